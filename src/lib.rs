@@ -1,7 +1,8 @@
 //! `wildcity`: a closed-loop driving simulator server for city twins made of 3D Gaussians.
 //!
-//! This package is the command line. The work is done by the packages of the workspace, each of which names
-//! only those below it; Cargo holds them to this table, and `tests/tidy` holds the table to the manifests.
+//! This package is the command line. The work is done by the packages of the workspace, each of
+//! which names only those below it; Cargo holds them to this table, and `tests/tidy` holds the
+//! table to the manifests.
 //!
 //! | package | what it is | depends on |
 //! |---|---|---|
@@ -27,25 +28,28 @@
 //! | [`wildcity_server`] | WebSocket and HTTP, and the viewer | episode, heap, protocol, push, render, repair, scene, session, sim, twin |
 //! | [`wildcity_suite`] | suites of scenarios: drives, judges and reports them | episode, render, scene, score, server, session, sim, twin |
 //!
-//! Data goes one way: file, twin, render, session, server, agent. An agent's pose or action goes server,
-//! session, sim. No package calls one above it.
+//! Data goes one way: file, twin, render, session, server, agent. An agent's pose or action goes
+//! server, session, sim. No package calls one above it.
 //!
 //! # Invariants
 //!
 //! 1. Only `protocol`, `client` and `server::convert` use the messages of the wire.
-//! 2. Only `twin::store` opens files of a twin; only `render::gpu` names wgpu; only `server` names axum;
-//!    only `repair::onnx` names the ONNX runtime; only `alpasim` names tonic and prost; only `heap` has `unsafe`.
-//! 3. `scene`, `render` and `sim` are pure: the same input gives the same bytes at any thread count.
+//! 2. Only `twin::store` opens files of a twin; only `render::gpu` names wgpu; only `server` names
+//!    axum; only `repair::onnx` names the ONNX runtime; only `alpasim` names tonic and prost; only
+//!    `heap` has `unsafe`.
+//! 3. `scene`, `render` and `sim` are pure: the same input gives the same bytes at any thread
+//!    count.
 //! 4. Scene data is checked once, when it enters; poses and cameras are checked once, at the wire.
-//! 5. An image is a function of scene version, render profile, poses, cameras and actors; and, where it says so,
-//!    of the repair model's hash and the episode's history; and of the effects of sensors, which a seed, a name and
-//!    a time decide. Caches change latency, never pixels.
-//! 6. Every observation names the scene version and the render profile that it was made with. A new version
-//!    becomes visible only between two steps, and only to a session that asked for it.
-//! 7. Time is integer microseconds; poses are f64 until the renderer makes them camera-relative f32.
+//! 5. An image is a function of scene version, render profile, poses, cameras and actors; and,
+//!    where it says so, of the repair model's hash and the episode's history; and of the effects of
+//!    sensors, which a seed, a name and a time decide. Caches change latency, never pixels.
+//! 6. Every observation names the scene version and the render profile that it was made with. A new
+//!    version becomes visible only between two steps, and only to a session that asked for it.
+//! 7. Time is integer microseconds; poses are f64 until the renderer makes them camera-relative
+//!    f32.
 //! 8. Every queue, message, buffer and count has a maximum, in the `limits` module of its package.
-//! 9. A scene pays only for what it has: without a sky, spherical harmonics, lenses, actors, repair or effects of
-//!    sensors there is no buffer, pass, pipeline or library for them.
+//! 9. A scene pays only for what it has: without a sky, spherical harmonics, lenses, actors, repair
+//!    or effects of sensors there is no buffer, pass, pipeline or library for them.
 //! 10. One table maps each fault to its wire code and its HTTP status, exhaustively.
 //!
 //! [`wildcity_heap`]: ../wildcity_heap/index.html

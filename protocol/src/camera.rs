@@ -22,8 +22,8 @@ pub enum Lens {
     Fisheye {
         /// Coefficients k1 to k4.
         k: [f64; 4],
-        /// Largest angle from the optical axis that the lens sees, in radians. If absent, the angle up to
-        /// which its polynomial increases.
+        /// Largest angle from the optical axis that the lens sees, in radians. If absent, the angle
+        /// up to which its polynomial increases.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         max_angle: Option<f64>,
     },
@@ -33,8 +33,8 @@ pub enum Lens {
         reference: FthetaReference,
         /// Coefficients of the powers 0 to 5, in radians and pixels.
         polynomial: [f64; 6],
-        /// `[c, d, e]` of the matrix `[[c, d], [e, 1]]`, which maps rotationally symmetric pixel offsets to
-        /// those of the real sensor.
+        /// `[c, d, e]` of the matrix `[[c, d], [e, 1]]`, which maps rotationally symmetric pixel
+        /// offsets to those of the real sensor.
         linear_cde: [f64; 3],
         /// Largest angle from the optical axis that the lens sees, in radians.
         max_angle: f64,
@@ -47,15 +47,17 @@ pub enum Lens {
 #[serde(rename_all = "snake_case")]
 #[cfg_attr(feature = "schema", schemars(rename = "Reference"))]
 pub enum FthetaReference {
-    /// The angle from the optical axis, in radians, to the distance from the principal point, in pixels.
+    /// The angle from the optical axis, in radians, to the distance from the principal point, in
+    /// pixels.
     AngleToPixel,
     /// The distance from the principal point, in pixels, to the angle, in radians.
     PixelToAngle,
 }
 
-/// Colour correction of a camera: `matrix * rgb + offset`, on the red, green and blue that the scene stores, from 0
-/// to 1. They are display-referred, as in the training photographs, and not proportional to light.
-/// Requests give the matrix, or a gain per channel instead; answers have the matrix.
+/// Colour correction of a camera: `matrix * rgb + offset`, on the red, green and blue that the
+/// scene stores, from 0 to 1. They are display-referred, as in the training photographs, and not
+/// proportional to light. Requests give the matrix, or a gain per channel instead; answers have the
+/// matrix.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[cfg_attr(feature = "schema", schemars(transform = crate::message::matrix_or_gain))]

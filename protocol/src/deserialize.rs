@@ -10,8 +10,8 @@ use crate::message::{
     ScenarioChoice, Start,
 };
 
-/// Chosen by the fields that are present. Serde's own `untagged` tries one variant after the other, and cannot report
-/// the error of each.
+/// Chosen by the fields that are present. Serde's own `untagged` tries one variant after the other,
+/// and cannot report the error of each.
 impl<'de> Deserialize<'de> for Start {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         #[derive(Deserialize)]

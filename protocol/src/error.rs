@@ -9,7 +9,8 @@ use serde::{Deserialize, Serialize};
 pub enum Code {
     /// The text frame is not JSON, or is nested too deeply.
     MalformedJson,
-    /// The JSON is not a request: its type is unknown, or a field is missing, unknown or of the wrong type.
+    /// The JSON is not a request: its type is unknown, or a field is missing, unknown or of the
+    /// wrong type.
     InvalidRequest,
     /// The client sent a binary frame; only the server sends those.
     UnexpectedBinary,
@@ -21,8 +22,8 @@ pub enum Code {
     WrongOrder,
     /// Client and server have no protocol version in common.
     UnsupportedProtocol,
-    /// The request does not fit the state of the session: a session is already open, none is open, the
-    /// episode has ended, or the session's dynamics do not accept this step.
+    /// The request does not fit the state of the session: a session is already open, none is open,
+    /// the episode has ended, or the session's dynamics do not accept this step.
     SessionState,
     /// There is no twin of this name.
     UnknownTwin,
@@ -90,7 +91,8 @@ pub enum Code {
     StorageFull,
     /// There is no push of this id.
     UnknownPush,
-    /// Another push changed the same cells since the base version, or an asset of another content has the name.
+    /// Another push changed the same cells since the base version, or an asset of another content
+    /// has the name.
     Conflict,
     /// The pushed Gaussians are invalid.
     PushRefused,

@@ -1,9 +1,11 @@
-//! The messages of the protocol `wildcity.v1`. This package has the types that are sent, and nothing else.
+//! The messages of the protocol `wildcity.v1`. This package has the types that are sent, and
+//! nothing else.
 //!
-//! Text frames are JSON: [`message::Request`] from the client, [`message::Answer`] from the server, matched by `seq`.
-//! Binary frames are [observations](observation). [`http`] has the bodies of HTTP requests and answers for uploads,
-//! pushes and versions. `protocol/README.md` describes the protocol; the JSON schemas in `protocol/schema` are
-//! generated from these types, and [`decode`] compares messages of clients with them.
+//! Text frames are JSON: [`message::Request`] from the client, [`message::Answer`] from the server,
+//! matched by `seq`. Binary frames are [observations](observation). [`http`] has the bodies of HTTP
+//! requests and answers for uploads, pushes and versions. `protocol/README.md` describes the
+//! protocol; the JSON schemas in `protocol/schema` are generated from these types, and [`decode`]
+//! compares messages of clients with them.
 //!
 //! ```
 //! use wildcity_protocol::message::{Pose, Request};
@@ -25,6 +27,8 @@
 //! # Ok::<(), serde_json::Error>(())
 //! ```
 
+#![warn(missing_docs)]
+
 pub mod camera;
 pub mod decode;
 mod deserialize;
@@ -37,5 +41,6 @@ pub mod observation;
 /// Name of the WebSocket subprotocol. It is also the only protocol version so far.
 pub const PROTOCOL: &str = "wildcity.v1";
 
-/// The WebSocket subprotocol of clients that watch a session: they receive its observations, and send nothing.
+/// The WebSocket subprotocol of clients that watch a session: they receive its observations, and
+/// send nothing.
 pub const WATCH_PROTOCOL: &str = "wildcity.watch.v1";

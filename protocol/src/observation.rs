@@ -1,8 +1,9 @@
 //! The observation: one binary frame in safetensors layout.
 //!
-//! The frame starts with the length of its header, 8 bytes little-endian. Then come the header, JSON padded
-//! with spaces, and the bytes of the tensors. The header's `__metadata__` is
-//! `{"observation": "<JSON of ObservationMetadata>"}`, because safetensors allows only strings there.
+//! The frame starts with the length of its header, 8 bytes little-endian. Then come the header,
+//! JSON padded with spaces, and the bytes of the tensors. The header's `__metadata__` is
+//! `{"observation": "<JSON of ObservationMetadata>"}`, because safetensors allows only strings
+//! there.
 //!
 //! The order of the tensors:
 //!
@@ -14,11 +15,12 @@
 //! 4. For each image `camera/<name>/rgb`, u8.
 //! 5. If requested, earlier frames: `camera/<name>/history/<back>/rgb`, u8.
 //!
-//! The answer to `step_many` has the same layout: its header has `{"many": "<JSON of ManyMetadata>"}`, and its tensors are
-//! u8 `[n]`, each a whole observation.
+//! The answer to `step_many` has the same layout: its header has
+//! `{"many": "<JSON of ManyMetadata>"}`, and its tensors are u8 `[n]`, each a whole observation.
 //!
-//! Image names start with `pose/<k>/` if there are several poses (`observe`). The length of the header is a
-//! multiple of 8 and floats come first, so floats are aligned to 4 bytes, and instances to 2, and can be read in place.
+//! Image names start with `pose/<k>/` if there are several poses (`observe`). The length of the
+//! header is a multiple of 8 and floats come first, so floats are aligned to 4 bytes, and instances
+//! to 2, and can be read in place.
 
 use serde::{Deserialize, Serialize};
 
@@ -62,7 +64,8 @@ pub struct ObservationMetadata {
     pub geo: Option<Geo>,
     /// The images, in order. Empty between two decisions.
     pub images: Vec<Image>,
-    /// Earlier frames of the same cameras, camera by camera, newest first. Absent if there are none.
+    /// Earlier frames of the same cameras, camera by camera, newest first. Absent if there are
+    /// none.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub history: Vec<Image>,
     /// What happened since the observation before, by time. Only with a scenario.
@@ -124,21 +127,21 @@ pub struct SessionRefusal {
 pub struct Ego {
     /// `world_from_rig`.
     pub pose: Pose,
-    /// Velocity in world axes, in m/s. With teleport dynamics: the displacement of the last step divided by
-    /// its time, zero at step 0.
+    /// Velocity in world axes, in m/s. With teleport dynamics: the displacement of the last step
+    /// divided by its time, zero at step 0.
     pub velocity: [f64; 3],
-    /// Change of the velocity over the last step, per second, in world axes, in m/s². Zero as long as no
-    /// earlier velocity is known.
+    /// Change of the velocity over the last step, per second, in world axes, in m/s². Zero as long
+    /// as no earlier velocity is known.
     pub acceleration: [f64; 3],
-    /// Yaw rate about the rig's z axis, positive to the left, in rad/s. With teleport dynamics: the mean
-    /// over the last step.
+    /// Yaw rate about the rig's z axis, positive to the left, in rad/s. With teleport dynamics: the
+    /// mean over the last step.
     pub yaw_rate: f64,
-    /// Angle of the front wheels, positive to the left, in radians. Absent with teleport dynamics, which
-    /// have no wheels.
+    /// Angle of the front wheels, positive to the left, in radians. Absent with teleport dynamics,
+    /// which have no wheels.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub steering: Option<f64>,
-    /// Number of poses of the history, counted from its end, that were driven. The earlier ones repeat the
-    /// start.
+    /// Number of poses of the history, counted from its end, that were driven. The earlier ones
+    /// repeat the start.
     pub history_count: u64,
 }
 
@@ -153,7 +156,8 @@ pub struct Event {
     /// Name of the actor, if it is about one. A contact without an actor is one with the twin.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub actor: Option<String>,
-    /// Name of the trigger, or the reason of an end: `time`, `off_route`, `contact`, `stuck` or `route_done`.
+    /// Name of the trigger, or the reason of an end: `time`, `off_route`, `contact`, `stuck` or
+    /// `route_done`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub name: Option<String>,
     /// Whether the ego is at fault for the contact.
@@ -187,7 +191,8 @@ pub enum EventKind {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Route {
-    /// Up to 20 points of the route in the rig's frame, in metres: the first beside the ego, then every 80/19 m.
+    /// Up to 20 points of the route in the rig's frame, in metres: the first beside the ego, then
+    /// every 80/19 m.
     pub points: Vec<[f64; 3]>,
     /// What to do next.
     pub command: NavigationCommand,
@@ -263,8 +268,8 @@ pub struct Image {
     /// Number of this camera's frames since this one. 0, and therefore absent, in `images`.
     #[serde(default, skip_serializing_if = "is_now")]
     pub back: u64,
-    /// Name of the colour tensor. The names of the other tensors have `depth`, `opacity`, `normals` or `instances` in
-    /// place of its final `rgb`.
+    /// Name of the colour tensor. The names of the other tensors have `depth`, `opacity`, `normals`
+    /// or `instances` in place of its final `rgb`.
     pub tensor: String,
     /// Encoding of the colour image.
     pub encoding: Encoding,
@@ -286,19 +291,19 @@ pub struct Image {
     /// The windshield in front of the lens, if there is one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub windshield: Option<Windshield>,
-    /// Fraction of the image that the lens sees, if that is not all of it. In the rest, colour, depth and
-    /// opacity are 0.
+    /// Fraction of the image that the lens sees, if that is not all of it. In the rest, colour,
+    /// depth and opacity are 0.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub seen: Option<f64>,
     /// `rig_from_camera`.
     pub camera_to_rig: Pose,
-    /// Time at which the first row is exposed, in simulated microseconds. Equal to `shutter_end_us` with a
-    /// global shutter.
+    /// Time at which the first row is exposed, in simulated microseconds. Equal to `shutter_end_us`
+    /// with a global shutter.
     pub shutter_start_us: i64,
     /// Time at which the last row is exposed, in simulated microseconds. This is the image's time.
     pub shutter_end_us: i64,
-    /// BLAKE3 of the image's raw pixel bytes (`[height, width, 3]`, before encoding), in hex: of what is sent, after
-    /// repair and after the effects of the sensors.
+    /// BLAKE3 of the image's raw pixel bytes (`[height, width, 3]`, before encoding), in hex: of
+    /// what is sent, after repair and after the effects of the sensors.
     pub hash: String,
     /// Confidence in the image, if the session asked for it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -319,16 +324,17 @@ pub struct ImageSensor {
     pub status: SensorStatus,
     /// What was done.
     pub reasons: Vec<SensorReason>,
-    /// When the frame was due, in simulated microseconds. The shutter times are those that the camera claims: earlier
-    /// than this for a frame that stands in for a dropped or late one.
+    /// When the frame was due, in simulated microseconds. The shutter times are those that the
+    /// camera claims: earlier than this for a frame that stands in for a dropped or late one.
     pub due_us: i64,
-    /// When the picture was taken, in simulated microseconds: before the shutter times if the camera is frozen.
+    /// When the picture was taken, in simulated microseconds: before the shutter times if the
+    /// camera is frozen.
     pub taken_us: i64,
     /// Offset of the exposure, in stops. Only with a drift of the exposure.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub stops: Option<f64>,
-    /// BLAKE3 of the raw pixel bytes before noise, exposure and dirt, in hex. Absent if the camera has none of them:
-    /// it is the image's `hash` then.
+    /// BLAKE3 of the raw pixel bytes before noise, exposure and dirt, in hex. Absent if the camera
+    /// has none of them: it is the image's `hash` then.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub clean_hash: Option<String>,
 }
@@ -363,20 +369,21 @@ pub enum SensorReason {
     Dirt,
 }
 
-/// What became of an image in a session that asked for repair. Depth, opacity, normals and instances stay those of
-/// the scene.
+/// What became of an image in a session that asked for repair. Depth, opacity, normals and
+/// instances stay those of the scene.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct ImageRepair {
     /// What became of it.
     pub status: RepairStatus,
-    /// BLAKE3 of the raw pixel bytes before the repair, in hex: the image's `hash` unless the status is `repaired`.
+    /// BLAKE3 of the raw pixel bytes before the repair, in hex: the image's `hash` unless the
+    /// status is `repaired`.
     pub rendered_hash: String,
     /// Why the model failed. Only with the status `failed`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub failure: Option<RepairFailure>,
-    /// The recorded images that the model saw beside it, at most 8: those that gave most pixels first. Only with the
-    /// status `repaired`, and if the model needs some.
+    /// The recorded images that the model saw beside it, at most 8: those that gave most pixels
+    /// first. Only with the status `repaired`, and if the model needs some.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub references: Vec<String>,
 }
@@ -409,7 +416,8 @@ pub enum RepairFailure {
     Other,
 }
 
-/// Confidence in an image: how close it is to what was recorded, and the measurements behind that number.
+/// Confidence in an image: how close it is to what was recorded, and the measurements behind that
+/// number.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Trust {

@@ -1,7 +1,8 @@
 //! The files of a scene that AlpaSim's runtime reads itself: rig, cameras, tracks and map.
 //!
-//! The runtime reads them from a zip archive named `.usdz`. Poses are in the scene's local frame, so that
-//! `world_to_nre` is the identity. There is no mesh: the runtime's physics is disabled, or the physics of this package.
+//! The runtime reads them from a zip archive named `.usdz`. Poses are in the scene's local frame,
+//! so that `world_to_nre` is the identity. There is no mesh: the runtime's physics is disabled, or
+//! the physics of this package.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -36,8 +37,8 @@ const ROAD_STEP_M: f64 = 2.0;
 /// Length of the road after the end of the scene, in metres, because a driver plans beyond the end.
 const BEYOND_M: f64 = 120.0;
 
-/// Length, width and height of the ego's box, and the box's centre in the rig frame, in metres: a car with the
-/// wheelbase of the simulated one, 2.85 m.
+/// Length, width and height of the ego's box, and the box's centre in the rig frame, in metres: a
+/// car with the wheelbase of the simulated one, 2.85 m.
 const BOX_M: [f64; 3] = [4.85, 1.9, 1.6];
 const BOX_CENTRE_M: [f64; 3] = [1.4, 0.0, 0.8];
 
@@ -55,10 +56,7 @@ pub enum ExportError {
     Tracks(#[from] FileError),
     /// The scene would have fewer than two poses.
     #[error("{scene} is shorter than {PERIOD_US} us: choose an earlier start")]
-    Short {
-        /// The scene.
-        scene: String,
-    },
+    Short { scene: String },
     /// More recorded actors are present at the same time than an image may show.
     #[error(
         "{scene} has {count} recorded actors at {since_us} us; an image shows at most {most}: leave some out of the \
@@ -66,7 +64,6 @@ pub enum ExportError {
         most = PlacedChunk::MAX_ACTORS
     )]
     Crowded {
-        /// The scene.
         scene: String,
         /// The first such time, in microseconds since the scene's start.
         since_us: i64,
@@ -89,7 +86,8 @@ pub struct SceneContent<'a> {
 /// The files of a scene, by name. `hash` is that of the version's manifest.
 ///
 /// # Errors
-/// The manifest has no such scene, or it is too short, or a track is damaged, or too many actors are present at once.
+/// The manifest has no such scene, or it is too short, or a track is damaged, or too many actors
+/// are present at once.
 pub fn files(
     id: &SceneId,
     manifest: &Manifest,
@@ -194,12 +192,13 @@ struct SceneTrack {
     id: String,
     label: &'static str,
     size_m: [f64; 3],
-    /// Times in microseconds since 1970, and poses of the middle of its box: x, y, z and a quaternion x, y, z, w.
+    /// Times in microseconds since 1970, and poses of the middle of its box: x, y, z and a
+    /// quaternion x, y, z, w.
     poses: Vec<(i64, [f64; 7])>,
 }
 
-/// The part of a recorded actor's track that a scene shows, at the scene's times since `start_us`; `None` if it is
-/// present at fewer than two of them.
+/// The part of a recorded actor's track that a scene shows, at the scene's times since `start_us`;
+/// `None` if it is present at fewer than two of them.
 fn track(
     section: &TrackSection,
     start_us: i64,
@@ -231,8 +230,8 @@ fn track(
     Ok(is_shown.then_some(SceneTrack { id, label, size_m: section.size, poses }))
 }
 
-/// The first time, in microseconds since the scene's start, at which more actors are present than an image may show,
-/// and their number.
+/// The first time, in microseconds since the scene's start, at which more actors are present than
+/// an image may show, and their number.
 fn crowded(tracks: &[SceneTrack]) -> Option<(i64, usize)> {
     let mut counts: BTreeMap<i64, usize> = BTreeMap::new();
     for (time_us, _) in tracks.iter().flat_map(|track| &track.poses) {
@@ -265,8 +264,8 @@ fn rows(pose: &Pose) -> [[f64; 4]; 4] {
     DMat4::from_rotation_translation(pose.rotation, pose.position_m).transpose().to_cols_array_2d()
 }
 
-/// One OpenDRIVE road along the poses: straight lines with an elevation, the ego's lane and an adjacent one. It has no
-/// `geoReference`, so that its coordinates are those of the local frame.
+/// One OpenDRIVE road along the poses: straight lines with an elevation, the ego's lane and an
+/// adjacent one. It has no `geoReference`, so that its coordinates are those of the local frame.
 fn road(poses: &[(i64, Pose)]) -> String {
     let mut points: Vec<DVec3> = Vec::new();
     for (_, pose) in poses {
@@ -306,7 +305,8 @@ fn road(poses: &[(i64, Pose)]) -> String {
             "<lane id=\"{id}\" type=\"driving\" level=\"false\"><width sOffset=\"0\" a=\"{LANE_M}\" b=\"0\" c=\"0\" d=\"0\"/></lane>"
         )
     };
-    // The reference line is shifted by half a lane, so that the drive runs in the middle of lane -1.
+    // The reference line is shifted by half a lane, so that the drive runs in the middle of lane
+    // -1.
     format!(
         r#"<?xml version="1.0" encoding="UTF-8"?>
 <OpenDRIVE>

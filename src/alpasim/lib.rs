@@ -13,11 +13,12 @@
 //! ```
 //!
 //! # Facts of the contract
-//! AlpaSim connects without TLS and without tokens, so that the services listen on loopback addresses unless told
-//! otherwise. All floats of poses are f32, and AlpaSim keeps its own poses in f32 as well: 8 mm at 100 km. So a scene
-//! has a local frame near its start, with the axes of the world. Messages have at most 64 MiB, as the clients' own
-//! limit. This package has no .proto file and no code generator: the messages are written by hand from the published
-//! field numbers, and a test calls every method with the stubs of another package.
+//! AlpaSim connects without TLS and without tokens, so that the services listen on loopback
+//! addresses unless told otherwise. All floats of poses are f32, and AlpaSim keeps its own poses in
+//! f32 as well: 8 mm at 100 km. So a scene has a local frame near its start, with the axes of the
+//! world. Messages have at most 64 MiB, as the clients' own limit. This package has no .proto file
+//! and no code generator: the messages are written by hand from the published field numbers, and a
+//! test calls every method with the stubs of another package.
 
 pub mod camera;
 pub mod egodriver;

@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
-/// Largest message: AlpaSim's client accepts as much. 16 raw 1920x1080 images have 100 MB, so that large
-/// batches need an encoding.
+/// Largest message: AlpaSim's client accepts as much. 16 raw 1920x1080 images have 100 MB, so that
+/// large batches need an encoding.
 pub const MESSAGE_BYTES: usize = 64 << 20;
 
 /// How long a request may wait for its images. AlpaSim's renderer waits as long for its backend.
@@ -18,8 +18,9 @@ pub const OPEN_SCENES: usize = 16;
 /// Images of one request: a minute of a rig of 16 cameras at 4 Hz would be 3,840.
 pub const BATCH_IMAGES: usize = 256;
 
-/// Dynamic objects whose assets stay in memory between requests. A box has at most 1,280 Gaussians, which take about
-/// 160 kB with their coarser levels: 384 boxes take 61 MB. All assets count against the memory of twins.
+/// Dynamic objects whose assets stay in memory between requests. A box has at most 1,280 Gaussians,
+/// which take about 160 kB with their coarser levels: 384 boxes take 61 MB. All assets count
+/// against the memory of twins.
 pub const OBJECT_ASSETS: usize = 384;
 
 /// Longest id of a track, in bytes.
@@ -28,8 +29,8 @@ pub const TRACK_ID_BYTES: usize = 256;
 /// Longest message of a gRPC status, in bytes: HTTP/2 sends it as a header.
 pub const STATUS_BYTES: usize = 4096;
 
-/// Boxes that one request puts on the ground: a rollout of 20 s has 200 poses of the ego. At 1 ms each, for 170,000
-/// keyframes, they take 1 s.
+/// Boxes that one request puts on the ground: a rollout of 20 s has 200 poses of the ego. At 1 ms
+/// each, for 170,000 keyframes, they take 1 s.
 pub const PHYSICS_BOXES: usize = 1024;
 
 /// Requests that put boxes on the ground at once. Each takes a thread.
@@ -59,7 +60,8 @@ pub const CONNECTIONS: usize = 256;
 /// How long connections may take to send their last answers when the service stops.
 pub const DRAIN: Duration = Duration::from_secs(2);
 
-/// Time of the start of every scene, in microseconds since 1970: AlpaSim requires integers of this size.
+/// Time of the start of every scene, in microseconds since 1970: AlpaSim requires integers of this
+/// size.
 pub const EPOCH_US: u64 = 1_700_000_000_000_000;
 
 /// How long a driver may take until it answers: networks of 20 GB are loaded from disk.
@@ -68,8 +70,8 @@ pub const DRIVER_START: Duration = Duration::from_secs(120);
 /// How long a driver may take for one answer, unless told otherwise.
 pub const DRIVER_ANSWER: Duration = Duration::from_secs(60);
 
-/// Largest image that is sent to a driver: gRPC servers accept messages of 4 MiB by default, with their
-/// other fields.
+/// Largest image that is sent to a driver: gRPC servers accept messages of 4 MiB by default, with
+/// their other fields.
 pub const DRIVER_IMAGE_BYTES: usize = (4 << 20) - 1024;
 
 /// Poses of a plan that are used: the limit of a step's trajectory.

@@ -1,7 +1,8 @@
 //! Dynamic objects: moving objects of a scene other than the ego.
 //!
-//! A request for an image names an object only by its track's id, with poses of the middle of its box. So the id
-//! describes the object, as the id of a scene describes the scene, and the server keeps no table:
+//! A request for an image names an object only by its track's id, with poses of the middle of its
+//! box. So the id describes the object, as the id of a scene describes the scene, and the server
+//! keeps no table:
 //!
 //! | id | what is drawn |
 //! |---|---|
@@ -9,7 +10,8 @@
 //! | `NAME@LxWxH`, `NAME@LxWxH#RRGGBB` | a box of this length, width and height in metres, grey or in this colour |
 //! | `NAME` | a grey box of the size of a car |
 //!
-//! `wildcity alpasim export --tracks` writes such ids; AlpaSim's runtime repeats those that a scene's file has.
+//! `wildcity alpasim export --tracks` writes such ids; AlpaSim's runtime repeats those that a
+//! scene's file has.
 
 use std::str::FromStr;
 
@@ -33,7 +35,8 @@ const GREY: [u8; 3] = [128, 128, 128];
 const CELL_M: f64 = 0.1;
 const MOST_CELLS: f64 = 16.0;
 
-/// Standard deviation of a cell's Gaussian, as a fraction of the cell's edge, and across the face, in metres.
+/// Standard deviation of a cell's Gaussian, as a fraction of the cell's edge, and across the face,
+/// in metres.
 const OVERLAP: f64 = 0.66;
 const THICKNESS_M: f64 = 0.004;
 
@@ -43,7 +46,8 @@ const NAMED: usize = 64;
 /// The logit of an opacity of 0.99.
 const LOGIT_OPACITY: f32 = 4.595;
 
-/// Factor of the colour of a face, so that the edges of a box are visible: front and rear, left and right, top.
+/// Factor of the colour of a face, so that the edges of a box are visible: front and rear, left and
+/// right, top.
 const SHADES: [f64; 3] = [0.7, 0.85, 1.0];
 
 /// The shape of an object.
@@ -51,9 +55,7 @@ const SHADES: [f64; 3] = [0.7, 0.85, 1.0];
 pub enum ObjectShape {
     /// An asset, by its hash or its name.
     Asset(String),
-    /// A box.
     Box {
-        /// Its size.
         size: ActorBox,
         /// Its red, green and blue.
         rgb8: [u8; 3],
@@ -71,7 +73,6 @@ pub enum ObjectShape {
 pub struct ObjectError {
     /// The refused id, or the first characters of an id that is too long.
     pub id: String,
-    /// The error.
     pub reason: String,
 }
 
@@ -79,9 +80,9 @@ impl ObjectShape {
     /// The object of a track's id.
     ///
     /// # Errors
-    /// It is longer than [`limits::TRACK_ID_BYTES`], or the text after its `@` is neither a name nor a size that an
-    /// actor may have.
-    pub fn of_track(id: &str) -> Result<Self, ObjectError> {
+    /// It is longer than [`limits::TRACK_ID_BYTES`], or the text after its `@` is neither a name
+    /// nor a size that an actor may have.
+    pub fn from_track(id: &str) -> Result<Self, ObjectError> {
         let most = limits::TRACK_ID_BYTES;
         if id.len() > most {
             let reason = format!(
@@ -94,8 +95,8 @@ impl ObjectShape {
         shape.parse().map_err(|reason| ObjectError { id: id.to_owned(), reason })
     }
 
-    /// Key of the shape, which is equal for equal boxes, however they were written. The key of a box has a `#`, which
-    /// names and hashes cannot have.
+    /// Key of the shape, which is equal for equal boxes, however they were written. The key of a
+    /// box has a `#`, which names and hashes cannot have.
     pub fn key(&self) -> String {
         let (size, [red, green, blue]) = match self {
             Self::Asset(name) => return name.clone(),
@@ -129,7 +130,7 @@ impl ObjectShape {
             name: "box".to_owned(),
             class: ActorClass::Object,
             box_: size,
-            provenance: Provenance::of("box".to_owned()),
+            provenance: Provenance::new("box".to_owned()),
         };
         ActorAsset::new(&gaussians(size, rgb8), description).map(Some)
     }
@@ -240,7 +241,7 @@ mod tests {
     fn an_id_says_what_is_drawn() {
         let size = ActorBox { length_m: 4.5, width_m: 1.8, height_m: 1.5 };
         let red = [0xc0, 0x10, 0x20];
-        let shape = |id: &str| ObjectShape::of_track(id).unwrap();
+        let shape = |id: &str| ObjectShape::from_track(id).unwrap();
         assert_eq!(shape("7@sedan"), ObjectShape::Asset("sedan".to_owned()));
         assert_eq!(shape("7@4.5x1.8x1.5"), ObjectShape::Box { size, rgb8: GREY });
         assert_eq!(shape("a@b@4.5x1.8x1.5#C01020"), ObjectShape::Box { size, rgb8: red });
@@ -260,7 +261,7 @@ mod tests {
             ("7@4.5x1.8x1.5#12345", "6 hex digits"),
             ("7@sedan#123456", "no asset and no size"),
         ] {
-            let text = ObjectShape::of_track(id).unwrap_err().to_string();
+            let text = ObjectShape::from_track(id).unwrap_err().to_string();
             assert!(text.contains(reason) && text.contains(id), "{text}");
         }
     }
@@ -268,15 +269,15 @@ mod tests {
     #[test]
     fn a_long_id_is_refused_by_its_first_characters() {
         let long = "é".repeat(limits::TRACK_ID_BYTES / 2);
-        assert_eq!(ObjectShape::of_track(&long), Ok(ObjectShape::Unknown));
-        let text = ObjectShape::of_track(&format!("{long}a")).unwrap_err().to_string();
+        assert_eq!(ObjectShape::from_track(&long), Ok(ObjectShape::Unknown));
+        let text = ObjectShape::from_track(&format!("{long}a")).unwrap_err().to_string();
         assert!(text.contains("257 bytes; at most 256 are accepted"), "{text}");
         assert_eq!(text.matches('é').count(), 64, "{text}");
     }
 
     #[test]
     fn equal_boxes_have_one_key() {
-        let key = |id: &str| ObjectShape::of_track(id).unwrap().key();
+        let key = |id: &str| ObjectShape::from_track(id).unwrap().key();
         assert_eq!(key("7@4x2x1"), "4x2x1#808080");
         for same in ["8@4.0x2x1", "7@4x02.0x1.#808080"] {
             assert_eq!(key(same), "4x2x1#808080", "{same}");
@@ -300,7 +301,7 @@ mod tests {
         assert!((bounds.min_m - DVec3::new(-2.25, -0.9, 0.05)).length() < 1e-9, "{bounds:?}");
         assert!((bounds.max_m - DVec3::new(2.25, 0.9, 1.5)).length() < 1e-9, "{bounds:?}");
         let top = (0..all.len()).find(|&index| all.means_m[index][2] == 1.5).unwrap();
-        let rgb = all.sh_of(top).iter().map(|&dc| 0.5 + sh::C0 * f64::from(dc));
+        let rgb = all.sh_at(top).iter().map(|&dc| 0.5 + sh::C0 * f64::from(dc));
         for (value, wanted) in rgb.zip([1.0, 0.0, 0.2]) {
             assert!((value - wanted).abs() < 1e-6, "{value} {wanted}");
         }

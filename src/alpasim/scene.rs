@@ -1,10 +1,10 @@
 //! Scenes: AlpaSim's name for a piece of a recorded drive.
 //!
-//! The id `TWIN@VERSION+TRAJECTORY+START_M`, such as `demo@1+log+100`, is complete, so that the server keeps no table.
-//! Names cannot have `@` and `+`, and AlpaSim creates folders for a `/`.
+//! The id `TWIN@VERSION+TRAJECTORY+START_M`, such as `demo@1+log+100`, is complete, so that the
+//! server keeps no table. Names cannot have `@` and `+`, and AlpaSim creates folders for a `/`.
 //!
-//! The local frame of a scene has the axes of the world. Its origin is the drive's position at START_M, rounded to
-//! whole metres, so that f32 poses lose nothing.
+//! The local frame of a scene has the axes of the world. Its origin is the drive's position at
+//! START_M, rounded to whole metres, so that f32 poses lose nothing.
 
 use std::fmt;
 use std::str::FromStr;
@@ -37,14 +37,10 @@ pub struct SceneId {
 pub enum SceneError {
     /// The text is not an id.
     #[error("{id:?} is no scene: expected TWIN@VERSION+TRAJECTORY+START_M, as demo@1+log+0")]
-    Id {
-        /// The refused text.
-        id: String,
-    },
+    Id { id: String },
     /// The version has no such drive.
     #[error("twin {twin:?} has no trajectory {trajectory:?}")]
     Trajectory {
-        /// The twin.
         twin: String,
         /// The drive asked for.
         trajectory: String,
@@ -54,25 +50,16 @@ pub enum SceneError {
     Start {
         /// The start asked for, in metres.
         start_m: f64,
-        /// The drive.
         trajectory: String,
         /// Its length, in metres.
         length_m: f64,
     },
     /// A pose is missing or invalid.
     #[error("{field}: {cause}")]
-    Pose {
-        /// The pose.
-        field: &'static str,
-        /// The error.
-        cause: PoseError,
-    },
+    Pose { field: &'static str, cause: PoseError },
     /// A pose is missing.
     #[error("{field} is missing")]
-    Missing {
-        /// The pose.
-        field: &'static str,
-    },
+    Missing { field: &'static str },
 }
 
 impl FromStr for SceneId {
@@ -178,7 +165,8 @@ pub fn pose_to_wire(pose: &Pose) -> common::Pose {
     }
 }
 
-/// The part of a drive that a scene shows: poses in its local frame, with times from [`limits::EPOCH_US`].
+/// The part of a drive that a scene shows: poses in its local frame, with times from
+/// [`limits::EPOCH_US`].
 ///
 /// # Errors
 /// As [`SceneId::drive`].

@@ -1,4 +1,5 @@
-//! Cameras of a data set: pinholes in place of lenses, and the camera models of transforms.json and COLMAP.
+//! Cameras of a data set: pinholes in place of lenses, and the camera models of transforms.json and
+//! COLMAP.
 
 use glam::DVec2;
 
@@ -38,10 +39,10 @@ impl CameraModel {
     ///
     /// # Errors
     /// A lens has no such model, or the models differ.
-    pub fn of(cameras: &[TrainingCamera]) -> Result<Self, AugmentError> {
+    pub fn from_cameras(cameras: &[TrainingCamera]) -> Result<Self, AugmentError> {
         let mut common: Option<Self> = None;
         for TrainingCamera { name, camera, .. } in cameras {
-            let own = Self::of_camera(name, camera)?;
+            let own = Self::from_camera(name, camera)?;
             common = Some(match (common, own) {
                 (None, own) => own,
                 (Some(common), own) if common == own => own,
@@ -56,7 +57,7 @@ impl CameraModel {
         Ok(common.unwrap_or(Self::Pinhole))
     }
 
-    fn of_camera(name: &str, camera: &Camera) -> Result<Self, AugmentError> {
+    fn from_camera(name: &str, camera: &Camera) -> Result<Self, AugmentError> {
         let refused = |lens| Err(AugmentError::Lens { camera: name.to_owned(), lens });
         if camera.windshield.is_some() {
             return refused("a windshield");
@@ -111,11 +112,12 @@ impl CameraModel {
     }
 }
 
-/// A pinhole of the field of a lens, with an image of the same size: its sides are where the field of the lens ends on
-/// the row and the column of the principal point, but at most 50° off the axis. Pixels need not be square.
+/// A pinhole of the field of a lens, with an image of the same size: its sides are where the field
+/// of the lens ends on the row and the column of the principal point, but at most 50° off the axis.
+/// Pixels need not be square.
 ///
 /// A pinhole without a windshield is returned unchanged.
-pub fn pinhole_of(camera: &Camera) -> Camera {
+pub fn without_lens(camera: &Camera) -> Camera {
     if camera.is_pinhole() {
         return *camera;
     }
@@ -168,9 +170,9 @@ mod tests {
 
     #[test]
     fn a_pinhole_shows_the_field_of_its_lens_up_to_50_degrees() {
-        assert_eq!(pinhole_of(&camera(Lens::Pinhole)), camera(Lens::Pinhole));
+        assert_eq!(without_lens(&camera(Lens::Pinhole)), camera(Lens::Pinhole));
         let lens = camera(opencv([-0.1, 0.01, 0.0, 0.0, 0.0, 0.0]));
-        let pinhole = pinhole_of(&lens);
+        let pinhole = without_lens(&lens);
         assert!(pinhole.is_pinhole() && pinhole.check().is_ok());
         for (at_px, axis) in [([0.0, 140.0], 0), ([400.0, 140.0], 0), ([210.0, 300.0], 1)] {
             let edge = lens.unproject(at_px.into()).unwrap();
@@ -180,7 +182,7 @@ mod tests {
         // 400 px of 250 px/rad see 0.8 rad to each side, and 60° are more than 50°.
         let mut wide = camera(fisheye());
         wide.pinhole = Pinhole { fx: 190.0, fy: 300.0, cx: 200.0, cy: 150.0 };
-        let pinhole = pinhole_of(&wide).pinhole;
+        let pinhole = without_lens(&wide).pinhole;
         let across_rad = 2.0 * (200.0 / pinhole.fx).atan();
         assert!((across_rad.to_degrees() - 100.0).abs() < 1e-9, "{across_rad}");
         assert!((150.0 / pinhole.fy).atan() < 0.51, "{pinhole:?}");
@@ -188,7 +190,7 @@ mod tests {
 
     #[test]
     fn a_file_has_one_model_and_others_are_refused_by_name() {
-        let model = |cameras: &[TrainingCamera]| CameraModel::of(cameras);
+        let model = |cameras: &[TrainingCamera]| CameraModel::from_cameras(cameras);
         let plain = named("front", Lens::Pinhole);
         let bent = named("left", opencv([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]));
         assert_eq!(model(std::slice::from_ref(&plain)).unwrap(), CameraModel::Pinhole);

@@ -1,7 +1,8 @@
 //! A COLMAP model in sparse/0: cameras, images and points, as text or binary.
 //!
-//! Written after COLMAP's `doc/format.rst`: `camera_from_world` as quaternion (w, x, y, z) and translation, pixel
-//! centres at 0.5, no points in the images, no tracks. Without rigs and frames COLMAP makes trivial ones.
+//! Written after COLMAP's `doc/format.rst`: `camera_from_world` as quaternion (w, x, y, z) and
+//! translation, pixel centres at 0.5, no points in the images, no tracks. Without rigs and frames
+//! COLMAP makes trivial ones.
 
 use std::fmt::Write as _;
 
@@ -39,7 +40,6 @@ pub struct ColmapModel<'a> {
     pub cameras: &'a [TrainingCamera],
     /// The images, counted from 1 as well.
     pub samples: &'a [Sample],
-    /// The points.
     pub points: &'a [Point],
 }
 
@@ -176,7 +176,8 @@ mod tests {
             rig_from_camera: Pose::IDENTITY,
         };
         let cameras = [named("left"), named("front")];
-        // The camera looks east from (1, 2, 3): the world's origin is 2 m to its right, 3 m below, 1 m behind it.
+        // The camera looks east from (1, 2, 3): the world's origin is 2 m to its right, 3 m below,
+        // 1 m behind it.
         let sample = Sample {
             name: "front/a.png".to_owned(),
             trajectory: "log".to_owned(),

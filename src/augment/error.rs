@@ -8,14 +8,7 @@ use std::path::{Path, PathBuf};
 pub enum AugmentError {
     /// A number of the plan is out of range.
     #[error("{field} is {value}; give {expected}")]
-    Number {
-        /// The option.
-        field: &'static str,
-        /// Its value.
-        value: f64,
-        /// The accepted values.
-        expected: String,
-    },
+    Number { field: &'static str, value: f64, expected: String },
     /// The twin has no drive to offset views from.
     #[error("the twin has no recorded drive: `wildcity twin drive` adds one")]
     NoDrive,
@@ -25,7 +18,6 @@ pub enum AugmentError {
          --cameras"
     )]
     Samples {
-        /// Their number.
         samples: usize,
         /// [`crate::limits::MOST_SAMPLES`].
         limit: usize,
@@ -36,7 +28,6 @@ pub enum AugmentError {
          pinholes of the lenses' fields are drawn"
     )]
     Lens {
-        /// The camera.
         camera: String,
         /// Property of the lens that cannot be described.
         lens: &'static str,
@@ -47,9 +38,7 @@ pub enum AugmentError {
          cameras by --cameras, or leave --lenses away"
     )]
     MixedLenses {
-        /// The camera.
         camera: String,
-        /// Its model.
         model: &'static str,
         /// Model of the cameras before it.
         other: &'static str,
@@ -61,13 +50,11 @@ pub enum AugmentError {
         dir.display()
     )]
     MadeOtherwise {
-        /// The folder.
         dir: PathBuf,
         /// The field that differs, by its name in augment.json.
         field: String,
         /// Its value in augment.json.
         there: String,
-        /// The value now.
         here: String,
     },
     /// A folder with files, but without augment.json.
@@ -75,45 +62,22 @@ pub enum AugmentError {
         "{} has files, but no augment.json: give an empty folder as --out, or one that `wildcity augment` made",
         dir.display()
     )]
-    NotOurs {
-        /// The folder.
-        dir: PathBuf,
-    },
+    NotOurs { dir: PathBuf },
     /// Another run writes to the folder.
     #[error("another `wildcity augment` writes to {}: wait for it, or give another --out", dir.display())]
-    InUse {
-        /// The folder.
-        dir: PathBuf,
-    },
+    InUse { dir: PathBuf },
     /// A file that cannot be understood.
     #[error("{}: {reason}. Delete the folder, and it is made anew", path.display())]
-    Damaged {
-        /// The file.
-        path: PathBuf,
-        /// The error.
-        reason: String,
-    },
+    Damaged { path: PathBuf, reason: String },
     /// An image has another number of values than its camera.
     #[error("{what} has {values} values, but the image has {pixels} pixels")]
-    Values {
-        /// The map.
-        what: &'static str,
-        /// Number of values.
-        values: usize,
-        /// Number of pixels.
-        pixels: usize,
-    },
+    Values { what: &'static str, values: usize, pixels: usize },
     /// A PNG cannot be encoded.
     #[error("cannot encode a PNG: {0}")]
     Png(String),
     /// A file cannot be read or written.
     #[error("{}: {cause}", path.display())]
-    File {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        cause: io::Error,
-    },
+    File { path: PathBuf, cause: io::Error },
 }
 
 impl AugmentError {

@@ -1,9 +1,10 @@
 //! The folder of a round: samples renamed into place, and a run that continues after them.
 //!
-//! Each file is written under a temporary name and renamed. When all files of a sample are written, it gets a line in
-//! `samples.partial.jsonl`. augment.json is written at the start, without the samples that are still to be rendered,
-//! and at the end, with all of them. So the folder of a run that was killed at any time has the settings of this run,
-//! and the next run keeps the samples whose files have the recorded hashes.
+//! Each file is written under a temporary name and renamed. When all files of a sample are written,
+//! it gets a line in `samples.partial.jsonl`. augment.json is written at the start, without the
+//! samples that are still to be rendered, and at the end, with all of them. So the folder of a run
+//! that was killed at any time has the settings of this run, and the next run keeps the samples
+//! whose files have the recorded hashes.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File, TryLockError};
@@ -53,8 +54,8 @@ struct ReadRecord {
 }
 
 impl Folder {
-    /// Opens the folder, which may be missing or hold an unfinished or finished round, and checks its samples. Calls
-    /// `progress` with the number of checked samples and the number of all.
+    /// Opens the folder, which may be missing or hold an unfinished or finished round, and checks
+    /// its samples. Calls `progress` with the number of checked samples and the number of all.
     ///
     /// # Errors
     /// It was made with other settings, is not a folder of a round, or another run writes there.
@@ -163,8 +164,8 @@ fn hash(bytes: &[u8]) -> String {
     Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// The lock of a folder for writing: a locked file, which is removed at the end. The system unlocks it if the process
-/// ends in another way.
+/// The lock of a folder for writing: a locked file, which is removed at the end. The system unlocks
+/// it if the process ends in another way.
 #[derive(Debug)]
 struct Lock {
     path: PathBuf,
@@ -181,7 +182,8 @@ impl Lock {
             Err(TryLockError::WouldBlock) => return Err(in_use()),
             Err(TryLockError::Error(cause)) => return Err(AugmentError::File { path, cause }),
         }
-        // Another run may have removed the file between creation and lock, and a third run may have created a new one.
+        // Another run may have removed the file between creation and lock, and a third run may have
+        // created a new one.
         let inode = |metadata: fs::Metadata| metadata.ino();
         let own = file.metadata().map(inode).map_err(AugmentError::file(&path))?;
         match fs::metadata(&path).map(inode) {
@@ -278,8 +280,8 @@ fn temporary_name(name: &str) -> String {
     format!("{name}.tmp")
 }
 
-/// Writes a file under a temporary name, and renames it. Only one run writes to the folder, so the next run overwrites
-/// temporary files of a killed one.
+/// Writes a file under a temporary name, and renames it. Only one run writes to the folder, so the
+/// next run overwrites temporary files of a killed one.
 fn write(path: &Path, bytes: &[u8]) -> Result<(), AugmentError> {
     if let Some(folder) = path.parent() {
         fs::create_dir_all(folder).map_err(AugmentError::file(folder))?;

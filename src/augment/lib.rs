@@ -1,5 +1,5 @@
-//! Off-trajectory views: views with a lateral offset from a twin's recorded drives, repaired by a model, as a data set
-//! for training.
+//! Off-trajectory views: views with a lateral offset from a twin's recorded drives, repaired by a
+//! model, as a data set for training.
 //!
 //! ```text
 //! plan          poses of the views: rounds, offsets, stations
@@ -12,9 +12,9 @@
 //! points        Gaussians as COLMAP's points
 //! ```
 //!
-//! This package does not render: `wildcity augment` renders the views through a server, like any agent. The idea of
-//! rounds, in which the views move away from the drive and the newest ones are trained on, is that of Difix3D+ (Wu et
-//! al. 2025).
+//! This package does not render: `wildcity augment` renders the views through a server, like any
+//! agent. The idea of rounds, in which the views move away from the drive and the newest ones are
+//! trained on, is that of Difix3D+ (Wu et al. 2025).
 
 mod cameras;
 mod colmap;
@@ -27,7 +27,7 @@ mod points;
 mod record;
 mod transforms;
 
-pub use cameras::{CameraModel, TrainingCamera, pinhole_of};
+pub use cameras::{CameraModel, TrainingCamera, without_lens};
 pub use colmap::{ColmapForm, ColmapModel};
 pub use error::AugmentError;
 pub use folder::Folder;

@@ -9,7 +9,8 @@ use wildcity_scene::geometry::camera::FieldMask;
 use crate::AugmentError;
 use crate::limits::{LEAST_OPACITY, MOST_DEPTH_M};
 
-/// The pixels that count: opaque, and within the lens' field. `opacity` is `[height, width]`, 0 to 1.
+/// The pixels that count: opaque, and within the lens' field. `opacity` is `[height, width]`, 0 to
+/// 1.
 ///
 /// # Errors
 /// `opacity` has another size than the camera's image.
@@ -19,7 +20,7 @@ pub fn counted(camera: &Camera, opacity: &[f32]) -> Result<Vec<bool>, AugmentErr
         return Err(AugmentError::Values { what: "opacity", values: opacity.len(), pixels });
     }
     let mut counts: Vec<bool> = opacity.iter().map(|opacity| *opacity >= LEAST_OPACITY).collect();
-    if let Some(field) = FieldMask::of(camera) {
+    if let Some(field) = FieldMask::from_camera(camera) {
         field.clear_outside(camera, 1, &mut counts);
     }
     Ok(counts)

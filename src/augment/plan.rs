@@ -28,12 +28,14 @@ pub struct Place {
     pub station_m: f64,
     /// Lateral offset from the drive, in metres: positive to the left.
     pub offset_m: f64,
-    /// Pose of the rig in the world: that of the drive at the station, moved along the rig's y axis (left).
+    /// Pose of the rig in the world: that of the drive at the station, moved along the rig's y axis
+    /// (left).
     pub world_from_rig: Pose,
 }
 
 impl Plan {
-    /// A plan with the requested offsets and the distance of two stations, in metres; both are rounded to centimetres.
+    /// A plan with the requested offsets and the distance of two stations, in metres; both are
+    /// rounded to centimetres.
     ///
     /// ```
     /// use wildcity_augment::Plan;
@@ -85,8 +87,8 @@ impl Plan {
         self.every_m
     }
 
-    /// The offsets of the round, in metres, left (positive) and right of the drive: for each requested one `min(0.5 m x
-    /// round, wanted)`, without repetitions.
+    /// The offsets of the round, in metres, left (positive) and right of the drive: for each
+    /// requested one `min(0.5 m x round, wanted)`, without repetitions.
     pub fn offsets_m(&self) -> Vec<f64> {
         let reached_m = ROUND_M * f64::from(self.round);
         let mut offsets_m: Vec<f64> =
@@ -106,7 +108,8 @@ impl Plan {
         let offsets_m = self.offsets_m();
         let mut places = Vec::new();
         for drive in drives {
-            // The last station is the end of the drive even if its length is a little too short in f64.
+            // The last station is the end of the drive even if its length is a little too short in
+            // f64.
             let steps = (drive.length_m() / self.every_m + 1e-9).floor() as usize;
             for step in 0..=steps {
                 let station_m = rounded(step as f64 * self.every_m);

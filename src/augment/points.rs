@@ -32,7 +32,7 @@ pub struct Surroundings {
 
 impl Surroundings {
     /// The surroundings within [`POINT_REACH_M`] of places.
-    pub fn of(places: &[Place]) -> Self {
+    pub fn from_places(places: &[Place]) -> Self {
         let mut places_m: Vec<DVec3> = Vec::new();
         for place in places {
             let at_m = place.world_from_rig.position_m;
@@ -64,7 +64,8 @@ impl Surroundings {
     }
 }
 
-/// A uniform sample of opaque Gaussians, seeded: the same Gaussians in the same order give the same points.
+/// A uniform sample of opaque Gaussians, seeded: the same Gaussians in the same order give the same
+/// points.
 #[derive(Debug)]
 pub struct PointSample {
     seed: u64,
@@ -108,8 +109,8 @@ impl PointSample {
         Self { seed, most, surroundings, seen: 0, kept: BinaryHeap::new() }
     }
 
-    /// Adds Gaussians that are near to each other, except those with an opacity below 1/2, which are not a surface, and
-    /// those outside of the surroundings.
+    /// Adds Gaussians that are near to each other, except those with an opacity below 1/2, which
+    /// are not a surface, and those outside of the surroundings.
     pub fn add(&mut self, gaussians: &Gaussians) {
         let near = self.surroundings.near(gaussians);
         for index in 0..gaussians.len() {
@@ -127,7 +128,7 @@ impl PointSample {
             if is_full {
                 self.kept.pop();
             }
-            let dc = &gaussians.sh_of(index)[..3];
+            let dc = &gaussians.sh_at(index)[..3];
             let rgb8 = [0, 1, 2].map(|c| {
                 let value = 0.5 + sh::C0 * f64::from(dc[c]);
                 (255.0 * value.clamp(0.0, 1.0)).round() as u8
@@ -174,7 +175,7 @@ mod tests {
         };
         let keyframes = vec![keyframe(0.0), keyframe(end_m)];
         let drive = Trajectory { name: "log".to_owned(), keyframes };
-        Surroundings::of(&Plan::new(1, &[1.0], 2.0).unwrap().places(&[drive]).unwrap())
+        Surroundings::from_places(&Plan::new(1, &[1.0], 2.0).unwrap().places(&[drive]).unwrap())
     }
 
     fn sample(seed: u64, most: usize) -> Vec<Point> {

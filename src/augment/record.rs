@@ -40,7 +40,6 @@ pub struct MadeWith {
     pub twin: String,
     /// Hash of its version.
     pub version_hash: String,
-    /// Backend that renders.
     pub backend: String,
     /// The model; `None` for views as rendered.
     pub repair: Option<RepairedWith>,
@@ -53,7 +52,6 @@ pub struct MadeWith {
 pub struct RepairedWith {
     /// Name of the model.
     pub model: String,
-    /// Its version.
     pub version: String,
     /// Hash of manifest, files, runtime and provider.
     pub repair_hash: String,
@@ -68,7 +66,6 @@ pub struct RepairedWith {
 /// Options of the command.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Options {
-    /// The round.
     pub round: u32,
     /// Wanted offsets, in metres.
     pub wanted_offsets_m: Vec<f64>,
@@ -97,8 +94,8 @@ pub struct Header {
     pub version: u64,
     /// Offsets of this round, in metres, positive to the left of the drive.
     pub offsets_m: Vec<f64>,
-    /// From the axes of the twin's capture to those of the twin, as eight numbers of `wildcity twin align`; `None` if
-    /// it is unknown.
+    /// From the axes of the twin's capture to those of the twin, as eight numbers of
+    /// `wildcity twin align`; `None` if it is unknown.
     pub world_from_capture: Option<String>,
 }
 
@@ -107,13 +104,11 @@ pub struct Header {
 pub struct Sample {
     /// Its path below `images/`, `rendered/`, `masks/` and `depth/`.
     pub name: String,
-    /// The drive.
     pub trajectory: String,
     /// Along the drive, in metres.
     pub station_m: f64,
     /// To the left of the drive, in metres.
     pub offset_m: f64,
-    /// The camera.
     pub camera: String,
     /// Pose of the camera in the twin's axes.
     pub world_from_camera: Pose,
@@ -143,7 +138,6 @@ pub struct SampleRepair {
 /// The encoded files of a sample, each a PNG.
 #[derive(Clone, Debug, Default)]
 pub struct SampleFiles {
-    /// The training image.
     pub image: Vec<u8>,
     /// Before the repair; `None` without a model.
     pub rendered: Option<Vec<u8>>,

@@ -1,9 +1,9 @@
 //! transforms.json, as nerfstudio reads it.
 //!
-//! Poses are `world_from_camera` with OpenGL's camera: x right, y up, z backwards (nerfstudio's data conventions). The
-//! world is the twin's. nerfstudio requires `mask_path` and `depth_file_path` on every frame or on none, and one
-//! `camera_model` per file. `weight`, `trust` and `station_m` are additions of this project, which other readers
-//! ignore.
+//! Poses are `world_from_camera` with OpenGL's camera: x right, y up, z backwards (nerfstudio's
+//! data conventions). The world is the twin's. nerfstudio requires `mask_path` and
+//! `depth_file_path` on every frame or on none, and one `camera_model` per file. `weight`, `trust`
+//! and `station_m` are additions of this project, which other readers ignore.
 
 use glam::{DMat3, DVec3};
 use serde_json::{Map, Value, json};

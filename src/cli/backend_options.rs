@@ -18,9 +18,10 @@ pub(super) struct RendererOptions {
     #[command(flatten)]
     backend: BackendOptions,
 
-    /// Run the stages up to and including this one on the cpu backend, and the rest on --device, even if
-    /// that device is software. If an image is wrong with --cpu-through project and right with --cpu-through
-    /// sort, the fault is in the GPU's sort stage. `wildcity bisect` tries all stages.
+    /// Run the stages up to and including this one on the cpu backend, and the rest on --device,
+    /// even if that device is software. If an image is wrong with --cpu-through project and right
+    /// with --cpu-through sort, the fault is in the GPU's sort stage. `wildcity bisect` tries all
+    /// stages.
     #[arg(long, value_name = "STAGE", value_enum)]
     cpu_through: Option<StageName>,
 }
@@ -43,13 +44,13 @@ pub(super) struct HardwareOptions {
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = threads)]
     threads: usize,
 
-    /// Device of the gpu backend: its number in `wildcity devices`, or a part of its name [default: the
-    /// fastest kind]
+    /// Device of the gpu backend: its number in `wildcity devices`, or a part of its name [default:
+    /// the fastest kind]
     #[arg(long, value_name = "DEVICE")]
     device: Option<String>,
 
-    /// GPU memory for Gaussians, in GiB. If they need more, the least recently drawn ones are evicted. Buffers of the
-    /// render stages need additional memory [default: all that the GPU has]
+    /// GPU memory for Gaussians, in GiB. If they need more, the least recently drawn ones are
+    /// evicted. Buffers of the render stages need additional memory [default: all that the GPU has]
     #[arg(long, value_name = "GIB", value_parser = gib)]
     gpu_memory_gib: Option<f64>,
 
@@ -61,8 +62,8 @@ pub(super) struct HardwareOptions {
 /// The backends of this build.
 #[derive(Clone, Copy, Debug, Default, clap::ValueEnum)]
 enum BackendName {
-    /// gpu if `--device` names a device, or if a hardware device renders a test image as the cpu backend
-    /// does; otherwise cpu. The choice is printed on standard error.
+    /// gpu if `--device` names a device, or if a hardware device renders a test image as the cpu
+    /// backend does; otherwise cpu. The choice is printed on standard error.
     #[default]
     Auto,
     /// wgpu on Vulkan, on `--device`.
@@ -141,7 +142,7 @@ impl BackendOptions {
     }
 
     /// Creates the backend that rendered a recording, unless `--backend` names another one.
-    pub(super) fn backend_of(&self, recorded: &str) -> anyhow::Result<Box<dyn Backend>> {
+    pub(super) fn replay_backend(&self, recorded: &str) -> anyhow::Result<Box<dyn Backend>> {
         let recorded = BackendName::from_str(recorded, false);
         match (self.backend, recorded) {
             (BackendName::Auto, Ok(backend)) => Self { backend, ..self.clone() }.backend(),

@@ -13,11 +13,11 @@ use super::scene_source::SceneSource;
 /// Find the stage of the gpu backend that is wrong, if one is.
 ///
 /// Draws each camera of the list on the cpu backend, on the gpu backend, and with the stages up to
-/// project, sort, or bin on the cpu and the rest on the GPU. Prints the PSNR of each image against the
-/// cpu's in dB (inf if no value differs, NaN if the GPU counted more than a frame can hold). A stage is
-/// wrong if the image is wrong (below 60 dB) when the GPU runs the stage, and right when the cpu runs it.
-/// The exit code is 1 if a camera has a wrong stage. `wildcity render --cpu-through STAGE` writes the
-/// images.
+/// project, sort, or bin on the cpu and the rest on the GPU. Prints the PSNR of each image against
+/// the cpu's in dB (inf if no value differs, NaN if the GPU counted more than a frame can hold). A
+/// stage is wrong if the image is wrong (below 60 dB) when the GPU runs the stage, and right when
+/// the cpu runs it. The exit code is 1 if a camera has a wrong stage.
+/// `wildcity render --cpu-through STAGE` writes the images.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Bisect {
@@ -46,7 +46,7 @@ impl Bisect {
         let mut wrong = None;
         for shot in &ready.shots {
             let views = std::slice::from_ref(&shot.view);
-            let scene = ready.scene_of(shot)?;
+            let scene = ready.scene(shot)?;
             let frame = Frame { scene: &scene, profile: &shot.profile, views };
             let bisection = bisect(&cpu, &gpu, &frame)?;
             write!(out, "{:<12}", shot.name)?;

@@ -8,8 +8,9 @@ use wildcity_render::gpu::{DeviceInfo, devices};
 
 /// List the devices that the gpu backend can use, the fastest kind first.
 ///
-/// --device takes the number or a part of the name. A device of the kind "cpu" is software (lavapipe): its
-/// images are right, but it is slower than the cpu backend, so --backend auto never selects it.
+/// --device takes the number or a part of the name. A device of the kind "cpu" is software
+/// (lavapipe): its images are right, but it is slower than the cpu backend, so --backend auto never
+/// selects it.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Devices {
@@ -28,7 +29,7 @@ impl Devices {
         let devices = devices();
         let mut out = io::stdout().lock();
         if self.json {
-            let devices: Vec<_> = devices.iter().map(json_of).collect();
+            let devices: Vec<_> = devices.iter().map(device_json).collect();
             writeln!(out, "{}", json!(devices))?;
             return Ok(());
         }
@@ -60,7 +61,7 @@ impl Devices {
     }
 }
 
-fn json_of(device: &DeviceInfo) -> serde_json::Value {
+fn device_json(device: &DeviceInfo) -> serde_json::Value {
     json!({
         "name": device.name,
         "kind": device.kind,

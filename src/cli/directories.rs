@@ -15,8 +15,8 @@ pub(super) struct Twins {
     #[arg(long, value_name = "DIR_OR_URL")]
     twins: Option<PathBuf>,
 
-    /// Directory that caches parts of twins from an object store [default: $XDG_CACHE_HOME/wildcity, or
-    /// ~/.cache/wildcity]
+    /// Directory that caches parts of twins from an object store [default:
+    /// $XDG_CACHE_HOME/wildcity, or ~/.cache/wildcity]
     #[arg(long, value_name = "DIR")]
     cache_dir: Option<PathBuf>,
 
@@ -70,8 +70,9 @@ impl Episodes {
 /// `--scenarios`, for the server.
 #[derive(Debug, clap::Args)]
 pub(super) struct Scenarios {
-    /// Directory of the scenarios that sessions can open by name: NAME.json, with the tracks and maps that they
-    /// name [default: $XDG_DATA_HOME/wildcity/scenarios, or ~/.local/share/wildcity/scenarios]
+    /// Directory of the scenarios that sessions can open by name: NAME.json, with the tracks and
+    /// maps that they name [default: $XDG_DATA_HOME/wildcity/scenarios, or
+    /// ~/.local/share/wildcity/scenarios]
     #[arg(long, value_name = "DIR")]
     scenarios: Option<PathBuf>,
 }
@@ -149,8 +150,8 @@ fn state_dir(given: Option<&PathBuf>, name: &str) -> anyhow::Result<PathBuf> {
     }
 }
 
-/// A directory of the XDG base directory specification: from its variable, or below HOME. Written by hand,
-/// because that is shorter than using a crate.
+/// A directory of the XDG base directory specification: from its variable, or below HOME. Written
+/// by hand, because that is shorter than using a crate.
 fn xdg_dir(variable: &str, below_home: &str) -> Option<PathBuf> {
     let set = |name| env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
     set(variable).or_else(|| set("HOME").map(|home| home.join(below_home)))
@@ -167,8 +168,9 @@ pub(super) struct TwinVersion {
 /// The twin that an edit changes.
 #[derive(Debug, clap::Args)]
 pub(super) struct EditedTwin {
-    /// The twin: NAME, or NAME@NUMBER for the version that the edit is made from [default: the latest]. Changes of
-    /// later versions are kept; an edit that would overwrite one of them is refused.
+    /// The twin: NAME, or NAME@NUMBER for the version that the edit is made from [default: the
+    /// latest]. Changes of later versions are kept; an edit that would overwrite one of them is
+    /// refused.
     #[arg(value_name = "TWIN")]
     pub(super) twin: TwinVersion,
 }

@@ -19,13 +19,14 @@ use super::serve::Serve;
 
 /// Check that this machine can run the server: devices, memory, open files, disks, twins, clock.
 ///
-/// Prints one line for each check. A line that starts with `bad` says what to do; then the exit code is 1. `note` is
-/// for information only. Nothing is changed: the check whether a directory can be written creates an unnamed file in it
-/// and removes it.
+/// Prints one line for each check. A line that starts with `bad` says what to do; then the exit
+/// code is 1. `note` is for information only. Nothing is changed: the check whether a directory can
+/// be written creates an unnamed file in it and removes it.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Doctor {
-    /// TOML file of `wildcity serve --config`: also check its address, tokens, certificate, audit log and scenarios.
+    /// TOML file of `wildcity serve --config`: also check its address, tokens, certificate, audit
+    /// log and scenarios.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["twins", "episodes", "uploads"])]
     config: Option<PathBuf>,
 
@@ -53,7 +54,8 @@ Examples:
 const LITTLE_MEMORY_BYTES: u64 = 2 << 30;
 /// Free space below which a push or a day of records may fail.
 const LITTLE_DISK_BYTES: u64 = 5 << 30;
-/// Open files of a full server: 1,024 connections, 512 unauthenticated ones, and the files that it reads.
+/// Open files of a full server: 1,024 connections, 512 unauthenticated ones, and the files that it
+/// reads.
 const FILES: u64 = 4096;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -89,7 +91,7 @@ impl Level {
 
 impl Doctor {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let serve = self.config.as_deref().map(Serve::of_file).transpose()?;
+        let serve = self.config.as_deref().map(Serve::from_file).transpose()?;
         let (twins, episodes, uploads) = match serve.as_ref().map(Serve::directories) {
             Some(all) => (&all.twins, &all.episodes, &all.uploads),
             None => (&self.twins, &self.episodes, &self.uploads),
@@ -131,10 +133,7 @@ fn twins_found(twins: &Twins) -> Vec<Finding> {
         Err(error) => return bad(format!("{error:#}")),
     };
     let is_remote = dir.to_string_lossy().contains("://");
-    let mut findings = match is_remote {
-        true => Vec::new(),
-        false => vec![disk("twins", &dir)],
-    };
+    let mut findings = if is_remote { Vec::new() } else { vec![disk("twins", &dir)] };
     let begun = std::time::Instant::now();
     let listed = twins.catalog().and_then(|catalog| {
         let twins = catalog.twins()?;
@@ -175,9 +174,10 @@ fn devices_found() -> Finding {
             Finding::new(Level::Good, "gpu", text)
         }
         None => {
-            let found = match devices.is_empty() {
-                true => "no Vulkan device",
-                false => "no Vulkan device except software",
+            let found = if devices.is_empty() {
+                "no Vulkan device"
+            } else {
+                "no Vulkan device except software"
             };
             let text = format!(
                 "{found}: the server renders on the CPU. For a GPU install its driver with Vulkan, and in a \
@@ -196,11 +196,10 @@ fn processors() -> Finding {
 fn memory() -> Finding {
     let bytes = default_memory_bytes();
     let text = format!("{:.1} GiB for Gaussians, unless --memory-gib says otherwise", gib(bytes));
-    match bytes >= LITTLE_MEMORY_BYTES {
-        true => Finding::new(Level::Good, "memory", text),
-        false => {
-            Finding::new(Level::Note, "memory", format!("{text}: enough for small twins only"))
-        }
+    if bytes >= LITTLE_MEMORY_BYTES {
+        Finding::new(Level::Good, "memory", text)
+    } else {
+        Finding::new(Level::Note, "memory", format!("{text}: enough for small twins only"))
     }
 }
 
@@ -220,7 +219,8 @@ fn open_files() -> Finding {
     }
 }
 
-/// A clock that is behind the program's own file is wrong: tokens of object stores and certificates need it.
+/// A clock that is behind the program's own file is wrong: tokens of object stores and certificates
+/// need it.
 fn clock() -> Finding {
     let built = std::env::current_exe().and_then(fs::metadata).and_then(|file| file.modified());
     let behind = built.ok().and_then(|built| built.duration_since(SystemTime::now()).ok());

@@ -23,15 +23,18 @@ const LOST_EXIT_CODE: u8 = 69;
 
 /// Drive in a twin of a running server with a driver of AlpaSim.
 ///
-/// The driver is a gRPC server of AlpaSim's service egodriver. In each step of 0.1 s it receives the new images, the
-/// ego's poses and the route, which follows a recorded drive or comes from a scenario. The ego then follows the
-/// driver's plan. Prints one line of JSON for each episode: outcome, steps, distance, and a hash of all frames. The
-/// exit code is 1 if an episode did not complete: a contact ends it as driving_failure. For a single episode it is 124 if the driver did not answer in time,
-/// and 69 if the connection to it was lost. For a server with tokens, set $WILDCITY_TOKEN.
+/// The driver is a gRPC server of AlpaSim's service egodriver. In each step of 0.1 s it receives
+/// the new images, the ego's poses and the route, which follows a recorded drive or comes from a
+/// scenario. The ego then follows the driver's plan. Prints one line of JSON for each episode:
+/// outcome, steps, distance, and a hash of all frames. The exit code is 1 if an episode did not
+/// complete: a contact ends it as driving_failure. For a single episode it is 124 if the driver did
+/// not answer in time, and 69 if the connection to it was lost. For a server with tokens, set
+/// $WILDCITY_TOKEN.
 ///
-/// Without TWIN the command is an agent for `wildcity episode run`, which describes the episode in environment
-/// variables. `--agent egodriver:HOST:PORT` starts it with all cameras of the rig; `--agent 'wildcity drive
-/// --egodriver HOST:PORT --cameras front --size 576x320'` starts it with others.
+/// Without TWIN the command is an agent for `wildcity episode run`, which describes the episode in
+/// environment variables. `--agent egodriver:HOST:PORT` starts it with all cameras of the rig;
+/// `--agent 'wildcity drive --egodriver HOST:PORT --cameras front --size 576x320'` starts it with
+/// others.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Drive {
@@ -83,8 +86,8 @@ pub(super) struct Drive {
     #[arg(long, value_name = "M_S")]
     speed: Option<f64>,
 
-    /// Duration of the recorded drive before the start, in microseconds: Alpamayo's driver needs 1.5 s of poses and
-    /// four frames
+    /// Duration of the recorded drive before the start, in microseconds: Alpamayo's driver needs
+    /// 1.5 s of poses and four frames
     #[arg(long, value_name = "US", default_value_t = 1_700_000)]
     warm_up_us: i64,
 

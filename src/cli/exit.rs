@@ -31,8 +31,8 @@ impl std::fmt::Display for Exit {
 
 impl std::error::Error for Exit {}
 
-/// An error with its causes. A cause whose text the error before it already ends with is not said twice: the `Display`
-/// text of many errors includes that of their source.
+/// An error with its causes. A cause whose text the error before it already ends with is not said
+/// twice: the `Display` text of many errors includes that of their source.
 pub(super) fn chain(error: &anyhow::Error) -> String {
     error.chain().map(ToString::to_string).fold(String::new(), |text, cause| {
         match (text.is_empty(), text.ends_with(&cause)) {

@@ -10,8 +10,8 @@ use super::output::counted;
 /// `--drop-bad`, for every command that reads scene files.
 #[derive(Clone, Copy, Debug, clap::Args)]
 pub(super) struct DropBad {
-    /// Leave out Gaussians that cannot be drawn, such as those with NaN or a quaternion of zeros, and say how many.
-    /// Without this option the file is refused.
+    /// Leave out Gaussians that cannot be drawn, such as those with NaN or a quaternion of zeros,
+    /// and say how many. Without this option the file is refused.
     #[arg(long)]
     pub(super) drop_bad: bool,
 }

@@ -20,22 +20,23 @@ use super::output;
 use super::packed_folder::scene_file;
 use super::profile_options::ProfileOptions;
 use super::progress;
-use super::rig::rig_of;
+use super::rig::find_rig;
 use super::sky_source::SkySource;
 
 /// Make a twin from a trained scene, or a new version of an existing twin.
 ///
-/// The format of SRC is detected from its content, not from its extension; the formats are listed below.
-/// Every Gaussian is checked before anything is written. An import that fails leaves nothing behind.
+/// The format of SRC is detected from its content, not from its extension; the formats are listed
+/// below. Every Gaussian is checked before anything is written. An import that fails leaves nothing
+/// behind.
 ///
-/// A new version of an existing twin has only the Gaussians of SRC. Earlier pushes to the twin remain in its earlier
-/// versions (`wildcity twin log`).
+/// A new version of an existing twin has only the Gaussians of SRC. Earlier pushes to the twin
+/// remain in its earlier versions (`wildcity twin log`).
 ///
-/// Prints how long each phase took: reading and checking the file, sorting Gaussians into cells, packing cells with
-/// their levels of detail, and publishing.
+/// Prints how long each phase took: reading and checking the file, sorting Gaussians into cells,
+/// packing cells with their levels of detail, and publishing.
 ///
-/// Memory: twice the uncompressed scene (56 bytes per Gaussian without SH, 236 with SH degree 3), and in
-/// addition the contents of an archive, a glTF buffer, or a NuRec payload.
+/// Memory: twice the uncompressed scene (56 bytes per Gaussian without SH, 236 with SH degree 3),
+/// and in addition the contents of an archive, a glTF buffer, or a NuRec payload.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Import {
@@ -66,20 +67,21 @@ pub(super) struct Import {
     #[arg(long, default_value_t = 1.0, allow_negative_numbers = true)]
     scale: f64,
 
-    /// The vehicle's cameras: a preset (see `wildcity rig show`) or a JSON file (see below). They become the twin's
-    /// default rig. A version that is imported without this option has no default rig, even if the previous version has
-    /// one.
+    /// The vehicle's cameras: a preset (see `wildcity rig show`) or a JSON file (see below). They
+    /// become the twin's default rig. A version that is imported without this option has no default
+    /// rig, even if the previous version has one.
     #[arg(long, value_name = "RIG")]
     rig: Option<String>,
 
-    /// JSON file of a recorded drive (see below), in the twin's axes and metres. May be given again. A version
-    /// has only the drives that its own import names.
+    /// JSON file of a recorded drive (see below), in the twin's axes and metres. May be given
+    /// again. A version has only the drives that its own import names.
     #[arg(long, value_name = "FILE")]
     trajectory: Vec<PathBuf>,
 
-    /// Where the origin of the twin lies on the earth, so that observations have latitude, longitude and heading:
-    /// LATITUDE,LONGITUDE[,ALTITUDE] in degrees (x is east there, y north), or EPSG:CODE,EASTING,NORTHING[,ALTITUDE]
-    /// for a twin in a UTM zone. Altitudes are above the WGS84 ellipsoid.
+    /// Where the origin of the twin lies on the earth, so that observations have latitude,
+    /// longitude and heading: LATITUDE,LONGITUDE[,ALTITUDE] in degrees (x is east there, y north),
+    /// or EPSG:CODE,EASTING,NORTHING[,ALTITUDE] for a twin in a UTM zone. Altitudes are above the
+    /// WGS84 ellipsoid.
     #[arg(long, value_name = "ANCHOR", allow_hyphen_values = true)]
     geo: Option<GeoAnchor>,
 
@@ -92,8 +94,8 @@ pub(super) struct Import {
     #[command(flatten)]
     bad: DropBad,
 
-    /// Record format in which Gaussians are stored: f32 (exact), h52, q32 or q24. For the last three the
-    /// number is the bytes per Gaussian at SH degree 1, before compression.
+    /// Record format in which Gaussians are stored: f32 (exact), h52, q32 or q24. For the last
+    /// three the number is the bytes per Gaussian at SH degree 1, before compression.
     #[arg(long, value_name = "FORMAT", default_value_t)]
     record: RecordFormat,
 
@@ -153,7 +155,7 @@ impl Import {
         changes.apply(RenderProfile::default())?;
         let given_axes = self.axes.as_deref().unwrap_or("identity");
         let sky = self.sky.read(given_axes)?;
-        let rig = self.rig.as_deref().map(rig_of).transpose()?;
+        let rig = self.rig.as_deref().map(find_rig).transpose()?;
         let trajectories = read_trajectories(&self.trajectory)?;
         let catalog = self.twins.catalog()?;
         let source = scene_file(self.source)?;

@@ -1,14 +1,14 @@
 //! The command line: one file, or one folder, for each subcommand.
 //!
-//! A command reads its options, calls the packages below, and prints. Long work shows a progress bar on
-//! standard error if that is a terminal; results go to standard output. Exit codes: 0 for success, 1 for a
-//! failure, 2 for a command line that cannot be parsed, and for `episode` also for a file that is missing or of another
-//! kind; `episode run` has more, which its help lists.
+//! A command reads its options, calls the packages below, and prints. Long work shows a progress
+//! bar on standard error if that is a terminal; results go to standard output. Exit codes: 0 for
+//! success, 1 for a failure, 2 for a command line that cannot be parsed, and for `episode` also for
+//! a file that is missing or of another kind; `episode run` has more, which its help lists.
 //!
-//! Each package has an error enum. Its `Display` text says everything, down to the text of the operating
-//! system. So an error is printed once, with its causes, and the commands add only the flag or the file that it
-//! belongs to. Numbers from outside are printed with `{:?}`, which writes 1e300 as such and not as 301
-//! digits.
+//! Each package has an error enum. Its `Display` text says everything, down to the text of the
+//! operating system. So an error is printed once, with its causes, and the commands add only the
+//! flag or the file that it belongs to. Numbers from outside are printed with `{:?}`, which writes
+//! 1e300 as such and not as 301 digits.
 
 use std::process::ExitCode;
 
@@ -106,9 +106,9 @@ enum Command {
     Doctor(doctor::Doctor),
 }
 
-/// Parses the command line, runs the command, and returns the exit code: 0 for success, 1 for a failure, and 3
-/// for a recording that is cut (`replay --verify`). A
-/// command line that cannot be parsed ends the process with code 2.
+/// Parses the command line, runs the command, and returns the exit code: 0 for success, 1 for a
+/// failure, and 3 for a recording that is cut (`replay --verify`). A command line that cannot be
+/// parsed ends the process with code 2.
 pub fn main() -> ExitCode {
     let arguments = Arguments::parse();
     let result = match arguments.command {
@@ -144,9 +144,10 @@ pub fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             let exit = error.downcast_ref::<exit::Exit>();
-            match exit.is_some_and(|exit| exit.is_finding) {
-                true => eprintln!("{error}"),
-                false => eprintln!("error: {}", exit::chain(&error)),
+            if exit.is_some_and(|exit| exit.is_finding) {
+                eprintln!("{error}")
+            } else {
+                eprintln!("error: {}", exit::chain(&error))
             }
             exit.map_or(ExitCode::FAILURE, |exit| exit.code.into())
         }
@@ -160,10 +161,10 @@ mod tests {
     use super::*;
 
     /// The commands without subcommands, each with the words that select it.
-    fn leaves_of(command: &clap::Command, path: &str) -> Vec<(String, clap::Command)> {
+    fn leaf_commands(command: &clap::Command, path: &str) -> Vec<(String, clap::Command)> {
         let path = format!("{path}{} ", command.get_name());
         let mut leaves: Vec<_> =
-            command.get_subcommands().flat_map(|sub| leaves_of(sub, &path)).collect();
+            command.get_subcommands().flat_map(|sub| leaf_commands(sub, &path)).collect();
         if leaves.is_empty() {
             leaves.push((path.trim_end().to_owned(), command.clone()));
         }
@@ -171,7 +172,7 @@ mod tests {
     }
 
     fn all_leaves() -> Vec<(String, clap::Command)> {
-        leaves_of(&Arguments::command(), "")
+        leaf_commands(&Arguments::command(), "")
     }
 
     #[test]

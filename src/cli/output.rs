@@ -6,8 +6,8 @@ use std::process;
 
 use anyhow::Context;
 
-/// Writes a file under a temporary name in the same directory, and then renames it. A reader finds the old
-/// file or the new one, even after a full disk.
+/// Writes a file under a temporary name in the same directory, and then renames it. A reader finds
+/// the old file or the new one, even after a full disk.
 pub(super) fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let cannot = || format!("cannot write {}", path.display());
     let name = path.file_name().context("the path has no file name").with_context(cannot)?;
@@ -16,7 +16,8 @@ pub(super) fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let temporary = path.with_file_name(temporary_name);
     let written = fs::write(&temporary, bytes).and_then(|()| fs::rename(&temporary, path));
     if written.is_err() {
-        // The first error is the one to report. A file that cannot be removed was most likely never made.
+        // The first error is the one to report. A file that cannot be removed was most likely never
+        // made.
         let _ = fs::remove_file(&temporary);
     }
     written.with_context(cannot)

@@ -1,4 +1,5 @@
-//! A scene of many files as one archive. A push has at most 256 files, and a streamed SOG has nine for each block.
+//! A scene of many files as one archive. A push has at most 256 files, and a streamed SOG has nine
+//! for each block.
 
 use std::collections::BTreeSet;
 use std::fs::{self, File};
@@ -28,8 +29,9 @@ impl PackedFolder {
     }
 }
 
-/// Packs the SOG in a folder, if `path` is a folder, or the only file of a push and describes a SOG. None for any other
-/// file. The same files give the same bytes, so that an upload continues where it stopped.
+/// Packs the SOG in a folder, if `path` is a folder, or the only file of a push and describes a
+/// SOG. None for any other file. The same files give the same bytes, so that an upload continues
+/// where it stopped.
 ///
 /// # Errors
 /// The folder has no SOG, or a description in it cannot be read; the archive cannot be written.
@@ -85,16 +87,16 @@ fn write(folder: &Path, description: &str) -> anyhow::Result<PackedFolder> {
     Ok(PackedFolder { path, _dir: dir })
 }
 
-/// The description and the files that it names, and those that these name, relative to `folder`, which must be
-/// canonical. Named files that do not exist are left out: a server needs only the finest blocks, and reports missing
-/// files.
+/// The description and the files that it names, and those that these name, relative to `folder`,
+/// which must be canonical. Named files that do not exist are left out: a server needs only the
+/// finest blocks, and reports missing files.
 fn named_files(folder: &Path, description: &str) -> anyhow::Result<BTreeSet<String>> {
     let mut names = BTreeSet::from([description.to_owned()]);
     let mut unread = vec![description.to_owned()];
     while let Some(name) = unread.pop() {
         let json =
             read_whole(&folder.join(&name), SCENE_JSON_BYTES).with_context(|| name.clone())?;
-        let SogFiles { descriptions, images } = SogFiles::of(&json, &name)?;
+        let SogFiles { descriptions, images } = SogFiles::from_json(&json, &name)?;
         for description in descriptions {
             if let Some(path) = existing(folder, &name, &description)?
                 && names.insert(path.clone())
@@ -109,7 +111,8 @@ fn named_files(folder: &Path, description: &str) -> anyhow::Result<BTreeSet<Stri
     Ok(names)
 }
 
-/// The path, relative to `folder`, of a file that a description in it names; `None` if there is no such file.
+/// The path, relative to `folder`, of a file that a description in it names; `None` if there is no
+/// such file.
 fn existing(folder: &Path, description: &str, named: &str) -> anyhow::Result<Option<String>> {
     anyhow::ensure!(
         is_below_folder(named),

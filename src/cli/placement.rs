@@ -9,16 +9,17 @@ use wildcity_twin::store::{Catalog, Version};
 
 use crate::cli::directories::{TwinVersion, Twins};
 
-/// The transform from the axes of a capture to those of its twin: that of the twin's import, or that of the options.
+/// The transform from the axes of a capture to those of its twin: that of the twin's import, or
+/// that of the options.
 #[derive(Debug, clap::Args)]
 pub(super) struct Placement {
-    /// The twin that was trained from the capture: its version records with which axes and scale it was imported, and
-    /// how it was aligned.
+    /// The twin that was trained from the capture: its version records with which axes and scale it
+    /// was imported, and how it was aligned.
     #[arg(long, value_name = "TWIN", conflicts_with_all = ["axes", "scale"])]
     twin: Option<TwinVersion>,
 
-    /// Directions of the capture's axes, in the form of `wildcity import --axes`; without --twin [default:
-    /// y-down-z-forward]
+    /// Directions of the capture's axes, in the form of `wildcity import --axes`; without --twin
+    /// [default: y-down-z-forward]
     #[arg(long, value_name = "AXES", allow_hyphen_values = true)]
     axes: Option<String>,
 
@@ -41,16 +42,16 @@ impl Placement {
             Some(twin) => {
                 let catalog = self.twins.catalog()?;
                 let version = catalog.version(&twin.name, twin.number)?;
-                of_version(&catalog, &version)
+                from_version(&catalog, &version)
             }
         }
     }
 }
 
 /// The change of a version's axes and unit since its capture was imported.
-pub(super) fn of_version(catalog: &Catalog, version: &Version) -> anyhow::Result<Alignment> {
+pub(super) fn from_version(catalog: &Catalog, version: &Version) -> anyhow::Result<Alignment> {
     let about = || format!("twin {} version {}", version.manifest.twin, version.number);
-    let import = import_of(catalog, version).with_context(about)?;
+    let import = original_import(catalog, version).with_context(about)?;
     let aligned = version.manifest.alignment().with_context(about)?;
     import.placed(aligned).with_context(about)
 }
@@ -74,13 +75,14 @@ struct Import {
 /// The import that a version was made from by pushes and edits.
 ///
 /// # Errors
-/// An older version cannot be read; a push of its files had other axes or another scale, so that there are two
-/// captures; or a push lost the alignment of the previous version, as pushes did before versions recorded it.
-fn import_of(catalog: &Catalog, version: &Version) -> anyhow::Result<Import> {
+/// An older version cannot be read; a push of its files had other axes or another scale, so that
+/// there are two captures; or a push lost the alignment of the previous version, as pushes did
+/// before versions recorded it.
+fn original_import(catalog: &Catalog, version: &Version) -> anyhow::Result<Import> {
     let twin = &version.manifest.twin;
     let log = catalog.versions(twin)?;
     let parent_of = |number| log.iter().find(|entry| entry.number == number)?.parent;
-    let import = Import::of(&version.manifest.provenance)?;
+    let import = Import::from_provenance(&version.manifest.provenance)?;
     let remedies = |parent: u64| {
         format!(
             "name an older version; or roll back (`wildcity twin rollback {twin} {parent}`) and push again; or give --axes \
@@ -102,7 +104,7 @@ fn import_of(catalog: &Catalog, version: &Version) -> anyhow::Result<Import> {
             remedies(parent)
         );
         anyhow::ensure!(
-            import == Import::of(&before.manifest.provenance)?,
+            import == Import::from_provenance(&before.manifest.provenance)?,
             "version {number} was pushed with other axes or another scale than version {parent}: {}",
             remedies(parent)
         );
@@ -120,7 +122,7 @@ impl Import {
     }
 
     /// The options that a version records for the files that it was made from.
-    fn of(provenance: &Provenance) -> anyhow::Result<Self> {
+    fn from_provenance(provenance: &Provenance) -> anyhow::Result<Self> {
         let one = |key: &str, default: &'static str| -> anyhow::Result<String> {
             let options = &provenance.options;
             let mut found: Vec<&str> =
@@ -147,12 +149,13 @@ mod tests {
 
     fn provenance(options: &[&str]) -> Provenance {
         let options = options.iter().map(|&option| option.to_owned()).collect();
-        Provenance { options, ..Provenance::of("test".into()) }
+        Provenance { options, ..Provenance::new("test".into()) }
     }
 
     #[test]
     fn a_capture_goes_where_its_twin_went() {
-        let made = Import::of(&provenance(&["axes=y-down-z-forward", "scale=2", "note=one"]));
+        let made =
+            Import::from_provenance(&provenance(&["axes=y-down-z-forward", "scale=2", "note=one"]));
         let aligned = "0,0,3,1,0,0,0,0.5".parse().unwrap();
         let alignment = made.unwrap().placed(Some(aligned)).unwrap();
         // 1 down is -2 m up; 3 more, and half of it.
@@ -162,11 +165,11 @@ mod tests {
 
     #[test]
     fn mirrors_and_different_files_are_refused() {
-        let mirrored = Import::of(&provenance(&["axes=y-up-z-forward"])).unwrap();
+        let mirrored = Import::from_provenance(&provenance(&["axes=y-up-z-forward"])).unwrap();
         let mirrored = mirrored.placed(None).unwrap_err();
         assert!(mirrored.to_string().contains("mirror"), "{mirrored}");
         let several = ["axes=identity", "scale=1", "axes=y-down-z-forward", "scale=1"];
-        let several = Import::of(&provenance(&several)).unwrap_err();
+        let several = Import::from_provenance(&provenance(&several)).unwrap_err();
         assert!(several.to_string().contains("--axes and --scale"), "{several}");
     }
 }

@@ -18,10 +18,10 @@ pub(super) struct ProfileOptions {
 
     /// Change one field of the render profile, for example --set near=0.2; may be given again, and
     /// overrides --profile. Fields: near, far (metres), blur (px²), antialiased (true or false),
-    /// alpha_cap, alpha_cut, stop (0 to 1), tau_px (largest error of a level of detail, in pixels; 0
-    /// draws full detail), reach_m (draw distance in metres, or none), rays (splats, or exact: only
-    /// the reference backend), sky_error (0 evaluates the sky for every pixel; otherwise the largest
-    /// colour error of the map that it is baked into), background (linear red,green,blue).
+    /// alpha_cap, alpha_cut, stop (0 to 1), tau_px (largest error of a level of detail, in pixels;
+    /// 0 draws full detail), reach_m (draw distance in metres, or none), rays (splats, or exact:
+    /// only the reference backend), sky_error (0 evaluates the sky for every pixel; otherwise the
+    /// largest colour error of the map that it is baked into), background (linear red,green,blue).
     #[arg(long = "set", value_name = "FIELD=VALUE")]
     settings: Vec<String>,
 }
@@ -54,8 +54,8 @@ impl LoadedProfile {
     }
 }
 
-/// Reads the file of `--profile`, and checks that its fields exist and fit the default profile. Whether
-/// they fit a twin's profile shows when they are applied to it.
+/// Reads the file of `--profile`, and checks that its fields exist and fit the default profile.
+/// Whether they fit a twin's profile shows when they are applied to it.
 pub(super) fn read_profile(path: &Path) -> anyhow::Result<ProfileOverrides> {
     let text = path.display().to_string();
     anyhow::ensure!(

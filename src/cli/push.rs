@@ -18,13 +18,13 @@ use super::{packed_folder, progress};
 /// Push trained scenes to a server, as a new version of a twin.
 ///
 /// The files become one scene. It replaces the 64 m cells that its Gaussians lie in, all at once.
-/// Running sessions keep their version until they switch to the new one. To continue an upload after a
-/// lost connection, run the same command again.
+/// Running sessions keep their version until they switch to the new one. To continue an upload
+/// after a lost connection, run the same command again.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Push {
-    /// Scene files in the formats that `wildcity import` reads, and the files that they name. For a SOG, only its
-    /// folder is needed, or only its meta.json or lod-meta.json.
+    /// Scene files in the formats that `wildcity import` reads, and the files that they name. For a
+    /// SOG, only its folder is needed, or only its meta.json or lod-meta.json.
     #[arg(value_name = "FILE", required = true)]
     files: Vec<PathBuf>,
 
@@ -35,22 +35,23 @@ pub(super) struct Push {
     #[command(flatten)]
     server: Server,
 
-    /// Directions of the files' axes, as in `wildcity import` [default: those that a file records, or those with which
-    /// the twin was imported; for a new twin identity]
+    /// Directions of the files' axes, as in `wildcity import` [default: those that a file records,
+    /// or those with which the twin was imported; for a new twin identity]
     #[arg(long, value_name = "AXES", allow_hyphen_values = true)]
     axes: Option<String>,
 
-    /// Metres per unit of the files [default: that with which the twin was imported; for a new twin 1]
+    /// Metres per unit of the files [default: that with which the twin was imported; for a new twin
+    /// 1]
     #[arg(long, value_name = "M")]
     scale: Option<f64>,
 
-    /// The frame of the files, after --axes and --scale: `twin`, or `capture` for the axes and the unit with which the
-    /// capture was imported, before `wildcity twin align` [default: twin]
+    /// The frame of the files, after --axes and --scale: `twin`, or `capture` for the axes and the
+    /// unit with which the capture was imported, before `wildcity twin align` [default: twin]
     #[arg(long, value_enum, value_name = "FRAME", hide_possible_values = true)]
     frame: Option<FrameName>,
 
-    /// `all`, or a cell to replace as X,Y; may be given again. Cell (i, j) is centred on (64 i, 64 j) m.
-    /// Gaussians in other cells are left out [default: the cells that the Gaussians lie in]
+    /// `all`, or a cell to replace as X,Y; may be given again. Cell (i, j) is centred on (64 i, 64
+    /// j) m. Gaussians in other cells are left out [default: the cells that the Gaussians lie in]
     #[arg(long, value_name = "CELL", allow_hyphen_values = true)]
     cells: Vec<String>,
 
@@ -75,8 +76,9 @@ pub(super) struct Push {
     #[arg(long)]
     note: Option<String>,
 
-    /// Refuse the push if, at any of four poses along the twin's drives, the PSNR between the images before and after
-    /// the push is lower than this, in dB; or if no Gaussian is visible from any of them.
+    /// Refuse the push if, at any of four poses along the twin's drives, the PSNR between the
+    /// images before and after the push is lower than this, in dB; or if no Gaussian is visible
+    /// from any of them.
     #[arg(long, value_name = "DB")]
     min_psnr_db: Option<f64>,
 
@@ -158,7 +160,8 @@ impl Push {
     ) -> anyhow::Result<Pushed> {
         let files = upload_all(client, &self.files, self.axes.as_deref(), self.scale).await?;
         let asked = NewPush {
-            // One id for this run: if an answer is lost, the client sends the same push again under this id.
+            // One id for this run: if an answer is lost, the client sends the same push again under
+            // this id.
             id: Some(uuid::Uuid::now_v7().as_simple().to_string()),
             files,
             frame: self.frame.map(|frame| match frame {
@@ -187,8 +190,8 @@ impl Push {
     }
 }
 
-/// Uploads files, with progress bars, and returns them in the form of a request. A folder with a SOG becomes one
-/// archive.
+/// Uploads files, with progress bars, and returns them in the form of a request. A folder with a
+/// SOG becomes one archive.
 pub(super) async fn upload_all(
     client: &HttpClient,
     paths: &[PathBuf],
@@ -223,8 +226,9 @@ fn file_name(path: &Path) -> Option<String> {
     path.file_name().and_then(|name| name.to_str()).map(str::to_owned)
 }
 
-/// The path of a file relative to the folder of the first file, which names it so: `textures/paint.png`. `None` if it
-/// is not in a folder below that one; then its own file name is its name.
+/// The path of a file relative to the folder of the first file, which names it so:
+/// `textures/paint.png`. `None` if it is not in a folder below that one; then its own file name is
+/// its name.
 fn name_beside(files: &[PathBuf], path: &Path) -> Option<String> {
     let below = path.strip_prefix(files.first()?.parent()?).ok()?;
     let steps: Option<Vec<&str>> = below.iter().map(|step| step.to_str()).collect();

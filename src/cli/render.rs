@@ -13,9 +13,9 @@ use super::{output, progress};
 
 /// Render a scene file or a twin to images, one for each camera of a list.
 ///
-/// Writes DIR/<name>.<format> for each camera. PNG and JPEG hold colour clamped to [0, 1] and rounded to 8
-/// bits. npy holds float32 [height, width, 4]: linear premultiplied red, green and blue on black, and
-/// opacity.
+/// Writes DIR/<name>.<format> for each camera. PNG and JPEG hold colour clamped to [0, 1] and
+/// rounded to 8 bits. npy holds float32 [height, width, 4]: linear premultiplied red, green and
+/// blue on black, and opacity.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Render {
@@ -59,7 +59,7 @@ impl Render {
         let mut out = io::stdout().lock();
         for shot in &ready.shots {
             let pixels = shot.view.camera.pixels();
-            let scene = ready.scene_of(shot)?;
+            let scene = ready.scene(shot)?;
             let frame = Frame {
                 scene: &scene,
                 profile: &shot.profile,
@@ -114,8 +114,8 @@ impl Format {
     }
 }
 
-/// A file of NumPy's format, version 1.0 (numpy.lib.format): magic, header length, a Python dict padded to
-/// 64 bytes, data.
+/// A file of NumPy's format, version 1.0 (numpy.lib.format): magic, header length, a Python dict
+/// padded to 64 bytes, data.
 fn npy(shape: [u32; 3], values: &[f32]) -> Vec<u8> {
     let [h, w, c] = shape;
     let dict = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({h}, {w}, {c}), }}");

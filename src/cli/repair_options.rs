@@ -1,4 +1,5 @@
-//! `--repair` and related options: the models that repair images, the same on every command that uses them.
+//! `--repair` and related options: the models that repair images, the same on every command that
+//! uses them.
 
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -12,8 +13,9 @@ const THREADS: i64 = wildcity_repair::limits::MAX_THREADS as i64;
 /// The models that repair images.
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct RepairOptions {
-    /// Manifests of models that repair images, separated by commas (docs/repair.md); `wildcity repair check` checks
-    /// one. A model and the runtime are loaded when a session or a record asks for it by name.
+    /// Manifests of models that repair images, separated by commas (docs/repair.md);
+    /// `wildcity repair check` checks one. A model and the runtime are loaded when a session or a
+    /// record asks for it by name.
     #[arg(long, value_name = "FILES")]
     repair: Option<Manifests>,
 
@@ -25,8 +27,8 @@ pub(super) struct RepairOptions {
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=THREADS))]
     repair_threads: u16,
 
-    /// Memory for recorded images that repair models compare with, in MiB. Images that do not fit are read again when
-    /// needed.
+    /// Memory for recorded images that repair models compare with, in MiB. Images that do not fit
+    /// are read again when needed.
     #[arg(long, value_name = "MIB", default_value_t = 512, value_parser = clap::value_parser!(u32).range(1..))]
     views_mib: u32,
 }

@@ -18,8 +18,8 @@ use super::{output, progress};
 
 /// Show a recorded episode, or render it again and compare every image with the recording.
 ///
-/// Without --out and --verify, prints a summary of the recording. With either, renders it again and names
-/// the first step and camera where pixels differ from the recorded ones.
+/// Without --out and --verify, prints a summary of the recording. With either, renders it again and
+/// names the first step and camera where pixels differ from the recorded ones.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Replay {
@@ -27,13 +27,15 @@ pub(super) struct Replay {
     #[arg(value_name = "EPISODE")]
     episode: PathBuf,
 
-    /// Render every frame again. The exit code is 1 if an image, a time, a hash or the summary at the end differs, or
-    /// if there are no frames. It is 3 if everything is as recorded, but the recording was cut: the episode still runs,
-    /// or the server was killed. Without --out, stops at the first difference.
+    /// Render every frame again. The exit code is 1 if an image, a time, a hash or the summary at
+    /// the end differs, or if there are no frames. It is 3 if everything is as recorded, but the
+    /// recording was cut: the episode still runs, or the server was killed. Without --out, stops at
+    /// the first difference.
     #[arg(long)]
     verify: bool,
 
-    /// Write every image as DIR/<frame>_<request>_<camera>.png; the directory is created if it is missing.
+    /// Write every image as DIR/<frame>_<request>_<camera>.png; the directory is created if it is
+    /// missing.
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
 
@@ -70,7 +72,7 @@ impl Replay {
         }
         let cache = Cache::new(self.twins.catalog()?);
         let header = &recording.header;
-        let backend = self.backend.backend_of(&header.backend)?;
+        let backend = self.backend.replay_backend(&header.backend)?;
 
         let bar = progress::count("rendering");
         bar.set_length(recording.frames.iter().map(|frame| frame.images.len() as u64).sum());

@@ -26,32 +26,36 @@ use wildcity_twin::residency::{Cache, Resident};
 use super::backend_options::HardwareOptions;
 use super::directories::{TwinVersion, Twins};
 use super::repair_options::RepairOptions;
-use super::rig::rig_of;
+use super::rig::find_rig;
 use super::stress::{BackendName, candidate};
 use super::{demo, output, progress};
 
-/// Measure the run time and the error of each setting of the renderer, on one twin and this machine.
+/// Measure the run time and the error of each setting of the renderer, on one twin and this
+/// machine.
 ///
-/// Compares backends, levels of detail, record formats, antialiasing, the smallest alpha, the stop transmittance, the
-/// sky map, lenses, image scale and encoding with the f64 reference. Sample points lie on the recorded drive and 1, 3
-/// and 5 m off it, or around a twin without a drive. Windows of each image are compared at full focal length, and whole
-/// steps are timed. Settings that cannot affect this twin are skipped, and the report lists them. The report also has
-/// the trust of images off the drive, the stress table, and the cost of each feature of a scene.
+/// Compares backends, levels of detail, record formats, antialiasing, the smallest alpha, the stop
+/// transmittance, the sky map, lenses, image scale and encoding with the f64 reference. Sample
+/// points lie on the recorded drive and 1, 3 and 5 m off it, or around a twin without a drive.
+/// Windows of each image are compared at full focal length, and whole steps are timed. Settings
+/// that cannot affect this twin are skipped, and the report lists them. The report also has the
+/// trust of images off the drive, the stress table, and the cost of each feature of a scene.
 ///
 /// Writes report.html (a single self-contained file), report.json and report.csv.
 ///
-/// With --at-least-db or --at-most-ms it recommends a setting: selected at some sample points, verified at
-/// the others, and written as profile.json for `wildcity serve --profile`. If no setting can be
-/// recommended, the report says why, and the profile.json of an earlier report is removed. The decibels and
-/// milliseconds of a recommendation apply to images before encoding, because a profile does not choose the
-/// encoding; the report lists the error and the time that each encoding adds.
+/// With --at-least-db or --at-most-ms it recommends a setting: selected at some sample points,
+/// verified at the others, and written as profile.json for `wildcity serve --profile`. If no
+/// setting can be recommended, the report says why, and the profile.json of an earlier report is
+/// removed. The decibels and milliseconds of a recommendation apply to images before encoding,
+/// because a profile does not choose the encoding; the report lists the error and the time that
+/// each encoding adds.
 ///
-/// The reference renders the whole twin at full detail and without a draw distance: it must fit into memory.
+/// The reference renders the whole twin at full detail and without a draw distance: it must fit
+/// into memory.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Command {
-    /// The twin: NAME, or NAME@NUMBER for an older version. `demo` is the demo street in record format f32,
-    /// which is built on first use, so that all record formats can be compared.
+    /// The twin: NAME, or NAME@NUMBER for an older version. `demo` is the demo street in record
+    /// format f32, which is built on first use, so that all record formats can be compared.
     #[arg(value_name = "TWIN", default_value = demo::TWIN)]
     twin: TwinVersion,
 
@@ -62,8 +66,8 @@ pub(super) struct Command {
     #[arg(long, value_name = "DIR", default_value = "wildcity-report")]
     out: PathBuf,
 
-    /// Recommend the fastest setting with at least this PSNR in every camera's window at every sample
-    /// point, in dB, before images are encoded.
+    /// Recommend the fastest setting with at least this PSNR in every camera's window at every
+    /// sample point, in dB, before images are encoded.
     #[arg(long, value_name = "DB", value_parser = at_least_db, allow_negative_numbers = true)]
     at_least_db: Option<Goal>,
 
@@ -73,8 +77,9 @@ pub(super) struct Command {
     #[arg(conflicts_with = "at_least_db")]
     at_most_ms: Option<Goal>,
 
-    /// Stations along the drive, each with a sample point on it and 1, 3 and 5 m off it; a twin without a drive has
-    /// four times as many sample points around it. The reference takes about a second for each sample point and camera.
+    /// Stations along the drive, each with a sample point on it and 1, 3 and 5 m off it; a twin
+    /// without a drive has four times as many sample points around it. The reference takes about a
+    /// second for each sample point and camera.
     #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u32).range(2..=limits::REPORT_STATIONS))]
     stations: u32,
 
@@ -86,8 +91,8 @@ pub(super) struct Command {
     #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
     repeat: u32,
 
-    /// Cameras to use instead of the twin's own: a preset (see `wildcity rig show`), or a JSON file as
-    /// `wildcity import --rig` reads it.
+    /// Cameras to use instead of the twin's own: a preset (see `wildcity rig show`), or a JSON file
+    /// as `wildcity import --rig` reads it.
     #[arg(long, value_name = "RIG")]
     rig: Option<String>,
 
@@ -102,13 +107,15 @@ pub(super) struct Command {
     #[command(flatten)]
     repair: RepairOptions,
 
-    /// Lateral distances from the drive at which --repair is measured, in metres; it is always measured on the drive.
+    /// Lateral distances from the drive at which --repair is measured, in metres; it is always
+    /// measured on the drive.
     #[arg(long, value_name = "M", value_delimiter = ',', default_values_t = [1.0, 3.0, 5.0], value_parser = offset_m)]
     #[arg(requires = "repair", allow_negative_numbers = true)]
     offsets: Vec<f64>,
 
-    /// Twin with the ground truth, for --repair on a twin that was generated with --spoil: NAME, or NAME@NUMBER.
-    /// Without it, there is no ground truth off the drive, and only times and flicker are measured.
+    /// Twin with the ground truth, for --repair on a twin that was generated with --spoil: NAME, or
+    /// NAME@NUMBER. Without it, there is no ground truth off the drive, and only times and flicker
+    /// are measured.
     #[arg(long, value_name = "TWIN", requires = "repair")]
     truth: Option<TwinVersion>,
 
@@ -193,7 +200,8 @@ impl Command {
         }
         let report = self.measure()?;
         self.write(&report)?;
-        // The files are written and contain the reason, but without a recommendation the command has failed.
+        // The files are written and contain the reason, but without a recommendation the command
+        // has failed.
         report.unmet_reason.map_or(Ok(()), |reason| bail!(reason))
     }
 
@@ -360,7 +368,7 @@ impl Command {
 
     /// The rig of `--rig`, the twin's own, or the default preset.
     fn rig(&self, manifest: &Manifest) -> anyhow::Result<Rig> {
-        let named = self.rig.as_deref().map(rig_of).transpose()?;
+        let named = self.rig.as_deref().map(find_rig).transpose()?;
         let own = || manifest.rig.clone();
         let default = || Rig::preset(wildcity_session::limits::RIG);
         named.or_else(own).or_else(default).context("the default rig preset is missing")

@@ -27,9 +27,9 @@ pub(super) struct SceneSource {
     #[arg(value_name = "SCENE")]
     scene: String,
 
-    /// JSON list of cameras, or one camera per line, in the scene's own axes and metres: name, width, height, fx, fy,
-    /// cx, cy (pixels), position (or position_ply), R_world_to_cam (rotation matrix by rows), and optionally near
-    /// (metres).
+    /// JSON list of cameras, or one camera per line, in the scene's own axes and metres: name,
+    /// width, height, fx, fy, cx, cy (pixels), position (or position_ply), R_world_to_cam (rotation
+    /// matrix by rows), and optionally near (metres).
     #[arg(long, value_name = "FILE")]
     cameras: PathBuf,
 
@@ -84,19 +84,19 @@ impl Deref for FrameScene<'_> {
 }
 
 impl Source {
-    /// Reads the scene of `SCENE`, with the profile that belongs to it: the twin's, or for a file the default with what
-    /// the file says.
+    /// Reads the scene of `SCENE`, with the profile that belongs to it: the twin's, or for a file
+    /// the default with what the file says.
     pub(super) fn open(
         scene: &str,
         twins: &Twins,
         DropBad { drop_bad }: DropBad,
     ) -> anyhow::Result<(Self, RenderProfile)> {
         let path = Path::new(scene);
-        // Pipes and devices count as files, so that the reader refuses them by name. A directory does
-        // not: it may have the same name as a twin.
+        // Pipes and devices count as files, so that the reader refuses them by name. A directory
+        // does not: it may have the same name as a twin.
         if path.exists() && !path.is_dir() {
             let bar = progress::bytes("reading");
-            let limits = ReadLimits { drop_bad, ..ReadLimits::of_own_file() };
+            let limits = ReadLimits { drop_bad, ..ReadLimits::for_own_file() };
             let read = ingest::read_limited(path, &limits, &mut progress::show(&bar));
             let read = file_notes::explained(read);
             let ReadScene { gaussians, notes, .. } =
@@ -141,7 +141,7 @@ impl Source {
 
 impl LoadedScene {
     /// The scene of a frame that has one shot.
-    pub(super) fn scene_of(&self, shot: &Shot) -> anyhow::Result<FrameScene<'_>> {
+    pub(super) fn scene(&self, shot: &Shot) -> anyhow::Result<FrameScene<'_>> {
         self.source.scene(&[shot.view], &shot.profile)
     }
 
@@ -166,8 +166,8 @@ impl SceneSource {
     }
 }
 
-/// A shot of a listed camera. Its own `near` overrides the scene's profile; the command line overrides
-/// both.
+/// A shot of a listed camera. Its own `near` overrides the scene's profile; the command line
+/// overrides both.
 fn shot(
     camera: ListedCamera,
     mut profile: RenderProfile,

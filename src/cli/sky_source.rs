@@ -13,19 +13,19 @@ use wildcity_twin::store::SkyBytes;
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct SkySource {
     /// Sky behind the Gaussians: safetensors with the sky of a drivestudio checkpoint
-    /// (sky_head.layers.0.weight, ..); or a PNG or JPEG with a panorama (2:1), a cross (4:3 or 3:4) or a
-    /// strip (6:1 or 1:6) of the six faces of a cube; or a folder with px.png, nx.png, py.png, ny.png,
-    /// pz.png and nz.png.
+    /// (sky_head.layers.0.weight, ..); or a PNG or JPEG with a panorama (2:1), a cross (4:3 or 3:4)
+    /// or a strip (6:1 or 1:6) of the six faces of a cube; or a folder with px.png, nx.png, py.png,
+    /// ny.png, pz.png and nz.png.
     #[arg(long, value_name = "FILE")]
     sky: Option<PathBuf>,
 
-    /// Training image that gives the sky its appearance, by its number, for a sky of a checkpoint [default:
-    /// the mean of all]
+    /// Training image that gives the sky its appearance, by its number, for a sky of a checkpoint
+    /// [default: the mean of all]
     #[arg(long, value_name = "INDEX", requires = "sky")]
     sky_image: Option<u32>,
 
-    /// Axes of the sky, in the form of `wildcity import --axes` [default: --axes for a sky of a checkpoint;
-    /// y-up-z-forward for images, which puts the middle of a panorama to the north]
+    /// Axes of the sky, in the form of `wildcity import --axes` [default: --axes for a sky of a
+    /// checkpoint; y-up-z-forward for images, which puts the middle of a panorama to the north]
     #[arg(long, value_name = "AXES", requires = "sky", allow_hyphen_values = true)]
     sky_axes: Option<String>,
 }

@@ -1,9 +1,9 @@
 //! `wildcity stress`.
 //!
-//! The stress table is part of the program and not of its tests, so that a faulty driver is found on the machine that
-//! has it. The reference is not compared with itself: its images must be finite, and have the values that a case
-//! states. For each check, `tests/stress/mutations.rs` applies a mutation to the cpu backend and to the reference that
-//! the check must detect.
+//! The stress table is part of the program and not of its tests, so that a faulty driver is found
+//! on the machine that has it. The reference is not compared with itself: its images must be
+//! finite, and have the values that a case states. For each check, `tests/stress/mutations.rs`
+//! applies a mutation to the cpu backend and to the reference that the check must detect.
 
 use std::io::{self, Write};
 
@@ -18,10 +18,10 @@ use super::progress;
 
 /// Render extreme scenes on every backend, and compare each with its bound.
 ///
-/// The scenes have needles of 10,000 px, depths from a centimetre to ten kilometres, places 4,500 km from
-/// the origin, NaN, or 70 million sort keys: each has broken a published renderer. Prints one table, and
-/// fails if a bound is exceeded. For a case that cannot run here, the table says why; for a case that
-/// exceeds a limit of the device, it says how much fits.
+/// The scenes have needles of 10,000 px, depths from a centimetre to ten kilometres, places 4,500
+/// km from the origin, NaN, or 70 million sort keys: each has broken a published renderer. Prints
+/// one table, and fails if a bound is exceeded. For a case that cannot run here, the table says
+/// why; for a case that exceeds a limit of the device, it says how much fits.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Stress {
@@ -84,9 +84,10 @@ impl Stress {
         });
         bar.finish_and_clear();
         let mut out = io::stdout().lock();
-        match self.json {
-            true => writeln!(out, "{}", serde_json::to_string(&table)?)?,
-            false => write!(out, "{table}")?,
+        if self.json {
+            writeln!(out, "{}", serde_json::to_string(&table)?)?
+        } else {
+            write!(out, "{table}")?
         }
         let missed = table.count(Verdict::Missed);
         ensure!(missed == 0, "{missed} bounds are missed");

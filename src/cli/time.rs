@@ -2,9 +2,9 @@
 
 /// A time such as `2026-11-21T08:52:20Z`, from microseconds since 1970.
 ///
-/// The algorithm is Hinnant's ("chrono-Compatible Low-Level Date Algorithms"). Years begin in March, so that
-/// the leap day is the last day of a year. Then 400 years (an era) have 146,097 days, and every group of
-/// five months, counted from March, has 153 days.
+/// The algorithm is Hinnant's ("chrono-Compatible Low-Level Date Algorithms"). Years begin in
+/// March, so that the leap day is the last day of a year. Then 400 years (an era) have 146,097
+/// days, and every group of five months, counted from March, has 153 days.
 pub(super) fn utc(time_us: i64) -> String {
     let seconds = time_us.div_euclid(1_000_000);
     let days_since_1970 = seconds.div_euclid(86_400);

@@ -12,8 +12,9 @@ use super::directories::ServerDirectories;
 
 /// Look at a twin in the browser, and drive through it by hand.
 ///
-/// Serves the viewer on a free port of this machine, prints its URL, and opens it in the browser. Drives are
-/// recorded as those of any agent. Ctrl-C ends it. A running `wildcity serve` has the same viewer at its own URL.
+/// Serves the viewer on a free port of this machine, prints its URL, and opens it in the browser.
+/// Drives are recorded as those of any agent. Ctrl-C ends it. A running `wildcity serve` has the
+/// same viewer at its own URL.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct View {
@@ -71,7 +72,8 @@ pub(super) fn serve(config: Config, twin: Option<&str>, open: bool) -> anyhow::R
     served
 }
 
-/// Opens a URL in the user's browser, if there is a screen. The URL has been printed, so a failure is no error.
+/// Opens a URL in the user's browser, if there is a screen. The URL has been printed, so a failure
+/// is no error.
 fn open_browser(url: &str) {
     let opener = match env::consts::OS {
         "macos" => "open",

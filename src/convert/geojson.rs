@@ -75,7 +75,7 @@ pub fn read(bytes: &[u8], origin: Option<[f64; 2]>) -> Result<MapFile, ConvertEr
     let none = Vec::new();
     let features = value["features"].as_array().unwrap_or(&none);
     let origin = origin.map(Origin::at).transpose()?;
-    let mut map = MapFile::of(Vec::new(), Vec::new());
+    let mut map = MapFile::new(Vec::new(), Vec::new());
     let mut nuplan = NuPlan::default();
     for (index, feature) in features.iter().enumerate() {
         let missing = |field: &str| {

@@ -12,24 +12,18 @@ use crate::lines::{ActorsLine, ScenarioLine};
 pub enum What {
     /// Twin, start, dynamics, seed, scenario or rig: the episodes have different setups.
     Setup,
-    /// The agent's command.
     Command,
-    /// The ego's pose.
     Ego,
     /// The pose of an actor.
     Actor,
-    /// The pixels.
     Image,
-    /// One episode ends.
     Length,
 }
 
 /// The first difference of two episodes.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Difference {
-    /// The step.
     pub step: u64,
-    /// Kind of difference.
     pub what: What,
     /// How, in words.
     pub how: String,
@@ -55,8 +49,8 @@ impl std::fmt::Display for Difference {
     }
 }
 
-/// The first step at which the command, the ego, an actor or an image of two episodes differ, tested in this order,
-/// after the setup. `None` if the episodes are equal from start to end.
+/// The first step at which the command, the ego, an actor or an image of two episodes differ,
+/// tested in this order, after the setup. `None` if the episodes are equal from start to end.
 pub fn diff(a: &EpisodeFile, b: &EpisodeFile) -> Option<Difference> {
     if let Some(how) = setup(a, b) {
         return Some(Difference { step: 0, what: What::Setup, how });
@@ -128,7 +122,8 @@ fn json(value: &impl serde::Serialize) -> Value {
     serde_json::to_value(value).unwrap_or_default()
 }
 
-/// The first place at which two values differ, and both values: `at: actors[0].idm.speed 8.0 against 9.0`.
+/// The first place at which two values differ, and both values:
+/// `at: actors[0].idm.speed 8.0 against 9.0`.
 fn value_difference(at: &str, a: &Value, b: &Value) -> Option<String> {
     let (path, a, b) = first_difference(String::new(), a, b)?;
     let text = |value: &Value| match value {

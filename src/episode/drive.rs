@@ -15,8 +15,8 @@ use wildcity_sim::ego::{EgoModel, TimedPose};
 use crate::file::{EpisodeFile, Frame};
 use crate::lines::{ActorsLine, Event, ScenarioLine};
 
-/// The numbers of an episode that scores are made of; `None` if it has no frame, or if a request followed a plan for
-/// several steps: the record has no poses of the steps between.
+/// The numbers of an episode that scores are made of; `None` if it has no frame, or if a request
+/// followed a plan for several steps: the record has no poses of the steps between.
 pub fn drive_record(episode: &EpisodeFile) -> Option<DriveRecord> {
     let frames = episode.driven();
     let poses: Vec<Pose> = frames.iter().filter_map(|frame| frame.poses.last().copied()).collect();
@@ -40,7 +40,8 @@ pub fn drive_record(episode: &EpisodeFile) -> Option<DriveRecord> {
             _ => None,
         })
         .collect();
-    // A record without a scenario does not say whether contact with the twin was looked for; a contact says it.
+    // A record without a scenario does not say whether contact with the twin was looked for; a
+    // contact says it.
     let checks_static =
         scenario.is_some_and(|scenario| scenario.checks_static) || !with_twin.is_empty();
     Some(DriveRecord {
@@ -65,15 +66,16 @@ pub fn drive_record(episode: &EpisodeFile) -> Option<DriveRecord> {
     })
 }
 
-/// When the ego first left the trained area, in microseconds. A record without events has no time of this, so that the
-/// start is returned.
+/// When the ego first left the trained area, in microseconds. A record without events has no time
+/// of this, so that the start is returned.
 pub fn off_model_us(episode: &EpisodeFile) -> Option<i64> {
     let event = episode.events.iter().find(|line| matches!(line.event, Event::OffModel { .. }));
     let at_end = episode.end.as_ref().is_some_and(|end| end.outcome == "off_model");
     event.map(|line| line.time_us).or(at_end.then_some(0))
 }
 
-/// The ego from its poses: velocities and accelerations are differences over two steps, at the ends over one.
+/// The ego from its poses: velocities and accelerations are differences over two steps, at the ends
+/// over one.
 pub(crate) fn ego_samples(poses: &[Pose], step_s: f64) -> Vec<EgoSample> {
     let places: Vec<DVec2> = poses.iter().map(|pose| pose.position_m.truncate()).collect();
     let mut turned = 0.0;
@@ -146,7 +148,8 @@ fn plans(frames: &[&Frame]) -> Vec<Plan> {
 }
 
 fn tracks(scenario: &ScenarioLine, lines: &[ActorsLine], steps: &[u64]) -> Vec<Track> {
-    // If a session returned to an earlier state, and in a warm-up, a step has several lines: use the last one.
+    // If a session returned to an earlier state, and in a warm-up, a step has several lines: use
+    // the last one.
     let of_step: BTreeMap<u64, &ActorsLine> = lines.iter().map(|line| (line.step, line)).collect();
     let mut tracks: Vec<Track> = scenario
         .actors
@@ -166,7 +169,7 @@ fn tracks(scenario: &ScenarioLine, lines: &[ActorsLine], steps: &[u64]) -> Vec<T
                 continue;
             };
             track.samples[k] = Some(TrackSample {
-                footprint: Body::new(&state.world_from_actor, &actor.box_of(), 0.0).footprint,
+                footprint: Body::new(&state.world_from_actor, &actor.actor_box(), 0.0).footprint,
                 velocity_mps: state.velocity_mps.truncate(),
             });
         }

@@ -26,13 +26,11 @@ pub struct Header {
     pub session: String,
     /// Name of the twin.
     pub twin: String,
-    /// Its version.
     pub version: u64,
     /// BLAKE3 of the version's manifest, in hex.
     pub version_hash: String,
     /// Name of the backend.
     pub backend: String,
-    /// The cameras.
     pub rig: RigHead,
     /// Seed of the episode.
     pub seed: u64,
@@ -57,7 +55,6 @@ pub struct RigHead {
 /// A camera by its name.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 pub struct CameraHead {
-    /// Its name.
     pub name: String,
 }
 
@@ -90,7 +87,6 @@ pub struct Frame {
 pub struct EndLine {
     /// Why it ended: `completed`, `off_model`, `agent_error` ..
     pub outcome: String,
-    /// Steps done.
     pub steps: u64,
     /// Simulated time, in microseconds.
     pub time_us: i64,
@@ -106,14 +102,12 @@ pub struct EndLine {
 pub struct Cut {
     /// The line, from 1.
     pub line: usize,
-    /// The error.
     pub reason: String,
 }
 
 /// A recorded episode.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EpisodeFile {
-    /// Its setup.
     pub header: Header,
     /// The scenario, if there was one.
     pub scenario: Option<ScenarioLine>,
@@ -137,31 +131,23 @@ pub enum ReadError {
     /// The file cannot be opened or read.
     #[error("cannot read {}: {cause}", path.display())]
     Io {
-        /// The file.
         path: PathBuf,
         /// The operating system's error.
         cause: io::Error,
     },
     /// The first line is not a header.
     #[error("{}: the first line is no header of an episode: {reason}", path.display())]
-    Header {
-        /// The file.
-        path: PathBuf,
-        /// The error.
-        reason: String,
-    },
+    Header { path: PathBuf, reason: String },
     /// The file is the MCAP export of a record.
     #[error("{} is an MCAP export; only the record is read: {}", path.display(), path.with_extension("jsonl").display())]
-    Mcap {
-        /// The file.
-        path: PathBuf,
-    },
+    Mcap { path: PathBuf },
 }
 
 /// First bytes of every MCAP file; their line break ends the first line.
 const MCAP_MAGIC: &[u8] = b"\x89MCAP0\r\n";
 
-/// A line's kind. It is read before the line, since a tagged enum copies every value of it first: a third of the time.
+/// A line's kind. It is read before the line, since a tagged enum copies every value of it first: a
+/// third of the time.
 #[derive(Deserialize)]
 struct Kind<'a> {
     #[serde(borrow)]
@@ -200,8 +186,8 @@ impl EpisodeFile {
     /// The format that this build reads.
     pub const FORMAT: u32 = 0;
 
-    /// Reads an episode's file. A damaged or incomplete line ends the reading: all lines before it are returned, and
-    /// [`EpisodeFile::cut`] has the place and the reason.
+    /// Reads an episode's file. A damaged or incomplete line ends the reading: all lines before it
+    /// are returned, and [`EpisodeFile::cut`] has the place and the reason.
     ///
     /// # Errors
     /// The file cannot be read, or its first line is not a header.
@@ -283,7 +269,8 @@ impl EpisodeFile {
         self.scenario.as_ref().map_or(0, |scenario| scenario.actors.len())
     }
 
-    /// The rig of an episode's file, with intrinsics and places of the cameras; `None` if the header has only names.
+    /// The rig of an episode's file, with intrinsics and places of the cameras; `None` if the
+    /// header has only names.
     ///
     /// # Errors
     /// The file cannot be read.
@@ -300,8 +287,8 @@ impl EpisodeFile {
         Ok(read.map(|read| read.rig))
     }
 
-    /// The frames that the ego drove: the start and each step, in order. If a session returned to an earlier step, the
-    /// frames after this replace the earlier ones.
+    /// The frames that the ego drove: the start and each step, in order. If a session returned to
+    /// an earlier step, the frames after this replace the earlier ones.
     pub fn driven(&self) -> Vec<&Frame> {
         let moves = |frame: &Frame| frame.request != "observe" && !frame.poses.is_empty();
         let steps = self.frames.iter().map(|frame| moves(frame).then_some(frame.step));
@@ -309,13 +296,14 @@ impl EpisodeFile {
     }
 
     /// The name of the episode: that of its file without the extension.
-    pub fn name_of(path: &Path) -> String {
+    pub fn episode_name(path: &Path) -> String {
         path.file_stem().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
     }
 }
 
-/// Indices of the frames that the ego drove. `steps` are those of all frames, in order; `None` for a frame that did not
-/// move the ego. If a session returned to an earlier step, the frames after this replace the earlier ones.
+/// Indices of the frames that the ego drove. `steps` are those of all frames, in order; `None` for
+/// a frame that did not move the ego. If a session returned to an earlier step, the frames after
+/// this replace the earlier ones.
 pub fn driven_indices(steps: impl IntoIterator<Item = Option<u64>>) -> Vec<usize> {
     let mut driven: Vec<(u64, usize)> = Vec::new();
     for (index, step) in steps.into_iter().enumerate() {
@@ -331,10 +319,7 @@ pub fn driven_indices(steps: impl IntoIterator<Item = Option<u64>>) -> Vec<usize
 /// # Errors
 /// [`ReadError::Mcap`].
 pub fn check_no_mcap(path: &Path, first_line: &[u8]) -> Result<(), ReadError> {
-    match first_line == MCAP_MAGIC {
-        true => Err(ReadError::Mcap { path: path.to_owned() }),
-        false => Ok(()),
-    }
+    if first_line == MCAP_MAGIC { Err(ReadError::Mcap { path: path.to_owned() }) } else { Ok(()) }
 }
 
 /// Reads the first line, with `text` as its buffer.

@@ -1,7 +1,8 @@
 //! Recorded episodes, without renderer and twin: reading, comparing and scoring them.
 //!
-//! The session writes an episode's file while it drives. This package has the lines that a scenario adds to it, and
-//! reads the file afterwards. It accepts fields that later builds add, and reads a truncated file up to its end.
+//! The session writes an episode's file while it drives. This package has the lines that a scenario
+//! adds to it, and reads the file afterwards. It accepts fields that later builds add, and reads a
+//! truncated file up to its end.
 //!
 //! | module | contents |
 //! |---|---|
@@ -28,7 +29,7 @@ mod scenario;
 pub use diff::{Difference, What, diff};
 pub use drive::{drive_record, off_model_us};
 pub use export::{
-    EpisodeExport, ExportError, Exported, ExportedImage, export, export_file, mcap_of,
+    EpisodeExport, ExportError, Exported, ExportedImage, export, export_file, mcap_path,
     remove_leftovers, write_whole,
 };
 pub use file::{
@@ -41,4 +42,4 @@ pub use lines::{
 };
 pub use listing::{Listed, list, read_mcap, read_text, record_bytes};
 pub use outcome::result;
-pub use scenario::{DriveStart, ground_of, pose_at, scenario_line};
+pub use scenario::{DriveStart, ground_surface, pose_at, scenario_line};

@@ -7,7 +7,8 @@
 //! {"kind":"result", ...}    before the end: verdict and scores
 //! ```
 //!
-//! A session without a scenario writes only events: contacts with the twin, and that the ego left the trained area.
+//! A session without a scenario writes only events: contacts with the twin, and that the ego left
+//! the trained area.
 
 use std::collections::BTreeMap;
 
@@ -23,13 +24,11 @@ use wildcity_sim::traffic::{ActorSpec, ActorState, EgoBox};
 /// The scenario that an episode drives.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ScenarioLine {
-    /// Its name.
     pub name: String,
     /// BLAKE3 of the resolved scenario's JSON, in hex: with its seed, the identity of the episode.
     pub hash: String,
     /// The resolved scenario: with the values of the sweep, and the jitter sampled.
     pub scenario: serde_json::Value,
-    /// The ego's size.
     pub ego: EgoLine,
     /// The actors, in order of their index.
     #[serde(default)]
@@ -45,8 +44,8 @@ pub struct ScenarioLine {
     /// The lanes of a map near the route; none without a map.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub lanes: Vec<LaneLine>,
-    /// The road under the lanes for vehicles, each by the points of its middle line; none without a map. The ego stands
-    /// on it where no recorded drive is near.
+    /// The road under the lanes for vehicles, each by the points of its middle line; none without a
+    /// map. The ego stands on it where no recorded drive is near.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub ground: Vec<Vec<GroundPoint>>,
     /// Whether contact with the twin's Gaussians is looked for.
@@ -66,9 +65,7 @@ pub struct EgoLine {
 /// Constant properties of an actor.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ActorLine {
-    /// Its name.
     pub name: String,
-    /// Its kind.
     pub class: ActorClass,
     /// Length, width and height, in metres.
     pub size: [f64; 3],
@@ -77,16 +74,15 @@ pub struct ActorLine {
     pub asset: Option<String>,
 }
 
-/// A point of the recorded drive: time since the episode's start in microseconds, and place in metres.
+/// A point of the recorded drive: time since the episode's start in microseconds, and place in
+/// metres.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RoutePoint(pub i64, pub [f64; 3]);
 
 /// A point of a road: place in metres, and unit normal, which is left out if it is vertical.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct GroundPoint {
-    /// Where it is.
     pub at: [f64; 3],
-    /// The normal.
     #[serde(default = "vertical", skip_serializing_if = "is_vertical")]
     pub up: [f64; 3],
 }
@@ -118,7 +114,6 @@ pub struct LaneLine {
 /// Where the actors are at a step.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ActorsLine {
-    /// Steps done.
     pub step: u64,
     /// Time, in microseconds.
     pub time_us: i64,
@@ -128,8 +123,8 @@ pub struct ActorsLine {
 
 /// An actor at a step: index, pose, velocity in m/s along world axes, yaw rate in rad/s.
 ///
-/// The pose has all digits, since images depend on it. Velocity and yaw rate are f32: half of their digits would be
-/// noise, and they are a third of a record.
+/// The pose has all digits, since images depend on it. Velocity and yaw rate are f32: half of their
+/// digits would be noise, and they are a third of a record.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ActorStateLine(pub u16, pub [f64; 3], pub [f64; 4], pub [f32; 3], pub f32);
 
@@ -140,7 +135,6 @@ pub struct EventLine {
     pub step: u64,
     /// When it happened, in microseconds.
     pub time_us: i64,
-    /// The event.
     #[serde(flatten)]
     pub event: Event,
 }
@@ -160,29 +154,23 @@ pub enum Event {
     },
     /// The trust of an observation fell below its limit.
     OffModel {
-        /// Its mean trust.
         trust: f64,
     },
     /// A trigger of an actor's script fired.
     Triggered {
-        /// The actor.
         actor: u16,
         /// Index of the trigger in its script.
         trigger: u32,
     },
-    /// An actor appeared.
     Appeared {
-        /// The actor.
         actor: u16,
     },
-    /// An actor disappeared.
     Left {
-        /// The actor.
         actor: u16,
     },
-    /// A rule of the scenario ended the episode: `time`, `contact`, `off_route`, `route_done`, `stuck`.
+    /// A rule of the scenario ended the episode: `time`, `contact`, `off_route`, `route_done`,
+    /// `stuck`.
     Ended {
-        /// The rule.
         rule: String,
     },
 }
@@ -247,7 +235,8 @@ pub struct FaultLine {
 }
 
 impl FaultLine {
-    /// The fault in words, with the values of the episode's scores: `contact.pedestrian with walker at 4.615 s`.
+    /// The fault in words, with the values of the episode's scores:
+    /// `contact.pedestrian with walker at 4.615 s`.
     pub fn text(&self, scores: &BTreeMap<String, ScoreLine>) -> String {
         let actor = self.actor.as_ref().map(|actor| format!(" with {actor}")).unwrap_or_default();
         let text = format!("{}{actor} at {:.3} s", self.fault, self.time_us as f64 * 1e-6);
@@ -264,7 +253,6 @@ impl FaultLine {
 /// A score: its value, or null and the reason.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ScoreLine {
-    /// The value.
     pub value: Option<f64>,
     /// Reason for the missing value.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -362,9 +350,10 @@ impl Event {
 }
 
 fn check_index(actor: u16, actors: usize) -> Result<(), String> {
-    match usize::from(actor) < actors {
-        true => Ok(()),
-        false => Err(format!("actor {actor}, but the scenario has {actors} actors")),
+    if usize::from(actor) < actors {
+        Ok(())
+    } else {
+        Err(format!("actor {actor}, but the scenario has {actors} actors"))
     }
 }
 
@@ -385,7 +374,7 @@ impl ActorLine {
     }
 
     /// Its box.
-    pub fn box_of(&self) -> ActorBox {
+    pub fn actor_box(&self) -> ActorBox {
         let [length_m, width_m, height_m] = self.size;
         ActorBox { length_m, width_m, height_m }
     }

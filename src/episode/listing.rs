@@ -5,7 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-use crate::export::mcap_of;
+use crate::export::mcap_path;
 use crate::limits;
 
 /// A file of an episode.
@@ -13,7 +13,6 @@ use crate::limits;
 pub struct Listed {
     /// The name of the episode: `SESSION-NUMBER`.
     pub name: String,
-    /// Its file.
     pub path: PathBuf,
     /// Its size, in bytes.
     pub bytes: u64,
@@ -23,7 +22,8 @@ pub struct Listed {
     pub modified: Option<SystemTime>,
 }
 
-/// The episodes of a directory, newest first, at most [`limits::LISTED`]. A directory that does not exist has none.
+/// The episodes of a directory, newest first, at most [`limits::LISTED`]. A directory that does not
+/// exist has none.
 ///
 /// # Errors
 /// The directory cannot be read.
@@ -45,7 +45,7 @@ pub fn list(dir: &Path) -> io::Result<Vec<Listed>> {
         listed.push(Listed {
             name: name.unwrap_or_default(),
             bytes: metadata.len(),
-            mcap_bytes: fs::metadata(mcap_of(&path))
+            mcap_bytes: fs::metadata(mcap_path(&path))
                 .ok()
                 .filter(fs::Metadata::is_file)
                 .map(|mcap| mcap.len()),
@@ -68,7 +68,7 @@ pub fn record_bytes(record: &Path) -> u64 {
 /// # Errors
 /// There is no such file, or it cannot be read.
 pub fn read_mcap(record: &Path, most: u64) -> io::Result<Option<Vec<u8>>> {
-    let path = mcap_of(record);
+    let path = mcap_path(record);
     let found = fs::symlink_metadata(&path)?;
     if !found.is_file() {
         return Err(io::Error::other("it is not a regular file"));
@@ -76,8 +76,8 @@ pub fn read_mcap(record: &Path, most: u64) -> io::Result<Option<Vec<u8>>> {
     if found.len() > most { Ok(None) } else { fs::read(path).map(Some) }
 }
 
-/// The text of an episode's file; none if it has more than `most` bytes. An incomplete last line, which a session may be
-/// writing, is left out.
+/// The text of an episode's file; none if it has more than `most` bytes. An incomplete last line,
+/// which a session may be writing, is left out.
 ///
 /// # Errors
 /// The file cannot be read.

@@ -7,9 +7,11 @@ use crate::drive::drive_record;
 use crate::file::EpisodeFile;
 use crate::lines::{EpisodeResult, FaultLine, ScoreLine};
 
-/// Judges an episode and scores it. `None` if the record has no frame, or not every step ([`drive_record`]).
+/// Judges an episode and scores it. `None` if the record has no frame, or not every step
+/// ([`drive_record`]).
 ///
-/// The same function serves the end of a session and `wildcity episode score`: it needs only a record.
+/// The same function serves the end of a session and `wildcity episode score`: it needs only a
+/// record.
 pub fn result(episode: &EpisodeFile) -> Option<EpisodeResult> {
     let record = drive_record(episode)?;
     let verdict = own::verdict(&record);

@@ -22,7 +22,7 @@ pub fn scenario_line(
     hash: &str,
     drives: &[Trajectory],
 ) -> ScenarioLine {
-    let start = DriveStart::of(resolved, drives);
+    let start = DriveStart::new(resolved, drives);
     let limit_us = resolved.end.time_us.or(start.as_ref().map(DriveStart::left_us));
     let route = match &start {
         Some(start) => start.route(limit_us),
@@ -55,7 +55,7 @@ fn ground_lines(surface: &LaneSurface) -> Vec<Vec<GroundPoint>> {
 }
 
 /// The road of a line of a scenario; `None` without a map.
-pub fn ground_of(line: &ScenarioLine) -> Option<LaneSurface> {
+pub fn ground_surface(line: &ScenarioLine) -> Option<LaneSurface> {
     let point = |point: &GroundPoint| SurfacePoint {
         position_m: DVec3::from_array(point.at),
         up: DVec3::from_array(point.up),
@@ -67,15 +67,15 @@ pub fn ground_of(line: &ScenarioLine) -> Option<LaneSurface> {
 /// The place on a recorded drive where an episode starts.
 #[derive(Clone, Debug)]
 pub struct DriveStart<'a> {
-    /// The drive.
     pub drive: &'a Trajectory,
     /// Its time at the start of the episode, in microseconds.
     pub start_us: i64,
 }
 
 impl<'a> DriveStart<'a> {
-    /// The drive that an episode starts on; `None` if it starts at a pose, or the twin has no drive.
-    pub fn of(resolved: &Scenario, drives: &'a [Trajectory]) -> Option<Self> {
+    /// The drive that an episode starts on; `None` if it starts at a pose, or the twin has no
+    /// drive.
+    pub fn new(resolved: &Scenario, drives: &'a [Trajectory]) -> Option<Self> {
         let (drive, station_m) = match &resolved.start {
             Some(EgoStart::Pose(_)) => return None,
             Some(EgoStart::Station { trajectory, station_m }) => {

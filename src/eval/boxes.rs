@@ -1,7 +1,7 @@
 //! Boxes around moving objects, from a log's labels, and the pixels that they hide.
 //!
-//! A twin has no moving vehicles and pedestrians, so pixels where a real image shows one do not count. An object that
-//! stands still may be part of the twin, so its pixels count.
+//! A twin has no moving vehicles and pedestrians, so pixels where a real image shows one do not
+//! count. An object that stands still may be part of the twin, so its pixels count.
 
 use std::collections::BTreeMap;
 
@@ -64,13 +64,11 @@ pub enum BoxesError {
     Line {
         /// Number of the line, from 1.
         line: usize,
-        /// The error.
         reason: String,
     },
     /// A track has two boxes at one time.
     #[error("track {track:?} has two boxes at time_us {time_us}; give one")]
     Twice {
-        /// The track.
         track: String,
         /// The time, in microseconds.
         time_us: i64,
@@ -151,7 +149,8 @@ impl Boxes {
         self.tracks.len()
     }
 
-    /// The boxes that move faster than [`MOVES_M_PER_S`] at a time, interpolated between the rows around it.
+    /// The boxes that move faster than [`MOVES_M_PER_S`] at a time, interpolated between the rows
+    /// around it.
     pub fn moving_at(&self, time_us: i64) -> Vec<MovingBox> {
         self.tracks.values().filter_map(|rows| moving_at(rows, time_us)).collect()
     }
@@ -201,8 +200,9 @@ fn between(a: &Row, b: &Row) -> DVec3 {
 }
 
 impl MovingBox {
-    /// The convex hull of its corners on the image of a camera, in pixels, in one sense of rotation; empty if it is not
-    /// in front of the camera. If only a part of an edge is within the camera's field, that part counts.
+    /// The convex hull of its corners on the image of a camera, in pixels, in one sense of
+    /// rotation; empty if it is not in front of the camera. If only a part of an edge is within the
+    /// camera's field, that part counts.
     pub fn hull_px(&self, camera: &Camera, world_from_camera: &Pose) -> Vec<DVec2> {
         let camera_from_box = world_from_camera.inverse() * self.world_from_box;
         let corner = |index: usize| {
@@ -228,7 +228,8 @@ impl MovingBox {
     }
 }
 
-/// The convex hull of points (Andrew's monotone chain), in one sense of rotation, without points on its edges.
+/// The convex hull of points (Andrew's monotone chain), in one sense of rotation, without points on
+/// its edges.
 fn hull(mut points: Vec<DVec2>) -> Vec<DVec2> {
     points.retain(|point| point.is_finite());
     points.sort_by(|a, b| a.x.total_cmp(&b.x).then(a.y.total_cmp(&b.y)));
@@ -254,7 +255,8 @@ fn hull(mut points: Vec<DVec2>) -> Vec<DVec2> {
     lower
 }
 
-/// Clears the pixels of an image whose middle is within `grown_px` of a hull as [`MovingBox::hull_px`] has it.
+/// Clears the pixels of an image whose middle is within `grown_px` of a hull as
+/// [`MovingBox::hull_px`] has it.
 ///
 /// `counts` is `[height, width]`.
 pub fn hide(hull_px: &[DVec2], size_px: [u32; 2], grown_px: f64, counts: &mut [bool]) {

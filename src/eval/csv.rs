@@ -11,8 +11,8 @@ const HEADER: &str = "name,camera,width,height,counted,covered,psnr_db,ssim,ssim
                       lidar_median_m\n";
 
 impl Evaluation {
-    /// The images as CSV: a header, and one line per image. Numbers that are infinite or NaN are the words `inf` and
-    /// `NaN`. Cells of scores that were not requested are empty.
+    /// The images as CSV: a header, and one line per image. Numbers that are infinite or NaN are
+    /// the words `inf` and `NaN`. Cells of scores that were not requested are empty.
     pub fn csv(&self) -> String {
         let lines = self.images.iter().map(line);
         std::iter::once(HEADER.to_owned()).chain(lines).collect()

@@ -17,7 +17,8 @@ pub struct EvaluatedImage {
     pub camera: String,
     /// Width and height, in pixels.
     pub size_px: [u32; 2],
-    /// Share of the pixels with an opacity of at least 1/2: near 0 if the camera looks past the scene.
+    /// Share of the pixels with an opacity of at least 1/2: near 0 if the camera looks past the
+    /// scene.
     pub covered: f64,
     /// The scores of the image as it was rendered.
     #[serde(flatten)]
@@ -37,7 +38,8 @@ pub struct EvaluatedImage {
 }
 
 impl EvaluatedImage {
-    /// The scores of one image. `covered` is the share of its pixels with an opacity of at least 1/2.
+    /// The scores of one image. `covered` is the share of its pixels with an opacity of at least
+    /// 1/2.
     pub fn new(name: String, size_px: [u32; 2], covered: f64, compared: &PairScores) -> Self {
         let camera = name.rsplit_once('/').map_or(String::new(), |(folder, _)| folder.to_owned());
         let rendered = compared.scored();

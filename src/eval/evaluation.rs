@@ -86,7 +86,6 @@ pub struct Subject {
     pub alignment: String,
     /// Every `every`-th image was compared, in the order of their names; 1 for all.
     pub every: usize,
-    /// Backend that rendered.
     pub backend: &'static str,
     /// Profile of the rendering.
     pub profile: RenderProfile,
@@ -111,7 +110,6 @@ pub struct Subject {
 pub struct BoxesSubject {
     /// File of the boxes.
     pub file: String,
-    /// Number of tracks.
     pub tracks: usize,
 }
 
@@ -129,15 +127,15 @@ pub struct LidarSubject {
 /// The model that repaired the images.
 #[derive(Clone, Debug, Serialize)]
 pub struct RepairSubject {
-    /// Its name.
     pub model: String,
-    /// Its version.
     pub version: String,
     /// Hash of everything that its output depends on, except the images.
     pub repair_hash: String,
-    /// Source of its reference images: `recorded`, or `rendered` on the drive; `None` if it needs none.
+    /// Source of its reference images: `recorded`, or `rendered` on the drive; `None` if it needs
+    /// none.
     pub references: Option<&'static str>,
-    /// Number of recorded images that the model did not get as references, because they are compared themselves.
+    /// Number of recorded images that the model did not get as references, because they are
+    /// compared themselves.
     pub left_out: usize,
 }
 
@@ -152,7 +150,8 @@ pub struct Evaluation {
     pub all: Means,
     /// Means of each camera.
     pub cameras: Vec<CameraMeans>,
-    /// Distance of the features of all images from those of the real ones; `None` if there is no network for it.
+    /// Distance of the features of all images from those of the real ones; `None` if there is no
+    /// network for it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub kid: Option<KidScores>,
     /// Off-trajectory views, by their distance; empty if none was requested.
@@ -171,10 +170,10 @@ impl Evaluation {
         }
         let of_camera = |(camera, images): (&str, Vec<&EvaluatedImage>)| CameraMeans {
             camera: camera.to_owned(),
-            means: Means::of(&images),
+            means: Means::from_images(&images),
         };
         let cameras = by_camera.into_iter().map(of_camera).collect();
-        let all = Means::of(&images.iter().collect::<Vec<_>>());
+        let all = Means::from_images(&images.iter().collect::<Vec<_>>());
         let conventions = CONVENTIONS.into_iter().collect();
         Self {
             format: FORMAT,

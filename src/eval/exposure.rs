@@ -1,8 +1,9 @@
 //! The affine change of each colour channel that brings a rendered image closest to the real one.
 //!
-//! A camera chooses its exposure and white balance anew for each image. A scene that was trained with a change for each
-//! image has none for a held-out one, and is then compared after the best change. These numbers are always better, so
-//! report them in addition to the others and not in place of them.
+//! A camera chooses its exposure and white balance anew for each image. A scene that was trained
+//! with a change for each image has none for a held-out one, and is then compared after the best
+//! change. These numbers are always better, so report them in addition to the others and not in
+//! place of them.
 
 use serde::Serialize;
 
@@ -18,8 +19,8 @@ pub struct Exposure {
 }
 
 impl Exposure {
-    /// The least-squares fit over the pixels that count. A channel of one value only is moved, not scaled; without
-    /// pixels nothing changes.
+    /// The least-squares fit over the pixels that count. A channel of one value only is moved, not
+    /// scaled; without pixels nothing changes.
     pub(super) fn fit(pair: &Pair) -> Self {
         let count = pair.counted().count() as f64;
         let mut mean_from = [0.0; 3];

@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use super::kid::KidScores;
-use super::mean::mean_of;
+use super::mean::mean;
 use super::reprojection::Reprojection;
 use wildcity_render::compare::json_numbers::serialize_number;
 
@@ -28,7 +28,8 @@ pub struct ExtrapolatedView {
 pub struct ViewScores {
     /// Error of the view after it is warped back onto the real image.
     pub reprojection: Reprojection,
-    /// [Flicker](wildcity_render::compare::flicker::flicker) against the previous view at the same lateral offset.
+    /// [Flicker](wildcity_render::compare::flicker::flicker) against the previous view at the same
+    /// lateral offset.
     #[serde(serialize_with = "serialize_number")]
     pub flicker: f64,
 }
@@ -38,7 +39,6 @@ pub struct ViewScores {
 pub struct Extrapolation {
     /// Lateral offset from the drive, in metres: positive to the left, negative to the right.
     pub offset_m: f64,
-    /// Mean trust.
     #[serde(serialize_with = "serialize_number")]
     pub trust: f64,
     /// Mean share of pixels with an opacity of at least 1/2.
@@ -52,15 +52,16 @@ pub struct Extrapolation {
     /// Flicker of the repaired views divided by that of the rendered ones.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub flicker_ratio: Option<f64>,
-    /// Distances of the features of the views from those of the real images, as [`Evaluation::kid`] has them.
+    /// Distances of the features of the views from those of the real images, as [`Evaluation::kid`]
+    /// has them.
     ///
     /// [`Evaluation::kid`]: super::Evaluation::kid
     #[serde(skip_serializing_if = "Option::is_none")]
     pub kid: Option<KidScores>,
     /// The views, in the order of the images.
     pub views: Vec<ExtrapolatedView>,
-    /// JPEG files for the page: the real image, the rendered view, and its pixels that were warped back; with a repair
-    /// also the repaired view.
+    /// JPEG files for the page: the real image, the rendered view, and its pixels that were warped
+    /// back; with a repair also the repaired view.
     #[serde(skip)]
     pub pictures: Vec<(&'static str, Vec<u8>)>,
 }
@@ -87,13 +88,13 @@ impl Extrapolation {
     pub fn new(offset_m: f64, views: Vec<ExtrapolatedView>) -> Self {
         let rendered: Vec<ViewScores> = views.iter().map(|view| view.rendered).collect();
         let repaired: Vec<ViewScores> = views.iter().filter_map(|view| view.repaired).collect();
-        let rendered = ViewMeans::of(&rendered);
-        let repaired = (!repaired.is_empty()).then(|| ViewMeans::of(&repaired));
+        let rendered = ViewMeans::from_views(&rendered);
+        let repaired = (!repaired.is_empty()).then(|| ViewMeans::from_views(&repaired));
         let ratio = repaired.map(|repaired| repaired.flicker / rendered.flicker);
         Self {
             offset_m,
-            trust: mean_of(views.iter().map(|view| view.trust)),
-            covered: mean_of(views.iter().map(|view| view.covered)),
+            trust: mean(views.iter().map(|view| view.trust)),
+            covered: mean(views.iter().map(|view| view.covered)),
             rendered,
             repaired,
             flicker_ratio: ratio.filter(|ratio| ratio.is_finite()),
@@ -105,9 +106,9 @@ impl Extrapolation {
 }
 
 impl ViewMeans {
-    fn of(views: &[ViewScores]) -> Self {
+    fn from_views(views: &[ViewScores]) -> Self {
         let mean = |value: &dyn Fn(&ViewScores) -> f64| {
-            mean_of(views.iter().map(value).filter(|value| !value.is_nan()))
+            mean(views.iter().map(value).filter(|value| !value.is_nan()))
         };
         Self {
             reprojection_psnr_db: mean(&|view| view.reprojection.psnr_db),

@@ -1,12 +1,13 @@
 //! KID, the distance of two sets of images by the features that a network computes of them.
 //!
-//! The squared maximum mean discrepancy with the kernel `k(x, y) = (x.y / d + 1)^3`, by its unbiased estimator (Binkowski,
-//! Sutherland, Arbel and Gretton 2018). As the authors do, it is the mean over random subsets of at most 1,000 images of
-//! each set. It needs no minimal number of images, while FID is biased below some thousands.
+//! The squared maximum mean discrepancy with the kernel `k(x, y) = (x.y / d + 1)^3`, by its
+//! unbiased estimator (Binkowski, Sutherland, Arbel and Gretton 2018). As the authors do, it is the
+//! mean over random subsets of at most 1,000 images of each set. It needs no minimal number of
+//! images, while FID is biased below some thousands.
 
 use serde::Serialize;
 
-use super::mean::mean_of;
+use super::mean::mean;
 use wildcity_render::compare::json_numbers::serialize_number;
 
 /// Number of subsets, if the sets are larger than one.
@@ -27,7 +28,6 @@ pub struct Kid {
     /// Standard deviation over the subsets; 0 if there is one.
     #[serde(serialize_with = "serialize_number")]
     pub standard_deviation: f64,
-    /// Number of subsets.
     pub subsets: usize,
     /// Images of each set in a subset.
     pub subset_size: usize,
@@ -63,15 +63,16 @@ impl Kid {
     ///
     /// # Errors
     /// There are too few, or they have different lengths.
-    pub fn of(a: &[Vec<f32>], b: &[Vec<f32>]) -> Result<Self, KidError> {
-        Self::of_subsets(a, b, SUBSETS, SUBSET_SIZE)
+    pub fn compare(a: &[Vec<f32>], b: &[Vec<f32>]) -> Result<Self, KidError> {
+        Self::compare_subsets(a, b, SUBSETS, SUBSET_SIZE)
     }
 
-    /// The distance by another number and size of subsets. If both sets fit into one subset, all images are compared.
+    /// The distance by another number and size of subsets. If both sets fit into one subset, all
+    /// images are compared.
     ///
     /// # Errors
-    /// As [`Kid::of`].
-    pub fn of_subsets(
+    /// As [`Kid::compare`].
+    pub fn compare_subsets(
         a: &[Vec<f32>],
         b: &[Vec<f32>],
         subsets: usize,
@@ -99,8 +100,8 @@ impl Kid {
             let of_b = random.choose(subset_size, b.len());
             values.push(squared_mmd(a, &of_a, b, &of_b));
         }
-        let mean = mean_of(values.iter().copied());
-        let variance = mean_of(values.iter().map(|value| (value - mean).powi(2)));
+        let mean = mean(values.iter().copied());
+        let variance = mean(values.iter().map(|value| (value - mean).powi(2)));
         Ok(Self { mean, standard_deviation: variance.sqrt(), subsets, subset_size, seed: SEED })
     }
 }
@@ -144,7 +145,8 @@ impl SplitMix64 {
         z ^ (z >> 31)
     }
 
-    /// Some of the indices below `of`, without repetition: the first of a shuffle (Fisher and Yates).
+    /// Some of the indices below `of`, without repetition: the first of a shuffle (Fisher and
+    /// Yates).
     fn choose(&mut self, count: usize, of: usize) -> Vec<usize> {
         let mut indices: Vec<usize> = (0..of).collect();
         for at in 0..count {
@@ -171,7 +173,7 @@ mod tests {
         let [a, b] = [vec![vec![1.0], vec![2.0]], vec![vec![0.0], vec![-1.0]]];
         // (1 * 2 + 1)^3 + (0 + 1)^3 - 2 / 4 of (1, 0, 1, -1).
         let between = (1.0 + 0.0 + 1.0 - 1.0) / 2.0;
-        let kid = Kid::of(&a, &b).unwrap();
+        let kid = Kid::compare(&a, &b).unwrap();
         assert!((kid.mean - (27.0 + 1.0 - between)).abs() < 1e-12, "{kid:?}");
         assert_eq!((kid.subsets, kid.subset_size), (1, 2));
     }
@@ -179,21 +181,21 @@ mod tests {
     #[test]
     fn other_images_are_farther_away_and_subsets_agree_with_all() {
         let [a, b, far] = [set(60, 16, 0.0), set(50, 16, 0.01), set(50, 16, 0.5)];
-        let near_kid = Kid::of(&a, &b).unwrap();
-        let far_kid = Kid::of(&a, &far).unwrap();
+        let near_kid = Kid::compare(&a, &b).unwrap();
+        let far_kid = Kid::compare(&a, &far).unwrap();
         assert!(far_kid.mean > near_kid.mean + 0.1, "{near_kid:?} {far_kid:?}");
-        let parts = Kid::of_subsets(&a, &far, 200, 20).unwrap();
+        let parts = Kid::compare_subsets(&a, &far, 200, 20).unwrap();
         assert_eq!((parts.subsets, parts.subset_size), (200, 20));
         assert!(parts.standard_deviation > 0.0);
         let error = parts.standard_deviation / 200.0_f64.sqrt();
         assert!((parts.mean - far_kid.mean).abs() < 5.0 * error, "{parts:?} {far_kid:?}");
-        assert_eq!(parts, Kid::of_subsets(&a, &far, 200, 20).unwrap());
+        assert_eq!(parts, Kid::compare_subsets(&a, &far, 200, 20).unwrap());
     }
 
     #[test]
     fn too_few_images_and_other_lengths_are_refused() {
-        assert_eq!(Kid::of(&set(1, 4, 0.0), &set(5, 4, 0.0)), Err(KidError::Few(1)));
-        assert_eq!(Kid::of(&set(3, 4, 0.0), &set(3, 5, 0.0)), Err(KidError::Lengths(4, 5)));
+        assert_eq!(Kid::compare(&set(1, 4, 0.0), &set(5, 4, 0.0)), Err(KidError::Few(1)));
+        assert_eq!(Kid::compare(&set(3, 4, 0.0), &set(3, 5, 0.0)), Err(KidError::Lengths(4, 5)));
     }
 
     #[test]

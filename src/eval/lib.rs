@@ -1,5 +1,5 @@
-//! Compares rendered images with real images that training did not see (held-out images), and reports the errors as
-//! one HTML page, as JSON and as CSV.
+//! Compares rendered images with real images that training did not see (held-out images), and
+//! reports the errors as one HTML page, as JSON and as CSV.
 //!
 //! ```text
 //! pair            a real image, a rendered one, and the pixels that count
@@ -17,8 +17,9 @@
 //! page            the HTML page
 //! ```
 //!
-//! The measures themselves are in [`wildcity_render::compare`], which the report uses as well. Images are compared in
-//! 8 bits, as agents get them and files store them, so that other programs compute the same numbers from the files.
+//! The measures themselves are in [`wildcity_render::compare`], which the report uses as well.
+//! Images are compared in 8 bits, as agents get them and files store them, so that other programs
+//! compute the same numbers from the files.
 
 mod boxes;
 mod csv;

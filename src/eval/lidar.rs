@@ -1,7 +1,8 @@
 //! Rendered depth against LiDAR.
 //!
-//! A LiDAR turns while the vehicle drives, so each point has its own time, and is transformed into the world with the
-//! vehicle's pose at that time: `p_world = T_ego(t) T_lidar p`. It is then projected into the image.
+//! A LiDAR turns while the vehicle drives, so each point has its own time, and is transformed into
+//! the world with the vehicle's pose at that time: `p_world = T_ego(t) T_lidar p`. It is then
+//! projected into the image.
 
 use std::collections::HashMap;
 
@@ -9,7 +10,7 @@ use glam::{DMat3, DMat4, DQuat, DVec2, DVec3, DVec4};
 use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors};
 use serde::Serialize;
 
-use super::mean::mean_of;
+use super::mean::mean;
 use wildcity_render::compare::json_numbers::serialize_number;
 use wildcity_scene::align::Alignment;
 use wildcity_scene::geometry::{Camera, Pose, PoseError};
@@ -55,7 +56,6 @@ pub enum LidarError {
     /// A tensor has another type or shape.
     #[error("tensor {name:?} is {found}; {must}")]
     Tensor {
-        /// Its name.
         name: &'static str,
         /// Its type and shape.
         found: String,
@@ -66,14 +66,7 @@ pub enum LidarError {
     #[error(
         "{name}[{index}] is no pose: {reason}; give rotation and translation in metres, last row 0 0 0 1"
     )]
-    Pose {
-        /// The tensor.
-        name: &'static str,
-        /// The matrix.
-        index: usize,
-        /// The reason.
-        reason: String,
-    },
+    Pose { name: &'static str, index: usize, reason: String },
     /// Poses are not in order of time.
     #[error("pose_time_us[{0}] is not after the one before it")]
     Time(usize),
@@ -98,9 +91,7 @@ pub struct WorldPoints {
 /// A rendered image that is compared with LiDAR. Maps are `[height, width]`.
 #[derive(Clone, Copy, Debug)]
 pub struct DepthMap<'a> {
-    /// Its camera.
     pub camera: &'a Camera,
-    /// Its pose.
     pub world_from_camera: &'a Pose,
     /// Depth of each pixel, as in [`Camera::depth_m`].
     pub depth_m: &'a [f32],
@@ -115,7 +106,8 @@ pub struct DepthMap<'a> {
 pub struct LidarDepth {
     /// Number of points that were compared.
     pub points: usize,
-    /// Mean absolute difference of the rendered depth to the point's, in metres; NaN without points.
+    /// Mean absolute difference of the rendered depth to the point's, in metres; NaN without
+    /// points.
     #[serde(serialize_with = "serialize_number")]
     pub mean_m: f64,
     /// Median of this difference, in metres.
@@ -132,7 +124,6 @@ pub struct LidarBin {
     pub from_m: f64,
     /// End of the range, exclusive, in metres.
     pub to_m: f64,
-    /// Number of points.
     pub points: usize,
     /// Mean absolute difference, in metres; NaN without points.
     #[serde(serialize_with = "serialize_number")]
@@ -157,8 +148,9 @@ pub struct LidarMeans {
 }
 
 impl LidarPoints {
-    /// Reads a safetensors file: `points_m` `[n, 3]` (f32 or f64), `time_us` `[n]` (i64); and perhaps `rig_from_lidar` `[4, 4]`
-    /// (f64, identity without it), `pose_time_us` `[m]` (i64) and `world_from_rig` `[m, 4, 4]` (f64).
+    /// Reads a safetensors file: `points_m` `[n, 3]` (f32 or f64), `time_us` `[n]` (i64); and
+    /// perhaps `rig_from_lidar` `[4, 4]` (f64, identity without it), `pose_time_us` `[m]` (i64) and
+    /// `world_from_rig` `[m, 4, 4]` (f64).
     ///
     /// # Errors
     /// Names the tensor that is missing or cannot be used. Points that are not finite are left out.
@@ -198,8 +190,8 @@ impl LidarPoints {
         self.points_m.is_empty()
     }
 
-    /// The points in the world. The poses are those of the file, changed by `alignment`, or else `drive`, in the world's
-    /// axes, with times in the same clock as the points'.
+    /// The points in the world. The poses are those of the file, changed by `alignment`, or else
+    /// `drive`, in the world's axes, with times in the same clock as the points'.
     ///
     /// # Errors
     /// [`LidarError::NoPoses`].
@@ -233,7 +225,8 @@ impl LidarPoints {
     }
 }
 
-/// The pose at a time: linear in position, SLERP in rotation; `None` outside of the poses and in a gap.
+/// The pose at a time: linear in position, SLERP in rotation; `None` outside of the poses and in a
+/// gap.
 fn pose_at(poses: &[Keyframe], time_us: i64) -> Option<Pose> {
     let after = poses.partition_point(|key| key.time_us <= time_us);
     let before = &poses[after.checked_sub(1)?];
@@ -251,7 +244,8 @@ fn pose_at(poses: &[Keyframe], time_us: i64) -> Option<Pose> {
     Some(Pose { position_m: a.position_m.lerp(b.position_m, share), rotation })
 }
 
-/// The rotation at a share of the shorter arc between two, by the angle itself also where it is small (Shoemake 1985).
+/// The rotation at a share of the shorter arc between two, by the angle itself also where it is
+/// small (Shoemake 1985).
 fn slerp(a: DQuat, b: DQuat, share: f64) -> DQuat {
     let [a, mut b] = [DVec4::from(a), DVec4::from(b)];
     if a.dot(b) < 0.0 {
@@ -277,7 +271,7 @@ impl WorldPoints {
 
 impl LidarDepth {
     /// Compares rendered depth with points of the world, in metres.
-    pub fn of(points_m: &[DVec3], map: &DepthMap<'_>) -> Self {
+    pub fn compare(points_m: &[DVec3], map: &DepthMap<'_>) -> Self {
         let mut errors: Vec<(f64, f64)> = Vec::new();
         for Seen { at_px, depth_m } in nearest(seen(points_m, map)) {
             let pixel = at_px.y as usize * map.camera.width_px as usize + at_px.x as usize;
@@ -291,19 +285,19 @@ impl LidarDepth {
             let [from_m, to_m] = [BINS_M[at], BINS_M[at + 1]];
             let within = errors.iter().filter(|(depth_m, _)| (from_m..to_m).contains(depth_m));
             let points = within.clone().count();
-            LidarBin { from_m, to_m, points, mean_m: mean_of(within.map(|(_, error_m)| *error_m)) }
+            LidarBin { from_m, to_m, points, mean_m: mean(within.map(|(_, error_m)| *error_m)) }
         };
         let bins = [0, 1, 2].map(bin);
         let mut sorted: Vec<f64> = errors.iter().map(|(_, error_m)| *error_m).collect();
         sorted.sort_by(f64::total_cmp);
-        let mean_m = mean_of(sorted.iter().copied());
+        let mean_m = mean(sorted.iter().copied());
         Self { points: sorted.len(), mean_m, median_m: median(&sorted), bins }
     }
 }
 
 impl LidarMeans {
     /// `None` if there is no image.
-    pub(super) fn of<'a>(images: impl Iterator<Item = &'a LidarDepth>) -> Option<Self> {
+    pub(super) fn from_images<'a>(images: impl Iterator<Item = &'a LidarDepth>) -> Option<Self> {
         let all: Vec<&LidarDepth> = images.collect();
         if all.is_empty() {
             return None;
@@ -320,8 +314,8 @@ impl LidarMeans {
         Some(Self {
             images: seen.len(),
             points: seen.iter().map(|image| image.points).sum(),
-            mean_m: mean_of(seen.iter().map(|image| image.mean_m)),
-            median_m: mean_of(seen.iter().map(|image| image.median_m)),
+            mean_m: mean(seen.iter().map(|image| image.mean_m)),
+            median_m: mean(seen.iter().map(|image| image.median_m)),
             bins: [0, 1, 2].map(bin),
         })
     }
@@ -347,7 +341,8 @@ fn seen(points_m: &[DVec3], map: &DepthMap<'_>) -> Vec<Seen> {
     points_m.iter().filter_map(project).collect()
 }
 
-/// Keeps a point, from the nearest on, if no kept point is within [`SAME_PX`]: it may be hidden behind that one.
+/// Keeps a point, from the nearest on, if no kept point is within [`SAME_PX`]: it may be hidden
+/// behind that one.
 fn nearest(mut seen: Vec<Seen>) -> Vec<Seen> {
     seen.sort_by(|a, b| a.depth_m.total_cmp(&b.depth_m));
     let cell_of = |at_px: DVec2| [at_px.x, at_px.y].map(|at| (at / SAME_PX).floor() as i32);

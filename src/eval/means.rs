@@ -4,14 +4,14 @@ use serde::Serialize;
 
 use super::evaluated_image::EvaluatedImage;
 use super::lidar::LidarMeans;
-use super::mean::mean_of;
+use super::mean::mean;
 use super::scores::{AlignedScores, Scored, Scores, pooled_psnr_db};
 use wildcity_render::compare::json_numbers::serialize_number;
 
-/// Means of the values of some images. Images without a pixel that counts are left out. NaN if no image is left.
+/// Means of the values of some images. Images without a pixel that counts are left out. NaN if no
+/// image is left.
 #[derive(Clone, Debug, Serialize)]
 pub struct Means {
-    /// Number of images.
     pub images: usize,
     /// Means of the images as they were rendered.
     #[serde(flatten)]
@@ -42,7 +42,6 @@ pub struct ScoreMeans {
     /// Mean of [`Scores::ssim_mirrored`].
     #[serde(serialize_with = "serialize_number")]
     pub ssim_mirrored: f64,
-    /// Mean FLIP.
     #[serde(serialize_with = "serialize_number")]
     pub flip: f64,
     /// Mean of [`Scores::lpips`]; `None` if it was not requested.
@@ -64,8 +63,8 @@ pub struct AlignedMeans {
     pub ssim: f64,
 }
 
-/// The change by a repair: the mean after it minus the mean before. Larger is better for PSNR and SSIM, smaller for the
-/// others.
+/// The change by a repair: the mean after it minus the mean before. Larger is better for PSNR and
+/// SSIM, smaller for the others.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Gain {
     /// Change of PSNR, in dB.
@@ -74,7 +73,6 @@ pub struct Gain {
     /// Change of [`Scores::ssim`].
     #[serde(serialize_with = "serialize_number")]
     pub ssim: f64,
-    /// Change of FLIP.
     #[serde(serialize_with = "serialize_number")]
     pub flip: f64,
     /// Change of LPIPS; `None` if it was not requested.
@@ -87,31 +85,30 @@ pub struct Gain {
 pub struct CameraMeans {
     /// Folder of the images' names.
     pub camera: String,
-    /// The means.
     #[serde(flatten)]
     pub means: Means,
 }
 
 impl Means {
-    pub(super) fn of(images: &[&EvaluatedImage]) -> Self {
+    pub(super) fn from_images(images: &[&EvaluatedImage]) -> Self {
         let counted = images.iter().copied().filter(|image| image.rendered.values > 0);
         let counted: Vec<&EvaluatedImage> = counted.collect();
         let rendered: Vec<&Scored> = counted.iter().map(|image| &image.rendered).collect();
         let repaired: Vec<&Scored> =
             counted.iter().filter_map(|image| image.repaired.as_ref()).collect();
-        let rendered = ScoreMeans::of(&rendered);
-        let repaired = (!repaired.is_empty()).then(|| ScoreMeans::of(&repaired));
-        let gain = repaired.as_ref().map(|repaired| Gain::of(&rendered, repaired));
-        let lidar = LidarMeans::of(images.iter().filter_map(|image| image.lidar.as_ref()));
+        let rendered = ScoreMeans::from_scored(&rendered);
+        let repaired = (!repaired.is_empty()).then(|| ScoreMeans::from_scored(&repaired));
+        let gain = repaired.as_ref().map(|repaired| Gain::between(&rendered, repaired));
+        let lidar = LidarMeans::from_images(images.iter().filter_map(|image| image.lidar.as_ref()));
         Self { images: counted.len(), rendered, repaired, gain, lidar }
     }
 }
 
 impl ScoreMeans {
-    fn of(scored: &[&Scored]) -> Self {
+    fn from_scored(scored: &[&Scored]) -> Self {
         let mean = |value: &dyn Fn(&Scores) -> f64| {
             // A mask may leave pixels, but not a whole window.
-            mean_of(scored.iter().map(|scored| value(&scored.scores)).filter(|v| !v.is_nan()))
+            mean(scored.iter().map(|scored| value(&scored.scores)).filter(|v| !v.is_nan()))
         };
         let is_aligned = scored.iter().any(|scored| scored.scores.aligned.is_some());
         let aligned = |value: &dyn Fn(&AlignedScores) -> f64| {
@@ -137,7 +134,7 @@ impl ScoreMeans {
 }
 
 impl Gain {
-    fn of(before: &ScoreMeans, after: &ScoreMeans) -> Self {
+    fn between(before: &ScoreMeans, after: &ScoreMeans) -> Self {
         Self {
             psnr_db: after.psnr_db - before.psnr_db,
             ssim: after.ssim - before.ssim,

@@ -29,7 +29,8 @@ pub enum PairError {
 }
 
 impl Pair {
-    /// Combines two images of one size. `counts` marks the pixels that are compared; all without it.
+    /// Combines two images of one size. `counts` marks the pixels that are compared; all without
+    /// it.
     ///
     /// # Errors
     /// [`PairError::Size`].

@@ -1,8 +1,8 @@
 //! Reprojection: an off-trajectory view, warped back onto the real image that it was moved from.
 //!
-//! Off the trajectory there is no real image. But most surfaces in such a view were seen from the drive, and must have
-//! the same colours. Specular surfaces and errors of the depth make a difference even in a perfect view, so use this
-//! number only to compare methods on the same views.
+//! Off the trajectory there is no real image. But most surfaces in such a view were seen from the
+//! drive, and must have the same colours. Specular surfaces and errors of the depth make a
+//! difference even in a perfect view, so use this number only to compare methods on the same views.
 
 use serde::Serialize;
 
@@ -24,13 +24,13 @@ pub struct Reprojection {
 }
 
 impl Reprojection {
-    /// Compares the view `back` with the real image `truth`. Both are `[height, width, 3]` in 8 bits. `valid` is
-    /// `[height, width]`, above 0 where `back` has a value. `counts` marks the pixels of the real image that count; all
-    /// count without it.
+    /// Compares the view `back` with the real image `truth`. Both are `[height, width, 3]` in 8
+    /// bits. `valid` is `[height, width]`, above 0 where `back` has a value. `counts` marks the
+    /// pixels of the real image that count; all count without it.
     ///
     /// # Errors
     /// [`PairError::Size`].
-    pub fn of(
+    pub fn compare(
         size_px: [u32; 2],
         truth: &[u8],
         back: &[u8],
@@ -41,7 +41,7 @@ impl Reprojection {
             *valid > 0.0 && counts.is_none_or(|counts| counts.get(pixel) == Some(&true))
         });
         let pair = Pair::new(size_px, truth.to_vec(), back.to_vec(), Some(counted.collect()))?;
-        let scores = PairScores::of(&pair, false).scores;
+        let scores = PairScores::compare(&pair, false).scores;
         Ok(Self { psnr_db: scores.psnr_db, flip: scores.flip, share: scores.counted })
     }
 }
@@ -60,12 +60,12 @@ mod tests {
         valid[0] = 0.0;
         let mut counts = [true; 16];
         counts[15] = false;
-        let of = |counts| Reprojection::of([4, 4], &truth, &back, &valid, counts).unwrap();
+        let of = |counts| Reprojection::compare([4, 4], &truth, &back, &valid, counts).unwrap();
         let found = of(Some(&counts[..]));
         assert!((found.psnr_db - 20.0 * 25.5_f64.log10()).abs() < 1e-12, "{found:?}");
         assert_eq!(found.share, 14.0 / 16.0);
         assert!(of(None).psnr_db < found.psnr_db - 3.0, "the last pixel counts then");
-        let error = Reprojection::of([4, 4], &truth, &back, &valid[1..], None).unwrap_err();
+        let error = Reprojection::compare([4, 4], &truth, &back, &valid[1..], None).unwrap_err();
         assert!(error.to_string().starts_with("the mask has 15 values"), "{error}");
     }
 }

@@ -21,7 +21,8 @@ pub struct Scores {
     /// [`Ssim::mirrored`]: all pixels, masked ones too.
     #[serde(serialize_with = "serialize_number")]
     pub ssim_mirrored: f64,
-    /// Mean of LDR-FLIP over the pixels that count. Masked pixels are replaced by the real image before.
+    /// Mean of LDR-FLIP over the pixels that count. Masked pixels are replaced by the real image
+    /// before.
     #[serde(serialize_with = "serialize_number")]
     pub flip: f64,
     /// Distance of the two images by the network that the user gave; `None` without one.
@@ -43,14 +44,12 @@ pub struct AlignedScores {
     /// As [`Scores::ssim`].
     #[serde(serialize_with = "serialize_number")]
     pub ssim: f64,
-    /// The change.
     pub exposure: Exposure,
 }
 
 /// Scores, and what means over the pixels of several images need.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Scored {
-    /// The scores.
     #[serde(flatten)]
     pub scores: Scores,
     /// Sum of the squared errors of all values that count, from 0 to 1 each.
@@ -64,7 +63,6 @@ pub struct Scored {
 /// The scores of a pair, and the other results of its comparison.
 #[derive(Clone, Debug)]
 pub struct PairScores {
-    /// The scores.
     pub scores: Scores,
     /// FLIP of each pixel, from 0 to 1; 0 for pixels that do not count.
     pub error_map: Vec<f32>,
@@ -76,14 +74,14 @@ pub struct PairScores {
 
 impl PairScores {
     /// Compares a pair; with `align` also after the best change of exposure.
-    pub fn of(pair: &Pair, align: bool) -> Self {
+    pub fn compare(pair: &Pair, align: bool) -> Self {
         let squares = pair.counted().map(|(rendered, truth)| {
             [0, 1, 2].map(|c: usize| (rendered[c] - truth[c]).powi(2)).iter().sum::<f64>()
         });
         let (squared_error, values) =
             squares.fold((0.0, 0), |(sum, count), square| (sum + square, count + 3));
         let truth = units(pair.truth());
-        let ssim = Ssim::of(&units(pair.rendered()), &truth, pair.size_px(), pair.counts());
+        let ssim = Ssim::compare(&units(pair.rendered()), &truth, pair.size_px(), pair.counts());
         let error_map = error_map(pair);
         let error_sum: f64 = error_map.iter().map(|&error| f64::from(error)).sum();
         let scores = Scores {
@@ -114,7 +112,8 @@ fn units(rgb8: &[u8]) -> Vec<f64> {
     rgb8.iter().map(|&byte| f64::from(byte) / 255.0).collect()
 }
 
-/// FLIP of each pixel. Where a pixel does not count, both images are the real one, so that it blurs into no other.
+/// FLIP of each pixel. Where a pixel does not count, both images are the real one, so that it blurs
+/// into no other.
 fn error_map(pair: &Pair) -> Vec<f32> {
     let unit = |byte: &u8| f32::from(*byte) / 255.0;
     let truth: Vec<f32> = pair.truth().iter().map(unit).collect();
@@ -146,7 +145,7 @@ fn aligned(pair: &Pair, truth: &[f64]) -> AlignedScores {
         .chunks_exact(3)
         .flat_map(|rgb| exposure.apply([rgb[0], rgb[1], rgb[2]]))
         .collect();
-    let ssim = Ssim::of(&changed, truth, pair.size_px(), pair.counts()).within;
+    let ssim = Ssim::compare(&changed, truth, pair.size_px(), pair.counts()).within;
     AlignedScores { psnr_db, ssim, exposure }
 }
 
@@ -167,7 +166,7 @@ mod tests {
         let (truth, rendered) = images();
         let scores = |counts| {
             let pair = Pair::new([40, 30], truth.clone(), rendered.clone(), counts).unwrap();
-            PairScores::of(&pair, true)
+            PairScores::compare(&pair, true)
         };
         let all = scores(None).scores;
         // Half of the values are off by 20.
@@ -190,7 +189,7 @@ mod tests {
         one[3 * (15 * 40 + 20)] = 255;
         let counts = (0..1200).map(|i| i != 15 * 40 + 20).collect();
         let pair = Pair::new([40, 30], truth.clone(), one, Some(counts)).unwrap();
-        assert_eq!(PairScores::of(&pair, false).scores.ssim, 1.0);
+        assert_eq!(PairScores::compare(&pair, false).scores.ssim, 1.0);
         assert!(nothing.psnr_db.is_nan() && nothing.ssim.is_nan() && nothing.flip.is_nan());
     }
 }

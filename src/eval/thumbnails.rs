@@ -1,4 +1,5 @@
-//! Small pictures of a pair for the page: the real image, the rendered one, and the map of their errors.
+//! Small pictures of a pair for the page: the real image, the rendered one, and the map of their
+//! errors.
 
 use std::io::Cursor;
 
@@ -31,7 +32,7 @@ impl Thumbnails {
     ///
     /// # Errors
     /// The encoder's message.
-    pub fn of(pair: &Pair, error_map: &[f32]) -> Result<Self, String> {
+    pub fn from_pair(pair: &Pair, error_map: &[f32]) -> Result<Self, String> {
         let size_px = pair.size_px();
         let files = [
             jpeg(pair.truth(), size_px)?,
@@ -59,12 +60,11 @@ impl Thumbnails {
 /// The encoder's message.
 pub fn jpeg(rgb8: &[u8], size_px: [u32; 2]) -> Result<Vec<u8>, String> {
     let picture = picture(rgb8.to_vec(), size_px)?;
-    let small = match picture.width() > WIDTH_PX {
-        true => {
-            let height = (picture.height() * WIDTH_PX).div_ceil(picture.width());
-            imageops::resize(&picture, WIDTH_PX, height, FilterType::Triangle)
-        }
-        false => picture,
+    let small = if picture.width() > WIDTH_PX {
+        let height = (picture.height() * WIDTH_PX).div_ceil(picture.width());
+        imageops::resize(&picture, WIDTH_PX, height, FilterType::Triangle)
+    } else {
+        picture
     };
     let mut file = Vec::new();
     let encoder = JpegEncoder::new_with_quality(&mut file, JPEG_QUALITY);
@@ -86,9 +86,8 @@ pub fn error_png(pair: &Pair, error_map: &[f32]) -> Result<Vec<u8>, String> {
 /// Errors from 0 to 1 as colours; grey where pixels do not count.
 fn colors(pair: &Pair, error_map: &[f32]) -> Vec<u8> {
     let last = (HEAT_RGB.len() - 1) as f32;
-    let color = |(pixel, error): (usize, &f32)| match pair.is_counted(pixel) {
-        true => heat_rgb(last * error),
-        false => UNCOUNTED_RGB,
+    let color = |(pixel, error): (usize, &f32)| {
+        if pair.is_counted(pixel) { heat_rgb(last * error) } else { UNCOUNTED_RGB }
     };
     error_map.iter().enumerate().flat_map(color).collect()
 }

@@ -1,8 +1,8 @@
-//! Assets of actors: the street's parked cars in more detail, a truck, a bus, a pedestrian, a cyclist and a crate. Actors
-//! without an asset of their own are drawn as one of them.
+//! Assets of actors: the street's parked cars in more detail, a truck, a bus, a pedestrian, a
+//! cyclist and a crate. Actors without an asset of their own are drawn as one of them.
 //!
-//! They are lit from above ([`Light::overhead`]), since an actor turns and its light does not. Pictures were used to
-//! check that they look right next to the parked cars.
+//! They are lit from above ([`Light::overhead`]), since an actor turns and its light does not.
+//! Pictures were used to check that they look right next to the parked cars.
 
 use glam::DVec3;
 
@@ -23,11 +23,10 @@ const DETAIL: usize = 4;
 pub struct ActorModel {
     /// The name of its asset.
     pub name: &'static str,
-    /// Its kind.
     pub class: ActorClass,
-    /// Its box.
     pub box_: ActorBox,
-    /// Its Gaussians, of SH degree 1, in its own axes: the origin is on the ground, x points forward and z up.
+    /// Its Gaussians, of SH degree 1, in its own axes: the origin is on the ground, x points
+    /// forward and z up.
     pub gaussians: Gaussians,
 }
 
@@ -43,8 +42,8 @@ pub const ACTOR_REVISION: u32 = 3;
 /// Cells along an edge of a truck and a bus: they have four times the surface of a car.
 const LARGE_DETAIL: usize = 2;
 
-/// All models: a red hatchback, a silver sedan, a white van, a truck, a bus, a pedestrian in mid-stride, a cyclist, and a
-/// wooden crate of 1 m.
+/// All models: a red hatchback, a silver sedan, a white van, a truck, a bus, a pedestrian in
+/// mid-stride, a cyclist, and a wooden crate of 1 m.
 pub fn actor_models() -> Vec<ActorModel> {
     let cars = [
         ("hatchback", &HATCHBACK, Paint::matt(0.62, 0.12, 0.11), DETAIL),
@@ -120,7 +119,8 @@ fn paint_crate(painter: &mut Painter) {
     }
 }
 
-/// The Gaussians with centres above the ground. A wheel arch is a whole disc, and a road need not hide its lower part.
+/// The Gaussians with centres above the ground. A wheel arch is a whole disc, and a road need not
+/// hide its lower part.
 fn above_ground(gaussians: &Gaussians) -> Gaussians {
     gaussians.select((0..gaussians.len()).filter(|&i| gaussians.means_m[i][2] >= 0.0))
 }

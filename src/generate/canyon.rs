@@ -1,7 +1,8 @@
-//! A street of any number of Gaussians, for measuring: a road between two facades, closed at its ends.
+//! A street of any number of Gaussians, for measuring: a road between two facades, closed at its
+//! ends.
 //!
-//! More Gaussians are smaller, so that they cover the same surfaces equally densely: a larger number gives
-//! more detail, as in a larger capture.
+//! More Gaussians are smaller, so that they cover the same surfaces equally densely: a larger
+//! number gives more detail, as in a larger capture.
 
 use super::random::Random;
 use wildcity_scene::Gaussians;
@@ -13,9 +14,10 @@ const HEIGHT_M: f64 = 6.0;
 /// Largest distance of a surfel from its surface, to either side, in metres.
 const ROUGH_M: f64 = 0.05;
 
-/// Makes `count` Gaussians of SH degree 1 around the origin, with the road along x at z = 0. Calls `progress`
-/// with the number of Gaussians that are done and the number of all. The same count gives the same Gaussians;
-/// between machines they may differ by rounding, because the logarithm is that of the system.
+/// Makes `count` Gaussians of SH degree 1 around the origin, with the road along x at z = 0. Calls
+/// `progress` with the number of Gaussians that are done and the number of all. The same count
+/// gives the same Gaussians; between machines they may differ by rounding, because the logarithm is
+/// that of the system.
 pub fn canyon(count: usize, progress: &mut dyn FnMut(u64, u64)) -> Gaussians {
     let [half_length, half_width] = HALF_M;
     let areas_m2 =
@@ -33,7 +35,8 @@ pub fn canyon(count: usize, progress: &mut dyn FnMut(u64, u64)) -> Gaussians {
         let (z, off) = (random.range(0.0, HEIGHT_M), random.range(-ROUGH_M, ROUGH_M));
         let side = if random.chance(0.5) { -1.0 } else { 1.0 };
         let at = random.range(0.0, area_m2);
-        // `across` is the axis that is perpendicular to the surface, along which the Gaussian is thin.
+        // `across` is the axis that is perpendicular to the surface, along which the Gaussian is
+        // thin.
         let (mean_m, across, grey) = if at < areas_m2[0] {
             ([x, y, off], 2, 0.25)
         } else if at < areas_m2[0] + areas_m2[1] {

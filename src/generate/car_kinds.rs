@@ -2,8 +2,9 @@
 
 /// Sizes of a kind in metres, and its outline from the tail (x = 0) to the nose (x = 1).
 ///
-/// Every knot is (x, belt, top): the position along the car as a fraction of its length, the height of the
-/// body's side, and the height of the middle line, both in metres. Heights are interpolated linearly.
+/// Every knot is (x, belt, top): the position along the car as a fraction of its length, the height
+/// of the body's side, and the height of the middle line, both in metres. Heights are interpolated
+/// linearly.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Kind {
     pub(super) length_m: f64,

@@ -128,8 +128,9 @@ impl Car {
         }
     }
 
-    /// Break points along the car, in metres from the tail: at every feature, and evenly between. On a car that
-    /// is seen from near by, steep parts have break points in proportion to the length of their slope.
+    /// Break points along the car, in metres from the tail: at every feature, and evenly between.
+    /// On a car that is seen from near by, steep parts have break points in proportion to the
+    /// length of their slope.
     fn lengthwise(&self, painter: &Painter) -> Vec<f64> {
         let kind = self.kind;
         let mut xs = vec![0.0];
@@ -255,7 +256,8 @@ impl Car {
         let nose = x > 0.5;
         let outwards = if nose { 1.0 } else { -1.0 };
         let (half_m, top_m) = (0.97 * self.half_width_m(x), self.kind.belt_m(x) + 0.01);
-        // As seen from outside, u runs to the right: to the car's left for a viewer in front of its nose.
+        // As seen from outside, u runs to the right: to the car's left for a viewer in front of its
+        // nose.
         let ys = painter.graded(-half_m, half_m, 0.10, 0.14);
         let zs = painter.even(SILL_M - 0.02, top_m, 0.08);
         let bulge = |y_m: f64| 0.05 * (1.0 - (y_m / half_m).powi(2));

@@ -1,8 +1,8 @@
 //! A city: streets end to start along one route of any length, made cell by cell.
 //!
-//! The route runs east and bends by up to 47° to both sides, so it never crosses itself. Streets are made from
-//! west to east: a cell is complete once it lies west of all streets that are still to come. Only two or three
-//! streets are in memory at a time, for a route of any length.
+//! The route runs east and bends by up to 47° to both sides, so it never crosses itself. Streets
+//! are made from west to east: a cell is complete once it lies west of all streets that are still
+//! to come. Only two or three streets are in memory at a time, for a route of any length.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -15,7 +15,7 @@ use wildcity_scene::{Gaussians, Trajectory};
 use wildcity_sim::map::MapFile;
 
 use super::light::Light;
-use super::map::{MappedStreet, map_of};
+use super::map::{MappedStreet, build_map};
 use super::random::Random;
 use super::road::LANE_T_M;
 use super::route::{self, BEYOND_M, Bends, Route, Wave};
@@ -23,8 +23,8 @@ use super::street::Plan;
 use super::surface::Painter;
 use super::{CitySettings, GenerateError};
 
-/// Shortest and longest street, except for the last two, in metres: long enough that side streets do not meet
-/// behind the houses where the route bends.
+/// Shortest and longest street, except for the last two, in metres: long enough that side streets
+/// do not meet behind the houses where the route bends.
 const STREET_M: [f64; 2] = [150.0, 220.0];
 /// Extent of a street from its centre line, in metres: the side street's 82, the house at its
 /// end, 13, and eaves.
@@ -43,8 +43,8 @@ pub struct Cell {
     pub gaussians: Gaussians,
 }
 
-/// An iterator over the cells of a city from west to east, each once. The same settings give the same cells on
-/// any number of threads.
+/// An iterator over the cells of a city from west to east, each once. The same settings give the
+/// same cells on any number of threads.
 #[derive(Debug)]
 pub struct City {
     settings: CitySettings,
@@ -73,8 +73,8 @@ pub fn city(settings: &CitySettings) -> Result<City, GenerateError> {
     })
 }
 
-/// The recorded drive through a city, from end to end in the right lane: a keyframe every 0.5 m at a
-/// constant speed.
+/// The recorded drive through a city, from end to end in the right lane: a keyframe every 0.5 m at
+/// a constant speed.
 ///
 /// # Errors
 /// Names the first setting out of range.
@@ -89,7 +89,8 @@ pub fn city_drive(settings: &CitySettings) -> Result<Trajectory, GenerateError> 
     Ok(Trajectory { name: "log".into(), keyframes: route::keyframes(poses, settings.speed_m_s) })
 }
 
-/// The map of a city, from end to end: the lanes of all its streets, linked, with their intersections.
+/// The map of a city, from end to end: the lanes of all its streets, linked, with their
+/// intersections.
 ///
 /// # Errors
 /// Names the first setting out of range.
@@ -105,7 +106,7 @@ pub fn city_map(settings: &CitySettings) -> Result<MapFile, GenerateError> {
         .iter()
         .map(|(route, crossing_m)| MappedStreet { route, crossing_m: *crossing_m })
         .collect();
-    Ok(map_of(&streets))
+    Ok(build_map(&streets))
 }
 
 impl Iterator for City {
@@ -118,8 +119,8 @@ impl Iterator for City {
 }
 
 impl City {
-    /// Paints the next streets, and moves the cells that are complete to the output. Returns whether there was
-    /// a street left.
+    /// Paints the next streets, and moves the cells that are complete to the output. Returns
+    /// whether there was a street left.
     fn paint(&mut self) -> bool {
         let count = rayon::current_num_threads().min(PAINTED_AT_ONCE);
         let first = usize::from(self.painted_any);
@@ -225,8 +226,9 @@ struct Streets {
 impl Streets {
     /// The bends of a city's route, before any street is made.
     ///
-    /// Together with the streets' own 0.30 rad the heading stays within 0.82 rad of east; the curvature
-    /// within `2π (0.30 / 260 + 0.40 / 3100 + 0.12 / 1100)` = 0.0088 1/m, a radius of 114 m.
+    /// Together with the streets' own 0.30 rad the heading stays within 0.82 rad of east; the
+    /// curvature within `2π (0.30 / 260 + 0.40 / 3100 + 0.12 / 1100)` = 0.0088 1/m, a radius of 114
+    /// m.
     fn new(settings: &CitySettings) -> Self {
         let mut random = Random::new(settings.seed, "bends", 0);
         let wide = [(0.40, 3100.0), (0.12, 1100.0)].map(|(swing_rad, period_m)| {

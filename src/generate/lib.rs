@@ -2,11 +2,11 @@
 //!
 //! Surfaces are tiled with flat Gaussians (`surface.rs`) whose colours carry the light of one sun
 //! (`light.rs`). World: ENU in metres, z up, the road at z = 0, the street running east from the
-//! origin. The same settings give the same bytes: nothing depends on a clock or on the order of threads, and
-//! each object has its own stream of random numbers (`random.rs`).
+//! origin. The same settings give the same bytes: nothing depends on a clock or on the order of
+//! threads, and each object has its own stream of random numbers (`random.rs`).
 //!
-//! The 439,000 Gaussians of the default settings, and their spacing at a [`StreetSettings::density`] of 1 (at
-//! the default of 0.8, spacings are 12 % wider):
+//! The 439,000 Gaussians of the default settings, and their spacing at a
+//! [`StreetSettings::density`] of 1 (at the default of 0.8, spacings are 12 % wider):
 //!
 //! | what | thousands | spacing |
 //! |---|---|---|
@@ -53,8 +53,8 @@ use wildcity_sim::map::MapFile;
 /// Counts the generator's changes: a demo twin of another revision is built again.
 pub const REVISION: u32 = 3;
 
-/// The sky over the streets, as safetensors: a clear day with the sun where their light comes from. Made
-/// by `scenes/sky.py`; world axes.
+/// The sky over the streets, as safetensors: a clear day with the sun where their light comes from.
+/// Made by `scenes/sky.py`; world axes.
 pub const SKY: &[u8] = include_bytes!("../../scenes/sky.safetensors");
 
 /// The settings of a street.
@@ -65,10 +65,11 @@ pub struct StreetSettings {
     pub seed: u64,
     /// Length of the street that is driven, in metres: 100 to 1,000.
     pub length_m: f64,
-    /// Station at which a side street crosses, in metres from the start: at least 40 from both ends.
+    /// Station at which a side street crosses, in metres from the start: at least 40 from both
+    /// ends.
     pub crossing_m: f64,
-    /// Number of Gaussians as a multiple of that at the spacings in the source, 0.1 to 4. Spacings are divided by
-    /// its square root.
+    /// Number of Gaussians as a multiple of that at the spacings in the source, 0.1 to 4. Spacings
+    /// are divided by its square root.
     pub density: f64,
 }
 
@@ -102,9 +103,7 @@ pub enum GenerateError {
     /// A setting is out of range.
     #[error("setting {field} is {value:?}; {must}")]
     Setting {
-        /// The setting.
         field: &'static str,
-        /// The refused value.
         value: f64,
         /// The values that are accepted.
         must: &'static str,
@@ -127,7 +126,7 @@ pub fn street(settings: &StreetSettings) -> Result<Street, GenerateError> {
 pub fn street_map(settings: &StreetSettings) -> Result<MapFile, GenerateError> {
     settings.check()?;
     let route = route::Route::new(settings.length_m);
-    Ok(map::map_of(&[map::MappedStreet { route: &route, crossing_m: settings.crossing_m }]))
+    Ok(map::build_map(&[map::MappedStreet { route: &route, crossing_m: settings.crossing_m }]))
 }
 
 impl Default for StreetSettings {
@@ -196,8 +195,8 @@ impl CitySettings {
 
     /// The [`StreetSettings::density`] that gives this number of Gaussians.
     fn spacing_density(&self) -> f64 {
-        // Pairs of (counted millions of Gaussians per km, density). They are not proportional, because the numbers
-        // of leaves and windows do not depend on the density.
+        // Pairs of (counted millions of Gaussians per km, density). They are not proportional,
+        // because the numbers of leaves and windows do not depend on the density.
         let counted = [(0.826, 0.432), (2.200, 2.0), (4.419, 5.0), (9.261, 12.0)];
         let above = counted.iter().rposition(|(millions, _)| *millions <= self.millions_per_km);
         let from = above.unwrap_or(0).min(counted.len() - 2);

@@ -42,8 +42,8 @@ pub(super) enum Occluder {
 
 /// The sun, the sky, and the objects that cast shadows.
 ///
-/// Occluders are stored in a grid by the area of their shadow on the plane z = 0, so that a point is tested only
-/// against those whose shadow can reach it.
+/// Occluders are stored in a grid by the area of their shadow on the plane z = 0, so that a point
+/// is tested only against those whose shadow can reach it.
 #[derive(Clone, Debug)]
 pub(super) struct Light {
     /// Whether the sun stands in the zenith: for objects that will turn.
@@ -69,13 +69,13 @@ impl Light {
                 cells: Vec::new(),
             };
         }
-        let first_cell = cell_of(low_m);
-        let last_cell = cell_of(high_m);
+        let first_cell = cell_index(low_m);
+        let last_cell = cell_index(high_m);
         let columns = (last_cell[0] - first_cell[0] + 1) as usize;
         let rows = (last_cell[1] - first_cell[1] + 1) as usize;
         let mut cells = vec![Vec::new(); columns * rows];
         for (index, [low_m, high_m]) in reaches.into_iter().enumerate() {
-            let (low, high) = (cell_of(low_m), cell_of(high_m));
+            let (low, high) = (cell_index(low_m), cell_index(high_m));
             for row in low[1]..=high[1] {
                 for column in low[0]..=high[0] {
                     let (row, column) = (row - first_cell[1], column - first_cell[0]);
@@ -86,8 +86,8 @@ impl Light {
         Self { overhead: false, occluders, first_cell, columns, cells }
     }
 
-    /// Light for objects that will turn: half of the sun from the zenith, and more of the sky, so that it fits every
-    /// heading.
+    /// Light for objects that will turn: half of the sun from the zenith, and more of the sky, so
+    /// that it fits every heading.
     pub(super) fn overhead() -> Self {
         Self { overhead: true, ..Self::new(Vec::new()) }
     }
@@ -107,7 +107,7 @@ impl Light {
     /// Share of the sunlight that reaches a point through all occluders, 0 to 1.
     fn sun_at(&self, point_m: DVec3) -> f64 {
         let shadow_m = on_ground(point_m);
-        let cell = cell_of(shadow_m);
+        let cell = cell_index(shadow_m);
         let (column, row) = (cell[0] - self.first_cell[0], cell[1] - self.first_cell[1]);
         if column < 0 || row < 0 || column >= self.columns as i64 {
             return 1.0;
@@ -182,7 +182,7 @@ fn shadow_box_m(occluder: &Occluder) -> [DVec2; 2] {
     [ends_m[0].min(ends_m[1]) - radius_m, ends_m[0].max(ends_m[1]) + radius_m]
 }
 
-fn cell_of(point_m: DVec2) -> [i64; 2] {
+fn cell_index(point_m: DVec2) -> [i64; 2] {
     [(point_m.x / CELL_M).floor() as i64, (point_m.y / CELL_M).floor() as i64]
 }
 

@@ -1,5 +1,5 @@
-//! The map of a street or a city: lanes, parking bays, pavements, crosswalks and intersections, from the same plan as
-//! the Gaussians.
+//! The map of a street or a city: lanes, parking bays, pavements, crosswalks and intersections,
+//! from the same plan as the Gaussians.
 
 use glam::DVec3;
 
@@ -60,8 +60,8 @@ pub(super) struct MappedStreet<'a> {
 }
 
 /// The map of streets that follow each other.
-pub(super) fn map_of(streets: &[MappedStreet<'_>]) -> MapFile {
-    let mut map = MapFile::of(Vec::new(), Vec::new());
+pub(super) fn build_map(streets: &[MappedStreet<'_>]) -> MapFile {
+    let mut map = MapFile::new(Vec::new(), Vec::new());
     for (index, street) in streets.iter().enumerate() {
         let is_last = index + 1 == streets.len();
         for strip in &STRIPS {
@@ -73,7 +73,8 @@ pub(super) fn map_of(streets: &[MappedStreet<'_>]) -> MapFile {
 }
 
 impl MappedStreet<'_> {
-    /// Adds a strip to both sides. Lanes for vehicles are cut at the intersection; other strips leave it out.
+    /// Adds a strip to both sides. Lanes for vehicles are cut at the intersection; other strips
+    /// leave it out.
     fn add_strip(&self, map: &mut MapFile, index: usize, is_last: bool, strip: &Strip) {
         let [from_m, to_m] = self.route.driven_m;
         let [before_m, after_m] = [self.crossing_m - STOP_M[1], self.crossing_m + STOP_M[1]];

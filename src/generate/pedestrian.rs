@@ -7,7 +7,8 @@ use super::surface::{Paint, Painter};
 /// Edge of a cell, in metres.
 const CELL_M: f64 = 0.016;
 
-/// A ring of a tube: where its middle is, and its half width (along y) and half depth (along x), in metres.
+/// A ring of a tube: where its middle is, and its half width (along y) and half depth (along x), in
+/// metres.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Ring {
     center_m: DVec3,
@@ -165,7 +166,8 @@ fn head(painter: &mut Painter) {
 
 /// Covers a tube through rings, from one end to the other.
 ///
-/// Rings lie in planes of constant arc length: across the tube's own direction in the plane of x and z, and along y.
+/// Rings lie in planes of constant arc length: across the tube's own direction in the plane of x
+/// and z, and along y.
 pub(super) fn tube(painter: &mut Painter, rings: &[Ring], paint: impl Fn(DVec3) -> Paint) {
     // Break points along the tube, by index of the ring.
     let mut along = vec![0.0];

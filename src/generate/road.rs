@@ -41,8 +41,8 @@ const STRIPE_M: f64 = 0.48;
 /// Pavement slabs are squares of this side, in metres.
 const SLAB_M: f64 = 0.90;
 
-/// Paints all ground along the street; `cross_s_m` is the middle of the crossing. `seed` is that of the
-/// surface grain, `covers_seed` that of the manhole covers.
+/// Paints all ground along the street; `cross_s_m` is the middle of the crossing. `seed` is that of
+/// the surface grain, `covers_seed` that of the manhole covers.
 pub(super) fn paint(
     painter: &mut Painter,
     route: &Route,

@@ -23,8 +23,8 @@ const SLACK_M: f64 = 40.0;
 const NODE_M: f64 = 0.25;
 /// Largest angle between the street and east, to both sides, in radians (17°).
 const SWING_RAD: f64 = 0.30;
-/// Period of the street's bends, in metres: the smallest radius is `260 / (2π 0.30)` = 138 m, which hides both
-/// ends of the street from nearly every point of it.
+/// Period of the street's bends, in metres: the smallest radius is `260 / (2π 0.30)` = 138 m, which
+/// hides both ends of the street from nearly every point of it.
 const SWING_PERIOD_M: f64 = 260.0;
 
 /// A street of constant width in the plane z = 0, by arc length `s` in metres.
@@ -41,8 +41,8 @@ pub(super) struct Route {
     nodes_m: Vec<DVec3>,
 }
 
-/// The bends of a street. Its heading from east is `0.30 sin(2π s / 260)` rad plus the additional waves; its
-/// position is the integral.
+/// The bends of a street. Its heading from east is `0.30 sin(2π s / 260)` rad plus the additional
+/// waves; its position is the integral.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Bends {
     /// Additional waves of the heading.
@@ -86,8 +86,8 @@ impl Route {
         Self { driven_m: [0.0, length_m], closed: [true; 2], ..line }
     }
 
-    /// The centre line from station to station, both multiples of 0.25 m, all of it driven and open at
-    /// both ends; at station `at_s_m`, a multiple too, it passes `at_m`.
+    /// The centre line from station to station, both multiples of 0.25 m, all of it driven and open
+    /// at both ends; at station `at_s_m`, a multiple too, it passes `at_m`.
     pub(super) fn line(bends: Bends, ends_m: [f64; 2], at_s_m: f64, at_m: DVec3) -> Self {
         // Midpoint rule; one segment of slack on either side for `at` beyond the ends.
         let first_s_m = ends_m[0] - SLACK_M;
@@ -140,16 +140,16 @@ impl Route {
         (s_m, (point_m - self.at(s_m).point_m).dot(self.at(s_m).left))
     }
 
-    /// Drives the lane `t_m` to the left of the centre line at 10 m/s, from 8 m after the start to as
-    /// far before the end.
+    /// Drives the lane `t_m` to the left of the centre line at 10 m/s, from 8 m after the start to
+    /// as far before the end.
     pub(super) fn drive(&self, name: &str, t_m: f64) -> Trajectory {
         let mut station_m = self.driven_m[0] + INDENT_M;
         let poses = self.poses(t_m, &mut station_m, self.driven_m[1] - INDENT_M);
         Trajectory { name: name.into(), keyframes: keyframes(poses, SPEED_M_S) }
     }
 
-    /// Poses every 0.5 m along the lane `t_m` to the left of the centre line, from one station to another,
-    /// both in metres. Sets `station_m` to the station of the pose after the last.
+    /// Poses every 0.5 m along the lane `t_m` to the left of the centre line, from one station to
+    /// another, both in metres. Sets `station_m` to the station of the pose after the last.
     pub(super) fn poses(&self, t_m: f64, station_m: &mut f64, to_s_m: f64) -> Vec<Pose> {
         let mut poses = Vec::new();
         while *station_m <= to_s_m {

@@ -1,10 +1,12 @@
-//! Synthetic reconstruction errors, like those of captures: small on the recorded drive, large off the trajectory.
+//! Synthetic reconstruction errors, like those of captures: small on the recorded drive, large off
+//! the trajectory.
 //!
-//! A capture is trained on images from one line, the drive. Training cannot determine what those images do not
-//! constrain. Consider the plane through a Gaussian and the segment of the drive from which the cameras saw it: all
-//! viewing rays lie in this plane. So the images do not constrain how the colour changes along the plane's normal, and
-//! they do not show a thin sheet in this plane, which they see edge-on. They constrain positions along the rays better,
-//! so displacements are a small part of the damage.
+//! A capture is trained on images from one line, the drive. Training cannot determine what those
+//! images do not constrain. Consider the plane through a Gaussian and the segment of the drive from
+//! which the cameras saw it: all viewing rays lie in this plane. So the images do not constrain how
+//! the colour changes along the plane's normal, and they do not show a thin sheet in this plane,
+//! which they see edge-on. They constrain positions along the rays better, so displacements are a
+//! small part of the damage.
 
 use std::ops::Range;
 
@@ -24,23 +26,26 @@ const PATCH_M: f64 = 0.7;
 /// The search for the nearest camera position tests every `STRIDE`-th one first.
 const STRIDE: usize = 8;
 
-/// Lateral distance of the side cameras from the middle of the rig, in metres. They saw what lies to the side.
+/// Lateral distance of the side cameras from the middle of the rig, in metres. They saw what lies
+/// to the side.
 const SIDE_CAMERA_M: f64 = 0.3;
-/// A Gaussian is assumed to be seen from a point of the drive that lies 4 m + 0.8 x distance behind the point that is
-/// nearest to it, at most [`VIEWED_FROM_BEHIND_MAX_M`]. This is the constant part, in metres.
+/// A Gaussian is assumed to be seen from a point of the drive that lies 4 m + 0.8 x distance behind
+/// the point that is nearest to it, at most [`VIEWED_FROM_BEHIND_MAX_M`]. This is the constant
+/// part, in metres.
 const VIEWED_FROM_BEHIND_M: f64 = 4.0;
 /// The part per metre of distance from the nearest point: see [`VIEWED_FROM_BEHIND_M`].
 const VIEWED_FROM_BEHIND_PER_M: f64 = 0.8;
 /// The largest value of the sum, in metres: see [`VIEWED_FROM_BEHIND_M`].
 const VIEWED_FROM_BEHIND_MAX_M: f64 = 60.0;
 
-// Sizes of the damage at an amount of 1. With 0.5, images of a city have 30 dB on the drive, and 27, 21 and 19 dB at
-// 1, 3 and 5 m off it (the three front cameras at 360 x 232 pixels).
+// Sizes of the damage at an amount of 1. With 0.5, images of a city have 30 dB on the drive, and
+// 27, 21 and 19 dB at 1, 3 and 5 m off it (the three front cameras at 360 x 232 pixels).
 /// Share of the Gaussians that are missing.
 const LOST: f64 = 0.02;
 /// Largest displacement along the ray, as a share of the distance.
 const MOVED: f64 = 0.014;
-/// Largest change of a colour (1 is white) from the plane to its normal; the smallest is [`TINT_LEAST`] of it.
+/// Largest change of a colour (1 is white) from the plane to its normal; the smallest is
+/// [`TINT_LEAST`] of it.
 const TINT: f64 = 4.0;
 /// See [`TINT`].
 const TINT_LEAST: f64 = 0.4;
@@ -48,7 +53,8 @@ const TINT_LEAST: f64 = 0.4;
 const TINT_GREY: f64 = 0.8;
 /// Share of the change that a whole patch has; the rest is drawn for each Gaussian.
 const TINT_PATCH: f64 = 0.9;
-/// Share of the Gaussians that are needles along the ray, up to [`NEEDLE_LENGTH`] times as long as they were wide.
+/// Share of the Gaussians that are needles along the ray, up to [`NEEDLE_LENGTH`] times as long as
+/// they were wide.
 const NEEDLES: f64 = 0.05;
 /// See [`NEEDLES`].
 const NEEDLE_LENGTH: f64 = 4.0;
@@ -84,8 +90,8 @@ struct ViewingRay {
 }
 
 impl Spoil {
-    /// Damage by `amount`, from 0 (none) to 1, to what was recorded along `drive`. The same arguments spoil the
-    /// same Gaussian in the same way, whichever other Gaussians are given.
+    /// Damage by `amount`, from 0 (none) to 1, to what was recorded along `drive`. The same
+    /// arguments spoil the same Gaussian in the same way, whichever other Gaussians are given.
     ///
     /// # Errors
     /// The amount is out of range.
@@ -220,7 +226,8 @@ impl Spoil {
 
     /// Smooth noise in [-1, 1] that changes within [`PATCH_M`].
     fn patch(&self, stream: u64, [x, y, z]: [f64; 3]) -> f64 {
-        // Noise of the plane; no surface of a street lies along the direction in which it is constant.
+        // Noise of the plane; no surface of a street lies along the direction in which it is
+        // constant.
         noise(mix(self.seed ^ stream), (x + 0.37 * z) / PATCH_M, (y + 0.61 * z) / PATCH_M)
     }
 }

@@ -46,8 +46,9 @@ pub(super) struct Plan {
 }
 
 impl Plan {
-    /// The street along `route` with a side street at station `crossing_m`. The first seed is that of all objects,
-    /// the second that of the ground's grain, which continues from one street to the next.
+    /// The street along `route` with a side street at station `crossing_m`. The first seed is that
+    /// of all objects, the second that of the ground's grain, which continues from one street to
+    /// the next.
     pub(super) fn new(route: Route, crossing_m: f64, [seed, grain_seed]: [u64; 2]) -> Self {
         Self {
             buildings: buildings::plan(&route, crossing_m, seed),
@@ -164,8 +165,8 @@ fn furnish(painter: &mut Painter, route: &Route, crossing_m: f64, seed: u64) {
     }
 }
 
-/// Stations along the whole street, `step_m` apart. They keep clear of the houses that close its ends; at an
-/// open end, the distance to the next street's first station is the same.
+/// Stations along the whole street, `step_m` apart. They keep clear of the houses that close its
+/// ends; at an open end, the distance to the next street's first station is the same.
 fn along(route: &Route, step_m: f64) -> impl Iterator<Item = f64> + use<> {
     let [clear, ends] = [[14.0, 10.0], route.ends_m];
     let clear_m = |end: usize| if route.closed[end] { clear[end] } else { 0.5 * step_m };

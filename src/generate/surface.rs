@@ -6,16 +6,17 @@ use wildcity_scene::{Gaussians, sh};
 
 use super::light::Light;
 
-/// Standard deviation of a surfel as a fraction of its cell's edge: with a smaller one the pattern of cells is
-/// visible, with a larger one the image is blurred. At 0.66, the common corner of four neighbours of opacity
-/// 0.97 is 0.5 / 0.66 = 0.76 sigma from each along both axes. They cover it to `1 - (1 - 0.97 exp(-0.76²))⁴` =
-/// 96 %, and with the next ring of eight to 97.5 %.
+/// Standard deviation of a surfel as a fraction of its cell's edge: with a smaller one the pattern
+/// of cells is visible, with a larger one the image is blurred. At 0.66, the common corner of four
+/// neighbours of opacity 0.97 is 0.5 / 0.66 = 0.76 sigma from each along both axes. They cover it
+/// to `1 - (1 - 0.97 exp(-0.76²))⁴` = 96 %, and with the next ring of eight to 97.5 %.
 const OVERLAP: f64 = 0.66;
 
 /// Half thickness of a surfel, in metres.
 const THICKNESS_M: f64 = 0.004;
 
-/// Factor by which cells grow from an edge inwards: they are fine where colours meet and coarse in between.
+/// Factor by which cells grow from an edge inwards: they are fine where colours meet and coarse in
+/// between.
 const GROWTH: f64 = 1.9;
 
 /// The appearance of a surface.
@@ -92,7 +93,8 @@ impl<'a> Painter<'a> {
         }
     }
 
-    /// A canvas for an object that is seen from near by, with `detail` times as many cells along every edge.
+    /// A canvas for an object that is seen from near by, with `detail` times as many cells along
+    /// every edge.
     pub(super) fn detailed(light: &'a Light, detail: usize) -> Self {
         Self { spacing: 1.0 / detail as f64, detail, ..Self::new(light, 1.0) }
     }
@@ -148,8 +150,8 @@ impl<'a> Painter<'a> {
 
     /// Covers a curved sheet: one surfel per cell between the break points `us` and `vs`.
     ///
-    /// `place` maps (u, v) to the world, with the outward normal along `∂u x ∂v`; `paint` returns the paint at
-    /// the middle of a cell, or `None` for a hole.
+    /// `place` maps (u, v) to the world, with the outward normal along `∂u x ∂v`; `paint` returns
+    /// the paint at the middle of a cell, or `None` for a hole.
     pub(super) fn sheet(
         &mut self,
         us: &[f64],
@@ -249,10 +251,12 @@ impl<'a> Painter<'a> {
 /// Colour of the mirrored sky.
 const MIRRORED_SKY: DVec3 = DVec3::new(0.80, 0.90, 1.0);
 
-/// Change of the mirrored sky with the viewing direction `d`, as a vector that is multiplied by `d` (dot product).
+/// Change of the mirrored sky with the viewing direction `d`, as a vector that is multiplied by `d`
+/// (dot product).
 ///
-/// A surface with normal n reflects more at grazing angles, where d·n rises from -1 to 0. The more the
-/// viewing direction rises along the surface, the higher and brighter is the reflected part of the sky.
+/// A surface with normal n reflects more at grazing angles, where d·n rises from -1 to 0. The more
+/// the viewing direction rises along the surface, the higher and brighter is the reflected part of
+/// the sky.
 fn mirror(normal: DVec3, gloss: f64) -> DVec3 {
     gloss * (0.6 * normal + 0.5 * (DVec3::Z - normal.z * normal))
 }

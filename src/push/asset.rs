@@ -26,16 +26,13 @@ use crate::status::{Push, State};
 pub struct AssetRequest {
     /// The files, which become one scene.
     pub files: Vec<RequestedFile>,
-    /// The rest.
     pub settings: AssetSettings,
 }
 
 /// Settings of an asset in addition to its Gaussians.
 #[derive(Clone, Debug)]
 pub struct AssetSettings {
-    /// Its name.
     pub name: String,
-    /// Its kind.
     pub class: ActorClass,
     /// Number of flat Gaussians that cover the triangles of a mesh.
     pub mesh_gaussians: u32,
@@ -99,7 +96,8 @@ pub fn make_asset(source: AssetSource, settings: &AssetSettings) -> Result<Actor
     ActorAsset::new(&gaussians, description).map_err(|error| refused(error.to_string()))
 }
 
-/// Moves Gaussians so that their origin is on the ground under the middle of their box. Returns the box.
+/// Moves Gaussians so that their origin is on the ground under the middle of their box. Returns the
+/// box.
 fn center(gaussians: &mut Gaussians) -> Result<ActorBox, PushError> {
     if gaussians.is_empty() {
         return Err(refused("there are no Gaussians to make an actor of".to_owned()));
@@ -118,12 +116,13 @@ fn refused(reason: String) -> PushError {
     PushError::Content { reason, cells: Vec::new() }
 }
 
-/// Waits for the push's permit, makes the asset, and stores it. Dropping the future before the asset is written
-/// abandons the push: nothing of it is visible. The caller ends the push with [`Push::close`].
+/// Waits for the push's permit, makes the asset, and stores it. Dropping the future before the
+/// asset is written abandons the push: nothing of it is visible. The caller ends the push with
+/// [`Push::close`].
 ///
 /// # Errors
-/// The content is refused, an asset with different content has the name, or the server could not do it; see
-/// [`PushError::is_refusal`].
+/// The content is refused, an asset with different content has the name, or the server could not do
+/// it; see [`PushError::is_refusal`].
 pub async fn publish_asset(
     catalog: &Catalog,
     queue: &PushQueue,
@@ -131,8 +130,8 @@ pub async fn publish_asset(
     request: AssetRequest,
     files: Vec<SourceFile>,
 ) -> Result<AddedActor, PushError> {
-    // A name of a twin does not start with a dot. Pushes of assets with one name run one after the other, so that two
-    // assets cannot be stored under the same name.
+    // A name of a twin does not start with a dot. Pushes of assets with one name run one after the
+    // other, so that two assets cannot be stored under the same name.
     let name = format!(".actors/{}", request.settings.name);
     let file_bytes = files.iter().map(|file| file.bytes).sum();
     let permit = queue.permit_with(&name, request.memory_bytes(file_bytes)).await?;
@@ -146,7 +145,8 @@ pub async fn publish_asset(
         too_many_fix: "an actor is one vehicle or person; reduce its Gaussians",
         drop_bad: false,
     };
-    // Blocking threads hold a clone of the permit, because they may outlive their push for a moment.
+    // Blocking threads hold a clone of the permit, because they may outlive their push for a
+    // moment.
     let stopping = StopWhenDropped(push.stop_flag().clone());
     let made = {
         let permit = permit.clone();

@@ -26,7 +26,8 @@ pub fn check_base(catalog: &Catalog, request: &PushRequest) -> Result<Option<u64
                 changed.filter(|cell| selected.contains(cell)).collect()
             }
             CellSelection::All => changed.collect(),
-            // These cells are known only after the files are read; the store then detects conflicts.
+            // These cells are known only after the files are read; the store then detects
+            // conflicts.
             CellSelection::Touched => Vec::new(),
         };
         if !cells.is_empty() {
@@ -38,8 +39,8 @@ pub fn check_base(catalog: &Catalog, request: &PushRequest) -> Result<Option<u64
     Ok(latest)
 }
 
-/// The id of a push that names none: a hash of its content and of the latest version, since the same
-/// content on top of another version is another push.
+/// The id of a push that names none: a hash of its content and of the latest version, since the
+/// same content on top of another version is another push.
 pub fn default_id(request: &PushRequest, latest: Option<u64>) -> String {
     let mut hasher = blake3::Hasher::new();
     hasher.update(request.request_hash.as_bytes());
@@ -47,7 +48,8 @@ pub fn default_id(request: &PushRequest, latest: Option<u64>) -> String {
     hasher.finalize().to_hex()[..32].to_owned()
 }
 
-/// The axes and the unit of files for which the request gives none: those with which the base was imported.
+/// The axes and the unit of files for which the request gives none: those with which the base was
+/// imported.
 ///
 /// # Errors
 /// The base was made from files in different axes; or as [`find_base`].

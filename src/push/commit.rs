@@ -23,9 +23,10 @@ pub(crate) struct NewContent<'a> {
     pub(crate) profile: RenderProfile,
 }
 
-/// The render profile of the version that a push makes: that of the base, or for a new twin the one that its files say,
-/// with the changes of the request. Also a warning if the files say another one.
-pub(crate) fn profile_of(
+/// The render profile of the version that a push makes: that of the base, or for a new twin the one
+/// that its files say, with the changes of the request. Also a warning if the files say another
+/// one.
+pub(crate) fn merge_profile(
     request: &PushRequest,
     base: Option<&Version>,
     antialiasing: Option<&Antialiasing>,
@@ -52,9 +53,10 @@ pub(crate) fn profile_of(
     Ok((profile, warning))
 }
 
-/// Writes the version. A push of some cells changes those of the base and keeps the base's settings. A push of all
-/// cells replaces the twin, but keeps rig, trajectories, sky, place on the earth and alignment of the base. Neither
-/// replaces changes that others made since the base, which is the latest version if the request names none.
+/// Writes the version. A push of some cells changes those of the base and keeps the base's
+/// settings. A push of all cells replaces the twin, but keeps rig, trajectories, sky, place on the
+/// earth and alignment of the base. Neither replaces changes that others made since the base, which
+/// is the latest version if the request names none.
 pub(crate) fn commit(
     catalog: &Catalog,
     push: &Push,
@@ -81,7 +83,7 @@ pub(crate) fn commit(
     let version = match base {
         Some(base) if request.cells != CellSelection::All => {
             let profile = (!request.profile.is_empty()).then_some(profile);
-            let change = VersionChange { profile, ..VersionChange::of(provenance) };
+            let change = VersionChange { profile, ..VersionChange::new(provenance) };
             commit.change(base.number, change)?
         }
         _ => {

@@ -1,5 +1,5 @@
-//! Edits: a new version with the same Gaussians on level ground, with a drive and a rig, which a person has placed with
-//! the mouse.
+//! Edits: a new version with the same Gaussians on level ground, with a drive and a rig, which a
+//! person has placed with the mouse.
 
 use std::sync::Arc;
 
@@ -7,7 +7,7 @@ use glam::DVec3;
 
 use wildcity_scene::align::{
     Alignment, AlignmentError, GroundPlane, GroundSearch, PathError, SceneExtent, drive_through,
-    find_ground, plane_through, scale_of, scene_extent,
+    find_ground, plane_through, scale_from_points, scene_extent,
 };
 use wildcity_scene::{Gaussians, Rig};
 use wildcity_session::Engine;
@@ -40,9 +40,7 @@ pub struct EditRequest {
 /// A drive through points.
 #[derive(Clone, Debug)]
 pub struct DriveRequest {
-    /// Its name.
     pub name: String,
-    /// The points.
     pub points: Vec<DVec3>,
     /// Its speed, in m/s.
     pub speed_m_s: f64,
@@ -64,29 +62,29 @@ impl EditRequest {
         }
         let mut alignment = Alignment::IDENTITY;
         if let Some((points, above)) = *ground {
-            let plane = plane_through(points, above).map_err(of_alignment("ground.points"))?;
+            let plane = plane_through(points, above).map_err(alignment_error("ground.points"))?;
             alignment = Alignment::onto(&plane);
         }
         if let Some((points, distance_m)) = *scale {
-            let metres = scale_of(points, distance_m).map_err(of_alignment("scale"))?;
-            alignment = alignment.scaled(metres).map_err(of_alignment("scale"))?;
+            let metres = scale_from_points(points, distance_m).map_err(alignment_error("scale"))?;
+            alignment = alignment.scaled(metres).map_err(alignment_error("scale"))?;
         }
         let trajectories = match drive {
             None => Vec::new(),
             Some(DriveRequest { name, points, speed_m_s }) => {
                 let points_m: Vec<DVec3> = points.iter().map(|&p| alignment.point_m(p)).collect();
-                vec![drive_through(name, &points_m, *speed_m_s).map_err(of_path)?]
+                vec![drive_through(name, &points_m, *speed_m_s).map_err(path_error)?]
             }
         };
         Ok(Edit { alignment, trajectories, rig: rig.clone() })
     }
 }
 
-fn of_alignment(field: &'static str) -> impl Fn(AlignmentError) -> PushError {
+fn alignment_error(field: &'static str) -> impl Fn(AlignmentError) -> PushError {
     move |error| PushError::InvalidField { field: field.to_owned(), reason: error.to_string() }
 }
 
-fn of_path(error: PathError) -> PushError {
+fn path_error(error: PathError) -> PushError {
     let field = match error {
         PathError::Points { .. } | PathError::Length { .. } => "drive.points".to_owned(),
         PathError::Place { index } => format!("drive.points[{index}]"),
@@ -96,8 +94,8 @@ fn of_path(error: PathError) -> PushError {
     PushError::InvalidField { field, reason: error.to_string() }
 }
 
-/// Makes the version when no other push of the twin runs. Before it becomes the latest, loads the sections that sessions
-/// see.
+/// Makes the version when no other push of the twin runs. Before it becomes the latest, loads the
+/// sections that sessions see.
 ///
 /// # Errors
 /// The request cannot be used; [`wildcity_twin::store::StoreError::Overlap`]; or as a commit.
@@ -145,7 +143,8 @@ pub struct Survey {
     pub ground: Option<GroundPlane>,
 }
 
-/// Looks for the ground of a version: of all its Gaussians, or of [`limits::SURVEYED_GAUSSIANS`] of them.
+/// Looks for the ground of a version: of all its Gaussians, or of [`limits::SURVEYED_GAUSSIANS`] of
+/// them.
 ///
 /// # Errors
 /// The version cannot be read.

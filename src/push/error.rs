@@ -22,7 +22,6 @@ pub enum PushError {
     InvalidField {
         /// The field, as it is called on the wire.
         field: String,
-        /// The error.
         reason: String,
     },
     /// A field of the request is not a name.
@@ -32,13 +31,11 @@ pub enum PushError {
     InvalidName {
         /// The field, as it is called on the wire.
         field: &'static str,
-        /// The refused text.
         name: String,
     },
     /// The content of the files cannot be accepted.
     #[error("{reason}")]
     Content {
-        /// Why not.
         reason: String,
         /// The cells (x, y) at fault; empty if the fault is not in cells.
         cells: Vec<[i32; 2]>,
@@ -48,7 +45,6 @@ pub enum PushError {
     UnknownPush {
         /// The id asked for.
         id: String,
-        /// The twin.
         twin: String,
     },
     /// Too many pushes wait or run.
@@ -62,12 +58,7 @@ pub enum PushError {
     Cancelled,
     /// It can no longer be cancelled.
     #[error("the push {id:?} {why}")]
-    TooLate {
-        /// Its id.
-        id: String,
-        /// Why not.
-        why: &'static str,
-    },
+    TooLate { id: String, why: &'static str },
     /// Reading and checking it took too long.
     #[error(
         "reading and checking took longer than {limit:?}; push the scene in parts, some cells each"
@@ -76,7 +67,6 @@ pub enum PushError {
         /// The most that it may take.
         limit: Duration,
     },
-    /// The process stops.
     #[error("the server is shutting down; send the push again when it is back")]
     ShuttingDown,
     /// The store, the cache of twins, or the renderer refused.
@@ -92,18 +82,15 @@ pub enum PushError {
     },
     /// The process abandoned it before it began.
     #[error("the push did not begin: {reason}")]
-    Abandoned {
-        /// Why.
-        reason: String,
-    },
+    Abandoned { reason: String },
     /// A defect of the program.
     #[error("a task crashed; the server's log says where")]
     Crashed,
 }
 
 impl PushError {
-    /// Whether the request, its files, or the base that it names are at fault, so that the same push
-    /// would be refused again. After any other error it may be tried again.
+    /// Whether the request, its files, or the base that it names are at fault, so that the same
+    /// push would be refused again. After any other error it may be tried again.
     pub fn is_refusal(&self) -> bool {
         match self {
             Self::OutOfRange { .. }
@@ -131,8 +118,8 @@ impl From<StoreError> for PushError {
     }
 }
 
-/// Whether a commit was refused because of its content or its base, and not because of a fault of the
-/// store.
+/// Whether a commit was refused because of its content or its base, and not because of a fault of
+/// the store.
 fn is_refused_content(error: &StoreError) -> bool {
     match error {
         StoreError::Gaussians(error) => !matches!(error, IngestError::File(_)),

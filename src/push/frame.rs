@@ -1,21 +1,23 @@
 //! The frame of a push: from the axes and unit of the capture to the twin's.
 //!
-//! A twin that was aligned (`wildcity twin align`, an edit) has different axes from the capture that it was trained
-//! from. Its manifest has the transform between the two, so that a training pipeline can push its result unchanged.
+//! A twin that was aligned (`wildcity twin align`, an edit) has different axes from the capture
+//! that it was trained from. Its manifest has the transform between the two, so that a training
+//! pipeline can push its result unchanged.
 
 use wildcity_scene::align::Alignment;
 use wildcity_twin::store::{StoreError, Version};
 
 use crate::error::PushError;
 
-/// The frame of a push's Gaussians, after the axes and the scale of each file, and of its preview poses.
+/// The frame of a push's Gaussians, after the axes and the scale of each file, and of its preview
+/// poses.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Frame {
     /// The axes and metres of the base version.
     #[default]
     Twin,
-    /// The axes and the unit with which the capture was imported, before the twin was aligned. The axes and the unit of
-    /// the twin if it never was.
+    /// The axes and the unit with which the capture was imported, before the twin was aligned. The
+    /// axes and the unit of the twin if it never was.
     Capture,
 }
 
@@ -29,7 +31,8 @@ impl Frame {
     }
 }
 
-/// The change from the capture's frame to that of a version; none if the version records no alignment.
+/// The change from the capture's frame to that of a version; none if the version records no
+/// alignment.
 pub(crate) fn twin_from_capture(base: &Version) -> Result<Option<Alignment>, PushError> {
     Ok(base.manifest.alignment().map_err(StoreError::from)?)
 }

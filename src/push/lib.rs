@@ -1,4 +1,5 @@
-//! Pushes: trained scenes become a new version of a twin, all of their cells at once or none; and assets of actors.
+//! Pushes: trained scenes become a new version of a twin, all of their cells at once or none; and
+//! assets of actors.
 //!
 //! ```text
 //! request   the request for a push, and the checks that need neither files nor twin
@@ -16,8 +17,8 @@
 //! publish   the pipeline: read, check, preview, commit, preload
 //! ```
 //!
-//! Nothing of a push is visible before its version is committed, or its asset is stored. This package contains neither
-//! HTTP nor JSON: the server converts requests and answers.
+//! Nothing of a push is visible before its version is committed, or its asset is stored. This
+//! package contains neither HTTP nor JSON: the server converts requests and answers.
 
 mod asset;
 mod base;

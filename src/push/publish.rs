@@ -1,14 +1,15 @@
 //! The pipeline of a push: read, check, preview, commit, preload.
 //!
-//! A push is uploaded files and the cells that they replace. All cells are published by one record of the
-//! twin's log.
+//! A push is uploaded files and the cells that they replace. All cells are published by one record
+//! of the twin's log.
 //!
-//! **Agents never wait for a push.** Small views before and after the change are rendered through the render
-//! queue of the sessions. Until the new version is loaded, `latest` remains the previous version for
-//! sessions that open the twin ([`Engine::pin_latest`]).
+//! **Agents never wait for a push.** Small views before and after the change are rendered through
+//! the render queue of the sessions. Until the new version is loaded, `latest` remains the previous
+//! version for sessions that open the twin ([`Engine::pin_latest`]).
 //!
-//! **A push needs no state that survives the server**, because its content is compared with the twin's. A client that
-//! got no answer sends its push again, and a push with the content of the latest version makes no new version.
+//! **A push needs no state that survives the server**, because its content is compared with the
+//! twin's. A client that got no answer sends its push again, and a push with the content of the
+//! latest version makes no new version.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -24,7 +25,7 @@ use wildcity_twin::store::{StoreError, Version, check_density};
 
 use crate::base::{default_axes, find_base};
 use crate::blocking::run_blocking;
-use crate::commit::{NewContent, commit, profile_of};
+use crate::commit::{NewContent, commit, merge_profile};
 use crate::error::PushError;
 use crate::preview::psnr::preview_psnr;
 use crate::preview::{check_psnr, comparison};
@@ -48,9 +49,9 @@ struct CheckedScene {
     report: PushReport,
 }
 
-/// Waits for the push's permit, carries it out, and returns the version that it made. Dropping the future
-/// abandons the push: before the commit nothing of it is visible. The caller ends the push with
-/// [`Push::end`].
+/// Waits for the push's permit, carries it out, and returns the version that it made. Dropping the
+/// future abandons the push: before the commit nothing of it is visible. The caller ends the push
+/// with [`Push::end`].
 ///
 /// # Errors
 /// The content is refused, or the server could not do it; see [`PushError::is_refusal`].
@@ -68,8 +69,8 @@ pub async fn publish(
 
     let limit = queue.check_timeout();
     let deadline = Instant::now() + limit;
-    // The frames have a later deadline than the push, so that a push that takes too long fails with `TimedOut` and not
-    // with the error of a frame.
+    // The frames have a later deadline than the push, so that a push that takes too long fails with
+    // `TimedOut` and not with the error of a frame.
     let frames_by = deadline + engine.step_timeout();
     let checked = read_and_check(engine, push, &request, files, &permit, frames_by);
     let Ok(checked) = timeout_at(deadline, checked).await else {
@@ -102,8 +103,8 @@ pub async fn publish(
 
 /// Everything before the commit. `frames_by` is the deadline of the preview's frames.
 ///
-/// Blocking threads hold a clone of the permit, because they may still run for a moment after the push was cancelled:
-/// the next push of the twin must not begin before they end.
+/// Blocking threads hold a clone of the permit, because they may still run for a moment after the
+/// push was cancelled: the next push of the twin must not begin before they end.
 async fn read_and_check(
     engine: &Arc<Engine>,
     push: &Arc<Push>,
@@ -118,7 +119,7 @@ async fn read_and_check(
         let engine = engine.clone();
         let request = request.clone();
         let permit = permit.clone();
-        let bounds = ReadBounds::of_twin(permit.memory_bytes(), request.drop_bad);
+        let bounds = ReadBounds::for_twin(permit.memory_bytes(), request.drop_bad);
         run_blocking(move || {
             let _permit = permit;
             let default_axes = default_axes(engine.catalog(), &request)?;
@@ -169,7 +170,8 @@ async fn check(
     Ok(scene)
 }
 
-/// Takes the scene to the twin's frame, finds the cells that the push replaces, and completes the report with both.
+/// Takes the scene to the twin's frame, finds the cells that the push replaces, and completes the
+/// report with both.
 fn compare_cells(
     push: &Push,
     request: &PushRequest,
@@ -179,7 +181,7 @@ fn compare_cells(
     let placed = scene.place_in_twin(request.frame, base);
     placed.inspect_err(|_| push.set_report(scene.report.clone()))?;
     let PushedScene { mut gaussians, hashes, options, antialiasing, mut report } = scene;
-    let (profile, warning) = profile_of(request, base, antialiasing.as_ref())?;
+    let (profile, warning) = merge_profile(request, base, antialiasing.as_ref())?;
     if let (Some(warning), Some(file)) = (warning, report.files.first_mut()) {
         file.warnings.push(warning);
     }
@@ -217,8 +219,9 @@ fn commit_held(
     scene: &CheckedScene,
     base: Option<&Version>,
 ) -> Result<Committed, PushError> {
-    // Until the new version is ready, sessions that open the latest version get the present latest version. It may be
-    // later than the base, because another version may have been committed during the preview.
+    // Until the new version is ready, sessions that open the latest version get the present latest
+    // version. It may be later than the base, because another version may have been committed
+    // during the preview.
     let held = pin_latest(engine, &request.twin)?;
     let content = NewContent {
         gaussians: &scene.gaussians,
@@ -240,8 +243,9 @@ pub(crate) fn pin_latest(engine: &Arc<Engine>, twin: &str) -> Result<Option<Late
     Ok(versions.last().map(|latest| engine.pin_latest(twin, latest.number)))
 }
 
-/// Loads those parts of the version that sessions on the twin see now, so that they need not wait when they switch. The
-/// version is already committed: sections that cannot be loaded now are loaded when it is opened.
+/// Loads those parts of the version that sessions on the twin see now, so that they need not wait
+/// when they switch. The version is already committed: sections that cannot be loaded now are
+/// loaded when it is opened.
 pub(crate) async fn preload(
     engine: &Arc<Engine>,
     twin: &str,

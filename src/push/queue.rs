@@ -1,7 +1,7 @@
 //! The pushes of a server: waiting, running, and recently ended ones.
 //!
-//! The pushes of one twin run one after the other, in the order of their requests. Pushes of different twins wait for
-//! each other only while memory is short.
+//! The pushes of one twin run one after the other, in the order of their requests. Pushes of
+//! different twins wait for each other only while memory is short.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Weak};
@@ -37,8 +37,9 @@ pub struct QueueLimits {
     pub check_timeout: Duration,
 }
 
-/// The right of a push to run: its share of the memory and the lock of its twin, which are released when all clones are
-/// dropped. Blocking threads hold a clone, because they may still run for a moment after their push was cancelled.
+/// The right of a push to run: its share of the memory and the lock of its twin, which are released
+/// when all clones are dropped. Blocking threads hold a clone, because they may still run for a
+/// moment after their push was cancelled.
 #[derive(Clone, Debug)]
 pub(crate) struct PushPermit(Arc<PermitParts>);
 
@@ -65,12 +66,7 @@ pub enum Begun {
     /// The request is that of a push that is already known.
     Known(Arc<Push>),
     /// A new push, which the caller must now run.
-    New {
-        /// The push.
-        push: Arc<Push>,
-        /// Its files.
-        files: Vec<SourceFile>,
-    },
+    New { push: Arc<Push>, files: Vec<SourceFile> },
 }
 
 impl PushQueue {
@@ -96,9 +92,9 @@ impl PushQueue {
         (entries.begun, entries.open_count())
     }
 
-    /// The push of an id: a known one, or a new one with the files that `files` returns. A known push that
-    /// failed is begun again. `files` is only called for a new push, because the uploads of a known one may
-    /// have been removed.
+    /// The push of an id: a known one, or a new one with the files that `files` returns. A known
+    /// push that failed is begun again. `files` is only called for a new push, because the uploads
+    /// of a known one may have been removed.
     ///
     /// # Errors
     /// The id belongs to a push with a different request, too many pushes are open, or `files`
@@ -180,8 +176,8 @@ impl PushQueue {
             twins.retain(|_, lock| Arc::strong_count(lock) > 1);
             twins.entry(twin.to_owned()).or_default().clone()
         };
-        // Lock the twin first, so that a push that waits for its twin reserves no memory, which pushes of other twins
-        // may need.
+        // Lock the twin first, so that a push that waits for its twin reserves no memory, which
+        // pushes of other twins may need.
         let twin = lock.lock_owned().await;
         let needed = memory_bytes.min(self.limits.memory_bytes);
         let memory = self.memory.clone().acquire_many_owned(memory_units(needed)).await;

@@ -28,7 +28,8 @@ pub(crate) struct PushedScene {
 }
 
 impl PushedScene {
-    /// Transforms the Gaussians to the frame of their base. The report contains their original frame.
+    /// Transforms the Gaussians to the frame of their base. The report contains their original
+    /// frame.
     ///
     /// # Errors
     /// [`PushError::Content`]: a Gaussian is outside its bounds there.
@@ -41,7 +42,7 @@ impl PushedScene {
         self.report.is_aligned = base.map(twin_from_capture).transpose()?.flatten().is_some();
         let Some(alignment) = frame.alignment(base)? else { return Ok(()) };
         alignment.apply(&mut self.gaussians);
-        self.report.ranges = Ranges::of(&self.gaussians);
+        self.report.ranges = Ranges::from_gaussians(&self.gaussians);
         validate::check(&self.gaussians, &Field::twin_name).map_err(|bad| PushError::Content {
             reason: format!("in the axes of the twin, {bad}: check the scale of the files"),
             cells: Vec::new(),
@@ -68,10 +69,10 @@ pub(crate) struct ReadBounds {
 
 impl ReadBounds {
     /// The bounds of a push of a twin.
-    pub(crate) fn of_twin(memory_bytes: u64, drop_bad: bool) -> Self {
+    pub(crate) fn for_twin(memory_bytes: u64, drop_bad: bool) -> Self {
         Self {
             memory_bytes,
-            mesh_gaussians: ReadLimits::of_own_file().mesh_gaussians,
+            mesh_gaussians: ReadLimits::for_own_file().mesh_gaussians,
             most_gaussians: limits::PUSH_GAUSSIANS,
             too_many_fix: "push the scene in parts, some cells each",
             drop_bad,
@@ -79,10 +80,10 @@ impl ReadBounds {
     }
 }
 
-/// Reads the files, converts them to the twin's axes, and joins them in the order of the request. A file that another
-/// one names, such as a buffer of a glTF, is a part of that scene and not a separate scene. `default_axes` has the axes
-/// of files for which they are not given. The report of the push is
-/// set on success, and on failure if Gaussians are the reason.
+/// Reads the files, converts them to the twin's axes, and joins them in the order of the request. A
+/// file that another one names, such as a buffer of a glTF, is a part of that scene and not a
+/// separate scene. `default_axes` has the axes of files for which they are not given. The report of
+/// the push is set on success, and on failure if Gaussians are the reason.
 pub(crate) fn read(
     push: &Push,
     requested: &[RequestedFile],
@@ -105,7 +106,7 @@ pub(crate) fn read(
 
     let mut scene = reader.scene;
     scene.report.sh_degree = scene.gaussians.sh_degree;
-    scene.report.ranges = Ranges::of(&scene.gaussians);
+    scene.report.ranges = Ranges::from_gaussians(&scene.gaussians);
     push.set_report(scene.report.clone());
     if scene.gaussians.is_empty() {
         let reason = "the files hold no Gaussians: there is nothing to push".to_owned();
@@ -171,8 +172,8 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// Reads one file, and joins it if all files before it are joined. If its content is refused for its
-    /// Gaussians, they are in the report.
+    /// Reads one file, and joins it if all files before it are joined. If its content is refused
+    /// for its Gaussians, they are in the report.
     fn read(&mut self, index: usize, requested: &RequestedFile) -> Result<(), PushError> {
         let file = &self.files[index];
         let name = &file.name;
@@ -281,7 +282,7 @@ mod tests {
 
     #[test]
     fn a_push_has_a_largest_size() {
-        let bounds = ReadBounds::of_twin(1 << 30, false);
+        let bounds = ReadBounds::for_twin(1 << 30, false);
         assert!(check_count("a.ply", limits::PUSH_GAUSSIANS, &bounds).is_ok());
         let error = check_count("b.ply", limits::PUSH_GAUSSIANS + 1, &bounds).unwrap_err();
         assert!(error.is_refusal());

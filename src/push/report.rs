@@ -1,4 +1,5 @@
-//! Contents of the files of a push, and the changes that it would make, before anything is committed.
+//! Contents of the files of a push, and the changes that it would make, before anything is
+//! committed.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -50,7 +51,6 @@ pub struct CellChange {
 pub struct FileReport {
     /// Name of the file.
     pub name: String,
-    /// Gaussians in it.
     pub gaussians: u64,
     /// Gaussians with a number outside its bounds.
     pub bad: u64,
@@ -77,7 +77,7 @@ pub struct Ranges {
 
 impl Ranges {
     /// The ranges of valid Gaussians; none without Gaussians.
-    pub fn of(gaussians: &Gaussians) -> Option<Self> {
+    pub fn from_gaussians(gaussians: &Gaussians) -> Option<Self> {
         if gaussians.is_empty() {
             return None;
         }
@@ -119,8 +119,8 @@ impl CellChanges {
     /// Compares the cells of a base with the number of Gaussians that a push has in each cell.
     ///
     /// # Errors
-    /// [`PushError::Content`]: a cell that was named has no Gaussian, or one that was not named would
-    /// lose nearly all of its Gaussians.
+    /// [`PushError::Content`]: a cell that was named has no Gaussian, or one that was not named
+    /// would lose nearly all of its Gaussians.
     pub(crate) fn new(
         selection: &CellSelection,
         base: Option<&Manifest>,
@@ -166,11 +166,11 @@ fn refuse_empty(cells: &[CellChange]) -> Result<(), PushError> {
     Err(PushError::Content { reason, cells: empty.iter().map(|change| change.cell).collect() })
 }
 
-/// Refuses cells that were not named and would keep less than [`limits::SHRUNK_SHARE`] (a tenth) of their
-/// Gaussians.
+/// Refuses cells that were not named and would keep less than [`limits::SHRUNK_SHARE`] (a tenth) of
+/// their Gaussians.
 ///
-/// Trained blocks overlap, so the few Gaussians that a push has in such a cell are assumed to be the margin
-/// of a neighbouring cell. Without this check a few strays would replace the cell.
+/// Trained blocks overlap, so the few Gaussians that a push has in such a cell are assumed to be
+/// the margin of a neighbouring cell. Without this check a few strays would replace the cell.
 fn refuse_shrunk(cells: &[CellChange]) -> Result<(), PushError> {
     let shrinks =
         |change: &&CellChange| (change.after as f64) < limits::SHRUNK_SHARE * change.before as f64;
@@ -199,11 +199,11 @@ mod tests {
             logit_opacities: vec![0.0, 100.0],
             sh: vec![0.0; 6],
         };
-        let ranges = Ranges::of(&gaussians).unwrap();
+        let ranges = Ranges::from_gaussians(&gaussians).unwrap();
         assert_eq!(ranges.mean_m, [[-1.0, -2.0, 0.0], [1.0, 5.0, 3.0]]);
         assert_eq!(ranges.scale_m, [f64::exp(-1.0), f64::exp(1.0)]);
         assert_eq!((ranges.opacity, ranges.quat_length), ([0.5, 1.0], [1.0, 5.0]));
-        assert_eq!(Ranges::of(&Gaussians::default()), None);
+        assert_eq!(Ranges::from_gaussians(&Gaussians::default()), None);
     }
 
     #[test]

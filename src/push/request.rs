@@ -19,7 +19,8 @@ pub struct PushRequest {
     pub id: Option<String>,
     /// Name of the twin. A twin that does not exist is made.
     pub twin: String,
-    /// BLAKE3 of everything that the client asked for: two requests of the same hash are the same push.
+    /// BLAKE3 of everything that the client asked for: two requests of the same hash are the same
+    /// push.
     pub request_hash: blake3::Hash,
     /// The files, which become one scene.
     pub files: Vec<RequestedFile>,
@@ -37,7 +38,8 @@ pub struct PushRequest {
     pub profile: Vec<String>,
     /// Description of the version, for people.
     pub note: Option<String>,
-    /// `world_from_rig` of the poses of the preview; some along the twin's trajectories if there are none.
+    /// `world_from_rig` of the poses of the preview; some along the twin's trajectories if there
+    /// are none.
     pub preview_poses: Option<Vec<Pose>>,
     /// The push is refused if the images of a pose differ by more than this PSNR, in dB.
     pub min_psnr_db: Option<f64>,
@@ -52,7 +54,8 @@ pub struct RequestedFile {
     pub upload: String,
     /// The axes and unit of the file.
     pub axes: SourceAxes,
-    /// The name by which other files of the push name it, if that is not the upload's. It is never used as a path.
+    /// The name by which other files of the push name it, if that is not the upload's. It is never
+    /// used as a path.
     pub name: Option<String>,
 }
 

@@ -21,7 +21,6 @@ pub struct SourceAxes {
 /// A scene file that waits to be read.
 #[derive(Clone, Debug)]
 pub struct SourceFile {
-    /// Name for messages.
     pub name: String,
     /// Path on the local disk.
     pub path: PathBuf,
@@ -55,8 +54,8 @@ impl SourceAxes {
         Self::given(Some(axes), Some(scale))
     }
 
-    /// As [`Self::parse`]. Axes that are not given are those that the file records, or else the twin's; a scale that is
-    /// not given is 1.
+    /// As [`Self::parse`]. Axes that are not given are those that the file records, or else the
+    /// twin's; a scale that is not given is 1.
     ///
     /// # Errors
     /// As [`Self::parse`].
@@ -71,7 +70,8 @@ impl SourceAxes {
         self.axes.is_some() && self.metres_per_unit.is_some()
     }
 
-    /// Converts a scene that was read to the twin's axes. `default` has those of a file for which they are not given.
+    /// Converts a scene that was read to the twin's axes. `default` has those of a file for which
+    /// they are not given.
     fn apply(&self, read: ReadScene, default: &Self) -> Result<SourceScene, IngestError> {
         let ReadScene { mut gaussians, hash, parts, mut notes } = read;
         let (axes, text) = self.used_axes(default, &mut notes);
@@ -81,12 +81,13 @@ impl SourceAxes {
         Ok(SourceScene { gaussians, hash, parts, options, notes })
     }
 
-    /// The given axes, or else those that the file records, or else the default; notes which ones if that may surprise.
+    /// The given axes, or else those that the file records, or else the default; notes which ones
+    /// if that may surprise.
     fn used_axes(&self, default: &Self, notes: &mut FileNotes) -> (Axes, String) {
         match (&self.axes, &notes.axes, &default.axes) {
             (Some((axes, text)), recorded, _) => {
                 if let Some(FileAxes { axes: recorded, said_by }) =
-                    recorded.as_ref().filter(|recorded| !axes.has_rotation_of(&recorded.axes))
+                    recorded.as_ref().filter(|recorded| !axes.has_same_rotation(&recorded.axes))
                 {
                     let recorded = recorded.option_text();
                     notes.warnings.push(format!(
@@ -101,7 +102,7 @@ impl SourceAxes {
                 (axes, text)
             }
             (None, None, Some((axes, text))) => {
-                if !axes.has_rotation_of(&Axes::IDENTITY) {
+                if !axes.has_same_rotation(&Axes::IDENTITY) {
                     notes
                         .warnings
                         .push(format!("no axes are given: those of the twin, {text}, are used"));
@@ -121,16 +122,17 @@ impl SourceAxes {
         self.metres_per_unit.or(inherited).unwrap_or(1.0)
     }
 
-    /// The axes and the scale as options, for the provenance of a version; those that are not given are `identity`
-    /// and 1.
+    /// The axes and the scale as options, for the provenance of a version; those that are not given
+    /// are `identity` and 1.
     pub fn options(&self) -> [String; 2] {
         let axes = self.axes.as_ref().map_or("identity", |(_, text)| text);
         [format!("axes={axes}"), format!("scale={}", self.metres_per_unit.unwrap_or(1.0))]
     }
 }
 
-/// Reads a scene file of any format, checks every Gaussian, and converts them to the twin's axes. The scene
-/// may name the files below its folder. `drop_bad` leaves out Gaussians outside their bounds.
+/// Reads a scene file of any format, checks every Gaussian, and converts them to the twin's axes.
+/// The scene may name the files below its folder. `drop_bad` leaves out Gaussians outside their
+/// bounds.
 ///
 /// # Errors
 /// As [`ingest::read`].
@@ -140,7 +142,7 @@ pub fn read_scene(
     drop_bad: bool,
     progress: Progress<'_>,
 ) -> Result<SourceScene, IngestError> {
-    let limits = ReadLimits { drop_bad, ..ReadLimits::of_own_file() };
+    let limits = ReadLimits { drop_bad, ..ReadLimits::for_own_file() };
     read_limited(path, axes, &SourceAxes::default(), &limits, progress)
 }
 
@@ -168,7 +170,7 @@ pub fn read_actor(
     mesh_gaussians: u32,
     progress: Progress<'_>,
 ) -> Result<SourceScene, IngestError> {
-    let limits = ReadLimits { mesh_gaussians, ..ReadLimits::of_own_file() };
+    let limits = ReadLimits { mesh_gaussians, ..ReadLimits::for_own_file() };
     read_limited(path, axes, &SourceAxes::default(), &limits, progress)
 }
 
@@ -188,8 +190,8 @@ pub fn read_tracked(
     Ok((objects, hash))
 }
 
-/// The provenance of a version that is made from files with these hashes. It contains no time and no user,
-/// so that the same content gives the same version.
+/// The provenance of a version that is made from files with these hashes. It contains no time and
+/// no user, so that the same content gives the same version.
 pub fn provenance(hashes: &[String], mut options: Vec<String>, levels: bool) -> Provenance {
     let source = match hashes {
         [one] => one.clone(),
@@ -198,5 +200,5 @@ pub fn provenance(hashes: &[String], mut options: Vec<String>, levels: bool) -> 
     if !levels {
         options.push("lod=off".to_owned());
     }
-    Provenance { options, ..Provenance::of(format!("blake3:{source}")) }
+    Provenance { options, ..Provenance::new(format!("blake3:{source}")) }
 }

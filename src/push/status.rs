@@ -48,7 +48,6 @@ impl State {
 /// Work done within a state. The unit is bytes while files are read, else poses or Gaussians.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Progress {
-    /// Work done.
     pub done: u64,
     /// All work of the state; 0 if unknown.
     pub total: u64,
@@ -66,7 +65,6 @@ pub struct PushedVersion {
 /// The state of a push, as it is reported to clients.
 #[derive(Clone, Debug)]
 pub struct Status {
-    /// The stage.
     pub state: State,
     /// Progress within the stage.
     pub progress: Progress,
@@ -145,8 +143,8 @@ impl Push {
         self.cancelled.notified().await;
     }
 
-    /// Reason for which the push ends: its cancellation if it was cancelled, because this also ends the reading with an
-    /// error.
+    /// Reason for which the push ends: its cancellation if it was cancelled, because this also ends
+    /// the reading with an error.
     pub(crate) fn cause(&self, error: PushError) -> PushError {
         let status = self.status.lock();
         match status.error.as_deref() {
@@ -160,8 +158,8 @@ impl Push {
         &self.stop
     }
 
-    /// Ends the push, unless it was cancelled before. An error that is a refusal gives [`State::Refused`], any
-    /// other [`State::Failed`]. Returns the state.
+    /// Ends the push, unless it was cancelled before. An error that is a refusal gives
+    /// [`State::Refused`], any other [`State::Failed`]. Returns the state.
     pub fn end(&self, result: Result<PushedVersion, PushError>) -> State {
         let mut status = self.status.lock();
         if !status.state.is_open() {
@@ -180,7 +178,8 @@ impl Push {
         status.state
     }
 
-    /// Ends a push whose result is reported elsewhere, unless it was cancelled before. Returns the state.
+    /// Ends a push whose result is reported elsewhere, unless it was cancelled before. Returns the
+    /// state.
     pub fn close(&self, result: Result<(), &PushError>) -> State {
         let mut status = self.status.lock();
         if status.state.is_open() {

@@ -7,7 +7,8 @@ use crate::{Frame, View};
 /// The views of a frame from the axes of each actor. A frame without actors has none.
 #[derive(Debug, Default)]
 pub(crate) struct ActorViews {
-    /// One list per view of the frame, in order of [`Scene::placed`](wildcity_scene::Scene::placed).
+    /// One list per view of the frame, in order of
+    /// [`Scene::placed`](wildcity_scene::Scene::placed).
     relative: Vec<Vec<View>>,
 }
 
@@ -22,7 +23,7 @@ impl ActorViews {
     }
 
     /// One view of the frame from the axes of each placed chunk, in order.
-    pub(crate) fn of(&self, view: usize) -> &[View] {
+    pub(crate) fn for_view(&self, view: usize) -> &[View] {
         self.relative.get(view).map_or(&[], Vec::as_slice)
     }
 

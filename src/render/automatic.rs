@@ -1,7 +1,9 @@
-//! Automatic choice of a backend (`--backend auto`): a GPU that passes a self-test, or else the cpu.
+//! Automatic choice of a backend (`--backend auto`): a GPU that passes a self-test, or else the
+//! cpu.
 //!
-//! A driver may be wrong without reporting an error. So a device first draws a small test scene twice. It is
-//! used only if both images have the same bytes and agree with those of the cpu backend.
+//! A driver may be wrong without reporting an error. So a device first draws a small test scene
+//! twice. It is used only if both images have the same bytes and agree with those of the cpu
+//! backend.
 
 use wildcity_scene::geometry::camera::Pinhole;
 use wildcity_scene::geometry::{Camera, Pose};
@@ -14,14 +16,13 @@ use super::{Backend, Frame, RenderError, Target, View};
 
 /// The chosen backend, and the reason for the choice.
 pub struct Selection {
-    /// The backend.
     pub backend: Box<dyn Backend>,
     /// One line for the operator.
     pub reason: String,
 }
 
-/// Chooses the fastest hardware device if it passes the self-test, or else the cpu backend. Software devices
-/// are correct but slow, and are never chosen. `limits` apply to a device.
+/// Chooses the fastest hardware device if it passes the self-test, or else the cpu backend.
+/// Software devices are correct but slow, and are never chosen. `limits` apply to a device.
 ///
 /// # Errors
 /// As [`Cpu::new`].
@@ -80,17 +81,18 @@ pub fn self_test(backend: &dyn Backend, truth: &dyn Backend) -> Result<f64, Self
     if db >= MIN_PSNR_DB { Ok(db) } else { Err(SelfTestError::Inaccurate { db }) }
 }
 
-/// Gaussians of the test scene. Its two views have about 46,000 splats, which are twelve blocks of the sort.
-/// Their 3,072 counters are two blocks of the scan. So every kernel runs with more than one workgroup.
+/// Gaussians of the test scene. Its two views have about 46,000 splats, which are twelve blocks of
+/// the sort. Their 3,072 counters are two blocks of the scan. So every kernel runs with more than
+/// one workgroup.
 const TEST_GAUSSIANS: usize = 30_000;
 
-/// Gaussians of all sizes, 1 to 60 m ahead, with colours of SH degree 1. Every 256th is large and faint
-/// (fog), and covers more macro tiles than one thread lists.
+/// Gaussians of all sizes, 1 to 60 m ahead, with colours of SH degree 1. Every 256th is large and
+/// faint (fog), and covers more macro tiles than one thread lists.
 fn test_scene() -> Scene {
     let mut gaussians = Gaussians::with_capacity(1, TEST_GAUSSIANS);
     for i in 0..TEST_GAUSSIANS {
-        // A low-discrepancy sequence: multiples of powers of the root of x⁹ = x + 1, modulo 1 (Roberts 2018).
-        // It needs no random number generator, so that the scene never changes.
+        // A low-discrepancy sequence: multiples of powers of the root of x⁹ = x + 1, modulo 1
+        // (Roberts 2018). It needs no random number generator, so that the scene never changes.
         let fraction = |power: i32| (0.5 + (i + 1) as f64 * 1.085_f64.powi(-power)).fract();
         let z_m = 60.0_f64.powf(fraction(1));
         let across = |power| 2.0 * fraction(power) - 1.0;

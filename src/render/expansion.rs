@@ -1,21 +1,25 @@
-//! When the expansion of a camera around a Gaussian's centre replaces the six points of the unscented transform.
+//! When the expansion of a camera around a Gaussian's centre replaces the six points of the
+//! unscented transform.
 //!
-//! The expansion has all terms of second order in the size of a Gaussian: they shift the mean and widen the
-//! covariance. The six points have terms of higher order as well, which matter only for Gaussians that are large for
-//! their distance. A bound of the difference, in pixels of mean and standard deviation together, decides for each
-//! Gaussian (profile field `lens_error_px`). Both fast backends have the same rule; the reference backend always
-//! projects six points.
+//! The expansion has all terms of second order in the size of a Gaussian: they shift the mean and
+//! widen the covariance. The six points have terms of higher order as well, which matter only for
+//! Gaussians that are large for their distance. A bound of the difference, in pixels of mean and
+//! standard deviation together, decides for each Gaussian (profile field `lens_error_px`). Both
+//! fast backends have the same rule; the reference backend always projects six points.
 //!
-//! With standard deviations as shares of the distance, `s` the largest and `Σ` the sum of their squares, the bound is
+//! With standard deviations as shares of the distance, `s` the largest and `Σ` the sum of their
+//! squares, the bound is
 //!
 //! ```text
 //! second Σ + third s³ + term of a rolling shutter
 //! ```
 //!
-//! - `third`: a column of the covariance's root has `t₁(v) + 3 t₃(v)`, where `t₁` and `t₃` are the terms of first and
-//!   third order. With the most pixels per radian L, a lens of r pixels at θ has `|t₃|` of at most about half of
-//!   `0.6 L + |r″|/2 + |r‴|/6`: perspective alone has `a c²`, at most 0.385, and the arc tangent `a³/3`.
-//! - `second`: second derivatives that the expansion leaves out, of OpenCV's distortion and of windshields.
+//! - `third`: a column of the covariance's root has `t₁(v) + 3 t₃(v)`, where `t₁` and `t₃` are the
+//!   terms of first and third order. With the most pixels per radian L, a lens of r pixels at θ has
+//!   `|t₃|` of at most about half of `0.6 L + |r″|/2 + |r‴|/6`: perspective alone has `a c²`, at
+//!   most 0.385, and the arc tangent `a³/3`.
+//! - `second`: second derivatives that the expansion leaves out, of OpenCV's distortion and of
+//!   windshields.
 
 use glam::{DVec2, DVec3};
 
@@ -39,9 +43,9 @@ impl ExpansionBound {
     /// Samples of a field along each axis.
     const STEPS: u32 = 9;
 
-    /// `None` if the profile asks for six points, or the camera has no expansion: windshields with polynomials
-    /// from the inside to the outside, and cameras that turn far during one exposure.
-    pub fn of(view: &View, profile: &RenderProfile) -> Option<Self> {
+    /// `None` if the profile asks for six points, or the camera has no expansion: windshields with
+    /// polynomials from the inside to the outside, and cameras that turn far during one exposure.
+    pub fn new(view: &View, profile: &RenderProfile) -> Option<Self> {
         let camera = &view.camera;
         let backward = camera
             .windshield
@@ -75,7 +79,8 @@ struct FieldBounds {
     third_px: f64,
 }
 
-/// The largest angle off the axis that the image shows, and a margin for Gaussians outside of it, in radians.
+/// The largest angle off the axis that the image shows, and a margin for Gaussians outside of it,
+/// in radians.
 fn max_seen_rad(camera: &Camera) -> f64 {
     camera.limit_rad().min(1.25 * camera.corner_rad() + 0.1)
 }
@@ -128,8 +133,8 @@ fn slopes(camera: &Camera) -> FieldBounds {
 
 /// A bound of a windshield's second derivatives within the image, per rad².
 ///
-/// Where its change of the angles φ, θ is ε per radian, it also has `ε tan φ` of the derivatives that these
-/// coordinates have on a sphere.
+/// Where its change of the angles φ, θ is ε per radian, it also has `ε tan φ` of the derivatives
+/// that these coordinates have on a sphere.
 fn windshield_bend(camera: &Camera, windshield: &Windshield) -> f64 {
     let bend = |polynomial: &Bivariate, identity: [f64; 2], at: DVec2| {
         let mut first = -DVec2::from_array(identity);

@@ -1,8 +1,9 @@
-//! The cpu backend up to a stage and the gpu backend from there, to find the gpu stage that is wrong.
+//! The cpu backend up to a stage and the gpu backend from there, to find the gpu stage that is
+//! wrong.
 //!
-//! The stages exchange [`StageOutputs`](crate::stage::StageOutputs). [`bisect`] draws a frame with every
-//! stage in turn as the last one on the cpu: the first gpu stage with which the image is still wrong is the
-//! faulty one.
+//! The stages exchange [`StageOutputs`](crate::stage::StageOutputs). [`bisect`] draws a frame with
+//! every stage in turn as the last one on the cpu: the first gpu stage with which the image is
+//! still wrong is the faulty one.
 
 use super::compare::psnr::{MIN_PSNR_DB, psnr_db, psnr_db_u8};
 use super::cpu::Cpu;
@@ -65,13 +66,13 @@ fn render_split(
     Ok(stats)
 }
 
-/// PSNR of the images of the gpu backend against those of the cpu backend, by the number of stages that run
-/// on the cpu.
+/// PSNR of the images of the gpu backend against those of the cpu backend, by the number of stages
+/// that run on the cpu.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Bisection {
-    /// The last stage on the cpu, if any, and the PSNR of all views in dB: the lesser of that of linear
-    /// colour and opacity and that of the 8-bit colour. Infinite if no value differs, NaN if the gpu failed
-    /// with [`RenderError::TooMany`].
+    /// The last stage on the cpu, if any, and the PSNR of all views in dB: the lesser of that of
+    /// linear colour and opacity and that of the 8-bit colour. Infinite if no value differs, NaN if
+    /// the gpu failed with [`RenderError::TooMany`].
     pub psnr_db: Vec<(Option<Stage>, f64)>,
 }
 
@@ -81,7 +82,7 @@ pub struct Bisection {
 /// As [`Backend::render`].
 pub fn bisect(cpu: &Cpu, gpu: &Gpu, frame: &Frame<'_>) -> Result<Bisection, RenderError> {
     let draw = |render: &dyn Fn(&mut [Target<'_>]) -> Result<FrameStats, RenderError>| {
-        let mut images = Images::of(frame.views);
+        let mut images = Images::new(frame.views);
         render(&mut images.targets())?;
         Ok(images)
     };
@@ -106,8 +107,8 @@ pub fn bisect(cpu: &Cpu, gpu: &Gpu, frame: &Frame<'_>) -> Result<Bisection, Rend
 impl Bisection {
     /// The name of the gpu stage that is wrong; `None` if every image is right.
     ///
-    /// Among the images that are wrong it takes the one with the most stages on the cpu: the first stage that
-    /// the gpu ran for it is the faulty one.
+    /// Among the images that are wrong it takes the one with the most stages on the cpu: the first
+    /// stage that the gpu ran for it is the faulty one.
     pub fn wrong(&self) -> Option<&'static str> {
         let is_right = |(_, db): &&(Option<Stage>, f64)| *db >= MIN_PSNR_DB;
         let right = self.psnr_db.iter().rev().take_while(is_right).count();
@@ -123,7 +124,7 @@ struct Images {
 }
 
 impl Images {
-    fn of(views: &[View]) -> Self {
+    fn new(views: &[View]) -> Self {
         let pixels = || views.iter().map(|view| view.camera.pixels());
         Self {
             rgba: pixels().map(|pixels| vec![0.0; 4 * pixels]).collect(),

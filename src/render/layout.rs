@@ -1,7 +1,7 @@
 //! Inputs of the fast backends: the scene and views in f64 become camera-relative f32.
 //!
-//! A position is subtracted from the camera's in f64, once per chunk and frame, and only the difference is
-//! rounded to f32: a twin 4,500 km from its origin loses nothing.
+//! A position is subtracted from the camera's in f64, once per chunk and frame, and only the
+//! difference is rounded to f32: a twin 4,500 km from its origin loses nothing.
 
 use std::sync::Arc;
 
@@ -31,7 +31,8 @@ pub struct Splat {
     pub rgb: [f32; 3],
     /// Camera-space z of the centre, in metres.
     pub depth_m: f32,
-    /// Half-size of the box outside of which alpha is below alpha_cut, in pixels, with [`EXTENT_SLACK_PX`].
+    /// Half-size of the box outside of which alpha is below alpha_cut, in pixels, with
+    /// [`EXTENT_SLACK_PX`].
     ///
     /// [`EXTENT_SLACK_PX`]: super::constants::EXTENT_SLACK_PX
     pub extent_px: [f32; 2],
@@ -46,7 +47,6 @@ pub struct Cutoffs {
     pub far_m: f32,
     /// Whether opacity is scaled down in proportion to the area that the blur adds to a splat.
     pub antialiased: bool,
-    /// Largest alpha.
     pub alpha_cap: f32,
     /// Base-2 logarithm of the smallest alpha.
     pub log2_alpha_cut: f32,
@@ -69,8 +69,8 @@ impl Cutoffs {
 
     /// The sort key of a splat: `view (4 bits) | depth (28 bits)`, from the nearest.
     ///
-    /// The bits of positive f32 rise with their values, so their difference from the bits of near is an exact
-    /// order; 28 bits reach 2^32 times near.
+    /// The bits of positive f32 rise with their values, so their difference from the bits of near
+    /// is an exact order; 28 bits reach 2^32 times near.
     #[inline(always)]
     pub fn sort_key(&self, view: usize, depth_m: f32) -> u32 {
         let depth = depth_m.to_bits() - self.near_m.to_bits();
@@ -85,17 +85,19 @@ impl Cutoffs {
 
 /// The variances that a view adds to the diagonal of screen covariances, along x and y, in px².
 ///
-/// The blur of a profile belongs to pixels of the camera's native size: a twin is trained on these. A pixel of
-/// an image whose sides are `s` times the native ones is the mean of native pixels. Their splats have the
-/// variance `s² blur` in its unit. The mean over `n = 1/s` pixels of width `s` adds that of their centres, a
-/// row of n points at distances s: `s² (n² - 1)/12 = (1 - s²)/12`. The mean keeps a splat's sum over all
-/// pixels, so its peak becomes lower as its area becomes larger, by `√(det before/det after)` of the average.
+/// The blur of a profile belongs to pixels of the camera's native size: a twin is trained on these.
+/// A pixel of an image whose sides are `s` times the native ones is the mean of native pixels.
+/// Their splats have the variance `s² blur` in its unit. The mean over `n = 1/s` pixels of width
+/// `s` adds that of their centres, a row of n points at distances s:
+/// `s² (n² - 1)/12 = (1 - s²)/12`. The mean keeps a splat's sum over all pixels, so its peak
+/// becomes lower as its area becomes larger, by `√(det before/det after)` of the average.
 ///
-/// Both are exact for a single splat. Where layers of splats end at the same edge, every layer covers the same
-/// part of a pixel, but blending multiplies what the layers let through as if their parts were independent, and
-/// so lets through too little. Measured best on two scenes at a half, a third and a quarter of the size: a
-/// spread of `(1 - s²)/15`, and a peak lower by the power 3/4 of the determinants' ratio instead of 1/2. That is
-/// 1.3 to 2.2 dB better, and makes a single splat lose a part of its sum (BENCHMARKS.md, "Small images").
+/// Both are exact for a single splat. Where layers of splats end at the same edge, every layer
+/// covers the same part of a pixel, but blending multiplies what the layers let through as if their
+/// parts were independent, and so lets through too little. Measured best on two scenes at a half, a
+/// third and a quarter of the size: a spread of `(1 - s²)/15`, and a peak lower by the power 3/4 of
+/// the determinants' ratio instead of 1/2. That is 1.3 to 2.2 dB better, and makes a single splat
+/// lose a part of its sum (BENCHMARKS.md, "Small images").
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PixelFilter {
     /// The profile's blur of native pixels.
@@ -115,7 +117,8 @@ pub(super) struct Filtered {
     pub(super) det: f64,
     /// Determinant before the blur of native pixels as a share of the one after it.
     pub(super) blur_share: f64,
-    /// Determinant after the blur of native pixels as a share of the one after the whole filter: 1 in a native image.
+    /// Determinant after the blur of native pixels as a share of the one after the whole filter: 1
+    /// in a native image.
     pub(super) shrink_share: f64,
 }
 
@@ -134,19 +137,24 @@ impl PixelFilter {
         Self { native_px2, total_px2 }
     }
 
-    /// Whether the image is smaller than the native one. If not, both variances are the profile's blur.
+    /// Whether the image is smaller than the native one. If not, both variances are the profile's
+    /// blur.
     #[inline(always)]
     pub fn is_shrunk(&self) -> bool {
         self.native_px2 != self.total_px2
     }
 
-    /// A screen covariance with its diagonal `xx`, `yy` and its determinant, in px², after the filter.
+    /// A screen covariance with its diagonal `xx`, `yy` and its determinant, in px², after the
+    /// filter.
     #[inline(always)]
     pub(super) fn filtered(&self, xx: f64, yy: f64, det_before: f64) -> Filtered {
         // A native image keeps its order of sums, and so its bytes.
-        let det_with = |add: DVec2| match self.is_shrunk() {
-            true => det_before + add.x * (yy + add.y) + add.y * xx,
-            false => det_before + add.x * (xx + yy + add.x),
+        let det_with = |add: DVec2| {
+            if self.is_shrunk() {
+                det_before + add.x * (yy + add.y) + add.y * xx
+            } else {
+                det_before + add.x * (xx + yy + add.x)
+            }
         };
         let det_native = det_with(self.native_px2);
         let det = det_with(self.total_px2);
@@ -178,8 +186,8 @@ pub struct ChunkView {
     pub rotation: [[f32; 3]; 3],
     /// The chunk's origin in camera space, in metres.
     pub translation_m: [f32; 3],
-    /// The camera's forward axis in the world, and the camera-space z of the chunk's origin in metres. In
-    /// f64, so that surfels of one plane are not ordered by rounding errors.
+    /// The camera's forward axis in the world, and the camera-space z of the chunk's origin in
+    /// metres. In f64, so that surfels of one plane are not ordered by rounding errors.
     pub forward: [f64; 4],
     /// The camera's centre relative to the chunk's origin, in world axes, in metres.
     pub camera_m: [f32; 3],
@@ -193,7 +201,6 @@ pub struct ChunkView {
     pub filter: PixelFilter,
     /// Smallest slope x/z and y/z at which the projection is linearised.
     pub slope_min: [f32; 2],
-    /// Largest slope.
     pub slope_max: [f32; 2],
 }
 
@@ -254,8 +261,8 @@ impl ChunkShadow {
         })
     }
 
-    /// Whether the shadow can fall on a Gaussian with its centre in a box, relative to the chunk's origin, in
-    /// metres; `true` when in doubt.
+    /// Whether the shadow can fall on a Gaussian with its centre in a box, relative to the chunk's
+    /// origin, in metres; `true` when in doubt.
     pub fn may_touch(&self, min_m: Vec3, max_m: Vec3) -> bool {
         let center_m = (0.5 * (min_m + max_m)).extend(1.0);
         let half_m = 0.5 * (max_m - min_m);
@@ -286,13 +293,14 @@ impl ChunkShadow {
 
 /// Half-spaces in which every Gaussian misses the image, to cull whole clusters of 256 at once.
 ///
-/// The bound is that of the linearised projection and not of the true ellipsoid: a linearised splat can be
-/// wider than the ellipsoid's outline, and culling must not change a pixel. A splat misses the left edge when
-/// `fx x/z + cx + k s (fx/z) √(1 + t²) + k √blur < 0`, where `s` is its largest standard deviation, `t` its
-/// clamped slope, `k` the extent in standard deviations and `blur` that of the [`PixelFilter`]: `√cov_xx` is
-/// at most `(fx/z) √(1 + t²) s + √blur`. Multiplied by `z/fx` the condition is linear in the centre:
-/// `x + ((cx + k √blur)/fx) z + k s √(1 + t²) < 0`. The other edges are analogous. Near and far have no
-/// width, since only centres are compared with them.
+/// The bound is that of the linearised projection and not of the true ellipsoid: a linearised splat
+/// can be wider than the ellipsoid's outline, and culling must not change a pixel. A splat misses
+/// the left edge when `fx x/z + cx + k s (fx/z) √(1 + t²) + k √blur < 0`, where `s` is its largest
+/// standard deviation, `t` its clamped slope, `k` the extent in standard deviations and `blur` that
+/// of the [`PixelFilter`]: `√cov_xx` is at most `(fx/z) √(1 + t²) s + √blur`. Multiplied by `z/fx`
+/// the condition is linear in the centre: `x + ((cx + k √blur)/fx) z + k s √(1 + t²) < 0`. The
+/// other edges are analogous. Near and far have no width, since only centres are compared with
+/// them.
 #[derive(Clone, Copy, Debug)]
 pub struct Frustum {
     planes: [Plane; 6],
@@ -341,9 +349,9 @@ impl Frustum {
         Self { planes: camera_planes.map(plane) }
     }
 
-    /// Whether a Gaussian with its centre in a box, relative to the chunk's origin, and standard deviations
-    /// up to `sigma_m` can touch the image; `true` when in doubt. The test allows for rounding errors of 1e-5
-    /// of the terms' size.
+    /// Whether a Gaussian with its centre in a box, relative to the chunk's origin, and standard
+    /// deviations up to `sigma_m` can touch the image; `true` when in doubt. The test allows for
+    /// rounding errors of 1e-5 of the terms' size.
     pub fn may_see(&self, min_m: Vec3, max_m: Vec3, sigma_m: f32) -> bool {
         let center = 0.5 * (min_m + max_m);
         let half = 0.5 * (max_m - min_m);
@@ -362,7 +370,8 @@ mod tests {
     use wildcity_scene::actor::ContactShadow;
     use wildcity_scene::geometry::Pose;
 
-    /// Boxes around an actor that is turned: the test may only reject those without a shadowed corner.
+    /// Boxes around an actor that is turned: the test may only reject those without a shadowed
+    /// corner.
     #[test]
     fn no_box_with_a_shadowed_corner_is_skipped() {
         let world_from_actor = Pose {

@@ -1,4 +1,5 @@
-//! The renderer: images of all cameras of one step, by one of several backends that compute the same images.
+//! The renderer: images of all cameras of one step, by one of several backends that compute the
+//! same images.
 //!
 //! | backend | arithmetic | purpose |
 //! |---|---|---|
@@ -6,12 +7,12 @@
 //! | [`cpu`] | f32, SIMD, all cores | the default without a GPU |
 //! | [`gpu`] | f32, WGSL compute shaders, one per stage | the fastest |
 //!
-//! The stages project, sort, bin, rasterize and resolve have the same names in the cpu and the gpu backend.
-//! Two combinations exist: [`automatic`] chooses a backend, and [`hybrid`] runs the first stages on the cpu
-//! and the rest on the gpu. [`compare`] measures how far images differ.
+//! The stages project, sort, bin, rasterize and resolve have the same names in the cpu and the gpu
+//! backend. Two combinations exist: [`automatic`] chooses a backend, and [`hybrid`] runs the first
+//! stages on the cpu and the rest on the gpu. [`compare`] measures how far images differ.
 //!
-//! An image is a function of (scene, render profile, views). It depends on no clock, no cache and no number
-//! of threads.
+//! An image is a function of (scene, render profile, views). It depends on no clock, no cache and
+//! no number of threads.
 
 mod actor_views;
 pub mod automatic;
@@ -45,7 +46,6 @@ pub use view::{Readout, RollingShutter, View};
 /// The input of a render call: all views of one step.
 #[derive(Clone, Copy, Debug)]
 pub struct Frame<'a> {
-    /// The scene.
     pub scene: &'a Scene,
     /// The accuracy and the thresholds.
     pub profile: &'a RenderProfile,
@@ -62,33 +62,34 @@ pub const FIRST_ACTOR_INSTANCE: u16 = 2;
 /// Most views of one frame: the cameras of the largest rig.
 pub const MAX_VIEWS: usize = Rig::MAX_CAMERAS;
 
-/// Buffers for the images of one view, row by row from the top; an image that is `None` is not computed.
-/// A backend writes every value of each buffer that it is given, whatever it held before. Pixels outside of the lens'
-/// field are 0 in all of them.
+/// Buffers for the images of one view, row by row from the top; an image that is `None` is not
+/// computed. A backend writes every value of each buffer that it is given, whatever it held before.
+/// Pixels outside of the lens' field are 0 in all of them.
 #[derive(Debug, Default)]
 pub struct Target<'a> {
-    /// `[height, width, 4]`: linear red, green and blue of the Gaussians (premultiplied) over the sky or the
-    /// background; and the opacity of the Gaussians only.
+    /// `[height, width, 4]`: linear red, green and blue of the Gaussians (premultiplied) over the
+    /// sky or the background; and the opacity of the Gaussians only.
     pub rgba: Option<&'a mut [f32]>,
     /// `[height, width, 3]`: the same colours, clamped to [0, 1] and rounded to 8 bits.
     pub rgb8: Option<&'a mut [u8]>,
-    /// `[height, width]`: expected depth ([`Camera::depth_m`]: z, or the distance for a lens that may see 90°
-    /// and more) in metres, 0 where opacity is 0.
+    /// `[height, width]`: expected depth ([`Camera::depth_m`]: z, or the distance for a lens that
+    /// may see 90° and more) in metres, 0 where opacity is 0.
     pub depth_m: Option<&'a mut [f32]>,
     /// `[height, width]`: accumulated opacity, a measure of the validity of the depth.
     pub opacity: Option<&'a mut [f32]>,
-    /// `[height, width, 3]`: unit normals of the surfaces of `depth_m`, which is then required, too. They are
-    /// in the camera's axes and point towards the camera; 0 where there is no depth.
+    /// `[height, width, 3]`: unit normals of the surfaces of `depth_m`, which is then required,
+    /// too. They are in the camera's axes and point towards the camera; 0 where there is no depth.
     pub normals: Option<&'a mut [f32]>,
-    /// `[height, width]`: owner of the Gaussian that brings the transmittance to a half or less: 0 none,
-    /// [`TWIN_INSTANCE`] the twin, and `k` + [`FIRST_ACTOR_INSTANCE`] actor `k`.
+    /// `[height, width]`: owner of the Gaussian that brings the transmittance to a half or less: 0
+    /// none, [`TWIN_INSTANCE`] the twin, and `k` + [`FIRST_ACTOR_INSTANCE`] actor `k`.
     pub instances: Option<&'a mut [u16]>,
     /// The camera's exposure and overlay, applied to `rgba` and `rgb8`.
     pub appearance: Option<&'a Appearance>,
 }
 
 impl Target<'_> {
-    /// The last step of every backend: masks pixels outside of the lens' field, and computes normals.
+    /// The last step of every backend: masks pixels outside of the lens' field, and computes
+    /// normals.
     fn finish(&mut self, view: &View) {
         self.mask(&view.camera);
         if let (Some(depth_m), Some(normals)) = (&self.depth_m, &mut self.normals) {
@@ -98,7 +99,7 @@ impl Target<'_> {
 
     /// Zeroes the pixels outside of the lens' field. A pinhole has none.
     fn mask(&mut self, camera: &Camera) {
-        let Some(field) = FieldMask::of(camera) else { return };
+        let Some(field) = FieldMask::from_camera(camera) else { return };
         if let Some(rgb8) = &mut self.rgb8 {
             field.clear_outside(camera, 3, rgb8);
         }
@@ -114,8 +115,8 @@ impl Target<'_> {
     }
 }
 
-/// Called once per view from a worker thread, with the view's index, as soon as its pixels are final: one
-/// image can be encoded while others are still drawn.
+/// Called once per view from a worker thread, with the view's index, as soon as its pixels are
+/// final: one image can be encoded while others are still drawn.
 pub type OnViewDone<'a> = &'a (dyn Fn(usize, &Target<'_>) + Sync);
 
 /// Time and work of a frame.
@@ -129,7 +130,8 @@ pub struct FrameStats {
     pub instances: u64,
     /// Number of Gaussian-pixel evaluations of the rasterizer, with those of idle lanes.
     pub evaluations: u64,
-    /// Largest size of the intermediate buffers in the machine's memory, in bytes. 0 if the backend does not count it.
+    /// Largest size of the intermediate buffers in the machine's memory, in bytes. 0 if the backend
+    /// does not count it.
     pub held_bytes: u64,
 }
 
@@ -138,43 +140,31 @@ pub struct FrameStats {
 pub enum RenderError {
     /// No view, or more than the sort key has bits for.
     #[error("a frame has 1 to {MAX_VIEWS} views, not {count}")]
-    Views {
-        /// The given number.
-        count: usize,
-    },
+    Views { count: usize },
     /// The profile asks for exact rays, and the backend draws only splats.
     #[error(
         "the {backend} backend draws splats, and the profile asks for rays=exact: use the reference \
          backend, or rays=splats"
     )]
-    ExactRays {
-        /// The backend's name.
-        backend: &'static str,
-    },
+    ExactRays { backend: &'static str },
     /// A target's buffer does not have its view's size.
     #[error(
         "view {view}: buffer {buffer} holds {given} values; the camera's size asks for {wanted}"
     )]
     TargetSize {
-        /// Which view.
         view: usize,
         /// The field of [`Target`].
         buffer: &'static str,
-        /// Its length.
         given: usize,
         /// The length that the camera's size requires.
         wanted: usize,
     },
     /// Normals are requested without depth.
     #[error("view {view}: normals are computed from depth: give depth_m a buffer, too")]
-    Normals {
-        /// Which view.
-        view: usize,
-    },
+    Normals { view: usize },
     /// An overlay does not have its view's size.
     #[error("view {view}: the overlay is {given:?} pixels, and the image {wanted:?}")]
     Overlay {
-        /// Which view.
         view: usize,
         /// Width and height of the overlay.
         given: [u32; 2],
@@ -183,12 +173,7 @@ pub enum RenderError {
     },
     /// The number of targets differs from the number of views.
     #[error("{targets} targets for {views} views; each view needs its own")]
-    Targets {
-        /// Number of targets.
-        targets: usize,
-        /// Number of views.
-        views: usize,
-    },
+    Targets { targets: usize, views: usize },
     /// The frame exceeds a limit of the backend.
     #[error("the frame needs more than {limit} {what}: ask for smaller images or fewer views")]
     TooMany {
@@ -211,10 +196,10 @@ pub enum RenderError {
     /// The sky cannot be drawn as the profile asks.
     #[error(transparent)]
     Sky(#[from] SkyError),
-    /// More actors than [`PlacedChunk::MAX_ACTORS`](wildcity_scene::actor::PlacedChunk::MAX_ACTORS).
+    /// More actors than
+    /// [`PlacedChunk::MAX_ACTORS`](wildcity_scene::actor::PlacedChunk::MAX_ACTORS).
     #[error("{placed} chunks of actors are placed; at most {limit} are drawn: remove actors")]
     Actors {
-        /// The given number.
         placed: usize,
         /// The largest number that is drawn.
         limit: usize,
@@ -222,7 +207,6 @@ pub enum RenderError {
     /// The device failed. The next frame opens it again.
     #[error("{device} failed: {reason}")]
     Device {
-        /// The device's name.
         device: String,
         /// The driver's error message.
         reason: String,
@@ -234,7 +218,8 @@ pub trait Backend: Send + Sync {
     /// The name, as in `--backend` and in observations.
     fn name(&self) -> &'static str;
 
-    /// The instruction set or the device, on which the last bit of a pixel may depend. May be empty.
+    /// The instruction set or the device, on which the last bit of a pixel may depend. May be
+    /// empty.
     fn detail(&self) -> String {
         String::new()
     }
@@ -245,8 +230,8 @@ pub trait Backend: Send + Sync {
     }
 
     /// Number of frames that it processes at once: up to this number, more concurrent callers of
-    /// [`Backend::render`] increase the throughput. It is 1 for a backend that uses the whole machine for one
-    /// frame.
+    /// [`Backend::render`] increase the throughput. It is 1 for a backend that uses the whole
+    /// machine for one frame.
     fn frames_in_flight(&self) -> usize {
         1
     }
@@ -256,18 +241,19 @@ pub trait Backend: Send + Sync {
         false
     }
 
-    /// Whether a small frame that is rendered while a large one is gets its share of the machine at once, so that it
-    /// need not wait for the large one, even if [`Backend::frames_in_flight`] is 1.
+    /// Whether a small frame that is rendered while a large one is gets its share of the machine at
+    /// once, so that it need not wait for the large one, even if [`Backend::frames_in_flight`] is
+    /// 1.
     fn renders_beside(&self) -> bool {
         false
     }
 
-    /// Limits the intermediate buffers between the stages of a frame, in bytes. With less memory a frame is drawn in
-    /// more parts, one after the other; its images do not depend on the limit.
+    /// Limits the intermediate buffers between the stages of a frame, in bytes. With less memory a
+    /// frame is drawn in more parts, one after the other; its images do not depend on the limit.
     fn limit_frame_bytes(&self, _bytes: u64) {}
 
-    /// Upper bound of its intermediate buffers in the machine's memory for a frame of these views, whatever the scene,
-    /// in bytes.
+    /// Upper bound of its intermediate buffers in the machine's memory for a frame of these views,
+    /// whatever the scene, in bytes.
     fn frame_bytes(&self, _views: &[View]) -> u64 {
         0
     }
@@ -277,10 +263,12 @@ pub trait Backend: Send + Sync {
         0
     }
 
-    /// Renders all views into their targets, `targets[i]` for `views[i]`, and calls `on_view_done` for each.
+    /// Renders all views into their targets, `targets[i]` for `views[i]`, and calls `on_view_done`
+    /// for each.
     ///
     /// # Errors
-    /// See [`RenderError`]. Except for a failing device, the same frame gives the same result every time.
+    /// See [`RenderError`]. Except for a failing device, the same frame gives the same result every
+    /// time.
     fn render(
         &self,
         frame: &Frame<'_>,
@@ -290,8 +278,8 @@ pub trait Backend: Send + Sync {
 }
 
 impl Frame<'_> {
-    /// The background, and the matrix `sky_from_world` that takes directions to its axes: the sky, or the
-    /// profile's background as a sky of one colour; `None` if that is black.
+    /// The background, and the matrix `sky_from_world` that takes directions to its axes: the sky,
+    /// or the profile's background as a sky of one colour; `None` if that is black.
     ///
     /// # Errors
     /// [`RenderError::Sky`].
@@ -366,9 +354,6 @@ impl Frame<'_> {
             return Err(RenderError::Actors { placed, limit });
         }
         let count = self.views.len();
-        match (1..=MAX_VIEWS).contains(&count) {
-            true => Ok(()),
-            false => Err(RenderError::Views { count }),
-        }
+        if (1..=MAX_VIEWS).contains(&count) { Ok(()) } else { Err(RenderError::Views { count }) }
     }
 }

@@ -1,33 +1,36 @@
 //! Surface normals of a depth image.
 //!
-//! Neighbouring pixels are points of one surface, and the cross product of the vectors between them is
-//! perpendicular to it. So normals are the same function of the depth image in every backend, cost nothing
-//! unless they are requested, and are as smooth as the depth. Rays are those of the camera, with its lens and
-//! shutter.
+//! Neighbouring pixels are points of one surface, and the cross product of the vectors between them
+//! is perpendicular to it. So normals are the same function of the depth image in every backend,
+//! cost nothing unless they are requested, and are as smooth as the depth. Rays are those of the
+//! camera, with its lens and shutter.
 //!
-//! Blending the Gaussians' own axes would take three more sums in every backend's inner loop. On a wall made
-//! of small discs, half of the pixels are within 0.2° behind a pinhole and 0.7° behind a fisheye.
+//! Blending the Gaussians' own axes would take three more sums in every backend's inner loop. On a
+//! wall made of small discs, half of the pixels are within 0.2° behind a pinhole and 0.7° behind a
+//! fisheye.
 //!
-//! Two neighbours belong to one surface if 1/depth changes linearly, as it does on every plane. So an edge between
-//! two surfaces is not mistaken for a slope.
+//! Two neighbours belong to one surface if 1/depth changes linearly, as it does on every plane. So
+//! an edge between two surfaces is not mistaken for a slope.
 
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
 use super::View;
 
-/// The largest second difference of 1/depth over three pixels, as a share of it, that is not an edge. 1/depth
-/// of a plane is linear over a pinhole's image; at 10 m this is a step of 10 cm, such as a kerb.
+/// The largest second difference of 1/depth over three pixels, as a share of it, that is not an
+/// edge. 1/depth of a plane is linear over a pinhole's image; at 10 m this is a step of 10 cm, such
+/// as a kerb.
 const EDGE_SHARE: f64 = 0.01;
 
-/// Rows of one parallel job. The points of the two rows around them are computed twice: 3 % more work.
+/// Rows of one parallel job. The points of the two rows around them are computed twice: 3 % more
+/// work.
 const ROWS: usize = 64;
 
-/// Writes unit normals `[height, width, 3]` in the axes of the camera at the end of its exposure (x right, y
-/// down, z forward), towards the camera; 0 where a pixel has no depth.
+/// Writes unit normals `[height, width, 3]` in the axes of the camera at the end of its exposure (x
+/// right, y down, z forward), towards the camera; 0 where a pixel has no depth.
 ///
-/// A pixel without a neighbour to compare with, in its row or in its column, does not show how its surface is
-/// inclined in that direction. The surface is then taken as facing the camera there.
+/// A pixel without a neighbour to compare with, in its row or in its column, does not show how its
+/// surface is inclined in that direction. The surface is then taken as facing the camera there.
 ///
 /// `depth_m` is `[height, width]`, 0 where there is no surface.
 pub(super) fn write(view: &View, depth_m: &[f32], normals: &mut [f32]) {
@@ -105,15 +108,15 @@ fn points(view: &View, depth_m: &[f32], row: usize) -> Vec<Option<Point>> {
     depth_m[row * width..][..width].iter().enumerate().map(point).collect()
 }
 
-/// The unit vector perpendicular to a vector along the surface that is closest to the ray's line. `None` if the
-/// surface is along the ray.
+/// The unit vector perpendicular to a vector along the surface that is closest to the ray's line.
+/// `None` if the surface is along the ray.
 fn perpendicular(ray: DVec3, along: DVec3) -> Option<DVec3> {
     let along = along.try_normalize()?;
     (ray - along * ray.dot(along)).try_normalize()
 }
 
-/// A vector along the surface: from one neighbour to the other, or between the pixel and the neighbour that
-/// is on the same surface.
+/// A vector along the surface: from one neighbour to the other, or between the pixel and the
+/// neighbour that is on the same surface.
 fn tangent(before: Option<Point>, here: Point, after: Option<Point>) -> Option<DVec3> {
     let (to, from) = match (before, after) {
         (Some(before), Some(after)) => {

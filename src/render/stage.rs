@@ -1,17 +1,17 @@
-//! The outputs of the stages project, sort and bin, in one plain form that every tiled backend can give and
-//! take.
+//! The outputs of the stages project, sort and bin, in one plain form that every tiled backend can
+//! give and take.
 //!
 //! The cpu backend gives them after any stage, and the gpu backend continues from them
-//! ([`hybrid`](crate::hybrid)), so that a wrong image is traced to its stage (`wildcity bisect`). Tests
-//! compare single stages on the same buffers: each mutation of the shaders in `tests/gpu/mutations.rs` must fail
-//! the stages that share the mutated shader, and no other. (The idea is Vello's "CPU up to a stage".)
+//! ([`hybrid`](crate::hybrid)), so that a wrong image is traced to its stage (`wildcity bisect`).
+//! Tests compare single stages on the same buffers: each mutation of the shaders in
+//! `tests/gpu/mutations.rs` must fail the stages that share the mutated shader, and no other. (The
+//! idea is Vello's "CPU up to a stage".)
 
 use super::layout::Splat;
 
 /// A stage with an output for the next one. The last stage, rasterize, produces pixels instead.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Stage {
-    /// Gaussians become splats.
     Project,
     /// Splats are put in order of (view, depth).
     Sort,
@@ -33,8 +33,8 @@ impl Stage {
     }
 }
 
-/// The outputs of a frame's stages up to one of them. The output of sort requires that of project, and that
-/// of bin requires both.
+/// The outputs of a frame's stages up to one of them. The output of sort requires that of project,
+/// and that of bin requires both.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StageOutputs {
     /// Output of project: all views' splats, in order of (view, global id).
@@ -43,10 +43,9 @@ pub struct StageOutputs {
     pub keys: Vec<u32>,
     /// Output of sort: indices of splats in order of their keys, equal keys in order of indices.
     pub order: Option<Vec<u32>>,
-    /// Output of bin.
     pub tiles: Option<TileLists>,
-    /// Output of project: the owners of the splats, for instance ids, in order of `first_splat`. Empty on the gpu
-    /// backend.
+    /// Output of project: the owners of the splats, for instance ids, in order of `first_splat`.
+    /// Empty on the gpu backend.
     pub owners: Vec<SplatOwner>,
 }
 

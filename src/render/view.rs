@@ -14,11 +14,11 @@ pub struct View {
     pub camera: Camera,
     /// The camera's pose at the end of the exposure.
     pub world_from_camera: Pose,
-    /// The camera's motion while its rows are exposed; `None` if all are exposed at once, or the camera is at
-    /// rest.
+    /// The camera's motion while its rows are exposed; `None` if all are exposed at once, or the
+    /// camera is at rest.
     pub rolling_shutter: Option<RollingShutter>,
-    /// How its rows are exposed, if one after the other: actors move during the exposure even if the camera is at
-    /// rest. Without it, as in `rolling_shutter`.
+    /// How its rows are exposed, if one after the other: actors move during the exposure even if
+    /// the camera is at rest. Without it, as in `rolling_shutter`.
     pub readout: Option<Readout>,
 }
 
@@ -40,13 +40,13 @@ pub struct RollingShutter {
     pub world_from_camera_first: Pose,
 }
 
-/// A rolling shutter relative to the camera's frame at the end of the exposure, so that f32 loses little: the
-/// remaining part of the exposure, and of the camera's motion, while a place of the image is exposed. The motion
-/// is that of [`Pose::interpolate`].
+/// A rolling shutter relative to the camera's frame at the end of the exposure, so that f32 loses
+/// little: the remaining part of the exposure, and of the camera's motion, while a place of the
+/// image is exposed. The motion is that of [`Pose::interpolate`].
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ShutterMotion {
-    /// `[a, b, c]`: at (x, y) of the image, in pixels, the fraction `a x + b y + c` of the exposure remains,
-    /// clamped to 0 to 1.
+    /// `[a, b, c]`: at (x, y) of the image, in pixels, the fraction `a x + b y + c` of the exposure
+    /// remains, clamped to 0 to 1.
     pub(super) remaining: [f64; 3],
     /// The camera's translation during the whole exposure, in metres, in world axes.
     pub(super) translation_world_m: DVec3,
@@ -75,7 +75,8 @@ impl View {
     /// Most rounds of the search for the row that sees a point.
     const MAX_ROUNDS: u32 = 32;
 
-    /// The search ends when the moment changes by at most this fraction of the exposure: 1e-7 of 1 m.
+    /// The search ends when the moment changes by at most this fraction of the exposure: 1e-7 of 1
+    /// m.
     const CONVERGED: f64 = 1e-7;
 
     /// A camera at rest.
@@ -84,13 +85,14 @@ impl View {
     }
 
     /// The cameras of a rig at rest.
-    pub fn of_rig(cameras: &[RigCamera], world_from_rig: Pose) -> Vec<Self> {
-        Self::of_moving_rig(cameras, world_from_rig, &|_| world_from_rig)
+    pub fn from_rig(cameras: &[RigCamera], world_from_rig: Pose) -> Vec<Self> {
+        Self::from_moving_rig(cameras, world_from_rig, &|_| world_from_rig)
     }
 
-    /// The cameras of a rig with the pose `world_from_rig` now, and the pose `world_from_rig_before(age_us)`
-    /// that many microseconds ago, which cameras with a rolling shutter need.
-    pub fn of_moving_rig(
+    /// The cameras of a rig with the pose `world_from_rig` now, and the pose
+    /// `world_from_rig_before(age_us)` that many microseconds ago, which cameras with a rolling
+    /// shutter need.
+    pub fn from_moving_rig(
         cameras: &[RigCamera],
         world_from_rig: Pose,
         world_from_rig_before: &dyn Fn(i64) -> Pose,
@@ -116,8 +118,9 @@ impl View {
         cameras.iter().map(view).collect()
     }
 
-    /// The longest time from the first row of an image to its last among some cameras, in microseconds: how long
-    /// before a frame's time [`PlacedChunk::world_from_actor_at_start`] is. 0 without rolling shutters.
+    /// The longest time from the first row of an image to its last among some cameras, in
+    /// microseconds: how long before a frame's time [`PlacedChunk::world_from_actor_at_start`] is.
+    /// 0 without rolling shutters.
     pub fn longest_exposure_us(cameras: &[RigCamera]) -> i64 {
         let durations = cameras.iter().filter_map(|camera| camera.shutter);
         durations.map(|shutter| shutter.duration_us).max().unwrap_or(0)
@@ -125,9 +128,10 @@ impl View {
 
     /// This view from an actor's axes: how the camera sees the Gaussians of a placed chunk.
     ///
-    /// The camera's motion relative to the actor is taken as that of [`Pose::interpolate`] between its ends. This is
-    /// exact for an actor that does not turn. For one that turns by an angle α during the exposure, the camera's arc
-    /// around it at a distance r is replaced by the chord, which is r α²/8 away: 0.6 mm at 20 m, 0.5 rad/s and 30 ms.
+    /// The camera's motion relative to the actor is taken as that of [`Pose::interpolate`] between
+    /// its ends. This is exact for an actor that does not turn. For one that turns by an angle α
+    /// during the exposure, the camera's arc around it at a distance r is replaced by the chord,
+    /// which is r α²/8 away: 0.6 mm at 20 m, 0.5 rad/s and 30 ms.
     pub fn seen_from(&self, placed: &PlacedChunk) -> Self {
         let last = relative_pose(&placed.world_from_actor, &self.world_from_camera);
         let from_shutter = self
@@ -164,15 +168,16 @@ impl View {
         }
     }
 
-    /// The unit direction, in the world, in which a place of the image, in pixels, looks; `None` outside of the
-    /// lens' field. The ray's origin is the position of [`View::world_from_camera_at`].
+    /// The unit direction, in the world, in which a place of the image, in pixels, looks; `None`
+    /// outside of the lens' field. The ray's origin is the position of
+    /// [`View::world_from_camera_at`].
     pub fn ray_world(&self, at_px: DVec2) -> Option<DVec3> {
         let direction = self.camera.unproject(at_px)?;
         Some(self.world_from_camera_at(at_px).rotation * direction)
     }
 
-    /// For a static pinhole: rows that take `(x, y, 1)` of the image to a direction in a sky's axes, of any
-    /// length. f32 is accurate to 1e-7 rad, since only the direction matters.
+    /// For a static pinhole: rows that take `(x, y, 1)` of the image to a direction in a sky's
+    /// axes, of any length. f32 is accurate to 1e-7 rad, since only the direction matters.
     pub(super) fn sky_from_pixel(&self, sky_from_world: DMat3) -> [[f32; 3]; 3] {
         let p = &self.camera.pinhole;
         let camera_from_pixel = DMat3::from_cols(
@@ -198,13 +203,13 @@ impl View {
 
     /// The image of a point of the world, with the lens extrapolated beyond its field.
     ///
-    /// With a rolling shutter, the row decides when a point is exposed, that decides the camera's pose, and
-    /// the pose decides the row. A fixed-point iteration finds the moment, beginning with `first_guess`. Each
-    /// round multiplies the error by what the image moves per row: a tenth for an object that passes close
-    /// by. Where an object passes so close that a round leaves more than half of the error, the interval
-    /// between a moment that is too early and one that is too late is halved instead. An object that moves
-    /// over the image as fast as the rows are read may have several solutions; it is found on one of them, or
-    /// outside of the image.
+    /// With a rolling shutter, the row decides when a point is exposed, that decides the camera's
+    /// pose, and the pose decides the row. A fixed-point iteration finds the moment, beginning with
+    /// `first_guess`. Each round multiplies the error by what the image moves per row: a tenth for
+    /// an object that passes close by. Where an object passes so close that a round leaves more
+    /// than half of the error, the interval between a moment that is too early and one that is too
+    /// late is halved instead. An object that moves over the image as fast as the rows are read may
+    /// have several solutions; it is found on one of them, or outside of the image.
     #[inline(always)]
     pub fn project_extrapolated(&self, world_m: DVec3, first_guess: f64) -> ProjectedPoint {
         let project_at = |fraction: f64, world_from_camera: Pose| {
@@ -247,8 +252,8 @@ impl View {
             self.rolling_shutter.as_ref()?;
         let last = &self.world_from_camera;
         let Camera { width_px, height_px, .. } = self.camera;
-        // Slope and offset of the remaining fraction along an axis: 1 at the middle of the first row or
-        // column, 0 at the middle of the last; a single row is the last one.
+        // Slope and offset of the remaining fraction along an axis: 1 at the middle of the first
+        // row or column, 0 at the middle of the last; a single row is the last one.
         let along = |size_px: u32| {
             let last_px = f64::from(size_px) - 1.0;
             if last_px > 0.0 { [-1.0 / last_px, 1.0 + 0.5 / last_px] } else { [0.0; 2] }
@@ -272,7 +277,8 @@ impl View {
         };
         let translation_world_m = last.position_m - first.position_m;
         let rotation = first.rotation.inverse() * last.rotation;
-        // Take the quaternion of the rotation that has the smaller angle; the other has the opposite sign.
+        // Take the quaternion of the rotation that has the smaller angle; the other has the
+        // opposite sign.
         let rotation = if rotation.w < 0.0 { -rotation } else { rotation };
         let sine = rotation.xyz().length();
         Some(ShutterMotion {
@@ -296,7 +302,8 @@ impl View {
     }
 }
 
-/// `world_from_a⁻¹ world_from_b`. Positions are subtracted first, so that little is lost far from the world's origin.
+/// `world_from_a⁻¹ world_from_b`. Positions are subtracted first, so that little is lost far from
+/// the world's origin.
 fn relative_pose(world_from_a: &Pose, world_from_b: &Pose) -> Pose {
     let a_from_world = world_from_a.rotation.inverse();
     Pose {

@@ -8,7 +8,6 @@ pub enum RepairError {
     /// A field of the manifest is wrong.
     #[error("{}: {field}: {message}", file.display())]
     Manifest {
-        /// The manifest.
         file: PathBuf,
         /// The path of the field, such as `inputs[0].role`.
         field: String,
@@ -29,7 +28,6 @@ pub enum RepairError {
     /// A file cannot be read.
     #[error("{}: {message}", path.display())]
     File {
-        /// The file.
         path: PathBuf,
         /// The message of the operating system, or the limit.
         message: String,
@@ -40,7 +38,6 @@ pub enum RepairError {
          hash if you trust it", path.display()
     )]
     Changed {
-        /// The file.
         path: PathBuf,
         /// The entry of the manifest, such as `files[0]`.
         field: String,
@@ -87,7 +84,6 @@ pub enum RepairError {
     /// The runtime cannot read the model.
     #[error("{}: the runtime refuses the model: {message}", path.display())]
     Graph {
-        /// The .onnx file.
         path: PathBuf,
         /// The message of the runtime.
         message: String,
@@ -95,7 +91,6 @@ pub enum RepairError {
     /// Building the session took too long.
     #[error("{}: the model was not ready within {limit_s} s", path.display())]
     LoadTimeout {
-        /// The .onnx file.
         path: PathBuf,
         /// The limit, in seconds.
         limit_s: u64,
@@ -116,9 +111,7 @@ pub enum RepairError {
     Shape {
         /// The name of the output.
         output: String,
-        /// The promised shape.
         wanted: Vec<i64>,
-        /// The returned shape.
         found: Vec<i64>,
     },
     /// An output has NaN or infinite values.
@@ -144,11 +137,7 @@ pub enum RepairError {
     },
     /// The model ran too long too often, or did not stop. It is not used again.
     #[error("the model is withdrawn: {reason}; load it again")]
-    Withdrawn {
-        /// The reason.
-        reason: String,
-    },
-    /// The runtime failed.
+    Withdrawn { reason: String },
     #[error("the runtime failed: {message}")]
     Run {
         /// The message of the runtime.

@@ -1,5 +1,6 @@
-//! Reads the files of a model. The hash covers the bytes that run: each file is read once, and the session is
-//! built from those bytes. A file that is replaced afterwards changes nothing until the model is loaded again.
+//! Reads the files of a model. The hash covers the bytes that run: each file is read once, and the
+//! session is built from those bytes. A file that is replaced afterwards changes nothing until the
+//! model is loaded again.
 
 use std::fs;
 use std::io::Read;
@@ -19,7 +20,6 @@ pub(crate) struct ModelFiles {
 
 /// The files from which a session is built.
 pub(crate) struct GraphFiles {
-    /// The .onnx file.
     pub(crate) path: PathBuf,
     pub(crate) bytes: Vec<u8>,
     /// External weights, by the name that the graph uses.
@@ -43,7 +43,8 @@ pub(crate) fn read(path: &Path) -> Result<ModelFiles, RepairError> {
     Ok(ModelFiles { manifest, manifest_bytes, graph })
 }
 
-/// The files that a manifest at `path` pins: the .onnx file, then external weights. There is at least one.
+/// The files that a manifest at `path` pins: the .onnx file, then external weights. There is at
+/// least one.
 pub(crate) fn read_graph(path: &Path, files: &[ModelFile]) -> Result<GraphFiles, RepairError> {
     let folder = path.parent().unwrap_or(Path::new(""));
     let mut contents = Vec::new();
@@ -84,7 +85,8 @@ fn read_at_most(path: &Path, limit: u64) -> Result<Vec<u8>, RepairError> {
     Ok(bytes)
 }
 
-/// The absolute path of the runtime library. Checks that it is a file, for a clearer message than the loader's.
+/// The absolute path of the runtime library. Checks that it is a file, for a clearer message than
+/// the loader's.
 pub(crate) fn check_library(path: &Path) -> Result<PathBuf, String> {
     let absolute =
         fs::canonicalize(path).map_err(|error| format!("{error}; name a libonnxruntime.so"))?;

@@ -18,7 +18,7 @@ pub(crate) struct Fitted {
 
 impl Fitted {
     /// The size for an image of a height and a width.
-    pub(crate) fn of(size: &Size, [height, width]: [usize; 2]) -> Result<Fitted, RepairError> {
+    pub(crate) fn new(size: &Size, [height, width]: [usize; 2]) -> Result<Fitted, RepairError> {
         let fixed = size.fixed.map(|sides| sides.map(|side| side as usize));
         let multiple = size.multiple();
         if size.fit == Fit::Resize {
@@ -49,9 +49,10 @@ impl Fitted {
 
     /// Planes of the image as the model gets them.
     pub(crate) fn fit(&self, planes: Planes, dtype: Dtype) -> Planes {
-        let fitted = match self.is_resized {
-            true => resample(&planes, self.height, self.width, Kernel::Lanczos3),
-            false => planes.padded(self.height, self.width),
+        let fitted = if self.is_resized {
+            resample(&planes, self.height, self.width, Kernel::Lanczos3)
+        } else {
+            planes.padded(self.height, self.width)
         };
         // Rounded here, so that a residual is relative to the values that the model got.
         if dtype == Dtype::F16 { fitted.rounded_to_f16() } else { fitted }

@@ -1,16 +1,18 @@
 //! Measures the halo: the distance within which a pixel of the output depends on the input.
 //!
-//! A NaN goes into one pixel of every input that has pixels. Sums and products carry it on whatever the other
-//! values are, so the outputs that become NaN are all that depend on that pixel. (A small change of the value
-//! may vanish in an activation and then shows too little.) With strides the answer depends on the phase of
-//! the pixel, so each is tried. An operation that does not propagate NaN would hide a dependency, so the
-//! caller compares tiles with the whole image once, before it relies on the halo.
+//! A NaN goes into one pixel of every input that has pixels. Sums and products carry it on whatever
+//! the other values are, so the outputs that become NaN are all that depend on that pixel. (A small
+//! change of the value may vanish in an activation and then shows too little.) With strides the
+//! answer depends on the phase of the pixel, so each is tried. An operation that does not propagate
+//! NaN would hide a dependency, so the caller compares tiles with the whole image once, before it
+//! relies on the halo.
 
 use crate::error::RepairError;
 use crate::limits::MAX_HALO_PROBE_PX;
 use crate::planes::Planes;
 
-/// Pixels in a row and in a column that are tried in a model of a fixed size: enough for strides up to 8.
+/// Pixels in a row and in a column that are tried in a model of a fixed size: enough for strides up
+/// to 8.
 const FIXED_PHASES: usize = 8;
 
 /// The distance within which the output depends on the input.
@@ -22,7 +24,8 @@ pub enum Halo {
     Whole,
 }
 
-/// Runs a model: planes of each input with pixels to planes of the output. A NaN in the output is not an error.
+/// Runs a model: planes of each input with pixels to planes of the output. A NaN in the output is
+/// not an error.
 pub(crate) type Run<'a> = dyn FnMut(&[Planes]) -> Result<Planes, RepairError> + 'a;
 
 /// The model that is probed.
@@ -76,7 +79,8 @@ impl Probe {
         Ok(Halo::Pixels(halo))
     }
 
-    /// Test images, equal in every call: a pattern with all frequencies, in the range of each input.
+    /// Test images, equal in every call: a pattern with all frequencies, in the range of each
+    /// input.
     pub(crate) fn images(&self, height: usize, width: usize) -> Vec<Planes> {
         let image = |(at, (channels, [black, white])): (usize, &(usize, [f32; 2]))| {
             let mut planes = Planes::zeros(*channels, height, width);
@@ -94,8 +98,9 @@ impl Probe {
     }
 }
 
-/// Largest distance of a NaN from the pixel, in pixels of the input. `None` if a NaN is at the border, because more may
-/// lie beyond it, or if there is no NaN, because the model then hides them.
+/// Largest distance of a NaN from the pixel, in pixels of the input. `None` if a NaN is at the
+/// border, because more may lie beyond it, or if there is no NaN, because the model then hides
+/// them.
 fn reach(output: &Planes, [y, x]: [usize; 2], scale: usize) -> Option<usize> {
     let mut reach = None;
     for channel in 0..output.channels {
@@ -122,7 +127,8 @@ fn reach(output: &Planes, [y, x]: [usize; 2], scale: usize) -> Option<usize> {
 mod tests {
     use super::*;
 
-    /// A model that takes the mean of 4 x 4 pixels for each of them: from 0 to 3 pixels far, by the phase.
+    /// A model that takes the mean of 4 x 4 pixels for each of them: from 0 to 3 pixels far, by the
+    /// phase.
     fn means_of_four(inputs: &[Planes]) -> Result<Planes, RepairError> {
         let input = &inputs[0];
         let mut output = Planes::zeros(1, input.height, input.width);

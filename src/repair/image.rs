@@ -6,9 +6,7 @@ use crate::limits::MAX_SIDE_PX;
 /// An image: rows from the top, RGB, 8 bits, sRGB.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Image {
-    /// In pixels.
     pub width: usize,
-    /// In pixels.
     pub height: usize,
     /// `3 * width * height` bytes.
     pub rgb8: Vec<u8>,
@@ -21,8 +19,8 @@ impl Image {
     }
 }
 
-/// A rendered image and its maps. A field is needed if the manifest has its role. All have the size of
-/// `rendered`; planes are row by row.
+/// A rendered image and its maps. A field is needed if the manifest has its role. All have the size
+/// of `rendered`; planes are row by row.
 #[derive(Clone, Copy, Debug)]
 pub struct View<'a> {
     /// The image to repair. Role `rgb` or `luma`.

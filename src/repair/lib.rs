@@ -1,14 +1,15 @@
 //! Repair of rendered images by an ONNX model: an image in, an image and two hashes out.
 //!
-//! A model is an .onnx file with a manifest in the same folder ([`Manifest`], `"format": "wildcity.repair/1"`). The
-//! manifest defines the meaning of each input (its role), the sizes that the model takes, and how its output is
-//! merged with the image. [`Model::load`] checks all of it: names, types and ranks of the inputs, the hash of each
-//! file, and a probe run (shape, NaN, time). [`Model::repair`] is a function: the same image gives the same
-//! bytes, with the cpu provider at any number of threads.
+//! A model is an .onnx file with a manifest in the same folder ([`Manifest`],
+//! `"format": "wildcity.repair/1"`). The manifest defines the meaning of each input (its role), the
+//! sizes that the model takes, and how its output is merged with the image. [`Model::load`] checks
+//! all of it: names, types and ranks of the inputs, the hash of each file, and a probe run (shape,
+//! NaN, time). [`Model::repair`] is a function: the same image gives the same bytes, with the cpu
+//! provider at any number of threads.
 //!
-//! Only `onnx.rs` names the runtime. The library is opened when the first model is loaded; without a model
-//! there is no thread, buffer or library. The package depends neither on the renderer nor on sessions; from
-//! `wildcity-scene` it uses cameras and poses.
+//! Only `onnx.rs` names the runtime. The library is opened when the first model is loaded; without
+//! a model there is no thread, buffer or library. The package depends neither on the renderer nor
+//! on sessions; from `wildcity-scene` it uses cameras and poses.
 //!
 //! | file | what it does |
 //! |---|---|

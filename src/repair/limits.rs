@@ -24,8 +24,8 @@ pub const MAX_TIMEOUT_MS: u64 = 600_000;
 pub const MAX_THREADS: usize = 64;
 /// Time to build a session. TensorRT compiles for minutes.
 pub const LOAD_TIMEOUT: Duration = Duration::from_secs(1200);
-/// Time between the request to stop a run and its end. The runtime looks at the request between two nodes
-/// of the graph.
+/// Time between the request to stop a run and its end. The runtime looks at the request between two
+/// nodes of the graph.
 pub const STOP_TIMEOUT: Duration = Duration::from_secs(10);
 /// Runs that may exceed `timeout_ms` before a model is withdrawn.
 pub const MAX_TIMEOUTS: u32 = 10;

@@ -1,4 +1,5 @@
-//! The manifest of a model: the meaning of its inputs, the sizes that it takes, and how its output is merged.
+//! The manifest of a model: the meaning of its inputs, the sizes that it takes, and how its output
+//! is merged.
 
 use serde::{Deserialize, Serialize};
 
@@ -16,7 +17,8 @@ pub struct Manifest {
     pub licence: String,
     /// The .onnx file, then files of external weights.
     pub files: Vec<ModelFile>,
-    /// The providers on which the model may run. The first is the default; there is no fall-back to another.
+    /// The providers on which the model may run. The first is the default; there is no fall-back to
+    /// another.
     pub providers: Vec<Provider>,
     /// GPU memory that the provider may take, in MiB.
     #[serde(default = "default_memory_mib")]
@@ -56,7 +58,6 @@ pub struct ModelFile {
 pub enum Provider {
     /// The processor. The same input gives the same bytes.
     Cpu,
-    /// NVIDIA CUDA.
     Cuda,
     /// NVIDIA TensorRT, and CUDA for the nodes that it does not support.
     Tensorrt,
@@ -132,7 +133,6 @@ pub enum Layout {
 pub struct Input {
     /// Its name in the graph.
     pub name: String,
-    /// Its meaning.
     pub role: InputRole,
     /// Its type in the graph.
     #[serde(default)]
@@ -243,7 +243,6 @@ pub enum Unit {
 pub struct Output {
     /// Its name in the graph.
     pub name: String,
-    /// Its meaning.
     pub role: OutputRole,
     /// The values of black and white.
     #[serde(default = "default_range")]

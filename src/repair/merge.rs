@@ -6,8 +6,8 @@ use crate::planes::Planes;
 use crate::resample::{Kernel, resample};
 use crate::roles;
 
-/// The image. `seen` is the image that the model got, and `output` what it returned; both are free of
-/// padding, and smaller or larger than the image if the fit is `resize`.
+/// The image. `seen` is the image that the model got, and `output` what it returned; both are free
+/// of padding, and smaller or larger than the image if the fit is `resize`.
 pub(crate) fn merge(manifest: &Manifest, view: &View<'_>, seen: Planes, output: Planes) -> Image {
     let role = manifest.output().role;
     let scale = manifest.output().scale as usize;
@@ -31,7 +31,8 @@ pub(crate) fn merge(manifest: &Manifest, view: &View<'_>, seen: Planes, output: 
         let output = resample(&roles::out_of_range(output, range), height, width, Kernel::Lanczos3);
         match role {
             OutputRole::Luma => {
-                // Chroma as colour minus luma: that is linear, so it can be resampled without a matrix.
+                // Chroma as colour minus luma: that is linear, so it can be resampled without a
+                // matrix.
                 let mut chroma = rendered.clone();
                 let luma = roles::luma(&rendered);
                 for channel in 0..3 {

@@ -23,7 +23,8 @@ use crate::tiles::Window;
 /// The runtime, the provider and the limits with which a model runs.
 #[derive(Clone, Debug)]
 pub struct LoadOptions {
-    /// The runtime: a libonnxruntime.so from version 1.18 on. An empty path is refused as `RuntimeUnnamed`.
+    /// The runtime: a libonnxruntime.so from version 1.18 on. An empty path is refused as
+    /// `RuntimeUnnamed`.
     pub library: PathBuf,
     /// The provider: one of the manifest's, or its first if none is given.
     pub provider: Option<Provider>,
@@ -97,9 +98,9 @@ impl std::fmt::Debug for Model {
 }
 
 impl Model {
-    /// Reads the manifest at `path` and the files that it pins, opens the runtime if this is the process's
-    /// first model, and probes: shape, NaN, time, three equal runs; for tiles the halo, and that tiles equal
-    /// the whole.
+    /// Reads the manifest at `path` and the files that it pins, opens the runtime if this is the
+    /// process's first model, and probes: shape, NaN, time, three equal runs; for tiles the halo,
+    /// and that tiles equal the whole.
     ///
     /// # Errors
     /// All of [`RepairError`] except `Input`.
@@ -145,15 +146,16 @@ impl Model {
         self.provider
     }
 
-    /// The runtime: name of its library, which has the version, and the commit that it was built from.
+    /// The runtime: name of its library, which has the version, and the commit that it was built
+    /// from.
     pub fn runtime(&self) -> String {
         let build = onnx::build_info();
         let commit = build.split("git-commit-id=").nth(1).and_then(|rest| rest.split(',').next());
         format!("{}, commit {}", onnx::library_name(), commit.unwrap_or("unknown"))
     }
 
-    /// BLAKE3 of everything that the output depends on, except the images: manifest (which pins the files),
-    /// build of the runtime, provider.
+    /// BLAKE3 of everything that the output depends on, except the images: manifest (which pins the
+    /// files), build of the runtime, provider.
     pub fn repair_hash(&self) -> blake3::Hash {
         self.repair_hash
     }
@@ -173,7 +175,8 @@ impl Model {
         self.manifest().inputs.iter().any(|input| input.role == role)
     }
 
-    /// Whether it ran too long too often, and no run will succeed any more. Loading it again makes it usable.
+    /// Whether it ran too long too often, and no run will succeed any more. Loading it again makes
+    /// it usable.
     pub fn is_withdrawn(&self) -> bool {
         self.runner.is_withdrawn()
     }
@@ -183,7 +186,7 @@ impl Model {
     /// # Errors
     /// `Input` or `Tiles`.
     pub fn check_size(&self, width: usize, height: usize) -> Result<(), RepairError> {
-        let fitted = Fitted::of(&self.manifest().size, [height, width])?;
+        let fitted = Fitted::new(&self.manifest().size, [height, width])?;
         self.windows(fitted.height, fitted.width).map(|_| ())
     }
 
@@ -204,7 +207,7 @@ impl Model {
         view.check()?;
         let manifest = self.manifest();
         let size = [view.rendered.height, view.rendered.width];
-        let fitted = Fitted::of(&manifest.size, size)?;
+        let fitted = Fitted::new(&manifest.size, size)?;
         let mut inputs = Vec::new();
         for input in self.runner.pixel_inputs() {
             inputs.push(fitted.fit(roles::planes(view, input)?, input.dtype));

@@ -1,5 +1,5 @@
-//! The models that a program offers, by name. Each is loaded on its first use, so that a program whose users
-//! request none loads no library.
+//! The models that a program offers, by name. Each is loaded on its first use, so that a program
+//! whose users request none loads no library.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -27,11 +27,12 @@ struct Entry {
 }
 
 impl Models {
-    /// Reads only the manifests at `paths`: no model and no library is loaded. If there is a manifest, checks that
-    /// the library is a file.
+    /// Reads only the manifests at `paths`: no model and no library is loaded. If there is a
+    /// manifest, checks that the library is a file.
     ///
     /// # Errors
-    /// A manifest cannot be read, two have the same name, or the library is not named or is not a file.
+    /// A manifest cannot be read, two have the same name, or the library is not named or is not a
+    /// file.
     pub fn read(paths: &[PathBuf], options: LoadOptions) -> Result<Models, RepairError> {
         let mut entries: BTreeMap<String, Entry> = BTreeMap::new();
         for path in paths {
@@ -67,8 +68,8 @@ impl Models {
         &self.references
     }
 
-    /// The model of a name. Loads it if it is not loaded yet, or was withdrawn; callers of the same model wait
-    /// for each other.
+    /// The model of a name. Loads it if it is not loaded yet, or was withdrawn; callers of the same
+    /// model wait for each other.
     ///
     /// # Errors
     /// [`RepairError::Unknown`], or those of [`Model::load`].

@@ -1,7 +1,9 @@
-//! Networks that measure images: a distance of two images (LPIPS), or the features of one (for KID).
+//! Networks that measure images: a distance of two images (LPIPS), or the features of one (for
+//! KID).
 //!
-//! A network is an .onnx file with a manifest in the same folder, like a repair model, but its output is numbers. It
-//! has an input of the role `image` and, if it compares images, one of the role `truth`.
+//! A network is an .onnx file with a manifest in the same folder, like a repair model, but its
+//! output is numbers. It has an input of the role `image` and, if it compares images, one of the
+//! role `truth`.
 
 use std::path::Path;
 use std::time::Duration;
@@ -38,7 +40,8 @@ pub struct NetworkManifest {
     pub licence: String,
     /// The .onnx file, then files of external weights.
     pub files: Vec<ModelFile>,
-    /// The providers on which it may run. The first is the default; there is no fall-back to another.
+    /// The providers on which it may run. The first is the default; there is no fall-back to
+    /// another.
     pub providers: Vec<Provider>,
     /// GPU memory that the provider may take, in MiB.
     #[serde(default = "default_memory_mib")]
@@ -142,8 +145,8 @@ impl NetworkManifest {
 }
 
 impl Network {
-    /// Reads the manifest at `path` and the files that it pins, and opens the runtime if this is the process's first
-    /// network or model.
+    /// Reads the manifest at `path` and the files that it pins, and opens the runtime if this is
+    /// the process's first network or model.
     ///
     /// # Errors
     /// The errors of [`crate::Model::load`].
@@ -171,10 +174,12 @@ impl Network {
         &self.manifest
     }
 
-    /// The values of the output for an image, and for the one that it is compared with if the network compares.
+    /// The values of the output for an image, and for the one that it is compared with if the
+    /// network compares.
     ///
     /// # Errors
-    /// `Input` if an image is missing or has another size, `NotFinite`, `TimedOut`, `Withdrawn`, `Run`.
+    /// `Input` if an image is missing or has another size, `NotFinite`, `TimedOut`, `Withdrawn`,
+    /// `Run`.
     pub fn run(&self, image: &Image, truth: Option<&Image>) -> Result<Vec<f32>, RepairError> {
         let mut feeds = Vec::with_capacity(self.manifest.inputs.len());
         for input in &self.manifest.inputs {

@@ -1,8 +1,8 @@
 //! The ONNX runtime: the only file that names it.
 //!
-//! The library is opened once, when the first model is loaded, and a process has one environment. Each model
-//! has a thread that builds its session and runs it, because the runtime can be asked to stop but not be
-//! forced: a caller waits for an answer, never for the thread.
+//! The library is opened once, when the first model is loaded, and a process has one environment.
+//! Each model has a thread that builds its session and runs it, because the runtime can be asked to
+//! stop but not be forced: a caller waits for an answer, never for the thread.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -260,7 +260,8 @@ fn session(
     builder.commit_from_memory(&files.bytes).map_err(|error| refused(error.to_string()))
 }
 
-/// The options of a session: sequential nodes, a fixed number of threads, no fall-back to another provider.
+/// The options of a session: sequential nodes, a fixed number of threads, no fall-back to another
+/// provider.
 fn builder(
     environment: &Environment,
     files: &GraphFiles,

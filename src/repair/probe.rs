@@ -17,7 +17,8 @@ pub(crate) struct Probed {
     pub(crate) halo: Option<usize>,
 }
 
-/// Runs the model on a pattern, and checks shape, NaN, time and repeated bytes; then measures the halo.
+/// Runs the model on a pattern, and checks shape, NaN, time and repeated bytes; then measures the
+/// halo.
 pub(crate) fn probe(runner: &Runner) -> Result<Probed, RepairError> {
     let manifest = &runner.manifest;
     let size = &manifest.size;

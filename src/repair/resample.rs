@@ -1,5 +1,6 @@
-//! Separable resampling: Lanczos 3 and Keys' bicubic. When an image is made smaller, the kernel is widened
-//! by the ratio, as Pillow does, so that nothing aliases. Weights are normalised, also at the border.
+//! Separable resampling: Lanczos 3 and Keys' bicubic. When an image is made smaller, the kernel is
+//! widened by the ratio, as Pillow does, so that nothing aliases. Weights are normalised, also at
+//! the border.
 
 use std::f64::consts::PI;
 

@@ -1,9 +1,10 @@
 //! Selects the views of a step that are repaired: by trust, with hysteresis, and at most
 //! [`Selection::per_step`] of them.
 //!
-//! Trust is 1 on the recorded drive, so nothing is repaired there. Two thresholds (hysteresis) prevent repair from
-//! switching on and off between steps, which would be visible as flicker. The selection does not depend on a
-//! clock: its budget is a number of images, so that a replay makes the same decisions.
+//! Trust is 1 on the recorded drive, so nothing is repaired there. Two thresholds (hysteresis)
+//! prevent repair from switching on and off between steps, which would be visible as flicker. The
+//! selection does not depend on a clock: its budget is a number of images, so that a replay makes
+//! the same decisions.
 
 use serde::{Deserialize, Serialize};
 
@@ -17,7 +18,8 @@ pub struct Selection {
     pub above: f64,
     /// Below this trust nothing is repaired, because a model would hallucinate the image.
     pub at_least: f64,
-    /// Largest number of repaired images per step: those with the least trust; of equal trust, the first cameras.
+    /// Largest number of repaired images per step: those with the least trust; of equal trust, the
+    /// first cameras.
     pub per_step: usize,
 }
 
@@ -64,10 +66,7 @@ impl Selection {
 
     /// Whether a camera is in repair at a trust, given whether it was after the previous step.
     fn is_on(&self, was_on: bool, trust: f64) -> bool {
-        match was_on {
-            true => trust <= self.above,
-            false => trust < self.below,
-        }
+        if was_on { trust <= self.above } else { trust < self.below }
     }
 
     /// Whether an image may be repaired, if `per_step` leaves room for it.
@@ -75,9 +74,9 @@ impl Selection {
         self.is_on(was_on, trust) && trust >= self.at_least
     }
 
-    /// Decides a step. `trust` has a value per camera; `before` marks the cameras that were in repair after the
-    /// previous step, and is empty after a reset and for single observations, which have no history. A trust
-    /// that is not a number counts as 0.
+    /// Decides a step. `trust` has a value per camera; `before` marks the cameras that were in
+    /// repair after the previous step, and is empty after a reset and for single observations,
+    /// which have no history. A trust that is not a number counts as 0.
     pub fn decide(&self, before: &[bool], trust: &[f64]) -> Decision {
         let trust: Vec<f64> = trust.iter().map(|t| if t.is_nan() { 0.0 } else { *t }).collect();
         let was_on = |camera: usize| before.get(camera).copied().unwrap_or(false);

@@ -73,9 +73,9 @@ pub(crate) fn image_shape(layout: Layout, channels: i64, [height, width]: [i64; 
     }
 }
 
-/// The error in a shape of the graph, if any. -1 in the graph agrees with every size; -1 in the manifest does not
-/// agree with a fixed size in the graph, because images have different sizes. A shape of rank 0 may be one that
-/// the graph does not declare, so the probe run decides.
+/// The error in a shape of the graph, if any. -1 in the graph agrees with every size; -1 in the
+/// manifest does not agree with a fixed size in the graph, because images have different sizes. A
+/// shape of rank 0 may be one that the graph does not declare, so the probe run decides.
 fn wrong_shape(graph: &[i64], manifest: &[i64]) -> Option<String> {
     if graph.is_empty() {
         return None;

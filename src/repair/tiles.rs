@@ -1,8 +1,9 @@
 //! Windows of an image whose outputs together equal the output for the whole image.
 //!
-//! Every window has the size of a tile and begins at a multiple of `multiple_of`, so that strides fall on the
-//! same pixels as in the whole image. Only the part of a window counts that is at least a halo away from its
-//! borders. Borders of the image are an exception: there, the model pads as it does in the whole image.
+//! Every window has the size of a tile and begins at a multiple of `multiple_of`, so that strides
+//! fall on the same pixels as in the whole image. Only the part of a window counts that is at least
+//! a halo away from its borders. Borders of the image are an exception: there, the model pads as it
+//! does in the whole image.
 
 use crate::error::RepairError;
 use crate::planes::Rect;
@@ -12,7 +13,8 @@ use crate::planes::Rect;
 pub(crate) struct Window {
     /// The window, in the image.
     pub(crate) seen: Rect,
-    /// The part that is used, in the image and within `seen`. The parts of all windows cover each pixel once.
+    /// The part that is used, in the image and within `seen`. The parts of all windows cover each
+    /// pixel once.
     pub(crate) used: Rect,
 }
 

@@ -1,5 +1,5 @@
-//! Reads a manifest, and checks the rules that its types do not express. An error names the field and the accepted
-//! values.
+//! Reads a manifest, and checks the rules that its types do not express. An error names the field
+//! and the accepted values.
 
 use std::path::Path;
 
@@ -26,8 +26,8 @@ impl Manifest {
     }
 }
 
-/// Reads a manifest of a format, and checks it. A file of another format is refused because of its format, and not
-/// because of one of its fields.
+/// Reads a manifest of a format, and checks it. A file of another format is refused because of its
+/// format, and not because of one of its fields.
 pub(crate) fn read<T: DeserializeOwned>(
     bytes: &[u8],
     file: &Path,

@@ -1,4 +1,5 @@
-//! Trust in images on the recorded drive and at lateral offsets from it, with an image from each distance.
+//! Trust in images on the recorded drive and at lateral offsets from it, with an image from each
+//! distance.
 
 use std::sync::Arc;
 
@@ -11,7 +12,8 @@ use wildcity_scene::geometry::CameraError;
 use wildcity_session::{TrainingCoverage, Trust};
 use wildcity_twin::residency::Resident;
 
-/// Trust in the images at one distance from the recorded drive: statistics over all cameras at all stations.
+/// Trust in the images at one distance from the recorded drive: statistics over all cameras at all
+/// stations.
 #[derive(Clone, Debug, Serialize)]
 pub struct Confidence {
     /// Lateral distance from the drive, in metres.
@@ -42,12 +44,11 @@ pub struct Confidence {
 pub struct ViewImage {
     /// Name of the sample point.
     pub sample_point: String,
-    /// A JPEG file.
     pub jpeg: Vec<u8>,
 }
 
-/// Widest image that is rendered, in pixels. Trust counts shares of pixels, which a small image has too, and
-/// the page shows small images.
+/// Widest image that is rendered, in pixels. Trust counts shares of pixels, which a small image has
+/// too, and the page shows small images.
 const WIDTH_PX: f64 = 360.0;
 /// JPEG quality of the images on the page.
 const JPEG_QUALITY: u8 = 85;

@@ -1,8 +1,9 @@
 //! Why a report cannot be made.
 //!
-//! The `Display` text of an error is complete, down to the text of the operating system, and so errors
-//! of this project have no `source`: the cause is a field named `cause`, or the error passes it on as
-//! `transparent`. A caller that prints an error, with `{:#}` or `to_string`, then prints each cause once.
+//! The `Display` text of an error is complete, down to the text of the operating system, and so
+//! errors of this project have no `source`: the cause is a field named `cause`, or the error passes
+//! it on as `transparent`. A caller that prints an error, with `{:#}` or `to_string`, then prints
+//! each cause once.
 
 use wildcity_render::RenderError;
 use wildcity_repair::RepairError;
@@ -29,23 +30,16 @@ pub enum ReportError {
     Profile(#[from] ProfileError),
     /// An image cannot be encoded, or its file cannot be decoded.
     #[error("an image cannot be encoded: {reason}")]
-    Encode {
-        /// The encoder's message.
-        reason: String,
-    },
+    Encode { reason: String },
     /// A plot cannot be drawn.
     #[error("a plot cannot be drawn: {reason}")]
-    Plot {
-        /// The plotter's message.
-        reason: String,
-    },
+    Plot { reason: String },
     /// A model cannot be used, or recorded images cannot be read.
     #[error(transparent)]
     Session(#[from] SessionError),
     /// The cameras cannot be scaled.
     #[error(transparent)]
     Rig(#[from] RigError),
-    /// A model fails.
     #[error("the repair model {model:?} failed on an image of the camera {camera:?}: {cause}")]
     Repair {
         /// Name of the model.

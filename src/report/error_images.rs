@@ -15,8 +15,8 @@ pub struct ErrorImages {
     pub files: [Vec<u8>; 3],
 }
 
-/// Errors that have the colours of [`HEAT_RGB`], in colour values from 0 to 1: below the first it is black,
-/// from the last on white. Steps of a factor of four, from a quarter of a step of 8 bits.
+/// Errors that have the colours of [`HEAT_RGB`], in colour values from 0 to 1: below the first it
+/// is black, from the last on white. Steps of a factor of four, from a quarter of a step of 8 bits.
 pub(super) const HEAT_STEPS: [f32; 6] = [1e-3, 4e-3, 1.6e-2, 6.4e-2, 0.256, 1.0];
 
 impl ErrorImages {

@@ -1,8 +1,8 @@
-//! Memory, traffic and GPU work of one step of a street, with each feature of a scene and without: a scene pays
-//! only for the features that it has.
+//! Memory, traffic and GPU work of one step of a street, with each feature of a scene and without:
+//! a scene pays only for the features that it has.
 //!
-//! These are counts (pipelines, buffers, dispatches, bytes), not times: they are the same on every machine,
-//! and show at once if the base scene pays for a feature that it does not have.
+//! These are counts (pipelines, buffers, dispatches, bytes), not times: they are the same on every
+//! machine, and show at once if the base scene pays for a feature that it does not have.
 
 use std::sync::Arc;
 
@@ -160,8 +160,8 @@ const FEATURES: [Feature; 21] = [
     feature("trust", |step| step.opacity = true),
 ];
 
-/// Renders the street with each feature on the cpu backend and on a device, and counts. `open_device` opens
-/// a device that has rendered nothing yet; it gives none if there is no device.
+/// Renders the street with each feature on the cpu backend and on a device, and counts.
+/// `open_device` opens a device that has rendered nothing yet; it gives none if there is no device.
 ///
 /// # Errors
 /// A frame cannot be rendered.
@@ -198,7 +198,8 @@ fn with_levels(scene: &Scene, max_error_m: f32) -> Scene {
     Scene { chunks: scene.chunks.iter().map(coarsest).collect(), ..scene.clone() }
 }
 
-/// A sky network with three octaves and 16 neurons. It is smooth enough to be baked into a small map.
+/// A sky network with three octaves and 16 neurons. It is smooth enough to be baked into a small
+/// map.
 fn sky_network() -> SkyModel {
     let layer = |outputs: usize, inputs: usize| {
         let numbers = |count: usize| (0..count).map(|i| 0.4 * (1.7 * i as f32).sin()).collect();
@@ -248,7 +249,8 @@ impl Step {
         }
     }
 
-    /// Two actors of one asset, with shadows and a tint. `since_start_m` is their way during the exposure.
+    /// Two actors of one asset, with shadows and a tint. `since_start_m` is their way during the
+    /// exposure.
     fn place_actors(&mut self, since_start_m: DVec3) {
         let size = 0.02_f64.ln() as f32;
         let mut ball = Gaussians::with_capacity(1, 500);
@@ -300,7 +302,8 @@ impl Step {
 
     /// None if the device was lost in the meantime.
     fn device_counts(&self, gpu: &Gpu) -> Result<Option<DeviceCounts>, ReportError> {
-        // The first frame grows the buffers, perhaps in several attempts; the second one is counted.
+        // The first frame grows the buffers, perhaps in several attempts; the second one is
+        // counted.
         self.render(gpu)?;
         let dispatches = |usage: &GpuUsage| usage.totals.dispatches;
         let before = gpu.usage().as_ref().map_or(0, dispatches);

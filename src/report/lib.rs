@@ -1,5 +1,5 @@
-//! Measures the cost and the error of each setting of the renderer, on one twin and one machine, and reports
-//! them as one HTML page, as JSON, and as CSV.
+//! Measures the cost and the error of each setting of the renderer, on one twin and one machine,
+//! and reports them as one HTML page, as JSON, and as CSV.
 //!
 //! ```text
 //! setting         one way to render a twin

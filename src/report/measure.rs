@@ -1,9 +1,9 @@
 //! The error of each setting against the reference, and its cost.
 //!
-//! **Windows are compared, and whole steps are timed.** The f64 reference takes a minute for six full images.
-//! Windows keep the full focal length, since levels of detail depend on it: a smaller image would be another
-//! test. All settings see the same windows. The PSNR is of values before they are rounded to 8 bits, since
-//! the rounding by itself limits PSNR to 59 dB.
+//! **Windows are compared, and whole steps are timed.** The f64 reference takes a minute for six
+//! full images. Windows keep the full focal length, since levels of detail depend on it: a smaller
+//! image would be another test. All settings see the same windows. The PSNR is of values before
+//! they are rounded to 8 bits, since the rounding by itself limits PSNR to 59 dB.
 
 use std::io::Cursor;
 use std::sync::Arc;
@@ -30,16 +30,15 @@ use wildcity_twin::residency::{PinnedScene, Resident};
 
 /// A twin, the backends, and the sample points that settings are measured at.
 pub struct Benchmark<'a> {
-    /// The twin.
     pub resident: &'a Arc<Resident>,
-    /// The backends; [`Setting::backend`] is an index into them. The first one renders the baseline.
+    /// The backends; [`Setting::backend`] is an index into them. The first one renders the
+    /// baseline.
     pub backends: &'a [Box<dyn Backend>],
-    /// The sample points.
     pub sample_points: &'a [SamplePoint],
     /// Number of timed runs of a step at each point, after one run that is not counted.
     pub repeat: u32,
-    /// Opens a new instance of the gpu backend's device, which has rendered nothing yet. None if there is no
-    /// device.
+    /// Opens a new instance of the gpu backend's device, which has rendered nothing yet. None if
+    /// there is no device.
     pub open_device: &'a dyn Fn() -> Option<Gpu>,
 }
 
@@ -50,8 +49,8 @@ const GPU: &str = "gpu";
 pub struct ReferenceImages {
     /// The images, by sample point and window.
     windows: Vec<Vec<Image>>,
-    /// Time that a step of all cameras would take, in milliseconds: the time of the windows, scaled to the
-    /// pixels of the whole images.
+    /// Time that a step of all cameras would take, in milliseconds: the time of the windows, scaled
+    /// to the pixels of the whole images.
     pub step_ms: f64,
 }
 
@@ -115,13 +114,12 @@ impl Benchmark<'_> {
             }
             // An image of another size is compared with the reference shrunk to it.
             let shrunk: Vec<Image>;
-            let references = match setting.scale == 1.0 {
-                true => references,
-                false => {
-                    let pairs = references.iter().zip(&images);
-                    shrunk = pairs.map(|(truth, image)| truth.averaged(image.size_px)).collect();
-                    &shrunk
-                }
+            let references = if setting.scale == 1.0 {
+                references
+            } else {
+                let pairs = references.iter().zip(&images);
+                shrunk = pairs.map(|(truth, image)| truth.averaged(image.size_px)).collect();
+                &shrunk
             };
             let PointErrors { psnr_db, min_db } = errors.add(point, images, references);
 
@@ -298,7 +296,8 @@ impl CostTotals {
     }
 }
 
-/// Memory that the sky takes in the form in which a profile renders it, in bytes: 0 unless it is a map.
+/// Memory that the sky takes in the form in which a profile renders it, in bytes: 0 unless it is a
+/// map.
 pub(super) fn sky_bytes(scene: &Scene, profile: &RenderProfile) -> Result<u64, RenderError> {
     let drawn = scene.sky.as_ref().map(|sky| sky.drawable(profile.sky_error));
     Ok(match drawn.transpose()? {

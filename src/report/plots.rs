@@ -124,8 +124,8 @@ pub(super) fn error_by_offset(all: &[&Measurement]) -> Result<String, ReportErro
     })
 }
 
-/// Trust over the distance from the recorded drive: the mean of all images, and the range from the lowest to
-/// the highest.
+/// Trust over the distance from the recorded drive: the mean of all images, and the range from the
+/// lowest to the highest.
 pub(super) fn trust_by_offset(all: &[Confidence]) -> Result<String, ReportError> {
     plot(2, |root| {
         let mut chart =
@@ -193,8 +193,8 @@ struct Label<'a> {
     color: RGBColor,
 }
 
-/// Writes labels in a column on the right, in the vertical order of their points and without overlap. A thin
-/// line joins each label to its point.
+/// Writes labels in a column on the right, in the vertical order of their points and without
+/// overlap. A thin line joins each label to its point.
 fn draw_labels(root: &Area<'_>, mut labels: Vec<Label<'_>>) -> PlotResult<()> {
     labels.sort_by_key(|label| (label.at_px.1, label.at_px.0));
     let (width_px, height_px) = root.dim_in_pixel();
@@ -210,8 +210,8 @@ fn draw_labels(root: &Area<'_>, mut labels: Vec<Label<'_>>) -> PlotResult<()> {
     Ok(())
 }
 
-/// Moves rising heights apart, so that each is at least a line below the previous one and the last is at most
-/// `bottom_px`. Moves them as little as possible.
+/// Moves rising heights apart, so that each is at least a line below the previous one and the last
+/// is at most `bottom_px`. Moves them as little as possible.
 fn spread(heights_px: &[i32], bottom_px: i32) -> Vec<i32> {
     let mut spread = heights_px.to_vec();
     for i in 1..spread.len() {

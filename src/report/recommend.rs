@@ -1,14 +1,15 @@
 //! The Pareto front of error and time, and the setting for a required error or time.
 //!
-//! **A setting is selected at every other station and verified at the rest.** Its worst selection point must
-//! be better than the goal by a margin: the standard deviation of the worse half of the points, at least 1 dB
-//! or a tenth of the time. Of eight values of a normal distribution the worst lies 1.4 deviations from the
-//! mean on average; so the goal lies 2.4 deviations away, where one point of 120 falls. With a margin of
-//! only 1 dB, a setting was selected that had 36 dB at two points of a capture and 34.4 dB at two others.
+//! **A setting is selected at every other station and verified at the rest.** Its worst selection
+//! point must be better than the goal by a margin: the standard deviation of the worse half of the
+//! points, at least 1 dB or a tenth of the time. Of eight values of a normal distribution the worst
+//! lies 1.4 deviations from the mean on average; so the goal lies 2.4 deviations away, where one
+//! point of 120 falls. With a margin of only 1 dB, a setting was selected that had 36 dB at two
+//! points of a capture and 34.4 dB at two others.
 //!
-//! A setting that misses the goal at the verification points is not recommended, and no profile is written:
-//! a setting that is good by chance is worse than none. Records and image sizes are measured but not
-//! recommended, since a server cannot change them.
+//! A setting that misses the goal at the verification points is not recommended, and no profile is
+//! written: a setting that is good by chance is worse than none. Records and image sizes are
+//! measured but not recommended, since a server cannot change them.
 
 use serde::Serialize;
 
@@ -32,11 +33,10 @@ pub enum Goal {
 
 /// A recommended setting: selected at some sample points, and verified at the others.
 ///
-/// All values except [`Recommendation::encodings`] are of images as they are rendered, before they are
-/// encoded: a profile does not choose the encoding.
+/// All values except [`Recommendation::encodings`] are of images as they are rendered, before they
+/// are encoded: a profile does not choose the encoding.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Recommendation {
-    /// The goal.
     #[serde(rename = "wanted")]
     pub goal: Goal,
     /// Name of the setting.
@@ -48,7 +48,8 @@ pub struct Recommendation {
     /// The worst value at the selection points, in the goal's unit.
     #[serde(rename = "chosen_by")]
     pub selection_worst: f64,
-    /// The margin by which that value had to be better than the goal, in the same unit: the spread of the points.
+    /// The margin by which that value had to be better than the goal, in the same unit: the spread
+    /// of the points.
     pub margin: f64,
     /// The worst value at the verification points, in the same unit.
     #[serde(rename = "verified")]
@@ -73,8 +74,8 @@ pub struct EncodingCost {
     /// Least PSNR of a window at any sample point after decoding, in dB.
     #[serde(rename = "least_db", serialize_with = "serialize_number")]
     pub min_db: f64,
-    /// Median time of a step minus that without encoding, in milliseconds. The two are timed in turn; the
-    /// difference can be below 0 by chance.
+    /// Median time of a step minus that without encoding, in milliseconds. The two are timed in
+    /// turn; the difference can be below 0 by chance.
     #[serde(rename = "more_ms")]
     pub extra_ms: f64,
 }
@@ -90,9 +91,9 @@ const MIN_MARGIN_MS_SHARE: f64 = 0.1;
 /// 20 log10(2^24) = 144.5 dB.
 const MAX_DB: f64 = 144.5;
 
-/// Which settings are on the Pareto front: no other setting is better in time or error without being worse
-/// in the other. Settings of [`Family::Rays`] have another reference; they are neither on the front nor
-/// compared with it.
+/// Which settings are on the Pareto front: no other setting is better in time or error without
+/// being worse in the other. Settings of [`Family::Rays`] have another reference; they are neither
+/// on the front nor compared with it.
 pub fn pareto_front(all: &[Measurement]) -> Vec<bool> {
     let is_comparable = |m: &&Measurement| m.setting.family != Family::Rays;
     let is_dominated = |m: &Measurement| {
@@ -117,11 +118,12 @@ struct Candidate<'a> {
     assessment: Assessment,
 }
 
-/// The best setting for the goal, of those that a server can use and that change something. Of equally good
-/// ones it is the first of the list, which begins with the twin as it is served.
+/// The best setting for the goal, of those that a server can use and that change something. Of
+/// equally good ones it is the first of the list, which begins with the twin as it is served.
 ///
 /// # Errors
-/// No setting reaches the goal at the selection points, or the best one misses it at the verification points.
+/// No setting reaches the goal at the selection points, or the best one misses it at the
+/// verification points.
 pub fn recommend(
     goal: Goal,
     all: &[Measurement],
@@ -170,7 +172,8 @@ pub fn recommend(
     })
 }
 
-/// The fastest candidate that reaches a required error, or the most exact one that reaches a required time.
+/// The fastest candidate that reaches a required error, or the most exact one that reaches a
+/// required time.
 fn best_candidate<'a>(goal: Goal, candidates: &[Candidate<'a>]) -> Option<Candidate<'a>> {
     let reaching = candidates.iter().copied();
     let mut reaching = reaching.filter(|c| goal.is_met_by(c.assessment.guaranteed));
@@ -225,7 +228,8 @@ impl Recommendation {
         self.profile.iter().map(changed_field).collect::<Result<_, _>>().map(ProfileOverrides::new)
     }
 
-    /// The command that starts a server with this setting, where `profile` is the path of the profile file.
+    /// The command that starts a server with this setting, where `profile` is the path of the
+    /// profile file.
     pub fn serve_command(&self, profile: &str) -> String {
         format!("wildcity serve --backend {} --profile {profile}", self.backend)
     }
@@ -238,9 +242,10 @@ impl Recommendation {
             format!("{encoding}{default} {min_db:.1} dB at worst and {extra_ms:+.1} ms a step")
         };
         let all: Vec<String> = self.encodings.iter().map(of_encoding).collect();
-        let encodings = match all.is_empty() {
-            true => String::new(),
-            false => format!("; encoded, the twin as served has: {}", all.join(", ")),
+        let encodings = if all.is_empty() {
+            String::new()
+        } else {
+            format!("; encoded, the twin as served has: {}", all.join(", "))
         };
         format!("of {}{encodings}", self.measured_state)
     }
@@ -310,8 +315,8 @@ impl Goal {
     }
 }
 
-/// Standard deviation of the values that are worse than the median, from the median. Values that are much
-/// better than the others do not count against a setting. 0 if no value is worse.
+/// Standard deviation of the values that are worse than the median, from the median. Values that
+/// are much better than the others do not count against a setting. 0 if no value is worse.
 fn worse_half_deviation(values: &[f64], is_worse: fn(&f64, &f64) -> bool) -> f64 {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);

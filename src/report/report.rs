@@ -12,8 +12,8 @@ use super::settings::Skipped;
 use wildcity_scene::RenderProfile;
 use wildcity_stress::table::{Column, Table};
 
-/// All measurements of one twin. JSON and CSV write numbers that are infinite or NaN as the words `inf`,
-/// `-inf` and `NaN`: a setting that is exact has a PSNR of `inf`.
+/// All measurements of one twin. JSON and CSV write numbers that are infinite or NaN as the words
+/// `inf`, `-inf` and `NaN`: a setting that is exact has a PSNR of `inf`.
 #[derive(Clone, Debug, Serialize)]
 pub struct Report {
     /// The twin, and how it is rendered.
@@ -32,8 +32,8 @@ pub struct Report {
     /// Settings that were not compared, with the reasons.
     #[serde(rename = "left_out")]
     pub skipped: Vec<Skipped>,
-    /// Time that a step of the reference would take with a ray for every pixel, in milliseconds. None if
-    /// every camera is a pinhole at rest.
+    /// Time that a step of the reference would take with a ray for every pixel, in milliseconds.
+    /// None if every camera is a pinhole at rest.
     pub exact_rays_ms: Option<f64>,
     /// Trust in the images over the distance from the recorded drive. Empty without a drive.
     #[serde(rename = "believed")]
@@ -80,9 +80,9 @@ pub struct Subject {
 }
 
 impl Report {
-    /// The settings as CSV: a header, and one line per setting, with decimal points and no quotes except
-    /// around names. A cell is empty where there is no value: dB at offsets from a drive if none was recorded,
-    /// and bytes of a device if the backend has none.
+    /// The settings as CSV: a header, and one line per setting, with decimal points and no quotes
+    /// except around names. A cell is empty where there is no value: dB at offsets from a drive if
+    /// none was recorded, and bytes of a device if the backend has none.
     pub fn csv(&self) -> String {
         let by_offset = OFFSETS_M.map(|offset_m| format!("psnr_db_at_{offset_m}_m")).join(",");
         let mut csv = format!(

@@ -1,4 +1,5 @@
-//! The poses at which settings are compared: along the recorded drive and at offsets from it, or around a capture.
+//! The poses at which settings are compared: along the recorded drive and at offsets from it, or
+//! around a capture.
 
 use glam::{DQuat, DVec3};
 
@@ -14,8 +15,8 @@ use wildcity_scene::{Manifest, Trajectory};
 pub struct SamplePoint {
     /// For example `60 m, 3 m left`.
     pub name: String,
-    /// Lateral distance from the recorded drive in metres, to either side. 0 on the drive, and for a twin
-    /// without one.
+    /// Lateral distance from the recorded drive in metres, to either side. 0 on the drive, and for
+    /// a twin without one.
     pub offset_m: f64,
     /// Whether settings are selected by the results here. The other points verify the selection.
     pub for_selection: bool,
@@ -30,19 +31,19 @@ pub struct SamplePoint {
 /// The number of sample points, and the size of the windows that are compared.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Sampling {
-    /// Number of stations along the drive. Each has a sample point per distance of [`OFFSETS_M`]; a twin without a
-    /// drive gets as many points around it.
+    /// Number of stations along the drive. Each has a sample point per distance of [`OFFSETS_M`]; a
+    /// twin without a drive gets as many points around it.
     pub stations: u32,
     /// Width and height of the compared windows, in pixels.
     pub window_px: [u32; 2],
 }
 
-/// Lateral distances from the recorded drive, in metres: on it, in the other half of the lane, in the next
-/// lane, and in the lane after that.
+/// Lateral distances from the recorded drive, in metres: on it, in the other half of the lane, in
+/// the next lane, and in the lane after that.
 pub const OFFSETS_M: [f64; 4] = [0.0, 1.0, 3.0, 5.0];
 
-/// Sample points along the twin's first recorded drive with these cameras, or around the twin if it has no
-/// drive.
+/// Sample points along the twin's first recorded drive with these cameras, or around the twin if it
+/// has no drive.
 pub fn sample_points(
     manifest: &Manifest,
     cameras: &[RigCamera],
@@ -54,8 +55,8 @@ pub fn sample_points(
     }
 }
 
-/// Sample points at evenly spaced stations. Every other station is for selection. Two stations have their
-/// offsets to the left, the next two to the right, and so on.
+/// Sample points at evenly spaced stations. Every other station is for selection. Two stations have
+/// their offsets to the left, the next two to the right, and so on.
 ///
 /// The rig moves with the mean speed of the whole drive, for cameras with rolling shutters.
 fn along(drive: &Trajectory, cameras: &[RigCamera], sampling: Sampling) -> Vec<SamplePoint> {
@@ -87,7 +88,7 @@ fn along(drive: &Trajectory, cameras: &[RigCamera], sampling: Sampling) -> Vec<S
                 offset_m,
                 for_selection: station.is_multiple_of(2),
                 world_from_rig: Some(world_from_rig),
-                views: View::of_moving_rig(cameras, world_from_rig, &world_from_rig_before),
+                views: View::from_moving_rig(cameras, world_from_rig, &world_from_rig_before),
                 windows: Vec::new(),
             };
             points.push(point.with_windows(points.len(), sampling.window_px, 1.0));
@@ -103,7 +104,8 @@ pub(super) fn mean_speed_m_per_us(drive: &Trajectory) -> f64 {
     if duration_us > 0 { drive.length_m() / duration_us as f64 } else { 0.0 }
 }
 
-/// Number of sample points around a capture for each station: as many as there are offsets from a drive.
+/// Number of sample points around a capture for each station: as many as there are offsets from a
+/// drive.
 const POINTS_PER_STATION: u32 = OFFSETS_M.len() as u32;
 
 /// Share of the sides of these images in which windows lie: around the middle, where the object is.
@@ -119,8 +121,8 @@ const AROUND_ELEVATION_DEG: f64 = 20.0;
 /// Cameras on a circle around the middle of a captured object. Each sees all of it. z is up.
 fn around(bounds: Bounds, sampling: Sampling) -> Vec<SamplePoint> {
     let middle_m = 0.5 * (bounds.min_m + bounds.max_m);
-    // 640 x 480 px at a focal length of 600 px show ±0.53 m across and ±0.4 m down at a distance of 1 m.
-    // So the longest side of the box fits at 1.2 times its length from the middle.
+    // 640 x 480 px at a focal length of 600 px show ±0.53 m across and ±0.4 m down at a distance of
+    // 1 m. So the longest side of the box fits at 1.2 times its length from the middle.
     let distance_m = 1.2 * bounds.size_m().max_element();
     let count = POINTS_PER_STATION * sampling.stations;
     let point_at = |index: u32| {
@@ -144,16 +146,17 @@ fn around(bounds: Bounds, sampling: Sampling) -> Vec<SamplePoint> {
     (0..count).map(point_at).collect()
 }
 
-/// 1/ρ and 1/ρ² with the plastic number ρ = 1.3247...: multiples of them, modulo 1, cover the unit square
-/// evenly without being regular (Roberts 2018, the R2 sequence).
+/// 1/ρ and 1/ρ² with the plastic number ρ = 1.3247...: multiples of them, modulo 1, cover the unit
+/// square evenly without being regular (Roberts 2018, the R2 sequence).
 const R2_STEPS: [f64; 2] = [0.754_877_666_2, 0.569_840_290_99];
 
-/// More cameras than a rig has: the sequence continues from camera to camera, then from point to point.
+/// More cameras than a rig has: the sequence continues from camera to camera, then from point to
+/// point.
 const CAMERAS_PER_POINT: usize = 16;
 
 impl SamplePoint {
-    /// Adds a window in each image. The windows of all points spread evenly over `share` of the image's
-    /// sides, around its middle. `index` is the number of this point.
+    /// Adds a window in each image. The windows of all points spread evenly over `share` of the
+    /// image's sides, around its middle. `index` is the number of this point.
     fn with_windows(mut self, index: usize, window_px: [u32; 2], share: f64) -> Self {
         let window = |(camera, view): (usize, &View)| {
             let i = (index * CAMERAS_PER_POINT + camera + 1) as f64;

@@ -20,8 +20,8 @@ pub struct Setting {
     pub profile: Vec<String>,
     /// Width and height of the images, as a share of the cameras'.
     pub scale: f64,
-    /// Whether images of another size are drawn with the blur of their own pixels, and not as the native
-    /// images shrunk.
+    /// Whether images of another size are drawn with the blur of their own pixels, and not as the
+    /// native images shrunk.
     pub own_blur: bool,
     /// Encoding of the images. None compares values before they are rounded to 8 bits, and times no
     /// encoding.
@@ -42,8 +42,8 @@ impl Setting {
         Ok(profile)
     }
 
-    /// Whether `wildcity serve` can use the setting without the twin being stored again: only its profile and
-    /// backend differ.
+    /// Whether `wildcity serve` can use the setting without the twin being stored again: only its
+    /// profile and backend differ.
     pub fn can_be_served(&self) -> bool {
         self.record.is_none()
             && self.scale == 1.0
@@ -68,11 +68,8 @@ pub enum ImageEncoding {
 pub enum Family {
     /// No change: the twin as it is served.
     AsServed,
-    /// The backend.
     Backend,
-    /// Levels of detail.
     Detail,
-    /// The draw distance.
     #[serde(rename = "reach")]
     DrawDistance,
     /// Record format of the Gaussians.

@@ -1,15 +1,18 @@
-//! The settings that are compared, each a change of one thing, and combinations that a profile can have.
+//! The settings that are compared, each a change of one thing, and combinations that a profile can
+//! have.
 //!
-//! **Settings that cannot affect this twin are skipped**, and the page names them: `sky_error` without a
-//! sky, exact rays without a lens, `tau_px` without levels of detail. The tile size is not a setting either: see
-//! `TILE_SIZE_REASON`. BENCHMARKS.md has its measurements (rows or blocks of pixels, one level of tiles or two).
+//! **Settings that cannot affect this twin are skipped**, and the page names them: `sky_error`
+//! without a sky, exact rays without a lens, `tau_px` without levels of detail. The tile size is
+//! not a setting either: see `TILE_SIZE_REASON`. BENCHMARKS.md has its measurements (rows or blocks
+//! of pixels, one level of tiles or two).
 //!
-//! **Small images are compared with the reference's image shrunk** to their size, because they replace that image.
-//! "Own blur" is the same image with the profile's blur in its own pixels, as a camera of that size without a native
-//! size renders it.
+//! **Small images are compared with the reference's image shrunk** to their size, because they
+//! replace that image. "Own blur" is the same image with the profile's blur in its own pixels, as a
+//! camera of that size without a native size renders it.
 //!
-//! **Non-pinhole cameras have two references.** All settings are compared with splats, so that their own
-//! errors show. One more row compares the twin as it is served with a ray for every pixel.
+//! **Non-pinhole cameras have two references.** All settings are compared with splats, so that
+//! their own errors show. One more row compares the twin as it is served with a ray for every
+//! pixel.
 
 use serde::Serialize;
 
@@ -58,7 +61,6 @@ pub struct SettingList {
 pub struct Skipped {
     /// The setting or family.
     pub what: String,
-    /// The reason.
     #[serde(rename = "why")]
     pub reason: String,
 }
@@ -78,7 +80,8 @@ const ALPHA_CUTS: [f64; 3] = [0.008, 0.016, 0.032];
 const STOPS: [f64; 3] = [1e-3, 4e-3, 1.6e-2];
 /// Values of `sky_error`: colour error of the baked sky; 0 evaluates it for every pixel.
 const SKY_ERRORS: [f64; 4] = [0.0, 0.01, 0.05, 0.1];
-/// Scales of the image's sides. An agent that reads 576 x 320 px of a camera of 1920 x 1080 px has 0.3.
+/// Scales of the image's sides. An agent that reads 576 x 320 px of a camera of 1920 x 1080 px has
+/// 0.3.
 const SCALES: [f64; 3] = [0.5, 1.0 / 3.0, 0.25];
 /// Values of `lens_error_px`; 0 projects six points of every Gaussian.
 const LENS_ERRORS_PX: [f64; 5] = [0.0, 1.0 / 256.0, 1.0 / 64.0, 1.0 / 16.0, 0.25];
@@ -105,8 +108,8 @@ const TILE_SIZE_REASON: &str = "16 x 16 px is part of the kernels' design: sixte
                                 backend. A macro tile has 8 x 4 tiles, one for each bit of a word. Another \
                                 size is another kernel, and the image would be the same";
 
-/// Every setting that can affect the twin. `backends` are names; the first backend renders all settings.
-/// Only record formats coarser than the twin's own are compared with it.
+/// Every setting that can affect the twin. `backends` are names; the first backend renders all
+/// settings. Only record formats coarser than the twin's own are compared with it.
 pub fn settings_to_compare(twin: &TwinFeatures, backends: &[&str]) -> SettingList {
     let mut list = ListBuilder::new(twin);
     list.add_backends(backends);

@@ -6,8 +6,8 @@ pub(super) fn min(values: impl IntoIterator<Item = f64>) -> f64 {
     values.into_iter().reduce(lesser).unwrap_or(f64::NAN)
 }
 
-/// The quantile of a share from 0 to 1: the value at the nearest rank, without interpolation. NaN if there
-/// are no values.
+/// The quantile of a share from 0 to 1: the value at the nearest rank, without interpolation. NaN
+/// if there are no values.
 pub(super) fn quantile(values: &[f64], share: f64) -> f64 {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);

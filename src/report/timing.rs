@@ -1,9 +1,9 @@
 //! Times of a step, measured in turn with a step of the twin as it is served.
 //!
-//! The speed of a machine changes while a report is made. Timed one after another, the last settings took
-//! twice as long as the first, because other programs had begun to compile. A step of the served twin right
-//! after each step of a setting shows how fast the machine was at that moment;
-//! [`super::measurement::normalize_machine_speed`] scales all times to one speed.
+//! The speed of a machine changes while a report is made. Timed one after another, the last
+//! settings took twice as long as the first, because other programs had begun to compile. A step of
+//! the served twin right after each step of a setting shows how fast the machine was at that
+//! moment; [`super::measurement::normalize_machine_speed`] scales all times to one speed.
 
 use std::time::Instant;
 
@@ -42,8 +42,8 @@ struct StepRun {
 }
 
 impl Step<'_> {
-    /// Times the step `repeat` times, in turn with `baseline`. One more run of each comes first and is not
-    /// counted: it allocates buffers.
+    /// Times the step `repeat` times, in turn with `baseline`. One more run of each comes first and
+    /// is not counted: it allocates buffers.
     pub(super) fn time(&self, baseline: &Step<'_>, repeat: u32) -> Result<StepTimes, ReportError> {
         let mut times = StepTimes::default();
         let mut own_images = self.empty_images();

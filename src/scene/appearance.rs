@@ -1,7 +1,7 @@
 //! How a camera's image differs from the scene: its exposure, and an overlay of its own vehicle.
 //!
-//! An overlay is part of the rig, as a PNG in the rig's JSON. So messages, manifests and recordings contain it
-//! without any extra mechanism, and it is cropped and scaled together with its camera.
+//! An overlay is part of the rig, as a PNG in the rig's JSON. So messages, manifests and recordings
+//! contain it without any extra mechanism, and it is cropped and scaled together with its camera.
 
 use std::io::Cursor;
 use std::sync::Arc;
@@ -21,11 +21,11 @@ pub struct Appearance {
     pub overlay: Option<Arc<Overlay>>,
 }
 
-/// An affine colour transform, `matrix * rgb + offset`, on linear red, green, blue. It is applied after the
-/// sky and before the overlay. Street reconstructions train one per camera.
+/// An affine colour transform, `matrix * rgb + offset`, on linear red, green, blue. It is applied
+/// after the sky and before the overlay. Street reconstructions train one per camera.
 ///
-/// JSON: `{"matrix": [[..], [..], [..]], "offset": [..]}`, or `{"gain": [..], "offset": [..]}` for a
-/// diagonal matrix. `offset` defaults to 0.
+/// JSON: `{"matrix": [[..], [..], [..]], "offset": [..]}`, or `{"gain": [..], "offset": [..]}` for
+/// a diagonal matrix. `offset` defaults to 0.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "ExposureFields", into = "ExposureFields")]
 pub struct Exposure {
@@ -35,8 +35,8 @@ pub struct Exposure {
     pub offset: [f64; 3],
 }
 
-/// An image of the camera's size that is blended over the rendered image. JSON holds it as a PNG with an
-/// alpha channel: `"data:image/png;base64,.."`.
+/// An image of the camera's size that is blended over the rendered image. JSON holds it as a PNG
+/// with an alpha channel: `"data:image/png;base64,.."`.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Overlay {
     width_px: u32,
@@ -53,7 +53,6 @@ pub enum AppearanceError {
     Exposure {
         /// `matrix` or `offset`.
         field: &'static str,
-        /// The refused value.
         value: f64,
     },
     /// An exposure with both a matrix and a gain, or with neither.
@@ -141,7 +140,8 @@ impl Appearance {
     /// Checks the appearance for a camera whose image has this width and height.
     ///
     /// # Errors
-    /// An exposure coefficient is out of range, or the size of the overlay differs from that of the image.
+    /// An exposure coefficient is out of range, or the size of the overlay differs from that of the
+    /// image.
     pub fn check(&self, camera_px: [u32; 2]) -> Result<(), AppearanceError> {
         if let Some(Exposure { matrix, offset }) = &self.exposure {
             for (field, values) in [("matrix", matrix.as_flattened()), ("offset", offset)] {
@@ -161,8 +161,8 @@ impl Appearance {
 }
 
 impl Overlay {
-    /// Limit of the pixels of all overlays of a rig together. 67 MB in memory: two 4K images, or twice the
-    /// pixels of six surround cameras of 1440 x 928 px.
+    /// Limit of the pixels of all overlays of a rig together. 67 MB in memory: two 4K images, or
+    /// twice the pixels of six surround cameras of 1440 x 928 px.
     pub const MAX_PIXELS: u64 = 1 << 24;
 
     /// Decodes a PNG for a camera's image of this width and height. The size in the PNG's header is
@@ -213,11 +213,13 @@ impl Overlay {
         Ok(Self { width_px, rgba8, png })
     }
 
-    /// The part of the overlay whose first column and row are `at_px`, resized to `size_px`. Shrinking
-    /// filters with a triangle two output pixels wide, weighted by alpha. Sizes are `[width, height]`.
+    /// The part of the overlay whose first column and row are `at_px`, resized to `size_px`.
+    /// Shrinking filters with a triangle two output pixels wide, weighted by alpha. Sizes are
+    /// `[width, height]`.
     ///
     /// # Errors
-    /// [`AppearanceError::Overlay`] if the part is not within the overlay, or the result is too large.
+    /// [`AppearanceError::Overlay`] if the part is not within the overlay, or the result is too
+    /// large.
     pub fn cropped_and_resized(
         &self,
         at_px: [u32; 2],
@@ -241,7 +243,8 @@ impl Overlay {
             };
             return Self::new(to_width, (0..part_height).flat_map(row).copied().collect());
         }
-        // Filter premultiplied colours: otherwise colours of transparent pixels leak into opaque ones.
+        // Filter premultiplied colours: otherwise colours of transparent pixels leak into opaque
+        // ones.
         let premultiplied = Rgba32FImage::from_fn(part_width, part_height, |x, y| {
             let at = 4 * ((top + y) as usize * width as usize + (left + x) as usize);
             let [r, g, b, a] = [0, 1, 2, 3].map(|c| f32::from(self.rgba8[at + c]) / 255.0);
@@ -283,9 +286,10 @@ fn refused(reason: &str) -> AppearanceError {
 
 fn check_pixels(pixels: u64) -> Result<(), AppearanceError> {
     let limit = Overlay::MAX_PIXELS;
-    match pixels <= limit {
-        true => Ok(()),
-        false => Err(refused(&format!("it has {pixels} pixels; at most {limit} are accepted"))),
+    if pixels <= limit {
+        Ok(())
+    } else {
+        Err(refused(&format!("it has {pixels} pixels; at most {limit} are accepted")))
     }
 }
 

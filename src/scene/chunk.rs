@@ -1,14 +1,15 @@
 //! Chunks: Gaussians that share an origin, activated and laid out for the renderer.
 //!
-//! A chunk of a twin is one *section*: one level of detail of one block of 16 m x 16 m within a cell of
-//! 64 m x 64 m ([`crate::lod`]). It is read, decoded and drawn as a unit, so the renderer does not deal with
-//! levels of detail. A chunk of a scene file is a whole cell. A sparse cell, such as one of a skyline, is a
-//! single block: as 3,000 blocks of three Gaussians each, the demo street's skyline took 9 ms of every frame.
+//! A chunk of a twin is one *section*: one level of detail of one block of 16 m x 16 m within a
+//! cell of 64 m x 64 m ([`crate::lod`]). It is read, decoded and drawn as a unit, so the renderer
+//! does not deal with levels of detail. A chunk of a scene file is a whole cell. A sparse cell,
+//! such as one of a skyline, is a single block: as 3,000 blocks of three Gaussians each, the demo
+//! street's skyline took 9 ms of every frame.
 //!
 //! A chunk stores Gaussians in *lane groups* of 16: one column of 16 floats per parameter. A vector
-//! instruction processes 16 Gaussians at once, and Gaussians that are culled by their position cost only
-//! three columns of reads. 256 Gaussians in Morton order form a *cluster* with a bounding box, which is
-//! culled as a unit.
+//! instruction processes 16 Gaussians at once, and Gaussians that are culled by their position cost
+//! only three columns of reads. 256 Gaussians in Morton order form a *cluster* with a bounding box,
+//! which is culled as a unit.
 
 use std::collections::BTreeSet;
 use std::ops::{Range, RangeInclusive};
@@ -31,13 +32,13 @@ pub const CELL_M: f64 = 64.0;
 pub const BLOCK_M: f64 = 16.0;
 /// Number of blocks along the edge of a cell.
 pub const BLOCKS: usize = (CELL_M / BLOCK_M) as usize;
-/// A cell with fewer Gaussians than this is a single block. Split into 16 blocks it would not even fill
-/// one cluster per block, and every chunk costs each frame some work. Cells of a skyline or a sky have only
-/// a few Gaussians each.
+/// A cell with fewer Gaussians than this is a single block. Split into 16 blocks it would not even
+/// fill one cluster per block, and every chunk costs each frame some work. Cells of a skyline or a
+/// sky have only a few Gaussians each.
 pub const SPARSE_CELL: usize = BLOCKS * BLOCKS * CLUSTER;
 
-/// Indices of the columns of a lane group. The SH coefficients come last: coefficient-major, then red,
-/// green, blue.
+/// Indices of the columns of a lane group. The SH coefficients come last: coefficient-major, then
+/// red, green, blue.
 pub mod column {
     /// Mean relative to the chunk's origin, in metres: three columns x, y, z.
     pub const MEAN: usize = 0;
@@ -45,15 +46,15 @@ pub mod column {
     pub const SCALE: usize = 3;
     /// Unit quaternion (w, x, y, z) that takes principal axes to world axes: four columns.
     pub const QUAT: usize = 6;
-    /// Base-2 logarithm of the peak opacity; minus infinity in empty lanes. Only merged Gaussians have a
-    /// positive one, where several overlapped. The renderer adds this value to its exponent.
+    /// Base-2 logarithm of the peak opacity; minus infinity in empty lanes. Only merged Gaussians
+    /// have a positive one, where several overlapped. The renderer adds this value to its exponent.
     pub const LOG2_OPACITY: usize = 10;
     /// First SH coefficient of the colour.
     pub const SH: usize = 11;
 }
 
-/// Number of columns at an SH degree: 11, and 3 per SH coefficient. 23 columns, 92 B per Gaussian, at
-/// degree 1.
+/// Number of columns at an SH degree: 11, and 3 per SH coefficient. 23 columns, 92 B per Gaussian,
+/// at degree 1.
 pub const fn columns(sh_degree: u8) -> usize {
     column::SH + 3 * sh::coefficients(sh_degree)
 }
@@ -141,8 +142,8 @@ pub struct Chunk {
 }
 
 impl Chunk {
-    /// An empty chunk with capacity for `capacity` Gaussians, to be filled with [`Chunk::push`]. `origin_m`
-    /// is in world axes.
+    /// An empty chunk with capacity for `capacity` Gaussians, to be filled with [`Chunk::push`].
+    /// `origin_m` is in world axes.
     pub fn new(cell: [i32; 2], origin_m: DVec3, sh_degree: u8, capacity: usize) -> Self {
         let mut lanes = LanePages::new(columns(sh_degree), None);
         lanes.expect(capacity.div_ceil(LANES));
@@ -188,8 +189,8 @@ impl Chunk {
 
     /// Activates one Gaussian and appends it.
     ///
-    /// Import accepts only finite values. A Gaussian that is invalid nevertheless becomes an empty lane: it
-    /// keeps its index and is never drawn, and its neighbours are not affected.
+    /// Import accepts only finite values. A Gaussian that is invalid nevertheless becomes an empty
+    /// lane: it keeps its index and is never drawn, and its neighbours are not affected.
     ///
     /// # Panics
     /// If the number of SH coefficients is not that of the chunk's degree.
@@ -204,8 +205,8 @@ impl Chunk {
         });
     }
 
-    /// Appends one activated Gaussian. One with a value that is not finite, or with an SH coefficient far
-    /// out of range, becomes an empty lane.
+    /// Appends one activated Gaussian. One with a value that is not finite, or with an SH
+    /// coefficient far out of range, becomes an empty lane.
     ///
     /// # Panics
     /// If the number of SH coefficients is not that of the chunk's degree.
@@ -280,11 +281,11 @@ impl Chunk {
         self.lanes.group(group)
     }
 
-    /// Half-size of the axis-aligned box around the 3-sigma ellipsoid of one Gaussian, in metres along world
-    /// axes.
+    /// Half-size of the axis-aligned box around the 3-sigma ellipsoid of one Gaussian, in metres
+    /// along world axes.
     ///
-    /// Per axis it is `3 sqrt(cov_ii)` with `cov = R S Sᵀ Rᵀ`, so `cov_ii` is the squared length of row i of
-    /// `R S`.
+    /// Per axis it is `3 sqrt(cov_ii)` with `cov = R S Sᵀ Rᵀ`, so `cov_ii` is the squared length of
+    /// row i of `R S`.
     pub fn half_extent_m(&self, index: usize) -> DVec3 {
         let value = |column| f64::from(self.value(index, column));
         let [w, x, y, z] = [0, 1, 2, 3].map(|i| value(column::QUAT + i));
@@ -299,9 +300,10 @@ impl Chunk {
         self.lane_group(index / LANES)[column].0[index % LANES]
     }
 
-    /// The Gaussians before activation, in the order of the chunk and in its origin's axes. Opacities of 1, which no
-    /// logit has, become 1 - 1e-13; empty lanes become invisible Gaussians. All are within the bounds of
-    /// [`validate`](super::validate), which rounding in a record could exceed.
+    /// The Gaussians before activation, in the order of the chunk and in its origin's axes.
+    /// Opacities of 1, which no logit has, become 1 - 1e-13; empty lanes become invisible
+    /// Gaussians. All are within the bounds of [`validate`](super::validate), which rounding in a
+    /// record could exceed.
     pub fn to_gaussians(&self) -> Gaussians {
         let mut gaussians = Gaussians::with_capacity(self.sh_degree, self.count);
         for index in 0..self.count {
@@ -313,7 +315,8 @@ impl Chunk {
             let quat = [0, 1, 2, 3].map(|k| value(column::QUAT + k));
             let is_empty = quat == [0.0; 4];
             gaussians.quats_wxyz.push(if is_empty { [1.0, 0.0, 0.0, 0.0] } else { quat });
-            // A file may have scales of 0, and records round small ones to 0: they are the smallest that is allowed.
+            // A file may have scales of 0, and records round small ones to 0: they are the smallest
+            // that is allowed.
             let ln =
                 |scale_m: f32| (f64::from(scale_m).ln() as f32).clamp(LN_SCALE[0], LN_SCALE[1]);
             gaussians.ln_scales.push(three(column::SCALE).map(ln));
@@ -326,7 +329,7 @@ impl Chunk {
     }
 
     /// Memory that a chunk of `count` Gaussians of an SH degree needs, in bytes.
-    pub fn bytes_of(sh_degree: u8, count: u64) -> u64 {
+    pub fn needed_bytes(sh_degree: u8, count: u64) -> u64 {
         let lanes = count.div_ceil(LANES as u64) * columns(sh_degree) as u64;
         let clusters = count.div_ceil(CLUSTER as u64);
         let of_cluster = size_of::<Cluster>() + size_of::<Page>();
@@ -339,7 +342,8 @@ impl Chunk {
     }
 }
 
-/// Bounds of every sixteenth Gaussian of a cluster: lane by lane, so that the compiler makes vector instructions of it.
+/// Bounds of every sixteenth Gaussian of a cluster: lane by lane, so that the compiler makes vector
+/// instructions of it.
 struct LaneBounds {
     min_m: [[f32; LANES]; 3],
     max_m: [[f32; LANES]; 3],
@@ -406,8 +410,9 @@ fn accepted(column: usize) -> RangeInclusive<f32> {
     match column {
         // Minus infinity is opacity 0: valid, never drawn.
         column::LOG2_OPACITY => f32::NEG_INFINITY..=f32::MAX,
-        // Twice the bound of import, since a record format may round beyond that bound. The gpu backend
-        // shares one colour scale among 256 Gaussians: a larger value would coarsen its neighbours.
+        // Twice the bound of import, since a record format may round beyond that bound. The gpu
+        // backend shares one colour scale among 256 Gaussians: a larger value would coarsen its
+        // neighbours.
         column::SH.. => -2.0 * sh::MAX_COEFFICIENT..=2.0 * sh::MAX_COEFFICIENT,
         _ => f32::MIN..=f32::MAX,
     }
@@ -439,13 +444,14 @@ pub struct Partition {
 pub struct CellRun {
     /// Grid cell (x, y); its square is centred on (64 x, 64 y) m.
     pub cell: [i32; 2],
-    /// The chunk's origin in the world, in metres: the cell's centre, at a height that is a multiple of
-    /// 64 m. Subtracting it from an f32 mean near the world's origin is exact.
+    /// The chunk's origin in the world, in metres: the cell's centre, at a height that is a
+    /// multiple of 64 m. Subtracting it from an f32 mean near the world's origin is exact.
     pub origin_m: DVec3,
     /// The cell's range of [`Partition::order`].
     pub run: Range<usize>,
-    /// The number of every block that is not empty, and its range of [`Partition::order`]. A sparse cell
-    /// (below [`SPARSE_CELL`]) is one block, with the number of its first block that is not empty.
+    /// The number of every block that is not empty, and its range of [`Partition::order`]. A sparse
+    /// cell (below [`SPARSE_CELL`]) is one block, with the number of its first block that is not
+    /// empty.
     pub blocks: Vec<(u8, Range<usize>)>,
 }
 
@@ -456,8 +462,8 @@ impl Partition {
             .par_iter()
             .enumerate()
             .map(|(index, mean)| {
-                let cell = [cell_of(mean[1]), cell_of(mean[0])];
-                (cell, block_of(mean, cell), morton(mean), index as u32)
+                let cell = [cell_index(mean[1]), cell_index(mean[0])];
+                (cell, block_index(mean, cell), morton(mean), index as u32)
             })
             .collect();
         keys.par_sort_unstable();
@@ -492,23 +498,24 @@ impl CellRun {
             quat_wxyz: gaussians.quats_wxyz[index],
             ln_scale: gaussians.ln_scales[index],
             logit_opacity: gaussians.logit_opacities[index],
-            sh: gaussians.sh_of(index),
+            sh: gaussians.sh_at(index),
         }
     }
 }
 
 /// The grid cell (x, y) of a mean in world metres.
 pub fn cell_at(mean_m: &[f64; 3]) -> [i32; 2] {
-    [cell_of(mean_m[0]), cell_of(mean_m[1])]
+    [cell_index(mean_m[0]), cell_index(mean_m[1])]
 }
 
 /// The cell index along one axis. Import accepts coordinates up to 1e8 m, so the index fits an i32.
-fn cell_of(coordinate_m: f64) -> i32 {
+fn cell_index(coordinate_m: f64) -> i32 {
     (coordinate_m / CELL_M).round() as i32
 }
 
-/// The number of a mean's block within its cell (y, x): 4 y + x, counted from the south-west corner.
-fn block_of(mean_m: &[f64; 3], [y, x]: [i32; 2]) -> u8 {
+/// The number of a mean's block within its cell (y, x): 4 y + x, counted from the south-west
+/// corner.
+fn block_index(mean_m: &[f64; 3], [y, x]: [i32; 2]) -> u8 {
     let step = |m: f64, cell: i32| {
         let from_edge_m = m - CELL_M * (f64::from(cell) - 0.5);
         (from_edge_m / BLOCK_M).floor().clamp(0.0, BLOCKS as f64 - 1.0) as u8
@@ -516,7 +523,8 @@ fn block_of(mean_m: &[f64; 3], [y, x]: [i32; 2]) -> u8 {
     BLOCKS as u8 * step(mean_m[1], y) + step(mean_m[0], x)
 }
 
-/// Morton code of a position: interleaves the bits of x, y, z in steps of 1/1024 of a cell, modulo 128 km.
+/// Morton code of a position: interleaves the bits of x, y, z in steps of 1/1024 of a cell, modulo
+/// 128 km.
 fn morton(mean_m: &[f64; 3]) -> u64 {
     mean_m.iter().enumerate().fold(0, |code, (axis, &m)| {
         let steps = (m * (1024.0 / CELL_M)).floor() as i64 as u64 & 0x1F_FFFF;
@@ -533,8 +541,8 @@ fn spread(x: u64) -> u64 {
     (x | x << 2) & 0x1249_2492_4924_9249
 }
 
-/// The chunks that a frame draws, and the sky behind them. The global id of a Gaussian is its index when
-/// counting through all chunks in order, and then through the actors' in order.
+/// The chunks that a frame draws, and the sky behind them. The global id of a Gaussian is its index
+/// when counting through all chunks in order, and then through the actors' in order.
 ///
 /// ```
 /// use wildcity_scene::{Gaussians, Scene};
@@ -555,10 +563,11 @@ fn spread(x: u64) -> u64 {
 pub struct Scene {
     /// Chunks of one SH degree, in order of (cell y, cell x).
     pub chunks: Vec<Arc<Chunk>>,
-    /// Actors. Among Gaussians with equal depths, those of the twin are in front, then those of actors in the order
-    /// of this list. At most [`PlacedChunk::MAX_ACTORS`] actors.
+    /// Actors. Among Gaussians with equal depths, those of the twin are in front, then those of
+    /// actors in the order of this list. At most [`PlacedChunk::MAX_ACTORS`] actors.
     pub placed: Vec<PlacedChunk>,
-    /// The sky; without one, the background colour of the render profile is drawn (black by default).
+    /// The sky; without one, the background colour of the render profile is drawn (black by
+    /// default).
     pub sky: Option<Arc<Sky>>,
 }
 
@@ -577,8 +586,8 @@ impl Scene {
         Self { chunks: partition.cells.par_iter().map(chunk).collect(), ..Self::default() }
     }
 
-    /// All Gaussians in one chunk with its origin at that of their axes, in Morton order: for assets of actors. Means
-    /// in f32 are exact to 4 µm within 64 m.
+    /// All Gaussians in one chunk with its origin at that of their axes, in Morton order: for
+    /// assets of actors. Means in f32 are exact to 4 µm within 64 m.
     pub fn single_chunk(gaussians: &Gaussians) -> Chunk {
         let mut order: Vec<(u64, usize)> =
             gaussians.means_m.iter().map(morton).zip(0..gaussians.len()).collect();
@@ -590,7 +599,7 @@ impl Scene {
                 quat_wxyz: gaussians.quats_wxyz[index],
                 ln_scale: gaussians.ln_scales[index],
                 logit_opacity: gaussians.logit_opacities[index],
-                sh: gaussians.sh_of(index),
+                sh: gaussians.sh_at(index),
             });
         }
         chunk
@@ -607,7 +616,8 @@ impl Scene {
         self.chunks.first().map_or(0, |chunk| chunk.sh_degree())
     }
 
-    /// Every chunk once, in order: those of the twin, then those of actors. Actors may share chunks.
+    /// Every chunk once, in order: those of the twin, then those of actors. Actors may share
+    /// chunks.
     pub fn distinct_chunks(&self) -> impl Iterator<Item = &Arc<Chunk>> {
         let mut shared = BTreeSet::new();
         let placed = self.placed.iter().map(|placed| &placed.chunk);
@@ -615,7 +625,8 @@ impl Scene {
         self.chunks.iter().chain(own)
     }
 
-    /// Memory that the chunks have allocated, in bytes. Memory that several actors share is counted once.
+    /// Memory that the chunks have allocated, in bytes. Memory that several actors share is counted
+    /// once.
     pub fn bytes(&self) -> usize {
         self.distinct_chunks().map(|chunk| chunk.bytes()).sum()
     }
@@ -662,7 +673,8 @@ mod tests {
         assert_eq!(unused, [f32::NEG_INFINITY; LANES - 1]);
     }
 
-    /// `push_activated` and `from_lanes` both empty the lane of an invalid Gaussian and keep its neighbour.
+    /// `push_activated` and `from_lanes` both empty the lane of an invalid Gaussian and keep its
+    /// neighbour.
     #[test]
     fn both_constructors_empty_the_lanes_of_invalid_gaussians() {
         let mut cell = Chunk::new([0, 0], DVec3::ZERO, 0, 2);
@@ -750,7 +762,7 @@ mod tests {
         for (index, from) in order.into_iter().enumerate() {
             assert_eq!(again.means_m[index], raw.means_m[from]);
             assert_eq!(again.quats_wxyz[index], [1.0, 0.0, 0.0, 0.0]);
-            assert_eq!(again.sh_of(index), raw.sh_of(from));
+            assert_eq!(again.sh_at(index), raw.sh_at(from));
             for axis in 0..3 {
                 let off = again.ln_scales[index][axis] - raw.ln_scales[from][axis];
                 assert!(off.abs() < 1e-6, "{off}");

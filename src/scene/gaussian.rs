@@ -10,9 +10,9 @@ use super::validate::{FULL_LOGIT, LN_SCALE, MAX_SH};
 
 /// Raw Gaussians, as columns of equal length `n`.
 ///
-/// Activation (Kerbl et al. 2023, section 5.1): `scale = exp(ln_scale)`, `opacity = sigmoid(logit)`, and the
-/// quaternion is normalised. The covariance is `R S Sᵀ Rᵀ`, where `R` is the rotation and `S` the diagonal
-/// matrix of the scales.
+/// Activation (Kerbl et al. 2023, section 5.1): `scale = exp(ln_scale)`,
+/// `opacity = sigmoid(logit)`, and the quaternion is normalised. The covariance is `R S Sᵀ Rᵀ`,
+/// where `R` is the rotation and `S` the diagonal matrix of the scales.
 ///
 /// ```
 /// use wildcity_scene::Gaussians;
@@ -23,17 +23,17 @@ use super::validate::{FULL_LOGIT, LN_SCALE, MAX_SH};
 /// gaussians.ln_scales.push([-3.0; 3]);
 /// gaussians.logit_opacities.push(2.0);
 /// gaussians.sh.extend([0.5, 0.4, 0.3]); // one coefficient: red, green, blue
-/// assert_eq!(gaussians.sh_of(0), [0.5, 0.4, 0.3]);
+/// assert_eq!(gaussians.sh_at(0), [0.5, 0.4, 0.3]);
 ///
 /// gaussians.raise_sh_degree(1);
-/// assert_eq!(gaussians.sh_of(0).len(), 3 * 4); // (1 + 1)² coefficients
+/// assert_eq!(gaussians.sh_at(0).len(), 3 * 4); // (1 + 1)² coefficients
 /// ```
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Gaussians {
     /// Spherical-harmonic degree of the colour, 0 to 3.
     pub sh_degree: u8,
-    /// Means, in metres along the axes of the file or twin. They are f64 because the coordinates of a twin
-    /// may be as large as 4.5e6 m.
+    /// Means, in metres along the axes of the file or twin. They are f64 because the coordinates of
+    /// a twin may be as large as 4.5e6 m.
     pub means_m: Vec<[f64; 3]>,
     /// Rotations (w, x, y, z) that take principal axes to world axes; of any length except zero.
     pub quats_wxyz: Vec<[f32; 4]>,
@@ -73,11 +73,11 @@ impl Gaussians {
         self.quats_wxyz.push(others.quats_wxyz[index]);
         self.ln_scales.push(others.ln_scales[index]);
         self.logit_opacities.push(others.logit_opacities[index]);
-        self.sh.extend_from_slice(others.sh_of(index));
+        self.sh.extend_from_slice(others.sh_at(index));
     }
 
-    /// Appends all Gaussians of `others`. Where the SH degrees differ, the result has the higher one:
-    /// the missing coefficients are zero, which changes no colour.
+    /// Appends all Gaussians of `others`. Where the SH degrees differ, the result has the higher
+    /// one: the missing coefficients are zero, which changes no colour.
     pub fn append(&mut self, others: &Self) {
         self.append_range(others, 0..others.len());
     }
@@ -97,7 +97,7 @@ impl Gaussians {
         }
         self.sh.reserve(range.len() * raised);
         for index in range {
-            self.sh.extend_from_slice(others.sh_of(index));
+            self.sh.extend_from_slice(others.sh_at(index));
             self.sh.resize(self.sh.len() + raised - own, 0.0);
         }
     }
@@ -129,8 +129,8 @@ impl Gaussians {
         self.clamp_coefficients();
     }
 
-    /// Replaces coefficients beyond the bound by the nearest within it: a rotation may turn several at the bound into
-    /// one beyond.
+    /// Replaces coefficients beyond the bound by the nearest within it: a rotation may turn several
+    /// at the bound into one beyond.
     pub fn clamp_coefficients(&mut self) {
         for coefficient in &mut self.sh {
             *coefficient = coefficient.clamp(-MAX_SH, MAX_SH);
@@ -138,7 +138,8 @@ impl Gaussians {
     }
 
     /// Replaces values that no file needs to avoid and that have a nearest one within the bounds of
-    /// [`validate`](super::validate): opacities of 0 and 1, whose logit is infinite, and scales below the smallest one.
+    /// [`validate`](super::validate): opacities of 0 and 1, whose logit is infinite, and scales
+    /// below the smallest one.
     pub fn clamp_activations(&mut self) {
         for logit in self.logit_opacities.iter_mut().filter(|logit| logit.is_infinite()) {
             *logit = FULL_LOGIT.copysign(*logit);
@@ -146,8 +147,8 @@ impl Gaussians {
         self.ln_scales.as_flattened_mut().iter_mut().for_each(raise_to_smallest);
     }
 
-    /// Scales all Gaussians about the origin. A factor of 1 changes no bit. Scales that would become smaller than the
-    /// smallest one become that one.
+    /// Scales all Gaussians about the origin. A factor of 1 changes no bit. Scales that would
+    /// become smaller than the smallest one become that one.
     pub fn scale(&mut self, factor: f64) {
         if factor == 1.0 {
             return;
@@ -188,7 +189,7 @@ impl Gaussians {
     }
 
     /// SH coefficients of one Gaussian: `[(sh_degree + 1)², 3]`.
-    pub fn sh_of(&self, index: usize) -> &[f32] {
+    pub fn sh_at(&self, index: usize) -> &[f32] {
         let stride = 3 * sh::coefficients(self.sh_degree);
         &self.sh[index * stride..(index + 1) * stride]
     }
@@ -246,9 +247,9 @@ mod tests {
         let mut first = numbered(2, &[5]);
         first.append(&numbered(0, &[1]));
         assert_eq!(first.sh_degree, 2);
-        assert_eq!(first.sh_of(0), numbered(2, &[5]).sh_of(0));
-        assert_eq!(first.sh_of(1)[..3], numbered(0, &[1]).sh);
-        assert_eq!(first.sh_of(1)[3..], [0.0; 24]);
+        assert_eq!(first.sh_at(0), numbered(2, &[5]).sh_at(0));
+        assert_eq!(first.sh_at(1)[..3], numbered(0, &[1]).sh);
+        assert_eq!(first.sh_at(1)[3..], [0.0; 24]);
     }
 
     #[test]

@@ -1,14 +1,14 @@
 //! The data of a city twin: Gaussians in chunks and levels of detail, cameras and rigs, recorded
 //! trajectories, skies, render profiles, and the manifest that ties them to one version.
 //!
-//! The whole package is pure: no files, no clock, no network. The same input gives the same bytes at any
-//! thread count.
+//! The whole package is pure: no files, no clock, no network. The same input gives the same bytes
+//! at any thread count.
 //!
 //! # Coordinates
-//! A mean lies in a grid cell of 64 m ([`chunk::CELL_M`]). Cells are centred on multiples of 64 m, so that
-//! the mean of a capture near the world's origin minus the origin of its chunk is exact in f32, and the
-//! `f32` record format loses nothing. Means are f64 until they are relative to their chunk; the renderer
-//! subtracts the camera in f64 once per chunk and frame.
+//! A mean lies in a grid cell of 64 m ([`chunk::CELL_M`]). Cells are centred on multiples of 64 m,
+//! so that the mean of a capture near the world's origin minus the origin of its chunk is exact in
+//! f32, and the `f32` record format loses nothing. Means are f64 until they are relative to their
+//! chunk; the renderer subtracts the camera in f64 once per chunk and frame.
 
 pub mod actor;
 pub mod align;

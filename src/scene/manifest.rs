@@ -1,8 +1,8 @@
 //! The manifest: lists everything that one version of a twin consists of.
 //!
-//! The *table* of sections is an object of its own: at 78 bytes a section, 100,000 sections would be 25 MB as
-//! JSON in the manifest. Each object repeats its own part of the table, so that it can be read without the
-//! manifest; `verify` compares the two.
+//! The *table* of sections is an object of its own: at 78 bytes a section, 100,000 sections would
+//! be 25 MB as JSON in the manifest. Each object repeats its own part of the table, so that it can
+//! be read without the manifest; `verify` compares the two.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -34,7 +34,6 @@ pub struct Manifest {
     /// The rig of the vehicle that recorded the twin, if known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rig: Option<Rig>,
-    /// Recorded drives.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub trajectories: Vec<Trajectory>,
     /// The twin's sky, if it has one.
@@ -46,9 +45,9 @@ pub struct Manifest {
     /// The place of the world on the earth, if it is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub geo: Option<GeoAnchor>,
-    /// From the axes and the unit with which the capture was imported to the twin's: all alignments since then as
-    /// one. None if the twin was never aligned; older versions have it only in their provenance
-    /// ([`Manifest::alignment`]).
+    /// From the axes and the unit with which the capture was imported to the twin's: all alignments
+    /// since then as one. None if the twin was never aligned; older versions have it only in their
+    /// provenance ([`Manifest::alignment`]).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub twin_from_capture: Option<Alignment>,
     /// The source of the version.
@@ -71,8 +70,9 @@ pub struct ChunkEntry {
     pub bounds: Bounds,
     /// Origin of the cell in the world, in metres: means in the object are relative to it.
     pub origin_m: DVec3,
-    /// The sections of the object, in order of (block, level). A route of 20 km has 100,000 and more, so
-    /// they are stored in [`Manifest::table`], 78 bytes each, and not in the manifest's JSON.
+    /// The sections of the object, in order of (block, level). A route of 20 km has 100,000 and
+    /// more, so they are stored in [`Manifest::table`], 78 bytes each, and not in the manifest's
+    /// JSON.
     #[serde(skip)]
     pub sections: Vec<Section>,
 }
@@ -84,10 +84,9 @@ pub struct Section {
     pub block: u8,
     /// Level of detail: 0 is full detail, higher levels are coarser.
     pub level: u8,
-    /// Number of Gaussians.
     pub count: u32,
-    /// Upper bound of the geometric error, in metres ([`crate::lod::Level::error_m`]). It rises with the
-    /// level.
+    /// Upper bound of the geometric error, in metres ([`crate::lod::Level::error_m`]). It rises
+    /// with the level.
     pub error_m: f32,
     /// Smallest corner of the 3-sigma boxes relative to the chunk's origin, in metres.
     pub min_m: [f32; 3],
@@ -134,7 +133,6 @@ pub struct ViewsRef {
     pub object: String,
     /// Size of the table, in bytes.
     pub bytes: u64,
-    /// Number of images.
     pub images: u64,
     /// Their total size, in bytes.
     pub image_bytes: u64,
@@ -157,13 +155,14 @@ const NOTE: &str = "note=";
 
 impl Provenance {
     /// The provenance of an import of `source` by this build, without options.
-    pub fn of(source: String) -> Self {
+    pub fn new(source: String) -> Self {
         let builder = concat!("wildcity ", env!("CARGO_PKG_VERSION")).to_owned();
         Self { source, builder, options: Vec::new() }
     }
 
-    /// The provenance of a version that is edited from one with this provenance. The note described the push, not the edit.
-    pub fn of_edit(&self) -> Self {
+    /// The provenance of a version that is edited from one with this provenance. The note described
+    /// the push, not the edit.
+    pub fn for_edit(&self) -> Self {
         let mut edited = self.clone();
         edited.options.retain(|option| !option.starts_with(NOTE));
         edited
@@ -184,13 +183,16 @@ impl Manifest {
     /// The layout version that this build writes.
     pub const FORMAT: u32 = 1;
 
-    /// From the axes and the unit with which the capture was imported to the twin's, if the twin was aligned since.
+    /// From the axes and the unit with which the capture was imported to the twin's, if the twin
+    /// was aligned since.
     ///
-    /// A version without [`Manifest::twin_from_capture`] was never aligned, or by a program that wrote alignments only
-    /// as options `align=` of the provenance. A push of such a program removed them: its version records no alignment.
+    /// A version without [`Manifest::twin_from_capture`] was never aligned, or by a program that
+    /// wrote alignments only as options `align=` of the provenance. A push of such a program
+    /// removed them: its version records no alignment.
     ///
     /// # Errors
-    /// An option of the provenance cannot be read, or all of them together are more than an [`Alignment`] may be.
+    /// An option of the provenance cannot be read, or all of them together are more than an
+    /// [`Alignment`] may be.
     pub fn alignment(&self) -> Result<Option<Alignment>, AlignmentError> {
         if self.twin_from_capture.is_some() {
             return Ok(self.twin_from_capture);
@@ -235,7 +237,8 @@ impl Section {
 }
 
 impl ChunkEntry {
-    /// The sections at full detail: one of each block, which together have all Gaussians of the cell.
+    /// The sections at full detail: one of each block, which together have all Gaussians of the
+    /// cell.
     pub fn full_detail(&self) -> impl Iterator<Item = &Section> {
         self.sections.iter().filter(|section| section.is_full_detail())
     }

@@ -1,9 +1,10 @@
 //! Memory of chunks: pages of one cluster each, and a pool of pages that chunks have returned.
 //!
-//! Sections of a twin have 1 kB to 9 MB. If each is one block of the heap, sections that come and go leave holes that
-//! the next ones do not fit into: 1,024 MiB of sections took 1,590 MiB of memory. All pages of an SH degree have one
-//! size, so any page fits in the place of another. Only the last page of a chunk may be smaller, so that a section of a
-//! few Gaussians takes no more than it needs.
+//! Sections of a twin have 1 kB to 9 MB. If each is one block of the heap, sections that come and
+//! go leave holes that the next ones do not fit into: 1,024 MiB of sections took 1,590 MiB of
+//! memory. All pages of an SH degree have one size, so any page fits in the place of another. Only
+//! the last page of a chunk may be smaller, so that a section of a few Gaussians takes no more than
+//! it needs.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -59,7 +60,8 @@ impl PagePool {
         Some(page)
     }
 
-    /// Keeps whole pages of `lanes` lanes, as many as the limit permits; the caller drops the others.
+    /// Keeps whole pages of `lanes` lanes, as many as the limit permits; the caller drops the
+    /// others.
     fn give_back(&self, lanes: usize, pages: &mut Vec<Page>) {
         let page_bytes = lanes * size_of::<Lanes>();
         let free = &mut *self.free.lock();
@@ -142,12 +144,11 @@ impl LanePages {
         if self.groups.is_multiple_of(PAGE_GROUPS) {
             let whole = PAGE_GROUPS * self.width;
             let expected = self.expected.saturating_sub(self.groups).max(groups);
-            let page = match expected < PAGE_GROUPS {
-                true => Page::with_capacity(expected * self.width),
-                false => {
-                    let free = self.pool.as_ref().and_then(|pool| pool.take(whole));
-                    free.unwrap_or_else(|| Page::with_capacity(whole))
-                }
+            let page = if expected < PAGE_GROUPS {
+                Page::with_capacity(expected * self.width)
+            } else {
+                let free = self.pool.as_ref().and_then(|pool| pool.take(whole));
+                free.unwrap_or_else(|| Page::with_capacity(whole))
             };
             self.pages.push(page);
         }

@@ -1,5 +1,5 @@
-//! The render profile: constants of the image formation that a twin's trainer used and that every backend
-//! must reproduce.
+//! The render profile: constants of the image formation that a twin's trainer used and that every
+//! backend must reproduce.
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
@@ -11,9 +11,9 @@ pub enum Rays {
     /// Each Gaussian is projected once, to a 2D ellipse (a splat). All backends.
     #[default]
     Splats,
-    /// Each pixel's ray is evaluated against the 3D Gaussian at its point of closest approach. This defines
-    /// the correct image and is slow; only the reference backend supports it. Lenses, windshields and
-    /// shutters are tested against it.
+    /// Each pixel's ray is evaluated against the 3D Gaussian at its point of closest approach. This
+    /// defines the correct image and is slow; only the reference backend supports it. Lenses,
+    /// windshields and shutters are tested against it.
     Exact,
 }
 
@@ -29,8 +29,8 @@ impl Rays {
 
 /// Constants of the image formation that differ between trainers (gsplat, INRIA, brush, ...).
 ///
-/// The defaults are those of gsplat 1.6 in its "classic" mode. The fields follow the rendering semantics of
-/// gsplat and of the reference code of Kerbl et al. 2023.
+/// The defaults are those of gsplat 1.6 in its "classic" mode. The fields follow the rendering
+/// semantics of gsplat and of the reference code of Kerbl et al. 2023.
 ///
 /// ```
 /// use wildcity_scene::RenderProfile;
@@ -54,27 +54,30 @@ pub struct RenderProfile {
     pub antialiased: bool,
     /// Largest alpha of one Gaussian at one pixel. gsplat before 2026-02 and brush: 0.999.
     pub alpha_cap: f64,
-    /// Smallest alpha that is blended; with a smaller one a Gaussian does not contribute to the pixel.
+    /// Smallest alpha that is blended; with a smaller one a Gaussian does not contribute to the
+    /// pixel.
     pub alpha_cut: f64,
-    /// Blending of a pixel stops before the Gaussian that would reduce the transmittance to this value or
-    /// below; that Gaussian is not blended.
+    /// Blending of a pixel stops before the Gaussian that would reduce the transmittance to this
+    /// value or below; that Gaussian is not blended.
     pub stop: f64,
-    /// Largest error of a level of detail on the screen, in pixels: each block of 16 m is drawn at the
-    /// coarsest level whose error stays below it. 0 draws full detail everywhere.
+    /// Largest error of a level of detail on the screen, in pixels: each block of 16 m is drawn at
+    /// the coarsest level whose error stays below it. 0 draws full detail everywhere.
     pub tau_px: f64,
     /// Blocks farther than this from the nearest camera are not drawn, in metres. `None` draws all.
     pub reach_m: Option<f64>,
     /// How Gaussians are evaluated. Serialized only if it is not the default.
     #[serde(skip_serializing_if = "Rays::is_splats")]
     pub rays: Rays,
-    /// Largest difference between the expansion of a lens or a rolling shutter around the centre of a Gaussian,
-    /// and the six points that define its splat, in pixels. Gaussians with a larger one are projected by six
-    /// points; with 0 all are. Pinholes at rest have neither. Serialized only if it is not the default.
+    /// Largest difference between the expansion of a lens or a rolling shutter around the centre of
+    /// a Gaussian, and the six points that define its splat, in pixels. Gaussians with a larger one
+    /// are projected by six points; with 0 all are. Pinholes at rest have neither. Serialized only
+    /// if it is not the default.
     #[serde(skip_serializing_if = "is_default_lens_error")]
     pub lens_error_px: f64,
-    /// Largest error of a baked sky in any direction, as a colour from 0 to 1; 0 evaluates the sky network
-    /// for every pixel. At 0.025 the edge of a cloud may be wrong by six steps of 8 bits, but 99 of 100
-    /// directions of the demo's sky are wrong by less than one step. Ignored by twins without a sky.
+    /// Largest error of a baked sky in any direction, as a colour from 0 to 1; 0 evaluates the sky
+    /// network for every pixel. At 0.025 the edge of a cloud may be wrong by six steps of 8 bits,
+    /// but 99 of 100 directions of the demo's sky are wrong by less than one step. Ignored by twins
+    /// without a sky.
     pub sky_error: f64,
     /// Background colour of twins without a sky: linear red, green, blue.
     pub background: [f64; 3],
@@ -97,9 +100,7 @@ pub enum ProfileError {
     /// A field is outside the range that the render stages support.
     #[error("profile field {field} is {value:?}; {must}")]
     Value {
-        /// The field.
         field: &'static str,
-        /// The refused value.
         value: f64,
         /// The values that are accepted.
         must: &'static str,
@@ -107,7 +108,6 @@ pub enum ProfileError {
     /// An override has an unknown field or a value of the wrong type.
     #[error("cannot read profile field {field}: {reason}; the fields are {}", RenderProfile::KEYS.join(", "))]
     Change {
-        /// The field.
         field: String,
         /// Why it was refused.
         reason: String,
@@ -115,7 +115,6 @@ pub enum ProfileError {
     /// `key=value` did not parse.
     #[error("cannot read profile setting {setting:?}: {reason}; the keys are {}", RenderProfile::KEYS.join(", "))]
     Setting {
-        /// The refused text.
         setting: String,
         /// Why it was refused.
         reason: String,
@@ -157,7 +156,8 @@ impl RenderProfile {
         "background",
     ];
 
-    /// Checks that every field is in range. The ranges keep the f32 arithmetic of all stages finite.
+    /// Checks that every field is in range. The ranges keep the f32 arithmetic of all stages
+    /// finite.
     ///
     /// # Errors
     /// [`ProfileError::Value`] names the first field out of range.

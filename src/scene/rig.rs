@@ -12,10 +12,11 @@ use crate::geometry::{Camera, CameraError, Pose};
 
 /// A camera mounted on the vehicle.
 ///
-/// JSON in rig files, manifests and recordings is the same as on the wire: `{"name", "width", "height", "fx",
-/// "fy", "cx", "cy", "camera_to_rig": {"xyz", "q"}}`, sizes and intrinsics in pixels. Optional fields are
-/// `lens`, `windshield` and `shutter` ([`crate::geometry::camera::json`]), `exposure` and `overlay`
-/// ([`Appearance`]), and `native_size` ([`Camera::native_size_px`]).
+/// JSON in rig files, manifests and recordings is the same as on the wire:
+/// `{"name", "width", "height", "fx", "fy", "cx", "cy", "camera_to_rig": {"xyz", "q"}}`, sizes and
+/// intrinsics in pixels. Optional fields are `lens`, `windshield` and `shutter`
+/// ([`crate::geometry::camera::json`]), `exposure` and `overlay` ([`Appearance`]), and
+/// `native_size` ([`Camera::native_size_px`]).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "CameraFields", into = "CameraFields")]
 pub struct RigCamera {
@@ -57,7 +58,8 @@ impl RigCamera {
         self.part(camera, [0, 0], [self.camera.width_px, self.camera.height_px])
     }
 
-    /// This camera with other intrinsics, which show a part of the image, and with that part of the overlay.
+    /// This camera with other intrinsics, which show a part of the image, and with that part of the
+    /// overlay.
     fn part(&self, camera: Camera, at_px: [u32; 2], part_px: [u32; 2]) -> Result<Self, RigError> {
         let mut appearance = self.appearance.clone();
         if let Some(overlay) = &mut appearance.overlay {
@@ -104,32 +106,18 @@ pub struct Rig {
 pub enum RigError {
     /// No cameras, or more than [`Rig::MAX_CAMERAS`].
     #[error("rig {rig:?} has {count} cameras; 1 to {limit} are accepted")]
-    Count {
-        /// The rig.
-        rig: String,
-        /// Number of cameras.
-        count: usize,
-        /// Largest accepted number.
-        limit: usize,
-    },
+    Count { rig: String, count: usize, limit: usize },
     /// A name is empty, too long, or has other characters than `[a-z0-9._-]`.
     #[error(
         "{name:?} is not a name: a name has 1 to 64 of a-z 0-9 . _ - and does not start with ."
     )]
-    Name {
-        /// The refused name.
-        name: String,
-    },
+    Name { name: String },
     /// Two cameras share a name.
     #[error("camera {name:?} occurs twice")]
-    Duplicate {
-        /// The name.
-        name: String,
-    },
+    Duplicate { name: String },
     /// The intrinsics or the shutter of a camera are invalid.
     #[error("camera {name:?}: {cause}")]
     Camera {
-        /// The camera.
         name: String,
         /// Why it was refused.
         cause: CameraError,
@@ -137,7 +125,6 @@ pub enum RigError {
     /// The exposure or the overlay of a camera is invalid.
     #[error("camera {name:?}: {cause}")]
     Appearance {
-        /// The camera.
         name: String,
         /// Why it was refused.
         cause: AppearanceError,
@@ -147,7 +134,6 @@ pub enum RigError {
     Overlays {
         /// Pixels of all overlays.
         pixels: u64,
-        /// Largest accepted number.
         limit: u64,
     },
 }
@@ -205,9 +191,10 @@ impl Rig {
 
 fn check_count(rig: &str, count: usize) -> Result<(), RigError> {
     let limit = Rig::MAX_CAMERAS;
-    match (1..=limit).contains(&count) {
-        true => Ok(()),
-        false => Err(RigError::Count { rig: rig.to_owned(), count, limit }),
+    if (1..=limit).contains(&count) {
+        Ok(())
+    } else {
+        Err(RigError::Count { rig: rig.to_owned(), count, limit })
     }
 }
 
@@ -226,10 +213,7 @@ pub fn check_overlays(cameras: &[RigCamera]) -> Result<(), RigError> {
 /// [`RigError::Overlays`].
 pub fn check_overlay_pixels(pixels: u64) -> Result<(), RigError> {
     let limit = Overlay::MAX_PIXELS;
-    match pixels <= limit {
-        true => Ok(()),
-        false => Err(RigError::Overlays { pixels, limit }),
-    }
+    if pixels <= limit { Ok(()) } else { Err(RigError::Overlays { pixels, limit }) }
 }
 
 /// Memory of all overlays, in bytes: decoded pixels and PNG files.
@@ -242,7 +226,8 @@ pub fn overlay_bytes(cameras: &[RigCamera]) -> u64 {
 pub const MAX_NAME_BYTES: usize = 64;
 
 /// Whether a text is a valid name of a twin, a rig, a camera, a trajectory or a session: 1 to 64 of
-/// `a-z 0-9 . _ -`, not starting with a dot. Such a name is safe as a file name and cannot be a path.
+/// `a-z 0-9 . _ -`, not starting with a dot. Such a name is safe as a file name and cannot be a
+/// path.
 pub fn is_name(text: &str) -> bool {
     let allowed = |b: u8| b.is_ascii_lowercase() || b.is_ascii_digit() || b"._-".contains(&b);
     (1..=MAX_NAME_BYTES).contains(&text.len())
@@ -284,8 +269,8 @@ struct RigFields {
     cameras: Vec<CameraFields>,
 }
 
-/// Counts the cameras first, and stops at the first one whose overlay exceeds the limit, so that no more overlays are
-/// decoded than a rig may have.
+/// Counts the cameras first, and stops at the first one whose overlay exceeds the limit, so that no
+/// more overlays are decoded than a rig may have.
 impl TryFrom<RigFields> for Rig {
     type Error = RigError;
 
@@ -304,7 +289,7 @@ impl From<RigCamera> for CameraFields {
     fn from(from: RigCamera) -> Self {
         let RigCamera { name, camera, rig_from_camera: camera_to_rig, shutter, appearance } = from;
         let Intrinsics { size_px, focal_px, center_px, lens, windshield, native_size_px } =
-            Intrinsics::of(&camera);
+            Intrinsics::from_camera(&camera);
         let [width, height] = size_px;
         let [fx, fy] = focal_px;
         let [cx, cy] = center_px;
@@ -329,8 +314,8 @@ impl From<RigCamera> for CameraFields {
     }
 }
 
-/// Refuses only fields that form no camera at all. Callers that read a rig also call [`Rig::check`], which
-/// checks the values and names the camera at fault.
+/// Refuses only fields that form no camera at all. Callers that read a rig also call
+/// [`Rig::check`], which checks the values and names the camera at fault.
 impl TryFrom<CameraFields> for RigCamera {
     type Error = RigError;
 
@@ -402,7 +387,8 @@ mod tests {
         assert!(serde_json::from_str::<Rig>(&unknown).is_err(), "a lens that is not drawn");
     }
 
-    /// Cameras are counted before any is checked: a file with 100,000 cameras must not cost more than reading it.
+    /// Cameras are counted before any is checked: a file with 100,000 cameras must not cost more
+    /// than reading it.
     #[test]
     fn too_many_cameras_are_refused_first() {
         let camera = r#"{"name":"front","width":100,"height":80,"fx":100,"fy":100,"cx":50,"cy":40,

@@ -66,13 +66,13 @@ pub fn basis(direction: DVec3) -> [f64; 16] {
     ]
 }
 
-/// Rotation of SH coefficients with the scene, by an orthogonal matrix M (mirrors included): a colour that was
-/// seen along `d` is afterwards seen along `M d`.
+/// Rotation of SH coefficients with the scene, by an orthogonal matrix M (mirrors included): a
+/// colour that was seen along `d` is afterwards seen along `M d`.
 ///
-/// The basis Y is orthonormal, so `Y(M d) = B Y(d)` with `B_jk = ∫ Y_j(M d) Y_k(d) dω` (Ramamoorthi and
-/// Hanrahan 2001). Coefficients are multiplied with the same B, which is orthogonal and mixes no degrees. The
-/// integrand is a polynomial of degree 6 at most; 4 Gauss-Legendre heights times 8 azimuths integrate degree
-/// 7 exactly, so B has the accuracy of f64.
+/// The basis Y is orthonormal, so `Y(M d) = B Y(d)` with `B_jk = ∫ Y_j(M d) Y_k(d) dω` (Ramamoorthi
+/// and Hanrahan 2001). Coefficients are multiplied with the same B, which is orthogonal and mixes
+/// no degrees. The integrand is a polynomial of degree 6 at most; 4 Gauss-Legendre heights times 8
+/// azimuths integrate degree 7 exactly, so B has the accuracy of f64.
 #[derive(Clone, Debug)]
 pub struct ShRotation {
     /// `B`, of which the first `coefficients(degree)` rows and columns are used.
@@ -81,8 +81,8 @@ pub struct ShRotation {
 }
 
 impl ShRotation {
-    /// The rotation for an orthogonal matrix that takes old directions to new ones, and for coefficients up to
-    /// `degree`.
+    /// The rotation for an orthogonal matrix that takes old directions to new ones, and for
+    /// coefficients up to `degree`.
     pub fn new(turned_from_plain: DMat3, degree: u8) -> Self {
         // Abscissae and weights of the 4-point rule on [-1, 1] (Abramowitz & Stegun, table 25.4).
         const HEIGHTS: [(f64, f64); 2] = [

@@ -1,4 +1,5 @@
-//! The transfer function of sRGB (IEC 61966-2-1), between stored values and linear light, both from 0 to 1.
+//! The transfer function of sRGB (IEC 61966-2-1), between stored values and linear light, both from
+//! 0 to 1.
 
 /// Linear light of a stored value.
 pub fn linear_from_stored(stored: f64) -> f64 {

@@ -51,16 +51,10 @@ pub enum TrajectoryError {
     #[error(
         "{name:?} is not a name of a trajectory: a name has 1 to 64 of a-z 0-9 . _ - and does not start with ."
     )]
-    Name {
-        /// The refused name.
-        name: String,
-    },
+    Name { name: String },
     /// There are no keyframes.
     #[error("trajectory {name:?} has no keyframes")]
-    Empty {
-        /// The trajectory.
-        name: String,
-    },
+    Empty { name: String },
     /// Times do not increase strictly.
     #[error("keyframes[{index}].time_us is {time_us}, not after the one before it ({before_us})")]
     Time {
@@ -77,8 +71,8 @@ impl Trajectory {
     /// Checks name, number and times of the keyframes.
     ///
     /// # Errors
-    /// The name is invalid, there are no keyframes, or times do not increase; then the error names the first
-    /// keyframe out of order.
+    /// The name is invalid, there are no keyframes, or times do not increase; then the error names
+    /// the first keyframe out of order.
     pub fn check(&self) -> Result<(), TrajectoryError> {
         if !is_name(&self.name) {
             return Err(TrajectoryError::Name { name: self.name.clone() });
@@ -103,8 +97,8 @@ impl Trajectory {
         self.keyframes.windows(2).map(|pair| segment_m(&pair[0], &pair[1])).sum()
     }
 
-    /// The place of the polyline through the keyframes that is nearest to a point, in metres; the first of equally near
-    /// ones.
+    /// The place of the polyline through the keyframes that is nearest to a point, in metres; the
+    /// first of equally near ones.
     pub fn nearest(&self, point_m: DVec3) -> NearestPlace {
         let position_m = |at: usize| self.keyframes[at].world_from_rig.position_m;
         let mut start_m = 0.0;

@@ -14,11 +14,13 @@ pub const QUAT_LENGTH: [f64; 2] = [1e-6, 1e6];
 pub const LN_SCALE: [f32; 2] = [-30.0, 10.0];
 /// Largest magnitude of an opacity before the sigmoid; in f32 the sigmoid is 1 from 17 on.
 pub const MAX_LOGIT: f32 = 1e4;
-/// Magnitude of the logit that stands for an opacity of 0 or 1, whose logit is infinite: the sigmoid of 20 is 1 in f32.
+/// Magnitude of the logit that stands for an opacity of 0 or 1, whose logit is infinite: the
+/// sigmoid of 20 is 1 in f32.
 pub const FULL_LOGIT: f32 = 20.0;
 /// Largest magnitude of a colour coefficient: colours are about 1.
 pub const MAX_SH: f32 = sh::MAX_COEFFICIENT;
-/// Number of invalid Gaussians of one file that are listed individually; further ones are only counted.
+/// Number of invalid Gaussians of one file that are listed individually; further ones are only
+/// counted.
 pub const NAMED_BAD_GAUSSIANS: usize = 16;
 
 /// Gaussians that one thread checks at a time.
@@ -76,7 +78,6 @@ pub struct BadGaussian {
     pub index: usize,
     /// Name of the field in the file.
     pub field: String,
-    /// The refused value.
     pub value: String,
     /// The bound that the value violates.
     pub must: &'static str,
@@ -87,7 +88,6 @@ pub struct BadGaussian {
 pub struct BadGaussians {
     /// The first of them: at least one, at most [`NAMED_BAD_GAUSSIANS`].
     pub first: Vec<BadGaussian>,
-    /// Number of these.
     pub count: u64,
     /// Number of Gaussians in the file.
     pub gaussians: u64,
@@ -147,8 +147,8 @@ pub fn is_valid(gaussians: &Gaussians, index: usize) -> bool {
     violation(gaussians, index).is_none()
 }
 
-/// The first number of a Gaussian that is outside its bounds. Every condition states what must hold, so
-/// that NaN fails it.
+/// The first number of a Gaussian that is outside its bounds. Every condition states what must
+/// hold, so that NaN fails it.
 fn violation(gaussians: &Gaussians, index: usize) -> Option<Violation> {
     for (axis, &m) in gaussians.means_m[index].iter().enumerate() {
         let near = m.abs() <= Pose::MAX_COORDINATE_M;
@@ -194,7 +194,7 @@ fn violation(gaussians: &Gaussians, index: usize) -> Option<Violation> {
             must: "an opacity is a logit (before the sigmoid), within 1e4 of 0",
         });
     }
-    for (i, c) in gaussians.sh_of(index).iter().enumerate() {
+    for (i, c) in gaussians.sh_at(index).iter().enumerate() {
         let bounded = c.abs() <= MAX_SH;
         if !bounded {
             return Some(Violation {

@@ -1,7 +1,8 @@
 //! Recorded images of a twin: what the cameras really saw along its drives.
 //!
-//! A manifest names a *table* of them, which is JSON and an object of its own, and the table names each image, a JPEG or
-//! PNG that is an object as well. Images are read when a repair model needs them ([`Manifest::views`]).
+//! A manifest names a *table* of them, which is JSON and an object of its own, and the table names
+//! each image, a JPEG or PNG that is an object as well. Images are read when a repair model needs
+//! them ([`Manifest::views`]).
 //!
 //! [`Manifest::views`]: crate::Manifest::views
 
@@ -16,8 +17,9 @@ use crate::geometry::{Camera, CameraError, Pose};
 
 /// An image that a camera took on a recorded drive.
 ///
-/// JSON: `{"trajectory", "station_m", "camera", "width", "height", "fx", "fy", "cx", "cy", "world_from_camera":
-/// {"xyz", "q"}, "image": {"object", "bytes"}}` and perhaps `mask`, like `image`, and `exposure_stops`; and, as in rig files, `lens`,
+/// JSON:
+/// `{"trajectory", "station_m", "camera", "width", "height", "fx", "fy", "cx", "cy", "world_from_camera": {"xyz", "q"}, "image": {"object", "bytes"}}`
+/// and perhaps `mask`, like `image`, and `exposure_stops`; and, as in rig files, `lens`,
 /// `windshield` and `native_size`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "ViewFields", into = "ViewFields")]
@@ -36,8 +38,8 @@ pub struct RecordedView {
     pub exposure_stops: Option<f64>,
     /// The JPEG or PNG.
     pub image: ObjectRef,
-    /// A PNG of the image's size, if not all pixels count: those darker than half show what the twin does not have, such as
-    /// the hood of the own vehicle.
+    /// A PNG of the image's size, if not all pixels count: those darker than half show what the
+    /// twin does not have, such as the hood of the own vehicle.
     pub mask: Option<ObjectRef>,
 }
 
@@ -49,7 +51,6 @@ pub enum ViewError {
     Name {
         /// `camera` or `trajectory`.
         field: &'static str,
-        /// The refused name.
         name: String,
     },
     /// A number is not finite.
@@ -57,23 +58,14 @@ pub enum ViewError {
     Number {
         /// `station_m` or `exposure_stops`.
         field: &'static str,
-        /// The refused value.
         value: f64,
     },
     /// An exposure that no camera has.
     #[error("exposure_stops is {value}; give -{most} to {most}", most = MOST_STOPS)]
-    Stops {
-        /// The refused value.
-        value: f64,
-    },
+    Stops { value: f64 },
     /// The camera cannot be used.
     #[error("camera {name:?}: {cause}")]
-    Camera {
-        /// Its name.
-        name: String,
-        /// Why.
-        cause: CameraError,
-    },
+    Camera { name: String, cause: CameraError },
 }
 
 #[derive(Serialize, Deserialize)]
@@ -134,8 +126,9 @@ impl RecordedView {
     }
 }
 
-/// A mask of an image that Lanczos 3 shrinks, `[height, width]`: a pixel counts if all of those that it is made of do. The
-/// kernel reaches three of the smaller pixels far. Nothing changes if the sizes are equal.
+/// A mask of an image that Lanczos 3 shrinks, `[height, width]`: a pixel counts if all of those
+/// that it is made of do. The kernel reaches three of the smaller pixels far. Nothing changes if
+/// the sizes are equal.
 pub fn reduced_mask(counts: &[bool], from_px: [u32; 2], to_px: [u32; 2]) -> Vec<bool> {
     if from_px == to_px {
         return counts.to_vec();
@@ -165,7 +158,7 @@ fn reached(at: usize, from: usize, to: usize) -> Range<usize> {
 impl From<RecordedView> for ViewFields {
     fn from(from: RecordedView) -> Self {
         let Intrinsics { size_px, focal_px, center_px, lens, windshield, native_size_px } =
-            Intrinsics::of(&from.camera);
+            Intrinsics::from_camera(&from.camera);
         let [width, height] = size_px;
         let [fx, fy] = focal_px;
         let [cx, cy] = center_px;
@@ -227,7 +220,8 @@ mod tests {
 
     #[test]
     fn a_pixel_of_a_smaller_mask_counts_if_all_of_its_pixels_do() {
-        // One pixel in the middle of 40 x 4, at 20.5: in 20 x 2 at 10.25, so that centres from 7.25 to 13.25 are reached.
+        // One pixel in the middle of 40 x 4, at 20.5: in 20 x 2 at 10.25, so that centres from 7.25
+        // to 13.25 are reached.
         let mut counts = vec![true; 40 * 4];
         counts[40 * 2 + 20] = false;
         let reduced = reduced_mask(&counts, [40, 4], [20, 2]);

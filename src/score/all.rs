@@ -4,9 +4,9 @@ use super::record::DriveRecord;
 use super::scored::Score;
 use super::{alpasim, alpasim_plans, bench2drive, hugsim, navsim, neuroncap, own};
 
-/// The least and the greatest value of a score; infinite without a bound, and for a name that is not one of
-/// [`score`]'s.
-pub fn range_of(name: &str) -> [f64; 2] {
+/// The least and the greatest value of a score; infinite without a bound, and for a name that is
+/// not one of [`score`]'s.
+pub fn score_range(name: &str) -> [f64; 2] {
     let [deviation, collision, ades @ ..] = alpasim_plans::NAMES;
     match name {
         own::NAME | alpasim::NAME | alpasim::OFF_ROAD | alpasim::WRONG_LANE | navsim::NAME => {

@@ -1,7 +1,8 @@
-//! AlpaSim's scene score, including its defects; `alpasim_plans` and `alpasim_road` have its other scores.
+//! AlpaSim's scene score, including its defects; `alpasim_plans` and `alpasim_road` have its other
+//! scores.
 //!
-//! Source: NVlabs/alpasim 3032e0c, `src/eval/src/eval/aggregation/scene_score.py`, `scorers/collision.py`,
-//! `scorers/plan_deviation.py`.
+//! Source: NVlabs/alpasim 3032e0c, `src/eval/src/eval/aggregation/scene_score.py`,
+//! `scorers/collision.py`, `scorers/plan_deviation.py`.
 
 use wildcity_sim::contact::Footprint;
 
@@ -39,7 +40,8 @@ pub enum Side {
 /// The contacts at one instant.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Collision {
-    /// As published, the side of the last track in the list. A later track hides a contact with the front.
+    /// As published, the side of the last track in the list. A later track hides a contact with the
+    /// front.
     pub published: Option<Side>,
     /// Whether any track was hit by the front or the side.
     pub any_at_fault: bool,
@@ -57,7 +59,7 @@ pub fn side(ego: &Footprint, other: &Footprint) -> Option<Side> {
 }
 
 /// The side of the rounded ego that another box touches.
-fn side_of(ego: &RoundedBox, other: &Footprint) -> Option<Side> {
+fn contact_side(ego: &RoundedBox, other: &Footprint) -> Option<Side> {
     if ego.distance_m(other) > 0.0 {
         return None;
     }
@@ -73,7 +75,7 @@ impl Side {
 
 impl Collision {
     /// The contacts by the sides of all tracks that are hit, in the order of the list.
-    pub fn of(sides: &[Side]) -> Self {
+    pub fn from_sides(sides: &[Side]) -> Self {
         let published = sides.last().copied();
         Self { published, any_at_fault: sides.iter().any(|side| side.is_at_fault()) }
     }
@@ -97,8 +99,8 @@ pub struct Rollout {
     pub offroad: bool,
 }
 
-/// The scene score: 0 after a collision at fault or off the road; else the progress over 0.8, at most 1; 1 for a
-/// recording below 5 m.
+/// The scene score: 0 after a collision at fault or off the road; else the progress over 0.8, at
+/// most 1; 1 for a recording below 5 m.
 pub fn scene_score(rollout: &Rollout) -> f64 {
     if rollout.collision_at_fault || rollout.offroad {
         return 0.0;
@@ -111,14 +113,15 @@ pub fn scene_score(rollout: &Rollout) -> f64 {
 
 /// All of AlpaSim's scores of an episode.
 pub fn scores(record: &DriveRecord) -> Vec<Score> {
-    let drive = Drive::of(record);
+    let drive = Drive::from_record(record);
     let cut_us = drive.as_ref().map(|drive| drive.cut_us).map_err(Clone::clone);
     let mut scores = vec![scene(&drive), off_road(record, &drive), wrong_lane(record, &drive)];
     scores.extend(alpasim_plans::scores(record, &cut_us));
     scores
 }
 
-/// An episode up to where it is cut: after a collision, off the road, or too far off the recorded drive.
+/// An episode up to where it is cut: after a collision, off the road, or too far off the recorded
+/// drive.
 struct Drive {
     rollout: Rollout,
     least_gap_m: Option<f64>,
@@ -129,7 +132,7 @@ struct Drive {
 }
 
 impl Drive {
-    fn of(record: &DriveRecord) -> Result<Self, Missing> {
+    fn from_record(record: &DriveRecord) -> Result<Self, Missing> {
         let tracks =
             record.tracks.as_ref().ok_or(Missing::new("needs the actors of a scenario"))?;
         let shape = record.shape.ok_or(Missing::new("needs the size of the ego"))?;
@@ -139,14 +142,15 @@ impl Drive {
         let rollout =
             Rollout { progress: 0.0, recorded_m, collision_at_fault: false, offroad: false };
         let map = record.map.as_ref();
-        let road = map.map(Road::of);
+        let road = map.map(Road::from_map);
         let mut drive = Self { rollout, least_gap_m: None, wrong_lane: None, cut_us: 0 };
         for (step, (sample, (station_m, off_m))) in record.ego.iter().zip(stations_m).enumerate() {
-            let ego = RoundedBox::of(&shape, sample);
+            let ego = RoundedBox::new(&shape, sample);
             let others =
                 tracks.iter().filter_map(|track| track.samples.get(step).copied().flatten());
             let others: Vec<Footprint> = others.map(|other| other.footprint).collect();
-            let sides: Vec<Side> = others.iter().filter_map(|other| side_of(&ego, other)).collect();
+            let sides: Vec<Side> =
+                others.iter().filter_map(|other| contact_side(&ego, other)).collect();
             let gaps_m = others.iter().map(|other| ego.distance_m(other));
             drive.least_gap_m = gaps_m.chain(drive.least_gap_m).reduce(f64::min);
             let off_road = road.as_ref().is_some_and(|road| road.is_off(&ego));
@@ -154,7 +158,7 @@ impl Drive {
             drive.wrong_lane = wrong.map(|wrong| wrong || drive.wrong_lane == Some(true));
             let rollout = &mut drive.rollout;
             rollout.progress = (station_m / recorded_m.max(f64::MIN_POSITIVE)).clamp(0.0, 1.0);
-            rollout.collision_at_fault |= Collision::of(&sides).is_at_fault();
+            rollout.collision_at_fault |= Collision::from_sides(&sides).is_at_fault();
             rollout.offroad |= off_road;
             drive.cut_us = record.dt_us * step as i64;
             if !sides.is_empty() || off_road || off_m > CUT_M {

@@ -28,7 +28,7 @@ pub struct RoundedBox {
 
 impl RoundedBox {
     /// The box of an ego at a sample.
-    pub fn of(shape: &EgoShape, sample: &EgoSample) -> Self {
+    pub fn new(shape: &EgoShape, sample: &EgoSample) -> Self {
         let full = shape.footprint(sample);
         let length_m = BOX_SHARE * full.length_m;
         let width_m = BOX_SHARE * full.width_m;
@@ -47,8 +47,8 @@ impl RoundedBox {
         self.outline.center_m
     }
 
-    /// Points of its outline, in metres: five of each corner's arc, 22.5 degrees apart, and those of the sides between,
-    /// no farther apart than `spacing_m`.
+    /// Points of its outline, in metres: five of each corner's arc, 22.5 degrees apart, and those
+    /// of the sides between, no farther apart than `spacing_m`.
     pub fn outline_m(&self, spacing_m: f64) -> Vec<DVec2> {
         let centers_m = self.core.corners_m();
         let arcs = (0..4 * ARC_POINTS).map(|k| {

@@ -1,12 +1,12 @@
 //! AlpaSim's scores of an agent's plans, including their defects.
 //!
 //! Source: NVlabs/alpasim 3032e0c, `src/eval/src/eval/scorers/plan_deviation.py`, `minADE.py`,
-//! `open_loop_collision.py`, and `src/wizard/configs/base_config.yaml` for the parameters. Distances are between
-//! centres of the ego's box, without height. As in the scene score, the episode is cut after a collision, or where the
-//! ego is off the road or 4 m off the recording.
+//! `open_loop_collision.py`, and `src/wizard/configs/base_config.yaml` for the parameters.
+//! Distances are between centres of the ego's box, without height. As in the scene score, the
+//! episode is cut after a collision, or where the ego is off the road or 4 m off the recording.
 //!
-//! AlpaSim raises an error if it interpolates a plan beyond its end; here such times are left out. Its minimum over
-//! sampled plans is the value of the one plan that an agent sends.
+//! AlpaSim raises an error if it interpolates a plan beyond its end; here such times are left out.
+//! Its minimum over sampled plans is the value of the one plan that an agent sends.
 
 use glam::DVec2;
 
@@ -34,7 +34,8 @@ const HORIZON_US: i64 = 3_000_000;
 /// Times ahead for which plans are compared with the recorded drive, in microseconds.
 const TIME_DELTAS_US: [i64; 4] = [500_000, 1_000_000, 2_500_000, 5_000_000];
 
-/// The mean of distances between successive plans, weighted by exp(-decay k); `None` without distances.
+/// The mean of distances between successive plans, weighted by exp(-decay k); `None` without
+/// distances.
 pub fn plan_deviation(distances_m: &[f64], decay: f64) -> Option<f64> {
     let weight = |k: usize| (-decay * k as f64).exp();
     let sum: f64 =
@@ -45,7 +46,7 @@ pub fn plan_deviation(distances_m: &[f64], decay: f64) -> Option<f64> {
 
 /// The scores of the plans, up to the time at which the episode is cut.
 pub(crate) fn scores(record: &DriveRecord, cut_us: &Result<i64, Missing>) -> Vec<Score> {
-    let input = Input::of(record, cut_us);
+    let input = Input::new(record, cut_us);
     let measure = |measure: &dyn Fn(&Input<'_>) -> Measured| match &input {
         Ok(input) => measure(input),
         Err(missing) => Err(missing.clone()),
@@ -72,7 +73,7 @@ struct Input<'a> {
 }
 
 impl<'a> Input<'a> {
-    fn of(record: &'a DriveRecord, cut_us: &Result<i64, Missing>) -> Result<Self, Missing> {
+    fn new(record: &'a DriveRecord, cut_us: &Result<i64, Missing>) -> Result<Self, Missing> {
         let cut_us = cut_us.clone()?;
         let shape = record.shape.ok_or(Missing::new("needs the size of the ego"))?;
         let plans = record.plans.iter().filter(|plan| plan.decided_us() <= cut_us);
@@ -90,7 +91,8 @@ impl<'a> Input<'a> {
 
     /// Mean distance between each plan and the previous one, at the times that both have.
     ///
-    /// `min_timesteps` of AlpaSim's configuration is never read there: a single common time is enough.
+    /// `min_timesteps` of AlpaSim's configuration is never read there: a single common time is
+    /// enough.
     fn deviation(&self) -> Measured {
         let of_pair = |pair: &[&Plan]| {
             let [before, plan] = [pair[0], pair[1]];
@@ -105,7 +107,8 @@ impl<'a> Input<'a> {
         found.ok_or(Missing::new("needs two plans in succession that have times in common"))
     }
 
-    /// Share of the decisions whose plan overlaps the box of an actor within 3 s, at the times of the plan's poses.
+    /// Share of the decisions whose plan overlaps the box of an actor within 3 s, at the times of
+    /// the plan's poses.
     fn collision(&self) -> Measured {
         let tracks = self.record.tracks.as_deref().unwrap_or_default();
         let of_plan = |plan: &&Plan| {
@@ -113,7 +116,7 @@ impl<'a> Input<'a> {
             let mut ahead = plan.future().iter().filter(|pose| pose.time_us <= until_us).peekable();
             ahead.peek()?;
             let hits = |pose: &PlannedPose| {
-                let ego = RoundedBox::of(&self.shape, &sample(pose));
+                let ego = RoundedBox::new(&self.shape, &sample(pose));
                 let boxes = tracks
                     .iter()
                     .filter_map(|track| box_at(track, pose.time_us, self.record.dt_us));
@@ -125,22 +128,29 @@ impl<'a> Input<'a> {
         found.ok_or(Missing::new("needs plans with a pose in the next 3 s"))
     }
 
-    /// Mean over the decisions of the mean distance between plan and recorded drive, at the steps up to a time ahead.
+    /// Mean over the decisions of the mean distance between plan and recorded drive, at the steps
+    /// up to a time ahead.
     fn ade(&self, delta_us: i64) -> Measured {
         let reference = self.record.reference.as_ref();
         let reference = reference.ok_or(Missing::new("needs the recorded drive"))?;
-        let found =
-            mean(self.plans.iter().filter_map(|plan| self.ade_of(plan, reference, delta_us)));
+        let found = mean(
+            self.plans.iter().filter_map(|plan| self.average_error_m(plan, reference, delta_us)),
+        );
         found.ok_or(Missing::new(format!(
             "needs plans, a recorded drive and an episode that reach {} s ahead",
             delta_us as f64 * 1e-6
         )))
     }
 
-    /// The mean distance of one plan. The mean ends at the first step that is not before the time ahead. `None` if this
-    /// step is later than the longest of [`TIME_DELTAS_US`], or than the end of the episode, of the plan or of the
-    /// recorded drive.
-    fn ade_of(&self, plan: &Plan, reference: &ReferenceDrive, delta_us: i64) -> Option<f64> {
+    /// The mean distance of one plan. The mean ends at the first step that is not before the time
+    /// ahead. `None` if this step is later than the longest of [`TIME_DELTAS_US`], or than the end
+    /// of the episode, of the plan or of the recorded drive.
+    fn average_error_m(
+        &self,
+        plan: &Plan,
+        reference: &ReferenceDrive,
+        delta_us: i64,
+    ) -> Option<f64> {
         let dt_us = self.record.dt_us;
         let now_us = plan.decided_us();
         let longest_us = now_us + TIME_DELTAS_US[TIME_DELTAS_US.len() - 1];

@@ -1,7 +1,7 @@
 //! AlpaSim's scores of the ego on the road, including their defects.
 //!
-//! Source: NVlabs/alpasim 3032e0c, `src/eval/src/eval/scorers/offroad.py`. Lanes farther than 6 m from the ego, which
-//! it leaves out, contain no part of the ego either.
+//! Source: NVlabs/alpasim 3032e0c, `src/eval/src/eval/scorers/offroad.py`. Lanes farther than 6 m
+//! from the ego, which it leaves out, contain no part of the ego either.
 
 use std::f64::consts::PI;
 
@@ -15,8 +15,8 @@ use super::plan::turn_rad;
 
 /// A road edge that is nearer than this is touched, in metres.
 const EDGE_M: f64 = 1e-3;
-/// Lanes that are no farther apart than this have a seam between them and no edge of the road, in metres: lanes of one
-/// road are sampled at different places, and no median is so narrow.
+/// Lanes that are no farther apart than this have a seam between them and no edge of the road, in
+/// metres: lanes of one road are sampled at different places, and no median is so narrow.
 pub const SEAM_M: f64 = 0.2;
 /// Half of the length of line that gives its heading, in metres.
 const HEADING_M: f64 = 0.01;
@@ -38,7 +38,7 @@ struct BoundedLane<'a> {
 
 impl<'a> Road<'a> {
     /// The road of a map.
-    pub fn of(map: &'a LaneMap) -> Self {
+    pub fn from_map(map: &'a LaneMap) -> Self {
         let bounded = |lane: &'a Lane| {
             let points_m = lane.outline_m.iter().copied();
             let least_m = points_m.clone().fold(DVec2::INFINITY, DVec2::min);
@@ -47,13 +47,15 @@ impl<'a> Road<'a> {
         Self { lanes: map.lanes.iter().map(bounded).collect() }
     }
 
-    /// Whether the ego is off the road: neither one lane nor their union contains it, and it touches their edge. An ego
-    /// that is wholly outside is not off the road, because it does not touch an edge.
+    /// Whether the ego is off the road: neither one lane nor their union contains it, and it
+    /// touches their edge. An ego that is wholly outside is not off the road, because it does not
+    /// touch an edge.
     ///
-    /// The original uses a map layer with the edges of the road, which our maps lack; this function uses the edges of
-    /// all lanes. So a seam between two lanes must not count: an opening of at most 0.2 m ([`SEAM_M`]). The original
-    /// tests the whole polygon of the ego; this function tests its outline and the surroundings of every lane's edge
-    /// below it, in steps of 0.2 m: a hole of 0.4 m by 0.4 m is always found.
+    /// The original uses a map layer with the edges of the road, which our maps lack; this function
+    /// uses the edges of all lanes. So a seam between two lanes must not count: an opening of at
+    /// most 0.2 m ([`SEAM_M`]). The original tests the whole polygon of the ego; this function
+    /// tests its outline and the surroundings of every lane's edge below it, in steps of 0.2 m: a
+    /// hole of 0.4 m by 0.4 m is always found.
     pub fn is_off(&self, ego: &RoundedBox) -> bool {
         let near: Vec<&Lane> = self.near(ego.center_m(), ego.reach_m() + SEAM_M).collect();
         let touches = |edge| ego.distance_m(&edge) < EDGE_M;
@@ -117,10 +119,11 @@ fn is_in_seam(lanes: &[&Lane], point_m: DVec2) -> bool {
     })
 }
 
-/// Whether the centre of the ego is in a lane of another direction; `None` if the lanes have no direction.
+/// Whether the centre of the ego is in a lane of another direction; `None` if the lanes have no
+/// direction.
 ///
-/// Headings from -π to π are subtracted without wrapping: where a lane leads west, an ego that follows it is in the
-/// wrong lane as soon as one of the two is beyond ±π.
+/// Headings from -π to π are subtracted without wrapping: where a lane leads west, an ego that
+/// follows it is in the wrong lane as soon as one of the two is beyond ±π.
 pub fn is_in_wrong_lane(map: &LaneMap, center_m: DVec2, yaw_rad: f64) -> Option<bool> {
     let ego_rad = turn_rad(0.0, yaw_rad);
     let mut directed =

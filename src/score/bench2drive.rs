@@ -72,8 +72,8 @@ impl Infraction {
     }
 }
 
-/// The driving score, 0 to 100: the share of the route in percent, times a factor for each infraction, times the share
-/// that was driven within the lanes. Six decimals.
+/// The driving score, 0 to 100: the share of the route in percent, times a factor for each
+/// infraction, times the share that was driven within the lanes. Six decimals.
 pub fn driving_score(route_percent: f64, infractions: &[Infraction], outside_percent: f64) -> f64 {
     let factor: f64 = infractions.iter().map(|infraction| infraction.factor()).product();
     let score = route_percent * factor * (1.0 - outside_percent / 100.0);
@@ -86,7 +86,8 @@ pub fn is_success(route_percent: f64, infractions: &[Infraction], outside_percen
     route_percent >= 100.0 && clean && outside_percent == 0.0
 }
 
-/// Efficiency: the mean of the ego's speeds in percent of the traffic's. `None` without any up to 1000 %.
+/// Efficiency: the mean of the ego's speeds in percent of the traffic's. `None` without any up to
+/// 1000 %.
 pub fn efficiency(percent_of_traffic: &[f64]) -> Option<f64> {
     let kept: Vec<f64> =
         percent_of_traffic.iter().copied().filter(|&percent| percent <= MOST_PERCENT).collect();
@@ -98,7 +99,6 @@ pub fn efficiency(percent_of_traffic: &[f64]) -> Option<f64> {
 pub struct MotionSample {
     /// Acceleration in the world, in m/s².
     pub acceleration_mps2: DVec2,
-    /// Unit vector ahead.
     pub forward: DVec2,
     /// Unit vector to the right.
     pub right: DVec2,
@@ -106,11 +106,11 @@ pub struct MotionSample {
     pub angular_velocity_degps: f64,
 }
 
-/// Whether each whole segment of 20 samples is smooth; remaining samples are dropped. Fewer than 21 samples are one
-/// segment.
+/// Whether each whole segment of 20 samples is smooth; remaining samples are dropped. Fewer than 21
+/// samples are one segment.
 ///
-/// As published, the yaw acceleration is the yaw rate, and both are compared in degrees with bounds in radians. `None`
-/// for fewer than 3 samples.
+/// As published, the yaw acceleration is the yaw rate, and both are compared in degrees with bounds
+/// in radians. `None` for fewer than 3 samples.
 pub fn smooth_segments(samples: &[MotionSample]) -> Option<Vec<bool>> {
     if samples.len() < 3 {
         return None;
@@ -199,8 +199,8 @@ fn route_percent(record: &DriveRecord) -> Measured {
     Ok((100.0 * farthest_m / length_m).min(100.0))
 }
 
-/// Contacts, each actor once per 5 s and 5 m, and only of an ego that moves. Lights, signs and emergency vehicles are
-/// not in a record.
+/// Contacts, each actor once per 5 s and 5 m, and only of an ego that moves. Lights, signs and
+/// emergency vehicles are not in a record.
 fn infractions(record: &DriveRecord) -> Result<Vec<Infraction>, Missing> {
     let tracks = record.tracks.as_ref().ok_or(Missing::new("needs the actors of a scenario"))?;
     let mut last: Vec<Option<(i64, DVec2)>> = vec![None; tracks.len()];
@@ -283,13 +283,13 @@ fn episode_smoothness(record: &DriveRecord) -> Measured {
     if record.dt_us != 100_000 {
         return Err(Missing::new("needs steps of 0.1 s"));
     }
-    let samples: Vec<MotionSample> = record.ego.iter().map(MotionSample::of).collect();
+    let samples: Vec<MotionSample> = record.ego.iter().map(MotionSample::from_sample).collect();
     let segments = smooth_segments(&samples).ok_or(Missing::new("needs 3 samples"))?;
     Ok(smoothness(&segments))
 }
 
 impl MotionSample {
-    fn of(ego: &EgoSample) -> Self {
+    fn from_sample(ego: &EgoSample) -> Self {
         let forward = DVec2::from_angle(ego.yaw_rad);
         Self {
             acceleration_mps2: forward.rotate(ego.acceleration_mps2),

@@ -1,7 +1,8 @@
 //! HUGSIM's HD-Score, including its defects.
 //!
-//! Source: hyzhou404/HUGSIM 62c690d, `sim/utils/score_calculator.py`, `sim/hugsim_env/envs/hug_sim.py`. Each decision
-//! is judged by its plan: poses 0.5 s apart, behind the ego's own pose.
+//! Source: hyzhou404/HUGSIM 62c690d, `sim/utils/score_calculator.py`,
+//! `sim/hugsim_env/envs/hug_sim.py`. Each decision is judged by its plan: poses 0.5 s apart, behind
+//! the ego's own pose.
 
 use glam::{DVec2, DVec3};
 
@@ -24,7 +25,6 @@ const SHORT_PLAN_M: f64 = 1.0;
 /// A box: its footprint, and the heights from `bottom_m` to `bottom_m + height_m`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct HugsimBox {
-    /// Seen from above.
     pub footprint: Footprint,
     /// Its lower side, in metres.
     pub bottom_m: f64,
@@ -44,7 +44,6 @@ pub struct PlanPose {
 /// The input by which one decision is judged.
 #[derive(Clone, Copy, Debug)]
 pub struct Decision<'a> {
-    /// The ego now.
     pub ego: HugsimBox,
     /// The ego's heading, in radians.
     pub yaw_rad: f64,
@@ -143,8 +142,8 @@ fn moved_on(plan: &[PlanPose], ahead_s: f64) -> Vec<PlanPose> {
     (0..plan.len()).map(move_by).collect()
 }
 
-/// DAC: 0 where ground lies in fewer than 2 of the 2 x 2 cells of the box. The published 0.5, for a share between 0.3
-/// and 0.5, is never reached: shares are quarters.
+/// DAC: 0 where ground lies in fewer than 2 of the 2 x 2 cells of the box. The published 0.5, for a
+/// share between 0.3 and 0.5, is never reached: shares are quarters.
 pub fn drivable(ground_m: &[DVec2], plan: &[PlanPose], ego: &Footprint) -> f64 {
     for pose in plan {
         let forward = DVec2::from_angle(pose.yaw_rad);
@@ -169,8 +168,8 @@ pub fn drivable(ground_m: &[DVec2], plan: &[PlanPose], ego: &Footprint) -> f64 {
     1.0
 }
 
-/// C: bounds of the speed's changes and of the heading; closed. The lateral acceleration is not tested: as
-/// published it is always 0. A plan of fewer than 4 poses is comfortable.
+/// C: bounds of the speed's changes and of the heading; closed. The lateral acceleration is not
+/// tested: as published it is always 0. A plan of fewer than 4 poses is comfortable.
 fn comfort(plan: &[PlanPose], ego: &PlanPose) -> f64 {
     if plan.len() < 4 {
         return 1.0;
@@ -211,7 +210,8 @@ fn within_pi(angle: f64) -> f64 {
     if angle < -PI { angle + TAU } else { angle }
 }
 
-/// Route completion: the index, from 1, of the nearest recorded camera, divided by 0.9 times the number of cameras.
+/// Route completion: the index, from 1, of the nearest recorded camera, divided by 0.9 times the
+/// number of cameras.
 pub fn route_completion(nearest_camera: usize, cameras: usize) -> f64 {
     (nearest_camera + 1) as f64 / (0.9 * cameras as f64)
 }
@@ -222,7 +222,8 @@ pub fn hd_score(pdms: &[f64], completions: &[f64]) -> f64 {
     mean * completions.iter().fold(0.0, |most: f64, &rc| most.max(rc)).min(1.0)
 }
 
-/// The score of an episode. It never has a value, because a record has no Gaussians and no plans 0.5 s apart.
+/// The score of an episode. It never has a value, because a record has no Gaussians and no plans
+/// 0.5 s apart.
 pub fn hd(_record: &DriveRecord) -> Score {
     let missing = "needs the twin's Gaussians, its ground, and a plan for each decision";
     Score::new(NAME, Err(Missing::new(missing)), [])

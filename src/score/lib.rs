@@ -1,8 +1,9 @@
 //! Scores of driven episodes.
 //!
-//! Every score is a pure function of a [`DriveRecord`]: no renderer, no twin, no clock. Scores of other projects are
-//! reproduced including their defects, and named after the project and its commit. Our own, `wildcity.*@N`, are
-//! corrected versions. A score whose input is missing has a reason in place of a value; it is never 0.
+//! Every score is a pure function of a [`DriveRecord`]: no renderer, no twin, no clock. Scores of
+//! other projects are reproduced including their defects, and named after the project and its
+//! commit. Our own, `wildcity.*@N`, are corrected versions. A score whose input is missing has a
+//! reason in place of a value; it is never 0.
 //!
 //! | module | source |
 //! |---|---|
@@ -35,7 +36,7 @@ mod savgol;
 mod scored;
 pub mod statistics;
 
-pub use all::{lower_is_better, range_of, score};
+pub use all::{lower_is_better, score, score_range};
 pub use alpasim_box::RoundedBox;
 pub use map::{Lane, LaneMap, RedArea};
 pub use plan::{Plan, PlannedPose};

@@ -9,7 +9,8 @@ use super::polyline::Polyline;
 /// A lane, or an intersection, seen from above.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Lane {
-    /// Its outline, without repeating the first point. An open set: a point on the outline is not in it.
+    /// Its outline, without repeating the first point. An open set: a point on the outline is not
+    /// in it.
     pub outline_m: Vec<DVec2>,
     /// Its middle, in driving direction; `None` for an area, or if the record lacks it.
     pub center: Option<Polyline>,
@@ -22,7 +23,6 @@ pub struct Lane {
 /// A connector that is closed by a red light for some samples.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RedArea {
-    /// Its outline.
     pub outline_m: Vec<DVec2>,
     /// The samples at which it is red.
     pub samples: std::ops::Range<usize>,
@@ -31,7 +31,6 @@ pub struct RedArea {
 /// The road as scores use it. A point in any lane is drivable.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LaneMap {
-    /// Its lanes.
     pub lanes: Vec<Lane>,
     /// The middle of the lanes of the ego's route.
     pub centerline: Polyline,
@@ -61,8 +60,8 @@ impl Lane {
         edges(&self.outline_m).map(on_edge).min_by(|a, b| distance_m(a).total_cmp(&distance_m(b)))
     }
 
-    /// Whether the bounds of its outline meet those from `least_m` to `most_m`: a pass over its points, where each test
-    /// of a point is one.
+    /// Whether the bounds of its outline meet those from `least_m` to `most_m`: a pass over its
+    /// points, where each test of a point is one.
     fn is_near(&self, least_m: DVec2, most_m: DVec2) -> bool {
         let points_m = self.outline_m.iter().copied();
         let own_least_m = points_m.clone().fold(DVec2::INFINITY, DVec2::min);

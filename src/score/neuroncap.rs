@@ -30,7 +30,8 @@ pub fn impact_speed_mps(ego_velocity_mps: DVec2, actor_velocity_mps: DVec2) -> f
     (ego_velocity_mps - actor_velocity_mps).length()
 }
 
-/// 5 without a contact; after one 4 max(0, 1 - impact/reference). A touch at no speed is 4 and not 5.
+/// 5 without a contact; after one 4 max(0, 1 - impact/reference). A touch at no speed is 4 and not
+/// 5.
 pub fn stars(impact_mps: Option<f64>, reference_mps: f64) -> f64 {
     match impact_mps {
         None => FREE,
@@ -38,8 +39,8 @@ pub fn stars(impact_mps: Option<f64>, reference_mps: f64) -> f64 {
     }
 }
 
-/// The first of `sub_steps` equal sub-steps, from 1, at whose end two boxes touch that move straight from one pose to
-/// another; the published search takes 10 for its steps of 0.5 s.
+/// The first of `sub_steps` equal sub-steps, from 1, at whose end two boxes touch that move
+/// straight from one pose to another; the published search takes 10 for its steps of 0.5 s.
 pub fn first_touching_sub_step(
     ego: [Footprint; 2],
     actor: [Footprint; 2],
@@ -58,10 +59,11 @@ pub fn first_touching_sub_step(
 
 /// The score of an episode, by its first contact.
 ///
-/// The published check of contacts (`neuro_ncap/evaluation/collision.py`, `COLLISION_CLASSES_TO_CHECK`) tests only
-/// vehicles and bicycles, and gives 5 to an ego that drives through a pedestrian or a barrier. So an episode whose
-/// first contact is with one of those has no value. The reference speed is that of the recording's last 0.5 s, as in
-/// the code; the paper takes the impact of an undisturbed run.
+/// The published check of contacts (`neuro_ncap/evaluation/collision.py`,
+/// `COLLISION_CLASSES_TO_CHECK`) tests only vehicles and bicycles, and gives 5 to an ego that
+/// drives through a pedestrian or a barrier. So an episode whose first contact is with one of those
+/// has no value. The reference speed is that of the recording's last 0.5 s, as in the code; the
+/// paper takes the impact of an undisturbed run.
 pub fn ncap(record: &DriveRecord) -> Score {
     let contact = record.contacts.iter().find(|contact| !contact.at_start);
     let impact_mps = contact.map(|contact| contact.impact_mps);

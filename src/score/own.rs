@@ -1,10 +1,10 @@
 //! `wildcity.verdict@2`: whether an episode passed.
 //!
-//! It passes if the ego had no contact at fault (`wildcity.fault@1`), with a pedestrian, or with the twin
-//! (`wildcity.static@1`), stayed on the drivable area, and made enough progress. A criterion whose input is missing in the
-//! record is not judged. An episode without a fault then is not judged either: what was not looked for is no pass. An
-//! episode that left the trained area before its first fault neither passes nor fails, because its images were not
-//! reliable.
+//! It passes if the ego had no contact at fault (`wildcity.fault@1`), with a pedestrian, or with
+//! the twin (`wildcity.static@1`), stayed on the drivable area, and made enough progress. A
+//! criterion whose input is missing in the record is not judged. An episode without a fault then is
+//! not judged either: what was not looked for is no pass. An episode that left the trained area
+//! before its first fault neither passes nor fails, because its images were not reliable.
 
 use serde::Serialize;
 
@@ -26,7 +26,6 @@ const LEAST_WAY_M: f64 = 2.0;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Judgement {
-    /// No fault.
     Passed,
     /// At least one fault.
     Failed,
@@ -51,7 +50,6 @@ pub enum Fault {
     /// A corner of the ego outside of all lanes.
     #[serde(rename = "off_road")]
     OffRoad,
-    /// Too little progress.
     #[serde(rename = "progress")]
     Progress,
 }
@@ -59,7 +57,6 @@ pub enum Fault {
 /// A part of the verdict, named after its fault.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Criterion {
-    /// Contacts with actors.
     Contact,
     /// Contact with the twin.
     Static,
@@ -87,9 +84,7 @@ impl Criterion {
 /// A criterion that was not judged.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct NotJudged {
-    /// The criterion.
     pub criterion: Criterion,
-    /// Why.
     pub reason: &'static str,
 }
 
@@ -102,7 +97,6 @@ impl std::fmt::Display for NotJudged {
 /// A fault and when it happened.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct FaultAt {
-    /// The fault.
     pub fault: Fault,
     /// Its time, in microseconds.
     pub time_us: i64,
@@ -114,7 +108,6 @@ pub struct FaultAt {
 /// The verdict of an episode, with the values that it is based on.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Verdict {
-    /// The result.
     pub judgement: Judgement,
     /// All faults, by time.
     pub faults: Vec<FaultAt>,
@@ -210,7 +203,8 @@ fn judgement(record: &DriveRecord, faults: &[FaultAt], not_judged: &[NotJudged])
     }
 }
 
-/// Contacts at fault, and those of a moving ego with a pedestrian. Boxes that overlapped at the start are not judged.
+/// Contacts at fault, and those of a moving ego with a pedestrian. Boxes that overlapped at the
+/// start are not judged.
 fn contact_faults(record: &DriveRecord) -> Vec<FaultAt> {
     let tracks = record.tracks.as_deref().unwrap_or_default();
     let judged = record.contacts.iter().filter(|contact| !contact.at_start);
@@ -228,8 +222,8 @@ fn contact_faults(record: &DriveRecord) -> Vec<FaultAt> {
         .collect()
 }
 
-/// The distance along the recorded drive divided by that of the recording, 0 to 1; 1 if the recording stands (below
-/// 2 m, as in nuPlan).
+/// The distance along the recorded drive divided by that of the recording, 0 to 1; 1 if the
+/// recording stands (below 2 m, as in nuPlan).
 fn progress(record: &DriveRecord) -> Option<f64> {
     let stations_m = record.stations_m()?;
     let recorded_m = record.recorded_way_m()?;

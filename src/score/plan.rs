@@ -15,7 +15,8 @@ pub struct PlannedPose {
     pub yaw_rad: f64,
 }
 
-/// The plan of the agent at a decision: the ego's pose at that time and future poses, in order of time.
+/// The plan of the agent at a decision: the ego's pose at that time and future poses, in order of
+/// time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Plan {
     poses: Vec<PlannedPose>,
@@ -43,8 +44,8 @@ impl Plan {
         &self.poses[1..]
     }
 
-    /// The pose at a time, between two of its poses: along a line, and the shorter way round; `None` before its first
-    /// and after its last.
+    /// The pose at a time, between two of its poses: along a line, and the shorter way round;
+    /// `None` before its first and after its last.
     pub fn at(&self, time_us: i64) -> Option<PlannedPose> {
         let after = self.poses.partition_point(|pose| pose.time_us < time_us);
         let to = self.poses.get(after)?;

@@ -2,7 +2,8 @@
 
 use glam::DVec2;
 
-/// A line through points on the ground, with the station of each: its distance from the start along the line.
+/// A line through points on the ground, with the station of each: its distance from the start along
+/// the line.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Polyline {
     points_m: Vec<DVec2>,
@@ -52,14 +53,14 @@ impl Polyline {
         self.stations_m[self.stations_m.len() - 1]
     }
 
-    /// The point at a station, and the unit vector along the line at this point; beyond the ends, those of the end. The
-    /// vector is zero on a line of one point.
+    /// The point at a station, and the unit vector along the line at this point; beyond the ends,
+    /// those of the end. The vector is zero on a line of one point.
     pub fn at(&self, station_m: f64) -> (DVec2, DVec2) {
         let last = self.points_m.len() - 1;
         let after =
             self.stations_m.partition_point(|&at_m| at_m < station_m).clamp(1.min(last), last);
-        // Points that coincide have no direction between them: use the direction of the next points that differ, or of
-        // the previous ones.
+        // Points that coincide have no direction between them: use the direction of the next points
+        // that differ, or of the previous ones.
         let differs = |k: &usize| self.stations_m[*k] > self.stations_m[*k - 1];
         let onward = (after.max(1)..=last).find(differs);
         let Some(to) = onward.or_else(|| (1..=after).rev().find(differs)) else {
@@ -77,8 +78,8 @@ impl Polyline {
         self.project_between(point_m, f64::NEG_INFINITY, f64::INFINITY)
     }
 
-    /// The nearest point of the segments that reach into a range of stations. So an ego on a route that crosses
-    /// itself stays on its own branch.
+    /// The nearest point of the segments that reach into a range of stations. So an ego on a route
+    /// that crosses itself stays on its own branch.
     pub fn project_between(&self, point_m: DVec2, from_m: f64, to_m: f64) -> Projection {
         let first = self.points_m[0];
         let alone = Projection {

@@ -40,7 +40,6 @@ pub struct EgoSample {
 /// An actor at one instant.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TrackSample {
-    /// Its box.
     pub footprint: Footprint,
     /// Its velocity in the world, in m/s.
     pub velocity_mps: DVec2,
@@ -49,9 +48,7 @@ pub struct TrackSample {
 /// An actor over an episode.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Track {
-    /// Its name.
     pub name: String,
-    /// Its kind.
     pub class: ActorClass,
     /// One for each sample of the ego; `None` while it is absent.
     pub samples: Vec<Option<TrackSample>>,
@@ -94,11 +91,9 @@ pub struct DriveRecord {
     pub contacts: Vec<Contact>,
     /// Contacts with the twin; `None` if they were not tested.
     pub static_contacts: Option<Vec<StaticContact>>,
-    /// The recorded drive.
     pub reference: Option<ReferenceDrive>,
     /// The time that the scenario gives, in microseconds; `None` if it gives none.
     pub limit_us: Option<i64>,
-    /// The lanes.
     pub map: Option<LaneMap>,
     /// Progress that is required to pass, 0 to 1.
     pub least_progress: f64,
@@ -153,9 +148,9 @@ impl DriveRecord {
         Some(reference.station_at_m(self.limit_us.unwrap_or(self.end_us()).max(self.end_us())))
     }
 
-    /// The station of the ego along the recorded drive at each sample, in metres, and its distance from it. The
-    /// search covers 5 m behind and 50 m ahead of the previous station, so that a route which crosses itself is
-    /// followed in order.
+    /// The station of the ego along the recorded drive at each sample, in metres, and its distance
+    /// from it. The search covers 5 m behind and 50 m ahead of the previous station, so that a
+    /// route which crosses itself is followed in order.
     pub fn stations_m(&self) -> Option<Vec<(f64, f64)>> {
         let line = &self.reference.as_ref()?.line;
         let mut station_m = 0.0;

@@ -1,10 +1,12 @@
 //! The Savitzky-Golay filter: a polynomial is fitted to each window of samples.
 
-/// Filters samples, or differentiates them, by polynomials of degree `order` fitted to windows of `window` samples.
+/// Filters samples, or differentiates them, by polynomials of degree `order` fitted to windows of
+/// `window` samples.
 ///
-/// As scipy's `savgol_filter` with `mode="interp"`: the first and last half windows are read from the polynomial of
-/// the first and last whole window. An even window has its middle between two samples; the value is that of the
-/// middle, half a sample late. `delta` is the spacing of the samples, `derivative` 0, 1 or 2.
+/// As scipy's `savgol_filter` with `mode="interp"`: the first and last half windows are read from
+/// the polynomial of the first and last whole window. An even window has its middle between two
+/// samples; the value is that of the middle, half a sample late. `delta` is the spacing of the
+/// samples, `derivative` 0, 1 or 2.
 ///
 /// # Panics
 /// If `window` is not above `order`, or there are fewer samples than `window`.
@@ -38,10 +40,11 @@ pub fn savgol(
     (0..values.len()).map(filtered).collect()
 }
 
-/// Weights of `window` samples at 0, 1, .. whose sum is a derivative, at `at`, of their least-squares polynomial.
+/// Weights of `window` samples at 0, 1, .. whose sum is a derivative, at `at`, of their
+/// least-squares polynomial.
 fn weights(window: usize, at: f64, order: usize, derivative: usize) -> Vec<f64> {
-    // Powers of positions relative to the middle, in half windows, so that the normal equations stay well
-    // conditioned: all powers are at most 1.
+    // Powers of positions relative to the middle, in half windows, so that the normal equations
+    // stay well conditioned: all powers are at most 1.
     let middle = 0.5 * (window - 1) as f64;
     let unit = middle.max(0.5);
     let position = |x: f64| (x - middle) / unit;
@@ -49,8 +52,8 @@ fn weights(window: usize, at: f64, order: usize, derivative: usize) -> Vec<f64> 
     let powers: Vec<Vec<f64>> = (0..window)
         .map(|k| (0..terms).map(|p| position(k as f64).powi(p as i32)).collect())
         .collect();
-    // The derivative of the polynomial at `at` is d · c, where the coefficients c solve (Xᵀ X) c = Xᵀ y. So its
-    // weights are X (Xᵀ X)⁻¹ d.
+    // The derivative of the polynomial at `at` is d · c, where the coefficients c solve (Xᵀ X) c =
+    // Xᵀ y. So its weights are X (Xᵀ X)⁻¹ d.
     let mut system: Vec<Vec<f64>> = (0..terms)
         .map(|i| {
             let row = (0..terms).map(|j| powers.iter().map(|x| x[i] * x[j]).sum());

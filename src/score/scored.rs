@@ -24,7 +24,8 @@ pub struct Score {
     /// Why it has no value.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reason: Option<String>,
-    /// The values that it was computed from: sub-scores, measures, thresholds; null for missing ones.
+    /// The values that it was computed from: sub-scores, measures, thresholds; null for missing
+    /// ones.
     pub parts: BTreeMap<&'static str, Option<f64>>,
 }
 
@@ -43,9 +44,8 @@ impl Score {
         parts: impl IntoIterator<Item = (&'static str, Option<f64>)>,
     ) -> Self {
         // JSON has no infinity, and no score is infinite.
-        let value = value.and_then(|value| match value.is_finite() {
-            true => Ok(value),
-            false => Err(Missing::new("is not a finite number")),
+        let value = value.and_then(|value| {
+            if value.is_finite() { Ok(value) } else { Err(Missing::new("is not a finite number")) }
         });
         let reason = value.as_ref().err().map(|missing| missing.reason.clone());
         let finite = |part: Option<f64>| part.filter(|part| part.is_finite());

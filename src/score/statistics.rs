@@ -23,7 +23,8 @@ pub fn wilson(passed: u64, runs: u64) -> [f64; 2] {
     [low, high]
 }
 
-/// A mean of fewer values has no interval: for two values t is 12.7, and the interval would be useless.
+/// A mean of fewer values has no interval: for two values t is 12.7, and the interval would be
+/// useless.
 pub const LEAST_VALUES: usize = 3;
 
 /// A mean, its standard deviation and half of its 95 % interval.
@@ -31,7 +32,6 @@ pub const LEAST_VALUES: usize = 3;
 pub struct Mean {
     /// Number of the values.
     pub count: usize,
-    /// The mean.
     pub mean: f64,
     /// The standard deviation of the values (n - 1); `None` for a single one.
     pub deviation: Option<f64>,
@@ -40,8 +40,9 @@ pub struct Mean {
 }
 
 impl Mean {
-    /// The mean of some values, with an interval by Student's t distribution; `None` without values.
-    pub fn of(values: &[f64]) -> Option<Self> {
+    /// The mean of some values, with an interval by Student's t distribution; `None` without
+    /// values.
+    pub fn from_values(values: &[f64]) -> Option<Self> {
         let n = values.len();
         if n == 0 {
             return None;
@@ -56,9 +57,9 @@ impl Mean {
         Some(Self { count: n, mean, deviation: Some(deviation), half_width: Some(half_width) })
     }
 
-    /// The 95 % interval of the mean of values from `least` to `most`: that of Student (1908), mean ± t · deviation/√n,
-    /// clipped to the range. The mean cannot be beyond it, so the clipped interval contains it as often. `None` below
-    /// [`LEAST_VALUES`] values.
+    /// The 95 % interval of the mean of values from `least` to `most`: that of Student (1908), mean
+    /// ± t · deviation/√n, clipped to the range. The mean cannot be beyond it, so the clipped
+    /// interval contains it as often. `None` below [`LEAST_VALUES`] values.
     pub fn interval(&self, [least, most]: [f64; 2]) -> Option<[f64; 2]> {
         let half_width = self.half_width.filter(|_| self.count >= LEAST_VALUES)?;
         Some([(self.mean - half_width).max(least), (self.mean + half_width).min(most)])
@@ -67,8 +68,8 @@ impl Mean {
 
 /// The 97.5 % quantile of Student's t distribution.
 ///
-/// Bisection of the angle θ = atan(t/√ν), of which the probability is a finite sum for whole degrees of freedom
-/// (Abramowitz and Stegun 26.7.3 and 26.7.4).
+/// Bisection of the angle θ = atan(t/√ν), of which the probability is a finite sum for whole
+/// degrees of freedom (Abramowitz and Stegun 26.7.3 and 26.7.4).
 fn student_t(degrees: usize) -> f64 {
     // Beyond, the sum is long and the quantile is the normal one to 2e-5.
     let degrees = degrees.min(100_000);
@@ -85,7 +86,8 @@ fn student_t(degrees: usize) -> f64 {
 fn within(angle: f64, degrees: usize) -> f64 {
     let (sin, cos) = angle.sin_cos();
     let is_odd = !degrees.is_multiple_of(2);
-    // The first term, and the factor from each to the next: k/(k + 1) cos², k = 2, 4, .. or 1, 3, ..
+    // The first term, and the factor from each to the next: k/(k + 1) cos², k = 2, 4, .. or 1, 3,
+    // ..
     let mut term = if is_odd { cos } else { 1.0 };
     let first = if is_odd { 2 } else { 1 };
     let mut sum = 0.0;

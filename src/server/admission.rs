@@ -1,10 +1,11 @@
 //! Admission of connections, before and after authentication.
 //!
-//! A connection counts as unauthenticated until it sends a request that its token allows (any request, on a server
-//! without tokens). Unauthenticated and authenticated connections have separate slots, so that neither can take all.
-//! While all slots for unauthenticated connections are in use, the oldest connection of the address with the most of
-//! them is closed for the next one. So a client that opens connections without using them loses them, and a health
-//! check, which sends its request at once, is answered.
+//! A connection counts as unauthenticated until it sends a request that its token allows (any
+//! request, on a server without tokens). Unauthenticated and authenticated connections have
+//! separate slots, so that neither can take all. While all slots for unauthenticated connections
+//! are in use, the oldest connection of the address with the most of them is closed for the next
+//! one. So a client that opens connections without using them loses them, and a health check, which
+//! sends its request at once, is answered.
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;
@@ -54,7 +55,8 @@ pub(crate) struct ConnectionSlot {
 }
 
 impl ConnectionSlots {
-    /// `authenticated_limit` slots for authenticated connections, and [`limits::UNAUTHENTICATED_CONNECTIONS`] others.
+    /// `authenticated_limit` slots for authenticated connections, and
+    /// [`limits::UNAUTHENTICATED_CONNECTIONS`] others.
     pub(crate) fn new(authenticated_limit: usize) -> Arc<Self> {
         Arc::new(Self {
             entries: Mutex::default(),
@@ -64,17 +66,18 @@ impl ConnectionSlots {
         })
     }
 
-    /// Returns a slot for a connection from an address. May first close another unauthenticated connection, or wait
-    /// until that is allowed.
+    /// Returns a slot for a connection from an address. May first close another unauthenticated
+    /// connection, or wait until that is allowed.
     pub(crate) async fn admit(self: &Arc<Self>, address: IpAddr) -> ConnectionSlot {
-        let address = network_of(address);
+        let address = client_network(address);
         loop {
             let left = self.left.notified();
             let wait = match self.entries.lock().make_room(address) {
                 Ok(()) => break,
                 Err(wait) => wait,
             };
-            // Until another connection is authenticated or ends, or the grace period of the oldest is over.
+            // Until another connection is authenticated or ends, or the grace period of the oldest
+            // is over.
             let _ = tokio::time::timeout(wait, left).await;
         }
         let close = Arc::new(Notify::new());
@@ -91,7 +94,8 @@ impl ConnectionSlots {
 }
 
 impl Entries {
-    /// Makes room for a connection from an address; or returns how long to wait before the next try.
+    /// Makes room for a connection from an address; or returns how long to wait before the next
+    /// try.
     fn make_room(&mut self, address: IpAddr) -> Result<(), Duration> {
         let of_address = self.by_address.get(&address).copied().unwrap_or_default();
         let is_full = self.waiting.len() >= limits::UNAUTHENTICATED_CONNECTIONS;
@@ -168,8 +172,9 @@ impl Drop for ConnectionSlot {
     }
 }
 
-/// The network that is assumed to belong to one client: an IPv4 address, or the /64 of an IPv6 address.
-fn network_of(address: IpAddr) -> IpAddr {
+/// The network that is assumed to belong to one client: an IPv4 address, or the /64 of an IPv6
+/// address.
+fn client_network(address: IpAddr) -> IpAddr {
     match address.to_canonical() {
         IpAddr::V6(v6) => {
             let [a, b, c, d, ..] = v6.segments();

@@ -1,9 +1,11 @@
-//! The audit log: which token made which version of a twin or which asset of an actor, one JSON object per line.
+//! The audit log: which token made which version of a twin or which asset of an actor, one JSON
+//! object per line.
 //!
-//! A line is on disk before a change begins, and another one after it has ended. A change that cannot be logged is
-//! refused. At [`limits::AUDIT_BYTES`] the file is renamed to FILE.1, an older FILE.1 to FILE.2 and so on, and a new
-//! file begins; if that fails, the log gives the reason and continues in the same file. A line has a bounded length:
-//! names are checked before, and reasons are cut.
+//! A line is on disk before a change begins, and another one after it has ended. A change that
+//! cannot be logged is refused. At [`limits::AUDIT_BYTES`] the file is renamed to FILE.1, an older
+//! FILE.1 to FILE.2 and so on, and a new file begins; if that fails, the log gives the reason and
+//! continues in the same file. A line has a bounded length: names are checked before, and reasons
+//! are cut.
 
 use std::fmt::Display;
 use std::fs::{self, File, OpenOptions};
@@ -142,8 +144,8 @@ impl Audit {
         self.write(grant, change, None)
     }
 
-    /// Logs the result of a change, or why it failed, and waits for the disk. The change has already happened, so a
-    /// line that cannot be written is only an error in the server's log.
+    /// Logs the result of a change, or why it failed, and waits for the disk. The change has
+    /// already happened, so a line that cannot be written is only an error in the server's log.
     pub(crate) fn end_now(
         &self,
         grant: &Grant,
@@ -267,7 +269,8 @@ impl Log {
     }
 }
 
-/// Makes the name of a file durable, as its lines are: otherwise a power cut takes both. Not all file systems can.
+/// Makes the name of a file durable, as its lines are: otherwise a power cut takes both. Not all
+/// file systems can.
 fn sync_name(path: &Path) {
     let dir = path.parent().filter(|dir| !dir.as_os_str().is_empty());
     let _ = File::open(dir.unwrap_or(Path::new("."))).and_then(|dir| dir.sync_all());

@@ -60,7 +60,8 @@ fn time(tag: u8, text: &str) -> Option<SystemTime> {
     if year < 1970 || !(1..=12).contains(&month) || !(1..=31).contains(&day) {
         return None;
     }
-    // Days since 1970-01-01 in the Gregorian calendar; years begin in March, so that a leap day ends one.
+    // Days since 1970-01-01 in the Gregorian calendar; years begin in March, so that a leap day
+    // ends one.
     let (year, month) = if month > 2 { (year, month - 3) } else { (year - 1, month + 9) };
     let days =
         365 * year + year / 4 - year / 100 + year / 400 + (153 * month + 2) / 5 + day - 719_469;

@@ -50,7 +50,6 @@ pub struct Config {
     pub audit: Option<PathBuf>,
     /// Whether an episode that ends is also written as an MCAP file, next to its record.
     pub mcap: bool,
-    /// The renderer.
     pub backend: Arc<dyn Backend>,
     /// The models that can repair images, by name. Each is loaded when a session asks for it.
     pub repairs: Arc<Models>,
@@ -63,8 +62,8 @@ pub struct Config {
 }
 
 impl Config {
-    /// A server for programs of this machine, on a free port, without tokens, TLS or disk cache, with all
-    /// defaults.
+    /// A server for programs of this machine, on a free port, without tokens, TLS or disk cache,
+    /// with all defaults.
     pub fn local(directories: Directories, backend: Arc<dyn Backend>) -> Self {
         Self {
             listen: SocketAddr::from(([127, 0, 0, 1], 0)),
@@ -84,8 +83,8 @@ impl Config {
     }
 }
 
-/// Time-outs, counts and bytes of a server. The constants in [`crate::limits`] and in the packages of
-/// the protocol, the session and the push are the defaults.
+/// Time-outs, counts and bytes of a server. The constants in [`crate::limits`] and in the packages
+/// of the protocol, the session and the push are the defaults.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Limits {
     /// Time-out for the first message of a connection.
@@ -102,20 +101,20 @@ pub struct Limits {
     pub drain: Duration,
     /// WebSocket connections at once.
     pub connections: usize,
-    /// Sessions at once.
     pub sessions: usize,
     /// Pushes that wait or run at once.
     pub pushes: usize,
-    /// Bytes of memory that running pushes may use together; a third of `resident_bytes` if there is no value.
+    /// Bytes of memory that running pushes may use together; a third of `resident_bytes` if there
+    /// is no value.
     pub push_memory_bytes: Option<u64>,
     /// Time-out for reading and checking one push.
     pub push: Duration,
-    /// Bytes of memory that all twins in use may use together; three quarters of the machine's memory if there is no
-    /// value.
+    /// Bytes of memory that all twins in use may use together; three quarters of the machine's
+    /// memory if there is no value.
     pub resident_bytes: Option<u64>,
-    /// Time between two returns of free memory to the operating system, while sections are evicted or pushes run.
+    /// Time between two returns of free memory to the operating system, while sections are evicted
+    /// or pushes run.
     pub memory_release: Duration,
-    /// Limits of uploads.
     pub spool: SpoolLimits,
 }
 
@@ -128,7 +127,8 @@ pub struct SpoolLimits {
     pub upload_bytes: u64,
     /// Bytes of all uploads.
     pub bytes: u64,
-    /// Bytes of the uploads of one token; if there is no value, half of all if several tokens may upload.
+    /// Bytes of the uploads of one token; if there is no value, half of all if several tokens may
+    /// upload.
     pub token_bytes: Option<u64>,
     /// How long an upload is kept after its last byte.
     pub age: Duration,

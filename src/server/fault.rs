@@ -1,5 +1,5 @@
-//! Why a request or a connection was refused. `convert::fault` gives each fault its wire code and its
-//! HTTP status.
+//! Why a request or a connection was refused. `convert::fault` gives each fault its wire code and
+//! its HTTP status.
 
 use std::io;
 use std::path::PathBuf;
@@ -14,7 +14,6 @@ use wildcity_twin::store::StoreError;
 /// Why a request or a connection was refused.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum Fault {
-    /// Not JSON.
     #[error("not JSON: {0}")]
     MalformedJson(String),
     /// JSON, but not a request.
@@ -22,20 +21,13 @@ pub(crate) enum Fault {
     InvalidRequest {
         /// The field at fault, for example `rig.cameras[2].width`, if any.
         field: Option<String>,
-        /// The error.
         reason: String,
     },
-    /// A binary message.
     #[error("requests are JSON text frames; only the server sends binary ones")]
     UnexpectedBinary,
     /// A message has more bytes than a request may have.
     #[error("a message of {bytes} bytes; at most {limit} are accepted")]
-    MessageTooLarge {
-        /// Bytes announced.
-        bytes: usize,
-        /// Bytes accepted.
-        limit: usize,
-    },
+    MessageTooLarge { bytes: usize, limit: usize },
     /// The bytes are not WebSocket.
     #[error("not WebSocket: {0}")]
     BrokenFrame(String),
@@ -47,9 +39,7 @@ pub(crate) enum Fault {
     SeqOutOfOrder {
         /// `seq` or `last_seq`.
         field: &'static str,
-        /// The number given.
         seq: u64,
-        /// The numbers accepted.
         expected: String,
     },
     /// A request before `hello`, or a second `hello`.
@@ -57,12 +47,7 @@ pub(crate) enum Fault {
     WrongOrder(&'static str),
     /// Server and client have no protocol version in common.
     #[error("this server speaks {server}; the client offers {}", offered.join(", "))]
-    UnsupportedProtocol {
-        /// The server's version.
-        server: &'static str,
-        /// The client's versions.
-        offered: Vec<String>,
-    },
+    UnsupportedProtocol { server: &'static str, offered: Vec<String> },
     /// The connection already has an open session, or it has none although the request needs one.
     #[error("{0}")]
     SessionState(&'static str),
@@ -92,12 +77,7 @@ pub(crate) enum Fault {
     },
     /// A list names a session twice.
     #[error("{field}: the session {name:?} is in the list already")]
-    SessionTwice {
-        /// The second entry.
-        field: String,
-        /// Its name.
-        name: String,
-    },
+    SessionTwice { field: String, name: String },
     /// The sessions to resume together did not belong to one connection.
     #[error(
         "{field}: the session {name:?} was not on the connection of the first: its last request was {seq}"
@@ -130,18 +110,12 @@ pub(crate) enum Fault {
     #[error(
         "{name:?} is not a name: a name has 1 to 64 of a-z 0-9 . _ - and does not start with ."
     )]
-    InvalidName {
-        /// The field.
-        field: String,
-        /// The refused text.
-        name: String,
-    },
+    InvalidName { field: String, name: String },
     /// The numbers of a pose are invalid.
     #[error("{field}: {cause}")]
     Pose {
         /// The pose, as `poses[3]`.
         field: String,
-        /// The error.
         cause: PoseError,
     },
     /// NaN or infinity in a pose, which JSON cannot express.
@@ -155,7 +129,6 @@ pub(crate) enum Fault {
     Camera {
         /// The camera, as `rig.cameras[2]`.
         field: String,
-        /// The error.
         cause: CameraError,
     },
     /// The exposure or the overlay of a camera cannot be used.
@@ -163,23 +136,16 @@ pub(crate) enum Fault {
     Appearance {
         /// The field, as `rig.cameras[2].overlay`.
         field: String,
-        /// The error.
         cause: AppearanceError,
     },
     /// The cameras do not form a valid rig.
     #[error("{cause}")]
-    Rig {
-        /// The field.
-        field: String,
-        /// The error.
-        cause: RigError,
-    },
+    Rig { field: String, cause: RigError },
     /// A count has reached its maximum.
     #[error("there are {limit} {what} already; try again later")]
     Busy {
         /// Name of the counted objects.
         what: &'static str,
-        /// The maximum.
         limit: usize,
     },
     /// The client was silent for too long.
@@ -221,7 +187,6 @@ pub(crate) enum Fault {
     NoMcap {
         /// The name of the episode.
         name: String,
-        /// Why.
         reason: String,
     },
     /// The token's role or twins do not allow the request.
@@ -229,7 +194,6 @@ pub(crate) enum Fault {
     Forbidden {
         /// The field or header that decides it.
         field: &'static str,
-        /// The missing right.
         reason: String,
     },
     /// The request's host name is not one of the server's names.
@@ -245,10 +209,7 @@ pub(crate) enum Fault {
     },
     /// A header that is allowed once occurs more than once.
     #[error("the header {header} is there more than once")]
-    HeaderTwice {
-        /// The header.
-        header: &'static str,
-    },
+    HeaderTwice { header: &'static str },
     /// A web page of another machine sent the request.
     #[error(
         "pages from {origin} are refused; only those of this machine and of --origin are accepted"
@@ -262,18 +223,10 @@ pub(crate) enum Fault {
     NoUpgrade,
     /// A header of the WebSocket handshake is wrong.
     #[error("the header {header} {must}")]
-    Handshake {
-        /// The header.
-        header: &'static str,
-        /// The requirement.
-        must: &'static str,
-    },
+    Handshake { header: &'static str, must: &'static str },
     /// The handshake does not offer the protocol's name.
     #[error("offer the subprotocol {protocol} in the header sec-websocket-protocol")]
-    NoSubprotocol {
-        /// The name.
-        protocol: &'static str,
-    },
+    NoSubprotocol { protocol: &'static str },
     /// The client cannot have observations in shared memory.
     #[error("no shared memory: {reason}")]
     NoSharedMemory {
@@ -284,18 +237,10 @@ pub(crate) enum Fault {
     },
     /// There is no route of this path.
     #[error("there is no {path}; protocol/README.md lists the routes")]
-    NoRoute {
-        /// The path.
-        path: String,
-    },
+    NoRoute { path: String },
     /// The route does not have this method.
     #[error("{path} has no method {method}; protocol/README.md lists the routes")]
-    NoMethod {
-        /// The method.
-        method: String,
-        /// The path.
-        path: String,
-    },
+    NoMethod { method: String, path: String },
     /// There is no upload of this id.
     #[error(
         "there is no upload {id:?}: it was never begun, did not match its digest, or is too old"
@@ -309,7 +254,6 @@ pub(crate) enum Fault {
     /// The bytes do not continue the upload.
     #[error("the upload has {held} bytes, Upload-Offset is {given}: go on from {held}")]
     UploadOffset {
-        /// The offset given.
         given: u64,
         /// The offset at which the upload continues.
         held: u64,
@@ -319,9 +263,7 @@ pub(crate) enum Fault {
     UploadDigest {
         /// The digest or size that differs.
         what: &'static str,
-        /// As announced.
         promised: String,
-        /// As received.
         found: String,
     },
     /// The disk or the space for uploads is full.
@@ -332,14 +274,10 @@ pub(crate) enum Fault {
     },
     /// This server has no directory for uploads.
     #[error("this server takes no uploads: {reason}")]
-    NoUploads {
-        /// Why not.
-        reason: String,
-    },
+    NoUploads { reason: String },
     /// A field of a body is outside its limits.
     #[error("{field} is {must}")]
     OutOfRange {
-        /// The field.
         field: String,
         /// Its value, and what is accepted.
         must: String,
@@ -362,15 +300,12 @@ pub(crate) enum Fault {
         path.display()
     )]
     Audit {
-        /// The log.
         path: PathBuf,
         /// The operating system's error.
         cause: io::Error,
     },
-    /// The server stops.
     #[error("the server is shutting down, and its sessions end: open a new one when it is back")]
     ShuttingDown,
-    /// The session refused.
     #[error(transparent)]
     Session(#[from] SessionError),
     /// The push was refused, or failed.

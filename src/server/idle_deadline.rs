@@ -6,8 +6,8 @@ use std::time::Duration;
 use parking_lot::Mutex;
 use tokio::time::{Instant, timeout};
 
-/// The time by which an HTTP connection must make progress with a request or its answer; otherwise it is
-/// closed. It does not apply to a connection that has become a WebSocket.
+/// The time by which an HTTP connection must make progress with a request or its answer; otherwise
+/// it is closed. It does not apply to a connection that has become a WebSocket.
 pub(crate) struct IdleDeadline {
     deadline: Mutex<Instant>,
     period: Duration,
@@ -24,8 +24,8 @@ impl IdleDeadline {
         *self.deadline.lock() = Instant::now() + self.period;
     }
 
-    /// Runs work of the server that the client waits for. The deadline is extended meanwhile, because the
-    /// delay is not caused by the client.
+    /// Runs work of the server that the client waits for. The deadline is extended meanwhile,
+    /// because the delay is not caused by the client.
     pub(crate) async fn extend_during<T>(&self, work: impl Future<Output = T>) -> T {
         let mut work = pin!(work);
         loop {

@@ -1,7 +1,8 @@
 //! The messages of a client, which are read even while its last request is carried out.
 //!
-//! A request may take a minute. Meanwhile, a client that sends a ping, to check the server, gets its pong at once, and
-//! a client that closes the connection gets its Close frame. A request that arrives too early waits in the inbox.
+//! A request may take a minute. Meanwhile, a client that sends a ping, to check the server, gets
+//! its pong at once, and a client that closes the connection gets its Close frame. A request that
+//! arrives too early waits in the inbox.
 
 use std::collections::VecDeque;
 use std::pin::pin;
@@ -33,8 +34,9 @@ impl Inbox {
         early
     }
 
-    /// Carries out a request, and keeps the messages that are received meanwhile. If a client sends too many messages
-    /// ahead, no more are read until the request is done, so that its pings wait as well.
+    /// Carries out a request, and keeps the messages that are received meanwhile. If a client sends
+    /// too many messages ahead, no more are read until the request is done, so that its pings wait
+    /// as well.
     pub(crate) async fn during<T>(&mut self, request: impl Future<Output = T>) -> T {
         let mut request = pin!(request);
         loop {

@@ -33,7 +33,8 @@ pub(crate) async fn listen(state: Arc<ServerState>, listener: TcpListener, tls: 
             accepted = accepted => match accepted {
                 Ok(accepted) => accepted,
                 Err(error) => {
-                    // Most likely no file descriptors are left; connections that end will free some.
+                    // Most likely no file descriptors are left; connections that end will free
+                    // some.
                     tracing::warn!("cannot accept a connection: {error}");
                     tokio::time::sleep(Duration::from_millis(100)).await;
                     continue;
@@ -85,7 +86,8 @@ impl Acceptor {
             .layer(axum::Extension(deadline.clone()));
         let connection = async move {
             let Some(stream) = stream.await else { return };
-            // Errors are caused by the client, which disconnected or sent no HTTP, and are not logged.
+            // Errors are caused by the client, which disconnected or sent no HTTP, and are not
+            // logged.
             let _ = http1::Builder::new()
                 .timer(TokioTimer::new())
                 .header_read_timeout(hello)
@@ -104,8 +106,8 @@ impl Acceptor {
     }
 }
 
-/// Disables Nagle's algorithm, so that small messages are sent at once, and enables TCP keepalive, so that
-/// the kernel detects dead peers.
+/// Disables Nagle's algorithm, so that small messages are sent at once, and enables TCP keepalive,
+/// so that the kernel detects dead peers.
 fn set_options(stream: &TcpStream) {
     let keepalive = TcpKeepalive::new()
         .with_time(limits::KEEPALIVE_IDLE)

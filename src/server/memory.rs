@@ -1,20 +1,22 @@
 //! Observations in memory that a client on the same machine maps, in place of the socket.
 //!
-//! The memory is an anonymous file (memfd). It has no name in a file system, so that nothing is left of it when the
-//! server or the client is killed at any moment: the kernel frees it with its last descriptor and its last mapping. It
-//! does not depend on the size of `/dev/shm` either, which is 64 MB in a container by default, less than three
-//! observations of six raw images.
+//! The memory is an anonymous file (memfd). It has no name in a file system, so that nothing is
+//! left of it when the server or the client is killed at any moment: the kernel frees it with its
+//! last descriptor and its last mapping. It does not depend on the size of `/dev/shm` either, which
+//! is 64 MB in a container by default, less than three observations of six raw images.
 //!
-//! The client opens it by its path in `/proc` of this process. The kernel permits this only to programs of the same
-//! user (and to root) in which this process has the same id. For another program, the path may be of a different file:
-//! the target of the path, a symbolic link, has a random name by which the client recognises the file before it opens
-//! it. Then it sends back a random text from the file, which proves to the server that it can read the observations.
+//! The client opens it by its path in `/proc` of this process. The kernel permits this only to
+//! programs of the same user (and to root) in which this process has the same id. For another
+//! program, the path may be of a different file: the target of the path, a symbolic link, has a
+//! random name by which the client recognises the file before it opens it. Then it sends back a
+//! random text from the file, which proves to the server that it can read the observations.
 //!
-//! The file has three slots, each as large as the largest answer, and its size is sealed: a client that maps it is
-//! never killed by SIGBUS. Pages that were not written take no memory. Written pages count against the budget for
-//! answers. A message that exceeds the budget is sent through the socket, and the next message tries the memory again.
-//! The server writes with positioned writes and maps nothing: there is one copy, from the observation that is kept for
-//! a repeated request.
+//! The file has three slots, each as large as the largest answer, and its size is sealed: a client
+//! that maps it is never killed by SIGBUS. Pages that were not written take no memory. Written
+//! pages count against the budget for answers. A message that exceeds the budget is sent through
+//! the socket, and the next message tries the memory again. The server writes with positioned
+//! writes and maps nothing: there is one copy, from the observation that is kept for a repeated
+//! request.
 
 use std::fs::File;
 use std::io;
@@ -73,7 +75,7 @@ impl SharedMemory {
                 reason: format!("{error}; connect without it"),
             })?;
         Ok(Self {
-            path: system::path_of(&file),
+            path: system::open_file_path(&file),
             target: format!("/memfd:{name} (deleted)"),
             file: Arc::new(file),
             proof,
@@ -107,7 +109,8 @@ impl SharedMemory {
         self.is_open
     }
 
-    /// Writes a message into the next slot. The slot is used up only if the whole message has been written.
+    /// Writes a message into the next slot. The slot is used up only if the whole message has been
+    /// written.
     ///
     /// # Errors
     /// The message is longer than a slot, or there is no memory.
@@ -132,7 +135,8 @@ impl SharedMemory {
         Ok(MemoryPlace { slot, offset, bytes })
     }
 
-    /// Counts the memory of a slot against the budget for answers, as far as it is not counted already.
+    /// Counts the memory of a slot against the budget for answers, as far as it is not counted
+    /// already.
     fn hold(&mut self, engine: &Engine, slot: usize, bytes: u64) -> io::Result<()> {
         if bytes > Self::SLOT_BYTES {
             return Err(io::ErrorKind::FileTooLarge.into());
@@ -179,7 +183,7 @@ mod system {
     }
 
     /// The path by which another program opens a file of this one.
-    pub(super) fn path_of(file: &File) -> String {
+    pub(super) fn open_file_path(file: &File) -> String {
         format!("/proc/{}/fd/{}", std::process::id(), file.as_raw_fd())
     }
 
@@ -204,7 +208,7 @@ mod system {
         Err(unsupported())
     }
 
-    pub(super) fn path_of(_: &File) -> String {
+    pub(super) fn open_file_path(_: &File) -> String {
         String::new()
     }
 

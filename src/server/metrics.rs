@@ -43,11 +43,9 @@ pub(crate) struct Metrics {
 pub(crate) struct GaugeValues {
     /// Sessions, connected or waiting to be resumed.
     pub(crate) sessions: usize,
-    /// WebSocket connections.
     pub(crate) connections: usize,
     /// Frames that wait for the renderer.
     pub(crate) frames_queued: usize,
-    /// Uploads on disk.
     pub(crate) uploads: usize,
     /// Their bytes, as announced.
     pub(crate) spool_bytes: u64,

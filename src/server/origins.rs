@@ -1,8 +1,8 @@
 //! Checks which web pages may send requests, and which host names are accepted.
 //!
-//! A page of any site can send requests to 127.0.0.1, and browsers name the site of the page in `Origin`. A site can
-//! also make its own host name resolve to 127.0.0.1 (DNS rebinding): requests of its pages then have no foreign
-//! `Origin`, but this name as `Host`. Programs send no `Origin`.
+//! A page of any site can send requests to 127.0.0.1, and browsers name the site of the page in
+//! `Origin`. A site can also make its own host name resolve to 127.0.0.1 (DNS rebinding): requests
+//! of its pages then have no foreign `Origin`, but this name as `Host`. Programs send no `Origin`.
 
 use std::net::IpAddr;
 
@@ -24,7 +24,8 @@ pub struct OriginError {
 }
 
 impl Origins {
-    /// Origins: scheme, host and port. Browsers leave out the scheme's own port, and so does the list.
+    /// Origins: scheme, host and port. Browsers leave out the scheme's own port, and so does the
+    /// list.
     ///
     /// # Errors
     /// Names the first one that no browser would send.
@@ -50,8 +51,8 @@ impl Origins {
         self.0.iter().any(|listed| listed.as_bytes() == origin)
     }
 
-    /// Refuses requests of pages that are neither local, nor listed, nor from this server itself. The last exception
-    /// applies only to servers with tokens, because a foreign page has no token.
+    /// Refuses requests of pages that are neither local, nor listed, nor from this server itself.
+    /// The last exception applies only to servers with tokens, because a foreign page has no token.
     ///
     /// # Errors
     /// [`Fault::ForbiddenOrigin`].
@@ -72,9 +73,10 @@ impl Origins {
         Err(Fault::ForbiddenOrigin { origin })
     }
 
-    /// Refuses requests for other hosts. Without tokens, and with a list of origins, the host must be this machine or
-    /// in the list; with tokens it may also be an address, which no site can rebind. A server with tokens and without a
-    /// list accepts all hosts, because its names are not configured.
+    /// Refuses requests for other hosts. Without tokens, and with a list of origins, the host must
+    /// be this machine or in the list; with tokens it may also be an address, which no site can
+    /// rebind. A server with tokens and without a list accepts all hosts, because its names are not
+    /// configured.
     ///
     /// # Errors
     /// [`Fault::ForbiddenHost`].
@@ -85,14 +87,15 @@ impl Origins {
             without_own_port(format!("{scheme}://{host}")) == *origin
         };
         let is_address =
-            has_tokens && name_of(host).trim_matches(['[', ']']).parse::<IpAddr>().is_ok();
+            has_tokens && host_name(host).trim_matches(['[', ']']).parse::<IpAddr>().is_ok();
         let knows_none = has_tokens && self.0.is_empty();
         if knows_none || is_address || is_local_authority(host) || self.0.iter().any(listed) {
             return Ok(());
         }
-        let served = match has_tokens {
-            true => "the hosts of --origin, addresses and localhost",
-            false => "localhost and the hosts of --origin (the server has no tokens)",
+        let served = if has_tokens {
+            "the hosts of --origin, addresses and localhost"
+        } else {
+            "localhost and the hosts of --origin (the server has no tokens)"
         };
         Err(Fault::ForbiddenHost { host: host.to_owned(), served })
     }
@@ -111,12 +114,12 @@ pub(crate) fn is_local_origin(origin: &str) -> bool {
 
 /// Whether a host, with or without a port, is this machine.
 fn is_local_authority(authority: &str) -> bool {
-    let host = name_of(authority);
+    let host = host_name(authority);
     host.eq_ignore_ascii_case("localhost") || ["127.0.0.1", "[::1]"].contains(&host)
 }
 
 /// A host without its port.
-fn name_of(authority: &str) -> &str {
+fn host_name(authority: &str) -> &str {
     match authority.rsplit_once(':') {
         Some((host, port)) if port.bytes().all(|b| b.is_ascii_digit()) => host,
         _ => authority,

@@ -20,7 +20,8 @@ struct Look {
 }
 
 impl Readiness {
-    /// The body of a refusal if the twins cannot be listed. A request that arrives during a check waits for its result.
+    /// The body of a refusal if the twins cannot be listed. A request that arrives during a check
+    /// waits for its result.
     pub(crate) async fn refusal(&self, engine: &Engine) -> Option<Value> {
         let check = async {
             engine.check_twins().await.err().map(|error| convert::refusal_body(&error.into()))

@@ -5,8 +5,9 @@ use std::sync::Arc;
 use crate::state::ServerState;
 use crate::tls::Tls;
 
-/// Reads both again with every SIGHUP, until dropped. Existing connections keep their certificate and the rights of
-/// their token. If a file cannot be used, the old values stay. After the call, SIGHUP does not end the process.
+/// Reads both again with every SIGHUP, until dropped. Existing connections keep their certificate
+/// and the rights of their token. If a file cannot be used, the old values stay. After the call,
+/// SIGHUP does not end the process.
 pub(crate) fn reload(
     tls: Option<Arc<Tls>>,
     state: Arc<ServerState>,

@@ -24,7 +24,8 @@ pub(crate) struct SessionRegistry {
     limit: usize,
     resume_grace: Duration,
     entries: Mutex<BTreeMap<String, Entry>>,
-    /// Sessions that were closed a short while ago, by name: the answer to `close` may be asked for again.
+    /// Sessions that were closed a short while ago, by name: the answer to `close` may be asked for
+    /// again.
     closed: Mutex<BTreeMap<String, ClosedSession>>,
 }
 
@@ -88,8 +89,8 @@ pub(crate) struct ListedSession {
 pub(crate) struct SessionSlot {
     /// `None` while the session is opened, and once it is closed.
     pub(crate) session: Option<Session>,
-    /// The last request that the session carried out, and its answer, which is sent again if the request
-    /// is repeated.
+    /// The last request that the session carried out, and its answer, which is sent again if the
+    /// request is repeated.
     pub(crate) last: Option<AnsweredRequest>,
     /// Number of the last request that was answered, refusals included.
     pub(crate) answered_seq: u64,
@@ -105,9 +106,7 @@ pub(crate) struct AnsweredRequest {
 /// An answer that was sent, and can be sent again.
 #[derive(Clone)]
 pub(crate) enum Answer {
-    /// A control message.
     Text(Arc<str>),
-    /// An observation.
     Observation(Arc<Observation>),
     /// Observations of several sessions.
     Many(Arc<ManyAnswer>),
@@ -141,7 +140,8 @@ pub(crate) struct ManyAnswer {
     pub(crate) frames: Vec<Arc<Observation>>,
 }
 
-/// A connection's exclusive access to a slot. Dropping it parks the session, or removes a closed one.
+/// A connection's exclusive access to a slot. Dropping it parks the session, or removes a closed
+/// one.
 pub(crate) struct SlotGuard {
     registry: Arc<SessionRegistry>,
     name: String,
@@ -230,7 +230,8 @@ impl SessionRegistry {
         Ok(entry.ok_or_else(unknown)?.snapshots.clone())
     }
 
-    /// Keeps the answer to `close` for a client that did not get it, as long as a session waits for `resume`.
+    /// Keeps the answer to `close` for a client that did not get it, as long as a session waits for
+    /// `resume`.
     pub(crate) fn remember_closed(
         &self,
         name: String,
@@ -259,8 +260,9 @@ impl SessionRegistry {
         self.closed.lock().get(name).filter(|session| session.owner == owner).cloned()
     }
 
-    /// Takes over the slot of a session, which `field` of a request names, even if its old connection still holds it:
-    /// after a network failure, the client detects long before the server that the old connection is dead.
+    /// Takes over the slot of a session, which `field` of a request names, even if its old
+    /// connection still holds it: after a network failure, the client detects long before the
+    /// server that the old connection is dead.
     ///
     /// # Errors
     /// There is no such session of this owner, or its last step runs for longer than `max_wait`.
@@ -458,8 +460,8 @@ impl Drop for SlotGuard {
 mod tests {
     use super::*;
 
-    /// The answer to `close` is not kept under a name that another session has taken in the meantime: a client that
-    /// resumes this name must get the open session.
+    /// The answer to `close` is not kept under a name that another session has taken in the
+    /// meantime: a client that resumes this name must get the open session.
     #[test]
     fn a_closed_session_gives_way_to_an_open_one() {
         let registry = SessionRegistry::new(8, Duration::from_secs(60));

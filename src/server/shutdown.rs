@@ -16,8 +16,8 @@ use crate::reload::reload;
 use crate::state::ServerState;
 use crate::tls::Tls;
 
-/// A server that listens. Dropping it stops it without waiting; the last of its tasks to end waits for the frames that are
-/// being rendered.
+/// A server that listens. Dropping it stops it without waiting; the last of its tasks to end waits
+/// for the frames that are being rendered.
 pub struct Running {
     state: Arc<ServerState>,
     address: SocketAddr,
@@ -49,7 +49,8 @@ async fn renew_leases(state: &ServerState) {
     }
 }
 
-/// Gives memory that evicted sections and pushes no longer need back to the operating system, until dropped.
+/// Gives memory that evicted sections and pushes no longer need back to the operating system, until
+/// dropped.
 async fn release_memory(state: &ServerState) {
     let changes = || (state.engine.residency().evictions, state.pushes.changes());
     let mut before = changes();
@@ -121,8 +122,8 @@ impl Running {
         self.state.sessions.count()
     }
 
-    /// How often a SIGHUP was carried out: certificate and tokens were read again, or stayed because they cannot be
-    /// used.
+    /// How often a SIGHUP was carried out: certificate and tokens were read again, or stayed
+    /// because they cannot be used.
     pub fn reloads(&self) -> u64 {
         self.state.metrics.reloads.get()
     }
@@ -132,8 +133,8 @@ impl Running {
         self.state.limits.connections - self.state.websocket_permits.available_permits()
     }
 
-    /// Stops accepting connections, lets running steps finish, notifies every client, and ends every session. Exports
-    /// that have started are finished.
+    /// Stops accepting connections, lets running steps finish, notifies every client, and ends
+    /// every session. Exports that have started are finished.
     pub async fn stop(self) {
         // An error means that no task waits for the signal any more.
         let _ = self.stop.send(true);

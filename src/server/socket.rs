@@ -35,7 +35,6 @@ pub(crate) struct CloseStatus {
 
 /// A message that arrived.
 pub(crate) enum Incoming {
-    /// A text message.
     Text(String),
     /// A ping, a pong or a part of a message: no request, but the client is alive.
     Alive,
@@ -46,15 +45,16 @@ pub(crate) enum Incoming {
 pub(crate) enum Disconnect {
     /// The client closed the connection, or the network failed.
     PeerLeft,
-    /// The client did not read in time. A part of a message may have been sent, so that nothing else can
-    /// be sent.
+    /// The client did not read in time. A part of a message may have been sent, so that nothing
+    /// else can be sent.
     SendTimedOut,
     /// The client made a mistake. It gets an answer, and the connection may end.
     Fault(Fault),
 }
 
 impl Socket {
-    /// Takes over a connection from HTTP; `read_ahead` has the bytes that HTTP has already read from it.
+    /// Takes over a connection from HTTP; `read_ahead` has the bytes that HTTP has already read
+    /// from it.
     pub(crate) async fn new(stream: Stream, read_ahead: Vec<u8>, send_timeout: Duration) -> Self {
         let config = WebSocketConfig::default()
             .max_message_size(Some(wildcity_protocol::limits::INBOUND_MESSAGE_BYTES))
@@ -79,7 +79,8 @@ impl Socket {
         match self.stream.next().await {
             Some(Ok(Message::Text(text))) => Ok(Incoming::Text(text.as_str().to_owned())),
             Some(Ok(Message::Binary(_))) => Err(Disconnect::Fault(Fault::UnexpectedBinary)),
-            // The pong is sent before more is read: a client that pings and never reads is not alive.
+            // The pong is sent before more is read: a client that pings and never reads is not
+            // alive.
             Some(Ok(Message::Ping(_))) => self.flush().await.map(|()| Incoming::Alive),
             Some(Ok(Message::Pong(_) | Message::Frame(_))) => Ok(Incoming::Alive),
             // tungstenite has prepared the Close frame that answers it (RFC 6455, section 5.5.1).
@@ -125,15 +126,16 @@ impl Socket {
         self.send(FINAL_BINARY, parts).await
     }
 
-    /// Sends a message from the caller's memory. tungstenite would copy an observation of megabytes into
-    /// its own buffer first. After an error the connection cannot be used.
+    /// Sends a message from the caller's memory. tungstenite would copy an observation of megabytes
+    /// into its own buffer first. After an error the connection cannot be used.
     async fn send(&mut self, first_byte: u8, payload: &[&[u8]]) -> Result<(), Disconnect> {
         if self.peer_closed || self.is_within_frame {
             return Err(Disconnect::PeerLeft);
         }
         self.is_within_frame = true;
         let send = async {
-            // A pong may still be in the library's buffer; it must be sent whole before this frame begins.
+            // A pong may still be in the library's buffer; it must be sent whole before this frame
+            // begins.
             self.stream.flush().await.map_err(io::Error::other)?;
             let header = frame_header(first_byte, payload.iter().map(|part| part.len()).sum());
             let stream = self.stream.get_mut();
@@ -159,10 +161,12 @@ impl Socket {
         }
     }
 
-    /// Closes the connection, with a Close frame of this status unless the client has closed it already.
+    /// Closes the connection, with a Close frame of this status unless the client has closed it
+    /// already.
     ///
-    /// Bytes that the client still sends are read for a while: closing a socket with unread bytes resets the
-    /// connection, and the client would never see the last answer. Its own Close frame is among these bytes.
+    /// Bytes that the client still sends are read for a while: closing a socket with unread bytes
+    /// resets the connection, and the client would never see the last answer. Its own Close frame
+    /// is among these bytes.
     pub(crate) async fn close(mut self, status: Option<CloseStatus>) {
         let closing = async {
             if let Some(CloseStatus { code, reason }) = status {
@@ -207,7 +211,8 @@ fn frame_header(first_byte: u8, len: usize) -> Vec<u8> {
 mod tests {
     use super::*;
 
-    /// A server that stops while a watcher reads slowly must not put its Close frame into an observation.
+    /// A server that stops while a watcher reads slowly must not put its Close frame into an
+    /// observation.
     #[tokio::test]
     async fn no_frame_begins_within_another() {
         let (mut client, server) = tokio::io::duplex(64);

@@ -29,22 +29,18 @@ use crate::token_counts::TokenCounts;
 /// Why a server did not start.
 #[derive(Debug, thiserror::Error)]
 pub enum ServerError {
-    /// The address is not a loopback address, and there are no tokens: any machine of the network could
-    /// open sessions and read the twins.
+    /// The address is not a loopback address, and there are no tokens: any machine of the network
+    /// could open sessions and read the twins.
     #[error(
         "{address} is not a loopback address, and without tokens only 127.0.0.1 and [::1] are \
          safe: give --tokens FILE, or reach them from elsewhere through an SSH tunnel"
     )]
-    PublicAddress {
-        /// The refused address.
-        address: SocketAddr,
-    },
+    PublicAddress { address: SocketAddr },
     /// The address cannot be used.
     #[error(
         "cannot listen on {address}: {cause}; stop the program that uses it, or give another --listen"
     )]
     Listen {
-        /// The address.
         address: SocketAddr,
         /// The operating system's error.
         cause: io::Error,
@@ -52,7 +48,6 @@ pub enum ServerError {
     /// The directory for episodes cannot be made.
     #[error("cannot record episodes in {}: {cause}", path.display())]
     Episodes {
-        /// The directory.
         path: PathBuf,
         /// The operating system's error.
         cause: io::Error,
@@ -60,7 +55,6 @@ pub enum ServerError {
     /// The audit log cannot be opened.
     #[error("cannot write the audit log {}: {cause}", path.display())]
     Audit {
-        /// The file.
         path: PathBuf,
         /// The operating system's error.
         cause: io::Error,
@@ -79,9 +73,9 @@ pub enum ServerError {
 /// Starts a server within the running tokio runtime and returns once it listens.
 ///
 /// # Errors
-/// The address is not a loopback address and there are no tokens, or the address or a directory cannot
-/// be used. A directory for uploads that cannot be used is only logged: the server starts and refuses
-/// uploads.
+/// The address is not a loopback address and there are no tokens, or the address or a directory
+/// cannot be used. A directory for uploads that cannot be used is only logged: the server starts
+/// and refuses uploads.
 pub async fn start(config: Config) -> Result<Running, ServerError> {
     let Config {
         listen,

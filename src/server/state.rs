@@ -38,7 +38,6 @@ pub(crate) struct ServerState {
     pub(crate) tickets: Tickets,
     pub(crate) audit: Arc<Audit>,
     pub(crate) open_pushes: TokenCounts,
-    /// WebSocket connections.
     pub(crate) open_connections: TokenCounts,
     pub(crate) readiness: Readiness,
     pub(crate) origins: Origins,

@@ -23,8 +23,8 @@ pub(crate) trait ByteStream: AsyncRead + AsyncWrite + Unpin + Send {}
 impl<T: AsyncRead + AsyncWrite + Unpin + Send> ByteStream for T {}
 
 impl Stream {
-    /// A connection over these bytes; `same_machine` is an error with the reason if the other end is not on this
-    /// machine, or if this is unknown.
+    /// A connection over these bytes; `same_machine` is an error with the reason if the other end
+    /// is not on this machine, or if this is unknown.
     pub(crate) fn new(
         bytes: impl ByteStream + 'static,
         same_machine: Result<(), &'static str>,
@@ -54,7 +54,8 @@ impl Stream {
         }
     }
 
-    /// Whether the other end is on this machine. An error has the reason if it is not, or if this is unknown.
+    /// Whether the other end is on this machine. An error has the reason if it is not, or if this
+    /// is unknown.
     pub(crate) fn same_machine(&self) -> Result<(), &'static str> {
         self.same_machine
     }

@@ -1,5 +1,5 @@
-//! One-time tickets, which stand for a token in the address of a WebSocket: browsers cannot send a token in a
-//! handshake.
+//! One-time tickets, which stand for a token in the address of a WebSocket: browsers cannot send a
+//! token in a handshake.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

@@ -39,9 +39,7 @@ impl TlsFiles {
 #[derive(Debug, thiserror::Error)]
 #[error("{}: {reason}", path.display())]
 pub struct TlsError {
-    /// The file.
     pub path: PathBuf,
-    /// The error.
     pub reason: String,
 }
 
@@ -65,8 +63,8 @@ impl Tls {
         self.acceptor.lock().clone()
     }
 
-    /// Reads the files again. Existing connections keep their certificate. If the new files cannot be used, the old
-    /// ones stay.
+    /// Reads the files again. Existing connections keep their certificate. If the new files cannot
+    /// be used, the old ones stay.
     pub(crate) fn read_again(&self) {
         match read(&self.files) {
             Ok(acceptor) => {

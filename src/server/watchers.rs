@@ -1,7 +1,7 @@
 //! Clients that look at a session without taking part in it.
 //!
-//! A session publishes its newest observation in a cell that holds one. Without watchers nothing is stored, and a slow
-//! watcher misses observations, so that the session never waits.
+//! A session publishes its newest observation in a cell that holds one. Without watchers nothing is
+//! stored, and a slow watcher misses observations, so that the session never waits.
 
 use std::sync::{Arc, Weak};
 
@@ -55,7 +55,8 @@ impl Drop for Watch {
     }
 }
 
-/// Sends a session's observations to a watcher, until the session or the watcher ends, or the server (`stopped`).
+/// Sends a session's observations to a watcher, until the session or the watcher ends, or the
+/// server (`stopped`).
 pub(crate) async fn serve(stopped: impl Future<Output = ()>, mut socket: Socket, mut watch: Watch) {
     let reason = tokio::select! {
         reason = send_all(&mut socket, &mut watch) => reason,

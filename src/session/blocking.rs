@@ -4,7 +4,8 @@ use tracing::Span;
 
 use crate::error::SessionError;
 
-/// Runs `work` on one of tokio's blocking threads, within the current span, and waits for its result.
+/// Runs `work` on one of tokio's blocking threads, within the current span, and waits for its
+/// result.
 ///
 /// # Errors
 /// [`SessionError::Crashed`] if `work` panicked.

@@ -1,12 +1,15 @@
-//! Contact of the ego with the twin (`wildcity.static@1`), which every session looks for unless it is switched off.
+//! Contact of the ego with the twin (`wildcity.static@1`), which every session looks for unless it
+//! is switched off.
 //!
-//! The ego touches the twin where the solid Gaussians in its box have more area than on the recorded drives near by:
-//! the recorded car drove there, so what its box overlapped is no obstacle. The drives within the same block of 16 m, or a
-//! few metres beside it, decide. The largest area on all drives of a city would hide a parked car where the road is
-//! clear, because of one bush that hangs over the road elsewhere.
+//! The ego touches the twin where the solid Gaussians in its box have more area than on the
+//! recorded drives near by: the recorded car drove there, so what its box overlapped is no
+//! obstacle. The drives within the same block of 16 m, or a few metres beside it, decide. The
+//! largest area on all drives of a city would hide a parked car where the road is clear, because of
+//! one bush that hangs over the road elsewhere.
 //!
-//! Solid Gaussians are read block by block around the ego, at full detail: what is drawn, and from where, does not
-//! matter. A contact is a function of the version, of the ego's box and of its motion in the step.
+//! Solid Gaussians are read block by block around the ego, at full detail: what is drawn, and from
+//! where, does not matter. A contact is a function of the version, of the ego's box and of its
+//! motion in the step.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -30,11 +33,12 @@ use crate::spatial_index::{Block, SectionId, SpatialIndex, block_at};
 
 /// Recorded drives up to this far outside of a block decide what is a contact in it, in metres.
 const BESIDE_M: f64 = 4.0;
-/// Largest distance between two places at which the area is measured along a recorded drive, in metres.
+/// Largest distance between two places at which the area is measured along a recorded drive, in
+/// metres.
 const MEASURED_M: f64 = 0.5;
 
-/// An ego is tested again when it has moved by this, in metres, or turned by this, in radians. What it meets stays in its box
-/// for longer.
+/// An ego is tested again when it has moved by this, in metres, or turned by this, in radians. What
+/// it meets stays in its box for longer.
 const TESTED_M: f64 = 0.25;
 const TESTED_RAD: f64 = 0.05;
 
@@ -70,11 +74,11 @@ impl TwinSolids {
         Self { catalog, index, blocks, ego_box, limits: Arc::default() }
     }
 
-    /// The contacts that begin while the ego goes from one state through others, step by step. Each step takes `dt_us`, and
-    /// the first begins at `begin_us`. Blocks while it reads what is near.
+    /// The contacts that begin while the ego goes from one state through others, step by step. Each
+    /// step takes `dt_us`, and the first begins at `begin_us`. Blocks while it reads what is near.
     ///
-    /// What the ego overlaps already at the beginning, as at the start of an episode or after a switch of the version, is
-    /// not a new contact before it has left it.
+    /// What the ego overlaps already at the beginning, as at the start of an episode or after a
+    /// switch of the version, is not a new contact before it has left it.
     ///
     /// # Errors
     /// The twin cannot be read.
@@ -112,8 +116,8 @@ impl TwinSolids {
         Ok(steps)
     }
 
-    /// Shows `visit` the contacts that begin in a step, in which the ego `touched` the twin at its start. Returns whether it
-    /// does at its end.
+    /// Shows `visit` the contacts that begin in a step, in which the ego `touched` the twin at its
+    /// start. Returns whether it does at its end.
     fn step_contacts(
         &self,
         near: &mut Near,

@@ -1,8 +1,9 @@
 //! One episode: the ego's pose, the simulated time, and the past poses. Pure: no clock, no I/O.
 //!
-//! An [`Episode`] is a plain value: a copy of it, or one that was written as JSON and read again, continues exactly as
-//! the original does. A step returns a new [`Episode`] and leaves the old one as it is. The session renders and records
-//! the new one before it replaces the old, so that a step which fails on the way changes nothing.
+//! An [`Episode`] is a plain value: a copy of it, or one that was written as JSON and read again,
+//! continues exactly as the original does. A step returns a new [`Episode`] and leaves the old one
+//! as it is. The session renders and records the new one before it replaces the old, so that a step
+//! which fails on the way changes nothing.
 
 use std::collections::VecDeque;
 
@@ -34,8 +35,8 @@ pub struct Episode {
     distance_m: f64,
     ego: Ego,
     terminated: bool,
-    /// Past poses by rising time since the episode's start; the last is now. Never empty. Reaches as far
-    /// back as the history, or as the frames of the warm-up before the first step.
+    /// Past poses by rising time since the episode's start; the last is now. Never empty. Reaches
+    /// as far back as the history, or as the frames of the warm-up before the first step.
     track: VecDeque<Keyframe>,
     /// Where the track began, in microseconds: 0, or the start of the warm-up, which is below 0.
     begin_us: i64,
@@ -51,7 +52,8 @@ pub struct Episode {
     /// By camera, whether its images are being repaired; empty if none is.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     repairing: Vec<bool>,
-    /// For each camera, the recorded image that its repair model compares with; empty if there is none.
+    /// For each camera, the recorded image that its repair model compares with; empty if there is
+    /// none.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     references: Vec<Option<String>>,
     /// State of its sensors, if the session has sensor effects.
@@ -69,8 +71,8 @@ fn is_false(value: &bool) -> bool {
 pub enum Outcome {
     /// The agent closed the session or terminated the episode.
     Completed,
-    /// As `Completed`, but the ego left the recorded area: the trust of a pose, or the mean trust of an observation that has
-    /// one, was below [`limits::OFF_MODEL_TRUST`].
+    /// As `Completed`, but the ego left the recorded area: the trust of a pose, or the mean trust
+    /// of an observation that has one, was below [`limits::OFF_MODEL_TRUST`].
     OffModel,
     /// A rule ended the episode: a contact, off the route, or stuck.
     DrivingFailure,
@@ -88,28 +90,28 @@ pub enum Outcome {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EpisodeSummary {
-    /// Why it ended.
     pub outcome: Outcome,
-    /// Steps done.
     pub steps: u64,
     /// Simulated time, in microseconds.
     pub time_us: i64,
     /// Distance driven, in metres: the sum of the straight lines between poses.
     pub distance_m: f64,
-    /// The least mean trust of an observation's images, 0 to 1; absent if no observation had a trust.
+    /// The least mean trust of an observation's images, 0 to 1; absent if no observation had a
+    /// trust.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub least_trust: Option<f64>,
 }
 
-/// The ego's last 1.5 s at 10 Hz, oldest first, in the rig's frame now; the last pose is the identity.
+/// The ego's last 1.5 s at 10 Hz, oldest first, in the rig's frame now; the last pose is the
+/// identity.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EgoHistory {
     /// Positions `[16, 3]`, in metres.
     pub xyz_m: [[f32; 3]; HISTORY_POSES],
     /// Rotation matrices `[16, 3, 3]`, row by row.
     pub rotation: [[[f32; 3]; 3]; HISTORY_POSES],
-    /// How many poses, counted from the end, were driven, warm-up included. The earlier ones repeat the first driven
-    /// pose.
+    /// How many poses, counted from the end, were driven, warm-up included. The earlier ones repeat
+    /// the first driven pose.
     pub count: usize,
 }
 
@@ -155,8 +157,8 @@ impl Episode {
     /// The episode after one more step.
     ///
     /// # Errors
-    /// [`SessionError::EpisodeOver`] after the last step, [`SessionError::Ego`] if the ego cannot execute
-    /// the command.
+    /// [`SessionError::EpisodeOver`] after the last step, [`SessionError::Ego`] if the ego cannot
+    /// execute the command.
     pub fn stepped(
         &self,
         command: &Command,
@@ -166,8 +168,8 @@ impl Episode {
         Ok(self.followed(command, 1, ground, terminate)?.0)
     }
 
-    /// Returns the episode after one or more steps along a plan, which is one command for all steps, and the ego after
-    /// each step.
+    /// Returns the episode after one or more steps along a plan, which is one command for all
+    /// steps, and the ego after each step.
     ///
     /// # Errors
     /// As [`Episode::stepped`].
@@ -202,9 +204,9 @@ impl Episode {
             next.ego = ego.clone();
         }
         next.terminated = terminate;
-        // For every step of the plan, keep one pose at or before the first one of the history, to interpolate from:
-        // frames of all times since the start of the plan are rendered at its end. The first plan may still render
-        // frames of the warm-up, so it keeps all of that.
+        // For every step of the plan, keep one pose at or before the first one of the history, to
+        // interpolate from: frames of all times since the start of the plan are rendered at its
+        // end. The first plan may still render frames of the warm-up, so it keeps all of that.
         let time_us = next.time_us();
         let plan_us = time_us - self.time_us();
         let reach_us =
@@ -215,8 +217,8 @@ impl Episode {
         Ok((next, egos))
     }
 
-    /// The ego after each of some steps, along the decision that is in effect at that step. With a planner latency this
-    /// is an earlier decision than the present one.
+    /// The ego after each of some steps, along the decision that is in effect at that step. With a
+    /// planner latency this is an earlier decision than the present one.
     fn follow_decisions(
         &mut self,
         command: &Command,
@@ -249,9 +251,9 @@ impl Episode {
 
     /// The views of some cameras of a rig, selected by their indices, from a pose of the rig.
     ///
-    /// Cameras with a rolling shutter move during the exposure: the ego's motion up to the time `taken_us` is
-    /// transferred to that pose. In a warm-up (`taken_us` below 0) and at the start of an episode, the rig stands
-    /// still during the exposure.
+    /// Cameras with a rolling shutter move during the exposure: the ego's motion up to the time
+    /// `taken_us` is transferred to that pose. In a warm-up (`taken_us` below 0) and at the start
+    /// of an episode, the rig stands still during the exposure.
     pub(crate) fn views(
         &self,
         cameras: &[RigCamera],
@@ -260,7 +262,7 @@ impl Episode {
         taken_us: i64,
     ) -> Vec<View> {
         let now = self.pose_at(taken_us);
-        let all = View::of_moving_rig(cameras, world_from_rig, &|age_us| {
+        let all = View::from_moving_rig(cameras, world_from_rig, &|age_us| {
             if taken_us < 0 {
                 return world_from_rig;
             }
@@ -293,8 +295,8 @@ impl Episode {
         before.copied().collect()
     }
 
-    /// Whether it contains only its start: no step was made, there is no warm-up before the start, and no sensor has
-    /// effects.
+    /// Whether it contains only its start: no step was made, there is no warm-up before the start,
+    /// and no sensor has effects.
     pub(crate) fn is_start_alone(&self) -> bool {
         self.step == 0 && self.begin_us == 0 && self.sensors.is_none()
     }
@@ -334,13 +336,14 @@ impl Episode {
         self.terminated
     }
 
-    /// The summary so far. An episode that its agent terminated counts as completed, even if `outcome` says
-    /// that the connection failed afterwards.
+    /// The summary so far. An episode that its agent terminated counts as completed, even if
+    /// `outcome` says that the connection failed afterwards.
     pub fn summary(&self, outcome: Outcome) -> EpisodeSummary {
         self.summary_with(outcome, self.least_trust)
     }
 
-    /// The summary of an episode whose images had another least trust: that of a record, for a replay.
+    /// The summary of an episode whose images had another least trust: that of a record, for a
+    /// replay.
     pub(crate) fn summary_with(
         &self,
         outcome: Outcome,
@@ -348,7 +351,8 @@ impl Episode {
     ) -> EpisodeSummary {
         let completed = self.terminated
             || matches!(outcome, Outcome::Completed | Outcome::OffModel | Outcome::DrivingFailure);
-        // A replay does not evaluate the rules of the scenario. It takes the outcome from the record.
+        // A replay does not evaluate the rules of the scenario. It takes the outcome from the
+        // record.
         let failed = self.failed || outcome == Outcome::DrivingFailure;
         // An ego that fails first has not left the area, whatever its images show afterwards.
         let has_low_trust = least_trust.is_some_and(|trust| trust < limits::OFF_MODEL_TRUST);
@@ -389,8 +393,8 @@ impl Episode {
         self.failed = reason.is_failure();
     }
 
-    /// Takes the trusts of an observation's images, 0 to 1 each, into account. Returns their mean; `None` if there are
-    /// none.
+    /// Takes the trusts of an observation's images, 0 to 1 each, into account. Returns their mean;
+    /// `None` if there are none.
     pub(crate) fn add_trusts(&mut self, trusts: impl Iterator<Item = f64>) -> Option<f64> {
         let mut sum = 0.0;
         let mut count = 0.0;
@@ -421,7 +425,8 @@ impl Episode {
         let rig_from_world = self.world_from_rig().inverse();
         let mut xyz_m = [[0.0; 3]; HISTORY_POSES];
         let mut rotation = [[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]; HISTORY_POSES];
-        // The last pose stays the exact identity; `rig_from_world * world_from_rig` would be rounded.
+        // The last pose stays the exact identity; `rig_from_world * world_from_rig` would be
+        // rounded.
         for k in 0..HISTORY_POSES - 1 {
             let age_us = (HISTORY_POSES - 1 - k) as i64 * HISTORY_STEP_US;
             let rig_from_past = rig_from_world * self.pose_at(self.time_us() - age_us);
@@ -434,8 +439,8 @@ impl Episode {
         EgoHistory { xyz_m, rotation, count }
     }
 
-    /// `world_from_rig` at a time since the episode's start: interpolated, and constant beyond both ends
-    /// of the track.
+    /// `world_from_rig` at a time since the episode's start: interpolated, and constant beyond both
+    /// ends of the track.
     pub(crate) fn pose_at(&self, time_us: i64) -> Pose {
         let after = self.track.partition_point(|key| key.time_us < time_us);
         let Some(to) = self.track.get(after) else { return self.world_from_rig() };

@@ -28,7 +28,6 @@ pub enum SessionError {
     /// There is no rig preset of this name.
     #[error("there is no rig preset {name:?}; there is {}", known.join(", "))]
     UnknownRig {
-        /// The requested name.
         name: String,
         /// The names of the presets.
         known: Vec<&'static str>,
@@ -38,7 +37,6 @@ pub enum SessionError {
     UnknownCamera {
         /// The field of the request that names it, as on the wire.
         field: String,
-        /// The requested name.
         name: String,
         /// The names of the rig's cameras.
         known: Vec<String>,
@@ -46,25 +44,18 @@ pub enum SessionError {
     /// The server has no repair model of this name.
     #[error("there is no repair model {name:?}; there is {}", joined_or_none(known))]
     UnknownRepair {
-        /// The requested name.
         name: String,
         /// The names of the models.
         known: Vec<String>,
     },
     /// The repair model cannot be loaded, or not be used for these images.
     #[error("the repair model {name:?} cannot be used: {reason}")]
-    RepairUnavailable {
-        /// The requested name.
-        name: String,
-        /// Why.
-        reason: String,
-    },
+    RepairUnavailable { name: String, reason: String },
     /// The repair model failed, and the session had asked for an error in this case.
     #[error("the image of camera {camera:?} was not repaired: {cause}; nothing changed")]
     Repair {
         /// Name of the camera.
         camera: String,
-        /// Why.
         cause: Box<RepairError>,
     },
     /// A recorded drive of the twin cannot be used as a route.
@@ -75,7 +66,6 @@ pub enum SessionError {
     UnknownSnapshot {
         /// The field of the request that names it, as on the wire.
         field: &'static str,
-        /// The requested name.
         name: String,
         /// The names of the session's snapshots.
         known: Vec<String>,
@@ -84,22 +74,15 @@ pub enum SessionError {
     #[error(
         "there is no recorded episode {name:?}; an episode is named SESSION-NUMBER, as its file"
     )]
-    UnknownEpisode {
-        /// The requested name.
-        name: String,
-    },
+    UnknownEpisode { name: String },
     /// A recorded episode cannot be continued.
     #[error("the recorded episode cannot be continued: {reason}")]
-    Branch {
-        /// The reason.
-        reason: String,
-    },
+    Branch { reason: String },
     /// A camera was requested twice.
     #[error("camera {name:?} is requested twice; name each camera once")]
     CameraTwice {
         /// Index of the second request in `outputs.cameras`.
         index: usize,
-        /// The name.
         name: String,
     },
     /// An option of one camera is outside its limits.
@@ -115,7 +98,6 @@ pub enum SessionError {
     UnknownTrajectory {
         /// The field of the request that names it, as on the wire.
         field: &'static str,
-        /// The requested name.
         name: String,
         /// The names of the twin's trajectories.
         known: Vec<String>,
@@ -170,11 +152,10 @@ pub enum SessionError {
     Encode {
         /// Name of the camera.
         camera: String,
-        /// The encoder's message.
         reason: String,
     },
-    /// The episode's file could not be written, so that the request had no effect: every answer is on
-    /// record.
+    /// The episode's file could not be written, so that the request had no effect: every answer is
+    /// on record.
     #[error(transparent)]
     Record(#[from] RecordError),
     /// A bug of the program: a worker thread panicked.
@@ -189,9 +170,9 @@ pub enum SessionError {
 }
 
 impl SessionError {
-    /// The error of a `reset`, which has no `warm_up_us`: a start that is too early for the session's warm-up is
-    /// the fault of the start.
-    pub(crate) fn of_reset(self, start: Option<&Start>) -> Self {
+    /// The error of a `reset`, which has no `warm_up_us`: a start that is too early for the
+    /// session's warm-up is the fault of the start.
+    pub(crate) fn into_reset_error(self, start: Option<&Start>) -> Self {
         match (self, start) {
             (Self::OutOfRange { field: "warm_up_us", must }, Some(start)) => {
                 let field = match start {

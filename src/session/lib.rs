@@ -1,8 +1,8 @@
 //! Sessions of agents on city twins: open, reset, step, observe, record, replay.
 //!
-//! An [`Engine`] is shared by all sessions; a [`Session`] belongs to one agent. A request renders, is
-//! recorded, and only then changes the session: if any of this fails, the session is unchanged, and the
-//! client can repeat the request.
+//! An [`Engine`] is shared by all sessions; a [`Session`] belongs to one agent. A request renders,
+//! is recorded, and only then changes the session: if any of this fails, the session is unchanged,
+//! and the client can repeat the request.
 //!
 //! | module | contents |
 //! |---|---|

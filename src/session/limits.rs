@@ -5,19 +5,21 @@ use std::time::Duration;
 /// Largest number of events of one observation.
 pub const EVENTS: usize = 64;
 
-/// Room in the header of an observation for its events and the route: 64 events of at most 600 bytes, 20 points of 80,
-/// and a text of a command of at most 1,000 bytes, each twice at worst, since the metadata is a text within JSON.
+/// Room in the header of an observation for its events and the route: 64 events of at most 600
+/// bytes, 20 points of 80, and a text of a command of at most 1,000 bytes, each twice at worst,
+/// since the metadata is a text within JSON.
 pub const SCENARIO_HEADER_BYTES: usize = 96 << 10;
 
-/// Room for an actor: a name of 64 bytes, 14 numbers of at most 24 digits, and the names of the fields.
+/// Room for an actor: a name of 64 bytes, 14 numbers of at most 24 digits, and the names of the
+/// fields.
 pub const ACTOR_HEADER_BYTES: usize = 640;
 
-/// Largest number of episodes that wait to be exported as MCAP: at 20 ms each, 20 s of work. Further episodes are not
-/// exported, and the listing says so.
+/// Largest number of episodes that wait to be exported as MCAP: at 20 ms each, 20 s of work.
+/// Further episodes are not exported, and the listing says so.
 pub const WAITING_EXPORTS: usize = 1024;
 
-/// Largest record that is exported as MCAP by itself, in bytes: it is held in memory, several times its size. A day at
-/// 10 Hz has 720 MB; `wildcity episode export` reads it.
+/// Largest record that is exported as MCAP by itself, in bytes: it is held in memory, several times
+/// its size. A day at 10 Hz has 720 MB; `wildcity episode export` reads it.
 pub const EXPORTED_RECORD_BYTES: u64 = 64 << 20;
 
 /// Episodes whose failed export is remembered: more than a listing has.
@@ -26,19 +28,21 @@ pub const FAILED_EXPORTS: usize = 1024;
 /// Default simulated time per step, in microseconds: 10 Hz.
 pub const DT_US: i64 = 100_000;
 
-/// An episode ends as `off_model` if the trust of one of its poses, or the mean trust of one of its observations, was below
-/// this. It is reached at a lateral offset of 11.5 m from the recorded drive, two lanes beyond the neighbouring one.
+/// An episode ends as `off_model` if the trust of one of its poses, or the mean trust of one of its
+/// observations, was below this. It is reached at a lateral offset of 11.5 m from the recorded
+/// drive, two lanes beyond the neighbouring one.
 pub const OFF_MODEL_TRUST: f64 = 0.1;
 
 /// JPEG quality unless the session requests another.
 pub const JPEG_QUALITY: u8 = 90;
 
-/// Largest observation that a client accepts, 1.5 GiB: [`ANSWER_PIXELS`] at [`PIXEL_BYTES`] are 1,476 MB.
-/// Normals add 12 bytes a pixel, so that half as many pixels fit with them; instances 2, so that three quarters fit. Six raw 1440x928 images with
-/// depth and opacity are 88 MB.
+/// Largest observation that a client accepts, 1.5 GiB: [`ANSWER_PIXELS`] at [`PIXEL_BYTES`] are
+/// 1,476 MB. Normals add 12 bytes a pixel, so that half as many pixels fit with them; instances 2,
+/// so that three quarters fit. Six raw 1440x928 images with depth and opacity are 88 MB.
 pub const OBSERVATION_BYTES: usize = 3 << 29;
 
-/// Largest number of bytes per pixel without normals and instances: raw colour, and depth and opacity as f32.
+/// Largest number of bytes per pixel without normals and instances: raw colour, and depth and
+/// opacity as f32.
 pub const PIXEL_BYTES: u64 = 3 + 4 + 4;
 
 /// Bytes per pixel of normals.
@@ -54,13 +58,13 @@ pub const OBSERVATION_HEADER_BYTES: u64 = 1 << 20;
 /// Open sessions, both connected ones and ones that wait for their client to resume.
 pub const SESSIONS: usize = 256;
 
-/// Largest number of steps of a plan, `until_us` of a step: a minute at 16 Hz. Each keeps a pose of 64 bytes until the
-/// plan's end.
+/// Largest number of steps of a plan, `until_us` of a step: a minute at 16 Hz. Each keeps a pose of
+/// 64 bytes until the plan's end.
 pub const PLAN_STEPS: usize = 1_000;
 
-/// How long a render queue that is dropped waits for the frames that are being rendered. 128 Mi pixels at 15 ns each
-/// (two cores, BENCHMARKS.md) take 2.0 s. A frame that takes longer is abandoned: on a GPU in software, or if a driver
-/// hangs.
+/// How long a render queue that is dropped waits for the frames that are being rendered. 128 Mi
+/// pixels at 15 ns each (two cores, BENCHMARKS.md) take 2.0 s. A frame that takes longer is
+/// abandoned: on a GPU in software, or if a driver hangs.
 pub const LAST_FRAME_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Longest plan, in microseconds: as long as the longest trajectory.
@@ -88,34 +92,38 @@ pub const HISTORY_POSES: usize = 16;
 /// Time between two poses of the ego history, in microseconds.
 pub const HISTORY_STEP_US: i64 = 100_000;
 
-/// Largest number of frames of each camera in one observation: 1.5 s at 10 Hz, the length of the ego history.
+/// Largest number of frames of each camera in one observation: 1.5 s at 10 Hz, the length of the
+/// ego history.
 pub const BUNDLE_FRAMES: usize = HISTORY_POSES;
 
-/// Longest time between two frames of a camera, or between two decisions, in microseconds. A longer step
-/// raises it to the step.
+/// Longest time between two frames of a camera, or between two decisions, in microseconds. A longer
+/// step raises it to the step.
 pub const BUNDLE_PERIOD_US: i64 = 10_000_000;
 
 /// Largest lateral jitter of a random start, in metres: the other side of a wide road.
 pub const START_LATERAL_M: f64 = 20.0;
 
-/// How old the picture of a camera with effects may be, in microseconds. The track keeps the poses of that time: at
-/// 1 kHz these are 10,000 poses of 64 bytes.
+/// How old the picture of a camera with effects may be, in microseconds. The track keeps the poses
+/// of that time: at 1 kHz these are 10,000 poses of 64 bytes.
 pub const SENSOR_REACH_US: i64 = 10_000_000;
 
-/// After this number of lost frames in a row the camera delivers the oldest of them: at one in two, every 500th frame.
+/// After this number of lost frames in a row the camera delivers the oldest of them: at one in two,
+/// every 500th frame.
 pub const SENSOR_DROPS: i64 = 8;
 
-/// Shortest and longest time between two values of a drifting exposure or bias, in microseconds: up to an hour.
+/// Shortest and longest time between two values of a drifting exposure or bias, in microseconds: up
+/// to an hour.
 pub const DRIFT_PERIOD_US: std::ops::RangeInclusive<i64> = 1_000..=3_600_000_000;
 
-/// Time between two biases of an inertial measurement unit unless the session names another, in microseconds.
+/// Time between two biases of an inertial measurement unit unless the session names another, in
+/// microseconds.
 pub const BIAS_PERIOD_US: i64 = 60_000_000;
 
 /// Largest number of spots of dirt on a lens. Each is computed for each image.
 pub const DIRT_SPOTS: u64 = 256;
 
-/// Longest warm-up, in microseconds: sixteen frames at 1 Hz, and more than twice what any known agent
-/// reads. At 100 Hz these are 2,000 poses of a recorded drive.
+/// Longest warm-up, in microseconds: sixteen frames at 1 Hz, and more than twice what any known
+/// agent reads. At 100 Hz these are 2,000 poses of a recorded drive.
 pub const WARM_UP_US: i64 = 20_000_000;
 
 /// Shortest simulated time of a step, in microseconds: at 1 kHz the ego history needs 1,500 poses.
@@ -124,45 +132,49 @@ pub const DT_MIN_US: i64 = 1_000;
 /// Longest simulated time of a step, in microseconds.
 pub const DT_MAX_US: i64 = 10_000_000;
 
-/// The renderer's intermediate buffers may use 1/`FRAME_SHARE` of the memory for twins. A frame that needs more is
-/// rendered in parts, which costs little: 128 MiB of 1 GiB are a million Gaussians at once.
+/// The renderer's intermediate buffers may use 1/`FRAME_SHARE` of the memory for twins. A frame
+/// that needs more is rendered in parts, which costs little: 128 MiB of 1 GiB are a million
+/// Gaussians at once.
 pub const FRAME_SHARE: u64 = 8;
 
-/// Solid Gaussians, with which contact is looked for, may use 1/`SOLID_SHARE` of the memory for twins in addition to it:
-/// 32 MiB of 1 GiB are 2 million places of 10 cm, the surfaces of 300 blocks of 16 m. Nine blocks are near an ego.
+/// Solid Gaussians, with which contact is looked for, may use 1/`SOLID_SHARE` of the memory for
+/// twins in addition to it: 32 MiB of 1 GiB are 2 million places of 10 cm, the surfaces of 300
+/// blocks of 16 m. Nine blocks are near an ego.
 pub const SOLID_SHARE: u64 = 32;
 
 /// Solid Gaussians are read ahead up to this far from the ego, in metres: 2 s at 20 m/s.
 pub const SOLIDS_AHEAD_M: f64 = 40.0;
 
-/// Bytes per pixel of a JPEG file for which memory is set aside: twice those of a street of quality 90.
+/// Bytes per pixel of a JPEG file for which memory is set aside: twice those of a street of quality
+/// 90.
 pub const JPEG_PIXEL_BYTES: u64 = 1;
 
-/// Frames that may wait for the renderer. A session waits for one at a time, and may leave an abandoned
-/// one in the queue after its deadline: hence twice the sessions.
+/// Frames that may wait for the renderer. A session waits for one at a time, and may leave an
+/// abandoned one in the queue after its deadline: hence twice the sessions.
 pub const QUEUED_FRAMES: usize = 2 * SESSIONS;
 
-/// A frame of more pixels takes a second and more on processors, so small frames are rendered at the same time. Sixteen
-/// 1440x928 images are 21 million.
+/// A frame of more pixels takes a second and more on processors, so small frames are rendered at
+/// the same time. Sixteen 1440x928 images are 21 million.
 pub const LARGE_PIXELS: u64 = 24 << 20;
 
-/// Bytes of all answers that are being made, sent, or kept for a repeated `seq`, and of the sessions'
-/// overlays, which take 134 MB per session at worst. Enough for 100 sessions with six raw 1440x928 images,
-/// depth and opacity (88 MB each), or for JPEGs to every session.
+/// Bytes of all answers that are being made, sent, or kept for a repeated `seq`, and of the
+/// sessions' overlays, which take 134 MB per session at worst. Enough for 100 sessions with six raw
+/// 1440x928 images, depth and opacity (88 MB each), or for JPEGs to every session.
 pub const ANSWERS_BYTES: u64 = 9 << 30;
 
-/// Largest memory of an answer, in bytes, that is kept for the next answer: six raw 1440x928 images take 24 MB.
+/// Largest memory of an answer, in bytes, that is kept for the next answer: six raw 1440x928 images
+/// take 24 MB.
 pub const SPARE_ANSWER_BYTES: usize = 32 << 20;
 
-/// Largest memory that a render thread keeps for the next frame, in bytes: RGB and opacity of six 1440x928 images take
-/// 56 MB.
+/// Largest memory that a render thread keeps for the next frame, in bytes: RGB and opacity of six
+/// 1440x928 images take 56 MB.
 pub const SCRATCH_BYTES: usize = 64 << 20;
 
 /// Longest line of an episode's file after the first: 256 image hashes of an `observe` take 17 kB.
 pub const EPISODE_LINE_BYTES: usize = 1 << 20;
 
-/// Longest first line of an episode's file. It holds the rig: overlays of 2^24 pixels of 4 bytes are 90 MB
-/// in base64 if PNG cannot compress them.
+/// Longest first line of an episode's file. It holds the rig: overlays of 2^24 pixels of 4 bytes
+/// are 90 MB in base64 if PNG cannot compress them.
 pub const EPISODE_HEAD_BYTES: usize = 96 << 20;
 
 /// The rig preset of a session that requests no rig, on a twin that has none.
@@ -174,48 +186,51 @@ pub const LEASE: Duration = Duration::from_secs(900);
 /// Time between two renewals of a lease. Two in a row may fail before the lease ends.
 pub const LEASE_RENEWAL: Duration = Duration::from_secs(300);
 
-/// Distances from a viewpoint to a block that a frame computes on the thread of its session, to find the sections that
-/// it draws: 0.1 ms. More of them, as in a city, are computed on another thread.
+/// Distances from a viewpoint to a block that a frame computes on the thread of its session, to
+/// find the sections that it draws: 0.1 ms. More of them, as in a city, are computed on another
+/// thread.
 pub const DEMAND_IN_PLACE: usize = 1 << 14;
 
 /// Shortest and longest time that prefetching looks ahead. Between them it is three times the 99th
-/// percentile of the load times. 1 s, for a local disk, is 30 m at 30 m/s; 5 s cover a slow remote store.
+/// percentile of the load times. 1 s, for a local disk, is 30 m at 30 m/s; 5 s cover a slow remote
+/// store.
 pub const PREFETCH_AHEAD: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(5));
 
 /// How many of the next steps are prefetched at their exact poses: a second at 10 Hz.
 pub const IMMINENT_STEPS: usize = 10;
 
-/// Distance between two prefetched poses beyond those steps, in metres. Along the path, the level of detail
-/// of a block at the side changes every 16 m or more.
+/// Distance between two prefetched poses beyond those steps, in metres. Along the path, the level
+/// of detail of a block at the side changes every 16 m or more.
 pub const PREFETCH_SPACING_M: f64 = 8.0;
 
-/// Number of poses that are prefetched after a step, and the same number along the agent's hint: 512 m. Each
-/// takes 0.2 ms in a city.
+/// Number of poses that are prefetched after a step, and the same number along the agent's hint:
+/// 512 m. Each takes 0.2 ms in a city.
 pub const PREFETCH_PLACES: usize = 64;
 
 /// Poses of one `prefetch` request: 2 km of a polyline.
 pub const PREFETCH_POSES: usize = 256;
 
-/// The ego counts as following a recorded drive within this distance, in metres: the other side of a wide
-/// road.
+/// The ego counts as following a recorded drive within this distance, in metres: the other side of
+/// a wide road.
 pub const ROUTE_NEAR_M: f64 = 15.0;
 
 /// The ego counts as standing if its last step was shorter than this, in metres.
 pub const STANDSTILL_STEP_M: f64 = 0.01;
 
-/// How far along a recorded drive is prefetched for an ego that stands on it, in metres: five seconds at
-/// urban speed.
+/// How far along a recorded drive is prefetched for an ego that stands on it, in metres: five
+/// seconds at urban speed.
 pub const STANDSTILL_AHEAD_M: f64 = 50.0;
 
-/// Largest number of steps that prefetching looks ahead, even if the agent steps much faster than real time.
+/// Largest number of steps that prefetching looks ahead, even if the agent steps much faster than
+/// real time.
 pub const STEPS_AHEAD: usize = 256;
 
-/// How long a push may preload its version for the running sessions. After that the version counts as ready
-/// even if something is still missing.
+/// How long a push may preload its version for the running sessions. After that the version counts
+/// as ready even if something is still missing.
 pub const PRELOAD_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Time between two checks whether the preload is complete. Twenty checks a second add little to seconds of
-/// loading.
+/// Time between two checks whether the preload is complete. Twenty checks a second add little to
+/// seconds of loading.
 pub const PRELOAD_POLL: Duration = Duration::from_millis(50);
 
 // The memory for answers is the memory that is set aside for images.
@@ -227,8 +242,8 @@ const _: () = assert!(OBSERVATION_BYTES as u64 <= ANSWERS_BYTES);
 // A path may be as long as the longest step.
 const _: () = assert!(wildcity_sim::limits::PATH_US >= DT_MAX_US);
 
-// A session that waits for a section which a store never delivers gets an error before its step times out:
-// 3 attempts of 3 x 5 s + 0.1 s + 0.2 s, and 0.25 s between them, are 46.2 s.
+// A session that waits for a section which a store never delivers gets an error before its step
+// times out: 3 attempts of 3 x 5 s + 0.1 s + 0.2 s, and 0.25 s between them, are 46.2 s.
 const _: () = {
     use wildcity_twin::limits::{
         LOAD_ATTEMPTS, LOAD_BACKOFF, REMOTE_BACKOFF, SECTION_TIMEOUT, SECTION_TRIES,
@@ -240,8 +255,8 @@ const _: () = {
     assert!(LOAD_ATTEMPTS as u128 * attempt_ms + between_ms < STEP_TIMEOUT.as_millis());
 };
 
-// The largest answer of a session fits a message, with normals at half of the pixels, and with instances at three
-// quarters of them.
+// The largest answer of a session fits a message, with normals at half of the pixels, and with
+// instances at three quarters of them.
 const _: () = {
     let room_bytes = OBSERVATION_BYTES as u64 - OBSERVATION_HEADER_BYTES;
     assert!(ANSWER_PIXELS * PIXEL_BYTES <= room_bytes);

@@ -23,7 +23,8 @@ pub struct SessionOptions {
     pub version: Option<u64>,
     /// Seed of the first episode.
     pub seed: u64,
-    /// Where to start; if absent, at the start of the twin's first trajectory, or at the world's origin.
+    /// Where to start; if absent, at the start of the twin's first trajectory, or at the world's
+    /// origin.
     pub start: Option<Start>,
     /// Cameras; if absent, the twin's rig, or the preset `vehicle6`.
     pub rig: Option<RigChoice>,
@@ -35,11 +36,11 @@ pub struct SessionOptions {
     pub dynamics: Dynamics,
     /// Simulated time of a step, in microseconds.
     pub dt_us: Option<i64>,
-    /// Time between two decisions of the agent, in microseconds; one step if absent. Only observations at
-    /// decisions have images.
+    /// Time between two decisions of the agent, in microseconds; one step if absent. Only
+    /// observations at decisions have images.
     pub decision_us: Option<i64>,
-    /// Length of the warm-up in microseconds. The warm-up is the part of the recorded drive before the
-    /// start; the first observations hold its poses and frames.
+    /// Length of the warm-up in microseconds. The warm-up is the part of the recorded drive before
+    /// the start; the first observations hold its poses and frames.
     pub warm_up_us: i64,
     /// Largest time for one answer.
     pub deadline: Option<Duration>,
@@ -49,15 +50,14 @@ pub struct SessionOptions {
     pub repair: Option<RepairOptions>,
     /// Effects of its sensors; none if absent.
     pub sensors: Option<Sensors>,
-    /// What contact with the twin does. If absent, the scenario decides; without a scenario, a contact of a teleported ego
-    /// is reported, and another one ends the episode.
+    /// What contact with the twin does. If absent, the scenario decides; without a scenario, a
+    /// contact of a teleported ego is reported, and another one ends the episode.
     pub contact: Option<ContactMode>,
 }
 
 /// A scenario, and which values of its ego section apply.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ScenarioOptions {
-    /// Which scenario.
     pub source: ScenarioSource,
     /// Values of its sweep; the first ones where absent.
     pub values: BTreeMap<String, serde_json::Value>,
@@ -118,12 +118,13 @@ pub enum OnFailure {
     /// The image is delivered as rendered, and marked so.
     #[default]
     Unrepaired,
-    /// The request is refused with [`SessionError::Repair`](crate::SessionError::Repair); nothing changed.
+    /// The request is refused with [`SessionError::Repair`](crate::SessionError::Repair); nothing
+    /// changed.
     Error,
 }
 
-/// Whether a session looks for contact with the twin, and what it does at a contact. With a scenario, `Off` switches it
-/// off, and the scenario says what a contact does.
+/// Whether a session looks for contact with the twin, and what it does at a contact. With a
+/// scenario, `Off` switches it off, and the scenario says what a contact does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ContactMode {
@@ -136,8 +137,8 @@ pub enum ContactMode {
 }
 
 impl ContactMode {
-    /// The mode of an episode unless the session names one. A teleported ego is not stopped by what it meets: it is
-    /// often put into places where no car drives.
+    /// The mode of an episode unless the session names one. A teleported ego is not stopped by what
+    /// it meets: it is often put into places where no car drives.
     pub(crate) fn default_for(model: EgoModel) -> Self {
         if model == EgoModel::Teleport { Self::Report } else { Self::End }
     }
@@ -146,7 +147,8 @@ impl ContactMode {
 /// Options of a step in addition to its command.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StepOptions {
-    /// Duration for which the command is followed, in microseconds: a whole number of steps; one step if absent.
+    /// Duration for which the command is followed, in microseconds: a whole number of steps; one
+    /// step if absent.
     pub until_us: Option<i64>,
     /// Whether the episode ends with it.
     pub terminate: bool,
@@ -222,7 +224,8 @@ pub struct Outputs {
     pub frames: Option<u64>,
     /// Whether images come with their trust.
     pub trust: bool,
-    /// Time between two frames in microseconds, by camera. Other cameras take a frame at every step.
+    /// Time between two frames in microseconds, by camera. Other cameras take a frame at every
+    /// step.
     pub periods_us: BTreeMap<String, i64>,
 }
 
@@ -250,7 +253,8 @@ pub struct PixelMaps {
     pub opacity: bool,
     /// Unit normals in the camera's axes, `[height, width, 3]`.
     pub normals: bool,
-    /// Whose Gaussian each pixel shows, u16 `[height, width]`: 0 none, 1 the twin, and actor k is k + 2.
+    /// Whose Gaussian each pixel shows, u16 `[height, width]`: 0 none, 1 the twin, and actor k is k
+    /// + 2.
     pub instances: bool,
 }
 

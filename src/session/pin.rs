@@ -33,10 +33,7 @@ pub(crate) async fn pin(
     };
     // Reads nothing, and takes less time than to wake another thread unless the twin is large.
     // Dropping the request takes the frame out of the pager's queue.
-    let request = match is_small {
-        true => request()?,
-        false => run_blocking(request).await??,
-    };
+    let request = if is_small { request()? } else { run_blocking(request).await?? };
     match timeout_at(deadline, answer).await {
         Ok(Ok(pinned)) => Ok(pinned?),
         Ok(Err(_)) => Err(SessionError::Crashed),

@@ -20,8 +20,8 @@ pub struct Snapshot {
     pub(crate) origin: Option<RecordedOrigin>,
 }
 
-/// The snapshots of a session, by name. Copies share them, so that other sessions can be opened from a
-/// snapshot while its own session drives on. They end with the last copy.
+/// The snapshots of a session, by name. Copies share them, so that other sessions can be opened
+/// from a snapshot while its own session drives on. They end with the last copy.
 #[derive(Clone, Debug, Default)]
 pub struct Snapshots(Arc<Mutex<BTreeMap<String, Arc<Snapshot>>>>);
 

@@ -1,4 +1,5 @@
-//! What of a version of a twin is near a place: its sections at full detail, and its recorded drives.
+//! What of a version of a twin is near a place: its sections at full detail, and its recorded
+//! drives.
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
@@ -15,7 +16,8 @@ use crate::observe::trust::RecordedPoses;
 /// A block of 16 m by its place in the world, in x and in y.
 pub(crate) type Block = [i64; 2];
 
-/// Between two keyframes that are farther apart than this, in metres, nothing was recorded: the drive has a gap.
+/// Between two keyframes that are farther apart than this, in metres, nothing was recorded: the
+/// drive has a gap.
 const GAP_M: f64 = 64.0;
 
 /// A section at full detail: the index of its chunk, and its own within the chunk.
@@ -25,9 +27,11 @@ pub(crate) type SectionId = [usize; 2];
 #[derive(Debug)]
 pub(crate) struct SpatialIndex {
     version: Arc<Version>,
-    /// The sections that may have Gaussians in the block: blocks with few Gaussians share a section with others.
+    /// The sections that may have Gaussians in the block: blocks with few Gaussians share a section
+    /// with others.
     sections: HashMap<Block, Vec<SectionId>>,
-    /// Index of the drive, and of the keyframe with which a part of the drive begins that touches the block.
+    /// Index of the drive, and of the keyframe with which a part of the drive begins that touches
+    /// the block.
     drives: HashMap<Block, Vec<[usize; 2]>>,
     /// `None` without a recorded drive.
     recorded: Option<Arc<RecordedPoses>>,
@@ -39,8 +43,8 @@ impl SpatialIndex {
         let mut sections: HashMap<Block, Vec<SectionId>> = HashMap::new();
         for (chunk_index, chunk) in manifest.chunks.iter().enumerate() {
             let center_m = CELL_M * DVec2::from_array(chunk.cell.map(f64::from));
-            // The bounds are those of whole Gaussians, and the centres are within the cell. The end of a cell is in the
-            // next one.
+            // The bounds are those of whole Gaussians, and the centres are within the cell. The end
+            // of a cell is in the next one.
             let cell_m = [-0.5, 0.5 - 1e-9].map(|edge| center_m + CELL_M * edge);
             for (section_index, section) in chunk.sections.iter().enumerate() {
                 if section.is_full_detail() {

@@ -30,7 +30,8 @@ impl EpisodeStart {
     /// `warm_up_us` of that drive; on a twin without a drive, at the world's origin.
     ///
     /// # Errors
-    /// The trajectory does not exist or is too short, or `warm_up_us` is out of range or impossible.
+    /// The trajectory does not exist or is too short, or `warm_up_us` is out of range or
+    /// impossible.
     pub(crate) fn resolve(
         manifest: &Manifest,
         start: Option<&Start>,
@@ -69,7 +70,7 @@ impl EpisodeStart {
         warm_up_us: i64,
     ) -> Result<Self, SessionError> {
         check_warm_up(warm_up_us)?;
-        let drive = drive_of(drives, "start.trajectory", name)?;
+        let drive = find_drive(drives, "start.trajectory", name)?;
         let length_m = drive.length_m();
         if !(0.0..=length_m).contains(&station_m) {
             let must = format!("{station_m} m; trajectory {name:?} is {length_m} m long");
@@ -93,7 +94,7 @@ impl EpisodeStart {
         let RandomStart { trajectory, from_m, to_m, lateral_m, heading_rad } = random;
         check_warm_up(warm_up_us)?;
         let drive = match (trajectory, drives.first()) {
-            (Some(name), _) => drive_of(drives, "start.random.trajectory", name)?,
+            (Some(name), _) => find_drive(drives, "start.random.trajectory", name)?,
             (None, Some(first)) => first,
             (None, None) => {
                 let must = "a draw along a trajectory, and the twin has none".to_owned();
@@ -122,10 +123,10 @@ impl EpisodeStart {
             return Err(SessionError::OutOfRange { field: "start.random.to_m", must });
         }
 
-        // Use one random stream for each value, so that a change of one range does not change the other values.
-        let draw = |name: &str, low: f64, high: f64| match low < high {
-            true => Random::new(seed, name, 0).range(low, high),
-            false => low,
+        // Use one random stream for each value, so that a change of one range does not change the
+        // other values.
+        let draw = |name: &str, low: f64, high: f64| {
+            if low < high { Random::new(seed, name, 0).range(low, high) } else { low }
         };
         let station_m = draw("start station", first_m, last_m);
         let aside_m = draw("start lateral", -lateral_m, *lateral_m);
@@ -209,7 +210,7 @@ impl EpisodeStart {
 }
 
 /// The drive of a name; `field` is the field of the request that has the name.
-fn drive_of<'a>(
+fn find_drive<'a>(
     drives: &'a [Trajectory],
     field: &'static str,
     name: &str,

@@ -1,4 +1,5 @@
-//! The parts of a session: settings that stay the same from opening to closing, and state that steps change.
+//! The parts of a session: settings that stay the same from opening to closing, and state that
+//! steps change.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -33,7 +34,8 @@ pub(crate) struct SessionSettings {
     /// The share of the budget for answers that the cameras' overlays take.
     pub(crate) _overlays: BudgetShare,
     pub(crate) dynamics: Dynamics,
-    /// Where episodes start unless `reset` names another start; sampled anew for each episode if `random_start` is set.
+    /// Where episodes start unless `reset` names another start; sampled anew for each episode if
+    /// `random_start` is set.
     pub(crate) start: EpisodeStart,
     pub(crate) random_start: Option<RandomStart>,
     pub(crate) warm_up_us: i64,
@@ -47,7 +49,8 @@ pub(crate) struct SessionSettings {
     pub(crate) reports_actors: bool,
     /// The repair of the images, if the session asked for it.
     pub(crate) repair: Option<Arc<SessionRepair>>,
-    /// What contact with the twin does; `None` leaves it to the dynamics of each episode, or to the scenario.
+    /// What contact with the twin does; `None` leaves it to the dynamics of each episode, or to the
+    /// scenario.
     pub(crate) contact: Option<ContactMode>,
     /// The size with which contact with the twin is looked for; `None` if it is not.
     pub(crate) solid_ego: Option<EgoBox>,
@@ -70,8 +73,8 @@ pub(crate) struct PinnedVersion {
     pub(crate) references: Option<Arc<ReferenceViews>>,
 }
 
-/// State that a step changes. With the settings and the version, it determines the coming observations. A copy
-/// continues exactly as the original does.
+/// State that a step changes. With the settings and the version, it determines the coming
+/// observations. A copy continues exactly as the original does.
 #[derive(Clone, Debug)]
 pub(crate) struct EpisodeState {
     pub(crate) episode: Episode,
@@ -105,7 +108,7 @@ impl PinnedVersion {
     }
 
     /// Whether it is the same version of the same twin.
-    pub(crate) fn is_version_of(&self, other: &Self) -> bool {
+    pub(crate) fn has_same_version(&self, other: &Self) -> bool {
         self.resident.version.hash == other.resident.version.hash
             && self.resident.version.number == other.resident.version.number
     }

@@ -1,5 +1,5 @@
-//! Images of a version from any views, without an episode: for programs that simulate elsewhere and only
-//! render here.
+//! Images of a version from any views, without an episode: for programs that simulate elsewhere and
+//! only render here.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -29,9 +29,7 @@ const STILL_PIXEL_BYTES: u64 = 6;
 /// One image to render.
 #[derive(Clone, Debug)]
 pub struct Still {
-    /// Camera and pose.
     pub view: View,
-    /// Exposure and overlay.
     pub appearance: Appearance,
     /// How the image is encoded.
     pub encoding: Encoding,
@@ -42,7 +40,8 @@ pub struct Still {
 pub struct StillActor {
     /// Asset that it is drawn from.
     pub asset: Arc<ResidentActor>,
-    /// Its pose where the exposures end: its origin is on the ground under its middle, x points forward.
+    /// Its pose where the exposures end: its origin is on the ground under its middle, x points
+    /// forward.
     pub world_from_actor: Pose,
     /// Its pose where the longest exposure begins.
     pub world_from_actor_at_start: Pose,
@@ -89,9 +88,9 @@ impl Stills {
         Ok(frame_fits && needed <= self.reservation.scene_bytes())
     }
 
-    /// Renders images, and returns a JPEG or PNG file, or raw pixels, for each. More than [`MAX_VIEWS`] are rendered in
-    /// several frames, each scheduled among the frames of all sessions. All of them show `actors`, at most
-    /// [`PlacedChunk::MAX_ACTORS`].
+    /// Renders images, and returns a JPEG or PNG file, or raw pixels, for each. More than
+    /// [`MAX_VIEWS`] are rendered in several frames, each scheduled among the frames of all
+    /// sessions. All of them show `actors`, at most [`PlacedChunk::MAX_ACTORS`].
     ///
     /// # Errors
     /// Names what was not ready within `max_wait`, or what the backend refuses.
@@ -178,8 +177,8 @@ fn encoded(index: usize, rgb8: Vec<u8>, still: &Still) -> Result<Vec<u8>, Sessio
     image.map(|image| image.file)
 }
 
-/// Buffers and images that a frame of stills needs in addition to its scene. More than [`MAX_VIEWS`] views are rendered
-/// in several frames.
+/// Buffers and images that a frame of stills needs in addition to its scene. More than
+/// [`MAX_VIEWS`] views are rendered in several frames.
 fn frame_bytes(engine: &Engine, views: &[View]) -> FrameBytes {
     views.chunks(MAX_VIEWS).fold(FrameBytes::default(), |most, views| {
         let pixels: u64 = views.iter().map(|view| view.camera.pixels() as u64).sum();

@@ -5,8 +5,8 @@ use wildcity_twin::residency::Viewpoint;
 
 /// The viewpoint of each view: its position, and its focal length along the finer axis.
 ///
-/// For a rolling shutter this is the position at the end of the exposure. The level of detail depends only on the
-/// distance, not on the direction.
+/// For a rolling shutter this is the position at the end of the exposure. The level of detail
+/// depends only on the distance, not on the direction.
 pub fn viewpoints(views: &[View]) -> Vec<Viewpoint> {
     let viewpoint = |view: &View| Viewpoint {
         position_m: view.world_from_camera.position_m,

@@ -1,17 +1,20 @@
-//! The ground under cars and pedestrians: recorded drives, and the lanes of a map where no drive is near.
+//! The ground under cars and pedestrians: recorded drives, and the lanes of a map where no drive is
+//! near.
 //!
-//! A rig's origin is on the ground under its rear axle, and its z axis is normal to the ground. So every
-//! keyframe of a recorded drive defines a ground plane: through its origin, perpendicular to its z axis. This
-//! needs only the manifest and works for every twin with a drive. The Gaussians represent surfaces, most of
-//! which are not ground, and classifying them would be a guess.
+//! A rig's origin is on the ground under its rear axle, and its z axis is normal to the ground. So
+//! every keyframe of a recorded drive defines a ground plane: through its origin, perpendicular to
+//! its z axis. This needs only the manifest and works for every twin with a drive. The Gaussians
+//! represent surfaces, most of which are not ground, and classifying them would be a guess.
 //!
-//! A scenario may have a map. Its lanes for vehicles define the ground where no drive is near: a drive was on the
-//! road, a map may be off by its survey. Where neither is near there is no ground, and a car stays in its own plane.
+//! A scenario may have a map. Its lanes for vehicles define the ground where no drive is near: a
+//! drive was on the road, a map may be off by its survey. Where neither is near there is no ground,
+//! and a car stays in its own plane.
 
-use glam::{DMat3, DQuat, DVec3};
+use glam::{DQuat, DVec3};
 
 use crate::limits;
 use crate::map::LaneSurface;
+use crate::plane::Plane;
 use wildcity_scene::Trajectory;
 use wildcity_scene::geometry::Pose;
 
@@ -20,12 +23,6 @@ use wildcity_scene::geometry::Pose;
 pub struct Ground<'a> {
     drives: &'a [Trajectory],
     lanes: Option<&'a LaneSurface>,
-}
-
-/// A plane through a point, with unit normal `up`.
-pub(crate) struct Plane {
-    pub(crate) point_m: DVec3,
-    pub(crate) up: DVec3,
 }
 
 impl<'a> Ground<'a> {
@@ -39,21 +36,22 @@ impl<'a> Ground<'a> {
         Self { lanes, ..self }
     }
 
-    /// Places a pose (`world_from_rig`) on the ground: moves it vertically onto the ground plane and tilts it to
-    /// the plane's normal, keeping its heading. A pose farther than [`limits::GROUND_NEAR_M`] from every drive
-    /// and lane is returned unchanged.
+    /// Places a pose (`world_from_rig`) on the ground: moves it vertically onto the ground plane
+    /// and tilts it to the plane's normal, keeping its heading. A pose farther than
+    /// [`limits::GROUND_NEAR_M`] from every drive and lane is returned unchanged.
     ///
-    /// The plane is that of the nearest drive in 3D, so a bridge and the street below it are distinguished; of the
-    /// nearest lane if no drive is that near. Between keyframes, and between points of a lane, it is interpolated.
-    /// Every keyframe is tested: 170,000 take a millisecond.
+    /// The plane is that of the nearest drive in 3D, so a bridge and the street below it are
+    /// distinguished; of the nearest lane if no drive is that near. Between keyframes, and between
+    /// points of a lane, it is interpolated. Every keyframe is tested: 170,000 take a millisecond.
     pub fn place(&self, world_from_rig: Pose) -> Pose {
         self.find(world_from_rig).unwrap_or(world_from_rig)
     }
 
-    /// As [`Ground::place`]; `None` for a pose that it leaves unchanged because there is no ground, or no heading.
+    /// As [`Ground::place`]; `None` for a pose that it leaves unchanged because there is no ground,
+    /// or no heading.
     pub fn find(&self, world_from_rig: Pose) -> Option<Pose> {
         let point_m = world_from_rig.position_m;
-        if let Some(plane) = self.of_drives(point_m) {
+        if let Some(plane) = self.drives_plane(point_m) {
             return plane.place(world_from_rig);
         }
         let plane = self.lanes?.plane_near(point_m, limits::GROUND_NEAR_M)?;
@@ -65,7 +63,7 @@ impl<'a> Ground<'a> {
         plane.place(world_from_rig)
     }
 
-    fn of_drives(&self, point_m: DVec3) -> Option<Plane> {
+    fn drives_plane(&self, point_m: DVec3) -> Option<Plane> {
         let mut nearest_m = limits::GROUND_NEAR_M;
         let mut under = None;
         for drive in self.drives {
@@ -92,28 +90,6 @@ impl<'a> Ground<'a> {
 fn is_upright(rotation: DQuat) -> bool {
     let up = rotation * DVec3::Z;
     up.x == 0.0 && up.y == 0.0 && up.z > 0.0
-}
-
-impl Plane {
-    fn place(&self, world_from_rig: Pose) -> Option<Pose> {
-        let Self { point_m, up } = *self;
-        // A drive that is tilted by more than 45 degrees does not define a ground.
-        if up.z < limits::GROUND_UP {
-            return None;
-        }
-        let mut position_m = world_from_rig.position_m;
-        let aside_m = position_m - point_m;
-        position_m.z = point_m.z - (aside_m.x * up.x + aside_m.y * up.y) / up.z;
-        let forward = world_from_rig.rotation * DVec3::X;
-        let forward = forward.reject_from_normalized(up);
-        // A rig that points along the normal has no heading.
-        if forward.length() < limits::GROUND_HEADING {
-            return None;
-        }
-        let forward = forward.normalize();
-        let rotation = DQuat::from_mat3(&DMat3::from_cols(forward, up.cross(forward), up));
-        Some(Pose { position_m, rotation: rotation.normalize() })
-    }
 }
 
 #[cfg(test)]

@@ -1,41 +1,44 @@
 //! Limits and defaults of this package, with the arithmetic behind each.
 
-/// Largest acceleration of an action, in m/s²: as in Alpamayo, about the grip of tyres on a dry road.
+/// Largest acceleration of an action, in m/s²: as in Alpamayo, about the grip of tyres on a dry
+/// road.
 pub const EGO_ACCELERATION_M_S2: f64 = 9.8;
 
 /// Largest curvature of an action, in 1/m: as in Alpamayo, a turning circle of 10 m.
 pub const EGO_CURVATURE_1_M: f64 = 0.2;
 
-/// Largest angle of the front wheels, in radians: that of the largest curvature at very low speed, 0.2 1/m
-/// times a wheelbase of 2.85 m. At speed the car understeers and reaches less curvature.
+/// Largest angle of the front wheels, in radians: that of the largest curvature at very low speed,
+/// 0.2 1/m times a wheelbase of 2.85 m. At speed the car understeers and reaches less curvature.
 pub const EGO_STEERING_RAD: f64 = EGO_CURVATURE_1_M * 2.85;
 
 /// Largest speed forwards, in m/s: 216 km/h.
 pub const EGO_SPEED_M_S: f64 = 60.0;
 
-/// Largest speed backwards, in m/s: 36 km/h. From 12.8 m/s on, an eigenvalue would coincide with the rate of
-/// the steering's lag, and from 28.6 m/s on an understeering car is unstable backwards.
+/// Largest speed backwards, in m/s: 36 km/h. From 12.8 m/s on, an eigenvalue would coincide with
+/// the rate of the steering's lag, and from 28.6 m/s on an understeering car is unstable backwards.
 pub const EGO_REVERSE_M_S: f64 = 10.0;
 
-/// Largest number of poses of a trajectory that an ego follows: 6.4 s at 10 Hz, as Alpamayo outputs.
+/// Largest number of poses of a trajectory that an ego follows: 6.4 s at 10 Hz, as Alpamayo
+/// outputs.
 pub const PATH_POSES: usize = 64;
 
 /// Latest time of such a trajectory, in microseconds: one minute.
 pub const PATH_US: i64 = 60_000_000;
 
-/// Period at which the tracker of a trajectory updates its action, in microseconds: a tenth of the steering's
-/// lag.
+/// Period at which the tracker of a trajectory updates its action, in microseconds: a tenth of the
+/// steering's lag.
 pub const TRACKER_TICK_US: u64 = 10_000;
 
-/// Distance up to which a recorded drive defines the ground, in metres: the width of a street with its
-/// pavements.
+/// Distance up to which a recorded drive defines the ground, in metres: the width of a street with
+/// its pavements.
 pub const GROUND_NEAR_M: f64 = 25.0;
 
-/// Smallest z component of a ground plane's unit normal: a slope of 45 degrees, steeper than any street.
+/// Smallest z component of a ground plane's unit normal: a slope of 45 degrees, steeper than any
+/// street.
 pub const GROUND_UP: f64 = std::f64::consts::FRAC_1_SQRT_2;
 
-/// Smallest length of a unit vector's part along the ground that gives a heading. Rounding leaves about 1e-16 of a
-/// vector along the normal.
+/// Smallest length of a unit vector's part along the ground that gives a heading. Rounding leaves
+/// about 1e-16 of a vector along the normal.
 pub const GROUND_HEADING: f64 = 1e-9;
 
 /// Longest sub-step of traffic, in microseconds.
@@ -59,8 +62,8 @@ pub const ACTOR_SPEED_M_S: f64 = EGO_SPEED_M_S;
 /// Largest acceleration or braking of an actor, in m/s²: beyond the grip of tyres on a dry road.
 pub const ACTOR_ACCELERATION_M_S2: f64 = 20.0;
 
-/// An IDM actor looks for a lead within this many of its desired gaps to a standing lead. A lead at this distance
-/// changes its acceleration by at most 1/16 of the largest.
+/// An IDM actor looks for a lead within this many of its desired gaps to a standing lead. A lead at
+/// this distance changes its acceleration by at most 1/16 of the largest.
 pub const LEAD_GAPS: f64 = 4.0;
 
 /// Least and largest distance within which an IDM actor looks for a lead, in metres.
@@ -90,10 +93,12 @@ pub const ROUTE_POINTS: u32 = 20;
 /// How far behind and ahead of its previous place the ego is searched for on its route, in metres.
 pub const ROUTE_SEARCH_M: [f64; 2] = [30.0, 100.0];
 
-/// If the ego is farther than this from the searched part, it is searched for on the whole route, in metres.
+/// If the ego is farther than this from the searched part, it is searched for on the whole route,
+/// in metres.
 pub const ROUTE_LOST_M: f64 = 50.0;
 
-/// A route is done if more than this share of it was driven and the ego is within [`ROUTE_END_M`] of its end (HUGSIM).
+/// A route is done if more than this share of it was driven and the ego is within [`ROUTE_END_M`]
+/// of its end (HUGSIM).
 pub const ROUTE_DONE: f64 = 0.99;
 /// Largest distance of the ego from the end of a route that is done, in metres: see [`ROUTE_DONE`].
 pub const ROUTE_END_M: f64 = 10.0;
@@ -121,5 +126,6 @@ pub const CONDITIONS: usize = 64;
 /// Deepest nesting of conditions: see [`CONDITIONS`].
 pub const CONDITION_DEPTH: usize = 6;
 
-/// Largest delay of a condition, in seconds: in sub-steps of 10 ms its values change at most 6000 times.
+/// Largest delay of a condition, in seconds: in sub-steps of 10 ms its values change at most 6000
+/// times.
 pub const LATER_S: f64 = 60.0;

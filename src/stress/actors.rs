@@ -6,7 +6,7 @@ use glam::{DQuat, DVec3};
 
 use super::order::low_discrepancy;
 use super::{Case, CaseBody, CaseRun};
-use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, gaussians_of};
+use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, gaussians_from_specs};
 use wildcity_render::compare::images::{RenderedImage, max_difference};
 use wildcity_render::compare::psnr::psnr_db;
 use wildcity_render::{Readout, RenderError, RollingShutter, View};
@@ -41,8 +41,8 @@ fn t25(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         moved.world_from_camera.rotation = turn * view.world_from_camera.rotation;
         let image = run.render_and_compare(what, &turned, &profile, moved)?;
         let off = max_difference(&still.rgba, &image.rgba);
-        // A device quantizes each of 16 coefficients in steps of 1/32,767 of the largest one of its cluster
-        // of 256, which is below 5e-4 in sum. The other backends keep f32.
+        // A device quantizes each of 16 coefficients in steps of 1/32,767 of the largest one of its
+        // cluster of 256, which is below 5e-4 in sum. The other backends keep f32.
         run.check_at_most(format!("{what}: off by"), off.into(), 5e-4);
     }
     Ok(())
@@ -59,7 +59,7 @@ fn actor() -> Gaussians {
             ..GaussianSpec::default()
         }
     });
-    let mut actor = gaussians_of(&balls.collect::<Vec<_>>());
+    let mut actor = gaussians_from_specs(&balls.collect::<Vec<_>>());
     actor.raise_sh_degree(3);
     for (i, colour) in actor.sh.chunks_exact_mut(3 * sh::coefficients(3)).enumerate() {
         for (k, value) in colour[3..].iter_mut().enumerate() {
@@ -104,7 +104,7 @@ fn t29(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         let truth = run.render(&merged, &profile, view)?;
         run.check_at_least_db(
             format!("{what}: as within the scene, dB"),
-            psnr_of(&image, &truth),
+            image_psnr_db(&image, &truth),
             60.0,
         );
         let alone = run.render(&Scene::from_gaussians(&road), &profile, view)?;
@@ -137,7 +137,7 @@ fn t30(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     // The camera at rest.
     let image = run.render_and_compare("across", &moving, &profile, view)?;
     let truth = run.render_reference(&moving, &exact, view)?;
-    run.check_at_least_db("across: exact rays, dB", psnr_of(&image, &truth), 38.0);
+    run.check_at_least_db("across: exact rays, dB", image_psnr_db(&image, &truth), 38.0);
 
     // The camera drives along: nothing moves.
     let mut first = view.world_from_camera;
@@ -146,7 +146,7 @@ fn t30(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let along = View { rolling_shutter, ..view };
     let image = run.render_and_compare("along", &moving, &profile, along)?;
     let truth = run.render(&at_rest, &profile, still)?;
-    run.check_at_least_db("along: as at rest, dB", psnr_of(&image, &truth), 60.0);
+    run.check_at_least_db("along: as at rest, dB", image_psnr_db(&image, &truth), 60.0);
     Ok(())
 }
 
@@ -173,9 +173,9 @@ fn road() -> Gaussians {
         rgb: [0.4, 0.4, 0.45],
         ..GaussianSpec::default()
     };
-    gaussians_of(&(0..80 * 300).map(surfel).collect::<Vec<_>>())
+    gaussians_from_specs(&(0..80 * 300).map(surfel).collect::<Vec<_>>())
 }
 
-fn psnr_of(image: &RenderedImage, truth: &RenderedImage) -> f64 {
+fn image_psnr_db(image: &RenderedImage, truth: &RenderedImage) -> f64 {
     psnr_db(image.rgba.iter().zip(&truth.rgba).map(|(a, b)| f64::from(a - b)))
 }

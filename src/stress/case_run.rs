@@ -21,7 +21,6 @@ pub struct CaseRun<'a> {
 pub struct Check {
     /// What was measured, and where.
     pub what: String,
-    /// The value.
     pub measured: f64,
     bound: Bound,
 }
@@ -29,7 +28,6 @@ pub struct Check {
 /// What a measured value must satisfy.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Bound {
-    /// At most this.
     AtMost(f64),
     /// At least so many dB.
     AtLeastDb(f64),
@@ -97,8 +95,9 @@ impl<'a> CaseRun<'a> {
         self.checks.push(Check { what: what.into(), measured, bound: Bound::True });
     }
 
-    /// Accepts an error that names a limit of the device ([`RenderError::TooMany`]): the verdict is then
-    /// [`Verdict::Refused`]. Only devices have such limits; from another backend it is an error like any other.
+    /// Accepts an error that names a limit of the device ([`RenderError::TooMany`]): the verdict is
+    /// then [`Verdict::Refused`]. Only devices have such limits; from another backend it is an
+    /// error like any other.
     pub(super) fn accept_limit(&mut self, error: RenderError) -> Result<(), RenderError> {
         if !matches!(error, RenderError::TooMany { .. }) || self.backend.name() != "gpu" {
             return Err(error);
@@ -160,9 +159,9 @@ impl<'a> CaseRun<'a> {
         Ok(render_images(&Reference, scene, profile, &[view])?.remove(0))
     }
 
-    /// The backend's images of one view, after checks that every value is finite and that the reference
-    /// backend's images agree. The reference backend is not compared with itself; its images must have the
-    /// values that a case states.
+    /// The backend's images of one view, after checks that every value is finite and that the
+    /// reference backend's images agree. The reference backend is not compared with itself; its
+    /// images must have the values that a case states.
     pub(super) fn render_and_compare(
         &mut self,
         what: impl Into<String>,
@@ -208,8 +207,8 @@ impl Check {
         }
     }
 
-    /// The share of its bound that the value takes: 1 is all of it. In dB the error counts: 20 dB are a
-    /// factor of ten.
+    /// The share of its bound that the value takes: 1 is all of it. In dB the error counts: 20 dB
+    /// are a factor of ten.
     pub fn bound_usage(&self) -> f64 {
         match self.bound {
             Bound::AtMost(0.0) => self.measured,

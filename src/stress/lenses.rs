@@ -4,7 +4,7 @@ use glam::{DQuat, DVec2, DVec3};
 
 use super::order::low_discrepancy;
 use super::{Case, CaseBody, CaseRun};
-use wildcity_render::compare::gaussians::{GaussianSpec, scene_of};
+use wildcity_render::compare::gaussians::{GaussianSpec, scene_from_specs};
 use wildcity_render::compare::images::crop_view;
 use wildcity_render::compare::psnr::psnr_db;
 use wildcity_render::{RenderError, RollingShutter, View};
@@ -36,7 +36,8 @@ fn t22(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let (camera, gaussian) = fisheye_and_gaussian();
     let profile = RenderProfile::DEFAULT;
     let view = View::new(camera, Pose::IDENTITY);
-    let image = run.render_and_compare("six points", &scene_of(&[gaussian]), &profile, view)?;
+    let image =
+        run.render_and_compare("six points", &scene_from_specs(&[gaussian]), &profile, view)?;
     let pixels = image.opacity.iter().enumerate().map(|(pixel, &opacity)| {
         let at_px = DVec2::new((pixel % 160) as f64 + 0.5, (pixel / 160) as f64 + 0.5);
         (f64::from(opacity), at_px)
@@ -45,9 +46,9 @@ fn t22(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let (point_px, point_px2) = sampled(&camera, &gaussian);
 
     run.check_at_most("centre off by px:", drawn_px.distance(point_px), 0.2);
-    // The image of a splat ends where alpha is below the cut, at r² = 2 ln(opacity / cut) in standard
-    // deviations. A 2D Gaussian truncated at r has 1 - r²/2 e^(-r²/2) / (1 - e^(-r²/2)) of its variance. The
-    // renderer's blur adds to it.
+    // The image of a splat ends where alpha is below the cut, at r² = 2 ln(opacity / cut) in
+    // standard deviations. A 2D Gaussian truncated at r has 1 - r²/2 e^(-r²/2) / (1 - e^(-r²/2)) of
+    // its variance. The renderer's blur adds to it.
     let left = profile.alpha_cut / gaussian.opacity;
     let share = 1.0 + left.ln() * left / (1.0 - left);
     let size_px2 = point_px2[0] + point_px2[1];
@@ -102,7 +103,8 @@ fn t23(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let camera = Camera { lens, ..Camera::from_pinhole(120, 100, pinhole) };
     let profile = RenderProfile::DEFAULT;
     let view = View::new(camera, Pose::IDENTITY);
-    let ball = |mean_m: DVec3| scene_of(&[GaussianSpec { mean_m, ..GaussianSpec::default() }]);
+    let ball =
+        |mean_m: DVec3| scene_from_specs(&[GaussianSpec { mean_m, ..GaussianSpec::default() }]);
 
     let behind = run.render(&ball(DVec3::new(0.0, 0.0, -3.0)), &profile, view)?;
     run.check("nothing of what is behind", behind.opacity.iter().all(|&o| o == 0.0));
@@ -113,7 +115,7 @@ fn t23(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
 
     let wall =
         GaussianSpec { sigma_m: DVec3::splat(50.0), mean_m: DVec3::Z, ..GaussianSpec::default() };
-    let wall = run.render_and_compare("all around", &scene_of(&[wall]), &profile, view)?;
+    let wall = run.render_and_compare("all around", &scene_from_specs(&[wall]), &profile, view)?;
     let wrong = wall.opacity.iter().enumerate().filter(|&(pixel, &opacity)| {
         let at_px = DVec2::new((pixel % 120) as f64 + 0.5, (pixel / 120) as f64 + 0.5);
         (opacity > 0.0) != camera.unproject(at_px).is_some()
@@ -122,7 +124,8 @@ fn t23(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     folded(run)
 }
 
-/// Balls within and beyond the fold of a lens: the angle at which its polynomial's radius begins to fall.
+/// Balls within and beyond the fold of a lens: the angle at which its polynomial's radius begins to
+/// fall.
 fn folded(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     // r (1 + k3 r⁶) rises up to r = 0.8, where it is 6/7 of r, and falls to 0 at r = 1.107.
     const FOLD: f64 = 0.8;
@@ -138,16 +141,21 @@ fn folded(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         sigma_m: DVec3::splat(0.02),
         ..GaussianSpec::default()
     };
-    let within =
-        run.render_and_compare("within the fold", &scene_of(&[ball(0.5, 0.4)]), &profile, view)?;
+    let within = run.render_and_compare(
+        "within the fold",
+        &scene_from_specs(&[ball(0.5, 0.4)]),
+        &profile,
+        view,
+    )?;
     run.check("within the fold: seen", within.opacity.iter().any(|&o| o > 0.1));
-    // The polynomial alone would put these balls within 0.65 focal lengths of the axis. A ball beyond the
-    // field may reach over the edge of the field, which is at 0.68, by as much as the blur.
+    // The polynomial alone would put these balls within 0.65 focal lengths of the axis. A ball
+    // beyond the field may reach over the edge of the field, which is at 0.68, by as much as the
+    // blur.
     let beyond = [0.9, 0.95, 1.0, 1.05, 1.1, 1.15];
     let beyond = (0..36).map(|i| ball(beyond[i % 6], 0.7 * i as f64));
     let image = run.render_and_compare(
         "beyond the fold",
-        &scene_of(&beyond.collect::<Vec<_>>()),
+        &scene_from_specs(&beyond.collect::<Vec<_>>()),
         &profile,
         view,
     )?;
@@ -211,16 +219,17 @@ fn balls() -> Scene {
             ..GaussianSpec::default()
         }
     };
-    scene_of(&(0..150).map(ball).collect::<Vec<_>>())
+    scene_from_specs(&(0..150).map(ball).collect::<Vec<_>>())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// The scaled unscented transform (Wan and van der Merwe 2000) with kappa 0: of six points at `alpha √3`
-    /// standard deviations, and of the centre. Returns the weight of the centre, and mean and covariance on
-    /// the image. With alpha 1 and beta 0 the centre has no weight, as in the renderer.
+    /// The scaled unscented transform (Wan and van der Merwe 2000) with kappa 0: of six points at
+    /// `alpha √3` standard deviations, and of the centre. Returns the weight of the centre, and
+    /// mean and covariance on the image. With alpha 1 and beta 0 the centre has no weight, as in
+    /// the renderer.
     fn unscented(
         camera: &Camera,
         gaussian: &GaussianSpec,
@@ -247,8 +256,8 @@ mod tests {
         (w0, mean_px, px2)
     }
 
-    /// Errors of a rule's mean and covariance against those of 20,000 points: in pixels, and as a share of the
-    /// size.
+    /// Errors of a rule's mean and covariance against those of 20,000 points: in pixels, and as a
+    /// share of the size.
     fn off(mean_m: DVec3, [alpha, beta]: [f64; 2]) -> (f64, f64) {
         let (camera, gaussian) = fisheye_and_gaussian();
         let gaussian = GaussianSpec { mean_m, ..gaussian };
@@ -259,9 +268,10 @@ mod tests {
         (mean_px.distance(point_px), spreads.fold(0.0, f64::max))
     }
 
-    /// gsplat's weights (alpha 0.1, beta 2, and so -99 at the centre) keep T22, too, and are closer than six
-    /// points without a centre. But they follow the lens only near the centre: for a Gaussian as wide as it
-    /// is far, 135° off the axis, they are off by 2,000 px, and six points by 150 px.
+    /// gsplat's weights (alpha 0.1, beta 2, and so -99 at the centre) keep T22, too, and are closer
+    /// than six points without a centre. But they follow the lens only near the centre: for a
+    /// Gaussian as wide as it is far, 135° off the axis, they are off by 2,000 px, and six points
+    /// by 150 px.
     #[test]
     fn a_weight_of_minus_99_fails_far_off_the_axis() {
         let (camera, gaussian) = fisheye_and_gaussian();

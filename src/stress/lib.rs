@@ -1,6 +1,6 @@
-//! Stress cases: extreme scenes, each of which has broken a published renderer, with the bound that every
-//! backend must keep. `wildcity stress` runs them and prints the table, so that a faulty driver is found on the
-//! machine that has it. Tests run them as well.
+//! Stress cases: extreme scenes, each of which has broken a published renderer, with the bound that
+//! every backend must keep. `wildcity stress` runs them and prints the table, so that a faulty
+//! driver is found on the machine that has it. Tests run them as well.
 //!
 //! ```text
 //! shapes     needles, tiny Gaussians, walls, beside the view        T1 T2 T3 T13 T26
@@ -12,20 +12,23 @@
 //! actors     colours that rotate with an actor, places, motion       T25 T29 T30
 //! ```
 //!
-//! The reference backend is not compared with itself: its images must be finite, and have the values that a case
-//! states.
+//! The reference backend is not compared with itself: its images must be finite, and have the
+//! values that a case states.
 //!
 //! # How to add a case
 //!
-//! 1. Write a constant `TN: Case` and a function `tN(run: &mut CaseRun<'_>)` in the file of its family. The
-//!    function builds a scene ([`GaussianSpec`](wildcity_render::compare::gaussians::GaussianSpec) is the
-//!    short form), renders it with `run.render_and_compare`, which also checks that every value is finite and
+//! 1. Write a constant `TN: Case` and a function `tN(run: &mut CaseRun<'_>)` in the file of its
+//!    family. The function builds a scene
+//!    ([`GaussianSpec`](wildcity_render::compare::gaussians::GaussianSpec) is the short form),
+//!    renders it with `run.render_and_compare`, which also checks that every value is finite and
 //!    that the reference backend agrees, and states further bounds with `run.check_at_most`,
-//!    `run.check_at_least_db` and `run.check`. Each check's text must say what was measured and where.
+//!    `run.check_at_least_db` and `run.check`. Each check's text must say what was measured and
+//!    where.
 //! 2. Add it to [`CASES`], in order of numbers. A case that takes gigabytes or minutes is a
 //!    `CaseBody::Heavy`, which runs only with `--heavy`.
-//! 3. Add a mutation to `tests/stress/mutations.rs` for every check: a faulty backend with which the check
-//!    must fail. A test fails for a check without one, since a bound that no fault exceeds proves nothing.
+//! 3. Add a mutation to `tests/stress/mutations.rs` for every check: a faulty backend with which
+//!    the check must fail. A test fails for a check without one, since a bound that no fault
+//!    exceeds proves nothing.
 
 mod actors;
 mod case_run;
@@ -48,7 +51,8 @@ pub use case_run::{CaseRun, Check};
 /// One row of the table.
 #[derive(Clone, Copy, Debug)]
 pub struct Case {
-    /// Its number, such as `T1`. T1 to T25 are those of the project's design; the others were found later.
+    /// Its number, such as `T1`. T1 to T25 are those of the project's design; the others were found
+    /// later.
     pub number: &'static str,
     /// The scene and the views.
     pub what: &'static str,
@@ -106,23 +110,21 @@ pub static CASES: [Case; 31] = [
 /// The result of a case on one backend.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Outcome {
-    /// The case's number.
     pub case: &'static str,
-    /// The backend's name.
     pub backend: &'static str,
     /// Whether it was run, and whether its bounds held.
     pub verdict: Verdict,
     /// What was rendered instead, if it is less than what the case states.
     #[serde(rename = "only")]
     pub reduced_to: Option<String>,
-    /// The first check that failed; or else the check closest to its bound, the limit of the device, or why
-    /// the case was not run.
+    /// The first check that failed; or else the check closest to its bound, the limit of the
+    /// device, or why the case was not run.
     #[serde(rename = "told")]
     pub detail: String,
-    /// The share of its bound that this check's value takes: 1 is all of it; 0 for a check without a size.
+    /// The share of its bound that this check's value takes: 1 is all of it; 0 for a check without
+    /// a size.
     #[serde(rename = "strain")]
     pub bound_usage: f64,
-    /// Number of checks.
     pub checks: usize,
     /// Wall time in seconds.
     pub seconds: f64,
@@ -132,7 +134,6 @@ pub struct Outcome {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Verdict {
-    /// All bounds hold.
     Held,
     /// A bound does not hold, or a frame failed.
     Missed,
@@ -184,7 +185,8 @@ impl Case {
 }
 
 impl Outcome {
-    /// The verdict in a word, with what was rendered instead if it is less than what the case states.
+    /// The verdict in a word, with what was rendered instead if it is less than what the case
+    /// states.
     pub fn word(&self) -> String {
         match &self.reduced_to {
             Some(reduced_to) => format!("{} ({reduced_to})", self.verdict.word()),

@@ -1,12 +1,14 @@
-//! The whole range of opacities, invalid values, the stop rule, and more layers than the loop limit of a
-//! software device.
+//! The whole range of opacities, invalid values, the stop rule, and more layers than the loop limit
+//! of a software device.
 
 use glam::DVec3;
 
 use super::places::street_view;
 use super::{Case, CaseBody, CaseRun};
 use wildcity_render::RenderError;
-use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, gaussians_of, scene_of};
+use wildcity_render::compare::gaussians::{
+    GaussianSpec, forward_view, gaussians_from_specs, scene_from_specs,
+};
 use wildcity_render::compare::images::max_difference;
 use wildcity_scene::{Gaussians, RenderProfile, Scene};
 
@@ -21,7 +23,7 @@ fn t11(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let profile = RenderProfile::default();
     let view = forward_view([65, 65], 100.0);
     let peak = |run: &mut CaseRun<'_>, logit: f32| {
-        let mut g = gaussians_of(&[GaussianSpec::default()]);
+        let mut g = gaussians_from_specs(&[GaussianSpec::default()]);
         g.logit_opacities[0] = logit;
         let scene = Scene::from_gaussians(&g);
         let image = run.render_and_compare(format!("logit {logit}"), &scene, &profile, view)?;
@@ -69,16 +71,16 @@ fn t12(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     for (what, invalid) in invalidated(&more) {
         let scene = Scene::from_gaussians(&invalid);
         let image = run.render_and_compare(what.clone(), &scene, &profile, view)?;
-        // With one Gaussian more, the others move by one index, and may be in the next cluster, where colours
-        // are quantized in other steps on a device: 1.5 / 32,767 of each coefficient.
+        // With one Gaussian more, the others move by one index, and may be in the next cluster,
+        // where colours are quantized in other steps on a device: 1.5 / 32,767 of each coefficient.
         let off = max_difference(&image.rgba, &right.rgba);
         run.check_at_most(format!("{what}: neighbours off by"), off.into(), 1e-4);
     }
     Ok(())
 }
 
-/// The same Gaussians, of SH degree 1, with one more before them: nearly opaque, with a standard deviation of
-/// 14 cm.
+/// The same Gaussians, of SH degree 1, with one more before them: nearly opaque, with a standard
+/// deviation of 14 cm.
 fn with_one_more(good: &Gaussians, mean_m: [f64; 3]) -> Gaussians {
     let mut more = good.clone();
     more.means_m.insert(0, mean_m);
@@ -127,9 +129,10 @@ pub(super) const T19: Case = Case {
 };
 
 fn t19(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    // Layers of alpha 0.9 at the centre: the transmittance becomes 0.1, 0.01, 0.001 and then 1e-4. The fourth
-    // layer would reach the stop, and is left out; ten thousand more layers change nothing. Layers of opacity
-    // 1 are capped at 0.99: 0.01, then 1e-4, off by no more than the rounding of the cap to f32, 2e-6 of it.
+    // Layers of alpha 0.9 at the centre: the transmittance becomes 0.1, 0.01, 0.001 and then 1e-4.
+    // The fourth layer would reach the stop, and is left out; ten thousand more layers change
+    // nothing. Layers of opacity 1 are capped at 0.99: 0.01, then 1e-4, off by no more than the
+    // rounding of the cap to f32, 2e-6 of it.
     let layer = |i: i32| GaussianSpec {
         mean_m: DVec3::new(0.0, 0.0, 5.0 + 1e-3 * f64::from(i)),
         sigma_m: DVec3::splat(20.0),
@@ -148,17 +151,17 @@ fn t19(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     ] {
         let profile = RenderProfile { stop, ..RenderProfile::default() };
         let layer = |i| GaussianSpec { opacity, ..layer(i) };
-        let layers = scene_of(&(0..count).map(layer).collect::<Vec<_>>());
+        let layers = scene_from_specs(&(0..count).map(layer).collect::<Vec<_>>());
         let what = format!("{count} layers of {opacity}, stop {stop:e}");
         let image = run.render_and_compare(what.clone(), &layers, &profile, view)?;
         let off = (1.0 - f64::from(image.opacity[4 * 9 + 4]) - left).abs();
         run.check_at_most(format!("{what}: transmittance off by"), off, 1e-6);
     }
-    // A pixel that has stopped stays stopped, although thin layers that follow would not reach the stop; its
-    // neighbours continue.
+    // A pixel that has stopped stays stopped, although thin layers that follow would not reach the
+    // stop; its neighbours continue.
     let dot = |i| GaussianSpec { sigma_m: DVec3::splat(0.015), ..layer(i) };
     let thin = |i| GaussianSpec { opacity: 0.1, ..layer(10 + i) };
-    let layers = scene_of(&(0..4).map(dot).chain((0..50).map(thin)).collect::<Vec<_>>());
+    let layers = scene_from_specs(&(0..4).map(dot).chain((0..50).map(thin)).collect::<Vec<_>>());
     let profile = RenderProfile { stop: 1.0001e-4, ..RenderProfile::default() };
     let image = run.render_and_compare("thin layers", &layers, &profile, view)?;
     let off = (1.0 - f64::from(image.opacity[4 * 9 + 4]) - 1e-3).abs();
@@ -176,13 +179,13 @@ pub(super) const T28: Case = Case {
 fn t28(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let fog = (0..70_000).map(|i| GaussianSpec {
         mean_m: DVec3::new(0.0, 0.0, 5.0 + 1e-4 * f64::from(i)),
-        // 80 px wide, so that alpha is just above the cut in the whole tile, and no pixel stops before the
-        // last layer.
+        // 80 px wide, so that alpha is just above the cut in the whole tile, and no pixel stops
+        // before the last layer.
         sigma_m: DVec3::splat(100.0),
         opacity: 1.05 / 255.0,
         ..GaussianSpec::default()
     });
-    let fog = scene_of(&fog.collect::<Vec<_>>());
+    let fog = scene_from_specs(&fog.collect::<Vec<_>>());
     let profile = RenderProfile { stop: 1e-300, ..RenderProfile::default() };
     match run.render_and_compare("the fog", &fog, &profile, forward_view([16, 16], 4.0)) {
         Err(error) => run.accept_limit(error)?,

@@ -4,7 +4,7 @@ use glam::{DQuat, DVec3};
 
 use super::places::street_view;
 use super::{Case, CaseBody, CaseRun};
-use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_of};
+use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_from_specs};
 use wildcity_render::compare::images::{max_difference, view_along};
 use wildcity_render::{RenderError, View};
 use wildcity_scene::{Gaussians, RenderProfile, Scene};
@@ -25,7 +25,7 @@ fn t6(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         })
     };
     let specs: Vec<GaussianSpec> = grid([1.0, 0.0, 0.0]).chain(grid([0.0, 1.0, 0.0])).collect();
-    let scene = scene_of(&specs);
+    let scene = scene_from_specs(&specs);
     let profile = RenderProfile::default();
     let view = forward_view([200, 150], 150.0);
     let image = run.render_and_compare("the walls", &scene, &profile, view)?;
@@ -48,8 +48,9 @@ pub(super) const T8: Case = Case {
 };
 
 fn t8(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    // Half-way through the rotation the depth order of the two centres changes, and the image jumps ("pops"),
-    // since whole Gaussians are sorted. The jump must be as large as that of the reference backend.
+    // Half-way through the rotation the depth order of the two centres changes, and the image jumps
+    // ("pops"), since whole Gaussians are sorted. The jump must be as large as that of the
+    // reference backend.
     let bar = |angle: f64, x: f64, rgb| GaussianSpec {
         mean_m: DVec3::new(x, 0.0, 5.0),
         rotation: DQuat::from_rotation_y(angle),
@@ -57,7 +58,8 @@ fn t8(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         rgb,
         ..GaussianSpec::default()
     };
-    let crossing = scene_of(&[bar(0.8, 0.02, [1.0, 0.2, 0.1]), bar(-0.8, -0.02, [0.1, 0.3, 1.0])]);
+    let crossing =
+        scene_from_specs(&[bar(0.8, 0.02, [1.0, 0.2, 0.1]), bar(-0.8, -0.02, [0.1, 0.3, 1.0])]);
     let profile = RenderProfile::default();
     let mut pops = [0.0_f32; 2];
     let mut last = None;
@@ -161,7 +163,7 @@ fn t27(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
             rgb: [red, green, blue],
         }
     });
-    let facade = scene_of(&surfels.collect::<Vec<_>>());
+    let facade = scene_from_specs(&surfels.collect::<Vec<_>>());
     let mut view = forward_view([240, 180], 180.0);
     view.world_from_camera.position_m = DVec3::new(21.3, 17.7, 9.1);
     view.world_from_camera.rotation = turn;
@@ -171,8 +173,8 @@ fn t27(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     Ok(())
 }
 
-/// A low-discrepancy sequence in [0, 1)⁶: multiples of powers of the root of x⁷ = x + 1, modulo 1 (Roberts
-/// 2018).
+/// A low-discrepancy sequence in [0, 1)⁶: multiples of powers of the root of x⁷ = x + 1, modulo 1
+/// (Roberts 2018).
 pub(super) fn low_discrepancy(i: usize) -> [f64; 6] {
     [1, 2, 3, 4, 5, 6].map(|power| (0.5 + (i + 1) as f64 * 1.112_775_684_f64.powi(-power)).fract())
 }

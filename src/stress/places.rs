@@ -1,10 +1,10 @@
-//! Gaussians centimetres ahead, around and behind the camera, over ten kilometres of depth, and far from the
-//! origin.
+//! Gaussians centimetres ahead, around and behind the camera, over ten kilometres of depth, and far
+//! from the origin.
 
 use glam::DVec3;
 
 use super::{Case, CaseBody, CaseRun};
-use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_of};
+use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_from_specs};
 use wildcity_render::compare::images::{max_difference, view_along};
 use wildcity_render::{RenderError, View};
 use wildcity_scene::chunk::column;
@@ -22,7 +22,7 @@ fn t4(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     for near in [0.01, 0.2] {
         let profile = RenderProfile { near, ..RenderProfile::default() };
         for z in [0.0100001, 0.011, 0.05, 0.19, 0.21] {
-            let close = scene_of(&[GaussianSpec {
+            let close = scene_from_specs(&[GaussianSpec {
                 mean_m: DVec3::new(0.002, -0.001, z),
                 sigma_m: DVec3::new(0.003, 0.02, 0.1),
                 ..GaussianSpec::default()
@@ -52,9 +52,11 @@ fn t5(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         sigma_m: DVec3::splat(sigma_m),
         ..GaussianSpec::default()
     };
-    let inside = run.render_and_compare("inside", &scene_of(&[at(0.3, 2.0)]), &profile, view)?;
+    let inside =
+        run.render_and_compare("inside", &scene_from_specs(&[at(0.3, 2.0)]), &profile, view)?;
     run.check("inside: seen", inside.opacity.iter().any(|&o| o > 0.5));
-    let behind = run.render_and_compare("behind", &scene_of(&[at(-1.0, 3.0)]), &profile, view)?;
+    let behind =
+        run.render_and_compare("behind", &scene_from_specs(&[at(-1.0, 3.0)]), &profile, view)?;
     let most = behind.opacity.iter().fold(0.0_f32, |most, &o| most.max(o));
     run.check_at_most("behind: opacity", most.into(), 0.0);
     Ok(())
@@ -70,7 +72,8 @@ pub(super) const T7: Case = Case {
 fn t7(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let mut specs = Vec::new();
     let mut centers = Vec::new();
-    // The pairs lie along +x, where each chunk holds its own part, so that centres keep their f32 values.
+    // The pairs lie along +x, where each chunk holds its own part, so that centres keep their f32
+    // values.
     for (i, x) in [0.0101_f32, 0.5, 3.0, 70.0, 1000.0, 9999.0].into_iter().enumerate() {
         let slope = (i as f64 - 2.5) * 0.3;
         for (x, rgb) in [(x.next_up(), [0.0, 1.0, 0.0]), (x, [1.0, 0.0, 0.0])] {
@@ -86,8 +89,12 @@ fn t7(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         centers.push((x, 200 * 50 + (slope * 100.0 + 100.0) as usize));
     }
     let view = view_along([200, 100], 100.0, DVec3::ZERO, DVec3::X, DVec3::NEG_Z);
-    let image =
-        run.render_and_compare("pairs", &scene_of(&specs), &RenderProfile::default(), view)?;
+    let image = run.render_and_compare(
+        "pairs",
+        &scene_from_specs(&specs),
+        &RenderProfile::default(),
+        view,
+    )?;
     for (x, pixel) in centers {
         let [red, green] = [0, 1].map(|channel| image.rgba[4 * pixel + channel]);
         run.check(format!("{x} m: the nearer one is in front"), red > 0.8 && green < 0.2);
@@ -151,8 +158,8 @@ fn encoded_street(run: &mut CaseRun<'_>, record: RecordFormat) -> Result<(), Ren
             off_m = off_m.max((chunk.value(index, column) - again.value(index, column)).abs());
         }
     }
-    // A cell is 64 m wide, centred on its origin, and the range of centres is a power of two. The bound is
-    // half a step of 128 m / 2^23 = 2^-16 m.
+    // A cell is 64 m wide, centred on its origin, and the range of centres is a power of two. The
+    // bound is half a step of 128 m / 2^23 = 2^-16 m.
     run.check_at_most("centres off by m", off_m.into(), 0.5 * 128.0 / f64::from(1 << 23));
     let mut view = street_view([200, 120]);
     view.world_from_camera.position_m += away;

@@ -4,7 +4,7 @@ use glam::{DQuat, DVec3};
 
 use super::{Case, CaseBody, CaseRun};
 use wildcity_render::RenderError;
-use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_of};
+use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_from_specs};
 use wildcity_render::compare::images::max_difference;
 use wildcity_render::constants::TILE_PX;
 use wildcity_scene::RenderProfile;
@@ -21,7 +21,7 @@ fn t1(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let view = forward_view([320, 240], 500.0);
     for sigma_px in [1e3, 3e3, 1e4] {
         for degrees in (0..180).step_by(2) {
-            let needle = scene_of(&[GaussianSpec {
+            let needle = scene_from_specs(&[GaussianSpec {
                 rotation: DQuat::from_rotation_z(f64::from(degrees).to_radians()),
                 sigma_m: DVec3::new(sigma_px * 5.0 / 500.0, 1e-4, 1e-4),
                 ..GaussianSpec::default()
@@ -63,7 +63,7 @@ fn t2(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let mut some_seen = false;
     for [x, y] in [[6.0, 1.6], [-6.0, 1.6], [0.5, 7.0], [9.0, -7.0]] {
         for angle in [0.0, 0.5, 1.2, 2.5] {
-            let long = scene_of(&[GaussianSpec {
+            let long = scene_from_specs(&[GaussianSpec {
                 mean_m: DVec3::new(x, y, 4.0),
                 rotation: DQuat::from_rotation_y(angle),
                 sigma_m: DVec3::new(4.0, 0.05, 0.3),
@@ -92,7 +92,8 @@ fn t3(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         let wall = GaussianSpec { sigma_m: DVec3::splat(sigma_m), ..GaussianSpec::default() };
         let what = format!("{sigma_m} m");
         let view = forward_view([333, 250], 300.0);
-        let image = run.render_and_compare(what.clone(), &scene_of(&[wall]), &profile, view)?;
+        let image =
+            run.render_and_compare(what.clone(), &scene_from_specs(&[wall]), &profile, view)?;
         let off = image.opacity.iter().fold(0.0_f32, |most, o| most.max((o - 0.9).abs()));
         run.check_at_most(format!("{what}: opacity from 0.9"), off.into(), 0.15);
         // Forty walls on the 4 x 5 macro tiles of a device, so that a whole workgroup lists them.
@@ -101,7 +102,7 @@ fn t3(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
             opacity: 0.03,
             ..wall
         });
-        let walls = scene_of(&walls.collect::<Vec<_>>());
+        let walls = scene_from_specs(&walls.collect::<Vec<_>>());
         let what = format!("forty of {sigma_m} m");
         let view = forward_view([444, 280], 300.0);
         run.render_and_compare(what.clone(), &walls, &profile, view)?;
@@ -130,7 +131,7 @@ pub(super) const T13: Case = Case {
 fn t13(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let profile = RenderProfile::default();
     for sigma_m in [DVec3::splat(1e-8), DVec3::new(1.0, 1e-6, 1e-6), DVec3::new(1e-8, 1e-2, 1e-8)] {
-        let thin = scene_of(&[GaussianSpec { sigma_m, ..GaussianSpec::default() }]);
+        let thin = scene_from_specs(&[GaussianSpec { sigma_m, ..GaussianSpec::default() }]);
         run.render_and_compare(
             format!("{sigma_m} m"),
             &thin,
@@ -138,7 +139,10 @@ fn t13(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
             forward_view([96, 96], 120.0),
         )?;
     }
-    let dust = scene_of(&[GaussianSpec { sigma_m: DVec3::splat(1e-8), ..GaussianSpec::default() }]);
+    let dust = scene_from_specs(&[GaussianSpec {
+        sigma_m: DVec3::splat(1e-8),
+        ..GaussianSpec::default()
+    }]);
     let image = run.render_and_compare("dust", &dust, &profile, forward_view([9, 9], 100.0))?;
     // The middle of an image of 9 px is the centre of a pixel, where alpha is the full opacity.
     let off = (image.opacity[4 * 9 + 4] - 0.9).abs();
@@ -154,10 +158,10 @@ pub(super) const T26: Case = Case {
 };
 
 fn t26(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    // A standard deviation of 22 km along and 1 mm across, 1 cm ahead of a camera with a focal length of
-    // 1,000 px: xx² is 1e37.
+    // A standard deviation of 22 km along and 1 mm across, 1 cm ahead of a camera with a focal
+    // length of 1,000 px: xx² is 1e37.
     for angle in [0.0, 0.4, 0.8, 1.3] {
-        let needle = scene_of(&[GaussianSpec {
+        let needle = scene_from_specs(&[GaussianSpec {
             mean_m: DVec3::new(0.0, 0.0, 0.0101),
             rotation: DQuat::from_rotation_z(angle),
             sigma_m: DVec3::new(2.2e4, 1e-3, 1e-3),

@@ -6,7 +6,7 @@ use super::order::low_discrepancy;
 use super::places::street_view;
 use super::{Case, CaseBody, CaseRun};
 use wildcity_render::RenderError;
-use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_of};
+use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_from_specs};
 use wildcity_render::compare::images::{RenderedImage, crop_rgba, crop_view, max_difference};
 use wildcity_render::compare::psnr::psnr_db;
 use wildcity_scene::{RenderProfile, Scene};
@@ -19,8 +19,9 @@ pub(super) const T14: Case = Case {
 };
 
 fn t14(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    // At a distance of 5 m and with a focal length of 160 px, a centre at a multiple of 0.5 m lies on the
-    // edge of a tile of 16 px. With a sigma of 16 px / √(2 ln(255 · 0.9)) the splat reaches the next edge.
+    // At a distance of 5 m and with a focal length of 160 px, a centre at a multiple of 0.5 m lies
+    // on the edge of a tile of 16 px. With a sigma of 16 px / √(2 ln(255 · 0.9)) the splat reaches
+    // the next edge.
     let exact_m = 16.0 * 5.0 / 160.0 / (2.0 * (255.0_f64 * 0.9).ln()).sqrt();
     let splats = (0..800_i32).map(|i| {
         let ulps = f64::from(i % 41 - 20) * f64::from(f32::EPSILON);
@@ -31,7 +32,7 @@ fn t14(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
             ..GaussianSpec::default()
         }
     });
-    let splats = scene_of(&splats.collect::<Vec<_>>());
+    let splats = scene_from_specs(&splats.collect::<Vec<_>>());
     let profile = RenderProfile::default();
     let view = forward_view([256, 160], 160.0);
     let image = run.render_and_compare("edges", &splats, &profile, view)?;
@@ -52,7 +53,7 @@ pub(super) const T15: Case = Case {
 
 fn t15(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let profile = RenderProfile::default();
-    let small = (scene_of(&[GaussianSpec::default()]), forward_view([64, 48], 50.0));
+    let small = (scene_from_specs(&[GaussianSpec::default()]), forward_view([64, 48], 50.0));
     let before = run.render_and_compare("a small frame", &small.0, &profile, small.1)?;
     let mut street = wildcity_generate::canyon(40_000, &mut |_, _| {});
     // Fog over many tiles, so that (Gaussian, tile) pairs grow faster than splats.
@@ -82,7 +83,7 @@ fn t16(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let view = forward_view([50, 40], 40.0);
     // In 8 bits 51, 89.25 and 216.75.
     let background = [0.2, 0.35, 0.85];
-    let at = |mean_m| scene_of(&[GaussianSpec { mean_m, ..GaussianSpec::default() }]);
+    let at = |mean_m| scene_from_specs(&[GaussianSpec { mean_m, ..GaussianSpec::default() }]);
     for (what, empty) in [
         ("none", Scene::default()),
         ("one behind", at(DVec3::new(0.0, 0.0, -5.0))),
@@ -130,7 +131,8 @@ pub(super) const T17: Case = Case {
 };
 
 fn t17(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    // The reference backend has no tiles, and would take 40 B a pixel: it draws a quarter of the sides.
+    // The reference backend has no tiles, and would take 40 B a pixel: it draws a quarter of the
+    // sides.
     let size_px = if run.is_reference() { [1921, 1081] } else { [7681, 4321] };
     if run.is_reference() {
         run.reduce_to(format!("{} x {} px", size_px[0], size_px[1]));
@@ -144,9 +146,9 @@ fn t17(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let margin_px = 32;
     let [right, bottom] = [0, 1].map(|axis| size_px[axis] - part_px[axis]);
     for at in [[0, 0], [right / 2 + 3, bottom / 2 + 5], [right, bottom]] {
-        // The slope clamp depends on an image's own edges (gsplat's rule), so that a part draws splats that
-        // are centred beyond its edges differently. The part is rendered with a margin, which is not
-        // compared.
+        // The slope clamp depends on an image's own edges (gsplat's rule), so that a part draws
+        // splats that are centred beyond its edges differently. The part is rendered with a margin,
+        // which is not compared.
         let padded_at = at.map(|px| px as i32 - margin_px as i32);
         let padded = crop_view(whole, padded_at, part_px.map(|px| px + 2 * margin_px));
         let truth = run.render_reference(&balls, &profile, padded)?;
@@ -164,7 +166,8 @@ fn t17(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     Ok(())
 }
 
-/// How far a crop may differ from the whole image: f32, and one splat with alpha at the cut of 1/255.
+/// How far a crop may differ from the whole image: f32, and one splat with alpha at the cut of
+/// 1/255.
 const MAX_CROP_DIFFERENCE: f64 = 2e-3 + 1.0 / 255.0;
 
 /// 3,000 balls, 4 to 64 m ahead, each 6 px wide at a focal length of 1,000 px.
@@ -180,7 +183,7 @@ fn balls() -> Scene {
             ..GaussianSpec::default()
         }
     });
-    scene_of(&balls.collect::<Vec<_>>())
+    scene_from_specs(&balls.collect::<Vec<_>>())
 }
 
 pub(super) const T18: Case = Case {
@@ -221,7 +224,7 @@ pub(super) const T31: Case = Case {
 
 fn t31(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let profile = RenderProfile::default();
-    let scene = scene_of(&(0..3_000).map(of_any_size).collect::<Vec<_>>());
+    let scene = scene_from_specs(&(0..3_000).map(random_size).collect::<Vec<_>>());
     let native = forward_view([192, 144], 150.0);
     let native_rgb = rgb(&run.render_reference(&scene, &profile, native)?);
     for [wide, high] in [[96, 72], [64, 48], [48, 36], [96, 36]] {
@@ -235,7 +238,7 @@ fn t31(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
             }
         };
         let image = run.render_and_compare(what.clone(), &scene, &profile, small)?;
-        let shrunk = mean_of(&native_rgb, [192 / wide as usize, 144 / high as usize]);
+        let shrunk = mean_color(&native_rgb, [192 / wide as usize, 144 / high as usize]);
         let db = |image: &RenderedImage| {
             let differences = rgb(image).into_iter().zip(&shrunk).map(|(a, b)| f64::from(a - b));
             psnr_db(differences)
@@ -248,8 +251,9 @@ fn t31(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     Ok(())
 }
 
-/// Gaussians with standard deviations of 0.05 to 6 native px in the view of T31, thin ones among them.
-fn of_any_size(i: usize) -> GaussianSpec {
+/// Gaussians with standard deviations of 0.05 to 6 native px in the view of T31, thin ones among
+/// them.
+fn random_size(i: usize) -> GaussianSpec {
     let [x, y, z, size, flat, ..] = low_discrepancy(i);
     let away_m = 4.0 + 8.0 * z;
     let sigma_m = away_m / 150.0 * 0.05 * 120.0_f64.powf(size.powi(2));
@@ -267,8 +271,9 @@ fn rgb(image: &RenderedImage) -> Vec<f32> {
     image.rgba.chunks_exact(4).flat_map(|rgba| [rgba[0], rgba[1], rgba[2]]).collect()
 }
 
-/// The colours of an image of 192 px width with the mean of `columns` by `rows` pixels in each of its own.
-fn mean_of(image: &[f32], [columns, rows]: [usize; 2]) -> Vec<f32> {
+/// The colours of an image of 192 px width with the mean of `columns` by `rows` pixels in each of
+/// its own.
+fn mean_color(image: &[f32], [columns, rows]: [usize; 2]) -> Vec<f32> {
     let row = 3 * 192;
     let height = image.len() / row;
     let mut mean = Vec::with_capacity(image.len() / (columns * rows));

@@ -10,7 +10,6 @@ use wildcity_render::Backend;
 /// The results of cases (rows) on backends (columns).
 #[derive(Clone, Debug, Serialize)]
 pub struct Table {
-    /// The backends.
     pub backends: Vec<Column>,
     /// One row per case.
     pub rows: Vec<Row>,
@@ -19,7 +18,6 @@ pub struct Table {
 /// A backend of the table.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Column {
-    /// Its name.
     pub backend: &'static str,
     /// The device or instruction set, or why the backend is not available.
     pub detail: String,
@@ -28,7 +26,6 @@ pub struct Column {
 /// A case, and its outcome on each backend.
 #[derive(Clone, Debug, Serialize)]
 pub struct Row {
-    /// The case's number.
     pub case: &'static str,
     /// The scene and the views.
     pub what: &'static str,
@@ -41,8 +38,8 @@ pub struct Row {
 /// A backend to run cases on, or its name and why it is not available.
 pub type Candidate = Result<Box<dyn Backend>, (&'static str, String)>;
 
-/// Runs cases on backends; heavy cases only if `heavy`. Before each run it calls `progress` with the number
-/// of finished runs and the number of the next case.
+/// Runs cases on backends; heavy cases only if `heavy`. Before each run it calls `progress` with
+/// the number of finished runs and the number of the next case.
 pub fn run(
     cases: &[&Case],
     backends: &[Candidate],
@@ -85,8 +82,8 @@ impl Table {
 }
 
 impl Row {
-    /// The outcome to print: the first that missed its bound, or else the one closest to its bound, or else
-    /// one that was not run.
+    /// The outcome to print: the first that missed its bound, or else the one closest to its bound,
+    /// or else one that was not run.
     pub fn tightest(&self) -> Option<&Outcome> {
         let missed = self.outcomes.iter().find(|outcome| outcome.verdict == Verdict::Missed);
         let held = || self.outcomes.iter().filter(|outcome| outcome.verdict == Verdict::Held);

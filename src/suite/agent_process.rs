@@ -31,8 +31,8 @@ pub(crate) struct AgentProcess<'a> {
 /// Why an episode was not driven to its end.
 #[derive(Debug)]
 pub(crate) enum NotDriven {
-    /// The shell finds no such command, or cannot run it, so that no other episode can be driven either. Holds the
-    /// shell's message.
+    /// The shell finds no such command, or cannot run it, so that no other episode can be driven
+    /// either. Holds the shell's message.
     NoCommand(String),
     /// A failure that may not occur in another attempt.
     Technical(Technical),
@@ -46,8 +46,9 @@ impl From<Technical> for NotDriven {
 
 /// Starts the command and waits for it and for the end of its record.
 ///
-/// The environment of the command has `WILDCITY_URL`, `WILDCITY_OPEN` (the fields of `open` as JSON, which it sends
-/// with outputs of its own), `WILDCITY_SEED` (for `reset`) and `WILDCITY_STEPS` (after which it terminates).
+/// The environment of the command has `WILDCITY_URL`, `WILDCITY_OPEN` (the fields of `open` as
+/// JSON, which it sends with outputs of its own), `WILDCITY_SEED` (for `reset`) and
+/// `WILDCITY_STEPS` (after which it terminates).
 pub(crate) async fn drive(
     process: &AgentProcess<'_>,
     case: &Case,
@@ -56,7 +57,7 @@ pub(crate) async fn drive(
     let mut running = Running(start(process, case).map_err(|error| {
         Technical::new("agent_lost", format!("the shell cannot be started: {error}"))
     })?);
-    let tail = Tail::of(running.0.stderr.take());
+    let tail = Tail::new(running.0.stderr.take());
     let status = wait(&mut running.0, process.timeout).await;
     drop(running);
     let stderr = tail.text().await;
@@ -70,8 +71,9 @@ pub(crate) async fn drive(
     Ok(wait_for_end(record).await.map_err(said)?)
 }
 
-/// Interprets the exit status of an agent's process. `None` if the shell did not find the command or could not run it.
-/// `has_driven`: whether a record exists, that is, whether the agent has reset its session.
+/// Interprets the exit status of an agent's process. `None` if the shell did not find the command
+/// or could not run it. `has_driven`: whether a record exists, that is, whether the agent has reset
+/// its session.
 fn interpret_exit(
     process: &AgentProcess<'_>,
     status: ExitStatus,
@@ -87,12 +89,13 @@ fn interpret_exit(
         _ => "agent_error",
     };
     let name = process.name;
-    let message = match has_driven {
-        true => format!("{name:?} ended with {status}"),
-        false => format!(
+    let message = if has_driven {
+        format!("{name:?} ended with {status}")
+    } else {
+        format!(
             "{name:?} ended with {status} and drove nothing: it must connect to $WILDCITY_URL, then open and reset the \
              session of $WILDCITY_OPEN"
-        ),
+        )
     };
     Some(Err(Technical::new(kind, message)))
 }
@@ -154,7 +157,8 @@ async fn wait(child: &mut Child, timeout: Duration) -> Result<ExitStatus, Techni
     }
 }
 
-/// Waits until the server has written the end of the record, which it does when the connection is closed.
+/// Waits until the server has written the end of the record, which it does when the connection is
+/// closed.
 async fn wait_for_end(record: &Path) -> Result<(), Technical> {
     let end = Instant::now() + limits::CLOSE_WAIT;
     loop {

@@ -8,7 +8,8 @@ use wildcity_twin::store::Version;
 use crate::error::SuiteError;
 use crate::file::SuiteFile;
 
-/// Checks cameras, size and length of steps against a twin. A session would refuse them, once for each episode.
+/// Checks cameras, size and length of steps against a twin. A session would refuse them, once for
+/// each episode.
 ///
 /// # Errors
 /// Names the suite's file and the field.

@@ -23,11 +23,11 @@ use crate::limits;
 /// A scenario with chosen values and a seed, checked against its twin.
 #[derive(Clone, Debug)]
 pub struct Case {
-    /// Its name, which is that of its session: `SCENARIO-SEED`, or `SCENARIO-COMBINATION-SEED` of a sweep.
+    /// Its name, which is that of its session: `SCENARIO-SEED`, or `SCENARIO-COMBINATION-SEED` of a
+    /// sweep.
     pub name: String,
     /// Name of the scenario.
     pub scenario: String,
-    /// The seed.
     pub seed: u64,
     /// The values of the sweep.
     pub values: BTreeMap<String, Value>,
@@ -76,11 +76,12 @@ pub fn cases(
                 combinations.push(case.values.clone());
             }
             let file = chosen(scenario, &case.values, options.bare)?;
-            let name = match case.values.is_empty() {
-                true => format!("{}-{}", file.name, case.seed),
-                false => format!("{}-{}-{}", file.name, combinations.len() - 1, case.seed),
+            let name = if case.values.is_empty() {
+                format!("{}-{}", file.name, case.seed)
+            } else {
+                format!("{}-{}-{}", file.name, combinations.len() - 1, case.seed)
             };
-            let version = versions.of(&file, suite)?;
+            let version = versions.find(&file, suite)?;
             let pinned = (&version.manifest, version.hash.as_str());
             let dir = scenario.path.parent().unwrap_or(Path::new(""));
             let loaded = Scenarios::in_dir(dir)
@@ -139,8 +140,9 @@ struct Versions<'a> {
 }
 
 impl Versions<'_> {
-    /// The version that a scenario names; the latest if it names none. It must have the cameras of the suite.
-    fn of(&mut self, file: &ScenarioFile, suite: &SuiteFile) -> Result<Arc<Version>, SuiteError> {
+    /// The version that a scenario names; the latest if it names none. It must have the cameras of
+    /// the suite.
+    fn find(&mut self, file: &ScenarioFile, suite: &SuiteFile) -> Result<Arc<Version>, SuiteError> {
         let wanted = file.twin.version_hash.clone().filter(|_| !self.latest);
         let key = (file.twin.name.clone(), wanted);
         if let Some(version) = self.opened.get(&key) {
@@ -177,7 +179,7 @@ impl Case {
     ) -> Self {
         let LoadedScenario { scenario: resolved, map, hash, .. } = loaded;
         let drives = &version.manifest.trajectories;
-        let start = DriveStart::of(&resolved, drives);
+        let start = DriveStart::new(&resolved, drives);
         let line = scenario_line(&resolved, map.as_ref(), &hash, drives);
         let dt_us = suite.dt_us.unwrap_or(session::DT_US);
         let steps = match line.limit_us {

@@ -100,7 +100,8 @@ fn follow(
     Ok(Command::Path(path))
 }
 
-/// A plan of the Intelligent Driver Model along the route, behind the nearest actor; the end of the route is a wall.
+/// A plan of the Intelligent Driver Model along the route, behind the nearest actor; the end of the
+/// route is a wall.
 struct IdmPlan<'a> {
     case: &'a Case,
     /// Station at each 10 ms from now.
@@ -154,9 +155,10 @@ impl<'a> IdmPlan<'a> {
         let length_m = course.length_m();
         let begin = course.nearest(episode.world_from_rig().position_m);
         let whole_s = case.line.limit_us.unwrap_or(0) as f64 * 1e-6;
-        let free_speed_mps = match whole_s > 0.0 {
-            true => (length_m / whole_s).max(LEAST_FREE_MPS),
-            false => Idm::WILDCITY.free_speed_mps,
+        let free_speed_mps = if whole_s > 0.0 {
+            (length_m / whole_s).max(LEAST_FREE_MPS)
+        } else {
+            Idm::WILDCITY.free_speed_mps
         };
         // The braking is not clipped, because a driver that must pass needs to be able to stop.
         let idm = Idm { free_speed_mps, clipped: false, ..Idm::WILDCITY };

@@ -9,7 +9,8 @@ use crate::result::SuiteResult;
 pub enum ExitCode {
     /// All criteria are met.
     Passed = 0,
-    /// An episode failed by driving, the pass rate is too low, or the run is worse than the previous one.
+    /// An episode failed by driving, the pass rate is too low, or the run is worse than the
+    /// previous one.
     Driving = 1,
     /// The command line, the suite, a scenario or the previous run is invalid.
     Usage = 2,
@@ -24,19 +25,19 @@ pub enum ExitCode {
 /// How a run ended.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Ending {
-    /// Its exit code.
     pub code: ExitCode,
     /// Why, in words.
     pub why: String,
 }
 
 impl Ending {
-    /// Decides how a run ended. Technical failures take precedence over driving failures, because an incomplete result
-    /// says little about the driver.
+    /// Decides how a run ended. Technical failures take precedence over driving failures, because
+    /// an incomplete result says little about the driver.
     ///
-    /// Without a required pass rate and without a previous run, every episode must pass. An episode without a verdict is
-    /// not a pass in any case: a driver that leaves the trained area would raise its rate.
-    pub fn of(result: &SuiteResult, against: Option<&Result<Comparison, CompareError>>) -> Self {
+    /// Without a required pass rate and without a previous run, every episode must pass. An episode
+    /// without a verdict is not a pass in any case: a driver that leaves the trained area would
+    /// raise its rate.
+    pub fn new(result: &SuiteResult, against: Option<&Result<Comparison, CompareError>>) -> Self {
         let counts = &result.counts;
         let has_failed = counts.failed > 0;
         let accepts_off_model = result.accept_unjudged.iter().any(|name| name == OFF_MODEL);
@@ -61,9 +62,12 @@ impl Ending {
             ExitCode::Passed
         };
         let mut why = vec![counted(result)];
-        why.extend(result.at_least.map(|least| match rate_is_low {
-            true => format!("the pass rate is at least {low:.3}, and {least} was wanted"),
-            false => format!("the pass rate is at least {low:.3}, as wanted ({least})"),
+        why.extend(result.at_least.map(|least| {
+            if rate_is_low {
+                format!("the pass rate is at least {low:.3}, and {least} was wanted")
+            } else {
+                format!("the pass rate is at least {low:.3}, as wanted ({least})")
+            }
         }));
         why.extend(against.map(|compared| match compared {
             Ok(comparison) => comparison.conclusion(),

@@ -6,7 +6,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use wildcity_episode::{EpisodeFile, FaultLine, ScoreLine, mcap_of};
+use wildcity_episode::{EpisodeFile, FaultLine, ScoreLine, mcap_path};
 use wildcity_score::own;
 use wildcity_session::Engine;
 
@@ -17,11 +17,9 @@ use crate::technical::Technical;
 /// One episode.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct EpisodeEntry {
-    /// Its name.
     pub name: String,
     /// Name of the scenario.
     pub scenario: String,
-    /// The seed.
     pub seed: u64,
     /// The values of the sweep.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
@@ -30,32 +28,31 @@ pub struct EpisodeEntry {
     pub scenario_hash: String,
     /// BLAKE3 of the twin's manifest.
     pub version_hash: String,
-    /// How it ended.
     pub status: Status,
     /// The faults, by time.
     pub faults: Vec<FaultLine>,
     /// Criteria that were not judged, and why: `off_road: the scenario has no map`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub not_judged: Vec<String>,
-    /// The scores.
     pub scores: BTreeMap<String, ScoreLine>,
-    /// Steps driven.
     pub steps: u64,
     /// Distance driven, in metres.
     pub distance_m: f64,
     /// BLAKE3 of all frame hashes; empty if nothing was driven.
     pub frames_hash: String,
-    /// The first episode of the scenario that was driven alike: same poses, actors, images and status. A duplicate says
-    /// nothing new, and is in no rate and no mean.
+    /// The first episode of the scenario that was driven alike: same poses, actors, images and
+    /// status. A duplicate says nothing new, and is in no rate and no mean.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub duplicate_of: Option<String>,
-    /// BLAKE3 of poses, actors and images, in hex; empty if nothing was driven. Not in `result.json`.
+    /// BLAKE3 of poses, actors and images, in hex; empty if nothing was driven. Not in
+    /// `result.json`.
     #[serde(skip)]
     pub(crate) drive_hash: String,
     /// The file of its record, below `episodes`; empty if nothing was driven.
     pub record: String,
-    /// The MCAP file of its record, below `episodes`, or why there is none; `None` if none was asked for. Not in
-    /// `result.json`: whether an export is ready at the end of a run depends on the clock.
+    /// The MCAP file of its record, below `episodes`, or why there is none; `None` if none was
+    /// asked for. Not in `result.json`: whether an export is ready at the end of a run depends on
+    /// the clock.
     #[serde(skip)]
     pub mcap: Option<Result<String, String>>,
     /// Technical failures, of every attempt.
@@ -68,9 +65,9 @@ pub struct EpisodeEntry {
 pub struct TechnicalEntry {
     /// `server_error`, `agent_error`, `agent_timeout` or `agent_lost`.
     pub kind: String,
-    /// What happened.
     pub message: String,
-    /// The last lines that the agent wrote to its standard error. Not in `result.json`: they may have times.
+    /// The last lines that the agent wrote to its standard error. Not in `result.json`: they may
+    /// have times.
     #[serde(skip)]
     pub stderr: String,
 }
@@ -79,7 +76,6 @@ pub struct TechnicalEntry {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Status {
-    /// Without a fault.
     Passed,
     /// With a fault of driving.
     Failed,
@@ -150,8 +146,8 @@ impl EpisodeEntry {
     }
 }
 
-/// Whether all criteria of an episode that were not judged are accepted. Each text begins with the name of its criterion.
-/// Without a text, the record has no verdict that a suite could accept.
+/// Whether all criteria of an episode that were not judged are accepted. Each text begins with the
+/// name of its criterion. Without a text, the record has no verdict that a suite could accept.
 fn are_accepted(not_judged: &[String], accept_unjudged: &[String]) -> bool {
     let is_accepted = |text: &String| {
         text.split_once(':').is_some_and(|(name, _)| accept_unjudged.iter().any(|one| one == name))
@@ -165,8 +161,8 @@ impl EpisodeEntry {
         if self.record.is_empty() {
             return;
         }
-        let mcap = mcap_of(Path::new(&self.record));
-        self.mcap = Some(match engine.export_failure(&EpisodeFile::name_of(&mcap)) {
+        let mcap = mcap_path(Path::new(&self.record));
+        self.mcap = Some(match engine.export_failure(&EpisodeFile::episode_name(&mcap)) {
             Some(reason) => Err(reason),
             None if episodes.join(&mcap).is_file() => Ok(mcap.display().to_string()),
             None => Err("it was not ready at the end of the run".to_owned()),
@@ -198,10 +194,8 @@ impl EpisodeEntry {
 impl TechnicalEntry {
     /// Kind, message, and what the agent said.
     pub fn text(&self) -> String {
-        let said = match self.stderr.is_empty() {
-            true => String::new(),
-            false => format!("\n{}", self.stderr),
-        };
+        let said =
+            if self.stderr.is_empty() { String::new() } else { format!("\n{}", self.stderr) };
         format!("{}: {}{said}", self.kind, self.message)
     }
 }

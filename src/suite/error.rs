@@ -21,7 +21,6 @@ pub enum SuiteError {
     Io {
         /// `read`, `write` ..
         what: &'static str,
-        /// The file.
         path: PathBuf,
         /// The operating system's error.
         cause: io::Error,
@@ -29,79 +28,46 @@ pub enum SuiteError {
     /// A file is larger than this build reads.
     #[error("{} has {bytes} bytes; at most {limit_bytes} are read", path.display())]
     TooLarge {
-        /// The file.
         path: PathBuf,
-        /// Its size.
         bytes: u64,
         /// The largest size that is read.
         limit_bytes: u64,
     },
     /// The suite, a scenario, or a file that it names is malformed, or does not fit its twin.
     #[error("{}: {cause}", path.display())]
-    File {
-        /// The file.
-        path: PathBuf,
-        /// Where and why.
-        cause: FileError,
-    },
+    File { path: PathBuf, cause: FileError },
     /// A scenario does not fit its twin, or a file that it names is malformed.
     #[error("{}: {cause}", path.display())]
-    Scenario {
-        /// The scenario's file.
-        path: PathBuf,
-        /// Where and why.
-        cause: ScenarioError,
-    },
+    Scenario { path: PathBuf, cause: ScenarioError },
     /// A file is not a result of a run.
     #[error(
         "{} is no result of a run: {reason}; give the result.json of `wildcity episode run`, or its --out directory",
         path.display()
     )]
-    NoResult {
-        /// The file.
-        path: PathBuf,
-        /// The error.
-        reason: String,
-    },
+    NoResult { path: PathBuf, reason: String },
     /// The command of the agent cannot be started.
     #[error("the agent {agent:?} cannot be started: {reason}; an agent is {AGENTS}")]
-    NoAgent {
-        /// The agent.
-        agent: String,
-        /// The shell's message.
-        reason: String,
-    },
+    NoAgent { agent: String, reason: String },
     /// The version of a twin that a scenario was made for does not exist.
     #[error(
         "scenario {scenario:?} was made for version {wanted} of twin {twin:?}, which is not in the store: import that \
          version, or run with --latest"
     )]
     NoVersion {
-        /// The scenario.
         scenario: String,
-        /// The twin.
         twin: String,
         /// BLAKE3 of the version's manifest.
         wanted: String,
     },
     /// Two cases have the same name.
     #[error("two episodes are named {name:?}: give the scenarios different names")]
-    SameName {
-        /// The name.
-        name: String,
-    },
+    SameName { name: String },
     /// There are more episodes than this build runs.
     #[error("{count} episodes; at most {} are run", crate::limits::EPISODES)]
-    TooMany {
-        /// Their number.
-        count: usize,
-    },
+    TooMany { count: usize },
     /// The directory has episodes of another run.
     #[error("{} has episodes of another run: give another directory with --out", dir.display())]
-    NotEmpty {
-        /// The directory.
-        dir: PathBuf,
-    },
+    NotEmpty { dir: PathBuf },
     /// A twin cannot be read.
     #[error(transparent)]
     Store(#[from] StoreError),

@@ -24,7 +24,6 @@ pub struct SuiteFile {
     pub format: String,
     /// Name of the suite.
     pub name: String,
-    /// Comment.
     #[serde(default)]
     pub note: Option<String>,
     /// Scenario files, relative to the suite's file.
@@ -44,16 +43,16 @@ pub struct SuiteFile {
     /// Simulated time of a step, in microseconds; if absent, 100000.
     #[serde(default)]
     pub dt_us: Option<i64>,
-    /// Lower limit of the pass rate, which the lower end of its interval must reach; if absent, every episode must
-    /// pass.
+    /// Lower limit of the pass rate, which the lower end of its interval must reach; if absent,
+    /// every episode must pass.
     #[serde(default)]
     pub at_least: Option<f64>,
-    /// Criteria that need not be judged for a pass, by their names ([`Criterion`]): scenarios without a map cannot be judged
-    /// by `off_road`. And `off_model`: episodes that leave the trained area are no mistake of the run. If absent, an
-    /// episode passes only if all criteria were judged.
+    /// Criteria that need not be judged for a pass, by their names ([`Criterion`]): scenarios
+    /// without a map cannot be judged by `off_road`. And `off_model`: episodes that leave the
+    /// trained area are no mistake of the run. If absent, an episode passes only if all criteria
+    /// were judged.
     #[serde(default)]
     pub accept_unjudged: Vec<String>,
-    /// Its own file.
     #[serde(skip)]
     pub path: PathBuf,
 }
@@ -64,9 +63,7 @@ pub(crate) const OFF_MODEL: &str = "off_model";
 /// A scenario of a suite.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SuiteScenario {
-    /// Its file.
     pub path: PathBuf,
-    /// Its contents.
     pub document: Document,
 }
 
@@ -85,7 +82,7 @@ impl SuiteFile {
             .map_err(|error| wrong(FileError::new("suite", format!("not JSON: {error}"))))?;
         if value.get("format").and_then(serde_json::Value::as_str) == Some(ScenarioFile::FORMAT) {
             let document = Document::from_json(value).map_err(wrong)?;
-            let suite = Self::of_one(path);
+            let suite = Self::single(path);
             return Ok((suite, vec![SuiteScenario { path: path.to_owned(), document }]));
         }
         let mut suite: Self = serde_path_to_error::deserialize(value).map_err(|error| {
@@ -113,7 +110,7 @@ impl SuiteFile {
     }
 
     /// The suite of one scenario.
-    fn of_one(path: &Path) -> Self {
+    fn single(path: &Path) -> Self {
         let name = path.file_stem().map(|name| name.to_string_lossy().into_owned());
         Self {
             format: Self::FORMAT.to_owned(),
@@ -153,7 +150,8 @@ impl SuiteFile {
     }
 }
 
-/// Checks names of criteria that need not be judged. The error names the first that is none, and those that there are.
+/// Checks names of criteria that need not be judged. The error names the first that is none, and
+/// those that there are.
 pub fn check_criteria(names: &[String]) -> Result<(), String> {
     let mut known = Criterion::ALL.map(Criterion::name).to_vec();
     known.push(OFF_MODEL);
@@ -163,8 +161,8 @@ pub fn check_criteria(names: &[String]) -> Result<(), String> {
     }
 }
 
-/// Refuses a scenario that names files in its own directory, because sessions look for them in the directory of the
-/// suite.
+/// Refuses a scenario that names files in its own directory, because sessions look for them in the
+/// directory of the suite.
 fn check_alone(document: &Document) -> Result<(), FileError> {
     let file = document.with(&document.first_values())?;
     let fields = [("map.file", file.map.is_some()), ("tracks.file", file.tracks.is_some())];

@@ -20,7 +20,6 @@ pub(crate) struct Finished {
     pub(crate) record: String,
     /// The end that the session wrote.
     pub(crate) end: EndLine,
-    /// Verdict and scores.
     pub(crate) result: EpisodeResult,
     /// BLAKE3 of all frame hashes, in hex: equal for equal drives.
     pub(crate) frames_hash: String,
@@ -77,8 +76,8 @@ fn finish_file(case: &Case, record: &Path) -> Result<Finished, Technical> {
     })
 }
 
-/// What was driven: where the ego and the actors were, and what was seen. Images alone would not do: an actor may be out of
-/// sight, and an agent may ask for no camera.
+/// What was driven: where the ego and the actors were, and what was seen. Images alone would not
+/// do: an actor may be out of sight, and an agent may ask for no camera.
 fn drive_hash(episode: &EpisodeFile) -> String {
     let mut hasher = blake3::Hasher::new();
     // Numbers and texts: writing them into memory cannot fail.

@@ -7,11 +7,12 @@ use crate::entry::{EpisodeEntry, Status, TechnicalEntry};
 use crate::file::OFF_MODEL;
 use crate::result::SuiteResult;
 
-/// The result as JUnit XML: `failure` is driving; `error` technical, or an episode without a verdict, since a skipped test
-/// counts as a good one; `skipped` an episode that left the trained area where the suite accepts this.
+/// The result as JUnit XML: `failure` is driving; `error` technical, or an episode without a
+/// verdict, since a skipped test counts as a good one; `skipped` an episode that left the trained
+/// area where the suite accepts this.
 ///
-/// A failed episode is a `failure` even if the run passes. The properties of the suite have the exit code and its
-/// reason.
+/// A failed episode is a `failure` even if the run passes. The properties of the suite have the
+/// exit code and its reason.
 pub fn junit(result: &SuiteResult, ending: &Ending) -> String {
     let counts = &result.counts;
     let accepts_off_model = result.accept_unjudged.iter().any(|name| name == OFF_MODEL);
@@ -93,15 +94,17 @@ fn case(text: &mut String, result: &SuiteResult, episode: &EpisodeEntry) {
     }
 }
 
-/// Notes in addition to the status: criteria that were not judged, and whether the episode is a duplicate.
+/// Notes in addition to the status: criteria that were not judged, and whether the episode is a
+/// duplicate.
 fn notes(episode: &EpisodeEntry) -> String {
     let is_told = episode.status == Status::NotJudged;
     let not_judged = episode.not_judged.iter().filter(|_| !is_told);
     let mut lines: Vec<String> = not_judged.map(|reason| format!("not judged: {reason}")).collect();
     lines.extend(episode.duplicate_text());
-    match lines.is_empty() {
-        true => String::new(),
-        false => format!("<system-out>{}</system-out>", escaped(&lines.join("\n"))),
+    if lines.is_empty() {
+        String::new()
+    } else {
+        format!("<system-out>{}</system-out>", escaped(&lines.join("\n")))
     }
 }
 

@@ -1,8 +1,8 @@
 //! Suites of scenarios, run without a person: "did my driver get worse?" as one command.
 //!
-//! A suite names scenarios; a run drives each of them with each of its seeds, with an external agent or with a built-in
-//! one, and judges every episode from its record. The results do not depend on how many episodes are driven
-//! at once.
+//! A suite names scenarios; a run drives each of them with each of its seeds, with an external
+//! agent or with a built-in one, and judges every episode from its record. The results do not
+//! depend on how many episodes are driven at once.
 //!
 //! | module | what it does |
 //! |---|---|

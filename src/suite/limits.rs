@@ -5,7 +5,8 @@ use std::time::Duration;
 /// Largest suite or scenario file, in bytes.
 pub const FILE_BYTES: u64 = 16 << 20;
 
-/// Largest result of a run, in bytes: an episode has 21 scores with their parts, 7 kB, and there are at most 100,000.
+/// Largest result of a run, in bytes: an episode has 21 scores with their parts, 7 kB, and there
+/// are at most 100,000.
 pub const RESULT_BYTES: u64 = 1 << 30;
 
 /// Largest number of episodes of a suite.
@@ -37,8 +38,8 @@ pub const STDERR_LINES: usize = 12;
 /// Largest number of bytes of these lines.
 pub const STDERR_BYTES: usize = 4 << 10;
 
-/// How long to wait for the rest of an agent's standard error after the agent has ended, because a process that it
-/// started may keep the stream open.
+/// How long to wait for the rest of an agent's standard error after the agent has ended, because a
+/// process that it started may keep the stream open.
 pub const STDERR_WAIT: Duration = Duration::from_millis(500);
 
 /// Exit statuses of a shell that finds no such command, or cannot run it.

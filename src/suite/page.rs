@@ -50,7 +50,8 @@ fn outcome(result: &SuiteResult, ending: &Ending) -> Markup {
     }
 }
 
-/// Episodes without a verdict, with the reasons: they come first, since a run with them says less than it seems to.
+/// Episodes without a verdict, with the reasons: they come first, since a run with them says less
+/// than it seems to.
 fn unjudged(result: &SuiteResult) -> Markup {
     let is_unjudged =
         |episode: &&EpisodeEntry| matches!(episode.status, Status::NotJudged | Status::OffModel);

@@ -17,16 +17,14 @@ use crate::result::SuiteResult;
 pub struct Picture {
     /// Name of the episode.
     pub episode: String,
-    /// The step.
     pub step: u64,
     /// Name of the camera.
     pub camera: String,
-    /// A JPEG file.
     pub jpeg: Vec<u8>,
 }
 
-/// The pictures of the worst episodes of a run: of the step of their worst fault, by their first camera. An episode
-/// that cannot be rendered again has no picture, which the report mentions.
+/// The pictures of the worst episodes of a run: of the step of their worst fault, by their first
+/// camera. An episode that cannot be rendered again has no picture, which the report mentions.
 pub fn pictures(
     result: &SuiteResult,
     episodes: &Path,
@@ -48,8 +46,9 @@ pub fn pictures(
 }
 
 impl SuiteResult {
-    /// The failed episodes: those with a contact first, then those off the road, then those that only lack progress, and of
-    /// these those with the earliest fault first. Without duplicates, which would show the same pictures.
+    /// The failed episodes: those with a contact first, then those off the road, then those that
+    /// only lack progress, and of these those with the earliest fault first. Without duplicates,
+    /// which would show the same pictures.
     pub(crate) fn worst(&self) -> Vec<&EpisodeEntry> {
         let distinct = self.episodes.iter().filter(|episode| episode.duplicate_of.is_none());
         let mut worst: Vec<&EpisodeEntry> =
@@ -63,7 +62,8 @@ impl SuiteResult {
     }
 }
 
-/// The fault that an episode is shown by: a contact that follows a step off the road says more than that step.
+/// The fault that an episode is shown by: a contact that follows a step off the road says more than
+/// that step.
 fn worst_fault(episode: &EpisodeEntry) -> Option<&FaultLine> {
     // The first of equally severe ones, since faults are in order of their times.
     episode.faults.iter().min_by_key(|fault| severity(fault))

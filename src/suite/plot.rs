@@ -106,8 +106,8 @@ fn sample_at(drive: &DriveRecord, fault_us: Option<i64>) -> Option<usize> {
 
 // Writing into a text cannot fail.
 
-/// The head of a plot: what it shows, and the name of each colour. At 12 px a character takes 7 px on average at most, and a
-/// plot is 420 px wide.
+/// The head of a plot: what it shows, and the name of each colour. At 12 px a character takes 7 px
+/// on average at most, and a plot is 420 px wide.
 fn begin(title: &str, legend: &[(&str, &str)]) -> String {
     let DVec2 { x, y } = SIZE_PX;
     let mut svg = format!(

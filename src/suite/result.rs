@@ -5,7 +5,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use wildcity_score::range_of;
+use wildcity_score::score_range;
 use wildcity_score::statistics::{Mean, wilson};
 
 use crate::entry::{EpisodeEntry, Status};
@@ -13,15 +13,14 @@ use crate::error::SuiteError;
 use crate::file::read;
 use crate::limits;
 
-/// All episodes of a run, and their rates and means. It has no clock times, so that the same drives give the same
-/// bytes.
+/// All episodes of a run, and their rates and means. It has no clock times, so that the same drives
+/// give the same bytes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SuiteResult {
     /// `wildcity.suite-result/1`.
     pub format: String,
     /// Name of the suite.
     pub suite: String,
-    /// The agent.
     pub agent: String,
     /// Whether versions that scenarios name were ignored.
     pub latest: bool,
@@ -51,7 +50,6 @@ pub struct SuiteResult {
 pub(crate) struct RunHead {
     /// Name of the suite.
     pub(crate) suite: String,
-    /// The agent.
     pub(crate) agent: String,
     /// Whether versions that scenarios name were ignored.
     pub(crate) latest: bool,
@@ -72,11 +70,8 @@ struct Head {
 /// How many episodes ended how.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Counts {
-    /// All.
     pub episodes: u64,
-    /// Passed.
     pub passed: u64,
-    /// Failed by driving.
     pub failed: u64,
     /// Left the trained area before any fault.
     pub off_model: u64,
@@ -84,7 +79,8 @@ pub struct Counts {
     pub not_judged: u64,
     /// Not driven, for technical reasons.
     pub technical: u64,
-    /// Driven as another episode of the same scenario was. They are counted above, and are in no rate and no mean.
+    /// Driven as another episode of the same scenario was. They are counted above, and are in no
+    /// rate and no mean.
     #[serde(default)]
     pub duplicates: u64,
 }
@@ -92,7 +88,6 @@ pub struct Counts {
 /// A rate with its 95 % interval (Wilson).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Rate {
-    /// Passed.
     pub passed: u64,
     /// Number of judged episodes.
     pub runs: u64,
@@ -105,7 +100,6 @@ pub struct Rate {
 /// A mean with its 95 % interval ([`Mean::interval`]).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct MeanEntry {
-    /// The mean.
     pub mean: f64,
     /// The ends of the interval, within the range of the score; null below three scenarios.
     pub interval: Option<[f64; 2]>,
@@ -146,11 +140,11 @@ impl SuiteResult {
             at_least: head.at_least,
             accept_unjudged: head.accept_unjudged,
             counts,
-            pass_rate: Rate::of(episodes.iter()),
+            pass_rate: Rate::count(episodes.iter()),
             means: means(&by_scenario),
             scenarios: by_scenario
                 .iter()
-                .map(|(name, of)| (name.clone(), Rate::of(of.iter().copied())))
+                .map(|(name, of)| (name.clone(), Rate::count(of.iter().copied())))
                 .collect(),
             episodes,
         }
@@ -159,12 +153,10 @@ impl SuiteResult {
     /// Reads the result of a run: its `result.json`, or the directory that has it.
     ///
     /// # Errors
-    /// The file cannot be read, or is not a result of a run; names the file, and the place of the first mistake.
+    /// The file cannot be read, or is not a result of a run; names the file, and the place of the
+    /// first mistake.
     pub fn read(run: &Path) -> Result<Self, SuiteError> {
-        let path = match run.is_dir() {
-            true => run.join(Self::FILE),
-            false => run.to_owned(),
-        };
+        let path = if run.is_dir() { run.join(Self::FILE) } else { run.to_owned() };
         let bytes = read(&path, limits::RESULT_BYTES)?;
         let wrong = |reason: String| SuiteError::NoResult { path: path.clone(), reason };
         let Head { format } = serde_json::from_slice(&bytes)
@@ -207,14 +199,14 @@ fn means(by_scenario: &BTreeMap<String, Vec<&EpisodeEntry>>) -> BTreeMap<String,
             }
         }
         for (name, values) in values {
-            if let Some(mean) = Mean::of(&values) {
+            if let Some(mean) = Mean::from_values(&values) {
                 per_scenario.entry(name.to_owned()).or_default().push(mean.mean);
             }
         }
     }
     let entry = |name: &str, values: &[f64]| {
-        let mean = Mean::of(values)?;
-        let interval = mean.interval(range_of(name));
+        let mean = Mean::from_values(values)?;
+        let interval = mean.interval(score_range(name));
         Some(MeanEntry { mean: mean.mean, interval, scenarios: values.len() as u64 })
     };
     let entries = per_scenario.into_iter().filter_map(|(name, values)| {
@@ -224,8 +216,9 @@ fn means(by_scenario: &BTreeMap<String, Vec<&EpisodeEntry>>) -> BTreeMap<String,
     entries.collect()
 }
 
-/// Marks episodes that were driven in the same way as an earlier one of their scenario, as two seeds of a scenario
-/// without jitter are. Counted twice, they would narrow the intervals without adding information.
+/// Marks episodes that were driven in the same way as an earlier one of their scenario, as two
+/// seeds of a scenario without jitter are. Counted twice, they would narrow the intervals without
+/// adding information.
 fn mark_duplicates(episodes: &mut [EpisodeEntry]) {
     let mut first: BTreeMap<(String, Status, String), String> = BTreeMap::new();
     for episode in episodes.iter_mut().filter(|episode| !episode.drive_hash.is_empty()) {
@@ -241,7 +234,7 @@ fn mark_duplicates(episodes: &mut [EpisodeEntry]) {
 
 impl Rate {
     /// The pass rate of the episodes that were judged, without duplicates.
-    fn of<'a>(episodes: impl Iterator<Item = &'a EpisodeEntry>) -> Self {
+    fn count<'a>(episodes: impl Iterator<Item = &'a EpisodeEntry>) -> Self {
         let distinct = episodes.filter(|episode| episode.duplicate_of.is_none());
         let judged = distinct.filter(|episode| episode.status.is_judged());
         let passes: Vec<bool> = judged.map(|episode| episode.status == Status::Passed).collect();

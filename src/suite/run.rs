@@ -51,9 +51,7 @@ impl AgentChoice {
 pub struct RunSettings {
     /// Name of the suite.
     pub suite: String,
-    /// The agent.
     pub agent: AgentChoice,
-    /// Episodes at once.
     pub jobs: usize,
     /// How often a technical failure is tried again.
     pub retries: u32,
@@ -61,11 +59,12 @@ pub struct RunSettings {
     pub agent_timeout: Duration,
     /// Whether versions that scenarios name were ignored.
     pub latest: bool,
-    /// Lower limit of the pass rate, which the lower end of its interval must reach. `None`: every episode must pass.
+    /// Lower limit of the pass rate, which the lower end of its interval must reach. `None`: every
+    /// episode must pass.
     pub at_least: Option<f64>,
-    /// Criteria that need not be judged for a pass ([`SuiteFile::accept_unjudged`](crate::SuiteFile::accept_unjudged)).
+    /// Criteria that need not be judged for a pass
+    /// ([`SuiteFile::accept_unjudged`](crate::SuiteFile::accept_unjudged)).
     pub accept_unjudged: Vec<String>,
-    /// The twins.
     pub catalog: Catalog,
     /// Directory or URL of the twins, for the server that external agents connect to.
     pub twins: PathBuf,
@@ -73,7 +72,6 @@ pub struct RunSettings {
     pub cache: Option<DiskCacheSettings>,
     /// Directory of the suite, with the tracks and maps that scenarios name.
     pub scenarios: PathBuf,
-    /// The renderer.
     pub backend: Arc<dyn Backend>,
     /// Directory of the records, which must be empty.
     pub episodes: PathBuf,
@@ -112,12 +110,12 @@ impl std::fmt::Debug for RunSettings {
     }
 }
 
-/// Drives all cases. The result is in order of their names and has no times of the clock, so it does not depend on
-/// `jobs`.
+/// Drives all cases. The result is in order of their names and has no times of the clock, so it
+/// does not depend on `jobs`.
 ///
 /// # Errors
-/// The directory has episodes of another run, the engine or the server cannot be started, or the shell finds no such
-/// command as the agent's.
+/// The directory has episodes of another run, the engine or the server cannot be started, or the
+/// shell finds no such command as the agent's.
 pub async fn run(settings: RunSettings, cases: Vec<Case>) -> Result<SuiteResult, SuiteError> {
     check_empty(&settings.episodes)?;
     let host = match &settings.agent {
@@ -186,9 +184,10 @@ pub async fn run(settings: RunSettings, cases: Vec<Case>) -> Result<SuiteResult,
 /// Refuses a directory with records: their names would differ from those of a fresh run.
 fn check_empty(dir: &Path) -> Result<(), SuiteError> {
     let failed = |cause| SuiteError::Io { what: "read", path: dir.to_owned(), cause };
-    match wildcity_episode::list(dir).map_err(failed)?.is_empty() {
-        true => Ok(()),
-        false => Err(SuiteError::NotEmpty { dir: dir.to_owned() }),
+    if wildcity_episode::list(dir).map_err(failed)?.is_empty() {
+        Ok(())
+    } else {
+        Err(SuiteError::NotEmpty { dir: dir.to_owned() })
     }
 }
 
@@ -196,7 +195,8 @@ fn engine(settings: &RunSettings) -> Result<Arc<Engine>, SuiteError> {
     Ok(Engine::start(EngineSettings {
         cache: Cache::new(settings.catalog.clone()),
         episodes: settings.episodes.clone(),
-        // Scenarios come with their sessions; files that they name are in the directory of the suite.
+        // Scenarios come with their sessions; files that they name are in the directory of the
+        // suite.
         scenarios: Scenarios::in_dir(&settings.scenarios),
         backend: settings.backend.clone(),
         step_timeout: Limits::default().step,

@@ -19,8 +19,9 @@ pub(crate) struct Tail {
 }
 
 impl Tail {
-    /// Starts to read. A process that the agent leaves behind may keep the stream open: then the thread stays.
-    pub(crate) fn of(stream: Option<ChildStderr>) -> Self {
+    /// Starts to read. A process that the agent leaves behind may keep the stream open: then the
+    /// thread stays.
+    pub(crate) fn new(stream: Option<ChildStderr>) -> Self {
         let lines: Arc<Mutex<VecDeque<String>>> = Arc::default();
         let (end, ended) = oneshot::channel::<()>();
         if let Some(stream) = stream {

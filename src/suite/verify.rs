@@ -9,7 +9,8 @@ use wildcity_twin::store::Catalog;
 
 use crate::result::SuiteResult;
 
-/// Replays every recorded episode of a run. Returns what differs, one line for each episode that does.
+/// Replays every recorded episode of a run. Returns what differs, one line for each episode that
+/// does.
 pub fn verify(
     result: &SuiteResult,
     episodes: &Path,

@@ -2,7 +2,8 @@
 
 use std::time::Duration;
 
-/// Most bytes that are set aside for the images of all sessions: as many as all answers may have together.
+/// Most bytes that are set aside for the images of all sessions: as many as all answers may have
+/// together.
 pub const IMAGE_BYTES: u64 = 9 << 30;
 
 /// Longest PLY header, in bytes. INRIA's with SH degree 3 has 1.5 kB.
@@ -30,8 +31,8 @@ pub const SCENE_PART_BYTES: u64 = 4 << 30;
 /// 200 B per leaf.
 pub const SCENE_JSON_BYTES: u64 = 64 << 20;
 
-/// Largest file of the poses of training images, in bytes. COLMAP's images.bin has the points of each image, 24 B each:
-/// 10,000 images of 5,000 points are 1.2 GB.
+/// Largest file of the poses of training images, in bytes. COLMAP's images.bin has the points of
+/// each image, 24 B each: 10,000 images of 5,000 points are 1.2 GB.
 pub const CAPTURE_BYTES: u64 = 4 << 30;
 
 /// The most files of one scene. A streamed SOG has eight per block.
@@ -41,8 +42,8 @@ pub const SCENE_PARTS: usize = 100_000;
 /// share add at most as many again. A lorry with a surface of 60 m² gets one every 17 mm.
 pub const MESH_GAUSSIANS: u32 = 200_000;
 
-/// Largest asset of an actor, in bytes: 2 million Gaussians of SH degree 3 in f32 are 472 MB, and the levels of
-/// detail as much again.
+/// Largest asset of an actor, in bytes: 2 million Gaussians of SH degree 3 in f32 are 472 MB, and
+/// the levels of detail as much again.
 pub const ACTOR_BYTES: u64 = 1 << 30;
 
 /// Largest header of an asset, in bytes. One has about 2 kB.
@@ -65,8 +66,8 @@ pub const IMPORT_GAUSSIANS: u64 = u32::MAX as u64;
 /// Largest manifest, in bytes. The 20,000 chunks of a log are 7 MB, its 170,000 keyframes 30 MB.
 pub const MANIFEST_BYTES: u64 = 64 << 20;
 
-/// Cells beyond which one commit must have [`GAUSSIANS_PER_CELL`] in each on average. Each cell is an object of 12 kB
-/// at least, so they take 50 MB.
+/// Cells beyond which one commit must have [`GAUSSIANS_PER_CELL`] in each on average. Each cell is
+/// an object of 12 kB at least, so they take 50 MB.
 pub const SPARSE_CELLS: usize = 4096;
 
 /// Gaussians in each of many cells, on average. A cell of a street has tens of thousands.
@@ -87,7 +88,8 @@ pub const CLAMPED_SHARE: f64 = 1e-4;
 /// Largest recorded image, in bytes: a PNG of 4 K in full noise.
 pub const VIEW_IMAGE_BYTES: u64 = 64 << 20;
 
-/// Largest table of recorded images, in bytes: 400,000 images of 500 bytes, 130 km of six cameras every 2 m.
+/// Largest table of recorded images, in bytes: 400,000 images of 500 bytes, 130 km of six cameras
+/// every 2 m.
 pub const VIEWS_TABLE_BYTES: u64 = 200 << 20;
 
 /// Largest record of a twin's log, in bytes. One has about 150.
@@ -153,8 +155,9 @@ pub const RESIDENT_BYTES: u64 = 16 << 30;
 /// one that hangs does not stop the others.
 pub const LOADERS: usize = 8;
 
-/// Memory of evicted sections that is kept for the next ones. A load evicts just before it reads, so this is needed
-/// only for what the loader threads read at the same time: eight sections of up to 9 MB.
+/// Memory of evicted sections that is kept for the next ones. A load evicts just before it reads,
+/// so this is needed only for what the loader threads read at the same time: eight sections of up
+/// to 9 MB.
 pub const FREE_PAGES_BYTES: usize = 64 << 20;
 
 /// Number of attempts to load a section before the frames that wait for it get the error.

@@ -5,8 +5,8 @@ use std::path::Path;
 use crate::format_files::glb;
 use crate::wildcity;
 
-/// Half of the plate's length and thickness, and its height, in metres. Its 65 m² are those of the lorry that
-/// `tests/actors/softness.py` measures, so that its Gaussians are as large.
+/// Half of the plate's length and thickness, and its height, in metres. Its 65 m² are those of the
+/// lorry that `tests/actors/softness.py` measures, so that its Gaussians are as large.
 const HALF_LENGTH_M: f32 = 5.2;
 const HALF_THICKNESS_M: f32 = 0.05;
 const HEIGHT_M: f32 = 3.0;
@@ -26,7 +26,8 @@ fn plate() -> Vec<u8> {
             buffer.extend(f32::to_le_bytes(m));
         }
     }
-    // The corners of each side, in turn around it: bit 0 of a corner is its x, bit 1 its y, bit 2 its z.
+    // The corners of each side, in turn around it: bit 0 of a corner is its x, bit 1 its y, bit 2
+    // its z.
     for [a, b, c, d] in
         [[0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5], [0, 1, 3, 2], [4, 5, 7, 6_u8]]
     {
@@ -95,8 +96,8 @@ fn edges(dir: &Path, options: &[&str]) -> Edges {
     Edges { width_px: from_above(0.9) - from_above(0.1), grown_px: height_px - wanted_px }
 }
 
-/// With the default number of Gaussians, edges at 8 m are about as sharp as those of triangles, which take up to 1.6 px
-/// between pixels: the table in BENCHMARKS.md.
+/// With the default number of Gaussians, edges at 8 m are about as sharp as those of triangles,
+/// which take up to 1.6 px between pixels: the table in BENCHMARKS.md.
 #[test]
 fn an_edge_of_a_mesh_at_eight_metres_is_sharp() {
     let dir = tempfile::tempdir().unwrap();

@@ -1,4 +1,5 @@
-//! `wildcity augment`: views off a drive, read back by `wildcity eval`; runs continued after damage and kills.
+//! `wildcity augment`: views off a drive, read back by `wildcity eval`; runs continued after damage
+//! and kills.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -23,8 +24,8 @@ use crate::root::root;
 use crate::versions::files;
 use crate::wildcity;
 
-/// A short street, and a degraded copy of it, with a pinhole to the front and a dark fisheye with a rolling shutter to
-/// the left. They are made once, and copied for each test.
+/// A short street, and a degraded copy of it, with a pinhole to the front and a dark fisheye with a
+/// rolling shutter to the left. They are made once, and copied for each test.
 fn twins(dir: &Path) {
     static MADE: OnceLock<tempfile::TempDir> = OnceLock::new();
     let made = MADE.get_or_init(|| {
@@ -62,7 +63,7 @@ fn make_twins(dir: &Path) {
         let new = NewVersion {
             rig: Some(rig.clone()),
             trajectories: vec![street.trajectory.clone()],
-            ..NewVersion::of(name, gaussians, Provenance::of("test".to_owned()))
+            ..NewVersion::from_gaussians(name, gaussians, Provenance::new("test".to_owned()))
         };
         catalog.commit(new, &mut |_, _| {}).unwrap();
     };
@@ -193,7 +194,7 @@ fn what_is_missing_or_damaged_is_drawn_again_and_other_sets_are_refused() {
     let new = NewVersion {
         rig: worn.manifest.rig.clone(),
         trajectories: worn.manifest.trajectories.clone(),
-        ..NewVersion::of("street", &gaussians, Provenance::of("trained".to_owned()))
+        ..NewVersion::from_gaussians("street", &gaussians, Provenance::new("trained".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();
     let said = refused(at, &arguments("street", "out", &[]));

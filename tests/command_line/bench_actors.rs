@@ -19,7 +19,11 @@ fn cars_cost_something_as_actors_and_within_the_twin() {
     let twins = tempfile::tempdir().unwrap();
     let new = NewVersion {
         trajectories: vec![street.trajectory],
-        ..NewVersion::of("street", &street.gaussians, Provenance::of("test".to_owned()))
+        ..NewVersion::from_gaussians(
+            "street",
+            &street.gaussians,
+            Provenance::new("test".to_owned()),
+        )
     };
     commit(twins.path(), new).unwrap();
     let dir = tempfile::tempdir().unwrap();

@@ -3,7 +3,7 @@
 use std::io::{Cursor, Write};
 use std::process::Command;
 
-use crate::format_files::{glb, gltf, sog, zip_of};
+use crate::format_files::{glb, gltf, sog, zip};
 use crate::scene_files::gaussians;
 
 /// Gaussians of the valid file that is turned into a decompression bomb.
@@ -48,9 +48,11 @@ impl Zeros {
     }
 }
 
-/// A lossless WebP image of equal pixels. Each of its five prefix codes has one symbol, which takes no bits.
+/// A lossless WebP image of equal pixels. Each of its five prefix codes has one symbol, which takes
+/// no bits.
 fn webp_of_one_color(side_px: u64, [red, green, blue, alpha]: [u8; 4]) -> Vec<u8> {
-    // Value and number of bits: the size, alpha and the version; neither transforms nor caches nor further codes.
+    // Value and number of bits: the size, alpha and the version; neither transforms nor caches nor
+    // further codes.
     let header = [(side_px - 1, 14), (side_px - 1, 14), (1, 1), (0, 3), (0, 3)];
     // A simple code, of one symbol, of eight bits.
     let code = |symbol: u8| (0b101 | u64::from(symbol) << 3, 11);
@@ -71,13 +73,14 @@ fn webp_of_one_color(side_px: u64, [red, green, blue, alpha]: [u8; 4]) -> Vec<u8
     file
 }
 
-/// Decompression bombs are refused because of the sizes that they declare, or as soon as a limit is reached. Each
-/// is read by a process of its own, whose memory stays bounded.
+/// Decompression bombs are refused because of the sizes that they declare, or as soon as a limit is
+/// reached. Each is read by a process of its own, whose memory stays bounded.
 #[test]
 fn decompression_bombs_are_refused_in_bounded_memory() {
     let dir = tempfile::tempdir().unwrap();
     let write = |name: &str, bytes: &[u8]| std::fs::write(dir.path().join(name), bytes).unwrap();
-    // 512 MiB of zeros in 0.5 MB: with a header that declares their size, and with one that declares none.
+    // 512 MiB of zeros in 0.5 MB: with a header that declares their size, and with one that
+    // declares none.
     let zeros = Zeros::new(512);
     let nothing = |start: &[u8]| zeros.after(start);
     let header = |count: u32| {
@@ -86,11 +89,11 @@ fn decompression_bombs_are_refused_in_bounded_memory() {
     };
     write("honest.spz", &nothing(&header((512 << 20) / 20)));
     write("sly.spz", &nothing(&header(0)));
-    write("payload.usdz", &zip_of(&[("x.nurec".into(), nothing(b""))], false));
+    write("payload.usdz", &zip(&[("x.nurec".into(), nothing(b""))], false));
     let big = vec![0; 256 << 20];
     write(
         "means.zip",
-        &zip_of(
+        &zip(
             &{
                 let mut files = sog(&gaussians(COUNT, 0, 20.0, 1), 2);
                 files[1].1 = big;
@@ -107,7 +110,7 @@ fn decompression_bombs_are_refused_in_bounded_memory() {
     files[1..].iter_mut().for_each(|file| file.1 = image.clone());
     let meta = String::from_utf8(files[0].1.clone()).unwrap();
     files[0].1 = meta.replace(r#""count":6"#, r#""count":67108864"#).into_bytes();
-    write("images.sog", &zip_of(&files, false));
+    write("images.sog", &zip(&files, false));
     // A thousand nodes show one mesh.
     let (json, buffer) = gltf(&gaussians(20_000, 3, 20.0, 1), "", "");
     let nodes = vec![r#"{"mesh":0}"#; 1000].join(",");

@@ -1,4 +1,5 @@
-//! `wildcity twin align`, `wildcity route from-colmap` and `from-nerfstudio`, `wildcity twin drive`.
+//! `wildcity twin align`, `wildcity route from-colmap` and `from-nerfstudio`,
+//! `wildcity twin drive`.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -201,17 +202,18 @@ fn a_capture_becomes_a_street_that_can_be_driven() {
     assert_eq!(third.manifest.rig.unwrap().name, "capture");
     assert!(done(at, &["twin", "fsck", "street"]).ends_with("all sound\n"));
 
-    // 5. A push of files in the axes of the import has the same capture, and one of other files has another.
+    // 5. A push of files in the axes of the import has the same capture, and one of other files has
+    //    another.
     let push = |base, provenance| {
         let options = StorageOptions { record: second.manifest.record, levels: true };
         let push = catalog.begin("street", CommitKind::Push, options).unwrap();
-        push.change(base, VersionChange::of(provenance)).unwrap()
+        push.change(base, VersionChange::new(provenance)).unwrap()
     };
-    let mut trained = Provenance::of("block7.ply".into());
+    let mut trained = Provenance::new("block7.ply".into());
     trained.options = ["axes=identity", "scale=1"].map(str::to_owned).to_vec();
     trained.set_note("epoch 30");
     push(3, trained);
-    let mut other = Provenance::of("block8.ply".into());
+    let mut other = Provenance::new("block8.ply".into());
     other.options.push("axes=y-down-z-forward".to_owned());
     push(4, other);
     let route = |twin, out| ["route", "from-colmap", "model", "--twin", twin, "--out", out];

@@ -156,8 +156,8 @@ fn objects_placed_by_a_killed_import_are_removed() {
     assert_eq!(catalog.version("street", None).unwrap(), version);
 }
 
-/// Without root, a test cannot fill a file system. A limit of the file size makes the same operation fail: a
-/// write in the middle of an object.
+/// Without root, a test cannot fill a file system. A limit of the file size makes the same
+/// operation fail: a write in the middle of an object.
 #[test]
 fn a_full_disk_leaves_the_old_version_and_nothing_else() {
     let dir = tempfile::tempdir().unwrap();

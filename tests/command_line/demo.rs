@@ -1,4 +1,5 @@
-//! The demo twin is built once, rebuilt when it is damaged, and never replaces a user's twin of that name.
+//! The demo twin is built once, rebuilt when it is damaged, and never replaces a user's twin of
+//! that name.
 
 use std::fs;
 use std::io::{BufRead as _, BufReader};
@@ -110,7 +111,8 @@ fn a_damaged_demo_twin_is_built_again() {
         assert!(output.status.success(), "{output:?}");
         String::from_utf8(output.stderr).unwrap()
     };
-    // A device that does not exist is refused before anything is drawn, but after the twin was built.
+    // A device that does not exist is refused before anything is drawn, but after the twin was
+    // built.
     let rebuild = || {
         let output = demo_with(dir.path(), &["--backend", "gpu", "--device", "no such card"]);
         assert_eq!(output.status.code(), Some(1), "{output:?}");

@@ -60,7 +60,8 @@ fn a_suite_is_driven_and_its_records_are_read() {
     assert_eq!(again.status.code(), Some(2), "the directory has another run");
     assert!(again.stderr.starts_with(b"error: "), "{}", String::from_utf8_lossy(&again.stderr));
     assert_eq!(wildcity(&["run", "nowhere.json"], dir.path()).status.code(), Some(2));
-    // An export that cannot be written is reported on standard error and in the report, not in the result.
+    // An export that cannot be written is reported on standard error and in the report, not in the
+    // result.
     std::fs::create_dir_all(dir.path().join("told/episodes/short-0-1.mcap")).unwrap();
     let told = run("log", "told");
     assert_eq!(told.status.code(), Some(0), "{}", stdout(&told));
@@ -137,7 +138,8 @@ fn a_suite_is_driven_and_its_records_are_read() {
     assert_eq!(count(&with_images, "/wildcity/step"), count(&bytes, "/wildcity/step"));
     let unknown = wildcity(&[&images[..], &["--camera", "roof"]].concat(), dir.path());
     assert!(String::from_utf8(unknown.stderr).unwrap().contains("--camera roof: the episode has"));
-    // The run wrote the same file next to the record; the order of the index differs from file to file.
+    // The run wrote the same file next to the record; the order of the index differs from file to
+    // file.
     let of_run = std::fs::read(dir.path().join("log/episodes/short-0-1.mcap")).unwrap();
     assert_eq!((count(&of_run, "/wildcity/step"), of_run.len()), (9, bytes.len()));
     let none = ["run", "short.json", "--twins", twins, "--mcap", "false", "--out", "none"];

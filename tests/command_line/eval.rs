@@ -16,7 +16,8 @@ pub(crate) const HEIGHT: u32 = 80;
 /// The amount that is added to each value of the image `b`, of 255.
 pub(crate) const OFF: u8 = 10;
 
-/// Names, positions and the rows of `R_world_to_cam` of cameras that look at the origin, each rolled a little.
+/// Names, positions and the rows of `R_world_to_cam` of cameras that look at the origin, each
+/// rolled a little.
 fn cameras() -> Vec<(&'static str, DVec3, [DVec3; 3])> {
     let camera = |(index, name): (usize, &'static str)| {
         let turn = 0.7 * index as f64;
@@ -183,7 +184,8 @@ fn lists_nerfstudio_and_colmap_give_the_same() {
     let (_, list) = eval(at, "scene.ply", "views.jsonl", &[]);
     let (_, nerfstudio) = eval(at, "scene.ply", "transforms.json", &[]);
     let (_, colmap) = eval(at, "scene.ply", "sparse/0", &[]);
-    // A pose that is written in other axes differs in its last bits, and so may a pixel by one of 255.
+    // A pose that is written in other axes differs in its last bits, and so may a pixel by one of
+    // 255.
     for other in [&nerfstudio, &colmap] {
         assert_eq!(other["images"].as_array().unwrap().len(), 3);
         for (image, listed) in
@@ -270,7 +272,8 @@ fn masked_pixels_do_not_count_and_smaller_images_scale_their_cameras() {
         let numbers = [&image["psnr_db"], &image["ssim"], &image["flip"], &image["counted"]];
         assert_eq!(numbers, [&json!("inf"), &json!(1.0), &json!(0.0), &json!(0.5)]);
     }
-    // Names of transforms.json start with the folder of the images; masks need not be in a folder of that name.
+    // Names of transforms.json start with the folder of the images; masks need not be in a folder
+    // of that name.
     let frames = transforms(&json!({})).replace("front/", "images/front/");
     fs::write(at.join("transforms.json"), frames).unwrap();
     mask.save(at.join("masks/front/b.png")).unwrap();
@@ -375,8 +378,8 @@ fn what_is_missing_or_of_another_size_is_named() {
     assert!(said.contains("--images nothing.json"), "{said}");
 }
 
-/// The only image of a real capture that is not ours: by another renderer, in f64. No photograph with its camera is in
-/// the data.
+/// The only image of a real capture that is not ours: by another renderer, in f64. No photograph
+/// with its camera is in the data.
 #[test]
 fn another_programs_image_of_a_real_capture_is_met() {
     let Some(scene) = real("scenes/skull/skull.ply") else { return };

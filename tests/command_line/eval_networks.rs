@@ -149,7 +149,8 @@ fn boxes_hide_what_moves_and_lidar_measures_depth() {
     let (_, made) = eval(at, "scene.ply", "views.jsonl", &with);
     let images = made["images"].as_array().unwrap();
     for image in images {
-        // A metre at 4 m and 90 px per unit: some 22 px of 120 x 80, grown by 3 px, and more at an angle.
+        // A metre at 4 m and 90 px per unit: some 22 px of 120 x 80, grown by 3 px, and more at an
+        // angle.
         let moving = number(&image["moving"]);
         assert!((0.05..0.25).contains(&moving), "{image}");
         assert!((number(&image["counted"]) - (1.0 - moving)).abs() < 1e-9, "{image}");
@@ -220,7 +221,7 @@ fn views_beside_the_drive_are_told_without_a_real_image() {
     let catalog = Catalog::open(&at.join("twins")).unwrap();
     let new = |name, trajectories| NewVersion {
         trajectories,
-        ..NewVersion::of(name, &scene, Provenance::of("test".to_owned()))
+        ..NewVersion::from_gaussians(name, &scene, Provenance::new("test".to_owned()))
     };
     catalog.commit(new("street", vec![log]), &mut |_, _| {}).unwrap();
     catalog.commit(new("bare", Vec::new()), &mut |_, _| {}).unwrap();

@@ -11,8 +11,8 @@ use wildcity_twin::store::Catalog;
 fn memory_does_not_grow_with_the_route() {
     let dir = tempfile::tempdir().unwrap();
     let [one, three] = ["1", "3"].map(|km| peak_bytes(km, dir.path()));
-    // A longer route may have denser parts, but holding all Gaussians of 2 km more, at 104 bytes each, would take
-    // 210 MB.
+    // A longer route may have denser parts, but holding all Gaussians of 2 km more, at 104 bytes
+    // each, would take 210 MB.
     assert!(three < one + (50 << 20), "{one} bytes at 1 km, {three} at 3 km");
 
     let version = Catalog::open(dir.path()).unwrap().version("km3", None).unwrap();

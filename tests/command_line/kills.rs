@@ -1,5 +1,5 @@
-//! kill -9 of a server at any point of a push: the old version or the new one, and the client's next
-//! try succeeds.
+//! kill -9 of a server at any point of a push: the old version or the new one, and the client's
+//! next try succeeds.
 
 use std::io::{BufRead as _, BufReader};
 use std::path::Path;
@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use wildcity_client::{ConnectOptions, HttpClient, PushState};
 use wildcity_twin::store::Catalog;
 
-use crate::http::{push_of, write};
+use crate::http::{new_push, write};
 use crate::scene_files::{Random, gaussians};
 use crate::support;
 
@@ -57,7 +57,7 @@ impl Drop for Serving {
 /// Uploads and pushes a file under an id, and returns the version.
 async fn push(client: HttpClient, path: std::path::PathBuf, id: String) -> u64 {
     let upload = client.upload(&path, &mut |_, _| {}).await.unwrap();
-    let mut asked = push_of(&[&upload.id]);
+    let mut asked = new_push(&[&upload.id]);
     asked.id = Some(id);
     let begun = client.push("test", &asked).await.unwrap();
     let ended = client.wait_for_push(begun, &mut |_| {}).await.unwrap();
@@ -101,9 +101,10 @@ async fn a_killed_server_has_the_old_version_or_the_new_one() {
         let pushing = tokio::spawn(push(serving.client.clone(), path.clone(), id.clone()));
         tokio::time::sleep(whole.mul_f64(random.unit())).await;
         // The load of the machine changes, so the kills follow the current duration of a push.
-        match pushing.is_finished() {
-            true => whole = whole * 7 / 8,
-            false => on_the_way += 1,
+        if pushing.is_finished() {
+            whole = whole * 7 / 8
+        } else {
+            on_the_way += 1
         }
         drop(serving);
         pushing.abort();

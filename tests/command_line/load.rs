@@ -49,8 +49,8 @@ async fn memory_is_flat_over_thousands_of_steps() {
     assert!(after < before + u64::from(STEPS) * 460, "{before} bytes grew to {after}");
 }
 
-/// Drives a car the same way twice, in one session: as many bytes in memory after the second lap as in the
-/// first, the same bytes seen, and a clock that is exact.
+/// Drives a car the same way twice, in one session: as many bytes in memory after the second lap as
+/// in the first, the same bytes seen, and a clock that is exact.
 async fn two_laps(steps: u64) {
     // The export of a record takes memory of its own, which this test does not measure.
     let served = Served::with(&["--mcap", "false"]);
@@ -84,7 +84,8 @@ async fn two_laps(steps: u64) {
     assert_eq!(laps[0], laps[1], "what is driven twice is the same");
     let (early, late) = (early_bytes.unwrap(), served.rss());
     eprintln!("2 x {steps} steps: {early} bytes in the middle of the first lap, {late} at the end");
-    // One and a half laps lie between. A leak of 70 B per step would be detected, in long laps a smaller one.
+    // One and a half laps lie between. A leak of 70 B per step would be detected, in long laps a
+    // smaller one.
     let accepted = (70 * steps * 3 / 2).min(1 << 20);
     assert!(late < early + accepted, "{early} bytes grew to {late}");
 }
@@ -152,8 +153,8 @@ async fn connections_above_the_limit_are_refused() {
     second.open(json!({})).await;
 }
 
-/// A client with a small receive buffer that never reads an image of this size: its megabytes do not fit anywhere. Linux
-/// keeps 4 MB of a connection.
+/// A client with a small receive buffer that never reads an image of this size: its megabytes do
+/// not fit anywhere. Linux keeps 4 MB of a connection.
 async fn client_that_never_reads(server: &TestServer, name: &str, size_px: [u32; 2]) -> Agent {
     let socket = TcpSocket::new_v4().unwrap();
     socket.set_recv_buffer_size(4096).unwrap();

@@ -207,7 +207,8 @@ fn actor(arguments: &[&str]) -> (bool, String, String) {
     (done.status.success(), text(done.stdout), text(done.stderr))
 }
 
-/// `wildcity actor push` to a server, and `wildcity actor import` on this machine, with the same options.
+/// `wildcity actor push` to a server, and `wildcity actor import` on this machine, with the same
+/// options.
 #[tokio::test(flavor = "multi_thread")]
 async fn an_actor_is_pushed_as_it_is_imported() {
     let Some(van) = crate::data::real("vehicles/kenney_carkit/van.glb") else { return };

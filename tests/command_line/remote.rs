@@ -95,7 +95,8 @@ fn an_actor_is_pushed_to_an_object_store() {
     let listed = || run(&["list", "--twins", &S3::url()]).1;
     let car = file("car", 1);
 
-    // An object that cannot be written: nothing is there. The server tries more often than a test would.
+    // An object that cannot be written: nothing is there. The server tries more often than a test
+    // would.
     s3.fail("PUT", "/.actors/objects/", 100, Fault::Status(403));
     let (done, _, error) = run(&["push", &car, "--server", &url]);
     assert!(!done && error.contains("cannot push the actor"), "{error}");

@@ -25,7 +25,8 @@ async fn the_command_verifies_what_the_cpu_backend_served() {
     let running = wildcity_server::start(config).await.unwrap();
     let mut agent = Agent::connect(running.address()).await;
     agent.hello().await;
-    // The session overrides the profile: the replay must use the recorded profile and not the twin's.
+    // The session overrides the profile: the replay must use the recorded profile and not the
+    // twin's.
     let own =
         json!({ "session": "a", "profile": { "blur": 4.0 }, "outputs": { "encoding": "raw" } });
     agent.open(own).await;

@@ -42,7 +42,7 @@ fn a_server_on_the_cpu_has_no_library_of_a_gpu_in_memory() {
 const SMALLEST: [&str; 4] = ["--stations", "2", "--window", "16"];
 
 /// The command's report of the street in a directory, in its folder `report`.
-fn report_of(dir: &Path, sampling: [&str; 4], more: &[&str]) -> Output {
+fn run_report(dir: &Path, sampling: [&str; 4], more: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_wildcity"))
         .args(["report", "street", "--backend", "cpu"])
         .args(sampling)
@@ -81,7 +81,7 @@ fn the_command_writes_a_self_contained_page_and_a_profile_that_serve_reads() {
     commit(dir.path(), vec![drive()]);
     let out = dir.path().join("report");
     let run =
-        report_of(dir.path(), ["--stations", "2", "--window", "48"], &["--at-least-db", "30"]);
+        run_report(dir.path(), ["--stations", "2", "--window", "48"], &["--at-least-db", "30"]);
     let said = String::from_utf8_lossy(&run.stderr);
     assert!(run.status.success(), "{said}");
     let read = |name: &str| std::fs::read_to_string(out.join(name)).unwrap();
@@ -178,7 +178,7 @@ fn without_a_recommendation_no_profile_is_left_and_the_report_says_why() {
         std::fs::write(&file, "{}").unwrap();
     };
     an_earlier_one();
-    let unmet = report_of(dir.path(), SMALLEST, &["--at-least-db", "500"]);
+    let unmet = run_report(dir.path(), SMALLEST, &["--at-least-db", "500"]);
     let said = String::from_utf8_lossy(&unmet.stderr);
     assert!(!unmet.status.success() && said.contains("at least 500 dB"), "{said}");
     assert!(!file.exists());
@@ -191,7 +191,7 @@ fn without_a_recommendation_no_profile_is_left_and_the_report_says_why() {
     assert!(read("report.html").contains("<b>at least 500 dB</b>: nothing is recommended"));
     // The old profile is also removed if there is no goal.
     an_earlier_one();
-    assert!(report_of(dir.path(), SMALLEST, &[]).status.success() && !file.exists());
+    assert!(run_report(dir.path(), SMALLEST, &[]).status.success() && !file.exists());
     let report: Value = serde_json::from_str(&read("report.json")).unwrap();
     assert_eq!(report["wanted"], Value::Null);
 }

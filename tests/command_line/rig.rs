@@ -82,7 +82,8 @@ fn points_are_reprojected_through_the_lenses_of_a_real_car() {
 
 #[test]
 fn a_camera_with_reprojection_errors_fails_the_check() {
-    // A view all around on 48 x 32 px: the lens distorts the image of a point, so that its centroid is off.
+    // A view all around on 48 x 32 px: the lens distorts the image of a point, so that its centroid
+    // is off.
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("rig.json");
     let place = r#""camera_to_rig": {"xyz": [0, 0, 1.5], "q": [0.5, -0.5, 0.5, -0.5]}"#;

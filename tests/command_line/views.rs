@@ -45,7 +45,7 @@ fn images_are_stored_scaled_along_the_drive_and_removed() {
     let log = Trajectory { name: "log".to_owned(), keyframes: (-3..20).map(keyframe).collect() };
     let new = |name, trajectories| NewVersion {
         trajectories,
-        ..NewVersion::of(name, &scene, Provenance::of("test".to_owned()))
+        ..NewVersion::from_gaussians(name, &scene, Provenance::new("test".to_owned()))
     };
     catalog.commit(new("street", vec![log]), &mut |_, _| {}).unwrap();
     catalog.commit(new("bare", Vec::new()), &mut |_, _| {}).unwrap();
@@ -118,7 +118,7 @@ fn masks_and_exposures_of_the_list_are_stored_and_a_bend_leaves_no_gap() {
     let scene = gaussians(100, 0, 10.0, 1);
     let street = NewVersion {
         trajectories: vec![log],
-        ..NewVersion::of("street", &scene, Provenance::of("test".to_owned()))
+        ..NewVersion::from_gaussians("street", &scene, Provenance::new("test".to_owned()))
     };
     catalog.commit(street, &mut |_, _| {}).unwrap();
     let views = ["twin", "views", "street", "--twins", "twins", "--images", "list.jsonl"];

@@ -7,7 +7,7 @@ use std::time::{Duration, SystemTime};
 use prost::Message as _;
 use serde_json::{Value, json};
 use wildcity_episode::{
-    EpisodeExport, EpisodeFile, ExportError, ExportedImage, export, export_file, mcap_of,
+    EpisodeExport, EpisodeFile, ExportError, ExportedImage, export, export_file, mcap_path,
     remove_leftovers, write_whole,
 };
 
@@ -100,7 +100,7 @@ fn a_full_disk_is_an_error_and_no_panic() {
     let nowhere = dir.path().join("nowhere/made-1.mcap");
     let error = export_file(&record, &nowhere).unwrap_err().to_string();
     assert!(error.contains("nowhere/made-1.mcap"), "{error}");
-    let exported = export_file(&record, &mcap_of(&record)).unwrap();
+    let exported = export_file(&record, &mcap_path(&record)).unwrap();
     let bytes = std::fs::read(dir.path().join("made-1.mcap")).unwrap();
     assert_eq!(mcap::MessageStream::new(&bytes).unwrap().count() as u64, exported.messages);
 }
@@ -224,9 +224,8 @@ fn images_are_between_the_steps_in_the_order_of_time() {
     assert!(times.is_sorted(), "{times:?}");
 }
 
-/// All of them write at the same time: each closure waits for the others.
-/// One begins and ends while another is under way: in one thread, so that a fault in their names fails and waits for
-/// nothing.
+/// All of them write at the same time: each closure waits for the others. One begins and ends while
+/// another is under way: in one thread, so that a fault in their names fails and waits for nothing.
 #[test]
 fn exports_to_one_name_at_once_do_not_meet() {
     let dir = tempfile::tempdir().unwrap();

@@ -109,7 +109,8 @@ fn what_later_builds_add_is_passed_over() {
 #[test]
 fn a_step_that_was_taken_again_counts_once() {
     let mut lines = Made { steps: 3, ..Made::default() }.lines();
-    // Back to step 1 and on from there: lines are header, scenario, then actors and frame of each step.
+    // Back to step 1 and on from there: lines are header, scenario, then actors and frame of each
+    // step.
     let again = lines[6..8].to_vec();
     lines.splice(10..10, again);
     let read = written::read(&lines);

@@ -82,7 +82,7 @@ fn depth_is_compared_as_numpy_does() {
         opacity: &opacity,
         counts: Some(&counts),
     };
-    let found = LidarDepth::of(&world.points_m, &map);
+    let found = LidarDepth::compare(&world.points_m, &map);
     let wanted = golden.depth;
     assert_eq!(found.points, wanted.points);
     assert!((found.mean_m - wanted.mean_m).abs() < 1e-9, "{found:?}");
@@ -92,7 +92,7 @@ fn depth_is_compared_as_numpy_does() {
         assert!((bin.mean_m - mean_m).abs() < 1e-9, "{bin:?}");
     }
     // A map that is 0.25 m off everywhere.
-    let exact = LidarDepth::of(&[], &map);
+    let exact = LidarDepth::compare(&[], &map);
     assert!(exact.points == 0 && exact.mean_m.is_nan() && exact.bins[0].mean_m.is_nan());
 }
 
@@ -125,7 +125,7 @@ fn what_has_no_depth_does_not_count_and_the_median_lies_between_the_middle_two()
         opacity: &vec![1.0; 300],
         counts: None,
     };
-    let found = LidarDepth::of(&points_m, &map);
+    let found = LidarDepth::compare(&points_m, &map);
     assert_eq!((found.points, found.mean_m, found.median_m), (4, 2.875, 2.0));
 }
 

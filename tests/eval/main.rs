@@ -1,4 +1,5 @@
-//! Boxes, LiDAR and KID against programs of other authors, or written again in numpy; and means of images.
+//! Boxes, LiDAR and KID against programs of other authors, or written again in numpy; and means of
+//! images.
 //!
 //! `plant.py` plants faults into the package, and says which test notices each.
 

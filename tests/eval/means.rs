@@ -1,4 +1,5 @@
-//! Means over images: gains of a repair, networks, LiDAR; the order of images, and what JSON and CSV say of them.
+//! Means over images: gains of a repair, networks, LiDAR; the order of images, and what JSON and
+//! CSV say of them.
 
 use wildcity_eval::{
     EvaluatedImage, Evaluation, LidarBin, LidarDepth, Pair, PairScores, Scored, Subject,
@@ -10,7 +11,7 @@ fn scores(off: u8, lpips: Option<f64>) -> PairScores {
     let truth: Vec<u8> = (0..3 * 16 * 16).map(|at| 60 + (at * 7919 % 90) as u8).collect();
     let rendered = truth.iter().enumerate().map(|(at, value)| value + off + (at * 31 % 5) as u8);
     let pair = Pair::new([16, 16], truth.clone(), rendered.collect(), None).unwrap();
-    let mut scores = PairScores::of(&pair, true);
+    let mut scores = PairScores::compare(&pair, true);
     scores.scores.lpips = lpips;
     scores
 }
@@ -45,7 +46,7 @@ fn near(found: f64, wanted: f64) {
 fn flat(name: &str, off: u8, is_hidden: bool) -> EvaluatedImage {
     let counts = is_hidden.then(|| vec![false; 144]);
     let pair = Pair::new([12, 12], vec![100; 432], vec![100 + off; 432], counts).unwrap();
-    EvaluatedImage::new(name.to_owned(), [12, 12], 1.0, &PairScores::of(&pair, false))
+    EvaluatedImage::new(name.to_owned(), [12, 12], 1.0, &PairScores::compare(&pair, false))
 }
 
 #[test]
@@ -127,14 +128,14 @@ fn a_mask_that_leaves_pixels_but_no_window_takes_no_mean_away() {
     let truth = vec![100; 3 * 16 * 16];
     let counts = (0..256).map(|at| at == 100).collect();
     let pair = Pair::new([16, 16], truth.clone(), vec![104; 3 * 256], Some(counts)).unwrap();
-    let narrow = PairScores::of(&pair, true);
+    let narrow = PairScores::compare(&pair, true);
     assert!(narrow.scores.ssim.is_nan() && narrow.scores.psnr_db.is_finite());
     let made = evaluation(vec![image("a.png", &whole), image("b.png", &narrow)]);
     near(made.all.rendered.ssim, whole.scores.ssim);
     near(made.all.rendered.psnr_db, 0.5 * (whole.scores.psnr_db + narrow.scores.psnr_db));
     // An image without pixels is in no mean.
     let nothing = Pair::new([16, 16], truth.clone(), truth, Some(vec![false; 256])).unwrap();
-    let nothing = PairScores::of(&nothing, true);
+    let nothing = PairScores::compare(&nothing, true);
     let made = evaluation(vec![image("a.png", &whole), image("b.png", &nothing)]);
     assert_eq!(made.all.images, 1);
 }

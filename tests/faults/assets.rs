@@ -1,4 +1,5 @@
-//! Assets of actors on a disk that fails to read: a failure hides no other asset, and gives no name away.
+//! Assets of actors on a disk that fails to read: a failure hides no other asset, and gives no name
+//! away.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -24,7 +25,7 @@ fn asset(name: &str, count: usize) -> ActorAsset {
         name: name.to_owned(),
         class: ActorClass::Object,
         box_: ActorBox { length_m: 1.0, width_m: 1.0, height_m: 1.0 },
-        provenance: Provenance::of("test".to_owned()),
+        provenance: Provenance::new("test".to_owned()),
     };
     ActorAsset::new(&gaussians, description).unwrap()
 }

@@ -1,11 +1,12 @@
-//! An object store in memory that fails requests, loses answers, and stops the process between two requests.
+//! An object store in memory that fails requests, loses answers, and stops the process between two
+//! requests.
 //!
-//! A put is atomic and visible at once, as S3 guarantees. Faults are in the requests: a request fails before or after
-//! it took effect, and the last request of a process that is stopped takes effect now, later, or never. "Later" is
-//! during the next process, for puts that replace nothing.
+//! A put is atomic and visible at once, as S3 guarantees. Faults are in the requests: a request
+//! fails before or after it took effect, and the last request of a process that is stopped takes
+//! effect now, later, or never. "Later" is during the next process, for puts that replace nothing.
 //!
-//! Requests run on one thread, each with its repetitions in the order in which they start, so that a history follows
-//! from its seed.
+//! Requests run on one thread, each with its repetitions in the order in which they start, so that
+//! a history follows from its seed.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;

@@ -1,10 +1,10 @@
-//! A disk in memory that forgets what was not synced, fails at reads and writes, and stops the process between two
-//! writes; and a clock that jumps.
+//! A disk in memory that forgets what was not synced, fails at reads and writes, and stops the
+//! process between two writes; and a clock that jumps.
 //!
-//! The disk has two states. The *live* one is what processes see. The *durable* one has the files as they were last
-//! synced, and the names at the last sync of their directory. After a power cut, each name that was not synced is old
-//! or new, and each file that was not synced has its old content, a part of the new one, or all of it. File systems
-//! allow any combination of these.
+//! The disk has two states. The *live* one is what processes see. The *durable* one has the files
+//! as they were last synced, and the names at the last sync of their directory. After a power cut,
+//! each name that was not synced is old or new, and each file that was not synced has its old
+//! content, a part of the new one, or all of it. File systems allow any combination of these.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{self, Cursor, ErrorKind, Read, Seek, SeekFrom, Write};
@@ -38,7 +38,8 @@ pub(crate) enum Plant {
     FailedReadIsAbsent,
     /// The content of files is not synced.
     UnsyncedFiles,
-    /// An unfinished upload counts with the bytes that were announced, and not with those that arrived.
+    /// An unfinished upload counts with the bytes that were announced, and not with those that
+    /// arrived.
     AnnouncedCounted,
 }
 
@@ -49,7 +50,8 @@ pub(crate) enum Fault {
     Kill,
     /// The power fails. In an object store: the process is killed during its request.
     PowerCut,
-    /// The disk is full, for only this write. An object store refuses one to three writes, or loses the answers.
+    /// The disk is full, for only this write. An object store refuses one to three writes, or loses
+    /// the answers.
     Full,
 }
 

@@ -69,7 +69,8 @@ const WRITES: u64 = 60;
 /// Reads of a push, about.
 const READS: u64 = 40;
 
-/// Approximate number of reads of a version: the latest is looked up, then the version, and then its sections are read.
+/// Approximate number of reads of a version: the latest is looked up, then the version, and then
+/// its sections are read.
 const SECTION_READS: u64 = 16;
 
 /// Reads of a garbage collection that removes objects, about: it looks at each object twice.
@@ -77,7 +78,7 @@ const COLLECTION_READS: u64 = 120;
 
 impl History {
     /// The history of a seed.
-    pub(crate) fn of(seed: u64) -> Self {
+    pub(crate) fn from_seed(seed: u64) -> Self {
         let mut random = Random::new(seed);
         let count = 3 + random.below(8);
         // Garbage is removed only by the second collection, so that some histories have many.

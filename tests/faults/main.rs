@@ -1,20 +1,23 @@
-//! Simulated faults: thousands of histories of commits, leases, garbage collections, rollbacks and reads on a disk that
-//! fails, and in an object store that refuses requests and loses answers, with a clock that jumps, in a process that is
-//! killed between any two writes. After each history no acknowledged version is lost, no version is mixed, no data in
-//! use is removed, and the store still works.
+//! Simulated faults: thousands of histories of commits, leases, garbage collections, rollbacks and
+//! reads on a disk that fails, and in an object store that refuses requests and loses answers, with
+//! a clock that jumps, in a process that is killed between any two writes. After each history no
+//! acknowledged version is lost, no version is mixed, no data in use is removed, and the store
+//! still works.
 //!
-//! Reads fail as well: with an error, an early end, wrong bits, or a delay of a minute. A failed read causes an error
-//! of the operation that needed it, and never different content; after it, the same read succeeds. Wrong bits are
-//! simulated only in objects: log records, leases and the state of garbage collection have no digest.
+//! Reads fail as well: with an error, an early end, wrong bits, or a delay of a minute. A failed
+//! read causes an error of the operation that needed it, and never different content; after it, the
+//! same read succeeds. Wrong bits are simulated only in objects: log records, leases and the state
+//! of garbage collection have no digest.
 //!
-//! Not simulated: two processes that write at once, requests to the object store that are carried out in another
-//! order than they began, the disk cache of remote twins, and wrong bits that stay.
+//! Not simulated: two processes that write at once, requests to the object store that are carried
+//! out in another order than they began, the disk cache of remote twins, and wrong bits that stay.
 //!
-//! Uploads and connections are simulated in the package of the server, over the same disk: `tests/faults/server`.
+//! Uploads and connections are simulated in the package of the server, over the same disk:
+//! `tests/faults/server`.
 //!
-//! A history follows only from its seed. A failure prints the seed and the shortest history that still fails; `SEED=n
-//! cargo test -p wildcity-twin --test faults one_history` runs one on both, and `HISTORIES=n ... many_histories` any
-//! number, from the seed `FIRST_SEED` on.
+//! A history follows only from its seed. A failure prints the seed and the shortest history that
+//! still fails; `SEED=n cargo test -p wildcity-twin --test faults one_history` runs one on both,
+//! and `HISTORIES=n ... many_histories` any number, from the seed `FIRST_SEED` on.
 
 mod assets;
 mod bucket;
@@ -64,7 +67,7 @@ fn run(kind: Kind, first: u64, histories: u64, plant: Option<Plant>) -> Option<F
                     if seed >= first + histories || failed.load(Ordering::Relaxed) < seed {
                         return;
                     }
-                    if History::of(seed).run(kind, plant).is_err() {
+                    if History::from_seed(seed).run(kind, plant).is_err() {
                         failed.fetch_min(seed, Ordering::Relaxed);
                     }
                     if seed.is_multiple_of(HISTORIES_TO_TELL) {
@@ -75,7 +78,7 @@ fn run(kind: Kind, first: u64, histories: u64, plant: Option<Plant>) -> Option<F
         }
     });
     let seed = failed.into_inner();
-    (seed < u64::MAX).then(|| History::of(seed).shrunk(kind, plant))
+    (seed < u64::MAX).then(|| History::from_seed(seed).shrunk(kind, plant))
 }
 
 fn run_or_panic(kind: Kind, histories: u64) {
@@ -102,14 +105,14 @@ fn many_histories_in_an_object_store() {
 fn one_history() {
     let seed = number("SEED").unwrap_or(1);
     for kind in [Kind::Disk, Kind::Bucket] {
-        if History::of(seed).run(kind, None).is_err() {
-            panic!("{kind:?}, {}", History::of(seed).shrunk(kind, None));
+        if History::from_seed(seed).run(kind, None).is_err() {
+            panic!("{kind:?}, {}", History::from_seed(seed).shrunk(kind, None));
         }
     }
 }
 
-/// The simulation detects the mutations that it is made for: each planted fault of the store's use of the disk, or of
-/// an object store.
+/// The simulation detects the mutations that it is made for: each planted fault of the store's use
+/// of the disk, or of an object store.
 #[test]
 fn planted_faults_are_found() {
     let plants = [

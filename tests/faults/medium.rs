@@ -61,8 +61,9 @@ pub(crate) trait Medium: Debug {
     /// The files of leases.
     fn leases_left(&self) -> Vec<String>;
 
-    /// Whether a lock keeps the version of a session and the objects of a commit in preparation. An object store has no
-    /// locks: a session renews its lease in time, and garbage is not collected while commits are in preparation.
+    /// Whether a lock keeps the version of a session and the objects of a commit in preparation. An
+    /// object store has no locks: a session renews its lease in time, and garbage is not collected
+    /// while commits are in preparation.
     fn has_locks(&self) -> bool;
 }
 

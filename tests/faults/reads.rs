@@ -18,8 +18,8 @@ pub(crate) enum ReadFault {
 pub(crate) enum Carries {
     /// Names and sizes.
     Names,
-    /// The content of a file without a digest: log records, leases, the state of garbage collection,
-    /// announcements of uploads.
+    /// The content of a file without a digest: log records, leases, the state of garbage
+    /// collection, announcements of uploads.
     Content,
     /// The content of a file with a digest.
     Digested,

@@ -1,6 +1,6 @@
-//! Unsynced writes of a process that was stopped or failed to sync: all later processes see them, and a power cut may
-//! undo them. Each history has such a fault at each of the writes of one operation, continues, and ends with a power
-//! cut.
+//! Unsynced writes of a process that was stopped or failed to sync: all later processes see them,
+//! and a power cut may undo them. Each history has such a fault at each of the writes of one
+//! operation, continues, and ends with a power cut.
 
 use crate::disk::Fault;
 use crate::history::{History, Operation, Step};
@@ -39,7 +39,8 @@ fn run(before: &[Operation], faulty: (Operation, u64, Fault), after: &[Step], se
     }
 }
 
-/// Checks that an operation makes fewer than [`WRITES`] writes: a fault after this number does not happen.
+/// Checks that an operation makes fewer than [`WRITES`] writes: a fault after this number does not
+/// happen.
 fn check_writes(before: &[Operation], operation: Operation, writes: u64) {
     let mut world = World::new(Kind::Disk, None).unwrap();
     before.iter().for_each(|&one| world.run(&step(1, one, None)).unwrap());
@@ -75,7 +76,8 @@ fn no_version_relies_on_a_folder_that_is_lost() {
 fn a_collected_version_stays_collected() {
     check(&[PUSH, OTHER_PUSH], COLLECT, &[COLLECT, COLLECT]);
     check(&[PUSH, OTHER_PUSH, COLLECT], COLLECT, &[COLLECT]);
-    // Files of a killed commit are removed at the next start, together with all files that no version names.
+    // Files of a killed commit are removed at the next start, together with all files that no
+    // version names.
     check(&[PUSH, OTHER_PUSH, COLLECT, PREPARE], COLLECT, &[]);
 }
 

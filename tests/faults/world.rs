@@ -47,7 +47,8 @@ pub(crate) struct World {
     catalog: Catalog,
     sessions: Vec<Session>,
     prepared: Option<Prepared>,
-    /// Versions that were acknowledged to a client: they must stay, until garbage collection may remove them.
+    /// Versions that were acknowledged to a client: they must stay, until garbage collection may
+    /// remove them.
     acknowledged: BTreeMap<u64, Cells>,
     /// Possible contents of versions of interrupted pushes, which were not acknowledged.
     possible: BTreeMap<u64, Vec<Cells>>,
@@ -77,16 +78,16 @@ fn storage() -> StorageOptions {
 }
 
 fn provenance() -> Provenance {
-    Provenance::of("simulation".to_owned())
+    Provenance::new("simulation".to_owned())
 }
 
 /// The cells of a bit mask, of a content.
-fn cells_of(mask: u8, content: u64) -> Cells {
+fn cells(mask: u8, content: u64) -> Cells {
     (0..3).filter(|cell| mask & (1 << cell) != 0).map(|cell| ([cell, 0], content)).collect()
 }
 
 /// As many Gaussians in each cell as it is to have.
-fn gaussians_of(cells: &Cells) -> Gaussians {
+fn gaussians(cells: &Cells) -> Gaussians {
     let mut gaussians = Gaussians::default();
     for (cell, count) in cells {
         for index in 0..*count {
@@ -100,7 +101,7 @@ fn gaussians_of(cells: &Cells) -> Gaussians {
     gaussians
 }
 
-fn content_of(version: &Version) -> Cells {
+fn content(version: &Version) -> Cells {
     version.manifest.chunks.iter().map(|chunk| (chunk.cell, chunk.count)).collect()
 }
 
@@ -158,7 +159,8 @@ impl World {
             Err(Failed::Broken(promise)) => return Err(promise),
             // A full disk or store refuses the write; without a fault every operation succeeds.
             Err(Failed::Refused(_)) if is_full => {}
-            // A read that fails is an error of the file, and never means that the file does not exist.
+            // A read that fails is an error of the file, and never means that the file does not
+            // exist.
             Err(Failed::Refused(StoreError::Io { .. } | StoreError::Damaged { .. }))
                 if has_failed_reads => {}
             Err(Failed::Refused(error)) => return Err(format!("{error} without a fault")),
@@ -170,8 +172,8 @@ impl World {
     fn carry_out(&mut self, operation: Operation) -> Result<(), Failed> {
         match operation {
             Operation::Read { back } => return self.read(back),
-            Operation::Push { cells, content } => self.push(&cells_of(cells, content)),
-            Operation::Prepare { cells, content } => self.prepare(cells_of(cells, content)),
+            Operation::Push { cells, content } => self.push(&cells(cells, content)),
+            Operation::Prepare { cells, content } => self.prepare(cells(cells, content)),
             Operation::PublishPrepared => self.publish_prepared(),
             Operation::Rollback { back } => self.rollback(back),
             Operation::Open { back } => self.open_session(back),
@@ -211,9 +213,9 @@ impl World {
         Ok(latest.map(|latest| latest.saturating_sub(back).max(1)))
     }
 
-    /// Carries out a commit upon the version `before`, and notes the answer to its client. `content` maps the content
-    /// of a version to that after the commit. The record of a stopped process may arrive meanwhile and be the version
-    /// below.
+    /// Carries out a commit upon the version `before`, and notes the answer to its client.
+    /// `content` maps the content of a version to that after the commit. The record of a stopped
+    /// process may arrive meanwhile and be the version below.
     fn commit(
         &mut self,
         before: u64,
@@ -247,13 +249,14 @@ impl World {
             result => result?,
         };
         if !self.medium.is_stopped() {
-            let found = content_of(&version);
-            // The version of a stopped process may have arrived, and have what the commit makes already.
+            let found = content(&version);
+            // The version of a stopped process may have arrived, and have what the commit makes
+            // already.
             let has_all = |cells: &Cells| *cells == found && content(cells) == found;
             let cells = match version.number {
                 _ if below.iter().any(has_all) => found,
                 number if number <= before + 1 => content(base),
-                number => content(&content_of(&self.catalog.version(TWIN, Some(number - 1))?)),
+                number => content(&content(&self.catalog.version(TWIN, Some(number - 1))?)),
             };
             self.acknowledged.insert(version.number, cells);
         }
@@ -263,8 +266,8 @@ impl World {
     fn push(&mut self, cells: &Cells) -> Result<(), StoreError> {
         let latest = self.latest()?;
         let before = latest.as_ref().map_or(0, |version| version.number);
-        let base = latest.as_ref().map(content_of).unwrap_or_default();
-        let gaussians = gaussians_of(cells);
+        let base = latest.as_ref().map(content).unwrap_or_default();
+        let gaussians = gaussians(cells);
         // A new twin replaces what another process has made of that name meanwhile.
         let content =
             |below: &Cells| if before == 0 { cells.clone() } else { merged(below, cells) };
@@ -272,7 +275,7 @@ impl World {
             if before == 0 {
                 let new = NewVersion {
                     storage: storage(),
-                    ..NewVersion::of(TWIN, &gaussians, provenance())
+                    ..NewVersion::from_gaussians(TWIN, &gaussians, provenance())
                 };
                 return world.catalog.commit(new, &mut |_, _| {});
             }
@@ -285,7 +288,7 @@ impl World {
     fn prepare(&mut self, cells: Cells) -> Result<(), StoreError> {
         let Some(latest) = self.latest()? else { return Ok(()) };
         let mut commit = self.catalog.begin(TWIN, CommitKind::Push, storage())?;
-        commit.put(&gaussians_of(&cells), None, &mut |_, _| {})?;
+        commit.put(&gaussians(&cells), None, &mut |_, _| {})?;
         self.prepared = Some(Prepared { commit, base: latest.number, cells, may_fail: false });
         Ok(())
     }
@@ -296,7 +299,7 @@ impl World {
         let Some(latest) = self.latest()? else { return Ok(()) };
         let published = self.commit(
             latest.number,
-            &content_of(&latest),
+            &content(&latest),
             |below| merged(below, &cells),
             |_| commit.change(base, cells_alone()),
         );
@@ -313,7 +316,7 @@ impl World {
         let Some(number) = self.number_before_latest(back)? else { return Ok(()) };
         let latest = self.catalog.latest(TWIN)?;
         let content = match self.catalog.version(TWIN, Some(number)) {
-            Ok(version) => content_of(&version),
+            Ok(version) => content(&version),
             Err(StoreError::GarbageCollected { .. }) if self.collectable.contains(&number) => {
                 return Ok(());
             }
@@ -332,7 +335,7 @@ impl World {
             }
             Err(error) => return Err(error),
         };
-        let cells = content_of(&self.catalog.version(TWIN, Some(number))?);
+        let cells = content(&self.catalog.version(TWIN, Some(number))?);
         self.sessions.push(Session { number, cells, lease });
         Ok(())
     }
@@ -372,7 +375,8 @@ impl World {
         Ok(())
     }
 
-    /// Lets the clock jump. If only a lease protects a session's version, a running process renews it in time.
+    /// Lets the clock jump. If only a lease protects a session's version, a running process renews
+    /// it in time.
     fn jump(&mut self, seconds: i64) -> Result<(), StoreError> {
         self.medium.apply_delayed_puts();
         self.clock.jump(seconds * 1_000_000);
@@ -432,7 +436,7 @@ impl World {
                 Failed::Refused(error) => format!("a session's version {number}: {error}"),
                 Failed::Broken(promise) => promise,
             })?;
-            if content_of(&version) != *cells {
+            if content(&version) != *cells {
                 return Err(format!("a session's version {number} changed"));
             }
         }
@@ -459,7 +463,7 @@ impl World {
                 }
                 version => version.map_err(|e| format!("version {number}: {e}"))?,
             };
-            let content = content_of(&version);
+            let content = content(&version);
             let is_possible = match self.acknowledged.get(&number) {
                 Some(told) => *told == content,
                 None => self
@@ -472,10 +476,7 @@ impl World {
             }
         }
         let checked = self.catalog.fsck(TWIN, &mut |_, _| {}).map_err(|e| e.to_string())?;
-        match checked.is_sound() {
-            true => self.check_sessions(),
-            false => Err(format!("fsck: {:?}", checked)),
-        }
+        if checked.is_sound() { self.check_sessions() } else { Err(format!("fsck: {:?}", checked)) }
     }
 
     /// Checks that the store still works, and that no unneeded object is left.
@@ -484,7 +485,7 @@ impl World {
         self.sessions.clear();
         self.prepared = None;
         let failed = |what: &'static str| move |e: StoreError| format!("{what}: {e}");
-        self.push(&cells_of(7, 9)).map_err(failed("a push"))?;
+        self.push(&cells(7, 9)).map_err(failed("a push"))?;
         let left = self.medium.leases_left();
         // The leases of processes that were stopped expire; those of sessions that ended are gone.
         let keep = Retention { versions: 1, grace: Duration::from_secs(60) };
@@ -510,5 +511,5 @@ fn open(medium: &dyn Medium, clock: &Arc<SimClock>) -> Result<Catalog, String> {
 
 fn cells_alone() -> VersionChange {
     let provenance = provenance();
-    VersionChange::of(provenance)
+    VersionChange::new(provenance)
 }

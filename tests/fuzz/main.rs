@@ -1,5 +1,6 @@
-//! The fuzz targets with simple mutations, for a bounded time, on stable. A failure prints the target, the seed and
-//! the bytes. `FUZZ_SECONDS=600 FUZZ_SEED=7 cargo test --test fuzz` runs longer.
+//! The fuzz targets with simple mutations, for a bounded time, on stable. A failure prints the
+//! target, the seed and the bytes. `FUZZ_SECONDS=600 FUZZ_SEED=7 cargo test --test fuzz` runs
+//! longer.
 
 #[path = "../support/root.rs"]
 mod root;
@@ -73,7 +74,8 @@ fn files(dir: &Path) -> Vec<Vec<u8>> {
     paths.iter().map(|path| fs::read(path).expect("a file")).collect()
 }
 
-/// The minimal files of each target: its folder in the corpus, or the golden vectors of the protocol.
+/// The minimal files of each target: its folder in the corpus, or the golden vectors of the
+/// protocol.
 fn corpus() -> BTreeMap<&'static str, Vec<Vec<u8>>> {
     let of = |name: &'static str| {
         let folder = match name {

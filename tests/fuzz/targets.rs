@@ -1,8 +1,8 @@
-//! The fuzz targets: one function per parser of bytes from outside. Each ends in an answer or an error, and never in a
-//! panic, a hang or an absurd allocation.
+//! The fuzz targets: one function per parser of bytes from outside. Each ends in an answer or an
+//! error, and never in a panic, a hang or an absurd allocation.
 //!
-//! `cargo fuzz run --fuzz-dir tests/fuzz scene` lets libFuzzer search (nightly); the test `fuzz` of this package does
-//! the same with simple mutations, for a bounded time, on stable.
+//! `cargo fuzz run --fuzz-dir tests/fuzz scene` lets libFuzzer search (nightly); the test `fuzz` of
+//! this package does the same with simple mutations, for a bounded time, on stable.
 
 use std::fs;
 
@@ -129,7 +129,8 @@ pub(crate) fn openscenario(data: &[u8]) {
     let _ = xosc::read(data, &settings);
 }
 
-/// The cameras of a capture: transforms.json, or cameras and images of COLMAP with a line of `===` between them.
+/// The cameras of a capture: transforms.json, or cameras and images of COLMAP with a line of `===`
+/// between them.
 pub(crate) fn capture(data: &[u8]) {
     let dir = tempfile::tempdir().expect("a directory");
     let file = |name: &str| dir.path().join(name);

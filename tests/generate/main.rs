@@ -1,4 +1,5 @@
-//! The demo street, and cities: the same every time, within the bounds of a twin, drivable, and closed.
+//! The demo street, and cities: the same every time, within the bounds of a twin, drivable, and
+//! closed.
 
 #[path = "../support/root.rs"]
 mod root;

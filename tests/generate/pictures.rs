@@ -60,9 +60,10 @@ fn every_camera_sees_daylight_without_holes() {
     assert!(seen_sky > 20_000, "{seen_sky}");
 }
 
-/// A camera with larger pixels of its own, and not one whose image is the native image shrunk: that filter makes thin splats
-/// fainter, by up to 0.4 % of the opacity of a native image, which is no hole of the street (`tests/render/small_images.rs`
-/// bounds its error). Opacity on average is at least 0.986 in native images, 0.983 in shrunk ones and 0.989 in these.
+/// A camera with larger pixels of its own, and not one whose image is the native image shrunk: that
+/// filter makes thin splats fainter, by up to 0.4 % of the opacity of a native image, which is no
+/// hole of the street (`tests/render/small_images.rs` bounds its error). Opacity on average is at
+/// least 0.986 in native images, 0.983 in shrunk ones and 0.989 in these.
 fn shrunk(camera: &Camera) -> Camera {
     let [width, height] = [camera.width_px, camera.height_px].map(|side| (side / SHRINK).into());
     let scaled = camera.scaled(width, height).expect("a quarter of a camera");

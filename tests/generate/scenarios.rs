@@ -1,5 +1,5 @@
-//! The demo's scenarios on the demo street: what they promise happens, and a driver that keeps its distance meets
-//! nothing.
+//! The demo's scenarios on the demo street: what they promise happens, and a driver that keeps its
+//! distance meets nothing.
 
 use wildcity_generate::{ActorModel, StreetSettings, street_map};
 use wildcity_scene::geometry::Pose;
@@ -96,7 +96,8 @@ impl Driven {
         self.names.iter().position(|other| other == name).unwrap()
     }
 
-    /// The ego's station, and the place of an actor relative to the ego's drive, while the actor is present.
+    /// The ego's station, and the place of an actor relative to the ego's drive, while the actor is
+    /// present.
     fn beside(&self, name: &str) -> Vec<(f64, CourseFootPoint)> {
         let course = Course::from_drive(&crate::DEMO.trajectory).unwrap();
         let index = self.index(name);
@@ -107,8 +108,8 @@ impl Driven {
             .collect()
     }
 
-    /// Asserts that cars from ahead keep to their own lane, 3.5 m to the left of the drive, and that at least one
-    /// passes the ego within some steps.
+    /// Asserts that cars from ahead keep to their own lane, 3.5 m to the left of the drive, and
+    /// that at least one passes the ego within some steps.
     fn check_oncoming(&self, steps: usize) {
         let oncoming = self.names.iter().filter(|name| name.starts_with("oncoming"));
         let passed = oncoming.map(|name| {

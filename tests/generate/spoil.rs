@@ -1,4 +1,5 @@
-//! Streets with synthetic errors: deterministic, nearly right on the drive, and wrong off the trajectory.
+//! Streets with synthetic errors: deterministic, nearly right on the drive, and wrong off the
+//! trajectory.
 
 use glam::DVec3;
 use wildcity_generate::{GenerateError, Spoil};
@@ -82,8 +83,8 @@ fn images_are_nearly_right_on_the_drive_and_worse_the_farther_beside_it() {
     assert!(psnr_db(&whole, 3.0) < beside_db - 2.0);
 }
 
-/// Mean PSNR of the three front cameras at a quarter of their sides, at stations along the drive and at an offset to
-/// its left.
+/// Mean PSNR of the three front cameras at a quarter of their sides, at stations along the drive
+/// and at an offset to its left.
 fn psnr_db(true_: &Scene, scene: &Scene, offset_m: f64) -> f64 {
     let rig = Rig::preset("vehicle6").expect("the vehicle is a preset");
     let cpu = Cpu::new(0, Simd::Best).expect("every machine has threads");

@@ -1,4 +1,5 @@
-//! Effects of a spoil on single Gaussians next to a straight drive: along the rays of the drive, and unseen from it.
+//! Effects of a spoil on single Gaussians next to a straight drive: along the rays of the drive,
+//! and unseen from it.
 
 use glam::{DQuat, DVec3};
 use wildcity_generate::Spoil;
@@ -62,7 +63,8 @@ impl Changed {
         Some(DVec3::from_array(*mean_m) - self.mean_m)
     }
 
-    /// How the first channel changes with the direction of a view: the colour's slope along x, y and z, without C1.
+    /// How the first channel changes with the direction of a view: the colour's slope along x, y
+    /// and z, without C1.
     fn slope(&self) -> Option<DVec3> {
         if self.after.is_empty() {
             return None;
@@ -88,9 +90,9 @@ fn eye_m(mean_m: DVec3, direction: DVec3) -> Option<DVec3> {
     (direction.z.abs() > 0.02).then(|| mean_m + direction * ((EYE_M - mean_m.z) / direction.z))
 }
 
-/// Whether a place is one that the cameras saw a Gaussian from: the side cameras are 0.3 m beside the middle, and
-/// they were behind it by 4 m and 0.8 times its distance from the drive: at the next keyframe after that, from the keyframe
-/// that is nearest to it, 0.5 m from the next.
+/// Whether a place is one that the cameras saw a Gaussian from: the side cameras are 0.3 m beside
+/// the middle, and they were behind it by 4 m and 0.8 times its distance from the drive: at the
+/// next keyframe after that, from the keyframe that is nearest to it, 0.5 m from the next.
 fn saw(eye_m: DVec3, mean_m: DVec3, within_m: f64) -> bool {
     let distance_m = DVec3::new(0.0, mean_m.y, mean_m.z - EYE_M).length();
     let before_m = 4.0 + 0.8 * distance_m;

@@ -138,7 +138,7 @@ fn a_chunk_that_was_dropped_is_dropped_from_the_device() {
     let many = Scene {
         placed: (0..8)
             .map(|seed| {
-                let chunk = placed::chunk_of(&placed::actor(20_000, 3, seed));
+                let chunk = placed::chunk(&placed::actor(20_000, 3, seed));
                 let pose = placed::on_street(30.0, 0.0, 0.0);
                 wildcity_scene::actor::PlacedChunk::at_rest(chunk, pose, seed as u16)
             })

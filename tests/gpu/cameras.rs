@@ -2,7 +2,7 @@
 //! for lenses is compiled.
 
 use glam::DVec3;
-use wildcity_render::compare::gaussians::{GaussianSpec, scene_of};
+use wildcity_render::compare::gaussians::{GaussianSpec, scene_from_specs};
 use wildcity_render::compare::reprojection::ReprojectionErrors;
 use wildcity_render::gpu::shaders::Shaders;
 use wildcity_render::gpu::{AdapterChoice, Gpu};
@@ -151,7 +151,7 @@ fn gaussians_that_pass_close_are_drawn_as_by_the_cpu() {
         sigma_m: DVec3::splat(0.05),
         ..GaussianSpec::default()
     };
-    let balls = scene_of(&[0, 1, 2, 3, 4].map(ball));
+    let balls = scene_from_specs(&[0, 1, 2, 3, 4].map(ball));
     let profile = RenderProfile::default();
     let truth = render_one(&cpu(), &balls, &profile, sideways_rolling_view());
     agree(&render_one(&*shared_gpu(), &balls, &profile, sideways_rolling_view()), &truth).unwrap();

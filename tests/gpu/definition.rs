@@ -24,7 +24,7 @@ pub(crate) struct Splat {
 }
 
 impl Splat {
-    fn of_backend(key: u32, splat: &layout::Splat) -> Self {
+    fn from_backend(key: u32, splat: &layout::Splat) -> Self {
         let slack = f64::from(EXTENT_SLACK_PX);
         Self {
             view: (key >> DEPTH_BITS) as usize,
@@ -38,7 +38,7 @@ impl Splat {
     }
 
     /// The Cholesky factor of `½ log2(e)` times the conic: `(l0 dx + l1 dy)² + (l2 dy)²`.
-    fn of_reference(view: usize, splat: &reference::Splat) -> Self {
+    fn from_reference(view: usize, splat: &reference::Splat) -> Self {
         let [xx, xy, yy] = (0.5 * std::f64::consts::LOG2_E * splat.conic).to_array();
         let l0 = xx.sqrt();
         Self {
@@ -75,7 +75,7 @@ impl Splat {
 /// The splats that a backend's stage project wrote.
 pub(crate) fn splats(between: &StageOutputs) -> Vec<Splat> {
     let pairs = between.keys.iter().zip(&between.splats);
-    pairs.map(|(&key, splat)| Splat::of_backend(key, splat)).collect()
+    pairs.map(|(&key, splat)| Splat::from_backend(key, splat)).collect()
 }
 
 /// Stage project by numerical differentiation: all splats in order of (view, global id), including those
@@ -84,7 +84,7 @@ pub(crate) fn project(frame: &Frame<'_>) -> Vec<Splat> {
     let mut all = Vec::new();
     for (index, view) in frame.views.iter().enumerate() {
         let splats = reference::project(frame.scene, frame.profile, view);
-        all.extend(splats.iter().map(|splat| Splat::of_reference(index, splat)));
+        all.extend(splats.iter().map(|splat| Splat::from_reference(index, splat)));
     }
     all
 }

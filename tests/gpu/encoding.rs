@@ -11,14 +11,14 @@ use wildcity_scene::chunk::{CLUSTER, column};
 use wildcity_scene::{RenderProfile, Scene, sh};
 
 use crate::definition::{self, Splat};
-use crate::gaussians::{GaussianSpec, forward_view, scene_of};
+use crate::gaussians::{GaussianSpec, forward_view, scene_from_specs};
 use crate::gpu::{gpu, gpu_with};
 use crate::scene_files::Random;
 
 /// Three clusters side by side in one chunk, all in front of the camera, with colours of an SH degree.
 fn wall(sh_degree: u8) -> wildcity_scene::Gaussians {
     let mut random = Random(71);
-    let mut wall = crate::gaussians::gaussians_of(&[]);
+    let mut wall = crate::gaussians::gaussians_from_specs(&[]);
     wall.sh_degree = sh_degree;
     for i in 0..3 * CLUSTER {
         let (x, y) = ((i % 32) as f64, (i / 32) as f64);
@@ -125,7 +125,8 @@ fn t10_a_needle_is_turned_by_less_than_six_millionths() {
             ..GaussianSpec::default()
         })
         .collect();
-    let (found, truths) = projected(&gpu(), &scene_of(&needles), forward_view([640, 480], 1000.0));
+    let (found, truths) =
+        projected(&gpu(), &scene_from_specs(&needles), forward_view([640, 480], 1000.0));
     // Angle, modulo pi, of the axis along which the conic `(l0 dx + l1 dy)² + (l2 dy)²` rises least.
     let angle_rad = |splat: &Splat| {
         let [l0, l1, l2] = splat.factor;

@@ -70,7 +70,7 @@ fn three_at_once() {
         ..GaussianSpec::default()
     };
     // One row of tiles may have 2,048 splats.
-    let too_many = gaussians::scene_of(&(0..3_000).map(layer).collect::<Vec<_>>());
+    let too_many = gaussians::scene_from_specs(&(0..3_000).map(layer).collect::<Vec<_>>());
     let streets = [300, 900].map(|n| street(n, 1, 62));
     let step = |step: u32| {
         let scene = Scene::from_gaussians(&streets[step as usize % 2]);

@@ -1,4 +1,5 @@
-//! Memory goes back to the operating system: one test, alone in its process, so that the numbers are its own.
+//! Memory goes back to the operating system: one test, alone in its process, so that the numbers
+//! are its own.
 #![cfg(all(target_os = "linux", target_env = "gnu"))]
 
 use std::hint::black_box;

@@ -22,7 +22,7 @@ fn covariance(g: &Gaussians, index: usize) -> DMat3 {
 }
 
 fn colour(g: &Gaussians, index: usize, direction: DVec3) -> DVec3 {
-    let terms = g.sh_of(index).chunks_exact(3).zip(sh::basis(direction));
+    let terms = g.sh_at(index).chunks_exact(3).zip(sh::basis(direction));
     terms.fold(DVec3::ZERO, |sum, (c, b)| {
         sum + b * DVec3::from_array([c[0], c[1], c[2]].map(f64::from))
     })

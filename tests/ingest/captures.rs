@@ -1,7 +1,8 @@
 //! Cameras of captures: every model projects as the program that the file is of.
 //!
-//! The pixels are those of OpenCV 4 (`projectPoints`, `fisheye.projectPoints`), whose models are COLMAP's
-//! (src/colmap/sensor/models.h) and instant-ngp's, and of nerfstudio's formula (cameras/camera_utils.py) in NumPy.
+//! The pixels are those of OpenCV 4 (`projectPoints`, `fisheye.projectPoints`), whose models are
+//! COLMAP's (src/colmap/sensor/models.h) and instant-ngp's, and of nerfstudio's formula
+//! (cameras/camera_utils.py) in NumPy.
 
 use glam::DVec3;
 
@@ -78,7 +79,8 @@ const COLMAP: [(&str, i32, &[f64], Pixels); 11] = [
 const PINHOLE: Pixels = [[815.0, 295.0], [360.0, 586.666667], [990.0, 662.5]];
 const FISHEYE: Pixels =
     [[809.863432, 296.625969], [380.625153, 575.386801], [949.727637, 635.614238]];
-/// nerfstudio's lens of perspective models with k1, k2, k3, p1, p2 = -0.1, 0.02, -0.004, 0.001, -0.002.
+/// nerfstudio's lens of perspective models with k1, k2, k3, p1, p2 = -0.1, 0.02, -0.004, 0.001,
+/// -0.002.
 const NERFSTUDIO: Pixels =
     [[813.190858, 294.588922], [365.264939, 585.718536], [976.328419, 656.543192]];
 
@@ -91,7 +93,7 @@ fn check(camera: &Camera, wanted: &Pixels, about: &str) {
 }
 
 /// The camera of a COLMAP model of one image, as text.
-fn of_text(name: &str, parameters: &str) -> Result<Camera, String> {
+fn from_text(name: &str, parameters: &str) -> Result<Camera, String> {
     let dir = tempfile::tempdir().unwrap();
     let cameras = format!("1 {name} 1280 800 {parameters}\n");
     std::fs::write(dir.path().join("cameras.txt"), cameras).unwrap();
@@ -101,7 +103,7 @@ fn of_text(name: &str, parameters: &str) -> Result<Camera, String> {
 }
 
 /// The same, in the binary form.
-fn of_bytes(number: i32, parameters: &[f64]) -> Result<Camera, String> {
+fn from_bytes(number: i32, parameters: &[f64]) -> Result<Camera, String> {
     let dir = tempfile::tempdir().unwrap();
     let one = 1_u64.to_le_bytes();
     let id = 1_i32.to_le_bytes();
@@ -121,8 +123,8 @@ fn of_bytes(number: i32, parameters: &[f64]) -> Result<Camera, String> {
 fn models_of_colmap_are_those_of_opencv() {
     for (name, number, parameters, wanted) in COLMAP {
         let text: Vec<String> = parameters.iter().map(f64::to_string).collect();
-        check(&of_text(name, &text.join(" ")).unwrap(), &wanted, name);
-        check(&of_bytes(number, parameters).unwrap(), &wanted, name);
+        check(&from_text(name, &text.join(" ")).unwrap(), &wanted, name);
+        check(&from_bytes(number, parameters).unwrap(), &wanted, name);
     }
 }
 
@@ -138,16 +140,18 @@ fn models_of_colmap_without_a_lens_are_not_supported() {
         (17, "EQUIRECTANGULAR"),
     ] {
         let wanted = format!("the camera model {name} is not supported");
-        for text in [of_text(name, "1 2 3").unwrap_err(), of_bytes(number, &[]).unwrap_err()] {
+        for text in [from_text(name, "1 2 3").unwrap_err(), from_bytes(number, &[]).unwrap_err()] {
             assert!(text.contains(&wanted), "{text}");
         }
     }
-    assert!(of_text("LENS", "1").unwrap_err().contains("\"LENS\" is not a camera model of COLMAP"));
-    assert!(of_bytes(99, &[]).unwrap_err().contains("model 99 is not one of COLMAP's"));
+    assert!(
+        from_text("LENS", "1").unwrap_err().contains("\"LENS\" is not a camera model of COLMAP")
+    );
+    assert!(from_bytes(99, &[]).unwrap_err().contains("model 99 is not one of COLMAP's"));
 }
 
 /// The camera of a transforms.json with these fields of the file.
-fn of_transforms(fields: &str) -> Result<Camera, String> {
+fn from_transforms(fields: &str) -> Result<Camera, String> {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("transforms.json");
     let frame =
@@ -178,7 +182,7 @@ fn lenses_of_transforms_are_those_of_their_programs() {
         (r#""fl_y": 700, "rolling_shutter": [0, 0, 0, 0]"#.to_owned(), PINHOLE),
     ];
     for (fields, wanted) in cases {
-        let camera = of_transforms(&fields).unwrap_or_else(|error| panic!("{fields}: {error}"));
+        let camera = from_transforms(&fields).unwrap_or_else(|error| panic!("{fields}: {error}"));
         let off = POINTS.iter().zip(&wanted).map(|(point, wanted)| {
             let pixel = camera.project(DVec3::from_array(*point)).unwrap();
             (pixel - glam::DVec2::from_array(*wanted)).length()
@@ -207,7 +211,7 @@ fn fields_of_transforms_that_make_another_camera_are_named() {
         (r#""rolling_shutter": [0, 0, 0.01, 0]"#, "rolling_shutter: is not read"),
         (r#""x_fov": 50"#, "x_fov: says a focal length of"),
     ] {
-        let text = of_transforms(&format!("{focal}, {fields}")).unwrap_err();
+        let text = from_transforms(&format!("{focal}, {fields}")).unwrap_err();
         assert!(text.contains(named), "{text}");
     }
 }

@@ -1,4 +1,5 @@
-//! Small scenes with the images that their authors expect: what is read is drawn so, or refused or warned of by name.
+//! Small scenes with the images that their authors expect: what is read is drawn so, or refused or
+//! warned of by name.
 
 use std::path::Path;
 
@@ -14,7 +15,7 @@ use crate::data::real;
 /// Reads a file of a case.
 fn read(file: &str, drop_bad: bool) -> Option<Result<ReadScene, IngestError>> {
     let path = real(&format!("cases/{file}"))?;
-    let limits = ReadLimits { drop_bad, ..ReadLimits::of_own_file() };
+    let limits = ReadLimits { drop_bad, ..ReadLimits::for_own_file() };
     Some(ingest::read_limited(&path, &limits, &mut |_, _| {}))
 }
 
@@ -23,7 +24,8 @@ fn accepted(file: &str) -> Option<ReadScene> {
     Some(read(file, false)?.unwrap_or_else(|error| panic!("{file}: {error}")))
 }
 
-/// The message for a file of a case that is refused, as the command line prints it, with every source.
+/// The message for a file of a case that is refused, as the command line prints it, with every
+/// source.
 fn refusal(file: &str) -> Option<String> {
     let error = read(file, false)?.unwrap_err();
     let sources = std::iter::successors(std::error::Error::source(&error), |e| e.source());

@@ -257,7 +257,7 @@ fn check(file: &str, axes: &str, original: &str, sh_degree: u8, steps: Steps, at
 
 /// The same Gaussians with colours of a lower degree.
 fn cut(g: &Gaussians, sh_degree: u8) -> Gaussians {
-    let sh = (0..g.len()).flat_map(|i| &g.sh_of(i)[..3 * sh::coefficients(sh_degree)]).copied();
+    let sh = (0..g.len()).flat_map(|i| &g.sh_at(i)[..3 * sh::coefficients(sh_degree)]).copied();
     Gaussians { sh_degree, sh: sh.collect(), ..g.clone() }
 }
 
@@ -305,7 +305,7 @@ fn off(a: &Gaussians, i: usize, b: &Gaussians, j: usize, steps: Steps) -> (f64, 
     let opacity = |logit: f32| 1.0 / (1.0 + (-logit).exp());
     let opacity = [opacity(a.logit_opacities[i]), opacity(b.logit_opacities[j])];
     // Colours beyond the range of the format's byte were clamped.
-    let dc = |g: &Gaussians, i: usize| -> [f32; 3] { std::array::from_fn(|c| g.sh_of(i)[c]) };
+    let dc = |g: &Gaussians, i: usize| -> [f32; 3] { std::array::from_fn(|c| g.sh_at(i)[c]) };
     let mean = (0..3).map(|k| (a.means_m[i][k] - b.means_m[j][k]).abs()).fold(0.0, f64::max);
     [
         (mean / steps.mean_m.max(1e-9), "position"),
@@ -313,7 +313,7 @@ fn off(a: &Gaussians, i: usize, b: &Gaussians, j: usize, steps: Steps) -> (f64, 
         (widest(&a.ln_scales[i], &b.ln_scales[j], steps.ln_scale), "ln scale"),
         (widest(&opacity[..1], &opacity[1..], steps.opacity), "opacity"),
         (widest(&dc(a, i), &dc(b, j), steps.dc), "colour"),
-        (widest(&a.sh_of(i)[3..], &b.sh_of(j)[3..], steps.sh), "colour coefficients"),
+        (widest(&a.sh_at(i)[3..], &b.sh_at(j)[3..], steps.sh), "colour coefficients"),
     ]
     .into_iter()
     .fold((0.0, ""), |most, next| if next.0 > most.0 { next } else { most })

@@ -6,8 +6,7 @@ use wildcity_scene::Gaussians;
 use wildcity_twin::ingest::{self, IngestError};
 
 use crate::format_files::{
-    Files, glb, gltf, gzip, ksplat, nurec_plain, sog, splat, spz_plain, spz4, streamed, usdz,
-    zip_of,
+    Files, glb, gltf, gzip, ksplat, nurec_plain, sog, splat, spz_plain, spz4, streamed, usdz, zip,
 };
 use crate::scene_files::{gaussians, gsplat_tensors, inria_columns, ply, safetensors};
 
@@ -47,7 +46,7 @@ pub(crate) fn corpus() -> Vec<Case> {
         whole("glTF", two),
         whole("SOG 1", sog(&some, 1)),
         whole("SOG 2", sog(&all, 2)),
-        one("zip of SOG", zip_of(&sog(&flat, 2), true)),
+        one("zip of SOG", zip(&sog(&flat, 2), true)),
         whole("streamed SOG", streamed()),
         Case { wrap: |b| usdz(b), ..one("NuRec", nurec_plain(&some, true)) },
         one("USDZ", usdz(nurec_plain(&flat, false))),

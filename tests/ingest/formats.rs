@@ -10,7 +10,7 @@ use wildcity_twin::ingest::{self, ListedFiles, ReadLimits, SogFiles, StopFlag};
 
 use crate::format_files::{
     Files, glb, gltf, gzip, ksplat, nurec_plain, opacity, sog, splat, spz_plain, spz4, streamed,
-    usdz, zip_of,
+    usdz, zip,
 };
 use crate::scene_files::gaussians;
 use crate::{read, refusal};
@@ -53,8 +53,8 @@ fn assert_alike(read: &Gaussians, written: &Gaussians, within: Within, name: &st
         near(&read.ln_scales[i], &written.ln_scales[i], within.ln_scale, "ln scale");
         let opacities = [read, written].map(|g| opacity(g.logit_opacities[i]) as f32);
         near(&opacities[..1], &opacities[1..], within.opacity, "opacity");
-        near(&read.sh_of(i)[..3], &written.sh_of(i)[..3], within.dc, "colour");
-        near(&read.sh_of(i)[3..], &written.sh_of(i)[3..], within.sh, "colour coefficient");
+        near(&read.sh_at(i)[..3], &written.sh_at(i)[..3], within.dc, "colour");
+        near(&read.sh_at(i)[3..], &written.sh_at(i)[3..], within.sh, "colour coefficient");
     }
 }
 
@@ -76,7 +76,7 @@ fn read_files(files: &Files) -> Result<(Gaussians, String), ingest::IngestError>
 /// The files that a description of a SOG names, and those that these name.
 fn named_files(files: &Files, description: &str) -> BTreeSet<String> {
     let (_, json) = files.iter().find(|(name, _)| name == description).unwrap();
-    let SogFiles { descriptions, images } = SogFiles::of(json, description).unwrap();
+    let SogFiles { descriptions, images } = SogFiles::from_json(json, description).unwrap();
     let beside = description.rfind('/').map_or("", |slash| &description[..=slash]);
     let path = |name: &String| format!("{beside}{name}");
     let others = descriptions.iter().flat_map(|name| named_files(files, &path(name)));
@@ -92,7 +92,8 @@ fn splat_comes_back() {
     assert_alike(&read(&splat(&g)).unwrap(), &g, within, ".splat");
 }
 
-/// A file without a magic number begins with numbers, which may have the bytes that other formats begin with.
+/// A file without a magic number begins with numbers, which may have the bytes that other formats
+/// begin with.
 #[test]
 fn a_splat_may_begin_as_other_formats_do() {
     let within = Within { quat: 0.02, opacity: 0.002, dc: 0.007, ..EXACT };
@@ -228,7 +229,7 @@ fn sog_comes_back_as_folder_and_archive() {
         for is_packed in [false, true] {
             let inside = |(n, bytes): &(String, Vec<u8>)| (format!("scene/{n}"), bytes.clone());
             let files: Files = files.iter().map(inside).collect();
-            assert_eq!(read(&zip_of(&files, is_packed)).unwrap(), folder, "{name}");
+            assert_eq!(read(&zip(&files, is_packed)).unwrap(), folder, "{name}");
         }
     }
 }
@@ -250,9 +251,9 @@ fn streamed_sog_gives_its_finest_level_and_its_environment() {
     assert_eq!(all.sh[..40 * 27], fine.sh[..40 * 27]);
     assert_eq!(all.means_m[40..], sky.means_m[..]);
     // The environment has no higher degrees, so they are zero.
-    assert!((40..50).all(|i| all.sh_of(i)[..3] == *sky.sh_of(i - 40)));
-    assert!((40..50).all(|i| all.sh_of(i)[3..].iter().all(|&c| c == 0.0)));
-    assert_eq!(read(&zip_of(&files, true)).unwrap(), all);
+    assert!((40..50).all(|i| all.sh_at(i)[..3] == *sky.sh_at(i - 40)));
+    assert!((40..50).all(|i| all.sh_at(i)[3..].iter().all(|&c| c == 0.0)));
+    assert_eq!(read(&zip(&files, true)).unwrap(), all);
 }
 
 /// Programs that pack a SOG pack what [`SogFiles`] names.
@@ -262,7 +263,7 @@ fn the_files_of_a_sog_are_those_that_are_read() {
     for files in [sog(&all, 1), sog(&all, 2), streamed()] {
         let dir = written(&files);
         let path = dir.path().join(&files[0].0);
-        let limits = ReadLimits::of_own_file();
+        let limits = ReadLimits::for_own_file();
         let read = ingest::read_limited(&path, &limits, &mut |_, _| {}).unwrap().parts;
         let named = named_files(&files, &files[0].0);
         assert!(read.len() >= 5 && read.is_subset(&named), "{read:?}, {named:?}");
@@ -315,7 +316,7 @@ fn rigid_nodes_are_split_by_point_ids() {
         let means: Vec<u8> =
             g.means_m.as_flattened().iter().flat_map(|m| (*m as f32).to_le_bytes()).collect();
         let sh = |from: usize, to: usize| -> Vec<u8> {
-            (0..30).flat_map(|i| floats_of(&g.sh_of(i)[from..to])).collect()
+            (0..30).flat_map(|i| float_bytes(&g.sh_at(i)[from..to])).collect()
         };
         let tensors: Vec<(&str, Vec<usize>, Vec<u8>)> = vec![
             ("means", vec![30, 3], means),
@@ -353,7 +354,7 @@ fn rigid_nodes_are_split_by_point_ids() {
     assert!(error.contains("10 numbers for 30"), "{error}");
 }
 
-fn floats_of(values: &[f32]) -> Vec<u8> {
+fn float_bytes(values: &[f32]) -> Vec<u8> {
     values.iter().flat_map(|v| v.to_le_bytes()).collect()
 }
 
@@ -403,7 +404,7 @@ fn a_listed_scene_reads_listed_files_only() {
     std::fs::write(dir.path().join("scene.bin"), &buffer).unwrap();
     std::fs::write(&elsewhere, &buffer).unwrap();
     let read = |listed: &ListedFiles| {
-        let limits = ReadLimits { listed: Some(listed), ..ReadLimits::of_own_file() };
+        let limits = ReadLimits { listed: Some(listed), ..ReadLimits::for_own_file() };
         ingest::read_limited(&path, &limits, &mut |_, _| {})
     };
     let error = read(&ListedFiles::new()).unwrap_err().to_string();
@@ -425,19 +426,20 @@ fn a_reader_has_a_budget_and_can_be_stopped() {
         ("gzip.spz", gzip(&spz_plain(&g, 3))),
         ("zstd.spz", spz4(&g)),
         ("scene.glb", glb(gltf(&g, "", ""))),
-        ("scene.sog", zip_of(&sog(&g, 2), false)),
+        ("scene.sog", zip(&sog(&g, 2), false)),
         ("scene.usdz", usdz(nurec_plain(&g, false))),
     ] {
         let path = dir.path().join(name);
         std::fs::write(&path, bytes).unwrap();
         let read = |limits: ReadLimits<'_>| ingest::read_limited(&path, &limits, &mut |_, _| {});
-        assert_eq!(read(ReadLimits::of_own_file()).unwrap().gaussians.len(), 2_000);
-        let error = read(ReadLimits { memory_bytes: 10_000, ..ReadLimits::of_own_file() });
+        assert_eq!(read(ReadLimits::for_own_file()).unwrap().gaussians.len(), 2_000);
+        let error = read(ReadLimits { memory_bytes: 10_000, ..ReadLimits::for_own_file() });
         let error = error.unwrap_err().to_string();
         assert!(error.contains("10000 may be used"), "{name}: {error}");
         let stop = StopFlag::default();
         stop.stop();
-        let error = read(ReadLimits { stop, ..ReadLimits::of_own_file() }).unwrap_err().to_string();
+        let error =
+            read(ReadLimits { stop, ..ReadLimits::for_own_file() }).unwrap_err().to_string();
         assert!(error.contains("reading was stopped"), "{name}: {error}");
     }
 }

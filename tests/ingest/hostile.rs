@@ -5,7 +5,7 @@ use wildcity_scene::Gaussians;
 use crate::corpus::{COUNT, corpus};
 use crate::format_files::{
     Files, glb, gltf, gzip, ksplat, nurec_plain, sog, splat, spz_plain, spz4, streamed, usdz, webp,
-    zip_of,
+    zip,
 };
 use crate::refusal;
 use crate::scene_files::gaussians;
@@ -152,7 +152,7 @@ fn counts_that_no_file_holds_are_refused_before_memory_is_allocated() {
 }
 
 /// The error of a scene of several files, one of which was changed.
-fn refusal_of(files: &Files, part: &str, change: &dyn Fn(&mut Vec<u8>)) -> String {
+fn refusal(files: &Files, part: &str, change: &dyn Fn(&mut Vec<u8>)) -> String {
     let dir = tempfile::tempdir().unwrap();
     for (name, bytes) in files {
         let mut bytes = bytes.clone();
@@ -179,7 +179,7 @@ fn text_change(from: &str, to: &str) -> impl Fn(&mut Vec<u8>) {
 #[test]
 fn a_sog_that_contradicts_itself_is_named_by_file() {
     let files = sog(&gaussians(COUNT, 1, 20.0, 1), 2);
-    let meta = |from: &str, to: &str| refusal_of(&files, "meta.json", &text_change(from, to));
+    let meta = |from: &str, to: &str| refusal(&files, "meta.json", &text_change(from, to));
     let many = format!(r#""count":{}"#, 1u64 << 60);
     for (text, wanted) in [
         (meta(r#""version":2"#, r#""version":3"#), "SOG header, meta.json: version 3; 2, and 1"),
@@ -217,16 +217,15 @@ fn a_sog_that_contradicts_itself_is_named_by_file() {
     ] {
         assert!(text.starts_with(wanted), "{text}\n{wanted}");
     }
-    let image = |name: &str, pixels: &[[u8; 4]]| {
-        refusal_of(&files, name, &|bytes| *bytes = webp(pixels, 4))
-    };
+    let image =
+        |name: &str, pixels: &[[u8; 4]]| refusal(&files, name, &|bytes| *bytes = webp(pixels, 4));
     let text = image("quats.webp", &[[0, 0, 0, 251]; 6]);
     assert!(text.starts_with("SOG body, quats.webp: Gaussian 0: alpha is 251"), "{text}");
-    let text = refusal_of(&files, "quats.webp", &|bytes| *bytes = b"no image".to_vec());
+    let text = refusal(&files, "quats.webp", &|bytes| *bytes = b"no image".to_vec());
     assert!(text.starts_with("SOG body, quats.webp: is a damaged WebP image: "), "{text}");
 
     let files = streamed();
-    let meta = |from: &str, to: &str| refusal_of(&files, "lod-meta.json", &text_change(from, to));
+    let meta = |from: &str, to: &str| refusal(&files, "lod-meta.json", &text_change(from, to));
     for (text, wanted) in [
         (
             meta(r#""file":1,"offset":0"#, r#""file":9,"offset":0"#),
@@ -258,16 +257,16 @@ fn a_sog_that_contradicts_itself_is_named_by_file() {
 fn errors_of_archives_and_payloads_say_what_is_missing() {
     let g = gaussians(COUNT, 0, 20.0, 1);
     let file = |name: &str, bytes: &[u8]| vec![(name.to_owned(), bytes.to_vec())];
-    let text = refusal(&zip_of(&file("readme.txt", b"hello"), false));
+    let text = refusal(&zip(&file("readme.txt", b"hello"), false));
     assert!(
         text.starts_with("zip body, directory: it holds no meta.json or lod-meta.json"),
         "{text}"
     );
-    let text = refusal(&zip_of(&file("archive/data.pkl", b"hello"), false));
+    let text = refusal(&zip(&file("archive/data.pkl", b"hello"), false));
     assert!(text.contains("python -m wildcity.convert"), "{text}");
-    let text = refusal(&zip_of(&sog(&g, 2)[..3], false));
+    let text = refusal(&zip(&sog(&g, 2)[..3], false));
     assert_eq!(text, "zip body, scales.webp: is not in the archive");
-    let mut zip = zip_of(&sog(&g, 2), false);
+    let mut zip = zip(&sog(&g, 2), false);
     let at = zip.windows(4).position(|w| w == b"RIFF").unwrap() + 20;
     zip[at] ^= 1;
     assert!(
@@ -378,7 +377,7 @@ fn bytes_after_the_end_and_wrong_counts_are_refused() {
         file
     };
     let payload = with(gzip(&nurec_plain(&g, false)), b"more");
-    let usdz = zip_of(&[("scene.nurec".to_owned(), payload)], false);
+    let usdz = zip(&[("scene.nurec".to_owned(), payload)], false);
     let mut counted = ksplat(&g, 0);
     counted[16] += 1;
     // Four bytes within the length that the header says.
@@ -392,7 +391,7 @@ fn bytes_after_the_end_and_wrong_counts_are_refused() {
             "SPZ body, the end: more than the gzip stream",
         ),
         (usdz, "NuRec body, the gzip stream: is followed by 4 bytes"),
-        (with(zip_of(&sog(&g, 2), false), &[0]), "zip body, the end of the directory: is not at"),
+        (with(zip(&sog(&g, 2), false), &[0]), "zip body, the end of the directory: is not at"),
         (counted, ".ksplat header, bytes 16 to 19: 7 Gaussians; the sections have 6"),
         (with(splat(&g), &[0; 32]), ".splat body, record 6: is all zeros"),
         (padded, "glTF header, chunks: 4 bytes after the last one"),

@@ -13,8 +13,9 @@ fn png(left: [u8; 4], right: [u8; 4]) -> Vec<u8> {
     png.into_inner()
 }
 
-/// A triangle with a material. TEXCOORD_0 lies in the left half of images, TEXCOORD_1 in the right one. Image 0 is sRGB
-/// (188, 0, 64) and (0, 255, 0), half transparent; image 1 is (0, 188, 64) and (255, 0, 128).
+/// A triangle with a material. TEXCOORD_0 lies in the left half of images, TEXCOORD_1 in the right
+/// one. Image 0 is sRGB (188, 0, 64) and (0, 255, 0), half transparent; image 1 is (0, 188, 64) and
+/// (255, 0, 128).
 fn model(attributes: &str, material: &str, more: &str) -> Vec<u8> {
     let positions: [[f32; 3]; 3] = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
     let uv: [[[f32; 2]; 3]; 2] =
@@ -52,7 +53,7 @@ const BOTH: &str = r#","TEXCOORD_0":1,"TEXCOORD_1":2"#;
 
 /// The one colour of all Gaussians, and their one opacity.
 fn looks(g: &Gaussians) -> ([f64; 3], f64) {
-    let colour = |i: usize| [0, 1, 2].map(|c| 0.5 + sh::C0 * f64::from(g.sh_of(i)[c]));
+    let colour = |i: usize| [0, 1, 2].map(|c| 0.5 + sh::C0 * f64::from(g.sh_at(i)[c]));
     let opacity = |i: usize| 1.0 / (1.0 + (-f64::from(g.logit_opacities[i])).exp());
     let first = (colour(0), opacity(0));
     let is_near = |a: f64, b: f64| (a - b).abs() < 1e-6;
@@ -77,8 +78,8 @@ fn emitted_light_adds_to_the_base_colour() {
             r#","extensions":{{"KHR_materials_emissive_strength":{{"emissiveStrength":{strength}}}}}"#
         )
     };
-    // Linear light and its sRGB: 0.05 is 0.247801, 0.2 is 0.484529, 0.3 is 0.583831, 0.4 is 0.665185, 0.8 is 0.906332.
-    // sRGB 188 is linear 0.502886, 64 is 0.051269, 128 is 0.215861.
+    // Linear light and its sRGB: 0.05 is 0.247801, 0.2 is 0.484529, 0.3 is 0.583831, 0.4 is
+    // 0.665185, 0.8 is 0.906332. sRGB 188 is linear 0.502886, 64 is 0.051269, 128 is 0.215861.
     let cases: [(String, [f64; 3]); 9] = [
         (base.to_owned(), [0.484529, 0.665185, 0.247801]),
         (format!(r#"{base},"emissiveFactor":[0.1,0.4,0]"#), [0.583831, 0.906332, 0.247801]),
@@ -91,7 +92,8 @@ fn emitted_light_adds_to_the_base_colour() {
             format!(r#"{base},"emissiveFactor":[0.1,0.4,0]{}"#, strength("0")),
             [0.484529, 0.665185, 0.247801],
         ),
-        // The texture's left half, (0, 188, 64): 0.4 + 0.5 * 0.502886 = 0.651443, 0.05 + 0.051269 = 0.101269.
+        // The texture's left half, (0, 188, 64): 0.4 + 0.5 * 0.502886 = 0.651443, 0.05 + 0.051269 =
+        // 0.101269.
         (
             format!(r#"{base},"emissiveFactor":[1,0.5,1],"emissiveTexture":{{"index":1}}"#),
             [0.484529, 0.827472, 0.351320],
@@ -134,7 +136,8 @@ fn emitted_light_adds_to_the_base_colour() {
 
 #[test]
 fn each_texture_has_its_own_coordinates_and_alpha_is_that_of_the_base() {
-    // Base: the right half of image 0, green and half transparent. Emitted: the left half of image 1.
+    // Base: the right half of image 0, green and half transparent. Emitted: the left half of image
+    // 1.
     let textures = r#""pbrMetallicRoughness":{"baseColorTexture":{"index":0,"texCoord":1}},
         "emissiveFactor":[0.5,0.5,1],"emissiveTexture":{"index":1}"#;
     for (alpha_mode, wanted) in [("OPAQUE", 0.97), ("BLEND", 0.97 * 128.0 / 255.0)] {

@@ -33,7 +33,7 @@ pub(crate) fn square(primitive: &str, more: &str) -> Vec<u8> {
 }
 
 fn colour(g: &Gaussians, index: usize) -> [f64; 3] {
-    [0, 1, 2].map(|c| 0.5 + sh::C0 * f64::from(g.sh_of(index)[c]))
+    [0, 1, 2].map(|c| 0.5 + sh::C0 * f64::from(g.sh_at(index)[c]))
 }
 
 #[test]
@@ -82,7 +82,8 @@ fn vehicles_have_their_size_and_their_colours() {
     assert!(white > 0.25 && tyres > 0.05 && logo > 0.01, "{white} {tyres} {logo}");
 }
 
-/// A triangle in the colours of a 2 x 1 image, red and green, with texture coordinates that all lie in its red half.
+/// A triangle in the colours of a 2 x 1 image, red and green, with texture coordinates that all lie
+/// in its red half.
 fn textured(info: &str) -> Vec<u8> {
     let positions: [[f32; 3]; 3] = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
     let uv: [[f32; 2]; 3] = [[0.1, 0.2], [0.4, 0.2], [0.1, 0.8]];

@@ -13,10 +13,10 @@ fn notes(files: &[(String, Vec<u8>)]) -> FileNotes {
         std::fs::write(dir.path().join(name), bytes).unwrap();
     }
     let first = dir.path().join(&files[0].0);
-    ingest::read_limited(&first, &ReadLimits::of_own_file(), &mut |_, _| {}).unwrap().notes
+    ingest::read_limited(&first, &ReadLimits::for_own_file(), &mut |_, _| {}).unwrap().notes
 }
 
-fn notes_of(bytes: Vec<u8>) -> FileNotes {
+fn file_notes(bytes: Vec<u8>) -> FileNotes {
     notes(&[("scene".to_owned(), bytes)])
 }
 
@@ -32,7 +32,7 @@ fn files_of_usual_writers_need_no_warning() {
     ];
     for bytes in plain {
         let start = String::from_utf8_lossy(&bytes[..4]).into_owned();
-        let notes = notes_of(bytes);
+        let notes = file_notes(bytes);
         assert_eq!(notes, FileNotes::default(), "{start}");
     }
     assert_eq!(notes(&sog(&g, 2)), FileNotes::default());
@@ -46,7 +46,7 @@ fn parts_of_a_ply_that_are_not_read_are_named() {
     let header = ply_header(6, &columns);
     let body = file[header.len()..].to_vec();
     let said = |header: &str, body: &[u8]| {
-        notes_of([header.as_bytes(), body].concat()).warnings.join("; ")
+        file_notes([header.as_bytes(), body].concat()).warnings.join("; ")
     };
     let renamed = header.replace("float nx", "float motion_0").replace("float nz", "float t");
     assert!(said(&renamed, &body).ends_with("properties not read: motion_0, t"));
@@ -101,7 +101,7 @@ fn flags_and_extensions_of_spz_are_read_or_named() {
         let mut bytes = spz_plain(&g, 3);
         bytes[14] = flags;
         bytes.extend(after);
-        notes_of(if is_packed { gzip(&bytes) } else { bytes })
+        file_notes(if is_packed { gzip(&bytes) } else { bytes })
     };
     for is_packed in [false, true] {
         let tagged = with(1, &[], is_packed);
@@ -140,7 +140,7 @@ fn keys_and_tensors_that_are_not_read_are_named() {
 
     let mut tensors = gsplat_tensors(&g);
     tensors.push(("velocities", vec![6, 3], vec![0.5; 18]));
-    let said = notes_of(safetensors(&tensors, &[])).warnings;
+    let said = file_notes(safetensors(&tensors, &[])).warnings;
     assert_eq!(said, ["tensors not read: velocities"]);
 }
 
@@ -149,7 +149,7 @@ fn splats_of_gltf_that_are_drawn_in_another_way_are_named() {
     let (json, buffer) = gltf(&gaussians(6, 0, 5.0, 3), "", "");
     let said = |from: &str, to: &str| {
         assert!(json.contains(from), "{json}");
-        notes_of(glb((json.replacen(from, to, 1), buffer.clone()))).warnings.join("; ")
+        file_notes(glb((json.replacen(from, to, 1), buffer.clone()))).warnings.join("; ")
     };
     let kernel = r#""kernel":"ellipse""#;
     assert!(

@@ -17,7 +17,7 @@ fn bits(g: &Gaussians, index: usize) -> Vec<u32> {
     let mean = g.means_m[index].map(|m| m as f32);
     let opacity = [g.logit_opacities[index]];
     let parts: [&[f32]; 5] =
-        [&mean, &g.quats_wxyz[index], &g.ln_scales[index], &opacity, g.sh_of(index)];
+        [&mean, &g.quats_wxyz[index], &g.ln_scales[index], &opacity, g.sh_at(index)];
     parts.concat().into_iter().map(f32::to_bits).collect()
 }
 
@@ -100,9 +100,9 @@ fn is_alike(a: &Gaussians, i: usize, b: &Gaussians, j: usize) -> bool {
         && dot.abs() > 0.9999
         && close(&a.ln_scales[i], &b.ln_scales[j], 0.05)
         && (sigmoid(a.logit_opacities[i]) - sigmoid(b.logit_opacities[j])).abs() < 0.01
-        && close(&a.sh_of(i)[..3], &b.sh_of(j)[..3], 0.05)
+        && close(&a.sh_at(i)[..3], &b.sh_at(j)[..3], 0.05)
         // 8 bits over [-4, 4] are steps of 0.031.
-        && close(&a.sh_of(i)[3..], &b.sh_of(j)[3..], 0.02)
+        && close(&a.sh_at(i)[3..], &b.sh_at(j)[3..], 0.02)
 }
 
 #[test]
@@ -204,7 +204,7 @@ fn every_component_type_of_gltf_is_read() {
         }
         // 0.1, 0.2, 0.3, then 1.1, 1.2, 1.3 and so on; zeros above the primitive's degree.
         for (index, coefficients) in [(11, 1), (12, 4), (13, 9), (14, 16)] {
-            for (k, &value) in g.sh_of(index).iter().enumerate() {
+            for (k, &value) in g.sh_at(index).iter().enumerate() {
                 let wanted = (k / 3) as f32 + 0.1 * (k % 3 + 1) as f32;
                 let wanted = if k / 3 < coefficients { wanted } else { 0.0 };
                 assert!((value - wanted).abs() < 1e-5, "{index} {k}: {value}");

@@ -33,8 +33,8 @@ fn commit(
     gaussians: &Gaussians,
     storage: StorageOptions,
 ) -> Result<Version, StoreError> {
-    let provenance = Provenance::of("test".into());
-    let new = NewVersion { storage, ..NewVersion::of("street", gaussians, provenance) };
+    let provenance = Provenance::new("test".into());
+    let new = NewVersion { storage, ..NewVersion::from_gaussians("street", gaussians, provenance) };
     Catalog::open(dir)?.commit(new, &mut |_, _| {})
 }
 

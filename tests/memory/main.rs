@@ -1,4 +1,5 @@
-//! What importing and serving take: one test, alone in its process, so that the numbers are its own.
+//! What importing and serving take: one test, alone in its process, so that the numbers are its
+//! own.
 
 #[path = "../support/scene_files.rs"]
 mod scene_files;
@@ -62,8 +63,8 @@ fn import_takes_twice_the_file_and_serving_120_bytes_a_gaussian() {
     assert!(peak <= allowed, "loading: from {before} to {peak} bytes, {allowed} allowed");
     assert!(peak - before >= 92 * n as u64, "the chunks are in memory");
 
-    // A frame of all of it through wide lenses: as much as the backend says, if it may have 48 MiB. At once its splats
-    // take 200 MiB.
+    // A frame of all of it through wide lenses: as much as the backend says, if it may have 48 MiB.
+    // At once its splats take 200 MiB.
     let backend = Cpu::new(2, Simd::Best).unwrap();
     backend.limit_frame_bytes(48 << 20);
     let views = views();

@@ -8,7 +8,7 @@ use wildcity_client::{Action, Client, ClientError, ConnectOptions, Movement};
 use wildcity_protocol::error::Code;
 use wildcity_protocol::message::{Open, Outcome, Pose, Request};
 
-use super::fake_server::{FakeServer, Reply, seq_of};
+use super::fake_server::{FakeServer, Reply, request_seq};
 use super::read;
 
 /// Whether an error is the expected one.
@@ -28,7 +28,7 @@ async fn opened(scripts: Vec<Vec<Reply>>) -> (FakeServer, Client) {
 }
 
 fn seqs(requests: &[Request]) -> Vec<u64> {
-    requests.iter().map(seq_of).collect()
+    requests.iter().map(request_seq).collect()
 }
 
 #[tokio::test]
@@ -81,8 +81,8 @@ async fn several_sessions_of_one_connection() {
 
     let action = Action { acceleration: -1.5, curvature: 0.025 };
     let steps = vec![
-        Movement::Pose(HERE).of_session("run-17"),
-        Movement::Action(action).of_session("run-18"),
+        Movement::Pose(HERE).for_session("run-17"),
+        Movement::Action(action).for_session("run-18"),
     ];
     let stepped = client.step_many(steps).await.unwrap();
     let names: Vec<_> = stepped.iter().map(|step| &*step.session).collect();
@@ -131,7 +131,7 @@ async fn damaged_answers_to_step_many() {
         let script = vec![HELLO, OPEN, OBSERVATION, Reply::Binary(bytes)];
         let (_server, mut client) = opened(vec![script]).await;
         client.step(HERE).await.unwrap();
-        let steps = vec![Movement::Pose(HERE).of_session("run-17")];
+        let steps = vec![Movement::Pose(HERE).for_session("run-17")];
         let refused = client.step_many(steps).await.unwrap_err();
         assert!(matches!(refused, ClientError::Frame(_)), "{refused}");
     }
@@ -294,8 +294,8 @@ async fn connecting_without_a_server_fails() {
     }
 }
 
-/// A server on another machine names a path that is a different file on this machine, or does not exist: it is not
-/// opened.
+/// A server on another machine names a path that is a different file on this machine, or does not
+/// exist: it is not opened.
 #[tokio::test]
 async fn memory_that_is_not_the_servers_is_not_opened() {
     for (path, target) in [("/proc/self/exe", "/memfd:wildcity (deleted)"), ("/none/such", "x")] {

@@ -18,7 +18,8 @@ struct Damaged {
     name: &'static str,
     what: &'static str,
     bytes: Vec<u8>,
-    /// Whether only the image is damaged, so that decoding the frame succeeds and decoding the image fails.
+    /// Whether only the image is damaged, so that decoding the frame succeeds and decoding the
+    /// image fails.
     image_only: bool,
     refused: Refusal,
 }
@@ -50,8 +51,8 @@ fn damaged_frames_are_refused() {
     assert_eq!(files, index.len() + 1);
 }
 
-/// A cut frame is an error. A flipped byte is an error, or an observation with the same pixels, or one that
-/// `verify` refuses. Nothing panics.
+/// A cut frame is an error. A flipped byte is an error, or an observation with the same pixels, or
+/// one that `verify` refuses. Nothing panics.
 #[test]
 fn no_prefix_and_no_flipped_byte_panics() {
     let frame = png_frame();

@@ -71,7 +71,8 @@ impl FakeServer {
         Self { url, task }
     }
 
-    /// The requests of each connection. Waits until all scripts are done and their clients are gone.
+    /// The requests of each connection. Waits until all scripts are done and their clients are
+    /// gone.
     pub(crate) async fn requests(self) -> Vec<Vec<Request>> {
         self.task.await.unwrap()
     }
@@ -91,7 +92,7 @@ async fn follow(stream: impl AsyncRead + AsyncWrite + Unpin, script: Vec<Reply>)
     for reply in script {
         let Some(Ok(Message::Text(text))) = socket.next().await else { return requests };
         let request: Request = serde_json::from_str(&text).unwrap();
-        let message = answer(&reply, seq_of(&request));
+        let message = answer(&reply, request_seq(&request));
         requests.push(request);
         match message {
             Some(message) => socket.send(message).await.unwrap(),
@@ -129,7 +130,7 @@ fn answer(reply: &Reply, seq: u64) -> Option<Message> {
     }
 }
 
-pub(crate) fn seq_of(request: &Request) -> u64 {
+pub(crate) fn request_seq(request: &Request) -> u64 {
     match request {
         Request::Open(open) => open.seq,
         Request::Hello { seq, .. }

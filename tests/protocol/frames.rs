@@ -37,13 +37,13 @@ pub(crate) struct Recipe {
     pub(crate) history: u64,
     pub(crate) normals: bool,
     pub(crate) instances: bool,
-    /// Whether the images come with their trust, the first camera is behind a windshield, and the georeference is
-    /// present.
+    /// Whether the images come with their trust, the first camera is behind a windshield, and the
+    /// georeference is present.
     pub(crate) trust_and_windshield: bool,
     /// Whether the session asked for repair: the first image is repaired, the second failed.
     pub(crate) repair: bool,
-    /// Whether sensors have effects: the first image is late and has noise, the second is as it is; and there are samples
-    /// of the motion.
+    /// Whether sensors have effects: the first image is late and has noise, the second is as it is;
+    /// and there are samples of the motion.
     pub(crate) sensors: bool,
 }
 
@@ -72,12 +72,10 @@ pub(crate) fn color(recipe: Recipe, image: u64, x: u64, y: u64) -> [u8; 3] {
     channels.map(|channel| u8::try_from(channel).unwrap())
 }
 
-/// Depth of a pixel, in metres; a third, so that it is not a round number in f32. 0 where nothing is seen.
+/// Depth of a pixel, in metres; a third, so that it is not a round number in f32. 0 where nothing
+/// is seen.
 pub(crate) fn depth_m(image: u64, x: u64, y: u64) -> f32 {
-    match opacity(x, y) > 0.0 {
-        true => (1 + x + 10 * y + 100 * image) as f32 / 3.0,
-        false => 0.0,
-    }
+    if opacity(x, y) > 0.0 { (1 + x + 10 * y + 100 * image) as f32 / 3.0 } else { 0.0 }
 }
 
 /// Normal of a pixel; 0 where there is no depth.
@@ -237,8 +235,8 @@ fn color_tensor(recipe: Recipe, stem: &str, camera: &RigCamera, pixels: Vec<u8>)
             let mut bytes = Vec::new();
             let encoder = jpeg_encoder::Encoder::new(&mut bytes, 95);
             encoder.encode(&pixels, width, height, jpeg_encoder::ColorType::Rgb).unwrap();
-            // An odd length, so that the tensors after it are not aligned to 4 bytes. Decoders stop at
-            // the end marker.
+            // An odd length, so that the tensors after it are not aligned to 4 bytes. Decoders stop
+            // at the end marker.
             if bytes.len().is_multiple_of(2) {
                 bytes.push(0);
             }

@@ -1,5 +1,5 @@
-//! The protocol: schemas, golden vectors, damaged frames, and the Rust client against a server that answers
-//! with the golden vectors.
+//! The protocol: schemas, golden vectors, damaged frames, and the Rust client against a server that
+//! answers with the golden vectors.
 //!
 //! Schemas and vectors are generated from the types by these tests. After a change of the types run
 //! `WILDCITY_BLESS=1 cargo test -p wildcity-client --test protocol`, and review the difference.

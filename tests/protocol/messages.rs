@@ -68,8 +68,8 @@ fn answers_with_unknown_fields_are_the_same_answers() {
     }
 }
 
-/// Adds a field to every object, except `profile`, `period_us` and the `cameras` of sensors: they are maps, so any field
-/// is known.
+/// Adds a field to every object, except `profile`, `period_us` and the `cameras` of sensors: they
+/// are maps, so any field is known.
 pub(crate) fn add_unknown_fields(value: &mut Value) {
     match value {
         Value::Object(fields) => {

@@ -208,7 +208,8 @@ fn tolerance(recipe: Recipe) -> u8 {
     if recipe.encoding == Encoding::Jpeg { 4 } else { 0 }
 }
 
-/// The contents that a client in any language can compare with: metadata, and a few pixels of each image.
+/// The contents that a client in any language can compare with: metadata, and a few pixels of each
+/// image.
 fn expected(frame: &Frame, recipe: Recipe) -> Value {
     let tensors: Vec<Value> = frame
         .tensors

@@ -18,8 +18,8 @@ fn every_json_example_is_a_message() {
         ("answer", parses::<Answer>),
         ("observation", parses::<ObservationMetadata>),
     ];
-    // Every request has one example; `open` has three, `reset`, `branch`, `close`, `resume` and `share_memory` two; `step` has
-    // four. Every answer has one.
+    // Every request has one example; `open` has three, `reset`, `branch`, `close`, `resume` and
+    // `share_memory` two; `step` has four. Every answer has one.
     assert_eq!(counted(page, kinds), [24, 9, 1]);
     let kinds: [Kind; 10] = [
         ("new upload", parses::<http::NewUpload>),

@@ -43,8 +43,8 @@ async fn an_edit_is_one_version_with_a_drive_on_its_ground() {
     assert_eq!(opened["cameras"].as_array().unwrap().len(), 6);
     assert_eq!(opened["version"], 2);
 
-    // A client that lost the answer edits version 1 again: it gets the version that it made. Another edit of version 1 is
-    // a conflict, and changes nothing.
+    // A client that lost the answer edits version 1 again: it gets the version that it made.
+    // Another edit of version 1 is a conflict, and changes nothing.
     assert_eq!(edit(&server, whole.clone()).await, made);
     let mut other = whole;
     other["scale"]["distance_m"] = json!(3);

@@ -4,7 +4,7 @@ use wildcity_client::{AllCells, CellSelection, NewPush, PushState};
 use wildcity_scene::Gaussians;
 use wildcity_twin::store::Catalog;
 
-use crate::http::{client, in_cell, push, push_of};
+use crate::http::{client, in_cell, new_push, push};
 use crate::scene_files::{inria_columns, ply};
 use crate::support::TestServer;
 
@@ -84,7 +84,7 @@ async fn a_tag_of_training_makes_the_profile_of_a_new_twin_and_a_warning_for_oth
     let client = client(&server);
     let upload = client.upload(&path, &mut |_, _| {}).await.unwrap();
     for (twin, is_new) in [("fresh", true), ("test", false)] {
-        let begun = client.push(twin, &push_of(&[&upload.id])).await.unwrap();
+        let begun = client.push(twin, &new_push(&[&upload.id])).await.unwrap();
         let pushed = client.wait_for_push(begun, &mut |_| {}).await.unwrap();
         assert_eq!(pushed.state, PushState::Ready, "{pushed:?}");
         let catalog = Catalog::open(server.twins.path()).unwrap();

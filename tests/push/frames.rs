@@ -1,5 +1,5 @@
-//! The frame of a push: a scene that was trained in the axes of the capture gets the same place as if it had been in
-//! the twin when the twin was aligned.
+//! The frame of a push: a scene that was trained in the axes of the capture gets the same place as
+//! if it had been in the twin when the twin was aligned.
 
 use serde_json::{Value, json};
 use wildcity_client::{AllCells, CellSelection, NewPush, Push, PushFrame, PushState};
@@ -7,11 +7,12 @@ use wildcity_scene::align::Alignment;
 use wildcity_scene::{Gaussians, RecordFormat};
 use wildcity_twin::store::{Catalog, Version};
 
-use crate::http::{client, get, in_cell, post, push_of, write};
+use crate::http::{client, get, in_cell, new_push, post, write};
 use crate::scene_files::gaussians;
 use crate::support::TestServer;
 
-/// Two alignments, one after the other: tilted ground and a different unit, and then rotated ground.
+/// Two alignments, one after the other: tilted ground and a different unit, and then rotated
+/// ground.
 fn edits() -> [Value; 2] {
     let ground = json!({"points": [[0, 0, 2], [4, 0, 3], [0, 4, 1]], "above": [0, 0, 50]});
     let scale = json!({"points": [[0, 0, 0], [0, 1, 0]], "distance_m": 1.75});
@@ -35,7 +36,7 @@ async fn push(
     let path = write(dir.path(), "scene.ply", scene);
     let client = client(server);
     let upload = client.upload(&path, &mut |_, _| {}).await.unwrap();
-    let mut asked = push_of(&[&upload.id]);
+    let mut asked = new_push(&[&upload.id]);
     asked.record = Some("f32".to_owned());
     asked.cells = Some(CellSelection::All(AllCells::All));
     change(&mut asked);
@@ -47,7 +48,8 @@ fn in_capture(push: &mut NewPush) {
     push.frame = Some(PushFrame::Capture);
 }
 
-/// 2,000 Gaussians of SH degree 2; the opacity of each is its number, so that they can be found again.
+/// 2,000 Gaussians of SH degree 2; the opacity of each is its number, so that they can be found
+/// again.
 fn scene(seed: u64) -> Gaussians {
     let mut scene = gaussians(2_000, 2, 60.0, seed);
     for (index, logit) in scene.logit_opacities.iter_mut().enumerate() {
@@ -121,7 +123,8 @@ async fn a_push_in_the_frame_of_the_capture_lies_as_if_it_had_been_aligned_with_
     let report = pushed.report.unwrap();
     assert_eq!((report.frame, report.aligned), (Some(PushFrame::Capture), true));
 
-    // One twin was stored as f32 before the alignment, the other one after it: equal up to the rounding of f32.
+    // One twin was stored as f32 before the alignment, the other one after it: equal up to the
+    // rounding of f32.
     let [before, after] = ["before", "after"].map(|twin| stored(&server, twin));
     let off = differences(&before, &after);
     assert!(off.iter().all(|&off| off < 3e-5), "{off:?}");
@@ -178,7 +181,8 @@ async fn the_frames_of_a_twin_that_was_never_aligned_are_one() {
 async fn cells_are_those_of_the_twin_and_other_cells_stay() {
     let server = TestServer::start().await;
     push(&server, "street", &in_cell([0, 0], 40, 1), |_| {}).await;
-    // Twice as large: cell (1, 0) of the capture, 64 m away, is around x = 128 m, which is cell (2, 0) of the twin.
+    // Twice as large: cell (1, 0) of the capture, 64 m away, is around x = 128 m, which is cell (2,
+    // 0) of the twin.
     let twice = json!({"scale": {"points": [[0, 0, 0], [0, 0, 1]], "distance_m": 2}});
     edit(&server, "street", &twice).await;
     let far = in_cell([1, 0], 30, 2);
@@ -216,8 +220,8 @@ async fn a_frame_that_cannot_be_used_is_named() {
     reply.refused(400, "invalid_request");
     assert_eq!(reply.body["field"], "frame", "{reply:?}");
 
-    // Aligned by a factor of 1,000: a scene that fits the bounds in the frame of the capture need not fit in that of
-    // the twin.
+    // Aligned by a factor of 1,000: a scene that fits the bounds in the frame of the capture need
+    // not fit in that of the twin.
     push(&server, "street", &in_cell([0, 0], 40, 1), |_| {}).await;
     let small = json!({"scale": {"points": [[0, 0, 0], [0, 0, 1]], "distance_m": 1000}});
     edit(&server, "street", &small).await;

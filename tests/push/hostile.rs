@@ -5,7 +5,7 @@ use serde_json::json;
 use wildcity_client::PushState;
 
 use crate::gltf_files::gltf;
-use crate::http::{client, get, in_cell, post, push_of, send};
+use crate::http::{client, get, in_cell, new_push, post, send};
 use crate::support::TestServer;
 
 #[tokio::test]
@@ -78,7 +78,8 @@ async fn hostile_bodies() {
     for name in ["..", "a/b", "", "a".repeat(300).as_str(), "\n"] {
         let body = json!({ "name": name, "size": 1, "digest": format!("blake3:{:064}", 0) });
         let reply = post(&server, "/v1/uploads", &body).await;
-        // A name is only shown and never used as a path; names with a separator are refused all the same.
+        // A name is only shown and never used as a path; names with a separator are refused all the
+        // same.
         assert!(reply.status == 400 || name == "..", "{name:?}: {reply:?}");
     }
     for digest in ["", "blake3:", "md5:00", &format!("blake3:{}", "G".repeat(64)), "blake3-/../x"] {
@@ -108,7 +109,7 @@ async fn a_pushed_scene_names_only_files_of_its_push() {
         client.upload(&path, &mut |_, _| {}).await.unwrap().id
     };
     let pushed = async |uploads: &[&str]| {
-        let begun = client.push("test", &push_of(uploads)).await.unwrap();
+        let begun = client.push("test", &new_push(uploads)).await.unwrap();
         client.wait_for_push(begun, &mut |_| {}).await.unwrap()
     };
     let scene = in_cell([0, 0], 40, 1);

@@ -1,5 +1,5 @@
-//! Uploads and pushes over HTTP: agents see all of a pushed scene once they request the version, and a failed push
-//! changes nothing.
+//! Uploads and pushes over HTTP: agents see all of a pushed scene once they request the version,
+//! and a failed push changes nothing.
 
 #[path = "../support/data.rs"]
 mod data;

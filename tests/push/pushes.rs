@@ -1,5 +1,5 @@
-//! Pushes: all of their cells change at once; a refusal lists everything that is wrong; the same push again
-//! has the same result.
+//! Pushes: all of their cells change at once; a refusal lists everything that is wrong; the same
+//! push again has the same result.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -14,7 +14,7 @@ use wildcity_scene::align::Alignment;
 use wildcity_server::Limits;
 use wildcity_twin::store::{Catalog, Edit};
 
-use crate::http::{client, get, in_cell, post, push, push_of, send, write};
+use crate::http::{client, get, in_cell, new_push, post, push, send, write};
 use crate::scene_files::gaussians;
 use crate::support::{TEST_TIMEOUT, TestServer};
 
@@ -69,7 +69,7 @@ async fn each_file_has_its_axes_and_its_scale() {
         let path = write(dir.path(), "one.ply", &one);
         uploads.push(client.upload(&path, &mut |_, _| {}).await.unwrap().id);
     }
-    let mut asked = push_of(&[&uploads[0], &uploads[1]]);
+    let mut asked = new_push(&[&uploads[0], &uploads[1]]);
     asked.record = Some("f32".to_owned());
     // x right, y down, z forward, in half metres; and a quarter turn.
     (asked.files[0].axes, asked.files[0].scale) = (Some("y-down-z-forward".to_owned()), Some(0.5));
@@ -100,7 +100,7 @@ async fn a_push_makes_a_new_twin() {
     let path = write(dir.path(), "a.ply", &in_cell([0, 0], 20, 1));
     let client = client(&server);
     let upload = client.upload(&path, &mut |_, _| {}).await.unwrap();
-    let begun = client.push("fresh", &push_of(&[&upload.id])).await.unwrap();
+    let begun = client.push("fresh", &new_push(&[&upload.id])).await.unwrap();
     let pushed = client.wait_for_push(begun, &mut |_| {}).await.unwrap();
     assert_eq!((pushed.state, pushed.version), (PushState::Ready, Some(1)), "{pushed:?}");
     assert_eq!(get(&server, "/v1/twins/fresh").await.body["gaussians"], 20);
@@ -214,7 +214,7 @@ async fn all_cells_replace_nothing_that_changed_while_they_were_checked() {
     let path = write(dir.path(), "whole.ply", &in_cell([2, 2], 7, 1));
     let upload = client.upload(&path, &mut |_, _| {}).await.unwrap();
     let cells = Some(CellSelection::All(AllCells::All));
-    let whole = NewPush { cells, ..push_of(&[&upload.id]) };
+    let whole = NewPush { cells, ..new_push(&[&upload.id]) };
     // The preview of a push renders eight frames. During these, another program writes a version.
     server.painter.slow_ms.store(500, Ordering::SeqCst);
     let begun = client.push("test", &whole).await.unwrap();
@@ -267,7 +267,8 @@ async fn views_before_and_after_are_compared() {
     assert_eq!(again.state, PushState::Ready, "{again:?}");
 }
 
-/// Levels of detail cause no difference, although a twin is rendered with them from afar and a push has none yet.
+/// Levels of detail cause no difference, although a twin is rendered with them from afar and a push
+/// has none yet.
 #[tokio::test]
 async fn the_same_content_has_equal_views_from_afar() {
     let cpu = Arc::new(Cpu::new(2, Simd::Best).unwrap());
@@ -337,7 +338,7 @@ async fn a_psnr_that_cannot_be_measured_is_refused() {
     let client = client(&server);
     let upload = client.upload(&path, &mut |_, _| {}).await.unwrap();
     let fresh = async |change: &dyn Fn(&mut NewPush)| {
-        let mut asked = push_of(&[&upload.id]);
+        let mut asked = new_push(&[&upload.id]);
         change(&mut asked);
         let begun = client.push("fresh", &asked).await.unwrap();
         client.wait_for_push(begun, &mut |_| {}).await.unwrap()
@@ -387,9 +388,9 @@ async fn a_slow_push_delays_no_other_twin_and_can_be_cancelled() {
     let other_id = upload("other.ply", in_cell([0, 0], 20, 2)).await;
     // The preview of a push renders eight frames.
     server.painter.slow_ms.store(1_000, Ordering::SeqCst);
-    let slow = NewPush { id: Some("slow".to_owned()), ..push_of(&[&slow_id]) };
+    let slow = NewPush { id: Some("slow".to_owned()), ..new_push(&[&slow_id]) };
     let begun = client.push("test", &slow).await.unwrap();
-    let other = client.push("other", &push_of(&[&other_id])).await.unwrap();
+    let other = client.push("other", &new_push(&[&other_id])).await.unwrap();
     let other = client.wait_for_push(other, &mut |_| {}).await.unwrap();
     assert_eq!(other.state, PushState::Ready, "{other:?}");
     let path = format!("/v1/twins/test/pushes/{}", begun.id);

@@ -8,7 +8,7 @@ use wildcity_client::{Client, ConnectOptions, HttpClient};
 use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_server::{Config, Tokens};
 
-use crate::http::{Reply, push_of, send};
+use crate::http::{Reply, new_push, send};
 use crate::support::TestServer;
 
 const DRIVER: &str = "driver-driver-driver";
@@ -171,7 +171,7 @@ async fn the_client_sends_its_token() {
     let pusher = HttpClient::new(&url, &with_token(PUSHER)).unwrap();
     assert!(!format!("{pusher:?}").contains(PUSHER));
     let upload = pusher.upload(&path, &mut |_, _| {}).await.unwrap();
-    let begun = pusher.push("test", &push_of(&[&upload.id])).await.unwrap();
+    let begun = pusher.push("test", &new_push(&[&upload.id])).await.unwrap();
     assert_eq!(pusher.wait_for_push(begun, &mut |_| {}).await.unwrap().version, Some(2));
     assert!(pusher.rollback("test", 1).await.unwrap_err().to_string().contains("403"));
     let admin = HttpClient::new(&url, &with_token(ADMIN)).unwrap();
@@ -187,7 +187,8 @@ async fn the_client_sends_its_token() {
     assert_eq!(driver.reset(0, None).await.unwrap().metadata().version, 2);
 }
 
-/// Changes of the images by a push are visible to all tokens that may push to the twin, and to no others.
+/// Changes of the images by a push are visible to all tokens that may push to the twin, and to no
+/// others.
 #[tokio::test]
 async fn the_report_of_a_push_is_for_those_that_may_push() {
     let cpu = Arc::new(Cpu::new(1, Simd::Best).unwrap());
@@ -197,7 +198,7 @@ async fn the_report_of_a_push_is_for_those_that_may_push() {
     let path = crate::http::write(dir.path(), "a.ply", &crate::http::in_cell([0, 0], 40, 1));
     let pusher = HttpClient::new(&url, &with_token(PUSHER)).unwrap();
     let upload = pusher.upload(&path, &mut |_, _| {}).await.unwrap();
-    let begun = pusher.push("test", &push_of(&[&upload.id])).await.unwrap();
+    let begun = pusher.push("test", &new_push(&[&upload.id])).await.unwrap();
     let request = format!("GET /v1/twins/test/pushes/{}", begun.id);
     pusher.wait_for_push(begun, &mut |_| {}).await.unwrap();
     for token in [PUSHER, RIVAL, ADMIN] {
@@ -391,7 +392,7 @@ async fn the_audit_log_says_which_token_changed_what() {
     let scene = crate::http::write(dir.path(), "a.ply", &crate::http::in_cell([0, 0], 40, 1));
     let rival = HttpClient::new(&url, &with_token(RIVAL)).unwrap();
     let upload = rival.upload(&scene, &mut |_, _| {}).await.unwrap();
-    let begun = rival.push("test", &push_of(&[&upload.id])).await.unwrap();
+    let begun = rival.push("test", &new_push(&[&upload.id])).await.unwrap();
     rival.wait_for_push(begun, &mut |_| {}).await.unwrap();
     let edit = |body: &'static str| ask(&server, "POST /v1/twins/test/edits", Some(ADMIN), body);
     assert_eq!(edit(r#"{"rig": "surround6"}"#).await.status, 200);

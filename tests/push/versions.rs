@@ -18,7 +18,9 @@ use wildcity_twin::store::{Catalog, Retention};
 
 use crate::http::{get, in_cell, post, push};
 use crate::metrics::scrape;
-use crate::support::{Agent, Seen, TEST_TIMEOUT, TestServer, commit_twin_of, pose, refused};
+use crate::support::{
+    Agent, Seen, TEST_TIMEOUT, TestServer, commit_twin_with_opacity, pose, refused,
+};
 
 /// Versions that are pushed while agents drive.
 const VERSIONS: u64 = 50;
@@ -268,7 +270,7 @@ async fn without_a_session_there_is_nothing_to_switch() {
 #[tokio::test]
 async fn a_rollback_to_a_collected_version_is_refused() {
     let server = TestServer::start().await;
-    commit_twin_of(server.twins.path(), 1.0);
+    commit_twin_with_opacity(server.twins.path(), 1.0);
     let catalog = Catalog::open(server.twins.path()).unwrap();
     let retention = Retention { versions: 1, grace: Duration::ZERO };
     // The first run notes the garbage, the second one removes it.

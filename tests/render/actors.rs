@@ -86,14 +86,14 @@ fn actors_do_not_depend_on_threads_and_agree_on_instruction_sets() {
     }
 }
 
-/// An actor that crosses at 30 m/s while a camera at rest exposes its rows in 30 ms: against the ray of every pixel at
-/// its own moment.
+/// An actor that crosses at 30 m/s while a camera at rest exposes its rows in 30 ms: against the
+/// ray of every pixel at its own moment.
 #[test]
 fn a_crossing_actor_agrees_with_exact_rays() {
     let pose = placed::on_street(27.0, 0.5, 1.5);
     let mut start = pose;
     start.position_m += DVec3::new(0.9, 0.0, 0.0);
-    let chunk = placed::chunk_of(&placed::actor(1_000, 1, 7));
+    let chunk = placed::chunk(&placed::actor(1_000, 1, 7));
     let placed_chunk =
         PlacedChunk { world_from_actor_at_start: start, ..PlacedChunk::at_rest(chunk, pose, 0) };
     let scene = Scene { placed: vec![placed_chunk], ..Scene::default() };
@@ -111,7 +111,7 @@ fn a_crossing_actor_agrees_with_exact_rays() {
 
 #[test]
 fn more_actors_than_are_drawn_are_refused() {
-    let chunk = placed::chunk_of(&placed::actor(10, 0, 1));
+    let chunk = placed::chunk(&placed::actor(10, 0, 1));
     let one = PlacedChunk::at_rest(Arc::clone(&chunk), placed::on_street(30.0, 0.0, 0.0), 0);
     let scene = Scene { placed: vec![one; PlacedChunk::MAX_ACTORS + 1], ..Scene::default() };
     let view = placed::views()[0].1;

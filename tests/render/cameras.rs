@@ -1,8 +1,8 @@
-//! Images by lenses and rolling shutters, compared with the analytic projection, with exact rays, and with
-//! the same scene rendered row by row.
+//! Images by lenses and rolling shutters, compared with the analytic projection, with exact rays,
+//! and with the same scene rendered row by row.
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
-use wildcity_render::compare::gaussians::{GaussianSpec, scene_of};
+use wildcity_render::compare::gaussians::{GaussianSpec, scene_from_specs};
 use wildcity_render::compare::reprojection::centroid;
 use wildcity_render::reference::Reference;
 use wildcity_render::unscented::UnscentedView;
@@ -70,8 +70,8 @@ fn zero_distortion_draws_the_bytes_of_a_pinhole() {
     let profile = RenderProfile::default();
     let image = render_one(&cpu(), &street, &profile, View::new(ideal, pose));
     assert!(render_one(&cpu(), &street, &profile, same) == image);
-    // With a rolling shutter at rest the image differs only by the unscented transform, which replaces
-    // linearisation.
+    // With a rolling shutter at rest the image differs only by the unscented transform, which
+    // replaces linearisation.
     let unmoved = View { rolling_shutter: Some(still), ..same };
     let db = psnr(&render_one(&cpu(), &street, &profile, unmoved).rgba, &image.rgba);
     eprintln!("a pinhole by six points: {db:.1} dB of a pinhole");
@@ -104,9 +104,10 @@ fn t23_beyond_180_degrees_and_never_around() {
     let view = View::new(camera, Pose::IDENTITY);
     let profile = RenderProfile::default();
     for backend in [&Reference as &dyn Backend, &cpu()] {
-        let image = render_one(backend, &scene_of(&[behind_of(&behind)]), &profile, view);
+        let image =
+            render_one(backend, &scene_from_specs(&[point_behind(&behind)]), &profile, view);
         assert!(image.opacity.iter().all(|&o| o == 0.0), "{}: from behind", backend.name());
-        let image = render_one(backend, &scene_of(&[behind_of(&right)]), &profile, view);
+        let image = render_one(backend, &scene_from_specs(&[point_behind(&right)]), &profile, view);
         let at_px = camera.project(right.mean_m).unwrap();
         let found_px = centroid(&image.opacity, [120, 100], at_px, f64::INFINITY).unwrap();
         assert!(found_px.distance(at_px) < 0.3);
@@ -116,7 +117,7 @@ fn t23_beyond_180_degrees_and_never_around() {
             mean_m: DVec3::Z,
             ..GaussianSpec::default()
         };
-        let image = render_one(backend, &scene_of(&[wall]), &profile, view);
+        let image = render_one(backend, &scene_from_specs(&[wall]), &profile, view);
         for (pixel, &opacity) in image.opacity.iter().enumerate() {
             let at_px = DVec2::new((pixel % 120) as f64 + 0.5, (pixel / 120) as f64 + 0.5);
             let seen = camera.unproject(at_px).is_some();
@@ -137,7 +138,7 @@ fn t23_beyond_180_degrees_and_never_around() {
     assert!(db >= 40.0, "{db:.1} dB");
 }
 
-fn behind_of(blob: &GaussianSpec) -> GaussianSpec {
+fn point_behind(blob: &GaussianSpec) -> GaussianSpec {
     GaussianSpec { mean_m: blob.mean_m, ..GaussianSpec::default() }
 }
 
@@ -156,10 +157,13 @@ fn t5_a_camera_within_a_gaussian_and_one_before_it() {
     for (name, camera) in lenses() {
         let view = View::new(camera, Pose::IDENTITY);
         let profile = RenderProfile::default();
-        let truth = render_one(&Reference, &scene_of(&[behind_of_size(&inside)]), &profile, view);
-        let image = render_one(&cpu(), &scene_of(&[behind_of_size(&inside)]), &profile, view);
+        let truth =
+            render_one(&Reference, &scene_from_specs(&[behind_of_size(&inside)]), &profile, view);
+        let image =
+            render_one(&cpu(), &scene_from_specs(&[behind_of_size(&inside)]), &profile, view);
         agree(&image, &truth).unwrap_or_else(|e| panic!("{name}: {e}"));
-        let image = render_one(&cpu(), &scene_of(&[behind_of_size(&behind)]), &profile, view);
+        let image =
+            render_one(&cpu(), &scene_from_specs(&[behind_of_size(&behind)]), &profile, view);
         assert!(image.opacity.iter().all(|&o| o == 0.0), "{name}: a mirrored contribution");
     }
 }
@@ -174,7 +178,7 @@ fn t2_long_things_on_the_ground_beside_the_view() {
         let view = View::new(camera, Pose::IDENTITY);
         for [x, y] in [[6.0, 1.6], [-6.0, 1.6], [0.5, 5.0]] {
             for angle in [0.0, 0.5, 1.2, 2.5] {
-                let long = scene_of(&[GaussianSpec {
+                let long = scene_from_specs(&[GaussianSpec {
                     mean_m: DVec3::new(x, y, 4.0),
                     rotation: DQuat::from_rotation_y(angle),
                     sigma_m: DVec3::new(2.0, 0.05, 0.3),
@@ -304,14 +308,15 @@ fn what_passes_close_is_seen_by_the_column_that_it_lands_on() {
         })
         .collect();
     let profile = RenderProfile::default();
-    let truth = render_one(&Reference, &scene_of(&balls), &profile, view);
+    let truth = render_one(&Reference, &scene_from_specs(&balls), &profile, view);
     assert!(truth.opacity.iter().filter(|&&o| o > 0.5).count() > 50, "little is seen");
-    agree(&render_one(&cpu(), &scene_of(&balls), &profile, view), &truth).unwrap();
+    agree(&render_one(&cpu(), &scene_from_specs(&balls), &profile, view), &truth).unwrap();
 }
 
 #[test]
 fn t22_six_points_scatter_as_a_million() {
-    // An inclined wide disc through the fisheye: mean and covariance on the image, by sampling points.
+    // An inclined wide disc through the fisheye: mean and covariance on the image, by sampling
+    // points.
     let camera = lenses()[1].1;
     let view = View::new(camera, Pose::IDENTITY);
     let unscented = UnscentedView::new(&view, &RenderProfile::default()).unwrap();

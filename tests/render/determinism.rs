@@ -1,4 +1,5 @@
-//! The same input gives the same bytes: at any number of threads, in any order of views, after any other frame.
+//! The same input gives the same bytes: at any number of threads, in any order of views, after any
+//! other frame.
 
 use std::sync::Mutex;
 
@@ -34,8 +35,8 @@ fn the_number_of_threads_does_not_show() {
     }
 }
 
-/// AVX2 and AVX-512 have the same operations, of eight and of sixteen lanes. SSE4.2 has no fused multiply-add: its images
-/// differ in last bits, and the backend says which instruction set it has.
+/// AVX2 and AVX-512 have the same operations, of eight and of sixteen lanes. SSE4.2 has no fused
+/// multiply-add: its images differ in last bits, and the backend says which instruction set it has.
 #[test]
 fn avx2_and_avx512_draw_the_same_bytes() {
     let [Ok(avx2), Ok(avx512)] = [Simd::Avx2, Simd::Avx512].map(|simd| Cpu::new(2, simd)) else {

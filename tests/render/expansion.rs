@@ -1,10 +1,11 @@
-//! The expansion of a lens around a Gaussian's centre, which stands for six points where both differ by little.
+//! The expansion of a lens around a Gaussian's centre, which stands for six points where both
+//! differ by little.
 
 use std::time::Instant;
 
 use glam::{DQuat, DVec2, DVec3};
 use wildcity_generate::StreetSettings;
-use wildcity_render::compare::gaussians::{GaussianSpec, scene_of};
+use wildcity_render::compare::gaussians::{GaussianSpec, scene_from_specs};
 use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_render::reference::Reference;
 use wildcity_render::stage::Stage;
@@ -43,8 +44,8 @@ fn views() -> Vec<(String, View)> {
     both.filter(|(name, _)| name != "pinhole").collect()
 }
 
-/// Gaussians of every shape and orientation that lie in the image, from 3 to 50 m away, with standard deviations
-/// of a thousandth to a twentieth of that.
+/// Gaussians of every shape and orientation that lie in the image, from 3 to 50 m away, with
+/// standard deviations of a thousandth to a twentieth of that.
 fn gaussians(view: &View, count: usize) -> Vec<GaussianSpec> {
     let mut random = Random(7);
     let mut specs = Vec::new();
@@ -82,8 +83,8 @@ fn ellipse(splat: &wildcity_render::layout::Splat) -> (DVec2, [f64; 3]) {
     (DVec2::from_array(splat.mean_px.map(f64::from)), covariance)
 }
 
-/// How far two splats are apart: distance of the means, and largest difference of the standard deviations in any
-/// direction.
+/// How far two splats are apart: distance of the means, and largest difference of the standard
+/// deviations in any direction.
 fn apart_px(a: &wildcity_render::layout::Splat, b: &wildcity_render::layout::Splat) -> f64 {
     let (mean_a, cov_a) = ellipse(a);
     let (mean_b, cov_b) = ellipse(b);
@@ -111,7 +112,7 @@ fn splats(
 #[test]
 fn expansions_are_as_close_to_six_points_as_the_bound_says() {
     for (name, view) in views() {
-        let scene = scene_of(&gaussians(&view, 4_000));
+        let scene = scene_from_specs(&gaussians(&view, 4_000));
         let points = splats(&scene, &six_points(), view);
         for bound_px in [1.0 / 256.0, 1.0 / 64.0, 0.25] {
             let profile = RenderProfile { lens_error_px: bound_px, ..RenderProfile::default() };
@@ -146,7 +147,8 @@ fn images_by_expansion_agree_with_the_definition() {
     }
 }
 
-/// A rig in the demo street, and pinholes of the same sizes and horizontal fields of view, at most 120°.
+/// A rig in the demo street, and pinholes of the same sizes and horizontal fields of view, at most
+/// 120°.
 fn rig_and_pinholes(name: &str, size_px: Option<[u64; 2]>) -> (Vec<View>, Vec<View>) {
     let street = wildcity_generate::street(&StreetSettings::default()).unwrap();
     let world_from_rig = street.trajectory.at_station(60.0);
@@ -231,7 +233,8 @@ pub(crate) fn paired(name: &str, a: &dyn Fn() -> StepMs, b: &dyn Fn() -> StepMs)
     ratio
 }
 
-/// `alpamayo2` against six pinholes and with the expansion, and rolling shutters against global ones.
+/// `alpamayo2` against six pinholes and with the expansion, and rolling shutters against global
+/// ones.
 #[test]
 #[ignore = "times: cargo test -p wildcity-render --test render lenses_and_shutters_cost -- --ignored --nocapture"]
 fn lenses_and_shutters_cost_little_more_than_pinholes() {

@@ -1,4 +1,5 @@
-//! PSNR, SSIM and FLIP against scikit-image, torchmetrics and flip-evaluator (`image_metrics.py` wrote the values).
+//! PSNR, SSIM and FLIP against scikit-image, torchmetrics and flip-evaluator (`image_metrics.py`
+//! wrote the values).
 
 use serde::Deserialize;
 use wildcity_render::compare::flip::flip;
@@ -39,7 +40,7 @@ fn psnr_and_ssim_are_those_of_scikit_image_and_torchmetrics() {
         let values = |image: &[u8]| -> Vec<f64> {
             image.iter().map(|&byte| f64::from(byte) / 255.0).collect()
         };
-        let ssim = Ssim::of(&values(&image), &values(&truth), case.size_px, None);
+        let ssim = Ssim::compare(&values(&image), &values(&truth), case.size_px, None);
         for (what, own, other) in [
             ("PSNR", psnr_db, case.psnr_db),
             ("SSIM within", ssim.within, case.ssim_within),

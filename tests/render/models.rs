@@ -1,8 +1,8 @@
-//! Camera models by themselves: projection and its inverse, comparison with formulas written independently, and
-//! rejected coefficients.
+//! Camera models by themselves: projection and its inverse, comparison with formulas written
+//! independently, and rejected coefficients.
 
 use glam::{DVec2, DVec3};
-use wildcity_render::compare::gaussians::{GaussianSpec, scene_of};
+use wildcity_render::compare::gaussians::{GaussianSpec, scene_from_specs};
 use wildcity_render::compare::reprojection::centroid;
 use wildcity_render::reference;
 use wildcity_render::{Backend, View};
@@ -158,8 +158,8 @@ fn zero_distortion_is_a_pinhole() {
 fn a_lens_ends_before_it_folds_back() {
     let wide = Pinhole { fx: 40.0, fy: 40.0, cx: 80.0, cy: 50.0 };
     let ideal = Camera::from_pinhole(160, 100, wide);
-    // θ - θ³/6 begins to fall at √2 rad. x (1 - 0.3 r²) begins to fall at r = 1.05; its field ends at 0.82,
-    // where the factor is 0.8.
+    // θ - θ³/6 begins to fall at √2 rad. x (1 - 0.3 r²) begins to fall at r = 1.05; its field ends
+    // at 0.82, where the factor is 0.8.
     let fisheye = Fisheye::new([-1.0 / 6.0, 0.0, 0.0, 0.0], None);
     let fisheye = Camera { lens: Lens::Fisheye(fisheye), ..ideal };
     assert!((fisheye.limit_rad() - 1.4).abs() < 1e-12, "{}", fisheye.limit_rad());
@@ -174,7 +174,7 @@ fn a_lens_ends_before_it_folds_back() {
         assert!(camera.project(DVec3::new(sin, 0.0, cos)).is_some(), "within");
         assert_eq!(camera.project(DVec3::NEG_Z), None, "behind");
         assert_eq!(camera.unproject(DVec2::new(1.0, 1.0)), None, "the corner");
-        let field = FieldMask::of(&camera).expect("a part of the image");
+        let field = FieldMask::from_camera(&camera).expect("a part of the image");
         for (row, [first, end]) in field.columns.iter().enumerate() {
             for column in 0..camera.width_px {
                 let at_px = DVec2::new(f64::from(column) + 0.5, row as f64 + 0.5);
@@ -185,7 +185,7 @@ fn a_lens_ends_before_it_folds_back() {
         let share = field.visible_share(&camera);
         assert!((0.1..0.8).contains(&share), "{share}");
     }
-    assert_eq!(FieldMask::of(&ideal), None);
+    assert_eq!(FieldMask::from_camera(&ideal), None);
 }
 
 #[test]
@@ -278,7 +278,8 @@ fn opencv_lenses_neither_fold_nor_lose_what_they_see() {
             let back = camera.unproject(at_px).unwrap_or_else(|| panic!("{lens:?} lost {slope}"));
             let off = back.distance(slope.normalize());
             assert!(off < 1e-9, "{lens:?}: {slope} came back off by {off:e}");
-            // The difference of two images has a positive component along the difference of the directions.
+            // The difference of two images has a positive component along the difference of the
+            // directions.
             if let Some((other, other_px)) = before {
                 let apart = (slope - other).truncate();
                 assert!(apart.dot(at_px - other_px) > 0.0, "{lens:?} mirrors {slope}, {other}");
@@ -340,7 +341,7 @@ fn tangential_distortion_mirrors_nothing_into_the_image() {
                 ..GaussianSpec::default()
             };
             let view = View::new(camera, Pose::IDENTITY);
-            let image = render_one(backend, &scene_of(&[ball]), &fine, view);
+            let image = render_one(backend, &scene_from_specs(&[ball]), &fine, view);
             let middle_px = camera.size_px() / 2.0;
             centroid(&image.opacity, [160, 100], middle_px, f64::INFINITY).map(|at_px| at_px.y)
         };
@@ -371,7 +372,8 @@ fn an_image_covers_all_of_the_field() {
                 mean_m: DVec3::Z,
                 ..GaussianSpec::default()
             };
-            let image = render_one(backend, &scene_of(&[wall]), &RenderProfile::default(), view);
+            let image =
+                render_one(backend, &scene_from_specs(&[wall]), &RenderProfile::default(), view);
             for (pixel, &opacity) in image.opacity.iter().enumerate() {
                 let from_axis = DVec2::new((pixel % 300) as f64, (pixel / 300) as f64) - 149.5;
                 let seen = from_axis.length() < edge_px;

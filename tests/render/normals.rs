@@ -1,7 +1,7 @@
 //! Normals of surfaces with a known normal, through every lens, and at the edges of surfaces.
 
 use glam::{DQuat, DVec3};
-use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_of};
+use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_from_specs};
 use wildcity_render::reference::Reference;
 use wildcity_render::{Backend, Frame, RenderError, RollingShutter, Target, View};
 use wildcity_scene::geometry::Pose;
@@ -64,7 +64,7 @@ fn off_deg(drawn: &Drawn, facing: DVec3) -> Vec<f64> {
 #[test]
 fn normals_of_a_wall_match() {
     let facing = DVec3::new(0.4, -0.3, -1.0).normalize();
-    let scene = scene_of(&wall(DVec3::new(0.0, 0.0, 3.0), facing, 5.0));
+    let scene = scene_from_specs(&wall(DVec3::new(0.0, 0.0, 3.0), facing, 5.0));
     let way = Pose { position_m: DVec3::new(-0.6, 0.0, 0.0), ..Pose::IDENTITY };
     let rolling_shutter =
         RollingShutter { direction: ShutterDirection::TopToBottom, world_from_camera_first: way };
@@ -91,12 +91,14 @@ fn normals_of_a_wall_match() {
 
 #[test]
 fn an_edge_belongs_to_neither_side() {
-    // A board 2 m away in front of a wall 4 m away: the edge between them must not give slanted normals.
+    // A board 2 m away in front of a wall 4 m away: the edge between them must not give slanted
+    // normals.
     let board = wall(DVec3::new(-1.0, 0.0, 2.0), DVec3::NEG_Z, 2.0);
     let behind = wall(DVec3::new(0.0, 0.0, 4.0), DVec3::NEG_Z, 12.0);
-    let scene = scene_of(&[board, behind].concat());
+    let scene = scene_from_specs(&[board, behind].concat());
     let drawn = draw(&cpu(), &scene, forward_view([160, 100], 90.0));
-    // At the board's edge discs fade out over some pixels, and their blended depth does have a slope.
+    // At the board's edge discs fade out over some pixels, and their blended depth does have a
+    // slope.
     let mut on_one = 0;
     let mut slopes = 0;
     for (normal, depth_m) in drawn.normals.chunks(3).zip(&drawn.depth_m) {
@@ -109,8 +111,8 @@ fn an_edge_belongs_to_neither_side() {
     assert!(on_one > 14_000 && slopes < 70, "{slopes} of {on_one}");
 }
 
-/// Every pixel with a depth has a unit normal towards the camera, also one that has no neighbour, or none in its
-/// row or its column.
+/// Every pixel with a depth has a unit normal towards the camera, also one that has no neighbour,
+/// or none in its row or its column.
 #[test]
 fn lone_pixels_face_the_camera() {
     let speck = |x_m: f64, y_m: f64| GaussianSpec {
@@ -131,7 +133,7 @@ fn lone_pixels_face_the_camera() {
     let alone = at(5.0, 5.0);
     let row = [at(10.0, 20.0), at(11.0, 20.0), at(12.0, 20.0)];
     let column = [at(30.0, 8.0), at(30.0, 9.0), at(30.0, 10.0)];
-    let scene = scene_of(&[&[alone], &row[..], &column[..]].concat());
+    let scene = scene_from_specs(&[&[alone], &row[..], &column[..]].concat());
     for backend in [&cpu() as &dyn Backend, &Reference] {
         let drawn = draw(backend, &scene, view);
         let covered: Vec<usize> =
@@ -148,7 +150,7 @@ fn lone_pixels_face_the_camera() {
 
 #[test]
 fn pixels_without_depth_have_no_normal() {
-    let ball = scene_of(&[GaussianSpec::default()]);
+    let ball = scene_from_specs(&[GaussianSpec::default()]);
     let drawn = draw(&cpu(), &ball, forward_view([40, 30], 30.0));
     let mut covered = 0;
     for (normal, depth_m) in drawn.normals.chunks(3).zip(&drawn.depth_m) {

@@ -58,8 +58,8 @@ fn a_cloud_around_the_camera() {
 
 #[test]
 fn the_demo_street_from_its_own_cameras() {
-    // Thousands of coplanar surfels: where depths differ by less than the resolution of f32, the backends may
-    // draw them in different orders.
+    // Thousands of coplanar surfels: where depths differ by less than the resolution of f32, the
+    // backends may draw them in different orders.
     let (street, views) = demo_street();
     compare(&street, &RenderProfile::default(), &views);
 }

@@ -30,15 +30,15 @@ fn anywhere(random: &mut Random) -> DVec3 {
     }
 }
 
-fn map_of(drawn: DrawableSky) -> Arc<CubeMap> {
+fn cube_map(drawn: DrawableSky) -> Arc<CubeMap> {
     match drawn {
         DrawableSky::CubeMap(map) => map,
         DrawableSky::Network(_) => panic!("it is not baked"),
     }
 }
 
-/// The values are those of `python scenes/sky.py truths`: a direction, its colour with the mean appearance,
-/// and its colour with the appearance of image 1.
+/// The values are those of `python scenes/sky.py truths`: a direction, its colour with the mean
+/// appearance, and its colour with the appearance of image 1.
 #[test]
 fn the_network_is_what_numpy_says() {
     let truths: Vec<[f64; 9]> = serde_json::from_str(include_str!("sky.json")).unwrap();
@@ -106,7 +106,7 @@ fn a_baked_sky_is_within_its_bound_everywhere() {
     let mut edges = Vec::new();
     for wanted in [0.05, 0.005, 0.0005] {
         let sky = sky();
-        let map = map_of(sky.drawable(wanted).unwrap());
+        let map = cube_map(sky.drawable(wanted).unwrap());
         assert!(map.error() <= wanted, "{} for {wanted}", map.error());
         let mut worst: f64 = 0.0;
         for _ in 0..100_000 {
@@ -118,7 +118,7 @@ fn a_baked_sky_is_within_its_bound_everywhere() {
         // A bound that is far too large would waste memory.
         assert!(worst > 0.1 * map.error(), "{worst}, stated {}", map.error());
         edges.push(map.edge());
-        assert!(Arc::ptr_eq(&map, &map_of(sky.drawable(wanted).unwrap())), "baked once");
+        assert!(Arc::ptr_eq(&map, &cube_map(sky.drawable(wanted).unwrap())), "baked once");
     }
     assert!(edges.is_sorted() && edges[0] < edges[2], "{edges:?}");
 }
@@ -128,24 +128,24 @@ fn a_baked_sky_is_within_its_bound_everywhere() {
 fn every_error_keeps_its_map() {
     let sky = sky();
     let wanted = [0.05, 0.0005, 0.005];
-    let maps = wanted.map(|wanted| map_of(sky.drawable(wanted).unwrap()));
+    let maps = wanted.map(|wanted| cube_map(sky.drawable(wanted).unwrap()));
     let bytes = sky.bytes();
     for (wanted, map) in wanted.into_iter().zip(&maps) {
-        assert!(Arc::ptr_eq(&map_of(sky.drawable(wanted).unwrap()), map), "{wanted}");
+        assert!(Arc::ptr_eq(&cube_map(sky.drawable(wanted).unwrap()), map), "{wanted}");
     }
     // A session gets the coarsest map that is good enough, in whichever order sessions ask.
-    let coarsest = map_of(sky.drawable(1.0).unwrap());
+    let coarsest = cube_map(sky.drawable(1.0).unwrap());
     assert_eq!(coarsest.edge(), 129);
     assert!(coarsest.error() <= 0.05 && Arc::ptr_eq(&coarsest, &maps[0]));
     assert_eq!(sky.bytes(), bytes);
     let fresh = Sky::new(sky.model().clone(), sky.sky_from_world());
-    assert!(*map_of(fresh.drawable(0.005).unwrap()) == *maps[2], "whatever was asked for before");
+    assert!(*cube_map(fresh.drawable(0.005).unwrap()) == *maps[2], "whatever was asked for before");
 }
 
 #[test]
 fn the_demo_sky_is_within_the_default_bound() {
     let sky = Sky::new(demo_model(None), DMat3::IDENTITY);
-    let map = map_of(sky.drawable(RenderProfile::DEFAULT.sky_error).unwrap());
+    let map = cube_map(sky.drawable(RenderProfile::DEFAULT.sky_error).unwrap());
     let mut random = Random(9);
     let mut worst: f64 = 0.0;
     for _ in 0..20_000 {
@@ -180,7 +180,8 @@ fn a_sky_too_sharp_for_any_map_is_refused_with_the_way_out() {
     render_one(&cpu(), &scene, &EXACT, view);
 }
 
-/// A sky behind a street: the two backends agree, and it adds the right colours to those of the street without a sky.
+/// A sky behind a street: the two backends agree, and it adds the right colours to those of the
+/// street without a sky.
 #[test]
 fn a_sky_behind_gaussians() {
     let mut gaussians = street(20_000, 1, 6);
@@ -235,7 +236,8 @@ fn a_sky_behind_gaussians() {
     }
 }
 
-/// A sky is infinitely far away: its image does not change when the camera moves, and does when it rotates.
+/// A sky is infinitely far away: its image does not change when the camera moves, and does when it
+/// rotates.
 #[test]
 fn a_sky_has_no_parallax() {
     let scene = empty(sky());
@@ -265,8 +267,8 @@ fn images_are_their_own_map() {
         for profile in [RenderProfile::DEFAULT, EXACT] {
             let [image, truth] =
                 [&cpu() as &dyn Backend, &Reference].map(|b| render_one(b, &scene, &profile, view));
-            // No pixel looks exactly along the edge of two faces, where either would be right: the closest is
-            // 6e-5 off.
+            // No pixel looks exactly along the edge of two faces, where either would be right: the
+            // closest is 6e-5 off.
             let off = |limit: f32| {
                 let pairs = image.rgba.iter().zip(&truth.rgba);
                 let within = pairs.filter(|(a, b)| (*a - *b).abs() <= limit).count();

@@ -1,4 +1,5 @@
-//! The intermediate buffers of the cpu backend are bounded, whatever the scene, and no bound changes the images.
+//! The intermediate buffers of the cpu backend are bounded, whatever the scene, and no bound
+//! changes the images.
 
 use glam::DVec3;
 use wildcity_render::cpu::Cpu;
@@ -87,7 +88,8 @@ fn splats_of_one_depth_are_cut_by_their_ids() {
     check(&Scene::from_gaussians(&wall), &RenderProfile::default(), &[view]);
 }
 
-/// Few Gaussians that cover the image: what they take are pairs with macro tiles, which only bin knows.
+/// Few Gaussians that cover the image: what they take are pairs with macro tiles, which only bin
+/// knows.
 #[test]
 fn large_splats_are_cut_by_their_macro_tiles() {
     let n = 6_000;

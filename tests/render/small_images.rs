@@ -17,8 +17,8 @@ use crate::images::{Image, agree, cpu, psnr, render_one, view_along};
 use crate::lenses::{lenses, rolling_view, street_scene};
 use crate::truths::read;
 
-/// The view with its image at a share of its size: as the native image shrunk, and with the blur of its own
-/// pixels.
+/// The view with its image at a share of its size: as the native image shrunk, and with the blur of
+/// its own pixels.
 fn small(view: View, divisor: u32) -> [View; 2] {
     let sides = [view.camera.width_px / divisor, view.camera.height_px / divisor].map(u64::from);
     let shrunk = View { camera: view.camera.scaled(sides[0], sides[1]).unwrap(), ..view };
@@ -37,8 +37,8 @@ fn colors(view: View, image: &Image) -> Colors {
     }
 }
 
-/// PSNR in dB of an image at a share of the native size against the native image averaged: shrunk, and with the
-/// blur of its own pixels.
+/// PSNR in dB of an image at a share of the native size against the native image averaged: shrunk,
+/// and with the blur of its own pixels.
 fn against_native(scene: &Scene, native: View, divisor: u32) -> [f64; 2] {
     let profile = RenderProfile::default();
     let whole = colors(native, &render_one(&cpu(), scene, &profile, native));
@@ -101,7 +101,8 @@ fn a_small_image_is_the_native_image_shrunk() {
     }
 }
 
-/// Cameras of every model at rest and rolling, with images of half the native width and a third of its height.
+/// Cameras of every model at rest and rolling, with images of half the native width and a third of
+/// its height.
 fn small_views(pose: Pose) -> Vec<(String, View)> {
     let mut views = Vec::new();
     for (name, camera) in lenses() {
@@ -169,7 +170,8 @@ fn an_image_of_native_size_or_larger_keeps_its_bytes() {
 fn a_part_of_a_small_image_is_the_image_of_the_part() {
     let (street, pose) = street_scene();
     let profile = RenderProfile::default();
-    // With a pinhole, large Gaussians that reach across the edge of a part are projected for the part.
+    // With a pinhole, large Gaussians that reach across the edge of a part are projected for the
+    // part.
     let native = lenses()[1].1;
     let part = native.cropped([40, 20], [80, 60]).unwrap().scaled(40, 30).unwrap();
     let of_part = native.scaled(80, 50).unwrap().cropped([20, 10], [40, 30]).unwrap();
@@ -190,7 +192,7 @@ fn small_images_cost_nothing() {
     let street = wildcity_generate::street(&StreetSettings::default()).unwrap();
     let scene = Scene::from_gaussians(&street.gaussians);
     let world_from_rig = street.trajectory.at_station(60.0);
-    let views = View::of_rig(&Rig::preset("vehicle6").unwrap().cameras, world_from_rig);
+    let views = View::from_rig(&Rig::preset("vehicle6").unwrap().cameras, world_from_rig);
     for divisor in [2, 3, 4] {
         let both: Vec<[View; 2]> = views.iter().map(|view| small(*view, divisor)).collect();
         let [shrunk, own] = [0, 1].map(|k| both.iter().map(|pair| pair[k]).collect::<Vec<_>>());

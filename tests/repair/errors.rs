@@ -17,7 +17,8 @@ use crate::support::picture;
 fn a_nan_is_an_error_at_load_and_in_a_run_and_the_model_goes_on() {
     let error = Folder::new(&doubles::arithmetic("Mul", f32::NAN), json!({})).load().unwrap_err();
     assert!(matches!(error, RepairError::NotFinite { count: 12_288, of: 12_288, .. }), "{error}");
-    // One that shows only with bright images. The probe has them: it is refused, too, so the range is less.
+    // One that shows only with bright images. The probe has them: it is refused, too, so the range
+    // is less.
     let dark = json!({"inputs": [{"name": "image", "role": "rgb", "range": [0, 0.48]}]});
     let mut folder = Folder::new(&doubles::nan_where_bright(), dark);
     let model = folder.load().unwrap();

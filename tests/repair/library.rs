@@ -1,5 +1,5 @@
-//! The runtime library: loaded when the first model is, once, and never a second one. Each test has a process
-//! of its own, since a library stays.
+//! The runtime library: loaded when the first model is, once, and never a second one. Each test has
+//! a process of its own, since a library stays.
 
 use std::fs;
 use std::process::Command;

@@ -1,7 +1,7 @@
 //! Repair by ONNX models: two trained ones, and small graphs that the tests write themselves.
 //!
-//! The tests need a runtime library: ORT_DYLIB_PATH, or onnxruntime in target/python as `.ci/test` installs
-//! it. Without one they fail and say so.
+//! The tests need a runtime library: ORT_DYLIB_PATH, or onnxruntime in target/python as `.ci/test`
+//! installs it. Without one they fail and say so.
 
 #[path = "../support/data.rs"]
 mod data;

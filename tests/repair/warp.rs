@@ -33,7 +33,8 @@ impl Walls {
         Some(at(WALL_M))
     }
 
-    /// Linear on the wall, so that interpolation between pixels is exact up to rounding; the board is blue.
+    /// Linear on the wall, so that interpolation between pixels is exact up to rounding; the board
+    /// is blue.
     fn colour(point_m: DVec3) -> [u8; 3] {
         if point_m.z < WALL_M - 1.0 {
             return [0, 0, 250];
@@ -68,7 +69,7 @@ impl Walls {
 
     fn reference(self, camera: &Camera, pose: Pose) -> Arc<Reference> {
         let (image, depth_m) = self.depth(camera, &|_| pose);
-        let projection = Arc::new(Projection::of(camera));
+        let projection = Arc::new(Projection::from_camera(camera));
         Arc::new(Reference { image, depth_m, projection, world_from_camera: pose })
     }
 
@@ -77,7 +78,7 @@ impl Walls {
         warp(
             &WarpTarget {
                 camera,
-                rays: &Rays::of(camera),
+                rays: &Rays::from_camera(camera),
                 world_from_camera: pose,
                 shutter: None,
                 depth_m: &depth_m,
@@ -101,8 +102,8 @@ fn at(x: f64, y: f64, z: f64) -> Pose {
     Pose { position_m: DVec3::new(x, y, z), rotation }
 }
 
-/// What the point of a pixel looks like, and where it is on the image of a reference. `None` where the view sees
-/// nothing.
+/// What the point of a pixel looks like, and where it is on the image of a reference. `None` where
+/// the view sees nothing.
 fn truth(
     walls: Walls,
     camera: &Camera,
@@ -119,8 +120,8 @@ fn truth(
     Some((Walls::colour(point_m), there, is_seen))
 }
 
-/// Compares a warp of one reference with the truth, but for a margin of pixels at the borders of the reference's image.
-/// Returns how many pixels were compared as valid and as not valid.
+/// Compares a warp of one reference with the truth, but for a margin of pixels at the borders of
+/// the reference's image. Returns how many pixels were compared as valid and as not valid.
 fn compare(walls: Walls, camera: &Camera, target: Pose, other: &Camera, from: Pose) -> [usize; 2] {
     let warped = walls.warped(camera, target, &[walls.reference(other, from)]);
     let width = camera.width_px as usize;
@@ -236,7 +237,7 @@ fn rows_of_a_moving_camera_have_their_own_poses() {
     let camera = pinhole();
     let first = Pose { position_m: DVec3::new(-0.8, 0.0, -0.5), ..at(0.0, 0.0, 0.0) };
     let last = at(0.0, 0.0, 0.0);
-    let rays = Rays::of(&camera);
+    let rays = Rays::from_camera(&camera);
     let reference = walls.reference(&camera, at(0.3, 0.0, -1.0));
     let directions = [
         ShutterDirection::TopToBottom,
@@ -275,7 +276,7 @@ fn nothing_comes_without_depth_or_from_far_beside() {
     let (_, depth_m) = walls.depth(&camera, &|_| target);
     let opacity: Vec<f32> = (0..depth_m.len()).map(|at| [0.49, 0.5][at % 2]).collect();
     let opaque = opaque_depth(&depth_m, &opacity);
-    let rays = Rays::of(&camera);
+    let rays = Rays::from_camera(&camera);
     let view = WarpTarget {
         camera: &camera,
         rays: &rays,

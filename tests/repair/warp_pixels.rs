@@ -1,4 +1,5 @@
-//! Which pixels a warp takes, to the pixel: images of noise before a wall, so that a shift by half a pixel is seen.
+//! Which pixels a warp takes, to the pixel: images of noise before a wall, so that a shift by half
+//! a pixel is seen.
 
 use std::sync::Arc;
 
@@ -32,7 +33,7 @@ fn noise() -> Image {
 }
 
 fn reference(image: Image, depth_m: Vec<f32>, world_from_camera: Pose) -> Arc<Reference> {
-    let projection = Arc::new(Projection::of(&camera()));
+    let projection = Arc::new(Projection::from_camera(&camera()));
     Arc::new(Reference { image, depth_m, projection, world_from_camera })
 }
 
@@ -42,7 +43,7 @@ fn wall() -> Vec<f32> {
 
 fn warped(depth_m: &[f32], world_from_camera: Pose, references: &[Arc<Reference>]) -> Warped {
     let camera = camera();
-    let rays = Rays::of(&camera);
+    let rays = Rays::from_camera(&camera);
     let target =
         WarpTarget { camera: &camera, rays: &rays, world_from_camera, shutter: None, depth_m };
     warp(&target, references)
@@ -166,7 +167,7 @@ fn each_reference_is_seen_through_its_own_camera() {
     let small = Arc::new(Reference {
         image,
         depth_m: vec![WALL_M as f32; 42 * 24],
-        projection: Arc::new(Projection::of(&half)),
+        projection: Arc::new(Projection::from_camera(&half)),
         world_from_camera: Pose::IDENTITY,
     });
     let side = painted([0, 200, 0], WALL_M, moved(1.0, 0.0, 0.0));

@@ -20,8 +20,8 @@ use crate::images::{cpu, render_one, view_along};
 use crate::skies::sky;
 use crate::streets::street;
 
-/// Pipelines that the base scene compiles, and dispatches of a step. One more would be one that it does not
-/// need.
+/// Pipelines that the base scene compiles, and dispatches of a step. One more would be one that it
+/// does not need.
 const BASE: [u64; 2] = [28, 50];
 
 #[test]
@@ -31,7 +31,7 @@ fn a_report_has_the_device_memory_of_each_setting() {
     let scene = street(20_000, 1, 5);
     let new = NewVersion {
         storage: StorageOptions { record: RecordFormat::F32, levels: false },
-        ..NewVersion::of("street", &scene, Provenance::of("test".to_owned()))
+        ..NewVersion::from_gaussians("street", &scene, Provenance::new("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();
     let resident = Cache::new(catalog).open("street", None).unwrap();
@@ -55,7 +55,8 @@ fn a_report_has_the_device_memory_of_each_setting() {
     };
     assert_eq!(held_bytes("as served", &open), None);
     assert_eq!(held_bytes("gpu", &|| None), None);
-    // The same images take as much on a device that the test opens: the Gaussians, and buffers of stages.
+    // The same images take as much on a device that the test opens: the Gaussians, and buffers of
+    // stages.
     let (device, scene) = (open().unwrap(), Scene::from_gaussians(&scene));
     let mut rgb8 = vec![0; 3 * 640 * 480];
     for place in &places {
@@ -119,8 +120,8 @@ fn each_feature_costs_and_the_base_scene_pays_for_none() {
         let [pipelines, buffers, dispatches, planes] = beyond(with);
         assert!(buffers > 0 && [pipelines, dispatches, planes] == [0; 3], "{with}");
     }
-    // Culling and projecting twice: of the actors, and of the chunks of the twin with their shadows. And buffers of
-    // lights and of shadows, with lenses for actors that move.
+    // Culling and projecting twice: of the actors, and of the chunks of the twin with their
+    // shadows. And buffers of lights and of shadows, with lenses for actors that move.
     for (with, more_buffers) in [("two actors", 2), ("two moving actors", 3)] {
         let [pipelines, buffers, dispatches, planes] = beyond(with);
         assert_eq!([pipelines, dispatches, planes], [4, 4, 0], "{with}");

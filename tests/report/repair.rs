@@ -50,7 +50,7 @@ impl Twins {
                 rig: Some(rig()),
                 trajectories: vec![drive()],
                 storage: STORAGE,
-                ..NewVersion::of(name, gaussians, Provenance::of("test".to_owned()))
+                ..NewVersion::from_gaussians(name, gaussians, Provenance::new("test".to_owned()))
             };
             catalog.commit(new, &mut |_, _| {}).unwrap();
         }
@@ -104,7 +104,7 @@ fn record(catalog: &Catalog, truth: &Arc<Resident>) {
     for step in 0..20 {
         let station_m = 2.0 * f64::from(step);
         let world_from_rig = drive().at_station(station_m);
-        let seen = View::of_rig(&rig().cameras, world_from_rig);
+        let seen = View::from_rig(&rig().cameras, world_from_rig);
         for (view, (camera, rgb8)) in seen.iter().zip(rig().cameras.iter().zip(drawn(truth, &seen)))
         {
             let jpeg = wildcity_session::jpeg(&rgb8, 120, 80, 98).unwrap();
@@ -224,7 +224,7 @@ fn models_with_known_images_have_known_rows_and_losses_are_told() {
     let [_, near, _] = rows(&report, "warped")[..] else { panic!("{:?}", report.rows) };
     assert!(near.gain_db > Some(0.3), "recorded images help 1 m beside the drive: {near:?}");
 
-    let page = page_of(&report);
+    let page = report_page(&report);
     for row in rows(&report, "brighter") {
         assert!(row.gain_db < Some(-1.0) && row.worse == Some(row.images), "{row:?}");
         let told = format!("class=\"miss\">{:+.2}<", row.gain_db.unwrap());
@@ -242,7 +242,7 @@ fn models_with_known_images_have_known_rows_and_losses_are_told() {
     assert!(page.contains(&warping.text()));
 }
 
-fn page_of(report: &RepairReport) -> String {
+fn report_page(report: &RepairReport) -> String {
     wildcity_report::repair::section(report).into_string()
 }
 
@@ -257,7 +257,7 @@ fn psnr_and_flicker_are_those_of_the_poses_beside_the_drive() {
         for (sum_db, offset_m) in sums_db.iter_mut().zip([0.0, 1.0, 3.0]) {
             let y_m = if station < 2 { offset_m } else { -offset_m };
             let beside = Pose { position_m: DVec3::new(0.0, y_m, 0.0), ..Pose::IDENTITY };
-            let views = View::of_rig(&rig().cameras, drive().at_station(station_m) * beside);
+            let views = View::from_rig(&rig().cameras, drive().at_station(station_m) * beside);
             let [own, truth] = [&twins.worn, &twins.truth].map(|twin| drawn(twin, &views));
             for (own, truth) in own.iter().zip(&truth) {
                 *sum_db += psnr_db_u8(own.iter().zip(truth));
@@ -270,7 +270,7 @@ fn psnr_and_flicker_are_those_of_the_poses_beside_the_drive() {
         let station_m = drive().length_m() * (f64::from(station) + 0.5) / 4.0;
         let [now, before] = [0.0, FRAME_M].map(|back_m| {
             let pose = drive().at_station(station_m - back_m);
-            drawn(&twins.truth, &View::of_rig(&rig().cameras, pose))
+            drawn(&twins.truth, &View::from_rig(&rig().cameras, pose))
         });
         for (now, before) in now.iter().zip(&before) {
             unmoved += flicker(now, before, &vec![1.0; 120 * 80]).unwrap() / 8.0;
@@ -281,7 +281,8 @@ fn psnr_and_flicker_are_those_of_the_poses_beside_the_drive() {
     for (row, sum_db) in rows(&report, "rendered").iter().zip(sums_db) {
         let psnr_db = row.psnr_db.unwrap();
         assert!((psnr_db - sum_db / 8.0).abs() < 1e-9, "{psnr_db} dB, not {}", sum_db / 8.0);
-        // A step of 0.8 m changes shading and rounding, but little else: the views are brought together.
+        // A step of 0.8 m changes shading and rounding, but little else: the views are brought
+        // together.
         assert!((0.0005..0.08).contains(&row.flicker), "{row:?}");
         assert!((0.0005..0.08).contains(&row.true_flicker.unwrap()), "{row:?}");
     }
@@ -298,7 +299,7 @@ fn without_a_true_twin_times_and_flicker_remain_and_the_page_says_so() {
         assert_eq!((row.flip, row.db_per_100_ms, row.true_flicker), (None, None, None), "{row:?}");
         assert!(row.flicker > 0.0 && row.render_ms > 0.0, "{row:?}");
     }
-    let page = page_of(&report);
+    let page = report_page(&report);
     assert!(page.contains("how these views truly look is unknown"), "{page}");
     assert!(!page.contains("PSNR, dB") && !page.contains("worse images"), "{page}");
     assert!(page.contains("flicker"));

@@ -31,8 +31,8 @@ use wildcity_twin::store::{Catalog, NewSky, NewVersion, SkyBytes, StorageOptions
 use crate::reported::{commit, commit_reaching, drive, rig};
 use crate::skies::demo_sky;
 
-/// Measures the settings that `keep` accepts, on the cpu backend at three stations, or at twelve sample
-/// points around a capture. Also returns the settings that were skipped.
+/// Measures the settings that `keep` accepts, on the cpu backend at three stations, or at twelve
+/// sample points around a capture. Also returns the settings that were skipped.
 fn measured(
     resident: &Arc<Resident>,
     rig: &Rig,
@@ -168,8 +168,8 @@ fn least_db(m: &Measurement, chooses: bool) -> f64 {
     places.map(|place| place.min_db).fold(f64::INFINITY, f64::min)
 }
 
-/// A slow, good setting and a fast one, with the given dB at six sample points: of each two, the first is
-/// for selection.
+/// A slow, good setting and a fast one, with the given dB at six sample points: of each two, the
+/// first is for selection.
 fn two(like: &[Measurement], slow_db: [f64; 6], fast_db: [f64; 6]) -> Vec<Measurement> {
     let mut all = like.to_vec();
     for (m, (db, ms)) in all.iter_mut().zip([(slow_db, 20.0), (fast_db, 10.0)]) {
@@ -200,10 +200,12 @@ fn the_margin_is_the_spread_between_sample_points() {
         chosen([36.2, 35.5, 36.4, 35.1, 36.3, 36.0]).unwrap(),
         ("stop=0.016".to_owned(), 1.0)
     );
-    // 36 is 2 dB below the median of 38, so other points may have less than 35: the slow one is selected.
+    // 36 is 2 dB below the median of 38, so other points may have less than 35: the slow one is
+    // selected.
     let (setting, margin) = chosen([36.0, 33.0, 38.0, 40.0, 44.0, 45.0]).unwrap();
     assert_eq!(setting, "as served");
-    // The points have 60, 62 dB and "exact"; that one is much better does not count against the setting.
+    // The points have 60, 62 dB and "exact"; that one is much better does not count against the
+    // setting.
     assert_eq!(margin, 2.0);
     // A setting that fails the verification is not recommended.
     let refused = chosen([40.0, 41.0, 40.5, 34.9, 40.2, 40.0]).unwrap_err();
@@ -318,8 +320,9 @@ fn a_sample_point_is_as_good_as_its_worst_camera() {
     assert!(matches!(refused, ReportError::NotVerified { .. }), "{refused}");
 }
 
-/// Poses at which nothing was measured: station, and distance to the left of the drive, in metres. Settings
-/// are selected and verified at stations of 6.5, 19.5 and 32.5 m, on the drive and 1, 3 and 5 m off it.
+/// Poses at which nothing was measured: station, and distance to the left of the drive, in metres.
+/// Settings are selected and verified at stations of 6.5, 19.5 and 32.5 m, on the drive and 1, 3
+/// and 5 m off it.
 const ELSEWHERE_M: [[f64; 2]; 6] =
     [[2.0, 0.0], [11.0, 2.0], [15.0, -2.0], [24.0, 0.0], [28.0, 4.0], [36.0, -4.0]];
 
@@ -383,12 +386,12 @@ fn changes(setting: &Setting) -> ProfileOverrides {
     ProfileOverrides::new(setting.profile.iter().map(field).collect())
 }
 
-/// Reference images of the rig's cameras at some poses, of all Gaussians as they were generated: colours from
-/// 0 to 1.
+/// Reference images of the rig's cameras at some poses, of all Gaussians as they were generated:
+/// colours from 0 to 1.
 fn truths(poses: &[Pose]) -> Vec<Vec<f32>> {
     let scene = Scene::from_gaussians(&wildcity_generate::canyon(30_000, &mut |_, _| {}));
     let at = |pose: &Pose| {
-        let views = View::of_rig(&rig().cameras, *pose);
+        let views = View::from_rig(&rig().cameras, *pose);
         render_images(&Reference, &scene, &RenderProfile::DEFAULT, &views).unwrap()
     };
     let colours = |drawing: RenderedImage| {
@@ -434,7 +437,7 @@ fn a_setting_recommended_for_a_capture_is_verified_at_other_points() {
     let skull = wildcity_twin::ingest::read(&path, &mut |_, _| {}).unwrap();
     let new = NewVersion {
         storage: StorageOptions { record: RecordFormat::F32, levels: false },
-        ..NewVersion::of("skull", &skull, Provenance::of("test".to_owned()))
+        ..NewVersion::from_gaussians("skull", &skull, Provenance::new("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();
     let resident = Cache::new(catalog).open("skull", None).unwrap();
@@ -476,7 +479,7 @@ fn a_sky_and_lenses_add_settings() {
             sky_from_world: DMat3::IDENTITY,
         })),
         storage: StorageOptions { record: RecordFormat::Q32, levels: false },
-        ..NewVersion::of("street", &street, Provenance::of("test".to_owned()))
+        ..NewVersion::from_gaussians("street", &street, Provenance::new("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();
     let resident = Cache::new(catalog).open("street", None).unwrap();
@@ -600,7 +603,8 @@ fn the_base_scene_pays_for_no_feature() {
         more(own.other_host_bytes > 0, &beside, "bytes beside");
         let planes = ["depth", "depth and opacity", "normals", "instance ids", "trust"];
         more(own.host_bytes_per_pixel > 3, &planes, "bytes of a pixel");
-        // Only features that change Gaussians or their projection, or add some, change the evaluations.
+        // Only features that change Gaussians or their projection, or add some, change the
+        // evaluations.
         let shapes = [
             "levels of detail, 1 m",
             "antialiasing",

@@ -35,8 +35,8 @@ fn sessions_beyond_the_memory_are_refused_with_the_numbers() {
     assert_eq!(cache.stats().reserved_bytes, 0);
 }
 
-/// The intermediate buffers of frames count once, their images for each session, and both are taken from the
-/// sections in memory.
+/// The intermediate buffers of frames count once, their images for each session, and both are taken
+/// from the sections in memory.
 #[test]
 fn frames_take_memory_from_the_sections() {
     let all = unlimited().open("demo", None).unwrap();
@@ -71,7 +71,8 @@ fn frames_take_memory_from_the_sections() {
     assert_eq!(cache.stats().reserved_bytes, scene_bytes + stages / 2 + images);
     drop(second);
 
-    // A small frame may be rendered while a large one is; two small or two large ones may not be rendered at once.
+    // A small frame may be rendered while a large one is; two small or two large ones may not be
+    // rendered at once.
     let frames = |is_large, beside| FrameBytes { stages, beside, is_large, images: 0 };
     let reserved = |sessions: u64, frames_bytes: u64| {
         let scenes_bytes = (sessions * scene_bytes).min(resident.total_bytes());
@@ -155,7 +156,7 @@ fn the_end_of_a_frame_makes_room_at_once() {
         let needed = all.demand(&frame(station_m), &PROFILE);
         let chunks = &all.version.manifest.chunks;
         let count = |n: &SectionRef| chunks[n.chunk].sections[n.section].count;
-        needed.iter().map(|n| Chunk::bytes_of(1, count(n).into())).sum()
+        needed.iter().map(|n| Chunk::needed_bytes(1, count(n).into())).sum()
     };
     // Each of the two fits, but not both together.
     let limit_bytes = bytes(0.0).max(bytes(500.0)) + bytes(0.0) / 4;
@@ -187,8 +188,8 @@ fn the_end_of_a_frame_makes_room_at_once() {
     });
     let mut waits: Vec<Duration> = waits.collect();
     waits.sort();
-    // Without a notice the loader would sleep for three quarters of that time. Other tests run beside this one, and may
-    // delay a loader that was notified: four of the five count.
+    // Without a notice the loader would sleep for three quarters of that time. Other tests run
+    // beside this one, and may delay a loader that was notified: four of the five count.
     assert!(waits[3] < wildcity_twin::limits::ROOM_POLL / 2, "{waits:?}");
 }
 

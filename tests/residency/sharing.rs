@@ -11,7 +11,7 @@ use crate::source::Faulty;
 use crate::streaming::{PROFILE, commit, demo, eyes, need_bytes, unlimited, views};
 
 /// Everything in full detail.
-fn all_of(resident: &Arc<Resident>) -> wildcity_twin::residency::PinnedScene {
+fn pin_all(resident: &Arc<Resident>) -> wildcity_twin::residency::PinnedScene {
     let eye = Viewpoint { position_m: DVec3::ZERO, focal_px: 1000.0 };
     let profile = RenderProfile { tau_px: 0.0, reach_m: None, ..PROFILE };
     resident.scene(&[eye], &profile).unwrap()
@@ -49,7 +49,7 @@ fn versions_share_the_memory_of_common_sections() {
     let catalog = wildcity_twin::store::Catalog::open(dir.path()).unwrap();
     let cache = Cache::new(catalog);
     let first = cache.open("street", None).unwrap();
-    let old = all_of(&first);
+    let old = pin_all(&first);
     let old_bytes = cache.stats().held_bytes;
     assert_eq!(old_bytes, old.bytes() as u64, "what is accounted for is what is held");
 
@@ -57,7 +57,7 @@ fn versions_share_the_memory_of_common_sections() {
     scene.sh[0] += 0.5;
     commit(dir.path(), "street", &scene);
     let second = cache.open("street", None).unwrap();
-    let new = all_of(&second);
+    let new = pin_all(&second);
     let same = new.chunks.iter().filter(|chunk| old.chunks.iter().any(|o| Arc::ptr_eq(o, chunk)));
     let same = same.count();
     assert_eq!((new.chunks.len() - same, old.chunks.len()), (1, new.chunks.len()));
@@ -68,7 +68,7 @@ fn versions_share_the_memory_of_common_sections() {
     // memory.
     let loads = cache.stats().loads;
     drop((old, first, new, second));
-    let again = all_of(&cache.open("street", Some(1)).unwrap());
+    let again = pin_all(&cache.open("street", Some(1)).unwrap());
     assert_eq!(again.gaussians(), 20_000);
     assert_eq!(cache.stats().loads, loads);
 }
@@ -76,9 +76,9 @@ fn versions_share_the_memory_of_common_sections() {
 #[test]
 fn a_section_takes_the_memory_that_is_computed_for_it() {
     let resident = unlimited().open("demo", None).unwrap();
-    let scene = all_of(&resident);
+    let scene = pin_all(&resident);
     for chunk in &scene.chunks {
-        let said = Chunk::bytes_of(chunk.sh_degree(), chunk.len() as u64);
+        let said = Chunk::needed_bytes(chunk.sh_degree(), chunk.len() as u64);
         assert_eq!(said, chunk.bytes() as u64);
     }
     let each = scene.bytes() as f64 / scene.gaussians() as f64;

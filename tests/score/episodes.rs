@@ -1,4 +1,5 @@
-//! Scores of whole episodes: verdicts, missing inputs, and the traps of standing and teleported egos.
+//! Scores of whole episodes: verdicts, missing inputs, and the traps of standing and teleported
+//! egos.
 
 use glam::DVec2;
 
@@ -6,7 +7,7 @@ use wildcity_scene::ActorClass;
 use wildcity_score::own::{Criterion, Fault, Judgement, verdict};
 use wildcity_score::{
     DriveRecord, EgoSample, EgoShape, Lane, LaneMap, Polyline, ReferenceDrive, StaticContact,
-    Track, TrackSample, lower_is_better, range_of, score,
+    Track, TrackSample, lower_is_better, score, score_range,
 };
 use wildcity_sim::contact::{CollisionType, Contact, Footprint};
 
@@ -14,7 +15,8 @@ use crate::thread_time::thread_time;
 
 const SHAPE: EgoShape = EgoShape { length_m: 5.0, width_m: 2.0, center_x_m: 1.3 };
 
-/// A drive of 10 s along x at `speed_mps`, along a recorded one at 10 m/s, with a parked car 100 m aside.
+/// A drive of 10 s along x at `speed_mps`, along a recorded one at 10 m/s, with a parked car 100 m
+/// aside.
 fn drive(speed_mps: f64) -> DriveRecord {
     let sample = |step: i32| EgoSample {
         origin_m: DVec2::new(0.1 * f64::from(step) * speed_mps, 0.0),
@@ -279,7 +281,8 @@ fn the_parts_of_epdms_are_those_of_the_drive() {
     assert_eq!(value(&clean, NAME), None, "without PDM-Closed there is no score");
     assert_eq!(part(&clean, NAME, "extended_comfort"), None);
 
-    // In the second 4 s the ego runs into a car that stands, on the wrong side of the road's middle.
+    // In the second 4 s the ego runs into a car that stands, on the wrong side of the road's
+    // middle.
     let mut hit = drive_with(10.0, Footprint::new(DVec2::new(60.0, 1.0), 0.0, 4.0, 2.0), 0.0);
     hit.map = road();
     for sample in &mut hit.ego {
@@ -374,18 +377,18 @@ fn every_score_has_a_range_and_stays_in_it() {
     hit.contacts.push(contact(2_000_000, 10.0, true));
     for record in [drive(10.0), drive(0.0), hit] {
         for score in score(&record) {
-            let [least, most] = range_of(score.name);
+            let [least, most] = score_range(score.name);
             assert_eq!(least, 0.0, "{} has no range", score.name);
             let is_within = score.value.is_none_or(|value| (least..=most).contains(&value));
             assert!(is_within, "{}: {:?} in {least}..{most}", score.name, score.value);
         }
     }
     // Shares, stars, percents and metres.
-    assert_eq!(range_of("wildcity.verdict@2"), [0.0, 1.0]);
-    assert_eq!(range_of("neuroncap.score@ecdcf28"), [0.0, 5.0]);
-    assert_eq!(range_of("bench2drive.driving@7ec25d1"), [0.0, 100.0]);
-    assert_eq!(range_of("alpasim.open_loop_collision@3032e0c"), [0.0, 1.0]);
-    assert_eq!(range_of("alpasim.min_ade_5s@3032e0c"), [0.0, f64::INFINITY]);
+    assert_eq!(score_range("wildcity.verdict@2"), [0.0, 1.0]);
+    assert_eq!(score_range("neuroncap.score@ecdcf28"), [0.0, 5.0]);
+    assert_eq!(score_range("bench2drive.driving@7ec25d1"), [0.0, 100.0]);
+    assert_eq!(score_range("alpasim.open_loop_collision@3032e0c"), [0.0, 1.0]);
+    assert_eq!(score_range("alpasim.min_ade_5s@3032e0c"), [0.0, f64::INFINITY]);
 }
 
 #[test]

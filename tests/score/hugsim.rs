@@ -15,7 +15,7 @@ fn footprint(row: &[f64]) -> Footprint {
     Footprint::new(DVec2::new(row[0], row[1]), row[6], row[4], row[3])
 }
 
-fn box_of(value: &Value) -> HugsimBox {
+fn hugsim_box(value: &Value) -> HugsimBox {
     let row = numbers(value);
     HugsimBox { footprint: footprint(&row), bottom_m: row[2], height_m: row[5] }
 }
@@ -37,7 +37,7 @@ fn plan(value: &Value) -> Vec<PlanPose> {
 fn static_collisions_are_as_in_the_vectors() {
     let Some(cases) = cases("hugsim", "static") else { return };
     for case in cases {
-        let ego = box_of(&case.input["box"]);
+        let ego = hugsim_box(&case.input["box"]);
         let points_m = points3(&case.input["points"]);
         assert_eq!(ego.points_within(&points_m), case.expected["within"], "{}", case.name);
         assert_eq!(ego.hits_static(&points_m), case.expected["collides"], "{}", case.name);
@@ -48,7 +48,7 @@ fn static_collisions_are_as_in_the_vectors() {
 fn drivable_areas_are_as_in_the_vectors() {
     let Some(cases) = cases("hugsim", "drivable") else { return };
     for case in cases {
-        let ego = box_of(&case.input["box"]).footprint;
+        let ego = hugsim_box(&case.input["box"]).footprint;
         let found =
             drivable(&points2(&case.input["ground"]), &plan(&case.input["trajectory"]), &ego);
         assert_near(found, &case.expected["dac"], &case.name);
@@ -66,7 +66,7 @@ fn decisions_are_as_in_the_vectors() {
             })
             .collect();
         let found = decision(&Decision {
-            ego: box_of(&case.input["box"]),
+            ego: hugsim_box(&case.input["box"]),
             yaw_rad: number(&case.input["box"][6]),
             plan: &plan(&case.input["plan"]),
             objects: &objects,

@@ -1,5 +1,5 @@
-//! Scores, against vectors computed from the published definitions (`shared/data/scores`), most of which the anchors'
-//! own code confirmed.
+//! Scores, against vectors computed from the published definitions (`shared/data/scores`), most of
+//! which the anchors' own code confirmed.
 
 #[path = "../support/data.rs"]
 mod data;

@@ -13,7 +13,8 @@ use wildcity_sim::contact::{CollisionType, Footprint};
 
 use crate::vectors::{assert_near, cases, number, numbers};
 
-/// [x, y, heading, vx, vy, ax, ay, steering, steering rate, yaw rate, yaw acceleration] of the rear axle.
+/// [x, y, heading, vx, vy, ax, ay, steering, steering rate, yaw rate, yaw acceleration] of the rear
+/// axle.
 fn states(value: &Value) -> Vec<EgoSample> {
     let rows = value.as_array().unwrap().iter().map(numbers);
     rows.map(|row| EgoSample {
@@ -181,7 +182,8 @@ fn extended_comfort_is_as_in_the_vectors() {
     }
 }
 
-/// A lane that holds the whole ego counts, whatever other lane a corner lies in; edges belong to no lane.
+/// A lane that holds the whole ego counts, whatever other lane a corner lies in; edges belong to no
+/// lane.
 #[test]
 fn a_lane_of_its_own_is_one_that_holds_all_corners() {
     let lane = |y_m: [f64; 2]| Lane {

@@ -155,7 +155,7 @@ fn sides_of_collisions_are_as_in_the_vectors() {
         let expected = &case.expected;
         let names: Vec<&str> = sides.iter().copied().map(name).collect();
         assert_eq!(json!(names), expected["each"], "{}", case.name);
-        let collision = Collision::of(&sides);
+        let collision = Collision::from_sides(&sides);
         let published = expected["as_published"].as_object().unwrap();
         for (side, hit) in published {
             let found = collision.published.map(name) == Some(side.as_str());

@@ -1,4 +1,5 @@
-//! AlpaSim's scores of plans and of the road, against values by hand. Each comment has the derivation.
+//! AlpaSim's scores of plans and of the road, against values by hand. Each comment has the
+//! derivation.
 
 use std::f64::consts::PI;
 
@@ -72,19 +73,19 @@ fn straight(from_tenths: i64, to_tenths: i64, speed_mps: f64) -> Plan {
     plan(&(from_tenths..=to_tenths).map(at).collect::<Vec<_>>())
 }
 
-fn of(record: &DriveRecord, name: &str) -> Score {
+fn plan_score(record: &DriveRecord, name: &str) -> Score {
     let found = score(record).into_iter().find(|score| score.name == name);
     found.unwrap_or_else(|| panic!("no score {name}"))
 }
 
 fn assert_value(record: &DriveRecord, name: &str, expected: f64) {
-    let found = of(record, name);
+    let found = plan_score(record, name);
     let near = found.value.is_some_and(|value| (value - expected).abs() < 1e-9);
     assert!(near, "{found:?}, not {expected}");
 }
 
 fn assert_none(record: &DriveRecord, name: &str, reason: &str) {
-    let found = of(record, name);
+    let found = plan_score(record, name);
     assert_eq!(found.value, None, "{found:?}");
     assert!(found.reason.as_ref().is_some_and(|found| found.contains(reason)), "{found:?}");
 }
@@ -92,8 +93,9 @@ fn assert_none(record: &DriveRecord, name: &str, reason: &str) {
 #[test]
 fn plans_deviate_by_the_decaying_mean_of_their_common_times() {
     let mut record = drive(100_000);
-    // Common are 0.2, 0.3, 0.4 and 0.5 s: the own pose at 0.1 s is not planned, and the first plan ends at 0.5 s. There
-    // they are 0, 0.2, 0.4 and 0.6 m apart, as in the vector: sum of exp(-0.1 k) d over sum of exp(-0.1 k).
+    // Common are 0.2, 0.3, 0.4 and 0.5 s: the own pose at 0.1 s is not planned, and the first plan
+    // ends at 0.5 s. There they are 0, 0.2, 0.4 and 0.6 m apart, as in the vector: sum of exp(-0.1
+    // k) d over sum of exp(-0.1 k).
     record.plans = vec![
         straight(0, 5, 10.0),
         plan(&[
@@ -106,7 +108,8 @@ fn plans_deviate_by_the_decaying_mean_of_their_common_times() {
         ]),
     ];
     assert_value(&record, DEVIATION, 0.275_070_563_579_220_9);
-    // A third plan is 1 m behind the second at 0.6 s, beside it, and 9 m aside before: only that time is common.
+    // A third plan is 1 m behind the second at 0.6 s, beside it, and 9 m aside before: only that
+    // time is common.
     record.plans.push(plan(&[(5, [5.0, 0.0], 0.0), (6, [5.0, 9.0], 0.0), (8, [7.0, 9.0], 0.0)]));
     assert_value(&record, DEVIATION, 0.5 * (0.275_070_563_579_220_9 + 1.0));
     record.plans = vec![straight(0, 5, 10.0), straight(5, 9, 10.0)];
@@ -116,8 +119,8 @@ fn plans_deviate_by_the_decaying_mean_of_their_common_times() {
 #[test]
 fn plans_deviate_at_the_centre_of_the_box_and_between_their_poses() {
     let mut record = drive(100_000);
-    // The same rear axle at 0.2 s, a quarter turned: the centres are at (1, 0) and (0, 1) from it. The first plan is
-    // halfway between its poses then, where it has x = 2 m and a heading of 0.
+    // The same rear axle at 0.2 s, a quarter turned: the centres are at (1, 0) and (0, 1) from it.
+    // The first plan is halfway between its poses then, where it has x = 2 m and a heading of 0.
     record.plans = vec![
         plan(&[(0, [0.0, 0.0], 0.0), (1, [1.0, 0.0], 0.2), (3, [3.0, 0.0], -0.2)]),
         plan(&[(1, [1.0, 0.0], 0.0), (2, [2.0, 0.0], 0.5 * PI)]),
@@ -133,17 +136,20 @@ fn plans_deviate_at_the_centre_of_the_box_and_between_their_poses() {
 #[test]
 fn the_mean_distance_from_the_recording_is_over_the_steps_up_to_each_horizon() {
     let mut record = drive(100_000);
-    // 1 m/s too slow: k tenths after the decision it is 0.1 k m behind. The means of k = 1..5, 10, 25 and 50.
+    // 1 m/s too slow: k tenths after the decision it is 0.1 k m behind. The means of k = 1..5, 10,
+    // 25 and 50.
     record.plans = vec![straight(0, 64, 9.0)];
     for (name, expected) in ADES.into_iter().zip([0.3, 0.55, 1.3, 2.55]) {
         assert_value(&record, name, expected);
     }
-    // A second decision, 1.5 s before the end of the episode, as recorded: it counts only for 0.5 and 1 s.
+    // A second decision, 1.5 s before the end of the episode, as recorded: it counts only for 0.5
+    // and 1 s.
     record.plans.push(straight(85, 149, 10.0));
     for (name, expected) in ADES.into_iter().zip([0.15, 0.275, 1.3, 2.55]) {
         assert_value(&record, name, expected);
     }
-    // An episode that ends at 6 s, before the recording: a decision at 4.5 s counts for 0.5 and 1 s.
+    // An episode that ends at 6 s, before the recording: a decision at 4.5 s counts for 0.5 and 1
+    // s.
     let mut short = drive(100_000);
     short.ego.truncate(61);
     short.plans = vec![straight(45, 109, 9.0)];
@@ -157,7 +163,7 @@ fn the_mean_distance_from_the_recording_is_over_the_steps_up_to_each_horizon() {
     record.plans = vec![straight(0, 64, 9.0)];
     record.reference.as_mut().unwrap().times_us = (0..=100).map(|k| 30_000 * k).collect();
     record.limit_us = None;
-    assert!(of(&record, ADES[2]).value.is_some());
+    assert!(plan_score(&record, ADES[2]).value.is_some());
     assert_none(&record, ADES[3], "reach 5 s ahead");
     record.reference = None;
     assert_none(&record, ADES[0], "needs the recorded drive");
@@ -165,8 +171,8 @@ fn the_mean_distance_from_the_recording_is_over_the_steps_up_to_each_horizon() {
 
 #[test]
 fn steps_that_do_not_divide_a_horizon_go_beyond_it_and_lose_the_longest() {
-    // Steps of 0.3 s: 0.5 s is reached with the step at 0.6 s, 0.3 and 0.6 m behind. 5 s would be with the one at 5.1
-    // s, which is later than the longest horizon.
+    // Steps of 0.3 s: 0.5 s is reached with the step at 0.6 s, 0.3 and 0.6 m behind. 5 s would be
+    // with the one at 5.1 s, which is later than the longest horizon.
     let mut record = drive(300_000);
     record.plans = vec![straight(0, 64, 9.0)];
     assert_value(&record, ADES[0], 0.45);
@@ -176,7 +182,8 @@ fn steps_that_do_not_divide_a_horizon_go_beyond_it_and_lose_the_longest() {
 #[test]
 fn the_distance_from_the_recording_is_at_the_centre_of_the_box() {
     let mut record = drive(100_000);
-    // As recorded, but a quarter turned: the centre is 1 m to the left of the rear axle, not ahead of it.
+    // As recorded, but a quarter turned: the centre is 1 m to the left of the rear axle, not ahead
+    // of it.
     let turned = |k: i64| (k, [k as f64, 0.0], 0.5 * PI);
     record.plans = vec![plan(&(0..=10).map(turned).collect::<Vec<_>>())];
     assert_value(&record, ADES[0], 2.0_f64.sqrt());
@@ -194,8 +201,8 @@ fn track(samples: Vec<Option<TrackSample>>) -> Track {
 
 #[test]
 fn a_plan_hits_what_is_there_within_three_seconds() {
-    // At 3 s the front is at 30 + 1 + 1.96 m. The rear of a car at 34.9 m is at 32.9 m, of one at 35 m at 33 m, which
-    // the plan meets at 3.1 s.
+    // At 3 s the front is at 30 + 1 + 1.96 m. The rear of a car at 34.9 m is at 32.9 m, of one at
+    // 35 m at 33 m, which the plan meets at 3.1 s.
     for (x_m, expected) in [(34.9, 1.0), (35.0, 0.0)] {
         let mut record = drive(100_000);
         record.ego.iter_mut().for_each(|sample| sample.origin_m.x *= 0.1);
@@ -232,7 +239,7 @@ fn what_is_decided_after_the_cut_does_not_count() {
     // The ego is 5 m off the recorded drive from 2 s on: the decision at 2 s is the last one.
     record.ego[20..].iter_mut().for_each(|sample| sample.origin_m.y = 5.0);
     record.plans = vec![straight(0, 64, 9.0), straight(20, 84, 9.0), straight(21, 85, 5.0)];
-    let found = of(&record, ADES[0]);
+    let found = plan_score(&record, ADES[0]);
     assert_eq!(found.parts["decisions"], Some(2.0));
     assert_value(&record, ADES[0], 0.3);
     record.plans.clear();
@@ -279,9 +286,11 @@ fn an_ego_is_off_the_road_where_it_crosses_the_edge_of_all_lanes() {
         lane(&[[from, -0.9], [to, -0.9], [to, 3.0], [from, 3.0]], &[])
     };
     assert_value(&on(vec![half([-50.0, 1.0]), half([1.0, 150.0])]), OFF_ROAD, 1.0);
-    // A median of 0.9 m below the ego is, although the arcs of its corners, 0.98 m apart, are in the two lanes.
+    // A median of 0.9 m below the ego is, although the arcs of its corners, 0.98 m apart, are in
+    // the two lanes.
     assert_value(&on(vec![strip([-3.0, -0.45]), strip([0.45, 3.0])]), OFF_ROAD, 1.0);
-    // Wholly outside of the road it touches no edge, so that it counts as on the road; a millimetre is a touch.
+    // Wholly outside of the road it touches no edge, so that it counts as on the road; a millimetre
+    // is a touch.
     assert_value(&on(vec![strip([5.0, 8.0])]), OFF_ROAD, 0.0);
     assert_value(&on(vec![strip([0.9805, 8.0])]), OFF_ROAD, 1.0);
     assert_value(&on(vec![strip([0.9815, 8.0])]), OFF_ROAD, 0.0);
@@ -291,7 +300,8 @@ fn an_ego_is_off_the_road_where_it_crosses_the_edge_of_all_lanes() {
 
 #[test]
 fn a_hole_in_the_road_below_the_ego_is_off_the_road() {
-    // The box of a standing ego reaches from -0.96 m to 2.96 m. The hole is 0.5 m square, between four lanes.
+    // The box of a standing ego reaches from -0.96 m to 2.96 m. The hole is 0.5 m square, between
+    // four lanes.
     let standing = |hole_x_m: f64| {
         let [from, to] = [hole_x_m - 0.25, hole_x_m + 0.25];
         let rest =
@@ -309,9 +319,9 @@ fn a_hole_in_the_road_below_the_ego_is_off_the_road() {
 
 #[test]
 fn the_corners_of_the_ego_are_round() {
-    // A standing ego reaches to x = 2.96 m and y = 0.98 m. Its corner has a radius of 0.49 m: the arc is 0.203 m from
-    // the corner of the box. A lane that lacks a triangle with legs of 0.2 m at that corner ends 0.141 m from it, one
-    // with legs of 0.4 m 0.283 m.
+    // A standing ego reaches to x = 2.96 m and y = 0.98 m. Its corner has a radius of 0.49 m: the
+    // arc is 0.203 m from the corner of the box. A lane that lacks a triangle with legs of 0.2 m at
+    // that corner ends 0.141 m from it, one with legs of 0.4 m 0.283 m.
     for (leg_m, expected) in [(0.2, 0.0), (0.4, 1.0)] {
         let lane = lane(
             &[[-5.0, -5.0], [2.97, -5.0], [2.97, 0.99 - leg_m], [2.97 - leg_m, 0.99], [-5.0, 0.99]],
@@ -339,7 +349,8 @@ fn a_heading_beyond_120_degrees_is_of_the_wrong_lane() {
     assert_value(&heading(-2.10, &east), WRONG_LANE, 1.0);
     // A heading of more than a turn is that within ±π.
     assert_value(&heading(2.0 * PI, &east), WRONG_LANE, 0.0);
-    // The lane leads west, at π. An ego turned by 0.01 rad from it is at -π + 0.01: 6.27 rad apart, as published.
+    // The lane leads west, at π. An ego turned by 0.01 rad from it is at -π + 0.01: 6.27 rad apart,
+    // as published.
     let west = [[150.0, 0.0], [-50.0, 0.0]];
     assert_value(&heading(PI - 0.01, &west), WRONG_LANE, 0.0);
     assert_value(&heading(PI + 0.01, &west), WRONG_LANE, 1.0);

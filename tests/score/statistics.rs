@@ -21,13 +21,13 @@ fn pass_rates_are_as_in_the_vectors() {
 fn means_are_as_in_the_vector() {
     let Some(cases) = cases("own", "mean of") else { return };
     for case in cases {
-        let found = Mean::of(&numbers(&case.input["scores"])).unwrap();
+        let found = Mean::from_values(&numbers(&case.input["scores"])).unwrap();
         assert_near(found.mean, &case.expected["mean"], &case.name);
         assert_near(found.deviation.unwrap(), &case.expected["sd"], &case.name);
         assert_near(found.half_width.unwrap(), &case.expected["half_width"], &case.name);
     }
-    assert_eq!(Mean::of(&[]), None);
-    assert_eq!(Mean::of(&[0.5]).unwrap().half_width, None);
+    assert_eq!(Mean::from_values(&[]), None);
+    assert_eq!(Mean::from_values(&[0.5]).unwrap().half_width, None);
 }
 
 #[test]
@@ -41,14 +41,14 @@ fn intervals_of_means_are_those_of_scipy_within_the_range() {
         (&[4.1, 5.0, 5.0, 3.2, 5.0], [0.0, 5.0], [3.460_479_762_128_794, 5.0]),
     ];
     for (values, range, expected) in cases {
-        let found = Mean::of(values).unwrap().interval(range).unwrap();
+        let found = Mean::from_values(values).unwrap().interval(range).unwrap();
         for (end, wanted) in found.iter().zip(expected) {
             assert!((end - wanted).abs() < 1e-9, "{values:?}: {found:?}");
         }
     }
     // Two values have half a width, but no interval.
-    let two = Mean::of(&[0.5, 0.7]).unwrap();
+    let two = Mean::from_values(&[0.5, 0.7]).unwrap();
     assert!(two.half_width.is_some_and(|half_width| half_width > 1.2));
     assert_eq!(two.interval([0.0, 1.0]), None);
-    assert_eq!(Mean::of(&[0.5]).unwrap().interval([0.0, 1.0]), None);
+    assert_eq!(Mean::from_values(&[0.5]).unwrap().interval([0.0, 1.0]), None);
 }

@@ -106,7 +106,8 @@ async fn what_is_no_appearance_is_refused_by_its_field() {
         refused(&answer, "camera_invalid");
         assert_eq!(answer["field"], field);
     }
-    // Each of the two is enough to be refused: a PNG of 4,096 x 3,000 clear pixels is a few kilobytes.
+    // Each of the two is enough to be refused: a PNG of 4,096 x 3,000 clear pixels is a few
+    // kilobytes.
     let clear = Overlay::new(4096, vec![0; 4 * 4096 * 3000]).unwrap().to_data_uri();
     let mut rig = front(json!({ "width": 4096, "height": 3000, "overlay": clear }));
     let second = rig["cameras"][0].clone();

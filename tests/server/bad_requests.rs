@@ -60,7 +60,7 @@ async fn every_bad_request_has_its_code_and_field() {
     let mut wrong = Vec::new();
     let mut count = 0;
     for (section, rows) in table() {
-        let (mut agent, next) = agent_of(&server, section).await;
+        let (mut agent, next) = connect_agent(&server, section).await;
         for Row { number, code, field, request } in rows {
             let text = text(request, agent.seq);
             agent.send_text(&text).await;
@@ -95,7 +95,7 @@ async fn every_bad_request_has_its_code_and_field() {
 type Check = fn(Agent) -> std::pin::Pin<Box<dyn Future<Output = ()>>>;
 
 /// A client in the state of a section, and a check that it still is.
-async fn agent_of(server: &TestServer, section: &str) -> (Agent, Check) {
+async fn connect_agent(server: &TestServer, section: &str) -> (Agent, Check) {
     fn hello(mut agent: Agent) -> std::pin::Pin<Box<dyn Future<Output = ()>>> {
         Box::pin(async move { assert_eq!(agent.hello().await["type"], "welcome") })
     }

@@ -1,5 +1,5 @@
-//! Snapshots, and sessions that begin in the middle of another episode: with the same commands, they give the same
-//! bytes.
+//! Snapshots, and sessions that begin in the middle of another episode: with the same commands,
+//! they give the same bytes.
 
 use std::sync::Arc;
 
@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use wildcity_render::cpu::{Cpu, Simd};
 
 use crate::replay::replay;
-use crate::support::{Agent, Seen, TestServer, commit_twin_of, pose, refused};
+use crate::support::{Agent, Seen, TestServer, commit_twin_with_opacity, pose, refused};
 
 const STEPS: u64 = 200;
 
@@ -18,12 +18,12 @@ const SWITCHES: [(u64, u64); 2] = [(50, 2), (90, 1)];
 async fn server() -> TestServer {
     let backend = Cpu::new(1, Simd::Best).expect("a backend");
     let server = TestServer::configured(|config| config.backend = Arc::new(backend)).await;
-    commit_twin_of(server.twins.path(), -1.0);
+    commit_twin_with_opacity(server.twins.path(), -1.0);
     server
 }
 
-/// A session with bundles of cameras of two rates, a rolling shutter, a warm-up, and decisions at every third
-/// step.
+/// A session with bundles of cameras of two rates, a rolling shutter, a warm-up, and decisions at
+/// every third step.
 async fn open(agent: &mut Agent, name: &str, model: &str) {
     let camera = |name: &str, shutter_us: i64| {
         json!({
@@ -76,8 +76,8 @@ async fn drive(agent: &mut Agent, model: &str, done: u64, until: u64) -> Vec<See
     seen
 }
 
-/// Asserts that two observations are equal but for the numbers of their requests, names of sessions, and times
-/// that they took.
+/// Asserts that two observations are equal but for the numbers of their requests, names of
+/// sessions, and times that they took.
 fn assert_same(one: &Seen, other: &Seen) {
     let step = &one.meta["step"];
     let meta = |seen: &Seen| {

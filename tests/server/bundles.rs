@@ -1,4 +1,5 @@
-//! The last frames of each camera, cameras at different rates, warm-up, and frames that are not read.
+//! The last frames of each camera, cameras at different rates, warm-up, and frames that are not
+//! read.
 
 use std::sync::atomic::Ordering;
 
@@ -25,7 +26,8 @@ async fn open(server: &TestServer, more: Value) -> Agent {
     agent
 }
 
-/// Times of the frames of a camera in an observation, in steps of 0.1 s, and their pixels: the present one first.
+/// Times of the frames of a camera in an observation, in steps of 0.1 s, and their pixels: the
+/// present one first.
 fn bundle(seen: &Seen, camera: &str) -> Vec<(i64, Vec<u8>)> {
     let entries = ["images", "history"].map(|list| seen.meta[list].as_array().cloned());
     let entries = entries.into_iter().flatten().flatten().filter(|image| image["camera"] == camera);
@@ -288,8 +290,8 @@ async fn what_was_drawn_for_later_is_rendered_again_in_a_replay() {
     };
     let report = replayed(&Painter::default());
     assert_eq!(report.difference, None);
-    // Reset: three of the front, three of the rear within 0.4 s. Steps: frames of the front at 3, 4, 5
-    // and 8, 9, 10 tenths, of the rear at 2, 4, 6, 8 and 10. And one look.
+    // Reset: three of the front, three of the rear within 0.4 s. Steps: frames of the front at 3,
+    // 4, 5 and 8, 9, 10 tenths, of the rear at 2, 4, 6, 8 and 10. And one look.
     assert_eq!(report.images, 3 + 3 + 6 + 5 + 2);
     assert!(replayed(&Cpu::new(1, Simd::Best).unwrap()).difference.is_some());
 }

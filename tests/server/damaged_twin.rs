@@ -21,7 +21,7 @@ fn commit(dir: &Path, name: &str) {
     };
     let new = NewVersion {
         rig: Some(crate::support::rig()),
-        ..NewVersion::of(name, &gaussians, Provenance::of("test".to_owned()))
+        ..NewVersion::from_gaussians(name, &gaussians, Provenance::new("test".to_owned()))
     };
     Catalog::open(dir).and_then(|catalog| catalog.commit(new, &mut |_, _| {})).expect("a twin");
 }

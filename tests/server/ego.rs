@@ -25,8 +25,8 @@ async fn act(agent: &mut Agent, acceleration: f64, curvature: f64) -> Seen {
     agent.look(json!({ "type": "step", "action": action })).await
 }
 
-/// The rest of a circle of 25 m radius that is driven at 5 m/s, after `driven_s`, in the frame of a rig near it: 2 s of
-/// poses.
+/// The rest of a circle of 25 m radius that is driven at 5 m/s, after `driven_s`, in the frame of a
+/// rig near it: 2 s of poses.
 fn rest_of_circle(ego: &Value, driven_s: f64) -> Value {
     let xyz = numbers(&ego["pose"]["xyz"]);
     let q = numbers(&ego["pose"]["q"]);

@@ -36,7 +36,8 @@ async fn refusal(server: &TestServer, text: &str) -> (u16, serde_json::Value) {
     (status, body)
 }
 
-/// Every refusal is JSON with a code: of the handshake, of a wrong route, of a body that is too large.
+/// Every refusal is JSON with a code: of the handshake, of a wrong route, of a body that is too
+/// large.
 #[tokio::test]
 async fn refusals_are_json_with_a_code_and_a_field() {
     let server = TestServer::start().await;
@@ -79,7 +80,8 @@ async fn refusals_are_json_with_a_code_and_a_field() {
         // The server has no tokens.
         assert!(!message.contains("token") && !message.is_empty(), "{message}");
     }
-    // The answer to a client of a different WebSocket version has the supported version (RFC 6455, section 4.4).
+    // The answer to a client of a different WebSocket version has the supported version (RFC 6455,
+    // section 4.4).
     let (_, answer) = request(&server, &upgrade("Version: 13", "Version: 8")).await;
     assert!(answer.contains("sec-websocket-version: 13"), "{answer}");
 

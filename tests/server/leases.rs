@@ -4,14 +4,14 @@ use std::time::Duration;
 
 use wildcity_twin::store::{Catalog, Retention};
 
-use crate::support::{TEST_TIMEOUT, TestServer, commit_twin_of};
+use crate::support::{TEST_TIMEOUT, TestServer, commit_twin_with_opacity};
 
 #[tokio::test]
 async fn a_version_that_a_session_sees_is_kept() {
     let server = TestServer::start().await;
     let mut agent = server.driver("a").await;
     let catalog = Catalog::open(server.twins.path()).unwrap();
-    commit_twin_of(server.twins.path(), 1.0);
+    commit_twin_with_opacity(server.twins.path(), 1.0);
     let keep = Retention { versions: 1, grace: Duration::ZERO };
     for _ in 0..2 {
         assert_eq!(catalog.collect("test", keep, false).unwrap().kept, [1, 2]);

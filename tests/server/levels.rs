@@ -1,5 +1,5 @@
-//! Levels of detail are chosen for all cameras of a frame. An image that is rendered again separately, or instead of a
-//! lost frame, must have the same levels as in its frame.
+//! Levels of detail are chosen for all cameras of a frame. An image that is rendered again
+//! separately, or instead of a lost frame, must have the same levels as in its frame.
 
 use std::sync::Arc;
 
@@ -16,7 +16,8 @@ use crate::branches::assert_all_same;
 use crate::replay::replay;
 use crate::support::{Agent, Seen, TestServer, pose};
 
-/// A server with the twin `wall`: small Gaussians of many colours, 20 to 60 m ahead of a drive of 9 m.
+/// A server with the twin `wall`: small Gaussians of many colours, 20 to 60 m ahead of a drive of 9
+/// m.
 async fn server() -> TestServer {
     let backend = Cpu::new(1, Simd::Best).expect("a backend");
     let server = TestServer::configured(|config| config.backend = Arc::new(backend)).await;
@@ -48,7 +49,7 @@ async fn server() -> TestServer {
     let log = Trajectory { name: "log".to_owned(), keyframes: (0..10).map(keyframe).collect() };
     let new = NewVersion {
         trajectories: vec![log],
-        ..NewVersion::of("wall", &gaussians, Provenance::of("test".to_owned()))
+        ..NewVersion::from_gaussians("wall", &gaussians, Provenance::new("test".to_owned()))
     };
     let catalog = Catalog::open(server.twins.path()).expect("a directory");
     catalog.commit(new, &mut |_, _| {}).expect("a twin");
@@ -92,8 +93,8 @@ fn hash<'a>(seen: &'a Seen, camera: &str) -> &'a Value {
     &images.iter().find(|image| image["camera"] == camera).unwrap()["hash"]
 }
 
-/// The other tests of this file depend on this: together with a camera of long focal length, the wide camera gets finer
-/// levels.
+/// The other tests of this file depend on this: together with a camera of long focal length, the
+/// wide camera gets finer levels.
 #[tokio::test]
 async fn cameras_of_a_frame_share_its_levels() {
     let server = server().await;
@@ -121,7 +122,8 @@ async fn a_record_is_continued_with_the_levels_of_its_frames() {
     }
 }
 
-/// Where an earlier picture stands in for a lost frame, the other camera's images stay as they are without the loss.
+/// Where an earlier picture stands in for a lost frame, the other camera's images stay as they are
+/// without the loss.
 #[tokio::test]
 async fn a_lost_frame_does_not_change_the_other_images() {
     let server = server().await;

@@ -253,7 +253,8 @@ async fn the_answer_is_repeated_and_survives_the_connection() {
     assert_eq!(agent.step(4.0).await.meta["step"], 3);
 }
 
-/// Sessions of other connections, or that are over, are not resumed with the first, which then still can be.
+/// Sessions of other connections, or that are over, are not resumed with the first, which then
+/// still can be.
 #[tokio::test]
 async fn what_cannot_be_resumed_together() {
     let server = TestServer::start().await;

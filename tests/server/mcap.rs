@@ -1,4 +1,5 @@
-//! MCAP files of episodes that end: written next to the records, delivered, and refused with the reason.
+//! MCAP files of episodes that end: written next to the records, delivered, and refused with the
+//! reason.
 
 use std::io::Write as _;
 use std::path::Path;
@@ -123,8 +124,9 @@ async fn what_was_cut_has_no_mcap_file_until_it_is_exported_by_hand() {
     assert_eq!((cut, cut), (exported.messages, whole));
 }
 
-/// Ends the reading of a pipe: gives a line to the first reader when it is notified, after [`TEST_TIMEOUT`], or when
-/// the sender is dropped. Then renames a file to the path of the pipe. Returns whether it was notified.
+/// Ends the reading of a pipe: gives a line to the first reader when it is notified, after
+/// [`TEST_TIMEOUT`], or when the sender is dropped. Then renames a file to the path of the pipe.
+/// Returns whether it was notified.
 ///
 /// Readers of the pipe continue in any case, so that a failing test also ends.
 fn release(pipe: &Path, file: &Path, told: &Receiver<()>) -> bool {
@@ -143,8 +145,8 @@ fn release(pipe: &Path, file: &Path, told: &Receiver<()>) -> bool {
     is_told && write.is_ok()
 }
 
-/// The export of `a-1` blocks, since a pipe that nothing writes to has the name of its record; the session goes on
-/// writing the record itself.
+/// The export of `a-1` blocks, since a pipe that nothing writes to has the name of its record; the
+/// session goes on writing the record itself.
 #[tokio::test]
 async fn no_request_waits_for_an_export() {
     let server = TestServer::start().await;

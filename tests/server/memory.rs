@@ -171,7 +171,8 @@ async fn slots_are_used_in_turn() {
     assert_eq!(memory.read(place), memory.read(again));
 }
 
-/// The answer to `step_many` is one message in memory, and that of a long message is written as that of a short one.
+/// The answer to `step_many` is one message in memory, and that of a long message is written as
+/// that of a short one.
 #[tokio::test]
 async fn steps_of_several_sessions_and_large_images() {
     let server = TestServer::start().await;
@@ -240,7 +241,8 @@ async fn what_cannot_share_memory() {
     let target = memory.target.clone();
     drop(memory);
     Memory::is_given_back(&target).await;
-    // Without a proof, observations come through the socket, and no other memory is offered any more.
+    // Without a proof, observations come through the socket, and no other memory is offered any
+    // more.
     agent.open(json!({ "session": "a" })).await;
     agent.step(1.0).await;
     refused(&agent.ask(ask()).await, "session_state");
@@ -275,7 +277,8 @@ async fn memory_is_given_back() {
                 assert_eq!(agent.ask(json!({ "type": "close" })).await["type"], "closed");
             }
             "kill" => {
-                // Reset the connection, as the kernel does for a killed process that left bytes unread.
+                // Reset the connection, as the kernel does for a killed process that left bytes
+                // unread.
                 agent.send(step(9.0)).await;
                 let socket = socket2::SockRef::from(&*agent.tcp()).set_linger(Some(Duration::ZERO));
                 socket.unwrap();
@@ -302,7 +305,8 @@ async fn memory_is_given_back() {
     agent.open(json!({ "session": "last" })).await;
     agent.place(step(1.0)).await;
     let target = memory.target.clone();
-    // The observation itself is gone with the next answer. After that, only the shared memory counts.
+    // The observation itself is gone with the next answer. After that, only the shared memory
+    // counts.
     let prefetch = json!({ "type": "prefetch", "poses": [pose(1.0)] });
     assert_eq!(agent.ask(prefetch).await["type"], "ok");
     assert!(engine.reserve_answer_bytes(ANSWERS_BYTES).is_err(), "the memory is counted");
@@ -319,7 +323,8 @@ async fn memory_is_given_back() {
     Memory::is_given_back(&target).await;
 }
 
-/// Without memory for a slot, an answer goes through the socket, and the next one tries the same slot again.
+/// Without memory for a slot, an answer goes through the socket, and the next one tries the same
+/// slot again.
 #[tokio::test]
 async fn a_full_budget_sends_through_the_socket() {
     let server = TestServer::start().await;
@@ -331,8 +336,8 @@ async fn a_full_budget_sends_through_the_socket() {
     agent.open(json!({ "session": "a", "outputs": outputs })).await;
     assert_eq!(agent.place(step(1.0)).await.slot, 0);
 
-    // Reserve all of the budget except the bytes of the next observation. It is larger than the previous one, whose
-    // memory is free by the time that the next one is delivered.
+    // Reserve all of the budget except the bytes of the next observation. It is larger than the
+    // previous one, whose memory is free by the time that the next one is delivered.
     let places: Vec<Value> = (0..8).map(|k| pose(f64::from(k))).collect();
     let mut all = 0;
     for power in (10..34).rev() {
@@ -404,7 +409,7 @@ async fn the_rust_client_shares_memory() {
         assert_eq!(seen.metadata().step, u64::from(k));
     }
     client.open(open("b")).await.unwrap();
-    let steps = ["a", "b"].map(|name| Movement::Pose(to(9.0)).of_session(name)).to_vec();
+    let steps = ["a", "b"].map(|name| Movement::Pose(to(9.0)).for_session(name)).to_vec();
     let stepped = client.step_many(steps).await.unwrap();
     assert_eq!(stepped[0].result.as_ref().unwrap().metadata().step, 5);
     assert_eq!(stepped[1].result.as_ref().unwrap().metadata().step, 1);

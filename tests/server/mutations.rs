@@ -1,5 +1,5 @@
-//! Requests that were valid until a generator changed them. Each gets an answer, no answer is `internal`, and
-//! no session is lost.
+//! Requests that were valid until a generator changed them. Each gets an answer, no answer is
+//! `internal`, and no session is lost.
 
 use std::collections::BTreeMap;
 use std::time::Instant;
@@ -111,7 +111,8 @@ fn places(value: &Value, here: &str, all: &mut Vec<String>) {
     }
 }
 
-/// A request with up to two changes: a value replaced, a field left out or added, or bytes of the text changed.
+/// A request with up to two changes: a value replaced, a field left out or added, or bytes of the
+/// text changed.
 fn mutated(random: &mut Random, seq: u64) -> String {
     const TOKENS: [&str; 22] = [
         "null",

@@ -138,7 +138,8 @@ async fn normals_halve_the_pixels_of_an_answer() {
     let server = TestServer::start().await;
     let mut agent = Agent::connect(server.address()).await;
     let most = agent.hello().await["limits"]["answer_pixels"].as_u64().unwrap();
-    // 8 x 6 and 5 x 4 px: the sizes of the images make up the number of pixels exactly, or one row more.
+    // 8 x 6 and 5 x 4 px: the sizes of the images make up the number of pixels exactly, or one row
+    // more.
     let width = 16_384;
     for (normals, instances, pixels) in [
         (true, false, most / 2),
@@ -217,8 +218,8 @@ async fn lenses_shutters_and_parts_of_images_are_described_as_sent() {
 async fn trust_is_sent_if_it_is_requested() {
     let server = TestServer::start().await;
     let mut agent = open(&server, json!({ "encoding": "raw", "trust": true })).await;
-    // The drive ends at 9 m; the painter's opacity is a quarter everywhere: a hole, where it is below the horizon. The
-    // sampled pixels of the small rear image are above it.
+    // The drive ends at 9 m; the painter's opacity is a quarter everywhere: a hole, where it is
+    // below the horizon. The sampled pixels of the small rear image are above it.
     let seen = agent.step(20.0).await;
     for (image, low_coverage) in seen.meta["images"].as_array().unwrap().iter().zip([1.0, 0.0]) {
         let trust = &image["trust"];

@@ -75,7 +75,7 @@ async fn a_version_with_a_profile_that_cannot_be_had_is_not_switched_to() {
     let next = NewVersion {
         rig: Some(rig()),
         profile: RenderProfile { rays: Rays::Exact, ..RenderProfile::default() },
-        ..NewVersion::of("test", &gaussians, Provenance::of("test".to_owned()))
+        ..NewVersion::from_gaussians("test", &gaussians, Provenance::new("test".to_owned()))
     };
     assert_eq!(catalog.commit(next, &mut |_, _| {}).unwrap().number, 2);
     let answer = agent.ask(json!({ "type": "switch_version" })).await;
@@ -95,8 +95,8 @@ fn one_gaussian() -> Gaussians {
     }
 }
 
-/// Commits a twin `creased`. Its sky has one kink: baked at the default sky_error, the map is off by at
-/// most half a step of 8 bits; for 1e-4 no map is fine enough.
+/// Commits a twin `creased`. Its sky has one kink: baked at the default sky_error, the map is off
+/// by at most half a step of 8 bits; for 1e-4 no map is fine enough.
 fn commit_creased(dir: &Path) {
     let floats = |values: &[f32]| values.iter().flat_map(|value| value.to_le_bytes()).collect();
     let layers: [(usize, usize, Vec<u8>, Vec<u8>); 3] = [
@@ -120,7 +120,7 @@ fn commit_creased(dir: &Path) {
     let new = NewVersion {
         rig: Some(rig()),
         sky: Some(NewSky::Put(sky)),
-        ..NewVersion::of("creased", &gaussians, Provenance::of("test".to_owned()))
+        ..NewVersion::from_gaussians("creased", &gaussians, Provenance::new("test".to_owned()))
     };
     Catalog::open(dir).and_then(|catalog| catalog.commit(new, &mut |_, _| {})).expect("a twin");
 }

@@ -1,5 +1,5 @@
-//! References of a session's views, end to end: a wall whose image is known, a model that returns the references in the
-//! view, and the pure warp.
+//! References of a session's views, end to end: a wall whose image is known, a model that returns
+//! the references in the view, and the pure warp.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -21,8 +21,8 @@ use crate::onnx_models::{Folder, library};
 use crate::repair::{beside, opening, pixels, statuses, step};
 use crate::support::{Agent, TestServer, refused};
 
-/// Draws a wall that crosses the road, 16 m ahead of the world's origin. Its image is correct on the drive, and redder
-/// off the trajectory, like that of a twin that was not trained there.
+/// Draws a wall that crosses the road, 16 m ahead of the world's origin. Its image is correct on
+/// the drive, and redder off the trajectory, like that of a twin that was not trained there.
 #[derive(Debug, Default)]
 pub(crate) struct Wall {
     views: AtomicU64,
@@ -130,13 +130,14 @@ fn view_at(width_px: u32, x_m: f64, y_m: f64) -> View {
     View::new(camera, world_from_rig * rig_from_camera)
 }
 
-/// Expected output of the model for a camera off the drive: references at 0, 2 and 4 m, of both cameras.
+/// Expected output of the model for a camera off the drive: references at 0, 2 and 4 m, of both
+/// cameras.
 fn expected(width_px: u32, y_m: f64, paint: Option<[u8; 3]>, stations: &[f64]) -> Vec<u8> {
-    expected_of(width_px, y_m, paint, stations, false)
+    expected_images(width_px, y_m, paint, stations, false)
 }
 
 /// As [`expected`]; if `masked`, without the left halves of the references.
-fn expected_of(
+fn expected_images(
     width_px: u32,
     y_m: f64,
     paint: Option<[u8; 3]>,
@@ -159,14 +160,14 @@ fn expected_of(
             if let Some(paint) = paint {
                 image.rgb8 = paint.repeat(depth_m.len());
             }
-            let projection = Arc::new(Projection::of(&view.camera));
+            let projection = Arc::new(Projection::from_camera(&view.camera));
             let world_from_camera = view.world_from_camera;
             references.push(Arc::new(Reference { image, depth_m, projection, world_from_camera }));
         }
     }
     let target = WarpTarget {
         camera: &view.camera,
-        rays: &Rays::of(&view.camera),
+        rays: &Rays::from_camera(&view.camera),
         world_from_camera: view.world_from_camera,
         shutter: None,
         depth_m: &depth_m,
@@ -236,11 +237,11 @@ fn replayed(server: &TestServer, folder: &Folder, episode: &str, repaired: u64) 
 
 /// Commits a version of the twin with uniformly painted images of both cameras at some stations.
 fn add_views(server: &TestServer, paint: [u8; 3], stations: &[f64], names: [&str; 2]) {
-    add_views_of(server, paint, stations, names, None);
+    add_views(server, paint, stations, names, None);
 }
 
 /// The same; with an exposure in stops, and a mask of their left halves, if there is one.
-fn add_views_of(
+fn add_views(
     server: &TestServer,
     paint: [u8; 3],
     stations: &[f64],
@@ -306,13 +307,13 @@ async fn recorded_images_are_warped_and_replayed() {
 async fn masked_pixels_are_not_brought_and_exposures_are_taken_back() {
     let folder = warped_model();
     let (server, _) = server(&[&folder]).await;
-    add_views_of(&server, [200, 10, 90], &[2.5], ["left", "right"], Some(1.0));
+    add_views(&server, [200, 10, 90], &[2.5], ["left", "right"], Some(1.0));
     let mut agent = server.agent().await;
     open(&mut agent, "a", "warped").await;
     let seen = step(&mut agent, 2.0).await;
     // Half as bright in linear light: 0.2888, 0.0015 and 0.0511 of 1.
     let dark = [146, 5, 64];
-    let wanted = expected_of(24, 2.0, Some(dark), &[2.5], true);
+    let wanted = expected_images(24, 2.0, Some(dark), &[2.5], true);
     assert_eq!(pixels(&seen, "left"), wanted);
     let count = |image: &[u8]| image.chunks(3).filter(|pixel| *pixel == dark).count();
     let whole = expected(24, 2.0, Some(dark), &[2.5]);

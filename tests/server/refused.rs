@@ -1,4 +1,5 @@
-//! Bad input: each kind has its own error, the session is unchanged, and the server serves the next client.
+//! Bad input: each kind has its own error, the session is unchanged, and the server serves the next
+//! client.
 
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -311,7 +312,8 @@ async fn silence_ends_a_connection() {
     tokio::time::timeout(TEST_TIMEOUT, reading).await.expect("closed").unwrap();
     server.still_serves().await;
 
-    // Never says anything but hello; goes silent within a session. The driver must be this fast, also on a busy machine.
+    // Never says anything but hello; goes silent within a session. The driver must be this fast,
+    // also on a busy machine.
     let idle = Duration::from_secs(2);
     let server = TestServer::with(Limits { idle, resume_grace, ..Limits::default() }).await;
     let mut greeter = server.agent().await;
@@ -368,7 +370,8 @@ async fn pings_are_answered_and_count_as_life() {
     assert_eq!(agent.step(1.0).await.meta["step"], 1);
 }
 
-/// Pongs that the client does not read must neither accumulate in the server nor keep the connection open.
+/// Pongs that the client does not read must neither accumulate in the server nor keep the
+/// connection open.
 #[tokio::test]
 async fn pings_of_a_client_that_does_not_read_are_no_life() {
     let send = Duration::from_millis(300);

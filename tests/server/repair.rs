@@ -1,4 +1,5 @@
-//! Repair of images in sessions, on the wire and on record. The models are small graphs, and a trained one.
+//! Repair of images in sessions, on the wire and on record. The models are small graphs, and a
+//! trained one.
 
 use std::fs;
 use std::sync::Arc;
@@ -31,8 +32,8 @@ pub(crate) fn brighter() -> Folder {
     Folder::new(&doubles::arithmetic("Add", 0.1), json!({"name": "brighter", "timeout_ms": 10_000}))
 }
 
-/// Two cameras without ground in their images, so that the trust depends only on the distance from the drive: half of
-/// it is lost in 3.5 m.
+/// Two cameras without ground in their images, so that the trust depends only on the distance from
+/// the drive: half of it is lost in 3.5 m.
 fn rig() -> Value {
     let camera = |name: &str, width: u64| {
         json!({"name": name, "width": width, "height": 16, "fx": 20.0, "fy": 20.0, "cx": 12.0, "cy": 12.0,
@@ -218,7 +219,8 @@ async fn a_model_gets_depth_opacity_and_normals_whether_or_not_they_are_sent() {
         agent.open(open).await;
         let seen = step(&mut agent, 2.0).await;
         assert_eq!(statuses(&seen), ["repaired"; 2]);
-        // The painter's depth is 1.5 m, and 2.5 m in the second view; its opacity 0.25, its normals -0.5.
+        // The painter's depth is 1.5 m, and 2.5 m in the second view; its opacity 0.25, its normals
+        // -0.5.
         for (camera, depth_m) in [("left", 1.5), ("right", 2.5)] {
             let more = 255.0 * (0.02 * depth_m + 0.5 * 0.25 - 0.2 * 0.5);
             for (value, before) in pixels(&seen, camera).iter().zip(pixels(&rendered, camera)) {

@@ -1,4 +1,5 @@
-//! Models that fail, hang, are swapped or cannot be used: each has its own refusal or flag, and sessions continue.
+//! Models that fail, hang, are swapped or cannot be used: each has its own refusal or flag, and
+//! sessions continue.
 
 use std::fs;
 
@@ -95,7 +96,8 @@ async fn a_hung_model_flags_the_frame_and_is_loaded_again_after_ten() {
     let mut plain = server.agent().await;
     plain.open(opening("b", Value::Null)).await;
     assert_eq!(statuses(&step(&mut agent, 2.0).await), ["repaired", "kept"]);
-    // The trust is 0.3 at 6 m: the model does not end, and the frame is delivered as rendered and marked so.
+    // The trust is 0.3 at 6 m: the model does not end, and the frame is delivered as rendered and
+    // marked so.
     let rendered = step(&mut plain, 6.0).await;
     for _ in 0..9 {
         let seen = step(&mut agent, 6.0).await;

@@ -108,8 +108,8 @@ async fn numbers_go_on_after_a_refused_request() {
     }
 }
 
-/// Two refused requests, a lost connection: the number after `last_seq` is valid, and so are those that the
-/// refused requests had, and the next one.
+/// Two refused requests, a lost connection: the number after `last_seq` is valid, and so are those
+/// that the refused requests had, and the next one.
 #[tokio::test]
 async fn last_seq_is_the_number_that_the_server_counts_by() {
     let server = TestServer::start().await;
@@ -139,7 +139,8 @@ async fn last_seq_is_the_number_that_the_server_counts_by() {
     }
 }
 
-/// A client that did not get the answer to `close` resumes and repeats it, as with any other request.
+/// A client that did not get the answer to `close` resumes and repeats it, as with any other
+/// request.
 #[tokio::test]
 async fn a_lost_answer_to_close_can_be_repeated() {
     let server = TestServer::start().await;

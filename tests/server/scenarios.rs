@@ -6,7 +6,8 @@ use serde_json::{Value, json};
 
 use crate::support::{Agent, TestServer, pose, refused};
 
-/// On the 9 m of the twin `test`: a car that stands at 8 m, a walker that appears, and a van next to the drive.
+/// On the 9 m of the twin `test`: a car that stands at 8 m, a walker that appears, and a van next
+/// to the drive.
 fn scenario() -> Value {
     json!({
         "format": "wildcity.scenario/1", "name": "short", "twin": {"name": "test"},

@@ -1,4 +1,5 @@
-//! Effects of sensors: their changes, which depend only on a seed, and are the same in branches, replays and records.
+//! Effects of sensors: their changes, which depend only on a seed, and are the same in branches,
+//! replays and records.
 
 use std::collections::BTreeSet;
 
@@ -398,7 +399,8 @@ async fn a_replay_decides_again() {
     assert!(report.difference.is_some() && report.wrong_value.is_none());
 }
 
-/// Room for the header is reserved before the header is known, also for the sensor effects of every image.
+/// Room for the header is reserved before the header is known, also for the sensor effects of every
+/// image.
 #[tokio::test]
 async fn the_longest_header_of_sensors_fits() {
     let server = TestServer::start().await;

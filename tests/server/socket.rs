@@ -121,7 +121,8 @@ async fn a_close_frame_is_answered_with_its_code() {
     }
 }
 
-/// A client that leaves during a step gets its Close frame at once, and the step is there when it comes back.
+/// A client that leaves during a step gets its Close frame at once, and the step is there when it
+/// comes back.
 #[tokio::test]
 async fn a_close_frame_is_answered_while_a_request_runs() {
     let server = TestServer::start().await;

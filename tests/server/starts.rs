@@ -135,7 +135,7 @@ async fn what_is_no_start_is_refused() {
 #[tokio::test]
 async fn resumed_tells_the_settings_of_now() {
     let server = TestServer::start().await;
-    crate::support::commit_twin_of(server.twins.path(), -1.0);
+    crate::support::commit_twin_with_opacity(server.twins.path(), -1.0);
     let mut agent = server.agent().await;
     let outputs = json!({ "encoding": "png", "trust": true, "period_us": { "rear": 200_000 } });
     let opened = agent

@@ -14,7 +14,8 @@ use wildcity_server::{Config, ServerError, TlsFiles};
 
 use crate::support::{TEST_TIMEOUT, TestServer};
 
-/// Writes a new certificate for 127.0.0.1, and returns a client's options that trust only this certificate.
+/// Writes a new certificate for 127.0.0.1, and returns a client's options that trust only this
+/// certificate.
 fn certify(dir: &Path) -> ConnectOptions {
     let CertifiedKey { cert, signing_key } =
         generate_simple_self_signed(vec!["127.0.0.1".to_owned()]).unwrap();

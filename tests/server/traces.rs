@@ -33,7 +33,8 @@ impl<S: tracing::Subscriber + for<'a> LookupSpan<'a>> Layer<S> for Spans {
         let name = attributes.metadata().name();
         let mut seen = Seen { name, parent, ..Seen::default() };
         attributes.record(&mut seen);
-        // The registry reuses the ids of spans that ended; the parts of a request end before it does.
+        // The registry reuses the ids of spans that ended; the parts of a request end before it
+        // does.
         self.0.lock().unwrap().insert(id.into_u64(), seen);
     }
 
@@ -78,7 +79,8 @@ async fn a_step_is_traced_with_its_parts() {
         seen.fields.get("type").is_some_and(|kind| kind == "step")
             && seen.fields.get("session").is_some_and(|session| session == "traced")
     };
-    // The answer is sent before its span ends: a thread that rendered it may hold a part of it for a moment.
+    // The answer is sent before its span ends: a thread that rendered it may hold a part of it for
+    // a moment.
     let has_ended = async {
         while !spans.0.lock().unwrap().values().any(|seen| is_step(seen) && seen.ended) {
             tokio::time::sleep(Duration::from_millis(5)).await;

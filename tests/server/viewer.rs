@@ -99,7 +99,8 @@ async fn a_ticket_opens_one_connection_with_the_rights_of_its_token() {
         401
     );
     assert_eq!(ask(&server, "GET /v1/sessions", ticket).await.0, 401);
-    // The session belongs to the token: another ticket of it resumes the session, a rival's does not.
+    // The session belongs to the token: another ticket of it resumes the session, a rival's does
+    // not.
     drop(agent);
     for (token, answer) in [(RIVAL, "error"), (DRIVER, "resumed")] {
         let (_, issued) = ask(&server, "POST /v1/tickets", token).await;
@@ -121,7 +122,8 @@ async fn a_watcher_gets_the_observations_of_the_agent() {
         connect(server.address(), "/v1/sessions/a/watch", WATCH, None).await.ok().unwrap();
     let driven = agent.step(1.0).await;
     assert_eq!(watcher.seen().await.bytes, driven.bytes);
-    // The watcher does not read now: the agent drives on, and the watcher sees the last step, and few of the others.
+    // The watcher does not read now: the agent drives on, and the watcher sees the last step, and
+    // few of the others.
     let mut last = driven;
     for step in 2..40 {
         last = agent.step(f64::from(step)).await;
@@ -146,10 +148,8 @@ async fn watching_changes_no_hash() {
         let server = TestServer::start().await;
         let mut agent = server.driver("a").await;
         let path = "/v1/sessions/a/watch";
-        let watcher = match watched {
-            true => connect(server.address(), path, WATCH, None).await.ok(),
-            false => None,
-        };
+        let watcher =
+            if watched { connect(server.address(), path, WATCH, None).await.ok() } else { None };
         let mut frames = Vec::new();
         for step in 0..5 {
             frames.push(agent.step(f64::from(step)).await.frame_hash().to_owned());

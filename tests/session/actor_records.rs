@@ -1,5 +1,5 @@
-//! Actors in records: replayed with their assets, refused if the scenario does not have them; and an object that was
-//! cut out of a twin and put back as an actor.
+//! Actors in records: replayed with their assets, refused if the scenario does not have them; and
+//! an object that was cut out of a twin and put back as an actor.
 
 use std::sync::OnceLock;
 
@@ -47,7 +47,7 @@ fn straight() -> &'static (tempfile::TempDir, Catalog) {
         let new = NewVersion {
             profile: PROFILE,
             trajectories: vec![log],
-            ..NewVersion::of("straight", &gaussians, Provenance::of("test".to_owned()))
+            ..NewVersion::from_gaussians("straight", &gaussians, Provenance::new("test".to_owned()))
         };
         catalog.commit(new, &mut |_, _| {}).unwrap();
         catalog.put_actor(&car_asset(), RecordFormat::F32).unwrap();
@@ -55,7 +55,8 @@ fn straight() -> &'static (tempfile::TempDir, Catalog) {
     })
 }
 
-/// A record has the poses of the actors: in the warm-up, within plans, and when they appear and disappear.
+/// A record has the poses of the actors: in the warm-up, within plans, and when they appear and
+/// disappear.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_recorded_episode_is_rendered_again_with_its_actors() {
     let (_, catalog) = straight();
@@ -195,7 +196,7 @@ fn what_was_cut_out_and_put_back_looks_as_before() {
     let catalog = Catalog::open(dir.path()).unwrap();
     let new = NewVersion {
         storage: StorageOptions { record: RecordFormat::F32, levels: false },
-        ..NewVersion::of("street", &gaussians, Provenance::of("test".to_owned()))
+        ..NewVersion::from_gaussians("street", &gaussians, Provenance::new("test".to_owned()))
     };
     let base = catalog.commit(new, &mut |_, _| {}).unwrap();
     let pose = Pose {
@@ -209,7 +210,7 @@ fn what_was_cut_out_and_put_back_looks_as_before() {
         name: "cut".to_owned(),
         class: ActorClass::Vehicle,
         box_,
-        provenance: Provenance::of("test".to_owned()),
+        provenance: Provenance::new("test".to_owned()),
     };
     let asset = ActorAsset::new(&cut.gaussians, description).unwrap();
     let stored = catalog.put_actor(&asset, RecordFormat::F32).unwrap();

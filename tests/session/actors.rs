@@ -1,4 +1,5 @@
-//! Sessions with actors: each frame shows them at their poses at its time, and nothing else changes.
+//! Sessions with actors: each frame shows them at their poses at its time, and nothing else
+//! changes.
 
 use std::sync::{Arc, OnceLock};
 
@@ -48,7 +49,7 @@ pub(crate) fn car_asset() -> ActorAsset {
         name: "red-box".to_owned(),
         class: ActorClass::Vehicle,
         box_: ActorBox { length_m: 4.0, width_m: 1.8, height_m: 1.5 },
-        provenance: Provenance::of("test".to_owned()),
+        provenance: Provenance::new("test".to_owned()),
     };
     ActorAsset::new(&gaussians, description).unwrap()
 }
@@ -119,9 +120,10 @@ async fn standing(session: &mut Session, steps: u32) -> Vec<Vec<blake3::Hash>> {
     seen
 }
 
-/// Expected images of an ego at rest, with actors at their poses now and at the start of the exposure.
+/// Expected images of an ego at rest, with actors at their poses now and at the start of the
+/// exposure.
 fn expected(placed: &[(u16, Pose, Pose)], shutters: bool) -> Vec<blake3::Hash> {
-    let views = View::of_rig(&rig(shutters), demo().at(EGO_M));
+    let views = View::from_rig(&rig(shutters), demo().at(EGO_M));
     let resident = unlimited().open("demo", None).unwrap();
     let mut scene = resident.scene(&eyes(&views), &PROFILE).unwrap();
     let asset = demo().catalog().actor(&car().hash).unwrap();
@@ -171,10 +173,7 @@ async fn every_frame_draws_the_actors_of_its_time() {
             assert!((now[0].position_m.distance(before[0].position_m) - 0.9).abs() < 1e-6);
             // 60 of the step's 100 ms before its end.
             let since = 1.0 - EXPOSURE_US as f64 * 1e-5;
-            let at_start = match shutters {
-                true => before[0].interpolate(&now[0], since),
-                false => now[0],
-            };
+            let at_start = if shutters { before[0].interpolate(&now[0], since) } else { now[0] };
             let drawn = [(0, now[0], at_start), (1, now[1], now[1])];
             assert_eq!(seen, expected(&drawn, shutters), "step {step}, shutters {shutters}");
             if shutters {
@@ -289,7 +288,8 @@ async fn a_default_asset_has_the_class_and_about_the_size_of_its_actor() {
         json!({"name": "sedan", "stand": {"xyz": [20, 70, 0], "yaw_rad": 0}}),
     ]);
     let mut session = open(&bench, "all", options(&all, true)).await;
-    // A reset takes the assets of the first episode. Boxes stay as they are, also that of an actor without a size.
+    // A reset takes the assets of the first episode. Boxes stay as they are, also that of an actor
+    // without a size.
     let before = session.traffic().unwrap().specs().to_vec();
     session.reset(1, None).await.unwrap();
     assert_eq!(session.traffic().unwrap().specs(), before);

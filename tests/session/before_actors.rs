@@ -1,9 +1,10 @@
-//! Frames without actors are those of the builds before there were actors: the images of commit 4f2fba29, which served
-//! the same file with the cpu backend to an agent that sent the same poses. Its demo street had the same images as
-//! well: 13 frames of six full-size cameras, and today's `wildcity replay --verify` finds no difference in its record.
+//! Frames without actors are those of the builds before there were actors: the images of commit
+//! 4f2fba29, which served the same file with the cpu backend to an agent that sent the same poses.
+//! Its demo street had the same images as well: 13 frames of six full-size cameras, and today's
+//! `wildcity replay --verify` finds no difference in its record.
 //!
-//! A change of the images of pinhole cameras on purpose changes the hashes. Then compare such a build with the previous
-//! one, and write the new hashes into this file.
+//! A change of the images of pinhole cameras on purpose changes the hashes. Then compare such a
+//! build with the previous one, and write the new hashes into this file.
 
 use std::sync::Arc;
 
@@ -64,7 +65,7 @@ async fn frames_without_actors_are_those_before_there_were_actors() {
     let dir = tempfile::tempdir().unwrap();
     let catalog = Catalog::open(dir.path()).unwrap();
     let cloud = gaussians(20_000, 1, 30.0, 9);
-    let new = NewVersion::of("cloud", &cloud, Provenance::of("test".to_owned()));
+    let new = NewVersion::from_gaussians("cloud", &cloud, Provenance::new("test".to_owned()));
     catalog.commit(new, &mut |_, _| {}).unwrap();
     let bench = bench_with(Cache::new(catalog), Arc::new(backend));
     let options = SessionOptions {

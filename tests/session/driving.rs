@@ -1,5 +1,5 @@
-//! Sessions that drive through the engine: with a small memory budget, and with sections that cannot be
-//! read.
+//! Sessions that drive through the engine: with a small memory budget, and with sections that
+//! cannot be read.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -28,8 +28,8 @@ pub(crate) fn bench(cache: Cache) -> Bench {
     bench_with(cache, Arc::new(ForSections(crate::images::cpu())))
 }
 
-/// The cpu backend without memory for intermediate buffers, so that small limits apply only to sections. Buffers hold
-/// other values before it writes them.
+/// The cpu backend without memory for intermediate buffers, so that small limits apply only to
+/// sections. Buffers hold other values before it writes them.
 struct ForSections(Cpu);
 
 impl Backend for ForSections {
@@ -67,10 +67,10 @@ impl Backend for ForSections {
 }
 
 pub(crate) fn bench_with(cache: Cache, backend: Arc<dyn wildcity_render::Backend>) -> Bench {
-    bench_of(cache, backend, Scenarios::in_dir(""))
+    open_bench(cache, backend, Scenarios::in_dir(""))
 }
 
-pub(crate) fn bench_of(
+pub(crate) fn open_bench(
     cache: Cache,
     backend: Arc<dyn wildcity_render::Backend>,
     scenarios: Scenarios,
@@ -164,7 +164,8 @@ async fn a_hint_is_loaded_before_the_ego_is_there() {
     session.prefetch(vec![there]).unwrap();
     let began = std::time::Instant::now();
     let resident = session.resident().clone();
-    // Wait until all of it was requested and has been loaded; a jump there must then wait for nothing.
+    // Wait until all of it was requested and has been loaded; a jump there must then wait for
+    // nothing.
     let needed = resident.demand(&eyes(&views(there)), &PROFILE);
     let begun = || needed.iter().all(|&one| source.reads(place(&resident, one)) > 0);
     while !begun() || resident.stats().loads < source.all_reads() {
@@ -292,7 +293,8 @@ async fn a_session_that_does_not_fit_is_refused_until_another_closes() {
     bench.session("second", None).await.unwrap();
 }
 
-/// The renderer's intermediate buffers stay within the reserved memory, whose size the budget determines.
+/// The renderer's intermediate buffers stay within the reserved memory, whose size the budget
+/// determines.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_session_reserves_what_its_frames_hold() {
     let mut reserved = Vec::new();

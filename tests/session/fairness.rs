@@ -1,6 +1,7 @@
 //! A session with small images together with sessions with the largest ones, on the cpu backend.
 //!
-//! `FAIRNESS_SESSIONS=12 FAIRNESS_SIZE=16384x8192 FAIRNESS_SECONDS=120` is the full size: 12 answers of 400 MB.
+//! `FAIRNESS_SESSIONS=12 FAIRNESS_SIZE=16384x8192 FAIRNESS_SECONDS=120` is the full size: 12
+//! answers of 400 MB.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -19,8 +20,8 @@ use wildcity_twin::residency::Cache;
 use crate::driving::{Bench, bench};
 use crate::streaming::demo;
 
-/// Where the sessions drive: at the start of the street; high above it unless the full size is asked for, so that a
-/// large frame takes a second and not a minute on a busy machine.
+/// Where the sessions drive: at the start of the street; high above it unless the full size is
+/// asked for, so that a large frame takes a second and not a minute on a busy machine.
 fn place() -> Pose {
     let street = demo().at(0.0);
     let height_m = if std::env::var("FAIRNESS_SIZE").is_ok() { 0.0 } else { 500.0 };
@@ -32,7 +33,8 @@ async fn session(bench: &Bench, name: String, width_px: u32, height_px: u32) -> 
     let [width, height] = [width_px, height_px].map(f64::from);
     let pinhole = Pinhole { fx: width, fy: width, cx: 0.5 * width, cy: 0.5 * height };
     let camera = Camera::from_pinhole(width_px, height_px, pinhole);
-    // Ahead, from the height of a windshield: OpenCV's axes (x right, y down, z ahead) in those of the vehicle.
+    // Ahead, from the height of a windshield: OpenCV's axes (x right, y down, z ahead) in those of
+    // the vehicle.
     let ahead =
         Pose { position_m: 1.5 * DVec3::Z, rotation: DQuat::from_xyzw(-0.5, 0.5, -0.5, 0.5) };
     let cameras = vec![RigCamera::new("front", camera, ahead)];

@@ -15,7 +15,7 @@ use wildcity_twin::store::{Catalog, NewVersion};
 
 use crate::actor_records::replay;
 use crate::actors::{open, options};
-use crate::driving::bench_of;
+use crate::driving::open_bench;
 use crate::streaming::PROFILE;
 
 /// Rise of the lane, in m per m.
@@ -36,7 +36,7 @@ fn hill() -> (tempfile::TempDir, Catalog) {
     let catalog = Catalog::open(dir.path()).unwrap();
     let new = NewVersion {
         profile: PROFILE,
-        ..NewVersion::of("hill", &gaussians, Provenance::of("test".to_owned()))
+        ..NewVersion::from_gaussians("hill", &gaussians, Provenance::new("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();
     (dir, catalog)
@@ -55,7 +55,7 @@ async fn the_ego_climbs_with_a_lane_and_its_record_is_driven_again() {
     let (_dir, catalog) = hill();
     let scenarios = tempfile::tempdir().unwrap();
     std::fs::write(scenarios.path().join("hill.map.json"), map().to_string()).unwrap();
-    let bench = bench_of(
+    let bench = open_bench(
         Cache::new(catalog.clone()),
         Arc::new(crate::images::cpu()),
         Scenarios::in_dir(scenarios.path()),
@@ -92,7 +92,8 @@ async fn the_ego_climbs_with_a_lane_and_its_record_is_driven_again() {
     let report = replay(&path, &catalog);
     assert_eq!((report.diverged, &report.wrong_value, report.difference), (None, &None, None));
     assert!(report.images >= 12, "{}", report.images);
-    // The map's file is deleted, and the record has a different road, so that the ego has different poses.
+    // The map's file is deleted, and the record has a different road, so that the ego has different
+    // poses.
     drop(scenarios);
     assert_eq!(replay(&path, &catalog).diverged, None);
     let text = std::fs::read_to_string(&path).unwrap();

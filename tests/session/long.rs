@@ -11,9 +11,9 @@ use wildcity_sim::{Command, Dynamics, Ego, Ground};
 const STEPS: u64 = 100_000;
 const STEP_US: i64 = 100_000;
 
-/// Largest accepted [`skewness`], 9 epsilons. Normalising leaves a quaternion's length within 2 epsilons
-/// of 1, so the product of its matrix with the transpose is within 4 epsilons of the identity, and is
-/// rounded itself.
+/// Largest accepted [`skewness`], 9 epsilons. Normalising leaves a quaternion's length within 2
+/// epsilons of 1, so the product of its matrix with the transpose is within 4 epsilons of the
+/// identity, and is rounded itself.
 const MAX_SKEWNESS: f64 = 2e-15;
 
 fn episode(model: EgoModel, start: Pose, speed_m_s: f64) -> Episode {
@@ -32,9 +32,9 @@ fn skewness(pose: &Pose) -> f64 {
 fn a_thousand_laps_end_where_they_began() {
     // 10 m/s on a circle with a circumference of 100 m: a metre per step.
     let action = Action { acceleration_m_s2: 0.0, curvature_1_m: TAU / 100.0 };
-    // Each step rounds the position to half an ulp, and the heading, which acts at the radius of 16 m: over
-    // 100,000 steps, 1.8e-15 m and 16 x 1.1e-16 m each near the origin, and 7.3e-12 m each where coordinates
-    // are 100 km.
+    // Each step rounds the position to half an ulp, and the heading, which acts at the radius of 16
+    // m: over 100,000 steps, 1.8e-15 m and 16 x 1.1e-16 m each near the origin, and 7.3e-12 m each
+    // where coordinates are 100 km.
     for (away_m, bound_m) in [(0.0, 1e-9), (1e5, 1e-6)] {
         let rotation = DQuat::from_euler(glam::EulerRot::ZYX, 0.7, 0.05, -0.02);
         let start = Pose { position_m: DVec3::new(away_m, -away_m, 30.0), rotation };
@@ -53,7 +53,8 @@ fn a_thousand_laps_end_where_they_began() {
         eprintln!("{away_m} m from the origin: {worst_m:e} m of drift");
         assert!(worst_m < bound_m, "{away_m} m from the origin: {worst_m} m of drift");
         let driven_m = driven.summary(wildcity_session::Outcome::Completed).distance_m;
-        // The sum of the chords, 2 r sin(φ/2) each, up to 100,000 roundings by half an ulp of 1e5 m.
+        // The sum of the chords, 2 r sin(φ/2) each, up to 100,000 roundings by half an ulp of 1e5
+        // m.
         let chords_m = STEPS as f64 * 100.0 / TAU * 2.0 * (TAU / 200.0).sin();
         assert!((driven_m - chords_m).abs() < 1e-6, "{driven_m} m, not {chords_m}");
     }

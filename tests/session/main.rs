@@ -1,4 +1,5 @@
-//! Sessions and episodes: the images, prefetched sections and stored state, the actors and the trust of their images.
+//! Sessions and episodes: the images, prefetched sections and stored state, the actors and the
+//! trust of their images.
 
 #[path = "../support/images.rs"]
 mod images;

@@ -14,8 +14,8 @@ use crate::streaming::{demo, unlimited};
 const ALL_MAPS: PixelMaps =
     PixelMaps { depth: true, opacity: true, normals: true, instances: true };
 
-/// Sessions whose answers have about the same size and different contents; one has a lens whose field ends within the
-/// image.
+/// Sessions whose answers have about the same size and different contents; one has a lens whose
+/// field ends within the image.
 fn sessions() -> Vec<SessionOptions> {
     let of = |encoding: Encoding, maps: PixelMaps, frames: u64| {
         let mut asked = options(&actors(&Value::from(&*car().hash)), false);
@@ -61,7 +61,8 @@ async fn observations_do_not_depend_on_those_of_other_sessions() {
         for (index, options) in sessions().into_iter().enumerate() {
             let name = format!("{round}-{index}");
             let among_others = observations(&shared, &name, options.clone()).await;
-            // Its buffers are zeroed, and those of the others hold other values before the backend writes them.
+            // Its buffers are zeroed, and those of the others hold other values before the backend
+            // writes them.
             let fresh = bench_with(unlimited(), Arc::new(crate::images::cpu()));
             let alone = observations(&fresh, &name, options).await;
             assert!(among_others == alone, "{name}");

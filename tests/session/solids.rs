@@ -48,7 +48,7 @@ fn walled() -> (TempDir, Catalog) {
         let new = NewVersion {
             profile: PROFILE,
             trajectories: vec![log],
-            ..NewVersion::of("walled", &gaussians, Provenance::of("test".to_owned()))
+            ..NewVersion::from_gaussians("walled", &gaussians, Provenance::new("test".to_owned()))
         };
         catalog.commit(new, &mut |_, _| {}).unwrap();
     }
@@ -83,7 +83,8 @@ async fn open(bench: &Bench, name: &str, version: u64) -> Session {
     session
 }
 
-/// Drives from one metre to another, 1 m per step. Returns the metre at which the ego had contact with the twin.
+/// Drives from one metre to another, 1 m per step. Returns the metre at which the ego had contact
+/// with the twin.
 async fn met(session: &mut Session, from_m: u32, to_m: u32) -> Option<u32> {
     for x_m in from_m + 1..=to_m {
         session.step(at(x_m.into()), false).await.unwrap();
@@ -108,7 +109,8 @@ async fn a_switch_of_version_changes_what_the_ego_meets() {
     let met_m = met(&mut wall, 0, 30).await.unwrap();
     assert!((14..=20).contains(&met_m), "{met_m}");
 
-    // Switch to the version with the wall: the contact is at the same place as in a session that was opened with it.
+    // Switch to the version with the wall: the contact is at the same place as in a session that
+    // was opened with it.
     let mut session = open(&bench, "into", 1).await;
     assert_eq!(met(&mut session, 0, 5).await, None);
     session.take_snapshot("before".to_owned()).unwrap();
@@ -149,7 +151,8 @@ async fn plain(
     session
 }
 
-/// Drives straight on at 10 m/s until the episode ends, for at most 40 steps. Returns all events, and how the episode went.
+/// Drives straight on at 10 m/s until the episode ends, for at most 40 steps. Returns all events,
+/// and how the episode went.
 async fn straight(mut session: Session) -> (Vec<Event>, EpisodeSummary) {
     let mut events = Vec::new();
     for step in 1..=40 {
@@ -270,7 +273,8 @@ async fn a_scenario_decides_what_a_contact_does() {
             ..SessionOptions::twin("walled", Outputs::colour(Encoding::Raw))
         }
     };
-    // The rule, what the session asks for, whether there is a contact, and whether it ends the episode.
+    // The rule, what the session asks for, whether there is a contact, and whether it ends the
+    // episode.
     let cases = [
         (None, None, true, false),
         (Some("any"), None, true, true),
@@ -306,7 +310,8 @@ async fn a_scenario_decides_what_a_contact_does() {
 async fn events_of_a_plan_are_in_order_and_a_contact_comes_before_what_follows_it() {
     let (_dir, catalog) = walled();
     let bench = bench(Cache::new(catalog));
-    // Into the wall and on, far from the drive: a contact, and then off the trained area, in one request.
+    // Into the wall and on, far from the drive: a contact, and then off the trained area, in one
+    // request.
     let path = |name: &'static str, aside_m: [f64; 2]| {
         let bench = &bench;
         async move {

@@ -1,8 +1,9 @@
 //! The trust of images, compared with the errors of a twin that was recorded on one drive.
 //!
-//! The demo street stands for the real world. Its twin has only the Gaussians that a camera of the drive saw. A pixel
-//! is correct if it differs from the world's by at most 16 of 255. Training has errors in the recorded parts as well,
-//! so a real twin has fewer correct pixels than this one: the test gives an upper bound.
+//! The demo street stands for the real world. Its twin has only the Gaussians that a camera of the
+//! drive saw. A pixel is correct if it differs from the world's by at most 16 of 255. Training has
+//! errors in the recorded parts as well, so a real twin has fewer correct pixels than this one: the
+//! test gives an upper bound.
 
 use glam::{DQuat, DVec3};
 use wildcity_generate::{Street, StreetSettings};
@@ -28,7 +29,8 @@ struct Pair {
     cpu: Cpu,
 }
 
-/// Means over all cameras at some places: the share of correct pixels, and the trust with its parts.
+/// Means over all cameras at some places: the share of correct pixels, and the trust with its
+/// parts.
 #[derive(Clone, Copy, Debug)]
 struct Measured {
     right: f64,
@@ -59,19 +61,20 @@ fn trust_falls_beside_the_drive_and_is_at_most_the_share_of_right_pixels() {
 fn far_from_the_recorded_drive_the_trust_is_zero() {
     let pair = pair();
     let away = Pose { position_m: DVec3::new(5_000.0, 0.0, 0.0), ..Pose::IDENTITY };
-    let view = View::of_rig(&small_rig().cameras, away)[0];
+    let view = View::from_rig(&small_rig().cameras, away)[0];
     let clear = vec![1.0; view.camera.pixels()];
     let Trust { value, outside, low_coverage, .. } = pair.coverage.trust(&away, &view, &clear);
     assert!(value < 1e-6 && outside == 1.0 && low_coverage == 0.0, "{value} {outside}");
     let on_it = pair.street.trajectory.at_station(30.0);
-    let view = View::of_rig(&small_rig().cameras, on_it)[0];
+    let view = View::from_rig(&small_rig().cameras, on_it)[0];
     let Trust { value, outside, angle_rad, .. } = pair.coverage.trust(&on_it, &view, &clear);
     assert!(value > 0.95 && outside == 0.0 && angle_rad < 0.05, "{value} {outside} {angle_rad}");
     let empty = vec![0.2; view.camera.pixels()];
     assert_eq!(pair.coverage.trust(&on_it, &view, &empty).value, 0.0);
 }
 
-/// A level camera with a small image, whose few followed samples are all above the horizon; and one that looks up.
+/// A level camera with a small image, whose few followed samples are all above the horizon; and one
+/// that looks up.
 #[test]
 fn a_level_camera_far_from_the_twin_is_outside() {
     let pair = pair();
@@ -84,7 +87,7 @@ fn a_level_camera_far_from_the_twin_is_outside() {
     let tilt_up = Pose { rotation: DQuat::from_rotation_y(-1.2), ..Pose::IDENTITY };
     for (world_from_rig, expected) in [(on_it, 0.0), (off_it, 1.0)] {
         for pose in [world_from_rig, world_from_rig * tilt_up] {
-            let view = View::of_rig(&rig.cameras, pose)[0];
+            let view = View::from_rig(&rig.cameras, pose)[0];
             let clear = vec![1.0; view.camera.pixels()];
             let Trust { outside, .. } = pair.coverage.trust(&pose, &view, &clear);
             assert_eq!(outside, expected, "{pose:?}");
@@ -101,7 +104,7 @@ impl Pair {
                 position_m: on_it.position_m + on_it.rotation * DVec3::Y * offset_m,
                 rotation: on_it.rotation * DQuat::from_rotation_z(yaw_rad),
             };
-            let views = View::of_rig(&small_rig().cameras, world_from_rig);
+            let views = View::from_rig(&small_rig().cameras, world_from_rig);
             let draw = |scene| render(&self.cpu, scene, &RenderProfile::default(), &views);
             for ((world, twin), view) in draw(&self.world).iter().zip(&draw(&self.twin)).zip(&views)
             {
@@ -143,21 +146,21 @@ fn pair() -> Pair {
     let new = NewVersion {
         trajectories: vec![street.trajectory.clone()],
         storage: StorageOptions { record: RecordFormat::F32, levels: false },
-        ..NewVersion::of("twin", &twin, Provenance::of("test".into()))
+        ..NewVersion::from_gaussians("twin", &twin, Provenance::new("test".into()))
     };
     let version = Catalog::open(dir.path()).unwrap().commit(new, &mut |_, _| {}).unwrap();
     let coverage = TrainingCoverage::new(&version.manifest).unwrap();
     Pair { twin: Scene::from_gaussians(&twin), street, world, coverage, cpu }
 }
 
-/// For each Gaussian, whether a camera of the drive saw it: its centre is in the image or at most its own
-/// extent outside, and nothing is in front of it.
+/// For each Gaussian, whether a camera of the drive saw it: its centre is in the image or at most
+/// its own extent outside, and nothing is in front of it.
 fn seen(street: &Street, world: &Scene, cpu: &Cpu) -> Vec<bool> {
     let gaussians = &street.gaussians;
     let mut seen = vec![false; gaussians.len()];
     // Every second metre: the keyframes between see the same.
     for keyframe in street.trajectory.keyframes.iter().step_by(4) {
-        let views = View::of_rig(&small_rig().cameras, keyframe.world_from_rig);
+        let views = View::from_rig(&small_rig().cameras, keyframe.world_from_rig);
         for (image, view) in
             render(cpu, world, &RenderProfile::default(), &views).iter().zip(&views)
         {

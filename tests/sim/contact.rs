@@ -95,7 +95,7 @@ fn lateral_faults_are_as_in_the_vectors() {
             other_velocity_mps: vector(&case.input["other_velocity"]),
             other_is_agent: true,
         };
-        assert_eq!(CollisionType::of(&input), CollisionType::ActiveLateral);
+        assert_eq!(CollisionType::classify(&input), CollisionType::ActiveLateral);
         let at_fault = is_ego_at_fault(&input, vector(&case.input["normal"]), None);
         assert_eq!(at_fault, case.expected["ego_at_fault"], "{}", case.name);
     }

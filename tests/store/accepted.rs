@@ -1,4 +1,5 @@
-//! What an import accepts, every edit of it accepts: at the ends of all bounds, in every record format.
+//! What an import accepts, every edit of it accepts: at the ends of all bounds, in every record
+//! format.
 
 use std::f32::consts::PI;
 
@@ -16,7 +17,8 @@ use wildcity_twin::store::{Catalog, Edit, NewVersion, StorageOptions, StoreError
 
 use crate::scene_files::{inria_columns, ply};
 
-/// Numbers of a Gaussian as a file may have them: values at the ends of their bounds are as likely as others.
+/// Numbers of a Gaussian as a file may have them: values at the ends of their bounds are as likely
+/// as others.
 fn gaussian() -> impl Strategy<Value = Gaussians> {
     let mean = prop_oneof![-40.0..40.0, Just(0.0), Just(5.5e7), Just(-5.5e7), -5e7..5e7];
     let quat = prop_oneof![-1.0_f32..1.0, Just(1e-3_f32), Just(9e4_f32)];
@@ -64,7 +66,7 @@ fn commit(
     record: RecordFormat,
 ) -> Result<Version, StoreError> {
     let storage = StorageOptions { record, levels: false };
-    let new = NewVersion::of("street", gaussians, Provenance::of("test".into()));
+    let new = NewVersion::from_gaussians("street", gaussians, Provenance::new("test".into()));
     catalog.commit(NewVersion { storage, ..new }, &mut |_, _| {})
 }
 

@@ -21,7 +21,7 @@ fn description(name: &str) -> AssetDescription {
         name: name.to_owned(),
         class: ActorClass::Vehicle,
         box_: ActorBox { length_m: 4.0, width_m: 4.0, height_m: 4.0 },
-        provenance: Provenance::of("test".to_owned()),
+        provenance: Provenance::new("test".to_owned()),
     }
 }
 
@@ -388,7 +388,7 @@ fn what_is_cut_out_and_what_stays_are_the_twin() {
     let all = gaussians(20_000, 1, 30.0, 3);
     let new = NewVersion {
         storage: StorageOptions { record: RecordFormat::F32, levels: false },
-        ..NewVersion::of("street", &all, Provenance::of("test".to_owned()))
+        ..NewVersion::from_gaussians("street", &all, Provenance::new("test".to_owned()))
     };
     let base = catalog.commit(new, &mut |_, _| {}).unwrap();
     let pose =

@@ -1,4 +1,5 @@
-//! A version remembers how it was aligned with its capture, and changes that were made for other axes are refused.
+//! A version remembers how it was aligned with its capture, and changes that were made for other
+//! axes are refused.
 
 use std::f64::consts::FRAC_PI_2;
 
@@ -72,17 +73,17 @@ fn an_alignment_of_the_provenance_counts() {
     }
 }
 
-/// A twin that was aligned before manifests had the alignment, and pushes of different cells at once: the first one
-/// writes the alignment to the manifest, which is no alignment by others.
+/// A twin that was aligned before manifests had the alignment, and pushes of different cells at
+/// once: the first one writes the alignment to the manifest, which is no alignment by others.
 #[test]
 fn changes_beside_each_other_keep_an_alignment_of_the_provenance() {
     let dir = tempfile::tempdir().unwrap();
     let catalog = Catalog::open(dir.path()).unwrap();
     let one = turn(DVec3::X, 2.0);
-    let mut provenance = Provenance::of("test".into());
+    let mut provenance = Provenance::new("test".into());
     provenance.options = vec![format!("align={one}")];
     let scene = gaussians(300, 0, 10.0, 1);
-    let new = NewVersion::of("street", &scene, provenance);
+    let new = NewVersion::from_gaussians("street", &scene, provenance);
     let old = catalog.commit(new, &mut |_, _| {}).unwrap();
     assert_eq!(old.manifest.twin_from_capture, None);
     let [first, second] = [[0, 0], [5, 5]].map(|cell| change(&catalog, cell, 2));
@@ -92,7 +93,8 @@ fn changes_beside_each_other_keep_an_alignment_of_the_provenance() {
     assert_eq!((latest.number, latest.manifest.twin_from_capture), (3, Some(one)));
 }
 
-/// A push that was made before others aligned the twin would lie in the old axes, in whichever cells.
+/// A push that was made before others aligned the twin would lie in the old axes, in whichever
+/// cells.
 #[test]
 fn a_change_from_before_an_alignment_is_refused() {
     let dir = tempfile::tempdir().unwrap();

@@ -37,7 +37,7 @@ fn from(source: &str) -> Provenance {
 
 /// A change of only cells, with `source` as its provenance.
 fn change(source: &str) -> VersionChange {
-    VersionChange::of(from(source))
+    VersionChange::new(from(source))
 }
 
 /// 200 Gaussians of SH degree 0 around the middle of a cell, 20 m wide.
@@ -121,7 +121,7 @@ fn a_dropped_commit_leaves_nothing_and_does_not_affect_others() {
     drop(one);
     let mut provenance = settings().provenance;
     provenance.source = "two".into();
-    let second = two.change(1, VersionChange::of(provenance)).unwrap();
+    let second = two.change(1, VersionChange::new(provenance)).unwrap();
     assert_eq!(second.number, 2);
     let objects = ["the chunk", "the table", "the manifest", "the record"].len();
     assert_eq!(files(dir.path()).len(), before.len() + objects);
@@ -182,7 +182,7 @@ fn an_edit_has_no_note() {
     let (catalog, _) = three(&dir);
     let mut pushed = from("block");
     pushed.set_note("epoch 30");
-    let pushed = VersionChange::of(pushed);
+    let pushed = VersionChange::new(pushed);
     let second = changed(&catalog, &[[0, 0]], 2).change(1, pushed).unwrap();
     assert_eq!(second.manifest.provenance.note(), Some("epoch 30"));
     let edited = || VersionChange::edit();
@@ -504,7 +504,8 @@ fn a_diff_names_cells_and_sizes() {
     assert_eq!(catalog.diff("street", 2, 2).unwrap().cells, []);
 }
 
-/// A small file must not become a gigabyte: a Gaussian in each of many cells is refused before anything is written.
+/// A small file must not become a gigabyte: a Gaussian in each of many cells is refused before
+/// anything is written.
 #[test]
 fn scattered_gaussians_are_refused() {
     let dir = tempfile::tempdir().unwrap();

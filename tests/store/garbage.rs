@@ -140,7 +140,8 @@ fn an_object_that_is_put_again_is_no_garbage_any_more() {
     });
 }
 
-/// An object that was noted as garbage of an old version may be one of a newer version, which is not noted yet.
+/// An object that was noted as garbage of an old version may be one of a newer version, which is
+/// not noted yet.
 #[test]
 fn a_version_loses_all_of_its_objects_or_none() {
     everywhere(|place| {
@@ -161,7 +162,8 @@ fn a_version_loses_all_of_its_objects_or_none() {
         push([3, 3], 5, 5);
         let second = catalog.collect("street", keep, false).unwrap();
         is_sound(&catalog, &[1, 2]);
-        // The manifests and tables of versions 1 and 2 go; the chunk of version 2 is needed. Versions 3 and 4 share one.
+        // The manifests and tables of versions 1 and 2 go; the chunk of version 2 is needed.
+        // Versions 3 and 4 share one.
         assert_eq!((second.removed.objects, second.noted.objects), (4, 2 * OWN + 2));
         let third = catalog.collect("street", keep, false).unwrap();
         is_sound(&catalog, &[1, 2, 3, 4, 5]);

@@ -1,11 +1,11 @@
-//! The stress cases on the cpu backend and on the reference backend, and mutations: faulty backends with
-//! which each check must fail.
+//! The stress cases on the cpu backend and on the reference backend, and mutations: faulty backends
+//! with which each check must fail.
 
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 use std::sync::{Arc, OnceLock};
 
 use glam::{DQuat, DVec3};
-use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_of};
+use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_from_specs};
 use wildcity_render::compare::images::{crop_rgba, crop_view, render_images};
 use wildcity_render::cpu::Cpu;
 use wildcity_render::reference::Reference;
@@ -44,7 +44,8 @@ fn checked_on_reference() -> &'static Checked {
     CHECKED.get_or_init(|| checked(&Reference))
 }
 
-/// Asserts that every case holds, except for those that take gigabytes. `device.rs` asserts the outcomes of cases.
+/// Asserts that every case holds, except for those that take gigabytes. `device.rs` asserts the
+/// outcomes of cases.
 fn all_hold(backend: &dyn Backend, checked: &Checked) {
     let wrong = checked.iter().filter(|(_, checks)| {
         checks.is_empty() || checks.iter().any(|c| !c.holds() || c.bound_usage() > 1.0)
@@ -251,8 +252,8 @@ impl Backend for MutatedBackend<'_> {
     }
 }
 
-/// The same scene after `edit`, which gets each chunk's origin in metres and a row of columns for each
-/// Gaussian.
+/// The same scene after `edit`, which gets each chunk's origin in metres and a row of columns for
+/// each Gaussian.
 fn remade(scene: &Scene, edit: &mut dyn FnMut(DVec3, &mut Vec<Vec<f32>>)) -> Scene {
     let again = scene.chunks.iter().map(|chunk| {
         let width = columns(chunk.sh_degree());
@@ -276,8 +277,9 @@ fn remade(scene: &Scene, edit: &mut dyn FnMut(DVec3, &mut Vec<Vec<f32>>)) -> Sce
     Scene { chunks: again.collect(), ..scene.clone() }
 }
 
-/// Moves Gaussians so that a pinhole draws them where an OpenCV lens' polynomial puts them, beyond its fold
-/// too; and replaces the lens by the pinhole. For a camera at the origin that looks along +z.
+/// Moves Gaussians so that a pinhole draws them where an OpenCV lens' polynomial puts them, beyond
+/// its fold too; and replaces the lens by the pinhole. For a camera at the origin that looks along
+/// +z.
 fn folded(scene: &Scene, view: &mut View) -> Scene {
     let Lens::OpenCv(lens) = view.camera.lens else { return scene.clone() };
     view.camera.lens = Lens::Pinhole;
@@ -372,12 +374,12 @@ const MUTATIONS: &[(&str, Mutation, &[&str])] = &[
     ("T31", OwnBlur, &["nearer to native by dB", "as f64"]),
 ];
 
-/// The check that no mutation of a backend affects: the bound of the record format. In the unit tests of
-/// `src/stress/places.rs` a coarser format fails it.
+/// The check that no mutation of a backend affects: the bound of the record format. In the unit
+/// tests of `src/stress/places.rs` a coarser format fails it.
 const OUT_OF_REACH: (&str, &str) = ("T10", "centres off by m");
 
-/// Asserts that the listed checks fail with each mutation of a backend, and that no check is without a
-/// mutation.
+/// Asserts that the listed checks fail with each mutation of a backend, and that no check is
+/// without a mutation.
 fn every_check_can_fail(backend: &dyn Backend, sound: &Checked) {
     let mut wrong = Vec::new();
     // The checks of the last case and its mutation: the table has some cases in several lines.
@@ -443,8 +445,8 @@ fn every_check_can_fail_on_the_reference() {
     every_check_can_fail(&Reference, checked_on_reference());
 }
 
-/// As the table above, by the whole text of each check: no check of the cases of moving actors holds under all of their
-/// mutations.
+/// As the table above, by the whole text of each check: no check of the cases of moving actors
+/// holds under all of their mutations.
 #[test]
 fn every_check_of_moving_actors_fails_under_a_mutation() {
     let backend = cpu();
@@ -553,7 +555,7 @@ fn too_much_is_refused_and_the_next_frame_is_right() {
     let profile = RenderProfile::default();
     let view = forward_view([10_240, 10_240], 300.0);
     let small = forward_view([64, 48], 50.0);
-    let walls = scene_of(&walls);
+    let walls = scene_from_specs(&walls);
     let fresh = render_one(&backend, &walls, &profile, small);
     let mut opacity = vec![7.0; view.camera.pixels()];
     let target = Target { opacity: Some(&mut opacity), ..Target::default() };
@@ -572,8 +574,10 @@ fn a_pose_turns_and_moves_the_image() {
         rotation: DQuat::from_rotation_y(std::f64::consts::FRAC_PI_2),
     };
     let view = View { world_from_camera: east, ..forward_view([65, 65], 100.0) };
-    let blob =
-        scene_of(&[GaussianSpec { mean_m: DVec3::new(8.0, 0.0, 0.0), ..GaussianSpec::default() }]);
+    let blob = scene_from_specs(&[GaussianSpec {
+        mean_m: DVec3::new(8.0, 0.0, 0.0),
+        ..GaussianSpec::default()
+    }]);
     let profile = RenderProfile::default();
     let image = render_one(&cpu(), &blob, &profile, view);
     agree(&image, &render_one(&Reference, &blob, &profile, view)).unwrap();

@@ -124,7 +124,7 @@ async fn a_run_of_a_worse_driver_is_worse_and_the_other_way_round_better() {
     assert_eq!(compare(&before, &stand, &[]).to_json(), worse.to_json());
 
     let ending =
-        |result: &SuiteResult, compared: Comparison| Ending::of(result, Some(&Ok(compared)));
+        |result: &SuiteResult, compared: Comparison| Ending::new(result, Some(&Ok(compared)));
     assert_eq!(ending(&stand, worse).code, ExitCode::Driving);
     // It fails as it did before: not worse, so 0.
     let failing = ending(&stand, compare(&stand, &stand, &[]));
@@ -133,7 +133,7 @@ async fn a_run_of_a_worse_driver_is_worse_and_the_other_way_round_better() {
     wanted.at_least = Some(0.5);
     assert_eq!(ending(&wanted, compare(&stand, &stand, &[])).code, ExitCode::Driving);
     let error = CompareError::NoValue { name: "a".to_owned() };
-    assert_eq!(Ending::of(&log, Some(&Err(error))).code, ExitCode::Usage);
+    assert_eq!(Ending::new(&log, Some(&Err(error))).code, ExitCode::Usage);
 
     // Comparisons that can be checked before anything is driven.
     let cases = bench.cases(&bench.path("suite.json")).unwrap();

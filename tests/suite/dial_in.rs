@@ -1,4 +1,5 @@
-//! External agents. The command is the binary of this test, which drives if an environment variable is set.
+//! External agents. The command is the binary of this test, which drives if an environment variable
+//! is set.
 
 use std::env;
 
@@ -82,7 +83,7 @@ async fn technical_failures_are_tried_again_and_both_kept() {
         assert_eq!(episode.status, Status::Technical, "{manner}");
         let kinds: Vec<&str> = episode.errors.iter().map(|error| &*error.kind).collect();
         assert_eq!(kinds, [kind; 2], "{manner}: {:?}", episode.errors);
-        assert_eq!(Ending::of(&result, None).code, ExitCode::Technical);
+        assert_eq!(Ending::new(&result, None).code, ExitCode::Technical);
     }
 }
 
@@ -103,7 +104,7 @@ async fn an_agent_that_drives_nothing_is_quoted() {
         if manner == "fails" {
             assert!(error.stderr.ends_with("line 29\nline 30"), "{}", error.stderr);
             assert!(!error.stderr.contains("line 18\n"), "the last twelve: {}", error.stderr);
-            let ending = Ending::of(&result, None);
+            let ending = Ending::new(&result, None);
             assert!(junit(&result, &ending).contains("line 30"));
             assert!(page(&result, &ending, &[], &bench.path(manner)).contains("line 30"));
             assert!(!result.to_json().contains("line 30"), "texts of agents may have times");

@@ -1,4 +1,5 @@
-//! Suites: their files, runs with built-in agents and with commands, results, reports and comparisons.
+//! Suites: their files, runs with built-in agents and with commands, results, reports and
+//! comparisons.
 
 mod compare;
 mod dial_in;

@@ -42,9 +42,10 @@ impl Backend for Timed {
     }
 }
 
-/// One camera of 1440 x 928 px on the demo street, with one thread and one episode at a time: the overhead of all steps
-/// adds up. It was below 5 % before every run looked for contact with the twin, which reads the solid Gaussians of the
-/// street once: 1 to 2 % of this run of one camera, and a sixth of that with six.
+/// One camera of 1440 x 928 px on the demo street, with one thread and one episode at a time: the
+/// overhead of all steps adds up. It was below 5 % before every run looked for contact with the
+/// twin, which reads the solid Gaussians of the street once: 1 to 2 % of this run of one camera,
+/// and a sixth of that with six.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_run_takes_less_than_a_tenth_more_than_its_rendering() {
     let bench = Bench::new();
@@ -52,7 +53,7 @@ async fn a_run_takes_less_than_a_tenth_more_than_its_rendering() {
     let new = NewVersion {
         rig: Some(Rig::preset("vehicle6").unwrap()),
         trajectories: vec![street.trajectory],
-        ..NewVersion::of("demo", &street.gaussians, Provenance::of("test".into()))
+        ..NewVersion::from_gaussians("demo", &street.gaussians, Provenance::new("test".into()))
     };
     bench.catalog().commit(new, &mut |_, _| {}).unwrap();
     let scenario = json!({

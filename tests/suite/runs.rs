@@ -11,7 +11,7 @@ use crate::street::{Bench, cpu, scenario};
 const VERDICT: &str = "wildcity.verdict@2";
 
 fn code(result: &SuiteResult) -> ExitCode {
-    Ending::of(result, None).code
+    Ending::new(result, None).code
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -48,7 +48,7 @@ async fn any_number_of_jobs_gives_the_same_bytes() {
     for jobs in [1, 2, 8] {
         let out = format!("jobs{jobs}");
         let result = bench.run(AgentChoice::BuiltIn(BuiltIn::Log), jobs, &out).await;
-        results.push((result.to_json(), junit(&result, &Ending::of(&result, None))));
+        results.push((result.to_json(), junit(&result, &Ending::new(&result, None))));
     }
     assert_eq!(results[0], results[1]);
     assert_eq!(results[0], results[2]);
@@ -87,7 +87,8 @@ async fn each_record_becomes_an_mcap_file_beside_it() {
         assert_eq!(*mcap, entry.record.replace(".jsonl", ".mcap"));
         let by_hand = bench.path("by-hand.mcap");
         export_file(&record, &by_hand).unwrap();
-        // With its end and result. The order of the index differs from file to file, its size does not.
+        // With its end and result. The order of the index differs from file to file, its size does
+        // not.
         let bytes = [by_hand, bench.path("log").join(mcap)]
             .map(|path| std::fs::metadata(path).unwrap().len());
         assert_eq!(bytes[0], bytes[1], "{}", entry.name);
@@ -109,7 +110,7 @@ async fn an_export_that_fails_is_in_the_report_and_changes_no_byte_of_the_result
     let told: Vec<bool> = run.episodes.iter().map(|e| e.mcap_error().is_some()).collect();
     assert_eq!(told, [true, false, false, false]);
     assert!(run.episodes[0].mcap_error().unwrap().contains("cannot write"), "{run:?}");
-    let html = page(&run, &Ending::of(&run, None), &[], &bench.path("log"));
+    let html = page(&run, &Ending::new(&run, None), &[], &bench.path("log"));
     assert_eq!(html.matches("no MCAP file: cannot write").count(), 1, "{html}");
     assert_eq!(html.matches("episodes/car-4-1.mcap").count(), 1, "{html}");
 
@@ -145,7 +146,7 @@ async fn the_report_shows_the_worst_episodes_with_pictures() {
     assert_eq!(shown.len(), 2);
     assert!(shown.iter().all(|picture| picture.jpeg.starts_with(&[0xff, 0xd8])));
     assert_eq!((shown[0].step, shown[0].camera.as_str()), (20, "front"));
-    let ending = Ending::of(&run, None);
+    let ending = Ending::new(&run, None);
     let html = page(&run, &ending, &shown, &bench.path("stand"));
     assert_eq!(html.matches("data:image/jpeg;base64,").count(), 2);
     assert_eq!(html.matches("<svg").count(), 4);
@@ -172,7 +173,7 @@ async fn the_report_shows_the_worst_episodes_with_pictures() {
 async fn titles_fit_into_their_plots() {
     let bench = Bench::new();
     let run = bench.run_built_in(BuiltIn::Stand, "stand").await;
-    let html = page(&run, &Ending::of(&run, None), &[], &bench.path("stand"));
+    let html = page(&run, &Ending::new(&run, None), &[], &bench.path("stand"));
     let titles: Vec<String> = html
         .split("<text x=\"6\"")
         .skip(1)
@@ -198,7 +199,7 @@ async fn a_run_without_a_verdict_has_no_rate() {
     let run = wildcity_suite::run(settings, cases).await.unwrap();
     assert_eq!(run.counts.technical, 1, "{}", run.to_json());
     assert_eq!(run.pass_rate.text(), "no episode was judged");
-    let ending = Ending::of(&run, None);
+    let ending = Ending::new(&run, None);
     assert_eq!(ending.code, ExitCode::Technical);
     let html = page(&run, &ending, &[], &bench.path("out"));
     assert!(html.contains("Pass rate: no episode was judged"), "{html}");
@@ -251,7 +252,7 @@ async fn what_was_not_looked_for_is_no_pass() {
         assert_eq!((found, code(&run)), (statuses, exit), "{}", run.to_json());
         let unseen = "contact.static: contact with the twin was not looked for";
         assert!(run.episodes[1].not_judged.iter().any(|text| text == unseen));
-        let html = page(&run, &Ending::of(&run, None), &[], &bench.path(&out));
+        let html = page(&run, &Ending::new(&run, None), &[], &bench.path(&out));
         let first = html.find("Without a verdict");
         assert_eq!(first.is_some(), exit == ExitCode::NotJudged);
         assert!(first.is_none_or(|at| at < html.find("Scenarios").unwrap()), "it comes first");
@@ -277,7 +278,7 @@ fn exit_codes_are_technical_before_driving() {
     let bench = Bench::new();
     let runtime = tokio::runtime::Runtime::new().unwrap();
     let passed = runtime.block_on(bench.run_built_in(BuiltIn::Log, "log"));
-    assert_eq!(Ending::of(&passed, None).why, "all 4 episodes passed");
+    assert_eq!(Ending::new(&passed, None).why, "all 4 episodes passed");
     let mut changed = passed.clone();
     changed.counts.failed = 1;
     assert_eq!(code(&changed), ExitCode::Driving);
@@ -300,7 +301,7 @@ fn exit_codes_are_technical_before_driving() {
     rated.at_least = Some(0.3);
     rated.counts.failed = 1;
     rated.counts.passed = 3;
-    let ending = Ending::of(&rated, None);
+    let ending = Ending::new(&rated, None);
     assert_eq!(ending.code, ExitCode::Passed);
     assert!(
         ending.why.contains("of 4 episodes: 0 not_judged, 0 off_model, 1 failed"),

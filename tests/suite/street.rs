@@ -69,7 +69,7 @@ impl Bench {
         let new = NewVersion {
             rig: Some(rig),
             trajectories: vec![log],
-            ..NewVersion::of("street", &gaussians, Provenance::of("test".into()))
+            ..NewVersion::from_gaussians("street", &gaussians, Provenance::new("test".into()))
         };
         let bench = Self { dir };
         bench.catalog().commit(new, &mut |_, _| {}).unwrap();

@@ -34,7 +34,7 @@ async fn a_driver_that_ignores_the_pedestrian_fails_for_contact() {
     assert_eq!(episode.faults[0].actor.as_deref(), Some("walker"));
     let shown = pictures(&failed, &bench.path("log"), &bench.catalog(), &cpu());
     assert_eq!(shown.len(), 1);
-    let html = page(&failed, &Ending::of(&failed, None), &shown, &bench.path("log"));
+    let html = page(&failed, &Ending::new(&failed, None), &shown, &bench.path("log"));
     assert!(html.contains("contact.pedestrian with walker") && html.contains("image/jpeg"));
 
     // The same scenario without its actors must pass, which checks the scenario itself.

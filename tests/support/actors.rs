@@ -5,7 +5,7 @@
 use std::sync::Arc;
 
 use glam::{DQuat, DVec3};
-use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, gaussians_of, scene_of};
+use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, gaussians, scene};
 use wildcity_render::{
     Backend, FIRST_ACTOR_INSTANCE, Frame, Readout, RollingShutter, TWIN_INSTANCE, Target, View,
 };
@@ -40,13 +40,14 @@ pub(crate) fn actor(n: usize, sh_degree: u8, seed: u64) -> Gaussians {
 }
 
 /// The chunk of an actor.
-pub(crate) fn chunk_of(gaussians: &Gaussians) -> Arc<Chunk> {
+pub(crate) fn chunk(gaussians: &Gaussians) -> Arc<Chunk> {
     let mut chunks = Scene::from_gaussians(gaussians).chunks;
     assert_eq!(chunks.len(), 1);
     chunks.remove(0)
 }
 
-/// A pose in the street of [`street`], where y is down: `ahead_m` along it, on its ground, turned by `yaw_rad`.
+/// A pose in the street of [`street`], where y is down: `ahead_m` along it, on its ground, turned
+/// by `yaw_rad`.
 pub(crate) fn on_street(ahead_m: f64, aside_m: f64, yaw_rad: f64) -> Pose {
     // The actor's x along the street (z), its y to the left (-x), its z up (-y).
     let axes = glam::DMat3::from_cols(DVec3::Z, DVec3::NEG_X, DVec3::NEG_Y);
@@ -54,7 +55,8 @@ pub(crate) fn on_street(ahead_m: f64, aside_m: f64, yaw_rad: f64) -> Pose {
     Pose { position_m: DVec3::new(aside_m, 1.6, ahead_m), rotation }
 }
 
-/// A pinhole, a fisheye, and both with a shutter that rolls while the camera drives at 30 m/s in a curve.
+/// A pinhole, a fisheye, and both with a shutter that rolls while the camera drives at 30 m/s in a
+/// curve.
 pub(crate) fn views() -> Vec<(&'static str, View)> {
     let pinhole =
         Camera::from_pinhole(160, 96, Pinhole { fx: 110.0, fy: 112.0, cx: 79.0, cy: 49.0 });
@@ -78,13 +80,14 @@ pub(crate) fn views() -> Vec<(&'static str, View)> {
     ]
 }
 
-/// The twin, three actors in it (two share a chunk, two overlap), and the same scene as one set of Gaussians.
+/// The twin, three actors in it (two share a chunk, two overlap), and the same scene as one set of
+/// Gaussians.
 pub(crate) fn street_with_actors() -> (Scene, Scene) {
     let mut twin = street(10_000, 1, 31);
     let car = actor(3_000, 3, 5);
     let other = actor(2_000, 0, 6);
     let scene = Scene::from_gaussians(&twin);
-    let (car_chunk, other_chunk) = (chunk_of(&car), chunk_of(&other));
+    let (car_chunk, other_chunk) = (chunk(&car), chunk(&other));
     let placed = [
         (&car, &car_chunk, on_street(26.0, 1.5, 0.3)),
         (&other, &other_chunk, on_street(27.0, 2.0, -2.0)),
@@ -143,10 +146,10 @@ fn check_merged_views(backend: &dyn Backend, views: Vec<(impl std::fmt::Display,
     }
 }
 
-/// Asserts that in an image with a rolling shutter, the motion of an actor has the same effect as the opposite motion
-/// of the camera.
+/// Asserts that in an image with a rolling shutter, the motion of an actor has the same effect as
+/// the opposite motion of the camera.
 pub(crate) fn check_motion(backend: &dyn Backend) {
-    let chunk = chunk_of(&actor(3_000, 3, 7));
+    let chunk = chunk(&actor(3_000, 3, 7));
     let profile = RenderProfile::default();
     for (name, rolling) in views().into_iter().filter(|(_, view)| view.rolling_shutter.is_some()) {
         let shutter = rolling.rolling_shutter.unwrap();
@@ -157,8 +160,8 @@ pub(crate) fn check_motion(backend: &dyn Backend) {
         };
         let truth = render_one(backend, &still, &profile, rolling);
 
-        // At the start of the exposure, the actor has the same pose relative to the camera at rest as to the moving
-        // camera.
+        // At the start of the exposure, the actor has the same pose relative to the camera at rest
+        // as to the moving camera.
         let world_from_first = shutter.world_from_camera_first;
         let world_from_actor_at_start =
             rolling.world_from_camera * world_from_first.inverse() * pose;
@@ -214,8 +217,8 @@ pub(crate) fn check_light(backend: &dyn Backend, reference: &dyn Backend) {
     }
 }
 
-/// Asserts that frames do not affect later frames: a frame with actors does not change a frame without them. Actors
-/// outside of all views change nothing either.
+/// Asserts that frames do not affect later frames: a frame with actors does not change a frame
+/// without them. Actors outside of all views change nothing either.
 pub(crate) fn check_ghosts(backend: &dyn Backend) {
     let (scene, _) = street_with_actors();
     let twin = Scene { placed: Vec::new(), ..scene.clone() };
@@ -247,8 +250,8 @@ pub(crate) fn instances(backend: &dyn Backend, scene: &Scene, view: View) -> (Ve
     (ids, opacity)
 }
 
-/// Asserts that instance ids are those of the reference backend, that they belong to the visible actors, and that
-/// requesting them changes no other image.
+/// Asserts that instance ids are those of the reference backend, that they belong to the visible
+/// actors, and that requesting them changes no other image.
 pub(crate) fn check_instances(backend: &dyn Backend, reference: &dyn Backend) {
     let (mut scene, _) = street_with_actors();
     scene.placed[2].actor = 40;
@@ -301,7 +304,8 @@ pub(crate) fn check_instance_vectors(backend: &dyn Backend) {
     }
 }
 
-/// The instance id, and the share of the light that is left, behind wide Gaussians: each whose, and its opacity.
+/// The instance id, and the share of the light that is left, behind wide Gaussians: each whose, and
+/// its opacity.
 fn through(backend: &dyn Backend, layers: &[[f64; 2]]) -> (u16, f64) {
     let mut twin = Vec::new();
     let mut placed = Vec::new();
@@ -312,11 +316,11 @@ fn through(backend: &dyn Backend, layers: &[[f64; 2]]) -> (u16, f64) {
             twin.push(GaussianSpec { mean_m: at_m, ..wide });
             continue;
         }
-        let chunk = chunk_of(&gaussians_of(&[GaussianSpec { mean_m: DVec3::ZERO, ..wide }]));
+        let chunk = chunk(&gaussians(&[GaussianSpec { mean_m: DVec3::ZERO, ..wide }]));
         let pose = Pose { position_m: at_m, ..Pose::IDENTITY };
         placed.push(PlacedChunk::at_rest(chunk, pose, id as u16 - FIRST_ACTOR_INSTANCE));
     }
-    let scene = Scene { placed, ..scene_of(&twin) };
+    let scene = Scene { placed, ..scene(&twin) };
     // The centre of the middle pixel is where all of them are.
     let (ids, opacity) = instances(backend, &scene, forward_view([33, 33], 60.0));
     let middle = 33 * 33 / 2;

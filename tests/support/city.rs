@@ -29,7 +29,7 @@ pub(crate) fn city(length_m: f64) -> City {
         sky: None,
         geo: None,
         twin_from_capture: None,
-        provenance: Provenance::of("test".into()),
+        provenance: Provenance::new("test".into()),
     };
     commit.replace(None, settings).unwrap();
     City { dir, drive }

@@ -6,8 +6,8 @@ use std::path::PathBuf;
 /// A file of the real data; `None`, with a note on standard error, where the data is absent.
 ///
 /// # Panics
-/// If the data is absent and `$WILDCITY_DATA_REQUIRED` is 1, as in CI on a machine that has the data; or if the
-/// data exists without this file, which is a mistake in the test.
+/// If the data is absent and `$WILDCITY_DATA_REQUIRED` is 1, as in CI on a machine that has the
+/// data; or if the data exists without this file, which is a mistake in the test.
 pub(crate) fn real(file: &str) -> Option<PathBuf> {
     let beside = crate::root::root().join("../shared/data");
     let root = std::env::var_os("WILDCITY_DATA").unwrap_or_else(|| beside.into());

@@ -8,7 +8,8 @@ use serde_json::{Value, json};
 
 use crate::support::{Agent, pose};
 
-/// An episode of ten steps, one `observe`, and a rotation that no f64 quaternion represents exactly.
+/// An episode of ten steps, one `observe`, and a rotation that no f64 quaternion represents
+/// exactly.
 pub(crate) async fn drive(agent: &mut Agent) {
     for step in 0..10 {
         agent.step(f64::from(step) * 0.7).await;

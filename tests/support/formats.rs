@@ -20,7 +20,7 @@ fn byte(value: f64) -> u8 {
 }
 
 fn rgba8(g: &Gaussians, i: usize) -> [u8; 4] {
-    let dc = |channel: usize| byte(0.5 + sh::C0 * f64::from(g.sh_of(i)[channel]));
+    let dc = |channel: usize| byte(0.5 + sh::C0 * f64::from(g.sh_at(i)[channel]));
     [dc(0), dc(1), dc(2), byte(opacity(g.logit_opacities[i]))]
 }
 
@@ -44,7 +44,7 @@ fn spz_attributes(g: &Gaussians, version: u32) -> Vec<Vec<u8>> {
     let fixed = |m: f64| ((m * 4096.0).round() as i32).to_le_bytes();
     let positions = g.means_m.as_flattened().iter().flat_map(|&m| fixed(m).into_iter().take(3));
     let wide = |c: f32| byte(f64::from(c) * 0.15 + 0.5);
-    let colours = all.clone().flat_map(|i| g.sh_of(i)[..3].to_vec()).map(wide);
+    let colours = all.clone().flat_map(|i| g.sh_at(i)[..3].to_vec()).map(wide);
     let scales = g.ln_scales.as_flattened().iter();
     let scales = scales.map(|ln| ((ln + 10.0) * 16.0).round().clamp(0.0, 255.0) as u8);
     let rotations = g.quats_wxyz.iter().flat_map(|&q| {
@@ -62,7 +62,7 @@ fn spz_attributes(g: &Gaussians, version: u32) -> Vec<Vec<u8>> {
         }
         word.to_le_bytes().to_vec()
     });
-    let higher = all.flat_map(|i| g.sh_of(i)[3..].to_vec());
+    let higher = all.flat_map(|i| g.sh_at(i)[3..].to_vec());
     let higher = higher.map(|c| (c * 128.0 + 128.0).round().clamp(0.0, 255.0) as u8);
     let opacities = g.logit_opacities.iter().map(|&logit| byte(opacity(logit)));
     vec![
@@ -113,8 +113,8 @@ fn half(value: f64) -> [u8; 2] {
     half::f16::from_f64(value).to_le_bytes()
 }
 
-/// A `.ksplat` file (mkkellogg) of a compression level: full buckets of 4 Gaussians and one partly filled bucket,
-/// with space for one more Gaussian than it has.
+/// A `.ksplat` file (mkkellogg) of a compression level: full buckets of 4 Gaussians and one partly
+/// filled bucket, with space for one more Gaussian than it has.
 pub(crate) fn ksplat(g: &Gaussians, level: u16) -> Vec<u8> {
     const BUCKET: usize = 4;
     let (full, rest) = (g.len() / BUCKET, g.len() % BUCKET);
@@ -172,7 +172,7 @@ pub(crate) fn ksplat(g: &Gaussians, level: u16) -> Vec<u8> {
         body.extend(rgba8(g, i));
         for degree in 1..=usize::from(g.sh_degree) {
             for (channel, k) in (0..3).flat_map(|c| (0..2 * degree + 1).map(move |k| (c, k))) {
-                let value = f64::from(g.sh_of(i)[3 * (degree * degree + k) + channel]);
+                let value = f64::from(g.sh_at(i)[3 * (degree * degree + k) + channel]);
                 match level {
                     0 => body.extend((value as f32).to_le_bytes()),
                     1 => body.extend(half(value)),
@@ -186,7 +186,8 @@ pub(crate) fn ksplat(g: &Gaussians, level: u16) -> Vec<u8> {
     [header, section, body].concat()
 }
 
-/// A lossless WebP image of four bytes per pixel, with this width and the smallest sufficient height.
+/// A lossless WebP image of four bytes per pixel, with this width and the smallest sufficient
+/// height.
 pub(crate) fn webp(pixels: &[[u8; 4]], width_px: usize) -> Vec<u8> {
     let height_px = pixels.len().div_ceil(width_px).max(1);
     let mut bytes = pixels.as_flattened().to_vec();
@@ -201,8 +202,9 @@ pub(crate) fn webp(pixels: &[[u8; 4]], width_px: usize) -> Vec<u8> {
 /// The files of a folder; the first one refers to the others.
 pub(crate) type Files = Vec<(String, Vec<u8>)>;
 
-/// PlayCanvas' SOG: the colours of higher degrees of every Gaussian are a separate entry, so that there are at most
-/// 65,536 Gaussians. Version 1 has ranges, version 2 codebooks of evenly spaced values.
+/// PlayCanvas' SOG: the colours of higher degrees of every Gaussian are a separate entry, so that
+/// there are at most 65,536 Gaussians. Version 1 has ranges, version 2 codebooks of evenly spaced
+/// values.
 pub(crate) fn sog(g: &Gaussians, version: u32) -> Files {
     let logarithm = |m: f64| m.signum() * m.abs().ln_1p();
     let range = |values: &mut dyn Iterator<Item = f64>| {
@@ -213,7 +215,7 @@ pub(crate) fn sog(g: &Gaussians, version: u32) -> Files {
     let means: [_; 3] =
         std::array::from_fn(|axis| range(&mut g.means_m.iter().map(|m| logarithm(m[axis]))));
     let scales = range(&mut g.ln_scales.as_flattened().iter().map(|&ln| ln.into()));
-    let colours = range(&mut (0..g.len()).flat_map(|i| g.sh_of(i)[..3].to_vec()).map(f64::from));
+    let colours = range(&mut (0..g.len()).flat_map(|i| g.sh_at(i)[..3].to_vec()).map(f64::from));
     let logits = range(&mut g.logit_opacities.iter().map(|&logit| logit.into()));
     let higher = range(&mut g.sh.iter().map(|&c| c.into()));
 
@@ -244,7 +246,7 @@ pub(crate) fn sog(g: &Gaussians, version: u32) -> Files {
         [x, y, z, 255]
     };
     let colour = |i: usize| {
-        let dc = |channel: usize| place(colours, g.sh_of(i)[channel].into());
+        let dc = |channel: usize| place(colours, g.sh_at(i)[channel].into());
         let logit = g.logit_opacities[i];
         let alpha = if version == 1 { place(logits, logit.into()) } else { byte(opacity(logit)) };
         [dc(0), dc(1), dc(2), alpha]
@@ -311,12 +313,10 @@ pub(crate) fn sog(g: &Gaussians, version: u32) -> Files {
 }
 
 /// A zip archive of files, packed or not.
-pub(crate) fn zip_of(files: &[(String, Vec<u8>)], is_packed: bool) -> Vec<u8> {
+pub(crate) fn zip(files: &[(String, Vec<u8>)], is_packed: bool) -> Vec<u8> {
     let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
-    let method = match is_packed {
-        true => zip::CompressionMethod::Deflated,
-        false => zip::CompressionMethod::Stored,
-    };
+    let method =
+        if is_packed { zip::CompressionMethod::Deflated } else { zip::CompressionMethod::Stored };
     let options = zip::write::SimpleFileOptions::default().compression_method(method);
     for (name, bytes) in files {
         zip.start_file(name.as_str(), options).unwrap();
@@ -339,7 +339,7 @@ pub(crate) fn nurec_plain(g: &Gaussians, with_cars: bool) -> Vec<u8> {
     let layer = |name: &str| {
         let higher = 3 * (sh::coefficients(g.sh_degree) - 1);
         let colour = |from: usize, to: usize| {
-            let values = (0..g.len()).flat_map(move |i| g.sh_of(i)[from..to].to_vec());
+            let values = (0..g.len()).flat_map(move |i| g.sh_at(i)[from..to].to_vec());
             halves(&mut values.map(f64::from))
         };
         // Scales as f32, the rest as f16.
@@ -390,7 +390,7 @@ pub(crate) fn nurec_plain(g: &Gaussians, with_cars: bool) -> Vec<u8> {
 pub(crate) fn usdz(payload: Vec<u8>) -> Vec<u8> {
     let layer = b"#usda 1.0\n".to_vec();
     let files = [("default.usda".to_owned(), layer), ("scene.nurec".to_owned(), gzip(&payload))];
-    zip_of(&files, false)
+    zip(&files, false)
 }
 
 /// Two blocks with two levels: 50 Gaussians, of which the finest level has 20 + 20; and an

@@ -31,14 +31,15 @@ fn gltf_attributes(g: &Gaussians) -> Vec<(String, usize, Vec<f32>)> {
     for degree in 0..=usize::from(g.sh_degree) {
         for n in 0..2 * degree + 1 {
             let first = 3 * (degree * degree + n);
-            let colour = (0..g.len()).flat_map(|i| g.sh_of(i)[first..first + 3].to_vec());
+            let colour = (0..g.len()).flat_map(|i| g.sh_at(i)[first..first + 3].to_vec());
             attributes.push((own(&format!("SH_DEGREE_{degree}_COEF_{n}")), 3, colour.collect()));
         }
     }
     attributes
 }
 
-/// A glTF document and its buffer. `node` is the JSON inside of the only node, `uri` the URI of the buffer.
+/// A glTF document and its buffer. `node` is the JSON inside of the only node, `uri` the URI of the
+/// buffer.
 pub(crate) fn gltf(g: &Gaussians, node: &str, uri: &str) -> (String, Vec<u8>) {
     let (mut buffer, mut views, mut accessors, mut names) = (Vec::new(), vec![], vec![], vec![]);
     for (index, (name, width, values)) in gltf_attributes(g).into_iter().enumerate() {

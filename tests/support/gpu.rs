@@ -1,5 +1,5 @@
-//! A GPU for tests. Lavapipe, a software device, counts as one, so that every machine can run the tests and
-//! none is skipped.
+//! A GPU for tests. Lavapipe, a software device, counts as one, so that every machine can run the
+//! tests and none is skipped.
 
 #![allow(dead_code, reason = "every test binary uses another part of it")]
 
@@ -50,8 +50,9 @@ fn watched(open: impl FnOnce() -> Result<Gpu, GpuError>) -> Watched {
 }
 
 /// A backend that fails its test if wgpu or its validation logs a warning or an error. With
-/// `WGPU_VALIDATION=1` that includes Vulkan's validation layer, if it is installed. The GPU is dropped
-/// before the log is checked, so that messages about objects that outlive their device count, too.
+/// `WGPU_VALIDATION=1` that includes Vulkan's validation layer, if it is installed. The GPU is
+/// dropped before the log is checked, so that messages about objects that outlive their device
+/// count, too.
 #[derive(Debug)]
 pub(crate) struct Watched(Option<Gpu>);
 

@@ -1,7 +1,7 @@
 //! A camera of every model, and checks of its images.
 
 use glam::{DQuat, DVec2, DVec3};
-use wildcity_render::compare::gaussians::{GaussianSpec, scene_of};
+use wildcity_render::compare::gaussians::{GaussianSpec, scene};
 use wildcity_render::compare::reprojection::centroid;
 use wildcity_render::layout::PixelFilter;
 use wildcity_render::reference;
@@ -16,7 +16,8 @@ use wildcity_scene::{Rays, RenderProfile, Scene};
 use crate::images::{psnr, render_one, view_along};
 use crate::streets::street;
 
-/// Cameras of 160 x 100 px: one of each model with moderate distortion, and two behind a windshield.
+/// Cameras of 160 x 100 px: one of each model with moderate distortion, and two behind a
+/// windshield.
 pub(crate) fn lenses() -> Vec<(&'static str, Camera)> {
     let ideal = Camera::from_pinhole(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
     let with = |lens| Camera { lens, ..ideal };
@@ -61,8 +62,8 @@ pub(crate) fn street_scene() -> (Scene, Pose) {
     (Scene::from_gaussians(&street(20_000, 1, 31)), pose)
 }
 
-/// A view with a rolling shutter: the camera moves by 0.9 m and rotates by 0.01 rad during the exposure, as
-/// at 30 m/s for 30 ms in a curve.
+/// A view with a rolling shutter: the camera moves by 0.9 m and rotates by 0.01 rad during the
+/// exposure, as at 30 m/s for 30 ms in a curve.
 pub(crate) fn rolling_view(camera: Camera, pose: Pose, direction: ShutterDirection) -> View {
     let world_from_camera_first = Pose {
         position_m: pose.position_m - pose.rotation * DVec3::new(0.05, 0.0, 0.9),
@@ -72,8 +73,9 @@ pub(crate) fn rolling_view(camera: Camera, pose: Pose, direction: ShutterDirecti
     View { rolling_shutter, ..View::new(camera, pose) }
 }
 
-/// A camera that looks to the side at 30 m/s. Its columns are exposed in 100 ms, in the direction against the
-/// motion of the image; an object 1.5 m away moves by more than the width of the image meanwhile.
+/// A camera that looks to the side at 30 m/s. Its columns are exposed in 100 ms, in the direction
+/// against the motion of the image; an object 1.5 m away moves by more than the width of the image
+/// meanwhile.
 pub(crate) fn sideways_rolling_view() -> View {
     let camera = Camera::from_pinhole(160, 100, Pinhole { fx: 90.0, fy: 92.0, cx: 79.0, cy: 51.0 });
     let first = Pose { position_m: DVec3::new(-3.0, 0.0, 0.0), ..Pose::IDENTITY };
@@ -82,15 +84,16 @@ pub(crate) fn sideways_rolling_view() -> View {
     View { rolling_shutter: Some(rolling_shutter), ..View::new(camera, Pose::IDENTITY) }
 }
 
-/// Asserts that small balls, `apart_m` apart in a plane 2 m ahead, each rendered separately, appear at the pixels that
-/// the camera model gives. Returns the number of visible balls.
+/// Asserts that small balls, `apart_m` apart in a plane 2 m ahead, each rendered separately, appear
+/// at the pixels that the camera model gives. Returns the number of visible balls.
 pub(crate) fn check_projections(
     backend: &dyn Backend,
     name: &str,
     camera: Camera,
     apart_m: f64,
 ) -> usize {
-    // A ball is so small that its image is as wide as the blur, and its centroid is that of its centre.
+    // A ball is so small that its image is as wide as the blur, and its centroid is that of its
+    // centre.
     let fine = RenderProfile { alpha_cut: 1e-5, ..RenderProfile::default() };
     let size_px = [camera.width_px, camera.height_px];
     let steps = |most_m: f64| (-(most_m / apart_m) as i32)..=(most_m / apart_m) as i32;
@@ -103,11 +106,12 @@ pub(crate) fn check_projections(
         }
         let ball = GaussianSpec { mean_m, sigma_m: DVec3::splat(0.003), ..GaussianSpec::default() };
         let view = View::new(camera, Pose::IDENTITY);
-        let image = render_one(backend, &scene_of(&[ball]), &fine, view);
+        let image = render_one(backend, &scene(&[ball]), &fine, view);
         let found_px = centroid(&image.opacity, size_px, at_px, f64::INFINITY);
         let off_px = found_px.unwrap_or(DVec2::INFINITY).distance(at_px);
-        // Samples at pixel centres move the centroid of a thin splat by up to 4π σ² exp(-2π² σ²) along each axis: by 0.13
-        // and 0.10 px in an image of 96 x 50 px, and by 0.17 px in one of 64 x 40.
+        // Samples at pixel centres move the centroid of a thin splat by up to 4π σ² exp(-2π² σ²)
+        // along each axis: by 0.13 and 0.10 px in an image of 96 x 50 px, and by 0.17 px in one of
+        // 64 x 40.
         let pi = std::f64::consts::PI;
         let moved_px =
             |variance_px2: f64| 4.0 * pi * variance_px2 * (-2.0 * pi * pi * variance_px2).exp();
@@ -125,8 +129,8 @@ pub(crate) fn scaled_and_cropped(camera: &Camera) -> [Camera; 3] {
     [*camera, camera.scaled(96, 50).unwrap(), camera.cropped([30, 20], [90, 70]).unwrap()]
 }
 
-/// Asserts that a backend's images through every lens have at least 45 dB against exact rays. The images are small, because
-/// the reference backend takes seconds for exact rays.
+/// Asserts that a backend's images through every lens have at least 45 dB against exact rays. The
+/// images are small, because the reference backend takes seconds for exact rays.
 pub(crate) fn check_against_exact_rays(backend: &dyn Backend) {
     let (street, pose) = street_scene();
     let exact = RenderProfile { rays: Rays::Exact, ..RenderProfile::default() };

@@ -50,7 +50,8 @@ pub(crate) fn six_channels() -> Vec<u8> {
     rgb(vec![node("Concat", &["image", "image"], &["repaired"], &[int("axis", 1)])], Vec::new())
 }
 
-/// A convolution of `side` x `side`, with a stride of `stride` down and up again. Its halo is known.
+/// A convolution of `side` x `side`, with a stride of `stride` down and up again. Its halo is
+/// known.
 pub(crate) fn convolution(side: usize, stride: usize) -> Vec<u8> {
     let pad = (side / 2) as u64;
     // Depthwise: each channel by itself, weights that are all different.
@@ -106,7 +107,8 @@ pub(crate) fn endless_if_bright() -> Vec<u8> {
     add_in_a_loop(nodes, vec![floats("limit", &[], &[0.9]), floats("many", &[], &[1e12])])
 }
 
-/// The image itself if the trust is above 0.4; under it a loop that never ends. Its inputs are `image` and `trust`.
+/// The image itself if the trust is above 0.4; under it a loop that never ends. Its inputs are
+/// `image` and `trust`.
 pub(crate) fn endless_if_doubtful() -> Vec<u8> {
     let nodes = vec![
         node("ReduceMax", &["trust"], &["max"], &[int("keepdims", 0)]),
@@ -192,8 +194,8 @@ pub(crate) fn sum_of_maps() -> Vec<u8> {
     .onnx()
 }
 
-/// The signature of Difix: `image` and `reference` in f16, -1 to 1. The reference works on all pixels, as
-/// attention does: its mean is added, weighted by a constant `strength`.
+/// The signature of Difix: `image` and `reference` in f16, -1 to 1. The reference works on all
+/// pixels, as attention does: its mean is added, weighted by a constant `strength`.
 pub(crate) fn difix() -> Vec<u8> {
     let half = |value: f32| half::f16::from_f32(value).to_le_bytes();
     Graph {

@@ -66,5 +66,5 @@ pub(crate) fn change(catalog: &Catalog, cell: [i32; 2], seed: u64) -> Commit {
 
 pub(crate) fn cells_alone() -> VersionChange {
     let provenance = street(&gaussians(0, 0, 1.0, 0)).provenance;
-    VersionChange::of(provenance)
+    VersionChange::new(provenance)
 }

@@ -76,7 +76,7 @@ pub(crate) fn write(dir: &Path, name: &str, gaussians: &Gaussians) -> PathBuf {
 }
 
 /// A push of some uploads, with every default.
-pub(crate) fn push_of(uploads: &[&str]) -> NewPush {
+pub(crate) fn new_push(uploads: &[&str]) -> NewPush {
     let file = |id: &&str| PushFile {
         upload: (*id).to_owned(),
         axes: Some("identity".to_owned()),
@@ -108,7 +108,7 @@ pub(crate) async fn push(
     let path = write(dir.path(), "scene.ply", gaussians);
     let client = client(server);
     let upload = client.upload(&path, &mut |_, _| {}).await.unwrap();
-    let mut asked = push_of(&[&upload.id]);
+    let mut asked = new_push(&[&upload.id]);
     change(&mut asked);
     let begun = client.push("test", &asked).await.unwrap();
     client.wait_for_push(begun, &mut |_| {}).await.unwrap()

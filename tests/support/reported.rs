@@ -32,7 +32,7 @@ pub(crate) fn commit_reaching(
         rig: Some(rig()),
         trajectories,
         storage: StorageOptions { record: RecordFormat::F32, levels: true },
-        ..NewVersion::of("street", &street, Provenance::of("test".to_owned()))
+        ..NewVersion::from_gaussians("street", &street, Provenance::new("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).unwrap();
     Cache::new(catalog).open("street", None).unwrap()

@@ -1,7 +1,8 @@
 //! An S3 server on loopback with configurable faults.
 //!
 //! The server is s3s-fs, within the process of the tests, so that neither Python nor a download is
-//! needed. It honours `If-None-Match`, but does not put atomically if absent: puts are serialised here.
+//! needed. It honours `If-None-Match`, but does not put atomically if absent: puts are serialised
+//! here.
 
 #![allow(dead_code, reason = "every test binary uses another part of it")]
 
@@ -148,7 +149,8 @@ pub(crate) fn quick() -> RetryPolicy {
     }
 }
 
-/// All files below a folder that are objects of the server, without the server's own metadata files.
+/// All files below a folder that are objects of the server, without the server's own metadata
+/// files.
 pub(crate) fn keys(dir: &Path) -> Vec<PathBuf> {
     let mut found = Vec::new();
     for entry in std::fs::read_dir(dir).into_iter().flatten() {

@@ -69,9 +69,10 @@ pub(crate) fn ply(gaussians: &Gaussians, columns: &[Column]) -> Vec<u8> {
     for index in 0..gaussians.len() {
         for column in columns {
             let value = value(gaussians, index, &column.name);
-            match column.is_double {
-                true => file.extend(value.to_le_bytes()),
-                false => file.extend((value as f32).to_le_bytes()),
+            if column.is_double {
+                file.extend(value.to_le_bytes())
+            } else {
+                file.extend((value as f32).to_le_bytes())
             }
         }
     }
@@ -89,7 +90,8 @@ pub(crate) fn ply_header(count: usize, columns: &[Column]) -> String {
     header + "end_header\n"
 }
 
-/// The value of a Gaussian for a column name of a PLY file; 0.25 for columns that are not of Gaussians.
+/// The value of a Gaussian for a column name of a PLY file; 0.25 for columns that are not of
+/// Gaussians.
 fn value(g: &Gaussians, index: usize, name: &str) -> f64 {
     let (stem, number) = match name.rsplit_once('_') {
         Some((stem, digits)) => (stem, digits.parse::<usize>().unwrap()),
@@ -103,10 +105,10 @@ fn value(g: &Gaussians, index: usize, name: &str) -> f64 {
         "rot" => g.quats_wxyz[index][number].into(),
         "scale" => g.ln_scales[index][number].into(),
         "opacity" => g.logit_opacities[index].into(),
-        "f_dc" => g.sh_of(index)[number].into(),
+        "f_dc" => g.sh_at(index)[number].into(),
         "f_rest" => {
             let (channel, k) = (number / (coefficients - 1), number % (coefficients - 1) + 1);
-            g.sh_of(index)[3 * k + channel].into()
+            g.sh_at(index)[3 * k + channel].into()
         }
         _ => 0.25,
     }
@@ -141,9 +143,10 @@ pub(crate) fn safetensors(tensors: &[Tensor], doubles: &[&str]) -> Vec<u8> {
     for (name, shape, values) in tensors {
         let (start, is_double) = (body.len(), doubles.contains(name));
         for &value in values {
-            match is_double {
-                true => body.extend(value.to_le_bytes()),
-                false => body.extend((value as f32).to_le_bytes()),
+            if is_double {
+                body.extend(value.to_le_bytes())
+            } else {
+                body.extend((value as f32).to_le_bytes())
             }
         }
         let (dtype, end) = (if is_double { "F64" } else { "F32" }, body.len());

@@ -124,15 +124,16 @@ pub(crate) fn twins() -> tempfile::TempDir {
 
 /// Commits a version of the twin `test`.
 pub(crate) fn commit_twin(dir: &Path) {
-    commit_twin_of(dir, 2.0);
+    commit_twin_with_opacity(dir, 2.0);
 }
 
-/// As [`commit_twin`], with Gaussians of this opacity before the sigmoid: another opacity makes another version.
-pub(crate) fn commit_twin_of(dir: &Path, logit_opacity: f32) {
+/// As [`commit_twin`], with Gaussians of this opacity before the sigmoid: another opacity makes
+/// another version.
+pub(crate) fn commit_twin_with_opacity(dir: &Path, logit_opacity: f32) {
     commit_twin_to(&Catalog::open(dir).expect("a directory"), logit_opacity);
 }
 
-/// As [`commit_twin_of`], to a catalog.
+/// As [`commit_twin_with_opacity`], to a catalog.
 pub(crate) fn commit_twin_to(catalog: &Catalog, logit_opacity: f32) {
     let gaussians = Gaussians {
         sh_degree: 0,
@@ -153,7 +154,7 @@ pub(crate) fn commit_twin_to(catalog: &Catalog, logit_opacity: f32) {
     let new = NewVersion {
         rig: Some(rig()),
         trajectories: vec![log],
-        ..NewVersion::of("test", &gaussians, Provenance::of("test".to_owned()))
+        ..NewVersion::from_gaussians("test", &gaussians, Provenance::new("test".to_owned()))
     };
     catalog.commit(new, &mut |_, _| {}).expect("a twin");
 }
@@ -254,7 +255,8 @@ impl TestServer {
         paths
     }
 
-    /// Waits until the first recorded episode has an end of this outcome: a moment after its session has ended.
+    /// Waits until the first recorded episode has an end of this outcome: a moment after its
+    /// session has ended.
     pub(crate) async fn record_ends_with(&self, outcome: &str) {
         let record = self.recorded()[0].clone();
         let text = || std::fs::read_to_string(&record).expect("a record");

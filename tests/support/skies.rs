@@ -15,8 +15,8 @@ use wildcity_twin::ingest;
 use crate::images::Image;
 use crate::scene_files::Random;
 
-/// Takes the world's axes to those of [`sky`]: a rotation with a reflection, so that an error in the axes
-/// shows.
+/// Takes the world's axes to those of [`sky`]: a rotation with a reflection, so that an error in
+/// the axes shows.
 pub(crate) const SKY_FROM_WORLD: DMat3 = DMat3::from_cols(
     DVec3::new(0.0, 0.6, 0.8),
     DVec3::new(1.0, 0.0, 0.0),
@@ -62,7 +62,8 @@ pub(crate) fn empty(sky: Arc<Sky>) -> Scene {
     Scene { sky: Some(sky), ..Scene::default() }
 }
 
-/// An exposure that mixes channels, and an overlay like a car's hood over the lower half, opaque at the bottom.
+/// An exposure that mixes channels, and an overlay like a car's hood over the lower half, opaque at
+/// the bottom.
 pub(crate) fn appearance(view: View) -> Appearance {
     let (width, height) = (view.camera.width_px, view.camera.height_px);
     let pixel = |k: u32| {

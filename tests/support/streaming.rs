@@ -1,4 +1,5 @@
-//! A sparse demo street of 600 m, of which a frame draws 120 m, so that a drive needs different parts over time.
+//! A sparse demo street of 600 m, of which a frame draws 120 m, so that a drive needs different
+//! parts over time.
 
 #![allow(dead_code, reason = "every test binary uses another part of it")]
 
@@ -20,7 +21,8 @@ use crate::images::{cpu, render, view_along};
 /// How long a test waits for anything before it fails.
 pub(crate) const TEST_TIMEOUT: Duration = Duration::from_secs(20);
 
-/// The profile: a frame draws sections within 120 m, so that a drive needs different parts over time.
+/// The profile: a frame draws sections within 120 m, so that a drive needs different parts over
+/// time.
 pub(crate) const PROFILE: RenderProfile =
     RenderProfile { reach_m: Some(120.0), ..RenderProfile::DEFAULT };
 
@@ -54,8 +56,9 @@ impl Demo {
 }
 
 pub(crate) fn commit(dir: &Path, name: &str, gaussians: &Gaussians) -> Version {
-    let provenance = Provenance::of("test".into());
-    let new = NewVersion { profile: PROFILE, ..NewVersion::of(name, gaussians, provenance) };
+    let provenance = Provenance::new("test".into());
+    let new =
+        NewVersion { profile: PROFILE, ..NewVersion::from_gaussians(name, gaussians, provenance) };
     Catalog::open(dir).unwrap().commit(new, &mut |_, _| {}).unwrap()
 }
 
@@ -89,7 +92,7 @@ pub(crate) fn bytes(resident: &Resident, needed: &[SectionRef]) -> u64 {
     let manifest = &resident.version.manifest;
     let of = |n: &SectionRef| {
         let count = manifest.chunks[n.chunk].sections[n.section].count;
-        Chunk::bytes_of(manifest.sh_degree, count.into())
+        Chunk::needed_bytes(manifest.sh_degree, count.into())
     };
     needed.iter().map(of).sum()
 }

@@ -1,4 +1,5 @@
-//! Processor time of a thread. Other programs on the machine do not change it, as they change the time of a clock.
+//! Processor time of a thread. Other programs on the machine do not change it, as they change the
+//! time of a clock.
 
 use std::time::Duration;
 

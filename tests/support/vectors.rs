@@ -1,4 +1,5 @@
-//! The vectors of contacts and scores in the real data: inputs, and results of the published definitions.
+//! The vectors of contacts and scores in the real data: inputs, and results of the published
+//! definitions.
 
 #![allow(dead_code, reason = "every test binary uses another part of it")]
 

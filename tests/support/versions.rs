@@ -11,8 +11,8 @@ use wildcity_twin::store::{Catalog, NewVersion, StorageOptions, StoreError, Vers
 /// A version of twin "street" with nothing but Gaussians.
 pub(crate) fn street(gaussians: &Gaussians) -> NewVersion<'_> {
     let storage = StorageOptions { record: RecordFormat::F32, levels: false };
-    let provenance = Provenance::of("test".into());
-    NewVersion { storage, ..NewVersion::of("street", gaussians, provenance) }
+    let provenance = Provenance::new("test".into());
+    NewVersion { storage, ..NewVersion::from_gaussians("street", gaussians, provenance) }
 }
 
 /// As [`street`], of another name.

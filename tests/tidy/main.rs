@@ -1,7 +1,8 @@
 //! Rules for the source that Cargo cannot check: which crate may be used where within a package, no import cycles,
-//! plain prose, links that lead to files, licences.
+//! no dialect, plain prose, links that lead to files, licences.
 
 mod cycles;
+mod dialect;
 mod licences;
 mod links;
 mod packages;

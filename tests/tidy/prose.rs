@@ -1,13 +1,10 @@
-//! Readable text: words for persons only where a person is meant, one binding per line.
+//! Readable text: words for persons only where a person is meant.
 
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
-use syn::visit::{self, Visit};
-
 use crate::root;
-use crate::source::rust_files;
 
 /// Words that mean persons. In this project something else is meant nearly always; then "what", "which", "that" or the
 /// name of the thing is right.
@@ -79,49 +76,4 @@ fn texts() -> BTreeMap<String, String> {
 fn is_text(path: &Path) -> bool {
     let extension = path.extension().and_then(|extension| extension.to_str());
     extension.is_some_and(|extension| EXTENSIONS.contains(&extension))
-}
-
-/// `let (a, b) = (x, y);` hides two bindings in a line.
-#[derive(Default)]
-struct TupleLets(usize);
-
-impl<'ast> Visit<'ast> for TupleLets {
-    fn visit_local(&mut self, local: &'ast syn::Local) {
-        let is_tuple = matches!(&local.pat, syn::Pat::Tuple(_));
-        let from_tuple =
-            local.init.as_ref().is_some_and(|init| matches!(&*init.expr, syn::Expr::Tuple(_)));
-        self.0 += usize::from(is_tuple && from_tuple);
-        visit::visit_local(self, local);
-    }
-}
-
-#[test]
-fn one_binding_stands_on_a_line() {
-    let mut found = Vec::new();
-    let mut lines = 0;
-    for folder in ["src", "protocol/src", "clients/rust"] {
-        for (file, text) in rust_files(&root().join(folder)) {
-            lines += text.lines().count();
-            let lets = tuple_lets(&text);
-            if lets > 0 {
-                found.push(format!("{folder}/{file}: {lets}"));
-            }
-        }
-    }
-    let count = found.len();
-    assert!(count * 1000 < lines, "{count} in {lines} lines:\n{}", found.join("\n"));
-}
-
-#[test]
-fn a_planted_tuple_is_found() {
-    assert_eq!(
-        tuple_lets("fn f() { let (a, b) = (1, 2); let (c, d) = pair(); let e = (1, 2); }"),
-        1
-    );
-}
-
-fn tuple_lets(text: &str) -> usize {
-    let mut lets = TupleLets::default();
-    lets.visit_file(&syn::parse_file(text).unwrap());
-    lets.0
 }

@@ -1,5 +1,5 @@
-//! Drives a car from observation to observation: accelerates to 8 m/s along the lane's start direction with
-//! a trajectory, then brakes to a standstill with actions.
+//! Drives a car from observation to observation: accelerates to 8 m/s along the lane's start
+//! direction with a trajectory, then brakes to a standstill with actions.
 //!
 //! `cargo run --release -p wildcity-client --example follow -- ws://127.0.0.1:8080/v1/session TWIN`
 
@@ -42,8 +42,8 @@ async fn main() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Poses for the next second, in the rig's current frame: straight ahead, at a speed that approaches
-/// [`CRUISE_M_S`] by 1 m/s².
+/// Poses for the next second, in the rig's current frame: straight ahead, at a speed that
+/// approaches [`CRUISE_M_S`] by 1 m/s².
 fn straight_ahead(observation: &Observation, dt_us: i64) -> Vec<TimedPose> {
     let step_s = 1e-6 * dt_us as f64;
     let mut speed_m_s = speed_m_s(observation);

@@ -1,7 +1,8 @@
-//! Measures steps per second of several sessions: on one connection with `step_many`, and on one connection per
-//! session.
+//! Measures steps per second of several sessions: on one connection with `step_many`, and on one
+//! connection per session.
 //!
-//! Each session has one camera of 96 x 60 px with raw images. The two ways take turns, and must give the same images.
+//! Each session has one camera of 96 x 60 px with raw images. The two ways take turns, and must
+//! give the same images.
 //!
 //! `cargo run --release -p wildcity-client --example many -- ws://127.0.0.1:8080/v1/session TWIN [SESSIONS] [STEPS]`
 
@@ -66,7 +67,7 @@ async fn one_connection(
     for step in 0..steps {
         let each = names.iter().zip(&starts).enumerate();
         let moves =
-            each.map(|(k, (name, start))| Movement::Pose(ahead(*start, step, k)).of_session(name));
+            each.map(|(k, (name, start))| Movement::Pose(ahead(*start, step, k)).for_session(name));
         last.clear();
         for stepped in client.step_many(moves.collect()).await? {
             let refused = |refused| anyhow::anyhow!("{}: {refused:?}", stepped.session);

@@ -1,9 +1,11 @@
-//! Pushes a trained scene to a server as the next version of a twin, and waits until agents can open it.
+//! Pushes a trained scene to a server as the next version of a twin, and waits until agents can
+//! open it.
 //!
 //! `cargo run --release -p wildcity-client --example push -- http://127.0.0.1:8080 TWIN SCENE`
 //!
 //! SCENE is a file of a format that `wildcity import` reads, for example a checkpoint that
-//! `python -m wildcity.convert` wrote as safetensors. The token is read from `WILDCITY_TOKEN`, if it is set.
+//! `python -m wildcity.convert` wrote as safetensors. The token is read from `WILDCITY_TOKEN`, if
+//! it is set.
 
 #![allow(clippy::print_stdout, reason = "an example tells its reader what it does")]
 

@@ -8,8 +8,9 @@ use crate::http::{HttpClient, HttpError};
 use crate::limits;
 
 impl HttpClient {
-    /// Asks the server to make an asset of an actor from uploaded files, and returns when it is stored. The same files
-    /// with the same options are the same asset, so that a request without an answer can be sent again.
+    /// Asks the server to make an asset of an actor from uploaded files, and returns when it is
+    /// stored. The same files with the same options are the same asset, so that a request without
+    /// an answer can be sent again.
     ///
     /// # Errors
     /// The server refuses, or does not answer within [`limits::ACTOR_TIMEOUT`].

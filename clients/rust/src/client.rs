@@ -23,9 +23,10 @@ use crate::options::ConnectOptions;
 /// Most clients have one session. With several, each call is for the one that was opened last or
 /// [selected](Client::select), and [`Client::step_many`] steps several at once.
 ///
-/// A request keeps its number if it was refused or its answer did not arrive. Make the same call again
-/// (after [`Client::reconnect`] if the connection was lost): the server carries it out only once. Dropping
-/// the future of a call before it completes closes the connection, because its answer could still come.
+/// A request keeps its number if it was refused or its answer did not arrive. Make the same call
+/// again (after [`Client::reconnect`] if the connection was lost): the server carries it out only
+/// once. Dropping the future of a call before it completes closes the connection, because its
+/// answer could still come.
 ///
 /// ```no_run
 /// use wildcity_client::{Client, ClientError, Open, Pose};
@@ -78,7 +79,7 @@ pub enum Movement {
 
 impl Movement {
     /// The step of a session, for [`Client::step_many`].
-    pub fn of_session(self, session: &str) -> SessionStep {
+    pub fn for_session(self, session: &str) -> SessionStep {
         let (pose, trajectory, action) = self.fields();
         SessionStep {
             session: session.to_owned(),
@@ -103,8 +104,8 @@ impl Movement {
 /// Options of a step in addition to its movement.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StepOptions {
-    /// For how long the movement, a trajectory or an action, is followed, in microseconds: a whole number of
-    /// steps. One step if `None`.
+    /// For how long the movement, a trajectory or an action, is followed, in microseconds: a whole
+    /// number of steps. One step if `None`.
     pub until_us: Option<i64>,
     /// Notes of the agent about the step, for the record: any JSON of at most 65,536 bytes.
     pub notes: Option<serde_json::Value>,
@@ -155,7 +156,8 @@ pub struct Resumed {
     pub also: Vec<ResumedSession>,
 }
 
-/// The server's answer to `switch_version`: the version that the session shows from the next step on.
+/// The server's answer to `switch_version`: the version that the session shows from the next step
+/// on.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Switched {
     /// Number of the version.
@@ -167,12 +169,12 @@ pub struct Switched {
 }
 
 impl Client {
-    /// Connects to `ws://HOST:PORT/v1/session` or `wss://HOST/v1/session` and sends `hello`. `name` appears
-    /// in the server's log.
+    /// Connects to `ws://HOST:PORT/v1/session` or `wss://HOST/v1/session` and sends `hello`. `name`
+    /// appears in the server's log.
     ///
     /// # Errors
-    /// [`ClientError::Connect`] if the address is invalid or the server does not answer within 10 s. A server
-    /// that speaks another protocol gives [`ClientError::UnexpectedAnswer`].
+    /// [`ClientError::Connect`] if the address is invalid or the server does not answer within 10
+    /// s. A server that speaks another protocol gives [`ClientError::UnexpectedAnswer`].
     pub async fn connect(url: &str, name: &str) -> Result<Self, ClientError> {
         Self::connect_with(url, name, &ConnectOptions::default()).await
     }
@@ -180,9 +182,10 @@ impl Client {
     /// As [`Client::connect`], with a token, additional root certificates, or shared memory.
     ///
     /// # Errors
-    /// As [`Client::connect`]. With shared memory, [`Code::SharedMemoryUnavailable`] if the server refuses it, and
-    /// [`ClientError::SharedMemory`] if its memory cannot be opened. An unknown token gives [`ClientError::Connect`] with HTTP status 401 in its
-    /// reason, a token without the role `drive` 403.
+    /// As [`Client::connect`]. With shared memory, [`Code::SharedMemoryUnavailable`] if the server
+    /// refuses it, and [`ClientError::SharedMemory`] if its memory cannot be opened. An unknown
+    /// token gives [`ClientError::Connect`] with HTTP status 401 in its reason, a token without the
+    /// role `drive` 403.
     pub async fn connect_with(
         url: &str,
         name: &str,
@@ -206,13 +209,13 @@ impl Client {
         })
     }
 
-    /// Continues a session that another client opened, for example one in a process that ended. Call it
-    /// directly after connecting. `last_seq` is the number of the last answer that the other client received
-    /// (`metadata().seq` of an observation).
+    /// Continues a session that another client opened, for example one in a process that ended.
+    /// Call it directly after connecting. `last_seq` is the number of the last answer that the
+    /// other client received (`metadata().seq` of an observation).
     ///
     /// # Errors
-    /// [`Code::UnknownSession`] if the session ended or its time to resume is over. After any other error the
-    /// connection is lost.
+    /// [`Code::UnknownSession`] if the session ended or its time to resume is over. After any other
+    /// error the connection is lost.
     pub async fn resume(&mut self, session: &str, last_seq: u64) -> Result<Resumed, ClientError> {
         self.resume_with(session, &[], last_seq).await
     }
@@ -235,12 +238,12 @@ impl Client {
 
     /// Connects again after the connection was lost, and continues the sessions that were open.
     ///
-    /// Then repeat the call that failed. It keeps its number, so the server carries it out only once: if it
-    /// already did, it sends the same answer again, byte for byte.
+    /// Then repeat the call that failed. It keeps its number, so the server carries it out only
+    /// once: if it already did, it sends the same answer again, byte for byte.
     ///
     /// # Errors
-    /// As [`Client::connect`] and [`Client::resume`]. After [`Code::UnknownSession`] another session can be
-    /// opened.
+    /// As [`Client::connect`] and [`Client::resume`]. After [`Code::UnknownSession`] another
+    /// session can be opened.
     pub async fn reconnect(&mut self) -> Result<Option<Resumed>, ClientError> {
         self.connection = None;
         let (connection, welcome) = begin(&self.endpoint, &self.name).await?;
@@ -258,7 +261,8 @@ impl Client {
         &self.sessions
     }
 
-    /// Chooses the session that calls are for. Nothing is sent: a name that is not open is refused by the server.
+    /// Chooses the session that calls are for. Nothing is sent: a name that is not open is refused
+    /// by the server.
     pub fn select(&mut self, session: &str) {
         self.selected = Some(session.to_owned());
     }
@@ -279,8 +283,8 @@ impl Client {
         self.answer_timeout = timeout;
     }
 
-    /// Opens a session on a twin. `open.seq` is ignored: the client sets it. While another session is open, the new one
-    /// needs a name.
+    /// Opens a session on a twin. `open.seq` is ignored: the client sets it. While another session
+    /// is open, the new one needs a name.
     ///
     /// # Errors
     /// [`ClientError::Refused`] if the server refuses; see [`ClientError`] for lost connections.
@@ -295,9 +299,9 @@ impl Client {
         }
     }
 
-    /// Opens a session in a state of another episode, with that episode's settings: a snapshot of a session that
-    /// still exists, or a step of an episode that the server has recorded. The new session has that state as its
-    /// snapshot `start`.
+    /// Opens a session in a state of another episode, with that episode's settings: a snapshot of a
+    /// session that still exists, or a step of an episode that the server has recorded. The new
+    /// session has that state as its snapshot `start`.
     ///
     /// # Errors
     /// [`Code::UnknownState`] if there is no such state; otherwise as [`Client::open`].
@@ -339,8 +343,8 @@ impl Client {
         self.exchange_for_observation(&request).await
     }
 
-    /// Moves the ego to `pose` (`world_from_rig`), advances the simulated time by one step, and returns the
-    /// observation there. Only with the dynamics `teleport`, which is the default.
+    /// Moves the ego to `pose` (`world_from_rig`), advances the simulated time by one step, and
+    /// returns the observation there. Only with the dynamics `teleport`, which is the default.
     ///
     /// # Errors
     /// [`ClientError::Refused`] if the server refuses; see [`ClientError`] for lost connections.
@@ -356,12 +360,12 @@ impl Client {
         self.drive(Movement::Pose(pose), true).await
     }
 
-    /// Moves the ego by a pose, a trajectory or an action, advances the simulated time by one step, and
-    /// returns the observation there. `terminate` ends the episode with this step.
+    /// Moves the ego by a pose, a trajectory or an action, advances the simulated time by one step,
+    /// and returns the observation there. `terminate` ends the episode with this step.
     ///
     /// # Errors
-    /// [`Code::SessionState`] if the session's dynamics do not accept this kind of movement; otherwise as
-    /// [`Client::step`].
+    /// [`Code::SessionState`] if the session's dynamics do not accept this kind of movement;
+    /// otherwise as [`Client::step`].
     pub async fn drive(
         &mut self,
         movement: Movement,
@@ -370,8 +374,8 @@ impl Client {
         self.follow(movement, StepOptions { terminate, ..StepOptions::default() }).await
     }
 
-    /// As [`Client::drive`], with notes for the record, or for several steps: the observation is the one at the end
-    /// of the plan.
+    /// As [`Client::drive`], with notes for the record, or for several steps: the observation is
+    /// the one at the end of the plan.
     ///
     /// # Errors
     /// As [`Client::drive`].
@@ -389,12 +393,12 @@ impl Client {
         self.exchange_for_observation(&request).await
     }
 
-    /// Steps several sessions of this connection, 1 to 64, in one message. A session whose step is refused does not
-    /// stop the others. The results are in the order of `steps`.
+    /// Steps several sessions of this connection, 1 to 64, in one message. A session whose step is
+    /// refused does not stop the others. The results are in the order of `steps`.
     ///
     /// # Errors
-    /// [`ClientError::Refused`] if the list itself is refused; then no session was stepped. Otherwise as
-    /// [`Client::step`].
+    /// [`ClientError::Refused`] if the list itself is refused; then no session was stepped.
+    /// Otherwise as [`Client::step`].
     pub async fn step_many(
         &mut self,
         steps: Vec<SessionStep>,
@@ -416,8 +420,9 @@ impl Client {
         self.exchange_for_observation(&request).await
     }
 
-    /// Asks the server to load what will be visible from `poses` (`world_from_rig`, in driving order) and
-    /// from the straight lines between them. Returns at once, without waiting until it is loaded.
+    /// Asks the server to load what will be visible from `poses` (`world_from_rig`, in driving
+    /// order) and from the straight lines between them. Returns at once, without waiting until it
+    /// is loaded.
     ///
     /// # Errors
     /// As [`Client::step`].
@@ -454,8 +459,8 @@ impl Client {
         self.exchange_for_observation(&request).await
     }
 
-    /// Shows another version of the twin from the next step on; the latest one if `version` is `None`. The
-    /// episode continues.
+    /// Shows another version of the twin from the next step on; the latest one if `version` is
+    /// `None`. The episode continues.
     ///
     /// # Errors
     /// [`Code::UnknownVersion`] if the twin has no such version; otherwise as [`Client::step`].
@@ -470,8 +475,8 @@ impl Client {
         }
     }
 
-    /// Ends the session. Another one can be opened on the same connection. If others are open, the last of them is
-    /// selected.
+    /// Ends the session. Another one can be opened on the same connection. If others are open, the
+    /// last of them is selected.
     ///
     /// # Errors
     /// As [`Client::step`].
@@ -497,8 +502,8 @@ impl Client {
         }
     }
 
-    /// Sends a request of the session and waits for its answer. The number is used up only if that answer
-    /// is not an error.
+    /// Sends a request of the session and waits for its answer. The number is used up only if that
+    /// answer is not an error.
     async fn exchange(&mut self, request: &Request) -> Result<Incoming, ClientError> {
         let mut connection = self.take_connection()?;
         let result = connection.exchange(request, self.next_seq, self.answer_timeout).await;
@@ -513,7 +518,8 @@ impl Client {
         result
     }
 
-    /// Resumes sessions on a new connection. Must be its first request after `hello` and `share_memory`.
+    /// Resumes sessions on a new connection. Must be its first request after `hello` and
+    /// `share_memory`.
     async fn resume_sessions(&mut self, last_seq: u64) -> Result<Resumed, ClientError> {
         let mut connection = self.take_connection()?;
         let mut names = self.sessions.iter().cloned();
@@ -525,8 +531,8 @@ impl Client {
                 Ok(incoming) => incoming,
                 Err(error) => {
                     if matches!(error, ClientError::Refused { code: Code::UnknownSession, .. }) {
-                        // A session is over. A new one can be opened on this connection, and its request
-                        // takes the number of this refused one.
+                        // A session is over. A new one can be opened on this connection, and its
+                        // request takes the number of this refused one.
                         self.sessions.clear();
                         self.selected = None;
                         self.next_seq = self.first_seq;
@@ -538,8 +544,8 @@ impl Client {
                 }
             };
         match incoming {
-            // One request is under way at a time, so the session has carried out either the request with
-            // number `last_seq` or the one after it.
+            // One request is under way at a time, so the session has carried out either the request
+            // with number `last_seq` or the one after it.
             Incoming::Answer(Answer::Resumed {
                 last_seq: session_seq,
                 step,
@@ -555,7 +561,8 @@ impl Client {
         }
     }
 
-    /// The name of the selected session for a request, which needs a name only if there are several sessions.
+    /// The name of the selected session for a request, which needs a name only if there are several
+    /// sessions.
     fn named(&self) -> Option<String> {
         self.selected.clone().filter(|_| self.sessions.len() > 1)
     }
@@ -577,8 +584,8 @@ impl Client {
         self.selected = self.sessions.last().cloned();
     }
 
-    /// Takes the connection for the time of a call. A dropped future does not give it back, which closes the
-    /// connection.
+    /// Takes the connection for the time of a call. A dropped future does not give it back, which
+    /// closes the connection.
     fn take_connection(&mut self) -> Result<Connection, ClientError> {
         self.connection.take().ok_or_else(|| {
             let reason = mem::take(&mut self.disconnect_reason);

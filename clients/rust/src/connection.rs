@@ -83,7 +83,8 @@ impl Endpoint {
         let limits = WebSocketConfig::default()
             .max_message_size(Some(OBSERVATION_BYTES))
             .max_frame_size(Some(OBSERVATION_BYTES));
-        // Sets TCP_NODELAY: in lock step a request must not wait for the acknowledgement of the previous request.
+        // Sets TCP_NODELAY: in lock step a request must not wait for the acknowledgement of the
+        // previous request.
         let no_delay = true;
         let connecting = connect_async_tls_with_config(
             self.upgrade.clone(),
@@ -110,7 +111,8 @@ impl Connection {
     /// Sends a request and returns its answer, which must have the same number.
     ///
     /// # Errors
-    /// [`ClientError::Refused`] if the answer is an error; otherwise the connection cannot be used again.
+    /// [`ClientError::Refused`] if the answer is an error; otherwise the connection cannot be used
+    /// again.
     pub(crate) async fn exchange(
         &mut self,
         request: &Request,
@@ -120,8 +122,8 @@ impl Connection {
         let text = serde_json::to_string(request).map_err(ClientError::Request)?;
         let send_and_receive = async {
             let sent = self.socket.send(Message::text(text)).await;
-            // A server sends the reason before it closes the connection. This message can be read even after a failed
-            // send, and explains more than the failure.
+            // A server sends the reason before it closes the connection. This message can be read
+            // even after a failed send, and explains more than the failure.
             let answer = self.receive().await;
             match sent {
                 Err(error) if matches!(answer, Err(ClientError::Disconnected(_))) => {

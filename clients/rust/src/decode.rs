@@ -18,7 +18,8 @@ pub(crate) enum DecodeError {
 
 /// Pixels of a JPEG file, u8 `[height, width, 3]`. `size` is the expected width and height.
 ///
-/// The size is checked before pixels are allocated, so that a small file cannot ask for a large buffer.
+/// The size is checked before pixels are allocated, so that a small file cannot ask for a large
+/// buffer.
 pub(crate) fn jpeg(file: &[u8], size: [usize; 2]) -> Result<Vec<u8>, DecodeError> {
     let options = DecoderOptions::default().jpeg_set_out_colorspace(ColorSpace::RGB);
     let mut decoder = JpegDecoder::new_with_options(ZCursor::new(file), options);

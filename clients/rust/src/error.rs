@@ -76,8 +76,8 @@ pub enum FrameError {
         /// Largest header length that the client accepts.
         limit: u64,
     },
-    /// The frame is not in safetensors layout: it is truncated, its header is not JSON, or tensors overlap
-    /// or reach beyond the end.
+    /// The frame is not in safetensors layout: it is truncated, its header is not JSON, or tensors
+    /// overlap or reach beyond the end.
     #[error("not in safetensors layout: {0}")]
     Layout(SafeTensorError),
     /// `__metadata__` has no `observation`.

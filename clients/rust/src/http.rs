@@ -1,7 +1,7 @@
 //! The HTTP client: pushes and versions. Uploads are in `upload`.
 //!
-//! Each request opens a new connection, because requests are rare, and a connection that is kept open may be cut by a
-//! broken network.
+//! Each request opens a new connection, because requests are rare, and a connection that is kept
+//! open may be cut by a broken network.
 
 use std::error::Error;
 use std::fmt::{self, Display};
@@ -80,7 +80,8 @@ pub enum HttpError {
         message: String,
         /// The cells at fault, as (x, y), if the error concerns cells.
         cells: Vec<[i32; 2]>,
-        /// The offset at which an upload must continue, in bytes, if the request had a different one.
+        /// The offset at which an upload must continue, in bytes, if the request had a different
+        /// one.
         offset: Option<u64>,
     },
     /// The answer does not conform to the protocol.
@@ -134,8 +135,8 @@ impl HttpClient {
         Ok(Self { server, http })
     }
 
-    /// Asks the server to make a new version of a twin from uploaded files, and returns as soon as the push
-    /// is queued. [`HttpClient::wait_for_push`] waits for its end.
+    /// Asks the server to make a new version of a twin from uploaded files, and returns as soon as
+    /// the push is queued. [`HttpClient::wait_for_push`] waits for its end.
     ///
     /// # Errors
     /// The server refuses, or does not answer.
@@ -152,8 +153,8 @@ impl HttpClient {
         self.request_json(Method::GET, &path, None::<&()>).await
     }
 
-    /// Waits until a push is ready, refused or failed, and returns its last state. `on_state` is called with
-    /// every state that the server reports, 10 times a second.
+    /// Waits until a push is ready, refused or failed, and returns its last state. `on_state` is
+    /// called with every state that the server reports, 10 times a second.
     ///
     /// # Errors
     /// The server refuses, or does not answer [`limits::HTTP_ATTEMPTS`] times in a row.
@@ -183,8 +184,8 @@ impl HttpClient {
         }
     }
 
-    /// Makes an old version of a twin the latest again, as a new version, and returns the number of the new
-    /// version.
+    /// Makes an old version of a twin the latest again, as a new version, and returns the number of
+    /// the new version.
     ///
     /// # Errors
     /// The server refuses, or does not answer.

@@ -1,9 +1,9 @@
 //! Client of the `wildcity.v1` protocol, for agents and training pipelines.
 //!
-//! [`Client`] drives: it opens a session over one WebSocket and works in lock step, so every call sends one
-//! request and waits for its one answer. [`HttpClient`] uploads scenes and publishes them as new versions of
-//! a twin. Both connect with and without TLS (`wss://`, `https://`), both need a tokio runtime, and neither
-//! uses a proxy.
+//! [`Client`] drives: it opens a session over one WebSocket and works in lock step, so every call
+//! sends one request and waits for its one answer. [`HttpClient`] uploads scenes and publishes them
+//! as new versions of a twin. Both connect with and without TLS (`wss://`, `https://`), both need a
+//! tokio runtime, and neither uses a proxy.
 //!
 //! ```no_run
 //! use wildcity_client::{Client, Open, Pose};
@@ -25,8 +25,10 @@
 //! # fn my_policy(_: &[u8], pose: Pose) -> Pose { pose }
 //! ```
 //!
-//! The examples of this package follow a trajectory and push a checkpoint. Units, frames, error codes and limits are in
-//! `protocol/README.md` of the project.
+//! The examples of this package follow a trajectory and push a checkpoint. Units, frames, error
+//! codes and limits are in `protocol/README.md` of the project.
+
+#![warn(missing_docs)]
 
 mod actors;
 mod client;

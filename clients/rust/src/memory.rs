@@ -1,7 +1,7 @@
 //! Observations in memory that a server on the same machine shares, in place of the socket.
 //!
-//! They are copied out of that memory. A mapping would save the copy, but Rust has no safe one: the server may write
-//! a slot again while a slice of it is alive.
+//! They are copied out of that memory. A mapping would save the copy, but Rust has no safe one: the
+//! server may write a slot again while a slice of it is alive.
 
 use std::fs::File;
 use std::sync::Arc;
@@ -35,7 +35,8 @@ impl SharedMemory {
     /// Opens the memory, and reads the text that proves it to the server.
     ///
     /// # Errors
-    /// [`ClientError::SharedMemory`]: the server runs on another machine, in another container or as another user.
+    /// [`ClientError::SharedMemory`]: the server runs on another machine, in another container or
+    /// as another user.
     pub(crate) fn open(offer: &Offer) -> Result<(Self, String), ClientError> {
         let failed = |reason: String| {
             ClientError::SharedMemory(format!(
@@ -44,8 +45,8 @@ impl SharedMemory {
                 offer.path
             ))
         };
-        // If the server is on another machine or in another container, its path may be of another file, which must not
-        // be opened.
+        // If the server is on another machine or in another container, its path may be of another
+        // file, which must not be opened.
         let found = std::fs::read_link(&offer.path).map_err(|error| failed(error.to_string()))?;
         if found.as_os_str() != offer.target.as_str() {
             return Err(failed(format!("it is {}, not {}", found.display(), offer.target)));

@@ -20,8 +20,8 @@ const WHEEL_SPEED: &str = "sensor.wheel_speed";
 
 /// An observation of the ego at one time: metadata, images, and the ego's past poses.
 ///
-/// [`Observation::decode`] checks everything except the contents of JPEG and PNG files, which are decoded on demand by
-/// [`ImageView::rgb`], and the hashes, which [`Observation::verify`] compares.
+/// [`Observation::decode`] checks everything except the contents of JPEG and PNG files, which are
+/// decoded on demand by [`ImageView::rgb`], and the hashes, which [`Observation::verify`] compares.
 ///
 /// ```
 /// use wildcity_client::Observation;
@@ -97,8 +97,8 @@ impl Observation {
         self.metadata.images.iter().map(|metadata| self.view(metadata))
     }
 
-    /// The last frames of a camera, oldest first: as many as `outputs.frames` asked for, fewer at the start
-    /// of an episode, and none between two decisions.
+    /// The last frames of a camera, oldest first: as many as `outputs.frames` asked for, fewer at
+    /// the start of an episode, and none between two decisions.
     pub fn frames(&self, camera: &str) -> Vec<ImageView<'_>> {
         let current = self.metadata.images.iter().filter(|image| image.pose == 0);
         let mut frames: Vec<_> = current
@@ -110,33 +110,34 @@ impl Observation {
         frames
     }
 
-    /// Past positions of the rig, f32 `[16, 3]`, in metres in the current rig frame: oldest first, 0.1 s
-    /// apart. The last one is now, which is zero.
+    /// Past positions of the rig, f32 `[16, 3]`, in metres in the current rig frame: oldest first,
+    /// 0.1 s apart. The last one is now, which is zero.
     pub fn history_xyz_m(&self) -> Cow<'_, [f32]> {
         floats(self.tensor_bytes(HISTORY_XYZ))
     }
 
-    /// Past rotations `rig(now)_from_rig(then)`, f32 `[16, 3, 3]`, row by row: oldest first, 0.1 s apart. The
-    /// last one is now, which is the identity.
+    /// Past rotations `rig(now)_from_rig(then)`, f32 `[16, 3, 3]`, row by row: oldest first, 0.1 s
+    /// apart. The last one is now, which is the identity.
     pub fn history_rot(&self) -> Cow<'_, [f32]> {
         floats(self.tensor_bytes(HISTORY_ROT))
     }
 
-    /// Samples of the inertial measurement unit, f32 `[n, 6]`: specific force in m/s² and angular velocity in rad/s, in
-    /// the rig's axes, for each step since the previous observation. Empty unless the session asked for it.
+    /// Samples of the inertial measurement unit, f32 `[n, 6]`: specific force in m/s² and angular
+    /// velocity in rad/s, in the rig's axes, for each step since the previous observation. Empty
+    /// unless the session asked for it.
     pub fn imu(&self) -> Cow<'_, [f32]> {
         floats(self.tensor_bytes(IMU))
     }
 
-    /// Speed in m/s as the wheels measured it, f32 `[n]`, at the times of [`Self::imu`]. Empty unless the session asked
-    /// for it.
+    /// Speed in m/s as the wheels measured it, f32 `[n]`, at the times of [`Self::imu`]. Empty
+    /// unless the session asked for it.
     pub fn wheel_speed(&self) -> Cow<'_, [f32]> {
         floats(self.tensor_bytes(WHEEL_SPEED))
     }
 
-    /// Compares the hash of each lossless image, earlier frames included, with its pixels, and the frame
-    /// hash with the images' hashes. JPEG images are skipped: they are hashed before encoding, and JPEG
-    /// changes their pixels.
+    /// Compares the hash of each lossless image, earlier frames included, with its pixels, and the
+    /// frame hash with the images' hashes. JPEG images are skipped: they are hashed before
+    /// encoding, and JPEG changes their pixels.
     ///
     /// # Errors
     /// The first hash that differs, or the first image that cannot be decoded.
@@ -164,7 +165,8 @@ impl Observation {
         ImageView { observation: self, metadata }
     }
 
-    /// Checks that every tensor that the metadata names exists, with the type and shape that it must have.
+    /// Checks that every tensor that the metadata names exists, with the type and shape that it
+    /// must have.
     fn check_tensors(&self) -> Result<(), FrameError> {
         self.check_tensor(HISTORY_XYZ, Dtype::F32, &[HISTORY_POSES, 3])?;
         self.check_tensor(HISTORY_ROT, Dtype::F32, &[HISTORY_POSES, 3, 3])?;
@@ -223,7 +225,8 @@ impl Observation {
         self.check_tensor(name, Dtype::U8, &[bytes])
     }
 
-    /// The bytes of a tensor that [`Observation::check_tensors`] checked; empty if there is no such tensor.
+    /// The bytes of a tensor that [`Observation::check_tensors`] checked; empty if there is no such
+    /// tensor.
     fn tensor_bytes(&self, name: &str) -> &[u8] {
         let Some(info) = self.tensors.info(name) else { return &[] };
         let (start, end) = info.data_offsets;
@@ -242,8 +245,8 @@ impl<'a> ImageView<'a> {
         self.observation.tensor_bytes(&self.metadata.tensor)
     }
 
-    /// Pixels, u8 `[height, width, 3]`: red, green, blue, row by row from the top left. Raw images are
-    /// returned in place, the others are decoded by every call.
+    /// Pixels, u8 `[height, width, 3]`: red, green, blue, row by row from the top left. Raw images
+    /// are returned in place, the others are decoded by every call.
     ///
     /// # Errors
     /// The JPEG or PNG file cannot be decoded, or its size differs from the metadata.
@@ -265,13 +268,14 @@ impl<'a> ImageView<'a> {
         })
     }
 
-    /// Depth in metres, f32 `[height, width]`, 0 where the opacity is 0: camera z, or distance for wide
-    /// lenses. `None` if the session did not ask for it.
+    /// Depth in metres, f32 `[height, width]`, 0 where the opacity is 0: camera z, or distance for
+    /// wide lenses. `None` if the session did not ask for it.
     pub fn depth_m(&self) -> Option<Cow<'a, [f32]>> {
         self.map("depth")
     }
 
-    /// Accumulated opacity, 0 to 1, f32 `[height, width]`. `None` if the session did not ask for it.
+    /// Accumulated opacity, 0 to 1, f32 `[height, width]`. `None` if the session did not ask for
+    /// it.
     pub fn opacity(&self) -> Option<Cow<'a, [f32]>> {
         self.map("opacity")
     }
@@ -283,8 +287,8 @@ impl<'a> ImageView<'a> {
     }
 
     /// Whose Gaussian each pixel shows, u16 `[height, width]`: 0 none, 1 the twin, else the
-    /// [`Actor::instance`](wildcity_protocol::observation::Actor::instance) of an actor. `None` if the session did not
-    /// ask for it.
+    /// [`Actor::instance`](wildcity_protocol::observation::Actor::instance) of an actor. `None` if
+    /// the session did not ask for it.
     pub fn instances(&self) -> Option<Vec<u16>> {
         let name = self.sibling_tensor("instances");
         self.observation.tensors.info(&name)?;
@@ -313,15 +317,16 @@ impl<'a> ImageView<'a> {
         compare_hashes(&self.metadata.tensor, found, &self.metadata.hash)
     }
 
-    /// Name of another tensor of the same image: `camera/front/rgb` and `depth` give `camera/front/depth`.
+    /// Name of another tensor of the same image: `camera/front/rgb` and `depth` give
+    /// `camera/front/depth`.
     fn sibling_tensor(&self, output: &str) -> String {
         let tensor = &self.metadata.tensor;
         format!("{}{output}", tensor.strip_suffix("rgb").unwrap_or(tensor))
     }
 }
 
-/// Refuses a long header before anything is allocated for it. A frame that is too short to have a length is
-/// refused later, with the rest of the layout.
+/// Refuses a long header before anything is allocated for it. A frame that is too short to have a
+/// length is refused later, with the rest of the layout.
 pub(crate) fn check_header_length(frame: &[u8]) -> Result<(), FrameError> {
     let limit = OBSERVATION_HEADER_BYTES;
     match frame.first_chunk().map(|length| u64::from_le_bytes(*length)) {
@@ -341,8 +346,8 @@ fn compare_hashes(name: &str, found: String, expected: &str) -> Result<(), Frame
     Err(FrameError::Hash { name: name.to_owned(), found, expected: expected.to_owned() })
 }
 
-/// Little-endian floats: in place if the machine is little-endian and the bytes are aligned to 4, otherwise
-/// copied. Bytes after a JPEG of odd length are not aligned.
+/// Little-endian floats: in place if the machine is little-endian and the bytes are aligned to 4,
+/// otherwise copied. Bytes after a JPEG of odd length are not aligned.
 fn floats(bytes: &[u8]) -> Cow<'_, [f32]> {
     match bytemuck::try_cast_slice(bytes) {
         Ok(floats) if cfg!(target_endian = "little") => Cow::Borrowed(floats),

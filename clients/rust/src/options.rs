@@ -17,11 +17,12 @@ use std::fmt;
 pub struct ConnectOptions {
     /// Bearer token, for a server that was started with tokens.
     pub token: Option<String>,
-    /// Root certificates in PEM format that `wss://` and `https://` trust in addition to those of the
-    /// operating system, for example that of a private certificate authority.
+    /// Root certificates in PEM format that `wss://` and `https://` trust in addition to those of
+    /// the operating system, for example that of a private certificate authority.
     pub root_certificates_pem: Vec<u8>,
-    /// Whether observations arrive in memory that the server shares, instead of the socket. The server must run on this
-    /// machine, in the same container and as the same user; otherwise connecting fails.
+    /// Whether observations arrive in memory that the server shares, instead of the socket. The
+    /// server must run on this machine, in the same container and as the same user; otherwise
+    /// connecting fails.
     pub shared_memory: bool,
 }
 

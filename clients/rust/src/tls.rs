@@ -7,10 +7,12 @@ use rustls::pki_types::CertificateDer;
 use rustls::pki_types::pem::PemObject as _;
 use rustls::{ClientConfig, RootCertStore};
 
-/// A configuration that trusts the operating system's root certificates, and those in `extra_roots_pem`.
+/// A configuration that trusts the operating system's root certificates, and those in
+/// `extra_roots_pem`.
 ///
 /// # Errors
-/// A text with the remedy: `extra_roots_pem` has no certificate or a damaged one, or there is no root certificate.
+/// A text with the remedy: `extra_roots_pem` has no certificate or a damaged one, or there is no
+/// root certificate.
 pub(crate) fn client_config(extra_roots_pem: &[u8]) -> Result<ClientConfig, String> {
     let mut roots = RootCertStore::empty();
     add_pem_roots(&mut roots, extra_roots_pem)?;
@@ -50,7 +52,8 @@ fn add_pem_roots(roots: &mut RootCertStore, pem: &[u8]) -> Result<(), String> {
     Ok(())
 }
 
-/// Name the cryptography provider, because rustls otherwise uses the default of the process, which may not be set.
+/// Name the cryptography provider, because rustls otherwise uses the default of the process, which
+/// may not be set.
 fn config(roots: RootCertStore) -> Result<ClientConfig, String> {
     let builder = ClientConfig::builder_with_provider(Arc::new(ring::default_provider()))
         .with_safe_default_protocol_versions()

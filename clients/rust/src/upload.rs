@@ -1,4 +1,5 @@
-//! Resumable uploads: a file is announced by its digest, and only the bytes that the server lacks are sent.
+//! Resumable uploads: a file is announced by its digest, and only the bytes that the server lacks
+//! are sent.
 
 use std::fs::File;
 use std::io::{self, Read as _, Seek as _, SeekFrom};
@@ -20,8 +21,8 @@ use crate::http::{HttpClient, HttpError};
 use crate::limits;
 
 impl HttpClient {
-    /// Uploads a file, or the part of it that the server lacks. `on_progress` gets the bytes on the server
-    /// and the size of the file.
+    /// Uploads a file, or the part of it that the server lacks. `on_progress` gets the bytes on the
+    /// server and the size of the file.
     ///
     /// # Errors
     /// The file cannot be read, or changes during the upload; the server refuses; or

@@ -1,19 +1,23 @@
 //! Strict decoding of messages of clients.
 //!
-//! serde accepts more than the protocol: an array in place of an object, `null` in place of an absent field, fields
-//! that do not exist, and the last of two fields of one name. If an agent has such a mistake, it gets wrong results
-//! instead of an error. So a message is first compared with its JSON schema, the one in `protocol/schema` that is
-//! generated from the types, and only then read by serde. The rules:
+//! serde accepts more than the protocol: an array in place of an object, `null` in place of an
+//! absent field, fields that do not exist, and the last of two fields of one name. If an agent has
+//! such a mistake, it gets wrong results instead of an error. So a message is first compared with
+//! its JSON schema, the one in `protocol/schema` that is generated from the types, and only then
+//! read by serde. The rules:
 //!
 //! - Objects are not arrays. Unknown, missing and duplicate fields are refused.
-//! - `null` is refused everywhere: an option that is not set is left out. Where a number belongs, `null` counts as
-//!   NaN, because JavaScript writes NaN so.
-//! - A number with a point or an exponent is an integer if its value is one, as in JSON Schema: `1e5`.
-//! - NaN and infinities, which JSON cannot represent, are found in all usual spellings (`non_finite`).
+//! - `null` is refused everywhere: an option that is not set is left out. Where a number belongs,
+//!   `null` counts as NaN, because JavaScript writes NaN so.
+//! - A number with a point or an exponent is an integer if its value is one, as in JSON Schema:
+//!   `1e5`.
+//! - NaN and infinities, which JSON cannot represent, are found in all usual spellings
+//!   (`non_finite`).
 //! - A message is nested at most 127 deep: `serde_json` refuses the 128th level.
 //!
-//! Every [`Mistake`] has the path of the field, for example `rig.cameras[2].lens.k[1]`. Ranges of numbers, counts
-//! and names are not checked here: the package that knows the limit refuses them, with a code of its own.
+//! Every [`Mistake`] has the path of the field, for example `rig.cameras[2].lens.k[1]`. Ranges of
+//! numbers, counts and names are not checked here: the package that knows the limit refuses them,
+//! with a code of its own.
 
 mod non_finite;
 mod shape;
@@ -42,7 +46,7 @@ macro_rules! inbound {
         impl Inbound for $message {
             fn shapes() -> &'static Shapes {
                 static SHAPES: LazyLock<Shapes> = LazyLock::new(|| {
-                    Shapes::of(include_str!(concat!("../../schema/", $schema, ".json")))
+                    Shapes::from_schema(include_str!(concat!("../../schema/", $schema, ".json")))
                 });
                 &SHAPES
             }
@@ -107,7 +111,8 @@ pub enum MistakeKind {
 /// ```
 ///
 /// # Errors
-/// The first mistake in the order of the text; a missing field comes after the fields of its object.
+/// The first mistake in the order of the text; a missing field comes after the fields of its
+/// object.
 pub fn decode<T: Inbound>(text: &str) -> Result<T, Refused> {
     let tree = match Tree::parse(text) {
         Ok(tree) => tree,

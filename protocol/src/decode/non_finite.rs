@@ -1,7 +1,8 @@
 //! NaN and infinity in JSON.
 //!
-//! JSON cannot represent them, but agents that divide by zero send them nevertheless: Python writes `NaN`,
-//! JavaScript `null`, others `1e999`. The answer to them names the field instead of saying "not JSON".
+//! JSON cannot represent them, but agents that divide by zero send them nevertheless: Python writes
+//! `NaN`, JavaScript `null`, others `1e999`. The answer to them names the field instead of saying
+//! "not JSON".
 
 /// The text with every bare number that is not finite replaced by `null`.
 pub(super) fn without_infinities(text: &str) -> String {

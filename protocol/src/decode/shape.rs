@@ -1,7 +1,7 @@
 //! Types and fields of a JSON schema, in a form that is fast to compare with.
 //!
-//! Only the keywords that schemars writes for this package's types are read. Ranges, counts and name patterns are
-//! checked by the packages that have the limits.
+//! Only the keywords that schemars writes for this package's types are read. Ranges, counts and
+//! name patterns are checked by the packages that have the limits.
 
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
@@ -60,11 +60,12 @@ impl Shapes {
     ///
     /// # Panics
     /// The schema has a keyword that this module does not support. A test reads every schema.
-    pub(super) fn of(schema: &str) -> Self {
+    pub(super) fn from_schema(schema: &str) -> Self {
         let schema: Value = serde_json::from_str(schema).expect("a schema is JSON");
         let definitions = schema["$defs"].as_object().into_iter().flatten();
-        let definitions = definitions.map(|(name, schema)| (name.clone(), Shape::of(schema)));
-        Self { root: Shape::of(&schema), definitions: definitions.collect() }
+        let definitions =
+            definitions.map(|(name, schema)| (name.clone(), Shape::from_value(schema)));
+        Self { root: Shape::from_value(&schema), definitions: definitions.collect() }
     }
 
     /// The shape behind the names of definitions.
@@ -77,17 +78,18 @@ impl Shapes {
 }
 
 impl Shape {
-    fn of(schema: &Value) -> Self {
+    fn from_value(schema: &Value) -> Self {
         let Some(keywords) = schema.as_object() else { return Self::Any };
         if let Some(Value::String(target)) = keywords.get("$ref") {
             return Self::Defined(target.trim_start_matches("#/$defs/").to_owned());
         }
-        // In addition to `properties`, `oneOf` says which fields exclude each other. serde's types check this.
+        // In addition to `properties`, `oneOf` says which fields exclude each other. serde's types
+        // check this.
         let alternatives = ["anyOf", "oneOf"].into_iter().find_map(|name| keywords.get(name));
         if let Some(Value::Array(alternatives)) = alternatives
             && !keywords.contains_key("properties")
         {
-            return Self::of_alternatives(alternatives);
+            return Self::from_alternatives(alternatives);
         }
         if let Some(word) = keywords.get("const").or(keywords.get("enum")) {
             return Self::Word(strings(word));
@@ -102,16 +104,16 @@ impl Shape {
                 let least = keywords.get("minItems").and_then(Value::as_u64);
                 let most = keywords.get("maxItems").and_then(Value::as_u64);
                 let len = least.filter(|_| least == most).map(|len| len as usize);
-                let item = keywords.get("items").map_or(Self::Any, Self::of);
+                let item = keywords.get("items").map_or(Self::Any, Self::from_value);
                 Self::List { item: Box::new(item), len }
             }
-            Some("object") => Self::Object(ObjectShape::of(keywords)),
+            Some("object") => Self::Object(ObjectShape::from_keywords(keywords)),
             Some(other) => panic!("type {other}"),
         }
     }
 
-    fn of_alternatives(alternatives: &[Value]) -> Self {
-        let shapes: Vec<Self> = alternatives.iter().map(Self::of).collect();
+    fn from_alternatives(alternatives: &[Value]) -> Self {
+        let shapes: Vec<Self> = alternatives.iter().map(Self::from_value).collect();
         if shapes.iter().all(|shape| matches!(shape, Self::Word(_))) {
             let words = shapes.into_iter().flat_map(|shape| match shape {
                 Self::Word(words) => words,
@@ -133,14 +135,16 @@ impl Shape {
 }
 
 impl ObjectShape {
-    fn of(keywords: &Map<String, Value>) -> Self {
+    fn from_keywords(keywords: &Map<String, Value>) -> Self {
         let fields = keywords.get("properties").and_then(Value::as_object).into_iter().flatten();
         let others = match keywords.get("additionalProperties") {
             None | Some(Value::Bool(false)) => None,
-            Some(shape) => Some(Box::new(Shape::of(shape))),
+            Some(shape) => Some(Box::new(Shape::from_value(shape))),
         };
         Self {
-            fields: fields.map(|(name, schema)| (name.clone(), Shape::of(schema))).collect(),
+            fields: fields
+                .map(|(name, schema)| (name.clone(), Shape::from_value(schema)))
+                .collect(),
             required: keywords.get("required").map(strings).unwrap_or_default(),
             others,
         }

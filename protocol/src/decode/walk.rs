@@ -8,8 +8,8 @@ use super::shape::{ObjectShape, Shape, Shapes};
 use super::tree::Tree;
 use super::{Mistake, MistakeKind};
 
-/// Integers up to here are exact as floating-point numbers: 2^53. A larger number with a point or an exponent may stand
-/// for several integers.
+/// Integers up to here are exact as floating-point numbers: 2^53. A larger number with a point or
+/// an exponent may stand for several integers.
 const EXACT: i128 = 1 << 53;
 
 /// Longest name of an unknown field that a path repeats, in characters.
@@ -51,10 +51,8 @@ impl Walk<'_> {
         }
         match (shape, tree) {
             (Shape::Number, Tree::Null) => {
-                let kind = match self.in_pose {
-                    true => MistakeKind::PoseNotFinite,
-                    false => MistakeKind::OutOfRange,
-                };
+                let kind =
+                    if self.in_pose { MistakeKind::PoseNotFinite } else { MistakeKind::OutOfRange };
                 let reason = "is not finite; a finite number is expected here";
                 Err(self.mistake(kind, reason))
             }
@@ -155,8 +153,8 @@ impl Walk<'_> {
         }
     }
 
-    /// Compares a value with the most likely one of several shapes: of its own type, and among objects the shape that
-    /// has the most of its fields.
+    /// Compares a value with the most likely one of several shapes: of its own type, and among
+    /// objects the shape that has the most of its fields.
     fn choice(&mut self, shapes: &[Shape], tree: &Tree) -> Result<Value, Mistake> {
         let mut best: Option<(usize, &Shape)> = None;
         let mut objects: Vec<String> = Vec::new();
@@ -269,9 +267,10 @@ fn integer(number: &Number) -> Option<i128> {
 /// The name of a field, as a path has it: quoted if it has other characters than names have.
 fn quoted(name: &str) -> String {
     let is_plain = |c: char| c.is_ascii_alphanumeric() || "._-".contains(c);
-    match !name.is_empty() && name.len() <= NAME_CHARS && name.chars().all(is_plain) {
-        true => name.to_owned(),
-        false => format!("[{:?}]", shortened(name)),
+    if !name.is_empty() && name.len() <= NAME_CHARS && name.chars().all(is_plain) {
+        name.to_owned()
+    } else {
+        format!("[{:?}]", shortened(name))
     }
 }
 

@@ -14,10 +14,12 @@ pub struct NewActor {
     pub name: String,
     /// What the actor is.
     pub class: ActorClass,
-    /// The files, which are merged into one scene. Their axes become the actor's: x forward, y left, z up.
+    /// The files, which are merged into one scene. Their axes become the actor's: x forward, y
+    /// left, z up.
     #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 256)))]
     pub files: Vec<PushFile>,
-    /// Number of flat Gaussians that cover the triangles of a mesh; small triangles add more. If absent, 200,000.
+    /// Number of flat Gaussians that cover the triangles of a mesh; small triangles add more. If
+    /// absent, 200,000.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(range(min = 1_000, max = 1_000_000)))]
     pub gaussians: Option<u32>,
@@ -65,11 +67,13 @@ pub struct ActorList {
     pub damaged: Vec<DamagedActor>,
 }
 
-/// An asset that differs from what was stored, or cannot be read; or a folder of assets that cannot be listed.
+/// An asset that differs from what was stored, or cannot be read; or a folder of assets that cannot
+/// be listed.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct DamagedActor {
-    /// Its hash, 64 hex digits; of a folder, the two digits that the hashes of its assets begin with.
+    /// Its hash, 64 hex digits; of a folder, the two digits that the hashes of its assets begin
+    /// with.
     #[cfg_attr(feature = "schema", schemars(regex(pattern = "^[0-9a-f]{2}([0-9a-f]{62})?$")))]
     pub hash: String,
     /// The name that it states, if that can be read.
@@ -79,8 +83,8 @@ pub struct DamagedActor {
     pub reason: String,
 }
 
-/// An asset of an actor: the answer to `POST /v1/actors` and `GET /v1/actors/{actor}`, and an entry of
-/// `GET /v1/actors`.
+/// An asset of an actor: the answer to `POST /v1/actors` and `GET /v1/actors/{actor}`, and an entry
+/// of `GET /v1/actors`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct ActorAsset {
@@ -93,7 +97,8 @@ pub struct ActorAsset {
     /// The box around the centres of its Gaussians.
     #[serde(rename = "box")]
     pub box_: ActorBox,
-    /// What it was made from. Absent for a token that is limited to some twins, since it may name others.
+    /// What it was made from. Absent for a token that is limited to some twins, since it may name
+    /// others.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub provenance: Option<ActorProvenance>,
     /// Number of Gaussians at full detail.
@@ -108,7 +113,8 @@ pub struct ActorAsset {
     pub levels: Vec<ActorLevel>,
 }
 
-/// The box of an actor. The origin is on the ground under its middle; x points forward, y to the left, z up.
+/// The box of an actor. The origin is on the ground under its middle; x points forward, y to the
+/// left, z up.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct ActorBox {
@@ -124,7 +130,8 @@ pub struct ActorBox {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct ActorProvenance {
-    /// BLAKE3 of the files, as `blake3:` and hex digits, or the generator, or the twin that it was cut from.
+    /// BLAKE3 of the files, as `blake3:` and hex digits, or the generator, or the twin that it was
+    /// cut from.
     pub source: String,
     /// The program that made it.
     pub builder: String,

@@ -60,7 +60,8 @@ pub struct NewPush {
     /// The scene files, which are merged into one scene.
     #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 256)))]
     pub files: Vec<PushFile>,
-    /// The frame of the files, after their axes and scale, and of `golden.poses`. If absent, that of the twin.
+    /// The frame of the files, after their axes and scale, and of `golden.poses`. If absent, that
+    /// of the twin.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub frame: Option<PushFrame>,
     /// The version that the push is based on. If absent, the latest.
@@ -69,8 +70,8 @@ pub struct NewPush {
     /// The 64 m cells to replace. If absent, those that contain Gaussians of the push.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub cells: Option<CellSelection>,
-    /// Storage format of a Gaussian: `f32`, `h52`, `q32` or `q24`. If absent, that of the base version;
-    /// `q32` in a new twin.
+    /// Storage format of a Gaussian: `f32`, `h52`, `q32` or `q24`. If absent, that of the base
+    /// version; `q32` in a new twin.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(regex(pattern = "^(f32|h52|q32|q24)$")))]
     pub record: Option<String>,
@@ -105,17 +106,19 @@ const AXES_PATTERN: &str = "^(identity|y-down-z-forward|y-up-z-back|y-up-z-forwa
 pub struct PushFile {
     /// Id of the upload.
     pub upload: String,
-    /// Axis convention of the file: a preset or nine numbers, as in `wildcity import --axes`. If absent, that which the
-    /// file records; else, in a push, that with which the twin was imported; else `identity`.
+    /// Axis convention of the file: a preset or nine numbers, as in `wildcity import --axes`. If
+    /// absent, that which the file records; else, in a push, that with which the twin was imported;
+    /// else `identity`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(regex(pattern = AXES_PATTERN)))]
     pub axes: Option<String>,
-    /// Metres per unit of the file. If absent, in a push, that with which the twin was imported; else 1.
+    /// Metres per unit of the file. If absent, in a push, that with which the twin was imported;
+    /// else 1.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(extend("exclusiveMinimum" = 0)))]
     pub scale: Option<f64>,
-    /// The name by which other files of the request name this one, such as `textures/paint.png`. If absent, that of
-    /// the upload.
+    /// The name by which other files of the request name this one, such as `textures/paint.png`. If
+    /// absent, that of the upload.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 1_024)))]
     pub name: Option<String>,
@@ -128,8 +131,8 @@ pub struct PushFile {
 pub enum PushFrame {
     /// The axes and metres of the base version.
     Twin,
-    /// The axes and the unit with which the capture was imported, before the twin was aligned. Those of the twin if it
-    /// never was.
+    /// The axes and the unit with which the capture was imported, before the twin was aligned.
+    /// Those of the twin if it never was.
     Capture,
 }
 
@@ -141,8 +144,8 @@ pub enum PushFrame {
 pub enum CellSelection {
     /// `"all"`: every cell of the twin.
     All(AllCells),
-    /// A list of cells (x, y). Cell (i, j) is centred on (64 i, 64 j) m. Gaussians in other cells are left
-    /// out.
+    /// A list of cells (x, y). Cell (i, j) is centred on (64 i, 64 j) m. Gaussians in other cells
+    /// are left out.
     Listed(#[cfg_attr(feature = "schema", schemars(length(min = 1)))] Vec<[i32; 2]>),
 }
 
@@ -156,15 +159,15 @@ pub enum AllCells {
     All,
 }
 
-/// Where a push is compared with its base version: images of both are rendered from some poses, and their
-/// PSNR is reported.
+/// Where a push is compared with its base version: images of both are rendered from some poses, and
+/// their PSNR is reported.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 #[cfg_attr(feature = "schema", schemars(rename = "Golden"))]
 pub struct PreviewRequest {
-    /// Poses of the rig, `world_from_rig`. If absent, four along the twin's trajectories. The report leaves out poses from which no
-    /// Gaussian is seen.
+    /// Poses of the rig, `world_from_rig`. If absent, four along the twin's trajectories. The
+    /// report leaves out poses from which no Gaussian is seen.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(length(max = 32)))]
     pub poses: Option<Vec<Pose>>,
@@ -218,8 +221,8 @@ pub enum PushState {
     Ready,
     /// Its content was refused. Nothing changed.
     Refused,
-    /// The server failed. Nothing changed, unless the error's message says otherwise, and the push can be
-    /// sent again.
+    /// The server failed. Nothing changed, unless the error's message says otherwise, and the push
+    /// can be sent again.
     Failed,
 }
 
@@ -261,7 +264,8 @@ pub struct PushReport {
     /// The frame that the files were taken to be in. Older servers do not say it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub frame: Option<PushFrame>,
-    /// Whether the base version was aligned: the frame of the capture is then another one than that of the twin.
+    /// Whether the base version was aligned: the frame of the capture is then another one than that
+    /// of the twin.
     #[serde(default)]
     pub aligned: bool,
     /// Smallest and largest values over all Gaussians. Absent if there are none.
@@ -399,8 +403,8 @@ pub struct MadeVersion {
     pub version_hash: String,
 }
 
-/// Where a twin is, and its ground: the answer to `GET /v1/twins/{twin}/ground`. All points are in the axes and the
-/// unit of the version.
+/// Where a twin is, and its ground: the answer to `GET /v1/twins/{twin}/ground`. All points are in
+/// the axes and the unit of the version.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Ground {
@@ -423,8 +427,8 @@ pub struct Rollback {
     pub version: u64,
 }
 
-/// `POST /v1/twins/{twin}/edits`: makes a new version with the same Gaussians on level ground, in metres, with a drive
-/// and a rig. All points are in the axes and the unit of the base version.
+/// `POST /v1/twins/{twin}/edits`: makes a new version with the same Gaussians on level ground, in
+/// metres, with a drive and a rig. All points are in the axes and the unit of the base version.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[cfg_attr(feature = "schema", schemars(extend("anyOf" = [
@@ -542,7 +546,8 @@ fn is_zero(value: &u64) -> bool {
     *value == 0
 }
 
-/// `POST /v1/tickets`: stands for the request's token in the address of one WebSocket, as `?ticket=`.
+/// `POST /v1/tickets`: stands for the request's token in the address of one WebSocket, as
+/// `?ticket=`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Ticket {

@@ -39,8 +39,8 @@ pub enum Answer {
         seq: u64,
         /// Name of the session.
         session: String,
-        /// Number of the last request that the session carried out. Repeat that request to get its answer
-        /// again, or continue with the next number.
+        /// Number of the last request that the session carried out. Repeat that request to get its
+        /// answer again, or continue with the next number.
         last_seq: u64,
         /// Steps done in the episode.
         step: u64,
@@ -58,14 +58,16 @@ pub enum Answer {
         /// Number of the request.
         seq: u64,
     },
-    /// Answer to `share_memory` without `proof`: the memory that the server offers. Its first bytes are the proof.
+    /// Answer to `share_memory` without `proof`: the memory that the server offers. Its first bytes
+    /// are the proof.
     SharedMemory {
         /// Number of the request.
         seq: u64,
-        /// Path by which the memory can be opened, of a client in the same container and of the same user.
+        /// Path by which the memory can be opened, of a client in the same container and of the
+        /// same user.
         path: String,
-        /// Target of that path, which is a symbolic link. If it has another one, the path is of another machine or
-        /// container, and must not be opened.
+        /// Target of that path, which is a symbolic link. If it has another one, the path is of
+        /// another machine or container, and must not be opened.
         target: String,
         /// Bytes of the proof, at the beginning of the memory.
         proof_bytes: u64,
@@ -74,7 +76,8 @@ pub enum Answer {
         /// Bytes from one slot to the next.
         slot_bytes: u64,
     },
-    /// In place of an observation, or of the answer to `step_many`: where in the shared memory it is.
+    /// In place of an observation, or of the answer to `step_many`: where in the shared memory it
+    /// is.
     InMemory {
         /// Number of the request.
         seq: u64,
@@ -222,7 +225,8 @@ pub struct Opened {
     pub outputs: Outputs,
     /// The twin's recorded trajectories.
     pub trajectories: Vec<TrajectoryInfo>,
-    /// Memory of the server that is reserved for the largest frame of the session and its images, in bytes.
+    /// Memory of the server that is reserved for the largest frame of the session and its images,
+    /// in bytes.
     pub reserved_bytes: u64,
     /// The repair of the images.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -246,7 +250,8 @@ pub struct OpenedRepair {
     pub model: String,
     /// Version of the model.
     pub version: String,
-    /// BLAKE3 of what decides the repaired bytes beside the image, in hex: manifest, files, runtime, provider.
+    /// BLAKE3 of what decides the repaired bytes beside the image, in hex: manifest, files,
+    /// runtime, provider.
     pub repair_hash: String,
     /// Where it runs: `cpu`, `cuda` or `tensorrt`.
     pub provider: String,
@@ -284,7 +289,8 @@ pub enum ReferenceSource {
 pub struct OpenedScenario {
     /// Its name.
     pub name: String,
-    /// BLAKE3 of the scenario with the first episode's seed, all values and all hashes: what that episode is.
+    /// BLAKE3 of the scenario with the first episode's seed, all values and all hashes: what that
+    /// episode is.
     pub hash: String,
     /// Number of actors.
     pub actors: u64,
@@ -331,8 +337,8 @@ pub struct Summary {
 pub enum Outcome {
     /// The agent closed the session, or ended the episode with `terminate`.
     Completed,
-    /// As `completed`, but the agent left the recorded area: the trust of a pose was below 0.1, or, with
-    /// `outputs.trust`, the mean trust of the images of a reset or a step.
+    /// As `completed`, but the agent left the recorded area: the trust of a pose was below 0.1, or,
+    /// with `outputs.trust`, the mean trust of the images of a reset or a step.
     OffModel,
     /// A rule ended the episode: a contact, off the route, or stuck.
     DrivingFailure,

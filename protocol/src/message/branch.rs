@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-/// Opens a session in a state of another episode, with that episode's settings: version, cameras, outputs,
-/// dynamics.
+/// Opens a session in a state of another episode, with that episode's settings: version, cameras,
+/// outputs, dynamics.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]

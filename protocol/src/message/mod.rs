@@ -1,8 +1,9 @@
 //! Control messages: JSON text frames.
 //!
 //! The client sends a [`Request`], the server replies with an [`Answer`] or an
-//! [observation](crate::observation). Unknown fields of requests are mistakes: [`crate::decode`] refuses them
-//! at any depth. Unknown fields of answers are ignored, because answers may gain fields.
+//! [observation](crate::observation). Unknown fields of requests are mistakes: [`crate::decode`]
+//! refuses them at any depth. Unknown fields of answers are ignored, because answers may gain
+//! fields.
 
 mod answer;
 mod branch;
@@ -55,17 +56,17 @@ pub(crate) fn periods(schema: &mut schemars::Schema) {
 /// Says in the schema of a step that it has exactly one movement.
 #[cfg(feature = "schema")]
 pub(crate) fn one_movement(schema: &mut schemars::Schema) {
-    exactly_one_of(schema, &["pose", "trajectory", "action"]);
+    require_exactly_one(schema, &["pose", "trajectory", "action"]);
 }
 
 /// Says in the schema of an exposure that it has either a matrix or a gain.
 #[cfg(feature = "schema")]
 pub(crate) fn matrix_or_gain(schema: &mut schemars::Schema) {
-    exactly_one_of(schema, &["matrix", "gain"]);
+    require_exactly_one(schema, &["matrix", "gain"]);
 }
 
 #[cfg(feature = "schema")]
-fn exactly_one_of(schema: &mut schemars::Schema, fields: &[&str]) {
+fn require_exactly_one(schema: &mut schemars::Schema, fields: &[&str]) {
     let one_of = fields.iter().map(|field| serde_json::json!({ "required": [field] }));
     schema.insert("oneOf".to_owned(), one_of.collect::<Vec<_>>().into());
 }

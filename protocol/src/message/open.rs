@@ -58,14 +58,15 @@ pub struct Open {
     /// Seed of the first episode.
     #[serde(default)]
     pub seed: u64,
-    /// Where to start. If absent, the start of the twin's first trajectory, or the origin if it has none.
+    /// Where to start. If absent, the start of the twin's first trajectory, or the origin if it has
+    /// none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub start: Option<Start>,
     /// The cameras. If absent, the twin's rig, or the preset `vehicle6` if it has none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rig: Option<RigChoice>,
-    /// Changes of the twin's render profile for this session, for example `{"tau_px": 2.0}`. Fields that
-    /// are absent keep the server's setting, if it has one, or else the twin's.
+    /// Changes of the twin's render profile for this session, for example `{"tau_px": 2.0}`. Fields
+    /// that are absent keep the server's setting, if it has one, or else the twin's.
     #[serde(default, skip_serializing_if = "serde_json::Map::is_empty")]
     pub profile: serde_json::Map<String, serde_json::Value>,
     /// What each observation holds.
@@ -82,8 +83,8 @@ pub struct Open {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(range(min = 1)))]
     pub deadline_ms: Option<u64>,
-    /// Time between two decisions of the agent, in simulated microseconds: a whole number of steps. Only
-    /// observations at decisions have images. If absent, every observation has images.
+    /// Time between two decisions of the agent, in simulated microseconds: a whole number of steps.
+    /// Only observations at decisions have images. If absent, every observation has images.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(range(min = 1_000, max = 10_000_000)))]
     pub decision_us: Option<i64>,
@@ -93,15 +94,15 @@ pub struct Open {
     /// Effects of the sensors, and the delay of the planner. If absent, none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sensors: Option<Sensors>,
-    /// What contact with the twin does. If absent, the scenario decides. Without a scenario, a contact of a teleported ego is
-    /// reported, and another one ends the episode.
+    /// What contact with the twin does. If absent, the scenario decides. Without a scenario, a
+    /// contact of a teleported ego is reported, and another one ends the episode.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub contact: Option<ContactMode>,
     /// The scenario to drive. If absent, there are no actors and no route.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scenario: Option<ScenarioChoice>,
-    /// Length of the recorded drive before the start, in microseconds. Its poses are the ego's history, and
-    /// its frames are in the first bundle. If absent, 0.
+    /// Length of the recorded drive before the start, in microseconds. Its poses are the ego's
+    /// history, and its frames are in the first bundle. If absent, 0.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(range(min = 0, max = 20_000_000)))]
     pub warm_up_us: Option<i64>,
@@ -148,7 +149,8 @@ impl Open {
     }
 }
 
-/// Which images are repaired, and by which model. In `opened` every field but those of the model is there.
+/// Which images are repaired, and by which model. In `opened` every field but those of the model is
+/// there.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
@@ -167,8 +169,8 @@ pub struct Repair {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(range(min = 0.0, max = 1.0)))]
     pub at_least: Option<f64>,
-    /// Most images that are repaired of one pose of the rig: those with the least trust, then the first cameras. If
-    /// absent, 16.
+    /// Most images that are repaired of one pose of the rig: those with the least trust, then the
+    /// first cameras. If absent, 16.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub per_step: Option<u64>,
     /// What happens when the model fails. If absent, `unrepaired`.
@@ -234,7 +236,8 @@ pub struct RandomStart {
     /// Name of the trajectory. If absent, the twin's first.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub trajectory: Option<String>,
-    /// Least distance from the start of the trajectory, in metres. If absent, 0, or where the warm-up ends.
+    /// Least distance from the start of the trajectory, in metres. If absent, 0, or where the
+    /// warm-up ends.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(range(min = 0.0)))]
     pub from_m: Option<f64>,
@@ -259,8 +262,8 @@ pub struct RandomStart {
 pub enum ScenarioChoice {
     /// A scenario of the server, by name, with the first values of its sweep.
     Name(String),
-    /// The scenario itself, in the format `wildcity.scenario/1`; or, without the field `format`, the `name` of one of the
-    /// server's with `values` of its sweep.
+    /// The scenario itself, in the format `wildcity.scenario/1`; or, without the field `format`,
+    /// the `name` of one of the server's with `values` of its sweep.
     Object(serde_json::Map<String, serde_json::Value>),
 }
 
@@ -338,12 +341,12 @@ pub struct RigCamera {
     /// The colour correction. If absent, colours are not changed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub exposure: Option<Exposure>,
-    /// The part of its own car that the camera sees: a PNG with opacity, of the image's size, drawn over
-    /// the image, as `data:image/png;base64,..`. Answers do not repeat it.
+    /// The part of its own car that the camera sees: a PNG with opacity, of the image's size, drawn
+    /// over the image, as `data:image/png;base64,..`. Answers do not repeat it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub overlay: Option<String>,
-    /// Width and height of what the image shows, in pixels of the camera's native size. An image below its
-    /// native size is the native image shrunk. If absent, the image has native size.
+    /// Width and height of what the image shows, in pixels of the camera's native size. An image
+    /// below its native size is the native image shrunk. If absent, the image has native size.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub native_size: Option<[f64; 2]>,
     /// `rig_from_camera`: camera axes are x right, y down, z forward.
@@ -360,8 +363,8 @@ pub struct Outputs {
     #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 16)))]
     #[cfg_attr(feature = "schema", schemars(transform = super::unique_items))]
     pub cameras: Option<Vec<String>>,
-    /// Crops and sizes of images that differ from the rig's, by camera name. The cameras of `opened`
-    /// describe the images as sent.
+    /// Crops and sizes of images that differ from the rig's, by camera name. The cameras of
+    /// `opened` describe the images as sent.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub images: BTreeMap<String, ImagePart>,
     /// Encoding of colour images.
@@ -370,15 +373,16 @@ pub struct Outputs {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(range(min = 1, max = 100)))]
     pub quality: Option<u8>,
-    /// Whether to add `depth`, f32 `[height, width]`: expected camera z, or distance for wide lenses, in
-    /// metres.
+    /// Whether to add `depth`, f32 `[height, width]`: expected camera z, or distance for wide
+    /// lenses, in metres.
     pub depth: bool,
     /// Whether to add `opacity`, f32 `[height, width]`: how valid depth and colour are.
     pub opacity: bool,
     /// Whether to add `normals`, f32 `[height, width, 3]`: unit vectors in the camera's axes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub normals: Option<bool>,
-    /// Whether to add `instances`, u16 `[height, width]`: whose Gaussian each pixel shows. If absent, false.
+    /// Whether to add `instances`, u16 `[height, width]`: whose Gaussian each pixel shows. If
+    /// absent, false.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub instances: Option<bool>,
     /// Number of last frames of each camera that an observation holds. If absent, 1.
@@ -391,8 +395,8 @@ pub struct Outputs {
     /// Whether to tell where the actors of the scenario are. If absent, false.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub actors: Option<bool>,
-    /// Time between two frames, by camera name, in simulated microseconds: a whole number of steps. If
-    /// absent, every camera takes a frame with every step.
+    /// Time between two frames, by camera name, in simulated microseconds: a whole number of steps.
+    /// If absent, every camera takes a frame with every step.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(transform = super::periods))]
     pub period_us: Option<BTreeMap<String, i64>>,
@@ -422,8 +426,8 @@ impl Default for Outputs {
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(default)]
 pub struct ImagePart {
-    /// Left column, top row, width and height of the crop, in pixels of the rig's image. If absent, the
-    /// whole image.
+    /// Left column, top row, width and height of the crop, in pixels of the rig's image. If absent,
+    /// the whole image.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub crop: Option<[u64; 4]>,
     /// Width and height at which the crop is rendered, in pixels. If absent, those of the crop.

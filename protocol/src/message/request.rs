@@ -8,9 +8,10 @@ use super::pose::Pose;
 
 /// A message from the client. Every request gets exactly one answer with the same `seq`.
 ///
-/// `seq` counts the requests of a connection from 0 without gaps. After `resume` it continues the count of
-/// the session. A request is carried out only once: if its number is sent again, the server repeats the
-/// answer. A refused request can be sent again with the same number or with the next one.
+/// `seq` counts the requests of a connection from 0 without gaps. After `resume` it continues the
+/// count of the session. A request is carried out only once: if its number is sent again, the
+/// server repeats the answer. A refused request can be sent again with the same number or with the
+/// next one.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
@@ -24,9 +25,9 @@ pub enum Request {
         /// Protocol versions that the client supports.
         protocols: Vec<String>,
     },
-    /// Asks for the observations in memory instead of the socket, for a client on the same machine. Without `proof`
-    /// the answer is `shared_memory`: where the memory is. With it, the answer is `ok`, and the observations come in
-    /// that memory from then on.
+    /// Asks for the observations in memory instead of the socket, for a client on the same machine.
+    /// Without `proof` the answer is `shared_memory`: where the memory is. With it, the answer is
+    /// `ok`, and the observations come in that memory from then on.
     ShareMemory {
         /// Number of this request.
         seq: u64,
@@ -36,8 +37,8 @@ pub enum Request {
     },
     /// Opens a session on a twin. Answer: `opened`.
     Open(Box<Open>),
-    /// Moves the ego, advances the time by `dt_us` or to `until_us`, and renders. Exactly one of `pose`, `trajectory` and
-    /// `action` is given. Answer: an observation.
+    /// Moves the ego, advances the time by `dt_us` or to `until_us`, and renders. Exactly one of
+    /// `pose`, `trajectory` and `action` is given. Answer: an observation.
     #[cfg_attr(feature = "schema", schemars(transform = super::one_movement))]
     Step {
         /// Number of this request.
@@ -56,20 +57,22 @@ pub enum Request {
         /// Acceleration and curvature of the ego. Only with kinematic or dynamic dynamics.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         action: Option<Action>,
-        /// For how long the trajectory or the action is followed, in microseconds since the start of the step: a
-        /// whole number of `dt_us`. The answer is the observation at its end. If absent, `dt_us`.
+        /// For how long the trajectory or the action is followed, in microseconds since the start
+        /// of the step: a whole number of `dt_us`. The answer is the observation at its end. If
+        /// absent, `dt_us`.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         #[cfg_attr(feature = "schema", schemars(range(min = 1_000, max = 60_000_000)))]
         until_us: Option<i64>,
-        /// What the agent notes about the step, for the record: any JSON but `null`, of at most 65,536 bytes without white space.
+        /// What the agent notes about the step, for the record: any JSON but `null`, of at most
+        /// 65,536 bytes without white space.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         notes: Option<serde_json::Value>,
         /// Whether the episode ends with this step.
         #[serde(default)]
         terminate: bool,
     },
-    /// Steps several sessions of the connection. A session whose step is refused does not stop the others. Answer: one
-    /// binary message with the observation or the refusal of each.
+    /// Steps several sessions of the connection. A session whose step is refused does not stop the
+    /// others. Answer: one binary message with the observation or the refusal of each.
     StepMany {
         /// Number of this request.
         seq: u64,
@@ -77,8 +80,8 @@ pub enum Request {
         #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 64)))]
         steps: Vec<SessionStep>,
     },
-    /// Renders images from poses without moving the ego. Answer: one observation with the images of all
-    /// poses.
+    /// Renders images from poses without moving the ego. Answer: one observation with the images of
+    /// all poses.
     Observe {
         /// Number of this request.
         seq: u64,
@@ -90,8 +93,8 @@ pub enum Request {
         #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 16)))]
         poses: Vec<Pose>,
     },
-    /// Announces where the ego may go next, so that the server loads what is visible from there. Answer:
-    /// `ok`, at once.
+    /// Announces where the ego may go next, so that the server loads what is visible from there.
+    /// Answer: `ok`, at once.
     Prefetch {
         /// Number of this request.
         seq: u64,
@@ -99,8 +102,8 @@ pub enum Request {
         #[serde(default, skip_serializing_if = "Option::is_none")]
         #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
         session: Option<String>,
-        /// Poses of the rig, `world_from_rig`, in driving order. The straight lines between them count too.
-        /// They replace the poses of the previous `prefetch`.
+        /// Poses of the rig, `world_from_rig`, in driving order. The straight lines between them
+        /// count too. They replace the poses of the previous `prefetch`.
         #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 256)))]
         poses: Vec<Pose>,
     },
@@ -126,7 +129,8 @@ pub enum Request {
         #[cfg_attr(feature = "schema", schemars(range(min = -10.0, max = 60.0)))]
         speed: Option<f64>,
     },
-    /// Shows another version of the twin from the next step on. The episode continues. Answer: `switched`.
+    /// Shows another version of the twin from the next step on. The episode continues. Answer:
+    /// `switched`.
     SwitchVersion {
         /// Number of this request.
         seq: u64,
@@ -138,7 +142,8 @@ pub enum Request {
         #[serde(default, skip_serializing_if = "Option::is_none")]
         version: Option<u64>,
     },
-    /// Stores the state of the episode under a name, in place of an earlier snapshot of that name. Answer: `ok`.
+    /// Stores the state of the episode under a name, in place of an earlier snapshot of that name.
+    /// Answer: `ok`.
     Snapshot {
         /// Number of this request.
         seq: u64,
@@ -209,12 +214,14 @@ pub struct SessionStep {
     /// Acceleration and curvature of the ego. Only with kinematic or dynamic dynamics.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub action: Option<Action>,
-    /// For how long the trajectory or the action is followed, in microseconds since the start of the step: a
-    /// whole number of `dt_us`. The answer is the observation at its end. If absent, `dt_us`.
+    /// For how long the trajectory or the action is followed, in microseconds since the start of
+    /// the step: a whole number of `dt_us`. The answer is the observation at its end. If absent,
+    /// `dt_us`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(range(min = 1_000, max = 60_000_000)))]
     pub until_us: Option<i64>,
-    /// What the agent notes about the step, for the record: any JSON but `null`, of at most 65,536 bytes without white space.
+    /// What the agent notes about the step, for the record: any JSON but `null`, of at most 65,536
+    /// bytes without white space.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub notes: Option<serde_json::Value>,
     /// Whether the episode ends with this step.
@@ -227,7 +234,8 @@ pub struct SessionStep {
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct TimedPose {
-    /// Time since the start of the step, in microseconds: above 0, and above that of the previous pose.
+    /// Time since the start of the step, in microseconds: above 0, and above that of the previous
+    /// pose.
     #[cfg_attr(feature = "schema", schemars(range(min = 1, max = 60_000_000)))]
     pub time_us: i64,
     /// Pose of the rig at that time, in the rig frame at the start of the step.

@@ -1,5 +1,6 @@
-//! Sensor effects, which a session asks for. All are sampled with the episode's seed. Answers repeat these types, and a
-//! newer server may add fields to them; in requests, unknown fields are refused by `decode`.
+//! Sensor effects, which a session asks for. All are sampled with the episode's seed. Answers
+//! repeat these types, and a newer server may add fields to them; in requests, unknown fields are
+//! refused by `decode`.
 
 use std::collections::BTreeMap;
 
@@ -19,7 +20,8 @@ pub struct Sensors {
     /// Adds the tensor `sensor.wheel_speed`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub wheel_speed: Option<WheelSpeed>,
-    /// Time after which a decision takes effect, in microseconds: a whole number of steps. If absent, 0.
+    /// Time after which a decision takes effect, in microseconds: a whole number of steps. If
+    /// absent, 0.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(range(min = 0, max = 10_000_000)))]
     pub delay_us: Option<i64>,

@@ -29,12 +29,12 @@ pub fn available(camera: &RigCamera) -> wire::AvailableCamera {
         resolution_h: intrinsics.height_px,
         resolution_w: intrinsics.width_px,
         shutter_type: shutter_type.into(),
-        external_distortion: Intrinsics::of(intrinsics).windshield.map(windshield_to_wire),
+        external_distortion: Intrinsics::from_camera(intrinsics).windshield.map(windshield_to_wire),
     };
     wire::AvailableCamera {
         intrinsics: Some(spec),
-        // AlpaSim calls it `rig_to_camera`, but its value is rig_from_camera: the runtime multiplies the ego's pose
-        // with it from the right.
+        // AlpaSim calls it `rig_to_camera`, but its value is rig_from_camera: the runtime
+        // multiplies the ego's pose with it from the right.
         rig_to_camera: Some(pose_to_wire(rig_from_camera)),
         logical_id: logical_id(name),
     }
@@ -73,7 +73,8 @@ fn param(camera: &Camera) -> wire::CameraParam {
             let end_rad = lens.limit_rad();
             let end_px = lens.radius_px(end_rad);
             let [linear_c, linear_d, linear_e] = lens.linear_cde();
-            // AlpaSim's rectifier and scorers read only the polynomial from angles, whichever is exact.
+            // AlpaSim's rectifier and scorers read only the polynomial from angles, whichever is
+            // exact.
             let (reference, forward, backward) = match lens.reference() {
                 FThetaReference::AngleToPixel => (
                     wire::PolynomialType::AngleToPixeldist,

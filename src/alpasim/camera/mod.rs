@@ -1,8 +1,9 @@
 //! Cameras and shutters, to and from AlpaSim's messages.
 //!
 //! # Principal points
-//! AlpaSim measures the principal point of an f-theta camera from the centre of the first pixel, so that its value is
-//! 0.5 less than in this project. For OpenCV's models it is measured from the corner, as in this project.
+//! AlpaSim measures the principal point of an f-theta camera from the centre of the first pixel, so
+//! that its value is 0.5 less than in this project. For OpenCV's models it is measured from the
+//! corner, as in this project.
 
 mod listed;
 mod polynomial;
@@ -25,12 +26,7 @@ const PREFIX: &str = "camera_";
 pub enum CameraSpecError {
     /// A field is missing, or has the wrong number of values.
     #[error("{field}: {must}")]
-    Field {
-        /// The field.
-        field: &'static str,
-        /// The requirement.
-        must: String,
-    },
+    Field { field: &'static str, must: String },
     /// The numbers are no camera.
     #[error("camera_intrinsics: {0}")]
     Camera(#[from] CameraError),

@@ -3,8 +3,9 @@
 /// Points at which a polynomial is fitted.
 const FIT_POINTS: usize = 256;
 
-/// Coefficients of powers 0 to 5 of the polynomial through 0 that is nearest to `of` on [0, `end`], by least
-/// squares. The variable is scaled to [0, 1], so that the normal equations are well-conditioned enough.
+/// Coefficients of powers 0 to 5 of the polynomial through 0 that is nearest to `of` on [0, `end`],
+/// by least squares. The variable is scaled to [0, 1], so that the normal equations are
+/// well-conditioned enough.
 pub(super) fn fitted(end: f64, of: &dyn Fn(f64) -> f64) -> [f64; 6] {
     const TERMS: usize = 5;
     let mut normal = [[0.0; TERMS + 1]; TERMS];

@@ -36,7 +36,8 @@ pub fn camera(
     Ok(camera.scaled(width_px, height_px)?)
 }
 
-/// The view of a request: the camera where its exposure ends, and its motion with a rolling shutter.
+/// The view of a request: the camera where its exposure ends, and its motion with a rolling
+/// shutter.
 ///
 /// # Errors
 /// Names the first field that cannot be used.

@@ -1,8 +1,8 @@
 //! One episode with a session of wildcity and a session of a driver.
 //!
-//! At each decision the driver gets the images that are new, the ego's poses, and the route; then it is asked for a
-//! plan, which the ego follows for one step. `EPISODE_US` is added to the simulated times that are sent, because they
-//! are unsigned.
+//! At each decision the driver gets the images that are new, the ego's poses, and the route; then
+//! it is asked for a plan, which the ego follows for one step. `EPISODE_US` is added to the
+//! simulated times that are sent, because they are unsigned.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -43,10 +43,11 @@ pub struct EpisodeSettings {
     pub token: Option<String>,
     /// `HOST:PORT` of the driver.
     pub driver: String,
-    /// Options of the session: twin, version, rig, scenario, times. Its outputs are not used. Without dynamics, the ego
-    /// is `model` at `speed_m_s`.
+    /// Options of the session: twin, version, rig, scenario, times. Its outputs are not used.
+    /// Without dynamics, the ego is `model` at `speed_m_s`.
     pub open: Open,
-    /// Name of the drive to follow; if absent, the drive of the start, or else the first one of the twin.
+    /// Name of the drive to follow; if absent, the drive of the start, or else the first one of the
+    /// twin.
     pub trajectory: Option<String>,
     /// Start along the drive, in metres; if absent, the start of `open`.
     pub start_m: Option<f64>,
@@ -60,7 +61,6 @@ pub struct EpisodeSettings {
     pub speed_m_s: Option<f64>,
     /// Frames of each camera before the first decision.
     pub frames: u32,
-    /// Steps.
     pub steps: u64,
     /// Seed of the episode.
     pub seed: u64,
@@ -88,13 +88,10 @@ pub enum Outcome {
 /// Result of an episode.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EpisodeReport {
-    /// Its seed.
     pub seed: u64,
-    /// How it ended.
     pub outcome: Outcome,
     /// Why, unless it completed.
     pub reason: Option<String>,
-    /// Steps driven.
     pub steps: u64,
     /// Length of the driven path, in metres.
     pub distance_m: f64,
@@ -150,7 +147,7 @@ pub async fn drive_episode(settings: &EpisodeSettings) -> Result<EpisodeReport, 
     };
     Ok(EpisodeReport {
         seed: settings.seed,
-        outcome: failure.as_ref().map_or_else(|| driven_outcome(closed.outcome), outcome_of),
+        outcome: failure.as_ref().map_or_else(|| driven_outcome(closed.outcome), outcome),
         reason: failure.map(|error| error.to_string()),
         steps: closed.steps,
         distance_m: closed.distance_m,
@@ -167,7 +164,7 @@ fn driven_outcome(closed: message::Outcome) -> Outcome {
     }
 }
 
-fn outcome_of(error: &DriverError) -> Outcome {
+fn outcome(error: &DriverError) -> Outcome {
     match error {
         DriverError::Lost(_) => Outcome::AgentLost,
         DriverError::TimedOut { .. } => Outcome::AgentTimeout,
@@ -380,8 +377,8 @@ impl<'a> Episode<'a> {
         Ok(())
     }
 
-    /// The driven poses of the ego's history, the present one last. Their speeds are computed from differences; the
-    /// present speed is that of the ego.
+    /// The driven poses of the ego's history, the present one last. Their speeds are computed from
+    /// differences; the present speed is that of the ego.
     fn history(
         &self,
         seen: &Observation,

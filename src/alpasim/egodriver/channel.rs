@@ -21,8 +21,8 @@ pub(super) struct Channel(SendRequest<Body>);
 type Sent = Result<http::Response<hyper::body::Incoming>, hyper::Error>;
 
 impl Channel {
-    /// Connects to `HOST:PORT`, and tries again until `max_wait` is over: a driver that loads a network starts
-    /// to listen late.
+    /// Connects to `HOST:PORT`, and tries again until `max_wait` is over: a driver that loads a
+    /// network starts to listen late.
     ///
     /// # Errors
     /// The last reason.
@@ -42,8 +42,8 @@ impl Channel {
         stream.set_nodelay(true).map_err(|error| error.to_string())?;
         let handshake = http2::handshake(TokioExecutor::new(), TokioIo::new(stream)).await;
         let (sender, connection) = handshake.map_err(|error| error.to_string())?;
-        // The task ends when the last clone of the sender is dropped, or the driver disconnects, after which calls
-        // fail.
+        // The task ends when the last clone of the sender is dropped, or the driver disconnects,
+        // after which calls fail.
         tokio::spawn(connection);
         Ok(Self(sender))
     }

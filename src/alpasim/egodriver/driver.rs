@@ -13,8 +13,8 @@ use super::channel::Channel;
 use crate::limits;
 use crate::wire::{common, egodriver as wire};
 
-/// `AvailableCamera.rig_to_camera` is the pose of the optical frame, as AlpaSim has it. Without this entry the
-/// package `carla-driver-interface` takes it for that of a body frame.
+/// `AvailableCamera.rig_to_camera` is the pose of the optical frame, as AlpaSim has it. Without
+/// this entry the package `carla-driver-interface` takes it for that of a body frame.
 const CONTRACT: (&str, &str) = ("carla-driver-interface-contract", "2");
 
 /// Why a driver did not answer as it must.
@@ -29,21 +29,13 @@ pub enum DriverError {
     /// It did not answer in time.
     #[error("the driver did not answer {method} within {seconds} s")]
     TimedOut {
-        /// The method.
         method: &'static str,
         /// How long it had.
         seconds: f64,
     },
     /// It refused a request.
     #[error("{method}: {code}: {text}")]
-    Refused {
-        /// The method.
-        method: &'static str,
-        /// The gRPC status.
-        code: String,
-        /// Its text.
-        text: String,
-    },
+    Refused { method: &'static str, code: String, text: String },
     /// Its plan cannot be driven.
     #[error("the plan {0}")]
     Plan(String),
@@ -52,7 +44,6 @@ pub enum DriverError {
         "the image of camera {camera:?} has {bytes} bytes, and drivers accept 4 MiB: choose a smaller --size"
     )]
     Image {
-        /// The camera.
         camera: String,
         /// Size of the file.
         bytes: usize,
@@ -168,14 +159,14 @@ impl Driver {
             grpc.ready().await.map_err(|error| DriverError::Lost(error.to_string()))?;
             let codec = ProstCodec::<Asked, Answer>::default();
             let answer = grpc.unary(request, path, codec).await;
-            answer.map(tonic::Response::into_inner).map_err(|status| of_status(method, &status))
+            answer.map(tonic::Response::into_inner).map_err(|status| driver_error(method, &status))
         };
         let seconds = max_wait.as_secs_f64();
         timeout(max_wait, calling).await.unwrap_or(Err(DriverError::TimedOut { method, seconds }))
     }
 }
 
-fn of_status(method: &'static str, status: &Status) -> DriverError {
+fn driver_error(method: &'static str, status: &Status) -> DriverError {
     let text = status.message().to_owned();
     match status.code() {
         Code::Unavailable => DriverError::Lost(text),

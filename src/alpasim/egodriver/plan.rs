@@ -11,7 +11,8 @@ use crate::wire::common::Trajectory;
 /// The poses after `now_us`, in the present rig frame. Drivers begin with the present pose.
 ///
 /// # Errors
-/// There is no pose after `now_us`, the plan ends before the step does, a pose is invalid, or times do not rise.
+/// There is no pose after `now_us`, the plan ends before the step does, a pose is invalid, or times
+/// do not rise.
 pub(super) fn trajectory(
     plan: Option<&Trajectory>,
     frame: &LocalFrame,

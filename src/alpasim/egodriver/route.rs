@@ -29,8 +29,9 @@ impl Route {
         Self { points, stations_m, at_m: None }
     }
 
-    /// 20 points of the drive from where the ego is to 80 m ahead, in the rig frame, at height 0. After the end of the
-    /// drive they continue straight, because a driver stops at the end of a route.
+    /// 20 points of the drive from where the ego is to 80 m ahead, in the rig frame, at height 0.
+    /// After the end of the drive they continue straight, because a driver stops at the end of a
+    /// route.
     pub(super) fn ahead(&mut self, world_from_rig: &Pose) -> Vec<Vec3> {
         let ego = world_from_rig.position_m.truncate();
         let at_m = self.nearest_m(ego);
@@ -76,8 +77,8 @@ impl Route {
     }
 }
 
-/// The 20 points of a scenario's route, which are in the rig frame and have the same distances, at height 0. A shorter
-/// route is extended straight.
+/// The 20 points of a scenario's route, which are in the rig frame and have the same distances, at
+/// height 0. A shorter route is extended straight.
 pub(super) fn waypoints(points: &[[f64; 3]]) -> Vec<Vec3> {
     let mut ahead: Vec<DVec2> = points.iter().map(|&[x, y, _]| DVec2::new(x, y)).collect();
     let direction = match ahead.as_slice() {

@@ -9,12 +9,13 @@ use crate::limits;
 use crate::object::raised;
 use crate::wire::physics::Status;
 
-/// Puts a box on the ground: moves it vertically and tilts it, so that it stands on the ground's plane, and keeps its
-/// heading and the x and y of its middle. `world_from_box` is the pose of its middle.
+/// Puts a box on the ground: moves it vertically and tilts it, so that it stands on the ground's
+/// plane, and keeps its heading and the x and y of its middle. `world_from_box` is the pose of its
+/// middle.
 ///
-/// The pose is returned unchanged, with the reason, if there is no ground at the box, or if it would move by more than
-/// [`limits::PHYSICS_TRANSLATION_M`] or rotate by more than [`limits::PHYSICS_ROTATION_RAD`]: AlpaSim's own service
-/// does the same.
+/// The pose is returned unchanged, with the reason, if there is no ground at the box, or if it
+/// would move by more than [`limits::PHYSICS_TRANSLATION_M`] or rotate by more than
+/// [`limits::PHYSICS_ROTATION_RAD`]: AlpaSim's own service does the same.
 pub fn on_ground(ground: &Ground<'_>, world_from_box: &Pose, height_m: f64) -> (Pose, Status) {
     match placed(ground, world_from_box, height_m) {
         None => (*world_from_box, Status::InsufficientPointsFitplane),
@@ -28,7 +29,8 @@ pub fn on_ground(ground: &Ground<'_>, world_from_box: &Pose, height_m: f64) -> (
 fn placed(ground: &Ground<'_>, world_from_box: &Pose, height_m: f64) -> Option<Pose> {
     let bottom = raised(world_from_box, -0.5 * height_m);
     let on_plane = ground.find(bottom)?;
-    // The middle is half the height away from the ground's plane, along its normal, which is not vertical.
+    // The middle is half the height away from the ground's plane, along its normal, which is not
+    // vertical.
     let up = on_plane.rotation * DVec3::Z;
     let aside_m = world_from_box.position_m - on_plane.position_m;
     let rise_m = (0.5 * height_m - aside_m.x * up.x - aside_m.y * up.y) / up.z;
@@ -79,7 +81,8 @@ mod tests {
             let (there, status) = on_ground(&ground, &level, HEIGHT_M);
             assert_eq!(status, Status::SuccessfulUpdate);
             assert_eq!(there.position_m.truncate(), level.position_m.truncate());
-            // The middle of the lower face is on the plane z = 0.1 x, and the box is along its normal.
+            // The middle of the lower face is on the plane z = 0.1 x, and the box is along its
+            // normal.
             let bottom = raised(&there, -0.5 * HEIGHT_M).position_m;
             assert!((bottom.z - 0.1 * bottom.x).abs() < 1e-9, "{bottom}");
             let up = there.rotation * DVec3::Z;

@@ -1,4 +1,5 @@
-//! wildcity as AlpaSim's physics: the service `physics.PhysicsService`, which puts boxes on the ground.
+//! wildcity as AlpaSim's physics: the service `physics.PhysicsService`, which puts boxes on the
+//! ground.
 //!
 //! The ground is that of the version's recorded drives, as for the simulated car. There is no mesh.
 
@@ -22,8 +23,8 @@ use crate::wire::physics as wire;
 
 pub use ground::on_ground;
 
-/// Puts the boxes of the ego and of other actors on the ground of a scene. `running` has a permit for each request that
-/// may run at the same time.
+/// Puts the boxes of the ego and of other actors on the ground of a scene. `running` has a permit
+/// for each request that may run at the same time.
 ///
 /// # Errors
 /// There is no such scene, or a pose or a size is missing or invalid, or too many requests run.

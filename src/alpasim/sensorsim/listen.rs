@@ -32,14 +32,10 @@ pub enum AlpasimError {
         "{address} is not a loopback address, and AlpaSim sends no tokens: any machine of the network could \
          read the twins; give --alpasim-open if that is intended"
     )]
-    PublicAddress {
-        /// The refused address.
-        address: SocketAddr,
-    },
+    PublicAddress { address: SocketAddr },
     /// The address cannot be used.
     #[error("cannot listen on {address}: {cause}")]
     Listen {
-        /// The address.
         address: SocketAddr,
         /// The operating system's error.
         cause: io::Error,
@@ -135,14 +131,16 @@ async fn accept(
             });
             let connection = http2::Builder::new(TokioExecutor::new())
                 .timer(TokioTimer::new())
-                // Images of a request have megabytes; the default window of 64 KiB would stop at each part.
+                // Images of a request have megabytes; the default window of 64 KiB would stop at
+                // each part.
                 .initial_stream_window_size(8 << 20)
                 .initial_connection_window_size(16 << 20)
                 .max_concurrent_streams(64)
                 .serve_connection(TokioIo::new(stream), service);
             tokio::pin!(connection);
             tokio::select! {
-                // Errors are caused by the client, which disconnected or sent no HTTP/2, and are not logged.
+                // Errors are caused by the client, which disconnected or sent no HTTP/2, and are
+                // not logged.
                 _ = &mut connection => {}
                 () = stopped(stopping) => {
                     // Running requests see the same signal, and are answered.

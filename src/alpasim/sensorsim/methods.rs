@@ -55,7 +55,8 @@ impl Sensorsim {
         })
     }
 
-    /// The latest version of each drive at every 100 m, and `*`: other versions and starts are valid too.
+    /// The latest version of each drive at every 100 m, and `*`: other versions and starts are
+    /// valid too.
     pub(super) async fn get_available_scenes(
         &self,
     ) -> Result<common::AvailableScenesReturn, Status> {
@@ -146,8 +147,9 @@ impl Sensorsim {
         Ok(image?)
     }
 
-    /// Several images. An invalid camera, pose or size fails only its own image. An error that concerns all images
-    /// fails the request, so that a client can distinguish an invalid request from a busy server.
+    /// Several images. An invalid camera, pose or size fails only its own image. An error that
+    /// concerns all images fails the request, so that a client can distinguish an invalid request
+    /// from a busy server.
     pub(super) async fn batch_render_rgb(
         &self,
         asked: wire::BatchRgbRenderRequest,

@@ -1,8 +1,8 @@
 //! The assets of dynamic objects that were drawn recently.
 //!
-//! A rollout requests the same objects ten times a second. So an asset stays in memory for [`limits::SCENE_IDLE`], and
-//! is not made or read again. Names are resolved anew for every request, because an asset may be removed, and its name
-//! given to another one.
+//! A rollout requests the same objects ten times a second. So an asset stays in memory for
+//! [`limits::SCENE_IDLE`], and is not made or read again. Names are resolved anew for every
+//! request, because an asset may be removed, and its name given to another one.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -20,7 +20,8 @@ use crate::object::{ObjectShape, actor_of_centre};
 use crate::scene::{LocalFrame, SceneError};
 use crate::wire::sensorsim as wire;
 
-/// Assets and the times when they were last drawn, by hash for assets of the store, and by key for boxes.
+/// Assets and the times when they were last drawn, by hash for assets of the store, and by key for
+/// boxes.
 #[derive(Default)]
 pub(super) struct ObjectAssets(Mutex<BTreeMap<String, (Arc<ResidentActor>, Instant)>>);
 
@@ -41,7 +42,7 @@ impl Object {
         object: &wire::DynamicObject,
         frame: &LocalFrame,
     ) -> Result<Self, SensorsimError> {
-        let shape = ObjectShape::of_track(&object.track_id)?;
+        let shape = ObjectShape::from_track(&object.track_id)?;
         let field = "dynamic_objects.pose_pair";
         let pair = object.pose_pair.ok_or(SceneError::Missing { field })?;
         let end = frame.world_from("dynamic_objects.pose_pair.end_pose", pair.end_pose.as_ref())?;
@@ -141,8 +142,8 @@ impl ObjectAssets {
         Some(asset.clone())
     }
 
-    /// Loads an asset into memory. If there is too little memory, drops assets that no request draws, and tries once
-    /// more.
+    /// Loads an asset into memory. If there is too little memory, drops assets that no request
+    /// draws, and tries once more.
     fn load(
         &self,
         key: &str,
@@ -180,7 +181,7 @@ mod tests {
     /// If there is too little memory, only assets that no request draws are dropped.
     #[test]
     fn assets_that_no_request_draws_make_room() {
-        let shape = ObjectShape::of_track("7@4x2x1").unwrap();
+        let shape = ObjectShape::from_track("7@4x2x1").unwrap();
         let asset = shape.box_asset().unwrap().unwrap();
         let dir = tempfile::tempdir().unwrap();
         let cache = Cache::limited(Catalog::open(dir.path()).unwrap(), Some(2 * asset.bytes()));

@@ -82,7 +82,8 @@ impl OpenVersions {
         }
     }
 
-    /// Drops scenes that were not drawn for [`limits::SCENE_IDLE`], and frees the memory of their versions.
+    /// Drops scenes that were not drawn for [`limits::SCENE_IDLE`], and frees the memory of their
+    /// versions.
     pub(super) async fn forget_idle(&self) {
         let mut open = self.versions.lock().await;
         open.retain(|_, version| {

@@ -127,8 +127,8 @@ struct Group {
 }
 
 impl Renderer<'_> {
-    /// The images of requests, or why there is none, in their order. Requests of the same scene and with the same
-    /// objects are rendered together.
+    /// The images of requests, or why there is none, in their order. Requests of the same scene and
+    /// with the same objects are rendered together.
     pub(super) async fn images(self, requests: &[&wire::RgbRenderRequest]) -> Vec<Image> {
         let mut images: Vec<Option<Image>> = requests.iter().map(|_| None).collect();
         let mut by_scene: Vec<(&str, Vec<usize>)> = Vec::new();
@@ -219,8 +219,8 @@ fn no_image() -> Image {
     Err(SensorsimError::Invalid("no image was made".to_owned()))
 }
 
-/// The same error for each of several requests. Errors of the operating system cannot be cloned, but the messages for
-/// the client can.
+/// The same error for each of several requests. Errors of the operating system cannot be cloned,
+/// but the messages for the client can.
 fn repeated(error: &SensorsimError, count: usize) -> impl Iterator<Item = Image> + use<> {
     let status = error.status();
     (0..count).map(move |_| Err(SensorsimError::Repeated(status.clone())))

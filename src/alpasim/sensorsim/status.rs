@@ -1,6 +1,7 @@
 //! The gRPC status of each error.
 //!
-//! AlpaSim's runtime retries `UNAVAILABLE`, and `DEADLINE_EXCEEDED` with the text "Stopped waiting for backend".
+//! AlpaSim's runtime retries `UNAVAILABLE`, and `DEADLINE_EXCEEDED` with the text "Stopped waiting
+//! for backend".
 
 use tonic::Status;
 
@@ -31,10 +32,8 @@ pub(crate) enum SensorsimError {
     /// The session layer refused.
     #[error(transparent)]
     Session(#[from] SessionError),
-    /// The service stops.
     #[error("the server is shutting down")]
     Stopping,
-    /// Not offered.
     #[error("{0}")]
     Unimplemented(&'static str),
     /// The error of another request of the same scene.
@@ -62,7 +61,7 @@ impl SensorsimError {
             Self::Invalid(_) | Self::Camera(_) | Self::Object(_) => Status::invalid_argument(text),
             Self::Stopping => Status::unavailable(text),
             Self::Unimplemented(what) => Status::unimplemented(*what),
-            Self::Session(error) => of_session(error, text),
+            Self::Session(error) => session_status(error, text),
             Self::Repeated(status) => status.clone(),
         };
         let text = status.message();
@@ -80,7 +79,7 @@ impl From<SensorsimError> for Status {
     }
 }
 
-fn of_session(error: &SessionError, text: String) -> Status {
+fn session_status(error: &SessionError, text: String) -> Status {
     let late = || Status::deadline_exceeded(format!("Stopped waiting for backend: {text}"));
     match error {
         SessionError::Twin(
@@ -143,7 +142,7 @@ mod tests {
         };
         let no_actor = StoreError::NoActor { text, found: 0, known: Vec::new() };
         let id = "x".parse::<crate::scene::SceneId>().unwrap_err();
-        let object = crate::object::ObjectShape::of_track("7@").unwrap_err();
+        let object = crate::object::ObjectShape::from_track("7@").unwrap_err();
         let late = "Stopped waiting for backend: ";
         for (error, code, start) in [
             (SensorsimError::from(id), Code::NotFound, "\"x\" is no scene"),

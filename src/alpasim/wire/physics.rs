@@ -1,8 +1,8 @@
 //! Package `physics`: boxes that are put on the ground.
 //!
-//! AlpaSim has had two forms of the ego: one pose (`pose_pair`, answered by `ego_pose`), and later a trajectory
-//! (`ego_trajectory_aabb`, answered by the field of the same name and `ego_status`). Their field numbers differ, so
-//! that one message has both.
+//! AlpaSim has had two forms of the ego: one pose (`pose_pair`, answered by `ego_pose`), and later
+//! a trajectory (`ego_trajectory_aabb`, answered by the field of the same name and `ego_status`).
+//! Their field numbers differ, so that one message has both.
 
 #![allow(missing_docs, reason = "the fields are AlpaSim's, and are explained there")]
 

@@ -18,9 +18,9 @@ pub(super) struct AssetOptions {
     #[arg(long, default_value = "vehicle", value_parser = parse_class)]
     pub(super) class: ActorClass,
 
-    /// Directions of the file's axes: a preset, or the 9 numbers of the matrix from the file's axes to the actor's
-    /// (x forward, y left, z up), row by row. A glTF file that looks along +z, as the standard says, has
-    /// '0 0 1 1 0 0 0 1 0'.
+    /// Directions of the file's axes: a preset, or the 9 numbers of the matrix from the file's axes
+    /// to the actor's (x forward, y left, z up), row by row. A glTF file that looks along +z, as
+    /// the standard says, has '0 0 1 1 0 0 0 1 0'.
     #[arg(long, default_value = "identity", allow_hyphen_values = true)]
     pub(super) axes: String,
 
@@ -28,8 +28,8 @@ pub(super) struct AssetOptions {
     #[arg(long, default_value_t = 1.0, allow_negative_numbers = true)]
     pub(super) scale: f64,
 
-    /// Number of flat Gaussians that cover the triangles of a mesh, 1,000 to 1,000,000. Small triangles add more
-    /// Gaussians.
+    /// Number of flat Gaussians that cover the triangles of a mesh, 1,000 to 1,000,000. Small
+    /// triangles add more Gaussians.
     #[arg(
         long,
         value_name = "N",
@@ -53,7 +53,7 @@ impl AssetOptions {
     pub(super) fn settings(&self, source: &Path) -> anyhow::Result<AssetSettings> {
         let name = match &self.name {
             Some(name) => name.clone(),
-            None => name_of(source),
+            None => default_name(source),
         };
         anyhow::ensure!(
             is_name(&name),
@@ -71,7 +71,7 @@ impl AssetOptions {
 }
 
 /// The file's name without its extension, in small letters, with _ for other characters.
-fn name_of(source: &Path) -> String {
+fn default_name(source: &Path) -> String {
     name_from(&source.file_stem().unwrap_or_default().to_string_lossy())
 }
 

@@ -20,11 +20,12 @@ use wildcity_twin::store::{Catalog, CutPlace, Version};
 use super::asset_options::parse_class;
 use crate::cli::directories::{TwinVersion, Twins};
 
-/// Cut the Gaussians in a box out of a twin: makes a new version without them, and an asset of exactly these Gaussians.
+/// Cut the Gaussians in a box out of a twin: makes a new version without them, and an asset of
+/// exactly these Gaussians.
 ///
-/// So a parked car can become an actor that drives away. Everything from 5 cm above the bottom of the box on is cut;
-/// the ground stays. Where the car hid the ground, the new version may have a hole, which shows in the opacity. Open
-/// sessions keep the version that they have.
+/// So a parked car can become an actor that drives away. Everything from 5 cm above the bottom of
+/// the box on is cut; the ground stays. Where the car hid the ground, the new version may have a
+/// hole, which shows in the opacity. Open sessions keep the version that they have.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Cut {
@@ -32,15 +33,15 @@ pub(super) struct Cut {
     #[arg(value_name = "TWIN")]
     twin: TwinVersion,
 
-    /// The box: the point on the ground under its middle and its heading, in world axes (metres, and degrees to the
-    /// left from x), and its length, width and height in metres.
+    /// The box: the point on the ground under its middle and its heading, in world axes (metres,
+    /// and degrees to the left from x), and its length, width and height in metres.
     #[arg(long = "box", value_name = "X,Y,Z,DEGREES,L,W,H", allow_hyphen_values = true)]
     #[arg(required_unless_present = "tracks", conflicts_with = "tracks", requires = "name")]
     region: Option<Region>,
 
-    /// Cut the volume that the recorded actors of a wildcity.tracks/1 file swept, instead of a box. Vehicles drove
-    /// through this volume, so it contains no static object. Makes no asset, because a moving car is reconstructed as a
-    /// smear.
+    /// Cut the volume that the recorded actors of a wildcity.tracks/1 file swept, instead of a box.
+    /// Vehicles drove through this volume, so it contains no static object. Makes no asset, because
+    /// a moving car is reconstructed as a smear.
     #[arg(long, value_name = "FILE")]
     tracks: Option<PathBuf>,
 
@@ -135,7 +136,7 @@ impl Cut {
 
         // Exact, since the twin's own record has rounded its values already.
         let source = format!("cut from twin {} version {}", self.twin.name, base.hash);
-        let provenance = Provenance::of(source);
+        let provenance = Provenance::new(source);
         let description = AssetDescription { name, class: self.class, box_, provenance };
         let asset = ActorAsset::new(&cut.gaussians, description).context("cannot make an asset")?;
         let stored = catalog.put_actor(&asset, RecordFormat::F32)?;

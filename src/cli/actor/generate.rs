@@ -6,12 +6,13 @@ use wildcity_session::generated_actors;
 
 use crate::cli::directories::Twins;
 
-/// Make the assets of actors that name none: a hatchback, a sedan, a van, a truck, a bus, a pedestrian, a cyclist and a crate.
+/// Make the assets of actors that name none: a hatchback, a sedan, a van, a truck, a bus, a
+/// pedestrian, a cyclist and a crate.
 ///
 /// A scenario that needs one makes it, too.
 ///
-/// They are made by a program, like the demo street, and lit from above, so that they fit every heading. Those that
-/// exist already stay as they are.
+/// They are made by a program, like the demo street, and lit from above, so that they fit every
+/// heading. Those that exist already stay as they are.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:

@@ -23,10 +23,11 @@ use crate::cli::file_notes;
 use crate::cli::packed_folder::scene_file;
 use crate::cli::progress;
 
-/// Make an asset of an actor from a file: Gaussians of any format that `wildcity import` reads, or a glTF mesh.
+/// Make an asset of an actor from a file: Gaussians of any format that `wildcity import` reads, or
+/// a glTF mesh.
 ///
-/// The box is that of the Gaussians' centres. They are moved so that the origin is on the ground under the middle of
-/// the box.
+/// The box is that of the Gaussians' centres. They are moved so that the origin is on the ground
+/// under the middle of the box.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Import {
@@ -37,8 +38,9 @@ pub(super) struct Import {
     #[command(flatten)]
     options: AssetOptions,
 
-    /// Import the tracked objects of a recorded drive, each as an asset named NAME-TRACK: those of NuRec, or
-    /// drivestudio's RigidNodes (python -m wildcity.convert CKPT.pth OUT.safetensors --model RigidNodes).
+    /// Import the tracked objects of a recorded drive, each as an asset named NAME-TRACK: those of
+    /// NuRec, or drivestudio's RigidNodes (python -m wildcity.convert CKPT.pth OUT.safetensors
+    /// --model RigidNodes).
     #[arg(long)]
     tracked: bool,
 
@@ -82,7 +84,8 @@ impl Import {
         Ok(())
     }
 
-    /// Imports each tracked object. Its origin stays under the middle of the track's box, where the track's poses are.
+    /// Imports each tracked object. Its origin stays under the middle of the track's box, where the
+    /// track's poses are.
     fn import_tracked(
         &self,
         settings: &AssetSettings,

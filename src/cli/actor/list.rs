@@ -7,8 +7,9 @@ use wildcity_twin::store::{ActorList, DamagedActor};
 
 use crate::cli::directories::Twins;
 
-/// List the assets of actors: name, class, size, Gaussians, and hash. An asset that cannot be read is listed as damaged
-/// with the reason: make it again, or remove it, unless the disk or the object store failed.
+/// List the assets of actors: name, class, size, Gaussians, and hash. An asset that cannot be read
+/// is listed as damaged with the reason: make it again, or remove it, unless the disk or the object
+/// store failed.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:

@@ -11,9 +11,11 @@ mod remove;
 mod show;
 mod summary;
 
-/// Make, list, show and remove assets of actors, from which other vehicles and pedestrians are rendered.
+/// Make, list, show and remove assets of actors, from which other vehicles and pedestrians are
+/// rendered.
 ///
-/// Assets are stored next to the twins, and all twins share them. An asset is identified by the BLAKE3 of its content.
+/// Assets are stored next to the twins, and all twins share them. An asset is identified by the
+/// BLAKE3 of its content.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:

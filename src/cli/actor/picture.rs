@@ -39,8 +39,8 @@ pub(super) fn draw_all_around(asset: &ActorAsset) -> anyhow::Result<Vec<u8>> {
     png(&all)
 }
 
-/// Renders the actor's right side as a vehicle's front camera sees it: 1440 x 928 px, a focal length of 1800 px,
-/// 1.5 m above the ground, and `distance_m` from the side of the box.
+/// Renders the actor's right side as a vehicle's front camera sees it: 1440 x 928 px, a focal
+/// length of 1800 px, 1.5 m above the ground, and `distance_m` from the side of the box.
 pub(super) fn draw_side(asset: &ActorAsset, distance_m: f64) -> anyhow::Result<Vec<u8>> {
     let aside_m = 0.5 * asset.description.box_.width_m + distance_m;
     let position_m = DVec3::new(0.0, -aside_m, 1.5);

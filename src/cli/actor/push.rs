@@ -14,17 +14,17 @@ use super::summary::Summary;
 use crate::cli::progress;
 use crate::cli::push::{Server, upload_all};
 
-/// Make an asset on a running server from files of this machine. `wildcity actor import` does this on the server's
-/// machine.
+/// Make an asset on a running server from files of this machine. `wildcity actor import` does this
+/// on the server's machine.
 ///
-/// The same files with the same options give the same hash. Sessions that open afterwards can use the asset, by name
-/// and by hash. The name is refused if an asset with other content has it. To continue an upload after a lost
-/// connection, run the same command again.
+/// The same files with the same options give the same hash. Sessions that open afterwards can use
+/// the asset, by name and by hash. The name is refused if an asset with other content has it. To
+/// continue an upload after a lost connection, run the same command again.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Push {
-    /// Files of Gaussians, or glTF meshes, and the files that they name. Files in folders below that of the first file
-    /// keep these folders in their names.
+    /// Files of Gaussians, or glTF meshes, and the files that they name. Files in folders below
+    /// that of the first file keep these folders in their names.
     #[arg(value_name = "FILE", required = true)]
     files: Vec<PathBuf>,
 

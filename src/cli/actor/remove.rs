@@ -8,8 +8,8 @@ use crate::cli::directories::Twins;
 
 /// Remove an asset, to free disk space or its name.
 ///
-/// Running episodes keep it in memory. Afterwards, scenarios that name it are refused, and recorded episodes that show
-/// it cannot be replayed, until the same asset is made again. No twin changes.
+/// Running episodes keep it in memory. Afterwards, scenarios that name it are refused, and recorded
+/// episodes that show it cannot be replayed, until the same asset is made again. No twin changes.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:

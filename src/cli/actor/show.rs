@@ -22,12 +22,13 @@ pub(super) struct Show {
     #[arg(value_name = "ACTOR")]
     actor: String,
 
-    /// Write a PNG of the actor from ahead on its left, from its right, from behind and from above, on grey.
+    /// Write a PNG of the actor from ahead on its left, from its right, from behind and from above,
+    /// on grey.
     #[arg(long, value_name = "FILE")]
     picture: Option<PathBuf>,
 
-    /// Draw the picture as a vehicle's camera sees the actor's right side from this distance, in metres: 1440 x 928
-    /// px, focal length 1800 px.
+    /// Draw the picture as a vehicle's camera sees the actor's right side from this distance, in
+    /// metres: 1440 x 928 px, focal length 1800 px.
     #[arg(long, value_name = "M", requires = "picture", value_parser = parse_distance)]
     distance: Option<f64>,
 

@@ -1,4 +1,5 @@
-//! The summary that `wildcity actor import` and `wildcity actor push` print of the asset that they made.
+//! The summary that `wildcity actor import` and `wildcity actor push` print of the asset that they
+//! made.
 
 use std::fmt;
 

@@ -18,8 +18,8 @@ use wildcity_twin::store::Catalog;
 
 /// Write scenes of a twin as the files that AlpaSim's runtime reads: rig, cameras, tracks and map.
 ///
-/// Writes one file per scene, TWIN@VERSION+TRAJECTORY+START_M.usdz, and prints what AlpaSim's configuration needs.
-/// The images come from `wildcity serve --alpasim`.
+/// Writes one file per scene, TWIN@VERSION+TRAJECTORY+START_M.usdz, and prints what AlpaSim's
+/// configuration needs. The images come from `wildcity serve --alpasim`.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Example:
@@ -41,8 +41,8 @@ pub(super) struct Export {
     #[arg(long, value_name = "S", default_value_t = 20.0, value_parser = positive)]
     length_s: f64,
 
-    /// Recorded traffic, a file of format wildcity.tracks/1 on the clock of the drive. A track without an asset becomes a
-    /// grey box of its size.
+    /// Recorded traffic, a file of format wildcity.tracks/1 on the clock of the drive. A track
+    /// without an asset becomes a grey box of its size.
     #[arg(long, value_name = "FILE")]
     tracks: Option<PathBuf>,
 

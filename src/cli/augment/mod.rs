@@ -31,18 +31,20 @@ use super::{output, placement, progress};
 
 /// Render views of a twin off its recorded drives, repair them, and write them as training data.
 ///
-/// A twin is accurate on its drives and less accurate off them. This command renders the twin off its drives, repairs
-/// the images with a model, and writes them with masks, depth and poses, so that a trainer can learn from them as from
-/// recorded images, but with less weight. A twin that is trained on these images is accurate at larger distances from
-/// the drives.
+/// A twin is accurate on its drives and less accurate off them. This command renders the twin off
+/// its drives, repairs the images with a model, and writes them with masks, depth and poses, so
+/// that a trainer can learn from them as from recorded images, but with less weight. A twin that is
+/// trained on these images is accurate at larger distances from the drives.
 ///
-/// A model can correct small errors; where the image is far off, it hallucinates. So the views move away from the
-/// drives in rounds: round N renders at min(0.5 m x N, OFFSET) for each OFFSET of --offsets, to the left and to the
-/// right of the drive, every --every metres, with the heading of the drive and all cameras. Train on a round, push the
-/// twin, and render the next round from it. Each round has its own folder, DIR/round_N.
+/// A model can correct small errors; where the image is far off, it hallucinates. So the views move
+/// away from the drives in rounds: round N renders at min(0.5 m x N, OFFSET) for each OFFSET of
+/// --offsets, to the left and to the right of the drive, every --every metres, with the heading of
+/// the drive and all cameras. Train on a round, push the twin, and render the next round from it.
+/// Each round has its own folder, DIR/round_N.
 ///
-/// Images have no overlay, exposure or rolling shutter. Poses are in the twin's axes. To continue an interrupted run,
-/// run the same command again. docs/augmentation.md explains how to train with it.
+/// Images have no overlay, exposure or rolling shutter. Poses are in the twin's axes. To continue
+/// an interrupted run, run the same command again. docs/augmentation.md explains how to train with
+/// it.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Augment {
@@ -50,7 +52,8 @@ pub(super) struct Augment {
     #[arg(value_name = "TWIN")]
     twin: TwinVersion,
 
-    /// Lateral offsets that the rounds lead to, in metres, separated by commas, each to both sides of the drives.
+    /// Lateral offsets that the rounds lead to, in metres, separated by commas, each to both sides
+    /// of the drives.
     #[arg(long, value_name = "M,..", default_value = "1,3,5", value_delimiter = ',', value_parser = metres)]
     offsets: Vec<f64>,
 
@@ -66,18 +69,19 @@ pub(super) struct Augment {
     #[arg(long, value_name = "NAMES", value_delimiter = ',')]
     cameras: Vec<String>,
 
-    /// Longest side of an image, in pixels; larger images of the rig are rendered at a reduced size [default: the
-    /// rig's]
+    /// Longest side of an image, in pixels; larger images of the rig are rendered at a reduced size
+    /// [default: the rig's]
     #[arg(long, value_name = "PX", value_parser = clap::value_parser!(u32).range(16..=8192))]
     side: Option<u32>,
 
-    /// Keep the lenses of the rig. Without this option, each lens is replaced by a pinhole with its field of view, up
-    /// to 100°. transforms.json and COLMAP can describe pinholes, OpenCV lenses with k1, k2, p1 and p2, and OpenCV
-    /// fisheyes; other lenses and windshields are refused.
+    /// Keep the lenses of the rig. Without this option, each lens is replaced by a pinhole with its
+    /// field of view, up to 100°. transforms.json and COLMAP can describe pinholes, OpenCV lenses
+    /// with k1, k2, p1 and p2, and OpenCV fisheyes; other lenses and windshields are refused.
     #[arg(long)]
     lenses: bool,
 
-    /// Largest number of points of the COLMAP model: opaque Gaussians within 100 m of a view, chosen at random.
+    /// Largest number of points of the COLMAP model: opaque Gaussians within 100 m of a view,
+    /// chosen at random.
     #[arg(long, value_name = "N", default_value_t = limits::POINTS, value_parser = clap::value_parser!(u32).range(0..=MOST_POINTS))]
     points: u32,
 
@@ -171,7 +175,7 @@ impl Augment {
         let plan = Plan::new(self.round, &self.offsets, self.every)?;
         let version = catalog.version(&self.twin.name, self.twin.number)?;
         let cameras = options::cameras(&version, &self.cameras, self.side, self.lenses)?;
-        let lens_model = CameraModel::of(&cameras)?;
+        let lens_model = CameraModel::from_cameras(&cameras)?;
         let places = plan.places(&version.manifest.trajectories)?;
         let samples = places.len() * cameras.len();
         let limit = limits::MOST_SAMPLES;
@@ -269,7 +273,7 @@ impl Augment {
             version: job.version.number,
             offsets_m: job.plan.offsets_m(),
             // Some versions do not record this, such as pushed ones.
-            world_from_capture: placement::of_version(catalog, &job.version)
+            world_from_capture: placement::from_version(catalog, &job.version)
                 .ok()
                 .map(|alignment| alignment.to_string()),
         }
@@ -305,7 +309,7 @@ impl Augment {
     }
 
     fn sampled_points(&self, catalog: &Catalog, job: &Job) -> anyhow::Result<Vec<Point>> {
-        let near = Surroundings::of(&job.places);
+        let near = Surroundings::from_places(&job.places);
         let mut sample = PointSample::new(self.seed, self.points as usize, near.clone());
         if self.points > 0 {
             let is_near = |bounds: &Bounds| near.meet(bounds);

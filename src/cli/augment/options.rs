@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::{Context, ensure};
 
-use wildcity_augment::{TrainingCamera, pinhole_of};
+use wildcity_augment::{TrainingCamera, without_lens};
 use wildcity_repair::{LoadOptions, Models, RepairError};
 use wildcity_scene::Rig;
 use wildcity_scene::geometry::Camera;
@@ -20,7 +20,8 @@ const DEFAULT_RIG: &str = "vehicle6";
 /// The model that repairs the images.
 #[derive(Debug, clap::Args)]
 pub(super) struct ModelOptions {
-    /// Manifest of the model that repairs the images (docs/repair.md) [default: none, images are as rendered]
+    /// Manifest of the model that repairs the images (docs/repair.md) [default: none, images are as
+    /// rendered]
     #[arg(long, value_name = "MODEL.json")]
     repair: Option<PathBuf>,
 
@@ -69,7 +70,7 @@ pub(super) fn cameras(
     }
     let is_drawn = |name: &String| named.is_empty() || named.contains(name);
     let cameras = rig.cameras.iter().filter(|camera| is_drawn(&camera.name)).map(|mounted| {
-        let camera = if lenses { mounted.camera } else { pinhole_of(&mounted.camera) };
+        let camera = if lenses { mounted.camera } else { without_lens(&mounted.camera) };
         let camera = sized(camera, side_px);
         let camera = camera.with_context(|| format!("camera {:?}", mounted.name))?;
         let rig_from_camera = mounted.rig_from_camera;

@@ -38,7 +38,8 @@ pub(super) struct Drawn {
 }
 
 impl ViewSessions {
-    /// Opens the sessions with these cameras. `model` is the name of the model and the least trust of its images.
+    /// Opens the sessions with these cameras. `model` is the name of the model and the least trust
+    /// of its images.
     pub(super) async fn open(
         url: &str,
         version: &Version,
@@ -140,7 +141,8 @@ async fn client(url: &str) -> anyhow::Result<Client> {
     Ok(client)
 }
 
-/// A camera without shutter, exposure and overlay, in the form of the wire. Rig files and the wire have the same JSON.
+/// A camera without shutter, exposure and overlay, in the form of the wire. Rig files and the wire
+/// have the same JSON.
 fn wire_camera(
     training: &TrainingCamera,
 ) -> anyhow::Result<wildcity_client::protocol::message::RigCamera> {

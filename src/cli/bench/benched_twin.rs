@@ -50,7 +50,8 @@ impl BenchedTwin {
         Ok(engine)
     }
 
-    /// A server for this process on a directory or URL of twins. Records, scenarios and uploads lie below `scratch`.
+    /// A server for this process on a directory or URL of twins. Records, scenarios and uploads lie
+    /// below `scratch`.
     pub(super) fn server(&self, twins: PathBuf, scratch: &Path) -> anyhow::Result<Config> {
         let directories = Directories {
             twins,

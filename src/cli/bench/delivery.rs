@@ -20,10 +20,10 @@ use wildcity_session::{Encoding, Outputs, RigChoice, Session, Still, Stills};
 
 /// Measure the cost of delivering a step's raw images to an agent on the same machine.
 ///
-/// The same poses are rendered in four ways, in turn: the renderer alone; a session of this process; a client through
-/// the socket; and a client with shared memory. Server and client are in this process. Prints, for each way, the median
-/// wall time and the median processor time of a step, and the median ratio of its time to that of the renderer alone in
-/// the same round.
+/// The same poses are rendered in four ways, in turn: the renderer alone; a session of this
+/// process; a client through the socket; and a client with shared memory. Server and client are in
+/// this process. Prints, for each way, the median wall time and the median processor time of a
+/// step, and the median ratio of its time to that of the renderer alone in the same round.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Delivery {
@@ -126,7 +126,7 @@ impl Delivery {
             ..self.twin.session(Outputs::colour(Encoding::Raw))
         };
         let session = Session::open(engine.clone(), "bench".to_owned(), options).await?;
-        let views = View::of_rig(&rig.cameras, start);
+        let views = View::from_rig(&rig.cameras, start);
         let stills = Stills::open(engine, session.resident().clone(), &views).await?;
         let shared = ConnectOptions { shared_memory: true, ..ConnectOptions::default() };
         let socket = self.client(running, &ConnectOptions::default()).await?;
@@ -162,7 +162,7 @@ impl Ways {
                     encoding: Encoding::Raw,
                 };
                 let views =
-                    View::of_rig(&self.rig.cameras, pose).into_iter().zip(&self.rig.cameras);
+                    View::from_rig(&self.rig.cameras, pose).into_iter().zip(&self.rig.cameras);
                 let limit = wildcity_protocol::limits::STEP_TIMEOUT;
                 self.stills.render(views.map(still).collect(), &[], limit).await?;
             }

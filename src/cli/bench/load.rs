@@ -17,10 +17,10 @@ use wildcity_twin::store::{Catalog, Version};
 
 /// Measure how fast a twin is read: every section is checked against its hash and decoded.
 ///
-/// For comparison, the bytes are also read without checks and decoding ("bare bytes"). Sections of a twin
-/// in an object store are read through the disk cache, unless --cache-gib is 0. With --cold, the system's
-/// page cache is emptied before each reading, which needs root. Without --cold, everything is read once
-/// beforehand, so that the times do not include the disk.
+/// For comparison, the bytes are also read without checks and decoding ("bare bytes"). Sections of
+/// a twin in an object store are read through the disk cache, unless --cache-gib is 0. With --cold,
+/// the system's page cache is emptied before each reading, which needs root. Without --cold,
+/// everything is read once beforehand, so that the times do not include the disk.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Load {

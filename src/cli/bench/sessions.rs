@@ -18,9 +18,10 @@ use wildcity_session::{Encoding, Engine, Outputs, RigChoice, Session, SessionOpt
 
 /// Measure how many steps per second several sessions on one twin make together, without a network.
 ///
-/// Every session drives along the twin's first trajectory, each from another place, as fast as it can. For each number
-/// of sessions, prints the steps per second of all together, the time of a step, the processor time of a step, and the
-/// time of a step beyond its pixels: the part that is neither waiting for the renderer nor rendering.
+/// Every session drives along the twin's first trajectory, each from another place, as fast as it
+/// can. For each number of sessions, prints the steps per second of all together, the time of a
+/// step, the processor time of a step, and the time of a step beyond its pixels: the part that is
+/// neither waiting for the renderer nor rendering.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Sessions {

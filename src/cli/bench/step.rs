@@ -12,9 +12,9 @@ use crate::cli::scene_source::SceneSource;
 
 /// Time one step: all cameras of a list in one frame, rendered to 8-bit colour.
 ///
-/// Prints the median time and the extremes in milliseconds, after one frame that is not counted, and the
-/// median time of each stage. Also counts visible (Gaussian, view) pairs, instances (Gaussian, tile) after
-/// binning, and Gaussian-pixel evaluations.
+/// Prints the median time and the extremes in milliseconds, after one frame that is not counted,
+/// and the median time of each stage. Also counts visible (Gaussian, view) pairs, instances
+/// (Gaussian, tile) after binning, and Gaussian-pixel evaluations.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Step {

@@ -1,4 +1,5 @@
-//! The agent of the demo's scenarios: follows the recorded drive, and keeps its distance from actors on it.
+//! The agent of the demo's scenarios: follows the recorded drive, and keeps its distance from
+//! actors on it.
 
 use anyhow::Context;
 use glam::DVec3;
@@ -19,7 +20,8 @@ pub(super) struct CarefulDriver {
 /// Poses of a plan, and the time between two of them.
 const PLAN_POSES: i64 = 20;
 const PLAN_STEP_US: i64 = 100_000;
-/// Largest lateral distance from the line at which an actor is in the way, in metres: half of both widths.
+/// Largest lateral distance from the line at which an actor is in the way, in metres: half of both
+/// widths.
 const BESIDE_M: f64 = 2.2;
 /// From the ego's rear axle to its front bumper, in metres.
 const FRONT_M: f64 = 4.0;

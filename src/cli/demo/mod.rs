@@ -40,15 +40,17 @@ use super::{output, progress, view};
 /// Build a demo street, drive through it as an agent, and write images of the drive.
 ///
 /// Builds the street on first use, serves it on a free loopback port, and drives along its recorded
-/// trajectory through the WebSocket, as any agent would. Writes a mosaic of the six cameras for every tenth
-/// step, the recorded episode, and report.json with the time of every step. With --view it opens the viewer
-/// instead, where the street can be driven by hand.
+/// trajectory through the WebSocket, as any agent would. Writes a mosaic of the six cameras for
+/// every tenth step, the recorded episode, and report.json with the time of every step. With --view
+/// it opens the viewer instead, where the street can be driven by hand.
 ///
-/// With --scenario, there is traffic: the agent keeps its distance from other vehicles and pedestrians.
+/// With --scenario, there is traffic: the agent keeps its distance from other vehicles and
+/// pedestrians.
 ///
-/// With --off-trajectory, the command does not drive. It renders views off the recorded drive from a degraded copy of
-/// the street, which has reconstruction errors there as real captures have. It compares these views with views of the
-/// street itself: as rendered, and with --repair also after the repair.
+/// With --off-trajectory, the command does not drive. It renders views off the recorded drive from
+/// a degraded copy of the street, which has reconstruction errors there as real captures have. It
+/// compares these views with views of the street itself: as rendered, and with --repair also after
+/// the repair.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Demo {
@@ -68,7 +70,8 @@ pub(super) struct Demo {
     #[arg(long, conflicts_with_all = ["steps", "scenario"])]
     view: bool,
 
-    /// Render views at this distance to the left of the recorded drive, in metres, instead of driving.
+    /// Render views at this distance to the left of the recorded drive, in metres, instead of
+    /// driving.
     #[arg(long, value_name = "M", conflicts_with_all = ["steps", "scenario", "view"], allow_negative_numbers = true)]
     off_trajectory: Option<f64>,
 
@@ -117,12 +120,11 @@ impl Demo {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let twins = self.twins.dir()?;
         output::create_dir(&self.out)?;
-        let repairs = match self.repair {
-            true => {
-                let options = LoadOptions::new(runtime_library(self.onnxruntime.as_ref()));
-                off_trajectory::model(&self.out.join("model"), options)?
-            }
-            false => Models::default(),
+        let repairs = if self.repair {
+            let options = LoadOptions::new(runtime_library(self.onnxruntime.as_ref()));
+            off_trajectory::model(&self.out.join("model"), options)?
+        } else {
+            Models::default()
         };
         let version = demo_twin(&twins, TWIN, StorageOptions::default(), None)?;
         let assets = match self.scenario {
@@ -172,8 +174,8 @@ impl Demo {
         self.report(&version, &drive)
     }
 
-    /// The agent: follows the recorded trajectory, and checks every frame's hash. Without a scenario it drives at a
-    /// constant speed.
+    /// The agent: follows the recorded trajectory, and checks every frame's hash. Without a
+    /// scenario it drives at a constant speed.
     async fn drive(
         &self,
         url: &str,
@@ -315,8 +317,8 @@ pub(super) fn exact_twin(twins: &Path) -> anyhow::Result<Version> {
     )
 }
 
-/// The demo twin in the user's directory. It is built on first use, and again if the generator changed or
-/// the files are damaged.
+/// The demo twin in the user's directory. It is built on first use, and again if the generator
+/// changed or the files are damaged.
 fn demo_twin(
     twins: &Path,
     name: &str,
@@ -328,7 +330,7 @@ fn demo_twin(
     let revision = wildcity_generate::REVISION;
     let settings_json = serde_json::to_string(&settings)?;
     let spoiled = spoil.map_or(String::new(), |amount| format!(", spoiled by {amount}"));
-    let provenance = Provenance::of(format!("{STREET}{revision}: {settings_json}{spoiled}"));
+    let provenance = Provenance::new(format!("{STREET}{revision}: {settings_json}{spoiled}"));
     let reason = match existing(&catalog, name, &provenance)? {
         Existing::Usable(version) => return Ok(*version),
         Existing::Rebuild(reason) => reason,
@@ -351,7 +353,7 @@ fn demo_twin(
                 sky_from_world: DMat3::IDENTITY,
             })),
             storage,
-            ..NewVersion::of(name, &street.gaussians, provenance)
+            ..NewVersion::from_gaussians(name, &street.gaussians, provenance)
         },
         &mut progress::show(&bar),
     )?;
@@ -398,14 +400,15 @@ fn existing(catalog: &Catalog, name: &str, provenance: &Provenance) -> anyhow::R
     if found != provenance {
         return Ok(Existing::Rebuild("the generator changed"));
     }
-    Ok(match is_intact(catalog, name, &version)? {
-        true => Existing::Usable(Box::new(version)),
-        false => Existing::Rebuild(DAMAGED),
+    Ok(if is_intact(catalog, name, &version)? {
+        Existing::Usable(Box::new(version))
+    } else {
+        Existing::Rebuild(DAMAGED)
     })
 }
 
-/// Whether every chunk of a version, and its sky, have the hashes that were committed. Damage in older
-/// versions does not count.
+/// Whether every chunk of a version, and its sky, have the hashes that were committed. Damage in
+/// older versions does not count.
 fn is_intact(catalog: &Catalog, name: &str, version: &Version) -> anyhow::Result<bool> {
     let bar = progress::bytes("checking");
     let verified = catalog.verify(name, &mut progress::show(&bar))?;

@@ -1,4 +1,5 @@
-//! One image with all cameras, in the order in which they look: the front ones above, the others below.
+//! One image with all cameras, in the order in which they look: the front ones above, the others
+//! below.
 
 use std::path::Path;
 

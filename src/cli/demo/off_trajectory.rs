@@ -1,4 +1,5 @@
-//! `wildcity demo --off-trajectory`: views off the drive from a degraded copy of the street, as rendered and repaired.
+//! `wildcity demo --off-trajectory`: views off the drive from a degraded copy of the street, as
+//! rendered and repaired.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write};
@@ -45,9 +46,11 @@ pub(super) fn model(dir: &Path, options: LoadOptions) -> anyhow::Result<Models> 
     Ok(Models::read(&[dir.join(MODEL[0].0)], options)?)
 }
 
-/// Stores recorded images in the degraded twin, unless it has some. They show the street without errors.
+/// Stores recorded images in the degraded twin, unless it has some. They show the street without
+/// errors.
 ///
-/// Their stations are those that the repair of the views searches: from 8 m behind a view to 2 m ahead of it.
+/// Their stations are those that the repair of the views searches: from 8 m behind a view to 2 m
+/// ahead of it.
 async fn record_images(
     url: &str,
     catalog: &Catalog,
@@ -107,7 +110,8 @@ pub(super) struct Views<'a> {
 }
 
 impl Views<'_> {
-    /// Draws the views, writes one picture per station with a row for each kind of image, and prints a table.
+    /// Draws the views, writes one picture per station with a row for each kind of image, and
+    /// prints a table.
     pub(super) async fn show(
         self,
         url: &str,

@@ -30,8 +30,8 @@ impl DemoScenario {
         }
     }
 
-    /// The scenario with the hashes of these assets in place of their names: other assets of the user may have the
-    /// same names.
+    /// The scenario with the hashes of these assets in place of their names: other assets of the
+    /// user may have the same names.
     pub(super) fn with_assets(self, assets: &[StoredActor]) -> anyhow::Result<Map<String, Value>> {
         let mut file: Map<String, Value> = serde_json::from_str(self.text())?;
         let actors = file.get_mut("actors").and_then(Value::as_array_mut);

@@ -12,14 +12,16 @@ use super::bad_input;
 
 /// Compare two runs of a suite: is the driver worse than before?
 ///
-/// Two episodes with the same scenario, values of the sweep and seed are a pair. Prints the verdicts that changed,
-/// then the mean difference of each score over the pairs with its 95 % interval. Pairs in different versions of the
-/// twin or of the scenario are not compared, nor are different versions of a score.
+/// Two episodes with the same scenario, values of the sweep and seed are a pair. Prints the
+/// verdicts that changed, then the mean difference of each score over the pairs with its 95 %
+/// interval. Pairs in different versions of the twin or of the scenario are not compared, nor are
+/// different versions of a score.
 ///
-/// The exit code is 1 if the run is worse: if any episode that passed before does not pass now, because it failed or
-/// has no verdict. For a driver that does not repeat exactly, --worse-by pass_rate=0.05 compares the pass rates over
-/// all pairs instead. Scores count only if --worse-by names them. It is 0 if the run is not worse, and 2 if a file
-/// cannot be read or the runs cannot be compared.
+/// The exit code is 1 if the run is worse: if any episode that passed before does not pass now,
+/// because it failed or has no verdict. For a driver that does not repeat exactly, --worse-by
+/// pass_rate=0.05 compares the pass rates over all pairs instead. Scores count only if --worse-by
+/// names them. It is 0 if the run is not worse, and 2 if a file cannot be read or the runs cannot
+/// be compared.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Compare {
@@ -31,8 +33,8 @@ pub(super) struct Compare {
     #[arg(value_name = "AFTER")]
     after: PathBuf,
 
-    /// By how much pass_rate, or the mean of a score, may be worse; may be given several times. pass_rate=0 compares
-    /// only the pass rates, and not each episode.
+    /// By how much pass_rate, or the mean of a score, may be worse; may be given several times.
+    /// pass_rate=0 compares only the pass rates, and not each episode.
     #[arg(long, value_name = "NAME=AMOUNT")]
     worse_by: Vec<Tolerance>,
 

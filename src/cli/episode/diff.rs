@@ -10,8 +10,9 @@ use crate::cli::exit::Exit;
 
 /// Compare two episodes: the first step at which command, ego, actor or image differ.
 ///
-/// The exit code is 0 if they are alike, 1 if they differ, 2 if one of them cannot be read. Give records (.jsonl), not
-/// their MCAP exports. For two runs of a suite, `wildcity episode compare` says which of their episodes changed.
+/// The exit code is 0 if they are alike, 1 if they differ, 2 if one of them cannot be read. Give
+/// records (.jsonl), not their MCAP exports. For two runs of a suite, `wildcity episode compare`
+/// says which of their episodes changed.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Diff {

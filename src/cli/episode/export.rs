@@ -15,12 +15,12 @@ use crate::cli::backend_options::BackendOptions;
 use crate::cli::directories::{Episodes, Twins};
 use crate::cli::progress;
 
-use super::kept::{camera_of, driven, keep_cameras};
+use super::kept::{camera_index, driven, keep_cameras};
 
 /// Export an episode as MCAP, for Foxglove, Rerun and others: indexed, compressed, with schemas.
 ///
-/// Runs and servers export each episode when it ends, without images. With --images the episode is driven and rendered
-/// again, and compared with its record.
+/// Runs and servers export each episode when it ends, without images. With --images the episode is
+/// driven and rendered again, and compared with its record.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Export {
@@ -36,7 +36,8 @@ pub(super) struct Export {
     #[arg(long)]
     images: bool,
 
-    /// A camera whose images are added; may be given several times [default: all cameras of the episode]
+    /// A camera whose images are added; may be given several times [default: all cameras of the
+    /// episode]
     #[arg(long, value_name = "NAME", requires = "images")]
     camera: Vec<String>,
 
@@ -61,7 +62,7 @@ const NOTED_ERROR_PX: f64 = 0.1;
 
 impl Export {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let path = super::record_of(&self.episode, &self.episodes)?;
+        let path = super::find_record(&self.episode, &self.episodes)?;
         let is_record = self
             .mcap
             .canonicalize()
@@ -71,9 +72,10 @@ impl Export {
             "--mcap {}: this is the record itself; name another file",
             self.mcap.display()
         );
-        let (exported, report) = match self.images {
-            true => self.with_images(&path).map(|(exported, report)| (exported, Some(report)))?,
-            false => (export_file(&path, &self.mcap)?, None),
+        let (exported, report) = if self.images {
+            self.with_images(&path).map(|(exported, report)| (exported, Some(report)))?
+        } else {
+            (export_file(&path, &self.mcap)?, None)
         };
         let mut out = io::stdout().lock();
         writeln!(out, "exported    {} messages to {}", exported.messages, self.mcap.display())?;
@@ -98,7 +100,7 @@ impl Export {
         let rig = EpisodeFile::rig(path)?;
         let mut recording = RecordedEpisode::read(path)?;
         let count = recording.header.rig.cameras.len();
-        let wanted = self.camera.iter().map(|name| camera_of(&recording, name));
+        let wanted = self.camera.iter().map(|name| camera_index(&recording, name));
         let mut wanted = wanted.collect::<anyhow::Result<Vec<usize>>>()?;
         if wanted.is_empty() {
             wanted = (0..count).collect();
@@ -109,7 +111,7 @@ impl Export {
             keep_cameras(frame, cameras, count);
         }
         let cache = Cache::new(self.twins.catalog()?);
-        let backend = self.backend.backend_of(&recording.header.backend)?;
+        let backend = self.backend.replay_backend(&recording.header.backend)?;
         let bar = progress::count("rendering");
         bar.set_length(recording.frames.iter().map(|frame| frame.images.len() as u64).sum());
         let written = write_whole(&self.mcap, |out| {

@@ -14,7 +14,8 @@ const EPISODES: &str = "episodes";
 /// Largest number of runs that a message names.
 const NAMED: usize = 5;
 
-/// The folder with the records: that of `--episodes`; or if that is the folder of a run, the folder `episodes` in it.
+/// The folder with the records: that of `--episodes`; or if that is the folder of a run, the folder
+/// `episodes` in it.
 ///
 /// # Errors
 /// There is no such folder, or it cannot be read; exit code 2.
@@ -44,7 +45,7 @@ pub(super) fn runs_in(dir: &Path) -> Vec<PathBuf> {
 }
 
 /// The file of an episode: a path, or a name `SESSION-NUMBER` in the folder of records.
-pub(super) fn file_of(episode: &Path, episodes: &Episodes) -> anyhow::Result<PathBuf> {
+pub(super) fn record_file(episode: &Path, episodes: &Episodes) -> anyhow::Result<PathBuf> {
     // A name may have dots, such as that of a second attempt: `straight-0.2-1`.
     let is_file_name = episode.extension().is_some_and(|ext| ext == "jsonl" || ext == "mcap");
     let is_name = !is_file_name && episode.components().count() == 1;

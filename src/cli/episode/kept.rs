@@ -6,7 +6,7 @@ use wildcity_episode::driven_indices;
 use wildcity_session::{FrameRecord, FrameRequest, RecordedEpisode};
 
 /// Index of the camera with a name.
-pub(super) fn camera_of(recording: &RecordedEpisode, wanted: &str) -> anyhow::Result<usize> {
+pub(super) fn camera_index(recording: &RecordedEpisode, wanted: &str) -> anyhow::Result<usize> {
     let cameras = &recording.header.rig.cameras;
     cameras.iter().position(|camera| camera.name == wanted).with_context(|| {
         let known: Vec<&str> = cameras.iter().map(|camera| &*camera.name).collect();
@@ -14,7 +14,8 @@ pub(super) fn camera_of(recording: &RecordedEpisode, wanted: &str) -> anyhow::Re
     })
 }
 
-/// Removes the images of other cameras from a frame, and all images of a frame that only observed poses.
+/// Removes the images of other cameras from a frame, and all images of a frame that only observed
+/// poses.
 pub(super) fn keep_cameras(frame: &mut FrameRecord, kept_cameras: &[usize], rig_cameras: usize) {
     let is_driven = matches!(frame.request, FrameRequest::Reset | FrameRequest::Step);
     let mut images = std::mem::take(&mut frame.images).into_iter();
@@ -22,7 +23,7 @@ pub(super) fn keep_cameras(frame: &mut FrameRecord, kept_cameras: &[usize], rig_
     let mut cameras = Vec::new();
     for pose in 0..frame.poses.len() {
         let mut of_pose = Vec::new();
-        for rendered in frame.cameras_of(pose, rig_cameras) {
+        for rendered in frame.due_cameras(pose, rig_cameras) {
             let (image, repair) = (images.next(), repairs.next());
             if kept_cameras.contains(&rendered) && is_driven {
                 of_pose.push(rendered);

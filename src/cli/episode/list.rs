@@ -11,9 +11,9 @@ use super::folder::{records, runs_in};
 
 /// List the recorded episodes, newest first.
 ///
-/// --episodes may be the folder of a run, which has the records in its folder `episodes`. A record is named
-/// SCENARIO-SEED-NUMBER, with a sweep SCENARIO-COMBINATION-SEED-NUMBER; the second attempt after a technical failure
-/// has .2 after the seed.
+/// --episodes may be the folder of a run, which has the records in its folder `episodes`. A record
+/// is named SCENARIO-SEED-NUMBER, with a sweep SCENARIO-COMBINATION-SEED-NUMBER; the second attempt
+/// after a technical failure has .2 after the seed.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct List {

@@ -19,16 +19,17 @@ use wildcity_suite::ExitCode;
 
 use super::directories::Episodes;
 use super::exit::Exit;
-use folder::file_of;
+use folder::record_file;
 
 /// Drive suites of scenarios; compare runs; list, score, compare and export recorded episodes.
 ///
-/// Exit codes of all of these commands: 0 for success; 1 if an episode failed (run), a run is worse (compare), two
-/// episodes differ (diff), or an episode cannot be scored, rendered or written; 2 for a mistake in the command line,
-/// and for a file or folder that is missing or cannot be read. `run` also has 3 and 4, which its help explains.
+/// Exit codes of all of these commands: 0 for success; 1 if an episode failed (run), a run is worse
+/// (compare), two episodes differ (diff), or an episode cannot be scored, rendered or written; 2
+/// for a mistake in the command line, and for a file or folder that is missing or cannot be read.
+/// `run` also has 3 and 4, which its help explains.
 ///
-/// A record is named SCENARIO-SEED-1, with a sweep SCENARIO-COMBINATION-SEED-1. SCENARIO-SEED.2-1 is the second attempt,
-/// after a technical failure of the first.
+/// A record is named SCENARIO-SEED-1, with a sweep SCENARIO-COMBINATION-SEED-1. SCENARIO-SEED.2-1
+/// is the second attempt, after a technical failure of the first.
 #[derive(Debug, clap::Args)]
 pub(super) struct Episode {
     #[command(subcommand)]
@@ -67,15 +68,15 @@ impl Episode {
 /// # Errors
 /// There is no such file, or it is not a record; exit code 2.
 fn read(episode: &Path, episodes: &Episodes) -> anyhow::Result<EpisodeFile> {
-    EpisodeFile::read(&file_of(episode, episodes)?).map_err(unreadable)
+    EpisodeFile::read(&record_file(episode, episodes)?).map_err(unreadable)
 }
 
 /// The file of an episode, after its first line was read.
 ///
 /// # Errors
 /// As for [`read`].
-fn record_of(episode: &Path, episodes: &Episodes) -> anyhow::Result<PathBuf> {
-    let path = file_of(episode, episodes)?;
+fn find_record(episode: &Path, episodes: &Episodes) -> anyhow::Result<PathBuf> {
+    let path = record_file(episode, episodes)?;
     EpisodeFile::header(&path).map_err(unreadable)?;
     Ok(path)
 }

@@ -23,23 +23,27 @@ use super::{bad_input, exit};
 
 /// Drive a suite of scenarios with an agent, judge every episode, and report.
 ///
-/// Writes into --out: result.json, junit.xml, report.html, and the records of the episodes. The exit code is 0 if every
-/// episode passed (and those that the suite accepts without a verdict), and 1 if one failed by driving. It is 2 if the command line, the suite, a scenario or the run of
-/// --against is wrong, or the agent cannot be started. It is 3 if an episode was not driven for technical reasons. It is 4
-/// if an episode does not repeat (--verify). It is 5 if none failed, but one has no verdict: a criterion could not be
-/// judged, or the ego left the trained area. A suite, or --accept-unjudged, may accept that by name.
+/// Writes into --out: result.json, junit.xml, report.html, and the records of the episodes. The
+/// exit code is 0 if every episode passed (and those that the suite accepts without a verdict), and
+/// 1 if one failed by driving. It is 2 if the command line, the suite, a scenario or the run of
+/// --against is wrong, or the agent cannot be started. It is 3 if an episode was not driven for
+/// technical reasons. It is 4 if an episode does not repeat (--verify). It is 5 if none failed, but
+/// one has no verdict: a criterion could not be judged, or the ego left the trained area. A suite,
+/// or --accept-unjudged, may accept that by name.
 ///
-/// With --at-least or --against, the exit code can be 0 although episodes failed. --at-least requires a pass rate, and
-/// --against that the run is not worse than an earlier one, as `wildcity episode compare` judges; it also writes
-/// comparison.json and comparison.html. junit.xml always lists every failure, and has the exit code as a property.
+/// With --at-least or --against, the exit code can be 0 although episodes failed. --at-least
+/// requires a pass rate, and --against that the run is not worse than an earlier one, as
+/// `wildcity episode compare` judges; it also writes comparison.json and comparison.html. junit.xml
+/// always lists every failure, and has the exit code as a property.
 ///
-/// Episodes of a scenario that were driven alike count once in rates and means: two seeds of a scenario without jitter
-/// are the same episode.
+/// Episodes of a scenario that were driven alike count once in rates and means: two seeds of a
+/// scenario without jitter are the same episode.
 ///
-/// The shell starts the command of --agent once for each episode, with these variables in its environment:
-/// WILDCITY_URL, WILDCITY_OPEN (fields of its request `open` as JSON), WILDCITY_SEED (for `reset`) and WILDCITY_STEPS
-/// (after which it closes its session). docs/suites.md has an example. The command must end with exit code 0; with 124
-/// if it ran out of time; or with 69 if it lost something that it needs.
+/// The shell starts the command of --agent once for each episode, with these variables in its
+/// environment: WILDCITY_URL, WILDCITY_OPEN (fields of its request `open` as JSON), WILDCITY_SEED
+/// (for `reset`) and WILDCITY_STEPS (after which it closes its session). docs/suites.md has an
+/// example. The command must end with exit code 0; with 124 if it ran out of time; or with 69 if it
+/// lost something that it needs.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Run {
@@ -47,8 +51,8 @@ pub(super) struct Run {
     #[arg(value_name = "SUITE")]
     suite: PathBuf,
 
-    /// The agent: log, stand or idm; egodriver:HOST:PORT for a driver of AlpaSim; or a command [default: that of the
-    /// suite, or log]
+    /// The agent: log, stand or idm; egodriver:HOST:PORT for a driver of AlpaSim; or a command
+    /// [default: that of the suite, or log]
     #[arg(long, value_name = "AGENT")]
     agent: Option<String>,
 
@@ -68,13 +72,14 @@ pub(super) struct Run {
     #[arg(long, value_name = "S", default_value_t = wildcity_suite::limits::AGENT_TIMEOUT.as_secs())]
     agent_timeout_s: u64,
 
-    /// The pass rate that is required, from 0 to 1: the lower end of the 95 % interval must reach it [default: that of
-    /// the suite; without one every episode must pass]
+    /// The pass rate that is required, from 0 to 1: the lower end of the 95 % interval must reach
+    /// it [default: that of the suite; without one every episode must pass]
     #[arg(long, value_name = "RATE")]
     at_least: Option<f64>,
 
-    /// A criterion that need not be judged for a pass: contact, contact.static, off_road (a scenario without a map) or
-    /// progress; or off_model, for episodes that leave the trained area. In addition to those of the suite.
+    /// A criterion that need not be judged for a pass: contact, contact.static, off_road (a
+    /// scenario without a map) or progress; or off_model, for episodes that leave the trained area.
+    /// In addition to those of the suite.
     #[arg(long, value_name = "CRITERION")]
     accept_unjudged: Vec<String>,
 
@@ -82,8 +87,8 @@ pub(super) struct Run {
     #[arg(long, value_name = "RUN")]
     against: Option<PathBuf>,
 
-    /// By how much pass_rate, or the mean of a score, may be worse than in that run; see `wildcity episode compare
-    /// --help`
+    /// By how much pass_rate, or the mean of a score, may be worse than in that run; see
+    /// `wildcity episode compare --help`
     #[arg(long, value_name = "NAME=AMOUNT", requires = "against")]
     worse_by: Vec<Tolerance>,
 
@@ -95,7 +100,8 @@ pub(super) struct Run {
     #[arg(long)]
     verify: bool,
 
-    /// Use the latest versions of the twins instead of those that the scenarios name; the results record this.
+    /// Use the latest versions of the twins instead of those that the scenarios name; the results
+    /// record this.
     #[arg(long)]
     latest: bool,
 
@@ -202,14 +208,12 @@ impl Run {
         catalog: &Catalog,
         backend: &dyn Backend,
     ) -> Ending {
-        let wrong = match self.verify {
-            true => verify(result, &self.episodes(), catalog, backend),
-            false => Vec::new(),
+        let wrong = if self.verify {
+            verify(result, &self.episodes(), catalog, backend)
+        } else {
+            Vec::new()
         };
-        match wrong.is_empty() {
-            true => Ending::of(result, compared),
-            false => Ending::not_verified(&wrong),
-        }
+        if wrong.is_empty() { Ending::new(result, compared) } else { Ending::not_verified(&wrong) }
     }
 
     fn write_files(

@@ -62,8 +62,8 @@ fn check_address(address: &str) -> Result<(), &'static str> {
     }
 }
 
-/// Waits until the driver of AlpaSim listens, if the agent is one. Otherwise the bridge of each episode would wait for
-/// the same time, without a message.
+/// Waits until the driver of AlpaSim listens, if the agent is one. Otherwise the bridge of each
+/// episode would wait for the same time, without a message.
 ///
 /// # Errors
 /// Nothing listens in the time that a driver may take to start; exit code 3.

@@ -36,7 +36,7 @@ impl Score {
         let mut out = io::stdout().lock();
         for path in &self.episodes_to_score {
             let episode = super::read(path, &self.episodes)?;
-            let name = EpisodeFile::name_of(path);
+            let name = EpisodeFile::episode_name(path);
             let scored = result(&episode).with_context(|| {
                 format!(
                     "{name} cannot be scored: it has no frame, or its agent drove several steps with one request, which \

@@ -10,13 +10,14 @@ use crate::cli::backend_options::BackendOptions;
 use crate::cli::directories::{Episodes, Twins};
 use crate::cli::{output, progress};
 
-use super::kept::{camera_of, keep_cameras};
+use super::kept::{camera_index, keep_cameras};
 
 /// Write the frames of an episode as numbered pictures, for a video.
 ///
-/// The episode is driven and rendered again, and compared with its record. This program has no video encoder. It prints
-/// an ffmpeg command that makes a video of the pictures, at the speed of the simulation. The command pads an odd width
-/// or height with a black column or row, because most players need even sizes.
+/// The episode is driven and rendered again, and compared with its record. This program has no
+/// video encoder. It prints an ffmpeg command that makes a video of the pictures, at the speed of
+/// the simulation. The command pads an odd width or height with a black column or row, because most
+/// players need even sizes.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Video {
@@ -49,10 +50,10 @@ Examples:
 
 impl Video {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let path = super::record_of(&self.episode, &self.episodes)?;
+        let path = super::find_record(&self.episode, &self.episodes)?;
         let mut recording = RecordedEpisode::read(&path).map_err(super::bad_input)?;
         let camera = match &self.camera {
-            Some(name) => camera_of(&recording, name)?,
+            Some(name) => camera_index(&recording, name)?,
             None => 0,
         };
         for frame in &mut recording.frames {
@@ -61,7 +62,7 @@ impl Video {
         output::create_dir(&self.out)?;
         let cache = Cache::new(self.twins.catalog()?);
         let header = &recording.header;
-        let backend = self.backend.backend_of(&header.backend)?;
+        let backend = self.backend.replay_backend(&header.backend)?;
 
         let bar = progress::count("rendering");
         bar.set_length(recording.frames.iter().map(|frame| frame.images.len() as u64).sum());
@@ -94,7 +95,8 @@ impl Video {
     }
 }
 
-/// Most players support only yuv420p, which has one colour for 2 x 2 pixels: an odd size gets a black row or column.
+/// Most players support only yuv420p, which has one colour for 2 x 2 pixels: an odd size gets a
+/// black row or column.
 const PAD: &str = "-vf 'pad=ceil(iw/2)*2:ceil(ih/2)*2' ";
 
 fn write_png(path: &Path, image: &ReplayedImage<'_>) -> anyhow::Result<()> {

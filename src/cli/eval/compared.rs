@@ -38,7 +38,8 @@ struct Truth<'a> {
 }
 
 impl Eval {
-    /// Renders one image and compares it with the real one. Does the same with the repaired image, if there is a model.
+    /// Renders one image and compares it with the real one. Does the same with the repaired image,
+    /// if there is a model.
     pub(super) fn evaluate(
         &self,
         setup: &Setup,
@@ -55,7 +56,7 @@ impl Eval {
 
         // Repair it, in the exposure of the twin.
         let needs_lens = repairer.is_some() || self.extrapolate.is_some();
-        let lens = needs_lens.then(|| Lens::of(&camera));
+        let lens = needs_lens.then(|| Lens::from_camera(&camera));
         let camera = RigCamera::new(camera_name, camera, Pose::IDENTITY);
         let mut repaired = match &lens {
             Some(lens) => repaired(setup, &view, &profile, &camera, lens, &mut rendered)?,
@@ -63,7 +64,8 @@ impl Eval {
         };
         expose(image.exposure_stops, &mut rendered, &mut repaired);
 
-        // Leave out what the twin does not have: masked pixels, the own vehicle, and moving objects.
+        // Leave out what the twin does not have: masked pixels, the own vehicle, and moving
+        // objects.
         let mask = image.mask.as_deref().map(|file| picture::mask(file, size_px)).transpose()?;
         let rig = renderer.source.version().and_then(|version| version.manifest.rig.as_ref());
         let outside = own_vehicle::outside(rig, camera_name, size_px);
@@ -83,7 +85,7 @@ impl Eval {
         scores.moving = moving;
         scores.lidar = labels.depth(image, &view, &rendered, of.counts);
         let mut thumbnails =
-            Thumbnails::of(&pair, &compared.error_map).map_err(anyhow::Error::msg)?;
+            Thumbnails::from_pair(&pair, &compared.error_map).map_err(anyhow::Error::msg)?;
         if let Some(rgb8) = &repaired {
             let folders = ["repaired", "repaired_errors"];
             let (pair, compared) = self.compare(networks, of, rgb8, folders)?;
@@ -95,8 +97,8 @@ impl Eval {
         Ok(Compared { scores, view, profile, truth, rendered, repaired, counts, camera, lens })
     }
 
-    /// Compares an image with the real one. With `--save-images`, writes the image and the map of its errors to two
-    /// folders.
+    /// Compares an image with the real one. With `--save-images`, writes the image and the map of
+    /// its errors to two folders.
     fn compare(
         &self,
         networks: &Networks,
@@ -106,7 +108,7 @@ impl Eval {
     ) -> anyhow::Result<(Pair, PairScores)> {
         let owned = counts.map(<[bool]>::to_vec);
         let pair = Pair::new(size_px, truth.to_vec(), rgb8.to_vec(), owned)?;
-        let mut compared = PairScores::of(&pair, self.align_exposure);
+        let mut compared = PairScores::compare(&pair, self.align_exposure);
         compared.scores.lpips = networks.lpips(size_px, rgb8, truth, counts)?;
         if self.save_images {
             self.save(name, folders, &pair, &compared.error_map)?;
@@ -145,7 +147,7 @@ fn repaired(
 
 /// The pixels that count: not masked, and within the lens' field.
 fn counted(view: &View, mask: Option<Vec<bool>>) -> Option<Vec<bool>> {
-    let Some(field) = FieldMask::of(&view.camera) else { return mask };
+    let Some(field) = FieldMask::from_camera(&view.camera) else { return mask };
     let mut counts = mask.unwrap_or_else(|| vec![true; view.camera.pixels()]);
     field.clear_outside(&view.camera, 1, &mut counts);
     Some(counts)

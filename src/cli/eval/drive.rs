@@ -30,15 +30,16 @@ pub(super) struct DrivePlace<'a> {
 
 impl Drives {
     /// `None` if the twin has no recorded drive.
-    pub(super) fn of(version: &Arc<Version>) -> Option<Self> {
+    pub(super) fn from_version(version: &Arc<Version>) -> Option<Self> {
         let coverage = TrainingCoverage::new(&version.manifest)?;
         Some(Self { version: version.clone(), coverage })
     }
 
     /// The place of an image that a camera took from a pose.
     ///
-    /// If the twin's rig has a camera of this name, its mounting gives the pose of the rig. For another camera, the rig
-    /// has the heading of the drive, and the lateral distance of the camera from it.
+    /// If the twin's rig has a camera of this name, its mounting gives the pose of the rig. For
+    /// another camera, the rig has the heading of the drive, and the lateral distance of the camera
+    /// from it.
     pub(super) fn place(
         &self,
         camera_name: &str,
@@ -74,12 +75,14 @@ impl DrivePlace<'_> {
         self.drive.rotation * DVec3::Y
     }
 
-    /// The motion to the place [`FRAME_M`] before this one, or behind it at the start of the drive: a pose of the world is
-    /// moved by multiplying it from the left. `None` if the drive is shorter.
+    /// The motion to the place [`FRAME_M`] before this one, or behind it at the start of the drive:
+    /// a pose of the world is moved by multiplying it from the left. `None` if the drive is
+    /// shorter.
     pub(super) fn step_back(&self) -> Option<Pose> {
-        let from_m = match self.station_m >= FRAME_M {
-            true => self.station_m - FRAME_M,
-            false => self.station_m + FRAME_M,
+        let from_m = if self.station_m >= FRAME_M {
+            self.station_m - FRAME_M
+        } else {
+            self.station_m + FRAME_M
         };
         let before = self.trajectory.at_station(from_m);
         let is_moved = before.position_m.distance(self.drive.position_m) > 0.5 * FRAME_M;

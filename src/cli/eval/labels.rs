@@ -24,17 +24,17 @@ const LONGEST_S: f64 = 10.0;
 /// `--boxes` and `--lidar`.
 #[derive(Debug, clap::Args)]
 pub(super) struct LabelOptions {
-    /// File of boxes around vehicles and pedestrians, one JSON object per line: time_us, track, size (length, width,
-    /// height in the unit of the poses), world_from_box ({"xyz", "q"}: the middle of the box, in the axes of the poses
-    /// of --images), and optionally velocity. Pixels in boxes that move faster than 1 m/s do not count. The images need
-    /// time_us in their list.
+    /// File of boxes around vehicles and pedestrians, one JSON object per line: time_us, track,
+    /// size (length, width, height in the unit of the poses), world_from_box ({"xyz", "q"}: the
+    /// middle of the box, in the axes of the poses of --images), and optionally velocity. Pixels in
+    /// boxes that move faster than 1 m/s do not count. The images need time_us in their list.
     #[arg(long, value_name = "FILE")]
     boxes: Option<PathBuf>,
 
-    /// Points of a LiDAR, a safetensors file: points_m [n, 3], time_us [n]; and optionally rig_from_lidar [4, 4],
-    /// pose_time_us [m] and world_from_rig [m, 4, 4] in the axes of the poses of --images [default: the twin's first
-    /// drive]. The rendered depth is compared with these points. The images need time_us in their list, in the same
-    /// clock.
+    /// Points of a LiDAR, a safetensors file: points_m [n, 3], time_us [n]; and optionally
+    /// rig_from_lidar [4, 4], pose_time_us [m] and world_from_rig [m, 4, 4] in the axes of the
+    /// poses of --images [default: the twin's first drive]. The rendered depth is compared with
+    /// these points. The images need time_us in their list, in the same clock.
     #[arg(long, value_name = "FILE")]
     lidar: Option<PathBuf>,
 
@@ -102,8 +102,8 @@ impl LabelOptions {
 }
 
 impl Labels {
-    /// Masks moving objects in an image. Returns the pixels that count, and the share that is masked; `None` without
-    /// boxes.
+    /// Masks moving objects in an image. Returns the pixels that count, and the share that is
+    /// masked; `None` without boxes.
     pub(super) fn hide(
         &self,
         image: &RealImage,
@@ -142,7 +142,7 @@ impl Labels {
             opacity: &rendered.opacity,
             counts,
         };
-        Some(LidarDepth::of(lidar.between_us(from_us, to_us), &map))
+        Some(LidarDepth::compare(lidar.between_us(from_us, to_us), &map))
     }
 }
 

@@ -38,42 +38,45 @@ use super::{output, placement, progress};
 
 /// Compare a twin or a scene file with real images that it was not trained on.
 ///
-/// Renders each image with its camera (pose, intrinsics, distortion) and measures PSNR, SSIM and FLIP. Writes
-/// report.html (a single self-contained file, the worst images first), eval.json and eval.csv. Means are those of the
-/// images' values. Give images that the twin was not trained on, because others give values that are too good: see
-/// --images and --every.
+/// Renders each image with its camera (pose, intrinsics, distortion) and measures PSNR, SSIM and
+/// FLIP. Writes report.html (a single self-contained file, the worst images first), eval.json and
+/// eval.csv. Means are those of the images' values. Give images that the twin was not trained on,
+/// because others give values that are too good: see --images and --every.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Eval {
-    /// The name of a twin: NAME, or NAME@NUMBER for an older version; or a scene file in any format that
-    /// `wildcity import` reads.
+    /// The name of a twin: NAME, or NAME@NUMBER for an older version; or a scene file in any format
+    /// that `wildcity import` reads.
     #[arg(value_name = "SCENE")]
     scene: String,
 
-    /// The images with their cameras: a transforms.json of nerfstudio; a COLMAP model (its folder, or a folder that has
-    /// it in sparse/0; text or binary); or a camera list in the format of `wildcity render --cameras`, one camera per
-    /// line, with "image" (and optionally "mask"). Poses of a list are in the axes of the scene. Other poses are in the
-    /// axes of the scene file; for a twin, they get the axes, scale and alignment with which it was made.
+    /// The images with their cameras: a transforms.json of nerfstudio; a COLMAP model (its folder,
+    /// or a folder that has it in sparse/0; text or binary); or a camera list in the format of
+    /// `wildcity render --cameras`, one camera per line, with "image" (and optionally "mask").
+    /// Poses of a list are in the axes of the scene. Other poses are in the axes of the scene file;
+    /// for a twin, they get the axes, scale and alignment with which it was made.
     #[arg(long, value_name = "FILE_OR_DIR")]
     images: PathBuf,
 
-    /// Folder of the images [default: that of transforms.json or of the list; for COLMAP, `images` next to the model].
-    /// Images may be smaller than their cameras, as in images_4: then the cameras are scaled.
+    /// Folder of the images [default: that of transforms.json or of the list; for COLMAP, `images`
+    /// next to the model]. Images may be smaller than their cameras, as in images_4: then the
+    /// cameras are scaled.
     #[arg(long, value_name = "DIR")]
     image_dir: Option<PathBuf>,
 
-    /// Folder of masks: for image NAME.png, NAME.png or NAME.png.png. Black pixels do not count, such as those of
-    /// vehicles and pedestrians that the twin does not have [default: the masks that transforms.json or the list names]
+    /// Folder of masks: for image NAME.png, NAME.png or NAME.png.png. Black pixels do not count,
+    /// such as those of vehicles and pedestrians that the twin does not have [default: the masks
+    /// that transforms.json or the list names]
     #[arg(long, value_name = "DIR")]
     masks: Option<PathBuf>,
 
-    /// Compare every Nth image in the order of their names, starting with the first. The trainers of INRIA and gsplat
-    /// hold out every 8th.
+    /// Compare every Nth image in the order of their names, starting with the first. The trainers
+    /// of INRIA and gsplat hold out every 8th.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     every: u32,
 
-    /// Axes of the poses, in the form of `wildcity import --axes` [default: as the twin was imported and aligned;
-    /// identity for a file and for a list]
+    /// Axes of the poses, in the form of `wildcity import --axes` [default: as the twin was
+    /// imported and aligned; identity for a file and for a list]
     #[arg(long, value_name = "AXES", allow_hyphen_values = true)]
     axes: Option<String>,
 
@@ -81,8 +84,8 @@ pub(super) struct Eval {
     #[arg(long, value_name = "M", requires = "axes")]
     scale: Option<f64>,
 
-    /// Also compare after fitting a gain and an offset to each colour channel of each image: for captures with
-    /// automatic exposure.
+    /// Also compare after fitting a gain and an offset to each colour channel of each image: for
+    /// captures with automatic exposure.
     #[arg(long)]
     align_exposure: bool,
 
@@ -90,7 +93,8 @@ pub(super) struct Eval {
     #[arg(long, value_name = "N", default_value_t = 24)]
     show: usize,
 
-    /// Also write the rendered images and the error maps in full size, as PNG, to rendered/ and errors/.
+    /// Also write the rendered images and the error maps in full size, as PNG, to rendered/ and
+    /// errors/.
     #[arg(long)]
     save_images: bool,
 
@@ -98,9 +102,9 @@ pub(super) struct Eval {
     #[arg(long, value_name = "DIR", default_value = "wildcity-eval")]
     out: PathBuf,
 
-    /// For each image, also render views at these lateral offsets to the left of the drive, in metres (negative:
-    /// right), and compute the metrics that need no real image: trust, reprojection, flicker. Needs a twin with a
-    /// drive.
+    /// For each image, also render views at these lateral offsets to the left of the drive, in
+    /// metres (negative: right), and compute the metrics that need no real image: trust,
+    /// reprojection, flicker. Needs a twin with a drive.
     #[arg(long, value_name = "METRES", allow_hyphen_values = true)]
     extrapolate: Option<Offsets>,
 
@@ -167,7 +171,7 @@ impl Eval {
         let backend = self.backend.backend()?;
         let repairer = self.repairer.load(&source, &self.twins, &held_out)?;
         let drives = match &source {
-            Source::Twin(resident) => Drives::of(&resident.version),
+            Source::Twin(resident) => Drives::from_version(&resident.version),
             Source::File(_) => None,
         };
         ensure!(
@@ -224,7 +228,7 @@ impl Eval {
         match (&self.axes, source) {
             (Some(axes), _) => placement::imported(axes, self.scale.unwrap_or(1.0)),
             (None, Source::Twin(resident)) if !list.is_in_scene_axes => {
-                placement::of_version(&self.twins.catalog()?, &resident.version)
+                placement::from_version(&self.twins.catalog()?, &resident.version)
             }
             (None, _) => Ok(Alignment::IDENTITY),
         }
@@ -270,7 +274,8 @@ impl Eval {
         Ok(drawn)
     }
 
-    /// Keeps only the pictures of the worst images, so that memory does not grow with the number of images.
+    /// Keeps only the pictures of the worst images, so that memory does not grow with the number of
+    /// images.
     fn forget_better_pictures(&self, evaluated: &mut [EvaluatedImage]) {
         let shown = evaluated.iter().filter(|image| image.thumbnails.is_some()).count();
         if shown <= self.show {

@@ -10,14 +10,14 @@ use wildcity_repair::{Image, LoadOptions, Network};
 /// `--lpips` and `--features`.
 #[derive(Debug, clap::Args)]
 pub(super) struct NetworkOptions {
-    /// Manifest of a network that computes the distance between two images, such as LPIPS (docs/evaluation.md). Pixels
-    /// that do not count are replaced by those of the real image.
+    /// Manifest of a network that computes the distance between two images, such as LPIPS
+    /// (docs/evaluation.md). Pixels that do not count are replaced by those of the real image.
     #[arg(long, value_name = "FILE")]
     lpips: Option<PathBuf>,
 
-    /// Manifest of a network that computes the features of an image, such as Inception. They give KID, the distance
-    /// between the set of rendered images and the set of real ones; with --extrapolate also for the views off the
-    /// drive.
+    /// Manifest of a network that computes the features of an image, such as Inception. They give
+    /// KID, the distance between the set of rendered images and the set of real ones; with
+    /// --extrapolate also for the views off the drive.
     #[arg(long, value_name = "FILE")]
     features: Option<PathBuf>,
 }
@@ -63,8 +63,8 @@ impl Networks {
         self.lpips.as_ref().map(name)
     }
 
-    /// The distance of an image from the real one; `None` without such a network. Pixels that do not count are those of
-    /// the real image in both.
+    /// The distance of an image from the real one; `None` without such a network. Pixels that do
+    /// not count are those of the real image in both.
     pub(super) fn lpips(
         &self,
         size_px: [u32; 2],
@@ -103,7 +103,7 @@ impl Networks {
         truth: &[Vec<f32>],
     ) -> anyhow::Result<Option<KidScores>> {
         let Some(network) = &self.features else { return Ok(None) };
-        let kid = |features: &[Vec<f32>]| Kid::of(features, truth).context("--features");
+        let kid = |features: &[Vec<f32>]| Kid::compare(features, truth).context("--features");
         let repaired = (!set.repaired.is_empty()).then(|| kid(&set.repaired)).transpose()?;
         Ok(Some(KidScores { network: name(network), rendered: kid(&set.rendered)?, repaired }))
     }

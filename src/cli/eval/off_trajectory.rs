@@ -106,8 +106,11 @@ pub(super) struct Lens {
 }
 
 impl Lens {
-    pub(super) fn of(camera: &Camera) -> Self {
-        Self { rays: Rays::of(camera), projection: Arc::new(Projection::of(camera)) }
+    pub(super) fn from_camera(camera: &Camera) -> Self {
+        Self {
+            rays: Rays::from_camera(camera),
+            projection: Arc::new(Projection::from_camera(camera)),
+        }
     }
 }
 
@@ -152,7 +155,8 @@ impl Line {
     ) -> anyhow::Result<OffTrajectoryImage> {
         let lens = image.lens;
         let moved_m = self.offset_m * place.left();
-        // The previous view is rendered first, and this one keeps its nearest recorded image, as in a session.
+        // The previous view is rendered first, and this one keeps its nearest recorded image, as in
+        // a session.
         let step = place.step_back();
         let before =
             step.map(|step| draw(tools, image, place, &|pose| step * moved(pose, moved_m), None));
@@ -171,8 +175,13 @@ impl Line {
         let size_px = [image.view.camera.width_px, image.view.camera.height_px];
         let scores = |of: &dyn Fn(&Drawn) -> Vec<u8>| {
             let back = into(lens, image.view, image.rendered, &now, of(&now));
-            let reprojection =
-                Reprojection::of(size_px, image.truth, &back.image.rgb8, &back.valid, image.counts);
+            let reprojection = Reprojection::compare(
+                size_px,
+                image.truth,
+                &back.image.rgb8,
+                &back.valid,
+                image.counts,
+            );
             let scores = ViewScores { reprojection: reprojection?, flicker: onto_now(of) };
             anyhow::Ok((scores, back.image.rgb8))
         };

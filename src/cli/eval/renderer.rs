@@ -32,7 +32,8 @@ pub(super) struct Maps {
 }
 
 impl Renderer {
-    /// How an image is rendered: `near` of the list overrides the scene's, and the command line both.
+    /// How an image is rendered: `near` of the list overrides the scene's, and the command line
+    /// both.
     pub(super) fn profile(&self, near: Option<f64>) -> anyhow::Result<RenderProfile> {
         let near = near.unwrap_or(self.own_profile.near);
         self.changes.apply(RenderProfile { near, ..self.own_profile })
@@ -74,7 +75,8 @@ pub(super) fn covered(image: &RenderedImage) -> f64 {
     covered as f64 / image.opacity.len() as f64
 }
 
-/// Converts rendered and repaired pixels from the exposure of the twin to that of a real image, if it is known.
+/// Converts rendered and repaired pixels from the exposure of the twin to that of a real image, if
+/// it is known.
 pub(super) fn expose(
     stops: Option<f64>,
     rendered: &mut RenderedImage,

@@ -26,13 +26,15 @@ const THREADS: i64 = wildcity_repair::limits::MAX_THREADS as i64;
 /// `--repair` and the runtime of networks.
 #[derive(Debug, clap::Args)]
 pub(super) struct RepairerOptions {
-    /// Also repair each image with the model of this manifest (docs/repair.md), and compare the repaired image, too.
-    /// Every image is repaired, at any trust. A model that compares with recorded images needs a twin with a drive; the
-    /// images that are compared here are withheld from it.
+    /// Also repair each image with the model of this manifest (docs/repair.md), and compare the
+    /// repaired image, too. Every image is repaired, at any trust. A model that compares with
+    /// recorded images needs a twin with a drive; the images that are compared here are withheld
+    /// from it.
     #[arg(long, value_name = "FILE")]
     repair: Option<PathBuf>,
 
-    /// ONNX Runtime library for --repair, --lpips and --features, version 1.18 or later [default: $ORT_DYLIB_PATH]
+    /// ONNX Runtime library for --repair, --lpips and --features, version 1.18 or later [default:
+    /// $ORT_DYLIB_PATH]
     #[arg(long, value_name = "PATH")]
     onnxruntime: Option<PathBuf>,
 
@@ -64,7 +66,8 @@ impl RepairerOptions {
         LoadOptions { threads: self.repair_threads.into(), ..LoadOptions::new(library) }
     }
 
-    /// Loads the model, if one is asked for. `held_out` are the poses of the images that are compared.
+    /// Loads the model, if one is asked for. `held_out` are the poses of the images that are
+    /// compared.
     pub(super) fn load(
         &self,
         source: &Source,
@@ -85,7 +88,7 @@ impl RepairerOptions {
     ) -> anyhow::Result<Repairer> {
         let options = self.load_options();
         let model = Arc::new(Model::load(manifest, &options)?);
-        let needed = NeededReferences::of(&model);
+        let needed = NeededReferences::from_model(&model);
         let name = &model.manifest().name;
         let references = match source {
             Source::Twin(resident) => {

@@ -35,8 +35,8 @@ struct NamedView {
 }
 
 impl Comparison<'_> {
-    /// Writes a PNG for each camera, with full detail on the left, and prints for each value the share of
-    /// Gaussians that is rendered and the PSNR.
+    /// Writes a PNG for each camera, with full detail on the left, and prints for each value the
+    /// share of Gaussians that is rendered and the PSNR.
     pub(super) fn write(
         &self,
         catalog: Catalog,
@@ -116,7 +116,7 @@ impl Comparison<'_> {
         let rig = manifest.rig.clone().or_else(|| Rig::preset(wildcity_session::limits::RIG));
         let rig = rig.context("the default rig preset is missing")?;
         let names = rig.cameras.iter().map(|camera| camera.name.clone());
-        let views = View::of_rig(&rig.cameras, world_from_rig);
+        let views = View::from_rig(&rig.cameras, world_from_rig);
         Ok(names.zip(views).map(|(name, view)| NamedView { name, view }).collect())
     }
 

@@ -15,8 +15,8 @@ use super::directories::{TwinVersion, Twins};
 
 /// Show the levels of detail of a twin: Gaussians, bytes, and geometric error of each.
 ///
-/// With --out it also renders images: for each camera a PNG with full detail next to the image at every --tau, and the
-/// PSNR between them in dB.
+/// With --out it also renders images: for each camera a PNG with full detail next to the image at
+/// every --tau, and the PSNR between them in dB.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Lod {
@@ -31,8 +31,8 @@ pub(super) struct Lod {
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
 
-    /// JSON list of cameras in the twin's axes, as `wildcity render --cameras` reads it [default: the twin's
-    /// rig, or the preset `vehicle6`, in the middle of the twin's first trajectory]
+    /// JSON list of cameras in the twin's axes, as `wildcity render --cameras` reads it [default:
+    /// the twin's rig, or the preset `vehicle6`, in the middle of the twin's first trajectory]
     #[arg(long, value_name = "FILE", requires = "out")]
     cameras: Option<PathBuf>,
 

@@ -12,10 +12,10 @@ use wildcity_twin::ingest;
 
 /// Read a map from OpenDRIVE or GeoJSON.
 ///
-/// OpenDRIVE: coordinates are those of the twin, at most 16 km from its origin, or with --origin those of a map projection
-/// such as UTM; the offset of the header counts. GeoJSON: features with the property layer, which is `lane`, `drivable`,
-/// `intersection`, `crosswalk`, `stop_line` or a layer of nuPlan; coordinates are metres of the twin, or degrees with
-/// --origin.
+/// OpenDRIVE: coordinates are those of the twin, at most 16 km from its origin, or with --origin
+/// those of a map projection such as UTM; the offset of the header counts. GeoJSON: features with
+/// the property layer, which is `lane`, `drivable`, `intersection`, `crosswalk`, `stop_line` or a
+/// layer of nuPlan; coordinates are metres of the twin, or degrees with --origin.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:
@@ -27,8 +27,8 @@ pub(in crate::cli) struct Import {
     #[arg(value_name = "FILE")]
     file: PathBuf,
 
-    /// The twin's origin: for OpenDRIVE its easting and northing in the file's projection, in metres; for GeoJSON in
-    /// degrees its longitude and latitude.
+    /// The twin's origin: for OpenDRIVE its easting and northing in the file's projection, in
+    /// metres; for GeoJSON in degrees its longitude and latitude.
     #[arg(long, value_name = "EAST,NORTH", value_parser = origin, allow_hyphen_values = true)]
     origin: Option<[f64; 2]>,
 

@@ -8,7 +8,8 @@ pub(in crate::cli) use import::origin;
 
 /// Make and check maps: lanes and areas of a twin.
 ///
-/// A twin needs no map. With one, actors can follow lanes, and scores can detect that an ego is off the road.
+/// A twin needs no map. With one, actors can follow lanes, and scores can detect that an ego is off
+/// the road.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:

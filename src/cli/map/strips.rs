@@ -9,8 +9,8 @@ use wildcity_sim::map::strips_beside;
 
 /// Make a map of strips along the recorded drives of a twin.
 ///
-/// Each drive becomes a lane of its name and a drivable area, from --left-m to its left to --right-m to its right.
-/// Only the owner of the twin knows these widths, so they have no default.
+/// Each drive becomes a lane of its name and a drivable area, from --left-m to its left to
+/// --right-m to its right. Only the owner of the twin knows these widths, so they have no default.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:

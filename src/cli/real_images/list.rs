@@ -147,7 +147,8 @@ fn has_frames(path: &Path) -> anyhow::Result<bool> {
     Ok(is_object && parsed.is_ok_and(|file| file.frames.is_some()))
 }
 
-/// The folder `images` in that of the model or in one of the two above, as COLMAP's workspaces have it.
+/// The folder `images` in that of the model or in one of the two above, as COLMAP's workspaces have
+/// it.
 fn colmap_images(model: &Path) -> PathBuf {
     let candidates = ["", "..", "../.."].map(|up| model.join(up).join("images"));
     let [beside, ..] = &candidates;
@@ -167,9 +168,9 @@ fn image_file(folder: &Path, name: &str) -> anyhow::Result<PathBuf> {
     })
 }
 
-/// The mask of an image: with the image's name, with .png in place of its extension, or with .png appended, as COLMAP
-/// names masks. Names of transforms.json start with the folder of the images, such as `images` or `images_4`; those of
-/// masks need not.
+/// The mask of an image: with the image's name, with .png in place of its extension, or with .png
+/// appended, as COLMAP names masks. Names of transforms.json start with the folder of the images,
+/// such as `images` or `images_4`; those of masks need not.
 fn mask_file(masks: &Path, name: &str) -> anyhow::Result<PathBuf> {
     let within = name.split_once('/').filter(|(folder, _)| folder.starts_with("images"));
     let names = [Some(name), within.map(|(_, within)| within)].into_iter().flatten();

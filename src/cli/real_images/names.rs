@@ -7,16 +7,17 @@ use wildcity_scene::rig::is_name;
 
 use super::list::RealImage;
 
-/// The camera of each image: its folder if the images are in several folders, else its file name without the digits at
-/// its end.
+/// The camera of each image: its folder if the images are in several folders, else its file name
+/// without the digits at its end.
 pub(in crate::cli) fn camera_names(images: &[&RealImage]) -> Vec<String> {
     let folder = |image: &RealImage| Path::new(&image.name).parent().map(Path::to_owned);
     let folders: BTreeSet<Option<PathBuf>> = images.iter().map(|image| folder(image)).collect();
     let name = |image: &&RealImage| {
         let path = Path::new(&image.name);
-        let text = match folders.len() > 1 {
-            true => path.parent().and_then(Path::file_name),
-            false => path.file_stem(),
+        let text = if folders.len() > 1 {
+            path.parent().and_then(Path::file_name)
+        } else {
+            path.file_stem()
         };
         let text = text.unwrap_or_default().to_string_lossy().to_ascii_lowercase();
         let ends_name = |c: char| c.is_ascii_digit() || "._-".contains(c);

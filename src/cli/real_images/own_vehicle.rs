@@ -1,12 +1,13 @@
-//! The part of an image that the own vehicle covers: the overlay of the rig's camera of the same name.
+//! The part of an image that the own vehicle covers: the overlay of the rig's camera of the same
+//! name.
 
 use wildcity_scene::Rig;
 
 /// Largest difference of the shapes of a real image and of an overlay, as a share.
 const SAME_SHAPE: f64 = 0.01;
 
-/// The pixels of an image outside of the overlay of the rig's camera of a name. `None` without such a camera or overlay, and
-/// if the image has another shape: then another camera took it.
+/// The pixels of an image outside of the overlay of the rig's camera of a name. `None` without such
+/// a camera or overlay, and if the image has another shape: then another camera took it.
 pub(in crate::cli) fn outside(
     rig: Option<&Rig>,
     camera_name: &str,

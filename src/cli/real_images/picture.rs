@@ -7,10 +7,12 @@ use image::{DynamicImage, ImageReader, Limits};
 
 use wildcity_scene::geometry::Camera;
 
-/// Largest difference of an image's two scales to its camera's, as a share: rounding of sides to pixels.
+/// Largest difference of an image's two scales to its camera's, as a share: rounding of sides to
+/// pixels.
 const SAME_SHAPE: f64 = 0.01;
 
-/// Reads a real image, in 8 bits, with its camera at the image's size. Where it is transparent, `background` shows.
+/// Reads a real image, in 8 bits, with its camera at the image's size. Where it is transparent,
+/// `background` shows.
 ///
 /// # Errors
 /// The file cannot be read, or has another shape than the camera.
@@ -59,7 +61,8 @@ pub(in crate::cli) fn inside(name: &str) -> PathBuf {
     Path::new(name).components().filter(|part| matches!(part, Component::Normal(_))).collect()
 }
 
-/// The camera at the size of the image. A scene that was trained on smaller images has them as its native ones.
+/// The camera at the size of the image. A scene that was trained on smaller images has them as its
+/// native ones.
 fn fitted(camera: &Camera, [width, height]: [u32; 2]) -> anyhow::Result<Camera> {
     let own = [camera.width_px, camera.height_px];
     if own == [width, height] {

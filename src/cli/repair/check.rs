@@ -16,11 +16,12 @@ use crate::cli::repair_options::runtime_library;
 
 /// Load a repair model, probe it, and measure it.
 ///
-/// Reads the manifest FILE and the files that it pins, compares it with the graph, and runs the model on a pattern:
-/// shape, NaN, time limit, three equal runs. For a model in tiles it measures the halo (how far an output pixel depends
-/// on the input) and checks that tiles give the same bits as the whole image. Then it prints time and additional memory
-/// of one image per size. Inputs other than the image get neutral values: the image itself as reference, 10 m of depth,
-/// full opacity and validity.
+/// Reads the manifest FILE and the files that it pins, compares it with the graph, and runs the
+/// model on a pattern: shape, NaN, time limit, three equal runs. For a model in tiles it measures
+/// the halo (how far an output pixel depends on the input) and checks that tiles give the same bits
+/// as the whole image. Then it prints time and additional memory of one image per size. Inputs
+/// other than the image get neutral values: the image itself as reference, 10 m of depth, full
+/// opacity and validity.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Check {
@@ -40,7 +41,8 @@ pub(super) struct Check {
     #[arg(long, value_name = "PATH")]
     onnxruntime: Option<PathBuf>,
 
-    /// One of the manifest's providers; the command does not fall back to another one [default: its first]
+    /// One of the manifest's providers; the command does not fall back to another one [default: its
+    /// first]
     #[arg(long, value_enum)]
     provider: Option<ProviderOption>,
 
@@ -147,9 +149,10 @@ impl Check {
 
     fn print_model(&self, out: &mut impl Write, model: &Model) -> io::Result<()> {
         let manifest = model.manifest();
-        let repeated = match model.is_deterministic() {
-            true => "three runs gave the same bytes",
-            false => "three runs gave different bytes",
+        let repeated = if model.is_deterministic() {
+            "three runs gave the same bytes"
+        } else {
+            "three runs gave different bytes"
         };
         let halo = match model.halo() {
             Some(Halo::Pixels(halo)) if manifest.size.fixed.is_some() => {

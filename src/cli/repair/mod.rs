@@ -6,8 +6,8 @@ mod warp_time;
 
 /// Check ONNX models that repair images.
 ///
-/// A model is an .onnx file with a manifest next to it (docs/repair.md). ONNX Runtime is a separate library, which
-/// --onnxruntime or $ORT_DYLIB_PATH names; it is loaded only to run a model.
+/// A model is an .onnx file with a manifest next to it (docs/repair.md). ONNX Runtime is a separate
+/// library, which --onnxruntime or $ORT_DYLIB_PATH names; it is loaded only to run a model.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:

@@ -16,7 +16,8 @@ const WALL_M: f64 = 20.0;
 /// Places of the references, in metres ahead of the view.
 const AHEAD_M: [f64; 5] = [-8.0, -5.5, -3.0, -0.5, 2.0];
 
-/// Seconds to warp five references that show the whole view into it, on one core: with a pinhole, and with a fisheye.
+/// Seconds to warp five references that show the whole view into it, on one core: with a pinhole,
+/// and with a fisheye.
 pub(super) fn seconds(width: usize, height: usize) -> [f64; 2] {
     let pinhole = Pinhole {
         fx: 0.6 * width as f64,
@@ -27,8 +28,8 @@ pub(super) fn seconds(width: usize, height: usize) -> [f64; 2] {
     let straight = Camera::from_pinhole(width as u32, height as u32, pinhole);
     let fisheye = Camera { lens: Lens::Fisheye(Fisheye::new([0.0; 4], None)), ..straight };
     [straight, fisheye].map(|camera| {
-        let projection = Arc::new(Projection::of(&camera));
-        let rays = Rays::of(&camera);
+        let projection = Arc::new(Projection::from_camera(&camera));
+        let rays = Rays::from_camera(&camera);
         let references: Vec<Arc<Reference>> = AHEAD_M
             .into_iter()
             .map(|ahead_m| {

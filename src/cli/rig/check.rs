@@ -2,15 +2,15 @@
 
 use std::io::{self, Write};
 
-use super::lookup::{rig_of, view_of};
+use super::lookup::{camera_view, find_rig};
 use crate::cli::backend_options::BackendOptions;
 use wildcity_render::compare::reprojection::ReprojectionErrors;
 
 /// Render points at known pixels, and check that each camera of a rig shows them there.
 ///
-/// Places a grid of small Gaussians in front of each camera, on rays through the centres of pixels, and
-/// compares the centroids of their images with those pixel centres. Prints the largest distance for each
-/// camera; the exit code is 1 if one is above 0.1 px.
+/// Places a grid of small Gaussians in front of each camera, on rays through the centres of pixels,
+/// and compares the centroids of their images with those pixel centres. Prints the largest distance
+/// for each camera; the exit code is 1 if one is above 0.1 px.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:
@@ -30,13 +30,13 @@ const MAX_DISTANCE_PX: f64 = 0.1;
 
 impl Check {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let rig = rig_of(&self.rig)?;
+        let rig = find_rig(&self.rig)?;
         let backend = self.backend.backend()?;
         let mut out = io::stdout().lock();
         let mut wrong = Vec::new();
         for camera in &rig.cameras {
             let ReprojectionErrors { count, worst_px } =
-                ReprojectionErrors::measure(&*backend, &view_of(camera))?;
+                ReprojectionErrors::measure(&*backend, &camera_view(camera))?;
             writeln!(out, "{:<24} {count:>3} points, at most {worst_px:.3} px off", camera.name)?;
             if worst_px > MAX_DISTANCE_PX || count == 0 {
                 wrong.push(camera.name.clone());

@@ -7,15 +7,15 @@ use glam::DVec2;
 use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
 
-use super::lookup::{rig_of, view_of};
+use super::lookup::{camera_view, find_rig};
 use crate::cli::output;
 use wildcity_scene::Rig;
 use wildcity_scene::rig::RigCamera;
 
 /// Draw the cameras of a rig from above, as an SVG file.
 ///
-/// The rig's front is at the top; grid squares have a side of one metre. Each camera is drawn with the
-/// horizontal field of view of its middle row.
+/// The rig's front is at the top; grid squares have a side of one metre. Each camera is drawn with
+/// the horizontal field of view of its middle row.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "Example:\n  wildcity rig draw vehicle6 --out vehicle6.svg")]
 pub(super) struct Draw {
@@ -39,7 +39,7 @@ const RAYS: u32 = 25;
 
 impl Draw {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let rig = rig_of(&self.rig)?;
+        let rig = find_rig(&self.rig)?;
         let mut svg = String::new();
         draw(&rig, &mut svg).map_err(|error| anyhow!("cannot draw the rig: {error}"))?;
         output::write(&self.out, svg.as_bytes())
@@ -69,7 +69,7 @@ fn draw(rig: &Rig, svg: &mut String) -> DrawResult {
 
 /// Draws the outline of a camera's field of view, with its name.
 fn draw_camera(chart: &mut Chart<'_, '_>, camera: &RigCamera, index: usize) -> DrawResult {
-    let view = view_of(camera);
+    let view = camera_view(camera);
     let position_m = camera.rig_from_camera.position_m;
     let width = f64::from(camera.camera.width_px);
     let height = f64::from(camera.camera.height_px);

@@ -8,7 +8,7 @@ use wildcity_scene::Rig;
 use wildcity_scene::rig::RigCamera;
 
 /// The preset of this name, or else the rig in this file.
-pub(in crate::cli) fn rig_of(name: &str) -> anyhow::Result<Rig> {
+pub(in crate::cli) fn find_rig(name: &str) -> anyhow::Result<Rig> {
     if let Some(rig) = Rig::preset(name) {
         return Ok(rig);
     }
@@ -22,6 +22,6 @@ pub(in crate::cli) fn rig_of(name: &str) -> anyhow::Result<Rig> {
 }
 
 /// The view of a camera while the rig stands at the world's origin.
-pub(super) fn view_of(camera: &RigCamera) -> View {
+pub(super) fn camera_view(camera: &RigCamera) -> View {
     View::new(camera.camera, camera.rig_from_camera)
 }

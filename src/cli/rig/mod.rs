@@ -5,7 +5,7 @@ mod draw;
 mod lookup;
 mod show;
 
-pub(super) use lookup::rig_of;
+pub(super) use lookup::find_rig;
 
 /// Show the cameras of a rig, draw them, and check that their images show points where they should.
 ///

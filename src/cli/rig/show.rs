@@ -4,15 +4,16 @@ use std::io::{self, Write};
 
 use glam::{DVec2, DVec3};
 
-use super::lookup::{rig_of, view_of};
+use super::lookup::{camera_view, find_rig};
 use wildcity_render::View;
 use wildcity_scene::Rig;
 
 /// Print the cameras of a rig; without RIG, the names of the presets.
 ///
-/// Positions are in the rig's axes, in metres: x forward, y left, z up. Yaw is positive to the left of
-/// straight ahead and pitch is positive above the horizon, both in degrees. A field of view is the angle
-/// between the rays of the midpoints of opposite edges, in degrees, or `-` if the lens shows nothing there.
+/// Positions are in the rig's axes, in metres: x forward, y left, z up. Yaw is positive to the left
+/// of straight ahead and pitch is positive above the horizon, both in degrees. A field of view is
+/// the angle between the rays of the midpoints of opposite edges, in degrees, or `-` if the lens
+/// shows nothing there.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "Examples:\n  wildcity rig show\n  wildcity rig show vehicle6")]
 pub(super) struct Show {
@@ -30,7 +31,7 @@ impl Show {
             }
             return Ok(());
         };
-        let rig = rig_of(&name)?;
+        let rig = find_rig(&name)?;
         writeln!(out, "{}: {} cameras", rig.name, rig.cameras.len())?;
         let headings =
             ["#", "camera", "size px", "field deg", "x m", "y m", "z m", "yaw deg", "pitch deg"];
@@ -40,7 +41,7 @@ impl Show {
             "{index:>2} {camera:<24} {size:>9} {field:>11} {x:>6} {y:>6} {z:>6} {yaw:>7} {pitch:>9}"
         )?;
         for (index, camera) in rig.cameras.iter().enumerate() {
-            let view = view_of(camera);
+            let view = camera_view(camera);
             let width_px = camera.camera.width_px;
             let height_px = camera.camera.height_px;
             let [x, y, z] = camera.rig_from_camera.position_m.to_array();
@@ -73,8 +74,8 @@ fn fields_of_view(view: &View) -> String {
     format!("{horizontal}x{vertical}")
 }
 
-/// Angle between the rays of two points of an image, in degrees. None if the lens shows nothing at one of
-/// them.
+/// Angle between the rays of two points of an image, in degrees. None if the lens shows nothing at
+/// one of them.
 fn angle_between_deg(view: &View, a_px: DVec2, b_px: DVec2) -> Option<f64> {
     let a = view.ray_world(a_px)?;
     let b = view.ray_world(b_px)?;

@@ -9,11 +9,12 @@ use super::files::read_times_us;
 use crate::cli::input_files::read_trajectory;
 use wildcity_scene::route;
 
-/// Match the keyframes of a drive with the times of another clock, for example those of a camera's images.
+/// Match the keyframes of a drive with the times of another clock, for example those of a camera's
+/// images.
 ///
-/// A time and a keyframe match if each is the other's nearest, and they are at most --tolerance-us apart.
-/// Prints one JSON object: the pairs with their residuals (keyframe time minus time), the times without a
-/// keyframe, and the median and the largest residual, all in microseconds.
+/// A time and a keyframe match if each is the other's nearest, and they are at most --tolerance-us
+/// apart. Prints one JSON object: the pairs with their residuals (keyframe time minus time), the
+/// times without a keyframe, and the median and the largest residual, all in microseconds.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Example:

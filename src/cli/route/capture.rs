@@ -14,9 +14,10 @@ use crate::cli::placement::Placement;
 
 /// Make a drive and a rig from the camera poses of a COLMAP model.
 ///
-/// DIR has cameras.bin and images.bin, or cameras.txt and images.txt, or has them in sparse/0. Each folder of images
-/// belongs to one camera of the rig. The rig stands level on the ground under the camera with the most images, and
-/// looks where that camera looks. Images are in the order of their names.
+/// DIR has cameras.bin and images.bin, or cameras.txt and images.txt, or has them in sparse/0. Each
+/// folder of images belongs to one camera of the rig. The rig stands level on the ground under the
+/// camera with the most images, and looks where that camera looks. Images are in the order of their
+/// names.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:
@@ -35,10 +36,10 @@ pub(in crate::cli) struct FromColmap {
 
 /// Make a drive and a rig from the camera poses of a transforms.json of nerfstudio or instant-ngp.
 ///
-/// Each folder of images belongs to one camera of the rig. The rig stands level on the ground under the camera with the
-/// most images, and looks where that camera looks. Images are in the order of their names. The poses must be in the
-/// axes of the scene: nerfstudio moves and scales them when it trains (--orientation-method none --center-method none
-/// --auto-scale-poses False keeps them).
+/// Each folder of images belongs to one camera of the rig. The rig stands level on the ground under
+/// the camera with the most images, and looks where that camera looks. Images are in the order of
+/// their names. The poses must be in the axes of the scene: nerfstudio moves and scales them when
+/// it trains (--orientation-method none --center-method none --auto-scale-poses False keeps them).
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:
@@ -63,12 +64,13 @@ struct DriveOptions {
     #[arg(long, value_name = "NAME", default_value = "capture")]
     name: String,
 
-    /// Images per second of the capture, if its images have no times (time_us of each frame of a transforms.json)
-    /// [default: 10]
+    /// Images per second of the capture, if its images have no times (time_us of each frame of a
+    /// transforms.json) [default: 10]
     #[arg(long, value_name = "N")]
     fps: Option<f64>,
 
-    /// Height of the camera above the ground, in metres [default: the ground is at z = 0 of the twin]
+    /// Height of the camera above the ground, in metres [default: the ground is at z = 0 of the
+    /// twin]
     #[arg(long, value_name = "M")]
     camera_height_m: Option<f64>,
 

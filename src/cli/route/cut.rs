@@ -13,8 +13,9 @@ use wildcity_scene::route::{self, Route};
 
 /// Cut a drive into shorter drives of given lengths, in the same world.
 ///
-/// Writes DIR/<name>-<length>-<number>.json for each cut, with a clock that starts at 0, and DIR/index.json with the
-/// name of each cut, its stations on the drive in metres, and its start on the drive's clock in microseconds.
+/// Writes DIR/<name>-<length>-<number>.json for each cut, with a clock that starts at 0, and
+/// DIR/index.json with the name of each cut, its stations on the drive in metres, and its start on
+/// the drive's clock in microseconds.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:
@@ -29,8 +30,8 @@ pub(in crate::cli) struct Cut {
     #[arg(long, value_name = "M", value_delimiter = ',', default_values_t = route::SUB_TRAJECTORY_LENGTHS_M)]
     length_m: Vec<f64>,
 
-    /// Distance from the start of one cut to the start of the next, in metres [default: the length, so that
-    /// cuts do not overlap]
+    /// Distance from the start of one cut to the start of the next, in metres [default: the length,
+    /// so that cuts do not overlap]
     #[arg(long, value_name = "M")]
     stride_m: Option<f64>,
 

@@ -11,8 +11,8 @@ use wildcity_scene::trajectory::Keyframe;
 
 /// Write the poses of a drive at given times.
 ///
-/// Between keyframes the position is interpolated linearly and the rotation spherically. A time before the
-/// first keyframe or after the last one is an error: nothing is extrapolated.
+/// Between keyframes the position is interpolated linearly and the rotation spherically. A time
+/// before the first keyframe or after the last one is an error: nothing is extrapolated.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Example:

@@ -8,10 +8,11 @@ mod interpolate;
 mod measure;
 mod subsample;
 
-/// Measure a recorded drive, cut it, match its clock with another clock, or make one from camera poses.
+/// Measure a recorded drive, cut it, match its clock with another clock, or make one from camera
+/// poses.
 ///
-/// Drives are JSON files as `wildcity import --trajectory` reads them. The results are such files too, in
-/// the same world.
+/// Drives are JSON files as `wildcity import --trajectory` reads them. The results are such files
+/// too, in the same world.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:

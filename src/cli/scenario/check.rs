@@ -17,9 +17,9 @@ use wildcity_twin::store::Catalog;
 
 /// Check scenarios against their twins, with every combination of their sweeps.
 ///
-/// Prints one line for each scenario, and warns of actors that no image shows, or that look larger or smaller than they
-/// are. The first mistake ends the command with exit code 2, as it ends `wildcity episode run`; it names the place in the
-/// file and what is accepted there.
+/// Prints one line for each scenario, and warns of actors that no image shows, or that look larger
+/// or smaller than they are. The first mistake ends the command with exit code 2, as it ends
+/// `wildcity episode run`; it names the place in the file and what is accepted there.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:
@@ -30,7 +30,8 @@ pub(in crate::cli) struct Check {
     #[arg(value_name = "FILE", required = true)]
     files: Vec<PathBuf>,
 
-    /// Accept twins, tracks and maps whose hashes differ from those that the scenario names, and say so.
+    /// Accept twins, tracks and maps whose hashes differ from those that the scenario names, and
+    /// say so.
     #[arg(long)]
     latest: bool,
 

@@ -11,9 +11,10 @@ use wildcity_twin::ingest;
 
 /// Read a scenario of OpenSCENARIO XML 1.0 to 1.3.
 ///
-/// The import supports catalogs, parameters with formulas, positions on roads, changes of speed, lane and offset,
-/// trajectories, and events with conditions, edges and delays. It refuses any other part, with its name and line,
-/// because the scenario would be different without it. Some parts can be left out on request; each is then listed.
+/// The import supports catalogs, parameters with formulas, positions on roads, changes of speed,
+/// lane and offset, trajectories, and events with conditions, edges and delays. It refuses any
+/// other part, with its name and line, because the scenario would be different without it. Some
+/// parts can be left out on request; each is then listed.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:
@@ -42,7 +43,8 @@ pub(in crate::cli) struct Import {
     #[arg(long, value_name = "DIR")]
     catalogs: Vec<PathBuf>,
 
-    /// Easting and northing of the twin's origin, as in `wildcity map import --origin` of these roads.
+    /// Easting and northing of the twin's origin, as in `wildcity map import --origin` of these
+    /// roads.
     #[arg(long, value_name = "EAST,NORTH", value_parser = crate::cli::map::origin, allow_hyphen_values = true)]
     origin: Option<[f64; 2]>,
 
@@ -50,9 +52,9 @@ pub(in crate::cli) struct Import {
     #[arg(long = "parameter", value_name = "NAME=VALUE", value_parser = parameter)]
     parameters: Vec<(String, String)>,
 
-    /// Parts to leave out: controllers, ego (actions of the entity that the agent drives), environment, appearance,
-    /// signals, stop (conditions of the end that are no time), distances, routes,
-    /// trailers, custom. Each that is left out is listed.
+    /// Parts to leave out: controllers, ego (actions of the entity that the agent drives),
+    /// environment, appearance, signals, stop (conditions of the end that are no time), distances,
+    /// routes, trailers, custom. Each that is left out is listed.
     #[arg(long, value_name = "PART,...", value_delimiter = ',', value_parser = part)]
     leave_out: Vec<openscenario::Part>,
 

@@ -16,8 +16,8 @@ use wildcity_twin::store::{Catalog, Version};
 
 /// Check scenarios, show one as an episode runs it, and import those of other formats.
 ///
-/// A scenario is a JSON file: a twin, an ego, actors, a route, and when an episode ends. The tracks and maps that it
-/// names are in the same directory. docs/scenarios.md explains every field.
+/// A scenario is a JSON file: a twin, an ego, actors, a route, and when an episode ends. The tracks
+/// and maps that it names are in the same directory. docs/scenarios.md explains every field.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:
@@ -65,14 +65,15 @@ fn opened(path: &Path, catalog: &Catalog) -> anyhow::Result<Opened> {
     let file = document.with(&document.first_values()).with_context(context)?;
     let version = match &file.twin.version_hash {
         None => catalog.version(&file.twin.name, None),
-        Some(hash) => version_of(catalog, &file.twin.name, hash),
+        Some(hash) => find_version(catalog, &file.twin.name, hash),
     };
     let version = version.with_context(context)?;
     Ok(Opened { scenarios, document, version })
 }
 
-/// The version with a hash. If there is none, the latest version, which the check of the hash then refuses.
-fn version_of(
+/// The version with a hash. If there is none, the latest version, which the check of the hash then
+/// refuses.
+fn find_version(
     catalog: &Catalog,
     twin: &str,
     hash: &str,
@@ -92,7 +93,7 @@ fn version_of(
 }
 
 /// Values of a sweep: NAME=VALUE.
-fn values_of(given: &[(String, Value)]) -> BTreeMap<String, Value> {
+fn given_values(given: &[(String, Value)]) -> BTreeMap<String, Value> {
     given.iter().cloned().collect()
 }
 

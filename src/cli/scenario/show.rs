@@ -5,13 +5,15 @@ use std::path::PathBuf;
 
 use serde_json::Value;
 
-use super::{opened, value, values_of};
+use super::{given_values, opened, value};
 use crate::cli::directories::Twins;
 use wildcity_session::StoredAssets;
 
-/// Show a scenario as an episode runs it: with a seed's jitter, the values of its sweep, and all hashes.
+/// Show a scenario as an episode runs it: with a seed's jitter, the values of its sweep, and all
+/// hashes.
 ///
-/// Prints JSON: the resolved scenario, which is a scenario itself, and its hash, the identity of the episode.
+/// Prints JSON: the resolved scenario, which is a scenario itself, and its hash, the identity of
+/// the episode.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:
@@ -43,7 +45,7 @@ impl Show {
         let catalog = self.twins.catalog()?;
         let opened = opened(&self.file, &catalog)?;
         let mut values = opened.document.first_values();
-        values.extend(values_of(&self.values));
+        values.extend(given_values(&self.values));
         let file = opened.document.with(&values)?;
         let version = (&opened.version.manifest, opened.version.hash.as_str());
         let assets = StoredAssets::new(&catalog);

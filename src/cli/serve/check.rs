@@ -20,7 +20,7 @@ impl Serve {
     ///
     /// # Errors
     /// The file cannot be read, has an unknown key or a value that the option refuses.
-    pub(in crate::cli) fn of_file(file: &Path) -> anyhow::Result<Self> {
+    pub(in crate::cli) fn from_file(file: &Path) -> anyhow::Result<Self> {
         let mut argument = OsString::from("--config=");
         argument.push(file);
         Ok(config_file::resolve(vec![argument])?.serve)
@@ -31,7 +31,8 @@ impl Serve {
         &self.directories
     }
 
-    /// Checks the address and every file that the server reads or writes outside of its directories. Changes nothing.
+    /// Checks the address and every file that the server reads or writes outside of its
+    /// directories. Changes nothing.
     pub(in crate::cli) fn checks(&self) -> Vec<Check> {
         let mut checks = vec![("listen", self.check_listen())];
         if let Some(path) = &self.tokens {
@@ -97,12 +98,11 @@ fn check_certificate(files: &TlsFiles) -> Result<String, String> {
 
 fn check_audit_log(path: &Path) -> Result<String, String> {
     let shown = path.display();
-    let written = match path.exists() {
-        true => OpenOptions::new().append(true).open(path).map(drop),
-        false => {
-            let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
-            tempfile::tempfile_in(folder.unwrap_or(Path::new("."))).map(drop)
-        }
+    let written = if path.exists() {
+        OpenOptions::new().append(true).open(path).map(drop)
+    } else {
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+        tempfile::tempfile_in(folder.unwrap_or(Path::new("."))).map(drop)
     };
     match written {
         Ok(()) => Ok(format!("{shown} can be written")),

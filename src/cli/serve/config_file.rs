@@ -1,9 +1,10 @@
 //! `--config FILE.toml`: the options of `wildcity serve` in a file, and `--print-config`.
 //!
-//! Every option of the command line is a key of the file: `--memory-gib` is `memory_gib`, and the options
-//! under the heading *Limits* are in the table `[limits]`. The file is converted to arguments, which are
-//! put before those of the command line. The last value of an option counts, so a flag overrides the file
-//! and the file overrides a default. Each option has one description, one check and one default.
+//! Every option of the command line is a key of the file: `--memory-gib` is `memory_gib`, and the
+//! options under the heading *Limits* are in the table `[limits]`. The file is converted to
+//! arguments, which are put before those of the command line. The last value of an option counts,
+//! so a flag overrides the file and the file overrides a default. Each option has one description,
+//! one check and one default.
 
 use std::ffi::OsString;
 use std::fmt::Write as _;
@@ -62,7 +63,7 @@ fn is_limit(option: &Arg) -> bool {
 }
 
 /// The key of an option, as `limits.sessions`.
-fn key_of(option: &Arg) -> String {
+fn option_key(option: &Arg) -> String {
     let name = option.get_id().as_str();
     if is_limit(option) { format!("{LIMITS}.{name}") } else { name.to_owned() }
 }
@@ -80,8 +81,8 @@ fn read(path: &Path) -> anyhow::Result<Vec<OsString>> {
     let command = command();
     let mut arguments = Vec::new();
     for (key, value) in flattened(table)? {
-        let Some(option) = keys(&command).find(|option| key_of(option) == key) else {
-            let nearest = nearest(&key, keys(&command).map(key_of));
+        let Some(option) = keys(&command).find(|option| option_key(option) == key) else {
+            let nearest = nearest(&key, keys(&command).map(option_key));
             anyhow::bail!("there is no key {key}; the nearest is {nearest}");
         };
         let text = match value {
@@ -123,8 +124,8 @@ fn flattened(table: Table) -> anyhow::Result<Vec<(String, Value)>> {
     Ok(values)
 }
 
-/// The key that is most similar to a wrong one: the one with the fewest edits of the name, and of several
-/// such keys the one in the right table.
+/// The key that is most similar to a wrong one: the one with the fewest edits of the name, and of
+/// several such keys the one in the right table.
 fn nearest(wrong: &str, keys: impl Iterator<Item = String>) -> String {
     let name = |key: &str| key.rsplit('.').next().unwrap_or_default().to_owned();
     let wrong_name = name(wrong);
@@ -137,8 +138,8 @@ fn nearest(wrong: &str, keys: impl Iterator<Item = String>) -> String {
 }
 
 impl Resolved {
-    /// Every value that is in effect, with its description: a file that `--config` reads, with the same
-    /// effect.
+    /// Every value that is in effect, with its description: a file that `--config` reads, with the
+    /// same effect.
     ///
     /// # Errors
     /// A default directory is not known, because HOME is not set.
@@ -182,7 +183,7 @@ impl Resolved {
         let given = given.map(|value| value.to_string_lossy().into_owned());
         match given {
             Some(given) => Ok(Some(given)),
-            None => self.serve.default_of(id),
+            None => self.serve.default_value(id),
         }
     }
 }
@@ -309,8 +310,8 @@ mod tests {
         let command = command();
         assert!(keys(&command).count() > 25);
         for option in keys(&command) {
-            assert!(option.get_help().is_some(), "{} has no description", key_of(option));
-            assert!(option.get_long().is_some(), "{} has no flag", key_of(option));
+            assert!(option.get_help().is_some(), "{} has no description", option_key(option));
+            assert!(option.get_long().is_some(), "{} has no flag", option_key(option));
         }
     }
 }

@@ -29,7 +29,8 @@ pub(super) struct LimitOptions {
     #[arg(long, value_name = "N", default_value_t = Limits::default().sessions, value_parser = count())]
     sessions: usize,
 
-    /// Largest number of WebSocket connections at a time; 64 more connections are accepted for HTTP requests only.
+    /// Largest number of WebSocket connections at a time; 64 more connections are accepted for HTTP
+    /// requests only.
     #[arg(long, value_name = "N", default_value_t = Limits::default().connections, value_parser = count())]
     connections: usize,
 
@@ -37,8 +38,9 @@ pub(super) struct LimitOptions {
     #[arg(long, value_name = "N", default_value_t = Limits::default().pushes, value_parser = count())]
     pushes: usize,
 
-    /// Memory that running pushes may take together, in GiB [default: a third of --memory-gib]. A push waits until the
-    /// memory that it may need is free: 24 times the size of its files, plus 0.25 GiB.
+    /// Memory that running pushes may take together, in GiB [default: a third of --memory-gib]. A
+    /// push waits until the memory that it may need is free: 24 times the size of its files, plus
+    /// 0.25 GiB.
     #[arg(long, value_name = "GIB", value_parser = gib)]
     push_memory_gib: Option<f64>,
 
@@ -54,13 +56,13 @@ pub(super) struct LimitOptions {
     #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().idle.as_secs_f64(), value_parser = seconds)]
     idle_timeout_s: f64,
 
-    /// Seconds within which a client must read an answer; at most 30, because clients wait for an answer
-    /// for 90 s, of which a step may take 60.
+    /// Seconds within which a client must read an answer; at most 30, because clients wait for an
+    /// answer for 90 s, of which a step may take 60.
     #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().send.as_secs_f64(), value_parser = send_seconds)]
     send_timeout_s: f64,
 
-    /// Seconds for one step, including the time that it waits for other sessions; at most 60, because
-    /// clients wait for an answer for 90 s.
+    /// Seconds for one step, including the time that it waits for other sessions; at most 60,
+    /// because clients wait for an answer for 90 s.
     #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().step.as_secs_f64(), value_parser = step_seconds)]
     step_timeout_s: f64,
 
@@ -72,7 +74,8 @@ pub(super) struct LimitOptions {
     #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().drain.as_secs_f64(), value_parser = seconds)]
     drain_timeout_s: f64,
 
-    /// Seconds between two returns of free memory to the system, while Gaussians are evicted or pushes run.
+    /// Seconds between two returns of free memory to the system, while Gaussians are evicted or
+    /// pushes run.
     #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().memory_release.as_secs_f64(), value_parser = seconds)]
     memory_release_s: f64,
 
@@ -81,15 +84,15 @@ pub(super) struct LimitOptions {
     max_uploads: usize,
 
     /// Largest size of an upload, in GiB.
-    #[arg(long, value_name = "GIB", default_value_t = gib_of(SpoolLimits::default().upload_bytes), value_parser = gib)]
+    #[arg(long, value_name = "GIB", default_value_t = bytes_as_gib(SpoolLimits::default().upload_bytes), value_parser = gib)]
     upload_gib: f64,
 
     /// Largest total size of all uploads, in GiB.
-    #[arg(long, value_name = "GIB", default_value_t = gib_of(SpoolLimits::default().bytes), value_parser = gib)]
+    #[arg(long, value_name = "GIB", default_value_t = bytes_as_gib(SpoolLimits::default().bytes), value_parser = gib)]
     spool_gib: f64,
 
-    /// Largest total size of the uploads of one token, in GiB [default: half of --spool-gib if several tokens may
-    /// upload, else all]
+    /// Largest total size of the uploads of one token, in GiB [default: half of --spool-gib if
+    /// several tokens may upload, else all]
     #[arg(long, value_name = "GIB", value_parser = gib)]
     token_spool_gib: Option<f64>,
 
@@ -128,7 +131,7 @@ impl LimitOptions {
 }
 
 /// Converts bytes to GiB.
-pub(super) fn gib_of(bytes: u64) -> f64 {
+pub(super) fn bytes_as_gib(bytes: u64) -> f64 {
     bytes as f64 / f64::from(1 << 30)
 }
 

@@ -1,8 +1,9 @@
 //! Where a server logs, and where it sends its traces.
 //!
-//! A trace is a request with its parts: a step loads chunks, waits for a render thread, is rendered and encoded, and is
-//! recorded and sent. The parts are spans of `tracing` at the level `debug`. So a server without traces, at the default
-//! level of its log, only checks for each span whether it is enabled.
+//! A trace is a request with its parts: a step loads chunks, waits for a render thread, is rendered
+//! and encoded, and is recorded and sent. The parts are spans of `tracing` at the level `debug`. So
+//! a server without traces, at the default level of its log, only checks for each span whether it
+//! is enabled.
 
 use std::io::{self, IsTerminal as _};
 
@@ -59,14 +60,16 @@ mod otlp {
     const WAITING_SPANS: usize = 1 << 15;
     /// Interval at which spans are sent.
     const SENT_EVERY: Duration = Duration::from_secs(1);
-    /// Path below an endpoint that names none (OTLP specification 1.9, section "OTLP/HTTP Request").
+    /// Path below an endpoint that names none (OTLP specification 1.9, section "OTLP/HTTP
+    /// Request").
     const TRACES_PATH: &str = "/v1/traces";
 
     /// Sends traces. When it is dropped, it sends the remaining spans.
     pub(in crate::cli::serve) struct Traces(SdkTracerProvider);
 
     impl Traces {
-        /// Sends the spans of this program to an endpoint, `http://host:4318` or the same with a path.
+        /// Sends the spans of this program to an endpoint, `http://host:4318` or the same with a
+        /// path.
         pub(super) fn to<S>(endpoint: &str) -> anyhow::Result<(Self, impl Layer<S> + use<S>)>
         where
             S: Subscriber + for<'a> LookupSpan<'a>,
@@ -78,12 +81,13 @@ mod otlp {
                 "{}: expected a URL, as http://127.0.0.1:4318",
                 cannot()
             );
-            let url = match host.trim_end_matches('/').contains('/') {
-                true => endpoint.to_owned(),
-                false => format!("{}{TRACES_PATH}", endpoint.trim_end_matches('/')),
+            let url = if host.trim_end_matches('/').contains('/') {
+                endpoint.to_owned()
+            } else {
+                format!("{}{TRACES_PATH}", endpoint.trim_end_matches('/'))
             };
-            // The exporter's HTTP client has no TLS provider. Another part of the program may have installed one
-            // already.
+            // The exporter's HTTP client has no TLS provider. Another part of the program may have
+            // installed one already.
             let _ = rustls::crypto::ring::default_provider().install_default();
             let exporter = SpanExporter::builder().with_http().with_endpoint(url).build();
             let exporter = exporter.with_context(cannot)?;

@@ -17,7 +17,7 @@ use wildcity_server::{Origins, TlsFiles, Tokens};
 use wildcity_twin::residency::default_memory_bytes;
 use wildcity_twin::store::DamagedTwin;
 
-use limit_options::{LimitOptions, gib_of};
+use limit_options::{LimitOptions, bytes_as_gib};
 
 use super::backend_options::{BackendOptions, bytes_of_gib, gib};
 use super::directories::ServerDirectories;
@@ -29,8 +29,9 @@ use super::repair_options::{RepairOptions, runtime_library};
 /// Prints `listening on ws://HOST:PORT/v1/session` when agents can connect, and logs to standard
 /// error. Ctrl-C or SIGTERM lets running steps finish, then stops.
 ///
-/// Every option can also be set in a TOML file: --memory-gib is memory_gib there, and the options under
-/// Limits are in the table [limits]. A flag overrides the file, and the file overrides a default.
+/// Every option can also be set in a TOML file: --memory-gib is memory_gib there, and the options
+/// under Limits are in the table [limits]. A flag overrides the file, and the file overrides a
+/// default.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Serve {
@@ -45,20 +46,22 @@ pub(super) struct Serve {
     #[command(flatten)]
     directories: ServerDirectories,
 
-    /// Export each episode as MCAP when it ends, next to its record: for Foxglove, Rerun and others. The export takes
-    /// additional disk space of about half the size of the record, and no step waits for it.
+    /// Export each episode as MCAP when it ends, next to its record: for Foxglove, Rerun and
+    /// others. The export takes additional disk space of about half the size of the record, and no
+    /// step waits for it.
     #[arg(long, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = true, num_args = 0..=1, default_missing_value = "true")]
     mcap: bool,
 
-    /// JSON file of tokens and what each allows: {"tokens": [{"name": "fleet", "role": "drive", "token": "TOKEN"}]}.
-    /// role is metrics, drive, push or admin. hash may replace token. twins lists the twins that the token may use.
-    /// limits are its largest numbers at a time: sessions, connections, pushes, upload_bytes. The file is read again at
-    /// SIGHUP. Without it, the server listens only on a loopback address. docs/operators.md says more.
+    /// JSON file of tokens and what each allows: {"tokens": [{"name": "fleet", "role": "drive",
+    /// "token": "TOKEN"}]}. role is metrics, drive, push or admin. hash may replace token. twins
+    /// lists the twins that the token may use. limits are its largest numbers at a time: sessions,
+    /// connections, pushes, upload_bytes. The file is read again at SIGHUP. Without it, the server
+    /// listens only on a loopback address. docs/operators.md says more.
     #[arg(long, value_name = "FILE")]
     tokens: Option<PathBuf>,
 
-    /// PEM file with the certificate of the server, followed by those of its authorities. The server then uses HTTPS,
-    /// with the key of --tls-key. Both files are read again at SIGHUP.
+    /// PEM file with the certificate of the server, followed by those of its authorities. The
+    /// server then uses HTTPS, with the key of --tls-key. Both files are read again at SIGHUP.
     #[arg(long, value_name = "FILE")]
     tls_cert: Option<PathBuf>,
 
@@ -67,43 +70,47 @@ pub(super) struct Serve {
     tls_key: Option<PathBuf>,
 
     /// Origins of web pages of other sites that may send requests, separated by commas, for example
-    /// https://sim.example.org; pages of this machine always may. With this option, the server answers only requests to
-    /// these hosts, to localhost and, with tokens, to its addresses: list the server's own host name, too.
+    /// https://sim.example.org; pages of this machine always may. With this option, the server
+    /// answers only requests to these hosts, to localhost and, with tokens, to its addresses: list
+    /// the server's own host name, too.
     #[arg(long, value_name = "ORIGINS", value_parser = origins)]
     origin: Option<Origins>,
 
-    /// File of the audit log: which token pushed, edited or rolled back which twin, one JSON object per line. A change
-    /// that cannot be logged is refused. At 64 MiB the file is renamed to FILE.1, an earlier FILE.1 to FILE.2, and so
-    /// on; eight of these are kept.
+    /// File of the audit log: which token pushed, edited or rolled back which twin, one JSON object
+    /// per line. A change that cannot be logged is refused. At 64 MiB the file is renamed to
+    /// FILE.1, an earlier FILE.1 to FILE.2, and so on; eight of these are kept.
     #[arg(long, value_name = "FILE")]
     audit_log: Option<PathBuf>,
 
-    /// Address and port to listen on; port 0 selects a free one. An address that is not loopback needs --tokens.
+    /// Address and port to listen on; port 0 selects a free one. An address that is not loopback
+    /// needs --tokens.
     #[arg(long, value_name = "ADDR", default_value = wildcity_server::limits::LISTEN, value_parser = address)]
     listen: SocketAddr,
 
-    /// Address and port of a second listener, for AlpaSim: the gRPC service `sensorsim`, through which AlpaSim uses the
-    /// twins as scenes of its renderer. AlpaSim sends no tokens.
+    /// Address and port of a second listener, for AlpaSim: the gRPC service `sensorsim`, through
+    /// which AlpaSim uses the twins as scenes of its renderer. AlpaSim sends no tokens.
     #[arg(long, value_name = "ADDR", value_parser = address)]
     alpasim: Option<SocketAddr>,
 
-    /// Allow an address of --alpasim that is not loopback: every machine that can connect to it can then read the
-    /// twins.
+    /// Allow an address of --alpasim that is not loopback: every machine that can connect to it can
+    /// then read the twins.
     #[arg(long, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = false, num_args = 0..=1, default_missing_value = "true")]
     alpasim_open: bool,
 
-    /// Refuse shared memory to clients on this machine: they then receive observations through the socket only.
+    /// Refuse shared memory to clients on this machine: they then receive observations through the
+    /// socket only.
     #[arg(long, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = false, num_args = 0..=1, default_missing_value = "true")]
     no_shared_memory: bool,
 
-    /// Memory for the Gaussians of all twins and for the frames that are rendered from them, in GiB, for example 2 or
-    /// 0.5 [default: three quarters of the machine's]. A session is refused if its largest frame does not fit into
-    /// memory together with those of the other sessions; the rest of the memory is a cache for later frames.
+    /// Memory for the Gaussians of all twins and for the frames that are rendered from them, in
+    /// GiB, for example 2 or 0.5 [default: three quarters of the machine's]. A session is refused
+    /// if its largest frame does not fit into memory together with those of the other sessions; the
+    /// rest of the memory is a cache for later frames.
     #[arg(long, value_name = "N", value_parser = gib)]
     memory_gib: Option<f64>,
 
-    /// JSON file of render profile fields that replace those of every twin, for example {"tau_px": 2.0};
-    /// `wildcity report` writes such files. A session may request other values.
+    /// JSON file of render profile fields that replace those of every twin, for example {"tau_px":
+    /// 2.0}; `wildcity report` writes such files. A session may request other values.
     #[arg(long, value_name = "FILE")]
     profile: Option<PathBuf>,
 
@@ -117,8 +124,8 @@ pub(super) struct Serve {
     #[arg(long, value_name = "FILTER")]
     log: Option<String>,
 
-    /// OpenTelemetry collector that receives traces of requests and pushes, by OTLP over HTTP, for example
-    /// http://127.0.0.1:4318. Needs a program built with the feature otlp.
+    /// OpenTelemetry collector that receives traces of requests and pushes, by OTLP over HTTP, for
+    /// example http://127.0.0.1:4318. Needs a program built with the feature otlp.
     #[arg(long, value_name = "URL")]
     otlp_endpoint: Option<String>,
 
@@ -159,9 +166,9 @@ impl Serve {
         resolved.serve.serve()
     }
 
-    /// The value of an option that was not given and has no fixed default, as text; none if it has no
-    /// effect.
-    fn default_of(&self, id: &str) -> anyhow::Result<Option<String>> {
+    /// The value of an option that was not given and has no fixed default, as text; none if it has
+    /// no effect.
+    fn default_value(&self, id: &str) -> anyhow::Result<Option<String>> {
         let text = |path: PathBuf| Some(path.display().to_string());
         Ok(match id {
             "twins" => text(self.directories.twins.dir()?),
@@ -170,7 +177,7 @@ impl Serve {
             "uploads" => text(self.directories.uploads.dir()?),
             "cache_dir" => self.directories.twins.cache().and_then(|cache| text(cache.dir)),
             "onnxruntime" => text(runtime_library(None)).filter(|path| !path.is_empty()),
-            "memory_gib" => Some(gib_of(default_memory_bytes()).to_string()),
+            "memory_gib" => Some(bytes_as_gib(default_memory_bytes()).to_string()),
             "log" => Some(self.log_filter()),
             _ => None,
         })
@@ -259,7 +266,8 @@ impl Serve {
             running.stop().await;
             Ok(())
         });
-        // A push that still writes after that is abandoned: a commit that is killed at any point leaves nothing.
+        // A push that still writes after that is abandoned: a commit that is killed at any point
+        // leaves nothing.
         runtime.shutdown_timeout(crate::cli::limits::SHUTDOWN_TIMEOUT);
         served
     }

@@ -8,11 +8,12 @@ use wildcity_twin::store::Edit;
 use super::change;
 use crate::cli::directories::{EditedTwin, Twins};
 use crate::cli::input_files::read_trajectories;
-use crate::cli::rig::rig_of;
+use crate::cli::rig::find_rig;
 
 /// Give a twin recorded drives and a rig: makes a new version with the same Gaussians.
 ///
-/// A drive replaces the drive of the same name; other drives stay. Open sessions keep the version that they have.
+/// A drive replaces the drive of the same name; other drives stay. Open sessions keep the version
+/// that they have.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:
@@ -23,11 +24,13 @@ pub(in crate::cli) struct Drive {
     #[command(flatten)]
     edited: EditedTwin,
 
-    /// JSON file of a drive, in the twin's axes and metres, as `wildcity import --help` shows it. May be given again.
+    /// JSON file of a drive, in the twin's axes and metres, as `wildcity import --help` shows it.
+    /// May be given again.
     #[arg(long, value_name = "FILE")]
     trajectory: Vec<PathBuf>,
 
-    /// The vehicle's cameras: a preset (see `wildcity rig show`), or a JSON file as `wildcity import --help` shows it.
+    /// The vehicle's cameras: a preset (see `wildcity rig show`), or a JSON file as
+    /// `wildcity import --help` shows it.
     #[arg(long, value_name = "RIG")]
     rig: Option<String>,
 
@@ -38,7 +41,7 @@ pub(in crate::cli) struct Drive {
 impl Drive {
     pub(in crate::cli) fn run(self) -> anyhow::Result<()> {
         let trajectories = read_trajectories(&self.trajectory)?;
-        let rig = self.rig.as_deref().map(rig_of).transpose()?;
+        let rig = self.rig.as_deref().map(find_rig).transpose()?;
         let catalog = self.twins.catalog()?;
         let base = catalog.version(&self.edited.twin.name, self.edited.twin.number)?;
         let alignment = Alignment::IDENTITY;

@@ -6,11 +6,13 @@ use crate::cli::directories::Twins;
 use crate::cli::progress;
 use wildcity_twin::store::{FsckReport, RecordSetAside};
 
-/// Check a twin: read every object of every version and compare it with its hash, and check the log.
+/// Check a twin: read every object of every version and compare it with its hash, and check the
+/// log.
 ///
-/// Prints damaged objects, lost versions, and objects that no version refers to. The exit code is 0 if
-/// everything is as it was committed, and 1 otherwise. To repair objects, import the same source again with
-/// the same options. Objects without a version are not damage: `wildcity twin gc` removes them.
+/// Prints damaged objects, lost versions, and objects that no version refers to. The exit code is 0
+/// if everything is as it was committed, and 1 otherwise. To repair objects, import the same source
+/// again with the same options. Objects without a version are not damage: `wildcity twin gc`
+/// removes them.
 #[derive(Debug, clap::Args)]
 #[command(
     after_long_help = "Examples:\n  wildcity twin fsck street && wildcity serve\n  wildcity twin fsck street --repair"
@@ -23,8 +25,8 @@ pub(super) struct Fsck {
     #[command(flatten)]
     twins: Twins,
 
-    /// Before the check, set aside the newest log record if it cannot be read, and those before it that cannot be read.
-    /// The version before them becomes the latest again.
+    /// Before the check, set aside the newest log record if it cannot be read, and those before it
+    /// that cannot be read. The version before them becomes the latest again.
     #[arg(long)]
     repair: bool,
 

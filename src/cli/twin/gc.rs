@@ -9,8 +9,9 @@ use wildcity_twin::store::Retention;
 
 /// Remove objects of a twin that none of the kept versions refers to.
 ///
-/// This takes two runs: the first one records which objects are garbage, and a run after the grace period
-/// removes them. Run the command every day. Versions that running servers use are kept, however old they are.
+/// This takes two runs: the first one records which objects are garbage, and a run after the grace
+/// period removes them. Run the command every day. Versions that running servers use are kept,
+/// however old they are.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:
@@ -26,7 +27,8 @@ pub(super) struct Gc {
           value_parser = clap::value_parser!(u32).range(1..))]
     keep: u32,
 
-    /// How long an object is kept after it was recorded as garbage, for example 90s, 30m, 24h or 7d.
+    /// How long an object is kept after it was recorded as garbage, for example 90s, 30m, 24h or
+    /// 7d.
     #[arg(long, value_name = "TIME", default_value = limits::GC_GRACE, value_parser = duration)]
     grace: Duration,
 

@@ -16,8 +16,8 @@ use wildcity_twin::store::{CommitKind, StorageOptions, VersionSettings};
 /// Generate a twin of a procedural city: a route between houses, cars and trees.
 ///
 /// The route winds eastwards through streets that each have a crossing and different objects. Its
-/// trajectory `log` has a keyframe every 0.5 m. The same options give the same bytes. Each cell is written
-/// as soon as it is complete, so a long route needs no more memory than a short one.
+/// trajectory `log` has a keyframe every 0.5 m. The same options give the same bytes. Each cell is
+/// written as soon as it is complete, so a long route needs no more memory than a short one.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(in crate::cli) struct Generate {
@@ -41,9 +41,9 @@ pub(in crate::cli) struct Generate {
     #[arg(long, value_name = "M_PER_S", default_value_t = 10.0)]
     speed_m_s: f64,
 
-    /// Add reconstruction errors like those of real captures, from 0 (none) to 1: small on the recorded drive, large
-    /// off it. Colours change with the viewing direction, there are sheet-shaped floaters, and some Gaussians are
-    /// displaced, missing or needle-shaped.
+    /// Add reconstruction errors like those of real captures, from 0 (none) to 1: small on the
+    /// recorded drive, large off it. Colours change with the viewing direction, there are
+    /// sheet-shaped floaters, and some Gaussians are displaced, missing or needle-shaped.
     #[arg(long, value_name = "AMOUNT")]
     spoil: Option<f64>,
 
@@ -68,11 +68,13 @@ Examples:
   wildcity twin generate --twin worn --length-km 0.2 --density 2 --spoil 0.5
   wildcity render town --cameras views.json --out images";
 
-/// Bytes on disk per Gaussian of a city of low density, including levels of detail. Dense cities take fewer.
+/// Bytes on disk per Gaussian of a city of low density, including levels of detail. Dense cities
+/// take fewer.
 const STORED_BYTES: u64 = 48;
 
-/// Draw distance, in metres: the bends of the street hide everything beyond. At four places of a kilometre the image is
-/// bit-identical to the one without a limit; with 300 m, one of the four is off by 1/255.
+/// Draw distance, in metres: the bends of the street hide everything beyond. At four places of a
+/// kilometre the image is bit-identical to the one without a limit; with 300 m, one of the four is
+/// off by 1/255.
 const REACH_M: f64 = 600.0;
 
 impl Generate {
@@ -111,7 +113,7 @@ impl Generate {
             sky: None,
             geo: None,
             twin_from_capture: None,
-            provenance: Provenance::of(format!(
+            provenance: Provenance::new(format!(
                 "city {}: {}{}",
                 wildcity_generate::REVISION,
                 serde_json::to_string(&settings)?,

@@ -7,8 +7,8 @@ use super::change;
 
 /// Set the place of a twin on the earth, or remove it: makes a new version with the same Gaussians.
 ///
-/// Observations of the version then have latitude, longitude and heading. Open sessions keep the version that they
-/// have.
+/// Observations of the version then have latitude, longitude and heading. Open sessions keep the
+/// version that they have.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 #[command(group = clap::ArgGroup::new("action").args(["anchor", "remove"]).required(true))]
@@ -16,7 +16,8 @@ pub(in crate::cli) struct Geo {
     #[command(flatten)]
     edited: EditedTwin,
 
-    /// Place of the twin's origin: LATITUDE,LONGITUDE[,ALTITUDE], or EPSG:CODE,EASTING,NORTHING[,ALTITUDE].
+    /// Place of the twin's origin: LATITUDE,LONGITUDE[,ALTITUDE], or
+    /// EPSG:CODE,EASTING,NORTHING[,ALTITUDE].
     #[arg(value_name = "ANCHOR", allow_hyphen_values = true)]
     anchor: Option<GeoAnchor>,
 

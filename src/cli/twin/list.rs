@@ -6,8 +6,8 @@ use wildcity_twin::store::DamagedTwin;
 
 use crate::cli::directories::Twins;
 
-/// List all twins with the number and hash of their latest versions. A twin whose newest log record cannot be read is
-/// listed as damaged; `wildcity twin fsck --repair` sets the record aside.
+/// List all twins with the number and hash of their latest versions. A twin whose newest log record
+/// cannot be read is listed as damaged; `wildcity twin fsck --repair` sets the record aside.
 #[derive(Debug, clap::Args)]
 #[command(
     after_long_help = "Examples:\n  wildcity twin list\n  wildcity twin list --twins s3://fleet/twins --json"

@@ -6,7 +6,8 @@ use crate::cli::directories::Twins;
 use crate::cli::time::utc;
 use wildcity_twin::store::{LogEntry, StoreError};
 
-/// Show all versions of a twin, oldest first: when and how each was made, from which version, and the note of its push.
+/// Show all versions of a twin, oldest first: when and how each was made, from which version, and
+/// the note of its push.
 #[derive(Debug, clap::Args)]
 #[command(
     after_long_help = "Examples:\n  wildcity twin log street\n  wildcity twin log street --json | jq .created_us"

@@ -6,8 +6,8 @@ use crate::cli::directories::Twins;
 
 /// Make an old version of a twin the latest version again, under a new number.
 ///
-/// Later versions are not lost: roll back to the former latest version to undo this. Open sessions keep the
-/// version that they have.
+/// Later versions are not lost: roll back to the former latest version to undo this. Open sessions
+/// keep the version that they have.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "Example:\n  wildcity twin rollback street 3")]
 pub(super) struct Rollback {

@@ -21,12 +21,14 @@ use crate::cli::{placement, progress};
 
 use super::change;
 
-/// Give a twin the images of its recorded drive, or remove them: makes a new version with the same Gaussians.
+/// Give a twin the images of its recorded drive, or remove them: makes a new version with the same
+/// Gaussians.
 ///
-/// A repair model can compare a rendered image with recorded ones (docs/repair.md). The images are stored as JPEG in
-/// the size that --side says, with their cameras. Each belongs to the place of the drive that is nearest to its camera.
-/// Masks are stored with the images. Masked pixels are not warped into views, and neither are pixels under the overlay
-/// of the rig's camera of the same name. Open sessions keep the version that they have.
+/// A repair model can compare a rendered image with recorded ones (docs/repair.md). The images are
+/// stored as JPEG in the size that --side says, with their cameras. Each belongs to the place of
+/// the drive that is nearest to its camera. Masks are stored with the images. Masked pixels are not
+/// warped into views, and neither are pixels under the overlay of the rig's camera of the same
+/// name. Open sessions keep the version that they have.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 #[command(group = clap::ArgGroup::new("action").args(["images", "remove"]).required(true))]
@@ -34,8 +36,8 @@ pub(in crate::cli) struct Views {
     #[command(flatten)]
     edited: EditedTwin,
 
-    /// The images with their cameras: a transforms.json, a COLMAP model, or a camera list, in the format of `wildcity
-    /// eval --images`.
+    /// The images with their cameras: a transforms.json, a COLMAP model, or a camera list, in the
+    /// format of `wildcity eval --images`.
     #[arg(long, value_name = "FILE_OR_DIR")]
     images: Option<PathBuf>,
 
@@ -43,8 +45,8 @@ pub(in crate::cli) struct Views {
     #[arg(long, value_name = "DIR", requires = "images")]
     image_dir: Option<PathBuf>,
 
-    /// Axes of the poses, in the form of `wildcity import --axes` [default: as the twin was imported and aligned;
-    /// identity for a list]
+    /// Axes of the poses, in the form of `wildcity import --axes` [default: as the twin was
+    /// imported and aligned; identity for a list]
     #[arg(long, value_name = "AXES", allow_hyphen_values = true, requires = "images")]
     axes: Option<String>,
 
@@ -52,13 +54,13 @@ pub(in crate::cli) struct Views {
     #[arg(long, value_name = "M", requires = "axes")]
     scale: Option<f64>,
 
-    /// Smallest distance between two images of a camera along the drive, in metres: 2 or 2m. Images up to a tenth
-    /// nearer are kept.
+    /// Smallest distance between two images of a camera along the drive, in metres: 2 or 2m. Images
+    /// up to a tenth nearer are kept.
     #[arg(long, value_name = "M", default_value = "2", value_parser = metres)]
     every: f64,
 
-    /// Longest side of a stored image, in pixels. Larger images are scaled down. Six cameras with an image every 2 m
-    /// take 0.4 GB per km.
+    /// Longest side of a stored image, in pixels. Larger images are scaled down. Six cameras with
+    /// an image every 2 m take 0.4 GB per km.
     #[arg(long, value_name = "PX", default_value_t = 720, value_parser = clap::value_parser!(u32).range(16..=8192))]
     side: u32,
 
@@ -80,12 +82,14 @@ Examples:
   wildcity twin views street --images capture --image-dir capture/images_2 --every 4m --side 480
   wildcity twin views street --remove";
 
-/// Tolerance of --every: an image is kept if its distance is at most this share below it. In a bend, a camera travels
-/// another distance than the drive; without the tolerance, images that were recorded every 2 m would be kept every 4 m.
+/// Tolerance of --every: an image is kept if its distance is at most this share below it. In a
+/// bend, a camera travels another distance than the drive; without the tolerance, images that were
+/// recorded every 2 m would be kept every 4 m.
 const SLACK: f64 = 0.1;
 
-/// Largest median distance of the images from the drives, in metres. A larger one means that the poses have other axes
-/// or another unit: cameras of a vehicle are within some metres, and another lane is within 20 m.
+/// Largest median distance of the images from the drives, in metres. A larger one means that the
+/// poses have other axes or another unit: cameras of a vehicle are within some metres, and another
+/// lane is within 20 m.
 const MOST_MEDIAN_M: f64 = 20.0;
 
 /// An image of the list with its place on the drive.
@@ -117,7 +121,7 @@ impl Views {
                 let alignment = match &self.axes {
                     Some(axes) => placement::imported(axes, self.scale.unwrap_or(1.0))?,
                     None if list.is_in_scene_axes => Alignment::IDENTITY,
-                    None => placement::of_version(&catalog, &base)?,
+                    None => placement::from_version(&catalog, &base)?,
                 };
                 listed = list.every(1).len();
                 let views = self.put(&mut commit, manifest, &list, &alignment)?;
@@ -202,8 +206,8 @@ impl Views {
         Ok(views)
     }
 
-    /// Stores an image, scaled down to `side`, and its mask if not all pixels count. Returns the camera of the stored
-    /// image.
+    /// Stores an image, scaled down to `side`, and its mask if not all pixels count. Returns the
+    /// camera of the stored image.
     fn store(
         &self,
         commit: &mut Commit,
@@ -250,9 +254,10 @@ fn metres(text: &str) -> Result<f64, String> {
         .trim()
         .parse()
         .map_err(|_| "expected metres, such as 2 or 2m".to_owned())?;
-    match (0.0..=1000.0).contains(&number) {
-        true => Ok(number),
-        false => Err("expected 0 to 1000 m".to_owned()),
+    if (0.0..=1000.0).contains(&number) {
+        Ok(number)
+    } else {
+        Err("expected 0 to 1000 m".to_owned())
     }
 }
 

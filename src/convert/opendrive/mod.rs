@@ -77,7 +77,7 @@ pub fn read(bytes: &[u8], origin: Option<[f64; 2]>) -> Result<Imported, ConvertE
         kind: AreaKind::Intersection,
         outline: area.boundary.iter().map(|point| array(*point)).collect(),
     });
-    let map = MapFile::of(lanes, areas.collect());
+    let map = MapFile::new(lanes, areas.collect());
     map.check().map_err(|error| ConvertError::new(error.path, error.message))?;
     Ok(Imported { map, geo, warnings })
 }

@@ -1,8 +1,8 @@
 //! Lenses as Foxglove's calibrations describe them, and the error of such a description.
 //!
-//! Foxglove supports only OpenCV's models. Any other lens is approximated by the nearest one: f-theta gets OpenCV's
-//! fisheye with the focal length and the four coefficients that fit best. Windshields and thin prisms are left out. The
-//! lens itself is in `/wildcity/episode`.
+//! Foxglove supports only OpenCV's models. Any other lens is approximated by the nearest one:
+//! f-theta gets OpenCV's fisheye with the focal length and the four coefficients that fit best.
+//! Windshields and thin prisms are left out. The lens itself is in `/wildcity/episode`.
 
 use glam::{DMat4, DVec2, DVec3, DVec4};
 
@@ -10,7 +10,7 @@ use wildcity_scene::geometry::Camera;
 use wildcity_scene::geometry::camera::{FTheta, Lens};
 use wildcity_scene::rig::RigCamera;
 
-use super::convert::{frame_of, timestamp};
+use super::convert::{camera_frame, timestamp};
 use super::messages as foxglove;
 
 /// Places of an image, along each side, where a calibration is compared with the lens.
@@ -44,12 +44,13 @@ enum Model {
 }
 
 impl Calibration {
-    pub(super) fn of(index: usize, camera: &RigCamera, time_us: i64) -> Self {
+    pub(super) fn new(index: usize, camera: &RigCamera, time_us: i64) -> Self {
         let camera = &camera.camera;
         let nearest = Nearest::to(camera);
         let (name, d) = nearest.model.in_foxglove();
         let DVec2 { x: fx, y: fy } = nearest.focal_px;
-        // Foxglove and OpenCV count pixels from the middle of the first one, this project from its corner.
+        // Foxglove and OpenCV count pixels from the middle of the first one, this project from its
+        // corner.
         let [cx, cy] = [camera.pinhole.cx - 0.5, camera.pinhole.cy - 0.5];
         let message = foxglove::CameraCalibration {
             timestamp: Some(timestamp(time_us)),
@@ -60,7 +61,7 @@ impl Calibration {
             k: vec![fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
             r: vec![1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
             p: vec![fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
-            frame_id: frame_of(index),
+            frame_id: camera_frame(index),
         };
         Self { message, error_px: nearest.error_px(camera) }
     }
@@ -80,8 +81,9 @@ impl Nearest {
         Self { model, focal_px }
     }
 
-    /// OpenCV's fisheye `r(θ) = f (θ + k1 θ³ + k2 θ⁵ + k3 θ⁷ + k4 θ⁹)` that is nearest to an f-theta lens up to an
-    /// angle, by least squares. Angles are in units of the largest, so that all powers are at most 1.
+    /// OpenCV's fisheye `r(θ) = f (θ + k1 θ³ + k2 θ⁵ + k3 θ⁷ + k4 θ⁹)` that is nearest to an
+    /// f-theta lens up to an angle, by least squares. Angles are in units of the largest, so that
+    /// all powers are at most 1.
     fn fitted(lens: &FTheta, most_rad: f64) -> Self {
         // The normal equations of the linear coefficient, and of the four others.
         let [mut linear, mut linear_right] = [0.0, 0.0];

@@ -56,7 +56,7 @@ pub(super) fn transform(
 }
 
 /// The frame of a camera: x right, y down, z into the image.
-pub(super) fn frame_of(camera: usize) -> String {
+pub(super) fn camera_frame(camera: usize) -> String {
     format!("camera/{camera}")
 }
 

@@ -1,7 +1,9 @@
-//! The protobuf descriptors of Foxglove's messages, which an MCAP file contains in addition to the messages.
+//! The protobuf descriptors of Foxglove's messages, which an MCAP file contains in addition to the
+//! messages.
 //!
-//! Source of names and numbers: foxglove/schemas, `schemas/proto/foxglove`. All fields are included, because a viewer
-//! may look for fields that episodes leave empty. The exceptions are the identifier and the lineage of an image.
+//! Source of names and numbers: foxglove/schemas, `schemas/proto/foxglove`. All fields are
+//! included, because a viewer may look for fields that episodes leave empty. The exceptions are the
+//! identifier and the lineage of an image.
 
 use prost::Message as _;
 use prost_types::field_descriptor_proto::{Label, Type};
@@ -10,8 +12,8 @@ use prost_types::{
     FileDescriptorProto, FileDescriptorSet,
 };
 
-/// Fields of a message: name, number, type. `[]` before a type repeats it, `.` begins the full name of a message, and
-/// `=` that of an enum.
+/// Fields of a message: name, number, type. `[]` before a type repeats it, `.` begins the full name
+/// of a message, and `=` that of an enum.
 type Fields = &'static [(&'static str, i32, &'static str)];
 
 const MESSAGES: &[(&str, Fields)] = &[

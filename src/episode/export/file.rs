@@ -1,4 +1,5 @@
-//! The MCAP file of a record: written under another name first, so that a reader never finds half a file.
+//! The MCAP file of a record: written under another name first, so that a reader never finds half a
+//! file.
 
 use std::ffi::OsStr;
 use std::fs::{self, File};
@@ -15,11 +16,12 @@ use super::write::{ExportError, Exported, export};
 
 /// Ending of the files of records.
 const ENDING: &str = ".mcap";
-/// Ending of the name that a file has while it is written: `a-1.mcap.RANDOM.tmp` becomes `a-1.mcap`.
+/// Ending of the name that a file has while it is written: `a-1.mcap.RANDOM.tmp` becomes
+/// `a-1.mcap`.
 const TEMPORARY: &str = ".tmp";
 
 /// Path of the MCAP file of a record: `a-1.mcap` for `a-1.jsonl`.
-pub fn mcap_of(record: &Path) -> PathBuf {
+pub fn mcap_path(record: &Path) -> PathBuf {
     record.with_extension("mcap")
 }
 
@@ -33,8 +35,9 @@ pub fn export_file(record: &Path, mcap: &Path) -> Result<Exported, ExportError> 
     write_whole(mcap, |out| export(&episode, rig.as_ref(), out))
 }
 
-/// Lets `write` write a file under a temporary name, and renames it when it is complete and on disk. Temporary names
-/// are unique, so that two exports to one path do not conflict: the last one stays.
+/// Lets `write` write a file under a temporary name, and renames it when it is complete and on
+/// disk. Temporary names are unique, so that two exports to one path do not conflict: the last one
+/// stays.
 ///
 /// # Errors
 /// The file cannot be created, `write` fails, or the file cannot be renamed: no file is left then.
@@ -78,12 +81,13 @@ fn name_whole(temporary: NamedTempFile, dir: &Path, path: &Path) -> io::Result<(
     Ok(())
 }
 
-/// Removes the temporary files of killed exports from a directory: files that were not written to for
-/// [`limits::LEFTOVER_AGE`] before `now`. The directory need not exist. Returns how many were removed.
+/// Removes the temporary files of killed exports from a directory: files that were not written to
+/// for [`limits::LEFTOVER_AGE`] before `now`. The directory need not exist. Returns how many were
+/// removed.
 ///
 /// # Errors
-/// The directory cannot be read, or a file cannot be removed: returns the first error, and still removes the other
-/// files.
+/// The directory cannot be read, or a file cannot be removed: returns the first error, and still
+/// removes the other files.
 pub fn remove_leftovers(dir: &Path, now: SystemTime) -> io::Result<usize> {
     let entries = match fs::read_dir(dir) {
         Ok(entries) => entries,

@@ -167,10 +167,8 @@ pub(super) struct Odometry {
     pub(super) child_frame_id: String,
     #[prost(message, optional, tag = "4")]
     pub(super) pose: Option<Pose>,
-    /// In m/s.
     #[prost(message, optional, tag = "5")]
     pub(super) linear_velocity: Option<Vector3>,
-    /// In rad/s.
     #[prost(message, optional, tag = "6")]
     pub(super) angular_velocity: Option<Vector3>,
 }

@@ -13,7 +13,8 @@
 //! | `/log` | `foxglove.Log`: events |
 //! | `/wildcity/episode`, `step`, `event`, `result` | JSON: the lines of the record |
 //!
-//! Times are those of the episode plus 1,000 s, because a warm-up has negative times and MCAP does not allow them.
+//! Times are those of the episode plus 1,000 s, because a warm-up has negative times and MCAP does
+//! not allow them.
 
 mod calibration;
 mod container;
@@ -25,5 +26,5 @@ mod output;
 mod parts;
 mod write;
 
-pub use file::{export_file, mcap_of, remove_leftovers, write_whole};
+pub use file::{export_file, mcap_path, remove_leftovers, write_whole};
 pub use write::{EpisodeExport, ExportError, Exported, ExportedImage, export};

@@ -1,6 +1,6 @@
-//! A writer that stores its first error and reports success to the crate `mcap`, which panics when its writer is
-//! dropped after some errors, for example if the disk is full. [`McapFile`](super::container::McapFile) returns the
-//! stored error.
+//! A writer that stores its first error and reports success to the crate `mcap`, which panics when
+//! its writer is dropped after some errors, for example if the disk is full.
+//! [`McapFile`](super::container::McapFile) returns the stored error.
 
 use std::cell::Cell;
 use std::io::{self, Seek, SeekFrom, Write};
@@ -58,12 +58,11 @@ impl<W: Seek> Seek for Output<W> {
             SeekFrom::Current(by) => self.position.saturating_add_signed(by),
             SeekFrom::End(by) => self.position.saturating_add_signed(by),
         };
-        self.position = match self.has_failed {
-            true => expected,
-            false => {
-                let sought = self.inner.seek(to);
-                self.keep(sought, expected)
-            }
+        self.position = if self.has_failed {
+            expected
+        } else {
+            let sought = self.inner.seek(to);
+            self.keep(sought, expected)
         };
         Ok(self.position)
     }

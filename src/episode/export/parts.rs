@@ -66,15 +66,15 @@ pub(super) fn event_text(episode: &EpisodeFile, event: &Event) -> (i32, String) 
     }
 }
 
-/// The command without the values that `/plan` has: a trajectory keeps only the times of its poses. Poses as text would
-/// be two thirds of a file.
-pub(super) fn command_of(frame: &Frame) -> Option<Value> {
+/// The command without the values that `/plan` has: a trajectory keeps only the times of its poses.
+/// Poses as text would be two thirds of a file.
+pub(super) fn command(frame: &Frame) -> Option<Value> {
     let Some(poses) = frame.plan() else { return frame.command.clone() };
     let times_us: Vec<i64> = poses.iter().map(|pose| pose.time_us).collect();
     Some(json!({ "trajectory": { "times_us": times_us, "poses": "/plan" } }))
 }
 
 /// The agent's trajectory in the rig's frame, if that was its command.
-pub(super) fn plan_of(frame: &Frame) -> Option<Vec<foxglove::Pose>> {
+pub(super) fn plan(frame: &Frame) -> Option<Vec<foxglove::Pose>> {
     Some(frame.plan()?.iter().map(|timed| pose(&timed.start_from_rig)).collect())
 }

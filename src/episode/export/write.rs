@@ -14,9 +14,9 @@ use wildcity_score::EgoSample;
 
 use super::calibration::Calibration;
 use super::container::McapFile;
-use super::convert::{color, cube, entity, frame_of, place, pose, timestamp, transform};
+use super::convert::{camera_frame, color, cube, entity, place, pose, timestamp, transform};
 use super::messages as foxglove;
-use super::parts::{command_of, event_text, motions, odometry, plan_of};
+use super::parts::{command, event_text, motions, odometry, plan};
 use crate::file::{EpisodeFile, Frame, ReadError};
 use crate::lines::{ActorsLine, EventLine, ScenarioLine};
 
@@ -29,7 +29,6 @@ pub enum ExportError {
     /// The file cannot be written.
     #[error("cannot write {}: {cause}", path.display())]
     Io {
-        /// The file.
         path: PathBuf,
         /// The operating system's error.
         cause: io::Error,
@@ -54,7 +53,6 @@ pub enum ExportError {
 /// Result of an export.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Exported {
-    /// Messages.
     pub messages: u64,
     /// How far the calibrations are off the lenses at most, in pixels.
     pub calibration_error_px: f64,
@@ -67,11 +65,11 @@ pub struct ExportedImage<'a> {
     pub camera: usize,
     /// When it was taken, in microseconds.
     pub time_us: i64,
-    /// It as JPEG.
     pub jpeg: &'a [u8],
 }
 
-/// Writes an episode without images. `rig` is that of its header; without one there are no calibrations.
+/// Writes an episode without images. `rig` is that of its header; without one there are no
+/// calibrations.
 ///
 /// # Errors
 /// The file cannot be written, or the episode has no frame.
@@ -83,7 +81,8 @@ pub fn export<W: Write + Seek>(
     EpisodeExport::begin(episode, rig, out)?.finish()
 }
 
-/// An MCAP file that is being written: messages in the order of time, as far as images are added in that order.
+/// An MCAP file that is being written: messages in the order of time, as far as images are added in
+/// that order.
 pub struct EpisodeExport<'a, W: Write + Seek> {
     file: McapFile<W>,
     episode: &'a EpisodeFile,
@@ -111,7 +110,7 @@ impl<'a, W: Write + Seek> EpisodeExport<'a, W> {
         let calibrations: Vec<Calibration> = cameras
             .iter()
             .enumerate()
-            .map(|(k, camera)| Calibration::of(k, camera, begin_us))
+            .map(|(k, camera)| Calibration::new(k, camera, begin_us))
             .collect();
         let errors_px = calibrations.iter().map(|calibration| calibration.error_px);
         let motions = motions(&frames, episode.header.dt_us);
@@ -120,7 +119,8 @@ impl<'a, W: Write + Seek> EpisodeExport<'a, W> {
             episode,
             frames: frames.iter().copied().zip(motions).collect::<Vec<_>>().into_iter().peekable(),
             events: episode.events.iter().peekable(),
-            // If a session returned to an earlier state, and in a warm-up, a step has several lines: use the last one.
+            // If a session returned to an earlier state, and in a warm-up, a step has several
+            // lines: use the last one.
             actors: episode.actors.iter().map(|line| (line.step, line)).collect(),
             shown: BTreeSet::new(),
             end_us,
@@ -144,7 +144,7 @@ impl<'a, W: Write + Seek> EpisodeExport<'a, W> {
         self.write_until(image.time_us)?;
         let message = foxglove::CompressedImage {
             timestamp: Some(timestamp(image.time_us)),
-            frame_id: frame_of(image.camera),
+            frame_id: camera_frame(image.camera),
             data: image.jpeg.to_vec(),
             format: "jpeg".to_owned(),
         };
@@ -175,7 +175,7 @@ impl<'a, W: Write + Seek> EpisodeExport<'a, W> {
             self.step(frame, motion)?;
             self.boxes(frame)?;
             // A plan is in the frame of the rig at the start of its step.
-            if let Some(poses) = self.frames.peek().and_then(|(next, _)| plan_of(next)) {
+            if let Some(poses) = self.frames.peek().and_then(|(next, _)| plan(next)) {
                 self.poses("/plan", "rig", frame.time_us, poses)?;
             }
         }
@@ -219,8 +219,9 @@ impl<'a, W: Write + Seek> EpisodeExport<'a, W> {
         time_us: i64,
     ) -> Result<(), ExportError> {
         let cameras = rig.map_or(&[][..], |rig| &rig.cameras).iter().enumerate();
-        let transforms = cameras
-            .map(|(k, camera)| transform("rig", &frame_of(k), time_us, &camera.rig_from_camera));
+        let transforms = cameras.map(|(k, camera)| {
+            transform("rig", &camera_frame(k), time_us, &camera.rig_from_camera)
+        });
         let transforms: Vec<_> = transforms.collect();
         if !transforms.is_empty() {
             self.transforms(time_us, transforms)?;
@@ -246,7 +247,8 @@ impl<'a, W: Write + Seek> EpisodeExport<'a, W> {
         self.poses("/route", "world", time_us, poses.collect())
     }
 
-    /// The outlines of the lanes, at the height of the start of the route: a map in a record is flat.
+    /// The outlines of the lanes, at the height of the start of the route: a map in a record is
+    /// flat.
     fn map(&mut self, scenario: &ScenarioLine, time_us: i64) -> Result<(), ExportError> {
         if scenario.lanes.is_empty() {
             return Ok(());
@@ -300,7 +302,7 @@ impl<'a, W: Write + Seek> EpisodeExport<'a, W> {
         self.file.proto("/ego/odometry", "foxglove.Odometry", time_us, &odometry)?;
         let cameras = &self.episode.header.rig.cameras;
         let line = json!({
-            "step": frame.step, "time_us": time_us, "request": frame.request, "command": command_of(frame),
+            "step": frame.step, "time_us": time_us, "request": frame.request, "command": command(frame),
             "terminated": frame.terminated, "frame_hash": frame.frame_hash, "images": frame.images,
             "cameras": cameras.iter().map(|camera| &camera.name).collect::<Vec<_>>(),
         });

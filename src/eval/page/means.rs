@@ -16,7 +16,8 @@ struct Columns {
     repaired: bool,
 }
 
-/// The means of all images and of each camera. With a repair there are three rows for each: rendered, repaired, gain.
+/// The means of all images and of each camera. With a repair there are three rows for each:
+/// rendered, repaired, gain.
 pub(super) fn table(evaluation: &Evaluation) -> Markup {
     let rendered = &evaluation.all.rendered;
     let columns = Columns {

@@ -1,4 +1,5 @@
-//! The preview of a push: compares small images of the base and of the version that the push would make.
+//! The preview of a push: compares small images of the base and of the version that the push would
+//! make.
 
 pub(crate) mod psnr;
 
@@ -18,12 +19,12 @@ pub use psnr::PsnrPreview;
 
 use psnr::ProposedChange;
 
-/// The comparison of a preview: the base with the replaced cells. `None` if there is no base, or if it cannot be
-/// compared.
+/// The comparison of a preview: the base with the replaced cells. `None` if there is no base, or if
+/// it cannot be compared.
 ///
 /// # Errors
-/// A comparison was asked for, and the push has too many Gaussians for one; or its profile cannot be
-/// used.
+/// A comparison was asked for, and the push has too many Gaussians for one; or its profile cannot
+/// be used.
 pub(crate) fn comparison(
     request: &PushRequest,
     gaussians: &Arc<Gaussians>,
@@ -64,8 +65,8 @@ fn within(gaussians: &Arc<Gaussians>, cells: &BTreeSet<[i32; 2]>, left_out: u64)
     Arc::new(gaussians.select((0..gaussians.len()).filter(is_within)))
 }
 
-/// Refuses a push that differs by more than the request allows, or that cannot be compared although the
-/// request demands it.
+/// Refuses a push that differs by more than the request allows, or that cannot be compared although
+/// the request demands it.
 pub(crate) fn check_psnr(
     request: &PushRequest,
     gaussians: &Gaussians,

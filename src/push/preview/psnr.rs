@@ -24,7 +24,8 @@ use crate::limits;
 pub struct PsnrPreview {
     /// Where the rig is.
     pub world_from_rig: Pose,
-    /// PSNR between the images before and after, all cameras together, in dB; infinite if they are equal.
+    /// PSNR between the images before and after, all cameras together, in dB; infinite if they are
+    /// equal.
     pub psnr_db: f64,
 }
 
@@ -34,20 +35,19 @@ pub(crate) struct ProposedChange {
     pub(crate) before: Arc<Version>,
     /// The new Gaussians of the replaced cells.
     pub(crate) gaussians: Arc<Gaussians>,
-    /// The replaced cells.
     pub(crate) cells: BTreeSet<[i32; 2]>,
     /// The render profile after the change.
     pub(crate) profile: RenderProfile,
 }
 
-/// Renders small images of a version before and after a proposed change, and compares them. The frames wait
-/// in the render queue with those of the sessions, until the deadline. It may be later than that of a step, because no
-/// agent waits for them. Without `poses`, the images are taken from some poses along the trajectories, near the
-/// change. Poses from which no Gaussian is seen are left out. Calls `progress` with the number of poses that are done and
-/// the number of all poses.
+/// Renders small images of a version before and after a proposed change, and compares them. The
+/// frames wait in the render queue with those of the sessions, until the deadline. It may be later
+/// than that of a step, because no agent waits for them. Without `poses`, the images are taken from
+/// some poses along the trajectories, near the change. Poses from which no Gaussian is seen are
+/// left out. Calls `progress` with the number of poses that are done and the number of all poses.
 ///
-/// The replaced cells are compared in full detail, so that levels of detail are no difference. Rounding by the record
-/// format is one: the new Gaussians are not stored yet.
+/// The replaced cells are compared in full detail, so that levels of detail are no difference.
+/// Rounding by the record format is one: the new Gaussians are not stored yet.
 ///
 /// # Errors
 /// The version cannot be read, or the backend refuses a frame.
@@ -87,7 +87,7 @@ pub(crate) async fn preview_psnr(
     let total = poses.len() as u64;
     for (done, world_from_rig) in (0..).zip(poses) {
         progress(done, total);
-        let views = View::of_rig(&cameras, world_from_rig);
+        let views = View::from_rig(&cameras, world_from_rig);
         let viewpoints = viewpoints(&views);
         let scenes;
         // A blocking thread has the reader while it reads.
@@ -160,7 +160,6 @@ struct SceneReader {
     /// The version before the change.
     version: Arc<Version>,
     profile: RenderProfile,
-    /// The replaced cells.
     replaced: BTreeSet<[i32; 2]>,
     /// What they have after the change.
     new: Scene,
@@ -230,8 +229,8 @@ fn merged(mut kept: Scene, new: &Scene) -> Scene {
     kept
 }
 
-/// Poses along the trajectories: spread over the parts that lie in the replaced cells, or over all of
-/// them if no part does.
+/// Poses along the trajectories: spread over the parts that lie in the replaced cells, or over all
+/// of them if no part does.
 fn preview_poses(change: &ProposedChange) -> Vec<Pose> {
     let drives = &change.before.manifest.trajectories;
     let keyframes = drives.iter().flat_map(|drive| &drive.keyframes);

@@ -1,5 +1,5 @@
-//! Errors of images against reference images: PSNR, SSIM, the largest error and its 99.9th percentile, and
-//! the mean error of depth in metres.
+//! Errors of images against reference images: PSNR, SSIM, the largest error and its 99.9th
+//! percentile, and the mean error of depth in metres.
 
 use serde::Serialize;
 
@@ -22,7 +22,8 @@ pub struct ImageErrors {
     /// 99.9th percentile of the errors of values.
     #[serde(serialize_with = "serialize_number")]
     pub p99_9: f64,
-    /// Mean error of depth, in metres, over pixels where both images have an opacity of at least 1/2.
+    /// Mean error of depth, in metres, over pixels where both images have an opacity of at least
+    /// 1/2.
     #[serde(serialize_with = "serialize_number")]
     pub depth_l1_m: f64,
 }
@@ -42,7 +43,6 @@ pub struct Image {
 
 /// The rows or columns of an image that one row or column of a smaller image covers.
 struct Coverage {
-    /// The first one.
     first: usize,
     /// Shares of it and of those that follow in the covered part; the sum is 1.
     shares: Vec<f32>,
@@ -50,7 +50,7 @@ struct Coverage {
 
 impl Coverage {
     /// The coverage of all `count` new rows over `own` rows.
-    fn of_all(count: u32, own: u32) -> Vec<Self> {
+    fn all(count: u32, own: u32) -> Vec<Self> {
         let step = f64::from(own) / f64::from(count);
         let of_one = |i: u32| {
             let begin = f64::from(i) * step;
@@ -66,8 +66,9 @@ impl Coverage {
 }
 
 impl Image {
-    /// A smaller image in which each pixel is the mean of the pixels that it covers, as an agent shrinks an image. The
-    /// mean of depths is weighted by opacity, as depths of Gaussians are within a pixel.
+    /// A smaller image in which each pixel is the mean of the pixels that it covers, as an agent
+    /// shrinks an image. The mean of depths is weighted by opacity, as depths of Gaussians are
+    /// within a pixel.
     pub fn averaged(&self, [width, height]: [u32; 2]) -> Self {
         let [own_width, own_height] = self.size_px;
         let mut new = Self {
@@ -76,8 +77,8 @@ impl Image {
             depth_m: Vec::new(),
             opacity: Vec::new(),
         };
-        let columns = Coverage::of_all(width, own_width);
-        for row in Coverage::of_all(height, own_height) {
+        let columns = Coverage::all(width, own_width);
+        for row in Coverage::all(height, own_height) {
             for column in &columns {
                 let mut rgb = [0.0; 3];
                 let mut opacity = 0.0;
@@ -151,11 +152,12 @@ impl ErrorAccumulator {
     }
 }
 
-/// [`Ssim::within`] of two images. An image smaller than a window has none, and is compared with mirrored edges.
+/// [`Ssim::within`] of two images. An image smaller than a window has none, and is compared with
+/// mirrored edges.
 fn ssim(image: &Image, truth: &Image) -> f64 {
     let [a, b] =
         [image, truth].map(|image| image.rgb.iter().map(|&v| v.into()).collect::<Vec<f64>>());
-    let ssim = Ssim::of(&a, &b, image.size_px, None);
+    let ssim = Ssim::compare(&a, &b, image.size_px, None);
     if ssim.within.is_nan() { ssim.mirrored } else { ssim.within }
 }
 

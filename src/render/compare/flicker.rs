@@ -1,10 +1,11 @@
 //! Flicker: the change from one image to the next where both show the same surface.
 
-/// Mean absolute difference of an image and the previous one, which was warped into its view, from 0 to 1: over the
-/// channels of the pixels where the warped image is valid. `None` if no pixel is valid.
+/// Mean absolute difference of an image and the previous one, which was warped into its view, from
+/// 0 to 1: over the channels of the pixels where the warped image is valid. `None` if no pixel is
+/// valid.
 ///
-/// `now` and `previous_warped` are `[height, width, 3]` in 8 bits. `valid` is `[height, width]`, above 0 where both
-/// images show the same surface.
+/// `now` and `previous_warped` are `[height, width, 3]` in 8 bits. `valid` is `[height, width]`,
+/// above 0 where both images show the same surface.
 pub fn flicker(now: &[u8], previous_warped: &[u8], valid: &[f32]) -> Option<f64> {
     let mut sum = 0_u64;
     let mut count = 0_u64;

@@ -1,9 +1,10 @@
-//! LDR-FLIP (Andersson et al. 2020, "FLIP: A Difference Evaluator for Alternating Images"): how much a person sees when
-//! two images alternate, from 0 to 1 for each pixel.
+//! LDR-FLIP (Andersson et al. 2020, "FLIP: A Difference Evaluator for Alternating Images"): how
+//! much a person sees when two images alternate, from 0 to 1 for each pixel.
 //!
-//! The images are taken as sRGB on a display with [`PIXELS_PER_DEGREE`]. Colours are blurred as the eye does at that
-//! distance (contrast sensitivity), compared in a Hunt-adjusted L*a*b*, and the difference is raised where edges or
-//! points differ. `flip-evaluator` 1.7 gives the same values to rounding in f32.
+//! The images are taken as sRGB on a display with [`PIXELS_PER_DEGREE`]. Colours are blurred as the
+//! eye does at that distance (contrast sensitivity), compared in a Hunt-adjusted L*a*b*, and the
+//! difference is raised where edges or points differ. `flip-evaluator` 1.7 gives the same values to
+//! rounding in f32.
 
 use std::f64::consts::PI;
 
@@ -12,15 +13,16 @@ use rayon::prelude::*;
 /// Pixels of a display per degree of the visual field: 3840 px on 0.7 m, seen from 0.7 m.
 pub const PIXELS_PER_DEGREE: f64 = 3840.0 * PI / 180.0;
 
-/// Amplitudes and widths of the two Gaussians of the contrast sensitivity of each opponent channel: achromatic,
-/// red-green, blue-yellow.
+/// Amplitudes and widths of the two Gaussians of the contrast sensitivity of each opponent channel:
+/// achromatic, red-green, blue-yellow.
 const SENSITIVITY: [[(f64, f64); 2]; 3] =
     [[(1.0, 0.0047), (0.0, 1e-5)], [(1.0, 0.0053), (0.0, 1e-5)], [(34.1, 0.04), (13.5, 0.025)]];
 /// The widest of them, which gives all three their reach.
 const WIDEST: f64 = 0.04;
 /// Width of an edge that the eye detects, in degrees.
 const FEATURE_DEG: f64 = 0.082;
-/// Exponents of colours and of features; where the compressed range of colours begins, and its value there.
+/// Exponents of colours and of features; where the compressed range of colours begins, and its
+/// value there.
 const COLOR_EXPONENT: f32 = 0.7;
 const FEATURE_EXPONENT: f32 = 0.5;
 const KNEE: f32 = 0.4;
@@ -43,8 +45,8 @@ const WHITE: [f32; 3] = [0.950_428_55, 1.0, 1.088_900_3];
 /// One value per pixel, row by row.
 type Plane = Vec<f32>;
 
-/// The error of each pixel between two images of sRGB values from 0 to 1, `[height, width, 3]`. The mean over the
-/// pixels is the FLIP of the images.
+/// The error of each pixel between two images of sRGB values from 0 to 1, `[height, width, 3]`. The
+/// mean over the pixels is the FLIP of the images.
 ///
 /// # Panics
 /// If a length does not fit the size.
@@ -56,9 +58,10 @@ pub fn flip(image: &[f32], truth: &[f32], size_px: [u32; 2]) -> Vec<f32> {
     let knee = KNEE * most;
     let error = |pixel: usize| {
         let color = hyab(image.lab[pixel], truth.lab[pixel]).powf(COLOR_EXPONENT);
-        let color = match color < knee {
-            true => KNEE_VALUE / knee * color,
-            false => KNEE_VALUE + (color - knee) / (most - knee) * (1.0 - KNEE_VALUE),
+        let color = if color < knee {
+            KNEE_VALUE / knee * color
+        } else {
+            KNEE_VALUE + (color - knee) / (most - knee) * (1.0 - KNEE_VALUE)
         };
         let edges = (image.edges[pixel] - truth.edges[pixel]).abs();
         let points = (image.points[pixel] - truth.points[pixel]).abs();
@@ -72,7 +75,6 @@ pub fn flip(image: &[f32], truth: &[f32], size_px: [u32; 2]) -> Vec<f32> {
 struct Perceived {
     /// Blurred colours in the Hunt-adjusted L*a*b*.
     lab: Vec<[f32; 3]>,
-    /// Strength of edges.
     edges: Plane,
     /// Strength of points and lines.
     points: Plane,
@@ -129,9 +131,12 @@ fn linear_of_opponent([y, cx, cz]: [f32; 3]) -> [f32; 3] {
 fn hunt_lab(rgb: [f32; 3]) -> [f32; 3] {
     let xyz = multiply(&XYZ_FROM_RGB, rgb);
     let delta = 6.0_f32 / 29.0;
-    let response = |value: f32| match value > delta.powi(3) {
-        true => value.cbrt(),
-        false => value / (3.0 * delta * delta) + 4.0 / 29.0,
+    let response = |value: f32| {
+        if value > delta.powi(3) {
+            value.cbrt()
+        } else {
+            value / (3.0 * delta * delta) + 4.0 / 29.0
+        }
     };
     let [x, y, z] = [0, 1, 2].map(|c| response(xyz[c] / WHITE[c]));
     let lightness = 116.0 * y - 16.0;
@@ -168,8 +173,9 @@ fn blur(plane: &[f32], width: usize, gaussians: [(f64, f64); 2]) -> Plane {
     sum
 }
 
-/// Kernels of features along an axis: a smooth one across the feature's own axis, that of edges, and that of points.
-/// In two dimensions positive and negative weights of edges and of points sum to 1 each.
+/// Kernels of features along an axis: a smooth one across the feature's own axis, that of edges,
+/// and that of points. In two dimensions positive and negative weights of edges and of points sum
+/// to 1 each.
 fn feature_kernels() -> [Vec<f32>; 3] {
     let sigma_px = 0.5 * FEATURE_DEG * PIXELS_PER_DEGREE;
     let reach = (3.0 * sigma_px).ceil() as i32;
@@ -190,8 +196,8 @@ fn feature_kernels() -> [Vec<f32>; 3] {
     ]
 }
 
-/// Correlates a plane with a kernel along rows and another along columns. Beyond its edges the plane continues with its
-/// last values.
+/// Correlates a plane with a kernel along rows and another along columns. Beyond its edges the
+/// plane continues with its last values.
 fn convolved(plane: &[f32], width: usize, across: &[f32], down: &[f32]) -> Plane {
     let height = plane.len() / width;
     let reach = across.len() / 2;

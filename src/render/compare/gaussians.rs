@@ -7,7 +7,8 @@ use crate::View;
 use crate::compare::images::view_along;
 use wildcity_scene::{Gaussians, Scene, sh};
 
-/// One Gaussian; by default an orange ball with a standard deviation of 10 cm, 5 m ahead of [`forward_view`].
+/// One Gaussian; by default an orange ball with a standard deviation of 10 cm, 5 m ahead of
+/// [`forward_view`].
 #[derive(Clone, Copy, Debug)]
 pub struct GaussianSpec {
     /// Centre, in metres.
@@ -18,7 +19,6 @@ pub struct GaussianSpec {
     pub sigma_m: DVec3,
     /// Peak opacity, between 0 and 1.
     pub opacity: f64,
-    /// Linear colour.
     pub rgb: [f64; 3],
 }
 
@@ -35,12 +35,12 @@ impl Default for GaussianSpec {
 }
 
 /// A scene of some Gaussians.
-pub fn scene_of(specs: &[GaussianSpec]) -> Scene {
-    Scene::from_gaussians(&gaussians_of(specs))
+pub fn scene_from_specs(specs: &[GaussianSpec]) -> Scene {
+    Scene::from_gaussians(&gaussians_from_specs(specs))
 }
 
 /// The columns of some Gaussians, with SH degree 0.
-pub fn gaussians_of(specs: &[GaussianSpec]) -> Gaussians {
+pub fn gaussians_from_specs(specs: &[GaussianSpec]) -> Gaussians {
     let mut g = Gaussians::with_capacity(0, specs.len());
     for GaussianSpec { mean_m, rotation: q, sigma_m, opacity, rgb } in specs {
         g.means_m.push(mean_m.to_array());

@@ -4,8 +4,8 @@
 pub const HEAT_RGB: [[u8; 3]; 6] =
     [[0, 0, 0], [52, 15, 92], [140, 32, 110], [215, 76, 60], [250, 160, 40], [252, 253, 191]];
 
-/// The colour at a place from 0 (the first of [`HEAT_RGB`]) to 5 (the last), interpolated; clamped to them. NaN has the
-/// colour of 0.
+/// The colour at a place from 0 (the first of [`HEAT_RGB`]) to 5 (the last), interpolated; clamped
+/// to them. NaN has the colour of 0.
 pub fn heat_rgb(place: f32) -> [u8; 3] {
     let last = HEAT_RGB.len() - 1;
     let place = place.clamp(0.0, last as f32);

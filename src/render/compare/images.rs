@@ -1,4 +1,5 @@
-//! All images of a view by a backend, parts of images, and whether the images of two backends agree.
+//! All images of a view by a backend, parts of images, and whether the images of two backends
+//! agree.
 
 use glam::{DMat3, DQuat, DVec3};
 
@@ -54,8 +55,8 @@ pub fn render_images(
     Ok(images)
 }
 
-/// A pinhole camera with a centred principal point and square pixels, at `position_m`, that looks along
-/// `forward`; `down` points to the image's lower edge.
+/// A pinhole camera with a centred principal point and square pixels, at `position_m`, that looks
+/// along `forward`; `down` points to the image's lower edge.
 pub fn view_along(
     size_px: [u32; 2],
     focal_px: f64,
@@ -77,7 +78,8 @@ pub fn view_along(
     View::new(Camera::from_pinhole(width_px, height_px, pinhole), world_from_camera)
 }
 
-/// A view with an image that is a part of another view's image. The part may reach beyond the image's edges.
+/// A view with an image that is a part of another view's image. The part may reach beyond the
+/// image's edges.
 pub fn crop_view(whole: View, [left, top]: [i32; 2], [width_px, height_px]: [u32; 2]) -> View {
     let mut camera = Camera { width_px, height_px, ..whole.camera };
     camera.pinhole.cx -= f64::from(left);
@@ -123,8 +125,9 @@ pub fn max_difference(a: &[f32], b: &[f32]) -> f32 {
 /// Least PSNR at which two images agree, in dB.
 pub const AGREEMENT_DB: f64 = 70.0;
 
-/// Whether two backends drew the same: a PSNR of at least [`AGREEMENT_DB`], no value off by more than 2/255,
-/// and depths within a hundredth, on average 1e-4, where opacity is at least 1/2. Returns the PSNR in dB.
+/// Whether two backends drew the same: a PSNR of at least [`AGREEMENT_DB`], no value off by more
+/// than 2/255, and depths within a hundredth, on average 1e-4, where opacity is at least 1/2.
+/// Returns the PSNR in dB.
 ///
 /// # Errors
 /// Describes the difference and its size.
@@ -140,9 +143,9 @@ pub fn agree(image: &RenderedImage, truth: &RenderedImage) -> Result<f64, String
     if bytes > Some(2) {
         return Err(format!("8-bit colour off by {bytes:?}"));
     }
-    // Where one backend blends a splat that the other finds just below alpha_cut, 1/255 of the weight comes
-    // from another depth: a hundredth of the depth, if the splat lies 2.5 times as deep. On average the
-    // backends must be far closer.
+    // Where one backend blends a splat that the other finds just below alpha_cut, 1/255 of the
+    // weight comes from another depth: a hundredth of the depth, if the splat lies 2.5 times as
+    // deep. On average the backends must be far closer.
     let mut off = 0.0;
     let mut covered = 0.0;
     for (pixel, (&depth, &truth_m)) in image.depth_m.iter().zip(&truth.depth_m).enumerate() {

@@ -1,5 +1,5 @@
-//! Serialization of numbers that JSON lacks: infinity and NaN become the strings `"inf"`, `"-inf"` and
-//! `"NaN"`, as in the CSV.
+//! Serialization of numbers that JSON lacks: infinity and NaN become the strings `"inf"`, `"-inf"`
+//! and `"NaN"`, as in the CSV.
 
 use serde::{Serialize, Serializer};
 
@@ -17,9 +17,10 @@ struct Number(f64);
 
 impl Serialize for Number {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        match self.0.is_finite() {
-            true => serializer.serialize_f64(self.0),
-            false => serializer.collect_str(&self.0),
+        if self.0.is_finite() {
+            serializer.serialize_f64(self.0)
+        } else {
+            serializer.collect_str(&self.0)
         }
     }
 }

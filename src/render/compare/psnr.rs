@@ -3,8 +3,9 @@
 /// Least PSNR at which an image of one backend counts as that of another, in dB.
 pub const MIN_PSNR_DB: f64 = 60.0;
 
-/// Peak signal-to-noise ratio in dB, of differences of values with peak 1: `-10 log10(mean of squares)`.
-/// Infinite if all differences are 0; NaN if one is a NaN, or if there are none.
+/// Peak signal-to-noise ratio in dB, of differences of values with peak 1:
+/// `-10 log10(mean of squares)`. Infinite if all differences are 0; NaN if one is a NaN, or if
+/// there are none.
 pub fn psnr_db(differences: impl Iterator<Item = f64>) -> f64 {
     let (sum, count) =
         differences.fold((0.0, 0_u64), |(sum, count), off| (sum + off * off, count + 1));

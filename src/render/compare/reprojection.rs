@@ -1,4 +1,5 @@
-//! Reprojection error: how far a camera's images of known points are from where its model puts them.
+//! Reprojection error: how far a camera's images of known points are from where its model puts
+//! them.
 
 use glam::DVec2;
 
@@ -15,15 +16,14 @@ const POINT_PX: f64 = 2.0;
 /// Points that a camera should show.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ReprojectionErrors {
-    /// Number of points.
     pub count: usize,
     /// Largest distance of a point's image from its pixel; infinite if a point is not visible.
     pub worst_px: f64,
 }
 
 impl ReprojectionErrors {
-    /// Renders a grid of small Gaussians, each on the ray of a known pixel, and measures the distances of
-    /// their images' centroids from these pixels.
+    /// Renders a grid of small Gaussians, each on the ray of a known pixel, and measures the
+    /// distances of their images' centroids from these pixels.
     ///
     /// # Errors
     /// The backend cannot draw them.
@@ -32,7 +32,8 @@ impl ReprojectionErrors {
         let mut gaussians = Gaussians::with_capacity(0, 0);
         let mut wanted = Vec::new();
         for (row, column) in (0..GRID[1]).flat_map(|row| (0..GRID[0]).map(move |k| (row, k))) {
-            // The middle of one of GRID equal cells of the image, 0.37 px into a pixel, off its centre.
+            // The middle of one of GRID equal cells of the image, 0.37 px into a pixel, off its
+            // centre.
             let share =
                 (DVec2::new(column.into(), row.into()) + 0.5) / DVec2::from(GRID.map(f64::from));
             let at_px = (share * size_px).floor() + 0.37;

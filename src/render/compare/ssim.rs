@@ -1,8 +1,10 @@
-//! Structural similarity (SSIM, Wang et al. 2004) of colour images, in the two ways in which papers compute it.
+//! Structural similarity (SSIM, Wang et al. 2004) of colour images, in the two ways in which papers
+//! compute it.
 //!
-//! Windows are Gaussian, 11 px wide, with a standard deviation of 1.5 px. Variances are those of the population. The
-//! value of a pixel is the mean over the three channels, not that of luma. Implementations differ at the image's edge:
-//! one noisy image has 0.56 or 0.59 only because of that. So a number needs its convention.
+//! Windows are Gaussian, 11 px wide, with a standard deviation of 1.5 px. Variances are those of
+//! the population. The value of a pixel is the mean over the three channels, not that of luma.
+//! Implementations differ at the image's edge: one noisy image has 0.56 or 0.59 only because of
+//! that. So a number needs its convention.
 
 use rayon::prelude::*;
 
@@ -21,22 +23,27 @@ const BAND_ROWS: usize = 32;
 /// Mean structural similarity of two images; 1 if nothing differs.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ssim {
-    /// Over the windows that lie within the image: Wang et al. 2004, and scikit-image with `gaussian_weights=True,
-    /// sigma=1.5, use_sample_covariance=False, channel_axis=-1`. With a mask, over the windows that have only
-    /// pixels that count. NaN if there is no such window.
+    /// Over the windows that lie within the image: Wang et al. 2004, and scikit-image with
+    /// `gaussian_weights=True, sigma=1.5, use_sample_covariance=False, channel_axis=-1`. With a
+    /// mask, over the windows that have only pixels that count. NaN if there is no such window.
     pub within: f64,
-    /// Over all pixels, with the image mirrored at its edges: torchmetrics' default, which gsplat uses. It does
-    /// not support a mask.
+    /// Over all pixels, with the image mirrored at its edges: torchmetrics' default, which gsplat
+    /// uses. It does not support a mask.
     pub mirrored: f64,
 }
 
 impl Ssim {
-    /// Compares two images of values from 0 to 1, `[height, width, 3]`. `counts` marks the pixels that count; all count
-    /// without it.
+    /// Compares two images of values from 0 to 1, `[height, width, 3]`. `counts` marks the pixels
+    /// that count; all count without it.
     ///
     /// # Panics
     /// If a length does not fit the size.
-    pub fn of(image: &[f64], truth: &[f64], size_px: [u32; 2], counts: Option<&[bool]>) -> Self {
+    pub fn compare(
+        image: &[f64],
+        truth: &[f64],
+        size_px: [u32; 2],
+        counts: Option<&[bool]>,
+    ) -> Self {
         let [width, height] = size_px.map(|px| px as usize);
         assert!(image.len() == 3 * width * height && truth.len() == image.len(), "{size_px:?}");
         assert!(counts.is_none_or(|counts| counts.len() == width * height), "{size_px:?}");
@@ -101,7 +108,8 @@ impl Pair<'_> {
         sums
     }
 
-    /// Weighted means along a row, around each of its pixels: of both images, of their squares, and of their product.
+    /// Weighted means along a row, around each of its pixels: of both images, of their squares, and
+    /// of their product.
     fn row_means(&self, row: usize, channel: usize) -> Vec<[f64; 5]> {
         let moments = |column: isize| {
             let at = 3 * (row * self.width + mirrored(column, self.width)) + channel;
@@ -164,7 +172,8 @@ impl BlockedPixels {
         Self { sums, stride }
     }
 
-    /// Number of pixels that do not count in the window around a pixel. The window lies within the image.
+    /// Number of pixels that do not count in the window around a pixel. The window lies within the
+    /// image.
     fn around(&self, row: usize, column: usize) -> u32 {
         let top = (row - REACH_PX) * self.stride;
         let bottom = (row + REACH_PX + 1) * self.stride;
@@ -176,7 +185,8 @@ impl BlockedPixels {
     }
 }
 
-/// The pixel of a row of `side` pixels that replaces one beyond its ends: mirrored, without repeating the last one.
+/// The pixel of a row of `side` pixels that replaces one beyond its ends: mirrored, without
+/// repeating the last one.
 fn mirrored(at: isize, side: usize) -> usize {
     let last = side as isize - 1;
     let turns = at.rem_euclid((2 * last).max(1));
@@ -212,11 +222,11 @@ mod tests {
     #[test]
     fn an_image_is_like_itself_and_structure_counts_more_than_brightness() {
         let truth = striped(0);
-        let same = Ssim::of(&truth, &truth, [40, 30], None);
+        let same = Ssim::compare(&truth, &truth, [40, 30], None);
         assert_eq!(same, Ssim { within: 1.0, mirrored: 1.0 });
         let brighter: Vec<f64> = truth.iter().map(|value| value + 0.05).collect();
-        let brighter = Ssim::of(&brighter, &truth, [40, 30], None);
-        let noisy = Ssim::of(&striped(40), &truth, [40, 30], None);
+        let brighter = Ssim::compare(&brighter, &truth, [40, 30], None);
+        let noisy = Ssim::compare(&striped(40), &truth, [40, 30], None);
         assert!(brighter.within > 0.97 && noisy.within < brighter.within, "{noisy:?}");
     }
 
@@ -224,21 +234,21 @@ mod tests {
     fn windows_with_a_masked_pixel_do_not_count() {
         let counts: Vec<bool> = (0..40 * 30).map(|i| i % 40 >= 10).collect();
         let noisy = striped(10);
-        let masked = Ssim::of(&noisy, &striped(0), [40, 30], Some(&counts));
+        let masked = Ssim::compare(&noisy, &striped(0), [40, 30], Some(&counts));
         assert_eq!(masked.within, 1.0);
         assert!(masked.mirrored < 0.99, "{masked:?}");
         // One column more, and the windows at column 14 have its pixels.
         let counts: Vec<bool> = (0..40 * 30).map(|i| i % 40 >= 9).collect();
-        assert!(Ssim::of(&noisy, &striped(0), [40, 30], Some(&counts)).within < 1.0);
+        assert!(Ssim::compare(&noisy, &striped(0), [40, 30], Some(&counts)).within < 1.0);
         let nothing = vec![false; 40 * 30];
-        assert!(Ssim::of(&noisy, &noisy, [40, 30], Some(&nothing)).within.is_nan());
+        assert!(Ssim::compare(&noisy, &noisy, [40, 30], Some(&nothing)).within.is_nan());
     }
 
     #[test]
     fn an_image_smaller_than_a_window_is_mirrored() {
         assert_eq!([-3, -1, 0, 3, 4, 5, 6].map(|at| mirrored(at, 4)), [3, 1, 0, 3, 2, 1, 0]);
         assert_eq!([-5, 0, 5].map(|at| mirrored(at, 1)), [0; 3]);
-        let one = Ssim::of(&[0.5; 3], &[0.5; 3], [1, 1], None);
+        let one = Ssim::compare(&[0.5; 3], &[0.5; 3], [1, 1], None);
         assert!(one.within.is_nan() && one.mirrored == 1.0);
     }
 }

@@ -1,4 +1,5 @@
-//! Exposure and overlay of one camera: the second part of stage resolve, for cameras that have them.
+//! Exposure and overlay of one camera: the second part of stage resolve, for cameras that have
+//! them.
 
 use fearless_simd::{f32x16, prelude::*};
 
@@ -46,7 +47,8 @@ fn expose<S: Simd>(simd: S, exposure: &Exposure, rgb: Vec3x16<S>) -> Vec3x16<S> 
     Vec3x16 { x, y, z }
 }
 
-/// Blends the overlay over the block with its top left pixel at `at_px`: `(1 - alpha) rgb + alpha color`.
+/// Blends the overlay over the block with its top left pixel at `at_px`:
+/// `(1 - alpha) rgb + alpha color`.
 #[inline(always)]
 fn blend_overlay<S: Simd>(
     simd: S,

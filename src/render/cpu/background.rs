@@ -1,9 +1,9 @@
-//! The background of a frame (sky or one colour), added where it is visible through the Gaussians: the first
-//! part of stage resolve, for frames that have one.
+//! The background of a frame (sky or one colour), added where it is visible through the Gaussians:
+//! the first part of stage resolve, for frames that have one.
 //!
-//! **Every backend omits the background where less than 1/255 of it is visible.** It would add at most one
-//! step of 8 bits, and most pixels of a street are of this kind. Alpha remains that of the Gaussians. A
-//! background of one colour is treated as a sky of one colour.
+//! **Every backend omits the background where less than 1/255 of it is visible.** It would add at
+//! most one step of 8 bits, and most pixels of a street are of this kind. Alpha remains that of the
+//! Gaussians. A background of one colour is treated as a sky of one colour.
 
 use std::sync::Arc;
 
@@ -30,7 +30,8 @@ pub(super) struct Background {
 enum PixelRays {
     /// Static pinhole: rows that take `(x, y, 1)` in pixels to a direction of any length.
     Pinhole([[f32; 3]; 3]),
-    /// A pinhole in motion or behind a windshield, or a lens that is round about its axis: 16 at a time.
+    /// A pinhole in motion or behind a windshield, or a lens that is round about its axis: 16 at a
+    /// time.
     Lens(LensRays),
     /// Any other camera: pixel by pixel in f64.
     PerPixel(Box<PerPixelRays>),
@@ -47,7 +48,7 @@ impl Background {
     ///
     /// # Errors
     /// The sky cannot be evaluated as the profile asks.
-    pub(super) fn of(frame: &Frame<'_>) -> Result<Vec<Self>, RenderError> {
+    pub(super) fn from_frame(frame: &Frame<'_>) -> Result<Vec<Self>, RenderError> {
         let Some((sky, sky_from_world)) = frame.background()? else { return Ok(Vec::new()) };
         let of_view = |view: &View| {
             let rays = if view.is_static_pinhole() {
@@ -139,8 +140,8 @@ impl Background {
 }
 
 impl PerPixelRays {
-    /// Directions of 16 pixels. A pixel outside of the lens' field gets +z; it is masked when the image is
-    /// complete.
+    /// Directions of 16 pixels. A pixel outside of the lens' field gets +z; it is masked when the
+    /// image is complete.
     fn directions(&self, x_px: &[f32; LANES], y_px: &[f32; LANES]) -> [[f32; LANES]; 3] {
         let mut directions = [0.0, 0.0, 1.0].map(|axis| [axis; LANES]);
         for lane in 0..LANES {
@@ -156,13 +157,14 @@ impl PerPixelRays {
     }
 }
 
-/// The colours of a cube map in directions of any length, by bilinear interpolation: as [`CubeMap::rgb`].
+/// The colours of a cube map in directions of any length, by bilinear interpolation: as
+/// [`CubeMap::rgb`].
 #[inline(always)]
 fn sample_cube_map<S: Simd>(simd: S, map: &Arc<CubeMap>, direction: Vec3x16<S>) -> [f32x16<S>; 3] {
     let splat = |value: f32| f32x16::splat(simd, value);
 
-    // The face: the axis with the largest magnitude, and its sign. With each face number, the coordinates
-    // right and down in it, and the magnitude ahead.
+    // The face: the axis with the largest magnitude, and its sign. With each face number, the
+    // coordinates right and down in it, and the magnitude ahead.
     let Vec3x16 { x, y, z } = direction;
     let ax = x.abs();
     let ay = y.abs();

@@ -1,9 +1,9 @@
 //! A batch of 64 splats, matched against the blocks of one tile.
 //!
-//! Each splat is tested against the 16 blocks of the tile at once, one block per lane, which gives a bit for each
-//! block. The matrix of 64 x 16 bits is transposed with vector compares. Each block then takes the splats of its 64
-//! bits in order, with all its sums in registers. Building a list per block instead of transposing bits cost 25 % of
-//! the whole stage rasterize.
+//! Each splat is tested against the 16 blocks of the tile at once, one block per lane, which gives
+//! a bit for each block. The matrix of 64 x 16 bits is transposed with vector compares. Each block
+//! then takes the splats of its 64 bits in order, with all its sums in registers. Building a list
+//! per block instead of transposing bits cost 25 % of the whole stage rasterize.
 
 use fearless_simd::{f32x16, prelude::*, u16x32};
 
@@ -12,11 +12,12 @@ use crate::constants::BLOCK_PX;
 use crate::layout::{Cutoffs, Splat};
 use wildcity_scene::chunk::LANES;
 
-/// Splats of a batch: 64 of 308 B stay in the first-level cache together with the sums, and their bits in one u64.
+/// Splats of a batch: 64 of 308 B stay in the first-level cache together with the sums, and their
+/// bits in one u64.
 pub(super) const BATCH: usize = 64;
 
-/// A splat, with the linear forms `u` and `v` of its exponent ([`Splat::factor`]) prepared for a tile: at a
-/// pixel they are the value at the centre of its block plus the offset of its lane.
+/// A splat, with the linear forms `u` and `v` of its exponent ([`Splat::factor`]) prepared for a
+/// tile: at a pixel they are the value at the centre of its block plus the offset of its lane.
 #[derive(Clone, Copy, Debug, Default)]
 #[repr(C, align(64))]
 pub(super) struct Matched {
@@ -61,9 +62,9 @@ impl Default for Batch {
 impl Batch {
     /// Finds the splats among the first `len` that touch each block of the tile at `at_px`.
     ///
-    /// A splat's ellipse lies within three slabs: `|dx| <= extent_x`, `|dy| <= extent_y` and `|u| <= √power`,
-    /// which together are tight for needles at any angle. A block is touched if its centre lies within the slabs,
-    /// each widened by half a block.
+    /// A splat's ellipse lies within three slabs: `|dx| <= extent_x`, `|dy| <= extent_y` and
+    /// `|u| <= √power`, which together are tight for needles at any angle. A block is touched if
+    /// its centre lies within the slabs, each widened by half a block.
     #[inline(always)]
     pub(super) fn match_blocks<S: Simd>(
         &mut self,
@@ -74,8 +75,8 @@ impl Batch {
     ) {
         let splat = |value: f32| f32x16::splat(simd, value);
 
-        // Offsets of pixel centres from the centre of their block: -1.5, -0.5, 0.5, 1.5 px; and of the 16 block
-        // centres from the first one.
+        // Offsets of pixel centres from the centre of their block: -1.5, -0.5, 0.5, 1.5 px; and of
+        // the 16 block centres from the first one.
         let half_px = 0.5 * (BLOCK_PX as f32 - 1.0);
         let lane_x = f32x16::from_fn(simd, |lane| (lane as u32 % BLOCK_PX) as f32 - half_px);
         let lane_y = f32x16::from_fn(simd, |lane| (lane as u32 / BLOCK_PX) as f32 - half_px);
@@ -90,7 +91,8 @@ impl Batch {
             let dy = block_y - splat(mean_px[1] - tile_y);
             let u = dx.mul_add(splat(*l0), dy * splat(*l1));
             let v = dy * splat(*l2);
-            // √power, and the change of u within half a block, both increased by more than the rounding error of f32.
+            // √power, and the change of u within half a block, both increased by more than the
+            // rounding error of f32.
             let reach_u = (log2_opacity - cutoffs.log2_alpha_cut).sqrt() * (1.0 + 1e-5)
                 + (half_px + 2e-3) * (l0.abs() + l1.abs());
             let touches = dx.abs().simd_le(splat(extent_px[0] + half_px))
@@ -109,8 +111,8 @@ impl Batch {
             self.blocks[k] = touches.to_bitmask() as u16;
         }
 
-        // Transpose the bits: bit k of `touching[block]` is bit `block` of `blocks[k]`. 32 splats are compared at
-        // a time.
+        // Transpose the bits: bit k of `touching[block]` is bit `block` of `blocks[k]`. 32 splats
+        // are compared at a time.
         self.blocks[len.min(BATCH)..].fill(0);
         let (low, high) = self.blocks.split_at(BATCH / 2);
         let low = u16x32::from_slice(simd, low);

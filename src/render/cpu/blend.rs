@@ -8,17 +8,17 @@ use super::resolve::{HalvedBy, TileSums};
 use crate::layout::Cutoffs;
 use wildcity_scene::chunk::LANES;
 
-/// Blends the splats that touch a block over it, from front to back. Returns whether all pixels of the block have
-/// stopped, and how many splats were blended.
+/// Blends the splats that touch a block over it, from front to back. Returns whether all pixels of
+/// the block have stopped, and how many splats were blended.
 ///
-/// Each splat has `alpha = min(cap, 2^(log2(opacity) - u² - v²))`, and adds `alpha T` of its colour; then the
-/// transmittance T is multiplied by `1 - alpha` (Kerbl et al. 2023, eq. 3). A pixel stops before the splat
-/// that would bring T to the stop or below.
+/// Each splat has `alpha = min(cap, 2^(log2(opacity) - u² - v²))`, and adds `alpha T` of its
+/// colour; then the transmittance T is multiplied by `1 - alpha` (Kerbl et al. 2023, eq. 3). A
+/// pixel stops before the splat that would bring T to the stop or below.
 ///
-/// **The transmittance that decides about stopping continues to fall after a pixel has stopped.** It never
-/// rises, so that the test `after > stop` remains false without a mask, and each iteration depends on the
-/// previous one by a single multiply-add. The transmittance of the image is a separate value, which changes only
-/// where the test holds.
+/// **The transmittance that decides about stopping continues to fall after a pixel has stopped.**
+/// It never rises, so that the test `after > stop` remains false without a mask, and each iteration
+/// depends on the previous one by a single multiply-add. The transmittance of the image is a
+/// separate value, which changes only where the test holds.
 #[inline(always)]
 pub(super) fn blend<S: Simd, const DEPTH: bool, const INSTANCES: bool>(
     simd: S,

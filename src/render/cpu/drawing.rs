@@ -1,5 +1,5 @@
-//! Draws a frame within the limit of its intermediate buffers: all views at once, or one half of them after the other,
-//! or one view slab by slab. The images do not depend on this choice.
+//! Draws a frame within the limit of its intermediate buffers: all views at once, or one half of
+//! them after the other, or one view slab by slab. The images do not depend on this choice.
 
 use fearless_simd::Level;
 
@@ -24,8 +24,8 @@ pub(super) struct Drawing<'a> {
     pub(super) stats: FrameStats,
 }
 
-/// Most bytes that are held while such views are drawn with `most_bytes` of intermediate buffers: these, the sums of
-/// one view that is drawn in slabs, and each thread's copies of a macro tile.
+/// Most bytes that are held while such views are drawn with `most_bytes` of intermediate buffers:
+/// these, the sums of one view that is drawn in slabs, and each thread's copies of a macro tile.
 pub(super) fn most_held_bytes(most_bytes: u64, views: &[View], threads: usize) -> u64 {
     let sums = views.iter().map(UnfinishedTiles::bytes).max().unwrap_or(0);
     most_bytes.max(sums) + sums + bin::COPIES_BYTES * threads as u64
@@ -41,8 +41,8 @@ pub(super) struct Stages<'a> {
 }
 
 impl Stages<'_> {
-    /// Projects, and bins if `last` is [`Stage::Bin`]. Each stage overwrites its part of `scratch`, so the data of an
-    /// earlier frame, even one that panicked, has no effect.
+    /// Projects, and bins if `last` is [`Stage::Bin`]. Each stage overwrites its part of `scratch`,
+    /// so the data of an earlier frame, even one that panicked, has no effect.
     pub(super) fn run(
         &self,
         scratch: &mut Scratch,
@@ -78,7 +78,7 @@ impl Drawing<'_> {
         part: FramePart<'_>,
         targets: &mut [Target<'_>],
     ) -> Result<(), RenderError> {
-        let most_bytes = self.most_bytes_of(&part);
+        let most_bytes = self.most_bytes(&part);
         let most_splats = usize::try_from(most_bytes / limits::SPLAT_BYTES).unwrap_or(usize::MAX);
         if part.max_splats(most_splats) <= most_splats {
             match self.draw_at_once(part, targets, most_bytes) {
@@ -98,7 +98,7 @@ impl Drawing<'_> {
     }
 
     /// A single view may have as much as its sums would take if it were drawn in slabs.
-    fn most_bytes_of(&self, part: &FramePart<'_>) -> u64 {
+    fn most_bytes(&self, part: &FramePart<'_>) -> u64 {
         match part.frame.views {
             [view] => self.most_bytes.max(UnfinishedTiles::bytes(view)),
             _ => self.most_bytes,

@@ -1,4 +1,5 @@
-//! The outputs of the stages in their plain form, for another backend to continue from or compare with.
+//! The outputs of the stages in their plain form, for another backend to continue from or compare
+//! with.
 
 use rayon::prelude::*;
 
@@ -8,8 +9,8 @@ use crate::FrameStats;
 use crate::layout::Cutoffs;
 use crate::stage::{SplatOwner, Stage, StageOutputs, TileLists};
 
-/// Copies the outputs of the stages up to and including `last`. Splats are numbered without the gaps at the
-/// ends of pages.
+/// Copies the outputs of the stages up to and including `last`. Splats are numbered without the
+/// gaps at the ends of pages.
 pub(super) fn stage_outputs(
     scratch: &Scratch,
     last: Stage,
@@ -36,7 +37,8 @@ pub(super) fn stage_outputs(
     let index = |place: u32| index_of_place[place as usize];
     timer.finish("hand over", stats);
     if last >= Stage::Sort {
-        // The cpu backend itself needs no order of whole views. The sort is stable: equal keys keep the order of global ids.
+        // The cpu backend itself needs no order of whole views. The sort is stable: equal keys keep
+        // the order of global ids.
         let mut order: Vec<u32> = (0..outputs.splats.len() as u32).collect();
         order.par_sort_by_key(|&splat| outputs.keys[splat as usize]);
         outputs.order = Some(order);
@@ -50,7 +52,7 @@ pub(super) fn stage_outputs(
             lists.ranges.resize(first_tile + grid.tiles(), [0; 2]);
             for number in 0..grid.macro_tiles() {
                 bins.load(view, number, &mut loaded);
-                for (within, [column, row]) in grid.tiles_of(number) {
+                for (within, [column, row]) in grid.macro_tile_tiles(number) {
                     let start = lists.instances.len() as u32;
                     let places = loaded.tile(within).iter().map(|&splat| loaded.place(splat));
                     lists.instances.extend(places.map(index));

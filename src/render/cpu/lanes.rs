@@ -1,7 +1,7 @@
 //! Sixteen 3D vectors, one per SIMD lane.
 //!
-//! Every function is `#[inline(always)]`: a function that remains a call of its own is compiled without the
-//! instruction set that its caller was dispatched to.
+//! Every function is `#[inline(always)]`: a function that remains a call of its own is compiled
+//! without the instruction set that its caller was dispatched to.
 
 use fearless_simd::{f32x16, prelude::*};
 
@@ -9,7 +9,8 @@ use wildcity_scene::chunk::{LANES, Lanes};
 
 /// One vector for each value, which has the value in every lane.
 ///
-/// It uses a loop and not `map` of an array: `map` remains a call, and so is compiled without the instruction set.
+/// It uses a loop and not `map` of an array: `map` remains a call, and so is compiled without the
+/// instruction set.
 #[inline(always)]
 pub(super) fn splats<S: Simd, const N: usize>(simd: S, values: [f32; N]) -> [f32x16<S>; N] {
     let mut vectors = [f32x16::splat(simd, 0.0); N];

@@ -1,14 +1,14 @@
-//! Elementary functions, 16 values at a time: shorter than a general library's, and exact to f32 within the
-//! stated ranges.
+//! Elementary functions, 16 values at a time: shorter than a general library's, and exact to f32
+//! within the stated ranges.
 
 use fearless_simd::{f32x16, i32x16, prelude::*};
 
 /// The angle within a quarter turn of a sine and its cosine, which is not negative; within 2e-7.
 ///
-/// The arc sine of the smaller of both, by a fit of `(asin x/x - 1)/x²` with an error of 5e-9; if the cosine is the
-/// smaller one, the angle is `π/2` minus this.
+/// The arc sine of the smaller of both, by a fit of `(asin x/x - 1)/x²` with an error of 5e-9; if
+/// the cosine is the smaller one, the angle is `π/2` minus this.
 #[inline(always)]
-pub(super) fn angle_of<S: Simd>(simd: S, sine: f32x16<S>, cosine: f32x16<S>) -> f32x16<S> {
+pub(super) fn atan2<S: Simd>(simd: S, sine: f32x16<S>, cosine: f32x16<S>) -> f32x16<S> {
     let splat = |value: f32| f32x16::splat(simd, value);
     let size = sine.abs();
     let steep = size.simd_gt(cosine);
@@ -43,8 +43,8 @@ pub(super) fn sin<S: Simd>(simd: S, x: f32x16<S>) -> f32x16<S> {
 
 /// The base-2 logarithm of positive normal numbers, within 2e-7.
 ///
-/// `x = 2^exponent m` with the mantissa m in [√½, √2). With `t = (m - 1)/(m + 1)`, so `|t| <= 0.172`,
-/// `ln m = 2 atanh t = 2 t + 2/3 t³ + 2/5 t⁵ + ...`.
+/// `x = 2^exponent m` with the mantissa m in [√½, √2). With `t = (m - 1)/(m + 1)`, so
+/// `|t| <= 0.172`, `ln m = 2 atanh t = 2 t + 2/3 t³ + 2/5 t⁵ + ...`.
 #[inline(always)]
 pub(super) fn log2<S: Simd>(simd: S, x: f32x16<S>) -> f32x16<S> {
     let splat = |value: f64| f32x16::splat(simd, value as f32);
@@ -64,11 +64,12 @@ pub(super) fn log2<S: Simd>(simd: S, x: f32x16<S>) -> f32x16<S> {
     (t * series).mul_add(splat(std::f64::consts::LOG2_E), exponent)
 }
 
-/// `2^x` for x in [-126, 0], within 2e-7, and exact for whole x. Elsewhere the result is arbitrary, and the
-/// call is safe.
+/// `2^x` for x in [-126, 0], within 2e-7, and exact for whole x. Elsewhere the result is arbitrary,
+/// and the call is safe.
 ///
-/// `2^x = 2^whole 2^f`: the whole part is added to the exponent's bits. The polynomial of the fraction f is
-/// the minimax fit of degree 5 to `2^f` on [0, 1) in relative error (8e-8), of those with value 1 at 0.
+/// `2^x = 2^whole 2^f`: the whole part is added to the exponent's bits. The polynomial of the
+/// fraction f is the minimax fit of degree 5 to `2^f` on [0, 1) in relative error (8e-8), of those
+/// with value 1 at 0.
 #[inline(always)]
 pub(super) fn exp2<S: Simd>(simd: S, x: f32x16<S>) -> f32x16<S> {
     let splat = |value: f32| f32x16::splat(simd, value);
@@ -96,7 +97,7 @@ mod tests {
             let angle = std::f64::consts::FRAC_PI_2 * f64::from(i) / 1_000.0;
             let found = dispatch!(Level::new(), simd => {
                 let [sine, cosine] = [angle.sin(), angle.cos()].map(|v| f32x16::splat(simd, v as f32));
-                angle_of(simd, sine, cosine).to_array()[0]
+                atan2(simd, sine, cosine).to_array()[0]
             });
             assert!((f64::from(found) - angle).abs() < 2e-7, "{angle} is {found}");
         }

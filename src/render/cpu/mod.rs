@@ -12,10 +12,10 @@
 //! | `lanes`, `math` | SIMD vectors and elementary functions |
 //! | `export` | outputs of the stages for another backend |
 //!
-//! The images are deterministic: parallel work writes to places that do not depend on the schedule, and every pixel
-//! adds its splats in one order. Scratch buffers are kept from frame to frame. Their size is bounded: views that
-//! together exceed the bound are rendered one half after the other, and a single view that exceeds it in slabs of
-//! depths.
+//! The images are deterministic: parallel work writes to places that do not depend on the schedule,
+//! and every pixel adds its splats in one order. Scratch buffers are kept from frame to frame.
+//! Their size is bounded: views that together exceed the bound are rendered one half after the
+//! other, and a single view that exceeds it in slabs of depths.
 
 mod appearance;
 mod background;
@@ -58,15 +58,16 @@ use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target, View};
 #[derive(Debug)]
 pub struct Cpu {
     main: Lane,
-    /// For frames that are rendered while the main lane is busy; `None` if its threads cannot be started.
+    /// For frames that are rendered while the main lane is busy; `None` if its threads cannot be
+    /// started.
     side: OnceLock<Option<Lane>>,
     level: Level,
     /// Most bytes of the main lane's intermediate buffers.
     lane_bytes: AtomicU64,
 }
 
-/// Threads and buffers for one frame at a time. With threads of its own, a frame gets its share of the cores; tasks of
-/// two frames in one pool would wait for each other.
+/// Threads and buffers for one frame at a time. With threads of its own, a frame gets its share of
+/// the cores; tasks of two frames in one pool would wait for each other.
 #[derive(Debug)]
 struct Lane {
     pool: ThreadPool,
@@ -87,7 +88,6 @@ pub enum Simd {
     /// The best one of the machine.
     #[default]
     Best,
-    /// Sixteen lanes.
     Avx512,
     /// Eight lanes, with fused multiply-add.
     Avx2,
@@ -103,10 +103,7 @@ pub enum CpuError {
     NoSuchSimd(Simd),
     /// More threads than [`limits::RENDER_THREADS`].
     #[error("{threads} render threads; 0 to {} are accepted", limits::RENDER_THREADS)]
-    TooManyThreads {
-        /// The requested number.
-        threads: usize,
-    },
+    TooManyThreads { threads: usize },
     /// The threads could not be started.
     #[error("cannot start the render threads: {0}")]
     Threads(rayon::ThreadPoolBuildError),
@@ -127,7 +124,8 @@ impl Cpu {
     /// A backend with its own thread pool of `threads` threads, or one per core if 0.
     ///
     /// # Errors
-    /// The machine lacks the instruction set, the threads cannot be started, or there are too many of them.
+    /// The machine lacks the instruction set, the threads cannot be started, or there are too many
+    /// of them.
     pub fn new(threads: usize, simd: Simd) -> Result<Self, CpuError> {
         if threads > limits::RENDER_THREADS {
             return Err(CpuError::TooManyThreads { threads });
@@ -162,8 +160,8 @@ impl Cpu {
         side.unwrap_or_else(|| self.main.take(most_bytes))
     }
 
-    /// Runs the stages up to and including `last`, and returns their outputs, for another backend to continue
-    /// from or to compare with.
+    /// Runs the stages up to and including `last`, and returns their outputs, for another backend
+    /// to continue from or to compare with.
     ///
     /// # Errors
     /// No view, too many views, a profile with exact rays, or too many (Gaussian, tile) pairs.
@@ -252,9 +250,9 @@ impl Backend for Cpu {
     ) -> Result<FrameStats, RenderError> {
         frame.check(targets)?;
         frame.check_splats(self.name())?;
-        // Outside of the pool: baking a sky waits for other threads, and a thread that waits within its own
-        // rayon pool may start unrelated work of the pool.
-        let backgrounds = Background::of(frame)?;
+        // Outside of the pool: baking a sky waits for other threads, and a thread that waits within
+        // its own rayon pool may start unrelated work of the pool.
+        let backgrounds = Background::from_frame(frame)?;
         let BusyLane { pool, mut scratch, most_bytes } = self.lane();
         let scratch = &mut *scratch;
         let cutoffs = Cutoffs::new(frame.profile);
@@ -294,8 +292,8 @@ impl StageTimer {
         Self::add(name, ms, stats);
     }
 
-    /// Adds the times of two stages that alternate, given the time of each in all threads: they share the wall time in
-    /// this proportion.
+    /// Adds the times of two stages that alternate, given the time of each in all threads: they
+    /// share the wall time in this proportion.
     fn finish_both(&mut self, stages: [(&'static str, u64); 2], stats: &mut FrameStats) {
         let ms = self.lap_ms();
         let total: u64 = stages.iter().map(|(_, ns)| ns).sum();

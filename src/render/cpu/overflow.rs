@@ -11,7 +11,6 @@ pub(super) struct Overflow;
 pub(super) enum PartError {
     /// It must be drawn in smaller parts.
     Overflow,
-    /// The frame fails.
     Render(RenderError),
 }
 

@@ -1,4 +1,5 @@
-//! Parts of a frame: the views that are rendered together, so that the intermediate buffers stay small.
+//! Parts of a frame: the views that are rendered together, so that the intermediate buffers stay
+//! small.
 
 use rayon::prelude::*;
 
@@ -24,9 +25,10 @@ impl FramePart<'_> {
     pub(super) fn halves(&self) -> [Self; 2] {
         let middle = self.frame.views.len() / 2;
         let (first, second) = self.frame.views.split_at(middle);
-        let (behind_first, behind_second) = match self.backgrounds.is_empty() {
-            true => (self.backgrounds, self.backgrounds),
-            false => self.backgrounds.split_at(middle),
+        let (behind_first, behind_second) = if self.backgrounds.is_empty() {
+            (self.backgrounds, self.backgrounds)
+        } else {
+            self.backgrounds.split_at(middle)
         };
         let part = |views, backgrounds, first_view| Self {
             frame: Frame { views, ..self.frame },
@@ -39,8 +41,8 @@ impl FramePart<'_> {
         ]
     }
 
-    /// An upper bound of its splats: all Gaussians of actors and of the clusters that its views may see. The clusters
-    /// of scenes with at most `few` Gaussians for all views are not tested.
+    /// An upper bound of its splats: all Gaussians of actors and of the clusters that its views may
+    /// see. The clusters of scenes with at most `few` Gaussians for all views are not tested.
     pub(super) fn max_splats(&self, few: usize) -> usize {
         let Frame { scene, views, .. } = self.frame;
         let all = scene.gaussians() * views.len();

@@ -1,13 +1,15 @@
 //! Stage rasterize: each tile of 16 x 16 pixels blends its splats from front to back.
 //!
-//! **A thread draws one macro tile at a time**, with copies of its splats in the caches of its core ([`MacroTile`]).
-//! Those with the most work are taken first, so that threads end at nearly the same time.
+//! **A thread draws one macro tile at a time**, with copies of its splats in the caches of its core
+//! ([`MacroTile`]). Those with the most work are taken first, so that threads end at nearly the
+//! same time.
 //!
-//! **The 16 lanes of a vector are a block of 4 x 4 pixels, not a row of 16.** On the benchmark street a splat
-//! touches 10.5 rows of a tile on average, but only 8 blocks, which saves a third of the evaluations.
+//! **The 16 lanes of a vector are a block of 4 x 4 pixels, not a row of 16.** On the benchmark
+//! street a splat touches 10.5 rows of a tile on average, but only 8 blocks, which saves a third of
+//! the evaluations.
 //!
-//! **Splats are matched in batches of 64** ([`Batch`]). Each block then blends the splats that touch it
-//! ([`blend`]).
+//! **Splats are matched in batches of 64** ([`Batch`]). Each block then blends the splats that
+//! touch it ([`blend`]).
 
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::Instant;
@@ -86,8 +88,8 @@ struct Drawing<'a> {
     bands: Vec<Mutex<Band<'a>>>,
 }
 
-/// Sorts and draws all views, and calls `on_view_done` as each is complete. A slab has one view, which is complete
-/// after the last slab.
+/// Sorts and draws all views, and calls `on_view_done` as each is complete. A slab has one view,
+/// which is complete after the last slab.
 pub(super) fn rasterize(
     level: Level,
     input: Input<'_>,
@@ -152,7 +154,8 @@ struct TileOutput<'a> {
     wants: Wants,
 }
 
-/// Sorts and draws one macro tile of one view, and resolves its tiles into the target's bands after the last slab.
+/// Sorts and draws one macro tile of one view, and resolves its tiles into the target's bands after
+/// the last slab.
 #[inline(always)]
 fn draw_macro_tile<S: Simd>(
     simd: S,
@@ -180,9 +183,9 @@ fn draw_macro_tile<S: Simd>(
     // Tiles of earlier slabs.
     let has_sums = unfinished.as_ref().is_some_and(|tiles| !tiles.is_empty());
     if let (false, false, Some(tiles)) = (is_last, has_sums, &mut unfinished) {
-        tiles.reserve_exact(drawing.grid.tiles_of(number).count());
+        tiles.reserve_exact(drawing.grid.macro_tile_tiles(number).count());
     }
-    for (index, (within, [column, row])) in drawing.grid.tiles_of(number).enumerate() {
+    for (index, (within, [column, row])) in drawing.grid.macro_tile_tiles(number).enumerate() {
         let at_px = [column * TILE_PX, row * TILE_PX];
         let mut sums = TileSums::default();
         let mut live = u16::MAX;
@@ -200,9 +203,10 @@ fn draw_macro_tile<S: Simd>(
         }
         if let (false, Some(tiles)) = (is_last, &mut unfinished) {
             let tile = UnfinishedTile { sums, live };
-            match has_sums {
-                true => tiles[index] = tile,
-                false => tiles.push(tile),
+            if has_sums {
+                tiles[index] = tile
+            } else {
+                tiles.push(tile)
             }
             continue;
         }

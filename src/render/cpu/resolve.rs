@@ -18,8 +18,8 @@ pub(super) fn block_corner(block: usize) -> [u32; 2] {
     [block as u32 % per_row * BLOCK_PX, block as u32 / per_row * BLOCK_PX]
 }
 
-/// For each pixel of a tile, the place of the splat that brings its transmittance to a half or less, plus 1; 0 if none
-/// has.
+/// For each pixel of a tile, the place of the splat that brings its transmittance to a half or
+/// less, plus 1; 0 if none has.
 pub(super) type HalvedBy = [[u32; LANES]; BLOCKS];
 
 /// Before any splat is blended.
@@ -60,8 +60,8 @@ pub(super) struct Band<'a> {
 }
 
 impl Band<'_> {
-    /// Writes the instances of one tile with its left edge at column `left`. If earlier slabs wrote some,
-    /// the instances of pixels that were halved in those slabs stay.
+    /// Writes the instances of one tile with its left edge at column `left`. If earlier slabs wrote
+    /// some, the instances of pixels that were halved in those slabs stay.
     pub(super) fn write_instances(
         &mut self,
         halved_by: &HalvedBy,

@@ -1,11 +1,13 @@
-//! Slabs: the splats of one view in a range of depths, drawn from the nearest slab to the farthest, so that the
-//! intermediate buffers are bounded whatever the scene.
+//! Slabs: the splats of one view in a range of depths, drawn from the nearest slab to the farthest,
+//! so that the intermediate buffers are bounded whatever the scene.
 //!
-//! A pixel blends its splats in order of (depth, global id). A view that is drawn in ranges of that order therefore has
-//! the same bytes, if each tile continues from the sums of the previous slab. Depth cuts a view in the same way for
-//! every camera: the depths of a cluster's Gaussians are bounded by their distance from the camera, whatever the lens.
-//! (Bands of rows would need no sums, but a bound on the rows of a cluster for each lens and shutter, and large splats
-//! lie in many bands.) A cluster that reaches into two slabs is projected for both, and each keeps its own splats.
+//! A pixel blends its splats in order of (depth, global id). A view that is drawn in ranges of that
+//! order therefore has the same bytes, if each tile continues from the sums of the previous slab.
+//! Depth cuts a view in the same way for every camera: the depths of a cluster's Gaussians are
+//! bounded by their distance from the camera, whatever the lens. (Bands of rows would need no sums,
+//! but a bound on the rows of a cluster for each lens and shutter, and large splats lie in many
+//! bands.) A cluster that reaches into two slabs is projected for both, and each keeps its own
+//! splats.
 //!
 //! The number of splats of a slab is estimated. A slab that has too many is cut into halves.
 
@@ -41,14 +43,14 @@ pub(super) struct DepthClusters {
     end_key: u32,
     /// Number of keys per step.
     step: u32,
-    /// Number of Gaussians up to the end of each step, as if each cluster's were spread evenly over its depths.
+    /// Number of Gaussians up to the end of each step, as if each cluster's were spread evenly over
+    /// its depths.
     up_to: Vec<f64>,
 }
 
 /// A range of a view's splats in order of (depth, global id).
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Cut {
-    /// Keys of depth.
     pub(super) keys: Range<u32>,
     /// Jobs: all, unless splats of one depth are too many.
     jobs: Range<usize>,
@@ -68,8 +70,8 @@ pub(super) struct SlabOfJob<'a> {
 }
 
 impl DepthClusters {
-    /// The clusters of all jobs of one view: of each job the number of each cluster that the view may see, and bounds of
-    /// the depths of its centres, in metres.
+    /// The clusters of all jobs of one view: of each job the number of each cluster that the view
+    /// may see, and bounds of the depths of its centres, in metres.
     pub(super) fn new<C: Iterator<Item = (usize, [f64; 2])>>(
         jobs: usize,
         visible_clusters: impl Fn(usize) -> C + Sync,
@@ -120,21 +122,23 @@ impl DepthClusters {
         self.first_key..self.end_key
     }
 
-    /// The cut that begins at a key and has about the given number of Gaussians, and their estimated number.
+    /// The cut that begins at a key and has about the given number of Gaussians, and their
+    /// estimated number.
     pub(super) fn next(&self, first_key: u32, gaussians: f64) -> (Cut, f64) {
         let first_step = (first_key.saturating_sub(self.first_key) / self.step) as usize;
         let before = first_step.checked_sub(1).map_or(0.0, |step| self.up_to[step.min(STEPS - 1)]);
         let end_step = self.up_to.partition_point(|&up_to| up_to <= before + gaussians);
         let end_step = end_step.max(first_step + 1);
-        let end_key = match end_step >= STEPS {
-            true => self.end_key,
-            false => self.first_key + end_step as u32 * self.step,
+        let end_key = if end_step >= STEPS {
+            self.end_key
+        } else {
+            self.first_key + end_step as u32 * self.step
         };
         let estimated = self.up_to[end_step.min(STEPS) - 1] - before;
         (Cut { keys: first_key..end_key, jobs: 0..self.ends.len() }, estimated)
     }
 
-    fn of_job(&self, job: usize) -> &[DepthCluster] {
+    fn job_clusters(&self, job: usize) -> &[DepthCluster] {
         let start = job.checked_sub(1).map_or(0, |before| self.ends[before]);
         &self.clusters[start..self.ends[job]]
     }
@@ -162,13 +166,14 @@ impl<'a> Slab<'a> {
     /// The jobs that may have splats in it.
     pub(super) fn jobs(&self) -> impl Iterator<Item = usize> {
         let Cut { keys, jobs } = self.cut;
-        let touches =
-            |&job: &usize| self.clusters.of_job(job).iter().any(|cluster| cluster.touches(keys));
+        let touches = |&job: &usize| {
+            self.clusters.job_clusters(job).iter().any(|cluster| cluster.touches(keys))
+        };
         jobs.clone().filter(touches)
     }
 
-    pub(super) fn of_job(&self, job: usize) -> SlabOfJob<'a> {
-        SlabOfJob { keys: &self.cut.keys, clusters: self.clusters.of_job(job) }
+    pub(super) fn job(&self, job: usize) -> SlabOfJob<'a> {
+        SlabOfJob { keys: &self.cut.keys, clusters: self.clusters.job_clusters(job) }
     }
 }
 

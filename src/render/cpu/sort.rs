@@ -1,16 +1,18 @@
 //! The order of a macro tile's splats: a radix sort of 28-bit depths, from the lowest digit.
 //!
-//! Every pass keeps the order of equal digits, so splats of equal depth keep the order of their global ids.
+//! Every pass keeps the order of equal digits, so splats of equal depth keep the order of their
+//! global ids.
 //!
 //! A depth key is the exact order of f32: the bits of positive floats rise with their values
-//! ([`Cutoffs::sort_key`]). Depths are computed in f64 and rounded once, so that surfels of one plane are not
-//! blended in the order of rounding errors (`project::pinhole::depth`).
+//! ([`Cutoffs::sort_key`]). Depths are computed in f64 and rounded once, so that surfels of one
+//! plane are not blended in the order of rounding errors (`project::pinhole::depth`).
 //!
 //! [`Cutoffs::sort_key`]: crate::layout::Cutoffs::sort_key
 
 use crate::constants::DEPTH_BITS;
 
-/// Bits of a digit: the 1,024 counters, and as many places to write to, fit the first two levels of cache.
+/// Bits of a digit: the 1,024 counters, and as many places to write to, fit the first two levels of
+/// cache.
 const DIGIT_BITS: u32 = DEPTH_BITS.div_ceil(PASSES);
 
 /// Digits of a depth.
@@ -18,8 +20,8 @@ const PASSES: u32 = 3;
 
 const DIGITS: usize = 1 << DIGIT_BITS;
 
-/// Sorts keys with the depth in their upper half and an index, from 0 in this order, in the lower half. `other` is scratch
-/// memory.
+/// Sorts keys with the depth in their upper half and an index, from 0 in this order, in the lower
+/// half. `other` is scratch memory.
 pub(super) fn sort_by_depth(keys: &mut Vec<u64>, other: &mut Vec<u64>) {
     // For fewer keys, counters cost more than comparisons.
     const FEW: usize = 256;
@@ -61,7 +63,8 @@ pub(super) fn sort_by_depth(keys: &mut Vec<u64>, other: &mut Vec<u64>) {
 mod tests {
     use super::*;
 
-    /// Sorts depths that differ in no bit, in few and in all, in lists on both sides of the change of method.
+    /// Sorts depths that differ in no bit, in few and in all, in lists on both sides of the change
+    /// of method.
     #[test]
     fn keys_are_sorted_by_depth_and_then_by_index() {
         let mut state = 1_u64;

@@ -10,7 +10,6 @@ use crate::View;
 #[derive(Clone, Copy)]
 pub(super) struct Continued<'a> {
     pub(super) tiles: &'a UnfinishedTiles,
-    /// No slab follows.
     pub(super) is_last: bool,
 }
 

@@ -127,7 +127,7 @@ impl Lens {
         if let Some(motion) = view.shutter_motion() {
             lens.set_shutter_motion(&motion);
         }
-        if let Some(bound) = ExpansionBound::of(view, profile) {
+        if let Some(bound) = ExpansionBound::new(view, profile) {
             let ExpansionBound { max_error_px, second_px, third_px } = bound;
             let bound = [max_error_px, second_px, third_px, 0.0];
             lens.expansion = bound.map(|value| value as f32);

@@ -132,7 +132,7 @@ impl ProjectWork {
                 ChunkInView { chunk, view, relative, of: Owner::Twin { shadows } }
             });
             let lenses = &lenses;
-            let placed = frame.scene.placed.iter().zip(actors.of(view)).enumerate();
+            let placed = frame.scene.placed.iter().zip(actors.for_view(view)).enumerate();
             let placed = placed.map(move |(index, (placed, relative))| {
                 let of = Owner::Actor { placed, lens: lenses.of(view, index) };
                 ChunkInView { chunk: &placed.chunk, view, relative, of }

@@ -20,8 +20,8 @@ pub(super) struct Pixel {
 
 /// One row of pixels, from the left.
 ///
-/// Splats that reach alpha_cut nowhere in the row are left out first: the image is the same, and takes a
-/// twentieth of the time.
+/// Splats that reach alpha_cut nowhere in the row are left out first: the image is the same, and
+/// takes a twentieth of the time.
 pub(super) fn row(splats: &[Splat], row: u32, width: usize, profile: &RenderProfile) -> Vec<Pixel> {
     let y_px = f64::from(row) + 0.5;
     let near_row = |splat: &&Splat| reaches(splat.mean_px.y - y_px, splat.reach_px.y);
@@ -57,7 +57,8 @@ impl Pixel {
     pub(super) const EMPTY: Self =
         Self { rgb: DVec3::ZERO, transmittance: 1.0, depth_m: 0.0, instance: 0 };
 
-    /// Blends the next splat, with its alpha before the cap. Returns false if the pixel stops before it.
+    /// Blends the next splat, with its alpha before the cap. Returns false if the pixel stops
+    /// before it.
     pub(super) fn add(&mut self, alpha: f64, splat: &Splat, profile: &RenderProfile) -> bool {
         let alpha = alpha.min(profile.alpha_cap);
         let touches = alpha >= profile.alpha_cut;

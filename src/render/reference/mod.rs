@@ -1,8 +1,8 @@
-//! The reference backend: the image by definition, in f64, without tiles, SIMD or bounds. It is slow and
-//! simple.
+//! The reference backend: the image by definition, in f64, without tiles, SIMD or bounds. It is
+//! slow and simple.
 //!
-//! It differentiates the camera numerically and inverts the covariance directly, so that an error in a
-//! formula that the other backends derive by hand shows up as a difference.
+//! It differentiates the camera numerically and inverts the covariance directly, so that an error
+//! in a formula that the other backends derive by hand shows up as a difference.
 
 mod background;
 mod blend;
@@ -60,7 +60,8 @@ impl Backend for Reference {
             project_ms += start.elapsed().as_secs_f64() * 1e3;
             stats.visible_pairs += splats.len() as u64;
 
-            // Blend row by row, then add the background, and apply exposure and overlay of the camera.
+            // Blend row by row, then add the background, and apply exposure and overlay of the
+            // camera.
             let start = Instant::now();
             let width = view.camera.width_px as usize;
             let appearance = target.appearance;

@@ -1,7 +1,7 @@
 //! Stage project by definition.
 //!
-//! The determinant of a covariance is computed as the sum of the squared minors of its root. `xx yy - xy²`
-//! would lose all digits for a needle of 3e8 px, even in f64.
+//! The determinant of a covariance is computed as the sum of the squared minors of its root.
+//! `xx yy - xy²` would lose all digits for a needle of 3e8 px, even in f64.
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
@@ -17,8 +17,8 @@ use wildcity_scene::{Chunk, RenderProfile, Scene, sh};
 /// A Gaussian on the image.
 #[derive(Clone, Copy, Debug)]
 pub struct Splat {
-    /// The Gaussian: index of its chunk, counting through those of the twin and then through those of actors, and
-    /// index within the chunk.
+    /// The Gaussian: index of its chunk, counting through those of the twin and then through those
+    /// of actors, and index within the chunk.
     pub gaussian: [usize; 2],
     /// The owner of the Gaussian, as in [`Target::instances`](crate::Target::instances).
     pub instance: u16,
@@ -28,7 +28,6 @@ pub struct Splat {
     pub mean_px: DVec2,
     /// Inverse screen covariance (xx, xy, yy), in px⁻².
     pub conic: DVec3,
-    /// Peak opacity.
     pub opacity: f64,
     /// Linear colour towards the camera.
     pub rgb: DVec3,
@@ -36,8 +35,8 @@ pub struct Splat {
     pub reach_px: DVec2,
 }
 
-/// Projects every Gaussian between near and far with an opacity of at least alpha_cut, on the image or outside
-/// of it, in order of global ids.
+/// Projects every Gaussian between near and far with an opacity of at least alpha_cut, on the image
+/// or outside of it, in order of global ids.
 pub fn project(scene: &Scene, profile: &RenderProfile, view: &View) -> Vec<Splat> {
     let twin = scene.chunks.par_iter().enumerate().flat_map_iter(|(number, chunk)| {
         let splat = move |i| {
@@ -71,8 +70,8 @@ fn shadow_factor(scene: &Scene, at_m: DVec3) -> f64 {
     scene.placed.iter().map(factor).product()
 }
 
-/// Sorts by depth rounded to f32; ties keep the order of global ids. The rounding is part of the definition,
-/// since backends sort 32 bits: all of them round the exact depth once.
+/// Sorts by depth rounded to f32; ties keep the order of global ids. The rounding is part of the
+/// definition, since backends sort 32 bits: all of them round the exact depth once.
 pub(super) fn sort(splats: &mut [Splat]) {
     splats.par_sort_by(|a, b| (a.depth_m as f32).total_cmp(&(b.depth_m as f32)));
 }
@@ -108,7 +107,8 @@ fn project_one(chunk: &Chunk, index: usize, profile: &RenderProfile, view: &View
     })
 }
 
-/// A Gaussian's centre in the world, and its axes times their standard deviations as columns, in metres.
+/// A Gaussian's centre in the world, and its axes times their standard deviations as columns, in
+/// metres.
 pub(super) fn mean_and_axes(chunk: &Chunk, index: usize) -> (DVec3, DMat3) {
     let value = |column| f64::from(chunk.value(index, column));
     let vector = |first| DVec3::new(value(first), value(first + 1), value(first + 2));
@@ -126,7 +126,6 @@ struct Footprint {
     xx: f64,
     xy: f64,
     yy: f64,
-    /// Its determinant.
     det_before: f64,
     /// The camera's position in the world.
     camera_m: DVec3,
@@ -158,8 +157,8 @@ fn project_pinhole(
     })
 }
 
-/// Projection by any other camera: the mean and the scatter of six points, each with weight 1/6 (see
-/// [`crate::unscented`]).
+/// Projection by any other camera: the mean and the scatter of six points, each with weight 1/6
+/// (see [`crate::unscented`]).
 fn project_unscented(
     mean_world: DVec3,
     axes_m: DMat3,
@@ -195,8 +194,8 @@ fn project_unscented(
     })
 }
 
-/// The rows of `∂pixel/∂point` by central differences, in px/m, at the centre with its slopes clamped to 0.3
-/// half-widths beyond the image (gsplat's `persp_proj`).
+/// The rows of `∂pixel/∂point` by central differences, in px/m, at the centre with its slopes
+/// clamped to 0.3 half-widths beyond the image (gsplat's `persp_proj`).
 fn jacobian(mean: DVec3, camera: &Camera) -> [DVec3; 2] {
     let p = &camera.pinhole;
     let width = f64::from(camera.width_px);
@@ -214,7 +213,8 @@ fn jacobian(mean: DVec3, camera: &Camera) -> [DVec3; 2] {
     [DVec3::new(dx.x, dy.x, dz.x), DVec3::new(dx.y, dy.y, dz.y)]
 }
 
-/// `max(0, SH(direction) + 0.5)` of a Gaussian; `toward` leads from the camera to its centre, in world axes.
+/// `max(0, SH(direction) + 0.5)` of a Gaussian; `toward` leads from the camera to its centre, in
+/// world axes.
 fn color(chunk: &Chunk, index: usize, toward: DVec3) -> DVec3 {
     let basis = sh::basis(toward.normalize());
     let mut rgb = DVec3::splat(0.5);

@@ -1,10 +1,10 @@
-//! Exact rays (`rays=exact`): every pixel's own ray against every Gaussian, without any projection. Lenses,
-//! windshields and shutters are compared with this.
+//! Exact rays (`rays=exact`): every pixel's own ray against every Gaussian, without any projection.
+//! Lenses, windshields and shutters are compared with this.
 //!
-//! A Gaussian's alpha on a ray is its response at the point of the ray that is closest in standard deviations
-//! (Wu et al. 2024, 3DGUT). This is a 2D Gaussian of the distances across the ray. The blur of the profile is
-//! a Gaussian of distances on the image. It is added in the pixels around this ray, where the two distances are
-//! proportional to each other.
+//! A Gaussian's alpha on a ray is its response at the point of the ray that is closest in standard
+//! deviations (Wu et al. 2024, 3DGUT). This is a 2D Gaussian of the distances across the ray. The
+//! blur of the profile is a Gaussian of distances on the image. It is added in the pixels around
+//! this ray, where the two distances are proportional to each other.
 
 use glam::{DMat3, DVec2, DVec3};
 
@@ -24,7 +24,6 @@ pub(super) struct UnprojectedGaussian {
     axes_m: DMat3,
     /// The largest standard deviation.
     sigma_m: f64,
-    /// Opacity before antialiasing.
     opacity: f64,
 }
 
@@ -54,8 +53,8 @@ pub(super) fn gaussians(scene: &Scene, splats: &[Splat]) -> Vec<UnprojectedGauss
     splats.iter().map(gaussian).collect()
 }
 
-/// One row of pixels, from the left. Splats, in order of depth, give colours and depths, and `gaussians` the
-/// shapes. `views` are those of [`relative_views`].
+/// One row of pixels, from the left. Splats, in order of depth, give colours and depths, and
+/// `gaussians` the shapes. `views` are those of [`relative_views`].
 pub(super) fn row(
     splats: &[Splat],
     gaussians: &[UnprojectedGaussian],
@@ -68,7 +67,7 @@ pub(super) fn row(
         let mut pixel = Pixel::EMPTY;
         let at_px = DVec2::new(f64::from(column) + 0.5, y_px);
         let rays: Vec<Option<Ray>> =
-            views.iter().map(|view| Ray::of(view, at_px, profile)).collect();
+            views.iter().map(|view| Ray::new(view, at_px, profile)).collect();
         for (splat, gaussian) in splats.iter().zip(gaussians) {
             let Some(ray) = &rays[gaussian.view] else { continue };
             let alpha = ray.alpha(gaussian, profile);
@@ -86,7 +85,8 @@ struct Ray {
     origin_m: DVec3,
     /// Unit, in the world.
     direction: DVec3,
-    /// Rows of the Jacobian: how the pixel changes as a point at unit distance moves across the ray.
+    /// Rows of the Jacobian: how the pixel changes as a point at unit distance moves across the
+    /// ray.
     px_per_rad: [DVec3; 2],
     /// A lower bound of the Jacobian's smaller singular value.
     least_px_per_rad: f64,
@@ -96,10 +96,11 @@ struct Ray {
 
 impl Ray {
     /// `None` outside of the lens' field.
-    fn of(view: &View, at_px: DVec2, profile: &RenderProfile) -> Option<Self> {
+    fn new(view: &View, at_px: DVec2, profile: &RenderProfile) -> Option<Self> {
         let direction = view.ray_world(at_px)?;
         let pose = view.world_from_camera_at(at_px);
-        // How the ray changes per pixel, by differences to both sides, or to the one that is within the field.
+        // How the ray changes per pixel, by differences to both sides, or to the one that is within
+        // the field.
         let derivative = |axis: DVec2| {
             let h = 1e-3;
             let side = |h: f64| {
@@ -119,20 +120,21 @@ impl Ray {
         let inverse = DMat3::from_cols(u, v, direction).inverse().transpose();
         let x = inverse.x_axis;
         let y = inverse.y_axis;
-        // The smaller singular value of a 2 x 3 matrix is at least the area |x × y| divided by the Frobenius
-        // norm.
+        // The smaller singular value of a 2 x 3 matrix is at least the area |x × y| divided by the
+        // Frobenius norm.
         let least_px_per_rad = x.cross(y).length() / x.length().hypot(y.length());
         let origin_m = pose.position_m;
         let filter = PixelFilter::new(profile, &view.camera);
         Some(Self { origin_m, direction, px_per_rad: [x, y], least_px_per_rad, filter })
     }
 
-    /// Alpha before the cap; 0 where it is certainly below the cut, or the closest point lies behind the camera.
+    /// Alpha before the cap; 0 where it is certainly below the cut, or the closest point lies
+    /// behind the camera.
     fn alpha(&self, gaussian: &UnprojectedGaussian, profile: &RenderProfile) -> f64 {
         let to_mean_m = gaussian.mean_m - self.origin_m;
         let along_m = to_mean_m.dot(self.direction);
-        // Skip a Gaussian that is far off the ray whatever its shape: the blur, in metres, is widest at its
-        // far end.
+        // Skip a Gaussian that is far off the ray whatever its shape: the blur, in metres, is
+        // widest at its far end.
         let across_m2 = to_mean_m.length_squared() - along_m * along_m;
         let farthest_m = along_m.max(0.0) + 4.0 * gaussian.sigma_m;
         let blur_px2 = self.filter.total_px2.max_element();

@@ -13,7 +13,8 @@ pub const DEFAULT_BYTES: u64 = 512 << 20;
 /// A hash of everything that a reference depends on.
 pub type ReferenceKey = [u8; 32];
 
-/// References that sessions share. A reference that is in use stays in memory until its last user drops it.
+/// References that sessions share. A reference that is in use stays in memory until its last user
+/// drops it.
 #[derive(Debug)]
 pub struct ReferenceCache {
     limit_bytes: u64,
@@ -24,7 +25,6 @@ pub struct ReferenceCache {
 struct State {
     entries: HashMap<ReferenceKey, Entry>,
     bytes: u64,
-    /// Counts uses.
     clock: u64,
 }
 
@@ -56,7 +56,8 @@ impl ReferenceCache {
         Some(Arc::clone(&entry.reference))
     }
 
-    /// Keeps a reference, and evicts others until all fit. A reference larger than the cache is not kept.
+    /// Keeps a reference, and evicts others until all fit. A reference larger than the cache is not
+    /// kept.
     pub fn insert(&self, key: ReferenceKey, reference: Arc<Reference>) {
         let bytes = reference.bytes();
         if bytes > self.limit_bytes {

@@ -1,12 +1,13 @@
 //! Warps recorded images into a view by depth (roles `reference_warped`, `reference_valid`).
 //!
-//! A pixel of the view is unprojected by its rendered depth to a point, and the point is projected into each reference.
-//! The reference fits if the point is within its image and the depth that was rendered there equals that of the point
-//! to within 0.2 m + 5 %. Of the references that fit, the one that sees the point from the most similar direction gives
-//! the colour. Pixels that no reference has seen stay black, and are not valid.
+//! A pixel of the view is unprojected by its rendered depth to a point, and the point is projected
+//! into each reference. The reference fits if the point is within its image and the depth that was
+//! rendered there equals that of the point to within 0.2 m + 5 %. Of the references that fit, the
+//! one that sees the point from the most similar direction gives the colour. Pixels that no
+//! reference has seen stay black, and are not valid.
 //!
-//! The source of the references does not matter. All arithmetic is f32 after the poses were subtracted, without
-//! fused operations, so the same input gives the same bytes on every processor.
+//! The source of the references does not matter. All arithmetic is f32 after the poses were
+//! subtracted, without fused operations, so the same input gives the same bytes on every processor.
 
 mod cache;
 mod lanes;
@@ -43,9 +44,7 @@ pub fn resized(image: &Image, width: usize, height: usize) -> Image {
 
 /// A depth map as [`warp`] needs it: in metres, and 0 where the opacity is below [`LEAST_OPACITY`].
 pub fn opaque_depth(depth_m: &[f32], opacity: &[f32]) -> Vec<f32> {
-    let opaque = |(depth_m, opacity): (&f32, &f32)| match *opacity >= LEAST_OPACITY {
-        true => *depth_m,
-        false => 0.0,
-    };
+    let opaque =
+        |(depth_m, opacity): (&f32, &f32)| if *opacity >= LEAST_OPACITY { *depth_m } else { 0.0 };
     depth_m.iter().zip(opacity).map(opaque).collect()
 }

@@ -1,8 +1,9 @@
 //! The projection of a camera in f32, 16 points at a time.
 //!
-//! A pinhole is projected as it is. All other lenses, and windshields, are a table of the pixels of directions, which
-//! is interpolated. Its axes are the direction's stereographic projection: smooth up to 180° off the axis, and
-//! without a trigonometric function. With 512 cells across 160° of a lens of 700 px per radian the error is 0.002 px.
+//! A pinhole is projected as it is. All other lenses, and windshields, are a table of the pixels of
+//! directions, which is interpolated. Its axes are the direction's stereographic projection: smooth
+//! up to 180° off the axis, and without a trigonometric function. With 512 cells across 160° of a
+//! lens of 700 px per radian the error is 0.002 px.
 
 use glam::{DVec2, DVec3};
 
@@ -22,9 +23,7 @@ const WIDEST_RAD: f64 = 2.9;
 /// The projection of a camera, for [`super::warp`].
 #[derive(Debug)]
 pub struct Projection {
-    /// In pixels.
     pub(super) width: usize,
-    /// In pixels.
     pub(super) height: usize,
     /// Whether its depth is the distance and not z.
     pub(super) depth_is_distance: bool,
@@ -63,15 +62,16 @@ pub(super) struct Positions {
 }
 
 impl Projection {
-    /// The projection of a camera. For a non-pinhole camera, this fills a table of 513 x 513 directions, in about
-    /// 10 ms.
-    pub fn of(camera: &Camera) -> Self {
+    /// The projection of a camera. For a non-pinhole camera, this fills a table of 513 x 513
+    /// directions, in about 10 ms.
+    pub fn from_camera(camera: &Camera) -> Self {
         let pinhole = &camera.pinhole;
-        let lens = match camera.is_pinhole() {
-            true => Lens::Pinhole(
+        let lens = if camera.is_pinhole() {
+            Lens::Pinhole(
                 [pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy].map(|value| value as f32),
-            ),
-            false => Lens::Table(Table::of(camera)),
+            )
+        } else {
+            Lens::Table(Table::from_camera(camera))
         };
         Self {
             width: camera.width_px as usize,
@@ -101,7 +101,7 @@ impl Projection {
 }
 
 impl Table {
-    fn of(camera: &Camera) -> Self {
+    fn from_camera(camera: &Camera) -> Self {
         let widest_rad = (camera.corner_rad() + MARGIN_RAD).min(WIDEST_RAD);
         let reach = (0.5 * widest_rad).tan();
         let step = 2.0 * reach / CELLS as f64;
@@ -166,7 +166,7 @@ mod tests {
             [0.0; 4],
         ));
         for camera in [non_pinhole(fisheye), non_pinhole(opencv), non_pinhole(SceneLens::Pinhole)] {
-            let projection = Projection::of(&camera);
+            let projection = Projection::from_camera(&camera);
             let mut seen = 0;
             for step in 0..400 {
                 let angle = f64::from(step) * 2.4;

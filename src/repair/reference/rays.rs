@@ -26,9 +26,9 @@ pub(super) struct RayPoints {
 }
 
 impl Rays {
-    /// The rays of a camera. For a non-pinhole camera, this fills a table of 12 bytes per pixel, in a microsecond
-    /// per pixel.
-    pub fn of(camera: &Camera) -> Self {
+    /// The rays of a camera. For a non-pinhole camera, this fills a table of 12 bytes per pixel, in
+    /// a microsecond per pixel.
+    pub fn from_camera(camera: &Camera) -> Self {
         let pinhole = &camera.pinhole;
         if camera.is_pinhole() {
             let values = [pinhole.fx.recip(), pinhole.fy.recip(), pinhole.cx, pinhole.cy];
@@ -45,7 +45,8 @@ impl Rays {
         Self(Kind::Table((0..camera.pixels()).map(ray).collect()))
     }
 
-    /// The points of pixels of a row of an image of a width, from column `left` on, at depths in metres.
+    /// The points of pixels of a row of an image of a width, from column `left` on, at depths in
+    /// metres.
     #[inline(always)]
     pub(super) fn points(
         &self,

@@ -13,7 +13,8 @@ use super::projection::{Points, Projection};
 use super::rays::Rays;
 use crate::image::Image;
 
-/// A reference fits where its depth differs from the point's by at most this, in metres, plus [`DEPTH_SHARE`].
+/// A reference fits where its depth differs from the point's by at most this, in metres, plus
+/// [`DEPTH_SHARE`].
 const DEPTH_M: f32 = 0.2;
 
 /// See [`DEPTH_M`], as a share of the point's depth.
@@ -25,11 +26,10 @@ const OVERLAP_STRIDE: usize = 16;
 /// A recorded image, or a rendered image that replaces it.
 #[derive(Debug)]
 pub struct Reference {
-    /// Its pixels.
     pub image: Image,
-    /// The depth of the scene at its pose, by [`super::opaque_depth`]: metres, 0 where there is none.
+    /// The depth of the scene at its pose, by [`super::opaque_depth`]: metres, 0 where there is
+    /// none.
     pub depth_m: Vec<f32>,
-    /// Its camera.
     pub projection: Arc<Projection>,
     /// The pose at which it was recorded.
     pub world_from_camera: Pose,
@@ -45,14 +45,13 @@ impl Reference {
 /// The view into which references are warped.
 #[derive(Clone, Copy, Debug)]
 pub struct WarpTarget<'a> {
-    /// Its camera.
     pub camera: &'a Camera,
     /// The rays of that camera.
     pub rays: &'a Rays,
     /// Its pose at the end of the exposure.
     pub world_from_camera: Pose,
-    /// The pose at the start of the exposure, and the order in which rows or columns are exposed, if the camera moves
-    /// meanwhile.
+    /// The pose at the start of the exposure, and the order in which rows or columns are exposed,
+    /// if the camera moves meanwhile.
     pub shutter: Option<(ShutterDirection, Pose)>,
     /// Its rendered depth, by [`super::opaque_depth`].
     pub depth_m: &'a [f32],
@@ -69,8 +68,8 @@ pub struct Warped {
     pub pixels: Vec<usize>,
 }
 
-/// A reference, and the transforms from the view to it: per group of pixels of one pose, rows of a rotation and
-/// a translation in metres.
+/// A reference, and the transforms from the view to it: per group of pixels of one pose, rows of a
+/// rotation and a translation in metres.
 struct Prepared<'a> {
     /// Index in the caller's list.
     index: usize,
@@ -87,7 +86,8 @@ enum Groups {
     Columns,
 }
 
-/// The references in a view. Among those that fit equally well, the nearest counts, then the first in the list.
+/// The references in a view. Among those that fit equally well, the nearest counts, then the first
+/// in the list.
 ///
 /// `depth_m` and the images must have the sizes of their cameras; missing values count as no depth.
 pub fn warp(target: &WarpTarget<'_>, references: &[Arc<Reference>]) -> Warped {
@@ -114,9 +114,10 @@ pub fn warp(target: &WarpTarget<'_>, references: &[Arc<Reference>]) -> Warped {
         .enumerate()
         .map(|(index, reference)| Prepared { index, reference, from_target: prepare(reference) })
         .collect();
-    // Test far references first. Most are behind the view, and the farther away they are, the smaller is the angle.
-    // So most pixels soon have their best reference, and later references are rejected without reading their depth.
-    // Of equal angles the last reference counts, which is the nearest.
+    // Test far references first. Most are behind the view, and the farther away they are, the
+    // smaller is the angle. So most pixels soon have their best reference, and later references are
+    // rejected without reading their depth. Of equal angles the last reference counts, which is the
+    // nearest.
     let distance_m = |one: &Prepared<'_>| {
         one.reference.world_from_camera.position_m.distance(target.world_from_camera.position_m)
     };
@@ -126,8 +127,8 @@ pub fn warp(target: &WarpTarget<'_>, references: &[Arc<Reference>]) -> Warped {
     warped
 }
 
-/// Whether a reference can show a part of a view: whether a point of a coarse grid of the view's pixels is within the
-/// image of a camera at a pose. Only such references are rendered.
+/// Whether a reference can show a part of a view: whether a point of a coarse grid of the view's
+/// pixels is within the image of a camera at a pose. Only such references are rendered.
 pub fn overlaps(target: &WarpTarget<'_>, camera: &Camera, world_from_camera: &Pose) -> bool {
     let width = target.camera.width_px as usize;
     let height = target.camera.height_px as usize;
@@ -172,7 +173,8 @@ fn poses(target: &WarpTarget<'_>) -> (Groups, Vec<Pose>) {
     }
 }
 
-/// Rows of the rotation from the axes of a view to those of a reference, and the view's place there, in metres.
+/// Rows of the rotation from the axes of a view to those of a reference, and the view's place
+/// there, in metres.
 fn relative(reference: &Pose, target: &Pose) -> [f32; 12] {
     let back = reference.rotation.inverse();
     let rows = DMat3::from_quat(back * target.rotation).transpose().to_cols_array();
@@ -289,10 +291,8 @@ fn best(
         for lane in (0..LANES).filter(|lane| is_candidate[*lane]) {
             let there = at.v[lane] as usize * projection.width + at.u[lane] as usize;
             let there_m = reference.depth_m[there];
-            let here_m = match projection.depth_is_distance {
-                true => points.distance[lane],
-                false => points.z[lane],
-            };
+            let here_m =
+                if projection.depth_is_distance { points.distance[lane] } else { points.z[lane] };
             let fits = (there_m - here_m).abs() <= DEPTH_M + DEPTH_SHARE * here_m;
             if fits && there_m > 0.0 {
                 best.similarity[lane] = similarity[lane];

@@ -1,8 +1,8 @@
 //! The trust below which a model should repair: the threshold with the largest gain.
 //!
-//! Each threshold in hundredths is tried at every other station. The one with the largest total gain is the
-//! recommendation, if images of the other stations gain by it as well. Of thresholds with equal gains the least is
-//! taken, so that no image is repaired whose gain was not measured.
+//! Each threshold in hundredths is tried at every other station. The one with the largest total
+//! gain is the recommendation, if images of the other stations gain by it as well. Of thresholds
+//! with equal gains the least is taken, so that no image is repaired whose gain was not measured.
 
 use serde::Serialize;
 
@@ -20,9 +20,7 @@ pub struct Gains {
 /// The effect of a threshold on some images.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Below {
-    /// The threshold.
     pub below: f64,
-    /// Number of images.
     pub images: usize,
     /// Number of images that it repairs: their trust is less.
     pub repaired: usize,
@@ -78,7 +76,6 @@ pub enum BelowError {
          more --stations"
     )]
     NotVerified {
-        /// The threshold.
         below: f64,
         /// Mean gain of the images that it repairs there; 0 if it repairs none.
         verified_db: f64,
@@ -89,7 +86,8 @@ pub enum BelowError {
 const HYSTERESIS: f64 = 0.1;
 
 impl Below {
-    /// The effect of a threshold on some images. None is repaired whose trust is below the default `at_least`.
+    /// The effect of a threshold on some images. None is repaired whose trust is below the default
+    /// `at_least`.
     pub fn new(below: f64, images: &[Gains]) -> Self {
         let Selection { at_least, .. } = Selection::default();
         let is_repaired = |image: &&Gains| image.trust < below && image.trust >= at_least;

@@ -1,4 +1,5 @@
-//! The flicker of rendered and repaired images: the previous one is warped into the view by rendered depth.
+//! The flicker of rendered and repaired images: the previous one is warped into the view by
+//! rendered depth.
 
 use std::sync::Arc;
 
@@ -7,7 +8,8 @@ use wildcity_render::compare::flicker::flicker;
 use wildcity_repair::Image;
 use wildcity_repair::reference::{Projection, Rays, Reference, WarpTarget, warp};
 
-/// Two frames in a row. Their depth is that of the rendered images, also if the pixels are repaired.
+/// Two frames in a row. Their depth is that of the rendered images, also if the pixels are
+/// repaired.
 pub(super) struct FlickerPair<'a> {
     /// This frame and the previous one.
     pub(super) views: [&'a View; 2],
@@ -19,7 +21,7 @@ pub(super) struct FlickerPair<'a> {
 
 impl FlickerPair<'_> {
     /// The flicker of two images; `None` if no pixel of the earlier one is in the later one.
-    pub(super) fn of(&self, [now, before]: [&[u8]; 2]) -> Option<f64> {
+    pub(super) fn flicker(&self, [now, before]: [&[u8]; 2]) -> Option<f64> {
         let [view, view_before] = self.views;
         let width = view.camera.width_px as usize;
         let height = view.camera.height_px as usize;

@@ -34,7 +34,6 @@ const FIRST_MODEL: usize = 2;
 
 /// The twin, models and poses that are measured.
 pub struct RepairBenchmark<'a> {
-    /// The twin.
     pub resident: &'a Arc<Resident>,
     /// Where it is stored, with its recorded images.
     pub catalog: &'a Catalog,
@@ -42,9 +41,7 @@ pub struct RepairBenchmark<'a> {
     pub truth: Option<&'a Arc<Resident>>,
     /// The backend that renders.
     pub backend: &'a dyn Backend,
-    /// The cameras.
     pub cameras: &'a [RigCamera],
-    /// The models.
     pub models: &'a [Arc<Model>],
     /// Recorded images in memory.
     pub references: &'a ReferenceCache,
@@ -63,7 +60,8 @@ pub struct RepairSubject {
     pub size_px: [u32; 2],
     /// Source of the reference images: `recorded` images, or the twin `rendered` on its drive.
     pub references: &'static str,
-    /// Number of reference images that were read or rendered, with their depth. They stay in memory.
+    /// Number of reference images that were read or rendered, with their depth. They stay in
+    /// memory.
     pub read: usize,
     /// Mean time to read and render one of them, in milliseconds.
     pub read_ms: f64,
@@ -76,7 +74,6 @@ pub struct RepairSubject {
 /// The twin that is the ground truth.
 #[derive(Clone, Debug, Serialize)]
 pub struct Truth {
-    /// Its name.
     pub twin: String,
     /// Number of its version.
     pub version: u64,
@@ -164,7 +161,7 @@ impl<'a> RepairMeasurement<'a> {
         let offline = OfflineReferences::open(resident.clone(), catalog.clone(), cameras, &[])?;
         benchmark.models.iter().try_for_each(|model| offline.check(model, cameras))?;
         let optics = |camera: &RigCamera| {
-            (Arc::new(Projection::of(&camera.camera)), Rays::of(&camera.camera))
+            (Arc::new(Projection::from_camera(&camera.camera)), Rays::from_camera(&camera.camera))
         };
         let optics = cameras.iter().map(optics).collect();
         Ok(Self { benchmark, cameras, offline, coverage, optics, read: 0, read_ms: 0.0 })
@@ -223,8 +220,8 @@ impl<'a> RepairMeasurement<'a> {
         samples: &mut Vec<Sample>,
     ) -> Result<(), ReportError> {
         let resident = self.benchmark.resident;
-        // Render the earlier frame first: it loads the sections, so that the timed render of the current frame does not
-        // wait for the disk.
+        // Render the earlier frame first: it loads the sections, so that the timed render of the
+        // current frame does not wait for the disk.
         let (mut before, _) = self.render_cameras(resident, &station.views[1])?;
         let (mut now, render_ms) = self.render_cameras(resident, &station.views[0])?;
         let mut truths = [Vec::new(), Vec::new()];
@@ -249,7 +246,7 @@ impl<'a> RepairMeasurement<'a> {
                 let depth_m = images.map(|image| opaque_depth(&image.depth_m, &image.opacity));
                 let (projection, rays) = &self.optics[camera];
                 let depth_m = [&depth_m[0][..], &depth_m[1][..]];
-                FlickerPair { views, depth_m, projection, rays }.of(pixels)
+                FlickerPair { views, depth_m, projection, rays }.flicker(pixels)
             };
             let truth = true_now.get(camera).zip(true_before.get(camera));
             let true_flicker =
@@ -366,7 +363,8 @@ impl<'a> RepairMeasurement<'a> {
     }
 }
 
-/// Overlays the warped recorded images on a rendered image. Returns the image, and the share that they cover.
+/// Overlays the warped recorded images on a rendered image. Returns the image, and the share that
+/// they cover.
 fn overlay_warped(rendered: &RenderedImage, beside: &ViewReferences) -> (Vec<u8>, f64) {
     let mut rgb8 = rendered.rgb8.clone();
     let Some((warped, valid)) = beside.warped() else { return (rgb8, 0.0) };

@@ -1,4 +1,5 @@
-//! Error against run time of repair: what models gain on and off the recorded drive, and what they cost.
+//! Error against run time of repair: what models gain on and off the recorded drive, and what they
+//! cost.
 //!
 //! ```text
 //! stations   the poses, on the drive and at lateral offsets from it, each with the pose of the previous frame
@@ -9,7 +10,8 @@
 //! page       the section of the HTML page
 //! ```
 //!
-//! Only the reported times depend on the clock: with a deterministic model, a second run gives the same other numbers.
+//! Only the reported times depend on the clock: with a deterministic model, a second run gives the
+//! same other numbers.
 
 mod below;
 mod flicker;
@@ -33,6 +35,7 @@ pub struct RepairReport {
     pub subject: RepairSubject,
     /// By distance from the drive, then by kind: rendered, warped, each model.
     pub rows: Vec<RepairRow>,
-    /// For each model, the trust below which it should repair. Empty without a twin that is the ground truth.
+    /// For each model, the trust below which it should repair. Empty without a twin that is the
+    /// ground truth.
     pub below: Vec<RecommendedBelow>,
 }

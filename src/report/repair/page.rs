@@ -119,7 +119,8 @@ fn recommendations(report: &RepairReport) -> Markup {
 }
 
 impl RecommendedBelow {
-    /// The recommendation in words, with the images that it was selected by and those that verify it.
+    /// The recommendation in words, with the images that it was selected by and those that verify
+    /// it.
     pub fn text(&self) -> String {
         let of = |at: &Option<Below>| at.as_ref().map_or("nothing".to_owned(), Below::text);
         let default = self.default.text();

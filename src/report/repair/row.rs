@@ -57,16 +57,16 @@ pub struct Sample {
     pub psnr_db: Option<f64>,
     /// PSNR minus that of the rendered image, in dB.
     pub gain_db: Option<f64>,
-    /// Mean FLIP.
     pub flip: Option<f64>,
-    /// [`wildcity_render::compare::flicker::flicker`]; `None` if the previous image shows nothing of this one.
+    /// [`wildcity_render::compare::flicker::flicker`]; `None` if the previous image shows nothing
+    /// of this one.
     pub flicker: Option<f64>,
     /// Flicker of the ground truth.
     pub true_flicker: Option<f64>,
 }
 
-/// The PSNR of equal images, so that differences of PSNR stay numbers: 8 bits of 360 x 232 pixels that differ by one
-/// step in one value have 102 dB.
+/// The PSNR of equal images, so that differences of PSNR stay numbers: 8 bits of 360 x 232 pixels
+/// that differ by one step in one value have 102 dB.
 pub(super) const EXACT_DB: f64 = 110.0;
 
 /// A model of the section.
@@ -80,7 +80,6 @@ pub struct RepairedModel {
     pub licence: String,
     /// BLAKE3 of everything that its output depends on, except the images.
     pub repair_hash: String,
-    /// The execution provider.
     pub provider: &'static str,
     /// Whether equal inputs give equal bytes.
     pub deterministic: bool,
@@ -95,7 +94,6 @@ pub struct RepairRow {
     pub kind: ImageKind,
     /// `rendered`, `warped`, or the model's name.
     pub name: String,
-    /// Number of images.
     pub images: usize,
     /// Mean trust in the rendered images.
     pub trust: f64,

@@ -10,7 +10,8 @@ use wildcity_scene::rig::{RigCamera, RigError};
 
 use crate::sample_points::mean_speed_m_per_us;
 
-/// Distance along the drive between a frame and the previous one, in metres: 8 m/s and ten frames a second.
+/// Distance along the drive between a frame and the previous one, in metres: 8 m/s and ten frames a
+/// second.
 pub const FRAME_M: f64 = 0.8;
 
 /// The poses that are measured, and the size of the images.
@@ -46,7 +47,8 @@ impl RepairSampling {
         Self { stations, offsets_m, side_px }
     }
 
-    /// The cameras at this size, without their overlays, because a model does not repair the ego vehicle.
+    /// The cameras at this size, without their overlays, because a model does not repair the ego
+    /// vehicle.
     ///
     /// # Errors
     /// A camera cannot be that small.
@@ -67,8 +69,9 @@ impl RepairSampling {
         cameras.iter().map(scaled).collect()
     }
 
-    /// The poses of all stations. Every other station is for selection. Two stations have their offsets to the left,
-    /// the next two to the right, and so on. All stations are at least one frame from the start.
+    /// The poses of all stations. Every other station is for selection. Two stations have their
+    /// offsets to the left, the next two to the right, and so on. All stations are at least one
+    /// frame from the start.
     pub(super) fn stations(&self, drive: &Trajectory, cameras: &[RigCamera]) -> Vec<RepairStation> {
         let speed_m_per_us = mean_speed_m_per_us(drive);
         let length_m = drive.length_m();
@@ -85,7 +88,7 @@ impl RepairSampling {
                 let stations_m = [station_m, station_m - FRAME_M];
                 let views = stations_m.map(|station_m| {
                     let before = |age_us: i64| at(station_m - speed_m_per_us * age_us as f64);
-                    View::of_moving_rig(cameras, at(station_m), &before)
+                    View::from_moving_rig(cameras, at(station_m), &before)
                 });
                 let for_selection = station.is_multiple_of(2);
                 let world_from_rig = stations_m.map(at);

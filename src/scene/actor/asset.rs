@@ -1,4 +1,5 @@
-//! Assets of actors: Gaussians in levels of detail, with a box and a class. All placements of an asset share it.
+//! Assets of actors: Gaussians in levels of detail, with a box and a class. All placements of an
+//! asset share it.
 
 use std::sync::Arc;
 
@@ -13,9 +14,9 @@ use super::{ActorBox, ActorClass};
 /// The Gaussians from which all actors of one kind are rendered.
 #[derive(Clone, Debug)]
 pub struct ActorAsset {
-    /// Its description.
     pub description: AssetDescription,
-    /// The levels of detail: level 0 without error, then fewer and fewer Gaussians with rising errors.
+    /// The levels of detail: level 0 without error, then fewer and fewer Gaussians with rising
+    /// errors.
     pub levels: Vec<AssetLevel>,
 }
 
@@ -25,9 +26,7 @@ pub struct ActorAsset {
 pub struct AssetDescription {
     /// A readable name, `[a-z0-9._-]+`. Several assets may have one name; the hash is the identity.
     pub name: String,
-    /// Its kind.
     pub class: ActorClass,
-    /// Its box.
     #[serde(rename = "box")]
     pub box_: ActorBox,
     /// The source from which it was made.
@@ -48,10 +47,7 @@ pub struct AssetLevel {
 pub enum AssetError {
     /// There are none, or more than [`ActorAsset::MOST_GAUSSIANS`].
     #[error("{count} Gaussians; an actor has from 1 to {most}", most = ActorAsset::MOST_GAUSSIANS)]
-    Count {
-        /// Their number.
-        count: usize,
-    },
+    Count { count: usize },
     /// A Gaussian lies farther from the origin than a box may reach.
     #[error(
         "Gaussian {index} is {distance_m:.1} m from the actor's origin; at most {most:.0} m are possible: check the \
@@ -59,14 +55,14 @@ pub enum AssetError {
         most = ActorAsset::FARTHEST_M
     )]
     TooFar {
-        /// Its index.
         index: usize,
         /// Its distance, in metres.
         distance_m: f64,
     },
 }
 
-/// A camera that sees an actor: its centre in the world in metres, and its longer focal length in pixels.
+/// A camera that sees an actor: its centre in the world in metres, and its longer focal length in
+/// pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ActorViewpoint {
     /// The camera's centre in the world, in metres.
@@ -109,8 +105,8 @@ impl ActorAsset {
         Ok(Self { description, levels })
     }
 
-    /// The box around the centres of some Gaussians, with its origin: what [`ActorBox`] is for Gaussians whose
-    /// origin is on the ground under the box's centre.
+    /// The box around the centres of some Gaussians, with its origin: what [`ActorBox`] is for
+    /// Gaussians whose origin is on the ground under the box's centre.
     pub fn bounds(gaussians: &Gaussians) -> Bounds {
         let mut bounds = Bounds::EMPTY;
         for &mean_m in &gaussians.means_m {
@@ -124,9 +120,10 @@ impl ActorAsset {
         self.levels.iter().map(|level| level.chunk.bytes() as u64).sum()
     }
 
-    /// The level with which a frame draws an actor: the coarsest one with an error of at most `tau_px` pixels at the
-    /// distance of the nearest camera from the actor's box and at the longest focal length, as for the blocks of a
-    /// twin. `None` for an actor that is beyond the profile's `reach_m` of every camera.
+    /// The level with which a frame draws an actor: the coarsest one with an error of at most
+    /// `tau_px` pixels at the distance of the nearest camera from the actor's box and at the
+    /// longest focal length, as for the blocks of a twin. `None` for an actor that is beyond the
+    /// profile's `reach_m` of every camera.
     pub fn level(
         &self,
         world_from_actor: &Pose,
@@ -176,7 +173,7 @@ mod tests {
             name: "ball".to_owned(),
             class: ActorClass::Object,
             box_: ActorBox { length_m: 4.0, width_m: 1.8, height_m: 1.5 },
-            provenance: Provenance::of("test".to_owned()),
+            provenance: Provenance::new("test".to_owned()),
         }
     }
 
@@ -226,7 +223,7 @@ mod tests {
             quat_wxyz: wide.quats_wxyz[0],
             ln_scale: wide.ln_scales[0],
             logit_opacity: wide.logit_opacities[0],
-            sh: wide.sh_of(0),
+            sh: wide.sh_at(0),
         });
         let row = |chunk: &Chunk, i: usize| [0, 3, 6, 10, 11].map(|column| chunk.value(i, column));
         let found = (0..chunk.len()).filter(|&i| row(&chunk, i) == row(&one, 0)).count();

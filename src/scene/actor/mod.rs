@@ -22,8 +22,9 @@ pub enum ActorClass {
     Object,
 }
 
-/// The box around an actor, in metres. Its origin is on the ground under its centre, x points forward, y to the
-/// left and z up: the box reaches from -length/2 to length/2, from -width/2 to width/2 and from 0 to height.
+/// The box around an actor, in metres. Its origin is on the ground under its centre, x points
+/// forward, y to the left and z up: the box reaches from -length/2 to length/2, from -width/2 to
+/// width/2 and from 0 to height.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ActorBox {

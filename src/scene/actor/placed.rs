@@ -10,33 +10,36 @@ use crate::geometry::Pose;
 /// The Gaussians of an actor at its pose in one frame.
 ///
 /// The renderer moves the camera and not the Gaussians: a placed chunk is seen by a camera at
-/// `world_from_actor⁻¹ world_from_camera`, computed in f64. So covariances, colours that depend on the direction,
-/// depths and culling follow from the renderer's ordinary path, and all placements of an asset share its memory.
+/// `world_from_actor⁻¹ world_from_camera`, computed in f64. So covariances, colours that depend on
+/// the direction, depths and culling follow from the renderer's ordinary path, and all placements
+/// of an asset share its memory.
 #[derive(Clone, Debug)]
 pub struct PlacedChunk {
-    /// The Gaussians, in the actor's axes: its origin is on the ground under the box's centre, x points forward and
-    /// z up.
+    /// The Gaussians, in the actor's axes: its origin is on the ground under the box's centre, x
+    /// points forward and z up.
     pub chunk: Arc<Chunk>,
     /// The actor's pose at the end of the exposure.
     pub world_from_actor: Pose,
-    /// The actor's pose at the start of the frame's longest exposure. The motion in between is that of
-    /// [`Pose::interpolate`]. The same as `world_from_actor` for an actor at rest, or if no camera has a rolling
-    /// shutter.
+    /// The actor's pose at the start of the frame's longest exposure. The motion in between is that
+    /// of [`Pose::interpolate`]. The same as `world_from_actor` for an actor at rest, or if no
+    /// camera has a rolling shutter.
     pub world_from_actor_at_start: Pose,
     /// Index of the actor, below [`PlacedChunk::MAX_ACTORS`].
     pub actor: u16,
     /// Factor on the Gaussians' linear red, green and blue; 1 leaves them as they are.
     pub tint: [f32; 3],
-    /// The shadow that the actor casts on the twin beneath it. An actor of several chunks has it on one of them.
+    /// The shadow that the actor casts on the twin beneath it. An actor of several chunks has it on
+    /// one of them.
     pub shadow: Option<ContactShadow>,
 }
 
 /// The darkening of the ground under an actor: a factor on the colours of the twin's Gaussians,
 /// `1 - 1/2 S(x, length) S(y, width) H(z)` at their centres in the actor's axes.
 ///
-/// `S(u, l) = 1 - smoothstep(l/2 - 0.3 m, l/2 + 0.3 m, |u|)` and `H(z) = 1 - smoothstep(0.05 m, 0.3 m, |z|)`. A dark
-/// Gaussian in place of the factor would be blended in the order of its centre, so that the road in front of that
-/// centre would hide half of it.
+/// `S(u, l) = 1 - smoothstep(l/2 - 0.3 m, l/2 + 0.3 m, |u|)` and
+/// `H(z) = 1 - smoothstep(0.05 m, 0.3 m, |z|)`. A dark Gaussian in place of the factor would be
+/// blended in the order of its centre, so that the road in front of that centre would hide half of
+/// it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ContactShadow {
     /// Length of the actor's box, in metres.
@@ -72,7 +75,8 @@ impl ContactShadow {
     /// From this height on, none of it does, in metres.
     pub const TOP_M: f32 = 0.3;
 
-    /// Half the size of the box outside of which the factor is 1, along the actor's axes, in metres.
+    /// Half the size of the box outside of which the factor is 1, along the actor's axes, in
+    /// metres.
     pub fn reach_m(&self) -> Vec3 {
         Vec3::new(
             0.5 * self.length_m + Self::FADE_M,

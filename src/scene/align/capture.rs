@@ -1,8 +1,9 @@
 //! A drive and a rig from the camera poses of training images.
 //!
-//! The images of one folder are of one camera. The rig stands level under the reference camera, at the camera's mean
-//! height below it; its x axis is where the camera looks, seen from above. So the ground that the drive defines follows
-//! hills, but not how the camera was tilted from image to image.
+//! The images of one folder are of one camera. The rig stands level under the reference camera, at
+//! the camera's mean height below it; its x axis is where the camera looks, seen from above. So the
+//! ground that the drive defines follows hills, but not how the camera was tilted from image to
+//! image.
 
 use std::cmp::Ordering;
 use std::collections::BTreeMap;
@@ -36,7 +37,8 @@ pub struct CaptureOptions {
     pub name: String,
     /// Images a second, if they have no times; `None` for [`DEFAULT_FPS`].
     pub fps: Option<f64>,
-    /// Height of the reference camera above the ground, in metres; `None` if the ground is at z = 0.
+    /// Height of the reference camera above the ground, in metres; `None` if the ground is at z =
+    /// 0.
     pub camera_height_m: Option<f64>,
     /// Folder of the reference camera; `None` for the one with the most images.
     pub reference: Option<String>,
@@ -56,8 +58,8 @@ pub struct CapturedDrive {
     pub rig: Rig,
     /// Height of the reference camera above the ground, in metres.
     pub camera_height_m: f64,
-    /// Largest angle between an image of the reference camera and the rig's camera at its time, in radians: how far the
-    /// camera was tilted from its mean.
+    /// Largest angle between an image of the reference camera and the rig's camera at its time, in
+    /// radians: how far the camera was tilted from its mean.
     pub most_tilt_rad: f64,
 }
 
@@ -80,7 +82,6 @@ pub enum CapturedDriveError {
         "{name:?} has no time_us, and other images have one: give it to all of {folder:?}, or to none"
     )]
     NoTime {
-        /// The image.
         name: String,
         /// The folder of the reference camera.
         folder: String,
@@ -89,16 +90,10 @@ pub enum CapturedDriveError {
     #[error(
         "{name:?} has the same time_us as the image before it, {time_us}: a camera takes one image at a time"
     )]
-    SameTime {
-        /// The image.
-        name: String,
-        /// The time.
-        time_us: i64,
-    },
+    SameTime { name: String, time_us: i64 },
     /// There is no such folder.
     #[error("there is no image in the folder {folder:?}; the folders are {}", known.join(", "))]
     Folder {
-        /// The folder.
         folder: String,
         /// The folders that have images.
         known: Vec<String>,
@@ -117,12 +112,7 @@ pub enum CapturedDriveError {
         "no image of the folder {folder:?} has the name of one in {reference:?}, so that its place on the rig is \
          unknown: name images of one time alike, or leave that folder out"
     )]
-    NoPair {
-        /// The camera's folder.
-        folder: String,
-        /// The reference camera's.
-        reference: String,
-    },
+    NoPair { folder: String, reference: String },
     /// The rig cannot be used.
     #[error(transparent)]
     Rig(#[from] RigError),
@@ -131,7 +121,8 @@ pub enum CapturedDriveError {
 /// The images of a folder.
 type Folder<'a> = Vec<&'a PosedImage>;
 
-/// Makes the drive and the rig of a capture. `alignment` takes the capture's axes and unit to the twin's.
+/// Makes the drive and the rig of a capture. `alignment` takes the capture's axes and unit to the
+/// twin's.
 ///
 /// # Errors
 /// Names what cannot be used.
@@ -200,8 +191,8 @@ pub fn captured_drive(
     Ok(CapturedDrive { trajectory, rig, camera_height_m, most_tilt_rad })
 }
 
-/// The images of the reference camera in the order in which they were taken, with their times from the first one on, in
-/// microseconds.
+/// The images of the reference camera in the order in which they were taken, with their times from
+/// the first one on, in microseconds.
 fn timed<'a>(
     mut images: Folder<'a>,
     folder: &str,
@@ -302,7 +293,8 @@ fn by_number(a: &str, b: &str) -> Ordering {
     left.len().cmp(&right.len()).then_with(|| a.cmp(b))
 }
 
-/// Heading of a camera, in radians from x towards y. One that looks down has that of the upper edge of its image.
+/// Heading of a camera, in radians from x towards y. One that looks down has that of the upper edge
+/// of its image.
 fn heading(world_from_camera: &Pose) -> f64 {
     let forward = world_from_camera.rotation * DVec3::Z;
     let upwards = world_from_camera.rotation * DVec3::NEG_Y;
@@ -314,7 +306,8 @@ fn heading(world_from_camera: &Pose) -> f64 {
     toward.y.atan2(toward.x)
 }
 
-/// The mean of rotations that are close to each other: of their quaternions, with the sign of the first.
+/// The mean of rotations that are close to each other: of their quaternions, with the sign of the
+/// first.
 fn mean_rotation(rotations: &[DQuat]) -> DQuat {
     let first = rotations[0];
     let sum =

@@ -1,8 +1,10 @@
-//! The ground of a scene whose axes are unknown: the plane that most of the scene lies on and little lies below.
+//! The ground of a scene whose axes are unknown: the plane that most of the scene lies on and
+//! little lies below.
 //!
-//! RANSAC (Fischler and Bolles 1981) over one Gaussian for each occupied cube of a grid, so that a plane counts by its
-//! area and not by how densely it was captured. All lengths are relative to the size of the scene: a capture has no
-//! metres yet. The random numbers have a fixed seed: the same Gaussians give the same plane.
+//! RANSAC (Fischler and Bolles 1981) over one Gaussian for each occupied cube of a grid, so that a
+//! plane counts by its area and not by how densely it was captured. All lengths are relative to the
+//! size of the scene: a capture has no metres yet. The random numbers have a fixed seed: the same
+//! Gaussians give the same plane.
 
 use std::collections::HashSet;
 
@@ -18,7 +20,6 @@ use super::median;
 pub struct GroundPlane {
     /// A point of it, in the unit of the scene.
     pub point: DVec3,
-    /// Its unit normal.
     pub up: DVec3,
 }
 
@@ -38,12 +39,7 @@ pub struct GroundSearch {
 pub enum GroundError {
     /// Too little of the scene is visible.
     #[error("{count} places of the scene are opaque; at least {least} are needed to find a plane")]
-    TooFew {
-        /// Occupied cubes.
-        count: usize,
-        /// The least number.
-        least: usize,
-    },
+    TooFew { count: usize, least: usize },
     /// No plane has enough of the scene on it.
     #[error(
         "found no ground: no plane has {least_percent} % of the scene on it and little of it below; choose three \
@@ -61,7 +57,8 @@ const CUBES: f64 = 120.0;
 const TOLERANCE: f64 = 0.01;
 /// How often the tolerance is halved while the plane is fitted, at most.
 const REFINEMENTS: i32 = 5;
-/// Share of the first round's places that a round must have: below it the tolerance is less than the ground is rough.
+/// Share of the first round's places that a round must have: below it the tolerance is less than
+/// the ground is rough.
 const LEAST_SHARE: f64 = 0.2;
 /// Least logit of the opacity of a Gaussian that counts: an opacity of 0.3.
 const LEAST_LOGIT: f32 = -0.85;
@@ -210,8 +207,9 @@ fn judge(places: &[SurfaceSample], plane: GroundPlane, tolerance: f64) -> (f64, 
     (on - above.min(below), GroundPlane { up, ..plane })
 }
 
-/// Fits the plane with a falling tolerance. Each round first moves the plane to the height that has most of the places
-/// near it, because a road is not the mean of itself and the pavements and lawns next to it.
+/// Fits the plane with a falling tolerance. Each round first moves the plane to the height that has
+/// most of the places near it, because a road is not the mean of itself and the pavements and lawns
+/// next to it.
 fn refine(places: &[SurfaceSample], mut plane: GroundPlane, tolerance: f64) -> GroundPlane {
     let mut first = 0;
     for round in 0..=REFINEMENTS {
@@ -262,7 +260,8 @@ fn densest(mut heights: Vec<f64>, width: f64) -> Option<f64> {
     (!window.is_empty()).then(|| window[window.len() / 2])
 }
 
-/// The plane with the least squares of distances: through the mean, normal to the two main axes of the points.
+/// The plane with the least squares of distances: through the mean, normal to the two main axes of
+/// the points.
 fn fit(points: &[DVec3]) -> Option<GroundPlane> {
     if points.len() < 3 {
         return None;
@@ -272,8 +271,9 @@ fn fit(points: &[DVec3]) -> Option<GroundPlane> {
         let d = point - mean;
         sum + DMat3::from_cols(d * d.x, d * d.y, d * d.z)
     });
-    // The eigenvector of the smallest eigenvalue: power iteration on the adjugate, whose largest eigenvalue belongs
-    // to it. The adjugate of a symmetric matrix with columns a, b, c has the columns b x c, c x a, a x b.
+    // The eigenvector of the smallest eigenvalue: power iteration on the adjugate, whose largest
+    // eigenvalue belongs to it. The adjugate of a symmetric matrix with columns a, b, c has the
+    // columns b x c, c x a, a x b.
     let scale = covariance.to_cols_array().iter().fold(0.0_f64, |most, e| most.max(e.abs()));
     let [a, b, c] = [covariance.x_axis, covariance.y_axis, covariance.z_axis].map(|v| v / scale);
     let mut adjugate = DMat3::from_cols(b.cross(c), c.cross(a), a.cross(b));

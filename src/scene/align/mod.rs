@@ -21,8 +21,8 @@ pub use path::{DEFAULT_SPEED_M_S, PathError, drive_through};
 
 /// A change of a twin's axes and unit: `p_new = metres_per_unit * (new_from_old * p_old)`.
 ///
-/// JSON: `{"new_from_old": {"xyz", "q"}, "metres_per_unit": 1.0}`; as an option of a version's provenance the eight
-/// numbers x, y, z, w, x, y, z of the pose and the scale, separated by commas.
+/// JSON: `{"new_from_old": {"xyz", "q"}, "metres_per_unit": 1.0}`; as an option of a version's
+/// provenance the eight numbers x, y, z, w, x, y, z of the pose and the scale, separated by commas.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Alignment {
@@ -55,7 +55,6 @@ pub enum AlignmentError {
     /// The rotation and the move are out of range.
     #[error("the move of the alignment, in the old unit: {0}")]
     Pose(PoseError),
-    /// Not eight numbers.
     #[error("{0:?} is not an alignment: expected eight numbers, separated by commas")]
     Text(String),
 }
@@ -64,15 +63,16 @@ impl Alignment {
     /// Changes nothing.
     pub const IDENTITY: Self = Self { new_from_old: Pose::IDENTITY, metres_per_unit: 1.0 };
 
-    /// Puts a plane at z = 0 with the shortest rotation, which keeps headings as far as possible. The foot of the old
-    /// origin on the plane becomes the new origin.
+    /// Puts a plane at z = 0 with the shortest rotation, which keeps headings as far as possible.
+    /// The foot of the old origin on the plane becomes the new origin.
     pub fn onto(ground: &GroundPlane) -> Self {
         let up = ground.up;
         // Upside down, the shortest rotation is not unique: half a turn about x.
         let is_upside_down = up.z < -1.0 + 1e-9;
-        let rotation = match is_upside_down {
-            true => DQuat::from_rotation_x(std::f64::consts::PI),
-            false => DQuat::from_rotation_arc(up, DVec3::Z),
+        let rotation = if is_upside_down {
+            DQuat::from_rotation_x(std::f64::consts::PI)
+        } else {
+            DQuat::from_rotation_arc(up, DVec3::Z)
         };
         let foot = up * up.dot(ground.point);
         let new_from_old = Pose { position_m: -(rotation * foot), rotation };
@@ -148,7 +148,8 @@ impl Alignment {
     }
 }
 
-/// The plane of three points; its upper side is that of the fourth, such as the camera that saw the three.
+/// The plane of three points; its upper side is that of the fourth, such as the camera that saw the
+/// three.
 ///
 /// # Errors
 /// [`AlignmentError::OnLine`].
@@ -169,7 +170,7 @@ pub fn plane_through([a, b, c]: [DVec3; 3], above: DVec3) -> Result<GroundPlane,
 ///
 /// # Errors
 /// [`AlignmentError::Points`], [`AlignmentError::Scale`].
-pub fn scale_of(points: [DVec3; 2], distance_m: f64) -> Result<f64, AlignmentError> {
+pub fn scale_from_points(points: [DVec3; 2], distance_m: f64) -> Result<f64, AlignmentError> {
     let length = points[0].distance(points[1]);
     let is_usable = length > 0.0 && length.is_finite() && distance_m > 0.0;
     if !is_usable {
@@ -267,9 +268,12 @@ mod tests {
     #[test]
     fn the_scale_of_two_points_is_positive() {
         let points = [DVec3::ZERO, DVec3::new(0.0, 0.0, 4.0)];
-        assert_eq!(scale_of(points, 2.0), Ok(0.5));
-        assert!(matches!(scale_of(points, -2.0), Err(AlignmentError::Points { .. })));
-        assert!(matches!(scale_of([DVec3::X; 2], 2.0), Err(AlignmentError::Points { .. })));
-        assert!(matches!(scale_of(points, 1e9), Err(AlignmentError::Scale(_))));
+        assert_eq!(scale_from_points(points, 2.0), Ok(0.5));
+        assert!(matches!(scale_from_points(points, -2.0), Err(AlignmentError::Points { .. })));
+        assert!(matches!(
+            scale_from_points([DVec3::X; 2], 2.0),
+            Err(AlignmentError::Points { .. })
+        ));
+        assert!(matches!(scale_from_points(points, 1e9), Err(AlignmentError::Scale(_))));
     }
 }

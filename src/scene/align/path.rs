@@ -24,10 +24,7 @@ const SAME_M: f64 = 1e-3;
 pub enum PathError {
     /// Too few or too many points.
     #[error("{count} different points; a drive goes through 2 to {MOST_POINTS}")]
-    Points {
-        /// Number of points.
-        count: usize,
-    },
+    Points { count: usize },
     /// A coordinate is not finite or too large.
     #[error("point {index} is not a place: its coordinates must be finite, and below 1e8 m")]
     Place {
@@ -54,8 +51,9 @@ pub enum PathError {
     },
 }
 
-/// A drive at constant speed through points, in metres: a centripetal Catmull-Rom curve (Yuksel, Schaefer and Keyser
-/// 2011), which has no loops between close points. The rig stands level, its x axis along the curve.
+/// A drive at constant speed through points, in metres: a centripetal Catmull-Rom curve (Yuksel,
+/// Schaefer and Keyser 2011), which has no loops between close points. The rig stands level, its x
+/// axis along the curve.
 ///
 /// # Errors
 /// Names what cannot be used.

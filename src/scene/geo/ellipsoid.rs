@@ -37,8 +37,9 @@ pub(super) fn enu_axes(point: &GeoPoint) -> DMat3 {
     DMat3::from_cols(east, north, up)
 }
 
-/// The point of WGS84 at earth-centred coordinates, by Bowring's iteration on the parametric latitude β:
-/// `tan φ = (z + e'² b sin³ β) / (p - e² a cos³ β)`. Three rounds are exact to rounding within 100 km of the ellipsoid.
+/// The point of WGS84 at earth-centred coordinates, by Bowring's iteration on the parametric
+/// latitude β: `tan φ = (z + e'² b sin³ β) / (p - e² a cos³ β)`. Three rounds are exact to rounding
+/// within 100 km of the ellipsoid.
 pub(super) fn to_geodetic(ecef_m: DVec3) -> GeoPoint {
     let minor_m = A_M * (1.0 - F);
     let second_e2 = E2 / (1.0 - E2);

@@ -1,9 +1,10 @@
 //! The place of a twin on the earth: latitude, longitude and heading of poses in its world.
 //!
-//! A twin's world is flat: x east, y north, z up, in metres. An anchor defines this flat world. With a WGS84 origin
-//! it is the tangent plane at the origin (ENU): a point is `X0 + E (x, y, z)` in earth-centred coordinates, which is
-//! exact at any distance, and "up" is that of the origin. With a UTM zone, x and y are differences of easting and
-//! northing: grid metres, 0.04 % shorter than metres on the ground in the zone's middle, and north is the grid's.
+//! A twin's world is flat: x east, y north, z up, in metres. An anchor defines this flat world.
+//! With a WGS84 origin it is the tangent plane at the origin (ENU): a point is `X0 + E (x, y, z)`
+//! in earth-centred coordinates, which is exact at any distance, and "up" is that of the origin.
+//! With a UTM zone, x and y are differences of easting and northing: grid metres, 0.04 % shorter
+//! than metres on the ground in the zone's middle, and north is the grid's.
 //!
 //! Tests compare both with values from PROJ.
 
@@ -62,7 +63,6 @@ pub struct ProjectedOrigin {
 /// A place on the earth, and a direction there.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct GeoPose {
-    /// The place.
     pub point: GeoPoint,
     /// Direction of the rig's x axis, in degrees from true north to the east, 0 to 360.
     pub heading_deg: f64,
@@ -73,34 +73,19 @@ pub struct GeoPose {
 pub enum GeoError {
     /// A number is out of range.
     #[error("geo.{field} is {value}; {least} to {most} are accepted")]
-    Range {
-        /// The field.
-        field: &'static str,
-        /// The refused value.
-        value: f64,
-        /// The least accepted.
-        least: f64,
-        /// The largest accepted.
-        most: f64,
-    },
+    Range { field: &'static str, value: f64, least: f64, most: f64 },
     /// The text is not an anchor.
     #[error(
         "{text:?} is not LATITUDE,LONGITUDE[,ALTITUDE] (degrees, metres) or \
          EPSG:CODE,EASTING,NORTHING[,ALTITUDE]"
     )]
-    Malformed {
-        /// The text.
-        text: String,
-    },
+    Malformed { text: String },
     /// The projection is not known.
     #[error(
         "geo.projection is {name:?}; UTM zones are accepted, EPSG:32601 to EPSG:32660 and EPSG:32701 to \
          EPSG:32760: give the latitude and longitude of the origin instead"
     )]
-    Projection {
-        /// The refused name.
-        name: String,
-    },
+    Projection { name: String },
 }
 
 impl GeoAnchor {
@@ -124,7 +109,8 @@ impl GeoAnchor {
         }
     }
 
-    /// The place of a rig on the earth, and its heading. The anchor has passed [`GeoAnchor::check`].
+    /// The place of a rig on the earth, and its heading. The anchor has passed
+    /// [`GeoAnchor::check`].
     ///
     /// # Errors
     /// As [`GeoAnchor::check`], for an anchor that has not.
@@ -150,7 +136,8 @@ impl GeoAnchor {
         }
     }
 
-    /// Position in the world, in metres, of a point of the earth: the inverse of [`GeoAnchor::locate`].
+    /// Position in the world, in metres, of a point of the earth: the inverse of
+    /// [`GeoAnchor::locate`].
     ///
     /// # Errors
     /// As [`GeoAnchor::check`], for an anchor that has not passed it.
@@ -161,7 +148,7 @@ impl GeoAnchor {
             }
             Self::Projected(origin) => {
                 let zone = UtmZone::named(&origin.projection)?;
-                let [easting_m, northing_m] = zone.of_geodetic(point);
+                let [easting_m, northing_m] = zone.from_geodetic(point);
                 Ok(DVec3::new(
                     easting_m - origin.easting_m,
                     northing_m - origin.northing_m,
@@ -187,8 +174,8 @@ fn within_turn(angle_deg: f64) -> f64 {
     Some(angle_deg.rem_euclid(360.0)).filter(|angle_deg| *angle_deg < 360.0).unwrap_or(0.0)
 }
 
-/// Reads `LATITUDE,LONGITUDE[,ALTITUDE]` in degrees and metres, or `EPSG:CODE,EASTING,NORTHING[,ALTITUDE]` in
-/// metres.
+/// Reads `LATITUDE,LONGITUDE[,ALTITUDE]` in degrees and metres, or
+/// `EPSG:CODE,EASTING,NORTHING[,ALTITUDE]` in metres.
 impl FromStr for GeoAnchor {
     type Err = GeoError;
 

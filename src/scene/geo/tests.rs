@@ -4,8 +4,8 @@ use glam::DQuat;
 
 use super::*;
 
-/// Origin (latitude, longitude, altitude), position in its tangent plane, and that point: by PROJ 9.5
-/// (`+proj=topocentric`), whose own inverse is exact to about 1e-8 m.
+/// Origin (latitude, longitude, altitude), position in its tangent plane, and that point: by PROJ
+/// 9.5 (`+proj=topocentric`), whose own inverse is exact to about 1e-8 m.
 const TOPOCENTRIC: [([f64; 3], [f64; 3], [f64; 3]); 15] = [
     ([52.5162, 13.3777, 34.0], [0.0, 0.0, 0.0], [52.5162000000000, 13.3777000000000, 34.000000000]),
     (
@@ -64,7 +64,8 @@ const TOPOCENTRIC: [([f64; 3], [f64; 3], [f64; 3]); 15] = [
     ),
 ];
 
-/// UTM zone, easting and northing, latitude and longitude, and meridian convergence in degrees: by PROJ 9.5.
+/// UTM zone, easting and northing, latitude and longitude, and meridian convergence in degrees: by
+/// PROJ 9.5.
 const UTM: [(&str, [f64; 2], [f64; 2], f64); 6] = [
     ("EPSG:32633", [391779.0, 5820076.5], [52.5200389577798, 13.4049947675464], -1.2658642168),
     ("EPSG:32756", [334900.0, 6252300.25], [-33.8566962673666, 151.2152960012971], 0.9945149782),
@@ -127,7 +128,8 @@ fn headings_are_from_north_to_the_east() {
         let off_deg = (found - expected + 180.0).rem_euclid(360.0) - 180.0;
         assert!(off_deg.abs() < 1e-9, "{yaw_deg}: {found}");
     }
-    // 40 km to the east, the meridian is turned by 0.59 degrees of longitude times the sine of the latitude.
+    // 40 km to the east, the meridian is turned by 0.59 degrees of longitude times the sine of the
+    // latitude.
     let far = anchor.locate(&facing(DVec3::new(40_000.0, 0.0, 0.0), std::f64::consts::FRAC_PI_2));
     let far = far.unwrap();
     let turned_deg = (far.point.longitude_deg - 13.4) * 52.5f64.to_radians().sin();

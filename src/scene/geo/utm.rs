@@ -1,6 +1,6 @@
-//! Zones of UTM: the transverse Mercator projection is Krüger's series in the third flattening n to order 6 (Karney,
-//! "Transverse Mercator with an accuracy of a few nanometers", 2011, equations 35 and 36), which is exact to 5 nm
-//! within 3,900 km of the central meridian.
+//! Zones of UTM: the transverse Mercator projection is Krüger's series in the third flattening n to
+//! order 6 (Karney, "Transverse Mercator with an accuracy of a few nanometers", 2011, equations 35
+//! and 36), which is exact to 5 nm within 3,900 km of the central meridian.
 
 use super::ellipsoid::{A_M, E2, N};
 use super::{GeoError, GeoPoint};
@@ -27,7 +27,8 @@ fn wrapped_deg(longitude_deg: f64) -> f64 {
     (longitude_deg + 180.0).rem_euclid(360.0) - 180.0
 }
 
-/// Krüger's coefficients α, which take the conformal sphere to the plane (Karney 2011, equation 35).
+/// Krüger's coefficients α, which take the conformal sphere to the plane (Karney 2011, equation
+/// 35).
 const ALPHA: [[f64; 6]; 6] = [
     [0.5, -2.0 / 3.0, 5.0 / 16.0, 41.0 / 180.0, -127.0 / 288.0, 7_891.0 / 37_800.0],
     [0.0, 13.0 / 48.0, -3.0 / 5.0, 557.0 / 1_440.0, 281.0 / 630.0, -1_983_433.0 / 1_935_360.0],
@@ -37,7 +38,8 @@ const ALPHA: [[f64; 6]; 6] = [
     [0.0, 0.0, 0.0, 0.0, 0.0, 212_378_941.0 / 319_334_400.0],
 ];
 
-/// Krüger's coefficients β, which take the plane to the conformal sphere (Karney 2011, equation 36).
+/// Krüger's coefficients β, which take the plane to the conformal sphere (Karney 2011, equation
+/// 36).
 const BETA: [[f64; 6]; 6] = [
     [0.5, -2.0 / 3.0, 37.0 / 96.0, -1.0 / 360.0, -81.0 / 512.0, 96_199.0 / 604_800.0],
     [0.0, 1.0 / 48.0, 1.0 / 15.0, -437.0 / 1_440.0, 46.0 / 105.0, -1_118_711.0 / 3_870_720.0],
@@ -52,7 +54,8 @@ fn at_n(series: &[[f64; 6]; 6]) -> [f64; 6] {
     series.map(|row| row.iter().rev().fold(0.0, |sum, coefficient| (sum + coefficient) * N))
 }
 
-/// Radius of the sphere whose meridian is as long as that of WGS84, in metres (Karney 2011, equation 14).
+/// Radius of the sphere whose meridian is as long as that of WGS84, in metres (Karney 2011,
+/// equation 14).
 fn rectifying_radius_m() -> f64 {
     let n2 = N * N;
     A_M / (1.0 + N) * (1.0 + n2 / 4.0 + n2 * n2 / 64.0 + n2 * n2 * n2 / 256.0)
@@ -76,13 +79,14 @@ impl UtmZone {
         if self.is_south { UTM_SOUTH_NORTHING_M } else { 0.0 }
     }
 
-    /// The point of WGS84 at an easting and a northing, with altitude 0, and the angle from true north to grid
-    /// north, clockwise, in radians.
+    /// The point of WGS84 at an easting and a northing, with altitude 0, and the angle from true
+    /// north to grid north, clockwise, in radians.
     pub(super) fn to_geodetic(self, easting_m: f64, northing_m: f64) -> (GeoPoint, f64) {
         let scale_m = UTM_SCALE * rectifying_radius_m();
         let xi = (northing_m - self.false_northing_m()) / scale_m;
         let eta = (easting_m - UTM_EASTING_M) / scale_m;
-        // The plane to the conformal sphere, and the derivative of that map (Karney 2011, equation 11 and 24).
+        // The plane to the conformal sphere, and the derivative of that map (Karney 2011, equation
+        // 11 and 24).
         let mut xi_sphere = xi;
         let mut eta_sphere = eta;
         let (mut p, mut q) = (1.0, 0.0);
@@ -96,7 +100,7 @@ impl UtmZone {
         let (sinh, cos) = (eta_sphere.sinh(), xi_sphere.cos());
         let conformal_tan = xi_sphere.sin() / sinh.hypot(cos);
         let longitude_rad = sinh.atan2(cos);
-        let latitude_rad = of_conformal(conformal_tan);
+        let latitude_rad = geodetic_latitude(conformal_tan);
         let convergence_rad = (xi_sphere.tan() * eta_sphere.tanh()).atan() + q.atan2(p);
         let point = GeoPoint {
             latitude_deg: latitude_rad.to_degrees(),
@@ -107,7 +111,7 @@ impl UtmZone {
     }
 
     /// Easting and northing of a point of WGS84, in metres.
-    pub(super) fn of_geodetic(self, point: &GeoPoint) -> [f64; 2] {
+    pub(super) fn from_geodetic(self, point: &GeoPoint) -> [f64; 2] {
         let longitude_rad = (point.longitude_deg - self.central_meridian_deg()).to_radians();
         let tan = conformal_tan(point.latitude_deg.to_radians());
         let (sin_lon, cos_lon) = longitude_rad.sin_cos();
@@ -132,9 +136,9 @@ fn conformal_tan(latitude_rad: f64) -> f64 {
     tan * sigma.hypot(1.0) - sigma * tan.hypot(1.0)
 }
 
-/// The latitude, in radians, of the tangent of a conformal latitude: Newton's method, which converges to rounding
-/// in three rounds (Karney 2011, equations 19 to 21).
-fn of_conformal(wanted_tan: f64) -> f64 {
+/// The latitude, in radians, of the tangent of a conformal latitude: Newton's method, which
+/// converges to rounding in three rounds (Karney 2011, equations 19 to 21).
+fn geodetic_latitude(wanted_tan: f64) -> f64 {
     let mut tan = wanted_tan;
     for _ in 0..4 {
         let found = conformal_tan(tan.atan());

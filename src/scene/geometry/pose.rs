@@ -40,7 +40,6 @@ pub enum PoseError {
     NotFinite {
         /// The component, such as `xyz[0]` or `q[3]`.
         field: &'static str,
-        /// The refused value.
         value: f64,
     },
     /// The norm of the quaternion differs from one by more than [`Pose::MAX_NORM_ERROR`].
@@ -75,10 +74,12 @@ impl Pose {
     /// The identity transform.
     pub const IDENTITY: Self = Self { position_m: DVec3::ZERO, rotation: DQuat::IDENTITY };
 
-    /// Largest accepted magnitude of a coordinate, in metres. A city spans 1e5 m; UTM northings reach 1e7 m.
+    /// Largest accepted magnitude of a coordinate, in metres. A city spans 1e5 m; UTM northings
+    /// reach 1e7 m.
     pub const MAX_COORDINATE_M: f64 = 1e8;
 
-    /// A quaternion whose norm differs from one by at most this is normalised; otherwise it is refused.
+    /// A quaternion whose norm differs from one by at most this is normalised; otherwise it is
+    /// refused.
     pub const MAX_NORM_ERROR: f64 = 1e-3;
 
     /// A pose from untrusted input: position in metres, quaternion as (w, x, y, z).
@@ -106,8 +107,8 @@ impl Pose {
         if !is_rotation {
             return Err(PoseError::NotARotation { length });
         }
-        // Normalising twice can change the last bits. A quaternion that is already unit is therefore kept,
-        // so that a pose that is written and read again is bit-identical.
+        // Normalising twice can change the last bits. A quaternion that is already unit is
+        // therefore kept, so that a pose that is written and read again is bit-identical.
         let is_unit = (rotation.length_squared() - 1.0).abs() <= 8.0 * f64::EPSILON;
         let rotation = if is_unit { rotation } else { rotation.normalize() };
         Ok(Self { position_m: DVec3::from_array(xyz_m), rotation })

@@ -17,8 +17,9 @@ pub(super) struct Node {
     pub(super) weight: f64,
 }
 
-/// A measure of the area that a Gaussian covers: proportional to the mean area of its projections along its three
-/// principal axes. Two flat neighbours that touch merge into a flat Gaussian with the sum of their areas.
+/// A measure of the area that a Gaussian covers: proportional to the mean area of its projections
+/// along its three principal axes. Two flat neighbours that touch merge into a flat Gaussian with
+/// the sum of their areas.
 pub(super) fn area_m2(scale_m: DVec3) -> f64 {
     let DVec3 { x, y, z } = scale_m;
     x * y + y * z + z * x
@@ -51,8 +52,8 @@ impl Node {
     }
 }
 
-/// The merge of two Gaussians: the first two moments of their weighted mixture. `scale_m` and `axes` are invalid
-/// until [`Node::diagonalise`] is called.
+/// The merge of two Gaussians: the first two moments of their weighted mixture. `scale_m` and
+/// `axes` are invalid until [`Node::diagonalise`] is called.
 pub(super) fn joined(a: &Node, b: &Node) -> Node {
     let weight = a.weight + b.weight;
     // Two invisible Gaussians get equal shares.
@@ -74,11 +75,12 @@ impl Node {
     }
 }
 
-/// The cost of a merge: the squared L2 norm of the difference between the fields before and after, relative to that
-/// of the field before; 0 to about 1.
+/// The cost of a merge: the squared L2 norm of the difference between the fields before and after,
+/// relative to that of the field before; 0 to about 1.
 ///
-/// A field is `weight x normal density x (1, colour)`, blurred with variance `blur_m2` so that details that a pixel
-/// cannot resolve do not count. With `∫ N(a, A) N(b, B) = N(a - b; 0, A + B)` all six terms have a closed form.
+/// A field is `weight x normal density x (1, colour)`, blurred with variance `blur_m2` so that
+/// details that a pixel cannot resolve do not count. With `∫ N(a, A) N(b, B) = N(a - b; 0, A + B)`
+/// all six terms have a closed form.
 pub(super) fn cost(a: &Node, b: &Node, merged: &Node, colours: [DVec3; 2], blur_m2: f64) -> f64 {
     let share = if merged.weight > 0.0 { b.weight / merged.weight } else { 0.5 };
     let colour = colours[0].lerp(colours[1], share);
@@ -109,8 +111,8 @@ fn outer(v: DVec3) -> DMat3 {
     DMat3::from_cols(v * v.x, v * v.y, v * v.z)
 }
 
-/// Eigenvalues and a right-handed set of eigenvectors of a symmetric matrix, by Jacobi rotations. Each rotation makes
-/// one off-diagonal entry zero; five rounds reach the accuracy of f64.
+/// Eigenvalues and a right-handed set of eigenvectors of a symmetric matrix, by Jacobi rotations.
+/// Each rotation makes one off-diagonal entry zero; five rounds reach the accuracy of f64.
 fn eigen(mut matrix: DMat3) -> (DVec3, DMat3) {
     let mut vectors = DMat3::IDENTITY;
     for _ in 0..8 {

@@ -1,14 +1,16 @@
-//! Levels of detail of a block: sets of fewer and fewer Gaussians, each with an upper bound of its error.
+//! Levels of detail of a block: sets of fewer and fewer Gaussians, each with an upper bound of its
+//! error.
 //!
-//! A level is made from the previous one by merging pairs of neighbours in Morton order, weighted by
-//! opacity x area (`merge.rs`). The error of a merged Gaussian is the largest, over all Gaussians of level 0 that
-//! it represents, of the distance that the mean moved plus 3 times the decrease of the standard deviation.
+//! A level is made from the previous one by merging pairs of neighbours in Morton order, weighted
+//! by opacity x area (`merge.rs`). The error of a merged Gaussian is the largest, over all
+//! Gaussians of level 0 that it represents, of the distance that the mean moved plus 3 times the
+//! decrease of the standard deviation.
 //!
-//! Levels are merged under a limit of the error and not by halving: limits rise by √2 from 1 mm, each block
-//! merges the pairs below the limit, cheapest first, and a level is kept if it has a third fewer Gaussians than
-//! the previously kept one. So a single pair that is far apart does not increase the error of a whole level, and
-//! the error of a level is close to its limit. There are no random numbers, no threads and no hashing: the same
-//! block gives the same levels.
+//! Levels are merged under a limit of the error and not by halving: limits rise by √2 from 1 mm,
+//! each block merges the pairs below the limit, cheapest first, and a level is kept if it has a
+//! third fewer Gaussians than the previously kept one. So a single pair that is far apart does not
+//! increase the error of a whole level, and the error of a level is close to its limit. There are
+//! no random numbers, no threads and no hashing: the same block gives the same levels.
 
 mod merge;
 
@@ -22,10 +24,9 @@ use merge::{Node, cost, joined};
 /// One level of detail of a block.
 #[derive(Clone, Debug)]
 pub struct Level {
-    /// Upper bound, in metres, of how far a Gaussian of level 0 was moved plus 3 times the standard deviation that
-    /// it lost; 0 for level 0.
+    /// Upper bound, in metres, of how far a Gaussian of level 0 was moved plus 3 times the standard
+    /// deviation that it lost; 0 for level 0.
     pub error_m: f32,
-    /// The Gaussians.
     pub chunk: Chunk,
 }
 
@@ -33,8 +34,9 @@ pub struct Level {
 const FINEST_LIMIT_M: f64 = 1.0 / 1024.0;
 /// The coarsest limit, in metres: the size of such a pixel at 29 km.
 const COARSEST_LIMIT_M: f64 = 16.0;
-/// A level is kept if it has at most this share of the Gaussians of the previously kept level. So all levels
-/// above 0 together have at most 0.65 / 0.35 = 1.9 times as many as level 0; half of that is usual.
+/// A level is kept if it has at most this share of the Gaussians of the previously kept level. So
+/// all levels above 0 together have at most 0.65 / 0.35 = 1.9 times as many as level 0; half of
+/// that is usual.
 const KEPT_SHARE: f64 = 0.65;
 /// Merging stops at this number: a block is one chunk with at least one lane group.
 const FEWEST: usize = 16;
@@ -44,14 +46,15 @@ const GROUP: usize = 64;
 const PARTNERS: usize = 16;
 /// Largest number of pairing rounds per limit; each round at most halves a block.
 const ROUNDS: usize = 8;
-/// Largest accepted cost of a merge, as a share of the fields' norm. On the demo street, 0.02 draws as many
-/// Gaussians at any tau as 0.2, with 1 dB less noise.
+/// Largest accepted cost of a merge, as a share of the fields' norm. On the demo street, 0.02 draws
+/// as many Gaussians at any tau as 0.2, with 1 dB less noise.
 const MOST_COST: f64 = 0.02;
-/// Variance that the renderer adds on the screen, in px²: differences that this blur hides have no cost.
+/// Variance that the renderer adds on the screen, in px²: differences that this blur hides have no
+/// cost.
 const BLUR_PX2: f64 = 0.3;
 
-/// The levels of a block above level 0, each coarser than the previous one; none if merging reduces the number of
-/// Gaussians too little.
+/// The levels of a block above level 0, each coarser than the previous one; none if merging reduces
+/// the number of Gaussians too little.
 pub fn levels(block: &Chunk) -> Vec<Level> {
     let mut merging = Merging::new(block);
     let mut kept = Vec::new();
@@ -116,11 +119,13 @@ impl Merging {
         merging
     }
 
-    /// Merges pairs until none is left whose error stays within the limit, or the rounds are used up.
+    /// Merges pairs until none is left whose error stays within the limit, or the rounds are used
+    /// up.
     fn merge_within(&mut self, limit_m: f64) {
         for round in 0..ROUNDS {
             let before = self.nodes.len();
-            // Every other round shifts the groups by half, so that pairs cross the borders of the previous round.
+            // Every other round shifts the groups by half, so that pairs cross the borders of the
+            // previous round.
             let first = if round % 2 == 0 { GROUP } else { GROUP / 2 };
             let mut partner = vec![None; before];
             let mut start = 0;
@@ -143,12 +148,12 @@ impl Merging {
     /// Chooses disjoint pairs within a group greedily, the cheapest first.
     fn pair(&self, group: std::ops::Range<usize>, limit_m: f64, partner: &mut [Option<u32>]) {
         let mut pairs = Vec::new();
-        // Most pairs are too far apart for any merge; comparing squares saves a square root for each. The margin
-        // keeps every pair that `price` may accept in spite of rounding.
+        // Most pairs are too far apart for any merge; comparing squares saves a square root for
+        // each. The margin keeps every pair that `price` may accept in spite of rounding.
         let farthest_m2 = 4.0 * limit_m * limit_m * (1.0 + 1e-9);
         let nodes = &self.nodes[group.clone()];
-        // Coordinate by coordinate, so that the distances to all successors are computed by vectors. There is nothing near
-        // behind the last node.
+        // Coordinate by coordinate, so that the distances to all successors are computed by
+        // vectors. There is nothing near behind the last node.
         let mut means_m = [[f64::INFINITY; GROUP + PARTNERS]; 3];
         for (place, node) in nodes.iter().enumerate() {
             for (coordinates, from) in means_m.iter_mut().zip(node.mean_m.to_array()) {
@@ -188,7 +193,8 @@ impl Merging {
         }
     }
 
-    /// The cost of merging two nodes; `None` if the error would exceed the limit or the cost is too high.
+    /// The cost of merging two nodes; `None` if the error would exceed the limit or the cost is too
+    /// high.
     fn price(&self, first: usize, second: usize, limit_m: f64) -> Option<f64> {
         let (a, b) = (&self.nodes[first], &self.nodes[second]);
         let (error_a, error_b) = (self.errors_m[first], self.errors_m[second]);
@@ -198,8 +204,8 @@ impl Merging {
             return None;
         }
         let merged = joined(a, b);
-        // A lower bound of the merged node's largest standard deviation: that along the longest axis of the
-        // larger node.
+        // A lower bound of the merged node's largest standard deviation: that along the longest
+        // axis of the larger node.
         let larger = if a.sigma_m() >= b.sigma_m() { a } else { b };
         let axis = longest_axis(larger);
         let sigma_m = axis.dot(merged.cov_m2 * axis).max(0.0).sqrt();
@@ -250,7 +256,8 @@ impl Merging {
                     self.sh[node * self.stride + k] = mixed as f32;
                 }
             }
-            // `end` never exceeds `node`, so no unread entry is overwritten: the second of a pair comes later.
+            // `end` never exceeds `node`, so no unread entry is overwritten: the second of a pair
+            // comes later.
             self.nodes[end] = joint;
             self.sh.copy_within(node * self.stride..(node + 1) * self.stride, end * self.stride);
             self.errors_m[end] = if partner[node].is_some() { 0.0 } else { self.errors_m[node] };

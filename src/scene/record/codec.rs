@@ -11,30 +11,32 @@ pub(super) enum Code {
     Half,
     /// This many bits: a multiple of a step, from the part's smallest value to its largest.
     Steps(u32),
-    /// As `Steps`, with a step that is a power of two, so that neighbouring blocks share their grid.
+    /// As `Steps`, with a step that is a power of two, so that neighbouring blocks share their
+    /// grid.
     Binary(u32),
-    /// A unit quaternion as its three smallest components with this many bits each, and the index of the largest
-    /// (the "smallest three" encoding).
+    /// A unit quaternion as its three smallest components with this many bits each, and the index
+    /// of the largest (the "smallest three" encoding).
     Rotation(u32),
 }
 
 /// The transform of a value before it is quantised.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Measure {
-    /// No transform.
     Plain,
-    /// `ln(value + THIN_M)`: for scales, where ratios matter, down to a size that no camera resolves.
+    /// `ln(value + THIN_M)`: for scales, where ratios matter, down to a size that no camera
+    /// resolves.
     Logarithm,
-    /// `2^value`: for opacities, which a chunk holds as base-2 logarithms. Linear, since alpha is linear in it;
-    /// up to the part's largest and not up to 1, since merged Gaussians may be above 1.
+    /// `2^value`: for opacities, which a chunk holds as base-2 logarithms. Linear, since alpha is
+    /// linear in it; up to the part's largest and not up to 1, since merged Gaussians may be above
+    /// 1.
     Opacity,
     /// The signed square root: for SH coefficients, most of which are near zero.
     Root,
 }
 
-/// 10 µm, added to scales before the logarithm. Trainers flatten surfels to 1e-9 m and less, which would use up
-/// most of the range of a logarithm: even with a lower limit of exp(-12) m, 22 % of the scales of one capture (the
-/// skull) were clamped.
+/// 10 µm, added to scales before the logarithm. Trainers flatten surfels to 1e-9 m and less, which
+/// would use up most of the range of a logarithm: even with a lower limit of exp(-12) m, 22 % of
+/// the scales of one capture (the skull) were clamped.
 const THIN_M: f32 = 1e-5;
 
 /// The grid of a part: value = (first + k) step.
@@ -45,9 +47,10 @@ pub(super) struct Grid {
 }
 
 impl Measure {
-    /// Range of transformed values that a grid may span; values outside are clamped. Scales up to 2.9 km; opacities
-    /// up to 64, while merged Gaussians reach about 10; coefficients up to 16, while colours are about 1; untransformed
-    /// values up to 1e9, beyond the 1e8 m that import accepts for means.
+    /// Range of transformed values that a grid may span; values outside are clamped. Scales up to
+    /// 2.9 km; opacities up to 64, while merged Gaussians reach about 10; coefficients up to 16,
+    /// while colours are about 1; untransformed values up to 1e9, beyond the 1e8 m that import
+    /// accepts for means.
     fn range(self) -> [f32; 2] {
         match self {
             Self::Plain => [-1e9, 1e9],
@@ -57,7 +60,7 @@ impl Measure {
         }
     }
 
-    fn of(self, value: f32) -> f32 {
+    fn apply(self, value: f32) -> f32 {
         match self {
             Self::Plain => value,
             Self::Logarithm => (value + THIN_M).ln(),
@@ -127,7 +130,7 @@ impl Code {
             }
             Self::Half => {
                 for column in 0..columns {
-                    let half = |value| u32::from(f16::from_f32(measure.of(value)).to_bits());
+                    let half = |value| u32::from(f16::from_f32(measure.apply(value)).to_bits());
                     let codes: Vec<u32> = values(column).map(half).collect();
                     write_planes(planes, &codes, 2);
                 }
@@ -151,7 +154,7 @@ impl Code {
         let measured: Vec<f32> = (0..columns)
             .flat_map(values)
             .map(|value| {
-                let measured = measure.of(value);
+                let measured = measure.apply(value);
                 let within = measured.clamp(low, high);
                 clamped += u64::from(within != measured);
                 within
@@ -171,8 +174,9 @@ impl Code {
 impl Grid {
     /// The finest grid that covers all values with the numbers 0 to 2^bits - 1.
     ///
-    /// The grid consists of multiples of its step, so that zero is on it: its start is rounded down to a
-    /// multiple, which uses one of the steps. A step of 2^-30 of the largest value is finer than f32.
+    /// The grid consists of multiples of its step, so that zero is on it: its start is rounded down
+    /// to a multiple, which uses one of the steps. A step of 2^-30 of the largest value is finer
+    /// than f32.
     fn over(values: &[f32], bits: u32, binary: bool) -> Self {
         let fold = |from: f64, pick: fn(f64, f64) -> f64| {
             values.iter().fold(from, |all, &value| pick(all, f64::from(value)))
@@ -210,9 +214,10 @@ impl Grid {
     }
 }
 
-/// Encodes a unit quaternion as its three smallest components, each of magnitude at most 1/√2, with zero in the
-/// middle of the range. The index of the largest component is in the upper bits of the first code. A quaternion
-/// and its negative are the same rotation, so the sign is chosen to make the largest component positive.
+/// Encodes a unit quaternion as its three smallest components, each of magnitude at most 1/√2, with
+/// zero in the middle of the range. The index of the largest component is in the upper bits of the
+/// first code. A quaternion and its negative are the same rotation, so the sign is chosen to make
+/// the largest component positive.
 fn smallest_three(quat: [f32; 4], bits: u32) -> [u32; 3] {
     let largest = (0..4).max_by(|&a, &b| quat[a].abs().total_cmp(&quat[b].abs())).unwrap_or(0);
     let half = f64::from((1_u32 << (bits - 1)) - 1);

@@ -1,10 +1,11 @@
 //! Decoding of the values of one field, a few lane groups at a time.
 //!
-//! A part is decoded tile by tile and not field by field: a tile of all columns stays in the cache of a core, whereas the
-//! columns of a whole part are 6 MB at degree 1, and every column touches each of its pages.
+//! A part is decoded tile by tile and not field by field: a tile of all columns stays in the cache
+//! of a core, whereas the columns of a whole part are 6 MB at degree 1, and every column touches
+//! each of its pages.
 //!
-//! The loops are compiled for each instruction set. This requires that the closures of quantised fields are inlined: with
-//! AVX-512, a Q32 part takes 11 ns per Gaussian instead of 18.
+//! The loops are compiled for each instruction set. This requires that the closures of quantised
+//! fields are inlined: with AVX-512, a Q32 part takes 11 ns per Gaussian instead of 18.
 
 use std::f32::consts::SQRT_2;
 use std::ops::Range;
@@ -23,7 +24,8 @@ pub(super) struct FieldDecoder<'a> {
     columns: Vec<StoredColumn<'a>>,
     /// Grid of quantised fields.
     grid: Option<Grid>,
-    /// The value of each code, where that is cheaper than to compute it for each Gaussian; else empty.
+    /// The value of each code, where that is cheaper than to compute it for each Gaussian; else
+    /// empty.
     table: Vec<f32>,
 }
 
@@ -35,8 +37,8 @@ struct StoredColumn<'a> {
 }
 
 impl<'a> FieldDecoder<'a> {
-    /// `grid` and `planes` are the field's own bytes: [`Code::grid_bytes`], and `count` times the sum of
-    /// [`Code::planes`].
+    /// `grid` and `planes` are the field's own bytes: [`Code::grid_bytes`], and `count` times the
+    /// sum of [`Code::planes`].
     pub(super) fn new(
         code: Code,
         measure: Measure,
@@ -62,8 +64,8 @@ impl<'a> FieldDecoder<'a> {
         Self { code, measure, columns: stored, grid, table }
     }
 
-    /// Passes the values of some lane groups to `put`: index of the lane group, column within the field, values.
-    /// Lanes after the last Gaussian hold unspecified values.
+    /// Passes the values of some lane groups to `put`: index of the lane group, column within the
+    /// field, values. Lanes after the last Gaussian hold unspecified values.
     #[inline(always)]
     pub(super) fn decode(
         &self,
@@ -74,13 +76,13 @@ impl<'a> FieldDecoder<'a> {
         match (self.code, self.grid) {
             (Code::Float, _) => {
                 self.each::<4>(groups, |group, column, codes| {
-                    put(group, column, of_lanes(codes, f32::from_bits));
+                    put(group, column, map_lanes(codes, f32::from_bits));
                 });
             }
             (Code::Half, _) => {
                 let half = |code| measure.value(f16::from_bits(code as u16).to_f32());
                 self.each::<2>(groups, |group, column, codes| {
-                    put(group, column, of_lanes(codes, half));
+                    put(group, column, map_lanes(codes, half));
                 });
             }
             (Code::Rotation(bits), _) => {
@@ -123,13 +125,13 @@ impl<'a> FieldDecoder<'a> {
             #[inline(always)]
             |group, column, codes| {
                 let values = if self.table.is_empty() {
-                    of_lanes(
+                    map_lanes(
                         codes,
                         #[inline(always)]
                         |code| self.measure.value(grid.at(code)),
                     )
                 } else {
-                    of_lanes(
+                    map_lanes(
                         codes,
                         #[inline(always)]
                         |code| self.table[code as usize & all],
@@ -178,9 +180,10 @@ impl StoredColumn<'_> {
     }
 }
 
-/// The value of each code. `map` of an array of 16 remains a call, and moves the array through memory.
+/// The value of each code. `map` of an array of 16 remains a call, and moves the array through
+/// memory.
 #[inline(always)]
-fn of_lanes(codes: [u32; LANES], value: impl Fn(u32) -> f32) -> [f32; LANES] {
+fn map_lanes(codes: [u32; LANES], value: impl Fn(u32) -> f32) -> [f32; LANES] {
     let mut values = [0.0; LANES];
     for (to, code) in values.iter_mut().zip(codes) {
         *to = value(code);

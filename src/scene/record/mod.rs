@@ -1,19 +1,19 @@
 //! Record formats: how the fields of a Gaussian are encoded for storage.
 //!
-//! A record format is a table of fields: which columns, how many bits, and on which scale. One codec processes
-//! the table. A part of a section, up to [`PART_GAUSSIANS`] Gaussians, begins with the grids of its quantised
-//! fields (index of the first step as i32 and the step as f32, little-endian, in the order of the table). Byte
-//! planes follow: for each column, first the lowest byte of all values, then the next. Slowly changing bytes end
-//! up side by side, where zstd compresses them. No two values share a byte, so decoding needs no
-//! shifts: the 32 bytes of a Q32 record become 47 whole bytes, of which 19 remain on disk, since zstd finds the
-//! empty high bits.
+//! A record format is a table of fields: which columns, how many bits, and on which scale. One
+//! codec processes the table. A part of a section, up to [`PART_GAUSSIANS`] Gaussians, begins with
+//! the grids of its quantised fields (index of the first step as i32 and the step as f32,
+//! little-endian, in the order of the table). Byte planes follow: for each column, first the lowest
+//! byte of all values, then the next. Slowly changing bytes end up side by side, where zstd
+//! compresses them. No two values share a byte, so decoding needs no shifts: the 32 bytes of a Q32
+//! record become 47 whole bytes, of which 19 remain on disk, since zstd finds the empty high bits.
 //!
-//! Ranges are those of the part's own values. Every grid consists of multiples of its step, so zero is
-//! always on it: grey colours, colours that do not depend on the direction, and surfaces flat on the ground
-//! keep these properties exactly. The steps of means are powers of two, so that neighbouring blocks share
-//! their grid. Opacity is stored linearly and not as a logarithm, because alpha is linear in it. SH
-//! coefficients are stored as signed square roots, so that one coefficient of 3 does not reduce the
-//! resolution of a thousand near 0.
+//! Ranges are those of the part's own values. Every grid consists of multiples of its step, so zero
+//! is always on it: grey colours, colours that do not depend on the direction, and surfaces flat on
+//! the ground keep these properties exactly. The steps of means are powers of two, so that
+//! neighbouring blocks share their grid. Opacity is stored linearly and not as a logarithm, because
+//! alpha is linear in it. SH coefficients are stored as signed square roots, so that one
+//! coefficient of 3 does not reduce the resolution of a thousand near 0.
 
 mod codec;
 mod decoder;
@@ -33,11 +33,12 @@ use decoder::FieldDecoder;
 
 pub use round_trip::{RoundTrip, round_trip};
 
-/// Largest number of Gaussians that share ranges, a multiple of a cluster. Before compression, 65,536 Gaussians
-/// at degree 3 are 7.9 MB as Q32 and 15 MB as F32.
+/// Largest number of Gaussians that share ranges, a multiple of a cluster. Before compression,
+/// 65,536 Gaussians at degree 3 are 7.9 MB as Q32 and 15 MB as F32.
 pub const PART_GAUSSIANS: usize = 1 << 16;
 
-/// Lane groups that are decoded at a time: 47 kB at degree 1 and 121 kB at degree 3, within the second-level cache.
+/// Lane groups that are decoded at a time: 47 kB at degree 1 and 121 kB at degree 3, within the
+/// second-level cache.
 const TILE_GROUPS: usize = 32;
 
 /// How the Gaussians of a twin are encoded.
@@ -92,11 +93,11 @@ impl RecordFormat {
     /// | Q32 | 3x23 | 2+3x10 | 3x10 | 10 | 3x11 | 9x9 | 15x8 | 21x8 | 174 | 255 | 375 | 543 |
     /// | Q24 | 3x20 | 2+3x8 | 3x8 | 7 | 3x7 | 9x6 | 15x5 | 21x5 | 138 | 192 | 267 | 372 |
     ///
-    /// Bits are spent where they affect an image most: each field by itself has 60 dB or more. Means get the most,
-    /// since the first visible artefact are surfels of one plane that change their order in depth: with 20 bits
-    /// (15 µm) instead of 23, the demo street had 61 dB, all of it from surfels of one facade. The three more
-    /// bits per axis are taken from the colour. A record has no bits for a level of detail or for flags,
-    /// since both are those of its section.
+    /// Bits are spent where they affect an image most: each field by itself has 60 dB or more.
+    /// Means get the most, since the first visible artefact are surfels of one plane that change
+    /// their order in depth: with 20 bits (15 µm) instead of 23, the demo street had 61 dB, all of
+    /// it from surfels of one facade. The three more bits per axis are taken from the colour. A
+    /// record has no bits for a level of detail or for flags, since both are those of its section.
     fn fields(self, sh_degree: u8) -> Vec<Field> {
         let ([x, y, z], scale, quat, opacity, dc, bands) = match self {
             Self::F32 => (
@@ -186,8 +187,8 @@ impl RecordFormat {
         grids
     }
 
-    /// Decodes a part of `count` Gaussians, and appends their lanes: column by column of each lane group,
-    /// [`columns`]`(sh_degree)` of them.
+    /// Decodes a part of `count` Gaussians, and appends their lanes: column by column of each lane
+    /// group, [`columns`]`(sh_degree)` of them.
     ///
     /// # Errors
     /// The size of the part is wrong; then nothing is appended.
@@ -201,7 +202,8 @@ impl RecordFormat {
         self.decode_with(Level::new(), part, sh_degree, count, lanes)
     }
 
-    /// As [`RecordFormat::decode`], with the instructions of a level; the values do not depend on it.
+    /// As [`RecordFormat::decode`], with the instructions of a level; the values do not depend on
+    /// it.
     fn decode_with(
         self,
         level: Level,

@@ -9,7 +9,6 @@ use crate::{Chunk, LanePages, RecordFormat, Scene};
 /// The result of [`round_trip`].
 #[derive(Clone, Debug)]
 pub struct RoundTrip {
-    /// The decoded scene.
     pub scene: Scene,
     /// Size of all encoded parts before compression, in bytes.
     pub coded_bytes: u64,

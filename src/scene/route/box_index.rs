@@ -6,16 +6,16 @@ use crate::geometry::Bounds;
 
 /// Items in the order of a drive, grouped into boxes of `BOX_ITEMS` consecutive items.
 ///
-/// A search tests every box but opens few: for 84 km of keyframes at 0.5 m, 2,600 boxes and some hundred of
-/// the 168,000 keyframes.
+/// A search tests every box but opens few: for 84 km of keyframes at 0.5 m, 2,600 boxes and some
+/// hundred of the 168,000 keyframes.
 #[derive(Clone, Debug)]
 pub struct BoxIndex {
     bounds: Vec<Bounds>,
     items: usize,
 }
 
-/// Number of items per box. The square root of 168,000, 410, would balance the numbers of boxes and items. It is
-/// smaller because testing an item takes longer than testing a box.
+/// Number of items per box. The square root of 168,000, 410, would balance the numbers of boxes and
+/// items. It is smaller because testing an item takes longer than testing a box.
 const BOX_ITEMS: usize = 64;
 
 impl BoxIndex {
@@ -25,9 +25,9 @@ impl BoxIndex {
         Self { bounds: items.chunks(BOX_ITEMS).map(union).collect(), items: items.len() }
     }
 
-    /// The index of the item with the smallest cost, and that cost; the first of several equal ones. A cost is
-    /// in metres and must not be less than the distance from the point to the item's bounds; the closer to
-    /// that distance, the faster the search.
+    /// The index of the item with the smallest cost, and that cost; the first of several equal
+    /// ones. A cost is in metres and must not be less than the distance from the point to the
+    /// item's bounds; the closer to that distance, the faster the search.
     pub fn min_cost(&self, point_m: DVec3, cost_m: impl Fn(usize) -> f64) -> Option<(usize, f64)> {
         let distances_m = self.bounds.iter().map(|bounds| bounds.distance_m(point_m));
         let (nearest, _) =
@@ -43,7 +43,8 @@ impl BoxIndex {
                 }
             }
         };
-        // Start with the nearest box: it usually contains the result, and then most others are skipped.
+        // Start with the nearest box: it usually contains the result, and then most others are
+        // skipped.
         search_box(nearest, &mut best);
         for (place, bounds) in self.bounds.iter().enumerate() {
             let may_be_less = |(_, least)| bounds.distance_m(point_m) <= least;

@@ -23,9 +23,9 @@ pub struct TimePair {
     pub residual_us: i64,
 }
 
-/// Associates the times of two clocks, both strictly increasing, in microseconds. Two times are associated if
-/// each is the nearest to the other and they differ by at most `tolerance_us`. So no time is used twice, and
-/// pairs do not cross. Of two equally near times the earlier one counts.
+/// Associates the times of two clocks, both strictly increasing, in microseconds. Two times are
+/// associated if each is the nearest to the other and they differ by at most `tolerance_us`. So no
+/// time is used twice, and pairs do not cross. Of two equally near times the earlier one counts.
 ///
 /// # Errors
 /// [`RouteError::Order`] names the first time that is out of order; [`RouteError::Value`] if the
@@ -60,8 +60,8 @@ pub fn associate(
 }
 
 impl Route<'_> {
-    /// The pose at a time in microseconds, interpolated between the keyframes before and after it: position
-    /// linearly, rotation spherically.
+    /// The pose at a time in microseconds, interpolated between the keyframes before and after it:
+    /// position linearly, rotation spherically.
     ///
     /// # Errors
     /// [`RouteError::Outside`] before the first keyframe or after the last one.

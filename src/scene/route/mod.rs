@@ -1,4 +1,5 @@
-//! Stations of a recorded drive: arc length at each keyframe, and quantities that follow only from the keyframes.
+//! Stations of a recorded drive: arc length at each keyframe, and quantities that follow only from
+//! the keyframes.
 //!
 //! The *station* of a keyframe is its distance along the polyline through the keyframes, in metres:
 //! `s_0 = 0` and `s_k = s_{k-1} + |p_k - p_{k-1}|`.
@@ -70,9 +71,7 @@ pub enum RouteError {
     /// A length, a stride or a tolerance is out of range.
     #[error("{field} is {value:?}; {must}")]
     Value {
-        /// The parameter.
         field: &'static str,
-        /// The refused value.
         value: f64,
         /// The values that are accepted.
         must: &'static str,
@@ -83,7 +82,6 @@ pub enum RouteError {
          interpolated, not extrapolated"
     )]
     Outside {
-        /// The trajectory.
         name: String,
         /// The refused time, in microseconds.
         time_us: i64,
@@ -132,12 +130,12 @@ impl<'a> Route<'a> {
         self.stations_m.last().copied().unwrap_or(0.0)
     }
 
-    /// The interpolated pose and time at a station in metres, clamped to the ends of the route. Where the
-    /// vehicle stood still, the time is that of its arrival.
+    /// The interpolated pose and time at a station in metres, clamped to the ends of the route.
+    /// Where the vehicle stood still, the time is that of its arrival.
     pub fn at(&self, station_m: f64) -> Keyframe {
         let keyframes = &self.trajectory.keyframes;
-        // The first keyframe at or after the station. It is keyframe 0 only if the station is at or before
-        // the start.
+        // The first keyframe at or after the station. It is keyframe 0 only if the station is at or
+        // before the start.
         let after = self.stations_m.partition_point(|&s_m| s_m < station_m);
         let after = after.min(keyframes.len() - 1);
         let Some(before) = after.checked_sub(1) else { return keyframes[0] };
@@ -147,7 +145,8 @@ impl<'a> Route<'a> {
         between(&keyframes[before], &keyframes[after], t)
     }
 
-    /// The station at a time of the drive's clock, in microseconds, clamped to the ends of the route.
+    /// The station at a time of the drive's clock, in microseconds, clamped to the ends of the
+    /// route.
     pub fn station_at(&self, time_us: i64) -> f64 {
         let keyframes = &self.trajectory.keyframes;
         let after = keyframes.partition_point(|keyframe| keyframe.time_us < time_us);
@@ -174,9 +173,9 @@ impl<'a> Route<'a> {
         .collect()
     }
 
-    /// The recorded keyframes that are at least `step_m` apart: the first one, and each one at this distance
-    /// from the previously kept one. The distance is Euclidean and not along the route, so that position
-    /// jitter of a standing vehicle does not accumulate.
+    /// The recorded keyframes that are at least `step_m` apart: the first one, and each one at this
+    /// distance from the previously kept one. The distance is Euclidean and not along the route, so
+    /// that position jitter of a standing vehicle does not accumulate.
     ///
     /// # Errors
     /// [`RouteError::Value`] if the step is not positive and finite.

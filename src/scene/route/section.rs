@@ -29,12 +29,12 @@ pub struct RouteSection {
 pub const MAX_SECTION_POSES: usize = 10_000;
 
 impl Route<'_> {
-    /// The poses of a part of the route: the recorded keyframes in it, or interpolated ones at its start and every
-    /// `every_m` from there.
+    /// The poses of a part of the route: the recorded keyframes in it, or interpolated ones at its
+    /// start and every `every_m` from there.
     ///
     /// # Errors
-    /// [`RouteError::Value`] if a station is not on the route, the spacing is not positive, or there are more than
-    /// [`MAX_SECTION_POSES`] poses.
+    /// [`RouteError::Value`] if a station is not on the route, the spacing is not positive, or
+    /// there are more than [`MAX_SECTION_POSES`] poses.
     pub fn section(&self, section: RouteSection) -> Result<Vec<RoutePose>, RouteError> {
         let RouteSection { from_m, to_m, every_m } = section;
         let length_m = self.length_m();

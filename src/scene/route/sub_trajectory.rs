@@ -8,23 +8,26 @@ use crate::Trajectory;
 pub struct SubTrajectory {
     /// Stations of its start and end on the drive, in metres.
     pub stations_m: [f64; 2],
-    /// Time of its start on the drive's clock, in microseconds. The sub-trajectory's own times start at 0.
+    /// Time of its start on the drive's clock, in microseconds. The sub-trajectory's own times
+    /// start at 0.
     pub from_us: i64,
-    /// The drive's keyframes between the ends and interpolated poses at both ends, in the drive's world. The
-    /// name is that of the drive with length and number, such as `log-250m-0003` or `log-2.5km-0000`.
+    /// The drive's keyframes between the ends and interpolated poses at both ends, in the drive's
+    /// world. The name is that of the drive with length and number, such as `log-250m-0003` or
+    /// `log-2.5km-0000`.
     pub trajectory: Trajectory,
 }
 
 /// Largest number of sub-trajectories of a drive: one per metre of 100 km.
 pub const MAX_SUB_TRAJECTORIES: usize = 100_000;
 
-/// Sub-trajectories of length `length_m`, one starting every `stride_m` from the start of a drive. A shorter
-/// rest at its end is omitted. With `stride_m == length_m` they do not overlap, and each begins where the
-/// previous one ends.
+/// Sub-trajectories of length `length_m`, one starting every `stride_m` from the start of a drive.
+/// A shorter rest at its end is omitted. With `stride_m == length_m` they do not overlap, and each
+/// begins where the previous one ends.
 ///
 /// # Errors
 /// [`RouteError::Value`] if a length is not positive and finite, or the stride makes more than
-/// [`MAX_SUB_TRAJECTORIES`] pieces; for a piece [`RouteError::Trajectory`] if its name becomes too long.
+/// [`MAX_SUB_TRAJECTORIES`] pieces; for a piece [`RouteError::Trajectory`] if its name becomes too
+/// long.
 pub fn sub_trajectories<'a>(
     route: &'a Route<'_>,
     length_m: f64,
@@ -51,8 +54,8 @@ fn piece(
 ) -> Result<SubTrajectory, RouteError> {
     let [from_m, to_m] = stations_m;
     let [first, last] = stations_m.map(|station_m| route.at(station_m));
-    // Keyframes strictly between the ends in space, and also in time: the two may differ where the vehicle
-    // stood still, or where an end was rounded to a microsecond.
+    // Keyframes strictly between the ends in space, and also in time: the two may differ where the
+    // vehicle stood still, or where an end was rounded to a microsecond.
     let inner = route.trajectory.keyframes.iter().zip(&route.stations_m);
     let inner = inner
         .skip(route.stations_m.partition_point(|&s_m| s_m <= from_m))
@@ -71,7 +74,8 @@ fn piece(
     Ok(SubTrajectory { stations_m, from_us: first.time_us, trajectory })
 }
 
-/// A length as in names of sub-trajectories, rounded to a millimetre (below 1 km) or a metre: `50m`, `2.5km`.
+/// A length as in names of sub-trajectories, rounded to a millimetre (below 1 km) or a metre:
+/// `50m`, `2.5km`.
 pub fn length_label(length_m: f64) -> String {
     let millimetre_m = |value: f64| (1e3 * value).round() / 1e3;
     if length_m < 1_000.0 {

@@ -1,19 +1,21 @@
 //! Baking a sky network into cube maps with a known error bound.
 //!
-//! There are four levels, each of twice the resolution of the previous one. A request gets the coarsest map
-//! whose error is small enough. So a sky has at most four maps, of 0.8, 3, 13 and 50 MB, for any combination of
-//! requests, and none is baked twice.
+//! There are four levels, each of twice the resolution of the previous one. A request gets the
+//! coarsest map whose error is small enough. So a sky has at most four maps, of 0.8, 3, 13 and 50
+//! MB, for any combination of requests, and none is baked twice.
 //!
-//! The error of a grid is measured against a grid of twice the resolution, at the middle of every edge of a
-//! cell and at its centre. For a smooth function these are the points where the error of a bilinear patch is
-//! largest. Now let a ReLU change the slope by k between two nodes, at a fraction `a` below a half. The error of
-//! linear interpolation is then `a (1 - a) k` at that point and `a k / 2` in the middle: at most twice the
-//! measured error. So the bound is twice the largest difference, plus rounding to 16 bits. The largest change of
-//! slope determines it: at the default `sky_error` of 0.025, the error of 99 of 100 directions of the demo's sky
-//! is less than a step of 8 bits.
+//! The error of a grid is measured against a grid of twice the resolution, at the middle of every
+//! edge of a cell and at its centre. For a smooth function these are the points where the error of
+//! a bilinear patch is largest. Now let a ReLU change the slope by k between two nodes, at a
+//! fraction `a` below a half. The error of linear interpolation is then `a (1 - a) k` at that point
+//! and `a k / 2` in the middle: at most twice the measured error. So the bound is twice the largest
+//! difference, plus rounding to 16 bits. The largest change of slope determines it: at the default
+//! `sky_error` of 0.025, the error of 99 of 100 directions of the demo's sky is less than a step of
+//! 8 bits.
 //!
-//! The first grid has 129 values along an edge, at most 0.9° apart, and is compared with one of 0.45°. The
-//! finest sine of seven octaves has a period of 5.6°, so no feature of it falls between the samples.
+//! The first grid has 129 values along an edge, at most 0.9° apart, and is compared with one of
+//! 0.45°. The finest sine of seven octaves has a period of 5.6°, so no feature of it falls between
+//! the samples.
 
 use std::sync::Arc;
 
@@ -30,9 +32,11 @@ const FIRST_EDGE: usize = 129;
 /// The maps of a network that have been baked, and the error bounds of its levels.
 #[derive(Debug, Default)]
 pub(super) struct Maps {
-    /// The coarsest first. Locked only briefly, so that frames whose map exists never wait for a bake.
+    /// The coarsest first. Locked only briefly, so that frames whose map exists never wait for a
+    /// bake.
     levels: Mutex<Vec<Level>>,
-    /// Locked while baking, so that concurrent requests for the same map wait for it instead of baking it again.
+    /// Locked while baking, so that concurrent requests for the same map wait for it instead of
+    /// baking it again.
     baking: Mutex<()>,
 }
 
@@ -154,7 +158,8 @@ impl Grid {
         CubeMap::from_nodes(self.edge, &self.rgb, error)
     }
 
-    /// Largest difference of the bilinear patches from the values of a grid of twice the resolution.
+    /// Largest difference of the bilinear patches from the values of a grid of twice the
+    /// resolution.
     fn difference(&self, finer: &Self) -> f64 {
         let rows = finer.rgb.par_chunks(finer.edge).enumerate();
         let worst = rows.map(|(row, values)| {

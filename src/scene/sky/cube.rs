@@ -1,7 +1,8 @@
 //! A cube map: six square grids of colours around the viewer, interpolated bilinearly.
 //!
-//! Faces are in the order +x, -x, +y, -y, +z, -z, with columns and rows as in OpenGL and most files. x is right,
-//! y up, z ahead: in these left-handed axes, seen from inside, each face is upright.
+//! Faces are in the order +x, -x, +y, -y, +z, -z, with columns and rows as in OpenGL and most
+//! files. x is right, y up, z ahead: in these left-handed axes, seen from inside, each face is
+//! upright.
 
 use glam::DVec3;
 
@@ -12,32 +13,35 @@ pub const FACES: usize = 6;
 
 /// Six grids of `edge` x `edge` values.
 ///
-/// A direction intersects the face of its largest component at `(s, t)` in [0, 1]², and the value is looked up
-/// at `(scale s + offset, scale t + offset)`. Baked maps have values on the very edges, shared by neighbouring
-/// faces. Images have values at pixel centres, and a border of one value that is looked up from the
-/// neighbouring faces. So neither has a visible seam.
+/// A direction intersects the face of its largest component at `(s, t)` in [0, 1]², and the value
+/// is looked up at `(scale s + offset, scale t + offset)`. Baked maps have values on the very
+/// edges, shared by neighbouring faces. Images have values at pixel centres, and a border of one
+/// value that is looked up from the neighbouring faces. So neither has a visible seam.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CubeMap {
     edge: usize,
     scale: f64,
     offset: f64,
     error: f64,
-    /// 16 bits each: red in the lower and green in the upper half of the first word, blue in the second.
+    /// 16 bits each: red in the lower and green in the upper half of the first word, blue in the
+    /// second.
     texels: Vec<[u32; 2]>,
 }
 
 impl CubeMap {
-    /// Largest number of values along an edge of a baked map: 50 MB; a texel is 0.09° at the centre of a face.
+    /// Largest number of values along an edge of a baked map: 50 MB; a texel is 0.09° at the centre
+    /// of a face.
     pub const MAX_EDGE: usize = 1025;
 
-    /// Largest width of a face that is read from an image: 113 MB of texels, within the 128 MiB that any GPU allows
-    /// per binding.
+    /// Largest width of a face that is read from an image: 113 MB of texels, within the 128 MiB
+    /// that any GPU allows per binding.
     pub const MAX_SIDE_PX: usize = 1536;
 
     /// Largest rounding error of a value in 16 bits.
     pub const STEP: f64 = 0.5 / 65_535.0;
 
-    /// A map from six images of `side_px` x `side_px` pixels, `[face, row, column, 3]`: red, green, blue.
+    /// A map from six images of `side_px` x `side_px` pixels, `[face, row, column, 3]`: red, green,
+    /// blue.
     ///
     /// # Errors
     /// The faces are empty or too large, or the number of bytes is wrong.
@@ -79,7 +83,7 @@ impl CubeMap {
                     texels.push(packed(if within {
                         pixel(face, column - 1, row - 1)
                     } else {
-                        clamped(face_of(Self::direction(face, [at(column), at(row)])))
+                        clamped(cube_face(Self::direction(face, [at(column), at(row)])))
                     }));
                 }
             }
@@ -93,7 +97,8 @@ impl CubeMap {
         Self { edge: 2, scale: 1.0, offset: 0.0, error: Self::STEP, texels }
     }
 
-    /// A map from values at `i / (edge - 1)`, `[face, row, column]`; `error` is the bound of their error.
+    /// A map from values at `i / (edge - 1)`, `[face, row, column]`; `error` is the bound of their
+    /// error.
     pub(super) fn from_nodes(edge: usize, nodes: &[[f32; 3]], error: f64) -> Self {
         let texel = |rgb: &[f32; 3]| packed(DVec3::from_array(rgb.map(f64::from)));
         let texels = nodes.iter().map(texel).collect();
@@ -102,7 +107,7 @@ impl CubeMap {
 
     /// The colour in [0, 1] along a direction of any length except 0.
     pub fn rgb(&self, direction: DVec3) -> DVec3 {
-        let (face, [s, t]) = face_of(direction);
+        let (face, [s, t]) = cube_face(direction);
         let u = self.scale * s + self.offset;
         let v = self.scale * t + self.offset;
         let last = self.edge - 2;
@@ -118,8 +123,8 @@ impl CubeMap {
         upper.lerp(at(column, row + 1).lerp(at(column + 1, row + 1), fu), fv)
     }
 
-    /// The direction, not of unit length, of the point `[s, t]` of a face, from its left and top edges. Outside
-    /// of [0, 1] the point is on the plane of the face.
+    /// The direction, not of unit length, of the point `[s, t]` of a face, from its left and top
+    /// edges. Outside of [0, 1] the point is on the plane of the face.
     pub fn direction(face: usize, [s, t]: [f64; 2]) -> DVec3 {
         let right = 2.0 * s - 1.0;
         let down = 2.0 * t - 1.0;
@@ -148,8 +153,8 @@ impl CubeMap {
         self.error
     }
 
-    /// The values, `[face, row, column]`: red in the lower and green in the upper 16 bits of the first word,
-    /// blue in the second.
+    /// The values, `[face, row, column]`: red in the lower and green in the upper 16 bits of the
+    /// first word, blue in the second.
     pub fn texels(&self) -> &[[u32; 2]] {
         &self.texels
     }
@@ -165,8 +170,9 @@ fn packed(rgb: DVec3) -> [u32; 2] {
     [r | g << 16, b]
 }
 
-/// The face that a direction intersects, and the point `[s, t]` in [0, 1], from its left and top edges.
-pub(super) fn face_of(direction: DVec3) -> (usize, [f64; 2]) {
+/// The face that a direction intersects, and the point `[s, t]` in [0, 1], from its left and top
+/// edges.
+pub(super) fn cube_face(direction: DVec3) -> (usize, [f64; 2]) {
     let DVec3 { x, y, z } = direction;
     let [ax, ay, az] = direction.abs().to_array();
     let (face, right, down, ahead) = if ax >= ay && ax >= az {
@@ -189,7 +195,7 @@ mod tests {
     fn face_of_inverts_direction() {
         for face in 0..FACES {
             for [s, t] in [[0.5, 0.5], [0.1, 0.9], [0.99, 0.02]] {
-                let (met, [u, v]) = face_of(3.0 * CubeMap::direction(face, [s, t]));
+                let (met, [u, v]) = cube_face(3.0 * CubeMap::direction(face, [s, t]));
                 assert_eq!(met, face);
                 assert!((u - s).abs() < 1e-15 && (v - t).abs() < 1e-15, "{face}: {u} {v}");
             }

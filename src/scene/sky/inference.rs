@@ -1,7 +1,8 @@
 //! Fast evaluation of a sky network: 16 directions at once, in f32.
 //!
-//! The appearance embedding is the same for every direction, so its products with the weights are folded into
-//! the biases. Eight outputs are accumulated at once, so that each input is loaded once for all of them.
+//! The appearance embedding is the same for every direction, so its products with the weights are
+//! folded into the biases. Eight outputs are accumulated at once, so that each input is loaded once
+//! for all of them.
 
 use fearless_simd::{f32x16, i32x16, prelude::*};
 
@@ -49,7 +50,8 @@ impl InferenceNetwork {
         let [first, second, third] = network.layers();
         let encoded = first.inputs - network.appearance().len();
         let width = first.outputs.next_multiple_of(GROUP);
-        // Inputs of the second layer: the outputs of the first, padded to `width`, then the encoded direction.
+        // Inputs of the second layer: the outputs of the first, padded to `width`, then the encoded
+        // direction.
         let joined = |input: usize| match input {
             _ if input < width => (input < first.outputs).then_some(input),
             _ => Some(input - width + first.outputs),
@@ -71,7 +73,8 @@ impl InferenceNetwork {
             layers: [
                 Dense::new(first, encoded, Some, |output| folded(first, output, encoded)),
                 Dense::new(second, joined_inputs, joined, |output| {
-                    // Without a skip connection no weights follow these inputs, and nothing is folded.
+                    // Without a skip connection no weights follow these inputs, and nothing is
+                    // folded.
                     folded(second, output, first.outputs + encoded)
                 }),
                 Dense::new(
@@ -109,8 +112,8 @@ impl InferenceNetwork {
         self.skip
     }
 
-    /// All parameters for a GPU, by layer and output: the bias, followed by the weights in groups of four; the
-    /// last group is padded with zeros.
+    /// All parameters for a GPU, by layer and output: the bias, followed by the weights in groups
+    /// of four; the last group is padded with zeros.
     pub fn weights(&self) -> Vec<[f32; 4]> {
         let mut rows = Vec::new();
         for (layer, outputs) in self.layers.iter().zip([self.width, self.width, 3]) {
@@ -192,7 +195,8 @@ impl InferenceNetwork {
 }
 
 impl Dense {
-    /// A layer whose input `i` is input `source(i)` of `layer`; where that is `None`, its weights are 0.
+    /// A layer whose input `i` is input `source(i)` of `layer`; where that is `None`, its weights
+    /// are 0.
     fn new(
         layer: &super::Layer,
         inputs: usize,
@@ -241,13 +245,13 @@ impl Dense {
     }
 }
 
-/// `sin(x + quarter π)`: the sine for `quarter` 0, the cosine for 0.5. The error is below 1.5e-7 for |x| up to
-/// 1,000.
+/// `sin(x + quarter π)`: the sine for `quarter` 0, the cosine for 0.5. The error is below 1.5e-7
+/// for |x| up to 1,000.
 ///
-/// Range reduction after Cody and Waite: subtract the nearest multiple of π (for the cosine, of π shifted by
-/// π/2), with π split into three parts of which the first two have so few bits that their products are exact.
-/// Then a minimax polynomial of degree 9, with an error of 5e-9 on [-π/2, π/2]. Adding π/2 to x for the cosine
-/// would instead cost a rounding error of 4e-6 at x = 64.
+/// Range reduction after Cody and Waite: subtract the nearest multiple of π (for the cosine, of π
+/// shifted by π/2), with π split into three parts of which the first two have so few bits that
+/// their products are exact. Then a minimax polynomial of degree 9, with an error of 5e-9 on [-π/2,
+/// π/2]. Adding π/2 to x for the cosine would instead cost a rounding error of 4e-6 at x = 64.
 #[inline(always)]
 fn sine<S: Simd>(simd: S, x: f32x16<S>, quarter: f32) -> f32x16<S> {
     let splat = |value: f32| f32x16::splat(simd, value);
@@ -262,8 +266,8 @@ fn sine<S: Simd>(simd: S, x: f32x16<S>, quarter: f32) -> f32x16<S> {
         .mul_add(square, splat(8.333_017e-3))
         .mul_add(square, splat(-1.666_665_7e-1));
     let sine = (fit * square).mul_add(r, r);
-    // The sign flips with every multiple of π. For the cosine it flips once more, since it falls where the sine
-    // of the remainder rises.
+    // The sign flips with every multiple of π. For the cosine it flips once more, since it falls
+    // where the sine of the remainder rises.
     let half_turns: i32x16<S> = whole.to_int();
     let odd = if quarter > 0.0 { half_turns + 1 } else { half_turns };
     let bits: i32x16<S> = sine.bitcast();

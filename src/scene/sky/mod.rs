@@ -1,19 +1,19 @@
 //! Skies: a colour for every direction, infinitely far away.
 //!
-//! A pixel is `C = C_gaussians + T C_sky(direction)`, where T is the transmittance of its Gaussians. A sky is a
-//! network, as street reconstructions train it, or a cube map of six images.
+//! A pixel is `C = C_gaussians + T C_sky(direction)`, where T is the transmittance of its
+//! Gaussians. A sky is a network, as street reconstructions train it, or a cube map of six images.
 //!
-//! Since a sky depends only on the direction, a network of 12,000 multiplications per pixel is baked into a
-//! cube map of at most 50 MB when a twin is opened (`bake.rs`). The field `sky_error` of the render profile
-//! bounds the error of the map in any direction; 0 evaluates the network for every pixel, in f32. The
-//! reference backend always evaluates the network, in f64. A sky has at most four maps, one per resolution,
-//! 67 MB together. Sessions share them, so none is baked twice. A session whose `sky_error` is below the error
-//! of the finest map is refused when it opens.
+//! Since a sky depends only on the direction, a network of 12,000 multiplications per pixel is
+//! baked into a cube map of at most 50 MB when a twin is opened (`bake.rs`). The field `sky_error`
+//! of the render profile bounds the error of the map in any direction; 0 evaluates the network for
+//! every pixel, in f32. The reference backend always evaluates the network, in f64. A sky has at
+//! most four maps, one per resolution, 67 MB together. Sessions share them, so none is baked twice.
+//! A session whose `sky_error` is below the error of the finest map is refused when it opens.
 //!
-//! Images become the faces of a cube map at import and are not baked. Baked grids have values on the very
-//! edges of the faces, which neighbouring faces share; images have a border of one value that is looked up
-//! from the neighbouring faces. Both use one formula with different scales and offsets, so no look-up needs to
-//! test where a face ends.
+//! Images become the faces of a cube map at import and are not baked. Baked grids have values on
+//! the very edges of the faces, which neighbouring faces share; images have a border of one value
+//! that is looked up from the neighbouring faces. Both use one formula with different scales and
+//! offsets, so no look-up needs to test where a face ends.
 
 mod bake;
 mod cube;
@@ -30,9 +30,9 @@ pub use cube::{CubeMap, FACES};
 pub use inference::{InferenceNetwork, Scratch};
 pub use network::{Layer, Network};
 
-/// The sky is not evaluated where the transmittance is below this value: it would change a pixel by at most
-/// one step of 8 bits, and nine of ten pixels of a street are of this kind. Every backend does the same, so it
-/// is part of the definition of an image.
+/// The sky is not evaluated where the transmittance is below this value: it would change a pixel by
+/// at most one step of 8 bits, and nine of ten pixels of a street are of this kind. Every backend
+/// does the same, so it is part of the definition of an image.
 pub const SKY_CUT: f64 = 1.0 / 255.0;
 
 /// A sky, ready to be evaluated.
@@ -50,7 +50,6 @@ pub struct Sky {
 pub enum SkyModel {
     /// The network by definition, and its form for fast evaluation.
     Network(Arc<Network>, Arc<InferenceNetwork>),
-    /// Six images.
     Cube(Arc<CubeMap>),
 }
 
@@ -59,7 +58,6 @@ pub enum SkyModel {
 pub enum DrawableSky {
     /// The network, evaluated for every pixel.
     Network(Arc<InferenceNetwork>),
-    /// A cube map.
     CubeMap(Arc<CubeMap>),
 }
 
@@ -102,17 +100,11 @@ pub enum SkyError {
         tensor: &'static str,
         /// Index of the value, row by row.
         index: usize,
-        /// The value.
         value: f32,
     },
     /// There is no appearance embedding of this index.
     #[error("the sky has the appearances of {count} images, from 0; there is no image {image}")]
-    Image {
-        /// The requested index.
-        image: u32,
-        /// Number of embeddings.
-        count: usize,
-    },
+    Image { image: u32, count: usize },
     /// The faces are empty or too large.
     #[error(
         "a face of the sky is {side_px} pixels wide; 1 to {} are accepted",
@@ -129,7 +121,6 @@ pub enum SkyError {
         side_px: usize,
         /// Bytes of six such faces.
         wanted: usize,
-        /// Bytes given.
         given: usize,
     },
     /// No cube map is fine enough for the requested error.
@@ -172,9 +163,9 @@ impl Sky {
         &self.model
     }
 
-    /// The form in which a backend evaluates the sky with a profile's `sky_error`. A network is baked on first
-    /// use, which takes about a second, or ten seconds for the finest of the four maps; maps are kept. Images
-    /// are returned as their own cube map for any error.
+    /// The form in which a backend evaluates the sky with a profile's `sky_error`. A network is
+    /// baked on first use, which takes about a second, or ten seconds for the finest of the four
+    /// maps; maps are kept. Images are returned as their own cube map for any error.
     ///
     /// # Errors
     /// [`SkyError::Coarse`] if no map up to [`CubeMap::MAX_EDGE`] has a small enough error.

@@ -1,8 +1,9 @@
 //! The network of a sky, as in OmniRe (Chen et al. 2024), evaluated in f64 by its definition.
 //!
-//! Inputs, in order: the direction itself (if the first layer has inputs for it); its sines at frequencies
-//! 1, 2, 4, ..., each with x, y, z; its cosines likewise; an appearance embedding. Three linear layers with
-//! ReLU between them; with a skip connection, the second layer also reads the inputs; a sigmoid at the end.
+//! Inputs, in order: the direction itself (if the first layer has inputs for it); its sines at
+//! frequencies 1, 2, 4, ..., each with x, y, z; its cosines likewise; an appearance embedding.
+//! Three linear layers with ReLU between them; with a skip connection, the second layer also reads
+//! the inputs; a sigmoid at the end.
 
 use glam::DVec3;
 
@@ -21,9 +22,7 @@ pub struct Network {
 /// One linear layer.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Layer {
-    /// Number of outputs.
     pub outputs: usize,
-    /// Number of inputs.
     pub inputs: usize,
     /// `[outputs, inputs]`.
     pub weight: Vec<f32>,
@@ -39,19 +38,19 @@ const TENSORS: [[&str; 2]; 3] = [
 ];
 
 impl Network {
-    /// Largest width of a layer: four times that of trained skies. Evaluation takes 0.4 s per million pixels
-    /// and core.
+    /// Largest width of a layer: four times that of trained skies. Evaluation takes 0.4 s per
+    /// million pixels and core.
     pub const MAX_WIDTH: usize = 256;
-    /// Largest number of octaves. The rounding error of an f32 direction, 6e-8, times 512 is 3e-5 rad in the
-    /// argument of the finest sine.
+    /// Largest number of octaves. The rounding error of an f32 direction, 6e-8, times 512 is 3e-5
+    /// rad in the argument of the finest sine.
     pub const MAX_OCTAVES: usize = 10;
     /// Largest length of an appearance embedding.
     pub const MAX_APPEARANCE: usize = 256;
     /// Largest accepted weight. Three layers of at most 575 inputs stay below 3e36, within f32.
     const MAX_WEIGHT: f32 = 1e6;
 
-    /// A network from its layers. Octaves, identity inputs and skip connection follow from the shapes.
-    /// `appearance` may be empty.
+    /// A network from its layers. Octaves, identity inputs and skip connection follow from the
+    /// shapes. `appearance` may be empty.
     ///
     /// # Errors
     /// A shape does not fit the others or is too large, or a weight is not finite.

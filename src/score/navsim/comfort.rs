@@ -1,8 +1,10 @@
 //! Comfort, as nuPlan and NAVSIM compute it, including their defects.
 //!
-//! Source: NAVSIM 0a380a9 `pdm_comfort_metrics.py`. The acceleration of the rear axle is moved to the centre of the box
-//! by + d (ω² + dω/dt) along the car and by nothing across it, where d is the distance of the two. A rigid body has
-//! - d ω² along it and + d dω/dt across it: the published lateral acceleration is always that of the rear axle.
+//! Source: NAVSIM 0a380a9 `pdm_comfort_metrics.py`. The acceleration of the rear axle is moved to
+//! the centre of the box by + d (ω² + dω/dt) along the car and by nothing across it, where d is the
+//! distance of the two. A rigid body has
+//! - d ω² along it and + d dω/dt across it: the published lateral acceleration is always that of
+//!   the rear axle.
 
 use crate::record::EgoSample;
 use crate::savgol::savgol;
@@ -21,7 +23,8 @@ pub mod bounds {
     pub const YAW_ACCELERATION_RADPS2: f64 = 1.93;
     /// Yaw rate, in rad/s.
     pub const YAW_RATE_RADPS: f64 = 0.95;
-    /// Root mean squares between successive plans: acceleration, jerk, yaw rate, yaw acceleration; closed.
+    /// Root mean squares between successive plans: acceleration, jerk, yaw rate, yaw acceleration;
+    /// closed.
     pub const EXTENDED: [f64; 4] = [0.7, 0.5, 0.1, 0.1];
 }
 
@@ -55,8 +58,8 @@ pub struct ExtendedComfort {
     pub is_within: bool,
 }
 
-/// The signals of samples `step_s` seconds apart; `center_x_m` is from the rear axle to the centre of the box. `None` for
-/// fewer than 5 samples, which no filter of them fits.
+/// The signals of samples `step_s` seconds apart; `center_x_m` is from the rear axle to the centre
+/// of the box. `None` for fewer than 5 samples, which no filter of them fits.
 pub fn comfort_signals(ego: &[EgoSample], step_s: f64, center_x_m: f64) -> Option<ComfortSignals> {
     let n = ego.len();
     if n < 5 {
@@ -90,8 +93,8 @@ pub fn comfort_signals(ego: &[EgoSample], step_s: f64, center_x_m: f64) -> Optio
     })
 }
 
-/// Whether each signal is within its bounds: longitudinal and lateral acceleration, jerk, longitudinal jerk, yaw
-/// acceleration, yaw rate.
+/// Whether each signal is within its bounds: longitudinal and lateral acceleration, jerk,
+/// longitudinal jerk, yaw acceleration, yaw rate.
 pub fn is_within(signals: &ComfortSignals) -> [bool; 6] {
     let inside = |values: &[f64], [low, high]: [f64; 2]| {
         values.iter().all(|&value| low < value && value < high)

@@ -1,7 +1,7 @@
 //! NAVSIM's extended predictive driver model score (EPDMS), including its defects.
 //!
-//! Source: autonomousvision/navsim 0a380a9, `pdm_scorer.py`, `pdm_score.py`, `run_pdm_score.py`; comfort is nuPlan's.
-//! A score is of 4 s: 41 states 0.1 s apart.
+//! Source: autonomousvision/navsim 0a380a9, `pdm_scorer.py`, `pdm_score.py`, `run_pdm_score.py`;
+//! comfort is nuPlan's. A score is of 4 s: 41 states 0.1 s apart.
 //!
 //! | file | what it computes |
 //! |---|---|
@@ -37,13 +37,11 @@ pub const STATES: usize = 41;
 /// The input of the rules.
 #[derive(Clone, Copy, Debug)]
 pub struct Scene<'a> {
-    /// The ego's size.
     pub shape: EgoShape,
     /// The ego, [`STATES`] samples 0.1 s apart.
     pub ego: &'a [EgoSample],
     /// The actors, over the same samples.
     pub tracks: &'a [Track],
-    /// The lanes.
     pub map: &'a LaneMap,
     /// Progress of the reference (PDM-Closed) along the centre line, in metres.
     pub reference_progress_m: f64,
@@ -77,23 +75,15 @@ pub struct Rules {
 /// All sub-scores, 0 to 1.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Submetrics {
-    /// No at-fault collisions.
     pub nc: f64,
-    /// Drivable area compliance.
     pub dac: f64,
-    /// Driving direction compliance.
     pub ddc: f64,
-    /// Traffic light compliance.
     pub tlc: f64,
-    /// Ego progress.
     pub ep: f64,
     /// Time to collision within bound.
     pub ttc: f64,
-    /// Lane keeping.
     pub lk: f64,
-    /// History comfort.
     pub hc: f64,
-    /// Extended comfort.
     pub ec: f64,
 }
 
@@ -114,7 +104,8 @@ impl Submetrics {
 
 /// The score: the product of the rules that must hold, times the weighted mean of the others.
 ///
-/// A sub-score in which the human driver scored exactly 0 counts as 1, except for the extended comfort.
+/// A sub-score in which the human driver scored exactly 0 counts as 1, except for the extended
+/// comfort.
 pub fn epdms(agent: &Submetrics, human: Option<&Submetrics>) -> f64 {
     let human = human.unwrap_or(&Submetrics::PERFECT);
     let filtered = |agent: f64, human: f64| if human == 0.0 { 1.0 } else { agent };
@@ -135,10 +126,10 @@ fn is_agent(class: ActorClass) -> bool {
     class != ActorClass::Object
 }
 
-/// The score of an episode. It has no value: the published score divides by the progress of the planner PDM-Closed,
-/// which this project does not have, and compares successive plans, which a driven episode does not have. Its parts are
-/// the sub-metrics that need neither, for the driven path: the minimum over all whole 4 s. A record has no traffic
-/// lights.
+/// The score of an episode. It has no value: the published score divides by the progress of the
+/// planner PDM-Closed, which this project does not have, and compares successive plans, which a
+/// driven episode does not have. Its parts are the sub-metrics that need neither, for the driven
+/// path: the minimum over all whole 4 s. A record has no traffic lights.
 pub fn pdm(record: &DriveRecord) -> Score {
     let map = match record.map {
         None => "a map of the lanes, ",

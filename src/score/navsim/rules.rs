@@ -9,7 +9,8 @@ use crate::record::{EgoSample, Track};
 
 /// Samples of a second, plus one: the published window has 11 increments and not 10.
 const DIRECTION_WINDOW: usize = 11;
-/// Distances against the traffic in that window that cost half of the score and all of it, in metres.
+/// Distances against the traffic in that window that cost half of the score and all of it, in
+/// metres.
 const DIRECTION_LIMITS_M: [f64; 2] = [2.0, 6.0];
 /// Progress is not measured against a reference that is not longer than this, in metres.
 const SHORT_REFERENCE_M: f64 = 5.0;
@@ -19,7 +20,8 @@ const AHEAD: [usize; 4] = [0, 3, 6, 9];
 const TTC_STANDING_MPS: f64 = 5e-3;
 /// A track that is less than this off the heading is ahead, in radians.
 const AHEAD_RAD: f64 = 30.0 * std::f64::consts::PI / 180.0;
-/// Distance from the centre line that is not kept, in metres, and for how many samples in a row it must last.
+/// Distance from the centre line that is not kept, in metres, and for how many samples in a row it
+/// must last.
 const LANE_KEEPING_M: f64 = 0.5;
 const LANE_KEEPING_SAMPLES: usize = 20;
 
@@ -56,7 +58,8 @@ struct Collisions {
     kinds: Vec<Option<CollisionType>>,
 }
 
-/// NC. A track whose contact was judged not at fault is ignored from then on; one at fault is judged again.
+/// NC. A track whose contact was judged not at fault is ignored from then on; one at fault is
+/// judged again.
 fn collisions(scene: &Scene<'_>, boxes: &[Footprint], lanes: &[LanePosition]) -> Collisions {
     let count = scene.tracks.len();
     let mut found = Collisions { score: 1.0, first: None, kinds: vec![None; count] };
@@ -67,7 +70,7 @@ fn collisions(scene: &Scene<'_>, boxes: &[Footprint], lanes: &[LanePosition]) ->
             if ignored[k] || !ego_box.touches(&sample.footprint) {
                 continue;
             }
-            let kind = CollisionType::of(&FaultInput {
+            let kind = CollisionType::classify(&FaultInput {
                 ego: *ego_box,
                 ego_origin_m: ego.origin_m,
                 ego_velocity_mps: ego.world_velocity_mps(),
@@ -112,8 +115,8 @@ fn direction(scene: &Scene<'_>, boxes: &[Footprint]) -> f64 {
     }
 }
 
-/// EP: progress along the centre line, divided by the larger of the reference's and the ego's own. The ego's own
-/// counts only as far as the rules hold.
+/// EP: progress along the centre line, divided by the larger of the reference's and the ego's own.
+/// The ego's own counts only as far as the rules hold.
 fn progress(scene: &Scene<'_>, boxes: &[Footprint], gate: f64) -> f64 {
     let station_m = |ego: &Footprint| scene.map.centerline.project(ego.center_m).station_m;
     let way_m = (station_m(&boxes[boxes.len() - 1]) - station_m(&boxes[0])).max(0.0);
@@ -121,8 +124,8 @@ fn progress(scene: &Scene<'_>, boxes: &[Footprint], gate: f64) -> f64 {
     if longest_m > SHORT_REFERENCE_M { (way_m / longest_m).clamp(0.0, 1.0) } else { 1.0 }
 }
 
-/// TTC: the first sample at which the ego, moved on at its speed, touches the future box of a track. A track that is
-/// touched in another way is ignored from then on.
+/// TTC: the first sample at which the ego, moved on at its speed, touches the future box of a
+/// track. A track that is touched in another way is ignored from then on.
 fn time_to_collision(scene: &Scene<'_>, lanes: &[LanePosition]) -> Option<usize> {
     let mut first = None;
     let mut ignored = vec![false; scene.tracks.len()];
@@ -142,8 +145,8 @@ fn time_to_collision(scene: &Scene<'_>, lanes: &[LanePosition]) -> Option<usize>
                 if ignored[k] || !moved_box.touches(&then.footprint) {
                     continue;
                 }
-                // As published: the future position of the track relative to the current position of the ego. A car
-                // that closes in from behind may be ahead by then.
+                // As published: the future position of the track relative to the current position
+                // of the ego. A car that closes in from behind may be ahead by then.
                 let bearing_rad = bearing_rad(ego, then.footprint.center_m);
                 let spread = lanes[step].in_multiple_lanes
                     || lanes[step].off_drivable

@@ -31,7 +31,8 @@ struct Entry {
     limits: TokenLimits,
 }
 
-/// The part of a message of serde that quotes nothing of the file, where a token may stand in the wrong place.
+/// The part of a message of serde that quotes nothing of the file, where a token may stand in the
+/// wrong place.
 fn hint(message: &str) -> Option<String> {
     let (message, _position) = message.rsplit_once(" at line ")?;
     if message.starts_with("missing field ") || message.starts_with("duplicate field ") {
@@ -42,14 +43,17 @@ fn hint(message: &str) -> Option<String> {
     Some(format!("expected {expected}"))
 }
 
-/// Bytes of the shortest token that is accepted: 16 characters of base64 have 96 bits, too many to guess.
+/// Bytes of the shortest token that is accepted: 16 characters of base64 have 96 bits, too many to
+/// guess.
 const MIN_TOKEN_BYTES: usize = 16;
 
 impl Tokens {
-    /// Reads a file, as [`Self::parse`] does, and notes its path: a running server reads it again at SIGHUP.
+    /// Reads a file, as [`Self::parse`] does, and notes its path: a running server reads it again
+    /// at SIGHUP.
     ///
     /// # Errors
-    /// The file cannot be read, is larger than [`limits::TOKENS_FILE_BYTES`], or has an entry that cannot be used.
+    /// The file cannot be read, is larger than [`limits::TOKENS_FILE_BYTES`], or has an entry that
+    /// cannot be used.
     pub fn read(path: &Path) -> Result<Self, TokensError> {
         let text = ingest::read_whole(path, limits::TOKENS_FILE_BYTES).map_err(|error| {
             TokensError { location: "the file".to_owned(), reason: error.to_string() }
@@ -57,8 +61,9 @@ impl Tokens {
         Ok(Self { file: Some(path.to_owned()), ..Self::parse(&text)? })
     }
 
-    /// Parses a file of tokens: `{"tokens": [{"name", "role", "token" or "hash", "twins", "limits"}]}`, where
-    /// `hash` is `blake3:` or `sha-256:` and the hash of the token in hex.
+    /// Parses a file of tokens:
+    /// `{"tokens": [{"name", "role", "token" or "hash", "twins", "limits"}]}`, where `hash` is
+    /// `blake3:` or `sha-256:` and the hash of the token in hex.
     ///
     /// # Errors
     /// Names the first entry that cannot be used.
@@ -66,7 +71,8 @@ impl Tokens {
         let wrong =
             |location: String, reason: &str| TokensError { location, reason: reason.to_owned() };
         let file: File = serde_json::from_slice(text).map_err(|error| {
-            // serde's message could quote a token that is in the wrong place; what it expected there quotes nothing.
+            // serde's message could quote a token that is in the wrong place; what it expected
+            // there quotes nothing.
             let location = format!("line {}, column {}", error.line(), error.column());
             let hint = hint(&error.to_string()).map(|hint| format!("{hint}; ")).unwrap_or_default();
             let form =

@@ -12,11 +12,9 @@ use crate::fault::Fault;
 pub enum Role {
     /// Read the metrics, and nothing else.
     Metrics,
-    /// Open sessions.
     Drive,
     /// Open sessions, upload and push.
     Push,
-    /// Everything.
     Admin,
 }
 
@@ -41,7 +39,6 @@ pub(crate) struct TokenLimits {
     pub(crate) connections: Option<usize>,
     /// Pushes and edits that wait or run.
     pub(crate) pushes: Option<usize>,
-    /// Bytes of uploads.
     pub(crate) upload_bytes: Option<u64>,
 }
 
@@ -52,8 +49,8 @@ impl Grant {
         Arc::new(Self { name: String::new(), role: Role::Admin, twins: None, limits })
     }
 
-    /// Requires a role, or one that includes it: [`Role::Admin`] includes all, and [`Role::Push`] includes
-    /// [`Role::Drive`].
+    /// Requires a role, or one that includes it: [`Role::Admin`] includes all, and [`Role::Push`]
+    /// includes [`Role::Drive`].
     ///
     /// # Errors
     /// [`Fault::Forbidden`] if the token has another role.

@@ -30,8 +30,8 @@ pub(super) struct Token {
     pub(super) secret: Secret,
 }
 
-/// A hash of a token. It cannot be inverted, and comparing two hashes takes the same time whether they
-/// are equal or not.
+/// A hash of a token. It cannot be inverted, and comparing two hashes takes the same time whether
+/// they are equal or not.
 #[derive(Clone, Debug)]
 pub(super) enum Secret {
     /// BLAKE3 of the token.
@@ -63,7 +63,8 @@ impl Tokens {
         let token = authorization.and_then(bearer).ok_or(Fault::Unauthorized)?;
         let of_token = blake3::hash(token);
         let of_sha256 = blake3::hash(&Sha256::digest(token));
-        // Compare with all tokens even after a match: the time must not depend on which token matches.
+        // Compare with all tokens even after a match: the time must not depend on which token
+        // matches.
         let mut matching = None;
         for Token { grant, secret } in &self.tokens {
             let is_equal = match secret {
@@ -88,8 +89,8 @@ impl CurrentTokens {
         self.0.lock().clone()
     }
 
-    /// Reads the file again, if the tokens came from one, and returns its path. Existing connections keep the rights of
-    /// their token.
+    /// Reads the file again, if the tokens came from one, and returns its path. Existing
+    /// connections keep the rights of their token.
     ///
     /// # Errors
     /// The path, and why the file cannot be used: then the old tokens stay.

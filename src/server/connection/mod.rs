@@ -1,6 +1,7 @@
 //! One agent, in lock step: read a request, answer it.
 //!
-//! A connection may have several sessions. They share its sequence of numbers, so that they can be resumed together.
+//! A connection may have several sessions. They share its sequence of numbers, so that they can be
+//! resumed together.
 //!
 //! | file | requests |
 //! |---|---|
@@ -11,8 +12,8 @@
 //! | `trace.rs` | their spans |
 //!
 //! Requests are numbered. A request is carried out if its number follows the last one answered, or
-//! repeats one that was refused since the last one that was carried out. A request that was carried out is
-//! never carried out again: if its number is repeated, the stored answer is sent again.
+//! repeats one that was refused since the last one that was carried out. A request that was carried
+//! out is never carried out again: if its number is repeated, the stored answer is sent again.
 
 mod opening;
 mod sharing;
@@ -46,9 +47,10 @@ pub(crate) async fn serve(
     is_forwarded: bool,
 ) {
     let hello_deadline = Instant::now() + state.limits.hello;
-    let same_machine = match is_forwarded {
-        true => Err("the connection comes through a proxy"),
-        false => socket.same_machine(),
+    let same_machine = if is_forwarded {
+        Err("the connection comes through a proxy")
+    } else {
+        socket.same_machine()
     };
     let mut inbox = Inbox::new(socket);
     let mut connection = Connection {
@@ -199,8 +201,8 @@ impl Connection {
         self.delivered(seq, answer).await.map_err(refusal)
     }
 
-    /// Accepts the numbers after the last request that was carried out, up to the one after the last answer: all
-    /// those between them were refused, and can be used again.
+    /// Accepts the numbers after the last request that was carried out, up to the one after the
+    /// last answer: all those between them were refused, and can be used again.
     fn check_order(&self, seq: u64) -> Result<(), Fault> {
         let expected = match (&self.last, self.answered_seq) {
             (None, None) if seq == 0 => return Ok(()),
@@ -214,9 +216,10 @@ impl Connection {
                 let repeated = last.as_ref().map(|last| last.seq);
                 let repeated =
                     repeated.map_or(String::new(), |last| format!(", or repeat request {last}"));
-                match first == next {
-                    true => format!("the next request is {next}{repeated}"),
-                    false => format!("go on with {first} to {next}{repeated}"),
+                if first == next {
+                    format!("the next request is {next}{repeated}")
+                } else {
+                    format!("go on with {first} to {next}{repeated}")
                 }
             }
         };
@@ -377,7 +380,8 @@ impl Connection {
         socket.send_text(&convert::refused(seq, fault)).await
     }
 
-    /// Parks the session, sends the reason to the client if that is possible, and closes the socket.
+    /// Parks the session, sends the reason to the client if that is possible, and closes the
+    /// socket.
     async fn end(mut self, mut socket: Socket, reason: Disconnect) {
         let outcome = match &reason {
             Disconnect::PeerLeft | Disconnect::Fault(Fault::Replaced) => Outcome::AgentLost,

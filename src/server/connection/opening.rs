@@ -15,8 +15,8 @@ fn new_session_name() -> String {
 }
 
 impl Connection {
-    /// Checks that another session of this name can be opened: the second session of a connection needs a name, so that
-    /// a client that has forgotten to close the first one gets an error.
+    /// Checks that another session of this name can be opened: the second session of a connection
+    /// needs a name, so that a client that has forgotten to close the first one gets an error.
     pub(super) fn check_room(&self, name: Option<&String>) -> Result<(), Fault> {
         let limit = limits::CONNECTION_SESSIONS;
         if !self.slots.is_empty() && name.is_none() {
@@ -90,8 +90,8 @@ impl Connection {
         Ok(Answer::Text(text.into()))
     }
 
-    /// Resumes the sessions of a lost connection. Also resumes the numbers of a connection whose `close` was carried
-    /// out, because its answer may have been lost.
+    /// Resumes the sessions of a lost connection. Also resumes the numbers of a connection whose
+    /// `close` was carried out, because its answer may have been lost.
     pub(super) async fn resume(
         &mut self,
         seq: u64,

@@ -39,8 +39,8 @@ impl Connection {
         Ok(Answer::Text(convert::ok(seq)?.into()))
     }
 
-    /// Returns the message to send for an answer: with shared memory, the location of a binary message that was written
-    /// into it.
+    /// Returns the message to send for an answer: with shared memory, the location of a binary
+    /// message that was written into it.
     pub(super) async fn delivered(&mut self, seq: u64, answer: Answer) -> Result<Answer, Fault> {
         let memory = self.memory.as_mut().filter(|memory| memory.is_open());
         let (Some(memory), false) = (memory, matches!(answer, Answer::Text(_))) else {

@@ -116,7 +116,7 @@ fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Resu
         trajectories: manifest
             .trajectories
             .iter()
-            .map(TrajectorySummary::of)
+            .map(TrajectorySummary::from_trajectory)
             .map(trajectory_info)
             .collect(),
         reserved_bytes: session.reserved_bytes(),

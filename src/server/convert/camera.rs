@@ -8,7 +8,7 @@ use wildcity_scene::geometry::camera::{
 };
 
 /// A lens from the wire.
-pub(super) fn lens_of(lens: wire::Lens) -> LensFields {
+pub(super) fn convert_lens(lens: wire::Lens) -> LensFields {
     match lens {
         wire::Lens::Opencv { k, p, s } => LensFields::Opencv { k, p, s },
         wire::Lens::Fisheye { k, max_angle } => LensFields::Fisheye { k, max_angle },
@@ -23,7 +23,7 @@ pub(super) fn lens_of(lens: wire::Lens) -> LensFields {
 }
 
 /// A windshield from the wire.
-pub(super) fn windshield_of(windshield: wire::Windshield) -> WindshieldFields {
+pub(super) fn convert_windshield(windshield: wire::Windshield) -> WindshieldFields {
     let wire::Windshield { reference, horizontal, vertical } = windshield;
     let reference = match reference {
         wire::WindshieldReference::Forward => WindshieldReference::Forward,
@@ -32,8 +32,9 @@ pub(super) fn windshield_of(windshield: wire::Windshield) -> WindshieldFields {
     WindshieldFields { reference, horizontal, vertical }
 }
 
-/// The exposure and the overlay of a camera from the wire; `size_px` is the width and height of its image.
-pub(super) fn appearance_of(
+/// The exposure and the overlay of a camera from the wire; `size_px` is the width and height of its
+/// image.
+pub(super) fn convert_appearance(
     exposure: Option<wire::Exposure>,
     overlay: Option<&str>,
     size_px: [u32; 2],
@@ -49,7 +50,7 @@ pub(super) fn exposure_to(Exposure { matrix, offset }: Exposure) -> wire::Exposu
 }
 
 /// A shutter from the wire.
-pub(super) fn shutter_of(shutter: wire::Shutter) -> Result<Shutter, CameraError> {
+pub(super) fn convert_shutter(shutter: wire::Shutter) -> Result<Shutter, CameraError> {
     let wire::Shutter { direction, duration_us } = shutter;
     let direction = match direction {
         wire::ShutterDirection::TopToBottom => ShutterDirection::TopToBottom,
@@ -65,7 +66,7 @@ pub(super) fn shutter_of(shutter: wire::Shutter) -> Result<Shutter, CameraError>
 pub(super) fn lens_and_windshield_to(
     camera: &Camera,
 ) -> (Option<wire::Lens>, Option<wire::Windshield>) {
-    let Intrinsics { lens, windshield, .. } = Intrinsics::of(camera);
+    let Intrinsics { lens, windshield, .. } = Intrinsics::from_camera(camera);
     (lens.map(lens_to), windshield.map(windshield_to))
 }
 

@@ -23,7 +23,8 @@ impl From<DriveSection> for DriveRequest {
     }
 }
 
-/// A part of a drive of a version. `prefix` is the path of the section's fields in the request, with its dot.
+/// A part of a drive of a version. `prefix` is the path of the section's fields in the request,
+/// with its dot.
 pub(crate) fn drive(
     version: &Version,
     request: &DriveRequest,

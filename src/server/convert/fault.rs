@@ -1,6 +1,7 @@
 //! The table of faults: the wire code of each fault, and the HTTP status of each code.
 //!
-//! Every `match` is exhaustive, so that a new fault or code does not compile before it has its entry.
+//! Every `match` is exhaustive, so that a new fault or code does not compile before it has its
+//! entry.
 
 use axum::http::StatusCode;
 use serde_json::Value;
@@ -41,7 +42,7 @@ pub(crate) fn http_status(fault: &Fault) -> StatusCode {
         Fault::NoUpgrade => StatusCode::UPGRADE_REQUIRED,
         Fault::NoRoute { .. } => StatusCode::NOT_FOUND,
         Fault::NoMethod { .. } => StatusCode::METHOD_NOT_ALLOWED,
-        fault => status_of(wire_fault(fault).code),
+        fault => http_status(wire_fault(fault).code),
     }
 }
 
@@ -107,9 +108,9 @@ fn cells_of_session(error: &SessionError) -> &[[i32; 2]] {
     }
 }
 
-/// The HTTP status of a code. Codes that only occur over WebSocket have a status as well, so that a new
-/// HTTP route can answer with any code.
-fn status_of(code: Code) -> StatusCode {
+/// The HTTP status of a code. Codes that only occur over WebSocket have a status as well, so that a
+/// new HTTP route can answer with any code.
+fn http_status(code: Code) -> StatusCode {
     match code {
         Code::MalformedJson
         | Code::InvalidRequest
@@ -242,13 +243,13 @@ pub(super) fn wire_fault(fault: &Fault) -> WireFault {
         | Fault::SpoolRead { .. }
         | Fault::SpoolWrite { .. }
         | Fault::Internal(_) => plain(Code::Internal),
-        Fault::Session(error) => of_session(error),
-        Fault::Push(error) => of_push(error),
+        Fault::Session(error) => session_fault(error),
+        Fault::Push(error) => push_fault(error),
     }
 }
 
 /// The code and the field of an error of a push.
-pub(super) fn of_push(error: &PushError) -> WireFault {
+pub(super) fn push_fault(error: &PushError) -> WireFault {
     match error {
         PushError::OutOfRange { field, .. } => at(Code::OutOfRange, field),
         PushError::InvalidField { field, .. } => at(Code::InvalidRequest, field),
@@ -259,17 +260,17 @@ pub(super) fn of_push(error: &PushError) -> WireFault {
         PushError::TimedOut { .. } => plain(Code::PushRefused),
         PushError::Cancelled | PushError::TooLate { .. } => plain(Code::Conflict),
         PushError::ShuttingDown => plain(Code::ShuttingDown),
-        PushError::Session(error) => of_session(error),
+        PushError::Session(error) => session_fault(error),
         PushError::Unreadable { .. } | PushError::Abandoned { .. } | PushError::Crashed => {
             plain(Code::Internal)
         }
     }
 }
 
-fn of_session(error: &SessionError) -> WireFault {
+fn session_fault(error: &SessionError) -> WireFault {
     match error {
-        SessionError::Twin(error) => of_store(error),
-        SessionError::Residency(error) => of_residency(error),
+        SessionError::Twin(error) => store_fault(error),
+        SessionError::Residency(error) => residency_fault(error),
         SessionError::Route(_) => at(Code::TwinDamaged, "twin"),
         SessionError::Scenario(error) => match error {
             ScenarioError::Unknown { .. } => at(Code::UnknownScenario, "scenario"),
@@ -288,7 +289,7 @@ fn of_session(error: &SessionError) -> WireFault {
         SessionError::Branch { .. } => at(Code::UnknownState, "from"),
         SessionError::CameraOption { field, .. } => at(Code::OutOfRange, field),
         SessionError::UnknownTrajectory { field, .. } => at(Code::UnknownTrajectory, field),
-        SessionError::Profile(error) => of_profile(error),
+        SessionError::Profile(error) => profile_fault(error),
         SessionError::Sky(_) => at(Code::OutOfRange, "profile.sky_error"),
         SessionError::OutOfRange { field, .. } => at(Code::OutOfRange, field),
         SessionError::AnswerTooLarge { field, .. } => at(Code::AnswerTooLarge, field),
@@ -305,7 +306,7 @@ fn of_session(error: &SessionError) -> WireFault {
         }
         SessionError::Busy { .. } => plain(Code::Busy),
         SessionError::DeadlineExceeded => plain(Code::DeadlineExceeded),
-        SessionError::Render(error) => of_render(error),
+        SessionError::Render(error) => render_fault(error),
         SessionError::Record(error) if is_full(&error.cause) => plain(Code::StorageFull),
         SessionError::Encode { .. }
         | SessionError::Record(_)
@@ -314,7 +315,7 @@ fn of_session(error: &SessionError) -> WireFault {
     }
 }
 
-fn of_profile(error: &ProfileError) -> WireFault {
+fn profile_fault(error: &ProfileError) -> WireFault {
     match error {
         ProfileError::Value { field, .. } => at(Code::OutOfRange, &format!("profile.{field}")),
         ProfileError::Change { field, .. } => at(Code::InvalidRequest, &format!("profile.{field}")),
@@ -322,7 +323,7 @@ fn of_profile(error: &ProfileError) -> WireFault {
     }
 }
 
-fn of_store(error: &StoreError) -> WireFault {
+fn store_fault(error: &StoreError) -> WireFault {
     match error {
         StoreError::Name { .. } => at(Code::InvalidName, "twin"),
         StoreError::NoTwin { .. } => at(Code::UnknownTwin, "twin"),
@@ -362,7 +363,7 @@ fn of_store(error: &StoreError) -> WireFault {
     }
 }
 
-fn of_residency(error: &ResidencyError) -> WireFault {
+fn residency_fault(error: &ResidencyError) -> WireFault {
     match error {
         ResidencyError::NoRoom { .. } | ResidencyError::TooLarge { .. } => at(Code::Busy, "twin"),
         ResidencyError::NoRoomForActor { .. } => at(Code::Busy, "scenario"),
@@ -374,7 +375,7 @@ fn of_residency(error: &ResidencyError) -> WireFault {
     }
 }
 
-fn of_render(error: &RenderError) -> WireFault {
+fn render_fault(error: &RenderError) -> WireFault {
     match error {
         RenderError::TooMany { .. } => plain(Code::AnswerTooLarge),
         // The device may have room again when other sessions have ended.
@@ -479,7 +480,7 @@ mod tests {
         for variant in variants {
             let code: Code = serde_json::from_value(variant["const"].clone()).unwrap();
             let name = variant["const"].as_str().expect("a text").to_owned();
-            table.push((name, status_of(code).as_u16()));
+            table.push((name, http_status(code).as_u16()));
         }
         table.sort();
         assert_eq!(rows, table);

@@ -24,8 +24,8 @@ use wildcity_twin::ingest::{BadGaussian, IngestError};
 use wildcity_twin::store::{LogEntry, Version};
 
 use super::answer::pose;
-use super::fault::{WireFault, cells_of_push, of_push};
-use super::field::poses_of;
+use super::fault::{WireFault, cells_of_push, push_fault};
+use super::field::convert_poses;
 use super::mistake::read_body;
 
 /// The body of `POST /v1/uploads`.
@@ -59,8 +59,8 @@ pub(crate) fn upload(upload: &Upload) -> Value {
 /// The body of `POST /v1/twins/{twin}/pushes`, checked as far as it can be without the files.
 pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<PushRequest, Fault> {
     let body: http::NewPush = read_body(body)?;
-    // The hash is computed from the parsed body, so that white space does not make it a different push. Nor does the name
-    // of a lone file, which no other names.
+    // The hash is computed from the parsed body, so that white space does not make it a different
+    // push. Nor does the name of a lone file, which no other names.
     let mut content = body.clone();
     if let [lone] = &mut content.files[..] {
         lone.name = None;
@@ -79,9 +79,9 @@ pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<PushRequest, Fault> 
         preview,
         drop_bad,
     } = body;
-    let preview_poses = preview
-        .poses
-        .map(|poses| poses_of("golden.poses", &poses, wildcity_push::limits::PREVIEW_MAX_POSES));
+    let preview_poses = preview.poses.map(|poses| {
+        convert_poses("golden.poses", &poses, wildcity_push::limits::PREVIEW_MAX_POSES)
+    });
     let request = PushRequest {
         id,
         twin,
@@ -168,7 +168,7 @@ pub(crate) fn push(id: &str, twin: &str, status: &Status) -> Value {
 }
 
 fn push_error(error: &PushError) -> http::PushError {
-    let WireFault { code, .. } = of_push(error);
+    let WireFault { code, .. } = push_fault(error);
     http::PushError { code, message: error.to_string(), cells: cells_of_push(error).to_vec() }
 }
 

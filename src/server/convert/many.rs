@@ -1,8 +1,8 @@
 //! The answer to `step_many`: observations of several sessions in one message.
 //!
-//! The message has safetensors layout. Each observation is a tensor of bytes, the same bytes as a message with only
-//! this observation. So nothing is copied: this module makes the header, and the observations are sent after it from
-//! their own buffers.
+//! The message has safetensors layout. Each observation is a tensor of bytes, the same bytes as a
+//! message with only this observation. So nothing is copied: this module makes the header, and the
+//! observations are sent after it from their own buffers.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -60,7 +60,8 @@ pub(crate) fn many(seq: u64, steps: Vec<Stepped>) -> Result<ManyAnswer, Fault> {
 /// A refusal whose field is that of the whole request.
 fn refusal(index: usize, fault: &Fault) -> SessionRefusal {
     let WireFault { code, field } = wire_fault(fault);
-    // A step in a list has no type. A step that does not fit the state of a session is a fault of the field `session`.
+    // A step in a list has no type. A step that does not fit the state of a session is a fault of
+    // the field `session`.
     let field = field.map(|field| if field == "type" { "session".to_owned() } else { field });
     let field = field.map(|field| format!("steps[{index}].{field}"));
     SessionRefusal { code, message: fault.to_string(), field }

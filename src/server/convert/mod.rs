@@ -1,4 +1,5 @@
-//! Conversion between the wire and the session: no other module of the server names the protocol's types.
+//! Conversion between the wire and the session: no other module of the server names the protocol's
+//! types.
 //!
 //! ```text
 //! mistake      mistakes in messages, as faults

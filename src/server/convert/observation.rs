@@ -23,8 +23,8 @@ use wildcity_sim::scenario;
 use super::answer::{camera, encoding, pose, text};
 use super::sensors::image_sensor;
 
-/// Completes an observation: writes the header, which has the names of the tensors and the metadata, into
-/// the space that is reserved for it in the buffer.
+/// Completes an observation: writes the header, which has the names of the tensors and the
+/// metadata, into the space that is reserved for it in the buffer.
 pub(crate) fn observation(
     seq: u64,
     session: &Session,
@@ -57,8 +57,8 @@ pub(crate) fn observation(
     header.metadata.insert("observation", observation);
     let header = text(&header)?;
 
-    // A safetensors file begins with the length of its header; the header is padded with spaces, so that the
-    // tensors begin at a multiple of 8.
+    // A safetensors file begins with the length of its header; the header is padded with spaces, so
+    // that the tensors begin at a multiple of 8.
     let padded = header.len().next_multiple_of(8);
     let Some(room) = frame.buffer.header_mut(HEADER_PREFIX_BYTES + padded) else {
         return Err(Fault::Internal(format!("there is no room for a header of {padded} bytes")));

@@ -22,16 +22,15 @@ use wildcity_sim::ego::{Action, Path, TimedPose};
 use wildcity_sim::{Dynamics, EgoModel};
 
 use super::drive::DriveRequest;
-use super::field::{name_of, pose_of, poses_of};
-use super::rig::rig_of;
-use super::sensors::sensors_of;
+use super::field::{check_name, convert_pose, convert_poses};
+use super::rig::convert_rig;
+use super::sensors::convert_sensors;
 
 /// A text frame, checked as far as it can be without a session.
 #[derive(Debug)]
 pub(crate) enum Parsed {
     /// A request with a number that could be read.
     Numbered {
-        /// The number.
         seq: u64,
         /// The session of the connection that it names, if any.
         session: Option<String>,
@@ -45,7 +44,6 @@ pub(crate) enum Parsed {
 /// Action of a request.
 #[derive(Debug)]
 pub(crate) enum Command {
-    /// Begins the connection.
     Hello {
         /// Name and version of the client.
         client: String,
@@ -55,7 +53,6 @@ pub(crate) enum Command {
         /// The text that is in the memory, once the client has opened it.
         proof: Option<String>,
     },
-    /// Opens a session.
     Open {
         /// Its name, if the client chose one.
         name: Option<String>,
@@ -110,14 +107,11 @@ pub(crate) enum Command {
     Branch {
         /// Its name, if the client chose one.
         name: Option<String>,
-        /// The state.
         from: BranchPoint,
     },
-    /// Ends the session.
     Close,
     /// Takes over a session of an earlier connection.
     Resume {
-        /// The session.
         session: String,
         /// Number of the last request with an answer that arrived.
         last_seq: u64,
@@ -139,19 +133,9 @@ pub(crate) struct SessionStep {
 #[derive(Debug)]
 pub(crate) enum BranchPoint {
     /// A snapshot of a session.
-    Snapshot {
-        /// The session.
-        session: String,
-        /// The snapshot.
-        snapshot: String,
-    },
+    Snapshot { session: String, snapshot: String },
     /// A step of a recorded episode.
-    Recorded {
-        /// The episode.
-        episode: String,
-        /// Steps done.
-        step: u64,
-    },
+    Recorded { episode: String, step: u64 },
 }
 
 /// Reads a text frame.
@@ -181,17 +165,17 @@ fn convert(request: Request) -> Parsed {
         Request::ShareMemory { seq, proof } => general(seq, Ok(Command::ShareMemory { proof })),
         Request::Open(open) => general(open.seq, open_command(*open)),
         Request::Step { seq, session, pose, trajectory, action, until_us, notes, terminate } => {
-            let movement = movement_of(pose, trajectory, action);
+            let movement = convert_movement(pose, trajectory, action);
             let options = StepOptions { until_us, terminate, notes };
             on(seq, session, movement.map(|movement| Command::Step { movement, options }))
         }
         Request::StepMany { seq, steps } => general(seq, many_command(steps)),
         Request::Observe { seq, session, poses } => {
-            let poses = poses_of("poses", &poses, wildcity_session::limits::OBSERVE_POSES);
+            let poses = convert_poses("poses", &poses, wildcity_session::limits::OBSERVE_POSES);
             on(seq, session, poses.map(|poses| Command::Observe { poses }))
         }
         Request::Prefetch { seq, session, poses } => {
-            let poses = poses_of("poses", &poses, wildcity_session::limits::PREFETCH_POSES);
+            let poses = convert_poses("poses", &poses, wildcity_session::limits::PREFETCH_POSES);
             on(seq, session, poses.map(|poses| Command::Prefetch { poses }))
         }
         Request::Reset { seq, session, seed, start, dynamics, speed } => {
@@ -202,10 +186,10 @@ fn convert(request: Request) -> Parsed {
             on(seq, session, Ok(Command::SwitchVersion { version }))
         }
         Request::Snapshot { seq, session, name } => {
-            on(seq, session, name_of("name", name).map(|name| Command::Snapshot { name }))
+            on(seq, session, check_name("name", name).map(|name| Command::Snapshot { name }))
         }
         Request::Restore { seq, session, name } => {
-            on(seq, session, name_of("name", name).map(|name| Command::Restore { name }))
+            on(seq, session, check_name("name", name).map(|name| Command::Restore { name }))
         }
         Request::Branch(branch) => general(branch.seq, branch_command(branch)),
         Request::Close { seq, session } => on(seq, session, Ok(Command::Close)),
@@ -217,13 +201,14 @@ fn convert(request: Request) -> Parsed {
 
 /// A request for one session of the connection.
 fn on(seq: u64, session: Option<String>, command: Result<Command, Fault>) -> Parsed {
-    match session.map(|name| name_of("session", name)).transpose() {
+    match session.map(|name| check_name("session", name)).transpose() {
         Ok(session) => Parsed::Numbered { seq, session, command },
         Err(fault) => Parsed::Numbered { seq, session: None, command: Err(fault) },
     }
 }
 
-/// Steps of several sessions. An invalid list is refused as a whole; a number out of range refuses only its own step.
+/// Steps of several sessions. An invalid list is refused as a whole; a number out of range refuses
+/// only its own step.
 fn many_command(steps: Vec<message::SessionStep>) -> Result<Command, Fault> {
     let most = limits::CONNECTION_SESSIONS;
     if !(1..=most).contains(&steps.len()) {
@@ -235,11 +220,11 @@ fn many_command(steps: Vec<message::SessionStep>) -> Result<Command, Fault> {
         let message::SessionStep { session, pose, trajectory, action, until_us, notes, terminate } =
             step;
         let field = format!("steps[{index}].session");
-        let session = name_of(&field, session)?;
+        let session = check_name(&field, session)?;
         if !names.insert(session.clone()) {
             return Err(Fault::SessionTwice { field, name: session });
         }
-        let step = match movement_of(pose, trajectory, action) {
+        let step = match convert_movement(pose, trajectory, action) {
             Err(Fault::InvalidRequest { field, reason }) => {
                 let field = field.map(|field| format!("steps[{index}].{field}"));
                 return Err(Fault::InvalidRequest { field, reason });
@@ -254,7 +239,7 @@ fn many_command(steps: Vec<message::SessionStep>) -> Result<Command, Fault> {
 }
 
 fn resume_command(session: String, last_seq: u64, also: Vec<String>) -> Result<Command, Fault> {
-    let session = name_of("session", session)?;
+    let session = check_name("session", session)?;
     let most = limits::CONNECTION_SESSIONS - 1;
     if also.len() > most {
         let must = format!("{} sessions; at most {most} are accepted", also.len());
@@ -263,22 +248,19 @@ fn resume_command(session: String, last_seq: u64, also: Vec<String>) -> Result<C
     let mut names = BTreeSet::from([session.clone()]);
     let other = |(index, name): (usize, String)| {
         let field = format!("also[{index}]");
-        let name = name_of(&field, name)?;
-        match names.insert(name.clone()) {
-            true => Ok(name),
-            false => Err(Fault::SessionTwice { field, name }),
-        }
+        let name = check_name(&field, name)?;
+        if names.insert(name.clone()) { Ok(name) } else { Err(Fault::SessionTwice { field, name }) }
     };
     let also = also.into_iter().enumerate().map(other).collect::<Result<_, Fault>>()?;
     Ok(Command::Resume { session, last_seq, also })
 }
 
 fn open_command(open: message::Open) -> Result<Command, Fault> {
-    let name = open.session.map(|name| name_of("session", name)).transpose()?;
+    let name = open.session.map(|name| check_name("session", name)).transpose()?;
     let rig = match open.rig {
         None => None,
         Some(message::RigChoice::Preset(name)) => Some(RigChoice::Preset(name)),
-        Some(message::RigChoice::Full(rig)) => Some(RigChoice::Full(rig_of(rig)?)),
+        Some(message::RigChoice::Full(rig)) => Some(RigChoice::Full(convert_rig(rig)?)),
     };
     let message::Outputs {
         cameras,
@@ -305,7 +287,7 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
     let scenario = match open.scenario {
         None => None,
         Some(choice) => {
-            let (source, values) = scenario_of(choice)?;
+            let (source, values) = convert_scenario(choice)?;
             Some(ScenarioOptions {
                 source,
                 values,
@@ -316,10 +298,10 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
         }
     };
     let opening = SessionOptions {
-        twin: name_of("twin", open.twin)?,
+        twin: check_name("twin", open.twin)?,
         version: open.version,
         seed: open.seed,
-        start: open.start.map(start_of).transpose()?,
+        start: open.start.map(convert_start).transpose()?,
         rig,
         profile: ProfileOverrides::new(open.profile),
         outputs: Outputs {
@@ -337,12 +319,12 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
             periods_us: period_us.unwrap_or_default(),
         },
         scenario,
-        dynamics: open.dynamics.map(dynamics_of).transpose()?.unwrap_or_default(),
+        dynamics: open.dynamics.map(convert_dynamics).transpose()?.unwrap_or_default(),
         dt_us: open.dt_us,
         deadline: open.deadline_ms.map(Duration::from_millis),
         decision_us: open.decision_us,
-        repair: open.repair.map(repair_of),
-        sensors: open.sensors.map(sensors_of),
+        repair: open.repair.map(convert_repair),
+        sensors: open.sensors.map(convert_sensors),
         contact: open.contact.map(|contact| match contact {
             message::ContactMode::End => ContactMode::End,
             message::ContactMode::Report => ContactMode::Report,
@@ -353,7 +335,7 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
     Ok(Command::Open { name, opening: Box::new(opening), drive: open.trajectory.map(Into::into) })
 }
 
-fn repair_of(repair: message::Repair) -> RepairOptions {
+fn convert_repair(repair: message::Repair) -> RepairOptions {
     let message::Repair { model, below, above, at_least, per_step, on_failure } = repair;
     let on_failure = match on_failure {
         None | Some(message::OnFailure::Unrepaired) => OnFailure::Unrepaired,
@@ -363,7 +345,7 @@ fn repair_of(repair: message::Repair) -> RepairOptions {
 }
 
 /// A scenario's name, its name with values, or the scenario itself, which has a format.
-fn scenario_of(
+fn convert_scenario(
     choice: message::ScenarioChoice,
 ) -> Result<(ScenarioSource, BTreeMap<String, Value>), Fault> {
     let mut object = match choice {
@@ -400,11 +382,11 @@ fn scenario_of(
 }
 
 fn branch_command(branch: message::Branch) -> Result<Command, Fault> {
-    let name = branch.session.map(|name| name_of("session", name)).transpose()?;
+    let name = branch.session.map(|name| check_name("session", name)).transpose()?;
     let from = match branch.from {
         message::BranchPoint::Snapshot { session, snapshot } => BranchPoint::Snapshot {
-            session: name_of("from.session", session)?,
-            snapshot: name_of("from.snapshot", snapshot)?,
+            session: check_name("from.session", session)?,
+            snapshot: check_name("from.snapshot", snapshot)?,
         },
         message::BranchPoint::Recorded { episode, step } => {
             if !is_episode_name(&episode) {
@@ -424,13 +406,13 @@ fn reset_options(
 ) -> Result<ResetOptions, Fault> {
     Ok(ResetOptions {
         seed,
-        start: start.map(start_of).transpose()?,
-        dynamics: dynamics.map(dynamics_of).transpose()?,
+        start: start.map(convert_start).transpose()?,
+        dynamics: dynamics.map(convert_dynamics).transpose()?,
         speed_m_s,
     })
 }
 
-fn dynamics_of(choice: message::DynamicsChoice) -> Result<Dynamics, Fault> {
+fn convert_dynamics(choice: message::DynamicsChoice) -> Result<Dynamics, Fault> {
     let message::Dynamics { model, speed, reverse } = match choice {
         message::DynamicsChoice::Full(dynamics) => dynamics,
         message::DynamicsChoice::Model(model) => {
@@ -445,18 +427,20 @@ fn dynamics_of(choice: message::DynamicsChoice) -> Result<Dynamics, Fault> {
     Ok(Dynamics::checked(model, speed, reverse).map_err(SessionError::from)?)
 }
 
-fn movement_of(
+fn convert_movement(
     pose: Option<message::Pose>,
     trajectory: Option<Vec<message::TimedPose>>,
     action: Option<message::Action>,
 ) -> Result<wildcity_sim::Command, Fault> {
     match (pose, trajectory, action) {
-        (Some(pose), None, None) => pose_of("pose", &pose).map(wildcity_sim::Command::Pose),
+        (Some(pose), None, None) => convert_pose("pose", &pose).map(wildcity_sim::Command::Pose),
         (None, Some(poses), None) => {
-            // Reads at most one pose more than the maximum, which is enough for the check to refuse the list.
+            // Reads at most one pose more than the maximum, which is enough for the check to refuse
+            // the list.
             let poses = poses.iter().take(wildcity_sim::limits::PATH_POSES + 1).enumerate();
             let timed = |(index, timed): (usize, &message::TimedPose)| {
-                let start_from_rig = pose_of(&format!("trajectory[{index}].pose"), &timed.pose)?;
+                let start_from_rig =
+                    convert_pose(&format!("trajectory[{index}].pose"), &timed.pose)?;
                 Ok(TimedPose { time_us: timed.time_us, start_from_rig })
             };
             let path = Path::checked(poses.map(timed).collect::<Result<_, Fault>>()?);
@@ -479,9 +463,9 @@ fn movement_of(
     }
 }
 
-fn start_of(start: message::Start) -> Result<Start, Fault> {
+fn convert_start(start: message::Start) -> Result<Start, Fault> {
     Ok(match start {
-        message::Start::Pose { pose } => Start::Pose(pose_of("start.pose", &pose)?),
+        message::Start::Pose { pose } => Start::Pose(convert_pose("start.pose", &pose)?),
         message::Start::Station { trajectory, station_m } => {
             Start::Station { trajectory, station_m }
         }
@@ -509,7 +493,7 @@ mod tests {
         };
         for x in ["NaN", "Infinity", "-Infinity", "1e999", "-1e999", "null"] {
             let Parsed::Numbered { seq: 3, command, .. } = parse(&step(x)) else { panic!("{x}") };
-            let field = field_of(command);
+            let field = fault_field(command);
             assert_eq!(field, "pose.xyz[1]", "{x}");
         }
         assert!(command(&step("1e308")).is_err(), "too far");
@@ -527,7 +511,7 @@ mod tests {
         }
     }
 
-    fn field_of(command: Result<Command, Fault>) -> String {
+    fn fault_field(command: Result<Command, Fault>) -> String {
         match command {
             Err(Fault::PoseNotFinite { field }) => field,
             other => panic!("{other:?}"),
@@ -539,10 +523,10 @@ mod tests {
         let unit = r#"{"xyz":[0,0,0],"q":[1,0,0,0]}"#;
         let bad = r#"{"xyz":[0,0,0],"q":[1,0,NaN,0]}"#;
         let observe = format!(r#"{{"type":"observe","seq":0,"poses":[{unit},{bad}]}}"#);
-        assert_eq!(field_of(command(&observe)), "poses[1].q[2]");
+        assert_eq!(fault_field(command(&observe)), "poses[1].q[2]");
         let camera = format!(r#"{{"name":"NaN \" NaN","camera_to_rig":{bad}}}"#);
         let open = format!(r#"{{"type":"open","seq":1,"rig":{{"cameras":[{camera}]}}}}"#);
-        assert_eq!(field_of(command(&open)), "rig.cameras[0].camera_to_rig.q[2]");
+        assert_eq!(fault_field(command(&open)), "rig.cameras[0].camera_to_rig.q[2]");
     }
 
     #[test]

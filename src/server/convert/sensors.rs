@@ -9,7 +9,7 @@ use wildcity_session::{
 };
 
 /// Converts the sensor settings of a request.
-pub(super) fn sensors_of(sensors: message::Sensors) -> Sensors {
+pub(super) fn convert_sensors(sensors: message::Sensors) -> Sensors {
     let message::Sensors { cameras, imu, wheel_speed, delay_us } = sensors;
     let axis = |axis: Option<message::AxisNoise>| {
         let message::AxisNoise { noise, bias } = axis.unwrap_or_default();
@@ -23,14 +23,17 @@ pub(super) fn sensors_of(sensors: message::Sensors) -> Sensors {
     let wheels =
         |message::WheelSpeed { noise, scale }: message::WheelSpeed| WheelSpeed { noise, scale };
     Sensors {
-        cameras: cameras.into_iter().map(|(name, camera)| (name, camera_of(camera))).collect(),
+        cameras: cameras
+            .into_iter()
+            .map(|(name, camera)| (name, convert_camera_sensor(camera)))
+            .collect(),
         imu: imu.map(unit),
         wheel_speed: wheel_speed.map(wheels),
         delay_us: delay_us.unwrap_or(0),
     }
 }
 
-fn camera_of(camera: message::CameraSensor) -> CameraSensor {
+fn convert_camera_sensor(camera: message::CameraSensor) -> CameraSensor {
     let message::CameraSensor { drop, late, freeze, noise, exposure, dirt } = camera;
     CameraSensor {
         drop,

@@ -45,8 +45,8 @@ pub(super) async fn show(
     Ok(Json(convert::actor(&actor, grant.allows_all_twins())).into_response())
 }
 
-/// `POST /v1/actors`: makes an asset of uploads, and answers when it is stored: 201, or 200 if it existed already. A
-/// client that disconnects earlier cancels the push.
+/// `POST /v1/actors`: makes an asset of uploads, and answers when it is stored: 201, or 200 if it
+/// existed already. A client that disconnects earlier cancels the push.
 pub(super) async fn push(
     Shared(state): Shared<Arc<ServerState>>,
     Extension(grant): Extension<Arc<Grant>>,

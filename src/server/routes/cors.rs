@@ -1,4 +1,5 @@
-//! Answers to pages of other sites (the Fetch standard, section 3.2: CORS): those of this machine and of `--origin`.
+//! Answers to pages of other sites (the Fetch standard, section 3.2: CORS): those of this machine
+//! and of `--origin`.
 
 use std::sync::Arc;
 
@@ -31,10 +32,8 @@ pub(super) async fn answer(
     };
     let is_preflight = request.method() == Method::OPTIONS
         && request.headers().contains_key(header::ACCESS_CONTROL_REQUEST_METHOD);
-    let mut response = match is_preflight {
-        true => StatusCode::NO_CONTENT.into_response(),
-        false => next.run(request).await,
-    };
+    let mut response =
+        if is_preflight { StatusCode::NO_CONTENT.into_response() } else { next.run(request).await };
     let headers = response.headers_mut();
     headers.insert(header::ACCESS_CONTROL_ALLOW_ORIGIN, origin);
     headers.append(header::VARY, HeaderValue::from_static("origin"));

@@ -50,7 +50,7 @@ pub(super) async fn show(
 ) -> HttpResult {
     grant.require(Role::Admin)?;
     let text = blocking(move || {
-        let path = record_of(&state, &grant, &name)?;
+        let path = find_record(&state, &grant, &name)?;
         match read_text(&path, limits::EPISODE_BYTES) {
             Ok(Some(text)) => Ok(text),
             Ok(None) => Err(too_large()),
@@ -68,7 +68,7 @@ pub(super) async fn mcap(
 ) -> HttpResult {
     grant.require(Role::Admin)?;
     let (checked, its_name) = (state.clone(), name.clone());
-    let record = blocking(move || record_of(&checked, &grant, &its_name)).await?;
+    let record = blocking(move || find_record(&checked, &grant, &its_name)).await?;
     let is_over = state.engine.wait_for_exports(Some(&name), limits::MCAP_WAIT).await;
     let bytes = blocking(move || {
         if let Ok(bytes) = read_mcap(&record, limits::EPISODE_BYTES) {
@@ -86,7 +86,7 @@ pub(super) async fn mcap(
 }
 
 /// The file of an episode whose twin the token may use.
-fn record_of(state: &ServerState, grant: &Grant, name: &str) -> Result<PathBuf, Fault> {
+fn find_record(state: &ServerState, grant: &Grant, name: &str) -> Result<PathBuf, Fault> {
     // A name, and so no path to another file.
     let unknown = || Fault::NoEpisode { name: name.to_owned() };
     let stem = name.rsplit_once('-').map_or(name, |(session, _)| session);

@@ -73,7 +73,7 @@ async fn authorize(
     // Before the ticket, which only a request that is otherwise good may use up.
     state.origins.check_host(has_tokens, host)?;
     let grant = match &state.tokens {
-        Some(tokens) => match tickets::of(&request, route)? {
+        Some(tokens) => match tickets::from_request(&request, route)? {
             Some(ticket) => state.tickets.redeem(ticket)?,
             None => {
                 let authorization = request.headers().get(header::AUTHORIZATION);

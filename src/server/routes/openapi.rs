@@ -1,5 +1,6 @@
-//! The OpenAPI document of the HTTP routes. `protocol/openapi.json` is written by the test below, from the table of
-//! routes and from `protocol/schema`, which other tests write from the protocol's types.
+//! The OpenAPI document of the HTTP routes. `protocol/openapi.json` is written by the test below,
+//! from the table of routes and from `protocol/schema`, which other tests write from the protocol's
+//! types.
 
 use axum::http::header;
 use axum::response::IntoResponse;
@@ -34,7 +35,8 @@ mod tests {
     const OF_REQUESTS: &str = "Request.";
 
     impl Schemas {
-        /// A reference to a file of `protocol/schema`, or to one of its definitions: `answer#TwinInfo`.
+        /// A reference to a file of `protocol/schema`, or to one of its definitions:
+        /// `answer#TwinInfo`.
         fn reference(&mut self, prefix: &str, name: &str) -> Value {
             let (file, definition) =
                 name.split_once('#').map_or((name, None), |(a, b)| (a, Some(b)));
@@ -67,8 +69,8 @@ mod tests {
         }
     }
 
-    /// Lets references lead to the document's schemas, and collects their names. Says how large integers may be, which
-    /// JSON Schema's formats do not.
+    /// Lets references lead to the document's schemas, and collects their names. Says how large
+    /// integers may be, which JSON Schema's formats do not.
     fn rename(prefix: &str, schema: &mut Value, named: &mut Vec<String>) {
         match schema {
             Value::Object(fields) => {

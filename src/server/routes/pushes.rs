@@ -1,4 +1,5 @@
-//! Pushes over HTTP: passes requests to the package `wildcity-push`, and answers with the push's status.
+//! Pushes over HTTP: passes requests to the package `wildcity-push`, and answers with the push's
+//! status.
 
 use std::future::pending;
 use std::sync::Arc;
@@ -22,8 +23,8 @@ use crate::token_counts::Counted;
 
 use super::refusal::HttpResult;
 
-/// `POST /v1/twins/{twin}/pushes`: answers 202 and carries the push out. A known push is answered with
-/// its status.
+/// `POST /v1/twins/{twin}/pushes`: answers 202 and carries the push out. A known push is answered
+/// with its status.
 pub(super) async fn begin(
     Shared(state): Shared<Arc<ServerState>>,
     Extension(grant): Extension<Arc<Grant>>,
@@ -101,7 +102,8 @@ struct OwnedPush {
     _open: Option<Counted>,
 }
 
-/// Logs that a push begins, and starts it. Returns when it is logged. A client that disconnects does not stop it.
+/// Logs that a push begins, and starts it. Returns when it is logged. A client that disconnects
+/// does not stop it.
 ///
 /// # Errors
 /// [`Fault::Audit`]: the push did not begin.
@@ -151,7 +153,8 @@ async fn run(
     state.metrics.push_ended(outcome(ended));
 }
 
-/// Completes when the server stops, unless the push can no longer be cancelled: then its result counts.
+/// Completes when the server stops, unless the push can no longer be cancelled: then its result
+/// counts.
 pub(super) async fn stopped_before_commit(state: &ServerState, push: &Push) {
     state.stopped().await;
     if push.cancel().is_err() {
@@ -168,7 +171,8 @@ pub(super) fn outcome(ended: State) -> &'static str {
     }
 }
 
-/// The finished uploads of a push, which belong to its token. An upload is not removed while its file is held.
+/// The finished uploads of a push, which belong to its token. An upload is not removed while its
+/// file is held.
 pub(super) fn find_uploads(
     state: &ServerState,
     owner: &str,

@@ -1,5 +1,5 @@
-//! Every route, with its description for `/v1/openapi.json`. The router is made from this table, so that every route is
-//! in the document.
+//! Every route, with its description for `/v1/openapi.json`. The router is made from this table, so
+//! that every route is in the document.
 
 use std::sync::Arc;
 
@@ -47,7 +47,8 @@ pub(super) enum Method {
     Delete,
 }
 
-/// A status in addition to that of success. Below 300 the body is the same as for success, otherwise it is a refusal.
+/// A status in addition to that of success. Below 300 the body is the same as for success,
+/// otherwise it is a refusal.
 pub(super) type Other = (u16, &'static str);
 
 /// Kind of a body.

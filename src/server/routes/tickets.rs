@@ -24,12 +24,16 @@ pub(super) async fn issue(
     Ok((StatusCode::CREATED, Json(convert::ticket(ticket))).into_response())
 }
 
-/// The ticket in the address of a WebSocket. Requests of other routes cannot have one: a ticket opens one connection.
+/// The ticket in the address of a WebSocket. Requests of other routes cannot have one: a ticket
+/// opens one connection.
 ///
 /// # Errors
 /// The request has a ticket, but is not a handshake of a WebSocket. The ticket stays valid.
-pub(super) fn of<'a>(request: &'a Request, route: &str) -> Result<Option<&'a str>, Fault> {
-    let Some(protocol) = websocket::protocol_of(route) else { return Ok(None) };
+pub(super) fn from_request<'a>(
+    request: &'a Request,
+    route: &str,
+) -> Result<Option<&'a str>, Fault> {
+    let Some(protocol) = websocket::subprotocol(route) else { return Ok(None) };
     let query = request.uri().query().unwrap_or_default();
     let ticket = query.split('&').find_map(|pair| pair.strip_prefix("ticket="));
     if ticket.is_some() {

@@ -20,7 +20,8 @@ use crate::state::ServerState;
 
 use super::refusal::HttpResult;
 
-/// `GET /v1/twins`: the latest version of every twin that the token may use, and the damaged ones of them.
+/// `GET /v1/twins`: the latest version of every twin that the token may use, and the damaged ones
+/// of them.
 pub(super) async fn list(
     State(state): State<Arc<ServerState>>,
     Extension(grant): Extension<Arc<Grant>>,
@@ -87,7 +88,8 @@ pub(super) async fn trajectory(
     Ok(Json(body.await?).into_response())
 }
 
-/// `GET /v1/twins/{twin}/ground`: where the latest version is, and the ground that it seems to stand on.
+/// `GET /v1/twins/{twin}/ground`: where the latest version is, and the ground that it seems to
+/// stand on.
 pub(super) async fn ground(
     State(state): State<Arc<ServerState>>,
     Extension(grant): Extension<Arc<Grant>>,
@@ -114,7 +116,8 @@ pub(super) async fn edit(
     check_twin(&name)?;
     let request = convert::new_edit(name, &body)?;
     let open = state.open_pushes.push(&grant)?;
-    // If the client disconnects, the edit is still completed, so that there is never a part of a version.
+    // If the client disconnects, the edit is still completed, so that there is never a part of a
+    // version.
     let edited = tokio::spawn(async move {
         let _open = open;
         let target = Target::Twin(request.twin.clone());
@@ -150,8 +153,8 @@ pub(super) async fn rollback(
         let made = rolled_back.as_ref().map(|version| Made::Version(version.number));
         state.audit.end_now(&grant, &change, made);
         let version = rolled_back?;
-        // A push that is still loading its version has pinned the previous one; move this pin, so that the rollback
-        // becomes the latest at once.
+        // A push that is still loading its version has pinned the previous one; move this pin, so
+        // that the rollback becomes the latest at once.
         engine.move_latest_pin(&name, version.number);
         tracing::info!(twin = name, version = version.number, "rolled back to {number}");
         Ok::<_, Fault>(version)
@@ -161,8 +164,9 @@ pub(super) async fn rollback(
 
 /// Refuses invalid names of twins, so that they do not get into the audit log.
 fn check_twin(name: &str) -> Result<(), Fault> {
-    match is_name(name) {
-        true => Ok(()),
-        false => Err(Fault::InvalidName { field: "twin".to_owned(), name: name.to_owned() }),
+    if is_name(name) {
+        Ok(())
+    } else {
+        Err(Fault::InvalidName { field: "twin".to_owned(), name: name.to_owned() })
     }
 }

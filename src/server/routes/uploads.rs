@@ -1,4 +1,5 @@
-//! Uploads over HTTP: announced with their digest, appended to at an offset, checked after the last byte.
+//! Uploads over HTTP: announced with their digest, appended to at an offset, checked after the last
+//! byte.
 
 use std::pin::pin;
 use std::sync::Arc;
@@ -72,8 +73,8 @@ pub(super) async fn delete(
     Ok(StatusCode::NO_CONTENT.into_response())
 }
 
-/// `PATCH /v1/uploads/{id}`: appends at `Upload-Offset`. Bytes that arrive before a connection is lost
-/// are kept; nothing is kept of a body that is refused.
+/// `PATCH /v1/uploads/{id}`: appends at `Upload-Offset`. Bytes that arrive before a connection is
+/// lost are kept; nothing is kept of a body that is refused.
 pub(super) async fn append(
     State(state): State<Arc<ServerState>>,
     Extension(grant): Extension<Arc<Grant>>,
@@ -88,9 +89,10 @@ pub(super) async fn append(
 
     // The announced bytes must continue the upload.
     let start = number(&headers, &UPLOAD_OFFSET)?;
-    let length = match headers.contains_key(header::CONTENT_LENGTH) {
-        true => number(&headers, &header::CONTENT_LENGTH)?,
-        false => 0,
+    let length = if headers.contains_key(header::CONTENT_LENGTH) {
+        number(&headers, &header::CONTENT_LENGTH)?
+    } else {
+        0
     };
     let announced_sha256 = sha256_of_content(&headers)?;
     let writer = spool.write(&upload).await?;
@@ -206,13 +208,14 @@ fn check_content_digest(
     Ok(())
 }
 
-/// After the last byte of the upload: checks the whole file, and removes it if it does not match its
-/// digest.
+/// After the last byte of the upload: checks the whole file, and removes it if it does not match
+/// its digest.
 fn finish(spool: &Spool, upload: Arc<Upload>, mut writer: Writer) -> Result<Arc<Upload>, Fault> {
     if upload.offset() == upload.announced().size
         && let Err(fault) = writer.finish()
     {
-        // If the disk only failed to read, keep the upload: a request without bytes checks it again.
+        // If the disk only failed to read, keep the upload: a request without bytes checks it
+        // again.
         if !matches!(fault, Fault::SpoolRead { .. }) {
             spool.remove(&upload);
         }
@@ -241,8 +244,8 @@ fn number(headers: &HeaderMap, name: &HeaderName) -> Result<u64, Fault> {
     })
 }
 
-/// The `sha-256` of `Content-Digest` (RFC 9530, section 2), if there is one. Other algorithms are ignored, as the
-/// standard requires.
+/// The `sha-256` of `Content-Digest` (RFC 9530, section 2), if there is one. Other algorithms are
+/// ignored, as the standard requires.
 fn sha256_of_content(headers: &HeaderMap) -> Result<Option<Vec<u8>>, Fault> {
     let values = headers.get_all(CONTENT_DIGEST).into_iter().flat_map(|value| value.to_str());
     let mut entries = values.flat_map(|value| value.split(','));

@@ -1,5 +1,5 @@
-//! The viewer: the page at `/` and its files, which are part of the program. Script and style are built from
-//! `clients/viewer/src`; the other files are in that folder.
+//! The viewer: the page at `/` and its files, which are part of the program. Script and style are
+//! built from `clients/viewer/src`; the other files are in that folder.
 
 use axum::http::{HeaderName, header};
 use axum::response::IntoResponse;
@@ -36,8 +36,8 @@ pub(super) const FILES: [File; 4] = [
     },
 ];
 
-/// The page may load from and connect to only this server; no other page may show it in a frame. Images arrive over the
-/// WebSocket, and are decoded from memory.
+/// The page may load from and connect to only this server; no other page may show it in a frame.
+/// Images arrive over the WebSocket, and are decoded from memory.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; \
      base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 

@@ -47,8 +47,8 @@ pub(super) async fn upgrade(
     })
 }
 
-/// `GET /v1/sessions/{session}/watch`: checks the handshake, and hands the socket over to a [`watchers`]' end of the
-/// session.
+/// `GET /v1/sessions/{session}/watch`: checks the handshake, and hands the socket over to a
+/// [`watchers`]' end of the session.
 pub(super) async fn watch(
     State(state): State<Arc<ServerState>>,
     Extension(slot): Extension<Arc<ConnectionSlot>>,
@@ -67,7 +67,7 @@ pub(super) async fn watch(
 }
 
 /// The subprotocol of a route, if the route is a WebSocket.
-pub(super) fn protocol_of(route: &str) -> Option<&'static str> {
+pub(super) fn subprotocol(route: &str) -> Option<&'static str> {
     match route {
         SESSION => Some(convert::SUBPROTOCOL),
         WATCH => Some(convert::WATCH_SUBPROTOCOL),

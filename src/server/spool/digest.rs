@@ -26,7 +26,7 @@ impl Digest {
     }
 
     /// The digest of an id.
-    pub(super) fn of_id(id: &str) -> Option<Self> {
+    pub(super) fn from_id(id: &str) -> Option<Self> {
         let (algorithm, hex) = id.rsplit_once('-')?;
         format!("{algorithm}:{hex}").try_into().ok()
     }
@@ -35,7 +35,7 @@ impl Digest {
     ///
     /// # Errors
     /// The file cannot be read, or ends early ([`ErrorKind::UnexpectedEof`]).
-    pub(super) fn of_same_kind(&self, mut file: impl Read, size: u64) -> io::Result<Self> {
+    pub(super) fn hash_same_kind(&self, mut file: impl Read, size: u64) -> io::Result<Self> {
         let bytes;
         let hash = match self.algorithm {
             Algorithm::Blake3 => {

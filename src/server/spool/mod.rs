@@ -8,16 +8,17 @@
 //! <spool>/<stem>.gone        a removed upload: freeing a large file takes a while
 //! ```
 //!
-//! **The id is the digest**: the same content is the same upload. So an upload needs no state except its bytes:
-//! announcing it again finds it, whatever happened to the server or the client. An incomplete upload survives a
-//! restart, and can be continued. A complete upload also survives a power cut; an incomplete one may lose its last
-//! bytes.
+//! **The id is the digest**: the same content is the same upload. So an upload needs no state
+//! except its bytes: announcing it again finds it, whatever happened to the server or the client.
+//! An incomplete upload survives a restart, and can be continued. A complete upload also survives a
+//! power cut; an incomplete one may lose its last bytes.
 //!
-//! **An upload belongs to the token that announced it.** Another token cannot see, continue, remove or push it, and has
-//! an upload of its own for the same content. The stem of its files is the id, followed by a hash of the token's name.
+//! **An upload belongs to the token that announced it.** Another token cannot see, continue, remove
+//! or push it, and has an upload of its own for the same content. The stem of its files is the id,
+//! followed by a hash of the token's name.
 //!
-//! **Space is counted for bytes that have arrived.** An announcement without bytes takes little space, and only for
-//! minutes ([`quota`]).
+//! **Space is counted for bytes that have arrived.** An announcement without bytes takes little
+//! space, and only for minutes ([`quota`]).
 
 mod digest;
 mod quota;
@@ -67,7 +68,6 @@ type Uploads = BTreeMap<String, Arc<Upload>>;
 /// How much of a spool is used.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct SpoolUsage {
-    /// Number of uploads.
     pub(crate) uploads: usize,
     /// Their bytes that have arrived, and those that are reserved for more.
     pub(crate) bytes: u64,
@@ -81,8 +81,9 @@ impl SpoolMedium {
 }
 
 impl Spool {
-    /// Opens a directory for one server, with the uploads of an earlier server. `tokens` is the number of tokens that
-    /// may upload, and `own_bytes` the limits of tokens that have their own limit, by name.
+    /// Opens a directory for one server, with the uploads of an earlier server. `tokens` is the
+    /// number of tokens that may upload, and `own_bytes` the limits of tokens that have their own
+    /// limit, by name.
     pub(crate) fn open(
         medium: SpoolMedium,
         limits: SpoolLimits,
@@ -105,12 +106,13 @@ impl Spool {
         Ok(spool)
     }
 
-    /// Returns the upload of a file by a token, and begins it if it is new. Old uploads are removed to make space for
-    /// it. An upload of an earlier server that could not be read when this server started is continued.
+    /// Returns the upload of a file by a token, and begins it if it is new. Old uploads are removed
+    /// to make space for it. An upload of an earlier server that could not be read when this server
+    /// started is continued.
     ///
     /// # Errors
-    /// The upload is too large, there is no space, the disk fails, or the token has a complete upload of the same
-    /// digest with a different size.
+    /// The upload is too large, there is no space, the disk fails, or the token has a complete
+    /// upload of the same digest with a different size.
     pub(crate) fn begin(&self, owner: &str, announced: Announced) -> Result<Arc<Upload>, Fault> {
         if announced.size > self.limits.upload_bytes {
             let must =
@@ -133,7 +135,8 @@ impl Spool {
                 known.touch();
                 return Ok(known.clone());
             }
-            // The size of complete content is certain. For incomplete content, either of the two sizes may be wrong.
+            // The size of complete content is certain. For incomplete content, either of the two
+            // sizes may be wrong.
             if known.is_complete() || Arc::strong_count(known) > 1 {
                 return Err(Fault::UploadDigest {
                     what: "the size of that content",
@@ -184,8 +187,8 @@ impl Spool {
         Ok(writer)
     }
 
-    /// Removes an upload, unless it was removed before. The caller has its [`Writer`], so that no other connection
-    /// writes to files of a newer upload.
+    /// Removes an upload, unless it was removed before. The caller has its [`Writer`], so that no
+    /// other connection writes to files of a newer upload.
     pub(crate) fn remove(&self, upload: &Upload) {
         let mut uploads = self.uploads.lock();
         if !is_own(&uploads, upload) {
@@ -227,14 +230,14 @@ impl Spool {
         quota::usage(uploads.values())
     }
 
-    /// Reads the directory. Files of uploads that cannot be continued are removed; files of other names, and files that
-    /// cannot be read now, are not changed.
+    /// Reads the directory. Files of uploads that cannot be continued are removed; files of other
+    /// names, and files that cannot be read now, are not changed.
     fn recover(&self) -> io::Result<()> {
         let names = self.medium.disk.list(&self.medium.dir)?;
         let upload_stem = |name: &String| {
             let (stem, kind) = name.split_once('.')?;
             let is_known = ["json", "part", "data", "gone"].contains(&kind);
-            let is_id = |id: &str| Digest::of_id(id).is_some();
+            let is_id = |id: &str| Digest::from_id(id).is_some();
             let is_stem = is_id(stem) || stem.rsplit_once('-').is_some_and(|(id, _)| is_id(id));
             (is_known && is_stem).then(|| stem.to_owned())
         };
@@ -245,7 +248,7 @@ impl Spool {
                 Ok(Some(upload)) => {
                     uploads.insert(stem, upload);
                 }
-                Ok(None) => drop(RemovedFiles::of(&self.medium, &stem)),
+                Ok(None) => drop(RemovedFiles::rename_all(&self.medium, &stem)),
                 Err(error) => tracing::warn!("cannot read the upload {stem}: {error}"),
             }
         }
@@ -285,7 +288,8 @@ mod tests {
         Announced { name: "a".to_owned(), size: 7, digest: digest.try_into().unwrap() }
     }
 
-    /// A server may be killed after it renamed the files of an upload, when the same content was announced again.
+    /// A server may be killed after it renamed the files of an upload, when the same content was
+    /// announced again.
     #[test]
     fn what_a_killed_server_was_deleting_is_deleted_at_the_next_start() {
         let dir = tempfile::tempdir().unwrap();

@@ -1,8 +1,9 @@
 //! Limits of the space that uploads use: of all tokens together, and of each.
 //!
-//! An upload uses space for the bytes that have arrived. While it is active, some more space is reserved, so that
-//! accepted uploads seldom fail because the spool is full. If no bytes arrive for minutes, the reservation ends:
-//! otherwise a token could prevent all others from uploading without sending anything.
+//! An upload uses space for the bytes that have arrived. While it is active, some more space is
+//! reserved, so that accepted uploads seldom fail because the spool is full. If no bytes arrive for
+//! minutes, the reservation ends: otherwise a token could prevent all others from uploading without
+//! sending anything.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -31,8 +32,8 @@ struct Demand<'a> {
 }
 
 impl Quota {
-    /// The limits of a spool for `tokens` tokens. `own_bytes` has the limits of tokens that have their own limit, in
-    /// bytes.
+    /// The limits of a spool for `tokens` tokens. `own_bytes` has the limits of tokens that have
+    /// their own limit, in bytes.
     pub(super) fn new(
         limits: SpoolLimits,
         tokens: usize,
@@ -47,7 +48,7 @@ impl Quota {
     }
 
     /// Limits of the uploads of a token.
-    fn of_token(&self, owner: &str) -> SpoolUsage {
+    fn token_usage(&self, owner: &str) -> SpoolUsage {
         let own = self.own_bytes.get(owner).copied();
         SpoolUsage { bytes: own.unwrap_or(self.token.bytes).min(self.all.bytes), ..self.token }
     }
@@ -64,7 +65,7 @@ impl Quota {
     ) -> Result<(), Fault> {
         // Refuse an upload that can never fit before it is sent.
         let size = upload.announced().size;
-        let most = self.of_token(upload.owner()).bytes;
+        let most = self.token_usage(upload.owner()).bytes;
         if size > most {
             let reason = format!(
                 "{size} bytes, and the uploads of this token may have {most}: send it in parts, or ask the operator \
@@ -87,7 +88,7 @@ impl Quota {
         more_bytes: u64,
         removed: &mut Vec<RemovedFiles>,
     ) -> Result<(), Fault> {
-        let bytes = upload.offset().saturating_add(more_bytes).max(room_of(upload));
+        let bytes = upload.offset().saturating_add(more_bytes).max(upload_bytes(upload));
         self.make_room(uploads, Demand { upload, bytes }, removed)
     }
 
@@ -98,7 +99,7 @@ impl Quota {
         removed: &mut Vec<RemovedFiles>,
     ) -> Result<(), Fault> {
         let owner = demand.upload.owner();
-        let token = self.of_token(owner);
+        let token = self.token_usage(owner);
         loop {
             let others = || uploads.values().filter(|known| known.stem() != demand.upload.stem());
             let own = usage(others().filter(|known| known.owner() == owner));
@@ -107,7 +108,8 @@ impl Quota {
             if !is_own_full && self.all.fits(all, demand.bytes) {
                 return Ok(());
             }
-            // Remove the token's own uploads first, and no others if the token's own quota is exceeded.
+            // Remove the token's own uploads first, and no others if the token's own quota is
+            // exceeded.
             let is_removable = |known: &&Arc<Upload>| {
                 is_removable(known, owner) && (!is_own_full || known.owner() == owner)
             };
@@ -115,9 +117,10 @@ impl Quota {
                 .filter(is_removable)
                 .min_by_key(|known| (known.owner() != owner, known.offset() > 0, known.used_us()));
             let Some(stem) = first.map(|known| known.stem().to_owned()) else {
-                let (whose, kept, most) = match is_own_full {
-                    true => ("this token keeps", own, token),
-                    false => ("the server keeps", all, self.all),
+                let (whose, kept, most) = if is_own_full {
+                    ("this token keeps", own, token)
+                } else {
+                    ("the server keeps", all, self.all)
                 };
                 let reason = format!(
                     "{whose} {} uploads of {} bytes, of at most {} uploads and {} bytes; push what is \
@@ -145,21 +148,21 @@ impl SpoolUsage {
 pub(super) fn usage<'a>(uploads: impl Iterator<Item = &'a Arc<Upload>>) -> SpoolUsage {
     uploads.fold(SpoolUsage::default(), |sum, upload| SpoolUsage {
         uploads: sum.uploads + 1,
-        bytes: sum.bytes.saturating_add(room_of(upload)),
+        bytes: sum.bytes.saturating_add(upload_bytes(upload)),
     })
 }
 
 /// Bytes that an upload takes: those that have arrived, and those that are reserved.
-fn room_of(upload: &Upload) -> u64 {
+fn upload_bytes(upload: &Upload) -> u64 {
     let held = upload.offset();
     let is_active = upload.idle() < limits::RESERVED_FOR;
     let reserved = if is_active && !upload.is_complete() { limits::RESERVED_BYTES } else { 0 };
     held.saturating_add(reserved).min(upload.announced().size)
 }
 
-/// Whether an upload may be removed to make space for an upload of `owner`. It must not be in use, and must be complete
-/// or have been idle for a while. A complete upload of another token must have been idle as well, because its push may
-/// follow soon.
+/// Whether an upload may be removed to make space for an upload of `owner`. It must not be in use,
+/// and must be complete or have been idle for a while. A complete upload of another token must have
+/// been idle as well, because its push may follow soon.
 fn is_removable(upload: &Arc<Upload>, owner: &str) -> bool {
     if Arc::strong_count(upload) > 1 {
         return false;

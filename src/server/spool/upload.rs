@@ -158,8 +158,8 @@ impl Upload {
         self.release.notified()
     }
 
-    /// Takes the upload over from the connection that writes it, if there is one: after a network failure the client
-    /// detects long before the server that the old connection is dead.
+    /// Takes the upload over from the connection that writes it, if there is one: after a network
+    /// failure the client detects long before the server that the old connection is dead.
     ///
     /// # Errors
     /// [`Fault::Busy`]: the other connection did not release it in time.
@@ -183,17 +183,18 @@ impl Upload {
         if self.announced.size == 0 { self.finish() } else { Ok(()) }
     }
 
-    /// Checks the bytes that arrived against the digest, and makes the upload durable. The bytes are durable already.
+    /// Checks the bytes that arrived against the digest, and makes the upload durable. The bytes
+    /// are durable already.
     ///
     /// # Errors
-    /// [`Fault::SpoolRead`]: the disk cannot be read now, and the upload is kept. After any other error the caller
-    /// removes the upload.
+    /// [`Fault::SpoolRead`]: the disk cannot be read now, and the upload is kept. After any other
+    /// error the caller removes the upload.
     fn finish(&self) -> Result<(), Fault> {
         let disk = &*self.medium.disk;
         let part = self.file("part");
         let Announced { size, digest, .. } = &self.announced;
         let read = || {
-            let found = disk.open(&part).and_then(|file| digest.of_same_kind(file, *size));
+            let found = disk.open(&part).and_then(|file| digest.hash_same_kind(file, *size));
             found.map_err(|cause| Fault::SpoolRead { cause })
         };
         // The upload is lost if its bytes are wrong, but not if they were only read wrong.
@@ -216,10 +217,10 @@ impl Upload {
         Ok(())
     }
 
-    /// Renames the files, so that a new upload can have the same id at once. They are deleted when the
-    /// result is dropped.
+    /// Renames the files, so that a new upload can have the same id at once. They are deleted when
+    /// the result is dropped.
     pub(super) fn set_aside(&self) -> RemovedFiles {
-        RemovedFiles::of(&self.medium, &self.stem)
+        RemovedFiles::rename_all(&self.medium, &self.stem)
     }
 
     /// Notes that the upload is used now.
@@ -306,8 +307,8 @@ fn write_fault(cause: io::Error) -> Fault {
     Fault::SpoolWrite { cause }
 }
 
-/// The file of an upload that was removed. It is deleted when this is dropped, which takes a while for
-/// tens of GB: not under a lock.
+/// The file of an upload that was removed. It is deleted when this is dropped, which takes a while
+/// for tens of GB: not under a lock.
 #[must_use]
 pub(super) struct RemovedFiles {
     medium: SpoolMedium,
@@ -315,10 +316,11 @@ pub(super) struct RemovedFiles {
 }
 
 impl RemovedFiles {
-    pub(super) fn of(medium: &SpoolMedium, stem: &str) -> Self {
+    pub(super) fn rename_all(medium: &SpoolMedium, stem: &str) -> Self {
         let path = |kind: &str| path(medium, stem, kind);
         let gone = path("gone");
-        // The announcement is removed last: if the process is killed before, the next start removes the rest.
+        // The announcement is removed last: if the process is killed before, the next start removes
+        // the rest.
         for kind in ["part", "data"] {
             log_error(&path(kind), medium.disk.rename(&path(kind), &gone));
         }

@@ -1,8 +1,9 @@
 //! The budget of bytes for answers, shared by all sessions.
 //!
-//! It covers the observations that are being made, sent, or kept for a repeated `seq`, the earlier frames
-//! that later observations contain again, memory that is shared with clients, and the overlays of the sessions'
-//! cameras. Without it, a few slow clients with large images could exhaust the server's memory.
+//! It covers the observations that are being made, sent, or kept for a repeated `seq`, the earlier
+//! frames that later observations contain again, memory that is shared with clients, and the
+//! overlays of the sessions' cameras. Without it, a few slow clients with large images could
+//! exhaust the server's memory.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};

@@ -1,5 +1,5 @@
-//! MCAP files of episodes that ended, written next to their records by a separate thread, so that no request waits for
-//! an export.
+//! MCAP files of episodes that ended, written next to their records by a separate thread, so that
+//! no request waits for an export.
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -13,7 +13,7 @@ use tokio::sync::watch;
 use tokio::time::timeout;
 
 use wildcity_episode::{
-    EpisodeFile, ExportError, export_file, mcap_of, record_bytes, remove_leftovers,
+    EpisodeFile, ExportError, export_file, mcap_path, record_bytes, remove_leftovers,
 };
 
 use crate::error::SessionError;
@@ -41,8 +41,8 @@ struct State {
 }
 
 impl Exports {
-    /// Starts the thread. It first removes from the directory of the records the files of exports that were killed, and
-    /// ends after the last export when this is dropped.
+    /// Starts the thread. It first removes from the directory of the records the files of exports
+    /// that were killed, and ends after the last export when this is dropped.
     ///
     /// # Errors
     /// [`SessionError::Thread`].
@@ -65,7 +65,7 @@ impl Exports {
 
     /// Queues a record for export, unless too many wait already.
     pub(crate) fn add(&self, record: PathBuf) {
-        let name = EpisodeFile::name_of(&record);
+        let name = EpisodeFile::episode_name(&record);
         let mut state = self.shared.state.lock();
         if state.waiting.len() >= limits::WAITING_EXPORTS {
             let reason = format!("{} others waited", limits::WAITING_EXPORTS);
@@ -77,8 +77,8 @@ impl Exports {
         let _ = self.records.send(record);
     }
 
-    /// Waits until the export of `episode` has ended, or all exports if it is `None`; at most `longest`. Returns
-    /// whether they have ended.
+    /// Waits until the export of `episode` has ended, or all exports if it is `None`; at most
+    /// `longest`. Returns whether they have ended.
     pub(crate) async fn wait(&self, episode: Option<&str>, longest: Duration) -> bool {
         let is_over = |_: &u64| !self.shared.state.lock().is_waiting(episode);
         let mut ended = self.shared.ended.subscribe();
@@ -112,7 +112,6 @@ impl Shared {
 
 /// Why an episode was not exported.
 enum Failure {
-    /// Something is wrong.
     Bad(String),
     /// The ego was never driven: the record has only frames of `observe`.
     Empty(String),
@@ -152,7 +151,7 @@ fn export(record: &Path) -> Result<(), Failure> {
             "the record has {bytes} bytes; at most {most} are exported by themselves"
         )));
     }
-    match export_file(record, &mcap_of(record)) {
+    match export_file(record, &mcap_path(record)) {
         Ok(_) => Ok(()),
         Err(error @ ExportError::Empty) => Err(Failure::Empty(error.to_string())),
         Err(error) => Err(Failure::Bad(error.to_string())),

@@ -1,4 +1,5 @@
-//! Leases of open versions: they prevent garbage collection, in any process, from deleting data in use.
+//! Leases of open versions: they prevent garbage collection, in any process, from deleting data in
+//! use.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Weak};
@@ -34,8 +35,8 @@ impl Leases {
 
     /// Takes a lease of a version unless there is one already. Blocks.
     ///
-    /// A failure is only logged: on a store without write access, the process that collects garbage must get the
-    /// versions in use by other means.
+    /// A failure is only logged: on a store without write access, the process that collects garbage
+    /// must get the versions in use by other means.
     pub(crate) fn take(&self, resident: &Arc<Resident>) {
         let version = &resident.version;
         let name = &version.manifest.twin;

@@ -1,4 +1,5 @@
-//! State that all sessions share: the twins in memory, the render queue, and the budget for answers.
+//! State that all sessions share: the twins in memory, the render queue, and the budget for
+//! answers.
 
 pub(crate) mod answer_budget;
 mod exports;
@@ -120,7 +121,8 @@ impl Engine {
         }))
     }
 
-    /// The version of every twin that `latest` stands for, and the damaged twins, which are also logged.
+    /// The version of every twin that `latest` stands for, and the damaged twins, which are also
+    /// logged.
     ///
     /// # Errors
     /// The directory of twins cannot be read.
@@ -175,8 +177,9 @@ impl Engine {
         self.queue.len()
     }
 
-    /// Lets a version count as the latest of its twin, whatever is committed, until the pin is dropped.
-    /// So a push can load its version before sessions open it: agents never wait for a push.
+    /// Lets a version count as the latest of its twin, whatever is committed, until the pin is
+    /// dropped. So a push can load its version before sessions open it: agents never wait for a
+    /// push.
     pub fn pin_latest(self: &Arc<Self>, twin: &str, number: u64) -> LatestPin {
         self.pins.lock().insert(twin.to_owned(), number);
         LatestPin { engine: self.clone(), twin: twin.to_owned() }
@@ -194,11 +197,13 @@ impl Engine {
         }
     }
 
-    /// Opens a version and loads the sections that some frames of it need, so that sessions at these viewpoints do not
-    /// wait when they switch to it. `frames` has the viewpoints of each frame.
+    /// Opens a version and loads the sections that some frames of it need, so that sessions at
+    /// these viewpoints do not wait when they switch to it. `frames` has the viewpoints of each
+    /// frame.
     ///
-    /// Loads only sections that fit into memory in addition to those that sessions need now or soon, which are loaded
-    /// first, and returns after [`limits::PRELOAD_TIMEOUT`] even if something is still missing.
+    /// Loads only sections that fit into memory in addition to those that sessions need now or
+    /// soon, which are loaded first, and returns after [`limits::PRELOAD_TIMEOUT`] even if
+    /// something is still missing.
     ///
     /// # Errors
     /// The version cannot be opened.
@@ -241,7 +246,8 @@ impl Engine {
         self.queue.backend().name()
     }
 
-    /// Properties of the backend on which pixels depend in addition to its name, such as its instruction set.
+    /// Properties of the backend on which pixels depend in addition to its name, such as its
+    /// instruction set.
     pub(crate) fn backend_detail(&self) -> String {
         self.queue.backend().detail()
     }
@@ -251,8 +257,8 @@ impl Engine {
         self.cache.stats()
     }
 
-    /// Opens a version of a twin, or the one that counts as its latest. This loads its manifest; Gaussians
-    /// are loaded when a frame needs them.
+    /// Opens a version of a twin, or the one that counts as its latest. This loads its manifest;
+    /// Gaussians are loaded when a frame needs them.
     ///
     /// # Errors
     /// The version does not exist or cannot be read.
@@ -271,8 +277,8 @@ impl Engine {
         Ok(opened.await??)
     }
 
-    /// Returns the asset of a hash, 64 lower-case hex digits. It stays in memory until its last copy is dropped. Blocks
-    /// while the asset is read, unless it is in memory already.
+    /// Returns the asset of a hash, 64 lower-case hex digits. It stays in memory until its last
+    /// copy is dropped. Blocks while the asset is read, unless it is in memory already.
     ///
     /// # Errors
     /// There is no such asset, or it is damaged, or there is too little memory.
@@ -280,9 +286,9 @@ impl Engine {
         Ok(self.cache.actor(hash)?)
     }
 
-    /// Keeps an asset that is not in the store in memory until its last copy is dropped, or returns the asset of the
-    /// same key if there is one. `key` identifies all inputs that the asset is made from, and is not a hash of the
-    /// store. The memory counts as that of twins.
+    /// Keeps an asset that is not in the store in memory until its last copy is dropped, or returns
+    /// the asset of the same key if there is one. `key` identifies all inputs that the asset is
+    /// made from, and is not a hash of the store. The memory counts as that of twins.
     ///
     /// # Errors
     /// There is no room for it.
@@ -294,8 +300,8 @@ impl Engine {
         Ok(self.cache.hold_actor(key, asset)?)
     }
 
-    /// Bakes the cube map of the twin's sky that frames of this profile look up, so that no frame waits
-    /// for it.
+    /// Bakes the cube map of the twin's sky that frames of this profile look up, so that no frame
+    /// waits for it.
     ///
     /// # Errors
     /// [`SessionError::Sky`] if the profile's `sky_error` is below what the finest map has.
@@ -308,14 +314,15 @@ impl Engine {
         baked.map_err(SessionError::Sky)
     }
 
-    /// What of a version is near a place. Sessions of the same version share it. Blocks: a long drive has half a million
-    /// keyframes and sections.
+    /// What of a version is near a place. Sessions of the same version share it. Blocks: a long
+    /// drive has half a million keyframes and sections.
     pub(crate) fn spatial_index(&self, resident: &Resident) -> Arc<SpatialIndex> {
         let hash = &resident.version.hash;
         if let Some(index) = self.indexes.lock().get(hash).and_then(Weak::upgrade) {
             return index;
         }
-        // Built without the lock: another session may build the same one, and then one of both is dropped.
+        // Built without the lock: another session may build the same one, and then one of both is
+        // dropped.
         let index = Arc::new(SpatialIndex::new(resident.version.clone()));
         let mut indexes = self.indexes.lock();
         indexes.retain(|_, index| index.strong_count() > 0);
@@ -328,8 +335,8 @@ impl Engine {
         TwinSolids::new(self.catalog().clone(), index, self.solid_blocks.clone(), ego_box)
     }
 
-    /// Reserves the memory that the worst frame of a rig needs, wherever in the twin the ego is, and the buffers and
-    /// images that the frame needs in addition to the scene.
+    /// Reserves the memory that the worst frame of a rig needs, wherever in the twin the ego is,
+    /// and the buffers and images that the frame needs in addition to the scene.
     ///
     /// # Errors
     /// Too little memory is left.
@@ -342,8 +349,8 @@ impl Engine {
         Ok(run_blocking(move || resident.reserve_with(extent, &profile, frame)).await??)
     }
 
-    /// Buffers and images that a frame of some views needs in addition to its scene. The frame renders `rendered` bytes
-    /// of images, and its session holds `images` bytes of them.
+    /// Buffers and images that a frame of some views needs in addition to its scene. The frame
+    /// renders `rendered` bytes of images, and its session holds `images` bytes of them.
     pub(crate) fn frame_bytes(&self, views: &[View], rendered: u64, images: u64) -> FrameBytes {
         let pixels: u64 = views.iter().map(|view| view.camera.pixels() as u64).sum();
         let is_large = pixels > limits::LARGE_PIXELS;
@@ -361,13 +368,14 @@ impl Engine {
         run_blocking(move || resident.worst_case_bytes_with(extent, &profile)).await
     }
 
-    /// Runs `work` on a render thread when its session is next. Returns its result and how long it was queued.
+    /// Runs `work` on a render thread when its session is next. Returns its result and how long it
+    /// was queued.
     ///
     /// # Errors
     /// [`SessionError::Busy`] if the queue is full, or earlier frames leave it no time;
-    /// [`SessionError::Crashed`] if `work` panicked; and [`SessionError::DeadlineExceeded`] if there is no
-    /// result by the deadline. Work that has not
-    /// started by then never starts; work that has is finished, and its result is discarded.
+    /// [`SessionError::Crashed`] if `work` panicked; and [`SessionError::DeadlineExceeded`] if
+    /// there is no result by the deadline. Work that has not started by then never starts; work
+    /// that has is finished, and its result is discarded.
     pub async fn run<T: Send + 'static>(
         &self,
         cost: FrameCost,
@@ -387,7 +395,8 @@ impl Engine {
         self.step_timeout
     }
 
-    /// Counts bytes that hold answers outside of the sessions against the budget for answers, until the share is dropped.
+    /// Counts bytes that hold answers outside of the sessions against the budget for answers, until
+    /// the share is dropped.
     ///
     /// # Errors
     /// [`SessionError::Busy`] if fewer are left.
@@ -411,8 +420,8 @@ impl Engine {
         self.exports.is_some()
     }
 
-    /// Waits until the export of `episode` has ended, or all exports if it is `None`; at most `longest`. Returns
-    /// whether they have ended.
+    /// Waits until the export of `episode` has ended, or all exports if it is `None`; at most
+    /// `longest`. Returns whether they have ended.
     pub async fn wait_for_exports(&self, episode: Option<&str>, longest: Duration) -> bool {
         match &self.exports {
             Some(exports) => exports.wait(episode, longest).await,

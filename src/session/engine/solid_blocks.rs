@@ -52,22 +52,22 @@ impl SolidBlocks {
         let mut held = self.held.lock();
         held.uses += 1;
         let block = HeldBlock { last_use: held.uses, solids };
-        held.bytes += bytes_of(&block);
+        held.bytes += held_bytes(&block);
         if let Some(replaced) = held.blocks.insert(section, block) {
-            held.bytes -= bytes_of(&replaced);
+            held.bytes -= held_bytes(&replaced);
         }
         while held.bytes > self.limit_bytes && held.blocks.len() > 1 {
             let oldest = held.blocks.iter().min_by_key(|(_, block)| block.last_use);
             let Some(oldest) = oldest.map(|(section, _)| *section) else { break };
             if let Some(dropped) = held.blocks.remove(&oldest) {
-                held.bytes -= bytes_of(&dropped);
+                held.bytes -= held_bytes(&dropped);
             }
         }
     }
 }
 
 /// Memory of a block and of its place in the table, in bytes.
-fn bytes_of(block: &HeldBlock) -> usize {
+fn held_bytes(block: &HeldBlock) -> usize {
     block.solids.bytes() + 128
 }
 
@@ -103,7 +103,8 @@ mod tests {
         for section in [0, 2, 3] {
             assert!(blocks.get(&key(section)).is_some(), "{section}");
         }
-        // The same section again takes no more memory; one that is larger than the limit stays until the next.
+        // The same section again takes no more memory; one that is larger than the limit stays
+        // until the next.
         blocks.insert(key(3), one.clone());
         assert!(blocks.get(&key(0)).is_some());
         blocks.insert(key(4), solids(1000));

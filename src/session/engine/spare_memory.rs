@@ -1,5 +1,5 @@
-//! Memory of a dropped answer, kept for the next one. New memory is zeroed, which takes 0.1 ms per 3 MB, although the
-//! renderer then overwrites every byte.
+//! Memory of a dropped answer, kept for the next one. New memory is zeroed, which takes 0.1 ms per
+//! 3 MB, although the renderer then overwrites every byte.
 
 use std::fmt;
 
@@ -7,7 +7,8 @@ use parking_lot::Mutex;
 
 use crate::limits;
 
-/// One block of memory, at most [`limits::SPARE_ANSWER_BYTES`]. The budget for answers does not count it.
+/// One block of memory, at most [`limits::SPARE_ANSWER_BYTES`]. The budget for answers does not
+/// count it.
 #[derive(Default)]
 pub(crate) struct SpareMemory(Mutex<Spare>);
 
@@ -19,7 +20,8 @@ struct Spare {
 }
 
 impl SpareMemory {
-    /// Returns `count` words with any values: the spare ones if they are at least `count` and at most twice as many.
+    /// Returns `count` words with any values: the spare ones if they are at least `count` and at
+    /// most twice as many.
     pub(crate) fn take(&self, count: usize) -> Vec<u64> {
         let mut spare = self.0.lock();
         if !(count..=2 * count).contains(&spare.words.capacity()) {
@@ -32,8 +34,8 @@ impl SpareMemory {
         words
     }
 
-    /// Keeps the words of a dropped answer. Of these and the words that are kept already, the larger block stays,
-    /// unless the kept block was too small or too large for a request since.
+    /// Keeps the words of a dropped answer. Of these and the words that are kept already, the
+    /// larger block stays, unless the kept block was too small or too large for a request since.
     pub(crate) fn recycle(&self, mut words: Vec<u64>) {
         if words.capacity() * size_of::<u64>() <= limits::SPARE_ANSWER_BYTES {
             let mut spare = self.0.lock();

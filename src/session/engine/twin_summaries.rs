@@ -17,11 +17,8 @@ pub struct TwinSummary {
     pub number: u64,
     /// BLAKE3 of the version's manifest, in hex.
     pub hash: String,
-    /// Number of Gaussians.
     pub gaussians: u64,
-    /// Spherical-harmonic degree.
     pub sh_degree: u8,
-    /// Its recorded trajectories.
     pub trajectories: Vec<TrajectorySummary>,
 }
 
@@ -39,7 +36,6 @@ pub struct TwinSummaries {
 pub struct DamagedSummary {
     /// Name of the twin.
     pub name: String,
-    /// The damage.
     pub reason: String,
 }
 
@@ -50,12 +46,11 @@ pub struct TrajectorySummary {
     pub name: String,
     /// Length, in metres.
     pub length_m: f64,
-    /// Number of keyframes.
     pub keyframes: u64,
 }
 
-/// Summaries of the twins of a catalog. A manifest may have megabytes and never changes, so each is read
-/// once.
+/// Summaries of the twins of a catalog. A manifest may have megabytes and never changes, so each is
+/// read once.
 #[derive(Debug)]
 pub(crate) struct SummaryCache {
     catalog: Catalog,
@@ -67,8 +62,8 @@ impl SummaryCache {
         Self { catalog, known: Mutex::default() }
     }
 
-    /// The latest version of every twin, or the version that `pinned` returns for a twin; and the damaged
-    /// twins, which do not hide the others.
+    /// The latest version of every twin, or the version that `pinned` returns for a twin; and the
+    /// damaged twins, which do not hide the others.
     ///
     /// # Errors
     /// The directory of twins cannot be read.
@@ -77,26 +72,29 @@ impl SummaryCache {
         pinned: &dyn Fn(&str) -> Option<u64>,
     ) -> Result<TwinSummaries, StoreError> {
         let TwinList { twins: listed, damaged } = self.catalog.twins()?;
-        let mut damaged: Vec<DamagedSummary> =
-            damaged.into_iter().map(|twin| DamagedSummary::of(twin.name, &twin.error)).collect();
-        // The lock is held while manifests are read, so that simultaneous requests read each one once.
+        let mut damaged: Vec<DamagedSummary> = damaged
+            .into_iter()
+            .map(|twin| DamagedSummary::from_error(twin.name, &twin.error))
+            .collect();
+        // The lock is held while manifests are read, so that simultaneous requests read each one
+        // once.
         let mut known = self.known.lock();
         let mut fresh = BTreeMap::new();
         for listing in listed {
             // Looked up after the log is read: a push pins the latest version before it commits.
             let pinned = pinned(&listing.name);
             let number = pinned.unwrap_or(listing.number);
-            // `listing.hash` is that of the latest version, so a pinned version is compared only by number: numbers
-            // only rise while a version is pinned.
+            // `listing.hash` is that of the latest version, so a pinned version is compared only by
+            // number: numbers only rise while a version is pinned.
             let is_current = |summary: &Arc<TwinSummary>| {
                 summary.number == number && (pinned.is_some() || summary.hash == listing.hash)
             };
             let summary = match known.remove(&listing.name).filter(is_current) {
                 Some(summary) => summary,
                 None => match self.catalog.version(&listing.name, Some(number)) {
-                    Ok(version) => Arc::new(TwinSummary::of(version)),
+                    Ok(version) => Arc::new(TwinSummary::from_version(version)),
                     Err(error) => {
-                        damaged.push(DamagedSummary::of(listing.name, &error));
+                        damaged.push(DamagedSummary::from_error(listing.name, &error));
                         continue;
                     }
                 },
@@ -121,18 +119,22 @@ impl SummaryCache {
 }
 
 impl DamagedSummary {
-    fn of(name: String, error: &StoreError) -> Self {
+    fn from_error(name: String, error: &StoreError) -> Self {
         Self { name, reason: error.to_string() }
     }
 }
 
 impl TwinSummary {
-    fn of(version: Version) -> Self {
+    fn from_version(version: Version) -> Self {
         let Version { number, hash, manifest, .. } = version;
         Self {
             gaussians: manifest.gaussians(),
             sh_degree: manifest.sh_degree,
-            trajectories: manifest.trajectories.iter().map(TrajectorySummary::of).collect(),
+            trajectories: manifest
+                .trajectories
+                .iter()
+                .map(TrajectorySummary::from_trajectory)
+                .collect(),
             name: manifest.twin,
             number,
             hash,
@@ -142,7 +144,7 @@ impl TwinSummary {
 
 impl TrajectorySummary {
     /// The summary of a trajectory.
-    pub fn of(trajectory: &Trajectory) -> Self {
+    pub fn from_trajectory(trajectory: &Trajectory) -> Self {
         Self {
             name: trajectory.name.clone(),
             length_m: trajectory.length_m(),

@@ -36,13 +36,14 @@ impl ObservationBuffer {
         Ok(Self { words, len, header, start: header, share })
     }
 
-    /// The message: the header, its length prefix included, and the tensors. Without a header only the tensors.
+    /// The message: the header, its length prefix included, and the tensors. Without a header only
+    /// the tensors.
     pub fn bytes(&self) -> &[u8] {
         &bytemuck::cast_slice(&self.words)[self.start..self.len]
     }
 
-    /// Makes the message begin with a header of `bytes`, its length prefix included, and returns them. `None` if fewer
-    /// are reserved.
+    /// Makes the message begin with a header of `bytes`, its length prefix included, and returns
+    /// them. `None` if fewer are reserved.
     pub fn header_mut(&mut self, bytes: usize) -> Option<&mut [u8]> {
         let header = self.header;
         self.start = header.checked_sub(bytes)?;
@@ -62,7 +63,8 @@ impl ObservationBuffer {
         let count = len.div_ceil(WORD_BYTES);
         let more = count.saturating_sub(self.words.capacity());
         self.share.merge(self.share.budget().reserve((more * WORD_BYTES) as u64)?);
-        // Exactly: `Vec` would otherwise reserve up to twice as much, which the budget would not count.
+        // Exactly: `Vec` would otherwise reserve up to twice as much, which the budget would not
+        // count.
         self.words.reserve_exact(count - self.words.len());
         self.words.resize(count, 0);
         self.len = len;

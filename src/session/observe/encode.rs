@@ -16,7 +16,6 @@ use crate::repair::status::ImageRepair;
 pub enum Encoding {
     /// JPEG, 4:2:0, of a quality from 1 to 100.
     Jpeg(u8),
-    /// PNG.
     Png,
     /// Pixels as they are.
     Raw,
@@ -26,7 +25,8 @@ pub enum Encoding {
 pub(crate) struct EncodedImage {
     /// BLAKE3 of its pixels.
     pub(crate) hash: blake3::Hash,
-    /// The JPEG or PNG file; for raw images, a copy of the pixels if a later observation shows them.
+    /// The JPEG or PNG file; for raw images, a copy of the pixels if a later observation shows
+    /// them.
     pub(crate) file: Vec<u8>,
     /// Its trust, if the session's images come with one.
     pub(crate) trust: Option<Trust>,
@@ -51,7 +51,7 @@ pub(crate) struct AppliedEffects {
 
 impl EncodedImage {
     /// An image with nothing but a hash.
-    fn of(hash: blake3::Hash) -> Self {
+    fn from_hash(hash: blake3::Hash) -> Self {
         Self {
             hash,
             file: Vec::new(),
@@ -79,14 +79,14 @@ pub(crate) fn encode(
         Encoding::Jpeg(quality) => jpeg(rgb8, width, height, quality)?,
         Encoding::Png => png(rgb8, width, height)?,
     };
-    Ok(EncodedImage { file, took: started.elapsed(), ..EncodedImage::of(hash) })
+    Ok(EncodedImage { file, took: started.elapsed(), ..EncodedImage::from_hash(hash) })
 }
 
 /// An image that is hashed and not encoded yet.
 pub(crate) fn hashed(rgb8: &[u8]) -> EncodedImage {
     let started = Instant::now();
     let hash = blake3::hash(rgb8);
-    EncodedImage { took: started.elapsed(), ..EncodedImage::of(hash) }
+    EncodedImage { took: started.elapsed(), ..EncodedImage::from_hash(hash) }
 }
 
 /// A PNG file of `[height, width, 3]` pixels.

@@ -9,8 +9,8 @@ use crate::error::SessionError;
 use crate::repair::status::ImageRepair;
 use crate::sensors::ImageSensor;
 
-/// The frames that coming decisions will show, in the order in which they were taken. Copies share the
-/// frames' bytes.
+/// The frames that coming decisions will show, in the order in which they were taken. Copies share
+/// the frames' bytes.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct FrameHistory(Vec<Arc<KeptFrame>>);
 
@@ -75,8 +75,8 @@ impl FrameHistory {
         self
     }
 
-    /// Drops the frames that no decision at or after a time, in microseconds, will show. Frames that the present
-    /// observation shows stay, because a snapshot of the present shows them again.
+    /// Drops the frames that no decision at or after a time, in microseconds, will show. Frames
+    /// that the present observation shows stay, because a snapshot of the present shows them again.
     pub(crate) fn drop_unneeded(&mut self, schedule: &Schedule, time_us: i64) {
         self.0.retain(|kept| schedule.is_shown_from(kept.frame.camera, kept.frame.due_us, time_us));
     }

@@ -1,9 +1,9 @@
 //! JPEG files.
 //!
-//! Two encoders: the crate jpeg-encoder, which is always available, and libjpeg-turbo, with the feature `turbojpeg`.
-//! Both write baseline JPEG, 4:2:0, with the quantisation tables of annex K scaled by the quality as the Independent
-//! JPEG Group does, so that sizes and errors are alike; the bytes are not. With either one the same pixels give the
-//! same bytes.
+//! Two encoders: the crate jpeg-encoder, which is always available, and libjpeg-turbo, with the
+//! feature `turbojpeg`. Both write baseline JPEG, 4:2:0, with the quantisation tables of annex K
+//! scaled by the quality as the Independent JPEG Group does, so that sizes and errors are alike;
+//! the bytes are not. With either one the same pixels give the same bytes.
 
 /// A JPEG file, 4:2:0, of `[height, width, 3]` pixels.
 ///

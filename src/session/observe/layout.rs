@@ -1,5 +1,5 @@
-//! Layout of the observations of a session: the cameras, their encoding and maps, and which frames of them are rendered
-//! when.
+//! Layout of the observations of a session: the cameras, their encoding and maps, and which frames
+//! of them are rendered when.
 
 use std::collections::BTreeMap;
 
@@ -26,23 +26,24 @@ use crate::viewpoint::viewpoints;
 /// Bytes of the header's length, little-endian, which comes before the header.
 pub const HEADER_PREFIX_BYTES: usize = 8;
 
-/// Room for the parts of the header that do not repeat: names of at most 64 bytes, hashes of 64, the ego's
-/// 15 numbers of at most 24 digits, 16 stages of 60 bytes: below 2 kB.
+/// Room for the parts of the header that do not repeat: names of at most 64 bytes, hashes of 64,
+/// the ego's 15 numbers of at most 24 digits, 16 stages of 60 bytes: below 2 kB.
 const HEADER_BASE_BYTES: usize = 4096;
 
-/// Room in the header per image: five tensors of at most 190 bytes, and 16 numbers of at most 24 digits,
-/// two names and a hash with their escaped keys, below 1,900 bytes; a lens of 12 numbers and a windshield
-/// of 42 with their keys, below 1,600 bytes.
+/// Room in the header per image: five tensors of at most 190 bytes, and 16 numbers of at most 24
+/// digits, two names and a hash with their escaped keys, below 1,900 bytes; a lens of 12 numbers
+/// and a windshield of 42 with their keys, below 1,600 bytes.
 const HEADER_IMAGE_BYTES: usize = 3584;
 
 /// Room in the header per image for the result of its repair: three texts, one of them a hash.
 const REPAIR_IMAGE_BYTES: usize = 256;
 
-/// Room in the header per image for the names of references: each has the names of a drive and of a camera, of 64 bytes,
-/// and a number.
+/// Room in the header per image for the names of references: each has the names of a drive and of a
+/// camera, of 64 bytes, and a number.
 const REFERENCES_IMAGE_BYTES: usize = MAX_REPORTED_REFERENCES * 160;
 
-/// Room in the header per image for the effects of its camera: five reasons, three numbers and a hash.
+/// Room in the header per image for the effects of its camera: five reasons, three numbers and a
+/// hash.
 const SENSOR_IMAGE_BYTES: usize = 512;
 
 /// Largest number of images of one answer, whether of several poses or of several times.
@@ -88,15 +89,18 @@ pub(crate) struct RigCapture {
     pub(crate) world_from_rig: Pose,
     /// When the pictures are taken, in microseconds since the episode's start.
     pub(crate) time_us: i64,
-    /// When the frames are due. Only a camera with sensor effects shows a picture of an earlier time.
+    /// When the frames are due. Only a camera with sensor effects shows a picture of an earlier
+    /// time.
     pub(crate) due_us: i64,
     /// Whether the effects of sensors apply. They do not for `observe`, which shows the scene.
     pub(crate) has_sensor_effects: bool,
     /// Indices of the cameras; there may be none.
     pub(crate) cameras: Vec<usize>,
-    /// Ascending indices of the cameras for whose views the levels of detail are chosen: at least [`Self::cameras`].
+    /// Ascending indices of the cameras for whose views the levels of detail are chosen: at least
+    /// [`Self::cameras`].
     pub(crate) detail_for: Vec<usize>,
-    /// Whether the observation shows the images now. Otherwise they are rendered for the frame history.
+    /// Whether the observation shows the images now. Otherwise they are rendered for the frame
+    /// history.
     pub(crate) shown: bool,
 }
 
@@ -109,7 +113,7 @@ pub(crate) struct EffectSeed {
 }
 
 impl EffectSeed {
-    pub(crate) fn of(episode: &Episode) -> Self {
+    pub(crate) fn from_episode(episode: &Episode) -> Self {
         Self { seed: episode.seed(), begin_us: episode.begin_us() }
     }
 }
@@ -148,7 +152,7 @@ impl ObservationLayout {
             return Err(SessionError::OutOfRange { field: "outputs.quality", must });
         }
         let visible_share = |RigCamera { camera, .. }: &RigCamera| {
-            FieldMask::of(camera).map(|field| field.visible_share(camera))
+            FieldMask::from_camera(camera).map(|field| field.visible_share(camera))
         };
         let visible_shares = cameras.iter().map(visible_share).collect();
         let layout = Self {
@@ -165,13 +169,14 @@ impl ObservationLayout {
         Ok(layout)
     }
 
-    /// Reserves room in the headers for the results of repair. Comes before [`Self::reserve_header`].
+    /// Reserves room in the headers for the results of repair. Comes before
+    /// [`Self::reserve_header`].
     pub(crate) fn reserve_repair(&mut self) {
         self.image_bytes += REPAIR_IMAGE_BYTES;
     }
 
-    /// Reserves room in the headers for the names of the images that a repair model compares with. Comes before
-    /// [`Self::reserve_header`].
+    /// Reserves room in the headers for the names of the images that a repair model compares with.
+    /// Comes before [`Self::reserve_header`].
     ///
     /// # Errors
     /// The largest header would be longer than clients accept.
@@ -193,8 +198,8 @@ impl ObservationLayout {
     /// Adds effects of the sensors.
     ///
     /// # Errors
-    /// Names the first setting that is out of range, or `sensors` if the largest header would be longer than clients
-    /// accept.
+    /// Names the first setting that is out of range, or `sensors` if the largest header would be
+    /// longer than clients accept.
     pub(crate) fn add_sensors(
         &mut self,
         settings: Sensors,
@@ -251,7 +256,8 @@ impl ObservationLayout {
         FrameSource { sensor, name, seed, period_us, begin_us }.at(due_us)
     }
 
-    /// The effects on the pixels of a camera's picture of a time, in microseconds, if there are any.
+    /// The effects on the pixels of a camera's picture of a time, in microseconds, if there are
+    /// any.
     pub(crate) fn pixel_effects(
         &self,
         camera: usize,
@@ -261,7 +267,7 @@ impl ObservationLayout {
         let sensor = self.sensor(camera)?;
         let mounted = &self.cameras[camera];
         let size_px = [mounted.camera.width_px, mounted.camera.height_px];
-        PixelEffects::of(sensor, of.seed, &mounted.name, taken_us, size_px)
+        PixelEffects::new(sensor, of.seed, &mounted.name, taken_us, size_px)
     }
 
     pub(crate) fn cameras(&self) -> &[RigCamera] {
@@ -285,27 +291,30 @@ impl ObservationLayout {
         &self.schedule
     }
 
-    /// Captures to render for an observation of the present time of an episode: the frames that this observation or a
-    /// later one contains and that are not in the history. One capture per time; the last one is that of the present
-    /// time, and may have no cameras. Cameras whose picture is of another time have captures of their own.
+    /// Captures to render for an observation of the present time of an episode: the frames that
+    /// this observation or a later one contains and that are not in the history. One capture per
+    /// time; the last one is that of the present time, and may have no cameras. Cameras whose
+    /// picture is of another time have captures of their own.
     pub(crate) fn captures(&self, episode: &Episode, history: &FrameHistory) -> Vec<RigCapture> {
         self.captures_beside(episode, &|camera, time_us| history.find(camera, time_us).is_some())
     }
 
-    /// As [`Self::captures`], with a history of the frames of which `is_kept` (camera, time in microseconds) is
-    /// true.
+    /// As [`Self::captures`], with a history of the frames of which `is_kept` (camera, time in
+    /// microseconds) is true.
     pub(crate) fn captures_beside(
         &self,
         episode: &Episode,
         is_kept: &dyn Fn(usize, i64) -> bool,
     ) -> Vec<RigCapture> {
         let now_us = episode.time_us();
-        // By the time when they are due, and that when their pictures are taken, which is not later.
+        // By the time when they are due, and that when their pictures are taken, which is not
+        // later.
         let mut cameras_by_time = BTreeMap::from([([now_us, now_us], Vec::new())]);
         for camera in 0..self.cameras.len() {
             for due_us in self.schedule.due(camera, now_us) {
                 if due_us >= episode.begin_us() && !is_kept(camera, due_us) {
-                    let taken_us = self.delivery(camera, EffectSeed::of(episode), due_us).taken_us;
+                    let taken_us =
+                        self.delivery(camera, EffectSeed::from_episode(episode), due_us).taken_us;
                     cameras_by_time.entry([due_us, taken_us]).or_default().push(camera);
                 }
             }
@@ -337,14 +346,15 @@ impl ObservationLayout {
         poses.into_iter().map(capture).collect()
     }
 
-    /// The cameras for whose views the levels of detail of a frame with sensor effects are chosen. If a camera may
-    /// deliver a different picture from the one that is due, these are all cameras of the rig, so that no image depends
-    /// on which frames are lost.
+    /// The cameras for whose views the levels of detail of a frame with sensor effects are chosen.
+    /// If a camera may deliver a different picture from the one that is due, these are all cameras
+    /// of the rig, so that no image depends on which frames are lost.
     pub(crate) fn detail_for(&self, cameras: &[usize]) -> Vec<usize> {
         let mut sensors = self.sensors.iter().flat_map(|sensors| &sensors.cameras);
-        match sensors.any(CameraSensor::changes_times) {
-            true => (0..self.cameras.len()).collect(),
-            false => cameras.to_vec(),
+        if sensors.any(CameraSensor::changes_times) {
+            (0..self.cameras.len()).collect()
+        } else {
+            cameras.to_vec()
         }
     }
 
@@ -359,7 +369,8 @@ impl ObservationLayout {
         episode.views(&self.cameras, &capture.cameras, capture.world_from_rig, capture.time_us)
     }
 
-    /// Checks that the images of `rigs` poses of the rig, which `field` of a request asks for, fit one answer.
+    /// Checks that the images of `rigs` poses of the rig, which `field` of a request asks for, fit
+    /// one answer.
     pub(super) fn check_size(&self, field: &'static str, rigs: usize) -> Result<(), SessionError> {
         let limit = self.pixel_limit();
         let pixels = self.rig_pixels() * rigs as u64;
@@ -369,14 +380,15 @@ impl ObservationLayout {
         Ok(())
     }
 
-    /// Pixels of the largest answer to a step, which take as many bytes without normals and instances.
+    /// Pixels of the largest answer to a step, which take as many bytes without normals and
+    /// instances.
     pub(crate) fn step_pixels(&self) -> u64 {
         let pixels = self.rig_pixels() * self.schedule.frames() as u64;
         pixels * limits::ANSWER_PIXELS / self.pixel_limit()
     }
 
-    /// Bytes of a session's answers to steps: the one that is made, and the previous one, which is kept for a repeated
-    /// request. Frames of earlier times are not counted.
+    /// Bytes of a session's answers to steps: the one that is made, and the previous one, which is
+    /// kept for a repeated request. Frames of earlier times are not counted.
     pub(crate) fn answers_bytes(&self) -> u64 {
         let PixelMaps { depth, opacity, normals, instances } = self.maps;
         let maps = [
@@ -393,8 +405,8 @@ impl ObservationLayout {
         2 * self.rig_pixels() * (maps + colour)
     }
 
-    /// Bytes of the images outside of the answer while a frame is rendered: pixels that are encoded, and maps from
-    /// which trust and normals are computed.
+    /// Bytes of the images outside of the answer while a frame is rendered: pixels that are
+    /// encoded, and maps from which trust and normals are computed.
     pub(crate) fn rendered_bytes(&self, has_trust: bool) -> u64 {
         let PixelMaps { depth, opacity, normals, .. } = self.maps;
         let pixels = if self.encoding == Encoding::Raw { 0 } else { 3 };
@@ -409,14 +421,9 @@ impl ObservationLayout {
 
     /// The most pixels of one answer: with normals or instances each takes more bytes.
     fn pixel_limit(&self) -> u64 {
-        let with_normals = match self.maps.normals {
-            true => limits::ANSWER_PIXELS / 2,
-            false => limits::ANSWER_PIXELS,
-        };
-        match self.maps.instances {
-            true => with_normals / 4 * 3,
-            false => with_normals,
-        }
+        let with_normals =
+            if self.maps.normals { limits::ANSWER_PIXELS / 2 } else { limits::ANSWER_PIXELS };
+        if self.maps.instances { with_normals / 4 * 3 } else { with_normals }
     }
 
     /// Reserves room in the headers for the state of a scenario with `actors` actors.
@@ -438,7 +445,8 @@ impl ObservationLayout {
         Err(SessionError::OutOfRange { field: "outputs.actors", must })
     }
 
-    /// Bytes to reserve for the header of an observation of some captures, including its length prefix.
+    /// Bytes to reserve for the header of an observation of some captures, including its length
+    /// prefix.
     pub(super) fn header_bytes(&self, captures: &[RigCapture]) -> usize {
         let rendered: usize = captures.iter().map(|capture| capture.cameras.len()).sum();
         // With several frames per camera, an observation contains more images than it renders.
@@ -465,8 +473,8 @@ impl ObservationLayout {
         !capture.shown || self.schedule.is_shown_after(camera, capture.due_us, capture.due_us)
     }
 
-    /// The frames of the history that a decision shows in addition to those of its own time: by camera, the newest
-    /// first.
+    /// The frames of the history that a decision shows in addition to those of its own time: by
+    /// camera, the newest first.
     pub(super) fn earlier_frames<'a>(
         &self,
         history: &'a FrameHistory,

@@ -114,7 +114,8 @@ pub enum TensorKind {
     Instances(usize),
     /// Colour: `[height, width, 3]` pixels, or the `[n]` bytes of a file.
     Rgb(usize),
-    /// Colour of an earlier image, by its index in [`Observation::history`]; shape as [`Self::Rgb`].
+    /// Colour of an earlier image, by its index in [`Observation::history`]; shape as
+    /// [`Self::Rgb`].
     PastRgb(usize),
 }
 
@@ -123,7 +124,6 @@ pub enum TensorKind {
 pub enum DType {
     /// 32-bit float, little-endian.
     F32,
-    /// Byte.
     U8,
     /// 16-bit unsigned integer, little-endian.
     U16,

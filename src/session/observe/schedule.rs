@@ -1,8 +1,8 @@
 //! Which frames are rendered: those that an observation shows, and no others.
 //!
-//! A camera takes a frame at every multiple of its period. The agent decides at every multiple of its own
-//! period, and then gets the last frames of each camera. Frames that no decision gets are not rendered. All
-//! times are in microseconds since the episode's start.
+//! A camera takes a frame at every multiple of its period. The agent decides at every multiple of
+//! its own period, and then gets the last frames of each camera. Frames that no decision gets are
+//! not rendered. All times are in microseconds since the episode's start.
 
 use std::collections::BTreeMap;
 
@@ -26,12 +26,13 @@ pub(crate) struct Schedule {
 }
 
 impl Schedule {
-    /// The schedule of some cameras, in the order of the images. A camera that `periods_us` does not name
-    /// takes a frame with every step of `dt_us`; without `decision_us`, the agent decides at every step.
+    /// The schedule of some cameras, in the order of the images. A camera that `periods_us` does
+    /// not name takes a frame with every step of `dt_us`; without `decision_us`, the agent decides
+    /// at every step.
     ///
     /// # Errors
-    /// Names the first value that is out of range or no multiple of a step, or the first camera that the
-    /// rig does not have.
+    /// Names the first value that is out of range or no multiple of a step, or the first camera
+    /// that the rig does not have.
     pub(crate) fn new(
         cameras: &[RigCamera],
         dt_us: i64,
@@ -102,22 +103,23 @@ impl Schedule {
         time_us.rem_euclid(self.decision_us) == 0
     }
 
-    /// When the frames of a camera were taken that the decision at `decision_us` shows, newest first.
+    /// When the frames of a camera were taken that the decision at `decision_us` shows, newest
+    /// first.
     pub(crate) fn shown_times(&self, camera: usize, decision_us: i64) -> impl Iterator<Item = i64> {
         let period_us = self.periods_us[camera];
         let newest = decision_us.div_euclid(period_us);
         (0..self.frames as i64).map(move |back| (newest - back) * period_us)
     }
 
-    /// When the frames of a camera were taken, up to `time_us`, that the next decision shows, newest
-    /// first. A decision at `time_us` itself is the next one.
+    /// When the frames of a camera were taken, up to `time_us`, that the next decision shows,
+    /// newest first. A decision at `time_us` itself is the next one.
     pub(crate) fn due(&self, camera: usize, time_us: i64) -> impl Iterator<Item = i64> {
         let next_us = time_us + (-time_us).rem_euclid(self.decision_us);
         self.shown_times(camera, next_us).filter(move |&taken_us| taken_us <= time_us)
     }
 
-    /// Whether the first decision at `time_us` or after it shows the frame of a camera that was taken at
-    /// `taken_us`. If it does not, no later one does.
+    /// Whether the first decision at `time_us` or after it shows the frame of a camera that was
+    /// taken at `taken_us`. If it does not, no later one does.
     pub(crate) fn is_shown_from(&self, camera: usize, taken_us: i64, time_us: i64) -> bool {
         self.is_shown_after(camera, taken_us, time_us - 1)
     }

@@ -1,18 +1,19 @@
 //! Trust: confidence in an image, from 1 (as recorded) to 0 (no information).
 //!
-//! A twin is accurate at the poses where it was recorded. The trust is a product of three factors. Two of them are one
-//! minus a measured share: of pixels that look down at the ground and have low opacity, and of rays to the ground that
-//! leave the twin. The third cannot be measured: from other poses, errors of the training become visible, and there is
-//! no recorded image to compare with. It decays exponentially with the distance and the rotation from the nearest
-//! recorded pose. The rate is a convention of this project; `tests/session/trust.rs` checks that the share of correct
+//! A twin is accurate at the poses where it was recorded. The trust is a product of three factors.
+//! Two of them are one minus a measured share: of pixels that look down at the ground and have low
+//! opacity, and of rays to the ground that leave the twin. The third cannot be measured: from other
+//! poses, errors of the training become visible, and there is no recorded image to compare with. It
+//! decays exponentially with the distance and the rotation from the nearest recorded pose. The rate
+//! is a convention of this project; `tests/session/trust.rs` checks that the share of correct
 //! pixels of a twin without training errors decays more slowly.
 //!
-//! It is computed on the render thread that finishes an image, from one in 256 of its pixels, while other
-//! cameras are still rendered. The nearest keyframe is found in an index of boxes of 64 keyframes
-//! ([`wildcity_scene::route`]), so that 84 km of keyframes are not searched one by one. An episode
-//! ends as `off_model` if the first factor of one of its poses was below
-//! [`limits::OFF_MODEL_TRUST`](crate::limits::OFF_MODEL_TRUST), whether or not images have a trust; and if the mean trust
-//! of an observation was, where they have one.
+//! It is computed on the render thread that finishes an image, from one in 256 of its pixels, while
+//! other cameras are still rendered. The nearest keyframe is found in an index of boxes of 64
+//! keyframes ([`wildcity_scene::route`]), so that 84 km of keyframes are not searched one by one.
+//! An episode ends as `off_model` if the first factor of one of its poses was below
+//! [`limits::OFF_MODEL_TRUST`](crate::limits::OFF_MODEL_TRUST), whether or not images have a trust;
+//! and if the mean trust of an observation was, where they have one.
 
 use std::collections::HashMap;
 
@@ -24,30 +25,31 @@ use wildcity_scene::chunk::{BLOCK_M, CELL_M};
 use wildcity_scene::geometry::{Bounds, Pose};
 use wildcity_scene::route::BoxIndex;
 
-/// Distance from the recorded poses at which the trust is 1/e, in metres; it is half at 3.5 m, in the next
-/// lane.
+/// Distance from the recorded poses at which the trust is 1/e, in metres; it is half at 3.5 m, in
+/// the next lane.
 const DECAY_M: f64 = 5.0;
 
-/// Angle from the recorded pose at which the trust is 1/e, in radians. When a rig rotates in place, its cameras look in
-/// directions that its other cameras recorded, so this decay is slow.
+/// Angle from the recorded pose at which the trust is 1/e, in radians. When a rig rotates in place,
+/// its cameras look in directions that its other cameras recorded, so this decay is slow.
 const DECAY_RAD: f64 = 12.0;
 
-/// In the search for the nearest recorded pose, a rotation of one radian counts as this distance, in metres.
+/// In the search for the nearest recorded pose, a rotation of one radian counts as this distance,
+/// in metres.
 const METRES_PER_RAD: f64 = DECAY_M / DECAY_RAD;
 
-/// Distance between sampled pixels, in rows and in columns. An image of 1440 x 928 px has 5,220 samples, one
-/// per 16 x 16 px, so that a share has a standard error of at most 0.7 %.
+/// Distance between sampled pixels, in rows and in columns. An image of 1440 x 928 px has 5,220
+/// samples, one per 16 x 16 px, so that a share has a standard error of at most 0.7 %.
 const PIXEL_STRIDE: usize = 16;
 
-/// The rays of every fourth of these samples, in rows and in columns, are followed through the map. An image
-/// of 1440 x 928 px has 345 of them, one per 64 x 64 px.
+/// The rays of every fourth of these samples, in rows and in columns, are followed through the map.
+/// An image of 1440 x 928 px has 345 of them, one per 64 x 64 px.
 const RAY_STRIDE: usize = 4;
 
 /// How far a ray is followed, in metres: through 13 blocks.
 const RAY_M: f64 = 200.0;
 
-/// A ray that descends less than this per metre counts as looking at the horizon and not at the ground: from
-/// 1.6 m above a road, it meets the road at a distance of more than 80 m.
+/// A ray that descends less than this per metre counts as looking at the horizon and not at the
+/// ground: from 1.6 m above a road, it meets the road at a distance of more than 80 m.
 const MIN_DESCENT: f64 = 0.02;
 
 /// A pixel with less opacity is a hole.
@@ -64,8 +66,8 @@ pub struct Trust {
     pub angle_rad: f64,
     /// Share of pixels with less than half opacity, of those that look down at the ground.
     pub low_coverage: f64,
-    /// Of the rays that look down at the ground, the share that meets no block of the twin within 200 m. For an image
-    /// without such rays: 1 if the twin has no block within 200 m, else 0.
+    /// Of the rays that look down at the ground, the share that meets no block of the twin within
+    /// 200 m. For an image without such rays: 1 if the twin has no block within 200 m, else 0.
     pub outside: f64,
 }
 
@@ -218,7 +220,7 @@ impl TrainingCoverage {
     /// Whether the twin has a block within [`RAY_M`], in any direction.
     fn is_near_content(&self, from_m: DVec3) -> bool {
         let around = (RAY_M / BLOCK_M) as i64;
-        let here = [from_m.x, from_m.y].map(|m| block_of(m) as i64);
+        let here = [from_m.x, from_m.y].map(|m| block_index(m) as i64);
         (-around..=around).any(|x| {
             (-around..=around).any(|y| self.heights_m.contains_key(&[here[0] + x, here[1] + y]))
         })
@@ -228,7 +230,7 @@ impl TrainingCoverage {
     /// descends, and has unit length.
     fn meets_content(&self, from_m: DVec3, ray: DVec3) -> bool {
         // From block to block through the map (Amanatides and Woo 1987).
-        let mut block = [block_of(from_m.x), block_of(from_m.y)];
+        let mut block = [block_index(from_m.x), block_index(from_m.y)];
         let mut enter_m = 0.0;
         while enter_m < RAY_M {
             // The ray leaves the block through the nearer of the two walls that it moves towards.
@@ -256,8 +258,8 @@ impl TrainingCoverage {
     }
 }
 
-/// Index of the block at a coordinate, in x or in y. Cells, and so blocks, are offset by half a cell from the
-/// origin.
-fn block_of(m: f64) -> f64 {
+/// Index of the block at a coordinate, in x or in y. Cells, and so blocks, are offset by half a
+/// cell from the origin.
+fn block_index(m: f64) -> f64 {
     ((m + 0.5 * CELL_M) / BLOCK_M).floor()
 }

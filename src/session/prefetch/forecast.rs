@@ -32,12 +32,13 @@ struct FollowedDrive<'a> {
 }
 
 impl EgoForecast<'_> {
-    /// Poses (`world_from_rig`) to prefetch, the soonest first: the exact poses of the next steps, then
-    /// poses some metres apart as far as the steps reach, then poses along the hint.
+    /// Poses (`world_from_rig`) to prefetch, the soonest first: the exact poses of the next steps,
+    /// then poses some metres apart as far as the steps reach, then poses along the hint.
     ///
-    /// The exact poses matter: levels of detail change at exact distances, so that a pose two metres away may need a
-    /// different section. Near a recorded drive and not against its direction, the ego is assumed to follow it, at its
-    /// current offset and angle; otherwise it is assumed to drive straight.
+    /// The exact poses matter: levels of detail change at exact distances, so that a pose two
+    /// metres away may need a different section. Near a recorded drive and not against its
+    /// direction, the ego is assumed to follow it, at its current offset and angle; otherwise it is
+    /// assumed to drive straight.
     pub(crate) fn places(&self) -> Vec<(Urgency, Pose)> {
         let step_m = self.last_step_m.length();
         let moves = step_m > limits::STANDSTILL_STEP_M;
@@ -92,10 +93,11 @@ impl EgoForecast<'_> {
     }
 }
 
-/// The part of a hint that is still ahead of an ego at `now`: the poses after the last one that the ego is near.
+/// The part of a hint that is still ahead of an ego at `now`: the poses after the last one that the
+/// ego is near.
 ///
-/// A hint may lead back to its start. So a pose counts as passed only if it is not much farther along the
-/// hint than the ego is from the hint's first pose.
+/// A hint may lead back to its start. So a pose counts as passed only if it is not much farther
+/// along the hint than the ego is from the hint's first pose.
 pub(crate) fn remaining_hint(hint: &[Pose], now: Pose) -> &[Pose] {
     let near_m = 2.0 * limits::PREFETCH_SPACING_M;
     let Some(first) = hint.first() else { return hint };

@@ -12,7 +12,8 @@ pub(crate) struct RecordedDrive {
     poses: Vec<Pose>,
     /// Distance of each pose along the drive, in metres.
     stations_m: Vec<f64>,
-    /// The boxes of the segments from each pose to the next; of a single pose, the box of that pose.
+    /// The boxes of the segments from each pose to the next; of a single pose, the box of that
+    /// pose.
     segments: BoxIndex,
 }
 
@@ -63,15 +64,16 @@ impl RecordedDrive {
                 distance_m: (to_point_m - t * segment_m).length(),
             }
         };
-        // The distance to a segment is not below that to its box, except for rounding: among equally near
-        // segments, rounding may decide.
+        // The distance to a segment is not below that to its box, except for rounding: among
+        // equally near segments, rounding may decide.
         let distance_to = |index: usize| on_segment(index).distance_m;
         let (index, distance_m) = self.segments.min_cost(point_m, distance_to)?;
         let station_m = self.stations_m[index] + on_segment(index).station_m;
         Some(NearestPoint { station_m, distance_m })
     }
 
-    /// The pose at a distance along the drive, in metres. Beyond its end the drive continues straight.
+    /// The pose at a distance along the drive, in metres. Beyond its end the drive continues
+    /// straight.
     pub(super) fn pose_at(&self, station_m: f64) -> Pose {
         let after = self.stations_m.partition_point(|&m| m < station_m);
         let last = self.poses.len() - 1;

@@ -17,7 +17,6 @@ use crate::scenario::past::ActorPast;
 /// Where the actors were up to a frame of a record.
 pub(super) struct ActorReplay<'a> {
     assets: ActorAssets,
-    /// Number of actors.
     count: usize,
     /// The longest exposure of a camera, in microseconds.
     exposure_us: i64,

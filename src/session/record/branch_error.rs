@@ -14,9 +14,7 @@ pub enum BranchError {
     Version {
         /// Number of the version.
         version: u64,
-        /// The recorded hash.
         recorded: String,
-        /// The hash now.
         now: String,
     },
     /// The episode had a scenario.
@@ -44,7 +42,6 @@ pub enum BranchError {
         time_us: i64,
         /// The backend that recorded it.
         recorded_by: String,
-        /// The backend now.
         backend: String,
     },
 }

@@ -10,9 +10,7 @@ use wildcity_sim::{Command, EgoError};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum RecordedCommand {
-    /// Acceleration and curvature.
     Action(Action),
-    /// Poses to follow.
     Trajectory(Vec<TimedPose>),
     /// A pose that is reached later: only with a delay of the planner.
     Pose(Pose),
@@ -20,15 +18,15 @@ pub enum RecordedCommand {
 
 impl RecordedCommand {
     /// The record of a command; `None` for a pose, which the poses of its frame have.
-    pub(crate) fn of(command: &Command) -> Option<Self> {
+    pub(crate) fn new(command: &Command) -> Option<Self> {
         match command {
             Command::Pose(_) => None,
-            Command::Path(_) | Command::Action(_) => Some(Self::of_any(command)),
+            Command::Path(_) | Command::Action(_) => Some(Self::from_command(command)),
         }
     }
 
     /// The record of any command, a pose included.
-    pub(crate) fn of_any(command: &Command) -> Self {
+    pub(crate) fn from_command(command: &Command) -> Self {
         match command {
             Command::Pose(pose) => Self::Pose(*pose),
             Command::Path(path) => Self::Trajectory(path.poses().to_vec()),

@@ -1,5 +1,5 @@
-//! Finds the state of a recorded episode after one of its steps: executes its commands again, and lists the frames that
-//! later observations show.
+//! Finds the state of a recorded episode after one of its steps: executes its commands again, and
+//! lists the frames that later observations show.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -177,7 +177,7 @@ fn frames_taken(
     let mut hashes = frame.images.iter();
     let mut taken = Vec::new();
     for (pose, capture) in layout.captures_beside(episode, &is_kept).iter().enumerate() {
-        let cameras = frame.cameras_of(pose, layout.cameras().len());
+        let cameras = frame.due_cameras(pose, layout.cameras().len());
         if frame.poses.get(pose) != Some(&capture.world_from_rig) || cameras != capture.cameras {
             let step = frame.step;
             let reason = match frame.request {

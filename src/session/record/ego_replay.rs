@@ -1,4 +1,5 @@
-//! Executes the commands of a recorded episode again, and compares the poses with the recorded ones.
+//! Executes the commands of a recorded episode again, and compares the poses with the recorded
+//! ones.
 
 use wildcity_scene::geometry::Pose;
 use wildcity_sim::{Command, Ground};
@@ -12,7 +13,6 @@ use crate::error::SessionError;
 pub struct DivergedStep {
     /// Line of the episode's file, from 1.
     pub line: usize,
-    /// The step.
     pub step: u64,
     /// `world_from_rig` as recorded.
     pub recorded: Pose,

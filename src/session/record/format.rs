@@ -42,11 +42,9 @@ pub struct EpisodeHeader {
     pub session: String,
     /// Name of the twin.
     pub twin: String,
-    /// Its version.
     pub version: u64,
     /// BLAKE3 of the version's manifest, in hex.
     pub version_hash: String,
-    /// The render profile.
     pub profile: RenderProfile,
     /// BLAKE3 of the profile's JSON, in hex.
     pub profile_hash: String,
@@ -71,7 +69,8 @@ pub struct EpisodeHeader {
     /// The session's other settings; absent if all are the defaults.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub settings: Option<RecordedSettings>,
-    /// The state at the beginning of the file, if that is more than a start: after a warm-up, or of a branch.
+    /// The state at the beginning of the file, if that is more than a start: after a warm-up, or of
+    /// a branch.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub state: Option<Episode>,
     /// The recorded episode that this one is a branch of.
@@ -85,7 +84,8 @@ pub struct EpisodeHeader {
     pub repair: Option<RecordedRepair>,
 }
 
-/// Settings of a session that images do not depend on, but bundles, later versions and later episodes do.
+/// Settings of a session that images do not depend on, but bundles, later versions and later
+/// episodes do.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RecordedSettings {
@@ -111,7 +111,6 @@ pub struct RecordedSettings {
 pub struct RecordedOrigin {
     /// Name of the episode's file, without its ending.
     pub episode: String,
-    /// Steps done there.
     pub step: u64,
 }
 
@@ -154,12 +153,12 @@ pub struct FrameRecord {
     /// Steps that the command moved the ego by, for which it was a plan.
     #[serde(default = "one", skip_serializing_if = "is_one")]
     pub steps: u64,
-    /// When the frames at the poses were taken, in microseconds; only for a plan. Otherwise the last one is at
-    /// `time_us`, and the earlier ones are in the warm-up.
+    /// When the frames at the poses were taken, in microseconds; only for a plan. Otherwise the
+    /// last one is at `time_us`, and the earlier ones are in the warm-up.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub times_us: Vec<i64>,
-    /// When the frames at the poses were due, in microseconds; only if a camera delivered a frame that was not due.
-    /// `times_us` says when their pictures were taken.
+    /// When the frames at the poses were due, in microseconds; only if a camera delivered a frame
+    /// that was not due. `times_us` says when their pictures were taken.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub due_us: Vec<i64>,
     /// Notes of the agent, unchanged.
@@ -171,7 +170,8 @@ pub struct FrameRecord {
     pub frame_hash: String,
     /// BLAKE3 of each image's pixels as sent, in hex: pose by pose, camera by camera.
     pub images: Vec<String>,
-    /// Results of the repair model, in the order of `images`; absent if it was used on none of them.
+    /// Results of the repair model, in the order of `images`; absent if it was used on none of
+    /// them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub repairs: Vec<Option<RecordedImageRepair>>,
 }
@@ -182,11 +182,9 @@ pub struct FrameRecord {
 pub struct RecordedVersion {
     /// Steps done before the switch.
     pub step: u64,
-    /// The version.
     pub version: u64,
     /// BLAKE3 of its manifest, in hex.
     pub version_hash: String,
-    /// The render profile.
     pub profile: RenderProfile,
     /// BLAKE3 of the profile's JSON, in hex.
     pub profile_hash: String,
@@ -198,7 +196,6 @@ pub struct RecordedVersion {
 pub enum FrameRequest {
     /// The start of an episode.
     Reset,
-    /// A step.
     Step,
     /// A snapshot was restored.
     Restore,
@@ -210,13 +207,10 @@ pub enum FrameRequest {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case")]
 pub(crate) enum Line {
-    /// The first line.
     Episode(Box<EpisodeHeader>),
     /// One per answer with images.
     Frame(FrameRecord),
-    /// Between two frames.
     Version(RecordedVersion),
-    /// After the header.
     Scenario(Box<ScenarioLine>),
     /// Before the frame of a step.
     Actors(ActorsLine),
@@ -224,13 +218,12 @@ pub(crate) enum Line {
     Event(EventLine),
     /// Verdict and scores, before the end.
     Result(EpisodeResult),
-    /// The last line.
     End(EpisodeSummary),
 }
 
 impl RecordedSettings {
     /// The settings of a session that requests none.
-    pub(crate) fn default_of(cameras: usize, dt_us: i64) -> Self {
+    pub(crate) fn with_defaults(cameras: usize, dt_us: i64) -> Self {
         Self {
             profile_overrides: ProfileOverrides::default(),
             schedule: Schedule::every_step(cameras, dt_us),
@@ -264,7 +257,8 @@ fn is_one(steps: &u64) -> bool {
 }
 
 impl FrameRecord {
-    /// When the frames at a pose were taken, in microseconds; those of a warm-up are at any time below 0.
+    /// When the frames at a pose were taken, in microseconds; those of a warm-up are at any time
+    /// below 0.
     pub fn taken_us(&self, pose: usize) -> i64 {
         let is_now = self.request == FrameRequest::Observe || pose + 1 == self.poses.len();
         let otherwise = if is_now { self.time_us } else { -1 };
@@ -277,13 +271,13 @@ impl FrameRecord {
     }
 
     /// The rendered cameras of a pose, by their index, of a rig with `rig_cameras`.
-    pub fn cameras_of(&self, pose: usize, rig_cameras: usize) -> Vec<usize> {
+    pub fn due_cameras(&self, pose: usize, rig_cameras: usize) -> Vec<usize> {
         self.cameras.get(pose).cloned().unwrap_or_else(|| (0..rig_cameras).collect())
     }
 }
 
-/// Whether a text names an episode: the name of a session, a hyphen and a number. Such a name is safe as a file
-/// name and cannot be a path.
+/// Whether a text names an episode: the name of a session, a hyphen and a number. Such a name is
+/// safe as a file name and cannot be a path.
 pub fn is_episode_name(text: &str) -> bool {
     let is_number =
         |text: &str| (1..=20).contains(&text.len()) && text.bytes().all(|b| b.is_ascii_digit());

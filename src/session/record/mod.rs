@@ -1,8 +1,8 @@
 //! Records of episodes, and their replay.
 //!
-//! Every answer with images is on record before it is sent, so that whatever an agent has seen can be rendered again. A
-//! replay executes the recorded commands, renders the recorded poses, and compares both with the record: poses to the
-//! bit, images by their hashes.
+//! Every answer with images is on record before it is sent, so that whatever an agent has seen can
+//! be rendered again. A replay executes the recorded commands, renders the recorded poses, and
+//! compares both with the record: poses to the bit, images by their hashes.
 
 mod actor_replay;
 pub(crate) mod branch_error;

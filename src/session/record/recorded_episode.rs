@@ -12,8 +12,8 @@ use super::replay_report::ReplayError;
 use crate::episode::EpisodeSummary;
 use crate::limits::{EPISODE_HEAD_BYTES, EPISODE_LINE_BYTES, PLAN_STEPS};
 
-// The first line has room for the largest overlays: 4 bytes a pixel, in base64 (4/3), and a thousandth that
-// PNG may add. The rest of a rig and a profile are below 1 MiB.
+// The first line has room for the largest overlays: 4 bytes a pixel, in base64 (4/3), and a
+// thousandth that PNG may add. The rest of a rig and a profile are below 1 MiB.
 const _: () =
     assert!(4 * Overlay::MAX_PIXELS * 4 / 3 * 1001 / 1000 + (1 << 20) <= EPISODE_HEAD_BYTES as u64);
 
@@ -30,13 +30,15 @@ pub struct RecordedEpisode {
     pub scenario: Option<Box<ScenarioLine>>,
     /// The actors of the next frame, each with the number of frames before it.
     pub actors: Vec<(usize, ActorsLine)>,
-    /// The steps that were done when the ego had left the area that the twin was trained on, if it left it.
+    /// The steps that were done when the ego had left the area that the twin was trained on, if it
+    /// left it.
     pub off_model_step: Option<u64>,
     /// Lines of the file, from 1, at which the frames are.
     pub frame_lines: Vec<usize>,
     /// Line of the file, from 1, at which the end is; 0 without one.
     pub end_line: usize,
-    /// How it went; absent if the server was killed or is still running. A last line without an end is left out.
+    /// How it went; absent if the server was killed or is still running. A last line without an end
+    /// is left out.
     pub end: Option<EpisodeSummary>,
 }
 
@@ -144,7 +146,8 @@ impl RecordedEpisode {
     }
 }
 
-/// Checks that the cameras and images of a frame match its poses. Returns what is wrong, if anything.
+/// Checks that the cameras and images of a frame match its poses. Returns what is wrong, if
+/// anything.
 fn check_images(frame: &FrameRecord, rig_cameras: usize) -> Result<(), String> {
     let poses = frame.poses.len();
     if !(1..=PLAN_STEPS as u64).contains(&frame.steps) {
@@ -168,7 +171,7 @@ fn check_images(frame: &FrameRecord, rig_cameras: usize) -> Result<(), String> {
             ));
         }
     }
-    let expected: usize = (0..poses).map(|pose| frame.cameras_of(pose, rig_cameras).len()).sum();
+    let expected: usize = (0..poses).map(|pose| frame.due_cameras(pose, rig_cameras).len()).sum();
     let images = frame.images.len();
     if images != expected {
         return Err(format!("{images} images, but {expected} cameras of {poses} poses"));

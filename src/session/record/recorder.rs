@@ -1,7 +1,8 @@
 //! Writes an episode's file.
 //!
-//! A line is written before its answer is sent, so that every answer is on record. If that fails, for
-//! example on a full disk, the file is truncated to its last whole line and the request is refused.
+//! A line is written before its answer is sent, so that every answer is on record. If that fails,
+//! for example on a full disk, the file is truncated to its last whole line and the request is
+//! refused.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write as _};
@@ -29,8 +30,8 @@ pub(crate) struct NewFile {
 }
 
 impl Recorder {
-    /// Creates a file with the first free number from `first_number` on, and writes its first lines. No
-    /// file is left behind if that fails.
+    /// Creates a file with the first free number from `first_number` on, and writes its first
+    /// lines. No file is left behind if that fails.
     pub(crate) fn create(
         dir: &Path,
         session: &str,
@@ -69,7 +70,8 @@ impl Recorder {
         }
     }
 
-    /// Verdict and scores of the episode so far, if it ends as its summary says; `None` if it cannot be read.
+    /// Verdict and scores of the episode so far, if it ends as its summary says; `None` if it
+    /// cannot be read.
     pub(crate) fn result(&self, summary: &EpisodeSummary) -> Option<EpisodeResult> {
         let mut episode = EpisodeFile::read(&self.path).ok()?;
         let end = serde_json::to_value(summary).ok()?;

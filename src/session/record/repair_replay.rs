@@ -1,8 +1,8 @@
 //! Repeats the repair of a recorded episode and its decisions.
 //!
-//! The decisions depend on the trust of the rendered images, which is computed again, and are compared with the record
-//! always. Repaired pixels are compared if the model is available, has the recorded hash and is deterministic;
-//! otherwise the report mentions that they were not compared.
+//! The decisions depend on the trust of the rendered images, which is computed again, and are
+//! compared with the record always. Repaired pixels are compared if the model is available, has the
+//! recorded hash and is deterministic; otherwise the report mentions that they were not compared.
 
 use std::sync::Arc;
 
@@ -28,7 +28,6 @@ use crate::repair::status::RepairState;
 /// The repair of an episode that is replayed.
 pub(super) struct RepairReplay<'a> {
     recorded: &'a RecordedRepair,
-    /// The recorded model.
     model: Option<Arc<Model>>,
     coverage: TrainingCoverage,
     /// Hysteresis state of each camera after the frames so far.
@@ -60,8 +59,8 @@ pub(super) struct Drawing<'a> {
 }
 
 impl<'a> RepairReplay<'a> {
-    /// `None` if the episode was not repaired. Loads the model if `models` has it, and adds its differences from the
-    /// recorded model to `changes`.
+    /// `None` if the episode was not repaired. Loads the model if `models` has it, and adds its
+    /// differences from the recorded model to `changes`.
     ///
     /// # Errors
     /// The model cannot be loaded, or the twin has no recorded drive any more.
@@ -89,7 +88,7 @@ impl<'a> RepairReplay<'a> {
                 model = Some(loaded);
             }
         }
-        let coverage = coverage_of(&resident.version.manifest)?;
+        let coverage = training_coverage(&resident.version.manifest)?;
         let cameras = &header.rig.cameras;
         let state = header.first_state().repair_state().for_cameras(cameras.len());
         let rays = CameraRays::new(cameras.len());
@@ -106,7 +105,7 @@ impl<'a> RepairReplay<'a> {
         resident: &Resident,
         cameras: &[RigCamera],
     ) -> Result<(), ReplayError> {
-        self.coverage = coverage_of(&resident.version.manifest)?;
+        self.coverage = training_coverage(&resident.version.manifest)?;
         self.read_references(resident, cameras)
     }
 
@@ -115,12 +114,12 @@ impl<'a> RepairReplay<'a> {
         resident: &Resident,
         cameras: &[RigCamera],
     ) -> Result<(), ReplayError> {
-        let needs = |model: &Arc<Model>| NeededReferences::of(model).any();
+        let needs = |model: &Arc<Model>| NeededReferences::from_model(model).any();
         if self.model.as_ref().is_some_and(needs) {
             let version = resident.version.clone();
             let table = self.catalog.views(&version);
             let table = table.map_err(|cause| ReplayError::Reference(cause.to_string()))?;
-            self.references = ReferenceViews::of(version, table, cameras);
+            self.references = ReferenceViews::new(version, table, cameras);
         }
         Ok(())
     }
@@ -143,8 +142,9 @@ impl<'a> RepairReplay<'a> {
         }
     }
 
-    /// Decides which of some cameras' images are repaired. `images` has a buffer for each camera of the rig, and
-    /// gets its trust. `is_observe`: the ego is not at the pose, and the decision has no history.
+    /// Decides which of some cameras' images are repaired. `images` has a buffer for each camera of
+    /// the rig, and gets its trust. `is_observe`: the ego is not at the pose, and the decision has
+    /// no history.
     pub(super) fn decide(
         &mut self,
         is_observe: bool,
@@ -159,9 +159,10 @@ impl<'a> RepairReplay<'a> {
             image.trust = self.coverage.trust(world_from_rig, view, &image.opacity).value;
             trusts.push(image.trust);
         }
-        let before: Vec<bool> = match is_observe {
-            true => Vec::new(),
-            false => selected.iter().map(|&camera| self.state.is_on[camera]).collect(),
+        let before: Vec<bool> = if is_observe {
+            Vec::new()
+        } else {
+            selected.iter().map(|&camera| self.state.is_on[camera]).collect()
         };
         let decision = self.recorded.selection.decide(&before, &trusts);
         if !is_observe {
@@ -201,20 +202,17 @@ impl<'a> RepairReplay<'a> {
     ) -> Result<ReferenceInputs, String> {
         let ImageToRepair { camera, mounted, rendered, view, world_from_rig, is_observe } = *image;
         let Some(references) = &self.references else { return Ok(ReferenceInputs::default()) };
-        let kept = match is_observe {
-            true => None,
-            false => self.state.references[camera].as_deref(),
-        };
-        let rays = self.rays.of(camera, mounted);
+        let kept = if is_observe { None } else { self.state.references[camera].as_deref() };
+        let rays = self.rays.camera_rays(camera, mounted);
         let of = OfflineView { camera: mounted, rays, view, world_from_rig, rendered, kept };
         let Self { models, catalog, .. } = *self;
         let cache = models.references();
         let supply = ReferenceSupply { resident, profile, backend, catalog, cache };
-        let found = supply.beside(references, &of, NeededReferences::of(model));
+        let found = supply.beside(references, &of, NeededReferences::from_model(model));
         found.map(|found| found.beside).map_err(|error| error.to_string())
     }
 }
 
-fn coverage_of(manifest: &Manifest) -> Result<TrainingCoverage, ReplayError> {
+fn training_coverage(manifest: &Manifest) -> Result<TrainingCoverage, ReplayError> {
     TrainingCoverage::new(manifest).ok_or(ReplayError::NoDrive)
 }

@@ -14,9 +14,9 @@ use crate::repair::status::{ImageRepair, RepairFailure, RepairStatus};
 pub struct RecordedRepair {
     /// Name of the model.
     pub model: String,
-    /// Its version.
     pub version: String,
-    /// BLAKE3 of all that decides its bytes, in hex: manifest, files, build of the runtime, provider.
+    /// BLAKE3 of all that decides its bytes, in hex: manifest, files, build of the runtime,
+    /// provider.
     pub repair_hash: String,
     /// `cpu`, `cuda` or `tensorrt`.
     pub provider: String,
@@ -42,7 +42,7 @@ pub enum RecordedImageRepair {
 
 impl RecordedRepair {
     /// The record of a session's repair.
-    pub(crate) fn of(repair: &SessionRepair) -> Self {
+    pub(crate) fn from_repair(repair: &SessionRepair) -> Self {
         let model = &repair.model;
         Self {
             model: model.manifest().name.clone(),

@@ -1,8 +1,9 @@
-//! Replay: drives and renders a recorded episode again, and compares every pose and image with the record.
+//! Replay: drives and renders a recorded episode again, and compares every pose and image with the
+//! record.
 
 use std::sync::Arc;
 
-use wildcity_episode::ground_of;
+use wildcity_episode::ground_surface;
 use wildcity_render::{Backend, Frame, RenderError, Target, View};
 use wildcity_repair::Models;
 use wildcity_scene::RenderProfile;
@@ -35,8 +36,8 @@ impl RecordedEpisode {
     /// Drives and renders the episode again, on the recorded versions of its twin.
     ///
     /// # Errors
-    /// A version cannot be opened, a command cannot be executed, the backend refuses a frame, or `visit`
-    /// fails.
+    /// A version cannot be opened, a command cannot be executed, the backend refuses a frame, or
+    /// `visit` fails.
     pub fn replay(
         &self,
         cache: &Cache,
@@ -47,7 +48,8 @@ impl RecordedEpisode {
         self.replay_repaired(cache, backend, &Models::default(), until, visit)
     }
 
-    /// As [`Self::replay`], and repairs images again by the recorded model, if it is one of `models`.
+    /// As [`Self::replay`], and repairs images again by the recorded model, if it is one of
+    /// `models`.
     ///
     /// # Errors
     /// As [`Self::replay`], and if the model cannot be loaded or fails.
@@ -152,7 +154,7 @@ impl<'a> Replay<'a> {
             resident,
             profile: &header.profile,
             ego: EgoReplay::new(header),
-            lanes: episode.scenario.as_ref().and_then(|line| ground_of(line)),
+            lanes: episode.scenario.as_ref().and_then(|line| ground_surface(line)),
             actors,
             frame_lines: &episode.frame_lines,
             repair,
@@ -218,7 +220,7 @@ impl<'a> Replay<'a> {
     ) -> Result<(), ReplayError> {
         let mut next_image = 0;
         for pose in 0..frame.poses.len() {
-            let selected = frame.cameras_of(pose, self.cameras.len());
+            let selected = frame.due_cameras(pose, self.cameras.len());
             if selected.is_empty() {
                 continue;
             }
@@ -244,7 +246,7 @@ impl<'a> Replay<'a> {
                     sensors.apply(frame, pose, camera, pixels);
                 }
                 let rendered_pixels = sensed.as_deref().unwrap_or(&rendered.rgb8);
-                let mut pairs = vec![(recorded_rendered, hash_of(rendered_pixels))];
+                let mut pairs = vec![(recorded_rendered, hash_pixels(rendered_pixels))];
                 let mut repaired = None;
                 if let (true, Some(repair)) = (is_repaired, &mut self.repair) {
                     let image = ImageToRepair {
@@ -270,7 +272,7 @@ impl<'a> Replay<'a> {
                                 sensors.apply(frame, pose, camera, pixels);
                             }
                             self.report.repaired.compared += 1;
-                            pairs.push((recorded, hash_of(pixels)));
+                            pairs.push((recorded, hash_pixels(pixels)));
                         }
                         None => self.report.repaired.not_compared += 1,
                     }
@@ -308,8 +310,8 @@ impl<'a> Replay<'a> {
         Ok(())
     }
 
-    /// Decides which images of a pose are repaired, and compares that with the record. `at` has the index of the
-    /// pose, and that of its first image.
+    /// Decides which images of a pose are repaired, and compares that with the record. `at` has the
+    /// index of the pose, and that of its first image.
     fn check_decision(
         &mut self,
         frame: &FrameRecord,
@@ -355,7 +357,8 @@ impl<'a> Replay<'a> {
         }
     }
 
-    /// Renders the selected cameras (indices, rising) at a pose of a frame into `images`. Returns their views.
+    /// Renders the selected cameras (indices, rising) at a pose of a frame into `images`. Returns
+    /// their views.
     fn render_pose(
         &mut self,
         frame: &FrameRecord,
@@ -400,7 +403,7 @@ impl<'a> Replay<'a> {
     }
 }
 
-fn hash_of(rgb8: &[u8]) -> String {
+fn hash_pixels(rgb8: &[u8]) -> String {
     blake3::hash(rgb8).to_hex().to_string()
 }
 
@@ -409,8 +412,8 @@ fn used(map: &mut [f32]) -> Option<&mut [f32]> {
     (!map.is_empty()).then_some(map)
 }
 
-/// Adds the changes of a version since it was recorded. The profile's hash changes with a build that has more fields,
-/// even for the same profile.
+/// Adds the changes of a version since it was recorded. The profile's hash changes with a build
+/// that has more fields, even for the same profile.
 fn add_scene_changes(
     changes: &mut Vec<ProvenanceChange>,
     recorded: &RecordedHashes<'_>,

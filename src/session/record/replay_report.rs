@@ -30,7 +30,8 @@ pub struct ReplayReport {
     pub repaired: RepairedImages,
 }
 
-/// Images that a model had repaired. Their rendered pixels and the decision are compared in any case.
+/// Images that a model had repaired. Their rendered pixels and the decision are compared in any
+/// case.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct RepairedImages {
     /// Repaired again, and compared.
@@ -44,11 +45,10 @@ pub struct RepairedImages {
 pub struct WrongValue {
     /// Line of the episode's file, from 1.
     pub line: usize,
-    /// The field: `step`, `time_us`, `frame_hash`, `repairs`, `sensors`, or one of the end: `outcome`, `steps`, `distance_m` ..
+    /// The field: `step`, `time_us`, `frame_hash`, `repairs`, `sensors`, or one of the end:
+    /// `outcome`, `steps`, `distance_m` ..
     pub field: &'static str,
-    /// As recorded.
     pub recorded: String,
-    /// As computed now.
     pub now: String,
 }
 
@@ -64,9 +64,9 @@ pub enum ReplayUntil {
 /// A difference between what recorded the episode and what replays it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ProvenanceChange {
-    /// `build`, `backend`, `backend detail`, `version hash`, `profile hash`, `repair hash` or `repair`.
+    /// `build`, `backend`, `backend detail`, `version hash`, `profile hash`, `repair hash` or
+    /// `repair`.
     pub what: &'static str,
-    /// As recorded.
     pub recorded: String,
     /// As it is now.
     pub now: String,
@@ -79,15 +79,13 @@ pub struct ImageDifference {
     pub line: usize,
     /// Which request was answered.
     pub request: FrameRequest,
-    /// The step.
     pub step: u64,
-    /// Index of the pose among those of the record; 0 but for `observe`, or for frames of a warm-up.
+    /// Index of the pose among those of the record; 0 but for `observe`, or for frames of a
+    /// warm-up.
     pub pose: usize,
     /// Name of the camera.
     pub camera: String,
-    /// The recorded hash.
     pub recorded: String,
-    /// The hash now.
     pub now: String,
 }
 
@@ -98,11 +96,9 @@ pub struct ReplayedImage<'a> {
     pub frame: usize,
     /// Which request was answered.
     pub request: FrameRequest,
-    /// The step.
     pub step: u64,
     /// Index of the pose among those of the record.
     pub pose: usize,
-    /// The camera.
     pub camera: &'a RigCamera,
     /// The pixels, `[height, width, 3]`.
     pub rgb8: &'a [u8],
@@ -114,7 +110,6 @@ pub enum ReplayError {
     /// The file cannot be read.
     #[error("cannot read {}: {cause}", path.display())]
     Read {
-        /// The file.
         path: PathBuf,
         /// The operating system's error.
         cause: io::Error,
@@ -125,11 +120,9 @@ pub enum ReplayError {
     /// A line is damaged, incomplete or out of place.
     #[error("{}, line {line}: {reason}", path.display())]
     Line {
-        /// The file.
         path: PathBuf,
         /// The line, from 1.
         line: usize,
-        /// The error.
         reason: String,
     },
     /// The recorded cameras are invalid.
@@ -140,42 +133,25 @@ pub enum ReplayError {
     Twin(#[from] ResidencyError),
     /// The data of a frame does not fit into memory, or could not be loaded.
     #[error("step {step}: {cause}")]
-    Residency {
-        /// The step.
-        step: u64,
-        /// Why.
-        cause: ResidencyError,
-    },
+    Residency { step: u64, cause: ResidencyError },
     /// The episode's ego cannot execute a recorded command.
     #[error("step {step}: {cause}")]
-    Ego {
-        /// The step.
-        step: u64,
-        /// Why.
-        cause: Box<SessionError>,
-    },
+    Ego { step: u64, cause: Box<SessionError> },
     /// The recorded settings of the sensors are out of range.
     #[error(transparent)]
     Sensors(Box<SessionError>),
     /// The backend refused a frame.
     #[error("step {step}: {cause}")]
-    Render {
-        /// The step.
-        step: u64,
-        /// Why.
-        cause: RenderError,
-    },
+    Render { step: u64, cause: RenderError },
     /// The repair model cannot be loaded.
     #[error(transparent)]
     Model(Box<RepairError>),
     /// The repair model fails on an image that it had repaired.
     #[error("step {step}, camera {camera:?}: {cause}")]
     Repair {
-        /// The step.
         step: u64,
         /// Name of the camera.
         camera: String,
-        /// Why.
         cause: Box<RepairError>,
     },
     /// The images were repaired by their trust, which needs a recorded drive.
@@ -187,11 +163,9 @@ pub enum ReplayError {
     /// The caller's function failed on an image.
     #[error("step {step}, camera {camera:?}: {reason:#}")]
     Visit {
-        /// The step.
         step: u64,
         /// Name of the camera.
         camera: String,
-        /// Why.
         reason: String,
     },
 }

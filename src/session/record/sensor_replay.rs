@@ -31,12 +31,12 @@ impl SensorReplay {
             ObservationLayout::new(cameras, header.outputs.encoding, maps, schedule.clone());
         let mut layout = layout.map_err(wrong)?;
         layout.add_sensors(sensors.clone(), header.dt_us).map_err(wrong)?;
-        let effect_seed = EffectSeed::of(&header.first_state());
+        let effect_seed = EffectSeed::from_episode(&header.first_state());
         Ok(Some(Self { layout, effect_seed }))
     }
 
-    /// The first camera of a pose whose picture, by the settings, was taken at a time or place that differs from the
-    /// recorded one, and the computed times, in microseconds.
+    /// The first camera of a pose whose picture, by the settings, was taken at a time or place that
+    /// differs from the recorded one, and the computed times, in microseconds.
     pub(super) fn wrong_delivery(
         &self,
         frame: &FrameRecord,

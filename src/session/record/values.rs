@@ -16,9 +16,10 @@ pub(super) fn wrong_in_frame(
         .or_else(|| wrong_frame_hash(frame, rig_cameras, line))
 }
 
-/// The hash of the shown images must be that of their recorded hashes, which the replay compares with the pixels.
+/// The hash of the shown images must be that of their recorded hashes, which the replay compares
+/// with the pixels.
 fn wrong_frame_hash(frame: &FrameRecord, rig_cameras: usize, line: usize) -> Option<WrongValue> {
-    fn hash_of<'a>(images: impl IntoIterator<Item = &'a String>) -> String {
+    fn hash_images<'a>(images: impl IntoIterator<Item = &'a String>) -> String {
         let mut hasher = blake3::Hasher::new();
         for image in images {
             // An invalid hash counts as 0, which differs from every hash of pixels.
@@ -28,26 +29,26 @@ fn wrong_frame_hash(frame: &FrameRecord, rig_cameras: usize, line: usize) -> Opt
         hasher.finalize().to_hex().to_string()
     }
     let shown = match frame.request {
-        FrameRequest::Observe => hash_of(&frame.images),
+        FrameRequest::Observe => hash_images(&frame.images),
         FrameRequest::Reset | FrameRequest::Step | FrameRequest::Restore => {
-            // The images of the poses that are due now, in order of the cameras; the others are earlier frames of a
-            // bundle. Without sensor effects only the last pose is due.
+            // The images of the poses that are due now, in order of the cameras; the others are
+            // earlier frames of a bundle. Without sensor effects only the last pose is due.
             let mut images = frame.images.iter();
             let mut shown: Vec<(usize, &String)> = Vec::new();
             for pose in 0..frame.poses.len() {
                 let is_last = pose + 1 == frame.poses.len();
-                let of_pose = frame.cameras_of(pose, rig_cameras).into_iter().zip(&mut images);
+                let of_pose = frame.due_cameras(pose, rig_cameras).into_iter().zip(&mut images);
                 let is_due = frame.due_us.get(pose) == Some(&frame.time_us);
                 let of_pose: Vec<_> = of_pose.collect();
                 shown.extend(of_pose.into_iter().filter(|_| is_last || is_due));
             }
             shown.sort_by_key(|(camera, _)| *camera);
-            hash_of(shown.into_iter().map(|(_, image)| image))
+            hash_images(shown.into_iter().map(|(_, image)| image))
         }
     };
-    // Observations between two decisions show no images, even if a later observation shows images that were rendered
-    // then.
-    let nothing = hash_of(&[]);
+    // Observations between two decisions show no images, even if a later observation shows images
+    // that were rendered then.
+    let nothing = hash_images(&[]);
     let is_known = frame.frame_hash == shown
         || (frame.request != FrameRequest::Observe && frame.frame_hash == nothing);
     if is_known {
@@ -56,8 +57,8 @@ fn wrong_frame_hash(frame: &FrameRecord, rig_cameras: usize, line: usize) -> Opt
     unequal(line, "frame_hash", &frame.frame_hash, &shown)
 }
 
-/// The first value of the last line that differs from the replayed episode's. Its trust comes with images and is not
-/// computed again, but the outcome must follow from it.
+/// The first value of the last line that differs from the replayed episode's. Its trust comes with
+/// images and is not computed again, but the outcome must follow from it.
 pub(super) fn wrong_in_end(
     end: &EpisodeSummary,
     episode: &Episode,

@@ -1,4 +1,5 @@
-//! References in memory: recorded images with the twin's depth, and their pixels warped into a view.
+//! References in memory: recorded images with the twin's depth, and their pixels warped into a
+//! view.
 
 use std::sync::{Arc, OnceLock};
 
@@ -64,8 +65,8 @@ impl CameraRays {
     }
 
     /// The rays of a camera, by its index.
-    pub(crate) fn of(&self, index: usize, camera: &RigCamera) -> &Rays {
-        self.0[index].get_or_init(|| Rays::of(&camera.camera))
+    pub(crate) fn camera_rays(&self, index: usize, camera: &RigCamera) -> &Rays {
+        self.0[index].get_or_init(|| Rays::from_camera(&camera.camera))
     }
 }
 
@@ -96,7 +97,8 @@ impl WarpQuery<'_> {
         seen.map(|view| view.exposed_for(self.camera).reduced_for(&self.camera.camera)).collect()
     }
 
-    /// Warps references into the image, and adds the result and the names of the references to `inputs`.
+    /// Warps references into the image, and adds the result and the names of the references to
+    /// `inputs`.
     pub(crate) fn warped(
         &self,
         references: &[(String, Arc<Reference>)],
@@ -123,8 +125,8 @@ pub(crate) struct ReadImage {
     counts: Option<Vec<bool>>,
 }
 
-/// Reads the recorded image of a reference, in the reference's size and exposure, and its mask. `None` if the reference
-/// has no recorded image. Blocks.
+/// Reads the recorded image of a reference, in the reference's size and exposure, and its mask.
+/// `None` if the reference has no recorded image. Blocks.
 ///
 /// # Errors
 /// The image or the mask cannot be read, or is not one of its camera's size.

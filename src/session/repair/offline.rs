@@ -1,7 +1,7 @@
 //! The repair of views without a session: references are read and rendered on the caller's thread.
 //!
-//! It is used by replays, by the report, which measures benefit and cost of the repair, and by evaluations. A model
-//! gets the same inputs as in a session.
+//! It is used by replays, by the report, which measures benefit and cost of the repair, and by
+//! evaluations. A model gets the same inputs as in a session.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -57,7 +57,6 @@ pub struct OfflineReferences {
 pub struct OfflineDrawing<'a> {
     /// Render profile of the twin.
     pub profile: &'a RenderProfile,
-    /// The renderer.
     pub backend: &'a dyn Backend,
     /// References that were read and rendered.
     pub cache: &'a ReferenceCache,
@@ -94,7 +93,7 @@ pub struct ViewReferences {
 
 impl NeededReferences {
     /// References that a model needs.
-    pub fn of(model: &Model) -> Self {
+    pub fn from_model(model: &Model) -> Self {
         let nearest = model.needs(InputRole::Reference);
         Self { warped: session_repair::needs_warped(model), nearest }
     }
@@ -193,9 +192,9 @@ impl ViewReferences {
 }
 
 impl OfflineReferences {
-    /// The references of a version. If it has no recorded images, it is rendered with `cameras`. Recorded images at the
-    /// poses `held_out` are left out: results are compared with them, so a model that gets them would get the ground
-    /// truth.
+    /// The references of a version. If it has no recorded images, it is rendered with `cameras`.
+    /// Recorded images at the poses `held_out` are left out: results are compared with them, so a
+    /// model that gets them would get the ground truth.
     ///
     /// # Errors
     /// The table of recorded images cannot be read.
@@ -211,7 +210,7 @@ impl OfflineReferences {
         let table = without(table, held_out);
         let left_out = had - table.len();
         let is_empty = table.is_empty() && cameras.is_empty();
-        let views = if is_empty { None } else { ReferenceViews::of(version, table, cameras) };
+        let views = if is_empty { None } else { ReferenceViews::new(version, table, cameras) };
         Ok(Self { resident, catalog, views, left_out })
     }
 
@@ -239,14 +238,14 @@ impl OfflineReferences {
     /// [`SessionError::RepairUnavailable`].
     pub fn check(&self, model: &Model, cameras: &[RigCamera]) -> Result<(), SessionError> {
         session_repair::check_cameras(model, cameras)?;
-        if NeededReferences::of(model).any() {
+        if NeededReferences::from_model(model).any() {
             session_repair::check_references(model, self.views.as_ref(), cameras)?;
         }
         Ok(())
     }
 
-    /// The references of a view. Blocks. The first view at a place takes longer, because its references are rendered
-    /// then.
+    /// The references of a view. Blocks. The first view at a place takes longer, because its
+    /// references are rendered then.
     ///
     /// # Errors
     /// An image or the twin cannot be read or rendered.

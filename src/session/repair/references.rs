@@ -1,13 +1,14 @@
 //! Chooses the recorded images that a repair model compares a view with.
 //!
-//! They are chosen by the rig's station on the nearest drive. For a warp these are the images at five places from 8 m
-//! behind the rig to 2 m ahead, of all cameras whose images overlap with the view. Most of the places are behind the
-//! rig, because the scene ahead of the rig was seen from there. For the role `reference` it is the nearest image of the
-//! same camera that looks in about the same direction.
+//! They are chosen by the rig's station on the nearest drive. For a warp these are the images at
+//! five places from 8 m behind the rig to 2 m ahead, of all cameras whose images overlap with the
+//! view. Most of the places are behind the rig, because the scene ahead of the rig was seen from
+//! there. For the role `reference` it is the nearest image of the same camera that looks in about
+//! the same direction.
 //!
-//! Recorded images of a twin may be at any stations. If a twin has none, the twin itself is rendered every [`STEP_M`]
-//! along its drive, with the session's cameras. These images contain nothing new, but the twin is accurate on its
-//! drive, and inaccurate off the trajectory.
+//! Recorded images of a twin may be at any stations. If a twin has none, the twin itself is
+//! rendered every [`STEP_M`] along its drive, with the session's cameras. These images contain
+//! nothing new, but the twin is accurate on its drive, and inaccurate off the trajectory.
 
 use std::sync::Arc;
 
@@ -25,7 +26,8 @@ use wildcity_twin::store::Version;
 /// Places along the drive, from the rig's, in metres.
 const OFFSETS_M: [f64; 5] = [-8.0, -5.5, -3.0, -0.5, 2.0];
 
-/// Largest distance between an image and a place along the drive for the image to be used there, in metres.
+/// Largest distance between an image and a place along the drive for the image to be used there, in
+/// metres.
 const MAX_STATION_DIFFERENCE_M: f64 = 1.5;
 
 /// Distance between the places where a twin without recorded images is drawn, in metres.
@@ -37,12 +39,12 @@ const REFERENCE_WITHIN_M: f64 = 30.0;
 /// Largest angle between the axes of a camera and of its `reference`: 30°.
 const REFERENCE_RAD: f64 = std::f64::consts::PI / 6.0;
 
-/// The `reference` changes only if another image is nearer by at least this distance, in metres, because each change is
-/// visible as flicker.
+/// The `reference` changes only if another image is nearer by at least this distance, in metres,
+/// because each change is visible as flicker.
 const SWITCH_HYSTERESIS_M: f64 = 0.5;
 
-/// A recorded image counts as held out if its position is within this distance of a held-out pose, in metres, and its
-/// optical axis within [`HELD_OUT_AXIS_RAD`].
+/// A recorded image counts as held out if its position is within this distance of a held-out pose,
+/// in metres, and its optical axis within [`HELD_OUT_AXIS_RAD`].
 const HELD_OUT_POSITION_M: f64 = 0.05;
 
 /// Largest angle between the optical axes of a recorded image and of a held-out pose, in radians.
@@ -56,7 +58,8 @@ const PROJECTIONS: usize = 64;
 pub enum ReferenceSource {
     /// Recorded images of the twin.
     Recorded,
-    /// Images of the twin itself, rendered on its recorded drive, because it has no recorded images.
+    /// Images of the twin itself, rendered on its recorded drive, because it has no recorded
+    /// images.
     Rendered,
 }
 
@@ -103,7 +106,8 @@ struct DriveStation<'a> {
 }
 
 impl ReferenceView {
-    /// Hash of all values on which its [`Reference`](wildcity_repair::reference::Reference) depends.
+    /// Hash of all values on which its [`Reference`](wildcity_repair::reference::Reference)
+    /// depends.
     pub(crate) fn key(&self, version_hash: &str, profile_hash: &blake3::Hash) -> ReferenceKey {
         let mut hasher = blake3::Hasher::new();
         hasher.update(version_hash.as_bytes()).update(profile_hash.as_bytes());
@@ -126,9 +130,9 @@ impl ReferenceView {
         self
     }
 
-    /// Returns this image for a view of a camera: halved until it has about as many pixels per radian as the view. From
-    /// an image with more, a view would sample only some pixels, and the next view different ones. A smaller image also
-    /// takes less time and memory.
+    /// Returns this image for a view of a camera: halved until it has about as many pixels per
+    /// radian as the view. From an image with more, a view would sample only some pixels, and the
+    /// next view different ones. A smaller image also takes less time and memory.
     pub(crate) fn reduced_for(mut self, camera: &Camera) -> Self {
         let px_per_rad = |camera: &Camera| (camera.pinhole.fx * camera.pinhole.fy).sqrt();
         let ratio = px_per_rad(&self.camera) / px_per_rad(camera);
@@ -164,17 +168,15 @@ impl ReferenceView {
 }
 
 impl ReferenceViews {
-    /// The references of a version. `table` has the recorded images; if it is empty, the twin is rendered with
-    /// `cameras`. `None` without a recorded drive.
-    pub(crate) fn of(
+    /// The references of a version. `table` has the recorded images; if it is empty, the twin is
+    /// rendered with `cameras`. `None` without a recorded drive.
+    pub(crate) fn new(
         version: Arc<Version>,
         table: Vec<RecordedView>,
         cameras: &[RigCamera],
     ) -> Option<Self> {
-        let source = match table.is_empty() {
-            true => ReferenceSource::Rendered,
-            false => ReferenceSource::Recorded,
-        };
+        let source =
+            if table.is_empty() { ReferenceSource::Rendered } else { ReferenceSource::Recorded };
         let drawn_with = |camera: &RigCamera| {
             let exposure = camera.appearance.exposure;
             let appearance = Appearance { exposure, overlay: None };
@@ -240,8 +242,9 @@ impl ReferenceViews {
         around
     }
 
-    /// The image for the role `reference`: of the same camera, nearest along the drive among those that look in the
-    /// same direction within 30°. The previous image, whose name is `kept`, stays until another is 0.5 m nearer.
+    /// The image for the role `reference`: of the same camera, nearest along the drive among those
+    /// that look in the same direction within 30°. The previous image, whose name is `kept`, stays
+    /// until another is 0.5 m nearer.
     pub(crate) fn nearest(
         &self,
         camera: &RigCamera,
@@ -256,7 +259,7 @@ impl ReferenceViews {
                 && view.angle_rad(world_from_camera) <= REFERENCE_RAD
         };
         let all: Vec<ReferenceView> =
-            self.of_camera(&place, &camera.name).into_iter().filter(fits).collect();
+            self.camera_views(&place, &camera.name).into_iter().filter(fits).collect();
         let nearest = all.iter().min_by(|a, b| distance_m(a).total_cmp(&distance_m(b)))?;
         let kept = all.iter().find(|view| Some(&*view.name) == kept);
         let kept = kept.filter(|kept| distance_m(kept) - distance_m(nearest) < SWITCH_HYSTERESIS_M);
@@ -271,7 +274,7 @@ impl ReferenceViews {
         if let Some(known) = find(&self.projections.lock()) {
             return known;
         }
-        let projection = Arc::new(Projection::of(camera));
+        let projection = Arc::new(Projection::from_camera(camera));
         let mut all = self.projections.lock();
         if all.len() < PROJECTIONS {
             all.push((*camera, projection.clone()));
@@ -310,7 +313,7 @@ impl ReferenceViews {
     }
 
     /// The images of a camera around a station.
-    fn of_camera(&self, place: &DriveStation<'_>, camera: &str) -> Vec<ReferenceView> {
+    fn camera_views(&self, place: &DriveStation<'_>, camera: &str) -> Vec<ReferenceView> {
         match self.source {
             ReferenceSource::Recorded => {
                 let of = place.drive.cameras.iter().filter(|(name, _)| name == camera);
@@ -330,7 +333,8 @@ impl ReferenceViews {
         }
     }
 
-    /// The nearest step of a drive at which the twin is rendered; the lower one of two at the same distance.
+    /// The nearest step of a drive at which the twin is rendered; the lower one of two at the same
+    /// distance.
     fn step(&self, drive: &Drive, station_m: f64) -> usize {
         let last = (drive.length_m / STEP_M).floor();
         (station_m / STEP_M - 0.5).ceil().clamp(0.0, last) as usize

@@ -1,6 +1,7 @@
 //! The pixels and maps of an image that may be repaired.
 
-/// An image as it was rendered, and the maps that the model may need. Maps that it does not need are empty.
+/// An image as it was rendered, and the maps that the model may need. Maps that it does not need
+/// are empty.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RenderedImage {
     /// `[height, width, 3]`: sRGB, 8 bits.

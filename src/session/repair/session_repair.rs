@@ -18,9 +18,7 @@ use super::rendered_image::RenderedImage;
 /// The repair of a session: the model, and when it is used.
 #[derive(Debug)]
 pub struct SessionRepair {
-    /// The model.
     pub model: Arc<Model>,
-    /// Which images.
     pub selection: Selection,
     /// Behaviour when the model fails.
     pub on_failure: OnFailure,
@@ -42,7 +40,7 @@ impl SessionRepair {
         deadline: Duration,
         reports_trust: bool,
     ) -> Result<Self, SessionError> {
-        let selection = selection_of(options)?;
+        let selection = select(options)?;
         let name = &options.model;
         let unavailable =
             |reason: String| SessionError::RepairUnavailable { name: name.clone(), reason };
@@ -85,7 +83,7 @@ impl SessionRepair {
 
     /// The rays of a camera, by its index.
     pub(crate) fn rays(&self, index: usize, camera: &RigCamera) -> &Rays {
-        self.rays.of(index, camera)
+        self.rays.camera_rays(index, camera)
     }
 
     /// Checks that each camera has an image for the role `reference`, if the model needs one.
@@ -143,7 +141,8 @@ pub(crate) fn check_cameras(model: &Model, cameras: &[RigCamera]) -> Result<(), 
     Ok(())
 }
 
-/// Checks that each camera has an image for the role `reference`, if a model needs one, and that there are images at all.
+/// Checks that each camera has an image for the role `reference`, if a model needs one, and that
+/// there are images at all.
 ///
 /// # Errors
 /// [`SessionError::RepairUnavailable`].
@@ -174,7 +173,8 @@ pub(crate) fn check_references(
     }
 }
 
-/// The repaired pixels of a camera's image: black outside of the lens' field, with the camera's overlay.
+/// The repaired pixels of a camera's image: black outside of the lens' field, with the camera's
+/// overlay.
 pub(crate) fn repair(
     model: &Model,
     camera: &RigCamera,
@@ -196,7 +196,7 @@ pub(crate) fn repair_timed(
     let height = camera.camera.height_px as usize;
     let image = Image { width, height, rgb8: rgb8.clone() };
     let mut mask = Vec::new();
-    let field = FieldMask::of(&camera.camera);
+    let field = FieldMask::from_camera(&camera.camera);
     if field.is_some() || model.needs(InputRole::Mask) {
         mask = vec![1.0; width * height];
     }
@@ -237,7 +237,7 @@ fn planar(interleaved: &[f32]) -> Vec<f32> {
     axis(0).chain(axis(1)).chain(axis(2)).collect()
 }
 
-fn selection_of(options: &RepairOptions) -> Result<Selection, SessionError> {
+fn select(options: &RepairOptions) -> Result<Selection, SessionError> {
     let default = Selection::default();
     let selection = Selection {
         below: options.below.unwrap_or(default.below),

@@ -22,7 +22,8 @@ impl ImageRepair {
     }
 }
 
-/// State of the repair of an episode's images that continues from one observation to the next, by camera.
+/// State of the repair of an episode's images that continues from one observation to the next, by
+/// camera.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(crate) struct RepairState {
     /// Whether the camera is in repair; empty if none is.
@@ -46,7 +47,6 @@ impl RepairState {
 pub enum RepairStatus {
     /// It was not selected.
     Kept,
-    /// It was repaired.
     Repaired,
     /// It was selected, and the model failed: it is as rendered.
     Failed(RepairFailure),

@@ -13,7 +13,8 @@ use wildcity_twin::store::{Catalog, StoredActor};
 
 use super::default_assets::{generated_actors, nearest};
 
-/// The asset of each actor, by its index; `None` for an actor that is not drawn. Copies share the assets.
+/// The asset of each actor, by its index; `None` for an actor that is not drawn. Copies share the
+/// assets.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct ActorAssets(Arc<[Option<Arc<ResidentActor>>]>);
 
@@ -24,7 +25,8 @@ pub(crate) struct FrameDetail<'a> {
     pub(crate) profile: &'a RenderProfile,
 }
 
-/// The assets of a store, as scenarios look them up. Remembers what it found: many actors have the same asset.
+/// The assets of a store, as scenarios look them up. Remembers what it found: many actors have the
+/// same asset.
 #[derive(Debug)]
 pub struct StoredAssets<'a> {
     catalog: &'a Catalog,
@@ -32,7 +34,8 @@ pub struct StoredAssets<'a> {
     generated: GeneratedActors,
 }
 
-/// The generated assets of a store, once they are needed; none if they cannot be made, as in a store that is read only.
+/// The generated assets of a store, once they are needed; none if they cannot be made, as in a
+/// store that is read only.
 pub(crate) type GeneratedActors = Arc<OnceLock<Vec<StoredActor>>>;
 
 impl<'a> StoredAssets<'a> {
@@ -93,10 +96,11 @@ impl ActorAssets {
         self.0.iter().all(Option::is_none)
     }
 
-    /// The actors that a frame draws, given the pose of each at the frame's time and at the start of the longest
-    /// exposure.
+    /// The actors that a frame draws, given the pose of each at the frame's time and at the start
+    /// of the longest exposure.
     ///
-    /// An actor that was absent at the start of the exposure appears during it, and is drawn at rest.
+    /// An actor that was absent at the start of the exposure appears during it, and is drawn at
+    /// rest.
     pub(crate) fn placed(
         &self,
         poses: &[Option<Pose>],
@@ -131,7 +135,8 @@ pub(crate) struct Placement<'a> {
 }
 
 impl FrameDetail<'_> {
-    /// The actors that a frame draws, each in the level of detail that the frame needs, with its shadow.
+    /// The actors that a frame draws, each in the level of detail that the frame needs, with its
+    /// shadow.
     pub(crate) fn placed<'a>(
         &self,
         actors: impl Iterator<Item = Placement<'a>>,
@@ -159,11 +164,8 @@ impl FrameDetail<'_> {
     }
 }
 
-/// When the exposure of a frame begins, in microseconds. In a warm-up and before the start of an episode nothing moves
-/// during the exposure, neither the rig nor actors.
+/// When the exposure of a frame begins, in microseconds. In a warm-up and before the start of an
+/// episode nothing moves during the exposure, neither the rig nor actors.
 pub(crate) fn exposure_start_us(taken_us: i64, exposure_us: i64) -> i64 {
-    match taken_us < 0 {
-        true => taken_us,
-        false => taken_us.saturating_sub(exposure_us).max(0),
-    }
+    if taken_us < 0 { taken_us } else { taken_us.saturating_sub(exposure_us).max(0) }
 }

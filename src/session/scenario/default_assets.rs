@@ -1,4 +1,5 @@
-//! The assets of actors that name none: generated models, stored like all others, since records name them by hash.
+//! The assets of actors that name none: generated models, stored like all others, since records
+//! name them by hash.
 
 use wildcity_generate::{ACTOR_REVISION, ActorModel, actor_models};
 use wildcity_scene::actor::{ActorAsset, AssetDescription};
@@ -26,7 +27,7 @@ pub fn generated_actors(catalog: &Catalog) -> Result<Vec<StoredActor>, String> {
     }
     for ActorModel { name, class, box_, gaussians } in actor_models() {
         if missing.contains(&name) {
-            let provenance = Provenance::of(source(name));
+            let provenance = Provenance::new(source(name));
             let description = AssetDescription { name: name.to_owned(), class, box_, provenance };
             let asset =
                 ActorAsset::new(&gaussians, description).map_err(|error| error.to_string())?;
@@ -37,8 +38,8 @@ pub fn generated_actors(catalog: &Catalog) -> Result<Vec<StoredActor>, String> {
     Ok(all)
 }
 
-/// The asset of a class whose size is the nearest: with the least sum of the logarithms of the ratios of length, width and
-/// height.
+/// The asset of a class whose size is the nearest: with the least sum of the logarithms of the
+/// ratios of length, width and height.
 pub(super) fn nearest<'a>(
     actors: &'a [StoredActor],
     class: ActorClass,

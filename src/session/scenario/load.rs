@@ -33,7 +33,6 @@ pub enum ScenarioSource {
 /// A scenario that was read for a seed and a version of its twin.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LoadedScenario {
-    /// The scenario.
     pub scenario: Scenario,
     /// Its lanes, if it names a map.
     pub map: Option<Map>,
@@ -56,7 +55,6 @@ pub enum ScenarioError {
     /// There is no file of this name.
     #[error("there is no scenario {name:?}; there is {}", joined(known))]
     Unknown {
-        /// The requested name.
         name: String,
         /// The names of the directory.
         known: Vec<String>,
@@ -94,12 +92,7 @@ pub enum ScenarioError {
     },
     /// The scenario plays in another twin.
     #[error("the scenario plays in twin {wanted:?}, and {requested:?} was opened: open {wanted:?}")]
-    Twin {
-        /// The scenario's twin.
-        wanted: String,
-        /// The opened twin.
-        requested: String,
-    },
+    Twin { wanted: String, requested: String },
 }
 
 impl ScenarioError {
@@ -127,7 +120,8 @@ impl Scenarios {
         let files = entries.map(|entry| entry.path());
         let scenarios = files.filter(|path| path.extension().is_some_and(|name| name == "json"));
         let is_scenario = |path: &PathBuf| {
-            // Tracks and maps are JSON as well. They are distinguished by a prefix, without reading the whole files.
+            // Tracks and maps are JSON as well. They are distinguished by a prefix, without reading
+            // the whole files.
             let mut head = vec![0; 4096];
             let read = File::open(path).and_then(|mut file| file.read(&mut head));
             read.is_ok_and(|count| {
@@ -160,7 +154,8 @@ impl Scenarios {
         parsed.map_err(|cause| ScenarioError::File { file: "scenario".to_owned(), cause })
     }
 
-    /// Resolves a scenario in a version of its twin. With `latest`, hashes that differ are noted and not refused.
+    /// Resolves a scenario in a version of its twin. With `latest`, hashes that differ are noted
+    /// and not refused.
     ///
     /// # Errors
     /// A mistake in the scenario or in a file that it names, or a hash that differs.
@@ -188,7 +183,7 @@ impl Scenarios {
             None => None,
             Some(pin) => {
                 let bytes = self.read("map.file", &pin.file, MAP_BYTES)?;
-                pins.check("map.hash", &mut pin.hash, &hash_of(&bytes))?;
+                pins.check("map.hash", &mut pin.hash, &hash_bytes(&bytes))?;
                 let map = MapFile::parse(&bytes).and_then(Map::new);
                 Some(map.map_err(wrong(&pin.file))?)
             }
@@ -197,7 +192,7 @@ impl Scenarios {
             None => None,
             Some(section) => {
                 let bytes = self.read("tracks.file", &section.file, MAP_BYTES)?;
-                pins.check("tracks.hash", &mut section.hash, &hash_of(&bytes))?;
+                pins.check("tracks.hash", &mut section.hash, &hash_bytes(&bytes))?;
                 Some(TracksFile::parse(&bytes).map_err(wrong(&section.file))?)
             }
         };
@@ -210,7 +205,7 @@ impl Scenarios {
         let scenario = Scenario::resolve(file, seed, &around).map_err(wrong("scenario"))?;
         // Serializing plain values into memory cannot fail. If it did, only the hash would differ.
         let json = serde_json::to_vec(&scenario.file).unwrap_or_default();
-        Ok(LoadedScenario { hash: hash_of(&json), scenario, map, unpinned: pins.unpinned })
+        Ok(LoadedScenario { hash: hash_bytes(&json), scenario, map, unpinned: pins.unpinned })
     }
 
     /// Reads and resolves a scenario with the first value of each of its sweep's names.
@@ -277,7 +272,7 @@ impl Pins {
     }
 }
 
-fn hash_of(bytes: &[u8]) -> String {
+fn hash_bytes(bytes: &[u8]) -> String {
     blake3::hash(bytes).to_hex().to_string()
 }
 

@@ -38,7 +38,8 @@ pub(crate) struct SessionScenario {
     scenarios: Scenarios,
     /// With the values of its sweep, without a seed.
     file: ScenarioFile,
-    /// Whether episodes start where the scenario's ego section says, because the request named no start.
+    /// Whether episodes start where the scenario's ego section says, because the request named no
+    /// start.
     gives_start: bool,
     generated: GeneratedActors,
 }
@@ -60,7 +61,7 @@ impl SessionScenario {
     }
 
     /// The scenario of an episode with a seed, and the assets of its actors, in memory.
-    pub(crate) fn of_episode(
+    pub(crate) fn for_episode(
         &self,
         seed: u64,
         version: &Version,
@@ -75,7 +76,8 @@ impl SessionScenario {
         Ok(EpisodeScenario { loaded: Arc::new(loaded), assets })
     }
 
-    /// Takes the assets of an episode for all that follow: a name may stand for another asset later.
+    /// Takes the assets of an episode for all that follow: a name may stand for another asset
+    /// later.
     pub(crate) fn pin_assets(&mut self, first: &LoadedScenario) {
         for (actor, pinned) in self.file.actors.iter_mut().zip(&first.scenario.file.actors) {
             actor.asset.clone_from(&pinned.asset);
@@ -85,7 +87,7 @@ impl SessionScenario {
     }
 
     /// The start of an episode, if the scenario gives it.
-    pub(crate) fn start_of(&self, loaded: &LoadedScenario) -> Option<Start> {
+    pub(crate) fn start(&self, loaded: &LoadedScenario) -> Option<Start> {
         let start = loaded.scenario.start.as_ref().filter(|_| self.gives_start)?;
         Some(match start {
             EgoStart::Pose(pose) => Start::Pose(*pose),

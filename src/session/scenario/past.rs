@@ -6,7 +6,8 @@ use std::sync::Arc;
 use wildcity_scene::geometry::Pose;
 use wildcity_sim::traffic::ActorState;
 
-/// The actors at the ends of past steps, by rising time in microseconds; the last is now. Copies share the states.
+/// The actors at the ends of past steps, by rising time in microseconds; the last is now. Copies
+/// share the states.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct ActorPast(VecDeque<(i64, Arc<[ActorState]>)>);
 
@@ -29,9 +30,9 @@ impl ActorPast {
         self.0.range(first..).map(|(time_us, states)| (*time_us, &**states))
     }
 
-    /// The pose of each actor at a time, by its index; `None` for one that is absent. Between two steps an actor is
-    /// present if it is present at both ends. Before the first time and after the last one, its pose is that at this
-    /// time.
+    /// The pose of each actor at a time, by its index; `None` for one that is absent. Between two
+    /// steps an actor is present if it is present at both ends. Before the first time and after the
+    /// last one, its pose is that at this time.
     pub(crate) fn poses_at(&self, time_us: i64) -> Vec<Option<Pose>> {
         let after = self.0.partition_point(|(past_us, _)| *past_us < time_us);
         let Some((to_us, to)) = self.0.get(after).or(self.0.back()) else { return Vec::new() };

@@ -1,4 +1,5 @@
-//! The traffic of an episode: its reaction to a step of the ego, and the events that the agent gets.
+//! The traffic of an episode: its reaction to a step of the ego, and the events that the agent
+//! gets.
 
 use std::sync::Arc;
 
@@ -32,8 +33,8 @@ pub struct EpisodeTraffic {
     exposure_us: i64,
     /// How old the pictures may be that sensors show, in microseconds.
     reach_us: i64,
-    /// States of the actors since the last observation, and before it for the longest exposure and the oldest pictures
-    /// of sensors. Frames of past times are rendered from them.
+    /// States of the actors since the last observation, and before it for the longest exposure and
+    /// the oldest pictures of sensors. Frames of past times are rendered from them.
     past: ActorPast,
 }
 
@@ -65,14 +66,10 @@ pub enum EventKind {
         /// Index of the trigger within the actor's script.
         trigger: usize,
     },
-    /// An actor appeared.
     Appeared {
-        /// Its index.
         actor: u16,
     },
-    /// An actor disappeared.
     Left {
-        /// Its index.
         actor: u16,
     },
     /// The ego left the area that the twin was trained on: the trust of its pose fell below
@@ -86,7 +83,8 @@ pub enum EventKind {
 }
 
 impl EpisodeTraffic {
-    /// The traffic at the start of an episode. `exposure_us` is the longest exposure of a camera, in microseconds.
+    /// The traffic at the start of an episode. `exposure_us` is the longest exposure of a camera,
+    /// in microseconds.
     pub(crate) fn at_start(
         loaded: Arc<LoadedScenario>,
         assets: ActorAssets,
@@ -129,8 +127,8 @@ impl EpisodeTraffic {
         Self { reach_us, ..self }
     }
 
-    /// The traffic after a step of `dt_us` in which the ego went from one state to another. `with_twin` has the contacts
-    /// with the twin that began in the step.
+    /// The traffic after a step of `dt_us` in which the ego went from one state to another.
+    /// `with_twin` has the contacts with the twin that began in the step.
     fn stepped(&self, from: &Ego, to: &Ego, dt_us: i64, with_twin: &[Event]) -> Self {
         let mut next = self.clone();
         next.events.clear();
@@ -179,8 +177,9 @@ impl EpisodeTraffic {
         next
     }
 
-    /// The traffic after the steps of a plan, each of `dt_us`, in which the ego went through `egos`. `with_twin` has the
-    /// contacts with the twin that began in each step. Its events are those of all steps.
+    /// The traffic after the steps of a plan, each of `dt_us`, in which the ego went through
+    /// `egos`. `with_twin` has the contacts with the twin that began in each step. Its events are
+    /// those of all steps.
     pub(crate) fn followed(
         &self,
         from: &Ego,
@@ -201,8 +200,8 @@ impl EpisodeTraffic {
         Self { events, ..next }
     }
 
-    /// Advances along the route, and ends the episode if a rule of the scenario applies. The first reason is kept,
-    /// since a plan continues to its end.
+    /// Advances along the route, and ends the episode if a rule of the scenario applies. The first
+    /// reason is kept, since a plan continues to its end.
     fn end(&mut self, ego: &Ego, has_contact: bool) {
         let world_from_rig = ego.world_from_rig();
         let route = self.loaded.scenario.route.clone();
@@ -234,7 +233,8 @@ impl EpisodeTraffic {
         matches!(self.loaded.scenario.end.contact, Some(Any | AtFault | Static))
     }
 
-    /// Whether the scenario's rule is about such a contact. Boxes that overlapped from the start are not judged.
+    /// Whether the scenario's rule is about such a contact. Boxes that overlapped from the start
+    /// are not judged.
     fn ends_episode(&self, contact: &Contact) -> bool {
         let class = self.specs[usize::from(contact.actor)].class;
         let is_meant = match self.loaded.scenario.end.contact {
@@ -270,8 +270,8 @@ impl EpisodeTraffic {
         self.world.states()
     }
 
-    /// The actors at the end of each of the last `steps` steps, with its time in microseconds; those of the last
-    /// request, or fewer.
+    /// The actors at the end of each of the last `steps` steps, with its time in microseconds;
+    /// those of the last request, or fewer.
     pub(crate) fn last_steps(&self, steps: usize) -> impl Iterator<Item = (i64, &[ActorState])> {
         self.past.last(steps)
     }
@@ -286,9 +286,12 @@ impl EpisodeTraffic {
         if self.assets.is_empty() {
             return Vec::new();
         }
-        let poses_at = |time_us: i64| match time_us < 0 {
-            true => poses(&self.world.states_before(time_us)),
-            false => self.past.poses_at(time_us),
+        let poses_at = |time_us: i64| {
+            if time_us < 0 {
+                poses(&self.world.states_before(time_us))
+            } else {
+                self.past.poses_at(time_us)
+            }
         };
         let at_start = poses_at(exposure_start_us(taken_us, self.exposure_us));
         self.assets.placed(&poses_at(taken_us), &at_start, frame)
@@ -329,8 +332,8 @@ impl EpisodeTraffic {
     }
 }
 
-/// Puts events in the order of their times, those of one time in the given order. Of more than [`limits::EVENTS`], keeps
-/// those that end or judge an episode before those that only tell.
+/// Puts events in the order of their times, those of one time in the given order. Of more than
+/// [`limits::EVENTS`], keeps those that end or judge an episode before those that only tell.
 pub(crate) fn settle(events: &mut Vec<Event>) {
     let weight = |event: &Event| match event.kind {
         EventKind::End(_) | EventKind::OffModel { .. } => 0,

@@ -45,9 +45,10 @@ impl Decisions {
         self.delay_us == 0
     }
 
-    /// Returns the ego after each of some steps of `dt_us` from `time_us`. The decision `command` is made at `time_us`,
-    /// takes effect after the latency, and holds until the end of these steps plus the latency. Before the first decision takes effect, a car keeps
-    /// its speed on a straight line, and an ego with `teleport` keeps its pose.
+    /// Returns the ego after each of some steps of `dt_us` from `time_us`. The decision `command`
+    /// is made at `time_us`, takes effect after the latency, and holds until the end of these steps
+    /// plus the latency. Before the first decision takes effect, a car keeps its speed on a
+    /// straight line, and an ego with `teleport` keeps its pose.
     ///
     /// # Errors
     /// The ego cannot execute the command, or a path ends before the next decision can take effect.
@@ -68,7 +69,7 @@ impl Decisions {
         // Refuse a command that this ego does not accept now, and not when it takes effect.
         ego.stepped(command, dt_us, ground)?;
         let world_from_rig = ego.world_from_rig();
-        let command = RecordedCommand::of_any(command);
+        let command = RecordedCommand::from_command(command);
         self.made.push_back(Decision { made_us: time_us, world_from_rig, command });
 
         let mut egos: Vec<Ego> = Vec::with_capacity(steps);

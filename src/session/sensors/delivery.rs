@@ -18,7 +18,8 @@ pub(crate) struct FrameSource<'a> {
     pub(crate) begin_us: i64,
 }
 
-/// The frame that a camera delivers when a frame is due. All times are in microseconds since the episode's start.
+/// The frame that a camera delivers when a frame is due. All times are in microseconds since the
+/// episode's start.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Delivery {
     /// When the frame was taken that is delivered, by the camera's own clock.
@@ -30,8 +31,8 @@ pub(crate) struct Delivery {
 }
 
 impl FrameSource<'_> {
-    /// Returns the frame that is delivered when the frame of `due_us`, a multiple of the period, is due: the most
-    /// recent frame that has arrived. The first frame of an episode always arrives.
+    /// Returns the frame that is delivered when the frame of `due_us`, a multiple of the period, is
+    /// due: the most recent frame that has arrived. The first frame of an episode always arrives.
     pub(crate) fn at(&self, due_us: i64) -> Delivery {
         let first_us = (self.begin_us + (-self.begin_us).rem_euclid(self.period_us)).min(due_us);
         let earliest_us = first_us.max(due_us - self.sensor.arrival_us(self.period_us));
@@ -64,9 +65,10 @@ impl FrameSource<'_> {
     fn picture_us(&self, stamp_us: i64) -> i64 {
         let Some(freeze) = self.sensor.freeze else { return stamp_us };
         let interval = stamp_us.div_euclid(freeze.for_us);
-        match self.draw("freeze", interval) < freeze.chance {
-            true => interval * freeze.for_us,
-            false => stamp_us,
+        if self.draw("freeze", interval) < freeze.chance {
+            interval * freeze.for_us
+        } else {
+            stamp_us
         }
     }
 
@@ -117,7 +119,8 @@ mod tests {
         let is_late = share(&sensor, |_, one| one.missing == Some(SensorReason::Late));
         assert!((is_late - 0.3).abs() < 4.0 * 0.0033, "{is_late}");
         let old = share(&sensor, |due_us, one| due_us - one.stamp_us == 2 * PERIOD_US);
-        // If the present and the previous frame are late, the frame of two periods ago has arrived in any case.
+        // If the present and the previous frame are late, the frame of two periods ago has arrived
+        // in any case.
         assert!((old - 0.09).abs() < 4.0 * 0.002, "{old}");
         assert_eq!(share(&sensor, |due_us, one| due_us - one.stamp_us > 2 * PERIOD_US), 0.0);
     }

@@ -7,9 +7,11 @@ use wildcity_scene::random::Random;
 /// Number of quantiles of the normal distribution: 16 random bits choose one.
 const QUANTILES: usize = 1 << 16;
 
-/// Quantiles of the normal distribution at (k + 1/2) / 65,536, scaled to variance 1. The largest is 4.3.
+/// Quantiles of the normal distribution at (k + 1/2) / 65,536, scaled to variance 1. The largest is
+/// 4.3.
 ///
-/// They solve dz/dp = 1/φ(z) = √(2π) exp(z²/2), integrated from the median by the method of Runge and Kutta.
+/// They solve dz/dp = 1/φ(z) = √(2π) exp(z²/2), integrated from the median by the method of Runge
+/// and Kutta.
 static NORMAL: LazyLock<Box<[f32]>> = LazyLock::new(|| {
     let slope = |z: f64| std::f64::consts::TAU.sqrt() * (0.5 * z * z).exp();
     let mut upper = Vec::with_capacity(QUANTILES / 2);
@@ -43,13 +45,15 @@ pub(crate) fn standard_normal(random: &mut Random) -> f64 {
     f64::from(NORMAL[(random.seed() >> 48) as usize])
 }
 
-/// A value that drifts with time: normally distributed with variance 1 at every time, and independent of its value two
-/// periods ago. At the fraction u of a period it is a cos(π u / 2) + b sin(π u / 2), where a and b are standard normal
-/// samples for the multiples of the period before and after. These weights keep the variance.
+/// A value that drifts with time: normally distributed with variance 1 at every time, and
+/// independent of its value two periods ago. At the fraction u of a period it is a cos(π u / 2) + b
+/// sin(π u / 2), where a and b are standard normal samples for the multiples of the period before
+/// and after. These weights keep the variance.
 pub(crate) fn drift(seed: u64, name: &str, period_us: i64, time_us: i64) -> f64 {
     let index = time_us.div_euclid(period_us);
     let part = time_us.rem_euclid(period_us) as f64 / period_us as f64;
-    // In a warm-up the index may be negative: its bits then serve as the index of the random generator.
+    // In a warm-up the index may be negative: its bits then serve as the index of the random
+    // generator.
     let drawn = |index: i64| standard_normal(&mut Random::new(seed, name, index as usize));
     let (sin, cos) = (std::f64::consts::FRAC_PI_2 * part).sin_cos();
     drawn(index) * cos + drawn(index + 1) * sin
@@ -61,7 +65,8 @@ mod tests {
 
     use super::*;
 
-    /// Abramowitz and Stegun, "Handbook of Mathematical Functions", table 26.1: P(z) of the normal distribution.
+    /// Abramowitz and Stegun, "Handbook of Mathematical Functions", table 26.1: P(z) of the normal
+    /// distribution.
     const TABLE: [(f64, f64); 4] =
         [(0.841_344_746, 1.0), (0.977_249_868, 2.0), (0.998_650_102, 3.0), (0.999_968_329, 4.0)];
 

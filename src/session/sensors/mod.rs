@@ -1,11 +1,12 @@
-//! Effects of sensors: lost, late and frozen frames, noise, drifting exposure, dirt on the lens, an inertial
-//! measurement unit, the wheel speed, and the planner latency.
+//! Effects of sensors: lost, late and frozen frames, noise, drifting exposure, dirt on the lens, an
+//! inertial measurement unit, the wheel speed, and the planner latency.
 //!
-//! Every effect is a function of the episode's seed, the sensor's name and a time. There is no running state, so a
-//! branch, a restored snapshot and a replay sample the same values, whatever other sessions do. Biases and the exposure
-//! drift without state: they are [interpolated](draw::drift) between samples for the multiples of a period. The only
-//! state of an episode, [`EpisodeSensors`], has the decisions that have not taken effect, and the motion since the last
-//! observation.
+//! Every effect is a function of the episode's seed, the sensor's name and a time. There is no
+//! running state, so a branch, a restored snapshot and a replay sample the same values, whatever
+//! other sessions do. Biases and the exposure drift without state: they are
+//! [interpolated](draw::drift) between samples for the multiples of a period. The only state of an
+//! episode, [`EpisodeSensors`], has the decisions that have not taken effect, and the motion since
+//! the last observation.
 //!
 //! | module | what it computes |
 //! |---|---|
@@ -84,9 +85,7 @@ pub enum SensorReason {
     Late,
     /// The picture stands still.
     Frozen,
-    /// It has noise.
     Noise,
-    /// Its exposure drifts.
     Exposure,
     /// The lens is dirty.
     Dirt,

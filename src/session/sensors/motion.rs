@@ -1,7 +1,7 @@
 //! Samples of the inertial measurement unit and of the wheel speed sensor.
 //!
-//! There is a sample for each step, at its end. With the rig's rotation R (world from rig), its acceleration a in world
-//! axes and gravity g = 9.80665 m/s² (ISO 80000-3), at a step of Δt:
+//! There is a sample for each step, at its end. With the rig's rotation R (world from rig), its
+//! acceleration a in world axes and gravity g = 9.80665 m/s² (ISO 80000-3), at a step of Δt:
 //!
 //! ```text
 //! specific force    f = R⁻¹ (a + g ẑ) + σ n + β(t)      m/s², in the axes of the rig: (0, 0, g) at rest
@@ -9,9 +9,9 @@
 //! speed             v = (1 + s) v_x + σ n               m/s along the rig, at the rear axle
 //! ```
 //!
-//! The samples n are standard normal and independent, the biases β [drift](super::draw::drift), and s is sampled once
-//! per episode. The terms are those of IEEE Std 952 (angle random walk and bias instability), with a bias of a bounded
-//! variance.
+//! The samples n are standard normal and independent, the biases β [drift](super::draw::drift), and
+//! s is sampled once per episode. The terms are those of IEEE Std 952 (angle random walk and bias
+//! instability), with a bias of a bounded variance.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -40,8 +40,8 @@ pub(crate) struct MotionSample {
 }
 
 impl MotionSample {
-    /// The sample of a step of `dt_us` from one state to another. At the start of an episode there is no step, and both
-    /// are equal.
+    /// The sample of a step of `dt_us` from one state to another. At the start of an episode there
+    /// is no step, and both are equal.
     pub(crate) fn new(from: &Ego, to: &Ego, dt_us: i64, time_us: i64) -> Self {
         let rig_from_world = to.world_from_rig().rotation.inverse();
         let turned =
@@ -108,7 +108,8 @@ mod tests {
         for _ in 0..5 {
             let to = from.stepped(&Command::Action(action), DT_US, &ground).unwrap();
             let [fx, fy, fz, wx, wy, wz] = MotionSample::new(&from, &to, DT_US, 0).imu(&exact(), 1);
-            // v² κ = 5 m/s² to the left, v κ = 0.5 rad/s; the mean over a step of 0.025 rad turns it by half of that.
+            // v² κ = 5 m/s² to the left, v κ = 0.5 rad/s; the mean over a step of 0.025 rad turns
+            // it by half of that.
             assert!((fy - 5.0).abs() < 2e-3 && (fx - 5.0 * 0.0125).abs() < 2e-3, "{fx} {fy}");
             assert!((fz - 9.80665).abs() < 1e-5 && (wz - 0.5).abs() < 1e-6, "{fz} {wz}");
             assert!(wx.abs() < 1e-9 && wy.abs() < 1e-9);

@@ -1,19 +1,20 @@
 //! Noise, exposure and dirt: from the pixels of a rendered image to those of a sensor.
 //!
-//! All of it happens in linear light L, which [`wildcity_scene::srgb`] decodes from stored values. For each pixel and
-//! channel,
+//! All of it happens in linear light L, which [`wildcity_scene::srgb`] decodes from stored values.
+//! For each pixel and channel,
 //!
 //! ```text
 //! L' = L 2^e (1 - a)            e stops of exposure; dirt takes the fraction a of the light
 //! L" = L' + σ(L') n             n normal; σ² = L'/N + (r/N)², for N electrons at full white and r of read noise
 //! ```
 //!
-//! The result is clamped to 0 to 1 (a full pixel is white), encoded, and rounded. The noise is the linear model of a
-//! sensor (EMVA Standard 1288, chapter 2; Foi, Trimeche, Katkovnik and Egiazarian, "Practical Poissonian-Gaussian noise
-//! modeling", 2008), with the normal distribution for that of Poisson. Dirt is out of focus, so that it has soft edges
-//! and only takes light (Gu, Ramamoorthi, Belhumeur and Nayar, "Removing image artifacts due to dirty camera lenses and
-//! thin occluders", 2009): in a spot of radius R, a = opacity (1 - s²(3 - 2s)) at s = (d/R - 1/2) 2, clamped to 0 to 1, for
-//! the distance d. The light that passes several spots is multiplied.
+//! The result is clamped to 0 to 1 (a full pixel is white), encoded, and rounded. The noise is the
+//! linear model of a sensor (EMVA Standard 1288, chapter 2; Foi, Trimeche, Katkovnik and
+//! Egiazarian, "Practical Poissonian-Gaussian noise modeling", 2008), with the normal distribution
+//! for that of Poisson. Dirt is out of focus, so that it has soft edges and only takes light (Gu,
+//! Ramamoorthi, Belhumeur and Nayar, "Removing image artifacts due to dirty camera lenses and thin
+//! occluders", 2009): in a spot of radius R, a = opacity (1 - s²(3 - 2s)) at s = (d/R - 1/2) 2,
+//! clamped to 0 to 1, for the distance d. The light that passes several spots is multiplied.
 
 use std::sync::LazyLock;
 
@@ -57,8 +58,9 @@ static STORED: LazyLock<Box<[u8]>> = LazyLock::new(|| {
 });
 
 impl PixelEffects {
-    /// The effects on the picture that a camera takes at a time, in microseconds; `None` if it has none.
-    pub(crate) fn of(
+    /// The effects on the picture that a camera takes at a time, in microseconds; `None` if it has
+    /// none.
+    pub(crate) fn new(
         sensor: &CameraSensor,
         seed: u64,
         camera: &str,
@@ -144,8 +146,8 @@ impl PixelEffects {
 /// SplitMix64's step: numbers at its multiples are those of one stream.
 const GOLDEN: u64 = 0x9E37_79B9_7F4A_7C15;
 
-/// The spots of a camera's lens in an episode: uniform over the image, with radii from a half to one and a half times
-/// the mean.
+/// The spots of a camera's lens in an episode: uniform over the image, with radii from a half to
+/// one and a half times the mean.
 fn spots(dirt: &LensDirt, seed: u64, camera: &str, aspect: f64) -> Vec<Spot> {
     let spot = |index: u64| {
         let mut random = Random::new(seed, &format!("{camera}/dirt"), index as usize);
@@ -168,7 +170,7 @@ mod tests {
 
     fn applied(sensor: &CameraSensor, seed: u64, taken_us: i64, value: u8) -> Vec<u8> {
         let mut rgb8 = vec![value; 3 * (WIDTH * HEIGHT) as usize];
-        let effects = PixelEffects::of(sensor, seed, "front", taken_us, [WIDTH, HEIGHT]).unwrap();
+        let effects = PixelEffects::new(sensor, seed, "front", taken_us, [WIDTH, HEIGHT]).unwrap();
         effects.apply(&mut rgb8, WIDTH as usize);
         rgb8
     }
@@ -198,7 +200,8 @@ mod tests {
                     / 2.0;
                 let model = light / full_well + (read / full_well).powi(2);
                 let expected = model + slope * slope / 12.0;
-                // 300,000 samples: standard errors √(σ²/n) and σ² √(2/n) = 0.26 %. Rounding to a curve adds 0.1 %.
+                // 300,000 samples: standard errors √(σ²/n) and σ² √(2/n) = 0.26 %. Rounding to a
+                // curve adds 0.1 %.
                 let error = (expected / 3e5).sqrt();
                 assert!((mean - light).abs() < 5.0 * error + 1e-5, "{full_well} {value}: {mean}");
                 let off = variance / expected - 1.0;
@@ -229,7 +232,7 @@ mod tests {
         assert_ne!(one, applied(&sensor, 2, 100_000, 128));
         assert_ne!(one, applied(&sensor, 1, 200_000, 128));
         let mut rear = vec![128; one.len()];
-        let effects = PixelEffects::of(&sensor, 1, "rear", 100_000, [WIDTH, HEIGHT]).unwrap();
+        let effects = PixelEffects::new(&sensor, 1, "rear", 100_000, [WIDTH, HEIGHT]).unwrap();
         effects.apply(&mut rear, WIDTH as usize);
         assert_ne!(one, rear);
     }
@@ -261,7 +264,8 @@ mod tests {
         let pixels = (WIDTH * HEIGHT) as f64;
         let black = rgb8.iter().step_by(3).filter(|&&value| value == 0).count() as f64;
         let clean = rgb8.iter().step_by(3).filter(|&&value| value == 200).count() as f64;
-        // The black part of a spot has half its radius; E[r²] = 0.05² (1 + 1/12), in widths. Spots overlap and are cut.
+        // The black part of a spot has half its radius; E[r²] = 0.05² (1 + 1/12), in widths. Spots
+        // overlap and are cut.
         let area =
             6.0 * std::f64::consts::PI * 0.0025 * (1.0 + 1.0 / 12.0) * f64::from(WIDTH * WIDTH);
         assert!(black > 0.1 * area / 4.0 && black < 2.0 * area / 4.0, "{black} of {area}");

@@ -37,7 +37,6 @@ pub struct CameraSensor {
     /// Intervals in which the picture stands still.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub freeze: Option<FrozenFrames>,
-    /// Noise.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub noise: Option<ImageNoise>,
     /// Drift of the exposure.
@@ -92,7 +91,6 @@ pub struct ExposureDrift {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LensDirt {
-    /// Number of spots.
     pub spots: u64,
     /// Mean radius, as a fraction of the image's width.
     pub radius: f64,
@@ -160,13 +158,15 @@ impl CameraSensor {
         self.drop.is_some() || self.late.is_some() || self.freeze.is_some()
     }
 
-    /// How long before a frame is due the picture may have been taken that is shown instead, in microseconds.
+    /// How long before a frame is due the picture may have been taken that is shown instead, in
+    /// microseconds.
     pub(crate) fn reach_us(&self, period_us: i64) -> i64 {
         let frozen_us = self.freeze.map_or(0, |freeze| freeze.for_us);
         self.arrival_us(period_us) + frozen_us
     }
 
-    /// Largest age, at the time when a frame is due, of the frame that may be delivered in its place, in microseconds.
+    /// Largest age, at the time when a frame is due, of the frame that may be delivered in its
+    /// place, in microseconds.
     pub(crate) fn arrival_us(&self, period_us: i64) -> i64 {
         let dropped_us = self.drop.map_or(0, |_| SENSOR_DROPS * period_us);
         self.late.map_or(0, |late| late.by_us) + dropped_us

@@ -1,5 +1,5 @@
-//! Snapshots: a session returns to them, and other sessions begin from them, or from a step of a recorded episode. A
-//! branch that gets the same commands as its original gives the same bytes.
+//! Snapshots: a session returns to them, and other sessions begin from them, or from a step of a
+//! recorded episode. A branch that gets the same commands as its original gives the same bytes.
 
 use std::sync::Arc;
 
@@ -52,8 +52,8 @@ impl Session {
         }
     }
 
-    /// Returns to a snapshot, and renders it. This restores the state of the session: version of the twin, ego, time,
-    /// frames of bundles. Later steps are recorded in a new file.
+    /// Returns to a snapshot, and renders it. This restores the state of the session: version of
+    /// the twin, ego, time, frames of bundles. Later steps are recorded in a new file.
     ///
     /// # Errors
     /// There is no such snapshot; otherwise as [`Session::step`].
@@ -62,8 +62,8 @@ impl Session {
         let Snapshot { version, state, origin, .. } = &*snapshot;
         let mut episode = state.episode.clone();
 
-        // The frames of the present are rendered again, since the history has only those of them that later
-        // observations show.
+        // The frames of the present are rendered again, since the history has only those of them
+        // that later observations show.
         let layout = &self.settings.layout;
         let earlier = state.frame_history.before(episode.time_us());
         let captures = layout.captures(&episode, &earlier);
@@ -71,7 +71,7 @@ impl Session {
         let deadline = Instant::now() + self.settings.deadline;
         let rendered = self.render(version, simulation, captures, Some(earlier), deadline).await?;
         let mut bytes = None;
-        if !version.is_version_of(&self.version) {
+        if !version.has_same_version(&self.version) {
             let resident = version.resident.clone();
             let extent = rig_extent(layout.cameras());
             bytes = Some(Engine::worst_case_bytes(resident, extent, version.profile).await?);
@@ -102,8 +102,8 @@ impl Session {
         Ok(rendered.observation)
     }
 
-    /// Opens a session in the state of another one's snapshot, with its settings. The new session has that state
-    /// as its snapshot `start`.
+    /// Opens a session in the state of another one's snapshot, with its settings. The new session
+    /// has that state as its snapshot `start`.
     ///
     /// # Errors
     /// There is not enough memory for its worst frame.
@@ -124,8 +124,8 @@ impl Session {
         Ok(session)
     }
 
-    /// Reads the record of an episode up to its step `step`, for [`Session::continued`]. The caller has checked the
-    /// name with [`is_episode_name`](crate::is_episode_name).
+    /// Reads the record of an episode up to its step `step`, for [`Session::continued`]. The caller
+    /// has checked the name with [`is_episode_name`](crate::is_episode_name).
     ///
     /// # Errors
     /// There is no such record, it is damaged, or it has fewer steps.
@@ -139,8 +139,8 @@ impl Session {
         run_blocking(move || Continuation::read(&path, origin)).await?
     }
 
-    /// Opens a session in the state that a recorded episode had after one of its steps, with its settings. The
-    /// new session has that state as its snapshot `start`.
+    /// Opens a session in the state that a recorded episode had after one of its steps, with its
+    /// settings. The new session has that state as its snapshot `start`.
     ///
     /// Executes the recorded commands again, and renders the frames that coming bundles show.
     ///
@@ -169,7 +169,7 @@ impl Session {
         let cameras = header.rig.cameras;
         let recorded = match header.settings {
             Some(settings) => settings,
-            None => RecordedSettings::default_of(cameras.len(), header.dt_us),
+            None => RecordedSettings::with_defaults(cameras.len(), header.dt_us),
         };
         recorded.schedule.check(cameras.len(), header.dt_us)?;
         let overlays = engine.answer_budget().reserve(overlay_bytes(&cameras))?;

@@ -59,7 +59,8 @@ pub struct Session {
     snapshots: Snapshots,
     /// The recorded episode that this one is a branch of, if it is one.
     origin: Option<RecordedOrigin>,
-    /// Number of the current episode's file, and the file once it exists: it begins with the first frame.
+    /// Number of the current episode's file, and the file once it exists: it begins with the first
+    /// frame.
     episode_number: u64,
     recorder: Option<Recorder>,
     /// Whether the session has switched versions since the last line of the episode's file.
@@ -84,7 +85,7 @@ impl Session {
 
     /// The viewpoints of the next frame if the ego stays where it is.
     pub fn viewpoints(&self) -> Vec<Viewpoint> {
-        viewpoints(&View::of_rig(
+        viewpoints(&View::from_rig(
             self.settings.layout.cameras(),
             self.state.episode.world_from_rig(),
         ))
@@ -176,7 +177,8 @@ impl Session {
         self.settings.layout.schedule().frames()
     }
 
-    /// Pixels that its answer to a step counts towards [`limits::ANSWER_PIXELS`](crate::limits::ANSWER_PIXELS).
+    /// Pixels that its answer to a step counts towards
+    /// [`limits::ANSWER_PIXELS`](crate::limits::ANSWER_PIXELS).
     pub fn step_pixels(&self) -> u64 {
         self.settings.layout.step_pixels()
     }

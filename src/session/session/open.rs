@@ -40,7 +40,8 @@ impl Session {
     /// Opens a session, and reserves the memory for its worst frame.
     ///
     /// # Errors
-    /// Names the first field of `options` that is invalid or cannot be satisfied. Nothing stays open then.
+    /// Names the first field of `options` that is invalid or cannot be satisfied. Nothing stays
+    /// open then.
     pub async fn open(
         engine: Arc<Engine>,
         name: String,
@@ -160,17 +161,18 @@ impl Session {
             solid_ego,
         };
 
-        // Prepare the version for its frames, and reserve the memory for the worst frame anywhere in the twin.
+        // Prepare the version for its frames, and reserve the memory for the worst frame anywhere
+        // in the twin.
         let coverage_for = match (outputs.trust, &settings.repair) {
             (true, _) => Some("outputs.trust"),
             (false, Some(_)) => Some("repair"),
             (false, None) => None,
         };
-        let profile = profile_of(&engine, &resident, &settings)?;
+        let profile = resolve_profile(&engine, &resident, &settings)?;
         let version = prepare(&engine, resident.clone(), profile, coverage_for, solid_ego).await?;
         let frame = frame_bytes(&engine, &settings.layout, version.coverage.is_some());
         let reservation = Engine::reserve(resident.clone(), extent, version.profile, frame).await?;
-        let references = references_of(&engine, &resident, &settings).await?;
+        let references = load_references(&engine, &resident, &settings).await?;
         let version = version.with_references(references);
 
         let exposure_us = View::longest_exposure_us(settings.layout.cameras());
@@ -219,11 +221,12 @@ impl Session {
 
     /// Switches to another version of the twin, or to its latest; the episode goes on.
     ///
-    /// The switch is recorded together with the next frame, so that one which fails or is dropped leaves
-    /// no trace.
+    /// The switch is recorded together with the next frame, so that one which fails or is dropped
+    /// leaves no trace.
     ///
     /// # Errors
-    /// The version cannot be opened, or its worst frame does not fit. The session stays on its own version.
+    /// The version cannot be opened, or its worst frame does not fit. The session stays on its own
+    /// version.
     pub async fn switch_version(&mut self, version: Option<u64>) -> Result<(), SessionError> {
         let current = &self.resident().version;
         let resident = self.engine.open_version(current.manifest.twin.clone(), version).await?;
@@ -232,12 +235,12 @@ impl Session {
         }
         let extent = rig_extent(self.settings.layout.cameras());
         let coverage_for = self.version.coverage.as_ref().map(|_| "outputs.trust");
-        let profile = profile_of(&self.engine, &resident, &self.settings)?;
+        let profile = resolve_profile(&self.engine, &resident, &self.settings)?;
         let solid_ego = self.settings.solid_ego;
         let version =
             prepare(&self.engine, resident.clone(), profile, coverage_for, solid_ego).await?;
         let bytes = Engine::worst_case_bytes(resident.clone(), extent, version.profile).await?;
-        let references = references_of(&self.engine, &resident, &self.settings).await?;
+        let references = load_references(&self.engine, &resident, &self.settings).await?;
         // There is no `await` from here on, so that a dropped future cannot leave half a switch.
         self.reservation.exchange(resident, bytes)?;
         self.version = version.with_references(references);
@@ -271,7 +274,7 @@ impl OpenedScenario {
             let scenarios = engine.scenarios().clone();
             let mut scenario =
                 SessionScenario::read(scenarios, &asked.source, &asked.values, gives_start)?;
-            let episode = scenario.of_episode(seed, &version, engine.cache())?;
+            let episode = scenario.for_episode(seed, &version, engine.cache())?;
             scenario.pin_assets(&episode.loaded);
             Ok(Self { asked, scenario, episode })
         })
@@ -285,7 +288,7 @@ impl OpenedScenario {
     /// Adds what the ego section says to what the request leaves open.
     fn complete(&self, options: &mut SessionOptions) {
         if options.start.is_none() {
-            options.start = self.scenario.start_of(&self.episode.loaded);
+            options.start = self.scenario.start(&self.episode.loaded);
         }
         if let (true, Some(dynamics)) = (self.asked.dynamics, self.resolved().dynamics) {
             options.dynamics = dynamics;
@@ -300,7 +303,7 @@ impl OpenedScenario {
 ///
 /// # Errors
 /// An override is out of range, or the backend cannot render the profile.
-fn profile_of(
+fn resolve_profile(
     engine: &Engine,
     resident: &Resident,
     settings: &SessionSettings,
@@ -310,8 +313,9 @@ fn profile_of(
     Ok(profile)
 }
 
-/// Prepares a version for the episodes of a session: bakes its sky, finds what is where, and reads where it was trained if
-/// the field `coverage_for` of the request needs to know. With the box `solid_ego`, contact with the twin is looked for.
+/// Prepares a version for the episodes of a session: bakes its sky, finds what is where, and reads
+/// where it was trained if the field `coverage_for` of the request needs to know. With the box
+/// `solid_ego`, contact with the twin is looked for.
 pub(super) async fn prepare(
     engine: &Arc<Engine>,
     resident: Arc<Resident>,
@@ -378,7 +382,8 @@ fn check_deadline(
     Ok(deadline)
 }
 
-/// The chosen rig, or the twin's, or the default preset, with the requested cameras in the requested order.
+/// The chosen rig, or the twin's, or the default preset, with the requested cameras in the
+/// requested order.
 fn select_cameras(
     manifest: &Manifest,
     choice: Option<RigChoice>,
@@ -459,7 +464,7 @@ fn crop_and_scale(mut rig: Rig, outputs: &Outputs) -> Result<Rig, SessionError> 
 
 /// The properties of a rig that determine how much memory its frames need.
 pub(super) fn rig_extent(cameras: &[RigCamera]) -> RigExtent {
-    let viewpoints = viewpoints(&View::of_rig(cameras, Pose::IDENTITY));
+    let viewpoints = viewpoints(&View::from_rig(cameras, Pose::IDENTITY));
     RigExtent {
         focal_px: viewpoints.iter().fold(0.0, |most, one| one.focal_px.max(most)),
         radius_m: viewpoints.iter().fold(0.0, |most, one| one.position_m.length().max(most)),
@@ -472,7 +477,7 @@ pub(super) fn frame_bytes(
     layout: &ObservationLayout,
     has_trust: bool,
 ) -> FrameBytes {
-    let views = View::of_rig(layout.cameras(), Pose::IDENTITY);
+    let views = View::from_rig(layout.cameras(), Pose::IDENTITY);
     engine.frame_bytes(&views, layout.rendered_bytes(has_trust), layout.answers_bytes())
 }
 
@@ -488,7 +493,7 @@ fn drive_to_follow<'a>(drives: &'a [Trajectory], start: Option<&Start>) -> Optio
 }
 
 /// The images that a repair model compares with; `None` if it needs none. Reads their table.
-async fn references_of(
+async fn load_references(
     engine: &Arc<Engine>,
     resident: &Arc<Resident>,
     settings: &SessionSettings,
@@ -502,7 +507,7 @@ async fn references_of(
     let read = move || {
         let version = resident.version.clone();
         let table = engine.catalog().views(&version)?;
-        let views = ReferenceViews::of(version, table, layout.cameras());
+        let views = ReferenceViews::new(version, table, layout.cameras());
         repair.check_references(views.as_ref(), layout.cameras())?;
         Ok::<_, SessionError>(views.map(Arc::new))
     };

@@ -14,8 +14,8 @@ use crate::viewpoint::viewpoints;
 
 impl Session {
     /// Accepts the path that the agent announces: from 1 to [`limits::PREFETCH_POSES`] poses
-    /// (`world_from_rig`), in order. Loads what is visible from these poses and from points between them, as
-    /// far as memory allows. Does not wait for the loads.
+    /// (`world_from_rig`), in order. Loads what is visible from these poses and from points between
+    /// them, as far as memory allows. Does not wait for the loads.
     ///
     /// # Errors
     /// The number of poses is out of range.
@@ -52,7 +52,8 @@ impl Session {
         }
     }
 
-    /// Loads in the background the sections that are visible from some poses, in place of an earlier prefetch.
+    /// Loads in the background the sections that are visible from some poses, in place of an
+    /// earlier prefetch.
     pub(super) fn prefetch_at(&self, places: Vec<(Urgency, Pose)>) {
         let prefetcher = self.reservation.prefetcher().clone();
         let layout = self.settings.layout.clone();
@@ -60,7 +61,8 @@ impl Session {
         let solids = self.version.solids.clone();
         let here = self.state.episode.world_from_rig();
         let here_m = here.position_m;
-        // What the ego would meet in the next two seconds: a step that reads a section waits for the disk.
+        // What the ego would meet in the next two seconds: a step that reads a section waits for
+        // the disk.
         let velocity_mps = self.state.episode.ego().velocity_m_s();
         let onwards = [1.0, 2.0].map(|s| Pose { position_m: here_m + s * velocity_mps, ..here });
         self.prefetch_task.submit(move || {
@@ -74,7 +76,9 @@ impl Session {
                 .collect();
             let places: Vec<_> = places
                 .into_iter()
-                .map(|(urgency, pose)| (urgency, viewpoints(&View::of_rig(layout.cameras(), pose))))
+                .map(|(urgency, pose)| {
+                    (urgency, viewpoints(&View::from_rig(layout.cameras(), pose)))
+                })
                 .collect();
             prefetcher.prefetch(&places, &profile);
             if let Some(solids) = solids {

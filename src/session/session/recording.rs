@@ -20,8 +20,9 @@ use crate::scenario::{EpisodeTraffic, Event, EventKind};
 use crate::state::{PinnedVersion, SessionSettings};
 
 impl Session {
-    /// Appends a frame to the episode's file. The first frame of an episode creates the file. `traffic` is that after a
-    /// step; `None` for a frame that is not a step. `events` are those of a step without a scenario.
+    /// Appends a frame to the episode's file. The first frame of an episode creates the file.
+    /// `traffic` is that after a step; `None` for a frame that is not a step. `events` are those of
+    /// a step without a scenario.
     pub(super) async fn record(
         &mut self,
         frame: FrameRecord,
@@ -61,7 +62,8 @@ impl Session {
     ) -> FrameRecord {
         let RenderedObservation { observation, captures, hashes, repairs, .. } = rendered;
         let all_cameras = self.settings.layout.cameras().len();
-        // Where the actors are in the warm-up depends on the time, and so do the effects of sensors.
+        // Where the actors are in the warm-up depends on the time, and so do the effects of
+        // sensors.
         let layout = &self.settings.layout;
         let is_timed = self.settings.scenario.is_some()
             || layout.sensors().is_some_and(|sensors| !sensors.cameras.is_empty());
@@ -103,8 +105,8 @@ impl Session {
         })
     }
 
-    /// Creates the file of an episode, with its header and its first frame. `episode` is the state before the step of
-    /// this frame.
+    /// Creates the file of an episode, with its header and its first frame. `episode` is the state
+    /// before the step of this frame.
     pub(super) async fn create_file(
         &self,
         pinned: &PinnedVersion,
@@ -141,7 +143,7 @@ impl Session {
             start: episode.world_from_rig(),
             dt_us: settings.dt_us,
             settings: recorded_settings(settings, self.trust()),
-            repair: settings.repair.as_deref().map(RecordedRepair::of),
+            repair: settings.repair.as_deref().map(RecordedRepair::from_repair),
             state: (!episode.is_start_alone()).then(|| episode.clone()),
             origin,
             scenario: traffic.map(|traffic| traffic.loaded().hash.clone()),
@@ -165,8 +167,8 @@ impl Session {
         Ok(created.await??)
     }
 
-    /// Writes the last line of the episode's file, and lets it be exported. A failure is only logged: the episode is
-    /// over either way.
+    /// Writes the last line of the episode's file, and lets it be exported. A failure is only
+    /// logged: the episode is over either way.
     pub(super) async fn end_recording(&mut self, outcome: Outcome) {
         let Some(recorder) = self.recorder.take() else { return };
         let summary = self.state.episode.summary(outcome);
@@ -188,7 +190,8 @@ impl Session {
     }
 }
 
-/// The lines before the frame of a request: with a scenario those of its traffic, otherwise its events.
+/// The lines before the frame of a request: with a scenario those of its traffic, otherwise its
+/// events.
 pub(super) fn simulation_lines(
     traffic: Option<&EpisodeTraffic>,
     events: &[Event],
@@ -201,9 +204,9 @@ pub(super) fn simulation_lines(
     }
 }
 
-/// The lines before the frame of a request: the poses of the actors at each frame of a warm-up and after each step, and
-/// the events. Before the first frame of a file also the poses in the earlier steps that its frames show, as in a
-/// branch, or if the first request is not a reset.
+/// The lines before the frame of a request: the poses of the actors at each frame of a warm-up and
+/// after each step, and the events. Before the first frame of a file also the poses in the earlier
+/// steps that its frames show, as in a branch, or if the first request is not a reset.
 fn traffic_lines(traffic: &EpisodeTraffic, frame: &FrameRecord, is_first: bool) -> Vec<Line> {
     let FrameRecord { step, steps, .. } = *frame;
     let warm_up_us = frame.times_us.iter().copied().filter(|time_us| *time_us < 0);
@@ -246,7 +249,7 @@ fn recorded_settings(settings: &SessionSettings, trust: bool) -> Option<Recorded
         contact: settings.contact,
     };
     let cameras = settings.layout.cameras().len();
-    (recorded != RecordedSettings::default_of(cameras, settings.dt_us)).then_some(recorded)
+    (recorded != RecordedSettings::with_defaults(cameras, settings.dt_us)).then_some(recorded)
 }
 
 async fn append(recorder: Recorder, lines: Vec<Line>) -> Result<(), SessionError> {

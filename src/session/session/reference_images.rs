@@ -1,7 +1,8 @@
 //! Reads and renders the references of a repair model.
 //!
-//! Each is rendered as a separate frame, scheduled among the frames of other sessions, and stays in memory for the next
-//! steps and for other sessions. Along the drive, new references are needed only every 2 m.
+//! Each is rendered as a separate frame, scheduled among the frames of other sessions, and stays in
+//! memory for the next steps and for other sessions. Along the drive, new references are needed
+//! only every 2 m.
 
 use std::collections::HashMap;
 use std::sync::Arc;

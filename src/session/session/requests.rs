@@ -1,7 +1,7 @@
 //! The requests that are answered with images (step, observe, reset), and close.
 //!
-//! Each request first renders, then records, and only then changes the session. If it fails or its future is dropped
-//! before that, the session is unchanged, and the client can repeat the request.
+//! Each request first renders, then records, and only then changes the session. If it fails or its
+//! future is dropped before that, the session is unchanged, and the client can repeat the request.
 
 use serde_json::Value;
 use tokio::time::{Instant, timeout_at};
@@ -54,8 +54,8 @@ impl Session {
     /// Moves the ego by one step of `dt_us` and renders.
     ///
     /// # Errors
-    /// The session is then unchanged, and the step can be repeated. If the future is dropped, the step may be on
-    /// record, but the session is unchanged as well.
+    /// The session is then unchanged, and the step can be repeated. If the future is dropped, the
+    /// step may be on record, but the session is unchanged as well.
     pub async fn step(
         &mut self,
         command: impl Into<Command>,
@@ -64,8 +64,8 @@ impl Session {
         self.follow(command.into(), StepOptions { terminate, ..StepOptions::default() }).await
     }
 
-    /// Moves the ego by one or more steps of `dt_us` along a plan, and renders at its end: the frames of that time, and
-    /// the frames since the start of the plan that the observation shows.
+    /// Moves the ego by one or more steps of `dt_us` along a plan, and renders at its end: the
+    /// frames of that time, and the frames since the start of the plan that the observation shows.
     ///
     /// # Errors
     /// As [`Session::step`], and if the notes or the number of steps are out of range.
@@ -115,9 +115,10 @@ impl Session {
         settle(&mut events);
 
         let mut record = self.frame_record(FrameRequest::Step, &next, &rendered);
-        record.command = match now.is_delayed() {
-            true => Some(RecordedCommand::of_any(&command)),
-            false => RecordedCommand::of(&command),
+        record.command = if now.is_delayed() {
+            Some(RecordedCommand::from_command(&command))
+        } else {
+            RecordedCommand::new(&command)
         };
         record.notes = options.notes;
         if steps > 1 {
@@ -146,8 +147,8 @@ impl Session {
         self.state.episode.followed(command, steps, &ground, terminate)
     }
 
-    /// What the ego meets of the twin while it goes through `egos`, and whether it leaves the trained area. Off the
-    /// threads that answer requests: it may have to read the twin.
+    /// What the ego meets of the twin while it goes through `egos`, and whether it leaves the
+    /// trained area. Off the threads that answer requests: it may have to read the twin.
     async fn meetings(
         &self,
         now: &Episode,
@@ -249,13 +250,13 @@ impl Session {
                 let scenario = scenario.clone();
                 let version = self.resident().version.clone();
                 let engine = self.engine.clone();
-                let find = move || scenario.of_episode(seed, &version, engine.cache());
+                let find = move || scenario.for_episode(seed, &version, engine.cache());
                 Some(run_blocking(find).await??)
             }
         };
         let start = start
             .or_else(|| settings.random_start.clone().map(Start::Random))
-            .or_else(|| settings.scenario.as_ref()?.start_of(&loaded.as_ref()?.loaded));
+            .or_else(|| settings.scenario.as_ref()?.start(&loaded.as_ref()?.loaded));
         let manifest = &self.resident().version.manifest;
         let lanes = loaded.as_ref().and_then(|found| found.loaded.lanes());
         let start = match &start {
@@ -273,7 +274,7 @@ impl Session {
                 seed,
                 lanes,
             )
-            .map_err(|error| error.of_reset(Some(start)))?,
+            .map_err(|error| error.into_reset_error(Some(start)))?,
         };
         let mut next = start
             .episode(seed, dynamics, settings.dt_us)
@@ -329,9 +330,11 @@ impl Session {
         self.state.episode.summary(outcome)
     }
 
-    /// Renders captures of a version one after the other, each scheduled among the other sessions' frames.
+    /// Renders captures of a version one after the other, each scheduled among the other sessions'
+    /// frames.
     ///
-    /// With a history, the observation also shows its earlier frames; without one (`observe`), it does not.
+    /// With a history, the observation also shows its earlier frames; without one (`observe`), it
+    /// does not.
     pub(super) async fn render(
         &self,
         version: &PinnedVersion,
@@ -416,8 +419,8 @@ fn first_failure_us(events: &[Event]) -> Option<i64> {
     events.iter().filter(fails).map(|event| event.time_us).min()
 }
 
-/// The event that an episode leaves the area that the twin was trained on, by a pose or by the images of an observation;
-/// `None` if it does not, or has left it before, or failed before.
+/// The event that an episode leaves the area that the twin was trained on, by a pose or by the
+/// images of an observation; `None` if it does not, or has left it before, or failed before.
 fn left_model(
     next: &mut Episode,
     off_model: Option<(i64, f64)>,

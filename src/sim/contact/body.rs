@@ -10,7 +10,6 @@ use super::footprint::Footprint;
 /// A box in the world: a footprint, and the heights that it reaches.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Body {
-    /// Seen from above.
     pub footprint: Footprint,
     /// Lowest height, in metres.
     pub bottom_m: f64,
@@ -19,9 +18,9 @@ pub struct Body {
 }
 
 impl Body {
-    /// The box of a pose (`world_from_actor`, or `world_from_rig`), whose centre is `center_x_m` ahead of the
-    /// pose's origin: 0 for an actor. The box stands upright: the tilt of a pose on a slope moves its centre but
-    /// leaves its outline as it is.
+    /// The box of a pose (`world_from_actor`, or `world_from_rig`), whose centre is `center_x_m`
+    /// ahead of the pose's origin: 0 for an actor. The box stands upright: the tilt of a pose on a
+    /// slope moves its centre but leaves its outline as it is.
     pub fn new(world_from_body: &Pose, size: &ActorBox, center_x_m: f64) -> Self {
         let forward = world_from_body.rotation * DVec3::X;
         // A pose that looks straight up has no heading; any does then.

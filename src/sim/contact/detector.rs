@@ -9,7 +9,8 @@ use super::fault::{CollisionType, FaultInput, LanePosition, is_ego_at_fault};
 use super::sweep::{Moving, overlap_s};
 use crate::traffic::{ActorSpec, ActorState, EgoBox, EgoState, SubStep};
 
-/// A faster motion within a sub-step is a teleport, in m/s: it is not swept, and only its end is tested.
+/// A faster motion within a sub-step is a teleport, in m/s: it is not swept, and only its end is
+/// tested.
 pub const MAX_SWEPT_SPEED_MPS: f64 = 60.0;
 
 /// The start of a contact.
@@ -19,8 +20,8 @@ pub struct Contact {
     pub actor: u16,
     /// When it began, in microseconds since the episode's start, rounded up.
     pub time_us: i64,
-    /// Whether the boxes overlapped when the episode began, or when the actor appeared. Such a contact is reported
-    /// and not judged.
+    /// Whether the boxes overlapped when the episode began, or when the actor appeared. Such a
+    /// contact is reported and not judged.
     pub at_start: bool,
     /// The kind of contact.
     pub kind: CollisionType,
@@ -38,8 +39,8 @@ pub struct Contact {
 
 /// Finds where contacts begin.
 ///
-/// A contact begins when two boxes touch that did not touch at the end of the previous sub-step. While they stay in
-/// contact, nothing more is reported.
+/// A contact begins when two boxes touch that did not touch at the end of the previous sub-step.
+/// While they stay in contact, nothing more is reported.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Detector {
     ego_box: EgoBox,
@@ -75,11 +76,12 @@ impl Detector {
         (detector, contacts)
     }
 
-    /// The contacts that begin in a sub-step, in the order of the actors. `lanes` is where the ego's corners lie at
-    /// its end, if there is a map.
+    /// The contacts that begin in a sub-step, in the order of the actors. `lanes` is where the
+    /// ego's corners lie at its end, if there is a map.
     ///
-    /// Within a sub-step, centres move on straight lines and the headings are those at its end. So every sub-step is
-    /// decided by itself, and a finer recording of the same motion gives the same decisions at the same sub-steps.
+    /// Within a sub-step, centres move on straight lines and the headings are those at its end. So
+    /// every sub-step is decided by itself, and a finer recording of the same motion gives the same
+    /// decisions at the same sub-steps.
     pub fn advance(
         &mut self,
         sub_step: &SubStep<'_>,
@@ -172,14 +174,14 @@ impl Pair<'_> {
             other_velocity_mps: actor_velocity_mps,
             other_is_agent: self.class != ActorClass::Object,
         };
-        // In 10 ms boxes get at most 1.2 m into each other, and the axis of least depth is the one on which they
-        // met.
+        // In 10 ms boxes get at most 1.2 m into each other, and the axis of least depth is the one
+        // on which they met.
         let (_, normal) = ego.widest_axis(&other);
         Contact {
             actor: self.actor_state.index,
             time_us,
             at_start: false,
-            kind: CollisionType::of(&input),
+            kind: CollisionType::classify(&input),
             ego_at_fault: is_ego_at_fault(&input, normal, lanes),
             normal,
             impact_mps: (ego_velocity_mps - actor_velocity_mps).length(),

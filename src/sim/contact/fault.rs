@@ -13,7 +13,6 @@ pub const BEHIND_RAD: f64 = 150.0 * std::f64::consts::PI / 180.0;
 /// Kinds of contact, in the order in which they are asked for (nuPlan's and NAVSIM's names).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum CollisionType {
-    /// The ego stood.
     StoppedEgo,
     /// The other stood, or is an object.
     StoppedTrack,
@@ -28,13 +27,11 @@ pub enum CollisionType {
 /// The state at the contact, on which the fault depends.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FaultInput {
-    /// The ego's box.
     pub ego: Footprint,
     /// The ego's reference point: its rear axle, in metres.
     pub ego_origin_m: DVec2,
     /// The ego's velocity, in m/s.
     pub ego_velocity_mps: DVec2,
-    /// The other's box.
     pub other: Footprint,
     /// The other's velocity, in m/s.
     pub other_velocity_mps: DVec2,
@@ -55,7 +52,7 @@ impl CollisionType {
     /// The kind of a contact.
     ///
     /// Source: NAVSIM 0a380a9, `pdm_scorer_utils.py` `get_collision_type`.
-    pub fn of(input: &FaultInput) -> Self {
+    pub fn classify(input: &FaultInput) -> Self {
         if input.ego_velocity_mps.length() <= STANDING_MPS {
             return Self::StoppedEgo;
         }
@@ -84,8 +81,8 @@ impl CollisionType {
         }
     }
 
-    /// NAVSIM's rule: whether a contact of this kind is the ego's fault. A lateral one is only if the ego was
-    /// not in a lane of its own.
+    /// NAVSIM's rule: whether a contact of this kind is the ego's fault. A lateral one is only if
+    /// the ego was not in a lane of its own.
     pub fn is_at_fault_in(self, lanes: LanePosition) -> bool {
         match self {
             Self::StoppedEgo | Self::ActiveRear => false,
@@ -96,7 +93,8 @@ impl CollisionType {
 }
 
 impl FaultInput {
-    /// The angle between the ego's heading and the line from its origin to the other's centre, in [0, π].
+    /// The angle between the ego's heading and the line from its origin to the other's centre, in
+    /// [0, π].
     pub fn bearing_rad(&self) -> f64 {
         let to_other = self.other.center_m - self.ego_origin_m;
         let ahead_m = self.ego.forward.dot(to_other);
@@ -105,11 +103,11 @@ impl FaultInput {
     }
 }
 
-/// `wildcity.fault@1`: NAVSIM's rule with the other's speed at the contact (NAVSIM takes that of its first frame).
-/// Without a map, a lateral contact is the ego's fault if the ego closes faster along `normal`, the unit vector from
-/// the ego to the other, than the other does.
+/// `wildcity.fault@1`: NAVSIM's rule with the other's speed at the contact (NAVSIM takes that of
+/// its first frame). Without a map, a lateral contact is the ego's fault if the ego closes faster
+/// along `normal`, the unit vector from the ego to the other, than the other does.
 pub fn is_ego_at_fault(input: &FaultInput, normal: DVec2, lanes: Option<LanePosition>) -> bool {
-    match (CollisionType::of(input), lanes) {
+    match (CollisionType::classify(input), lanes) {
         (CollisionType::ActiveLateral, None) => {
             input.ego_velocity_mps.dot(normal) > -input.other_velocity_mps.dot(normal)
         }

@@ -4,9 +4,10 @@ use glam::DVec2;
 
 /// Two boxes whose gap is at most this are in contact, in metres.
 ///
-/// Sets are closed, so a gap of exactly 0 is a contact. A gap is a sum of a few products of some metres, with an
-/// error of 1e-15 m; poses at a UTM northing of 5e6 m have steps of 9e-10 m. The limit lies between the two, so
-/// that rounding decides nothing and one step of the pose decides everything.
+/// Sets are closed, so a gap of exactly 0 is a contact. A gap is a sum of a few products of some
+/// metres, with an error of 1e-15 m; poses at a UTM northing of 5e6 m have steps of 9e-10 m. The
+/// limit lies between the two, so that rounding decides nothing and one step of the pose decides
+/// everything.
 pub const TOUCH_M: f64 = 1e-10;
 
 /// An oriented rectangle on the ground: a box seen from above.
@@ -85,11 +86,12 @@ impl Footprint {
         [self.forward, self.left(), other.forward, other.left()]
     }
 
-    /// The largest separation along the normal of a side, in metres: above 0 apart, 0 touching, below 0 the
-    /// depth to which they overlap. It is at most the distance.
+    /// The largest separation along the normal of a side, in metres: above 0 apart, 0 touching,
+    /// below 0 the depth to which they overlap. It is at most the distance.
     ///
-    /// Separating axis theorem: two convex shapes are apart if and only if a normal of one of their sides
-    /// separates them. The centres are subtracted first: far from the origin nothing else is exact.
+    /// Separating axis theorem: two convex shapes are apart if and only if a normal of one of their
+    /// sides separates them. The centres are subtracted first: far from the origin nothing else is
+    /// exact.
     pub fn gap_m(&self, other: &Self) -> f64 {
         self.widest_axis(other).0
     }
@@ -118,7 +120,8 @@ impl Footprint {
         if self.touches(other) {
             return 0.0;
         }
-        // Relative to this box. Between two convex shapes that are apart, the nearest pair has a corner.
+        // Relative to this box. Between two convex shapes that are apart, the nearest pair has a
+        // corner.
         let own = Self { center_m: DVec2::ZERO, ..*self };
         let other = other.shifted(-self.center_m);
         let from_own = own.corners_m().into_iter().map(|corner| other.distance_to_m(corner));

@@ -10,8 +10,8 @@
 //! | `solid.rs` | contact with the twin's own Gaussians |
 //! | `solids.rs` | these Gaussians in a grid, and the area of them that the ego overlaps at a pose |
 //!
-//! All of it is f64 and relative to the ego, so that a decision is the same at any distance from the world's
-//! origin. Boxes are closed sets: boxes that touch are in contact.
+//! All of it is f64 and relative to the ego, so that a decision is the same at any distance from
+//! the world's origin. Boxes are closed sets: boxes that touch are in contact.
 
 mod body;
 mod detector;

@@ -1,7 +1,8 @@
 //! Contact with the twin's own Gaussians: `wildcity.static@1`.
 //!
-//! HUGSIM counts Gaussians, but a count depends on how densely a scene was trained. The area of their largest
-//! cross-sections does not: splitting a Gaussian in four of half the size leaves it as it was.
+//! HUGSIM counts Gaussians, but a count depends on how densely a scene was trained. The area of
+//! their largest cross-sections does not: splitting a Gaussian in four of half the size leaves it
+//! as it was.
 
 use std::f64::consts::PI;
 
@@ -9,15 +10,16 @@ use glam::DVec3;
 
 /// Least opacity of a Gaussian that counts.
 pub const SOLID_OPACITY: f64 = 0.5;
-/// How much smaller than the ego's box the tested box is on each side, in metres, because the edge of a surface is
-/// blurred.
+/// How much smaller than the ego's box the tested box is on each side, in metres, because the edge
+/// of a surface is blurred.
 pub const SIDE_MARGIN_M: f64 = 0.1;
 /// Height above the ground from which Gaussians count, in metres: kerbs are driven over.
 pub const GROUND_MARGIN_M: f64 = 0.3;
 /// Area that is always free, in m²: a few floaters.
 pub const FREE_AREA_M2: f64 = 0.05;
 
-/// A Gaussian of the twin in the axes of the ego's box: x forward and y left of its centre, z above the ground.
+/// A Gaussian of the twin in the axes of the ego's box: x forward and y left of its centre, z above
+/// the ground.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SolidPoint {
     /// Its centre, in metres.
@@ -31,8 +33,8 @@ pub struct SolidPoint {
 /// The area of Gaussians in the ego's box that counts as a contact.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct StaticLimit {
-    /// The largest area of Gaussians inside the ego's box on the recorded drives near by, in m²; 0 if there is none. The
-    /// recorded car drove there, so this much area is no obstacle.
+    /// The largest area of Gaussians inside the ego's box on the recorded drives near by, in m²; 0
+    /// if there is none. The recorded car drove there, so this much area is no obstacle.
     pub most_on_drive_m2: f64,
 }
 

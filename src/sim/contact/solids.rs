@@ -1,4 +1,5 @@
-//! The solid Gaussians of a part of a twin in a grid, in which the ego's box finds those that it overlaps.
+//! The solid Gaussians of a part of a twin in a grid, in which the ego's box finds those that it
+//! overlaps.
 
 use std::collections::BTreeMap;
 use std::f64::consts::FRAC_PI_2;
@@ -12,9 +13,9 @@ use crate::traffic::EgoBox;
 
 /// Edge of a grid cell, in metres: a car lies in 6 to 12 of them.
 const CELL_M: f64 = 2.0;
-/// Gaussians in the same cube of this edge are added up, in metres. A car does not notice 10 cm, since the tested box
-/// is 10 cm smaller than the car on each side; and a capture with a hundred Gaussians in each cube takes the memory of
-/// one.
+/// Gaussians in the same cube of this edge are added up, in metres. A car does not notice 10 cm,
+/// since the tested box is 10 cm smaller than the car on each side; and a capture with a hundred
+/// Gaussians in each cube takes the memory of one.
 const MERGED_M: f64 = 0.1;
 
 /// The solid Gaussians of a part of a twin.
@@ -61,8 +62,8 @@ impl CubePoint {
 
 /// The part of the ego's box in which Gaussians are a contact, at a pose.
 ///
-/// It is tilted as the pose is: on a slope of 15 % the road is 0.36 m higher below the front of an upright car than below
-/// its middle, and would count.
+/// It is tilted as the pose is: on a slope of 15 % the road is 0.36 m higher below the front of an
+/// upright car than below its middle, and would count.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TestedBox {
     /// The middle of the box, on the ground.
@@ -115,7 +116,8 @@ impl Solids {
     pub fn new(points: impl IntoIterator<Item = SolidPoint>) -> Self {
         let solid = points.into_iter().filter(|point| point.opacity >= SOLID_OPACITY);
         let points: Vec<CubePoint> = solid.map(CubePoint::new).collect();
-        // By cube, and within a cube in the given order: a sum of areas depends on its order in the last digits.
+        // By cube, and within a cube in the given order: a sum of areas depends on its order in the
+        // last digits.
         let mut order: Vec<(CubeKey, usize)> =
             points.iter().enumerate().map(|(index, point)| (point.key(), index)).collect();
         order.sort_unstable();

@@ -13,11 +13,13 @@ pub struct Moving {
     pub velocity_mps: DVec2,
 }
 
-/// The times at which two boxes overlap, in seconds from now, as [first, last]; the past is negative. `None` if
-/// they never do. Boxes that overlap and do not move against each other do so from -infinity to infinity.
+/// The times at which two boxes overlap, in seconds from now, as [first, last]; the past is
+/// negative. `None` if they never do. Boxes that overlap and do not move against each other do so
+/// from -infinity to infinity.
 ///
-/// On each axis, the distance of the centres is linear in time, so the boxes overlap on it within one interval. They
-/// overlap while they do on all four axes: the intersection of these intervals, in closed form.
+/// On each axis, the distance of the centres is linear in time, so the boxes overlap on it within
+/// one interval. They overlap while they do on all four axes: the intersection of these intervals,
+/// in closed form.
 pub fn overlap_s(a: &Moving, b: &Moving) -> Option<[f64; 2]> {
     let apart_m = b.footprint.center_m - a.footprint.center_m;
     let closing_mps = b.velocity_mps - a.velocity_mps;
@@ -27,7 +29,8 @@ pub fn overlap_s(a: &Moving, b: &Moving) -> Option<[f64; 2]> {
         let along_m = apart_m.dot(axis);
         let rate_mps = closing_mps.dot(axis);
         let reach_m = a.footprint.radius_m(axis) + b.footprint.radius_m(axis) + TOUCH_M;
-        // Slower than 1e-12 m/s is a rounding error of velocities of 1e3 m/s, and moves nothing in an hour.
+        // Slower than 1e-12 m/s is a rounding error of velocities of 1e3 m/s, and moves nothing in
+        // an hour.
         if rate_mps.abs() < 1e-12 {
             if along_m.abs() > reach_m {
                 return None;
@@ -41,8 +44,8 @@ pub fn overlap_s(a: &Moving, b: &Moving) -> Option<[f64; 2]> {
     (first_s <= last_s).then_some([first_s, last_s])
 }
 
-/// The time until two boxes touch, in seconds; 0 if they do now, `None` if they never will. Without a velocity
-/// against each other there is no such time.
+/// The time until two boxes touch, in seconds; 0 if they do now, `None` if they never will. Without
+/// a velocity against each other there is no such time.
 pub fn time_to_contact_s(a: &Moving, b: &Moving) -> Option<f64> {
     let [first_s, last_s] = overlap_s(a, b)?;
     (last_s >= 0.0).then_some(first_s.max(0.0))

@@ -1,8 +1,9 @@
-//! Lateral dynamics while speed changes. There is no closed form, so the state is approximated by a polynomial
-//! that satisfies `|v| dz/dt = G(v) z + v steer δ` at five nodes of an interval (Radau IIA, order 9: Hairer and
-//! Wanner, "Solving Ordinary Differential Equations II", IV.5). The equation is linear, so one system of ten
-//! linear equations gives the solution. The last node is the end of the interval, so the method is L-stable:
-//! stiff transients are damped. Nothing is divided by v.
+//! Lateral dynamics while speed changes. There is no closed form, so the state is approximated by a
+//! polynomial that satisfies `|v| dz/dt = G(v) z + v steer δ` at five nodes of an interval (Radau
+//! IIA, order 9: Hairer and Wanner, "Solving Ordinary Differential Equations II", IV.5). The
+//! equation is linear, so one system of ten linear equations gives the solution. The last node is
+//! the end of the interval, so the method is L-stable: stiff transients are damped. Nothing is
+//! divided by v.
 
 use std::sync::LazyLock;
 
@@ -22,8 +23,8 @@ pub(super) const NODES: [f64; POINTS] = [
     1.0,
 ];
 
-/// Weights of the integrals from the start of the interval to each node. The last row is the quadrature over
-/// the interval, exact for polynomials of degree 8.
+/// Weights of the integrals from the start of the interval to each node. The last row is the
+/// quadrature over the interval, exact for polynomials of degree 8.
 pub(super) static INTEGRALS: LazyLock<[[f64; POINTS]; POINTS]> = LazyLock::new(|| {
     // Exact for every power: sum_j a_ij c_j^k = c_i^(k + 1) / (k + 1).
     let powers: [[f64; POINTS]; POINTS] =
@@ -45,8 +46,9 @@ static DERIVATIVES: LazyLock<[[f64; POINTS]; POINTS]> = LazyLock::new(|| {
     })
 });
 
-/// Lateral velocity (m/s) and yaw rate (rad/s) at the nodes of an interval of `piece_s` seconds that starts with
-/// `sideways`, given the speeds (m/s, of one sign) and steering angles (rad) at the nodes.
+/// Lateral velocity (m/s) and yaw rate (rad/s) at the nodes of an interval of `piece_s` seconds
+/// that starts with `sideways`, given the speeds (m/s, of one sign) and steering angles (rad) at
+/// the nodes.
 pub(super) fn solve(
     tyres: &LateralDynamics,
     piece_s: f64,

@@ -4,7 +4,8 @@ use glam::{DMat2, DVec2};
 
 use super::vehicle::LateralDynamics;
 
-/// The steering actuator: the angle follows its setpoint with a first-order lag, `dδ/dt = (target - δ) / lag`.
+/// The steering actuator: the angle follows its setpoint with a first-order lag,
+/// `dδ/dt = (target - δ) / lag`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Steering {
     /// Angle of the front wheels, in radians, positive to the left.
@@ -17,12 +18,13 @@ pub(super) struct Steering {
 
 /// The solution of `|v| dz/dt = G z + v steer δ(t)` for a speed v, from a state z.
 ///
-/// The steering angle is `target + (δ - target) e^(-t / lag)`, so a particular solution is `c + d e^(-t / lag)`
-/// with `G c = -v steer target` and `(G + |v| / lag) d = -v steer (δ - target)`. The remainder decays as the
-/// matrix exponential of `G t / |v|`. Everything stays finite as v goes to 0, where z becomes 0 at once: the car
-/// rolls in the direction of its wheels. `G + |v| / lag` is regular unless an eigenvalue equals the rate of the
-/// lag, -10 1/s: the eigenvalues are below -14 1/s at up to 10 m/s backwards, and forwards below -23 1/s or
-/// complex.
+/// The steering angle is `target + (δ - target) e^(-t / lag)`, so a particular solution is
+/// `c + d e^(-t / lag)` with `G c = -v steer target` and
+/// `(G + |v| / lag) d = -v steer (δ - target)`. The remainder decays as the matrix exponential of
+/// `G t / |v|`. Everything stays finite as v goes to 0, where z becomes 0 at once: the car rolls in
+/// the direction of its wheels. `G + |v| / lag` is regular unless an eigenvalue equals the rate of
+/// the lag, -10 1/s: the eigenvalues are below -14 1/s at up to 10 m/s backwards, and forwards
+/// below -23 1/s or complex.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ConstantSpeed {
     speed_m_s: f64,
@@ -56,8 +58,8 @@ impl ConstantSpeed {
         Self { speed_m_s, lag_s, matrix, settled, lagging, fading }
     }
 
-    /// Lateral velocity (m/s) and yaw rate (rad/s) after a time in seconds, and the change of heading until
-    /// then, in radians.
+    /// Lateral velocity (m/s) and yaw rate (rad/s) after a time in seconds, and the change of
+    /// heading until then, in radians.
     pub(super) fn after(&self, time_s: f64) -> (DVec2, f64) {
         let lag = (-time_s / self.lag_s).exp();
         let stretch_s2_m = time_s / self.speed_m_s.abs();
@@ -76,8 +78,8 @@ impl ConstantSpeed {
 }
 
 /// The exponential of a matrix: `e^μ (cosh ν + sinh ν / ν (M - μ))`, where μ is half its trace and
-/// `(M - μ)² = ν²` (Cayley-Hamilton). For negative ν² the hyperbolic functions become cosine and sine. Nothing
-/// overflows if the real parts of the eigenvalues `μ ± ν` are not positive.
+/// `(M - μ)² = ν²` (Cayley-Hamilton). For negative ν² the hyperbolic functions become cosine and
+/// sine. Nothing overflows if the real parts of the eigenvalues `μ ± ν` are not positive.
 fn exponential(matrix: DMat2) -> DMat2 {
     let mean = 0.5 * (matrix.x_axis.x + matrix.y_axis.y);
     let rest = matrix - DMat2::from_diagonal(DVec2::splat(mean));

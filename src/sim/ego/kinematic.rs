@@ -7,8 +7,8 @@ use super::single_track::SingleTrackState;
 use super::speed::Drive;
 use super::vehicle::Vehicle;
 
-/// The state after a step of constant acceleration and curvature, which apply without lag. The speed stays
-/// within `bounds_m_s`, which must contain 0. The car rolls without slip.
+/// The state after a step of constant acceleration and curvature, which apply without lag. The
+/// speed stays within `bounds_m_s`, which must contain 0. The car rolls without slip.
 pub(super) fn rolled(
     from: &SingleTrackState,
     car: &Vehicle,
@@ -44,9 +44,9 @@ pub(super) fn rolled(
     }
 }
 
-/// Displacement along an arc in the frame of its start (metres, x forward and y left), and the change of
-/// heading, in radians: `(sin(κ s) / κ, (1 - cos(κ s)) / κ)`, computed as a chord at half the angle, which
-/// avoids 0 / 0.
+/// Displacement along an arc in the frame of its start (metres, x forward and y left), and the
+/// change of heading, in radians: `(sin(κ s) / κ, (1 - cos(κ s)) / κ)`, computed as a chord at half
+/// the angle, which avoids 0 / 0.
 pub(super) fn arc(length_m: f64, curvature_1_m: f64) -> (DVec2, f64) {
     let half = 0.5 * length_m * curvature_1_m;
     let chord_m = if half.abs() < 1e-4 {

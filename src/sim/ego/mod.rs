@@ -1,28 +1,31 @@
 //! The ego: its state, its motion models, and its response to commands.
 //!
-//! There are three models. `teleport` takes the pose that the agent sends. `kinematic` rolls without slip and
-//! reaches the commanded acceleration and curvature at once. `dynamic` is the linear single-track model (Rajamani,
-//! "Vehicle Dynamics and Control", chapter 2; the CommonRoad vehicle models call it the single-track model) with
-//! lags of steering and drive. The last two move in the plane of the rig, which the [`Ground`] lifts and tilts.
+//! There are three models. `teleport` takes the pose that the agent sends. `kinematic` rolls
+//! without slip and reaches the commanded acceleration and curvature at once. `dynamic` is the
+//! linear single-track model (Rajamani, "Vehicle Dynamics and Control", chapter 2; the CommonRoad
+//! vehicle models call it the single-track model) with lags of steering and drive. The last two
+//! move in the plane of the rig, which the [`Ground`] lifts and tilts.
 //!
 //! # Integration of the dynamic model
-//! For given speed and steering, lateral velocity and yaw rate obey two linear equations, whose eigenvalues at
-//! low speed v are -178/v and -438/v: 438,000 1/s at 1 mm/s. An explicit step of 10 ms is stable only from
-//! 1.6 m/s (RK4) or 2.2 m/s (RK2) on, which is why other simulators switch to another model at low speed. Here the
-//! equations are solved instead of stepped. At constant speed the solution is a matrix exponential
-//! (`constant_speed.rs`). While speed changes there is no closed form, and a collocation polynomial that satisfies
-//! the equations at five points takes its place (`collocation.rs`, Radau IIA of order 9). Both forms are
-//! multiplied by |v|, so that nothing is divided by v: at standstill they give zero lateral slip. Steering and
-//! drive lag exponentially, and bounds of speed are reached at their exact times. The result is exact at constant
-//! speed and has an error of 1e-9 otherwise, from standstill to the largest speed, without another model.
+//! For given speed and steering, lateral velocity and yaw rate obey two linear equations, whose
+//! eigenvalues at low speed v are -178/v and -438/v: 438,000 1/s at 1 mm/s. An explicit step of 10
+//! ms is stable only from 1.6 m/s (RK4) or 2.2 m/s (RK2) on, which is why other simulators switch
+//! to another model at low speed. Here the equations are solved instead of stepped. At constant
+//! speed the solution is a matrix exponential (`constant_speed.rs`). While speed changes there is
+//! no closed form, and a collocation polynomial that satisfies the equations at five points takes
+//! its place (`collocation.rs`, Radau IIA of order 9). Both forms are multiplied by |v|, so that
+//! nothing is divided by v: at standstill they give zero lateral slip. Steering and drive lag
+//! exponentially, and bounds of speed are reached at their exact times. The result is exact at
+//! constant speed and has an error of 1e-9 otherwise, from standstill to the largest speed, without
+//! another model.
 //!
-//! The integration intervals grow. A change of steering leaves a transient that decays within v/178 s, so
-//! intervals begin with a length of v/438 and grow by half each: about twenty suffice for any speed, and no
-//! interval is repeated.
+//! The integration intervals grow. A change of steering leaves a transient that decays within v/178
+//! s, so intervals begin with a length of v/438 and grow by half each: about twenty suffice for any
+//! speed, and no interval is repeated.
 //!
-//! The study that compares integrators is a test and not a command: its reference is the implicit solver of
-//! another crate, which only the tests depend on, and the other methods that it compares are used by no
-//! part of the server. An agent's machine needs neither.
+//! The study that compares integrators is a test and not a command: its reference is the implicit
+//! solver of another crate, which only the tests depend on, and the other methods that it compares
+//! are used by no part of the server. An agent's machine needs neither.
 
 mod collocation;
 mod constant_speed;
@@ -64,7 +67,6 @@ pub enum EgoModel {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Dynamics {
-    /// The motion model.
     pub model: EgoModel,
     /// Speed at the start of an episode, in m/s along the rig; 0 for a teleport.
     pub speed_m_s: f64,
@@ -79,7 +81,6 @@ pub enum Command {
     Pose(Pose),
     /// A trajectory to follow.
     Path(Path),
-    /// Acceleration and curvature.
     Action(Action),
 }
 
@@ -96,8 +97,8 @@ pub struct Action {
     /// Acceleration along the car, in m/s², within ±[`limits::EGO_ACCELERATION_M_S2`].
     pub acceleration_m_s2: f64,
     /// Curvature of the path of the rear axle, in 1/m, positive to the left, within
-    /// ±[`limits::EGO_CURVATURE_1_M`]. The dynamic model steers such that it reaches this curvature in steady
-    /// state.
+    /// ±[`limits::EGO_CURVATURE_1_M`]. The dynamic model steers such that it reaches this curvature
+    /// in steady state.
     pub curvature_1_m: f64,
 }
 
@@ -144,21 +145,13 @@ pub enum EgoError {
     Range {
         /// The field, by its name on the wire.
         field: &'static str,
-        /// The refused value.
         value: f64,
-        /// The smallest accepted.
         least: f64,
-        /// The largest accepted.
         most: f64,
     },
     /// A path has too many poses, or none.
     #[error("the trajectory has {count} poses; 1 to {limit} are accepted")]
-    PathCount {
-        /// Number of poses.
-        count: usize,
-        /// Largest accepted number.
-        limit: usize,
-    },
+    PathCount { count: usize, limit: usize },
     /// The times of a path do not increase strictly.
     #[error(
         "trajectory[{index}].time_us is {time_us}; more than {before_us} and at most {limit_us} is accepted"
@@ -235,8 +228,8 @@ impl Dynamics {
         Self::checked(self.model, speed_m_s, self.reverse).map_err(refused)
     }
 
-    /// The first pose of an episode that is requested to start at `world_from_rig`: the same pose, placed on
-    /// the ground unless the model is a teleport.
+    /// The first pose of an episode that is requested to start at `world_from_rig`: the same pose,
+    /// placed on the ground unless the model is a teleport.
     pub fn start_pose(&self, world_from_rig: Pose, ground: &Ground<'_>) -> Pose {
         match self.model {
             EgoModel::Teleport => world_from_rig,
@@ -327,8 +320,8 @@ impl Ego {
         }
     }
 
-    /// The egos after each of `steps` steps along a plan, a trajectory or an action that holds for all of them. A
-    /// plan of one step is [`Ego::stepped`].
+    /// The egos after each of `steps` steps along a plan, a trajectory or an action that holds for
+    /// all of them. A plan of one step is [`Ego::stepped`].
     ///
     /// # Errors
     /// As [`Ego::stepped`]; the path must reach to the end of the last step.
@@ -359,8 +352,8 @@ impl Ego {
         Ok(egos)
     }
 
-    /// The ego after a step along a plan that was made `since_us` microseconds before the step, when the rig was at
-    /// `world_from_start`.
+    /// The ego after a step along a plan that was made `since_us` microseconds before the step,
+    /// when the rig was at `world_from_start`.
     ///
     /// # Errors
     /// As [`Ego::stepped`]; the path must reach to the end of the step.
@@ -412,20 +405,21 @@ impl Ego {
         self.world_from_rig
     }
 
-    /// Present velocity of the rig's origin along world axes, in m/s. For a teleport it is the mean over the
-    /// last step, and zero at the start.
+    /// Present velocity of the rig's origin along world axes, in m/s. For a teleport it is the mean
+    /// over the last step, and zero at the start.
     pub fn velocity_m_s(&self) -> DVec3 {
         self.velocity_m_s
     }
 
-    /// Mean acceleration over the last step along world axes, in m/s²: the change of velocity divided by the
-    /// step's duration. Zero at the start, and after the first step of a teleport, whose earlier velocity is
-    /// unknown.
+    /// Mean acceleration over the last step along world axes, in m/s²: the change of velocity
+    /// divided by the step's duration. Zero at the start, and after the first step of a teleport,
+    /// whose earlier velocity is unknown.
     pub fn acceleration_m_s2(&self) -> DVec3 {
         self.acceleration_m_s2
     }
 
-    /// Present yaw rate about the rig's z axis, in rad/s. For a teleport it is the mean over the last step.
+    /// Present yaw rate about the rig's z axis, in rad/s. For a teleport it is the mean over the
+    /// last step.
     pub fn yaw_rate_rad_s(&self) -> f64 {
         self.yaw_rate_rad_s
     }
@@ -439,7 +433,8 @@ impl Ego {
         let way_m = world_from_rig.position_m - self.world_from_rig.position_m;
         let velocity_m_s = way_m / step_s;
         let turn = self.world_from_rig.rotation.inverse() * world_from_rig.rotation;
-        // The rotation about z in the swing-twist decomposition: twice the angle of the (w, z) part.
+        // The rotation about z in the swing-twist decomposition: twice the angle of the (w, z)
+        // part.
         let turned_rad = path::wrapped(2.0 * turn.z.atan2(turn.w));
         let acceleration_m_s2 =
             if self.moved { (velocity_m_s - self.velocity_m_s) / step_s } else { DVec3::ZERO };
@@ -459,10 +454,12 @@ impl Ego {
             position_m: car.position_m.extend(0.0),
             rotation: DQuat::from_rotation_z(car.yaw_rad),
         };
-        // A car that does not move keeps its pose bit by bit: the product would be normalised once more.
-        let world_from_rig = match start_from_rig == Pose::IDENTITY {
-            true => self.world_from_rig,
-            false => ground.place(self.world_from_rig * start_from_rig),
+        // A car that does not move keeps its pose bit by bit: the product would be normalised once
+        // more.
+        let world_from_rig = if start_from_rig == Pose::IDENTITY {
+            self.world_from_rig
+        } else {
+            ground.place(self.world_from_rig * start_from_rig)
         };
         let rear_m_s = car.lateral_m_s - Vehicle::DEFAULT.rear_to_cg_m * car.yaw_rate_rad_s;
         let velocity_m_s = world_from_rig.rotation * DVec3::new(car.speed_m_s, rear_m_s, 0.0);
@@ -493,8 +490,8 @@ impl Ego {
         car.after(&vehicle, setpoint, step_s, bounds_m_s)
     }
 
-    /// The car after a step along a reference: the tracker computes a new action for each tick. The step begins at
-    /// the time `from_us` of the reference, and `car` is in its frame.
+    /// The car after a step along a reference: the tracker computes a new action for each tick. The
+    /// step begins at the time `from_us` of the reference, and `car` is in its frame.
     fn tracked(
         &self,
         reference: &ReferenceTrajectory,

@@ -1,4 +1,5 @@
-//! A trajectory that an agent sends to be followed: timed poses, and the reference that the tracker derives.
+//! A trajectory that an agent sends to be followed: timed poses, and the reference that the tracker
+//! derives.
 
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
@@ -49,7 +50,8 @@ impl TryFrom<RowOrNamed> for TimedPose {
     }
 }
 
-/// 1 to [`limits::PATH_POSES`] poses in order of time. The trajectory starts at time 0 at the pose of the rig.
+/// 1 to [`limits::PATH_POSES`] poses in order of time. The trajectory starts at time 0 at the pose
+/// of the rig.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Path {
     poses: Vec<TimedPose>,
@@ -70,7 +72,8 @@ pub(super) struct ReferenceState {
     pub(super) yaw_rate_rad_s: f64,
 }
 
-/// The poses of a path projected to the plane, with speeds, accelerations and yaw rates from finite differences.
+/// The poses of a path projected to the plane, with speeds, accelerations and yaw rates from finite
+/// differences.
 #[derive(Debug)]
 pub(super) struct ReferenceTrajectory {
     /// Times in seconds, and the reference then.
@@ -81,8 +84,8 @@ impl Path {
     /// A path from untrusted input.
     ///
     /// # Errors
-    /// There are no poses or too many, or their times do not increase strictly from above 0 to at most
-    /// [`limits::PATH_US`].
+    /// There are no poses or too many, or their times do not increase strictly from above 0 to at
+    /// most [`limits::PATH_US`].
     pub fn checked(poses: Vec<TimedPose>) -> Result<Self, EgoError> {
         if !(1..=limits::PATH_POSES).contains(&poses.len()) {
             return Err(EgoError::PathCount { count: poses.len(), limit: limits::PATH_POSES });
@@ -115,9 +118,10 @@ impl Path {
         for pose in &self.poses {
             if time_us <= pose.time_us {
                 let t = (time_us - before.time_us) as f64 / (pose.time_us - before.time_us) as f64;
-                return match pose.time_us == time_us {
-                    true => pose.start_from_rig,
-                    false => before.start_from_rig.interpolate(&pose.start_from_rig, t),
+                return if pose.time_us == time_us {
+                    pose.start_from_rig
+                } else {
+                    before.start_from_rig.interpolate(&pose.start_from_rig, t)
                 };
             }
             before = *pose;
@@ -125,8 +129,9 @@ impl Path {
         before.start_from_rig
     }
 
-    /// The reference in the plane, from the path's own poses. The rig's present pose is added only if the path
-    /// has a single pose. Otherwise a rig that lags behind would get a reference that starts fast and brakes.
+    /// The reference in the plane, from the path's own poses. The rig's present pose is added only
+    /// if the path has a single pose. Otherwise a rig that lags behind would get a reference that
+    /// starts fast and brakes.
     pub(super) fn reference(&self) -> ReferenceTrajectory {
         let start = TimedPose { time_us: 0, start_from_rig: Pose::IDENTITY };
         let start = (self.poses.len() == 1).then_some(start);
@@ -169,8 +174,8 @@ impl Path {
 }
 
 impl ReferenceTrajectory {
-    /// The reference at a time in seconds: interpolated; before the first pose extrapolated backwards; after the
-    /// last pose that of the last.
+    /// The reference at a time in seconds: interpolated; before the first pose extrapolated
+    /// backwards; after the last pose that of the last.
     pub(super) fn at(&self, time_s: f64) -> ReferenceState {
         let after = self.knots.partition_point(|(knot_s, _)| *knot_s < time_s);
         let Some((to_s, to)) = self.knots.get(after) else { return self.knots[after - 1].1 };

@@ -1,4 +1,5 @@
-//! One step of the linear single-track model: speed, steering, lateral velocity, yaw rate, and the pose.
+//! One step of the linear single-track model: speed, steering, lateral velocity, yaw rate, and the
+//! pose.
 
 use glam::DVec2;
 use serde::{Deserialize, Serialize};
@@ -37,17 +38,17 @@ pub struct Setpoint {
     pub steering_rad: f64,
 }
 
-/// Ratio of the lengths of consecutive intervals. A transient that decays at a rate λ has fallen to `e^(-2 x)` of
-/// its initial value when an interval is x / λ long, and collocation at five points has an error of at most
-/// 7e-9 of that value (at x = 5).
+/// Ratio of the lengths of consecutive intervals. A transient that decays at a rate λ has fallen to
+/// `e^(-2 x)` of its initial value when an interval is x / λ long, and collocation at five points
+/// has an error of at most 7e-9 of that value (at x = 5).
 const GROWTH: f64 = 1.5;
 
-/// Largest length of an interval, as a fraction of the lag: over such an interval, a polynomial approximates
-/// the exponential of the lag with a relative error of 1e-15.
+/// Largest length of an interval, as a fraction of the lag: over such an interval, a polynomial
+/// approximates the exponential of the lag with a relative error of 1e-15.
 const MAX_INTERVAL_LAGS: f64 = 0.25;
 
-/// Below this speed, in m/s, intervals do not become shorter. There, the lateral velocity after a change of
-/// steering is at most `v² δ' / 178²` = 3e-9 m/s, and lasts for 6 µs.
+/// Below this speed, in m/s, intervals do not become shorter. There, the lateral velocity after a
+/// change of steering is at most `v² δ' / 178²` = 3e-9 m/s, and lasts for 6 µs.
 const MIN_INTERVAL_SPEED_M_S: f64 = 1e-3;
 
 impl SingleTrackState {
@@ -62,12 +63,13 @@ impl SingleTrackState {
         }
     }
 
-    /// The state after a step of `step_s` seconds. The speed stays within `bounds_m_s` (smallest and largest,
-    /// in m/s), which must contain 0.
+    /// The state after a step of `step_s` seconds. The speed stays within `bounds_m_s` (smallest
+    /// and largest, in m/s), which must contain 0.
     ///
-    /// Exact at constant speed. While speed changes, lateral velocity and yaw rate are collocated in intervals,
-    /// with an error below 1e-9 (m, rad, m/s) for a step of 0.1 s at every speed. The pose is integrated in both
-    /// cases by the quadrature of the same nodes, which is exact to degree 8 and has the same error.
+    /// Exact at constant speed. While speed changes, lateral velocity and yaw rate are collocated
+    /// in intervals, with an error below 1e-9 (m, rad, m/s) for a step of 0.1 s at every speed. The
+    /// pose is integrated in both cases by the quadrature of the same nodes, which is exact to
+    /// degree 8 and has the same error.
     #[must_use]
     pub fn after(
         &self,

@@ -1,6 +1,7 @@
 //! Speed over a step: the drive follows its setpoint with a lag, and speed stays within bounds.
 
-/// A part of a step in which speed is constant, or changes without reaching a bound or changing sign.
+/// A part of a step in which speed is constant, or changes without reaching a bound or changing
+/// sign.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Phase {
     /// Duration, in seconds; above zero.
@@ -19,7 +20,8 @@ pub(super) struct Phase {
 pub(super) struct Drive {
     /// Speed, in m/s; below 0 backwards.
     pub(super) speed_m_s: f64,
-    /// Acceleration that the drive delivers, in m/s²; at a bound of speed the actual acceleration is 0.
+    /// Acceleration that the drive delivers, in m/s²; at a bound of speed the actual acceleration
+    /// is 0.
     pub(super) acceleration_m_s2: f64,
     /// Setpoint of the acceleration, in m/s².
     pub(super) target_m_s2: f64,
@@ -43,9 +45,9 @@ impl Drive {
         self.target_m_s2 + lacking * (-time_s / self.lag_s).exp()
     }
 
-    /// Divides a step into phases; also returns the drive's acceleration at its end. `bounds_m_s` are the
-    /// smallest and largest speed and contain 0. A step has at most one change of the acceleration's sign, two
-    /// bounds and a standstill: six phases.
+    /// Divides a step into phases; also returns the drive's acceleration at its end. `bounds_m_s`
+    /// are the smallest and largest speed and contain 0. A step has at most one change of the
+    /// acceleration's sign, two bounds and a standstill: six phases.
     pub(super) fn phases(mut self, step_s: f64, bounds_m_s: [f64; 2]) -> (Vec<Phase>, f64) {
         let mut phases = Vec::new();
         let mut left_s = step_s;
@@ -82,8 +84,8 @@ impl Drive {
         opposed.then(|| self.lag_s * ratio.ln()).filter(|time_s| *time_s > 0.0)
     }
 
-    /// Time until speed reaches a bound or 0, at most `most_s`, and the speed at that time. Speed must be
-    /// monotone for `most_s`.
+    /// Time until speed reaches a bound or 0, at most `most_s`, and the speed at that time. Speed
+    /// must be monotone for `most_s`.
     fn free(&self, most_s: f64, bounds_m_s: [f64; 2]) -> (f64, f64) {
         let end_m_s = self.speed_after(most_s);
         let [low, high] = bounds_m_s;
@@ -98,7 +100,8 @@ impl Drive {
         let reached = [low, 0.0, high].into_iter().filter(between);
         let first = if rises { reached.reduce(f64::min) } else { reached.reduce(f64::max) };
         let Some(target_m_s) = first else { return (most_s, end_m_s) };
-        // 64 bisections leave no f64 between the bounds; Newton's method would need care where a = 0.
+        // 64 bisections leave no f64 between the bounds; Newton's method would need care where a =
+        // 0.
         let mut before_s = 0.0;
         let mut after_s = most_s;
         for _ in 0..64 {

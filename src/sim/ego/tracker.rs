@@ -9,12 +9,12 @@ use super::path::{ReferenceState, ReferenceTrajectory, wrapped};
 use super::single_track::SingleTrackState;
 use super::vehicle::Vehicle;
 
-/// Longitudinal gain, in 1/s: an error of position and speed decays as `(1 + 2 t) e^(-2 t)`. This is ten times
-/// slower than what the drive's lag allows before the loop oscillates.
+/// Longitudinal gain, in 1/s: an error of position and speed decays as `(1 + 2 t) e^(-2 t)`. This
+/// is ten times slower than what the drive's lag allows before the loop oscillates.
 const LONGITUDINAL_GAIN_1_S: f64 = 2.0;
 
-/// Length over which a lateral error decays, in seconds of driving at the present speed, but at least
-/// [`LATERAL_DECAY_M`].
+/// Length over which a lateral error decays, in seconds of driving at the present speed, but at
+/// least [`LATERAL_DECAY_M`].
 const LATERAL_DECAY_S: f64 = 0.6;
 
 /// Smallest length over which a lateral error decays, in metres; it applies at low speed.
@@ -23,13 +23,13 @@ const LATERAL_DECAY_M: f64 = 4.0;
 /// Below this speed, in m/s, changes of the reference's heading count as noise and not as a curve.
 const MIN_CURVE_SPEED_M_S: f64 = 0.1;
 
-/// Acceleration and curvature for a car at a time of the reference, in seconds. The feedforward part is taken
-/// `lag_s` ahead, to compensate the actuators' lag.
+/// Acceleration and curvature for a car at a time of the reference, in seconds. The feedforward
+/// part is taken `lag_s` ahead, to compensate the actuators' lag.
 ///
-/// Feedforward of the reference plus linear feedback. Along the path `a = a* + 4 (v* - v) + 4 Δs`; across it
-/// `κ = κ* + Δy / l² + 2 Δψ / l`, whose errors decay as `(1 + s / l) e^(-s / l)` over the distance s. Δψ is
-/// measured against the direction of motion and not against the heading, since the car drifts. Both results are
-/// clamped to the range of an action.
+/// Feedforward of the reference plus linear feedback. Along the path `a = a* + 4 (v* - v) + 4 Δs`;
+/// across it `κ = κ* + Δy / l² + 2 Δψ / l`, whose errors decay as `(1 + s / l) e^(-s / l)` over the
+/// distance s. Δψ is measured against the direction of motion and not against the heading, since
+/// the car drifts. Both results are clamped to the range of an action.
 pub(super) fn track(
     reference: &ReferenceTrajectory,
     time_s: f64,
@@ -64,7 +64,8 @@ fn curvature(wanted: &ReferenceState) -> f64 {
     }
 }
 
-/// Slip angle of the rear axle, in radians: direction of motion minus heading, positive to the left.
+/// Slip angle of the rear axle, in radians: direction of motion minus heading, positive to the
+/// left.
 fn drift_rad(car: &SingleTrackState) -> f64 {
     let rear_m_s = car.lateral_m_s - Vehicle::DEFAULT.rear_to_cg_m * car.yaw_rate_rad_s;
     if car.speed_m_s.abs() < MIN_CURVE_SPEED_M_S { 0.0 } else { (rear_m_s / car.speed_m_s).atan() }

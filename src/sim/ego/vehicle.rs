@@ -2,10 +2,11 @@
 
 use glam::{DMat2, DVec2};
 
-/// Parameters of the single-track model, in which both wheels of an axle are merged into one in its middle.
+/// Parameters of the single-track model, in which both wheels of an axle are merged into one in its
+/// middle.
 ///
-/// The defaults are those of the vehicle model of NVIDIA's AlpaSim (a Ford Fusion). As there, stiffness is given
-/// per wheel and doubled for the axle.
+/// The defaults are those of the vehicle model of NVIDIA's AlpaSim (a Ford Fusion). As there,
+/// stiffness is given per wheel and doubled for the axle.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Vehicle {
     /// Mass, in kg.
@@ -24,11 +25,12 @@ pub struct Vehicle {
     pub lag_s: f64,
 }
 
-/// The lateral dynamics at speed v, forwards or backwards. The state z is the lateral velocity of the centre of
-/// gravity (m/s, positive to the left) and the yaw rate (rad/s, positive to the left):
-/// `|v| dz/dt = (grip + v |v| turning) z + v steer δ`.
+/// The lateral dynamics at speed v, forwards or backwards. The state z is the lateral velocity of
+/// the centre of gravity (m/s, positive to the left) and the yaw rate (rad/s, positive to the
+/// left): `|v| dz/dt = (grip + v |v| turning) z + v steer δ`.
 ///
-/// These are Newton's equations with linear tyres (Rajamani, "Vehicle Dynamics and Control", 2.3), multiplied by
+/// These are Newton's equations with linear tyres (Rajamani, "Vehicle Dynamics and Control", 2.3),
+/// multiplied by
 /// |v|. The lateral force of a tyre is its stiffness times its slip angle, `(u - v δ) / |v|` for a wheel with
 /// lateral velocity u. After the multiplication nothing is divided by v, and v = 0 gives z = 0.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -49,11 +51,12 @@ impl Vehicle {
         lag_s: 0.1,
     };
 
-    /// The steering angle, in radians, that gives a curvature (1/m) in steady state at a speed (m/s).
+    /// The steering angle, in radians, that gives a curvature (1/m) in steady state at a speed
+    /// (m/s).
     ///
     /// Setting dz/dt = 0 gives `δ = κ (L + K v²)` with the understeer gradient
-    /// `K = m (l_r C_r - l_f C_f) / (2 L C_f C_r)` (Rajamani, 3.1.3). K is 0.0035 s²/m for the default vehicle: it
-    /// understeers.
+    /// `K = m (l_r C_r - l_f C_f) / (2 L C_f C_r)` (Rajamani, 3.1.3). K is 0.0035 s²/m for the
+    /// default vehicle: it understeers.
     pub fn steering_rad(&self, curvature_1_m: f64, speed_m_s: f64) -> f64 {
         let Self { mass_kg, rear_to_cg_m, wheelbase_m, .. } = *self;
         let front = self.front_wheel_n_rad;
@@ -90,7 +93,8 @@ impl LateralDynamics {
         matrix
     }
 
-    /// The rate of the fastest decay at low speed times the speed, in m/s²: 438 for the default vehicle.
+    /// The rate of the fastest decay at low speed times the speed, in m/s²: 438 for the default
+    /// vehicle.
     pub(super) fn stiffness_m_s2(&self) -> f64 {
         // The larger magnitude of the two eigenvalues, which are real and negative.
         let half = 0.5 * (self.grip.x_axis.x + self.grip.y_axis.y);

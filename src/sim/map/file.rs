@@ -122,7 +122,7 @@ impl MapFile {
     pub const FORMAT: &str = "wildcity.map/1";
 
     /// A map of these lanes and areas.
-    pub fn of(lanes: Vec<Lane>, areas: Vec<Area>) -> Self {
+    pub fn new(lanes: Vec<Lane>, areas: Vec<Area>) -> Self {
         Self { format: Self::FORMAT.to_owned(), lanes, areas, stop_lines: Vec::new() }
     }
 

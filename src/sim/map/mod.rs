@@ -51,9 +51,10 @@ impl Map {
         file.check()?;
         let indices = file.lanes.iter().enumerate();
         let indices = indices.map(|(index, lane)| (lane.id.clone(), index)).collect();
-        let lanes = file.lanes.iter().map(Outline::of_lane).collect();
-        let areas = file.areas.iter().map(|area| Outline::of(area.outline.iter())).collect();
-        let surface = LaneSurface::of_driving(&file.lanes);
+        let lanes = file.lanes.iter().map(Outline::from_lane).collect();
+        let areas =
+            file.areas.iter().map(|area| Outline::from_points(area.outline.iter())).collect();
+        let surface = LaneSurface::from_driving_lanes(&file.lanes);
         Ok(Self { file, indices, lanes, areas, surface })
     }
 
@@ -82,14 +83,16 @@ impl Map {
             .map(|(index, _)| index)
     }
 
-    /// Whether vehicles may be at a point: in a lane for vehicles, or in a drivable area or an intersection.
+    /// Whether vehicles may be at a point: in a lane for vehicles, or in a drivable area or an
+    /// intersection.
     pub fn is_drivable(&self, point_m: DVec2) -> bool {
         self.lanes_at(point_m).next().is_some()
             || self.is_in(point_m, AreaKind::Drivable)
             || self.is_in(point_m, AreaKind::Intersection)
     }
 
-    /// Whether a point is in an area of a kind, or in a lane that leads through an intersection if that is asked.
+    /// Whether a point is in an area of a kind, or in a lane that leads through an intersection if
+    /// that is asked.
     pub fn is_in(&self, point_m: DVec2, kind: AreaKind) -> bool {
         let mut areas = self.areas.iter().zip(&self.file.areas);
         let in_area = areas.any(|(outline, area)| area.kind == kind && outline.contains(point_m));
@@ -102,17 +105,17 @@ impl Map {
     ///
     /// # Errors
     /// There is no such lane: the index within `ids`, and what to write.
-    pub(crate) fn surface_of(&self, ids: &[String]) -> Result<LaneSurface, (usize, String)> {
+    pub(crate) fn lane_surface(&self, ids: &[String]) -> Result<LaneSurface, (usize, String)> {
         let lanes = ids.iter().enumerate().map(|(index, id)| {
             let none = || (index, format!("there is no lane {id:?}; name a lane of the map"));
             self.lane(id).ok_or_else(none)
         });
-        Ok(LaneSurface::of(lanes.collect::<Result<Vec<_>, _>>()?.into_iter()))
+        Ok(LaneSurface::from_lanes(lanes.collect::<Result<Vec<_>, _>>()?.into_iter()))
     }
 }
 
 impl Outline {
-    fn of<'a>(points: impl Iterator<Item = &'a [f64; 3]>) -> Self {
+    fn from_points<'a>(points: impl Iterator<Item = &'a [f64; 3]>) -> Self {
         let points_m: Vec<DVec2> = points.map(|[x, y, _]| DVec2::new(*x, *y)).collect();
         let none = DVec2::INFINITY;
         let min_m = points_m.iter().fold(none, |min_m, point_m| min_m.min(*point_m));
@@ -120,12 +123,12 @@ impl Outline {
         Self { points_m, min_m, max_m }
     }
 
-    fn of_lane(lane: &Lane) -> Self {
-        Self::of(lane.left.iter().chain(lane.right.iter().rev()))
+    fn from_lane(lane: &Lane) -> Self {
+        Self::from_points(lane.left.iter().chain(lane.right.iter().rev()))
     }
 
-    /// Whether a point is inside or on the edge: the winding number is not 0. So a strip that crosses itself has no
-    /// hole there.
+    /// Whether a point is inside or on the edge: the winding number is not 0. So a strip that
+    /// crosses itself has no hole there.
     fn contains(&self, point_m: DVec2) -> bool {
         let in_box = point_m.cmpge(self.min_m).all() && point_m.cmple(self.max_m).all();
         if !in_box {
@@ -135,7 +138,8 @@ impl Outline {
         let last = self.points_m.last().copied();
         let before = last.into_iter().chain(self.points_m.iter().copied());
         for (from_m, to_m) in before.zip(&self.points_m) {
-            // Relative to the point, so that the decision is the same at any distance from the origin.
+            // Relative to the point, so that the decision is the same at any distance from the
+            // origin.
             let [from, to] = [from_m - point_m, *to_m - point_m];
             let cross = from.perp_dot(to);
             let is_on_edge = cross == 0.0 && from.dot(to) <= 0.0;
@@ -173,7 +177,7 @@ mod tests {
 
     #[test]
     fn points_are_in_their_lanes_edges_included() {
-        let map = Map::new(MapFile::of(vec![lane("a", 0.0, &["b"]), lane("b", 3.5, &[])], vec![]));
+        let map = Map::new(MapFile::new(vec![lane("a", 0.0, &["b"]), lane("b", 3.5, &[])], vec![]));
         let map = map.unwrap();
         let at = |x, y| map.lanes_at(DVec2::new(x, y)).collect::<Vec<_>>();
         assert_eq!(at(10.0, 0.0), [0]);
@@ -191,7 +195,7 @@ mod tests {
         let outline = [[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [2.0, 1.0], [0.0, 4.0]];
         let outline = outline.map(|[x, y]| [x + 1e7, y, 0.0]).to_vec();
         let area = Area { kind: AreaKind::Drivable, outline };
-        let map = Map::new(MapFile::of(vec![], vec![area])).unwrap();
+        let map = Map::new(MapFile::new(vec![], vec![area])).unwrap();
         let is_in = |x: f64, y: f64| map.is_drivable(DVec2::new(x + 1e7, y));
         assert!(is_in(0.5, 2.0) && is_in(3.5, 2.0) && is_in(2.0, 1.0) && is_in(2.0, 0.0));
         assert!(!is_in(2.0, 1.5) && !is_in(2.0, -0.001) && !is_in(4.1, 2.0));
@@ -200,14 +204,14 @@ mod tests {
     #[test]
     fn mistakes_name_their_place() {
         let path = |file: MapFile| Map::new(file).unwrap_err().path;
-        assert_eq!(path(MapFile::of(vec![lane("a", 0.0, &["c"])], vec![])), "lanes[0].next[0]");
+        assert_eq!(path(MapFile::new(vec![lane("a", 0.0, &["c"])], vec![])), "lanes[0].next[0]");
         let twice = vec![lane("a", 0.0, &[]), lane("a", 0.0, &[])];
-        assert_eq!(path(MapFile::of(twice, vec![])), "lanes[1].id");
+        assert_eq!(path(MapFile::new(twice, vec![])), "lanes[1].id");
         let mut short = lane("a", 0.0, &[]);
         short.left.truncate(1);
-        assert_eq!(path(MapFile::of(vec![short], vec![])), "lanes[0].left");
+        assert_eq!(path(MapFile::new(vec![short], vec![])), "lanes[0].left");
         let mut far = lane("a", 0.0, &[]);
         far.right[1][2] = 1e9;
-        assert_eq!(path(MapFile::of(vec![far], vec![])), "lanes[0].right[1][2]");
+        assert_eq!(path(MapFile::new(vec![far], vec![])), "lanes[0].right[1][2]");
     }
 }

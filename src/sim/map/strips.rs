@@ -9,8 +9,9 @@ use super::file::{Area, AreaKind, Lane, LaneKind, MapFile};
 /// Distance between two points of an edge, in metres.
 const SPACING_M: f64 = 2.0;
 
-/// A map of one lane and one drivable strip along each drive: from `left_m` to the left of the drive to `right_m` to
-/// its right, both above 0. The owner of the twin gives both: a default would be a guess that judges.
+/// A map of one lane and one drivable strip along each drive: from `left_m` to the left of the
+/// drive to `right_m` to its right, both above 0. The owner of the twin gives both: a default would
+/// be a guess that judges.
 pub fn strips_beside(drives: &[Trajectory], left_m: f64, right_m: f64) -> MapFile {
     let mut lanes = Vec::new();
     let mut areas = Vec::new();
@@ -48,5 +49,5 @@ pub fn strips_beside(drives: &[Trajectory], left_m: f64, right_m: f64) -> MapFil
             limit_mps: None,
         });
     }
-    MapFile::of(lanes, areas)
+    MapFile::new(lanes, areas)
 }

@@ -3,7 +3,7 @@
 use glam::{DVec2, DVec3};
 
 use super::file::{Lane, LaneKind};
-use crate::ground::Plane;
+use crate::plane::Plane;
 
 /// Horizontal length below which two points have no direction, in metres.
 const DIRECTION_M: f64 = 1e-6;
@@ -33,13 +33,13 @@ pub struct SurfacePoint {
 
 impl LaneSurface {
     /// The surface of the lanes for vehicles among these.
-    pub(super) fn of_driving(lanes: &[Lane]) -> Self {
-        Self::of(lanes.iter().filter(|lane| lane.kind == LaneKind::Driving))
+    pub(super) fn from_driving_lanes(lanes: &[Lane]) -> Self {
+        Self::from_lanes(lanes.iter().filter(|lane| lane.kind == LaneKind::Driving))
     }
 
     /// The surface of some lanes.
-    pub(super) fn of<'a>(lanes: impl Iterator<Item = &'a Lane>) -> Self {
-        Self::from_lines(lanes.map(points_of))
+    pub(super) fn from_lanes<'a>(lanes: impl Iterator<Item = &'a Lane>) -> Self {
+        Self::from_lines(lanes.map(surface_points))
     }
 
     /// The surface of middle lines, each of points in driving direction.
@@ -52,8 +52,8 @@ impl LaneSurface {
         self.lines.iter().map(|line| line.points.as_slice())
     }
 
-    /// The tangent plane at the place of a middle line that is nearest to a point in 3D, if one is nearer than
-    /// `within_m`.
+    /// The tangent plane at the place of a middle line that is nearest to a point in 3D, if one is
+    /// nearer than `within_m`.
     pub(crate) fn plane_near(&self, point_m: DVec3, within_m: f64) -> Option<Plane> {
         let mut nearest_m = within_m;
         let mut plane = None;
@@ -96,12 +96,12 @@ impl SurfaceLine {
 
 /// The middle line of a lane with the normals of its road.
 ///
-/// The normal is perpendicular to the way ahead and to the way from the right edge to the left one. The edges are
-/// compared at equal shares of their lengths.
-fn points_of(lane: &Lane) -> Vec<SurfacePoint> {
+/// The normal is perpendicular to the way ahead and to the way from the right edge to the left one.
+/// The edges are compared at equal shares of their lengths.
+fn surface_points(lane: &Lane) -> Vec<SurfacePoint> {
     let center: Vec<DVec3> = lane.center.iter().map(|point| DVec3::from_array(*point)).collect();
     let [left, right] = [Edge::new(&lane.left), Edge::new(&lane.right)];
-    let shares = shares_of(&center);
+    let shares = length_shares(&center);
     let last = center.len() - 1;
     let points = center.iter().zip(shares).enumerate();
     points
@@ -113,8 +113,8 @@ fn points_of(lane: &Lane) -> Vec<SurfacePoint> {
         .collect()
 }
 
-/// The upward unit normal to two directions. Where one of them has no horizontal part, or both are parallel, that of
-/// a road that is level across.
+/// The upward unit normal to two directions. Where one of them has no horizontal part, or both are
+/// parallel, that of a road that is level across.
 fn normal(ahead: DVec3, across: DVec3) -> DVec3 {
     let is_direction = |way_m: DVec3| way_m.truncate().length() > DIRECTION_M;
     if !is_direction(ahead) {
@@ -142,7 +142,7 @@ struct Edge {
 impl Edge {
     fn new(points: &[[f64; 3]]) -> Self {
         let points_m: Vec<DVec3> = points.iter().map(|point| DVec3::from_array(*point)).collect();
-        let shares = shares_of(&points_m);
+        let shares = length_shares(&points_m);
         Self { points_m, shares }
     }
 
@@ -157,8 +157,9 @@ impl Edge {
     }
 }
 
-/// The share of a line's horizontal length up to each point; 0 throughout for a line without length.
-fn shares_of(points_m: &[DVec3]) -> Vec<f64> {
+/// The share of a line's horizontal length up to each point; 0 throughout for a line without
+/// length.
+fn length_shares(points_m: &[DVec3]) -> Vec<f64> {
     let flat = |point_m: &DVec3| DVec2::new(point_m.x, point_m.y);
     let mut length_m = 0.0;
     let mut shares = vec![0.0];
@@ -176,7 +177,8 @@ fn shares_of(points_m: &[DVec3]) -> Vec<f64> {
 mod tests {
     use super::*;
 
-    /// A lane along x of 100 m that climbs by `climb` and falls to the right by `cross`, in m per m.
+    /// A lane along x of 100 m that climbs by `climb` and falls to the right by `cross`, in m per
+    /// m.
     fn lane(climb: f64, cross: f64) -> Lane {
         let line = |y_m: f64, xs_m: &[f64]| {
             xs_m.iter().map(|x_m| [*x_m, y_m, climb * x_m + cross * y_m]).collect::<Vec<_>>()
@@ -196,7 +198,7 @@ mod tests {
 
     #[test]
     fn a_plane_road_has_its_plane_everywhere() {
-        let surface = LaneSurface::of_driving(&[lane(0.08, 0.025)]);
+        let surface = LaneSurface::from_driving_lanes(&[lane(0.08, 0.025)]);
         let wanted = DVec3::new(-0.08, -0.025, 1.0).normalize();
         for point_m in [DVec3::new(45.0, 6.0, 3.0), DVec3::new(0.0, -9.0, 0.0), DVec3::X * 104.0] {
             let plane = surface.plane_near(point_m, 25.0).unwrap();
@@ -209,7 +211,7 @@ mod tests {
 
     #[test]
     fn a_flat_road_is_exactly_flat() {
-        let surface = LaneSurface::of_driving(&[lane(0.0, 0.0)]);
+        let surface = LaneSurface::from_driving_lanes(&[lane(0.0, 0.0)]);
         let plane = surface.plane_near(DVec3::new(41.3, 2.0, 0.3), 25.0).unwrap();
         assert_eq!((plane.up, plane.point_m.z), (DVec3::Z, 0.0));
     }
@@ -223,7 +225,7 @@ mod tests {
                 .map(|x_m: f64| [x_m, y_m, 5.0 - (x_m - 50.0).abs() / 10.0])
                 .to_vec();
         }
-        let surface = LaneSurface::of_driving(&[crest]);
+        let surface = LaneSurface::from_driving_lanes(&[crest]);
         let pitch = |x_m: f64| {
             let point_m = DVec3::new(x_m, 0.0, 5.0 - (x_m - 50.0).abs() / 10.0);
             let plane = surface.plane_near(point_m, 25.0).unwrap();
@@ -238,15 +240,16 @@ mod tests {
     #[test]
     fn sidewalks_are_no_road_and_degenerate_lanes_are_level_across() {
         let sidewalk = Lane { kind: LaneKind::Sidewalk, ..lane(0.0, 0.0) };
-        assert_eq!(LaneSurface::of_driving(&[sidewalk]), LaneSurface::default());
+        assert_eq!(LaneSurface::from_driving_lanes(&[sidewalk]), LaneSurface::default());
         let narrow = lane(0.08, 0.0);
         let narrow = Lane { left: narrow.center.clone(), right: narrow.center.clone(), ..narrow };
-        let plane = LaneSurface::of([narrow].iter()).plane_near(DVec3::X * 50.0, 25.0).unwrap();
+        let plane =
+            LaneSurface::from_lanes([narrow].iter()).plane_near(DVec3::X * 50.0, 25.0).unwrap();
         assert!((plane.up - DVec3::new(-0.08, 0.0, 1.0).normalize()).length() < 1e-12);
         let place = vec![[1.0, 2.0, 3.0]; 2];
         let spot =
             Lane { center: place.clone(), left: place.clone(), right: place, ..lane(0.0, 0.0) };
-        let plane = LaneSurface::of([spot].iter()).plane_near(DVec3::ZERO, 25.0).unwrap();
+        let plane = LaneSurface::from_lanes([spot].iter()).plane_near(DVec3::ZERO, 25.0).unwrap();
         assert_eq!((plane.point_m, plane.up), (DVec3::new(1.0, 2.0, 3.0), DVec3::Z));
     }
 }

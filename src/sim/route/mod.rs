@@ -8,11 +8,12 @@ use crate::limits;
 use crate::scenario::NavigationCommand;
 use crate::traffic::Course;
 
-/// Distance between two points of the route that an observation shows, in metres: 20 points over 80 m, as in
-/// AlpaSim.
+/// Distance between two points of the route that an observation shows, in metres: 20 points over 80
+/// m, as in AlpaSim.
 const POINT_SPACING_M: f64 = 80.0 / 19.0;
 
-/// Time for which a command looks ahead, in seconds, and the least speed for it, in m/s (NeuroNCAP, `model_api.py`).
+/// Time for which a command looks ahead, in seconds, and the least speed for it, in m/s (NeuroNCAP,
+/// `model_api.py`).
 const COMMAND_AHEAD_S: f64 = 3.0;
 const COMMAND_SPEED_MPS: f64 = 2.0;
 
@@ -36,7 +37,6 @@ pub struct NavigationRoute {
 pub struct RouteCommand {
     /// Where it must be carried out, in metres along the route.
     pub station_m: f64,
-    /// The command.
     pub command: NavigationCommand,
     /// Its text; `{m}` stands for the distance in metres.
     pub text: Option<String>,
@@ -60,9 +60,9 @@ pub struct RouteProgress {
 /// The route in an observation.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RouteView {
-    /// Up to 20 points in the rig's frame, in metres: from the route's nearest point to the ego on, 80/19 m apart.
+    /// Up to 20 points in the rig's frame, in metres: from the route's nearest point to the ego on,
+    /// 80/19 m apart.
     pub points_m: Vec<DVec3>,
-    /// The command.
     pub command: NavigationCommand,
     /// The text of the command, if the route has one.
     pub text: Option<String>,
@@ -80,8 +80,9 @@ impl NavigationRoute {
         }
     }
 
-    /// The ego's place after it moved. The search stays near the previous place, so that no part of a route that
-    /// crosses itself is skipped. Only an ego that is far from this part is searched for on the whole route.
+    /// The ego's place after it moved. The search stays near the previous place, so that no part of
+    /// a route that crosses itself is skipped. Only an ego that is far from this part is searched
+    /// for on the whole route.
     pub fn after(&self, before: &RouteProgress, world_from_rig: &Pose) -> RouteProgress {
         let point_m = world_from_rig.position_m;
         let [back_m, ahead_m] = limits::ROUTE_SEARCH_M;
@@ -135,7 +136,8 @@ impl NavigationRoute {
         if whole_m <= 0.0 { 1.0 } else { (driven_m / whole_m).clamp(0.0, 1.0) }
     }
 
-    /// Whether the ego has arrived: more than 99 % of the route driven, and less than 10 m from its end.
+    /// Whether the ego has arrived: more than 99 % of the route driven, and less than 10 m from its
+    /// end.
     pub fn is_done(&self, progress: &RouteProgress, world_from_rig: &Pose) -> bool {
         let end_m = self.course.point_m(self.course.length_m());
         self.share(progress) > limits::ROUTE_DONE

@@ -53,7 +53,7 @@ impl<'a> Courses<'a> {
                 let map = self.around.map.ok_or_else(|| {
                     FileError::new("lanes", "need a map: write \"map\": {\"file\": ..}")
                 })?;
-                let surface = map.surface_of(ids).map_err(|(index, message)| {
+                let surface = map.lane_surface(ids).map_err(|(index, message)| {
                     FileError::new(format!("lanes[{index}]"), message)
                 })?;
                 let points = surface.lines().flatten();

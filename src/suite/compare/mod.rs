@@ -1,7 +1,9 @@
-//! Compares two runs: which episodes and scores got worse, and whether the later run counts as worse.
+//! Compares two runs: which episodes and scores got worse, and whether the later run counts as
+//! worse.
 //!
-//! Episodes are pairs by scenario, values of the sweep and seed. A pair is compared if both were driven in the same
-//! version of the twin and in the same resolved scenario: otherwise a difference says nothing about the driver.
+//! Episodes are pairs by scenario, values of the sweep and seed. A pair is compared if both were
+//! driven in the same version of the twin and in the same resolved scenario: otherwise a difference
+//! says nothing about the driver.
 //!
 //! | module | what it does |
 //! |---|---|
@@ -53,7 +55,8 @@ pub struct Comparison {
     pub pass_rate: PairedRate,
     /// The scores that both runs have.
     pub scores: BTreeMap<String, ScoreChange>,
-    /// Scores that are not compared, in words, because only one run has them or their versions differ.
+    /// Scores that are not compared, in words, because only one run has them or their versions
+    /// differ.
     pub scores_not_compared: Vec<String>,
     /// All episodes of both runs, by name.
     pub episodes: Vec<ComparedEpisode>,
@@ -64,7 +67,6 @@ pub struct Comparison {
 pub struct RunName {
     /// Name of the suite.
     pub suite: String,
-    /// The agent.
     pub agent: String,
 }
 
@@ -83,8 +85,8 @@ pub struct ChangeCounts {
     pub duplicates: u64,
 }
 
-/// Number of the same episodes that passed before, and that pass now. An episode that passed before and has no verdict
-/// now does not pass.
+/// Number of the same episodes that passed before, and that pass now. An episode that passed before
+/// and has no verdict now does not pass.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct PairedRate {
     /// Pairs that the previous run has judged, without duplicates.
@@ -100,10 +102,7 @@ pub struct PairedRate {
 pub enum CompareError {
     /// No episode of one run can be compared with an episode of the other.
     #[error("the runs cannot be compared: {reason}")]
-    NothingToCompare {
-        /// Why not.
-        reason: String,
-    },
+    NothingToCompare { reason: String },
     /// The steps are of different length.
     #[error(
         "the runs cannot be compared: steps took {before_us} µs before and take {after_us} µs now; run both suites with \
@@ -129,23 +128,17 @@ pub enum CompareError {
     /// The rule names a score that the runs do not have.
     #[error("--worse-by {name}: no such score; there is {}", known.join(", "))]
     UnknownScore {
-        /// The name.
         name: String,
         /// The existing names, with [`PASS_RATE`].
         known: Vec<String>,
     },
     /// The rule names a score that no pair has.
     #[error("--worse-by {name}: no pair of episodes has a value of it in both runs")]
-    NoValue {
-        /// The name.
-        name: String,
-    },
+    NoValue { name: String },
     /// A result has an episode twice.
     #[error("a result has two episodes of scenario {scenario:?} with seed {seed}: {names}")]
     Twice {
-        /// The scenario.
         scenario: String,
-        /// The seed.
         seed: u64,
         /// The names of both.
         names: String,
@@ -187,7 +180,7 @@ impl Comparison {
             return Err(CompareError::NothingToCompare { reason: why_nothing(&episodes) });
         }
         // Apply the rule.
-        let pass_rate = PairedRate::of(&compared);
+        let pass_rate = PairedRate::from_pairs(&compared);
         let scores = scores::changes(&compared);
         let rule = rule.resolved(&scores.keys().map(String::as_str).collect::<Vec<_>>())?;
         let reasons = rule.reasons(&episodes, pass_rate, &scores)?;
@@ -196,8 +189,8 @@ impl Comparison {
             worse: !reasons.is_empty(),
             reasons,
             rule,
-            before: RunName::of(before),
-            after: RunName::of(after),
+            before: RunName::from_result(before),
+            after: RunName::from_result(after),
             counts: counts(&episodes),
             pass_rate,
             scores,
@@ -206,7 +199,8 @@ impl Comparison {
         })
     }
 
-    /// Checks, before anything is driven, that a run of these cases can be compared with a previous run.
+    /// Checks, before anything is driven, that a run of these cases can be compared with a previous
+    /// run.
     ///
     /// # Errors
     /// As for [`Comparison::new`].
@@ -216,10 +210,10 @@ impl Comparison {
         let names = scores::names(before);
         rule.resolved(&names.iter().copied().collect::<Vec<_>>())?;
         let by_key = pair::by_key(before)?;
-        let is_there = |case: &&Case| by_key.contains_key(&Key::of_case(case));
+        let is_there = |case: &&Case| by_key.contains_key(&Key::from_case(case));
         let there: Vec<&Case> = cases.iter().filter(is_there).collect();
         let is_alike = |case: &&&Case| {
-            let entry = by_key[&Key::of_case(case)];
+            let entry = by_key[&Key::from_case(case)];
             entry.version_hash == case.version_hash && entry.scenario_hash == case.line.hash
         };
         match there.iter().find(is_alike) {
@@ -237,9 +231,10 @@ impl Comparison {
 
     /// Whether it is worse, and why, in one line.
     pub fn conclusion(&self) -> String {
-        match self.worse {
-            true => format!("worse than before: {}", self.reasons.join("; ")),
-            false => format!("not worse than before: {}", self.rule.kept(self.pass_rate)),
+        if self.worse {
+            format!("worse than before: {}", self.reasons.join("; "))
+        } else {
+            format!("not worse than before: {}", self.rule.kept(self.pass_rate))
         }
     }
 
@@ -261,14 +256,14 @@ impl Comparison {
 }
 
 impl RunName {
-    fn of(run: &SuiteResult) -> Self {
+    fn from_result(run: &SuiteResult) -> Self {
         Self { suite: run.suite.clone(), agent: run.agent.clone() }
     }
 }
 
 impl PairedRate {
     /// The rate of the pairs that are compared.
-    fn of(compared: &[(&EpisodeEntry, &EpisodeEntry)]) -> Self {
+    fn from_pairs(compared: &[(&EpisodeEntry, &EpisodeEntry)]) -> Self {
         let judged = compared.iter().filter(|(before, _)| before.status.is_judged());
         let passes = |entry: &EpisodeEntry| u64::from(entry.status == Status::Passed);
         let none = Self { pairs: 0, before: 0, after: 0 };

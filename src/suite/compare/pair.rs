@@ -38,12 +38,10 @@ pub struct ComparedEpisode {
     pub name: String,
     /// Name of the scenario.
     pub scenario: String,
-    /// The seed.
     pub seed: u64,
     /// The values of the sweep.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub values: BTreeMap<String, Value>,
-    /// Its change.
     pub change: Change,
     /// How it ended before.
     pub before: Option<Side>,
@@ -52,7 +50,8 @@ pub struct ComparedEpisode {
     /// Why the two are not compared.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub differs: Option<String>,
-    /// Whether another pair was driven in the same way in both runs: then this pair is in no rate and no mean.
+    /// Whether another pair was driven in the same way in both runs: then this pair is in no rate
+    /// and no mean.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub duplicate: bool,
     /// The scores that differ: before and now.
@@ -63,7 +62,6 @@ pub struct ComparedEpisode {
 /// How an episode ended in a run.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Side {
-    /// Its status.
     pub status: Status,
     /// The names of its faults, by time.
     pub faults: Vec<String>,
@@ -93,11 +91,11 @@ impl Key {
         Self { scenario: scenario.to_owned(), values, seed }
     }
 
-    fn of(entry: &EpisodeEntry) -> Self {
+    fn from_entry(entry: &EpisodeEntry) -> Self {
         Self::new(&entry.scenario, &entry.values, entry.seed)
     }
 
-    pub(super) fn of_case(case: &Case) -> Self {
+    pub(super) fn from_case(case: &Case) -> Self {
         Self::new(&case.scenario, &case.values, case.seed)
     }
 }
@@ -106,7 +104,7 @@ impl Key {
 pub(super) fn by_key(run: &SuiteResult) -> Result<BTreeMap<Key, &EpisodeEntry>, CompareError> {
     let mut by_key: BTreeMap<Key, &EpisodeEntry> = BTreeMap::new();
     for entry in &run.episodes {
-        if let Some(other) = by_key.insert(Key::of(entry), entry) {
+        if let Some(other) = by_key.insert(Key::from_entry(entry), entry) {
             return Err(CompareError::Twice {
                 scenario: entry.scenario.clone(),
                 seed: entry.seed,
@@ -160,8 +158,8 @@ impl<'a> Pair<'a> {
             seed: any.map_or(0, |entry| entry.seed),
             values: any.map_or(BTreeMap::new(), |entry| entry.values.clone()),
             change,
-            before: self.before.map(Side::of),
-            after: self.after.map(Side::of),
+            before: self.before.map(Side::from_entry),
+            after: self.after.map(Side::from_entry),
             differs,
             duplicate: false,
             scores: self.comparable().map_or(BTreeMap::new(), |(a, b)| differing_scores(a, b)),
@@ -206,7 +204,7 @@ fn differing_scores(
 }
 
 impl Side {
-    fn of(entry: &EpisodeEntry) -> Self {
+    fn from_entry(entry: &EpisodeEntry) -> Self {
         let mut why = entry.fault_texts();
         match entry.status {
             Status::NotJudged => why.extend(entry.not_judged.iter().cloned()),
@@ -221,9 +219,10 @@ impl Side {
 
     /// The status and its reason.
     pub(super) fn text(&self) -> String {
-        match self.why.is_empty() {
-            true => self.status.name().to_owned(),
-            false => format!("{}: {}", self.status.name(), self.why.join("; ")),
+        if self.why.is_empty() {
+            self.status.name().to_owned()
+        } else {
+            format!("{}: {}", self.status.name(), self.why.join("; "))
         }
     }
 }

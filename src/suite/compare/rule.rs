@@ -19,8 +19,8 @@ const NAMED: usize = 5;
 
 /// When a run is worse: by default, if any episode passed before and does not pass now.
 ///
-/// A tolerance of [`PASS_RATE`] replaces this by the pass rate over all pairs, for drivers that are not deterministic.
-/// A tolerance of a score adds this score; by default, scores do not count.
+/// A tolerance of [`PASS_RATE`] replaces this by the pass rate over all pairs, for drivers that are
+/// not deterministic. A tolerance of a score adds this score; by default, scores do not count.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Rule {
     /// By how much each may be worse on average, in its own unit.
@@ -44,9 +44,10 @@ impl FromStr for Tolerance {
         let (name, amount) = text.split_once('=').ok_or(expected)?;
         let amount: f64 =
             amount.parse().map_err(|_| format!("{amount:?} is not a number; {expected}"))?;
-        match name.is_empty() || !amount.is_finite() || amount < 0.0 {
-            true => Err(format!("an amount is 0 or more; {expected}")),
-            false => Ok(Self { name: name.to_owned(), amount }),
+        if name.is_empty() || !amount.is_finite() || amount < 0.0 {
+            Err(format!("an amount is 0 or more; {expected}"))
+        } else {
+            Ok(Self { name: name.to_owned(), amount })
         }
     }
 }
@@ -84,7 +85,8 @@ impl Rule {
         match self.worse_by.get(PASS_RATE) {
             None => reasons.extend(lost_passes(episodes)),
             Some(&most) => {
-                // Use one division, so that 10 of 10 and 9 of 10 differ by exactly the value of "0.1".
+                // Use one division, so that 10 of 10 and 9 of 10 differ by exactly the value of
+                // "0.1".
                 let lost = rate.before as f64 - rate.after as f64;
                 let fall = lost / rate.pairs.max(1) as f64;
                 if fall > most {

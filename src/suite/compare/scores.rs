@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde::Serialize;
 
 use wildcity_score::statistics::Mean;
-use wildcity_score::{lower_is_better, range_of};
+use wildcity_score::{lower_is_better, score_range};
 
 use crate::entry::EpisodeEntry;
 use crate::result::SuiteResult;
@@ -21,8 +21,8 @@ pub struct ScoreChange {
     pub after: Option<f64>,
     /// Mean of the differences, now less before.
     pub difference: Option<f64>,
-    /// The ends of its 95 % interval: Student's t over the pairs, within the range of the score; null for fewer than
-    /// three pairs.
+    /// The ends of its 95 % interval: Student's t over the pairs, within the range of the score;
+    /// null for fewer than three pairs.
     pub interval: Option<[f64; 2]>,
     /// Whether lower values are better.
     pub lower_is_better: bool,
@@ -84,11 +84,11 @@ pub(super) fn changes(pairs: &[(&EpisodeEntry, &EpisodeEntry)]) -> BTreeMap<Stri
         both.cloned().collect::<Vec<String>>()
     };
     let names: BTreeSet<String> = pairs.iter().flat_map(of_pair).collect();
-    names.into_iter().map(|name| (name.clone(), ScoreChange::of(&name, pairs))).collect()
+    names.into_iter().map(|name| (name.clone(), ScoreChange::new(&name, pairs))).collect()
 }
 
 impl ScoreChange {
-    fn of(name: &str, pairs: &[(&EpisodeEntry, &EpisodeEntry)]) -> Self {
+    fn new(name: &str, pairs: &[(&EpisodeEntry, &EpisodeEntry)]) -> Self {
         let mut before = Vec::new();
         let mut after = Vec::new();
         let mut only = [0, 0];
@@ -105,21 +105,21 @@ impl ScoreChange {
             }
         }
         let differences: Vec<f64> = before.iter().zip(&after).map(|(old, new)| new - old).collect();
-        let mean = Mean::of(&differences);
-        let [least, most] = range_of(name);
+        let mean = Mean::from_values(&differences);
+        let [least, most] = score_range(name);
         let interval = mean.and_then(|mean| mean.interval([least - most, most - least]));
         let lower_is_better = lower_is_better(name);
         let is_same = differences.iter().all(|difference| *difference == 0.0);
         let direction = match interval {
             _ if is_same && !differences.is_empty() => Direction::Same,
-            Some([low, _]) if low > 0.0 => direction_of(!lower_is_better),
-            Some([_, high]) if high < 0.0 => direction_of(lower_is_better),
+            Some([low, _]) if low > 0.0 => direction(!lower_is_better),
+            Some([_, high]) if high < 0.0 => direction(lower_is_better),
             _ => Direction::Unclear,
         };
         Self {
             pairs: differences.len() as u64,
-            before: Mean::of(&before).map(|mean| mean.mean),
-            after: Mean::of(&after).map(|mean| mean.mean),
+            before: Mean::from_values(&before).map(|mean| mean.mean),
+            after: Mean::from_values(&after).map(|mean| mean.mean),
             difference: mean.map(|mean| mean.mean),
             interval,
             lower_is_better,
@@ -135,7 +135,7 @@ impl ScoreChange {
     }
 }
 
-fn direction_of(is_better: bool) -> Direction {
+fn direction(is_better: bool) -> Direction {
     if is_better { Direction::Better } else { Direction::Worse }
 }
 

@@ -5,7 +5,8 @@ use std::fmt::Write as _;
 use super::scores::Direction;
 use super::{Change, Comparison, ScoreChange};
 
-/// The comparison: what changed first, then the scores. The decision is not in it, but in [`Comparison::conclusion`].
+/// The comparison: what changed first, then the scores. The decision is not in it, but in
+/// [`Comparison::conclusion`].
 pub(super) fn text(comparison: &Comparison) -> String {
     let mut text = String::new();
     let mut row = |label: &str, rest: &str| {

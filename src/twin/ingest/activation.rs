@@ -27,8 +27,11 @@ pub(super) fn dc(colour: f64) -> f32 {
 pub(super) fn quat_of_smallest_three(largest: usize, others: [f64; 3]) -> [f32; 4] {
     let square = others.iter().map(|q| q * q).sum::<f64>();
     let mut left = others.into_iter();
-    std::array::from_fn(|i| match i == largest {
-        true => (1.0 - square).max(0.0).sqrt() as f32,
-        false => left.next().unwrap_or(0.0) as f32,
+    std::array::from_fn(|i| {
+        if i == largest {
+            (1.0 - square).max(0.0).sqrt() as f32
+        } else {
+            left.next().unwrap_or(0.0) as f32
+        }
     })
 }

@@ -14,7 +14,8 @@ use super::scene_files::SceneFiles;
 use super::unpack_budget::UnpackBudget;
 use super::{IngestError, nurec, sog};
 
-/// Reads the scene of an archive within a budget of nothing read, found by the first file in it of a known name.
+/// Reads the scene of an archive within a budget of nothing read, found by the first file in it of
+/// a known name.
 pub(super) fn read(
     bytes: Vec<u8>,
     budget: UnpackBudget,
@@ -100,7 +101,8 @@ impl SceneFiles for Archive {
     }
 }
 
-/// Checks that nothing follows the archive: the file ends with its last record, whose comment has the stated length.
+/// Checks that nothing follows the archive: the file ends with its last record, whose comment has
+/// the stated length.
 fn check_end(bytes: &[u8]) -> Result<(), IngestError> {
     const RECORD_BYTES: usize = 22;
     let is_record_at = |at: usize| {
@@ -110,12 +112,11 @@ fn check_end(bytes: &[u8]) -> Result<(), IngestError> {
     };
     let last = bytes.len().saturating_sub(RECORD_BYTES);
     let first = last.saturating_sub(usize::from(u16::MAX));
-    match bytes.len() >= RECORD_BYTES && (first..=last).rev().any(is_record_at) {
-        true => Ok(()),
-        false => {
-            let reason = "is not at the end of the file: the file is truncated, or something follows the archive";
-            Err(error("the end of the directory", reason.into()))
-        }
+    if bytes.len() >= RECORD_BYTES && (first..=last).rev().any(is_record_at) {
+        Ok(())
+    } else {
+        let reason = "is not at the end of the file: the file is truncated, or something follows the archive";
+        Err(error("the end of the directory", reason.into()))
     }
 }
 

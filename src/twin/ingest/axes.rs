@@ -1,7 +1,7 @@
 //! Converts from the axes and unit of a file to a twin's: metres, x east, y north, z up.
 //!
-//! Hardly any file says what its axes are (two PLY files may differ), so an import has options for them. An SPZ file may
-//! say it in an extension.
+//! Hardly any file says what its axes are (two PLY files may differ), so an import has options for
+//! them. An SPZ file may say it in an extension.
 
 use std::str::FromStr;
 
@@ -45,8 +45,8 @@ impl Axes {
     /// The file has a twin's axes and unit.
     pub const IDENTITY: Self = Self { twin_from_file: DMat3::IDENTITY, metres_per_unit: 1.0 };
 
-    /// Largest difference of an entry of `M Mᵀ` from the identity's: a matrix typed with four digits is
-    /// accepted.
+    /// Largest difference of an entry of `M Mᵀ` from the identity's: a matrix typed with four
+    /// digits is accepted.
     const MAX_ERROR: f64 = 1e-3;
 
     /// From a matrix. Its rows are the twin's axes in the file's axes.
@@ -91,7 +91,8 @@ impl Axes {
         self.twin_from_file.transpose()
     }
 
-    /// This change of axes and unit for poses; `None` for axes with a reflection, in which no camera has a pose.
+    /// This change of axes and unit for poses; `None` for axes with a reflection, in which no
+    /// camera has a pose.
     pub fn alignment(&self) -> Option<Alignment> {
         let is_mirrored = self.twin_from_file.determinant() < 0.0;
         let rotation = DQuat::from_mat3(&self.twin_from_file).normalize();
@@ -116,7 +117,7 @@ impl Axes {
     }
 
     /// Whether the rotation is that of other axes, whatever the unit.
-    pub fn has_rotation_of(&self, other: &Self) -> bool {
+    pub fn has_same_rotation(&self, other: &Self) -> bool {
         let off = self.twin_from_file - other.twin_from_file;
         off.to_cols_array().iter().all(|e| e.abs() <= Self::MAX_ERROR)
     }

@@ -20,7 +20,6 @@ use wildcity_scene::rig::MAX_NAME_BYTES;
 pub struct ListedCamera {
     /// Its name, which becomes part of file names.
     pub name: String,
-    /// Size and intrinsics.
     pub camera: Camera,
     /// Its pose, in the axes and units of the scene.
     pub world_from_camera: Pose,
@@ -56,59 +55,39 @@ pub enum CamerasError {
     Name {
         /// Index of the camera, from 0.
         index: usize,
-        /// The refused name.
         name: String,
         /// The values that are accepted.
         must: &'static str,
     },
     /// A camera has neither `position` nor `position_ply`, or both.
     #[error("camera {name:?}: give either position or position_ply")]
-    Position {
-        /// The camera's name.
-        name: String,
-    },
+    Position { name: String },
     /// The matrix is a rotation with a reflection.
     #[error("camera {name:?}: R_world_to_cam is a mirror; flip one of its axes")]
-    Mirror {
-        /// The camera's name.
-        name: String,
-    },
+    Mirror { name: String },
     /// The matrix is not a rotation.
     #[error(
         "camera {name:?}: R_world_to_cam is no rotation (rows off by {error:.1e} from orthonormal, \
          determinant {determinant:.3})"
     )]
     Rotation {
-        /// The camera's name.
         name: String,
         /// Largest absolute entry of R Rᵀ - I.
         error: f64,
-        /// Its determinant.
         determinant: f64,
     },
     /// The position cannot be used.
     #[error("camera {name:?}: {cause}")]
-    Pose {
-        /// The camera's name.
-        name: String,
-        /// The error.
-        cause: PoseError,
-    },
+    Pose { name: String, cause: PoseError },
     /// An exposure that no camera has.
     #[error("camera {name:?}: exposure_stops is {stops}; give -{most} to {most}", most = MOST_STOPS)]
-    Stops {
-        /// The camera's name.
-        name: String,
-        /// The refused value.
-        stops: f64,
-    },
+    Stops { name: String, stops: f64 },
     /// A field that only cameras of a rig have.
     #[error(
         "camera {name:?}: a camera in a list has no {field}, because it is at rest; leave {field} out, or mount \
          the camera on a rig"
     )]
     RigCameraField {
-        /// The camera's name.
         name: String,
         /// `shutter`, `exposure` or `overlay`.
         field: &'static str,
@@ -118,20 +97,10 @@ pub enum CamerasError {
         "camera {name:?}: {field} is not a field of a camera list: give \"lens\", such as {{\"model\": \"opencv\", \"k\": \
          [..]}}, or leave {field} out"
     )]
-    OtherLens {
-        /// The camera's name.
-        name: String,
-        /// The field.
-        field: &'static str,
-    },
+    OtherLens { name: String, field: &'static str },
     /// The size or an intrinsic cannot be used.
     #[error("camera {name:?}: {cause}")]
-    Camera {
-        /// The camera's name.
-        name: String,
-        /// The error.
-        cause: CameraError,
-    },
+    Camera { name: String, cause: CameraError },
 }
 
 const NAME_RULE: &str = "must be 1 to 64 of A-Z a-z 0-9 . _ -, not starting with .";

@@ -36,7 +36,6 @@ pub enum IngestError {
     /// A header cannot be parsed, or is not that of a Gaussian scene.
     #[error("{format} header, {place}: {reason}")]
     Header {
-        /// The format.
         format: &'static str,
         /// Where in the header, such as `line 3` or `tensor means`.
         place: String,
@@ -50,7 +49,6 @@ pub enum IngestError {
         if held < promised { "truncated" } else { "oversized" }
     )]
     Size {
-        /// The format.
         format: &'static str,
         /// Bytes that must follow the header.
         promised: u128,
@@ -62,7 +60,6 @@ pub enum IngestError {
     /// The body contradicts its header or itself.
     #[error("{format} body, {place}: {reason}")]
     Body {
-        /// The format.
         format: &'static str,
         /// Where in the body, such as `positions` or `means_l.webp`.
         place: String,
@@ -76,11 +73,9 @@ pub enum IngestError {
         limit_bytes(*packed)
     )]
     DecompressionBomb {
-        /// The format.
         format: &'static str,
         /// Where in the file.
         place: String,
-        /// Compressed bytes.
         packed: u64,
         /// Bytes that they would unpack to.
         unpacked: u128,
@@ -101,10 +96,7 @@ pub enum IngestError {
         "{count} Gaussians; at most {} fit one import: split the scene",
         limits::IMPORT_GAUSSIANS
     )]
-    TooMany {
-        /// Number of Gaussians.
-        count: u64,
-    },
+    TooMany { count: u64 },
     /// Gaussians that no renderer can draw.
     #[error(transparent)]
     Values(#[from] BadGaussians),
@@ -114,16 +106,15 @@ pub enum IngestError {
     /// `--axes` or `--scale` cannot be used.
     #[error("{option} {given:?}: {reason}")]
     InvalidAxes {
-        /// The option.
         option: &'static str,
-        /// The given value.
         given: String,
         /// The error, and the accepted values.
         reason: String,
     },
 }
 
-// Not `#[from]`, which would make it the source, too, and a message with its sources would say it twice.
+// Not `#[from]`, which would make it the source, too, and a message with its sources would say it
+// twice.
 impl From<SkyError> for IngestError {
     fn from(error: SkyError) -> Self {
         Self::Sky(error)

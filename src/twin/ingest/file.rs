@@ -71,8 +71,8 @@ pub fn read_whole(path: &Path, limit_bytes: u64) -> Result<Vec<u8>, FileError> {
     read_at_most(file, file_bytes, limit_bytes)
 }
 
-/// Reads to the end, which must come within `limit_bytes`. `expected_bytes` is the size of the file: a buffer that
-/// grows while it is filled could take twice as much.
+/// Reads to the end, which must come within `limit_bytes`. `expected_bytes` is the size of the
+/// file: a buffer that grows while it is filled could take twice as much.
 pub(super) fn read_at_most(
     input: impl Read,
     expected_bytes: u64,

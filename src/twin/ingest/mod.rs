@@ -85,7 +85,7 @@ pub fn read_hashed(
     path: &Path,
     progress: Progress<'_>,
 ) -> Result<(Gaussians, String), IngestError> {
-    let limits = ReadLimits::of_own_file();
+    let limits = ReadLimits::for_own_file();
     read_limited(path, &limits, progress).map(|read| (read.gaussians, read.hash))
 }
 
@@ -116,7 +116,7 @@ pub fn read_limited(
         BufReader::with_capacity(BUFFER_BYTES, HashReader::new(file, limits.stop.clone()));
     let mut reading = Reading::new(limits.drop_bad);
     let reader = &mut reading;
-    let gaussians = match Format::of(input.fill_buf()?)? {
+    let gaussians = match Format::detect(input.fill_buf()?)? {
         Format::Json => {
             let parts = PartFiles::new(path, limits, progress);
             return read_parts(input, file_bytes, parts, reading, MultiFileFormat::Json);
@@ -161,7 +161,7 @@ pub fn read_limited(
 pub fn may_name_others(path: &Path) -> Result<bool, FileError> {
     let (file, _) = file::open(path)?;
     let mut input = BufReader::new(file);
-    Ok(matches!(Format::of(input.fill_buf()?), Ok(Format::Json | Format::Glb)))
+    Ok(matches!(Format::detect(input.fill_buf()?), Ok(Format::Json | Format::Glb)))
 }
 
 /// A format in which the first file may name others.
@@ -211,7 +211,7 @@ enum Format {
 
 impl Format {
     /// Detects the format from the first bytes of a file.
-    fn of(start: &[u8]) -> Result<Self, IngestError> {
+    fn detect(start: &[u8]) -> Result<Self, IngestError> {
         Ok(match start {
             [b'p', b'l', b'y', b'\n' | b'\r', ..] => Self::Ply,
             [b'N', b'G', b'S', b'P', ..] => Self::Spz,
@@ -233,16 +233,17 @@ impl Format {
     }
 }
 
-/// Whether a file that starts like this is a JSON object: text that begins with a brace, and a name or another brace.
-/// A number of a `.splat` file may begin with the same bytes, but 64 bytes of numbers, colours and rotations are not
-/// text.
+/// Whether a file that starts like this is a JSON object: text that begins with a brace, and a name
+/// or another brace. A number of a `.splat` file may begin with the same bytes, but 64 bytes of
+/// numbers, colours and rotations are not text.
 fn is_json(start: &[u8]) -> bool {
     let object = start.trim_ascii_start().strip_prefix(b"{").map(<[u8]>::trim_ascii_start);
     object.is_some_and(|object| matches!(object, [] | [b'"' | b'}', ..]))
         && is_text(&start[..start.len().min(64)])
 }
 
-/// Whether bytes are UTF-8 without control characters but white space. The last character may be cut.
+/// Whether bytes are UTF-8 without control characters but white space. The last character may be
+/// cut.
 fn is_text(bytes: &[u8]) -> bool {
     let is_utf8 = match std::str::from_utf8(bytes) {
         Ok(_) => true,
@@ -251,7 +252,8 @@ fn is_text(bytes: &[u8]) -> bool {
     is_utf8 && bytes.iter().all(|byte| !byte.is_ascii_control() || byte.is_ascii_whitespace())
 }
 
-/// Whether a file that starts like this is a safetensors file: a length in eight bytes, and JSON of that length.
+/// Whether a file that starts like this is a safetensors file: a length in eight bytes, and JSON of
+/// that length.
 fn is_safetensors(start: &[u8]) -> bool {
     start.split_first_chunk().is_some_and(|(length, rest)| {
         let length = usize::try_from(u64::from_le_bytes(*length)).unwrap_or(usize::MAX);

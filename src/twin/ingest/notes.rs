@@ -1,4 +1,5 @@
-//! What a file says besides its Gaussians: how they were trained, their axes, and what was not read.
+//! What a file says besides its Gaussians: how they were trained, their axes, and what was not
+//! read.
 
 use serde_json::{Map, Value};
 
@@ -23,7 +24,8 @@ pub struct FileNotes {
     pub antialiasing: Option<Antialiasing>,
     /// The axes that it is in.
     pub axes: Option<FileAxes>,
-    /// What was not read, or is drawn in another way than its authors may expect. Each names a part of the file.
+    /// What was not read, or is drawn in another way than its authors may expect. Each names a part
+    /// of the file.
     pub warnings: Vec<String>,
     /// Number of Gaussians outside their bounds that were left out.
     pub dropped: u64,
@@ -41,7 +43,6 @@ pub struct Antialiasing {
 /// Axes that a file records.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FileAxes {
-    /// The axes.
     pub axes: Axes,
     /// The part of the file that says so.
     pub said_by: String,
@@ -132,8 +133,8 @@ impl Reading {
         }
     }
 
-    /// Checks Gaussians; `name` gives the name of a field in the file. Infinite opacities and vanishing scales become the
-    /// nearest values that can be stored.
+    /// Checks Gaussians; `name` gives the name of a field in the file. Infinite opacities and
+    /// vanishing scales become the nearest values that can be stored.
     ///
     /// # Errors
     /// Gaussians outside their bounds, unless they are left out.

@@ -7,17 +7,17 @@ use super::IngestError;
 use super::scene_files::ListedFiles;
 use crate::limits;
 
-/// Limits of reading a scene, and its resolution. The first three are for scenes from an untrusted source.
+/// Limits of reading a scene, and its resolution. The first three are for scenes from an untrusted
+/// source.
 #[derive(Clone, Debug)]
 pub struct ReadLimits<'a> {
     /// The files that the scene may name; without a list, those below the folder of its own file.
     pub listed: Option<&'a ListedFiles>,
     /// Bytes of memory that compressed content may unpack to.
     pub memory_bytes: u64,
-    /// Stops the reading.
     pub stop: StopFlag,
-    /// About how many Gaussians the triangles of a mesh become; triangles smaller than one Gaussian's share add
-    /// more. Scenes of Gaussians keep theirs.
+    /// About how many Gaussians the triangles of a mesh become; triangles smaller than one
+    /// Gaussian's share add more. Scenes of Gaussians keep theirs.
     pub mesh_gaussians: u32,
     /// Leaves out Gaussians outside their bounds; without it they are errors.
     pub drop_bad: bool,
@@ -28,8 +28,9 @@ pub struct ReadLimits<'a> {
 pub struct StopFlag(Arc<AtomicBool>);
 
 impl ReadLimits<'_> {
-    /// The limits of a file that the user of this machine named: its folder, all of the memory, any time.
-    pub fn of_own_file() -> Self {
+    /// The limits of a file that the user of this machine named: its folder, all of the memory, any
+    /// time.
+    pub fn for_own_file() -> Self {
         Self {
             listed: None,
             memory_bytes: u64::MAX,

@@ -24,7 +24,7 @@ pub(super) fn read(
     progress: Progress<'_>,
 ) -> Result<Gaussians, IngestError> {
     let (metadata, body_start) = read_metadata(&mut input, file_bytes)?;
-    let plan = ReadPlan::of(&metadata)?;
+    let plan = ReadPlan::from_metadata(&metadata)?;
     let skipped = plan.skipped(&metadata);
     if !skipped.is_empty() {
         reading.warn_skipped("tensors", &skipped.iter().map(String::as_str).collect::<Vec<_>>());
@@ -71,8 +71,8 @@ fn read_tensors(
     Ok(gaussians)
 }
 
-/// Reads Gaussians with the number of the object that each belongs to: the tensor `point_ids`, [N] or [N,1], I32 or
-/// I64.
+/// Reads Gaussians with the number of the object that each belongs to: the tensor `point_ids`, [N]
+/// or [N,1], I32 or I64.
 pub(super) fn read_tracked(
     input: &mut impl Read,
     file_bytes: u64,
@@ -83,7 +83,7 @@ pub(super) fn read_tracked(
     input.take(limits::SCENE_PART_BYTES).read_to_end(&mut bytes)?;
     let mut file = &bytes[..];
     let (metadata, body_start) = read_metadata(&mut file, file_bytes)?;
-    let plan = ReadPlan::of(&metadata)?;
+    let plan = ReadPlan::from_metadata(&metadata)?;
     let one_tensor = plan.one_tensor;
     let mut gaussians = read_tensors(file, body_start, file_bytes, plan, progress)?;
     gaussians.clamp_activations();
@@ -139,7 +139,8 @@ struct ReadPlan<'a> {
     one_tensor: bool,
 }
 
-/// Prefix of the tensors of a sky, which `--sky` reads, and names of those that only other readers need.
+/// Prefix of the tensors of a sky, which `--sky` reads, and names of those that only other readers
+/// need.
 const SKY_PREFIX: &str = "sky_head.";
 const OF_OTHER_READERS: [&str; 2] = ["appearance_embedding.weight", "point_ids"];
 
@@ -156,7 +157,7 @@ enum Column {
 }
 
 impl<'a> ReadPlan<'a> {
-    fn of(metadata: &'a Metadata) -> Result<Self, IngestError> {
+    fn from_metadata(metadata: &'a Metadata) -> Result<Self, IngestError> {
         let find = |name: &str| {
             let missing = || bad(&format!("tensor {name}"), "is missing".into());
             metadata.info(name).ok_or_else(missing)
@@ -254,9 +255,12 @@ impl<R: Read> Body<'_, R> {
             self.input.read_exact(&mut row)?;
             let doubles = row.as_chunks::<8>().0;
             let singles = row.as_chunks::<4>().0;
-            take(std::array::from_fn(|i| match is_f64 {
-                true => f64::from_le_bytes(doubles[i]),
-                false => f32::from_le_bytes(singles[i]).into(),
+            take(std::array::from_fn(|i| {
+                if is_f64 {
+                    f64::from_le_bytes(doubles[i])
+                } else {
+                    f32::from_le_bytes(singles[i]).into()
+                }
             }));
             self.done += row.len() as u64;
             if index.is_multiple_of(REPORT_EVERY) {

@@ -47,7 +47,6 @@ pub(super) struct PartFiles<'a> {
 
 /// Where the files are.
 enum Place<'a> {
-    /// Below a folder.
     Folder(PathBuf),
     /// Anywhere, but only these.
     Listed(&'a ListedFiles),
@@ -113,7 +112,8 @@ impl SceneFiles for PartFiles<'_> {
             return Err(failed(FileError::TooMany { limit: crate::limits::SCENE_PARTS }));
         }
         let path = self.path(name).map_err(failed)?;
-        // A name takes a few bytes, and a file any number: read once per name, a small file could take any time.
+        // A name takes a few bytes, and a file any number: read once per name, a small file could
+        // take any time.
         if !self.names.insert(name.to_owned()) {
             return Err(failed(FileError::Repeated));
         }

@@ -32,7 +32,6 @@ use super::{IngestError, read_whole};
 pub struct SkyFile {
     /// The sky as a twin stores it, which [`decode`] reads.
     pub bytes: Vec<u8>,
-    /// The decoded sky.
     pub model: SkyModel,
 }
 
@@ -68,7 +67,7 @@ pub fn read_bytes(bytes: &[u8], image: Option<u32>) -> Result<SkyFile, IngestErr
 pub fn decode(bytes: &[u8], image: Option<u32>) -> Result<SkyModel, IngestError> {
     if bytes.get(8) == Some(&b'{') {
         let Weights { layers, appearances } = Weights::read(bytes)?;
-        return Ok(SkyModel::network(Network::new(layers, appearances.of(image)?)?));
+        return Ok(SkyModel::network(Network::new(layers, appearances.row(image)?)?));
     }
     if let Some(image) = image {
         return Err(SkyError::Image { image, count: 0 }.into());
@@ -117,7 +116,7 @@ const APPEARANCES: &str = "appearance_embedding.weight";
 
 impl Appearances {
     /// The row of an image, or the mean of all rows.
-    fn of(&self, image: Option<u32>) -> Result<Vec<f32>, SkyError> {
+    fn row(&self, image: Option<u32>) -> Result<Vec<f32>, SkyError> {
         let Self { count, length, values } = self;
         let row = |row: usize| &values[row * length..(row + 1) * length];
         match image {

@@ -1,9 +1,10 @@
 //! Tracked objects: Gaussians of each moving object of a recorded drive, in the object's own axes.
 //!
-//! Two formats have them. NuRec has layers with `gaussian_cuboid_ids`, the index of each Gaussian's track in
-//! `obj_track_ids`; their positions are relative to the middle of the track's cuboid (x forward, y left, z up). And
-//! drivestudio has RigidNodes, which `python -m wildcity.convert --model RigidNodes` writes as safetensors with the
-//! tensor `point_ids`. A static reading of the file leaves them out, since they have no fixed place.
+//! Two formats have them. NuRec has layers with `gaussian_cuboid_ids`, the index of each Gaussian's
+//! track in `obj_track_ids`; their positions are relative to the middle of the track's cuboid (x
+//! forward, y left, z up). And drivestudio has RigidNodes, which
+//! `python -m wildcity.convert --model RigidNodes` writes as safetensors with the tensor
+//! `point_ids`. A static reading of the file leaves them out, since they have no fixed place.
 
 use std::io::BufReader;
 use std::path::Path;
@@ -22,11 +23,11 @@ pub fn read_tracked(
     path: &Path,
     progress: Progress<'_>,
 ) -> Result<(Vec<TrackedObject>, String), IngestError> {
-    let limits = ReadLimits::of_own_file();
+    let limits = ReadLimits::for_own_file();
     let (opened, file_bytes) = file::open(path)?;
     let mut input =
         BufReader::with_capacity(BUFFER_BYTES, HashReader::new(opened, limits.stop.clone()));
-    let found = match Format::of(std::io::BufRead::fill_buf(&mut input)?)? {
+    let found = match Format::detect(std::io::BufRead::fill_buf(&mut input)?)? {
         Format::Safetensors => {
             let (gaussians, ids) = safetensors::read_tracked(&mut input, file_bytes, progress)?;
             objects::split(&gaussians, &ids, |id| Some(id.to_string()))

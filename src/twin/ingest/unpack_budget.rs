@@ -35,7 +35,8 @@ impl UnpackBudget {
     /// Counts bytes that are about to be unpacked, before memory is allocated for them.
     ///
     /// # Errors
-    /// [`IngestError::DecompressionBomb`], [`IngestError::TooMuchMemory`], [`IngestError::Stopped`].
+    /// [`IngestError::DecompressionBomb`], [`IngestError::TooMuchMemory`],
+    /// [`IngestError::Stopped`].
     pub(super) fn unpack(
         &mut self,
         format: &'static str,

@@ -1,8 +1,8 @@
 //! Assets of actors in memory: one copy for all sessions.
 //!
-//! A scenario's assets are in memory from when it opens, with all levels of detail, until its last episode ends: no
-//! frame waits for an actor. They count against the memory of twins, and sections get what is left. So do assets that
-//! a program makes and the store does not have.
+//! A scenario's assets are in memory from when it opens, with all levels of detail, until its last
+//! episode ends: no frame waits for an actor. They count against the memory of twins, and sections
+//! get what is left. So do assets that a program makes and the store does not have.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Weak};
@@ -29,7 +29,8 @@ pub struct ResidentActor {
 }
 
 impl ResidentActor {
-    /// BLAKE3 of the asset, 64 lower-case hex digits; of an asset that is not in the store, its key.
+    /// BLAKE3 of the asset, 64 lower-case hex digits; of an asset that is not in the store, its
+    /// key.
     pub fn hash(&self) -> &str {
         &self.hash
     }
@@ -59,7 +60,8 @@ impl ActorPool {
         }
     }
 
-    /// An asset that is not in the store, under a key that is not a hash; the existing one if the key has one already.
+    /// An asset that is not in the store, under a key that is not a hash; the existing one if the
+    /// key has one already.
     ///
     /// # Errors
     /// [`ResidencyError::NoRoomForActor`].
@@ -100,7 +102,7 @@ fn add(
     let name = asset.description.name.clone();
     let frame = FrameBytes::default();
     let claim = Claim { twin: name, version: hash.to_owned(), bytes, total_bytes: bytes, frame };
-    shared.budget.lock().reserve(&claim).map_err(ResidencyError::of_actor)?;
+    shared.budget.lock().reserve(&claim).map_err(ResidencyError::for_actor)?;
     shared.pager.with_table(|table| table.add_outside_bytes(bytes));
     let shared = shared.clone();
     let actor = Arc::new(ResidentActor { hash: hash.to_owned(), asset, claim, shared });
@@ -110,7 +112,7 @@ fn add(
 
 impl ResidencyError {
     /// The error of an asset for which there is not enough memory.
-    fn of_actor(self) -> Self {
+    fn for_actor(self) -> Self {
         match self {
             Self::NoRoom { twin, needed_bytes, held_bytes, limit_bytes } => {
                 Self::NoRoomForActor { actor: twin, needed_bytes, held_bytes, limit_bytes }
@@ -148,7 +150,7 @@ mod tests {
             name: "box".to_owned(),
             class: ActorClass::Object,
             box_: ActorBox::PEDESTRIAN,
-            provenance: Provenance::of("test".to_owned()),
+            provenance: Provenance::new("test".to_owned()),
         };
         ActorAsset::new(&gaussians, description).unwrap()
     }

@@ -10,10 +10,10 @@ use super::ResidencyError;
 
 /// Bytes that are reserved for the worst frames of sessions, by version.
 ///
-/// Sessions on one version share its sections, so together they never need more than the whole version takes. Frames
-/// are rendered one at a time, except that a small frame may be rendered while a large one is. So the intermediate
-/// buffers count twice at most: the largest of all frames, and the largest of the small frames. The images of every
-/// session count.
+/// Sessions on one version share its sections, so together they never need more than the whole
+/// version takes. Frames are rendered one at a time, except that a small frame may be rendered
+/// while a large one is. So the intermediate buffers count twice at most: the largest of all
+/// frames, and the largest of the small frames. The images of every session count.
 #[derive(Clone, Debug)]
 pub(super) struct Budget {
     limit_bytes: u64,
@@ -32,8 +32,8 @@ pub(super) struct Budget {
 pub struct FrameBytes {
     /// Intermediate buffers of a frame while it is rendered. All sessions share them.
     pub stages: u64,
-    /// Intermediate buffers of a small frame that is rendered while a large one is; 0 for large frames, which are never
-    /// rendered while another large frame is.
+    /// Intermediate buffers of a small frame that is rendered while a large one is; 0 for large
+    /// frames, which are never rendered while another large frame is.
     pub beside: u64,
     /// Whether it is a large frame, during which small ones are rendered.
     pub is_large: bool,
@@ -61,7 +61,6 @@ struct VersionClaims {
 pub(super) struct Claim {
     /// The twin's name, for the error.
     pub(super) twin: String,
-    /// The version's hash.
     pub(super) version: String,
     /// Bytes that the scene of the frame needs at once.
     pub(super) bytes: u64,

@@ -103,8 +103,8 @@ impl Cache {
         Ok(resident)
     }
 
-    /// The asset of a hash, 64 lower-case hex digits, in memory until its last copy is dropped. Reads it unless it is
-    /// in memory already; blocks meanwhile.
+    /// The asset of a hash, 64 lower-case hex digits, in memory until its last copy is dropped.
+    /// Reads it unless it is in memory already; blocks meanwhile.
     ///
     /// # Errors
     /// As [`Catalog::actor`]; [`ResidencyError::NoRoomForActor`].
@@ -112,8 +112,9 @@ impl Cache {
         self.actors.get(&self.catalog, &self.shared, hash)
     }
 
-    /// An asset that is not in the store, in memory until its last copy is dropped; the existing one if the key has one
-    /// already. `key` identifies everything that it is made from, and is not a hash.
+    /// An asset that is not in the store, in memory until its last copy is dropped; the existing
+    /// one if the key has one already. `key` identifies everything that it is made from, and is not
+    /// a hash.
     ///
     /// # Errors
     /// [`ResidencyError::NoRoomForActor`].

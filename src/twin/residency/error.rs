@@ -18,7 +18,6 @@ pub enum ResidencyError {
          import the twin with a smaller reach_m or a larger tau_px"
     )]
     NoRoom {
-        /// The twin's name.
         twin: String,
         /// Bytes that its worst frame needs beyond those that are reserved already.
         needed_bytes: u64,
@@ -33,7 +32,6 @@ pub enum ResidencyError {
          sessions: close some, allow more with --memory-gib, or import the actor with fewer Gaussians"
     )]
     NoRoomForActor {
-        /// The asset's name.
         actor: String,
         /// Bytes of all its levels of detail.
         needed_bytes: u64,
@@ -49,7 +47,6 @@ pub enum ResidencyError {
          or a larger tau_px"
     )]
     TooLarge {
-        /// The twin's name.
         twin: String,
         /// Bytes that the frame needs.
         needed_bytes: u64,
@@ -62,7 +59,6 @@ pub enum ResidencyError {
          after {waited:.1?}; loading continues: try again, or allow more time"
     )]
     TimedOut {
-        /// The twin's name.
         twin: String,
         /// Sections that are still missing.
         missing: usize,
@@ -77,7 +73,6 @@ pub enum ResidencyError {
          {attempts} attempts: {cause}"
     )]
     Load {
-        /// The twin's name.
         twin: String,
         /// Grid cell (x, y).
         cell: [i32; 2],
@@ -85,19 +80,13 @@ pub enum ResidencyError {
         block: u8,
         /// The level of detail.
         level: u8,
-        /// Number of attempts.
         attempts: u32,
         /// Why the last attempt failed.
         cause: String,
     },
     /// Its sky cannot be drawn with the error that its profile asks for.
     #[error("the sky of twin {twin:?}: {cause}")]
-    Sky {
-        /// The twin's name.
-        twin: String,
-        /// The reason.
-        cause: SkyError,
-    },
+    Sky { twin: String, cause: SkyError },
     /// The loader threads cannot be started.
     #[error("cannot start the threads that load sections: {reason}")]
     Thread {

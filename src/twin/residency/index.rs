@@ -98,7 +98,8 @@ impl BlockIndex {
     ) -> Vec<SectionRef> {
         let focal_px = longest_focal_px(viewpoints);
         let distance_m = |bounds: &Bounds| {
-            // Square roots round monotonically, so that one of the least square gives the least distance.
+            // Square roots round monotonically, so that one of the least square gives the least
+            // distance.
             let squared_m2 = |viewpoint: &Viewpoint| {
                 let at_m = viewpoint.position_m;
                 at_m.clamp(bounds.min_m, bounds.max_m).distance_squared(at_m)

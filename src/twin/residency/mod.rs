@@ -13,9 +13,9 @@
 //!
 //! # Decisions
 //!
-//! A frame draws exactly the sections that [`demand`](demand()) returns; the memory in use only affects
-//! how long it waits. A frame therefore gets all of its sections at once, or it waits. It is never drawn
-//! with fewer sections.
+//! A frame draws exactly the sections that [`demand`](demand()) returns; the memory in use only
+//! affects how long it waits. A frame therefore gets all of its sections at once, or it waits. It
+//! is never drawn with fewer sections.
 //!
 //! **A section is in memory once**, under a key made of everything that its chunk depends on:
 //! content hash, cell, block, level, origin, and record. Fifty versions of a twin that differ in
@@ -38,22 +38,25 @@
 //! **Memory is allocated in pages**: the next section is read into the pages of an evicted one
 //! (`wildcity_scene::pages`). The heap loses a few per cent of the budget between pages.
 //!
-//! **Eviction is least recently used; a prefetch counts as a use.** As far as prefetching predicts the
-//! need for sections, this evicts first what is needed last. A prefetch evicts nothing that was used since
-//! its session's last prefetch, and is dropped if this does not free enough memory. So a prefetch can evict neither its
-//! own sections nor those that other sessions at the same pace are about to need.
+//! **Eviction is least recently used; a prefetch counts as a use.** As far as prefetching predicts
+//! the need for sections, this evicts first what is needed last. A prefetch evicts nothing that was
+//! used since its session's last prefetch, and is dropped if this does not free enough memory. So a
+//! prefetch can evict neither its own sections nor those that other sessions at the same pace are
+//! about to need.
 //!
-//! **Prefetching uses the exact poses of the next steps**, with the rig's own cameras. One point in the
-//! middle of the rig would be cheaper, but levels change at exact distances, so that a point two metres away
-//! needs other sections.
+//! **Prefetching uses the exact poses of the next steps**, with the rig's own cameras. One point in
+//! the middle of the rig would be cheaper, but levels change at exact distances, so that a point
+//! two metres away needs other sections.
 //!
-//! **A session reserves the memory of its worst frame**, wherever it drives: the frame that needs the most.
-//! The search halves rectangles of the twin's map, the one with the highest bound first, until that one is
-//! as small as a cell. A bound computed from the distance of a rectangle is never below the need of a point
-//! in it. The searched rectangles lie along the road, so 20 km of road take about as many as it has cells.
+//! **A session reserves the memory of its worst frame**, wherever it drives: the frame that needs
+//! the most. The search halves rectangles of the twin's map, the one with the highest bound first,
+//! until that one is as small as a cell. A bound computed from the distance of a rectangle is never
+//! below the need of a point in it. The searched rectangles lie along the road, so 20 km of road
+//! take about as many as it has cells.
 //!
-//! **A failed load** is tried three times within 0.3 s, by any free thread; then the frames that wait for it
-//! get the error. The section then counts as absent, so the next frame that needs it tries again.
+//! **A failed load** is tried three times within 0.3 s, by any free thread; then the frames that
+//! wait for it get the error. The section then counts as absent, so the next frame that needs it
+//! tries again.
 //!
 //! There are no watermarks (such as 90 % and 80 %): a load evicts as much as it needs. The GPU's
 //! pages are not tied to this table: the GPU copy of the chunks has a budget of its own.

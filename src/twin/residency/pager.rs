@@ -113,8 +113,8 @@ impl Pager {
         Ok(WaitingFrame { shared: self.0.clone(), number })
     }
 
-    /// Loads sections that frames may need later, in order, as far as the memory allows. This replaces
-    /// the prefetch of the same owner with the number `before`. Returns the new number.
+    /// Loads sections that frames may need later, in order, as far as the memory allows. This
+    /// replaces the prefetch of the same owner with the number `before`. Returns the new number.
     pub(super) fn prefetch(
         &self,
         before: Option<u64>,
@@ -130,7 +130,8 @@ impl Pager {
             requests.forget_unrequested_failures();
             (number, requests.has_queued())
         };
-        // Usually all is in memory. To wake eight loaders for nothing took a tenth of a millisecond of each step.
+        // Usually all is in memory. To wake eight loaders for nothing took a tenth of a millisecond
+        // of each step.
         if has_work {
             self.0.work.notify_all();
         }

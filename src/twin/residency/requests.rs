@@ -109,7 +109,6 @@ pub(super) struct CompleteFrame {
 /// Why a load failed.
 pub(super) enum LoadFailure {
     Store(StoreError),
-    /// It panicked.
     Crashed,
 }
 
@@ -213,7 +212,7 @@ impl<C> Requests<C> {
 
     /// Number of sections of a prefetch that may still be loaded.
     pub(super) fn pending(&self, number: u64) -> usize {
-        let queued = |urgency| self.queue.range(keys_of(urgency, number));
+        let queued = |urgency| self.queue.range(request_keys(urgency, number));
         let entries = queued(Urgency::Imminent).chain(queued(Urgency::Speculative));
         entries.filter(|(key, _)| self.table.get(key.id).is_none()).count()
     }
@@ -240,7 +239,7 @@ impl<C> Requests<C> {
     }
 
     fn unqueue(&mut self, urgency: Urgency, request: u64) {
-        let entries = self.queue.range(keys_of(urgency, request));
+        let entries = self.queue.range(request_keys(urgency, request));
         let keys: Vec<QueueKey> = entries.map(|(key, _)| *key).collect();
         keys.iter().for_each(|key| {
             self.queue.remove(key);
@@ -460,7 +459,7 @@ impl<C> Requests<C> {
 }
 
 /// The queue keys of a request's sections.
-fn keys_of(urgency: Urgency, request: u64) -> RangeInclusive<QueueKey> {
+fn request_keys(urgency: Urgency, request: u64) -> RangeInclusive<QueueKey> {
     let first = QueueKey { urgency, request, order: 0, id: 0 };
     first..=QueueKey { order: u32::MAX, id: SlotId::MAX, ..first }
 }

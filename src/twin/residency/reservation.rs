@@ -19,8 +19,9 @@ pub struct Reservation {
     prefetcher: Arc<Prefetcher>,
 }
 
-/// Loads sections of a version before the frames that will need them. It is shared with the background task
-/// that determines these sections. It ends with its [`Reservation`] even if that task still runs.
+/// Loads sections of a version before the frames that will need them. It is shared with the
+/// background task that determines these sections. It ends with its [`Reservation`] even if that
+/// task still runs.
 #[derive(Debug)]
 pub struct Prefetcher {
     resident: Arc<Resident>,
@@ -31,7 +32,6 @@ pub struct Prefetcher {
 enum PrefetchState {
     /// Holds the number of the last prefetch request.
     Open(Option<u64>),
-    /// Prefetching has ended.
     Ended,
 }
 
@@ -45,8 +45,8 @@ impl Resident {
         self.reserve_with(extent, profile, FrameBytes::default())
     }
 
-    /// As [`Resident::reserve`], for frames that are drawn with a profile other than the version's, and with the memory
-    /// that they take in addition to their scenes.
+    /// As [`Resident::reserve`], for frames that are drawn with a profile other than the version's,
+    /// and with the memory that they take in addition to their scenes.
     ///
     /// # Errors
     /// As [`Resident::reserve`].
@@ -67,9 +67,9 @@ impl Reservation {
         Ok(Self { claim, prefetcher: Arc::new(Prefetcher::new(resident)) })
     }
 
-    /// Reserves `bytes` for scenes of another version in place of this one, in one step: both need not fit at the
-    /// same time. Prefetching of the old version ends. The memory that frames take in addition to their scenes stays
-    /// reserved.
+    /// Reserves `bytes` for scenes of another version in place of this one, in one step: both need
+    /// not fit at the same time. Prefetching of the old version ends. The memory that frames take
+    /// in addition to their scenes stays reserved.
     ///
     /// # Errors
     /// [`ResidencyError::NoRoom`] with the numbers; nothing has changed then.

@@ -29,7 +29,6 @@ pub(super) struct Shared {
 /// A version of a twin, ready to be rendered. Sections are loaded when frames request them.
 #[derive(Debug)]
 pub struct Resident {
-    /// The version.
     pub version: Arc<Version>,
     /// The sky behind its Gaussians, baked to its profile's `sky_error`.
     sky: Option<Arc<Sky>>,
@@ -45,7 +44,8 @@ pub struct Resident {
     worst_cases: Mutex<Vec<(WorstCaseKey, u64)>>,
 }
 
-/// The inputs of the worst case: the rig, and the two values of a profile that decide how much is drawn.
+/// The inputs of the worst case: the rig, and the two values of a profile that decide how much is
+/// drawn.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct WorstCaseKey {
     extent: RigExtent,
@@ -79,7 +79,7 @@ impl Resident {
         for chunk in &manifest.chunks {
             first.push(keys.len());
             keys.extend(chunk.sections.iter().map(|section| {
-                let bytes = Chunk::bytes_of(manifest.sh_degree, section.count.into());
+                let bytes = Chunk::needed_bytes(manifest.sh_degree, section.count.into());
                 (key(manifest, chunk, section), bytes)
             }));
         }

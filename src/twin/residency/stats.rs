@@ -35,7 +35,6 @@ pub struct Stats {
     pub limit_bytes: u64,
     /// Bytes that are reserved for the worst frames of open sessions.
     pub reserved_bytes: u64,
-    /// Sections in memory.
     pub held_sections: u64,
     /// Median duration of the last loads.
     pub load_p50: Duration,

@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use wildcity_scene::Chunk;
 
-/// A hash of everything that a section's chunk depends on. Versions that have a section in common share its
-/// memory.
+/// A hash of everything that a section's chunk depends on. Versions that have a section in common
+/// share its memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(super) struct Key(pub(super) [u8; 16]);
 
@@ -250,7 +250,8 @@ impl SectionTable {
         }
     }
 
-    /// An asset was loaded, which takes memory from the sections. They are evicted with the next load.
+    /// An asset was loaded, which takes memory from the sections. They are evicted with the next
+    /// load.
     pub(super) fn add_outside_bytes(&mut self, bytes: u64) {
         self.outside_bytes += bytes;
     }

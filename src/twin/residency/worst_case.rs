@@ -21,11 +21,11 @@ pub struct RigExtent {
 
 /// An upper bound, in bytes, of the sections that a frame of a rig anywhere needs at once.
 ///
-/// No point in a square is nearer to a block than the square itself is. So the levels that are chosen by the
-/// distance of the square add up to bytes that no frame in the square exceeds. The square with the highest
-/// bound is halved repeatedly until it is as small as a cell; then no point anywhere needs more than its
-/// bound. A point outside of the bounding box needs no more than the nearest point in the box, which is
-/// nearer to everything.
+/// No point in a square is nearer to a block than the square itself is. So the levels that are
+/// chosen by the distance of the square add up to bytes that no frame in the square exceeds. The
+/// square with the highest bound is halved repeatedly until it is as small as a cell; then no point
+/// anywhere needs more than its bound. A point outside of the bounding box needs no more than the
+/// nearest point in the box, which is nearer to everything.
 pub(super) fn worst_case_bytes(
     index: &BlockIndex,
     manifest: &Manifest,
@@ -42,7 +42,7 @@ pub(super) fn worst_case_bytes(
         index.visit(profile.reach_m, distance_m, |block, distance_m| {
             let levels = block.levels(manifest);
             let level = coarsest_level(levels, extent.focal_px, distance_m, profile.tau_px);
-            bytes += Chunk::bytes_of(manifest.sh_degree, levels[level].count.into());
+            bytes += Chunk::needed_bytes(manifest.sh_degree, levels[level].count.into());
         });
         Square { bytes, area }
     };

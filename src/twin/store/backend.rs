@@ -10,8 +10,8 @@ use super::StoreError;
 use super::disk::Lock;
 use super::layout::{object_key, record_key};
 
-/// A directory or an object store with twins. Callers must check names of twins and hashes before they
-/// pass them.
+/// A directory or an object store with twins. Callers must check names of twins and hashes before
+/// they pass them.
 pub(super) trait ObjectBackend: Debug + Send + Sync {
     /// The directory, or the URL.
     fn root(&self) -> &Path;
@@ -31,7 +31,8 @@ pub(super) trait ObjectBackend: Debug + Send + Sync {
     /// [`StoreError::Damaged`] for another hash, and for an object longer than `limit_bytes`.
     fn read_object(&self, name: &str, hash: &str, limit_bytes: u64) -> Result<Vec<u8>, StoreError>;
 
-    /// Reads an object of any size. Returns its first bytes, at most `most_bytes`, and the hash of all of them.
+    /// Reads an object of any size. Returns its first bytes, at most `most_bytes`, and the hash of
+    /// all of them.
     fn read_and_hash(
         &self,
         name: &str,
@@ -80,15 +81,16 @@ pub(super) trait ObjectBackend: Debug + Send + Sync {
     /// Names of the twins with a commit that has begun and not ended: it runs, or it was killed.
     fn unfinished_commits(&self) -> Result<Vec<String>, StoreError>;
 
-    /// Removes the remains of killed commits of a twin: their staging, and objects that they placed and
-    /// that `named` does not contain. Running commits are not affected.
+    /// Removes the remains of killed commits of a twin: their staging, and objects that they placed
+    /// and that `named` does not contain. Running commits are not affected.
     fn remove_abandoned(
         &self,
         name: &str,
         named: &dyn Fn() -> Option<BTreeSet<String>>,
     ) -> Result<(), StoreError>;
 
-    /// Renames a log record, so that it is part of the log no more. Returns the path that it has then.
+    /// Renames a log record, so that it is part of the log no more. Returns the path that it has
+    /// then.
     ///
     /// # Errors
     /// The record does not exist, or the backend cannot rename.
@@ -125,12 +127,12 @@ pub(super) trait ObjectBackend: Debug + Send + Sync {
     /// Removes a side file, if it exists.
     fn remove_side_file(&self, name: &str, file: &str) -> Result<(), StoreError>;
 
-    /// Removes what stopped processes left in a folder of side files, if it was written before a time: files that
-    /// were being written, and locks without their side file.
+    /// Removes what stopped processes left in a folder of side files, if it was written before a
+    /// time: files that were being written, and locks without their side file.
     fn remove_leftovers(&self, name: &str, folder: &str, before_us: i64) -> Result<(), StoreError>;
 
-    /// Keeps a side file locked until the lock is dropped, or the process ends. `None` where the backend has no
-    /// locks.
+    /// Keeps a side file locked until the lock is dropped, or the process ends. `None` where the
+    /// backend has no locks.
     fn hold(&self, name: &str, file: &str) -> Result<Option<Lock>, StoreError>;
 
     /// Whether a process keeps a side file locked.
@@ -173,11 +175,12 @@ pub(super) trait Staging: Debug + Send {
         record: &[u8],
     ) -> Result<(), StoreError>;
 
-    /// Makes objects visible that no log record names: assets. The caller has called [`Staging::lock_publishing`].
+    /// Makes objects visible that no log record names: assets. The caller has called
+    /// [`Staging::lock_publishing`].
     fn place_objects(&mut self, hashes: &BTreeSet<&str>) -> Result<(), StoreError>;
 
-    /// Replaces objects of an existing version, which repairs damaged and missing ones, and syncs its
-    /// record to the disk. The caller has called [`Staging::lock_publishing`].
+    /// Replaces objects of an existing version, which repairs damaged and missing ones, and syncs
+    /// its record to the disk. The caller has called [`Staging::lock_publishing`].
     fn restore(&mut self, hashes: &BTreeSet<&str>, number: u64) -> Result<(), StoreError>;
 
     /// Where its objects lie, for messages.

@@ -41,7 +41,6 @@ pub struct DiskCacheSettings {
 /// A twin and its latest version.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TwinListing {
-    /// The twin's name.
     pub name: String,
     /// Number of its latest version, from 1.
     pub number: u64,
@@ -61,9 +60,7 @@ pub struct TwinList {
 /// A twin whose newest log record cannot be read.
 #[derive(Debug)]
 pub struct DamagedTwin {
-    /// The twin's name.
     pub name: String,
-    /// The error.
     pub error: StoreError,
 }
 
@@ -76,18 +73,18 @@ pub struct Version {
     pub hash: String,
     /// When it was committed, in microseconds since 1970.
     pub created_us: i64,
-    /// Its content.
     pub manifest: Manifest,
 }
 
 impl Catalog {
-    /// Opens a directory of twins, which need not exist yet, and removes the remains of killed commits;
-    /// or opens the twins at a URL (`s3://bucket/folder`, `gs://`, `az://`, `file:///folder`), with
-    /// credentials from the environment.
+    /// Opens a directory of twins, which need not exist yet, and removes the remains of killed
+    /// commits; or opens the twins at a URL (`s3://bucket/folder`, `gs://`, `az://`,
+    /// `file:///folder`), with credentials from the environment.
     ///
     /// # Errors
-    /// The directory cannot be listed; [`StoreError::Url`]. Remains that cannot be removed are no error here, so
-    /// that one twin does not keep the others from being opened: the next commit of that twin reports it.
+    /// The directory cannot be listed; [`StoreError::Url`]. Remains that cannot be removed are no
+    /// error here, so that one twin does not keep the others from being opened: the next commit of
+    /// that twin reports it.
     pub fn open(dir: &Path) -> Result<Self, StoreError> {
         Self::open_cached(dir, None)
     }
@@ -132,8 +129,8 @@ impl Catalog {
         Self { clock, ..self }
     }
 
-    /// Opens a directory of twins on a disk, with a clock: the parts of a machine, or of a simulated one. As
-    /// [`Catalog::open`], removes the remains of killed commits.
+    /// Opens a directory of twins on a disk, with a clock: the parts of a machine, or of a
+    /// simulated one. As [`Catalog::open`], removes the remains of killed commits.
     ///
     /// # Errors
     /// As [`Catalog::open`].
@@ -295,8 +292,8 @@ impl Catalog {
     /// [`StoreError::Damaged`] if not.
     pub(super) fn check_chunk(&self, name: &str, chunk: &ChunkEntry) -> Result<(), StoreError> {
         let most = limits::CHUNK_TABLE_BYTES + chunk_file::PAGE_BYTES;
-        // The hash is compared first, because its error is clearer than one that follows from a damaged
-        // table of contents.
+        // The hash is compared first, because its error is clearer than one that follows from a
+        // damaged table of contents.
         let start = self.objects.read_start(name, &chunk.object, most)?;
         let path = self.objects.object_path(name, &chunk.object);
         chunk_file::check_start(&start, chunk)

@@ -19,8 +19,8 @@
 //! compares the two.
 //!
 //! A section is read, decoded, and drawn as one unit: one level of detail of one block of 16 m,
-//! within a cell of 64 m. It becomes one `scene::Chunk`, so the renderer does not depend on
-//! levels. A sparse cell, such as one of a skyline, is a single block: as 3,000 blocks of three Gaussians
+//! within a cell of 64 m. It becomes one `scene::Chunk`, so the renderer does not depend on levels.
+//! A sparse cell, such as one of a skyline, is a single block: as 3,000 blocks of three Gaussians
 //! each, the demo street's skyline took 9 ms of every frame.
 
 use std::cell::RefCell;
@@ -154,7 +154,7 @@ pub(super) fn write(
         origin_m: origin_m.to_array(),
         sh_degree,
         record: record as u8,
-        sections: packed.iter().map(|packed| Row::of(&packed.section)).collect(),
+        sections: packed.iter().map(|packed| Row::from_section(&packed.section)).collect(),
     };
 
     // Give each section its offset. Integers have a fixed size, so the offsets do not change the
@@ -202,8 +202,8 @@ fn place(end: u64, bytes: u32) -> u64 {
 /// Decodes a section. The caller has compared its bytes with their hash.
 ///
 /// # Errors
-/// Says what is wrong with it. Memory is allocated part by part, so that a short input with a large count
-/// allocates little.
+/// Says what is wrong with it. Memory is allocated part by part, so that a short input with a large
+/// count allocates little.
 pub(super) fn unpack(
     bytes: &[u8],
     chunk: &ChunkEntry,
@@ -234,8 +234,9 @@ pub(super) fn unpack(
 
 /// Passes one part of up to `capacity` bytes on, decompressed.
 ///
-/// Each thread keeps a context of 160 kB and the bytes of its largest part. To make a context for each section took a
-/// twentieth of the time of loading, and parts of all sizes would leave holes between the pages of sections.
+/// Each thread keeps a context of 160 kB and the bytes of its largest part. To make a context for
+/// each section took a twentieth of the time of loading, and parts of all sizes would leave holes
+/// between the pages of sections.
 fn decompressed<T>(part: &[u8], capacity: usize, take: impl FnOnce(io::Result<&[u8]>) -> T) -> T {
     thread_local! {
         static KEPT: RefCell<(Option<Decompressor<'static>>, Vec<u8>)> =
@@ -269,7 +270,7 @@ pub(super) fn table(
 ) -> io::Result<Vec<u8>> {
     let mut table = Vec::new();
     for chunk in chunks {
-        let sections = chunk.sections.iter().map(Row::of).collect();
+        let sections = chunk.sections.iter().map(Row::from_section).collect();
         let contents = Contents {
             cell: chunk.cell,
             origin_m: chunk.origin_m.to_array(),
@@ -365,7 +366,7 @@ impl Contents {
 }
 
 impl Row {
-    fn of(section: &Section) -> Self {
+    fn from_section(section: &Section) -> Self {
         let Section { block, level, count, error_m, min_m, max_m, offset_bytes, bytes, hash } =
             *section;
         Self { block, level, count, error_m, min_m, max_m, offset_bytes, bytes, hash }
@@ -543,7 +544,8 @@ mod tests {
         for at in 0..own.len() {
             let mut own = own.to_vec();
             own[at] ^= 0x40;
-            // The caller compares the hash before, so here it is enough that damaged bytes cause no panic.
+            // The caller compares the hash before, so here it is enough that damaged bytes cause no
+            // panic.
             let _ = unpack(&own, &entry, &section, 0, RecordFormat::Q32, None);
         }
     }

@@ -1,5 +1,5 @@
-//! The time, as an interface: leases, garbage collection, the log and the spool of uploads need it, and a simulation lets
-//! it jump.
+//! The time, as an interface: leases, garbage collection, the log and the spool of uploads need it,
+//! and a simulation lets it jump.
 
 use std::fmt::Debug;
 use std::sync::LazyLock;

@@ -19,7 +19,6 @@ pub const CUT_ABOVE_M: f64 = 0.05;
 /// A new version without some Gaussians, and those Gaussians.
 #[derive(Clone, Debug)]
 pub struct Cut {
-    /// The new version.
     pub version: Version,
     /// The Gaussians that were cut out, in the axes of the box, at full detail.
     pub gaussians: Gaussians,
@@ -30,16 +29,17 @@ pub struct Cut {
 pub struct CutPlace {
     /// Where it is: its origin is on the ground under the middle.
     pub world_from_box: Pose,
-    /// Its size.
     pub box_: ActorBox,
 }
 
 impl Catalog {
-    /// Makes a version without the Gaussians whose centres lie in a box, from [`CUT_ABOVE_M`] above its bottom. Cells
-    /// that the box does not touch stay as they are; in the others the Gaussians that stay are encoded again.
+    /// Makes a version without the Gaussians whose centres lie in a box, from [`CUT_ABOVE_M`] above
+    /// its bottom. Cells that the box does not touch stay as they are; in the others the Gaussians
+    /// that stay are encoded again.
     ///
     /// # Errors
-    /// [`StoreError::NothingToCut`] if no Gaussian lies in the box, or none would stay in a cell; otherwise as a commit.
+    /// [`StoreError::NothingToCut`] if no Gaussian lies in the box, or none would stay in a cell;
+    /// otherwise as a commit.
     pub fn cut(
         &self,
         base: &Version,
@@ -57,8 +57,8 @@ impl Catalog {
         Ok(cut)
     }
 
-    /// As [`Catalog::cut`], with many boxes: what lies in any of them goes, and is returned in world axes. `option` is
-    /// noted in the provenance.
+    /// As [`Catalog::cut`], with many boxes: what lies in any of them goes, and is returned in
+    /// world axes. `option` is noted in the provenance.
     ///
     /// # Errors
     /// As [`Catalog::cut`].
@@ -103,9 +103,9 @@ impl Catalog {
         let storage = StorageOptions { record: manifest.record, levels: manifest.has_levels() };
         let mut commit = self.begin(&manifest.twin, CommitKind::Import, storage)?;
         commit.put(&staying, Some(&cells), &mut |_, _| {})?;
-        let mut provenance = manifest.provenance.of_edit();
+        let mut provenance = manifest.provenance.for_edit();
         provenance.options.push(option);
-        let version = commit.change(base.number, VersionChange::of(provenance))?;
+        let version = commit.change(base.number, VersionChange::new(provenance))?;
         Ok(Cut { version, gaussians: cut })
     }
 

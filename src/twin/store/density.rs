@@ -4,8 +4,8 @@ use crate::limits;
 
 use super::StoreError;
 
-/// Checks that the Gaussians of one commit do not cost far more on disk than they are worth: each cell is an object
-/// of 12 kB at least, whatever it holds.
+/// Checks that the Gaussians of one commit do not cost far more on disk than they are worth: each
+/// cell is an object of 12 kB at least, whatever it holds.
 ///
 /// # Errors
 /// [`StoreError::Scattered`].

@@ -1,7 +1,8 @@
 //! A file system, as an interface.
 //!
-//! The store writes to disks through it, and so does the server's spool of uploads, so that a simulation can take the
-//! disk's place: one that loses what was not synced, fails, or stops the process between any two operations.
+//! The store writes to disks through it, and so does the server's spool of uploads, so that a
+//! simulation can take the disk's place: one that loses what was not synced, fails, or stops the
+//! process between any two operations.
 
 use std::any::Any;
 use std::fmt::Debug;
@@ -82,11 +83,12 @@ pub trait Disk: Debug + Send + Sync {
     /// As [`std::fs::File::sync_all`].
     fn sync_dir(&self, dir: &Path) -> io::Result<()>;
 
-    /// Locks a file until the lock is dropped, or the process ends, however it ends. `None` if another lock
-    /// is held and `wait` is [`Wait::No`].
+    /// Locks a file until the lock is dropped, or the process ends, however it ends. `None` if
+    /// another lock is held and `wait` is [`Wait::No`].
     ///
     /// # Errors
-    /// The file cannot be opened or locked. It is created if need be, unless `wait` is [`Wait::NoAndExisting`].
+    /// The file cannot be opened or locked. It is created if need be, unless `wait` is
+    /// [`Wait::NoAndExisting`].
     fn lock(&self, path: &Path, wait: Wait) -> io::Result<Option<Lock>>;
 }
 
@@ -117,8 +119,8 @@ pub trait WriteFile: Write + Debug + Send {
     /// Discards all bytes from an offset on.
     ///
     /// # Errors
-    /// As [`std::fs::File::set_len`]; [`io::ErrorKind::UnexpectedEof`] if the file has fewer bytes, to which none are
-    /// added.
+    /// As [`std::fs::File::set_len`]; [`io::ErrorKind::UnexpectedEof`] if the file has fewer bytes,
+    /// to which none are added.
     fn truncate(&mut self, bytes: u64) -> io::Result<()>;
 
     /// Makes what was written durable.

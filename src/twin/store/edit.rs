@@ -1,4 +1,5 @@
-//! Editing a version: other axes and unit, other drives, another rig. The Gaussians are otherwise the same.
+//! Editing a version: other axes and unit, other drives, another rig. The Gaussians are otherwise
+//! the same.
 
 use glam::DMat3;
 
@@ -15,7 +16,8 @@ use super::{Catalog, StoreError, Version, views};
 /// The changes of an edit.
 #[derive(Clone, Debug)]
 pub struct Edit {
-    /// Turns, moves and scales the Gaussians, the drives and the sky; the identity leaves the stored bytes as they are.
+    /// Turns, moves and scales the Gaussians, the drives and the sky; the identity leaves the
+    /// stored bytes as they are.
     pub alignment: Alignment,
     /// Drives in the new axes. A drive replaces the one of its name.
     pub trajectories: Vec<Trajectory>,
@@ -24,16 +26,17 @@ pub struct Edit {
 }
 
 impl Catalog {
-    /// Makes a version with the Gaussians of an existing one in other axes and another unit, and with other drives.
+    /// Makes a version with the Gaussians of an existing one in other axes and another unit, and
+    /// with other drives.
     ///
-    /// The rig stays as it is, since it is in metres of the vehicle, and so does the profile. A place on the earth is
-    /// of the old axes, and is dropped if they change. The version remembers the alignment, with earlier ones, as the
-    /// way from its capture. All Gaussians are in memory at once. `progress` gets the number of Gaussians written and
-    /// in all.
+    /// The rig stays as it is, since it is in metres of the vehicle, and so does the profile. A
+    /// place on the earth is of the old axes, and is dropped if they change. The version remembers
+    /// the alignment, with earlier ones, as the way from its capture. All Gaussians are in memory
+    /// at once. `progress` gets the number of Gaussians written and in all.
     ///
     /// # Errors
-    /// The base cannot be read; what the edit makes is out of a twin's bounds, or all alignments together are out of
-    /// theirs; others changed the twin since the base
+    /// The base cannot be read; what the edit makes is out of a twin's bounds, or all alignments
+    /// together are out of theirs; others changed the twin since the base
     /// ([`StoreError::Overlap`]); or as a commit.
     pub fn edit(
         &self,
@@ -59,7 +62,7 @@ impl Catalog {
             return commit.change(base.number, change);
         }
 
-        let mut provenance = manifest.provenance.of_edit();
+        let mut provenance = manifest.provenance.for_edit();
         provenance.options.push(format!("align={alignment}"));
         let before = manifest.alignment()?;
         let twin_from_capture = before.map_or(alignment, |before| alignment.after(&before));

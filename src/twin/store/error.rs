@@ -23,21 +23,16 @@ pub enum StoreError {
         action: &'static str,
         /// The file, directory, or URL.
         path: PathBuf,
-        /// The reason given.
         cause: io::Error,
     },
     /// A text cannot be a twin's name.
     #[error(
         "{name:?} cannot be the name of a twin: names have 1 to 64 of a-z 0-9 . _ - and do not start with ."
     )]
-    Name {
-        /// The refused name.
-        name: String,
-    },
+    Name { name: String },
     /// No version of such a twin was ever committed.
     #[error("there is no twin {name:?} in {}; {}", dir.display(), known_twins(known))]
     NoTwin {
-        /// The requested name.
         name: String,
         /// The directory or URL of twins.
         dir: PathBuf,
@@ -46,47 +41,24 @@ pub enum StoreError {
     },
     /// The twin has no version of this number.
     #[error("twin {name:?} has no version {number}; the latest is {latest}")]
-    NoVersion {
-        /// The twin.
-        name: String,
-        /// The requested version.
-        number: u64,
-        /// The latest version.
-        latest: u64,
-    },
+    NoVersion { name: String, number: u64, latest: u64 },
     /// Garbage collection removed the version's objects.
     #[error("version {number} of twin {name:?} was removed by `wildcity twin gc`: use a later one")]
-    GarbageCollected {
-        /// The twin.
-        name: String,
-        /// The requested version.
-        number: u64,
-    },
+    GarbageCollected { name: String, number: u64 },
     /// A version was leased while garbage collection was about to remove its objects.
     #[error(
         "version {number} of twin {name:?} has just come into use: nothing was removed; try again"
     )]
-    Leased {
-        /// The twin.
-        name: String,
-        /// The version.
-        number: u64,
-    },
+    Leased { name: String, number: u64 },
     /// Stored bytes differ from what was committed.
     #[error("{} is damaged: {reason}; import the twin again", path.display())]
-    Damaged {
-        /// The file.
-        path: PathBuf,
-        /// The difference.
-        reason: String,
-    },
+    Damaged { path: PathBuf, reason: String },
     /// Written by another version of this program.
     #[error(
         "{} has format {found}; this build reads format {supported}: import the twin again",
         path.display()
     )]
     Format {
-        /// The file.
         path: PathBuf,
         /// The format that the file states.
         found: u32,
@@ -110,11 +82,11 @@ pub enum StoreError {
     /// An asset differs from what was stored, or cannot be read.
     #[error("{}", damaged_actor(hash, name.as_deref(), reason))]
     ActorDamaged {
-        /// Its hash, 64 lower-case hex digits; only the first two if their folder of hashes is not a folder.
+        /// Its hash, 64 lower-case hex digits; only the first two if their folder of hashes is not
+        /// a folder.
         hash: String,
         /// The name that it states, if that can be read. It may be damaged, too.
         name: Option<String>,
-        /// The error.
         reason: String,
     },
     /// An asset of another content has the name.
@@ -124,7 +96,6 @@ pub enum StoreError {
         hash.get(..12).unwrap_or(hash)
     )]
     ActorExists {
-        /// The name.
         name: String,
         /// The hash of the asset that has it.
         hash: String,
@@ -145,7 +116,6 @@ pub enum StoreError {
     /// Another commit took the same number first.
     #[error("version {number} of twin {name:?} was committed by another import; try again")]
     Conflict {
-        /// The twin.
         name: String,
         /// The number that was taken.
         number: u64,
@@ -156,7 +126,6 @@ pub enum StoreError {
          cells that are new"
     )]
     DuplicateCell {
-        /// The twin.
         name: String,
         /// Grid cell (x, y).
         cell: [i32; 2],
@@ -168,7 +137,6 @@ pub enum StoreError {
         limits::GAUSSIANS_PER_CELL
     )]
     Scattered {
-        /// Number of Gaussians.
         gaussians: u64,
         /// Number of cells that they lie in.
         cells: usize,
@@ -179,7 +147,6 @@ pub enum StoreError {
          the whole twin"
     )]
     FieldMismatch {
-        /// The twin.
         name: String,
         /// `sh_degree` or `record`.
         field: &'static str,
@@ -192,12 +159,7 @@ pub enum StoreError {
     #[error(
         "twin {name:?} was made by others meanwhile: make the change from its version {latest}"
     )]
-    TwinExists {
-        /// The twin.
-        name: String,
-        /// Its latest version.
-        latest: u64,
-    },
+    TwinExists { name: String, latest: u64 },
     /// Other commits changed the same cells or settings since the base of a change.
     #[error(
         "twin {name:?} changed since version {base}, in the same place: version {latest} has other \
@@ -205,16 +167,14 @@ pub enum StoreError {
         overlap(cells, settings)
     )]
     Overlap {
-        /// The twin.
         name: String,
         /// The version that the change was made from.
         base: u64,
-        /// The latest version.
         latest: u64,
         /// Grid cells (x, y) that both changed, in order of (y, x).
         cells: Vec<[i32; 2]>,
-        /// The fields of [`Diff::settings`](super::Diff::settings) that both changed. `alignment` is listed even if
-        /// only others changed it.
+        /// The fields of [`Diff::settings`](super::Diff::settings) that both changed. `alignment`
+        /// is listed even if only others changed it.
         settings: Vec<&'static str>,
     },
     /// A side file (a lease, or the state of garbage collection) is too large to be read again.
@@ -226,7 +186,6 @@ pub enum StoreError {
     SideFileSize {
         /// The file that would be written.
         path: PathBuf,
-        /// Its size.
         bytes: u64,
         /// The largest size that is read.
         limit: u64,
@@ -236,31 +195,16 @@ pub enum StoreError {
         "version {number} of twin {name:?} is in place, but might be lost in a power cut \
          ({cause}); import the same again"
     )]
-    NotSynced {
-        /// The twin.
-        name: String,
-        /// The version.
-        number: u64,
-        /// The cause.
-        cause: Box<StoreError>,
-    },
+    NotSynced { name: String, number: u64, cause: Box<StoreError> },
     /// The answer to the last request of a commit was lost, and the log cannot be read.
     #[error(
         "it is unknown whether version {number} of twin {name:?} was committed ({cause}): look with \
          `wildcity twin log`, and try again if it was not"
     )]
-    OutcomeUnknown {
-        /// The twin.
-        name: String,
-        /// The version.
-        number: u64,
-        /// The cause.
-        cause: io::Error,
-    },
+    OutcomeUnknown { name: String, number: u64, cause: io::Error },
     /// A URL of twins cannot be used.
     #[error("cannot use {url} for twins: {reason}")]
     Url {
-        /// The URL.
         url: String,
         /// The error in it, or in the credentials.
         reason: String,
@@ -275,13 +219,11 @@ pub enum StoreError {
         100.0 * limits::CLAMPED_SHARE
     )]
     Clamped {
-        /// The record.
         record: RecordFormat,
         /// The field with the most such values.
         field: &'static str,
         /// Number of such values.
         count: u64,
-        /// Number of Gaussians.
         gaussians: u64,
     },
     /// The render profile of a commit cannot be used.
@@ -301,10 +243,7 @@ pub enum StoreError {
     Trajectory(#[from] TrajectoryError),
     /// Two trajectories share a name.
     #[error("two trajectories are named {name:?}: rename one")]
-    DuplicateTrajectory {
-        /// The name.
-        name: String,
-    },
+    DuplicateTrajectory { name: String },
     /// The manifest or the table of a twin is too large.
     #[error(
         "the {what} would take {bytes} bytes; at most {limit} are read: shorten trajectories, or \
@@ -313,7 +252,6 @@ pub enum StoreError {
     ManifestSize {
         /// `manifest`, or `table` for the table of its chunks' sections.
         what: &'static str,
-        /// Its size.
         bytes: u64,
         /// The largest size that is read.
         limit: u64,
@@ -326,7 +264,6 @@ pub enum StoreError {
     ViewSize {
         /// `image` or `table`.
         what: &'static str,
-        /// Its size.
         bytes: u64,
         /// The largest size that is read.
         limit: u64,

@@ -52,7 +52,6 @@ pub struct DamagedObject {
 pub struct RecordSetAside {
     /// Number of the version that it was the record of.
     pub number: u64,
-    /// Its damage.
     pub error: StoreError,
     /// Where it is now.
     pub path: PathBuf,
@@ -111,9 +110,9 @@ impl Catalog {
         })
     }
 
-    /// Sets the newest records of a twin's log aside, as long as the newest cannot be read. The version before
-    /// them is the latest again, and the next commit takes their number. Objects stay: a commit of the same content
-    /// uses them.
+    /// Sets the newest records of a twin's log aside, as long as the newest cannot be read. The
+    /// version before them is the latest again, and the next commit takes their number. Objects
+    /// stay: a commit of the same content uses them.
     ///
     /// # Errors
     /// [`StoreError::Name`], [`StoreError::NoTwin`]; the log cannot be listed or changed.
@@ -121,7 +120,8 @@ impl Catalog {
         let mut aside = Vec::new();
         for number in self.numbers(name)?.into_iter().rev() {
             let Err(error) = self.record(name, number) else { break };
-            // A file that the system refuses to read may be sound: its permissions or the disk may be at fault.
+            // A file that the system refuses to read may be sound: its permissions or the disk may
+            // be at fault.
             let is_refused =
                 matches!(&error, StoreError::Io { cause, .. } if cause.raw_os_error().is_some());
             if is_refused {

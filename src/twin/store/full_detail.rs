@@ -6,8 +6,8 @@ use wildcity_scene::geometry::Bounds;
 use super::{Catalog, StoreError, Version};
 
 impl Catalog {
-    /// Shows `visit` the Gaussians of each section at full detail whose 3-sigma bounds `is_wanted`, in world axes. Only one
-    /// section is in memory at a time.
+    /// Shows `visit` the Gaussians of each section at full detail whose 3-sigma bounds `is_wanted`,
+    /// in world axes. Only one section is in memory at a time.
     ///
     /// # Errors
     /// As [`Catalog::section`].

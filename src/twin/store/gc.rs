@@ -4,12 +4,13 @@
 //! The first run notes them as candidates. A later run, after the grace period, removes the
 //! candidates that are still garbage and were not written since. So a process that reads a version
 //! at the first run has that long to lease it, and a commit that needs an object again has written
-//! it again. A version goes as a whole: as long as its manifest stays, all of its objects do, though some of them may
-//! have been noted before, as those of an older version.
+//! it again. A version goes as a whole: as long as its manifest stays, all of its objects do,
+//! though some of them may have been noted before, as those of an older version.
 //!
-//! In a directory, publishing is locked while objects are removed. In an object store there is no lock: if a commit writes
-//! an object again in the very seconds in which it is removed, the object is lost. So run garbage collection there only
-//! while no push can need an object that has been garbage for a day.
+//! In a directory, publishing is locked while objects are removed. In an object store there is no
+//! lock: if a commit writes an object again in the very seconds in which it is removed, the object
+//! is lost. So run garbage collection there only while no push can need an object that has been
+//! garbage for a day.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::ErrorKind;
@@ -43,15 +44,14 @@ pub struct CollectionReport {
     pub removed: ObjectTotals,
     /// Objects that are garbage, and may be removed after the grace period.
     pub noted: ObjectTotals,
-    /// A version that is not kept, and the damage of its manifest, which hides what the version needs. No object is
-    /// removed until the manifest itself is.
+    /// A version that is not kept, and the damage of its manifest, which hides what the version
+    /// needs. No object is removed until the manifest itself is.
     pub blocked_by: Option<(u64, String)>,
 }
 
 /// A number of objects, and their total size.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ObjectTotals {
-    /// Number of objects.
     pub objects: u64,
     /// Their total size, in bytes.
     pub bytes: u64,
@@ -61,7 +61,8 @@ pub struct ObjectTotals {
 /// microseconds since 1970.
 type Candidates = BTreeMap<String, i64>;
 
-/// Age of what a stopped process left of a side file, in microseconds: a day, in which every write ends.
+/// Age of what a stopped process left of a side file, in microseconds: a day, in which every write
+/// ends.
 const LEFTOVER_AGE_US: i64 = 86_400_000_000;
 /// The side file with the candidates.
 const CANDIDATES: &str = "gc/candidates";
@@ -79,8 +80,8 @@ struct CollectionPlan {
 }
 
 impl Catalog {
-    /// Removes objects that have been garbage for the grace period, and records objects that are garbage now.
-    /// With `dry_run`, nothing is removed or recorded.
+    /// Removes objects that have been garbage for the grace period, and records objects that are
+    /// garbage now. With `dry_run`, nothing is removed or recorded.
     ///
     /// # Errors
     /// [`StoreError::Name`], [`StoreError::NoTwin`]; a version that is to be kept cannot be read.
@@ -196,8 +197,8 @@ impl Catalog {
         Ok(plan)
     }
 
-    /// Decides which of the `others`, the versions that are not kept and not gone, go now: those that lose their
-    /// manifest. Objects that another of them needs stay until that one goes.
+    /// Decides which of the `others`, the versions that are not kept and not gone, go now: those
+    /// that lose their manifest. Objects that another of them needs stay until that one goes.
     fn keep_whole_versions(
         &self,
         name: &str,
@@ -211,8 +212,8 @@ impl Catalog {
         let mut manifests = Vec::new();
         let mut needed = BTreeSet::new();
         for number in others {
-            // A damaged record names no object that could be removed. One that the disk fails to read may: its version
-            // would seem damaged if it lost objects and were not marked.
+            // A damaged record names no object that could be removed. One that the disk fails to
+            // read may: its version would seem damaged if it lost objects and were not marked.
             let record = match self.record(name, number) {
                 Err(StoreError::Damaged { .. }) => continue,
                 record => record?,

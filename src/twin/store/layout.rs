@@ -1,5 +1,5 @@
-//! Paths of the parts of a twin below the root of a directory or an object store, and rules for their
-//! names.
+//! Paths of the parts of a twin below the root of a directory or an object store, and rules for
+//! their names.
 
 use std::path::PathBuf;
 

@@ -1,8 +1,8 @@
 //! Leases: a process that uses a version records it with an expiry time, and garbage collection
 //! keeps the version until then.
 //!
-//! In a directory, the process also keeps a file locked. Then the version is kept as long as the process lives, even if
-//! the clock jumps beyond the expiry time. An object store has no such lock.
+//! In a directory, the process also keeps a file locked. Then the version is kept as long as the
+//! process lives, even if the clock jumps beyond the expiry time. An object store has no such lock.
 
 use std::time::Duration;
 
@@ -12,8 +12,8 @@ use super::disk::Lock;
 use super::layout::LOCK_ENDING;
 use super::{Catalog, StoreError};
 
-/// A version in use. The lease ends when it is dropped; or when it was not renewed for its duration, except in a
-/// directory, as long as its process lives.
+/// A version in use. The lease ends when it is dropped; or when it was not renewed for its
+/// duration, except in a directory, as long as its process lives.
 #[derive(Debug)]
 pub struct Lease {
     catalog: Catalog,

@@ -1,4 +1,5 @@
-//! A twin's log: for each version the hash of its manifest, the time of its commit, and how it was made.
+//! A twin's log: for each version the hash of its manifest, the time of its commit, and how it was
+//! made.
 
 use serde::{Deserialize, Serialize};
 
@@ -13,15 +14,16 @@ pub struct LogEntry {
     pub created_us: i64,
     /// Identity of the commit that made it; `None` for versions from before commits had one.
     pub commit: Option<String>,
-    /// The version that it was made from: the base of a push or an edit, or the version that a rollback
-    /// restored.
+    /// The version that it was made from: the base of a push or an edit, or the version that a
+    /// rollback restored.
     pub parent: Option<u64>,
     /// How it was made.
     pub kind: CommitKind,
 }
 
 impl LogEntry {
-    /// Whether it is an edit of another version, such as an alignment. An import of files has no parent.
+    /// Whether it is an edit of another version, such as an alignment. An import of files has no
+    /// parent.
     pub fn is_edit(&self) -> bool {
         self.kind == CommitKind::Import && self.parent.is_some()
     }
@@ -50,8 +52,8 @@ pub enum CommitKind {
     Rollback,
 }
 
-/// A record of the log, stored as JSON. How a version was made is stored here and not in the manifest,
-/// so that the hash of a manifest depends only on the content of the version.
+/// A record of the log, stored as JSON. How a version was made is stored here and not in the
+/// manifest, so that the hash of a manifest depends only on the content of the version.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct LogRecord {

@@ -27,18 +27,18 @@
 //!
 //! **On conflict, the commit reads the winning record.** Its own record means that the answer to an
 //! earlier attempt was lost: the commit succeeded. Changes to other cells mean that the commit is
-//! rebased on the winner. Changes to the same cells, or an alignment to other axes, are an error that
-//! names them ([`StoreError::Overlap`]).
+//! rebased on the winner. Changes to the same cells, or an alignment to other axes, are an error
+//! that names them ([`StoreError::Overlap`]).
 //!
-//! **The log record, and not the manifest, stores when and how a version was made.** So a version's hash is a
-//! hash of its content, and a rollback is a new record with an old hash.
+//! **The log record, and not the manifest, stores when and how a version was made.** So a version's
+//! hash is a hash of its content, and a rollback is a new record with an old hash.
 //!
 //! **In a directory, several commits of one twin may be in preparation**, each in a folder of its
 //! own. Its lock is released by the kernel when the process ends, however it ends. A second lock
-//! per twin is held while publishing, while removing the remains of killed commits, and during garbage
-//! collection, so that no commit relies on an object that is being removed. An object store has no such lock:
-//! there, the remains of a killed commit are ordinary garbage, which is removed in two steps: one run records
-//! it, and another run removes it after a day.
+//! per twin is held while publishing, while removing the remains of killed commits, and during
+//! garbage collection, so that no commit relies on an object that is being removed. An object store
+//! has no such lock: there, the remains of a killed commit are ordinary garbage, which is removed
+//! in two steps: one run records it, and another run removes it after a day.
 //!
 //! **Requests to object stores are timed and retried in one place** (`remote/retry.rs`);
 //! `object_store`'s own retries are off.

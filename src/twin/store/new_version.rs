@@ -21,7 +21,6 @@ pub struct NewVersion<'a> {
     pub profile: RenderProfile,
     /// The rig of the vehicle that recorded them.
     pub rig: Option<Rig>,
-    /// Recorded drives.
     pub trajectories: Vec<Trajectory>,
     /// The sky behind them.
     pub sky: Option<NewSky>,
@@ -35,7 +34,7 @@ pub struct NewVersion<'a> {
 
 impl<'a> NewVersion<'a> {
     /// Only Gaussians, rendered and stored with defaults.
-    pub fn of(name: &'a str, gaussians: &'a Gaussians, provenance: Provenance) -> Self {
+    pub fn from_gaussians(name: &'a str, gaussians: &'a Gaussians, provenance: Provenance) -> Self {
         Self {
             name,
             gaussians,

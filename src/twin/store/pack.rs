@@ -68,7 +68,8 @@ impl<'a> CellPacker<'a> {
     }
 
     /// Writes an object for each cell. Returns the chunks in order, and counts of the values that
-    /// the record could not hold. `progress` gets the number of Gaussians written, from 0, and in all.
+    /// the record could not hold. `progress` gets the number of Gaussians written, from 0, and in
+    /// all.
     pub(super) fn put(
         &self,
         staging: &mut dyn Staging,

@@ -7,14 +7,14 @@ use super::layout::ACTORS;
 use super::{Catalog, StoreError};
 
 impl Catalog {
-    /// Removes the remains of killed commits of all twins: their staging, and objects that they placed without
-    /// a record.
+    /// Removes the remains of killed commits of all twins: their staging, and objects that they
+    /// placed without a record.
     ///
     /// A process with read-only access leaves this to processes that may write.
     ///
     /// # Errors
-    /// The unfinished commits cannot be listed, or the remains of twin `needed` cannot be removed. A failure of
-    /// another twin is left to the next commit of that twin.
+    /// The unfinished commits cannot be listed, or the remains of twin `needed` cannot be removed.
+    /// A failure of another twin is left to the next commit of that twin.
     pub(super) fn remove_abandoned_commits(&self, needed: Option<&str>) -> Result<(), StoreError> {
         for name in self.objects.unfinished_commits()? {
             // If a version is damaged, it is unknown which objects it named, so every object is

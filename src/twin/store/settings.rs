@@ -17,7 +17,6 @@ pub struct VersionSettings {
     pub profile: RenderProfile,
     /// The rig of the vehicle that recorded it.
     pub rig: Option<Rig>,
-    /// Recorded drives.
     pub trajectories: Vec<Trajectory>,
     /// The sky behind the Gaussians.
     pub sky: Option<NewSky>,
@@ -29,21 +28,21 @@ pub struct VersionSettings {
     pub provenance: Provenance,
 }
 
-/// The parts of a version, other than cells, that a change replaces. A field that is `None` keeps the base's
-/// value.
+/// The parts of a version, other than cells, that a change replaces. A field that is `None` keeps
+/// the base's value.
 #[derive(Clone, Debug)]
 pub struct VersionChange {
     /// How it must be rendered.
     pub profile: Option<RenderProfile>,
     /// The rig of the vehicle that recorded it.
     pub rig: Option<Rig>,
-    /// All recorded drives.
     pub trajectories: Option<Vec<Trajectory>>,
     /// The sky behind the Gaussians; `Some(None)` removes it.
     pub sky: Option<Option<NewSky>>,
     /// Where the world lies on the earth; `Some(None)` removes it.
     pub geo: Option<Option<GeoAnchor>>,
-    /// Where the new version comes from; `None` for an edit, which comes from where its base does, and has no note.
+    /// Where the new version comes from; `None` for an edit, which comes from where its base does,
+    /// and has no note.
     pub provenance: Option<Provenance>,
 }
 
@@ -71,7 +70,7 @@ impl VersionChange {
     }
 
     /// Keeps everything of the base version but its provenance.
-    pub fn of(provenance: Provenance) -> Self {
+    pub fn new(provenance: Provenance) -> Self {
         Self { provenance: Some(provenance), ..Self::edit() }
     }
 

@@ -17,7 +17,6 @@ use super::{Catalog, StoreError, Version};
 pub enum NewSky {
     /// The sky of an earlier version of the twin.
     Kept(SkyRef),
-    /// A new sky.
     Put(SkyBytes),
 }
 

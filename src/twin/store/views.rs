@@ -21,8 +21,8 @@ impl Commit {
         self.put_object(bytes)
     }
 
-    /// Writes the table of a version's recorded images. The version has them once a change or settings name the
-    /// result.
+    /// Writes the table of a version's recorded images. The version has them once a change or
+    /// settings name the result.
     ///
     /// # Errors
     /// [`StoreError::ViewSize`], or it cannot be written.
@@ -40,15 +40,17 @@ impl Commit {
 }
 
 impl Catalog {
-    /// The recorded images of a version, in the order of their table; none if it has none. Images are not read.
+    /// The recorded images of a version, in the order of their table; none if it has none. Images
+    /// are not read.
     ///
     /// # Errors
     /// [`StoreError::Damaged`] if the table differs from what was committed.
     pub fn views(&self, version: &Version) -> Result<Vec<RecordedView>, StoreError> {
-        self.views_of(&version.manifest)
+        self.read_views(&version.manifest)
     }
 
-    /// Reads a recorded image, and compares it with its hash. Through the disk cache, if there is one.
+    /// Reads a recorded image, and compares it with its hash. Through the disk cache, if there is
+    /// one.
     ///
     /// # Errors
     /// [`StoreError::Damaged`] if it differs from what was committed.
@@ -61,7 +63,8 @@ impl Catalog {
         self.objects.read_object(twin, &view.image.object, limits::VIEW_IMAGE_BYTES)
     }
 
-    /// Reads the mask of a recorded image, as [`Catalog::view_image`]; `None` if all of its pixels count.
+    /// Reads the mask of a recorded image, as [`Catalog::view_image`]; `None` if all of its pixels
+    /// count.
     ///
     /// # Errors
     /// As [`Catalog::view_image`].
@@ -75,7 +78,7 @@ impl Catalog {
         self.objects.read_object(twin, &mask.object, limits::VIEW_IMAGE_BYTES).map(Some)
     }
 
-    pub(super) fn views_of(&self, manifest: &Manifest) -> Result<Vec<RecordedView>, StoreError> {
+    pub(super) fn read_views(&self, manifest: &Manifest) -> Result<Vec<RecordedView>, StoreError> {
         let Some(named) = &manifest.views else { return Ok(Vec::new()) };
         let twin = &manifest.twin;
         let bytes = self.objects.read_object(twin, &named.object, limits::VIEWS_TABLE_BYTES)?;
@@ -94,7 +97,7 @@ impl Catalog {
 
     /// The objects of a manifest's recorded images: the table, and each image and mask.
     pub(super) fn view_objects(&self, manifest: &Manifest) -> Result<BTreeSet<String>, StoreError> {
-        let views = self.views_of(manifest)?;
+        let views = self.read_views(manifest)?;
         let images = views.iter().flat_map(objects).map(|object| object.object.clone());
         let table = manifest.views.iter().map(|views| views.object.clone());
         Ok(images.chain(table).collect())

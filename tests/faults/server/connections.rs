@@ -1,5 +1,5 @@
-//! Histories of connections: agents drive, each with a session of its own, over connections that are cut at any byte.
-//! They resume, and repeat the request whose answer they did not get.
+//! Histories of connections: agents drive, each with a session of its own, over connections that
+//! are cut at any byte. They resume, and repeat the request whose answer they did not get.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -87,7 +87,7 @@ impl Connections {
 impl super::History for Connections {
     type Plant = Plant;
 
-    fn of(seed: u64) -> Self {
+    fn from_seed(seed: u64) -> Self {
         let mut random = Random::new(seed);
         let count = 1 + random.below(3);
         let agents = (0..count as u8).map(|index| Agent::random(&mut random, index)).collect();
@@ -373,7 +373,8 @@ impl Network {
         Ok(Link { socket, faults })
     }
 
-    /// Checks that each step was carried out once, and that nothing is left of the connections and sessions.
+    /// Checks that each step was carried out once, and that nothing is left of the connections and
+    /// sessions.
     async fn finish(self, steps: u64) -> Result<(), String> {
         let Self { server, unclosed } = self;
         drop(unclosed);

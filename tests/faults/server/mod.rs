@@ -1,11 +1,14 @@
-//! Simulated faults of the server: histories of uploads on a disk that fails, and of sessions over connections that are
-//! cut. Requests go through the server's own router, and through connections in memory.
+//! Simulated faults of the server: histories of uploads on a disk that fails, and of sessions over
+//! connections that are cut. Requests go through the server's own router, and through connections
+//! in memory.
 //!
-//! A history follows from its seed, except for the order in which threads run. A failure prints the seed and the shortest
-//! history that still fails; `SEED=n cargo test -p wildcity-server --lib one_history` runs one of each kind, and
+//! A history follows from its seed, except for the order in which threads run. A failure prints the
+//! seed and the shortest history that still fails;
+//! `SEED=n cargo test -p wildcity-server --lib one_history` runs one of each kind, and
 //! `HISTORIES=n ... many_histories` any number, from the seed `FIRST_SEED` on.
 //!
-//! Not simulated: TLS, the kernel's sockets, and a client that does not read until the time-out for it.
+//! Not simulated: TLS, the kernel's sockets, and a client that does not read until the time-out for
+//! it.
 
 mod connections;
 #[allow(dead_code, reason = "the simulation of the store uses another part of it")]
@@ -50,7 +53,7 @@ trait History: Clone + Display {
     type Plant: Copy + Debug + Sync;
 
     /// The history of a seed.
-    fn of(seed: u64) -> Self;
+    fn from_seed(seed: u64) -> Self;
 
     /// Runs it.
     ///
@@ -94,7 +97,7 @@ fn run<H: History>(first: u64, histories: u64, plant: Option<H::Plant>) -> Optio
                     if seed >= first + histories || failed_before(seed) {
                         return;
                     }
-                    if let Some(said) = reason(&machine, &H::of(seed), plant)
+                    if let Some(said) = reason(&machine, &H::from_seed(seed), plant)
                         && !failed_before(seed)
                     {
                         *failed.lock() = Some((seed, said));
@@ -106,11 +109,11 @@ fn run<H: History>(first: u64, histories: u64, plant: Option<H::Plant>) -> Optio
             });
         }
     });
-    failed.into_inner().map(|(seed, said)| shrunk(H::of(seed), said, plant))
+    failed.into_inner().map(|(seed, said)| shrunk(H::from_seed(seed), said, plant))
 }
 
-/// Shortens a failing history by leaving out parts while it still fails. A history that fails only if threads run in a
-/// certain order is not shortened.
+/// Shortens a failing history by leaving out parts while it still fails. A history that fails only
+/// if threads run in a certain order is not shortened.
 fn shrunk<H: History>(mut history: H, mut said: String, plant: Option<H::Plant>) -> Failure<H> {
     let machine = Machine::new();
     loop {
@@ -155,8 +158,8 @@ fn one_history() {
 }
 
 fn run_one<H: History>(machine: &Machine, seed: u64) {
-    if let Some(said) = reason(machine, &H::of(seed), None) {
-        let Failure { history, said } = shrunk(H::of(seed), said, None);
+    if let Some(said) = reason(machine, &H::from_seed(seed), None) {
+        let Failure { history, said } = shrunk(H::from_seed(seed), said, None);
         panic!("{said}\n{history}");
     }
 }

@@ -27,7 +27,8 @@ impl CutStream {
         Self { stream, cut }
     }
 
-    /// The end that no client uses any more. Until it is dropped, the server is not notified of the cut.
+    /// The end that no client uses any more. Until it is dropped, the server is not notified of the
+    /// cut.
     pub(super) fn into_unclosed(self) -> DuplexStream {
         self.stream
     }

@@ -1,5 +1,5 @@
-//! A damaged asset among good ones: the good ones are listed, pushed and used in sessions; the damaged one is listed
-//! with the reason. Messages to clients contain no path of the server.
+//! A damaged asset among good ones: the good ones are listed, pushed and used in sessions; the
+//! damaged one is listed with the reason. Messages to clients contain no path of the server.
 
 use std::process::Command;
 
@@ -9,12 +9,12 @@ use wildcity_client::HttpClient;
 use crate::http::{Reply, client, get};
 use crate::support::{Agent, TestServer, refused};
 
-use super::{actor_of, ball, upload_ply};
+use super::{ball, new_actor, upload_ply};
 
 /// Pushes a ball. Returns the hash of the asset.
 async fn pushed(client: &HttpClient, name: &str, seed: u64) -> String {
     let id = upload_ply(client, &format!("{name}.ply"), &ball(300, seed)).await;
-    client.push_actor(&actor_of(name, &[&id])).await.unwrap().hash
+    client.push_actor(&new_actor(name, &[&id])).await.unwrap().hash
 }
 
 /// A scenario with one actor of this asset.

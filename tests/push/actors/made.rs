@@ -11,7 +11,7 @@ use crate::http::{client, get, post, write};
 use crate::metrics::scrape;
 use crate::support::{TestServer, refused};
 
-use super::{actor_of, ball, imported, refusal, upload, upload_ply};
+use super::{ball, imported, new_actor, refusal, upload, upload_ply};
 
 #[tokio::test]
 async fn a_pushed_asset_is_that_of_an_import() {
@@ -78,14 +78,14 @@ async fn classes_and_scales_are_those_asked_for() {
     let server = TestServer::start().await;
     let client = client(&server);
     let id = upload_ply(&client, "ball.ply", &ball(300, 1)).await;
-    let whole = client.push_actor(&actor_of("whole", &[&id])).await.unwrap();
+    let whole = client.push_actor(&new_actor("whole", &[&id])).await.unwrap();
     for (class, name) in [
         (ActorClass::Vehicle, "vehicle"),
         (ActorClass::Pedestrian, "pedestrian"),
         (ActorClass::Bicycle, "bicycle"),
         (ActorClass::Object, "object"),
     ] {
-        let mut asked = NewActor { class, ..actor_of(name, &[&id]) };
+        let mut asked = NewActor { class, ..new_actor(name, &[&id]) };
         asked.files[0].scale = Some(0.5);
         let made = client.push_actor(&asked).await.unwrap();
         assert_eq!((made.class, made.box_.length_m), (class, 0.5 * whole.box_.length_m));
@@ -100,7 +100,7 @@ async fn a_pushed_vehicle_is_that_of_an_import() {
     let client = client(&server);
     let axes = "0 0 1 1 0 0 0 1 0";
     let wanted = imported(&truck, "truck", axes, RecordFormat::default(), 20_000);
-    let mut asked = actor_of("truck", &[&upload(&client, &truck).await]);
+    let mut asked = new_actor("truck", &[&upload(&client, &truck).await]);
     asked.files[0].axes = Some(axes.to_owned());
     asked.gaussians = Some(20_000);
     let made = client.push_actor(&asked).await.unwrap();
@@ -113,14 +113,15 @@ async fn a_pushed_vehicle_is_that_of_an_import() {
     let paint = van.parent().unwrap().join(texture);
     let wanted = imported(&van, "van", "identity", RecordFormat::default(), 200_000);
     let uploads = [upload(&client, &van).await, upload(&client, &paint).await];
-    let mut asked = actor_of("van", &[&uploads[0], &uploads[1]]);
+    let mut asked = new_actor("van", &[&uploads[0], &uploads[1]]);
     let (_, _, message) = refusal(&client, &asked).await;
     assert!(message.contains(&format!("part {texture:?}: is not the name of")), "{message}");
     asked.files[1].name = Some(texture.to_owned());
     assert_eq!(client.push_actor(&asked).await.unwrap().hash, wanted.hash);
 }
 
-/// The image of an ego at rest, with an actor 6 m ahead that is drawn from an asset, or without one.
+/// The image of an ego at rest, with an actor 6 m ahead that is drawn from an asset, or without
+/// one.
 async fn image_with(server: &TestServer, asset: Option<&str>) -> Vec<u8> {
     let mut actor = json!({ "name": "ahead", "stand": { "xyz": [6, 0, 0] } });
     match asset {
@@ -149,7 +150,7 @@ async fn a_session_that_opens_afterwards_drives_with_it() {
 
     let client = client(&server);
     let id = upload_ply(&client, "ball.ply", &ball(3_000, 1)).await;
-    let made = client.push_actor(&actor_of("ball", &[&id])).await.unwrap();
+    let made = client.push_actor(&new_actor("ball", &[&id])).await.unwrap();
     let without = image_with(&server, None).await;
     let by_name = image_with(&server, Some("ball")).await;
     assert_ne!(by_name, without, "the asset is seen");

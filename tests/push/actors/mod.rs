@@ -25,7 +25,7 @@ pub(super) fn ball(count: usize, seed: u64) -> Gaussians {
     gaussians
 }
 
-pub(super) fn actor_of(name: &str, uploads: &[&str]) -> NewActor {
+pub(super) fn new_actor(name: &str, uploads: &[&str]) -> NewActor {
     let file = |id: &&str| PushFile {
         upload: (*id).to_owned(),
         axes: Some("identity".to_owned()),

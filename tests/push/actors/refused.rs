@@ -7,7 +7,7 @@ use crate::gltf_files::gltf;
 use crate::http::{client, get, in_cell, post, send};
 use crate::support::TestServer;
 
-use super::{actor_of, ball, imported, nothing_is_stored, refusal, upload, upload_ply};
+use super::{ball, imported, new_actor, nothing_is_stored, refusal, upload, upload_ply};
 
 #[tokio::test]
 async fn every_bad_request_has_its_code_and_field() {
@@ -118,7 +118,7 @@ async fn files_that_are_no_actor_are_refused_with_their_reason() {
         (vec![bytes("alone.gltf", json.as_bytes()).await], "is not the name of"),
     ] {
         let uploads: Vec<&str> = uploads.iter().map(|id| &**id).collect();
-        let (status, code, message) = refusal(&client, &actor_of("thing", &uploads)).await;
+        let (status, code, message) = refusal(&client, &new_actor("thing", &uploads)).await;
         assert_eq!((status, &*code), (422, "push_refused"), "{message}");
         assert!(message.contains(why), "not {why:?}: {message}");
     }
@@ -126,7 +126,7 @@ async fn files_that_are_no_actor_are_refused_with_their_reason() {
 
     // With the file that it names, the scene is an actor of one file.
     let scene_id = bytes("block.gltf", json.as_bytes()).await;
-    let made = client.push_actor(&actor_of("block", &[&buffer_id, &scene_id])).await.unwrap();
+    let made = client.push_actor(&new_actor("block", &[&buffer_id, &scene_id])).await.unwrap();
     std::fs::write(dir.path().join("block.bin"), &buffer).unwrap();
     let path = dir.path().join("block.gltf");
     let wanted = imported(&path, "block", "identity", RecordFormat::default(), 200_000);

@@ -10,10 +10,10 @@ use wildcity_client::{HttpError, NewActor, Push};
 use wildcity_server::Limits;
 use wildcity_twin::store::{ActorList, Catalog};
 
-use crate::http::{client, get, in_cell, push_of};
+use crate::http::{client, get, in_cell, new_push};
 use crate::support::TestServer;
 
-use super::{actor_of, ball, metrics_have, nothing_is_stored, refusal, upload_ply};
+use super::{ball, metrics_have, new_actor, nothing_is_stored, refusal, upload_ply};
 
 /// Sends the request of a push, and keeps the connection open.
 async fn begin(server: &TestServer, asked: &NewActor) -> TcpStream {
@@ -35,7 +35,7 @@ async fn a_client_that_goes_away_leaves_nothing() {
     let client = client(&server);
     // Reading these and making their levels of detail takes seconds.
     let id = upload_ply(&client, "large.ply", &ball(1_000_000, 1)).await;
-    let stream = begin(&server, &actor_of("large", &[&id])).await;
+    let stream = begin(&server, &new_actor("large", &[&id])).await;
     metrics_have(&server, "wildcity_pushes_open 1").await;
     drop(stream);
     metrics_have(&server, "wildcity_pushes_total{outcome=\"failed\"} 1").await;
@@ -43,8 +43,9 @@ async fn a_client_that_goes_away_leaves_nothing() {
     nothing_is_stored(&server).await;
     let text = std::fs::read_to_string(&audit).unwrap();
     assert!(text.lines().last().unwrap().contains("the push was cancelled"), "{text}");
-    // The repeated push makes the asset; the threads of the first push have ended by then, and have stored nothing.
-    let made = client.push_actor(&actor_of("large", &[&id])).await.unwrap();
+    // The repeated push makes the asset; the threads of the first push have ended by then, and have
+    // stored nothing.
+    let made = client.push_actor(&new_actor("large", &[&id])).await.unwrap();
     let listed = client.actors().await.unwrap().actors;
     assert_eq!((listed.len(), &listed[0].hash), (1, &made.hash));
 }
@@ -55,7 +56,7 @@ async fn a_server_that_stops_leaves_nothing_half_made() {
     let client = client(&server);
     let id = upload_ply(&client, "large.ply", &ball(1_000_000, 1)).await;
     let pushing = client.clone();
-    let asked = actor_of("large", &[&id]);
+    let asked = new_actor("large", &[&id]);
     let pushed = tokio::spawn(async move { pushing.push_actor(&asked).await });
     metrics_have(&server, "wildcity_pushes_open 1").await;
     let TestServer { running, twins, .. } = server;
@@ -78,7 +79,7 @@ async fn a_push_of_an_asset_has_a_time_limit_and_waits_for_memory() {
     let server = TestServer::with(limits).await;
     let slow = client(&server);
     let id = upload_ply(&slow, "large.ply", &ball(500_000, 1)).await;
-    let (status, code, message) = refusal(&slow, &actor_of("large", &[&id])).await;
+    let (status, code, message) = refusal(&slow, &new_actor("large", &[&id])).await;
     assert_eq!((status, &*code), (422, "push_refused"), "{message}");
     assert!(message.contains("took longer than"), "{message}");
     tokio::time::sleep(Duration::from_secs(2)).await;
@@ -91,8 +92,8 @@ async fn a_push_of_an_asset_has_a_time_limit_and_waits_for_memory() {
     let twin = upload_ply(&client, "twin.ply", &in_cell([0, 0], 40, 1)).await;
     let small = upload_ply(&client, "small.ply", &ball(40, 2)).await;
     server.painter.slow_ms.store(300, Ordering::SeqCst);
-    let begun = client.push("test", &push_of(&[&twin])).await.unwrap();
-    let asked = actor_of("small", &[&small]);
+    let begun = client.push("test", &new_push(&[&twin])).await.unwrap();
+    let asked = new_actor("small", &[&small]);
     let made = async {
         let made = client.push_actor(&asked).await.unwrap();
         (made.gaussians, get(&server, "/v1/twins/test").await.body["version"].clone())
@@ -111,9 +112,9 @@ async fn pushes_of_assets_count_among_the_open_ones() {
     let twin = upload_ply(&client, "twin.ply", &in_cell([0, 0], 40, 1)).await;
     let small = upload_ply(&client, "small.ply", &ball(40, 2)).await;
     server.painter.slow_ms.store(300, Ordering::SeqCst);
-    let begun = client.push("test", &push_of(&[&twin])).await.unwrap();
-    let (status, code, message) = refusal(&client, &actor_of("small", &[&small])).await;
+    let begun = client.push("test", &new_push(&[&twin])).await.unwrap();
+    let (status, code, message) = refusal(&client, &new_actor("small", &[&small])).await;
     assert_eq!((status, &*code), (503, "busy"), "{message}");
     client.wait_for_push(begun, &mut |_| {}).await.unwrap();
-    client.push_actor(&actor_of("small", &[&small])).await.unwrap();
+    client.push_actor(&new_actor("small", &[&small])).await.unwrap();
 }

@@ -25,13 +25,14 @@ use super::timed::median;
 use crate::cli::progress;
 use street::Cars;
 
-/// Measure the cost of actors: a step among cars that are actors, against one in a twin that contains the same cars.
+/// Measure the cost of actors: a step among cars that are actors, against one in a twin that
+/// contains the same cars.
 ///
-/// Cars stand in two lanes around the middle of the twin's first trajectory. Both twins, without a sky, and the car's
-/// asset are made in a temporary directory. One session in each drives through the same poses, in turn; images are
-/// raw. Prints the median step of each, the median of the ratios of the pairs, and the processor time of all steps;
-/// first at full detail, where both draw the same Gaussians, and then with the levels of detail that the twin's
-/// profile asks for.
+/// Cars stand in two lanes around the middle of the twin's first trajectory. Both twins, without a
+/// sky, and the car's asset are made in a temporary directory. One session in each drives through
+/// the same poses, in turn; images are raw. Prints the median step of each, the median of the
+/// ratios of the pairs, and the processor time of all steps; first at full detail, where both draw
+/// the same Gaussians, and then with the levels of detail that the twin's profile asks for.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Actors {
@@ -42,7 +43,8 @@ pub(super) struct Actors {
     #[arg(long, value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=256))]
     cars: u32,
 
-    /// Number of Gaussians of a car: the largest ones of the generated sedan are halved until this number is reached.
+    /// Number of Gaussians of a car: the largest ones of the generated sedan are halved until this
+    /// number is reached.
     #[arg(long, value_name = "N", default_value_t = 100_000,
         value_parser = clap::value_parser!(u32).range(1_000..=1_000_000))]
     gaussians: u32,
@@ -65,7 +67,8 @@ Examples:
   wildcity bench actors demo
   wildcity bench actors demo --backend cpu --cars 10 --pairs 21 --json | jq .ratio";
 
-/// How far the ego drives in one step, in metres: the view must change, and the same cars must stay in it.
+/// How far the ego drives in one step, in metres: the view must change, and the same cars must stay
+/// in it.
 const STEP_M: f64 = 0.1;
 
 /// Steps of one session.
@@ -131,9 +134,10 @@ impl Actors {
             // Each is the first one in every second pair.
             let mut seen = Vec::new();
             for is_actors in [pair % 2 == 0, pair % 2 != 0] {
-                let (session, times) = match is_actors {
-                    true => (&mut actors, &mut row.actors),
-                    false => (&mut baked, &mut row.baked),
+                let (session, times) = if is_actors {
+                    (&mut actors, &mut row.actors)
+                } else {
+                    (&mut baked, &mut row.baked)
                 };
                 seen.push(times.step(session, pose).await?);
             }

@@ -26,8 +26,9 @@ const SPACING_M: f64 = 6.0;
 const LANE_M: f64 = 3.5;
 /// Distance of the ego to the next cars in its own lane, in metres, beyond half of the spacing.
 const FREE_M: f64 = 10.0;
-/// Standard deviation of a half of a flat Gaussian, and distance of its middle from the whole's, as shares of the
-/// whole's standard deviation: a cell of the painter's (0.66 standard deviations of a cell) becomes two cells.
+/// Standard deviation of a half of a flat Gaussian, and distance of its middle from the whole's, as
+/// shares of the whole's standard deviation: a cell of the painter's (0.66 standard deviations of a
+/// cell) becomes two cells.
 const HALF: [f64; 2] = [0.5, 0.25 / 0.66];
 
 /// The cars, and the drive between them.
@@ -39,7 +40,8 @@ pub(super) struct Cars {
     places: Vec<Pose>,
 }
 
-/// Commits [`BARE`] and [`BAKED`] to a catalog and stores the car's asset there: `count` cars of `gaussians` each.
+/// Commits [`BARE`] and [`BAKED`] to a catalog and stores the car's asset there: `count` cars of
+/// `gaussians` each.
 pub(super) fn commit(
     source: &Catalog,
     version: &Version,
@@ -56,7 +58,7 @@ pub(super) fn commit(
     let model = actor_models().into_iter().find(|model| model.name == "sedan");
     let model = model.context("there is no generated sedan")?;
     let car = refined(model.gaussians, gaussians as usize);
-    let provenance = Provenance::of(format!("sedan of {} Gaussians", car.len()));
+    let provenance = Provenance::new(format!("sedan of {} Gaussians", car.len()));
     let description = AssetDescription {
         name: "car".to_owned(),
         class: model.class,
@@ -75,7 +77,7 @@ pub(super) fn commit(
             profile: manifest.profile,
             trajectories: vec![drive.clone()],
             storage: StorageOptions { record: manifest.record, levels: true },
-            ..NewVersion::of(name, all, provenance.clone())
+            ..NewVersion::from_gaussians(name, all, provenance.clone())
         };
         let written = into.commit(new, &mut progress::show(&bar));
         bar.finish_and_clear();
@@ -110,7 +112,8 @@ impl Cars {
     }
 }
 
-/// Where the cars stand: alternately in the ego's lane, around the middle of the drive, and in the oncoming lane.
+/// Where the cars stand: alternately in the ego's lane, around the middle of the drive, and in the
+/// oncoming lane.
 fn places(drive: &Trajectory, count: u32) -> anyhow::Result<Vec<Pose>> {
     let rows = count.div_ceil(2);
     let needed_m = f64::from(rows) * SPACING_M + 2.0 * FREE_M;
@@ -124,16 +127,18 @@ fn places(drive: &Trajectory, count: u32) -> anyhow::Result<Vec<Pose>> {
         let from_ahead = index % 2 == 1;
         let free_m = if from_ahead { 0.0 } else { FREE_M.copysign(from_middle_m) };
         let station_m = 0.5 * length_m + from_middle_m + free_m;
-        let beside = match from_ahead {
-            true => Pose { position_m: LANE_M * DVec3::Y, rotation: DQuat::from_rotation_z(PI) },
-            false => Pose::IDENTITY,
+        let beside = if from_ahead {
+            Pose { position_m: LANE_M * DVec3::Y, rotation: DQuat::from_rotation_z(PI) }
+        } else {
+            Pose::IDENTITY
         };
         drive.at_station(station_m) * beside
     };
     Ok((0..count).map(place).collect())
 }
 
-/// Halves the largest Gaussians along their longest axes, or leaves out the last ones, until there are `count`.
+/// Halves the largest Gaussians along their longest axes, or leaves out the last ones, until there
+/// are `count`.
 fn refined(mut gaussians: Gaussians, count: usize) -> Gaussians {
     if gaussians.len() >= count {
         return gaussians.select(0..count);

@@ -24,9 +24,10 @@ use step::DriveStep;
 
 /// Time a drive along a twin's first trajectory, in a session without a network.
 ///
-/// Drives at a constant speed with ten steps per second. Each step starts 0.1 s after the previous one, or as soon as
-/// the previous one is done if that took longer, like an agent that runs in real time. For every kilometre, prints how
-/// long the steps took, how many of them waited for the disk and for how long, and how much memory was in use.
+/// Drives at a constant speed with ten steps per second. Each step starts 0.1 s after the previous
+/// one, or as soon as the previous one is done if that took longer, like an agent that runs in real
+/// time. For every kilometre, prints how long the steps took, how many of them waited for the disk
+/// and for how long, and how much memory was in use.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Drive {
@@ -45,8 +46,8 @@ pub(super) struct Drive {
     #[arg(long, value_name = "N")]
     steps: Option<u32>,
 
-    /// Divide the width and height of every camera by N and render only the middle of its image. The same
-    /// Gaussians must be in memory as for whole images, but there is less to render.
+    /// Divide the width and height of every camera by N and render only the middle of its image.
+    /// The same Gaussians must be in memory as for whole images, but there is less to render.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
     crop: u32,
 

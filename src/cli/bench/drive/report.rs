@@ -11,7 +11,8 @@ use super::step::DriveStep;
 use wildcity_scene::rig::RigCamera;
 use wildcity_twin::residency::Stats;
 
-/// Number of steps before a drive counts as warm: 3 s, in which the prefetcher measures the rig's speed.
+/// Number of steps before a drive counts as warm: 3 s, in which the prefetcher measures the rig's
+/// speed.
 const WARM_UP: usize = 30;
 
 /// A drive, and the jumps after it.
@@ -53,7 +54,7 @@ pub(super) struct Row {
 }
 
 impl Row {
-    fn of(steps: &[DriveStep]) -> Self {
+    fn from_steps(steps: &[DriveStep]) -> Self {
         let mut steps_ms: Vec<f64> = steps.iter().map(|step| ms(step.step)).collect();
         steps_ms.sort_by(f64::total_cmp);
         let quantile_ms = |share: f64| {
@@ -92,7 +93,7 @@ impl Report {
     fn kilometres(&self) -> Vec<(u64, Row)> {
         let km = |step: &DriveStep| (1e-3 * step.station_m) as u64;
         let runs = self.steps.chunk_by(|a, b| km(a) == km(b));
-        runs.map(|run| (km(&run[0]), Row::of(run))).collect()
+        runs.map(|run| (km(&run[0]), Row::from_steps(run))).collect()
     }
 
     pub(super) fn print(&self, json: bool) -> anyhow::Result<()> {
@@ -158,10 +159,10 @@ impl Report {
             line(&km.to_string(), &row)?;
         }
         let warm = WARM_UP.min(self.steps.len());
-        line("all", &Row::of(&self.steps))?;
-        line("warm", &Row::of(&self.steps[warm..]))?;
+        line("all", &Row::from_steps(&self.steps))?;
+        line("warm", &Row::from_steps(&self.steps[warm..]))?;
         if !self.jumps.is_empty() {
-            line("teleports", &Row::of(&self.jumps))?;
+            line("teleports", &Row::from_steps(&self.jumps))?;
         }
         writeln!(out, "most memory {:.0} MiB", mib(self.peak_rss_bytes))?;
         Ok(())
@@ -187,9 +188,9 @@ impl Report {
             "prefetches_dropped": prefetches_dropped,
             "peak_rss_bytes": self.peak_rss_bytes,
             "kilometres": kilometres,
-            "all": Row::of(&self.steps),
-            "warm": Row::of(&self.steps[WARM_UP.min(self.steps.len())..]),
-            "teleports": Row::of(&self.jumps),
+            "all": Row::from_steps(&self.steps),
+            "warm": Row::from_steps(&self.steps[WARM_UP.min(self.steps.len())..]),
+            "teleports": Row::from_steps(&self.jumps),
         })
     }
 

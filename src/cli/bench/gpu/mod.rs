@@ -18,16 +18,18 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::{RenderProfile, Rig, Scene};
 
 /// Measure a device: the time of each stage of a step with six full cameras, in streets of several
-/// sizes, next to the limit of the device's memory and an estimate of its arithmetic (its roofline).
+/// sizes, next to the limit of the device's memory and an estimate of its arithmetic (its
+/// roofline).
 ///
-/// Prints tables in Markdown. The streets are generated in memory and are the same on every machine up to
-/// rounding. Times of stages are device time, by the device's clock. Rows marked "host" are host time; the
-/// last of them, "unaccounted", is the rest of the step: copying pixels to memory that the host can read,
-/// mapping it, and waiting between submissions. So the rows add up to the step as its caller sees it. The
-/// peak rates of the device are measured in the same run, by a copy and by a loop of multiply-adds. The
-/// bytes that a stage must move are computed from the counts of the frame
-/// (`src/render/gpu/bandwidth.rs` has the formulas). The cpu backend draws the same step for comparison,
-/// and the first images of both are compared, so that a device that is fast but wrong is detected.
+/// Prints tables in Markdown. The streets are generated in memory and are the same on every machine
+/// up to rounding. Times of stages are device time, by the device's clock. Rows marked "host" are
+/// host time; the last of them, "unaccounted", is the rest of the step: copying pixels to memory
+/// that the host can read, mapping it, and waiting between submissions. So the rows add up to the
+/// step as its caller sees it. The peak rates of the device are measured in the same run, by a copy
+/// and by a loop of multiply-adds. The bytes that a stage must move are computed from the counts of
+/// the frame (`src/render/gpu/bandwidth.rs` has the formulas). The cpu backend draws the same step
+/// for comparison, and the first images of both are compared, so that a device that is fast but
+/// wrong is detected.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Gpu {
@@ -41,11 +43,13 @@ pub(super) struct Gpu {
     )]
     gaussians: Vec<u32>,
 
-    /// The device: its number in `wildcity devices`, or a part of its name. Default: the fastest kind.
+    /// The device: its number in `wildcity devices`, or a part of its name. Default: the fastest
+    /// kind.
     #[arg(long, value_name = "DEVICE")]
     device: Option<String>,
 
-    /// Frames to time. Before them, at least two frames, and frames for a second, are rendered and not timed.
+    /// Frames to time. Before them, at least two frames, and frames for a second, are rendered and
+    /// not timed.
     #[arg(long, default_value_t = 9, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     repeat: u32,
 
@@ -66,7 +70,8 @@ Examples:
 
 /// Untimed frames before the timed ones: the first one uploads the scene and allocates buffers.
 const WARM_UP: u32 = 2;
-/// Least time of the untimed frames: a graphics card that was idle needs hundreds of milliseconds to raise its clock.
+/// Least time of the untimed frames: a graphics card that was idle needs hundreds of milliseconds
+/// to raise its clock.
 const WARM_UP_TIME: Duration = Duration::from_secs(1);
 
 impl Gpu {
@@ -82,9 +87,10 @@ impl Gpu {
             report.scenes.push(scene.with_context(|| format!("{gaussians} Gaussians"))?);
         }
         let mut out = io::stdout().lock();
-        match self.json {
-            true => writeln!(out, "{}", serde_json::to_string(&report)?)?,
-            false => write!(out, "{report}")?,
+        if self.json {
+            writeln!(out, "{}", serde_json::to_string(&report)?)?
+        } else {
+            write!(out, "{report}")?
         }
         Ok(())
     }
@@ -143,7 +149,7 @@ impl Gpu {
 fn views() -> anyhow::Result<Vec<View>> {
     let rig = Rig::preset("vehicle6").context("the rig vehicle6 comes with the program")?;
     ensure!(!rig.cameras.is_empty(), "the rig vehicle6 has no cameras");
-    Ok(View::of_rig(&rig.cameras, Pose::IDENTITY))
+    Ok(View::from_rig(&rig.cameras, Pose::IDENTITY))
 }
 
 /// Device time, bytes, and rooflines of each stage; empty for a device without a clock.

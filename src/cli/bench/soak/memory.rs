@@ -1,9 +1,10 @@
 //! The memory of the process during a soak.
 //!
-//! A push takes memory for seconds. The maximum of a longer time therefore is higher, although nothing grows; the
-//! median of a window is not.
+//! A push takes memory for seconds. The maximum of a longer time therefore is higher, although
+//! nothing grows; the median of a window is not.
 
-/// Windows of equal length. The first ends when caches and pools are full, which in a soak of an hour is ten minutes.
+/// Windows of equal length. The first ends when caches and pools are full, which in a soak of an
+/// hour is ten minutes.
 const WINDOWS: usize = 6;
 
 /// Resident memory, in bytes, sample by sample.

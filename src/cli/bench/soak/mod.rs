@@ -23,14 +23,15 @@ use super::benched_twin::BenchedTwin;
 use super::memory::{mib, rss_bytes};
 use crate::cli::exit::Exit;
 
-/// Drive many sessions of small cameras against a server for minutes or hours, and check that memory does not grow and
-/// images do not change.
+/// Drive many sessions of small cameras against a server for minutes or hours, and check that
+/// memory does not grow and images do not change.
 ///
-/// The server runs in this process. The twin needs a recorded drive: each session drives the same stretch of the first
-/// one again and again, and compares the hash of every image with that of its first round. Prints the memory of the
-/// process every minute. The exit code is 1 if a request fails, a hash changes, or memory grows by more than --growth.
-/// Growth is the largest median of a later sixth of the time, compared with the median of the first sixth. With
-/// --memory-gib below what the twin needs, the server evicts and loads all the time.
+/// The server runs in this process. The twin needs a recorded drive: each session drives the same
+/// stretch of the first one again and again, and compares the hash of every image with that of its
+/// first round. Prints the memory of the process every minute. The exit code is 1 if a request
+/// fails, a hash changes, or memory grows by more than --growth. Growth is the largest median of a
+/// later sixth of the time, compared with the median of the first sixth. With --memory-gib below
+/// what the twin needs, the server evicts and loads all the time.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Soak {
@@ -49,8 +50,8 @@ pub(super) struct Soak {
     #[arg(long, value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     steps: u32,
 
-    /// Push new versions to a copy of the twin and collect garbage, send damaged requests, and open sessions that do not
-    /// read their images, all at the same time.
+    /// Push new versions to a copy of the twin and collect garbage, send damaged requests, and open
+    /// sessions that do not read their images, all at the same time.
     #[arg(long)]
     mixed: bool,
 
@@ -154,9 +155,10 @@ impl Soak {
             anyhow::Ok(total)
         };
         let others = async {
-            match self.mixed {
-                true => self.others(running, driving, scratch).await.map(Some),
-                false => Ok(None),
+            if self.mixed {
+                self.others(running, driving, scratch).await.map(Some)
+            } else {
+                Ok(None)
             }
         };
         let watched = self.watch(driving.until);

@@ -1,5 +1,5 @@
-//! The other load on a server in a mixed soak: pushes with garbage collection, damaged requests, and clients that do
-//! not read. None of it may disturb the agents.
+//! The other load on a server in a mixed soak: pushes with garbage collection, damaged requests,
+//! and clients that do not read. None of it may disturb the agents.
 
 use std::fs;
 use std::io;
@@ -36,7 +36,8 @@ const PUSHED: usize = 20_000;
 /// Versions that garbage collection keeps in addition to those in use.
 const KEPT: Retention = Retention { versions: 2, grace: Duration::from_secs(1) };
 
-/// Copies a twin into an empty directory of twins, so that pushes to it leave the user's own as it is.
+/// Copies a twin into an empty directory of twins, so that pushes to it leave the user's own as it
+/// is.
 pub(super) fn copy_twin(from: &Path, to: &Path, twin: &str) -> anyhow::Result<()> {
     let source = from.join(twin);
     anyhow::ensure!(
@@ -61,7 +62,8 @@ fn copy_directory(from: &Path, to: &Path) -> io::Result<()> {
     Ok(())
 }
 
-/// Pushes a scene to the twin again and again, each time a different one, and collects the garbage of earlier versions.
+/// Pushes a scene to the twin again and again, each time a different one, and collects the garbage
+/// of earlier versions.
 pub(super) struct Pusher {
     pub(super) url: String,
     pub(super) catalog: Catalog,
@@ -118,8 +120,8 @@ impl Pusher {
     }
 }
 
-/// A scene of grey points in a box of 20 m, in antimatter15's format: mean and scale as f32, then colour, opacity and
-/// rotation as u8.
+/// A scene of grey points in a box of 20 m, in antimatter15's format: mean and scale as f32, then
+/// colour, opacity and rotation as u8.
 fn splat(middle_m: DVec3, seed: u64) -> Vec<u8> {
     let mut random = Random::new(seed, "soak", 0);
     let mut bytes = Vec::with_capacity(32 * PUSHED);

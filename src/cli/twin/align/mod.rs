@@ -10,34 +10,39 @@ use anyhow::Context;
 use glam::DVec3;
 
 use wildcity_scene::Gaussians;
-use wildcity_scene::align::{Alignment, GroundPlane, GroundSearch, find_ground, scale_of};
+use wildcity_scene::align::{Alignment, GroundPlane, GroundSearch, find_ground, scale_from_points};
 use wildcity_twin::store::Edit;
 
 use super::change;
 use crate::cli::directories::{EditedTwin, Twins};
 use crate::cli::{output, progress};
 
-/// Put a capture on the ground: find the plane that the scene stands on, and make it level, at height 0, in metres.
+/// Put a capture on the ground: find the plane that the scene stands on, and make it level, at
+/// height 0, in metres.
 ///
-/// Without --apply nothing changes: the command prints the ground that it found, and draws the twin before and after,
-/// with the ground as a grid. Look at the picture, then run the command again with --apply: that makes a new version,
-/// with the drives and the sky of the old one in the new axes. The twin's place on the earth is dropped, because it
-/// belongs to the old axes. Open sessions keep the version that they have. The version records the change: `wildcity
-/// push --frame capture` pushes files that are still in the axes of the capture.
+/// Without --apply nothing changes: the command prints the ground that it found, and draws the twin
+/// before and after, with the ground as a grid. Look at the picture, then run the command again
+/// with --apply: that makes a new version, with the drives and the sky of the old one in the new
+/// axes. The twin's place on the earth is dropped, because it belongs to the old axes. Open
+/// sessions keep the version that they have. The version records the change:
+/// `wildcity push --frame capture` pushes files that are still in the axes of the capture.
 ///
-/// The ground is the plane with most of the scene on it and little of it below. The same twin gives the same plane.
-/// All Gaussians are in memory at once: 56 bytes each without SH, 236 with SH degree 3, and as much for the picture.
+/// The ground is the plane with most of the scene on it and little of it below. The same twin gives
+/// the same plane. All Gaussians are in memory at once: 56 bytes each without SH, 236 with SH
+/// degree 3, and as much for the picture.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(in crate::cli) struct Align {
     #[command(flatten)]
     edited: EditedTwin,
 
-    /// Direction that is up in the twin now, within 45 degrees: x, -x, y, -y, z, -z; auto tries all directions.
+    /// Direction that is up in the twin now, within 45 degrees: x, -x, y, -y, z, -z; auto tries all
+    /// directions.
     #[arg(long, value_name = "AXIS", default_value = "auto", allow_hyphen_values = true)]
     up: Up,
 
-    /// First of two points whose real distance is known, in the twin's axes and unit; see --to and --distance-m.
+    /// First of two points whose real distance is known, in the twin's axes and unit; see --to and
+    /// --distance-m.
     #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true, requires_all = ["to", "distance_m"])]
     from: Option<Point>,
 
@@ -53,8 +58,8 @@ pub(in crate::cli) struct Align {
     #[arg(long, value_name = "M", conflicts_with = "from")]
     scale: Option<f64>,
 
-    /// PNG file to write: the twin before in the upper row and after in the lower one; on the left a slice from the
-    /// side, on the right the view from above [default: TWIN-align.png]
+    /// PNG file to write: the twin before in the upper row and after in the lower one; on the left
+    /// a slice from the side, on the right the view from above [default: TWIN-align.png]
     #[arg(long, value_name = "FILE")]
     picture: Option<PathBuf>,
 
@@ -166,7 +171,8 @@ impl Align {
     fn metres_per_unit(&self) -> anyhow::Result<f64> {
         match (self.from, self.to, self.distance_m) {
             (Some(from), Some(to), Some(distance_m)) => {
-                Ok(scale_of([from.0, to.0], distance_m).context("--from, --to, --distance-m")?)
+                Ok(scale_from_points([from.0, to.0], distance_m)
+                    .context("--from, --to, --distance-m")?)
             }
             _ => {
                 let scale = self.scale.unwrap_or(1.0);

@@ -35,7 +35,8 @@ struct Extent {
     half: DVec3,
 }
 
-/// Draws the twin before and after, as a PNG. Also returns the distance of the grid's lines, in metres.
+/// Draws the twin before and after, as a PNG. Also returns the distance of the grid's lines, in
+/// metres.
 pub(super) fn before_and_after(
     gaussians: Gaussians,
     alignment: &Alignment,
@@ -48,7 +49,7 @@ pub(super) fn before_and_after(
     };
     let mut after = before.clone();
     alignment.apply(&mut after);
-    let aligned = Extent::of(&after);
+    let aligned = Extent::from_gaussians(&after);
     let step_m = grid_step(&aligned);
     let grid = grid(&aligned, step_m);
     let old = |at_m: DVec3| {
@@ -60,7 +61,7 @@ pub(super) fn before_and_after(
     let profile = RenderProfile { background: [0.05, 0.06, 0.07], reach_m: None, ..profile };
     let [width, height] = SIZE_PX;
     let mut all = RgbImage::new(2 * width + GAP_PX, 2 * height + GAP_PX);
-    let rows = [(&before, Extent::of(&before), &old_grid), (&after, aligned, &grid)];
+    let rows = [(&before, Extent::from_gaussians(&before), &old_grid), (&after, aligned, &grid)];
     for (row, (shown, extent, grid)) in rows.into_iter().enumerate() {
         for (column, is_side) in [true, false].into_iter().enumerate() {
             let picture = draw(shown, &extent, is_side, &profile, grid)?;
@@ -76,7 +77,7 @@ pub(super) fn before_and_after(
 
 impl Extent {
     /// The extent of all Gaussians but the outermost.
-    fn of(gaussians: &Gaussians) -> Self {
+    fn from_gaussians(gaussians: &Gaussians) -> Self {
         let ends = [0, 1, 2].map(|axis| {
             let mut values: Vec<f64> = gaussians.means_m.iter().map(|mean| mean[axis]).collect();
             let last = values.len().saturating_sub(1);
@@ -147,10 +148,8 @@ fn draw(
 fn view(extent: &Extent, is_side: bool) -> View {
     let Extent { middle, half } = *extent;
     let [width, height] = SIZE_PX.map(f64::from);
-    let [forward, down] = match is_side {
-        true => [DVec3::Y, DVec3::NEG_Z],
-        false => [DVec3::NEG_Z, DVec3::NEG_Y],
-    };
+    let [forward, down] =
+        if is_side { [DVec3::Y, DVec3::NEG_Z] } else { [DVec3::NEG_Z, DVec3::NEG_Y] };
     let across = half.x;
     let upwards = if is_side { half.z } else { half.y };
     let away = AWAY * half.max_element();

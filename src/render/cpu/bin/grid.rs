@@ -10,7 +10,6 @@ pub(in crate::cpu) struct Grid {
     pub(super) size_px: [u32; 2],
     /// Tiles per row.
     pub(in crate::cpu) columns: u32,
-    /// Rows of tiles.
     pub(in crate::cpu) rows: u32,
     /// Base-2 logarithm of a macro tile's width and height in tiles.
     pub(super) macro_bits: [u32; 2],
@@ -46,7 +45,7 @@ impl Grid {
     }
 
     /// The tiles of a macro tile: the number of each within it, its column and its row.
-    pub(in crate::cpu) fn tiles_of(
+    pub(in crate::cpu) fn macro_tile_tiles(
         &self,
         number: usize,
     ) -> impl Iterator<Item = (usize, [u32; 2])> {

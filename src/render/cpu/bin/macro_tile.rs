@@ -1,8 +1,9 @@
 //! Stage sort: the splats of one macro tile in order of depth, and the lists of its tiles.
 //!
-//! A thread has one macro tile at a time, with copies of its splats: they stay in the caches while its tiles are sorted
-//! and drawn. Read tile by tile from where they were projected, they came from memory about twice each, and
-//! `rasterize` waited for them during 40 % of its time on dense captures.
+//! A thread has one macro tile at a time, with copies of its splats: they stay in the caches while
+//! its tiles are sorted and drawn. Read tile by tile from where they were projected, they came from
+//! memory about twice each, and `rasterize` waited for them during 40 % of its time on dense
+//! captures.
 
 use crate::cpu::project::Projected;
 use crate::cpu::sort::sort_by_depth;
@@ -29,7 +30,8 @@ pub(in crate::cpu) struct MacroTile {
     pairs: Vec<Pair>,
     /// The splat of each pair; empty if there are too many.
     copies: Vec<Splat>,
-    /// Indices of pairs, tile after tile, from the nearest splat. Values after the last list are meaningless.
+    /// Indices of pairs, tile after tile, from the nearest splat. Values after the last list are
+    /// meaningless.
     instances: Vec<u32>,
     /// End of each tile's list in `instances`.
     ends: [u32; MACRO_TILE_TILES],
@@ -39,7 +41,8 @@ pub(in crate::cpu) struct MacroTile {
 }
 
 impl MacroTile {
-    /// Takes the splats of the macro tile `number` of a view, puts them in order of depth, and lists them by tile.
+    /// Takes the splats of the macro tile `number` of a view, puts them in order of depth, and
+    /// lists them by tile.
     #[inline(always)]
     pub(super) fn load(&mut self, number: usize, segments: &[Segment]) {
         let Self { pairs, copies, instances, ends, keys, other } = self;
@@ -47,13 +50,14 @@ impl MacroTile {
         copies.clear();
         keys.clear();
         for segment in segments {
-            pairs.extend_from_slice(segment.of(number));
+            pairs.extend_from_slice(segment.macro_tile(number));
         }
         keys.extend((0..).zip(&*pairs).map(|(index, pair)| u64::from(pair.depth) << 32 | index));
         sort_by_depth(keys, other);
 
-        // Count the splats of each tile, and turn the counts into places. Without branches on the bits, which are hard
-        // to predict: the compiler makes vector instructions of the inner loop.
+        // Count the splats of each tile, and turn the counts into places. Without branches on the
+        // bits, which are hard to predict: the compiler makes vector instructions of the inner
+        // loop.
         let mut counts = [0; MACRO_TILE_TILES];
         for pair in &*pairs {
             for (tile, count) in counts.iter_mut().enumerate() {

@@ -1,14 +1,15 @@
 //! Stages bin and sort: for every tile, the list of splats that can touch it, from the nearest.
 //!
-//! **Two levels.** Bin finds the macro tiles (up to 8 x 4 tiles) that each splat touches, and its tiles within each as a mask.
-//! It walks over the splats once, in the order in which they lie in memory. Sort takes one macro tile at a time, just
-//! before it is drawn: its splats are put in order of depth and distributed to its tiles while they stay in the cache of a core.
-//! Sorting each view as a whole instead, and reading its splats in that order, took twice the time on dense captures:
-//! nearly every read missed the caches.
+//! **Two levels.** Bin finds the macro tiles (up to 8 x 4 tiles) that each splat touches, and its
+//! tiles within each as a mask. It walks over the splats once, in the order in which they lie in
+//! memory. Sort takes one macro tile at a time, just before it is drawn: its splats are put in
+//! order of depth and distributed to its tiles while they stay in the cache of a core. Sorting each
+//! view as a whole instead, and reading its splats in that order, took twice the time on dense
+//! captures: nearly every read missed the caches.
 //!
-//! **The lists do not depend on the schedule.** The splats of a view are cut into segments that run in parallel. A macro tile
-//! takes its pairs from all segments in order, so that they are in order of global ids; and the order by (depth, index) is
-//! unique.
+//! **The lists do not depend on the schedule.** The splats of a view are cut into segments that run
+//! in parallel. A macro tile takes its pairs from all segments in order, so that they are in order
+//! of global ids; and the order by (depth, index) is unique.
 
 mod grid;
 mod macro_tile;
@@ -32,26 +33,25 @@ pub(super) use grid::Grid;
 pub(super) use macro_tile::{COPIES_BYTES, MacroTile};
 use segment::{Pair, Segment};
 
-/// Most bytes of pairs and instances: each pair once in its segment, and while its macro tile is drawn with two keys and
-/// again in a list of them.
-fn bytes_of(pairs: u64, instances: u64) -> u64 {
+/// Most bytes of pairs and instances: each pair once in its segment, and while its macro tile is
+/// drawn with two keys and again in a list of them.
+fn needed_bytes(pairs: u64, instances: u64) -> u64 {
     let of_pair = 2 * size_of::<Pair>() + 2 * size_of::<u64>();
     pairs * of_pair as u64 + instances * size_of::<u32>() as u64
 }
 
 /// Checks the number of (splat, tile) pairs.
 pub(super) fn check_instances(instances: u64) -> Result<(), RenderError> {
-    match instances > MAX_INSTANCES {
-        true => {
-            let what = "(Gaussian, tile) pairs";
-            Err(RenderError::TooMany { what, limit: MAX_INSTANCES })
-        }
-        false => Ok(()),
+    if instances > MAX_INSTANCES {
+        let what = "(Gaussian, tile) pairs";
+        Err(RenderError::TooMany { what, limit: MAX_INSTANCES })
+    } else {
+        Ok(())
     }
 }
 
-/// Least number of splats of a segment, unless its view has fewer: enough to outweigh its counters of a view's macro
-/// tiles.
+/// Least number of splats of a segment, unless its view has fewer: enough to outweigh its counters
+/// of a view's macro tiles.
 const SEGMENT: usize = 1 << 14;
 
 /// The splats of a frame by macro tile.
@@ -74,8 +74,8 @@ impl Bins {
     /// Stage bin: finds the macro tiles that each splat touches.
     ///
     /// # Errors
-    /// More than [`MAX_INSTANCES`] (splat, tile) pairs; or [`Overflow`], if the buffers of this part of the frame take
-    /// more than `most_bytes` from now on.
+    /// More than [`MAX_INSTANCES`] (splat, tile) pairs; or [`Overflow`], if the buffers of this
+    /// part of the frame take more than `most_bytes` from now on.
     pub(super) fn bin(
         &mut self,
         level: Level,
@@ -95,8 +95,9 @@ impl Bins {
         let scratches = &self.scratches;
         let segments = self.segments[..self.used_segments].par_iter_mut().with_max_len(1);
         segments.for_each(|segment| {
-            // Beyond either limit the rest is skipped: the part is drawn in smaller parts, or the frame fails.
-            let is_over = bytes_of(pairs.load(Relaxed), total.load(Relaxed)) > most_bytes;
+            // Beyond either limit the rest is skipped: the part is drawn in smaller parts, or the
+            // frame fails.
+            let is_over = needed_bytes(pairs.load(Relaxed), total.load(Relaxed)) > most_bytes;
             if is_over || total.load(Relaxed) > MAX_INSTANCES {
                 return;
             }
@@ -112,15 +113,15 @@ impl Bins {
         });
         self.instances = total.into_inner();
         self.pairs = pairs.into_inner();
-        if bytes_of(self.pairs, self.instances) > most_bytes {
+        if needed_bytes(self.pairs, self.instances) > most_bytes {
             return Err(Overflow.into());
         }
         check_instances(self.instances)?;
         Ok(())
     }
 
-    /// Frees the memory that segments and the threads' lists of pairs keep from earlier frames if it is more than
-    /// `most_bytes`: each may have been long in another frame.
+    /// Frees the memory that segments and the threads' lists of pairs keep from earlier frames if
+    /// it is more than `most_bytes`: each may have been long in another frame.
     pub(super) fn trim(&mut self, most_bytes: u64) {
         let of_segments: usize = self.segments.iter().map(Segment::held_bytes).sum();
         let scratches = self.scratches.get_mut();
@@ -134,20 +135,20 @@ impl Bins {
 
     /// Most bytes that a part of the frame holds until it is drawn.
     pub(super) fn held_bytes(&self, projected: &Projected) -> u64 {
-        (projected.places() * size_of::<Splat>()) as u64 + bytes_of(self.pairs, self.instances)
+        (projected.places() * size_of::<Splat>()) as u64 + needed_bytes(self.pairs, self.instances)
     }
 
     /// Stage sort of one macro tile: puts its splats in order of depth, and lists them by tile.
     #[inline(always)]
     pub(super) fn load(&self, view: usize, number: usize, tile: &mut MacroTile) {
-        tile.load(number, self.of_view(view));
+        tile.load(number, self.view_segments(view));
     }
 
-    /// The macro tiles of a view, those with the most instances first: the last ones are small, so that no thread waits
-    /// long for another.
+    /// The macro tiles of a view, those with the most instances first: the last ones are small, so
+    /// that no thread waits long for another.
     pub(super) fn by_work(&self, view: usize) -> Vec<usize> {
         let mut instances = vec![0_u64; self.grids[view].macro_tiles()];
-        for segment in self.of_view(view) {
+        for segment in self.view_segments(view) {
             for (instances, counts) in instances.iter_mut().zip(&segment.counts) {
                 *instances += u64::from(counts.instances);
             }
@@ -168,7 +169,7 @@ impl Bins {
     }
 
     /// The segments of a view.
-    fn of_view(&self, view: usize) -> &[Segment] {
+    fn view_segments(&self, view: usize) -> &[Segment] {
         let segments = &self.segments[..self.used_segments];
         let first = segments.partition_point(|segment| segment.view < view);
         let end = segments.partition_point(|segment| segment.view <= view);

@@ -16,7 +16,7 @@ pub(super) struct TileBox {
 impl TileBox {
     /// `None` if it touches no pixel's centre.
     #[inline(always)]
-    pub(super) fn of(splat: &Splat, grid: &Grid) -> Option<Self> {
+    pub(super) fn new(splat: &Splat, grid: &Grid) -> Option<Self> {
         let [x, y] = splat.mean_px;
         let [extent_x, extent_y] = splat.extent_px;
         let (left, right) = tiles(x, -extent_x, extent_x, grid.size_px[0])?;
@@ -25,15 +25,16 @@ impl TileBox {
     }
 }
 
-/// Calls `visit` with the first and last tile of every row of tiles that the ellipse `u² + v² <= power` touches, where
-/// `u = l0 dx + l1 dy` and `v = l2 dy` (see [`Splat`]) and power is `log2(opacity) - log2(alpha_cut)`: row, first
-/// column, last column.
+/// Calls `visit` with the first and last tile of every row of tiles that the ellipse
+/// `u² + v² <= power` touches, where `u = l0 dx + l1 dy` and `v = l2 dy` (see [`Splat`]) and power
+/// is `log2(opacity) - log2(alpha_cut)`: row, first column, last column.
 ///
-/// At the height dy the ellipse reaches to the right as far as `x(dy) = s dy + √(power - (l2 dy)²)/l0`, with
-/// `s = -l1/l0`. This is concave in dy, and its maximum over the whole ellipse lies at
-/// `dy* = s (power/l2²)/extent_x`. So its maximum over a band of rows lies at dy*, or at the end of the band
-/// that is nearest to dy*. The left edge is the mirror image. (Speedy-Splat, Hanson et al. 2025, finds the same
-/// set of tiles by following the ellipse's bounds.)
+/// At the height dy the ellipse reaches to the right as far as
+/// `x(dy) = s dy + √(power - (l2 dy)²)/l0`, with `s = -l1/l0`. This is concave in dy, and its
+/// maximum over the whole ellipse lies at `dy* = s (power/l2²)/extent_x`. So its maximum over a
+/// band of rows lies at dy*, or at the end of the band that is nearest to dy*. The left edge is the
+/// mirror image. (Speedy-Splat, Hanson et al. 2025, finds the same set of tiles by following the
+/// ellipse's bounds.)
 #[inline(always)]
 pub(super) fn for_each_row(
     splat: &Splat,
@@ -74,8 +75,8 @@ pub(super) fn for_each_row(
     }
 }
 
-/// First and last tile of a row or column of `size_px` pixels with a pixel's centre, at +0.5, between `center + low` and
-/// `center + high`; `None` if there is no such pixel.
+/// First and last tile of a row or column of `size_px` pixels with a pixel's centre, at +0.5,
+/// between `center + low` and `center + high`; `None` if there is no such pixel.
 #[inline(always)]
 fn tiles(center: f32, low: f32, high: f32, size_px: u32) -> Option<(u32, u32)> {
     let last_px = (size_px - 1) as f32;
@@ -87,8 +88,8 @@ fn tiles(center: f32, low: f32, high: f32, size_px: u32) -> Option<(u32, u32)> {
     (first <= last).then(|| (whole(first) / TILE_PX, whole(last) / TILE_PX))
 }
 
-/// A whole number from 0 to 2^23 - 1 as an integer: 2^23 + n has the bits of n as its mantissa. A conversion takes six
-/// instructions, since it handles all other numbers as well.
+/// A whole number from 0 to 2^23 - 1 as an integer: 2^23 + n has the bits of n as its mantissa. A
+/// conversion takes six instructions, since it handles all other numbers as well.
 #[inline(always)]
 fn whole(value: f32) -> u32 {
     (value + 8_388_608.0).to_bits() & 0x7F_FFFF

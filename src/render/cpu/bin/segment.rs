@@ -55,13 +55,14 @@ impl Segment {
         let units = &projected.units()[self.units.clone()];
         let mut instances = 0;
         for (first_place, splats) in units.iter().flat_map(|unit| projected.pages(unit)) {
-            // Beyond the limit the frame fails. A pair has at least one instance, so this bounds the memory, too.
+            // Beyond the limit the frame fails. A pair has at least one instance, so this bounds
+            // the memory, too.
             if instances > MAX_INSTANCES {
                 return;
             }
             for (place, splat) in (first_place..).zip(splats) {
                 let pair = Pair { depth: cutoffs.sort_key(0, splat.depth_m), place, tiles: 0 };
-                if let Some(area) = TileBox::of(splat, grid) {
+                if let Some(area) = TileBox::new(splat, grid) {
                     let added = self.add(splat, &area, grid, cutoffs.log2_alpha_cut, pair, pairs);
                     instances += u64::from(added);
                 }
@@ -144,7 +145,7 @@ impl Segment {
                     let number = macro_row * macro_columns + column;
                     let counts = &mut self.counts[number as usize];
                     counts.instances += high - low + 1;
-                    match of_macro_tile(&mut pairs[row_start..], number) {
+                    match find_macro_tile(&mut pairs[row_start..], number) {
                         Some(pair) => pair.tiles |= tiles,
                         None => {
                             pairs.push((number, Pair { tiles, ..pair }));
@@ -179,7 +180,7 @@ impl Segment {
     }
 
     /// The pairs of a macro tile.
-    pub(super) fn of(&self, number: usize) -> &[Pair] {
+    pub(super) fn macro_tile(&self, number: usize) -> &[Pair] {
         let end_before = number.checked_sub(1).map_or(0, |before| self.counts[before].pairs);
         &self.pairs[end_before as usize..self.counts[number].pairs as usize]
     }
@@ -192,7 +193,7 @@ fn tiles_of_line(low: u32, high: u32) -> u32 {
 }
 /// The pair of a macro tile among those of one splat and one row of macro tiles.
 #[inline(always)]
-fn of_macro_tile(pairs: &mut [(u32, Pair)], number: u32) -> Option<&mut Pair> {
+fn find_macro_tile(pairs: &mut [(u32, Pair)], number: u32) -> Option<&mut Pair> {
     // They are nearly always consecutive, from the left.
     let (first, _) = pairs.first()?;
     let guess = number.wrapping_sub(*first) as usize;

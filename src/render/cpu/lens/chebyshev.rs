@@ -1,30 +1,31 @@
 //! Smooth functions as short series.
 //!
-//! A series is chosen by its Chebyshev terms, whose sizes bound the remainder, and evaluated by powers: half the
-//! operations, in two independent chains. The functions here are smooth beyond the ends of
-//! their range, so that the coefficients of the powers fall, too, and nothing cancels.
+//! A series is chosen by its Chebyshev terms, whose sizes bound the remainder, and evaluated by
+//! powers: half the operations, in two independent chains. The functions here are smooth beyond the
+//! ends of their range, so that the coefficients of the powers fall, too, and nothing cancels.
 
 use fearless_simd::{f32x16, prelude::*};
 
 /// Nodes at which a function is sampled.
 const NODES: usize = 32;
 
-/// Most terms of a series. Real lenses need 8 to 14, and a fisheye with an image up to 100° off the axis 18
-/// to 22.
+/// Most terms of a series. Real lenses need 8 to 14, and a fisheye with an image up to 100° off the
+/// axis 18 to 22.
 const MAX_TERMS: usize = 24;
 
 /// `f(x)/x` from 0 to a limit, as a polynomial of `v = 2x/limit - 1`, which runs from -1 to 1.
 #[derive(Clone, Debug)]
 pub(super) struct ChebyshevSeries {
-    /// Coefficients of an even power and of the odd one above it, from the highest powers to the lowest.
+    /// Coefficients of an even power and of the odd one above it, from the highest powers to the
+    /// lowest.
     pairs: Vec<[f32; 2]>,
     /// `2/limit`.
     v_per_x: f32,
 }
 
 impl ChebyshevSeries {
-    /// The fewest terms with a remainder that changes f by less than `max_error`; `None` if that takes more
-    /// than [`MAX_TERMS`].
+    /// The fewest terms with a remainder that changes f by less than `max_error`; `None` if that
+    /// takes more than [`MAX_TERMS`].
     pub(super) fn fit(limit: f64, max_error: f64, f: &dyn Fn(f64) -> f64) -> Option<Self> {
         // Sample at the Chebyshev nodes, and take the discrete cosine transform.
         let node = |j: usize| std::f64::consts::PI * (j as f64 + 0.5) / NODES as f64;
@@ -40,7 +41,8 @@ impl ChebyshevSeries {
         };
         let mut terms: Vec<f64> = (0..NODES).map(term).collect();
 
-        // Drop terms from the end while their sum of magnitudes, times x <= limit, stays below the bound.
+        // Drop terms from the end while their sum of magnitudes, times x <= limit, stays below the
+        // bound.
         let mut dropped = 0.0;
         while let Some(last) = terms.last() {
             dropped += last.abs() * limit;
@@ -52,7 +54,7 @@ impl ChebyshevSeries {
         }
         let usable = (1..=MAX_TERMS).contains(&terms.len()) && dropped.is_finite();
         usable.then(|| {
-            let powers = powers_of(&terms);
+            let powers = power_series(&terms);
             let odd = |even: usize| powers.get(even + 1).map_or(0.0, |&odd| odd as f32);
             let evens = (0..powers.len()).step_by(2).rev();
             let pairs = evens.map(|even| [powers[even] as f32, odd(even)]).collect();
@@ -76,9 +78,9 @@ impl ChebyshevSeries {
     }
 }
 
-/// The coefficients of the powers, from degree 0, of a sum of Chebyshev polynomials: `T₀ = 1`, `T₁ = v` and
-/// `Tₖ₊₁ = 2 v Tₖ - Tₖ₋₁`.
-fn powers_of(terms: &[f64]) -> Vec<f64> {
+/// The coefficients of the powers, from degree 0, of a sum of Chebyshev polynomials: `T₀ = 1`,
+/// `T₁ = v` and `Tₖ₊₁ = 2 v Tₖ - Tₖ₋₁`.
+fn power_series(terms: &[f64]) -> Vec<f64> {
     let count = terms.len();
     let mut sum = vec![0.0; count];
     let mut before = vec![0.0; count];

@@ -1,18 +1,20 @@
-//! Projection around a point to second order: the result of the six points of the unscented transform for a small
-//! Gaussian, without projecting the points.
+//! Projection around a point to second order: the result of the six points of the unscented
+//! transform for a small Gaussian, without projecting the points.
 //!
-//! Let a displacement of a point at distance d be `d (a, b, c)`: a away from the lens' axis, b around it, c along
-//! the ray. With the point's angle θ off the axis and the lens' radius r(θ), the image moves by
+//! Let a displacement of a point at distance d be `d (a, b, c)`: a away from the lens' axis, b
+//! around it, c along the ray. With the point's angle θ off the axis and the lens' radius r(θ), the
+//! image moves by
 //!
 //! ```text
 //! away from the axis:  α a - α a c + γ a²/2 + κ b²/2      α = r′, β = r/sin θ, γ = r″
 //! around the axis:     β b - β b c + μ a b                κ = (α cos θ - β)/sin θ, μ = (α - β cos θ)/sin θ
 //! ```
 //!
-//! up to terms of third order. A lens of slopes X = x/z, Y = y/z has the same form with α = β = 1 and the rest 0,
-//! for `a = (δx - X δz)/z`, `b = (δy - Y δz)/z` and `c = δz/z`; the distortion's Jacobian leads from there to
-//! pixels. A windshield and a shutter change the map from a displacement to (a, b, c), and nothing else to first order.
-//! [`crate::unscented::ExpansionBound`] bounds the terms that are left out.
+//! up to terms of third order. A lens of slopes X = x/z, Y = y/z has the same form with α = β = 1
+//! and the rest 0, for `a = (δx - X δz)/z`, `b = (δy - Y δz)/z` and `c = δz/z`; the distortion's
+//! Jacobian leads from there to pixels. A windshield and a shutter change the map from a
+//! displacement to (a, b, c), and nothing else to first order. [`crate::unscented::ExpansionBound`]
+//! bounds the terms that are left out.
 
 use fearless_simd::{f32x16, prelude::*};
 
@@ -28,7 +30,8 @@ pub(in crate::cpu) struct Px<S: Simd> {
 
 /// The projection around 16 points.
 pub(in crate::cpu) struct Expansion<S: Simd> {
-    /// Rows that take a displacement in the camera's frame at the moment of exposure, in metres, to (a, b, c).
+    /// Rows that take a displacement in the camera's frame at the moment of exposure, in metres, to
+    /// (a, b, c).
     rows: [Vec3x16<S>; 3],
     alpha: f32x16<S>,
     beta: f32x16<S>,
@@ -42,8 +45,8 @@ pub(in crate::cpu) struct Expansion<S: Simd> {
     shutter: Option<ShutterTerms<S>>,
 }
 
-/// The rolling shutter around a point: the exposure time depends on the image position, and the image position depends
-/// on the exposure time.
+/// The rolling shutter around a point: the exposure time depends on the image position, and the
+/// image position depends on the exposure time.
 struct ShutterTerms<S: Simd> {
     /// (a, b, c) of a point per unit of the remaining exposure.
     motion: Vec3x16<S>,
@@ -53,8 +56,8 @@ struct ShutterTerms<S: Simd> {
     per_px: Px<S>,
     /// `1/(1 - per_px · motion_px)`.
     gain: f32x16<S>,
-    /// 1 where the exposure time changes with the image position; 0 beyond the first and the last row, where it is
-    /// clamped.
+    /// 1 where the exposure time changes with the image position; 0 beyond the first and the last
+    /// row, where it is clamped.
     rolls: f32x16<S>,
     /// Distance of the remaining exposure from 0 or 1, where its change begins or ends.
     to_limit: f32x16<S>,
@@ -64,7 +67,8 @@ struct ShutterTerms<S: Simd> {
 
 /// The image of a Gaussian's axes.
 pub(in crate::cpu) struct ExpandedAxes<S: Simd> {
-    /// Columns of a root of the covariance, in pixels: of the axes, then of the terms of second order.
+    /// Columns of a root of the covariance, in pixels: of the axes, then of the terms of second
+    /// order.
     pub(in crate::cpu) columns: [Px<S>; 6],
     /// From the image of the centre to the mean of the six points.
     pub(in crate::cpu) mean_shift: Px<S>,
@@ -98,8 +102,9 @@ impl<S: Simd> Px<S> {
 }
 
 impl LensProjection {
-    /// The expansion around points of the camera's frame at the moment of their exposure ([`Self::at_exposure`]);
-    /// `None` for a lens that no short series describes. Lanes with a negative margin are meaningless.
+    /// The expansion around points of the camera's frame at the moment of their exposure
+    /// ([`Self::at_exposure`]); `None` for a lens that no short series describes. Lanes with a
+    /// negative margin are meaningless.
     #[inline(always)]
     pub(in crate::cpu) fn expand<S: Simd>(
         &self,
@@ -147,8 +152,9 @@ impl LensProjection {
         let inside = refraction.inside;
         let mut expansion = self.expand_lens(simd, inside.scale(distance_m), per_sin)?;
         expansion.room = expansion.room.min(refraction.margin);
-        // A displacement v becomes inside (unit · v) + by_x (x̂ - x unit) · v + by_y (ŷ - y unit) · v, where x̂ and ŷ
-        // are the camera's axes. So each row has a part along the ray, and one along x̂ and ŷ.
+        // A displacement v becomes inside (unit · v) + by_x (x̂ - x unit) · v + by_y (ŷ - y unit) ·
+        // v, where x̂ and ŷ are the camera's axes. So each row has a part along the ray, and one
+        // along x̂ and ŷ.
         for row in &mut expansion.rows {
             let along_x = row.dot(refraction.by_x);
             let along_y = row.dot(refraction.by_y);
@@ -205,8 +211,8 @@ impl LensProjection {
                     gamma = within.select(gamma, zero);
                     room = within.select(room, tangent.past_begin_rad(simd, t));
                 }
-                // Below 1e-3 rad off the axis the numerators are of second order and consist of rounding errors only,
-                // so the divisor is clamped.
+                // Below 1e-3 rad off the axis the numerators are of second order and consist of
+                // rounding errors only, so the divisor is clamped.
                 let per_sin = one / sin.max(splat(1e-3));
                 let kappa = (alpha * cos - beta) * per_sin;
                 let mu = (alpha - beta * cos) * per_sin;
@@ -247,7 +253,7 @@ impl LensProjection {
                 let room = splat(max_slope2.sqrt()) - x.mul_add(x, y * y).sqrt();
                 let room = in_front.select(room, splat(-1.0));
                 let plane = [[fx, zero], [zero, fy]];
-                Some(Expansion::of_slopes(simd, [x, y], inverse, plane, room))
+                Some(Expansion::from_slopes(simd, [x, y], inverse, plane, room))
             }
             Model::Slopes { focal_px, k, p, s, max_slope2 } => {
                 let inverse = one / z;
@@ -280,17 +286,17 @@ impl LensProjection {
                     [fy * (across + twice(prism_y * x)), fy * (along_y + twice(prism_y * y))],
                 ];
                 let room = splat(max_slope2.sqrt()) - r2.sqrt();
-                Some(Expansion::of_slopes(simd, [x, y], inverse, plane, room))
+                Some(Expansion::from_slopes(simd, [x, y], inverse, plane, room))
             }
         }
     }
 }
 
 impl<S: Simd> Expansion<S> {
-    /// The expansion of a lens of slopes x and y, around points at a depth of 1/`inverse`. `plane` leads from slopes to
-    /// pixels.
+    /// The expansion of a lens of slopes x and y, around points at a depth of 1/`inverse`. `plane`
+    /// leads from slopes to pixels.
     #[inline(always)]
-    fn of_slopes(
+    fn from_slopes(
         simd: S,
         [x, y]: [f32x16<S>; 2],
         inverse: f32x16<S>,
@@ -317,8 +323,8 @@ impl<S: Simd> Expansion<S> {
         }
     }
 
-    /// The image of a Gaussian's axes, times their standard deviations, in metres, in the camera's frame at the moment of
-    /// exposure.
+    /// The image of a Gaussian's axes, times their standard deviations, in metres, in the camera's
+    /// frame at the moment of exposure.
     #[inline(always)]
     pub(in crate::cpu) fn axes(&self, simd: S, axes_m: [Vec3x16<S>; 3]) -> ExpandedAxes<S> {
         let zero = f32x16::splat(simd, 0.0);
@@ -347,8 +353,8 @@ impl<S: Simd> Expansion<S> {
             square += length2;
             longest2 = longest2.max(length2);
         }
-        // The middle of a pair of points is offset from the centre's image by 3 times its axis' terms. Its distance
-        // from the mean, over √3, is a column of the root.
+        // The middle of a pair of points is offset from the centre's image by 3 times its axis'
+        // terms. Its distance from the mean, over √3, is a column of the root.
         let root_3 = f32x16::splat(simd, 3.0_f32.sqrt());
         let per_root_3 = f32x16::splat(simd, 3.0_f32.sqrt().recip());
         for bend in &mut columns[3..] {
@@ -359,8 +365,8 @@ impl<S: Simd> Expansion<S> {
         let mut shutter_px = zero;
         if let Some(terms) = &self.shutter {
             let ShutterTerms { motion_px, to_limit, rotation_rad, .. } = terms;
-            // The camera's rotation between two moments, and the ends of the exposure, where the change of the
-            // moment stops: a point beyond them is off by the motion since then.
+            // The camera's rotation between two moments, and the ends of the exposure, where the
+            // change of the moment stops: a point beyond them is off by the motion since then.
             let px_per_rad = self.alpha.abs().max(self.beta.abs()) * self.plane_scale();
             shutter_px = px_per_rad * longest * *rotation_rad * most_moment;
             let points = f32x16::splat(simd, 3.0_f32.sqrt()) * most_moment;

@@ -1,15 +1,17 @@
 //! Lenses and rolling shutters, 16 points at a time in f32, within the lens' field.
 //!
-//! **Lenses that are round about their axis (fisheye, f-theta) are two series.** With `t = tan(θ/2) = |(x, y)|/(|p| +
-//! z)` the angle θ needs a square root instead of an arc tangent, and the image radius r(θ) divided by t is a smooth
-//! function of t, whichever way a calibration's polynomial leads. 8 to 14 terms approximate it within
-//! [`MAX_SERIES_ERROR_PX`], and as many lead back from a pixel to its ray ([`LensRays`]); the number of terms is
-//! chosen when a lens is prepared. The results are within 8e-4 px of f64, also with a rolling shutter ([`search`]).
-//! With Newton's method instead, a step of a real six-camera rig spent four fifths of its time in it.
+//! **Lenses that are round about their axis (fisheye, f-theta) are two series.** With
+//! `t = tan(θ/2) = |(x, y)|/(|p| + z)` the angle θ needs a square root instead of an arc tangent,
+//! and the image radius r(θ) divided by t is a smooth function of t, whichever way a calibration's
+//! polynomial leads. 8 to 14 terms approximate it within [`MAX_SERIES_ERROR_PX`], and as many lead
+//! back from a pixel to its ray ([`LensRays`]); the number of terms is chosen when a lens is
+//! prepared. The results are within 8e-4 px of f64, also with a rolling shutter ([`search`]). With
+//! Newton's method instead, a step of a real six-camera rig spent four fifths of its time in it.
 //!
-//! Beyond the field, round lenses and pinholes are continued by a line in the angle ([`tangent`]), as in f64. Three
-//! kinds of points are left to the f64 path ([`crate::unscented`]), one by one: those beyond the field of other
-//! lenses, those for which the search finds no row, and those of cameras that this module does not describe.
+//! Beyond the field, round lenses and pinholes are continued by a line in the angle ([`tangent`]),
+//! as in f64. Three kinds of points are left to the f64 path ([`crate::unscented`]), one by one:
+//! those beyond the field of other lenses, those for which the search finds no row, and those of
+//! cameras that this module does not describe.
 
 mod chebyshev;
 mod expansion;
@@ -34,7 +36,8 @@ use shutter::SimdShutter;
 use tangent::Tangent;
 use windshield::{Refracted, SimdWindshield};
 
-/// Largest error of a series, in pixels: a tenth of the resolution of f32 away from the middle of an image.
+/// Largest error of a series, in pixels: a tenth of the resolution of f32 away from the middle of
+/// an image.
 const MAX_SERIES_ERROR_PX: f64 = 1e-5;
 
 /// The projection of a view that is not a static pinhole, ready for many points.
@@ -66,9 +69,7 @@ enum Model {
 /// Derivatives of the radius r(θ) of a round lens, as series in t.
 #[derive(Clone, Debug)]
 struct RoundDerivatives {
-    /// r′(θ).
     slope: ChebyshevSeries,
-    /// r″(θ).
     curvature: ChebyshevSeries,
 }
 
@@ -77,9 +78,11 @@ struct RoundDerivatives {
 pub(super) struct LensPixels<S: Simd> {
     pub(super) x_px: f32x16<S>,
     pub(super) y_px: f32x16<S>,
-    /// Not below 0 where the pixels are those of the point: within the field, or where the lens is continued.
+    /// Not below 0 where the pixels are those of the point: within the field, or where the lens is
+    /// continued.
     pub(super) margin: f32x16<S>,
-    /// For round lenses: the distance from the principal point divided by the sine of the angle off the axis.
+    /// For round lenses: the distance from the principal point divided by the sine of the angle off
+    /// the axis.
     per_sin: f32x16<S>,
 }
 
@@ -97,8 +100,8 @@ impl LensProjection {
             Some(windshield) => Some(SimdWindshield::new(windshield)?),
         };
         let focal_px = [pinhole.fx as f32, pinhole.fy as f32];
-        // The series covers a little more than the image, so that most Gaussians that reach into the image
-        // have all six points within it.
+        // The series covers a little more than the image, so that most Gaussians that reach into
+        // the image have all six points within it.
         let max_rad = || view.camera.limit_rad().min(1.25 * max_seen_rad(&view.camera) + 0.1);
         let model = match lens {
             // A pinhole behind a windshield or in motion: slopes without a distortion.
@@ -151,7 +154,8 @@ impl LensProjection {
         Some(Self { shutter, ..self.clone() })
     }
 
-    /// Points of the camera's frame at the end of the exposure, in its frame while a fraction remains, in metres.
+    /// Points of the camera's frame at the end of the exposure, in its frame while a fraction
+    /// remains, in metres.
     #[inline(always)]
     pub(super) fn at_exposure<S: Simd>(
         &self,
@@ -225,7 +229,8 @@ impl LensProjection {
                 let mut x_slope = x * inverse;
                 let mut y_slope = y * inverse;
                 let slope2 = x_slope.mul_add(x_slope, y_slope * y_slope);
-                // Points behind the camera are not within, and neither is a NaN (a point in the camera plane).
+                // Points behind the camera are not within, and neither is a NaN (a point in the
+                // camera plane).
                 let within = z.simd_gt(splat(0.0)) & slope2.simd_le(splat(*max_slope2));
                 let mut margin = within.select(splat(0.0), splat(-1.0));
                 if !within.all_true() {
@@ -269,7 +274,8 @@ impl LensProjection {
                 LensPixels {
                     x_px: (x.mul_add(radial, tangential_x) + prism_x).mul_add(fx, cx),
                     y_px: (y.mul_add(radial, tangential_y) + prism_y).mul_add(fy, cy),
-                    // Points behind the camera are outside, and so is a NaN (a point in the camera plane).
+                    // Points behind the camera are outside, and so is a NaN (a point in the camera
+                    // plane).
                     margin: z.simd_gt(splat(0.0)).select(splat(*max_slope2) - r2, splat(-1.0)),
                     per_sin: splat(0.0),
                 }
@@ -282,8 +288,8 @@ impl LensProjection {
 const INSIDE: f32 = 1.0 - 1e-5;
 
 impl Model {
-    /// A lens by its radius at an angle, up to a largest angle: the series of `r(2 atan t)/t`, within `max_error` of
-    /// the radius. The lens' field ends at `limit_rad`.
+    /// A lens by its radius at an angle, up to a largest angle: the series of `r(2 atan t)/t`,
+    /// within `max_error` of the radius. The lens' field ends at `limit_rad`.
     fn round(
         max_rad: f64,
         limit_rad: f64,
@@ -304,7 +310,8 @@ impl Model {
 }
 
 impl RoundDerivatives {
-    /// Largest error of the slope, as a share of the slope at the axis. It is a relative error of the size of a splat.
+    /// Largest error of the slope, as a share of the slope at the axis. It is a relative error of
+    /// the size of a splat.
     const SLOPE_ERROR: f64 = 1e-5;
 
     /// Largest error of the curvature, which only moves the mean of a splat by a pixel or so.
@@ -327,8 +334,8 @@ impl RoundDerivatives {
     }
 }
 
-/// `r′` of a radius at an angle, by a central difference within the field. Series are sampled at angles that are
-/// farther than the difference from the field's ends.
+/// `r′` of a radius at an angle, by a central difference within the field. Series are sampled at
+/// angles that are farther than the difference from the field's ends.
 fn round_slope(radius: &dyn Fn(f64) -> f64, max_rad: f64, rad: f64) -> f64 {
     let h = 1e-4;
     let rad = rad.clamp(h, max_rad - h);
@@ -342,8 +349,8 @@ fn round_curvature(radius: &dyn Fn(f64) -> f64, max_rad: f64, rad: f64) -> f64 {
     (radius(rad + h) - 2.0 * radius(rad) + radius(rad - h)) / (h * h)
 }
 
-/// The largest angle off the axis that the image shows, behind the windshield, in radians. The field may be
-/// far wider, and a wider range takes more terms.
+/// The largest angle off the axis that the image shows, behind the windshield, in radians. The
+/// field may be far wider, and a wider range takes more terms.
 fn max_seen_rad(camera: &Camera) -> f64 {
     camera.corner_rad().min(camera.limit_rad())
 }
@@ -358,8 +365,9 @@ mod tests {
     use wildcity_scene::geometry::Pose;
     use wildcity_scene::geometry::camera::{Fisheye, OpenCv, Pinhole, ShutterDirection};
 
-    /// The cameras of two real rigs (one is behind a windshield) and one camera of each other model, each
-    /// with its name and the number of 4,000 directions up to the end of its field that must be found within it.
+    /// The cameras of two real rigs (one is behind a windshield) and one camera of each other
+    /// model, each with its name and the number of 4,000 directions up to the end of its field that
+    /// must be found within it.
     fn cameras() -> Vec<(String, Camera, usize)> {
         let rigs = ["alpamayo1", "alpamayo2"].map(|rig| Rig::preset(rig).unwrap());
         let real = rigs.into_iter().flat_map(|rig| rig.cameras);
@@ -382,7 +390,8 @@ mod tests {
         cameras
     }
 
-    /// A camera that is rotated in the world: at rest, and moving by 0.9 m and 0.01 rad during the exposure.
+    /// A camera that is rotated in the world: at rest, and moving by 0.9 m and 0.01 rad during the
+    /// exposure.
     fn views(camera: Camera) -> [View; 2] {
         let pose = Pose { rotation: DQuat::from_rotation_x(0.7), ..Pose::IDENTITY };
         let at_rest = View::new(camera, pose);
@@ -433,7 +442,8 @@ mod tests {
         assert!(max_error_rad < 2e-6, "{max_error_rad:e} rad");
     }
 
-    /// Points on a spiral from the axis to far beyond the end of the field, and points at 0.9 m from them.
+    /// Points on a spiral from the axis to far beyond the end of the field, and points at 0.9 m
+    /// from them.
     #[test]
     fn projected_points_match_f64() {
         for (name, camera, least_inside) in cameras() {
@@ -482,8 +492,9 @@ mod tests {
                 assert!(inside > least_inside, "{name}: {inside}");
                 let is_bare = camera.windshield.is_none();
                 let is_continued = is_bare && matches!(camera.lens, Lens::FTheta(_));
-                // 999 points are beyond the field at the end of the exposure. When they are exposed, a camera that
-                // drives towards them may have them within its field: 100 of them with a telephoto lens.
+                // 999 points are beyond the field at the end of the exposure. When they are
+                // exposed, a camera that drives towards them may have them within its field: 100 of
+                // them with a telephoto lens.
                 assert!(beyond > 900 || !is_continued, "{name}: {beyond} beyond its field");
                 eprintln!("{name}: {max_error_px:.1e} px");
                 // Behind a windshield and far beyond the image 2.0e-3 px were measured.

@@ -20,12 +20,13 @@ const MAX_TANGENT_ERROR: f64 = 5e-8;
 pub(in crate::cpu) struct LensRays {
     shutter: Option<SimdShutter>,
     windshield: Option<SimdWindshield>,
-    /// Rows that take `(x, y, 1)` in pixels to round coordinates, which are slopes for a pinhole, and
-    /// otherwise pixels or focal lengths from the axis.
+    /// Rows that take `(x, y, 1)` in pixels to round coordinates, which are slopes for a pinhole,
+    /// and otherwise pixels or focal lengths from the axis.
     round_from_px: [[f32; 3]; 2],
     /// `None` for a pinhole.
     round: Option<RoundLens>,
-    /// Rows that take directions in the camera's frame at the end of the exposure to the requested axes.
+    /// Rows that take directions in the camera's frame at the end of the exposure to the requested
+    /// axes.
     axes_from_camera: [[f32; 3]; 3],
 }
 
@@ -34,13 +35,12 @@ pub(in crate::cpu) struct LensRays {
 struct RoundLens {
     /// `tan(θ/2)/ρ` by the distance ρ in round coordinates.
     series: ChebyshevSeries,
-    /// The largest ρ.
     max_radius: f32,
 }
 
 impl LensRays {
-    /// `None` for OpenCV's polynomials of slopes, for cameras that [`super::LensProjection`] does not describe, and
-    /// for a windshield with a refraction that fades within the image.
+    /// `None` for OpenCV's polynomials of slopes, for cameras that [`super::LensProjection`] does
+    /// not describe, and for a windshield with a refraction that fades within the image.
     pub(in crate::cpu) fn new(view: &View, axes_from_world: DMat3) -> Option<Self> {
         let Camera { pinhole, lens, windshield, .. } = &view.camera;
         let shutter = match view.shutter_motion() {
@@ -84,8 +84,8 @@ impl LensRays {
         })
     }
 
-    /// Viewing directions, of any length, of places of the image in pixels. Beyond the lens' field they are
-    /// arbitrary.
+    /// Viewing directions, of any length, of places of the image in pixels. Beyond the lens' field
+    /// they are arbitrary.
     #[inline(always)]
     pub(in crate::cpu) fn directions<S: Simd>(
         &self,

@@ -1,16 +1,17 @@
 //! The search for the moment at which a rolling shutter exposes a point, 16 points at a time.
 //!
-//! The image row decides when a point is exposed, that decides where the camera is, and that decides the row. In
-//! terms of the fraction r of the exposure that remains, the row's fraction minus r is 0 at the moment that is
-//! sought. The secant method finds it. Where there is no secant yet, or it is not that of a slow motion over the
-//! image, the slope is that of a point at rest on the image or of the centre. The row's fraction is not clamped to
-//! the exposure, so that it is smooth; r is.
+//! The image row decides when a point is exposed, that decides where the camera is, and that
+//! decides the row. In terms of the fraction r of the exposure that remains, the row's fraction
+//! minus r is 0 at the moment that is sought. The secant method finds it. Where there is no secant
+//! yet, or it is not that of a slow motion over the image, the slope is that of a point at rest on
+//! the image or of the centre. The row's fraction is not clamped to the exposure, so that it is
+//! smooth; r is.
 //!
-//! **The last step is taken on the image.** With two places on the image at two moments, the place at a third one is
-//! that of the line through both. On a path that turns by a share a of itself in the whole exposure, the line is off
-//! by at most a times the movement between the two times the remaining step. Where that is below [`MAX_ERROR_PX`],
-//! the lens is not applied again. The search for a point begins at the moment of its Gaussian's centre, with the
-//! centre's slope.
+//! **The last step is taken on the image.** With two places on the image at two moments, the place
+//! at a third one is that of the line through both. On a path that turns by a share a of itself in
+//! the whole exposure, the line is off by at most a times the movement between the two times the
+//! remaining step. Where that is below [`MAX_ERROR_PX`], the lens is not applied again. The search
+//! for a point begins at the moment of its Gaussian's centre, with the centre's slope.
 
 use fearless_simd::{f32x16, mask32x16, prelude::*};
 
@@ -67,8 +68,8 @@ impl<S: Simd> Moment<S> {
 impl LensProjection {
     /// Projects points of the camera's frame at the end of the exposure, at a distance in metres.
     ///
-    /// A point for which the search does not converge, or that is not within the field, has a negative margin. The
-    /// search does not wait for points that are not `wanted`.
+    /// A point for which the search does not converge, or that is not within the field, has a
+    /// negative margin. The search does not wait for points that are not `wanted`.
     #[inline(always)]
     pub(in crate::cpu) fn project<S: Simd>(
         &self,
@@ -85,9 +86,9 @@ impl LensProjection {
         self.search(simd, shutter, at_end_m, &end, wanted)
     }
 
-    /// Projects points near others that are exposed at `moment`, given in the camera's frame at that moment. As
-    /// [`Self::project`]. It is not inlined: few Gaussians need it, and inlining takes the compiler a fifth of this
-    /// package's time.
+    /// Projects points near others that are exposed at `moment`, given in the camera's frame at
+    /// that moment. As [`Self::project`]. It is not inlined: few Gaussians need it, and inlining
+    /// takes the compiler a fifth of this package's time.
     #[inline(always)]
     pub(in crate::cpu) fn project_near<S: Simd>(
         &self,

@@ -1,9 +1,9 @@
-//! Rolling shutters, 16 points at a time: [`crate::View::project_extrapolated`] as seen from the end of
-//! the exposure.
+//! Rolling shutters, 16 points at a time: [`crate::View::project_extrapolated`] as seen from the
+//! end of the exposure.
 //!
-//! Everything is relative to the camera's frame at the end of the exposure, so that f32 holds only the small
-//! motion during one exposure. "Remaining" is the fraction of the exposure that is still to come when a row
-//! is exposed: 1 for the first row, 0 for the last.
+//! Everything is relative to the camera's frame at the end of the exposure, so that f32 holds only
+//! the small motion during one exposure. "Remaining" is the fraction of the exposure that is still
+//! to come when a row is exposed: 1 for the first row, 0 for the last.
 
 use fearless_simd::{f32x16, prelude::*};
 
@@ -76,11 +76,11 @@ impl SimdShutter {
         self.rotation_rad
     }
 
-    /// The motion of a point in the camera's frame, in metres per unit of the remaining fraction. `then_m` is its
-    /// place in that frame while `remaining` remains.
+    /// The motion of a point in the camera's frame, in metres per unit of the remaining fraction.
+    /// `then_m` is its place in that frame while `remaining` remains.
     ///
-    /// The place is `R(r) (p + r t)` with the rotation R by `r ω` about the axis k, so that its derivative is
-    /// `ω k × place + R t`.
+    /// The place is `R(r) (p + r t)` with the rotation R by `r ω` about the axis k, so that its
+    /// derivative is `ω k × place + R t`.
     #[inline(always)]
     pub(super) fn velocity<S: Simd>(
         &self,
@@ -93,9 +93,9 @@ impl SimdShutter {
         axis.cross(then_m).mul_add(f32x16::splat(simd, self.rotation_rad), rotated_m)
     }
 
-    /// A bound of how much the path of a point on the image turns during the exposure, as a share of itself, by the
-    /// point's distance from the camera in metres: how far the camera moves by the least distance, and how far it
-    /// rotates. Infinite close to the camera.
+    /// A bound of how much the path of a point on the image turns during the exposure, as a share
+    /// of itself, by the point's distance from the camera in metres: how far the camera moves by
+    /// the least distance, and how far it rotates. Infinite close to the camera.
     #[inline(always)]
     pub(super) fn turn<S: Simd>(&self, simd: S, distance_m: f32x16<S>) -> f32x16<S> {
         let splat = |value: f32| f32x16::splat(simd, value);
@@ -112,8 +112,8 @@ impl SimdShutter {
         self.rotated(simd, Vec3x16::splat(simd, self.translation_m), remaining)
     }
 
-    /// Points of the camera's frame at some moment in its frame when more of the exposure remains, `by` in units of it.
-    /// `motion_m` is [`Self::motion`] at that moment.
+    /// Points of the camera's frame at some moment in its frame when more of the exposure remains,
+    /// `by` in units of it. `motion_m` is [`Self::motion`] at that moment.
     #[inline(always)]
     pub(super) fn later<S: Simd>(
         &self,
@@ -126,7 +126,8 @@ impl SimdShutter {
         self.rotated(simd, motion_m.mul_add(by, then_m), by)
     }
 
-    /// Vectors of the camera's frame at the end of the exposure, in its frame while a fraction remains.
+    /// Vectors of the camera's frame at the end of the exposure, in its frame while a fraction
+    /// remains.
     #[inline(always)]
     pub(in crate::cpu) fn rotated<S: Simd>(
         &self,
@@ -137,8 +138,8 @@ impl SimdShutter {
         if self.rotates { v.plus(self.rotation_change(simd, v, remaining)) } else { v }
     }
 
-    /// Points of the camera's frame at the end of the exposure, in its frame while a fraction remains, in
-    /// metres.
+    /// Points of the camera's frame at the end of the exposure, in its frame while a fraction
+    /// remains, in metres.
     #[inline(always)]
     pub(super) fn to_exposure_frame<S: Simd>(
         &self,
@@ -150,7 +151,8 @@ impl SimdShutter {
         self.rotated(simd, moved_m, remaining)
     }
 
-    /// The difference of the camera-space z of points while a fraction remains and at the end, in metres.
+    /// The difference of the camera-space z of points while a fraction remains and at the end, in
+    /// metres.
     #[inline(always)]
     pub(in crate::cpu) fn z_change<S: Simd>(
         &self,
@@ -165,7 +167,8 @@ impl SimdShutter {
         translation_m.z + self.rotation_change(simd, at_end_m.plus(translation_m), remaining).z
     }
 
-    /// The remaining motion of the camera's centre, in metres, in its frame at the end of the exposure.
+    /// The remaining motion of the camera's centre, in metres, in its frame at the end of the
+    /// exposure.
     #[inline(always)]
     pub(in crate::cpu) fn translation<S: Simd>(&self, simd: S, remaining: f32x16<S>) -> Vec3x16<S> {
         Vec3x16::splat(simd, self.translation_m).scale(remaining)
@@ -195,8 +198,8 @@ impl SimdShutter {
     /// The change of a vector by rotation, from the frame at the end to the frame while a fraction
     /// remains; with a negative fraction, the other way.
     ///
-    /// Rodrigues' formula without the vector itself: `sin θ (k × v) + (1 - cos θ) k × (k × v)`, with
-    /// `1 - cos θ = 2 sin²(θ/2)`, which does not cancel for small angles.
+    /// Rodrigues' formula without the vector itself: `sin θ (k × v) + (1 - cos θ) k × (k × v)`,
+    /// with `1 - cos θ = 2 sin²(θ/2)`, which does not cancel for small angles.
     #[inline(always)]
     fn rotation_change<S: Simd>(&self, simd: S, v: Vec3x16<S>, remaining: f32x16<S>) -> Vec3x16<S> {
         let axis = Vec3x16::splat(simd, self.axis);

@@ -3,7 +3,7 @@
 
 use fearless_simd::{f32x16, prelude::*};
 
-use crate::cpu::math::angle_of;
+use crate::cpu::math::atan2;
 
 /// The distance from the principal point beyond an angle off the axis: a line.
 #[derive(Clone, Copy, Debug)]
@@ -20,7 +20,8 @@ impl Tangent {
     /// The tangent of half of [`WIDEST_RAD`](wildcity_scene::geometry::camera::WIDEST_RAD).
     const WIDEST: f32 = 5.797_884;
 
-    /// A line that begins at an angle off the axis, with the distance there and its change per radian.
+    /// A line that begins at an angle off the axis, with the distance there and its change per
+    /// radian.
     pub(super) fn new(begin_rad: f64, radius: f64, per_rad: f64) -> Self {
         let begin = (0.5 * begin_rad).tan() as f32;
         Self { begin, radius: radius as f32, per_rad: per_rad as f32 }
@@ -28,15 +29,15 @@ impl Tangent {
 
     /// Distances at angles with `t = tan(θ/2)`, beyond the start of the line.
     ///
-    /// With u the tangent of half the angle from the start, that half has the sine `u/√(1 + u²)` and the cosine
-    /// `1/√(1 + u²)`.
+    /// With u the tangent of half the angle from the start, that half has the sine `u/√(1 + u²)`
+    /// and the cosine `1/√(1 + u²)`.
     #[inline(always)]
     pub(super) fn radius<S: Simd>(&self, simd: S, t: f32x16<S>) -> f32x16<S> {
         let splat = |value: f32| f32x16::splat(simd, value);
         let one = splat(1.0);
         let u = (t - splat(self.begin)) / t.mul_add(splat(self.begin), one);
         let cosine = one / u.mul_add(u, one).sqrt();
-        let half_rad = angle_of(simd, u * cosine, cosine);
+        let half_rad = atan2(simd, u * cosine, cosine);
         (half_rad + half_rad).mul_add(splat(self.per_rad), splat(self.radius))
     }
 
@@ -53,8 +54,8 @@ impl Tangent {
         t.simd_le(widest).select(widest - t, f32x16::splat(simd, -1.0))
     }
 
-    /// Lower bound of the angle by which `t = tan(θ/2)` is beyond the start of the line, in radians: below 0 before it.
-    /// `dt/dθ` is `(1 + t²)/2`.
+    /// Lower bound of the angle by which `t = tan(θ/2)` is beyond the start of the line, in
+    /// radians: below 0 before it. `dt/dθ` is `(1 + t²)/2`.
     #[inline(always)]
     pub(super) fn past_begin_rad<S: Simd>(&self, simd: S, t: f32x16<S>) -> f32x16<S> {
         let splat = |value: f32| f32x16::splat(simd, value);

@@ -5,25 +5,26 @@ use glam::DVec3;
 
 use super::max_seen_rad;
 use crate::cpu::lanes::Vec3x16;
-use crate::cpu::math::{angle_of, sin};
+use crate::cpu::math::{atan2, sin};
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::geometry::camera::{Bivariate, Windshield, WindshieldReference};
 
-/// A windshield with polynomials from outside angles to inside angles. Directions inside are those of [`Windshield`],
-/// which fades the refraction out at large angles. Directions outside, and derivatives, are valid where the
-/// refraction is complete.
+/// A windshield with polynomials from outside angles to inside angles. Directions inside are those
+/// of [`Windshield`], which fades the refraction out at large angles. Directions outside, and
+/// derivatives, are valid where the refraction is complete.
 ///
-/// The polynomials give the change of the angles. A windshield changes a ray by 0.01, so the f32 rounding error of the
-/// change is a hundredth of that of a ray. This matters at large angles: computed only from `z² = 1 - x² - y²`, z =
-/// 0.15 would be off by 1e-6, and the image of a lens of slopes by 0.01 px.
+/// The polynomials give the change of the angles. A windshield changes a ray by 0.01, so the f32
+/// rounding error of the change is a hundredth of that of a ray. This matters at large angles:
+/// computed only from `z² = 1 - x² - y²`, z = 0.15 would be off by 1e-6, and the image of a lens of
+/// slopes by 0.01 px.
 #[derive(Clone, Debug)]
 pub(super) struct SimdWindshield {
     horizontal: Polynomial2,
     vertical: Polynomial2,
 }
 
-/// A polynomial of two angles: for each power of the second, coefficients of the first angle's powers, highest
-/// power first.
+/// A polynomial of two angles: for each power of the second, coefficients of the first angle's
+/// powers, highest power first.
 #[derive(Clone, Debug)]
 struct Polynomial2(Vec<Vec<f32>>);
 
@@ -37,7 +38,6 @@ struct ValueAndSlopes<S: Simd> {
 /// Directions behind a windshield.
 #[derive(Clone, Copy)]
 pub(super) struct Refracted<S: Simd> {
-    /// Unit directions inside.
     pub(super) direction: Vec3x16<S>,
     /// Not below 0 where the refraction is complete.
     pub(super) margin: f32x16<S>,
@@ -50,20 +50,21 @@ pub(super) struct RefractionDerivatives<S: Simd> {
     /// Its derivatives by the x and the y of the unit direction outside.
     pub(super) by_x: Vec3x16<S>,
     pub(super) by_y: Vec3x16<S>,
-    /// How far the outside z is above the least one at which the refraction is complete: not below 0 where it is.
+    /// How far the outside z is above the least one at which the refraction is complete: not below
+    /// 0 where it is.
     pub(super) margin: f32x16<S>,
 }
 
 impl SimdWindshield {
-    /// Rounds of the fixed-point search for the direction outside. Each halves the error at worst; with real
-    /// windshields it leaves a fiftieth.
+    /// Rounds of the fixed-point search for the direction outside. Each halves the error at worst;
+    /// with real windshields it leaves a fiftieth.
     const ROUNDS: u32 = 24;
 
     /// The largest change of an angle for which [`sine_change`] is accurate, in radians.
     const MAX_RAD: f64 = 0.5;
 
-    /// `None` if the polynomials lead from the inside to the outside, or if they change rays by more than
-    /// [`Self::MAX_RAD`].
+    /// `None` if the polynomials lead from the inside to the outside, or if they change rays by
+    /// more than [`Self::MAX_RAD`].
     pub(super) fn new(windshield: &Windshield) -> Option<Self> {
         let horizontal = Polynomial2::change(windshield.horizontal(), [1, 0]);
         let vertical = Polynomial2::change(windshield.vertical(), [0, 1]);
@@ -78,8 +79,8 @@ impl SimdWindshield {
         let splat = |value: f32| f32x16::splat(simd, value);
         let unit = outside.scale(splat(1.0) / outside.dot(outside).sqrt());
         let cosines = [cosine(simd, unit.x), cosine(simd, unit.y)];
-        let phi = angle_of(simd, unit.x, cosines[0]);
-        let theta = angle_of(simd, unit.y, cosines[1]);
+        let phi = atan2(simd, unit.x, cosines[0]);
+        let theta = atan2(simd, unit.y, cosines[1]);
         let [none_z, full_z] = Windshield::FADES_Z;
         let per_z = splat((1.0 / (full_z - none_z)) as f32);
         let share = ((unit.z - splat(none_z as f32)) * per_z).max(splat(0.0)).min(splat(1.0));
@@ -97,15 +98,15 @@ impl SimdWindshield {
 
     /// The refraction around unit directions outside.
     ///
-    /// With `x = sin φ` outside and `x′ = sin h(φ, θ)` inside, `∂x′/∂x = cos h ∂h/∂φ / cos φ`, and likewise for the
-    /// other three; z′ follows from the unit length.
+    /// With `x = sin φ` outside and `x′ = sin h(φ, θ)` inside, `∂x′/∂x = cos h ∂h/∂φ / cos φ`, and
+    /// likewise for the other three; z′ follows from the unit length.
     #[inline(always)]
     pub(super) fn expand<S: Simd>(&self, simd: S, unit: Vec3x16<S>) -> RefractionDerivatives<S> {
         let splat = |value: f32| f32x16::splat(simd, value);
         let one = splat(1.0);
         let cosines = [cosine(simd, unit.x), cosine(simd, unit.y)];
-        let phi = angle_of(simd, unit.x, cosines[0]);
-        let theta = angle_of(simd, unit.y, cosines[1]);
+        let phi = atan2(simd, unit.x, cosines[0]);
+        let theta = atan2(simd, unit.y, cosines[1]);
         let horizontal = self.horizontal.with_slopes(simd, phi, theta);
         let vertical = self.vertical.with_slopes(simd, phi, theta);
         let inside = turned(simd, unit, cosines, [horizontal.value, vertical.value]);
@@ -140,8 +141,8 @@ impl SimdWindshield {
     pub(super) fn outside<S: Simd>(&self, simd: S, inside: Vec3x16<S>) -> Vec3x16<S> {
         let splat = |value: f32| f32x16::splat(simd, value);
         let unit = inside.scale(splat(1.0) / inside.dot(inside).sqrt());
-        let inside_phi = angle_of(simd, unit.x, cosine(simd, unit.x));
-        let inside_theta = angle_of(simd, unit.y, cosine(simd, unit.y));
+        let inside_phi = atan2(simd, unit.x, cosine(simd, unit.x));
+        let inside_theta = atan2(simd, unit.y, cosine(simd, unit.y));
         // The change is nearly the same outside, so that each round is close to the fixed point.
         let mut phi = inside_phi;
         let mut theta = inside_theta;
@@ -157,8 +158,8 @@ impl SimdWindshield {
     }
 }
 
-/// Unit directions whose angles φ = asin x and θ = asin y are changed, by their cosines and the changes. z follows from
-/// the unit length.
+/// Unit directions whose angles φ = asin x and θ = asin y are changed, by their cosines and the
+/// changes. z follows from the unit length.
 #[inline(always)]
 fn turned<S: Simd>(
     simd: S,
@@ -173,8 +174,9 @@ fn turned<S: Simd>(
     Vec3x16 { x: unit.x + x, y: unit.y + y, z }
 }
 
-/// The change of a sine with its angle: `sin(φ + δ) - sin φ` is `cos φ sin δ - sin φ (1 - cos δ)`. Taylor's
-/// terms up to the 8th power of δ leave 3e-10 of `1 - cos δ` up to [`SimdWindshield::MAX_RAD`].
+/// The change of a sine with its angle: `sin(φ + δ) - sin φ` is `cos φ sin δ - sin φ (1 - cos δ)`.
+/// Taylor's terms up to the 8th power of δ leave 3e-10 of `1 - cos δ` up to
+/// [`SimdWindshield::MAX_RAD`].
 #[inline(always)]
 fn sine_change<S: Simd>(simd: S, [sine, cosine]: [f32x16<S>; 2], by_rad: f32x16<S>) -> f32x16<S> {
     let splat = |value: f64| f32x16::splat(simd, value as f32);

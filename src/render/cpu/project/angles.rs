@@ -17,7 +17,8 @@ pub(super) struct CenterAngles<S: Simd> {
     spread: f32x16<S>,
     /// Change of this angle by the shutter, if both are exposed at different moments.
     motion: f32x16<S>,
-    /// Reach of splats from the images of their centres, in pixels per radian of their points' spread.
+    /// Reach of splats from the images of their centres, in pixels per radian of their points'
+    /// spread.
     reach_px_per_rad: f32x16<S>,
     /// Not close to the camera, where these bounds do not hold.
     far: mask32x16<S>,
@@ -93,9 +94,9 @@ impl<S: Simd> CenterAngles<S> {
         self.far & (self.continued & out | self.least.simd_gt(splat(bound.max_center_rad)))
     }
 
-    /// The Gaussians that miss the image, given the images of their centres: the largest number of pixels per radian
-    /// bounds the distance of their points' images from there. A windshield changes the angle between two rays by less
-    /// than half of it.
+    /// The Gaussians that miss the image, given the images of their centres: the largest number of
+    /// pixels per radian bounds the distance of their points' images from there. A windshield
+    /// changes the angle between two rays by less than half of it.
     #[inline(always)]
     pub(super) fn beside(
         &self,
@@ -112,7 +113,8 @@ impl<S: Simd> CenterAngles<S> {
         self.far & self.continued & off_x.max(off_y).simd_gt(reach_px)
     }
 
-    /// Reach of splats from the images of their centres, in pixels, if their points spread by some angles.
+    /// Reach of splats from the images of their centres, in pixels, if their points spread by some
+    /// angles.
     #[inline(always)]
     fn reach_px(&self, simd: S, spread_rad: f32x16<S>, bound: &CullBound) -> f32x16<S> {
         spread_rad.mul_add(self.reach_px_per_rad, f32x16::splat(simd, bound.blur_px as f32))

@@ -1,4 +1,5 @@
-//! The axes of Gaussians, and coordinates of their centres in f64: the first step of both projections.
+//! The axes of Gaussians, and coordinates of their centres in f64: the first step of both
+//! projections.
 
 use fearless_simd::{f32x16, f64x8, prelude::*};
 
@@ -24,7 +25,8 @@ pub(super) fn transform_row<S: Simd>(simd: S, points: Vec3x16<S>, row: [f64; 4])
     (low, high)
 }
 
-/// Columns of the rotation matrices of a block's unit quaternions: each Gaussian's own axes, in the world.
+/// Columns of the rotation matrices of a block's unit quaternions: each Gaussian's own axes, in the
+/// world.
 ///
 /// The matrix of a unit quaternion (w, x, y, z) is
 ///

@@ -6,11 +6,11 @@ use crate::cpu::lanes::Vec3x16;
 use wildcity_scene::chunk::{Lanes, column};
 use wildcity_scene::sh;
 
-/// `max(0, SH(direction) + 0.5)`, linear, of 16 Gaussians. `toward` leads from the camera to each centre in
-/// world axes; it may have any length.
+/// `max(0, SH(direction) + 0.5)`, linear, of 16 Gaussians. `toward` leads from the camera to each
+/// centre in world axes; it may have any length.
 ///
-/// The real basis up to degree 3 and its signs are those of 3D Gaussian splatting (Kerbl et al. 2023). Chunks
-/// hold three columns (red, green, blue) per coefficient, in order of degree.
+/// The real basis up to degree 3 and its signs are those of 3D Gaussian splatting (Kerbl et al.
+/// 2023). Chunks hold three columns (red, green, blue) per coefficient, in order of degree.
 #[inline(always)]
 pub(super) fn color<S: Simd>(
     simd: S,
@@ -61,8 +61,8 @@ pub(super) fn color<S: Simd>(
 }
 
 impl<S: Simd> Vec3x16<S> {
-    /// Adds `basis` times SH coefficient `k`. It is not a closure, because a closure would not be inlined, and so would
-    /// be compiled without the instruction set.
+    /// Adds `basis` times SH coefficient `k`. It is not a closure, because a closure would not be
+    /// inlined, and so would be compiled without the instruction set.
     #[inline(always)]
     fn plus_term(self, simd: S, columns: &[Lanes], k: usize, basis: f32x16<S>) -> Self {
         Self::load(simd, columns, column::SH + 3 * k).mul_add(basis, self)

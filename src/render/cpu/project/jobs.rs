@@ -29,8 +29,8 @@ pub(in crate::cpu) struct Job<'a> {
 }
 
 impl Job<'_> {
-    /// The Gaussians that it projects: the address of their chunk, and the first cluster. Only the schedule depends on
-    /// it.
+    /// The Gaussians that it projects: the address of their chunk, and the first cluster. Only the
+    /// schedule depends on it.
     pub(super) fn gaussians(&self) -> (usize, usize) {
         (std::ptr::from_ref(self.chunk).addr(), self.clusters.start)
     }
@@ -71,7 +71,8 @@ struct NonPinholeView<'a> {
     lens: Option<LensProjection>,
 }
 
-/// Runs `work` with the jobs of a frame: one for each unit that a view may see, in order of (view, global id).
+/// Runs `work` with the jobs of a frame: one for each unit that a view may see, in order of (view,
+/// global id).
 pub(in crate::cpu) fn with_jobs<R>(frame: &Frame<'_>, work: impl FnOnce(&[Job<'_>]) -> R) -> R {
     // Compute the data that is the same for all chunks of a view or of an actor.
     let non_pinhole: Vec<Option<NonPinholeView<'_>>> =
@@ -83,7 +84,7 @@ pub(in crate::cpu) fn with_jobs<R>(frame: &Frame<'_>, work: impl FnOnce(&[Job<'_
     for (index, non_pinhole) in non_pinhole.iter().enumerate() {
         add_twin(index, frame, non_pinhole.as_ref(), &shadows, &mut jobs);
         let from_actors = from_actors.get(index).map_or(&[][..], Vec::as_slice);
-        add_actors(index, frame, actor_views.of(index), from_actors, &mut jobs);
+        add_actors(index, frame, actor_views.for_view(index), from_actors, &mut jobs);
     }
     work(&jobs)
 }
@@ -135,7 +136,8 @@ impl<'a> ChunkProjection<'a> {
         }
     }
 
-    /// Bounds of the depths of all centres in a cluster, in metres. They allow for rounding errors of 1e-5.
+    /// Bounds of the depths of all centres in a cluster, in metres. They allow for rounding errors
+    /// of 1e-5.
     fn depths_m(&self, cluster: &Cluster) -> [f64; 2] {
         let Cluster { min_m, max_m, .. } = *cluster;
         let center_m = (0.5 * (min_m + max_m)).as_dvec3();
@@ -154,8 +156,8 @@ impl<'a> ChunkProjection<'a> {
     }
 }
 
-/// The views from actors' axes that are not static pinholes. Data that depends on the lens is taken from `own`, the
-/// frame's own views.
+/// The views from actors' axes that are not static pinholes. Data that depends on the lens is taken
+/// from `own`, the frame's own views.
 fn non_pinhole_from_actors<'a>(
     frame: &Frame<'_>,
     actor_views: &'a ActorViews,
@@ -181,8 +183,8 @@ fn non_pinhole_from_actors<'a>(
     actor_views.all().zip(own).map(of_view).collect()
 }
 
-/// Adds the jobs of one view and the twin, in order of global ids. A unit that a view cannot see has no job; it costs
-/// one visibility test per cluster.
+/// Adds the jobs of one view and the twin, in order of global ids. A unit that a view cannot see
+/// has no job; it costs one visibility test per cluster.
 fn add_twin<'a>(
     index: usize,
     frame: &Frame<'a>,
@@ -201,8 +203,8 @@ fn add_twin<'a>(
     }
 }
 
-/// Adds the jobs of one view and all actors, in order of global ids. `relative` are the view from the axes of each
-/// actor.
+/// Adds the jobs of one view and all actors, in order of global ids. `relative` are the view from
+/// the axes of each actor.
 fn add_actors<'a>(
     index: usize,
     frame: &Frame<'a>,

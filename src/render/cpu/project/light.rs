@@ -1,5 +1,5 @@
-//! Changes of the colours of splats that do not depend on the viewing direction: an actor's tint, and the contact
-//! shadows of actors on the twin.
+//! Changes of the colours of splats that do not depend on the viewing direction: an actor's tint,
+//! and the contact shadows of actors on the twin.
 
 use fearless_simd::{f32x16, prelude::*};
 

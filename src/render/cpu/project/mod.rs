@@ -1,23 +1,27 @@
 //! Stage project: 3D Gaussians become 2D splats on the images of all views, 16 Gaussians at a time.
 //!
-//! The method is EWA splatting (Zwicker et al. 2001) as used by 3D Gaussian splatting (Kerbl et al. 2023). A
-//! static pinhole camera has its projection linearised at each centre ([`pinhole`]). Every other camera (lens
-//! distortion, windshield, rolling shutter while it moves) has six points of each Gaussian projected
-//! ([`unscented`]). Both produce the same kind of splat ([`splat_block`]). A static pinhole keeps its own
-//! path, to the byte: without other cameras in a frame the second path does not run.
+//! The method is EWA splatting (Zwicker et al. 2001) as used by 3D Gaussian splatting (Kerbl et al.
+//! 2023). A static pinhole camera has its projection linearised at each centre ([`pinhole`]). Every
+//! other camera (lens distortion, windshield, rolling shutter while it moves) has six points of
+//! each Gaussian projected ([`unscented`]). Both produce the same kind of splat ([`splat_block`]).
+//! A static pinhole keeps its own path, to the byte: without other cameras in a frame the second
+//! path does not run.
 //!
 //! # Layout
 //!
-//! Work is cut into units of one view and 16 clusters of one chunk. Threads compute units in any order, and
-//! their results are stored in order of (view, global id), so the output does not depend on the schedule.
+//! Work is cut into units of one view and 16 clusters of one chunk. Threads compute units in any
+//! order, and their results are stored in order of (view, global id), so the output does not depend
+//! on the schedule.
 //!
-//! **Splats stay where they were projected.** They lie in pages of 256 splats that one frame leaves to the
-//! next. Bin writes 12 bytes for each macro tile of a splat, and sort copies the splats of one macro tile at a time. Copying all
-//! of a frame into depth order was no faster to read, and it doubled the memory of a frame.
+//! **Splats stay where they were projected.** They lie in pages of 256 splats that one frame leaves
+//! to the next. Bin writes 12 bytes for each macro tile of a splat, and sort copies the splats of
+//! one macro tile at a time. Copying all of a frame into depth order was no faster to read, and it
+//! doubled the memory of a frame.
 //!
-//! **Every function that a hot loop calls is `#[inline(always)]`.** `fearless_simd` dispatches to an
-//! instruction set at run time, on stable Rust. A closure or an iterator adapter that remains a call of its
-//! own is compiled without that instruction set. Removing such calls made this stage four times as fast.
+//! **Every function that a hot loop calls is `#[inline(always)]`.** `fearless_simd` dispatches to
+//! an instruction set at run time, on stable Rust. A closure or an iterator adapter that remains a
+//! call of its own is compiled without that instruction set. Removing such calls made this stage
+//! four times as fast.
 
 mod angles;
 mod axes;
@@ -43,16 +47,17 @@ use wildcity_scene::chunk::{CLUSTER, LANES, Lanes};
 
 pub(super) use self::jobs::{Job, with_jobs};
 
-/// Number of blocks by which memory is read ahead. The loads of the block itself would come too late: the processor
-/// does not reach the loads of the next block before the computations of the current one.
+/// Number of blocks by which memory is read ahead. The loads of the block itself would come too
+/// late: the processor does not reach the loads of the next block before the computations of the
+/// current one.
 const AHEAD: usize = 2;
 
 /// Splats of a page.
 const PAGE: usize = 1 << PAGE_BITS;
 const PAGE_BITS: u32 = 8;
 
-/// 12 KiB of splats. The units of a frame change as the ego moves; pages pass from one unit to another, so
-/// memory follows the largest frame and not the sum of each unit's largest size.
+/// 12 KiB of splats. The units of a frame change as the ego moves; pages pass from one unit to
+/// another, so memory follows the largest frame and not the sum of each unit's largest size.
 type Page = Box<[Splat; PAGE]>;
 
 /// All splats of a frame.
@@ -70,7 +75,6 @@ pub(super) struct Projected {
 pub(super) struct Unit {
     /// Index of the view.
     pub(super) view: usize,
-    /// Number of splats.
     pub(super) len: usize,
     /// Index of its first page.
     first_page: usize,
@@ -82,7 +86,8 @@ impl Projected {
     /// Projects the Gaussians of all jobs, or only the splats that are in a slab.
     ///
     /// # Errors
-    /// [`Overflow`]: there are more than `most_places` places for splats. Then nothing is projected.
+    /// [`Overflow`]: there are more than `most_places` places for splats. Then nothing is
+    /// projected.
     pub(super) fn project(
         &mut self,
         level: Level,
@@ -95,8 +100,8 @@ impl Projected {
         free.get_mut().append(pages);
         units.clear();
 
-        // In parallel: each job fills pages of its own. Views that see the same Gaussians follow each other, so that
-        // these are read from memory once.
+        // In parallel: each job fills pages of its own. Views that see the same Gaussians follow
+        // each other, so that these are read from memory once.
         let mut order: Vec<usize> = match slab {
             None => (0..jobs.len()).collect(),
             Some(slab) => slab.jobs().collect(),
@@ -111,7 +116,7 @@ impl Projected {
                 if used_pages.load(Relaxed) > most_pages {
                     return (0, Vec::new());
                 }
-                let slab = slab.map(|slab| slab.of_job(index));
+                let slab = slab.map(|slab| slab.job(index));
                 dispatch!(level, simd => project_unit(simd, &jobs[index], cutoffs, slab, splats));
                 used_pages.fetch_add(splats.len().div_ceil(PAGE), Relaxed);
                 (splats.len(), copy_to_pages(splats, free))
@@ -203,7 +208,8 @@ fn prefetch(columns: &[Lanes]) {
     }
 }
 
-/// Projects the visible clusters of a job, one block of 16 Gaussians after the other; of a slab only its splats.
+/// Projects the visible clusters of a job, one block of 16 Gaussians after the other; of a slab
+/// only its splats.
 #[inline(always)]
 fn project_unit<S: Simd>(
     simd: S,

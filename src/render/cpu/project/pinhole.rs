@@ -13,11 +13,11 @@ use wildcity_scene::chunk::{Lanes, column};
 
 /// Projects one block of 16 Gaussians, or returns `None` if none of them can be seen.
 ///
-/// The screen covariance, in px², is `Σ′ = J W Σ Wᵀ Jᵀ + blur I` with `Σ = R S Sᵀ Rᵀ` (Zwicker et al. 2001;
-/// Kerbl et al. 2023, eqs. 5 and 6): `W` is the rotation of camera_from_world, `J = ∂pixel/∂point` the
-/// Jacobian of the projection at the centre, `R` and `S` the Gaussian's rotation and standard deviations.
-/// Computed here are the two rows of the 2 x 3 root `V = J W R S`; `Σ′ = V Vᵀ + blur I` follows in
-/// [`Ellipse::from_root`].
+/// The screen covariance, in px², is `Σ′ = J W Σ Wᵀ Jᵀ + blur I` with `Σ = R S Sᵀ Rᵀ` (Zwicker et
+/// al. 2001; Kerbl et al. 2023, eqs. 5 and 6): `W` is the rotation of camera_from_world,
+/// `J = ∂pixel/∂point` the Jacobian of the projection at the centre, `R` and `S` the Gaussian's
+/// rotation and standard deviations. Computed here are the two rows of the 2 x 3 root
+/// `V = J W R S`; `Σ′ = V Vᵀ + blur I` follows in [`Ellipse::from_root`].
 #[inline(always)]
 pub(super) fn project_block<S: Simd>(
     simd: S,
@@ -66,11 +66,11 @@ pub(super) fn project_block<S: Simd>(
 
 /// Camera-space z of centres, in metres: computed in f64 and rounded to f32 once.
 ///
-/// Splats are blended in order of this number. Thousands of surfels of one facade have the same depth. As a
-/// sum in f32 it differed by rounding errors, and they were blended in the order of those errors: 54 dB
-/// between backends on the demo street, and single pixels off by 0.2. In f64 it costs 12 instructions for 16
-/// Gaussians. Ties keep the order of global ids, and the backends agree above 70 dB, with no value off by more
-/// than 2/255.
+/// Splats are blended in order of this number. Thousands of surfels of one facade have the same
+/// depth. As a sum in f32 it differed by rounding errors, and they were blended in the order of
+/// those errors: 54 dB between backends on the demo street, and single pixels off by 0.2. In f64 it
+/// costs 12 instructions for 16 Gaussians. Ties keep the order of global ids, and the backends
+/// agree above 70 dB, with no value off by more than 2/255.
 #[inline(always)]
 fn depth<S: Simd>(simd: S, view: &ChunkView, mean: Vec3x16<S>) -> f32x16<S> {
     let (low, high) = transform_row(simd, mean, view.forward);
@@ -91,12 +91,13 @@ fn camera_coordinate<S: Simd>(
     splat(rx).mul_add(mean.x, splat(ry).mul_add(mean.y, z))
 }
 
-/// A row of `J W R`, in px/m: how a pixel coordinate moves as the centre moves along each of its own axes.
+/// A row of `J W R`, in px/m: how a pixel coordinate moves as the centre moves along each of its
+/// own axes.
 ///
 /// For the pixel coordinate `f x/z + c` the row of `J` is `(f/z)(1, 0, -x/z)`. Times `W` this is
-/// `(f/z)(W_x - (x/z) W_z)` with the rows of `W`; and times `R` its dot products with the own axes. Outside of
-/// the image the slope x/z is clamped, since the linearisation is wrong there and would give splats of unbounded
-/// size (see [`SLOPE_SLACK`](crate::constants::SLOPE_SLACK)).
+/// `(f/z)(W_x - (x/z) W_z)` with the rows of `W`; and times `R` its dot products with the own axes.
+/// Outside of the image the slope x/z is clamped, since the linearisation is wrong there and would
+/// give splats of unbounded size (see [`SLOPE_SLACK`](crate::constants::SLOPE_SLACK)).
 #[inline(always)]
 fn jacobian_row<S: Simd>(
     simd: S,

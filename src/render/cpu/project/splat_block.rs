@@ -1,11 +1,12 @@
 //! Sixteen splats: their screen ellipses, their visibility on the image, and their storage.
 //!
-//! **A splat stores a Cholesky factor of its inverse covariance, not the inverse itself (a "conic").** The
-//! rasterizer's exponent is then `log2(opacity) - (l0 dx + l1 dy)² - (l2 dy)²`, a sum of squares, which stays
-//! correct in sign however thin the needle. Swapping the axes when the ellipse is wider than high would make
-//! the larger pivot come first. Needles of 1,000 to 10,000 px at steps of 2° were measured without the swap:
-//! alpha is within 2e-3 of f64 at every angle (stress case T1), as the error of either pivot is
-//! `1e-7 √(ac/det)`. So there is one form, and the row loop has no branch.
+//! **A splat stores a Cholesky factor of its inverse covariance, not the inverse itself (a
+//! "conic").** The rasterizer's exponent is then `log2(opacity) - (l0 dx + l1 dy)² - (l2 dy)²`, a
+//! sum of squares, which stays correct in sign however thin the needle. Swapping the axes when the
+//! ellipse is wider than high would make the larger pivot come first. Needles of 1,000 to 10,000 px
+//! at steps of 2° were measured without the swap: alpha is within 2e-3 of f64 at every angle
+//! (stress case T1), as the error of either pivot is `1e-7 √(ac/det)`. So there is one form, and
+//! the row loop has no branch.
 
 use fearless_simd::{f32x16, mask32x16, prelude::*};
 
@@ -30,18 +31,20 @@ pub(super) struct Ellipse<S: Simd> {
     sigma_y: f32x16<S>,
     /// Determinant before the blur as a share of the one after the blur of native pixels.
     blur_share: f32x16<S>,
-    /// For an image below its native size: determinant after the blur of native pixels as a share of the one
-    /// after the whole filter.
+    /// For an image below its native size: determinant after the blur of native pixels as a share
+    /// of the one after the whole filter.
     shrink_share: Option<f32x16<S>>,
 }
 
 impl<S: Simd> Ellipse<S> {
-    /// From the rows of `V = J W R S`, in pixels: a square root of the screen covariance before the blur.
+    /// From the rows of `V = J W R S`, in pixels: a square root of the screen covariance before the
+    /// blur.
     ///
-    /// `Σ′ = V Vᵀ + blur I`. With the 2 x 2 minors `m` of `V` (its rows' cross product), Cauchy and Binet's
-    /// formula gives `det Σ′ = |m|² + blur |V|² + blur²`: a sum of positives, exact to rounding even for
-    /// needles, for which `ac - b²` cancels to nothing. The determinant is of fourth order in the size, so
-    /// that a splat wider than [`MAX_SIGMA_PX`] is computed in a unit larger than the pixel.
+    /// `Σ′ = V Vᵀ + blur I`. With the 2 x 2 minors `m` of `V` (its rows' cross product), Cauchy and
+    /// Binet's formula gives `det Σ′ = |m|² + blur |V|² + blur²`: a sum of positives, exact to
+    /// rounding even for needles, for which `ac - b²` cancels to nothing. The determinant is of
+    /// fourth order in the size, so that a splat wider than [`MAX_SIGMA_PX`] is computed in a unit
+    /// larger than the pixel.
     #[inline(always)]
     pub(super) fn from_root(simd: S, v0: Vec3x16<S>, v1: Vec3x16<S>, filter: &PixelFilter) -> Self {
         let splat = |value: f32| f32x16::splat(simd, value);
@@ -62,12 +65,13 @@ impl<S: Simd> Ellipse<S> {
         }
     }
 
-    /// From the covariance before the blur, whose unit of length is a pixel divided by `units_per_px`.
+    /// From the covariance before the blur, whose unit of length is a pixel divided by
+    /// `units_per_px`.
     ///
     /// With `Σ′ = [a b; b c]` the exponent's form is
     /// `q(dx, dy) = (dx, dy) Σ′⁻¹ (dx, dy)ᵀ = (c dx - b dy)²/(c det) + dy²/c`, and so
-    /// `l0 = √c/√det`, `l1 = -b/(√c √det)` and `l2 = 1/√c`, each times `log2_unit`.
-    /// An image below its native size is filtered by another variance along each axis ([`PixelFilter`]). Native
+    /// `l0 = √c/√det`, `l1 = -b/(√c √det)` and `l2 = 1/√c`, each times `log2_unit`. An image below
+    /// its native size is filtered by another variance along each axis ([`PixelFilter`]). Native
     /// images have their own branch, since another order of the sums would change their bytes.
     #[inline(always)]
     pub(super) fn from_moments(
@@ -150,7 +154,8 @@ impl<S: Simd> ProjectedBlock<S> {
         let splat = |value: f32| f32x16::splat(simd, value);
         let Self { mean_x, mean_y, depth_m, mut log2_opacity, ellipse, in_range } = self;
         if cutoffs.antialiased {
-            // Yu et al. 2024 (Mip-Splatting): √(det before / det after), with gsplat's floor of 0.005.
+            // Yu et al. 2024 (Mip-Splatting): √(det before / det after), with gsplat's floor of
+            // 0.005.
             let ratio = ellipse.blur_share.max(splat(0.005 * 0.005));
             log2_opacity = splat(0.5).mul_add(log2(simd, ratio), log2_opacity);
         }
@@ -159,8 +164,8 @@ impl<S: Simd> ProjectedBlock<S> {
             log2_opacity = power.mul_add(log2(simd, ratio), log2_opacity);
         }
 
-        // The box where alpha reaches the cut: u² + v² = log2(opacity) - log2(alpha_cut), and along x and y
-        // the ellipse extends by √ of that in standard deviations, divided by the unit.
+        // The box where alpha reaches the cut: u² + v² = log2(opacity) - log2(alpha_cut), and along
+        // x and y the ellipse extends by √ of that in standard deviations, divided by the unit.
         let power = log2_opacity - splat(cutoffs.log2_alpha_cut);
         let reach = power.max(splat(0.0)).sqrt() / splat(LOG2_UNIT);
         let extent_x = reach.mul_add(ellipse.sigma_x, splat(EXTENT_SLACK_PX));
@@ -189,7 +194,8 @@ impl<S: Simd> ProjectedBlock<S> {
     }
 }
 
-/// The splats that reach a pixel's centre of an image of this size along one axis: these lie at 0.5 to size - 0.5.
+/// The splats that reach a pixel's centre of an image of this size along one axis: these lie at 0.5
+/// to size - 0.5.
 #[inline(always)]
 fn on_image<S: Simd>(simd: S, mean: f32x16<S>, extent: f32x16<S>, size_px: f32) -> mask32x16<S> {
     let first = f32x16::splat(simd, 0.5);
@@ -197,7 +203,8 @@ fn on_image<S: Simd>(simd: S, mean: f32x16<S>, extent: f32x16<S>, size_px: f32) 
     (mean + extent).simd_ge(first) & (mean - extent).simd_le(last)
 }
 
-/// Sixteen splats as columns (the fields of [`Splat`]), and which of them are visible, one bit each.
+/// Sixteen splats as columns (the fields of [`Splat`]), and which of them are visible, one bit
+/// each.
 #[derive(Default)]
 pub(super) struct SplatBlock {
     pub(super) visible: u64,

@@ -1,10 +1,10 @@
 //! Projection by every camera that is not a static pinhole: six points of each Gaussian
-//! ([`crate::unscented`] explains the method), or the camera's expansion around its centre where the two differ by
-//! less than a bound ([`crate::expansion`]).
+//! ([`crate::unscented`] explains the method), or the camera's expansion around its centre where
+//! the two differ by less than a bound ([`crate::expansion`]).
 //!
-//! Where [`LensProjection`] describes the camera, 16 Gaussians are projected at a time in f32. Those with a
-//! point beyond the lens' field, or with a point for which the search found no row, are projected one by one
-//! in f64 by [`UnscentedView`].
+//! Where [`LensProjection`] describes the camera, 16 Gaussians are projected at a time in f32.
+//! Those with a point beyond the lens' field, or with a point for which the search found no row,
+//! are projected one by one in f64 by [`UnscentedView`].
 
 use fearless_simd::{f32x16, mask32x16, prelude::*};
 use glam::{DMat3, DQuat, DVec2, DVec3, Vec3};
@@ -31,8 +31,8 @@ pub(super) struct UnscentedChunkView<'a> {
     lens: Option<&'a LensProjection>,
     /// The chunk's origin in the world.
     origin_m: DVec3,
-    /// Rows that take a point `(x, y, z, 1)` of the chunk to the camera's frame at the end of the exposure,
-    /// in metres.
+    /// Rows that take a point `(x, y, z, 1)` of the chunk to the camera's frame at the end of the
+    /// exposure, in metres.
     camera_from_chunk: [[f64; 4]; 3],
     /// The rotation of these as a quaternion (x, y, z, w).
     camera_from_chunk_rotation: [f32; 4],
@@ -79,8 +79,8 @@ impl<'a> UnscentedChunkView<'a> {
         self.unscented.may_see(origin_m, min_m, max_m, sigma_m)
     }
 
-    /// A depth, and the largest difference of the depths of all centres in a ball from it while the camera moves, in
-    /// metres. The ball is relative to the chunk's origin.
+    /// A depth, and the largest difference of the depths of all centres in a ball from it while the
+    /// camera moves, in metres. The ball is relative to the chunk's origin.
     pub(super) fn depth_m(&self, center_m: DVec3, radius_m: f64) -> [f64; 2] {
         let CullBound { translation_m, rotation_rad, .. } = *self.unscented.cull_bound();
         let at_end_m = self
@@ -88,10 +88,11 @@ impl<'a> UnscentedChunkView<'a> {
             .map(|[x, y, z, offset_m]| DVec3::new(x, y, z).dot(center_m) + offset_m);
         let distance_m = DVec3::from_array(at_end_m).length();
         let reach_m = radius_m + translation_m;
-        match self.depth_is_distance {
-            true => [distance_m, reach_m],
+        if self.depth_is_distance {
+            [distance_m, reach_m]
+        } else {
             // A rotation moves a point by at most its angle times the distance.
-            false => [at_end_m[2], reach_m + rotation_rad * (distance_m + reach_m)],
+            [at_end_m[2], reach_m + rotation_rad * (distance_m + reach_m)]
         }
     }
 }
@@ -128,9 +129,10 @@ pub(super) fn project_block<S: Simd>(
     Some(splats)
 }
 
-/// Projects those Gaussians of a block whose points are within the lens' field: by the expansion around their
-/// centres where that suffices, and by six points elsewhere. Returns their splats, and a bit for each other
-/// Gaussian that may be seen. `toward_m` receives the vectors from the camera to the centres, in world axes.
+/// Projects those Gaussians of a block whose points are within the lens' field: by the expansion
+/// around their centres where that suffices, and by six points elsewhere. Returns their splats, and
+/// a bit for each other Gaussian that may be seen. `toward_m` receives the vectors from the camera
+/// to the centres, in world axes.
 #[inline(always)]
 fn project_lanes<S: Simd>(
     simd: S,
@@ -142,7 +144,8 @@ fn project_lanes<S: Simd>(
 ) -> (SplatBlock, u64) {
     let splat = |value: f32| f32x16::splat(simd, value);
 
-    // Centres in the camera's frame at the end of the exposure, in f64 for depth and in f32 for the rest.
+    // Centres in the camera's frame at the end of the exposure, in f64 for depth and in f32 for the
+    // rest.
     let mean = Vec3x16::load(simd, columns, column::MEAN);
     let [right, down, forward] = view.camera_from_chunk;
     let x = transform_row(simd, mean, right);
@@ -175,8 +178,8 @@ fn project_lanes<S: Simd>(
     }
     *toward_m = [toward.x.to_array(), toward.y.to_array(), toward.z.to_array()];
 
-    // Near and far. While the shutter rolls the depth is known only where the row was found; the f64 path
-    // decides for the others.
+    // Near and far. While the shutter rolls the depth is known only where the row was found; the
+    // f64 path decides for the others.
     let depth_m = depth(simd, at_end_m, view, lens, distance_m, moment.remaining);
     let in_depth = depth_m.simd_ge(splat(cutoffs.near_m)) & depth_m.simd_le(splat(cutoffs.far_m));
     let found = center_px.margin.simd_ge(splat(0.0));
@@ -184,8 +187,8 @@ fn project_lanes<S: Simd>(
         None => splat(0.0).simd_ge(splat(0.0)),
         Some(_) => found,
     };
-    // Cull Gaussians too far outside of the lens' field, or so far outside of the image that none of their points
-    // reaches it.
+    // Cull Gaussians too far outside of the lens' field, or so far outside of the image that none
+    // of their points reaches it.
     let least_z = splat(bound.max_center_cos as f32) * distance_m;
     let too_far = then_m.z.simd_lt(least_z) | angles.beside(simd, center_px, view.size_px, bound);
     let in_range = in_range & (in_depth | !is_depth) & !(found & too_far);
@@ -228,7 +231,6 @@ struct CenteredBlock<S: Simd> {
     then_m: Vec3x16<S>,
     /// Own axes times their standard deviations, in the same frames, in metres.
     axes_m: [Vec3x16<S>; 3],
-    /// The centres' images.
     exposed: ExposedPixels<S>,
     depth_m: f32x16<S>,
     log2_opacity: f32x16<S>,
@@ -236,8 +238,8 @@ struct CenteredBlock<S: Simd> {
     in_range: mask32x16<S>,
 }
 
-/// The splats of those Gaussians for which the expansion is close enough to six points, and the others that may
-/// be seen.
+/// The splats of those Gaussians for which the expansion is close enough to six points, and the
+/// others that may be seen.
 #[inline(always)]
 fn expand<S: Simd>(
     simd: S,
@@ -287,8 +289,8 @@ fn is_close<S: Simd>(simd: S, remainder: &Remainder<S>, bound: &ExpansionBound) 
     within & error_px.simd_le(splat(bound.max_error_px))
 }
 
-/// Projects those Gaussians of a block that have all six points within the lens' field. Returns their splats,
-/// and a bit for each other Gaussian that may be seen.
+/// Projects those Gaussians of a block that have all six points within the lens' field. Returns
+/// their splats, and a bit for each other Gaussian that may be seen.
 #[inline(always)]
 fn project_six_points<S: Simd>(
     simd: S,
@@ -321,8 +323,8 @@ fn project_six_points<S: Simd>(
     let mean_x = mean_x * sixth;
     let mean_y = mean_y * sixth;
 
-    // The 2 x 6 root of the covariance, as in `UnscentedView::project`: half differences of each pair, and
-    // distances of each pair's middle from the mean.
+    // The 2 x 6 root of the covariance, as in `UnscentedView::project`: half differences of each
+    // pair, and distances of each pair's middle from the mean.
     let half = splat(0.5 / 3.0_f32.sqrt());
     let mut root = [[splat(0.0); 2]; 6];
     for (axis, [ax, ay, bx, by]) in pairs.into_iter().enumerate() {
@@ -343,8 +345,9 @@ fn project_six_points<S: Simd>(
 
 /// The covariance of a root with six columns, and its determinant.
 ///
-/// With the rows x and y of the root, and `r = y - x (x·y)/(x·x)`, the part of y across x, the determinant is
-/// `(x·x)(r·r)`: a product of sums of squares, which f32 rounds no more than the sum of the squares of the 15 minors.
+/// With the rows x and y of the root, and `r = y - x (x·y)/(x·x)`, the part of y across x, the
+/// determinant is `(x·x)(r·r)`: a product of sums of squares, which f32 rounds no more than the sum
+/// of the squares of the 15 minors.
 #[inline(always)]
 fn moments_of_root<S: Simd>(simd: S, root: [[f32x16<S>; 2]; 6]) -> Moments<S> {
     let splat = |value: f32| f32x16::splat(simd, value);
@@ -368,12 +371,13 @@ fn add<S: Simd>((low, high): F64x16<S>, more: f32x16<S>) -> F64x16<S> {
     (low + more.0, high + more.1)
 }
 
-/// Depth of centres, in metres: computed in f64 and rounded to f32 once, since splats are blended in order of
-/// it.
+/// Depth of centres, in metres: computed in f64 and rounded to f32 once, since splats are blended
+/// in order of it.
 ///
-/// `at_end_m` are the centres in the camera's frame at the end of the exposure. The depth of a centre that is exposed
-/// earlier is that at its own moment: it is larger by the distance that the camera still moves until the end.
-/// `distance_m` is their distance from the camera then, rounded in every step.
+/// `at_end_m` are the centres in the camera's frame at the end of the exposure. The depth of a
+/// centre that is exposed earlier is that at its own moment: it is larger by the distance that the
+/// camera still moves until the end. `distance_m` is their distance from the camera then, rounded
+/// in every step.
 #[inline(always)]
 fn depth<S: Simd>(
     simd: S,
@@ -400,14 +404,15 @@ fn depth<S: Simd>(
     }
     let low = x.0.mul_add(x.0, y.0.mul_add(y.0, z.0 * z.0));
     let high = x.1.mul_add(x.1, y.1.mul_add(y.1, z.1 * z.1));
-    // A step of Newton's method from the f32 distance: its error, squared, is below the resolution of f32.
+    // A step of Newton's method from the f32 distance: its error, squared, is below the resolution
+    // of f32.
     let (near_low, near_high) = distance_m.widen();
     let off = (low - near_low * near_low).narrow(high - near_high * near_high);
     off.mul_add(f32x16::splat(simd, 0.5) / distance_m, distance_m)
 }
 
-/// Projects one Gaussian in f64 into its lane of `to`, and returns the vector from the camera to its centre,
-/// in world axes, in metres; `None` if it cannot be seen.
+/// Projects one Gaussian in f64 into its lane of `to`, and returns the vector from the camera to
+/// its centre, in world axes, in metres; `None` if it cannot be seen.
 #[inline(always)]
 fn project_one(
     columns: &[Lanes],

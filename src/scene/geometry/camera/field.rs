@@ -4,20 +4,22 @@ use glam::{DVec2, DVec3};
 
 use super::{Camera, Lens, WIDEST_RAD};
 
-/// The columns of each row that lie within a lens' field, for cameras whose field does not cover the image.
+/// The columns of each row that lie within a lens' field, for cameras whose field does not cover
+/// the image.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FieldMask {
-    /// First column and the column after the last, for each row; equal where no column is in the field.
+    /// First column and the column after the last, for each row; equal where no column is in the
+    /// field.
     pub columns: Vec<[u32; 2]>,
 }
 
 impl FieldMask {
-    /// The mask of a camera; `None` if the field covers the whole image, as for most cameras. That test takes
-    /// some microseconds.
+    /// The mask of a camera; `None` if the field covers the whole image, as for most cameras. That
+    /// test takes some microseconds.
     ///
-    /// The field of every model is a slightly deformed disc, so it has no holes and each row of it is one
-    /// interval.
-    pub fn of(camera: &Camera) -> Option<Self> {
+    /// The field of every model is a slightly deformed disc, so it has no holes and each row of it
+    /// is one interval.
+    pub fn from_camera(camera: &Camera) -> Option<Self> {
         let sees = |column: u32, row: u32| {
             let at_px = DVec2::new(f64::from(column) + 0.5, f64::from(row) + 0.5);
             camera.unproject(at_px).is_some()
@@ -46,7 +48,8 @@ impl FieldMask {
         seen as f64 / camera.pixels() as f64
     }
 
-    /// Sets pixels outside of the field to the default value. `image` has `values` values per pixel.
+    /// Sets pixels outside of the field to the default value. `image` has `values` values per
+    /// pixel.
     pub fn clear_outside<T: Default + Clone>(
         &self,
         camera: &Camera,
@@ -75,7 +78,8 @@ fn border(camera: &Camera) -> impl Iterator<Item = [u32; 2]> {
     })
 }
 
-/// The column nearest to `end` that is in the field, by bisection between `end` and `seen`, which is in it.
+/// The column nearest to `end` that is in the field, by bisection between `end` and `seen`, which
+/// is in it.
 fn edge(end: u32, seen: u32, sees: impl Fn(u32) -> bool) -> u32 {
     if sees(end) {
         return end;
@@ -93,14 +97,14 @@ fn edge(end: u32, seen: u32, sees: impl Fn(u32) -> bool) -> u32 {
     within
 }
 
-/// Bounds of a camera's projection around its axis, from which culling decides whether a Gaussian may be
-/// visible.
+/// Bounds of a camera's projection around its axis, from which culling decides whether a Gaussian
+/// may be visible.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FieldCone {
     /// Every pixel's ray is within this angle of the axis, in radians.
     pub image_rad: f64,
-    /// Beyond [`FieldCone::image_rad`], the distance from the principal point grows by at least this many
-    /// pixels per radian.
+    /// Beyond [`FieldCone::image_rad`], the distance from the principal point grows by at least
+    /// this many pixels per radian.
     pub least_px_per_rad: f64,
     /// Bounds of the scale within cones around the axis, from the narrowest to [`WIDEST_RAD`].
     pub scales: [ScaleWithin; FieldCone::SCALES],
@@ -123,14 +127,15 @@ impl FieldCone {
     /// Number of cones in [`FieldCone::scales`].
     pub const SCALES: usize = 5;
 
-    /// Angles by which these cones are wider than the image, in radians, except for the last. Most Gaussians that are
-    /// culled lie just outside of the image, where a pinhole of 100° has 3 times the scale that it has on its axis; at
-    /// the end of its continuation it has 17 times that scale.
+    /// Angles by which these cones are wider than the image, in radians, except for the last. Most
+    /// Gaussians that are culled lie just outside of the image, where a pinhole of 100° has 3 times
+    /// the scale that it has on its axis; at the end of its continuation it has 17 times that
+    /// scale.
     const WIDER_RAD: [f64; Self::SCALES - 1] = [0.05, 0.15, 0.35, 0.7];
 
-    /// Bounds of a camera from a thousand samples of its projection, with a margin of a fifth for what lies
-    /// between samples.
-    pub fn of(camera: &Camera) -> Self {
+    /// Bounds of a camera from a thousand samples of its projection, with a margin of a fifth for
+    /// what lies between samples.
+    pub fn from_camera(camera: &Camera) -> Self {
         let axis_px = DVec2::new(camera.pinhole.cx, camera.pinhole.cy);
         let corner_px = axis_px.abs().max((camera.size_px() - axis_px).abs()).length();
         let step_rad = WIDEST_RAD / f64::from(Self::STEPS);
@@ -174,10 +179,8 @@ impl FieldCone {
             let step = ((rad / step_rad).ceil() as usize).min(Self::STEPS as usize);
             ScaleWithin { rad, most_px_per_rad: 1.2 * most_px_per_rad[step] }
         });
-        let least_px_per_rad = match least_px_per_rad.is_finite() {
-            true => (0.8 * least_px_per_rad).max(0.0),
-            false => 0.0,
-        };
+        let least_px_per_rad =
+            if least_px_per_rad.is_finite() { (0.8 * least_px_per_rad).max(0.0) } else { 0.0 };
         Self { image_rad, least_px_per_rad, scales }
     }
 }

@@ -1,13 +1,13 @@
-//! OpenCV's fisheye model: the distance from the principal point is a polynomial of the angle off the axis,
-//! not of its tangent.
+//! OpenCV's fisheye model: the distance from the principal point is a polynomial of the angle off
+//! the axis, not of its tangent.
 
 use glam::{DVec2, DVec3};
 
 use super::monotone::{MonotonePolynomial, TERMS};
 use super::{CameraError, WIDEST_RAD};
 
-/// `r = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)` for the angle θ off the axis; r is the distance from the
-/// principal point in focal lengths (Kannala and Brandt 2006; OpenCV's `fisheye` module).
+/// `r = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)` for the angle θ off the axis; r is the distance from
+/// the principal point in focal lengths (Kannala and Brandt 2006; OpenCV's `fisheye` module).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Fisheye {
     k: [f64; 4],
@@ -16,8 +16,8 @@ pub struct Fisheye {
 }
 
 impl Fisheye {
-    /// A lens with coefficients k1 to k4. Its field ends at `max_angle_rad` off the axis, or where the
-    /// polynomial stops rising, whichever is less.
+    /// A lens with coefficients k1 to k4. Its field ends at `max_angle_rad` off the axis, or where
+    /// the polynomial stops rising, whichever is less.
     pub fn new(k: [f64; 4], max_angle_rad: Option<f64>) -> Self {
         let mut coefficients = [0.0; TERMS];
         coefficients[1] = 1.0;
@@ -38,8 +38,8 @@ impl Fisheye {
         self.max_angle_rad
     }
 
-    /// The polynomial: distance from the principal point in focal lengths, by the angle off the axis in
-    /// radians.
+    /// The polynomial: distance from the principal point in focal lengths, by the angle off the
+    /// axis in radians.
     pub fn radius(&self) -> &MonotonePolynomial {
         &self.radius
     }
@@ -55,8 +55,8 @@ impl Fisheye {
         super::check_field("lens", self.limit_rad())
     }
 
-    /// Projects a direction, in focal lengths from the principal point; extrapolates linearly in the angle
-    /// beyond the limit.
+    /// Projects a direction, in focal lengths from the principal point; extrapolates linearly in
+    /// the angle beyond the limit.
     #[inline(always)]
     pub(super) fn plane(&self, direction: DVec3) -> DVec2 {
         radial(direction, |angle_rad| self.radius.at(angle_rad), self.radius.slope(0.0))
@@ -68,8 +68,8 @@ impl Fisheye {
     }
 }
 
-/// `r(θ)` along the azimuth of a direction; `central` is the slope of `r` at 0, used where the direction is
-/// so close to the axis that the azimuth is numerically undefined.
+/// `r(θ)` along the azimuth of a direction; `central` is the slope of `r` at 0, used where the
+/// direction is so close to the axis that the azimuth is numerically undefined.
 #[inline(always)]
 pub(super) fn radial(direction: DVec3, r: impl Fn(f64) -> f64, central: f64) -> DVec2 {
     let off_axis = direction.truncate().length();
@@ -79,9 +79,9 @@ pub(super) fn radial(direction: DVec3, r: impl Fn(f64) -> f64, central: f64) -> 
     azimuth(direction) * r(off_axis.atan2(direction.z))
 }
 
-/// The unit vector perpendicular to the axis that points towards a direction. Straight behind the camera it
-/// is undefined; within 0.001 rad of that it fades to zero, so that the projection of a Gaussian across that
-/// point stays continuous.
+/// The unit vector perpendicular to the axis that points towards a direction. Straight behind the
+/// camera it is undefined; within 0.001 rad of that it fades to zero, so that the projection of a
+/// Gaussian across that point stays continuous.
 #[inline(always)]
 pub(super) fn azimuth(direction: DVec3) -> DVec2 {
     let least = (-1e-3 * direction.z).max(1e-300);

@@ -10,8 +10,8 @@ use super::monotone::{MonotonePolynomial, TERMS};
 /// `pixel = [[c, d], [e, 1]] r(θ) (x, y)/|(x, y)| + principal point`, for the angle
 /// `θ = atan2(|(x, y)|, z)` (NVIDIA's public description of its vehicle cameras).
 ///
-/// Calibrations give two polynomials: one is exact (the reference), the other approximates its inverse. Only
-/// the reference is kept here; it is inverted with Newton's method.
+/// Calibrations give two polynomials: one is exact (the reference), the other approximates its
+/// inverse. Only the reference is kept here; it is inverted with Newton's method.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FTheta {
     reference: FThetaReference,
@@ -32,11 +32,12 @@ pub enum FThetaReference {
 }
 
 impl FTheta {
-    /// Largest distance from the principal point, in pixels, so that powers of pixels stay within f64.
+    /// Largest distance from the principal point, in pixels, so that powers of pixels stay within
+    /// f64.
     const MOST_PX: f64 = 65_536.0;
 
-    /// A lens from the coefficients of powers 0 to 5 (radians and pixels), `[c, d, e]`, and the limit of its
-    /// field in radians off the axis.
+    /// A lens from the coefficients of powers 0 to 5 (radians and pixels), `[c, d, e]`, and the
+    /// limit of its field in radians off the axis.
     pub fn new(
         reference: FThetaReference,
         polynomial: [f64; 6],
@@ -91,8 +92,8 @@ impl FTheta {
         DVec2::new(self.linear_cde[0], 1.0) * self.central_px()
     }
 
-    /// `r(θ)`: distance from the principal point in pixels, before `[[c, d], [e, 1]]`, of an angle off the
-    /// axis in radians.
+    /// `r(θ)`: distance from the principal point in pixels, before `[[c, d], [e, 1]]`, of an angle
+    /// off the axis in radians.
     #[inline(always)]
     pub fn radius_px(&self, angle_rad: f64) -> f64 {
         match self.reference {
@@ -152,8 +153,8 @@ impl FTheta {
         super::check_field("lens", self.limit_rad())
     }
 
-    /// Projects a direction, in pixels from the principal point; extrapolates linearly in the angle beyond
-    /// the limit.
+    /// Projects a direction, in pixels from the principal point; extrapolates linearly in the angle
+    /// beyond the limit.
     #[inline(always)]
     pub(super) fn offset_px(&self, direction: DVec3) -> DVec2 {
         self.linear() * radial(direction, |angle| self.radius_px(angle), self.central_px())

@@ -37,7 +37,6 @@ pub struct Intrinsics {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "model", rename_all = "lowercase", deny_unknown_fields)]
 pub enum LensFields {
-    /// OpenCV's distortion.
     Opencv {
         /// k1 to k6.
         k: [f64; 6],
@@ -48,15 +47,14 @@ pub enum LensFields {
         #[serde(default)]
         s: [f64; 4],
     },
-    /// OpenCV's fisheye.
     Fisheye {
         /// k1 to k4.
         k: [f64; 4],
-        /// Limit of the field, in radians off the axis; by default where the polynomial stops rising.
+        /// Limit of the field, in radians off the axis; by default where the polynomial stops
+        /// rising.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         max_angle: Option<f64>,
     },
-    /// NVIDIA's f-theta.
     Ftheta {
         /// The direction of the polynomial.
         reference: FThetaReference,
@@ -105,14 +103,14 @@ impl Intrinsics {
     }
 
     /// The intrinsics of a camera.
-    pub fn of(camera: &Camera) -> Self {
+    pub fn from_camera(camera: &Camera) -> Self {
         let Pinhole { fx, fy, cx, cy } = camera.pinhole;
         Self {
             size_px: [camera.width_px, camera.height_px],
             focal_px: [Some(fx), Some(fy)],
             center_px: [cx, cy],
-            lens: LensFields::of(&camera.lens),
-            windshield: camera.windshield.as_ref().map(WindshieldFields::of),
+            lens: LensFields::from_lens(&camera.lens),
+            windshield: camera.windshield.as_ref().map(WindshieldFields::from_windshield),
             native_size_px: camera.native_size_px.map(|size_px| size_px.to_array()),
         }
     }
@@ -129,7 +127,7 @@ impl LensFields {
         }
     }
 
-    fn of(lens: &Lens) -> Option<Self> {
+    fn from_lens(lens: &Lens) -> Option<Self> {
         Some(match lens {
             Lens::Pinhole => return None,
             Lens::OpenCv(lens) => Self::Opencv { k: lens.k(), p: lens.p(), s: lens.s() },
@@ -151,7 +149,7 @@ impl WindshieldFields {
         Ok(Windshield::new(self.reference, horizontal, vertical))
     }
 
-    fn of(windshield: &Windshield) -> Self {
+    fn from_windshield(windshield: &Windshield) -> Self {
         Self {
             reference: windshield.reference(),
             horizontal: windshield.horizontal().coefficients().to_vec(),

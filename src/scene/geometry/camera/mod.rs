@@ -1,24 +1,25 @@
 //! Camera models, one file each.
 //!
-//! A direction in the camera frame is refracted by the windshield, if there is one, and then projected by the
-//! lens to a pixel. Each lens has a valid field that ends before the image would fold back; pixels outside of
-//! it are not drawn.
+//! A direction in the camera frame is refracted by the windshield, if there is one, and then
+//! projected by the lens to a pixel. Each lens has a valid field that ends before the image would
+//! fold back; pixels outside of it are not drawn.
 //!
 //! # Extrapolation beyond the field
-//! The projection of a Gaussian needs points of it that may lie outside of the field, where the model folds
-//! back or is undefined. There it is continued linearly in the angle ([`Camera::project_extrapolated`]). The
-//! limit belongs to the lens and not to the image, so that rendering a part of an image gives the same pixels
-//! as the whole, except for images that reach beyond 73° off the axis with a model of slopes (pinhole, OpenCV).
-//! These are continued linearly from slope 4, 76° off the axis, or from the farthest corner. With a limit of
-//! 8, where slopes rise by 65 per radian, a road below the camera was torn into splats that reached into the
-//! image: 42 dB behind a windshield and 28 dB with a shutter that rolls from the right, instead of 47 to
-//! 49 dB. Pixels outside of the field are masked in the final image ([`FieldMask`]), since no bound on splats
-//! keeps them empty.
+//! The projection of a Gaussian needs points of it that may lie outside of the field, where the
+//! model folds back or is undefined. There it is continued linearly in the angle
+//! ([`Camera::project_extrapolated`]). The limit belongs to the lens and not to the image, so that
+//! rendering a part of an image gives the same pixels as the whole, except for images that reach
+//! beyond 73° off the axis with a model of slopes (pinhole, OpenCV). These are continued linearly
+//! from slope 4, 76° off the axis, or from the farthest corner. With a limit of 8, where slopes
+//! rise by 65 per radian, a road below the camera was torn into splats that reached into the image:
+//! 42 dB behind a windshield and 28 dB with a shutter that rolls from the right, instead of 47 to
+//! 49 dB. Pixels outside of the field are masked in the final image ([`FieldMask`]), since no bound
+//! on splats keeps them empty.
 //!
 //! # Depth
-//! Depth is the distance to the camera for lenses that may see 90° and more (fisheye, f-theta), where z is
-//! neither an order nor a distance. It is z for pinhole and OpenCV lenses, so that a small distortion changes
-//! little.
+//! Depth is the distance to the camera for lenses that may see 90° and more (fisheye, f-theta),
+//! where z is neither an order nor a distance. It is z for pinhole and OpenCV lenses, so that a
+//! small distortion changes little.
 
 pub mod field;
 pub mod fisheye;
@@ -41,9 +42,9 @@ pub use pinhole::Pinhole;
 pub use shutter::{Shutter, ShutterDirection};
 pub use windshield::{Bivariate, Windshield, WindshieldReference};
 
-/// Upper limit of the field of every lens, in radians off the axis: 160°. Towards 180° a whole ring of pixels
-/// shows almost the same direction, so that pixels per radian around the ring grow without bound; at 160°
-/// they are three times those along the radius.
+/// Upper limit of the field of every lens, in radians off the axis: 160°. Towards 180° a whole ring
+/// of pixels shows almost the same direction, so that pixels per radian around the ring grow
+/// without bound; at 160° they are three times those along the radius.
 pub const WIDEST_RAD: f64 = 2.8;
 
 /// The intrinsics of a camera: an image size and the model that maps directions to pixels.
@@ -75,27 +76,25 @@ pub struct Camera {
     pub height_px: u32,
     /// Focal lengths at the axis, and the principal point.
     pub pinhole: Pinhole,
-    /// The lens model.
     pub lens: Lens,
     /// The windshield in front of the lens.
     pub windshield: Option<Windshield>,
-    /// The image's width and height in pixels of the native image, that is, at the size at which the camera
-    /// takes images and twins are trained; `None` if that is its own size. An image below its native size is
-    /// rendered as the native image shrunk ([`Camera::native_scale`]).
+    /// The image's width and height in pixels of the native image, that is, at the size at which
+    /// the camera takes images and twins are trained; `None` if that is its own size. An image
+    /// below its native size is rendered as the native image shrunk ([`Camera::native_scale`]).
     pub native_size_px: Option<DVec2>,
 }
 
 /// How a lens maps the angle off its axis to the image.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub enum Lens {
-    /// No distortion: the distance from the principal point is proportional to the tangent of the angle.
+    /// No distortion: the distance from the principal point is proportional to the tangent of the
+    /// angle.
     #[default]
     Pinhole,
     /// OpenCV's radial, tangential and thin prism distortion.
     OpenCv(OpenCv),
-    /// OpenCV's fisheye.
     Fisheye(Fisheye),
-    /// NVIDIA's f-theta.
     FTheta(FTheta),
 }
 
@@ -117,7 +116,6 @@ pub enum CameraError {
     Intrinsic {
         /// `fx`, `lens.k`, `windshield` and so on.
         field: &'static str,
-        /// The refused value.
         value: f64,
         /// The values that are accepted.
         must: &'static str,
@@ -135,11 +133,8 @@ pub enum CameraError {
     Crop {
         /// First column, in pixels.
         left: u64,
-        /// First row.
         top: u64,
-        /// Columns.
         width: u64,
-        /// Rows.
         height: u64,
         /// Width of the image, in pixels.
         of_width: u32,
@@ -161,8 +156,8 @@ impl CameraError {
 }
 
 impl Camera {
-    /// Largest accepted width or height, in pixels: enough for 16 K panoramas, and tile coordinates fit
-    /// 16 bits.
+    /// Largest accepted width or height, in pixels: enough for 16 K panoramas, and tile coordinates
+    /// fit 16 bits.
     pub const MAX_SIDE_PX: u32 = 16_384;
 
     /// Smallest accepted share of the image that is within the lens' field.
@@ -239,8 +234,8 @@ impl Camera {
         self.lens == Lens::Pinhole && self.windshield.is_none()
     }
 
-    /// Projects a camera-space point, in metres, to pixels, possibly outside of the image. `None` outside of
-    /// the valid field.
+    /// Projects a camera-space point, in metres, to pixels, possibly outside of the image. `None`
+    /// outside of the valid field.
     pub fn project(&self, point_m: DVec3) -> Option<DVec2> {
         let inside = self.inside(point_m);
         let off_axis = inside.truncate().length();
@@ -254,21 +249,21 @@ impl Camera {
         seen.then(|| self.land(inside, OpenCv::MOST_SLOPE))
     }
 
-    /// Projects a camera-space point, in metres, to pixels. Beyond its field the model is continued linearly
-    /// in the angle, at the rate that it has at the limit. Used for the shape of Gaussians that reach into the
-    /// field from outside.
+    /// Projects a camera-space point, in metres, to pixels. Beyond its field the model is continued
+    /// linearly in the angle, at the rate that it has at the limit. Used for the shape of Gaussians
+    /// that reach into the field from outside.
     #[inline(always)]
     pub fn project_extrapolated(&self, point_m: DVec3) -> DVec2 {
         self.land(self.inside(point_m), self.extrapolation_slope())
     }
 
-    /// The slope (tangent of the angle off the axis) from which pinhole and OpenCV lenses are extrapolated
-    /// linearly in the angle: 4, 76° off the axis, or the slope of the farthest corner of the image if that is
-    /// larger, at most 8.
+    /// The slope (tangent of the angle off the axis) from which pinhole and OpenCV lenses are
+    /// extrapolated linearly in the angle: 4, 76° off the axis, or the slope of the farthest corner
+    /// of the image if that is larger, at most 8.
     ///
-    /// The slope's derivative by the angle is `1 + slope²`. With a limit of 8, geometry far off the axis, such
-    /// as the road below the camera, was torn into splats of some hundred pixels that reached into the image.
-    /// With 4 none did.
+    /// The slope's derivative by the angle is `1 + slope²`. With a limit of 8, geometry far off the
+    /// axis, such as the road below the camera, was torn into splats of some hundred pixels that
+    /// reached into the image. With 4 none did.
     #[inline(always)]
     pub fn extrapolation_slope(&self) -> f64 {
         let Pinhole { fx, fy, cx, cy } = self.pinhole;
@@ -278,8 +273,8 @@ impl Camera {
         (corner / OpenCv::LEAST_FACTOR).clamp(4.0, OpenCv::MOST_SLOPE)
     }
 
-    /// The unit direction in the camera frame that projects to an image position, in pixels. `None` outside
-    /// of the valid field.
+    /// The unit direction in the camera frame that projects to an image position, in pixels. `None`
+    /// outside of the valid field.
     pub fn unproject(&self, at_px: DVec2) -> Option<DVec3> {
         let Pinhole { fx, fy, cx, cy } = self.pinhole;
         let offset_px = at_px - DVec2::new(cx, cy);
@@ -296,8 +291,8 @@ impl Camera {
         })
     }
 
-    /// Depth of a camera-space point, in metres: its distance for lenses that may see 90° and more (fisheye,
-    /// f-theta), its z for all others.
+    /// Depth of a camera-space point, in metres: its distance for lenses that may see 90° and more
+    /// (fisheye, f-theta), its z for all others.
     #[inline(always)]
     pub fn depth_m(&self, point_m: DVec3) -> f64 {
         if self.depth_is_distance() { point_m.length() } else { point_m.z }
@@ -324,15 +319,15 @@ impl Camera {
         DVec2::new(f64::from(self.width_px), f64::from(self.height_px))
     }
 
-    /// Sides of the image as shares of those of the native image, at most 1: an image that is larger than the
-    /// native one is rendered like a native one.
+    /// Sides of the image as shares of those of the native image, at most 1: an image that is
+    /// larger than the native one is rendered like a native one.
     pub fn native_scale(&self) -> DVec2 {
         let native_px = self.native_size_px.unwrap_or(self.size_px());
         (self.size_px() / native_px).min(DVec2::ONE)
     }
 
-    /// The camera with the same field of view and a different image size, in pixels. The native size stays
-    /// what it was.
+    /// The camera with the same field of view and a different image size, in pixels. The native
+    /// size stays what it was.
     ///
     /// # Errors
     /// The size or the scaled intrinsics are out of range.
@@ -389,8 +384,8 @@ impl Camera {
         }
     }
 
-    /// Projects a direction behind the windshield to pixels. Models of slopes are extrapolated linearly in the
-    /// angle from slope `straight` on.
+    /// Projects a direction behind the windshield to pixels. Models of slopes are extrapolated
+    /// linearly in the angle from slope `straight` on.
     #[inline(always)]
     fn land(&self, inside: DVec3, straight: f64) -> DVec2 {
         let Pinhole { fx, fy, cx, cy } = self.pinhole;
@@ -404,8 +399,8 @@ impl Camera {
         }
     }
 
-    /// The largest angle off the axis of the image's corners behind the windshield, in radians. Corners
-    /// outside of the lens' field count with the limit of the field.
+    /// The largest angle off the axis of the image's corners behind the windshield, in radians.
+    /// Corners outside of the lens' field count with the limit of the field.
     pub fn corner_rad(&self) -> f64 {
         let bare = Self { windshield: None, ..*self };
         let corners = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]];
@@ -416,7 +411,8 @@ impl Camera {
         angles_rad.into_iter().fold(0.0, f64::max)
     }
 
-    /// The focal lengths of an f-theta lens follow from its polynomial; given ones must agree with these.
+    /// The focal lengths of an f-theta lens follow from its polynomial; given ones must agree with
+    /// these.
     fn check_focal_px(&self, lens: &FTheta) -> Result<(), CameraError> {
         let DVec2 { x, y } = lens.focal_px();
         for (field, value, derived) in [("fx", self.pinhole.fx, x), ("fy", self.pinhole.fy, y)] {
@@ -447,7 +443,8 @@ fn sides(width: u64, height: u64) -> Result<[u32; 2], CameraError> {
     Ok([side("width", width)?, side("height", height)?])
 }
 
-/// Largest accepted magnitude of a coefficient. Calibrations in pixels reach 1e5; larger is a mistake.
+/// Largest accepted magnitude of a coefficient. Calibrations in pixels reach 1e5; larger is a
+/// mistake.
 const MAX_COEFFICIENT: f64 = 1e9;
 
 fn check_numbers(field: &'static str, numbers: &[f64]) -> Result<(), CameraError> {
@@ -471,8 +468,8 @@ fn check_max_angle(max_angle_rad: Option<f64>) -> Result<(), CameraError> {
     }
 }
 
-/// Smallest accepted field, in radians off the axis. A smaller one means a polynomial that falls from the
-/// start.
+/// Smallest accepted field, in radians off the axis. A smaller one means a polynomial that falls
+/// from the start.
 const LEAST_FIELD_RAD: f64 = 1e-3;
 
 fn check_field(field: &'static str, value: f64) -> Result<(), CameraError> {

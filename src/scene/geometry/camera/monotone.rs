@@ -12,12 +12,12 @@ pub struct MonotonePolynomial {
 }
 
 impl MonotonePolynomial {
-    /// The range ends where the slope falls below this share of the slope at 0. A pixel there covers fifty
-    /// times the angle of one in the centre; farther out the image would fold back.
+    /// The range ends where the slope falls below this share of the slope at 0. A pixel there
+    /// covers fifty times the angle of one in the centre; farther out the image would fold back.
     const LEAST_SLOPE: f64 = 0.02;
 
-    /// Number of steps in which the end of the range is searched before it is bisected to the last bit. It
-    /// is large because the slope of a polynomial of degree 9 may have eight zeros.
+    /// Number of steps in which the end of the range is searched before it is bisected to the last
+    /// bit. It is large because the slope of a polynomial of degree 9 may have eight zeros.
     const STEPS: u32 = 2048;
 
     /// The polynomial on the largest range `0..=end` within `0..=most` on which it rises.
@@ -49,7 +49,8 @@ impl MonotonePolynomial {
         (1..TERMS).rev().fold(0.0, |sum, k| sum * x + k as f64 * self.coefficients[k])
     }
 
-    /// The inverse: the `x` with value `y`, for `y` of at least 0; beyond the end that of the tangent.
+    /// The inverse: the `x` with value `y`, for `y` of at least 0; beyond the end that of the
+    /// tangent.
     pub fn invert(&self, y: f64) -> f64 {
         let top = self.at(self.end);
         let beyond = y >= top;
@@ -71,11 +72,11 @@ impl MonotonePolynomial {
     }
 }
 
-/// The `x` in `0..=end` at which a rising function has a value; `end` if it does not reach it. `at` gives the
-/// function's value and slope.
+/// The `x` in `0..=end` at which a rising function has a value; `end` if it does not reach it. `at`
+/// gives the function's value and slope.
 ///
-/// Newton's method from `first`, safeguarded by bisection: a step that would leave the bracket is replaced by
-/// the bracket's midpoint. It ends when a step is below `tolerance * end`.
+/// Newton's method from `first`, safeguarded by bisection: a step that would leave the bracket is
+/// replaced by the bracket's midpoint. It ends when a step is below `tolerance * end`.
 pub(super) fn invert_monotone(
     value: f64,
     first: f64,
@@ -105,8 +106,8 @@ pub(super) fn invert_monotone(
     x
 }
 
-/// The largest `x` in `0..=most` such that a condition, which holds at 0, holds on `0..=x`: the first of
-/// `steps` steps that violates it, refined by bisection.
+/// The largest `x` in `0..=most` such that a condition, which holds at 0, holds on `0..=x`: the
+/// first of `steps` steps that violates it, refined by bisection.
 pub(super) fn largest_valid(holds: impl Fn(f64) -> bool, most: f64, steps: u32) -> f64 {
     let at = |step: u32| most * f64::from(step) / f64::from(steps);
     let Some(first_not) = (1..=steps).find(|&step| !holds(at(step))) else { return most };

@@ -18,22 +18,22 @@ pub struct OpenCv {
 }
 
 impl OpenCv {
-    /// Largest slope of a ray: 82.9° off the axis, where one radian is `1 + 8²` = 65 times as many pixels as
-    /// at the axis.
+    /// Largest slope of a ray: 82.9° off the axis, where one radian is `1 + 8²` = 65 times as many
+    /// pixels as at the axis.
     pub(super) const MOST_SLOPE: f64 = 8.0;
 
-    /// Smallest radial factor `icD`. A smaller one means that the calibration is used outside of the range
-    /// that it was made for (gsplat has the same bound).
+    /// Smallest radial factor `icD`. A smaller one means that the calibration is used outside of
+    /// the range that it was made for (gsplat has the same bound).
     pub(super) const LEAST_FACTOR: f64 = 0.8;
 
-    /// Smallest derivative of the distortion in any direction, as a share of that at the axis (the same for
-    /// every lens model).
+    /// Smallest derivative of the distortion in any direction, as a share of that at the axis (the
+    /// same for every lens model).
     const LEAST_RISE: f64 = 0.02;
 
-    /// Largest derivative of the distortion in any direction, as a multiple of that at the axis. A larger one
-    /// means that a rational lens is close to a pole, where Gaussians that reach there would be torn over the
-    /// image. For a lens with a pole, the image agrees with per-pixel rays to 49 dB at 8, 33 dB at 16 and 15 dB
-    /// at 50; an Azure Kinect stays below 2.
+    /// Largest derivative of the distortion in any direction, as a multiple of that at the axis. A
+    /// larger one means that a rational lens is close to a pole, where Gaussians that reach there
+    /// would be torn over the image. For a lens with a pole, the image agrees with per-pixel rays
+    /// to 49 dB at 8, 33 dB at 16 and 15 dB at 50; an Azure Kinect stays below 2.
     const MOST_RISE: f64 = 8.0;
 
     /// Number of steps in which the limit is searched.
@@ -74,11 +74,12 @@ impl OpenCv {
         self.s
     }
 
-    /// Limit of the field, as the slope (tangent) of the angle off the axis: the largest slope, at most 8, up
-    /// to which `icD` is above 0.8 and the derivative of the distortion is within its bounds.
+    /// Limit of the field, as the slope (tangent) of the angle off the axis: the largest slope, at
+    /// most 8, up to which `icD` is above 0.8 and the derivative of the distortion is within its
+    /// bounds.
     ///
-    /// Up to there `distort` is monotone: `(distort(b) - distort(a)) . (b - a) > 0` for any two slopes, since
-    /// the symmetric part of its Jacobian is positive definite on the whole disc.
+    /// Up to there `distort` is monotone: `(distort(b) - distort(a)) . (b - a) > 0` for any two
+    /// slopes, since the symmetric part of its Jacobian is positive definite on the whole disc.
     pub fn limit_slope(&self) -> f64 {
         self.limit_slope
     }
@@ -103,8 +104,8 @@ impl OpenCv {
         }
     }
 
-    /// Projects a direction, in focal lengths from the principal point. Beyond the limit, or beyond slope
-    /// `straight` if that is less, it extrapolates linearly in the angle.
+    /// Projects a direction, in focal lengths from the principal point. Beyond the limit, or beyond
+    /// slope `straight` if that is less, it extrapolates linearly in the angle.
     #[inline(always)]
     pub(super) fn plane(&self, direction: DVec3, straight: f64) -> DVec2 {
         let end = straight.min(self.limit_slope);
@@ -123,8 +124,8 @@ impl OpenCv {
     /// The unit direction that projects to `plane`, or `None` beyond the limit.
     pub(super) fn direction(&self, plane: DVec2) -> Option<DVec3> {
         let most = self.limit_slope;
-        // Damped Newton's method. It starts at the inverse of only the radial part, and halves each step
-        // until it reduces the residual.
+        // Damped Newton's method. It starts at the inverse of only the radial part, and halves each
+        // step until it reduces the residual.
         let mut slope = plane.normalize_or_zero() * self.radial_slope(plane.length());
         let mut off = self.distort(slope) - plane;
         for _ in 0..32 {
@@ -172,11 +173,11 @@ impl OpenCv {
         [factor, factor + 2.0 * slope * slope * rise]
     }
 
-    /// Upper bounds of the derivatives of the tangential and of the prism distortion at a slope, over all
-    /// azimuths and directions.
+    /// Upper bounds of the derivatives of the tangential and of the prism distortion at a slope,
+    /// over all azimuths and directions.
     ///
-    /// The tangential part is the gradient of `(p2 x + p1 y) r²`, whose Hessian has eigenvalues of at most
-    /// `6 |p| r`. The Jacobian of the prism part is an outer product of two vectors.
+    /// The tangential part is the gradient of `(p2 x + p1 y) r²`, whose Hessian has eigenvalues of
+    /// at most `6 |p| r`. The Jacobian of the prism part is an outer product of two vectors.
     fn skew(&self, slope: f64) -> [f64; 2] {
         let [p1, p2] = self.p;
         let [s1, s2, s3, s4] = self.s;

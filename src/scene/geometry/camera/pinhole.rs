@@ -19,8 +19,8 @@ pub struct Pinhole {
 }
 
 impl Pinhole {
-    /// Larger focal lengths and principal points are refused as mistakes. They would also lose precision in
-    /// f32.
+    /// Larger focal lengths and principal points are refused as mistakes. They would also lose
+    /// precision in f32.
     const MAX_PX: f64 = 1e6;
 
     /// Checks the intrinsics.
@@ -45,9 +45,9 @@ impl Pinhole {
         Ok(())
     }
 
-    /// The slopes x/z and y/z of a direction. Where the slope exceeds `straight`, it is continued linearly in
-    /// the angle off the axis, also behind the camera, so that every direction has a finite slope. The rate
-    /// is that of the tangent: `d tan θ / dθ = 1 + tan² θ`.
+    /// The slopes x/z and y/z of a direction. Where the slope exceeds `straight`, it is continued
+    /// linearly in the angle off the axis, also behind the camera, so that every direction has a
+    /// finite slope. The rate is that of the tangent: `d tan θ / dθ = 1 + tan² θ`.
     #[inline(always)]
     pub(super) fn extrapolated_slope(direction: DVec3, straight: f64) -> DVec2 {
         let off_axis = direction.truncate().length();

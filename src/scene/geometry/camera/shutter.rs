@@ -11,8 +11,8 @@ use super::{Camera, CameraError};
 pub struct Shutter {
     /// The order of exposure.
     pub direction: ShutterDirection,
-    /// Time from the exposure of the first row to that of the last, in microseconds. The time of the image
-    /// is that of the last row.
+    /// Time from the exposure of the first row to that of the last, in microseconds. The time of
+    /// the image is that of the last row.
     pub duration_us: i64,
 }
 
@@ -49,8 +49,8 @@ impl Shutter {
 }
 
 impl ShutterDirection {
-    /// When an image position (in pixels) is exposed, as a fraction of the duration: 0 at the centre of the
-    /// first row, 1 at the centre of the last row, clamped to [0, 1].
+    /// When an image position (in pixels) is exposed, as a fraction of the duration: 0 at the
+    /// centre of the first row, 1 at the centre of the last row, clamped to [0, 1].
     #[inline(always)]
     pub fn fraction(self, at_px: DVec2, camera: &Camera) -> f64 {
         let along = |at_px: f64, size_px: u32| {

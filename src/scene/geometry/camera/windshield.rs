@@ -1,4 +1,5 @@
-//! A windshield in front of the lens: it refracts rays by two bivariate polynomials of their angles.
+//! A windshield in front of the lens: it refracts rays by two bivariate polynomials of their
+//! angles.
 
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
@@ -8,11 +9,11 @@ use super::CameraError;
 /// Number of coefficients of a bivariate polynomial of order 5, the highest supported.
 const MOST: usize = 21;
 
-/// The angles `φ = asin(x/|p|)`, `θ = asin(y/|p|)` of a ray outside become `h(φ, θ)`, `v(φ, θ)` inside, or the
-/// reverse (NVIDIA's public description of its bivariate windshield model).
+/// The angles `φ = asin(x/|p|)`, `θ = asin(y/|p|)` of a ray outside become `h(φ, θ)`, `v(φ, θ)`
+/// inside, or the reverse (NVIDIA's public description of its bivariate windshield model).
 ///
-/// Calibrations give polynomials for both directions; one pair is exact (the reference). Only that is kept
-/// here, and inverted by fixed-point iteration.
+/// Calibrations give polynomials for both directions; one pair is exact (the reference). Only that
+/// is kept here, and inverted by fixed-point iteration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Windshield {
     reference: WindshieldReference,
@@ -39,17 +40,17 @@ pub struct Bivariate {
 }
 
 impl Windshield {
-    /// The refraction fades out between these values of z of the unit direction: full above 0.15 (81° off the
-    /// axis), none below 0.05 (87°). Without a limit, the polynomials would refract rays far off the axis
-    /// arbitrarily; with an abrupt one, a Gaussian across it would be torn.
+    /// The refraction fades out between these values of z of the unit direction: full above 0.15
+    /// (81° off the axis), none below 0.05 (87°). Without a limit, the polynomials would refract
+    /// rays far off the axis arbitrarily; with an abrupt one, a Gaussian across it would be torn.
     pub const FADES_Z: [f64; 2] = [0.05, 0.15];
 
     /// Largest accepted refraction, in radians. Real windshields refract by 0.01.
     const MOST_RAD: f64 = 0.2;
 
-    /// Largest accepted change of the refraction between two rays, per angle between them. With 0.5 the
-    /// fixed-point inversion at least halves its error in each step. Real windshields have 0.02, and 0.26 far
-    /// above and below the image.
+    /// Largest accepted change of the refraction between two rays, per angle between them. With 0.5
+    /// the fixed-point inversion at least halves its error in each step. Real windshields have
+    /// 0.02, and 0.26 far above and below the image.
     const MOST_CHANGE: f64 = 0.5;
 
     /// Steps of the inversion: an error of 2^-52 at worst.
@@ -66,8 +67,8 @@ impl Windshield {
         windshield
     }
 
-    /// A bound of the angle by which a ray is refracted, in radians: the largest of a thousand samples, and a
-    /// fifth more for what lies between them.
+    /// A bound of the angle by which a ray is refracted, in radians: the largest of a thousand
+    /// samples, and a fifth more for what lies between them.
     pub fn most_rad(&self) -> f64 {
         self.most_rad
     }
@@ -101,8 +102,8 @@ impl Windshield {
         &self.vertical
     }
 
-    /// Checks the refraction of all rays within `corner_rad` of the axis, outside or inside. If it changes
-    /// slowly enough everywhere, no two rays are refracted to the same one.
+    /// Checks the refraction of all rays within `corner_rad` of the axis, outside or inside. If it
+    /// changes slowly enough everywhere, no two rays are refracted to the same one.
     pub(super) fn check(&self, corner_rad: f64) -> Result<(), CameraError> {
         super::check_numbers("windshield.horizontal", self.horizontal.coefficients())?;
         super::check_numbers("windshield.vertical", self.vertical.coefficients())?;
@@ -124,7 +125,8 @@ impl Windshield {
         Ok(())
     }
 
-    /// Checks the refraction at a ray's angles: its size, and its derivative by central differences.
+    /// Checks the refraction at a ray's angles: its size, and its derivative by central
+    /// differences.
     fn check_at(&self, at: DVec2) -> Result<(), CameraError> {
         let refused =
             |value, must| Err(CameraError::Intrinsic { field: "windshield", value, must });
@@ -184,8 +186,8 @@ impl Windshield {
         DVec3::new(x, y, (1.0 - x * x - y * y).max(0.0).sqrt()).normalize()
     }
 
-    /// The angles after refraction: those of the polynomials, blended with the unchanged angles where the
-    /// refraction fades out.
+    /// The angles after refraction: those of the polynomials, blended with the unchanged angles
+    /// where the refraction fades out.
     fn turned(&self, at: DVec2) -> DVec2 {
         let [none, all] = Self::FADES_Z;
         let share = ((z(at) - none) / (all - none)).clamp(0.0, 1.0);

@@ -1,10 +1,11 @@
 //! The order of frames: start-time fair queueing of the sessions, weighted by cost.
 //!
-//! Source: Goyal, Vin and Cheng, *Start-time fair queueing*, SIGCOMM 1996. Each frame has a start tag: the later of the
-//! queue's virtual time and the finish tag of its session's previous frame. Its finish tag is the start tag plus its
-//! cost. The frame with the smallest finish tag is next, and the virtual time becomes its start tag. So each session
-//! gets the same number of pixels, a small frame passes the large ones that wait, and no frame is passed for ever: the
-//! tags of later frames grow with the virtual time.
+//! Source: Goyal, Vin and Cheng, *Start-time fair queueing*, SIGCOMM 1996. Each frame has a start
+//! tag: the later of the queue's virtual time and the finish tag of its session's previous frame.
+//! Its finish tag is the start tag plus its cost. The frame with the smallest finish tag is next,
+//! and the virtual time becomes its start tag. So each session gets the same number of pixels, a
+//! small frame passes the large ones that wait, and no frame is passed for ever: the tags of later
+//! frames grow with the virtual time.
 
 use std::collections::BTreeMap;
 
@@ -81,7 +82,8 @@ mod tests {
 
     const ANY: u64 = u64::MAX;
 
-    /// Serves `frames` frames of sessions that always have one waiting. Returns how many each session got.
+    /// Serves `frames` frames of sessions that always have one waiting. Returns how many each
+    /// session got.
     fn served(costs: &[u64], frames: usize) -> Vec<usize> {
         let mut queue = FairQueue::default();
         let mut counts = vec![0; costs.len()];

@@ -1,15 +1,18 @@
 //! The queue of frames in front of the render threads.
 //!
-//! There are as many render threads as the backend keeps frames in flight. The cpu backend renders one, on all cores:
-//! two at once would take as long together and hold twice the memory. A GPU renders one frame while the previous one is
-//! encoded. Frames of the sessions are scheduled fairly ([`fair`]).
+//! There are as many render threads as the backend keeps frames in flight. The cpu backend renders
+//! one, on all cores: two at once would take as long together and hold twice the memory. A GPU
+//! renders one frame while the previous one is encoded. Frames of the sessions are scheduled fairly
+//! ([`fair`]).
 //!
-//! **A frame of seconds does not keep the others waiting.** While a large frame is rendered, another thread renders
-//! the small ones, if the backend can do both at once: the operating system shares the cores among them.
+//! **A frame of seconds does not keep the others waiting.** While a large frame is rendered,
+//! another thread renders the small ones, if the backend can do both at once: the operating system
+//! shares the cores among them.
 //!
-//! **A frame that cannot be ready in time is not started.** The time that large frames take per pixel is measured. A
-//! frame that cannot be done before its deadline is refused when it arrives, or when it is next: otherwise a server
-//! with too many large frames would discard most of its frames.
+//! **A frame that cannot be ready in time is not started.** The time that large frames take per
+//! pixel is measured. A frame that cannot be done before its deadline is refused when it arrives,
+//! or when it is next: otherwise a server with too many large frames would discard most of its
+//! frames.
 
 mod fair;
 mod scratch;
@@ -40,8 +43,8 @@ struct Job {
     work: Box<dyn FnOnce(&mut Scratch) + Send>,
 }
 
-/// The queue. On drop it waits for its render threads. Otherwise the last of them might drop the backend while the
-/// process exits, and NVIDIA's driver crashes then.
+/// The queue. On drop it waits for its render threads. Otherwise the last of them might drop the
+/// backend while the process exits, and NVIDIA's driver crashes then.
 pub(crate) struct RenderQueue {
     shared: Arc<Shared>,
 }
@@ -49,7 +52,8 @@ pub(crate) struct RenderQueue {
 struct Shared {
     backend: Arc<dyn Backend>,
     state: Mutex<State>,
-    /// Signalled when a frame arrives, when a large frame is started, and when the queue is dropped.
+    /// Signalled when a frame arrives, when a large frame is started, and when the queue is
+    /// dropped.
     changed: Condvar,
 }
 
@@ -59,7 +63,8 @@ struct State {
     is_closed: bool,
     /// Pixels of the large frames that are being rendered.
     rendering: u64,
-    /// Nanoseconds that a large frame takes per pixel: a moving average; 0 before the first large frame.
+    /// Nanoseconds that a large frame takes per pixel: a moving average; 0 before the first large
+    /// frame.
     ns_per_pixel: f64,
     /// Whether there is a thread for small frames.
     has_side_thread: bool,
@@ -69,7 +74,6 @@ struct State {
 /// Which frames a render thread takes.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Lane {
-    /// All of them.
     Main,
     /// Renders small frames while a large one is rendered.
     Side,
@@ -106,9 +110,9 @@ impl RenderQueue {
     ///
     /// # Errors
     /// [`SessionError::Busy`] if the queue is full, or earlier frames leave it no time;
-    /// [`SessionError::Crashed`] if `work` panicked; and [`SessionError::DeadlineExceeded`] if there is no
-    /// result by the deadline. Work that has not started by then never starts; work that has is finished, and
-    /// its result is discarded.
+    /// [`SessionError::Crashed`] if `work` panicked; and [`SessionError::DeadlineExceeded`] if
+    /// there is no result by the deadline. Work that has not started by then never starts; work
+    /// that has is finished, and its result is discarded.
     pub(crate) async fn run<T: Send + 'static>(
         &self,
         cost: FrameCost,
@@ -191,8 +195,8 @@ impl Shared {
                 return Err(SessionError::Busy { what: "pixels queued" });
             }
         }
-        // The thread is only useful if the backend can render two frames at once, and only needed once there is a
-        // large frame.
+        // The thread is only useful if the backend can render two frames at once, and only needed
+        // once there is a large frame.
         let needs_side_thread =
             state.rendering > 0 && !state.has_side_thread && self.backend.renders_beside();
         state.queue.push(cost, job);
@@ -327,7 +331,8 @@ mod tests {
                         running.most
                     };
                     running.lock().now += 1;
-                    // Wait for the others that should run now, and a little longer for one too many.
+                    // Wait for the others that should run now, and a little longer for one too
+                    // many.
                     while most() < frames_in_flight && begun.elapsed() < Duration::from_secs(10) {
                         std::thread::sleep(Duration::from_millis(1));
                     }

@@ -4,8 +4,8 @@ use wildcity_render::View;
 
 use crate::limits;
 
-/// Buffers that a render thread keeps between frames, so that no step allocates and zeroes them. A backend writes every
-/// value of an image, so what they held before does not matter.
+/// Buffers that a render thread keeps between frames, so that no step allocates and zeroes them. A
+/// backend writes every value of an image, so what they held before does not matter.
 #[derive(Debug, Default)]
 pub struct Scratch {
     /// RGB images that are encoded.
@@ -19,7 +19,8 @@ pub struct Scratch {
 }
 
 impl Scratch {
-    /// Frees buffers beyond [`limits::SCRATCH_BYTES`] in all: first those that the fewest frames need.
+    /// Frees buffers beyond [`limits::SCRATCH_BYTES`] in all: first those that the fewest frames
+    /// need.
     pub(crate) fn free_excess(&mut self) {
         let Self { images, opacity, depth_m, normals } = self;
         let mut left = limits::SCRATCH_BYTES;
@@ -30,13 +31,14 @@ impl Scratch {
     }
 }
 
-/// Buffers for one image of each view of a frame. There may be more of them, and larger ones, than the frame needs.
+/// Buffers for one image of each view of a frame. There may be more of them, and larger ones, than
+/// the frame needs.
 #[derive(Debug, Default)]
 pub(crate) struct Buffers<T>(Vec<Vec<T>>);
 
 impl<T: Copy + Default> Buffers<T> {
     /// A buffer for each view, with a number of values per pixel.
-    pub(crate) fn of_views(
+    pub(crate) fn for_views(
         &mut self,
         views: &[View],
         values_per_pixel: usize,
@@ -82,7 +84,7 @@ mod tests {
                 buffer.fill(9.0);
                 (buffer.len(), had_values)
             };
-            buffers.of_views(&views, values).map(counts).collect::<Vec<_>>()
+            buffers.for_views(&views, values).map(counts).collect::<Vec<_>>()
         };
         assert_eq!(sizes(&[4, 5], 1), [(4, false), (5, false)]);
         assert_eq!(sizes(&[2, 9, 3], 3), [(6, true), (27, true), (9, false)]);

@@ -1,4 +1,5 @@
-//! Closes an observation: appends what was encoded, names the tensors, and updates the frame history.
+//! Closes an observation: appends what was encoded, names the tensors, and updates the frame
+//! history.
 
 use std::mem;
 
@@ -30,24 +31,26 @@ pub(crate) struct RenderedObservation {
     pub(crate) hashes: Vec<blake3::Hash>,
     /// Result of the repair of each rendered image; empty unless the session asked for repair.
     pub(crate) repairs: Vec<ImageRepair>,
-    /// State of the repair after this observation. `None` without repair, and for poses that the ego is not at.
+    /// State of the repair after this observation. `None` without repair, and for poses that the
+    /// ego is not at.
     pub(crate) repair_state: Option<RepairState>,
     trusts: Vec<Option<Trust>>,
 }
 
 impl RenderedObservation {
-    /// The trusts of the rendered images, including images that only later observations show. Empty if the session's
-    /// images come without trust.
+    /// The trusts of the rendered images, including images that only later observations show. Empty
+    /// if the session's images come without trust.
     pub(crate) fn trusts(&self) -> impl Iterator<Item = f64> {
         self.trusts.iter().flatten().map(|trust| trust.value)
     }
 }
 
 impl ObservationBuilder {
-    /// Appends the encoded images and the earlier frames that the history has, and names every tensor.
+    /// Appends the encoded images and the earlier frames that the history has, and names every
+    /// tensor.
     ///
-    /// `history` has the frames of all earlier observations. Without it, as for `observe`, the observation
-    /// shows no earlier frames.
+    /// `history` has the frames of all earlier observations. Without it, as for `observe`, the
+    /// observation shows no earlier frames.
     pub(crate) fn finish(
         mut self,
         history: Option<FrameHistory>,
@@ -112,7 +115,8 @@ impl ObservationBuilder {
         shown
     }
 
-    /// When an image was taken by its camera's clock, in microseconds, and the effects of the camera on it.
+    /// When an image was taken by its camera's clock, in microseconds, and the effects of the
+    /// camera on it.
     fn delivered(
         &self,
         capture: &RigCapture,
@@ -202,8 +206,8 @@ impl ObservationBuilder {
         tensors
     }
 
-    /// Moves the images that later observations show into the history, appends images of earlier times that this one
-    /// shows, and drops images from the history that no later one shows.
+    /// Moves the images that later observations show into the history, appends images of earlier
+    /// times that this one shows, and drops images from the history that no later one shows.
     fn append_earlier_frames(
         &mut self,
         history: &mut FrameHistory,

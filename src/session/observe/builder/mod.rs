@@ -27,7 +27,8 @@ use crate::sensors::pixels::PixelEffects;
 
 use self::repair::{Finished, ObservationRepair, RenderedCapture};
 
-/// An observation that is being built: one capture after the other is rendered, then `finish` closes it.
+/// An observation that is being built: one capture after the other is rendered, then `finish`
+/// closes it.
 pub(crate) struct ObservationBuilder {
     layout: Arc<ObservationLayout>,
     budget: AnswerBudget,
@@ -48,7 +49,8 @@ pub(crate) struct ObservationBuilder {
     /// Where the next shown image's raw pixels go, in bytes from the buffer's start.
     raw_at: usize,
     captures: Vec<RigCapture>,
-    /// The images of all captures so far: capture by capture, and in each in the order of its cameras.
+    /// The images of all captures so far: capture by capture, and in each in the order of its
+    /// cameras.
     encoded: Vec<EncodedImage>,
     timings: Timings,
     residency: ResidencyStats,
@@ -68,9 +70,10 @@ impl ObservationBuilder {
         let EgoHistory { xyz_m, rotation, count } = episode.history();
         let history: [&[u8]; 2] = [bytemuck::bytes_of(&xyz_m), bytemuck::bytes_of(&rotation)];
         let mut history = history.concat();
-        let motion_samples = match captures.iter().any(|capture| capture.has_sensor_effects) {
-            true => add_motion(&mut history, &layout, episode),
-            false => [None; 2],
+        let motion_samples = if captures.iter().any(|capture| capture.has_sensor_effects) {
+            add_motion(&mut history, &layout, episode)
+        } else {
+            [None; 2]
         };
 
         // | header | ego history, motion | floats of all captures | instances of all | raw pixels of all |
@@ -95,7 +98,7 @@ impl ObservationBuilder {
             repair: None,
             buffer,
             history_count: count,
-            effect_seed: EffectSeed::of(episode),
+            effect_seed: EffectSeed::from_episode(episode),
             motion_samples,
             floats_at,
             instances_at,
@@ -113,7 +116,8 @@ impl ObservationBuilder {
         Self { repair, ..self }
     }
 
-    /// Renders the views of a capture that has cameras; captures come in order. Runs on a render thread.
+    /// Renders the views of a capture that has cameras; captures come in order. Runs on a render
+    /// thread.
     pub(crate) fn render(
         &mut self,
         capture: &RigCapture,
@@ -131,8 +135,8 @@ impl ObservationBuilder {
         };
         let reports_trust = filter.as_ref().is_none_or(|filter| filter.session.reports_trust);
 
-        // Maps that the observation does not hold, but that are needed: trust is computed from opacity,
-        // normals are computed from depth, and a repair model may need each of them.
+        // Maps that the observation does not hold, but that are needed: trust is computed from
+        // opacity, normals are computed from depth, and a repair model may need each of them.
         let PixelMaps { depth, opacity, normals, .. } = layout.maps();
         let model_needs = |needs: fn(&SessionRepair) -> bool| {
             filter.as_ref().is_some_and(|filter| needs(&filter.session))
@@ -146,9 +150,12 @@ impl ObservationBuilder {
             u64::from(needs_opacity) + u64::from(needs_depth) + 3 * u64::from(needs_normals);
         // Noise and the like are computed on copies.
         let effect_seed = self.effect_seed;
-        let effects = |camera: &usize| match capture.has_sensor_effects {
-            true => layout.pixel_effects(*camera, effect_seed, capture.time_us),
-            false => None,
+        let effects = |camera: &usize| {
+            if capture.has_sensor_effects {
+                layout.pixel_effects(*camera, effect_seed, capture.time_us)
+            } else {
+                None
+            }
         };
         let effects: Vec<Option<PixelEffects>> = capture.cameras.iter().map(effects).collect();
         let has_effects = effects.iter().any(Option::is_some);
@@ -156,29 +163,27 @@ impl ObservationBuilder {
         let _share = self.budget.reserve(4 * pixels * extra_values + copied)?;
 
         // Where the renderer writes.
-        let raw_at = match filter.is_some() || has_effects {
-            true => self.raw_places(capture),
-            false => Vec::new(),
-        };
-        let mut targets = self.targets(capture, scratch.images.of_views(frame.views, 3));
+        let raw_at =
+            if filter.is_some() || has_effects { self.raw_places(capture) } else { Vec::new() };
+        let mut targets = self.targets(capture, scratch.images.for_views(frame.views, 3));
         if needs_opacity {
-            for (target, map) in targets.iter_mut().zip(scratch.opacity.of_views(frame.views, 1)) {
+            for (target, map) in targets.iter_mut().zip(scratch.opacity.for_views(frame.views, 1)) {
                 target.opacity = Some(map);
             }
         }
         if needs_depth {
-            for (target, map) in targets.iter_mut().zip(scratch.depth_m.of_views(frame.views, 1)) {
+            for (target, map) in targets.iter_mut().zip(scratch.depth_m.for_views(frame.views, 1)) {
                 target.depth_m = Some(map);
             }
         }
         if needs_normals {
-            for (target, map) in targets.iter_mut().zip(scratch.normals.of_views(frame.views, 3)) {
+            for (target, map) in targets.iter_mut().zip(scratch.normals.for_views(frame.views, 3)) {
                 target.normals = Some(map);
             }
         }
 
-        // Each image is encoded as soon as it is complete, while others are still rendered; one that may be
-        // repaired is copied instead.
+        // Each image is encoded as soon as it is complete, while others are still rendered; one
+        // that may be repaired is copied instead.
         let slots: Vec<OnceLock<FinishedView>> =
             frame.views.iter().map(|_| OnceLock::new()).collect();
         let rendering = Span::current();
@@ -238,12 +243,14 @@ impl ObservationBuilder {
         Ok(())
     }
 
-    /// Whether the buffer holds the pixels of a capture as they are, so that the renderer writes them there.
+    /// Whether the buffer holds the pixels of a capture as they are, so that the renderer writes
+    /// them there.
     fn holds_pixels(&self, capture: &RigCapture) -> bool {
         self.layout.encoding() == Encoding::Raw && capture.shown
     }
 
-    /// Where the pixels of each view of a capture are in the buffer, if the observation holds them there.
+    /// Where the pixels of each view of a capture are in the buffer, if the observation holds them
+    /// there.
     fn raw_places(&self, capture: &RigCapture) -> Vec<Option<usize>> {
         let holds_pixels = self.holds_pixels(capture);
         let mut next = self.raw_at;
@@ -255,8 +262,8 @@ impl ObservationBuilder {
         capture.cameras.iter().map(place).collect()
     }
 
-    /// Targets of a capture's images: the buffer for maps and pixels that the observation contains as rendered, and
-    /// `images` for pixels that are encoded first.
+    /// Targets of a capture's images: the buffer for maps and pixels that the observation contains
+    /// as rendered, and `images` for pixels that are encoded first.
     fn targets<'a>(
         &'a mut self,
         capture: &RigCapture,
@@ -292,10 +299,11 @@ impl ObservationBuilder {
             let normals = map(normals, 3);
             let instances = (instances && capture.shown)
                 .then(|| as_ids(split_off_front(&mut instances_part, 2 * pixels)));
-            let rgb8 = match holds_pixels {
-                true => split_off_front(&mut raw_part, 3 * pixels),
+            let rgb8 = if holds_pixels {
+                split_off_front(&mut raw_part, 3 * pixels)
+            } else {
                 // There is one for each camera; the backend would refuse an empty one.
-                false => images.next().unwrap_or_default(),
+                images.next().unwrap_or_default()
             };
             targets.push(Target {
                 rgba: None,
@@ -335,11 +343,12 @@ impl ObservationBuilder {
     }
 }
 
-/// Result of a render thread for a view: the image, and the data that the selection needs if there is one.
+/// Result of a render thread for a view: the image, and the data that the selection needs if there
+/// is one.
 type FinishedView = (Result<EncodedImage, String>, Option<Finished>);
 
-/// The hash and the file of a camera's image after the effects on its pixels; for raw pixels a copy if there are
-/// effects, and another copy if a later observation shows them.
+/// The hash and the file of a camera's image after the effects on its pixels; for raw pixels a copy
+/// if there are effects, and another copy if a later observation shows them.
 fn encoded(
     layout: &ObservationLayout,
     camera: usize,
@@ -372,8 +381,9 @@ fn encoded(
     Ok(image)
 }
 
-/// Appends the samples of the motion sensors of an episode: first of the inertial measurement unit, then of the wheels.
-/// Returns the number of samples of each; `None` if the session does not have the sensor.
+/// Appends the samples of the motion sensors of an episode: first of the inertial measurement unit,
+/// then of the wheels. Returns the number of samples of each; `None` if the session does not have
+/// the sensor.
 fn add_motion(
     bytes: &mut Vec<u8>,
     layout: &ObservationLayout,
@@ -400,13 +410,14 @@ fn split_off_front<'a>(rest: &mut &'a mut [u8], bytes: usize) -> &'a mut [u8] {
     front
 }
 
-/// The bytes as floats. They are aligned: the buffer's address is a multiple of 8, and the header's room, the ego
-/// history and the maps before them are multiples of 4 bytes.
+/// The bytes as floats. They are aligned: the buffer's address is a multiple of 8, and the header's
+/// room, the ego history and the maps before them are multiples of 4 bytes.
 fn as_floats(bytes: &mut [u8]) -> &mut [f32] {
     bytemuck::cast_slice_mut(bytes)
 }
 
-/// The bytes as instances. They are aligned: all bytes before them are of floats, and of other instances.
+/// The bytes as instances. They are aligned: all bytes before them are of floats, and of other
+/// instances.
 fn as_ids(bytes: &mut [u8]) -> &mut [u16] {
     bytemuck::cast_slice_mut(bytes)
 }

@@ -1,9 +1,10 @@
 //! The repair of an observation's images.
 //!
-//! The renderer's callback encodes an image at once unless it may be repaired. Such a candidate is copied
-//! instead. When all views of its pose are rendered, so that the trust of each is known, the selection decides,
-//! and the candidates are repaired and encoded outside of the render queue: frames of other sessions are
-//! rendered meanwhile, and a model that hangs delays only its own session.
+//! The renderer's callback encodes an image at once unless it may be repaired. Such a candidate is
+//! copied instead. When all views of its pose are rendered, so that the trust of each is known, the
+//! selection decides, and the candidates are repaired and encoded outside of the render queue:
+//! frames of other sessions are rendered meanwhile, and a model that hangs delays only its own
+//! session.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
@@ -30,7 +31,8 @@ pub(crate) struct ObservationRepair {
     pub(super) session: Arc<SessionRepair>,
     /// Hysteresis state of each camera after the captures so far.
     state: RepairState,
-    /// Whether the state is kept from one capture to the next. False for `observe`, whose poses are not the ego's.
+    /// Whether the state is kept from one capture to the next. False for `observe`, whose poses are
+    /// not the ego's.
     has_history: bool,
     /// Candidates of the last capture.
     candidates: Vec<Candidate>,
@@ -69,7 +71,8 @@ pub(super) struct RenderedCapture<'a> {
     pub(super) first: usize,
 }
 
-/// Decides, for each view of a capture, whether it is a repair candidate. Shared by the threads that finish the views.
+/// Decides, for each view of a capture, whether it is a repair candidate. Shared by the threads
+/// that finish the views.
 pub(super) struct CandidateFilter {
     pub(super) session: Arc<SessionRepair>,
     /// For each view of the capture, whether the repair of its camera is on.
@@ -84,7 +87,8 @@ pub(super) struct Finished {
 }
 
 impl ObservationRepair {
-    /// `state` is the state after the previous observation; `None` for poses that the ego is not at.
+    /// `state` is the state after the previous observation; `None` for poses that the ego is not
+    /// at.
     pub(crate) fn new(
         session: Arc<SessionRepair>,
         cameras: usize,
@@ -210,7 +214,8 @@ impl ObservationBuilder {
         self.repair.as_ref().is_some_and(|repair| !repair.candidates.is_empty())
     }
 
-    /// The references that the chosen images of the last capture need, each once. Takes some milliseconds an image.
+    /// The references that the chosen images of the last capture need, each once. Takes some
+    /// milliseconds an image.
     pub(crate) fn wanted_references(&mut self, views: &ReferenceViews) -> Vec<ReferenceView> {
         let Some(repair) = &mut self.repair else { return Vec::new() };
         let session = repair.session.clone();

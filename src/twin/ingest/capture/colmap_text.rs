@@ -16,7 +16,7 @@ pub(super) fn read(cameras: &Path, images: &Path) -> Result<Vec<PosedImage>, Cap
     read_images(images, cameras, &known)
 }
 
-fn text_of(path: &Path) -> Result<String, CaptureError> {
+fn read_text(path: &Path) -> Result<String, CaptureError> {
     let bytes = read_whole(path, limits::CAPTURE_BYTES)
         .map_err(|cause| CaptureError::File { path: path.to_owned(), cause })?;
     String::from_utf8(bytes).map_err(|error| {
@@ -28,7 +28,7 @@ fn text_of(path: &Path) -> Result<String, CaptureError> {
 /// `CAMERA_ID MODEL WIDTH HEIGHT PARAMETERS..`
 fn read_cameras(path: &Path) -> Result<BTreeMap<u64, Camera>, CaptureError> {
     const FORM: &str = "expected CAMERA_ID MODEL WIDTH HEIGHT PARAMETERS..";
-    let text = text_of(path)?;
+    let text = read_text(path)?;
     let mut cameras = BTreeMap::new();
     for (index, line) in text.lines().enumerate() {
         if line.trim().is_empty() || line.starts_with('#') {
@@ -61,13 +61,14 @@ fn read_cameras(path: &Path) -> Result<BTreeMap<u64, Camera>, CaptureError> {
     Ok(cameras)
 }
 
-/// Two lines an image: `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, and its points, which are not read.
+/// Two lines an image: `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, and its points, which are
+/// not read.
 fn read_images(
     path: &Path,
     cameras_path: &Path,
     cameras: &BTreeMap<u64, Camera>,
 ) -> Result<Vec<PosedImage>, CaptureError> {
-    let text = text_of(path)?;
+    let text = read_text(path)?;
     let mut images = Vec::new();
     let mut lines = text.lines().enumerate();
     while let Some((index, line)) = lines.next() {

@@ -13,7 +13,6 @@ pub enum Place {
     Byte(usize),
     /// A field of JSON, as `frames[3].transform_matrix`.
     Field(String),
-    /// All of it.
     File,
 }
 
@@ -22,28 +21,18 @@ pub enum Place {
 pub enum CaptureError {
     /// A file cannot be read.
     #[error("{}: {cause}", path.display())]
-    File {
-        /// The file.
-        path: PathBuf,
-        /// Why not.
-        cause: FileError,
-    },
+    File { path: PathBuf, cause: FileError },
     /// There is no COLMAP model.
     #[error(
         "{} has no COLMAP model: expected cameras.bin and images.bin, or cameras.txt and images.txt, in it or in \
          sparse/0; `colmap model_converter` writes them",
         dir.display()
     )]
-    NoModel {
-        /// The folder.
-        dir: PathBuf,
-    },
+    NoModel { dir: PathBuf },
     /// The content of a file.
     #[error("{}{place}: {reason}", path.display())]
     Content {
-        /// The file.
         path: PathBuf,
-        /// Where in it.
         place: Place,
         /// The error, and what to do.
         reason: String,

@@ -1,6 +1,8 @@
-//! Camera poses of training images: COLMAP models, as text and binary, and transforms.json of nerfstudio and instant-ngp.
+//! Camera poses of training images: COLMAP models, as text and binary, and transforms.json of
+//! nerfstudio and instant-ngp.
 //!
-//! The poses are in the axes and unit of the file, which are those of a scene that was trained from it.
+//! The poses are in the axes and unit of the file, which are those of a scene that was trained from
+//! it.
 
 mod colmap_binary;
 mod colmap_model;
@@ -17,8 +19,8 @@ use wildcity_scene::align::PosedImage;
 pub use error::{CaptureError, Place};
 pub use nerfstudio::{FrameImage, read as read_nerfstudio, read_frames as read_nerfstudio_frames};
 
-/// Reads a COLMAP model: the folder with cameras.bin and images.bin, or with cameras.txt and images.txt; or a folder
-/// that has it in sparse/0 or sparse.
+/// Reads a COLMAP model: the folder with cameras.bin and images.bin, or with cameras.txt and
+/// images.txt; or a folder that has it in sparse/0 or sparse.
 ///
 /// # Errors
 /// There is no model, or the error names the file, the line or the byte, and what to do.
@@ -41,7 +43,7 @@ pub fn read_colmap(dir: &Path) -> Result<Vec<PosedImage>, CaptureError> {
 }
 
 /// A rotation that may be off by rounding. `None` if it is a reflection or stretched.
-fn rotation_of(matrix: DMat3) -> Option<DQuat> {
+fn to_rotation(matrix: DMat3) -> Option<DQuat> {
     let off = (matrix * matrix.transpose() - DMat3::IDENTITY).to_cols_array();
     let is_rotation = off.iter().all(|e| e.abs() <= 1e-3) && matrix.determinant() > 0.0;
     is_rotation.then(|| DQuat::from_mat3(&matrix).normalize())

@@ -4,7 +4,6 @@ use super::document::Document;
 
 /// One attribute of all Gaussians.
 pub(super) struct Column<'a> {
-    /// Number of rows.
     pub(super) count: usize,
     bytes: &'a [u8],
     stride: usize,
@@ -46,7 +45,7 @@ impl<'a> Column<'a> {
         if let Some(name) = view.extensions.keys().next() {
             return Err(format!("its bufferView is compressed by {name}; export it without"));
         }
-        let component = Component::of(accessor.component_type);
+        let component = Component::from_number(accessor.component_type);
         let component =
             component.ok_or(format!("componentType {} is not read", accessor.component_type))?;
         let row_bytes = (component.bytes() * width) as u64;
@@ -96,7 +95,7 @@ impl<'a> Column<'a> {
 }
 
 impl Component {
-    fn of(number: u32) -> Option<Self> {
+    fn from_number(number: u32) -> Option<Self> {
         Some(match number {
             5120 => Self::I8,
             5121 => Self::U8,

@@ -40,7 +40,6 @@ pub(super) struct Node {
     pub(super) mesh: Option<usize>,
     #[serde(default)]
     pub(super) children: Vec<usize>,
-    /// Column-major.
     pub(super) matrix: Option<[f64; 16]>,
     pub(super) translation: Option<[f64; 3]>,
     /// x, y, z, w.

@@ -1,7 +1,8 @@
 //! The properties of a material that are used, and the images of its textures.
 //!
-//! Source: glTF 2.0, sections 3.9.2 (metallic-roughness material) and 3.9.3 (additional textures), and the texts of
-//! KHR_materials_emissive_strength, KHR_materials_unlit and KHR_texture_transform. In linear light:
+//! Source: glTF 2.0, sections 3.9.2 (metallic-roughness material) and 3.9.3 (additional textures),
+//! and the texts of KHR_materials_emissive_strength, KHR_materials_unlit and KHR_texture_transform.
+//! In linear light:
 //!
 //! ```text
 //! base  = baseColorFactor * baseColorTexture * COLOR_0
@@ -10,10 +11,10 @@
 //! alpha = base.a                                                  (1 with alphaMode OPAQUE)
 //! ```
 //!
-//! The base colour is a surface's in white light of strength 1 from all sides; emitted light is added to
-//! reflected light. Textures are decoded from sRGB, and an absent texture is 1. `alpha` covers the objects behind the
-//! surface, so that emitted light is as opaque as the surface. An emissive texture without a factor emits nothing, and
-//! is not read.
+//! The base colour is a surface's in white light of strength 1 from all sides; emitted light is
+//! added to reflected light. Textures are decoded from sRGB, and an absent texture is 1. `alpha`
+//! covers the objects behind the surface, so that emitted light is as opaque as the surface. An
+//! emissive texture without a factor emits nothing, and is not read.
 
 use std::collections::BTreeMap;
 use std::io::Cursor;
@@ -56,10 +57,10 @@ impl<'a> MaterialSource<'a> {
     ///
     /// # Errors
     /// Says what cannot be read.
-    pub(super) fn of(material: &gltf::Material<'a>) -> Result<Self, String> {
+    pub(super) fn from_gltf(material: &gltf::Material<'a>) -> Result<Self, String> {
         let textured = |name, info: Option<gltf::texture::Info<'a>>| {
             let Some(info) = info else { return Ok(None) };
-            let area = TextureArea::of(name, &info)?;
+            let area = TextureArea::new(name, &info)?;
             Ok::<_, String>(Some((info.texture().source(), area)))
         };
         let base = material.pbr_metallic_roughness();
@@ -120,8 +121,8 @@ impl<'a> MaterialSource<'a> {
     }
 }
 
-/// The factor of the emitted light, times its strength. A material without lighting emits none: its light is its base
-/// colour.
+/// The factor of the emitted light, times its strength. A material without lighting emits none: its
+/// light is its base colour.
 fn emissive_factor(material: &gltf::Material<'_>) -> Result<DVec3, String> {
     if material.unlit() {
         return Ok(DVec3::ZERO);
@@ -129,23 +130,24 @@ fn emissive_factor(material: &gltf::Material<'_>) -> Result<DVec3, String> {
     let strength = f64::from(material.emissive_strength().unwrap_or(1.0));
     let factor = DVec3::from_array(material.emissive_factor().map(f64::from));
     let accepted = |number: f64| number.is_finite() && number >= 0.0;
-    match accepted(strength) && factor.to_array().into_iter().all(accepted) {
-        true => Ok(strength * factor),
-        false => Err(format!(
+    if accepted(strength) && factor.to_array().into_iter().all(accepted) {
+        Ok(strength * factor)
+    } else {
+        Err(format!(
             "has a material with emissiveFactor {:?} and emissiveStrength {strength}; both are finite and at least 0",
             factor.to_array()
-        )),
+        ))
     }
 }
 
 impl TextureArea {
     /// The area of a texture; all of the image without a transform.
-    fn of(texture: &'static str, info: &gltf::texture::Info<'_>) -> Result<Self, String> {
+    fn new(texture: &'static str, info: &gltf::texture::Info<'_>) -> Result<Self, String> {
         let set = info.tex_coord();
         let mut area = Self { texture, set, offset: DVec2::ZERO, scale: DVec2::ONE };
         let Some(transform) = info.texture_transform() else { return Ok(area) };
-        // Programs disagree about its direction: the formula of the extension's text turns the other way than the
-        // viewer of its authors.
+        // Programs disagree about its direction: the formula of the extension's text turns the
+        // other way than the viewer of its authors.
         if transform.rotation() != 0.0 {
             return Err("has a texture that KHR_texture_transform rotates; export rotated texture coordinates".into());
         }
@@ -153,9 +155,10 @@ impl TextureArea {
         area.offset = DVec2::from_array(transform.offset().map(f64::from));
         area.scale = DVec2::from_array(transform.scale().map(f64::from));
         let numbers = [area.offset, area.scale];
-        match numbers.iter().all(|pair| pair.is_finite()) {
-            true => Ok(area),
-            false => Err("has a texture with a KHR_texture_transform that is not finite".into()),
+        if numbers.iter().all(|pair| pair.is_finite()) {
+            Ok(area)
+        } else {
+            Err("has a texture with a KHR_texture_transform that is not finite".into())
         }
     }
 

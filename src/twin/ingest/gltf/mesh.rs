@@ -2,7 +2,8 @@
 //! material.
 //!
 //! Long triangles are halved first (`triangle.rs` covers each). The colour is what a camera sees in
-//! white light from all sides: the material's base colour, plus the light that it emits (`material.rs`).
+//! white light from all sides: the material's base colour, plus the light that it emits
+//! (`material.rs`).
 
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
@@ -26,7 +27,8 @@ use wildcity_scene::Gaussians;
 
 /// Bytes of a Gaussian of a mesh in memory.
 const GAUSSIAN_BYTES: u64 = 56;
-/// Largest number of Gaussians per requested one, because of small triangles and rounding to whole cells.
+/// Largest number of Gaussians per requested one, because of small triangles and rounding to whole
+/// cells.
 const MOST_PER_ASKED: u64 = 4;
 
 /// Covers all triangles of the scene.
@@ -47,7 +49,8 @@ pub(super) fn read(
         for primitive in mesh.primitives() {
             let place =
                 Place { node: placed.node, mesh: mesh.index(), primitive: primitive.index() };
-            let source = MaterialSource::of(&primitive.material()).map_err(|r| place.bad(r))?;
+            let source =
+                MaterialSource::from_gltf(&primitive.material()).map_err(|r| place.bad(r))?;
             for image in source.images() {
                 if let Entry::Vacant(unread) = textures.entry(image.index()) {
                     unread.insert(material::decode(image, buffers, uris)?);
@@ -135,7 +138,8 @@ struct Corners {
     positions_m: Vec<DVec3>,
     /// Vertex colours; none if all are white.
     colors: Option<Vec<DVec4>>,
-    /// Coordinates in the base colour's texture, and in that of the emitted light; none without a texture.
+    /// Coordinates in the base colour's texture, and in that of the emitted light; none without a
+    /// texture.
     uv: Option<Vec<DVec2>>,
     emissive_uv: Option<Vec<DVec2>>,
 }
@@ -173,7 +177,8 @@ impl PrimitiveReader<'_> {
         indices.as_chunks::<3>().0.iter().map(triangle).collect()
     }
 
-    /// Checks the accessors before the gltf crate reads them, and that there are those that the material names.
+    /// Checks the accessors before the gltf crate reads them, and that there are those that the
+    /// material names.
     fn check_accessors(&self) -> Result<(), String> {
         const FRACTIONS: &[DataType] = &[DataType::U8, DataType::U16, DataType::F32];
         const INDICES: &[DataType] = &[DataType::U8, DataType::U16, DataType::U32];
@@ -187,7 +192,8 @@ impl PrimitiveReader<'_> {
         for area in self.source.areas() {
             let coordinates = get(Semantic::TexCoords(area.set));
             if coordinates.is_none() {
-                // glTF 2.0, textureInfo.texCoord: a primitive must have them for the material to be applicable.
+                // glTF 2.0, textureInfo.texCoord: a primitive must have them for the material to be
+                // applicable.
                 return Err(format!(
                     "has no attribute TEXCOORD_{}, which the {} of its material names; export the mesh with texture \
                      coordinates, or the material without this texture",

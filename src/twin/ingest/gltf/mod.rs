@@ -4,8 +4,8 @@
 //! read, with the transforms of its nodes: POSITION, ROTATION (x, y, z, w), SCALE, OPACITY (0 to 1)
 //! and SH_DEGREE_l_COEF_n, or COLOR_0 where there are none. SCALE is a standard deviation; in
 //! earlier drafts it was its logarithm, which is detected by negative values: no standard deviation
-//! is negative. Other kernels, colour spaces and projections than those that are drawn are named in a warning. Splats that
-//! KHR_gaussian_splatting_compression_spz_2 compresses are read as SPZ.
+//! is negative. Other kernels, colour spaces and projections than those that are drawn are named in
+//! a warning. Splats that KHR_gaussian_splatting_compression_spz_2 compresses are read as SPZ.
 //!
 //! The triangles of a scene without splats are covered with flat Gaussians (`mesh.rs`).
 

@@ -12,13 +12,13 @@ const DRAWN: [(&str, &[&str]); 4] = [
     ("kernel", &["ellipse"]),
     ("colorSpace", &["srgb_rec709_display"]),
     ("projection", &["perspective"]),
-    // Splats are sorted by depth along the camera's axis; the two orders differ only for splats that overlap off the
-    // axis, and the extension leaves sorting to the renderer.
+    // Splats are sorted by depth along the camera's axis; the two orders differ only for splats
+    // that overlap off the axis, and the extension leaves sorting to the renderer.
     ("sortingMethod", &["cameraDistance", "zDepth"]),
 ];
 
-/// Warns of settings that are drawn in another way, and of keys that are not read. They are no errors, because the
-/// extension lets renderers fall back.
+/// Warns of settings that are drawn in another way, and of keys that are not read. They are no
+/// errors, because the extension lets renderers fall back.
 pub(super) fn check(primitive: &Primitive, reading: &mut Reading) {
     let settings = primitive.extensions.get(EXTENSION).and_then(Value::as_object);
     for (key, value) in settings.into_iter().flatten() {

@@ -13,9 +13,10 @@ use crate::ingest::activation;
 use wildcity_scene::Gaussians;
 use wildcity_scene::srgb::{linear_from_stored, stored_from_linear};
 
-/// Ratio of a Gaussian's standard deviation to that of its triangle. Whatever the triangle's shape, a covered surface
-/// lets 4 % of the light through, 9 % at most. With 1.7 these are 8 and 19 %, and what lies behind shows; with 2.1 they
-/// are 2 and 4 %, and edges lie 0.3 to 0.6 px farther out at 3 and 5 m. `tests/actors/softness.py` compares them.
+/// Ratio of a Gaussian's standard deviation to that of its triangle. Whatever the triangle's shape,
+/// a covered surface lets 4 % of the light through, 9 % at most. With 1.7 these are 8 and 19 %, and
+/// what lies behind shows; with 2.1 they are 2 and 4 %, and edges lie 0.3 to 0.6 px farther out at
+/// 3 and 5 m. `tests/actors/softness.py` compares them.
 const WIDER: f64 = 1.9;
 /// Longest edge of a triangle that becomes one Gaussian, in edges of a square with the area of a
 /// share. The Gaussian of a longer, narrow triangle would reach beyond its ends.
@@ -159,8 +160,8 @@ impl Triangle {
         Some(([w, x, y, z].map(|q| q as f32), [long_m, short_m, FLATNESS * long_m]))
     }
 
-    /// Display colour and opacity, 0 to 1, at a point given by its barycentric coordinates. The colour is the linear
-    /// base colour plus the emitted light, encoded.
+    /// Display colour and opacity, 0 to 1, at a point given by its barycentric coordinates. The
+    /// colour is the linear base colour plus the emitted light, encoded.
     fn color(&self, shares: [f64; 3]) -> ([f64; 3], f64) {
         let weighted = |values: [DVec4; 3]| (0..3).map(|k| shares[k] * values[k]).sum::<DVec4>();
         let texel = |image: &Texture, corners: [DVec2; 3]| {

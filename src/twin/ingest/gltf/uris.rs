@@ -11,8 +11,8 @@ use crate::limits;
 
 use super::bad;
 
-/// Fetches URIs. Each file is read once and held until this is dropped, however often the document names
-/// it: otherwise a document of 5 kB could hold a file of 64 MB a hundred times.
+/// Fetches URIs. Each file is read once and held until this is dropped, however often the document
+/// names it: otherwise a document of 5 kB could hold a file of 64 MB a hundred times.
 pub(super) struct Uris<'a> {
     parts: &'a mut dyn SceneFiles,
     files: BTreeMap<String, Rc<Vec<u8>>>,

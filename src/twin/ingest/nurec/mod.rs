@@ -53,8 +53,8 @@ pub(super) fn read(
 ) -> Result<Gaussians, IngestError> {
     let bytes = unpack(payload, budget)?;
     let root = msgpack::parse(&bytes).map_err(|reason| bad("MessagePack", reason))?;
-    let payload = Payload::of(&root)?;
-    let is_static = |name: &&str| payload.tracks_of(name).is_empty();
+    let payload = Payload::from_root(&root)?;
+    let is_static = |name: &&str| payload.layer_tracks(name).is_empty();
     let layers: Vec<&str> = payload.names.iter().copied().filter(is_static).collect();
     let moving: Vec<&str> = payload.names.iter().copied().filter(|name| !is_static(name)).collect();
     if !moving.is_empty() {
@@ -83,10 +83,10 @@ pub(super) fn read_tracked(
 ) -> Result<Vec<TrackedObject>, IngestError> {
     let bytes = unpack(payload, budget)?;
     let root = msgpack::parse(&bytes).map_err(|reason| bad("MessagePack", reason))?;
-    let payload = Payload::of(&root)?;
+    let payload = Payload::from_root(&root)?;
     let mut found = Vec::new();
     for &name in &payload.names {
-        let tracks = payload.tracks_of(name);
+        let tracks = payload.layer_tracks(name);
         if tracks.is_empty() {
             continue;
         }
@@ -122,7 +122,8 @@ fn unpack(payload: &[u8], budget: &mut UnpackBudget) -> Result<Vec<u8>, IngestEr
     Ok(bytes)
 }
 
-/// The maps of a payload that are read. They are searched once per layer and field, so they are indexed.
+/// The maps of a payload that are read. They are searched once per layer and field, so they are
+/// indexed.
 struct Payload<'a> {
     /// The layers' names, in the order of the file.
     names: Vec<&'a str>,
@@ -132,7 +133,7 @@ struct Payload<'a> {
 }
 
 impl<'a> Payload<'a> {
-    fn of(root: &'a Value<'a>) -> Result<Self, IngestError> {
+    fn from_root(root: &'a Value<'a>) -> Result<Self, IngestError> {
         let missing = |name: &str| bad(name, "is missing".into());
         let data = root.get("nre_data").ok_or_else(|| missing("nre_data"))?;
         let state = data.get("state_dict").ok_or_else(|| missing("nre_data.state_dict"))?;
@@ -169,7 +170,7 @@ impl<'a> Payload<'a> {
     }
 
     /// The tracks of a layer; none for a static one.
-    fn tracks_of(&self, layer: &str) -> &'a [Value<'a>] {
+    fn layer_tracks(&self, layer: &str) -> &'a [Value<'a>] {
         match self.tracks.get(layer) {
             Some(Value::Array(ids)) => ids,
             _ => &[],
@@ -305,9 +306,10 @@ struct Array<'a> {
 impl Array<'_> {
     fn value(&self, row: usize, column: usize) -> f32 {
         let index = row * self.columns + column;
-        match self.is_f32 {
-            true => f32::from_le_bytes(self.bytes.as_chunks().0[index]),
-            false => f16::from_le_bytes(self.bytes.as_chunks().0[index]).to_f32(),
+        if self.is_f32 {
+            f32::from_le_bytes(self.bytes.as_chunks().0[index])
+        } else {
+            f16::from_le_bytes(self.bytes.as_chunks().0[index]).to_f32()
         }
     }
 

@@ -44,7 +44,8 @@ impl<'a> Value<'a> {
             .map(|e| &e.1)
     }
 
-    /// The values of a map by their text keys, as [`Value::get`] finds them, but in logarithmic time.
+    /// The values of a map by their text keys, as [`Value::get`] finds them, but in logarithmic
+    /// time.
     pub(super) fn index(&self) -> BTreeMap<&'a str, &Value<'a>> {
         let mut index = BTreeMap::new();
         let entries = if let Value::Map(entries) = self { &entries[..] } else { &[] };

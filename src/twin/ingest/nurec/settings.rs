@@ -1,14 +1,15 @@
 //! The settings of a layer: how its numbers are activated, and the kernel of its particles.
 //!
 //! Source: the templates that 3dgrut's exporter fills (export/nurec_templates.py), and its kernels
-//! (threedgrut/model/geometry, particleResponse): of degree 2, exp(-d²/2), which is a Gaussian; of degree n, another
-//! function of the same distance d, which is wider or narrower.
+//! (threedgrut/model/geometry, particleResponse): of degree 2, exp(-d²/2), which is a Gaussian; of
+//! degree n, another function of the same distance d, which is wider or narrower.
 
 use super::msgpack::Value;
 use super::{IngestError, bad};
 use crate::ingest::notes::Reading;
 
-/// Keys of the settings of particles that are checked, or that bound errors far below those that are visible.
+/// Keys of the settings of particles that are checked, or that bound errors far below those that
+/// are visible.
 const KNOWN: [&str; 5] = [
     "density_kernel_degree",
     "density_kernel_planar",
@@ -17,7 +18,8 @@ const KNOWN: [&str; 5] = [
     "radiance_sph_degree",
 ];
 
-/// Refuses parameters with other activations, and particles with other kernels, than those that are drawn.
+/// Refuses parameters with other activations, and particles with other kernels, than those that are
+/// drawn.
 pub(super) fn check(settings: &Value<'_>, layer: &str) -> Result<(), IngestError> {
     let wanted = [
         ("density_activation", "sigmoid"),

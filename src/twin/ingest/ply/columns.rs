@@ -105,7 +105,8 @@ impl Columns {
 }
 
 impl BaseColour {
-    /// nerfstudio's `ns-export gaussian-splat --ply-color-mode rgb` writes red, green and blue in place of f_dc.
+    /// nerfstudio's `ns-export gaussian-splat --ply-color-mode rgb` writes red, green and blue in
+    /// place of f_dc.
     fn find(vertex: &Element) -> Result<Self, IngestError> {
         let find = |names: [&str; 3]| {
             names.iter().map(|name| vertex.property(name).cloned()).collect::<Result<Vec<_>, _>>()
@@ -124,8 +125,9 @@ impl BaseColour {
     }
 }
 
-/// Scales and opacity with the 3D filter of mip-splatting (Yu et al. 2024, section 4.1): the Gaussian is convolved with
-/// one of the standard deviation `filter`, and keeps its integral. A filter of 0 changes no bit.
+/// Scales and opacity with the 3D filter of mip-splatting (Yu et al. 2024, section 4.1): the
+/// Gaussian is convolved with one of the standard deviation `filter`, and keeps its integral. A
+/// filter of 0 changes no bit.
 fn filtered(ln_scales: [f32; 3], logit: f32, filter: f64) -> ([f32; 3], f32) {
     if filter == 0.0 {
         return (ln_scales, logit);

@@ -1,12 +1,12 @@
-//! PLY as the reference code of 3D Gaussian splatting writes it (Kerbl et al. 2023), in text or in bytes of either
-//! order.
+//! PLY as the reference code of 3D Gaussian splatting writes it (Kerbl et al. 2023), in text or in
+//! bytes of either order.
 //!
 //! Columns are found by name, in any order and of any type: x y z, rot_0..3 (w, x, y, z),
 //! scale_0..2 (ln), opacity (logit), f_dc_0..2, and f_rest_0.. of 0, 9, 24 or 45 coefficients,
-//! channel-major: all of red, then green, then blue. Dialects: no scale_2 (2D Gaussian splatting), filter_3D
-//! (mip-splatting), red green blue of bytes in place of f_dc (nerfstudio), and an element vertex_background with one
-//! more per moving object (street_gaussians). Normals are skipped; other columns, elements and comments are named in a
-//! warning.
+//! channel-major: all of red, then green, then blue. Dialects: no scale_2 (2D Gaussian splatting),
+//! filter_3D (mip-splatting), red green blue of bytes in place of f_dc (nerfstudio), and an element
+//! vertex_background with one more per moving object (street_gaussians). Normals are skipped; other
+//! columns, elements and comments are named in a warning.
 
 mod body;
 mod columns;
@@ -40,7 +40,8 @@ pub(super) fn read(
     if vertex.property("packed_position").is_ok() {
         return compressed::read(input, &header, file_bytes, reading, progress);
     }
-    // Check columns before the size: a missing column changes the size, too, and its name is the clearer error.
+    // Check columns before the size: a missing column changes the size, too, and its name is the
+    // clearer error.
     let columns = Columns::find(vertex)?;
     header.check_size(file_bytes)?;
     let count = check_count(vertex.count)?;

@@ -11,7 +11,6 @@ use super::bad;
 pub struct SogFiles {
     /// Other descriptions: the blocks of a streamed scene, and its surroundings.
     pub descriptions: Vec<String>,
-    /// Names of images.
     pub images: Vec<String>,
 }
 
@@ -39,7 +38,7 @@ impl SogFiles {
     ///
     /// # Errors
     /// It is not JSON, or a key that names files has another type.
-    pub fn of(json: &[u8], name: &str) -> Result<Self, IngestError> {
+    pub fn from_json(json: &[u8], name: &str) -> Result<Self, IngestError> {
         let keys: Keys = serde_json::from_slice(json).map_err(|e| bad(name, e.to_string()))?;
         let Keys { filenames, environment, means, scales, quats, sh0, sh_n } = keys;
         let images = [means, scales, quats, sh0, sh_n].into_iter().flatten();

@@ -69,7 +69,6 @@ pub(super) struct Higher {
     mins: Option<f64>,
     maxs: Option<f64>,
     codebook: Option<Vec<f64>>,
-    /// Centroids and labels.
     pub(super) files: (String, String),
 }
 
@@ -94,7 +93,7 @@ pub(super) struct HigherTable {
 impl Tables {
     /// # Errors
     /// Says what is missing or wrong.
-    pub(super) fn of(meta: &Meta) -> Result<Self, String> {
+    pub(super) fn from_meta(meta: &Meta) -> Result<Self, String> {
         let means = std::array::from_fn(|axis| [meta.means.mins[axis], meta.means.maxs[axis]]);
         match meta.version {
             None => {

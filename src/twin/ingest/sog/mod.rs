@@ -26,7 +26,8 @@ use meta::{Meta, Tables};
 
 const FORMAT: &str = "SOG";
 
-/// Files that describe a SOG: that of a streamed scene first, which has the other one in its folders as well.
+/// Files that describe a SOG: that of a streamed scene first, which has the other one in its
+/// folders as well.
 pub const DESCRIPTIONS: [&str; 2] = [streamed::NAME, "meta.json"];
 
 /// Reads a scene, given its meta.json or lod-meta.json and the folder of that file, which is empty
@@ -56,7 +57,8 @@ struct Kind {
     lod_levels: Option<serde::de::IgnoredAny>,
 }
 
-/// Reads a scene of one meta.json, whose Gaussians are not checked yet; errors call that file `name`.
+/// Reads a scene of one meta.json, whose Gaussians are not checked yet; errors call that file
+/// `name`.
 fn read_one(
     json: &[u8],
     name: &str,
@@ -70,7 +72,7 @@ fn read_one(
     if !skipped.is_empty() {
         reading.warn_skipped(&format!("keys of {name}"), &skipped);
     }
-    let tables = Tables::of(&meta).map_err(|reason| bad(name, reason))?;
+    let tables = Tables::from_meta(&meta).map_err(|reason| bad(name, reason))?;
     let count = check_count(tables.count)?;
     // All files are read first, because the limit of unpacking depends on their total size.
     let mut fetch = |file: &str| -> Result<NamedFile, IngestError> {

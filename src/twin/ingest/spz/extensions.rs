@@ -1,4 +1,5 @@
-//! Extensions of SPZ: records of a type, a length, and a payload (nianticlabs/spz, extensions/README.md).
+//! Extensions of SPZ: records of a type, a length, and a payload (nianticlabs/spz,
+//! extensions/README.md).
 
 use std::io::{self, Read};
 
@@ -7,7 +8,8 @@ use crate::ingest::{Axes, IngestError};
 
 /// `SPZ_ADOBE_coordinate_system`: a u32.
 const COORDINATE_SYSTEM: u32 = 0xADBE_0003;
-/// `SPZ_ADOBE_safe_orbit_camera`: where a viewer's camera may go, which has no effect on the picture.
+/// `SPZ_ADOBE_safe_orbit_camera`: where a viewer's camera may go, which has no effect on the
+/// picture.
 const SAFE_ORBIT_CAMERA: u32 = 0xADBE_0002;
 /// Bytes of the extensions after the payload of versions 2 and 3 that are read.
 pub(super) const LEGACY_BYTES: u64 = 64 << 10;

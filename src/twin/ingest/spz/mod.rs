@@ -1,12 +1,12 @@
 //! SPZ, Niantic's format: versions 2 and 3 in one gzip stream (or none), version 4 in zstd streams.
 //!
 //! Source: the format's description and headers in nianticlabs/spz. All versions hold the same
-//! attributes, each for all Gaussians, in the order of `Header::attributes`: positions (3 x 24-bit fixed
-//! point), opacities (u8), colours (3 u8), ln scales (3 u8, sixteenths from -10), rotations and the
-//! higher colour coefficients (u8, 128ths from -1; coefficient-major, then red, green, blue).
-//! Version 4 has an uncompressed header of 32 bytes and a table of the streams' sizes
-//! after it. Between the two, or after the payload of earlier versions, there may be extensions: the one of the
-//! coordinate system is read, others are named in a warning.
+//! attributes, each for all Gaussians, in the order of `Header::attributes`: positions (3 x 24-bit
+//! fixed point), opacities (u8), colours (3 u8), ln scales (3 u8, sixteenths from -10), rotations
+//! and the higher colour coefficients (u8, 128ths from -1; coefficient-major, then red, green,
+//! blue). Version 4 has an uncompressed header of 32 bytes and a table of the streams' sizes after
+//! it. Between the two, or after the payload of earlier versions, there may be extensions: the one
+//! of the coordinate system is read, others are named in a warning.
 
 mod extensions;
 
@@ -246,7 +246,8 @@ impl Attribute {
 /// Rows that are read at once.
 const ROWS_AT_ONCE: usize = 4096;
 
-/// Reads the extensions up to version 4's table of streams, and the compressed size of every attribute from it.
+/// Reads the extensions up to version 4's table of streams, and the compressed size of every
+/// attribute from it.
 fn read_table(
     input: &mut impl Read,
     header: &Header,

@@ -11,7 +11,8 @@ use crate::store::{Catalog, StoreError};
 use super::object::{HEAD_BYTES, Header};
 use super::{ActorList, DamagedActor, StoredActor};
 
-/// Assets, and those of which nothing is known, because the disk or the object store fails to read them.
+/// Assets, and those of which nothing is known, because the disk or the object store fails to read
+/// them.
 #[derive(Default)]
 pub(super) struct ReadActors {
     list: ActorList,
@@ -52,7 +53,7 @@ impl ReadActors {
 impl DamagedActor {
     fn unlisted(unlisted: UnlistedObjects) -> Self {
         let UnlistedObjects { digits: hash, error } = unlisted;
-        let mut reason = reason_of(error);
+        let mut reason = skip_reason(error);
         if hash.len() == 2 {
             reason = format!("the folder of all assets whose hashes begin so: {reason}");
         }
@@ -97,7 +98,7 @@ impl Catalog {
                 }
                 Err(error @ StoreError::Io { .. }) if is_file => return ReadActor::Unread(error),
                 Err(error) => {
-                    let reason = reason_of(error);
+                    let reason = skip_reason(error);
                     return ReadActor::Damaged(DamagedActor { hash, name: None, reason });
                 }
             };
@@ -115,8 +116,9 @@ impl Catalog {
     }
 }
 
-/// The error of an asset that cannot be read, without its path, because clients of a server get this text.
-pub(super) fn reason_of(error: StoreError) -> String {
+/// The error of an asset that cannot be read, without its path, because clients of a server get
+/// this text.
+pub(super) fn skip_reason(error: StoreError) -> String {
     match error {
         StoreError::Io { action, cause, .. } => format!("cannot {action} it: {cause}"),
         StoreError::Damaged { reason, .. } => reason,

@@ -8,8 +8,9 @@
 //! ...    the levels, from level 0 on: parts of zstd-compressed records, as the sections of a chunk
 //! ```
 //!
-//! There is no log: an asset never changes, and the same input gives the same object. Garbage collection of twins does
-//! not touch assets; [`Catalog::remove_actor`] removes one. A damaged asset does not affect the others.
+//! There is no log: an asset never changes, and the same input gives the same object. Garbage
+//! collection of twins does not touch assets; [`Catalog::remove_actor`] removes one. A damaged
+//! asset does not affect the others.
 
 mod list;
 mod object;
@@ -26,7 +27,7 @@ use super::backend::{ListedObject, ObjectListing};
 use super::layout::{ACTORS, is_hash};
 use super::{Catalog, StoreError};
 
-use list::reason_of;
+use list::skip_reason;
 use object::Header;
 
 /// An asset in the store, without its Gaussians.
@@ -36,7 +37,6 @@ pub struct StoredActor {
     pub hash: String,
     /// Size of the object, in bytes.
     pub bytes: u64,
-    /// Its description.
     pub description: AssetDescription,
     /// Spherical-harmonic degree of its colours.
     pub sh_degree: u8,
@@ -55,33 +55,32 @@ pub struct ActorList {
     pub damaged: Vec<DamagedActor>,
 }
 
-/// An asset that differs from what was stored, or cannot be read; or a folder of assets that cannot be listed.
+/// An asset that differs from what was stored, or cannot be read; or a folder of assets that cannot
+/// be listed.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DamagedActor {
-    /// Its hash, 64 lower-case hex digits; for a folder, the first two digits of the hashes of its assets.
+    /// Its hash, 64 lower-case hex digits; for a folder, the first two digits of the hashes of its
+    /// assets.
     pub hash: String,
-    /// The name that it states, if that can be read. It may be damaged, too, so that it stands for no asset.
+    /// The name that it states, if that can be read. It may be damaged, too, so that it stands for
+    /// no asset.
     pub name: Option<String>,
-    /// The error.
     pub reason: String,
 }
 
 /// The result of [`Catalog::add_actor`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct AddedActor {
-    /// The asset.
     pub actor: StoredActor,
     /// Whether it was not there before.
     pub is_new: bool,
 }
 
-/// Whether an asset may get the name of an asset of another content. A name that two assets have cannot be used for
-/// either.
+/// Whether an asset may get the name of an asset of another content. A name that two assets have
+/// cannot be used for either.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SameName {
-    /// It may.
     Allowed,
-    /// It may not.
     Refused,
 }
 
@@ -89,7 +88,6 @@ pub enum SameName {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StoredLevel {
-    /// Number of Gaussians.
     pub count: u32,
     /// Upper bound of the geometric error, in metres.
     pub error_m: f32,
@@ -112,8 +110,8 @@ impl Catalog {
 
     /// As [`Catalog::put_actor`], and returns whether the asset is new.
     ///
-    /// In an object store, which has no locks, two processes that add different assets of one name at the same time
-    /// both succeed.
+    /// In an object store, which has no locks, two processes that add different assets of one name
+    /// at the same time both succeed.
     ///
     /// # Errors
     /// As [`Catalog::put_actor`]; [`StoreError::ActorExists`] with [`SameName::Refused`].
@@ -170,11 +168,12 @@ impl Catalog {
     /// The one asset of a name, of a hash, or of a hash that begins with at least 4 digits.
     ///
     /// # Errors
-    /// [`StoreError::NoActor`] if there is none, or more than one; [`StoreError::ActorDamaged`] if the only ones are
-    /// damaged; the disk fails to read one that may be it.
+    /// [`StoreError::NoActor`] if there is none, or more than one; [`StoreError::ActorDamaged`] if
+    /// the only ones are damaged; the disk fails to read one that may be it.
     pub fn find_actor(&self, text: &str) -> Result<StoredActor, StoreError> {
         let mut listing = self.objects.list_objects(ACTORS)?;
-        // Sessions look the assets of each episode up by their whole hashes: no other asset is read then.
+        // Sessions look the assets of each episode up by their whole hashes: no other asset is read
+        // then.
         if listing.objects.iter().any(|object| object.hash == text) {
             listing.objects.retain(|object| object.hash == text);
             listing.unlisted.clear();
@@ -184,7 +183,8 @@ impl Catalog {
         let is_hash_of = |hash: &str| is_prefix && hash.starts_with(text);
         let is_it = |one: &&StoredActor| one.description.name == text || is_hash_of(&one.hash);
         let found: Vec<&StoredActor> = actors.iter().filter(is_it).collect();
-        // A damaged asset keeps no other from its name. In a damaged folder may be whatever begins with its digits.
+        // A damaged asset keeps no other from its name. In a damaged folder may be whatever begins
+        // with its digits.
         let is_damaged = |one: &&DamagedActor| {
             let is_in_folder = !is_hash(&one.hash) && is_prefix && text.starts_with(&one.hash);
             let is_named = found.is_empty() && one.name.as_deref() == Some(text);
@@ -204,11 +204,12 @@ impl Catalog {
         Err(StoreError::NoActor { text: text.to_owned(), found: count, known: known.collect() })
     }
 
-    /// Removes an asset, given as to [`Catalog::find_actor`]; a damaged one, too. Returns its hash. With `dry_run`
-    /// nothing is removed.
+    /// Removes an asset, given as to [`Catalog::find_actor`]; a damaged one, too. Returns its hash.
+    /// With `dry_run` nothing is removed.
     ///
-    /// Sessions that have the asset in memory keep it. Scenarios that name it are refused from now on, and recorded
-    /// episodes that drew it cannot be replayed, until the same asset is stored again.
+    /// Sessions that have the asset in memory keep it. Scenarios that name it are refused from now
+    /// on, and recorded episodes that drew it cannot be replayed, until the same asset is stored
+    /// again.
     ///
     /// # Errors
     /// [`StoreError::NoActor`]; it cannot be removed.
@@ -249,7 +250,7 @@ impl Catalog {
             Err(error @ StoreError::Io { .. }) => {
                 return Err(self.find_actor(hash).err().unwrap_or(error));
             }
-            Err(error) => return Err(damaged(None, reason_of(error))),
+            Err(error) => return Err(damaged(None, skip_reason(error))),
         };
         let (header, rest) = Header::read(&bytes).map_err(|reason| damaged(None, reason))?;
         match header.levels(rest) {

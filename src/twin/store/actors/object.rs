@@ -38,7 +38,8 @@ impl Catalog {
     /// The bytes of an asset, and its header.
     ///
     /// # Errors
-    /// [`StoreError::Clamped`] if the record format cannot hold its values; it cannot be compressed.
+    /// [`StoreError::Clamped`] if the record format cannot hold its values; it cannot be
+    /// compressed.
     pub(super) fn encode_actor(
         &self,
         asset: &ActorAsset,
@@ -137,8 +138,8 @@ impl Header {
     }
 }
 
-/// A level in the form of a chunk's section: what [`chunk_file::unpack`] reads of it is the count, the cell and the
-/// origin.
+/// A level in the form of a chunk's section: what [`chunk_file::unpack`] reads of it is the count,
+/// the cell and the origin.
 fn section(level: &StoredLevel) -> (ChunkEntry, Section) {
     let entry = ChunkEntry {
         cell: [0, 0],

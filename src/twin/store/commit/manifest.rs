@@ -73,7 +73,7 @@ impl Commit {
             Some(provenance) => manifest.provenance = provenance,
             // An edit that changes nothing makes no version, so it keeps the note.
             None if edited.as_ref() == Some(&manifest) => {}
-            None => manifest.provenance = manifest.provenance.of_edit(),
+            None => manifest.provenance = manifest.provenance.for_edit(),
         }
         Ok(manifest)
     }

@@ -104,9 +104,9 @@ impl Commit {
     /// A twin of any size can be put part by part, as long as no cell is in two parts.
     ///
     /// # Errors
-    /// Before anything is written: a Gaussian that cannot be used, [`StoreError::Scattered`], a cell that was put
-    /// before, an SH degree other than that of an earlier part. Otherwise what could not be written; nothing
-    /// of this call is part of the version then.
+    /// Before anything is written: a Gaussian that cannot be used, [`StoreError::Scattered`], a
+    /// cell that was put before, an SH degree other than that of an earlier part. Otherwise what
+    /// could not be written; nothing of this call is part of the version then.
     pub fn put(
         &mut self,
         gaussians: &Gaussians,
@@ -141,8 +141,9 @@ impl Commit {
         Ok(ObjectRef { object: stored.hash, bytes: stored.bytes })
     }
 
-    /// Sets the recorded images of the version: those of [`Commit::put_views`], those of another version of the twin,
-    /// or none. Otherwise [`Commit::change`] keeps those of its base, and [`Commit::replace`] has none.
+    /// Sets the recorded images of the version: those of [`Commit::put_views`], those of another
+    /// version of the twin, or none. Otherwise [`Commit::change`] keeps those of its base, and
+    /// [`Commit::replace`] has none.
     pub fn set_views(&mut self, views: Option<ViewsRef>) {
         self.views = Some(views);
     }

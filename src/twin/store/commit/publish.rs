@@ -1,4 +1,5 @@
-//! Publishing a version: one commit after the other, each on the latest version, and only if it reverts nothing of others.
+//! Publishing a version: one commit after the other, each on the latest version, and only if it
+//! reverts nothing of others.
 
 use std::collections::BTreeSet;
 
@@ -43,7 +44,8 @@ impl Commit {
     /// Publishes exactly what was put as the first version of a new twin, all or nothing.
     ///
     /// # Errors
-    /// [`StoreError::TwinExists`] if others made a twin of this name meanwhile; otherwise as [`Commit::replace`].
+    /// [`StoreError::TwinExists`] if others made a twin of this name meanwhile; otherwise as
+    /// [`Commit::replace`].
     pub fn create(self, settings: VersionSettings) -> Result<Version, StoreError> {
         self.publish_put(None, settings, |commit, latest, _| match latest {
             Some(latest) => Err(StoreError::TwinExists { name: commit.name.clone(), latest }),
@@ -112,7 +114,7 @@ impl Commit {
             if let Some(views) = &manifest.views {
                 uncached.objects.check_present(&commit.name, &views.object, views.bytes)?;
             }
-            for view in uncached.views_of(&manifest)? {
+            for view in uncached.read_views(&manifest)? {
                 for image in views::objects(&view) {
                     uncached.objects.check_present(&commit.name, &image.object, image.bytes)?;
                 }
@@ -121,9 +123,10 @@ impl Commit {
         })
     }
 
-    /// Checks that the `new` manifest reverts nothing that other commits changed from the base to the
-    /// latest version. The same change on both sides is not a conflict; the other one may be this commit's
-    /// own first attempt. If others aligned the twin, every change is one: it was made for the old axes.
+    /// Checks that the `new` manifest reverts nothing that other commits changed from the base to
+    /// the latest version. The same change on both sides is not a conflict; the other one may be
+    /// this commit's own first attempt. If others aligned the twin, every change is one: it was
+    /// made for the old axes.
     fn check_overlap(
         &self,
         base: &Version,

@@ -112,12 +112,14 @@ impl Local {
         }
     }
 
-    /// Creates a directory of which nothing need survive a power cut: of commits in preparation, and of locks.
+    /// Creates a directory of which nothing need survive a power cut: of commits in preparation,
+    /// and of locks.
     pub(super) fn create_transient(&self, dir: &Path) -> Result<(), StoreError> {
         if self.exists(dir)? { Ok(()) } else { create_dirs(&*self.disk, dir) }
     }
 
-    /// Waits until no other process publishes a version of a twin, takes the publish lock, and settles the twin.
+    /// Waits until no other process publishes a version of a twin, takes the publish lock, and
+    /// settles the twin.
     pub(super) fn lock_publishing(&self, name: &str) -> Result<Option<Lock>, StoreError> {
         self.create_transient(&self.root.join(STAGING))?;
         let lock = self.publish_lock(name, Wait::Yes)?;
@@ -125,12 +127,13 @@ impl Local {
         Ok(lock)
     }
 
-    /// Makes the log of a twin and the state of garbage collection durable, as they are now. The caller holds the
-    /// publish lock.
+    /// Makes the log of a twin and the state of garbage collection durable, as they are now. The
+    /// caller holds the publish lock.
     ///
-    /// A process that was stopped, or that failed to sync, may have left a record, or its removal, that a power cut
-    /// takes back. A removal of objects, or a new number, that followed from what the log said would then have relied
-    /// on what never was: the versions before the lost one would be without objects, or the log would have a gap.
+    /// A process that was stopped, or that failed to sync, may have left a record, or its removal,
+    /// that a power cut takes back. A removal of objects, or a new number, that followed from what
+    /// the log said would then have relied on what never was: the versions before the lost one
+    /// would be without objects, or the log would have a gap.
     pub(super) fn settle(&self, name: &str) -> Result<(), StoreError> {
         let twin = self.root.join(name);
         for dir in [twin.join(LOG), twin.join(COLLECTION), twin] {
@@ -142,15 +145,15 @@ impl Local {
         Ok(())
     }
 
-    /// Takes the publish lock; `None` if another process has it and this one does not wait. Its file is never
-    /// removed: otherwise two commits could lock two files of one name.
+    /// Takes the publish lock; `None` if another process has it and this one does not wait. Its
+    /// file is never removed: otherwise two commits could lock two files of one name.
     pub(super) fn publish_lock(&self, name: &str, wait: Wait) -> Result<Option<Lock>, StoreError> {
         let path = self.root.join(STAGING).join(format!("{name}.lock"));
         self.disk.lock(&path, wait).map_err(StoreError::io("lock", &path))
     }
 
-    /// Whether something is at a path. A disk that fails is an error: otherwise a commit would leave an object behind,
-    /// or take another version's object for its own.
+    /// Whether something is at a path. A disk that fails is an error: otherwise a commit would
+    /// leave an object behind, or take another version's object for its own.
     pub(super) fn exists(&self, path: &Path) -> Result<bool, StoreError> {
         match self.disk.info(path) {
             Err(e) if matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {

@@ -27,8 +27,8 @@ use super::files::{WRITING, create_dirs, entries};
 const TOUCH_AFTER: Duration = Duration::from_secs(60);
 /// Age after which an unfinished file counts as left behind by a killed process.
 const LEFT_AFTER: Duration = Duration::from_secs(3600);
-/// Each process frees space whenever it has written this fraction (1 / `SLACK`) of the limit, so that several
-/// processes together stay close to the limit.
+/// Each process frees space whenever it has written this fraction (1 / `SLACK`) of the limit, so
+/// that several processes together stay close to the limit.
 const SLACK: u64 = 16;
 
 /// A directory of cached parts.
@@ -113,8 +113,8 @@ impl DiskCache {
         self.dir.join(&hash[..2]).join(hash)
     }
 
-    /// Removes the least recently used parts until there is space for everything that is written before the
-    /// next call. One process at a time does this; concurrent callers return at once.
+    /// Removes the least recently used parts until there is space for everything that is written
+    /// before the next call. One process at a time does this; concurrent callers return at once.
     fn make_room(&self) -> Result<(), StoreError> {
         let path = self.dir.join("lock");
         let lock = File::options().create(true).append(true).open(&path);

@@ -9,7 +9,8 @@ use crate::store::disk::{Disk, ReadFile};
 
 /// Bytes read or written at once.
 pub(super) const BUFFER_BYTES: usize = 256 << 10;
-/// Errors of syncing a directory that belongs to another user, or whose file system cannot sync directories.
+/// Errors of syncing a directory that belongs to another user, or whose file system cannot sync
+/// directories.
 const CANNOT_SYNC: [ErrorKind; 3] =
     [ErrorKind::PermissionDenied, ErrorKind::InvalidInput, ErrorKind::Unsupported];
 /// First character of the name of a file that is being written.
@@ -80,11 +81,12 @@ pub(super) fn create_parent(disk: &dyn Disk, path: &Path) -> Result<(), StoreErr
     path.parent().map_or(Ok(()), |dir| create_dirs(disk, dir))
 }
 
-/// Creates a directory and the missing ones above it, and makes their names durable: what is written into a
-/// directory is lost in a power cut if the directory's own name is.
+/// Creates a directory and the missing ones above it, and makes their names durable: what is
+/// written into a directory is lost in a power cut if the directory's own name is.
 ///
-/// A directory that exists may have been created by a process that was stopped before it synced the name. So that name
-/// is synced, too. The names above it are durable, because each is synced before anything is created below it.
+/// A directory that exists may have been created by a process that was stopped before it synced the
+/// name. So that name is synced, too. The names above it are durable, because each is synced before
+/// anything is created below it.
 ///
 /// # Errors
 /// [`StoreError::Io`] names the directory that cannot be created or synced.
@@ -95,8 +97,8 @@ pub fn create_dirs(disk: &dyn Disk, dir: &Path) -> Result<(), StoreError> {
     }
     if is_dir(disk, dir) {
         return match dir.parent().map(|parent| disk.sync_dir(parent)) {
-            // This process may not read the directory above, so that another user has created this one; or its file
-            // system cannot sync directories.
+            // This process may not read the directory above, so that another user has created this
+            // one; or its file system cannot sync directories.
             Some(Err(error)) if CANNOT_SYNC.contains(&error.kind()) => Ok(()),
             Some(synced) => synced.map_err(StoreError::io("sync", dir)),
             None => Ok(()),
@@ -107,7 +109,8 @@ pub fn create_dirs(disk: &dyn Disk, dir: &Path) -> Result<(), StoreError> {
     sync_parent(disk, dir)
 }
 
-/// Creates directories in an existing one, and makes their names durable, as [`create_dirs`], with a single sync.
+/// Creates directories in an existing one, and makes their names durable, as [`create_dirs`], with
+/// a single sync.
 pub(super) fn create_dirs_in(
     disk: &dyn Disk,
     parent: &Path,
@@ -121,7 +124,8 @@ pub(super) fn create_dirs_in(
     sync(disk, parent)
 }
 
-/// Creates a directory, whose name is not durable yet. Another process may create it at the same time.
+/// Creates a directory, whose name is not durable yet. Another process may create it at the same
+/// time.
 fn create_dir(disk: &dyn Disk, dir: &Path) -> Result<(), StoreError> {
     match disk.create_dir(dir) {
         Err(error) if error.kind() != ErrorKind::AlreadyExists || !is_dir(disk, dir) => {

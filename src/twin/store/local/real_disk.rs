@@ -111,8 +111,8 @@ impl WriteFile for File {
     }
 }
 
-/// Opens a regular file. The store writes nothing but regular files, so that anything else is damage or an attack:
-/// opening a pipe would wait for ever, and a link could lead out of the twin.
+/// Opens a regular file. The store writes nothing but regular files, so that anything else is
+/// damage or an attack: opening a pipe would wait for ever, and a link could lead out of the twin.
 fn open_regular(options: &mut OpenOptions, path: &Path) -> io::Result<File> {
     // NONBLOCK concerns pipes and devices only; regular files ignore it.
     let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK;

@@ -19,7 +19,6 @@ use super::url;
 /// The twins below a prefix of an object store.
 #[derive(Clone, Debug)]
 pub(in crate::store) struct Remote {
-    /// The URL.
     pub(super) root: PathBuf,
     /// Prefix of every key.
     pub(super) prefix: Key,
@@ -130,8 +129,8 @@ impl Remote {
         read
     }
 
-    /// Reads until the bytes match their hash, a bounded number of times, because they may have been damaged
-    /// in transit and not in the store.
+    /// Reads until the bytes match their hash, a bounded number of times, because they may have
+    /// been damaged in transit and not in the store.
     pub(super) fn read_verified(
         &self,
         key: &str,

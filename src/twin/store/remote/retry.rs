@@ -1,5 +1,5 @@
-//! Requests run on threads of their own, each with a time-out and a bounded number of retries. This is the
-//! only place where requests are timed and retried: `object_store`'s own retries are off.
+//! Requests run on threads of their own, each with a time-out and a bounded number of retries. This
+//! is the only place where requests are timed and retried: `object_store`'s own retries are off.
 //!
 //! The calling thread waits on a channel, because `block_on` panics on threads of another runtime.
 
@@ -20,13 +20,15 @@ pub struct RetryPolicy {
     pub timeout: Duration,
     /// The most attempts of one request.
     pub tries: u32,
-    /// Pause before the second attempt; it doubles before each further one. With none, no other request comes in between.
+    /// Pause before the second attempt; it doubles before each further one. With none, no other
+    /// request comes in between.
     pub backoff: Duration,
     /// How long one request for a section may take. Steps wait for these.
     pub section_timeout: Duration,
     /// The most attempts of a request for a section.
     pub section_tries: u32,
-    /// Number of threads that wait for answers. On one thread, requests are sent in the order in which they begin.
+    /// Number of threads that wait for answers. On one thread, requests are sent in the order in
+    /// which they begin.
     pub threads: usize,
 }
 

@@ -50,8 +50,8 @@ pub(super) fn open(url: &str) -> Result<(Arc<dyn ObjectStore>, Key), StoreError>
     Ok((store.map_err(|error| refused(error.to_string()))?, prefix))
 }
 
-/// Selects ring as the cryptography of TLS, once. The default, aws-lc, would add more C code to the build than
-/// all other dependencies together.
+/// Selects ring as the cryptography of TLS, once. The default, aws-lc, would add more C code to the
+/// build than all other dependencies together.
 fn provide_tls() {
     static ONCE: Once = Once::new();
     ONCE.call_once(|| {

@@ -1,5 +1,6 @@
-//! Histories of uploads: two tokens begin, send, cut off, continue and delete uploads, while the process is killed, the
-//! power fails, the disk is full, reads fail, are slow, end early or have wrong bits, and the clock jumps.
+//! Histories of uploads: two tokens begin, send, cut off, continue and delete uploads, while the
+//! process is killed, the power fails, the disk is full, reads fail, are slow, end early or have
+//! wrong bits, and the clock jumps.
 
 mod world;
 
@@ -33,7 +34,8 @@ struct Name {
 #[derive(Clone, Copy, Debug)]
 enum Operation {
     Begin(Name),
-    /// Sends up to so many of the missing bytes, cut off after so many bytes of the request if it is cut.
+    /// Sends up to so many of the missing bytes, cut off after so many bytes of the request if it
+    /// is cut.
     Append {
         name: Name,
         bytes: u64,
@@ -82,7 +84,7 @@ pub(super) struct Uploads {
 impl super::History for Uploads {
     type Plant = Plant;
 
-    fn of(seed: u64) -> Self {
+    fn from_seed(seed: u64) -> Self {
         let mut random = Random::new(seed);
         let count = 4 + random.below(12);
         let steps = (0..count).map(|_| Step::random(&mut random)).collect();

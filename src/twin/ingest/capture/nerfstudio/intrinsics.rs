@@ -1,9 +1,10 @@
 //! Cameras of transforms.json, by the formulas of the programs that train from it.
 //!
-//! nerfstudio (cameras/camera_utils.py, data/dataparsers/nerfstudio_dataparser.py): lenses of perspective models are
-//! `(x, y) (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸)` and OpenCV's tangential terms p1, p2; those of fisheye models are OpenCV's
-//! `fisheye`, with the same tangential terms. A frame or the file may have `distortion_params` in their place: k1 to k4,
-//! p1, p2. instant-ngp (src/nerf_loader.cu, read_lens): OpenCV's lens, or with `is_fisheye` OpenCV's `fisheye`.
+//! nerfstudio (cameras/camera_utils.py, data/dataparsers/nerfstudio_dataparser.py): lenses of
+//! perspective models are `(x, y) (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸)` and OpenCV's tangential
+//! terms p1, p2; those of fisheye models are OpenCV's `fisheye`, with the same tangential terms. A
+//! frame or the file may have `distortion_params` in their place: k1 to k4, p1, p2. instant-ngp
+//! (src/nerf_loader.cu, read_lens): OpenCV's lens, or with `is_fisheye` OpenCV's `fisheye`.
 
 use std::collections::BTreeMap;
 
@@ -24,12 +25,14 @@ pub(super) struct Wrong {
     pub(super) reason: String,
 }
 
-/// Models of nerfstudio with a pinhole or OpenCV's lens. `perspective` is of exporters of simulators.
+/// Models of nerfstudio with a pinhole or OpenCV's lens. `perspective` is of exporters of
+/// simulators.
 const PERSPECTIVE: [&str; 6] =
     ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "perspective"];
 const FISHEYE: [&str; 3] = ["OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE"];
 
-/// Fields of instant-ngp that make another camera than the ones that are read, unless they are false or zero.
+/// Fields of instant-ngp that make another camera than the ones that are read, unless they are
+/// false or zero.
 const REFUSED: [(&str, &str); 6] = [
     ("ftheta_p0", "an f-theta lens: undistort the images"),
     ("latlong", "a panorama: cut pinhole images from it"),
@@ -77,7 +80,8 @@ impl Intrinsics {
         Ok(camera)
     }
 
-    /// Focal lengths: in pixels, or as an angle of view of instant-ngp; one of the two stands for both.
+    /// Focal lengths: in pixels, or as an angle of view of instant-ngp; one of the two stands for
+    /// both.
     fn focal_px(&self, width: f64, height: f64) -> Result<[f64; 2], Wrong> {
         let along = |side: f64, fl: &'static str, angle: &'static str, fov: &'static str| {
             let of_angle = |angle_rad: f64| 0.5 * side / (0.5 * angle_rad).tan();
@@ -200,7 +204,8 @@ fn is_set(value: &Value) -> bool {
 
 fn perspective([k1, k2, k3, k4]: [f64; 4], p: [f64; 2]) -> Result<Lens, Wrong> {
     if k4 != 0.0 {
-        // OpenCV's fourth coefficient is in the denominator, and nerfstudio's is of r to the power of 8.
+        // OpenCV's fourth coefficient is in the denominator, and nerfstudio's is of r to the power
+        // of 8.
         let reason = format!(
             "is {k4}: a lens that is no fisheye is read with k1, k2, k3, p1 and p2; calibrate it without k4, or \
              undistort the images"

@@ -1,7 +1,8 @@
 //! transforms.json of nerfstudio and instant-ngp.
 //!
-//! Poses are `world_from_camera` with OpenGL's camera: x right, y up, z backwards. Intrinsics are of the file or of a
-//! frame, which overrides the file's (nerfstudio's data conventions; instant-ngp's docs/nerf_dataset_tips.md).
+//! Poses are `world_from_camera` with OpenGL's camera: x right, y up, z backwards. Intrinsics are
+//! of the file or of a frame, which overrides the file's (nerfstudio's data conventions;
+//! instant-ngp's docs/nerf_dataset_tips.md).
 
 mod intrinsics;
 
@@ -13,12 +14,13 @@ use serde::Deserialize;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::views::{MOST_STOPS, refused_stops};
 
-use super::{CaptureError, Place, PosedImage, rotation_of};
+use super::{CaptureError, Place, PosedImage, to_rotation};
 use crate::ingest::file::read_whole;
 use crate::limits;
 use intrinsics::{Intrinsics, Wrong};
 
-/// The file. Fields without an effect on cameras and images, such as `aabb_scale` and `ply_file_path`, are not listed.
+/// The file. Fields without an effect on cameras and images, such as `aabb_scale` and
+/// `ply_file_path`, are not listed.
 #[derive(Deserialize)]
 struct Transforms {
     frames: Vec<Frame>,
@@ -107,7 +109,7 @@ fn posed(
     let row = |at: usize| DVec3::new(rows[at][0], rows[at][1], rows[at][2]);
     let world_from_opengl = DMat3::from_cols(row(0), row(1), row(2)).transpose();
     let rotation =
-        rotation_of(world_from_opengl * DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0)));
+        to_rotation(world_from_opengl * DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0)));
     let Some(rotation) = rotation else {
         return Err(matrix(
             "the left 3 x 3 numbers are not a rotation: rows must have length 1, at right angles, without a \

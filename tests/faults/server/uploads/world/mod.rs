@@ -43,7 +43,8 @@ struct Known {
     /// Bytes that the server has acknowledged.
     held: u64,
     is_complete: bool,
-    /// When its files were last written, and when it was last announced or written, by the time of day.
+    /// When its files were last written, and when it was last announced or written, by the time of
+    /// day.
     written_us: i64,
     used_us: i64,
     /// When bytes last came, by the clock that never jumps.
@@ -92,7 +93,7 @@ enum Failure {
 
 impl Failure {
     /// An answer that is not expected without a fault.
-    fn of(what: &str, Answer { status, body }: &Answer) -> Self {
+    fn new(what: &str, Answer { status, body }: &Answer) -> Self {
         let reason = format!("{what} is answered with {status}: {body}");
         let is_panic = reason.contains("a task crashed");
         if matches!(status, 500 | 507) && !is_panic {
@@ -288,7 +289,7 @@ impl<'a> World<'a> {
                 Ok(self.expect_offset(name, &answer.body)?)
             }
             507 if pressure.is_some() => Ok(()),
-            _ => Err(Failure::of("an announcement", &answer)),
+            _ => Err(Failure::new("an announcement", &answer)),
         }
     }
 
@@ -324,7 +325,7 @@ impl<'a> World<'a> {
             404 if !self.known.contains_key(&name) => Ok(()),
             200 => self.appended(name, end, &answer.body),
             507 if pressure.is_some() => Ok(()),
-            _ => Err(Failure::of("a part", &answer)),
+            _ => Err(Failure::new("a part", &answer)),
         }
     }
 
@@ -346,8 +347,8 @@ impl<'a> World<'a> {
         Ok(self.expect_offset(name, body)?)
     }
 
-    /// At most one of two parts for one offset is accepted. The other is refused for its offset, or because the later
-    /// connection replaced it.
+    /// At most one of two parts for one offset is accepted. The other is refused for its offset, or
+    /// because the later connection replaced it.
     async fn append_twice(
         &mut self,
         name: Name,
@@ -382,7 +383,7 @@ impl<'a> World<'a> {
                 }
                 409 => {}
                 507 if pressure.is_some() => {}
-                _ => return Err(Failure::of("one of two parts", &answer)),
+                _ => return Err(Failure::new("one of two parts", &answer)),
             }
         }
         match taken {
@@ -410,7 +411,7 @@ impl<'a> World<'a> {
         };
         match answer.status {
             409 => Ok(self.expect_offset(name, &answer.body)?),
-            _ => Err(Failure::of("a part for another offset", &answer)),
+            _ => Err(Failure::new("a part for another offset", &answer)),
         }
     }
 
@@ -427,7 +428,7 @@ impl<'a> World<'a> {
                 Ok(())
             }
             404 if !was_known => Ok(()),
-            _ => Err(Failure::of("a removal", &answer)),
+            _ => Err(Failure::new("a removal", &answer)),
         }
     }
 
@@ -442,7 +443,7 @@ impl<'a> World<'a> {
             match self.request(other.owner, &head, b"", None).await? {
                 Some(Answer { status: 404, .. }) | None => {}
                 Some(answer) => {
-                    return Err(Failure::of(&format!("{method} of another's upload"), &answer));
+                    return Err(Failure::new(&format!("{method} of another's upload"), &answer));
                 }
             }
         }
