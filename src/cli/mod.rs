@@ -144,9 +144,10 @@ pub fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             let exit = error.downcast_ref::<exit::Exit>();
-            match exit.is_some_and(|exit| exit.is_finding) {
-                true => eprintln!("{error}"),
-                false => eprintln!("error: {}", exit::chain(&error)),
+            if exit.is_some_and(|exit| exit.is_finding) {
+                eprintln!("{error}");
+            } else {
+                eprintln!("error: {}", exit::chain(&error));
             }
             exit.map_or(ExitCode::FAILURE, |exit| exit.code.into())
         }
