@@ -180,7 +180,7 @@ pub enum Event {
         /// The actor.
         actor: u16,
     },
-    /// A rule of the scenario ended the episode: `time`, `contact`, `off_route`, `route_done`, `stuck`.
+    /// A rule of the scenario ended the episode: `time`, `contact`, `off_route`, `route_done`, `stuck`, `condition`.
     Ended {
         /// The rule.
         rule: String,

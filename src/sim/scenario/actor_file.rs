@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use wildcity_scene::ActorClass;
 
+use super::line_fields::section_on_course;
 use super::pose::PoseSection;
 use super::script_file::TriggerSection;
 
@@ -66,80 +67,39 @@ pub struct LogSection {
     pub track: String,
 }
 
-/// An actor on a course.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[serde(deny_unknown_fields, default)]
-pub struct PathSection {
-    /// A recorded trajectory of the twin, as the line to follow. Exactly one of `along`, `points` and `lanes`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub along: Option<String>,
-    /// Points in the world, in metres, in order. They are placed on the ground where there is one.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub points: Option<Vec<[f64; 3]>>,
-    /// Lanes of the map, in order.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub lanes: Option<Vec<String>>,
-    /// Whether to follow it from its end to its start. If absent, false.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub reverse: Option<bool>,
-    /// Where it starts, in metres along the line.
-    pub station_m: f64,
-    /// Its offset to the left of the line, in metres. If absent, 0.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub offset_m: Option<f64>,
-    /// Its speed at the start, in m/s.
-    pub speed: f64,
-    /// Whether it disappears at the end of the line. Otherwise it stands there.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub leaves: Option<bool>,
+section_on_course! {
+    /// An actor on a course.
+    #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+    #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+    #[serde(deny_unknown_fields, default)]
+    pub struct PathSection {}
 }
 
-/// An actor that follows a course by the Intelligent Driver Model.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[serde(deny_unknown_fields, default)]
-pub struct IdmSection {
-    /// A recorded trajectory of the twin, as the line to follow. Exactly one of `along`, `points` and `lanes`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub along: Option<String>,
-    /// Points in the world, in metres, in order. They are placed on the ground where there is one.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub points: Option<Vec<[f64; 3]>>,
-    /// Lanes of the map, in order.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub lanes: Option<Vec<String>>,
-    /// Whether to follow it from its end to its start. If absent, false.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub reverse: Option<bool>,
-    /// Where it starts, in metres along the line.
-    pub station_m: f64,
-    /// Its offset to the left of the line, in metres. If absent, 0.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub offset_m: Option<f64>,
-    /// Its speed at the start, in m/s.
-    pub speed: f64,
-    /// Whether it disappears at the end of the line. Otherwise it stands there.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub leaves: Option<bool>,
-    /// Which variant of the model. If absent, `wildcity`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub model: Option<IdmModel>,
-    /// Speed of a free road, in m/s. If absent, that of the variant.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub v0: Option<f64>,
-    /// Gap to a standing lead, in metres.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub s0: Option<f64>,
-    /// Time headway, in seconds.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub headway_s: Option<f64>,
-    /// Largest acceleration, in m/s².
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub a: Option<f64>,
-    /// Comfortable braking, in m/s².
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub b: Option<f64>,
+section_on_course! {
+    /// An actor that follows a course by the Intelligent Driver Model.
+    #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+    #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+    #[serde(deny_unknown_fields, default)]
+    pub struct IdmSection {
+        /// Which variant of the model. If absent, `wildcity`.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        pub model: Option<IdmModel>,
+        /// Speed of a free road, in m/s. If absent, that of the variant.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        pub v0: Option<f64>,
+        /// Gap to a standing lead, in metres.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        pub s0: Option<f64>,
+        /// Time headway, in seconds.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        pub headway_s: Option<f64>,
+        /// Largest acceleration, in m/s².
+        #[serde(skip_serializing_if = "Option::is_none")]
+        pub a: Option<f64>,
+        /// Comfortable braking, in m/s².
+        #[serde(skip_serializing_if = "Option::is_none")]
+        pub b: Option<f64>,
+    }
 }
 
 /// Variants of the Intelligent Driver Model.

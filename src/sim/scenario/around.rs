@@ -104,7 +104,7 @@ pub(super) fn drive_named<'a>(
 }
 
 /// Points of a file.
-pub(super) fn points_of(path: &str, points: &[[f64; 3]]) -> Result<Vec<DVec3>, FileError> {
+pub(super) fn checked_points(path: &str, points: &[[f64; 3]]) -> Result<Vec<DVec3>, FileError> {
     if !(2..=limits::COURSE_POINTS).contains(&points.len()) {
         let message =
             format!("{} points; 2 to {} are accepted", points.len(), limits::COURSE_POINTS);

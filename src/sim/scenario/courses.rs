@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
-use super::around::{Surroundings, drive_named, points_of};
+use super::around::{Surroundings, checked_points, drive_named};
 use super::error::FileError;
 use crate::Ground;
 use crate::traffic::Course;
@@ -45,7 +45,7 @@ impl<'a> Courses<'a> {
                 return Ok(course);
             }
             (None, Some(points), None) => {
-                let points_m = points_of("points", points)?;
+                let points_m = checked_points("points", points)?;
                 Course::from_points(&points_m, &self.around.ground())
                     .ok_or_else(|| FileError::new("points", none()))?
             }

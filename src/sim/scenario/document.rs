@@ -42,7 +42,7 @@ impl Document {
         remove_notes(&mut value);
         let sweep = match value.as_object_mut().and_then(|fields| fields.remove("sweep")) {
             None => SweepSection::default(),
-            Some(sweep) => sweep_of(sweep)?,
+            Some(sweep) => sweep_from(sweep)?,
         };
         let document = Self { value, sweep };
         document.check_sweep()?;
@@ -123,7 +123,7 @@ impl Document {
 }
 
 /// The sweep, field by field, since the path within a flattened map would be lost.
-fn sweep_of(value: Value) -> Result<SweepSection, FileError> {
+fn sweep_from(value: Value) -> Result<SweepSection, FileError> {
     let Value::Object(fields) = value else {
         let message = "is no object; write {\"seeds\": [0, 9], \"NAME\": [values]}";
         return Err(FileError::new("sweep", message));

@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use super::actor_file::ActorSection;
 use super::pose::PoseSection;
+use super::script_file::ConditionSection;
 
 /// A scenario: a twin, an ego, actors, and when it ends.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -253,6 +254,9 @@ pub struct EndSection {
     /// absent, true.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub route_done: Option<bool>,
+    /// When this holds. A trigger is named `ACTOR/TRIGGER`; parts that are about a trigger's own actor are refused.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub when: Option<ConditionSection>,
 }
 
 /// Which contacts end an episode.

@@ -116,12 +116,7 @@ impl Measures<'_> {
     }
 
     fn body(&self, body: &Body) -> Option<&LeadCandidate> {
-        match body.actor {
-            None => self.bodies.first(),
-            Some(actor) => {
-                self.bodies.iter().find(|other| other.actor.map(usize::from) == Some(actor))
-            }
-        }
+        LeadCandidate::find(self.bodies, body.actor)
     }
 
     /// The distance by the rate at which it becomes less, in seconds.

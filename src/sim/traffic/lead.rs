@@ -62,6 +62,11 @@ impl LeadCandidate {
         }
     }
 
+    /// The body of an actor, or of the ego; `None` if it is absent.
+    pub(super) fn find(bodies: &[Self], actor: Option<usize>) -> Option<&Self> {
+        bodies.iter().find(|body| body.actor.map(usize::from) == actor)
+    }
+
     /// Horizontal direction of its length.
     pub(super) fn forward(&self) -> DVec3 {
         self.forward

@@ -1,5 +1,8 @@
 //! Triggers: what an actor does when a condition holds, each once.
 
+use super::distance::KeepDistance;
+use super::together::ArriveTogether;
+
 /// A condition and the actions that follow when it first holds.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Trigger {
@@ -115,6 +118,10 @@ pub enum Action {
         /// Added to it, in m/s.
         delta_mps: f64,
     },
+    /// Keeps a distance from another body.
+    KeepDistance(KeepDistance),
+    /// Drives so that it is at a place when another body is at its own.
+    ArriveTogether(ArriveTogether),
     /// Changes its offset from the course.
     Offset {
         /// To this offset, in metres to the left.

@@ -31,6 +31,8 @@ pub struct Traffic {
     pub ego_box: EgoBox,
     /// The actors; at most [`limits::ACTORS`].
     pub actors: Vec<Actor>,
+    /// Ends the episode when it holds. It has no actor of its own.
+    pub end: Option<Condition>,
 }
 
 /// An actor before the episode begins.
@@ -85,6 +87,17 @@ pub struct World {
     progress: Vec<ActorProgress>,
     /// The distances driven since the start: by the ego, then by each actor, in metres.
     travelled_m: Vec<f64>,
+    end: EndState,
+}
+
+/// The values of the condition that ends the episode.
+#[derive(Clone, Debug, Default, PartialEq)]
+struct EndState {
+    condition: ConditionState,
+    /// When it was last evaluated, in microseconds.
+    last_us: Option<i64>,
+    /// When it held first, in microseconds.
+    held_us: Option<i64>,
 }
 
 /// The progress of one actor's behaviour and script.
@@ -138,7 +151,7 @@ impl World {
             })
             .collect();
         let travelled_m = vec![0.0; progress.len() + 1];
-        Self { traffic, time_us: 0, states, progress, travelled_m }
+        Self { traffic, time_us: 0, states, progress, travelled_m, end: EndState::default() }
     }
 
     /// The actors as they were set up.
@@ -174,6 +187,11 @@ impl World {
         self.progress.get(actor)?.fired.get(trigger)?.fired_us
     }
 
+    /// When the condition held that ends the episode, in microseconds; `None` if it has not.
+    pub fn end_us(&self) -> Option<i64> {
+        self.end.held_us
+    }
+
     /// When the actions of a trigger had ended, in microseconds; `None` before. `Phase::Done` leaves out those that
     /// another trigger replaced.
     pub fn ended_us(&self, actor: usize, trigger: usize, phase: Phase) -> Option<i64> {
@@ -195,6 +213,7 @@ impl World {
             let sub_begin_us = self.time_us;
             let sub_end_us = begin_us.saturating_add(since_us);
             let bodies = self.bodies(&ego_now);
+            self.look_for_end(&traffic, &ego_now, &bodies);
             self.fire(&traffic, &ego_now, &bodies);
             let before = std::mem::take(&mut self.states);
             let after = self.advance_actors(&traffic, &before, &bodies, sub_end_us);
@@ -211,6 +230,28 @@ impl World {
             self.time_us = sub_end_us;
             ego_now = ego_next;
         }
+        // At the end of the step too, so that the step in which the condition holds is the last one.
+        if traffic.end.is_some() {
+            let bodies = self.bodies(&ego_now);
+            self.look_for_end(&traffic, &ego_now, &bodies);
+        }
+    }
+
+    /// Evaluates the condition that ends the episode: at each instant once, as an edge or a delay remembers its values.
+    fn look_for_end(&mut self, traffic: &Traffic, ego: &EgoState, bodies: &[LeadCandidate]) {
+        let Some(when) = traffic.end.as_ref().filter(|_| self.end.held_us.is_none()) else {
+            return;
+        };
+        let is_new = self.end.last_us != Some(self.time_us);
+        if !is_new || !when.after.is_none_or(|after| self.is_after(after)) {
+            return;
+        }
+        let mut state = std::mem::take(&mut self.end.condition);
+        let own = |part: &Condition| self.holds(traffic, None, part, ego, bodies);
+        let holds = state.value(when, self.time_us, &own);
+        let now_us = self.time_us;
+        self.end =
+            EndState { condition: state, last_us: Some(now_us), held_us: holds.then_some(now_us) };
     }
 
     /// The boxes of the ego and of all present actors, the ego's first.
@@ -256,7 +297,7 @@ impl World {
             return false;
         }
         let mut state = std::mem::take(&mut self.progress[index].fired[at].condition);
-        let own = |part: &Condition| self.holds(traffic, index, part, ego, bodies);
+        let own = |part: &Condition| self.holds(traffic, Some(index), part, ego, bodies);
         let value = state.value(when, self.time_us, &own);
         self.progress[index].fired[at].condition = state;
         value
@@ -295,36 +336,56 @@ impl World {
         }
     }
 
+    /// Whether the own parts of a condition hold, of an actor by its index, or of no actor.
     fn holds(
         &self,
         traffic: &Traffic,
-        index: usize,
+        index: Option<usize>,
         when: &Condition,
         ego: &EgoState,
         bodies: &[LeadCandidate],
     ) -> bool {
-        let progress = &self.progress[index];
+        let follow = index.and_then(|index| {
+            match (&traffic.actors[index].behaviour, &self.progress[index].behaviour) {
+                (Behaviour::Follow(follow), BehaviourState::Follow(now)) => Some((follow, now)),
+                _ => None,
+            }
+        });
+        let course = follow.map(|(follow, now)| follow.course(now));
+        let measures = Measures { bodies, travelled_m: &self.travelled_m, course };
+        when.time_us.is_none_or(|time_us| self.time_us >= time_us)
+            && when.ego_speed_above_mps.is_none_or(|least| ego.velocity_mps.length() >= least)
+            && when.after.is_none_or(|after| self.is_after(after))
+            && when.measure.is_none_or(|measure| measures.holds(&measure))
+            && self.holds_of_own(traffic, index, when, bodies)
+            && when
+                .station_m
+                .is_none_or(|least_m| follow.is_some_and(|(_, now)| now.station_m >= least_m))
+            && when.ego_station_m.is_none_or(|least_m| {
+                course.is_some_and(|course| course.nearest(bodies[0].center_m).station_m >= least_m)
+            })
+    }
+
+    /// Whether the parts hold that are about the state of the condition's own actor.
+    fn holds_of_own(
+        &self,
+        traffic: &Traffic,
+        index: Option<usize>,
+        when: &Condition,
+        bodies: &[LeadCandidate],
+    ) -> bool {
+        let Some(index) = index else { return true };
         let state = &self.states[index];
         let speed_mps = state.velocity_mps.length();
-        let station_m = || match (&traffic.actors[index].behaviour, &progress.behaviour) {
-            (Behaviour::Follow(_), BehaviourState::Follow(now)) => now.station_m,
-            _ => f64::NEG_INFINITY,
-        };
-        let ego_station_m = || match (&traffic.actors[index].behaviour, &progress.behaviour) {
-            (Behaviour::Follow(follow), BehaviourState::Follow(now)) => {
-                follow.course(now).nearest(bodies[0].center_m).station_m
-            }
-            _ => f64::NEG_INFINITY,
-        };
         // While this actor has not appeared yet, its distances are measured from the place where it will appear.
-        let own_m = match state.present {
-            true => state.world_from_actor.position_m,
-            false => {
-                progress
-                    .state(index, &traffic.actors[index], self.time_us, None)
-                    .world_from_actor
-                    .position_m
-            }
+        let own_m = || {
+            let pose = if state.present {
+                state.world_from_actor
+            } else {
+                let actor = &traffic.actors[index];
+                self.progress[index].state(index, actor, self.time_us, None).world_from_actor
+            };
+            pose.position_m
         };
         let near = |near: Near| {
             let other_m = match near.actor {
@@ -334,22 +395,11 @@ impl World {
                     other.present.then_some(other.world_from_actor.position_m)
                 }
             };
-            other_m.is_some_and(|other_m| other_m.distance(own_m) <= near.within_m)
+            other_m.is_some_and(|other_m| other_m.distance(own_m()) <= near.within_m)
         };
-        let course = match (&traffic.actors[index].behaviour, &progress.behaviour) {
-            (Behaviour::Follow(follow), BehaviourState::Follow(now)) => Some(follow.course(now)),
-            _ => None,
-        };
-        let measures = Measures { bodies, travelled_m: &self.travelled_m, course };
-        when.time_us.is_none_or(|time_us| self.time_us >= time_us)
-            && when.speed_above_mps.is_none_or(|least| state.present && speed_mps >= least)
+        when.speed_above_mps.is_none_or(|least| state.present && speed_mps >= least)
             && when.speed_below_mps.is_none_or(|most| state.present && speed_mps <= most)
-            && when.ego_speed_above_mps.is_none_or(|least| ego.velocity_mps.length() >= least)
-            && when.after.is_none_or(|after| self.is_after(after))
-            && when.measure.is_none_or(|measure| measures.holds(&measure))
             && when.near.is_none_or(near)
-            && when.station_m.is_none_or(|least_m| station_m() >= least_m)
-            && when.ego_station_m.is_none_or(|least_m| ego_station_m() >= least_m)
     }
 
     /// Advances all actors to the end of a sub-step. Returns their states then.
