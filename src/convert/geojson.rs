@@ -21,7 +21,7 @@ use serde_json::{Map, Value};
 
 use wildcity_sim::map::{Area, AreaKind, Lane, LaneKind, MapFile, StopLine};
 
-use crate::{ConvertError, text_of};
+use crate::{ConvertError, utf8_text};
 
 /// The semi-major axis of WGS 84, in metres, and the square of its eccentricity.
 const EQUATOR_M: f64 = 6_378_137.0;
@@ -66,7 +66,7 @@ struct NuPlanLane {
 /// # Errors
 /// Names the feature at fault.
 pub fn read(bytes: &[u8], origin: Option<[f64; 2]>) -> Result<MapFile, ConvertError> {
-    let value: Value = serde_json::from_str(text_of(bytes)?)
+    let value: Value = serde_json::from_str(utf8_text(bytes)?)
         .map_err(|error| ConvertError::new("file", format!("not JSON: {error}")))?;
     if value["type"] != "FeatureCollection" {
         let message = "write a FeatureCollection with the property `layer` on every feature";

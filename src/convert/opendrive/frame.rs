@@ -50,7 +50,7 @@ pub(super) fn framed(text: &str, origin: Option<[f64; 2]>) -> Result<Framed, Con
     // Far from the origin, coordinates are those of the projection already, and so are heights.
     let is_local = places.iter().flatten().all(|axis| axis.abs() <= f64::from(FARTHEST_M));
     let offset = offset.filter(|_| is_local);
-    let geo = origin_m.and_then(|origin_m| anchor_of(&document, origin_m, offset.as_ref()));
+    let geo = origin_m.and_then(|origin_m| anchor_from(&document, origin_m, offset.as_ref()));
     Ok(Framed { text, geo, notes })
 }
 
@@ -221,7 +221,7 @@ fn moved(text: &str, document: &Document<'_>, shift_m: [f64; 2]) -> String {
 }
 
 /// The anchor of an origin in the map's projection, if that is a UTM zone of WGS84.
-fn anchor_of(
+fn anchor_from(
     document: &Document<'_>,
     [easting_m, northing_m]: [f64; 2],
     offset: Option<&Offset>,

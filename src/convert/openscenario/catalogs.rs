@@ -30,7 +30,7 @@ pub(super) struct Catalogs<'a> {
 
 /// Reads the files of the catalogs if the scenario refers to any: XML files in directories relative to its own, and
 /// in those of the settings.
-pub(super) fn texts_of(
+pub(super) fn read_texts(
     root: &Element<'_>,
     node: Node<'_, '_>,
     settings: &Settings,
@@ -68,7 +68,7 @@ pub(super) fn texts_of(
 }
 
 /// Parses the files of catalogs. Files that are no catalogs stay unused.
-pub(super) fn documents_of(texts: &[CatalogText]) -> Vec<(Document<'_>, &str)> {
+pub(super) fn parse_documents(texts: &[CatalogText]) -> Vec<(Document<'_>, &str)> {
     let parsed = texts
         .iter()
         .map(|text| Some((xml::parse(&text.text, super::NODES).ok()?, text.label.as_str())));

@@ -35,7 +35,7 @@ pub(super) fn read_bytes(path: &Path) -> Result<Vec<u8>, ConvertError> {
 /// Reads a text.
 pub(super) fn read_text(path: &Path) -> Result<String, ConvertError> {
     let bytes = read_bytes(path)?;
-    let text = crate::text_of(&bytes)
+    let text = crate::utf8_text(&bytes)
         .map_err(|error| ConvertError::new(format!("{}", path.display()), error.message))?;
     Ok(text.to_owned())
 }

@@ -10,9 +10,9 @@ use crate::ConvertError;
 /// Parts that an import may leave out on request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Part {
-    /// Controllers of entities, and what activates or overrides them.
+    /// Controllers of entities but the ego, and what activates or overrides them.
     Controllers,
-    /// Actions of the entity that the agent drives, but for its start.
+    /// Actions of the entity that the agent drives, but for its start and its route.
     Ego,
     /// Weather, time of day and the state of the road.
     Environment,
@@ -20,9 +20,9 @@ pub enum Part {
     Appearance,
     /// Traffic signals.
     Signals,
-    /// Conditions of the stop trigger that are no time.
+    /// Conditions of the stop trigger that are not read.
     Stop,
-    /// Distances that an actor keeps, and motion that is synchronized with another's.
+    /// Distances across, and other distances and arrivals that are not read.
     Distances,
     /// Routes that are not read: actors take the straightest way.
     Routes,

@@ -1,9 +1,11 @@
 //! What is known of a scenario while its file is read.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use wildcity_scene::ActorClass;
-use wildcity_sim::scenario::{ConditionSection, ProfileSection};
+use wildcity_sim::scenario::{
+    ArriveTogetherSection, ConditionSection, KeepDistanceSection, ProfileSection,
+};
 
 use super::catalogs::Catalogs;
 use super::roads::{RoadMap, Spot};
@@ -83,6 +85,8 @@ pub(super) enum Act {
         factor: f64,
         delta_mps: f64,
     },
+    Keep(Box<KeepDistanceSection>),
+    Arrive(Box<ArriveTogetherSection>),
     /// To the lane with this id.
     Lane {
         lane: i32,
@@ -121,6 +125,12 @@ pub(super) struct Context<'a> {
     pub(super) variables: BTreeMap<String, String>,
     /// The parameters and variables that actions set: the name, the value and the event.
     pub(super) sets: Vec<(String, String, String)>,
+    /// The minor version of the file: 0 for 1.0.
+    pub(super) minor_version: i32,
+    /// The entities with controllers of their own.
+    pub(super) controlled: BTreeSet<String>,
+    /// The line along which the ego goes.
+    pub(super) ego_route: Option<Vec<[f64; 3]>>,
     /// Why the roads that the scenario names were not read.
     pub(super) missing_roads: Option<String>,
 }
