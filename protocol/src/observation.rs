@@ -156,8 +156,8 @@ pub struct Event {
     /// Name of the actor, if it is about one. A contact without an actor is one with the twin.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub actor: Option<String>,
-    /// Name of the trigger, or the reason of an end: `time`, `off_route`, `contact`, `stuck` or
-    /// `route_done`.
+    /// Name of the trigger, or the reason of an end: `time`, `off_route`, `contact`, `stuck`,
+    /// `route_done` or `condition`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub name: Option<String>,
     /// Whether the ego is at fault for the contact.

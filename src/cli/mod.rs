@@ -145,9 +145,9 @@ pub fn main() -> ExitCode {
         Err(error) => {
             let exit = error.downcast_ref::<exit::Exit>();
             if exit.is_some_and(|exit| exit.is_finding) {
-                eprintln!("{error}")
+                eprintln!("{error}");
             } else {
-                eprintln!("error: {}", exit::chain(&error))
+                eprintln!("error: {}", exit::chain(&error));
             }
             exit.map_or(ExitCode::FAILURE, |exit| exit.code.into())
         }

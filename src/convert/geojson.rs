@@ -1,7 +1,8 @@
 //! Maps from GeoJSON.
 //!
-//! Coordinates are metres in the twin's axes, or longitude and latitude (degrees, WGS 84) if an origin is given: then
-//! they are converted to east, north and up from this origin. Each feature has the property `layer`:
+//! Coordinates are metres in the twin's axes, or longitude and latitude (degrees, WGS 84) if an
+//! origin is given: then they are converted to east, north and up from this origin. Each feature
+//! has the property `layer`:
 //!
 //! | layer | geometry | properties |
 //! |---|---|---|
@@ -9,10 +10,11 @@
 //! | `drivable`, `intersection`, `crosswalk` | Polygon | |
 //! | `stop_line` | LineString of two points | optional `lights` |
 //!
-//! and nuPlan's layers of areas: `generic_drivable_areas`, `carpark_areas`, `road_segments`, `intersections`,
-//! `crosswalks`; and of lanes: `baseline_paths` (with `lane_fid` or `lane_connector_fid`), `lanes_polygons` and
-//! `gen_lane_connectors_scaled_width_polygons` (with `fid`, `left_boundary_fid`, `right_boundary_fid`, connectors with
-//! `exit_lane_fid` and `entry_lane_fid`), and `boundaries` (with `fid`). Other layers are refused by name.
+//! and nuPlan's layers of areas: `generic_drivable_areas`, `carpark_areas`, `road_segments`,
+//! `intersections`, `crosswalks`; and of lanes: `baseline_paths` (with `lane_fid` or
+//! `lane_connector_fid`), `lanes_polygons` and `gen_lane_connectors_scaled_width_polygons` (with
+//! `fid`, `left_boundary_fid`, `right_boundary_fid`, connectors with `exit_lane_fid` and
+//! `entry_lane_fid`), and `boundaries` (with `fid`). Other layers are refused by name.
 
 use std::collections::BTreeMap;
 
@@ -21,7 +23,7 @@ use serde_json::{Map, Value};
 
 use wildcity_sim::map::{Area, AreaKind, Lane, LaneKind, MapFile, StopLine};
 
-use crate::{ConvertError, text_of};
+use crate::{ConvertError, utf8_text};
 
 /// The semi-major axis of WGS 84, in metres, and the square of its eccentricity.
 const EQUATOR_M: f64 = 6_378_137.0;
@@ -48,7 +50,8 @@ struct NuPlan {
     /// Middles by the lane's or connector's fid.
     paths: BTreeMap<String, Vec<[f64; 3]>>,
     boundaries: BTreeMap<String, Vec<[f64; 3]>>,
-    /// Lanes and connectors by fid: left and right boundary, whether it is a connector, following lane.
+    /// Lanes and connectors by fid: left and right boundary, whether it is a connector, following
+    /// lane.
     lanes: Vec<NuPlanLane>,
 }
 
@@ -60,13 +63,13 @@ struct NuPlanLane {
     connects: Option<[String; 2]>,
 }
 
-/// Reads a GeoJSON map; `origin` is the longitude and latitude, in degrees, of the twin's origin, if coordinates are
-/// degrees.
+/// Reads a GeoJSON map; `origin` is the longitude and latitude, in degrees, of the twin's origin,
+/// if coordinates are degrees.
 ///
 /// # Errors
 /// Names the feature at fault.
 pub fn read(bytes: &[u8], origin: Option<[f64; 2]>) -> Result<MapFile, ConvertError> {
-    let value: Value = serde_json::from_str(text_of(bytes)?)
+    let value: Value = serde_json::from_str(utf8_text(bytes)?)
         .map_err(|error| ConvertError::new("file", format!("not JSON: {error}")))?;
     if value["type"] != "FeatureCollection" {
         let message = "write a FeatureCollection with the property `layer` on every feature";
@@ -122,9 +125,10 @@ impl Feature<'_> {
             }
             "lanes_polygons" | "gen_lane_connectors_scaled_width_polygons" => {
                 let is_connector = self.layer != "lanes_polygons";
-                let connects = match is_connector {
-                    true => Some([self.id("exit_lane_fid")?, self.id("entry_lane_fid")?]),
-                    false => None,
+                let connects = if is_connector {
+                    Some([self.id("exit_lane_fid")?, self.id("entry_lane_fid")?])
+                } else {
+                    None
                 };
                 nuplan.lanes.push(NuPlanLane {
                     feature: self.index,
@@ -326,8 +330,8 @@ impl Origin {
         })
     }
 
-    /// East, north and height of a place. The height stays that above the ellipsoid, so that a map is as level as
-    /// the earth.
+    /// East, north and height of a place. The height stays that above the ellipsoid, so that a map
+    /// is as level as the earth.
     fn to_enu(&self, place: [f64; 3]) -> [f64; 3] {
         let [longitude, latitude, height_m] = place;
         let enu_m = self.enu_from_ecef * (ecef_m([longitude, latitude, 0.0]) - self.at_m);
@@ -380,8 +384,9 @@ mod tests {
     #[test]
     fn a_degree_is_as_long_as_on_the_ellipsoid() {
         let origin = Origin::at([10.0, 48.0]).unwrap();
-        // Length of a degree in metres, in series of the latitude φ: 111412.84 cos φ - 93.5 cos 3φ + 0.118 cos 5φ
-        // to the east, 111132.92 - 559.82 cos 2φ + 1.175 cos 4φ to the north (American Practical Navigator, table 7).
+        // Length of a degree in metres, in series of the latitude φ: 111412.84 cos φ - 93.5 cos 3φ
+        // + 0.118 cos 5φ to the east, 111132.92 - 559.82 cos 2φ + 1.175 cos 4φ to the north
+        // (American Practical Navigator, table 7).
         let [east_m, _, _] = origin.to_enu([10.001, 48.0, 0.0]);
         assert!((east_m - 74.625_33).abs() < 1e-3, "{east_m}");
         let [_, north_m, up_m] = origin.to_enu([10.0, 48.001, 5.0]);

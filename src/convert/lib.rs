@@ -33,7 +33,7 @@ impl ConvertError {
 }
 
 /// The bytes of a file as text.
-fn text_of(bytes: &[u8]) -> Result<&str, ConvertError> {
+fn utf8_text(bytes: &[u8]) -> Result<&str, ConvertError> {
     if bytes.len() > TEXT_BYTES {
         let message = format!("{} bytes; at most {TEXT_BYTES} are read", bytes.len());
         return Err(ConvertError::new("file", message));

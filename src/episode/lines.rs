@@ -169,7 +169,7 @@ pub enum Event {
         actor: u16,
     },
     /// A rule of the scenario ended the episode: `time`, `contact`, `off_route`, `route_done`,
-    /// `stuck`.
+    /// `stuck`, `condition`.
     Ended {
         rule: String,
     },

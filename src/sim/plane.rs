@@ -12,8 +12,8 @@ pub(crate) struct Plane {
 }
 
 impl Plane {
-    /// The pose on the plane with the same heading, moved vertically; `None` if the plane is too steep to be a ground,
-    /// or the pose points along its normal.
+    /// The pose on the plane with the same heading, moved vertically; `None` if the plane is too
+    /// steep to be a ground, or the pose points along its normal.
     pub(crate) fn place(&self, world_from_rig: Pose) -> Option<Pose> {
         let Self { point_m, up } = *self;
         // A drive that is tilted by more than 45 degrees does not define a ground.

@@ -1,5 +1,5 @@
-//! Public OpenSCENARIO files, of which most must import. They are not in the repository: `$WILDCITY_OPENSCENARIO` is a
-//! directory of them with their catalogs and roads.
+//! Public OpenSCENARIO files, of which most must import. They are not in the repository:
+//! `$WILDCITY_OPENSCENARIO` is a directory of them with their catalogs and roads.
 
 use std::collections::BTreeMap;
 use std::io::Write;
@@ -20,7 +20,8 @@ fn files(dir: &Path, found: &mut Vec<PathBuf>) {
     }
 }
 
-/// Directories of catalogs that files take for granted: `$WILDCITY_OPENSCENARIO_CATALOGS`, with `:` between them.
+/// Directories of catalogs that files take for granted: `$WILDCITY_OPENSCENARIO_CATALOGS`, with `:`
+/// between them.
 fn catalogs() -> Vec<PathBuf> {
     std::env::var_os("WILDCITY_OPENSCENARIO_CATALOGS")
         .map_or_else(Vec::new, |paths| std::env::split_paths(&paths).collect())
@@ -55,6 +56,12 @@ fn import(path: &Path, parts: &[Part]) -> Result<(), String> {
     resolved.map(|_| ()).map_err(|error| format!("resolve: {error}"))
 }
 
+/// A reason without the name of a catalog's file and numbers.
+fn kind(error: &str) -> String {
+    let from = error.find("line ").unwrap_or(0);
+    error[from..].chars().filter(|c| !c.is_ascii_digit()).take(120).collect()
+}
+
 #[test]
 fn most_public_files_import() {
     let mut out = std::io::stderr();
@@ -71,6 +78,7 @@ fn most_public_files_import() {
     let mut with_parts = 0;
     let mut scenarios = 0;
     let mut counts: BTreeMap<String, [usize; 3]> = BTreeMap::new();
+    let mut needed: BTreeMap<String, Vec<String>> = BTreeMap::new();
     let mut refusals: BTreeMap<String, Vec<String>> = BTreeMap::new();
     for path in &paths {
         // Catalogs and distributions of parameters are no scenarios.
@@ -83,28 +91,34 @@ fn most_public_files_import() {
         let corpus = below.iter().next().unwrap().to_string_lossy().into_owned();
         let [all_of, plain_of, with_of] = counts.entry(corpus).or_default();
         *all_of += 1;
-        let is_plain = import(path, &[]).is_ok();
-        plain += usize::from(is_plain);
-        *plain_of += usize::from(is_plain);
+        let plainly = import(path, &[]);
+        plain += usize::from(plainly.is_ok());
+        *plain_of += usize::from(plainly.is_ok());
+        let name = path.file_name().unwrap().to_string_lossy().into_owned();
         match import(path, &all) {
             Ok(()) => {
                 with_parts += 1;
                 *with_of += 1;
+                if let Err(error) = plainly {
+                    needed.entry(kind(&error)).or_default().push(format!("{name}: {error}"));
+                }
             }
             Err(error) => {
-                let kind: String =
-                    error.chars().filter(|c| !c.is_ascii_digit()).take(120).collect();
-                let name = path.file_name().unwrap().to_string_lossy().into_owned();
-                refusals.entry(kind).or_default().push(format!("{name}: {error}"));
+                refusals.entry(kind(&error)).or_default().push(format!("{name}: {error}"));
             }
         }
     }
     let mut lines =
         vec![format!("{scenarios} scenarios, {plain} import, {with_parts} with parts left out")];
     lines.extend(counts.iter().map(|(corpus, counts)| format!("{corpus}: {counts:?}")));
-    let mut kinds: Vec<_> = refusals.into_values().collect();
-    kinds.sort_by_key(|kind| std::cmp::Reverse(kind.len()));
-    lines.extend(kinds.iter().map(|kind| format!("{:4}  {}", kind.len(), kind[0])));
+    lines.push("what is refused without options first, and why others do not import:".to_owned());
+    for reasons in [needed, refusals] {
+        let mut kinds: Vec<_> = reasons.into_values().collect();
+        kinds.sort_by_key(|kind| std::cmp::Reverse(kind.len()));
+        lines.extend(kinds.iter().map(|kind| format!("{:4}  {}", kind.len(), kind[0])));
+        lines.push(String::new());
+    }
     out.write_all((lines.join("\n") + "\n").as_bytes()).unwrap();
     assert!(with_parts * 264 >= 200 * scenarios, "{with_parts} of {scenarios}");
+    assert!(plain * 264 >= 95 * scenarios, "{plain} of {scenarios} without options");
 }

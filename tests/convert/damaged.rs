@@ -1,5 +1,5 @@
-//! Ten thousand damaged files: scenarios, tracks and maps, of every format. None may panic, and each error has a place
-//! and a message.
+//! Ten thousand damaged files: scenarios, tracks and maps, of every format. None may panic, and
+//! each error has a place and a message.
 
 use serde_json::{Value, json};
 
@@ -118,7 +118,8 @@ fn the_whole_scenario_resolves_and_runs() {
     assert_eq!(run(&serde_json::to_vec(&scenario()).unwrap()), Ok(8));
 }
 
-/// Resolves a scenario with its first values and runs it for two seconds. Returns the number of actors.
+/// Resolves a scenario with its first values and runs it for two seconds. Returns the number of
+/// actors.
 fn run(text: &[u8]) -> Result<usize, String> {
     let document = Document::parse(text).map_err(|error| told(&error.path, &error.message))?;
     let refused = |error: wildcity_sim::scenario::FileError| told(&error.path, &error.message);

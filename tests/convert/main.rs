@@ -11,6 +11,7 @@ mod damaged;
 mod geojson;
 mod opendrive;
 mod openscenario;
+mod openscenario_motion;
 mod schema;
 
 /// A file of the small inputs with expected values.

@@ -6,7 +6,8 @@ use wildcity_sim::map::{LaneKind, Map, MapFile};
 
 use crate::case;
 
-/// A straight road of 100 m with two lanes and a pavement, that continues into an arc of radius 50 m.
+/// A straight road of 100 m with two lanes and a pavement, that continues into an arc of radius 50
+/// m.
 pub(crate) const ROADS: &str = r#"<?xml version="1.0"?>
 <OpenDRIVE>
   <header revMajor="1" revMinor="6" name="two roads"/>
@@ -144,7 +145,8 @@ fn edges_of_a_banked_road_are_along_its_bank() {
     }
 }
 
-/// A lane that becomes wider by 1 m in 10 m: its middle turns by 2.9 degrees, its ends stay across the road.
+/// A lane that becomes wider by 1 m in 10 m: its middle turns by 2.9 degrees, its ends stay across
+/// the road.
 #[test]
 fn edges_of_a_widening_lane_are_across_the_road() {
     let text = r#"<OpenDRIVE><header revMajor="1" revMinor="7"/>

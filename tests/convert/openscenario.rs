@@ -145,7 +145,7 @@ pub(crate) fn settings() -> Settings {
     }
 }
 
-fn resolved(file: ScenarioFile) -> Scenario {
+pub(crate) fn resolved(file: ScenarioFile) -> Scenario {
     let around = Surroundings { drives: &[], tracks: None, map: None, assets: &NoAssets };
     Scenario::resolve(file, 1, &around).unwrap()
 }
@@ -315,7 +315,7 @@ const ROADS: &str = r#"<OpenDRIVE><header revMajor="1" revMinor="6"/>
 </laneSection></lanes></road></OpenDRIVE>"#;
 
 /// Reads a file on the roads.
-fn on_roads(text: &str, leave_out: &[Part]) -> Result<Imported, String> {
+pub(crate) fn on_roads(text: &str, leave_out: &[Part]) -> Result<Imported, String> {
     let dir = tempfile::tempdir().unwrap();
     let roads = dir.path().join("roads.xodr");
     std::fs::write(&roads, ROADS).unwrap();
@@ -367,7 +367,7 @@ fn places_on_lanes_have_their_points_and_headings() {
 }
 
 /// A car on lane -2 of the roads that changes to another lane within 4 s, from time 2 on.
-const LANES: &str = r#"<OpenSCENARIO>
+pub(crate) const LANES: &str = r#"<OpenSCENARIO>
 <FileHeader revMajor="1" revMinor="3" date="" description="" author=""/>
 <CatalogLocations/><RoadNetwork/>
 <Entities>
@@ -475,8 +475,8 @@ fn speeds_follow_those_of_others() {
 
 #[test]
 fn parts_are_left_out_on_request_only_and_told() {
-    let controller = "<PrivateAction><ControllerAction><ActivateControllerAction lateral=\"true\" \
-                      longitudinal=\"true\"/></ControllerAction></PrivateAction></Private></Actions>";
+    let controller = "<PrivateAction><ControllerAction><AssignControllerAction><Controller \
+                      name=\"c\"/></AssignControllerAction></ControllerAction></PrivateAction></Private></Actions>";
     let text = LANES.replace("</Private></Actions>", controller);
     let error = on_roads(&text, &[]).unwrap_err();
     assert!(
@@ -485,6 +485,21 @@ fn parts_are_left_out_on_request_only_and_told() {
     );
     let notes = on_roads(&text, &[Part::Controllers]).unwrap().notes;
     assert!(notes.len() == 1 && notes[0].contains("<ControllerAction>"), "{notes:?}");
+    // The agent is the ego's controller, and without a controller there is nothing to activate.
+    let activate = controller.replace(
+        "<AssignControllerAction><Controller name=\"c\"/></AssignControllerAction>",
+        "<ActivateControllerAction lateral=\"true\" longitudinal=\"true\"/>",
+    );
+    let notes = on_roads(&LANES.replace("</Private></Actions>", &activate), &[]).unwrap().notes;
+    assert!(notes.len() == 1 && notes[0].contains("\"Van\" has no controller"), "{notes:?}");
+    let of_ego = controller.replace("</Private></Actions>", "");
+    let text = LANES.replacen(
+        "</Position></TeleportAction></PrivateAction></Private>",
+        &format!("</Position></TeleportAction></PrivateAction>{of_ego}</Private>"),
+        1,
+    );
+    let notes = on_roads(&text, &[]).unwrap().notes;
+    assert!(notes.len() == 1 && notes[0].contains("agent is the ego's controller"), "{notes:?}");
     // What nothing knows is never left out.
     let text = LANES.replace("<StopTrigger/>", "<StopTrigger/><Extra/>");
     let all: Vec<Part> = Part::ALL.iter().map(|(part, _)| *part).collect();

@@ -1,5 +1,6 @@
 //! `src/sim/schema` is generated from the types. After a change run
-//! `WILDCITY_BLESS=1 cargo test -p wildcity-convert --test convert schema`, and review the difference.
+//! `WILDCITY_BLESS=1 cargo test -p wildcity-convert --test convert schema`, and review the
+//! difference.
 
 use schemars::transform::{RecursiveTransform, Transform};
 use schemars::{Schema, schema_for};

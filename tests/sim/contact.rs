@@ -218,8 +218,8 @@ fn every_step_length_decides_alike_about_a_nanometre() {
 
 #[test]
 fn what_lies_between_two_sub_steps_is_swept() {
-    // A sign of 5 cm cuts the ego's front left corner (3.9, 1.0) at 50 m/s: it is in the box from 0.3834 s to
-    // 0.3848 s, within one sub-step.
+    // A sign of 5 cm cuts the ego's front left corner (3.9, 1.0) at 50 m/s: it is in the box from
+    // 0.3834 s to 0.3848 s, within one sub-step.
     let sign = ActorBox { length_m: 0.05, width_m: 0.05, height_m: 2.0 };
     let motion = |time_s: f64| {
         let way_m = 35.0 * (time_s - 0.3834);

@@ -40,10 +40,11 @@ impl Law {
     }
 }
 
-/// The car after a step at one speed or another, but not through standstill, where the law divides by 0.
+/// The car after a step at one speed or another, but not through standstill, where the law divides
+/// by 0.
 pub(crate) fn reference(from: &SingleTrackState, told: Setpoint, step_s: f64) -> SingleTrackState {
-    // Its order is 5: a thousand steps leave 1e-14. Its own control of the error, which takes a relative
-    // tolerance to the power of 2/3, left 1e-7.
+    // Its order is 5: a thousand steps leave 1e-14. Its own control of the error, which takes a
+    // relative tolerance to the power of 2/3, left 1e-7.
     let method = ImplicitRungeKutta::radau5()
         .rtol(1e-13)
         .atol(1e-18)

@@ -1,6 +1,7 @@
 //! Error against run time of ways to integrate the same car, for BENCHMARKS.md: run by hand, as
 //! `cargo test -p wildcity-sim --test sim study -- --ignored --nocapture`. Writes
-//! `ego_integrators.csv` and the picture `ego_integrators.svg` to `$WILDCITY_STUDY`, or next to the built program.
+//! `ego_integrators.csv` and the picture `ego_integrators.svg` to `$WILDCITY_STUDY`, or next to the
+//! built program.
 
 use std::fmt::Write as _;
 use std::path::PathBuf;
@@ -21,8 +22,8 @@ enum Way {
     Rk4,
     /// The midpoint rule, order 2.
     Rk2,
-    /// The midpoint rule, and below 5 m/s a model that pulls to rolling with a gain of 10 1/s, as AlpaSim
-    /// does it.
+    /// The midpoint rule, and below 5 m/s a model that pulls to rolling with a gain of 10 1/s, as
+    /// AlpaSim does it.
     Rk2Switched,
 }
 
@@ -131,8 +132,8 @@ fn stepped(way: Way, from: &SingleTrackState, told: Setpoint, step_s: f64) -> Si
     }
 }
 
-/// The model below the switch: lateral velocity and yaw rate are pulled to rolling without slip, and the
-/// rear axle does not slip.
+/// The model below the switch: lateral velocity and yaw rate are pulled to rolling without slip,
+/// and the rear axle does not slip.
 fn pulled(law: &Law, state: &[f64; 8]) -> [f64; 8] {
     let car = Vehicle::DEFAULT;
     let [_, _, yaw, speed, lateral, yaw_rate, steering, _] = *state;

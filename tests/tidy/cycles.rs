@@ -1,5 +1,6 @@
-//! No two files of a package import each other, directly or through others. A file and the `mod.rs` or `lib.rs` above it
-//! are not counted: the one declares the other. What a `mod.rs` re-exports counts as an import of the file below it.
+//! No two files of a package import each other, directly or through others. A file and the `mod.rs`
+//! or `lib.rs` above it are not counted: the one declares the other. What a `mod.rs` re-exports
+//! counts as an import of the file below it.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -53,7 +54,8 @@ fn a_planted_cycle_through_an_export_is_found() {
     }
 }
 
-/// Which file names an item of which other. An item that a `mod.rs` re-exports is that of the file that defines it.
+/// Which file names an item of which other. An item that a `mod.rs` re-exports is that of the file
+/// that defines it.
 fn edges(files: &BTreeMap<String, String>) -> Edges {
     let by_module: BTreeMap<Vec<String>, &String> =
         files.keys().map(|file| (module(file), file)).collect();

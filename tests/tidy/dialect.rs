@@ -1,6 +1,8 @@
-//! The source reads as other Rust does: the names, forms and comments that a reader of Rust expects.
+//! The source reads as other Rust does: the names, forms and comments that a reader of Rust
+//! expects.
 //!
-//! `cargo test --test tidy dialect -- --nocapture` prints the table that the limits below are checked against.
+//! `cargo test --test tidy dialect -- --nocapture` prints the table that the limits below are
+//! checked against.
 
 use std::fmt;
 
@@ -54,8 +56,8 @@ impl Dialect {
         dialect
     }
 
-    /// `of`, `length_of`, `of_length`: a constructor is `new` or `from_x`, and any other function is a verb or what it
-    /// returns.
+    /// `of`, `length_of`, `of_length`: a constructor is `new` or `from_x`, and any other function
+    /// is a verb or what it returns.
     fn check_name(&mut self, name: &syn::Ident) {
         let text = name.to_string();
         if text == "of" || text.ends_with("_of") || text.starts_with("of_") {

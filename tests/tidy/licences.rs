@@ -1,7 +1,7 @@
 //! Licences and versions of all dependencies, as `deny.toml` allows them.
 //!
-//! `cargo deny check` checks this and more, but takes longer to build than this project. Both read the same list,
-//! `deny.toml`.
+//! `cargo deny check` checks this and more, but takes longer to build than this project. Both read
+//! the same list, `deny.toml`.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -105,8 +105,8 @@ fn no_crate_is_there_twice_unless_it_is_listed() {
     );
 }
 
-/// Whether an SPDX expression can be fulfilled with allowed licences. `AND` binds closer than `OR`, as SPDX
-/// says; `/` is an old spelling of `OR`.
+/// Whether an SPDX expression can be fulfilled with allowed licences. `AND` binds closer than `OR`,
+/// as SPDX says; `/` is an old spelling of `OR`.
 fn is_allowed(expression: &str, allowed: &[String]) -> bool {
     let spaced = expression.replace('/', " OR ").replace('(', " ( ").replace(')', " ) ");
     let words: Vec<&str> = spaced.split_whitespace().collect();

@@ -1,5 +1,5 @@
-//! The table of packages in `src/lib.rs` equals the manifests, and crates that belong to one place are named only
-//! there.
+//! The table of packages in `src/lib.rs` equals the manifests, and crates that belong to one place
+//! are named only there.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -36,8 +36,9 @@ const CRATES: &[(&str, &[&str])] = &[
     ("image_webp", &["src/twin/ingest/sog"]),
 ];
 
-/// Files that may open files: those of a twin only `store/local`; the others scenes and settings of the
-/// user, training data, episodes, uploads, scenarios, their catalogs and roads, pictures, and how much memory there is.
+/// Files that may open files: those of a twin only `store/local`; the others scenes and settings of
+/// the user, training data, episodes, uploads, scenarios, their catalogs and roads, pictures, and
+/// how much memory there is.
 const FILES: &[&str] = &[
     "src/twin/store/local",
     "src/twin/residency/budget.rs",
@@ -62,7 +63,8 @@ const FILES: &[&str] = &[
 /// The modules that open files.
 const FILE_MODULES: &[&[&str]] = &[&["std", "fs"], &["tokio", "fs"]];
 
-/// Within the server, only the converter uses the messages of the wire; its limits apply everywhere.
+/// Within the server, only the converter uses the messages of the wire; its limits apply
+/// everywhere.
 const WIRE_IN_SERVER: &[&str] = &["src/server/convert"];
 
 #[test]

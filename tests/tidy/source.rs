@@ -103,8 +103,8 @@ pub(crate) fn rust_files(folder: &Path) -> BTreeMap<String, String> {
     files
 }
 
-/// A path that code names, as `["crate", "cpu", "bin"]` or `["axum", "Router"]`, and its line, from 1.
-/// `self` and `super` are resolved: paths in the package start with `crate`.
+/// A path that code names, as `["crate", "cpu", "bin"]` or `["axum", "Router"]`, and its line, from
+/// 1. `self` and `super` are resolved: paths in the package start with `crate`.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Named {
     pub(crate) path: Vec<String>,

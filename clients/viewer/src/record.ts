@@ -86,6 +86,6 @@ function eventOf(line: any, names: string[]): RecordedEvent {
   const { time_us: timeUs, event, actor, rule, trust, ego_at_fault: atFault } = line;
   const parts = [String(event).replaceAll("_", " "), names[actor] ?? "", rule?.replaceAll("_", " ") ?? "",
     trust === undefined ? "" : `trust ${trust.toFixed(2)}`, atFault ? "(ego at fault)" : ""];
-  const isBad = event === "contact" || event === "static_contact" || (event === "ended" && !["route_done", "time"].includes(rule));
+  const isBad = event === "contact" || event === "static_contact" || (event === "ended" && !["route_done", "time", "condition"].includes(rule));
   return { time_us: timeUs, text: parts.filter(Boolean).join(" "), isBad };
 }

@@ -57,12 +57,7 @@ fn looks(scenario: &Scenario, assets: &StoredAssets<'_>) -> Vec<String> {
             return Some(format!("actor {name:?} is invisible, and can be hit"));
         };
         let own = assets.find(asset).ok()?.box_;
-        let ratios = [
-            own.length_m / box_.length_m,
-            own.width_m / box_.width_m,
-            own.height_m / box_.height_m,
-        ];
-        let is_other = ratios.iter().any(|ratio| ratio.max(1.0 / ratio) > OTHER_SIZE);
+        let is_other = own.ratios(box_).iter().any(|ratio| ratio.max(1.0 / ratio) > OTHER_SIZE);
         let size = |box_: &ActorBox| {
             format!("{:.1} x {:.1} x {:.1} m", box_.length_m, box_.width_m, box_.height_m)
         };

@@ -1,4 +1,5 @@
-//! The frame of an OpenDRIVE file: its numbers, its place on the earth, and its coordinates near the origin.
+//! The frame of an OpenDRIVE file: its numbers, its place on the earth, and its coordinates near
+//! the origin.
 
 use roxmltree::{Document, Node};
 use wildcity_scene::geo::{GeoAnchor, ProjectedOrigin};
@@ -37,7 +38,8 @@ pub(super) struct Framed {
     pub(super) notes: Vec<String>,
 }
 
-/// Moves the coordinates of a file to `origin`, which is an easting and a northing, or else by the offset of its header.
+/// Moves the coordinates of a file to `origin`, which is an easting and a northing, or else by the
+/// offset of its header.
 pub(super) fn framed(text: &str, origin: Option<[f64; 2]>) -> Result<Framed, ConvertError> {
     let document = xml::parse(text, NODES)?;
     check_numbers(&document)?;
@@ -50,7 +52,7 @@ pub(super) fn framed(text: &str, origin: Option<[f64; 2]>) -> Result<Framed, Con
     // Far from the origin, coordinates are those of the projection already, and so are heights.
     let is_local = places.iter().flatten().all(|axis| axis.abs() <= f64::from(FARTHEST_M));
     let offset = offset.filter(|_| is_local);
-    let geo = origin_m.and_then(|origin_m| anchor_of(&document, origin_m, offset.as_ref()));
+    let geo = origin_m.and_then(|origin_m| anchor_from(&document, origin_m, offset.as_ref()));
     Ok(Framed { text, geo, notes })
 }
 
@@ -167,8 +169,8 @@ fn chosen_shift(
             Err(ConvertError::new("OpenDRIVE", message))
         }
         (Some([east, north]), offset) => {
-            // By the standard, the offset takes coordinates to the projection. Coordinates far from the origin are
-            // those of the projection already.
+            // By the standard, the offset takes coordinates to the projection. Coordinates far from
+            // the origin are those of the projection already.
             let offset = offset.filter(|_| is_local);
             offset.map(check_heading).transpose()?;
             let [x, y] = offset.map_or([0.0, 0.0], |offset| offset.xy_m);
@@ -221,7 +223,7 @@ fn moved(text: &str, document: &Document<'_>, shift_m: [f64; 2]) -> String {
 }
 
 /// The anchor of an origin in the map's projection, if that is a UTM zone of WGS84.
-fn anchor_of(
+fn anchor_from(
     document: &Document<'_>,
     [easting_m, northing_m]: [f64; 2],
     offset: Option<&Offset>,

@@ -1,7 +1,8 @@
 //! Maps from OpenDRIVE.
 //!
-//! The crate xodr computes the lanes' centre lines and widths in the file's own axes, in f32: 1 mm at 16 km from the
-//! origin. A map that reaches beyond is refused, unless it is moved to an origin of its own first.
+//! The crate xodr computes the lanes' centre lines and widths in the file's own axes, in f32: 1 mm
+//! at 16 km from the origin. A map that reaches beyond is refused, unless it is moved to an origin
+//! of its own first.
 
 mod frame;
 
@@ -12,22 +13,21 @@ use xodr::{
     Direction, LanePosition, LaneType, Point, RoadId, RoadNetwork, RoadPosition, SpeedLimit,
 };
 
-use crate::{ConvertError, text_of};
+use crate::{ConvertError, utf8_text};
 
 /// Farthest coordinate, in metres.
 pub const FARTHEST_M: f32 = 16_000.0;
 
-/// Lanes narrower than this are left out, in metres: a lane that starts or ends as a wedge has no width at this end.
+/// Lanes narrower than this are left out, in metres: a lane that starts or ends as a wedge has no
+/// width at this end.
 const NARROW_M: f32 = 0.05;
 
 /// A map, and the elements that the reader ignored or assumed.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Imported {
-    /// The map.
     pub map: MapFile,
     /// The place of the origin on the earth, if the file says it.
     pub geo: Option<GeoAnchor>,
-    /// Messages for people.
     pub warnings: Vec<String>,
 }
 
@@ -40,8 +40,8 @@ pub(crate) struct Roads {
 }
 
 /// Reads the roads of an OpenDRIVE file, with the place of `origin` as the origin.
-pub(crate) fn roads_of(bytes: &[u8], origin: Option<[f64; 2]>) -> Result<Roads, ConvertError> {
-    let framed = frame::framed(text_of(bytes)?, origin)?;
+pub(crate) fn roads_from(bytes: &[u8], origin: Option<[f64; 2]>) -> Result<Roads, ConvertError> {
+    let framed = frame::framed(utf8_text(bytes)?, origin)?;
     let (network, provenance) = xodr::load_str_with_provenance(&framed.text)
         .map_err(|error| ConvertError::new("OpenDRIVE", error.to_string()))?;
     let mut warnings = framed.notes;
@@ -49,17 +49,17 @@ pub(crate) fn roads_of(bytes: &[u8], origin: Option<[f64; 2]>) -> Result<Roads, 
     Ok(Roads { network, geo: framed.geo, warnings })
 }
 
-/// Reads an OpenDRIVE file. `origin` is the easting and the northing of the map's origin in the projection of the file;
-/// without it, the origin is that of the file, or the offset of the file's header is added where only that brings the
-/// roads near it.
+/// Reads an OpenDRIVE file. `origin` is the easting and the northing of the map's origin in the
+/// projection of the file; without it, the origin is that of the file, or the offset of the file's
+/// header is added where only that brings the roads near it.
 ///
 /// # Errors
 /// It is not OpenDRIVE, has no lanes, or reaches beyond [`FARTHEST_M`].
 pub fn read(bytes: &[u8], origin: Option<[f64; 2]>) -> Result<Imported, ConvertError> {
-    let Roads { network, geo, warnings } = roads_of(bytes, origin)?;
+    let Roads { network, geo, warnings } = roads_from(bytes, origin)?;
     let mut lanes = Vec::new();
     for lane in network.lanes() {
-        if let Some(lane) = lane_of(&network, lane)? {
+        if let Some(lane) = lane_from(&network, lane)? {
             lanes.push(lane);
         }
     }
@@ -82,9 +82,9 @@ pub fn read(bytes: &[u8], origin: Option<[f64; 2]>) -> Result<Imported, ConvertE
     Ok(Imported { map, geo, warnings })
 }
 
-fn lane_of(network: &RoadNetwork, lane: &xodr::Lane) -> Result<Option<Lane>, ConvertError> {
-    let Some(id) = id_of(network, lane.id) else { return Ok(None) };
-    let Some(kind) = kind_of(lane.kind) else { return Ok(None) };
+fn lane_from(network: &RoadNetwork, lane: &xodr::Lane) -> Result<Option<Lane>, ConvertError> {
+    let Some(id) = lane_id(network, lane.id) else { return Ok(None) };
+    let Some(kind) = lane_kind(lane.kind) else { return Ok(None) };
     let points = lane.center.points();
     let tangents = lane.center.tangents();
     let width_m =
@@ -131,12 +131,12 @@ fn lane_of(network: &RoadNetwork, lane: &xodr::Lane) -> Result<Option<Lane>, Con
     });
     let road = network.road_lane(lane.id).and_then(|of| network.road(of.road));
     let intersection = road.is_some_and(|road| road.junction().is_some());
-    let next = lane.successors.iter().filter_map(|next| id_of(network, *next)).collect();
+    let next = lane.successors.iter().filter_map(|next| lane_id(network, *next)).collect();
     Ok(Some(Lane { id, kind, center, left, right, next, intersection, limit_mps }))
 }
 
-/// The horizontal direction across the road to its left, at a point of the lane's middle: lanes are cut across the road,
-/// also where they become wider and their middle is no parallel to the road.
+/// The horizontal direction across the road to its left, at a point of the lane's middle: lanes are
+/// cut across the road, also where they become wider and their middle is no parallel to the road.
 fn across_lane(network: &RoadNetwork, lane: &xodr::Lane, point: Point) -> Option<DVec3> {
     let road = network.road_lane(lane.id)?.road;
     let at = network.road_position_on(road, point)?;
@@ -160,14 +160,14 @@ pub(crate) fn across_road(network: &RoadNetwork, road: RoadId, s: f64) -> Option
 }
 
 /// `ROAD/SECTION/LANE`, as the file numbers them.
-fn id_of(network: &RoadNetwork, lane: xodr::LaneId) -> Option<String> {
+fn lane_id(network: &RoadNetwork, lane: xodr::LaneId) -> Option<String> {
     let of = network.road_lane(lane)?;
     let road = network.road(of.road)?;
     Some(format!("{}/{}/{}", road.od_id(), of.section, of.od_id))
 }
 
 /// The kind of a lane; `None` for lanes that are not a surface to move on.
-fn kind_of(kind: LaneType) -> Option<LaneKind> {
+fn lane_kind(kind: LaneType) -> Option<LaneKind> {
     use LaneType as From;
     if kind.is_drivable() {
         return Some(LaneKind::Driving);

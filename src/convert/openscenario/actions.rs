@@ -7,7 +7,7 @@ use super::element::Element;
 use super::ledger::Part;
 use super::model::{Act, Context, Line};
 use super::roads::shifted_id;
-use super::{catalogs, trajectory};
+use super::{catalogs, controllers, distances, trajectory};
 use crate::ConvertError;
 
 /// A shape and an extent, without an aim.
@@ -30,21 +30,22 @@ pub(super) fn private_act(
         "LongitudinalAction" => {
             let action = kind.only_child()?;
             if action.name() == "LongitudinalDistanceAction" {
-                return action.leave_out(Part::Distances).map(|()| None);
+                let keep = distances::distance(&action, name, context);
+                return distances::or_left_out(&action, keep.map(|keep| Act::Keep(Box::new(keep))));
             }
-            if let Some(act) = match_of(&action, name, context)? {
+            if let Some(act) = speed_match(&action, name, context)? {
                 return Ok(Some(act));
             }
-            let profile = speed_of(&action, context)?;
+            let profile = speed_change(&action, context)?;
             // A rate of 0 keeps the speed.
             Ok((profile.rate != Some(0.0)).then_some(Act::Speed(profile)))
         }
         "LateralAction" => {
             let action = kind.only_child()?;
             match action.name() {
-                "LaneChangeAction" => lane_change_of(&action, name, context).map(Some),
+                "LaneChangeAction" => lane_change(&action, name, context).map(Some),
                 "LateralDistanceAction" => action.leave_out(Part::Distances).map(|()| None),
-                "LaneOffsetAction" => Ok(Some(Act::Offset(offset_of(&action)?))),
+                "LaneOffsetAction" => Ok(Some(Act::Offset(offset_change(&action)?))),
                 _ => Err(action.unread()),
             }
         }
@@ -52,7 +53,7 @@ pub(super) fn private_act(
             let action = kind.only_child()?;
             match action.name() {
                 "FollowTrajectoryAction" => {
-                    Ok(Some(Act::Trajectory(trajectory_of(&action, context)?)))
+                    Ok(Some(Act::Trajectory(trajectory_line(&action, context)?)))
                 }
                 "AssignRouteAction" | "AcquirePositionAction" | "RandomRouteAction" => {
                     action.leave_out(Part::Routes).map(|()| None)
@@ -60,10 +61,13 @@ pub(super) fn private_act(
                 _ => Err(action.unread()),
             }
         }
-        "SynchronizeAction" => kind.leave_out(Part::Distances).map(|()| None),
+        "SynchronizeAction" => {
+            let arrive = distances::arrival(kind, name, context);
+            distances::or_left_out(kind, arrive.map(|arrive| Act::Arrive(Box::new(arrive))))
+        }
         "TrailerAction" => kind.leave_out(Part::Trailers).map(|()| None),
         "ControllerAction" | "ActivateControllerAction" => {
-            kind.leave_out(Part::Controllers).map(|()| None)
+            controllers::read_action(kind, name, context).map(|()| None)
         }
         "AppearanceAction" | "VisibilityAction" => kind.leave_out(Part::Appearance).map(|()| None),
         _ => Err(kind.unread()),
@@ -71,7 +75,7 @@ pub(super) fn private_act(
 }
 
 /// A speed that follows that of another entity; `None` for another action.
-pub(super) fn match_of(
+pub(super) fn speed_match(
     speed: &Element<'_>,
     own: &str,
     context: &Context<'_>,
@@ -83,7 +87,7 @@ pub(super) fn match_of(
     }
     speed.only(&["SpeedActionDynamics", "SpeedActionTarget"])?;
     let dynamics = speed.need("SpeedActionDynamics")?;
-    if dynamics_of(&dynamics)?.shape != ShapeSection::Step {
+    if dynamics_from(&dynamics)?.shape != ShapeSection::Step {
         let message = "is read as a step only, because the other's speed may change meanwhile";
         return Err(dynamics.wrong(message));
     }
@@ -101,7 +105,7 @@ pub(super) fn match_of(
 }
 
 /// The aim and the dynamics of a `<SpeedAction>`.
-pub(super) fn speed_of(
+pub(super) fn speed_change(
     speed: &Element<'_>,
     context: &Context<'_>,
 ) -> Result<ProfileSection, ConvertError> {
@@ -123,7 +127,7 @@ pub(super) fn speed_of(
         return Err(target.wrong(&format!("is {to:?} m/s; at most {most} m/s are accepted")));
     }
     let dynamics = speed.need("SpeedActionDynamics")?;
-    let profile = dynamics_of(&dynamics)?;
+    let profile = dynamics_from(&dynamics)?;
     match (profile.over_m, profile.shape) {
         (None, _) => {}
         (Some(_), ShapeSection::Linear) => {
@@ -161,8 +165,8 @@ fn relative_speed_mps(target: &Element<'_>, context: &Context<'_>) -> Result<f64
 }
 
 /// The shape and the extent of a change.
-fn dynamics_of(dynamics: &Element<'_>) -> Result<ProfileSection, ConvertError> {
-    let shape = shape_of(dynamics)?;
+fn dynamics_from(dynamics: &Element<'_>) -> Result<ProfileSection, ConvertError> {
+    let shape = shape_from(dynamics)?;
     let dimension = dynamics.text("dynamicsDimension")?;
     let value = dynamics.number("value")?;
     let extent = value.abs();
@@ -204,7 +208,7 @@ pub(super) fn profile_entry(entry: &Element<'_>) -> Result<(Act, f64), ConvertEr
     Ok((Act::Speed(ProfileSection { to, ..profile }), over_s))
 }
 
-fn shape_of(dynamics: &Element<'_>) -> Result<ShapeSection, ConvertError> {
+fn shape_from(dynamics: &Element<'_>) -> Result<ShapeSection, ConvertError> {
     match dynamics.text("dynamicsShape")?.as_str() {
         "step" => Ok(ShapeSection::Step),
         "linear" => Ok(ShapeSection::Linear),
@@ -219,7 +223,7 @@ fn shape_of(dynamics: &Element<'_>) -> Result<ShapeSection, ConvertError> {
     }
 }
 
-fn lane_change_of(
+fn lane_change(
     action: &Element<'_>,
     name: &str,
     context: &Context<'_>,
@@ -251,14 +255,14 @@ fn lane_change_of(
         _ => return Err(target.unread()),
     };
     let dynamics = action.need("LaneChangeActionDynamics")?;
-    let profile = dynamics_of(&dynamics)?;
+    let profile = dynamics_from(&dynamics)?;
     if profile.rate == Some(0.0) {
         return Err(dynamics.wrong("a rate of 0 never arrives; give a larger one"));
     }
     Ok(Act::Lane { lane, offset_m, profile })
 }
 
-fn offset_of(action: &Element<'_>) -> Result<ProfileSection, ConvertError> {
+fn offset_change(action: &Element<'_>) -> Result<ProfileSection, ConvertError> {
     action.only(&["LaneOffsetActionDynamics", "LaneOffsetTarget"])?;
     if action.find_flag("continuous")?.unwrap_or(false) {
         // An offset from the own lane stays as it is.
@@ -270,7 +274,7 @@ fn offset_of(action: &Element<'_>) -> Result<ProfileSection, ConvertError> {
     }
     let to = target.number("value")?;
     let dynamics = action.need("LaneOffsetActionDynamics")?;
-    let shape = shape_of(&dynamics)?;
+    let shape = shape_from(&dynamics)?;
     let acceleration = dynamics.find_number("maxLateralAcc")?;
     if shape == ShapeSection::Step {
         return Ok(ProfileSection { to, ..NOWHERE });
@@ -280,7 +284,7 @@ fn offset_of(action: &Element<'_>) -> Result<ProfileSection, ConvertError> {
 }
 
 /// The line of a `<FollowTrajectoryAction>`.
-pub(super) fn trajectory_of(
+pub(super) fn trajectory_line(
     follow: &Element<'_>,
     context: &Context<'_>,
 ) -> Result<Line, ConvertError> {
@@ -302,7 +306,7 @@ pub(super) fn trajectory_of(
         Some(reference) => context.catalogs.entry(&reference)?,
         None => catalogs::declared(&holder.need("Trajectory")?)?,
     };
-    let mut line = trajectory::line_of(&trajectory, context)?;
+    let mut line = trajectory::line_from(&trajectory, context)?;
     if holder.find("CatalogReference")?.is_some() {
         trajectory.check_read()?;
     }

@@ -9,9 +9,11 @@ use wildcity_sim::scenario::{
     TimedPosition, TriggerSection,
 };
 
+use super::lane_line::LaneLine;
 use super::ledger::Ledger;
 use super::model::{Act, Context, Draft, Entity, Line, Place};
-use super::roads::{LaneLine, Spot, simplified};
+use super::roads::Spot;
+use super::simplify::simplified;
 
 /// A scenario without an end is prepared for this time, in seconds.
 const USUAL_S: f64 = 300.0;
@@ -23,8 +25,8 @@ const LONGEST_M: f64 = 20_000.0;
 const SHORTEST_M: f64 = 100.0;
 
 /// The ego, which starts where its entity does.
-pub(super) fn ego_of(ego: &Entity, ledger: &Ledger) -> EgoSection {
-    let pose = ego.place.map(|place| section_of(&place.shifted(ego.rear_m, 0.0)));
+pub(super) fn ego_section(ego: &Entity, ledger: &Ledger) -> EgoSection {
+    let pose = ego.place.map(|place| pose_section(&place.shifted(ego.rear_m, 0.0)));
     let start =
         pose.map(|pose| StartSection { trajectory: None, station_m: None, pose: Some(pose) });
     let dynamics =
@@ -41,7 +43,7 @@ pub(super) fn ego_of(ego: &Entity, ledger: &Ledger) -> EgoSection {
     }
 }
 
-fn section_of(place: &Place) -> PoseSection {
+fn pose_section(place: &Place) -> PoseSection {
     PoseSection { xyz: place.xyz_m, yaw_rad: Some(place.yaw_rad), q: None }
 }
 
@@ -63,8 +65,9 @@ struct Drive<'e> {
 }
 
 impl Builder<'_, '_> {
-    /// An actor: on its trajectory, through timed positions, standing, along its lane, or straight on.
-    pub(super) fn actor_of(&self, entity: &Entity) -> Result<ActorSection, String> {
+    /// An actor: on its trajectory, through timed positions, standing, along its lane, or straight
+    /// on.
+    pub(super) fn actor_section(&self, entity: &Entity) -> Result<ActorSection, String> {
         let place = entity.place.or_else(|| first_place(entity.line.as_ref()?));
         let place = place.ok_or("has no position in <Init>; add a <TeleportAction>")?;
         let time_s = self.end_s.unwrap_or(USUAL_S);
@@ -101,12 +104,12 @@ impl Builder<'_, '_> {
             }
             None if entity.begin_mps == 0.0 && !moves => {
                 let [ahead_m, left_m, _] = entity.center_m;
-                actor.stand = Some(section_of(&place.shifted(ahead_m, left_m)));
+                actor.stand = Some(pose_section(&place.shifted(ahead_m, left_m)));
             }
             None => actor.path = Some(self.ahead(&mut drive)?),
         }
         let triggers: Result<Vec<TriggerSection>, String> =
-            entity.script.iter().map(|draft| self.trigger_of(draft, &mut drive)).collect();
+            entity.script.iter().map(|draft| self.trigger_section(draft, &mut drive)).collect();
         actor.script = triggers?;
         let count = actor.script.len();
         if count > limits::TRIGGERS {
@@ -165,7 +168,7 @@ impl Builder<'_, '_> {
         let offset_m = side(spot) * spot.at.offset + left_m;
         let path = PathSection {
             points: Some(line.points.clone()),
-            station_m: ahead_m.max(0.0).min(length_of(&line.points)),
+            station_m: ahead_m.max(0.0).min(line_length_m(&line.points)),
             offset_m: some_offset(offset_m),
             speed: entity.begin_mps,
             ..PathSection::default()
@@ -179,19 +182,20 @@ impl Builder<'_, '_> {
             let roads = line.forks.join("; ");
             self.note(entity, &format!("takes the straightest way at forks: {roads}"));
         }
-        if line.is_cut && length_of(&line.points) + 1.0 >= LONGEST_M {
+        if line.is_cut && line_length_m(&line.points) + 1.0 >= LONGEST_M {
             self.note(entity, "stands after 20 km");
         }
     }
 
-    /// A trajectory that goes on as the lane does at its end, and the length of the trajectory itself, in metres.
+    /// A trajectory that goes on as the lane does at its end, and the length of the trajectory
+    /// itself, in metres.
     fn continued(
         &self,
         drive: &mut Drive<'_>,
         line: &Line,
     ) -> Result<(Vec<[f64; 3]>, f64), String> {
         let mut points = line.points.clone();
-        let length_m = length_of(&points);
+        let length_m = line_length_m(&points);
         let [.., before, last] = points.as_slice() else {
             return Err("has a trajectory of less than two points".into());
         };
@@ -216,7 +220,11 @@ impl Builder<'_, '_> {
         Ok((points, length_m))
     }
 
-    fn trigger_of(&self, draft: &Draft, drive: &mut Drive<'_>) -> Result<TriggerSection, String> {
+    fn trigger_section(
+        &self,
+        draft: &Draft,
+        drive: &mut Drive<'_>,
+    ) -> Result<TriggerSection, String> {
         let mut then = Vec::new();
         let left_m = drive.entity.center_m[1];
         for act in &draft.then {
@@ -227,6 +235,10 @@ impl Builder<'_, '_> {
                     factor: (*factor != 1.0).then_some(*factor),
                     delta: (*delta_mps != 0.0).then_some(*delta_mps),
                 }),
+                Act::Keep(section) => then.push(ActionSection::KeepDistance((**section).clone())),
+                Act::Arrive(section) => {
+                    then.push(ActionSection::ArriveTogether((**section).clone()))
+                }
                 Act::Offset(profile) => {
                     let sign = drive.lanes.as_ref().map_or(1.0, |(spot, _)| side(*spot));
                     let to = sign * profile.to + left_m;
@@ -273,7 +285,7 @@ impl Builder<'_, '_> {
                 }
                 Act::Trajectory(line) => {
                     let (points, length_m) = self.continued(drive, line)?;
-                    let most_m = length_of(&points);
+                    let most_m = line_length_m(&points);
                     // It begins at the first point, wherever the actor is.
                     let ahead_m = drive.entity.center_m[0].max(0.0);
                     then.push(ActionSection::Path(CourseSection {
@@ -327,7 +339,7 @@ fn first_place(line: &Line) -> Option<Place> {
     Some(Place { xyz_m: *first, yaw_rad, spot: None })
 }
 
-fn length_of(points: &[[f64; 3]]) -> f64 {
+fn line_length_m(points: &[[f64; 3]]) -> f64 {
     let flat = |point: &[f64; 3]| DVec2::new(point[0], point[1]);
     points.windows(2).map(|pair| flat(&pair[0]).distance(flat(&pair[1]))).sum()
 }

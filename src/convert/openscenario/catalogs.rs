@@ -28,9 +28,9 @@ pub(super) struct Catalogs<'a> {
     ledger: &'a Ledger,
 }
 
-/// Reads the files of the catalogs if the scenario refers to any: XML files in directories relative to its own, and
-/// in those of the settings.
-pub(super) fn texts_of(
+/// Reads the files of the catalogs if the scenario refers to any: XML files in directories relative
+/// to its own, and in those of the settings.
+pub(super) fn read_texts(
     root: &Element<'_>,
     node: Node<'_, '_>,
     settings: &Settings,
@@ -68,7 +68,7 @@ pub(super) fn texts_of(
 }
 
 /// Parses the files of catalogs. Files that are no catalogs stay unused.
-pub(super) fn documents_of(texts: &[CatalogText]) -> Vec<(Document<'_>, &str)> {
+pub(super) fn parse_documents(texts: &[CatalogText]) -> Vec<(Document<'_>, &str)> {
     let parsed = texts
         .iter()
         .map(|text| Some((xml::parse(&text.text, super::NODES).ok()?, text.label.as_str())));
@@ -123,7 +123,8 @@ pub(super) fn plain_parameter(name: &str) -> String {
     name.trim_start_matches('$').to_owned()
 }
 
-/// An element where its own `<ParameterDeclarations>` are known too. Values may use earlier parameters.
+/// An element where its own `<ParameterDeclarations>` are known too. Values may use earlier
+/// parameters.
 pub(super) fn declared<'a>(element: &Element<'a>) -> Result<Element<'a>, ConvertError> {
     declared_with(element, &BTreeMap::new())
 }
@@ -168,13 +169,15 @@ fn check_constraints(declaration: &Element<'_>, value: &str) -> Result<(), Conve
         }
         meets_any |= meets;
     }
-    match meets_any {
-        true => Ok(()),
-        false => Err(declaration.wrong(&format!("value={value:?} violates its constraints"))),
+    if meets_any {
+        Ok(())
+    } else {
+        Err(declaration.wrong(&format!("value={value:?} violates its constraints")))
     }
 }
 
-/// The value of a comparison of OpenSCENARIO; `None` if texts are compared by size, or for an unknown rule.
+/// The value of a comparison of OpenSCENARIO; `None` if texts are compared by size, or for an
+/// unknown rule.
 pub(super) fn compare(rule: &str, value: &str, bound: &str) -> Option<bool> {
     match rule {
         "equalTo" => return Some(is_same(value, bound)),

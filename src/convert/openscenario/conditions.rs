@@ -6,40 +6,42 @@ use wildcity_sim::scenario::{
 
 use super::element::Element;
 use super::model::Context;
-use super::position::place_of;
+use super::position::place_from;
 use crate::ConvertError;
 
-/// In front of a name in `after` whose triggers are not known yet, with the type of the storyboard's element.
+/// In front of a name in `after` whose triggers are not known yet, with the type of the
+/// storyboard's element.
 pub(super) const PENDING: char = '\u{1}';
 
 /// Slower than this stands, in m/s.
 const STANDS_MPS: f64 = 0.01;
 
-/// The condition of a trigger: one of its groups. `is_immediate` says whether it is evaluated from the start on.
-pub(super) fn trigger_of(
+/// The condition of a trigger: one of its groups. `is_immediate` says whether it is evaluated from
+/// the start on.
+pub(super) fn trigger_condition(
     trigger: &Element<'_>,
     context: &Context<'_>,
     is_immediate: bool,
 ) -> Result<ConditionSection, ConvertError> {
     trigger.only(&["ConditionGroup"])?;
     let groups: Result<Vec<ConditionSection>, ConvertError> =
-        trigger.children().map(|group| group_of(&group, context, is_immediate)).collect();
-    Ok(any_of(groups?))
+        trigger.children().map(|group| group_condition(&group, context, is_immediate)).collect();
+    Ok(join_any(groups?))
 }
 
 /// The condition of a group: all of its conditions.
-pub(super) fn group_of(
+pub(super) fn group_condition(
     group: &Element<'_>,
     context: &Context<'_>,
     is_immediate: bool,
 ) -> Result<ConditionSection, ConvertError> {
     group.only(&["Condition"])?;
     let parts: Result<Vec<ConditionSection>, ConvertError> =
-        group.children().map(|part| condition_of(&part, context, is_immediate)).collect();
-    Ok(all_of(parts?))
+        group.children().map(|part| condition_from(&part, context, is_immediate)).collect();
+    Ok(join_all(parts?))
 }
 
-pub(super) fn all_of(mut parts: Vec<ConditionSection>) -> ConditionSection {
+pub(super) fn join_all(mut parts: Vec<ConditionSection>) -> ConditionSection {
     parts.retain(|part| *part != ConditionSection::default());
     match parts.len() {
         0 => ConditionSection::default(),
@@ -48,7 +50,7 @@ pub(super) fn all_of(mut parts: Vec<ConditionSection>) -> ConditionSection {
     }
 }
 
-pub(super) fn any_of(mut parts: Vec<ConditionSection>) -> ConditionSection {
+pub(super) fn join_any(mut parts: Vec<ConditionSection>) -> ConditionSection {
     match parts.len() {
         0 => ConditionSection::default(),
         1 => parts.remove(0),
@@ -57,7 +59,7 @@ pub(super) fn any_of(mut parts: Vec<ConditionSection>) -> ConditionSection {
     }
 }
 
-fn condition_of(
+fn condition_from(
     condition: &Element<'_>,
     context: &Context<'_>,
     is_immediate: bool,
@@ -136,14 +138,14 @@ fn by_value(
                 ..Default::default()
             })
         }
-        "ParameterCondition" => value_of(kind, "parameterRef", context, delay_s),
-        "VariableCondition" => value_of(kind, "variableRef", context, delay_s),
+        "ParameterCondition" => parameter_condition(kind, "parameterRef", context, delay_s),
+        "VariableCondition" => parameter_condition(kind, "variableRef", context, delay_s),
         _ => Err(kind.unread()),
     }
 }
 
 /// A parameter or a variable has one value, or actions set another one.
-fn value_of(
+fn parameter_condition(
     kind: &Element<'_>,
     attribute: &str,
     context: &Context<'_>,
@@ -170,7 +172,7 @@ fn value_of(
             delay_s: (delay_s > 0.0).then_some(delay_s),
             ..Default::default()
         });
-        return Ok(any_of(parts.collect()));
+        return Ok(join_any(parts.collect()));
     }
     match holds {
         Some(true) => Ok(ConditionSection {
@@ -205,14 +207,14 @@ fn by_entity(by: &Element<'_>, context: &Context<'_>) -> Result<ConditionSection
         if !context.entities.contains_key(&name) {
             return Err(entity.wrong(&format!("there is no entity {name:?}")));
         }
-        let measure = measure_of(&kind, &name, context)?;
+        let measure = measure_from(&kind, &name, context)?;
         parts.push(ConditionSection { measure: Some(measure), held_s, ..Default::default() });
     }
     match (rule.as_str(), parts.len()) {
         (_, 0) => Err(triggering.wrong("is empty")),
         (_, 1) => Ok(parts.remove(0)),
-        ("any", _) => Ok(any_of(parts)),
-        ("all", _) => Ok(all_of(parts)),
+        ("any", _) => Ok(join_any(parts)),
+        ("all", _) => Ok(join_all(parts)),
         _ => Err(triggering.wrong(&format!("triggeringEntitiesRule={rule:?}; any or all"))),
     }
 }
@@ -236,7 +238,7 @@ fn body(quantity: QuantitySection, name: &str, context: &Context<'_>) -> Measure
     }
 }
 
-fn measure_of(
+fn measure_from(
     kind: &Element<'_>,
     name: &str,
     context: &Context<'_>,
@@ -262,12 +264,12 @@ fn measure_of(
             Ok(MeasureSection { above, ..body(Travelled, name, context) })
         }
         "ReachPositionCondition" => {
-            let xyz = Some(place_of(&kind.need("Position")?, context)?.xyz_m);
+            let xyz = Some(place_from(&kind.need("Position")?, context)?.xyz_m);
             let below = Some(kind.number("tolerance")?);
             Ok(MeasureSection { xyz, below, ..body(Point, name, context) })
         }
         "DistanceCondition" => {
-            let xyz = Some(place_of(&kind.need("Position")?, context)?.xyz_m);
+            let xyz = Some(place_from(&kind.need("Position")?, context)?.xyz_m);
             kind.expect("freespace", &["false", "0"])?;
             kind.expect("alongRoute", &["false", "0"])?;
             kind.expect("relativeDistanceType", &["euclidianDistance", "cartesianDistance"])?;
@@ -286,20 +288,20 @@ fn measure_of(
             let measure = to_entity((kind, kind), body(quantity, name, context), context)?;
             bounded(kind, measure)
         }
-        "TimeHeadwayCondition" => time_of(kind, kind, body(Headway, name, context), context),
+        "TimeHeadwayCondition" => time_measure(kind, kind, body(Headway, name, context), context),
         "TimeToCollisionCondition" => {
             let target = kind.need("TimeToCollisionConditionTarget")?.only_child()?;
             if target.name() != "EntityRef" {
                 return Err(target.unread());
             }
-            time_of(kind, &target, body(TimeToCollision, name, context), context)
+            time_measure(kind, &target, body(TimeToCollision, name, context), context)
         }
         _ => Err(kind.unread()),
     }
 }
 
 /// A time: a distance by a speed.
-fn time_of(
+fn time_measure(
     kind: &Element<'_>,
     target: &Element<'_>,
     measure: MeasureSection,

@@ -208,9 +208,10 @@ impl<'a> Element<'a> {
     /// An attribute that is a whole number.
     pub(super) fn whole(&self, name: &str) -> Result<i32, ConvertError> {
         let value = self.number(name)?;
-        match value.fract() == 0.0 && value.abs() < 1e9 {
-            true => Ok(value as i32),
-            false => Err(self.wrong(&format!("{name}={value:?}; write a whole number"))),
+        if value.fract() == 0.0 && value.abs() < 1e9 {
+            Ok(value as i32)
+        } else {
+            Err(self.wrong(&format!("{name}={value:?}; write a whole number")))
         }
     }
 

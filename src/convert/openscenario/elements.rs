@@ -2,9 +2,10 @@
 
 use std::collections::BTreeMap;
 
+use wildcity_sim::limits;
 use wildcity_sim::scenario::{ConditionSection, PhaseSection};
 
-use super::conditions::{PENDING, all_of};
+use super::conditions::{PENDING, join_all};
 use super::element::Element;
 use super::model::{Context, Draft};
 use crate::ConvertError;
@@ -26,7 +27,8 @@ pub(super) struct Elements {
 pub(super) struct Event {
     /// `ACTOR/TRIGGER` of its actions, with the names of the actions.
     pub(super) triggers: Vec<(String, String)>,
-    /// The trigger that marks the start of an event of the ego, and the longest of its actions, in seconds, if known.
+    /// The trigger that marks the start of an event of the ego, and the longest of its actions, in
+    /// seconds, if known.
     pub(super) mark: Option<(String, Option<f64>)>,
 }
 
@@ -62,8 +64,13 @@ pub(super) fn unknown() -> ConditionSection {
     ConditionSection { after, ..ConditionSection::default() }
 }
 
-/// Puts triggers in place of the names of storyboard elements, and adds the marks that conditions wait for.
-pub(super) fn resolve(elements: Elements, context: &mut Context<'_>) -> Result<(), ConvertError> {
+/// Puts triggers in place of the names of storyboard elements, and adds the marks that conditions
+/// wait for. Returns the conditions of `ends`, the groups of the stop trigger.
+pub(super) fn resolve(
+    elements: Elements,
+    ends: Vec<(Element<'_>, ConditionSection)>,
+    context: &mut Context<'_>,
+) -> Result<Vec<ConditionSection>, ConvertError> {
     let mut elements = elements;
     let marks = std::mem::take(&mut elements.marks);
     // Marks that nothing waits for may have conditions that were not read.
@@ -81,7 +88,23 @@ pub(super) fn resolve(elements: Elements, context: &mut Context<'_>) -> Result<(
     // Only what something waits for: first by actions, then by the marks themselves.
     let mut wanted: Vec<String> = Vec::new();
     for draft in context.entities.values().flat_map(|entity| &entity.script) {
-        names_of(&draft.when, &mut wanted);
+        collect_names(&draft.when, &mut wanted);
+    }
+    let mut conditions = Vec::new();
+    for (group, mut when) in ends {
+        let resolved = resolve_condition(&mut when, &elements);
+        let is_small = || match count(&when) + conditions.iter().map(count).sum::<usize>() {
+            sum if sum + 1 < limits::CONDITIONS => Ok(()),
+            _ => Err(group.wrong("waits for more events than a condition may have parts")),
+        };
+        let marked = resolved.and_then(|()| is_small());
+        match marked.and_then(|()| check_marks(&when, &marks, context)) {
+            Ok(()) => {
+                collect_names(&when, &mut wanted);
+                conditions.push(when);
+            }
+            Err(error) => super::stop::leave_out(&group, error)?,
+        }
     }
     loop {
         let is_wanted = |key: &str, mark: &Draft| {
@@ -89,23 +112,58 @@ pub(super) fn resolve(elements: Elements, context: &mut Context<'_>) -> Result<(
             actor.is_some_and(|actor| wanted.contains(&format!("{actor}/{}", mark.name)))
         };
         let Some(at) = marks.iter().position(|(key, mark, _)| is_wanted(key, mark)) else {
-            return Ok(());
+            return Ok(conditions);
         };
         let (key, mark, error) = marks.remove(at);
         if let Some(error) = error {
             return Err(error);
         }
-        names_of(&mark.when, &mut wanted);
+        collect_names(&mark.when, &mut wanted);
         if let Some(entity) = context.entities.get_mut(&key) {
             entity.script.push(mark);
         }
     }
 }
 
+/// The number of a condition and its parts.
+fn count(when: &ConditionSection) -> usize {
+    1 + when.all.iter().chain(&when.any).map(count).sum::<usize>()
+}
+
+/// A mark, with the key of its entity, and why its condition was not read.
+type Mark = (String, Draft, Option<ConvertError>);
+
+/// Refuses a condition that waits, perhaps by way of other marks, for one whose condition was not
+/// read.
+fn check_marks(
+    when: &ConditionSection,
+    marks: &[Mark],
+    context: &Context<'_>,
+) -> Result<(), ConvertError> {
+    let mut open = Vec::new();
+    collect_names(when, &mut open);
+    let mut seen: Vec<String> = Vec::new();
+    while let Some(name) = open.pop() {
+        let is_named = |(key, mark, _): &&Mark| {
+            let actor = context.entities.get(key).map(|entity| &entity.name);
+            actor.is_some_and(|actor| name == format!("{actor}/{}", mark.name))
+        };
+        let Some((_, mark, error)) = marks.iter().find(is_named) else { continue };
+        if let Some(error) = error {
+            return Err(error.clone());
+        }
+        if !seen.contains(&name) {
+            collect_names(&mark.when, &mut open);
+            seen.push(name);
+        }
+    }
+    Ok(())
+}
+
 /// The triggers that a condition waits for.
-fn names_of(when: &ConditionSection, names: &mut Vec<String>) {
+fn collect_names(when: &ConditionSection, names: &mut Vec<String>) {
     names.extend(when.after.clone());
-    when.all.iter().chain(&when.any).for_each(|part| names_of(part, names));
+    when.all.iter().chain(&when.any).for_each(|part| collect_names(part, names));
 }
 
 fn resolve_condition(when: &mut ConditionSection, elements: &Elements) -> Result<(), ConvertError> {
@@ -121,11 +179,12 @@ fn resolve_condition(when: &mut ConditionSection, elements: &Elements) -> Result
     let phase = when.phase.unwrap_or(PhaseSection::Fired);
     let parts = elements.afters(&kind, &name, phase, when.delay_s.unwrap_or(0.0));
     let parts = parts.map_err(|message| ConvertError::new(place, message))?;
-    let after = all_of(parts);
+    let after = join_all(parts);
     *when = ConditionSection { after: None, phase: None, delay_s: None, ..when.clone() };
-    *when = match *when == ConditionSection::default() {
-        true => after,
-        false => all_of(vec![after, when.clone()]),
+    *when = if *when == ConditionSection::default() {
+        after
+    } else {
+        join_all(vec![after, when.clone()])
     };
     Ok(())
 }
@@ -147,10 +206,14 @@ impl Elements {
             ..Default::default()
         };
         let is_fired = phase == PhaseSection::Fired;
+        let unmarked = || {
+            Err(format!("waits for {kind} {name:?}, but there is no entity but the ego to mark it"))
+        };
         if kind == "act" && is_fired {
             return match self.acts.get(name) {
                 None => Err(format!("there is no act {name:?}")),
                 Some(None) => Ok(vec![at_start()]),
+                Some(Some(gate)) if gate.is_empty() => unmarked(),
                 Some(Some(gate)) => Ok(vec![after(gate, phase, delay_s)]),
             };
         }
@@ -187,12 +250,12 @@ impl Elements {
                 );
                 return Err(message);
             };
+            if mark.is_empty() {
+                return unmarked();
+            }
             parts.push(after(mark, PhaseSection::Fired, delay_s + duration_s));
         }
         parts.dedup();
-        match parts.is_empty() {
-            true => Err(format!("{kind} {name:?} has no actions")),
-            false => Ok(parts),
-        }
+        if parts.is_empty() { Err(format!("{kind} {name:?} has no actions")) } else { Ok(parts) }
     }
 }

@@ -26,10 +26,18 @@ pub(super) fn read_entities<'a>(
             "ObjectController",
         ])?;
         for controller in object.all("ObjectController") {
-            if controller.children().next().is_some() {
-                controller.leave_out(Part::Controllers)?;
-                context.placed_by_others.push((object.text("name")?, Part::Controllers));
+            if controller.children().next().is_none() {
+                continue;
             }
+            let name = object.text("name")?;
+            if name == context.ego {
+                controller.mark_left_out();
+                controller.note("has no effect: the agent is the ego's controller");
+                continue;
+            }
+            controller.leave_out(Part::Controllers)?;
+            context.controlled.insert(name.clone());
+            context.placed_by_others.push((name, Part::Controllers));
         }
         let mut described = object.children().filter(|child| child.name() != "ObjectController");
         let what = described.next().ok_or_else(|| object.wrong("has no vehicle or pedestrian"))?;
@@ -38,8 +46,8 @@ pub(super) fn read_entities<'a>(
             _ => declared(&what)?,
         };
         let name = object.text("name")?;
-        let entity = entity_of(&what, &name)?;
-        if let Some(trailer) = trailer_of(&what)? {
+        let entity = entity_from(&what, &name)?;
+        if let Some(trailer) = read_trailer(&what)? {
             context.placed_by_others.push((trailer, Part::Trailers));
         }
         if context.entities.values().any(|other| other.name == entity.name) {
@@ -55,7 +63,7 @@ pub(super) fn read_entities<'a>(
 }
 
 /// The entity that a vehicle tows.
-fn trailer_of(what: &Element<'_>) -> Result<Option<String>, ConvertError> {
+fn read_trailer(what: &Element<'_>) -> Result<Option<String>, ConvertError> {
     let Some(trailer) = what.find("Trailer")? else { return Ok(None) };
     let reference = trailer.only_child()?;
     if reference.name() != "TrailerRef" {
@@ -69,7 +77,8 @@ fn trailer_of(what: &Element<'_>) -> Result<Option<String>, ConvertError> {
     Ok(Some(name))
 }
 
-/// Properties are a simulator's own: how an entity looks, but for one of esmini that moves its reference point.
+/// Properties are a simulator's own: how an entity looks, but for one of esmini that moves its
+/// reference point.
 fn check_properties(properties: &Element<'_>) -> Result<(), ConvertError> {
     for property in properties.all("Property") {
         let is_offset = property.text("name")? == "refpoint_x_offset";
@@ -83,7 +92,7 @@ fn check_properties(properties: &Element<'_>) -> Result<(), ConvertError> {
     Ok(())
 }
 
-fn entity_of(what: &Element<'_>, name: &str) -> Result<Entity, ConvertError> {
+fn entity_from(what: &Element<'_>, name: &str) -> Result<Entity, ConvertError> {
     what.only(&[
         "ParameterDeclarations",
         "BoundingBox",

@@ -5,7 +5,8 @@ use std::collections::BTreeMap;
 /// Deepest nesting of parentheses.
 const DEPTH: usize = 64;
 
-/// A text of an attribute with its parameters put in: as it is, a parameter `$name`, or a formula `${..}`.
+/// A text of an attribute with its parameters put in: as it is, a parameter `$name`, or a formula
+/// `${..}`.
 pub(super) fn text(text: &str, parameters: &BTreeMap<String, String>) -> Result<String, String> {
     let Some(rest) = text.strip_prefix('$') else { return Ok(text.to_owned()) };
     let formula = rest.strip_prefix('{').and_then(|rest| rest.strip_suffix('}'));
@@ -90,16 +91,14 @@ impl Parser<'_> {
         if !is_parameter && text.starts_with(|c: char| c.is_ascii_alphabetic()) {
             return Ok(sign * self.function()?);
         }
-        let end = match is_parameter {
-            true => text.find(|c: char| !is_in_name(c)),
-            false => Some(number_length(text)),
+        let end = if is_parameter {
+            text.find(|c: char| !is_in_name(c))
+        } else {
+            Some(number_length(text))
         };
         let (word, rest) = text.split_at(end.unwrap_or(text.len()));
         self.rest = rest.trim_start();
-        let number = match is_parameter {
-            true => parameter(word, self.parameters)?,
-            false => word,
-        };
+        let number = if is_parameter { parameter(word, self.parameters)? } else { word };
         let value: Option<f64> = number.trim().parse().ok();
         value.map(|value| sign * value).ok_or_else(|| format!("{number:?} is not a number"))
     }
@@ -118,10 +117,7 @@ impl Parser<'_> {
             *value = self.sum()?;
         }
         self.depth -= 1;
-        match self.take(')') {
-            true => Ok(values),
-            false => Err("a closing parenthesis is missing".to_owned()),
-        }
+        if self.take(')') { Ok(values) } else { Err("a closing parenthesis is missing".to_owned()) }
     }
 
     fn function(&mut self) -> Result<f64, String> {
@@ -161,7 +157,8 @@ impl Parser<'_> {
     }
 }
 
-/// The length of the number at the start of a text, in bytes: with an exponent, whose sign is no sum.
+/// The length of the number at the start of a text, in bytes: with an exponent, whose sign is no
+/// sum.
 fn number_length(text: &str) -> usize {
     let is_digit = |c: char| c.is_ascii_digit() || c == '.';
     let end = text.find(|c: char| !is_digit(c)).unwrap_or(text.len());

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use crate::{ConvertError, TEXT_BYTES};
 
-/// The XML files of a directory, in order of their names; none if it is absent, because only what a scenario refers to
-/// must be there.
+/// The XML files of a directory, in order of their names; none if it is absent, because only what a
+/// scenario refers to must be there.
 pub(super) fn xml_files(directory: &Path) -> Vec<PathBuf> {
     let Ok(files) = std::fs::read_dir(directory) else { return Vec::new() };
     let mut paths: Vec<PathBuf> = files.filter_map(|file| Some(file.ok()?.path())).collect();
@@ -35,7 +35,7 @@ pub(super) fn read_bytes(path: &Path) -> Result<Vec<u8>, ConvertError> {
 /// Reads a text.
 pub(super) fn read_text(path: &Path) -> Result<String, ConvertError> {
     let bytes = read_bytes(path)?;
-    let text = crate::text_of(&bytes)
+    let text = crate::utf8_text(&bytes)
         .map_err(|error| ConvertError::new(format!("{}", path.display()), error.message))?;
     Ok(text.to_owned())
 }

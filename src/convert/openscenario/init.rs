@@ -2,18 +2,22 @@
 
 use wildcity_sim::scenario::{ConditionSection, ShapeSection};
 
-use super::actions::{match_of, private_act, speed_of, trajectory_of};
+use super::actions::{private_act, speed_change, speed_match, trajectory_line};
+use super::controllers;
+use super::distances;
+use super::ego_route::read_ego_route;
 use super::element::Element;
 use super::ledger::Part;
 use super::model::{Act, Context, Draft, Entity};
-use super::position::place_of;
-use super::route::{lanes_between, waypoints_of};
+use super::position::place_from;
+use super::route::{lanes_between, waypoints};
 use crate::ConvertError;
 
 /// An action of `Init` with its entity.
 type InitAction<'a> = (String, Element<'a>);
 
-/// Reads the actions of `Init`. An action that refers to another entity is read after those of that entity.
+/// Reads the actions of `Init`. An action that refers to another entity is read after those of that
+/// entity.
 pub(super) fn read_init<'a>(
     init: &Element<'a>,
     context: &mut Context<'a>,
@@ -86,7 +90,7 @@ fn read_place(
     context: &mut Context<'_>,
 ) -> Result<(), ConvertError> {
     action.only(&["Position"])?;
-    let place = place_of(&action.need("Position")?, context)?;
+    let place = place_from(&action.need("Position")?, context)?;
     set_place(name, place, context);
     Ok(())
 }
@@ -108,8 +112,7 @@ fn read_speed(
     let speed = action.only_child()?;
     let is_ego = name == context.ego;
     if speed.name() == "LongitudinalDistanceAction" && !is_ego {
-        context.waiting.retain(|other| other != name);
-        return speed.leave_out(Part::Distances);
+        return read_distance(&speed, name, context);
     }
     if is_ego
         && let Some(dynamics) = speed.find("SpeedActionDynamics")?
@@ -120,7 +123,7 @@ fn read_speed(
         context.waiting.retain(|other| other != name);
         return action.leave_out(Part::Ego);
     }
-    if !is_ego && let Some(act) = match_of(&speed, name, context)? {
+    if !is_ego && let Some(act) = speed_match(&speed, name, context)? {
         let Act::Match { of, factor, delta_mps } = &act else { return Err(speed.unread()) };
         let is_other = |entity: &&Entity| Some(&entity.name) == of.as_ref();
         let other = match of {
@@ -138,12 +141,12 @@ fn read_speed(
         add(entity, "init-speed", vec![act]);
         return Ok(());
     }
-    let profile = match speed_of(&speed, context) {
+    let profile = match speed_change(&speed, context) {
         // Whatever moves the ego later is the agent's.
         Err(_)
             if is_ego
                 && (speed.name() != "SpeedAction"
-                    || match_of(&speed, name, context)?.is_some()) =>
+                    || speed_match(&speed, name, context)?.is_some()) =>
         {
             action.leave_out(Part::Ego)?;
             context.waiting.retain(|other| other != name);
@@ -162,9 +165,50 @@ fn read_speed(
             false => add(entity, "init-speed", vec![Act::Speed(profile)]),
         }
     }
+    is_read(name, context);
+    Ok(())
+}
+
+/// Notes that an action which sets the speed of an entity was read.
+fn is_read(name: &str, context: &mut Context<'_>) {
     if let Some(at) = context.waiting.iter().position(|other| other == name) {
         context.waiting.remove(at);
     }
+}
+
+/// Reads a distance of `Init`. Without bounds the entity begins there, as fast as the other.
+fn read_distance(
+    action: &Element<'_>,
+    name: &str,
+    context: &mut Context<'_>,
+) -> Result<(), ConvertError> {
+    let keep = distances::distance(action, name, context);
+    let act = distances::or_left_out(action, keep.map(|keep| Act::Keep(Box::new(keep))))?;
+    let Some(Act::Keep(keep)) = act else {
+        is_read(name, context);
+        return Ok(());
+    };
+    let other = action.text("entityRef")?;
+    if context.waiting.contains(&other) {
+        return Err(action.wrong("refers to an entity whose speed is not known"));
+    }
+    let [own, of] = [name, other.as_str()].map(|name| context.entities.get(name));
+    let place = own.zip(of).and_then(|(entity, other)| {
+        distances::place_at_distance(&keep, entity, other, context.roads.as_ref())
+    });
+    let other_mps = of.map_or(0.0, |other| other.begin_mps);
+    if let Some(place) = place {
+        set_place(name, place, context);
+    }
+    let Some(entity) = context.entities.get_mut(name) else { return Err(action.unread()) };
+    if keep.acceleration.is_none() {
+        entity.begin_mps = other_mps;
+    }
+    if place.is_none() || keep.once != Some(true) {
+        entity.fastest_mps = wildcity_sim::limits::ACTOR_SPEED_M_S;
+        add(entity, "init-distance", vec![Act::Keep(keep)]);
+    }
+    is_read(name, context);
     Ok(())
 }
 
@@ -187,8 +231,9 @@ fn read_other(
         "InfrastructureAction" => return action.leave_out(Part::Signals),
         "EntityAction" => return read_entity_action(action, context),
         "ControllerAction" | "ActivateControllerAction" => {
-            return action.leave_out(Part::Controllers);
+            return controllers::read_action(action, name, context);
         }
+        "RoutingAction" if is_ego => return read_route_of_ego(action, context),
         "AppearanceAction" | "VisibilityAction" => return action.leave_out(Part::Appearance),
         _ if is_ego => return action.leave_out(Part::Ego),
         _ => {}
@@ -196,7 +241,7 @@ fn read_other(
     if action.name() == "RoutingAction" {
         let follow = action.only_child()?;
         if follow.name() == "AssignRouteAction" {
-            let waypoints = waypoints_of(&follow, context, place_of)?;
+            let waypoints = waypoints(&follow, context, place_from)?;
             let roads = context.roads.as_ref().ok_or_else(|| follow.wrong("needs the roads"))?;
             let lanes = lanes_between(&waypoints, roads);
             let lanes = lanes.map_err(|message| follow.wrong(&message))?;
@@ -206,7 +251,7 @@ fn read_other(
             return Ok(());
         }
         if follow.name() == "FollowTrajectoryAction" {
-            let line = trajectory_of(&follow, context)?;
+            let line = trajectory_line(&follow, context)?;
             if let Some(entity) = context.entities.get_mut(name) {
                 entity.line = Some(line);
             }
@@ -222,11 +267,26 @@ fn read_other(
     Ok(())
 }
 
+/// Reads where the ego goes; what does not say that is left out on request.
+pub(super) fn read_route_of_ego(
+    action: &Element<'_>,
+    context: &mut Context<'_>,
+) -> Result<(), ConvertError> {
+    match read_ego_route(action, context) {
+        Ok(()) => Ok(()),
+        Err(_) if action.leaves_out(Part::Ego) => action.leave_out(Part::Ego),
+        Err(ConvertError { place, message }) => {
+            let part = Part::Ego.name();
+            Err(ConvertError::new(place, format!("{message}; or use --leave-out {part}")))
+        }
+    }
+}
+
 fn read_entity_action(action: &Element<'_>, context: &mut Context<'_>) -> Result<(), ConvertError> {
     let name = action.text("entityRef")?;
     let kind = action.only_child()?;
     let place = match kind.name() {
-        "AddEntityAction" => Some(place_of(&kind.need("Position")?, context)?),
+        "AddEntityAction" => Some(place_from(&kind.need("Position")?, context)?),
         "DeleteEntityAction" => None,
         _ => return Err(kind.unread()),
     };

@@ -1,4 +1,5 @@
-//! What the importer has read: whatever it has not read is refused at the end, so that nothing is ignored in silence.
+//! What the importer has read: whatever it has not read is refused at the end, so that nothing is
+//! ignored in silence.
 
 use std::cell::RefCell;
 use std::collections::{BTreeSet, HashSet};
@@ -10,19 +11,18 @@ use crate::ConvertError;
 /// Parts that an import may leave out on request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Part {
-    /// Controllers of entities, and what activates or overrides them.
+    /// Controllers of entities but the ego, and what activates or overrides them.
     Controllers,
-    /// Actions of the entity that the agent drives, but for its start.
+    /// Actions of the entity that the agent drives, but for its start and its route.
     Ego,
     /// Weather, time of day and the state of the road.
     Environment,
     /// Lights, animations and visibility.
     Appearance,
-    /// Traffic signals.
     Signals,
-    /// Conditions of the stop trigger that are no time.
+    /// Conditions of the stop trigger that are not read.
     Stop,
-    /// Distances that an actor keeps, and motion that is synchronized with another's.
+    /// Distances across, and other distances and arrivals that are not read.
     Distances,
     /// Routes that are not read: actors take the straightest way.
     Routes,

@@ -5,27 +5,33 @@
 //! | `element`, `expression` | elements, attributes, and formulas of parameters |
 //! | `ledger` | what was read: anything else is refused, or left out on request with a note |
 //! | `files`, `catalogs`, `entities` | files beside it, catalogs and parameters; vehicles, pedestrians and objects |
-//! | `position`, `roads`, `route`, `trajectory` | places in the world and on roads, lines along lanes, trajectories |
-//! | `init`, `story`, `elements`, `actions`, `conditions`, `stop` | the storyboard |
+//! | `position`, `roads`, `lane_line`, `simplify`, `route`, `trajectory` | places in the world and on roads, lines along lanes, trajectories |
+//! | `init`, `story`, `elements`, `actions`, `distances`, `controllers`, `ego_route`, `conditions`, `stop` | the storyboard |
 //! | `model`, `build` | what is known of the scenario, and its actors |
 //!
-//! Everything else is refused with its name and line: a scenario with a part missing would be another scenario.
+//! Everything else is refused with its name and line: a scenario with a part missing would be
+//! another scenario.
 
 mod actions;
 mod build;
 mod catalogs;
 mod conditions;
+mod controllers;
+mod distances;
+mod ego_route;
 mod element;
 mod elements;
 mod entities;
 mod expression;
 mod files;
 mod init;
+mod lane_line;
 mod ledger;
 mod model;
 mod position;
 mod roads;
 mod route;
+mod simplify;
 mod stop;
 mod story;
 mod trajectory;
@@ -34,11 +40,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
-use wildcity_sim::scenario::{EndSection, ScenarioFile, TwinPin, VerdictSection};
+use wildcity_sim::scenario::{EndSection, RouteSection, ScenarioFile, TwinPin, VerdictSection};
 
 pub use ledger::Part;
 
-use crate::{ConvertError, opendrive, text_of, xml};
+use crate::{ConvertError, opendrive, utf8_text, xml};
 use build::Builder;
 use catalogs::Catalogs;
 use element::{Element, Source};
@@ -75,7 +81,6 @@ pub struct Settings {
 /// A scenario, and what a person should know about it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Imported {
-    /// The scenario.
     pub file: ScenarioFile,
     /// What was left out or assumed, with lines.
     pub notes: Vec<String>,
@@ -87,7 +92,7 @@ pub struct Imported {
 /// Names the element and the line of the first part that is not read.
 pub fn read(bytes: &[u8], settings: &Settings) -> Result<Imported, ConvertError> {
     // Some editors mark UTF-8 in front.
-    let text = text_of(bytes)?.trim_start_matches('\u{feff}');
+    let text = utf8_text(bytes)?.trim_start_matches('\u{feff}');
     let document = xml::parse(text, NODES)?;
     let ledger = Ledger::new(settings.leave_out.clone());
     let source = Source { index: 0, label: "" };
@@ -102,10 +107,10 @@ pub fn read(bytes: &[u8], settings: &Settings) -> Result<Imported, ConvertError>
     let root = catalogs::declared(&root)?;
     let root = with_parameters(&root, &settings.parameters)?;
     check_header(&root)?;
-    let texts = catalogs::texts_of(&root, document.root_element(), settings)?;
-    let documents = catalogs::documents_of(&texts);
+    let texts = catalogs::read_texts(&root, document.root_element(), settings)?;
+    let documents = catalogs::parse_documents(&texts);
     let catalogs = Catalogs::new(&documents, &ledger);
-    let file = file_of((&root, document.root_element()), catalogs, settings, &ledger)?;
+    let file = file_from((&root, document.root_element()), catalogs, settings, &ledger)?;
     root.check_read()?;
     Ok(Imported { file, notes: ledger.notes() })
 }
@@ -145,8 +150,9 @@ fn check_header(root: &Element<'_>) -> Result<(), ConvertError> {
     Ok(())
 }
 
-/// The values that actions set: the name, the value, and the event; without an event, an empty text.
-fn sets_of(node: roxmltree::Node<'_, '_>) -> Vec<(String, String, String)> {
+/// The values that actions set: the name, the value, and the event; without an event, an empty
+/// text.
+fn read_sets(node: roxmltree::Node<'_, '_>) -> Vec<(String, String, String)> {
     let actions = node.descendants().filter_map(|node| {
         let name = match node.tag_name().name() {
             "ParameterAction" => node.attribute("parameterRef"),
@@ -163,7 +169,7 @@ fn sets_of(node: roxmltree::Node<'_, '_>) -> Vec<(String, String, String)> {
 }
 
 /// The values of variables at the start.
-fn variables_of(root: &Element<'_>) -> Result<BTreeMap<String, String>, ConvertError> {
+fn read_variables(root: &Element<'_>) -> Result<BTreeMap<String, String>, ConvertError> {
     let mut variables = BTreeMap::new();
     if let Some(section) = root.find("VariableDeclarations")? {
         section.only(&["VariableDeclaration"])?;
@@ -174,13 +180,13 @@ fn variables_of(root: &Element<'_>) -> Result<BTreeMap<String, String>, ConvertE
     Ok(variables)
 }
 
-fn file_of<'a>(
+fn file_from<'a>(
     (root, node): (&Element<'a>, roxmltree::Node<'_, '_>),
     catalogs: Catalogs<'a>,
     settings: &Settings,
     ledger: &'a Ledger,
 ) -> Result<ScenarioFile, ConvertError> {
-    let (roads, missing_roads) = roads_of(root, settings)?;
+    let (roads, missing_roads) = read_roads(root, settings)?;
     let mut context = Context {
         entities: BTreeMap::new(),
         roads,
@@ -189,9 +195,12 @@ fn file_of<'a>(
         is_in_story: false,
         waiting: Vec::new(),
         placed_by_others: Vec::new(),
-        variables: variables_of(root)?,
-        sets: sets_of(node),
+        variables: read_variables(root)?,
+        sets: read_sets(node),
         missing_roads,
+        minor_version: root.need("FileHeader")?.whole("revMinor")?,
+        controlled: controllers::assigned(node).into_iter().collect(),
+        ego_route: None,
     };
     entities::read_entities(&root.need("Entities")?, &mut context)?;
     if !context.entities.contains_key(&settings.ego) {
@@ -206,9 +215,11 @@ fn file_of<'a>(
     for story in storyboard.all("Story") {
         story::read_story(&story, &mut context, &mut states)?;
     }
-    elements::resolve(states, &mut context)?;
     let stop = storyboard.find("StopTrigger")?;
-    let end_s = stop.map(|stop| stop::stop_time_s(&stop, &context)).transpose()?.flatten();
+    let stop = stop.map(|stop| stop::read_stop(&stop, &context)).transpose()?.unwrap_or_default();
+    let end_s = stop.time_s;
+    let ends = elements::resolve(states, stop.groups, &mut context)?;
+    let when = (!ends.is_empty()).then(|| conditions::join_any(ends));
     let builder = Builder { context: &context, ledger, end_s };
     let mut actors = Vec::new();
     for (name, entity) in context.entities.iter().filter(|(name, _)| **name != settings.ego) {
@@ -217,28 +228,33 @@ fn file_of<'a>(
             ledger.note(format!("entity {name:?}: is left out ({})", part.name()));
             continue;
         }
-        let actor = builder.actor_of(entity);
+        let actor = builder.actor_section(entity);
         actors
             .push(actor.map_err(|message| ConvertError::new(format!("entity {name:?}"), message))?);
     }
+    let ego = &context.entities[&settings.ego];
+    let points = context.ego_route.clone();
+    let route = points.map(|points| RouteSection { points: Some(points), ..Default::default() });
+    // The file's own trigger ends the scenario, and not the route.
+    let route_done = route.is_some().then_some(false);
     Ok(ScenarioFile {
         format: ScenarioFile::FORMAT.to_owned(),
         name: settings.name.clone(),
         twin: TwinPin { name: settings.twin.clone(), version_hash: None },
         map: None,
-        ego: build::ego_of(&context.entities[&settings.ego], ledger),
-        route: None,
+        ego: build::ego_section(ego, ledger),
+        route,
         tracks: None,
         actors,
         sweep: None,
-        end: EndSection { time_s: end_s, ..EndSection::default() },
+        end: EndSection { time_s: end_s, when, route_done, ..EndSection::default() },
         verdict: VerdictSection::default(),
         seed: None,
     })
 }
 
 /// The roads that the file or the settings name, or why they were not read.
-fn roads_of(
+fn read_roads(
     root: &Element<'_>,
     settings: &Settings,
 ) -> Result<(Option<RoadMap>, Option<String>), ConvertError> {
@@ -267,7 +283,7 @@ fn roads_of(
         }
     };
     let bytes = files::read_bytes(&path)?;
-    let roads = opendrive::roads_of(&bytes, settings.origin).map_err(|error| {
+    let roads = opendrive::roads_from(&bytes, settings.origin).map_err(|error| {
         ConvertError::new(format!("{}, {}", path.display(), error.place), error.message)
     })?;
     Ok((Some(RoadMap::new(roads.network)), None))

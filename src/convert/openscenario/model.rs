@@ -1,9 +1,11 @@
 //! What is known of a scenario while its file is read.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use wildcity_scene::ActorClass;
-use wildcity_sim::scenario::{ConditionSection, ProfileSection};
+use wildcity_sim::scenario::{
+    ArriveTogetherSection, ConditionSection, KeepDistanceSection, ProfileSection,
+};
 
 use super::catalogs::Catalogs;
 use super::roads::{RoadMap, Spot};
@@ -36,8 +38,8 @@ pub(super) struct Entity {
     pub(super) name: String,
     pub(super) class: ActorClass,
     pub(super) size: [f64; 3],
-    /// From the reference point, the middle of the rear axle on the ground, to the box's centre, in metres forward, to
-    /// the left and up.
+    /// From the reference point, the middle of the rear axle on the ground, to the box's centre, in
+    /// metres forward, to the left and up.
     pub(super) center_m: [f64; 3],
     /// From the reference point forward to the rear axle, in metres.
     pub(super) rear_m: f64,
@@ -83,6 +85,8 @@ pub(super) enum Act {
         factor: f64,
         delta_mps: f64,
     },
+    Keep(Box<KeepDistanceSection>),
+    Arrive(Box<ArriveTogetherSection>),
     /// To the lane with this id.
     Lane {
         lane: i32,
@@ -105,7 +109,8 @@ impl Act {
     }
 }
 
-/// The entities, roads and catalogs of a scenario, and the name of the entity that the agent drives.
+/// The entities, roads and catalogs of a scenario, and the name of the entity that the agent
+/// drives.
 pub(super) struct Context<'a> {
     pub(super) entities: BTreeMap<String, Entity>,
     pub(super) roads: Option<RoadMap>,
@@ -121,6 +126,12 @@ pub(super) struct Context<'a> {
     pub(super) variables: BTreeMap<String, String>,
     /// The parameters and variables that actions set: the name, the value and the event.
     pub(super) sets: Vec<(String, String, String)>,
+    /// The minor version of the file: 0 for 1.0.
+    pub(super) minor_version: i32,
+    /// The entities with controllers of their own.
+    pub(super) controlled: BTreeSet<String>,
+    /// The line along which the ego goes.
+    pub(super) ego_route: Option<Vec<[f64; 3]>>,
     /// Why the roads that the scenario names were not read.
     pub(super) missing_roads: Option<String>,
 }
@@ -132,7 +143,8 @@ impl Context<'_> {
         entity.map(|entity| entity.name.clone())
     }
 
-    /// From the middle of an entity's box forward to its reference point, in metres: the ego's is its rear axle.
+    /// From the middle of an entity's box forward to its reference point, in metres: the ego's is
+    /// its rear axle.
     pub(super) fn ahead_m(&self, name: &str) -> Option<f64> {
         let entity = self.entities.get(name)?;
         Some(-entity.center_m[0])

@@ -7,7 +7,7 @@ use super::route::place_on_route;
 use crate::ConvertError;
 
 /// The place of a `<Position>`.
-pub(super) fn place_of(
+pub(super) fn place_from(
     position: &Element<'_>,
     context: &Context<'_>,
 ) -> Result<Place, ConvertError> {
@@ -30,12 +30,12 @@ pub(super) fn place_of(
         }
         "RoutePosition" => {
             let roads = roads(&kind, context)?;
-            let at = place_on_route(&kind, context, roads, place_of)?;
+            let at = place_on_route(&kind, context, roads, place_from)?;
             lane_facing(&kind, at, roads)?
         }
         "RelativeLanePosition" => relative_lane_place(&kind, context)?,
         "RelativeRoadPosition" => {
-            let (name, base) = base_of(&kind, context)?;
+            let (name, base) = base_place(&kind, context)?;
             let roads = roads(&kind, context)?;
             let wrong = |message: String| kind.wrong(&message);
             let Some(spot) = base.spot else {
@@ -66,7 +66,7 @@ fn roads<'c>(kind: &Element<'_>, context: &'c Context<'_>) -> Result<&'c RoadMap
 }
 
 /// The entity of `entityRef`, and its place.
-fn base_of(kind: &Element<'_>, context: &Context<'_>) -> Result<(String, Place), ConvertError> {
+fn base_place(kind: &Element<'_>, context: &Context<'_>) -> Result<(String, Place), ConvertError> {
     let name = kind.text("entityRef")?;
     let place = context.entities.get(&name).and_then(|entity| entity.place);
     let place = place.ok_or_else(|| {
@@ -76,7 +76,7 @@ fn base_of(kind: &Element<'_>, context: &Context<'_>) -> Result<(String, Place),
 }
 
 fn relative_place(kind: &Element<'_>, context: &Context<'_>) -> Result<Place, ConvertError> {
-    let (_, base) = base_of(kind, context)?;
+    let (_, base) = base_place(kind, context)?;
     let [dx, dy, dz] = ["dx", "dy", "dz"].map(|axis| kind.number_or_0(axis));
     let (dx, dy, dz) = (dx?, dy?, dz?);
     let mut xyz_m = match kind.name() {
@@ -96,7 +96,8 @@ fn lane_place(kind: &Element<'_>, context: &Context<'_>) -> Result<Place, Conver
     lane_facing(kind, at, roads)
 }
 
-/// A place on a lane with the heading of an `<Orientation>`; without one it faces as its traffic does.
+/// A place on a lane with the heading of an `<Orientation>`; without one it faces as its traffic
+/// does.
 fn lane_facing(
     kind: &Element<'_>,
     at: xodr::LanePosition,
@@ -109,7 +110,7 @@ fn lane_facing(
 }
 
 fn relative_lane_place(kind: &Element<'_>, context: &Context<'_>) -> Result<Place, ConvertError> {
-    let (name, base) = base_of(kind, context)?;
+    let (name, base) = base_place(kind, context)?;
     let roads = roads(kind, context)?;
     let Some(spot) = base.spot else {
         return Err(kind.wrong(&format!("{name:?} is on no lane")));
@@ -131,7 +132,8 @@ fn relative_lane_place(kind: &Element<'_>, context: &Context<'_>) -> Result<Plac
     lane_facing(kind, at, roads)
 }
 
-/// The heading of an `<Orientation>`: absolute, or relative to a heading, which is returned without an `<Orientation>`.
+/// The heading of an `<Orientation>`: absolute, or relative to a heading, which is returned without
+/// an `<Orientation>`.
 fn heading_rad(kind: &Element<'_>, base_rad: f64) -> Result<f64, ConvertError> {
     kind.only(&["Orientation", "RouteRef", "InRoutePosition"])?;
     let Some(orientation) = kind.find("Orientation")? else { return Ok(base_rad) };

@@ -14,13 +14,13 @@ use crate::ConvertError;
 const WAYPOINTS: usize = 1000;
 
 /// What reads the place of a `<Position>`: positions may be on routes themselves.
-pub(super) type PlaceOf = fn(&Element<'_>, &Context<'_>) -> Result<Place, ConvertError>;
+pub(super) type ReadPlace = fn(&Element<'_>, &Context<'_>) -> Result<Place, ConvertError>;
 
 /// The places of a `<Route>`, or of the one that a reference names.
-pub(super) fn waypoints_of(
+pub(super) fn waypoints(
     holder: &Element<'_>,
     context: &Context<'_>,
-    place_of: PlaceOf,
+    place_from: ReadPlace,
 ) -> Result<Vec<LanePosition>, ConvertError> {
     holder.only(&["Route", "CatalogReference"])?;
     let (route, is_entry) = match holder.find("CatalogReference")? {
@@ -36,7 +36,7 @@ pub(super) fn waypoints_of(
         waypoint.only(&["Position"])?;
         // There is one shortest way on most maps; a random one is none that could be repeated.
         waypoint.expect("routeStrategy", &["shortest", "fastest", "leastIntersections"])?;
-        let place = place_of(&waypoint.need("Position")?, context)?;
+        let place = place_from(&waypoint.need("Position")?, context)?;
         let spot = place.spot.ok_or_else(|| waypoint.wrong("is on no lane"))?;
         places.push(spot.at);
         if places.len() > WAYPOINTS {
@@ -57,10 +57,10 @@ pub(super) fn place_on_route(
     kind: &Element<'_>,
     context: &Context<'_>,
     roads: &RoadMap,
-    place_of: PlaceOf,
+    place_from: ReadPlace,
 ) -> Result<LanePosition, ConvertError> {
     kind.only(&["RouteRef", "InRoutePosition", "Orientation"])?;
-    let waypoints = waypoints_of(&kind.need("RouteRef")?, context, place_of)?;
+    let waypoints = waypoints(&kind.need("RouteRef")?, context, place_from)?;
     let place = kind.need("InRoutePosition")?.only_child()?;
     if place.name() != "FromLaneCoordinates" {
         return Err(place.unread());

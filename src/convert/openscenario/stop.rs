@@ -1,55 +1,70 @@
 //! The stop trigger.
 
-use super::conditions::group_of;
+use wildcity_sim::limits;
+use wildcity_sim::scenario::ConditionSection;
+
+use super::conditions::group_condition;
 use super::element::Element;
 use super::ledger::Part;
 use super::model::Context;
 use crate::ConvertError;
 
-/// When a `<StopTrigger>` ends the scenario, in seconds; `None` if it does not by time.
-pub(super) fn stop_time_s(
-    stop: &Element<'_>,
-    context: &Context<'_>,
-) -> Result<Option<f64>, ConvertError> {
-    stop.only(&["ConditionGroup"])?;
-    let mut end_s: Option<f64> = None;
-    for group in stop.children() {
-        let kinds: Result<Vec<&str>, ConvertError> =
-            group.children().map(|condition| kind_of(&condition)).collect();
-        let kinds = kinds?;
-        if kinds.is_empty() {
-            return Err(group.wrong("is empty"));
-        }
-        let is_timed = kinds.iter().all(|kind| *kind == "SimulationTimeCondition");
-        let is_known =
-            |kind: &&str| matches!(*kind, "SimulationTimeCondition" | "ParameterCondition");
-        let condition = match kinds.iter().all(is_known) {
-            true => group_of(&group, context, true),
-            false => Err(group.unread()),
-        };
-        // The mistake itself says more than that the group may be left out.
-        if is_timed && !group.leaves_out(Part::Stop) {
-            condition.clone()?;
-        }
-        let Ok(condition) = condition else {
-            group.leave_out(Part::Stop)?;
-            continue;
-        };
-        let parts = condition.all.iter().chain([&condition]).filter_map(|part| part.time_s);
-        let time_s = parts.fold(0.0, f64::max);
-        // A parameter that is another never ends it.
-        if time_s < wildcity_sim::limits::END_S {
-            end_s = Some(end_s.map_or(time_s, |before_s| before_s.min(time_s)));
-        }
-    }
-    Ok(end_s)
+/// When a scenario ends.
+#[derive(Default)]
+pub(super) struct Stop<'a> {
+    /// After this time, in seconds.
+    pub(super) time_s: Option<f64>,
+    /// When one of these holds, each with its element.
+    pub(super) groups: Vec<(Element<'a>, ConditionSection)>,
 }
 
-/// The kind of a condition.
-fn kind_of<'a>(condition: &Element<'a>) -> Result<&'a str, ConvertError> {
-    let by = condition.only_child()?;
-    match by.name() {
-        "ByValueCondition" => Ok(by.only_child()?.name()),
-        other => Ok(other),
+/// Reads a `<StopTrigger>`.
+pub(super) fn read_stop<'a>(
+    stop: &Element<'a>,
+    context: &Context<'_>,
+) -> Result<Stop<'a>, ConvertError> {
+    stop.only(&["ConditionGroup"])?;
+    let mut read = Stop::default();
+    for group in stop.children() {
+        if group.children().next().is_none() {
+            return Err(group.wrong("is empty"));
+        }
+        let condition = match group_condition(&group, context, true) {
+            Ok(condition) => condition,
+            Err(error) => {
+                leave_out(&group, error)?;
+                continue;
+            }
+        };
+        match time_s(&condition) {
+            // A parameter that is another never ends it.
+            Some(time_s) if time_s >= limits::END_S => {}
+            Some(time_s) => {
+                read.time_s = Some(read.time_s.map_or(time_s, |before_s| before_s.min(time_s)));
+            }
+            None => read.groups.push((group, condition)),
+        }
     }
+    Ok(read)
+}
+
+/// Leaves out a group that is not read because of an error, if that was asked for.
+pub(super) fn leave_out(group: &Element<'_>, error: ConvertError) -> Result<(), ConvertError> {
+    if group.leaves_out(Part::Stop) {
+        return group.leave_out(Part::Stop);
+    }
+    let ConvertError { place, message } = error;
+    Err(ConvertError::new(place, format!("{message}; or use --leave-out {}", Part::Stop.name())))
+}
+
+/// The time of a condition that is nothing else, in seconds.
+fn time_s(condition: &ConditionSection) -> Option<f64> {
+    let ConditionSection { time_s: own_s, all, .. } = condition;
+    let plain =
+        ConditionSection { time_s: *own_s, all: all.clone(), ..ConditionSection::default() };
+    if *condition != plain {
+        return None;
+    }
+    let parts: Option<Vec<f64>> = all.iter().map(time_s).collect();
+    Some(parts?.into_iter().fold(own_s.unwrap_or(0.0), f64::max))
 }

@@ -4,13 +4,13 @@ use wildcity_sim::scenario::ConditionSection;
 
 use super::actions::{private_act, profile_entry};
 use super::catalogs::declared;
-use super::conditions::trigger_of;
+use super::conditions::trigger_condition;
 use super::element::Element;
 use super::elements::{Elements, Event, unknown};
-use super::init::set_place;
+use super::init::{read_route_of_ego, set_place};
 use super::ledger::Part;
 use super::model::{Act, Context, Draft};
-use super::position::place_of;
+use super::position::place_from;
 use crate::ConvertError;
 
 /// The place of an event in the storyboard.
@@ -40,7 +40,7 @@ pub(super) fn read_story<'a>(
             stop.leave_out(Part::Stop)?;
         }
         let act_name = act.find_text("name")?.unwrap_or_default();
-        let gate = gate_of(&act, &act_name, context, elements)?;
+        let gate = act_gate(&act, &act_name, context, elements)?;
         for group in act.all("ManeuverGroup") {
             group.only(&["Actors", "Maneuver", "CatalogReference"])?;
             group.ignore(&["maximumExecutionCount"])?;
@@ -85,19 +85,20 @@ pub(super) fn read_story<'a>(
 }
 
 /// The trigger that fires when an act starts; `None` if it starts with the scenario.
-fn gate_of(
+fn act_gate(
     act: &Element<'_>,
     name: &str,
     context: &mut Context<'_>,
     elements: &mut Elements,
 ) -> Result<Option<String>, ConvertError> {
     let start = act.find("StartTrigger")?;
-    let start = start.map(|start| trigger_of(&start, context, true)).transpose()?;
+    let start = start.map(|start| trigger_condition(&start, context, true)).transpose()?;
     let start = start.unwrap_or_default();
     let at_once = ConditionSection { time_s: Some(0.0), ..ConditionSection::default() };
-    let gate = match start == ConditionSection::default() || start == at_once {
-        true => None,
-        false => Some(elements.mark(&format!("act-{name}"), start, context, act)?),
+    let gate = if start == ConditionSection::default() || start == at_once {
+        None
+    } else {
+        Some(elements.mark(&format!("act-{name}"), start, context, act)?)
     };
     elements.acts.insert(name.to_owned(), gate.clone());
     Ok(gate)
@@ -132,7 +133,7 @@ fn read_event<'a>(
     // A name that is no formula is a text.
     let name = event.text("name").or_else(|_| event.raw("name"))?;
     let start = event.find("StartTrigger")?;
-    let read = start.as_ref().map(|start| trigger_of(start, context, scope.gate.is_none()));
+    let read = start.as_ref().map(|start| trigger_condition(start, context, scope.gate.is_none()));
     let start = match (read.transpose(), &start) {
         // When the agent's entity would act does not matter, if nothing waits for it.
         (Err(_), Some(start)) if is_of_ego => {
@@ -185,7 +186,7 @@ impl<'a> EventRead<'_, 'a> {
             "PrivateAction" => {
                 let kind = kind.only_child()?;
                 for target in &self.scope.actors {
-                    self.act_of(&kind, target, &action_name, context, elements)?;
+                    self.add_act(&kind, target, &action_name, context, elements)?;
                 }
                 Ok(())
             }
@@ -194,7 +195,13 @@ impl<'a> EventRead<'_, 'a> {
                 match global.name() {
                     "EntityAction" => {
                         let target = global.text("entityRef")?;
-                        self.act_of(&global.only_child()?, &target, &action_name, context, elements)
+                        self.add_act(
+                            &global.only_child()?,
+                            &target,
+                            &action_name,
+                            context,
+                            elements,
+                        )
                     }
                     "ParameterAction" | "VariableAction" => {
                         let is_parameter = global.name() == "ParameterAction";
@@ -219,7 +226,7 @@ impl<'a> EventRead<'_, 'a> {
     }
 
     /// Adds an action of an entity.
-    fn act_of(
+    fn add_act(
         &mut self,
         kind: &Element<'a>,
         target: &str,
@@ -233,6 +240,10 @@ impl<'a> EventRead<'_, 'a> {
         let is_controller = matches!(kind.name(), "ControllerAction" | "ActivateControllerAction");
         let is_look = matches!(kind.name(), "AppearanceAction" | "VisibilityAction");
         if target == context.ego && !is_controller && !is_look {
+            if kind.name() == "RoutingAction" && is_destination(kind) {
+                read_route_of_ego(kind, context)?;
+                return self.mark_ego(None, kind, context, elements);
+            }
             let duration_s = duration_s(kind)?;
             kind.leave_out(Part::Ego)?;
             return self.mark_ego(duration_s, kind, context, elements);
@@ -245,13 +256,13 @@ impl<'a> EventRead<'_, 'a> {
         }
         let act = match kind.name() {
             "AddEntityAction" => {
-                let place = place_of(&kind.need("Position")?, context)?;
+                let place = place_from(&kind.need("Position")?, context)?;
                 set_place(target, place, context);
                 Act::Spawn
             }
             "DeleteEntityAction" => Act::Remove,
             "TeleportAction" => {
-                let place = place_of(&kind.need("Position")?, context)?;
+                let place = place_from(&kind.need("Position")?, context)?;
                 let before = context.entities.get(target).and_then(|entity| entity.place);
                 set_place(target, place, context);
                 if let Some(entity) = context.entities.get_mut(target) {
@@ -325,7 +336,9 @@ impl<'a> EventRead<'_, 'a> {
         let Some(entity) = context.entities.get_mut(target) else { return Err(kind.unread()) };
         match &act {
             Act::Speed(profile) => entity.fastest_mps = entity.fastest_mps.max(profile.to),
-            Act::Match { .. } => entity.fastest_mps = wildcity_sim::limits::ACTOR_SPEED_M_S,
+            Act::Match { .. } | Act::Keep(_) | Act::Arrive(_) => {
+                entity.fastest_mps = wildcity_sim::limits::ACTOR_SPEED_M_S
+            }
             Act::Lane { lane, .. } => entity.lane = Some(*lane),
             Act::Spawn if entity.script.is_empty() => entity.present = false,
             _ => {}
@@ -378,6 +391,12 @@ impl<'a> EventRead<'_, 'a> {
         triggers.push((reference.clone(), action_name.to_owned()));
         Ok(reference)
     }
+}
+
+/// Whether a `<RoutingAction>` says where to go.
+fn is_destination(routing: &Element<'_>) -> bool {
+    let names = ["AssignRouteAction", "AcquirePositionAction", "FollowTrajectoryAction"];
+    routing.children().any(|action| names.contains(&action.name()))
 }
 
 /// How long an action lasts, in seconds, if its dynamics say so.

@@ -2,7 +2,7 @@
 
 use super::element::Element;
 use super::model::{Context, Line};
-use super::position::place_of;
+use super::position::place_from;
 use crate::ConvertError;
 
 /// Distance between two points of a curve, in metres.
@@ -12,7 +12,7 @@ const SPACING_M: f64 = 0.5;
 const POINTS: usize = wildcity_sim::limits::COURSE_POINTS;
 
 /// The points of a `<Trajectory>`.
-pub(super) fn line_of(
+pub(super) fn line_from(
     trajectory: &Element<'_>,
     context: &Context<'_>,
 ) -> Result<Line, ConvertError> {
@@ -42,7 +42,7 @@ fn polyline(shape: &Element<'_>, context: &Context<'_>) -> Result<Line, ConvertE
     for vertex in shape.children() {
         vertex.only(&["Position"])?;
         let position = vertex.need("Position")?;
-        let place = place_of(&position, context)?;
+        let place = place_from(&position, context)?;
         let kind = position.only_child()?;
         let is_turned = kind.find_number("h")?.is_some_and(|h| h != 0.0);
         if is_turned || kind.find("Orientation")?.is_some() {
@@ -59,7 +59,7 @@ fn polyline(shape: &Element<'_>, context: &Context<'_>) -> Result<Line, ConvertE
 
 fn clothoid(shape: &Element<'_>, context: &Context<'_>) -> Result<Line, ConvertError> {
     shape.only(&["Position"])?;
-    let place = place_of(&shape.need("Position")?, context)?;
+    let place = place_from(&shape.need("Position")?, context)?;
     let curvature = shape.number("curvature")?;
     let slope = match shape.find_number("curvaturePrime")? {
         Some(slope) => slope,
@@ -104,7 +104,7 @@ fn nurbs(shape: &Element<'_>, context: &Context<'_>) -> Result<Line, ConvertErro
     let mut is_timed = false;
     for control in shape.all("ControlPoint") {
         control.only(&["Position"])?;
-        let [x, y, z] = place_of(&control.need("Position")?, context)?.xyz_m;
+        let [x, y, z] = place_from(&control.need("Position")?, context)?.xyz_m;
         let weight = control.find_number("weight")?.unwrap_or(1.0);
         is_timed |= control.find_number("time")?.is_some();
         controls.push([x * weight, y * weight, z * weight, weight]);

@@ -75,6 +75,15 @@ impl ActorBox {
     /// A pedestrian: 0.6 m x 0.6 m x 1.75 m.
     pub const PEDESTRIAN: Self = Self { length_m: 0.6, width_m: 0.6, height_m: 1.75 };
 
+    /// Length, width and height as shares of those of another box.
+    pub fn ratios(&self, other: &Self) -> [f64; 3] {
+        [
+            self.length_m / other.length_m,
+            self.width_m / other.width_m,
+            self.height_m / other.height_m,
+        ]
+    }
+
     /// Checks that each extent is finite and from [`Self::LEAST_M`] to [`Self::MOST_M`].
     ///
     /// # Errors

@@ -46,13 +46,7 @@ pub(super) fn nearest<'a>(
     box_: &ActorBox,
 ) -> Option<&'a StoredActor> {
     let apart = |actor: &StoredActor| {
-        let own = actor.description.box_;
-        let ratios = [
-            own.length_m / box_.length_m,
-            own.width_m / box_.width_m,
-            own.height_m / box_.height_m,
-        ];
-        ratios.map(|ratio| ratio.ln().abs()).iter().sum::<f64>()
+        actor.description.box_.ratios(box_).map(|ratio| ratio.ln().abs()).iter().sum::<f64>()
     };
     let of_class = actors.iter().filter(|actor| actor.description.class == class);
     of_class.min_by(|a, b| apart(a).total_cmp(&apart(b)))

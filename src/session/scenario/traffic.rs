@@ -216,6 +216,7 @@ impl EpisodeTraffic {
                 .zip(self.progress)
                 .is_some_and(|(route, progress)| route.is_done(&progress, &world_from_rig)),
             has_contact,
+            has_held: self.world.end_us().is_some(),
         };
         if self.ended.is_some() {
             return;

@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use wildcity_scene::ActorClass;
 
+use super::line_fields::section_on_course;
 use super::pose::PoseSection;
 use super::script_file::TriggerSection;
 
@@ -21,11 +22,12 @@ pub struct ActorSection {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(with = "Option<ClassSchema>"))]
     pub class: Option<ActorClass>,
-    /// The name of its asset, or its BLAKE3, 64 lower-case hex digits; `none` if it is not drawn. If absent, the generated
-    /// asset of its class whose size is the nearest.
+    /// The name of its asset, or its BLAKE3, 64 lower-case hex digits; `none` if it is not drawn.
+    /// If absent, the generated asset of its class whose size is the nearest.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub asset: Option<String>,
-    /// Length, width and height, in metres. If absent, those of its asset; without an asset, of its kind.
+    /// Length, width and height, in metres. If absent, those of its asset; without an asset, of its
+    /// kind.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub size: Option<[f64; 3]>,
     /// Whether it is present from the start; otherwise its script spawns it. If absent, true.
@@ -49,7 +51,8 @@ pub struct ActorSection {
     /// Stands.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub stand: Option<PoseSection>,
-    /// Conditions and their actions: all actions for `path` and `idm`, only `spawn` and `remove` for the others.
+    /// Conditions and their actions: all actions for `path` and `idm`, only `spawn` and `remove`
+    /// for the others.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub script: Vec<TriggerSection>,
     /// Random displacement of its starting pose.
@@ -66,80 +69,39 @@ pub struct LogSection {
     pub track: String,
 }
 
-/// An actor on a course.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[serde(deny_unknown_fields, default)]
-pub struct PathSection {
-    /// A recorded trajectory of the twin, as the line to follow. Exactly one of `along`, `points` and `lanes`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub along: Option<String>,
-    /// Points in the world, in metres, in order. They are placed on the ground where there is one.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub points: Option<Vec<[f64; 3]>>,
-    /// Lanes of the map, in order.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub lanes: Option<Vec<String>>,
-    /// Whether to follow it from its end to its start. If absent, false.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub reverse: Option<bool>,
-    /// Where it starts, in metres along the line.
-    pub station_m: f64,
-    /// Its offset to the left of the line, in metres. If absent, 0.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub offset_m: Option<f64>,
-    /// Its speed at the start, in m/s.
-    pub speed: f64,
-    /// Whether it disappears at the end of the line. Otherwise it stands there.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub leaves: Option<bool>,
+section_on_course! {
+    /// An actor on a course.
+    #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+    #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+    #[serde(deny_unknown_fields, default)]
+    pub struct PathSection {}
 }
 
-/// An actor that follows a course by the Intelligent Driver Model.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[serde(deny_unknown_fields, default)]
-pub struct IdmSection {
-    /// A recorded trajectory of the twin, as the line to follow. Exactly one of `along`, `points` and `lanes`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub along: Option<String>,
-    /// Points in the world, in metres, in order. They are placed on the ground where there is one.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub points: Option<Vec<[f64; 3]>>,
-    /// Lanes of the map, in order.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub lanes: Option<Vec<String>>,
-    /// Whether to follow it from its end to its start. If absent, false.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub reverse: Option<bool>,
-    /// Where it starts, in metres along the line.
-    pub station_m: f64,
-    /// Its offset to the left of the line, in metres. If absent, 0.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub offset_m: Option<f64>,
-    /// Its speed at the start, in m/s.
-    pub speed: f64,
-    /// Whether it disappears at the end of the line. Otherwise it stands there.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub leaves: Option<bool>,
-    /// Which variant of the model. If absent, `wildcity`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub model: Option<IdmModel>,
-    /// Speed of a free road, in m/s. If absent, that of the variant.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub v0: Option<f64>,
-    /// Gap to a standing lead, in metres.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub s0: Option<f64>,
-    /// Time headway, in seconds.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub headway_s: Option<f64>,
-    /// Largest acceleration, in m/s².
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub a: Option<f64>,
-    /// Comfortable braking, in m/s².
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub b: Option<f64>,
+section_on_course! {
+    /// An actor that follows a course by the Intelligent Driver Model.
+    #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+    #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+    #[serde(deny_unknown_fields, default)]
+    pub struct IdmSection {
+        /// Which variant of the model. If absent, `wildcity`.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        pub model: Option<IdmModel>,
+        /// Speed of a free road, in m/s. If absent, that of the variant.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        pub v0: Option<f64>,
+        /// Gap to a standing lead, in metres.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        pub s0: Option<f64>,
+        /// Time headway, in seconds.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        pub headway_s: Option<f64>,
+        /// Largest acceleration, in m/s².
+        #[serde(skip_serializing_if = "Option::is_none")]
+        pub a: Option<f64>,
+        /// Comfortable braking, in m/s².
+        #[serde(skip_serializing_if = "Option::is_none")]
+        pub b: Option<f64>,
+    }
 }
 
 /// Variants of the Intelligent Driver Model.
@@ -162,8 +124,8 @@ pub enum IdmModel {
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct CollideSection {
-    /// Times since the episode's start, in seconds, with positions in the world, in metres. The actor faces the
-    /// direction of its motion, and stands before the first and after the last.
+    /// Times since the episode's start, in seconds, with positions in the world, in metres. The
+    /// actor faces the direction of its motion, and stands before the first and after the last.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub positions: Option<Vec<TimedPosition>>,
     /// Heading of an actor that stands, in radians. If absent, 0.
@@ -178,7 +140,8 @@ pub struct CollideSection {
     /// When they meet, in seconds since the episode's start.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub time_s: Option<f64>,
-    /// The actor's heading there relative to the trajectory's, in radians: π is frontal, ±π/2 from the side.
+    /// The actor's heading there relative to the trajectory's, in radians: π is frontal, ±π/2 from
+    /// the side.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub angle_rad: Option<f64>,
     /// The actor's constant speed, in m/s.
@@ -225,8 +188,8 @@ pub struct JitterSection {
     pub lateral_m: f64,
     /// Heading, in radians; for `collide`, `attack` and `stand`.
     pub yaw_rad: f64,
-    /// Direction that counts as along, in radians from the world's x axis; for `collide`, `attack` and `stand`. If
-    /// absent, the actor's heading.
+    /// Direction that counts as along, in radians from the world's x axis; for `collide`, `attack`
+    /// and `stand`. If absent, the actor's heading.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub along_rad: Option<f64>,
     /// The sampled displacement: only in the resolved scenario of a record.

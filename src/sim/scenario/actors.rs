@@ -10,14 +10,15 @@ use super::actor_file::{
     ActorSection, AttackSection, IdmModel, IdmSection, JitterDraw, NOT_DRAWN, PathSection,
 };
 use super::around::{AssetInfo, EgoStart, Surroundings};
-use super::collide::collide_of;
+use super::collide::collide_from;
+use super::condition::References;
 use super::courses::Courses;
 use super::error::{FileError, in_range, listed, named};
 use super::file::ScenarioFile;
 use super::jitter::{displaced, drawn};
-use super::pose::pose_of;
-use super::script::{References, script_of};
-use super::tracks::{TrackSection, box_of};
+use super::pose::pose_from;
+use super::script::add_script;
+use super::tracks::{TrackSection, box_from};
 use crate::limits;
 use crate::traffic::{
     Actor, ActorSpec, Attack, Behaviour, CourseFollower, Idm, Track, TrackKeyframe,
@@ -27,14 +28,23 @@ use crate::traffic::{
 const TICK_US: i64 = 250_000;
 const PLAN_TICKS: u32 = 3;
 
-/// All actors, first the recorded ones and then those of the scenario, with the names of their triggers.
-pub(super) fn actors_of(
+/// All actors, first the recorded ones and then those of the scenario.
+pub(super) struct Actors {
+    pub(super) actors: Vec<Actor>,
+    /// The names of the triggers of each actor.
+    pub(super) trigger_names: Vec<Vec<String>>,
+    /// The index of each actor, by name.
+    pub(super) indices: BTreeMap<String, usize>,
+}
+
+/// All actors of a scenario.
+pub(super) fn actors_from(
     file: &mut ScenarioFile,
     seed: u64,
     around: &Surroundings<'_>,
     start: Option<&EgoStart>,
     courses: &mut Courses<'_>,
-) -> Result<(Vec<Actor>, Vec<Vec<String>>), FileError> {
+) -> Result<Actors, FileError> {
     let tracks = recorded(file, around, start)?;
     let count = tracks.len() + file.actors.len();
     if count > limits::ACTORS {
@@ -43,7 +53,7 @@ pub(super) fn actors_of(
     }
     let mut actors: Vec<Actor> = Vec::with_capacity(count);
     for (section, track) in tracks {
-        let box_ = box_of("tracks", section.size)?;
+        let box_ = box_from("tracks", section.size)?;
         let asset = named_asset("tracks", section.asset.as_deref(), around)?;
         let asset = match &section.asset {
             Some(_) => asset,
@@ -85,11 +95,11 @@ pub(super) fn actors_of(
     let references = References { indices: &indices, triggers: &trigger_names };
     for (index, section) in file.actors.iter_mut().enumerate() {
         let own = recorded_count + index;
-        let actor = actor_of(section, own, seed, around, start, courses, &references)
+        let actor = actor_from(section, own, seed, around, start, courses, &references)
             .map_err(|error| error.within(&format!("actors[{index}]")))?;
         actors.push(actor);
     }
-    Ok((actors, trigger_names))
+    Ok(Actors { actors, trigger_names, indices })
 }
 
 /// The tracks of the scenario's tracks file, on the episode's clock.
@@ -151,7 +161,7 @@ fn default_asset(
     found.map_err(|reason| FileError::new(path, format!("has no asset, and {reason}")))
 }
 
-fn actor_of(
+fn actor_from(
     section: &mut ActorSection,
     own: usize,
     seed: u64,
@@ -195,17 +205,17 @@ fn actor_of(
         let shifted = track.shifted(start_time_us(around, start));
         Behaviour::Track(shifted.map_err(|error| error.within("log.track"))?)
     } else if let Some(path) = &section.path {
-        Behaviour::Follow(follow_of("path", path, &drawn, None, courses)?)
+        Behaviour::Follow(follower_from("path", path, &drawn, None, courses)?)
     } else if let Some(idm) = &section.idm {
-        let model = idm_of(idm).map_err(|error| error.within("idm"))?;
-        Behaviour::Follow(follow_of("idm", &path_of(idm), &drawn, Some(model), courses)?)
+        let model = idm_from(idm).map_err(|error| error.within("idm"))?;
+        Behaviour::Follow(follower_from("idm", &path_from_idm(idm), &drawn, Some(model), courses)?)
     } else if let Some(collide) = &section.collide {
-        let track = collide_of(collide, &drawn, along_rad, around);
+        let track = collide_from(collide, &drawn, along_rad, around);
         Behaviour::Track(track.map_err(|error| error.within("collide"))?)
     } else if let Some(attack) = &section.attack {
-        attack_of(attack, &drawn, along_rad).map_err(|error| error.within("attack"))?
+        attack_from(attack, &drawn, along_rad).map_err(|error| error.within("attack"))?
     } else if let Some(pose) = &section.stand {
-        let pose = displaced(&pose_of("stand", pose)?, &drawn, along_rad);
+        let pose = displaced(&pose_from("stand", pose)?, &drawn, along_rad);
         Behaviour::Track(standing(pose))
     } else {
         return Err(FileError::new("name", "has no behaviour"));
@@ -218,7 +228,7 @@ fn actor_of(
     }
     let class = class.or(track_class).unwrap_or(ActorClass::Vehicle);
     let box_ = match (section.size.or(track_size), &asset) {
-        (Some(size), _) => box_of("size", size)?,
+        (Some(size), _) => box_from("size", size)?,
         (None, Some(asset)) => asset.box_,
         (None, None) => usual_box(class),
     };
@@ -227,8 +237,8 @@ fn actor_of(
         None => default_asset("asset", class, &box_, around)?,
     };
     let asset = asset.map(|asset| asset.hash);
-    // An actor that is not drawn keeps the word for it, so that it is not drawn again either. One that gets an asset by its
-    // size keeps that size: the asset's own would be taken the next time.
+    // An actor that is not drawn keeps the word for it, so that it is not drawn again either. One
+    // that gets an asset by its size keeps that size: the asset's own would be taken the next time.
     if asset.is_some() {
         section.size.get_or_insert([box_.length_m, box_.width_m, box_.height_m]);
         section.asset.clone_from(&asset);
@@ -239,7 +249,7 @@ fn actor_of(
         script: Vec::new(),
         present: section.present.unwrap_or(true),
     };
-    script_of(section, own, &mut actor, courses, references)?;
+    add_script(section, own, &mut actor, courses, references)?;
     Ok(actor)
 }
 
@@ -266,7 +276,7 @@ fn track_named<'a>(id: &str, around: &Surroundings<'a>) -> Result<&'a TrackSecti
 }
 
 /// The part of an IDM section that `path` has too.
-fn path_of(idm: &IdmSection) -> PathSection {
+fn path_from_idm(idm: &IdmSection) -> PathSection {
     PathSection {
         along: idm.along.clone(),
         points: idm.points.clone(),
@@ -279,7 +289,7 @@ fn path_of(idm: &IdmSection) -> PathSection {
     }
 }
 
-fn follow_of(
+fn follower_from(
     field: &str,
     path: &PathSection,
     drawn: &JitterDraw,
@@ -312,7 +322,7 @@ fn follow_of(
     })
 }
 
-fn idm_of(section: &IdmSection) -> Result<Idm, FileError> {
+fn idm_from(section: &IdmSection) -> Result<Idm, FileError> {
     let variant = match section.model.unwrap_or(IdmModel::Wildcity) {
         IdmModel::Wildcity => Idm::WILDCITY,
         IdmModel::Nuplan => Idm::NUPLAN,
@@ -345,7 +355,7 @@ fn standing(world_from_actor: Pose) -> Track {
     Track::standing(keyframe)
 }
 
-fn attack_of(
+fn attack_from(
     section: &AttackSection,
     drawn: &JitterDraw,
     along_rad: Option<f64>,
@@ -360,7 +370,7 @@ fn attack_of(
     }
     Ok(Behaviour::Attack {
         attack: Attack { plan_us: TICK_US * i64::from(ticks), best: best as usize },
-        world_from_actor: displaced(&pose_of("pose", &section.pose)?, drawn, along_rad),
+        world_from_actor: displaced(&pose_from("pose", &section.pose)?, drawn, along_rad),
         speed_mps: in_range("speed", section.speed, [0.0, limits::ACTOR_SPEED_M_S])?,
     })
 }

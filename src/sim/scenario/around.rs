@@ -31,7 +31,8 @@ pub trait Assets {
     /// The reason if it cannot be used.
     fn find(&self, name: &str) -> Result<AssetInfo, String>;
 
-    /// The asset of an actor that names none, by its class and its size; `None` if there is none of the class.
+    /// The asset of an actor that names none, by its class and its size; `None` if there is none of
+    /// the class.
     ///
     /// # Errors
     /// The reason if assets cannot be read.
@@ -57,9 +58,7 @@ impl Assets for NoAssets {
 pub struct AssetInfo {
     /// Its hash, 64 lower-case hex digits.
     pub hash: String,
-    /// Its kind.
     pub class: ActorClass,
-    /// Its box.
     pub box_: ActorBox,
 }
 
@@ -70,7 +69,6 @@ pub enum EgoStart {
     Pose(Pose),
     /// Along a recorded trajectory.
     Station {
-        /// Its name.
         trajectory: String,
         /// Distance along it, in metres.
         station_m: f64,
@@ -104,7 +102,7 @@ pub(super) fn drive_named<'a>(
 }
 
 /// Points of a file.
-pub(super) fn points_of(path: &str, points: &[[f64; 3]]) -> Result<Vec<DVec3>, FileError> {
+pub(super) fn checked_points(path: &str, points: &[[f64; 3]]) -> Result<Vec<DVec3>, FileError> {
     if !(2..=limits::COURSE_POINTS).contains(&points.len()) {
         let message =
             format!("{} points; 2 to {} are accepted", points.len(), limits::COURSE_POINTS);

@@ -12,7 +12,7 @@ use crate::limits;
 use crate::traffic::{Track, TrackKeyframe};
 
 /// The track of a collision course, displaced by its jitter.
-pub(super) fn collide_of(
+pub(super) fn collide_from(
     section: &CollideSection,
     drawn: &JitterDraw,
     along_rad: Option<f64>,
@@ -68,10 +68,11 @@ fn through_positions(
             let pose = Pose { position_m: *point_m + shift_m, rotation };
             TrackKeyframe { time_us: *time_us, world_from_actor: ground.place(pose) }
         });
-    track_of(keyframes.collect())
+    track_from(keyframes.collect())
 }
 
-/// The direction of the motion at a point: towards the next point; at the last, from the previous one.
+/// The direction of the motion at a point: towards the next point; at the last, from the previous
+/// one.
 fn facing_rad(points_m: &[DVec3], index: usize) -> Option<f64> {
     let last = points_m.len() - 1;
     let way_m = match index == last {
@@ -112,10 +113,10 @@ fn meeting(
     };
     // As long again after the meeting, and at least 10 s.
     let end_us = ((2.0 * time_s).max(time_s + 10.0) * 1e6).round() as i64;
-    track_of(vec![at(0), at(end_us)])
+    track_from(vec![at(0), at(end_us)])
 }
 
-fn track_of(keyframes: Vec<TrackKeyframe>) -> Result<Track, FileError> {
+fn track_from(keyframes: Vec<TrackKeyframe>) -> Result<Track, FileError> {
     Track::new(keyframes)
         .map(Track::held)
         .map_err(|error| FileError::new("positions", error.to_string()))

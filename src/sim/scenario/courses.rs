@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
-use super::around::{Surroundings, drive_named, points_of};
+use super::around::{Surroundings, checked_points, drive_named};
 use super::error::FileError;
 use crate::Ground;
 use crate::traffic::Course;
@@ -21,7 +21,8 @@ impl<'a> Courses<'a> {
         Self { around, drives: BTreeMap::new() }
     }
 
-    /// The line of a recorded drive, points or lanes, of which exactly one is given. `field` names the drive's field.
+    /// The line of a recorded drive, points or lanes, of which exactly one is given. `field` names
+    /// the drive's field.
     pub(super) fn line(
         &mut self,
         field: &str,
@@ -45,7 +46,7 @@ impl<'a> Courses<'a> {
                 return Ok(course);
             }
             (None, Some(points), None) => {
-                let points_m = points_of("points", points)?;
+                let points_m = checked_points("points", points)?;
                 Course::from_points(&points_m, &self.around.ground())
                     .ok_or_else(|| FileError::new("points", none()))?
             }

@@ -18,7 +18,6 @@ pub struct Document {
 /// One combination of a sweep.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Case {
-    /// The seed.
     pub seed: u64,
     /// The value of each `$name`.
     pub values: BTreeMap<String, Value>,
@@ -42,7 +41,7 @@ impl Document {
         remove_notes(&mut value);
         let sweep = match value.as_object_mut().and_then(|fields| fields.remove("sweep")) {
             None => SweepSection::default(),
-            Some(sweep) => sweep_of(sweep)?,
+            Some(sweep) => sweep_from(sweep)?,
         };
         let document = Self { value, sweep };
         document.check_sweep()?;
@@ -123,7 +122,7 @@ impl Document {
 }
 
 /// The sweep, field by field, since the path within a flattened map would be lost.
-fn sweep_of(value: Value) -> Result<SweepSection, FileError> {
+fn sweep_from(value: Value) -> Result<SweepSection, FileError> {
     let Value::Object(fields) = value else {
         let message = "is no object; write {\"seeds\": [0, 9], \"NAME\": [values]}";
         return Err(FileError::new("sweep", message));

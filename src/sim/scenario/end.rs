@@ -31,8 +31,9 @@ pub enum EndReason {
     Contact,
     /// The ego stood for too long.
     Stuck,
-    /// The ego arrived.
     RouteDone,
+    /// The scenario's own condition holds.
+    Condition,
 }
 
 /// The values that the rules test after a step.
@@ -48,6 +49,8 @@ pub struct EndInput {
     pub is_route_done: bool,
     /// Whether a contact of the kind that the rule names began in this step.
     pub has_contact: bool,
+    /// Whether the scenario's own condition has held.
+    pub has_held: bool,
 }
 
 /// How long the ego has been slow.
@@ -65,18 +68,19 @@ impl EndReason {
             Self::Contact => "contact",
             Self::Stuck => "stuck",
             Self::RouteDone => "route_done",
+            Self::Condition => "condition",
         }
     }
 
-    /// Whether the ego failed: it neither arrived nor ran out of time.
+    /// Whether the ego failed: neither did it arrive, nor was the scenario over.
     pub fn is_failure(self) -> bool {
-        !matches!(self, Self::Time | Self::RouteDone)
+        !matches!(self, Self::Time | Self::RouteDone | Self::Condition)
     }
 }
 
 impl EndRules {
-    /// Whether an episode ends after a step; of several reasons the first of: contact, off the route, stuck, route
-    /// done, time.
+    /// Whether an episode ends after a step; of several reasons the first of: contact, off the
+    /// route, stuck, route done, the scenario's condition, time.
     pub fn ended(&self, input: &EndInput, stuck: &mut Stuck) -> Option<EndReason> {
         let is_slow = input.velocity_mps.length() < limits::STUCK_M_S;
         stuck.since_us = is_slow.then(|| stuck.since_us.unwrap_or(input.time_us));
@@ -88,6 +92,7 @@ impl EndRules {
             (EndReason::OffRoute, off_route),
             (EndReason::Stuck, self.stuck_us.is_some_and(|most_us| slow_us >= most_us)),
             (EndReason::RouteDone, self.route_done && input.is_route_done),
+            (EndReason::Condition, input.has_held),
             (EndReason::Time, self.time_us.is_some_and(|end_us| input.time_us >= end_us)),
         ];
         holds.into_iter().find(|(_, holds)| *holds).map(|(reason, _)| reason)
@@ -105,6 +110,7 @@ mod tests {
             off_route_m: Some(2.0),
             is_route_done: false,
             has_contact: false,
+            has_held: false,
         }
     }
 
@@ -124,6 +130,9 @@ mod tests {
         assert_eq!(rules.ended(&contact, stuck), Some(EndReason::Contact));
         let done = EndInput { is_route_done: true, ..after(1, 5.0) };
         assert_eq!(rules.ended(&done, stuck), Some(EndReason::RouteDone));
+        let held = EndInput { has_held: true, ..after(1000, 5.0) };
+        assert_eq!(rules.ended(&held, stuck), Some(EndReason::Condition), "before its time");
+        assert!(!EndReason::Condition.is_failure());
     }
 
     #[test]

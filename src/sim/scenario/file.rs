@@ -1,8 +1,9 @@
-//! The scenario file `wildcity.scenario/1`, as it is written: JSON with numbers in metres, seconds and radians unless
-//! a name says otherwise.
+//! The scenario file `wildcity.scenario/1`, as it is written: JSON with numbers in metres, seconds
+//! and radians unless a name says otherwise.
 //!
-//! Every object may have a `note`, a comment, and a string `"$name"` in place of any value stands for a value of the
-//! sweep. Notes are removed and such strings replaced before the file is read as these types.
+//! Every object may have a `note`, a comment, and a string `"$name"` in place of any value stands
+//! for a value of the sweep. Notes are removed and such strings replaced before the file is read as
+//! these types.
 
 use std::collections::BTreeMap;
 
@@ -10,6 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use super::actor_file::ActorSection;
 use super::pose::PoseSection;
+use super::script_file::ConditionSection;
 
 /// A scenario: a twin, an ego, actors, and when it ends.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -58,7 +60,8 @@ pub struct ScenarioFile {
 pub struct TwinPin {
     /// Name of the twin.
     pub name: String,
-    /// BLAKE3 of the version's manifest, 64 lower-case hex digits. If absent, the version is not pinned.
+    /// BLAKE3 of the version's manifest, 64 lower-case hex digits. If absent, the version is not
+    /// pinned.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub version_hash: Option<String>,
 }
@@ -80,7 +83,8 @@ pub struct FilePin {
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct EgoSection {
-    /// Where it starts. If absent, as in the request `open`: the start of the twin's first trajectory.
+    /// Where it starts. If absent, as in the request `open`: the start of the twin's first
+    /// trajectory.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<StartSection>,
     /// How it moves. If absent, by teleport.
@@ -214,8 +218,8 @@ pub struct TracksSection {
     /// Tracks that are left out.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub without: Vec<String>,
-    /// Time of the tracks at which the episode begins, in microseconds. If absent, the time at which the recorded
-    /// trajectory passed the ego's start; 0 if the ego starts at a pose.
+    /// Time of the tracks at which the episode begins, in microseconds. If absent, the time at
+    /// which the recorded trajectory passed the ego's start; 0 if the ego starts at a pose.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub start_us: Option<i64>,
 }
@@ -249,10 +253,14 @@ pub struct EndSection {
     /// Slower than 0.1 m/s for this time, in seconds: 60 in Bench2Drive.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub stuck_s: Option<f64>,
-    /// Whether the end of the route ends the episode: more than 99 % of it, and less than 10 m from its end. If
-    /// absent, true.
+    /// Whether the end of the route ends the episode: more than 99 % of it, and less than 10 m from
+    /// its end. If absent, true.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub route_done: Option<bool>,
+    /// When this holds. A trigger is named `ACTOR/TRIGGER`; parts that are about a trigger's own
+    /// actor are refused.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub when: Option<ConditionSection>,
 }
 
 /// Which contacts end an episode.
@@ -275,11 +283,12 @@ pub enum ContactRule {
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct VerdictSection {
-    /// Distance that a pass requires, as a share of what the recorded drive covers in the same time, 0 to 1. If absent,
-    /// 0.8.
+    /// Distance that a pass requires, as a share of what the recorded drive covers in the same
+    /// time, 0 to 1. If absent, 0.8.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub progress: Option<f64>,
-    /// Whether contact with the twin is looked for. If absent, true. If false, `contact.static` is not judged.
+    /// Whether contact with the twin is looked for. If absent, true. If false, `contact.static` is
+    /// not judged.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub twin_contact: Option<bool>,
 }

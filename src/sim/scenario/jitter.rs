@@ -1,5 +1,6 @@
-//! Random displacements of actors, as NeuroNCAP draws them (atonderski/neuro-ncap@ecdcf28, `scenario.py`): uniform
-//! within plus and minus a bound, along (cos, sin), to the right of it (sin, -cos), and in heading.
+//! Random displacements of actors, as NeuroNCAP draws them (atonderski/neuro-ncap@ecdcf28,
+//! `scenario.py`): uniform within plus and minus a bound, along (cos, sin), to the right of it
+//! (sin, -cos), and in heading.
 
 use glam::{DQuat, DVec3};
 
@@ -9,7 +10,8 @@ use wildcity_scene::random::Random;
 use super::actor_file::{JitterDraw, JitterSection};
 use super::error::{FileError, in_range};
 
-/// The displacement of an actor; nothing without jitter. What a resolved file says was drawn is drawn again.
+/// The displacement of an actor; nothing without jitter. What a resolved file says was drawn is
+/// drawn again.
 pub(super) fn drawn(
     section: Option<&JitterSection>,
     seed: u64,
@@ -42,7 +44,8 @@ pub(super) fn drawn(
     })
 }
 
-/// The displacement in the world of a draw, in metres; `along_rad` is the direction that counts as along.
+/// The displacement in the world of a draw, in metres; `along_rad` is the direction that counts as
+/// along.
 pub(super) fn displacement_m(drawn: &JitterDraw, along_rad: f64) -> DVec3 {
     let (sin, cos) = along_rad.sin_cos();
     drawn.longitudinal_m * DVec3::new(cos, sin, 0.0) + drawn.lateral_m * DVec3::new(sin, -cos, 0.0)

@@ -1,11 +1,12 @@
-//! Scenarios: files that say which actors move in a twin, where the ego drives, and when an episode ends.
+//! Scenarios: files that say which actors move in a twin, where the ego drives, and when an episode
+//! ends.
 //!
 //! | module | what it does |
 //! |---|---|
-//! | `file`, `actor_file`, `script_file`, `tracks` | the formats `wildcity.scenario/1` and `wildcity.tracks/1` |
+//! | `file`, `actor_file`, `script_file`, `line_fields`, `tracks` | the formats `wildcity.scenario/1` and `wildcity.tracks/1` |
 //! | `document` | reads a scenario, and puts in the values of its sweep |
 //! | `resolve`, `around` | checks a scenario against its twin |
-//! | `actors`, `courses`, `collide`, `script`, `jitter`, `pose` | checks its actors, and sets them up |
+//! | `actors`, `courses`, `collide`, `script`, `condition`, `pair_action`, `jitter`, `pose` | checks its actors, and sets them up |
 //! | `end` | the rules that end an episode |
 //! | `error` | mistakes, with their place in the file |
 
@@ -13,12 +14,15 @@ mod actor_file;
 mod actors;
 mod around;
 mod collide;
+mod condition;
 mod courses;
 mod document;
 mod end;
 pub(crate) mod error;
 mod file;
 mod jitter;
+mod line_fields;
+mod pair_action;
 mod pose;
 mod resolve;
 mod script;

@@ -23,7 +23,7 @@ pub struct PoseSection {
 }
 
 /// A pose of a file, checked.
-pub(super) fn pose_of(path: &str, section: &PoseSection) -> Result<Pose, FileError> {
+pub(super) fn pose_from(path: &str, section: &PoseSection) -> Result<Pose, FileError> {
     let refused = |field: &str, message: String| FileError::new(format!("{path}.{field}"), message);
     let q_wxyz = match (section.q, section.yaw_rad) {
         (Some(_), Some(_)) => {

@@ -6,16 +6,17 @@ use wildcity_scene::random::Random;
 use wildcity_scene::route::Route;
 use wildcity_scene::{ActorBox, Trajectory};
 
-use super::actors::actors_of;
+use super::actors::{Actors, actors_from};
 use super::around::{EgoStart, Surroundings, drive_named};
+use super::condition::{References, condition};
 use super::courses::Courses;
 use super::end::EndRules;
 use super::error::{FileError, check_format, hashed, in_range, named};
 use super::file::{
     DynamicsSection, EgoSection, EndSection, FilePin, ModelSection, RouteSection, ScenarioFile,
 };
-use super::pose::pose_of;
-use super::tracks::box_of;
+use super::pose::pose_from;
+use super::tracks::box_from;
 use crate::limits;
 use crate::route::{COMMAND_AHEAD_M, NavigationRoute, RouteCommand};
 use crate::traffic::{EgoBox, Traffic};
@@ -24,9 +25,9 @@ use crate::{Dynamics, EgoModel};
 /// A scenario that is ready to run.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scenario {
-    /// The file with seed, drawn jitter and hashes of assets. Without its `format` it is the episode's identity.
+    /// The file with seed, drawn jitter and hashes of assets. Without its `format` it is the
+    /// episode's identity.
     pub file: ScenarioFile,
-    /// The actors.
     pub traffic: Arc<Traffic>,
     /// Names of the triggers of each actor, in order; empty where a trigger has none.
     pub trigger_names: Vec<Vec<String>>,
@@ -46,7 +47,8 @@ pub struct Scenario {
 const START_FRAME_US: i64 = 500_000;
 
 impl Scenario {
-    /// Checks a scenario and everything that it refers to, draws its jitter, and sets up its traffic.
+    /// Checks a scenario and everything that it refers to, draws its jitter, and sets up its
+    /// traffic.
     ///
     /// # Errors
     /// Names the place of the first mistake in the file.
@@ -65,12 +67,12 @@ impl Scenario {
         {
             section.station_m = Some(*station_m);
         }
-        let dynamics = file.ego.dynamics.as_ref().map(dynamics_of).transpose();
+        let dynamics = file.ego.dynamics.as_ref().map(dynamics_from).transpose();
         let dynamics = dynamics.map_err(|error| error.within("ego"))?;
         let ego_box = match &file.ego.box_ {
             None => EgoBox::default(),
             Some(section) => {
-                let box_ = box_of("ego.box.size", section.size)?;
+                let box_ = box_from("ego.box.size", section.size)?;
                 let most_m = ActorBox::MOST_M;
                 let center_x_m = in_range("ego.box.center_x", section.center_x, [-most_m, most_m])?;
                 EgoBox { box_, center_x_m }
@@ -79,18 +81,21 @@ impl Scenario {
         let mut courses = Courses::new(around);
         let route = match &file.route {
             Some(section) => {
-                Some(route_of(section, &mut courses).map_err(|error| error.within("route"))?)
+                Some(route_from(section, &mut courses).map_err(|error| error.within("route"))?)
             }
             None => default_route(start.as_ref(), &mut courses),
         };
-        let (actors, trigger_names) =
-            actors_of(&mut file, seed, around, start.as_ref(), &mut courses)?;
-        let end = end_of(&file.end, route.is_some()).map_err(|error| error.within("end"))?;
+        let Actors { actors, trigger_names, indices } =
+            actors_from(&mut file, seed, around, start.as_ref(), &mut courses)?;
+        let references = References { indices: &indices, triggers: &trigger_names };
+        let when = file.end.when.as_ref().map(|when| condition(when, None, &references));
+        let when = when.transpose().map_err(|error| error.within("end.when"))?;
+        let end = end_rules(&file.end, route.is_some()).map_err(|error| error.within("end"))?;
         if let Some(progress) = file.verdict.progress {
             in_range("verdict.progress", progress, [0.0, 1.0])?;
         }
         let warm_up_us = file.ego.warm_up_us;
-        let traffic = Arc::new(Traffic { seed, ego_box, actors });
+        let traffic = Arc::new(Traffic { seed, ego_box, actors, end: when });
         let route = route.map(Arc::new);
         Ok(Self { file, traffic, trigger_names, route, end, start, dynamics, warm_up_us })
     }
@@ -146,7 +151,7 @@ fn ego_start(
             if start.station_m.is_some() {
                 return Err(FileError::new("start.station_m", "is for a start along a trajectory"));
             }
-            Ok(Some(EgoStart::Pose(pose_of("start.pose", pose)?)))
+            Ok(Some(EgoStart::Pose(pose_from("start.pose", pose)?)))
         }
         (Some(name), None) => {
             let drive = drive_named("start.trajectory", name, drives)?;
@@ -183,7 +188,7 @@ fn shifted(drive: &Trajectory, station_m: f64, seed: u64, frames: u32) -> Result
     Ok(stations_m[before] + t * (stations_m[after] - stations_m[before]))
 }
 
-fn dynamics_of(section: &DynamicsSection) -> Result<Dynamics, FileError> {
+fn dynamics_from(section: &DynamicsSection) -> Result<Dynamics, FileError> {
     let model = match section.model {
         ModelSection::Teleport => EgoModel::Teleport,
         ModelSection::Kinematic => EgoModel::Kinematic,
@@ -193,7 +198,7 @@ fn dynamics_of(section: &DynamicsSection) -> Result<Dynamics, FileError> {
         .map_err(|error| FileError::new(error.field(), error.to_string()))
 }
 
-fn route_of(
+fn route_from(
     section: &RouteSection,
     courses: &mut Courses<'_>,
 ) -> Result<NavigationRoute, FileError> {
@@ -235,7 +240,7 @@ fn default_route(start: Option<&EgoStart>, courses: &mut Courses<'_>) -> Option<
     Some(NavigationRoute { course: (*course).clone(), commands: Vec::new() })
 }
 
-fn end_of(section: &EndSection, has_route: bool) -> Result<EndRules, FileError> {
+fn end_rules(section: &EndSection, has_route: bool) -> Result<EndRules, FileError> {
     let microseconds = |path: &str, value_s: Option<f64>| -> Result<Option<i64>, FileError> {
         let value_s = value_s.map(|value_s| in_range(path, value_s, [0.001, limits::END_S]));
         Ok(value_s.transpose()?.map(|value_s| (value_s * 1e6).round() as i64))

@@ -1,30 +1,16 @@
 //! Scripts of actors: what each does when a condition holds.
 
-use std::collections::BTreeMap;
-
 use super::actor_file::ActorSection;
+use super::condition::{References, condition};
 use super::courses::Courses;
-use super::error::{FileError, in_range, listed, named};
-use super::script_file::{
-    ActionSection, ConditionSection, EdgeSection, MeasureSection, PhaseSection, ProfileSection,
-    QuantitySection, ShapeSection,
-};
+use super::error::{FileError, in_range, named};
+use super::pair_action::{arrive_together, keep_distance};
+use super::script_file::{ActionSection, ProfileSection, ShapeSection};
 use crate::limits;
-use crate::traffic::{
-    Action, Actor, After, Behaviour, Body, Condition, Edge, Measure, Near, Other, Over, Phase,
-    Quantity, Shape, Trigger,
-};
-
-/// The names that scripts may refer to.
-pub(super) struct References<'a> {
-    /// The index of each actor, by name.
-    pub(super) indices: &'a BTreeMap<String, usize>,
-    /// The names of each actor's triggers.
-    pub(super) triggers: &'a [Vec<String>],
-}
+use crate::traffic::{Action, Actor, Behaviour, Over, Shape, Trigger};
 
 /// Adds the triggers of a section to its actor, whose index is `own`.
-pub(super) fn script_of(
+pub(super) fn add_script(
     section: &ActorSection,
     own: usize,
     actor: &mut Actor,
@@ -45,8 +31,7 @@ pub(super) fn script_of(
                 return Err(FileError::new(format!("{path}.name"), message));
             }
         }
-        let mut count = 0;
-        let when = condition_of(&trigger.when, own, references, (0, &mut count));
+        let when = condition(&trigger.when, Some(own), references);
         let when = when.map_err(|error| error.within(&format!("{path}.when")))?;
         // A trigger without actions is an instant that `after` may name.
         let is_empty = trigger.then.is_empty() && trigger.name.is_none();
@@ -60,7 +45,7 @@ pub(super) fn script_of(
         }
         let mut then = Vec::with_capacity(trigger.then.len());
         for (at, action) in trigger.then.iter().enumerate() {
-            let action = action_of(action, &mut actor.behaviour, courses, (references, own));
+            let action = action_from(action, &mut actor.behaviour, courses, (references, own));
             then.push(action.map_err(|error| error.within(&format!("{path}.do[{at}]")))?);
         }
         actor.script.push(Trigger { when, then });
@@ -68,169 +53,8 @@ pub(super) fn script_of(
     Ok(())
 }
 
-/// A condition at a depth, with the number of conditions so far.
-fn condition_of(
-    section: &ConditionSection,
-    own: usize,
-    references: &References<'_>,
-    (depth, count): (usize, &mut usize),
-) -> Result<Condition, FileError> {
-    *count += 1;
-    if *count > limits::CONDITIONS || depth > limits::CONDITION_DEPTH {
-        let [most, deepest] = [limits::CONDITIONS, limits::CONDITION_DEPTH];
-        let message = format!("at most {most} conditions, {deepest} deep, are accepted");
-        return Err(FileError::new("all", message));
-    }
-    let mut parts = |name: &str, parts: &[ConditionSection]| {
-        let parts = parts.iter().enumerate().map(|(index, part)| {
-            condition_of(part, own, references, (depth + 1, &mut *count))
-                .map_err(|error| error.within(&format!("{name}[{index}]")))
-        });
-        parts.collect::<Result<Vec<Condition>, FileError>>()
-    };
-    let all = parts("all", &section.all)?;
-    let any = parts("any", &section.any)?;
-    let microseconds = |path: &str, value_s: f64| -> Result<i64, FileError> {
-        Ok((in_range(path, value_s, [0.0, limits::END_S])? * 1e6).round() as i64)
-    };
-    let bounded = |path: &str, value: Option<f64>| {
-        value.map(|value| in_range(path, value, [0.0, 1e6])).transpose()
-    };
-    let near = match (section.within_m, &section.of) {
-        (None, None) => None,
-        (None, Some(_)) => {
-            return Err(FileError::new("of", "needs within_m: write the distance"));
-        }
-        (Some(within_m), of) => {
-            let actor = of.as_ref().map(|name| {
-                references.indices.get(name).copied().ok_or_else(|| {
-                    let known = listed(references.indices.keys().map(String::as_str));
-                    let must = format!(
-                        "there is no actor {name:?}; there is {known}; without `of`, the distance is to the ego"
-                    );
-                    FileError::new("of", must)
-                })
-            });
-            let within_m = in_range("within_m", within_m, [0.0, 1e6])?;
-            Some(Near { actor: actor.transpose()?, within_m })
-        }
-    };
-    let after = match (&section.after, section.delay_s) {
-        (None, Some(_)) => {
-            return Err(FileError::new("delay_s", "needs after: write the trigger's name"));
-        }
-        (None, None) if section.phase.is_some() => {
-            return Err(FileError::new("phase", "needs after: write the trigger's name"));
-        }
-        (None, None) => None,
-        (Some(name), delay_s) => Some(After {
-            delay_us: microseconds("delay_s", delay_s.unwrap_or(0.0))?,
-            phase: match section.phase {
-                None | Some(PhaseSection::Fired) => Phase::Fired,
-                Some(PhaseSection::Done) => Phase::Done,
-                Some(PhaseSection::Ended) => Phase::Ended,
-            },
-            ..trigger_named(name, own, references)?
-        }),
-    };
-    let later_s = in_range("later_s", section.later_s.unwrap_or(0.0), [0.0, limits::LATER_S])?;
-    let held_us = microseconds("held_s", section.held_s.unwrap_or(0.0))?;
-    let measure = section.measure.as_ref().map(|measure| measure_of(measure, references));
-    let measure = measure.transpose().map_err(|error| error.within("measure"))?;
-    Ok(Condition {
-        time_us: section.time_s.map(|time_s| microseconds("time_s", time_s)).transpose()?,
-        near,
-        station_m: bounded("station_m", section.station_m)?,
-        ego_station_m: bounded("ego_station_m", section.ego_station_m)?,
-        speed_above_mps: bounded("speed_above", section.speed_above)?,
-        speed_below_mps: bounded("speed_below", section.speed_below)?,
-        ego_speed_above_mps: bounded("ego_speed_above", section.ego_speed_above)?,
-        after,
-        measure,
-        all,
-        any,
-        edge: section.edge.map(|edge| match edge {
-            EdgeSection::Rising => Edge::Rising,
-            EdgeSection::Falling => Edge::Falling,
-            EdgeSection::Both => Edge::Both,
-        }),
-        held_us,
-        later_us: (later_s * 1e6).round() as i64,
-    })
-}
-
-fn measure_of(section: &MeasureSection, references: &References<'_>) -> Result<Measure, FileError> {
-    let body = |field: &str, name: &Option<String>, ahead_m: Option<f64>| {
-        let ahead = if field == "of" { "ahead_m" } else { "to_ahead_m" };
-        let actor = match name {
-            None => None,
-            Some(name) => Some(references.indices.get(name).copied().ok_or_else(|| {
-                let known = listed(references.indices.keys().map(String::as_str));
-                let message =
-                    format!("there is no actor {name:?}; there is {known}; the ego has no name");
-                FileError::new(field, message)
-            })?),
-        };
-        let ahead_m = in_range(ahead, ahead_m.unwrap_or(0.0), [-100.0, 100.0])?;
-        Ok::<Body, FileError>(Body { actor, ahead_m })
-    };
-    let of = body("of", &section.of, section.ahead_m)?;
-    let other = Other {
-        to: body("to", &section.to, section.to_ahead_m)?,
-        is_free: section.free.unwrap_or(false),
-        is_on_course: section.on_course.unwrap_or(false),
-        is_straight: section.straight.unwrap_or(false),
-    };
-    let quantity = match section.quantity {
-        QuantitySection::Speed => Quantity::Speed,
-        QuantitySection::Travelled => Quantity::Travelled,
-        QuantitySection::Point => {
-            let xyz = section.xyz.ok_or_else(|| FileError::new("xyz", "is missing"))?;
-            for axis in xyz {
-                in_range("xyz", axis, [-1e7, 1e7])?;
-            }
-            Quantity::Point(glam::DVec3::from_array(xyz))
-        }
-        QuantitySection::Distance => Quantity::Distance(other),
-        QuantitySection::Longitudinal => Quantity::Longitudinal(other),
-        QuantitySection::Lateral => Quantity::Lateral(other),
-        QuantitySection::Headway => Quantity::Headway(other),
-        QuantitySection::TimeToCollision => Quantity::TimeToCollision(other),
-    };
-    check_measure(section)?;
-    Ok(Measure { quantity, of, above: section.above, below: section.below })
-}
-
-/// Checks that a measure has bounds, and no field that its quantity ignores.
-fn check_measure(section: &MeasureSection) -> Result<(), FileError> {
-    for (field, bound) in [("above", section.above), ("below", section.below)] {
-        bound.map(|bound| in_range(field, bound, [0.0, 1e6])).transpose()?;
-    }
-    if section.above.is_none() && section.below.is_none() {
-        return Err(FileError::new("above", "is missing, as is below; write one of them"));
-    }
-    use QuantitySection::{Distance, Headway, Lateral, Longitudinal, Point, TimeToCollision};
-    let quantity = section.quantity;
-    let is_relative =
-        matches!(quantity, Distance | Longitudinal | Lateral | Headway | TimeToCollision);
-    let is_along = matches!(quantity, Longitudinal | Lateral | Headway | TimeToCollision);
-    let is_by_speed = matches!(quantity, Headway | TimeToCollision);
-    let ignored = [
-        ("xyz", section.xyz.is_some() && quantity != Point),
-        ("to", section.to.is_some() && !is_relative),
-        ("to_ahead_m", section.to_ahead_m.is_some() && !is_relative),
-        ("free", section.free.is_some() && !is_relative),
-        ("straight", section.straight.is_some() && !is_by_speed),
-        ("on_course", section.on_course.is_some() && !is_along),
-    ];
-    match ignored.iter().find(|(_, is_ignored)| *is_ignored) {
-        None => Ok(()),
-        Some((field, _)) => Err(FileError::new(*field, "is not for this quantity; remove it")),
-    }
-}
-
 /// The aim, the extent and the shape of a change.
-fn profile_of(section: &ProfileSection) -> Result<(Over, Shape), FileError> {
+fn profile(section: &ProfileSection) -> Result<(Over, Shape), FileError> {
     let shape = match section.shape {
         ShapeSection::Step => Shape::Step,
         ShapeSection::Linear => Shape::Linear,
@@ -257,22 +81,8 @@ fn profile_of(section: &ProfileSection) -> Result<(Over, Shape), FileError> {
     }
 }
 
-/// A trigger by `TRIGGER` or `ACTOR/TRIGGER`.
-fn trigger_named(text: &str, own: usize, references: &References<'_>) -> Result<After, FileError> {
-    let missing = || {
-        let message = format!("there is no trigger {text:?}; write TRIGGER or ACTOR/TRIGGER");
-        FileError::new("after", message)
-    };
-    let (actor, name) = match text.split_once('/') {
-        None => (own, text),
-        Some((actor, name)) => (*references.indices.get(actor).ok_or_else(missing)?, name),
-    };
-    let triggers = &references.triggers[actor];
-    let trigger = triggers.iter().position(|other| !name.is_empty() && other == name);
-    Ok(After { actor, trigger: trigger.ok_or_else(missing)?, phase: Phase::Fired, delay_us: 0 })
-}
-
-fn action_of(
+/// The action of a section.
+fn action_from(
     section: &ActionSection,
     behaviour: &mut Behaviour,
     courses: &mut Courses<'_>,
@@ -296,7 +106,7 @@ fn action_of(
         },
         ActionSection::SpeedProfile(section) => {
             let within = |error: FileError| error.within("speed_profile");
-            let (over, shape) = profile_of(section).map_err(within)?;
+            let (over, shape) = profile(section).map_err(within)?;
             if section.acceleration.is_some() {
                 return Err(FileError::new(
                     "speed_profile.acceleration",
@@ -307,12 +117,7 @@ fn action_of(
             Action::SpeedProfile { to_mps, over, shape }
         }
         ActionSection::SpeedMatch { of, factor, delta } => {
-            let index = |name: &String| {
-                references.indices.get(name).copied().ok_or_else(|| {
-                    let message = format!("there is no actor {name:?}; the ego has no name");
-                    FileError::new("speed_match.of", message)
-                })
-            };
+            let index = |name: &String| references.actor("speed_match.of", name);
             let most_mps = limits::ACTOR_SPEED_M_S;
             Action::SpeedMatch {
                 of: of.as_ref().map(index).transpose()?,
@@ -324,9 +129,23 @@ fn action_of(
                 )?,
             }
         }
+        ActionSection::KeepDistance(section) => {
+            let keep = keep_distance(section, (references, own));
+            let keep = keep.map_err(|error| error.within("keep_distance"))?;
+            let is_idm = matches!(behaviour, Behaviour::Follow(follow) if follow.idm.is_some());
+            if is_idm && keep.bounds.is_none() {
+                let message = "is missing, as is braking: an idm actor is not put anywhere at once";
+                return Err(FileError::new("keep_distance.acceleration", message));
+            }
+            Action::KeepDistance(keep)
+        }
+        ActionSection::ArriveTogether(section) => {
+            let arrive = arrive_together(section, (references, own));
+            Action::ArriveTogether(arrive.map_err(|error| error.within("arrive_together"))?)
+        }
         ActionSection::OffsetProfile(section) => {
             let within = |error: FileError| error.within("offset_profile");
-            let (over, shape) = profile_of(section).map_err(within)?;
+            let (over, shape) = profile(section).map_err(within)?;
             let to_m = in_range("offset_profile.to", section.to, [-100.0, 100.0])?;
             Action::OffsetProfile { to_m, over, shape }
         }

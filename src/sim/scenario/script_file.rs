@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::line_fields::section_on_line;
+
 /// A condition and what follows, once.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
@@ -67,8 +69,8 @@ pub struct ConditionSection {
     /// The parts must have held for this time without a break, in seconds. If absent, 0.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub held_s: Option<f64>,
-    /// Holds only at the instant at which the parts begin to hold (`rising`), cease to hold (`falling`), or either
-    /// (`both`). The first evaluation is no such instant.
+    /// Holds only at the instant at which the parts begin to hold (`rising`), cease to hold
+    /// (`falling`), or either (`both`). The first evaluation is no such instant.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub edge: Option<EdgeSection>,
     /// Holds this much later than its parts and its edge, in seconds. If absent, 0.
@@ -127,11 +129,12 @@ pub struct MeasureSection {
     /// Whether a distance is between boxes. If absent, it is between reference points.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub free: Option<bool>,
-    /// Whether `longitudinal`, `lateral` and `headway` are along the course of the trigger's actor. If absent, they are
-    /// along the heading of the measured body.
+    /// Whether `longitudinal`, `lateral` and `headway` are along the course of the trigger's actor.
+    /// If absent, they are along the heading of the measured body.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub on_course: Option<bool>,
-    /// Whether `headway` and `time_to_collision` are by the straight distance. If absent, they are by the distance along.
+    /// Whether `headway` and `time_to_collision` are by the straight distance. If absent, they are
+    /// by the distance along.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub straight: Option<bool>,
     /// At least this.
@@ -180,8 +183,8 @@ pub enum ShapeSection {
     Cubic,
 }
 
-/// A change to a value by a shape: with exactly one of `over_s`, `over_m`, `rate` and `acceleration`, and with none of
-/// them for `step`.
+/// A change to a value by a shape: with exactly one of `over_s`, `over_m`, `rate` and
+/// `acceleration`, and with none of them for `step`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
@@ -242,6 +245,10 @@ pub enum ActionSection {
         #[serde(default, skip_serializing_if = "Option::is_none")]
         delta: Option<f64>,
     },
+    /// Keeps a distance from another.
+    KeepDistance(KeepDistanceSection),
+    /// Drives so that it is at a place when another is at its own.
+    ArriveTogether(ArriveTogetherSection),
     /// Moves to another offset from the course by a shape.
     OffsetProfile(ProfileSection),
     /// Continues on another course, from its nearest place.
@@ -257,28 +264,115 @@ pub enum ActionSection {
     Remove {},
 }
 
-/// A line to follow: exactly one of `along`, `points` and `lanes`.
+/// A distance from another, along the own course or the own heading: exactly one of `gap_m` and
+/// `headway_s`. With the largest `acceleration` and `braking`, the actor makes up what is missing;
+/// without both, it is put there at once and takes over the other's speed.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct CourseSection {
-    /// A recorded trajectory of the twin.
+pub struct KeepDistanceSection {
+    /// The other actor. If absent, the ego.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub along: Option<String>,
-    /// Points in the world, in metres, in order. They are placed on the ground where there is one.
+    pub of: Option<String>,
+    /// The distance, in metres.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub points: Option<Vec<[f64; 3]>>,
-    /// Lanes of the map, in order.
+    pub gap_m: Option<f64>,
+    /// The distance as the time in which whichever drives behind covers it, in seconds.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub lanes: Option<Vec<String>>,
-    /// Whether to follow it from its end to its start. If absent, false.
+    pub headway_s: Option<f64>,
+    /// Whether the actor drives behind or ahead of the other. If absent, where it is.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub reverse: Option<bool>,
-    /// Place on the line at which the action is done, in metres: for a condition with the `phase` `done`. If absent, it
-    /// is done at once.
+    pub side: Option<SideSection>,
+    /// Whether the distance is between boxes. If absent, it is between reference points.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub done_m: Option<f64>,
-    /// Place on the line to which the actor is put, in metres. If absent, it continues from the nearest place.
+    pub free: Option<bool>,
+    /// Whether the distance is along the actor's course. If absent, it is along its heading.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub at_m: Option<f64>,
+    pub on_course: Option<bool>,
+    /// From the middle of its box forward to its reference point, in metres. If absent, 0.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ahead_m: Option<f64>,
+    /// From the middle of the other's box forward to its reference point, in metres. If absent, 0.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub to_ahead_m: Option<f64>,
+    /// Whether the action is done once the distance is reached. If absent, it is kept until another
+    /// action changes the speed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub once: Option<bool>,
+    /// Largest acceleration, in m/s².
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub acceleration: Option<f64>,
+    /// Largest braking, in m/s².
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub braking: Option<f64>,
+    /// Largest speed, in m/s. If absent, that of all actors.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub fastest: Option<f64>,
+}
+
+/// A side of another.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(rename_all = "snake_case")]
+pub enum SideSection {
+    /// Behind it.
+    Behind,
+    /// Ahead of it.
+    Ahead,
+}
+
+/// An arrival at a place when another is at its own: `speed`, or `factor` and `delta`, is the speed
+/// of the arrival. Without them, the actor changes its speed at a constant rate.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct ArriveTogetherSection {
+    /// The actor's place, in metres in the world: the nearest on its course counts.
+    pub at: [f64; 3],
+    /// The other actor. If absent, the ego.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub of: Option<String>,
+    /// The other's place, in metres in the world.
+    pub of_at: [f64; 3],
+    /// From the middle of its box forward to its reference point, in metres. If absent, 0.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ahead_m: Option<f64>,
+    /// From the middle of the other's box forward to its reference point, in metres. If absent, 0.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub to_ahead_m: Option<f64>,
+    /// Speed of the arrival, in m/s.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub speed: Option<f64>,
+    /// Speed of the arrival as a share of the other's. If absent, 1.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub factor: Option<f64>,
+    /// Added to it, in m/s. If absent, 0.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub delta: Option<f64>,
+    /// So far before its place it has that speed, in metres. If absent, 0.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub steady_m: Option<f64>,
+    /// It is there within this distance, in metres. If absent, 0.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub within_m: Option<f64>,
+    /// The other is there within this distance, in metres. If absent, 0: when it passes its place.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub of_within_m: Option<f64>,
+}
+
+section_on_line! {
+    /// A line to follow: exactly one of `along`, `points` and `lanes`.
+    #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+    #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+    #[serde(deny_unknown_fields, default)]
+    pub struct CourseSection {
+        /// Place on the line at which the action is done, in metres: for a condition with the
+        /// `phase` `done`. If absent, it is done at once.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        pub done_m: Option<f64>,
+        /// Place on the line to which the actor is put, in metres. If absent, it continues from the
+        /// nearest place.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        pub at_m: Option<f64>,
+    }
 }

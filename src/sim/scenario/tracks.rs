@@ -9,7 +9,7 @@ use wildcity_scene::{ActorBox, ActorClass};
 use super::actor_file::NOT_DRAWN;
 use super::error::{FileError, check_format, hashed, json, named, typed};
 use super::pose::PoseSection;
-use super::pose::pose_of;
+use super::pose::pose_from;
 use crate::limits;
 use crate::traffic::{Track, TrackKeyframe};
 
@@ -92,7 +92,7 @@ impl TracksFile {
             if let Some(asset) = track.asset.as_deref().filter(|asset| *asset != NOT_DRAWN) {
                 hashed("asset", asset).map_err(within)?;
             }
-            box_of("size", track.size).map_err(within)?;
+            box_from("size", track.size).map_err(within)?;
             track.shifted(0).map_err(within)?;
         }
         Ok(())
@@ -112,7 +112,7 @@ impl TrackSection {
                 let message = format!("{}; too far from the episode's start", keyframe.time_us);
                 return Err(FileError::new(format!("{path}.time_us"), message));
             };
-            let pose = pose_of(&format!("{path}.pose"), &keyframe.pose)?;
+            let pose = pose_from(&format!("{path}.pose"), &keyframe.pose)?;
             keyframes.push(TrackKeyframe { time_us, world_from_actor: pose });
         }
         Track::new(keyframes).map_err(|error| FileError::new("keyframes", error.to_string()))
@@ -120,7 +120,7 @@ impl TrackSection {
 }
 
 /// A box of length, width and height.
-pub(super) fn box_of(
+pub(super) fn box_from(
     path: &str,
     [length_m, width_m, height_m]: [f64; 3],
 ) -> Result<ActorBox, FileError> {

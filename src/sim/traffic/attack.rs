@@ -1,10 +1,11 @@
-//! An attacker that plans its way towards the ego, after HUGSIM (hyzhou404/HUGSIM@62c690d, `agent_controller.py`).
+//! An attacker that plans its way towards the ego, after HUGSIM (hyzhou404/HUGSIM@62c690d,
+//! `agent_controller.py`).
 //!
-//! Every few ticks of 0.25 s the attacker considers 150 cubic splines of 2 s: five offsets to the side, ten
-//! accelerations, and three headings at the end. Those that no vehicle could drive are dropped. The cost of one is
-//! the least distance to the predicted ego, plus 0.1 for each neighbour that comes nearer than 2 m. One of the best
-//! is sampled. HUGSIM predicts the ego at 0.25 s a point and the attacker at 0.1 s a point; here both are predicted at
-//! the same times.
+//! Every few ticks of 0.25 s the attacker considers 150 cubic splines of 2 s: five offsets to the
+//! side, ten accelerations, and three headings at the end. Those that no vehicle could drive are
+//! dropped. The cost of one is the least distance to the predicted ego, plus 0.1 for each neighbour
+//! that comes nearer than 2 m. One of the best is sampled. HUGSIM predicts the ego at 0.25 s a
+//! point and the attacker at 0.1 s a point; here both are predicted at the same times.
 
 use glam::DVec2;
 
@@ -33,13 +34,15 @@ const NEIGHBOUR_COST_M: f64 = 0.1;
 /// Settings of an attacker.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Attack {
-    /// Time between two plans, in microseconds: 3 ticks of 0.25 s in HUGSIM's fast mode, 10 in its slow mode.
+    /// Time between two plans, in microseconds: 3 ticks of 0.25 s in HUGSIM's fast mode, 10 in its
+    /// slow mode.
     pub plan_us: i64,
     /// Number of best plans from which one is sampled: 1, 2 and 10 in HUGSIM's modes.
     pub best: usize,
 }
 
-/// A cubic spline in the plane, in the axes of the attacker at the start of the plan: x ahead, y to the left.
+/// A cubic spline in the plane, in the axes of the attacker at the start of the plan: x ahead, y to
+/// the left.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Spline {
     /// Speed at the start, in m/s.
@@ -88,16 +91,18 @@ impl Spline {
         std::array::from_fn(|at| self.position_m((at + 1) as f64 * POINT_S))
     }
 
-    /// Whether a vehicle could drive it: speeds along its heading, accelerations and yaw rates between points.
+    /// Whether a vehicle could drive it: speeds along its heading, accelerations and yaw rates
+    /// between points.
     fn is_drivable(&self) -> bool {
         let velocities: [DVec2; PLAN_POINTS + 1] =
             std::array::from_fn(|at| self.velocity_mps(at as f64 * POINT_S));
         velocities.windows(2).all(|pair| {
             let [before, after] = [pair[0], pair[1]];
             // Below 0.1 m/s the direction of the velocity is no heading.
-            let turn_rad = match before.length().min(after.length()) < 0.1 {
-                true => 0.0,
-                false => before.angle_to(after),
+            let turn_rad = if before.length().min(after.length()) < 0.1 {
+                0.0
+            } else {
+                before.angle_to(after)
             };
             // Along x, since a plan begins along x and turns by less than a right angle.
             let speed_mps = after.length().copysign(after.x);
@@ -142,12 +147,13 @@ pub fn cost_m(plan: &[DVec2], attacked: &[DVec2], neighbours: &[Vec<DVec2>]) -> 
     least_m(attacked) + NEIGHBOUR_COST_M * near as f64
 }
 
-/// The points at which a body is predicted to be, at constant speed and yaw rate, in the same order and axes as
-/// those of a plan.
+/// The points at which a body is predicted to be, at constant speed and yaw rate, in the same order
+/// and axes as those of a plan.
 pub fn predicted(at_m: DVec2, velocity_mps: DVec2, yaw_rate_radps: f64) -> [DVec2; PLAN_POINTS] {
     let mut point_m = at_m;
     let mut velocity_mps = velocity_mps;
-    // Half a turn before each straight piece and half after: exact in direction, second order in place.
+    // Half a turn before each straight piece and half after: exact in direction, second order in
+    // place.
     let half_turn = DVec2::from_angle(0.5 * yaw_rate_radps * POINT_S);
     std::array::from_fn(|_| {
         velocity_mps = half_turn.rotate(velocity_mps);

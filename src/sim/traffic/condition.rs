@@ -18,13 +18,15 @@ pub(super) struct ConditionState {
     last: Option<bool>,
     /// Since when the parts have held, in microseconds.
     since_us: Option<i64>,
-    /// The values at the instants at which they changed, oldest first: as far back as the condition's delay.
+    /// The values at the instants at which they changed, oldest first: as far back as the
+    /// condition's delay.
     changes: VecDeque<(i64, bool)>,
     parts: Vec<ConditionState>,
 }
 
 impl ConditionState {
-    /// The value of a condition at a time, with a function that evaluates its own parts without `all` and `any`.
+    /// The value of a condition at a time, with a function that evaluates its own parts without
+    /// `all` and `any`.
     ///
     /// Every part is evaluated, because a part with an edge or a delay remembers its values.
     pub(super) fn value(
@@ -106,9 +108,10 @@ impl Measures<'_> {
             Quantity::Lateral(other) => self.along_m(body, of, other, false),
             Quantity::TimeToCollision(other) => self.time_to_collision_s(body, of, other),
             Quantity::Headway(other) => {
-                let way_m = match other.is_straight {
-                    true => self.distance_m(body, of, other)?,
-                    false => self.along_m(body, of, other, true)?,
+                let way_m = if other.is_straight {
+                    self.distance_m(body, of, other)?
+                } else {
+                    self.along_m(body, of, other, true)?
                 };
                 Some(way_m / body.velocity_mps.length().max(HEADWAY_MPS))
             }
@@ -116,25 +119,19 @@ impl Measures<'_> {
     }
 
     fn body(&self, body: &Body) -> Option<&LeadCandidate> {
-        match body.actor {
-            None => self.bodies.first(),
-            Some(actor) => {
-                self.bodies.iter().find(|other| other.actor.map(usize::from) == Some(actor))
-            }
-        }
+        LeadCandidate::find(self.bodies, body.actor)
     }
 
     /// The distance by the rate at which it becomes less, in seconds.
     fn time_to_collision_s(&self, body: &LeadCandidate, of: &Body, other: Other) -> Option<f64> {
         let to = self.body(&other.to)?;
         let way_m = to.center_m - body.center_m;
-        let (distance_m, direction) = match other.is_straight {
-            true => (self.distance_m(body, of, other)?, way_m.normalize_or_zero()),
-            false => {
-                let forward = body.forward();
-                let sign = if way_m.dot(forward) < 0.0 { -1.0 } else { 1.0 };
-                (self.along_m(body, of, other, true)?, sign * forward)
-            }
+        let (distance_m, direction) = if other.is_straight {
+            (self.distance_m(body, of, other)?, way_m.normalize_or_zero())
+        } else {
+            let forward = body.forward();
+            let sign = if way_m.dot(forward) < 0.0 { -1.0 } else { 1.0 };
+            (self.along_m(body, of, other, true)?, sign * forward)
         };
         let closing_mps = (body.velocity_mps - to.velocity_mps).dot(direction);
         Some(if closing_mps > 0.0 { distance_m / closing_mps } else { f64::INFINITY })
@@ -143,9 +140,10 @@ impl Measures<'_> {
     /// The straight distance, in metres.
     fn distance_m(&self, body: &LeadCandidate, of: &Body, other: Other) -> Option<f64> {
         let to = self.body(&other.to)?;
-        Some(match other.is_free {
-            true => body.gap_m(to),
-            false => reference_m(body, of).distance(reference_m(to, &other.to)),
+        Some(if other.is_free {
+            body.gap_m(to)
+        } else {
+            reference_m(body, of).distance(reference_m(to, &other.to))
         })
     }
 
@@ -163,10 +161,8 @@ impl Measures<'_> {
             Some(course) => {
                 let [from, to] = [course.nearest(from_m), course.nearest(to_m)];
                 let forward = course.at(from.station_m).rotation * DVec3::X;
-                let way_m = match is_along {
-                    true => to.station_m - from.station_m,
-                    false => to.left_m - from.left_m,
-                };
+                let way_m =
+                    if is_along { to.station_m - from.station_m } else { to.left_m - from.left_m };
                 (forward, way_m)
             }
             None => {

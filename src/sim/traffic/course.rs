@@ -7,8 +7,8 @@ use wildcity_scene::geometry::Pose;
 
 use crate::Ground;
 
-/// Points of a course that are nearer than this to the previous point are left out, in metres: a recording has
-/// thousands of keyframes at one place while the vehicle stood.
+/// Points of a course that are nearer than this to the previous point are left out, in metres: a
+/// recording has thousands of keyframes at one place while the vehicle stood.
 const SPACING_M: f64 = 0.01;
 
 /// A line of poses: x along the line, z up from the ground. Beyond both ends it continues straight.
@@ -52,8 +52,8 @@ impl Course {
         Self::from_poses(drive.keyframes.iter().map(|keyframe| keyframe.world_from_rig))
     }
 
-    /// The course through points in order, placed on the ground. A pose faces halfway between the directions to
-    /// its neighbours. `None` without two places that differ horizontally.
+    /// The course through points in order, placed on the ground. A pose faces halfway between the
+    /// directions to its neighbours. `None` without two places that differ horizontally.
     pub fn from_points(points_m: &[DVec3], ground: &Ground<'_>) -> Option<Self> {
         let mut kept: Vec<DVec3> = Vec::new();
         for point_m in points_m {
@@ -158,11 +158,11 @@ impl Course {
         best
     }
 
-    /// The first station from `from_m` to `to_m` at which the course is within `radius_m` of a point, in the
-    /// horizontal plane, to within 0.5 m.
+    /// The first station from `from_m` to `to_m` at which the course is within `radius_m` of a
+    /// point, in the horizontal plane, to within 0.5 m.
     ///
-    /// The distance changes by at most the way along the course, so the search advances by the distance that is
-    /// missing: a few steps instead of a test of each segment.
+    /// The distance changes by at most the way along the course, so the search advances by the
+    /// distance that is missing: a few steps instead of a test of each segment.
     pub fn first_within(
         &self,
         point_m: DVec3,

@@ -7,11 +7,13 @@ use glam::{DQuat, DVec3};
 use wildcity_scene::ActorBox;
 use wildcity_scene::geometry::Pose;
 
-use super::course::{Course, turned_rad};
+use super::course::{Course, flat, turned_rad};
+use super::distance::Place;
 use super::idm::{Idm, rolled};
 use super::lateral::Lateral;
 use super::lead::{Corridor, Lead, LeadCandidate, lead_ahead};
-use super::script::{Action, Over, Shape};
+use super::script::Action;
+use super::speed::{SpeedCommand, SpeedMatch, SpeedProfile};
 use super::state::ActorState;
 use crate::limits;
 
@@ -49,7 +51,8 @@ pub(super) struct CourseFollowerState {
     course_done_m: f64,
 }
 
-/// The triggers whose changes of speed, offset and course are under way, by their indices in the script.
+/// The triggers whose changes of speed, offset and course are under way, by their indices in the
+/// script.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Owners {
     pub(super) speed: Option<usize>,
@@ -68,76 +71,6 @@ impl Owners {
         let pairs =
             [(self.speed, after.speed), (self.offset, after.offset), (self.course, after.course)];
         pairs.iter().any(|(before, after)| *before == Some(trigger) && before != after)
-    }
-}
-
-/// A change of speed that a script commands.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct SpeedCommand {
-    to_mps: f64,
-    rate_mps2: f64,
-    profile: Option<SpeedProfile>,
-    matched: Option<SpeedMatch>,
-}
-
-/// The speed of another body that an actor drives with.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct SpeedMatch {
-    of: Option<usize>,
-    factor: f64,
-    delta_mps: f64,
-}
-
-impl SpeedMatch {
-    /// The speed now, in m/s; `None` if the other is absent.
-    fn speed_mps(&self, bodies: &[LeadCandidate]) -> Option<f64> {
-        let body = bodies.iter().find(|body| body.actor.map(usize::from) == self.of)?;
-        let speed_mps = self.factor * body.velocity_mps.length() + self.delta_mps;
-        Some(speed_mps.clamp(0.0, limits::ACTOR_SPEED_M_S))
-    }
-}
-
-/// A change of speed by a shape.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct SpeedProfile {
-    from_mps: f64,
-    shape: Shape,
-    over_s: f64,
-    elapsed_s: f64,
-}
-
-impl SpeedCommand {
-    /// The acceleration for the next sub-step, in m/s².
-    fn acceleration(&self, speed_mps: f64, duration_s: f64, bodies: &[LeadCandidate]) -> f64 {
-        if let Some(matched) = self.matched {
-            return (matched.speed_mps(bodies).unwrap_or(speed_mps) - speed_mps) / duration_s;
-        }
-        let Some(profile) = self.profile else {
-            let needed = (self.to_mps - speed_mps) / duration_s;
-            return needed.clamp(-self.rate_mps2, self.rate_mps2);
-        };
-        let share = match profile.over_s > 0.0 {
-            true => profile.shape.at((profile.elapsed_s + duration_s) / profile.over_s),
-            false => 1.0,
-        };
-        let next_mps = profile.from_mps + share * (self.to_mps - profile.from_mps);
-        // Exact at the end, so that the change is known to be complete.
-        (next_mps - speed_mps) / duration_s
-    }
-
-    fn after(mut self, duration_s: f64) -> Self {
-        if let Some(profile) = &mut self.profile {
-            profile.elapsed_s += duration_s;
-        }
-        self
-    }
-
-    fn is_over(&self, speed_mps: f64) -> bool {
-        match self.profile {
-            _ if self.matched.is_some() => false,
-            Some(profile) => profile.elapsed_s >= profile.over_s,
-            None => speed_mps == self.to_mps,
-        }
     }
 }
 
@@ -169,28 +102,20 @@ impl CourseFollower {
         trigger: usize,
     ) -> CourseFollowerState {
         let mut next = *now;
-        let profile = |over: Over, shape: Shape, to_mps: f64| SpeedProfile {
-            from_mps: now.speed_mps,
-            shape,
-            over_s: seconds(over, shape, [now.speed_mps, to_mps]),
-            elapsed_s: 0.0,
-        };
         match action {
             Action::Speed { to_mps, rate_mps2 } => {
-                let command = SpeedCommand { to_mps, rate_mps2, profile: None, matched: None };
-                next.command(command, trigger);
+                next.command(SpeedCommand::To { to_mps, rate_mps2 }, trigger);
             }
             Action::SpeedProfile { to_mps, over, shape } => {
-                let profile = Some(profile(over, shape, to_mps));
-                let command = SpeedCommand { to_mps, rate_mps2: 0.0, profile, matched: None };
-                next.command(command, trigger);
+                let profile = SpeedProfile::new(now.speed_mps, to_mps, over, shape);
+                next.command(SpeedCommand::Profile(profile), trigger);
             }
             Action::SpeedMatch { of, factor, delta_mps } => {
-                let matched = Some(SpeedMatch { of, factor, delta_mps });
-                let to_mps = now.speed_mps;
-                let command = SpeedCommand { to_mps, rate_mps2: 0.0, profile: None, matched };
-                next.command(command, trigger);
+                let matched = SpeedMatch { of, factor, delta_mps };
+                next.command(SpeedCommand::Match(matched), trigger);
             }
+            Action::KeepDistance(keep) => next.command(SpeedCommand::Keep(keep), trigger),
+            Action::ArriveTogether(arrive) => next.command(SpeedCommand::Arrive(arrive), trigger),
             Action::Offset { to_m, over_s } => {
                 next.lateral = now.lateral.moving_to(to_m, over_s, now.speed_mps);
                 next.by.offset = Some(trigger);
@@ -225,8 +150,18 @@ impl CourseFollower {
         duration_s: f64,
     ) -> Option<CourseFollowerState> {
         let course = self.course(now);
+        let mut now = *now;
+        let mut place = self.place(&now, box_);
+        if let Some(SpeedCommand::Keep(keep)) = &now.speed_command
+            && let Some(missing) = keep.jump(&place, bodies)
+        {
+            now.station_m = (now.station_m + missing.way_m).clamp(0.0, course.length_m());
+            now.speed_mps = missing.speed_mps.clamp(0.0, limits::ACTOR_SPEED_M_S);
+            place = self.place(&now, box_);
+        }
+        let now = &now;
         let lead = self.idm.and_then(|idm| self.lead(now, &idm, box_, own, bodies));
-        let acceleration = self.acceleration(now, lead, bodies, duration_s);
+        let acceleration = self.acceleration(now, &place, lead, bodies, duration_s);
         let [way_m, speed_mps] = rolled(now.speed_mps, acceleration, duration_s);
 
         // A line that lies d to the left of one with curvature k is (1 - k d) as long.
@@ -234,9 +169,10 @@ impl CourseFollower {
         let station_m = now.station_m + way_m / stretch.max(0.1);
         let lateral = now.lateral.after(duration_s, 0.5 * (now.speed_mps + speed_mps));
         let speed_command = now.speed_command.map(|command| command.after(duration_s));
-        let is_over = speed_command.is_none_or(|command| command.is_over(speed_mps));
+        let is_over =
+            speed_command.is_none_or(|command| command.is_over(&place, speed_mps, bodies));
         // A command to stop holds the actor until the next one.
-        let is_kept = |command: &SpeedCommand| command.to_mps == 0.0 || !is_over;
+        let is_kept = |command: &SpeedCommand| command.aim_mps() == Some(0.0) || !is_over;
         let speed_command = speed_command.filter(is_kept);
         let by = Owners {
             speed: now.by.speed.filter(|_| !is_over),
@@ -258,24 +194,25 @@ impl CourseFollower {
     fn acceleration(
         &self,
         now: &CourseFollowerState,
+        place: &Place<'_>,
         lead: Option<Lead>,
         bodies: &[LeadCandidate],
         duration_s: f64,
     ) -> f64 {
-        let commanded = now
-            .speed_command
-            .map(|command| command.acceleration(now.speed_mps, duration_s, bodies));
+        let commanded =
+            now.speed_command.map(|command| command.acceleration_mps2(place, duration_s, bodies));
         let Some(idm) = self.idm else { return commanded.unwrap_or(0.0) };
         let lead = lead.unwrap_or(Lead { gap_m: f64::INFINITY, speed_mps: now.speed_mps });
-        // During a commanded change to a lower speed, the free-road term would brake at its own rate.
+        // During a commanded change to a lower speed, the free-road term would brake at its own
+        // rate.
         let free_speed_mps = now.free_flow_speed_mps.max(commanded.map_or(0.0, |_| now.speed_mps));
         let model = Idm { free_speed_mps, ..idm };
         let followed = model.acceleration(now.speed_mps, lead.speed_mps, lead.gap_m);
         commanded.map_or(followed, |commanded| commanded.min(followed))
     }
 
-    /// Returns what the actor follows: the nearest box in its corridor, or the end of its course, which acts as a
-    /// standing lead.
+    /// Returns what the actor follows: the nearest box in its corridor, or the end of its course,
+    /// which acts as a standing lead.
     fn lead(
         &self,
         now: &CourseFollowerState,
@@ -306,15 +243,29 @@ impl CourseFollower {
         Some(body.filter(|body| body.gap_m <= end.gap_m).unwrap_or(end))
     }
 
+    /// Where an actor is in a state, for its changes of speed.
+    fn place(&self, at: &CourseFollowerState, box_: &ActorBox) -> Place<'_> {
+        let pose = self.pose(at);
+        Place {
+            course: self.course(at),
+            station_m: at.station_m,
+            center_m: pose.position_m,
+            forward: flat(pose.rotation * DVec3::X).normalize_or_zero(),
+            half_length_m: 0.5 * box_.length_m,
+            speed_mps: at.speed_mps,
+        }
+    }
+
     /// The pose of an actor in a state.
     fn pose(&self, at: &CourseFollowerState) -> Pose {
         let on_course = self.course(at).at(at.station_m);
         let offset_m = at.lateral.offset_m();
         let rate_mps = at.lateral.rate_mps(at.speed_mps);
         let position_m = on_course.position_m + on_course.rotation * (offset_m * DVec3::Y);
-        let rotation = match rate_mps == 0.0 {
-            true => on_course.rotation,
-            false => on_course.rotation * DQuat::from_rotation_z(rate_mps.atan2(at.speed_mps)),
+        let rotation = if rate_mps == 0.0 {
+            on_course.rotation
+        } else {
+            on_course.rotation * DQuat::from_rotation_z(rate_mps.atan2(at.speed_mps))
         };
         Pose { position_m, rotation: rotation.normalize() }
     }
@@ -344,8 +295,9 @@ impl CourseFollower {
 
 impl CourseFollowerState {
     fn command(&mut self, command: SpeedCommand, trigger: usize) {
-        if command.to_mps > 0.0 {
-            self.free_flow_speed_mps = command.to_mps;
+        let aim_mps = command.aim_mps().unwrap_or(self.speed_mps);
+        if aim_mps > 0.0 {
+            self.free_flow_speed_mps = aim_mps;
         }
         self.speed_command = Some(command);
         self.by.speed = Some(trigger);
@@ -365,15 +317,5 @@ impl CourseFollowerState {
         if self.by.course == Some(trigger) {
             self.by.course = None;
         }
-    }
-}
-
-/// The time of a change of speed, in seconds.
-fn seconds(over: Over, shape: Shape, [from_mps, to_mps]: [f64; 2]) -> f64 {
-    let extent = shape.extent(to_mps - from_mps, over);
-    match over {
-        // Every shape here is symmetric, so that its mean speed is that of its ends.
-        Over::Distance(_) => 2.0 * extent / (from_mps + to_mps).max(1e-3),
-        _ => extent,
     }
 }

@@ -1,9 +1,10 @@
 //! The Intelligent Driver Model: acceleration from the own speed, the lead's speed and the gap.
 //!
 //! Treiber and Kesting, "Traffic Flow Dynamics" (2013), chapter 11:
-//! `a (1 - (v / v0)^δ - (s* / s)²)` with `s* = s0 + max(0, v T + v Δv / (2 √(a b)))`, where Δv is the closing
-//! speed and s the gap between bumpers. Simulators differ in parameters, in the bracket `max(0, .)`, in the least
-//! gap and in the bounds of the result; each variant here is that of the named program at the named commit.
+//! `a (1 - (v / v0)^δ - (s* / s)²)` with `s* = s0 + max(0, v T + v Δv / (2 √(a b)))`, where Δv is
+//! the closing speed and s the gap between bumpers. Simulators differ in parameters, in the bracket
+//! `max(0, .)`, in the least gap and in the bounds of the result; each variant here is that of the
+//! named program at the named commit.
 
 /// Parameters of the model.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -12,7 +13,8 @@ pub struct Idm {
     pub free_speed_mps: f64,
     /// Gap to a standing lead, in metres; s0 of the formula.
     pub least_gap_m: f64,
-    /// Time between the lead's rear and the own front passing one place, in seconds; T of the formula.
+    /// Time between the lead's rear and the own front passing one place, in seconds; T of the
+    /// formula.
     pub headway_s: f64,
     /// Largest acceleration, in m/s²; a of the formula.
     pub acceleration_mps2: f64,
@@ -20,8 +22,9 @@ pub struct Idm {
     pub braking_mps2: f64,
     /// Exponent of the free-road term; δ of the formula.
     pub exponent: f64,
-    /// Whether a lead that pulls away adds nothing to the desired gap: the bracket `max(0, .)`. Without it, a fast
-    /// lead that pulls away makes the desired gap negative, and its square brakes.
+    /// Whether a lead that pulls away adds nothing to the desired gap: the bracket `max(0, .)`.
+    /// Without it, a fast lead that pulls away makes the desired gap negative, and its square
+    /// brakes.
     pub bracket: bool,
     /// Smaller gaps count as this, in metres.
     pub gap_floor_m: f64,
@@ -62,8 +65,8 @@ impl Idm {
         clipped: false,
     };
 
-    /// Acceleration in m/s² at speed `speed_mps` behind a lead at `lead_mps`, both along the course, with
-    /// `gap_m` between bumpers; an infinite gap is a free road.
+    /// Acceleration in m/s² at speed `speed_mps` behind a lead at `lead_mps`, both along the
+    /// course, with `gap_m` between bumpers; an infinite gap is a free road.
     pub fn acceleration(&self, speed_mps: f64, lead_mps: f64, gap_m: f64) -> f64 {
         let desired_m = self.desired_gap_m(speed_mps, lead_mps);
         let gap_m = gap_m.max(self.gap_floor_m);
@@ -85,8 +88,8 @@ impl Idm {
     }
 }
 
-/// Distance in metres and speed in m/s after `duration_s` of constant acceleration from a speed of at least 0.
-/// An actor that brakes to 0 within that time stands from then on.
+/// Distance in metres and speed in m/s after `duration_s` of constant acceleration from a speed of
+/// at least 0. An actor that brakes to 0 within that time stands from then on.
 pub fn rolled(speed_mps: f64, acceleration_mps2: f64, duration_s: f64) -> [f64; 2] {
     let end_mps = speed_mps + acceleration_mps2 * duration_s;
     if end_mps < 0.0 {

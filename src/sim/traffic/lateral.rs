@@ -1,11 +1,13 @@
-//! Lateral manoeuvres of an actor on its course: from one offset to another by a quintic, or by a given shape.
+//! Lateral manoeuvres of an actor on its course: from one offset to another by a quintic, or by a
+//! given shape.
 
 use super::script::{Over, Shape};
 
 /// The offset from the course, to the left, in metres.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Lateral {
-    /// Coefficients of the polynomial in the manoeuvre's time, in seconds: metres, m/s, m/s² and so on.
+    /// Coefficients of the polynomial in the manoeuvre's time, in seconds: metres, m/s, m/s² and so
+    /// on.
     coefficients: [f64; 6],
     /// Elapsed time of the manoeuvre, in seconds. It stops while the actor stands.
     elapsed_s: f64,
@@ -21,8 +23,8 @@ pub(super) struct Lateral {
 /// How fast a manoeuvre runs.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Pace {
-    /// Reference speed, in m/s: the actor's speed at the start of the manoeuvre, at least 1. At this speed or above the
-    /// manoeuvre runs in real time; below it, in proportion to the speed.
+    /// Reference speed, in m/s: the actor's speed at the start of the manoeuvre, at least 1. At
+    /// this speed or above the manoeuvre runs in real time; below it, in proportion to the speed.
     Speed(f64),
     /// In real time, while the actor moves.
     Time,
@@ -81,8 +83,9 @@ impl Lateral {
         self.duration_s > 0.0
     }
 
-    /// A manoeuvre to `target_m` within `duration_s` from the present offset, rate and acceleration. At its end, rate
-    /// and acceleration are 0: the quintic with these six conditions.
+    /// A manoeuvre to `target_m` within `duration_s` from the present offset, rate and
+    /// acceleration. At its end, rate and acceleration are 0: the quintic with these six
+    /// conditions.
     pub(super) fn moving_to(&self, target_m: f64, duration_s: f64, speed_mps: f64) -> Self {
         let [from_m, rate, acceleration] = self.derivatives();
         let way_m = target_m - from_m;
@@ -101,8 +104,8 @@ impl Lateral {
         }
     }
 
-    /// The offset after `duration_s` at a mean speed. The manoeuvre slows down with the actor, so that the actor never
-    /// slides sideways.
+    /// The offset after `duration_s` at a mean speed. The manoeuvre slows down with the actor, so
+    /// that the actor never slides sideways.
     pub(super) fn after(&self, duration_s: f64, speed_mps: f64) -> Self {
         let elapsed_s = self.elapsed_s + self.pace.rate(speed_mps) * duration_s;
         if elapsed_s >= self.duration_s {

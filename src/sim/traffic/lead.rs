@@ -26,7 +26,8 @@ pub(super) struct LeadCandidate {
 /// The vehicle, or the end of a course, that an actor follows.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Lead {
-    /// From the actor's front to the lead's rear along the course, in metres; below 0 if they overlap.
+    /// From the actor's front to the lead's rear along the course, in metres; below 0 if they
+    /// overlap.
     pub(super) gap_m: f64,
     /// The lead's speed along the course, in m/s.
     pub(super) speed_mps: f64,
@@ -60,6 +61,11 @@ impl LeadCandidate {
             velocity_mps: state.velocity_mps,
             yaw_rate_radps: state.yaw_rate_radps,
         }
+    }
+
+    /// The body of an actor, or of the ego; `None` if it is absent.
+    pub(super) fn find(bodies: &[Self], actor: Option<usize>) -> Option<&Self> {
+        bodies.iter().find(|body| body.actor.map(usize::from) == actor)
     }
 
     /// Horizontal direction of its length.
@@ -127,8 +133,8 @@ impl LeadCandidate {
     }
 }
 
-/// The nearest candidate ahead in the corridor. Of equally near ones it is the slowest, so that their order cannot
-/// matter.
+/// The nearest candidate ahead in the corridor. Of equally near ones it is the slowest, so that
+/// their order cannot matter.
 pub(super) fn lead_ahead(
     course: &Course,
     corridor: &Corridor,

@@ -5,6 +5,7 @@
 //! | `world` | all actors of an episode, advanced by sub-steps |
 //! | `track` | actors that repeat recorded motion, or timed positions |
 //! | `follow`, `course`, `lateral` | actors on a course, with changes of offset |
+//! | `speed`, `distance`, `together` | changes of speed: to a speed, at a distance from another, and to arrive with another |
 //! | `idm`, `lead` | the Intelligent Driver Model, and what an actor follows |
 //! | `attack` | actors that plan their way towards the ego |
 //! | `script`, `condition` | conditions and actions, and the values of conditions |
@@ -13,17 +14,21 @@
 pub mod attack;
 mod condition;
 mod course;
+mod distance;
 mod follow;
 mod idm;
 mod lateral;
 mod lead;
 mod script;
+mod speed;
 mod state;
+mod together;
 mod track;
 mod world;
 
 pub use attack::Attack;
 pub use course::{Course, CourseFootPoint};
+pub use distance::{Bounds, Gap, KeepDistance, Side};
 pub use follow::CourseFollower;
 pub use idm::{Idm, rolled};
 pub use script::{
@@ -31,5 +36,6 @@ pub use script::{
     Trigger,
 };
 pub use state::{ActorSpec, ActorState, EgoBox, EgoState, SubStep};
+pub use together::{ArriveTogether, FinalSpeed};
 pub use track::{Track, TrackError, TrackKeyframe, Tracked};
 pub use world::{Actor, Behaviour, EgoMotion, Traffic, World};

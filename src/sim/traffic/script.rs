@@ -1,5 +1,8 @@
 //! Triggers: what an actor does when a condition holds, each once.
 
+use super::distance::KeepDistance;
+use super::together::ArriveTogether;
+
 /// A condition and the actions that follow when it first holds.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Trigger {
@@ -26,7 +29,8 @@ pub struct Condition {
     pub speed_below_mps: Option<f64>,
     /// The ego is at least this fast, in m/s.
     pub ego_speed_above_mps: Option<f64>,
-    /// Another trigger fired at least [`After::delay_us`] ago. The parts below are evaluated only from then on.
+    /// Another trigger fired at least [`After::delay_us`] ago. The parts below are evaluated only
+    /// from then on.
     pub after: Option<After>,
     /// A measured value is within bounds.
     pub measure: Option<Measure>,
@@ -49,7 +53,6 @@ pub enum Edge {
     Rising,
     /// From true to false.
     Falling,
-    /// Either.
     Both,
 }
 
@@ -69,7 +72,6 @@ pub struct After {
     pub actor: usize,
     /// Index within the actor's script.
     pub trigger: usize,
-    /// What has happened.
     pub phase: Phase,
     /// Time since then, in microseconds.
     pub delay_us: i64,
@@ -78,7 +80,6 @@ pub struct After {
 /// What has happened to a trigger.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Phase {
-    /// It fired.
     #[default]
     Fired,
     /// Its actions have reached their aims.
@@ -90,7 +91,6 @@ pub enum Phase {
 /// An action of an actor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Action {
-    /// Changes its speed.
     Speed {
         /// To this speed, in m/s; for an IDM actor the new speed of a free road, or standstill.
         to_mps: f64,
@@ -115,6 +115,10 @@ pub enum Action {
         /// Added to it, in m/s.
         delta_mps: f64,
     },
+    /// Keeps a distance from another body.
+    KeepDistance(KeepDistance),
+    /// Drives so that it is at a place when another body is at its own.
+    ArriveTogether(ArriveTogether),
     /// Changes its offset from the course.
     Offset {
         /// To this offset, in metres to the left.
@@ -140,14 +144,13 @@ pub enum Action {
         /// Station to which the actor is put, in metres; without it, it stays where it is.
         at_m: Option<f64>,
     },
-    /// Ends the changes of speed and offset of a trigger of this actor: both keep their present values.
+    /// Ends the changes of speed and offset of a trigger of this actor: both keep their present
+    /// values.
     Halt {
         /// Index within the actor's script.
         trigger: usize,
     },
-    /// Appears.
     Spawn,
-    /// Disappears.
     Remove,
 }
 
@@ -167,7 +170,6 @@ pub enum Over {
 /// The course of a value from its start to its aim, over an extent of 1.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Shape {
-    /// At once.
     Step,
     /// At a constant rate.
     Linear,
@@ -221,13 +223,9 @@ impl Shape {
 /// A value of the traffic, with its bounds.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Measure {
-    /// What is measured.
     pub quantity: Quantity,
-    /// Whose.
     pub of: Body,
-    /// At least this.
     pub above: Option<f64>,
-    /// At most this.
     pub below: Option<f64>,
 }
 
@@ -255,11 +253,11 @@ pub enum Quantity {
 /// The other body of a distance.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Other {
-    /// Whose.
     pub to: Body,
     /// Whether the distance is between the boxes; otherwise it is between the reference points.
     pub is_free: bool,
-    /// Whether the distance along is that of the own course; otherwise it is along the heading of the first body.
+    /// Whether the distance along is that of the own course; otherwise it is along the heading of
+    /// the first body.
     pub is_on_course: bool,
     /// Whether a headway is by the straight distance.
     pub is_straight: bool,

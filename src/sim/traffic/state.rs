@@ -12,9 +12,7 @@ use crate::Ego;
 pub struct ActorSpec {
     /// Name within the scenario, `[a-z0-9._-]+`.
     pub name: String,
-    /// Its kind.
     pub class: ActorClass,
-    /// Its box.
     pub box_: ActorBox,
     /// BLAKE3 of its asset, 64 lower-case hex digits. An actor without an asset is not rendered.
     pub asset: Option<String>,
@@ -31,7 +29,8 @@ pub struct ActorState {
     pub velocity_mps: DVec3,
     /// Yaw rate about the actor's z axis, in rad/s, positive to the left.
     pub yaw_rate_radps: f64,
-    /// Whether it is in the world. An absent actor is neither rendered nor touched; its pose is meaningless.
+    /// Whether it is in the world. An absent actor is neither rendered nor touched; its pose is
+    /// meaningless.
     pub present: bool,
 }
 
@@ -49,7 +48,6 @@ pub struct EgoState {
 /// The box of the ego in its rig's axes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct EgoBox {
-    /// Extents.
     pub box_: ActorBox,
     /// From the rig's origin, the middle of the rear axle, forward to the box's centre, in metres.
     pub center_x_m: f64,

@@ -20,8 +20,8 @@ pub struct TrackKeyframe {
 pub struct Track {
     /// At least one, with strictly increasing times.
     keyframes: Vec<TrackKeyframe>,
-    /// Whether the actor stands at its first pose before the first keyframe, and at its last pose after the last.
-    /// Otherwise it is absent then.
+    /// Whether the actor stands at its first pose before the first keyframe, and at its last pose
+    /// after the last. Otherwise it is absent then.
     held: bool,
 }
 
@@ -93,8 +93,8 @@ impl Track {
         &self.keyframes
     }
 
-    /// Pose and motion at a time; `None` if the actor is absent then. At a keyframe the velocity is that of the
-    /// motion after it, and at the last keyframe that of the motion before it.
+    /// Pose and motion at a time; `None` if the actor is absent then. At a keyframe the velocity is
+    /// that of the motion after it, and at the last keyframe that of the motion before it.
     pub fn at(&self, time_us: i64) -> Option<Tracked> {
         let last = self.keyframes.len() - 1;
         let is_before = time_us < self.keyframes[0].time_us;

@@ -1,8 +1,9 @@
 //! The traffic of an episode: all actors, advanced together.
 //!
-//! A step is cut into equal sub-steps of at most 10 ms. Each evaluates the triggers first, in the order of the
-//! actors and of their scripts, and then moves every actor. Triggers and actors read only the states at the start of
-//! the sub-step, and each actor has its own stream of random numbers. So the order of the actors cannot matter.
+//! A step is cut into equal sub-steps of at most 10 ms. Each evaluates the triggers first, in the
+//! order of the actors and of their scripts, and then moves every actor. Triggers and actors read
+//! only the states at the start of the sub-step, and each actor has its own stream of random
+//! numbers. So the order of the actors cannot matter.
 
 use std::sync::Arc;
 
@@ -27,10 +28,11 @@ use crate::{Ego, EgoModel};
 pub struct Traffic {
     /// Seed of every stream of random numbers.
     pub seed: u64,
-    /// The ego's box.
     pub ego_box: EgoBox,
     /// The actors; at most [`limits::ACTORS`].
     pub actors: Vec<Actor>,
+    /// Ends the episode when it holds. It has no actor of its own.
+    pub end: Option<Condition>,
 }
 
 /// An actor before the episode begins.
@@ -38,7 +40,6 @@ pub struct Traffic {
 pub struct Actor {
     /// Name, class, box and asset.
     pub spec: ActorSpec,
-    /// How it moves.
     pub behaviour: Behaviour,
     /// Its conditions and the actions that follow.
     pub script: Vec<Trigger>,
@@ -51,11 +52,8 @@ pub struct Actor {
 pub enum Behaviour {
     /// Along timed poses, whatever others do.
     Track(Track),
-    /// Along a course.
     Follow(CourseFollower),
-    /// Towards the ego.
     Attack {
-        /// The settings.
         attack: Attack,
         /// Its pose at the start of the episode.
         world_from_actor: Pose,
@@ -71,8 +69,8 @@ pub struct EgoMotion {
     pub from: EgoState,
     /// At the end of the step.
     pub to: EgoState,
-    /// Whether the velocities of both states belong to the motion between them. Then the position is the cubic
-    /// with these ends. Otherwise, as for a teleport, it changes linearly.
+    /// Whether the velocities of both states belong to the motion between them. Then the position
+    /// is the cubic with these ends. Otherwise, as for a teleport, it changes linearly.
     pub smooth: bool,
 }
 
@@ -85,6 +83,17 @@ pub struct World {
     progress: Vec<ActorProgress>,
     /// The distances driven since the start: by the ego, then by each actor, in metres.
     travelled_m: Vec<f64>,
+    end: EndState,
+}
+
+/// The values of the condition that ends the episode.
+#[derive(Clone, Debug, Default, PartialEq)]
+struct EndState {
+    condition: ConditionState,
+    /// When it was last evaluated, in microseconds.
+    last_us: Option<i64>,
+    /// When it held first, in microseconds.
+    held_us: Option<i64>,
 }
 
 /// The progress of one actor's behaviour and script.
@@ -132,13 +141,12 @@ impl World {
         let progress: Vec<ActorProgress> = traffic.actors.iter().map(ActorProgress::new).collect();
         let states = traffic.actors.iter().zip(&progress).enumerate();
         let states = states
-            .map(|(index, (actor, progress))| match progress.spawned {
-                true => progress.state(index, actor, 0, None),
-                false => absent(index),
+            .map(|(index, (actor, progress))| {
+                if progress.spawned { progress.state(index, actor, 0, None) } else { absent(index) }
             })
             .collect();
         let travelled_m = vec![0.0; progress.len() + 1];
-        Self { traffic, time_us: 0, states, progress, travelled_m }
+        Self { traffic, time_us: 0, states, progress, travelled_m, end: EndState::default() }
     }
 
     /// The actors as they were set up.
@@ -156,8 +164,8 @@ impl World {
         &self.states
     }
 
-    /// The actors at a time before the episode's start, in a warm-up: tracks at their own times, others in their
-    /// starting state.
+    /// The actors at a time before the episode's start, in a warm-up: tracks at their own times,
+    /// others in their starting state.
     pub fn states_before(&self, time_us: i64) -> Vec<ActorState> {
         let start = Self::new(self.traffic.clone());
         let actors = self.traffic.actors.iter().zip(&start.progress).enumerate();
@@ -174,8 +182,13 @@ impl World {
         self.progress.get(actor)?.fired.get(trigger)?.fired_us
     }
 
-    /// When the actions of a trigger had ended, in microseconds; `None` before. `Phase::Done` leaves out those that
-    /// another trigger replaced.
+    /// When the condition held that ends the episode, in microseconds; `None` if it has not.
+    pub fn end_us(&self) -> Option<i64> {
+        self.end.held_us
+    }
+
+    /// When the actions of a trigger had ended, in microseconds; `None` before. `Phase::Done`
+    /// leaves out those that another trigger replaced.
     pub fn ended_us(&self, actor: usize, trigger: usize, phase: Phase) -> Option<i64> {
         let fired = self.progress.get(actor)?.fired.get(trigger)?;
         match phase {
@@ -185,8 +198,8 @@ impl World {
         }
     }
 
-    /// Advances all actors by `dt_us` microseconds, above 0, in which the ego moves as given. Calls `each` after
-    /// each sub-step.
+    /// Advances all actors by `dt_us` microseconds, above 0, in which the ego moves as given. Calls
+    /// `each` after each sub-step.
     pub fn step(&mut self, dt_us: i64, ego: &EgoMotion, each: &mut dyn FnMut(&SubStep<'_>)) {
         let traffic = self.traffic.clone();
         let begin_us = self.time_us;
@@ -195,6 +208,7 @@ impl World {
             let sub_begin_us = self.time_us;
             let sub_end_us = begin_us.saturating_add(since_us);
             let bodies = self.bodies(&ego_now);
+            self.look_for_end(&traffic, &ego_now, &bodies);
             self.fire(&traffic, &ego_now, &bodies);
             let before = std::mem::take(&mut self.states);
             let after = self.advance_actors(&traffic, &before, &bodies, sub_end_us);
@@ -211,6 +225,30 @@ impl World {
             self.time_us = sub_end_us;
             ego_now = ego_next;
         }
+        // At the end of the step too, so that the step in which the condition holds is the last
+        // one.
+        if traffic.end.is_some() {
+            let bodies = self.bodies(&ego_now);
+            self.look_for_end(&traffic, &ego_now, &bodies);
+        }
+    }
+
+    /// Evaluates the condition that ends the episode: at each instant once, as an edge or a delay
+    /// remembers its values.
+    fn look_for_end(&mut self, traffic: &Traffic, ego: &EgoState, bodies: &[LeadCandidate]) {
+        let Some(when) = traffic.end.as_ref().filter(|_| self.end.held_us.is_none()) else {
+            return;
+        };
+        let is_new = self.end.last_us != Some(self.time_us);
+        if !is_new || !when.after.is_none_or(|after| self.is_after(after)) {
+            return;
+        }
+        let mut state = std::mem::take(&mut self.end.condition);
+        let own = |part: &Condition| self.holds(traffic, None, part, ego, bodies);
+        let holds = state.value(when, self.time_us, &own);
+        let now_us = self.time_us;
+        self.end =
+            EndState { condition: state, last_us: Some(now_us), held_us: holds.then_some(now_us) };
     }
 
     /// The boxes of the ego and of all present actors, the ego's first.
@@ -256,7 +294,7 @@ impl World {
             return false;
         }
         let mut state = std::mem::take(&mut self.progress[index].fired[at].condition);
-        let own = |part: &Condition| self.holds(traffic, index, part, ego, bodies);
+        let own = |part: &Condition| self.holds(traffic, Some(index), part, ego, bodies);
         let value = state.value(when, self.time_us, &own);
         self.progress[index].fired[at].condition = state;
         value
@@ -295,36 +333,57 @@ impl World {
         }
     }
 
+    /// Whether the own parts of a condition hold, of an actor by its index, or of no actor.
     fn holds(
         &self,
         traffic: &Traffic,
-        index: usize,
+        index: Option<usize>,
         when: &Condition,
         ego: &EgoState,
         bodies: &[LeadCandidate],
     ) -> bool {
-        let progress = &self.progress[index];
+        let follow = index.and_then(|index| {
+            match (&traffic.actors[index].behaviour, &self.progress[index].behaviour) {
+                (Behaviour::Follow(follow), BehaviourState::Follow(now)) => Some((follow, now)),
+                _ => None,
+            }
+        });
+        let course = follow.map(|(follow, now)| follow.course(now));
+        let measures = Measures { bodies, travelled_m: &self.travelled_m, course };
+        when.time_us.is_none_or(|time_us| self.time_us >= time_us)
+            && when.ego_speed_above_mps.is_none_or(|least| ego.velocity_mps.length() >= least)
+            && when.after.is_none_or(|after| self.is_after(after))
+            && when.measure.is_none_or(|measure| measures.holds(&measure))
+            && self.holds_of_own(traffic, index, when, bodies)
+            && when
+                .station_m
+                .is_none_or(|least_m| follow.is_some_and(|(_, now)| now.station_m >= least_m))
+            && when.ego_station_m.is_none_or(|least_m| {
+                course.is_some_and(|course| course.nearest(bodies[0].center_m).station_m >= least_m)
+            })
+    }
+
+    /// Whether the parts hold that are about the state of the condition's own actor.
+    fn holds_of_own(
+        &self,
+        traffic: &Traffic,
+        index: Option<usize>,
+        when: &Condition,
+        bodies: &[LeadCandidate],
+    ) -> bool {
+        let Some(index) = index else { return true };
         let state = &self.states[index];
         let speed_mps = state.velocity_mps.length();
-        let station_m = || match (&traffic.actors[index].behaviour, &progress.behaviour) {
-            (Behaviour::Follow(_), BehaviourState::Follow(now)) => now.station_m,
-            _ => f64::NEG_INFINITY,
-        };
-        let ego_station_m = || match (&traffic.actors[index].behaviour, &progress.behaviour) {
-            (Behaviour::Follow(follow), BehaviourState::Follow(now)) => {
-                follow.course(now).nearest(bodies[0].center_m).station_m
-            }
-            _ => f64::NEG_INFINITY,
-        };
-        // While this actor has not appeared yet, its distances are measured from the place where it will appear.
-        let own_m = match state.present {
-            true => state.world_from_actor.position_m,
-            false => {
-                progress
-                    .state(index, &traffic.actors[index], self.time_us, None)
-                    .world_from_actor
-                    .position_m
-            }
+        // While this actor has not appeared yet, its distances are measured from the place where it
+        // will appear.
+        let own_m = || {
+            let pose = if state.present {
+                state.world_from_actor
+            } else {
+                let actor = &traffic.actors[index];
+                self.progress[index].state(index, actor, self.time_us, None).world_from_actor
+            };
+            pose.position_m
         };
         let near = |near: Near| {
             let other_m = match near.actor {
@@ -334,22 +393,11 @@ impl World {
                     other.present.then_some(other.world_from_actor.position_m)
                 }
             };
-            other_m.is_some_and(|other_m| other_m.distance(own_m) <= near.within_m)
+            other_m.is_some_and(|other_m| other_m.distance(own_m()) <= near.within_m)
         };
-        let course = match (&traffic.actors[index].behaviour, &progress.behaviour) {
-            (Behaviour::Follow(follow), BehaviourState::Follow(now)) => Some(follow.course(now)),
-            _ => None,
-        };
-        let measures = Measures { bodies, travelled_m: &self.travelled_m, course };
-        when.time_us.is_none_or(|time_us| self.time_us >= time_us)
-            && when.speed_above_mps.is_none_or(|least| state.present && speed_mps >= least)
+        when.speed_above_mps.is_none_or(|least| state.present && speed_mps >= least)
             && when.speed_below_mps.is_none_or(|most| state.present && speed_mps <= most)
-            && when.ego_speed_above_mps.is_none_or(|least| ego.velocity_mps.length() >= least)
-            && when.after.is_none_or(|after| self.is_after(after))
-            && when.measure.is_none_or(|measure| measures.holds(&measure))
             && when.near.is_none_or(near)
-            && when.station_m.is_none_or(|least_m| station_m() >= least_m)
-            && when.ego_station_m.is_none_or(|least_m| ego_station_m() >= least_m)
     }
 
     /// Advances all actors to the end of a sub-step. Returns their states then.
@@ -370,12 +418,11 @@ impl World {
                 }
                 let state = &before[index];
                 progress.advance(traffic, actor, state, bodies, [begin_us, end_us]);
-                match progress.spawned {
-                    true => {
-                        let before = state.present.then_some((state.world_from_actor, duration_s));
-                        progress.state(index, actor, end_us, before)
-                    }
-                    false => absent(index),
+                if progress.spawned {
+                    let before = state.present.then_some((state.world_from_actor, duration_s));
+                    progress.state(index, actor, end_us, before)
+                } else {
+                    absent(index)
                 }
             })
             .collect()
@@ -400,8 +447,8 @@ impl EgoMotion {
         way_m / (dt_us as f64 * 1e-6)
     }
 
-    /// The ends of the sub-steps of a step of `dt_us`, above 0: the time since the start of the step, in microseconds,
-    /// and the ego then.
+    /// The ends of the sub-steps of a step of `dt_us`, above 0: the time since the start of the
+    /// step, in microseconds, and the ego then.
     pub fn sub_steps(&self, dt_us: i64) -> impl Iterator<Item = (i64, EgoState)> {
         let count = dt_us.max(1).unsigned_abs().div_ceil(limits::SUB_STEP_US.unsigned_abs()) as i64;
         (1..=count).map(move |sub_step| {
@@ -433,13 +480,12 @@ impl EgoMotion {
                     + dt_s * t * (1.0 - t) * (1.0 - t) * from.velocity_mps
                     - dt_s * t * t * (1.0 - t) * to.velocity_mps;
         }
-        let velocity_mps = match self.smooth {
-            true => from.velocity_mps.lerp(to.velocity_mps, t),
-            false => to.velocity_mps,
-        };
-        let yaw_rate_radps = match self.smooth {
-            true => from.yaw_rate_radps + t * (to.yaw_rate_radps - from.yaw_rate_radps),
-            false => to.yaw_rate_radps,
+        let velocity_mps =
+            if self.smooth { from.velocity_mps.lerp(to.velocity_mps, t) } else { to.velocity_mps };
+        let yaw_rate_radps = if self.smooth {
+            from.yaw_rate_radps + t * (to.yaw_rate_radps - from.yaw_rate_radps)
+        } else {
+            to.yaw_rate_radps
         };
         EgoState { world_from_rig: pose, velocity_mps, yaw_rate_radps }
     }
@@ -590,11 +636,13 @@ impl Attacking {
         let velocity = self.spline.velocity_mps(since_s);
         let begin = &self.world_from_begin;
         let velocity_mps = begin.rotation * velocity.extend(0.0);
-        // The heading is the direction of motion, backwards at a negative speed; below 0.1 m/s it stays.
+        // The heading is the direction of motion, backwards at a negative speed; below 0.1 m/s it
+        // stays.
         let ahead = if velocity.x < 0.0 { -velocity } else { velocity };
-        let rotation = match velocity.length() < 0.1 {
-            true => before.map_or(begin.rotation, |(before, _)| before.rotation),
-            false => begin.rotation * DQuat::from_rotation_z(ahead.to_angle()),
+        let rotation = if velocity.length() < 0.1 {
+            before.map_or(begin.rotation, |(before, _)| before.rotation)
+        } else {
+            begin.rotation * DQuat::from_rotation_z(ahead.to_angle())
         };
         let pose = Pose {
             position_m: begin.transform_point(at_m.extend(0.0)),

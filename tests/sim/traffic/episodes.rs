@@ -20,13 +20,13 @@ use crate::vectors::{assert_near, cases, number};
 const CAR: ActorBox = ActorBox { length_m: 4.5, width_m: 1.8, height_m: 1.5 };
 const EGO_BOX: EgoBox = EgoBox { box_: CAR, center_x_m: 1.3 };
 
-fn straight(length_m: f64) -> Arc<Course> {
+pub(super) fn straight(length_m: f64) -> Arc<Course> {
     let points = [DVec3::ZERO, length_m * DVec3::X];
     Arc::new(Course::from_points(&points, &Ground::from_drives(&[])).unwrap())
 }
 
 /// A closed winding road of 600 m.
-fn winding() -> Arc<Course> {
+pub(super) fn winding() -> Arc<Course> {
     let points: Vec<DVec3> = (0..=600)
         .map(|s| {
             let s_m = f64::from(s);
@@ -36,7 +36,12 @@ fn winding() -> Arc<Course> {
     Arc::new(Course::from_points(&points, &Ground::from_drives(&[])).unwrap())
 }
 
-fn follow(course: &Arc<Course>, station_m: f64, speed_mps: f64, idm: Option<Idm>) -> Behaviour {
+pub(super) fn follow(
+    course: &Arc<Course>,
+    station_m: f64,
+    speed_mps: f64,
+    idm: Option<Idm>,
+) -> Behaviour {
     Behaviour::Follow(CourseFollower {
         courses: vec![course.clone()],
         station_m,
@@ -47,13 +52,13 @@ fn follow(course: &Arc<Course>, station_m: f64, speed_mps: f64, idm: Option<Idm>
     })
 }
 
-fn actor(name: &str, behaviour: Behaviour, script: Vec<Trigger>) -> Actor {
+pub(super) fn actor(name: &str, behaviour: Behaviour, script: Vec<Trigger>) -> Actor {
     let spec = ActorSpec { name: name.into(), class: ActorClass::Vehicle, box_: CAR, asset: None };
     Actor { spec, behaviour, script, present: true }
 }
 
-fn traffic(actors: Vec<Actor>) -> Arc<Traffic> {
-    Arc::new(Traffic { seed: 7, ego_box: EGO_BOX, actors })
+pub(super) fn traffic(actors: Vec<Actor>) -> Arc<Traffic> {
+    Arc::new(Traffic { seed: 7, ego_box: EGO_BOX, actors, end: None })
 }
 
 /// An ego that stands far away.
@@ -324,8 +329,8 @@ fn the_order_of_actors_does_not_matter() {
     compare_orders(300, 100_000);
 }
 
-/// A hash of the bits of all states after every step, actor by actor, of a world in which each actor lies at
-/// `place(index)` of the list.
+/// A hash of the bits of all states after every step, actor by actor, of a world in which each
+/// actor lies at `place(index)` of the list.
 fn episode_hash(steps: u32, place: &dyn Fn(usize) -> usize) -> u64 {
     let actors = fifty();
     let mut listed = actors.clone();
@@ -346,7 +351,8 @@ fn episode_hash(steps: u32, place: &dyn Fn(usize) -> usize) -> u64 {
     hash.finish()
 }
 
-/// 100,000 steps of 50 actors: alone, and then in three orders at the same time, each on a thread of its own.
+/// 100,000 steps of 50 actors: alone, and then in three orders at the same time, each on a thread
+/// of its own.
 #[test]
 #[ignore = "a minute; run it after a change of traffic: cargo test -p wildcity-sim --test sim -- --ignored hundred_thousand"]
 fn a_hundred_thousand_steps_are_deterministic() {

@@ -315,7 +315,8 @@ class ScenarioTask(Task):
 
     def _ended(self, state: DriveState) -> tuple[bool, bool]:
         reason = end_of(state.observation)
-        return reason is not None and reason != "time", reason == "time"
+        is_over = reason in ("time", "condition")
+        return reason is not None and not is_over, is_over
 
     def _ahead(self, state: DriveState) -> NDArray[np.float64]:
         route = state.observation.metadata.route
