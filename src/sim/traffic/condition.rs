@@ -235,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn parts_are_all_or_any_of() {
+    fn parts_hold_all_or_any() {
         let leaf = |time_us| Condition { time_us: Some(time_us), ..Condition::default() };
         let value = |condition: &Condition| {
             let own = |part: &Condition| part.time_us.is_none_or(|time_us| time_us <= 5);
@@ -263,7 +263,7 @@ mod tests {
             yaw_rate_radps: 0.0,
             present: true,
         };
-        LeadCandidate::of_actor(&spec, &state)
+        LeadCandidate::from_actor(&spec, &state)
     }
 
     #[test]

@@ -49,7 +49,7 @@ pub(super) struct Corridor {
 }
 
 impl LeadCandidate {
-    pub(super) fn of_actor(spec: &ActorSpec, state: &ActorState) -> Self {
+    pub(super) fn from_actor(spec: &ActorSpec, state: &ActorState) -> Self {
         let pose = state.world_from_actor;
         Self {
             actor: Some(state.index),
@@ -117,7 +117,7 @@ impl LeadCandidate {
         })
     }
 
-    pub(super) fn of_ego(ego: &EgoState, ego_box: &EgoBox) -> Self {
+    pub(super) fn from_ego(ego: &EgoState, ego_box: &EgoBox) -> Self {
         let pose = ego.world_from_rig;
         let ahead_m = pose.rotation * (ego_box.center_x_m * DVec3::X);
         Self {

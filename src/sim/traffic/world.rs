@@ -256,8 +256,8 @@ impl World {
         let present = self.states.iter().filter(|state| state.present);
         let actors = &self.traffic.actors;
         let boxes = present
-            .map(|state| LeadCandidate::of_actor(&actors[usize::from(state.index)].spec, state));
-        std::iter::once(LeadCandidate::of_ego(ego, &self.traffic.ego_box)).chain(boxes).collect()
+            .map(|state| LeadCandidate::from_actor(&actors[usize::from(state.index)].spec, state));
+        std::iter::once(LeadCandidate::from_ego(ego, &self.traffic.ego_box)).chain(boxes).collect()
     }
 
     /// Fires the triggers whose conditions hold at the start of the sub-step.

@@ -65,19 +65,20 @@ fn a_distance_is_reached_by_braking_as_the_formula_says() {
             let change_mps = pair[1][1] - pair[0][1];
             assert!((-0.03 - 1e-9..=0.02 + 1e-9).contains(&change_mps), "{from_m}: {change_mps}");
         }
-        // While it brakes with 3 m/s², the speed of approach is √(2 b (way - b τ² / 2)) with τ =
-        // 0.5 s.
-        let braking =
-            states.windows(2).filter(|pair| (pair[1][1] - pair[0][1] + 0.03).abs() < 1e-6);
-        for pair in braking.filter(|pair| pair[0][0] > 22.0) {
+        // While it brakes with 3 m/s², the speed of approach is √(2 b (way - b τ² / 2)) with τ = 0.5 s.
+        let is_braking = |pair: &&[[f64; 2]]| pair[1][1] - pair[0][1] < -0.028 && pair[0][0] > 22.0;
+        let braking: Vec<_> = states.windows(2).filter(is_braking).collect();
+        assert!(braking.len() > 100 || from_m > 160.0, "{from_m}: {}", braking.len());
+        for pair in braking {
             let way_m = pair[0][0] - 20.0;
             let expected_mps = (2.0 * 3.0 * (way_m - 0.375)).sqrt();
             assert!((pair[0][1] - 14.0 - expected_mps).abs() < 0.2, "{from_m}: {pair:?}");
         }
         let [gap_m, speed_mps] = states[states.len() - 1];
         assert!((gap_m - 20.0).abs() < 0.02 && (speed_mps - 14.0).abs() < 0.02, "{gap_m}");
-        let least_m = states.iter().skip(1000).map(|state| state[0]).fold(f64::INFINITY, f64::min);
-        assert!(least_m > 19.9, "{from_m}: it overshoots: {least_m}");
+        // It comes from one side, and stays on it.
+        let is_beyond = |gap_m: f64| if from_m > 160.0 { gap_m > 20.1 } else { gap_m < 19.9 };
+        assert!(states.iter().all(|state| !is_beyond(state[0])), "{from_m}: it overshoots");
     }
 }
 
@@ -198,13 +199,13 @@ fn a_condition_ends_an_episode_in_the_step_in_which_it_holds() {
             world.step(step_us, &ego(ego_m, 10.0, step_us), &mut |_| {});
             ego_m += 10.0 * step_us as f64 * 1e-6;
         }
-        world.end_us()
+        (world.end_us(), world.time_us())
     };
     let time = Condition { time_us: Some(1_000_000), ..Condition::default() };
-    assert_eq!(ended(time.clone(), 100_000, 0.0), Some(1_000_000));
-    assert_eq!(ended(time.clone(), 7_000, 0.0), Some(1_001_000));
+    assert_eq!(ended(time.clone(), 100_000, 0.0), (Some(1_000_000), 1_000_000));
+    assert_eq!(ended(time.clone(), 7_000, 0.0), (Some(1_001_000), 1_001_000));
     let later = Condition { later_us: 500_000, ..time };
-    assert_eq!(ended(later, 100_000, 0.0), Some(1_500_000));
+    assert_eq!(ended(later, 100_000, 0.0), (Some(1_500_000), 1_500_000));
     let near = Measure {
         quantity: Quantity::Point(DVec3::new(21.3, 0.0, 0.0)),
         of: wildcity_sim::traffic::Body { actor: None, ahead_m: 0.0 },
@@ -213,9 +214,9 @@ fn a_condition_ends_an_episode_in_the_step_in_which_it_holds() {
     };
     // The ego's middle is 1.3 m ahead of its place.
     let near = Condition { measure: Some(near), ..Condition::default() };
-    let at_us = ended(near.clone(), 100_000, 0.0).unwrap();
+    let at_us = ended(near.clone(), 100_000, 0.0).0.unwrap();
     assert!((1_000_000..=1_010_000).contains(&at_us), "{at_us}");
     let rising = Condition { edge: Some(wildcity_sim::traffic::Edge::Rising), ..near };
-    assert!(ended(rising.clone(), 100_000, 0.0).is_some());
-    assert_eq!(ended(rising, 100_000, 15.0), None, "it held from the start on: that is no edge");
+    assert!(ended(rising.clone(), 100_000, 0.0).0.is_some());
+    assert_eq!(ended(rising, 100_000, 15.0).0, None, "it held from the start on: that is no edge");
 }
