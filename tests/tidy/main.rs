@@ -1,12 +1,14 @@
 //! Rules for the source that Cargo cannot check: which crate may be used where within a package, no import cycles,
-//! plain prose, links that lead to files, licences.
+//! plain prose, links that lead to files and headings, licences; the book and the version.
 
+mod book;
 mod cycles;
 mod licences;
 mod links;
 mod packages;
 mod prose;
 mod source;
+mod versions;
 
 use std::path::PathBuf;
 
