@@ -6,8 +6,8 @@
     docs/generate.py --wildcity target/debug/wildcity (also pages that ask the program)
 
 PAGES are `benchmarks` (BENCHMARKS.md, from docs/benchmarks), `protocol` (docs/reference/protocol, from
-protocol/schema, protocol/openapi.json and protocol/vectors), `summary` (the lists of those pages in docs/SUMMARY.md), and, with
-`--wildcity`, `commands` (docs/reference/commands, from the help of the program) and `metrics`
+protocol/schema, protocol/openapi.json and protocol/vectors), `summary` (the lists of those pages in docs/SUMMARY.md),
+and, with `--wildcity`, `commands` (docs/reference/commands, from the help of the program) and `metrics`
 (docs/reference/metrics.md, from a running server).
 """
 

@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
-"""A preprocessor of mdbook: a page of docs/project, which is only a link to a document of the repository, becomes that document. Links to
-such documents lead to their pages, and links to other files outside of docs/ become text."""
+"""A preprocessor of mdbook: a page of docs/project, which is only a link to a document of the repository, becomes that
+document. Links to such documents lead to their pages, and links to other files outside of docs/ become text."""
 
 from __future__ import annotations
 
@@ -32,11 +32,8 @@ def main() -> None:
         if not chapter["path"]:
             continue
         source = next((source for source, path in pages.items() if path == chapter["path"]), DOCS / chapter["path"])
-        if source.is_relative_to(DOCS):
-            text = chapter["content"]
-        else:
-            text = source.read_text()
-        chapter["content"] = LINK.sub(lambda link: moved(link, source, chapter["path"], pages), text)
+        text = chapter["content"] if source.is_relative_to(DOCS) else source.read_text()
+        chapter["content"] = moved(text, source, chapter["path"], pages)
     json.dump(book, sys.stdout)
 
 
@@ -47,20 +44,24 @@ def walk(items: list[Any]) -> Any:
             yield from walk(item["Chapter"]["sub_items"])
 
 
-def moved(link: re.Match[str], source: Path, page: str, pages: dict[Path, str]) -> str:
-    """A link of the document `source`, as it is on `page`."""
-    mark, text, target = link.groups()
-    file, hash_sign, anchor = target.partition("#")
-    if "://" in target or not file:
-        return link[0]
-    at = (source.parent / file).resolve()
-    if at in pages:
-        to = DOCS / pages[at]
-    elif at.is_relative_to(DOCS) and at.is_file():
-        to = at
-    else:
-        return text
-    return f"{mark}[{text}]({os.path.relpath(to, (DOCS / page).parent)}{hash_sign}{anchor})"
+def moved(text: str, source: Path, page: str, pages: dict[Path, str]) -> str:
+    """The text of the document `source`, with its links as they are on `page`."""
+
+    def link(found: re.Match[str]) -> str:
+        mark, label, target = found.groups()
+        file, hash_sign, anchor = target.partition("#")
+        if "://" in target or not file:
+            return found[0]
+        at = (source.parent / file).resolve()
+        if at in pages:
+            to = DOCS / pages[at]
+        elif at.is_relative_to(DOCS) and at.is_file():
+            to = at
+        else:
+            return label
+        return f"{mark}[{label}]({os.path.relpath(to, (DOCS / page).parent)}{hash_sign}{anchor})"
+
+    return LINK.sub(link, text)
 
 
 if __name__ == "__main__":

@@ -46,7 +46,9 @@ def help_of(program: Path, path: list[str]) -> str:
             text=True,
         )
         if done.returncode != 0 or home in done.stdout:
-            raise SystemExit(f"{program} {' '.join(path)} --help ends with {done.returncode}:\n{done.stdout}{done.stderr}")
+            raise SystemExit(
+                f"{program} {' '.join(path)} --help ends with {done.returncode}:\n{done.stdout}{done.stderr}"
+            )
     return "\n".join(line.rstrip() for line in done.stdout.strip().splitlines()) + "\n"
 
 

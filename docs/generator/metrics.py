@@ -1,7 +1,9 @@
 """docs/reference/metrics.md: what a server says at `GET /metrics`, without values.
 
-A second server has its twins in an object store, an empty one of this program, which adds the metrics of stores. A metric with labels is
-listed once it has a value: so the first server is asked for a twin that does not exist, and for a push that it refuses."""
+A second server has its twins in an object store, an empty one of this program, which adds the metrics of stores. A
+metric with labels is
+listed once it has a value: so the first server is asked for a twin that does not exist, and for a push that it
+refuses."""
 
 from __future__ import annotations
 
@@ -19,8 +21,8 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 HEAD = "<!-- Written by docs/generate.py from a running server. -->\n\n# Metrics\n\n"
-HEAD += "`GET /metrics` has these as OpenMetrics text. Names of counters get the suffix `_total`. The metrics `wildcity_store_` "
-HEAD += "exist with twins in an object store.\n\n"
+HEAD += "`GET /metrics` has these as OpenMetrics text. Names of counters get the suffix `_total`. "
+HEAD += "The metrics `wildcity_store_` exist with twins in an object store.\n\n"
 LIMIT_S = 60.0
 EMPTY = b"""<?xml version="1.0" encoding="UTF-8"?>
 <ListBucketResult xmlns="http://s3.amazonaws.com/doc/2006-03-01/"><Name>bucket</Name><KeyCount>0</KeyCount><MaxKeys>1000</MaxKeys>
@@ -59,7 +61,9 @@ def asked(program: Path, home: Path, twins: str, bucket: str) -> str:
     store = {"AWS_ACCESS_KEY_ID": "a", "AWS_SECRET_ACCESS_KEY": "b", "AWS_REGION": "c", "AWS_ALLOW_HTTP": "true"}
     environment = {"PATH": os.environ["PATH"], "HOME": str(home), "AWS_ENDPOINT": bucket, **store}
     command = [program, "serve", "--listen", "127.0.0.1:0", "--backend", "cpu", "--twins", twins]
-    with subprocess.Popen(command, cwd=home, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as server:
+    with subprocess.Popen(
+        command, cwd=home, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as server:
         try:
             assert server.stdout is not None
             line = server.stdout.readline()
@@ -94,7 +98,9 @@ def push(url: str) -> None:
         assert error.code == 404, error
 
 
-def request(url: str, body: bytes | None = None, method: str | None = None, headers: dict[str, str] | None = None) -> bytes:
+def request(
+    url: str, body: bytes | None = None, method: str | None = None, headers: dict[str, str] | None = None
+) -> bytes:
     headers = {"Content-Type": "application/json", **(headers or {})}
     with urllib.request.urlopen(urllib.request.Request(url, body, headers, method=method), timeout=LIMIT_S) as answer:
         return bytes(answer.read())

@@ -10,15 +10,36 @@ Schema = dict[str, Any]
 
 FOLDER = "docs/reference/protocol"
 # The bodies of HTTP, in the order of their use.
-BODIES = ["twins", "version", "drive", "rollback", "made_version", "ground", "new_edit", "new_upload", "upload", "new_push", "push"]
+BODIES = [
+    "twins",
+    "version",
+    "drive",
+    "rollback",
+    "made_version",
+    "ground",
+    "new_edit",
+    "new_upload",
+    "upload",
+    "new_push",
+    "push",
+]
 BODIES += ["new_actor", "actor", "actors", "session", "episode", "ticket", "refusal"]
 HEAD = "<!-- Written by docs/generate.py from protocol/. -->\n\n"
 DEFINITIONS = "#/$defs/"
-SIMPLE = {"string": "text", "integer": "integer", "number": "number", "boolean": "`true` or `false`", "object": "object", "null": "`null`"}
+SIMPLE = {
+    "string": "text",
+    "integer": "integer",
+    "number": "number",
+    "boolean": "`true` or `false`",
+    "object": "object",
+    "null": "`null`",
+}
 
 
 def pages(root: Path) -> tuple[dict[str, str], str]:
-    schemas = {path.stem: plain(json.loads(path.read_text())) for path in sorted((root / "protocol" / "schema").glob("*.json"))}
+    schemas = {
+        path.stem: plain(json.loads(path.read_text())) for path in sorted((root / "protocol" / "schema").glob("*.json"))
+    }
     sockets = {"request", "answer", "observation", "many"}
     if unknown := schemas.keys() ^ (sockets | set(BODIES)):
         raise SystemExit(f"docs/generator/protocol.py and protocol/schema differ: {sorted(unknown)}")
@@ -33,7 +54,9 @@ def pages(root: Path) -> tuple[dict[str, str], str]:
         "requests": messages("Requests", schemas["request"], vectors / "requests"),
         "answers": messages("Answers", schemas["answer"], vectors / "answers"),
         "observation": observation(schemas["observation"], schemas["many"]),
-        "http": http(json.loads((root / "protocol" / "openapi.json").read_text()), {name: schemas[name] for name in BODIES}),
+        "http": http(
+            json.loads((root / "protocol" / "openapi.json").read_text()), {name: schemas[name] for name in BODIES}
+        ),
         "types": "# Types of messages\n\n" + "".join(section(name, types[name]) for name in sorted(types)),
     }
     return {f"{FOLDER}/{name}.md": HEAD + text.rstrip() + "\n" for name, text in written.items()}, FOLDER
@@ -109,19 +132,26 @@ def fields(schema: Schema) -> str:
         text += "| field | type | |\n|---|---|---|\n"
         for name, field in properties.items():
             if "const" in field:
-                field = {**field, "description": field.get("description", "the kind of the message" if name == "type" else "")}
+                field = {
+                    **field,
+                    "description": field.get("description", "the kind of the message" if name == "type" else ""),
+                }
             needed = " (required)" if name in schema.get("required", []) and "const" not in field else ""
             text += f"| `{name}`{needed} | {kind(field)} | {cell(field.get('description', ''))}{default(field)} |\n"
         text += "\n"
     variants = schema.get("oneOf") or schema.get("anyOf") or []
     if all("const" in variant for variant in variants) and variants:
         text += "| value | |\n|---|---|\n"
-        text += "".join(f"| `{variant['const']}` | {cell(variant.get('description', ''))} |\n" for variant in variants) + "\n"
+        text += (
+            "".join(f"| `{variant['const']}` | {cell(variant.get('description', ''))} |\n" for variant in variants)
+            + "\n"
+        )
     elif variants and all(variant.keys() == {"required"} for variant in variants):
         text += f"One of {', '.join(names(variant['required']) for variant in variants)} is required.\n\n"
     else:
-        for number, variant in enumerate(variants, 1):
-            text += f"{number}. {prose(variant) or kind(variant)}{': ' + kind(variant) if '$ref' in variant else ''}\n\n{fields(variant)}"
+        for place, variant in enumerate(variants, 1):
+            what = f": {kind(variant)}" if "$ref" in variant else ""
+            text += f"{place}. {prose(variant) or kind(variant)}{what}\n\n{fields(variant)}"
     return text
 
 
@@ -146,7 +176,15 @@ def kind(field: Schema) -> str:
         return " or ".join(kind({**field, "type": one}) for one in what)
     if what == "array":
         least, most = field.get("minItems"), field.get("maxItems")
-        count = f"{least} " if least == most and least is not None else f"{least} to {most} " if most and least else f"at most {most} " if most else ""
+        count = (
+            f"{least} "
+            if least == most and least is not None
+            else f"{least} to {most} "
+            if most and least
+            else f"at most {most} "
+            if most
+            else ""
+        )
         if "prefixItems" in field:
             return f"[{', '.join(kind(item) for item in field['prefixItems'])}]"
         return f"list of {count}{plural(kind(field.get('items', {})))}"

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
 from wildcity import AugmentedViews
 
 torch = pytest.importorskip("torch", reason="PyTorch is optional: pip install torch")

@@ -43,9 +43,7 @@ def test_the_types_are_right_for_the_first_and_the_last_supported_python(version
     assert done.returncode == 0, done.stdout
 
 
-def test_a_wheel_carries_the_program(
-    reader: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wheel_carries_the_program(reader: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Built here, installed in an empty environment, which has the program and the client then."""
     # The fastest one: the program is large, and the size of its wheel is not what is tested.
     monkeypatch.setattr(zlib, "Z_DEFAULT_COMPRESSION", zlib.Z_BEST_SPEED)

@@ -11,6 +11,15 @@ GENERATE = Path(__file__).resolve().parents[3] / "docs" / "generate.py"
 
 
 def test_the_pages_are_as_the_program_generates_them() -> None:
-    command = [sys.executable, "-B", str(GENERATE), "--check", "--wildcity", os.environ["WILDCITY_BIN"], "commands", "metrics"]
+    command = [
+        sys.executable,
+        "-B",
+        str(GENERATE),
+        "--check",
+        "--wildcity",
+        os.environ["WILDCITY_BIN"],
+        "commands",
+        "metrics",
+    ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
