@@ -112,3 +112,12 @@ def test_the_newest_glibc_symbol_gives_the_platform() -> None:
     assert tag.startswith("manylinux_2_35_")
     with pytest.raises(ValueError, match="names no glibc"):
         build_wheel.platform_tag(b"static")
+
+
+def test_a_release_has_the_version_as_its_tag_and_a_section_of_the_changelog() -> None:
+    version = field(CLIENT / "pyproject.toml", "version")
+    notes = [sys.executable, str(ROOT / ".ci" / "release_notes.py")]
+    done = subprocess.run([*notes, f"v{version}"], capture_output=True, text=True)
+    assert done.returncode == 0 and "### " in done.stdout, done.stderr
+    for tag in (version, f"v{version}.1", "v0.0.1"):
+        assert subprocess.run([*notes, tag], capture_output=True).returncode == 1, tag
