@@ -8,9 +8,8 @@ from typing import Any
 
 HEAD = """# Benchmarks
 
-Measured run times and errors, one table per question. `docs/generate.py` writes this page from `docs/benchmarks`. To
-replace a table, replace its JSON file. Several figures in a cell are repeated runs. On a loaded machine only ratios
-count. PSNR is against the named reference; higher is closer. Earlier measurements are in the history of this file.
+Run times and errors, one table per question, written by `docs/generate.py` from `docs/benchmarks`. Several figures in a
+cell are repeated runs. On a loaded machine only ratios count. PSNR is against the named reference; higher is closer.
 
 """
 

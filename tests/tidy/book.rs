@@ -21,7 +21,18 @@ fn the_table_of_contents_has_every_page_once() {
         .filter(|path| path.starts_with(&docs) && !path.ends_with("SUMMARY.md"))
         .map(|path| (path, 1))
         .collect();
-    assert_eq!(listed, wanted, "left: docs/SUMMARY.md; right: the pages of docs");
+    let differ = |a: &BTreeMap<PathBuf, usize>, b: &BTreeMap<PathBuf, usize>| -> Vec<PathBuf> {
+        a.iter()
+            .filter(|(path, count)| b.get(*path) != Some(*count))
+            .map(|(path, _)| path.clone())
+            .collect()
+    };
+    let lacks = differ(&wanted, &listed);
+    let wrong = differ(&listed, &wanted);
+    assert!(
+        lacks.is_empty() && wrong.is_empty(),
+        "docs/SUMMARY.md does not list once: {lacks:#?}; lists twice, or is no page: {wrong:#?}"
+    );
 }
 
 /// `clients/python/tests/test_reference.py` does the same with the pages that need the program.
