@@ -1,4 +1,5 @@
-//! docs/ is a book: its table of contents has every page once, and the pages that a program writes are as it writes them.
+//! docs/ is a book: its table of contents has every page once, and the pages that a program writes
+//! are as it writes them.
 
 use std::collections::BTreeMap;
 use std::fs;
