@@ -4,9 +4,9 @@
     cargo test --no-run --message-format=json-render-diagnostics >MESSAGES
     .ci/run_tests.py MESSAGES [NAME FOLDER COMMAND]...
 
-One after the other, as `cargo test` runs them, they leave a quarter of two cores unused: some wait for disks, sockets and
-time limits while others compute. Each runs in the folder of its package, as under cargo. What one prints appears when it
-has ended. All run, whatever fails.
+One after the other, as `cargo test` runs them, they leave a quarter of two cores unused: some wait for disks, sockets
+and time limits while others compute. Each runs in the folder of its package, as under cargo. What one prints appears
+when it has ended. All run, whatever fails.
 """
 
 import contextlib
@@ -102,7 +102,9 @@ def main() -> None:
     jobs = tests(Path(messages))
     if not jobs:
         sys.exit(f"{messages} names no test executable")
-    jobs += [Job(name, folder, ["bash", "-c", command]) for name, folder, command in zip(*[iter(others)] * 3, strict=True)]
+    jobs += [
+        Job(name, folder, ["bash", "-c", command]) for name, folder, command in zip(*[iter(others)] * 3, strict=True)
+    ]
     names = [job.name for job in jobs]
     if unknown := [name for name in ALONE + LONG if name not in names and name not in ("Python client", "viewer")]:
         sys.exit(f".ci/run_tests.py: no test is called {', '.join(unknown)}")

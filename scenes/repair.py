@@ -225,7 +225,9 @@ def residual(parameters, rgb, warped, valid):
 
     def conv(name, x):
         weight, bias = parameters[name]
-        return jax.lax.conv_general_dilated(x, weight, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")) + bias
+        return (
+            jax.lax.conv_general_dilated(x, weight, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")) + bias
+        )
 
     relu = jax.nn.relu
     halve = lambda x: 0.25 * (x[:, ::2, ::2] + x[:, 1::2, ::2] + x[:, ::2, 1::2] + x[:, 1::2, 1::2])
@@ -303,9 +305,8 @@ def write(parameters, out):
         return node("Relu", f"{name}.relu", [done]) if relu else done
 
     halve = lambda name, x: node("AveragePool", name, [x], kernel_shape=[2, 2], strides=[2, 2])
-    double = lambda name, x: node(
-        "Resize", name, [x, "", "twice"], mode="nearest", coordinate_transformation_mode="asymmetric", nearest_mode="floor"
-    )  # fmt: skip
+    nearest = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
+    double = lambda name, x: node("Resize", name, [x, "", "twice"], **nearest)
     constant("twice", np.array([1.0, 1.0, 2.0, 2.0], np.float32))
     images = ("rgb", "reference_warped", "reference_valid")
     fine = conv("fine_more", conv("fine", node("Concat", "images", images, axis=1)))
@@ -379,9 +380,14 @@ def gains(street, repair, every_m=12.0):
     for offset_m in (0.0, *OFFSETS_M):
         arrays, _ = street.views(stations_m, np.full(len(stations_m), offset_m))
         scores = [
-            (valid.mean(), psnr(rendered, true), psnr(fill(rendered, warped, valid), true), psnr(repair(rendered, warped, valid), true))
+            (
+                valid.mean(),
+                psnr(rendered, true),
+                psnr(fill(rendered, warped, valid), true),
+                psnr(repair(rendered, warped, valid), true),
+            )
             for rendered, warped, valid, true in arrays
-        ]  # fmt: skip
+        ]
         rows.append((offset_m, *np.mean(scores, axis=0)))
     return rows
 
@@ -405,7 +411,9 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path(__file__).parent, help="folder of repair.onnx and repair.json")
     parser.add_argument("--twins", type=Path, help="folder that keeps the streets [default: a temporary one]")
-    parser.add_argument("--steps", type=int, default=1500, help="steps of training; 0 measures the files that are there")
+    parser.add_argument(
+        "--steps", type=int, default=1500, help="steps of training; 0 measures the files that are there"
+    )
     parser.add_argument("--views", type=int, default=28, help="poses per street that are trained on")
     options = parser.parse_args()
     os.environ.setdefault("JAX_PLATFORMS", "cpu")

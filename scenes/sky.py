@@ -165,7 +165,10 @@ def read(path):
 def truths(path):
     """The content of `tests/render/sky.json`: directions, and their colours as numpy computes them."""
     tensors, away = read(path), look(np.random.default_rng(3), 48)
-    seen = [[*direction, *colours(tensors, direction[None])[0], *colours(tensors, direction[None], 1)[0]] for direction in away]
+    seen = [
+        [*direction, *colours(tensors, direction[None])[0], *colours(tensors, direction[None], 1)[0]]
+        for direction in away
+    ]
     return "[\n" + ",\n".join(json.dumps([float(f"{value:.17g}") for value in row]) for row in seen) + "\n]\n"
 
 

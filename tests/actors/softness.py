@@ -94,7 +94,13 @@ def truth(described: list[dict], size: np.ndarray, distance: float) -> np.ndarra
             "fov_axis": "x",
             "to_world": look,
             "sampler": {"type": "stratified", "sample_count": 64},
-            "film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "rfilter": {"type": "box"}, "pixel_format": "rgb"},
+            "film": {
+                "type": "hdrfilm",
+                "width": WIDTH,
+                "height": HEIGHT,
+                "rfilter": {"type": "box"},
+                "pixel_format": "rgb",
+            },
         },
         "sky": {"type": "constant", "radiance": {"type": "rgb", "value": GREY}},
     }

@@ -81,7 +81,11 @@ fn import_inspect_and_verify_print_the_contents() {
         "profile     near=0.2 far=",
         "rig         car: front\n",
         "trajectory  log: 2 keyframes, 5.0 m\n",
-        "builder     wildcity 0.1.0 axes=y-down-z-forward scale=2\n",
+        concat!(
+            "builder     wildcity ",
+            env!("CARGO_PKG_VERSION"),
+            " axes=y-down-z-forward scale=2\n"
+        ),
     ] {
         assert!(said.contains(line), "{line}\n{said}");
     }

@@ -1,5 +1,5 @@
-"""Writes lidar.safetensors and lidar.json: points of a LiDAR that turns on a moving vehicle, in the world, and the depth of
-an image against them.
+"""Writes lidar.safetensors and lidar.json: points of a LiDAR that turns on a moving vehicle, in the world, and the
+depth of an image against them.
 
     pip install numpy scipy safetensors
     python3 tests/eval/lidar.py

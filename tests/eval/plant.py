@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "support"))
-from plant import Copy, Fault, chosen, planted, run, source  # noqa: E402
+from plant import Copy, Fault, chosen, planted, run, source
 
 # (file of src/eval, old, new)
 FAULTS = [
@@ -20,14 +20,22 @@ FAULTS = [
     ("boxes.rs", "const LARGEST_GAP_US: i64 = 1_000_000", "const LARGEST_GAP_US: i64 = 999_999"),
     ("boxes.rs", "const BEYOND_US: i64 = 100_000", "const BEYOND_US: i64 = 200_000"),
     ("boxes.rs", "row.size_m *= alignment.metres_per_unit;", ""),
-    ("boxes.rs", "alignment.new_from_old.rotation * v * alignment.metres_per_unit", "alignment.new_from_old.rotation * v"),
+    (
+        "boxes.rs",
+        "alignment.new_from_old.rotation * v * alignment.metres_per_unit",
+        "alignment.new_from_old.rotation * v",
+    ),
     ("boxes.rs", "alignment.new_from_old.rotation * v * alignment", "v * alignment"),
     ("boxes.rs", "row.world_from_box = alignment.pose(&row.world_from_box);", ""),
     ("boxes.rs", "(Some(a), Some(b)) => a.lerp(b, share)", "(Some(a), Some(_)) => a"),
     ("boxes.rs", "before.size_m.lerp(next.size_m, share)", "before.size_m"),
     ("boxes.rs", "velocity * (time_us - row.time_us) as f64 * 1e-6", "velocity * 0.0 * time_us as f64"),
     ("boxes.rs", "neighbour.filter(|(a, b)| gap_us(a, b) <= LARGEST_GAP_US)", "neighbour"),
-    ("boxes.rs", "row.velocity_m_per_s.or(near.map(|(a, b)| between(a, b)))?", "near.map(|(a, b)| between(a, b)).or(row.velocity_m_per_s)?"),
+    (
+        "boxes.rs",
+        "row.velocity_m_per_s.or(near.map(|(a, b)| between(a, b)))?",
+        "near.map(|(a, b)| between(a, b)).or(row.velocity_m_per_s)?",
+    ),
     ("boxes.rs", "if points.len() < corners.len()", "if points.len() > corners.len()"),
     ("boxes.rs", "from ^ 1, from ^ 2, from ^ 4", "from ^ 1, from ^ 2"),
     ("boxes.rs", "perp_dot(point - a) <= 0.0", "perp_dot(point - a) >= 0.0"),
@@ -63,10 +71,26 @@ FAULTS = [
     ("reprojection.rs", "truth.to_vec(), back.to_vec()", "back.to_vec(), back.to_vec()"),
     ("extrapolation.rs", "repaired.flicker / rendered.flicker", "rendered.flicker / repaired.flicker"),
     ("extrapolation.rs", ".filter(|value| !value.is_nan())", ""),
-    ("extrapolation.rs", "trust: mean_of(views.iter().map(|view| view.trust))", "trust: mean_of(views.iter().map(|view| view.covered))"),
-    ("extrapolation.rs", "covered: mean_of(views.iter().map(|view| view.covered))", "covered: mean_of(views.iter().map(|view| view.trust))"),
-    ("extrapolation.rs", "reprojection_flip: mean(&|view| view.reprojection.flip)", "reprojection_flip: mean(&|view| view.reprojection.share)"),
-    ("extrapolation.rs", "reprojection_share: mean(&|view| view.reprojection.share)", "reprojection_share: mean(&|view| view.reprojection.flip)"),
+    (
+        "extrapolation.rs",
+        "trust: mean_of(views.iter().map(|view| view.trust))",
+        "trust: mean_of(views.iter().map(|view| view.covered))",
+    ),
+    (
+        "extrapolation.rs",
+        "covered: mean_of(views.iter().map(|view| view.covered))",
+        "covered: mean_of(views.iter().map(|view| view.trust))",
+    ),
+    (
+        "extrapolation.rs",
+        "reprojection_flip: mean(&|view| view.reprojection.flip)",
+        "reprojection_flip: mean(&|view| view.reprojection.share)",
+    ),
+    (
+        "extrapolation.rs",
+        "reprojection_share: mean(&|view| view.reprojection.share)",
+        "reprojection_share: mean(&|view| view.reprojection.flip)",
+    ),
     ("kid.rs", "powi(3)", "powi(2)"),
     ("kid.rs", "dot / x.len() as f64 + 1.0", "dot / x.len() as f64"),
     ("kid.rs", "dot / x.len() as f64 + 1.0", "dot + 1.0"),
@@ -91,7 +115,11 @@ FAULTS = [
     ("scores.rs", "let ssim = Ssim::of(&changed, truth", "let ssim = Ssim::of(truth, truth"),
     ("scores.rs", "pair.size_px(), pair.counts());", "pair.size_px(), None);"),
     ("pair.rs", "self.counts.as_ref().map_or(1.0, share)", "self.counts.as_ref().map_or(0.0, share)"),
-    ("pair.rs", ".map(move |(_, (rendered, truth))| (unit(rendered), unit(truth)))", ".map(move |(_, (rendered, truth))| (unit(truth), unit(rendered)))"),
+    (
+        "pair.rs",
+        ".map(move |(_, (rendered, truth))| (unit(rendered), unit(truth)))",
+        ".map(move |(_, (rendered, truth))| (unit(truth), unit(rendered)))",
+    ),
     ("means.rs", "image.rendered.values > 0", "true"),
     ("means.rs", "psnr_db: after.psnr_db - before.psnr_db", "psnr_db: before.psnr_db - after.psnr_db"),
     ("means.rs", "ssim: after.ssim - before.ssim", "ssim: after.ssim"),

@@ -4,9 +4,9 @@
     pip install schemathesis
     WILDCITY_BIN=target/release/wildcity tests/openapi/fuzz.py [EXAMPLES]
 
-EXAMPLES is the most requests of one kind that each operation gets (default 100). A request that the document allows must be answered
-with a status that the document lists for the operation; an answer must have the form that the document says; no answer
-is a 500. It is not part of the gate.
+EXAMPLES is the most requests of one kind that each operation gets (default 100). A request that the document allows
+must be answered with a status that the document lists for the operation; an answer must have the form that the document
+says; no answer is a 500. It is not part of the gate.
 """
 
 from __future__ import annotations

@@ -71,9 +71,7 @@ def scores(image, reference):
 
 def main():
     cases = []
-    for seed, (kind, width, height) in enumerate(
-        [("noise", 48, 36), ("shift", 61, 37), ("blur", 24, 40)]
-    ):
+    for seed, (kind, width, height) in enumerate([("noise", 48, 36), ("shift", 61, 37), ("blur", 24, 40)]):
         reference = truth(width, height, seed)
         image = spoiled(reference, kind, seed)
         cases.append(

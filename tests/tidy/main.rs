@@ -1,6 +1,7 @@
 //! Rules for the source that Cargo cannot check: which crate may be used where within a package, no import cycles,
-//! no dialect, plain prose, links that lead to files, licences.
+//! no dialect, plain prose, links that lead to files and headings, licences; the book and the version.
 
+mod book;
 mod cycles;
 mod dialect;
 mod licences;
@@ -8,6 +9,7 @@ mod links;
 mod packages;
 mod prose;
 mod source;
+mod versions;
 
 use std::path::PathBuf;
 

@@ -20,11 +20,13 @@ const READ: &[&str] = &[
     "tests",
     "docs",
     ".ci",
+    ".github",
     "README.md",
     "ARCHITECTURE.md",
     "BENCHMARKS.md",
     "CHANGELOG.md",
     "CONTRIBUTING.md",
+    "SECURITY.md",
 ];
 
 const EXTENSIONS: &[&str] = &["rs", "md", "py", "wgsl", "toml", "yml"];

@@ -51,7 +51,9 @@ def main(url: str, pid: int, rounds: int) -> None:
     with wildcity.connect(url) as client:
         raw = wildcity.Outputs(encoding="raw")
         sessions = {
-            way: client.open("demo", session=f"way-{k}", rig="vehicle6", outputs=raw, dynamics="kinematic", sensors=sensors)
+            way: client.open(
+                "demo", session=f"way-{k}", rig="vehicle6", outputs=raw, dynamics="kinematic", sensors=sensors
+            )
             for k, (way, sensors) in enumerate(WAYS.items())
         }
         for session in sessions.values():

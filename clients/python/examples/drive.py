@@ -1,6 +1,6 @@
 """Drives straight ahead through a twin by teleport, and saves the images of all cameras.
 
-    python drive.py ws://127.0.0.1:8080/v1/session TWIN [OUT]
+python drive.py ws://127.0.0.1:8080/v1/session TWIN [OUT]
 """
 
 import math

@@ -58,7 +58,8 @@ SCHEDULER: dict[str, Any] = {
     "timestep_spacing": "trailing",
 }
 ADAPTED = ("conv1", "conv2", "conv_in", "conv_shortcut", "conv", "conv_out", "to_k", "to_q", "to_v", "to_out.0")
-"""Ends of the decoder's layers that have an adapter: with the skip convolutions, those of src/model.py of nv-tlabs/Difix3D."""
+"""Ends of the decoder's layers that have an adapter: with the skip convolutions, those of src/model.py of
+nv-tlabs/Difix3D."""
 
 
 def write_folder(path: Path, seed: int = 1, changes: Mapping[str, dict[str, Any]] | None = None) -> Path:

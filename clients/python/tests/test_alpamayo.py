@@ -179,9 +179,7 @@ def mix_indices(metadata: Metadata) -> None:
         (mix_indices, "'cross_right_120fov' has frames of the indices"),
     ],
 )
-def test_what_the_models_would_misread_is_refused_by_name(
-    change: Callable[[Metadata], None], message: str
-) -> None:
+def test_what_the_models_would_misread_is_refused_by_name(change: Callable[[Metadata], None], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         alpamayo.inputs(observation("1.5", change), "1.5")
 

@@ -285,7 +285,9 @@ def test_a_rolling_shutter_moves_the_camera_within_the_image(door: Door) -> None
 def test_a_batch_answers_camera_by_camera(door: Door) -> None:
     item = sensorsim_pb2.BatchRGBRenderRequestItem
     good = item(camera_name="front", request=request())
-    turned = item(camera_name="turned", request=request(sensor_pose=sensorsim_pb2.PosePair(end_pose=pose(HERE, (2, 0, 0, 0)))))
+    turned = item(
+        camera_name="turned", request=request(sensor_pose=sensorsim_pb2.PosePair(end_pose=pose(HERE, (2, 0, 0, 0))))
+    )
     empty = item(camera_name="empty", request=request(resolution_w=0))
     late = item(camera_name="late", request=request(frame_start_us=AT + 1))
     answer = door.stub.batch_render_rgb(sensorsim_pb2.BatchRGBRenderRequest(items=[good, turned, empty, late]))
@@ -333,7 +335,11 @@ def test_aggregated_requests_and_loaded_scenes(door: Door) -> None:
         ({"dynamic_objects": [thing("7@nothing")]}, "INVALID_ARGUMENT", "nothing"),
         ({"dynamic_objects": [thing("7@4x2x0")]}, "INVALID_ARGUMENT", "height_m is 0.0"),
         ({"dynamic_objects": [thing("7@4x2x1#red")]}, "INVALID_ARGUMENT", "6 hex digits"),
-        ({"dynamic_objects": [sensorsim_pb2.DynamicObject(track_id="7@4x2x1")]}, "INVALID_ARGUMENT", "pose_pair is missing"),
+        (
+            {"dynamic_objects": [sensorsim_pb2.DynamicObject(track_id="7@4x2x1")]},
+            "INVALID_ARGUMENT",
+            "pose_pair is missing",
+        ),
         ({"dynamic_objects": [thing("7", (float("inf"), 0, 0))]}, "INVALID_ARGUMENT", "finite"),
         ({"dynamic_objects": [thing("7")] * 257}, "INVALID_ARGUMENT", "257 dynamic_objects; at most 256"),
     ],
@@ -376,7 +382,9 @@ def test_a_public_address_needs_consent() -> None:
     serving = [binary, "serve", "--listen", "127.0.0.1:0", "--alpasim", "0.0.0.0:0"]
     done = subprocess.run(serving, capture_output=True, text=True, timeout=60)
     assert done.returncode == 1 and "--alpasim-open" in done.stderr, done.stderr
-    with subprocess.Popen([*serving, "--alpasim-open"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+    with subprocess.Popen(
+        [*serving, "--alpasim-open"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as process:
         try:
             assert listening(process)["AlpaSim: listening on "].startswith("0.0.0.0:")
         finally:

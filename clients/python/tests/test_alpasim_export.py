@@ -1,4 +1,5 @@
-"""`wildcity alpasim export`: the files are what AlpaSim's runtime reads (its `Artifact`, `Rig` and `TrafficObjects`)."""
+"""`wildcity alpasim export`: the files are what AlpaSim's runtime reads (its `Artifact`, `Rig` and
+`TrafficObjects`)."""
 
 from __future__ import annotations
 
@@ -82,8 +83,12 @@ def test_one_sequence_without_tracks(scenes: dict[str, dict[str, bytes]]) -> Non
 def test_tracks_are_within_the_scene_by_the_middle_of_their_boxes(tmp_path: Path) -> None:
     binary = os.environ["WILDCITY_BIN"]
     twins = import_corridor(tmp_path)
-    made = subprocess.run([binary, "actor", "generate", *twins], capture_output=True, text=True, check=True, timeout=120)
-    (sedan,) = (line.split()[1] for before, line in itertools.pairwise(made.stdout.splitlines()) if "actor sedan:" in before)
+    made = subprocess.run(
+        [binary, "actor", "generate", *twins], capture_output=True, text=True, check=True, timeout=120
+    )
+    (sedan,) = (
+        line.split()[1] for before, line in itertools.pairwise(made.stdout.splitlines()) if "actor sedan:" in before
+    )
 
     def track(name: str, first: int, last: int, **more: Any) -> dict[str, Any]:
         turn = math.pi / 2
@@ -131,8 +136,8 @@ def test_tracks_are_within_the_scene_by_the_middle_of_their_boxes(tmp_path: Path
         ("{", "tracks.json"),
         ('{"format": "wildcity.tracks/2", "tracks": []}', "wildcity.tracks/1"),
         (
-            '{"format": "wildcity.tracks/1", "tracks": [{"id": "a", "class": "vehicle", "size": [4, 2, 1], "asset": "%s",'
-            ' "keyframes": [{"time_us": 0, "pose": {"xyz": [0, 0, 0]}}]}]}' % ("0" * 64),
+            '{"format": "wildcity.tracks/1", "tracks": [{"id": "a", "class": "vehicle", "size": [4, 2, 1],'
+            ' "asset": "%s", "keyframes": [{"time_us": 0, "pose": {"xyz": [0, 0, 0]}}]}]}' % ("0" * 64),
             'track "a"',
         ),
     ],

@@ -1,4 +1,5 @@
-"""AlpaSim's `physics`: boxes on the ground. Its messages are described here by hand, from the published field numbers."""
+"""AlpaSim's `physics`: boxes on the ground. Its messages are described here by hand, from the published field
+numbers."""
 
 from __future__ import annotations
 
@@ -11,7 +12,10 @@ from google.protobuf import descriptor_pb2, descriptor_pool
 from google.protobuf.message_factory import GetMessageClass
 from test_alpasim import SCENE, Door, door, pose
 
-OPTIONAL, REPEATED = descriptor_pb2.FieldDescriptorProto.LABEL_OPTIONAL, descriptor_pb2.FieldDescriptorProto.LABEL_REPEATED
+OPTIONAL, REPEATED = (
+    descriptor_pb2.FieldDescriptorProto.LABEL_OPTIONAL,
+    descriptor_pb2.FieldDescriptorProto.LABEL_REPEATED,
+)
 STRING, FIXED64 = descriptor_pb2.FieldDescriptorProto.TYPE_STRING, descriptor_pb2.FieldDescriptorProto.TYPE_FIXED64
 INT32 = descriptor_pb2.FieldDescriptorProto.TYPE_INT32
 """The wire of an enum is that of an int32."""
@@ -80,7 +84,9 @@ def ground(door: Door, **fields: Any) -> Any:
 
 def parsed(name: str, message: Any) -> Any:
     """A message of the package `common` in the pool of this file's messages."""
-    field = next(f for m in MESSAGES for f in PHYSICS[m].DESCRIPTOR.fields if f.message_type and f.message_type.name == name)
+    field = next(
+        f for m in MESSAGES for f in PHYSICS[m].DESCRIPTOR.fields if f.message_type and f.message_type.name == name
+    )
     return GetMessageClass(field.message_type).FromString(message.SerializeToString())
 
 
@@ -125,7 +131,10 @@ def test_each_form_of_the_ego_is_answered_alone(door: Door) -> None:
 
 def test_version_and_scenes_are_those_of_the_renderer(door: Door) -> None:
     empty = common_pb2.Empty()
-    for method, answer in (("get_version", common_pb2.VersionId), ("get_available_scenes", common_pb2.AvailableScenesReturn)):
+    for method, answer in (
+        ("get_version", common_pb2.VersionId),
+        ("get_available_scenes", common_pb2.AvailableScenesReturn),
+    ):
         assert call(door, method, empty, answer) == getattr(door.stub, method)(empty)
     with pytest.raises(grpc.RpcError) as refused:
         call(door, "shut_down", empty, common_pb2.Empty)
@@ -136,7 +145,11 @@ def test_version_and_scenes_are_those_of_the_renderer(door: Door) -> None:
     ("fields", "code", "text"),
     [
         ({"scene_id": "nowhere@1+log+0"}, "NOT_FOUND", "nowhere"),
-        ({"ego_data": PHYSICS["EgoData"](pose_pair=PHYSICS["PosePair"]())}, "INVALID_ARGUMENT", "ego_data.aabb is missing"),
+        (
+            {"ego_data": PHYSICS["EgoData"](pose_pair=PHYSICS["PosePair"]())},
+            "INVALID_ARGUMENT",
+            "ego_data.aabb is missing",
+        ),
         ({"other_objects": [PHYSICS["OtherObject"](aabb=SIZE)]}, "INVALID_ARGUMENT", "future_pose is missing"),
     ],
 )

@@ -1,8 +1,8 @@
 """Other projects' own code on episodes that `wildcity episode run` drives, compared with the scores in their results.
 
-$WILDCITY_ANCHORS is a folder with checkouts of `Bench2Drive`, `alpasim`, `navsim` and `nuplan-devkit` at the commits that
-the scores' names have. A check whose checkout is missing, or whose packages are not installed, is listed as NOT RUN.
-What the anchors are given is computed here, from the poses of the records.
+$WILDCITY_ANCHORS is a folder with checkouts of `Bench2Drive`, `alpasim`, `navsim` and `nuplan-devkit` at the commits
+that the scores' names have. A check whose checkout is missing, or whose packages are not installed, is listed as NOT
+RUN. What the anchors are given is computed here, from the poses of the records.
 """
 
 from __future__ import annotations
@@ -190,9 +190,7 @@ def alpasim(name: str) -> Any:
     for package in ("eval", "eval.scorers", "eval.aggregation"):
         stand_in(package, __path__=[str(source.joinpath(*package.split(".")[1:]))])
     metric = SimpleNamespace(MAX="max")
-    stand_in(
-        "eval.data", AggregationType=metric, MetricReturn=SimpleNamespace, SimulationResult=object
-    )
+    stand_in("eval.data", AggregationType=metric, MetricReturn=SimpleNamespace, SimulationResult=object)
     stand_in("eval.scorers.base", Scorer=object)
     return module(name)
 

@@ -14,7 +14,6 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
-
 from wildcity import AugmentedError, AugmentedViews
 
 Matrix = NDArray[np.float64]
@@ -42,8 +41,7 @@ def transforms(folder: Path) -> tuple[dict[str, Matrix], dict[str, Matrix]]:
     frames = json.loads((folder / "transforms.json").read_text())["frames"]
     name = {frame["file_path"]: frame["file_path"].removeprefix("images/") for frame in frames}
     intrinsics = {
-        name[f["file_path"]]: np.array([[f["fl_x"], 0, f["cx"]], [0, f["fl_y"], f["cy"]], [0, 0, 1]])
-        for f in frames
+        name[f["file_path"]]: np.array([[f["fl_x"], 0, f["cx"]], [0, f["fl_y"], f["cy"]], [0, 0, 1]]) for f in frames
     }
     poses = {name[f["file_path"]]: np.array(f["transform_matrix"]) @ OPENGL for f in frames}
     return intrinsics, poses
@@ -77,7 +75,9 @@ def pixels(folder: Path, kind: str, name: str) -> NDArray[np.float64]:
     return np.array(Image.open(folder / kind / name)).astype(np.float64)
 
 
-def reprojected(folder: Path, geometry: tuple[dict[str, Matrix], dict[str, Matrix]], a: str, b: str) -> tuple[float, float]:
+def reprojected(
+    folder: Path, geometry: tuple[dict[str, Matrix], dict[str, Matrix]], a: str, b: str
+) -> tuple[float, float]:
     """Of the pixels of `a` that have depth: the share that `b` shows at the depth they have there, and the median
     difference of their colours, of 255."""
     intrinsics, poses = geometry

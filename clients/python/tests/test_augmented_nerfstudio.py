@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
 from wildcity import AugmentedViews
 
 torch = pytest.importorskip("torch", reason="PyTorch is optional: pip install torch")
@@ -109,7 +108,7 @@ def test_the_parser_has_the_cameras_poses_and_files(folders: dict[str, Path], ki
 
 @pytest.mark.parametrize("kind", ["pinholes", "lenses"])
 def test_rays_of_the_parser_are_those_of_our_lenses(folders: dict[str, Path], kind: str) -> None:
-    """A ray of nerfstudio, projected by the formulas of protocol/README.md, is at the pixel that it was made for."""
+    """A ray of nerfstudio, projected by the formulas of docs/cameras.md, is at the pixel that it was made for."""
     outputs = parsed(folders[kind], eval_mode="all")
     cameras = outputs.cameras
     for at in (0, len(cameras) - 1):

@@ -214,9 +214,7 @@ def test_silence_ends_in_a_time_out(connect: Connect) -> None:
         (frame("damaged/overlap.bin"), BadFrame, "offset"),
     ],
 )
-def test_invalid_answers_are_named(
-    connect: Connect, reply: str | bytes, error: type[Exception], says: str
-) -> None:
+def test_invalid_answers_are_named(connect: Connect, reply: str | bytes, error: type[Exception], says: str) -> None:
     with FakeServer(["welcome", "opened", reply]) as server:
         session = connect(server.url).open("street")
         with pytest.raises(error, match=says):

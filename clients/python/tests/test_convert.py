@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
 from wildcity import convert
 from wildcity.convert import CheckpointError
 
@@ -164,10 +163,7 @@ def test_a_sky_is_written_to_the_same_file(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     shapes = {"0.weight": (8, 9), "0.bias": (8,), "1.weight": (8, 17), "1.bias": (8,)}
     shapes |= {"2.weight": (3, 8), "2.bias": (3,)}
-    network = {
-        f"sky_head.layers.{name}": rng.standard_normal(shape).astype("<f4")
-        for name, shape in shapes.items()
-    }
+    network = {f"sky_head.layers.{name}": rng.standard_normal(shape).astype("<f4") for name, shape in shapes.items()}
     network["appearance_embedding.weight"] = rng.standard_normal((4, 3)).astype("<f4")
     state = {name: Tensor(values) for name, values in network.items()}
     state["direction_encoding.scales"] = Tensor(np.ones(7, "<f4"))
@@ -218,9 +214,7 @@ class Evil:
         return os.mkdir, (os.environ["EVIL"],)
 
 
-def test_nothing_in_a_checkpoint_is_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_in_a_checkpoint_is_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = tmp_path / "made"
     monkeypatch.setenv("EVIL", str(made))
     saved = {"splats": tensors(gaussians()), "optimizer": Evil(), "list": [Evil(), {"a": Evil()}]}
@@ -393,8 +387,6 @@ def test_converted_files_can_be_imported(tmp_path: Path) -> None:
     source = save(tmp_path / "ckpt.pt", {"splats": tensors(gaussians())})
     convert.convert(source, tmp_path / "out.safetensors")
     command = [binary, "import", tmp_path / "out.safetensors", "--twin", "converted"]
-    done = subprocess.run(
-        [*command, "--twins", tmp_path / "twins"], capture_output=True, text=True, check=False
-    )
+    done = subprocess.run([*command, "--twins", tmp_path / "twins"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "20 Gaussians of SH degree 3" in done.stdout

@@ -1,4 +1,5 @@
-"""The manifest, the configurations and the scheduler's step of Difix. Needs no PyTorch: test_difix_graph.py has the rest."""
+"""The manifest, the configurations and the scheduler's step of Difix. Needs no PyTorch: test_difix_graph.py has the
+rest."""
 
 from __future__ import annotations
 

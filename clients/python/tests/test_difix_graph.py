@@ -1,8 +1,8 @@
 """The graph of Difix: against diffusers, peft and onnxruntime, with tiny widths and random weights.
 
-`oracle` states Difix once more with the classes of diffusers, as NVIDIA's pipeline does. PyTorch and diffusers are large, so the
-gate does not install them. No published weights were here: what these tests cannot show is that the folder of nvidia/difix_ref
-is what they assume. The exporter refuses another one, with the name of the tensor.
+`oracle` states Difix once more with the classes of diffusers, as NVIDIA's pipeline does. PyTorch and diffusers are
+large, so the gate does not install them. No published weights were here: what these tests cannot show is that the
+folder of nvidia/difix_ref is what they assume. The exporter refuses another one, with the name of the tensor.
 """
 
 from __future__ import annotations
@@ -162,7 +162,9 @@ def oracle(weights: Path) -> Callable[..., torch.Tensor]:
 def test_the_tensors_of_sd_turbo_have_these_names_and_shapes() -> None:
     with torch.device("meta"):
         ours = Difix(VaeConfig.read(VAE), UnetConfig.read(UNET), Step(1.0, 0.0), True)
-        vae = diffusers.AutoencoderKL.from_config({key: VAE[key] for key in VAE if key not in ("gamma", "ignore_skip", "lora_rank")})
+        vae = diffusers.AutoencoderKL.from_config(
+            {key: VAE[key] for key in VAE if key not in ("gamma", "ignore_skip", "lora_rank")}
+        )
         unet = diffusers.UNet2DConditionModel.from_config(UNET)
         theirs = {f"vae.{name}": values.shape for name, values in vae.state_dict().items()}
         theirs |= {f"unet.{name}": values.shape for name, values in unet.state_dict().items()}
@@ -230,7 +232,10 @@ def test_the_graph_without_reference(weights: Path, alone: Path) -> None:
     assert [port.name for port in graph.get_inputs()] == ["image"]
     (repaired,) = graph.run(None, {"image": image.numpy()})
     assert np.abs(repaired - oracle(weights)(image).numpy()).max() < TOLERANCE
-    assert [(graph.run(None, {"image": image.numpy()[at : at + 1]})[0] == repaired[at]).all() for at in (0, 1)] == [True, True]
+    assert [(graph.run(None, {"image": image.numpy()[at : at + 1]})[0] == repaired[at]).all() for at in (0, 1)] == [
+        True,
+        True,
+    ]
     assert [entry["role"] for entry in json.loads(alone.read_text())["inputs"]] == ["rgb"]
 
 
@@ -277,7 +282,11 @@ def test_the_graph_is_plain_onnx_of_opset_17(exported: Path) -> None:
 
 def test_weights_beside_the_graph_give_the_same_bits(weights: Path, exported: Path, tmp_path: Path) -> None:
     beside = export_difix.export(weights, tmp_path / "difix_ref.onnx", dtype="f32", providers=["cpu"], external_above=0)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["difix_ref.json", "difix_ref.onnx", "difix_ref.onnx.data"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "difix_ref.json",
+        "difix_ref.onnx",
+        "difix_ref.onnx.data",
+    ]
     files = json.loads(beside.read_text())["files"]
     assert [file["path"] for file in files] == ["difix_ref.onnx", "difix_ref.onnx.data"]
     assert (tmp_path / "difix_ref.onnx").stat().st_size < exported.with_suffix(".onnx").stat().st_size / 2
@@ -401,7 +410,7 @@ def test_damaged_weights_are_refused_with_the_tensor(
     (out / "difix_ref.onnx").write_bytes(b"as it was")
     with pytest.raises(ExportError) as refused:
         export_difix.export(folder, out / "difix_ref.onnx")
-    layer = tensor.split(".lora_")[0].split(".base_layer")[0]
+    layer = tensor.split(".lora_", maxsplit=1)[0].split(".base_layer", maxsplit=1)[0]
     assert refused.value.field.startswith(f"{part}/diffusion_pytorch_model.safetensors: {layer}"), refused.value.field
     assert says in refused.value.message, refused.value.message
     assert [path.name for path in out.iterdir()] == ["difix_ref.onnx"]
@@ -470,7 +479,7 @@ def test_adapters_are_added_as_peft_adds_them() -> None:
         assert (conv - adapted["conv"](image)).abs().max() < 1e-5
         linear = torch.nn.functional.linear(row, merged["linear.weight"], merged["linear.bias"])
         assert (linear - adapted["linear"](row)).abs().max() < 1e-5
-    assert difix_weights.LORA_ALPHA == peft.LoraConfig().lora_alpha
+    assert peft.LoraConfig().lora_alpha == difix_weights.LORA_ALPHA
 
 
 def test_the_prompt_is_padded_to_77_tokens_and_counts(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:

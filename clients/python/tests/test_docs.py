@@ -33,6 +33,7 @@ PAGES = [
     "docs/scenarios.md",
     "docs/scenes.md",
     "docs/suites.md",
+    "docs/tutorial.md",
 ]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
@@ -83,14 +84,10 @@ def parts(block: str) -> Iterator[str]:
         yield script
 
 
-def serve(
-    command: str, port: int, folder: Path, environment: dict[str, str]
-) -> subprocess.Popen[str]:
+def serve(command: str, port: int, folder: Path, environment: dict[str, str]) -> subprocess.Popen[str]:
     """Starts a server on a port that nothing else has, and waits until it listens."""
     words = [*shlex.split(command), "--listen", f"127.0.0.1:{port}"]
-    server = subprocess.Popen(
-        words, cwd=folder, env=environment, stdout=subprocess.PIPE, text=True
-    )
+    server = subprocess.Popen(words, cwd=folder, env=environment, stdout=subprocess.PIPE, text=True)
     assert server.stdout is not None
     line = server.stdout.readline()
     assert "listening" in line, f"{command} said {line!r}"

@@ -258,9 +258,7 @@ def test_returns_to_a_snapshot_and_branches(connect: Connect, server: Server) ->
     name = f"tree-{time.time_ns()}"
     with connect(server.url) as client:
         dynamics = Dynamics("dynamic", 5.0)
-        with client.open(
-            "corridor", rig=PAIR, outputs=RAW, start=log, dynamics=dynamics, session=name
-        ) as session:
+        with client.open("corridor", rig=PAIR, outputs=RAW, start=log, dynamics=dynamics, session=name) as session:
             session.reset(seed=1)
             before = session.step(Action(1.0, 0.05), until_us=300_000, notes={"why": "to the fork"})
             assert (before.metadata.step, before.metadata.time_us) == (3, 300_000)
@@ -303,9 +301,7 @@ def test_drives_a_car(connect: Connect, server: Server) -> None:
     with connect(server.url) as client:
         dynamics = Dynamics("dynamic", speed=5.0)
         start = Station("log", 2.0)
-        with client.open(
-            "corridor", rig=PAIR, outputs=RAW, start=start, dynamics=dynamics
-        ) as session:
+        with client.open("corridor", rig=PAIR, outputs=RAW, start=start, dynamics=dynamics) as session:
             assert session.opened.dynamics == dynamics
             ahead = [TimedPose(100_000 * k, Pose((0.5 * k, 0.0, 0.0))) for k in range(1, 65)]
             seen = session.step(Trajectory(tuple(ahead)))
@@ -321,9 +317,7 @@ def test_drives_a_car(connect: Connect, server: Server) -> None:
 def test_a_model_reads_four_frames_at_each_decision(server: Server) -> None:
     outputs = wildcity.Outputs(frames=4, trust=True)
     with wildcity.connect(server.url) as client:
-        session = client.open(
-            "corridor", outputs=outputs, decision_us=1_000_000, warm_up_us=1_600_000
-        )
+        session = client.open("corridor", outputs=outputs, decision_us=1_000_000, warm_up_us=1_600_000)
         opened = session.opened
         assert (opened.outputs.frames, opened.outputs.trust, opened.decision_us) == (4, True, 10**6)
         assert opened.start.xyz == pytest.approx((8.0, 0.0, 0.0))
@@ -577,7 +571,6 @@ def write_corridor(path: Path) -> None:
 
 def write_log(path: Path) -> None:
     keyframes = [
-        {"time_us": 100_000 * k, "world_from_rig": {"xyz": [0.5 * k, 0, 0], "q": [1, 0, 0, 0]}}
-        for k in range(21)
+        {"time_us": 100_000 * k, "world_from_rig": {"xyz": [0.5 * k, 0, 0], "q": [1, 0, 0, 0]}} for k in range(21)
     ]
     path.write_text(json.dumps({"name": "log", "keyframes": keyframes}))

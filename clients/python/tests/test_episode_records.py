@@ -215,9 +215,7 @@ def test_kill_9_of_a_run_leaves_readable_records(quick_reader: dict[str, str], t
     assert shown.returncode == 0 and f"steps       {frames[-1]['step']}" in shown.stdout, shown.stdout
 
 
-def test_kill_9_of_a_server_loses_at_most_the_step_under_way(
-    quick_reader: dict[str, str], tmp_path: Path
-) -> None:
+def test_kill_9_of_a_server_loses_at_most_the_step_under_way(quick_reader: dict[str, str], tmp_path: Path) -> None:
     draw = random.Random(17)
     for attempt in range(4):
         folder = tmp_path / str(attempt)

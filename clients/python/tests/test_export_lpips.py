@@ -73,7 +73,8 @@ ALEXNET: list[Any] = [
     (4, 2), "relu", 3, (1, 2), "relu", 3, (1, 1), "relu", (1, 1), "relu", (1, 1), "relu",
 ]  # fmt: skip
 VGG16: list[Any] = [
-    (1, 1), "relu", (1, 1), "relu", 2, (1, 1), "relu", (1, 1), "relu", 2, (1, 1), "relu", (1, 1), "relu", (1, 1), "relu", 2,
+    (1, 1), "relu", (1, 1), "relu", 2, (1, 1), "relu", (1, 1), "relu", 2,
+    (1, 1), "relu", (1, 1), "relu", (1, 1), "relu", 2,
     (1, 1), "relu", (1, 1), "relu", (1, 1), "relu", 2, (1, 1), "relu", (1, 1), "relu", (1, 1), "relu",
 ]  # fmt: skip
 SQUEEZENET: list[Any] = [(2, 0), "relu", 3, "fire", "fire", 3, "fire", "fire", 3, "fire", "fire", "fire", "fire"]
@@ -83,8 +84,8 @@ SLICES = {"alex": [2, 5, 8, 10, 12], "vgg": [4, 9, 16, 23, 30], "squeeze": [2, 5
 
 def features(net: str, arrays: dict[str, Array], x: Array) -> list[Array]:
     """Of an image [3, h, w]: behind each slice."""
-    relu = lambda x: np.maximum(x, 0.0)  # noqa: E731
-    get = lambda layer: [arrays[f"features.{layer}.{kind}"].astype(float) for kind in ("weight", "bias")]  # noqa: E731
+    relu = lambda x: np.maximum(x, 0.0)
+    get = lambda layer: [arrays[f"features.{layer}.{kind}"].astype(float) for kind in ("weight", "bias")]
     taps = []
     for index, layer in enumerate(FEATURES[net]):
         if layer == "relu":
@@ -125,7 +126,9 @@ def pair(height: int, width: int, seed: int = 2) -> tuple[Array, Array]:
 
 def session(path: Path) -> Callable[[Array, Array], Array]:
     run = onnxruntime.InferenceSession(path.with_suffix(".onnx"), providers=["CPUExecutionProvider"])
-    assert {port.name: port.shape for port in run.get_inputs()} == dict.fromkeys(("image", "truth"), [1, 3, "height", "width"])
+    assert {port.name: port.shape for port in run.get_inputs()} == dict.fromkeys(
+        ("image", "truth"), [1, 3, "height", "width"]
+    )
 
     def distance(image: Array, truth: Array) -> Array:
         (found,) = run.run(["distance"], {"image": image[None], "truth": truth[None]})
@@ -169,7 +172,11 @@ def test_the_networks_have_the_sizes_of_the_published_ones() -> None:
 def test_weights_of_the_package_give_the_same_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Names of lpips.LPIPS(net="squeeze").state_dict(): its slices keep torchvision's numbers.
     classifier, linear = weights("squeeze")
-    slices = {name: 1 + sum(int(name.split(".")[1]) >= end for end in SLICES["squeeze"]) for name in classifier if "features" in name}
+    slices = {
+        name: 1 + sum(int(name.split(".")[1]) >= end for end in SLICES["squeeze"])
+        for name in classifier
+        if "features" in name
+    }
     state = {f"net.slice{number}.{name.removeprefix('features.')}": classifier[name] for name, number in slices.items()}
     state |= linear | {name.replace("lin", "lins.", 1): values for name, values in linear.items()}
     state |= {"scaling_layer.shift": np.zeros((1, 3, 1, 1), np.float32)}
@@ -199,7 +206,7 @@ def test_wrong_weights_are_refused_and_nothing_is_written(tmp_path: Path, capsys
     out = tmp_path / "lpips.onnx"
     out.write_bytes(b"as it was")
     classifier, linear = weights("squeeze")
-    stored = lambda name, arrays: (save_file(arrays, tmp_path / name), tmp_path / name)[1]  # noqa: E731
+    stored = lambda name, arrays: (save_file(arrays, tmp_path / name), tmp_path / name)[1]
     good = files("squeeze", tmp_path)
     half = dict(classifier)
     half.pop("features.4.expand3x3.bias")
@@ -221,7 +228,9 @@ def test_wrong_weights_are_refused_and_nothing_is_written(tmp_path: Path, capsys
         with pytest.raises(ExportError) as refused:
             export_lpips.export("squeeze", out, given)
         assert fault in str(refused.value), refused.value
-    with pytest.raises(ExportError, match=r"features\.0\.(weight|bias): the shape .*; alex has |alex has no such array"):
+    with pytest.raises(
+        ExportError, match=r"features\.0\.(weight|bias): the shape .*; alex has |alex has no such array"
+    ):
         export_lpips.export("alex", out, good)
     with pytest.raises(ExportError, match=r"--out: .*; a name that ends with \.onnx"):
         export_lpips.export("squeeze", tmp_path / "lpips.json", good)
@@ -236,7 +245,9 @@ def test_wrong_weights_are_refused_and_nothing_is_written(tmp_path: Path, capsys
 
 
 def test_eval_measures_with_it(tmp_path: Path) -> None:
-    written = export_lpips.main(["--net", "alex", "--out", str(tmp_path / "lpips.onnx"), "--weights", *map(str, files("alex", tmp_path))])
+    written = export_lpips.main(
+        ["--net", "alex", "--out", str(tmp_path / "lpips.onnx"), "--weights", *map(str, files("alex", tmp_path))]
+    )
     assert written == 0
     manifest = json.loads((tmp_path / "lpips.json").read_text())
     assert manifest["files"][0]["path"] == "lpips.onnx" and manifest["name"] == "lpips-alex"
@@ -250,7 +261,9 @@ def test_eval_measures_with_it(tmp_path: Path) -> None:
     from PIL import Image
 
     shown = np.asarray(Image.open(tmp_path / "rendered" / "ahead.png").convert("RGB"))
-    changed = np.clip(shown.astype(int) + np.random.default_rng(3).integers(-40, 41, shown.shape), 0, 255).astype(np.uint8)
+    changed = np.clip(shown.astype(int) + np.random.default_rng(3).integers(-40, 41, shown.shape), 0, 255).astype(
+        np.uint8
+    )
     (tmp_path / "real").mkdir()
     Image.fromarray(changed).save(tmp_path / "real" / "ahead.png")
     library = next((Path(onnxruntime.__file__).parent / "capi").glob("libonnxruntime.so*"))
@@ -266,7 +279,17 @@ def test_eval_measures_with_it(tmp_path: Path) -> None:
 def street(folder: Path) -> None:
     """A scene of some Gaussians, and a list of one camera that sees them."""
     random = np.random.default_rng(1)
-    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+    names = [
+        "x",
+        "y",
+        "z",
+        "f_dc_0",
+        "f_dc_1",
+        "f_dc_2",
+        "opacity",
+        *(f"scale_{i}" for i in range(3)),
+        *(f"rot_{i}" for i in range(4)),
+    ]
     count = 400
     values = np.concatenate(
         [
@@ -278,7 +301,13 @@ def street(folder: Path) -> None:
         ],
         1,
     ).astype("<f4")
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *(f"property float {name}" for name in names), "end_header"]
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {count}",
+        *(f"property float {name}" for name in names),
+        "end_header",
+    ]
     (folder / "scene.ply").write_bytes("\n".join([*header, ""]).encode() + values.tobytes())
     camera = {"name": "ahead", "image": "ahead.png", "width": 96, "height": 80, "fx": 80, "fy": 80, "cx": 48, "cy": 40}
     pose = {"position": [0, 0, -5], "R_world_to_cam": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}

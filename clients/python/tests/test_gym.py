@@ -275,9 +275,7 @@ def test_unknown_cameras_are_refused_by_the_server(server: Server) -> None:
 def test_the_vector_environment_is_n_environments(server: Server) -> None:
     """Observations, rewards, ends and restarts equal those of Gymnasium's own SyncVectorEnv, step by step."""
     arguments = {**SMALL, "horizon": 4, "server": server.url}
-    ours = gymnasium.make_vec(
-        "wildcity/Drive-v0", num_envs=3, vectorization_mode="vector_entry_point", **arguments
-    )
+    ours = gymnasium.make_vec("wildcity/Drive-v0", num_envs=3, vectorization_mode="vector_entry_point", **arguments)
     theirs = gymnasium.vector.SyncVectorEnv([lambda: DriveEnv(**arguments)] * 3)
     numbers = np.random.default_rng(7)
     try:
@@ -290,9 +288,7 @@ def test_the_vector_environment_is_n_environments(server: Server) -> None:
             compare(result, theirs.step(actions))
             assert ours.observation_space.contains(result[0])
         mask = np.array([True, False, False])
-        compare(
-            ours.reset(seed=9, options={"reset_mask": mask}), theirs.reset(seed=9, options={"reset_mask": mask})
-        )
+        compare(ours.reset(seed=9, options={"reset_mask": mask}), theirs.reset(seed=9, options={"reset_mask": mask}))
     finally:
         ours.close()
         theirs.close()
@@ -351,7 +347,10 @@ def test_serve_starts_and_stops_the_program(tmp_path: Path) -> None:
 
 
 def test_a_server_that_does_not_start_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ServeFailed, match=r"(?s)ended with 2.*--colour"), wildcity.serve(tmp_path, arguments=["--colour"]):
+    with (
+        pytest.raises(ServeFailed, match=r"(?s)ended with 2.*--colour"),
+        wildcity.serve(tmp_path, arguments=["--colour"]),
+    ):
         raise AssertionError("it started")
     silent = tmp_path / "silent"
     silent.write_text("#!/bin/sh\nexec sleep 60\n")

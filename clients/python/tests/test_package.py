@@ -43,9 +43,7 @@ def test_the_types_are_right_for_the_first_and_the_last_supported_python(version
     assert done.returncode == 0, done.stdout
 
 
-def test_a_wheel_carries_the_program(
-    reader: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wheel_carries_the_program(reader: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Built here, installed in an empty environment, which has the program and the client then."""
     # The fastest one: the program is large, and the size of its wheel is not what is tested.
     monkeypatch.setattr(zlib, "Z_DEFAULT_COMPRESSION", zlib.Z_BEST_SPEED)
@@ -114,3 +112,12 @@ def test_the_newest_glibc_symbol_gives_the_platform() -> None:
     assert tag.startswith("manylinux_2_35_")
     with pytest.raises(ValueError, match="names no glibc"):
         build_wheel.platform_tag(b"static")
+
+
+def test_a_release_has_the_version_as_its_tag_and_a_section_of_the_changelog() -> None:
+    version = field(CLIENT / "pyproject.toml", "version")
+    notes = [sys.executable, str(ROOT / ".ci" / "release_notes.py")]
+    done = subprocess.run([*notes, f"v{version}"], capture_output=True, text=True)
+    assert done.returncode == 0 and "### " in done.stdout, done.stderr
+    for tag in (version, f"v{version}.1", "v0.0.1"):
+        assert subprocess.run([*notes, tag], capture_output=True).returncode == 1, tag

@@ -1,4 +1,5 @@
-"""The model that comes with the project, run by onnxruntime as the server does, and the warp that it was trained with."""
+"""The model that comes with the project, run by onnxruntime as the server does, and the warp that it was trained
+with."""
 
 from __future__ import annotations
 
@@ -44,7 +45,16 @@ def test_the_graph_is_what_the_manifest_says(session: onnxruntime.InferenceSessi
 
 def test_the_server_takes_the_file_and_draws_it_in_tiles_that_equal_the_whole() -> None:
     library = next((Path(onnxruntime.__file__).parent / "capi").glob("libonnxruntime.so*"))
-    command = [binary(), "repair", "check", ROOT / "scenes" / "repair.json", "--onnxruntime", library, "--size", "64x64"]
+    command = [
+        binary(),
+        "repair",
+        "check",
+        ROOT / "scenes" / "repair.json",
+        "--onnxruntime",
+        library,
+        "--size",
+        "64x64",
+    ]
     check = subprocess.run(command, capture_output=True, text=True)
     assert check.returncode == 0, check.stderr
     # Two convolutions of 3 x 3 at each size on the way down and one on the way up, the last one at full size.

@@ -1,7 +1,7 @@
 """RFC 6455 against the real server, by two WebSocket implementations that are not this project's.
 
-`websockets` is a complete client; `wsproto` (the implementation of Hypercorn) turns events into bytes and back, so that a
-test decides about every frame. The cases follow the groups of the Autobahn test suite: 1 framing, 2 pings and pongs,
+`websockets` is a complete client; `wsproto` (the implementation of Hypercorn) turns events into bytes and back, so that
+a test decides about every frame. The cases follow the groups of the Autobahn test suite: 1 framing, 2 pings and pongs,
 3 reserved bits, 4 opcodes, 5 fragmentation, 6 UTF-8, 7 close handling, 9 limits.
 """
 
@@ -95,9 +95,7 @@ class Wire:
         self.socket = socket.create_connection((address.hostname, address.port), timeout=10)
         self.connection = WSConnection(ConnectionType.CLIENT)
         self.events: list[Any] = []
-        request = Request(
-            host=address.netloc, target=address.path, subprotocols=["wildcity.v1"]
-        )
+        request = Request(host=address.netloc, target=address.path, subprotocols=["wildcity.v1"])
         self.send(request)
         accepted = self.next()
         assert isinstance(accepted, AcceptConnection), accepted

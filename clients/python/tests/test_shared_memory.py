@@ -17,7 +17,7 @@ import pytest
 import wildcity
 from conftest import vector
 from fake_server import FakeServer
-from test_end_to_end import PAIR, Server, server  # noqa: F401
+from test_end_to_end import PAIR, Server, server
 from wildcity import Action, ConnectFailed, Observation, Outputs, Pose, SlotInUse
 
 Connect = Callable[..., Any]
@@ -47,7 +47,7 @@ def is_given_back(names: set[str]) -> None:
 @pytest.mark.parametrize("encoding", ["raw", "png"])
 def test_memory_and_socket_have_the_same_bytes(
     connect: Connect,
-    server: Server,  # noqa: F811
+    server: Server,
     encoding: Any,
     copy: bool,
 ) -> None:
@@ -75,7 +75,7 @@ def test_memory_and_socket_have_the_same_bytes(
     client.close()
 
 
-def test_no_array_changes_while_it_exists(connect: Connect, server: Server) -> None:  # noqa: F811
+def test_no_array_changes_while_it_exists(connect: Connect, server: Server) -> None:
     client = connect(server.url, shared_memory=True, copy=False)
     session = client.open("corridor", rig=PAIR, outputs=Outputs(encoding="raw", depth=True))
     kept = session.reset(seed=1).images["front"]
@@ -105,7 +105,7 @@ def test_no_array_changes_while_it_exists(connect: Connect, server: Server) -> N
     client.close()
 
 
-def test_what_is_let_go_is_free_without_the_collector(connect: Connect, server: Server) -> None:  # noqa: F811
+def test_what_is_let_go_is_free_without_the_collector(connect: Connect, server: Server) -> None:
     client = connect(server.url, shared_memory=True, copy=False)
     session = client.open("corridor", rig=PAIR, outputs=Outputs(encoding="png", depth=True), dynamics="kinematic")
     gc.collect()
@@ -127,7 +127,7 @@ def test_what_is_let_go_is_free_without_the_collector(connect: Connect, server: 
     session.close()
 
 
-def test_several_sessions_share_the_memory_of_their_connection(connect: Connect, server: Server) -> None:  # noqa: F811
+def test_several_sessions_share_the_memory_of_their_connection(connect: Connect, server: Server) -> None:
     client = connect(server.url, shared_memory=True, copy=False)
     plain = connect(server.url)
     small = Outputs(cameras=("rear",), encoding="raw")
@@ -151,7 +151,7 @@ def test_several_sessions_share_the_memory_of_their_connection(connect: Connect,
     client.close()
 
 
-def test_memory_is_given_back(connect: Connect, server: Server) -> None:  # noqa: F811
+def test_memory_is_given_back(connect: Connect, server: Server) -> None:
     files = set(os.listdir("/dev/shm"))
     before = names_of_memory()
     client = connect(server.url, shared_memory=True, copy=False)

@@ -10,9 +10,9 @@ from test_end_to_end import PAIR, Server, server
 
 pytest.importorskip("stable_baselines3", reason="pip install stable-baselines3, which needs PyTorch")
 
-import torch  # noqa: E402
-from stable_baselines3 import PPO  # noqa: E402
-from stable_baselines3.common.monitor import Monitor  # noqa: E402
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.monitor import Monitor
 
 STEPS = 2_000
 

@@ -12,6 +12,7 @@ from typing import Any, get_args
 import jsonschema
 import numpy as np
 import pytest
+import wildcity
 from conftest import PROTOCOL, frame, vector
 from wildcity import (
     Action,
@@ -71,12 +72,8 @@ SENSORS = Sensors(
 )
 HERE = Pose((12.5, -3.25, 0.125), (0.8, 0.0, 0.0, 0.6))
 ABOVE = Pose((12.5, -3.25, 30.0))
-PLANNED = Trajectory(
-    (TimedPose(100_000, Pose((1.5, 0.5, 0.0))), TimedPose(200_000, Pose((3.25, 0.5, 0.0))))
-)
-LONGER = Trajectory(
-    (TimedPose(500_000, Pose((1.5, 0.5, 0.0))), TimedPose(1_000_000, Pose((3.25, 0.5, 0.0))))
-)
+PLANNED = Trajectory((TimedPose(100_000, Pose((1.5, 0.5, 0.0))), TimedPose(200_000, Pose((3.25, 0.5, 0.0)))))
+LONGER = Trajectory((TimedPose(500_000, Pose((1.5, 0.5, 0.0))), TimedPose(1_000_000, Pose((3.25, 0.5, 0.0)))))
 LOG = Station("log", 12.5)
 FRONT = Camera("front", 4, 3, 3.5, 3.5, 2.0, 1.5, Pose((1.6, 0.0, 1.5), (0.5, -0.5, 0.5, -0.5)))
 REAR = dataclasses.replace(
@@ -85,9 +82,7 @@ REAR = dataclasses.replace(
     camera_to_rig=Pose((-0.9, 0.0, 1.4), (0.5, -0.5, -0.5, 0.5)),
     lens=Lens("fisheye", k=(-0.03, -0.005, -0.001, 0.001), max_angle=1.2),
     shutter=Shutter("top_to_bottom", 30_000),
-    exposure=Exposure(
-        matrix=((1.25, 0.0, 0.0), (0.0, 1.125, -0.0625), (0.0, 0.0, 1.5)), offset=(0.0, -0.03125, 0.0)
-    ),
+    exposure=Exposure(matrix=((1.25, 0.0, 0.0), (0.0, 1.125, -0.0625), (0.0, 0.0, 1.5)), offset=(0.0, -0.03125, 0.0)),
 )
 SEEN = dataclasses.replace(
     FRONT, exposure=Exposure(gain=(1.5, 1.0, 0.75)), overlay=png_data_uri(b"hood"), native_size=(8.0, 6.5)
@@ -128,9 +123,7 @@ REQUESTS: dict[str, Callable[[SessionProtocol], Any]] = {
     "open_repair": lambda c: c.open("street", repair=Repair("zero-dce", 0.625, 0.875, 0.125, 4, "error")),
     "step_action": lambda c: c.step(Action(-1.5, 0.025), False),
     "step_trajectory": lambda c: c.step(PLANNED, False),
-    "step_until": lambda c: c.step(
-        LONGER, False, 1_000_000, {"confidence": 0.75, "reasoning": "a clear road"}
-    ),
+    "step_until": lambda c: c.step(LONGER, False, 1_000_000, {"confidence": 0.75, "reasoning": "a clear road"}),
     "step": lambda c: c.step(HERE, False),
     "step_terminate": lambda c: c.step(HERE, True),
     "observe": lambda c: c.observe([HERE, ABOVE]),
@@ -174,6 +167,8 @@ def names(folder: str) -> list[str]:
 @pytest.mark.parametrize("name", names("requests"))
 def test_requests_are_the_golden_ones(name: str) -> None:
     golden = vector(f"requests/{name}.json")
+    if "client" in golden:
+        golden["client"]["version"] = wildcity.__version__
     protocol = SessionProtocol("golden")
     protocol.first_seq = protocol.next_seq = golden["seq"]
     assert json.loads(next(REQUESTS[name](protocol))) == golden
@@ -190,9 +185,7 @@ def test_answers_keep_everything(name: str) -> None:
 @pytest.mark.parametrize("name", names("answers"))
 def test_unknown_fields_of_answers_are_ignored(name: str) -> None:
     golden = vector(f"answers/{name}.json")
-    assert decode_answer(json.dumps(with_unknown_fields(golden))) == decode_answer(
-        json.dumps(golden)
-    )
+    assert decode_answer(json.dumps(with_unknown_fields(golden))) == decode_answer(json.dumps(golden))
 
 
 def test_unknown_fields_of_the_metadata_are_ignored() -> None:
@@ -227,8 +220,8 @@ def test_observations_of_several_sessions() -> None:
 
 
 def with_unknown_fields(value: Any) -> Any:
-    """Adds a field to every object, except `profile`, `period_us` and the `cameras` of sensors: they are maps, so any field
-    is known."""
+    """Adds a field to every object, except `profile`, `period_us` and the `cameras` of sensors: they are maps, so any
+    field is known."""
     if isinstance(value, list):
         return [with_unknown_fields(item) for item in value]
     if not isinstance(value, dict):
@@ -246,7 +239,8 @@ def with_unknown_fields(value: Any) -> Any:
 
 
 @pytest.mark.parametrize(
-    "name", ["raw", "png", "jpeg", "two_poses", "bundle", "normals", "instances", "trust", "repair", "sensors", "no_images"]
+    "name",
+    ["raw", "png", "jpeg", "two_poses", "bundle", "normals", "instances", "trust", "repair", "sensors", "no_images"],
 )
 def test_observations_decode_to_their_contents(name: str) -> None:
     expected = vector(f"observations/{name}.expected.json")
@@ -277,9 +271,7 @@ def without_absent(metadata: dict[str, Any]) -> dict[str, Any]:
     return metadata
 
 
-def check_image(
-    observation: Observation, pose: int, camera: str, expected: dict[str, Any], tolerance: int
-) -> None:
+def check_image(observation: Observation, pose: int, camera: str, expected: dict[str, Any], tolerance: int) -> None:
     view = observation.views[pose]
     image = view.images[camera]
     assert image.dtype == np.uint8 and list(image.shape) == expected["shape"]
@@ -494,7 +486,10 @@ BEYOND_A_SCHEMA = {
     "unsupported_protocol",
     "answer_too_large",
     "scenario_invalid",
-} | {f"unknown_{what}" for what in "session twin version rig camera trajectory repair scenario state".split()}
+} | {
+    f"unknown_{what}"
+    for what in ["session", "twin", "version", "rig", "camera", "trajectory", "repair", "scenario", "state"]
+}
 DEPENDS_ON_OTHERS = (
     # Integers above 2^53 and 2^64, lengths of quaternions, and what the drive, the steps and the other cameras are.
     ("seq", "1e18"),

@@ -146,7 +146,9 @@ export class EpisodePage implements Page {
       const [first] = recordings;
       const { trajectories } = await get<Twin>(`v1/twins/${first!.twin}`);
       await this.map.load(first!.twin, first!.frames[0]!.version, trajectories.map(({ name }) => name));
-      recordings.forEach(({ frames }, at) => this.map.path(frames.map(({ pose }) => pose.xyz), at === 0 ? "accent" : "warm"));
+      for (const [at, { frames }] of recordings.entries()) {
+        this.map.path(frames.map(({ pose }) => pose.xyz), at === 0 ? "accent" : "warm");
+      }
       this.map.lanes(recordings.flatMap(({ lanes }) => lanes));
       this.showEvents(recordings);
       const line = el("div.line", {}, this.play, el("div.track", {}, this.slider, this.marks), this.time);

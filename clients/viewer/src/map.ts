@@ -238,7 +238,7 @@ export class MapView {
       line(path, colour("line"), Math.max(5, 3 * this.pixelsPerM));
       line(path, colour("dim"), 1, [5, 5]);
     }
-    this.ghosts.forEach((ghost) => line(ghost.points, colour(ghost.colour), 1.5));
+    for (const ghost of this.ghosts) line(ghost.points, colour(ghost.colour), 1.5);
     for (let at = 1; at < this.trail.length; at++) {
       const { xyz, trust } = this.trail[at]!;
       line([this.trail[at - 1]!.xyz, xyz], trust === undefined ? colour("accent") : trustColour(trust), 3);

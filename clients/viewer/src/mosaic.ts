@@ -87,7 +87,10 @@ export class Mosaic {
     const others = cells.filter((cell) => cell !== main);
     const isFront = ({ yaw }: Cell): boolean => Math.abs(yaw) < FRONT_RAD;
     const rows = [cells.filter(isFront), cells.filter((cell) => !isFront(cell))].filter((row) => row.length > 0);
-    if (width < NARROW_PX || height === 0) return this.place([[main], others], [0, 0]);
+    if (width < NARROW_PX || height === 0) {
+      this.place([[main], others], [0, 0]);
+      return;
+    }
 
     const stripWidth = Math.min(width, STRIP_SHARE * height * aspectOf(others));
     const stripHeight = others.length ? stripWidth / aspectOf(others) + GAP_PX : 0;

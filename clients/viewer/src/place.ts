@@ -286,7 +286,10 @@ export class PlacePage implements Page {
     const at = this.step === "path" && ground ? this.onGround(ground, x, y) : this.placeAt(x, y);
     const before = this.clicks.of(this.step).length;
     this.clicks.click(this.step, at);
-    if (!at) return showStatus("there is nothing at that place: click on a surface", "bad");
+    if (!at) {
+      showStatus("there is nothing at that place: click on a surface", "bad");
+      return;
+    }
     const places = this.clicks.of(this.step).length;
     showStatus(places > before ? "" : "begun again with this place; Undo brings the earlier places back");
     if (this.step === "ground" && places === 3 && this.ground) this.setUp(normalOf(this.ground));

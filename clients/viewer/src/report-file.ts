@@ -67,10 +67,10 @@ export function parseWindows(html: string): Map<string, WorstWindow> {
     if (name === undefined || place === undefined) continue;
     const files = [...figure.matchAll(/src="data:image\/png;base64,([^"]*)"/g)].map(([, data]) =>
       new Blob([Uint8Array.from(atob(data!), (character) => character.charCodeAt(0))], { type: "image/png" }));
-    windows.set(unescape(name), { place: unescape(place), files });
+    windows.set(unescaped(name), { place: unescaped(place), files });
   }
   return windows;
 }
 
-const unescape = (text: string): string =>
+const unescaped = (text: string): string =>
   text.replaceAll("&lt;", "<").replaceAll("&gt;", ">").replaceAll("&quot;", '"').replaceAll("&amp;", "&");

@@ -9,7 +9,7 @@ const [a, b, c, d] = [[0, 0, 0], [2, 0, 0], [0, 1, 0], [5, 5, 0]];
 
 function clicked(step, ...places) {
   const clicks = new Clicks();
-  places.forEach((at) => clicks.click(step, at));
+  for (const at of places) clicks.click(step, at);
   return clicks;
 }
 
@@ -30,7 +30,7 @@ test("a double click leaves the places as they were", () => {
 test("clicks of a double click that hit nothing are not taken back", () => {
   for (const pair of [[undefined, undefined], [d, undefined], [undefined, d]]) {
     const clicks = clicked("path", a, b);
-    pair.forEach((at) => clicks.click("path", at));
+    for (const at of pair) clicks.click("path", at);
     clicks.restoreBeforeDoubleClick("path");
     assert.deepEqual(clicks.of("path"), [a, b]);
   }

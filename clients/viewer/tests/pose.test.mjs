@@ -3,7 +3,9 @@ import { test } from "node:test";
 import { bundled } from "./bundle.mjs";
 
 const { heading, looking, multiply, rotate, transform } = await bundled("pose");
-const near = (found, expected) => found.forEach((value, at) => assert.ok(Math.abs(value - expected[at]) < 1e-12, `${found}`));
+const near = (found, expected) => {
+  for (const [at, value] of found.entries()) assert.ok(Math.abs(value - expected[at]) < 1e-12, `${found}`);
+};
 
 test("rotations are those of the protocol", () => {
   const half = Math.SQRT1_2;

@@ -32,7 +32,7 @@ const { load } = await bundled("record");
 
 /** Lets the server have a record. */
 function serve(record) {
-  const text = record.map((line) => JSON.stringify(line)).join("\n") + "\n";
+  const text = `${record.map((line) => JSON.stringify(line)).join("\n")}\n`;
   globalThis.fetch = async (path) => {
     assert.equal(path, "v1/episodes/run-1");
     return new Response(text);

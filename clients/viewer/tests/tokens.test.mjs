@@ -35,7 +35,7 @@ const refused = (status) => new RegExp(`^Failed to load resource: the server res
 /** Chromium logs each refused request: these, and nothing else. */
 function assertComplaints(complaints, ...statuses) {
   assert.equal(complaints.length, statuses.length, complaints.join("\n"));
-  statuses.forEach((status, at) => assert.match(complaints[at], refused(status)));
+  for (const [at, status] of statuses.entries()) assert.match(complaints[at], refused(status));
 }
 
 test("a server with tokens asks for one, and a ticket opens the session", async () => {

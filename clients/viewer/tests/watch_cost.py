@@ -18,13 +18,25 @@ STEPS = 8
 
 url, twin = sys.argv[1:3]
 blocks = int(sys.argv[3]) if len(sys.argv) > 3 else 40
-sizes = {"front": (480, 310), "front_left": (240, 155), "front_right": (240, 155), "left": (248, 146), "right": (248, 146), "rear": (248, 146)}
+sizes = {
+    "front": (480, 310),
+    "front_left": (240, 155),
+    "front_right": (240, 155),
+    "left": (248, 146),
+    "right": (248, 146),
+    "rear": (248, 146),
+}
 outputs = Outputs(quality=85, images={name: ImagePart(size=size) for name, size in sizes.items()})
 
 
 def watch(session, stop, seen):
     """Reads what a watcher gets, until it is to stop."""
-    with connect(url.replace("/v1/session", f"/v1/sessions/{session}/watch"), subprotocols=["wildcity.watch.v1"], max_size=None, proxy=None) as watcher:
+    with connect(
+        url.replace("/v1/session", f"/v1/sessions/{session}/watch"),
+        subprotocols=["wildcity.watch.v1"],
+        max_size=None,
+        proxy=None,
+    ) as watcher:
         while not stop.is_set():
             try:
                 watcher.recv(timeout=0.05)
@@ -64,7 +76,15 @@ with wildcity.connect(url) as client, client.open(twin, session="watched", outpu
 ratio = lambda some: statistics.median(a / b for a, b in some)
 draw = random.Random(1)
 resampled = sorted(ratio(draw.choices(pairs, k=len(pairs))) for _ in range(2_000))
-print(json.dumps({
-    "watched_ms": round(statistics.median(a for a, _ in pairs), 2), "alone_ms": round(statistics.median(b for _, b in pairs), 2),
-    "ratio": round(ratio(pairs), 4), "interval_95": [round(resampled[50], 4), round(resampled[1949], 4)], "blocks": blocks, "steps": STEPS,
-}))
+print(
+    json.dumps(
+        {
+            "watched_ms": round(statistics.median(a for a, _ in pairs), 2),
+            "alone_ms": round(statistics.median(b for _, b in pairs), 2),
+            "ratio": round(ratio(pairs), 4),
+            "interval_95": [round(resampled[50], 4), round(resampled[1949], 4)],
+            "blocks": blocks,
+            "steps": STEPS,
+        }
+    )
+)

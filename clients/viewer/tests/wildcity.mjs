@@ -61,7 +61,9 @@ export async function behindWire(server) {
     near.pipe(far).pipe(near);
   });
   await new Promise((resolve) => wire.listen(0, "127.0.0.1", resolve));
-  const cut = () => sockets.forEach((socket) => socket.destroy());
+  const cut = () => {
+    for (const socket of sockets) socket.destroy();
+  };
   const stop = () => {
     wire.close();
     cut();

@@ -12,15 +12,6 @@ from websockets.asyncio.client import connect as connect_websocket
 from websockets.exceptions import WebSocketException
 
 from .authorization import authorization_headers
-from .session_protocol import (
-    CONNECT_OPTIONS,
-    Exchange,
-    Message,
-    SessionProtocol,
-    can_reuse_connection,
-    connect_failed,
-    translate_error,
-)
 from .errors import ConnectFailed, Disconnected, Refused, WildCityError
 from .observation import Observation
 from .protocol import (
@@ -47,6 +38,15 @@ from .protocol import (
     Trajectory,
     Welcome,
 )
+from .session_protocol import (
+    CONNECT_OPTIONS,
+    Exchange,
+    Message,
+    SessionProtocol,
+    can_reuse_connection,
+    connect_failed,
+    translate_error,
+)
 from .shared_memory import SharedMemory
 
 T = TypeVar("T")
@@ -66,8 +66,8 @@ async def connect(
     `name` appears in the server's log. `timeout` is how long an answer may take, in seconds; the server's own
     limits are shorter. `token` is for a server that was started with tokens; the default is `$WILDCITY_TOKEN`.
 
-    With `shared_memory`, observations come in memory that the server shares, in place of the socket. The server must run
-    on this machine, in the same container and as the same user. With `copy=False` the arrays of an observation are
+    With `shared_memory`, observations come in memory that the server shares, in place of the socket. The server must
+    run on this machine, in the same container and as the same user. With `copy=False` the arrays of an observation are
     views of that memory: at most two observations can be kept in addition to the requested one, and while arrays of an
     older one exist, calls raise `SlotInUse`.
 
@@ -253,7 +253,8 @@ async def _answer(connection: ClientConnection, request: str) -> Message:
 
 
 class Session:
-    """An open session, one of those of its client. An `async with` block closes it at its end, if the connection is still open."""
+    """An open session, one of those of its client. An `async with` block closes it at its end, if the connection is
+    still open."""
 
     def __init__(self, client: Client, name: str, opened: Opened | None) -> None:
         self.name = name

@@ -7,8 +7,8 @@
         seen = session.step(alpamayo.trajectory(pred_xyz, pred_rot))
 
 The dictionaries have the keys, types and shapes of `load_physical_aiavdataset` of Alpamayo 1, 1.5 and 2 Super, but for
-the recorded future. The models accept swapped cameras and reversed frames without an error, so `inputs` checks all of it
-and names the camera at fault. Needs numpy only; `as_torch` needs PyTorch.
+the recorded future. The models accept swapped cameras and reversed frames without an error, so `inputs` checks all of
+it and names the camera at fault. Needs numpy only; `as_torch` needs PyTorch.
 """
 
 from __future__ import annotations
@@ -134,10 +134,7 @@ def inputs(seen: Observation, model: Model = "1.5", task: str = "trajectory") ->
 def as_torch(data: Mapping[str, Any]) -> dict[str, Any]:
     """The inputs with every array as a `torch.Tensor` in the same memory (DLPack), on the CPU."""
     torch = importlib.import_module("torch")
-    return {
-        key: torch.from_dlpack(value) if isinstance(value, np.ndarray) else value
-        for key, value in data.items()
-    }
+    return {key: torch.from_dlpack(value) if isinstance(value, np.ndarray) else value for key, value in data.items()}
 
 
 def trajectory(pred_xyz: Any, pred_rot: Any, sample: int = 0) -> Trajectory:

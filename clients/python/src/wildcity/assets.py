@@ -134,9 +134,7 @@ def push_actor(
     return _actor(answer, "actor")
 
 
-def actors(
-    *, server: str = "http://127.0.0.1:8080", token: str | None = None, timeout: float = 60.0
-) -> ActorList:
+def actors(*, server: str = "http://127.0.0.1:8080", token: str | None = None, timeout: float = 60.0) -> ActorList:
     """All assets of a server, and those that are damaged.
 
     Raises `Refused` if the server refuses, and `ConnectFailed` if it does not answer.

@@ -67,8 +67,8 @@ class AugmentedViews:
     An item has `image` uint8 [h, w, 3], `mask` bool [h, w] (which pixels count), `depth` float32 [h, w] (metres, 0 for
     none: z, or the distance for a fisheye), `K` float64 [3, 3] (pixels, centres at 0.5), `world_from_camera` and
     `camera_from_world` float64 [4, 4] (the twin's axes; camera x right, y down, z forward), `weight` and `trust`
-    float32; with lenses also `distortion`. Images of cameras of different sizes do not fit into one batch: choose `cameras`, or
-    take a batch size of 1.
+    float32; with lenses also `distortion`. Images of cameras of different sizes do not fit into one batch: choose
+    `cameras`, or take a batch size of 1.
     """
 
     def __init__(
@@ -143,9 +143,7 @@ class AugmentedViews:
                 if not path.is_file():
                     raise AugmentedError(f"{path} is missing: run `wildcity augment` again")
                 if hashlib.sha256(path.read_bytes()).hexdigest() != expected:
-                    raise AugmentedError(
-                        f"{path} differs from its hash in augment.json: run `wildcity augment` again"
-                    )
+                    raise AugmentedError(f"{path} differs from its hash in augment.json: run `wildcity augment` again")
 
 
 def _rounds(folder: Path) -> Iterator[int]:
@@ -181,9 +179,7 @@ def _samples(folder: Path) -> Iterator[AugmentedSample]:
             repaired=sample.get("repair", {}).get("status") == "repaired",
             camera_model=model,
             files=sample["files"],
-            K=np.array(
-                [[frame["fl_x"], 0.0, frame["cx"]], [0.0, frame["fl_y"], frame["cy"]], [0.0, 0.0, 1.0]]
-            ),
+            K=np.array([[frame["fl_x"], 0.0, frame["cx"]], [0.0, frame["fl_y"], frame["cy"]], [0.0, 0.0, 1.0]]),
             distortion=np.array([frame[name] for name in names], np.float64),
             world_from_camera=_matrix(pose["xyz"], pose["q"]),
         )

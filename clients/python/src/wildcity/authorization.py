@@ -6,7 +6,8 @@ import os
 
 
 def authorization_headers(token: str | None) -> dict[str, str]:
-    """The header with `token`, or with `$WILDCITY_TOKEN` if it is None; no header without either, or if `token` is empty.
+    """The header with `token`, or with `$WILDCITY_TOKEN` if it is None; no header without either, or if `token` is
+    empty.
 
     White space around the token, such as the newline at the end of a file, is removed. Raises `ValueError` if it has
     other characters than a token. The message does not contain the token: messages end up in logs.

@@ -51,9 +51,7 @@ _TRAINERS = "gsplat, drivestudio, street_gaussians, splatfacto, INRIA or 3dgrut"
 _Arrays = dict[str, npt.NDArray[Any]]
 
 
-def convert(
-    source: str | PathLike[str], target: str | PathLike[str], model: str | None = None
-) -> int:
+def convert(source: str | PathLike[str], target: str | PathLike[str], model: str | None = None) -> int:
     """Writes the Gaussians of a checkpoint, and its sky if it has one, as safetensors.
 
     Returns the number of Gaussians. `model` selects one of several models of a checkpoint. `target` is written
@@ -73,7 +71,8 @@ def splats(source: str | PathLike[str], model: str | None = None) -> _Arrays:
     """The Gaussians of a checkpoint, with gsplat's names and shapes.
 
     means [N,3], quats [N,4] (w, x, y, z), scales [N,3] (natural logarithm), opacities [N] (logit), sh0 [N,1,3],
-    shN [N,K,3]; of drivestudio's RigidNodes also point_ids [N], the object of each Gaussian. Raises `CheckpointError` if there is no such model, or several and `model` is None.
+    shN [N,K,3]; of drivestudio's RigidNodes also point_ids [N], the object of each Gaussian. Raises `CheckpointError`
+    if there is no such model, or several and `model` is None.
     """
     name, found = _chosen(source, model)
     return _shaped_of(source, name, found.arrays)
@@ -105,11 +104,7 @@ def sky(source: str | PathLike[str]) -> _Arrays:
             names = [*_SKY_TENSORS, "appearance_embedding.weight"]
             found = {name: arrays.get(prefix + name) for name in names}
             if all(isinstance(found[name], np.ndarray) for name in _SKY_TENSORS):
-                return {
-                    name: values.astype("<f4")
-                    for name, values in found.items()
-                    if isinstance(values, np.ndarray)
-                }
+                return {name: values.astype("<f4") for name, values in found.items() if isinstance(values, np.ndarray)}
     return {}
 
 

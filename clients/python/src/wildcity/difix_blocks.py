@@ -119,7 +119,8 @@ class Attention(nn.Module):
 
 
 class Fused(torch.autograd.Function):
-    """The operator MultiHeadAttention of onnxruntime, which does not keep the scores. It is not part of ONNX's opset 17."""
+    """The operator MultiHeadAttention of onnxruntime, which does not keep the scores. It is not part of ONNX's opset
+    17."""
 
     @staticmethod
     def symbolic(graph: Any, q: Any, k: Any, v: Any, heads: int) -> Any:

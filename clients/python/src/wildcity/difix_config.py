@@ -1,6 +1,7 @@
 """Reads and checks the JSON files of a Difix folder: the sizes of the two networks, and the one step of the scheduler.
 
-Needs no PyTorch. Difix (Wu et al., "Difix3D+: Improving 3D Reconstructions with Single-Step Diffusion Models", CVPR 2025;
+Needs no PyTorch. Difix (Wu et al., "Difix3D+: Improving 3D Reconstructions with Single-Step Diffusion Models", CVPR
+2025;
 code: nv-tlabs/Difix3D) is SD-Turbo with skip connections in its autoencoder. Its folder has the layout of diffusers:
 `vae/config.json`, `unet/config.json`, `scheduler/scheduler_config.json`, and the weights next to them.
 """
@@ -55,7 +56,9 @@ class VaeConfig:
         widths = _integers(config, file, "block_out_channels")
         levels = len(widths)
         if levels != 4:
-            raise ExportError(f"{file}: block_out_channels", f"{levels} levels; Difix has 4, one for each skip convolution")
+            raise ExportError(
+                f"{file}: block_out_channels", f"{levels} levels; Difix has 4, one for each skip convolution"
+            )
         expected = {
             "in_channels": 3,
             "out_channels": 3,
@@ -163,7 +166,8 @@ class Step:
     """The one step of the scheduler: clean = (latent - noise_weight * noise) / signal_weight.
 
     A latent image at time t is sqrt(a) * clean + sqrt(1 - a) * noise (DDPM, Ho et al. 2020, equation 4), where a is the
-    product of 1 - beta up to t. The network predicts the noise. There is no step after this one, so the prediction of the
+    product of 1 - beta up to t. The network predicts the noise. There is no step after this one, so the prediction of
+    the
     clean image is the result, and no noise is added: what DDPMScheduler computes with `timesteps=[199]`.
     """
 
@@ -177,7 +181,8 @@ class Step:
         """Checks a `scheduler_config.json` and computes the step. Raises `ExportError` with the key.
 
         sd-turbo's file has beta_start 0.00085, beta_end 0.012, `scaled_linear` (the square roots of the betas are
-        equidistant) and 1000 steps. Then a is 0.755238 at 199. `clip_sample` does not count: NVIDIA's pipeline switches it off.
+        equidistant) and 1000 steps. Then a is 0.755238 at 199. `clip_sample` does not count: NVIDIA's pipeline switches
+        it off.
         """
         expected = {
             "beta_schedule": "scaled_linear",
@@ -188,7 +193,7 @@ class Step:
         }
         _expect(config, file, expected)
         if "beta_schedule" not in config:
-            raise ExportError(f"{file}: beta_schedule", "missing; SD-Turbo has \"scaled_linear\"")
+            raise ExportError(f"{file}: beta_schedule", 'missing; SD-Turbo has "scaled_linear"')
         count = _integer(config, file, "num_train_timesteps")
         if count <= timestep:
             raise ExportError(f"{file}: num_train_timesteps", f"{count}; more than the time {timestep} of Difix")
@@ -201,10 +206,11 @@ class Step:
 
 
 def image_multiple(vae: VaeConfig, unet: UnetConfig) -> int:
-    """The sides of an image must be multiples of this, in pixels: each level of both networks halves them. 64 for SD-Turbo.
+    """The sides of an image must be multiples of this, in pixels: each level of both networks halves them. 64 for
+    SD-Turbo.
 
-    diffusers takes multiples of 8, with other sizes of `upsample` when a side of a level is odd. A graph is traced once,
-    so it has one rule for all sizes.
+    diffusers takes multiples of 8, with other sizes of `upsample` when a side of a level is odd. A graph is traced
+    once, so it has one rule for all sizes.
     """
     levels: int = len(vae.widths) - 1 + len(unet.widths) - 1
     return 1 << levels
@@ -215,7 +221,9 @@ def read_json(path: Path, field: str) -> dict[str, Any]:
     try:
         value = json.loads(path.read_text())
     except (OSError, ValueError) as error:
-        raise ExportError(field, f"{error}; give a folder in the layout of diffusers, such as nvidia/difix_ref") from error
+        raise ExportError(
+            field, f"{error}; give a folder in the layout of diffusers, such as nvidia/difix_ref"
+        ) from error
     if not isinstance(value, dict):
         raise ExportError(field, f"{type(value).__name__}; an object")
     return value

@@ -119,7 +119,8 @@ class Encoder(nn.Module):
         for level, width in enumerate(widths):
             block = Level()
             block.resnets = nn.ModuleList(
-                Resnet(before if layer == 0 else width, width, config.groups, FINE_EPS) for layer in range(config.layers)
+                Resnet(before if layer == 0 else width, width, config.groups, FINE_EPS)
+                for layer in range(config.layers)
             )
             if level + 1 < len(widths):
                 block.downsamplers = nn.ModuleList([Down(width, pad_before=0)])

@@ -134,7 +134,8 @@ class Transformer(nn.Module):
 
 
 class TransformerBlock(nn.Module):
-    """Self-attention over the tokens of all views of a place, then per view: cross-attention to the prompt, and two layers."""
+    """Self-attention over the tokens of all views of a place, then per view: cross-attention to the prompt, and two
+    layers."""
 
     def __init__(self, config: UnetConfig, level: int, views: int) -> None:
         super().__init__()

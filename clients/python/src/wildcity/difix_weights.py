@@ -1,8 +1,8 @@
 """Reads the tensors of a Difix folder into the network, and computes the embedding of the prompt.
 
 nvidia/difix and nvidia/difix_ref keep the decoder's adapters (LoRA, Hu et al. 2021) next to the weights they change:
-`decoder.conv_in.base_layer.weight`, `decoder.conv_in.lora_A.vae_skip.weight`, `decoder.conv_in.lora_B.vae_skip.weight`. The graph
-has their sum.
+`decoder.conv_in.base_layer.weight`, `decoder.conv_in.lora_A.vae_skip.weight`, `decoder.conv_in.lora_B.vae_skip.weight`.
+The graph has their sum.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from .difix_unet import sinusoids
 __all__ = ["folder", "load", "merge_adapters", "prompt_embedding"]
 
 LORA_ALPHA = 8
-"""The sum is base + alpha / rank * B A. src/model.py of nv-tlabs/Difix3D gives a rank (4) and no alpha: the default of peft's
-LoraConfig applies. `lora_alpha` in vae/config.json takes precedence."""
+"""The sum is base + alpha / rank * B A. src/model.py of nv-tlabs/Difix3D gives a rank (4) and no alpha: the default of
+peft's LoraConfig applies. `lora_alpha` in vae/config.json takes precedence."""
 
 F16_MAX = 65504.0
 

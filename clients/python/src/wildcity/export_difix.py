@@ -3,10 +3,10 @@
     python -m wildcity.export_difix --weights DIR --out difix_ref.onnx
     python -m wildcity.export_difix --weights nvidia/difix --out difix.onnx --no-reference --dtype f32
 
-`--weights` is a folder in the layout of diffusers, as nvidia/difix_ref and nvidia/difix have it: tokenizer, text_encoder, unet,
-vae, scheduler. If there is no such folder, the name is that of a repository, which is downloaded from huggingface.co.
-The weights may be used non-commercially only; wildcity has none. Needs `pip install 'wildcity[difix]'` (PyTorch), no
-GPU, and for f16 10 GB of memory.
+`--weights` is a folder in the layout of diffusers, as nvidia/difix_ref and nvidia/difix have it: tokenizer,
+text_encoder, unet, vae, scheduler. If there is no such folder, the name is that of a repository, which is downloaded
+from huggingface.co. The weights may be used non-commercially only; wildcity has none. Needs `pip install
+'wildcity[difix]'` (PyTorch), no GPU, and for f16 10 GB of memory.
 """
 
 from __future__ import annotations
@@ -116,7 +116,8 @@ def manifest(
     providers: Sequence[str] = ("cuda",),
     multiple: int = MULTIPLE,
 ) -> dict[str, Any]:
-    """The manifest of a graph (docs/repair.md). files: names and BLAKE3 of the .onnx file, then of its external weights."""
+    """The manifest of a graph (docs/repair.md). files: names and BLAKE3 of the .onnx file, then of its external
+    weights."""
     image = {"name": "image", "role": "rgb", "dtype": dtype, "range": [-1, 1]}
     recorded = {"name": "reference", "role": "reference", "dtype": dtype, "range": [-1, 1]}
     return {
@@ -145,7 +146,8 @@ def blake3(path: Path) -> str:
 
 
 def _write_graph(model: Difix, folder: Path, name: str, external_above: int) -> list[Path]:
-    """Writes the graph to a folder: the .onnx file, and a second file if the weights are larger than `external_above`."""
+    """Writes the graph to a folder: the .onnx file, and a second file if the weights are larger than
+    `external_above`."""
     import onnx
     import torch
 
@@ -210,7 +212,8 @@ def _difference(model: Difix, graph: Path) -> float:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Without the warnings of the tracer: that it is the older of two, and that checks of shapes are not in the graph."""
+    """Without the warnings of the tracer: that it is the older of two, and that checks of shapes are not in the
+    graph."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
@@ -225,7 +228,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--no-reference", action="store_true", help="for nvidia/difix, whose only input is the image")
     parser.add_argument("--dtype", choices=["f16", "f32"], default="f16", help="[default: f16]")
     parser.add_argument(
-        "--attention", choices=["plain", "fused"], default="plain", help="fused: an operator of onnxruntime [default: plain]"
+        "--attention",
+        choices=["plain", "fused"],
+        default="plain",
+        help="fused: an operator of onnxruntime [default: plain]",
     )
     parser.add_argument("--compare", action="store_true", help="compare the graph on the processor with PyTorch")
     parser.add_argument("--name", help="what sessions ask for [default: difix-ref, or difix]")

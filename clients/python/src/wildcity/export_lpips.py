@@ -3,11 +3,12 @@
     python -m wildcity.export_lpips --net alex --out lpips_alex.onnx
     python -m wildcity.export_lpips --net alex --weights alexnet.pth lpips/weights/v0.1/alex.pth --out lpips_alex.onnx
 
-LPIPS (Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018) compares features of a
-network that was trained to classify. wildcity has no weights. The first form takes them from the packages lpips and torchvision,
-which must be installed; torchvision downloads those of the classifier if they are not on the disk. The second form reads files:
-the classifier's of torchvision, and the linear weights that lpips has in its folder `weights/v0.1`; or one file with all
-of an `lpips.LPIPS`. Files end with .safetensors, .npz, or .pth (PyTorch must be installed). Needs `pip install 'wildcity[lpips]'`.
+LPIPS (Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018) compares
+features of a network that was trained to classify. wildcity has no weights. The first form takes them from the packages
+lpips and torchvision, which must be installed; torchvision downloads those of the classifier if they are not on the
+disk. The second form reads files: the classifier's of torchvision, and the linear weights that lpips has in its folder
+`weights/v0.1`; or one file with all of an `lpips.LPIPS`. Files end with .safetensors, .npz, or .pth (PyTorch must be
+installed). Needs `pip install 'wildcity[lpips]'`.
 """
 
 from __future__ import annotations
@@ -101,7 +102,8 @@ NETS: dict[str, Sequence[Step]] = {
     "squeeze": (
         Conv(0, 3, 64, 3, stride=2), Tap(), Pool(3, ceil=True), Fire(3, 64, 16, 128), Fire(4, 128, 16, 128), Tap(),
         Pool(3, ceil=True), Fire(6, 128, 32, 256), Fire(7, 256, 32, 256), Tap(), Pool(3, ceil=True),
-        Fire(9, 256, 48, 384), Tap(), Fire(10, 384, 48, 384), Tap(), Fire(11, 384, 64, 512), Tap(), Fire(12, 512, 64, 512), Tap(),
+        Fire(9, 256, 48, 384), Tap(), Fire(10, 384, 48, 384), Tap(), Fire(11, 384, 64, 512), Tap(),
+        Fire(12, 512, 64, 512), Tap(),
     ),
 }  # fmt: skip
 """torchvision's alexnet, vgg16 and squeezenet1_1, as far as lpips/pretrained_networks.py cuts them into slices."""
@@ -160,7 +162,11 @@ def collected(net: str, files: Sequence[tuple[str, Mapping[str, Any]]]) -> Array
             found[own] = array
     for name in expected:
         if name not in found:
-            part = "linear weights, which lpips has in weights/v0.1" if name.startswith("lin") else "classifier of torchvision"
+            part = (
+                "linear weights, which lpips has in weights/v0.1"
+                if name.startswith("lin")
+                else "classifier of torchvision"
+            )
             names = ", ".join(file for file, _ in files)
             raise ExportError(f"--weights {names}", f"no array {name}: it is in the {part}")
     return found
@@ -201,7 +207,10 @@ def graph(net: str, arrays: Arrays) -> bytes:
     x = made.node("Div", "scaled", [x, made.constant("scale", scale)])
 
     def conv(layer: str, x: str, side: int, stride: int = 1, pad: int = 0) -> str:
-        of = [x, *(made.constant(name, arrays[name]) for name in (f"features.{layer}.weight", f"features.{layer}.bias"))]
+        of = [
+            x,
+            *(made.constant(name, arrays[name]) for name in (f"features.{layer}.weight", f"features.{layer}.bias")),
+        ]
         done = made.node("Conv", layer, of, kernel_shape=[side] * 2, strides=[stride] * 2, pads=[pad] * 4)
         return made.node("Relu", f"{layer}.relu", [done])
 
@@ -214,7 +223,9 @@ def graph(net: str, arrays: Arrays) -> bytes:
             wide = [conv(f"{step.index}.expand1x1", squeezed, 1), conv(f"{step.index}.expand3x3", squeezed, 3, pad=1)]
             x = made.node("Concat", f"{step.index}.expanded", wide, axis=1)
         elif isinstance(step, Pool):
-            x = made.node("MaxPool", f"pool{at}", [x], kernel_shape=[step.side] * 2, strides=[2, 2], ceil_mode=int(step.ceil))
+            x = made.node(
+                "MaxPool", f"pool{at}", [x], kernel_shape=[step.side] * 2, strides=[2, 2], ceil_mode=int(step.ceil)
+            )
         else:
             distances.append(_tap(made, len(distances), x, arrays))
     total = distances[0]
@@ -227,7 +238,9 @@ def graph(net: str, arrays: Arrays) -> bytes:
     constants = [numpy_helper.from_array(values, name) for name, values in made.constants.items()]
     whole = helper.make_graph(made.nodes, f"lpips_{net}", images, [distance], constants)
     # onnxruntime reads version 8 of the format from 1.10 on.
-    model = helper.make_model(whole, ir_version=8, opset_imports=[helper.make_opsetid("", 17)], producer_name="wildcity")
+    model = helper.make_model(
+        whole, ir_version=8, opset_imports=[helper.make_opsetid("", 17)], producer_name="wildcity"
+    )
     checker.check_model(model)
     content: bytes = model.SerializeToString()
     return content
@@ -237,14 +250,18 @@ def _tap(made: _Graph, tap: int, x: str, arrays: Arrays) -> str:
     """The mean over the pixels of the weighted squares of differences, of features with the length 1."""
     name = f"tap{tap}"
     channels = made.constant("channels", np.array([1], np.int64))
-    squares = made.node("ReduceSum", f"{name}.squares", [made.node("Mul", f"{name}.squared", [x, x]), channels], keepdims=1)
+    squares = made.node(
+        "ReduceSum", f"{name}.squares", [made.node("Mul", f"{name}.squared", [x, x]), channels], keepdims=1
+    )
     epsilon = made.constant("epsilon", np.array(EPSILON, np.float32))
     length = made.node("Add", f"{name}.length", [made.node("Sqrt", f"{name}.root", [squares]), epsilon])
     unit = made.node("Div", f"{name}.unit", [x, length])
     image, truth = made.split("Split", [f"{name}.image", f"{name}.truth"], [unit], axis=0)
     apart = made.node("Sub", f"{name}.apart", [image, truth])
     apart = made.node("Mul", f"{name}.apart2", [apart, apart])
-    weighted = made.node("Conv", f"{name}.weighted", [apart, made.constant(f"lin{tap}", arrays[f"lin{tap}"])], kernel_shape=[1, 1])
+    weighted = made.node(
+        "Conv", f"{name}.weighted", [apart, made.constant(f"lin{tap}", arrays[f"lin{tap}"])], kernel_shape=[1, 1]
+    )
     return made.node("ReduceMean", f"{name}.mean", [weighted], axes=[2, 3], keepdims=1)
 
 
@@ -275,8 +292,8 @@ def export(
 
     net: "alex", "vgg" or "squeeze". weights: files; without them the installed package lpips.
 
-    Raises `ExportError` if the weights are not those of the network, or a file cannot be written. Then the files at `out`
-    are as they were.
+    Raises `ExportError` if the weights are not those of the network, or a file cannot be written. Then the files at
+    `out` are as they were.
     """
     out = Path(out)
     if out.suffix != ".onnx":
@@ -347,9 +364,13 @@ def main(arguments: list[str] | None = None) -> int:
     """The command line; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m wildcity.export_lpips", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument("--net", required=True, choices=list(NETS), help="the network; numbers of two cannot be compared")
+    parser.add_argument(
+        "--net", required=True, choices=list(NETS), help="the network; numbers of two cannot be compared"
+    )
     parser.add_argument("--out", required=True, help="the .onnx file; the manifest is written next to it")
-    parser.add_argument("--weights", nargs="+", default=[], help="files of weights [default: the installed package lpips]")
+    parser.add_argument(
+        "--weights", nargs="+", default=[], help="files of weights [default: the installed package lpips]"
+    )
     parser.add_argument("--providers", default="cpu", help="of the manifest, with commas [default: cpu]")
     chosen = parser.parse_args(arguments)
     try:

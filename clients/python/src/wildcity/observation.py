@@ -241,7 +241,8 @@ class View:
 
     @cached_property
     def instances(self) -> Mapping[str, NDArray[np.uint16]]:
-        """uint16 [height, width] by camera: 0 none, 1 the twin, else `Actor.instance`, if the session asked for them."""
+        """uint16 [height, width] by camera: 0 none, 1 the twin, else `Actor.instance`, if the session asked for
+        them."""
         return self._maps("instances")
 
     def _maps(self, output: str) -> Mapping[str, NDArray[Any]]:
@@ -256,9 +257,7 @@ class View:
 class _LazyArrays(Mapping[str, NDArray[Any]]):
     """Arrays by camera, made at the first access. `have` says which arrays exist, for errors."""
 
-    def __init__(
-        self, infos: Mapping[str, ImageInfo], make: Callable[[ImageInfo], NDArray[Any]], have: str
-    ) -> None:
+    def __init__(self, infos: Mapping[str, ImageInfo], make: Callable[[ImageInfo], NDArray[Any]], have: str) -> None:
         self._infos = infos
         self._make = make
         self._have = have
@@ -317,8 +316,7 @@ def _decode_image(content: _Content, image: ImageInfo) -> NDArray[np.uint8]:
             # Checked before decoding, so that a small file cannot cause a large allocation.
             if opened.size != (image.width, image.height):
                 raise BadFrame(
-                    f"{image.tensor!r} is {opened.width}x{opened.height} px; "
-                    f"expected {image.width}x{image.height}"
+                    f"{image.tensor!r} is {opened.width}x{opened.height} px; expected {image.width}x{image.height}"
                 )
             pixels = np.asarray(opened.convert("RGB"))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
@@ -365,9 +363,7 @@ def _read_table(header: dict[str, Any], data_start: int, frame_bytes: int) -> di
         tensors[name] = tensor
         end = stop
     if data_start + end != frame_bytes:
-        raise BadFrame(
-            f"the tensors end at offset {end}, the frame at {frame_bytes - data_start}"
-        )
+        raise BadFrame(f"the tensors end at offset {end}, the frame at {frame_bytes - data_start}")
     return tensors
 
 

@@ -303,7 +303,8 @@ class Repair:
 
 @dataclass(frozen=True)
 class LateFrames:
-    """Frames that arrive `by_us` late with the probability `chance`. `by_us` is a whole number of the camera's frames."""
+    """Frames that arrive `by_us` late with the probability `chance`. `by_us` is a whole number of the camera's
+    frames."""
 
     chance: float
     by_us: int
@@ -605,7 +606,8 @@ class Ego:
 
 @dataclass(frozen=True)
 class Geo:
-    """Place of the ego on the earth (WGS84): degrees, metres above the ellipsoid, and degrees from north to the east."""
+    """Place of the ego on the earth (WGS84): degrees, metres above the ellipsoid, and degrees from north to the
+    east."""
 
     latitude: float
     longitude: float

@@ -85,7 +85,8 @@ def push(
     twin: name of the twin; it is created if it does not exist.
     server: `http://HOST:PORT` or `https://HOST:PORT`.
     token: for a server that was started with tokens; the default is `$WILDCITY_TOKEN`.
-    axes, scale: axis convention and metres per unit of the files, as in `wildcity import`. The default is the axes that a
+    axes, scale: axis convention and metres per unit of the files, as in `wildcity import`. The default is the axes that
+    a
         file records, or those with which the twin was imported.
     frame: "twin", which is the default, or "capture": the axes and the unit with which the capture was imported, before
         `wildcity twin align`. `report["frame"]` is the frame that was used; `report["aligned"]` is true if they differ.
@@ -103,7 +104,8 @@ def push(
     An interrupted upload continues where it stopped. What of a file is not read is a warning of Python.
 
     Raises `PushFailed` if the scene is refused, `Refused` if a request is refused, and `ConnectFailed` if the
-    server does not answer; `ValueError` if `cells` or a SOG cannot be understood, and `OSError` if a file cannot be read.
+    server does not answer; `ValueError` if `cells` or a SOG cannot be understood, and `OSError` if a file cannot be
+    read.
     """
     paths = [files] if isinstance(files, (str, os.PathLike)) else list(files)
     wanted_cells = _checked_cells(cells)
@@ -135,8 +137,8 @@ def push(
                     warnings.warn(f"{file['name']}: {warning}", stacklevel=2)
             if frame is None and push.report.get("aligned"):
                 warnings.warn(
-                    f"version {push.version} of twin {twin}: the twin was aligned, and the files were taken to be in its "
-                    'axes. If they are in the axes of its capture, roll back and push with frame="capture"; with '
+                    f"version {push.version} of twin {twin}: the twin was aligned, and the files were taken to be in "
+                    'its axes. If they are in the axes of its capture, roll back and push with frame="capture"; with '
                     'frame="twin" there is no warning',
                     stacklevel=2,
                 )
@@ -282,9 +284,7 @@ def _upload(http_client: HttpClient, path: Path, report: Callable[[PushProgress]
                     raise
 
 
-def _chunks(
-    file: BinaryIO, offset: int, size: int, report: Callable[[PushProgress], None]
-) -> Iterator[bytes]:
+def _chunks(file: BinaryIO, offset: int, size: int, report: Callable[[PushProgress], None]) -> Iterator[bytes]:
     """The bytes of a file from `offset` on, with a report after each chunk."""
     while offset < size and (chunk := file.read(min(CHUNK_BYTES, size - offset))):
         yield chunk

@@ -1,8 +1,8 @@
 """The client's side of the protocol without the connection: it numbers requests and matches answers to them.
 
 Each method of `SessionProtocol` is a generator. It yields the text of one request, receives the answering message
-through `send`, and returns the decoded answer. `sync` and `aio` only transfer the messages. Answers in shared memory are
-read here.
+through `send`, and returns the decoded answer. `sync` and `aio` only transfer the messages. Answers in shared memory
+are read here.
 """
 
 from __future__ import annotations
@@ -162,8 +162,7 @@ class SessionProtocol:
     ) -> Exchange[dict[str, Observation | Refused]]:
         """Steps several sessions."""
         entries = [
-            {"session": name, **_step(step if isinstance(step, Step) else Step(step))}
-            for name, step in steps.items()
+            {"session": name, **_step(step if isinstance(step, Step) else Step(step))} for name, step in steps.items()
         ]
         many = yield from self._next("step_many", Many, {"steps": entries})
         return many.results

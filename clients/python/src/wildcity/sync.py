@@ -14,15 +14,6 @@ from websockets.sync.client import ClientConnection
 from websockets.sync.client import connect as connect_websocket
 
 from .authorization import authorization_headers
-from .session_protocol import (
-    CONNECT_OPTIONS,
-    Exchange,
-    Message,
-    SessionProtocol,
-    can_reuse_connection,
-    connect_failed,
-    translate_error,
-)
 from .errors import ConnectFailed, Disconnected, Refused, WildCityError
 from .observation import Observation
 from .protocol import (
@@ -49,6 +40,15 @@ from .protocol import (
     Trajectory,
     Welcome,
 )
+from .session_protocol import (
+    CONNECT_OPTIONS,
+    Exchange,
+    Message,
+    SessionProtocol,
+    can_reuse_connection,
+    connect_failed,
+    translate_error,
+)
 from .shared_memory import SharedMemory
 
 T = TypeVar("T")
@@ -68,8 +68,8 @@ def connect(
     `name` appears in the server's log. `timeout` is how long an answer may take, in seconds; the server's own
     limits are shorter. `token` is for a server that was started with tokens; the default is `$WILDCITY_TOKEN`.
 
-    With `shared_memory`, observations come in memory that the server shares, in place of the socket. The server must run
-    on this machine, in the same container and as the same user. With `copy=False` the arrays of an observation are
+    With `shared_memory`, observations come in memory that the server shares, in place of the socket. The server must
+    run on this machine, in the same container and as the same user. With `copy=False` the arrays of an observation are
     views of that memory: at most two observations can be kept in addition to the requested one, and while arrays of an
     older one exist, calls raise `SlotInUse`.
 
@@ -170,9 +170,7 @@ class Client:
         resumed = self._run(self._protocol.resume(session, last_seq))
         return Session(self, session, resumed.opened)
 
-    def step_many(
-        self, steps: Mapping[str, Pose | Trajectory | Action | Step]
-    ) -> dict[str, Observation | Refused]:
+    def step_many(self, steps: Mapping[str, Pose | Trajectory | Action | Step]) -> dict[str, Observation | Refused]:
         """Steps several sessions of this connection, 1 to 64, in one message: `steps` has their movements by name.
 
         Returns, by session name, the observation or the `Refused` of that session's step. A refused step does not stop

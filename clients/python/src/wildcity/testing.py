@@ -50,9 +50,7 @@ class Alpamayo:
         self.samples = samples
         self.calls = 0
 
-    def __call__(
-        self, data: Mapping[str, Any], route: Any = None
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def __call__(self, data: Mapping[str, Any], route: Any = None) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """`pred_xyz` (1, 1, S, 64, 3) and `pred_rot` (1, 1, S, 64, 3, 3). Raises `ModelInputError`."""
         arrays = {key: np.asarray(data[key]) if key in data else None for key in _DTYPES}
         self._check_types(arrays)

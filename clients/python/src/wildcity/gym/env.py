@@ -33,9 +33,7 @@ class DriveEnv(gymnasium.Env[Any, Any]):
         self._version: int | None = None
         self._seen: Seen | None = None
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Seen, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
         """Starts an episode."""
         super().reset(seed=seed)
         session, task = self._opened()

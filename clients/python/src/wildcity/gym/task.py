@@ -75,7 +75,8 @@ class DriveConfig:
     """Arguments of `wildcity/Drive-v0`.
 
     server, token, timeout: as `wildcity.connect`.
-    twin, version, trajectory: the twin and the recorded drive to follow; the latest version and the first drive if None.
+    twin, version, trajectory: the twin and the recorded drive to follow; the latest version and the first drive if
+    None.
     scenario: a scenario to drive in, as for `Client.open`. Route, start, dynamics and end are then those of the
         scenario, and trajectory, dynamics, speed, off_route_m, start_m and waypoint_m must have their defaults.
     rig, cameras, size: the rig (the twin's own if None), the cameras to render, and the (width, height) of each image.
@@ -145,9 +146,7 @@ class DriveConfig:
     def observation_space(self) -> spaces.Dict:
         """The cameras as `image_NAME`, then history, speed and route, all in SI units."""
         width, height = self.size
-        images = {
-            image_key(camera): spaces.Box(0, 255, (height, width, 3), np.uint8) for camera in self.cameras
-        }
+        images = {image_key(camera): spaces.Box(0, 255, (height, width, 3), np.uint8) for camera in self.cameras}
         return spaces.Dict(
             {
                 **images,

@@ -1,0 +1,25 @@
+"""The pages of docs/reference that the program generates."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+GENERATE = Path(__file__).resolve().parents[3] / "docs" / "generate.py"
+
+
+def test_the_pages_are_as_the_program_generates_them() -> None:
+    command = [
+        sys.executable,
+        "-B",
+        str(GENERATE),
+        "--check",
+        "--wildcity",
+        os.environ["WILDCITY_BIN"],
+        "commands",
+        "metrics",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,64 @@
+"""docs/reference/commands from the help of the program, one page for each command with its subcommands."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import tempfile
+from pathlib import Path
+
+FOLDER = "docs/reference/commands"
+HEAD = "<!-- Written by docs/generate.py from the help of the program. -->\n\n"
+LISTED = re.compile(r"^  ([a-z][a-z0-9-]*)  +(\S.*)$")
+
+
+def pages(root: Path, program: Path) -> tuple[dict[str, str], str]:
+    top = help_of(program, [])
+    index = f"{HEAD}# Commands\n\n| command | |\n|---|---|\n"
+    written = {}
+    for name, summary in subcommands(top):
+        index += f"| [`{name}`]({name}.md) | {summary} |\n"
+        written[f"{FOLDER}/{name}.md"] = HEAD + page(program, [name]).rstrip() + "\n"
+    written[f"{FOLDER}/index.md"] = index
+    return written, FOLDER
+
+
+def page(program: Path, path: list[str]) -> str:
+    text = help_of(program, path)
+    level = "#" * min(len(path), 4)
+    written = f"{level} wildcity {' '.join(path)}\n\n```text\n{text}```\n\n"
+    for name, _ in subcommands(text):
+        written += page(program, [*path, name])
+    return written
+
+
+def help_of(program: Path, path: list[str]) -> str:
+    """What `--help` prints where there is no terminal: lines of 100 columns."""
+    with tempfile.TemporaryDirectory() as home:
+        environment = {"PATH": os.environ["PATH"], "HOME": home, "NO_COLOR": "1"}
+        done = subprocess.run(
+            ["wildcity", *path, "--help"],
+            executable=program,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+        )
+        if done.returncode != 0 or home in done.stdout:
+            raise SystemExit(
+                f"{program} {' '.join(path)} --help ends with {done.returncode}:\n{done.stdout}{done.stderr}"
+            )
+    return "\n".join(line.rstrip() for line in done.stdout.strip().splitlines()) + "\n"
+
+
+def subcommands(text: str) -> list[tuple[str, str]]:
+    """Names and summaries of the section `Commands:`, without `help`."""
+    section = text.partition("\nCommands:\n")[2].partition("\n\n")[0]
+    found: list[tuple[str, str]] = []
+    for line in section.splitlines():
+        if listed := LISTED.match(line):
+            found.append((listed[1], listed[2]))
+        elif found:
+            found[-1] = (found[-1][0], f"{found[-1][1]} {line.strip()}")
+    return [one for one in found if one[0] != "help"]
