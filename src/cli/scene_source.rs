@@ -141,7 +141,7 @@ impl Source {
 
 impl LoadedScene {
     /// The scene of a frame that has one shot.
-    pub(super) fn scene(&self, shot: &Shot) -> anyhow::Result<FrameScene<'_>> {
+    pub(super) fn shot_scene(&self, shot: &Shot) -> anyhow::Result<FrameScene<'_>> {
         self.source.scene(&[shot.view], &shot.profile)
     }
 

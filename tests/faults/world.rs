@@ -485,7 +485,7 @@ impl World {
         self.sessions.clear();
         self.prepared = None;
         let failed = |what: &'static str| move |e: StoreError| format!("{what}: {e}");
-        self.push(&cells(7, 9)).map_err(failed("a push"))?;
+        self.push(&masked_cells(7, 9)).map_err(failed("a push"))?;
         let left = self.medium.leases_left();
         // The leases of processes that were stopped expire; those of sessions that ended are gone.
         let keep = Retention { versions: 1, grace: Duration::from_secs(60) };

@@ -120,6 +120,10 @@ struct FiredTrigger {
 }
 
 #[derive(Clone, Debug, PartialEq)]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "a world has at most 256 actors, and nearly all of them follow"
+)]
 enum BehaviourState {
     Track,
     Follow(CourseFollowerState),
