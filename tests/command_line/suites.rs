@@ -142,16 +142,16 @@ fn a_run_against_another_is_one_command() {
         assert!(bench.path().join("worse").join(file).is_file(), "{file}");
     }
     assert!(
-        bench
-            .out("worse/report.html")
-            .contains("Exit code 1: of 2 episodes: 0 not_judged, 0 off_model, 2 failed")
+        bench.out("worse/report.html").contains(
+            "Exit code 1: of 2 episodes: 0 not judged, 0 left the trained area, 2 failed"
+        )
     );
 
     // Episodes that failed before may fail again; the content of junit.xml does not change.
     let kept = bench.run("stand", "kept", &["--against", "stand"]);
     let (out, _) = ends(&kept, 0);
     assert!(
-        out.contains("ended       of 2 episodes: 0 not_judged, 0 off_model, 2 failed")
+        out.contains("ended       of 2 episodes: 0 not judged, 0 left the trained area, 2 failed")
             && out.contains("not worse"),
         "{out}"
     );
@@ -180,7 +180,7 @@ fn a_run_says_why_it_ended_so() {
     let (out, _) = ends(&passed, 0);
     // Two seeds without jitter are one episode: Wilson of 1 of 1.
     assert!(out.contains("passed      1 of 1 (95 %: 20.7 to 100.0 %)"), "{out}");
-    assert!(out.contains("warning     1 of 2 episodes were driven as another one"), "{out}");
+    assert!(out.contains("note        1 of 2 episodes were driven as another one"), "{out}");
     assert!(
         out.contains("short-1") && out.contains("driven as short-0 was, and not counted"),
         "{out}"
