@@ -182,6 +182,7 @@ impl Case {
         version: &Version,
     ) -> Result<Self, SuiteError> {
         let start = scenario_start(&loaded, &version.manifest)
+            .map_err(Box::new)
             .map_err(|cause| SuiteError::Start { path: path.to_owned(), cause })?;
         let LoadedScenario { scenario: resolved, map, hash, .. } = loaded;
         let drives = &version.manifest.trajectories;

@@ -41,7 +41,7 @@ pub enum SuiteError {
     Scenario { path: PathBuf, cause: ScenarioError },
     /// The warm-up or the start of a scenario is not possible in its twin.
     #[error("{}: ego.start: {cause}", path.display())]
-    Start { path: PathBuf, cause: SessionError },
+    Start { path: PathBuf, cause: Box<SessionError> },
     /// A scenario lacks what the agent needs.
     #[error("scenario {scenario:?}: {cause}")]
     Agent { scenario: String, cause: FileError },
