@@ -6,8 +6,8 @@ use glam::{DVec2, DVec3};
 
 use wildcity_scene::geometry::Pose;
 use wildcity_score::{
-    DriveRecord, EgoSample, EgoShape, Lane, LaneMap, Plan, PlannedPose, Polyline, ReferenceDrive,
-    StaticContact, Track, TrackSample,
+    DriveRecord, EgoSample, EgoShape, Lane, LaneMap, NO_MAP, NO_REFERENCE, Plan, PlannedPose,
+    Polyline, ReferenceDrive, StaticContact, Track, TrackSample,
 };
 use wildcity_sim::contact::Body;
 use wildcity_sim::ego::{EgoModel, TimedPose};
@@ -58,8 +58,10 @@ pub fn drive_record(episode: &EpisodeFile) -> Option<DriveRecord> {
         contacts: contacts.collect(),
         static_contacts: checks_static.then_some(with_twin),
         reference: scenario.and_then(reference),
+        no_reference: scenario.map_or(NO_REFERENCE, no_reference),
         limit_us: scenario.and_then(|scenario| scenario.limit_us),
         map: scenario.and_then(lanes),
+        no_map: scenario.map_or(NO_MAP, no_map),
         least_progress: scenario
             .map_or(wildcity_score::own::LEAST_PROGRESS, |scenario| scenario.least_progress),
         off_model_us: off_model_us(episode),
@@ -183,11 +185,36 @@ fn reference(scenario: &ScenarioLine) -> Option<ReferenceDrive> {
     Some(ReferenceDrive { line, times_us: scenario.route.iter().map(|point| point.0).collect() })
 }
 
+/// Why a scenario without a drive to follow has none.
+fn no_reference(scenario: &ScenarioLine) -> &'static str {
+    if scenario.way.is_empty() {
+        NO_REFERENCE
+    } else {
+        "nothing says when the ego is due on the route: add end.time_s"
+    }
+}
+
+/// Why a scenario without lanes in its record has none.
+fn no_map(scenario: &ScenarioLine) -> &'static str {
+    let has_map = scenario.scenario.get("map").is_some_and(|map| !map.is_null());
+    let has_route = !scenario.route.is_empty() || !scenario.way.is_empty();
+    match (has_map, has_route) {
+        (false, _) => NO_MAP,
+        (true, false) => "no route says which lanes of the map are near: add route",
+        (true, true) => "no lane of the map is near the route",
+    }
+}
+
 fn lanes(scenario: &ScenarioLine) -> Option<LaneMap> {
     if scenario.lanes.is_empty() {
         return None;
     }
-    let centerline = reference(scenario)?.line;
+    let centerline = match reference(scenario) {
+        Some(reference) => reference.line,
+        None => Polyline::new(
+            scenario.way.iter().map(|point| DVec2::new(point[0], point[1])).collect(),
+        )?,
+    };
     let lanes = scenario.lanes.iter().map(|lane| Lane {
         center: Polyline::new(lane.center.iter().map(|&point| DVec2::from_array(point)).collect()),
         outline_m: lane.outline.iter().map(|&point| DVec2::from_array(point)).collect(),

@@ -13,7 +13,7 @@ use wildcity_sim::Dynamics;
 use wildcity_sim::ego::TimedPose;
 
 use crate::limits;
-use crate::lines::{ActorsLine, EpisodeResult, EventLine, ScenarioLine};
+use crate::lines::{ActorsLine, EpisodeResult, Event, EventLine, ScenarioLine};
 
 /// Setup of an episode: the fields of its first line that need no renderer.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
@@ -174,13 +174,36 @@ impl Frame {
 }
 
 impl EpisodeFile {
-    /// The name of a trigger of an actor's script; `None` if the scenario gives it none.
-    pub fn trigger_name(&self, actor: &str, trigger: u32) -> Option<String> {
+    /// The triggers of an actor, as the scenario lists them.
+    fn script(&self, actor: &str) -> Option<&Vec<serde_json::Value>> {
         let actors = self.scenario.as_ref()?.scenario.get("actors")?.as_array()?;
         let is_named =
             |entry: &&serde_json::Value| entry.get("name").is_some_and(|name| name == actor);
-        let script = actors.iter().find(is_named)?.get("script")?;
-        Some(script.get(trigger as usize)?.get("name")?.as_str()?.to_owned())
+        actors.iter().find(is_named)?.get("script")?.as_array()
+    }
+
+    /// The name of a trigger of an actor's script; `None` if the scenario gives it none.
+    pub fn trigger_name(&self, actor: &str, trigger: u32) -> Option<String> {
+        let entry = self.script(actor)?.get(trigger as usize)?;
+        Some(entry.get("name")?.as_str()?.to_owned())
+    }
+
+    /// The triggers that did not fire: the name of the actor, and the index in its script.
+    pub fn unfired_triggers(&self) -> Vec<(&str, u32)> {
+        let has_fired = |index: usize, at: u32| {
+            self.events.iter().any(|line| match line.event {
+                Event::Triggered { actor, trigger } => usize::from(actor) == index && trigger == at,
+                _ => false,
+            })
+        };
+        let actors = self.scenario.iter().flat_map(|scenario| &scenario.actors).enumerate();
+        actors
+            .flat_map(|(index, actor)| {
+                let triggers = 0..self.script(&actor.name).map_or(0, Vec::len) as u32;
+                let unfired = triggers.filter(move |trigger| !has_fired(index, *trigger));
+                unfired.map(|trigger| (&*actor.name, trigger))
+            })
+            .collect()
     }
 
     /// The format that this build reads.
@@ -206,7 +229,7 @@ impl EpisodeFile {
             cut: None,
         };
         for number in 2.. {
-            let line = read_line(&mut reader, limits::LINE_BYTES, &mut text).map_err(failed)?;
+            let line = read_line(&mut reader, line_bytes(number), &mut text).map_err(failed)?;
             let added = match line {
                 Ok(false) => break,
                 Ok(true) => parse(&text).and_then(|line| episode.add(line)),
@@ -282,7 +305,7 @@ impl EpisodeFile {
         let failed = |cause| ReadError::Io { path: path.to_owned(), cause };
         let mut reader = BufReader::new(File::open(path).map_err(failed)?);
         let mut text = Vec::new();
-        let line = read_line(&mut reader, limits::HEAD_BYTES, &mut text).map_err(failed)?;
+        let line = read_line(&mut reader, line_bytes(1), &mut text).map_err(failed)?;
         let read = line.ok().and_then(|_| serde_json::from_slice::<WithRig>(&text).ok());
         Ok(read.map(|read| read.rig))
     }
@@ -298,6 +321,15 @@ impl EpisodeFile {
     /// The name of the episode: that of its file without the extension.
     pub fn episode_name(path: &Path) -> String {
         path.file_stem().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
+    }
+}
+
+/// The largest length of a line of an episode's file, in bytes; the first line has number 1.
+pub fn line_bytes(number: usize) -> usize {
+    match number {
+        1 => limits::HEAD_BYTES,
+        2 => limits::SCENARIO_LINE_BYTES,
+        _ => limits::LINE_BYTES,
     }
 }
 
@@ -330,7 +362,7 @@ fn read_header(
 ) -> Result<Header, ReadError> {
     let failed = |cause| ReadError::Io { path: path.to_owned(), cause };
     let no_header = |reason: String| ReadError::Header { path: path.to_owned(), reason };
-    let first = read_line(reader, limits::HEAD_BYTES, text).map_err(failed)?;
+    let first = read_line(reader, line_bytes(1), text).map_err(failed)?;
     check_no_mcap(path, text)?;
     let header = match first.and_then(|_| parse(text)).map_err(no_header)? {
         Line::Episode(header) => *header,

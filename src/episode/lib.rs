@@ -34,7 +34,7 @@ pub use export::{
 };
 pub use file::{
     CameraHead, Cut, EndLine, EpisodeFile, Frame, Header, ReadError, RigHead, check_no_mcap,
-    driven_indices,
+    driven_indices, line_bytes,
 };
 pub use lines::{
     ActorLine, ActorStateLine, ActorsLine, Collision, ContactEvent, EgoLine, EpisodeResult, Event,

@@ -2,12 +2,17 @@
 
 use std::time::Duration;
 
-/// Longest line of an episode's file after the first, in bytes: 256 actors of 200 bytes and 256
-/// image hashes of 67 take 70 kB; the route of a scenario with a keyframe every 0.5 m takes 80
-/// bytes a point, 8 MB for 50 km.
-pub const LINE_BYTES: usize = 16 << 20;
+/// Longest line of an episode's file after the second, in bytes: 256 actors of 200 bytes and 256
+/// image hashes of 67 take 70 kB.
+pub const LINE_BYTES: usize = 1 << 20;
 
-/// Longest first line, in bytes, as the session writes it: the overlays of a rig.
+/// Longest second line, in bytes, which is that of a scenario. The road under a map's lanes and the
+/// outlines of the lanes near the route take about as much as the map's file, which may have as
+/// much. A route with a keyframe every 0.5 m takes 80 bytes a point, 8 MB for 50 km.
+pub const SCENARIO_LINE_BYTES: usize = 256 << 20;
+
+/// Longest first line, in bytes. It holds the rig: overlays of 2^24 pixels of 4 bytes are 90 MB in
+/// base64 if PNG cannot compress them.
 pub const HEAD_BYTES: usize = 96 << 20;
 
 /// Largest number of steps of an episode: a day at 10 Hz.

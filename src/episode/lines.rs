@@ -21,6 +21,8 @@ use wildcity_score::own;
 use wildcity_sim::contact::{CollisionType, Contact};
 use wildcity_sim::traffic::{ActorSpec, ActorState, EgoBox};
 
+use crate::limits;
+
 /// The scenario that an episode drives.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ScenarioLine {
@@ -36,6 +38,10 @@ pub struct ScenarioLine {
     /// The recorded drive from where the episode starts; empty if there is none to follow.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub route: Vec<RoutePoint>,
+    /// The route where nothing says when the ego is due, neither a recorded drive nor an end of the
+    /// scenario: places in metres.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub way: Vec<[f64; 3]>,
     /// When the episode ends at the latest, in microseconds.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub limit_us: Option<i64>,
@@ -232,6 +238,12 @@ pub struct FaultLine {
     /// Name of the actor, for a contact with one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub actor: Option<String>,
+    /// The area that was met, in m², for a contact with the twin.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub area_m2: Option<f64>,
+    /// The ego's speed, in m/s, for a contact with the twin.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub impact_mps: Option<f64>,
 }
 
 impl FaultLine {
@@ -240,14 +252,25 @@ impl FaultLine {
     pub fn text(&self, scores: &BTreeMap<String, ScoreLine>) -> String {
         let actor = self.actor.as_ref().map(|actor| format!(" with {actor}")).unwrap_or_default();
         let text = format!("{}{actor} at {:.3} s", self.fault, self.time_us as f64 * 1e-6);
+        if let (Some(impact_mps), Some(area_m2)) = (self.impact_mps, self.area_m2) {
+            return format!("{text}, at {impact_mps:.2} m/s, {area_m2:.3} m²");
+        }
         let part = |name: &str| scores.get(own::NAME)?.parts.get(name).copied().flatten();
         match (&*self.fault, part("progress"), part("least_progress")) {
             ("progress", Some(progress), Some(least)) => {
-                format!("{text}: {progress:.3} of the recorded drive, and {least} is the least")
+                let progress = less(progress, least);
+                format!("{text}: {progress} of the recorded drive, and {least} is the least")
             }
             _ => text,
         }
     }
+}
+
+/// A value in as many digits, at least three, as show that it is less than another.
+fn less(value: f64, than: f64) -> String {
+    let in_digits = |digits: usize| format!("{value:.digits$}");
+    let shows = |text: &String| text.parse::<f64>().is_ok_and(|shown| shown < than);
+    (3..=17).map(in_digits).find(shows).unwrap_or_else(|| value.to_string())
 }
 
 /// A score: its value, or null and the reason.
@@ -357,6 +380,47 @@ fn check_index(actor: u16, actors: usize) -> Result<(), String> {
     }
 }
 
+impl ScenarioLine {
+    /// Checks that the line can be read back.
+    ///
+    /// # Errors
+    /// It is longer than [`SCENARIO_LINE_BYTES`](limits::SCENARIO_LINE_BYTES); says what to do.
+    pub fn check(&self) -> Result<(), String> {
+        // The kind and the line break are added.
+        const ADDED_BYTES: usize = 64;
+        self.check_bytes(limits::SCENARIO_LINE_BYTES - ADDED_BYTES)
+    }
+
+    /// Checks that it has at most so many bytes.
+    fn check_bytes(&self, most_bytes: usize) -> Result<(), String> {
+        let mut counted = ByteCount(0);
+        // Numbers, texts and lists: counting them cannot fail.
+        let _ = serde_json::to_writer(&mut counted, self);
+        if counted.0 <= most_bytes {
+            return Ok(());
+        }
+        Err(format!(
+            "its lanes and the route take {} bytes in the record, and at most {most_bytes} can be read back: name a map \
+             of the surroundings of the route",
+            counted.0
+        ))
+    }
+}
+
+/// Counts the bytes that are written into it.
+struct ByteCount(usize);
+
+impl std::io::Write for ByteCount {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.0 += bytes.len();
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
 impl EgoLine {
     /// The line of a box.
     pub fn new(ego: &EgoBox) -> Self {
@@ -430,5 +494,39 @@ impl ActorStateLine {
             yaw_rate_radps: f64::from(yaw_rate_radps),
             present: true,
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_value_is_shown_in_digits_that_tell_it_from_its_limit() {
+        let shown = [(0.333_333, 0.8), (0.799_96, 0.8), (0.8 - 1e-12, 0.8), (0.799, 0.8)];
+        let texts = shown.map(|(value, than)| less(value, than));
+        assert_eq!(texts, ["0.333", "0.79996", "0.799999999999", "0.799"]);
+    }
+
+    #[test]
+    fn a_scenario_that_cannot_be_read_back_is_told_before_it_is_written() {
+        let line = ScenarioLine {
+            name: "town".to_owned(),
+            hash: String::new(),
+            scenario: serde_json::Value::Null,
+            ego: EgoLine { size: [5.0, 2.0, 1.5], center_x: 1.3 },
+            actors: Vec::new(),
+            route: Vec::new(),
+            way: Vec::new(),
+            limit_us: None,
+            least_progress: 0.8,
+            lanes: Vec::new(),
+            ground: vec![vec![GroundPoint { at: [1.5; 3], up: [0.0, 0.0, 1.0] }; 1000]],
+            checks_static: true,
+        };
+        let bytes = serde_json::to_vec(&line).unwrap().len();
+        assert_eq!((line.check(), line.check_bytes(bytes)), (Ok(()), Ok(())));
+        let error = line.check_bytes(bytes - 1).unwrap_err();
+        assert!(error.contains(&format!("{bytes} bytes")) && error.contains("map"), "{error}");
     }
 }

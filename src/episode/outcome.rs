@@ -5,7 +5,7 @@ use wildcity_score::score;
 
 use crate::drive::drive_record;
 use crate::file::EpisodeFile;
-use crate::lines::{EpisodeResult, FaultLine, ScoreLine};
+use crate::lines::{EpisodeResult, Event, FaultLine, ScoreLine};
 
 /// Judges an episode and scores it. `None` if the record has no frame, or not every step
 /// ([`drive_record`]).
@@ -16,13 +16,28 @@ pub fn result(episode: &EpisodeFile) -> Option<EpisodeResult> {
     let record = drive_record(episode)?;
     let verdict = own::verdict(&record);
     let actors = episode.scenario.as_ref().map_or(&[][..], |scenario| &scenario.actors);
-    let fault = |fault: &own::FaultAt| FaultLine {
-        fault: fault.fault.name().to_owned(),
-        time_us: fault.time_us,
-        actor: fault
-            .actor
-            .and_then(|actor| actors.get(usize::from(actor)))
-            .map(|actor| actor.name.clone()),
+    // What was met in a contact with the twin, by its time.
+    let met = |time_us: i64| {
+        episode.events.iter().find_map(|line| match line.event {
+            Event::StaticContact { area_m2, impact_mps } if line.time_us == time_us => {
+                Some((area_m2, impact_mps))
+            }
+            _ => None,
+        })
+    };
+    let fault = |fault: &own::FaultAt| {
+        let is_static = fault.fault == own::Fault::Static;
+        let met = is_static.then(|| met(fault.time_us)).flatten();
+        FaultLine {
+            fault: fault.fault.name().to_owned(),
+            time_us: fault.time_us,
+            actor: fault
+                .actor
+                .and_then(|actor| actors.get(usize::from(actor)))
+                .map(|actor| actor.name.clone()),
+            area_m2: met.map(|(area_m2, _)| area_m2),
+            impact_mps: met.map(|(_, impact_mps)| impact_mps),
+        }
     };
     let line = |score: wildcity_score::Score| {
         let parts = score.parts.into_iter().map(|(name, part)| (name.to_owned(), part)).collect();

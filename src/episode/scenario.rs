@@ -1,5 +1,7 @@
 //! The line of a scenario, which a record needs to be judged later.
 
+use std::collections::BTreeSet;
+
 use glam::{DVec2, DVec3};
 
 use wildcity_scene::Trajectory;
@@ -24,10 +26,21 @@ pub fn scenario_line(
 ) -> ScenarioLine {
     let start = DriveStart::new(resolved, drives);
     let limit_us = resolved.end.time_us.or(start.as_ref().map(DriveStart::left_us));
-    let route = match &start {
-        Some(start) => start.route(limit_us),
-        None => planned_route(resolved, limit_us),
+    let mut way = Vec::new();
+    let route = match (&start, limit_us) {
+        (Some(start), _) => start.route(limit_us),
+        (None, Some(limit_us)) => {
+            let share_us = |share: f64| (share * limit_us as f64) as i64;
+            let points = planned_route(resolved).into_iter();
+            points.map(|(share, place_m)| RoutePoint(share_us(share), place_m)).collect()
+        }
+        (None, None) => {
+            way = planned_route(resolved).into_iter().map(|(_, place_m)| place_m).collect();
+            Vec::new()
+        }
     };
+    let places_m: Vec<[f64; 3]> =
+        route.iter().map(|point: &RoutePoint| point.1).chain(way.iter().copied()).collect();
     let least_progress = resolved.file.verdict.progress;
     let actors = resolved.traffic.actors.iter();
     ScenarioLine {
@@ -37,9 +50,10 @@ pub fn scenario_line(
         scenario: serde_json::to_value(&resolved.file).unwrap_or_default(),
         ego: EgoLine::new(&resolved.traffic.ego_box),
         actors: actors.map(|actor| ActorLine::new(&actor.spec)).collect(),
-        lanes: map.map_or(Vec::new(), |map| lanes(map, &route)),
+        lanes: map.map_or(Vec::new(), |map| lanes(map, &places_m)),
         ground: map.map_or(Vec::new(), |map| ground_lines(map.surface())),
         route,
+        way,
         limit_us,
         least_progress: least_progress.unwrap_or(wildcity_score::own::LEAST_PROGRESS),
         checks_static: resolved.file.verdict.twin_contact != Some(false),
@@ -73,15 +87,26 @@ pub struct DriveStart<'a> {
 }
 
 impl<'a> DriveStart<'a> {
-    /// The drive that an episode starts on; `None` if it starts at a pose, or the twin has no
-    /// drive.
+    /// The drive that an episode starts on, or for a start at a pose the drive that is the route,
+    /// from the place nearest to this pose on. `None` if the route of such a start is no drive, or
+    /// the twin has no drive.
     pub fn new(resolved: &Scenario, drives: &'a [Trajectory]) -> Option<Self> {
+        let named = |name: &str| drives.iter().find(|drive| drive.name == name);
         let (drive, station_m) = match &resolved.start {
-            Some(EgoStart::Pose(_)) => return None,
-            Some(EgoStart::Station { trajectory, station_m }) => {
-                (drives.iter().find(|drive| drive.name == *trajectory)?, *station_m)
+            Some(EgoStart::Pose(pose)) => {
+                let section = resolved.file.route.as_ref()?;
+                let course = &resolved.route.as_ref()?.course;
+                let drive = named(section.trajectory.as_deref()?)?;
+                (drive, course.nearest(pose.position_m).station_m)
             }
-            None => (drives.first()?, 0.0),
+            Some(EgoStart::Station { trajectory, station_m }) => (named(trajectory)?, *station_m),
+            None => {
+                // The warm-up is the part of the drive before the start.
+                let drive = drives.first()?;
+                let first_us = drive.keyframes.first()?.time_us;
+                let start_us = first_us.saturating_add(resolved.warm_up_us.unwrap_or(0));
+                return Some(Self { drive, start_us });
+            }
         };
         let start_us = Route::new(drive).ok()?.at(station_m).time_us;
         Some(Self { drive, start_us })
@@ -127,37 +152,46 @@ pub fn pose_at(drive: &Trajectory, time_us: i64) -> Pose {
     }
 }
 
-/// A route that was not driven: due evenly over the time of the scenario.
-fn planned_route(resolved: &Scenario, limit_us: Option<i64>) -> Vec<RoutePoint> {
-    let (Some(route), Some(limit_us)) = (&resolved.route, limit_us) else { return Vec::new() };
-    let length_m = route.course.length_m();
-    let count = (length_m / SPACING_M).ceil().max(1.0) as i64;
+/// A route that was not driven, from where the episode starts: the share of the way to each point,
+/// by which it is due evenly over the time of the scenario, and its place in metres.
+fn planned_route(resolved: &Scenario) -> Vec<(f64, [f64; 3])> {
+    let Some(route) = &resolved.route else { return Vec::new() };
+    let course = &route.course;
+    let begin_m = match &resolved.start {
+        Some(EgoStart::Pose(pose)) => course.nearest(pose.position_m).station_m,
+        // A start along a drive has the drive in place of a planned route.
+        Some(EgoStart::Station { .. }) | None => 0.0,
+    };
+    let way_m = course.length_m() - begin_m;
+    let count = (way_m / SPACING_M).ceil().max(1.0) as i64;
     let point = |k: i64| {
         let share = k as f64 / count as f64;
-        let place_m = route.course.point_m(share * length_m);
-        RoutePoint((share * limit_us as f64) as i64, place_m.to_array())
+        (share, course.point_m(begin_m + share * way_m).to_array())
     };
     (0..=count).map(point).collect()
 }
 
-/// The lanes and areas of a map near a route.
-fn lanes(map: &Map, route: &[RoutePoint]) -> Vec<LaneLine> {
-    let near = |outline: &[[f64; 2]]| {
-        outline.iter().any(|[x, y]| {
-            route.iter().any(|point| (point.1[0] - x).hypot(point.1[1] - y) < LANES_M)
-        })
+/// The lanes and areas of a map near the places of a route, in metres.
+fn lanes(map: &Map, route: &[[f64; 3]]) -> Vec<LaneLine> {
+    let places_m: Vec<DVec2> = route.iter().map(|[x, y, _]| DVec2::new(*x, *y)).collect();
+    // Most points of a large map are outside of these bounds.
+    let least_m = places_m.iter().copied().fold(DVec2::INFINITY, DVec2::min) - LANES_M;
+    let most_m = places_m.iter().copied().fold(DVec2::NEG_INFINITY, DVec2::max) + LANES_M;
+    let is_near = |point: &[f64; 2]| {
+        let point_m = DVec2::from_array(*point);
+        point_m.cmpge(least_m).all()
+            && point_m.cmple(most_m).all()
+            && places_m.iter().any(|place_m| place_m.distance(point_m) < LANES_M)
     };
+    let on_route: BTreeSet<usize> =
+        places_m.iter().flat_map(|place_m| map.lanes_at(*place_m)).collect();
     let flat = |point: &[f64; 3]| [point[0], point[1]];
     let file = map.file();
     let driving = file.lanes.iter().enumerate().filter(|(_, lane)| lane.kind == LaneKind::Driving);
     let of_lanes = driving.map(|(index, lane)| {
         let outline = lane.left.iter().chain(lane.right.iter().rev()).map(flat).collect();
-        let is_on = |point: &RoutePoint| {
-            let place_m = DVec2::new(point.1[0], point.1[1]);
-            map.lanes_at(place_m).any(|at| at == index)
-        };
         let center = lane.center.iter().map(flat).collect();
-        let route = route.iter().any(is_on);
+        let route = on_route.contains(&index);
         LaneLine { outline, center, route, intersection: lane.intersection }
     });
     let of_areas = file.areas.iter().filter_map(|area| {
@@ -169,5 +203,5 @@ fn lanes(map: &Map, route: &[RoutePoint]) -> Vec<LaneLine> {
         let outline = area.outline.iter().map(flat).collect();
         Some(LaneLine { outline, center: Vec::new(), route: false, intersection })
     });
-    of_lanes.chain(of_areas).filter(|lane| near(&lane.outline)).collect()
+    of_lanes.chain(of_areas).filter(|lane| lane.outline.iter().any(is_near)).collect()
 }

@@ -42,7 +42,8 @@ pub use map::{Lane, LaneMap, RedArea};
 pub use plan::{Plan, PlannedPose};
 pub use polyline::Polyline;
 pub use record::{
-    DriveRecord, EgoSample, EgoShape, ReferenceDrive, StaticContact, Track, TrackSample,
+    DriveRecord, EgoSample, EgoShape, NO_MAP, NO_REFERENCE, ReferenceDrive, StaticContact, Track,
+    TrackSample,
 };
 pub use savgol::savgol;
 pub use scored::{Measured, Missing, Score};

@@ -164,11 +164,12 @@ pub fn verdict(record: &DriveRecord) -> Verdict {
                 actor: None,
             }));
         }
-        _ => lacks(Criterion::OffRoad, "the scenario has no map"),
+        (Some(_), None) => lacks(Criterion::OffRoad, "the record has no size of the ego"),
+        (None, _) => lacks(Criterion::OffRoad, record.no_map),
     }
     let progress = progress(record);
     match progress {
-        None => lacks(Criterion::Progress, "there is no recorded drive to follow"),
+        None => lacks(Criterion::Progress, record.no_reference),
         Some(progress) if progress < record.least_progress => {
             faults.push(FaultAt { fault: Fault::Progress, time_us: record.end_us(), actor: None });
         }

@@ -9,6 +9,11 @@ use super::map::LaneMap;
 use super::plan::Plan;
 use super::polyline::Polyline;
 
+/// The reason without a recorded drive, and without a route in its place.
+pub const NO_REFERENCE: &str = "there is no recorded drive to follow";
+/// The reason without a map.
+pub const NO_MAP: &str = "the scenario has no map";
+
 /// The size of the ego, and where its reference point is.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct EgoShape {
@@ -92,9 +97,13 @@ pub struct DriveRecord {
     /// Contacts with the twin; `None` if they were not tested.
     pub static_contacts: Option<Vec<StaticContact>>,
     pub reference: Option<ReferenceDrive>,
+    /// Why there is no `reference`, where there is none: [`NO_REFERENCE`] or another reason.
+    pub no_reference: &'static str,
     /// The time that the scenario gives, in microseconds; `None` if it gives none.
     pub limit_us: Option<i64>,
     pub map: Option<LaneMap>,
+    /// Why there is no `map`, where there is none: [`NO_MAP`] or another reason.
+    pub no_map: &'static str,
     /// Progress that is required to pass, 0 to 1.
     pub least_progress: f64,
     /// When the ego first left the area that the twin was trained on, in microseconds.

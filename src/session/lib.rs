@@ -94,5 +94,6 @@ pub use sensors::settings::{
 pub use sensors::{ImageSensor, SensorReason};
 pub use session::Session;
 pub use snapshot::{Snapshot, Snapshots};
+pub use start::scenario_start;
 pub use stills::{Still, StillActor, Stills};
 pub use viewpoint::viewpoints;

@@ -170,13 +170,6 @@ pub const SPARE_ANSWER_BYTES: usize = 32 << 20;
 /// 1440x928 images take 56 MB.
 pub const SCRATCH_BYTES: usize = 64 << 20;
 
-/// Longest line of an episode's file after the first: 256 image hashes of an `observe` take 17 kB.
-pub const EPISODE_LINE_BYTES: usize = 1 << 20;
-
-/// Longest first line of an episode's file. It holds the rig: overlays of 2^24 pixels of 4 bytes
-/// are 90 MB in base64 if PNG cannot compress them.
-pub const EPISODE_HEAD_BYTES: usize = 96 << 20;
-
 /// The rig preset of a session that requests no rig, on a twin that has none.
 pub const RIG: &str = "vehicle6";
 

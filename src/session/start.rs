@@ -14,6 +14,7 @@ use crate::episode::Episode;
 use crate::error::SessionError;
 use crate::limits;
 use crate::options::{RandomStart, Start};
+use crate::scenario::LoadedScenario;
 
 /// The start of an episode, resolved against a version of the twin.
 #[derive(Clone, Debug)]
@@ -22,6 +23,23 @@ pub(crate) struct EpisodeStart {
     warm_up: Vec<Keyframe>,
     /// Where the ego starts, on the ground if its dynamics need one.
     world_from_rig: Pose,
+}
+
+/// Where an episode of a scenario starts, if its request gives no start, dynamics and warm-up of
+/// its own: `world_from_rig`.
+///
+/// # Errors
+/// The scenario's warm-up is out of range, or impossible at its start.
+pub fn scenario_start(loaded: &LoadedScenario, manifest: &Manifest) -> Result<Pose, SessionError> {
+    let scenario = &loaded.scenario;
+    let start = scenario.start.as_ref().map(Start::from);
+    let warm_up_us = scenario.warm_up_us.unwrap_or(0);
+    let dynamics = scenario.dynamics.unwrap_or_default();
+    // No start of a scenario is sampled by the session, so that the seed has no effect.
+    let seed = 0;
+    let lanes = loaded.lanes();
+    EpisodeStart::resolve(manifest, start.as_ref(), warm_up_us, dynamics, seed, lanes)
+        .map(|start| start.world_from_rig)
 }
 
 impl EpisodeStart {

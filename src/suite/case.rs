@@ -8,11 +8,12 @@ use serde_json::Value;
 
 use wildcity_episode::{DriveStart, ScenarioLine, scenario_line};
 use wildcity_scene::Trajectory;
+use wildcity_scene::geometry::Pose;
 use wildcity_session::{
     Encoding, ImagePart, LoadedScenario, Outputs, ScenarioOptions, ScenarioSource, Scenarios,
-    SessionOptions, StoredAssets, limits as session,
+    SessionOptions, StoredAssets, limits as session, scenario_start,
 };
-use wildcity_sim::scenario::{Case as Seeded, Scenario, ScenarioFile};
+use wildcity_sim::scenario::{Case as Seeded, FileError, Scenario, ScenarioFile};
 use wildcity_twin::store::{Catalog, Version};
 
 use crate::cameras;
@@ -37,7 +38,9 @@ pub struct Case {
     pub line: Arc<ScenarioLine>,
     /// Options of its session.
     pub options: SessionOptions,
-    /// The recorded drive that the episode starts on, if it does.
+    /// Where the ego starts, `world_from_rig`.
+    pub start: Pose,
+    /// The recorded drive that the episode starts on, or that is its route, if there is one.
     pub drive: Option<Arc<Trajectory>>,
     /// Time of that drive at the start of the episode, in microseconds.
     pub drive_start_us: i64,
@@ -87,7 +90,8 @@ pub fn cases(
             let loaded = Scenarios::in_dir(dir)
                 .resolve(file, case.seed, pinned, options.latest, &assets)
                 .map_err(|cause| SuiteError::Scenario { path: scenario.path.clone(), cause })?;
-            cases.push(Case::new(suite, name, case, loaded, &version));
+            let case = Case::new(suite, (scenario.path.as_path(), name), case, loaded, &version)?;
+            cases.push(case);
             if cases.len() > limits::EPISODES {
                 return Err(SuiteError::TooMany { count: cases.len() });
             }
@@ -172,15 +176,24 @@ impl Versions<'_> {
 impl Case {
     fn new(
         suite: &SuiteFile,
-        name: String,
+        (path, name): (&Path, String),
         Seeded { seed, values }: Seeded,
         loaded: LoadedScenario,
         version: &Version,
-    ) -> Self {
+    ) -> Result<Self, SuiteError> {
+        let start = scenario_start(&loaded, &version.manifest)
+            .map_err(Box::new)
+            .map_err(|cause| SuiteError::Start { path: path.to_owned(), cause })?;
         let LoadedScenario { scenario: resolved, map, hash, .. } = loaded;
         let drives = &version.manifest.trajectories;
-        let start = DriveStart::new(&resolved, drives);
+        let on_drive = DriveStart::new(&resolved, drives);
         let line = scenario_line(&resolved, map.as_ref(), &hash, drives);
+        if map.is_some() {
+            line.check().map_err(|message| SuiteError::File {
+                path: path.to_owned(),
+                cause: FileError::new("map", format!("is too large: {message}")),
+            })?;
+        }
         let dt_us = suite.dt_us.unwrap_or(session::DT_US);
         let steps = match line.limit_us {
             Some(limit_us) => (limit_us.max(0) as u64).div_ceil(dt_us.max(1) as u64),
@@ -200,26 +213,28 @@ impl Case {
             }),
             ..SessionOptions::twin(resolved.file.twin.name.clone(), outputs(suite, version))
         };
-        Self {
+        Ok(Self {
             name,
             scenario: resolved.file.name.clone(),
             seed,
             values,
             line: Arc::new(line),
             options,
-            drive_start_us: start.as_ref().map_or(0, |start| start.start_us),
-            drive: start.map(|start| Arc::new(start.drive.clone())),
+            start,
+            drive_start_us: on_drive.as_ref().map_or(0, |on_drive| on_drive.start_us),
+            drive: on_drive.map(|on_drive| Arc::new(on_drive.drive.clone())),
             steps,
             version_hash: version.hash.clone(),
             resolved: Arc::new(resolved),
-        }
+        })
     }
 }
 
 /// The cameras and sizes of the suite, as raw pixels: no agent looks at them, so none are encoded.
 fn outputs(suite: &SuiteFile, version: &Version) -> Outputs {
     let mut outputs = Outputs::colour(Encoding::Raw);
-    outputs.trust = true;
+    // Without a drive there is nothing to compare an image with.
+    outputs.trust = !version.manifest.trajectories.is_empty();
     outputs.cameras.clone_from(&suite.cameras);
     if let Some(size) = suite.size {
         let of_rig = || {

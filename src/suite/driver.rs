@@ -3,9 +3,11 @@
 use glam::DVec3;
 
 use wildcity_episode::pose_at;
+use wildcity_scene::Trajectory;
 use wildcity_scene::geometry::Pose;
 use wildcity_session::{Episode, Session};
 use wildcity_sim::ego::{Action, Path, TimedPose};
+use wildcity_sim::scenario::{FileError, Scenario};
 use wildcity_sim::traffic::{Idm, rolled};
 use wildcity_sim::{Command, EgoModel};
 
@@ -50,10 +52,31 @@ impl BuiltIn {
         }
     }
 
+    /// Checks that a scenario has what this agent follows: `log` a recorded drive, which is `drive`,
+    /// and `idm` a route.
+    ///
+    /// # Errors
+    /// Names the field to add.
+    pub fn check(self, scenario: &Scenario, drive: Option<&Trajectory>) -> Result<(), FileError> {
+        match self {
+            Self::Log if drive.is_none() => Err(FileError::new(
+                "route.trajectory",
+                "is missing: the agent log follows a recorded drive of the twin; name it there, or start on it with \
+                 ego.start.trajectory (`wildcity twin drive` gives a twin a drive)",
+            )),
+            Self::Idm if scenario.route.is_none() => Err(FileError::new(
+                "route",
+                "is missing: the agent idm follows a route; write route.lanes (of a map), route.points, or \
+                 route.trajectory (a recorded drive, which `wildcity twin drive` gives a twin)",
+            )),
+            Self::Log | Self::Idm | Self::Stand => Ok(()),
+        }
+    }
+
     /// The command for the next step.
     ///
     /// # Errors
-    /// The scenario has no recorded drive, which this agent follows.
+    /// The scenario has no recorded drive, which this agent follows ([`Self::check`]).
     pub(crate) fn command(self, case: &Case, session: &Session) -> Result<Command, String> {
         let episode = session.episode();
         let teleports = episode.ego().dynamics().model == EgoModel::Teleport;

@@ -89,7 +89,7 @@ fn counted(result: &SuiteResult) -> String {
         return format!("all {} episodes passed", counts.episodes);
     }
     format!(
-        "of {} episodes: {} not_judged, {} off_model, {} failed, {} technical",
+        "of {} episodes: {} not judged, {} left the trained area, {} failed, {} not driven for technical reasons",
         counts.episodes, counts.not_judged, counts.off_model, counts.failed, counts.technical
     )
 }

@@ -7,10 +7,11 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use wildcity_episode::{EpisodeFile, FaultLine, ScoreLine, mcap_path};
-use wildcity_score::own;
+use wildcity_score::{NO_MAP, own};
 use wildcity_session::Engine;
 
 use crate::case::Case;
+use crate::file::OFF_MODEL;
 use crate::finish::Finished;
 use crate::technical::Technical;
 
@@ -120,9 +121,13 @@ impl EpisodeEntry {
             mcap: None,
             errors: errors.collect(),
         };
-        if let Some(Finished { record, end, result, frames_hash, drive_hash }) = finished {
+        if let Some(Finished { record, end, mut result, frames_hash, drive_hash }) = finished {
+            if !case.options.outputs.trust {
+                // Without a recorded drive nothing says where the twin was trained.
+                result.not_judged.push(format!("{OFF_MODEL}: {NO_TRUST}"));
+            }
             entry.status = match result.verdict.as_str() {
-                "passed" => Status::Passed,
+                "passed" if result.not_judged.is_empty() => Status::Passed,
                 "failed" => Status::Failed,
                 "off_model" => Status::OffModel,
                 _ if are_accepted(&result.not_judged, accept_unjudged) => Status::Passed,
@@ -131,10 +136,17 @@ impl EpisodeEntry {
             entry.faults = result.faults;
             entry.not_judged = result.not_judged;
             entry.scores = result.scores;
-            if let (Status::Passed, Some(score)) = (entry.status, entry.scores.get_mut(own::NAME)) {
+            match (entry.status, entry.scores.get_mut(own::NAME)) {
                 // It has no value if a criterion was not judged.
-                score.value = Some(1.0);
-                score.reason = None;
+                (Status::Passed, Some(score)) => {
+                    score.value = Some(1.0);
+                    score.reason = None;
+                }
+                (Status::NotJudged, Some(score)) => {
+                    score.value = None;
+                    score.reason = Some(entry.not_judged.join("; "));
+                }
+                _ => {}
             }
             entry.steps = end.steps;
             entry.distance_m = end.distance_m;
@@ -155,7 +167,33 @@ fn are_accepted(not_judged: &[String], accept_unjudged: &[String]) -> bool {
     !not_judged.is_empty() && not_judged.iter().all(is_accepted)
 }
 
+/// The status `off_model` in words.
+pub(crate) const LEFT: &str = "left the trained area of the twin before any fault";
+
+/// The reason why a twin without a recorded drive is not judged by [`OFF_MODEL`].
+const NO_TRUST: &str = "the twin has no recorded drive to compare with";
+
+/// What to do about a criterion that was not judged.
+fn fix(not_judged: &str) -> String {
+    let name = not_judged.split_once(':').map_or(not_judged, |(name, _)| name);
+    let accepted = format!("--accept-unjudged {name}");
+    match not_judged {
+        text if text.ends_with(NO_MAP) => format!("add a map, or {accepted}"),
+        text if text.ends_with(NO_TRUST) => {
+            format!("add a drive with `wildcity twin drive`, or {accepted}")
+        }
+        _ => format!("{accepted} accepts this"),
+    }
+}
+
 impl EpisodeEntry {
+    /// Why the episode has no verdict, and what to do about it; empty if it has one.
+    pub fn not_judged_texts(&self) -> Vec<String> {
+        let is_not_judged = self.status == Status::NotJudged;
+        let reasons = self.not_judged.iter().filter(|_| is_not_judged);
+        reasons.map(|reason| format!("{reason} ({})", fix(reason))).collect()
+    }
+
     /// Says where the MCAP file of the record is, or why there is none.
     pub(crate) fn add_mcap(&mut self, episodes: &Path, engine: &Engine) {
         if self.record.is_empty() {

@@ -39,6 +39,12 @@ pub enum SuiteError {
     /// A scenario does not fit its twin, or a file that it names is malformed.
     #[error("{}: {cause}", path.display())]
     Scenario { path: PathBuf, cause: ScenarioError },
+    /// The warm-up or the start of a scenario is not possible in its twin.
+    #[error("{}: ego.start: {cause}", path.display())]
+    Start { path: PathBuf, cause: Box<SessionError> },
+    /// A scenario lacks what the agent needs.
+    #[error("scenario {scenario:?}: {cause}")]
+    Agent { scenario: String, cause: FileError },
     /// A file is not a result of a run.
     #[error(
         "{} is no result of a run: {reason}; give the result.json of `wildcity episode run`, or its --out directory",

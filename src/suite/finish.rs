@@ -2,7 +2,6 @@
 
 use std::path::{Path, PathBuf};
 
-use glam::DVec3;
 use serde::Deserialize as _;
 use serde::de::IntoDeserializer as _;
 use serde::de::value::Error as ValueError;
@@ -97,8 +96,7 @@ fn drive_hash(episode: &EpisodeFile) -> String {
 fn check(case: &Case, episode: &EpisodeFile) -> Result<(), Technical> {
     let header = &episode.header;
     let scenario = episode.scenario.as_ref().map(|scenario| scenario.hash.as_str());
-    let start_m = case.line.route.first().map(|point| DVec3::from_array(point.1));
-    let is_elsewhere = |start_m| header.start.position_m.distance(start_m) > START_M;
+    let off_m = header.start.position_m.distance(case.start.position_m);
     let wrong = [
         ("twin", header.twin != case.options.twin),
         ("version", header.version_hash != case.version_hash),
@@ -106,7 +104,7 @@ fn check(case: &Case, episode: &EpisodeFile) -> Result<(), Technical> {
         ("scenario", scenario != Some(&case.line.hash)),
         ("dynamics", header.dynamics != case.resolved.dynamics.unwrap_or_default()),
         ("dt_us", Some(header.dt_us) != case.options.dt_us),
-        ("start", start_m.is_some_and(is_elsewhere)),
+        ("start", off_m > START_M),
     ];
     match wrong.into_iter().find(|(_, wrong)| *wrong) {
         None => Ok(()),

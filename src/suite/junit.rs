@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use crate::ending::Ending;
-use crate::entry::{EpisodeEntry, Status, TechnicalEntry};
+use crate::entry::{EpisodeEntry, LEFT, Status, TechnicalEntry};
 use crate::file::OFF_MODEL;
 use crate::result::SuiteResult;
 
@@ -65,19 +65,17 @@ fn case(text: &mut String, result: &SuiteResult, episode: &EpisodeEntry) {
             element("failure", kind, lines.first().map_or("", |line| line), &lines.join("\n"))
         }
         Status::OffModel => {
-            let message = "left the trained area of the twin before any fault";
+            let message = LEFT;
             if result.accept_unjudged.iter().any(|name| name == OFF_MODEL) {
                 format!("<skipped message=\"{message}\"/>")
             } else {
                 element("error", "off_model", message, message)
             }
         }
-        Status::NotJudged => element(
-            "error",
-            "not_judged",
-            &episode.not_judged.join("; "),
-            &episode.not_judged.join("\n"),
-        ),
+        Status::NotJudged => {
+            let texts = episode.not_judged_texts();
+            element("error", "not_judged", &texts.join("; "), &texts.join("\n"))
+        }
         Status::Technical => {
             let last = episode.errors.last();
             let kind = last.map_or("server_error", |error| &error.kind);

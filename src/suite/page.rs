@@ -7,7 +7,7 @@ use data_encoding::BASE64;
 use maud::{Markup, PreEscaped, html};
 
 use crate::ending::Ending;
-use crate::entry::{EpisodeEntry, Status, TechnicalEntry};
+use crate::entry::{EpisodeEntry, LEFT, Status, TechnicalEntry};
 use crate::html::{document, percent};
 use crate::picture::Picture;
 use crate::plot::plots;
@@ -39,12 +39,12 @@ fn outcome(result: &SuiteResult, ending: &Ending) -> Markup {
     let counts = &result.counts;
     html! {
         p {
-            (counts.episodes) " episodes: " (counts.not_judged) " not_judged, " (counts.off_model)
-            " off_model, " (counts.failed) " failed, " (counts.passed) " passed, "
+            (counts.episodes) " episodes: " (counts.not_judged) " not judged, " (counts.off_model)
+            " left the trained area, " (counts.failed) " failed, " (counts.passed) " passed, "
             (counts.technical) " not driven for technical reasons."
         }
         p { "Pass rate: " (rate(&result.pass_rate)) "." }
-        @if counts.duplicates > 0 { p.failed { (duplicates(result)) } }
+        @if let Some(text) = result.duplicates_text() { p { "Note: " (text) "." } }
         p { "Exit code " (ending.code as u8) ": " (ending.why) "." }
         @if result.latest { p { "Run on the latest versions of the twins, whatever the scenarios name." } }
     }
@@ -72,11 +72,6 @@ fn unjudged(result: &SuiteResult) -> Markup {
             }
         }
     }
-}
-
-/// The warning about duplicates.
-fn duplicates(result: &SuiteResult) -> String {
-    format!("Warning: {}.", result.duplicates_text().unwrap_or_default())
 }
 
 fn rate(rate: &Rate) -> String {
@@ -192,12 +187,10 @@ fn table(result: &SuiteResult) -> Markup {
 
 /// Reason of the status of an episode.
 fn why(episode: &EpisodeEntry) -> Markup {
-    let is_not_judged = episode.status == Status::NotJudged;
-    let reasons = episode.not_judged.iter().filter(|_| is_not_judged);
     let mut texts = episode.fault_texts();
-    texts.extend(reasons.cloned());
+    texts.extend(episode.not_judged_texts());
     if episode.status == Status::OffModel {
-        texts.push("left the trained area of the twin before any fault".to_owned());
+        texts.push(LEFT.to_owned());
     }
     texts.extend(episode.duplicate_text());
     html! {

@@ -25,8 +25,9 @@ const MARGIN_PX: f64 = 28.0;
 pub(crate) fn plots(episode: &EpisodeEntry, episodes: &Path) -> Option<String> {
     let record = EpisodeFile::read(&episodes.join(&episode.record)).ok()?;
     let drive = drive_record(&record)?;
-    let fault_us = episode.faults.first().map(|fault| fault.time_us);
-    Some(from_above(&drive, fault_us) + &speed(&drive, fault_us))
+    let faults: Vec<usize> =
+        episode.faults.iter().filter_map(|fault| sample_at(&drive, fault.time_us)).collect();
+    Some(from_above(&drive, &faults) + &speed(&drive, &faults))
 }
 
 /// Maps values to pixels, with the same scale on both axes if `is_even`.
@@ -53,13 +54,14 @@ impl Frame {
     }
 }
 
-fn from_above(drive: &DriveRecord, fault_us: Option<i64>) -> String {
+/// The drive from above, with a dot at the samples of faults.
+fn from_above(drive: &DriveRecord, faults: &[usize]) -> String {
     let ego: Vec<DVec2> = drive.ego.iter().map(|sample| sample.origin_m).collect();
     let route = drive.reference.as_ref().map_or(Vec::new(), |drive| drive.line.points_m().to_vec());
     let all: Vec<DVec2> = ego.iter().chain(&route).copied().collect();
     let frame = Frame::around(&all, true);
     let legend =
-        [(DRIVEN, "driven"), (RECORDED, "recorded"), (ACTORS, "actors"), (FAULT, "first fault")];
+        [(DRIVEN, "driven"), (RECORDED, "recorded"), (ACTORS, "actors"), (FAULT, "faults")];
     let mut svg = begin("from above", &legend);
     scale_bar(&mut svg, &frame);
     line(&mut svg, &frame, &route, RECORDED, 4.0);
@@ -70,13 +72,13 @@ fn from_above(drive: &DriveRecord, fault_us: Option<i64>) -> String {
         line(&mut svg, &frame, &there, ACTORS, 1.5);
     }
     line(&mut svg, &frame, &ego, DRIVEN, 2.0);
-    if let Some(at) = sample_at(drive, fault_us) {
+    for &at in faults {
         dot(&mut svg, frame.at(ego[at]));
     }
     svg + "</svg>"
 }
 
-fn speed(drive: &DriveRecord, fault_us: Option<i64>) -> String {
+fn speed(drive: &DriveRecord, faults: &[usize]) -> String {
     let step_s = drive.dt_us as f64 * 1e-6;
     let points: Vec<DVec2> = drive
         .ego
@@ -92,15 +94,16 @@ fn speed(drive: &DriveRecord, fault_us: Option<i64>) -> String {
     let axis = [DVec2::ZERO, DVec2::new(end_s, 0.0)];
     line(&mut svg, &frame, &axis, RECORDED, 1.0);
     line(&mut svg, &frame, &points, DRIVEN, 2.0);
-    if let Some(at) = sample_at(drive, fault_us) {
+    for &at in faults {
         dot(&mut svg, frame.at(points[at]));
     }
     svg + "</svg>"
 }
 
-fn sample_at(drive: &DriveRecord, fault_us: Option<i64>) -> Option<usize> {
+/// The sample at a time, in microseconds; that of a contact within a step is the one before it.
+fn sample_at(drive: &DriveRecord, time_us: i64) -> Option<usize> {
     let last = drive.ego.len() as i64 - 1;
-    let step = fault_us? / drive.dt_us.max(1);
+    let step = time_us / drive.dt_us.max(1);
     usize::try_from(step.clamp(0, last)).ok()
 }
 

@@ -169,7 +169,7 @@ impl SuiteResult {
             .map_err(|error| wrong(format!("{}: {}", error.path(), error.inner())))
     }
 
-    /// The warning about duplicates; `None` if there are none.
+    /// The note about duplicates; `None` if there are none.
     pub fn duplicates_text(&self) -> Option<String> {
         let Counts { duplicates, episodes, .. } = self.counts;
         (duplicates > 0).then(|| {

@@ -114,10 +114,13 @@ impl std::fmt::Debug for RunSettings {
 /// does not depend on `jobs`.
 ///
 /// # Errors
-/// The directory has episodes of another run, the engine or the server cannot be started, or the
-/// shell finds no such command as the agent's.
+/// The directory has episodes of another run, a scenario lacks what a built-in agent follows, the
+/// engine or the server cannot be started, or the shell finds no such command as the agent's.
 pub async fn run(settings: RunSettings, cases: Vec<Case>) -> Result<SuiteResult, SuiteError> {
     check_empty(&settings.episodes)?;
+    if let AgentChoice::BuiltIn(agent) = &settings.agent {
+        check_agent(*agent, &cases)?;
+    }
     let host = match &settings.agent {
         AgentChoice::BuiltIn(_) => Host::Engine(engine(&settings)?),
         AgentChoice::Command { .. } => server(&settings).await?,
@@ -179,6 +182,15 @@ pub async fn run(settings: RunSettings, cases: Vec<Case>) -> Result<SuiteResult,
         Some(error) => Err(error),
         None => Ok(SuiteResult::new(head, entries)),
     }
+}
+
+/// Refuses an agent that some scenario does not suit: a mistake that a second attempt would repeat.
+fn check_agent(agent: BuiltIn, cases: &[Case]) -> Result<(), SuiteError> {
+    cases.iter().try_for_each(|case| {
+        agent
+            .check(&case.resolved, case.drive.as_deref())
+            .map_err(|cause| SuiteError::Agent { scenario: case.scenario.clone(), cause })
+    })
 }
 
 /// Refuses a directory with records: their names would differ from those of a fresh run.

@@ -45,8 +45,11 @@ fn a_suite_is_driven_and_its_records_are_read() {
     assert!(stdout(&stand).contains("progress"), "{}", stdout(&stand));
     // A verdict is not an error of the program.
     let verdict = String::from_utf8(stand.stderr).unwrap();
+    let (ended, verdict) = verdict.split_once('\n').unwrap();
+    // An episode is told as it ends.
+    assert!(ended.starts_with("1/1 after ") && ended.ends_with(" s: failed short-0"), "{ended}");
     assert!(
-        verdict.starts_with("of 1 episodes: 0 not_judged, 0 off_model, 1 failed, "),
+        verdict.starts_with("of 1 episodes: 0 not judged, 0 left the trained area, 1 failed, "),
         "{verdict}"
     );
     let wanted = ["run", "short.json", "--twins", twins, "--at-least", "0.9", "--out", "wanted"];

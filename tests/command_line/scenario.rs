@@ -126,6 +126,65 @@ fn check_warns_of_what_images_do_not_show() {
 }
 
 #[test]
+fn check_says_what_never_happens_and_what_agents_need() {
+    let dir = support::twins();
+    let at = dir.path();
+    let walker = |when: Value| json!({"name": "go", "when": when, "do": [{"speed": {"to": 1.4, "rate": 1}}]});
+    let mut file = json!({
+        "format": "wildcity.scenario/1", "name": "cross", "twin": {"name": "test"},
+        "ego": {"start": {"pose": {"xyz": [0, 0, 0], "yaw_rad": 0}}},
+        "actors": [{"name": "walker", "class": "pedestrian",
+            "path": {"points": [[5, -6, 0], [5, 7, 0]], "speed": 0},
+            "script": [walker(json!({"ego_station_m": 50}))]}],
+        "end": {"time_s": 1}});
+    let check = |file: &Value| {
+        fs::write(at.join("cross.json"), file.to_string()).unwrap();
+        done(&["scenario", "check", "cross.json", "--twins", "."], at)
+    };
+    let checked = check(&file);
+    let warning = "warning: trigger \"go\" of actor \"walker\" never fires: ego_station_m is 50 m";
+    assert!(
+        checked.contains(warning) && checked.contains("has 13.0 m; write within_m"),
+        "{checked}"
+    );
+    assert!(checked.contains("note: route: is missing: the agent idm"), "{checked}");
+    assert!(checked.contains("note: route.trajectory: is missing: the agent log"), "{checked}");
+
+    file["route"] = json!({"trajectory": "log"});
+    for (when, never) in [
+        (json!({"time_s": 2}), true),
+        (json!({"time_s": 0.5}), false),
+        (json!({"within_m": 4}), false),
+        (json!({"any": [{"station_m": 14}, {"within_m": 4}]}), false),
+        (json!({"any": [{"station_m": 14}, {"time_s": 2}]}), true),
+        (json!({"all": [{"station_m": 14}, {"within_m": 4}]}), true),
+    ] {
+        file["actors"][0]["script"] = json!([walker(when.clone())]);
+        let checked = check(&file);
+        assert_eq!(checked.contains("never fires"), never, "{when}: {checked}");
+        assert!(!checked.contains("note: "), "{checked}");
+    }
+    // The last one did not fire: the record says so.
+    let twins = ["--twins", ".", "--backend", "cpu", "--threads", "1", "--mcap", "false"];
+    let suite = json!({"format": "wildcity.suite/1", "name": "s", "scenarios": ["cross.json"],
+        "cameras": ["front"]});
+    fs::write(at.join("s.json"), suite.to_string()).unwrap();
+    let driven = run(&[&["episode", "run", "s.json", "--agent", "stand"][..], &twins].concat(), at);
+    assert!(driven.status.code().is_some_and(|code| code != 2), "{driven:?}");
+    let record = "wildcity-run/episodes/cross-0-1.jsonl";
+    let shown = done(&["episode", "show", record], at);
+    assert!(shown.contains("not fired   walker: trigger go"), "{shown}");
+    // Without a route, the agent cannot drive: the setup is wrong, and nothing was tried.
+    file.as_object_mut().unwrap().remove("route");
+    fs::write(at.join("cross.json"), file.to_string()).unwrap();
+    let none = ["episode", "run", "cross.json", "--agent", "idm", "--out", "none"];
+    let refused = run(&[&none[..], &twins].concat(), at);
+    assert_eq!(refused.status.code(), Some(2), "{refused:?}");
+    let error = String::from_utf8(refused.stderr).unwrap();
+    assert!(error.contains("scenario \"cross\": route: is missing"), "{error}");
+}
+
+#[test]
 fn files_of_others_become_maps_and_scenarios() {
     let dir = tempfile::tempdir().unwrap();
     let at = dir.path();
@@ -151,6 +210,8 @@ fn files_of_others_become_maps_and_scenarios() {
          <Storyboard><Init><Actions/></Init></Storyboard>\n</OpenSCENARIO>"
     );
     fs::write(at.join("a.xosc"), &xosc).unwrap();
+    let error = refused(&["map", "import", "a.xosc", "--out", "b.map.json"], at);
+    assert!(error.contains("a.xosc is OpenSCENARIO: `wildcity scenario import`"), "{error}");
     let import = ["scenario", "import", "a.xosc", "--twin", "street", "--out", "a.json"];
     assert!(done(&import, at).contains("wildcity scenario check"));
     let file: Value = serde_json::from_slice(&fs::read(at.join("a.json")).unwrap()).unwrap();

@@ -231,15 +231,17 @@ fn exports_to_one_name_at_once_do_not_meet() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("a.mcap");
     // More than is buffered.
-    let half = [b'a'; 25_000];
+    let half = vec![b'a'; 25_000];
     let written = write_whole(&path, |out| {
         out.write_all(&half).map_err(ExportError::Output)?;
-        write_whole(&path, |inner| inner.write_all(&[b'b'; 40_000]).map_err(ExportError::Output))?;
-        assert_eq!(std::fs::read(&path).unwrap(), [b'b'; 40_000]);
+        write_whole(&path, |inner| {
+            inner.write_all(&vec![b'b'; 40_000]).map_err(ExportError::Output)
+        })?;
+        assert_eq!(std::fs::read(&path).unwrap(), vec![b'b'; 40_000]);
         out.write_all(&half).map_err(ExportError::Output)
     });
     written.unwrap();
-    assert_eq!(std::fs::read(&path).unwrap(), [b'a'; 50_000], "the last one, whole");
+    assert_eq!(std::fs::read(&path).unwrap(), vec![b'a'; 50_000], "the last one, whole");
     let left = std::fs::read_dir(dir.path()).unwrap().count();
     assert_eq!(left, 1, "no temporary file");
 }

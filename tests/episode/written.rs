@@ -80,6 +80,7 @@ impl Made {
             ego: EgoLine::new(&ego),
             actors: (0..self.actors).map(|index| ActorLine::new(&spec(index))).collect(),
             route: route.collect(),
+            way: Vec::new(),
             limit_us: Some(self.steps as i64 * 100_000),
             least_progress: 0.8,
             lanes: Vec::new(),

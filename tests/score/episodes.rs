@@ -6,8 +6,8 @@ use glam::DVec2;
 use wildcity_scene::ActorClass;
 use wildcity_score::own::{Criterion, Fault, Judgement, verdict};
 use wildcity_score::{
-    DriveRecord, EgoSample, EgoShape, Lane, LaneMap, Polyline, ReferenceDrive, StaticContact,
-    Track, TrackSample, lower_is_better, score, score_range,
+    DriveRecord, EgoSample, EgoShape, Lane, LaneMap, NO_MAP, NO_REFERENCE, Polyline,
+    ReferenceDrive, StaticContact, Track, TrackSample, lower_is_better, score, score_range,
 };
 use wildcity_sim::contact::{CollisionType, Contact, Footprint};
 
@@ -47,8 +47,10 @@ fn drive(speed_mps: f64) -> DriveRecord {
             line: Polyline::new(points_m).unwrap(),
             times_us: (0..=10).map(|k| k * 1_000_000).collect(),
         }),
+        no_reference: NO_REFERENCE,
         limit_us: Some(10_000_000),
         map: None,
+        no_map: NO_MAP,
         least_progress: 0.8,
         off_model_us: None,
     }

@@ -7,8 +7,8 @@ use glam::DVec2;
 
 use wildcity_scene::ActorClass;
 use wildcity_score::{
-    DriveRecord, EgoSample, EgoShape, Lane, LaneMap, Plan, PlannedPose, Polyline, ReferenceDrive,
-    Score, Track, TrackSample, score,
+    DriveRecord, EgoSample, EgoShape, Lane, LaneMap, NO_MAP, NO_REFERENCE, Plan, PlannedPose,
+    Polyline, ReferenceDrive, Score, Track, TrackSample, score,
 };
 use wildcity_sim::contact::Footprint;
 
@@ -47,8 +47,10 @@ fn drive(dt_us: i64) -> DriveRecord {
             line: Polyline::new(points_m).unwrap(),
             times_us: (0..=100).map(|k| 100_000 * k).collect(),
         }),
+        no_reference: NO_REFERENCE,
         limit_us: Some(10_000_000),
         map: None,
+        no_map: NO_MAP,
         least_progress: 0.8,
         off_model_us: None,
     }

@@ -237,11 +237,11 @@ fn replayed(server: &TestServer, folder: &Folder, episode: &str, repaired: u64) 
 
 /// Commits a version of the twin with uniformly painted images of both cameras at some stations.
 fn add_views(server: &TestServer, paint: [u8; 3], stations: &[f64], names: [&str; 2]) {
-    add_views(server, paint, stations, names, None);
+    add_exposed_views(server, paint, stations, names, None);
 }
 
 /// The same; with an exposure in stops, and a mask of their left halves, if there is one.
-fn add_views(
+fn add_exposed_views(
     server: &TestServer,
     paint: [u8; 3],
     stations: &[f64],
@@ -307,7 +307,7 @@ async fn recorded_images_are_warped_and_replayed() {
 async fn masked_pixels_are_not_brought_and_exposures_are_taken_back() {
     let folder = warped_model();
     let (server, _) = server(&[&folder]).await;
-    add_views(&server, [200, 10, 90], &[2.5], ["left", "right"], Some(1.0));
+    add_exposed_views(&server, [200, 10, 90], &[2.5], ["left", "right"], Some(1.0));
     let mut agent = server.agent().await;
     open(&mut agent, "a", "warped").await;
     let seen = step(&mut agent, 2.0).await;

@@ -6,5 +6,6 @@ mod dial_in;
 mod files;
 mod overhead;
 mod runs;
+mod setups;
 mod street;
 mod traffic;

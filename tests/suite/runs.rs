@@ -152,10 +152,12 @@ async fn the_report_shows_the_worst_episodes_with_pictures() {
     assert_eq!(html.matches("<svg").count(), 4);
     assert!(html.contains("progress at 2.000 s: 0.") && !html.contains("http://cdn"), "{html}");
     assert!(
-        html.contains("Exit code 1: of 4 episodes: 0 not_judged, 0 off_model, 4 failed"),
+        html.contains(
+            "Exit code 1: of 4 episodes: 0 not judged, 0 left the trained area, 4 failed"
+        ),
         "{html}"
     );
-    assert!(html.contains("Warning: 2 of 4 episodes were driven as another one"), "{html}");
+    assert!(html.contains("Note: 2 of 4 episodes were driven as another one"), "{html}");
     assert!(html.contains("off_road: the scenario has no map"), "what was not judged: {html}");
     assert_eq!(html.matches("driven as car-3 was, and not counted").count(), 1, "{html}");
 
@@ -182,7 +184,7 @@ async fn titles_fit_into_their_plots() {
         .collect();
     assert_eq!(titles.len(), 4);
     for title in titles {
-        assert!(title.contains("first fault") || title.starts_with("speed"), "{title}");
+        assert!(title.contains("faults") || title.starts_with("speed"), "{title}");
         assert!(title.chars().count() * 7 < 420, "{title}");
     }
 }
@@ -190,12 +192,11 @@ async fn titles_fit_into_their_plots() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_run_without_a_verdict_has_no_rate() {
     let bench = Bench::new();
-    // No recorded drive to follow: the agent fails, and not the driving.
-    let mut value = scenario("posed", &json!({ "model": "kinematic", "speed": 10.0 }));
-    let start = json!({ "xyz": [20.0, 0.0, 0.0], "q": [1.0, 0.0, 0.0, 0.0] });
-    value["ego"]["start"] = json!({ "pose": start });
-    let cases = bench.cases(&bench.write("posed.json", &value)).unwrap();
-    let settings = bench.settings(AgentChoice::BuiltIn(BuiltIn::Log), 1, "out");
+    // The agent fails, and not the driving.
+    let value = scenario("lost", &json!({ "model": "kinematic", "speed": 10.0 }));
+    let cases = bench.cases(&bench.write("lost.json", &value)).unwrap();
+    let agent = AgentChoice::Command { name: "lost".to_owned(), line: "exit 3".to_owned() };
+    let settings = bench.settings(agent, 1, "out");
     let run = wildcity_suite::run(settings, cases).await.unwrap();
     assert_eq!(run.counts.technical, 1, "{}", run.to_json());
     assert_eq!(run.pass_rate.text(), "no episode was judged");
@@ -304,7 +305,7 @@ fn exit_codes_are_technical_before_driving() {
     let ending = Ending::new(&rated, None);
     assert_eq!(ending.code, ExitCode::Passed);
     assert!(
-        ending.why.contains("of 4 episodes: 0 not_judged, 0 off_model, 1 failed"),
+        ending.why.contains("of 4 episodes: 0 not judged, 0 left the trained area, 1 failed"),
         "{}",
         ending.why
     );
@@ -313,7 +314,7 @@ fn exit_codes_are_technical_before_driving() {
     let xml = junit(&rated, &ending);
     assert!(xml.contains("failures=\"1\"") && xml.contains("\"exit_code\" value=\"0\""), "{xml}");
     let html = page(&rated, &ending, &[], &bench.path("log"));
-    assert!(html.contains("Exit code 0: of 4 episodes: 0 not_judged"), "{html}");
+    assert!(html.contains("Exit code 0: of 4 episodes: 0 not judged"), "{html}");
     rated.at_least = Some(0.9);
     assert_eq!(code(&rated), ExitCode::Driving);
 }

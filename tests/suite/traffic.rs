@@ -124,6 +124,9 @@ async fn a_driver_that_leaves_the_road_meets_the_twin() {
     });
     let (area_m2, impact_mps) = met.unwrap();
     // A post has 0.374 m².
+    // The page says as much as the record, and marks the step.
+    let html = page(&off_road, &Ending::new(&off_road, None), &[], &bench.path("idm"));
+    assert!(html.contains(&format!(" s, at {impact_mps:.2} m/s, {area_m2:.3} m²")), "{html}");
     assert!(area_m2 > 0.3 && (5.0..11.0).contains(&impact_mps), "{area_m2} m², {impact_mps} m/s");
     let log = drive(BuiltIn::Log, "log").await;
     assert_eq!(log.counts.passed, 1, "{}", log.to_json());

@@ -3,13 +3,13 @@
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use wildcity_render::Backend;
 use wildcity_suite::{
-    CaseOptions, CompareError, Comparison, Ending, ExitCode, Rule, RunSettings, Status, SuiteError,
-    SuiteFile, SuiteResult, TechnicalEntry, Tolerance, cases, check_criteria, junit, page,
-    pictures, verify,
+    CaseOptions, CompareError, Comparison, Ending, EpisodeEntry, ExitCode, Rule, RunSettings,
+    SuiteError, SuiteFile, SuiteResult, TechnicalEntry, Tolerance, cases, check_criteria, junit,
+    page, pictures, verify,
 };
 use wildcity_twin::store::Catalog;
 
@@ -156,6 +156,7 @@ impl Run {
         let bar = progress::count("driving");
         bar.set_length(cases.len() as u64);
         let counted = bar.clone();
+        let begun = Instant::now();
         let settings = RunSettings {
             suite: suite.name,
             agent,
@@ -172,12 +173,22 @@ impl Run {
             backend: backend.clone(),
             episodes: self.episodes(),
             mcap: self.mcap,
-            progress: Box::new(move |_| counted.inc(1)),
+            progress: Box::new(move |episode: &EpisodeEntry| {
+                counted.inc(1);
+                let status = episode.status.name();
+                let (done, all) = (counted.position(), counted.length().unwrap_or(0));
+                let seconds = begun.elapsed().as_secs_f64();
+                counted.suspend(|| {
+                    eprintln!("{done}/{all} after {seconds:.0} s: {status} {}", episode.name);
+                });
+            }),
         };
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
         let driven = runtime.block_on(wildcity_suite::run(settings, cases));
         let result = driven.map_err(|error| match error {
-            error @ (SuiteError::NotEmpty { .. } | SuiteError::NoAgent { .. }) => bad_input(error),
+            error @ (SuiteError::NotEmpty { .. }
+            | SuiteError::NoAgent { .. }
+            | SuiteError::Agent { .. }) => bad_input(error),
             error => exit(ExitCode::Technical, error),
         })?;
         bar.finish_and_clear();
@@ -250,9 +261,7 @@ impl Run {
         for episode in &result.episodes {
             let mut why: Vec<String> =
                 episode.faults.iter().map(|fault| fault.fault.clone()).collect();
-            if episode.status == Status::NotJudged {
-                why.extend(episode.not_judged.iter().cloned());
-            }
+            why.extend(episode.not_judged_texts());
             why.extend(episode.errors.last().map(TechnicalEntry::text));
             why.extend(episode.duplicate_text());
             let status = episode.status.name();
@@ -264,7 +273,7 @@ impl Run {
         }
         writeln!(out, "passed      {}", result.pass_rate.text())?;
         if let Some(text) = result.duplicates_text() {
-            writeln!(out, "warning     {text}")?;
+            writeln!(out, "note        {text}")?;
         }
         if let Some(comparison) = comparison {
             write!(out, "\n{}\n", comparison.to_text())?;

@@ -33,6 +33,9 @@ impl Show {
             let seconds = line.time_us as f64 * 1e-6;
             writeln!(out, "{:<11} {seconds:.3} s {}", "event", text(&line.event, &episode))?;
         }
+        for (actor, trigger) in episode.unfired_triggers() {
+            writeln!(out, "not fired   {actor}: trigger {}", named(&episode, actor, trigger))?;
+        }
         match &episode.end {
             Some(end) => writeln!(
                 out,
@@ -91,6 +94,11 @@ fn head(out: &mut impl Write, episode: &EpisodeFile) -> io::Result<()> {
     Ok(())
 }
 
+/// The name of a trigger, or its index if it has none.
+fn named(episode: &EpisodeFile, actor: &str, trigger: u32) -> String {
+    episode.trigger_name(actor, trigger).unwrap_or(trigger.to_string())
+}
+
 fn text(event: &Event, episode: &EpisodeFile) -> String {
     let name = |index: u16| {
         let actors = episode.scenario.as_ref().map_or(&[][..], |scenario| &scenario.actors);
@@ -115,8 +123,7 @@ fn text(event: &Event, episode: &EpisodeFile) -> String {
         Event::OffModel { trust } => format!("left the trained area: trust {trust:.3}"),
         Event::Triggered { actor, trigger } => {
             let actor = name(*actor);
-            let trigger = episode.trigger_name(&actor, *trigger).unwrap_or(trigger.to_string());
-            format!("{actor} fires trigger {trigger}")
+            format!("{actor} fires trigger {}", named(episode, &actor, *trigger))
         }
         Event::Appeared { actor } => format!("{} appears", name(*actor)),
         Event::Left { actor } => format!("{} leaves", name(*actor)),

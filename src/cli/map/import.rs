@@ -42,6 +42,11 @@ impl Import {
         let context = || format!("{}", self.file.display());
         let bytes = ingest::read_whole(&self.file, wildcity_convert::TEXT_BYTES as u64);
         let bytes = bytes.with_context(context)?;
+        anyhow::ensure!(
+            !is_openscenario(&bytes),
+            "{} is OpenSCENARIO: `wildcity scenario import` reads it",
+            self.file.display()
+        );
         let is_json = bytes.trim_ascii_start().first() == Some(&b'{');
         let (map, geo, warnings) = if is_json {
             (geojson::read(&bytes, self.origin).with_context(context)?, None, Vec::new())
@@ -66,6 +71,16 @@ impl Import {
         }
         Ok(())
     }
+}
+
+/// Whether the root element of an XML file is that of OpenSCENARIO.
+fn is_openscenario(bytes: &[u8]) -> bool {
+    // The declaration and comments may be before it.
+    const HEAD_BYTES: usize = 64 << 10;
+    let head = String::from_utf8_lossy(&bytes[..bytes.len().min(HEAD_BYTES)]);
+    let elements = head.split('<').skip(1);
+    let mut names = elements.filter(|element| !element.starts_with(['?', '!']));
+    names.next().is_some_and(|root| root.starts_with("OpenSCENARIO"))
 }
 
 /// An anchor as `wildcity twin geo` reads it.

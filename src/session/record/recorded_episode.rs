@@ -4,18 +4,19 @@ use std::fs::File;
 use std::io::{BufRead as _, BufReader, Read as _};
 use std::path::Path;
 
-use wildcity_episode::{ActorsLine, Event, ScenarioLine, check_no_mcap};
+use wildcity_episode::limits::HEAD_BYTES;
+use wildcity_episode::{ActorsLine, Event, ScenarioLine, check_no_mcap, line_bytes};
 use wildcity_scene::appearance::Overlay;
 
 use super::format::{EpisodeHeader, FrameRecord, Line, RecordedVersion};
 use super::replay_report::ReplayError;
 use crate::episode::EpisodeSummary;
-use crate::limits::{EPISODE_HEAD_BYTES, EPISODE_LINE_BYTES, PLAN_STEPS};
+use crate::limits::PLAN_STEPS;
 
 // The first line has room for the largest overlays: 4 bytes a pixel, in base64 (4/3), and a
 // thousandth that PNG may add. The rest of a rig and a profile are below 1 MiB.
 const _: () =
-    assert!(4 * Overlay::MAX_PIXELS * 4 / 3 * 1001 / 1000 + (1 << 20) <= EPISODE_HEAD_BYTES as u64);
+    assert!(4 * Overlay::MAX_PIXELS * 4 / 3 * 1001 / 1000 + (1 << 20) <= HEAD_BYTES as u64);
 
 /// A recorded episode.
 #[derive(Clone, Debug, PartialEq)]
@@ -65,7 +66,7 @@ impl RecordedEpisode {
 
             // A line, no longer than its limit.
             let mut text = Vec::new();
-            let limit = if number == 1 { EPISODE_HEAD_BYTES } else { EPISODE_LINE_BYTES };
+            let limit = line_bytes(number);
             reader.by_ref().take(limit as u64).read_until(b'\n', &mut text).map_err(failed)?;
             match text.last() {
                 None => break,

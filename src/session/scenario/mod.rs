@@ -89,11 +89,17 @@ impl SessionScenario {
     /// The start of an episode, if the scenario gives it.
     pub(crate) fn start(&self, loaded: &LoadedScenario) -> Option<Start> {
         let start = loaded.scenario.start.as_ref().filter(|_| self.gives_start)?;
-        Some(match start {
-            EgoStart::Pose(pose) => Start::Pose(*pose),
+        Some(start.into())
+    }
+}
+
+impl From<&EgoStart> for Start {
+    fn from(start: &EgoStart) -> Self {
+        match start {
+            EgoStart::Pose(pose) => Self::Pose(*pose),
             EgoStart::Station { trajectory, station_m } => {
-                Start::Station { trajectory: trajectory.clone(), station_m: *station_m }
+                Self::Station { trajectory: trajectory.clone(), station_m: *station_m }
             }
-        })
+        }
     }
 }

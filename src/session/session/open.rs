@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
+use wildcity_episode::scenario_line;
 use wildcity_render::View;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::{Rig, RigCamera, check_overlay_pixels, overlay_bytes};
@@ -29,7 +30,7 @@ use crate::prefetch::latest_task::LatestTask;
 use crate::prefetch::recorded_drive::RecordedDrive;
 use crate::repair::references::ReferenceViews;
 use crate::repair::session_repair::SessionRepair;
-use crate::scenario::{EpisodeScenario, EpisodeTraffic, SessionScenario};
+use crate::scenario::{EpisodeScenario, EpisodeTraffic, LoadedScenario, SessionScenario};
 use crate::sensors::settings::Sensors;
 use crate::snapshot::Snapshots;
 use crate::start::EpisodeStart;
@@ -275,6 +276,7 @@ impl OpenedScenario {
             let mut scenario =
                 SessionScenario::read(scenarios, &asked.source, &asked.values, gives_start)?;
             let episode = scenario.for_episode(seed, &version, engine.cache())?;
+            check_line(&episode.loaded, &version.manifest)?;
             scenario.pin_assets(&episode.loaded);
             Ok(Self { asked, scenario, episode })
         })
@@ -297,6 +299,20 @@ impl OpenedScenario {
             options.warm_up_us = warm_up_us;
         }
     }
+}
+
+/// Refuses a scenario whose line in a record could not be read back: before anything is driven, and
+/// not afterwards. Without a map, it is far shorter than that.
+fn check_line(loaded: &LoadedScenario, manifest: &Manifest) -> Result<(), SessionError> {
+    if loaded.map.is_none() {
+        return Ok(());
+    }
+    let drives = &manifest.trajectories;
+    let line = scenario_line(&loaded.scenario, loaded.map.as_ref(), &loaded.hash, drives);
+    line.check().map_err(|reason| {
+        let must = format!("too large: {reason}");
+        SessionError::OutOfRange { field: "scenario.map", must }
+    })
 }
 
 /// The profile of a version with the session's overrides.

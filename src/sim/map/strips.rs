@@ -1,17 +1,26 @@
 //! Drivable areas along recorded drives, for a twin without a map.
 
+use std::iter;
+
 use glam::DVec3;
 
 use wildcity_scene::Trajectory;
+use wildcity_scene::trajectory::Keyframe;
 
 use super::file::{Area, AreaKind, Lane, LaneKind, MapFile};
+use crate::traffic::EgoBox;
 
 /// Distance between two points of an edge, in metres.
 const SPACING_M: f64 = 2.0;
 
+/// How far a strip reaches beyond the box of an ego at either end of the drive, in metres. A corner
+/// on the edge of an area is outside of it.
+const BEYOND_M: f64 = 1.0;
+
 /// A map of one lane and one drivable strip along each drive: from `left_m` to the left of the
 /// drive to `right_m` to its right, both above 0. The owner of the twin gives both: a default would
-/// be a guess that judges.
+/// be a guess that judges. The strip is longer than the lane, since the ego's box reaches beyond the
+/// rear axle, which is on the drive.
 pub fn strips_beside(drives: &[Trajectory], left_m: f64, right_m: f64) -> MapFile {
     let mut lanes = Vec::new();
     let mut areas = Vec::new();
@@ -36,7 +45,23 @@ pub fn strips_beside(drives: &[Trajectory], left_m: f64, right_m: f64) -> MapFil
         if center.len() < 2 {
             continue;
         }
-        let outline = left.iter().chain(right.iter().rev()).copied().collect();
+        let EgoBox { box_, center_x_m } = EgoBox::default();
+        let behind_m = 0.5 * box_.length_m - center_x_m + BEYOND_M;
+        let ahead_m = 0.5 * box_.length_m + center_x_m + BEYOND_M;
+        let [first, last] = [&drive.keyframes[0], &drive.keyframes[count - 1]];
+        let end = |keyframe: &Keyframe, x_m: f64| {
+            let corner_m = |y_m: f64| DVec3::new(x_m, y_m, 0.0);
+            [left_m, -right_m]
+                .map(|y_m| keyframe.world_from_rig.transform_point(corner_m(y_m)).to_array())
+        };
+        let [rear_left, rear_right] = end(first, -behind_m);
+        let [front_left, front_right] = end(last, ahead_m);
+        let outline = iter::once(rear_left)
+            .chain(left.iter().copied())
+            .chain([front_left, front_right])
+            .chain(right.iter().rev().copied())
+            .chain([rear_right])
+            .collect();
         areas.push(Area { kind: AreaKind::Drivable, outline });
         lanes.push(Lane {
             id: drive.name.clone(),
