@@ -100,7 +100,9 @@ impl Boxes {
     /// # Errors
     /// Names the first line that is not a valid box, or the track that has two boxes at one time.
     pub fn parse(text: &str) -> Result<Self, BoxesError> {
+        // A map in the order of names, so that results do not depend on a hash.
         let mut tracks: BTreeMap<String, Vec<Row>> = BTreeMap::new();
+        // Blank lines are skipped, but counted: the message names the line of the file.
         for (at, text) in text.lines().enumerate().filter(|(_, text)| !text.trim().is_empty()) {
             let wrong = |reason: String| BoxesError::Line { line: at + 1, reason };
             let line: Line =
@@ -111,6 +113,7 @@ impl Boxes {
             if let Some(value) = line.velocity.iter().flatten().find(|value| !value.is_finite()) {
                 return Err(wrong(format!("velocity has {value:?}; give finite numbers")));
             }
+            // A number and its text are the same track.
             let name = match line.track {
                 Track::Text(name) => name,
                 Track::Number(number) => number.to_string(),
@@ -123,6 +126,8 @@ impl Boxes {
             });
         }
         for (track, rows) in &mut tracks {
+            // Rows of a track may come in any order. From here on they are sorted, which
+            // `moving_at` relies on.
             rows.sort_by_key(|row| row.time_us);
             if let Some(pair) = rows.windows(2).find(|pair| pair[0].time_us == pair[1].time_us) {
                 let time_us = pair[0].time_us;
@@ -138,6 +143,7 @@ impl Boxes {
         for row in self.tracks.values_mut().flatten() {
             row.world_from_box = alignment.pose(&row.world_from_box);
             row.size_m *= alignment.metres_per_unit;
+            // The rotation turns a velocity; the move of the origin does not change it.
             let turned = |v: DVec3| alignment.new_from_old.rotation * v * alignment.metres_per_unit;
             row.velocity_m_per_s = row.velocity_m_per_s.map(turned);
         }
@@ -158,16 +164,20 @@ impl Boxes {
 
 /// The box of a track at a time, if it moves then.
 fn moving_at(rows: &[Row], time_us: i64) -> Option<MovingBox> {
+    // Rows up to the time come before it, with one at the time itself.
     let after = rows.partition_point(|row| row.time_us <= time_us);
     let before = after.checked_sub(1).map(|at| &rows[at]);
     let next = rows.get(after);
     let gap_us = |a: &Row, b: &Row| b.time_us - a.time_us;
+    // Between two rows that are near enough in time.
     if let (Some(before), Some(next)) = (before, next)
         && gap_us(before, next) <= LARGEST_GAP_US
     {
         let share = (time_us - before.time_us) as f64 / gap_us(before, next) as f64;
         let velocity = match (before.velocity_m_per_s, next.velocity_m_per_s) {
             (Some(a), Some(b)) => a.lerp(b, share),
+            // One given velocity is better than a difference of positions, which has the noise of
+            // both.
             (Some(one), None) | (None, Some(one)) => one,
             (None, None) => between(before, next),
         };
@@ -178,14 +188,17 @@ fn moving_at(rows: &[Row], time_us: i64) -> Option<MovingBox> {
     // At an end of the track or of a part of it.
     let (row, neighbour) = match (before, next) {
         (Some(row), _) if time_us - row.time_us <= BEYOND_US => {
+            // The row before it, for a difference; the neighbour may be on the other side of a gap.
             (row, after.checked_sub(2).map(|at| (&rows[at], row)))
         }
         (_, Some(row)) if row.time_us - time_us <= BEYOND_US => {
             (row, rows.get(after + 1).map(|next| (row, next)))
         }
+        // Farther from any row than a tenth of a second: the track is not there.
         _ => return None,
     };
     let near = neighbour.filter(|(a, b)| gap_us(a, b) <= LARGEST_GAP_US);
+    // Without any velocity it is unknown whether the box moves: nothing is hidden.
     let velocity = row.velocity_m_per_s.or(near.map(|(a, b)| between(a, b)))?;
     let mut world_from_box = row.world_from_box;
     world_from_box.position_m += velocity * (time_us - row.time_us) as f64 * 1e-6;
@@ -205,6 +218,8 @@ impl MovingBox {
     /// camera's field, that part counts.
     pub fn hull_px(&self, camera: &Camera, world_from_camera: &Pose) -> Vec<DVec2> {
         let camera_from_box = world_from_camera.inverse() * self.world_from_box;
+        // The bits of the index are the signs along x, y and z, so that two corners differ in one
+        // bit along an edge.
         let corner = |index: usize| {
             let sign = |bit: usize| if index >> bit & 1 == 1 { 0.5 } else { -0.5 };
             let of_size = DVec3::new(sign(0), sign(1), sign(2));
@@ -213,8 +228,12 @@ impl MovingBox {
         let corners: [DVec3; 8] = [0, 1, 2, 3, 4, 5, 6, 7].map(corner);
         let at_px = corners.map(|corner| camera.project(corner));
         let mut points: Vec<DVec2> = at_px.iter().copied().flatten().collect();
+        // A corner outside of the lens' field has no place on the image: the visible parts of edges
+        // stand in for it.
         if points.len() < corners.len() {
             for from in 0..8_usize {
+                // Three edges from each corner; each edge is visited from its lower index only, 12
+                // in all.
                 for to in [from ^ 1, from ^ 2, from ^ 4].into_iter().filter(|to| *to > from) {
                     let along = |step: u32| {
                         let share = f64::from(step) / f64::from(EDGE_POINTS);
@@ -240,6 +259,8 @@ fn hull(mut points: Vec<DVec2>) -> Vec<DVec2> {
     let half = |points: &mut dyn Iterator<Item = DVec2>| {
         let mut chain: Vec<DVec2> = Vec::new();
         for point in points {
+            // The last two points and the new one turn right or go straight: the middle one is not
+            // on the hull.
             while let [.., a, b] = chain[..]
                 && (b - a).perp_dot(point - a) <= 0.0
             {
@@ -247,6 +268,7 @@ fn hull(mut points: Vec<DVec2>) -> Vec<DVec2> {
             }
             chain.push(point);
         }
+        // The end of one chain is the beginning of the other.
         chain.pop();
         chain
     };
@@ -265,6 +287,8 @@ pub fn hide(hull_px: &[DVec2], size_px: [u32; 2], grown_px: f64, counts: &mut [b
     let high = hull_px.iter().fold(*first, |high, point| high.max(*point)) + grown_px;
     // The range of pixels whose middles lie between two positions.
     let range = |low: f64, high: f64, side: u32| {
+        // The first pixel whose middle, at + 0.5, is not before the position; clamped, because a
+        // hull may lie beyond the image.
         let first = (low - 0.5).ceil().clamp(0.0, f64::from(side)) as usize;
         let after = ((high - 0.5).floor() + 1.0).clamp(0.0, f64::from(side)) as usize;
         first..after
@@ -283,11 +307,14 @@ pub fn hide(hull_px: &[DVec2], size_px: [u32; 2], grown_px: f64, counts: &mut [b
 fn is_near(point: DVec2, polygon: &[DVec2], distance: f64) -> bool {
     let edges = || polygon.iter().zip(polygon.iter().cycle().skip(1));
     let is_left = |(a, b): (&DVec2, &DVec2)| (*b - *a).perp_dot(point - *a) >= 0.0;
+    // Fewer than three points enclose nothing: only their distance counts.
     if polygon.len() > 2 && edges().all(is_left) {
         return true;
     }
     edges().any(|(a, b)| {
         let along = *b - *a;
+        // The foot of the perpendicular as a share of the edge; the bound is for a polygon of one
+        // point.
         let share = (point - *a).dot(along) / along.length_squared().max(f64::MIN_POSITIVE);
         (*a + along * share.clamp(0.0, 1.0)).distance(point) <= distance
     })
@@ -312,11 +339,15 @@ mod tests {
 
     #[test]
     fn a_box_is_where_its_track_is_at_the_time() {
+        // Rows out of order, a blank line, and a gap of 1.8 s, which is longer than tracks are
+        // interpolated over.
         let track = row(200_000, 1.0, "") + &row(0, 0.0, "") + "\n" + &row(2_000_000, 9.0, "");
         assert_eq!(x_m(&track, 0), Some(0.0));
         assert_eq!(x_m(&track, 50_000), Some(0.25));
         assert!((x_m(&track, 250_000).unwrap() - 1.25).abs() < 1e-12, "it goes on at 5 m/s");
         assert!((x_m(&track, -100_000).unwrap() + 0.5).abs() < 1e-12);
+        // 0.1 s beyond each end and into the gap is the limit; the last row has no near neighbour
+        // and no velocity.
         for time_us in [-100_001, 300_001, 1_000_000, 1_950_000, 2_050_000, 2_500_000] {
             assert_eq!(x_m(&track, time_us), None, "{time_us}");
         }
@@ -384,6 +415,8 @@ mod tests {
         let camera = Camera::from_pinhole(80, 60, pinhole);
         let at = |z_m: f64| MovingBox {
             size_m: DVec3::new(2.0, 2.0, 8.0),
+            // The box reaches from 4 m before its middle to 4 m behind: at 3 m a part of it is
+            // behind the camera.
             world_from_box: Pose { position_m: DVec3::new(0.0, 1.5, z_m), ..Pose::IDENTITY },
         };
         let hidden = |one: MovingBox| {

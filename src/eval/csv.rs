@@ -20,6 +20,7 @@ impl Evaluation {
 }
 
 fn line(image: &EvaluatedImage) -> String {
+    // Names are quoted always, because a file name may contain commas, quotes and line breaks.
     let quoted = |text: &str| format!("\"{}\"", text.replace('"', "\"\""));
     let [width, height] = image.size_px;
     let mut cells = vec![quoted(&image.name), quoted(&image.camera)];
@@ -27,6 +28,8 @@ fn line(image: &EvaluatedImage) -> String {
     cells.extend([image.rendered.scores.counted, image.covered].map(|share| share.to_string()));
     cells.extend(scores(Some(&image.rendered.scores)));
     cells.extend(scores(image.repaired.as_ref().map(|repaired| &repaired.scores)));
+    // `None` is an empty cell: not requested, which differs from `NaN`, requested and without a
+    // value.
     cells.push(cell(image.moving));
     cells.push(image.lidar.as_ref().map_or(String::new(), |lidar| lidar.points.to_string()));
     cells.push(cell(image.lidar.as_ref().map(|lidar| lidar.mean_m)));

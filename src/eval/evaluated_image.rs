@@ -41,6 +41,7 @@ impl EvaluatedImage {
     /// The scores of one image. `covered` is the share of its pixels with an opacity of at least
     /// 1/2.
     pub fn new(name: String, size_px: [u32; 2], covered: f64, compared: &PairScores) -> Self {
+        // The whole path before the last slash: cameras of different drives stay apart.
         let camera = name.rsplit_once('/').map_or(String::new(), |(folder, _)| folder.to_owned());
         let rendered = compared.scored();
         Self {
@@ -59,6 +60,7 @@ impl EvaluatedImage {
     /// Orders images by rising PSNR; images without a pixel that counts are the last.
     pub fn compare(&self, other: &Self) -> Ordering {
         // The sign of a NaN is not defined, and total_cmp would sort by it.
+        // NaN as a flag of its own, with a number in its place, so that the order is total.
         let key = |image: &Self| match image.rendered.scores.psnr_db {
             db if db.is_nan() => (true, 0.0),
             db => (false, db),

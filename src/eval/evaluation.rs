@@ -164,6 +164,7 @@ pub struct Evaluation {
 impl Evaluation {
     /// Computes the means of the images.
     pub fn new(subject: Subject, images: Vec<EvaluatedImage>) -> Self {
+        // Grouped in the order of names.
         let mut by_camera: BTreeMap<&str, Vec<&EvaluatedImage>> = BTreeMap::new();
         for image in &images {
             by_camera.entry(&image.camera).or_default().push(image);
@@ -173,7 +174,9 @@ impl Evaluation {
             means: Means::from_images(&images),
         };
         let cameras = by_camera.into_iter().map(of_camera).collect();
+        // Not the mean of the cameras' means: each image counts once.
         let all = Means::from_images(&images.iter().collect::<Vec<_>>());
+        // A map, so that eval.json has them in alphabetical order.
         let conventions = CONVENTIONS.into_iter().collect();
         Self {
             format: FORMAT,
@@ -189,6 +192,7 @@ impl Evaluation {
 
     /// The images by rising PSNR; images without a pixel that counts are the last.
     pub fn worst_first(&self) -> Vec<&EvaluatedImage> {
+        // References: sorting the images would change the order of eval.json.
         let mut images: Vec<&EvaluatedImage> = self.images.iter().collect();
         images.sort_by(|a, b| a.compare(b));
         images

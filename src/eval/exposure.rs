@@ -27,6 +27,7 @@ impl Exposure {
         let mut mean_to = [0.0; 3];
         for (from, to) in pair.counted() {
             for c in 0..3 {
+                // Divided one by one: a sum of millions of values stays near 1.
                 mean_from[c] += from[c] / count;
                 mean_to[c] += to[c] / count;
             }
@@ -40,8 +41,10 @@ impl Exposure {
                 covariance[c] += (from[c] - mean_from[c]) * (to[c] - mean_to[c]);
             }
         }
+        // A variance of 1e-12 is far below (1/255)² = 1.5e-5, the square of one step of 8 bits.
         let is_flat = |c: usize| variance[c] <= 1e-12 * count;
         let gain = [0, 1, 2].map(|c| if is_flat(c) { 1.0 } else { covariance[c] / variance[c] });
+        // The line goes through both means.
         let offset = [0, 1, 2].map(|c: usize| mean_to[c] - gain[c] * mean_from[c]);
         Self { gain, offset }
     }
@@ -57,6 +60,7 @@ mod tests {
     use super::*;
 
     fn pair(change: impl Fn(usize, u8) -> u8) -> Pair {
+        // Values up to 100, so that twice the value plus 20 is within 8 bits.
         let rendered: Vec<u8> = (0..300).map(|i| (i * 37 % 101) as u8).collect();
         let truth = rendered.iter().enumerate().map(|(i, &value)| change(i % 3, value)).collect();
         Pair::new([10, 10], truth, rendered, None).unwrap()
@@ -78,6 +82,7 @@ mod tests {
         assert_eq!(fit.gain, [1.0; 3]);
         assert!((fit.apply([100.0 / 255.0; 3])[0] - 200.0 / 255.0).abs() < 1e-12, "{fit:?}");
         let hidden = Pair::new([1, 1], vec![9; 3], vec![0; 3], Some(vec![false])).unwrap();
+        // No pixel counts: the identity.
         assert_eq!(Exposure::fit(&hidden), Exposure { gain: [1.0; 3], offset: [0.0; 3] });
         let bright = Exposure { gain: [2.0; 3], offset: [-0.2; 3] };
         assert_eq!(bright.apply([0.05, 0.9, 0.5]), [0.0, 1.0, 0.8]);

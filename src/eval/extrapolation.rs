@@ -88,8 +88,11 @@ impl Extrapolation {
     pub fn new(offset_m: f64, views: Vec<ExtrapolatedView>) -> Self {
         let rendered: Vec<ViewScores> = views.iter().map(|view| view.rendered).collect();
         let repaired: Vec<ViewScores> = views.iter().filter_map(|view| view.repaired).collect();
+        // A view without a repair is left out of the repaired means.
         let rendered = ViewMeans::from_views(&rendered);
         let repaired = (!repaired.is_empty()).then(|| ViewMeans::from_views(&repaired));
+        // The quotient of means and not the mean of quotients, in which a still view would weigh
+        // most.
         let ratio = repaired.map(|repaired| repaired.flicker / rendered.flicker);
         Self {
             offset_m,
@@ -97,6 +100,7 @@ impl Extrapolation {
             covered: mean(views.iter().map(|view| view.covered)),
             rendered,
             repaired,
+            // 0/0, or a view that does not flicker at all: JSON has no infinity.
             flicker_ratio: ratio.filter(|ratio| ratio.is_finite()),
             kid: None,
             views,
@@ -108,6 +112,7 @@ impl Extrapolation {
 impl ViewMeans {
     fn from_views(views: &[ViewScores]) -> Self {
         let mean = |value: &dyn Fn(&ViewScores) -> f64| {
+            // NaN marks a view without a valid pixel.
             mean(views.iter().map(value).filter(|value| !value.is_nan()))
         };
         Self {
@@ -143,12 +148,14 @@ mod tests {
                 view(0.7, scores(f64::NAN, 0.04), scores(26.0, 0.04)),
             ],
         );
+        // The second view has no PSNR, and its trust counts: (0.5 + 0.7) / 2.
         assert_eq!((made.rendered.reprojection_psnr_db, made.trust), (20.0, 0.6));
         assert_eq!(made.repaired.unwrap().reprojection_psnr_db, 25.0);
         assert!((made.covered - 0.9).abs() < 1e-12, "{made:?}");
         let Reprojection { flip, share, .. } = scores(1.0, 1.0).reprojection;
         let means = [made.rendered.reprojection_flip, made.rendered.reprojection_share];
         assert_eq!(means, [flip, share]);
+        // Means of flicker: 0.045 / 0.03 = 1.5.
         assert!((made.flicker_ratio.unwrap() - 1.5).abs() < 1e-12, "{made:?}");
         assert!(Extrapolation::new(1.0, Vec::new()).rendered.flicker.is_nan());
     }

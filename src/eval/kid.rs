@@ -78,6 +78,7 @@ impl Kid {
         subsets: usize,
         most: usize,
     ) -> Result<Self, KidError> {
+        // The estimator divides by n (n - 1) for each set.
         let fewest = a.len().min(b.len());
         if fewest < 2 {
             return Err(KidError::Few(fewest));
@@ -86,13 +87,16 @@ impl Kid {
         if let Some(other) = a.iter().chain(b).find(|one| one.len() != length) {
             return Err(KidError::Lengths(length, other.len()));
         }
+        // Both sets fit: one comparison of all is exact, and there is nothing to choose at random.
         if a.len().max(b.len()) <= most {
             let all = |set: &[Vec<f32>]| (0..set.len()).collect::<Vec<usize>>();
             let mean = squared_mmd(a, &all(a), b, &all(b));
             let subset_size = fewest;
             return Ok(Self { mean, standard_deviation: 0.0, subsets: 1, subset_size, seed: SEED });
         }
+        // Subsets of equal size, as the authors take them.
         let subset_size = fewest.min(most);
+        // A fixed seed: the same images give the same number.
         let mut random = SplitMix64(SEED);
         let mut values = Vec::with_capacity(subsets);
         for _ in 0..subsets {
@@ -101,6 +105,7 @@ impl Kid {
             values.push(squared_mmd(a, &of_a, b, &of_b));
         }
         let mean_distance = mean(values.iter().copied());
+        // Over the subsets, divided by their number: a population variance.
         let variance = mean(values.iter().map(|value| (value - mean_distance).powi(2)));
         Ok(Self {
             mean: mean_distance,
@@ -116,12 +121,14 @@ impl Kid {
 fn squared_mmd(a: &[Vec<f32>], of_a: &[usize], b: &[Vec<f32>], of_b: &[usize]) -> f64 {
     let within = |set: &[Vec<f32>], of: &[usize]| {
         let mut sum = 0.0;
+        // Each pair once, counted twice below: the kernel is symmetric.
         for (at, &i) in of.iter().enumerate() {
             for &j in &of[at + 1..] {
                 sum += kernel(&set[i], &set[j]);
             }
         }
         let count = of.len() as f64;
+        // 2 sum / (n (n - 1)) is the mean over ordered pairs of different images.
         2.0 * sum / (count * (count - 1.0))
     };
     let mut between = 0.0;
@@ -130,11 +137,13 @@ fn squared_mmd(a: &[Vec<f32>], of_a: &[usize], b: &[Vec<f32>], of_b: &[usize]) -
             between += kernel(&a[i], &b[j]);
         }
     }
+    // Pairs of one image from each set: none is an image with itself.
     let pairs = of_a.len() as f64 * of_b.len() as f64;
     within(a, of_a) + within(b, of_b) - 2.0 * between / pairs
 }
 
 fn kernel(x: &[f32], y: &[f32]) -> f64 {
+    // In f64: features of 2,048 values and a third power lose digits in f32.
     let dot: f64 = x.iter().zip(y).map(|(x, y)| f64::from(*x) * f64::from(*y)).sum();
     (dot / x.len() as f64 + 1.0).powi(3)
 }
@@ -155,6 +164,7 @@ impl SplitMix64 {
     /// Yates).
     fn choose(&mut self, count: usize, of: usize) -> Vec<usize> {
         let mut indices: Vec<usize> = (0..of).collect();
+        // Only the first `count` steps of the shuffle: the rest is not used.
         for at in 0..count {
             // Off from uniform by at most of / 2^64.
             let other = at + (self.next() % (of - at) as u64) as usize;
@@ -170,6 +180,7 @@ mod tests {
     use super::*;
 
     fn set(count: usize, length: usize, shift: f32) -> Vec<Vec<f32>> {
+        // Multiples of a prime modulo 1,000, from -1 to 1, plus the shift.
         let value = |at: usize| ((at * 7919 + 13) % 1000) as f32 / 500.0 - 1.0 + shift;
         (0..count).map(|i| (0..length).map(|j| value(i * length + j)).collect()).collect()
     }
@@ -193,6 +204,7 @@ mod tests {
         let parts = Kid::compare_subsets(&a, &far, 200, 20).unwrap();
         assert_eq!((parts.subsets, parts.subset_size), (200, 20));
         assert!(parts.standard_deviation > 0.0);
+        // The standard error of the mean of 200 subsets; five of them are the tolerance.
         let error = parts.standard_deviation / 200.0_f64.sqrt();
         assert!((parts.mean - far_kid.mean).abs() < 5.0 * error, "{parts:?} {far_kid:?}");
         assert_eq!(parts, Kid::compare_subsets(&a, &far, 200, 20).unwrap());

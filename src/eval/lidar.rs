@@ -171,8 +171,10 @@ impl LidarPoints {
         let mut timed: Vec<(i64, DVec3)> = times.into_iter().zip(points).collect();
         // Sensors write NaN where there was no return.
         timed.retain(|(_, point_m)| point_m.is_finite());
+        // Sorted by time: `between_us` searches by bisection.
         timed.sort_by_key(|(time_us, _)| *time_us);
         let (time_us, points_m) = timed.into_iter().unzip();
+        // Without a mount the points are in the rig's axes.
         let rig_from_lidar = match floats(&file, "rig_from_lidar", &[Some(4), Some(4)])? {
             Some(matrix) => pose("rig_from_lidar", 0, &matrix)?,
             None => Pose::IDENTITY,
@@ -208,11 +210,13 @@ impl LidarPoints {
             poses.iter().map(pose).collect()
         };
         let own = self.poses.as_ref().map(aligned);
+        // The poses of the file come first: they are in the clock of its points.
         let poses = own.as_deref().or(drive).filter(|poses| !poses.is_empty());
         let poses = poses.ok_or(LidarError::NoPoses)?;
         let mut world = WorldPoints { points_m: Vec::new(), time_us: Vec::new(), skipped: 0 };
         for (time_us, point_m) in self.time_us.iter().zip(&self.points_m) {
             match pose_at(poses, *time_us) {
+                // p_world = T_rig(t) T_lidar p.
                 Some(world_from_rig) => {
                     let rig_m = self.rig_from_lidar.transform_point(*point_m);
                     world.points_m.push(world_from_rig.transform_point(rig_m));
@@ -228,8 +232,10 @@ impl LidarPoints {
 /// The pose at a time: linear in position, SLERP in rotation; `None` outside of the poses and in a
 /// gap.
 fn pose_at(poses: &[Keyframe], time_us: i64) -> Option<Pose> {
+    // The first pose after the time. Before the first one there is none to interpolate from.
     let after = poses.partition_point(|key| key.time_us <= time_us);
     let before = &poses[after.checked_sub(1)?];
+    // On a pose, no second one is needed, not even at the end or before a gap.
     if before.time_us == time_us {
         return Some(before.world_from_rig);
     }
@@ -248,12 +254,14 @@ fn pose_at(poses: &[Keyframe], time_us: i64) -> Option<Pose> {
 /// small (Shoemake 1985).
 fn slerp(a: DQuat, b: DQuat, share: f64) -> DQuat {
     let [a, mut b] = [DVec4::from(a), DVec4::from(b)];
+    // q and -q are one rotation: the nearer of both gives the shorter arc.
     if a.dot(b) < 0.0 {
         b = -b;
     }
     // Accurate for small angles, where the arc cosine of the dot product is not.
     let angle = 2.0 * (a - b).length().atan2((a + b).length());
     let weights = match angle {
+        // Below 1e-12 rad the sine divides 0 by 0, and the chord is the arc.
         angle if angle < 1e-12 => [1.0 - share, share],
         angle => [1.0 - share, share].map(|part| (part * angle).sin() / angle.sin()),
     };
@@ -265,6 +273,7 @@ impl WorldPoints {
     pub fn between_us(&self, from_us: i64, to_us: i64) -> &[DVec3] {
         let first = self.time_us.partition_point(|time_us| *time_us < from_us);
         let after = self.time_us.partition_point(|time_us| *time_us <= to_us);
+        // `max` keeps the range valid if the times are given in the wrong order.
         &self.points_m[first..after.max(first)]
     }
 }
@@ -274,20 +283,24 @@ impl LidarDepth {
     pub fn compare(points_m: &[DVec3], map: &DepthMap<'_>) -> Self {
         let mut errors: Vec<(f64, f64)> = Vec::new();
         for Seen { at_px, depth_m } in nearest(seen(points_m, map)) {
+            // Within the image by `seen`: both casts round down to an existing pixel.
             let pixel = at_px.y as usize * map.camera.width_px as usize + at_px.x as usize;
             let is_counted = map.counts.is_none_or(|counts| counts[pixel]);
             let is_drawn = map.opacity[pixel] >= LEAST_OPACITY && map.depth_m[pixel] > 0.0;
+            // The far end is exclusive, as that of each bin.
             if is_counted && is_drawn && depth_m < BINS_M[3] {
                 errors.push((depth_m, (f64::from(map.depth_m[pixel]) - depth_m).abs()));
             }
         }
         let bin = |at: usize| {
             let [from_m, to_m] = [BINS_M[at], BINS_M[at + 1]];
+            // Bins are half-open: a point counts in one of them.
             let within = errors.iter().filter(|(depth_m, _)| (from_m..to_m).contains(depth_m));
             let points = within.clone().count();
             LidarBin { from_m, to_m, points, mean_m: mean(within.map(|(_, error_m)| *error_m)) }
         };
         let bins = [0, 1, 2].map(bin);
+        // Sorted for the median; the mean does not depend on the order but for rounding.
         let mut sorted: Vec<f64> = errors.iter().map(|(_, error_m)| *error_m).collect();
         sorted.sort_by(f64::total_cmp);
         let mean_m = mean(sorted.iter().copied());
@@ -302,11 +315,13 @@ impl LidarMeans {
         if all.is_empty() {
             return None;
         }
+        // Images without a point have NaN as their mean, and would spoil all.
         let seen: Vec<&LidarDepth> = all.into_iter().filter(|image| image.points > 0).collect();
         let bin = |at: usize| {
             let of: Vec<LidarBin> = seen.iter().map(|image| image.bins[at]).collect();
             let points = of.iter().map(|bin| bin.points).sum();
             let with_points = of.iter().filter(|bin| bin.points > 0);
+            // Weighted by points, because bins are of the points of all images together.
             let sum_m: f64 = with_points.map(|bin| bin.points as f64 * bin.mean_m).sum();
             let [from_m, to_m] = [BINS_M[at], BINS_M[at + 1]];
             LidarBin { from_m, to_m, points, mean_m: sum_m / points as f64 }
@@ -333,9 +348,11 @@ fn seen(points_m: &[DVec3], map: &DepthMap<'_>) -> Vec<Seen> {
     let camera_from_world = map.world_from_camera.inverse();
     let size_px = map.camera.size_px();
     let project = |point_m: &DVec3| {
+        // The projection and the depth both need the point in the camera's axes.
         let point_m = camera_from_world.transform_point(*point_m);
         let at_px = map.camera.project(point_m)?;
         let is_within = at_px.cmpge(DVec2::ZERO).all() && at_px.cmplt(size_px).all();
+        // As the renderer defines depth for this lens: z or distance.
         is_within.then(|| Seen { at_px, depth_m: map.camera.depth_m(point_m) })
     };
     points_m.iter().filter_map(project).collect()
@@ -344,7 +361,10 @@ fn seen(points_m: &[DVec3], map: &DepthMap<'_>) -> Vec<Seen> {
 /// Keeps a point, from the nearest on, if no kept point is within [`SAME_PX`]: it may be hidden
 /// behind that one.
 fn nearest(mut seen: Vec<Seen>) -> Vec<Seen> {
+    // Nearest first: a kept point can only be nearer than the ones that it hides.
     seen.sort_by(|a, b| a.depth_m.total_cmp(&b.depth_m));
+    // Cells as wide as the radius: whatever is within it lies in the cell of the point or in one of
+    // the eight around. This makes the search O(n) and not O(n²).
     let cell_of = |at_px: DVec2| [at_px.x, at_px.y].map(|at| (at / SAME_PX).floor() as i32);
     let mut cells: HashMap<[i32; 2], Vec<DVec2>> = HashMap::new();
     let mut kept = Vec::new();
@@ -368,6 +388,7 @@ fn median(sorted: &[f64]) -> f64 {
     match sorted.len() {
         0 => f64::NAN,
         count if count % 2 == 1 => sorted[middle],
+        // The mean of the middle two, as NumPy has it.
         _ => 0.5 * (sorted[middle - 1] + sorted[middle]),
     }
 }
@@ -376,6 +397,7 @@ fn median(sorted: &[f64]) -> f64 {
 fn poses(file: &SafeTensors<'_>) -> Result<Option<Vec<Keyframe>>, LidarError> {
     let Some(times) = times(file, "pose_time_us")? else { return Ok(None) };
     let shape = [Some(times.len()), Some(4), Some(4)];
+    // The shape ties the number of matrices to that of times.
     let matrices = floats(file, "world_from_rig", &shape)?;
     let matrices = matrices.ok_or(LidarError::Missing("world_from_rig"))?;
     if let Some(at) = times.windows(2).position(|pair| pair[1] <= pair[0]) {
@@ -394,11 +416,14 @@ fn pose(name: &'static str, index: usize, rows: &[f64]) -> Result<Pose, LidarErr
     let wrong = |reason: String| LidarError::Pose { name, index, reason };
     let mut values = [0.0; 16];
     values.copy_from_slice(rows);
+    // The file has rows and glam takes columns.
     let matrix = DMat4::from_cols_array(&values).transpose();
     let rotation = DMat3::from_mat4(matrix);
+    // R Rᵀ = 1 for a rotation; the determinant tells a mirror apart.
     let off = (rotation * rotation.transpose() - DMat3::IDENTITY).to_cols_array();
     let error = off.iter().fold(0.0, |most: f64, value| most.max(value.abs()));
     // A matrix with a NaN is refused, too.
+    // 1e-4 leaves room for matrices that were written with few digits.
     let is_rotation = error <= 1e-4 && rotation.determinant() > 0.0;
     if !is_rotation || matrix.row(3) != DVec4::W {
         return Err(wrong(format!(
@@ -423,6 +448,7 @@ fn floats(
     let agrees =
         |(own, wanted): (&usize, &Option<usize>)| wanted.is_none_or(|wanted| wanted == *own);
     let is_shape = own.len() == shape.len() && own.iter().zip(shape).all(agrees);
+    // An unknown type has no values, and fails the check of the number below, which names the type.
     let values = match tensor.dtype() {
         Dtype::F64 => wide(tensor.data()),
         Dtype::F32 => narrow(tensor.data()),
@@ -454,6 +480,7 @@ fn times(file: &SafeTensors<'_>, name: &'static str) -> Result<Option<Vec<i64>>,
         let found = format!("{:?} {:?}", tensor.dtype(), tensor.shape());
         return Err(LidarError::Tensor { name, found, must: "times are i64 in one dimension" });
     }
+    // The length is a multiple of 8, which safetensors checks against shape and type.
     let (values, _) = tensor.data().as_chunks::<8>();
     Ok(Some(values.iter().map(|value| i64::from_le_bytes(*value)).collect()))
 }

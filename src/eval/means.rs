@@ -91,11 +91,14 @@ pub struct CameraMeans {
 
 impl Means {
     pub(super) fn from_images(images: &[&EvaluatedImage]) -> Self {
+        // An image without counted pixels has NaN everywhere; LiDAR below has its own points and
+        // counts all images.
         let counted = images.iter().copied().filter(|image| image.rendered.values > 0);
         let counted: Vec<&EvaluatedImage> = counted.collect();
         let rendered: Vec<&Scored> = counted.iter().map(|image| &image.rendered).collect();
         let repaired: Vec<&Scored> =
             counted.iter().filter_map(|image| image.repaired.as_ref()).collect();
+        // Of the same images, so that the gain compares like with like.
         let rendered = ScoreMeans::from_scored(&rendered);
         let repaired = (!repaired.is_empty()).then(|| ScoreMeans::from_scored(&repaired));
         let gain = repaired.as_ref().map(|repaired| Gain::between(&rendered, repaired));
@@ -110,6 +113,7 @@ impl ScoreMeans {
             // A mask may leave pixels, but not a whole window.
             mean(scored.iter().map(|scored| value(&scored.scores)).filter(|v| !v.is_nan()))
         };
+        // Requested for all images or for none; NaN for one that lacks it.
         let is_aligned = scored.iter().any(|scored| scored.scores.aligned.is_some());
         let aligned = |value: &dyn Fn(&AlignedScores) -> f64| {
             mean(&|scores| scores.aligned.as_ref().map_or(f64::NAN, value))
@@ -117,6 +121,7 @@ impl ScoreMeans {
         let has_lpips = scored.iter().any(|scored| scored.scores.lpips.is_some());
         Self {
             psnr_db: mean(&|scores| scores.psnr_db),
+            // Sums over all images, then the logarithm: images count by their pixels.
             pooled_psnr_db: pooled_psnr_db(
                 scored.iter().map(|scored| scored.squared_error).sum(),
                 scored.iter().map(|scored| scored.values).sum(),

@@ -42,6 +42,7 @@ impl Pair {
     ) -> Result<Self, PairError> {
         let [width, height] = size_px;
         let pixels = width as usize * height as usize;
+        // No mask has the right size by definition.
         let masked = counts.as_ref().map_or(pixels, Vec::len);
         for (what, values, expected) in [
             ("real image", truth.len(), 3 * pixels),
@@ -94,6 +95,7 @@ impl Pair {
     pub(super) fn counted(&self) -> impl Iterator<Item = ([f64; 3], [f64; 3])> {
         let unit = |rgb: &[u8]| [rgb[0], rgb[1], rgb[2]].map(|byte| f64::from(byte) / 255.0);
         let pixels = self.rendered.chunks_exact(3).zip(self.truth.chunks_exact(3)).enumerate();
+        // A filter and not a copy: an image of 4K has 25 million values.
         pixels
             .filter(|(pixel, _)| self.is_counted(*pixel))
             .map(move |(_, (rendered, truth))| (unit(rendered), unit(truth)))

@@ -40,7 +40,10 @@ impl Reprojection {
         let counted = valid.iter().enumerate().map(|(pixel, valid)| {
             *valid > 0.0 && counts.is_none_or(|counts| counts.get(pixel) == Some(&true))
         });
+        // Lengths that disagree give a `counted` of another length, which `Pair::new` names as the
+        // mask.
         let pair = Pair::new(size_px, truth.to_vec(), back.to_vec(), Some(counted.collect()))?;
+        // Without the aligned scores, which this comparison does not report.
         let scores = PairScores::compare(&pair, false).scores;
         Ok(Self { psnr_db: scores.psnr_db, flip: scores.flip, share: scores.counted })
     }
@@ -62,8 +65,10 @@ mod tests {
         counts[15] = false;
         let of = |counts| Reprojection::compare([4, 4], &truth, &back, &valid, counts).unwrap();
         let found = of(Some(&counts[..]));
+        // 110 against 100: 20 log10(255 / 10).
         assert!((found.psnr_db - 20.0 * 25.5_f64.log10()).abs() < 1e-12, "{found:?}");
         assert_eq!(found.share, 14.0 / 16.0);
+        // 255 against 100 raises the error of one pixel far above that of the others.
         assert!(of(None).psnr_db < found.psnr_db - 3.0, "the last pixel counts then");
         let error = Reprojection::compare([4, 4], &truth, &back, &valid[1..], None).unwrap_err();
         assert!(error.to_string().starts_with("the mask has 15 values"), "{error}");

@@ -88,6 +88,7 @@ impl PairScores {
             psnr_db: pooled_psnr_db(squared_error, values),
             ssim: ssim.within,
             ssim_mirrored: ssim.mirrored,
+            // A mean over pixels: 0/0 is NaN if none counts.
             flip: error_sum / (values / 3) as f64,
             lpips: None,
             counted: pair.counted_share(),
@@ -105,6 +106,8 @@ impl PairScores {
 
 /// PSNR of all values together, in dB.
 pub(super) fn pooled_psnr_db(squared_error: f64, values: u64) -> f64 {
+    // Values are from 0 to 1, so that the peak is 1: -10 log10(mean squared error). Without an
+    // error it is infinite, without values NaN.
     -10.0 * (squared_error / values as f64).log10()
 }
 
@@ -116,6 +119,7 @@ fn units(rgb8: &[u8]) -> Vec<f64> {
 /// into no other.
 fn error_map(pair: &Pair) -> Vec<f32> {
     let unit = |byte: &u8| f32::from(*byte) / 255.0;
+    // f32 is what the FLIP of the renderer takes.
     let truth: Vec<f32> = pair.truth().iter().map(unit).collect();
     let mut rendered: Vec<f32> = pair.rendered().iter().map(unit).collect();
     for (pixel, (rendered, truth)) in
@@ -125,6 +129,8 @@ fn error_map(pair: &Pair) -> Vec<f32> {
             rendered.copy_from_slice(truth);
         }
     }
+    // FLIP filters with a kernel, so that a pixel's error also depends on its neighbours; pixels
+    // that do not count get none of it.
     let mut errors = flip(&rendered, &truth, pair.size_px());
     for (pixel, error) in errors.iter_mut().enumerate() {
         if !pair.is_counted(pixel) {
@@ -136,6 +142,7 @@ fn error_map(pair: &Pair) -> Vec<f32> {
 
 fn aligned(pair: &Pair, truth: &[f64]) -> AlignedScores {
     let exposure = Exposure::fit(pair);
+    // Clamped by `apply` as a display would, before the difference.
     let differences = pair.counted().flat_map(|(rendered, truth)| {
         let rendered = exposure.apply(rendered);
         [0, 1, 2].map(|c: usize| rendered[c] - truth[c])
@@ -155,6 +162,7 @@ mod tests {
 
     /// A textured image, and a copy with +20 in the left half.
     fn images() -> (Vec<u8>, Vec<u8>) {
+        // Values of 40 to 159, so that 20 more stay below 255.
         let truth: Vec<u8> = (0..3 * 40 * 30).map(|i| 40 + (i * 7919 % 120) as u8).collect();
         let spoil = |(i, value): (usize, &u8)| value + if i / 3 % 40 < 20 { 20 } else { 0 };
         let rendered = truth.iter().enumerate().map(spoil).collect();
@@ -178,6 +186,7 @@ mod tests {
         assert_eq!((right.scores.ssim, right.scores.flip, right.scores.counted), (1.0, 0.0, 0.5));
         assert!(right.scores.ssim_mirrored < 1.0, "masked pixels count there");
         let left = scores(Some((0..1200).map(|i| i % 40 < 20).collect()));
+        // The left half alone is off by 20 everywhere.
         let left_db = 20.0 * (255.0_f64 / 20.0).log10();
         assert!((left.scores.psnr_db - left_db).abs() < 1e-9, "{left:?}");
         assert!(left.error_map.iter().enumerate().all(|(i, e)| (i % 40 < 20) == (*e > 0.0)));

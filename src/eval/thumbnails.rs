@@ -61,6 +61,7 @@ impl Thumbnails {
 pub fn jpeg(rgb8: &[u8], size_px: [u32; 2]) -> Result<Vec<u8>, String> {
     let picture = picture(rgb8.to_vec(), size_px)?;
     let small = if picture.width() > WIDTH_PX {
+        // Rounded up, so that a very wide picture has a height of at least 1.
         let height = (picture.height() * WIDTH_PX).div_ceil(picture.width());
         imageops::resize(&picture, WIDTH_PX, height, FilterType::Triangle)
     } else {
@@ -85,6 +86,7 @@ pub fn error_png(pair: &Pair, error_map: &[f32]) -> Result<Vec<u8>, String> {
 
 /// Errors from 0 to 1 as colours; grey where pixels do not count.
 fn colors(pair: &Pair, error_map: &[f32]) -> Vec<u8> {
+    // `heat_rgb` takes a position in the table of colours.
     let last = (HEAT_RGB.len() - 1) as f32;
     let color = |(pixel, error): (usize, &f32)| {
         if pair.is_counted(pixel) { heat_rgb(last * error) } else { UNCOUNTED_RGB }

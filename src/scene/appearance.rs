@@ -172,6 +172,8 @@ impl Overlay {
     /// [`AppearanceError::Size`], [`AppearanceError::Overlay`].
     pub fn from_png(png: Vec<u8>, camera_px: [u32; 2]) -> Result<Self, AppearanceError> {
         let unreadable = |error: image::ImageError| refused(&error.to_string());
+        // A closure, because `into_dimensions` consumes the reader and the pixels need a second
+        // one.
         let reader = || ImageReader::with_format(Cursor::new(&png[..]), ImageFormat::Png);
         let (width_px, height_px) = reader().into_dimensions().map_err(unreadable)?;
         let overlay_px = [width_px, height_px];
@@ -229,6 +231,7 @@ impl Overlay {
         let [left, top] = at_px;
         let [width, height] = self.size_px();
         let [part_width, part_height] = part_px;
+        // Subtracts instead of adding: `from + part` could overflow for values near u32::MAX.
         let within = |from: u32, part: u32, of: u32| part > 0 && from <= of && part <= of - from;
         if !within(left, part_width, width) || !within(top, part_height, height) {
             let reason = "the part is not within the overlay";
@@ -236,6 +239,8 @@ impl Overlay {
         }
         let [to_width, to_height] = size_px;
         check_pixels(u64::from(to_width) * u64::from(to_height))?;
+        // Without a change of size the bytes stay as they are: filtering would round colours of
+        // half transparent pixels.
         if size_px == part_px {
             let row = |y: u32| {
                 let at = 4 * ((top + y) as usize * width as usize + left as usize);
@@ -340,6 +345,8 @@ mod tests {
         };
         let mut rgb8 = [10, 100, 60, 0, 255, 200];
         swap.change_rgb8(&mut rgb8);
+        // Red of the first pixel: 100 + 0.2 * 255 = 151. Its blue: 2 * 60 = 120. Red of the second:
+        // 255 + 51 is clamped to 255; its blue: 400 is, too.
         assert_eq!(rgb8, [151, 10, 120, 255, 0, 255]);
     }
 
@@ -378,6 +385,8 @@ mod tests {
         assert_eq!(Overlay::from_data_uri(&small, [2, 3]), Err(size));
         // A PNG whose header declares 100,000 x 100,000 pixels.
         let mut png = Overlay::new(1, vec![0; 4]).unwrap().png;
+        // Bytes 16 to 23 of a PNG are width and height in the IHDR chunk, most significant byte
+        // first: 0x000186A0 is 100,000.
         png[16..24].copy_from_slice(&[0, 1, 0x86, 0xA0, 0, 1, 0x86, 0xA0]);
         assert!(Overlay::from_png(png, [100_000; 2]).is_err());
     }

@@ -108,6 +108,8 @@ impl Cluster {
         let mean_m = Vec3::from_array(mean_m);
         self.min_m = self.min_m.min(mean_m);
         self.max_m = self.max_m.max(mean_m);
+        // The largest of three axes, whatever the rotation: a sphere of that sigma contains the
+        // ellipsoid, and no rotation needs to be evaluated.
         self.sigma_m = self.sigma_m.max(Vec3::from_array(scale_m).max_element());
     }
 }
@@ -169,6 +171,7 @@ impl Chunk {
         assert_eq!(lanes.width(), width, "lanes of another degree");
         assert_eq!(lanes.len(), count.div_ceil(LANES), "lanes of another count");
         let mut clusters = Vec::with_capacity(count.div_ceil(CLUSTER));
+        // How many Gaussians are left from this group on: lanes from `left` on are padding.
         let mut left = count;
         for of_cluster in lanes.clusters_mut() {
             let mut bounds = LaneBounds::EMPTY;
@@ -179,6 +182,8 @@ impl Chunk {
                 bounds.add(group, &drawable);
                 for lane in (0..LANES).filter(|&lane| !drawable[lane]) {
                     group.iter_mut().for_each(|lanes| lanes.0[lane] = 0.0);
+                    // Zeros are finite, so that vector code may compute with this lane; an opacity
+                    // of minus infinity makes its contribution exactly 0.
                     group[column::LOG2_OPACITY].0[lane] = f32::NEG_INFINITY;
                 }
             }
@@ -195,6 +200,7 @@ impl Chunk {
     /// # Panics
     /// If the number of SH coefficients is not that of the chunk's degree.
     pub fn push(&mut self, record: &RawGaussian<'_>) {
+        // In f64: squares of an f32 near its limits overflow or vanish in f32.
         let length = record.quat_wxyz.iter().map(|&q| f64::from(q).powi(2)).sum::<f64>().sqrt();
         self.push_activated(&ActivatedGaussian {
             mean_m: record.mean_m,
@@ -222,8 +228,11 @@ impl Chunk {
         if self.count.is_multiple_of(CLUSTER) {
             self.clusters.push(Cluster::EMPTY);
         }
+        // Counted before the check: an invalid Gaussian keeps its index.
         self.count += 1;
 
+        // The order of this chain is that of the columns, from which `is_drawable` takes the
+        // bounds.
         let ActivatedGaussian { mean_m, scale_m, quat_wxyz, log2_opacity, sh } = record;
         let geometry = mean_m.iter().chain(scale_m).chain(quat_wxyz);
         if !is_drawable(geometry.chain([log2_opacity]).chain(*sh).copied()) {
@@ -310,9 +319,11 @@ impl Chunk {
             let value = |column| self.value(index, column);
             let three = |column| [0, 1, 2].map(|axis| value(column + axis));
             let mean_m = DVec3::from_array(three(column::MEAN).map(f64::from)) + self.origin_m;
+            // Rounding in a record can push a mean at the very edge beyond the bound of import.
             let most_m = Pose::MAX_COORDINATE_M;
             gaussians.means_m.push(mean_m.to_array().map(|m| m.clamp(-most_m, most_m)));
             let quat = [0, 1, 2, 3].map(|k| value(column::QUAT + k));
+            // A zero quaternion marks an empty lane: a Gaussian that is drawn has a unit one.
             let is_empty = quat == [0.0; 4];
             gaussians.quats_wxyz.push(if is_empty { [1.0, 0.0, 0.0, 0.0] } else { quat });
             // A file may have scales of 0, and records round small ones to 0: they are the smallest
@@ -359,6 +370,8 @@ impl LaneBounds {
 
     /// Adds the drawable Gaussians of a lane group.
     fn add(&mut self, group: &[Lanes], drawable: &[bool; LANES]) {
+        // Comparisons in the form of a select, without branches and without `f32::min`, whose rules
+        // for NaN cost instructions.
         for axis in 0..3 {
             let mean_m = &group[column::MEAN + axis].0;
             let scale_m = &group[column::SCALE + axis].0;
@@ -421,11 +434,16 @@ fn accepted(column: usize) -> RangeInclusive<f32> {
 /// `log2(1 / (1 + exp(-x)))` without overflow or cancellation, for every x that is not NaN.
 fn log2_sigmoid(logit: f32) -> f32 {
     let x = f64::from(logit);
+    // ln sigmoid(x) = min(x, 0) - ln(1 + e^-|x|): the exponent is never positive, so that nothing
+    // overflows, and ln_1p keeps the digits of a tiny e^-|x|.
     ((x.min(0.0) - (-x.abs()).exp().ln_1p()) * std::f64::consts::LOG2_E) as f32
 }
 
 /// The inverse of [`log2_sigmoid`], within -100 to 30: `-ln(1/opacity - 1)`.
 fn logit_from_log2(log2_opacity: f32) -> f32 {
+    // 1/opacity - 1 = 2^-log2 - 1 by exp_m1, which does not cancel for opacities near 1. Merged
+    // Gaussians have opacities above 1: there it is negative, becomes 0, and the logit is clamped
+    // to 30.
     let inverse_less_one = (-f64::from(log2_opacity) * std::f64::consts::LN_2).exp_m1();
     (-inverse_less_one.max(0.0).ln()).clamp(-100.0, 30.0) as f32
 }
@@ -462,10 +480,14 @@ impl Partition {
             .par_iter()
             .enumerate()
             .map(|(index, mean)| {
+                // (y, x), so that the sort gives the order of cells that `Partition::cells`
+                // promises.
                 let cell = [cell_index(mean[1]), cell_index(mean[0])];
                 (cell, block_index(mean, cell), morton(mean), index as u32)
             })
             .collect();
+        // Unstable is enough: the index is the last part of the key, so that no two keys are equal
+        // and the order is deterministic.
         keys.par_sort_unstable();
         let mut cells = Vec::new();
         let mut start = 0;
@@ -474,10 +496,14 @@ impl Partition {
             let heights = run.iter().map(|&(.., index)| means_m[index as usize][2]);
             let (low, high) =
                 heights.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), z| (l.min(z), h.max(z)));
+            // The origin's height is the multiple of 64 m nearest to the middle of the cell's
+            // heights. A multiple of a power of two subtracts without rounding.
             let level = (0.5 * (low + high) / CELL_M).round();
             let origin_m = CELL_M * DVec3::new(f64::from(x), f64::from(y), level);
             let mut blocks = Vec::new();
             let mut end = start;
+            // One predicate for both cases: in a sparse cell it is always true, so that the whole
+            // run is one block.
             for block in run.chunk_by(|a, b| run.len() < SPARSE_CELL || a.1 == b.1) {
                 blocks.push((block[0].1, end..end + block.len()));
                 end += block.len();
@@ -494,6 +520,8 @@ impl CellRun {
     pub fn record<'a>(&self, gaussians: &'a Gaussians, index: usize) -> RawGaussian<'a> {
         let mean = DVec3::from_array(gaussians.means_m[index]) - self.origin_m;
         RawGaussian {
+            // Subtracted in f64, then rounded: relative to the origin the f32 has an error of
+            // micrometres, which absolute coordinates of 4.5e6 m would not.
             mean_m: mean.as_vec3().to_array(),
             quat_wxyz: gaussians.quats_wxyz[index],
             ln_scale: gaussians.ln_scales[index],
@@ -510,6 +538,7 @@ pub fn cell_at(mean_m: &[f64; 3]) -> [i32; 2] {
 
 /// The cell index along one axis. Import accepts coordinates up to 1e8 m, so the index fits an i32.
 fn cell_index(coordinate_m: f64) -> i32 {
+    // 1e8 / 64 is 1.6e6, far below 2^31.
     (coordinate_m / CELL_M).round() as i32
 }
 
@@ -518,6 +547,8 @@ fn cell_index(coordinate_m: f64) -> i32 {
 fn block_index(mean_m: &[f64; 3], [y, x]: [i32; 2]) -> u8 {
     let step = |m: f64, cell: i32| {
         let from_edge_m = m - CELL_M * (f64::from(cell) - 0.5);
+        // A mean at the cell's edge may round to either side of it; the clamp keeps it in a block
+        // of its cell.
         (from_edge_m / BLOCK_M).floor().clamp(0.0, BLOCKS as f64 - 1.0) as u8
     };
     BLOCKS as u8 * step(mean_m[1], y) + step(mean_m[0], x)
@@ -527,6 +558,8 @@ fn block_index(mean_m: &[f64; 3], [y, x]: [i32; 2]) -> u8 {
 /// 128 km.
 fn morton(mean_m: &[f64; 3]) -> u64 {
     mean_m.iter().enumerate().fold(0, |code, (axis, &m)| {
+        // Through i64, because a cast of a negative float to u64 gives 0. The mask takes the low 21
+        // bits: positions repeat after 128 km, and negative ones come after positive ones.
         let steps = (m * (1024.0 / CELL_M)).floor() as i64 as u64 & 0x1F_FFFF;
         code | spread(steps) << axis
     })
@@ -621,6 +654,8 @@ impl Scene {
     pub fn distinct_chunks(&self) -> impl Iterator<Item = &Arc<Chunk>> {
         let mut shared = BTreeSet::new();
         let placed = self.placed.iter().map(|placed| &placed.chunk);
+        // By address: two actors share a chunk if they share the allocation. Comparing contents
+        // would cost a pass over all Gaussians.
         let own = placed.filter(move |chunk| shared.insert(Arc::as_ptr(chunk)));
         self.chunks.iter().chain(own)
     }
@@ -724,6 +759,7 @@ mod tests {
         let count = 2 * CLUSTER + 21;
         let mut pushed = Chunk::new([0, 0], DVec3::ZERO, 0, count);
         for i in 0..count {
+            // Multiples modulo the prime 1009: a cheap, repeatable scatter from -0.5 to 0.5.
             let share = |k: usize| (i * k % 1_009) as f32 / 1_009.0 - 0.5;
             let x_m = if i == CLUSTER + 7 { f32::NAN } else { 30.0 * share(37) };
             pushed.push_activated(&ActivatedGaussian {
@@ -768,6 +804,7 @@ mod tests {
                 assert!(off.abs() < 1e-6, "{off}");
             }
             let [was, is] = [raw.logit_opacities[from], again.logit_opacities[index]];
+            // A logit of 100 comes back as 30, where the inverse is clamped.
             assert!((was.clamp(-100.0, 30.0) - is).abs() < 1e-4, "{was} became {is}");
         }
     }
@@ -784,6 +821,7 @@ mod tests {
             for &i in cluster {
                 bounds.add(DVec3::from_array(means[i as usize]), DVec3::ZERO);
             }
+            // 8 points 2 m apart span 14 m; the bound leaves one step of tolerance.
             assert!(bounds.size_m().max_element() <= 16.0, "{bounds:?}");
         }
     }

@@ -60,6 +60,8 @@ impl Gaussians {
 
     /// Reserves memory for exactly `n` more Gaussians.
     pub fn reserve_exact(&mut self, n: usize) {
+        // Exact and not amortised: the count of a file is known before it is read, and a reserve of
+        // half as much again would be gigabytes.
         self.means_m.reserve_exact(n);
         self.quats_wxyz.reserve_exact(n);
         self.ln_scales.reserve_exact(n);
@@ -91,6 +93,7 @@ impl Gaussians {
         self.logit_opacities.extend_from_slice(&others.logit_opacities[range.clone()]);
         let own = 3 * sh::coefficients(others.sh_degree);
         let raised = 3 * sh::coefficients(self.sh_degree);
+        // Equal degrees, the usual case: one copy of all coefficients.
         if own == raised {
             self.sh.extend_from_slice(&others.sh[range.start * own..range.end * own]);
             return;
@@ -119,6 +122,8 @@ impl Gaussians {
         }
         for quat in &mut self.quats_wxyz {
             let [w, x, y, z] = quat.map(f64::from);
+            // The rotation is composed on the left: the principal axes turn with the Gaussian. In
+            // f64, as the result is rounded once.
             let q = a_from_b.rotation * DQuat::from_xyzw(x, y, z, w);
             *quat = [q.w, q.x, q.y, q.z].map(|q| q as f32);
         }
@@ -126,6 +131,8 @@ impl Gaussians {
         for color in self.sh.chunks_exact_mut(3 * sh::coefficients(self.sh_degree)) {
             colors.apply(color);
         }
+        // Rotations keep the length of a band's vector, so that one coefficient may grow up to the
+        // square root of the band's size.
         self.clamp_coefficients();
     }
 
@@ -153,6 +160,7 @@ impl Gaussians {
         if factor == 1.0 {
             return;
         }
+        // A factor on a scale is a summand of its logarithm.
         let ln = factor.ln();
         for mean in &mut self.means_m {
             *mean = mean.map(|m| m * factor);
@@ -179,6 +187,8 @@ impl Gaussians {
         let from = 3 * sh::coefficients(self.sh_degree);
         let to = 3 * sh::coefficients(degree);
         if from < to {
+            // Rows become wider, so that the whole array is laid out again: O(n), and memory for
+            // both at once.
             let mut raised = vec![0.0; self.len() * to];
             for (new, old) in raised.chunks_exact_mut(to).zip(self.sh.chunks_exact(from)) {
                 new[..from].copy_from_slice(old);

@@ -164,6 +164,7 @@ impl Provenance {
     /// the push, not the edit.
     pub fn for_edit(&self) -> Self {
         let mut edited = self.clone();
+        // The version that follows is not the push that the note describes.
         edited.options.retain(|option| !option.starts_with(NOTE));
         edited
     }
@@ -194,14 +195,18 @@ impl Manifest {
     /// An option of the provenance cannot be read, or all of them together are more than an
     /// [`Alignment`] may be.
     pub fn alignment(&self) -> Result<Option<Alignment>, AlignmentError> {
+        // The field has all alignments as one; options are read only where it is missing.
         if self.twin_from_capture.is_some() {
             return Ok(self.twin_from_capture);
         }
         let mut options = self.provenance.options.iter().filter_map(|o| o.strip_prefix("align="));
+        // In the order of the options, which is that of the alignments: each next one is applied
+        // after all before it.
         let all = options.try_fold(None, |first: Option<Alignment>, text| {
             let next: Alignment = text.parse()?;
             Ok(Some(first.map_or(next, |first| next.after(&first))))
         })?;
+        // A product of valid alignments can leave the range.
         all.map(|all| all.check().map(|()| all)).transpose()
     }
 
@@ -219,6 +224,7 @@ impl Manifest {
     /// Size of all objects without the manifest itself, in bytes.
     pub fn stored_bytes(&self) -> u64 {
         let sky = self.sky.as_ref().map_or(0, |sky| sky.bytes);
+        // The table of the views, and the images that it lists.
         let views = self.views.as_ref().map_or(0, |views| views.bytes + views.image_bytes);
         self.table.bytes + sky + views + self.chunks.iter().map(|chunk| chunk.bytes).sum::<u64>()
     }
@@ -245,6 +251,8 @@ impl ChunkEntry {
 
     /// Union of a section's 3-sigma boxes in the world, in metres.
     pub fn section_bounds(&self, section: &Section) -> Bounds {
+        // Corners are stored in f32 relative to the cell, so that they keep their precision far
+        // from the world's origin.
         let world_m = |corner: [f32; 3]| self.origin_m + DVec3::from_array(corner.map(f64::from));
         Bounds { min_m: world_m(section.min_m), max_m: world_m(section.max_m) }
     }

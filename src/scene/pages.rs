@@ -54,7 +54,9 @@ impl PagePool {
     }
 
     fn take(&self, lanes: usize) -> Option<Page> {
+        // One lock for both fields, so that `bytes` is always that of `pages`.
         let free = &mut *self.free.lock();
+        // `None` leaves the count as it is: nothing was taken.
         let page = free.pages.get_mut(&lanes)?.pop()?;
         free.bytes -= lanes * size_of::<Lanes>();
         Some(page)
@@ -66,6 +68,8 @@ impl PagePool {
         let page_bytes = lanes * size_of::<Lanes>();
         let free = &mut *self.free.lock();
         let kept = free.pages.entry(lanes).or_default();
+        // From the end, and only pages of the full capacity. What is left is freed by the caller,
+        // after the lock is released.
         while free.bytes + page_bytes <= self.limit_bytes
             && let Some(mut page) = pages.pop_if(|page| page.capacity() == lanes)
         {
@@ -123,6 +127,7 @@ impl LanePages {
         assert!(lanes.len().is_multiple_of(self.width), "a part of a lane group");
         let mut rest = lanes;
         while !rest.is_empty() {
+            // Room in the last page, which is a whole page if the last one is full.
             let room = (PAGE_GROUPS - self.groups % PAGE_GROUPS) * self.width;
             let (now, later) = rest.split_at(rest.len().min(room));
             self.last_page(now.len() / self.width).extend_from_slice(now);
@@ -143,7 +148,10 @@ impl LanePages {
     fn last_page(&mut self, groups: usize) -> &mut Page {
         if self.groups.is_multiple_of(PAGE_GROUPS) {
             let whole = PAGE_GROUPS * self.width;
+            // At least what is about to be appended, also if more comes than was announced.
             let expected = self.expected.saturating_sub(self.groups).max(groups);
+            // The rest of a chunk: exactly its size, from the heap, since pages in the pool are
+            // whole.
             let page = if expected < PAGE_GROUPS {
                 Page::with_capacity(expected * self.width)
             } else {
@@ -184,6 +192,7 @@ impl LanePages {
 impl Clone for LanePages {
     /// The clone's pages come from the heap.
     fn clone(&self) -> Self {
+        // Without a pool: `Vec::clone` takes memory of the heap, which returns to the heap.
         Self { pages: self.pages.clone(), pool: None, ..*self }
     }
 }

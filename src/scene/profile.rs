@@ -162,6 +162,8 @@ impl RenderProfile {
     /// # Errors
     /// [`ProfileError::Value`] names the first field out of range.
     pub fn check(&self) -> Result<(), ProfileError> {
+        // One row for each field: name, value for the message, whether it is in range, and the
+        // range in words. All rows are computed, which is cheap; the first wrong one is reported.
         let checks = [
             ("near", self.near, (1e-4..=1e3).contains(&self.near), "near is from 1e-4 to 1e3 m"),
             (
@@ -192,6 +194,7 @@ impl RenderProfile {
             ),
             (
                 "reach_m",
+                // The value is only for the message; an absent reach passes the next line.
                 self.reach_m.unwrap_or(f64::INFINITY),
                 self.reach_m.is_none_or(|reach_m| (0.0..=1e9).contains(&reach_m)),
                 "reach_m is from 0 to 1e9 m, or none",
@@ -210,6 +213,7 @@ impl RenderProfile {
             ),
             (
                 "background",
+                // The first colour out of range, for the message.
                 self.background.into_iter().find(|c| !(0.0..=1.0).contains(c)).unwrap_or(0.0),
                 self.background.iter().all(|c| (0.0..=1.0).contains(c)),
                 "each of its colours is from 0 to 1",
@@ -236,6 +240,7 @@ impl RenderProfile {
             "blur" => self.blur = number()?,
             "antialiased" => {
                 self.antialiased =
+                    // `parse` accepts exactly `true` and `false`, as JSON does.
                     value.parse().map_err(|_| bad("expected true or false".into()))?;
             }
             "alpha_cap" => self.alpha_cap = number()?,
@@ -250,6 +255,7 @@ impl RenderProfile {
             "lens_error_px" => self.lens_error_px = number()?,
             "sky_error" => self.sky_error = number()?,
             "background" => {
+                // Three numbers exactly: fewer or more fail the conversion to an array.
                 let colours: Result<Vec<f64>, _> = value.split(',').map(str::parse).collect();
                 self.background = colours
                     .ok()
@@ -258,6 +264,7 @@ impl RenderProfile {
             }
             _ => return Err(bad(format!("there is no field {key:?}"))),
         }
+        // A setting that makes the profile inconsistent is refused although it is in range alone.
         self.check()
     }
 }
@@ -274,6 +281,8 @@ impl ProfileOverrides {
     /// Names the field that does not exist, does not parse, or is out of range.
     pub fn apply(&self, profile: RenderProfile) -> Result<RenderProfile, ProfileError> {
         let mut changed = profile;
+        // Through JSON, because the names and types of fields are those of serde: an override needs
+        // no second list of them.
         for (field, value) in &self.0 {
             let bad = |reason: String| ProfileError::Change { field: field.clone(), reason };
             let whole = serde_json::to_value(changed).map_err(|e| bad(e.to_string()))?;
@@ -292,6 +301,7 @@ impl ProfileOverrides {
                 })
             })?;
         }
+        // Once, after all: two overrides may be valid only together, such as near and far.
         changed.check()?;
         Ok(changed)
     }
@@ -299,6 +309,7 @@ impl ProfileOverrides {
     /// These overrides, and those of `others` for fields that these do not set.
     pub fn or(&self, others: &Self) -> Self {
         let mut fields = others.0.clone();
+        // `extend` overwrites, so that these win.
         fields.extend(self.0.clone());
         Self(fields)
     }

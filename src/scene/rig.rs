@@ -61,6 +61,7 @@ impl RigCamera {
     /// This camera with other intrinsics, which show a part of the image, and with that part of the
     /// overlay.
     fn part(&self, camera: Camera, at_px: [u32; 2], part_px: [u32; 2]) -> Result<Self, RigError> {
+        // A copy; overlays are behind an `Arc`, so that it is cheap.
         let mut appearance = self.appearance.clone();
         if let Some(overlay) = &mut appearance.overlay {
             let size_px = [camera.width_px, camera.height_px];
@@ -167,6 +168,7 @@ impl Rig {
     /// # Errors
     /// Names the first camera that is invalid.
     pub fn check(&self) -> Result<(), RigError> {
+        // The number first: later checks take time per camera, and the limit bounds it.
         check_count(&self.name, self.cameras.len())?;
         if !is_name(&self.name) {
             return Err(RigError::Name { name: self.name.clone() });
@@ -180,6 +182,8 @@ impl Rig {
             if !names.insert(name) {
                 return Err(RigError::Duplicate { name: name.clone() });
             }
+            // Intrinsics before the shutter, and both before the appearance, whose check needs a
+            // valid size.
             let shutter = shutter.as_ref().map_or(Ok(()), Shutter::check);
             camera.check().and(shutter).map_err(|cause| mounted.wrong(cause))?;
             let looks = appearance.check([camera.width_px, camera.height_px]);
@@ -230,7 +234,9 @@ pub const MAX_NAME_BYTES: usize = 64;
 /// path.
 pub fn is_name(text: &str) -> bool {
     let allowed = |b: u8| b.is_ascii_lowercase() || b.is_ascii_digit() || b"._-".contains(&b);
+    // The length in bytes: all allowed characters have one byte.
     (1..=MAX_NAME_BYTES).contains(&text.len())
+        // Names are file names; a leading dot would hide the file, and `..` would leave the folder.
         && !text.starts_with('.')
         && text.bytes().all(allowed)
 }
@@ -279,6 +285,8 @@ impl TryFrom<RigFields> for Rig {
         let mut cameras = Vec::with_capacity(fields.len());
         for camera in fields {
             cameras.push(camera.try_into()?);
+            // After each camera, so that the memory of decoded overlays never exceeds the limit by
+            // more than one.
             check_overlays(&cameras)?;
         }
         Ok(Self { name, cameras })
@@ -331,6 +339,7 @@ impl TryFrom<CameraFields> for RigCamera {
             Ok(camera) => camera,
             Err(cause) => return Err(RigError::Camera { name, cause }),
         };
+        // The header of the overlay is compared with the camera's size before a pixel is decoded.
         let appearance = match Appearance::new(fields.exposure, fields.overlay.as_deref(), size_px)
         {
             Ok(appearance) => appearance,
@@ -397,6 +406,7 @@ mod tests {
             format!(r#"{{"name":"test","cameras":[{}]}}"#, [camera].repeat(count).join(","))
         };
         let refused = |count| serde_json::from_str::<Rig>(&rig(count)).unwrap_err().to_string();
+        // 16 cameras pass the count, so that the first overlay is read and refused.
         assert!(refused(16).contains("overlay"), "{}", refused(16));
         assert!(refused(100_000).contains("100000 cameras"), "{}", refused(100_000));
     }
@@ -423,6 +433,7 @@ mod tests {
             let text = serde_json::to_string(&read).unwrap();
             assert_eq!(serde_json::from_str::<Rig>(&text).unwrap(), read, "{text}");
         }
+        // 100 x 80 pixels are 8,000.
         let hood = Overlay::new(100, [[1, 2, 3, 4]; 8000].as_flattened().to_vec()).unwrap();
         let looks = format!(
             r#""fx":50,"fy":50,"exposure":{{"gain":[1,2,3]}},"overlay":"{}""#,
@@ -490,6 +501,8 @@ mod tests {
             rig.cameras.iter().zip(looks)
         {
             assert_eq!(name, named);
+            // Columns of the matrix are the camera's axes on the rig: z is where it looks, and y is
+            // down.
             let axes = rig_from_camera.rotation_matrix();
             assert!((axes.z_axis - forward).length() < 1e-12, "{name} looks along {}", axes.z_axis);
             assert!((axes.y_axis + DVec3::Z).length() < 1e-12, "{name}: down is {}", axes.y_axis);

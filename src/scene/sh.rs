@@ -90,8 +90,10 @@ impl ShRotation {
             (0.861_136_311_594_052_6, 0.347_854_845_137_453_85),
         ];
         let mut matrix = [[0.0; 16]; 16];
+        // The rule is symmetric about 0; two abscissae stand for four.
         for (height, weight) in HEIGHTS.into_iter().flat_map(|(z, w)| [(z, w), (-z, w)]) {
             for step in 0..8 {
+                // Eight azimuths of π/4 integrate trigonometric polynomials up to degree 7 exactly.
                 let (sin, cos) = (f64::from(step) * FRAC_PI_4).sin_cos();
                 let radius = (1.0 - height * height).sqrt();
                 let direction = DVec3::new(radius * cos, radius * sin, height);
@@ -99,6 +101,8 @@ impl ShRotation {
                 let turned = basis(turned_from_plain * direction);
                 for (row, turned) in matrix.iter_mut().zip(turned) {
                     for (entry, plain) in row.iter_mut().zip(plain) {
+                        // Weight of the height times the arc of an azimuth, π/4: the weights sum up
+                        // to 2 * 8 * π/4 = 4π.
                         *entry += weight * FRAC_PI_4 * turned * plain;
                     }
                 }
@@ -109,6 +113,7 @@ impl ShRotation {
 
     /// Rotates the coefficients of one Gaussian in place, `[(degree + 1)², 3]`.
     pub fn apply(&self, colour: &mut [f32]) {
+        // A copy, because every output reads all inputs.
         let mut plain = [[0.0; 3]; 16];
         for (plain, colour) in plain.iter_mut().zip(colour.chunks_exact(3)) {
             *plain = [colour[0], colour[1], colour[2]].map(f64::from);

@@ -107,10 +107,14 @@ impl Trajectory {
         for (from, pair) in self.keyframes.windows(2).enumerate() {
             let along_m = position_m(from + 1) - position_m(from);
             let length_m = segment_m(&pair[0], &pair[1]);
+            // A standing vehicle makes segments without a length, which would divide by 0. Their
+            // place is the end of the segment before.
             if length_m > 0.0 {
+                // Foot of the perpendicular, as a share of the segment.
                 let share = (point_m - position_m(from)).dot(along_m) / along_m.length_squared();
                 let share = share.clamp(0.0, 1.0);
                 let distance_m = (position_m(from) + share * along_m).distance(point_m);
+                // Strictly nearer, so that the first of equal places stays.
                 if distance_m < nearest.distance_m {
                     nearest = NearestPlace { station_m: start_m + share * length_m, distance_m };
                 }
@@ -124,8 +128,11 @@ impl Trajectory {
     pub fn at_station(&self, station_m: f64) -> Pose {
         let mut start_m = 0.0;
         for pair in self.keyframes.windows(2) {
+            // A linear walk over the segments for each call; `Route::at` searches by bisection.
             let length_m = segment_m(&pair[0], &pair[1]);
+            // Segments without a length are skipped here, too.
             if length_m > 0.0 && station_m <= start_m + length_m {
+                // Before the start, the first pose.
                 let t = ((station_m - start_m) / length_m).max(0.0);
                 return pair[0].world_from_rig.interpolate(&pair[1].world_from_rig, t);
             }

@@ -102,6 +102,8 @@ pub fn check(
     name: &(dyn Fn(Field) -> String + Sync),
 ) -> Result<(), BadGaussians> {
     // Most files are valid, so all cores search for the first invalid Gaussian.
+    // `find_first` gives the first index whichever thread finds one, so that the message does not
+    // depend on threads.
     let first = (0..gaussians.len())
         .into_par_iter()
         .by_uniform_blocks(BLOCK_GAUSSIANS)
@@ -109,6 +111,7 @@ pub fn check(
     let Some(first) = first else { return Ok(()) };
     let mut named = Vec::new();
     let mut count = 0;
+    // From there one thread is enough: invalid files are rare, and names are needed in order.
     for index in first..gaussians.len() {
         let Some(Violation { field, value, must }) = violation(gaussians, index) else { continue };
         count += 1;
@@ -150,6 +153,7 @@ pub fn is_valid(gaussians: &Gaussians, index: usize) -> bool {
 /// The first number of a Gaussian that is outside its bounds. Every condition states what must
 /// hold, so that NaN fails it.
 fn violation(gaussians: &Gaussians, index: usize) -> Option<Violation> {
+    // The order of the checks is that of the columns: the first one at fault is named.
     for (axis, &m) in gaussians.means_m[index].iter().enumerate() {
         let near = m.abs() <= Pose::MAX_COORDINATE_M;
         if !near {
@@ -168,6 +172,7 @@ fn violation(gaussians: &Gaussians, index: usize) -> Option<Violation> {
             must: "a quaternion is finite",
         });
     }
+    // In f64: the squares of components up to 3e38 leave f32.
     let length = quat.iter().map(|&q| f64::from(q).powi(2)).sum::<f64>().sqrt();
     if !(QUAT_LENGTH[0]..=QUAT_LENGTH[1]).contains(&length) {
         return Some(Violation {

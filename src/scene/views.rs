@@ -135,10 +135,13 @@ pub fn reduced_mask(counts: &[bool], from_px: [u32; 2], to_px: [u32; 2]) -> Vec<
     }
     let [width, height] = from_px.map(|side| side as usize);
     let [to_width, to_height] = to_px.map(|side| side as usize);
+    // True until a pixel that does not count reaches it: most masks exclude few pixels.
     let mut reduced = vec![true; to_width * to_height];
     for (pixel, _) in counts.iter().enumerate().filter(|(_, counts)| !**counts) {
         let columns = reached(pixel % width, width, to_width);
         for row in reached(pixel / width, height, to_height) {
+            // A rectangle of the smaller image: rows and columns are independent in a separable
+            // kernel.
             reduced[row * to_width..][columns.clone()].fill(false);
         }
     }
@@ -148,10 +151,12 @@ pub fn reduced_mask(counts: &[bool], from_px: [u32; 2], to_px: [u32; 2]) -> Vec<
 /// The pixels of a row of `to` that Lanczos 3 makes of pixel `at` of a row of `from`.
 fn reached(at: usize, from: usize, to: usize) -> Range<usize> {
     const REACH_PX: f64 = 3.0;
+    // The centre of the pixel, in pixels of the smaller image.
     let center_px = (at as f64 + 0.5) * to as f64 / from as f64;
     // Centres are at +0.5. Negative numbers become 0.
     let first = (center_px - REACH_PX - 0.5).ceil() as usize;
     let last = (center_px + REACH_PX - 0.5).floor() as usize;
+    // Cut at the far edge; `first` cannot be beyond it, because the centre is within the image.
     first..(last + 1).min(to)
 }
 
@@ -222,6 +227,8 @@ mod tests {
     fn a_pixel_of_a_smaller_mask_counts_if_all_of_its_pixels_do() {
         // One pixel in the middle of 40 x 4, at 20.5: in 20 x 2 at 10.25, so that centres from 7.25
         // to 13.25 are reached.
+        // Row 2 of 4, whose centre 2.5 is 1.25 in the smaller image: both of its rows are within
+        // three pixels.
         let mut counts = vec![true; 40 * 4];
         counts[40 * 2 + 20] = false;
         let reduced = reduced_mask(&counts, [40, 4], [20, 2]);

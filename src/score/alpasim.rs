@@ -52,6 +52,8 @@ pub fn side(ego: &Footprint, other: &Footprint) -> Option<Side> {
     if !ego.touches(other) {
         return None;
     }
+    // The order of the tests decides: a corner that touches both the front line and the side is a
+    // hit of the front.
     if ego.front_line().touches(other) {
         return Some(Side::Front);
     }
@@ -60,6 +62,8 @@ pub fn side(ego: &Footprint, other: &Footprint) -> Option<Side> {
 
 /// The side of the rounded ego that another box touches.
 fn contact_side(ego: &RoundedBox, other: &Footprint) -> Option<Side> {
+    // The rounded box decides whether there is a contact, and the sharp one which side it is on, as
+    // published.
     if ego.distance_m(other) > 0.0 {
         return None;
     }
@@ -105,6 +109,7 @@ pub fn scene_score(rollout: &Rollout) -> f64 {
     if rollout.collision_at_fault || rollout.offroad {
         return 0.0;
     }
+    // After the rule for faults: a standing scene still fails with a collision.
     if rollout.recorded_m < SHORT_RECORDING_M {
         return 1.0;
     }
@@ -114,6 +119,8 @@ pub fn scene_score(rollout: &Rollout) -> f64 {
 /// All of AlpaSim's scores of an episode.
 pub fn scores(record: &DriveRecord) -> Vec<Score> {
     let drive = Drive::from_record(record);
+    // The scores of plans need only the time of the cut; an input that is missing here is missing
+    // there, too.
     let cut_us = drive.as_ref().map(|drive| drive.cut_us).map_err(Clone::clone);
     let mut scores = vec![scene(&drive), off_road(record, &drive), wrong_lane(record, &drive)];
     scores.extend(alpasim_plans::scores(record, &cut_us));
@@ -136,6 +143,7 @@ impl Drive {
         let tracks =
             record.tracks.as_ref().ok_or(Missing::new("needs the actors of a scenario"))?;
         let shape = record.shape.ok_or(Missing::new("needs the size of the ego"))?;
+        // Both need the drive, and give one reason.
         let no_drive = Missing::new("needs the recorded drive");
         let stations_m = record.stations_m().ok_or(no_drive.clone())?;
         let recorded_m = record.recorded_way_m().ok_or(no_drive)?;
@@ -151,16 +159,22 @@ impl Drive {
             let others: Vec<Footprint> = others.map(|other| other.footprint).collect();
             let sides: Vec<Side> =
                 others.iter().filter_map(|other| contact_side(&ego, other)).collect();
+            // The least gap so far is one more candidate, so that the fold goes over the whole
+            // episode.
             let gaps_m = others.iter().map(|other| ego.distance_m(other));
             drive.least_gap_m = gaps_m.chain(drive.least_gap_m).reduce(f64::min);
             let off_road = road.as_ref().is_some_and(|road| road.is_off(&ego));
             let wrong = map.and_then(|map| is_in_wrong_lane(map, ego.center_m(), sample.yaw_rad));
+            // Once wrong, wrong for the rest. It stays `None` as long as lanes have no direction.
             drive.wrong_lane = wrong.map(|wrong| wrong || drive.wrong_lane == Some(true));
             let rollout = &mut drive.rollout;
+            // Progress is that of the last sample and not the largest one. The bound replaces a
+            // division by 0; then any station above 0 is full progress.
             rollout.progress = (station_m / recorded_m.max(f64::MIN_POSITIVE)).clamp(0.0, 1.0);
             rollout.collision_at_fault |= Collision::from_sides(&sides).is_at_fault();
             rollout.offroad |= off_road;
             drive.cut_us = record.dt_us * step as i64;
+            // The sample of the cut still counts: its contact is the reason for the cut.
             if !sides.is_empty() || off_road || off_m > CUT_M {
                 break;
             }

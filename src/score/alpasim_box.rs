@@ -53,6 +53,7 @@ impl RoundedBox {
         let centers_m = self.core.corners_m();
         let arcs = (0..4 * ARC_POINTS).map(|k| {
             let center_m = centers_m[k / ARC_POINTS];
+            // The signs of the corner's direction turn one formula into four.
             let out = center_m - self.core.center_m;
             let along = self.core.forward * out.dot(self.core.forward).signum();
             let aside = self.core.left() * out.dot(self.core.left()).signum();
@@ -62,9 +63,11 @@ impl RoundedBox {
         let Footprint { center_m, forward, length_m, width_m } = self.core;
         let left = self.core.left();
         // The vector along each side, and the vector from the centre to its middle.
+        // A side of the core, moved outwards by the radius, is a side of the rounded box.
         let along = [length_m * forward, (0.5 * width_m + self.radius_m) * left];
         let across = [width_m * left, (0.5 * length_m + self.radius_m) * forward];
         let sides = [along, across].into_iter().flat_map(|[way_m, out_m]| {
+            // `spacing_m` above the side gives one interval, and no point between the arcs.
             let count = (way_m.length() / spacing_m).ceil() as usize;
             let shares = (1..count).map(move |k| k as f64 / count as f64 - 0.5);
             shares.flat_map(move |share| [-1.0, 1.0].map(|sign| share * way_m + sign * out_m))
@@ -79,6 +82,7 @@ impl RoundedBox {
 
     /// Whether a point lies in the box.
     pub fn holds(&self, point_m: DVec2) -> bool {
+        // The rounded box is all points within the radius of its core.
         self.core.distance_to_m(point_m) <= self.radius_m
     }
 

@@ -37,6 +37,7 @@ const TIME_DELTAS_US: [i64; 4] = [500_000, 1_000_000, 2_500_000, 5_000_000];
 /// The mean of distances between successive plans, weighted by exp(-decay k); `None` without
 /// distances.
 pub fn plan_deviation(distances_m: &[f64], decay: f64) -> Option<f64> {
+    // Earlier poses count most: the weight of pose k is e^(-0.1 k).
     let weight = |k: usize| (-decay * k as f64).exp();
     let sum: f64 =
         distances_m.iter().enumerate().map(|(k, distance_m)| weight(k) * distance_m).sum();
@@ -47,6 +48,7 @@ pub fn plan_deviation(distances_m: &[f64], decay: f64) -> Option<f64> {
 /// The scores of the plans, up to the time at which the episode is cut.
 pub(crate) fn scores(record: &DriveRecord, cut_us: &Result<i64, Missing>) -> Vec<Score> {
     let input = Input::new(record, cut_us);
+    // One missing input is the reason of all six scores.
     let measure = |measure: &dyn Fn(&Input<'_>) -> Measured| match &input {
         Ok(input) => measure(input),
         Err(missing) => Err(missing.clone()),
@@ -94,8 +96,10 @@ impl<'a> Input<'a> {
     /// `min_timesteps` of AlpaSim's configuration is never read there: a single common time is
     /// enough.
     fn deviation(&self) -> Measured {
+        // `future` leaves out the ego's own pose at the decision, which is no part of the plan.
         let of_pair = |pair: &[&Plan]| {
             let [before, plan] = [pair[0], pair[1]];
+            // Only times that both plans have: beyond its end the earlier one is not extrapolated.
             let common = plan.future().iter().filter(|pose| pose.time_us <= before.end_us());
             let distances_m = common.filter_map(|pose| {
                 let expected = before.at(pose.time_us)?;
@@ -111,10 +115,13 @@ impl<'a> Input<'a> {
     /// the plan's poses.
     fn collision(&self) -> Measured {
         let tracks = self.record.tracks.as_deref().unwrap_or_default();
+        // `None` for a plan without a pose in the horizon: it is no decision that could collide.
         let of_plan = |plan: &&Plan| {
             let until_us = plan.decided_us() + HORIZON_US;
             let mut ahead = plan.future().iter().filter(|pose| pose.time_us <= until_us).peekable();
             ahead.peek()?;
+            // The ego's box at the planned pose, against the others where they really were at that
+            // time.
             let hits = |pose: &PlannedPose| {
                 let ego = RoundedBox::new(&self.shape, &sample(pose));
                 let boxes = tracks
@@ -153,13 +160,16 @@ impl<'a> Input<'a> {
     ) -> Option<f64> {
         let dt_us = self.record.dt_us;
         let now_us = plan.decided_us();
+        // One horizon for all deltas: the longest, 5 s.
         let longest_us = now_us + TIME_DELTAS_US[TIME_DELTAS_US.len() - 1];
         let recorded_us = reference.times_us.last().copied()?;
         let end_us = longest_us.min(self.record.end_us()).min(recorded_us);
+        // Rounded up to whole steps: the first step that is not before the time ahead.
         let steps = (delta_us + dt_us - 1) / dt_us;
         if now_us + steps * dt_us > end_us {
             return None;
         }
+        // From 1: at the decision itself the distance is 0.
         let distances_m = (1..=steps).map(|step| {
             let time_us = now_us + step * dt_us;
             let planned_m = self.center_m(&plan.at(time_us)?);
@@ -178,15 +188,18 @@ fn recorded_at(reference: &ReferenceDrive, time_us: i64) -> PlannedPose {
 
 /// The box of a track at a time, interpolated between its samples; `None` where it is absent.
 fn box_at(track: &Track, time_us: i64, dt_us: i64) -> Option<Footprint> {
+    // `div_euclid` rounds down, so that a time before 0 gives no sample and not sample 0.
     let before = usize::try_from(time_us.div_euclid(dt_us)).ok()?;
     let from = track.samples.get(before).copied().flatten()?.footprint;
     let t = time_us.rem_euclid(dt_us) as f64 / dt_us as f64;
+    // On a sample the next one is not needed, and may be absent at the end of a track.
     if t == 0.0 {
         return Some(from);
     }
     let to = track.samples.get(before + 1).copied().flatten()?.footprint;
     let yaw_rad = from.forward.to_angle();
     let turned = yaw_rad + t * turn_rad(yaw_rad, to.forward.to_angle());
+    // The size is that of the earlier sample: boxes of a track do not change.
     let center_m = from.center_m.lerp(to.center_m, t);
     Some(Footprint::new(center_m, turned, from.length_m, from.width_m))
 }

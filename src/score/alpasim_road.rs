@@ -40,6 +40,7 @@ impl<'a> Road<'a> {
     /// The road of a map.
     pub fn from_map(map: &'a LaneMap) -> Self {
         let bounded = |lane: &'a Lane| {
+            // Bounds once per lane: later tests of a far lane then cost one comparison.
             let points_m = lane.outline_m.iter().copied();
             let least_m = points_m.clone().fold(DVec2::INFINITY, DVec2::min);
             BoundedLane { lane, least_m, most_m: points_m.fold(DVec2::NEG_INFINITY, DVec2::max) }
@@ -59,6 +60,7 @@ impl<'a> Road<'a> {
     pub fn is_off(&self, ego: &RoundedBox) -> bool {
         let near: Vec<&Lane> = self.near(ego.center_m(), ego.reach_m() + SEAM_M).collect();
         let touches = |edge| ego.distance_m(&edge) < EDGE_M;
+        // The containment first: it is false for few samples, and edges are tested only then.
         !hold(&near, ego) && near.iter().any(|lane| lane.edges().any(touches))
     }
 
@@ -74,8 +76,11 @@ impl<'a> Road<'a> {
 
 /// Whether one lane contains the ego, or the union of all lanes does.
 fn hold(lanes: &[&Lane], ego: &RoundedBox) -> bool {
+    // Points no farther apart than a seam, so that no opening wider than a seam fits between two of
+    // them.
     let outline_m = ego.outline_m(SEAM_M);
     // A lane has no hole.
+    // One lane that has the whole outline contains the box: the fast, usual case.
     if lanes.iter().any(|lane| outline_m.iter().all(|&point_m| lane.holds(point_m))) {
         return true;
     }
@@ -83,6 +88,7 @@ fn hold(lanes: &[&Lane], ego: &RoundedBox) -> bool {
         return false;
     }
     // A hole below the ego has edges of lanes around it.
+    // A bound by circles first, then the exact distance.
     let below = |edge: &Footprint| {
         let reach_m = ego.reach_m() + 0.5 * edge.length_m;
         edge.center_m.distance(ego.center_m()) <= reach_m && ego.distance_m(edge) == 0.0
@@ -110,6 +116,7 @@ fn is_on_road(lanes: &[&Lane], point_m: DVec2) -> bool {
 
 /// Whether a point lies between two lanes that are no farther apart than a seam.
 fn is_in_seam(lanes: &[&Lane], point_m: DVec2) -> bool {
+    // The way from the point to each lane.
     let way_m = |lane: &&Lane| Some(lane.nearest_on_outline_m(point_m)? - point_m);
     let ways_m: Vec<DVec2> = lanes.iter().filter_map(way_m).collect();
     ways_m.iter().any(|a_m| {
@@ -125,11 +132,13 @@ fn is_in_seam(lanes: &[&Lane], point_m: DVec2) -> bool {
 /// Headings from -π to π are subtracted without wrapping: where a lane leads west, an ego that
 /// follows it is in the wrong lane as soon as one of the two is beyond ±π.
 pub fn is_in_wrong_lane(map: &LaneMap, center_m: DVec2, yaw_rad: f64) -> Option<bool> {
+    // From -π to π, as the published code has it.
     let ego_rad = turn_rad(0.0, yaw_rad);
     let mut directed =
         map.lanes.iter().filter_map(|lane| Some((lane, lane.center.as_ref()?))).peekable();
     directed.peek()?;
     Some(directed.any(|(lane, line)| {
+        // The heading from two points 2 cm apart; at the ends of the line one side is shorter.
         let station_m = line.project(center_m).station_m;
         let ahead_m = line.at((station_m + HEADING_M).min(line.length_m())).0;
         let behind_m = line.at((station_m - HEADING_M).max(0.0)).0;

@@ -112,6 +112,7 @@ pub struct MotionSample {
 /// As published, the yaw acceleration is the yaw rate, and both are compared in degrees with bounds
 /// in radians. `None` for fewer than 3 samples.
 pub fn smooth_segments(samples: &[MotionSample]) -> Option<Vec<bool>> {
+    // Three samples are the least that a parabola fits.
     if samples.len() < 3 {
         return None;
     }
@@ -123,6 +124,8 @@ pub fn smooth_segments(samples: &[MotionSample]) -> Option<Vec<bool>> {
 
 fn is_smooth(samples: &[MotionSample]) -> bool {
     let (window, order) = FILTER;
+    // A short segment has a window of all its samples; `savgol` needs one above the order, which
+    // the check for 3 samples ensures.
     let window = window.min(samples.len());
     let values =
         |value: &dyn Fn(&MotionSample) -> f64| samples.iter().map(value).collect::<Vec<_>>();
@@ -130,6 +133,7 @@ fn is_smooth(samples: &[MotionSample]) -> bool {
         |value: &dyn Fn(&MotionSample) -> f64| savgol(&values(value), window, order, 0, 1.0);
     let slope = |values: &[f64]| savgol(values, window, order, 1, 0.1);
 
+    // Signals are smoothed before they are differentiated, as published.
     let longitudinal = smoothed(&|sample| sample.acceleration_mps2.dot(sample.forward));
     let lateral = smoothed(&|sample| sample.acceleration_mps2.dot(sample.right));
     let length = smoothed(&|sample| sample.acceleration_mps2.length());
@@ -148,6 +152,7 @@ fn is_smooth(samples: &[MotionSample]) -> bool {
         })
         .collect();
     let rate = savgol(&rates, window, order, 0, 1.0);
+    // Every bound is open: a value on it is not smooth.
     let [least, most] = bounds::LONGITUDINAL_MPS2;
     let even = |values: &[f64], most: f64| values.iter().all(|value| value.abs() < most);
     longitudinal.iter().all(|&a| least < a && a < most)
@@ -195,6 +200,7 @@ fn route_percent(record: &DriveRecord) -> Measured {
     if length_m <= 0.0 {
         return Err(Missing::new("needs a recorded drive that moves"));
     }
+    // The farthest station and not the last one: driving back does not reduce the route.
     let farthest_m = stations_m.iter().fold(0.0, |most: f64, station| most.max(station.0));
     Ok((100.0 * farthest_m / length_m).min(100.0))
 }
@@ -203,10 +209,13 @@ fn route_percent(record: &DriveRecord) -> Measured {
 /// emergency vehicles are not in a record.
 fn infractions(record: &DriveRecord) -> Result<Vec<Infraction>, Missing> {
     let tracks = record.tracks.as_ref().ok_or(Missing::new("needs the actors of a scenario"))?;
+    // Per actor: the last contact, also one that was not charged, since the window starts again
+    // with each.
     let mut last: Vec<Option<(i64, DVec2)>> = vec![None; tracks.len()];
     let mut found = Vec::new();
     for contact in record.contacts.iter().filter(|contact| !contact.at_start) {
         let Some(track) = tracks.get(usize::from(contact.actor)) else { continue };
+        // Rounded down to a sample; a contact after the last sample takes that one.
         let sample = (contact.time_us / record.dt_us.max(1)) as usize;
         let place_m = record.ego[sample.min(record.ego.len() - 1)].origin_m;
         let before = &mut last[usize::from(contact.actor)];
@@ -225,6 +234,7 @@ fn infractions(record: &DriveRecord) -> Result<Vec<Infraction>, Missing> {
     }
     let of_twin = record.static_contacts.iter().flatten();
     let moving = of_twin.filter(|contact| contact.impact_mps >= STANDING_MPS);
+    // Contacts with the twin have no actor and no window: each is the beginning of one contact.
     found.extend(moving.map(|_| Infraction::Static));
     Ok(found)
 }
@@ -241,6 +251,7 @@ fn outside_percent(record: &DriveRecord) -> Measured {
             outside_m += step_m;
         }
     }
+    // A standing ego was never outside by any distance.
     Ok(if way_m > 0.0 { 100.0 * outside_m / way_m } else { 0.0 })
 }
 
@@ -252,6 +263,7 @@ fn episode_efficiency(record: &DriveRecord) -> Measured {
     let mut percents = Vec::new();
     let mut ego_mps = Vec::new();
     let mut traffic_mps = Vec::new();
+    // Check point 0 is the start, where nothing has been driven yet.
     let mut next = 1;
     for (step, (sample, (station_m, _))) in record.ego.iter().zip(&stations_m).enumerate() {
         ego_mps.push(sample.speed_mps());
@@ -262,9 +274,11 @@ fn episode_efficiency(record: &DriveRecord) -> Measured {
             }
         }
         let check_point_m = next as f64 * length_m / CHECK_POINTS as f64;
+        // At most one check point per step; a longer jump is caught up with in the next steps.
         if *station_m >= check_point_m && next <= CHECK_POINTS {
             let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len().max(1) as f64;
             let traffic = mean(&traffic_mps);
+            // Standing traffic has no speed to compare with: the part is left out.
             if traffic > 0.0 {
                 percents.push(100.0 * mean(&ego_mps) / traffic);
             }
@@ -280,6 +294,7 @@ fn episode_smoothness(record: &DriveRecord) -> Measured {
     if !record.is_driven {
         return Err(Missing::new("needs an ego that was driven and not teleported"));
     }
+    // The bounds and the filter assume 10 Hz.
     if record.dt_us != 100_000 {
         return Err(Missing::new("needs steps of 0.1 s"));
     }
@@ -292,6 +307,7 @@ impl MotionSample {
     fn from_sample(ego: &EgoSample) -> Self {
         let forward = DVec2::from_angle(ego.yaw_rad);
         Self {
+            // From the car's axes to the world's, because CARLA gives world accelerations.
             acceleration_mps2: forward.rotate(ego.acceleration_mps2),
             forward,
             right: -forward.perp(),

@@ -106,9 +106,11 @@ impl HugsimBox {
 
 /// Judges one decision.
 pub fn decision(decision: &Decision<'_>) -> DecisionScore {
+    // The plan begins with the pose of the ego itself.
     let ego = PlanPose { position_m: decision.ego.footprint.center_m, yaw_rad: decision.yaw_rad };
     let mut plan: Vec<PlanPose> =
         std::iter::once(ego).chain(decision.plan.iter().copied()).collect();
+    // A plan that hardly moves has headings from noise.
     if plan[plan.len() - 1].position_m.distance(ego.position_m) < SHORT_PLAN_M {
         for pose in &mut plan {
             pose.yaw_rad = ego.yaw_rad;
@@ -116,6 +118,7 @@ pub fn decision(decision: &Decision<'_>) -> DecisionScore {
     }
     let nc = if collides(decision, &plan) { 0.0 } else { 1.0 };
     let ttc =
+        // Moved on by 0.5 s and by 1 s at the speed between its poses.
         if [0.5, 1.0].iter().any(|&s| collides(decision, &moved_on(&plan, s))) { 0.0 } else { 1.0 };
     let dac = drivable(decision.ground_m, &plan, &decision.ego.footprint);
     DecisionScore { nc, dac, ttc, c: comfort(&plan, &ego) }
@@ -124,6 +127,7 @@ pub fn decision(decision: &Decision<'_>) -> DecisionScore {
 fn collides(decision: &Decision<'_>, plan: &[PlanPose]) -> bool {
     plan.iter().enumerate().any(|(i, pose)| {
         let ego = decision.ego.at(pose);
+        // Beyond the list, the last boxes stay: others are assumed to stop.
         let last = decision.objects.len().saturating_sub(1);
         let objects = decision.objects.get(i.min(last)).map_or(&[][..], Vec::as_slice);
         ego.hits_static(decision.points_m)
@@ -134,6 +138,8 @@ fn collides(decision: &Decision<'_>, plan: &[PlanPose]) -> bool {
 /// The plan moved on at the speed between its poses; the first one has that of the second.
 fn moved_on(plan: &[PlanPose], ahead_s: f64) -> Vec<PlanPose> {
     let move_by = |i: usize| {
+        // The speed of pose i is that from the pose before it. The first pose has none before it; a
+        // plan of one pose does not move.
         let from = i.max(1).min(plan.len() - 1);
         let way_m = plan[from].position_m - plan[from.saturating_sub(1)].position_m;
         let position_m = plan[i].position_m + way_m / STEP_S * ahead_s;
@@ -147,12 +153,14 @@ fn moved_on(plan: &[PlanPose], ahead_s: f64) -> Vec<PlanPose> {
 pub fn drivable(ground_m: &[DVec2], plan: &[PlanPose], ego: &Footprint) -> f64 {
     for pose in plan {
         let forward = DVec2::from_angle(pose.yaw_rad);
+        // Two by two cells: rear right, rear left, front right, front left.
         let mut cells = [false; 4];
         for point in ground_m {
             let from_center = *point - pose.position_m;
             let ahead_m = from_center.dot(forward);
             let aside_m = from_center.dot(forward.perp());
             for (cell, filled) in cells.iter_mut().enumerate() {
+                // Each cell is half as long and half as wide as the box, open at its sides.
                 let first_m = if cell < 2 { -0.5 * ego.length_m } else { 0.0 };
                 let right_m = if cell % 2 == 0 { -0.5 * ego.width_m } else { 0.0 };
                 let along = first_m < ahead_m && ahead_m < first_m + 0.5 * ego.length_m;
@@ -161,6 +169,7 @@ pub fn drivable(ground_m: &[DVec2], plan: &[PlanPose], ego: &Footprint) -> f64 {
             }
         }
         let share = 0.25 * cells.iter().filter(|&&filled| filled).count() as f64;
+        // 0.25 or less: at most one of four cells has ground.
         if share < 0.3 {
             return 0.0;
         }
@@ -174,6 +183,8 @@ fn comfort(plan: &[PlanPose], ego: &PlanPose) -> f64 {
     if plan.len() < 4 {
         return 1.0;
     }
+    // In the axes of the ego at the decision, as the published code has it. Lengths and differences
+    // do not depend on that.
     let to_ego = DVec2::from_angle(-ego.yaw_rad);
     let local: Vec<PlanPose> = plan
         .iter()
@@ -193,6 +204,7 @@ fn comfort(plan: &[PlanPose], ego: &PlanPose) -> f64 {
         .windows(2)
         .map(|pair| within_pi(pair[1].yaw_rad - pair[0].yaw_rad) / STEP_S)
         .collect();
+    // Each derivative has one value fewer: 4 poses give 3 speeds, 2 accelerations and 1 jerk.
     let accelerations = slopes(&speeds);
     let [least, most] = bounds::LONGITUDINAL_MPS2;
     let even = |values: &[f64], most: f64| values.iter().all(|value| value.abs() <= most);
@@ -206,6 +218,7 @@ fn comfort(plan: &[PlanPose], ego: &PlanPose) -> f64 {
 /// A difference of two headings, turned by 2π at most once each way.
 fn within_pi(angle: f64) -> f64 {
     use std::f64::consts::{PI, TAU};
+    // Not a full wrap: a difference of more than 3π would stay beyond π, as published.
     let angle = if angle > PI { angle - TAU } else { angle };
     if angle < -PI { angle + TAU } else { angle }
 }

@@ -53,6 +53,8 @@ impl Lane {
     pub(crate) fn nearest_on_outline_m(&self, point_m: DVec2) -> Option<DVec2> {
         let on_edge = |(a, b): (DVec2, DVec2)| {
             let way = b - a;
+            // The foot of the perpendicular as a share of the edge; the bound keeps an edge without
+            // length from 0/0, and gives its start.
             let share = (point_m - a).dot(way) / way.length_squared().max(f64::MIN_POSITIVE);
             a + share.clamp(0.0, 1.0) * way
         };
@@ -82,11 +84,14 @@ impl LaneMap {
         let mut lanes_with_corners = 0;
         let mut one_holds_all = false;
         let mut in_any = [false; 4];
+        // Bounds of the corners reject most lanes before any point is tested.
         let least_m = corners.into_iter().fold(DVec2::INFINITY, DVec2::min);
         let most_m = corners.into_iter().fold(DVec2::NEG_INFINITY, DVec2::max);
         for lane in self.lanes.iter().filter(|lane| lane.is_near(least_m, most_m)) {
+            // A corner on an outline is in neither of two adjacent lanes.
             let inside = corners.map(|corner| lane.contains(corner));
             let count = inside.iter().filter(|&&inside| inside).count();
+            // More than one lane has corners, and none has all four: the box straddles.
             lanes_with_corners += usize::from(count > 0);
             one_holds_all |= count == 4;
             for (any, inside) in in_any.iter_mut().zip(inside) {
@@ -95,6 +100,7 @@ impl LaneMap {
         }
         LanePosition {
             in_multiple_lanes: lanes_with_corners > 1 && !one_holds_all,
+            // A corner in no lane is off the road.
             off_drivable: in_any.contains(&false),
         }
     }
@@ -132,6 +138,7 @@ fn contains(outline_m: &[DVec2], point_m: DVec2) -> bool {
 
 /// The position of a point relative to an outline, by the even-odd rule.
 fn side(outline_m: &[DVec2], point_m: DVec2) -> Side {
+    // A ray to the right; each edge that it crosses changes the side.
     let mut inside = false;
     for (a, b) in edges(outline_m) {
         // Most edges lie above the point or below it.
@@ -142,7 +149,11 @@ fn side(outline_m: &[DVec2], point_m: DVec2) -> Side {
             return Side::OnOutline;
         }
         let across = (b - a).perp_dot(point_m - a);
+        // Half-open in y: a vertex belongs to one of its two edges, so that a ray through it counts
+        // once.
         let crosses = (a.y > point_m.y) != (b.y > point_m.y);
+        // Whether the crossing is to the right of the point, by the sign of the cross product and
+        // not by a division.
         if crosses && (across > 0.0) == (b.y > a.y) {
             inside = !inside;
         }
@@ -152,6 +163,7 @@ fn side(outline_m: &[DVec2], point_m: DVec2) -> Side {
 
 /// Whether a box and an outline have a point in common; both are closed sets.
 fn touches(outline_m: &[DVec2], ego: &Footprint) -> bool {
+    // A box that lies within has no edge in common, and an outline within the box has.
     let corner_inside = ego.corners_m().into_iter().any(|corner| contains(outline_m, corner));
     let edge_touches = edges(outline_m).any(|(a, b)| ego.touches(&edge(a, b)));
     corner_inside || edge_touches
@@ -159,6 +171,7 @@ fn touches(outline_m: &[DVec2], ego: &Footprint) -> bool {
 
 fn is_on_edge(a: DVec2, b: DVec2, point_m: DVec2) -> bool {
     let across = (b - a).perp_dot(point_m - a);
+    // The two vectors to the ends point apart exactly between them.
     let beside = (point_m - a).dot(point_m - b);
     across == 0.0 && beside <= 0.0
 }

@@ -65,6 +65,7 @@ pub fn first_touching_sub_step(
 /// has no value. The reference speed is that of the recording's last 0.5 s, as in the code; the
 /// paper takes the impact of an undisturbed run.
 pub fn ncap(record: &DriveRecord) -> Score {
+    // Boxes that overlapped at the start are no contact of the drive.
     let contact = record.contacts.iter().find(|contact| !contact.at_start);
     let impact_mps = contact.map(|contact| contact.impact_mps);
     let reference_mps = record.reference.as_ref().and_then(reference_speed_mps);
@@ -74,11 +75,13 @@ pub fn ncap(record: &DriveRecord) -> Score {
         matches!(class, Some(ActorClass::Pedestrian | ActorClass::Object))
     });
     let value: Measured = match (&record.tracks, impact_mps, reference_mps) {
+        // The order of the arms is the order in which missing inputs are named.
         (None, ..) => Err(Missing::new("needs the actors of a scenario")),
         (Some(_), Some(_), _) if is_left_out => Err(Missing::new(LEFT_OUT)),
         (Some(_), Some(_), None) => {
             Err(Missing::new("needs the speed of the recorded drive in its last 0.5 s"))
         }
+        // Without a contact the reference speed is not used, so that infinity may stand for it.
         (Some(_), impact_mps, reference_mps) => {
             Ok(stars(impact_mps, reference_mps.unwrap_or(f64::INFINITY)))
         }
@@ -89,6 +92,7 @@ pub fn ncap(record: &DriveRecord) -> Score {
 /// The speed over the last 0.5 s; `None` if the drive is shorter or stands.
 fn reference_speed_mps(drive: &ReferenceDrive) -> Option<f64> {
     let end_us = *drive.times_us.last()?;
+    // The window of the last 0.5 s must be within the recording.
     let from_us = end_us - REFERENCE_US;
     if from_us < drive.times_us[0] {
         return None;

@@ -141,6 +141,8 @@ impl Fault {
 /// Judges an episode.
 pub fn verdict(record: &DriveRecord) -> Verdict {
     let mut not_judged = Vec::new();
+    // Criteria without their input are collected, not returned early: a fault of another one still
+    // decides.
     let mut lacks = |criterion, reason| not_judged.push(NotJudged { criterion, reason });
     let mut faults = contact_faults(record);
     if record.tracks.is_none() {
@@ -157,6 +159,7 @@ pub fn verdict(record: &DriveRecord) -> Verdict {
     match (&record.map, &record.shape) {
         (Some(map), Some(shape)) => {
             let off = |sample| map.position(&shape.footprint(sample)).off_drivable;
+            // Only the first sample off the road: one fault for one excursion or many.
             let first = record.ego.iter().position(off);
             faults.extend(first.map(|step| FaultAt {
                 fault: Fault::OffRoad,
@@ -167,6 +170,7 @@ pub fn verdict(record: &DriveRecord) -> Verdict {
         (Some(_), None) => lacks(Criterion::OffRoad, "the record has no size of the ego"),
         (None, _) => lacks(Criterion::OffRoad, record.no_map),
     }
+    // Judged at the end: progress has no earlier time.
     let progress = progress(record);
     match progress {
         None => lacks(Criterion::Progress, record.no_reference),
@@ -175,6 +179,7 @@ pub fn verdict(record: &DriveRecord) -> Verdict {
         }
         Some(_) => {}
     }
+    // Stable: faults of one time keep the order contact, twin, road, progress.
     faults.sort_by_key(|fault| fault.time_us);
     let impacts = record.contacts.iter().filter(|contact| !contact.at_start);
     Verdict {
@@ -192,10 +197,12 @@ pub fn verdict(record: &DriveRecord) -> Verdict {
 fn judgement(record: &DriveRecord, faults: &[FaultAt], not_judged: &[NotJudged]) -> Judgement {
     let first_us = faults.first().map(|fault| fault.time_us);
     let off_model =
+        // Strictly before: a fault at the same time still counts as seen on the trained area.
         record.off_model_us.is_some_and(|off_us| first_us.is_none_or(|fault_us| off_us < fault_us));
     if off_model {
         Judgement::OffModel
     } else if !faults.is_empty() {
+        // Any fault decides, whatever was not judged; only a pass needs all criteria.
         Judgement::Failed
     } else if !not_judged.is_empty() {
         Judgement::NotJudged
@@ -212,6 +219,8 @@ fn contact_faults(record: &DriveRecord) -> Vec<FaultAt> {
     judged
         .filter_map(|contact| {
             let class = tracks.get(usize::from(contact.actor)).map(|track| track.class);
+            // A standing ego is not charged with a pedestrian that walks into it, unless the rules
+            // of fault say so.
             let moves = contact.ego_velocity_mps.length() > STANDING_MPS;
             let fault = match (class, contact.ego_at_fault) {
                 (Some(ActorClass::Pedestrian), _) if moves => Fault::Pedestrian,
@@ -231,6 +240,7 @@ fn progress(record: &DriveRecord) -> Option<f64> {
     if recorded_m < LEAST_WAY_M {
         return Some(1.0);
     }
+    // The difference, because the first sample need not be at station 0.
     let way_m = stations_m.last()?.0 - stations_m.first()?.0;
     Some((way_m / recorded_m).clamp(0.0, 1.0))
 }
@@ -259,6 +269,7 @@ fn accelerations_mps2(record: &DriveRecord) -> Option<[f64; 2]> {
         record.ego.iter().map(|ego| value(ego).abs()).fold(0.0, f64::max)
     };
     let along = most(&|ego| ego.acceleration_mps2.x);
+    // v ω is the centripetal acceleration of the rear axle.
     let across = most(&|ego| ego.velocity_mps.x * ego.yaw_rate_radps);
     Some([along, across])
 }

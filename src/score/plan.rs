@@ -25,6 +25,7 @@ pub struct Plan {
 impl Plan {
     /// A plan; `None` without a pose after the ego's own, or if times do not rise.
     pub fn new(poses: Vec<PlannedPose>) -> Option<Self> {
+        // Rising times make the interpolation below safe: no interval has a length of 0.
         let rises = poses.windows(2).all(|pair| pair[0].time_us < pair[1].time_us);
         (poses.len() > 1 && rises).then_some(Self { poses })
     }
@@ -47,6 +48,7 @@ impl Plan {
     /// The pose at a time, between two of its poses: along a line, and the shorter way round;
     /// `None` before its first and after its last.
     pub fn at(&self, time_us: i64) -> Option<PlannedPose> {
+        // The first pose at or after the time.
         let after = self.poses.partition_point(|pose| pose.time_us < time_us);
         let to = self.poses.get(after)?;
         if to.time_us == time_us {
@@ -65,5 +67,6 @@ impl Plan {
 /// The shorter turn from one heading to another, in radians.
 pub(crate) fn turn_rad(from_rad: f64, to_rad: f64) -> f64 {
     let turn = to_rad - from_rad;
+    // The nearest multiple of a full turn is taken out: the result is from -π to π.
     turn - TAU * (turn / TAU).round()
 }

@@ -57,6 +57,8 @@ impl Polyline {
     /// those of the end. The vector is zero on a line of one point.
     pub fn at(&self, station_m: f64) -> (DVec2, DVec2) {
         let last = self.points_m.len() - 1;
+        // The segment that ends at or after the station, clamped to an existing one. `last` is 0
+        // for a line of one point.
         let after =
             self.stations_m.partition_point(|&at_m| at_m < station_m).clamp(1.min(last), last);
         // Points that coincide have no direction between them: use the direction of the next points
@@ -67,6 +69,7 @@ impl Polyline {
             return (self.points_m[0], DVec2::ZERO);
         };
         let from = to - 1;
+        // Above 0, because the two stations differ.
         let length_m = self.stations_m[to] - self.stations_m[from];
         let t = ((station_m - self.stations_m[from]) / length_m).clamp(0.0, 1.0);
         let [a, b] = [self.points_m[from], self.points_m[to]];
@@ -81,6 +84,8 @@ impl Polyline {
     /// The nearest point of the segments that reach into a range of stations. So an ego on a route
     /// that crosses itself stays on its own branch.
     pub fn project_between(&self, point_m: DVec2, from_m: f64, to_m: f64) -> Projection {
+        // Stations of the found segment may lie outside of the range; only the segment must reach
+        // into it.
         let first = self.points_m[0];
         let alone = Projection {
             station_m: 0.0,
@@ -88,6 +93,7 @@ impl Polyline {
             along: DVec2::ZERO,
             left_m: 0.0,
         };
+        // Linear in the number of points; the range skips most of them before any arithmetic.
         let mut nearest: Option<Projection> = None;
         for k in 1..self.points_m.len() {
             if self.stations_m[k] < from_m || self.stations_m[k - 1] > to_m {
@@ -98,6 +104,7 @@ impl Polyline {
             let Some(along) = way.try_normalize() else { continue };
             let ahead_m = (point_m - start).dot(along).clamp(0.0, way.length());
             let distance_m = (start + ahead_m * along).distance(point_m);
+            // Strictly nearer: of equal places the first one stays.
             if nearest.is_none_or(|nearest| distance_m < nearest.distance_m) {
                 let station_m = self.stations_m[k - 1] + ahead_m;
                 let left_m = along.perp().dot(point_m - start);

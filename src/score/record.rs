@@ -154,6 +154,8 @@ impl DriveRecord {
     /// Distance that the recorded drive covered in the time of the scenario, in metres.
     pub fn recorded_way_m(&self) -> Option<f64> {
         let reference = self.reference.as_ref()?;
+        // The longer of the scenario's time and the episode's: an episode that ends early is
+        // compared with the whole drive.
         Some(reference.station_at_m(self.limit_us.unwrap_or(self.end_us()).max(self.end_us())))
     }
 
@@ -162,6 +164,8 @@ impl DriveRecord {
     /// route which crosses itself is followed in order.
     pub fn stations_m(&self) -> Option<Vec<(f64, f64)>> {
         let line = &self.reference.as_ref()?.line;
+        // The search moves with the ego. A jump of more than 50 m between two samples is not
+        // followed.
         let mut station_m = 0.0;
         let project = |sample: &EgoSample| {
             let found = line.project_between(sample.origin_m, station_m - 5.0, station_m + 50.0);

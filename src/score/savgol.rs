@@ -18,10 +18,15 @@ pub fn savgol(
     delta: f64,
 ) -> Vec<f64> {
     assert!(order < window && window <= values.len(), "a window from order + 1 to all samples");
+    // `inner` serves all samples whose window is centred; samples at the ends get weights of their
+    // own.
     let half = window / 2;
     let inner = weights(window, 0.5 * (window - 1) as f64, order, derivative);
+    // In an even window, sample i is the earlier of the middle two, and the value is that half a
+    // sample after it.
     let samples_before = if window.is_multiple_of(2) { half - 1 } else { half };
     let last_start = values.len() - window;
+    // Weights are for a spacing of 1; a derivative by x scales with 1 / delta.
     let scale = delta.powi(derivative as i32);
     let filtered = |i: usize| {
         let at_edge;
@@ -56,6 +61,8 @@ fn weights(window: usize, at: f64, order: usize, derivative: usize) -> Vec<f64> 
     // Xᵀ y. So its weights are X (Xᵀ X)⁻¹ d.
     let mut system: Vec<Vec<f64>> = (0..terms)
         .map(|i| {
+            // A row is [sums of products, right side]. The right side has the chain rule: a
+            // derivative in half windows, divided by the unit for each order.
             let row = (0..terms).map(|j| powers.iter().map(|x| x[i] * x[j]).sum());
             row.chain([
                 derivative_of_power(i, derivative, position(at)) / unit.powi(derivative as i32)
@@ -122,6 +129,7 @@ mod tests {
     fn an_even_window_is_half_a_sample_late() {
         let samples: Vec<f64> = (0..10).map(f64::from).collect();
         let filtered = savgol(&samples, 4, 1, 0, 1.0);
+        // A window of 4 around the interval from 5 to 6 has its middle at 5.5.
         assert!((filtered[5] - 5.5).abs() < 1e-13, "{}", filtered[5]);
         assert!((filtered[0] - 0.0).abs() < 1e-13 && (filtered[9] - 9.0).abs() < 1e-13);
     }

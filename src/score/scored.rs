@@ -48,6 +48,7 @@ impl Score {
             if value.is_finite() { Ok(value) } else { Err(Missing::new("is not a finite number")) }
         });
         let reason = value.as_ref().err().map(|missing| missing.reason.clone());
+        // Infinite parts, such as a time to contact that never comes, are null as well.
         let finite = |part: Option<f64>| part.filter(|part| part.is_finite());
         let parts = parts.into_iter().map(|(name, part)| (name, finite(part))).collect();
         Self { name, value: value.ok(), reason, parts }

@@ -15,9 +15,11 @@ pub fn wilson(passed: u64, runs: u64) -> [f64; 2] {
     let n = runs as f64;
     let p = passed as f64 / n;
     let z2 = NORMAL * NORMAL;
+    // Wilson: (p + z²/2n ± z sqrt(p (1 - p)/n + z²/4n²)) / (1 + z²/n).
     let scale = 1.0 + z2 / n;
     let middle = (p + z2 / (2.0 * n)) / scale;
     let half = NORMAL / scale * (p * (1.0 - p) / n + z2 / (4.0 * n * n)).sqrt();
+    // Exact at the ends: rounding could leave 1e-17 where the bound is 0.
     let low = if passed == 0 { 0.0 } else { (middle - half).max(0.0) };
     let high = if passed == runs { 1.0 } else { (middle + half).min(1.0) };
     [low, high]
@@ -48,6 +50,7 @@ impl Mean {
             return None;
         }
         let mean = values.iter().sum::<f64>() / n as f64;
+        // One value has no deviation: n - 1 is 0.
         if n == 1 {
             return Some(Self { count: n, mean, deviation: None, half_width: None });
         }
@@ -75,8 +78,11 @@ fn student_t(degrees: usize) -> f64 {
     let degrees = degrees.min(100_000);
     let mut low = 0.0;
     let mut high = FRAC_PI_2;
+    // 100 halvings are more than an f64 distinguishes; the loop has no condition that could fail to
+    // end.
     for _ in 0..100 {
         let middle = 0.5 * (low + high);
+        // `within` is the two-sided probability: 0.95 leaves 2.5 % on each side.
         if within(middle, degrees) < 0.95 { low = middle } else { high = middle }
     }
     low.tan() * (degrees as f64).sqrt()

@@ -28,6 +28,7 @@ fn t25(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let view = forward_view([160, 120], 150.0);
     let still =
         run.render_and_compare("the actor", &Scene::from_gaussians(&actor), &profile, view)?;
+    // A case in which nothing is seen would hold for any error: each one states that something is.
     run.check("seen", still.opacity.iter().any(|&o| o > 0.9));
     for (what, turn) in [
         ("turned about y", DQuat::from_rotation_y(1.1)),
@@ -61,8 +62,11 @@ fn actor() -> Gaussians {
     });
     let mut actor = gaussians_from_specs(&balls.collect::<Vec<_>>());
     actor.raise_sh_degree(3);
+    // 16 coefficients of 3 channels; the first is DC and keeps the colour of the specification.
     for (i, colour) in actor.sh.chunks_exact_mut(3 * sh::coefficients(3)).enumerate() {
         for (k, value) in colour[3..].iter_mut().enumerate() {
+            // 45 values for each Gaussian: 15 coefficients beyond DC, of 3 channels. They are from
+            // -0.2 to 0.2.
             *value = (0.4 * (low_discrepancy(i * 45 + k)[3] - 0.5)) as f32;
         }
     }
@@ -109,6 +113,7 @@ fn t29(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         );
         let alone = run.render(&Scene::from_gaussians(&road), &profile, view)?;
         let seen = max_difference(&image.rgba, &alone.rgba) > 0.1;
+        // The road hides the actor below it, and the actor must not shine through.
         run.check(format!("{what}: the actor is seen"), seen == (what != "under the road"));
     }
     Ok(())
@@ -125,6 +130,7 @@ pub(super) const T30: Case = Case {
 fn t30(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let profile = RenderProfile::default();
     let exact = RenderProfile { rays: Rays::Exact, ..profile };
+    // 30 m/s for 30 ms are 0.9 m.
     let across_m = DVec3::new(0.9, 0.0, 0.0);
     let actor = actor();
     let (at_rest, _) = placed_and_merged(&Gaussians::default(), &actor, &[Pose::IDENTITY]);
@@ -132,6 +138,7 @@ fn t30(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     moving.placed[0].world_from_actor_at_start.position_m = -across_m;
     let direction = ShutterDirection::TopToBottom;
     let still = forward_view([96, 64], 60.0);
+    // A readout without a motion of the camera: rows are exposed in turn, and only the actor moves.
     let view = View { readout: Some(Readout { direction, share: 1.0 }), ..still };
 
     // The camera at rest.
@@ -164,9 +171,11 @@ fn placed_and_merged(scene: &Gaussians, actor: &Gaussians, poses: &[Pose]) -> (S
     (placed, Scene::from_gaussians(&merged))
 }
 
-/// A closed road below the camera (y down), 3 m wide and 40 m long.
+/// A closed road below the camera (y down), 8 m wide and 30 m long.
 fn road() -> Gaussians {
     let surfel = |i: usize| GaussianSpec {
+        // 80 columns and 300 rows, 10 cm apart; with a standard deviation of 8 cm they leave no
+        // gap.
         mean_m: DVec3::new(0.1 * (i % 80) as f64 - 4.0, 1.5, 1.0 + 0.1 * (i / 80) as f64),
         sigma_m: DVec3::new(0.08, 0.004, 0.08),
         opacity: 0.99,

@@ -48,12 +48,15 @@ impl<'a> CaseRun<'a> {
     /// The outcome of the run, given how its function ended.
     pub(super) fn outcome(self, case: &Case, ended: Result<(), RenderError>) -> Outcome {
         let (verdict, detail, bound_usage) = match (self.verdict(), &self.refused, ended) {
+            // A frame that failed has no image to judge: missed, whatever was checked before.
             (_, _, Err(error)) => (Verdict::Missed, error.to_string(), f64::INFINITY),
             (Some(check), _, _) if !check.holds() => {
                 (Verdict::Missed, check.to_string(), check.bound_usage())
             }
+            // A limit that the device named is no failure, but a failed check before it is.
             (_, Some(limit), _) => (Verdict::Refused, limit.to_string(), 0.0),
             (Some(check), None, _) => (Verdict::Held, check.to_string(), check.bound_usage()),
+            // A case without a check proves nothing.
             (None, None, _) => (Verdict::Missed, "nothing was compared".to_owned(), f64::INFINITY),
         };
         let case = case.number;
@@ -73,6 +76,7 @@ impl<'a> CaseRun<'a> {
 
     /// The first check that failed, or else the one closest to its bound.
     pub(super) fn verdict(&self) -> Option<&Check> {
+        // The first failure, because later ones often follow from it.
         let missed = self.checks.iter().find(|check| !check.holds());
         let closest =
             || self.checks.iter().max_by(|a, b| a.bound_usage().total_cmp(&b.bound_usage()));
@@ -173,6 +177,7 @@ impl<'a> CaseRun<'a> {
         let image = self.render(scene, profile, view)?;
         let RenderedImage { rgba, depth_m, opacity, .. } = &image;
         let mut values = rgba.iter().chain(depth_m).chain(opacity);
+        // All maps in one check, so that the table of mutations has one entry for it.
         self.check(format!("{what}: every value is finite"), values.all(|v| v.is_finite()));
         if !self.is_reference() {
             let truth = self.render_reference(scene, profile, view)?;
@@ -211,8 +216,10 @@ impl Check {
     /// are a factor of ten.
     pub fn bound_usage(&self) -> f64 {
         match self.bound {
+            // A bound of 0 has no share; the value itself then orders the checks.
             Bound::AtMost(0.0) => self.measured,
             Bound::AtMost(most) => self.measured / most,
+            // The error is 10^(-dB / 20): its quotient with that of the bound.
             Bound::AtLeastDb(least) => 10.0_f64.powf((least - self.measured) / 20.0),
             Bound::True => 0.0,
         }
@@ -266,6 +273,7 @@ mod tests {
         run.check_at_most("close to it", 3e-4, 5e-4);
         run.check_at_least_db("closer, dB", 71.0, 70.0);
         assert_eq!(run.verdict().unwrap().what, "closer, dB");
+        // NaN fails every bound, and a failed check comes before the closest.
         run.check_at_most("beyond", f64::NAN, 5e-4);
         assert_eq!(run.verdict().unwrap().what, "beyond");
     }

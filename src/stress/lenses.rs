@@ -52,9 +52,12 @@ fn t22(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let left = profile.alpha_cut / gaussian.opacity;
     let share = 1.0 + left.ln() * left / (1.0 - left);
     let size_px2 = point_px2[0] + point_px2[1];
+    // Errors as a share of the size (sum of both variances), so that the mixed term has a scale,
+    // too.
     for (axis, (drawn, point)) in
         ["x", "y", "xy"].into_iter().zip(drawn_px2.into_iter().zip(point_px2))
     {
+        // The blur adds the same variance to both axes and none to the mixed term.
         let blur = if axis == "xy" { 0.0 } else { profile.blur };
         let off = (drawn / share - blur - point).abs() / size_px2;
         run.check_at_most(format!("spread along {axis} off by"), off, 0.03);
@@ -100,6 +103,8 @@ pub(super) const T23: Case = Case {
 fn t23(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let lens = Lens::Fisheye(Fisheye::new([0.0; 4], Some(110_f64.to_radians())));
     let pinhole = Pinhole { fx: 24.0, fy: 24.0, cx: 60.0, cy: 50.0 };
+    // 110 degrees at 24 px a radian are 46 px, so that the field ends within the image and its edge
+    // is seen.
     let camera = Camera { lens, ..Camera::from_pinhole(120, 100, pinhole) };
     let profile = RenderProfile::DEFAULT;
     let view = View::new(camera, Pose::IDENTITY);
@@ -108,6 +113,7 @@ fn t23(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
 
     let behind = run.render(&ball(DVec3::new(0.0, 0.0, -3.0)), &profile, view)?;
     run.check("nothing of what is behind", behind.opacity.iter().all(|&o| o == 0.0));
+    // Beyond 90 degrees: the depth along the axis is negative.
     let (sin, cos) = 100_f64.to_radians().sin_cos();
     let beside =
         run.render_and_compare("at 100°", &ball(3.0 * DVec3::new(sin, 0.0, cos)), &profile, view)?;
@@ -160,6 +166,7 @@ fn folded(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         view,
     )?;
     let mirrored = image.opacity.iter().enumerate().filter(|&(pixel, _)| {
+        // 0.65 focal lengths are within the field; mirrored balls would land there.
         let at_px = DVec2::new((pixel % 160) as f64 + 0.5, (pixel / 160) as f64 + 0.5);
         at_px.distance(DVec2::new(80.0, 60.0)) < 0.65 * FOCAL_PX
     });
@@ -183,6 +190,7 @@ fn t24(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let exact = RenderProfile { rays: Rays::Exact, ..profile };
     let balls = balls();
     for direction in [ShutterDirection::TopToBottom, ShutterDirection::BottomToTop] {
+        // 0.9 m in 30 ms are 30 m/s; 0.01 rad are 19 degrees a second.
         let world_from_camera_first = Pose {
             position_m: DVec3::new(-0.05, 0.0, -0.9),
             rotation: DQuat::from_rotation_y(-0.01),
@@ -192,6 +200,7 @@ fn t24(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         let image = run.render_and_compare(format!("{direction:?}"), &balls, &profile, view)?;
         let mut drawn = Vec::new();
         let mut truth = Vec::new();
+        // Every fifth row: an image of exact rays per row is slow.
         for row in (0..SIZE_PX[1]).step_by(5) {
             let at_px = DVec2::splat(f64::from(row) + 0.5);
             let still = View::new(camera, view.world_from_camera_at(at_px));

@@ -155,6 +155,8 @@ impl Case {
         let start = Instant::now();
         let mut run = CaseRun::new(backend);
         let ended = body(&mut run);
+        // The clock stops before the outcome is made. An error of the body is a verdict, so that
+        // the table has every case.
         Outcome { seconds: start.elapsed().as_secs_f64(), ..run.outcome(self, ended) }
     }
 
@@ -163,6 +165,7 @@ impl Case {
     /// # Errors
     /// A frame failed.
     pub fn checks(&self, backend: &dyn Backend) -> Result<Vec<Check>, RenderError> {
+        // Heavy cases run here as well; whether to ask for one is up to the caller.
         let (CaseBody::Light(body) | CaseBody::Heavy(body)) = self.body;
         let mut run = CaseRun::new(backend);
         body(&mut run)?;

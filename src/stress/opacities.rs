@@ -23,6 +23,8 @@ fn t11(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let profile = RenderProfile::default();
     let view = forward_view([65, 65], 100.0);
     let peak = |run: &mut CaseRun<'_>, logit: f32| {
+        // The logit is set afterwards, because a specification has opacities and no infinite
+        // logits.
         let mut g = gaussians_from_specs(&[GaussianSpec::default()]);
         g.logit_opacities[0] = logit;
         let scene = Scene::from_gaussians(&g);
@@ -82,6 +84,7 @@ fn t12(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
 /// The same Gaussians, of SH degree 1, with one more before them: nearly opaque, with a standard
 /// deviation of 14 cm.
 fn with_one_more(good: &Gaussians, mean_m: [f64; 3]) -> Gaussians {
+    // Before all others: it shifts the index of each of them by one.
     let mut more = good.clone();
     more.means_m.insert(0, mean_m);
     more.quats_wxyz.insert(0, [1.0, 0.0, 0.0, 0.0]);
@@ -110,6 +113,7 @@ fn invalidated(more: &Gaussians) -> Vec<(String, Gaussians)> {
         edit(&mut invalid);
         all.push((name, invalid));
     };
+    // Fields of each kind; opacities have a line of their own, because an infinite logit is valid.
     for (name, invalidate) in INVALIDATE {
         for bad in [f32::NAN, f32::INFINITY] {
             add(format!("{name} {bad}"), &|g| invalidate(g, bad));
@@ -139,6 +143,7 @@ fn t19(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         rgb: [1.0; 3],
         ..GaussianSpec::default()
     };
+    // 9 px with a focal length of 1,000 px: layers of 20 m cover the image evenly.
     let view = forward_view([9, 9], 1000.0);
     for (count, opacity, stop, left) in [
         (3, 0.9, 1.0001e-4, 1e-3),
@@ -191,6 +196,7 @@ fn t28(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         Err(error) => run.accept_limit(error)?,
         Ok(image) => {
             let least = image.opacity.iter().fold(1.0_f32, |least, &o| least.min(o));
+            // 70,000 layers of 1.05 / 255 leave e^-288: the fog is opaque everywhere.
             run.check_at_most("the fog lets through", 1.0 - f64::from(least), 1e-3);
         }
     }

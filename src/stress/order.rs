@@ -29,6 +29,7 @@ fn t6(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let profile = RenderProfile::default();
     let view = forward_view([200, 150], 150.0);
     let image = run.render_and_compare("the walls", &scene, &profile, view)?;
+    // Row 80, column 110: within both walls, to the right of and below the image's centre.
     let center = 4 * (80 * 200 + 110);
     let [red, green] = [0, 1].map(|channel| image.rgba[center + channel]);
     run.check("the first of each pair is in front", red > green);
@@ -64,6 +65,7 @@ fn t8(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let mut pops = [0.0_f32; 2];
     let mut last = None;
     for step in -10..=10 {
+        // From -0.5 to 0.5 degrees: the order changes at 0.
         let yaw = (0.05 * f64::from(step)).to_radians();
         let forward = DVec3::new(yaw.sin(), 0.0, yaw.cos());
         let view = view_along([160, 120], 150.0, DVec3::ZERO, forward, DVec3::Y);
@@ -116,6 +118,7 @@ fn t21(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         let [x, y, z, red, green, blue] = low_discrepancy(i);
         let z_m = 5.0 + 100.0 * z;
         dust.means_m.push([0.8 * (x - 0.5) * z_m, 0.8 * (y - 0.5) * z_m, z_m]);
+        // The positions fill the view's pyramid, so that every Gaussian makes keys in every view.
         dust.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
         dust.ln_scales.push([-4.0; 3]);
         dust.logit_opacities.push(-5.0);
@@ -176,5 +179,6 @@ fn t27(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
 /// A low-discrepancy sequence in [0, 1)⁶: multiples of powers of the root of x⁷ = x + 1, modulo 1
 /// (Roberts 2018).
 pub(super) fn low_discrepancy(i: usize) -> [f64; 6] {
+    // i + 1, because the first multiple would be 0 for every power.
     [1, 2, 3, 4, 5, 6].map(|power| (0.5 + (i + 1) as f64 * 1.112_775_684_f64.powi(-power)).fract())
 }

@@ -24,6 +24,7 @@ fn t4(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         for z in [0.0100001, 0.011, 0.05, 0.19, 0.21] {
             let close = scene_from_specs(&[GaussianSpec {
                 mean_m: DVec3::new(0.002, -0.001, z),
+                // Longer than it is far: a part of it is behind the camera.
                 sigma_m: DVec3::new(0.003, 0.02, 0.1),
                 ..GaussianSpec::default()
             }]);
@@ -31,6 +32,7 @@ fn t4(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
             let view = forward_view([160, 120], 1800.0);
             let image = run.render_and_compare(what.clone(), &close, &profile, view)?;
             let drawn = image.opacity.iter().any(|&o| o > 0.0);
+            // The centre alone decides, however far the Gaussian reaches.
             run.check(format!("{what}: drawn as near says"), drawn == (z > near));
         }
     }
@@ -75,11 +77,15 @@ fn t7(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     // The pairs lie along +x, where each chunk holds its own part, so that centres keep their f32
     // values.
     for (i, x) in [0.0101_f32, 0.5, 3.0, 70.0, 1000.0, 9999.0].into_iter().enumerate() {
+        // Slopes of -0.75 to 0.75 put the pairs side by side, 30 px apart.
         let slope = (i as f64 - 2.5) * 0.3;
+        // The farther one first, so that the order in the scene is the wrong one.
         for (x, rgb) in [(x.next_up(), [0.0, 1.0, 0.0]), (x, [1.0, 0.0, 0.0])] {
             let x = f64::from(x);
             specs.push(GaussianSpec {
                 mean_m: DVec3::new(x, -slope * x, 0.0),
+                // The size grows with the distance: each has a standard deviation of 2 px in the
+                // image.
                 sigma_m: DVec3::splat(0.02 * x),
                 rgb,
                 opacity: 0.95,
@@ -185,6 +191,7 @@ mod tests {
     #[test]
     fn a_coarser_record_misses_the_bound_of_centres() {
         let mut run = CaseRun::new(&Reference);
+        // 20 bits instead of 23 have steps eight times as large.
         encoded_street(&mut run, RecordFormat::Q24).unwrap();
         let missed: Vec<String> =
             run.into_checks().into_iter().filter(|c| !c.holds()).map(|c| c.what).collect();

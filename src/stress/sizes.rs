@@ -24,6 +24,7 @@ fn t14(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     // the next edge.
     let exact_m = 16.0 * 5.0 / 160.0 / (2.0 * (255.0_f64 * 0.9).ln()).sqrt();
     let splats = (0..800_i32).map(|i| {
+        // From -20 to 20 ulp, in a different order from that of the places.
         let ulps = f64::from(i % 41 - 20) * f64::from(f32::EPSILON);
         let [x, y] = [f64::from(i % 16 - 8), f64::from(i / 16 % 10 - 5)];
         GaussianSpec {
@@ -57,6 +58,7 @@ fn t15(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let before = run.render_and_compare("a small frame", &small.0, &profile, small.1)?;
     let mut street = wildcity_generate::canyon(40_000, &mut |_, _| {});
     // Fog over many tiles, so that (Gaussian, tile) pairs grow faster than splats.
+    // One in 200 becomes fog: 2.7 m wide, nearly transparent.
     for i in (0..street.len()).step_by(200) {
         street.ln_scales[i] = [1.0; 3];
         street.logit_opacities[i] = -4.0;
@@ -64,6 +66,7 @@ fn t15(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let street = Scene::from_gaussians(&street);
     let large =
         run.render_and_compare("a large one", &street, &profile, street_view([400, 225]))?;
+    // A buffer that grew for the large frame must not show its content in the small one.
     let after = run.render(&small.0, &profile, small.1)?;
     run.check("the small frame after it has the same bytes", after == before);
     let again = run.render(&street, &profile, street_view([400, 225]))?;
@@ -137,6 +140,7 @@ fn t17(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     if run.is_reference() {
         run.reduce_to(format!("{} x {} px", size_px[0], size_px[1]));
     }
+    // 0.52 of the width: a horizontal field of 88 degrees.
     let focal_px = 0.52 * f64::from(size_px[0]);
     let balls = balls();
     let profile = RenderProfile::default();
@@ -226,12 +230,15 @@ fn t31(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let profile = RenderProfile::default();
     let scene = scene_from_specs(&(0..3_000).map(random_size).collect::<Vec<_>>());
     let native = forward_view([192, 144], 150.0);
+    // Native and small images are compared in f64: only the shrinking is under test.
     let native_rgb = rgb(&run.render_reference(&scene, &profile, native)?);
     for [wide, high] in [[96, 72], [64, 48], [48, 36], [96, 36]] {
         let what = format!("{wide} x {high}");
         let mut small = native;
         small.camera = match native.camera.scaled(wide, high) {
             Ok(camera) => camera,
+            // A refused size is a failed check and not the end of the case: the other sizes still
+            // run.
             Err(error) => {
                 run.check(format!("{what}: {error}"), false);
                 continue;
@@ -243,6 +250,7 @@ fn t31(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
             let differences = rgb(image).into_iter().zip(&shrunk).map(|(a, b)| f64::from(a - b));
             psnr_db(differences)
         };
+        // Without a native size the image has the blur of its own pixels.
         small.camera.native_size_px = None;
         let own_blur = run.render_reference(&scene, &profile, small)?;
         let better_db = db(&image) - db(&own_blur);

@@ -76,6 +76,7 @@ impl Table {
 
     /// Width of a backend's column in characters, with a gap of two.
     fn width(&self, backend: usize) -> usize {
+        // Characters and not bytes, as `write!` pads by characters.
         let words = self.rows.iter().filter_map(|row| Some(row.outcomes.get(backend)?.word()));
         words.map(|word| word.chars().count()).fold(8, usize::max) + 2
     }
@@ -125,6 +126,7 @@ impl fmt::Display for Table {
             writeln!(f, "{}", row.what)?;
             writeln!(f, "{:indent$}{}", "", row.bound)?;
             let refused = row.outcomes.iter().filter(|o| o.verdict == Verdict::Refused);
+            // The tightest outcome, and every refusal with the limit that its device named.
             for Outcome { backend, detail, .. } in row.tightest().into_iter().chain(refused) {
                 writeln!(f, "{:indent$}{backend}: {detail}", "")?;
             }

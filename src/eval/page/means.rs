@@ -25,6 +25,7 @@ pub(super) fn table(evaluation: &Evaluation) -> Markup {
         aligned: rendered.aligned.is_some(),
         repaired: evaluation.all.repaired.is_some(),
     };
+    // One camera is the same as all.
     let has_cameras = evaluation.cameras.len() > 1;
     html! {
         div.wide {

@@ -59,6 +59,7 @@ pub fn render(evaluation: &Evaluation) -> String {
 fn introduction(evaluation: &Evaluation) -> Markup {
     let subject = &evaluation.subject;
     let total = evaluation.images.len();
+    // Images that are in no mean.
     let uncounted = total - evaluation.all.images;
     let past = evaluation.images.iter().filter(|image| image.covered < BARELY_COVERED).count();
     html! {
@@ -129,6 +130,7 @@ fn pictures(worst_first: &[&EvaluatedImage]) -> Markup {
     if shown.is_empty() {
         return html! {};
     }
+    // The last colour stands for an error of 1.
     let last = HEAT_RGB.len() - 1;
     html! {
         h2 { "The worst images" }
@@ -142,6 +144,7 @@ fn pictures(worst_first: &[&EvaluatedImage]) -> Markup {
         }
         p.key {
             @for (step, [r, g, b]) in HEAT_RGB.iter().enumerate() {
+                // Black on bright colours, white on dark ones; blue hardly adds to brightness.
                 @let text = if u32::from(*r) + u32::from(*g) > 250 { "#000" } else { "#fff" };
                 span style=(format!("background:rgb({r},{g},{b});color:{text}")) {
                     (format!("{:.1}", step as f64 / last as f64))

@@ -90,6 +90,8 @@ impl ActorAsset {
         let distances_m =
             gaussians.means_m.iter().map(|&mean_m| DVec3::from_array(mean_m).length());
         let too_far = distances_m.enumerate().find(|(_, distance_m)| {
+            // Written as a negation, because a NaN distance is not near: `distance > FARTHEST_M`
+            // would accept it.
             let near = *distance_m <= Self::FARTHEST_M;
             !near
         });
@@ -97,6 +99,8 @@ impl ActorAsset {
             return Err(AssetError::TooFar { index, distance_m });
         }
         let full = Scene::single_chunk(gaussians);
+        // `lod::levels` returns only the coarser levels, with rising errors. The full chunk goes to
+        // the front, so that errors rise over the whole list and `level` can search from the back.
         let coarser = lod::levels(&full)
             .into_iter()
             .map(|lod::Level { error_m, chunk }| AssetLevel { error_m, chunk: Arc::new(chunk) });
@@ -131,6 +135,8 @@ impl ActorAsset {
         tau_px: f64,
         reach_m: Option<f64>,
     ) -> Option<&Arc<Chunk>> {
+        // The box in the actor's axes: its origin is on the ground under the centre, so that z is
+        // from 0 to the height.
         let ActorBox { length_m, width_m, height_m } = self.description.box_;
         let half_m = 0.5 * DVec3::new(length_m, width_m, height_m);
         let bounds = Bounds {
@@ -141,10 +147,15 @@ impl ActorAsset {
             let from_actor_m = viewpoint.position_m - world_from_actor.position_m;
             bounds.distance_m(world_from_actor.rotation.inverse() * from_actor_m)
         };
+        // Without a camera the nearest distance is infinite, beyond every reach.
         let nearest_m = viewpoints.iter().map(distance_m).fold(f64::INFINITY, f64::min);
         let focal_px = viewpoints.iter().fold(0.0, |most: f64, seen| most.max(seen.focal_px));
         let within_reach = reach_m.is_none_or(|reach_m| nearest_m <= reach_m);
+        // An error of e metres at d metres is f e / d pixels. Multiplied by d, the test holds for a
+        // camera inside the box (d = 0): there only the level with an error of 0 passes.
         let small = |level: &&AssetLevel| focal_px * f64::from(level.error_m) <= tau_px * nearest_m;
+        // Errors rise, so that the last level that passes is the coarsest one. The first level
+        // stands in where none passes, such as for a NaN distance.
         let level = self.levels.iter().rfind(small).or(self.levels.first());
         level.filter(|_| within_reach).map(|level| &level.chunk)
     }
@@ -183,6 +194,8 @@ mod tests {
         assert!(asset.levels.len() > 3, "{} levels", asset.levels.len());
         let at = Pose { position_m: DVec3::new(100.0, 0.0, 0.0), ..Pose::IDENTITY };
         let count = |distance_m: f64, reach_m| {
+            // The face of the box is 2 m in front of the origin, and 1 m is a height within the
+            // box: the distance to the box is exactly `distance_m`.
             let position_m = at.position_m - DVec3::new(2.0 + distance_m, 0.0, -1.0);
             let viewpoint = ActorViewpoint { position_m, focal_px: 1000.0 };
             asset.level(&at, &[viewpoint], 1.0, reach_m).map(|chunk| chunk.len())
@@ -212,6 +225,7 @@ mod tests {
     #[test]
     fn an_asset_is_one_chunk_around_its_origin() {
         let mut wide = ball(5_000);
+        // 4 m times 20 is 80 m: more than one cell of 64 m.
         wide.means_m.iter_mut().for_each(|m| m[0] *= 20.0);
         let asset = ActorAsset::new(&wide, description()).unwrap();
         assert_eq!(asset.levels[0].chunk.len(), 5_000);

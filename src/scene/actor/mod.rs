@@ -92,6 +92,7 @@ impl ActorBox {
         let extents =
             [("length_m", self.length_m), ("width_m", self.width_m), ("height_m", self.height_m)];
         for (field, value) in extents {
+            // `contains` is false for NaN.
             let accepted = (Self::LEAST_M..=Self::MOST_M).contains(&value);
             if !accepted {
                 let [least, most] = [Self::LEAST_M, Self::MOST_M];

@@ -88,12 +88,18 @@ impl ContactShadow {
     /// The factor at a point in the actor's axes, in metres.
     pub fn factor(&self, at_m: DVec3) -> f64 {
         let outside = |half_m: f32, at_m: f64| {
+            // Widen before the arithmetic: edges computed in f32 would move the fade by a rounding
+            // error, and the reference backend computes in f64.
             let [fade_m, half_m] = [Self::FADE_M, half_m].map(f64::from);
             1.0 - smoothstep(half_m - fade_m, half_m + fade_m, at_m.abs())
         };
+        // Three shares from 0 to 1; the product is the share of the shadow that falls on this
+        // point.
         let along = outside(0.5 * self.length_m, at_m.x);
         let across = outside(0.5 * self.width_m, at_m.y);
         let [ground_m, top_m] = [Self::GROUND_M, Self::TOP_M].map(f64::from);
+        // Below the ground counts like above it: the surface of a reconstructed road scatters to
+        // both sides of z = 0.
         let above = 1.0 - smoothstep(ground_m, top_m, at_m.z.abs());
         1.0 - f64::from(Self::DEPTH) * along * across * above
     }
@@ -115,7 +121,11 @@ mod tests {
     fn a_shadow_halves_the_ground_beneath_and_ends_beside_and_above() {
         let factor = |x: f64, y: f64, z: f64| SHADOW.factor(DVec3::new(x, y, z));
         assert_eq!(factor(0.0, 0.0, 0.0), 0.5);
+        // Within 2.0 - 0.3 m and 1.0 - 0.3 m of the centre and below 0.05 m, all three shares are
+        // 1.
         assert_eq!(factor(1.6, -0.6, 0.04), 0.5);
+        // On the outline the fade is half way: 1 - 0.5 * 0.5 = 0.75. The tolerance is for 0.3,
+        // which f32 does not hold exactly.
         assert!((factor(2.0, 0.0, 0.0) - 0.75).abs() < 1e-6, "{}", factor(2.0, 0.0, 0.0));
         assert!((factor(0.0, 1.0, 0.0) - 0.75).abs() < 1e-6);
         for outside in [factor(2.31, 0.0, 0.0), factor(0.0, -1.31, 0.0), factor(0.0, 0.0, 0.31)] {

@@ -138,6 +138,7 @@ pub fn captured_drive(
     if let Some(fps) = fps.filter(|fps| !(1e-3..=1e4).contains(fps)) {
         return Err(CapturedDriveError::Fps(fps));
     }
+    // Align first: heights, headings and distances below are metres in the axes of the twin.
     let images: Vec<PosedImage> = images.iter().map(|image| aligned(image, alignment)).collect();
     let folders = folders(&images, options)?;
     let reference_name = reference(&folders, options)?;
@@ -145,11 +146,15 @@ pub fn captured_drive(
 
     // 1. How the reference camera stands on the rig.
     let heights_m = reference.iter().map(|image| image.world_from_camera.position_m.z);
+    // The median, because a bridge or an outlier of the reconstruction moves a mean.
     let camera_height_m = camera_height_m.unwrap_or_else(|| median(heights_m.collect()));
+    // A NaN height is not above the ground, and is refused as well.
     let is_above = camera_height_m > 0.0;
     if !is_above {
         return Err(CapturedDriveError::BelowGround { height_m: camera_height_m });
     }
+    // What is left of a camera's rotation after its heading: pitch and roll, which differ from
+    // image to image by the vehicle's nodding. Their mean is the mount.
     let level = |image: &PosedImage| DQuat::from_rotation_z(heading(&image.world_from_camera));
     let mounts: Vec<DQuat> = reference
         .iter()
@@ -159,6 +164,8 @@ pub fn captured_drive(
     let rig_from_reference = Pose { position_m: camera_height_m * DVec3::Z, rotation };
 
     // 2. The poses of the rig.
+    // The rig stands exactly under the camera and turns only about z. The tilt of single images is
+    // dropped here and reported as `most_tilt_rad`.
     let keyframe = |(image, time_us): (&&PosedImage, i64)| Keyframe {
         time_us,
         world_from_rig: Pose {
@@ -173,6 +180,8 @@ pub fn captured_drive(
     // 3. The cameras.
     let mut cameras = Vec::with_capacity(folders.len());
     for (folder, of_camera) in &folders {
+        // The reference camera defines the rig, so that its mount is exact; a mean over pairs with
+        // itself would only add rounding.
         let rig_from_camera = if *folder == reference_name {
             rig_from_reference
         } else {
@@ -200,6 +209,8 @@ fn timed<'a>(
 ) -> Result<(Folder<'a>, Vec<i64>), CapturedDriveError> {
     if images.iter().all(|image| image.time_us.is_none()) {
         let period_us = 1e6 / fps.unwrap_or(DEFAULT_FPS);
+        // Rounded from the index and not summed up, so that the error stays below 0.5 µs however
+        // long the drive is.
         let times_us = (0..images.len()).map(|index| (period_us * index as f64).round() as i64);
         return Ok((images, times_us.collect()));
     }
@@ -210,13 +221,18 @@ fn timed<'a>(
     if let Some(fps) = fps {
         return Err(CapturedDriveError::FpsAndTimes(fps));
     }
+    // Sorted by time, and names no longer count. The sort is stable, so that equal times stay in
+    // the order of names for the message below.
     images.sort_by_key(|image| image.time_us);
     let all_us: Vec<i64> = images.iter().filter_map(|image| image.time_us).collect();
+    // A trajectory needs rising times.
     if let Some(at) = all_us.windows(2).position(|pair| pair[0] == pair[1]) {
         let (name, time_us) = (images[at + 1].name.clone(), all_us[at]);
         return Err(CapturedDriveError::SameTime { name, time_us });
     }
     let first_us = all_us.first().copied().unwrap_or(0);
+    // Times may be those of a clock since 1970; the subtraction saturates, because a file can name
+    // any i64.
     Ok((images, all_us.into_iter().map(|time_us| time_us.saturating_sub(first_us)).collect()))
 }
 
@@ -226,6 +242,7 @@ fn aligned(image: &PosedImage, alignment: &Alignment) -> PosedImage {
 
 /// The folder of an image, and its name without folder and extension.
 fn parts(name: &str) -> (&str, &str) {
+    // Both separators: COLMAP on Windows writes backslashes into its model.
     let (folder, file) = name.rsplit_once(['/', '\\']).unwrap_or(("", name));
     (folder.trim_start_matches("./"), file.rsplit_once('.').map_or(file, |(stem, _)| stem))
 }
@@ -257,6 +274,8 @@ fn reference(
     options: &CaptureOptions,
 ) -> Result<String, CapturedDriveError> {
     let wanted = options.reference.clone().unwrap_or_else(|| {
+        // The first of equal folders, in the order of their names, so that the choice does not
+        // depend on the order of images.
         let most = folders.values().map(Vec::len).max().unwrap_or(0);
         let first = folders.iter().find(|(_, images)| images.len() == most);
         first.map(|(folder, _)| folder.clone()).unwrap_or_default()
@@ -275,11 +294,14 @@ fn by_number(a: &str, b: &str) -> Ordering {
         let in_number = is_digit(text);
         text.find(|c: char| c.is_ascii_digit() != in_number).unwrap_or(text.len())
     };
+    // Compares run by run: a run is all digits or has none. Both texts lose one run in each round.
     let (mut left, mut right) = (a, b);
     while !left.is_empty() && !right.is_empty() {
         let (l, left_rest) = left.split_at(split(left));
         let (r, right_rest) = right.split_at(split(right));
         let order = if is_digit(l) && is_digit(r) {
+            // Numbers compare as texts, without leading zeros first: a name may have more digits
+            // than any integer type holds. Then the longer number is the larger one.
             let (l, r) = (l.trim_start_matches('0'), r.trim_start_matches('0'));
             l.len().cmp(&r.len()).then_with(|| l.cmp(r))
         } else {
@@ -290,6 +312,8 @@ fn by_number(a: &str, b: &str) -> Ordering {
         }
         (left, right) = (left_rest, right_rest);
     }
+    // Equal so far. The shorter rest comes first; names that differ only in zeros (`07`, `7`) keep
+    // a total order by their text.
     left.len().cmp(&right.len()).then_with(|| a.cmp(b))
 }
 
@@ -299,6 +323,8 @@ fn heading(world_from_camera: &Pose) -> f64 {
     let forward = world_from_camera.rotation * DVec3::Z;
     let upwards = world_from_camera.rotation * DVec3::NEG_Y;
     let toward = match forward.z {
+        // 0.9 is the sine of 64 degrees. Nearer to the vertical, the direction seen from above is
+        // mostly noise, and the upper edge of the image takes its place.
         z if z < -0.9 => upwards,
         z if z > 0.9 => -upwards,
         _ => forward,
@@ -311,12 +337,15 @@ fn heading(world_from_camera: &Pose) -> f64 {
 fn mean_rotation(rotations: &[DQuat]) -> DQuat {
     let first = rotations[0];
     let sum =
+        // q and -q are one rotation. Without equal signs, two of them would cancel out.
         rotations.iter().fold(first * 0.0, |sum, &q| sum + if q.dot(first) < 0.0 { -q } else { q });
     if sum.length() > 1e-9 { sum.normalize() } else { first }
 }
 
 /// The mean pose of a camera in the axes of the reference camera, over images of the same name.
 fn relative(reference: &[&PosedImage], other: &[&PosedImage]) -> Option<Pose> {
+    // Images of one time have one stem. Of equal stems in a folder (`1.png` and `1.jpg`) the last
+    // counts.
     let by_stem: BTreeMap<&str, &PosedImage> =
         other.iter().map(|image| (parts(&image.name).1, *image)).collect();
     let pair = |image: &&PosedImage| {
@@ -334,6 +363,8 @@ fn relative(reference: &[&PosedImage], other: &[&PosedImage]) -> Option<Pose> {
 
 /// The camera that most images have; the first of equals. COLMAP may estimate one for each image.
 fn usual_camera(images: &[&PosedImage]) -> Camera {
+    // A list and not a map: a camera has floats, which have no order and no hash. Captures have few
+    // different cameras.
     let mut cameras: Vec<(Camera, usize)> = Vec::new();
     for image in images {
         match cameras.iter_mut().find(|(camera, _)| *camera == image.camera) {
@@ -376,9 +407,12 @@ mod tests {
             Camera::from_pinhole(640, 480, Pinhole { fx: focal, fy: focal, cx: 320.0, cy: 240.0 })
         };
         let mut images = Vec::new();
+        // Falling numbers, so that the test fails if the order of the images is kept.
         for i in (0..12_u32).rev() {
+            // 0.13 rad times 11 is 1.43 rad, about a quarter of a circle with a radius of 20 m.
             let angle = 0.13 * f64::from(i);
             let at_m = 20.0 * DVec3::new(angle.sin(), 1.0 - angle.cos(), 0.01 * f64::from(i));
+            // The nodding is symmetric, so that its mean is 0: from -0.022 to 0.022 rad.
             let nod = DQuat::from_rotation_y(0.004 * (f64::from(i) - 5.5));
             let world_from_rig = Pose { position_m: at_m, rotation: DQuat::from_rotation_z(angle) };
             let world_from_front =
@@ -442,6 +476,7 @@ mod tests {
         let made = captured_drive(&images, &Alignment::IDENTITY, &options()).unwrap();
         made.trajectory.check().unwrap();
         let keyframes = &made.trajectory.keyframes;
+        // 11 intervals of 0.1 s, at 10 images a second.
         assert_eq!((keyframes.len(), keyframes[11].time_us), (12, 1_100_000));
         for (i, keyframe) in keyframes.iter().enumerate() {
             let angle = 0.13 * i as f64;
@@ -476,6 +511,8 @@ mod tests {
     fn axes_and_unit_are_those_of_the_twin() {
         let (images, _) = images();
         let plane = super::super::GroundPlane { point: DVec3::Z, up: DVec3::NEG_Z };
+        // `turn` puts the capture upside down, and `back` is its inverse: together they change
+        // nothing.
         let turn = Alignment::onto(&plane);
         let turned: Vec<PosedImage> = images.iter().map(|image| aligned(image, &turn)).collect();
         let back = Alignment { new_from_old: turn.new_from_old.inverse(), metres_per_unit: 1.0 };

@@ -118,6 +118,8 @@ pub fn find_ground(
         return Err(GroundError::TooFew { count: places.len(), least: LEAST_PLACES });
     }
     let tolerance = TOLERANCE * radius;
+    // Every `stride`-th place, so that at most COMPARED of them are judged: 3,000 planes times
+    // 12,000 places are 36 million products.
     let stride = places.len().div_ceil(COMPARED);
     let compared: Vec<SurfaceSample> = places.iter().copied().step_by(stride).collect();
     let mut random = Random::new(search.seed, "ground", 0);
@@ -125,11 +127,16 @@ pub fn find_ground(
     for at in 0..search.hypotheses {
         let Some(plane) = hypothesis(&compared, at, &mut random) else { continue };
         let (score, plane) = judge(&compared, plane, tolerance);
+        // 0.7 is about cos 45 degrees. An up direction of zero length refuses every plane.
         let is_wanted = search.up.is_none_or(|up| plane.up.dot(up.normalize_or_zero()) > 0.7);
+        // Strictly greater: of equal planes the first one stays, so that the result is
+        // deterministic.
         if is_wanted && best.is_none_or(|(most, _)| score > most) {
             best = Some((score, plane));
         }
     }
+    // The score is places on the plane less those on its wrong side: a table top has too few, and a
+    // plane through the middle of a scene has as many below as above.
     let least = f64::from(LEAST_PERCENT) / 100.0 * compared.len() as f64;
     match best {
         Some((score, plane)) if score >= least => Ok(refine(&places, plane, tolerance)),
@@ -141,6 +148,7 @@ fn extent(gaussians: &Gaussians, opaque: &[usize]) -> SceneExtent {
     if opaque.is_empty() {
         return SceneExtent { middle: DVec3::ZERO, radius: 0.0 };
     }
+    // A median for each axis: a sky dome and floaters far away do not move it.
     let axis = |axis: usize| median(opaque.iter().map(|&i| gaussians.means_m[i][axis]).collect());
     let middle = DVec3::new(axis(0), axis(1), axis(2));
     let distance = |&i: &usize| DVec3::from_array(gaussians.means_m[i]).distance(middle);
@@ -163,6 +171,8 @@ fn places(gaussians: &Gaussians, opaque: &[usize], cube: f64) -> Vec<SurfaceSamp
 
 /// The thinnest axis of a flat Gaussian.
 fn normal(gaussians: &Gaussians, i: usize) -> Option<DVec3> {
+    // A difference of logarithms is the logarithm of the ratio: thinnest against middle axis. A
+    // needle has two thin axes and is not flat.
     let scales = gaussians.ln_scales[i];
     let mut order = [0, 1, 2];
     order.sort_by(|&a, &b| scales[a].total_cmp(&scales[b]));
@@ -176,6 +186,8 @@ fn normal(gaussians: &Gaussians, i: usize) -> Option<DVec3> {
 fn hypothesis(places: &[SurfaceSample], at: usize, random: &mut Random) -> Option<GroundPlane> {
     let mut pick = || places[random.below(places.len())];
     let [a, b, c] = [pick(), pick(), pick()];
+    // Half of the hypotheses use one normal, which is right with one lucky draw and not three; the
+    // other half also serve scenes of round Gaussians.
     if at.is_multiple_of(2) {
         return a.normal.map(|up| GroundPlane { point: a.at, up });
     }
@@ -198,11 +210,15 @@ fn judge(places: &[SurfaceSample], plane: GroundPlane, tolerance: f64) -> (f64, 
                 None => 0.5,
             };
         } else if height > 3.0 * tolerance {
+            // Between one and three tolerances a place counts neither as on the plane nor beside
+            // it: kerbs and the ground's own roughness.
             above += 1.0;
         } else if height < -3.0 * tolerance {
             below += 1.0;
         }
     }
+    // Only the smaller side is a penalty: the ground may have all of the scene above it, but not
+    // much below.
     let up = if below > above { -plane.up } else { plane.up };
     (on - above.min(below), GroundPlane { up, ..plane })
 }
@@ -211,6 +227,8 @@ fn judge(places: &[SurfaceSample], plane: GroundPlane, tolerance: f64) -> (f64, 
 /// most of the places near it, because a road is not the mean of itself and the pavements and lawns
 /// next to it.
 fn refine(places: &[SurfaceSample], mut plane: GroundPlane, tolerance: f64) -> GroundPlane {
+    // The largest number of places so far: a round that keeps less than a fifth of them has a
+    // tolerance below the roughness of the ground.
     let mut first = 0;
     for round in 0..=REFINEMENTS {
         let tolerance = tolerance * 0.5_f64.powi(round);
@@ -246,6 +264,8 @@ fn refine(places: &[SurfaceSample], mut plane: GroundPlane, tolerance: f64) -> G
 /// Middle of the window of this width with the most values.
 fn densest(mut heights: Vec<f64>, width: f64) -> Option<f64> {
     heights.sort_by(f64::total_cmp);
+    // Two ends of a window move through the sorted heights, each only forwards: O(n) after the
+    // sort. `best` is a half-open range of indices.
     let mut best = (0, 0);
     let mut from = 0;
     for to in 0..heights.len() {
@@ -277,6 +297,8 @@ fn fit(points: &[DVec3]) -> Option<GroundPlane> {
     let scale = covariance.to_cols_array().iter().fold(0.0_f64, |most, e| most.max(e.abs()));
     let [a, b, c] = [covariance.x_axis, covariance.y_axis, covariance.z_axis].map(|v| v / scale);
     let mut adjugate = DMat3::from_cols(b.cross(c), c.cross(a), a.cross(b));
+    // Each round squares the matrix: 12 rounds are the power 2^12 = 4096. Two eigenvalues that
+    // differ by 1 % then differ by a factor of e^40.
     for _ in 0..12 {
         let norm = adjugate.to_cols_array().iter().fold(0.0_f64, |most, e| most.max(e.abs()));
         if !(norm > 0.0 && norm.is_finite()) {
@@ -301,6 +323,8 @@ mod tests {
         let mut gaussians = Gaussians::with_capacity(0, count);
         for i in 0..count {
             let (x, y) = (random.range(-5.0, 5.0), random.range(-5.0, 5.0));
+            // Six tenths floor (rough by 1 cm), two tenths wall, two tenths round noise above the
+            // floor.
             let (at, turn) = match i % 10 {
                 0..=5 => (DVec3::new(x, y, random.range(-0.01, 0.01)), DQuat::IDENTITY),
                 6..=7 => (DVec3::new(5.0, y, 0.3 * (x + 5.0)), DQuat::from_rotation_y(1.57)),

@@ -68,6 +68,7 @@ impl Alignment {
     pub fn onto(ground: &GroundPlane) -> Self {
         let up = ground.up;
         // Upside down, the shortest rotation is not unique: half a turn about x.
+        // The rotation from up to z is about their cross product, which vanishes near -z.
         let is_upside_down = up.z < -1.0 + 1e-9;
         let rotation = if is_upside_down {
             DQuat::from_rotation_x(std::f64::consts::PI)
@@ -75,6 +76,7 @@ impl Alignment {
             DQuat::from_rotation_arc(up, DVec3::Z)
         };
         let foot = up * up.dot(ground.point);
+        // The foot p0 becomes the origin: R p0 + t = 0.
         let new_from_old = Pose { position_m: -(rotation * foot), rotation };
         Self { new_from_old, ..Self::IDENTITY }
     }
@@ -115,6 +117,8 @@ impl Alignment {
 
     /// Turns, moves and scales Gaussians with their colours.
     pub fn apply(&self, gaussians: &mut Gaussians) {
+        // A rotation by the identity would still round quaternions and colours; bytes of an
+        // unchanged scene stay the same.
         if self.new_from_old != Pose::IDENTITY {
             gaussians.transform(&self.new_from_old);
         }
@@ -206,6 +210,7 @@ impl FromStr for Alignment {
 
 /// The median; the upper one of an even number. There is at least one value.
 fn median(mut values: Vec<f64>) -> f64 {
+    // Selection is O(n), which matters: the heights of a scene are millions of values.
     let middle = values.len() / 2;
     *values.select_nth_unstable_by(middle, f64::total_cmp).1
 }

@@ -74,10 +74,14 @@ pub fn drive_through(
         return Err(PathError::Place { index });
     }
     let mut knots: Vec<DVec3> = points_m.to_vec();
+    // Only neighbours: a drive may come back to a point later. A double click would make an
+    // interval of zero length, which divides by 0 in the curve.
     knots.dedup_by(|a, b| a.distance(*b) < SAME_M);
     if !(2..=MOST_POINTS).contains(&knots.len()) {
         return Err(PathError::Points { count: knots.len() });
     }
+    // The length of the polygon bounds the memory before the curve is computed. The curve is rarely
+    // more than half as long again; a factor of 2 is the margin.
     let straight_m: f64 = knots.windows(2).map(|pair| pair[0].distance(pair[1])).sum();
     let most_m = MOST_STEPS * STEP_M;
     if straight_m > 0.5 * most_m {
@@ -98,6 +102,7 @@ pub fn drive_through(
     }
 
     // 2. Keyframes at equal distances.
+    // Stations rise, because knots differ by at least SAME_M: the division in `at_m` is safe.
     let mut stations_m = vec![0.0];
     for pair in curve.windows(2) {
         stations_m.push(stations_m[stations_m.len() - 1] + pair[0].distance(pair[1]));
@@ -112,6 +117,8 @@ pub fn drive_through(
     let mut heading_rad = 0.0;
     let keyframe = |step: usize| {
         let station_m = length_m * step as f64 / steps as f64;
+        // Half a step to both sides: a central difference, without the lag of a one-sided one. At
+        // the ends `at_m` clamps, and the difference is one-sided.
         let reach_m = 0.5 * length_m / steps as f64;
         let way = at_m(station_m + reach_m) - at_m(station_m - reach_m);
         let flat = DVec2::new(way.x, way.y);
@@ -136,6 +143,8 @@ pub fn drive_through(
 
 /// The curve between the middle two of four knots, at t from 0 to 1 (Barry and Goldman 1988).
 fn catmull_rom([a, b, c, d]: [DVec3; 4], t: f64) -> DVec3 {
+    // Knots of the parameter: centripetal, the square root of the distance. Distances of 0 do not
+    // occur, since neighbours differ.
     let t1 = a.distance(b).sqrt();
     let t2 = t1 + b.distance(c).sqrt();
     let t3 = t2 + c.distance(d).sqrt();

@@ -44,6 +44,8 @@ pub(super) fn to_geodetic(ecef_m: DVec3) -> GeoPoint {
     let minor_m = A_M * (1.0 - F);
     let second_e2 = E2 / (1.0 - E2);
     let p_m = ecef_m.x.hypot(ecef_m.y);
+    // The start is exact on the ellipsoid: tan β = z a / (p b), from tan β = (b/a) tan φ and p tan
+    // φ (1 - e²) = z.
     let mut beta_rad = (ecef_m.z * A_M).atan2(p_m * minor_m);
     let mut latitude_rad = 0.0;
     for _ in 0..3 {
@@ -51,9 +53,12 @@ pub(super) fn to_geodetic(ecef_m: DVec3) -> GeoPoint {
         let rise_m = ecef_m.z + second_e2 * minor_m * sin.powi(3);
         let run_m = p_m - E2 * A_M * cos.powi(3);
         latitude_rad = rise_m.atan2(run_m);
+        // tan β = (1 - f) tan φ, by atan2, which has no pole at 90 degrees.
         beta_rad = ((1.0 - F) * latitude_rad.sin()).atan2(latitude_rad.cos());
     }
     let (sin, cos) = latitude_rad.sin_cos();
+    // h = p cos φ + z sin φ - a sqrt(1 - e² sin² φ), which is stable at the equator and at the
+    // poles, where p / cos φ is not.
     let altitude_m = p_m * cos + ecef_m.z * sin - A_M * (1.0 - E2 * sin * sin).sqrt();
     GeoPoint {
         latitude_deg: latitude_rad.to_degrees(),

@@ -102,6 +102,8 @@ impl GeoAnchor {
             }
             Self::Projected(origin) => {
                 UtmZone::named(&origin.projection)?;
+                // 400 km on both sides of the central meridian; half a zone, 3 degrees, is 334 km
+                // at the equator.
                 in_range("easting_m", origin.easting_m, 1e5, 9e5)?;
                 in_range("northing_m", origin.northing_m, 0.0, 1e7)?;
                 in_range("altitude_m", origin.altitude_m, -12_000.0, 100_000.0)
@@ -120,6 +122,8 @@ impl GeoAnchor {
         match self {
             Self::Origin(origin) => {
                 let point = to_geodetic(to_ecef(origin) + enu_axes(origin) * at_m);
+                // The direction goes to earth-centred axes and from there to the axes at the point:
+                // east of the origin, the local north is turned.
                 let here = enu_axes(&point).transpose() * (enu_axes(origin) * forward);
                 Ok(GeoPose { point, heading_deg: heading_deg(here.x, here.y) })
             }
@@ -129,6 +133,8 @@ impl GeoAnchor {
                 let northing_m = origin.northing_m + at_m.y;
                 let (mut point, convergence_rad) = zone.to_geodetic(easting_m, northing_m);
                 point.altitude_m = origin.altitude_m + at_m.z;
+                // The world's y axis is grid north. Grid north is turned against true north by the
+                // convergence, which grows with the distance from the central meridian.
                 let grid_deg = heading_deg(forward.x, forward.y);
                 let heading_deg = within_turn(grid_deg + convergence_rad.to_degrees());
                 Ok(GeoPose { point, heading_deg })

@@ -91,6 +91,7 @@ fn points_of_a_tangent_plane_are_those_of_proj() {
         let at = facing(DVec3::from_array(xyz_m), 0.0);
         let GeoPoint { latitude_deg, longitude_deg, altitude_m } =
             anchor.locate(&at).unwrap().point;
+        // 2e-12 degrees are 0.2 µm on the ground.
         assert!((latitude_deg - expected[0]).abs() < 2e-12, "{latitude_deg}, {expected:?}");
         assert!((longitude_deg - expected[1]).abs() < 2e-12, "{longitude_deg}, {expected:?}");
         assert!((altitude_m - expected[2]).abs() < 3e-8, "{altitude_m}, {expected:?}");
@@ -104,6 +105,8 @@ fn points_of_utm_are_those_of_proj() {
     for (zone, [easting_m, northing_m], [latitude_deg, longitude_deg], convergence) in UTM {
         let anchor: GeoAnchor =
             format!("{zone},{},{}", easting_m - 10.0, northing_m).parse().unwrap();
+        // 10 m less in the anchor, and 10 m in the pose: the sum is the tabulated easting. The rig
+        // looks along y, to grid north.
         let at = facing(DVec3::new(10.0, 0.0, 3.0), std::f64::consts::FRAC_PI_2);
         let GeoPose { point, heading_deg } = anchor.locate(&at).unwrap();
         assert!((point.latitude_deg - latitude_deg).abs() < 1e-12, "{zone}: {point:?}");

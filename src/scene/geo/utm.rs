@@ -51,6 +51,8 @@ const BETA: [[f64; 6]; 6] = [
 
 /// The coefficients at the flattening of WGS84.
 fn at_n(series: &[[f64; 6]; 6]) -> [f64; 6] {
+    // Horner's scheme from the highest power. The first coefficient belongs to n and not to 1, so
+    // that each round also multiplies the sum by n.
     series.map(|row| row.iter().rev().fold(0.0, |sum, coefficient| (sum + coefficient) * N))
 }
 
@@ -72,6 +74,7 @@ impl UtmZone {
     }
 
     fn central_meridian_deg(self) -> f64 {
+        // Zone 1 covers 180 to 174 degrees west; its middle is at 177 degrees west.
         6.0 * f64::from(self.number) - 183.0
     }
 
@@ -90,6 +93,8 @@ impl UtmZone {
         let mut xi_sphere = xi;
         let mut eta_sphere = eta;
         let (mut p, mut q) = (1.0, 0.0);
+        // Terms of order 2, 4, .., 12 of ξ and η, and at the same time of their derivative p - i q,
+        // whose argument is a part of the convergence.
         for (index, beta) in at_n(&BETA).into_iter().enumerate() {
             let k = 2.0 * (index + 1) as f64;
             xi_sphere -= beta * (k * xi).sin() * (k * eta).cosh();
@@ -101,6 +106,7 @@ impl UtmZone {
         let conformal_tan = xi_sphere.sin() / sinh.hypot(cos);
         let longitude_rad = sinh.atan2(cos);
         let latitude_rad = geodetic_latitude(conformal_tan);
+        // The convergence of the spherical projection, and the rotation by the series.
         let convergence_rad = (xi_sphere.tan() * eta_sphere.tanh()).atan() + q.atan2(p);
         let point = GeoPoint {
             latitude_deg: latitude_rad.to_degrees(),
@@ -115,6 +121,7 @@ impl UtmZone {
         let longitude_rad = (point.longitude_deg - self.central_meridian_deg()).to_radians();
         let tan = conformal_tan(point.latitude_deg.to_radians());
         let (sin_lon, cos_lon) = longitude_rad.sin_cos();
+        // The transverse projection of the sphere; its inverse is at the end of `to_geodetic`.
         let xi_sphere = tan.atan2(cos_lon);
         let eta_sphere = (sin_lon / tan.hypot(cos_lon)).asinh();
         let (mut xi, mut eta) = (xi_sphere, eta_sphere);
@@ -140,6 +147,7 @@ fn conformal_tan(latitude_rad: f64) -> f64 {
 /// converges to rounding in three rounds (Karney 2011, equations 19 to 21).
 fn geodetic_latitude(wanted_tan: f64) -> f64 {
     let mut tan = wanted_tan;
+    // One round more than needed, so that the result does not depend on how close the start is.
     for _ in 0..4 {
         let found = conformal_tan(tan.atan());
         let slope =

@@ -18,6 +18,7 @@ impl Bounds {
 
     /// Whether the box contains no point.
     pub fn is_empty(&self) -> bool {
+        // All axes are empty or none is: `add` changes all of them.
         self.min_m.x > self.max_m.x
     }
 
@@ -34,6 +35,7 @@ impl Bounds {
 
     /// Distance from a point to the box, in metres; 0 inside.
     pub fn distance_m(&self, point_m: DVec3) -> f64 {
+        // The nearest point of the box is the point itself with each coordinate clamped.
         point_m.clamp(self.min_m, self.max_m).distance(point_m)
     }
 

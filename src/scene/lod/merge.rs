@@ -32,6 +32,8 @@ impl Node {
         let axes = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
         let root = axes * DMat3::from_diagonal(scale_m);
         let weight = opacity * area_m2(scale_m);
+        // The covariance as root times its transpose is symmetric and has no negative eigenvalue,
+        // also after rounding.
         Self { mean_m, cov_m2: root * root.transpose(), scale_m, axes, weight }
     }
 
@@ -42,6 +44,7 @@ impl Node {
 
     /// Opacity of the peak; above 1 where several Gaussians overlapped.
     pub(super) fn opacity(&self) -> f64 {
+        // 0 / 0 for a Gaussian without any extent: NaN, which callers treat as invisible.
         self.weight / area_m2(self.scale_m)
     }
 
@@ -62,6 +65,7 @@ pub(super) fn joined(a: &Node, b: &Node) -> Node {
     let mean_m = a.mean_m + share * offset;
     // Both displacements together: share (1 - share) d dᵀ.
     let spread = outer(offset) * (share * (1.0 - share));
+    // The law of total variance: the mean of the covariances plus the covariance of the means.
     let cov_m2 = a.cov_m2 * (1.0 - share) + b.cov_m2 * share + spread;
     Node { mean_m, cov_m2, weight, ..*a }
 }
@@ -70,6 +74,7 @@ impl Node {
     /// Computes principal axes and standard deviations from the covariance.
     pub(super) fn diagonalise(&mut self) {
         let (squares, axes) = eigen(self.cov_m2);
+        // Rounding may leave a tiny negative eigenvalue of a flat Gaussian.
         self.scale_m = squares.max(DVec3::ZERO).map(f64::sqrt);
         self.axes = axes;
     }
@@ -85,9 +90,13 @@ pub(super) fn cost(a: &Node, b: &Node, merged: &Node, colours: [DVec3; 2], blur_
     let share = if merged.weight > 0.0 { b.weight / merged.weight } else { 0.5 };
     let colour = colours[0].lerp(colours[1], share);
     let fields =
+        // The merged field counts negatively, so that the square of the sum is the square of the
+        // difference.
         [(a, a.weight, colours[0]), (b, b.weight, colours[1]), (merged, -merged.weight, colour)];
     let term = |i: usize, j: usize| {
         let ((p, weight_p, colour_p), (q, weight_q, colour_q)) = (fields[i], fields[j]);
+        // 1 + p·q is the inner product of (1, colour) with (1, colour): opacity counts as much as a
+        // channel of colour.
         weight_p * weight_q * (1.0 + colour_p.dot(colour_q)) * overlap(p, q, blur_m2)
     };
     let there = term(0, 0) + term(1, 1) + 2.0 * term(0, 1);
@@ -97,6 +106,7 @@ pub(super) fn cost(a: &Node, b: &Node, merged: &Node, colours: [DVec3; 2], blur_
 
 /// `N(a - b; 0, A + B + 2 blur)` without the constant `(2 π)^(-3/2)`.
 fn overlap(a: &Node, b: &Node, blur_m2: f64) -> f64 {
+    // Each of the two is blurred, so that the variance counts twice.
     let sum = a.cov_m2 + b.cov_m2 + DMat3::from_diagonal(DVec3::splat(2.0 * blur_m2));
     let offset = b.mean_m - a.mean_m;
     // Solve by Cramer's rule: the cofactor rows are the inverse times the determinant.
@@ -123,6 +133,8 @@ fn eigen(mut matrix: DMat3) -> (DVec3, DMat3) {
             }
             // Golub & Van Loan, Matrix Computations, symmetric Schur decomposition.
             let tau = (qq - pp) / (2.0 * pq);
+            // The smaller of the two angles that make the entry 0: it is at most 45 degrees, which
+            // keeps the iteration stable.
             let t = tau.signum() / (tau.abs() + (1.0 + tau * tau).sqrt());
             let cos = 1.0 / (1.0 + t * t).sqrt();
             let sin = t * cos;

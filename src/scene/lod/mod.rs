@@ -60,11 +60,14 @@ pub fn levels(block: &Chunk) -> Vec<Level> {
     let mut kept = Vec::new();
     let mut last = block.len();
     let mut limit_m = FINEST_LIMIT_M;
+    // At most 29 limits: from 2^-10 to 2^4 in steps of √2.
     while limit_m <= COARSEST_LIMIT_M && merging.nodes.len() > FEWEST {
         merging.merge_within(limit_m);
         if (merging.nodes.len() as f64) <= KEPT_SHARE * last as f64 {
             last = merging.nodes.len();
             let before_m = kept.last().map_or(0.0, |level: &Level| level.error_m);
+            // Not below the level before, because a later merge can bring a mean back; `level` and
+            // the reader of a table need rising errors.
             let error_m = merging.error_m().max(before_m);
             kept.push(Level { error_m, chunk: merging.chunk(block) });
         }
@@ -150,6 +153,8 @@ impl Merging {
         let mut pairs = Vec::new();
         // Most pairs are too far apart for any merge; comparing squares saves a square root for
         // each. The margin keeps every pair that `price` may accept in spite of rounding.
+        // Half the distance is moved by one of the two, so that pairs beyond twice the limit are
+        // out: (2 limit)².
         let farthest_m2 = 4.0 * limit_m * limit_m * (1.0 + 1e-9);
         let nodes = &self.nodes[group.clone()];
         // Coordinate by coordinate, so that the distances to all successors are computed by
@@ -180,9 +185,12 @@ impl Merging {
                 }
             }
         }
+        // Cheapest first. Ties end with the indices, so that the order does not depend on the sort.
         pairs.sort_by(|a, b| {
             a.cost.total_cmp(&b.cost).then((a.first, a.second).cmp(&(b.first, b.second)))
         });
+        // A node takes part in at most one merge of a round, because the cost of a second one would
+        // be out of date.
         let mut taken = [false; GROUP];
         for Pair { first, second, .. } in pairs {
             let places = [first - group.start, second - group.start];
@@ -219,6 +227,8 @@ impl Merging {
             return None;
         }
         let colours = [self.colour(first), self.colour(second)];
+        // The limit stands for the size of a pixel at the distance at which this level is drawn, so
+        // that the blur of the renderer is 0.3 limit².
         let cost = cost(a, b, &merged, colours, BLUR_PX2 * limit_m * limit_m);
         (cost <= MOST_COST).then_some(cost)
     }
@@ -260,6 +270,8 @@ impl Merging {
             // comes later.
             self.nodes[end] = joint;
             self.sh.copy_within(node * self.stride..(node + 1) * self.stride, end * self.stride);
+            // An unmerged node keeps its error. That of a merged one is computed from its leaves
+            // below, which is less than the sum of the bounds.
             self.errors_m[end] = if partner[node].is_some() { 0.0 } else { self.errors_m[node] };
             is_new.push(partner[node].is_some());
             end += 1;
@@ -267,6 +279,8 @@ impl Merging {
         self.nodes.truncate(end);
         self.sh.truncate(end * self.stride);
         self.errors_m.truncate(end);
+        // Leaves are followed through all merges, so that an error is measured against level 0 and
+        // not against the level before.
         for (node, (mean_m, sigma_m)) in self.node_of_leaf.iter_mut().zip(&self.leaves) {
             *node = place[*node as usize];
             if !is_new[*node as usize] {
@@ -283,6 +297,7 @@ impl Merging {
     /// The largest error of all nodes, rounded up to f32.
     fn error_m(&self) -> f32 {
         let largest = self.errors_m.iter().fold(0.0_f64, |all, &error| all.max(error));
+        // The cast rounds to nearest, possibly down; the next number up is an upper bound again.
         (largest as f32).next_up()
     }
 
@@ -295,6 +310,7 @@ impl Merging {
                 mean_m: node.mean_m.as_vec3().to_array(),
                 scale_m: node.scale_m.as_vec3().to_array(),
                 quat_wxyz: node.quat_wxyz().map(|q| q as f32),
+                // Also false for the NaN of a node without extent.
                 log2_opacity: if opacity > 0.0 { opacity.log2() as f32 } else { f32::NEG_INFINITY },
                 sh,
             });

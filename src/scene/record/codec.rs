@@ -65,6 +65,8 @@ impl Measure {
             Self::Plain => value,
             Self::Logarithm => (value + THIN_M).ln(),
             Self::Opacity => value.exp2(),
+            // The square root spends the codes on small values; the sign is kept, and zero stays
+            // zero.
             Self::Root => value.abs().sqrt().copysign(value),
         }
     }
@@ -74,6 +76,7 @@ impl Measure {
     pub(super) fn value(self, measure: f32) -> f32 {
         match self {
             Self::Plain => measure,
+            // Rounding near a scale of 0 may give a tiny negative number.
             Self::Logarithm => (measure.exp() - THIN_M).max(0.0),
             Self::Opacity => measure.log2(),
             Self::Root => measure * measure.abs(),
@@ -94,11 +97,13 @@ impl Code {
 
     /// Bytes per value of each stored column.
     pub(super) fn planes(self, columns: usize) -> Vec<usize> {
+        // Whole bytes, because zstd compresses the empty high bits of a plane of their own.
         let bytes = |bits: u32| bits.div_ceil(8) as usize;
         match self {
             Self::Float => vec![4; columns],
             Self::Half => vec![2; columns],
             Self::Steps(bits) | Self::Binary(bits) => vec![bytes(bits); columns],
+            // The first code also has the index of the largest component, two bits more.
             Self::Rotation(bits) => vec![bytes(bits + 2), bytes(bits), bytes(bits)],
         }
     }
@@ -120,6 +125,7 @@ impl Code {
         grids: &mut Vec<u8>,
         planes: &mut Vec<u8>,
     ) -> u64 {
+        // Codes without a grid are written here, and return; what follows is quantisation alone.
         let (bits, binary) = match self {
             Self::Float => {
                 for column in 0..columns {
@@ -137,6 +143,7 @@ impl Code {
                 return 0;
             }
             Self::Rotation(bits) => {
+                // Four columns are read side by side, because a code depends on all components.
                 let [w, x, y, z] = [0, 1, 2, 3].map(values);
                 let quats = w.zip(x).zip(y.zip(z)).map(|((w, x), (y, z))| [w, x, y, z]);
                 let codes: Vec<[u32; 3]> = quats.map(|q| smallest_three(q, bits)).collect();
@@ -151,6 +158,8 @@ impl Code {
         };
         let [low, high] = measure.range();
         let mut clamped = 0;
+        // All columns of the field share a grid, so that they are measured together before any code
+        // is computed.
         let measured: Vec<f32> = (0..columns)
             .flat_map(values)
             .map(|value| {
@@ -164,6 +173,8 @@ impl Code {
         grids.extend(grid.first.to_le_bytes());
         grids.extend(grid.step.to_le_bytes());
         let codes: Vec<u32> = measured.iter().map(|&value| grid.code(value, bits)).collect();
+        // `measured` has the columns one after the other, each of the same length. `max` is for a
+        // part without Gaussians, whose chunk length would be 0.
         for column in codes.chunks(codes.len().div_ceil(columns).max(1)) {
             write_planes(planes, column, bits.div_ceil(8) as usize);
         }
@@ -182,8 +193,11 @@ impl Grid {
             values.iter().fold(from, |all, &value| pick(all, f64::from(value)))
         };
         let (low, high) = (fold(f64::INFINITY, f64::min), fold(f64::NEG_INFINITY, f64::max));
+        // 2^bits numbers are 2^bits - 1 steps, of which one is used up by rounding the start down.
         let steps = f64::from((1_u32 << bits) - 2);
         let finest = low.abs().max(high.abs()) / f64::from(1 << 30);
+        // The step is the range by the steps, but not so fine that `first` would leave i32: |low| /
+        // step is at most 2^30.
         let step = ((high - low) / steps).max(finest);
         let spans = step > 1e-30;
         if !spans {
@@ -204,6 +218,7 @@ impl Grid {
     /// The value of a code.
     #[inline(always)]
     pub(super) fn at(self, code: u32) -> f32 {
+        // Wrapping, because a damaged file may have any grid: a wrong value, but no panic.
         self.first.wrapping_add(code as i32) as f32 * self.step
     }
 
@@ -220,11 +235,14 @@ impl Grid {
 /// the largest component positive.
 fn smallest_three(quat: [f32; 4], bits: u32) -> [u32; 3] {
     let largest = (0..4).max_by(|&a, &b| quat[a].abs().total_cmp(&quat[b].abs())).unwrap_or(0);
+    // One number less than the bits allow, so that the range is symmetric and zero has a code in
+    // its middle.
     let half = f64::from((1_u32 << (bits - 1)) - 1);
     let sign = if quat[largest] < 0.0 { -1.0 } else { 1.0 };
     let mut codes = [0; 3];
     let others = (0..4).filter(|&k| k != largest);
     for (code, k) in codes.iter_mut().zip(others) {
+        // Components other than the largest are at most 1/√2; times √2 they are within -1..=1.
         let share = sign * f64::from(quat[k]) * std::f64::consts::SQRT_2;
         *code = ((share * half).round().clamp(-half, half) + half) as u32;
     }

@@ -46,6 +46,8 @@ impl<'a> FieldDecoder<'a> {
         [grid, mut planes]: [&'a [u8]; 2],
         count: usize,
     ) -> Self {
+        // The planes of a column follow each other; splitting them off in order gives each column
+        // its own.
         let stored = code.planes(columns).into_iter().map(|bytes| {
             let (own, rest) = planes.split_at(bytes * count);
             planes = rest;
@@ -88,6 +90,8 @@ impl<'a> FieldDecoder<'a> {
             (Code::Rotation(bits), _) => {
                 let [a, b, c] = [0, 1, 2].map(|k: usize| self.columns[k]);
                 for group in groups {
+                    // The number of bytes is a constant in each arm, so that the loads are
+                    // unrolled.
                     let codes = match bits {
                         // The index of the largest component makes the first code two bits longer.
                         ..=6 => [a.codes::<1>(group), b.codes::<1>(group), c.codes::<1>(group)],
@@ -119,6 +123,7 @@ impl<'a> FieldDecoder<'a> {
         grid: Grid,
         mut put: impl FnMut(usize, usize, [f32; LANES]),
     ) {
+        // The table has 2^bits entries; the mask spares the bounds check.
         let all = self.table.len().saturating_sub(1);
         self.each::<BYTES>(
             groups,
@@ -202,6 +207,8 @@ fn from_smallest_three(codes: [[u32; LANES]; 3], bits: u32) -> [[f32; LANES]; 4]
         let first = codes[0][lane] & ((1 << bits) - 1);
         let [a, b, c] =
             [first, codes[1][lane], codes[2][lane]].map(|code| (code as f32 - half) * step);
+        // The largest follows from the unit length. Rounding may make the sum of the others exceed
+        // 1 by a little.
         let d = (1.0 - a * a - b * b - c * c).max(0.0).sqrt();
         // Selections and not branches, so that all lanes are computed at once.
         quats[0][lane] = if largest == 0 { d } else { a };

@@ -144,6 +144,8 @@ impl RecordFormat {
         ];
         let names = ["SH degree 1", "SH degree 2", "SH degree 3"];
         for degree in 1..=usize::from(sh_degree) {
+            // A band begins after all coefficients of the lower degrees, and has 2 degree + 1 of
+            // them in three channels.
             let column = column::SH + 3 * sh::coefficients(degree as u8 - 1);
             let columns = 3 * (2 * degree + 1);
             let band = measure(Measure::Root);
@@ -170,6 +172,7 @@ impl RecordFormat {
     /// # Panics
     /// If the range does not begin at a lane group or ends after the chunk.
     pub fn encode(self, chunk: &Chunk, run: Range<usize>, clamped: &mut Clamped) -> Vec<u8> {
+        // Lane groups of a part begin at lane 0, so that a reader can append part after part.
         assert!(run.start.is_multiple_of(LANES) && run.end <= chunk.len(), "{run:?}");
         let fields = self.fields(chunk.sh_degree());
         let mut grids = Vec::new();
@@ -183,6 +186,7 @@ impl RecordFormat {
                 field.code.encode(field.measure, field.columns, &values, &mut grids, &mut planes);
             clamped.add(field.name, count);
         }
+        // Grids are at the front, so that a decoder has them before the planes.
         grids.append(&mut planes);
         grids
     }
@@ -212,6 +216,7 @@ impl RecordFormat {
         count: usize,
         lanes: &mut LanePages,
     ) -> Result<(), String> {
+        // The size follows from format, degree and count: after this check no split below can fail.
         let wanted = self.part_bytes(sh_degree, count);
         if part.len() != wanted {
             return Err(format!("{count} Gaussians take {wanted} bytes, not {}", part.len()));
@@ -231,7 +236,11 @@ impl RecordFormat {
         let width = columns(sh_degree);
         let groups = count.div_ceil(LANES);
         lanes.expect(groups);
+        // One tile, used again for all: its lanes beyond the last Gaussian hold values of the tile
+        // before, and the chunk empties them.
         let mut tile = vec![Lanes([0.0; LANES]); groups.min(TILE_GROUPS) * width];
+        // Tile by tile; within a tile, field by field. Each decoder writes its columns of every
+        // lane group.
         for start in (0..groups).step_by(TILE_GROUPS) {
             let end = groups.min(start + TILE_GROUPS);
             for (column, decoder) in &decoders {
@@ -318,6 +327,7 @@ mod tests {
                 Chunk::from_lanes([0, 0], DVec3::ZERO, 1, count, lanes)
             });
             for (index, column) in (0..count).flat_map(|i| (0..columns(1)).map(move |c| (i, c))) {
+                // Bits and not values, so that -0 and 0 differ and NaN equals itself.
                 let values = [&best, &least].map(|chunk| chunk.value(index, column).to_bits());
                 assert_eq!(values[0], values[1], "{format}: {index}, column {column}");
             }

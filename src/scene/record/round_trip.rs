@@ -29,6 +29,7 @@ pub fn round_trip(scene: &Scene, record: RecordFormat) -> RoundTrip {
             all.coded_bytes += part.len() as u64;
             record
                 .decode(&part, chunk.sh_degree(), end - start, &mut lanes)
+                // `decode` fails only for a wrong size.
                 .expect("a part has the size that its record just gave it");
         }
         all.clamped += clamped.worst().map_or(0, |(_, count)| count);

@@ -37,6 +37,8 @@ impl BoxIndex {
             let first = place * BOX_ITEMS;
             for item in first..(first + BOX_ITEMS).min(self.items) {
                 let cost = cost_m(item);
+                // Compared with the index as the second part, so that of equal costs the first item
+                // counts, in whichever order boxes are opened.
                 let less = |(known, least): (usize, f64)| (cost, item) < (least, known);
                 if best.is_none_or(less) {
                     *best = Some((item, cost));
@@ -47,6 +49,7 @@ impl BoxIndex {
         // skipped.
         search_box(nearest, &mut best);
         for (place, bounds) in self.bounds.iter().enumerate() {
+            // Not strictly less: an equal cost may belong to an item with a smaller index.
             let may_be_less = |(_, least)| bounds.distance_m(point_m) <= least;
             if place != nearest && best.is_none_or(may_be_less) {
                 search_box(place, &mut best);
@@ -63,6 +66,8 @@ mod tests {
 
     /// Twice around a block of 100 m x 60 m, one pose per metre.
     fn drive() -> Vec<DVec3> {
+        // The block's outline is 2 (100 + 60) = 320 m long; the second round repeats every pose, so
+        // that ties occur.
         let at = |way_m: f64| match way_m % 320.0 {
             m if m < 100.0 => DVec3::new(m, 0.0, 0.0),
             m if m < 160.0 => DVec3::new(100.0, m - 100.0, 0.0),
@@ -89,6 +94,7 @@ mod tests {
             let slow = slow.min_by(|(_, a), (_, b)| a.total_cmp(b));
             assert_eq!(boxes.min_cost(place_m, cost_m), slow, "{place_m}");
         }
+        // Fewer than half of all items are looked at, where a linear search looks at all.
         assert!(looked_at.get() < 400 * 640 / 2, "{} of {}", looked_at.get(), 400 * 640);
         assert_eq!(BoxIndex::new(&[]).min_cost(DVec3::ZERO, |_| 0.0), None);
     }

@@ -44,8 +44,11 @@ pub fn associate(
     let mut pairs = Vec::new();
     let mut unmatched = Vec::new();
     for (first, &time_us) in first_us.iter().enumerate() {
+        // The nearest of the nearest must be the time itself: otherwise two times would share a
+        // partner.
         let mutual = nearest(second_us, time_us)
             .filter(|&second| nearest(first_us, second_us[second]) == Some(first))
+            // Unsigned differences: two i64 may be farther apart than i64 reaches.
             .filter(|&second| time_us.abs_diff(second_us[second]) <= tolerance_us.unsigned_abs());
         match mutual {
             Some(second) => {
@@ -72,12 +75,14 @@ impl Route<'_> {
             let name = self.trajectory.name.clone();
             return Err(RouteError::Outside { name, time_us, from_us, to_us });
         }
+        // The first keyframe at or after the time; it exists, because the time is within the drive.
         let after = keyframes.partition_point(|keyframe| keyframe.time_us < time_us);
         let to = &keyframes[after];
         let Some(from) = after.checked_sub(1).map(|before| &keyframes[before]) else {
             return Ok(to.world_from_rig);
         };
         let since_us = |earlier_us: i64, later_us: i64| later_us.abs_diff(earlier_us) as f64;
+        // Keyframe times increase strictly, so that the denominator is not 0.
         let t = since_us(from.time_us, time_us) / since_us(from.time_us, to.time_us);
         Ok(between(from, to, t).world_from_rig)
     }
@@ -86,6 +91,8 @@ impl Route<'_> {
 /// The index of the nearest time; of two equally near ones the earlier.
 fn nearest(times_us: &[i64], time_us: i64) -> Option<usize> {
     let after = times_us.partition_point(|&other_us| other_us < time_us);
+    // Only the neighbours of the insertion place can be nearest. `min_by_key` takes the first of
+    // equal ones: the earlier.
     let candidates = [after.checked_sub(1), (after < times_us.len()).then_some(after)];
     candidates.into_iter().flatten().min_by_key(|&place| times_us[place].abs_diff(time_us))
 }

@@ -112,6 +112,8 @@ impl<'a> Route<'a> {
     pub fn new(trajectory: &'a Trajectory) -> Result<Self, RouteError> {
         trajectory.check()?;
         let mut station_m = 0.0;
+        // A running sum: n keyframes cost n distances, and stations never decrease, because
+        // distances are not negative.
         let steps = trajectory.keyframes.windows(2).map(|pair| {
             station_m += distance_m(&pair[0], &pair[1]);
             station_m
@@ -141,6 +143,8 @@ impl<'a> Route<'a> {
         let Some(before) = after.checked_sub(1) else { return keyframes[0] };
         let from_m = self.stations_m[before];
         let to_m = self.stations_m[after];
+        // Stations of the two differ, unless the station is beyond the end: then the quotient is
+        // above 1 or infinite, and `min` takes the end.
         let t = ((station_m - from_m) / (to_m - from_m)).min(1.0);
         between(&keyframes[before], &keyframes[after], t)
     }
@@ -163,6 +167,7 @@ impl<'a> Route<'a> {
     pub fn chunks(&self) -> Vec<RouteChunk> {
         let number = |s_m: f64| (s_m / ROUTE_CHUNK_LENGTH_M).floor() as u64;
         let mut first = 0;
+        // Stations never decrease, so that keyframes of a chunk are neighbours.
         let runs = self.stations_m.chunk_by(|a, b| number(*a) == number(*b));
         runs.map(|run| {
             let keyframes = first..first + run.len();
@@ -184,6 +189,7 @@ impl<'a> Route<'a> {
         let mut kept: Vec<Keyframe> = Vec::new();
         for keyframe in &self.trajectory.keyframes {
             // 0.1 % less, so that keyframes at exactly this distance are kept in spite of rounding.
+            // Compared with the keyframe that was kept last and not with the one before.
             if kept.last().is_none_or(|last| distance_m(last, keyframe) >= 0.999 * step_m) {
                 kept.push(*keyframe);
             }
@@ -200,6 +206,7 @@ fn between(from: &Keyframe, to: &Keyframe, t: f64) -> Keyframe {
     // i128, since the difference of two i64 times may overflow i64.
     let span_us = (i128::from(to.time_us) - i128::from(from.time_us)) as f64;
     Keyframe {
+        // t span_us is within the two times; only the cast of a huge span can saturate.
         time_us: from.time_us.saturating_add((t * span_us).round() as i64),
         world_from_rig: from.world_from_rig.interpolate(&to.world_from_rig, t),
     }

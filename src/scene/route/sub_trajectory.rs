@@ -42,6 +42,7 @@ pub fn sub_trajectories<'a>(
         let must = "a stride divides a drive into at most 100000 pieces";
         return Err(RouteError::Value { field: "stride_m", value: stride_m, must });
     }
+    // A product and not a running sum, so that rounding does not accumulate over 100,000 pieces.
     let station_m = move |number: usize| number as f64 * stride_m;
     let at = move |number| piece(route, number, [station_m(number), station_m(number) + length_m]);
     Ok((0..count as usize).map(at))
@@ -53,6 +54,7 @@ fn piece(
     stations_m: [f64; 2],
 ) -> Result<SubTrajectory, RouteError> {
     let [from_m, to_m] = stations_m;
+    // Interpolated ends: a piece has exactly the wanted length, wherever the keyframes are.
     let [first, last] = stations_m.map(|station_m| route.at(station_m));
     // Keyframes strictly between the ends in space, and also in time: the two may differ where the
     // vehicle stood still, or where an end was rounded to a microsecond.
@@ -70,6 +72,8 @@ fn piece(
     }
     let name = format!("{}-{}-{number:04}", route.trajectory.name, length_label(to_m - from_m));
     let trajectory = Trajectory { name, keyframes };
+    // Ends that fall on one microsecond make times that do not increase: the check refuses such a
+    // piece.
     trajectory.check()?;
     Ok(SubTrajectory { stations_m, from_us: first.time_us, trajectory })
 }

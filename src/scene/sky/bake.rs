@@ -62,7 +62,11 @@ impl Maps {
             return answer;
         }
         let _baking = self.baking.lock();
+        // From here on this thread is the only one that bakes. Another may have finished while it
+        // waited.
         let simd = Simd::new();
+        // The finer grid of a round is the grid of the next one, so that no network value is
+        // computed twice.
         let mut next: Option<Grid> = None;
         loop {
             let level = match self.known(wanted) {
@@ -77,6 +81,7 @@ impl Maps {
                 let finer = next.insert(Grid::new(simd, network, edge(level + 1)));
                 2.0 * grid.difference(finer) + CubeMap::STEP
             });
+            // A level that is too coarse is recorded with its error and without a map.
             let map = (error <= wanted).then(|| Arc::new(grid.map(error)));
             let mut levels = self.levels();
             match levels.get_mut(level) {
@@ -89,6 +94,7 @@ impl Maps {
     /// The answer if it is known, or else the level to bake next.
     fn known(&self, wanted: f64) -> Result<Result<Arc<CubeMap>, SkyError>, usize> {
         let levels = self.levels();
+        // Coarsest first: the first level that is good enough is the smallest map.
         let found = levels.iter().position(|level| level.error <= wanted);
         let level = found.unwrap_or(levels.len());
         match levels.get(level) {
@@ -113,6 +119,8 @@ impl Maps {
 
 /// Number of values along an edge of the grids of a level.
 fn edge(level: usize) -> usize {
+    // Twice as many cells as the level before, and one node more than cells: nodes of a level are
+    // also nodes of the next.
     ((FIRST_EDGE - 1) << level) + 1
 }
 
@@ -125,6 +133,8 @@ struct Grid {
 impl Grid {
     fn new(level: Simd, network: &InferenceNetwork, edge: usize) -> Self {
         let mut rgb = vec![[0.0; 3]; FACES * edge * edge];
+        // A row is a job and owns its slice, so that no lock is needed; each thread has its own
+        // scratch memory.
         rgb.par_chunks_mut(edge).enumerate().for_each_init(
             || network.scratch(),
             |scratch, (row, to)| {
@@ -133,6 +143,8 @@ impl Grid {
                 for (block, to) in to.chunks_mut(LANES).enumerate() {
                     let mut directions = [[0.0; LANES]; 3];
                     for lane in 0..LANES {
+                        // Lanes beyond the edge repeat the last column; their results are not
+                        // copied.
                         let column = (block * LANES + lane).min(edge - 1);
                         let s = column as f64 / (edge - 1) as f64;
                         let away =
@@ -167,6 +179,8 @@ impl Grid {
             let row = row % finer.edge;
             let coarse =
                 |row: usize| &self.rgb[(face * self.edge + row) * self.edge..][..self.edge];
+            // An even row of the finer grid is a row of the coarser one, and an odd one lies
+            // between two: then `above` and `below` differ.
             let above = coarse(row / 2);
             let below = coarse(row.div_ceil(2));
             let mut worst: f32 = 0.0;
@@ -174,6 +188,8 @@ impl Grid {
                 let left = column / 2;
                 let right = column.div_ceil(2);
                 for c in 0..3 {
+                    // On a node all four are the same value, on the middle of an edge two and two,
+                    // in the centre of a cell four: the mean is the bilinear patch in each case.
                     let patch = above[left][c] + above[right][c] + below[left][c] + below[right][c];
                     worst = worst.max((0.25 * patch - value[c]).abs());
                 }

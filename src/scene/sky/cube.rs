@@ -61,6 +61,7 @@ impl CubeMap {
         // A look-up within one face, whose outermost pixels extend to its edges.
         let clamped = |(face, [s, t]): (usize, [f64; 2])| {
             let last = side_px - 1;
+            // From [0, 1] to pixel centres, which are at +0.5.
             let at = |x: f64| (x * side_px as f64 - 0.5).clamp(0.0, last as f64);
             let u = at(s);
             let v = at(t);
@@ -73,7 +74,9 @@ impl CubeMap {
             let upper = pixel(face, column, row).lerp(pixel(face, right, row), fu);
             upper.lerp(pixel(face, column, below).lerp(pixel(face, right, below), fu), fv)
         };
+        // A border of one texel on each side.
         let edge = side_px + 2;
+        // Texel k is pixel k - 1, whose centre is at (k - 1 + 0.5) / side.
         let at = |k: usize| (k as f64 - 0.5) / side_px as f64;
         let mut texels = Vec::with_capacity(FACES * edge * edge);
         for face in 0..FACES {
@@ -83,6 +86,8 @@ impl CubeMap {
                     texels.push(packed(if within {
                         pixel(face, column - 1, row - 1)
                     } else {
+                        // A texel of the border is beyond the edge of its face: its direction
+                        // belongs to a neighbour.
                         clamped(cube_face(Self::direction(face, [at(column), at(row)])))
                     }));
                 }
@@ -110,6 +115,8 @@ impl CubeMap {
         let (face, [s, t]) = cube_face(direction);
         let u = self.scale * s + self.offset;
         let v = self.scale * t + self.offset;
+        // The last cell begins one before the last node, so that `column + 1` exists, also for s =
+        // 1.
         let last = self.edge - 2;
         let column = (u as usize).min(last);
         let row = (v as usize).min(last);
@@ -126,6 +133,7 @@ impl CubeMap {
     /// The direction, not of unit length, of the point `[s, t]` of a face, from its left and top
     /// edges. Outside of [0, 1] the point is on the plane of the face.
     pub fn direction(face: usize, [s, t]: [f64; 2]) -> DVec3 {
+        // From [0, 1] to [-1, 1]: a face is at distance 1 and has a half width of 1.
         let right = 2.0 * s - 1.0;
         let down = 2.0 * t - 1.0;
         match face {
@@ -166,6 +174,7 @@ impl CubeMap {
 }
 
 fn packed(rgb: DVec3) -> [u32; 2] {
+    // Clamped, because a network's rounding may leave [0, 1]; 65,535 is the largest of 16 bits.
     let [r, g, b] = rgb.to_array().map(|c| (c.clamp(0.0, 1.0) * 65_535.0).round() as u32);
     [r | g << 16, b]
 }
@@ -175,6 +184,8 @@ fn packed(rgb: DVec3) -> [u32; 2] {
 pub(super) fn cube_face(direction: DVec3) -> (usize, [f64; 2]) {
     let DVec3 { x, y, z } = direction;
     let [ax, ay, az] = direction.abs().to_array();
+    // Ties go to x, then y: the edge of a cube belongs to one face. `ahead` is not 0 for a
+    // direction of any length.
     let (face, right, down, ahead) = if ax >= ay && ax >= az {
         if x >= 0.0 { (0, -z, -y, ax) } else { (1, z, -y, ax) }
     } else if ay >= az {
@@ -237,6 +248,7 @@ mod tests {
         let mut worst: f64 = 0.0;
         for i in 0..1000 {
             let along = f64::from(i) / 500.0 - 1.0;
+            // Two directions on both sides of an edge, 1e-9 apart, must have nearly one colour.
             for (a, b) in [
                 (DVec3::new(1.0, along, 1.0 - 1e-9), DVec3::new(1.0 - 1e-9, along, 1.0)),
                 (DVec3::new(along, -1.0, 1.0 - 1e-9), DVec3::new(along, -1.0 + 1e-9, 1.0)),

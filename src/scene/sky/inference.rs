@@ -58,6 +58,8 @@ impl InferenceNetwork {
         };
         let joined_inputs = if network.skip() { width + encoded } else { width };
         let appearance = network.appearance();
+        // The appearance is the same for all directions, so that its products are a constant: in
+        // f64, because the sum replaces many f32 additions.
         let folded = |layer: &super::Layer, output: usize, from: usize| {
             let row = &layer.weight[output * layer.inputs..][..layer.inputs];
             let products = row.iter().skip(from).zip(appearance);
@@ -120,6 +122,7 @@ impl InferenceNetwork {
             for output in 0..outputs {
                 let group = output / GROUP;
                 let k = output % GROUP;
+                // A row is an output: the bias and then its weights, four to a vector.
                 rows.push([layer.bias[group][k], 0.0, 0.0, 0.0]);
                 let weights = &layer.weight[group * layer.inputs..][..layer.inputs];
                 rows.extend(weights.chunks(4).map(|four| {
@@ -155,6 +158,8 @@ impl InferenceNetwork {
         scratch: &mut Scratch,
     ) -> [[f32; LANES]; 3] {
         let Scratch { joined, hidden, logits } = scratch;
+        // The first layer writes in front of the encoded direction, so that the second one reads
+        // both as one slice without a copy.
         let (first, input) = joined.split_at_mut(self.width);
         self.encode(simd, direction, input);
         let [one, two, three] = &self.layers;
@@ -165,6 +170,8 @@ impl InferenceNetwork {
         let mut rgb = [[0.0; LANES]; 3];
         for (rgb, logits) in rgb.iter_mut().zip(&*logits) {
             for (value, logit) in rgb.iter_mut().zip(&logits.0) {
+                // The logistic function of three values only; the exponential is not worth a vector
+                // form.
                 *value = 1.0 / (1.0 + (-logit).exp());
             }
         }
@@ -180,6 +187,7 @@ impl InferenceNetwork {
             }
             next = 3;
         }
+        // First all sines, then all cosines, as the network was trained.
         for quarter in [0.0, 0.5] {
             let mut scale = 1.0;
             for _ in 0..self.octaves {
@@ -203,6 +211,7 @@ impl Dense {
         source: impl Fn(usize) -> Option<usize>,
         bias: impl Fn(usize) -> f32,
     ) -> Self {
+        // Padded outputs have weights and biases of 0, so that their value is 0 after ReLU.
         let groups = layer.outputs.div_ceil(GROUP);
         let of = |group: usize, value: &dyn Fn(usize) -> f32| -> [f32; GROUP] {
             std::array::from_fn(|k| {
@@ -227,10 +236,12 @@ impl Dense {
         let zero = f32x16::splat(simd, 0.0);
         let groups = self.weight.chunks_exact(self.inputs).zip(&self.bias);
         for ((weights, bias), to) in groups.zip(to.chunks_exact_mut(GROUP)) {
+            // Sixteen directions times eight outputs: 8 vectors of 16 sums stay in registers.
             let mut sums = [zero; GROUP];
             for k in 0..GROUP {
                 sums[k] = f32x16::splat(simd, bias[k]);
             }
+            // One load of an input serves eight outputs.
             for (weight, value) in weights.iter().zip(from) {
                 let value = f32x16::load_array_ref(simd, &value.0);
                 for k in 0..GROUP {
@@ -257,9 +268,12 @@ fn sine<S: Simd>(simd: S, x: f32x16<S>, quarter: f32) -> f32x16<S> {
     let splat = |value: f32| f32x16::splat(simd, value);
     let whole = x.mul_add(splat(std::f32::consts::FRAC_1_PI), splat(0.5 - quarter)).floor();
     let turns = -(whole + splat(quarter));
+    // π = 3.140625 + 9.67741e-4 - 8.742278e-8, the largest part first. The products of the first
+    // two are exact.
     let r = turns.mul_add(splat(3.140_625), x);
     let r = turns.mul_add(splat(9.677_41e-4), r);
     let r = turns.mul_add(splat(-8.742_278e-8), r);
+    // Odd polynomial r + r³ P(r²), evaluated from the highest power.
     let square = r * r;
     let fit = square
         .mul_add(splat(2.600_054_6e-6), splat(-1.980_661_5e-4))
@@ -282,6 +296,7 @@ mod tests {
 
     #[test]
     fn sine_and_cosine_are_accurate() {
+        // From -100 to 100, beyond the argument of 64 that seven octaves reach.
         for i in -64_000..=64_000 {
             let x = i as f32 / 640.0;
             for (quarter, truth) in [(0.0, f64::from(x).sin()), (0.5, f64::from(x).cos())] {

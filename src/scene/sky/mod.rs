@@ -171,6 +171,7 @@ impl Sky {
     /// [`SkyError::Coarse`] if no map up to [`CubeMap::MAX_EDGE`] has a small enough error.
     pub fn drawable(&self, sky_error: f64) -> Result<DrawableSky, SkyError> {
         match &self.model {
+            // A cube map of images is exact by definition.
             SkyModel::Cube(map) => Ok(DrawableSky::CubeMap(map.clone())),
             SkyModel::Network(_, folded) if sky_error == 0.0 => {
                 Ok(DrawableSky::Network(folded.clone()))

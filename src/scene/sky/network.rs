@@ -70,6 +70,8 @@ impl Network {
         if !(1..=Self::MAX_WIDTH).contains(&width) {
             return shape(0, format!("a layer is from 1 to {} wide", Self::MAX_WIDTH));
         }
+        // What is left of the inputs without the appearance; saturating, because the numbers come
+        // from a file.
         let encoded = inputs.saturating_sub(appearance.len());
         // 6 inputs per octave (sine and cosine of x, y, z), and 3 more for the direction itself.
         let octaves = encoded / 6;
@@ -84,6 +86,7 @@ impl Network {
             );
             return shape(0, must);
         }
+        // The second layer's shape says whether there is a skip connection.
         let skip = layers[1].inputs == width + inputs;
         if layers[1].outputs != width || !(skip || layers[1].inputs == width) {
             return shape(1, format!("it must be [{width}, {}]", width + inputs));
@@ -91,6 +94,7 @@ impl Network {
         if [layers[2].outputs, layers[2].inputs] != [3, width] {
             return shape(2, format!("it must be [3, {width}]"));
         }
+        // Shapes are consistent now; lengths and values are left.
         for (layer, [weight, bias]) in layers.iter().zip(TENSORS) {
             let Layer { outputs, inputs, .. } = *layer;
             for (tensor, values, shape) in
@@ -109,6 +113,7 @@ impl Network {
 
     /// The colour in (0, 1) along a unit direction.
     pub fn rgb(&self, direction: DVec3) -> DVec3 {
+        // Inputs in the order that the module comment states.
         let mut input = Vec::with_capacity(self.layers[0].inputs);
         if self.identity {
             input.extend(direction.to_array());
@@ -118,6 +123,7 @@ impl Network {
         input.extend(octaves().flat_map(|scaled| scaled.to_array().map(f64::cos)));
         input.extend(self.appearance.iter().map(|&number| f64::from(number)));
 
+        // The last layer has no ReLU: its outputs are logits of colours, which may be negative.
         let relu = |values: Vec<f64>| -> Vec<f64> {
             values.into_iter().map(|value| value.max(0.0)).collect()
         };

@@ -75,10 +75,13 @@ pub fn comfort_signals(ego: &[EgoSample], step_s: f64, center_x_m: f64) -> Optio
     let lateral = collect(&|ego| ego.acceleration_mps2.y);
     let length = collect(&|ego| ego.acceleration_mps2.length());
 
+    // The published windows are 8 and 15; shorter drives take all samples.
     let smooth = |values: &[f64]| rounded(savgol(values, n.min(8), 2, 0, 1.0));
     let slope = |values: &[f64]| rounded(savgol(values, n.min(15), 2, 1, step_s));
+    // Headings must not jump at ±π before they are differentiated.
     let yaw = unwrapped(ego.iter().map(|ego| ego.yaw_rad));
     let of_yaw = |order, derivative| rounded(savgol(&yaw, 5, order, derivative, step_s));
+    // Jerks are slopes of signals that are smoothed already.
     let acceleration_mps2 = smooth(&length);
     let longitudinal_mps2 = smooth(&longitudinal);
     Some(ComfortSignals {
@@ -122,6 +125,7 @@ pub fn extended_comfort(one: &ComfortSignals, two: &ComfortSignals) -> ExtendedC
         rms(&one.yaw_rate_radps, &two.yaw_rate_radps),
         rms(&one.yaw_acceleration_parabola_radps2, &two.yaw_acceleration_parabola_radps2),
     ];
+    // Closed, unlike the bounds of history comfort.
     let is_within = rms.iter().zip(bounds::EXTENDED).all(|(&rms, most)| rms <= most);
     ExtendedComfort { rms, is_within }
 }

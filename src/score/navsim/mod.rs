@@ -113,6 +113,7 @@ pub fn epdms(agent: &Submetrics, human: Option<&Submetrics>) -> f64 {
         * filtered(agent.dac, human.dac)
         * filtered(agent.ddc, human.ddc)
         * filtered(agent.tlc, human.tlc);
+    // Weights 5 + 5 + 2 + 2 + 2 = 16.
     let weighted = 5.0 * filtered(agent.ep, human.ep)
         + 5.0 * filtered(agent.ttc, human.ttc)
         + 2.0 * filtered(agent.lk, human.lk)
@@ -142,6 +143,7 @@ pub fn pdm(record: &DriveRecord) -> Score {
     let missing = format!("needs {map}{tracks}the planner PDM-Closed and successive plans");
     let comfort = history_comfort(record).map(|comfort| f64::from(u8::from(comfort)));
     let rules = rules_as_driven(record);
+    // `None` without a whole window: the part has no value, not 1.
     let least = |value: &dyn Fn(&Rules) -> f64| rules.iter().map(value).reduce(f64::min);
     let parts = [
         ("no_at_fault_collisions", least(&|rules| rules.no_at_fault_collisions)),
@@ -165,6 +167,8 @@ fn rules_as_driven(record: &DriveRecord) -> Vec<Rules> {
     if !record.is_driven || record.dt_us != 100_000 {
         return Vec::new();
     }
+    // Windows share their end state: 40 intervals of 0.1 s each. A rest of less than 4 s is left
+    // out.
     let firsts = (0..record.ego.len()).step_by(STATES - 1);
     let windows = firsts.filter_map(|first| Some((first, record.ego.get(first..first + STATES)?)));
     windows
@@ -175,6 +179,7 @@ fn rules_as_driven(record: &DriveRecord) -> Vec<Rules> {
                 samples: track.samples.iter().copied().skip(first).take(STATES).collect(),
             };
             let tracks: Vec<Track> = tracks.iter().map(of_window).collect();
+            // Progress is not used, and a reference of 0 keeps it from being measured.
             rules(&Scene { shape, ego, tracks: &tracks, map, reference_progress_m: 0.0 })
         })
         .collect()

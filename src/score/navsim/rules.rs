@@ -37,6 +37,7 @@ pub fn rules(scene: &Scene<'_>) -> Rules {
     let direction = direction(scene, &boxes);
     let red = boxes.iter().enumerate().any(|(sample, ego)| scene.map.touches_red(ego, sample));
     let lights = if red { 0.0 } else { 1.0 };
+    // Progress counts only as far as all rules hold.
     let gate = collisions.score * drivable * direction * lights;
     Rules {
         no_at_fault_collisions: collisions.score,
@@ -79,6 +80,7 @@ fn collisions(scene: &Scene<'_>, boxes: &[Footprint], lanes: &[LanePosition]) ->
                 other_velocity_mps: first_velocity_mps(track),
                 other_is_agent: is_agent(track.class),
             });
+            // The first kind stays, also if later contacts of the same track differ.
             found.kinds[k].get_or_insert(kind);
             if kind.is_at_fault_in(lanes[step]) {
                 found.score = found.score.min(if is_agent(track.class) { 0.0 } else { 0.5 });
@@ -104,7 +106,9 @@ fn direction(scene: &Scene<'_>, boxes: &[Footprint]) -> f64 {
     let against_m: Vec<f64> = (0..boxes.len())
         .map(|i| if scene.map.is_off_route(boxes[i].center_m) { steps_m(i) } else { 0.0 })
         .collect();
+    // `against_m` has the distances that were driven off the route, state by state.
     let most_m = (0..against_m.len())
+        // A window of 11 increments that ends at i; shorter at the beginning.
         .map(|i| against_m[(i + 1).saturating_sub(DIRECTION_WINDOW)..=i].iter().sum())
         .fold(0.0, f64::max);
     let [half_m, all_m] = DIRECTION_LIMITS_M;
@@ -120,6 +124,8 @@ fn direction(scene: &Scene<'_>, boxes: &[Footprint]) -> f64 {
 fn progress(scene: &Scene<'_>, boxes: &[Footprint], gate: f64) -> f64 {
     let station_m = |ego: &Footprint| scene.map.centerline.project(ego.center_m).station_m;
     let way_m = (station_m(&boxes[boxes.len() - 1]) - station_m(&boxes[0])).max(0.0);
+    // Without rules broken, the ego's own way may exceed the reference's, and the quotient is at
+    // most 1.
     let longest_m = scene.reference_progress_m.max(way_m * gate);
     if longest_m > SHORT_REFERENCE_M { (way_m / longest_m).clamp(0.0, 1.0) } else { 1.0 }
 }
@@ -129,12 +135,14 @@ fn progress(scene: &Scene<'_>, boxes: &[Footprint], gate: f64) -> f64 {
 fn time_to_collision(scene: &Scene<'_>, lanes: &[LanePosition]) -> Option<usize> {
     let mut first = None;
     let mut ignored = vec![false; scene.tracks.len()];
+    // States whose farthest look-ahead is still within the 4 s: 41 - 9 = 32.
     let last = scene.ego.len() - AHEAD[AHEAD.len() - 1];
     for (step, ego) in scene.ego.iter().enumerate().take(last) {
         let speed_mps = ego.speed_mps();
         if speed_mps < TTC_STANDING_MPS {
             continue;
         }
+        // Near times first, so that the nearest contact decides whether a track is ignored.
         for ahead in AHEAD {
             let way_m = speed_mps * ahead as f64 * STEP_S * DVec2::from_angle(ego.yaw_rad);
             let moved = EgoSample { origin_m: ego.origin_m + way_m, ..*ego };

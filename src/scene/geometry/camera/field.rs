@@ -24,10 +24,14 @@ impl FieldMask {
             let at_px = DVec2::new(f64::from(column) + 0.5, f64::from(row) + 0.5);
             camera.unproject(at_px).is_some()
         };
+        // The field of a lens is convex enough that it covers the image if it covers the border:
+        // 132 samples instead of all pixels.
         if camera.lens == Lens::Pinhole || border(camera).all(|[column, row]| sees(column, row)) {
             return None;
         }
         let middle = camera.pinhole.cx.clamp(0.0, f64::from(camera.width_px - 1)) as u32;
+        // A row needs one column within the field as a start; from there bisection finds both edges
+        // in 14 steps each, since a side has at most 2^14 pixels.
         let columns = (0..camera.height_px).map(|row| {
             // Find any column of the row in the field: the one at the axis, or one of 64 samples.
             let samples = (0..64).map(|k| (u64::from(camera.width_px) * k / 64) as u32);
@@ -84,6 +88,8 @@ fn edge(end: u32, seen: u32, sees: impl Fn(u32) -> bool) -> u32 {
     if sees(end) {
         return end;
     }
+    // `out` is outside of the field, `within` inside, until they are neighbours. `end` may be on
+    // either side of `seen`.
     let mut out = end;
     let mut within = seen;
     while out.abs_diff(within) > 1 {
@@ -147,6 +153,7 @@ impl FieldCone {
                 camera.project_extrapolated(DVec3::new(x * sin, y * sin, cos)) - axis_px
             })
         };
+        // If no ring covers the image, the whole continuation counts as image.
         let mut image_rad = WIDEST_RAD;
         let mut least_px_per_rad = f64::INFINITY;
         // The largest scale up to each step.
@@ -159,8 +166,11 @@ impl FieldCone {
             let mut most: f64 = most_px_per_rad[step as usize - 1];
             for (k, (at, inner)) in here.iter().zip(&before).enumerate() {
                 let beside = here[(k + 1) % here.len()];
+                // Around the axis and away from it: the larger of both is a bound of the scale, up
+                // to the margin.
                 let across = at.distance(beside) / across_rad;
                 most = most.max(at.distance(*inner) / step_rad).max(across);
+                // Only beyond the image: culling uses this bound for Gaussians outside of it.
                 if covered {
                     let outwards = (at.length() - inner.length()) / step_rad;
                     least_px_per_rad = least_px_per_rad.min(outwards);
@@ -176,9 +186,11 @@ impl FieldCone {
         let scales = std::array::from_fn(|k| {
             let wanted_rad = Self::WIDER_RAD.get(k).map_or(WIDEST_RAD, |wider| image_rad + wider);
             let rad = wanted_rad.min(WIDEST_RAD);
+            // Rounded up, so that the sampled cone contains the wanted one.
             let step = ((rad / step_rad).ceil() as usize).min(Self::STEPS as usize);
             ScaleWithin { rad, most_px_per_rad: 1.2 * most_px_per_rad[step] }
         });
+        // With no step beyond the image there is no bound: 0 culls nothing.
         let least_px_per_rad =
             if least_px_per_rad.is_finite() { (0.8 * least_px_per_rad).max(0.0) } else { 0.0 };
         Self { image_rad, least_px_per_rad, scales }

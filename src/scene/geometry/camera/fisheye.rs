@@ -24,6 +24,8 @@ impl Fisheye {
         for (k, to) in k.into_iter().zip([3, 5, 7, 9]) {
             coefficients[to] = k;
         }
+        // The polynomial has only odd powers, so that it continues smoothly through the axis.
+        // Coefficient 1 is 1: r is in focal lengths.
         let radius = MonotonePolynomial::new(coefficients, max_angle_rad.unwrap_or(WIDEST_RAD));
         Self { k, max_angle_rad, radius }
     }
@@ -73,6 +75,8 @@ impl Fisheye {
 #[inline(always)]
 pub(super) fn radial(direction: DVec3, r: impl Fn(f64) -> f64, central: f64) -> DVec2 {
     let off_axis = direction.truncate().length();
+    // Nearer to the axis than 1e-12 the azimuth is rounding noise. The linear term is exact there,
+    // since the next one is of third order.
     if off_axis < 1e-12 * direction.z {
         return direction.truncate() * (central / direction.z);
     }
@@ -84,6 +88,7 @@ pub(super) fn radial(direction: DVec3, r: impl Fn(f64) -> f64, central: f64) -> 
 /// Gaussian across that point stays continuous.
 #[inline(always)]
 pub(super) fn azimuth(direction: DVec3) -> DVec2 {
+    // In front of the camera the floor is only a guard against 0/0.
     let least = (-1e-3 * direction.z).max(1e-300);
     direction.truncate() / direction.truncate().length().max(least)
 }

@@ -49,6 +49,8 @@ impl FTheta {
         let rising = match reference {
             FThetaReference::AngleToPixel => MonotonePolynomial::new(coefficients, max_angle_rad),
             FThetaReference::PixelToAngle => {
+                // The end is given as an angle, and this polynomial needs it in pixels: invert on
+                // the range that rises, and use less if it ends before the angle.
                 let whole = MonotonePolynomial::new(coefficients, Self::MOST_PX);
                 MonotonePolynomial::new(coefficients, whole.invert(max_angle_rad).min(whole.end()))
             }
@@ -80,6 +82,8 @@ impl FTheta {
     pub fn limit_rad(&self) -> f64 {
         match self.reference {
             FThetaReference::AngleToPixel => self.rising.end(),
+            // The range of the polynomial is in pixels; its value at the end is the angle. At an
+            // end of 0 the slope is meaningless.
             FThetaReference::PixelToAngle if self.rising.end() > 0.0 => {
                 self.rising.at(self.rising.end())
             }
@@ -123,10 +127,14 @@ impl FTheta {
 
     /// The lens of an image that is `scale.x` times as wide and `scale.y` times as high.
     pub(super) fn scaled(&self, scale: DVec2) -> Self {
+        // Scaling multiplies the matrix by diag(sx, sy). The last entry must stay 1, so that sy
+        // goes into the polynomial: c and d become c sx/sy and d sx/sy, and e stays.
         let [c, d, e] = self.linear_cde;
         let wider = scale.x / scale.y;
         let mut polynomial = self.polynomial;
         for (power, coefficient) in polynomial.iter_mut().enumerate() {
+            // Pixels become sy times as many: an angle polynomial is multiplied by sy; one of
+            // pixels takes x / sy, that is sy^-power for each coefficient.
             *coefficient *= match self.reference {
                 FThetaReference::AngleToPixel => scale.y,
                 FThetaReference::PixelToAngle => scale.y.powi(-(power as i32)),
@@ -144,6 +152,7 @@ impl FTheta {
             let field = "lens.polynomial[0]";
             return Err(CameraError::Intrinsic { field, value: self.polynomial[0], must });
         }
+        // A determinant near 0 makes the image a line; a negative one mirrors it.
         let upright = self.linear().determinant();
         let usable = self.linear_cde[0] > 0.0 && upright > 1e-3;
         if !usable {

@@ -85,7 +85,10 @@ impl Intrinsics {
     /// # Errors
     /// A focal length is missing, or the number of a windshield's coefficients fits no polynomial.
     pub fn camera(&self) -> Result<Camera, CameraError> {
+        // No lens in the file is a pinhole, the default of `Lens`.
         let lens = self.lens.as_ref().map(LensFields::lens).unwrap_or_default();
+        // Only this model knows its focal lengths. Given ones are kept here, and `Camera::check`
+        // compares them.
         let own = match &lens {
             Lens::FTheta(lens) => Some(lens.focal_px()),
             _ => None,

@@ -187,6 +187,7 @@ impl Camera {
     pub fn check(&self) -> Result<(), CameraError> {
         sides(self.width_px.into(), self.height_px.into())?;
         self.pinhole.check()?;
+        // The lens first: below, `unproject` needs a usable one.
         match &self.lens {
             Lens::Pinhole => {}
             Lens::OpenCv(lens) => lens.check()?,
@@ -197,6 +198,8 @@ impl Camera {
             }
         }
         if let Some(windshield) = &self.windshield {
+            // Only rays that reach the image count, so that a polynomial may be useless beyond the
+            // corners.
             windshield.check(self.corner_rad())?;
         }
         for value in self.native_size_px.map_or([1.0; 2], |size| size.to_array()) {
@@ -240,12 +243,15 @@ impl Camera {
         let inside = self.inside(point_m);
         let off_axis = inside.truncate().length();
         let seen = match &self.lens {
+            // A pinhole has no limit but its own plane.
             Lens::Pinhole if inside.z > 0.0 => return Some(self.pinhole.project(inside)),
             Lens::Pinhole => false,
+            // Slopes without a division: off <= limit z, for z above 0.
             Lens::OpenCv(lens) => inside.z > 0.0 && off_axis <= lens.limit_slope() * inside.z,
             Lens::Fisheye(lens) => off_axis.atan2(inside.z) <= lens.limit_rad(),
             Lens::FTheta(lens) => off_axis.atan2(inside.z) <= lens.limit_rad(),
         };
+        // Within the field nothing is extrapolated; the largest slope turns that branch off.
         seen.then(|| self.land(inside, OpenCv::MOST_SLOPE))
     }
 
@@ -270,6 +276,8 @@ impl Camera {
         let center_px = DVec2::new(cx, cy);
         let most_px = center_px.abs().max((self.size_px() - center_px).abs());
         let corner = (most_px / DVec2::new(fx, fy)).length();
+        // A lens may shrink slopes to 0.8 of the ray's: the corner's ray is at most 1 / 0.8 as
+        // steep as its pixel.
         (corner / OpenCv::LEAST_FACTOR).clamp(4.0, OpenCv::MOST_SLOPE)
     }
 
@@ -283,8 +291,10 @@ impl Camera {
             Lens::Pinhole => Some(plane.extend(1.0).normalize()),
             Lens::OpenCv(lens) => lens.direction(plane),
             Lens::Fisheye(lens) => lens.direction(plane),
+            // An f-theta lens has its focal length in the polynomial, so that it takes pixels.
             Lens::FTheta(lens) => lens.direction(offset_px),
         };
+        // Outwards, rays pass the lens before the windshield: the inverse order of `project`.
         inside.map(|inside| match &self.windshield {
             None => inside,
             Some(windshield) => windshield.outside(inside),
@@ -337,12 +347,16 @@ impl Camera {
         let Pinhole { fx, fy, cx, cy } = self.pinhole;
         let mut pinhole =
             Pinhole { fx: fx * scale.x, fy: fy * scale.y, cx: cx * scale.x, cy: cy * scale.y };
+        // Lenses of slopes and angles work in focal lengths and do not change with the size; only
+        // f-theta works in pixels.
         let mut lens = self.lens;
         if let Lens::FTheta(ftheta) = &mut lens {
             *ftheta = ftheta.scaled(scale);
             (pinhole.fx, pinhole.fy) = ftheta.focal_px().into();
         }
         let mut scaled = Self { width_px, height_px, pinhole, lens, ..*self };
+        // The first scaling records the native size, later ones keep it. An image that is back at
+        // its native size has none.
         let native_px = self.native_size_px.unwrap_or(self.size_px());
         scaled.native_size_px = (native_px != scaled.size_px()).then_some(native_px);
         scaled.check()?;
@@ -359,6 +373,8 @@ impl Camera {
         let [width_px, height_px] = sides(width, height)?;
         let of_width = self.width_px;
         let of_height = self.height_px;
+        // Compared after the subtraction, with `min` against an underflow: `left + width` of
+        // untrusted numbers could overflow.
         let within = left <= u64::from(of_width - width_px.min(of_width))
             && top <= u64::from(of_height - height_px.min(of_height))
             && width_px <= of_width
@@ -366,10 +382,13 @@ impl Camera {
         if !within {
             return Err(CameraError::Crop { left, top, width, height, of_width, of_height });
         }
+        // Cutting only moves the principal point: the lens and its field stay what they are.
         let mut cropped = Self { width_px, height_px, ..*self };
         cropped.pinhole.cx -= left as f64;
         cropped.pinhole.cy -= top as f64;
         cropped.native_size_px =
+            // A part has the same scale as the whole: its native size is the same part of the
+            // native image.
             self.native_size_px.map(|native_px| native_px * (cropped.size_px() / self.size_px()));
         cropped.check()?;
         Ok(cropped)
@@ -402,6 +421,7 @@ impl Camera {
     /// The largest angle off the axis of the image's corners behind the windshield, in radians.
     /// Corners outside of the lens' field count with the limit of the field.
     pub fn corner_rad(&self) -> f64 {
+        // Corners behind the windshield: the one that is checked may not be invertible yet.
         let bare = Self { windshield: None, ..*self };
         let corners = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]];
         let angles_rad = corners.map(|corner| {
@@ -416,6 +436,7 @@ impl Camera {
     fn check_focal_px(&self, lens: &FTheta) -> Result<(), CameraError> {
         let DVec2 { x, y } = lens.focal_px();
         for (field, value, derived) in [("fx", self.pinhole.fx, x), ("fy", self.pinhole.fy, y)] {
+            // Relative, because the values may have been written with few digits.
             let agrees = (value - derived).abs() <= 1e-6 * derived;
             if !agrees {
                 let must =

@@ -24,6 +24,8 @@ impl MonotonePolynomial {
     pub(super) fn new(coefficients: [f64; TERMS], most: f64) -> Self {
         let mut rising = Self { coefficients, end: 0.0 };
         let central = rising.slope(0.0);
+        // All three parts are false for NaN. The slope is also compared with 0, because a falling
+        // polynomial has a negative bound.
         let rises = |x: f64| {
             let slope = rising.slope(x);
             slope.is_finite() && slope > 0.0 && slope >= Self::LEAST_SLOPE * central
@@ -38,6 +40,7 @@ impl MonotonePolynomial {
     /// The value at `x` (Horner's scheme); beyond the end the tangent at the end.
     #[inline(always)]
     pub fn at(&self, x: f64) -> f64 {
+        // Beyond the end, the value at the end and its tangent: continuous with its slope.
         let within = x.min(self.end);
         let value = self.coefficients.iter().rev().fold(0.0, |sum, c| sum * within + c);
         if x > self.end { value + self.slope(self.end) * (x - self.end) } else { value }
@@ -46,6 +49,7 @@ impl MonotonePolynomial {
     /// The derivative at `x`, for `x` within the range.
     #[inline(always)]
     pub fn slope(&self, x: f64) -> f64 {
+        // Horner's scheme of Σ k c_k x^(k-1).
         (1..TERMS).rev().fold(0.0, |sum, k| sum * x + k as f64 * self.coefficients[k])
     }
 
@@ -57,6 +61,7 @@ impl MonotonePolynomial {
         if beyond {
             return self.end + (y - top) / self.slope(self.end);
         }
+        // A linear start. The safeguard of `invert_monotone` corrects it where it is far off.
         let first = (y / self.slope(0.0)).clamp(0.0, self.end);
         invert_monotone(y, first, self.end, 1e-15, |x| [self.at(x), self.slope(x)])
     }
@@ -84,6 +89,7 @@ pub(super) fn invert_monotone(
     tolerance: f64,
     at: impl Fn(f64) -> [f64; 2],
 ) -> f64 {
+    // The root is in low..=high in every round.
     let mut low = 0.0;
     let mut high = end;
     let mut x = first;
@@ -95,6 +101,8 @@ pub(super) fn invert_monotone(
         } else {
             low = x;
         }
+        // A slope of 0 or NaN makes `next` infinite or NaN, which fails the comparison: the
+        // midpoint takes over.
         let next = x - off / slope;
         let next = if next > low && next < high { next } else { 0.5 * (low + high) };
         let done = (next - x).abs() <= tolerance * end;
@@ -110,9 +118,11 @@ pub(super) fn invert_monotone(
 /// first of `steps` steps that violates it, refined by bisection.
 pub(super) fn largest_valid(holds: impl Fn(f64) -> bool, most: f64, steps: u32) -> f64 {
     let at = |step: u32| most * f64::from(step) / f64::from(steps);
+    // Coarse steps first: bisection alone would find any violation and not the first one.
     let Some(first_not) = (1..=steps).find(|&step| !holds(at(step))) else { return most };
     let mut low = at(first_not - 1);
     let mut high = at(first_not);
+    // 60 halvings of a step exhaust the 53 bits of an f64.
     for _ in 0..60 {
         let middle = 0.5 * (low + high);
         if holds(middle) {

@@ -42,6 +42,8 @@ impl OpenCv {
     /// A lens with coefficients k1 to k6, p1 and p2, s1 to s4.
     pub fn new(k: [f64; 6], p: [f64; 2], s: [f64; 4]) -> Self {
         let mut lens = Self { k, p, s, limit_slope: 0.0 };
+        // The derivative in a direction is between the radial bounds, less and plus the skew. NaN
+        // at a pole fails every comparison.
         let usable = |slope: f64| {
             let [across, along] = lens.stretch(slope);
             let [tangential, prism] = lens.skew(slope);
@@ -94,6 +96,8 @@ impl OpenCv {
     /// The coefficients that determine where the field ends, for error messages.
     pub(super) fn at_fault(&self) -> &'static str {
         let [tangential, prism] = self.skew(self.limit_slope);
+        // Without skew the field would be larger: then the skew is at fault, and the larger part of
+        // it is named.
         let alone = Self::new(self.k, [0.0; 2], [0.0; 4]).limit_slope;
         if alone <= self.limit_slope {
             "lens"
@@ -116,6 +120,8 @@ impl OpenCv {
         }
         let azimuth = azimuth(direction);
         let edge = azimuth * end;
+        // Angle beyond the end; the slope changes by 1 + tan² per radian there, and the Jacobian
+        // takes slopes to the plane.
         let beyond_rad = off_axis.atan2(direction.z) - end.atan();
         let slope_per_rad = 1.0 + end * end;
         self.distort(edge) + self.jacobian(edge) * azimuth * (slope_per_rad * beyond_rad)
@@ -126,12 +132,18 @@ impl OpenCv {
         let most = self.limit_slope;
         // Damped Newton's method. It starts at the inverse of only the radial part, and halves each
         // step until it reduces the residual.
+        // The radial part is nearly the whole distortion, so that Newton's method starts close to
+        // the root.
         let mut slope = plane.normalize_or_zero() * self.radial_slope(plane.length());
         let mut off = self.distort(slope) - plane;
+        // Newton's method doubles the digits in each round; 32 rounds are for starts near the fold,
+        // where steps are halved.
         for _ in 0..32 {
             let mut step = self.jacobian(slope).inverse() * off;
             let mut halved = 0;
             let done = loop {
+                // A little beyond the limit, so that a root at the limit is reached from both
+                // sides, but not into the fold.
                 let next = (slope - step).clamp_length_max(1.01 * most);
                 let next_off = self.distort(next) - plane;
                 if next_off.length_squared() < off.length_squared() {
@@ -151,6 +163,8 @@ impl OpenCv {
                 break;
             }
         }
+        // Three tests: a root was found, it is not the mirrored one behind the fold, and it is
+        // within the field.
         let lands = off.length() <= 1e-9 * (1.0 + plane.length());
         let upright = self.jacobian(slope).determinant() > 0.0;
         let seen = lands && upright && slope.length() <= most * (1.0 + 1e-12);
@@ -183,6 +197,8 @@ impl OpenCv {
         let [s1, s2, s3, s4] = self.s;
         let r2 = slope * slope;
         let prism = DVec2::new(s1 + 2.0 * s2 * r2, s3 + 2.0 * s4 * r2).length();
+        // The prism's outer product: |(s1 + 2 s2 r², s3 + 2 s4 r²)| times the gradient of r², which
+        // is 2 r.
         [6.0 * p1.hypot(p2) * slope, 2.0 * prism * slope]
     }
 
@@ -228,6 +244,7 @@ impl OpenCv {
         let [k1, k2, k3, k4, k5, k6] = self.k;
         let above = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
         let below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6));
+        // Behind the pole of a rational lens; NaN makes every later comparison fail.
         if below <= 0.0 {
             return (f64::NAN, f64::NAN);
         }

@@ -51,6 +51,7 @@ impl Pinhole {
     #[inline(always)]
     pub(super) fn extrapolated_slope(direction: DVec3, straight: f64) -> DVec2 {
         let off_axis = direction.truncate().length();
+        // False behind the camera, where z is negative.
         let within = off_axis < straight * direction.z;
         if within {
             return direction.truncate() / direction.z;

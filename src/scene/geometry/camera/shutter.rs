@@ -59,7 +59,9 @@ impl ShutterDirection {
             if last_px > 0.0 { (at_px - 0.5) / last_px } else { 1.0 }
         };
         let fraction = match self {
+            // Position of the row's centre, (row + 0.5 - 0.5) / (rows - 1).
             Self::TopToBottom => along(at_px.y, camera.height_px),
+            // From below, the distance to the lower edge counts.
             Self::BottomToTop => along(f64::from(camera.height_px) - at_px.y, camera.height_px),
             Self::LeftToRight => along(at_px.x, camera.width_px),
             Self::RightToLeft => along(f64::from(camera.width_px) - at_px.x, camera.width_px),
