@@ -205,7 +205,10 @@ impl EpisodeFile {
             end: None,
             cut: None,
         };
+        // Line 1 was the header.
         for number in 2.. {
+            // An error of the disk ends the reading with nothing. An error in a line keeps what was
+            // read before it.
             let line = read_line(&mut reader, limits::LINE_BYTES, &mut text).map_err(failed)?;
             let added = match line {
                 Ok(false) => break,
@@ -231,16 +234,20 @@ impl EpisodeFile {
     }
 
     fn add(&mut self, line: Line) -> Result<(), String> {
+        // A session writes `end` last, so that what follows was appended by something else.
         if self.end.is_some() {
             return Err("it follows the end of the episode".to_owned());
         }
         match line {
             Line::Episode(_) => return Err("a second header".to_owned()),
+            // Before the other arm of frames: a file of any length must not fill the memory.
             Line::Frame(_) if self.frames.len() >= limits::STEPS => {
                 return Err(format!("more than {} frames", limits::STEPS));
             }
             Line::Scenario(scenario) => self.scenario = Some(*scenario),
             Line::Actors(actors) => {
+                // The scenario stands before its actors and events in a file. Without one the count
+                // is 0, and no index is valid.
                 actors.check(self.actor_count())?;
                 self.actors.push(actors);
             }
@@ -250,6 +257,8 @@ impl EpisodeFile {
             }
             Line::Frame(frame) => {
                 // If a session returned to an earlier step, drop the events after it.
+                // The last event is looked at first: to go through all events at each frame would
+                // take frames x events.
                 if frame.request != "observe"
                     && self.events.last().is_some_and(|last| last.time_us > frame.time_us)
                 {
@@ -275,6 +284,8 @@ impl EpisodeFile {
     /// # Errors
     /// The file cannot be read.
     pub fn rig(path: &Path) -> Result<Option<Rig>, ReadError> {
+        // The overlays of a rig may take nearly all of `HEAD_BYTES`, so that only this function
+        // parses them.
         #[derive(Deserialize)]
         struct WithRig {
             rig: Rig,
@@ -283,6 +294,7 @@ impl EpisodeFile {
         let mut reader = BufReader::new(File::open(path).map_err(failed)?);
         let mut text = Vec::new();
         let line = read_line(&mut reader, limits::HEAD_BYTES, &mut text).map_err(failed)?;
+        // A header without intrinsics is no error: its caller does without the rig.
         let read = line.ok().and_then(|_| serde_json::from_slice::<WithRig>(&text).ok());
         Ok(read.map(|read| read.rig))
     }
@@ -305,6 +317,8 @@ impl EpisodeFile {
 /// a frame that did not move the ego. If a session returned to an earlier step, the frames after
 /// this replace the earlier ones.
 pub fn driven_indices(steps: impl IntoIterator<Item = Option<u64>>) -> Vec<usize> {
+    // Steps rise strictly in `driven`, so that those to be replaced are at its end, and a binary
+    // search finds the first of them.
     let mut driven: Vec<(u64, usize)> = Vec::new();
     for (index, step) in steps.into_iter().enumerate() {
         let Some(step) = step else { continue };
@@ -331,6 +345,7 @@ fn read_header(
     let failed = |cause| ReadError::Io { path: path.to_owned(), cause };
     let no_header = |reason: String| ReadError::Header { path: path.to_owned(), reason };
     let first = read_line(reader, limits::HEAD_BYTES, text).map_err(failed)?;
+    // Before the parser's message, which would name a byte and not the mistake.
     check_no_mcap(path, text)?;
     let header = match first.and_then(|_| parse(text)).map_err(no_header)? {
         Line::Episode(header) => *header,
@@ -353,7 +368,9 @@ fn read_line(
     limit: usize,
     text: &mut Vec<u8>,
 ) -> io::Result<Result<bool, String>> {
+    // The buffer of the line before is used again: a record has a line or two for each step.
     text.clear();
+    // A file without line breaks is read up to the limit and not into memory as a whole.
     reader.by_ref().take(limit as u64).read_until(b'\n', text)?;
     Ok(match text.last() {
         None => Ok(false),
@@ -376,6 +393,8 @@ fn parse(text: &[u8]) -> Result<Line, String> {
         "frame" => Line::Frame(line(text)?),
         "result" => Line::Result(line(text)?),
         "end" => Line::End(line(text)?),
+        // A record of a later build stays readable: a kind that this build does not know is
+        // skipped.
         _ => Line::Other,
     })
 }

@@ -16,6 +16,7 @@ pub fn result(episode: &EpisodeFile) -> Option<EpisodeResult> {
     let record = drive_record(episode)?;
     let verdict = own::verdict(&record);
     let actors = episode.scenario.as_ref().map_or(&[][..], |scenario| &scenario.actors);
+    // Names instead of indices: a result is read without the scenario.
     let fault = |fault: &own::FaultAt| FaultLine {
         fault: fault.fault.name().to_owned(),
         time_us: fault.time_us,

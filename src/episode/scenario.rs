@@ -23,6 +23,7 @@ pub fn scenario_line(
     drives: &[Trajectory],
 ) -> ScenarioLine {
     let start = DriveStart::new(resolved, drives);
+    // The scenario's own limit, or else the time that the recorded car took from there.
     let limit_us = resolved.end.time_us.or(start.as_ref().map(DriveStart::left_us));
     let route = match &start {
         Some(start) => start.route(limit_us),
@@ -42,6 +43,7 @@ pub fn scenario_line(
         route,
         limit_us,
         least_progress: least_progress.unwrap_or(wildcity_score::own::LEAST_PROGRESS),
+        // A scenario that does not say it has the contact looked for.
         checks_static: resolved.file.verdict.twin_contact != Some(false),
     }
 }
@@ -101,6 +103,8 @@ impl<'a> DriveStart<'a> {
     fn route(&self, limit_us: Option<i64>) -> Vec<RoutePoint> {
         let end_us = limit_us.unwrap_or(i64::MAX).min(self.left_us()).max(0);
         let at = |time_us: i64| RoutePoint(time_us, self.pose_at(time_us).position_m.to_array());
+        // Both ends are interpolated poses, and the keyframes lie strictly between them, so that
+        // times rise strictly.
         let times_us = self.drive.keyframes.iter().map(|key| key.time_us - self.start_us);
         let between = times_us.filter(|time_us| (1..end_us).contains(time_us));
         let mut route: Vec<RoutePoint> = std::iter::once(0).chain(between).map(at).collect();
@@ -114,12 +118,16 @@ impl<'a> DriveStart<'a> {
 /// The pose of a drive at one of its times; constant beyond its ends.
 pub fn pose_at(drive: &Trajectory, time_us: i64) -> Pose {
     let keys = &drive.keyframes;
+    // Keyframes below `after` are earlier than the time; the one at `after` is not.
     let after = keys.partition_point(|key| key.time_us < time_us);
     match (after.checked_sub(1).map(|before| &keys[before]), keys.get(after)) {
         (None, Some(first)) => first.world_from_rig,
         (Some(last), None) => last.world_from_rig,
+        // An exact keyframe is returned as it is, because an interpolation may round its last
+        // digits.
         (Some(_), Some(to)) if to.time_us == time_us => to.world_from_rig,
         (Some(from), Some(to)) => {
+            // Here from < time < to, so that the divisor is positive and t is between 0 and 1.
             let t = (time_us - from.time_us) as f64 / (to.time_us - from.time_us) as f64;
             from.world_from_rig.interpolate(&to.world_from_rig, t)
         }
@@ -129,8 +137,11 @@ pub fn pose_at(drive: &Trajectory, time_us: i64) -> Pose {
 
 /// A route that was not driven: due evenly over the time of the scenario.
 fn planned_route(resolved: &Scenario, limit_us: Option<i64>) -> Vec<RoutePoint> {
+    // A point of a route has a time at which it is due. Without a limit there is none.
     let (Some(route), Some(limit_us)) = (&resolved.route, limit_us) else { return Vec::new() };
     let length_m = route.course.length_m();
+    // Rounded up, so that points are at most `SPACING_M` apart. `max` keeps both ends of a route of
+    // length 0.
     let count = (length_m / SPACING_M).ceil().max(1.0) as i64;
     let point = |k: i64| {
         let share = k as f64 / count as f64;
@@ -142,6 +153,7 @@ fn planned_route(resolved: &Scenario, limit_us: Option<i64>) -> Vec<RoutePoint> 
 
 /// The lanes and areas of a map near a route.
 fn lanes(map: &Map, route: &[RoutePoint]) -> Vec<LaneLine> {
+    // Each point of an outline against each point of the route, once for an episode.
     let near = |outline: &[[f64; 2]]| {
         outline.iter().any(|[x, y]| {
             route.iter().any(|point| (point.1[0] - x).hypot(point.1[1] - y) < LANES_M)
@@ -151,6 +163,7 @@ fn lanes(map: &Map, route: &[RoutePoint]) -> Vec<LaneLine> {
     let file = map.file();
     let driving = file.lanes.iter().enumerate().filter(|(_, lane)| lane.kind == LaneKind::Driving);
     let of_lanes = driving.map(|(index, lane)| {
+        // One border forward and the other one backward: a ring around the lane.
         let outline = lane.left.iter().chain(lane.right.iter().rev()).map(flat).collect();
         let is_on = |point: &RoutePoint| {
             let place_m = DVec2::new(point.1[0], point.1[1]);
@@ -164,6 +177,7 @@ fn lanes(map: &Map, route: &[RoutePoint]) -> Vec<LaneLine> {
         let intersection = match area.kind {
             AreaKind::Drivable => false,
             AreaKind::Intersection => true,
+            // Other areas are not for cars.
             _ => return None,
         };
         let outline = area.outline.iter().map(flat).collect();
