@@ -52,11 +52,13 @@ impl std::fmt::Display for Difference {
 /// The first step at which the command, the ego, an actor or an image of two episodes differ,
 /// tested in this order, after the setup. `None` if the episodes are equal from start to end.
 pub fn diff(a: &EpisodeFile, b: &EpisodeFile) -> Option<Difference> {
+    // A difference of the setup explains every later one, so that it alone is reported.
     if let Some(how) = setup(a, b) {
         return Some(Difference { step: 0, what: What::Setup, how });
     }
     let frames_a = a.driven();
     let frames_b = b.driven();
+    // `zip` ends with the shorter episode: the lengths count only if all common steps are equal.
     for (frame_a, frame_b) in frames_a.iter().zip(&frames_b) {
         let actors_a = actors_at(a, frame_a.step);
         let actors_b = actors_at(b, frame_b.step);
@@ -68,6 +70,7 @@ pub fn diff(a: &EpisodeFile, b: &EpisodeFile) -> Option<Difference> {
             return Some(Difference { step: frame_a.step, what, how });
         }
     }
+    // The first frame is the start and no step. `max` keeps an episode without frames at 0 steps.
     let [steps_a, steps_b] = [frames_a.len(), frames_b.len()].map(|frames| frames.max(1) - 1);
     (steps_a != steps_b).then(|| Difference {
         step: steps_a.min(steps_b) as u64,
@@ -113,6 +116,8 @@ fn scenario(a: Option<&ScenarioLine>, b: Option<&ScenarioLine>) -> Option<String
         return None;
     }
     let at = format!("scenario {}", a.name);
+    // The hash is that of the text. Two texts of different digits can have equal values, and then
+    // only the hashes can be shown.
     let hashes = || format!("{at}: hash {} against {}", a.hash, b.hash);
     Some(value_difference(&at, &a.scenario, &b.scenario).unwrap_or_else(hashes))
 }
@@ -140,8 +145,12 @@ fn first_difference<'a>(
     b: &'a Value,
 ) -> Option<(String, &'a Value, &'a Value)> {
     match (a, b) {
+        // Each level compares whole values again. A scenario is a few levels deep, so that this
+        // costs less than building the path of every equal value.
         _ if a == b => None,
         (Value::Object(a), Value::Object(b)) => {
+            // Keys of both sides, sorted: a key that one side lacks is found as well, as null on
+            // that side.
             let keys: BTreeSet<&String> = a.keys().chain(b.keys()).collect();
             let of = |map: &'a Map<String, Value>, key: &str| map.get(key).unwrap_or(&Value::Null);
             keys.into_iter()
@@ -167,6 +176,8 @@ fn command(a: &Frame, b: &Frame) -> Option<(What, String)> {
     if is_same && a.terminated == b.terminated {
         return None;
     }
+    // From here on something differs. A termination comes first: it differs even if the commands
+    // are equal.
     if a.terminated != b.terminated {
         return Some((What::Command, format!("terminate {}, {}", a.terminated, b.terminated)));
     }
@@ -174,6 +185,7 @@ fn command(a: &Frame, b: &Frame) -> Option<(What, String)> {
 }
 
 fn ego(a: &Frame, b: &Frame) -> Option<(What, String)> {
+    // `driven` returns only frames that have poses, so that `?` hides no difference.
     let (pose_a, pose_b) = (a.poses.last()?, b.poses.last()?);
     if pose_a == pose_b {
         return None;
@@ -184,6 +196,8 @@ fn ego(a: &Frame, b: &Frame) -> Option<(What, String)> {
 }
 
 fn actors_at(episode: &EpisodeFile, step: u64) -> Option<&ActorsLine> {
+    // A step has several lines if the session returned to an earlier state. The last one was
+    // driven.
     episode.actors.iter().rev().find(|line| line.step == step)
 }
 
@@ -199,6 +213,8 @@ fn actors(
     let empty = Vec::new();
     let a = a.map_or(&empty, |line| &line.actors);
     let b = b.map_or(&empty, |line| &line.actors);
+    // Indices rise in both lists, and a state contains its index. An actor that only one side has
+    // makes the states at its place differ.
     for (state_a, state_b) in a.iter().zip(b) {
         if state_a != state_b {
             let place = |xyz_m: [f64; 3]| glam::DVec3::from_array(xyz_m);
@@ -226,6 +242,7 @@ fn image(episode: &EpisodeFile, a: &Frame, b: &Frame) -> Option<(What, String)> 
 }
 
 fn shortened(text: &str) -> String {
+    // Counts characters and not bytes, so that the cut is on a boundary of a character.
     const MOST: usize = 120;
     match text.char_indices().nth(MOST) {
         Some((end, _)) => format!("{} ..", &text[..end]),

@@ -21,6 +21,8 @@ pub fn drive_record(episode: &EpisodeFile) -> Option<DriveRecord> {
     let frames = episode.driven();
     let poses: Vec<Pose> = frames.iter().filter_map(|frame| frame.poses.last().copied()).collect();
     let steps: Vec<u64> = frames.iter().map(|frame| frame.step).collect();
+    // Scores divide differences of poses by a constant dt, so that a missing step would look like a
+    // jump.
     let is_gapless = steps.windows(2).all(|pair| pair[1] == pair[0] + 1);
     if poses.is_empty() || !is_gapless {
         return None;
@@ -80,6 +82,8 @@ pub fn off_model_us(episode: &EpisodeFile) -> Option<i64> {
 /// over one.
 pub(crate) fn ego_samples(poses: &[Pose], step_s: f64) -> Vec<EgoSample> {
     let places: Vec<DVec2> = poses.iter().map(|pose| pose.position_m.truncate()).collect();
+    // `atan2` jumps by 2π where the yaw passes ±π, and a difference over the jump would be a rate
+    // of 2π per step. `turned` counts the jumps, so that neighbours differ by at most π.
     let mut turned = 0.0;
     let mut before: Option<f64> = None;
     let yaws: Vec<f64> = poses
@@ -94,12 +98,15 @@ pub(crate) fn ego_samples(poses: &[Pose], step_s: f64) -> Vec<EgoSample> {
             yaw - std::f64::consts::TAU * turned
         })
         .collect();
+    // Each derivative is the difference of the one above it: an acceleration depends on poses of up
+    // to two steps before and after.
     let velocities = slopes(&places, step_s);
     let accelerations = slopes(&velocities, step_s);
     let rates = slopes(&yaws, step_s);
     let yaw_accelerations = slopes(&rates, step_s);
     (0..poses.len())
         .map(|k| {
+            // Scores judge comfort along the axes of the car, x forward.
             let to_car = DVec2::from_angle(-yaws[k]);
             EgoSample {
                 origin_m: places[k],
@@ -118,8 +125,11 @@ fn slopes<T>(values: &[T], step_s: f64) -> Vec<T>
 where
     T: Copy + std::ops::Sub<Output = T> + std::ops::Div<f64, Output = T>,
 {
+    // The callers refuse an empty list, so that this does not underflow.
     let last = values.len() - 1;
     let slope = |k: usize| {
+        // Two steps apart inside, one step at the ends. A single value is its own neighbour: the
+        // difference is 0, and `max` keeps the divisor from being 0 as well.
         let from = k.saturating_sub(1);
         let to = (k + 1).min(last);
         (values[to] - values[from]) / ((to - from).max(1) as f64 * step_s)
@@ -131,14 +141,19 @@ where
 fn plans(frames: &[&Frame]) -> Vec<Plan> {
     let Some(begin_us) = frames.first().map(|first| first.time_us) else { return Vec::new() };
     let of_pair = |pair: &[&Frame]| {
+        // The command of a frame was decided on what the frame before it showed. Time and place of
+        // the plan are therefore those of the first of the pair.
         let decided_us = pair[0].time_us - begin_us;
         let world_from_start = pair[0].poses.last()?;
+        // An agent sends only the poses to come. The present one is put in front, so that the plan
+        // begins where the ego is.
         let now = TimedPose { time_us: 0, start_from_rig: Pose::IDENTITY };
         let own = std::iter::once(now).chain(pair[1].plan()?);
         let poses = own.map(|TimedPose { time_us, start_from_rig }| {
             let world_from_rig = *world_from_start * start_from_rig;
             let forward = world_from_rig.rotation * DVec3::X;
             PlannedPose {
+                // An agent may send any time; an overflow must not panic.
                 time_us: decided_us.saturating_add(time_us),
                 origin_m: world_from_rig.position_m.truncate(),
                 yaw_rad: forward.y.atan2(forward.x),
@@ -162,6 +177,7 @@ fn tracks(scenario: &ScenarioLine, lines: &[ActorsLine], steps: &[u64]) -> Vec<T
             samples: vec![None; steps.len()],
         })
         .collect();
+    // A sample stays `None` where the actor is absent at that step.
     for (k, step) in steps.iter().enumerate() {
         let Some(line) = of_step.get(step) else { continue };
         for state in line.actors.iter().filter_map(|state| state.state()) {
@@ -221,5 +237,6 @@ fn lanes(scenario: &ScenarioLine) -> Option<LaneMap> {
         is_on_route: lane.route,
         is_intersection: lane.intersection,
     });
+    // The lines of a record have no traffic lights.
     Some(LaneMap { lanes: lanes.collect(), centerline, red: Vec::new() })
 }

@@ -228,6 +228,7 @@ impl EpisodeFile {
             end: None,
             cut: None,
         };
+        // Line 1 was the header.
         for number in 2.. {
             let line = read_line(&mut reader, line_bytes(number), &mut text).map_err(failed)?;
             let added = match line {
@@ -254,16 +255,20 @@ impl EpisodeFile {
     }
 
     fn add(&mut self, line: Line) -> Result<(), String> {
+        // A session writes `end` last, so that what follows was appended by something else.
         if self.end.is_some() {
             return Err("it follows the end of the episode".to_owned());
         }
         match line {
             Line::Episode(_) => return Err("a second header".to_owned()),
+            // Before the other arm of frames: a file of any length must not fill the memory.
             Line::Frame(_) if self.frames.len() >= limits::STEPS => {
                 return Err(format!("more than {} frames", limits::STEPS));
             }
             Line::Scenario(scenario) => self.scenario = Some(*scenario),
             Line::Actors(actors) => {
+                // The scenario stands before its actors and events in a file. Without one the count
+                // is 0, and no index is valid.
                 actors.check(self.actor_count())?;
                 self.actors.push(actors);
             }
@@ -273,6 +278,8 @@ impl EpisodeFile {
             }
             Line::Frame(frame) => {
                 // If a session returned to an earlier step, drop the events after it.
+                // The last event is looked at first: to go through all events at each frame would
+                // take frames x events.
                 if frame.request != "observe"
                     && self.events.last().is_some_and(|last| last.time_us > frame.time_us)
                 {
@@ -298,6 +305,8 @@ impl EpisodeFile {
     /// # Errors
     /// The file cannot be read.
     pub fn rig(path: &Path) -> Result<Option<Rig>, ReadError> {
+        // The overlays of a rig may take nearly all of `HEAD_BYTES`, so that only this function
+        // parses them.
         #[derive(Deserialize)]
         struct WithRig {
             rig: Rig,
@@ -337,6 +346,8 @@ pub fn line_bytes(number: usize) -> usize {
 /// a frame that did not move the ego. If a session returned to an earlier step, the frames after
 /// this replace the earlier ones.
 pub fn driven_indices(steps: impl IntoIterator<Item = Option<u64>>) -> Vec<usize> {
+    // Steps rise strictly in `driven`, so that those to be replaced are at its end, and a binary
+    // search finds the first of them.
     let mut driven: Vec<(u64, usize)> = Vec::new();
     for (index, step) in steps.into_iter().enumerate() {
         let Some(step) = step else { continue };
@@ -385,7 +396,9 @@ fn read_line(
     limit: usize,
     text: &mut Vec<u8>,
 ) -> io::Result<Result<bool, String>> {
+    // The buffer of the line before is used again: a record has a line or two for each step.
     text.clear();
+    // A file without line breaks is read up to the limit and not into memory as a whole.
     reader.by_ref().take(limit as u64).read_until(b'\n', text)?;
     Ok(match text.last() {
         None => Ok(false),
@@ -408,6 +421,8 @@ fn parse(text: &[u8]) -> Result<Line, String> {
         "frame" => Line::Frame(line(text)?),
         "result" => Line::Result(line(text)?),
         "end" => Line::End(line(text)?),
+        // A record of a later build stays readable: a kind that this build does not know is
+        // skipped.
         _ => Line::Other,
     })
 }

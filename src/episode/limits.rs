@@ -16,6 +16,7 @@ pub const SCENARIO_LINE_BYTES: usize = 256 << 20;
 pub const HEAD_BYTES: usize = 96 << 20;
 
 /// Largest number of steps of an episode: a day at 10 Hz.
+// 24 x 3600 x 10 = 864,000, and 2²⁰ = 1,048,576.
 pub const STEPS: usize = 1 << 20;
 
 /// A temporary file of an export that was not written to for this time belongs to a killed process.
@@ -24,4 +25,5 @@ pub const STEPS: usize = 1 << 20;
 pub const LEFTOVER_AGE: Duration = Duration::from_secs(3600);
 
 /// Largest number of episodes of a list.
+// With name and path, an entry takes about 200 bytes: 2 MB in all.
 pub const LISTED: usize = 10_000;

@@ -131,6 +131,7 @@ pub struct ActorsLine {
 ///
 /// The pose has all digits, since images depend on it. Velocity and yaw rate are f32: half of their
 /// digits would be noise, and they are a third of a record.
+// Without names of fields, which would be repeated for each actor at each step.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ActorStateLine(pub u16, pub [f64; 3], pub [f64; 4], pub [f32; 3], pub f32);
 
@@ -257,6 +258,8 @@ impl FaultLine {
         }
         let part = |name: &str| scores.get(own::NAME)?.parts.get(name).copied().flatten();
         match (&*self.fault, part("progress"), part("least_progress")) {
+            // The only fault that two numbers explain: how far the ego came, and how far it had to
+            // come.
             ("progress", Some(progress), Some(least)) => {
                 let progress = less(progress, least);
                 format!("{text}: {progress} of the recorded drive, and {least} is the least")
@@ -287,6 +290,7 @@ pub struct ScoreLine {
 
 impl From<CollisionType> for Collision {
     fn from(kind: CollisionType) -> Self {
+        // Without `_`: a kind that `sim` adds does not compile before it has a name in records.
         match kind {
             CollisionType::StoppedEgo => Self::StoppedEgo,
             CollisionType::StoppedTrack => Self::StoppedTrack,
@@ -456,6 +460,7 @@ impl ActorsLine {
     /// # Errors
     /// It is not, or an actor has no valid pose; describes the error.
     pub fn check(&self, actors: usize) -> Result<(), String> {
+        // Indices that rise also occur only once, and `diff` can compare two lines place by place.
         let mut before: Option<u16> = None;
         for state in &self.actors {
             let actor = state.0;
@@ -463,6 +468,7 @@ impl ActorsLine {
             if let Some(before) = before.filter(|before| *before >= actor) {
                 return Err(format!("actor {actor} follows actor {before}: indices must rise"));
             }
+            // The poses are checked once here; `state` would only skip an invalid one.
             if let Err(error) = Pose::checked(state.1, state.2) {
                 return Err(format!("actor {actor}: {error}"));
             }
@@ -479,6 +485,7 @@ impl ActorStateLine {
             state.index,
             position_m.to_array(),
             state.world_from_actor.q_wxyz(),
+            // Next to 100 m/s, values of f32 are 8 µm/s apart.
             state.velocity_mps.as_vec3().to_array(),
             state.yaw_rate_radps as f32,
         )
@@ -492,6 +499,7 @@ impl ActorStateLine {
             world_from_actor: Pose::checked(xyz_m, q_wxyz).ok()?,
             velocity_mps: DVec3::from_array(velocity_mps.map(f64::from)),
             yaw_rate_radps: f64::from(yaw_rate_radps),
+            // Only actors that are present are written.
             present: true,
         })
     }

@@ -53,7 +53,10 @@ pub fn list(dir: &Path) -> io::Result<Vec<Listed>> {
             path,
         });
     }
+    // Names break ties, so that the list does not depend on the order in the directory. An episode
+    // without a time counts as the oldest.
     listed.sort_by(|a, b| b.modified.cmp(&a.modified).then_with(|| a.name.cmp(&b.name)));
+    // Cut after sorting: which episodes are the newest is not known before.
     listed.truncate(limits::LISTED);
     Ok(listed)
 }
@@ -69,6 +72,7 @@ pub fn record_bytes(record: &Path) -> u64 {
 /// There is no such file, or it cannot be read.
 pub fn read_mcap(record: &Path, most: u64) -> io::Result<Option<Vec<u8>>> {
     let path = mcap_path(record);
+    // A link is not followed: it could lead out of the directory of the records.
     let found = fs::symlink_metadata(&path)?;
     if !found.is_file() {
         return Err(io::Error::other("it is not a regular file"));
@@ -82,10 +86,12 @@ pub fn read_mcap(record: &Path, most: u64) -> io::Result<Option<Vec<u8>>> {
 /// # Errors
 /// The file cannot be read.
 pub fn read_text(path: &Path, most: u64) -> io::Result<Option<Vec<u8>>> {
+    // Tested before the file is read into memory. It may grow by a few lines in between.
     if fs::metadata(path)?.len() > most {
         return Ok(None);
     }
     let mut text = fs::read(path)?;
+    // Without any line break nothing is complete.
     let complete = text.iter().rposition(|&byte| byte == b'\n').map_or(0, |last| last + 1);
     text.truncate(complete);
     Ok(Some(text))

@@ -25,6 +25,7 @@ pub fn scenario_line(
     drives: &[Trajectory],
 ) -> ScenarioLine {
     let start = DriveStart::new(resolved, drives);
+    // The scenario's own limit, or else the time that the recorded car took from there.
     let limit_us = resolved.end.time_us.or(start.as_ref().map(DriveStart::left_us));
     let mut way = Vec::new();
     let route = match (&start, limit_us) {
@@ -56,6 +57,7 @@ pub fn scenario_line(
         way,
         limit_us,
         least_progress: least_progress.unwrap_or(wildcity_score::own::LEAST_PROGRESS),
+        // A scenario that does not say it has the contact looked for.
         checks_static: resolved.file.verdict.twin_contact != Some(false),
     }
 }
@@ -126,6 +128,8 @@ impl<'a> DriveStart<'a> {
     fn route(&self, limit_us: Option<i64>) -> Vec<RoutePoint> {
         let end_us = limit_us.unwrap_or(i64::MAX).min(self.left_us()).max(0);
         let at = |time_us: i64| RoutePoint(time_us, self.pose_at(time_us).position_m.to_array());
+        // Both ends are interpolated poses, and the keyframes lie strictly between them, so that
+        // times rise strictly.
         let times_us = self.drive.keyframes.iter().map(|key| key.time_us - self.start_us);
         let between = times_us.filter(|time_us| (1..end_us).contains(time_us));
         let mut route: Vec<RoutePoint> = std::iter::once(0).chain(between).map(at).collect();
@@ -139,12 +143,16 @@ impl<'a> DriveStart<'a> {
 /// The pose of a drive at one of its times; constant beyond its ends.
 pub fn pose_at(drive: &Trajectory, time_us: i64) -> Pose {
     let keys = &drive.keyframes;
+    // Keyframes below `after` are earlier than the time; the one at `after` is not.
     let after = keys.partition_point(|key| key.time_us < time_us);
     match (after.checked_sub(1).map(|before| &keys[before]), keys.get(after)) {
         (None, Some(first)) => first.world_from_rig,
         (Some(last), None) => last.world_from_rig,
+        // An exact keyframe is returned as it is, because an interpolation may round its last
+        // digits.
         (Some(_), Some(to)) if to.time_us == time_us => to.world_from_rig,
         (Some(from), Some(to)) => {
+            // Here from < time < to, so that the divisor is positive and t is between 0 and 1.
             let t = (time_us - from.time_us) as f64 / (to.time_us - from.time_us) as f64;
             from.world_from_rig.interpolate(&to.world_from_rig, t)
         }
@@ -189,6 +197,7 @@ fn lanes(map: &Map, route: &[[f64; 3]]) -> Vec<LaneLine> {
     let file = map.file();
     let driving = file.lanes.iter().enumerate().filter(|(_, lane)| lane.kind == LaneKind::Driving);
     let of_lanes = driving.map(|(index, lane)| {
+        // One border forward and the other one backward: a ring around the lane.
         let outline = lane.left.iter().chain(lane.right.iter().rev()).map(flat).collect();
         let center = lane.center.iter().map(flat).collect();
         let route = on_route.contains(&index);
@@ -198,6 +207,7 @@ fn lanes(map: &Map, route: &[[f64; 3]]) -> Vec<LaneLine> {
         let intersection = match area.kind {
             AreaKind::Drivable => false,
             AreaKind::Intersection => true,
+            // Other areas are not for cars.
             _ => return None,
         };
         let outline = area.outline.iter().map(flat).collect();

@@ -12,8 +12,10 @@ use crate::error::SessionError;
 pub async fn run_blocking<T: Send + 'static>(
     work: impl FnOnce() -> T + Send + 'static,
 ) -> Result<T, SessionError> {
+    // A span belongs to its thread, so that the closure takes it along.
     let span = Span::current();
     tokio::task::spawn_blocking(move || span.in_scope(work))
         .await
+        // Blocking tasks are not cancelled here: an error of the handle is a panic.
         .map_err(|_| SessionError::Crashed)
 }

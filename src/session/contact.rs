@@ -91,6 +91,7 @@ impl TwinSolids {
     ) -> Result<Vec<Vec<Event>>, StoreError> {
         let mut near = Near::default();
         let mut from = EgoState::new(from);
+        // Unknown until the ego moves: the test reads sections that an ego at rest does not need.
         let mut touches: Option<bool> = None;
         let mut steps = Vec::with_capacity(egos.len());
         for (ego, step) in egos.iter().zip(0..) {
@@ -135,10 +136,12 @@ impl TwinSolids {
             }
             return Ok(area_m2.is_some());
         }
+        // `tested` is the last state that was tested, and `skipped` are the states after it.
         let mut tested = motion.from;
         let mut skipped: Vec<(i64, EgoState)> = Vec::new();
         for (since_us, state) in motion.sub_steps(dt_us) {
             skipped.push((since_us, state));
+            // The end of the step is always tested, because the next step starts from `touched`.
             if since_us < dt_us && is_beside(&tested, &state) {
                 continue;
             }
@@ -195,16 +198,22 @@ impl TwinSolids {
 
     /// The area above which there is a contact in a block.
     fn limit(&self, near: &mut Near, block: Block) -> Result<StaticLimit, StoreError> {
+        // The lock is not held while sections are read. Two threads may compute the same limit,
+        // with the same result.
         if let Some(limit) = self.limits.lock().get(&block) {
             return Ok(*limit);
         }
         let south_west_m = corner_m(block) - BESIDE_M;
         let north_east_m = corner_m(block) + BLOCK_M + BESIDE_M;
         let mut most_on_drive_m2: f64 = 0.0;
+        // The margin is less than a block (4 m of 16 m), so that drives of the eight neighbours are
+        // all that can reach into it.
         let [x, y] = block;
         for beside in (x - 1..=x + 1).flat_map(|x| (y - 1..=y + 1).map(move |y| [x, y])) {
             for [from, to] in self.index.drives(beside) {
                 let way_m = from.position_m.distance(to.position_m);
+                // Both ends of a part of the drive and places between them, at most `MEASURED_M`
+                // apart.
                 let parts = (way_m / MEASURED_M).ceil().max(1.0);
                 for part in 0..=parts as u32 {
                     let pose = from.interpolate(&to, f64::from(part) / parts);
@@ -226,9 +235,12 @@ impl TwinSolids {
             return Ok(solids.clone());
         }
         let (chunk, section) = self.index.section(id);
+        // Equal contents in two cells have one hash, but lie at two places: the origin belongs to
+        // the key. Its bits are used because f64 has no hash.
         let key = (section.hash, chunk.origin_m.to_array().map(f64::to_bits));
         let solids = match self.blocks.get(&key) {
             Some(solids) => solids,
+            // Read without a lock; threads that miss at the same time insert equal contents.
             None => {
                 let read = self.catalog.section(self.index.version(), chunk, section)?;
                 let solid = (0..read.len()).filter_map(|index| solid_point(&read, index));
@@ -251,6 +263,7 @@ fn is_beside(tested: &EgoState, now: &EgoState) -> bool {
 
 /// The south-west corner of a block.
 fn corner_m([x, y]: Block) -> DVec2 {
+    // Cell (0, 0) has the origin at its middle, and block (0, 0) is at its south-west corner.
     BLOCK_M * DVec2::new(x as f64, y as f64) - 0.5 * wildcity_scene::chunk::CELL_M
 }
 

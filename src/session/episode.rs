@@ -125,6 +125,7 @@ impl Episode {
     pub(crate) fn with_warm_up(seed: u64, ego: Ego, warm_up: &[Keyframe], dt_us: i64) -> Self {
         let start = Keyframe { time_us: 0, world_from_rig: ego.world_from_rig() };
         let track: VecDeque<Keyframe> = warm_up.iter().copied().chain([start]).collect();
+        // It has the start at least.
         let begin_us = track[0].time_us;
         Self {
             seed,
@@ -149,6 +150,7 @@ impl Episode {
     pub(crate) fn with_sensors(mut self, sensors: Option<EpisodeSensors>) -> Self {
         self.sensors = sensors.map(Box::new);
         if let Some(motion) = self.sensors.as_mut().and_then(|sensors| sensors.motion.as_mut()) {
+            // At the start there is one sample, of an ego that stands: from the start to itself.
             motion.push(MotionSample::new(&self.ego, &self.ego, self.dt_us, 0));
         }
         self
@@ -186,6 +188,8 @@ impl Episode {
         let mut next = self.clone();
         let egos = next.follow_decisions(command, steps, ground)?;
         if let Some(motion) = next.sensors.as_mut().and_then(|sensors| sensors.motion.as_mut()) {
+            // An observation has the samples since the one before it, and a plan is observed at its
+            // end.
             motion.clear();
             let mut from = &self.ego;
             for (to, index) in egos.iter().zip(1..) {
@@ -194,6 +198,7 @@ impl Episode {
                 from = to;
             }
         }
+        // From here on `next` advances; the samples above begin at the state of `self`.
         for ego in &egos {
             let world_from_rig = ego.world_from_rig();
             let moved_m = world_from_rig.position_m - next.world_from_rig().position_m;
@@ -209,8 +214,11 @@ impl Episode {
         // end. The first plan may still render frames of the warm-up, so it keeps all of that.
         let time_us = next.time_us();
         let plan_us = time_us - self.time_us();
+        // The earliest frame of the plan is one step after its start, at `time_us` - `plan_us` +
+        // `dt_us`, and the history reaches `HISTORY_US` back from there.
         let reach_us =
             next.reach_us() + (HISTORY_US + plan_us - self.dt_us).max(plan_us - self.begin_us);
+        // If the second pose is early enough to interpolate from, then the first one is not needed.
         while next.track.len() > 2 && next.track[1].time_us <= time_us - reach_us {
             next.track.pop_front();
         }
@@ -267,6 +275,7 @@ impl Episode {
                 return world_from_rig;
             }
             let then = self.pose_at((taken_us - age_us).max(0));
+            // At the ego's own pose without a product, which would round.
             if world_from_rig == now { then } else { world_from_rig * (now.inverse() * then) }
         });
         selected.iter().map(|&camera| all[camera]).collect()
@@ -291,6 +300,7 @@ impl Episode {
 
     /// The poses before its start, if the track still has them.
     pub(crate) fn warm_up(&self) -> Vec<Keyframe> {
+        // Only before the first step is the warm-up complete.
         let before = self.track.iter().filter(|key| self.step == 0 && key.time_us < 0);
         before.copied().collect()
     }
@@ -402,6 +412,7 @@ impl Episode {
             sum += trust;
             count += 1.0;
         }
+        // Without any trust, the least one stays as it was.
         let mean = (count > 0.0).then(|| sum / count)?;
         self.least_trust = Some(self.least_trust.map_or(mean, |least: f64| least.min(mean)));
         Some(mean)
@@ -415,6 +426,7 @@ impl Episode {
     /// Stores the state of the repair after an observation; `None` changes nothing.
     pub(crate) fn set_repair_state(&mut self, state: Option<RepairState>) {
         let Some(RepairState { is_on, references }) = state else { return };
+        // No camera and no list are the same: states are compared, and written into records.
         self.repairing = if is_on.contains(&true) { is_on } else { Vec::new() };
         let has_one = references.iter().any(Option::is_some);
         self.references = if has_one { references } else { Vec::new() };
@@ -434,6 +446,8 @@ impl Episode {
             // Transposed, since glam's arrays go column by column.
             rotation[k] = rig_from_past.rotation_matrix().transpose().as_mat3().to_cols_array_2d();
         }
+        // Whole steps of the history since the track began; a pose between two of them counts as
+        // not driven.
         let steps_back = (self.time_us() - self.begin_us) / HISTORY_STEP_US;
         let count = usize::try_from(steps_back).unwrap_or(0).min(HISTORY_POSES - 1) + 1;
         EgoHistory { xyz_m, rotation, count }
@@ -442,6 +456,7 @@ impl Episode {
     /// `world_from_rig` at a time since the episode's start: interpolated, and constant beyond both
     /// ends of the track.
     pub(crate) fn pose_at(&self, time_us: i64) -> Pose {
+        // All poses before `after` are earlier than the time.
         let after = self.track.partition_point(|key| key.time_us < time_us);
         let Some(to) = self.track.get(after) else { return self.world_from_rig() };
         match after.checked_sub(1) {
@@ -513,10 +528,12 @@ mod tests {
     fn other_rates_are_interpolated_and_the_track_stays_short() {
         // 30 ms steps of 0.3 m: 0.1 s ago is 1 m back whatever the rate.
         let episode = driven(1000, 30_000, 0.3);
+        // 1.5 s are 50 steps, which have 51 poses. The others are the ones to interpolate from.
         assert!(episode.track.len() <= 53, "{}", episode.track.len());
         for (k, xyz_m) in episode.history().xyz_m.iter().enumerate() {
             assert!((f64::from(xyz_m[0]) - (k as f64 - 15.0)).abs() < 1e-4, "{k}: {xyz_m:?}");
         }
+        // 20 m in 2 s: 1.5 s ago the ego was 15 m behind, in the middle of a step.
         let slow = driven(3, 2_000_000, 20.0);
         assert!((slow.history().xyz_m[0][0] + 15.0).abs() < 1e-4, "{:?}", slow.history().xyz_m[0]);
     }
@@ -536,6 +553,7 @@ mod tests {
             Some(Shutter { direction: ShutterDirection::TopToBottom, duration_us: 30_000 });
         assert_eq!(views(&still, &camera, 0.0)[0].rolling_shutter, None, "it stands");
         // 30 ms at 30 m/s are 0.9 m; from another place as from its own.
+        // The camera is 1.5 m in front of the rig: its first line is taken at x + 1.5 - 0.9.
         for (x_m, first_m) in [(9.0, 9.6), (20.0, 20.6)] {
             let view = views(&driven, &camera, x_m)[0];
             assert!((view.world_from_camera.position_m.x - x_m - 1.5).abs() < 1e-9);
@@ -554,8 +572,10 @@ mod tests {
             .collect();
         let ego = Ego::new(Dynamics::default(), at(0.0, 0.0));
         let start = Episode::with_warm_up(1, ego, &warm_up, 100_000);
+        // Five poses of the warm-up, and the start.
         assert_eq!((start.step(), start.time_us(), start.history().count), (0, 0, 6));
         let xs_m = |episode: &Episode| episode.history().xyz_m.map(|p| p[0]);
+        // Before the warm-up, its first pose repeats.
         assert_eq!(xs_m(&start)[8..], [-5.0, -5.0, -5.0, -4.0, -3.0, -2.0, -1.0, 0.0]);
         let next = moved(&start, at(1.0, 0.0), false).unwrap();
         assert_eq!(xs_m(&next)[8..], [-6.0, -6.0, -5.0, -4.0, -3.0, -2.0, -1.0, 0.0]);
@@ -566,6 +586,7 @@ mod tests {
     #[test]
     fn velocity_distance_and_the_end() {
         let episode = driven(3, 50_000, 0.5);
+        // 0.5 m in 50 ms.
         assert!((episode.ego().velocity_m_s() - DVec3::X * 10.0).length() < 1e-12);
         let over = moved(&episode, at(1.5, 0.0), true).unwrap();
         let summary = over.summary(Outcome::AgentLost);
@@ -573,6 +594,7 @@ mod tests {
             outcome: Outcome::Completed,
             steps: 4,
             time_us: 200_000,
+            // Three steps of 0.5 m, and a last one on the spot.
             distance_m: 1.5,
             least_trust: None,
         };

@@ -174,6 +174,7 @@ impl SessionError {
     /// session's warm-up is the fault of the start.
     pub(crate) fn into_reset_error(self, start: Option<&Start>) -> Self {
         match (self, start) {
+            // `warm_up_us` belongs to `open`. What a reset can change is its start.
             (Self::OutOfRange { field: "warm_up_us", must }, Some(start)) => {
                 let field = match start {
                     Start::Pose(_) => "start.pose",
@@ -191,6 +192,7 @@ impl SessionError {
 impl From<ResidencyError> for SessionError {
     fn from(error: ResidencyError) -> Self {
         match error {
+            // Errors of the store have one variant, wherever they come from.
             ResidencyError::Store(error) => Self::Twin(error),
             other => Self::Residency(other),
         }

@@ -8,14 +8,17 @@ pub const EVENTS: usize = 64;
 /// Room in the header of an observation for its events and the route: 64 events of at most 600
 /// bytes, 20 points of 80, and a text of a command of at most 1,000 bytes, each twice at worst,
 /// since the metadata is a text within JSON.
+// 2 x (64 x 600 + 20 x 80 + 1,000) = 82,000 bytes, of 98,304.
 pub const SCENARIO_HEADER_BYTES: usize = 96 << 10;
 
 /// Room for an actor: a name of 64 bytes, 14 numbers of at most 24 digits, and the names of the
 /// fields.
+// 64 + 14 x 24 = 400 bytes, which leaves 240 for names of fields and punctuation.
 pub const ACTOR_HEADER_BYTES: usize = 640;
 
 /// Largest number of episodes that wait to be exported as MCAP: at 20 ms each, 20 s of work.
 /// Further episodes are not exported, and the listing says so.
+// 1,024 x 20 ms = 20.5 s.
 pub const WAITING_EXPORTS: usize = 1024;
 
 /// Largest record that is exported as MCAP by itself, in bytes: it is held in memory, several times
@@ -39,6 +42,7 @@ pub const JPEG_QUALITY: u8 = 90;
 /// Largest observation that a client accepts, 1.5 GiB: [`ANSWER_PIXELS`] at [`PIXEL_BYTES`] are
 /// 1,476 MB. Normals add 12 bytes a pixel, so that half as many pixels fit with them; instances 2,
 /// so that three quarters fit. Six raw 1440x928 images with depth and opacity are 88 MB.
+// 2²⁷ pixels x 11 bytes = 1,476,395,008, of 1,610,612,736 bytes.
 pub const OBSERVATION_BYTES: usize = 3 << 29;
 
 /// Largest number of bytes per pixel without normals and instances: raw colour, and depth and
@@ -53,6 +57,7 @@ pub const INSTANCE_BYTES: u64 = 2;
 
 /// Largest header of an observation that a client accepts: 16 poses of 16 cameras are 256 images
 /// of at most 3.5 kB, together 0.9 MB.
+// 16 x 16 x 3.5 kB = 896 kB.
 pub const OBSERVATION_HEADER_BYTES: u64 = 1 << 20;
 
 /// Open sessions, both connected ones and ones that wait for their client to resume.
@@ -81,6 +86,7 @@ pub const SNAPSHOTS: usize = 64;
 pub const OBSERVE_POSES: usize = 16;
 
 /// Pixels of one answer, all images together: 16 poses of six 1440x928 cameras are 128 MPx.
+// 16 x 6 x 1440 x 928 = 128,286,720 pixels, of 134,217,728.
 pub const ANSWER_PIXELS: u64 = 128 << 20;
 
 /// How long one step may take, including rendering and time in queues.
@@ -151,15 +157,18 @@ pub const JPEG_PIXEL_BYTES: u64 = 1;
 
 /// Frames that may wait for the renderer. A session waits for one at a time, and may leave an
 /// abandoned one in the queue after its deadline: hence twice the sessions.
+// 2 x 256 = 512.
 pub const QUEUED_FRAMES: usize = 2 * SESSIONS;
 
 /// A frame of more pixels takes a second and more on processors, so small frames are rendered at
 /// the same time. Sixteen 1440x928 images are 21 million.
+// 16 x 1440 x 928 = 21,381,120 pixels are below 24 x 2²⁰ = 25,165,824.
 pub const LARGE_PIXELS: u64 = 24 << 20;
 
 /// Bytes of all answers that are being made, sent, or kept for a repeated `seq`, and of the
 /// sessions' overlays, which take 134 MB per session at worst. Enough for 100 sessions with six raw
 /// 1440x928 images, depth and opacity (88 MB each), or for JPEGs to every session.
+// 100 x 88 MB = 8.8 GB, of 9.66 GB.
 pub const ANSWERS_BYTES: u64 = 9 << 30;
 
 /// Largest memory of an answer, in bytes, that is kept for the next answer: six raw 1440x928 images
@@ -168,6 +177,7 @@ pub const SPARE_ANSWER_BYTES: usize = 32 << 20;
 
 /// Largest memory that a render thread keeps for the next frame, in bytes: RGB and opacity of six
 /// 1440x928 images take 56 MB.
+// Six images have 8,017,920 pixels, of 3 bytes of colour and 4 of opacity.
 pub const SCRATCH_BYTES: usize = 64 << 20;
 
 /// The rig preset of a session that requests no rig, on a twin that has none.
@@ -198,6 +208,7 @@ pub const PREFETCH_SPACING_M: f64 = 8.0;
 
 /// Number of poses that are prefetched after a step, and the same number along the agent's hint:
 /// 512 m. Each takes 0.2 ms in a city.
+// 64 x 8 m.
 pub const PREFETCH_PLACES: usize = 64;
 
 /// Poses of one `prefetch` request: 2 km of a polyline.
@@ -241,9 +252,11 @@ const _: () = {
     use wildcity_twin::limits::{
         LOAD_ATTEMPTS, LOAD_BACKOFF, REMOTE_BACKOFF, SECTION_TIMEOUT, SECTION_TRIES,
     };
+    // Pauses double: between three tries they are 1 + 2 of the first.
     let pauses = (1 << (SECTION_TRIES - 1)) - 1;
     let attempt_ms =
         SECTION_TIMEOUT.as_millis() * SECTION_TRIES as u128 + REMOTE_BACKOFF.as_millis() * pauses;
+    // Pauses grow by a factor of four: between three attempts they are 1 + 4 of the first.
     let between_ms = 5 * LOAD_BACKOFF.as_millis();
     assert!(LOAD_ATTEMPTS as u128 * attempt_ms + between_ms < STEP_TIMEOUT.as_millis());
 };
@@ -256,5 +269,6 @@ const _: () = {
     let with_instances = PIXEL_BYTES + INSTANCE_BYTES;
     assert!(ANSWER_PIXELS / 2 * (PIXEL_BYTES + NORMAL_BYTES) <= room_bytes);
     assert!(ANSWER_PIXELS * 3 / 4 * with_instances <= room_bytes);
+    // Both at once: three quarters of one half.
     assert!(ANSWER_PIXELS * 3 / 8 * (with_instances + NORMAL_BYTES) <= room_bytes);
 };

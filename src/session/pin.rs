@@ -36,7 +36,9 @@ pub(crate) async fn pin(
     let request = if is_small { request()? } else { run_blocking(request).await?? };
     match timeout_at(deadline, answer).await {
         Ok(Ok(pinned)) => Ok(pinned?),
+        // The pager dropped the request without an answer, which it never does unless it panics.
         Ok(Err(_)) => Err(SessionError::Crashed),
+        // Only the request knows which sections are still missing.
         Err(_) => Err(request.timeout_error().into()),
     }
 }

@@ -39,6 +39,7 @@ impl Snapshots {
     /// There are [`limits::SNAPSHOTS`] other snapshots already.
     pub(crate) fn store(&self, name: String, snapshot: Snapshot) -> Result<(), SessionError> {
         let mut snapshots = self.0.lock();
+        // A name that is used again takes no more room.
         if !snapshots.contains_key(&name) && snapshots.len() >= limits::SNAPSHOTS {
             let most = limits::SNAPSHOTS;
             let must = format!(

@@ -51,6 +51,7 @@ impl SpatialIndex {
                     let bounds = chunk.section_bounds(section);
                     let [low_m, high_m] = [bounds.min_m, bounds.max_m]
                         .map(|corner_m| corner_m.truncate().clamp(cell_m[0], cell_m[1]));
+                    // A section of few Gaussians may cover many blocks, up to the whole cell.
                     for block in blocks_between(low_m, high_m) {
                         sections.entry(block).or_default().push([chunk_index, section_index]);
                     }
@@ -65,6 +66,7 @@ impl SpatialIndex {
                 if a_m.distance(b_m) > GAP_M {
                     continue;
                 }
+                // Of the rectangle around the part: a few more than a slanted line touches.
                 for block in blocks_between(a_m.min(b_m), a_m.max(b_m)) {
                     drives.entry(block).or_default().push([drive_index, key_index]);
                 }
@@ -80,6 +82,8 @@ impl SpatialIndex {
 
     /// The sections that may have Gaussians in a rectangle, in a fixed order.
     pub(crate) fn sections(&self, low_m: DVec2, high_m: DVec2) -> BTreeSet<SectionId> {
+        // Blocks may share sections. A set has each once, in an order that sums of areas can rely
+        // on.
         let of_block = |block| self.sections.get(&block).into_iter().flatten().copied();
         blocks_between(low_m, high_m).flat_map(of_block).collect()
     }
@@ -94,6 +98,7 @@ impl SpatialIndex {
     pub(crate) fn drives(&self, block: Block) -> impl Iterator<Item = [Pose; 2]> {
         let drives = &self.version.manifest.trajectories;
         self.drives.get(&block).into_iter().flatten().map(|[drive, key]| {
+            // The key is the first of a pair, so that there is one after it.
             let keyframes = &drives[*drive].keyframes;
             [keyframes[*key].world_from_rig, keyframes[*key + 1].world_from_rig]
         })
@@ -113,6 +118,7 @@ pub(crate) fn block_at(point_m: DVec2) -> Block {
 
 /// The blocks that a rectangle touches, from west to east and from south to north.
 pub(crate) fn blocks_between(low_m: DVec2, high_m: DVec2) -> impl Iterator<Item = Block> {
+    // None if the rectangle is empty.
     let [[west, south], [east, north]] = [low_m, high_m].map(block_at);
     (west..=east).flat_map(move |x| (south..=north).map(move |y| [x, y]))
 }

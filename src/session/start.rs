@@ -67,6 +67,7 @@ impl EpisodeStart {
             Some(Start::Random(random)) => Self::at_random(drives, random, warm_up_us, seed)?,
             None => Self::at_first_drive(drives, warm_up_us)?,
         };
+        // Whatever the kind of start, an ego on wheels is put onto the ground.
         let ground = Ground::from_drives(drives).and_lanes(lanes);
         resolved.world_from_rig = dynamics.start_pose(resolved.world_from_rig, &ground);
         Ok(resolved)
@@ -94,6 +95,7 @@ impl EpisodeStart {
             let must = format!("{station_m} m; trajectory {name:?} is {length_m} m long");
             return Err(SessionError::OutOfRange { field: "start.station_m", must });
         }
+        // Only the times of a warm-up need a route.
         if warm_up_us == 0 {
             let world_from_rig = drive.at_station(station_m);
             return Ok(Self { warm_up: Vec::new(), world_from_rig });
@@ -126,6 +128,7 @@ impl EpisodeStart {
         let route = Route::new(drive)?;
         let length_m = route.length_m();
         let begin_us = drive.keyframes.first().map_or(0, |first| first.time_us);
+        // Before this station there is not enough of the drive for the warm-up.
         let warm_m = match warm_up_us {
             0 => 0.0,
             _ => route.station_at(begin_us.saturating_add(warm_up_us)),
@@ -144,6 +147,7 @@ impl EpisodeStart {
         // Use one random stream for each value, so that a change of one range does not change the
         // other values.
         let draw = |name: &str, low: f64, high: f64| {
+            // An empty range has no random value.
             if low < high { Random::new(seed, name, 0).range(low, high) } else { low }
         };
         let station_m = draw("start station", first_m, last_m);
@@ -151,6 +155,7 @@ impl EpisodeStart {
         let turn_rad = draw("start heading", -heading_rad, *heading_rad);
 
         let drawn = Self::at_station(drives, &drive.name, station_m, warm_up_us)?;
+        // In the axes of the rig: y points to the left.
         let offset = Pose {
             position_m: DVec3::new(0.0, aside_m, 0.0),
             rotation: DQuat::from_rotation_z(turn_rad),
@@ -161,6 +166,8 @@ impl EpisodeStart {
     /// Moves the rig, and the drive before the start, by an offset in the rig's frame.
     fn moved_by(self, offset: Pose) -> Self {
         let world_from_rig = self.world_from_rig * offset;
+        // The motion in the world that brings the old start to the new one: all poses before it
+        // move alike.
         let moved = world_from_rig * self.world_from_rig.inverse();
         let moved_key =
             |key: Keyframe| Keyframe { world_from_rig: moved * key.world_from_rig, ..key };
@@ -188,6 +195,7 @@ impl EpisodeStart {
     ) -> Result<Self, SessionError> {
         let route = Route::new(drive)?;
         let from_us = start_us.saturating_sub(warm_up_us);
+        // The warm-up reaches beyond the drive: the field at fault is its length.
         let pose_at = |time_us: i64| {
             route
                 .pose_at(time_us)
@@ -195,6 +203,7 @@ impl EpisodeStart {
         };
         let first = Keyframe { time_us: -warm_up_us, world_from_rig: pose_at(from_us)? };
         let world_from_rig = pose_at(start_us)?;
+        // Both ends are there already, so that these lie strictly between them.
         let between = drive
             .keyframes
             .iter()

@@ -109,6 +109,7 @@ impl PinnedVersion {
 
     /// Whether it is the same version of the same twin.
     pub(crate) fn has_same_version(&self, other: &Self) -> bool {
+        // After a rollback, two numbers may have one hash.
         self.resident.version.hash == other.resident.version.hash
             && self.resident.version.number == other.resident.version.number
     }

@@ -81,6 +81,7 @@ impl Stills {
         let needed = Engine::worst_case_bytes(resident, extent(views), self.profile).await?;
         let FrameBytes { stages, beside, is_large, images } = frame_bytes(&self.engine, views);
         let frame = self.reservation.frame();
+        // Each purpose by itself: memory of one is not lent to another.
         let frame_fits = stages <= frame.stages
             && beside <= frame.beside
             && (frame.is_large || !is_large)
@@ -105,6 +106,7 @@ impl Stills {
             let must = format!("{}; at most {most} are accepted", actors.len());
             return Err(SessionError::OutOfRange { field: "actors", must });
         }
+        // One deadline for all frames together.
         let deadline = Instant::now() + max_wait;
         let mut images = Vec::with_capacity(stills.len());
         for part in stills.chunks(MAX_VIEWS) {
@@ -121,6 +123,7 @@ impl Stills {
     ) -> Result<Vec<Vec<u8>>, SessionError> {
         let views: Vec<View> = stills.iter().map(|still| still.view).collect();
         let pixels: u64 = views.iter().map(|view| view.camera.pixels() as u64).sum();
+        // Until the files are done: pixels and their copies exist at the same time.
         let _share = self.engine.answer_budget().reserve(STILL_PIXEL_BYTES * pixels)?;
 
         // Load before the job is queued, so that no render thread waits for a disk.
@@ -132,6 +135,7 @@ impl Stills {
         let mut scene = pin(resident, profile, deadline, viewpoints).await?;
         scene.place(placed);
         let work = move |_: &mut _, backend: &dyn wildcity_render::Backend| {
+            // The renderer writes every pixel; zeros are only there to make the memory valid.
             let zeroed = |view: &View| vec![0; 3 * view.camera.pixels()];
             let mut images: Vec<Vec<u8>> = views.iter().map(zeroed).collect();
             let mut targets: Vec<Target<'_>> = images
@@ -144,12 +148,14 @@ impl Stills {
                 })
                 .collect();
             let frame = Frame { scene: &scene, profile: &profile, views: &views };
+            // All images are encoded afterwards, so that nothing happens as each is done.
             let rendered = backend.render(&frame, &mut targets, &|_, _| {});
             rendered.map(|_| (images, stills))
         };
         let cost = FrameCost { session: self.number, pixels };
         let (rendered, _queued) = self.engine.run(cost, deadline, work).await?;
         let (images, stills) = rendered?;
+        // Off the render thread, which renders for sessions meanwhile.
         run_blocking(move || {
             let both = images.into_iter().zip(&stills).enumerate();
             both.map(|(index, (rgb8, still))| encoded(index, rgb8, still)).collect()
@@ -180,6 +186,7 @@ fn encoded(index: usize, rgb8: Vec<u8>, still: &Still) -> Result<Vec<u8>, Sessio
 /// Buffers and images that a frame of stills needs in addition to its scene. More than
 /// [`MAX_VIEWS`] views are rendered in several frames.
 fn frame_bytes(engine: &Engine, views: &[View]) -> FrameBytes {
+    // Rendered one after the other, frames share the memory of the largest.
     views.chunks(MAX_VIEWS).fold(FrameBytes::default(), |most, views| {
         let pixels: u64 = views.iter().map(|view| view.camera.pixels() as u64).sum();
         let frame = engine.frame_bytes(views, 0, STILL_PIXEL_BYTES * pixels);
@@ -195,6 +202,7 @@ fn frame_bytes(engine: &Engine, views: &[View]) -> FrameBytes {
 /// The focal length of the finest view, and how far the views are from their middle.
 fn extent(views: &[View]) -> RigExtent {
     let viewpoints = viewpoints(views);
+    // Without views, the middle is the origin and not NaN.
     let count = viewpoints.len().max(1) as f64;
     let middle_m = viewpoints.iter().map(|one| one.position_m).sum::<DVec3>() / count;
     RigExtent {

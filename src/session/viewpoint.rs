@@ -10,6 +10,7 @@ use wildcity_twin::residency::Viewpoint;
 pub fn viewpoints(views: &[View]) -> Vec<Viewpoint> {
     let viewpoint = |view: &View| Viewpoint {
         position_m: view.world_from_camera.position_m,
+        // The finer axis, so that neither has too little detail.
         focal_px: view.camera.pinhole.fx.max(view.camera.pinhole.fy),
     };
     views.iter().map(viewpoint).collect()

@@ -14,6 +14,7 @@ use super::descriptors::descriptor_set;
 use super::output::{Failure, Output};
 
 /// Bytes of a chunk before compression: about a second of 30 actors at 10 Hz.
+// 64 KiB / (10 x 30) = 218 bytes, about one box of an actor.
 const CHUNK_BYTES: u64 = 64 << 10;
 
 pub(super) struct McapFile<W: Write + Seek> {
@@ -70,6 +71,8 @@ impl<W: Write + Seek> McapFile<W> {
     /// Writes the index. Returns the number of messages.
     pub(super) fn finish(mut self) -> Result<u64, ExportError> {
         self.writer.finish()?;
+        // `finish` succeeds even if the output failed, since `Output` reports only successes to
+        // mcap.
         self.check()?;
         Ok(self.messages)
     }
@@ -94,6 +97,8 @@ impl<W: Write + Seek> McapFile<W> {
             None => {
                 let id = match encoding {
                     "protobuf" => self.writer.add_schema(schema, "protobuf", &self.descriptors)?,
+                    // The lines of the record are read by their keys. A schema of their fields
+                    // would have to follow every field that the record gets.
                     _ => self.writer.add_schema(schema, "jsonschema", br#"{"type":"object"}"#)?,
                 };
                 self.schemas.insert(schema, id);
@@ -107,6 +112,8 @@ impl<W: Write + Seek> McapFile<W> {
 
     fn write(&mut self, channel_id: u16, time_us: i64, data: &[u8]) -> Result<(), ExportError> {
         let log_time = nanoseconds(time_us);
+        // The number is only for information. It stays at its largest value, rather than begin
+        // again at 0.
         let sequence = u32::try_from(self.messages).unwrap_or(u32::MAX);
         let header = MessageHeader { channel_id, sequence, log_time, publish_time: log_time };
         self.writer.write_to_known_channel(&header, data)?;

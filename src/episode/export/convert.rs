@@ -5,15 +5,19 @@ use wildcity_scene::geometry::Pose;
 use super::messages as foxglove;
 
 /// Offset that is added to the times of an episode, in microseconds.
+// A warm-up has negative times, down to -20 s.
 const TIME_OFFSET_US: i64 = 1_000_000_000;
 
 pub(super) fn nanoseconds(time_us: i64) -> u64 {
+    // A time before the offset becomes 0. 2⁶³ µs are more nanoseconds than a u64 holds, so that the
+    // product saturates.
     u64::try_from(time_us.saturating_add(TIME_OFFSET_US)).unwrap_or(0).saturating_mul(1000)
 }
 
 pub(super) fn timestamp(time_us: i64) -> foxglove::Timestamp {
     let nanoseconds = nanoseconds(time_us);
     foxglove::Timestamp {
+        // u64::MAX / 10⁹ = 1.8 · 10¹⁰ fits an i64, and a remainder below 10⁹ fits an i32.
         seconds: (nanoseconds / 1_000_000_000) as i64,
         nanos: (nanoseconds % 1_000_000_000) as i32,
     }
@@ -36,6 +40,7 @@ pub(super) fn place(xyz_m: [f64; 3]) -> foxglove::Pose {
 }
 
 fn quaternion(pose: &Pose) -> foxglove::Quaternion {
+    // Foxglove puts the scalar last, and this project first.
     let [w, x, y, z] = pose.q_wxyz();
     foxglove::Quaternion { x, y, z, w }
 }
@@ -70,6 +75,7 @@ pub(super) fn entity(time_us: i64, frame: &str, id: &str) -> foxglove::SceneEnti
         timestamp: Some(timestamp(time_us)),
         frame_id: frame.to_owned(),
         id: id.to_owned(),
+        // Moves with its frame between two updates, as the ego's box does with the rig.
         frame_locked: true,
         ..foxglove::SceneEntity::default()
     }

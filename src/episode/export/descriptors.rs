@@ -229,12 +229,14 @@ pub(super) fn descriptor_set() -> Vec<u8> {
         enum_type: ENUMS.iter().map(|(name, values)| enumeration(name, values)).collect(),
         ..FileDescriptorProto::default()
     };
+    // A file comes after those that it depends on, as readers resolve them in order.
     let file = vec![google("timestamp", "Timestamp"), google("duration", "Duration"), foxglove];
     FileDescriptorSet { file }.encode_to_vec()
 }
 
 fn message(name: &str, fields: &[(&str, i32, &str)]) -> DescriptorProto {
     let field = |(name, number, of): &(&str, i32, &str)| {
+        // `[]` stands before all other marks of a type.
         let (label, of) = match of.strip_prefix("[]") {
             Some(of) => (Label::Repeated, of),
             None => (Label::Optional, *of),
@@ -248,6 +250,8 @@ fn message(name: &str, fields: &[(&str, i32, &str)]) -> DescriptorProto {
             ("fixed32", _) => (Type::Fixed32, None),
             ("int64", _) => (Type::Int64, None),
             ("int32", _) => (Type::Int32, None),
+            // What is left is the full name of a message, with the `.` at its start that protobuf
+            // expects.
             (of, None) => (Type::Message, Some(of.to_owned())),
         };
         FieldDescriptorProto {
@@ -267,6 +271,8 @@ fn message(name: &str, fields: &[(&str, i32, &str)]) -> DescriptorProto {
 }
 
 fn enumeration(name: &str, values: &[&str]) -> EnumDescriptorProto {
+    // Foxglove's enums count from 0 in order, so that the index is the number. The longest has six
+    // values.
     let value = |(number, value): (usize, &&str)| EnumValueDescriptorProto {
         name: Some((**value).to_owned()),
         number: Some(number as i32),

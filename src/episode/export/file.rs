@@ -46,6 +46,7 @@ pub fn write_whole<T>(
     write: impl FnOnce(&mut BufWriter<&mut File>) -> Result<T, ExportError>,
 ) -> Result<T, ExportError> {
     let failed = |cause| ExportError::Io { path: path.to_owned(), cause };
+    // The parent of a bare file name is the empty path, which is no directory that can be opened.
     let dir = match path.parent() {
         Some(dir) if !dir.as_os_str().is_empty() => dir,
         _ => Path::new("."),
@@ -54,6 +55,7 @@ pub fn write_whole<T>(
     let mut temporary = create(dir, path).map_err(failed)?;
     let mut out = BufWriter::new(temporary.as_file_mut());
     let written = write(&mut out)?;
+    // A dropped `BufWriter` ignores an error of its last write, so that it is flushed here.
     out.flush().map_err(failed)?;
     drop(out);
     name_whole(temporary, dir, path).map_err(failed)?;
@@ -67,6 +69,8 @@ fn create(dir: &Path, path: &Path) -> io::Result<NamedTempFile> {
     prefix.push(".");
     let mut builder = tempfile::Builder::new();
     builder.prefix(&prefix).suffix(TEMPORARY);
+    // The default of tempfile is 0600, with which other users could not read the export. The umask
+    // still applies.
     #[cfg(unix)]
     builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
     builder.tempfile_in(dir)
@@ -74,8 +78,10 @@ fn create(dir: &Path, path: &Path) -> io::Result<NamedTempFile> {
 
 /// Brings a file to disk and gives it its name, also on disk.
 fn name_whole(temporary: NamedTempFile, dir: &Path, path: &Path) -> io::Result<()> {
+    // Contents first, name second: after a power cut, no name leads to half a file.
     temporary.as_file().sync_all()?;
     temporary.persist(path).map_err(|error| error.error)?;
+    // The new name is part of the directory, and on disk only when the directory is.
     #[cfg(unix)]
     File::open(dir)?.sync_all()?;
     Ok(())
@@ -104,6 +110,7 @@ pub fn remove_leftovers(dir: &Path, now: SystemTime) -> io::Result<usize> {
         // A file may get its name meanwhile.
         let Ok(metadata) = entry.metadata() else { continue };
         let Ok(modified) = metadata.modified() else { continue };
+        // A time in the future, after the clock was set back, is an error here and counts as young.
         let is_old = now.duration_since(modified).is_ok_and(|age| age >= limits::LEFTOVER_AGE);
         if !metadata.is_file() || !is_old {
             continue;
@@ -123,5 +130,6 @@ fn is_temporary(name: &OsStr) -> bool {
     let Some(name) = name.to_str().and_then(|name| name.strip_suffix(TEMPORARY)) else {
         return false;
     };
+    // `a-1.mcap`, or `a-1.mcap` with a random part behind it.
     name.ends_with(ENDING) || name.rsplit_once('.').is_some_and(|(of, _)| of.ends_with(ENDING))
 }

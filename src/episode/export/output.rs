@@ -25,6 +25,7 @@ impl<W> Output<W> {
     /// The value of a success; after a failure, `otherwise`.
     fn keep<T>(&mut self, done: io::Result<T>, otherwise: T) -> T {
         done.unwrap_or_else(|error| {
+            // From now on `inner` is not called, so that no later error replaces this one.
             self.has_failed = true;
             self.failure.set(Some(error));
             otherwise
@@ -35,9 +36,13 @@ impl<W> Output<W> {
 impl<W: Write> Write for Output<W> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         if !self.has_failed {
+            // All of the bytes, so that the success that mcap is told of is true until the first
+            // error.
             let written = self.inner.write_all(bytes);
             self.keep(written, ());
         }
+        // It advances after a failure as well: mcap computes the offsets of its index from
+        // positions.
         self.position += bytes.len() as u64;
         Ok(bytes.len())
     }
@@ -55,6 +60,8 @@ impl<W: Seek> Seek for Output<W> {
     fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
         let expected = match to {
             SeekFrom::Start(at) => at,
+            // A file that was only appended to ends at the position. For all other seeks `inner`
+            // knows better.
             SeekFrom::Current(by) => self.position.saturating_add_signed(by),
             SeekFrom::End(by) => self.position.saturating_add_signed(by),
         };

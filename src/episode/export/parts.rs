@@ -13,7 +13,9 @@ use crate::lines::Event;
 
 /// The ego's motion at each frame; none if the record skips steps.
 pub(super) fn motions(frames: &[&Frame], dt_us: i64) -> Vec<Option<EgoSample>> {
+    // Over a gap, a difference divided by one step would be a wrong velocity.
     let is_gapless = frames.windows(2).all(|pair| pair[1].step == pair[0].step + 1);
+    // Frames of a drive all have a pose, so that `poses` is as long as `frames`.
     let poses: Vec<Pose> = frames.iter().filter_map(|frame| frame.poses.last().copied()).collect();
     if !is_gapless || poses.len() < 2 {
         return vec![None; frames.len()];
@@ -41,6 +43,7 @@ pub(super) fn odometry(
 
 /// The level and the text of an event.
 pub(super) fn event_text(episode: &EpisodeFile, event: &Event) -> (i32, String) {
+    // Numbers of `LogLevel` in `descriptors.rs`.
     const INFO: i32 = 2;
     const WARNING: i32 = 3;
     let name = |index: u16| {

@@ -126,6 +126,8 @@ impl<'a, W: Write + Seek> EpisodeExport<'a, W> {
             end_us,
             calibration_error_px: errors_px.fold(0.0, f64::max),
         };
+        // All that is constant gets the time of the first frame: a viewer that starts there has it
+        // at once.
         export.about(rig, &calibrations, begin_us)?;
         export.rig(rig, calibrations, begin_us)?;
         export.path(&frames, begin_us)?;
@@ -167,8 +169,11 @@ impl<'a, W: Write + Seek> EpisodeExport<'a, W> {
 
     /// Writes frames and events before a time.
     fn write_until(&mut self, time_us: i64) -> Result<(), ExportError> {
+        // Frames of exactly this time wait, so that the images of a time stand before its other
+        // messages.
         while let Some((frame, motion)) = self.frames.next_if(|(frame, _)| frame.time_us < time_us)
         {
+            // What happened during a step comes before the state at its end.
             while let Some(event) = self.events.next_if(|event| event.time_us <= frame.time_us) {
                 self.event(event)?;
             }
@@ -179,6 +184,7 @@ impl<'a, W: Write + Seek> EpisodeExport<'a, W> {
                 self.poses("/plan", "rig", frame.time_us, poses)?;
             }
         }
+        // Events after the last frame, such as the end of the episode, wait for no frame.
         if self.frames.peek().is_none() {
             while let Some(event) = self.events.next() {
                 self.event(event)?;
@@ -260,6 +266,8 @@ impl<'a, W: Write + Seek> EpisodeExport<'a, W> {
             thickness: 2.0,
             scale_invariant: true,
             points: lane.outline.iter().map(|&[x, y]| foxglove::Point3 { x, y, z }).collect(),
+            // Colours of the palette of Okabe and Ito, which can be told apart without red or green
+            // vision.
             color: Some(match (lane.route, lane.intersection) {
                 (true, _) => color(0.0, 0.62, 0.45, 1.0),
                 (false, true) => color(0.94, 0.89, 0.26, 1.0),
@@ -317,15 +325,20 @@ impl<'a, W: Write + Seek> EpisodeExport<'a, W> {
             let cubes = vec![cube(center, size_m, color)];
             foxglove::SceneEntity { cubes, ..entity(time_us, frame, id) }
         };
+        // The rig's origin is on the ground below the rear axle: the middle of the box is half its
+        // height above it. The box is in the frame of the rig, so that `/tf` moves it.
         let size_m = scenario.ego.size;
         let center_m = [scenario.ego.center_x, 0.0, 0.5 * size_m[2]];
         let center = Pose { position_m: center_m.into(), ..Pose::IDENTITY };
         let mut entities = vec![boxed("rig", "ego", &center, size_m, color(0.0, 0.45, 0.7, 0.5))];
+        // A viewer keeps an entity until it is deleted: the actors of the step before that are not
+        // there now are deleted by name.
         let mut there = BTreeSet::new();
         let states = self.actors.get(&frame.step).map_or(&[][..], |line| &line.actors);
         for state in states.iter().filter_map(|state| state.state()) {
             let Some(actor) = scenario.actors.get(usize::from(state.index)) else { continue };
             there.insert(state.index);
+            // The origin of an actor is on the ground, as the rig's is.
             let up_m = [0.0, 0.0, 0.5 * actor.size[2]];
             let center =
                 state.world_from_actor * Pose { position_m: up_m.into(), ..Pose::IDENTITY };

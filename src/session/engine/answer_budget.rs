@@ -36,8 +36,10 @@ impl AnswerBudget {
     /// [`SessionError::Busy`] if fewer are left.
     pub(crate) fn reserve(&self, bytes: u64) -> Result<BudgetShare, SessionError> {
         let limit = limits::ANSWERS_BYTES;
+        // An overflow of the sum counts as too much.
         let within_limit = |used: u64| used.checked_add(bytes).filter(|&sum| sum <= limit);
         self.0
+            // Relaxed, because no other data depends on the count.
             .reserved
             .fetch_update(Ordering::Relaxed, Ordering::Relaxed, within_limit)
             .map(|_| BudgetShare { budget: self.clone(), bytes })
@@ -82,7 +84,9 @@ mod tests {
     #[test]
     fn dropped_shares_return_to_the_budget() {
         let budget = AnswerBudget::default();
+        // A round would fail if the one before it had kept a byte.
         for _ in 0..3 {
+            // Two halves of an odd limit leave one byte, so that 2 bytes are never left.
             let mut half = budget.reserve(limits::ANSWERS_BYTES / 2).unwrap();
             half.merge(budget.reserve(limits::ANSWERS_BYTES / 2).unwrap());
             assert!(matches!(budget.reserve(2), Err(SessionError::Busy { .. })));

@@ -53,6 +53,7 @@ impl Exports {
         std::thread::Builder::new()
             .name("export".to_owned())
             .spawn(move || {
+                // In the thread, so that a directory of many files does not delay the start.
                 if let Err(error) = remove_leftovers(&episodes, SystemTime::now()) {
                     let dir = episodes.display();
                     tracing::warn!("{dir}: leftovers of exports were not removed: {error}");
@@ -66,6 +67,8 @@ impl Exports {
     /// Queues a record for export, unless too many wait already.
     pub(crate) fn add(&self, record: PathBuf) {
         let name = EpisodeFile::episode_name(&record);
+        // The lock is held until the record is sent: names and records enter their queues in one
+        // order, and `run` can take the first name for each record.
         let mut state = self.shared.state.lock();
         if state.waiting.len() >= limits::WAITING_EXPORTS {
             let reason = format!("{} others waited", limits::WAITING_EXPORTS);
@@ -81,6 +84,8 @@ impl Exports {
     /// `longest`. Returns whether they have ended.
     pub(crate) async fn wait(&self, episode: Option<&str>, longest: Duration) -> bool {
         let is_over = |_: &u64| !self.shared.state.lock().is_waiting(episode);
+        // `wait_for` looks at the state first and then after each export. The subscription is older
+        // than the first look, so that no end is missed.
         let mut ended = self.shared.ended.subscribe();
         timeout(longest, ended.wait_for(is_over)).await.is_ok_and(|waited| waited.is_ok())
     }
@@ -96,6 +101,7 @@ impl Exports {
 impl Shared {
     fn run(&self, records: &Receiver<PathBuf>) {
         for record in records {
+            // A panic must not end the thread: all later records would wait forever.
             let exported = catch_unwind(AssertUnwindSafe(|| export(&record)));
             let exported =
                 exported.unwrap_or_else(|_| Err(Failure::Bad("the export crashed".to_owned())));
@@ -104,6 +110,8 @@ impl Shared {
             if let Err(reason) = exported {
                 state.fail(name, reason);
             }
+            // A waiter locks the state within the lock of the channel. To notify it while the state
+            // is locked would take the two in the other order, and could deadlock.
             drop(state);
             self.ended.send_modify(|ended| *ended += 1);
         }
@@ -136,6 +144,7 @@ impl State {
                 reason
             }
         };
+        // The oldest reason makes room for the newest.
         if self.failed.len() >= limits::FAILED_EXPORTS {
             self.failed.pop_front();
         }

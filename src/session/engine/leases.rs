@@ -41,8 +41,11 @@ impl Leases {
         let version = &resident.version;
         let name = &version.manifest.twin;
         let number = version.number;
+        // Locked while the store writes: two sessions that open one version would otherwise take
+        // two leases.
         let mut leased = self.leased.lock();
         if let Some(known) = leased.get_mut(&(name.clone(), number)) {
+            // It was closed and opened again; the lease goes on for what is open now.
             known.resident = Arc::downgrade(resident);
             return;
         }
@@ -61,7 +64,9 @@ impl Leases {
     /// The first lease that cannot be renewed; the others are renewed all the same.
     pub(crate) fn renew(&self) -> Result<(), StoreError> {
         let mut leased = self.leased.lock();
+        // A lease ends when it is dropped.
         leased.retain(|_, known| known.resident.strong_count() > 0);
+        // All of them before the first error: `collect` into a `Result` at once would stop there.
         let renewed: Vec<_> = leased.values_mut().map(|known| known.lease.renew()).collect();
         renewed.into_iter().collect()
     }

@@ -99,9 +99,11 @@ impl Engine {
     pub fn start(settings: EngineSettings) -> Result<Arc<Self>, SessionError> {
         let EngineSettings { cache, episodes, scenarios, backend, step_timeout, repairs, mcap } =
             settings;
+        // Before the queue starts, so that no frame is rendered without the limit.
         backend.limit_frame_bytes(cache.limit_bytes() / limits::FRAME_SHARE);
         let exports = mcap.then(|| Exports::start(episodes.clone())).transpose()?;
         Ok(Arc::new(Self {
+            // What reads `cache` comes before the field that it moves into.
             summaries: Arc::new(SummaryCache::new(cache.catalog().clone())),
             leases: Arc::new(Leases::new(cache.catalog().clone())),
             indexes: Mutex::default(),
@@ -114,6 +116,7 @@ impl Engine {
             step_timeout,
             repairs,
             queue: RenderQueue::start(backend)?,
+            // The first number belongs to the frames of pushes.
             session_numbers: AtomicU64::new(PUSHES + 1),
             answer_budget: AnswerBudget::default(),
             exports,
@@ -213,16 +216,19 @@ impl Engine {
         number: u64,
         frames: Vec<Vec<Viewpoint>>,
     ) -> Result<(), SessionError> {
+        // By its number, because the pin still stands for the version before.
         let resident = self.open_version(twin.to_owned(), Some(number)).await?;
         let deadline = Instant::now() + limits::PRELOAD_TIMEOUT;
         let prefetcher = Arc::new(Prefetcher::new(resident));
         let requested = prefetcher.clone();
         run_blocking(move || {
+            // The most urgent class of a prefetch, because a push waits for these sections.
             let places: Vec<_> =
                 frames.into_iter().map(|viewpoints| (Urgency::Imminent, viewpoints)).collect();
             requested.prefetch(&places, &requested.resident().version.manifest.profile);
         })
         .await?;
+        // The prefetcher counts what is pending, but reports no end: this polls.
         while prefetcher.pending() > 0 && Instant::now() < deadline {
             sleep(limits::PRELOAD_POLL).await;
         }
@@ -268,9 +274,12 @@ impl Engine {
         version: Option<u64>,
     ) -> Result<Arc<Resident>, SessionError> {
         let engine = self.clone();
+        // A version that is asked for by its number passes by the pin.
         let version = version.or_else(|| self.pinned_latest(&twin));
         let opened = run_blocking(move || {
             let resident = engine.cache.open(&twin, version)?;
+            // Before the version is handed out: garbage collection must not delete what a session
+            // begins to read.
             engine.leases.take(&resident);
             Ok::<_, ResidencyError>(resident)
         });
@@ -325,6 +334,7 @@ impl Engine {
         // dropped.
         let index = Arc::new(SpatialIndex::new(resident.version.clone()));
         let mut indexes = self.indexes.lock();
+        // The versions that were closed meanwhile go, so that the map does not grow with each push.
         indexes.retain(|_, index| index.strong_count() > 0);
         indexes.insert(hash.clone(), Arc::downgrade(&index));
         index
@@ -355,6 +365,7 @@ impl Engine {
         let pixels: u64 = views.iter().map(|view| view.camera.pixels() as u64).sum();
         let is_large = pixels > limits::LARGE_PIXELS;
         let backend = self.queue.backend();
+        // Only small frames are rendered beside another one, see `render_queue`.
         let beside = if is_large { 0 } else { backend.bytes_beside(views) + rendered };
         FrameBytes { stages: backend.frame_bytes(views) + rendered, beside, is_large, images }
     }
@@ -387,6 +398,7 @@ impl Engine {
 
     /// Returns a unique number for a session, by which its frames are scheduled.
     pub(crate) fn new_session_number(&self) -> u64 {
+        // Only that numbers differ matters, and no order with other memory.
         self.session_numbers.fetch_add(1, Ordering::Relaxed)
     }
 

@@ -52,11 +52,14 @@ impl SolidBlocks {
         let mut held = self.held.lock();
         held.uses += 1;
         let block = HeldBlock { last_use: held.uses, solids };
+        // Added before what it replaces is subtracted, so that the sum never falls below zero.
         held.bytes += held_bytes(&block);
         if let Some(replaced) = held.blocks.insert(section, block) {
             held.bytes -= held_bytes(&replaced);
         }
+        // The last block stays even if it alone is above the limit: its reader uses it now.
         while held.bytes > self.limit_bytes && held.blocks.len() > 1 {
+            // A search of all blocks, but only where one was read, which takes longer.
             let oldest = held.blocks.iter().min_by_key(|(_, block)| block.last_use);
             let Some(oldest) = oldest.map(|(section, _)| *section) else { break };
             if let Some(dropped) = held.blocks.remove(&oldest) {
@@ -68,6 +71,7 @@ impl SolidBlocks {
 
 /// Memory of a block and of its place in the table, in bytes.
 fn held_bytes(block: &HeldBlock) -> usize {
+    // A key and a block have 72 bytes, and up to half of a hash table is empty.
     block.solids.bytes() + 128
 }
 
@@ -97,6 +101,7 @@ mod tests {
         for section in 0..3 {
             blocks.insert(key(section), one.clone());
         }
+        // Now 1 is the oldest, so that it makes room for 3.
         assert!(blocks.get(&key(0)).is_some());
         blocks.insert(key(3), one.clone());
         assert!(blocks.get(&key(1)).is_none(), "used before all others");

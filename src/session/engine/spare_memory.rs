@@ -24,11 +24,14 @@ impl SpareMemory {
     /// most twice as many.
     pub(crate) fn take(&self, count: usize) -> Vec<u64> {
         let mut spare = self.0.lock();
+        // An answer of less than half its size would hold memory that the budget has to count for
+        // nothing.
         if !(count..=2 * count).contains(&spare.words.capacity()) {
             spare.is_unfit = true;
             return vec![0; count];
         }
         let mut words = std::mem::take(&mut spare.words);
+        // `resize` may write zeros, which other sessions do not wait for.
         drop(spare);
         words.resize(count, 0);
         words
@@ -40,6 +43,7 @@ impl SpareMemory {
         if words.capacity() * size_of::<u64>() <= limits::SPARE_ANSWER_BYTES {
             let mut spare = self.0.lock();
             if spare.is_unfit || words.capacity() > spare.words.capacity() {
+                // What is replaced is freed at the end of the function, without the lock.
                 std::mem::swap(&mut spare.words, &mut words);
                 spare.is_unfit = false;
             }
@@ -69,6 +73,7 @@ mod tests {
             spare.recycle(words);
             was_spare
         };
+        // A block of 1000 serves 500: it is not more than twice as large.
         assert_eq!([1000, 1000, 500, 1000].map(next), [false, true, true, true]);
         // Blocks that do not fit are replaced, even by smaller ones.
         assert_eq!([1001, 1001, 499, 499].map(next), [false, true, false, true]);

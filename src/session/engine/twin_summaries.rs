@@ -79,6 +79,7 @@ impl SummaryCache {
         // The lock is held while manifests are read, so that simultaneous requests read each one
         // once.
         let mut known = self.known.lock();
+        // Only twins that still exist are carried over, so that `known` does not grow.
         let mut fresh = BTreeMap::new();
         for listing in listed {
             // Looked up after the log is read: a push pins the latest version before it commits.

@@ -26,6 +26,7 @@ impl ObservationBuffer {
         header: usize,
     ) -> Result<Self, SessionError> {
         let count = len.div_ceil(WORD_BYTES);
+        // The budget first: memory that it does not cover is never allocated.
         let mut share = budget.reserve((count * WORD_BYTES) as u64)?;
         let mut words = budget.spare().take(count);
         // The spare words may be more than the budget has left.
@@ -46,6 +47,7 @@ impl ObservationBuffer {
     /// them. `None` if fewer are reserved.
     pub fn header_mut(&mut self, bytes: usize) -> Option<&mut [u8]> {
         let header = self.header;
+        // The header ends where the tensors begin, whatever its length is.
         self.start = header.checked_sub(bytes)?;
         let start = self.start;
         Some(&mut self.bytes_mut()[start..header])
@@ -61,10 +63,12 @@ impl ObservationBuffer {
         let mut start = self.len;
         let len = start + parts.iter().map(|part| part.len()).sum::<usize>();
         let count = len.div_ceil(WORD_BYTES);
+        // The capacity that the words have is counted already.
         let more = count.saturating_sub(self.words.capacity());
         self.share.merge(self.share.budget().reserve((more * WORD_BYTES) as u64)?);
         // Exactly: `Vec` would otherwise reserve up to twice as much, which the budget would not
         // count.
+        // `len` only grew, so that `count` is at least the number of words.
         self.words.reserve_exact(count - self.words.len());
         self.words.resize(count, 0);
         self.len = len;
@@ -78,6 +82,7 @@ impl ObservationBuffer {
 
 impl Drop for ObservationBuffer {
     fn drop(&mut self) {
+        // The share goes back to the budget right after this: spare memory is not part of it.
         self.share.budget().spare().recycle(std::mem::take(&mut self.words));
     }
 }
@@ -92,8 +97,10 @@ mod tests {
         for appended in [16, 40, 8] {
             // The second and third have the memory of those before them.
             let mut buffer = ObservationBuffer::new(&budget, 80_000, 16).unwrap();
+            // Five bytes and the others, so that a part ends within a word.
             buffer.append(&[&[1; 5], &vec![2; appended - 5]]).unwrap();
             assert_eq!(buffer.bytes().len(), 80_000 - 16 + appended);
+            // The last byte of the first part, and the first one of the second.
             assert_eq!(buffer.bytes()[80_000 - 16 + 4..][..2], [1, 2]);
             assert_eq!(budget.reserved(), (WORD_BYTES * buffer.words.capacity()) as u64);
         }

@@ -73,6 +73,7 @@ pub(crate) fn encode(
     encoding: Encoding,
 ) -> Result<EncodedImage, String> {
     let started = Instant::now();
+    // Of the pixels and not of the file: the same with every encoding.
     let hash = blake3::hash(rgb8);
     let file = match encoding {
         Encoding::Raw => Vec::new(),

@@ -15,6 +15,7 @@ pub fn jpeg(rgb8: &[u8], width: u32, height: u32, quality: u8) -> Result<Vec<u8>
         within.ok_or_else(|| format!("a JPEG has sides of 1 to 65535 px, not {px}"))
     };
     let size_px = [side(width)?, side(height)?];
+    // Both sides are below 2¹⁶ here, so that the product does not overflow.
     if rgb8.len() as u64 != 3 * u64::from(width) * u64::from(height) {
         let bytes = rgb8.len();
         return Err(format!("{bytes} bytes are not {width} x {height} pixels of 3 bytes"));
@@ -64,6 +65,7 @@ mod tests {
 
     #[test]
     fn a_jpeg_shows_the_image_again_and_repeats_its_bytes() {
+        // Whole blocks of 16 x 16 px, parts of blocks, and a single pixel.
         for [width, height] in [[160, 96], [33, 17], [1, 1]] {
             let rgb8 = picture(width, height);
             let file = jpeg(&rgb8, width, height, 90).unwrap();
@@ -74,6 +76,7 @@ mod tests {
             let squares =
                 read.as_raw().iter().zip(&rgb8).map(|(a, b)| f64::from(a.abs_diff(*b)).powi(2));
             let mean = squares.sum::<f64>() / rgb8.len() as f64;
+            // 30 is a signal-to-noise ratio of 10 log10(255² / 30) = 33 dB.
             assert!(mean < 30.0, "{width} x {height}: mean squared error {mean}");
         }
     }
@@ -87,6 +90,7 @@ mod tests {
 
     #[test]
     fn what_is_no_image_is_an_error() {
+        // A byte too few, a byte too many, no pixel, and a side that is too long.
         for (bytes, width, height) in [(11, 2, 2), (13, 2, 2), (0, 0, 0), (3 * 65_536, 65_536, 1)] {
             assert!(
                 jpeg(&vec![0; bytes], width, height, 90).is_err(),

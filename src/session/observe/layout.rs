@@ -51,6 +51,8 @@ const IMAGES: usize = limits::OBSERVE_POSES * Rig::MAX_CAMERAS;
 const _: () = assert!(limits::BUNDLE_FRAMES <= limits::OBSERVE_POSES);
 
 // A client accepts the longest header, and the renderer renders any rig in one frame.
+// 4,096 + 256 x (3,584 + 256) = 987,136 bytes, of 1,048,576. Names of references and effects of
+// sensors are checked when a session asks for them.
 const _: () = assert!(
     HEADER_BASE_BYTES + IMAGES * (HEADER_IMAGE_BYTES + REPAIR_IMAGE_BYTES)
         <= limits::OBSERVATION_HEADER_BYTES as usize
@@ -151,6 +153,7 @@ impl ObservationLayout {
             let must = format!("{quality}; 1 to 100 are accepted");
             return Err(SessionError::OutOfRange { field: "outputs.quality", must });
         }
+        // Once for a session: its cameras do not change.
         let visible_share = |RigCamera { camera, .. }: &RigCamera| {
             FieldMask::from_camera(camera).map(|field| field.visible_share(camera))
         };
@@ -165,6 +168,7 @@ impl ObservationLayout {
             image_bytes: HEADER_IMAGE_BYTES,
             sensors: None,
         };
+        // The largest answer to a step has all frames of all cameras.
         layout.check_size("outputs", layout.schedule.frames())?;
         Ok(layout)
     }
@@ -206,6 +210,7 @@ impl ObservationLayout {
         dt_us: i64,
     ) -> Result<(), SessionError> {
         let cameras = settings.check(&self.cameras, &self.schedule, dt_us)?;
+        // Motion sensors alone add nothing to the description of an image.
         if !settings.cameras.is_empty() {
             self.image_bytes += SENSOR_IMAGE_BYTES;
         }
@@ -231,6 +236,7 @@ impl ObservationLayout {
     /// The effects on a camera's images, if it has any.
     pub(crate) fn sensor(&self, camera: usize) -> Option<&CameraSensor> {
         let sensor = self.sensors.as_ref().map(|sensors| &sensors.cameras[camera]);
+        // A camera with default settings is one that the session did not name.
         sensor.filter(|sensor| **sensor != CameraSensor::default())
     }
 
@@ -240,12 +246,14 @@ impl ObservationLayout {
         let reach_us = |(camera, sensor): (usize, &CameraSensor)| {
             sensor.reach_us(self.schedule.period_us(camera))
         };
+        // The track of poses has to reach back as far as the slowest camera.
         let reach_us = cameras.iter().enumerate().map(reach_us).max().unwrap_or(0);
         Some(EpisodeSensors::at_start(settings, reach_us))
     }
 
     /// The frame that a camera delivers in an episode when a frame is due, in microseconds.
     pub(crate) fn delivery(&self, camera: usize, of: EffectSeed, due_us: i64) -> Delivery {
+        // Noise alone leaves the times as they are.
         let changed = self.sensor(camera).filter(|sensor| sensor.changes_times());
         let Some(sensor) = changed else {
             return Delivery { stamp_us: due_us, taken_us: due_us, missing: None };
@@ -309,9 +317,12 @@ impl ObservationLayout {
         let now_us = episode.time_us();
         // By the time when they are due, and that when their pictures are taken, which is not
         // later.
+        // The entry of now exists without cameras too. It has the greatest key, so that it becomes
+        // the last capture.
         let mut cameras_by_time = BTreeMap::from([([now_us, now_us], Vec::new())]);
         for camera in 0..self.cameras.len() {
             for due_us in self.schedule.due(camera, now_us) {
+                // There is no pose before the track begins.
                 if due_us >= episode.begin_us() && !is_kept(camera, due_us) {
                     let taken_us =
                         self.delivery(camera, EffectSeed::from_episode(episode), due_us).taken_us;
@@ -384,6 +395,7 @@ impl ObservationLayout {
     /// instances.
     pub(crate) fn step_pixels(&self) -> u64 {
         let pixels = self.rig_pixels() * self.schedule.frames() as u64;
+        // In units of pixels of the full limit: one counts 2 with normals, and 4/3 with instances.
         pixels * limits::ANSWER_PIXELS / self.pixel_limit()
     }
 
@@ -399,6 +411,7 @@ impl ObservationLayout {
         ];
         let maps = maps.iter().map(|&(held, bytes)| if held { bytes } else { 0 }).sum::<u64>();
         let colour = match self.encoding {
+            // The PNG of an image full of noise is as large as its pixels.
             Encoding::Raw | Encoding::Png => 3,
             Encoding::Jpeg(_) => limits::JPEG_PIXEL_BYTES,
         };
@@ -409,6 +422,7 @@ impl ObservationLayout {
     /// encoded, and maps from which trust and normals are computed.
     pub(crate) fn rendered_bytes(&self, has_trust: bool) -> u64 {
         let PixelMaps { depth, opacity, normals, .. } = self.maps;
+        // Raw pixels are rendered into the answer itself.
         let pixels = if self.encoding == Encoding::Raw { 0 } else { 3 };
         let opacity = if has_trust && !opacity { 4 } else { 0 };
         let depth = if normals && !depth { 4 } else { 0 };
@@ -432,6 +446,7 @@ impl ObservationLayout {
     /// The largest header would be longer than clients accept.
     pub(crate) fn reserve_header(&mut self, actors: usize) -> Result<(), SessionError> {
         self.scenario_bytes = limits::SCENARIO_HEADER_BYTES + actors * limits::ACTOR_HEADER_BYTES;
+        // All images and all actors of the scenario in one header.
         let images = self.schedule.frames() * self.cameras.len();
         let most = limits::OBSERVATION_HEADER_BYTES as usize;
         let needed = HEADER_BASE_BYTES + images * self.image_bytes + self.scenario_bytes;
@@ -464,6 +479,7 @@ impl ObservationLayout {
         InPlaceBytes {
             floats: 4 * pixels * self.maps.values(),
             instances: if self.maps.instances { 2 * pixels } else { 0 },
+            // Other encodings append their files later.
             raw: if self.encoding == Encoding::Raw { 3 * pixels } else { 0 },
         }
     }
@@ -482,6 +498,7 @@ impl ObservationLayout {
     ) -> Vec<EarlierFrame<'a>> {
         let of_camera = |camera| {
             let times_us = self.schedule.shown_times(camera, now_us);
+            // The frame of now is among the images of the observation itself.
             let earlier_us = times_us.filter(|&time_us| time_us < now_us);
             let frames = earlier_us.filter_map(move |time_us| history.find(camera, time_us));
             frames.enumerate().map(|(index, frame)| EarlierFrame { back: index + 1, frame })

@@ -48,6 +48,7 @@ impl Schedule {
         }
         let decision_us = decision_us.unwrap_or(dt_us);
         check_period("decision_us", decision_us, dt_us)?;
+        // In the order of names, so that of several mistakes always the same one is named.
         for (name, &period_us) in periods_us {
             if !cameras.iter().any(|camera| camera.name == *name) {
                 let known = cameras.iter().map(|camera| camera.name.clone()).collect();
@@ -100,6 +101,8 @@ impl Schedule {
 
     /// Whether the agent decides at a time.
     pub(crate) fn is_decision(&self, time_us: i64) -> bool {
+        // Times of a warm-up are negative, so that the remainder is the Euclidean one here and
+        // below.
         time_us.rem_euclid(self.decision_us) == 0
     }
 
@@ -107,6 +110,7 @@ impl Schedule {
     /// first.
     pub(crate) fn shown_times(&self, camera: usize, decision_us: i64) -> impl Iterator<Item = i64> {
         let period_us = self.periods_us[camera];
+        // Rounded down at negative times as well.
         let newest = decision_us.div_euclid(period_us);
         (0..self.frames as i64).map(move |back| (newest - back) * period_us)
     }
@@ -114,6 +118,7 @@ impl Schedule {
     /// When the frames of a camera were taken, up to `time_us`, that the next decision shows,
     /// newest first. A decision at `time_us` itself is the next one.
     pub(crate) fn due(&self, camera: usize, time_us: i64) -> impl Iterator<Item = i64> {
+        // What is missing to the next multiple: 0 at a multiple itself.
         let next_us = time_us + (-time_us).rem_euclid(self.decision_us);
         self.shown_times(camera, next_us).filter(move |&taken_us| taken_us <= time_us)
     }
@@ -135,6 +140,7 @@ impl Schedule {
 /// Checks that a period is a whole number of steps and within its limits.
 fn check_period(field: &str, value_us: i64, dt_us: i64) -> Result<(), SessionError> {
     let limits_us = dt_us..=limits::BUNDLE_PERIOD_US.max(dt_us);
+    // A negative multiple passes the first test, and fails the second.
     if value_us % dt_us == 0 && limits_us.contains(&value_us) {
         return Ok(());
     }
@@ -167,6 +173,7 @@ mod tests {
     #[test]
     fn four_of_ten_frames_are_rendered_for_an_agent_that_decides_once_a_second() {
         let schedule = schedule(4, 100_000, 1_000_000);
+        // Decisions are at 0, 10 and 20, and each one shows its frame and the three before it.
         let rendered: Vec<i64> =
             (0..=20).filter(|&k| schedule.is_rendered(FRONT, k * 100_000)).collect();
         assert_eq!(rendered, [0, 7, 8, 9, 10, 17, 18, 19, 20]);
@@ -192,6 +199,7 @@ mod tests {
     /// Every frame that a decision shows was rendered when it was taken, and kept from then on.
     #[test]
     fn every_shown_frame_was_rendered_and_kept() {
+        // Periods that divide each other, and such that do not.
         for (frames, rear_us, decision_us) in
             [(1, 300_000, 100_000), (4, 200_000, 500_000), (3, 700_000, 300_000)]
         {
@@ -199,6 +207,7 @@ mod tests {
             for now_us in (0..100).map(|k| k * 100_000).filter(|&t| schedule.is_decision(t)) {
                 for shown_us in schedule.shown_times(REAR, now_us) {
                     assert!(schedule.is_rendered(REAR, shown_us), "{shown_us} for {now_us}");
+                    // At every step between the two, the frame has to be kept.
                     let mut between = (shown_us..now_us).step_by(100_000);
                     assert!(
                         between.all(|t| schedule.is_shown_after(REAR, shown_us, t)),
@@ -221,6 +230,7 @@ mod tests {
         assert_eq!(new(16, "rear", 100_000, 100_000), "");
         assert!(new(17, "rear", 100_000, 100_000).starts_with("outputs.frames is 17"));
         assert!(new(0, "rear", 100_000, 100_000).starts_with("outputs.frames is 0"));
+        // No multiple of a step, shorter than a step, and negative.
         assert!(new(1, "rear", 150_000, 100_000).starts_with("outputs.period_us.rear is 150000"));
         assert!(new(1, "rear", 0, 100_000).starts_with("outputs.period_us.rear is 0"));
         assert!(new(1, "rear", 100_000, -100_000).starts_with("decision_us is -100000"));

@@ -27,6 +27,7 @@ use wildcity_scene::route::BoxIndex;
 
 /// Distance from the recorded poses at which the trust is 1/e, in metres; it is half at 3.5 m, in
 /// the next lane.
+// 5 m x ln 2 = 3.5 m.
 const DECAY_M: f64 = 5.0;
 
 /// Angle from the recorded pose at which the trust is 1/e, in radians. When a rig rotates in place,
@@ -35,14 +36,17 @@ const DECAY_RAD: f64 = 12.0;
 
 /// In the search for the nearest recorded pose, a rotation of one radian counts as this distance,
 /// in metres.
+// 5 / 12 = 0.42 m for a radian.
 const METRES_PER_RAD: f64 = DECAY_M / DECAY_RAD;
 
 /// Distance between sampled pixels, in rows and in columns. An image of 1440 x 928 px has 5,220
 /// samples, one per 16 x 16 px, so that a share has a standard error of at most 0.7 %.
+// 90 x 58 = 5,220, and √(1/4 / 5,220) = 0.7 %.
 const PIXEL_STRIDE: usize = 16;
 
 /// The rays of every fourth of these samples, in rows and in columns, are followed through the map.
 /// An image of 1440 x 928 px has 345 of them, one per 64 x 64 px.
+// ⌈90 / 4⌉ x ⌈58 / 4⌉ = 23 x 15 = 345.
 const RAY_STRIDE: usize = 4;
 
 /// How far a ray is followed, in metres: through 13 blocks.
@@ -50,6 +54,7 @@ const RAY_M: f64 = 200.0;
 
 /// A ray that descends less than this per metre counts as looking at the horizon and not at the
 /// ground: from 1.6 m above a road, it meets the road at a distance of more than 80 m.
+// 1.6 m / 0.02 = 80 m.
 const MIN_DESCENT: f64 = 0.02;
 
 /// A pixel with less opacity is a hole.
@@ -129,6 +134,7 @@ impl RecordedPoses {
                 angle_rad: recorded.rotation.angle_between(world_from_rig.rotation),
             }
         };
+        // Never below the distance, with which the index excludes boxes.
         let cost_m = |index: usize| {
             let Deviation { distance_m, angle_rad } = deviation_from(index);
             distance_m + METRES_PER_RAD * angle_rad
@@ -157,6 +163,7 @@ impl TrainingCoverage {
                 let block_in_cell = [section.block % 4, section.block / 4].map(i64::from);
                 let block =
                     [0, 1].map(|axis| 4 * i64::from(chunk.cell[axis]) + block_in_cell[axis]);
+                // An empty range, which the first section replaces.
                 let height = heights_m.entry(block).or_insert([f64::INFINITY, f64::NEG_INFINITY]);
                 *height = [height[0].min(bounds.min_m.z), height[1].max(bounds.max_m.z)];
             }
@@ -178,6 +185,7 @@ impl TrainingCoverage {
         let width = view.camera.width_px as usize;
         let height = view.camera.height_px as usize;
         let from_m = view.world_from_camera.position_m;
+        // A pixel counts for the holes, and every sixteenth of them also for the rays.
         let mut pixels = 0_u64;
         let mut holes = 0_u64;
         let mut rays = 0_u64;
@@ -189,6 +197,7 @@ impl TrainingCoverage {
         for (sample_row, row) in samples(height).enumerate() {
             for (sample_column, column) in samples(width).enumerate() {
                 let at_px = DVec2::new(column as f64 + 0.5, row as f64 + 0.5);
+                // Outside of the lens there is no ray.
                 let Some(ray) = view.ray_world(at_px).filter(|ray| ray.z < -MIN_DESCENT) else {
                     continue;
                 };
@@ -199,6 +208,7 @@ impl TrainingCoverage {
                     rays += 1;
                     outside += u64::from(!self.meets_content(from_m, ray));
                 } else if rays == 0 {
+                    // Kept until the first ray is followed. In a large image that is soon.
                     skipped.push(ray);
                 }
             }
@@ -209,6 +219,7 @@ impl TrainingCoverage {
             outside =
                 skipped.iter().filter(|ray| !self.meets_content(from_m, **ray)).count() as u64;
         }
+        // Nothing looks down at the ground, as in an image of the sky.
         if rays == 0 {
             let outside = if self.is_near_content(from_m) { 0.0 } else { 1.0 };
             return GroundShares { holes: 0.0, outside };
@@ -219,6 +230,7 @@ impl TrainingCoverage {
 
     /// Whether the twin has a block within [`RAY_M`], in any direction.
     fn is_near_content(&self, from_m: DVec3) -> bool {
+        // 12 blocks each way: at most 25 x 25 = 625 look-ups.
         let around = (RAY_M / BLOCK_M) as i64;
         let here = [from_m.x, from_m.y].map(|m| block_index(m) as i64);
         (-around..=around).any(|x| {
@@ -230,10 +242,12 @@ impl TrainingCoverage {
     /// descends, and has unit length.
     fn meets_content(&self, from_m: DVec3, ray: DVec3) -> bool {
         // From block to block through the map (Amanatides and Woo 1987).
+        // As f64, because walls are computed from it. The values are far below 2⁵³.
         let mut block = [block_index(from_m.x), block_index(from_m.y)];
         let mut enter_m = 0.0;
         while enter_m < RAY_M {
             // The ray leaves the block through the nearer of the two walls that it moves towards.
+            // A wall that the ray never meets counts as its end.
             let mut walls_m = [RAY_M; 2];
             for axis in 0..2 {
                 if ray[axis] != 0.0 {
@@ -247,10 +261,12 @@ impl TrainingCoverage {
                 // It descends from its height at the entry to that at the exit.
                 let top_m = from_m.z + enter_m * ray.z;
                 let bottom_m = from_m.z + leave_m * ray.z;
+                // The heights of the ray in this block and those of the content overlap.
                 if bottom_m <= *high_m && top_m >= *low_m {
                     return true;
                 }
             }
+            // An axis without motion is only chosen if the ray ends here.
             block[axis] += ray[axis].signum();
             enter_m = leave_m;
         }

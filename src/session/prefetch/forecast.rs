@@ -45,10 +45,13 @@ impl EgoForecast<'_> {
         let followed = self.followed_drive();
         let pose_after = |distance_m: f64| match followed {
             Some(FollowedDrive { drive, station_m }) => {
+                // Offset and angle to the drive stay as they are now.
                 let drive_from_rig = drive.pose_at(station_m).inverse() * self.world_from_rig;
                 drive.pose_at(station_m + distance_m) * drive_from_rig
             }
             None => {
+                // An ego that stands has a drive or no distance to go, so that the divisor is not
+                // 0.
                 let moved_m = self.last_step_m * (distance_m / step_m);
                 let position_m = self.world_from_rig.position_m + moved_m;
                 Pose { position_m, ..self.world_from_rig }
@@ -71,10 +74,12 @@ impl EgoForecast<'_> {
             (false, None) => 0.0,
         };
         while distance_m < reach_m && places.len() < limits::PREFETCH_PLACES {
+            // The first one is a spacing beyond the last exact pose.
             distance_m += limits::PREFETCH_SPACING_M;
             places.push((Urgency::Speculative, pose_after(distance_m)));
         }
 
+        // In addition to the forecast: an agent that turns off announces it here.
         let hinted = sample_polyline(self.hint);
         places.extend(hinted.into_iter().map(|pose| (Urgency::Speculative, pose)));
         places
@@ -85,9 +90,11 @@ impl EgoForecast<'_> {
         let drive = self.drive?;
         let nearest = drive.nearest(self.world_from_rig.position_m)?;
         let station_m = nearest.station_m;
+        // The drive continues straight beyond its end, so that there is a direction everywhere.
         let ahead_m = drive.pose_at(station_m + 1.0).position_m;
         let direction_m = ahead_m - drive.pose_at(station_m).position_m;
         let is_near = nearest.distance_m <= limits::ROUTE_NEAR_M;
+        // The product is 0 for an ego that stands, which may start along the drive.
         let is_along = direction_m.dot(self.last_step_m) >= 0.0;
         (is_near && is_along).then_some(FollowedDrive { drive, station_m })
     }
@@ -99,8 +106,10 @@ impl EgoForecast<'_> {
 /// A hint may lead back to its start. So a pose counts as passed only if it is not much farther
 /// along the hint than the ego is from the hint's first pose.
 pub(crate) fn remaining_hint(hint: &[Pose], now: Pose) -> &[Pose] {
+    // Two places that are prefetched: 16 m.
     let near_m = 2.0 * limits::PREFETCH_SPACING_M;
     let Some(first) = hint.first() else { return hint };
+    // The way here may be up to twice as long as the straight line.
     let passable_m = 2.0 * first.position_m.distance(now.position_m) + near_m;
     let mut along_m = 0.0;
     let mut previous = first;
@@ -111,6 +120,7 @@ pub(crate) fn remaining_hint(hint: &[Pose], now: Pose) -> &[Pose] {
             break;
         }
         if pose.position_m.distance(now.position_m) <= near_m {
+            // The last pose near the ego counts, even if one before it is farther away.
             passed = index + 1;
         }
         previous = pose;
@@ -121,10 +131,12 @@ pub(crate) fn remaining_hint(hint: &[Pose], now: Pose) -> &[Pose] {
 /// Poses along the straight lines between `corners`, at most `PREFETCH_SPACING_M` apart and at most
 /// `PREFETCH_PLACES` in number.
 fn sample_polyline(corners: &[Pose]) -> Vec<Pose> {
+    // The first corner; each line adds the poses after its start.
     let mut poses: Vec<Pose> = corners.first().copied().into_iter().collect();
     for pair in corners.windows(2) {
         let length_m = pair[0].position_m.distance(pair[1].position_m);
         let parts = (length_m / limits::PREFETCH_SPACING_M).ceil().max(1.0);
+        // A line may have any length, and only as many poses as there is room for.
         let left = limits::PREFETCH_PLACES.saturating_sub(poses.len());
         let fractions = (1..=(parts as usize).min(left)).map(|part| part as f64 / parts);
         poses.extend(fractions.map(|t| pair[0].interpolate(&pair[1], t)));
@@ -181,6 +193,7 @@ mod tests {
             assert!(pose.position_m.distance(wanted) < 1e-9, "{pose:?}");
         }
         let last = places[places.len() - 1].position_m.x;
+        // 10 m + 20 x 3 m = 70 m, reached or passed by less than a spacing.
         assert!((70.0..=70.0 + limits::PREFETCH_SPACING_M).contains(&last), "20 steps: {last}");
         assert_eq!(ahead(at(10.0, 5.0), DVec3::ZERO, None, &[]), [], "an ego that stands stays");
     }
@@ -188,6 +201,7 @@ mod tests {
     #[test]
     fn along_a_drive_the_ego_keeps_its_offset_around_the_corner() {
         let drive = corner_drive();
+        // 60 m: 12 m to the corner, and some 50 m north of it.
         let places = ahead(at(90.0, -2.0), DVec3::X * 3.0, Some(&drive), &[]);
         let after_corner = places.iter().filter(|pose| pose.position_m.y > 5.0);
         for pose in after_corner.clone() {
@@ -208,6 +222,7 @@ mod tests {
     fn a_hint_is_prefetched_until_the_ego_has_passed_it() {
         let hint = [at(0.0, 0.0), at(0.0, 40.0), at(40.0, 40.0)];
         let places = ahead(at(-100.0, 0.0), DVec3::ZERO, None, &hint);
+        // 80 m / 8 m, and the first corner.
         assert_eq!(places.len(), 11, "every 8 m: {places:?}");
         assert!(places.contains(&hint[1]) && places.contains(&hint[2]));
         assert_eq!(remaining_hint(&hint, at(-100.0, 0.0)), hint);
@@ -216,9 +231,12 @@ mod tests {
         // Around a block, back to where it began.
         let block = [at(0.0, 0.0), at(0.0, 40.0), at(40.0, 40.0), at(40.0, 0.0), at(0.0, 0.0)];
         assert_eq!(remaining_hint(&block, at(0.0, 0.0)), &block[1..]);
+        // The last corner is near as well, but 120 m along the hint. At most 2 x 38 m + 16 m = 92 m
+        // can be passed here.
         assert_eq!(remaining_hint(&block[1..], at(0.0, 2.0)), &block[1..]);
         assert_eq!(remaining_hint(&block[1..], at(0.0, 30.0)), &block[2..]);
         assert_eq!(remaining_hint(&block[4..], at(3.0, 0.0)), []);
+        // More poses than are prefetched: 1,000 km / 8 m.
         let long = [at(0.0, 0.0), at(1e6, 0.0)];
         assert_eq!(sample_polyline(&long).len(), limits::PREFETCH_PLACES);
     }

@@ -23,6 +23,8 @@ impl LatestTask {
     pub(crate) fn submit(&self, task: impl FnOnce() + Send + 'static) {
         let replaced = {
             let mut state = self.0.lock();
+            // The flag changes only under the lock under which `next` is looked at: a task that
+            // waits always has a thread that will take it.
             if !state.running {
                 state.running = true;
                 let shared = self.0.clone();
@@ -39,6 +41,7 @@ impl LatestTask {
 impl Drop for LatestTask {
     fn drop(&mut self) {
         // The owner has ended, so the waiting task has no use.
+        // Bound to a name, so that it is dropped after the lock.
         let _next = self.0.lock().next.take();
     }
 }
@@ -48,6 +51,7 @@ fn run_all(shared: &Mutex<State>) {
     loop {
         let next = {
             let mut state = shared.lock();
+            // A `submit` after this starts another thread.
             state.running = state.next.is_some();
             state.next.take()
         };
@@ -86,6 +90,7 @@ mod tests {
         }
         assert!(reported.try_recv().is_err(), "the first task still runs");
         release_first.send(()).unwrap();
+        // Each task replaced the one that waited before it.
         assert_eq!(reported.recv().unwrap(), 999);
         drop(report);
         assert!(reported.recv().is_err(), "no other task was kept");

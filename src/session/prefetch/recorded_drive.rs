@@ -33,6 +33,7 @@ impl RecordedDrive {
         let mut stations_m = Vec::with_capacity(poses.len());
         let mut station_m = 0.0;
         for (index, pose) in poses.iter().enumerate() {
+            // The first pose is its own predecessor, at distance 0.
             let previous = poses[index.saturating_sub(1)];
             station_m += pose.position_m.distance(previous.position_m);
             stations_m.push(station_m);
@@ -44,6 +45,7 @@ impl RecordedDrive {
             }
             bounds
         };
+        // One segment less than poses, but one of a single pose, and none without poses.
         let count = poses.len().saturating_sub(1).max(poses.len().min(1));
         let segments: Vec<Bounds> = (0..count).map(segment).collect();
         Self { poses, stations_m, segments: BoxIndex::new(&segments) }
@@ -57,6 +59,7 @@ impl RecordedDrive {
             let to_m = self.poses.get(index + 1).map_or(from_m, |next| next.position_m);
             let segment_m = to_m - from_m;
             let to_point_m = point_m - from_m;
+            // Where the car stood, a segment has no length: t is 0 then, and not NaN.
             let length_squared_m2 = segment_m.length_squared().max(1e-12);
             let t = (to_point_m.dot(segment_m) / length_squared_m2).clamp(0.0, 1.0);
             NearestPoint {
@@ -76,6 +79,7 @@ impl RecordedDrive {
     /// straight.
     pub(super) fn pose_at(&self, station_m: f64) -> Pose {
         let after = self.stations_m.partition_point(|&m| m < station_m);
+        // There is at least one pose, see the type.
         let last = self.poses.len() - 1;
         if after > last {
             let end = self.poses[last];
@@ -84,6 +88,7 @@ impl RecordedDrive {
         }
         let before = after.saturating_sub(1);
         let length_m = self.stations_m[after] - self.stations_m[before];
+        // At station 0 both are the first pose.
         let t = if length_m > 0.0 { (station_m - self.stations_m[before]) / length_m } else { 1.0 };
         self.poses[before].interpolate(&self.poses[after], t)
     }

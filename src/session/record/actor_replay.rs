@@ -43,7 +43,9 @@ impl<'a> ActorReplay<'a> {
 
     /// Goes on to a frame, by its index.
     pub(super) fn advance(&mut self, frame: usize) {
+        // A line belongs to the frame that follows it, so that it has the frame's index before it.
         while let Some((_, line)) = self.later.next_if(|(before, _)| *before <= frame) {
+            // No frame of a later request looks farther back, and its exposure not before this.
             self.past.drop_before(line.time_us - self.exposure_us - LONGEST_REQUEST_US);
             self.past.push(line.time_us, &states(line, self.count));
         }
@@ -54,6 +56,7 @@ impl<'a> ActorReplay<'a> {
         if self.assets.is_empty() {
             return Vec::new();
         }
+        // A rolling shutter shows an actor from one pose to the other.
         let at_start = self.past.poses_at(exposure_start_us(taken_us, self.exposure_us));
         self.assets.placed(&self.past.poses_at(taken_us), &at_start, frame)
     }
@@ -65,6 +68,7 @@ const LONGEST_REQUEST_US: i64 = crate::limits::PLAN_US + crate::limits::DT_MAX_U
 /// All actors of a line, by their index; those that it leaves out are absent.
 fn states(line: &ActorsLine, count: usize) -> Vec<ActorState> {
     let absent = |index: usize| ActorState {
+        // Lines have indices as u16, so that a scenario has no more actors.
         index: index as u16,
         world_from_actor: Pose::IDENTITY,
         velocity_mps: glam::DVec3::ZERO,
@@ -73,6 +77,7 @@ fn states(line: &ActorsLine, count: usize) -> Vec<ActorState> {
     };
     let mut states: Vec<ActorState> = (0..count).map(absent).collect();
     for state in line.actors.iter().filter_map(ActorStateLine::state) {
+        // `RecordedEpisode::read` has checked the indices.
         if let Some(place) = states.get_mut(usize::from(state.index)) {
             *place = state;
         }

@@ -20,6 +20,7 @@ impl RecordedCommand {
     /// The record of a command; `None` for a pose, which the poses of its frame have.
     pub(crate) fn new(command: &Command) -> Option<Self> {
         match command {
+            // The pose would be in the line twice.
             Command::Pose(_) => None,
             Command::Path(_) | Command::Action(_) => Some(Self::from_command(command)),
         }
@@ -42,6 +43,7 @@ impl RecordedCommand {
         Ok(match self {
             Self::Pose(pose) => Command::Pose(*pose),
             Self::Action(action) => Command::Action(*action),
+            // A file may have been changed, so that the path is checked as one of a request is.
             Self::Trajectory(poses) => Command::Path(Path::checked(poses.clone())?),
         })
     }

@@ -57,6 +57,7 @@ impl Continuation {
     /// Reads the record. Blocks.
     pub(crate) fn read(path: &Path, origin: RecordedOrigin) -> Result<Self, SessionError> {
         let RecordedOrigin { step, ref episode } = origin;
+        // The most likely mistake has an error of its own: a wrong name.
         if !path.is_file() {
             return Err(SessionError::UnknownEpisode { name: episode.clone() });
         }
@@ -67,8 +68,10 @@ impl Continuation {
             let must = format!("{step}; the record has steps {first} to {last}");
             return Err(SessionError::OutOfRange { field: "from.step", must });
         }
+        // What came after the step is not part of the branch.
         record.frames.retain(|frame| frame.step <= step);
         let frames = record.frames.len();
+        // A switch without a frame after it shows nothing, and its version need not exist.
         record.versions.retain(|(frames_before, _)| *frames_before < frames);
         Ok(Self { record, origin, versions: BTreeMap::new() })
     }
@@ -105,6 +108,7 @@ impl Continuation {
         let number = resident.version.number;
         let header = (&self.record.header.version, &self.record.header.version_hash);
         let switched = self.record.versions.iter().map(|(_, to)| (&to.version, &to.version_hash));
+        // The header and a switch back may name the same version; the hash of each must match.
         for (&version, recorded) in std::iter::once(header).chain(switched) {
             if version == number && *recorded != resident.version.hash {
                 let recorded = recorded.clone();
@@ -132,11 +136,13 @@ impl Continuation {
         let mut ego = EgoReplay::new(header);
         let mut kept: Vec<KeptFrames> = Vec::new();
         for (index, frame) in frames.iter().enumerate() {
+            // All switches that stand before this frame in the file: the last one counts.
             while let Some((_, to)) = switches.next_if(|(frames_before, _)| *frames_before <= index)
             {
                 version = version_of(to.version)?;
                 profile = to.profile;
             }
+            // Poses of `observe` move no ego and enter no history.
             if frame.request == FrameRequest::Observe {
                 continue;
             }
@@ -148,12 +154,15 @@ impl Continuation {
             let time_us = episode.time_us();
             let taken = frames_taken(layout, &episode, &kept, frame)?;
             kept.push(KeptFrames { episode, version: version.clone(), profile, frames: taken });
+            // At each step, so that only the states of the last bundle are in memory.
             drop_unneeded(layout, &mut kept, time_us);
         }
         let mut episode = ego.into_episode();
+        // The ego may have left the area only after the step of the branch.
         if self.record.off_model_step.is_some_and(|left| left <= self.origin.step) {
             episode.leave_model();
         }
+        // A plan of several steps may pass over the one that was asked for.
         let (reached, step) = (episode.step(), self.origin.step);
         if reached != step {
             let reason = format!("its steps lead to step {reached} and not to {step}");
@@ -174,6 +183,8 @@ fn frames_taken(
         let mut all = kept.iter().flat_map(|frames| &frames.frames);
         all.any(|one| one.capture.due_us == time_us && one.camera == camera)
     };
+    // Hashes are pose by pose and camera by camera, so that a single iterator over all captures
+    // stays with them.
     let mut hashes = frame.images.iter();
     let mut taken = Vec::new();
     for (pose, capture) in layout.captures_beside(episode, &is_kept).iter().enumerate() {
@@ -191,6 +202,7 @@ fn frames_taken(
             };
             return Err(BranchError::Diverged(reason));
         }
+        // `zip` asks the cameras first, so that it takes no hash too many.
         for (&camera, hash) in cameras.iter().zip(&mut hashes) {
             if layout.is_shown_later(capture, camera) {
                 // With the levels of detail that were chosen together with the other cameras.

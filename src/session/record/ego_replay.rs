@@ -54,10 +54,12 @@ impl EgoReplay {
         let (FrameRequest::Step, Some(&recorded)) = (frame.request, frame.poses.last()) else {
             return Ok(None);
         };
+        // Without a command in the line, the pose of the frame is the command.
         let command = match &frame.command {
             None => Command::Pose(recorded),
             Some(recorded) => recorded.command().map_err(SessionError::Ego)?,
         };
+        // Not ended, even if the recorded step was the last one: a branch goes on from here.
         self.episode = self.episode.followed(&command, frame.steps as usize, ground, false)?.0;
         let now = self.episode.world_from_rig();
         Ok((now != recorded).then_some(DivergedStep { line, step: frame.step, recorded, now }))

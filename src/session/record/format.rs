@@ -261,6 +261,7 @@ impl FrameRecord {
     /// below 0.
     pub fn taken_us(&self, pose: usize) -> i64 {
         let is_now = self.request == FrameRequest::Observe || pose + 1 == self.poses.len();
+        // All times of the warm-up are below 0, and which one it is does not matter.
         let otherwise = if is_now { self.time_us } else { -1 };
         self.times_us.get(pose).copied().unwrap_or(otherwise)
     }
@@ -280,6 +281,7 @@ impl FrameRecord {
 /// safe as a file name and cannot be a path.
 pub fn is_episode_name(text: &str) -> bool {
     let is_number =
+        // A u64 has at most 20 digits.
         |text: &str| (1..=20).contains(&text.len()) && text.bytes().all(|b| b.is_ascii_digit());
     text.rsplit_once('-').is_some_and(|(session, number)| is_name(session) && is_number(number))
 }

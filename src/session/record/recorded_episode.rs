@@ -95,6 +95,7 @@ impl RecordedEpisode {
                         let known = EpisodeHeader::FORMAT;
                         return Err(wrong(format!("format {format}; this build reads {known}")));
                     }
+                    // Checked here, so that a replay uses rig and state without further tests.
                     first.rig.check()?;
                     if let Some(state) = &first.state {
                         state.check().map_err(|reason| wrong(reason.to_owned()))?;
@@ -102,6 +103,7 @@ impl RecordedEpisode {
                     header = Some(*first);
                 }
                 Line::Frame(frame) if number > 1 => {
+                    // There is a header: line 1 was one, or was refused.
                     let cameras = header.as_ref().map_or(0, |header| header.rig.cameras.len());
                     check_images(&frame, cameras).map_err(wrong)?;
                     frames.push(frame);
@@ -110,11 +112,14 @@ impl RecordedEpisode {
                 Line::Scenario(line) if number > 1 => scenario = Some(line),
                 Line::Actors(line) if number > 1 => {
                     line.check(actor_count).map_err(wrong)?;
+                    // With the number of frames so far, by which a replay finds the frame of the
+                    // line.
                     actors.push((frames.len(), line));
                 }
                 Line::Event(event) if number > 1 => {
                     event.check(actor_count).map_err(wrong)?;
                     if let Event::OffModel { .. } = event.event {
+                        // The first time counts; a record of a branch may have several.
                         off_model_step = off_model_step.or(Some(event.step));
                     }
                 }
@@ -125,11 +130,13 @@ impl RecordedEpisode {
                     end_line = number;
                 }
                 Line::Episode(_) => return Err(wrong("a second header".to_owned())),
+                // Any other line as the first of the file.
                 _ => {
                     return Err(wrong("the episode's header is missing".to_owned()));
                 }
             }
         }
+        // Without a single line, no line was wrong.
         let empty =
             || ReplayError::Line { path: path.to_owned(), line: 1, reason: "empty".to_owned() };
         let header = header.ok_or_else(empty)?;
@@ -165,6 +172,7 @@ fn check_images(frame: &FrameRecord, rig_cameras: usize) -> Result<(), String> {
     }
     for cameras in &frame.cameras {
         let rising = cameras.is_sorted_by(|a, b| a < b);
+        // Rising, so that the last one is the largest.
         let exist = cameras.last().is_none_or(|&last| last < rig_cameras);
         if !rising || !exist {
             return Err(format!(
@@ -172,6 +180,7 @@ fn check_images(frame: &FrameRecord, rig_cameras: usize) -> Result<(), String> {
             ));
         }
     }
+    // One image for each camera of each pose, in this order.
     let expected: usize = (0..poses).map(|pose| frame.due_cameras(pose, rig_cameras).len()).sum();
     let images = frame.images.len();
     if images != expected {

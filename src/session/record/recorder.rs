@@ -43,6 +43,8 @@ impl Recorder {
         let mut number = first_number;
         let (file, path) = loop {
             let path = dir.join(format!("{session}-{number}.jsonl"));
+            // To look for a free name and to take it is one operation, so that two servers in one
+            // directory never share a file.
             match OpenOptions::new().append(true).create_new(true).open(&path) {
                 Ok(file) => break (file, path),
                 Err(error) if error.kind() == io::ErrorKind::AlreadyExists => number += 1,
@@ -73,7 +75,9 @@ impl Recorder {
     /// Verdict and scores of the episode so far, if it ends as its summary says; `None` if it
     /// cannot be read.
     pub(crate) fn result(&self, summary: &EpisodeSummary) -> Option<EpisodeResult> {
+        // From the file itself, so that the result is the one that `wildcity episode score` gets.
         let mut episode = EpisodeFile::read(&self.path).ok()?;
+        // The two packages have types of their own for an end, with the same fields in JSON.
         let end = serde_json::to_value(summary).ok()?;
         episode.end = serde_json::from_value(end).ok();
         wildcity_episode::result(&episode)
@@ -85,13 +89,16 @@ impl Recorder {
     }
 
     fn try_append(&self, lines: &[Line]) -> io::Result<()> {
+        // A line of a step has some 800 bytes, and a few short lines may come before it.
         let mut text = Vec::with_capacity(2048);
         for line in lines {
             serde_json::to_writer(&mut text, line)?;
             text.push(b'\n');
         }
+        // No other process appends to the file.
         let length_before = self.file.metadata()?.len();
         let written = (&*self.file).write_all(&text);
+        // A part of a line may be on disk. In append mode, the next line begins at the new end.
         if written.is_err() {
             self.file.set_len(length_before)?;
         }
@@ -137,6 +144,7 @@ mod tests {
 
     #[test]
     fn a_full_disk_refuses_the_line() {
+        // This device refuses every write as a full disk does.
         let full = OpenOptions::new().append(true).open("/dev/full").unwrap();
         let path = Path::new("/dev/full").into();
         let recorder = Recorder { file: Arc::new(full), path };

@@ -80,6 +80,8 @@ impl<'a> RepairReplay<'a> {
                 let recorded = recorded.to_owned();
                 changes.push(ProvenanceChange { what, recorded, now: now.to_owned() });
             };
+            // Another hash means other pixels: to compare them would report the model and not the
+            // replay.
             if now != recorded.repair_hash {
                 change("repair hash", &recorded.repair_hash, &now);
             } else if !(recorded.deterministic && loaded.is_deterministic()) {
@@ -93,6 +95,7 @@ impl<'a> RepairReplay<'a> {
         let state = header.first_state().repair_state().for_cameras(cameras.len());
         let rays = CameraRays::new(cameras.len());
         let references = None;
+        // In two steps, since which references are read depends on the model.
         let mut replay =
             Self { recorded, model, coverage, state, rays, references, models, catalog };
         replay.read_references(resident, cameras)?;
@@ -105,6 +108,7 @@ impl<'a> RepairReplay<'a> {
         resident: &Resident,
         cameras: &[RigCamera],
     ) -> Result<(), ReplayError> {
+        // From here on trusts are those of the other version.
         self.coverage = training_coverage(&resident.version.manifest)?;
         self.read_references(resident, cameras)
     }
@@ -127,10 +131,13 @@ impl<'a> RepairReplay<'a> {
     /// The buffers of a camera's image that decisions and the model need.
     pub(super) fn buffers(&self, camera: &RigCamera) -> RenderedImage {
         let pixels = camera.camera.pixels();
+        // Without the model nothing is repaired again, and its inputs are not rendered.
         let needs = |role| self.model.as_ref().is_some_and(|model| model.needs(role));
         let normals = needs(InputRole::Normals);
         let warped = self.model.as_deref().is_some_and(session_repair::needs_warped);
+        // Normals are computed from depth, and references are warped by it.
         let depth = normals || warped || needs(InputRole::Depth);
+        // An empty map is one that is not rendered.
         let map =
             |is_needed: bool, values: usize| vec![0.0; usize::from(is_needed) * values * pixels];
         RenderedImage {
@@ -159,6 +166,7 @@ impl<'a> RepairReplay<'a> {
             image.trust = self.coverage.trust(world_from_rig, view, &image.opacity).value;
             trusts.push(image.trust);
         }
+        // No camera was on, as in the session.
         let before: Vec<bool> = if is_observe {
             Vec::new()
         } else {
@@ -188,6 +196,7 @@ impl<'a> RepairReplay<'a> {
             .map_err(|message| RepairError::Input { field: "reference".to_owned(), message })?;
         let repaired = session_repair::repair(&model, image.mounted, image.rendered, &inputs)?;
         if !image.is_observe {
+            // Only after a success, as in the session.
             self.state.references[image.camera] = inputs.nearest;
         }
         Ok(Some(repaired))
@@ -201,6 +210,7 @@ impl<'a> RepairReplay<'a> {
         Drawing { resident, profile, backend }: Drawing<'_>,
     ) -> Result<ReferenceInputs, String> {
         let ImageToRepair { camera, mounted, rendered, view, world_from_rig, is_observe } = *image;
+        // Only a model that needs references has a list of them.
         let Some(references) = &self.references else { return Ok(ReferenceInputs::default()) };
         let kept = if is_observe { None } else { self.state.references[camera].as_deref() };
         let rays = self.rays.camera_rays(camera, mounted);

@@ -68,6 +68,7 @@ impl RecordedImageRepair {
             RepairStatus::Failed(failure) => Some(Self::Failed(failure)),
         };
         let list: Vec<Option<Self>> = repairs.iter().map(record).collect();
+        // Most answers have no repair, and their lines no such field.
         if list.iter().all(Option::is_none) { Vec::new() } else { list }
     }
 }

@@ -73,6 +73,7 @@ impl RecordedEpisode {
             }
             replay.actors.advance(index);
             replay.drive(frame, index)?;
+            // Images from another pose would differ too; the pose is the explanation.
             if until == ReplayUntil::FirstDifference && replay.report.diverged.is_some() {
                 return Ok(replay.report);
             }
@@ -84,6 +85,7 @@ impl RecordedEpisode {
         }
         if let Some(end) = &self.end {
             let mut episode = replay.ego.episode().clone();
+            // A replay does not compute the trust of all images, so that the record says it.
             if self.off_model_step.is_some() {
                 episode.leave_model();
             }
@@ -140,6 +142,7 @@ impl<'a> Replay<'a> {
 
         let repair = RepairReplay::new(header, &resident, repairs, &mut changes)?;
         let cameras = &header.rig.cameras;
+        // With repair, the buffers have what decisions and the model need besides.
         let buffers = |camera: &RigCamera| match &repair {
             Some(repair) => repair.buffers(camera),
             None => RenderedImage {
@@ -195,6 +198,7 @@ impl<'a> Replay<'a> {
             .ego
             .drive(frame, self.frame_lines[index], &ground)
             .map_err(|cause| ReplayError::Ego { step: frame.step, cause: Box::new(cause) })?;
+        // Later poses differ because of the first.
         if self.report.diverged.is_none() {
             self.report.diverged = diverged;
         }
@@ -221,10 +225,13 @@ impl<'a> Replay<'a> {
         let mut next_image = 0;
         for pose in 0..frame.poses.len() {
             let selected = frame.due_cameras(pose, self.cameras.len());
+            // At the time between two frames of all cameras, nothing is due at the last pose.
             if selected.is_empty() {
                 continue;
             }
             let views = self.render_pose(frame, pose, &selected)?;
+            // The selection depends on the trusts of all images of the pose, so that it follows
+            // their rendering.
             self.check_decision(frame, index, &selected, &views, [pose, next_image]);
             self.check_delivery(frame, index, &selected, pose);
             for (view, &camera) in views.iter().zip(&selected) {
@@ -235,11 +242,15 @@ impl<'a> Replay<'a> {
                 let rendered = &self.images[camera];
 
                 // The rendered pixels, and those that the model makes of them.
+                // A repaired image has two hashes: as sent, in `images`, and as rendered, in
+                // `repairs`.
                 let recorded_rendered = match repair {
                     Some(RecordedImageRepair::Repaired(rendered)) => rendered,
                     Some(RecordedImageRepair::Failed(_)) | None => recorded,
                 };
                 let is_repaired = matches!(repair, Some(RecordedImageRepair::Repaired(_)));
+                // Effects come after the repair. The hash of a repaired image before it is
+                // therefore one without effects, and that of any other image one with them.
                 let mut sensed = None;
                 if let (Some(sensors), false) = (&self.sensors, is_repaired) {
                     let pixels = sensed.insert(rendered.rgb8.clone());
@@ -266,6 +277,8 @@ impl<'a> Replay<'a> {
                         let camera = mounted.name.clone();
                         ReplayError::Repair { step: frame.step, camera, cause: Box::new(cause) }
                     })?;
+                    // Without the recorded model, the repaired pixels are not known: the caller
+                    // sees the rendered ones.
                     match &mut repaired {
                         Some(pixels) => {
                             if let Some(sensors) = &self.sensors {
@@ -283,6 +296,7 @@ impl<'a> Replay<'a> {
                     step: frame.step,
                     pose,
                     camera: mounted,
+                    // What was sent, as far as it can be computed again.
                     rgb8: repaired.as_deref().unwrap_or(rendered_pixels),
                 };
                 visit(&image).map_err(|reason| {
@@ -290,6 +304,8 @@ impl<'a> Replay<'a> {
                     ReplayError::Visit { step: frame.step, camera, reason }
                 })?;
                 self.report.images += 1;
+                // The first of a pair that differs: with other rendered pixels, other repaired ones
+                // explain nothing.
                 let different = pairs.into_iter().find(|(recorded, now)| *recorded != now);
                 if let (Some((recorded, now)), None) = (different, &self.report.difference) {
                     self.report.difference = Some(ImageDifference {
@@ -324,6 +340,7 @@ impl<'a> Replay<'a> {
         let is_observe = frame.request == FrameRequest::Observe;
         let world_from_rig = &frame.poses[pose];
         let chosen = repair.decide(is_observe, world_from_rig, selected, views, &mut self.images);
+        // Images of the pose are in the order of its cameras.
         for (view, is_chosen) in chosen.into_iter().enumerate() {
             let recorded = frame.repairs.get(first_image + view).is_some_and(Option::is_some);
             if recorded != is_chosen && self.report.wrong_value.is_none() {
@@ -371,6 +388,7 @@ impl<'a> Replay<'a> {
         let views_of =
             |cameras: &[usize]| episode.views(self.cameras, cameras, frame.poses[pose], taken_us);
         let views = views_of(selected);
+        // If a camera may lose frames, levels of detail are chosen for more cameras than are drawn.
         let viewpoints = match &self.sensors {
             Some(sensors) => viewpoints(&views_of(&sensors.detail_for(frame, selected))),
             None => viewpoints(&views),
@@ -382,6 +400,7 @@ impl<'a> Replay<'a> {
         let detail = FrameDetail { viewpoints: &viewpoints, profile: self.profile };
         scene.place(self.actors.placed(taken_us, detail));
 
+        // `selected` rises, so that the targets are in the order of the views.
         let all = self.images.iter_mut().zip(self.cameras).enumerate();
         let mut targets: Vec<Target<'_>> = all
             .filter(|(camera, _)| selected.contains(camera))

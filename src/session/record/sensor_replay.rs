@@ -25,7 +25,9 @@ impl SensorReplay {
         };
         let wrong = |cause: SessionError| ReplayError::Sensors(Box::new(cause));
         let cameras = header.rig.cameras.clone();
+        // As `open` does: the file may have been changed.
         schedule.check(cameras.len(), header.dt_us).map_err(wrong)?;
+        // No maps: only the times and the effects of the layout are used here.
         let maps = PixelMaps::default();
         let layout =
             ObservationLayout::new(cameras, header.outputs.encoding, maps, schedule.clone());
@@ -44,11 +46,13 @@ impl SensorReplay {
         selected: &[usize],
         episode: &Episode,
     ) -> Option<[String; 2]> {
+        // `observe` shows the scene without effects.
         if frame.request == FrameRequest::Observe {
             return None;
         }
         let due_us = frame.due_us(pose);
         let recorded_us = frame.taken_us(pose);
+        // The recorded pose has to be where the ego was when the picture was taken.
         let is_there = episode.pose_at(recorded_us) == frame.poses[pose];
         let mut with_effects =
             selected.iter().filter(|camera| self.layout.sensor(**camera).is_some());
@@ -68,6 +72,7 @@ impl SensorReplay {
 
     /// The cameras for whose views the levels of detail of a frame are chosen.
     pub(super) fn detail_for(&self, frame: &FrameRecord, selected: &[usize]) -> Vec<usize> {
+        // As in the session: what is drawn must not depend on which frames were lost.
         match frame.request {
             FrameRequest::Observe => selected.to_vec(),
             _ => self.layout.detail_for(selected),

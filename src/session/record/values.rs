@@ -39,6 +39,8 @@ fn wrong_frame_hash(frame: &FrameRecord, rig_cameras: usize, line: usize) -> Opt
                 let is_last = pose + 1 == frame.poses.len();
                 let of_pose = frame.due_cameras(pose, rig_cameras).into_iter().zip(&mut images);
                 let is_due = frame.due_us.get(pose) == Some(&frame.time_us);
+                // Collected before the filter, which would otherwise leave the images of other
+                // poses in the iterator.
                 let of_pose: Vec<_> = of_pose.collect();
                 shown.extend(of_pose.into_iter().filter(|_| is_last || is_due));
             }

@@ -53,6 +53,7 @@ impl ReferenceInputs {
     /// Adds the image of the role `reference`, in the size of a camera's images.
     pub(crate) fn set_reference(&mut self, name: &str, reference: &Reference, camera: &Camera) {
         let [width, height] = [camera.width_px, camera.height_px].map(|side| side as usize);
+        // The model takes all images in one size.
         self.reference = Some(resized(&reference.image, width, height));
         self.nearest = Some(name.to_owned());
         self.names.push(name.to_owned());
@@ -94,6 +95,7 @@ impl WarpQuery<'_> {
         let is_seen =
             |view: &ReferenceView| overlaps(&target, &view.camera, &view.world_from_camera);
         let seen = references.into_iter().filter(is_seen);
+        // In the exposure of the view, and not much larger than it.
         seen.map(|view| view.exposed_for(self.camera).reduced_for(&self.camera.camera)).collect()
     }
 
@@ -110,8 +112,10 @@ impl WarpQuery<'_> {
         let warped = warp(&self.target(&depth_m), &images);
         let mut used: Vec<(usize, &String)> =
             warped.pixels.iter().copied().zip(references.iter().map(|(name, _)| name)).collect();
+        // A reference without a pixel in the result had no influence.
         used.retain(|(pixels, _)| *pixels > 0);
         used.sort_by(|(a, _), (b, _)| b.cmp(a));
+        // The name for the role `reference` may be there already.
         let left = MAX_REPORTED_REFERENCES.saturating_sub(inputs.names.len());
         inputs.names.extend(used.into_iter().take(left).map(|(_, name)| name.clone()));
         inputs.warped = Some((warped.image, warped.valid));
@@ -143,12 +147,14 @@ pub(crate) fn read(
     let image = Image { width, height, rgb8: rgb8.into_raw() };
     let size_px = [view.camera.width_px, view.camera.height_px];
     let mut image = resized(&image, size_px[0] as usize, size_px[1] as usize);
+    // First back to the light that it was taken in, and then to the exposure of the view.
     if let Some(stops) = recorded.exposure_stops {
         change_stops(&mut image.rgb8, -stops);
         if let Some(exposure) = &view.appearance.exposure {
             exposure.change_rgb8(&mut image.rgb8);
         }
     }
+    // A pixel of the mask counts or does not: grey is rounded to the nearer of both.
     let mask = catalog.view_mask(version, recorded)?.zip(recorded.mask.as_ref());
     let counts = match mask {
         None => None,
@@ -174,12 +180,14 @@ fn decoded(
     };
     let [width, height] = [camera.width_px, camera.height_px];
     let mut reader = ImageReader::new(std::io::Cursor::new(bytes));
+    // Before decoding: the header of a damaged file may claim any size.
     let mut limits = Limits::default();
     limits.max_image_width = Some(width);
     limits.max_image_height = Some(height);
     reader.limits(limits);
     let reader = reader.with_guessed_format().map_err(|error| damaged(error.to_string()))?;
     let image = reader.decode().map_err(|error| damaged(error.to_string()))?;
+    // The limits refuse larger images only.
     if [image.width(), image.height()] != [width, height] {
         let [w, h] = [image.width(), image.height()];
         return Err(damaged(format!("it has {w} x {h} px; its camera has {width} x {height}")));
@@ -200,6 +208,7 @@ pub(crate) fn draw(
     let views = [view.view()];
     let mut depth_m = vec![0.0; pixels];
     let mut opacity = vec![0.0; pixels];
+    // Pixels are drawn only if none were recorded. Depth always comes from the twin.
     let is_drawn = recorded.is_none();
     let blank = || Image {
         width: view.camera.width_px as usize,
@@ -216,6 +225,7 @@ pub(crate) fn draw(
         ..Target::default()
     };
     backend.render(&Frame { scene, profile, views: &views }, &mut [target], &|_, _| {})?;
+    // Where the twin lets light through, its depth is that of no surface.
     for (depth_m, opacity) in depth_m.iter_mut().zip(&opacity) {
         if *opacity < LEAST_OPACITY {
             *depth_m = 0.0;

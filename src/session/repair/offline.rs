@@ -117,6 +117,7 @@ impl ReferenceSupply<'_> {
     ) -> Result<ViewReferences, SessionError> {
         let &OfflineView { camera, rays, view, world_from_rig, rendered, kept } = of;
         let mut found = ViewReferences::default();
+        // First, as in a session: names are reported in this order.
         if needed.nearest {
             let pose = &view.world_from_camera;
             let nearest = views.nearest(camera, pose, world_from_rig, kept);
@@ -127,6 +128,7 @@ impl ReferenceSupply<'_> {
         }
         if needed.warped {
             let query = WarpQuery { camera, rays, view, image: rendered };
+            // Reading is measured in `timed`, and not a second time here.
             let started = Instant::now();
             let overlapping = query.overlapping(views.around(world_from_rig));
             found.warp = started.elapsed();
@@ -150,6 +152,7 @@ impl ReferenceSupply<'_> {
         found: &mut ViewReferences,
     ) -> Result<Arc<Reference>, SessionError> {
         let Self { resident, profile, backend, catalog, cache } = *self;
+        // The same key as in a session, with which the cache may be shared.
         let key = view.key(&resident.version.hash, &profile_hash(profile));
         if let Some(known) = cache.get(&key) {
             return Ok(known);
@@ -161,6 +164,7 @@ impl ReferenceSupply<'_> {
         let drawn = drawn::draw(view, image, projection, &scene, profile, backend);
         let reference = Arc::new(drawn?);
         cache.insert(key, reference.clone());
+        // Only what was not in memory counts.
         found.read += started.elapsed();
         found.read_count += 1;
         Ok(reference)
@@ -209,6 +213,7 @@ impl OfflineReferences {
         let had = table.len();
         let table = without(table, held_out);
         let left_out = had - table.len();
+        // There is nothing to read, and nothing to render with.
         let is_empty = table.is_empty() && cameras.is_empty();
         let views = if is_empty { None } else { ReferenceViews::new(version, table, cameras) };
         Ok(Self { resident, catalog, views, left_out })
@@ -229,6 +234,7 @@ impl OfflineReferences {
     /// # Errors
     /// [`SessionError::RepairUnavailable`].
     pub fn check_scale(model: &Model) -> Result<(), SessionError> {
+        // Without cameras, only the scale is left to check.
         session_repair::check_cameras(model, &[])
     }
 

@@ -116,6 +116,7 @@ impl ReferenceView {
         let exposure = &self.appearance.exposure;
         let stops = self.recorded.as_ref().and_then(|view| view.exposure_stops);
         let mask = self.recorded.as_ref().and_then(|view| view.mask.as_ref());
+        // Debug writes all digits of a float, so that values which differ have texts which differ.
         let text = format!(
             "{name} {camera:?} {world_from_camera:?} {image:?} {exposure:?} {stops:?} {mask:?}"
         );
@@ -134,9 +135,11 @@ impl ReferenceView {
     /// radian as the view. From an image with more, a view would sample only some pixels, and the
     /// next view different ones. A smaller image also takes less time and memory.
     pub(crate) fn reduced_for(mut self, camera: &Camera) -> Self {
+        // Pixels per radian near the axis, by the mean of both focal lengths.
         let px_per_rad = |camera: &Camera| (camera.pinhole.fx * camera.pinhole.fy).sqrt();
         let ratio = px_per_rad(&self.camera) / px_per_rad(camera);
         // The nearest power of two: the remaining ratio is between 0.7 and 1.4.
+        // Never enlarged, and at most by 2⁸.
         let halvings = ratio.log2().round().clamp(0.0, 8.0) as i32;
         if halvings == 0 {
             return self;
@@ -177,6 +180,7 @@ impl ReferenceViews {
     ) -> Option<Self> {
         let source =
             if table.is_empty() { ReferenceSource::Rendered } else { ReferenceSource::Recorded };
+        // A reference shows the scene at an instant: no part of the car, and no rolling shutter.
         let drawn_with = |camera: &RigCamera| {
             let exposure = camera.appearance.exposure;
             let appearance = Appearance { exposure, overlay: None };
@@ -190,6 +194,7 @@ impl ReferenceViews {
         }
         for view in table {
             let of = trajectories.iter().position(|drive| drive.name == view.trajectory);
+            // Images along a drive that the version does not have cannot be placed.
             let Some(drive) = of.and_then(|index| drives.get_mut(index)) else { continue };
             let at = drive.cameras.iter().position(|(name, _)| *name == view.camera_name);
             let at = at.unwrap_or_else(|| {
@@ -198,9 +203,11 @@ impl ReferenceViews {
             });
             drive.cameras[at].1.push(Arc::new(view));
         }
+        // By station, so that the first of two at the same distance is the lower one.
         for (_, views) in drives.iter_mut().flat_map(|drive| &mut drive.cameras) {
             views.sort_by(|a, b| a.station_m.total_cmp(&b.station_m));
         }
+        // A drive without images must not be the nearest one: nothing could be taken from it.
         if source == ReferenceSource::Recorded {
             drives.retain(|drive| !drive.cameras.is_empty());
         }
@@ -234,6 +241,7 @@ impl ReferenceViews {
                 (view.station_m - wanted_m).abs() <= MAX_STATION_DIFFERENCE_M
             };
             for view in self.at(&place, wanted_m).into_iter().filter(is_near) {
+                // Two places may share their nearest image.
                 if around.iter().all(|other| other.name != view.name) {
                     around.push(view);
                 }
@@ -261,6 +269,7 @@ impl ReferenceViews {
         let all: Vec<ReferenceView> =
             self.camera_views(&place, &camera.name).into_iter().filter(fits).collect();
         let nearest = all.iter().min_by(|a, b| distance_m(a).total_cmp(&distance_m(b)))?;
+        // The image of before is only kept while it fits.
         let kept = all.iter().find(|view| Some(&*view.name) == kept);
         let kept = kept.filter(|kept| distance_m(kept) - distance_m(nearest) < SWITCH_HYSTERESIS_M);
         Some(kept.unwrap_or(nearest).clone().exposed_for(camera))
@@ -274,6 +283,8 @@ impl ReferenceViews {
         if let Some(known) = find(&self.projections.lock()) {
             return known;
         }
+        // Without the lock, since it takes milliseconds. Two threads may add the same table, which
+        // only takes memory.
         let projection = Arc::new(Projection::from_camera(camera));
         let mut all = self.projections.lock();
         if all.len() < PROJECTIONS {
@@ -324,6 +335,7 @@ impl ReferenceViews {
                 let middle = self.step(place.drive, place.station_m);
                 let of: Vec<&RigCamera> =
                     self.cameras.iter().filter(|own| own.name == camera).collect();
+                // Infinity is clamped to the last step.
                 let most = self.step(place.drive, f64::INFINITY);
                 (middle.saturating_sub(around)..=(middle + around).min(most))
                     .flat_map(|step| of.iter().map(move |camera| (step, *camera)))
@@ -336,7 +348,9 @@ impl ReferenceViews {
     /// The nearest step of a drive at which the twin is rendered; the lower one of two at the same
     /// distance.
     fn step(&self, drive: &Drive, station_m: f64) -> usize {
+        // Whole steps within the length: the rest at the end has none.
         let last = (drive.length_m / STEP_M).floor();
+        // x - 1/2 rounded up is the nearest integer, and the lower one of two.
         (station_m / STEP_M - 0.5).ceil().clamp(0.0, last) as usize
     }
 
@@ -416,6 +430,7 @@ mod tests {
             position_m: DVec3::X * x_m,
             rotation: DQuat::from_rotation_y(turn_rad),
         };
+        // Within and beyond 5 cm and 0.02 rad; 3.1 rad is nearly the opposite direction.
         for (x_m, turn_rad, is_same) in [
             (1.0, 0.0, true),
             (1.04, 0.01, true),
@@ -436,6 +451,8 @@ mod tests {
     #[test]
     fn a_reference_is_halved_until_it_has_the_resolution_of_the_view() {
         let view = reference(100, 80.0, None).camera;
+        // Ratios of the focal lengths: 1, 0.5, then 1.4 and 1.44, below and above √2, then 2, 2 and
+        // 4.
         for (width_px, focal_px, wanted_px) in [
             (100, 80.0, 100),
             (50, 40.0, 50),
@@ -452,6 +469,7 @@ mod tests {
             assert_eq!(reduced.name, "log@2.00/front");
         }
         let large = reference(200, 160.0, None);
+        // The size is part of the identity: both may be in memory.
         assert_ne!(large.id(), large.clone().reduced_for(&view).id());
     }
 

@@ -44,11 +44,14 @@ impl SessionRepair {
         let name = &options.model;
         let unavailable =
             |reason: String| SessionError::RepairUnavailable { name: name.clone(), reason };
+        // A wrong name is a mistake of the request; anything else is one of the model.
         let model = models.get(name).map_err(|error| match error {
             RepairError::Unknown { name, known } => SessionError::UnknownRepair { name, known },
             other => unavailable(other.to_string()),
         })?;
         check_cameras(&model, cameras)?;
+        // A model that hangs is stopped after its time. With a shorter deadline, the whole step
+        // would fail.
         let timeout_ms = model.manifest().timeout_ms;
         if Duration::from_millis(timeout_ms) >= deadline {
             let must = format!(
@@ -164,6 +167,7 @@ pub(crate) fn check_references(
     };
     let is_missing = |camera: &&RigCamera| !views.has_camera(&camera.name);
     let missing = cameras.iter().find(is_missing);
+    // Only this role needs every camera: a warp takes the images of any.
     match missing.filter(|_| model.needs(InputRole::Reference)) {
         None => Ok(()),
         Some(RigCamera { name, .. }) => refused(format!(
@@ -197,6 +201,7 @@ pub(crate) fn repair_timed(
     let image = Image { width, height, rgb8: rgb8.clone() };
     let mut mask = Vec::new();
     let field = FieldMask::from_camera(&camera.camera);
+    // With a limited field, every model gets the mask, so that the result is black outside.
     if field.is_some() || model.needs(InputRole::Mask) {
         mask = vec![1.0; width * height];
     }
@@ -204,6 +209,7 @@ pub(crate) fn repair_timed(
         field.clear_outside(&camera.camera, 1, &mut mask);
     }
     let normals = planar(normals);
+    // Maps that the model does not ask for are empty, and an empty map is no input.
     let given = |role: InputRole, values| model.needs(role).then_some(values);
     let view = View {
         depth_m: given(InputRole::Depth, &depth_m[..]),
@@ -218,11 +224,13 @@ pub(crate) fn repair_timed(
     };
     let (repaired, times) = model.repair_timed(&view)?;
     let mut repaired = repaired.image.rgb8;
+    // The model may have changed the overlay, which is no part of the scene.
     if let Some(overlay) = &camera.appearance.overlay {
         let alphas = overlay.rgba8().chunks_exact(4).map(|pixel| u32::from(pixel[3]));
         let pixels = repaired.chunks_exact_mut(3).zip(rgb8.chunks_exact(3));
         for ((out, rendered), alpha) in pixels.zip(alphas) {
             for (out, rendered) in out.iter_mut().zip(rendered) {
+                // At most 255², and + 127 rounds the quotient to the nearest.
                 let sum = (255 - alpha) * u32::from(*out) + alpha * u32::from(*rendered);
                 *out = ((sum + 127) / 255) as u8;
             }
@@ -233,6 +241,7 @@ pub(crate) fn repair_timed(
 
 /// All x, then all y, then all z.
 fn planar(interleaved: &[f32]) -> Vec<f32> {
+    // The renderer writes the three values of a pixel side by side; a model takes planes.
     let axis = |axis: usize| interleaved.iter().skip(axis).step_by(3).copied();
     axis(0).chain(axis(1)).chain(axis(2)).collect()
 }

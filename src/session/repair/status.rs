@@ -36,6 +36,7 @@ impl RepairState {
     /// Resizes the state to one entry per camera.
     #[must_use]
     pub(crate) fn for_cameras(mut self, cameras: usize) -> Self {
+        // An empty list stands for cameras that are all off.
         self.is_on.resize(cameras, false);
         self.references.resize(cameras, None);
         self

@@ -58,10 +58,13 @@ impl Assets for StoredAssets<'_> {
             let actor = self.catalog.find_actor(name).map_err(|error| error.to_string())?;
             Ok(info(&actor))
         };
+        // An error is kept as well: other actors of this name get the same answer.
         entry.or_insert_with(find).clone()
     }
 
     fn default_for(&self, class: ActorClass, box_: &ActorBox) -> Result<Option<AssetInfo>, String> {
+        // Made once for all episodes. After a failure the list stays empty, so that it is reported
+        // once.
         let generated = self.generated.get_or_init(|| {
             generated_actors(self.catalog).unwrap_or_else(|reason| {
                 tracing::warn!("actors that name no asset are not drawn: {reason}");
@@ -149,6 +152,7 @@ impl FrameDetail<'_> {
         let RenderProfile { tau_px, reach_m, .. } = *self.profile;
         let placed = actors.filter_map(|placement| {
             let Placement { actor, asset, world_from_actor, world_from_actor_at_start } = placement;
+            // Too far from all viewpoints, it is not drawn.
             let chunk = asset.level(&world_from_actor, &viewpoints, tau_px, reach_m)?;
             let box_ = asset.description.box_;
             Some(PlacedChunk {

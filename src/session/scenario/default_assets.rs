@@ -17,11 +17,14 @@ pub fn generated_actors(catalog: &Catalog) -> Result<Vec<StoredActor>, String> {
     let mut all = Vec::new();
     let mut missing = Vec::new();
     for name in ActorModel::NAMES {
+        // By the source and not by the name, which any asset may have. One of another revision is
+        // missing.
         match stored.iter().find(|actor| actor.description.provenance.source == source(name)) {
             Some(actor) => all.push(actor.clone()),
             None => missing.push(name),
         }
     }
+    // In most cases; then no model is made.
     if missing.is_empty() {
         return Ok(all);
     }
@@ -46,6 +49,7 @@ pub(super) fn nearest<'a>(
     box_: &ActorBox,
 ) -> Option<&'a StoredActor> {
     let apart = |actor: &StoredActor| {
+        // By logarithms, half as long is as far off as twice as long.
         actor.description.box_.ratios(box_).map(|ratio| ratio.ln().abs()).iter().sum::<f64>()
     };
     let of_class = actors.iter().filter(|actor| actor.description.class == class);

@@ -116,6 +116,7 @@ impl Scenarios {
 
     /// The names of the scenarios, in order.
     pub fn names(&self) -> Vec<String> {
+        // A directory that cannot be read has no scenarios.
         let entries = std::fs::read_dir(&self.dir).into_iter().flatten().flatten();
         let files = entries.map(|entry| entry.path());
         let scenarios = files.filter(|path| path.extension().is_some_and(|name| name == "json"));
@@ -145,6 +146,7 @@ impl Scenarios {
                 let file = format!("{name}.json");
                 let unknown = || ScenarioError::Unknown { name: name.clone(), known: self.names() };
                 let path = self.dir.join(&file);
+                // What is no name is not looked up: it could be a path.
                 if !is_name(name) || !path.is_file() {
                     return Err(unknown());
                 }
@@ -174,6 +176,8 @@ impl Scenarios {
             });
         }
         let mut pins = Pins { latest, unpinned: Vec::new() };
+        // In the order in which a wrong version would show: another twin explains all other
+        // mistakes.
         pins.check("twin.version_hash", &mut file.twin.version_hash, version_hash)?;
         let wrong = |file: &str| {
             let file = file.to_owned();
@@ -183,6 +187,8 @@ impl Scenarios {
             None => None,
             Some(pin) => {
                 let bytes = self.read("map.file", &pin.file, MAP_BYTES)?;
+                // The hash before the contents, so that a file which was changed is reported as
+                // such.
                 pins.check("map.hash", &mut pin.hash, &hash_bytes(&bytes))?;
                 let map = MapFile::parse(&bytes).and_then(Map::new);
                 Some(map.map_err(wrong(&pin.file))?)
@@ -221,6 +227,7 @@ impl Scenarios {
         assets: &dyn Assets,
     ) -> Result<LoadedScenario, ScenarioError> {
         let document = self.document(source)?;
+        // Values of the caller replace the first ones of the sweep.
         let mut chosen = document.first_values();
         chosen.extend(values.iter().map(|(name, value)| (name.clone(), value.clone())));
         let file = document.with(&chosen);
@@ -267,6 +274,7 @@ impl Pins {
             }
             _ => {}
         }
+        // From here on the scenario names what was used, and its own hash covers that.
         *wanted = Some(found.to_owned());
         Ok(())
     }
@@ -279,10 +287,12 @@ fn hash_bytes(bytes: &[u8]) -> String {
 fn read_at_most(path: &Path, limit_bytes: usize) -> Result<Vec<u8>, String> {
     let file = File::open(path).map_err(|error| error.to_string())?;
     let metadata = file.metadata().map_err(|error| error.to_string())?;
+    // Of a pipe or a device, reading might never end.
     if !metadata.is_file() {
         return Err("it is not a file".to_owned());
     }
     let mut bytes = Vec::new();
+    // A byte more than the limit, to tell a file at the limit from a longer one.
     let read = file.take(limit_bytes as u64 + 1).read_to_end(&mut bytes);
     read.map_err(|error| error.to_string())?;
     if bytes.len() > limit_bytes {

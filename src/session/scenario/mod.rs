@@ -70,6 +70,7 @@ impl SessionScenario {
         let pinned = (&version.manifest, version.hash.as_str());
         let file = self.file.clone();
         let assets = StoredAssets::sharing(cache.catalog(), self.generated.clone());
+        // Pinned, never the latest: all episodes of a session play in the same files.
         let loaded = self.scenarios.resolve(file, seed, pinned, false, &assets)?;
         let actors = loaded.scenario.traffic.actors.iter();
         let assets = ActorAssets::load(cache, actors.map(|actor| actor.spec.asset.as_deref()))?;
@@ -79,6 +80,7 @@ impl SessionScenario {
     /// Takes the assets of an episode for all that follow: a name may stand for another asset
     /// later.
     pub(crate) fn pin_assets(&mut self, first: &LoadedScenario) {
+        // Both come from the same file, so that actors are in the same order.
         for (actor, pinned) in self.file.actors.iter_mut().zip(&first.scenario.file.actors) {
             actor.asset.clone_from(&pinned.asset);
             // An actor that got its asset by its size keeps this size.

@@ -19,6 +19,7 @@ impl ActorPast {
 
     /// Drops the states that no time from `time_us` on needs.
     pub(crate) fn drop_before(&mut self, time_us: i64) {
+        // The first state is needed until the second one is early enough to interpolate from.
         while self.0.len() > 1 && self.0[1].0 <= time_us {
             self.0.pop_front();
         }
@@ -35,15 +36,18 @@ impl ActorPast {
     /// last one, its pose is that at this time.
     pub(crate) fn poses_at(&self, time_us: i64) -> Vec<Option<Pose>> {
         let after = self.0.partition_point(|(past_us, _)| *past_us < time_us);
+        // After the last time, the last states. Without any states there is no actor.
         let Some((to_us, to)) = self.0.get(after).or(self.0.back()) else { return Vec::new() };
         let before = after.checked_sub(1).map(|before| &self.0[before]);
         // Exact at the end of a step: interpolation could round.
         let Some((from_us, from)) = before.filter(|_| *to_us > time_us) else {
             return poses(to);
         };
+        // Here from < time < to.
         let t = (time_us - from_us) as f64 / (to_us - from_us) as f64;
         let between = from.iter().zip(to.iter()).map(|(from, to)| {
             let (from, to) = (pose(from)?, pose(to)?);
+            // An actor that stands stays exactly where it is.
             Some(if from == to { to } else { from.interpolate(&to, t) })
         });
         between.collect()
@@ -83,6 +87,8 @@ mod tests {
         }
         let x_m = |past: &ActorPast, time_us| past.poses_at(time_us)[0].map(|p| p.position_m.x);
         let all = [-5, 0, 25, 100, 150, 200, 250, 300, 999].map(|time_us| x_m(&past, time_us));
+        // 25 is a quarter of the way from 1 m to 3 m. At 150 and 250 the actor is absent at one
+        // end.
         let wanted =
             [Some(1.0), Some(1.0), Some(1.5), Some(3.0), None, None, None, Some(7.0), Some(7.0)];
         assert_eq!(all, wanted);

@@ -105,6 +105,7 @@ impl EpisodeTraffic {
             kind: EventKind::Contact(contact),
         };
         let mut past = ActorPast::default();
+        // The first state is that of the start, from which the first step is interpolated.
         past.push(world.time_us(), world.states());
         Self {
             specs,
@@ -130,6 +131,7 @@ impl EpisodeTraffic {
     /// The traffic after a step of `dt_us` in which the ego went from one state to another.
     /// `with_twin` has the contacts with the twin that began in the step.
     fn stepped(&self, from: &Ego, to: &Ego, dt_us: i64, with_twin: &[Event]) -> Self {
+        // A copy, so that a step which fails later changes nothing.
         let mut next = self.clone();
         next.events.clear();
         let motion = EgoMotion::new(EgoState::new(from), to);
@@ -138,8 +140,10 @@ impl EpisodeTraffic {
         let specs = &self.specs;
         let mut contacts: Vec<Contact> = Vec::new();
         let mut presence: Vec<Event> = Vec::new();
+        // The world only says when a trigger fired: which ones fire in this step is the difference.
         let before: Vec<Vec<Option<i64>>> = next.fired_us();
         next.world.step(dt_us, &motion, &mut |sub_step| {
+            // By sub-step, because an actor may appear, be touched and leave within one step.
             let lanes = map.map(|map| lane_position(map, &sub_step.ego[1], &ego_box));
             contacts.extend(next.detector.advance(sub_step, specs, lanes));
             for (before, after) in sub_step.before.iter().zip(sub_step.after) {
@@ -162,6 +166,7 @@ impl EpisodeTraffic {
             }
         }
         next.events.append(&mut presence);
+        // Before the contacts become events.
         let has_contact = (self.twin_ends_episode() && !with_twin.is_empty())
             || contacts.iter().any(|contact| self.ends_episode(contact));
         next.events.extend_from_slice(with_twin);
@@ -171,7 +176,9 @@ impl EpisodeTraffic {
                 kind: EventKind::Contact(contact),
             }),
         );
+        // The last of the past states is always that of now.
         next.past.push(next.world.time_us(), next.world.states());
+        // After the events that it may be the consequence of.
         next.end(to, has_contact);
         settle(&mut next.events);
         next
@@ -188,11 +195,14 @@ impl EpisodeTraffic {
         with_twin: &[Vec<Event>],
     ) -> Self {
         let mut next = self.clone();
+        // Frames of this plan are at most as old as its beginning, their exposure and the reach of
+        // sensors.
         next.past.drop_before(self.world.time_us() - self.exposure_us - self.reach_us);
         let mut from = from;
         let mut events = Vec::new();
         for (ego, with_twin) in egos.iter().zip(with_twin) {
             next = next.stepped(from, ego, dt_us, with_twin);
+            // A step forgets the events of the one before it, so that they are collected here.
             events.append(&mut next.events);
             from = ego;
         }
@@ -205,6 +215,7 @@ impl EpisodeTraffic {
     fn end(&mut self, ego: &Ego, has_contact: bool) {
         let world_from_rig = ego.world_from_rig();
         let route = self.loaded.scenario.route.clone();
+        // Even after the end, since the rest of the plan is driven and observed.
         if let (Some(route), Some(progress)) = (&route, &mut self.progress) {
             *progress = route.after(progress, &world_from_rig);
         }
@@ -244,6 +255,7 @@ impl EpisodeTraffic {
             Some(ContactRule::Pedestrian) => class == ActorClass::Pedestrian,
             Some(ContactRule::Static) | None => false,
         };
+        // An overlap at the start is no fault of the driving.
         is_meant && !contact.at_start
     }
 
@@ -288,6 +300,7 @@ impl EpisodeTraffic {
             return Vec::new();
         }
         let poses_at = |time_us: i64| {
+            // The past begins at 0; the traffic computes where the actors were before.
             if time_us < 0 {
                 poses(&self.world.states_before(time_us))
             } else {
@@ -341,10 +354,13 @@ pub(crate) fn settle(events: &mut Vec<Event>) {
         EventKind::Contact(_) | EventKind::StaticContact { .. } => 1,
         EventKind::Trigger { .. } | EventKind::Appeared { .. } | EventKind::Left { .. } => 2,
     };
+    // Chosen by weight first, and by time among those of one weight.
     if events.len() > limits::EVENTS {
         events.sort_by_key(|event| (weight(event), event.time_us));
         events.truncate(limits::EVENTS);
     }
+    // A stable sort, and `false` before `true`: triggers, appearances and departures come before
+    // the contacts and the end of the same time.
     events.sort_by_key(|event| (event.time_us, weight(event) < 2));
 }
 
@@ -353,7 +369,9 @@ fn lane_position(map: &Map, ego: &EgoState, ego_box: &EgoBox) -> LanePosition {
     let body = Body::new(&ego.world_from_rig, &ego_box.box_, ego_box.center_x_m);
     let corners_m = body.footprint.corners_m();
     let lanes = corners_m.map(|corner_m| map.lanes_at(corner_m).collect::<Vec<_>>());
+    // A lane that has all four corners.
     let has_common = lanes[0].iter().any(|lane| lanes[1..].iter().all(|of| of.contains(lane)));
+    // An ego in no lane at all is off the road, and not between lanes.
     let in_any = lanes.iter().any(|of| !of.is_empty());
     LanePosition {
         in_multiple_lanes: in_any && !has_common,

@@ -23,6 +23,7 @@ impl Sensors {
         schedule: &Schedule,
         dt_us: i64,
     ) -> Result<Vec<CameraSensor>, SessionError> {
+        // A camera without settings has the default, which changes nothing.
         let mut by_index = vec![CameraSensor::default(); cameras.len()];
         for (name, sensor) in &self.cameras {
             let field = format!("sensors.cameras.{name}");
@@ -46,6 +47,7 @@ impl Sensors {
             number("sensors.wheel_speed.noise", noise, 0.0..=100.0)?;
             number("sensors.wheel_speed.scale", scale, 0.0..=0.5)?;
         }
+        // The whole delay in steps: decisions take effect at the start of a step.
         whole("sensors.delay_us", self.delay_us, dt_us, 0..=limits::BUNDLE_PERIOD_US)?;
         Ok(by_index)
     }
@@ -66,6 +68,7 @@ impl CameraSensor {
             number(&at("freeze.chance"), chance, 0.0..=1.0)?;
             whole(&at("freeze.for_us"), for_us, period_us, period_us..=SENSOR_REACH_US)?;
         }
+        // Each delay is within its limit, but a picture can be late, frozen and replaced.
         if !reach_us.contains(&self.reach_us(period_us)) {
             let must = format!(
                 "such that a picture may be {} µs old; at most {SENSOR_REACH_US} µs are accepted",
@@ -94,6 +97,7 @@ impl CameraSensor {
 }
 
 fn number(field: &str, value: f64, accepted: RangeInclusive<f64>) -> Result<(), SessionError> {
+    // NaN is in no range.
     if accepted.contains(&value) {
         return Ok(());
     }

@@ -61,6 +61,8 @@ impl Decisions {
         ground: &Ground<'_>,
     ) -> Result<Vec<Ego>, EgoError> {
         if let Command::Path(path) = command {
+            // The next decision is made after these steps, and takes effect after the delay: until
+            // then the path is followed.
             let end_us = dt_us * steps as i64 + self.delay_us;
             if path.end_us() < end_us {
                 return Err(EgoError::PathShort { end_us: path.end_us(), step_us: end_us });
@@ -75,14 +77,18 @@ impl Decisions {
         let mut egos: Vec<Ego> = Vec::with_capacity(steps);
         for step in 0..steps {
             let now_us = time_us + dt_us * step as i64;
+            // If the second decision is in effect, the first one is over.
             while self.made.get(1).is_some_and(|next| next.made_us + self.delay_us <= now_us) {
                 self.made.pop_front();
             }
             let before = egos.last().unwrap_or(ego);
+            // The first decision is in effect, or still waits. In that case all others wait too.
             let effective = self.made.front().filter(|made| made.made_us + self.delay_us <= now_us);
             egos.push(match effective {
                 None => before.stepped(&none_yet(before), dt_us, ground)?,
                 Some(Decision { made_us, world_from_rig, command }) => {
+                    // A path is in the frame of its decision: it goes on where it is at this time
+                    // and place.
                     let since_us = now_us - made_us;
                     before.resumed(&command.command()?, *world_from_rig, since_us, dt_us, ground)?
                 }

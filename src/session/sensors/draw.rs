@@ -19,6 +19,7 @@ static NORMAL: LazyLock<Box<[f32]>> = LazyLock::new(|| {
     for k in 0..QUANTILES / 2 {
         // Half a step from the median to the first.
         let way = if k == 0 { 0.5 } else { 1.0 } / QUANTILES as f64;
+        // `way` x `slope` is about the rise of z: parts of 0.005 of a standard deviation.
         let parts = (way * slope(z) * 200.0).ceil().max(1.0);
         let step = way / parts;
         for _ in 0..parts as usize {
@@ -30,6 +31,7 @@ static NORMAL: LazyLock<Box<[f32]>> = LazyLock::new(|| {
         }
         upper.push(z);
     }
+    // The mean is 0 by symmetry, so that the upper half has the variance of the whole.
     let variance = upper.iter().map(|z| z * z).sum::<f64>() / upper.len() as f64;
     let scaled = |z: &f64| (z / variance.sqrt()) as f32;
     upper.iter().rev().map(|z| -scaled(z)).chain(upper.iter().map(scaled)).collect()
@@ -42,6 +44,7 @@ pub(crate) fn normal_table() -> &'static [f32] {
 
 /// A sample of the standard normal distribution.
 pub(crate) fn standard_normal(random: &mut Random) -> f64 {
+    // The upper 16 bits are a uniform index into 65,536 quantiles.
     f64::from(NORMAL[(random.seed() >> 48) as usize])
 }
 
@@ -56,6 +59,7 @@ pub(crate) fn drift(seed: u64, name: &str, period_us: i64, time_us: i64) -> f64 
     // generator.
     let drawn = |index: i64| standard_normal(&mut Random::new(seed, name, index as usize));
     let (sin, cos) = (std::f64::consts::FRAC_PI_2 * part).sin_cos();
+    // cos² + sin² = 1 keeps the variance.
     drawn(index) * cos + drawn(index + 1) * sin
 }
 
@@ -73,6 +77,7 @@ mod tests {
     #[test]
     fn quantiles_are_those_of_the_normal_distribution() {
         for (p, z) in TABLE {
+            // The quantile k stands for the probability (k + 1/2) / 65,536.
             let place = p * QUANTILES as f64 - 0.5;
             let [low, high] = [place.floor(), place.ceil()].map(|k| f64::from(NORMAL[k as usize]));
             let at = low + (place - place.floor()) * (high - low);
@@ -86,6 +91,7 @@ mod tests {
         let count = QUANTILES as f64;
         assert!(sum.abs() < 1e-6, "{sum}");
         assert!((squares / count - 1.0).abs() < 1e-6);
+        // 3 for a normal distribution; cut off at 4.3, the tails are missing a little.
         assert!((fourth / count - 3.0).abs() < 0.02, "{}", fourth / count);
     }
 

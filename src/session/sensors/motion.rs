@@ -44,6 +44,7 @@ impl MotionSample {
     /// is no step, and both are equal.
     pub(crate) fn new(from: &Ego, to: &Ego, dt_us: i64, time_us: i64) -> Self {
         let rig_from_world = to.world_from_rig().rotation.inverse();
+        // Products of unit quaternions are only nearly of unit length.
         let turned =
             (from.world_from_rig().rotation.inverse() * to.world_from_rig().rotation).normalize();
         // The shorter of the two ways to turn.
@@ -58,7 +59,9 @@ impl MotionSample {
 
     /// The sample of the unit: specific force and angular velocity.
     pub(crate) fn imu(&self, imu: &Imu, seed: u64) -> [f32; 6] {
+        // Each step has a time of its own, and so noise of its own.
         let mut random = Random::new(seed, "imu/noise", self.time_us as usize);
+        // One stream for all axes: they are drawn in order.
         let mut axis = |index: usize| {
             let AxisNoise { noise, bias } =
                 if index < 3 { imu.accelerometer } else { imu.gyroscope };
@@ -75,6 +78,7 @@ impl MotionSample {
 
     /// The sample of the wheel speed.
     pub(crate) fn wheel_speed(&self, wheels: &WheelSpeed, seed: u64) -> f32 {
+        // Without the time: one value for the whole episode.
         let scale = standard_normal(&mut Random::new(seed, "wheels/scale", 0));
         let mut random = Random::new(seed, "wheels/noise", self.time_us as usize);
         let WheelSpeed { noise, scale: deviation } = wheels;
@@ -125,6 +129,7 @@ mod tests {
         let up = Pose { rotation: DQuat::from_rotation_y(-0.1), ..Pose::IDENTITY };
         let ego = Ego::new(Dynamics::default(), up);
         let [fx, fy, fz, ..] = MotionSample::new(&ego, &ego, DT_US, 0).imu(&exact(), 1);
+        // The front is up by 0.1 rad: what holds the car against gravity points forward in part.
         let expected = [9.80665 * 0.1_f64.sin(), 0.0, 9.80665 * 0.1_f64.cos()];
         for (measured, expected) in [fx, fy, fz].into_iter().zip(expected) {
             assert!((f64::from(measured) - expected).abs() < 1e-5, "{measured} {expected}");
@@ -149,6 +154,7 @@ mod tests {
             squares[6] += f64::from(sample.wheel_speed(&wheels, seed)).powi(2);
         }
         for (index, square) in squares.into_iter().enumerate() {
+            // At rest the scale has no effect: 0.2². Noise and bias of the unit are 0.3² + 0.4².
             let expected = if index == 6 { 0.04 } else { 0.09 + 0.16 };
             // Standard error of a variance: √(2/n) = 1.4 %.
             let variance = square / count as f64;
@@ -166,6 +172,7 @@ mod tests {
         };
         assert_eq!(at(0, 3), at(100_000, 3));
         assert_ne!(at(0, 3), at(0, 4));
+        // At most 4.3 deviations of 5 %: 20 x 0.05 x 4.3 = 4.3.
         assert!(at(0, 3) != 20.0 && (at(0, 3) - 20.0).abs() < 4.4);
     }
 }

@@ -70,11 +70,14 @@ impl PixelEffects {
         if !sensor.changes_pixels() {
             return None;
         }
+        // Lengths are in widths of the image, so that spots are round.
         let aspect = f64::from(height) / f64::from(width);
         let stops = sensor.exposure.map(|exposure| {
             let name = format!("{camera}/exposure");
             exposure.stops * drift(seed, &name, exposure.period_us, taken_us)
         });
+        // The time is the index, so that two pictures have different noise, and one picture always
+        // the same.
         let key = Random::new(seed, &format!("{camera}/noise"), taken_us as usize).seed();
         Some(Self {
             noise: sensor.noise,
@@ -89,9 +92,11 @@ impl PixelEffects {
     pub(crate) fn apply(&self, rgb8: &mut [u8], width: usize) {
         let normal = normal_table();
         let gain = self.stops.unwrap_or(0.0).exp2() as f32;
+        // σ² = L (1 / N) + (r / N)².
         let [per_light, dark] = self.noise.map_or([0.0; 2], |noise| {
             [1.0 / noise.full_well, (noise.read / noise.full_well).powi(2)].map(|one| one as f32)
         });
+        // Without spots, all pixels of all rows get the same share.
         let mut passing = vec![gain; width];
         for (row, pixels) in rgb8.chunks_exact_mut(3 * width).enumerate() {
             if !self.spots.is_empty() {
@@ -104,6 +109,8 @@ impl PixelEffects {
             {
                 let bits = match self.noise {
                     Some(_) => {
+                        // A function of the pixel's number and not a running stream: rows may be
+                        // computed in any order.
                         let counter = ((first + column) as u64).wrapping_mul(GOLDEN);
                         mix(self.key.wrapping_add(counter))
                     }
@@ -112,9 +119,13 @@ impl PixelEffects {
                 for (channel, value) in pixel.iter_mut().enumerate() {
                     let mut light = LINEAR[usize::from(*value)] * passing;
                     if self.noise.is_some() {
+                        // 16 of the 64 bits for each of three channels.
                         let n = normal[(bits >> (16 * channel)) as usize & 0xFFFF];
+                        // Light is not negative here, so that the root is real.
                         light += (light * per_light + dark).sqrt() * n;
                     }
+                    // + 0.5 rounds to the nearest step. The largest is 65,535.5, which is cut to
+                    // the last index.
                     let step = light.clamp(0.0, 1.0) * (ENCODE_STEPS - 1) as f32 + 0.5;
                     *value = STORED[step as usize];
                 }
@@ -128,10 +139,12 @@ impl PixelEffects {
         let y = (row as f32 + 0.5) / width;
         for &Spot { x, y: middle, radius } in &self.spots {
             let down = y - middle;
+            // Half of the chord in which the row cuts the spot; 0 if it passes by.
             let half = (radius * radius - down * down).max(0.0).sqrt();
             if half == 0.0 {
                 continue;
             }
+            // Rounded outwards: at the edge of a spot s is 1, and nothing changes.
             let first = ((x - half) * width).max(0.0) as usize;
             let end = ((x + half) * width).ceil().clamp(0.0, width) as usize;
             for (column, passing) in passing.iter_mut().enumerate().take(end).skip(first) {
@@ -150,6 +163,7 @@ const GOLDEN: u64 = 0x9E37_79B9_7F4A_7C15;
 /// one and a half times the mean.
 fn spots(dirt: &LensDirt, seed: u64, camera: &str, aspect: f64) -> Vec<Spot> {
     let spot = |index: u64| {
+        // Without the time: dirt stays where it is for an episode.
         let mut random = Random::new(seed, &format!("{camera}/dirt"), index as usize);
         Spot {
             x: random.unit() as f32,
@@ -220,6 +234,7 @@ mod tests {
         for apart in [1, 2, 3, width, width + 3] {
             let pairs = light.iter().zip(&light[apart..]).map(|(a, b)| a * b);
             let correlation = pairs.sum::<f64>() / light.len() as f64 / variance;
+            // The correlation of n independent pairs has a standard error of 1/√n.
             assert!(correlation.abs() < 5.0 / 3e5_f64.sqrt(), "{apart}: {correlation}");
         }
     }
@@ -246,6 +261,7 @@ mod tests {
             let expected = 255.0
                 * stored_from_linear((linear_from_stored(90.0 / 255.0) * stops.exp2()).min(1.0));
             let [value, ..] = applied(&sensor, 9, taken_us, 90)[..] else { panic!("no pixels") };
+            // Half a stored value from rounding, and a little from the table.
             assert!((f64::from(value) - expected).abs() < 0.6, "{value} {expected}");
         }
         let still = ExposureDrift { stops: 0.0, period_us: 1_000_000 };

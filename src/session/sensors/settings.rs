@@ -142,6 +142,7 @@ impl Sensors {
 
     /// Removes cameras that have no effect; `None` if nothing is left.
     pub(crate) fn used(mut self) -> Option<Self> {
+        // A camera without effects is the same as one that is not named, also in the record.
         self.cameras.retain(|_, camera| *camera != CameraSensor::default());
         (self != Self::default()).then_some(self)
     }
@@ -161,6 +162,7 @@ impl CameraSensor {
     /// How long before a frame is due the picture may have been taken that is shown instead, in
     /// microseconds.
     pub(crate) fn reach_us(&self, period_us: i64) -> i64 {
+        // A frame that replaces another one may itself be of a frozen picture: the ages add up.
         let frozen_us = self.freeze.map_or(0, |freeze| freeze.for_us);
         self.arrival_us(period_us) + frozen_us
     }
@@ -168,6 +170,7 @@ impl CameraSensor {
     /// Largest age, at the time when a frame is due, of the frame that may be delivered in its
     /// place, in microseconds.
     pub(crate) fn arrival_us(&self, period_us: i64) -> i64 {
+        // Of that many lost frames in a row, the oldest is delivered all the same.
         let dropped_us = self.drop.map_or(0, |_| SENSOR_DROPS * period_us);
         self.late.map_or(0, |late| late.by_us) + dropped_us
     }

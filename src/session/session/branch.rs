@@ -40,6 +40,8 @@ impl Session {
     /// The present state.
     fn present(&self) -> Snapshot {
         let step = self.state.episode.step();
+        // Without a file, no frame of this episode is on record: a branch has the origin that the
+        // episode has.
         let recorded = self.recorder.as_ref().map(|_| RecordedOrigin {
             episode: format!("{}-{}", self.name, self.episode_number),
             step,
@@ -58,6 +60,7 @@ impl Session {
     /// # Errors
     /// There is no such snapshot; otherwise as [`Session::step`].
     pub async fn restore(&mut self, name: &str) -> Result<Observation, SessionError> {
+        // The snapshot stays as it is, even if another one takes its name meanwhile.
         let snapshot = self.snapshots.find("name", name)?;
         let Snapshot { version, state, origin, .. } = &*snapshot;
         let mut episode = state.episode.clone();
@@ -70,6 +73,7 @@ impl Session {
         let simulation = SimulationState { episode: &episode, traffic: state.traffic.as_ref() };
         let deadline = Instant::now() + self.settings.deadline;
         let rendered = self.render(version, simulation, captures, Some(earlier), deadline).await?;
+        // Another version needs other memory for its worst frame.
         let mut bytes = None;
         if !version.has_same_version(&self.version) {
             let resident = version.resident.clone();
@@ -82,6 +86,8 @@ impl Session {
         let mut lines = simulation_lines(traffic, &state.events, &record, true);
         lines.push(Line::Frame(record));
         let file = self.create_file(version, origin.clone(), traffic, &episode, lines).await?;
+        // Nothing after this can fail. If this does, the file goes again, and the session stays as
+        // it was.
         if let Some(bytes) = bytes
             && let Err(error) = self.reservation.exchange(version.resident.clone(), bytes)
         {
@@ -91,6 +97,8 @@ impl Session {
         self.version = version.clone();
         self.end_recording(Outcome::Completed).await;
 
+        // Only for the least trust: whether the ego has left the area was decided when this state
+        // was reached.
         let _mean = episode.add_trusts(rendered.trusts());
         episode.set_repair_state(rendered.repair_state);
         self.begin(file, origin.clone());
@@ -115,6 +123,7 @@ impl Session {
         let Snapshot { settings, version, state, origin } = from;
         let extent = rig_extent(settings.layout.cameras());
         let frame = frame_bytes(&engine, &settings.layout, version.coverage.is_some());
+        // Memory for its own frames: a branch lives on without the session that it comes from.
         let resident = version.resident.clone();
         let reservation = Engine::reserve(resident, extent, version.profile, frame).await?;
         let (settings, version, state) = (settings.clone(), version.clone(), state.clone());
@@ -153,6 +162,7 @@ impl Session {
     ) -> Result<Self, SessionError> {
         let deadline = engine.step_timeout();
         let origin = continuation.origin().clone();
+        // All of them before the drive, which runs on a thread that cannot wait for them.
         for number in continuation.versions() {
             let twin = continuation.twin().to_owned();
             continuation.add_version(engine.open_version(twin, Some(number)).await?)?;
@@ -171,6 +181,7 @@ impl Session {
             Some(settings) => settings,
             None => RecordedSettings::with_defaults(cameras.len(), header.dt_us),
         };
+        // The file may have been changed, so that its values are checked as those of a request are.
         recorded.schedule.check(cameras.len(), header.dt_us)?;
         let overlays = engine.answer_budget().reserve(overlay_bytes(&cameras))?;
         let extent = rig_extent(&cameras);
@@ -198,6 +209,7 @@ impl Session {
             warm_up_us: recorded.warm_up_us,
             dt_us: header.dt_us,
             deadline,
+            // Only prefetching follows it, and a record does not name it.
             drive: None,
             scenario: None,
             reports_actors: false,
@@ -219,6 +231,7 @@ impl Session {
         .await?;
         let frame = frame_bytes(&engine, &settings.layout, version.coverage.is_some());
         let reservation = Engine::reserve(driven.version, extent, driven.profile, frame).await?;
+        // A record with a scenario was refused, so that there is no traffic.
         let state = EpisodeState::at_start(driven.episode.clone());
         let mut session =
             Self::assembled(engine, name, Arc::new(settings), reservation, version, state);
@@ -234,6 +247,7 @@ impl Session {
         kept: Vec<KeptFrames>,
         recorded_by: &str,
     ) -> Result<(), SessionError> {
+        // In the order in which they were taken, each with the state and the version of its time.
         for KeptFrames { episode, version, profile, frames } in kept {
             let coverage_for = self.version.coverage.as_ref().map(|_| "outputs.trust");
             let version = prepare(&self.engine, version, profile, coverage_for, None).await?;
@@ -242,6 +256,7 @@ impl Session {
             let simulation = SimulationState { episode: &episode, traffic: None };
             let deadline = Instant::now() + self.settings.deadline;
             let rendered = self.render(&version, simulation, captures, history, deadline).await?;
+            // Each capture has one camera, so that hashes and frames correspond.
             for (frame, now) in frames.iter().zip(&rendered.hashes) {
                 if now.to_hex().as_str() != frame.hash {
                     let camera = self.cameras()[frame.camera].name.clone();

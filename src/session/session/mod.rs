@@ -138,6 +138,7 @@ impl Session {
 
     /// Whether images come with their trust.
     pub fn trust(&self) -> bool {
+        // With repair there is a coverage even if the client did not ask for the trust.
         let is_reported = self.settings.repair.as_ref().is_none_or(|repair| repair.reports_trust);
         self.version.coverage.is_some() && is_reported
     }

@@ -79,6 +79,7 @@ impl Session {
             })
             .await??
         };
+        // Counted as long as the settings exist, which the session shares with its branches.
         let overlays = engine.answer_budget().reserve(overlay_bytes(&rig.cameras))?;
         let extent = rig_extent(&rig.cameras);
 
@@ -114,6 +115,7 @@ impl Session {
         if let Some(sensors) = options.sensors.and_then(Sensors::used) {
             layout.add_sensors(sensors, dt_us)?;
         }
+        // Last, because its check covers what the others have added.
         if let Some(opened) = &opened {
             let actors = opened.resolved().traffic.actors.len();
             layout.reserve_header(if opened.asked.actors { actors } else { 0 })?;
@@ -131,6 +133,7 @@ impl Session {
         let drive = drive_to_follow(&manifest.trajectories, options.start.as_ref());
         let drive = drive.map(|drive| Arc::new(RecordedDrive::new(drive)));
 
+        // The same seed as for the start, as in every later episode.
         let episode = start
             .episode(options.seed, options.dynamics, dt_us)
             .with_sensors(layout.episode_sensors());
@@ -164,6 +167,7 @@ impl Session {
 
         // Prepare the version for its frames, and reserve the memory for the worst frame anywhere
         // in the twin.
+        // An error about the coverage names the field that needs it.
         let coverage_for = match (outputs.trust, &settings.repair) {
             (true, _) => Some("outputs.trust"),
             (false, Some(_)) => Some("repair"),
@@ -172,6 +176,7 @@ impl Session {
         let profile = resolve_profile(&engine, &resident, &settings)?;
         let version = prepare(&engine, resident.clone(), profile, coverage_for, solid_ego).await?;
         let frame = frame_bytes(&engine, &settings.layout, version.coverage.is_some());
+        // After the profile is known: coarser levels of detail need less memory.
         let reservation = Engine::reserve(resident.clone(), extent, version.profile, frame).await?;
         let references = load_references(&engine, &resident, &settings).await?;
         let version = version.with_references(references);
@@ -246,6 +251,7 @@ impl Session {
         self.reservation.exchange(resident, bytes)?;
         self.version = version.with_references(references);
         self.version_switched = true;
+        // Where the ego is comes first, because the next frame is there.
         let mut places = vec![(Urgency::Imminent, self.state.episode.world_from_rig())];
         places.extend(self.forecast().places());
         self.prefetch_at(places);
@@ -270,6 +276,7 @@ impl OpenedScenario {
         let engine = engine.clone();
         let version = resident.version.clone();
         let seed = options.seed;
+        // A start that the request names is that of all its episodes, whatever the scenario says.
         let gives_start = options.start.is_none();
         run_blocking(move || {
             let scenarios = engine.scenarios().clone();
@@ -371,6 +378,7 @@ pub(super) fn solid_ego(
 ) -> Option<EgoBox> {
     let is_off = contact == Some(ContactMode::Off)
         || scenario.is_some_and(|scenario| scenario.file.verdict.twin_contact == Some(false));
+    // The size of the scenario's ego, with which its contacts with actors are looked for too.
     let ego_box = scenario.map_or_else(EgoBox::default, |scenario| scenario.traffic.ego_box);
     (!is_off).then_some(ego_box)
 }
@@ -390,6 +398,7 @@ fn check_deadline(
     step_timeout: Duration,
 ) -> Result<Duration, SessionError> {
     let deadline = deadline.unwrap_or(step_timeout);
+    // A longer deadline would never be reached: the server ends a step after its own.
     if deadline.is_zero() || deadline > step_timeout {
         let must =
             format!("{deadline:?}; more than zero and at most {step_timeout:?} are accepted");
@@ -431,6 +440,7 @@ fn select_cameras(
             let field = format!("outputs.cameras[{index}]");
             SessionError::UnknownCamera { field, name: name.clone(), known }
         })?;
+        // Names are unique in a rig, so that an equal camera is the same one.
         if selected.contains(camera) {
             return Err(SessionError::CameraTwice { index, name: name.clone() });
         }
@@ -451,6 +461,7 @@ fn crop_and_scale(mut rig: Rig, outputs: &Outputs) -> Result<Rig, SessionError> 
         let part = outputs.images.get(&camera.name).copied().unwrap_or_default();
         let cropped = part.crop.map_or(full, |[_, _, width, height]| [width, height]);
         let [width, height] = part.size.unwrap_or(cropped);
+        // The sizes are those of the request, and unchecked so far.
         width.saturating_mul(height)
     };
     let overlaid = rig.cameras.iter().filter(|camera| camera.appearance.overlay.is_some());
@@ -464,6 +475,7 @@ fn crop_and_scale(mut rig: Rig, outputs: &Outputs) -> Result<Rig, SessionError> 
             return Err(SessionError::UnknownCamera { field, name: name.clone(), known });
         };
         let camera = &mut rig.cameras[index];
+        // First the crop, in pixels of the rig's camera, and then the size of what is left.
         if let Some([left, top, width, height]) = *crop {
             let cropped = camera.cropped([left, top], [width, height]);
             *camera = cropped
@@ -480,6 +492,7 @@ fn crop_and_scale(mut rig: Rig, outputs: &Outputs) -> Result<Rig, SessionError> 
 
 /// The properties of a rig that determine how much memory its frames need.
 pub(super) fn rig_extent(cameras: &[RigCamera]) -> RigExtent {
+    // At the origin, the position of a camera is its distance from the rig.
     let viewpoints = viewpoints(&View::from_rig(cameras, Pose::IDENTITY));
     RigExtent {
         focal_px: viewpoints.iter().fold(0.0, |most, one| one.focal_px.max(most)),
@@ -493,6 +506,7 @@ pub(super) fn frame_bytes(
     layout: &ObservationLayout,
     has_trust: bool,
 ) -> FrameBytes {
+    // Buffers depend on sizes and not on places.
     let views = View::from_rig(layout.cameras(), Pose::IDENTITY);
     engine.frame_bytes(&views, layout.rendered_bytes(has_trust), layout.answers_bytes())
 }
@@ -504,6 +518,7 @@ fn drive_to_follow<'a>(drives: &'a [Trajectory], start: Option<&Start>) -> Optio
             Start::Station { trajectory, .. }
             | Start::Random(RandomStart { trajectory: Some(trajectory), .. }),
         ) => drives.iter().find(|drive| drive.name == *trajectory),
+        // A pose may be near any drive: the forecast tests whether it is near this one.
         Some(Start::Pose(_) | Start::Random(_)) | None => drives.first(),
     }
 }
@@ -539,6 +554,7 @@ async fn training_coverage(
     // Blocking: a long drive has half a million keyframes and blocks.
     let coverage = run_blocking(move || TrainingCoverage::new(&resident.version.manifest)).await?;
     coverage.map(Arc::new).ok_or_else(|| {
+        // One is an object and the other one a flag.
         let set = if field == "repair" { "set" } else { "true" };
         let must = format!("{set}, and the twin has no recorded drive to compare with");
         SessionError::OutOfRange { field, must }

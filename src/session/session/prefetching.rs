@@ -31,6 +31,7 @@ impl Session {
 
     /// After a step: measures the agent's pace and prefetches for the next steps.
     pub(super) fn look_ahead(&mut self) {
+        // Real time, with what the agent needs to decide: that is the time there is for loading.
         self.frame_interval = self.last_frame_at.elapsed();
         self.last_frame_at = Instant::now();
         self.hint = remaining_hint(&self.hint, self.state.episode.world_from_rig()).to_vec();
@@ -41,9 +42,11 @@ impl Session {
     pub(super) fn forecast(&self) -> EgoForecast<'_> {
         let (shortest, longest) = limits::PREFETCH_AHEAD;
         let ahead = (3 * self.resident().load_p99()).clamp(shortest, longest);
+        // Less than 1 ms counts as 1 ms, so that this never divides by 0.
         let steps = ahead.as_secs_f64() / self.frame_interval.as_secs_f64().max(1e-3);
         EgoForecast {
             world_from_rig: self.state.episode.world_from_rig(),
+            // The displacement of a step, if the velocity stays.
             last_step_m: self.state.episode.ego().velocity_m_s()
                 * (self.settings.dt_us as f64 * 1e-6),
             steps: (steps.ceil() as usize).min(limits::STEPS_AHEAD),
@@ -55,6 +58,7 @@ impl Session {
     /// Loads in the background the sections that are visible from some poses, in place of an
     /// earlier prefetch.
     pub(super) fn prefetch_at(&self, places: Vec<(Urgency, Pose)>) {
+        // Copies of all that the task needs: it may run while later steps change the session.
         let prefetcher = self.reservation.prefetcher().clone();
         let layout = self.settings.layout.clone();
         let profile = self.version.profile;
@@ -66,6 +70,7 @@ impl Session {
         let velocity_mps = self.state.episode.ego().velocity_m_s();
         let onwards = [1.0, 2.0].map(|s| Pose { position_m: here_m + s * velocity_mps, ..here });
         self.prefetch_task.submit(move || {
+            // Poses of both lists, before `places` becomes viewpoints.
             let is_near = |pose: &&Pose| pose.position_m.distance(here_m) < limits::SOLIDS_AHEAD_M;
             let near: Vec<Pose> = places
                 .iter()

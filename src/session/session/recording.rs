@@ -30,16 +30,20 @@ impl Session {
         events: &[Event],
     ) -> Result<(), SessionError> {
         let is_first = self.recorder.is_none();
+        // The first frame of a file also needs the actors of the state that it begins with.
         let shown = traffic.or(self.state.traffic.as_ref().filter(|_| is_first));
         let mut lines = simulation_lines(shown, events, &frame, is_first);
         lines.push(Line::Frame(frame));
         match self.recorder.clone() {
             Some(recorder) => {
+                // Together with the frame, so that a switch before a failed frame is not on record.
                 let version = self.version_switched.then(|| self.version_line());
                 append(recorder, version.into_iter().chain(lines).collect()).await?;
             }
             None => {
                 let origin = self.origin.clone();
+                // The state before the step: a replay begins with it, and executes the command of
+                // the first frame.
                 let before = &self.state;
                 let traffic = before.traffic.as_ref();
                 let file = self
@@ -49,6 +53,7 @@ impl Session {
                 self.episode_number = file.number;
             }
         }
+        // Only now: after a failure, the next frame has to write the switch.
         self.version_switched = false;
         Ok(())
     }
@@ -68,10 +73,12 @@ impl Session {
         let is_timed = self.settings.scenario.is_some()
             || layout.sensors().is_some_and(|sensors| !sensors.cameras.is_empty());
         let needs_times = is_timed && captures.len() > 1;
+        // The times at which frames were due are only needed where they differ.
         let is_other = captures.iter().any(|capture| capture.due_us != capture.time_us);
         let due_us = captures.iter().map(|capture| capture.due_us);
         let times_us = captures.iter().map(|capture| capture.time_us).collect();
         let mut cameras: Vec<_> = captures.iter().map(|capture| capture.cameras.clone()).collect();
+        // All cameras at all poses are the usual case, which records leave out.
         if cameras.iter().all(|of_pose| of_pose.len() == all_cameras) {
             cameras.clear();
         }
@@ -144,17 +151,20 @@ impl Session {
             dt_us: settings.dt_us,
             settings: recorded_settings(settings, self.trust()),
             repair: settings.repair.as_deref().map(RecordedRepair::from_repair),
+            // A plain start follows from seed, dynamics and pose, which the header has anyway.
             state: (!episode.is_start_alone()).then(|| episode.clone()),
             origin,
             scenario: traffic.map(|traffic| traffic.loaded().hash.clone()),
         };
         let dir = self.engine.episodes().to_owned();
         let name = self.name.clone();
+        // The first number to try; another server may have used it.
         let first_number = self.episode_number + 1;
         let scenario = traffic.map(|traffic| {
             let loaded = traffic.loaded();
             let drives = &version.manifest.trajectories;
             let line = ScenarioLine {
+                // The session may have switched it off.
                 checks_static: pinned.solids.is_some(),
                 ..scenario_line(&loaded.scenario, loaded.map.as_ref(), &loaded.hash, drives)
             };
@@ -170,6 +180,7 @@ impl Session {
     /// Writes the last line of the episode's file, and lets it be exported. A failure is only
     /// logged: the episode is over either way.
     pub(super) async fn end_recording(&mut self, outcome: Outcome) {
+        // Taken first, so that an episode never gets two ends.
         let Some(recorder) = self.recorder.take() else { return };
         let summary = self.state.episode.summary(outcome);
         let mut lines = Vec::new();
@@ -212,7 +223,10 @@ fn traffic_lines(traffic: &EpisodeTraffic, frame: &FrameRecord, is_first: bool) 
     let warm_up_us = frame.times_us.iter().copied().filter(|time_us| *time_us < 0);
     let warm_up =
         warm_up_us.map(|time_us| ActorsLine::new(step, time_us, &traffic.states_before(time_us)));
+    // The first frame of a file has all that the past holds, as its frames may show it. Otherwise
+    // the past may hold fewer steps than were made.
     let count = traffic.last_steps(if is_first { usize::MAX } else { steps as usize }).count();
+    // The last of the states is that of `step`.
     let before = (step + 1).saturating_sub(count as u64);
     let of_steps = (before..).zip(traffic.last_steps(count));
     let of_steps = of_steps.map(|(step, (time_us, states))| ActorsLine::new(step, time_us, states));
@@ -249,6 +263,7 @@ fn recorded_settings(settings: &SessionSettings, trust: bool) -> Option<Recorded
         contact: settings.contact,
     };
     let cameras = settings.layout.cameras().len();
+    // Compared as a whole, so that a field which is added later is not forgotten.
     (recorded != RecordedSettings::with_defaults(cameras, settings.dt_us)).then_some(recorded)
 }
 

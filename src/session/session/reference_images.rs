@@ -37,6 +37,7 @@ impl Session {
         deadline: Instant,
     ) -> Result<ObservationBuilder, SessionError> {
         let started = Instant::now();
+        // The builder goes to the thread and back, because the search adds to its candidates.
         let find = {
             let views = views.clone();
             move || {
@@ -47,6 +48,7 @@ impl Session {
         let (wanted, found) = run_blocking(find).await?;
         builder = found;
         let mut references = HashMap::with_capacity(wanted.len());
+        // One after the other: like its frames, each has its turn among those of other sessions.
         for view in wanted {
             let id = view.id();
             let reference = self.reference(version, views, view, deadline);
@@ -81,9 +83,11 @@ impl Session {
             }
         };
         let read = timeout_at(deadline, run_blocking(read)).await;
+        // Too late, a panic, and an error of the store.
         let (image, projection) = read.map_err(|_| SessionError::DeadlineExceeded)???;
         let profile = version.profile;
         let places = viewpoints(&[view.view()]);
+        // Pinned until it is drawn, as the scene of any frame is.
         let pinned = pin(version.resident.clone(), profile, deadline, places).await?;
         let cost = FrameCost { session: self.number, pixels: view.camera.pixels() as u64 };
         let work = move |_: &mut Scratch, backend: &dyn wildcity_render::Backend| {
@@ -91,6 +95,7 @@ impl Session {
         };
         let (drawn, _queued): (_, Duration) = self.engine.run(cost, deadline, work).await?;
         let reference = Arc::new(drawn?);
+        // Two sessions may have drawn the same one meanwhile. Both are equal.
         repairs.references().insert(key, reference.clone());
         Ok(reference)
     }

@@ -79,6 +79,7 @@ impl Session {
         let deadline = Instant::now() + self.settings.deadline;
         let now = &self.state.episode;
         let (mut next, egos) = self.moved(&command, steps, options.terminate)?;
+        // On copies of the states: traffic needs them afterwards.
         let met = self.meetings(now, egos.clone(), deadline).await?;
         let traffic = self.state.traffic.as_ref();
         let dt_us = self.settings.dt_us;
@@ -101,12 +102,14 @@ impl Session {
             }
         }
 
+        // A copy: the session keeps its own until the step is on record.
         let frame_history = self.state.frame_history.clone();
         let captures = self.settings.layout.captures(&next, &frame_history);
         let simulation = SimulationState { episode: &next, traffic: traffic.as_ref() };
         let rendered =
             self.render(&self.version, simulation, captures, Some(frame_history), deadline).await?;
         let happened = traffic.as_ref().map_or(events.as_slice(), EpisodeTraffic::events);
+        // An ego that failed first has not left the area by what came after.
         let failed_us = next.is_failed().then(|| first_failure_us(happened)).flatten();
         let left = left_model(&mut next, met.off_model, &rendered, failed_us);
         if let Some(event) = left {
@@ -115,6 +118,8 @@ impl Session {
         settle(&mut events);
 
         let mut record = self.frame_record(FrameRequest::Step, &next, &rendered);
+        // With a delay, the pose at the end is not the one that was commanded, so that every
+        // command is on record.
         record.command = if now.is_delayed() {
             Some(RecordedCommand::from_command(&command))
         } else {
@@ -123,10 +128,12 @@ impl Session {
         record.notes = options.notes;
         if steps > 1 {
             record.steps = steps as u64;
+            // Without them, frames before the last one would count as those of a warm-up.
             record.times_us = rendered.captures.iter().map(|capture| capture.time_us).collect();
         }
         self.record(record, traffic.as_ref(), &events).instrument(debug_span!("record")).await?;
 
+        // Nothing fails from here on.
         next.set_repair_state(rendered.repair_state);
         let frame_history = rendered.frame_history;
         self.state = EpisodeState { episode: next, frame_history, traffic, events };
@@ -156,6 +163,7 @@ impl Session {
         deadline: Instant,
     ) -> Result<Meetings, SessionError> {
         let solids = self.version.solids.clone();
+        // An ego that has left the area once is not looked for again.
         let recorded = self.version.index.recorded().filter(|_| !now.is_off_model()).cloned();
         let from = now.ego().clone();
         let (begin_us, dt_us) = (now.time_us(), self.settings.dt_us);
@@ -170,6 +178,8 @@ impl Session {
             let off_model = trusts.into_iter().find(|(_, trust)| *trust < limits::OFF_MODEL_TRUST);
             Ok::<_, SessionError>(Meetings { contacts, off_model })
         };
+        // After the deadline the thread still ends its work, and what it has read serves the next
+        // try.
         let found = timeout_at(deadline, run_blocking(find)).await;
         found.map_err(|_| SessionError::DeadlineExceeded)??
     }
@@ -185,6 +195,7 @@ impl Session {
         let dt_us = self.settings.dt_us;
         let Some(until_us) = until_us else { return Ok(1) };
         let refused = |must: String| SessionError::OutOfRange { field: "until_us", must };
+        // A single step may be longer than the longest plan.
         let most_us =
             dt_us.saturating_mul(limits::PLAN_STEPS as i64).min(limits::PLAN_US.max(dt_us));
         if !(dt_us..=most_us).contains(&until_us) || until_us % dt_us != 0 {
@@ -197,6 +208,7 @@ impl Session {
                 "several steps, and a pose is reached with one: send a trajectory or an action";
             return Err(refused(format!("{until_us} µs, {must}")));
         }
+        // At most `PLAN_STEPS`.
         Ok((until_us / dt_us) as usize)
     }
 
@@ -209,6 +221,7 @@ impl Session {
             let must = format!("{}; 1 to {} are accepted", poses.len(), limits::OBSERVE_POSES);
             return Err(SessionError::OutOfRange { field: "poses", must });
         }
+        // A copy, because recording needs the session mutably.
         let episode = self.state.episode.clone();
         let captures = self.settings.layout.captures_at(&episode, poses);
         let simulation =
@@ -254,6 +267,8 @@ impl Session {
                 Some(run_blocking(find).await??)
             }
         };
+        // The request, then the session's random start, then the scenario. Without any, the
+        // session's start.
         let start = start
             .or_else(|| settings.random_start.clone().map(Start::Random))
             .or_else(|| settings.scenario.as_ref()?.start(&loaded.as_ref()?.loaded));
@@ -291,6 +306,7 @@ impl Session {
         let deadline = Instant::now() + self.settings.deadline;
         let rendered =
             self.render(&self.version, simulation, captures, Some(frame_history), deadline).await?;
+        // Judged like every later pose, so that an episode can begin outside of the area.
         let trust = self.version.index.recorded().map(|at| at.trust(&next.world_from_rig()));
         let off_model =
             trust.filter(|trust| *trust < limits::OFF_MODEL_TRUST).map(|trust| (0, trust));
@@ -304,6 +320,7 @@ impl Session {
         let before = traffic.as_ref();
         let mut lines = simulation_lines(before, &events, &record, true);
         lines.push(Line::Frame(record));
+        // Before the old episode ends: if there is no new file, the old one goes on.
         let file = self.create_file(&self.version, None, before, &next, lines).await?;
         self.end_recording(Outcome::Completed).await;
 
@@ -353,10 +370,12 @@ impl Session {
             &captures,
         )?
         .with_repair(self.settings.repair.clone().map(|repair| {
+            // Without history, the poses are not the ego's, and no state of the repair is kept.
             let state = history.is_some().then(|| episode.repair_state());
             ObservationRepair::new(repair, layout.cameras().len(), state)
         }));
         for capture in captures {
+            // Nothing is due, but the observation has a time and a history.
             if capture.cameras.is_empty() {
                 builder.add_capture(capture);
                 continue;
@@ -376,9 +395,11 @@ impl Session {
             builder.add_load(pinned.waited_for, pinned.waited);
             let pixels = views.iter().map(|view| view.camera.pixels() as u64).sum();
             let cost = FrameCost { session: self.number, pixels };
+            // The builder goes to the render thread with the work, and comes back with the result.
             let work = move |scratch: &mut Scratch, backend: &dyn Backend| {
                 let frame = Frame { scene: &pinned, profile: &profile, views: &views };
                 let rendered = builder.render(&capture, &frame, backend, scratch);
+                // In any case, and before the repair, which looks at the last capture.
                 builder.add_capture(capture);
                 rendered.map(|()| builder)
             };
@@ -391,6 +412,8 @@ impl Session {
                 }
                 let repaired = run_blocking(move || builder.repair().map(|()| builder));
                 let repaired = repaired.instrument(debug_span!("repair"));
+                // A model that hangs ends with its own timeout; the session does not wait for it
+                // longer than for a frame.
                 let in_time = timeout_at(deadline, repaired).await;
                 builder = in_time.map_err(|_| SessionError::DeadlineExceeded)???;
             }
@@ -427,9 +450,12 @@ fn left_model(
     rendered: &RenderedObservation,
     failed_us: Option<i64>,
 ) -> Option<Event> {
+    // First of all, because the least trust counts every observation.
     let of_images = next.add_trusts(rendered.trusts());
     let is_low = of_images.filter(|trust| *trust < limits::OFF_MODEL_TRUST);
+    // The poses of all steps come before the images of the last one.
     let (time_us, trust) = off_model.or(is_low.map(|trust| (next.time_us(), trust)))?;
+    // At the same time, the failure counts.
     if next.is_off_model() || failed_us.is_some_and(|failed_us| failed_us <= time_us) {
         return None;
     }

@@ -49,8 +49,12 @@ impl<T> FairQueue<T> {
 
     /// Adds a frame.
     pub(super) fn push(&mut self, cost: FrameCost, item: T) {
+        // Without an entry its last finish is not later than the virtual time, so that 0 does as
+        // well.
         let before = self.finished.get(&cost.session).copied().unwrap_or_default();
         let start = before.max(self.virtual_time);
+        // A frame without pixels costs 1, so that its tag rises too. At 2²⁷ pixels a frame, tags
+        // saturate after 2³⁷ frames.
         let finish = start.saturating_add(cost.pixels.max(1));
         self.finished.insert(cost.session, finish);
         self.arrivals += 1;
@@ -60,8 +64,11 @@ impl<T> FairQueue<T> {
     /// Takes the next frame that has at most `most_pixels` pixels.
     pub(super) fn pop(&mut self, most_pixels: u64) -> Option<(FrameCost, T)> {
         let fits = |waiting: &Waiting<T>| waiting.cost.pixels <= most_pixels;
+        // The first one in nearly all cases. Only the side lane passes large frames, of which at
+        // most `QUEUED_FRAMES` wait.
         let (&tag, _) = self.waiting.iter().find(|(_, waiting)| fits(waiting))?;
         let Waiting { cost, start, item } = self.waiting.remove(&tag)?;
+        // Lanes take frames out of order, and the virtual time must not go back.
         self.virtual_time = self.virtual_time.max(start);
         // A session without a frame ahead of the virtual time is as good as new.
         let now = self.virtual_time;
@@ -100,6 +107,7 @@ mod tests {
 
     #[test]
     fn each_session_gets_the_same_number_of_pixels() {
+        // 10,000 pixels for each session are 100 + 1,000 + 1,000 + 200 = 2,300 frames.
         let counts = served(&[100, 10, 10, 50], 2_300);
         for (count, wanted) in counts.iter().zip([100, 1_000, 1_000, 200]) {
             assert!(count.abs_diff(wanted) < 40, "{counts:?}");
@@ -114,6 +122,7 @@ mod tests {
         }
         queue.push(FrameCost { session: 99, pixels: 768 }, 99);
         assert_eq!(queue.pop(ANY).unwrap().1, 99);
+        // Frames of exactly 768 pixels do not count.
         assert_eq!(queue.pixels_above(768), 12 << 27);
         // Frames of equal cost are served in order of arrival.
         let order: Vec<u64> = std::iter::from_fn(|| queue.pop(ANY)).map(|(_, item)| item).collect();
@@ -127,6 +136,8 @@ mod tests {
         queue.push(FrameCost { session: 0, pixels: 1_000 }, 0);
         let mut passed = 0;
         loop {
+            // The tag of the large frame is 1,000, and those of the small ones are 10, 20, 30 ..:
+            // about a hundred come first.
             queue.push(FrameCost { session: 1, pixels: 10 }, 1);
             match queue.pop(ANY).unwrap().1 {
                 0 => break,

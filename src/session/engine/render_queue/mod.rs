@@ -85,6 +85,7 @@ impl RenderQueue {
     /// # Errors
     /// [`SessionError::Thread`] if one cannot be started.
     pub(crate) fn start(backend: Arc<dyn Backend>) -> Result<Self, SessionError> {
+        // A backend that reports 0 still needs a thread that calls it.
         let threads = backend.frames_in_flight().max(1);
         let shared = Shared { backend, state: Mutex::default(), changed: Condvar::new() };
         let queue = Self { shared: Arc::new(shared) };
@@ -120,6 +121,7 @@ impl RenderQueue {
         work: impl FnOnce(&mut Scratch, &dyn Backend) -> T + Send + 'static,
     ) -> Result<(T, Duration), SessionError> {
         let (reply, answer) = oneshot::channel();
+        // The work runs on a thread that has no span, so that the request's span is taken along.
         let within = Span::current();
         let waiting = debug_span!("queue");
         let requested = Instant::now();
@@ -127,6 +129,8 @@ impl RenderQueue {
         let job = move |scratch: &mut Scratch| {
             let queued = requested.elapsed();
             drop(waiting);
+            // The session gave up while the frame waited: its deadline passed, or the request was
+            // cancelled.
             if reply.is_closed() {
                 return;
             }
@@ -151,12 +155,15 @@ impl Drop for RenderQueue {
     fn drop(&mut self) {
         let mut state = self.shared.state.lock();
         state.is_closed = true;
+        // The threads need the lock to see that the queue is closed, so it is not held while they
+        // end.
         let threads = std::mem::take(&mut state.threads);
         drop(state);
         self.shared.changed.notify_all();
         // A driver that hangs must not keep the process alive.
         let deadline = Instant::now() + limits::LAST_FRAME_TIMEOUT;
         for thread in threads {
+            // A join of std has no timeout.
             while !thread.is_finished() && Instant::now() < deadline {
                 thread::sleep(Duration::from_millis(1));
             }
@@ -189,7 +196,10 @@ impl Shared {
         if state.queue.len() >= limits::QUEUED_FRAMES {
             return Err(SessionError::Busy { what: "frames queued" });
         }
+        // Small frames are not refused for their time: it is not measured, and short.
         if is_large(cost) {
+            // On average, half of a frame that is being rendered is still to be done. The sum has
+            // at most 2⁹ frames of 2²⁷ pixels.
             let before = state.rendering / 2 + state.queue.pixels_above(limits::LARGE_PIXELS);
             if Instant::now() + state.time_for(before.saturating_add(cost.pixels)) > job.deadline {
                 return Err(SessionError::Busy { what: "pixels queued" });
@@ -216,6 +226,7 @@ impl Shared {
         while let Some((cost, job)) = self.next(lane) {
             let begun = Instant::now();
             (job.work)(&mut scratch);
+            // After the answer, which does not wait for memory to be freed.
             scratch.free_excess();
             if is_large(cost) {
                 self.state.lock().rendered(cost, begun.elapsed());
@@ -227,17 +238,25 @@ impl Shared {
     fn next(&self, lane: Lane) -> Option<(FrameCost, Job)> {
         let mut state = self.state.lock();
         loop {
+            // First of all: frames that still wait are dropped with the queue, and their sessions
+            // get an error.
             if state.is_closed {
                 return None;
             }
             let most_pixels = match lane {
+                // While no large frame is rendered, the main lane serves all frames, and the side
+                // lane sleeps.
                 Lane::Main => Some(u64::MAX),
                 Lane::Side => (state.rendering > 0).then_some(limits::LARGE_PIXELS),
             };
             let Some((cost, job)) = most_pixels.and_then(|most| state.queue.pop(most)) else {
+                // Every change wakes every thread; one that finds nothing for its lane sleeps
+                // again.
                 self.changed.wait(&mut state);
                 continue;
             };
+            // The time of a small frame is unknown: it begins unless its deadline has passed
+            // already.
             let needed = if is_large(cost) { state.time_for(cost.pixels) } else { Duration::ZERO };
             if Instant::now() + needed >= job.deadline {
                 // Dropping the job answers its session.
@@ -245,6 +264,7 @@ impl Shared {
             }
             if is_large(cost) {
                 state.rendering += cost.pixels;
+                // Unlocked first, so that the threads that wake up do not wait for the lock.
                 drop(state);
                 self.changed.notify_all();
             }
@@ -261,8 +281,11 @@ impl State {
 
     /// Notes that a large frame was rendered.
     fn rendered(&mut self, cost: FrameCost, took: Duration) {
+        // `next` added them, so that this does not underflow.
         self.rendering -= cost.pixels;
         let measured = took.as_secs_f64() * 1e9 / cost.pixels as f64;
+        // The last frame counts a quarter: after eight frames of another speed, the average is 90 %
+        // theirs (1 - 0.75⁸).
         let is_first = self.ns_per_pixel == 0.0;
         self.ns_per_pixel =
             if is_first { measured } else { 0.75 * self.ns_per_pixel + 0.25 * measured };
@@ -397,6 +420,7 @@ mod tests {
         };
         // The first one is the measure.
         run(0, limits::STEP_TIMEOUT).await.unwrap();
+        // Time for three frames of 100 ms, and for some delay.
         let time = Duration::from_millis(350);
         let runs = futures_util::future::join_all((1..=12).map(|session| run(session, time))).await;
         let ready = runs.iter().filter(|result| result.is_ok()).count();

@@ -24,6 +24,7 @@ impl Scratch {
     pub(crate) fn free_excess(&mut self) {
         let Self { images, opacity, depth_m, normals } = self;
         let mut left = limits::SCRATCH_BYTES;
+        // Every frame needs images, and only some need the maps.
         images.keep_within(&mut left);
         for maps in [opacity, depth_m, normals] {
             maps.keep_within(&mut left);
@@ -43,6 +44,7 @@ impl<T: Copy + Default> Buffers<T> {
         views: &[View],
         values_per_pixel: usize,
     ) -> impl Iterator<Item = &mut [T]> {
+        // Buffers only grow here; `free_excess` bounds them after the frame.
         self.0.resize_with(self.0.len().max(views.len()), Vec::new);
         let counts = views.iter().map(move |view| values_per_pixel * view.camera.pixels());
         self.0.iter_mut().zip(counts).map(|(buffer, count)| {
@@ -56,6 +58,7 @@ impl<T: Copy + Default> Buffers<T> {
     /// Takes the buffers from the bytes that are left, and frees those that are too many.
     fn keep_within(&mut self, left: &mut usize) {
         self.0.retain(|buffer| {
+            // One that does not fit is freed, and a smaller one after it may still fit.
             let rest = left.checked_sub(buffer.capacity() * size_of::<T>());
             *left = rest.unwrap_or(*left);
             rest.is_some()
@@ -86,8 +89,11 @@ mod tests {
             };
             buffers.for_views(&views, values).map(counts).collect::<Vec<_>>()
         };
+        // Each image has a row: 4 and 5 pixels of one value. Both buffers are fresh.
         assert_eq!(sizes(&[4, 5], 1), [(4, false), (5, false)]);
+        // Two buffers are those from above, enlarged, and the third one is fresh.
         assert_eq!(sizes(&[2, 9, 3], 3), [(6, true), (27, true), (9, false)]);
+        // Fewer views keep the other buffers, which the next frame has again.
         assert_eq!(sizes(&[1], 1), [(1, true)]);
         assert_eq!(sizes(&[4, 9, 3], 3), [(12, true), (27, true), (9, true)]);
     }
@@ -96,6 +102,8 @@ mod tests {
     fn a_thread_keeps_a_bounded_number_of_bytes() {
         let third = limits::SCRATCH_BYTES / 3;
         let mut scratch = Scratch::default();
+        // In thirds of the limit: images 1 and 3, opacity 1, depth 2 and 1. After an image and the
+        // opacity one third is left, for the second depth.
         // Its capacity counts, and not its length.
         scratch.images.0 = vec![Vec::with_capacity(third), Vec::with_capacity(3 * third)];
         scratch.opacity.0 = vec![vec![0.0; third / 4]];

@@ -57,6 +57,8 @@ impl ObservationBuilder {
         held_bytes: u64,
         limit_bytes: u64,
     ) -> Result<RenderedObservation, SessionError> {
+        // Files are appended in the order in which the tensors are named: those of now, and then
+        // those of earlier times.
         let shown = self.shown_images();
         self.append_files(&shown)?;
         let mut tensors = self.name_tensors(&shown);
@@ -69,6 +71,7 @@ impl ObservationBuilder {
         }
 
         let mut images: Vec<ImageInfo> = shown.into_iter().map(|image| image.info).collect();
+        // A client expects them by pose and camera; the captures come by time.
         images.sort_by_key(|image| [image.pose, image.camera]);
         let frame_hash = frame_hash(images.iter().map(|image| image.hash));
         Ok(RenderedObservation {
@@ -98,6 +101,7 @@ impl ObservationBuilder {
         let mut pose = 0;
         for capture in &self.captures {
             for &camera in &capture.cameras {
+                // Images that are not shown were encoded too, so that the index counts them.
                 if capture.shown {
                     let EncodedImage { hash, trust, ref repair, .. } = self.encoded[encoded];
                     let repair = repair.clone();
@@ -110,6 +114,7 @@ impl ObservationBuilder {
                 encoded += 1;
             }
             // A step has one pose, even if a camera shows a picture that was taken from another.
+            // `observe` has a pose for each capture.
             pose += usize::from(capture.shown && !capture.has_sensor_effects);
         }
         shown
@@ -123,6 +128,7 @@ impl ObservationBuilder {
         camera: usize,
         encoded: usize,
     ) -> (i64, Option<ImageSensor>) {
+        // Without effects, a picture is taken when its capture is.
         if !capture.has_sensor_effects || self.layout.sensor(camera).is_none() {
             return (capture.time_us, None);
         }
@@ -131,6 +137,7 @@ impl ObservationBuilder {
         let has_effects = |sensor: &CameraSensor| {
             [
                 missing,
+                // A picture from before its stamp is one that the camera repeats.
                 (taken_us < stamp_us).then_some(SensorReason::Frozen),
                 sensor.noise.map(|_| SensorReason::Noise),
                 sensor.exposure.map(|_| SensorReason::Exposure),
@@ -176,12 +183,15 @@ impl ObservationBuilder {
         }
         let PixelMaps { depth, opacity, normals, instances } = layout.maps();
         // Each with its place among the images.
+        // At most 256 images: to compare all pairs is cheap.
         let place = |image: &ShownImage| {
             let key = |one: &ShownImage| [one.info.pose, one.info.camera];
             shown.iter().filter(|other| key(other) < key(image)).count()
         };
         let placed: Vec<(usize, &ShownImage)> =
             shown.iter().map(|image| (place(image), image)).collect();
+        // Floats of all images, then instances, then bytes: by falling size, so that each tensor is
+        // aligned without gaps.
         for &(index, image) in &placed {
             let [height, width] = layout.size_px(image.info.camera);
             if depth {
@@ -223,6 +233,8 @@ impl ObservationBuilder {
                     let (time_us, sensor) = self.delivered(capture, camera, index);
                     let EncodedImage { hash, trust, ref repair, .. } = self.encoded[index];
                     let repair = repair.clone();
+                    // Moved and not copied: if this observation shows the image too, its file was
+                    // appended above.
                     let bytes = mem::take(&mut self.encoded[index].file);
                     let due_us = capture.due_us;
                     let frame =
@@ -237,6 +249,7 @@ impl ObservationBuilder {
         let mut past_images = Vec::new();
         if layout.schedule().is_decision(now_us) {
             let earlier = layout.earlier_frames(history, now_us);
+            // Earlier frames come after all images of now.
             let files: Vec<&[u8]> = earlier.iter().map(|one| &one.frame.bytes[..]).collect();
             self.buffer.append(&files)?;
             for (index, one) in earlier.iter().enumerate() {
@@ -258,6 +271,7 @@ impl ObservationBuilder {
                 });
             }
         }
+        // After they were shown: frames that only this decision needed go now.
         history.drop_unneeded(layout.schedule(), now_us);
         Ok(past_images)
     }

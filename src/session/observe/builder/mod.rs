@@ -66,6 +66,7 @@ impl ObservationBuilder {
         captures: &[RigCapture],
     ) -> Result<Self, SessionError> {
         // Only `observe` can ask for more than `open` has checked.
+        // Refused before memory is reserved, with the limit of pixels and not that of the budget.
         layout.check_size("poses", captures.iter().filter(|capture| capture.shown).count())?;
         let EgoHistory { xyz_m, rotation, count } = episode.history();
         let history: [&[u8]; 2] = [bytemuck::bytes_of(&xyz_m), bytemuck::bytes_of(&rotation)];
@@ -80,6 +81,7 @@ impl ObservationBuilder {
         let header = layout.header_bytes(captures);
         let floats_at = header + history.len();
         let in_place = captures.iter().map(|capture| layout.in_place_bytes(capture));
+        // Each kind of all captures together, so that a kind is one block of the buffer.
         let all = in_place.fold(InPlaceBytes::default(), |sum, one| InPlaceBytes {
             floats: sum.floats + one.floats,
             instances: sum.instances + one.instances,
@@ -129,6 +131,8 @@ impl ObservationBuilder {
         let coverage = self.coverage.clone();
 
         let pixels: u64 = frame.views.iter().map(|view| view.camera.pixels() as u64).sum();
+        // Its memory is reserved before the frame is rendered: to refuse it afterwards would waste
+        // the frame.
         let filter = match &mut self.repair {
             Some(repair) => Some(repair.candidate_filter(&self.budget, capture, pixels)?),
             None => None,
@@ -146,6 +150,7 @@ impl ObservationBuilder {
         let needs_depth = uses_depth && !(depth && capture.shown);
         let needs_normals =
             model_needs(SessionRepair::needs_normals) && !(normals && capture.shown);
+        // In floats a pixel: opacity and depth take one each, a normal three.
         let extra_values =
             u64::from(needs_opacity) + u64::from(needs_depth) + 3 * u64::from(needs_normals);
         // Noise and the like are computed on copies.
@@ -160,9 +165,11 @@ impl ObservationBuilder {
         let effects: Vec<Option<PixelEffects>> = capture.cameras.iter().map(effects).collect();
         let has_effects = effects.iter().any(Option::is_some);
         let copied = 3 * pixels * u64::from(has_effects);
+        // Returned when the capture is rendered.
         let _share = self.budget.reserve(4 * pixels * extra_values + copied)?;
 
         // Where the renderer writes.
+        // Before `targets` moves `raw_at` on, and borrows the buffer.
         let raw_at =
             if filter.is_some() || has_effects { self.raw_places(capture) } else { Vec::new() };
         let mut targets = self.targets(capture, scratch.images.for_views(frame.views, 3));
@@ -184,6 +191,7 @@ impl ObservationBuilder {
 
         // Each image is encoded as soon as it is complete, while others are still rendered; one
         // that may be repaired is copied instead.
+        // A slot for each view, which the backend's threads fill in any order without a lock.
         let slots: Vec<OnceLock<FinishedView>> =
             frame.views.iter().map(|_| OnceLock::new()).collect();
         let rendering = Span::current();
@@ -199,6 +207,8 @@ impl ObservationBuilder {
             let repair = filter.as_ref().zip(trust);
             let repair = repair.map(|(filter, trust)| filter.finished(index, trust.value, target));
             let mut image = match &repair {
+                // Encoding waits for the repair; the hash of the rendered pixels is needed in any
+                // case.
                 Some(Finished { candidate: Some(_), .. }) => Ok(hashed(pixels)),
                 _ => {
                     let is_later = layout.is_shown_later(capture, camera);
@@ -207,6 +217,7 @@ impl ObservationBuilder {
             };
             if let Ok(image) = &mut image {
                 image.trust = trust.filter(|_| reports_trust);
+                // A record compares what was rendered, before any effect.
                 let rendered_hash = image.effects.map_or(image.hash, |effects| effects.clean_hash);
                 image.repair = repair.is_some().then(|| ImageRepair::kept(rendered_hash));
             }
@@ -228,6 +239,8 @@ impl ObservationBuilder {
                 let camera = layout.cameras()[camera].name.clone();
                 SessionError::Encode { camera, reason }
             })?;
+            // Effects were computed on a copy while the targets borrowed the buffer. Now it takes
+            // the place of the rendered pixels.
             let changed = mem::take(&mut image.changed);
             if let (false, Some(&Some(at))) = (changed.is_empty(), raw_at.get(view)) {
                 self.buffer.bytes_mut()[at..at + changed.len()].copy_from_slice(&changed);
@@ -235,6 +248,7 @@ impl ObservationBuilder {
             self.timings.encode += image.took;
             self.encoded.push(image);
         }
+        // All trusts of the capture are known now, and the selection depends on all of them.
         if let (Some(repair), Some(filter)) = (&mut self.repair, &filter) {
             let rendered =
                 RenderedCapture { finished: repairs, views: frame.views, raw_at: &raw_at, first };
@@ -253,6 +267,7 @@ impl ObservationBuilder {
     /// there.
     fn raw_places(&self, capture: &RigCapture) -> Vec<Option<usize>> {
         let holds_pixels = self.holds_pixels(capture);
+        // Places of views that are not held are counted as well, but not returned.
         let mut next = self.raw_at;
         let place = |camera: &usize| {
             let at = next;
@@ -275,9 +290,11 @@ impl ObservationBuilder {
         let instances_at = self.instances_at;
         let raw_at = self.raw_at;
         let own = layout.in_place_bytes(capture);
+        // Moved on by the whole capture, so that the next one begins behind it.
         self.floats_at += own.floats;
         self.instances_at += own.instances;
         self.raw_at += own.raw;
+        // Disjoint slices for each target: threads can write all of them at once.
         let (maps_part, raw_part) = self.buffer.bytes_mut().split_at_mut(raw_at);
         let (float_part, instances_part) = maps_part.split_at_mut(instances_at);
         let mut float_part = &mut float_part[floats_at..floats_at + own.floats];
@@ -319,6 +336,7 @@ impl ObservationBuilder {
     }
 
     fn add_stages(&mut self, stats: FrameStats) {
+        // A backend has a handful of stages, and a list keeps their order.
         for (stage, ms) in stats.stages_ms {
             match self.timings.stages_ms.iter_mut().find(|(name, _)| *name == stage) {
                 Some((_, sum)) => *sum += ms,
@@ -372,6 +390,7 @@ fn encoded(
     let mut image = encode(&changed, width, height, layout.encoding())?;
     image.took += took;
     image.effects = Some(AppliedEffects { clean_hash, stops: effects.stops });
+    // Raw pixels travel in the buffer. A later observation needs a copy of its own.
     if layout.encoding() == Encoding::Raw {
         if is_shown_later {
             image.file.clone_from(&changed);
@@ -405,6 +424,8 @@ fn add_motion(
 
 /// Splits the first bytes off a slice.
 fn split_off_front<'a>(rest: &mut &'a mut [u8], bytes: usize) -> &'a mut [u8] {
+    // The slice is taken out first, because a borrow through `rest` would not live as long as the
+    // parts.
     let (front, others) = mem::take(rest).split_at_mut(bytes);
     *rest = others;
     front

@@ -116,6 +116,7 @@ impl ObservationRepair {
         let normals = u64::from(self.session.needs_normals());
         // Two more copies of the depth, and the references in the view.
         let warped = u64::from(self.session.needs_warped());
+        // The colour takes 3 bytes a pixel, the opacity and the other maps 4 a value.
         let values = 1 + depth + 3 * normals + 4 * warped;
         self.share = Some(budget.reserve(pixels * (3 + 4 * values))?);
         let was_on = capture.cameras.iter().map(|&camera| self.state.is_on[camera]).collect();
@@ -131,12 +132,15 @@ impl ObservationRepair {
     ) {
         let RenderedCapture { finished, views, raw_at, first } = rendered;
         let trusts: Vec<f64> = finished.iter().map(|image| image.trust).collect();
+        // All views are judged by the state before the capture, so that their order does not
+        // matter.
         let decision = filter.session.selection.decide(&filter.was_on, &trusts);
         for (view, Finished { candidate, .. }) in finished.into_iter().enumerate() {
             let camera = capture.cameras[view];
             if self.has_history {
                 self.state.is_on[camera] = decision.is_on[view];
             }
+            // Images of high trust are encoded already.
             let Some(image) = candidate else { continue };
             self.candidates.push(Candidate {
                 camera,
@@ -151,6 +155,7 @@ impl ObservationRepair {
             });
         }
         if self.candidates.is_empty() {
+            // Nothing was copied, so that nothing needs the memory.
             self.share = None;
         }
     }
@@ -172,6 +177,7 @@ impl Candidate {
             inputs.set_reference(&nearest.name, reference, &camera.camera);
         }
         if session.needs_warped() {
+            // A reference that could not be read is left out.
             let named = |view: &ReferenceView| {
                 Some((view.name.clone(), references.get(&view.id())?.clone()))
             };
@@ -188,6 +194,7 @@ impl Candidate {
 impl CandidateFilter {
     /// Returns the data of a finished view that the selection needs.
     pub(super) fn finished(&self, view: usize, trust: f64, target: &Target<'_>) -> Finished {
+        // Runs on a thread of the renderer: only what may be repaired is copied.
         if !self.session.selection.is_candidate(self.was_on[view], trust) {
             return Finished { trust, candidate: None };
         }
@@ -219,6 +226,7 @@ impl ObservationBuilder {
     pub(crate) fn wanted_references(&mut self, views: &ReferenceViews) -> Vec<ReferenceView> {
         let Some(repair) = &mut self.repair else { return Vec::new() };
         let session = repair.session.clone();
+        // Two images may need the same reference: it is listed where it is found first.
         let mut wanted: Vec<ReferenceView> = Vec::new();
         let mut known = HashSet::new();
         let mut want = |view: &ReferenceView| {
@@ -270,12 +278,14 @@ impl ObservationBuilder {
         let session = repair.session.clone();
         let candidates = std::mem::take(&mut repair.candidates);
         let references = std::mem::take(&mut repair.references);
+        // Candidates are always those of the last capture.
         let capture = self.captures.last().cloned();
         for candidate in candidates {
             let Candidate { camera, index, is_chosen, ref image, raw_at, .. } = candidate;
             let mounted = &self.layout.cameras()[camera];
             let mut status = RepairStatus::Kept;
             let mut names = Vec::new();
+            // The model reads the image, and a failure sends these pixels as they are.
             let mut pixels = image.rgb8.clone();
             if is_chosen {
                 let started = Instant::now();
@@ -287,6 +297,7 @@ impl ObservationBuilder {
                         status = RepairStatus::Repaired;
                         names = inputs.names;
                         pixels = repaired;
+                        // A repair that fails keeps the reference of the one before.
                         repair.state.references[camera] = inputs.nearest;
                     }
                     Err(cause) if session.on_failure == OnFailure::Error => {
@@ -300,6 +311,8 @@ impl ObservationBuilder {
                     }
                 }
             }
+            // Effects are those of the camera, and come after the repair, which is part of the
+            // rendering.
             let effects =
                 capture.as_ref().filter(|capture| capture.has_sensor_effects).and_then(|capture| {
                     self.layout.pixel_effects(camera, self.effect_seed, capture.time_us)
@@ -308,6 +321,7 @@ impl ObservationBuilder {
                 capture.as_ref().is_some_and(|capture| self.layout.is_shown_later(capture, camera));
             let done = encoded(&self.layout, camera, &pixels, is_later, effects.as_ref())
                 .map_err(|reason| SessionError::Encode { camera: mounted.name.clone(), reason })?;
+            // The renderer wrote its pixels there; a raw image is replaced in place.
             if let Some(at) = raw_at {
                 let sent = if done.changed.is_empty() { &pixels } else { &done.changed };
                 self.buffer.bytes_mut()[at..at + sent.len()].copy_from_slice(sent);
@@ -320,6 +334,7 @@ impl ObservationBuilder {
             rendered.effects = done.effects;
             rendered.repair = Some(ImageRepair { status, rendered_hash, references: names });
         }
+        // The last of the copies was dropped with its candidate.
         repair.share = None;
         Ok(())
     }
