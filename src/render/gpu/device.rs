@@ -200,7 +200,7 @@ pub(super) struct Device {
     limits: Limits,
     /// Most bytes of a binding, even if the adapter allows more.
     binding_limit: u64,
-    /// The first error since the last [`Device::check`].
+    /// The first error. It stays: several frames may be in flight, and the device is given up after an error.
     fault: Arc<Mutex<Option<String>>>,
     /// Counts of created objects and dispatches, so that the cost of each feature can be reported.
     totals: AtomicTotals,
@@ -276,12 +276,12 @@ impl Device {
         &self.shaders
     }
 
-    /// Reports the first error since the last call.
+    /// Reports the first error of this device.
     ///
     /// # Errors
     /// A command was invalid, memory ran out, or the device is lost.
     pub(super) fn check(&self) -> Result<(), RenderError> {
-        match self.fault.lock().take() {
+        match self.fault.lock().clone() {
             None => Ok(()),
             Some(reason) => Err(self.failed(reason)),
         }

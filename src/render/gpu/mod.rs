@@ -8,9 +8,13 @@
 //!
 //! # Frames in flight
 //!
-//! A GPU has three frames in flight ([`Backend::frames_in_flight`]): one is drawn, in the order of the
-//! calls (`gpu/tickets.rs`), while others are copied out, hashed, and encoded. The engine runs a render thread
-//! for each. Drawing runs on the caller's thread, and culling in a thread pool of its own. A rayon thread
+//! A frame is prepared, recorded and submitted in its turn, in the order of the calls (`gpu/tickets.rs`). It is
+//! waited for, copied out, hashed and encoded outside of its turn, while the next frames have theirs. The device has at
+//! most two of them, so that it finds the next frame in its queue when one is done (`gpu/slots.rs`). A frame whose
+//! buffers were too small, or that does not fit the device at once, is drawn in one turn.
+//!
+//! The engine runs a render thread for each frame in flight ([`Backend::frames_in_flight`]), more of them on a machine
+//! with more cores. Preparing runs on the caller's thread, and culling in a thread pool of its own. A rayon thread
 //! that waits takes up other work of its pool; if that were the next frame, it would wait for this one,
 //! which waits for it.
 
@@ -34,9 +38,11 @@ mod resolve;
 mod roofline;
 mod scan;
 pub mod shaders;
+mod slots;
 mod sort;
 mod tickets;
 
+use std::sync::Arc;
 use std::time::Instant;
 
 use parking_lot::Mutex;
@@ -48,12 +54,13 @@ pub use bandwidth::FrameCounts;
 pub use device::{AdapterChoice, DeviceInfo, DeviceTotals, GpuError, devices};
 pub use roofline::Roofline;
 
-use self::chain::Chain;
+use self::chain::{Chain, InFlight, Turn, Waited};
 use self::device::Device;
 use self::discarded::Discarded;
 use self::read_back::MappedFrame;
 use self::resolve::{Outputs, Pixels};
 use self::shaders::Shaders;
+use self::slots::Slots;
 use self::tickets::TicketQueue;
 use super::stage::{Stage, StageOutputs};
 use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
@@ -73,6 +80,8 @@ pub struct Gpu {
     /// encoded.
     cull: ThreadPool,
     queue: TicketQueue,
+    /// The frames that the device has.
+    slots: Slots,
     /// Empty after the device has failed; the next frame opens it again.
     chain: Mutex<Option<Chain>>,
     discarded: Discarded,
@@ -176,6 +185,7 @@ impl Gpu {
             deliver: pool("deliver")?,
             cull: pool("cull")?,
             queue: TicketQueue::default(),
+            slots: Slots::default(),
             chain: Mutex::new(Some(Chain::new(device, limits.mirror_bytes)?)),
             discarded: Discarded::default(),
             shaders,
@@ -184,13 +194,16 @@ impl Gpu {
 
     /// The memory and the counts of the device; `None` while it is lost.
     pub fn usage(&self) -> Option<GpuUsage> {
-        self.chain.lock().as_ref().map(|chain| GpuUsage {
+        let slot = self.chain.lock();
+        let chain = slot.as_ref()?;
+        let tally = chain.tally.lock();
+        Some(GpuUsage {
             name: chain.device.info.name.clone(),
             mirror_bytes: chain.mirror.bytes(),
             allocated_bytes: chain.device.allocated_bytes(),
-            retries: chain.retries,
-            regions: chain.regions,
-            last_frame: chain.last_frame,
+            retries: tally.retries,
+            regions: tally.regions,
+            last_frame: tally.last_frame,
             totals: chain.device.totals(),
         })
     }
@@ -219,8 +232,8 @@ impl Gpu {
         targets: &mut [Target<'_>],
         finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
-        self.render_with(frame, targets, finished, |chain, outputs| {
-            chain.resume(done, frame, outputs)
+        self.render_with(frame, targets, finished, |outputs| {
+            self.in_turn(|chain| chain.resume(done, frame, outputs))
         })
     }
 
@@ -239,13 +252,21 @@ impl Gpu {
         self.in_turn(|chain| chain.run_through(frame, done, last, &self.cull))
     }
 
-    /// Runs `work` on the device after all earlier callers. Opens the device again if it was lost. The
-    /// device is free for the next caller when this returns.
+    /// Runs `work` on the device after all earlier callers. Opens the device again if it was lost. The next caller has
+    /// its turn when this returns.
     fn in_turn<T>(
         &self,
         work: impl FnOnce(&mut Chain) -> Result<T, RenderError>,
     ) -> Result<T, RenderError> {
         let _ticket = self.queue.wait();
+        self.with_chain(work)
+    }
+
+    /// Runs `work` on the device; called in turn.
+    fn with_chain<T>(
+        &self,
+        work: impl FnOnce(&mut Chain) -> Result<T, RenderError>,
+    ) -> Result<T, RenderError> {
         let mut slot = self.chain.lock();
         // If `work` panics, the slot stays empty: memory may be half-written then, and the next caller
         // opens the device again.
@@ -262,6 +283,43 @@ impl Gpu {
         done
     }
 
+    /// Draws a frame. The next one has its turn while the device draws this one.
+    fn draw(&self, frame: &Frame<'_>, outputs: &Outputs) -> Result<MappedFrame, RenderError> {
+        let called = Instant::now();
+        let ticket = self.queue.wait();
+        let slot = self.slots.wait();
+        let wait = called.elapsed();
+        let turn = self.with_chain(|chain| chain.take_turn(frame, outputs, &self.cull))?;
+        drop(ticket);
+        let waited = match turn {
+            Turn::Drawn(drawn) => Waited::Drawn(drawn),
+            Turn::InFlight(in_flight) => self.finish(*in_flight)?,
+        };
+        drop(slot);
+        let mut drawn = match waited {
+            Waited::Drawn(drawn) => drawn,
+            Waited::Overflowed(needs) => {
+                self.in_turn(|chain| chain.draw_again(needs, frame, outputs, &self.cull))?
+            }
+        };
+        drawn.stats.stages_ms.insert(0, ("wait", wait.as_secs_f64() * 1e3));
+        Ok(drawn)
+    }
+
+    /// Waits for a frame in flight. If its device has failed, the next frame opens it again.
+    fn finish(&self, in_flight: InFlight) -> Result<Waited, RenderError> {
+        let device = in_flight.device.clone();
+        let waited = in_flight.wait();
+        if let Err(RenderError::Device { .. }) = waited {
+            let mut slot = self.chain.lock();
+            // Another frame of the same device may have failed before, and the device may be open again.
+            if slot.as_ref().is_some_and(|chain| Arc::ptr_eq(&chain.device, &device)) {
+                slot.take().into_iter().for_each(|chain| self.discarded.add(chain));
+            }
+        }
+        waited
+    }
+
     /// Opens the device again after it was lost.
     fn reopen(&self) -> Result<Chain, RenderError> {
         let failed = |reason| RenderError::Device { device: self.info.name.clone(), reason };
@@ -276,25 +334,19 @@ impl Gpu {
         Chain::new(device, self.limits.mirror_bytes)
     }
 
-    /// Draws a frame, and copies its pixels to the targets.
+    /// Draws a frame with `draw`, and copies its pixels to the targets.
     fn render_with(
         &self,
         frame: &Frame<'_>,
         targets: &mut [Target<'_>],
         finished: OnViewDone<'_>,
-        draw: impl FnOnce(&mut Chain, &Outputs) -> Result<MappedFrame, RenderError>,
+        draw: impl FnOnce(&Outputs) -> Result<MappedFrame, RenderError>,
     ) -> Result<FrameStats, RenderError> {
         frame.check(targets)?;
         frame.check_splats(self.name())?;
         let outputs = Outputs::of(targets);
-        let ms = |since: Instant| since.elapsed().as_secs_f64() * 1e3;
-
         // Draw on this thread: a thread of a pool that waits may take up another frame of that pool.
-        let called = Instant::now();
-        let (drawn, wait_ms) = self.in_turn(|chain| {
-            let wait_ms = ms(called);
-            Ok((draw(chain, &outputs)?, wait_ms))
-        })?;
+        let drawn = draw(&outputs)?;
 
         // Copy the pixels. Other frames can be drawn meanwhile.
         let start = Instant::now();
@@ -318,8 +370,7 @@ impl Gpu {
             });
         });
         let mut stats = drawn.stats.clone();
-        stats.stages_ms.insert(0, ("wait", wait_ms));
-        stats.stages_ms.push(("deliver", ms(start)));
+        stats.stages_ms.push(("deliver", start.elapsed().as_secs_f64() * 1e3));
         drawn.recycle();
         Ok(stats)
     }
@@ -340,7 +391,7 @@ impl Backend for Gpu {
     }
 
     fn frames_in_flight(&self) -> usize {
-        limits::GPU_FRAMES
+        limits::gpu_frames(self.threads())
     }
 
     fn render(
@@ -349,9 +400,7 @@ impl Backend for Gpu {
         targets: &mut [Target<'_>],
         finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
-        self.render_with(frame, targets, finished, |chain, outputs| {
-            chain.draw(frame, outputs, &self.cull)
-        })
+        self.render_with(frame, targets, finished, |outputs| self.draw(frame, outputs))
     }
 }
 

@@ -1,7 +1,6 @@
 //! Reading a frame back: buffers in memory that the host can read, reused by later frames.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::{Arc, mpsc};
 
 use parking_lot::Mutex;
 use wgpu::{BufferUsages, BufferView, MapMode, PollType, SubmissionIndex};
@@ -56,10 +55,7 @@ impl MappedFrame {
         // A buffer cannot be unmapped while a view of it exists.
         drop(pages);
         read_back.unmap();
-        let mut unused = pool.0.lock();
-        if unused.len() < limits::GPU_FRAMES {
-            unused.push(read_back);
-        }
+        pool.give_back(read_back);
     }
 }
 
@@ -67,6 +63,14 @@ impl ReadBackPool {
     /// Takes the buffers of an earlier frame, if some are unused.
     pub(super) fn take(&self) -> Option<ReadBack> {
         self.0.lock().pop()
+    }
+
+    /// Keeps unmapped buffers for another frame.
+    pub(super) fn give_back(&self, read_back: ReadBack) {
+        let mut unused = self.0.lock();
+        if unused.len() < limits::GPU_FRAMES_MAX {
+            unused.push(read_back);
+        }
     }
 }
 
@@ -107,22 +111,27 @@ impl ReadBack {
         device: &Device,
         submission: SubmissionIndex,
     ) -> Result<(), RenderError> {
-        let failed = Arc::new(AtomicBool::new(false));
+        let (mapped, all_mapped) = mpsc::channel();
         for buffer in self.all() {
-            let failed = Arc::clone(&failed);
+            let mapped = mapped.clone();
             buffer.buffer().slice(..).map_async(MapMode::Read, move |result| {
-                failed.fetch_or(result.is_err(), Relaxed);
+                // Sending fails if this frame has failed meanwhile.
+                let _ = mapped.send(result.is_ok());
             });
         }
+        drop(mapped);
         let timeout = Some(device.frame_timeout());
         let wait = PollType::Wait { submission_index: Some(submission), timeout };
         let polled = device.device.poll(wait);
         device.check()?;
         polled.map_err(|error| device.failed(error.to_string()))?;
-        match failed.load(Relaxed) {
-            true => Err(device.failed("its memory could not be read".to_owned())),
-            false => Ok(()),
+        // Another thread that waits for the device may have taken the callbacks, and still be calling them.
+        for _ in self.all() {
+            if all_mapped.recv_timeout(limits::MAP_CALLBACK) != Ok(true) {
+                return Err(device.failed("its memory could not be read".to_owned()));
+            }
         }
+        Ok(())
     }
 
     /// The counters and the timestamps.

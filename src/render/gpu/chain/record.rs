@@ -7,6 +7,7 @@ use wgpu::SubmissionIndex;
 use super::{Chain, CurrentFrame, Source, add_time};
 use crate::FrameStats;
 use crate::constants::DEPTH_BITS;
+use crate::gpu::device::Device;
 use crate::gpu::kernel::{Recorder, TIMESTAMP_BYTES};
 use crate::gpu::layout::{Counters, Frame as GpuFrame, Owner};
 use crate::gpu::plan::{Counts, job};
@@ -124,24 +125,24 @@ impl Chain {
         }
         sorted
     }
+}
 
-    /// Adds the time of each stage by the device's clock. If it has none, adds the time of the whole
-    /// submission as "device".
-    pub(super) fn add_stage_times(
-        &self,
-        stats: &mut FrameStats,
-        stages: &[&'static str],
-        timestamps: &[u64],
-        whole: Duration,
-    ) {
-        let Some(tick_ns) = self.device.tick_ns() else {
-            add_time(stats, "device", whole);
-            return;
-        };
-        for (stage, ticks) in stages.iter().zip(timestamps.chunks_exact(2)) {
-            let ns = ticks[1].saturating_sub(ticks[0]) as f64 * f64::from(tick_ns);
-            add_time(stats, stage, Duration::from_nanos(ns as u64));
-        }
+/// Adds the time of each stage by the device's clock. If it has none, adds the time of the whole
+/// submission as "device".
+pub(super) fn add_stage_times(
+    device: &Device,
+    stats: &mut FrameStats,
+    stages: &[&'static str],
+    timestamps: &[u64],
+    whole: Duration,
+) {
+    let Some(tick_ns) = device.tick_ns() else {
+        add_time(stats, "device", whole);
+        return;
+    };
+    for (stage, ticks) in stages.iter().zip(timestamps.chunks_exact(2)) {
+        let ns = ticks[1].saturating_sub(ticks[0]) as f64 * f64::from(tick_ns);
+        add_time(stats, stage, Duration::from_nanos(ns as u64));
     }
 }
 
