@@ -32,6 +32,7 @@ mod mirror;
 mod partition;
 mod plan;
 mod project;
+mod project_work;
 mod rasterize;
 mod read_back;
 mod resolve;

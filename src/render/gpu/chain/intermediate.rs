@@ -11,7 +11,7 @@ use crate::gpu::kernel::Recorder;
 use crate::gpu::layout::{Counters, Frame as GpuFrame, SplatColor, SplatShape};
 use crate::gpu::partition::Capacity;
 use crate::gpu::plan::Counts;
-use crate::gpu::project::ProjectWork;
+use crate::gpu::project_work::ProjectWork;
 use crate::gpu::read_back::{MappedFrame, ReadBack};
 use crate::gpu::resolve::Outputs;
 use crate::layout::Splat;
