@@ -395,6 +395,10 @@ impl Backend for Gpu {
         limits::gpu_frames(self.threads())
     }
 
+    fn has_idle_cores(&self) -> bool {
+        true
+    }
+
     fn render(
         &self,
         frame: &Frame<'_>,
