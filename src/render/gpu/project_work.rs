@@ -140,11 +140,14 @@ impl ProjectWork {
         // Chunk views, and the cluster views of each page by kernel.
         let mut work = Self::default();
         let mut by_kernel: BTreeMap<(usize, Variant), Vec<u32>> = BTreeMap::new();
-        let found = parts.iter().map(|(pair, _)| *pair).zip(&visible).collect::<Vec<_>>();
-        for of_pair in found.chunk_by(|(one, _), (other, _)| one == other) {
-            let pair = &pairs[of_pair[0].0];
-            let clusters = of_pair.iter().flat_map(|(_, clusters)| clusters.as_slice());
-            work.add(pair, clusters, frame, &mut by_kernel);
+        let mut last = None;
+        let mut chunk_views = [None; 2];
+        for ((pair, _), clusters) in parts.iter().zip(&visible) {
+            if last != Some(*pair) {
+                last = Some(*pair);
+                chunk_views = [None; 2];
+            }
+            work.add(&pairs[*pair], clusters, frame, &mut chunk_views, &mut by_kernel);
         }
 
         // One dispatch per page and kernel.
@@ -157,42 +160,35 @@ impl ProjectWork {
         work
     }
 
-    /// Adds the visible clusters of a chunk in a view.
-    fn add<'c>(
+    /// Adds some visible clusters of a chunk in a view. `chunk_views` are those of the pair without and with shadows.
+    fn add(
         &mut self,
         pair: &ChunkInView<'_>,
-        clusters: impl Iterator<Item = &'c ClusterPlace>,
+        clusters: &[ClusterPlace],
         frame: &Frame<'_>,
+        chunk_views: &mut [Option<u32>; 2],
         by_kernel: &mut BTreeMap<(usize, Variant), Vec<u32>>,
     ) {
-        let has_actors = !frame.scene.placed.is_empty();
-        let mut chunk_views = [None; 2];
         // Neighbouring clusters have the same kernel, mostly: it is looked up once for them.
-        let mut last = None;
-        let mut run: Vec<u32> = Vec::new();
-        for &ClusterPlace { page, line, shadowed } in clusters {
-            if chunk_views == [None; 2] {
+        let runs = clusters.chunk_by(|a, b| (a.page, a.shadowed) == (b.page, b.shadowed));
+        for run in runs {
+            let ClusterPlace { page, shadowed, .. } = run[0];
+            if *chunk_views == [None; 2] {
                 self.add_owner(pair);
             }
             let variant = pair.variant(shadowed);
             let chunk_view = *chunk_views[usize::from(shadowed)].get_or_insert_with(|| {
                 self.chunk_views.push(pair.chunk_view(variant, frame.profile));
-                if has_actors {
+                if !frame.scene.placed.is_empty() {
                     self.add_light(pair, shadowed);
                 }
                 self.chunk_views.len() as u32 - 1
             });
-            if last != Some((page, variant)) {
-                if let Some(kernel) = last {
-                    by_kernel.entry(kernel).or_default().append(&mut run);
-                }
-                last = Some((page, variant));
-            }
-            run.push(self.cluster_views.len() as u32);
-            self.cluster_views.push(ClusterView { line, chunk_view });
-        }
-        if let Some(kernel) = last {
-            by_kernel.entry(kernel).or_default().append(&mut run);
+            let first = self.cluster_views.len() as u32;
+            let views = run.iter().map(|place| ClusterView { line: place.line, chunk_view });
+            self.cluster_views.extend(views);
+            let kernel = by_kernel.entry((page, variant)).or_default();
+            kernel.extend(first..first + run.len() as u32);
         }
     }
 
