@@ -28,6 +28,7 @@ mod growable_buffer;
 mod kernel;
 pub mod layout;
 mod lens;
+mod long_tiles;
 mod mirror;
 mod partition;
 mod plan;
@@ -42,8 +43,9 @@ pub mod shaders;
 mod slots;
 mod sort;
 mod tickets;
+mod tuning;
+mod turns;
 
-use std::sync::Arc;
 use std::time::Instant;
 
 use parking_lot::Mutex;
@@ -54,8 +56,9 @@ use wgpu::AdapterInfo;
 pub use bandwidth::FrameCounts;
 pub use device::{AdapterChoice, DeviceInfo, DeviceTotals, GpuError, devices};
 pub use roofline::Roofline;
+pub use tuning::Tuning;
 
-use self::chain::{Chain, InFlight, Turn, Waited};
+use self::chain::Chain;
 use self::device::Device;
 use self::discarded::Discarded;
 use self::read_back::MappedFrame;
@@ -75,6 +78,8 @@ pub struct Gpu {
     info: AdapterInfo,
     shaders: Shaders,
     limits: MemoryLimits,
+    /// Which kernels run, if that was chosen.
+    tuning: Option<Tuning>,
     /// Copies images to their targets, and runs the callbacks of finished views.
     deliver: ThreadPool,
     /// Culls clusters. It has its own pool, so that a frame that is drawn does not wait for one that is
@@ -131,7 +136,7 @@ impl Gpu {
     /// # Errors
     /// There is no such device, or a shader cannot be compiled for it.
     pub fn new(choice: &AdapterChoice, threads: usize) -> Result<Self, GpuError> {
-        Self::open(choice, threads, Shaders::default(), MemoryLimits::default())
+        Self::open(choice, threads, Shaders::default(), MemoryLimits::default(), None)
     }
 
     /// As [`Gpu::new`] with other shaders: for tests that break a shader and check that it is detected.
@@ -143,7 +148,7 @@ impl Gpu {
         threads: usize,
         shaders: Shaders,
     ) -> Result<Self, GpuError> {
-        Self::open(choice, threads, shaders, MemoryLimits::default())
+        Self::open(choice, threads, shaders, MemoryLimits::default(), None)
     }
 
     /// As [`Gpu::new`] with limits on the device's memory.
@@ -155,7 +160,20 @@ impl Gpu {
         threads: usize,
         limits: MemoryLimits,
     ) -> Result<Self, GpuError> {
-        Self::open(choice, threads, Shaders::default(), limits)
+        Self::open(choice, threads, Shaders::default(), limits, None)
+    }
+
+    /// As [`Gpu::with_shaders`] with a choice of kernels: for tests of those that the device would not run.
+    ///
+    /// # Errors
+    /// As [`Gpu::new`].
+    pub fn with_tuning(
+        choice: &AdapterChoice,
+        threads: usize,
+        shaders: Shaders,
+        tuning: Tuning,
+    ) -> Result<Self, GpuError> {
+        Self::open(choice, threads, shaders, MemoryLimits::default(), Some(tuning))
     }
 
     fn open(
@@ -163,6 +181,7 @@ impl Gpu {
         threads: usize,
         shaders: Shaders,
         limits: MemoryLimits,
+        tuning: Option<Tuning>,
     ) -> Result<Self, GpuError> {
         if threads > limits::RENDER_THREADS {
             let limit = limits::RENDER_THREADS;
@@ -173,7 +192,7 @@ impl Gpu {
             binding_bytes: limits.binding_bytes.max(limits::BINDING_BYTES_MIN),
             ..limits
         };
-        let device = Device::open(choice, &shaders, limits.binding_bytes)?;
+        let device = Device::open(choice, &shaders, limits.binding_bytes, tuning)?;
         let pool = |name: &'static str| {
             let builder = rayon::ThreadPoolBuilder::new().num_threads(threads);
             let pool = builder.thread_name(move |i| format!("{name}-{i}")).build();
@@ -183,6 +202,7 @@ impl Gpu {
             choice: choice.clone(),
             info: device.info.clone(),
             limits,
+            tuning,
             deliver: pool("deliver")?,
             cull: pool("cull")?,
             queue: TicketQueue::default(),
@@ -251,88 +271,6 @@ impl Gpu {
     ) -> Result<StageOutputs, RenderError> {
         frame.check_views()?;
         self.in_turn(|chain| chain.run_through(frame, done, last, &self.cull))
-    }
-
-    /// Runs `work` on the device after all earlier callers. Opens the device again if it was lost. The next caller has
-    /// its turn when this returns.
-    fn in_turn<T>(
-        &self,
-        work: impl FnOnce(&mut Chain) -> Result<T, RenderError>,
-    ) -> Result<T, RenderError> {
-        let _ticket = self.queue.wait();
-        self.with_chain(work)
-    }
-
-    /// Runs `work` on the device; called in turn.
-    fn with_chain<T>(
-        &self,
-        work: impl FnOnce(&mut Chain) -> Result<T, RenderError>,
-    ) -> Result<T, RenderError> {
-        let mut slot = self.chain.lock();
-        // If `work` panics, the slot stays empty: memory may be half-written then, and the next caller
-        // opens the device again.
-        let mut chain = match slot.take() {
-            Some(chain) => chain,
-            None => self.reopen()?,
-        };
-        let done = work(&mut chain);
-        match done {
-            // Memory may be half-written here, too.
-            Err(RenderError::Device { .. }) => self.discarded.add(chain),
-            _ => *slot = Some(chain),
-        }
-        done
-    }
-
-    /// Draws a frame. The next one has its turn while the device draws this one.
-    fn draw(&self, frame: &Frame<'_>, outputs: &Outputs) -> Result<MappedFrame, RenderError> {
-        let called = Instant::now();
-        let ticket = self.queue.wait();
-        let slot = self.slots.wait();
-        let wait = called.elapsed();
-        let turn = self.with_chain(|chain| chain.take_turn(frame, outputs, &self.cull))?;
-        drop(ticket);
-        let waited = match turn {
-            Turn::Drawn(drawn) => Waited::Drawn(drawn),
-            Turn::InFlight(in_flight) => self.finish(*in_flight)?,
-        };
-        drop(slot);
-        let mut drawn = match waited {
-            Waited::Drawn(drawn) => drawn,
-            Waited::Overflowed(needs) => {
-                self.in_turn(|chain| chain.draw_again(needs, frame, outputs, &self.cull))?
-            }
-        };
-        drawn.stats.stages_ms.insert(0, ("wait", wait.as_secs_f64() * 1e3));
-        Ok(drawn)
-    }
-
-    /// Waits for a frame in flight. If its device has failed, the next frame opens it again.
-    fn finish(&self, in_flight: InFlight) -> Result<Waited, RenderError> {
-        let device = in_flight.device.clone();
-        let waited = in_flight.wait();
-        if let Err(RenderError::Device { .. }) = waited {
-            let mut slot = self.chain.lock();
-            // Another frame of the same device may have failed before, and the device may be open again.
-            if slot.as_ref().is_some_and(|chain| Arc::ptr_eq(&chain.device, &device)) {
-                slot.take().into_iter().for_each(|chain| self.discarded.add(chain));
-            }
-        }
-        waited
-    }
-
-    /// Opens the device again after it was lost.
-    fn reopen(&self) -> Result<Chain, RenderError> {
-        let failed = |reason| RenderError::Device { device: self.info.name.clone(), reason };
-        let device = Device::open(&self.choice, &self.shaders, self.limits.binding_bytes);
-        let device = device.map_err(|error| failed(error.to_string()))?;
-        // Another device would draw other bytes, and was not requested.
-        if device.info != self.info {
-            let reason = format!("it was lost, and in its place is {}", device.info.name);
-            return Err(failed(reason));
-        }
-        tracing::info!(device = device.info.name, "the GPU was opened again");
-        Chain::new(device, self.limits.mirror_bytes)
     }
 
     /// Draws a frame with `draw`, and copies its pixels to the targets.

@@ -8,10 +8,13 @@ use wgpu::{BufferUsages, BufferView, MapMode, PollType, SubmissionIndex};
 use super::device::Device;
 use super::growable_buffer::GrowableBuffer;
 use super::kernel::TIMESTAMP_BYTES;
-use super::layout::{Counters, FrameView};
+use super::layout::{Counters, FrameView, TileCounters};
 use super::rasterize::pages;
 use super::resolve::Planes;
 use crate::{FrameStats, RenderError, limits};
+
+/// Offset of the counters of stage rasterize after the others, in bytes.
+pub(super) const TILE_COUNTERS_OFFSET: u64 = 128;
 
 /// Offset of the timestamps after the counters, in bytes.
 pub(super) const TIMESTAMP_OFFSET: u64 = 256;
@@ -26,6 +29,14 @@ pub(super) struct ReadBack {
     pub(super) pages: Vec<GrowableBuffer>,
     /// Tiles of a page; the last page may have fewer.
     pub(super) tiles_per_page: u32,
+}
+
+/// What the host reads of a submission beside pixels.
+#[derive(Debug)]
+pub(super) struct Head {
+    pub(super) counters: Counters,
+    pub(super) tile_counters: TileCounters,
+    pub(super) timestamps: Vec<u64>,
 }
 
 /// The unused read-back buffers of one device.
@@ -135,12 +146,16 @@ impl ReadBack {
     }
 
     /// The counters and the timestamps.
-    pub(super) fn head(&self, device: &Device) -> Result<(Counters, Vec<u64>), RenderError> {
+    pub(super) fn head(&self, device: &Device) -> Result<Head, RenderError> {
         let view = view(device, &self.head)?;
-        let counters = bytemuck::pod_read_unaligned(&view[..size_of::<Counters>()]);
-        let start = TIMESTAMP_OFFSET as usize;
-        let timestamps = view[start..start + TIMESTAMP_BYTES as usize].chunks_exact(8);
-        Ok((counters, timestamps.map(bytemuck::pod_read_unaligned).collect()))
+        let part = |at: u64, bytes: usize| &view[at as usize..at as usize + bytes];
+        let timestamps = part(TIMESTAMP_OFFSET, TIMESTAMP_BYTES as usize).chunks_exact(8);
+        let tile_counters = part(TILE_COUNTERS_OFFSET, size_of::<TileCounters>());
+        Ok(Head {
+            counters: bytemuck::pod_read_unaligned(part(0, size_of::<Counters>())),
+            tile_counters: bytemuck::pod_read_unaligned(tile_counters),
+            timestamps: timestamps.map(bytemuck::pod_read_unaligned).collect(),
+        })
     }
 
     /// The pixels.

@@ -71,6 +71,8 @@ const VARIANTS: &[Variant] = &[
     plain("bin"),
     plain("ranges"),
     plain("expand"),
+    plain("long_tiles"),
+    plain("rasterize_long"),
     variant("rasterize", "rasterize", &[NO_INSTANCES, NO_BACKGROUND]),
     variant("rasterize_map", "rasterize", &[NO_INSTANCES, BACKGROUND, MAP, RAY_PINHOLE]),
     variant("rasterize_map_lens", "rasterize", &[NO_INSTANCES, BACKGROUND, MAP, RAY_LENS]),
@@ -97,6 +99,7 @@ const FILES: &[(&str, &str)] = &[
     ("instances", include_str!("../../../shaders/instances.wgsl")),
     ("layout", include_str!("../../../shaders/shared/layout.wgsl")),
     ("lens", include_str!("../../../shaders/lens.wgsl")),
+    ("long_tiles", include_str!("../../../shaders/long_tiles.wgsl")),
     ("math", include_str!("../../../shaders/shared/math.wgsl")),
     ("no_actors", include_str!("../../../shaders/shared/no_actors.wgsl")),
     ("no_instances", include_str!("../../../shaders/shared/no_instances.wgsl")),
@@ -107,6 +110,7 @@ const FILES: &[(&str, &str)] = &[
     ("project", include_str!("../../../shaders/project.wgsl")),
     ("ranges", include_str!("../../../shaders/ranges.wgsl")),
     ("rasterize", include_str!("../../../shaders/rasterize.wgsl")),
+    ("rasterize_long", include_str!("../../../shaders/rasterize_long.wgsl")),
     ("ray_lens", include_str!("../../../shaders/ray_lens.wgsl")),
     ("ray_pinhole", include_str!("../../../shaders/ray_pinhole.wgsl")),
     ("resolve", include_str!("../../../shaders/resolve.wgsl")),
@@ -115,6 +119,7 @@ const FILES: &[(&str, &str)] = &[
     ("sky_map", include_str!("../../../shaders/sky_map.wgsl")),
     ("sky_network", include_str!("../../../shaders/sky_network.wgsl")),
     ("sort", include_str!("../../../shaders/sort.wgsl")),
+    ("tile_blocks", include_str!("../../../shaders/shared/tile_blocks.wgsl")),
     ("unscented", include_str!("../../../shaders/unscented.wgsl")),
 ];
 

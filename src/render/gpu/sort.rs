@@ -123,7 +123,7 @@ mod tests {
     /// Stress case T21: as many keys as a binding holds, 2^25 on lavapipe, and 70 million at most.
     #[test]
     fn t21_as_many_keys_as_a_binding_holds() {
-        let device = Device::open(&AdapterChoice::Best, &Shaders::default(), u64::MAX)
+        let device = Device::open(&AdapterChoice::Best, &Shaders::default(), u64::MAX, None)
             .expect("the GPU's tests need a Vulkan driver: apt-get install mesa-vulkan-drivers");
         let count = (device.binding_bytes() / 4).min(70_000_000) as u32;
         // Half a million distinct keys that differ in all four digits, so that 64 keys and more are equal.

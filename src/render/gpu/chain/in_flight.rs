@@ -12,10 +12,10 @@ use super::regions::{DrawInput, PreparedRegion};
 use super::{Chain, CurrentFrame, Source, Tally, add_counts, add_time, fits, needs};
 use crate::actor_views::ActorViews;
 use crate::gpu::device::Device;
-use crate::gpu::layout::{Counters, RASTER_BATCH};
+use crate::gpu::layout::RASTER_BATCH;
 use crate::gpu::partition::{Capacity, PartitionKey, TileRows};
 use crate::gpu::rasterize::TileOutput;
-use crate::gpu::read_back::{MappedFrame, ReadBackPool};
+use crate::gpu::read_back::{Head, MappedFrame, ReadBackPool};
 use crate::gpu::resolve::Outputs;
 use crate::{Frame, RenderError};
 
@@ -133,13 +133,13 @@ impl InFlight {
     /// The device fails, or a tile has more splats than a software device can blend.
     pub(in crate::gpu) fn wait(self) -> Result<Waited, RenderError> {
         let Self { device, read_backs, tally, mut current, cluster_views, submitted } = self;
-        let counters = submitted.wait(&device, &mut current)?;
-        if !fits(&counters, &current.parameters) {
+        let head = submitted.wait(&device, &mut current)?;
+        if !fits(&head.counters, &current.parameters) {
             current.read_back.unmap();
             read_backs.give_back(current.read_back);
-            return Ok(Waited::Overflowed(needs(&counters)));
+            return Ok(Waited::Overflowed(needs(&head.counters)));
         }
-        current.count(cluster_views, &counters)?;
+        current.count(cluster_views, &head)?;
         {
             let mut tally = tally.lock();
             tally.regions += 1;
@@ -150,23 +150,23 @@ impl InFlight {
 }
 
 impl Submitted {
-    /// Waits for the region, maps its read-back buffers, and adds the times of its stages. Returns what the device counted.
+    /// Waits for the region, maps its read-back buffers, and adds the times of its stages.
     pub(super) fn wait(
         self,
         device: &Device,
         current: &mut CurrentFrame,
-    ) -> Result<Counters, RenderError> {
+    ) -> Result<Head, RenderError> {
         current.read_back.map(device, self.index)?;
         device.check()?;
-        let (counters, timestamps) = current.read_back.head(device)?;
+        let head = current.read_back.head(device)?;
         super::record::add_stage_times(
             device,
             &mut current.stats,
             &self.stages,
-            &timestamps,
+            &head.timestamps,
             self.at.elapsed(),
         );
-        Ok(counters)
+        Ok(head)
     }
 }
 
@@ -175,19 +175,15 @@ impl CurrentFrame {
     ///
     /// # Errors
     /// A tile has more splats than a software device can blend.
-    pub(super) fn count(
-        &mut self,
-        cluster_views: u32,
-        counters: &Counters,
-    ) -> Result<(), RenderError> {
+    pub(super) fn count(&mut self, cluster_views: u32, head: &Head) -> Result<(), RenderError> {
         let most = self.parameters.batch_limit;
-        if counters.most_batches > most {
+        if head.tile_counters.most_batches > most {
             let what = "visible splats in one tile (on a software device)";
             let limit = u64::from(most) * u64::from(RASTER_BATCH);
             return Err(RenderError::TooMany { what, limit });
         }
-        add_counts(&mut self.stats, counters);
-        self.counts.add(cluster_views, counters);
+        add_counts(&mut self.stats, head);
+        self.counts.add(cluster_views, head);
         Ok(())
     }
 }

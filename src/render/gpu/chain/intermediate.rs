@@ -80,7 +80,7 @@ impl Chain {
             let submission = self.device.queue.submit([recorder.encoder.finish()]);
             read_back.map(&self.device, submission)?;
             self.device.check()?;
-            let (counters, _) = read_back.head(&self.device)?;
+            let counters = read_back.head(&self.device)?.counters;
             read_back.unmap();
 
             // Read the outputs, or try again in larger buffers.

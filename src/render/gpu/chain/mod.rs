@@ -24,7 +24,7 @@ use super::bin::{Bin, BinCapacity, BinSizes};
 use super::device::Device;
 use super::growable_buffer::GrowableBuffer;
 use super::kernel::{TIMESTAMP_BYTES, timestamps};
-use super::layout::{Counters, Frame as GpuFrame};
+use super::layout::{Counters, Frame as GpuFrame, LONG_TILES};
 use super::lens::Lenses;
 use super::mirror::Mirror;
 use super::partition::{Capacity, PartitionCache};
@@ -32,7 +32,7 @@ use super::plan::Plan;
 use super::project::{Project, SplatBuffers};
 use super::project_work::ProjectWork;
 use super::rasterize::Rasterize;
-use super::read_back::{MappedFrame, ReadBack, ReadBackPool};
+use super::read_back::{Head, MappedFrame, ReadBack, ReadBackPool};
 use super::resolve::{Outputs, Planes};
 use super::scan::Scan;
 use super::sort::Sort;
@@ -165,6 +165,8 @@ impl Chain {
         let mut parameters = GpuFrame::new(frame.views, frame.profile);
         let background_iterations = self.rasterize.background_iterations();
         parameters.batch_limit = self.device.max_tile_batches(background_iterations);
+        parameters.long_tile_splats = self.device.tuning().long_tile_splats;
+        parameters.long_tiles = LONG_TILES.min(parameters.tiles);
         let tiles_per_page = self.rasterize.reserve(&self.device, planes, parameters.tiles);
         let mut read_back = self.read_backs.take().unwrap_or_else(|| ReadBack::new(&self.device));
         read_back.reserve(&self.device, planes, parameters.tiles, tiles_per_page);
@@ -267,8 +269,9 @@ fn add_time(stats: &mut FrameStats, stage: &'static str, time: Duration) {
 }
 
 /// Adds the counts of a region. A splat that reaches into two bands of a view counts twice.
-fn add_counts(stats: &mut FrameStats, counters: &Counters) {
+fn add_counts(stats: &mut FrameStats, head: &Head) {
+    let Head { counters, tile_counters, .. } = head;
     stats.visible_pairs += u64::from(counters.splats);
     stats.instances += u64::from(counters.instances);
-    stats.evaluations += counters.evaluations();
+    stats.evaluations += tile_counters.evaluations();
 }

@@ -9,11 +9,11 @@ use crate::FrameStats;
 use crate::constants::DEPTH_BITS;
 use crate::gpu::device::Device;
 use crate::gpu::kernel::{Recorder, TIMESTAMP_BYTES};
-use crate::gpu::layout::{Counters, Frame as GpuFrame, Owner};
+use crate::gpu::layout::{Counters, Frame as GpuFrame, Owner, TileCounters};
 use crate::gpu::plan::{Counts, job};
 use crate::gpu::project::ProjectInputs;
 use crate::gpu::rasterize::{RasterizeInputs, TileOutput};
-use crate::gpu::read_back::TIMESTAMP_OFFSET;
+use crate::gpu::read_back::{TILE_COUNTERS_OFFSET, TIMESTAMP_OFFSET};
 use crate::gpu::sort::{Columns, SortJobs};
 use crate::stage::Stage;
 
@@ -49,7 +49,7 @@ impl Chain {
 
         let mut pass = recorder.stage("rasterize");
         let inputs = RasterizeInputs { plan, splats, bin, lenses, owners, first_splats };
-        self.rasterize.run(device, &mut pass, inputs, output);
+        self.rasterize.run(device, &mut pass, inputs, output, current.parameters.tiles);
         drop(pass);
 
         // Copy all values that the host reads.
@@ -59,6 +59,9 @@ impl Chain {
         let stages = recorder.finish_stages(timestamps);
         let encoder = &mut recorder.encoder;
         encoder.copy_buffer_to_buffer(plan.counters(), 0, head, 0, size_of::<Counters>() as u64);
+        let bytes = size_of::<TileCounters>() as u64;
+        let tile_counters = plan.tile_counters();
+        encoder.copy_buffer_to_buffer(tile_counters, 0, head, TILE_COUNTERS_OFFSET, bytes);
         encoder.copy_buffer_to_buffer(timestamps, 0, head, TIMESTAMP_OFFSET, TIMESTAMP_BYTES);
         self.rasterize.copy(encoder, &read_back.pages, output);
         let submission = device.queue.submit([recorder.encoder.finish()]);

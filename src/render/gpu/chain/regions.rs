@@ -157,10 +157,10 @@ impl Chain {
     ) -> Result<Capacity, RenderError> {
         loop {
             let submitted = self.submit_region(source, tiles.clone(), current);
-            let counters = submitted.wait(&self.device, current)?;
-            let (needs, fits) = self.evaluate(&counters, &current.parameters);
+            let head = submitted.wait(&self.device, current)?;
+            let (needs, fits) = self.evaluate(&head.counters, &current.parameters);
             if fits {
-                current.count(source.cluster_views(), &counters)?;
+                current.count(source.cluster_views(), &head)?;
                 return Ok(needs);
             }
             if needs.min_regions(self.limit()) > 1 {
