@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use glam::DMat3;
 use wildcity_render::gpu::shaders::Shaders;
-use wildcity_render::gpu::{Gpu, Tuning};
+use wildcity_render::gpu::{Gpu, Scatter, Tuning};
 use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::{RenderProfile, Scene, Sky};
 
@@ -17,13 +17,21 @@ use crate::streets::{demo_street, street, street_views};
 use crate::{placed, shared_gpu};
 
 /// The kernels that software devices run.
-const PLAIN: Tuning = Tuning { long_tile_splats: u32::MAX };
+const PLAIN: Tuning = Tuning { long_tile_splats: u32::MAX, scatter: Scatter::Plain };
+
+/// The kernel of hardware that moves the keys of a sort, if the device can run it.
+const BALLOTS: Tuning = Tuning { scatter: Scatter::EmulatedBallots, ..PLAIN };
 
 /// Every tile has the kernel of long lists.
-const LONG: Tuning = Tuning { long_tile_splats: 0 };
+const LONG: Tuning = Tuning { long_tile_splats: 0, ..PLAIN };
 
-/// Other choices, beside [`PLAIN`]. With the second, some tiles have that kernel and others not.
-const CHOICES: [Tuning; 2] = [LONG, Tuning { long_tile_splats: 40 }];
+/// Other choices, beside [`PLAIN`].
+const CHOICES: [Tuning; 3] = [
+    LONG,
+    BALLOTS,
+    // Some tiles have it and others not.
+    Tuning { long_tile_splats: 40, ..BALLOTS },
+];
 
 fn tuned(tuning: Tuning) -> Watched {
     gpu_with_tuning(Shaders::default(), tuning)
@@ -104,7 +112,7 @@ fn every_choice_of_kernels_draws_the_same_bytes() {
 #[test]
 fn a_hundred_frames_of_long_tiles_are_equal() {
     let scene = Scene::from_gaussians(&street(20_000, 1, 83));
-    let gpu = tuned(Tuning { long_tile_splats: 40 });
+    let gpu = tuned(Tuning { long_tile_splats: 40, ..PLAIN });
     let profile = RenderProfile::default();
     let first = render(&gpu, &scene, &profile, &street_views());
     for repeat in 1..100 {
@@ -139,6 +147,16 @@ const MUTATIONS: &[(&str, &str, &str)] = &[
     ("rasterize", "at + 4u * plane", "at + 3u * plane"),
     ("rasterize", "(place - 1u) * LONG_TILE_WORDS", "place * LONG_TILE_WORDS"),
     ("rasterize", "long_places[tile] != 0u", "long_places[tile] == 9u"),
+    ("sort_ballots_emulated", "select(~votes, votes, is_set)", "votes"),
+    ("sort_ballots_emulated", "& below.x", "& ~below.x"),
+    ("sort_ballots_emulated", "held && own_rank == 0u", "held"),
+    ("sort_ballots_emulated", "before += sums[k]", "before += 0u"),
+    ("sort_ballots_emulated", "before += starts[k]", "before += 0u"),
+    ("sort_ballots_emulated", "before += counted", "before = counted"),
+    ("sort_ballots_emulated", "let to = starts[digit(key)] + place", "let to = place"),
+    ("sort_ballots_emulated", "totals[group.x] = before", "totals[group.x] = 0u"),
+    ("sort_ballots_emulated", "store(place_3, values[first + ", "store(place_3, values["),
+    ("sort_ballots_emulated", "at_5 = own + 5u", "at_5 = own + 4u"),
 ];
 
 #[test]
@@ -151,7 +169,7 @@ fn a_mutation_of_these_kernels_changes_the_image() {
         let broken = broken.unwrap_or_else(|| panic!("{shader} has no text {original:?}"));
         // Some tiles have long lists and others not.
         [40, 0].into_iter().any(|long_tile_splats| {
-            let tuning = Tuning { long_tile_splats };
+            let tuning = Tuning { long_tile_splats, ..BALLOTS };
             let gpu = gpu_with_tuning(broken.clone(), tuning);
             render(&gpu, &scene, &profile, &wide_views()) != truth
         })

@@ -252,7 +252,7 @@ impl Device {
         let opened = opened.ok_or_else(|| failed("the driver does not respond".into()))?;
         let (device, queue) = opened.map_err(|error| failed(error.to_string()))?;
 
-        let tuning = tuning.unwrap_or_else(|| Tuning::new(&info));
+        let tuning = tuning.unwrap_or_else(|| Tuning::new(&info, device.features(), &limits));
 
         // The handlers are set first of all: without one, an error ends the process.
         let fault = Arc::new(Mutex::new(None));

@@ -56,7 +56,7 @@ use wgpu::AdapterInfo;
 pub use bandwidth::FrameCounts;
 pub use device::{AdapterChoice, DeviceInfo, DeviceTotals, GpuError, devices};
 pub use roofline::Roofline;
-pub use tuning::Tuning;
+pub use tuning::{Scatter, Tuning};
 
 use self::chain::Chain;
 use self::device::Device;

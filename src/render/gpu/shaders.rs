@@ -57,6 +57,8 @@ const BACKGROUND: Choice = choice("BACKGROUND", "background");
 const NO_BACKGROUND: Choice = choice("BACKGROUND", "no_background");
 const MAP: Choice = choice("SKY", "sky_map");
 const NETWORK: Choice = choice("SKY", "sky_network");
+const BALLOTS: Choice = choice("BALLOTS", "ballots");
+const BALLOTS_EMULATED: Choice = choice("BALLOTS", "ballots_emulated");
 const RAY_PINHOLE: Choice = choice("RAYS", "ray_pinhole");
 const RAY_LENS: Choice = choice("RAYS", "ray_lens");
 
@@ -68,6 +70,8 @@ const VARIANTS: &[Variant] = &[
     plain("scan"),
     plain("plan"),
     plain("sort"),
+    variant("sort_ballots", "sort_ballots", &[BALLOTS]),
+    variant("sort_ballots_emulated", "sort_ballots", &[BALLOTS_EMULATED]),
     plain("bin"),
     plain("ranges"),
     plain("expand"),
@@ -92,6 +96,8 @@ const FILES: &[(&str, &str)] = &[
     ("angle", include_str!("../../../shaders/shared/angle.wgsl")),
     ("appearance", include_str!("../../../shaders/appearance.wgsl")),
     ("background", include_str!("../../../shaders/background.wgsl")),
+    ("ballots", include_str!("../../../shaders/ballots.wgsl")),
+    ("ballots_emulated", include_str!("../../../shaders/ballots_emulated.wgsl")),
     ("bin", include_str!("../../../shaders/bin.wgsl")),
     ("constants", include_str!("../../../shaders/shared/constants.wgsl")),
     ("expansion", include_str!("../../../shaders/expansion.wgsl")),
@@ -120,6 +126,7 @@ const FILES: &[(&str, &str)] = &[
     ("sky_network", include_str!("../../../shaders/sky_network.wgsl")),
     ("sort", include_str!("../../../shaders/sort.wgsl")),
     ("tile_blocks", include_str!("../../../shaders/shared/tile_blocks.wgsl")),
+    ("sort_ballots", include_str!("../../../shaders/sort_ballots.wgsl")),
     ("unscented", include_str!("../../../shaders/unscented.wgsl")),
 ];
 
