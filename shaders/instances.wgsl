@@ -19,6 +19,11 @@ fn note_owner(list_index: u32, before: vec4f, after: vec4f, counts: vec4<bool>) 
     halved_by = select(halved_by, vec4u(list_index + 1u), halves);
 }
 
+// Takes over what another kernel has recorded.
+fn set_owners(list_indices: vec4u) {
+    halved_by = list_indices;
+}
+
 // The instances of four pixels: 0 none, 1 the twin, k + 2 actor k.
 fn instances() -> vec4u {
     return vec4u(

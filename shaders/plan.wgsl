@@ -27,7 +27,8 @@ const MACRO_TILES: u32 = 8;
 const BATCHES: u32 = 9;
 const BATCH_TILES: u32 = 10;
 const INSTANCES: u32 = 11;
-const JOB_COUNT: u32 = 12;
+const LONG_TILES: u32 = 12;
+const JOB_COUNT: u32 = 13;
 
 // Runs after the prefix sum over the visible splats of all cluster views.
 @compute @workgroup_size(1)

@@ -11,6 +11,8 @@
 // those of lenses: it may do so in one variant of this shader and not in another, and a pixel's bytes must not
 // depend on what else is requested.
 //
+// Tiles with long lists are blended by `rasterize_long.wgsl`: `main` leaves them out, and `finish` writes their pixels.
+//
 // `BACKGROUND` stands for `background.wgsl` or `no_background.wgsl`, and `INSTANCES` for `instances.wgsl` or
 // `no_instances.wgsl`. Twin of
 // `src/render/cpu/rasterize.rs`.
@@ -18,6 +20,7 @@
 #import constants
 #import layout
 #import math
+#import tile_blocks
 #import INSTANCES
 #import resolve
 #import BACKGROUND
@@ -28,7 +31,14 @@
 @group(0) @binding(3) var<storage, read> instance_splats: array<u32>;
 @group(0) @binding(4) var<storage, read> shapes: array<SplatShape>;
 @group(0) @binding(5) var<storage, read> colors: array<SplatColor>;
-@group(0) @binding(6) var<storage, read_write> counters: Counters;
+@group(0) @binding(6) var<storage, read_write> counters: TileCounters;
+// For each tile, its place among the tiles with long lists, plus 1; 0 for the others.
+@group(0) @binding(15) var<storage, read> long_places: array<u32>;
+// The sums of tiles with long lists; `rasterize_long.wgsl` has the layout.
+@group(0) @binding(16) var<storage, read> long_sums: array<vec4u>;
+
+// Whether another kernel blends the tiles with long lists.
+override LONG_TILES: bool;
 
 // 64 threads of 4 pixels. A batch takes 44 B per splat, 6 KiB of workgroup memory, so that this memory
 // does not limit how many workgroups a multiprocessor can hold.
@@ -66,12 +76,14 @@ fn main(
         return;
     }
     let tile = span.first + index;
+    if LONG_TILES && long_places[tile] != 0u {
+        return;
+    }
     let view_index = view_of(tile);
     let view = frame.view[view_index];
-    let tile_of_view = tile - view.first_tile;
-    let corner = vec2u(tile_of_view % view.columns, tile_of_view / view.columns) * TILE_PX;
+    let corner = corner_of(tile, view);
     let block = thread / 4u;
-    let first_pixel = vec2u(block % 4u, block / 4u) * BLOCK_PX + vec2u(0u, thread % 4u);
+    let first_pixel = first_pixel_of(thread);
     let at_px = vec2f(corner + first_pixel) + 0.5;
 
     if thread == 0u {
@@ -171,6 +183,50 @@ fn main(
     resolve(index, first_pixel.y * TILE_PX + first_pixel.x, sums);
 }
 
+// Writes the pixels of a tile with a long list.
+@compute @workgroup_size(THREADS)
+fn finish(
+    @builtin(workgroup_id) group: vec3u,
+    @builtin(num_workgroups) groups: vec3u,
+    @builtin(local_invocation_index) thread: u32,
+) {
+    let index = group_index(group, groups);
+    if index >= span.count {
+        return;
+    }
+    let tile = span.first + index;
+    let place = long_places[tile];
+    if place == 0u {
+        return;
+    }
+    let view_index = view_of(tile);
+    let first_pixel = first_pixel_of(thread);
+    let at_px = vec2f(corner_of(tile, frame.view[view_index]) + first_pixel) + 0.5;
+    let at = ((place - 1u) * LONG_TILE_WORDS + first_pixel.y * TILE_PX + first_pixel.x) / 4u;
+    let plane = TILE_PX * TILE_PX / 4u;
+    var sums = Sums(
+        bitcast<vec4f>(long_sums[at]),
+        bitcast<vec4f>(long_sums[at + plane]),
+        bitcast<vec4f>(long_sums[at + 2u * plane]),
+        bitcast<vec4f>(long_sums[at + 3u * plane]),
+        bitcast<vec4f>(long_sums[at + 4u * plane]),
+    );
+    set_owners(long_sums[at + 5u * plane]);
+    if thread == 0u {
+        let counts = long_sums[((place - 1u) * LONG_TILE_WORDS) / 4u + 6u * plane];
+        atomicAdd(&counters.block_pairs, counts.x);
+        atomicMax(&counters.most_batches, counts.y);
+    }
+    sums = composite(sums, view_index, at_px, thread);
+    resolve(index, first_pixel.y * TILE_PX + first_pixel.x, sums);
+}
+
+// The first pixel of the tile that a thread has: one of four in a row.
+fn first_pixel_of(thread: u32) -> vec2u {
+    let block = thread / 4u;
+    return vec2u(block % 4u, block / 4u) * BLOCK_PX + vec2u(0u, thread % 4u);
+}
+
 // log2(alpha) = log2(opacity) - (l0 dx + l1 dy)^2 - (l2 dy)^2 of a splat of the batch at four pixels.
 fn exponents(k: u32, at_px: vec2f) -> vec4f {
     let mean_factor = mean_factors[k];
@@ -209,32 +265,4 @@ fn blend(
     (*sums).transmittance = select((*sums).transmittance, after, counts);
     *running = after;
     return !any(counts);
-}
-
-// Blocks of a tile that the box of a splat reaches, a bit each, row by row, by the test with which `bin.wgsl`
-// finds its tiles. `corner` is the first pixel of the tile.
-fn blocks_of(shape: SplatShape, corner: vec2u) -> u32 {
-    let size = f32(TILE_PX);
-    let first_px = ceil(shape.mean_px - shape.extent_px - 0.5) - vec2f(corner);
-    let last_px = floor(shape.mean_px + shape.extent_px - 0.5) - vec2f(corner);
-    let first = clamp(first_px, vec2f(0.0), vec2f(size));
-    let last = clamp(last_px, vec2f(-1.0), vec2f(size - 1.0));
-    if any(first > last) {
-        return 0u;
-    }
-    let low = vec2u(first) / BLOCK_PX;
-    let high = vec2u(last) / BLOCK_PX;
-    // A bit per column in each row, and the first bit of each row that is reached.
-    let columns = (2u << high.x) - (1u << low.x);
-    let rows = ((16u << (4u * high.y)) - (1u << (4u * low.y))) & 0x1111u;
-    return columns * rows;
-}
-
-// Index of the view that a tile belongs to.
-fn view_of(tile: u32) -> u32 {
-    var view = 0u;
-    while view + 1u < frame.views && frame.view[view + 1u].first_tile <= tile {
-        view++;
-    }
-    return view;
 }

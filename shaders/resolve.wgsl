@@ -2,7 +2,7 @@
 // `rasterize`, so that the sums stay in registers.
 //
 // The output is tile after tile, and within a tile one plane of 256 values after another, in this order
-// and only if requested: packed RGBA8, red, green, blue, opacity, depth, instance. Twin of
+// and only if requested: red, green and blue of 8 bits, then red, green, blue, opacity, depth, instance. Twin of
 // `src/render/cpu/resolve.rs`.
 
 override RGB8: bool;
@@ -13,6 +13,8 @@ override DEPTH: bool;
 @group(0) @binding(7) var<storage, read_write> pixels: array<vec4u>;
 
 const PLANE: u32 = TILE_PX * TILE_PX;
+// Words of the plane of 8-bit colours: four pixels take three words.
+const RGB8_PLANE: u32 = PLANE / 4 * 3;
 
 // Accumulated values of four pixels of a row.
 struct Sums {
@@ -28,17 +30,20 @@ struct Sums {
 
 // Writes four pixels of a tile; `first_pixel` is the index of the first one in the tile.
 fn resolve(tile: u32, first_pixel: u32, sums: Sums) {
-    let planes = u32(RGB8) + 3u * u32(RGB) + u32(OPACITY) + u32(DEPTH) + INSTANCE_PLANES;
-    var at = tile * planes * PLANE + first_pixel;
+    let planes = 3u * u32(RGB) + u32(OPACITY) + u32(DEPTH) + INSTANCE_PLANES;
+    var at = tile * (planes * PLANE + u32(RGB8) * RGB8_PLANE);
     let opacity = 1.0 - sums.transmittance;
     if RGB8 {
-        let bytes = to_8_bit(sums.red)
-            | (to_8_bit(sums.green) << vec4u(8u))
-            | (to_8_bit(sums.blue) << vec4u(16u))
-            | (to_8_bit(opacity) << vec4u(24u));
-        write(at, bytes);
-        at += PLANE;
+        let red = to_8_bit(sums.red);
+        let green = to_8_bit(sums.green);
+        let blue = to_8_bit(sums.blue);
+        let first = at + first_pixel / 4u * 3u;
+        write_word(first, red.x | (green.x << 8u) | (blue.x << 16u) | (red.y << 24u));
+        write_word(first + 1u, green.y | (blue.y << 8u) | (red.z << 16u) | (green.z << 24u));
+        write_word(first + 2u, blue.z | (red.w << 8u) | (green.w << 16u) | (blue.w << 24u));
+        at += RGB8_PLANE;
     }
+    at += first_pixel;
     if RGB {
         write(at, bitcast<vec4u>(sums.red));
         write(at + PLANE, bitcast<vec4u>(sums.green));
@@ -63,6 +68,11 @@ fn resolve(tile: u32, first_pixel: u32, sums: Sums) {
 // Writes four values of a plane. Planes and rows are multiples of four values, so `at` is one too.
 fn write(at: u32, four: vec4u) {
     pixels[at / 4u] = four;
+}
+
+// Writes one word.
+fn write_word(at: u32, word: u32) {
+    pixels[at / 4u][at % 4u] = word;
 }
 
 // Clamps to [0, 1], scales to 255, and rounds to the nearest integer.

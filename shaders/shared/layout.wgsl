@@ -26,9 +26,9 @@ struct Frame {
     log2_alpha_cut: f32,
     stop: f32,
     batch_limit: u32,
-    pad0: u32,
-    pad1: u32,
-    pad2: u32,
+    long_tile_splats: u32,
+    long_tiles: u32,
+    pad: u32,
     view: array<FrameView, MAX_VIEWS>,
 }
 
@@ -131,6 +131,9 @@ struct Counters {
     splats: u32,
     touches: u32,
     instances: u32,
+}
+
+struct TileCounters {
     block_pairs: atomic<u32>,
     most_batches: atomic<u32>,
 }

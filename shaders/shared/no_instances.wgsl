@@ -7,3 +7,5 @@ fn note_owner(list_index: u32, before: vec4f, after: vec4f, counts: vec4<bool>) 
 fn instances() -> vec4u {
     return vec4u(0u);
 }
+
+fn set_owners(list_indices: vec4u) {}

@@ -314,7 +314,7 @@ impl Step {
             buffers: usage.totals.buffers,
             dispatches: dispatches(&usage) - before,
             moved_bytes: usage.last_frame.stage_bytes().iter().map(|(_, bytes)| bytes).sum(),
-            read_back_bytes_per_pixel: 4 * usage.last_frame.planes,
+            read_back_bytes_per_pixel: usage.last_frame.pixel_bytes,
         }))
     }
 

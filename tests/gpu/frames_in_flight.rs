@@ -83,3 +83,23 @@ fn many_callers_with_few_threads_do_not_deadlock() {
         }
     });
 }
+
+/// The buffers are too small for one of two frames that are drawn at the same time, or for both.
+#[test]
+fn a_frame_that_overflows_beside_another() {
+    let scenes = [5_000, 150_000].map(|n| Scene::from_gaussians(&street(n, 1, 53)));
+    let alone = [0, 1].map(|k| draw(&gpu_on(&AdapterChoice::Best, 2), &scenes[k], &|_, _| {}));
+    let gpu = gpu_on(&AdapterChoice::Best, 2);
+    thread::scope(|scope| {
+        for thread in 0..4 {
+            let (gpu, scenes, alone) = (&gpu, &scenes, &alone);
+            scope.spawn(move || {
+                for turn in 0..3 {
+                    let k = (thread + turn) % 2;
+                    assert!(draw(gpu, &scenes[k], &|_, _| {}) == alone[k], "{thread}, {turn}");
+                }
+            });
+        }
+    });
+    assert!(gpu.usage().unwrap().retries > 0, "no frame overflowed");
+}

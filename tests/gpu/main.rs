@@ -38,6 +38,7 @@ mod parity;
 mod regions;
 mod sky;
 mod stages;
+mod tuning;
 mod twins;
 
 use std::sync::{Arc, Mutex, PoisonError, Weak};

@@ -86,7 +86,7 @@ fn layouts_are_the_same() {
         }
         Frame {
             splat_capacity, touch_capacity, instance_capacity, views, tiles, macro_tiles, near_m, far_m,
-            antialiased, alpha_cap, log2_alpha_cut, stop, batch_limit, pad0, pad1, pad2, view,
+            antialiased, alpha_cap, log2_alpha_cut, stop, batch_limit, long_tile_splats, long_tiles, pad, view,
         }
         Background {
             scale, offset, edge, width, octaves, encoded, identity, skip, sky_from_pixel,
@@ -107,7 +107,8 @@ fn layouts_are_the_same() {
         Span { first, count }
         Job { length, groups }
         JobSlot { job, pad }
-        Counters { splats, touches, instances, block_pairs, most_batches }
+        Counters { splats, touches, instances }
+        TileCounters { block_pairs, most_batches }
         SplatShape { mean_px, extent_px, factor, log2_opacity }
         SplatColor { rgb, depth_m }
     };

@@ -8,7 +8,7 @@ use std::process::Output;
 use std::sync::{Mutex, Once, PoisonError};
 
 use wildcity_render::gpu::shaders::Shaders;
-use wildcity_render::gpu::{AdapterChoice, Gpu, GpuError, MemoryLimits};
+use wildcity_render::gpu::{AdapterChoice, Gpu, GpuError, MemoryLimits, Tuning};
 use wildcity_render::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
 
 /// The best device of this machine.
@@ -24,6 +24,11 @@ pub(crate) fn gpu_on(choice: &AdapterChoice, threads: usize) -> Watched {
 /// The best device with other shaders.
 pub(crate) fn gpu_with(shaders: Shaders) -> Watched {
     watched(|| Gpu::with_shaders(&AdapterChoice::Best, 0, shaders))
+}
+
+/// The best device with other shaders, and a choice of kernels.
+pub(crate) fn gpu_with_tuning(shaders: Shaders, tuning: Tuning) -> Watched {
+    watched(|| Gpu::with_tuning(&AdapterChoice::Best, 0, shaders, tuning))
 }
 
 /// Limits that allow bindings of this many bytes.

@@ -2,9 +2,10 @@
 //! the memory side of the stage's roofline.
 
 use super::layout::{
-    Counters, DIGITS, EXPAND_BATCH, Frame as GpuFrame, GEOMETRY_WORDS, MACRO_COLUMNS, MACRO_ROWS,
-    SOA_BLOCK, SORT_BLOCK,
+    DIGITS, EXPAND_BATCH, Frame as GpuFrame, GEOMETRY_WORDS, MACRO_COLUMNS, MACRO_ROWS, SOA_BLOCK,
+    SORT_BLOCK,
 };
+use super::read_back::Head;
 use super::resolve::Planes;
 use super::sort::DIGIT_BITS;
 use crate::Frame;
@@ -21,8 +22,8 @@ pub struct FrameCounts {
     pub views: u32,
     /// Pixels of all views.
     pub pixels: u64,
-    /// 32-bit values per pixel that were requested.
-    pub planes: u64,
+    /// Bytes per pixel of the values that were requested: 3 for colours of 8 bits, 4 for each other value.
+    pub pixel_bytes: u64,
     /// Tiles of all views.
     pub tiles: u64,
     /// Macro tiles of all views.
@@ -46,7 +47,7 @@ impl FrameCounts {
             sh_degree: frame.scene.sh_degree(),
             views: gpu_frame.views,
             pixels: frame.views.iter().map(|view| view.camera.pixels() as u64).sum(),
-            planes: planes.tile_bytes() / u64::from(4 * TILE_PX * TILE_PX),
+            pixel_bytes: planes.tile_bytes() / u64::from(TILE_PX * TILE_PX),
             tiles: gpu_frame.tiles.into(),
             macro_tiles: gpu_frame.macro_tiles.into(),
             ..Self::default()
@@ -54,12 +55,13 @@ impl FrameCounts {
     }
 
     /// Adds the counts of a region.
-    pub(super) fn add(&mut self, cluster_views: u32, counters: &Counters) {
+    pub(super) fn add(&mut self, cluster_views: u32, head: &Head) {
+        let Head { counters, tile_counters, .. } = head;
         self.cluster_views += u64::from(cluster_views);
         self.splats += u64::from(counters.splats);
         self.touches += u64::from(counters.touches);
         self.instances += u64::from(counters.instances);
-        self.evaluations += counters.evaluations();
+        self.evaluations += tile_counters.evaluations();
     }
 
     /// Name and bytes of each stage: what it reads and writes if each kernel reads and writes every array
@@ -79,7 +81,7 @@ impl FrameCounts {
     /// | | tile | range 8 |
     /// | | macro tile | range 8, written once and read three times; number of batches, its prefix sum, and two reads of it 24 |
     /// | rasterize | visible pair | shape and colour 48, once: neighbouring tiles find them in the cache |
-    /// | | instance, tile, pixel | splat 4; range 8; 4 for each requested value |
+    /// | | instance, tile, pixel | splat 4; range 8; 3 for colours of 8 bits, 4 for each other value |
     pub fn stage_bytes(&self) -> [(&'static str, u64); 6] {
         let Self { cluster_views, splats, touches, instances, tiles, macro_tiles, .. } = *self;
         let cluster = CLUSTER as u64;
@@ -111,7 +113,7 @@ impl FrameCounts {
                 "expand",
                 touches * 16 + instances * 4 + batch_tiles * scanned + tiles * 8 + macro_tiles * 56,
             ),
-            ("rasterize", splats * 48 + instances * 4 + tiles * 8 + self.pixels * 4 * self.planes),
+            ("rasterize", splats * 48 + instances * 4 + tiles * 8 + self.pixels * self.pixel_bytes),
         ]
     }
 

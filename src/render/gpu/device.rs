@@ -24,6 +24,7 @@ use wgpu::{
 
 use super::layout::{MACRO_COLUMNS, MACRO_ROWS, WORKGROUP};
 use super::shaders::Shaders;
+use super::tuning::Tuning;
 use crate::RenderError;
 
 /// Why there is no GPU to render on.
@@ -198,9 +199,10 @@ pub(super) struct Device {
     pub(super) info: AdapterInfo,
     shaders: Shaders,
     limits: Limits,
+    tuning: Tuning,
     /// Most bytes of a binding, even if the adapter allows more.
     binding_limit: u64,
-    /// The first error since the last [`Device::check`].
+    /// The first error. It stays: several frames may be in flight, and the device is given up after an error.
     fault: Arc<Mutex<Option<String>>>,
     /// Counts of created objects and dispatches, so that the cost of each feature can be reported.
     totals: AtomicTotals,
@@ -234,12 +236,14 @@ impl Device {
         choice: &AdapterChoice,
         shaders: &Shaders,
         binding_limit: u64,
+        tuning: Option<Tuning>,
     ) -> Result<Self, GpuError> {
         let adapter = choice.find()?;
         let info = adapter.get_info();
         let limits = adapter.limits();
         let descriptor = DeviceDescriptor {
-            required_features: adapter.features() & Features::TIMESTAMP_QUERY,
+            required_features: adapter.features()
+                & (Features::TIMESTAMP_QUERY | Features::SUBGROUP),
             required_limits: limits.clone(),
             ..DeviceDescriptor::default()
         };
@@ -247,6 +251,8 @@ impl Device {
         let opened = adapter.request_device(&descriptor).now_or_never();
         let opened = opened.ok_or_else(|| failed("the driver does not respond".into()))?;
         let (device, queue) = opened.map_err(|error| failed(error.to_string()))?;
+
+        let tuning = tuning.unwrap_or_else(|| Tuning::new(&info, device.features(), &limits));
 
         // The handlers are set first of all: without one, an error ends the process.
         let fault = Arc::new(Mutex::new(None));
@@ -265,10 +271,16 @@ impl Device {
             info,
             shaders: shaders.clone(),
             limits,
+            tuning,
             binding_limit,
             fault,
             totals: AtomicTotals::default(),
         })
+    }
+
+    /// Which kernels run on this device.
+    pub(super) fn tuning(&self) -> Tuning {
+        self.tuning
     }
 
     /// The shaders that run on this device.
@@ -276,12 +288,12 @@ impl Device {
         &self.shaders
     }
 
-    /// Reports the first error since the last call.
+    /// Reports the first error of this device.
     ///
     /// # Errors
     /// A command was invalid, memory ran out, or the device is lost.
     pub(super) fn check(&self) -> Result<(), RenderError> {
-        match self.fault.lock().take() {
+        match self.fault.lock().clone() {
             None => Ok(()),
             Some(reason) => Err(self.failed(reason)),
         }

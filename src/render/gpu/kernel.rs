@@ -1,9 +1,10 @@
 //! Compute kernels (compiled entry points of shaders), and the passes that run them.
 
+use parking_lot::Mutex;
 use wgpu::{
-    BindGroupDescriptor, BindGroupEntry, BindGroupLayout, BindingResource, Buffer, BufferBinding,
-    BufferSize, CommandEncoder, CommandEncoderDescriptor, ComputePass, ComputePassDescriptor,
-    ComputePassTimestampWrites, ComputePipeline, ComputePipelineDescriptor,
+    BindGroup, BindGroupDescriptor, BindGroupEntry, BindGroupLayout, BindingResource, Buffer,
+    BufferBinding, BufferSize, CommandEncoder, CommandEncoderDescriptor, ComputePass,
+    ComputePassDescriptor, ComputePassTimestampWrites, ComputePipeline, ComputePipelineDescriptor,
     PipelineCompilationOptions, QuerySet, QuerySetDescriptor, QueryType, ShaderModule,
     ShaderModuleDescriptor, ShaderSource,
 };
@@ -17,6 +18,44 @@ pub(super) struct Kernel {
     label: &'static str,
     pipeline: ComputePipeline,
     layout: BindGroupLayout,
+    /// The bind groups of recent runs, the latest one last. Most frames bind what the frame before did: making a bind
+    /// group takes the host as long as recording a dispatch.
+    bind_groups: Mutex<Vec<(Vec<BoundBuffer>, BindGroup)>>,
+}
+
+/// Most bind groups that a kernel keeps. The prefix sum has one for each of its nine runs.
+const BIND_GROUPS: usize = 16;
+
+/// Part of a buffer at a binding number. Buffers that look alike differ.
+#[derive(Clone, Debug, PartialEq)]
+struct BoundBuffer {
+    binding: u32,
+    buffer: Buffer,
+    offset: u64,
+    size: Option<BufferSize>,
+}
+
+impl BoundBuffer {
+    /// `None` for other resources than buffers.
+    fn new(binding: u32, resource: &BindingResource<'_>) -> Option<Self> {
+        match resource {
+            BindingResource::Buffer(BufferBinding { buffer, offset, size }) => {
+                Some(Self { binding, buffer: (*buffer).clone(), offset: *offset, size: *size })
+            }
+            _ => None,
+        }
+    }
+
+    fn is(&self, (binding, resource): &(u32, BindingResource<'_>)) -> bool {
+        matches!(
+            resource,
+            BindingResource::Buffer(BufferBinding { buffer, offset, size })
+                if self.binding == *binding
+                    && self.buffer == **buffer
+                    && self.offset == *offset
+                    && self.size == *size
+        )
+    }
 }
 
 /// Number of workgroups of a kernel.
@@ -66,7 +105,7 @@ impl Kernel {
             cache: None,
         });
         let layout = pipeline.get_bind_group_layout(0);
-        Self { label: entry, pipeline, layout }
+        Self { label: entry, pipeline, layout, bind_groups: Mutex::default() }
     }
 
     /// Runs the kernel in a pass, with these resources by binding number.
@@ -78,18 +117,7 @@ impl Kernel {
         resources: &[(u32, BindingResource<'_>)],
     ) {
         device.count_dispatch();
-        let entries: Vec<BindGroupEntry<'_>> = resources
-            .iter()
-            .map(|(binding, resource)| BindGroupEntry {
-                binding: *binding,
-                resource: resource.clone(),
-            })
-            .collect();
-        let bind_group = device.device.create_bind_group(&BindGroupDescriptor {
-            label: Some(self.label),
-            layout: &self.layout,
-            entries: &entries,
-        });
+        let bind_group = self.bind_group(device, resources);
         pass.set_pipeline(&self.pipeline);
         pass.set_bind_group(0, &bind_group, &[]);
         match groups {
@@ -102,6 +130,44 @@ impl Kernel {
                 pass.dispatch_workgroups_indirect(jobs, slot * SLOT_BYTES + 4);
             }
         }
+    }
+}
+
+impl Kernel {
+    /// The bind group of these resources, that of an earlier run if there is one. Buffers that were destroyed since are
+    /// never bound again, so that their bind groups are forgotten in time.
+    fn bind_group(&self, device: &Device, resources: &[(u32, BindingResource<'_>)]) -> BindGroup {
+        let mut kept = self.bind_groups.lock();
+        let is_same = |bound: &[BoundBuffer]| {
+            bound.len() == resources.len()
+                && bound.iter().zip(resources).all(|(bound, resource)| bound.is(resource))
+        };
+        if let Some(index) = kept.iter().rposition(|(bound, _)| is_same(bound)) {
+            let found = kept.remove(index);
+            let bind_group = found.1.clone();
+            kept.push(found);
+            return bind_group;
+        }
+        let entries: Vec<BindGroupEntry<'_>> = resources
+            .iter()
+            .map(|(binding, resource)| BindGroupEntry {
+                binding: *binding,
+                resource: resource.clone(),
+            })
+            .collect();
+        let bind_group = device.device.create_bind_group(&BindGroupDescriptor {
+            label: Some(self.label),
+            layout: &self.layout,
+            entries: &entries,
+        });
+        let bound = resources.iter().map(|(binding, from)| BoundBuffer::new(*binding, from));
+        if let Some(bound) = bound.collect() {
+            if kept.len() == BIND_GROUPS {
+                kept.remove(0);
+            }
+            kept.push((bound, bind_group.clone()));
+        }
+        bind_group
     }
 }
 

@@ -37,6 +37,11 @@ pub const LARGE_SPLAT_MACRO_TILES: u32 = 16;
 pub const EXPAND_BATCH: u32 = 1024;
 /// Splats that a tile loads into workgroup memory and blends at a time.
 pub const RASTER_BATCH: u32 = 128;
+/// Most tiles with long lists that have a kernel of their own: 26 MiB of sums. 5 million visible pairs of six full
+/// cameras have 600.
+pub const LONG_TILES: u32 = 4096;
+/// Words of such a tile's sums, as in `shaders/shared/tile_blocks.wgsl`.
+pub const LONG_TILE_WORDS: u32 = 6 * constants::TILE_PX * constants::TILE_PX + 64;
 /// Gaussians of a structure-of-arrays block of the mirror, and 32-bit words of one of its lines: 128 B,
 /// which a warp reads in one transaction. A cluster's header is one line, of which three words are used.
 pub const SOA_BLOCK: u32 = 32;
@@ -97,12 +102,12 @@ pub struct Frame {
     pub stop: f32,
     /// Most batches of [`RASTER_BATCH`] splats that a tile may load.
     pub batch_limit: u32,
+    /// Tiles with more splats than this have a kernel of their own.
+    pub long_tile_splats: u32,
+    /// Most such tiles.
+    pub long_tiles: u32,
     /// Zero.
-    pub pad0: u32,
-    /// Zero.
-    pub pad1: u32,
-    /// Zero.
-    pub pad2: u32,
+    pub pad: u32,
     /// The views, in order.
     pub view: [FrameView; MAX_VIEWS],
 }
@@ -399,7 +404,7 @@ pub struct JobSlot {
     pub pad: [[u32; 4]; 15],
 }
 
-/// Counters that the host reads after a frame (20 bytes).
+/// Counters that the host reads after a frame (12 bytes).
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Counters {
@@ -409,6 +414,13 @@ pub struct Counters {
     pub touches: u32,
     /// (Splat, tile) pairs, likewise; 0 if the touches did not fit.
     pub instances: u32,
+}
+
+/// Counters of stage rasterize that the host reads after a frame (8 bytes). They have a buffer of their own: the kernels
+/// that blend tiles would otherwise wait for each other.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct TileCounters {
     /// Pairs of a splat and a block of [`constants::BLOCK_PX`] that its box reaches, in all loaded batches. Blocks that have
     /// stopped count too.
     pub block_pairs: u32,
@@ -416,7 +428,7 @@ pub struct Counters {
     pub most_batches: u32,
 }
 
-impl Counters {
+impl TileCounters {
     /// Evaluations of a splat at a pixel: all pixels of the blocks that its box reaches. Pixels that have stopped count too.
     pub(super) fn evaluations(&self) -> u64 {
         u64::from(self.block_pairs) * u64::from(constants::BLOCK_PX * constants::BLOCK_PX)

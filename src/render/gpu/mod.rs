@@ -8,9 +8,13 @@
 //!
 //! # Frames in flight
 //!
-//! A GPU has three frames in flight ([`Backend::frames_in_flight`]): one is drawn, in the order of the
-//! calls (`gpu/tickets.rs`), while others are copied out, hashed, and encoded. The engine runs a render thread
-//! for each. Drawing runs on the caller's thread, and culling in a thread pool of its own. A rayon thread
+//! A frame is prepared, recorded and submitted in its turn, in the order of the calls (`gpu/tickets.rs`). It is
+//! waited for, copied out, hashed and encoded outside of its turn, while the next frames have theirs. The device has at
+//! most two of them, so that it finds the next frame in its queue when one is done (`gpu/slots.rs`). A frame whose
+//! buffers were too small, or that does not fit the device at once, is drawn in one turn.
+//!
+//! The engine runs a render thread for each frame in flight ([`Backend::frames_in_flight`]), more of them on a machine
+//! with more cores. Preparing runs on the caller's thread, and culling in a thread pool of its own. A rayon thread
 //! that waits takes up other work of its pool; if that were the next frame, it would wait for this one,
 //! which waits for it.
 
@@ -24,18 +28,23 @@ mod growable_buffer;
 mod kernel;
 pub mod layout;
 mod lens;
+mod long_tiles;
 mod mirror;
 mod partition;
 mod plan;
 mod project;
+mod project_work;
 mod rasterize;
 mod read_back;
 mod resolve;
 mod roofline;
 mod scan;
 pub mod shaders;
+mod slots;
 mod sort;
 mod tickets;
+mod tuning;
+mod turns;
 
 use std::time::Instant;
 
@@ -47,6 +56,7 @@ use wgpu::AdapterInfo;
 pub use bandwidth::FrameCounts;
 pub use device::{AdapterChoice, DeviceInfo, DeviceTotals, GpuError, devices};
 pub use roofline::Roofline;
+pub use tuning::{Scatter, Tuning};
 
 use self::chain::Chain;
 use self::device::Device;
@@ -54,6 +64,7 @@ use self::discarded::Discarded;
 use self::read_back::MappedFrame;
 use self::resolve::{Outputs, Pixels};
 use self::shaders::Shaders;
+use self::slots::Slots;
 use self::tickets::TicketQueue;
 use super::stage::{Stage, StageOutputs};
 use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
@@ -67,12 +78,16 @@ pub struct Gpu {
     info: AdapterInfo,
     shaders: Shaders,
     limits: MemoryLimits,
+    /// Which kernels run, if that was chosen.
+    tuning: Option<Tuning>,
     /// Copies images to their targets, and runs the callbacks of finished views.
     deliver: ThreadPool,
     /// Culls clusters. It has its own pool, so that a frame that is drawn does not wait for one that is
     /// encoded.
     cull: ThreadPool,
     queue: TicketQueue,
+    /// The frames that the device has.
+    slots: Slots,
     /// Empty after the device has failed; the next frame opens it again.
     chain: Mutex<Option<Chain>>,
     discarded: Discarded,
@@ -121,7 +136,7 @@ impl Gpu {
     /// # Errors
     /// There is no such device, or a shader cannot be compiled for it.
     pub fn new(choice: &AdapterChoice, threads: usize) -> Result<Self, GpuError> {
-        Self::open(choice, threads, Shaders::default(), MemoryLimits::default())
+        Self::open(choice, threads, Shaders::default(), MemoryLimits::default(), None)
     }
 
     /// As [`Gpu::new`] with other shaders: for tests that break a shader and check that it is detected.
@@ -133,7 +148,7 @@ impl Gpu {
         threads: usize,
         shaders: Shaders,
     ) -> Result<Self, GpuError> {
-        Self::open(choice, threads, shaders, MemoryLimits::default())
+        Self::open(choice, threads, shaders, MemoryLimits::default(), None)
     }
 
     /// As [`Gpu::new`] with limits on the device's memory.
@@ -145,7 +160,20 @@ impl Gpu {
         threads: usize,
         limits: MemoryLimits,
     ) -> Result<Self, GpuError> {
-        Self::open(choice, threads, Shaders::default(), limits)
+        Self::open(choice, threads, Shaders::default(), limits, None)
+    }
+
+    /// As [`Gpu::with_shaders`] with a choice of kernels: for tests of those that the device would not run.
+    ///
+    /// # Errors
+    /// As [`Gpu::new`].
+    pub fn with_tuning(
+        choice: &AdapterChoice,
+        threads: usize,
+        shaders: Shaders,
+        tuning: Tuning,
+    ) -> Result<Self, GpuError> {
+        Self::open(choice, threads, shaders, MemoryLimits::default(), Some(tuning))
     }
 
     fn open(
@@ -153,6 +181,7 @@ impl Gpu {
         threads: usize,
         shaders: Shaders,
         limits: MemoryLimits,
+        tuning: Option<Tuning>,
     ) -> Result<Self, GpuError> {
         if threads > limits::RENDER_THREADS {
             let limit = limits::RENDER_THREADS;
@@ -163,7 +192,7 @@ impl Gpu {
             binding_bytes: limits.binding_bytes.max(limits::BINDING_BYTES_MIN),
             ..limits
         };
-        let device = Device::open(choice, &shaders, limits.binding_bytes)?;
+        let device = Device::open(choice, &shaders, limits.binding_bytes, tuning)?;
         let pool = |name: &'static str| {
             let builder = rayon::ThreadPoolBuilder::new().num_threads(threads);
             let pool = builder.thread_name(move |i| format!("{name}-{i}")).build();
@@ -173,9 +202,11 @@ impl Gpu {
             choice: choice.clone(),
             info: device.info.clone(),
             limits,
+            tuning,
             deliver: pool("deliver")?,
             cull: pool("cull")?,
             queue: TicketQueue::default(),
+            slots: Slots::default(),
             chain: Mutex::new(Some(Chain::new(device, limits.mirror_bytes)?)),
             discarded: Discarded::default(),
             shaders,
@@ -184,13 +215,16 @@ impl Gpu {
 
     /// The memory and the counts of the device; `None` while it is lost.
     pub fn usage(&self) -> Option<GpuUsage> {
-        self.chain.lock().as_ref().map(|chain| GpuUsage {
+        let slot = self.chain.lock();
+        let chain = slot.as_ref()?;
+        let tally = chain.tally.lock();
+        Some(GpuUsage {
             name: chain.device.info.name.clone(),
             mirror_bytes: chain.mirror.bytes(),
             allocated_bytes: chain.device.allocated_bytes(),
-            retries: chain.retries,
-            regions: chain.regions,
-            last_frame: chain.last_frame,
+            retries: tally.retries,
+            regions: tally.regions,
+            last_frame: tally.last_frame,
             totals: chain.device.totals(),
         })
     }
@@ -219,8 +253,8 @@ impl Gpu {
         targets: &mut [Target<'_>],
         finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
-        self.render_with(frame, targets, finished, |chain, outputs| {
-            chain.resume(done, frame, outputs)
+        self.render_with(frame, targets, finished, |outputs| {
+            self.in_turn(|chain| chain.resume(done, frame, outputs))
         })
     }
 
@@ -239,62 +273,19 @@ impl Gpu {
         self.in_turn(|chain| chain.run_through(frame, done, last, &self.cull))
     }
 
-    /// Runs `work` on the device after all earlier callers. Opens the device again if it was lost. The
-    /// device is free for the next caller when this returns.
-    fn in_turn<T>(
-        &self,
-        work: impl FnOnce(&mut Chain) -> Result<T, RenderError>,
-    ) -> Result<T, RenderError> {
-        let _ticket = self.queue.wait();
-        let mut slot = self.chain.lock();
-        // If `work` panics, the slot stays empty: memory may be half-written then, and the next caller
-        // opens the device again.
-        let mut chain = match slot.take() {
-            Some(chain) => chain,
-            None => self.reopen()?,
-        };
-        let done = work(&mut chain);
-        match done {
-            // Memory may be half-written here, too.
-            Err(RenderError::Device { .. }) => self.discarded.add(chain),
-            _ => *slot = Some(chain),
-        }
-        done
-    }
-
-    /// Opens the device again after it was lost.
-    fn reopen(&self) -> Result<Chain, RenderError> {
-        let failed = |reason| RenderError::Device { device: self.info.name.clone(), reason };
-        let device = Device::open(&self.choice, &self.shaders, self.limits.binding_bytes);
-        let device = device.map_err(|error| failed(error.to_string()))?;
-        // Another device would draw other bytes, and was not requested.
-        if device.info != self.info {
-            let reason = format!("it was lost, and in its place is {}", device.info.name);
-            return Err(failed(reason));
-        }
-        tracing::info!(device = device.info.name, "the GPU was opened again");
-        Chain::new(device, self.limits.mirror_bytes)
-    }
-
-    /// Draws a frame, and copies its pixels to the targets.
+    /// Draws a frame with `draw`, and copies its pixels to the targets.
     fn render_with(
         &self,
         frame: &Frame<'_>,
         targets: &mut [Target<'_>],
         finished: OnViewDone<'_>,
-        draw: impl FnOnce(&mut Chain, &Outputs) -> Result<MappedFrame, RenderError>,
+        draw: impl FnOnce(&Outputs) -> Result<MappedFrame, RenderError>,
     ) -> Result<FrameStats, RenderError> {
         frame.check(targets)?;
         frame.check_splats(self.name())?;
         let outputs = Outputs::of(targets);
-        let ms = |since: Instant| since.elapsed().as_secs_f64() * 1e3;
-
         // Draw on this thread: a thread of a pool that waits may take up another frame of that pool.
-        let called = Instant::now();
-        let (drawn, wait_ms) = self.in_turn(|chain| {
-            let wait_ms = ms(called);
-            Ok((draw(chain, &outputs)?, wait_ms))
-        })?;
+        let drawn = draw(&outputs)?;
 
         // Copy the pixels. Other frames can be drawn meanwhile.
         let start = Instant::now();
@@ -318,8 +309,7 @@ impl Gpu {
             });
         });
         let mut stats = drawn.stats.clone();
-        stats.stages_ms.insert(0, ("wait", wait_ms));
-        stats.stages_ms.push(("deliver", ms(start)));
+        stats.stages_ms.push(("deliver", start.elapsed().as_secs_f64() * 1e3));
         drawn.recycle();
         Ok(stats)
     }
@@ -340,7 +330,11 @@ impl Backend for Gpu {
     }
 
     fn frames_in_flight(&self) -> usize {
-        limits::GPU_FRAMES
+        limits::gpu_frames(self.threads())
+    }
+
+    fn has_idle_cores(&self) -> bool {
+        true
     }
 
     fn render(
@@ -349,9 +343,7 @@ impl Backend for Gpu {
         targets: &mut [Target<'_>],
         finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
-        self.render_with(frame, targets, finished, |chain, outputs| {
-            chain.draw(frame, outputs, &self.cull)
-        })
+        self.render_with(frame, targets, finished, |outputs| self.draw(frame, outputs))
     }
 }
 

@@ -6,7 +6,9 @@ use wgpu::{Buffer, BufferUsages, ComputePass};
 use super::device::Device;
 use super::growable_buffer::GrowableBuffer;
 use super::kernel::{Groups, JobRef, Kernel, fold_groups, module};
-use super::layout::{Counters, DIGITS, Frame, Job, JobSlot, SCAN_BLOCK, SORT_BLOCK, WORKGROUP};
+use super::layout::{
+    Counters, DIGITS, Frame, Job, JobSlot, SCAN_BLOCK, SORT_BLOCK, TileCounters, WORKGROUP,
+};
 
 /// Slots of the jobs; `plan.wgsl` has the same numbers.
 pub(super) mod job {
@@ -22,7 +24,9 @@ pub(super) mod job {
     pub(crate) const BATCHES: u64 = 9;
     pub(crate) const BATCH_TILES: u64 = 10;
     pub(crate) const INSTANCES: u64 = 11;
-    pub(crate) const COUNT: usize = 12;
+    /// Tiles with long lists; `long_tiles.wgsl` counts them.
+    pub(crate) const LONG_TILES: u64 = 12;
+    pub(crate) const COUNT: usize = 13;
 }
 
 /// Counts that are known before the first stage of a frame runs; those that the device computes are zero.
@@ -46,6 +50,7 @@ pub(super) struct Plan {
     frame: GrowableBuffer,
     jobs: GrowableBuffer,
     counters: GrowableBuffer,
+    tile_counters: GrowableBuffer,
 }
 
 impl Plan {
@@ -65,6 +70,11 @@ impl Plan {
             ),
             jobs: GrowableBuffer::new(device, "jobs", storage | BufferUsages::INDIRECT),
             counters: GrowableBuffer::new(device, "counters", storage | BufferUsages::COPY_SRC),
+            tile_counters: GrowableBuffer::new(
+                device,
+                "tile counters",
+                storage | BufferUsages::COPY_SRC,
+            ),
         };
         plan.frame.reserve(device, size_of::<Frame>() as u64);
         plan.jobs.reserve(device, (job::COUNT * size_of::<JobSlot>()) as u64);
@@ -85,11 +95,14 @@ impl Plan {
         ] {
             jobs[slot as usize].job = job(length, per_group);
         }
+        jobs[job::LONG_TILES as usize].job = Job { length: 0, groups: [0, 1, 1] };
         let counters = Counters { splats, instances, ..bytemuck::Zeroable::zeroed() };
         let write = |to: &GrowableBuffer, bytes| device.queue.write_buffer(to.buffer(), 0, bytes);
         write(&self.frame, bytemuck::bytes_of(frame));
         write(&self.jobs, bytemuck::bytes_of(&jobs));
         write(&self.counters, bytemuck::bytes_of(&counters));
+        let tile_counters: TileCounters = bytemuck::Zeroable::zeroed();
+        write(&self.tile_counters, bytemuck::bytes_of(&tile_counters));
     }
 
     pub(super) fn frame(&self) -> &Buffer {
@@ -103,6 +116,11 @@ impl Plan {
 
     pub(super) fn counters(&self) -> &Buffer {
         self.counters.buffer()
+    }
+
+    /// The counters of stage rasterize.
+    pub(super) fn tile_counters(&self) -> &Buffer {
+        self.tile_counters.buffer()
     }
 
     /// Sets the jobs that depend on the number of splats, after the prefix sum over the visible splats of
@@ -162,6 +180,7 @@ mod tests {
             ("BATCHES", job::BATCHES),
             ("BATCH_TILES", job::BATCH_TILES),
             ("INSTANCES", job::INSTANCES),
+            ("LONG_TILES", job::LONG_TILES),
             ("JOB_COUNT", job::COUNT as u64),
         ]);
         // The constants that the file itself declares, without those of the files that it imports.

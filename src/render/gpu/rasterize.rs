@@ -1,12 +1,16 @@
 //! Stage rasterize: blends the splats of each tile front to back, and writes the requested pixels.
 //!
-//! Twin of `render/cpu/rasterize.rs`; WGSL: `shaders/rasterize.wgsl`, `shaders/resolve.wgsl`.
+//! Twin of `render/cpu/rasterize.rs`; WGSL: `shaders/rasterize.wgsl`, `shaders/resolve.wgsl`. Tiles with long lists:
+//! `long_tiles.rs`.
 
 use std::ops::Range;
 use std::sync::Arc;
 
 use glam::{DMat3, DVec3};
-use wgpu::{BindingResource, BufferBinding, BufferSize, BufferUsages, CommandEncoder, ComputePass};
+use wgpu::{
+    BindingResource, BufferBinding, BufferSize, BufferUsages, CommandEncoder, ComputePass,
+    ShaderModule,
+};
 
 use super::background::{Background, BackgroundShader};
 use super::bin::Bin;
@@ -15,6 +19,7 @@ use super::growable_buffer::GrowableBuffer;
 use super::kernel::{Groups, Kernel, LazyShader, slot_binding, span_slots};
 use super::layout::{Owner, Span};
 use super::lens::Lenses;
+use super::long_tiles::LongTiles;
 use super::plan::Plan;
 use super::project::SplatBuffers;
 use super::resolve::Planes;
@@ -23,16 +28,34 @@ use wildcity_scene::appearance::Appearance;
 use wildcity_scene::sky::{CubeMap, DrawableSky};
 
 /// The stage with one kind of background; one kernel for each combination of planes.
-type Shader = LazyShader<Kernel, { Planes::VARIANTS }>;
+type Shader = LazyShader<TileKernels, { Planes::VARIANTS }>;
+
+/// The kernels that write pixels.
+#[derive(Debug)]
+struct TileKernels {
+    /// Blends tiles.
+    blend: Kernel,
+    /// Writes those of long lists, if they have a kernel of their own.
+    finish: Option<Kernel>,
+}
+
+impl TileKernels {
+    fn new(device: &Device, module: &ShaderModule, planes: Planes) -> Self {
+        let has_long_tiles = device.tuning().has_long_tiles();
+        let long = ("LONG_TILES", f64::from(u8::from(has_long_tiles)));
+        let constants: Vec<_> = planes.constants().into_iter().chain([long]).collect();
+        let finish = || Kernel::new(device, module, "finish", &constants);
+        Self {
+            blend: Kernel::new(device, module, "main", &constants),
+            finish: has_long_tiles.then(finish),
+        }
+    }
+}
 
 /// The kernels of the stage, and its output.
 #[derive(Debug)]
 pub(super) struct Rasterize {
-    no_background: Shader,
-    map: Shader,
-    network: Shader,
-    map_lens: Shader,
-    network_lens: Shader,
+    shaders: BackgroundShaders,
     /// For frames with instance ids; created with the first of them.
     instances: Option<Instances>,
     /// For frames with a background or with appearances; created with the first of them.
@@ -41,6 +64,10 @@ pub(super) struct Rasterize {
     black: Option<Arc<CubeMap>>,
     /// Whether the current frame uses `background`.
     has_background: bool,
+    /// `None` on devices on which all tiles have the same kernel.
+    long_tiles: Option<LongTiles>,
+    /// A place for each tile where a shader asks for it and there is none.
+    no_places: GrowableBuffer,
     spans: GrowableBuffer,
     /// Pixels, tile after tile, page after page.
     pages: Vec<GrowableBuffer>,
@@ -49,13 +76,13 @@ pub(super) struct Rasterize {
 /// The kernels and the input of instance ids.
 #[derive(Debug)]
 struct Instances {
-    shaders: InstanceShaders,
+    shaders: BackgroundShaders,
     owners: GrowableBuffer,
 }
 
-/// The stage with each kind of background and instance ids.
+/// The stage with each kind of background.
 #[derive(Debug)]
-struct InstanceShaders {
+struct BackgroundShaders {
     no_background: Shader,
     map: Shader,
     network: Shader,
@@ -66,7 +93,7 @@ struct InstanceShaders {
 impl Instances {
     fn new(device: &Device) -> Self {
         let usage = BufferUsages::STORAGE | BufferUsages::COPY_DST;
-        let shaders = InstanceShaders {
+        let shaders = BackgroundShaders {
             no_background: Shader::new("instances"),
             map: Shader::new("instances_map"),
             network: Shader::new("instances_network"),
@@ -105,15 +132,19 @@ impl Rasterize {
     pub(super) fn new(device: &Device) -> Self {
         let uniform = BufferUsages::UNIFORM | BufferUsages::COPY_DST;
         Self {
-            no_background: Shader::new("rasterize").with_module(device),
-            map: Shader::new("rasterize_map"),
-            network: Shader::new("rasterize_network"),
-            map_lens: Shader::new("rasterize_map_lens"),
-            network_lens: Shader::new("rasterize_network_lens"),
+            shaders: BackgroundShaders {
+                no_background: Shader::new("rasterize").with_module(device),
+                map: Shader::new("rasterize_map"),
+                network: Shader::new("rasterize_network"),
+                map_lens: Shader::new("rasterize_map_lens"),
+                network_lens: Shader::new("rasterize_network_lens"),
+            },
             instances: None,
             background: None,
             black: None,
             has_background: false,
+            long_tiles: device.tuning().has_long_tiles().then(|| LongTiles::new(device)),
+            no_places: GrowableBuffer::new(device, "no long tiles", BufferUsages::STORAGE),
             spans: GrowableBuffer::new(device, "tile spans", uniform),
             pages: Vec::new(),
         }
@@ -152,6 +183,9 @@ impl Rasterize {
 
     /// Makes room for the pixels of all tiles. Returns the number of tiles of a page.
     pub(super) fn reserve(&mut self, device: &Device, planes: Planes, tiles: u32) -> u32 {
+        if let Some(long_tiles) = &mut self.long_tiles {
+            long_tiles.reserve(device, tiles);
+        }
         let tile_bytes = planes.tile_bytes();
         let per_page = (device.binding_bytes() / tile_bytes).min(u64::from(u32::MAX)) as u32;
         for (page, tiles) in pages(&(0..tiles), per_page) {
@@ -164,80 +198,134 @@ impl Rasterize {
         per_page
     }
 
-    /// Blends the tiles of a region.
+    /// Blends the tiles of a region. The frame has `frame_tiles` tiles.
     pub(super) fn run(
         &mut self,
         device: &Device,
         pass: &mut ComputePass<'_>,
         inputs: RasterizeInputs<'_>,
         output: &TileOutput,
+        frame_tiles: u32,
     ) {
         let RasterizeInputs { plan, splats, bin, lenses, owners, first_splats } = inputs;
         let TileOutput { planes, tiles, tiles_per_page } = output;
-
-        // The kernel for this kind of background and these planes.
-        let background = self.background.as_ref().filter(|_| self.has_background);
+        self.compile(device, *planes);
         if planes.has_instances() {
             let instances = self.instances.get_or_insert_with(|| Instances::new(device));
             let count = Owner { cluster_view: 0, instance: owners.len() as u32 };
             let list: Vec<Owner> = [count].iter().chain(owners).copied().collect();
             instances.owners.fill(device, bytemuck::cast_slice(&list));
         }
-        let instances = self.instances.as_mut().filter(|_| planes.has_instances());
-        let (instances, owners) = match instances {
-            Some(Instances { shaders, owners }) => (Some(shaders), Some(&*owners)),
-            None => (None, None),
-        };
-        let shader = match (background.map(Background::shader), instances) {
-            (None, None) => &mut self.no_background,
-            (None, Some(own)) => &mut own.no_background,
-            (Some(BackgroundShader::Map), None) => &mut self.map,
-            (Some(BackgroundShader::Map), Some(own)) => &mut own.map,
-            (Some(BackgroundShader::Network), None) => &mut self.network,
-            (Some(BackgroundShader::Network), Some(own)) => &mut own.network,
-            (Some(BackgroundShader::MapLens), None) => &mut self.map_lens,
-            (Some(BackgroundShader::MapLens), Some(own)) => &mut own.map_lens,
-            (Some(BackgroundShader::NetworkLens), None) => &mut self.network_lens,
-            (Some(BackgroundShader::NetworkLens), Some(own)) => &mut own.network_lens,
-        };
-        let kernel = shader.variant(device, planes.variant(), |module| {
-            Kernel::new(device, module, "main", &planes.constants())
-        });
-        let mut background_resources = Vec::new();
-        if let Some(owners) = owners {
-            background_resources.extend([(13, owners.bind()), (14, first_splats.bind())]);
-        }
-        if let Some(background) = background {
-            background_resources.extend(background.bind());
-            if background.has_lenses() {
-                background_resources.extend(lenses.bind());
-            }
-        }
-
-        // One dispatch per page of pixels.
         let spans = pages(tiles, *tiles_per_page)
             .map(|(_, tiles)| Span { first: tiles.start, count: tiles.len() as u32 });
         self.spans.fill(device, &span_slots(spans));
-        for (index, (page, tiles)) in pages(tiles, *tiles_per_page).enumerate() {
-            let bytes = page_bytes(*planes, &tiles, *tiles_per_page);
+        if let Some(long_tiles) = &mut self.long_tiles {
+            long_tiles.run(device, pass, (plan, splats, bin), frame_tiles, *planes);
+        }
+        let Some(kernels) = self.shader(*planes).compiled(planes.variant()) else { return };
+
+        // One dispatch per page of pixels.
+        let places = match &self.long_tiles {
+            Some(long_tiles) => long_tiles.bind_places(),
+            None => (15, self.no_places.bind()),
+        };
+        let composite = self.composite_resources(*planes, lenses, first_splats);
+        let page_resources = |index: usize, page: usize, tiles: &Range<u32>| {
+            let bytes = page_bytes(*planes, tiles, *tiles_per_page);
             let pixels = BufferBinding {
                 buffer: self.pages[page].buffer(),
-                // A tile takes 1 KiB or a multiple of it, so any tile's offset is aligned.
+                // A tile takes a multiple of 256 bytes, so any tile's offset is aligned.
                 offset: bytes.start,
                 size: BufferSize::new(bytes.end - bytes.start),
             };
+            let span = slot_binding(self.spans.buffer(), index as u64, size_of::<Span>());
             let mut resources = vec![
                 (0, plan.frame().as_entire_binding()),
-                (1, slot_binding(self.spans.buffer(), index as u64, size_of::<Span>())),
+                (1, span),
+                (6, plan.tile_counters().as_entire_binding()),
+                (7, BindingResource::Buffer(pixels)),
+                places.clone(),
+            ];
+            resources.extend(composite.iter().cloned());
+            resources
+        };
+        for (index, (page, tiles)) in pages(tiles, *tiles_per_page).enumerate() {
+            let mut resources = page_resources(index, page, &tiles);
+            resources.extend([
                 (2, bin.ranges.bind()),
                 (3, bin.instances.bind()),
                 (4, splats.shapes.bind()),
                 (5, splats.colors.bind()),
-                (6, plan.counters().as_entire_binding()),
-                (7, BindingResource::Buffer(pixels)),
-            ];
-            resources.extend(background_resources.iter().cloned());
-            kernel.run(device, pass, Groups::Count(tiles.len() as u32), &resources);
+            ]);
+            kernels.blend.run(device, pass, Groups::Count(tiles.len() as u32), &resources);
+        }
+        let (Some(finish), Some(long_tiles)) = (&kernels.finish, &self.long_tiles) else { return };
+        for (index, (page, tiles)) in pages(tiles, *tiles_per_page).enumerate() {
+            let mut resources = page_resources(index, page, &tiles);
+            resources.push(long_tiles.bind_sums());
+            if planes.has_instances() {
+                resources.push((3, bin.instances.bind()));
+            }
+            finish.run(device, pass, Groups::Count(tiles.len() as u32), &resources);
+        }
+    }
+
+    /// What the kernels need for the background, the appearances and the instances.
+    fn composite_resources<'a>(
+        &'a self,
+        planes: Planes,
+        lenses: &'a Lenses,
+        first_splats: &'a GrowableBuffer,
+    ) -> Vec<(u32, BindingResource<'a>)> {
+        let mut resources = Vec::new();
+        if let Some(instances) = self.instances.as_ref().filter(|_| planes.has_instances()) {
+            resources.extend([(13, instances.owners.bind()), (14, first_splats.bind())]);
+        }
+        if let Some(background) = self.shown_background() {
+            resources.extend(background.bind());
+            if background.has_lenses() {
+                resources.extend(lenses.bind());
+            }
+        }
+        resources
+    }
+
+    /// The background of the current frame.
+    fn shown_background(&self) -> Option<&Background> {
+        self.background.as_ref().filter(|_| self.has_background)
+    }
+
+    /// Compiles the kernels of the current frame, if they are missing.
+    fn compile(&mut self, device: &Device, planes: Planes) {
+        if planes.has_instances() {
+            self.instances.get_or_insert_with(|| Instances::new(device));
+        }
+        let background = self.shown_background().map(Background::shader);
+        let instances = self.instances.as_mut().filter(|_| planes.has_instances());
+        let shaders = match instances {
+            Some(instances) => &mut instances.shaders,
+            None => &mut self.shaders,
+        };
+        let shader = match background {
+            None => &mut shaders.no_background,
+            Some(BackgroundShader::Map) => &mut shaders.map,
+            Some(BackgroundShader::Network) => &mut shaders.network,
+            Some(BackgroundShader::MapLens) => &mut shaders.map_lens,
+            Some(BackgroundShader::NetworkLens) => &mut shaders.network_lens,
+        };
+        shader.variant(device, planes.variant(), |module| TileKernels::new(device, module, planes));
+    }
+
+    /// The shader for the current frame's background and these planes.
+    fn shader(&self, planes: Planes) -> &Shader {
+        let instances = self.instances.as_ref().filter(|_| planes.has_instances());
+        let shaders = instances.map_or(&self.shaders, |instances| &instances.shaders);
+        match self.shown_background().map(Background::shader) {
+            None => &shaders.no_background,
+            Some(BackgroundShader::Map) => &shaders.map,
+            Some(BackgroundShader::Network) => &shaders.network,
+            Some(BackgroundShader::MapLens) => &shaders.map_lens,
+            Some(BackgroundShader::NetworkLens) => &shaders.network_lens,
         }
     }
 

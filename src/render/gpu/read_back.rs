@@ -1,7 +1,6 @@
 //! Reading a frame back: buffers in memory that the host can read, reused by later frames.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::{Arc, mpsc};
 
 use parking_lot::Mutex;
 use wgpu::{BufferUsages, BufferView, MapMode, PollType, SubmissionIndex};
@@ -9,10 +8,13 @@ use wgpu::{BufferUsages, BufferView, MapMode, PollType, SubmissionIndex};
 use super::device::Device;
 use super::growable_buffer::GrowableBuffer;
 use super::kernel::TIMESTAMP_BYTES;
-use super::layout::{Counters, FrameView};
+use super::layout::{Counters, FrameView, TileCounters};
 use super::rasterize::pages;
 use super::resolve::Planes;
 use crate::{FrameStats, RenderError, limits};
+
+/// Offset of the counters of stage rasterize after the others, in bytes.
+pub(super) const TILE_COUNTERS_OFFSET: u64 = 128;
 
 /// Offset of the timestamps after the counters, in bytes.
 pub(super) const TIMESTAMP_OFFSET: u64 = 256;
@@ -27,6 +29,14 @@ pub(super) struct ReadBack {
     pub(super) pages: Vec<GrowableBuffer>,
     /// Tiles of a page; the last page may have fewer.
     pub(super) tiles_per_page: u32,
+}
+
+/// What the host reads of a submission beside pixels.
+#[derive(Debug)]
+pub(super) struct Head {
+    pub(super) counters: Counters,
+    pub(super) tile_counters: TileCounters,
+    pub(super) timestamps: Vec<u64>,
 }
 
 /// The unused read-back buffers of one device.
@@ -56,10 +66,7 @@ impl MappedFrame {
         // A buffer cannot be unmapped while a view of it exists.
         drop(pages);
         read_back.unmap();
-        let mut unused = pool.0.lock();
-        if unused.len() < limits::GPU_FRAMES {
-            unused.push(read_back);
-        }
+        pool.give_back(read_back);
     }
 }
 
@@ -67,6 +74,14 @@ impl ReadBackPool {
     /// Takes the buffers of an earlier frame, if some are unused.
     pub(super) fn take(&self) -> Option<ReadBack> {
         self.0.lock().pop()
+    }
+
+    /// Keeps unmapped buffers for another frame.
+    pub(super) fn give_back(&self, read_back: ReadBack) {
+        let mut unused = self.0.lock();
+        if unused.len() < limits::GPU_FRAMES_MAX {
+            unused.push(read_back);
+        }
     }
 }
 
@@ -107,31 +122,40 @@ impl ReadBack {
         device: &Device,
         submission: SubmissionIndex,
     ) -> Result<(), RenderError> {
-        let failed = Arc::new(AtomicBool::new(false));
+        let (mapped, all_mapped) = mpsc::channel();
         for buffer in self.all() {
-            let failed = Arc::clone(&failed);
+            let mapped = mapped.clone();
             buffer.buffer().slice(..).map_async(MapMode::Read, move |result| {
-                failed.fetch_or(result.is_err(), Relaxed);
+                // Sending fails if this frame has failed meanwhile.
+                let _ = mapped.send(result.is_ok());
             });
         }
+        drop(mapped);
         let timeout = Some(device.frame_timeout());
         let wait = PollType::Wait { submission_index: Some(submission), timeout };
         let polled = device.device.poll(wait);
         device.check()?;
         polled.map_err(|error| device.failed(error.to_string()))?;
-        match failed.load(Relaxed) {
-            true => Err(device.failed("its memory could not be read".to_owned())),
-            false => Ok(()),
+        // Another thread that waits for the device may have taken the callbacks, and still be calling them.
+        for _ in self.all() {
+            if all_mapped.recv_timeout(limits::MAP_CALLBACK) != Ok(true) {
+                return Err(device.failed("its memory could not be read".to_owned()));
+            }
         }
+        Ok(())
     }
 
     /// The counters and the timestamps.
-    pub(super) fn head(&self, device: &Device) -> Result<(Counters, Vec<u64>), RenderError> {
+    pub(super) fn head(&self, device: &Device) -> Result<Head, RenderError> {
         let view = view(device, &self.head)?;
-        let counters = bytemuck::pod_read_unaligned(&view[..size_of::<Counters>()]);
-        let start = TIMESTAMP_OFFSET as usize;
-        let timestamps = view[start..start + TIMESTAMP_BYTES as usize].chunks_exact(8);
-        Ok((counters, timestamps.map(bytemuck::pod_read_unaligned).collect()))
+        let part = |at: u64, bytes: usize| &view[at as usize..at as usize + bytes];
+        let timestamps = part(TIMESTAMP_OFFSET, TIMESTAMP_BYTES as usize).chunks_exact(8);
+        let tile_counters = part(TILE_COUNTERS_OFFSET, size_of::<TileCounters>());
+        Ok(Head {
+            counters: bytemuck::pod_read_unaligned(part(0, size_of::<Counters>())),
+            tile_counters: bytemuck::pod_read_unaligned(tile_counters),
+            timestamps: timestamps.map(bytemuck::pod_read_unaligned).collect(),
+        })
     }
 
     /// The pixels.

@@ -12,8 +12,10 @@ use crate::Target;
 use crate::constants::TILE_PX;
 use wildcity_scene::appearance::Appearance;
 
-/// Pixels of a tile.
+/// Pixels of a tile, and words of a plane of 32-bit values.
 const PLANE: usize = (TILE_PX * TILE_PX) as usize;
+/// Words of the plane of 8-bit colours.
+const RGB8_PLANE: usize = 3 * PLANE / 4;
 
 /// Which values of a pixel the device computes and the host reads: those that any target requests.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -77,38 +79,45 @@ impl Planes {
         ]
     }
 
+    /// Whether depth is computed.
+    pub(super) fn has_depth(self) -> bool {
+        self.depth
+    }
+
     /// Whether instance ids are computed.
     pub(super) fn has_instances(self) -> bool {
         self.instances
     }
 
-    /// Bytes of the pixels of one tile, at least one plane, so that buffers are never empty.
+    /// Bytes of the pixels of one tile, at least one plane, so that buffers are never empty. They are a multiple of 256, so
+    /// that a binding may start at any tile.
     pub(super) fn tile_bytes(self) -> u64 {
-        4 * (self.count().max(1) * PLANE) as u64
+        4 * self.words().max(PLANE - RGB8_PLANE) as u64
     }
 
-    /// Number of planes.
-    fn count(self) -> usize {
-        let [rgb8, rgb, opacity, depth, instances] = self.starts();
-        let ends = [(rgb8, 1), (rgb, 3), (opacity, 1), (depth, 1), (instances, 1)];
-        let ends = ends.into_iter().filter_map(|(start, planes)| Some(start? + planes));
-        ends.max().unwrap_or(0)
+    /// Words of a tile.
+    fn words(self) -> usize {
+        self.parts().iter().map(|(requested, words)| usize::from(*requested) * words).sum()
     }
 
-    /// First plane of rgb8, rgb, opacity, depth, and instances; `None` if it is not requested.
+    /// Whether rgb8, rgb, opacity, depth, and instances are requested, and the words that each takes of a tile.
+    fn parts(self) -> [(bool, usize); 5] {
+        [
+            (self.rgb8, RGB8_PLANE),
+            (self.rgb, 3 * PLANE),
+            (self.opacity, PLANE),
+            (self.depth, PLANE),
+            (self.instances, PLANE),
+        ]
+    }
+
+    /// First word of rgb8, rgb, opacity, depth, and instances in a tile; `None` if it is not requested.
     fn starts(self) -> [Option<usize>; 5] {
         let mut next = 0;
-        let planes = [
-            (self.rgb8, 1),
-            (self.rgb, 3),
-            (self.opacity, 1),
-            (self.depth, 1),
-            (self.instances, 1),
-        ];
-        planes.map(|(requested, planes)| {
+        self.parts().map(|(requested, words)| {
             requested.then(|| {
-                next += planes;
-                next - planes
+                next += words;
+                next - words
             })
         })
     }
@@ -132,14 +141,17 @@ impl Pixels<'_> {
         let [rgb8, rgb, opacity, depth, instances] = self.planes.starts();
         if let (Some(to), Some(plane)) = (&mut target.rgb8, rgb8) {
             self.for_each_row(view, to.par_chunks_mut(3 * row_pixels), |to, at, tile, from| {
-                for (to, word) in to[3 * at..].chunks_exact_mut(3).zip(row(tile, plane, &from)) {
-                    to.copy_from_slice(&word.to_le_bytes()[..3]);
-                }
+                // The words have the bytes in the order of the pixels on every device: Vulkan is little-endian, and so
+                // are the machines that it runs on.
+                let first = 4 * plane + 3 * from.start;
+                let bytes: &[u8] = bytemuck::cast_slice(tile);
+                to[3 * at..][..3 * from.len()].copy_from_slice(&bytes[first..][..3 * from.len()]);
             });
         }
         if let (Some(to), Some(rgb), Some(opacity)) = (&mut target.rgba, rgb, opacity) {
             self.for_each_row(view, to.par_chunks_mut(4 * row_pixels), |to, at, tile, from| {
-                for (channel, plane) in [rgb, rgb + 1, rgb + 2, opacity].into_iter().enumerate() {
+                let planes = [rgb, rgb + PLANE, rgb + 2 * PLANE, opacity];
+                for (channel, plane) in planes.into_iter().enumerate() {
                     let to = to[4 * at..].chunks_exact_mut(4);
                     for (to, word) in to.zip(row(tile, plane, &from)) {
                         to[channel] = f32::from_bits(*word);
@@ -191,13 +203,13 @@ impl Pixels<'_> {
     /// The words of one tile.
     fn tile(&self, tile: u32) -> &[u32] {
         let page = self.pages[(tile / self.tiles_per_page) as usize];
-        let words = self.planes.count() * PLANE;
+        let words = self.planes.tile_bytes() as usize / 4;
         let first = (tile % self.tiles_per_page) as usize * words;
         &page[first..first + words]
     }
 }
 
-/// One row of one plane of a tile.
+/// One row of a plane of a tile that starts at this word.
 fn row<'a>(tile: &'a [u32], plane: usize, range: &Range<usize>) -> &'a [u32] {
-    &tile[plane * PLANE + range.start..plane * PLANE + range.end]
+    &tile[plane + range.start..plane + range.end]
 }

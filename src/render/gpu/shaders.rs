@@ -57,6 +57,8 @@ const BACKGROUND: Choice = choice("BACKGROUND", "background");
 const NO_BACKGROUND: Choice = choice("BACKGROUND", "no_background");
 const MAP: Choice = choice("SKY", "sky_map");
 const NETWORK: Choice = choice("SKY", "sky_network");
+const BALLOTS: Choice = choice("BALLOTS", "ballots");
+const BALLOTS_EMULATED: Choice = choice("BALLOTS", "ballots_emulated");
 const RAY_PINHOLE: Choice = choice("RAYS", "ray_pinhole");
 const RAY_LENS: Choice = choice("RAYS", "ray_lens");
 
@@ -68,9 +70,13 @@ const VARIANTS: &[Variant] = &[
     plain("scan"),
     plain("plan"),
     plain("sort"),
+    variant("sort_ballots", "sort_ballots", &[BALLOTS]),
+    variant("sort_ballots_emulated", "sort_ballots", &[BALLOTS_EMULATED]),
     plain("bin"),
     plain("ranges"),
     plain("expand"),
+    plain("long_tiles"),
+    plain("rasterize_long"),
     variant("rasterize", "rasterize", &[NO_INSTANCES, NO_BACKGROUND]),
     variant("rasterize_map", "rasterize", &[NO_INSTANCES, BACKGROUND, MAP, RAY_PINHOLE]),
     variant("rasterize_map_lens", "rasterize", &[NO_INSTANCES, BACKGROUND, MAP, RAY_LENS]),
@@ -90,6 +96,8 @@ const FILES: &[(&str, &str)] = &[
     ("angle", include_str!("../../../shaders/shared/angle.wgsl")),
     ("appearance", include_str!("../../../shaders/appearance.wgsl")),
     ("background", include_str!("../../../shaders/background.wgsl")),
+    ("ballots", include_str!("../../../shaders/ballots.wgsl")),
+    ("ballots_emulated", include_str!("../../../shaders/ballots_emulated.wgsl")),
     ("bin", include_str!("../../../shaders/bin.wgsl")),
     ("constants", include_str!("../../../shaders/shared/constants.wgsl")),
     ("expansion", include_str!("../../../shaders/expansion.wgsl")),
@@ -97,6 +105,7 @@ const FILES: &[(&str, &str)] = &[
     ("instances", include_str!("../../../shaders/instances.wgsl")),
     ("layout", include_str!("../../../shaders/shared/layout.wgsl")),
     ("lens", include_str!("../../../shaders/lens.wgsl")),
+    ("long_tiles", include_str!("../../../shaders/long_tiles.wgsl")),
     ("math", include_str!("../../../shaders/shared/math.wgsl")),
     ("no_actors", include_str!("../../../shaders/shared/no_actors.wgsl")),
     ("no_instances", include_str!("../../../shaders/shared/no_instances.wgsl")),
@@ -107,6 +116,7 @@ const FILES: &[(&str, &str)] = &[
     ("project", include_str!("../../../shaders/project.wgsl")),
     ("ranges", include_str!("../../../shaders/ranges.wgsl")),
     ("rasterize", include_str!("../../../shaders/rasterize.wgsl")),
+    ("rasterize_long", include_str!("../../../shaders/rasterize_long.wgsl")),
     ("ray_lens", include_str!("../../../shaders/ray_lens.wgsl")),
     ("ray_pinhole", include_str!("../../../shaders/ray_pinhole.wgsl")),
     ("resolve", include_str!("../../../shaders/resolve.wgsl")),
@@ -115,6 +125,8 @@ const FILES: &[(&str, &str)] = &[
     ("sky_map", include_str!("../../../shaders/sky_map.wgsl")),
     ("sky_network", include_str!("../../../shaders/sky_network.wgsl")),
     ("sort", include_str!("../../../shaders/sort.wgsl")),
+    ("tile_blocks", include_str!("../../../shaders/shared/tile_blocks.wgsl")),
+    ("sort_ballots", include_str!("../../../shaders/sort_ballots.wgsl")),
     ("unscented", include_str!("../../../shaders/unscented.wgsl")),
 ];
 

@@ -6,7 +6,7 @@ use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 use serde::{Deserialize, Serialize};
 
-use super::jpeg::jpeg;
+use super::jpeg::{jpeg, jpeg_in_strips};
 use super::trust::Trust;
 use crate::repair::status::ImageRepair;
 
@@ -65,21 +65,27 @@ impl EncodedImage {
 }
 
 /// Hashes and encodes the pixels of an image. Runs on a render thread while other images are still
-/// rendered.
+/// rendered. With `in_parallel`, the other threads of its pool help.
 pub(crate) fn encode(
     rgb8: &[u8],
     width: u32,
     height: u32,
     encoding: Encoding,
+    in_parallel: bool,
 ) -> Result<EncodedImage, String> {
     let started = Instant::now();
-    // Of the pixels and not of the file: the same with every encoding.
-    let hash = blake3::hash(rgb8);
-    let file = match encoding {
-        Encoding::Raw => Vec::new(),
-        Encoding::Jpeg(quality) => jpeg(rgb8, width, height, quality)?,
-        Encoding::Png => png(rgb8, width, height)?,
+    let file = || match encoding {
+        Encoding::Raw => Ok(Vec::new()),
+        Encoding::Jpeg(quality) if in_parallel => jpeg_in_strips(rgb8, width, height, quality),
+        Encoding::Jpeg(quality) => jpeg(rgb8, width, height, quality),
+        Encoding::Png => png(rgb8, width, height),
     };
+    let (hash, file) = if in_parallel {
+        rayon::join(|| blake3::hash(rgb8), file)
+    } else {
+        (blake3::hash(rgb8), file())
+    };
+    let file = file?;
     Ok(EncodedImage { file, took: started.elapsed(), ..EncodedImage::from_hash(hash) })
 }
 

@@ -11,7 +11,7 @@ use crate::gpu::kernel::Recorder;
 use crate::gpu::layout::{Counters, Frame as GpuFrame, SplatColor, SplatShape};
 use crate::gpu::partition::Capacity;
 use crate::gpu::plan::Counts;
-use crate::gpu::project::ProjectWork;
+use crate::gpu::project_work::ProjectWork;
 use crate::gpu::read_back::{MappedFrame, ReadBack};
 use crate::gpu::resolve::Outputs;
 use crate::layout::Splat;
@@ -80,7 +80,7 @@ impl Chain {
             let submission = self.device.queue.submit([recorder.encoder.finish()]);
             read_back.map(&self.device, submission)?;
             self.device.check()?;
-            let (counters, _) = read_back.head(&self.device)?;
+            let counters = read_back.head(&self.device)?.counters;
             read_back.unmap();
 
             // Read the outputs, or try again in larger buffers.

@@ -7,12 +7,13 @@ use wgpu::SubmissionIndex;
 use super::{Chain, CurrentFrame, Source, add_time};
 use crate::FrameStats;
 use crate::constants::DEPTH_BITS;
+use crate::gpu::device::Device;
 use crate::gpu::kernel::{Recorder, TIMESTAMP_BYTES};
-use crate::gpu::layout::{Counters, Frame as GpuFrame, Owner};
+use crate::gpu::layout::{Counters, Frame as GpuFrame, Owner, TileCounters};
 use crate::gpu::plan::{Counts, job};
 use crate::gpu::project::ProjectInputs;
 use crate::gpu::rasterize::{RasterizeInputs, TileOutput};
-use crate::gpu::read_back::TIMESTAMP_OFFSET;
+use crate::gpu::read_back::{TILE_COUNTERS_OFFSET, TIMESTAMP_OFFSET};
 use crate::gpu::sort::{Columns, SortJobs};
 use crate::stage::Stage;
 
@@ -48,7 +49,7 @@ impl Chain {
 
         let mut pass = recorder.stage("rasterize");
         let inputs = RasterizeInputs { plan, splats, bin, lenses, owners, first_splats };
-        self.rasterize.run(device, &mut pass, inputs, output);
+        self.rasterize.run(device, &mut pass, inputs, output, current.parameters.tiles);
         drop(pass);
 
         // Copy all values that the host reads.
@@ -58,6 +59,9 @@ impl Chain {
         let stages = recorder.finish_stages(timestamps);
         let encoder = &mut recorder.encoder;
         encoder.copy_buffer_to_buffer(plan.counters(), 0, head, 0, size_of::<Counters>() as u64);
+        let bytes = size_of::<TileCounters>() as u64;
+        let tile_counters = plan.tile_counters();
+        encoder.copy_buffer_to_buffer(tile_counters, 0, head, TILE_COUNTERS_OFFSET, bytes);
         encoder.copy_buffer_to_buffer(timestamps, 0, head, TIMESTAMP_OFFSET, TIMESTAMP_BYTES);
         self.rasterize.copy(encoder, &read_back.pages, output);
         let submission = device.queue.submit([recorder.encoder.finish()]);
@@ -124,24 +128,24 @@ impl Chain {
         }
         sorted
     }
+}
 
-    /// Adds the time of each stage by the device's clock. If it has none, adds the time of the whole
-    /// submission as "device".
-    pub(super) fn add_stage_times(
-        &self,
-        stats: &mut FrameStats,
-        stages: &[&'static str],
-        timestamps: &[u64],
-        whole: Duration,
-    ) {
-        let Some(tick_ns) = self.device.tick_ns() else {
-            add_time(stats, "device", whole);
-            return;
-        };
-        for (stage, ticks) in stages.iter().zip(timestamps.chunks_exact(2)) {
-            let ns = ticks[1].saturating_sub(ticks[0]) as f64 * f64::from(tick_ns);
-            add_time(stats, stage, Duration::from_nanos(ns as u64));
-        }
+/// Adds the time of each stage by the device's clock. If it has none, adds the time of the whole
+/// submission as "device".
+pub(super) fn add_stage_times(
+    device: &Device,
+    stats: &mut FrameStats,
+    stages: &[&'static str],
+    timestamps: &[u64],
+    whole: Duration,
+) {
+    let Some(tick_ns) = device.tick_ns() else {
+        add_time(stats, "device", whole);
+        return;
+    };
+    for (stage, ticks) in stages.iter().zip(timestamps.chunks_exact(2)) {
+        let ns = ticks[1].saturating_sub(ticks[0]) as f64 * f64::from(tick_ns);
+        add_time(stats, stage, Duration::from_nanos(ns as u64));
     }
 }
 

@@ -52,6 +52,13 @@ struct Page {
     free: FreeLines,
 }
 
+impl Page {
+    /// Frees the memory once the frames on the device are done: bind groups of earlier frames would keep it.
+    fn free(self) {
+        self.buffer.destroy();
+    }
+}
+
 /// A chunk on the device.
 #[derive(Debug)]
 struct Resident {
@@ -98,7 +105,7 @@ impl Mirror {
             // The free lines may be fragmented: evict everything and try again.
             self.resident.clear();
             self.by_last_frame.clear();
-            self.pages.clear();
+            self.pages.drain(..).flatten().for_each(Page::free);
             self.add_missing(device, scene).map_err(|Full| RenderError::DeviceMemory {
                 needed_bytes: scene.distinct_chunks().map(|chunk| lines_of(chunk)).sum::<u64>()
                     * LINE_BYTES,
@@ -231,7 +238,7 @@ impl Mirror {
         }
         for slot in &mut self.pages {
             if slot.as_ref().is_some_and(|page| page.free.is_all(page.lines)) {
-                *slot = None;
+                slot.take().into_iter().for_each(Page::free);
             }
         }
     }

@@ -195,6 +195,7 @@ impl ObservationBuilder {
         let slots: Vec<OnceLock<FinishedView>> =
             frame.views.iter().map(|_| OnceLock::new()).collect();
         let rendering = Span::current();
+        let in_parallel = backend.has_idle_cores();
         let finished = |index: usize, target: &Target<'_>| {
             let camera = capture.cameras[index];
             let name = &*layout.cameras()[camera].name;
@@ -212,7 +213,8 @@ impl ObservationBuilder {
                 Some(Finished { candidate: Some(_), .. }) => Ok(hashed(pixels)),
                 _ => {
                     let is_later = layout.is_shown_later(capture, camera);
-                    encoded(&layout, camera, pixels, is_later, effects[index].as_ref())
+                    let image = ImageToEncode { camera, pixels, is_shown_later: is_later };
+                    encoded(&layout, image, effects[index].as_ref(), in_parallel)
                 }
             };
             if let Ok(image) = &mut image {
@@ -365,18 +367,26 @@ impl ObservationBuilder {
 /// is one.
 type FinishedView = (Result<EncodedImage, String>, Option<Finished>);
 
-/// The hash and the file of a camera's image after the effects on its pixels; for raw pixels a copy
-/// if there are effects, and another copy if a later observation shows them.
+/// An image of a camera.
+#[derive(Clone, Copy)]
+struct ImageToEncode<'a> {
+    camera: usize,
+    pixels: &'a [u8],
+    is_shown_later: bool,
+}
+
+/// The hash and the file of a camera's image after the effects on its pixels; for raw pixels a copy if there are
+/// effects, and another copy if a later observation shows them.
 fn encoded(
     layout: &ObservationLayout,
-    camera: usize,
-    pixels: &[u8],
-    is_shown_later: bool,
+    image: ImageToEncode<'_>,
     effects: Option<&PixelEffects>,
+    in_parallel: bool,
 ) -> Result<EncodedImage, String> {
+    let ImageToEncode { camera, pixels, is_shown_later } = image;
     let [height, width] = layout.size_px(camera).map(|side| side as u32);
     let Some(effects) = effects else {
-        let mut image = encode(pixels, width, height, layout.encoding())?;
+        let mut image = encode(pixels, width, height, layout.encoding(), in_parallel)?;
         if layout.encoding() == Encoding::Raw && is_shown_later {
             image.file = pixels.to_vec();
         }
@@ -387,7 +397,7 @@ fn encoded(
     let mut changed = pixels.to_vec();
     effects.apply(&mut changed, width as usize);
     let took = started.elapsed();
-    let mut image = encode(&changed, width, height, layout.encoding())?;
+    let mut image = encode(&changed, width, height, layout.encoding(), in_parallel)?;
     image.took += took;
     image.effects = Some(AppliedEffects { clean_hash, stops: effects.stops });
     // Raw pixels travel in the buffer. A later observation needs a copy of its own.

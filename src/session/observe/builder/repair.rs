@@ -15,7 +15,7 @@ use wildcity_repair::reference::Reference;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::RigCamera;
 
-use super::{ObservationBuilder, encoded};
+use super::{ImageToEncode, ObservationBuilder, encoded};
 use crate::engine::answer_budget::{AnswerBudget, BudgetShare};
 use crate::error::SessionError;
 use crate::observe::layout::RigCapture;
@@ -319,7 +319,9 @@ impl ObservationBuilder {
                 });
             let is_later =
                 capture.as_ref().is_some_and(|capture| self.layout.is_shown_later(capture, camera));
-            let done = encoded(&self.layout, camera, &pixels, is_later, effects.as_ref())
+            let image = ImageToEncode { camera, pixels: &pixels, is_shown_later: is_later };
+            // Few images are repaired, and not on the threads that encode the others.
+            let done = encoded(&self.layout, image, effects.as_ref(), false)
                 .map_err(|reason| SessionError::Encode { camera: mounted.name.clone(), reason })?;
             // The renderer wrote its pixels there; a raw image is replaced in place.
             if let Some(at) = raw_at {
