@@ -100,9 +100,11 @@ pub fn files(
     let route = Route::new(drive)?;
     let start_us = route.at(id.start_m).time_us;
     let last_us = drive.keyframes.last().map_or(start_us, |last| last.time_us);
+    // A drive may end before the scene's length. The cast saturates, as does the sum.
     let end_us = last_us.min(start_us.saturating_add((length_s * 1e6) as i64));
     let mut poses = Vec::new();
     let mut time_us = start_us;
+    // At 10 Hz, 20 s have 201 poses, the first one at 0.
     while time_us <= end_us {
         let world = route.pose_at(time_us)?;
         let local = Pose { position_m: world.position_m - frame.origin_m, ..world };
@@ -114,6 +116,8 @@ pub fn files(
     }
     let times_us: Vec<i64> = poses.iter().map(|(since_us, _)| *since_us).collect();
     let sections = tracks.map_or(&[][..], |file| &file.tracks);
+    // Tracks are sampled at the times of the ego, so that each time has a pose of all that are
+    // present.
     let mut tracks = Vec::new();
     for section in sections {
         tracks.extend(track(section, start_us, &times_us, frame)?);
@@ -136,12 +140,14 @@ fn pretty(value: &Value) -> String {
 }
 
 fn metadata(id: &SceneId, hash: &str, cameras: &[RigCamera], poses: &[(i64, Pose)]) -> Value {
+    // 1.7e15 us are below 2^53, so that f64 holds them exactly.
     let seconds = |since_us: i64| 1e-6 * (limits::EPOCH_US as i64 + since_us) as f64;
     let last_us = poses.last().map_or(0, |(since_us, _)| *since_us);
     let camera_ids: Vec<String> = cameras.iter().map(|camera| logical_id(&camera.name)).collect();
     json!({
         "scene_id": id.to_string(),
         "version_string": format!("wildcity {}", env!("CARGO_PKG_VERSION")),
+        // A constant, so that the same version gives the same file.
         "training_date": "1970-01-01",
         "dataset_hash": hash,
         "uuid": id.to_string(),
@@ -153,9 +159,11 @@ fn metadata(id: &SceneId, hash: &str, cameras: &[RigCamera], poses: &[(i64, Pose
 }
 
 fn rig_trajectories(cameras: &[RigCamera], poses: &[(i64, Pose)]) -> Value {
+    // All poses are in the local frame already.
     let identity = rows(&Pose::IDENTITY);
     let times: Vec<i64> =
         poses.iter().map(|(since_us, _)| limits::EPOCH_US as i64 + since_us).collect();
+    // The runtime joins calibrations and frames by this id.
     let unique_id = |camera: &RigCamera| format!("{}@{SEQUENCE}", logical_id(&camera.name));
     let calibrations: serde_json::Map<_, _> = cameras
         .iter()
@@ -211,6 +219,7 @@ fn track(
     let pose = |time_us: i64| {
         let centre = centre_of_actor(&track.at(time_us)?.world_from_actor, &size);
         let [x, y, z] = (centre.position_m - frame.origin_m).to_array();
+        // The file has the scalar last.
         let [qw, qx, qy, qz] = centre.q_wxyz();
         Some((limits::EPOCH_US as i64 + time_us, [x, y, z, qx, qy, qz, qw]))
     };
@@ -219,6 +228,7 @@ fn track(
         Some(hash) => id_of_asset(&section.id, hash),
         None => id_of_box(&section.id, &size),
     };
+    // The names of the classes of AlpaSim's tracks.
     let label = match section.class {
         ActorClass::Vehicle => "automobile",
         ActorClass::Pedestrian => "person",
@@ -235,6 +245,7 @@ fn track(
 fn crowded(tracks: &[SceneTrack]) -> Option<(i64, usize)> {
     let mut counts: BTreeMap<i64, usize> = BTreeMap::new();
     for (time_us, _) in tracks.iter().flat_map(|track| &track.poses) {
+        // Sorted by time, so that the first hit below is the earliest.
         *counts.entry(time_us - limits::EPOCH_US as i64).or_default() += 1;
     }
     counts.into_iter().find(|&(_, count)| count > PlacedChunk::MAX_ACTORS)
@@ -261,12 +272,15 @@ fn sequence_tracks(tracks: &[SceneTrack]) -> Value {
 
 /// A transform as a 4x4 matrix, row by row.
 fn rows(pose: &Pose) -> [[f64; 4]; 4] {
+    // glam's arrays are columns; the columns of the transposed matrix are the rows.
     DMat4::from_rotation_translation(pose.rotation, pose.position_m).transpose().to_cols_array_2d()
 }
 
 /// One OpenDRIVE road along the poses: straight lines with an elevation, the ego's lane and an
 /// adjacent one. It has no `geoReference`, so that its coordinates are those of the local frame.
 fn road(poses: &[(i64, Pose)]) -> String {
+    // Points at least 2 m apart in the plane: a car at rest would give lines of length 0, which
+    // have no heading.
     let mut points: Vec<DVec3> = Vec::new();
     for (_, pose) in poses {
         let far =
@@ -276,6 +290,7 @@ fn road(poses: &[(i64, Pose)]) -> String {
         }
     }
     let last = poses.last().map_or(Pose::IDENTITY, |(_, pose)| *pose);
+    // The added piece is level and straight in the direction of the last pose.
     let ahead = (last.rotation * DVec3::X).with_z(0.0).normalize_or(DVec3::X);
     let from = points.last().copied().unwrap_or(last.position_m);
     points.push(from + BEYOND_M * ahead);
@@ -283,11 +298,14 @@ fn road(poses: &[(i64, Pose)]) -> String {
     let mut lines = String::new();
     let mut elevations = String::new();
     let mut s_m = 0.0;
+    // Each line begins where the one before ends: `s_m` is the sum of their lengths in the plane.
+    // No length is 0, so the slope is finite.
     for pair in points.windows(2) {
         let along: DVec2 = (pair[1] - pair[0]).truncate();
         let length_m = along.length();
         let heading = along.y.atan2(along.x);
         let [x, y, z] = pair[0].to_array();
+        // The elevation of a piece is a + b ds, with the slope as b.
         let slope = (pair[1].z - z) / length_m;
         // Writing to a text cannot fail.
         let _ = writeln!(
@@ -348,6 +366,8 @@ mod tests {
             poses: times_us.map(at).to_vec(),
         };
         let most = PlacedChunk::MAX_ACTORS;
+        // As many actors as an image may show at the times 0 and 1 period; one more is refused at
+        // the second time only.
         let mut tracks: Vec<SceneTrack> = (0..most).map(|_| track([0, PERIOD_US])).collect();
         // Not at the same time.
         tracks.push(track([2 * PERIOD_US, 3 * PERIOD_US]));

@@ -25,6 +25,7 @@ where
 {
     let codec = ProstCodec::<Answer, Asked>::default();
     let mut grpc = Grpc::new(codec)
+        // tonic's default of 4 MiB for requests would refuse batches with many objects.
         .apply_max_message_size_config(Some(limits::MESSAGE_BYTES), Some(limits::MESSAGE_BYTES));
     grpc.unary(Once(Some(method)), request).await
 }
@@ -46,6 +47,7 @@ where
     type Future = AsResponse<Answering>;
 
     fn call(&mut self, request: Request<Asked>) -> Self::Future {
+        // `call` takes `&mut self`, and the method can be called once only, so it is taken out.
         let called = self.0.take().map(|method| method(request.into_inner()));
         AsResponse(called.map(Box::pin))
     }
@@ -66,6 +68,7 @@ where
     ) -> std::task::Poll<Self::Output> {
         match &mut self.0 {
             Some(answering) => answering.as_mut().poll(context).map_ok(Response::new),
+            // tonic calls a unary service once for each request.
             None => std::task::Poll::Ready(Err(Status::internal("a method was called twice"))),
         }
     }

@@ -91,6 +91,7 @@ impl ObjectShape {
             );
             return Err(ObjectError { id: id.chars().take(NAMED).collect(), reason });
         }
+        // The last `@`: the name of a track may have one, and a shape has none.
         let Some((_, shape)) = id.rsplit_once('@') else { return Ok(Self::Unknown) };
         shape.parse().map_err(|reason| ObjectError { id: id.to_owned(), reason })
     }
@@ -104,6 +105,7 @@ impl ObjectShape {
             Self::Unknown => (&CAR, GREY),
         };
         let ActorBox { length_m, width_m, height_m } = size;
+        // f64 prints the shortest text of a number, so that 4, 4.0 and 04 have one key.
         format!("{length_m}x{width_m}x{height_m}#{red:02x}{green:02x}{blue:02x}")
     }
 
@@ -145,6 +147,8 @@ impl FromStr for ObjectShape {
             Some((size, colour)) => (size, Some(colour)),
             None => (text, None),
         };
+        // `map_while` stops at the first part that is no number, so that the count of parts is
+        // compared below.
         let extents: Vec<f64> = size.split('x').map_while(|part| part.parse().ok()).collect();
         let [length_m, width_m, height_m] = match extents[..] {
             [length_m, width_m, height_m] if size.split('x').count() == 3 => {
@@ -197,6 +201,7 @@ pub(crate) fn raised(pose: &Pose, by_m: f64) -> Pose {
 fn rgb8(hex: &str) -> Option<[u8; 3]> {
     let is_hex = hex.len() == 6 && hex.bytes().all(|byte| byte.is_ascii_hexdigit());
     let number = is_hex.then(|| u32::from_str_radix(hex, 16).ok())??;
+    // Six digits are below 2^24, so the first byte is 0.
     let [_, red, green, blue] = number.to_be_bytes();
     Some([red, green, blue])
 }
@@ -204,15 +209,22 @@ fn rgb8(hex: &str) -> Option<[u8; 3]> {
 /// The five faces of a box that are not on the ground, as flat Gaussians.
 fn gaussians(size: ActorBox, rgb8: [u8; 3]) -> Gaussians {
     let extents_m = DVec3::new(size.length_m, size.width_m, size.height_m);
+    // 1 to 16 cells along each edge: at most 5 faces of 16 x 16, which are 1,280. The cells of a
+    // large box are larger.
     let cells = (extents_m / CELL_M).ceil().min(DVec3::splat(MOST_CELLS)).max(DVec3::ONE);
     let cell_m = extents_m / cells;
     let mut gaussians = Gaussians::default();
+    // The lower face is never seen: it is on the ground.
     let faces = [(0, -1.0), (0, 1.0), (1, -1.0), (1, 1.0), (2, 1.0)];
     for (axis, side) in faces {
+        // A Gaussian at each cell's middle with 0.66 of the cell as its standard deviation leaves
+        // no gap between two cells.
         let mut sigmas_m = OVERLAP * cell_m;
         sigmas_m[axis] = THICKNESS_M;
         let rgb = rgb8.map(|value| SHADES[axis] * f64::from(value) / 255.0);
+        // The inverse of colour = 0.5 + C0 dc.
         let dc = rgb.map(|value| ((value - 0.5) / sh::C0) as f32);
+        // The two axes within the face.
         let [u, v] = [(axis + 1) % 3, (axis + 2) % 3];
         for i in 0..cells[u] as usize {
             for j in 0..cells[v] as usize {
@@ -221,6 +233,7 @@ fn gaussians(size: ActorBox, rgb8: [u8; 3]) -> Gaussians {
                 at_m[axis] = 0.5 * side * extents_m[axis];
                 at_m[u] = (i as f64 + 0.5) * cell_m[u] - 0.5 * extents_m[u];
                 at_m[v] = (j as f64 + 0.5) * cell_m[v] - 0.5 * extents_m[v];
+                // An actor's origin is on the ground.
                 at_m.z += 0.5 * extents_m.z;
                 gaussians.means_m.push(at_m.to_array());
                 gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
@@ -268,6 +281,7 @@ mod tests {
 
     #[test]
     fn a_long_id_is_refused_by_its_first_characters() {
+        // Two bytes each, so that exactly as many bytes as are accepted.
         let long = "é".repeat(limits::TRACK_ID_BYTES / 2);
         assert_eq!(ObjectShape::from_track(&long), Ok(ObjectShape::Unknown));
         let text = ObjectShape::from_track(&format!("{long}a")).unwrap_err().to_string();
@@ -279,6 +293,7 @@ mod tests {
     fn equal_boxes_have_one_key() {
         let key = |id: &str| ObjectShape::from_track(id).unwrap().key();
         assert_eq!(key("7@4x2x1"), "4x2x1#808080");
+        // Other names, spellings of a number, and the default colour written out.
         for same in ["8@4.0x2x1", "7@4x02.0x1.#808080"] {
             assert_eq!(key(same), "4x2x1#808080", "{same}");
         }
@@ -300,6 +315,7 @@ mod tests {
         // Every face but the lower one has Gaussians, on the face.
         assert!((bounds.min_m - DVec3::new(-2.25, -0.9, 0.05)).length() < 1e-9, "{bounds:?}");
         assert!((bounds.max_m - DVec3::new(2.25, 0.9, 1.5)).length() < 1e-9, "{bounds:?}");
+        // The top has the shade 1, so that its colour is the given one: 51 of 255 is 0.2.
         let top = (0..all.len()).find(|&index| all.means_m[index][2] == 1.5).unwrap();
         let rgb = all.sh_at(top).iter().map(|&dc| 0.5 + sh::C0 * f64::from(dc));
         for (value, wanted) in rgb.zip([1.0, 0.0, 0.2]) {

@@ -58,6 +58,7 @@ impl AssetRequest {
     /// Names the first field that is outside its limits.
     pub fn check(&self) -> Result<(), PushError> {
         let AssetSettings { name, mesh_gaussians, .. } = &self.settings;
+        // The name is a part of a path in the store, so it is checked before anything else.
         if !is_name(name) {
             return Err(PushError::InvalidName { field: "name", name: name.clone() });
         }
@@ -74,6 +75,8 @@ impl AssetRequest {
     /// Bytes of memory that making the asset may use, for files of `file_bytes` bytes.
     fn memory_bytes(&self, file_bytes: u64) -> u64 {
         let mesh_gaussians = u64::from(self.settings.mesh_gaussians);
+        // A file may be a mesh, so the number of Gaussians that is asked for counts in addition to
+        // the bytes. The product of a u32 and 952 does not wrap a u64.
         limits::push_memory_bytes(file_bytes)
             .saturating_add(limits::MEMORY_PER_MESH_GAUSSIAN * mesh_gaussians)
     }
@@ -86,6 +89,8 @@ impl AssetRequest {
 pub fn make_asset(source: AssetSource, settings: &AssetSettings) -> Result<ActorAsset, PushError> {
     let AssetSource { mut gaussians, hashes, mut options } = source;
     let box_ = center(&mut gaussians)?;
+    // The same file with another number of Gaussians is another asset, so the number belongs to the
+    // provenance.
     options.push(format!("gaussians={}", settings.mesh_gaussians));
     let description = AssetDescription {
         name: settings.name.clone(),
@@ -99,12 +104,16 @@ pub fn make_asset(source: AssetSource, settings: &AssetSettings) -> Result<Actor
 /// Moves Gaussians so that their origin is on the ground under the middle of their box. Returns the
 /// box.
 fn center(gaussians: &mut Gaussians) -> Result<ActorBox, PushError> {
+    // Without Gaussians the bounds would be infinite, and so would the box.
     if gaussians.is_empty() {
         return Err(refused("there are no Gaussians to make an actor of".to_owned()));
     }
     let Bounds { min_m, max_m } = ActorAsset::bounds(gaussians);
     let middle_m = 0.5 * (min_m + max_m);
+    // The poses of an actor are on the ground, so z is that of its lowest point, and not of its
+    // middle.
     let origin_m = DVec3::new(middle_m.x, middle_m.y, min_m.z);
+    // A translation does not change the extent, so the box is computed from the bounds before it.
     gaussians.transform(&Pose { position_m: -origin_m, ..Pose::IDENTITY });
     let DVec3 { x: length_m, y: width_m, z: height_m } = max_m - min_m;
     let box_ = ActorBox { length_m, width_m, height_m };
@@ -133,6 +142,7 @@ pub async fn publish_asset(
     // A name of a twin does not start with a dot. Pushes of assets with one name run one after the
     // other, so that two assets cannot be stored under the same name.
     let name = format!(".actors/{}", request.settings.name);
+    // The time of waiting does not count towards the limit below: only reading is limited.
     let file_bytes = files.iter().map(|file| file.bytes).sum();
     let permit = queue.permit_with(&name, request.memory_bytes(file_bytes)).await?;
 
@@ -159,6 +169,8 @@ pub async fn publish_asset(
             make_asset(source, &request.settings)
         })
     };
+    // At the limit the thread still runs. The stop flag, which is set as `stopping` is dropped on
+    // the way out, ends it soon.
     let limit = queue.check_timeout();
     let made = timeout(limit, made).await.map_err(|_| PushError::TimedOut { limit })?;
     let asset = made.map_err(|error| push.cause(error))?;
@@ -201,6 +213,7 @@ mod tests {
         for &mean_m in means_m {
             gaussians.means_m.push(mean_m);
             gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+            // exp(-4) is 18 mm, and the sigmoid of 3 is 0.95.
             gaussians.ln_scales.push([-4.0; 3]);
             gaussians.logit_opacities.push(3.0);
             gaussians.sh.extend([0.2; 3]);
@@ -211,6 +224,8 @@ mod tests {
 
     #[test]
     fn the_origin_is_on_the_ground_under_the_middle() {
+        // The middle is (12, 21), and the lowest point is at z = 5: this is where the origin comes
+        // to.
         let made = make_asset(source(&[[10.0, 20.0, 5.0], [14.0, 22.0, 6.5]]), &settings());
         let ActorAsset { description, levels } = made.unwrap();
         assert_eq!(description.box_, ActorBox { length_m: 4.0, width_m: 2.0, height_m: 1.5 });
@@ -222,6 +237,7 @@ mod tests {
         let chunk = &levels[0].chunk;
         let mut places: Vec<[f32; 3]> =
             (0..2).map(|i| [0, 1, 2].map(|axis| chunk.value(i, axis))).collect();
+        // A level may store its Gaussians in another order than the source.
         places.sort_by(|a, b| a[0].total_cmp(&b[0]));
         assert_eq!(places, [[-2.0, -1.0, 0.0], [2.0, 1.0, 1.5]]);
     }
@@ -246,6 +262,7 @@ mod tests {
         let file = RequestedFile { upload: "x".to_owned(), axes, name: None };
         let request = AssetRequest { files: vec![file], settings: settings() };
         request.check().unwrap();
+        // Both neighbours of the range, and both ends of the type.
         for mesh_gaussians in [0, 999, 1_000_001, u32::MAX] {
             let settings = AssetSettings { mesh_gaussians, ..settings() };
             let error = AssetRequest { settings, ..request.clone() }.check().unwrap_err();

@@ -14,9 +14,11 @@ use crate::source::SourceAxes;
 pub fn check_base(catalog: &Catalog, request: &PushRequest) -> Result<Option<u64>, PushError> {
     let versions = match catalog.versions(&request.twin) {
         Ok(versions) => versions,
+        // The push makes the twin. A base of a twin that does not exist is an error instead.
         Err(StoreError::NoTwin { .. }) if request.base.is_none() => return Ok(None),
         Err(error) => return Err(error.into()),
     };
+    // A base that is the latest has no differences, so this needs no case of its own.
     let latest = versions.last().map(|entry| entry.number);
     if let (Some(base), Some(latest)) = (request.base, latest) {
         let diff = catalog.diff(&request.twin, base, latest)?;
@@ -32,6 +34,7 @@ pub fn check_base(catalog: &Catalog, request: &PushRequest) -> Result<Option<u64
         };
         if !cells.is_empty() {
             let name = request.twin.clone();
+            // Only cells are compared here; the commit itself compares settings, too.
             let settings = Vec::new();
             return Err(StoreError::Overlap { name, base, latest, cells, settings }.into());
         }
@@ -44,7 +47,10 @@ pub fn check_base(catalog: &Catalog, request: &PushRequest) -> Result<Option<u64
 pub fn default_id(request: &PushRequest, latest: Option<u64>) -> String {
     let mut hasher = blake3::Hasher::new();
     hasher.update(request.request_hash.as_bytes());
+    // Versions count from 1, so 0 stands for a twin that does not exist yet.
     hasher.update(&latest.unwrap_or(0).to_le_bytes());
+    // 32 hex digits are 128 bits, which do not collide, and they stay within the 64 characters of a
+    // name.
     hasher.finalize().to_hex()[..32].to_owned()
 }
 
@@ -62,6 +68,8 @@ pub(crate) fn default_axes(
     };
     let Some(base) = find_base(catalog, request)? else { return Ok(SourceAxes::default()) };
     let options = &base.manifest.provenance.options;
+    // The options list one axes and one scale for each file of the base, mostly equal ones. Only
+    // neighbours are merged: `a b a` stays ambiguous, as it should.
     let found = |key: &str| {
         let mut found: Vec<&str> =
             options.iter().filter_map(|option| option.strip_prefix(key)).collect();
@@ -78,6 +86,7 @@ pub(crate) fn default_axes(
             ),
         });
     }
+    // A base that was not imported from a file, such as a generated one, has neither option.
     let scale = scales.first().and_then(|scale| scale.parse().ok());
     SourceAxes::given(axes.first().copied(), scale).map_err(|error| PushError::InvalidField {
         field: format!("files[{index}].axes"),

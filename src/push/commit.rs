@@ -33,12 +33,16 @@ pub(crate) fn merge_profile(
 ) -> Result<(RenderProfile, Option<String>), PushError> {
     let of_files = FileNotes { antialiasing: antialiasing.cloned(), ..FileNotes::default() };
     let of_files = of_files.profile();
+    // An existing twin keeps its profile: cells of other pushes were trained for it. Only a new
+    // twin takes that of its files.
     let own = match base {
         Some(base) => base.manifest.profile,
         None => of_files.apply(RenderProfile::DEFAULT).map_err(StoreError::from)?,
     };
     let profile = profile_with(own, &request.profile).map_err(StoreError::from)?;
     let is_asked = |key: &str| request.profile.iter().any(|setting| setting.starts_with(key));
+    // The files agree with the profile if applying their settings changes nothing. A setting that
+    // the client gave itself is no surprise either, so it gives no warning.
     let is_right = of_files.apply(profile).map_err(StoreError::from)? == profile
         || is_asked("antialiased=")
         || is_asked("blur=");
@@ -68,6 +72,8 @@ pub(crate) fn commit(
     let record = request.record.or(old.map(|old| old.record)).unwrap_or_default();
     let storage = StorageOptions { record, levels: request.levels };
     let mut commit = catalog.begin(&request.twin, CommitKind::Push, storage)?;
+    // With `Touched` and `All` no Gaussian is left out: `Touched` is defined by the Gaussians, and
+    // `All` also removes the cells without any.
     let only = match &request.cells {
         CellSelection::These(cells) => Some(cells),
         CellSelection::Touched | CellSelection::All => None,
@@ -82,6 +88,8 @@ pub(crate) fn commit(
     let profile = content.profile;
     let version = match base {
         Some(base) if request.cells != CellSelection::All => {
+            // A change without a profile does not conflict with a change of the profile that was
+            // committed meanwhile, so it is set only if the request asks for it.
             let profile = (!request.profile.is_empty()).then_some(profile);
             let change = VersionChange { profile, ..VersionChange::new(provenance) };
             commit.change(base.number, change)?
@@ -98,7 +106,11 @@ pub(crate) fn commit(
                     .map_err(StoreError::from)?,
                 provenance,
             };
+            // The settings are complete: what is not copied from the old version here would be
+            // lost.
             commit.set_views(old.and_then(|old| old.views.clone()));
+            // Neither replaces what others committed since `base` was read: both fail with a
+            // conflict.
             match base {
                 Some(base) => commit.replace(Some(base.number), settings)?,
                 None => commit.create(settings)?,

@@ -61,6 +61,8 @@ impl EditRequest {
             });
         }
         let mut alignment = Alignment::IDENTITY;
+        // The ground comes first and the scale second: the scale multiplies the aligned axes and
+        // leaves the ground at z = 0.
         if let Some((points, above)) = *ground {
             let plane = plane_through(points, above).map_err(alignment_error("ground.points"))?;
             alignment = Alignment::onto(&plane);
@@ -69,6 +71,8 @@ impl EditRequest {
             let metres = scale_from_points(points, distance_m).map_err(alignment_error("scale"))?;
             alignment = alignment.scaled(metres).map_err(alignment_error("scale"))?;
         }
+        // The points are in the axes of the base, and the drive is stored in those of the new
+        // version.
         let trajectories = match drive {
             None => Vec::new(),
             Some(DriveRequest { name, points, speed_m_s }) => {
@@ -108,10 +112,13 @@ pub async fn publish_edit(
     let edit = request.edit()?;
     let twin = request.twin;
     let catalog = engine.catalog().clone();
+    // The base is read before the permit, because the memory to wait for depends on its size.
     let base = {
         let twin = twin.clone();
         run_blocking(move || Ok(catalog.version(&twin, request.base)?)).await?
     };
+    // Only an alignment changes Gaussians, and then each of them is read and written again. A drive
+    // or a rig changes the manifest only.
     let needed =
         if edit.alignment == Alignment::IDENTITY { 0 } else { base.manifest.stored_bytes() };
     let permit = queue.permit(&twin, needed).await?;
@@ -120,6 +127,8 @@ pub async fn publish_edit(
         let twin = twin.clone();
         run_blocking(move || {
             let _permit = permit;
+            // The pin comes before the commit, so that no session opens the new version between the
+            // commit and the preload.
             let held = pin_latest(&engine, &twin)?;
             let version = engine.catalog().edit(&base, edit, &mut |_, _| {})?;
             Ok((version, held))
@@ -127,6 +136,7 @@ pub async fn publish_edit(
         .await?
     };
     tracing::info!(twin, version = version.number, "edited");
+    // From here on nothing fails: the version exists, and a preload is only a help.
     preload(engine, &twin, version.number, viewpoints(&twin)).await;
     drop(held);
     Ok(PushedVersion { number: version.number, hash: version.hash })
@@ -160,6 +170,9 @@ pub async fn survey(
     run_blocking(move || {
         let _permit = permit;
         let version = catalog.version(&twin, version)?;
+        // Every stride-th Gaussian of each section is a sample that is spread over the scene, and
+        // the same one at each call. The stride of an empty version would be 0, which `step_by`
+        // refuses.
         let stride =
             version.manifest.gaussians().div_ceil(limits::SURVEYED_GAUSSIANS).max(1) as usize;
         let sh_degree = version.manifest.sh_degree;
@@ -167,6 +180,7 @@ pub async fn survey(
         catalog.visit_full_detail(&version, &|_| true, &mut |section| {
             some.append(&section.select((0..section.len()).step_by(stride)));
         })?;
+        // A scene without a ground is no error: the page then lets a person place it.
         let ground = find_ground(&some, &GroundSearch::default()).ok();
         Ok(Survey { version: version.number, extent: scene_extent(&some), ground })
     })
@@ -182,7 +196,10 @@ mod tests {
         EditRequest {
             twin: "street".to_owned(),
             base: None,
+            // The ground is at z = -2, and the point above it at z = -9: up is -z, so the scene
+            // stands on its head.
             ground: Some((triangle.map(|p| p - 2.0 * DVec3::Z), DVec3::NEG_Z * 9.0)),
+            // Two units are 8 m, so that a unit is 4 m.
             scale: Some(([DVec3::ZERO, 2.0 * DVec3::X], 8.0)),
             drive: Some(DriveRequest {
                 name: "path".to_owned(),
@@ -197,6 +214,7 @@ mod tests {
     fn the_drive_is_on_the_new_ground_in_metres() {
         let edit = request().edit().unwrap();
         let keyframes = &edit.trajectories[0].keyframes;
+        // Five units of 4 m are 20 m, and a point one unit above the ground is at 4 m.
         let last = keyframes[keyframes.len() - 1].world_from_rig.position_m;
         assert!(last.z.abs() < 1e-9 && (last.length() - 20.0).abs() < 1e-9, "{last}");
         assert!((edit.alignment.point_m(DVec3::new(0.0, 0.0, -3.0)).z - 4.0).abs() < 1e-9);

@@ -97,8 +97,11 @@ impl PushError {
             | Self::InvalidField { .. }
             | Self::InvalidName { .. }
             | Self::Content { .. }
+            // The same files take the same time again, so the client has to divide the push.
             | Self::TimedOut { .. } => true,
             Self::Session(SessionError::Twin(error)) => is_refused_content(error),
+            // No wildcard in this match: an added variant has to be sorted into one of the two
+            // groups.
             Self::UnknownPush { .. }
             | Self::Busy { .. }
             | Self::Cancelled
@@ -122,7 +125,9 @@ impl From<StoreError> for PushError {
 /// the store.
 fn is_refused_content(error: &StoreError) -> bool {
     match error {
+        // A file that the system cannot read says nothing about its content.
         StoreError::Gaussians(error) => !matches!(error, IngestError::File(_)),
+        // These depend on the content, the settings or the base alone.
         StoreError::Clamped { .. }
         | StoreError::Profile(_)
         | StoreError::FieldMismatch { .. }
@@ -133,6 +138,7 @@ fn is_refused_content(error: &StoreError) -> bool {
         | StoreError::ActorExists { .. }
         | StoreError::TwinExists { .. }
         | StoreError::Overlap { .. } => true,
+        // These depend on the medium, on its other users, or on a defect of the program.
         StoreError::Io { .. }
         | StoreError::Name { .. }
         | StoreError::NoTwin { .. }
@@ -186,9 +192,12 @@ mod tests {
             count: 1,
             gaussians: 2,
         };
+        // One fault of the base and one of the content; sending either again gives the same answer.
         for error in [overlap, clamped] {
             assert!(PushError::from(error).is_refusal());
         }
+        // Nothing is known about the outcome, or the disk did not take it: sending it again settles
+        // this, because a push of equal content makes no second version.
         let unsettled = StoreError::OutcomeUnknown {
             name: name(),
             number: 2,

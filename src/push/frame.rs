@@ -26,6 +26,7 @@ impl Frame {
     pub(crate) fn alignment(self, base: Option<&Version>) -> Result<Option<Alignment>, PushError> {
         match (self, base) {
             (Self::Capture, Some(base)) => twin_from_capture(base),
+            // A new twin has no alignment yet, so that both frames are the same.
             (Self::Capture, None) | (Self::Twin, _) => Ok(None),
         }
     }

@@ -28,6 +28,7 @@ pub const CHECK_TIMEOUT: Duration = Duration::from_secs(1800);
 
 /// Bytes of memory that a push of files of `file_bytes` bytes may use.
 pub fn push_memory_bytes(file_bytes: u64) -> u64 {
+    // The sizes come from the disk, so the sum saturates; the queue then caps it at its limit.
     file_bytes.saturating_mul(MEMORY_PER_FILE_BYTE).saturating_add(MEMORY_BASE_BYTES)
 }
 

@@ -67,6 +67,7 @@ pub async fn publish(
     let permit = queue.permit(&request.twin, file_bytes).await?;
     let request = Arc::new(request);
 
+    // The limit begins with the permit, so that a push that waits for others is not punished.
     let limit = queue.check_timeout();
     let deadline = Instant::now() + limit;
     // The frames have a later deadline than the push, so that a push that takes too long fails with
@@ -74,9 +75,11 @@ pub async fn publish(
     let frames_by = deadline + engine.step_timeout();
     let checked = read_and_check(engine, push, &request, files, &permit, frames_by);
     let Ok(checked) = timeout_at(deadline, checked).await else {
+        // Dropping the future does not end its blocking thread; the flag does.
         push.stop_flag().stop();
         return Err(PushError::TimedOut { limit });
     };
+    // A cancellation ends the reading with an error, too, and is the reason to report.
     let (scene, base) = checked.map_err(|error| push.cause(error))?;
 
     // From here on, the push cannot be cancelled.
@@ -93,6 +96,7 @@ pub async fn publish(
         .await?
     };
     let Committed { version, held } = committed;
+    // The version exists. What follows cannot fail, so the push ends with success.
     tracing::info!(twin = request.twin, version = version.number, "pushed");
 
     push.enter(State::Prefetching)?;
@@ -128,6 +132,7 @@ async fn read_and_check(
         .await?
     };
 
+    // The base is looked up again after minutes of reading, so that changes of others count.
     push.enter(State::Validating)?;
     let base = {
         let engine = engine.clone();
@@ -147,6 +152,7 @@ async fn check(
     base: Option<Arc<Version>>,
     frames_by: Instant,
 ) -> Result<CheckedScene, PushError> {
+    // Counting the cells of 250 million Gaussians takes seconds, which an async thread must not.
     let (mut scene, changed) = {
         let push = push.clone();
         let request = request.clone();
@@ -160,12 +166,14 @@ async fn check(
     };
     if let Some(changed) = changed {
         let progress = |done, total| push.set_progress(done, total);
+        // The poses are in the frame of the files, and the images in that of the twin.
         let alignment = request.frame.alignment(base.as_deref())?.unwrap_or(Alignment::IDENTITY);
         let poses = request.preview_poses.as_ref();
         let poses = poses.map(|poses| poses.iter().map(|pose| alignment.pose(pose)).collect());
         scene.report.preview = preview_psnr(engine, changed, poses, frames_by, &progress).await?;
         push.set_report(scene.report.clone());
     }
+    // The report is set before this check, so that a refused push shows its PSNR, too.
     check_psnr(request, &scene.gaussians, &scene.report, base.as_deref())?;
     Ok(scene)
 }
@@ -178,6 +186,8 @@ fn compare_cells(
     mut scene: PushedScene,
     base: Option<&Version>,
 ) -> Result<CheckedScene, PushError> {
+    // From here on all coordinates are those of the twin, and cells mean its cells. Each refusal
+    // below sets the report first: it tells the user what was refused.
     let placed = scene.place_in_twin(request.frame, base);
     placed.inspect_err(|_| push.set_report(scene.report.clone()))?;
     let PushedScene { mut gaussians, hashes, options, antialiasing, mut report } = scene;
@@ -191,6 +201,7 @@ fn compare_cells(
     {
         gaussians.raise_sh_degree(base.manifest.sh_degree);
     }
+    // One pass, O(n log c) for n Gaussians in c cells; a push of a street has about a hundred.
     let mut counts = BTreeMap::new();
     for mean_m in &gaussians.means_m {
         *counts.entry(cell_at(mean_m)).or_insert(0) += 1;
@@ -237,6 +248,7 @@ fn commit_held(
 pub(crate) fn pin_latest(engine: &Arc<Engine>, twin: &str) -> Result<Option<LatestPin>, PushError> {
     let versions = match engine.catalog().versions(twin) {
         Ok(versions) => versions,
+        // No session can open a twin that does not exist, so there is nothing to hold back.
         Err(StoreError::NoTwin { .. }) => return Ok(None),
         Err(error) => return Err(error.into()),
     };
@@ -255,6 +267,7 @@ pub(crate) async fn preload(
     let prepared = engine.preload(twin, version, frames);
     match timeout(wildcity_session::limits::PRELOAD_TIMEOUT, prepared).await {
         Ok(Ok(())) => {}
+        // Neither case fails the push: sessions then load the sections when they need them.
         Ok(Err(error)) => tracing::warn!(twin, "not loaded ahead: {error}"),
         Err(_) => tracing::warn!(twin, "not loaded ahead in time"),
     }

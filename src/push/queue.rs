@@ -72,6 +72,7 @@ pub enum Begun {
 impl PushQueue {
     /// An empty queue.
     pub fn new(limits: QueueLimits) -> Self {
+        // Rounding up gives the smallest limit one unit at least, so that a push can always run.
         let memory = Arc::new(Semaphore::new(memory_units(limits.memory_bytes) as usize));
         Self { entries: Mutex::default(), twins: Mutex::default(), memory, limits }
     }
@@ -105,6 +106,8 @@ impl PushQueue {
         id: &str,
         files: impl FnOnce() -> Result<Vec<SourceFile>, E>,
     ) -> Result<Begun, E> {
+        // The lock is held from the lookup to the insertion, so that two equal requests make one
+        // push.
         let mut entries = self.entries.lock();
         let key = (request.twin.clone(), id.to_owned());
         if let Some(push) = entries.pushes.get(&key) {
@@ -112,6 +115,8 @@ impl PushQueue {
                 let must = format!("{id:?}, the id of a push that asked for something else");
                 return Err(PushError::OutOfRange { field: "id".to_owned(), must }.into());
             }
+            // A refused push stays known: the same content would be refused again. A failed one may
+            // be tried again under its id.
             if push.status().state != State::Failed {
                 return Ok(Begun::Known(push.clone()));
             }
@@ -120,10 +125,12 @@ impl PushQueue {
         if entries.open_count() >= limit {
             return Err(PushError::Busy { limit }.into());
         }
+        // The files come last: a request that is refused for another reason pins no upload.
         let files = files()?;
         entries.begun += 1;
         let push = Arc::new(Push::new(request.request_hash, entries.begun));
         entries.pushes.insert(key, push.clone());
+        // The inserted push is open, so that it is never the one that is forgotten.
         entries.forget_oldest();
         Ok(Begun::New { push, files })
     }
@@ -141,6 +148,8 @@ impl PushQueue {
         entries.begun += 1;
         // No other request is this push, so that its hash is never compared.
         let push = Arc::new(Push::new(blake3::hash(&[]), entries.begun));
+        // An asset's push has no id by which it could be found, so a weak reference is enough to
+        // count it.
         entries.actors.retain(|actor| actor.strong_count() > 0);
         entries.actors.push(Arc::downgrade(&push));
         Ok(push)
@@ -179,6 +188,8 @@ impl PushQueue {
         // Lock the twin first, so that a push that waits for its twin reserves no memory, which
         // pushes of other twins may need.
         let twin = lock.lock_owned().await;
+        // More than there is would wait for ever. A push that is capped runs alone, and its reader
+        // refuses files that unpack to more.
         let needed = memory_bytes.min(self.limits.memory_bytes);
         let memory = self.memory.clone().acquire_many_owned(memory_units(needed)).await;
         // The semaphore is never closed while the process runs.
@@ -197,17 +208,21 @@ impl PushPermit {
 
 /// Bytes as permits of the semaphore, rounded up.
 fn memory_units(bytes: u64) -> u32 {
+    // u32::MAX units of 1 MiB are 4 PiB.
     u32::try_from(bytes.div_ceil(limits::MEMORY_UNIT_BYTES)).unwrap_or(u32::MAX)
 }
 
 impl Entries {
     fn open_count(&self) -> usize {
+        // At most 64 remembered and some open ones, so counting is cheaper than a counter that must
+        // agree with every way in which a push ends.
         let actors = self.actors.iter().filter_map(Weak::upgrade).filter(|push| push.is_open());
         self.pushes.values().filter(|push| push.is_open()).count() + actors.count()
     }
 
     /// Removes the oldest ended pushes while there are too many.
     fn forget_oldest(&mut self) {
+        // One iteration, as a rule: each begun push adds one entry. An open push is never removed.
         while self.pushes.len() > limits::REMEMBERED_PUSHES {
             let ended = self.pushes.iter().filter(|(_, push)| !push.is_open());
             let Some(oldest) = ended.min_by_key(|(_, push)| push.number()) else { return };
@@ -267,6 +282,7 @@ mod tests {
         let push = new(begin(&queue, "a", "x"));
         assert!(matches!(begin(&queue, "a", "x"), Ok(Begun::Known(_))));
         assert!(matches!(begin(&queue, "b", "x"), Err(PushError::OutOfRange { .. })));
+        // A crash is a failure: the id begins a second push. A refusal below keeps it.
         assert_eq!(push.end(Err(PushError::Crashed)), State::Failed);
         let again = new(begin(&queue, "a", "x"));
         assert!(Arc::ptr_eq(&again, &queue.get("city", "x").unwrap()));
@@ -294,6 +310,7 @@ mod tests {
         assert!(matches!(begin(&queue, "a", "x"), Err(PushError::Busy { limit: 1 })));
         let version = PushedVersion { number: 1, hash: String::new() };
         first.end(Ok(version.clone()));
+        // With the first one this is one more than are remembered.
         for number in 0..limits::REMEMBERED_PUSHES {
             new(begin(&queue, "a", &format!("p{number}"))).end(Ok(version.clone()));
         }
@@ -324,6 +341,7 @@ mod tests {
     #[tokio::test]
     async fn pushes_of_different_twins_wait_for_memory_only() {
         let queue = queue(8);
+        // The queue has 1 GiB, and a push of 1000 bytes takes the base of 256 MiB: four fit.
         let first = comes(&queue, "city", 1000).await.expect("nothing runs");
         assert!(comes(&queue, "city", 1000).await.is_none(), "one push of a twin at a time");
         let other = comes(&queue, "street", 1000).await.expect("another twin");

@@ -42,6 +42,7 @@ impl PushedScene {
         self.report.is_aligned = base.map(twin_from_capture).transpose()?.flatten().is_some();
         let Some(alignment) = frame.alignment(base)? else { return Ok(()) };
         alignment.apply(&mut self.gaussians);
+        // The report shows the values that would be stored, also if they are refused next.
         self.report.ranges = Ranges::from_gaussians(&self.gaussians);
         validate::check(&self.gaussians, &Field::twin_name).map_err(|bad| PushError::Content {
             reason: format!("in the axes of the twin, {bad}: check the scale of the files"),
@@ -95,6 +96,7 @@ pub(crate) fn read(
     // Read scenes that may name other files first, so that the named files are not read as scenes.
     let names_others: Vec<bool> =
         files.iter().map(|file| ingest::may_name_others(&file.path).unwrap_or(false)).collect();
+    // A file whose head cannot be read names no other; its own reader then reports why.
     for is_first in [true, false] {
         for (index, requested) in requested.iter().enumerate() {
             if names_others[index] == is_first && !reader.parts.contains(&files[index].name) {
@@ -102,11 +104,14 @@ pub(crate) fn read(
             }
         }
     }
+    // A part that is not the last file leaves a gap in the order, at which joining stopped. Here
+    // the rest is joined.
     reader.join_read(files.len())?;
 
     let mut scene = reader.scene;
     scene.report.sh_degree = scene.gaussians.sh_degree;
     scene.report.ranges = Ranges::from_gaussians(&scene.gaussians);
+    // The report is set before the check for emptiness, because its warnings may say why.
     push.set_report(scene.report.clone());
     if scene.gaussians.is_empty() {
         let reason = "the files hold no Gaussians: there is nothing to push".to_owned();
@@ -157,6 +162,7 @@ impl<'a> Reader<'a> {
             listed,
             default_axes,
             bounds,
+            // For the progress only, so that parts, which no reader counts, do no harm.
             total_bytes: files.iter().map(|file| file.bytes).sum(),
             read_bytes: 0,
             parts: BTreeSet::new(),
@@ -194,6 +200,8 @@ impl<'a> Reader<'a> {
         let default = self.default_axes;
         let read = match read_limited(&file.path, &requested.axes, default, &limits, progress) {
             Ok(read) => read,
+            // Only this error has something for the report: how many Gaussians are bad, and the
+            // first of them.
             Err(IngestError::Values(bad)) => {
                 let report = &mut self.scene.report;
                 report.gaussians += bad.gaussians;
@@ -213,6 +221,7 @@ impl<'a> Reader<'a> {
                     cells: Vec::new(),
                 });
             }
+            // The server's disk is at fault and not the content, so this is no refusal.
             Err(IngestError::File(cause)) => {
                 return Err(PushError::Unreadable {
                     name: name.clone(),
@@ -224,6 +233,7 @@ impl<'a> Reader<'a> {
         self.read_bytes += file.bytes;
         self.parts.extend(read.parts.iter().cloned());
         self.read.insert(index, read);
+        // Joining at once keeps one scene in memory beside the joined one, and not all of them.
         if index == self.next {
             self.join_read(index + 1)?;
         }
@@ -232,6 +242,8 @@ impl<'a> Reader<'a> {
 
     /// Joins the scenes that were read of the files before `end`.
     fn join_read(&mut self, end: usize) -> Result<(), PushError> {
+        // The map is sorted by index, so that the scenes are joined in the order of the request,
+        // which the version's bytes depend on.
         while let Some(entry) = self.read.first_entry().filter(|entry| *entry.key() < end) {
             let name = &self.files[*entry.key()].name;
             let SourceScene { gaussians, hash, options, notes, .. } = entry.remove();
@@ -248,6 +260,7 @@ impl<'a> Reader<'a> {
                 warnings: notes.warnings,
             });
             let total = scene.report.gaussians;
+            // Before the copy, so that the memory of one scene too many is never reserved.
             check_count(name, total, &self.bounds)
                 .inspect_err(|_| self.push.set_report(scene.report.clone()))?;
             if scene.gaussians.is_empty() {
@@ -286,6 +299,7 @@ mod tests {
         assert!(check_count("a.ply", limits::PUSH_GAUSSIANS, &bounds).is_ok());
         let error = check_count("b.ply", limits::PUSH_GAUSSIANS + 1, &bounds).unwrap_err();
         assert!(error.is_refusal());
+        // 250,000,000 are accepted, and the error names the count that is one more.
         let text = error.to_string();
         assert!(text.starts_with("b.ply") && text.contains("250000001"), "{text}");
     }

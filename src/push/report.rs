@@ -87,6 +87,7 @@ impl Ranges {
         let ln_scales = gaussians.ln_scales.as_flattened();
         let scales_m = ln_scales.iter().map(|&ln| f64::from(ln).exp());
         let logits = gaussians.logit_opacities.iter();
+        // For a logit of -100 the exponential is 1e43, which f64 holds and f32 does not.
         let opacities = logits.map(|&logit| 1.0 / (1.0 + (-f64::from(logit)).exp()));
         let quats = gaussians.quats_wxyz.iter();
         let lengths = quats.map(|q| q.iter().map(|&q| f64::from(q).powi(2)).sum::<f64>().sqrt());
@@ -101,6 +102,7 @@ impl Ranges {
 
 /// The smallest and the largest of some values.
 fn range(values: impl Iterator<Item = f64>) -> [f64; 2] {
+    // The caller has at least one value, so that neither infinity remains.
     values.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], value| {
         [low.min(value), high.max(value)]
     })
@@ -130,8 +132,11 @@ impl CellChanges {
         let before: BTreeMap<[i32; 2], u64> =
             chunks.iter().map(|chunk| (chunk.cell, chunk.count)).collect();
         let replaced: BTreeSet<[i32; 2]> = match selection {
+            // A named cell is replaced even if the base does not have it.
             CellSelection::These(cells) => cells.clone(),
             CellSelection::Touched => after.keys().copied().collect(),
+            // Cells of the base without a Gaussian in the push are removed, and reported as going
+            // to 0.
             CellSelection::All => before.keys().chain(after.keys()).copied().collect(),
         };
         let count = |counts: &BTreeMap<[i32; 2], u64>, cell| counts.get(cell).copied().unwrap_or(0);
@@ -143,12 +148,14 @@ impl CellChanges {
                 after: count(after, cell),
             })
             .collect();
+        // The set is in order of (x, y), and the store and its reports are in order of (y, x).
         cells.sort_by_key(|change| (change.cell[1], change.cell[0]));
         match selection {
             CellSelection::These(_) => refuse_empty(&cells)?,
             CellSelection::Touched => refuse_shrunk(&cells)?,
             CellSelection::All => {}
         }
+        // `kept` sums a part of the same counts, so the difference is not negative.
         let kept: u64 = cells.iter().map(|change| change.after).sum();
         Ok(Self { cells, left_out: after.values().sum::<u64>() - kept })
     }
@@ -173,6 +180,8 @@ fn refuse_empty(cells: &[CellChange]) -> Result<(), PushError> {
 /// the margin of a neighbouring cell. Without this check a few strays would replace the cell.
 fn refuse_shrunk(cells: &[CellChange]) -> Result<(), PushError> {
     let shrinks =
+        // Counts below 2^53 are exact in f64. A cell without Gaussians before never shrinks: 0 < 0
+        // is false.
         |change: &&CellChange| (change.after as f64) < limits::SHRUNK_SHARE * change.before as f64;
     let shrunk: Vec<_> = cells.iter().filter(shrinks).collect();
     let Some(CellChange { cell: [x, y], before, after }) = shrunk.first() else { return Ok(()) };
@@ -194,6 +203,7 @@ mod tests {
         let gaussians = Gaussians {
             sh_degree: 0,
             means_m: vec![[1.0, -2.0, 3.0], [-1.0, 5.0, 0.0]],
+            // The second quaternion has the length 5, and a logit of 100 is an opacity of 1 in f64.
             quats_wxyz: vec![[1.0, 0.0, 0.0, 0.0], [0.0, 3.0, 4.0, 0.0]],
             ln_scales: vec![[0.0; 3], [0.0, -1.0, 1.0]],
             logit_opacities: vec![0.0, 100.0],
@@ -209,6 +219,7 @@ mod tests {
     #[test]
     fn named_cells_decide_what_is_left_out() {
         let after = BTreeMap::from([([0, 0], 5), ([1, 0], 7)]);
+        // The five Gaussians of cell (0, 0) are not named and so left out.
         let named = CellSelection::These(BTreeSet::from([[1, 0]]));
         let changes = CellChanges::new(&named, None, &after).unwrap();
         assert_eq!(changes.cells, [CellChange { cell: [1, 0], before: 0, after: 7 }]);

@@ -86,12 +86,15 @@ impl PushRequest {
                 "empty; leave it out, or name at least one cell".to_owned(),
             );
         }
+        // Tried on the default profile: a setting is valid or not, whatever the others are. The
+        // base, which is not known here, gets them in the pipeline.
         for (index, setting) in self.profile.iter().enumerate() {
             RenderProfile::default().set(setting).map_err(|error| PushError::InvalidField {
                 field: format!("profile[{index}]"),
                 reason: error.to_string(),
             })?;
         }
+        // Characters and not bytes: a note in Japanese may be as long as one in English.
         if self.note.as_ref().is_some_and(|note| note.chars().count() > limits::NOTE_CHARS) {
             return out_of_range("note", format!("longer than {} characters", limits::NOTE_CHARS));
         }
@@ -101,6 +104,7 @@ impl PushRequest {
             let must = format!("{} poses; at most {}", poses.len(), limits::PREVIEW_MAX_POSES);
             return out_of_range("golden.poses", must);
         }
+        // Both become keys of the queue, and the twin becomes a path of the store.
         for (field, name) in [("id", self.id.as_ref()), ("twin", Some(&self.twin))] {
             if let Some(name) = name
                 && !is_name(name)
@@ -119,6 +123,8 @@ pub(crate) fn check_files(files: &[RequestedFile]) -> Result<(), PushError> {
         return Err(PushError::OutOfRange { field: "files".to_owned(), must });
     }
     let is_bad = |name: &String| {
+        // The name is only compared with the names within other files, so slashes and dots are
+        // harmless. Control characters would reach logs and terminals.
         !(1..=limits::FILE_NAME_BYTES).contains(&name.len()) || name.chars().any(char::is_control)
     };
     let names = files.iter().map(|file| file.name.as_ref());

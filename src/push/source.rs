@@ -60,6 +60,7 @@ impl SourceAxes {
     /// # Errors
     /// As [`Self::parse`].
     pub fn given(axes: Option<&str>, metres_per_unit: Option<f64>) -> Result<Self, IngestError> {
+        // Only to check the scale: the axes may be unknown until the file is read.
         Axes::IDENTITY.scaled(metres_per_unit.unwrap_or(1.0))?;
         let parsed = |text: &str| Ok::<_, IngestError>((text.parse::<Axes>()?, text.to_owned()));
         Ok(Self { axes: axes.map(parsed).transpose()?, metres_per_unit })
@@ -76,6 +77,8 @@ impl SourceAxes {
         let ReadScene { mut gaussians, hash, parts, mut notes } = read;
         let (axes, text) = self.used_axes(default, &mut notes);
         let scale = self.used_scale(default, &mut notes);
+        // Rotation and scale are one step, because each pass goes over every Gaussian and its
+        // harmonics.
         axes.scaled(scale)?.apply(&mut gaussians);
         let options = [format!("axes={text}"), format!("scale={scale}")];
         Ok(SourceScene { gaussians, hash, parts, options, notes })
@@ -84,7 +87,10 @@ impl SourceAxes {
     /// The given axes, or else those that the file records, or else the default; notes which ones
     /// if that may surprise.
     fn used_axes(&self, default: &Self, notes: &mut FileNotes) -> (Axes, String) {
+        // What the user says counts more than what the file says, and that more than what the twin
+        // was made from.
         match (&self.axes, &notes.axes, &default.axes) {
+            // Two spellings of one rotation are no contradiction, so rotations are compared.
             (Some((axes, text)), recorded, _) => {
                 if let Some(FileAxes { axes: recorded, said_by }) =
                     recorded.as_ref().filter(|recorded| !axes.has_same_rotation(&recorded.axes))
@@ -102,6 +108,7 @@ impl SourceAxes {
                 (axes, text)
             }
             (None, None, Some((axes, text))) => {
+                // The identity is what a user without axes expects, so it is no surprise.
                 if !axes.has_same_rotation(&Axes::IDENTITY) {
                     notes
                         .warnings
@@ -115,6 +122,7 @@ impl SourceAxes {
 
     /// The given metres per unit, or else the default; notes it if that may surprise.
     fn used_scale(&self, default: &Self, notes: &mut FileNotes) -> f64 {
+        // No scene file gives its unit here, so there are only two sources.
         let inherited = default.metres_per_unit.filter(|_| self.metres_per_unit.is_none());
         if let Some(scale) = inherited.filter(|scale| *scale != 1.0) {
             notes.warnings.push(format!("no scale is given: that of the twin, {scale}, is used"));
@@ -185,6 +193,7 @@ pub fn read_tracked(
 ) -> Result<(Vec<TrackedObject>, String), IngestError> {
     let (mut objects, hash) = ingest::read_tracked(path, progress)?;
     let (file_axes, _) = axes.axes.clone().unwrap_or((Axes::IDENTITY, String::new()));
+    // There is no twin to inherit from: an asset has axes of its own.
     let file_axes = file_axes.scaled(axes.metres_per_unit.unwrap_or(1.0))?;
     objects.iter_mut().for_each(|object| file_axes.apply(&mut object.gaussians));
     Ok((objects, hash))
@@ -193,6 +202,8 @@ pub fn read_tracked(
 /// The provenance of a version that is made from files with these hashes. It contains no time and
 /// no user, so that the same content gives the same version.
 pub fn provenance(hashes: &[String], mut options: Vec<String>, levels: bool) -> Provenance {
+    // The hash of one file is the provenance itself, so that a user can compare it with `b3sum`.
+    // The order of several counts, as it does for the content.
     let source = match hashes {
         [one] => one.clone(),
         several => blake3::hash(several.join("\n").as_bytes()).to_hex().to_string(),

@@ -131,6 +131,7 @@ impl Push {
         }
         status.state = State::Failed;
         status.error = Some(Arc::new(PushError::Cancelled));
+        // The waiter may lock the status at once.
         drop(status);
         // Before the reading ends because of it.
         self.cancelled.notify_one();
@@ -140,6 +141,8 @@ impl Push {
 
     /// Returns when the push is cancelled.
     pub async fn cancelled(&self) {
+        // `notify_one` stores a permit, so a cancellation before this call is not lost. There is
+        // one waiter for each push.
         self.cancelled.notified().await;
     }
 
@@ -162,6 +165,8 @@ impl Push {
     /// [`State::Refused`], any other [`State::Failed`]. Returns the state.
     pub fn end(&self, result: Result<PushedVersion, PushError>) -> State {
         let mut status = self.status.lock();
+        // A push ends once. What comes later, such as the error of a reader that was stopped, is
+        // dropped.
         if !status.state.is_open() {
             return status.state;
         }
@@ -183,6 +188,7 @@ impl Push {
     pub fn close(&self, result: Result<(), &PushError>) -> State {
         let mut status = self.status.lock();
         if status.state.is_open() {
+            // The caller owns the error and answers with it, so only the state is kept here.
             status.state = match result {
                 Ok(()) => State::Ready,
                 Err(error) if error.is_refusal() => State::Refused,

@@ -69,8 +69,11 @@ impl ConnectionSlots {
     /// Returns a slot for a connection from an address. May first close another unauthenticated
     /// connection, or wait until that is allowed.
     pub(crate) async fn admit(self: &Arc<Self>, address: IpAddr) -> ConnectionSlot {
+        // A client with a network of its own could otherwise take a slot for each of its addresses.
         let address = client_network(address);
         loop {
+            // The permit of `notify_one` is stored, so that a slot that becomes free before the
+            // wait below is not missed.
             let left = self.left.notified();
             let wait = match self.entries.lock().make_room(address) {
                 Ok(()) => break,
@@ -81,6 +84,8 @@ impl ConnectionSlots {
             let _ = tokio::time::timeout(wait, left).await;
         }
         let close = Arc::new(Notify::new());
+        // Only the accept loop admits connections, one at a time, so the room that was made is
+        // still there.
         let mut entries = self.entries.lock();
         entries.admitted += 1;
         let number = entries.admitted;
@@ -98,10 +103,14 @@ impl Entries {
     /// try.
     fn make_room(&mut self, address: IpAddr) -> Result<(), Duration> {
         let of_address = self.by_address.get(&address).copied().unwrap_or_default();
+        // Two limits: of all, and of one address, which is half of it, so that one address cannot
+        // fill the slots alone.
         let is_full = self.waiting.len() >= limits::UNAUTHENTICATED_CONNECTIONS;
         if !is_full && of_address < limits::UNAUTHENTICATED_OF_ADDRESS {
             return Ok(());
         }
+        // The keys are numbers that rise, so that the first match in the map is the oldest. Both
+        // searches go over 512 entries at most.
         let most = self.by_address.iter().max_by_key(|(_, count)| **count).map(|(most, _)| *most);
         let from = if is_full { most } else { Some(address) };
         let oldest = self.waiting.iter().find(|(_, connection)| Some(connection.address) == from);
@@ -109,7 +118,10 @@ impl Entries {
         // Many clients may connect at once: each has this long to send its request.
         let age = connection.arrived.elapsed();
         match limits::UNAUTHENTICATED_GRACE.checked_sub(age) {
+            // There is no slot until the grace period is over. A wait of 0 would spin.
             Some(left) if is_full => return Err(left.max(Duration::from_millis(1))),
+            // Only the address has too many: there is room for now, and a later connection finds
+            // them older.
             Some(_) => return Ok(()),
             None => {}
         }
@@ -125,6 +137,8 @@ impl Entries {
         };
         if let Some(count) = self.by_address.get_mut(&address) {
             *count -= 1;
+            // Addresses without connections are forgotten, or the map would grow with every client
+            // there ever was.
             if *count == 0 {
                 self.by_address.remove(&address);
             }
@@ -139,6 +153,8 @@ impl ConnectionSlot {
     /// # Errors
     /// [`Fault::Busy`] if there are too many authenticated connections.
     pub(crate) fn mark_authenticated(&self) -> Result<(), Fault> {
+        // The lock covers the check and the take, so that two requests of one connection take one
+        // permit.
         let mut permit = self.permit.lock();
         if permit.is_some() {
             return Ok(());
@@ -148,6 +164,8 @@ impl ConnectionSlot {
             return Err(Fault::Busy { what: "connections", limit });
         };
         *permit = Some(taken);
+        // The permit is stored before the connection leaves the others, so it always counts in one
+        // of the two.
         drop(permit);
         self.leave();
         Ok(())
@@ -175,6 +193,8 @@ impl Drop for ConnectionSlot {
 /// The network that is assumed to belong to one client: an IPv4 address, or the /64 of an IPv6
 /// address.
 fn client_network(address: IpAddr) -> IpAddr {
+    // An IPv4 address that is mapped to IPv6 counts as IPv4, or its /64 would be that of all IPv4
+    // clients.
     match address.to_canonical() {
         IpAddr::V6(v6) => {
             let [a, b, c, d, ..] = v6.segments();
@@ -201,6 +221,7 @@ mod tests {
         let other = connections.admit(elsewhere).await;
         let begun = Instant::now();
         let mut idle = Vec::new();
+        // One slot is taken by the other address, so this fills the rest.
         for _ in 1..limits::UNAUTHENTICATED_CONNECTIONS {
             idle.push(connections.admit(HERE).await);
         }

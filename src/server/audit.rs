@@ -103,6 +103,7 @@ impl Audit {
         grant: &Arc<Grant>,
         change: &Change,
     ) -> Result<(), Fault> {
+        // Without a log, no thread and no copies are needed.
         if self.0.is_none() {
             return Ok(());
         }
@@ -152,6 +153,7 @@ impl Audit {
         change: &Change,
         ended: Result<Made, impl Display>,
     ) {
+        // Cut between characters: a byte index could be within one.
         let reason = |reason: String| match reason.char_indices().nth(limits::AUDIT_REASON_CHARS) {
             Some((at, _)) => format!("{} ..", &reason[..at]),
             None => reason,
@@ -169,6 +171,8 @@ impl Audit {
         ended: Option<Result<Made, String>>,
     ) -> Result<(), Fault> {
         let Some(log) = &self.0 else { return Ok(()) };
+        // A clock before 1970 gives 0, because a wrong time is no reason to refuse a change.
+        // Microseconds fill a u64 after 584,000 years.
         let since_1970 = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let Change { what, target, id } = change;
         let (twin, actor) = match target {
@@ -196,6 +200,7 @@ impl Audit {
             Some(Ok(Made::Nothing)) => Line { state: "done", ..begun },
             Some(Err(reason)) => Line { state: "refused", reason: Some(reason), ..begun },
         };
+        // The line is made before the lock is taken, which is held for the disk alone.
         let mut text = serde_json::to_vec(&line).map_err(|e| Fault::Internal(e.to_string()))?;
         text.push(b'\n');
         let mut log = log.lock();
@@ -206,6 +211,8 @@ impl Audit {
 
 impl Log {
     fn open(path: &Path, limit_bytes: u64) -> io::Result<Self> {
+        // In append mode the kernel puts each write at the end, also if another program has
+        // written.
         let file = OpenOptions::new().create(true).append(true).open(path)?;
         let bytes = file.metadata()?.len();
         sync_name(path);
@@ -224,9 +231,12 @@ impl Log {
 
     /// Appends a line, and returns when it is on disk.
     fn append(&mut self, line: &[u8]) -> io::Result<()> {
+        // A line that is longer than the limit alone still goes into an empty file.
         if self.bytes > 0 && self.bytes + line.len() as u64 > self.limit_bytes {
             self.rotate();
         }
+        // `sync_data` also syncs the length of the file, without which the line could not be read
+        // again.
         let written = self.file.write_all(line).and_then(|()| self.file.sync_data());
         match written {
             Ok(()) => self.bytes += line.len() as u64,
@@ -295,6 +305,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("audit.jsonl");
         let grant = Grant::everything();
+        // The second turn opens the file of the first, as a restart does: 3 lines each.
         for _ in 0..2 {
             let audit = Audit::open(Some(&path)).unwrap();
             audit.begin_now(&grant, &change()).unwrap();
@@ -315,6 +326,8 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("audit.jsonl");
         fs::write(&path, "{\"cut").unwrap();
+        // The cut line has 5 bytes and its end 1, and the first line 13: 19 of 40. The next line
+        // has 31.
         let mut log = Log::open(&path, 40).unwrap();
         log.append(b"{\"first\": 1}\n").unwrap();
         assert_eq!(fs::read_to_string(&path).unwrap(), "{\"cut\n{\"first\": 1}\n");
@@ -334,6 +347,8 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("audit.jsonl");
         let mut log = Log::open(&path, 40).unwrap();
+        // Each line has 33 bytes, so that each gets its own file. With 8 old files and 11 lines,
+        // numbers 0 and 1 are gone.
         let last = limits::AUDIT_OLD_FILES + 2;
         for number in 0..=last {
             log.append(format!("{{\"line, too long for two\": {number:4}}}\n").as_bytes()).unwrap();
@@ -350,6 +365,7 @@ mod tests {
         audit.end_now(&Grant::everything(), &change(), Err("é".repeat(60_000)));
         let reason =
             lines(&dir.path().join("long.jsonl"))[0]["reason"].as_str().unwrap().to_owned();
+        // Three characters say that the reason was cut.
         assert_eq!(reason.chars().count(), limits::AUDIT_REASON_CHARS + 3);
     }
 

@@ -9,6 +9,8 @@ const VERSION: u8 = 0xA0;
 
 /// The end of the validity of a certificate in DER; `None` if it has none that can be read.
 pub(crate) fn expiry(der: &[u8]) -> Option<SystemTime> {
+    // A certificate is a sequence of the signed part, the algorithm and the signature. The first
+    // element of it has all that is needed.
     let (_, certificate, _) = element(der)?;
     let (_, mut fields, _) = element(certificate)?;
     if element(fields)?.0 == VERSION {
@@ -30,10 +32,14 @@ fn element(der: &[u8]) -> Option<(u8, &[u8], &[u8])> {
     let (&first, rest) = rest.split_first()?;
     let (length, rest) = match first {
         0..=0x7F => (usize::from(first), rest),
+        // The long form: the low bits count the bytes of the length. Four bytes are 4 GiB, and fit
+        // a usize.
         0x81..=0x84 => {
             let (bytes, rest) = rest.split_at_checked(usize::from(first & 0x7F))?;
             (bytes.iter().fold(0, |length, byte| (length << 8) | usize::from(*byte)), rest)
         }
+        // 0x80 is the indefinite length, which DER forbids. More than four bytes of length are no
+        // certificate.
         _ => return None,
     };
     let (content, rest) = rest.split_at_checked(length)?;
@@ -47,6 +53,7 @@ fn time(tag: u8, text: &str) -> Option<SystemTime> {
         UTC_TIME => {
             let (year, rest) = digits.split_at_checked(2)?;
             let year: u64 = year.parse().ok()?;
+            // Two digits are 1950 to 2049 (RFC 5280, section 4.1.2.5.1).
             (if year < 50 { 2000 + year } else { 1900 + year }, rest)
         }
         GENERALIZED_TIME => {
@@ -63,6 +70,8 @@ fn time(tag: u8, text: &str) -> Option<SystemTime> {
     // Days since 1970-01-01 in the Gregorian calendar; years begin in March, so that a leap day
     // ends one.
     let (year, month) = if month > 2 { (year, month - 3) } else { (year - 1, month + 9) };
+    // (153 m + 2) / 5 counts the days before month m of a year that begins in March. 719,469 are
+    // the days from its year 0 to 1970, plus 1, because days of a month count from 1.
     let days =
         365 * year + year / 4 - year / 100 + year / 400 + (153 * month + 2) / 5 + day - 719_469;
     let seconds = ((days * 24 + hour) * 60 + minute) * 60 + second;

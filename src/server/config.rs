@@ -66,6 +66,7 @@ impl Config {
     /// with all defaults.
     pub fn local(directories: Directories, backend: Arc<dyn Backend>) -> Self {
         Self {
+            // A loopback address, because there are no tokens.
             listen: SocketAddr::from(([127, 0, 0, 1], 0)),
             directories,
             cache: None,
@@ -137,6 +138,7 @@ pub struct SpoolLimits {
 impl Limits {
     /// The limits of the pushes.
     pub(crate) fn queue(&self) -> QueueLimits {
+        // The share follows the memory for twins, so that one flag scales both.
         let twins_bytes = self.resident_bytes.unwrap_or_else(default_memory_bytes);
         let share_bytes = twins_bytes / wildcity_push::limits::MEMORY_SHARE_OF_TWINS;
         QueueLimits {
@@ -150,6 +152,7 @@ impl Limits {
 impl Default for Limits {
     fn default() -> Self {
         Self {
+            // Limits that a client has to know are those of the protocol.
             hello: wildcity_protocol::limits::HELLO_TIMEOUT,
             idle: limits::IDLE_TIMEOUT,
             send: wildcity_protocol::limits::SEND_TIMEOUT,
@@ -182,6 +185,8 @@ impl Default for SpoolLimits {
 
 impl std::fmt::Debug for Config {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        // Taken apart by name, so that a field that is added has to be decided on here: tokens must
+        // not be printed.
         let Self {
             listen,
             directories,

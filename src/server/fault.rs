@@ -327,6 +327,8 @@ impl Fault {
     pub(crate) fn is_fatal(&self) -> bool {
         matches!(
             self,
+            // After the first three the position in the stream of bytes is unknown, so that no
+            // further message can be read. After the others the connection has no use.
             Self::MessageTooLarge { .. }
                 | Self::BrokenFrame(_)
                 | Self::NotUtf8
@@ -339,6 +341,7 @@ impl Fault {
 
 fn list(names: &[String]) -> String {
     match names {
+        // An empty list would end the sentence with nothing.
         [] => "none".to_owned(),
         names => names.join(", "),
     }

@@ -29,6 +29,7 @@ impl IdleDeadline {
     pub(crate) async fn extend_during<T>(&self, work: impl Future<Output = T>) -> T {
         let mut work = pin!(work);
         loop {
+            // Twice in each period, so that the deadline never passes while the work runs.
             self.extend();
             if let Ok(done) = timeout(self.period / 2, &mut work).await {
                 self.extend();
@@ -41,6 +42,8 @@ impl IdleDeadline {
     pub(crate) async fn passed(&self) {
         loop {
             let deadline = *self.deadline.lock();
+            // The deadline may have moved while this slept. A request that makes progress costs no
+            // wake-up: only the end of the old deadline does.
             if deadline <= Instant::now() {
                 return;
             }
@@ -55,6 +58,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_client_is_not_cut_off_while_it_waits_for_the_server() {
+        // The work takes three periods of silence.
         let deadline = IdleDeadline::new(Duration::from_millis(400));
         tokio::select! {
             biased;

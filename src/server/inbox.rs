@@ -27,6 +27,7 @@ impl Inbox {
 
     /// Waits for the next message. Dropping the future loses no message.
     pub(crate) async fn next(&mut self) -> Result<Incoming, Disconnect> {
+        // In order of arrival: the socket is read only when nothing waits.
         let Some(early) = self.early.pop_front() else { return self.socket.receive().await };
         if let Ok(Incoming::Text(text)) = &early {
             self.early_bytes -= text.len();
@@ -42,10 +43,13 @@ impl Inbox {
         loop {
             let has_room = self.early.len() < limits::EARLY_MESSAGES
                 && self.early_bytes < wildcity_protocol::limits::INBOUND_MESSAGE_BYTES;
+            // Without reading, TCP's window fills, and the client has to wait.
             if self.ended || !has_room {
                 return request.await;
             }
             tokio::select! {
+                // The request first: when it is done, nothing more is read, and the next call of
+                // `next` gets it.
                 biased;
                 done = &mut request => return done,
                 received = self.socket.receive() => self.keep(received),
@@ -55,8 +59,11 @@ impl Inbox {
 
     fn keep(&mut self, received: Result<Incoming, Disconnect>) {
         match &received {
+            // A ping was answered already, and a request that is carried out has no idle deadline
+            // to extend.
             Ok(Incoming::Alive) => return,
             Ok(Incoming::Text(text)) => self.early_bytes += text.len(),
+            // A mistake in one message is answered in its turn, after the request that runs now.
             Err(Disconnect::Fault(fault)) if !fault.is_fatal() => {}
             Err(_) => self.ended = true,
         }

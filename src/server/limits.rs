@@ -158,6 +158,8 @@ pub const MCAP_WAIT: Duration = Duration::from_secs(20);
 const _: () = {
     use wildcity_protocol::limits as wire;
     use wildcity_session::limits as session;
+    // The session does not know the protocol, so each package has its own constant. They are equal
+    // here, or nothing compiles.
     assert!(session::OBSERVATION_BYTES == wire::OBSERVATION_BYTES);
     assert!(session::OBSERVATION_HEADER_BYTES == wire::OBSERVATION_HEADER_BYTES);
     assert!(session::HISTORY_POSES == wire::HISTORY_POSES);

@@ -25,6 +25,8 @@ pub(crate) async fn listen(state: Arc<ServerState>, listener: TcpListener, tls: 
     let acceptor = Acceptor::new(state.clone());
     let hello = state.limits.hello;
     loop {
+        // The slot is a part of accepting: while there is none, connections wait in the kernel's
+        // queue.
         let accepted = async {
             let (stream, address) = listener.accept().await?;
             Ok::<_, std::io::Error>((stream, acceptor.admit(address.ip()).await))
@@ -42,6 +44,8 @@ pub(crate) async fn listen(state: Arc<ServerState>, listener: TcpListener, tls: 
             },
             () = state.stopped() => return,
         };
+        // The handshake of TLS runs in the connection's own task, so that a slow client holds up no
+        // other.
         set_options(&stream);
         let tls = tls.clone();
         acceptor.serve(slot, async move { Stream::accept(stream, tls.as_deref(), hello).await });
@@ -58,6 +62,8 @@ pub(crate) struct Acceptor {
 impl Acceptor {
     pub(crate) fn new(state: Arc<ServerState>) -> Self {
         let connections =
+            // All WebSockets, and some more for HTTP, or nothing could be asked while all are in
+            // use.
             ConnectionSlots::new(state.limits.connections + limits::SPARE_CONNECTIONS);
         let app = routes::router(state.clone());
         Self { state, connections, app }
@@ -76,6 +82,7 @@ impl Acceptor {
     ) -> JoinHandle<()> {
         let state = self.state.clone();
         let hello = state.limits.hello;
+        // A client may take `hello` to send its request, and `send` to read the answer.
         let deadline = Arc::new(IdleDeadline::new(hello + state.limits.send));
         // A WebSocket outlives its HTTP request, and keeps the slot that came with it.
         let slot = Arc::new(slot);
@@ -99,6 +106,8 @@ impl Acceptor {
             tokio::select! {
                 () = connection => {}
                 () = deadline.passed() => {}
+                // Each of these drops the connection. A WebSocket has been moved to a task of its
+                // own by then, and is not ended by the deadline.
                 () = slot.closed() => {}
                 () = state.stopped() => {}
             }

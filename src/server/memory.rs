@@ -67,6 +67,7 @@ impl SharedMemory {
     /// The operating system is not Linux, or refuses.
     pub(crate) fn new() -> Result<Self, Fault> {
         let name = format!("wildcity-{}", uuid::Uuid::new_v4().as_simple());
+        // 122 random bits, which a program that cannot read the memory does not guess.
         let proof = uuid::Uuid::new_v4().as_simple().to_string();
         let file = system::sealed_file(&name, MEMORY_SLOTS as u64 * Self::SLOT_BYTES)
             .and_then(|file| system::write_at(&file, 0, proof.as_bytes()).map(|()| file))
@@ -76,6 +77,8 @@ impl SharedMemory {
             })?;
         Ok(Self {
             path: system::open_file_path(&file),
+            // What the kernel shows for a memfd: it has no name in any directory, so it looks
+            // deleted.
             target: format!("/memfd:{name} (deleted)"),
             file: Arc::new(file),
             proof,
@@ -96,6 +99,8 @@ impl SharedMemory {
     /// # Errors
     /// The client sends a different text.
     pub(crate) fn open(&mut self, proof: &str) -> Result<(), Fault> {
+        // The proof is in the first slot, and is overwritten by the first message: it is of use
+        // once.
         if proof != self.proof {
             let reason = "this is not the text at the beginning of the memory; connect without shared memory";
             return Err(Fault::NoSharedMemory { field: "proof", reason: reason.to_owned() });
@@ -122,6 +127,7 @@ impl SharedMemory {
         let bytes = answer.message_bytes();
         let slot = self.next;
         let offset = slot as u64 * Self::SLOT_BYTES;
+        // The budget is asked before a byte is written, because pages that were written stay.
         self.hold(engine, slot, bytes)?;
         if bytes <= limits::INLINE_MEMORY_BYTES {
             write_parts(&self.file, offset, answer)?;
@@ -131,6 +137,7 @@ impl SharedMemory {
             let written = tokio::task::spawn_blocking(move || write_parts(&file, offset, &answer));
             written.await.map_err(io::Error::other)??;
         }
+        // The client reads the last answer while the next one is written, which is in another slot.
         self.next = (slot + 1) % MEMORY_SLOTS;
         Ok(MemoryPlace { slot, offset, bytes })
     }
@@ -141,6 +148,8 @@ impl SharedMemory {
         if bytes > Self::SLOT_BYTES {
             return Err(io::ErrorKind::FileTooLarge.into());
         }
+        // At most 4,095 B more than `bytes`. A page counts once: a slot keeps the pages of its
+        // longest message.
         let needed = bytes.next_multiple_of(PAGE_BYTES);
         let more = needed.saturating_sub(self.held[slot]);
         if more == 0 {
@@ -148,6 +157,7 @@ impl SharedMemory {
         }
         let share = engine.reserve_answer_bytes(more).map_err(io::Error::other)?;
         match &mut self.share {
+            // One share for the whole connection, which gives all of it back when it is dropped.
             Some(held) => held.merge(share),
             None => self.share = Some(share),
         }
@@ -178,6 +188,8 @@ mod system {
         let flags = MemfdFlags::CLOEXEC | MemfdFlags::ALLOW_SEALING;
         let file = File::from(memfd_create(name, flags)?);
         file.set_len(bytes)?;
+        // SHRINK keeps the client's mapping valid, GROW keeps the memory bounded, and SEAL forbids
+        // further seals, such as one against writing.
         fcntl_add_seals(&file, SealFlags::SHRINK | SealFlags::GROW | SealFlags::SEAL)?;
         Ok(file)
     }

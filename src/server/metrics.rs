@@ -59,6 +59,8 @@ impl Metrics {
         // 16 buckets from 1 ms to 33 s, each twice the previous one: most steps take 0.1 s.
         let seconds = || Histogram::new(exponential_buckets(1e-3, 2.0, 16));
         let metrics = Self {
+            // The registry is filled below, with clones that share the values, and put in place at
+            // the end.
             registry: Registry::default(),
             steps: Counter::default(),
             step_seconds: seconds(),
@@ -79,6 +81,8 @@ impl Metrics {
             pushes_open: Gauge::default(),
         };
         let m = &metrics;
+        // Clones of a counter count together, so that the fields of this struct are what is
+        // encoded.
         registry.register("steps", "Steps carried out", m.steps.clone());
         let help = "From a step's arrival to its observation, waiting included";
         registry.register_with_unit("step", help, Unit::Seconds, m.step_seconds.clone());
@@ -116,6 +120,7 @@ impl Metrics {
     /// # Errors
     /// A collector failed.
     pub(crate) fn text(&self, gauges: GaugeValues) -> Result<String, std::fmt::Error> {
+        // Gauges are read when they are asked for, and so never drift from what they count.
         self.sessions.set(gauges.sessions as i64);
         self.connections.set(gauges.connections as i64);
         self.frames_queued.set(gauges.frames_queued as i64);
@@ -144,6 +149,7 @@ struct Residency(Arc<Engine>);
 
 impl Collector for Residency {
     fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> Result<(), std::fmt::Error> {
+        // One copy of the statistics, so that the numbers of one answer belong together.
         let stats = self.0.residency();
         let failed = "Loads that failed because";
         for (name, help, count) in [
@@ -168,6 +174,7 @@ impl Collector for Residency {
             let kind = counter.metric_type();
             counter.encode(encoder.encode_descriptor(&name, &help, None, kind)?)?;
         }
+        // A directory has no requests to count.
         if let Some(traffic) = self.0.catalog().traffic() {
             for (name, help, count) in [
                 ("requests", "Requests to the object store", traffic.requests),

@@ -30,6 +30,7 @@ impl Origins {
     /// # Errors
     /// Names the first one that no browser would send.
     pub fn new(origins: Vec<String>) -> Result<Self, OriginError> {
+        // The text must be exactly what a browser sends, because `lists` compares bytes.
         let is_origin = |origin: &str| {
             let uri: Result<Uri, _> = origin.parse();
             let Ok(uri) = uri else { return false };
@@ -62,9 +63,13 @@ impl Origins {
         has_tokens: bool,
         host: Option<&str>,
     ) -> Result<(), Fault> {
+        // Programs send none. Browsers send one with each request that may change something, or
+        // whose answer a page can read.
         let Some(origin) = headers.get(header::ORIGIN) else { return Ok(()) };
+        // An origin that is no text is neither local nor own, and is refused below.
         let text = origin.to_str().unwrap_or_default();
         let authority = text.split_once("://").map(|(_, authority)| authority);
+        // Without tokens this would admit rebound names: there `Origin` and `Host` agree, too.
         let is_own = has_tokens && authority.is_some() && authority == host;
         if is_local_origin(text) || self.lists(origin.as_bytes()) || is_own {
             return Ok(());
@@ -81,13 +86,17 @@ impl Origins {
     /// # Errors
     /// [`Fault::ForbiddenHost`].
     pub(crate) fn check_host(&self, has_tokens: bool, host: Option<&str>) -> Result<(), Fault> {
+        // HTTP/1.0 has no host. No browser speaks it.
         let Some(host) = host else { return Ok(()) };
+        // The scheme of the request is unknown behind a proxy, so the port is compared under the
+        // scheme of each listed origin.
         let listed = |origin: &String| {
             let scheme = origin.split_once("://").map_or("", |(scheme, _)| scheme);
             without_own_port(format!("{scheme}://{host}")) == *origin
         };
         let is_address =
             has_tokens && host_name(host).trim_matches(['[', ']']).parse::<IpAddr>().is_ok();
+        // A rebound name does no harm then: the page has no token to send.
         let knows_none = has_tokens && self.0.is_empty();
         if knows_none || is_address || is_local_authority(host) || self.0.iter().any(listed) {
             return Ok(());
@@ -121,6 +130,8 @@ fn is_local_authority(authority: &str) -> bool {
 /// A host without its port.
 fn host_name(authority: &str) -> &str {
     match authority.rsplit_once(':') {
+        // The last colon, because an IPv6 address has more of them. In `[::1]` it is followed by
+        // `1]`, which are not only digits.
         Some((host, port)) if port.bytes().all(|b| b.is_ascii_digit()) => host,
         _ => authority,
     }
@@ -140,6 +151,8 @@ mod tests {
         for origin in [
             "null",
             "http://example.org",
+            // Names that only begin, contain or end like a local one, and users that look like a
+            // host.
             "http://localhost.example.org",
             "http://127.0.0.1.example.org:80",
             "http://example.org:127",
@@ -174,6 +187,7 @@ mod tests {
     fn hosts_are_local_listed_or_addresses() {
         let listed = Origins::new(vec!["https://sim.example.org".to_owned()]).unwrap();
         let none = Origins::default();
+        // Columns: neither tokens nor list, a list, tokens, both.
         for (host, open, with_list, with_tokens, with_both) in [
             ("localhost:8080", true, true, true, true),
             ("[::1]:8080", true, true, true, true),

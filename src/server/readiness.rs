@@ -23,6 +23,7 @@ impl Readiness {
     /// The body of a refusal if the twins cannot be listed. A request that arrives during a check
     /// waits for its result.
     pub(crate) async fn refusal(&self, engine: &Engine) -> Option<Value> {
+        // A future and not a result: it is polled only if the last look is too old.
         let check = async {
             engine.check_twins().await.err().map(|error| convert::refusal_body(&error.into()))
         };
@@ -34,6 +35,7 @@ impl Readiness {
         now: Instant,
         check: impl Future<Output = Option<Value>>,
     ) -> Option<Value> {
+        // Held during the check, so that one check runs at a time.
         let mut last = self.0.lock().await;
         if let Some(Look { at, refusal }) = &*last
             && now < *at + limits::READY_AGE
@@ -64,6 +66,7 @@ mod tests {
             readiness.look(now, look).await
         };
         let begin = Instant::now();
+        // Ten questions from 0 to 0.9 of the age of a look. The one at the full age looks again.
         for part in 0..10_u32 {
             assert_eq!(ask(begin + part * limits::READY_AGE / 10).await, Some(1.into()));
         }

@@ -12,6 +12,8 @@ pub(crate) fn reload(
     tls: Option<Arc<Tls>>,
     state: Arc<ServerState>,
 ) -> impl Future<Output = ()> + Send {
+    // Outside of the future: from here on SIGHUP does not end the process, even if the future is
+    // polled later.
     #[cfg(unix)]
     let hangup = {
         use tokio::signal::unix::{SignalKind, signal};
@@ -23,6 +25,7 @@ pub(crate) fn reload(
             Ok(mut hangup) => {
                 while hangup.recv().await.is_some() {
                     let shared = (tls.clone(), state.clone());
+                    // Files are read and keys are parsed, neither of which an async thread must do.
                     let read = move || read_again(shared.0.as_deref(), &shared.1);
                     if tokio::task::spawn_blocking(read).await.is_err() {
                         tracing::error!("SIGHUP: reading again crashed");
@@ -34,6 +37,7 @@ pub(crate) fn reload(
         }
         #[cfg(not(unix))]
         drop((tls, state));
+        // The caller selects over this future, so it must not end.
         std::future::pending().await
     }
 }
@@ -48,6 +52,7 @@ fn read_again(tls: Option<&Tls>, state: &ServerState) {
         Some(Err((file, error))) => {
             tracing::error!(file = %file.display(), "the old tokens stay: {error}");
         }
+        // Said once if there was neither, or an operator would wait for an effect.
         Some(Ok(None)) | None if tls.is_none() => {
             tracing::info!(
                 "SIGHUP: there is nothing to read again, neither a certificate nor tokens"

@@ -168,12 +168,14 @@ impl SessionRegistry {
         grant: &Grant,
     ) -> Result<SlotGuard, Fault> {
         let mut entries = self.entries.lock();
+        // Names are unique over all tokens, because they also name the files of episodes.
         if entries.contains_key(&name) {
             return Err(Fault::SessionExists { name });
         }
         if entries.len() >= self.limit {
             return Err(Fault::Busy { what: "sessions", limit: self.limit });
         }
+        // Counted only if the token has a limit; there are at most some hundred sessions.
         let own = || entries.values().filter(|entry| entry.owner == grant.name).count();
         if let Some(limit) = grant.limits.sessions
             && own() >= limit
@@ -182,6 +184,7 @@ impl SessionRegistry {
         }
         let slot = Arc::new(AsyncMutex::new(SessionSlot::default()));
         let release = Arc::new(Notify::new());
+        // The lock is free, because no other reference to it exists yet.
         let guard = slot.clone().try_lock_owned();
         let guard = guard.map_err(|_| Fault::Internal("a new slot is locked".to_owned()))?;
         let newest = Newest::new();
@@ -195,6 +198,8 @@ impl SessionRegistry {
             parked: None,
         };
         entries.insert(name.clone(), entry);
+        // `remember_closed` takes the two locks in the other order, so that they must not be held
+        // together here.
         drop(entries);
         self.closed.lock().remove(&name);
         Ok(self.guard(name, release, newest, guard))
@@ -239,11 +244,14 @@ impl SessionRegistry {
         last: AnsweredRequest,
         summary: &EpisodeSummary,
     ) {
+        // Held while the entries are looked at: `reserve` removes what is inserted below, as it
+        // comes after.
         let mut closed = self.closed.lock();
         // While the session was closing, its name was free: it may be another session's by now.
         if self.entries.lock().contains_key(&name) {
             return;
         }
+        // Clients can open and close as often as they like, so the map has a bound.
         if closed.len() >= self.limit {
             let oldest = closed.iter().min_by_key(|(_, session)| session.since);
             if let Some(name) = oldest.map(|(name, _)| name.clone()) {
@@ -274,6 +282,7 @@ impl SessionRegistry {
         max_wait: Duration,
     ) -> Result<SlotGuard, Fault> {
         let unknown = || Fault::UnknownSession { field: field.to_owned(), name: name.to_owned() };
+        // The connection that has the session may be within a step, which it finishes first.
         let give_up = Instant::now() + max_wait;
         loop {
             let slot = {
@@ -281,6 +290,8 @@ impl SessionRegistry {
                 // Other clients must not learn that the session exists.
                 let entry = entries.get(name).filter(|entry| entry.owner == owner);
                 let entry = entry.ok_or_else(unknown)?;
+                // Without a holder the permit of `notify_one` would be stored, and would hit the
+                // next one.
                 if entry.parked.is_none() {
                     entry.release.notify_one();
                 }
@@ -291,6 +302,8 @@ impl SessionRegistry {
                 if guard.session.is_none() {
                     return Err(unknown());
                 }
+                // A signal of its own: one that was meant for the old connection must not end this
+                // one.
                 let release = Arc::new(Notify::new());
                 let mut entries = self.entries.lock();
                 let entry = entries.get_mut(name).ok_or_else(unknown)?;
@@ -314,6 +327,7 @@ impl SessionRegistry {
         slot: OwnedMutexGuard<SessionSlot>,
     ) -> SlotGuard {
         let registry = self.clone();
+        // The outcome if the guard is dropped without more being known.
         SlotGuard { registry, name, outcome: Outcome::AgentLost, release, newest, slot }
     }
 
@@ -342,6 +356,7 @@ impl SessionRegistry {
     pub(crate) async fn end_expired(&self) {
         let shortest = Duration::from_millis(10);
         let longest = Duration::from_secs(5);
+        // A session ends at most a quarter of the grace period late. Tests have short ones.
         let period = (self.resume_grace / 4).clamp(shortest, longest);
         loop {
             tokio::time::sleep(period).await;
@@ -375,6 +390,7 @@ impl SessionRegistry {
             let slot = entry.slot.clone();
             Some(Chosen { name: name.clone(), slot, since: parked.since, outcome })
         };
+        // Chosen under the lock and ended without it: closing a session writes to disk, and awaits.
         let chosen: Vec<Chosen> = self.entries.lock().iter().filter_map(choose).collect();
         for Chosen { name, slot, since, outcome } in chosen {
             // A locked slot is being resumed right now.
@@ -386,6 +402,8 @@ impl SessionRegistry {
                 if parked.is_none_or(|parked| parked.since != since) {
                     continue;
                 }
+                // Removed before it is closed, while the slot is locked: a client that resumes it
+                // now finds nothing.
                 entries.remove(&name);
             }
             if let Some(session) = slot.session.take() {
@@ -416,6 +434,8 @@ impl SlotGuard {
 
     /// Updates the part of the session's state that is visible to the rest of the server.
     pub(crate) fn update_view(&self) {
+        // Copied, because others must not wait for the slot, which is locked as long as a step
+        // runs.
         let Some(session) = &self.slot.session else { return };
         let version = &session.resident().version;
         let view = SessionView {
@@ -447,6 +467,8 @@ impl std::ops::DerefMut for SlotGuard {
 
 impl Drop for SlotGuard {
     fn drop(&mut self) {
+        // The slot is unlocked after this function, when its fields are dropped: whichever client
+        // waits for it finds the entry parked or gone.
         let mut entries = self.registry.entries.lock();
         if self.slot.session.is_none() {
             entries.remove(&self.name);
@@ -478,6 +500,7 @@ mod tests {
             registry.remember_closed("a".to_owned(), &grant.name, last, &summary);
         };
         let is_kept = || registry.closed("a", &grant.name).is_some();
+        // Closed, opened again under its name, closed late by the first client, and gone.
         remember();
         assert!(is_kept());
         let open = registry.reserve("a".to_owned(), &grant).unwrap();

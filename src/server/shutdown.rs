@@ -29,6 +29,7 @@ pub struct Running {
 /// Removes uploads that are too old, until dropped.
 async fn remove_old_uploads(state: &ServerState) {
     let Ok(spool) = &state.spool else { return std::future::pending().await };
+    // An upload is at most a quarter of its age too old, or a minute.
     let period = (spool.age() / 4).clamp(Duration::from_millis(10), Duration::from_secs(60));
     loop {
         tokio::time::sleep(period).await;
@@ -52,6 +53,8 @@ async fn renew_leases(state: &ServerState) {
 /// Gives memory that evicted sections and pushes no longer need back to the operating system, until
 /// dropped.
 async fn release_memory(state: &ServerState) {
+    // Each release walks the whole heap, so it is done only if something was freed since the last
+    // one.
     let changes = || (state.engine.residency().evictions, state.pushes.changes());
     let mut before = changes();
     loop {
@@ -80,9 +83,12 @@ impl Running {
     ) -> Self {
         let has_tls = tls.is_some();
         let reloading = reload(tls.clone(), state.clone());
+        // A task of its own, because `stop` waits for it: afterwards no connection is accepted.
         let listening = tokio::spawn(listen(state.clone(), listener, tls));
         let periodic = state.clone();
         tokio::spawn(async move {
+            // One task for all: none of them ends before the server, and each spends its time
+            // waiting.
             tokio::select! {
                 () = periodic.sessions.end_expired() => {}
                 () = remove_old_uploads(&periodic) => {}
@@ -143,10 +149,13 @@ impl Running {
         }
         let ServerState { websocket_permits, limits, sessions, .. } = &*self.state;
         // Each connection holds one permit: all permits are free when all connections have ended.
+        // The signal above reaches every connection: it finishes its request, tells its client, and
+        // ends.
         let all = websocket_permits.acquire_many(limits.connections as u32);
         if timeout(limits.drain, all).await.is_err() {
             tracing::warn!("some clients did not leave within {:?}", limits.drain);
         }
+        // The connections that have ended in time have parked their sessions, which end here.
         sessions.end_all_parked().await;
         if !self.state.engine.wait_for_exports(None, limits.drain).await {
             tracing::warn!(
@@ -172,6 +181,8 @@ pub fn stop_signal() -> std::io::Result<impl Future<Output = ()>> {
     #[cfg(unix)]
     {
         use tokio::signal::unix::{SignalKind, signal};
+        // Registered here and not in the future, so that a signal before the first poll is not
+        // lost.
         let mut terminate = signal(SignalKind::terminate())?;
         let mut interrupt = signal(SignalKind::interrupt())?;
         Ok(async move {

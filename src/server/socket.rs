@@ -88,6 +88,7 @@ impl Socket {
                 self.peer_closed = true;
                 self.flush().await.and(Err(Disconnect::PeerLeft))
             }
+            // The end of the stream, and any error of the network: there is no peer to tell.
             None => Err(Disconnect::PeerLeft),
             Some(Err(error)) => Err(match error {
                 Error::Capacity(CapacityError::MessageTooLong { size, max_size }) => {
@@ -129,9 +130,11 @@ impl Socket {
     /// Sends a message from the caller's memory. tungstenite would copy an observation of megabytes
     /// into its own buffer first. After an error the connection cannot be used.
     async fn send(&mut self, first_byte: u8, payload: &[&[u8]]) -> Result<(), Disconnect> {
+        // After either, a frame would be read as something else, or not at all.
         if self.peer_closed || self.is_within_frame {
             return Err(Disconnect::PeerLeft);
         }
+        // Set before the first byte: if this future is dropped at any point, the mark stays.
         self.is_within_frame = true;
         let send = async {
             // A pong may still be in the library's buffer; it must be sent whole before this frame
@@ -142,6 +145,8 @@ impl Socket {
             let all = std::iter::once(&*header).chain(payload.iter().copied());
             let mut all: Vec<IoSlice<'_>> = all.map(IoSlice::new).collect();
             let mut rest = &mut all[..];
+            // One system call for header and parts, as a rule; a full socket takes a part and
+            // continues.
             while !rest.is_empty() {
                 let written = stream.write_vectored(rest).await?;
                 if written == 0 {
@@ -175,6 +180,8 @@ impl Socket {
                 let _ = self.send(FINAL_CLOSE, &[&payload]).await;
             }
             let mut stream = self.stream.into_inner();
+            // The client reads the end of the stream after the last message, while its own bytes
+            // are still read.
             stream.shutdown().await?;
             let mut discarded = vec![0; 64 << 10];
             while stream.read(&mut discarded).await? > 0 {}
@@ -194,6 +201,7 @@ const FINAL_CLOSE: u8 = 0x88;
 fn frame_header(first_byte: u8, len: usize) -> Vec<u8> {
     let mut header = vec![first_byte];
     match len {
+        // 126 and 127 announce longer lengths. The match arms bound each cast.
         0..=125 => header.push(len as u8),
         126..=0xFFFF => {
             header.push(126);
@@ -215,6 +223,8 @@ mod tests {
     /// observation.
     #[tokio::test]
     async fn no_frame_begins_within_another() {
+        // The pipe holds 64 bytes: the header of 4 bytes and 60 of the payload are sent when the
+        // sender gives up.
         let (mut client, server) = tokio::io::duplex(64);
         let stream = Stream::new(server, Err("a test"));
         let mut socket = Socket::new(stream, Vec::new(), Duration::from_secs(5)).await;
@@ -232,6 +242,7 @@ mod tests {
 
     #[test]
     fn frame_headers_of_every_length() {
+        // Both sides of each border between 7, 16 and 64 bits.
         assert_eq!(frame_header(FINAL_BINARY, 125), [0x82, 125]);
         assert_eq!(frame_header(FINAL_TEXT, 0), [0x81, 0]);
         assert_eq!(frame_header(FINAL_BINARY, 126), [0x82, 126, 0, 126]);

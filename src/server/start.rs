@@ -92,6 +92,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         shared_memory,
         limits,
     } = config;
+    // First, so that a refused configuration makes no directory.
     if tokens.is_none() && !listen.ip().is_loopback() {
         return Err(ServerError::PublicAddress { address: listen });
     }
@@ -120,6 +121,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
     let address = listener.local_addr().map_err(listen_error)?;
 
     // Uploads. Agents can drive without them.
+    // All clients of a server without tokens share one owner, the empty name.
     let uploaders = tokens.as_ref().map_or(1, Tokens::uploaders);
     let own_bytes = tokens.as_ref().map(Tokens::upload_bytes).unwrap_or_default();
     let spool = Spool::open(SpoolMedium::directory(&uploads), limits.spool, uploaders, own_bytes);
@@ -129,6 +131,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         reason
     });
 
+    // A watch and not a notification: a task that asks later sees the value, too.
     let (stop, stopping) = watch::channel(false);
     let state = Arc::new(ServerState {
         metrics: Metrics::new(engine.clone()),

@@ -36,11 +36,14 @@ impl Stream {
     pub(crate) async fn accept(tcp: TcpStream, tls: Option<&Tls>, limit: Duration) -> Option<Self> {
         let Some(tls) = tls else {
             let same_machine = match tcp.peer_addr() {
+                // A loopback address may still be the end of a tunnel; the proof of the shared
+                // memory decides.
                 Ok(peer) if peer.ip().to_canonical().is_loopback() => Ok(()),
                 _ => Err("the client is not connected through the loopback interface"),
             };
             return Some(Self::new(tcp, same_machine));
         };
+        // A client that begins no handshake would hold its slot for ever.
         match timeout(limit, tls.acceptor().accept(tcp)).await {
             Ok(Ok(stream)) => {
                 let reason = "the connection has TLS, and may come through another machine";
@@ -97,6 +100,8 @@ impl AsyncWrite for Stream {
     }
 
     fn is_write_vectored(&self) -> bool {
+        // Passed on, because the default is no, and hyper would then copy the parts of an answer
+        // together.
         self.bytes.is_write_vectored()
     }
 }

@@ -35,6 +35,7 @@ impl Tickets {
 
     fn issue_at(&self, grant: Arc<Grant>, now: Instant) -> Result<String, Fault> {
         let mut entries = self.entries.lock();
+        // All entries are looked at for each ticket: 2,048 at most, and pages ask seldom.
         entries.retain(|_, entry| entry.is_good(now));
         let own = entries.iter().filter(|(_, entry)| entry.grant.name == grant.name);
         let own: Vec<([u8; 32], Instant)> = own.map(|(key, entry)| (*key, entry.issued)).collect();
@@ -43,6 +44,7 @@ impl Tickets {
         {
             entries.remove(oldest);
         }
+        // After the removal above, so that a token with many tickets can always have a new one.
         if entries.len() >= limits::TICKETS {
             return Err(Fault::Busy { what: "unused tickets", limit: limits::TICKETS });
         }
@@ -62,6 +64,7 @@ impl Tickets {
     }
 
     fn redeem_at(&self, ticket: &str, now: Instant) -> Result<Arc<Grant>, Fault> {
+        // Removed before it is checked: a ticket that is too old is used up, too.
         let entry = self.entries.lock().remove(&key(ticket));
         let entry = entry.filter(|entry| entry.is_good(now));
         Ok(entry.ok_or(Fault::UnknownTicket)?.grant)
@@ -116,6 +119,7 @@ mod tests {
     fn unused_tickets_are_bounded_and_forgotten() {
         let tickets = Tickets::default();
         let now = Instant::now();
+        // 2,048 / 32 = 64 tokens fill the table, and one more gets none.
         let grants = grants(limits::TICKETS / limits::TOKEN_TICKETS + 1);
         let (last, others) = grants.split_last().unwrap();
         for grant in others {
@@ -137,6 +141,7 @@ mod tests {
         let grants = grants(2);
         let at = |step: usize| begin + Duration::from_millis(step as u64);
         let others = tickets.issue_at(grants[1].clone(), begin).unwrap();
+        // Two more than a token may have, so that its first two are gone.
         let issued: Vec<String> = (0..limits::TOKEN_TICKETS + 2)
             .map(|step| tickets.issue_at(grants[0].clone(), at(step)).unwrap())
             .collect();

@@ -67,6 +67,7 @@ impl Tls {
     /// be used, the old ones stay.
     pub(crate) fn read_again(&self) {
         match read(&self.files) {
+            // The files are read before the lock is taken, so that no handshake waits for the disk.
             Ok(acceptor) => {
                 *self.acceptor.lock() = acceptor;
                 tracing::info!(cert = %self.files.cert.display(), "read the certificate again");

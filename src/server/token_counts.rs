@@ -49,6 +49,7 @@ impl TokenCounts {
         {
             return Err(Fault::Busy { what, limit });
         }
+        // Tokens without a limit are counted, too: a limit may be added while they run.
         counts.insert(grant.name.clone(), count + 1);
         Ok(Counted { counts: self.clone(), token: grant.name.clone() })
     }
@@ -59,6 +60,7 @@ impl Drop for Counted {
         let mut counts = self.counts.0.lock();
         if let Some(count) = counts.get_mut(&self.token) {
             *count -= 1;
+            // Names of tokens that were removed from the file do not stay.
             if *count == 0 {
                 counts.remove(&self.token);
             }

@@ -35,6 +35,8 @@ impl Newest {
     /// Sends an observation to the watchers, if there are any.
     pub(crate) fn show(&self, observation: &Arc<Observation>) {
         if self.0.receiver_count() > 0 {
+            // Replaced and not queued: a watcher that is slow sees the newest one, and the memory
+            // of one observation is held.
             self.0.send_replace(Some(observation.clone()));
         }
     }
@@ -76,6 +78,7 @@ pub(crate) async fn serve(stopped: impl Future<Output = ()>, mut socket: Socket,
 async fn send_all(socket: &mut Socket, watch: &mut Watch) -> Disconnect {
     let mut next = Instant::now();
     loop {
+        // The wait comes before the look, so that what is sent is the newest at that moment.
         let changed = async {
             sleep_until(next).await;
             watch.receiver.changed().await
@@ -85,6 +88,7 @@ async fn send_all(socket: &mut Socket, watch: &mut Watch) -> Disconnect {
                 if changed.is_err() {
                     return Disconnect::Fault(Fault::SessionEnded);
                 }
+                // Cloned, because a borrow would hold up the session until the watcher has read.
                 let newest = watch.receiver.borrow_and_update().clone();
                 let Some(observation) = newest else { continue };
                 if let Err(reason) = socket.send_binary(&[observation.buffer.bytes()]).await {

@@ -15,6 +15,7 @@ use crate::wire::sensorsim as wire;
 /// A camera of a rig, as `get_available_cameras` lists it.
 pub fn available(camera: &RigCamera) -> wire::AvailableCamera {
     let RigCamera { name, camera: intrinsics, rig_from_camera, shutter, .. } = camera;
+    // A rig has no entry for a global shutter, and AlpaSim has a value for it.
     let shutter_type = match shutter.map(|shutter| shutter.direction) {
         None => wire::ShutterType::Global,
         Some(ShutterDirection::TopToBottom) => wire::ShutterType::RollingTopToBottom,
@@ -48,6 +49,8 @@ fn param(camera: &Camera) -> wire::CameraParam {
             principal_point_y: pinhole.cy,
             focal_length_x: pinhole.fx,
             focal_length_y: pinhole.fy,
+            // A pinhole is OpenCV's model without distortion. The lists have their full lengths, as
+            // those of a lens with distortion.
             radial_coeffs: vec![0.0; 6],
             tangential_coeffs: vec![0.0; 2],
             thin_prism_coeffs: vec![0.0; 4],
@@ -67,9 +70,13 @@ fn param(camera: &Camera) -> wire::CameraParam {
             focal_length_x: pinhole.fx,
             focal_length_y: pinhole.fy,
             radial_coeffs: lens.k().to_vec(),
+            // The field is required: without a given angle, it is the one up to which the
+            // polynomial rises.
             max_angle: lens.max_angle_rad().unwrap_or_else(|| lens.limit_rad()),
         }),
         Lens::FTheta(lens) => {
+            // The fit covers what the lens can see: angles to `end_rad`, which are radii to
+            // `end_px`.
             let end_rad = lens.limit_rad();
             let end_px = lens.radius_px(end_rad);
             let [linear_c, linear_d, linear_e] = lens.linear_cde();
@@ -88,6 +95,7 @@ fn param(camera: &Camera) -> wire::CameraParam {
                 ),
             };
             wire::CameraParam::Ftheta(wire::FthetaCameraParam {
+                // AlpaSim measures from the centre of the first pixel.
                 principal_point_x: pinhole.cx - 0.5,
                 principal_point_y: pinhole.cy - 0.5,
                 reference_poly: reference.into(),
@@ -103,6 +111,8 @@ fn param(camera: &Camera) -> wire::CameraParam {
 fn windshield_to_wire(fields: WindshieldFields) -> wire::ExternalDistortion {
     let WindshieldFields { reference, horizontal, vertical } = fields;
     let model = match reference {
+        // Only the polynomials of the reference direction are sent; those of the other one stay
+        // empty.
         WindshieldReference::Forward => wire::BivariateWindshieldModelParameters {
             reference_poly: wire::ReferencePolynomial::Forward.into(),
             horizontal_poly: horizontal,

@@ -48,12 +48,15 @@ pub fn camera_name(logical_id: &str) -> Option<&str> {
 /// The rig's cameras, then those of a preset with names that the rig does not have.
 pub fn with_preset(own: &[RigCamera], preset: Vec<RigCamera>) -> Vec<RigCamera> {
     let is_free = |camera: &RigCamera| own.iter().all(|other| other.name != camera.name);
+    // The own cameras come first, so that a client that takes the first of a name gets the
+    // calibrated one.
     own.iter().cloned().chain(preset.into_iter().filter(is_free)).collect()
 }
 
 /// The quality of a JPEG: the request's percentage, or the default for 0.
 pub fn jpeg_quality(image_quality: f32) -> u8 {
     match image_quality {
+        // From 1 to 100 after `min`, which fits a u8. NaN and negative values take the other arm.
         quality if quality >= 1.0 => quality.round().min(100.0) as u8,
         _ => limits::JPEG_QUALITY,
     }
@@ -89,7 +92,7 @@ mod tests {
         }
     }
 
-    /// The polynomial that the reference does not give is its inverse to a tenth of a pixel.
+    /// The polynomial that the reference does not give is its inverse to 0.3 pixels.
     #[test]
     fn fitted_polynomials_invert_the_reference() {
         for camera in Rig::preset("alpamayo2").unwrap().cameras {
@@ -100,8 +103,11 @@ mod tests {
                 panic!("{}", camera.name);
             };
             let at = |polynomial: &[f64], x: f64| {
+                // Horner's scheme; the coefficients are in order of their powers.
                 polynomial.iter().rev().fold(0.0, |sum, coefficient| sum * x + coefficient)
             };
+            // From an angle to a radius and back to an angle: the error is taken in pixels, as it
+            // would be seen in an image.
             for step in 1..=100 {
                 let angle_rad = lens.limit_rad() * f64::from(step) / 100.0;
                 let px = at(&sent.angle_to_pixeldist_poly, angle_rad);
@@ -124,6 +130,8 @@ mod tests {
         assert!(refused(&|spec| spec.camera_param = None, [8, 8]).contains("camera_param"));
         assert!(refused(&|_| (), [0, 8]).contains("width is 0"));
         assert!(refused(&|spec| spec.resolution_h = 0, [8, 8]).contains("height is 0"));
+        // Seven coefficients of 1, where the lens has powers 0 to 5. A seventh of 0 would be
+        // accepted.
         let many = |spec: &mut wire::CameraSpec| {
             if let Some(wire::CameraParam::Ftheta(lens)) = &mut spec.camera_param {
                 lens.angle_to_pixeldist_poly = vec![1.0; 7];

@@ -18,6 +18,8 @@ pub fn camera(
     size_px: [u32; 2],
 ) -> Result<Camera, CameraSpecError> {
     let spec = spec.ok_or_else(|| field("camera_intrinsics", "is missing"))?;
+    // The intrinsics are those of the native size. A request may ask for another one, to which the
+    // camera is scaled afterwards.
     let native_px = [spec.resolution_w, spec.resolution_h];
     let mut intrinsics = match &spec.camera_param {
         None => return Err(field("camera_intrinsics.camera_param", "is missing")),
@@ -28,10 +30,12 @@ pub fn camera(
     intrinsics.size_px = native_px;
     intrinsics.windshield = spec.external_distortion.as_ref().map(windshield).transpose()?;
     let camera = intrinsics.camera()?;
+    // Before scaling, so that an error names the numbers that the client sent.
     camera.check()?;
     if size_px == native_px {
         return Ok(camera);
     }
+    // A size of 0 is refused here, with the name of the side.
     let [width_px, height_px] = size_px.map(u64::from);
     Ok(camera.scaled(width_px, height_px)?)
 }
@@ -44,6 +48,7 @@ pub fn camera(
 pub fn view(request: &wire::RgbRenderRequest, frame: &LocalFrame) -> Result<View, CameraSpecError> {
     let size_px = [request.resolution_w, request.resolution_h];
     let camera = camera(request.camera_intrinsics.as_ref(), size_px)?;
+    // The times themselves are not needed: the poses at both ends are in the request.
     if request.frame_start_us > request.frame_end_us {
         let must =
             format!("{} is after frame_end_us {}", request.frame_start_us, request.frame_end_us);
@@ -52,6 +57,7 @@ pub fn view(request: &wire::RgbRenderRequest, frame: &LocalFrame) -> Result<View
     let pair = request.sensor_pose.ok_or(SceneError::Missing { field: "sensor_pose" })?;
     let end = frame.world_from("sensor_pose.end_pose", pair.end_pose.as_ref())?;
     let shutter = request.camera_intrinsics.as_ref().map(wire::CameraSpec::shutter_type);
+    // A global shutter has one pose. The pose at the start is not read, and may be missing.
     let Some(direction) = shutter.and_then(direction) else {
         return Ok(View::new(camera, end));
     };
@@ -69,6 +75,7 @@ fn ftheta(lens: &wire::FthetaCameraParam) -> Result<Intrinsics, CameraSpecError>
     let reference = match lens.reference_poly() {
         wire::PolynomialType::PixeldistToAngle => FThetaReference::PixelToAngle,
         wire::PolynomialType::AngleToPixeldist => FThetaReference::AngleToPixel,
+        // A client that does not say which polynomial is exact has sent at least one of them.
         wire::PolynomialType::Unknown if lens.angle_to_pixeldist_poly.is_empty() => {
             FThetaReference::PixelToAngle
         }
@@ -96,6 +103,7 @@ fn ftheta(lens: &wire::FthetaCameraParam) -> Result<Intrinsics, CameraSpecError>
     Ok(Intrinsics {
         size_px: [0, 0],
         focal_px: [None, None],
+        // From the centre of the first pixel to its corner.
         center_px: [lens.principal_point_x + 0.5, lens.principal_point_y + 0.5],
         lens: Some(lens_fields),
         windshield: None,
@@ -119,6 +127,7 @@ fn opencv(lens: &wire::OpenCvPinholeCameraParam) -> Result<Intrinsics, CameraSpe
 
 fn fisheye(lens: &wire::OpenCvFisheyeCameraParam) -> Result<Intrinsics, CameraSpecError> {
     let k = padded("opencv_fisheye_param.radial_coeffs", &lens.radial_coeffs)?;
+    // 0 is what protobuf has for a field that was not sent.
     let max_angle = Some(lens.max_angle).filter(|&angle| angle != 0.0);
     Ok(Intrinsics {
         size_px: [0, 0],
@@ -163,6 +172,8 @@ fn padded<const N: usize>(
     name: &'static str,
     coefficients: &[f64],
 ) -> Result<[f64; N], CameraSpecError> {
+    // Zeros beyond the model's length change nothing, so they are accepted. NaN is not 0, and is
+    // refused.
     let beyond = coefficients.iter().skip(N).any(|&c| c != 0.0);
     if beyond {
         let must = format!("has {} coefficients; at most {N} are accepted", coefficients.len());

@@ -131,11 +131,14 @@ pub async fn drive_episode(settings: &EpisodeSettings) -> Result<EpisodeReport, 
 
     let options = ConnectOptions::with_token(settings.token.clone());
     let mut client = Client::connect_with(&settings.server, "wildcity-egodriver", &options).await?;
+    // The drive is needed before the session opens, for its start and its speed.
     let drive = recorded_drive(settings, &client, &options).await?;
     let opened = client.open(open(settings, &drive)).await?;
     let first = client.reset(settings.seed, None).await?;
     let mut episode = Episode::new(settings, &opened, drive)?;
 
+    // Both sessions are closed whatever the result is: otherwise the server would wait for the next
+    // request until it times out.
     let driven = episode.drive(&mut client, &mut driver, first).await;
     let closed = client.close().await?;
     // The driver may be gone; the report then has this error.
@@ -158,6 +161,7 @@ pub async fn drive_episode(settings: &EpisodeSettings) -> Result<EpisodeReport, 
 /// The outcome of an episode in which the driver answered to the end.
 fn driven_outcome(closed: message::Outcome) -> Outcome {
     match closed {
+        // What remains is completed from the driver's side: the driver answered to the end.
         message::Outcome::DrivingFailure => Outcome::DrivingFailure,
         message::Outcome::OffModel => Outcome::OffModel,
         _ => Outcome::Completed,
@@ -183,6 +187,7 @@ async fn recorded_drive(
     let open = &settings.open;
     let twin = client.welcome().twins.iter().find(|twin| twin.name == open.twin);
     let first = twin.and_then(|twin| twin.trajectories.first()).map(|drive| drive.name.clone());
+    // The route follows the drive on which the episode starts. A start at a free pose names none.
     let started = match &open.start {
         Some(Start::Station { trajectory, .. }) => Some(trajectory.clone()),
         Some(Start::Random { random }) => random.trajectory.clone(),
@@ -194,6 +199,7 @@ async fn recorded_drive(
     let http = HttpClient::new(&http_address(&settings.server), options)?;
     let section = DriveSection { name, from_m: None, to_m: None, every_m: None };
     let drive = http.trajectory(&open.twin, open.version, &section).await?;
+    // From here on a drive has two poses or more, so that `poses[0]` and a segment exist.
     let count = drive.poses.len();
     if count < 2 {
         let text = format!("trajectory {:?} has {count} poses; a route needs two", drive.name);
@@ -205,6 +211,7 @@ async fn recorded_drive(
 /// `http://HOST:PORT` of `ws://HOST:PORT/v1/session`.
 fn http_address(server: &str) -> String {
     let address = server.trim_end_matches("/v1/session");
+    // The `s` of `wss` stays, so that it becomes `https`.
     address.replacen("ws", "http", 1)
 }
 
@@ -212,6 +219,8 @@ fn open(settings: &EpisodeSettings, drive: &Drive) -> Open {
     let start_m = settings.start_m;
     let start =
         start_m.map(|station_m| Start::Station { trajectory: drive.name.clone(), station_m });
+    // A size without names of cameras has no camera to belong to; the images then have the size of
+    // the rig.
     let images = settings.size_px.iter().flat_map(|size| {
         let names = settings.cameras.iter().flatten();
         names.map(|name| {
@@ -233,6 +242,7 @@ fn open(settings: &EpisodeSettings, drive: &Drive) -> Open {
             frames: Some(u64::from(settings.frames)),
             ..Outputs::default()
         },
+        // Trajectories need a vehicle that follows them, so there are dynamics in any case.
         dynamics: Some(given.dynamics.unwrap_or_else(dynamics)),
         ..given.clone()
     }
@@ -246,6 +256,7 @@ fn recorded_speed_m_s(drive: &Drive, settings: &EpisodeSettings) -> f64 {
         None => at.time_us >= first_us + settings.open.warm_up_us.unwrap_or_default(),
     };
     let after = drive.poses.iter().position(is_after).unwrap_or(0);
+    // The pose before it must exist: a start at the first pose takes the first segment.
     let after = after.clamp(1, drive.poses.len() - 1);
     let [from, to] = [&drive.poses[after - 1], &drive.poses[after]];
     (to.station_m - from.station_m) / (1e-6 * (to.time_us - from.time_us) as f64)
@@ -304,6 +315,8 @@ impl<'a> Episode<'a> {
         Ok(Self {
             settings,
             cameras: cameras.collect::<Result<_, _>>()?,
+            // Rounded to whole metres, which f32 holds exactly: poses lose nothing on the way to
+            // the driver.
             frame: LocalFrame { origin_m: start.position_m.round() },
             route: Route::new(points),
             dt_us: opened.dt_us,
@@ -318,6 +331,7 @@ impl<'a> Episode<'a> {
         driver: &mut Driver,
         first: Observation,
     ) -> Result<(), StepError> {
+        // The driver learns of the cameras and of the history before the first image.
         let available_cameras = self.cameras.iter().map(available).collect();
         let vehicle = Some(wire::VehicleDefinition { available_cameras });
         let start = wire::DriveSessionRequest {
@@ -329,6 +343,8 @@ impl<'a> Episode<'a> {
         let (history, states) = self.history(&first)?;
         driver.submit_egomotion(history, states).await?;
 
+        // In each turn `seen` is the newest observation, of which the driver has nothing yet. The
+        // history of the first one was sent above.
         let mut seen = first;
         for step in 1..=self.settings.steps {
             self.hashes.update(seen.metadata().frame_hash.as_bytes());
@@ -339,11 +355,13 @@ impl<'a> Episode<'a> {
             }
             let here = ego_pose(&seen)?;
             let now_us = driver_us(seen.metadata().time_us);
+            // A scenario has a route of its own, which counts more than the recorded drive.
             let waypoints = match &seen.metadata().route {
                 Some(route) => waypoints(&route.points),
                 None => self.route.ahead(&here),
             };
             driver.submit_route(wire::Route { waypoints, timestamp_us: now_us }).await?;
+            // The query time is the end of the step: up to there the plan must reach.
             let plan = driver.drive(now_us, now_us + self.dt_us.unsigned_abs()).await?;
             let planned =
                 trajectory(plan.trajectory.as_ref(), &self.frame, &here, now_us, self.dt_us)?;
@@ -354,6 +372,7 @@ impl<'a> Episode<'a> {
                 break;
             }
         }
+        // The last observation is hashed, too, though no driver sees it.
         self.hashes.update(seen.metadata().frame_hash.as_bytes());
         Ok(())
     }
@@ -365,6 +384,8 @@ impl<'a> Episode<'a> {
         seen: &Observation,
     ) -> Result<(), DriverError> {
         for camera in &self.cameras {
+            // An observation repeats the frames of the ones before it, by the number that `frames`
+            // asks for.
             for image in seen.frames(&camera.name) {
                 let end_us = image.metadata().shutter_end_us;
                 if self.sent_us.get(&camera.name).is_some_and(|&sent_us| end_us <= sent_us) {
@@ -392,18 +413,25 @@ impl<'a> Episode<'a> {
             .zip(rotations.chunks_exact(9))
             .map(|(xyz, rows)| {
                 let entries: [f64; 9] = std::array::from_fn(|k| f64::from(rows[k]));
+                // The tensor has rows, and glam takes columns.
                 let matrix = DMat3::from_cols_array(&entries).transpose();
                 let position_m = DVec3::from_array(std::array::from_fn(|k| f64::from(xyz[k])));
                 here * Pose { position_m, rotation: DQuat::from_mat3(&matrix).normalize() }
             })
             .collect();
+        // The tensor has a fixed length. Poses before the start of the episode are filled in, and
+        // are no motion, so they are left out.
         let driven = (seen.metadata().ego.history_count as usize).clamp(1, past.len());
         let past = &past[past.len() - driven..];
         let seconds = 1e-6 * HISTORY_US as f64;
         let mut poses = Vec::new();
         let mut states = Vec::new();
+        // `back` counts the periods from the present: driven - 1 for the oldest pose, and 1 for the
+        // last pair. The present pose follows below with the ego's own speed.
         for (back, pair) in (1..driven).rev().zip(past.windows(2)) {
             let velocity = (pair[1].position_m - pair[0].position_m) / seconds;
+            // The rotation from one pose to the next in the axes of the earlier one: its axis times
+            // its angle, over the time between them, is the angular velocity in rad/s.
             let turned = (pair[0].rotation.inverse() * pair[1].rotation).to_scaled_axis() / seconds;
             poses.push(self.at_time(now_us - back as i64 * HISTORY_US, &pair[0]));
             states.push(state(&pair[0], velocity, turned, DVec3::ZERO));
@@ -423,6 +451,7 @@ impl<'a> Episode<'a> {
         let ego = &seen.metadata().ego;
         let velocity = DVec3::from_array(ego.velocity);
         let acceleration = DVec3::from_array(ego.acceleration);
+        // The car turns about its own vertical axis only.
         let states = vec![state(&here, velocity, ego.yaw_rate * DVec3::Z, acceleration)];
         let poses = vec![self.at_time(seen.metadata().time_us, &here)];
         Ok((Trajectory { poses }, states))
@@ -445,6 +474,7 @@ fn state(
         angular_velocity: Some(vec3(angular_rad_s)),
         linear_velocity: Some(vec3(rig_from_world * velocity)),
         linear_acceleration: Some(vec3(rig_from_world * acceleration)),
+        // The simulation does not compute it.
         angular_acceleration: Some(Vec3::default()),
     }
 }
@@ -456,6 +486,7 @@ fn vec3(v: DVec3) -> Vec3 {
 fn camera_image(image: ImageView<'_>) -> Result<wire::CameraImage, DriverError> {
     let metadata = image.metadata();
     let image_bytes = image.encoded().to_vec();
+    // The driver would refuse the message with a status that does not name the size.
     if image_bytes.len() > limits::DRIVER_IMAGE_BYTES {
         let camera = metadata.camera.clone();
         return Err(DriverError::Image { camera, bytes: image_bytes.len() });

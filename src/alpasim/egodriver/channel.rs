@@ -39,6 +39,7 @@ impl Channel {
 
     async fn try_connect(address: &str) -> Result<Self, String> {
         let stream = TcpStream::connect(address).await.map_err(|error| error.to_string())?;
+        // Calls and answers alternate, so that Nagle's algorithm would delay each of them.
         stream.set_nodelay(true).map_err(|error| error.to_string())?;
         let handshake = http2::handshake(TokioExecutor::new(), TokioIo::new(stream)).await;
         let (sender, connection) = handshake.map_err(|error| error.to_string())?;

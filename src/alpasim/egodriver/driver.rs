@@ -69,6 +69,8 @@ impl Driver {
     ) -> Result<Self, DriverError> {
         let no_address = |_| DriverError::Address(address.to_owned());
         let origin: Uri = format!("http://{address}").parse().map_err(no_address)?;
+        // The wait for the first connection is longer than that for an answer: the network is
+        // loaded then.
         let channel = Channel::connect(address, limits::DRIVER_START).await;
         let channel =
             channel.map_err(|reason| DriverError::Lost(format!("{address}: {reason}")))?;
@@ -145,6 +147,7 @@ impl Driver {
         Answer: prost::Message + Default + Send + Sync + 'static,
     {
         let path = format!("/egodriver.EgodriverService/{method}");
+        // The names of methods are literals of this file, so that this fails only by a defect.
         let path = PathAndQuery::try_from(path).map_err(|error| DriverError::Refused {
             method,
             code: "INTERNAL".to_owned(),
@@ -162,6 +165,7 @@ impl Driver {
             answer.map(tonic::Response::into_inner).map_err(|status| driver_error(method, &status))
         };
         let seconds = max_wait.as_secs_f64();
+        // The limit includes the wait until the connection takes a request.
         timeout(max_wait, calling).await.unwrap_or(Err(DriverError::TimedOut { method, seconds }))
     }
 }
@@ -169,6 +173,8 @@ impl Driver {
 fn driver_error(method: &'static str, status: &Status) -> DriverError {
     let text = status.message().to_owned();
     match status.code() {
+        // Lost and refused are different outcomes of an episode: only the second one is the
+        // driver's choice.
         Code::Unavailable => DriverError::Lost(text),
         // hyper's errors have no status of the driver.
         Code::Unknown | Code::Cancelled if text.contains("connection") => DriverError::Lost(text),

@@ -22,6 +22,7 @@ pub(super) fn trajectory(
 ) -> Result<Vec<TimedPose>, DriverError> {
     let poses = plan.map(|plan| plan.poses.as_slice()).unwrap_or_default();
     let rig_from_world = world_from_rig.inverse();
+    // Invariant: all planned times are in (now_us, last_us] and rise.
     let mut last_us = now_us;
     let mut planned = Vec::new();
     for at in poses.iter().filter(|at| at.timestamp_us > now_us) {
@@ -33,15 +34,18 @@ pub(super) fn trajectory(
         let pose = frame.world_from("pose", at.pose.as_ref());
         let pose = pose.map_err(|error| DriverError::Plan(format!("at {last_us} us: {error}")))?;
         let in_rig = rig_from_world * pose;
+        // Not negative, because the filter keeps later poses only.
         let time_us = i64::try_from(last_us - now_us).unwrap_or(i64::MAX);
         let pose = WirePose { xyz: in_rig.position_m.to_array(), q: in_rig.q_wxyz() };
         planned.push(TimedPose { time_us, pose });
+        // What is beyond is not driven before the next plan. It is not checked either.
         if planned.len() == limits::PLAN_POSES {
             break;
         }
     }
     match planned.last() {
         None => Err(DriverError::Plan(format!("has no pose after {now_us} us"))),
+        // Extrapolation would be a plan that the driver did not make.
         Some(last) if last.time_us < dt_us => {
             let text = format!("ends {} us from now, within the step of {dt_us} us", last.time_us);
             Err(DriverError::Plan(text))
@@ -60,6 +64,7 @@ mod tests {
 
     fn plan(times_us: &[u64]) -> Trajectory {
         let at = |&timestamp_us: &u64| {
+            // 10 m/s along x: 1e-5 m for each microsecond.
             let position_m = FRAME.origin_m + 1e-5 * timestamp_us as f64 * DVec3::X;
             let pose = FRAME.local_from(&Pose { position_m, ..Pose::IDENTITY });
             PoseAtTime { pose: Some(pose), timestamp_us }
@@ -69,6 +74,8 @@ mod tests {
 
     #[test]
     fn plans_begin_after_now_and_reach_beyond_the_step() {
+        // The ego is where the plan is at 100 ms, at 1 m. The next pose, at 200 ms, is 1 m ahead of
+        // it.
         let here = Pose { position_m: FRAME.origin_m + DVec3::X, ..Pose::IDENTITY };
         let read = |times_us: &[u64]| {
             let plan = plan(times_us);
@@ -78,6 +85,7 @@ mod tests {
         let times_us: Vec<i64> = planned.iter().map(|at| at.time_us).collect();
         assert_eq!(times_us, [100_000, 200_000]);
         assert!((planned[0].pose.xyz[0] - 1.0).abs() < 1e-6);
+        // None, only the present one, one within the step, falling times, and equal times.
         for times_us in [&[][..], &[100_000], &[150_000], &[300_000, 200_000], &[200_000, 200_000]]
         {
             assert!(read(times_us).is_err(), "{times_us:?}");

@@ -34,14 +34,18 @@ impl Route {
     /// route.
     pub(super) fn ahead(&mut self, world_from_rig: &Pose) -> Vec<Vec3> {
         let ego = world_from_rig.position_m.truncate();
+        // The search continues from the place of the call before, so that the ego stays on its
+        // branch where a drive crosses itself.
         let at_m = self.nearest_m(ego);
         self.at_m = Some(at_m);
         let forward = (world_from_rig.rotation * DVec3::X).truncate().normalize_or(DVec2::X);
         let left = forward.perp();
+        // 20 points have 19 gaps of 4.21 m.
         let spacing_m = AHEAD_M / (WAYPOINTS - 1) as f64;
         let stations_m = (0..WAYPOINTS).map(|k| at_m + k as f64 * spacing_m);
         stations_m
             .map(|station_m| {
+                // From the world to the rig in the plane: x is along `forward`, and y along `left`.
                 let offset = self.at(station_m) - ego;
                 let [x, y] = [offset.dot(forward) as f32, offset.dot(left) as f32];
                 Vec3 { x, y, z: 0.0 }
@@ -58,6 +62,8 @@ impl Route {
             .filter(|(_, stations_m)| is_near(stations_m[0]))
             .map(|(points, stations_m)| {
                 let along = points[1] - points[0];
+                // The foot of the perpendicular, as a share of the segment, and clamped to its
+                // ends. A segment of length 0 gives its first point.
                 let t = ((ego - points[0]).dot(along) / along.length_squared().max(1e-12))
                     .clamp(0.0, 1.0);
                 let distance_m = (points[0] + t * along).distance(ego);
@@ -70,6 +76,9 @@ impl Route {
     /// The point at a station; straight on beyond the ends.
     fn at(&self, station_m: f64) -> DVec2 {
         let last = self.points.len() - 1;
+        // The segment [after - 1, after] holds the station. The clamp takes the first or the last
+        // segment for stations outside, which the line below then extends. A drive has two points
+        // or more.
         let after = self.stations_m.partition_point(|&s_m| s_m < station_m).clamp(1, last);
         let [from, to] = [self.points[after - 1], self.points[after]];
         let length_m = self.stations_m[after] - self.stations_m[after - 1];
@@ -82,6 +91,7 @@ impl Route {
 pub(super) fn waypoints(points: &[[f64; 3]]) -> Vec<Vec3> {
     let mut ahead: Vec<DVec2> = points.iter().map(|&[x, y, _]| DVec2::new(x, y)).collect();
     let direction = match ahead.as_slice() {
+        // Fewer than two points have no direction: straight ahead of the ego.
         [.., before, last] => (*last - *before).normalize_or(DVec2::X),
         _ => DVec2::X,
     };
@@ -99,6 +109,8 @@ mod tests {
 
     #[test]
     fn a_route_that_ends_goes_straight_on() {
+        // Two points to the left of the ego: the last of 20 is 19 gaps, 80 m, beyond the first at y
+        // = 1.
         let spacing_m = 80.0 / 19.0;
         let ahead = waypoints(&[[0.0, 1.0, 2.0], [0.0, 1.0 + spacing_m, 2.0]]);
         assert_eq!(ahead.len(), 20);
@@ -110,6 +122,8 @@ mod tests {
     #[test]
     fn the_route_is_ahead_of_the_ego_and_goes_straight_on() {
         let mut route = Route::new((0..=10).map(|k| (f64::from(k), [f64::from(k), 0.0, 5.0])));
+        // A drive of 10 m along x. The ego is beside its station 4, 1 m to the left, and looks
+        // along y.
         let yaw = std::f64::consts::FRAC_PI_2;
         let pose = Pose {
             position_m: DVec3::new(4.0, 1.0, 5.0),

@@ -27,10 +27,14 @@ pub fn on_ground(ground: &Ground<'_>, world_from_box: &Pose, height_m: f64) -> (
 }
 
 fn placed(ground: &Ground<'_>, world_from_box: &Pose, height_m: f64) -> Option<Pose> {
+    // The ground is searched from the lower face: a bridge and the street below it are
+    // distinguished by height.
     let bottom = raised(world_from_box, -0.5 * height_m);
     let on_plane = ground.find(bottom)?;
     // The middle is half the height away from the ground's plane, along its normal, which is not
     // vertical.
+    // With p the middle, g a point of the plane, n its normal and h the height, n (p - g) = h / 2.
+    // Solved for the z of p: g.z + (h / 2 - n.x (p - g).x - n.y (p - g).y) / n.z.
     let up = on_plane.rotation * DVec3::Z;
     let aside_m = world_from_box.position_m - on_plane.position_m;
     let rise_m = (0.5 * height_m - aside_m.x * up.x - aside_m.y * up.y) / up.z;
@@ -42,6 +46,7 @@ fn refused(from: &Pose, to: &Pose) -> Option<Status> {
     if (to.position_m.z - from.position_m.z).abs() > limits::PHYSICS_TRANSLATION_M {
         return Some(Status::HighTranslation);
     }
+    // The heading is kept, so that the tilt is the whole rotation.
     let [up_from, up_to] = [from, to].map(|pose| pose.rotation * DVec3::Z);
     let is_turned = up_from.angle_between(up_to) > limits::PHYSICS_ROTATION_RAD;
     is_turned.then_some(Status::HighRotation)
@@ -75,6 +80,8 @@ mod tests {
     fn a_box_stands_on_the_slope_with_its_heading_and_place() {
         let drives = uphill();
         let ground = Ground::from_drives(&drives);
+        // Along the drive, and turned from it; on the ground, above and below it by less than 1.5
+        // m. The slope of 0.1 at x = 20 m is 2 m high.
         for (yaw_rad, above_m) in [(0.0, 0.0), (0.3, 0.9), (2.5, -0.4)] {
             let level =
                 at(20.0, 2.0, 2.0 + 0.5 * HEIGHT_M + above_m, DQuat::from_rotation_z(yaw_rad));
@@ -89,6 +96,7 @@ mod tests {
             assert!((up - DVec3::new(-0.1, 0.0, 1.0).normalize()).length() < 1e-9, "{up}");
             let forward = there.rotation * DVec3::X;
             let turned = forward.truncate().angle_to(glam::DVec2::from_angle(yaw_rad));
+            // A tilt of 0.1 changes a heading in the plane by up to 0.1^2 / 4 = 0.0025 rad.
             assert!(turned.abs() < 0.01, "{forward}");
             let (again, _) = on_ground(&ground, &there, HEIGHT_M);
             assert!((again.position_m - there.position_m).length() < 1e-9);
@@ -100,6 +108,8 @@ mod tests {
         let drives = uphill();
         let ground = Ground::from_drives(&drives);
         let flat = DQuat::IDENTITY;
+        // 1.6 m are more than the 1.5 m that a box may move, and 0.2 rad sideways with 0.1 uphill
+        // are 0.22, more than 0.17. 80 m aside there is no ground.
         let high = at(20.0, 0.0, 2.0 + 0.5 * HEIGHT_M + 1.6, flat);
         let low = at(20.0, 0.0, 2.0 + 0.5 * HEIGHT_M - 1.6, flat);
         let tilted = at(20.0, 0.0, 2.0 + 0.5 * HEIGHT_M, DQuat::from_rotation_x(0.2));

@@ -65,12 +65,14 @@ fn answer(
     frame: &LocalFrame,
     asked: &wire::GroundIntersectionRequest,
 ) -> Result<wire::GroundIntersectionReturn, SensorsimError> {
+    // The work is boxes times keyframes, so it is bounded before it begins.
     let boxes = asked.other_objects.len() + asked.ego_data.as_ref().map_or(0, ego_boxes);
     let most = limits::PHYSICS_BOXES;
     if boxes > most {
         let text = format!("{boxes} poses; at most {most} are accepted");
         return Err(SensorsimError::Invalid(text));
     }
+    // One ground for all boxes of the request.
     let ground = Ground::from_drives(drives);
     let placed = |field, pose: Option<&WirePose>, height_m: f64| {
         let world: Pose = frame.world_from(field, pose)?;
@@ -81,6 +83,8 @@ fn answer(
     let mut answer = wire::GroundIntersectionReturn::default();
     if let Some(ego) = &asked.ego_data {
         let height_m = height_m("ego_data.aabb", ego.aabb)?;
+        // A request has one form of the ego or the other, by the version of the client. Each is
+        // answered in its own field.
         if let Some(pair) = &ego.pose_pair {
             let field = "ego_data.pose_pair.future_pose";
             answer.ego_pose = Some(placed(field, pair.future_pose.as_ref(), height_m)?);
@@ -118,6 +122,7 @@ fn height_m(field: &str, size: Option<Aabb>) -> Result<f64, SensorsimError> {
     let most_m = wildcity_scene::ActorBox::MOST_M as f32;
     let sizes = [("size_x", size_x), ("size_y", size_y), ("size_z", size_z)];
     for (name, value) in sizes {
+        // NaN is in no range, and so is refused as well.
         let accepted = (0.0..=most_m).contains(&value);
         if !accepted {
             let text = format!("{field}.{name} is {value:?}; a box has from 0 to {most_m:?} m");
@@ -164,6 +169,7 @@ mod tests {
             pose: Some(wire_pose(4.0, z_m)),
             timestamp_us,
         };
+        // The second pose is 6.5 m too high, so it is returned as it came.
         let trajectory = common::Trajectory { poses: vec![at(2.0, 8), at(9.0, 9)] };
         let asked = wire::GroundIntersectionRequest {
             ego_data: Some(wire::EgoData {

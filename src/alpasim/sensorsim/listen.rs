@@ -61,6 +61,7 @@ pub async fn start(
     listen: SocketAddr,
     open: bool,
 ) -> Result<Running, AlpasimError> {
+    // Before the socket is bound, so that a refused address is never open, not even for a moment.
     if !open && !listen.ip().is_loopback() {
         return Err(AlpasimError::PublicAddress { address: listen });
     }
@@ -72,6 +73,8 @@ pub async fn start(
     let permits = Arc::new(Semaphore::new(limits::CONNECTIONS));
     let free = permits.clone();
     let listening = tokio::spawn(async move {
+        // All three run until the first ends, which is the stop: the other two never return. The
+        // listener is closed as `accept` is dropped.
         tokio::select! {
             () = accept(sensorsim.clone(), listener, free, stopping.clone()) => {}
             () = sensorsim.forget_idle() => {}
@@ -125,6 +128,8 @@ async fn accept(
         let sensorsim = sensorsim.clone();
         let stopping = stopping.clone();
         tokio::spawn(async move {
+            // A closure for each connection, and a clone for each request: requests of one
+            // connection run at once.
             let service = service_fn(move |request| {
                 let sensorsim = sensorsim.clone();
                 async move { Ok::<_, Infallible>(call(sensorsim, request).await) }
@@ -148,6 +153,8 @@ async fn accept(
                     let _ = tokio::time::timeout(limits::DRAIN, connection).await;
                 }
             }
+            // The permit ends with the connection, and not with the last request: `stop` waits for
+            // it.
             drop(permit);
         });
     }
@@ -158,6 +165,7 @@ async fn call(
     sensorsim: Arc<Sensorsim>,
     request: http::Request<hyper::body::Incoming>,
 ) -> http::Response<tonic::body::Body> {
+    // HTTP/2 names a method by `/package.Service/method`.
     let path = request.uri().path().to_owned();
     if let Some(method) = path.strip_prefix(PHYSICS) {
         return call_physics(&sensorsim, method, &path, request).await;

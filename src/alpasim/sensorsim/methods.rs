@@ -39,6 +39,8 @@ impl Sensorsim {
     /// Frees the memory of scenes that are no longer drawn, until dropped.
     pub(super) async fn forget_idle(&self) {
         loop {
+            // A tenth of the idle time, so that memory is freed 10 to 11 minutes after the last
+            // image.
             tokio::time::sleep(Duration::from_secs(60)).await;
             self.open.forget_idle().await;
             self.assets.forget_idle();
@@ -75,6 +77,7 @@ impl Sensorsim {
                 }
             }
         }
+        // A scene that is not listed is as valid, so that the list may be cut.
         scene_ids.truncate(limits::LISTED_SCENES);
         scene_ids.push("*".to_owned());
         Ok(common::AvailableScenesReturn { scene_ids })
@@ -124,6 +127,7 @@ impl Sensorsim {
         for twin in &listed.twins {
             let opened = self.engine.open_version(twin.name.clone(), Some(twin.number)).await;
             let resident = opened.map_err(SensorsimError::from)?;
+            // The cameras of a preset have no overlay.
             let Some(rig) = &resident.version.manifest.rig else { continue };
             let has_overlay = |camera: &&RigCamera| camera.appearance.overlay.is_some();
             ego_mask_metadata.extend(rig.cameras.iter().filter(has_overlay).map(|camera| {
@@ -142,6 +146,7 @@ impl Sensorsim {
         &self,
         asked: wire::RgbRenderRequest,
     ) -> Result<wire::RgbRenderReturn, Status> {
+        // As a batch of one, so that both methods have the same rules.
         let mut images = self.images(&[&asked]).await?;
         let image = images.pop().ok_or_else(|| Status::internal("no image"))?;
         Ok(image?)
@@ -154,6 +159,7 @@ impl Sensorsim {
         &self,
         asked: wire::BatchRgbRenderRequest,
     ) -> Result<wire::BatchRgbRenderReturn, Status> {
+        // An item without its request is malformed, and with it the batch.
         let requests: Option<Vec<_>> =
             asked.items.iter().map(|item| item.request.as_ref()).collect();
         let requests =
@@ -171,6 +177,8 @@ impl Sensorsim {
                 },
                 Err(error) => {
                     let status = error.status();
+                    // The runtime retries a whole request by its status, which an item does not
+                    // have.
                     if status.code() != tonic::Code::InvalidArgument {
                         return Err(status);
                     }
@@ -191,6 +199,7 @@ impl Sensorsim {
         &self,
         asked: wire::AggregatedRenderRequest,
     ) -> Result<wire::AggregatedRenderReturn, Status> {
+        // Images without the lidar that belongs to them would look like a complete answer.
         if !asked.lidar_requests.is_empty() {
             return self.render_lidar().map(|_| wire::AggregatedRenderReturn::default());
         }

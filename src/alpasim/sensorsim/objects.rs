@@ -46,6 +46,7 @@ impl Object {
         let field = "dynamic_objects.pose_pair";
         let pair = object.pose_pair.ok_or(SceneError::Missing { field })?;
         let end = frame.world_from("dynamic_objects.pose_pair.end_pose", pair.end_pose.as_ref())?;
+        // Without a pose at the start the object is at rest during the exposure.
         let start = match &pair.start_pose {
             Some(start) => frame.world_from("dynamic_objects.pose_pair.start_pose", Some(start))?,
             None => end,
@@ -69,14 +70,17 @@ impl ObjectAssets {
         engine: &Arc<Engine>,
         objects: &[Object],
     ) -> Result<Vec<StillActor>, SensorsimError> {
+        // Without objects no thread is needed.
         if objects.is_empty() {
             return Ok(Vec::new());
         }
         let shapes: Vec<ObjectShape> = objects.iter().map(|object| object.shape.clone()).collect();
         let (own, engine) = (self.clone(), engine.clone());
+        // Assets may be read from disk or made, neither of which an async thread must do.
         let read = tokio::task::spawn_blocking(move || own.assets(&engine, &shapes));
         let assets = read.await.map_err(|_| SessionError::Crashed)??;
         let placed = objects.iter().zip(assets).map(|(object, asset)| {
+            // The size of the asset, and not that of the id: an id with a name has none.
             let size = asset.asset().description.box_;
             StillActor {
                 world_from_actor: actor_of_centre(&object.world_from_centre, &size),
@@ -128,6 +132,7 @@ impl ObjectAssets {
         if let Some(box_asset) = made {
             return self.load(key, || engine.hold_actor(key, box_asset.clone()));
         }
+        // From the name, or the first characters of a hash, to the hash, which is the key.
         let hash = engine.catalog().find_actor(key).map_err(SessionError::from)?.hash;
         match self.known(&hash) {
             Some(asset) => Ok(asset),
@@ -150,6 +155,7 @@ impl ObjectAssets {
         load: impl Fn() -> Result<Arc<ResidentActor>, SessionError>,
     ) -> Result<Arc<ResidentActor>, SensorsimError> {
         let asset = match load() {
+            // A count of 1 is the map's own reference. A request in progress holds another one.
             Err(SessionError::Residency(ResidencyError::NoRoomForActor { .. })) => {
                 self.0.lock().retain(|_, (asset, _)| Arc::strong_count(asset) > 1);
                 load()?
@@ -157,6 +163,8 @@ impl ObjectAssets {
             loaded => loaded?,
         };
         let mut known = self.0.lock();
+        // The oldest leaves. 384 entries are searched in microseconds, so no list in order of use
+        // is kept.
         if !known.contains_key(key) && known.len() >= limits::OBJECT_ASSETS {
             let oldest = known.iter().min_by_key(|(_, (_, drawn))| *drawn);
             let oldest = oldest.map(|(key, _)| key.clone());
@@ -184,6 +192,7 @@ mod tests {
         let shape = ObjectShape::from_track("7@4x2x1").unwrap();
         let asset = shape.box_asset().unwrap().unwrap();
         let dir = tempfile::tempdir().unwrap();
+        // The memory holds two assets, so that the third one needs the room of another.
         let cache = Cache::limited(Catalog::open(dir.path()).unwrap(), Some(2 * asset.bytes()));
         let assets = ObjectAssets::default();
         let load = |key: &str| assets.load(key, || Ok(cache.hold_actor(key, asset.clone())?));

@@ -49,12 +49,14 @@ impl OpenVersions {
             let oldest = oldest.map(|(key, _)| key.clone());
             oldest.and_then(|key| open.remove(&key));
         }
+        // Taken out, so that its reservation can be dropped before the larger one is made.
         let known = open.remove(&key);
         let enough = match &known {
             Some(version) => version.stills.covers(views).await?,
             None => false,
         };
         let mut scenes = known.as_ref().map(|version| version.scenes.clone()).unwrap_or_default();
+        // The scenes of the version outlive a change of its reservation.
         scenes.insert(scene.to_owned(), Instant::now());
         let stills = match known {
             Some(version) if enough => version.stills,
@@ -77,6 +79,7 @@ impl OpenVersions {
     /// Logs, once per scene, that objects are drawn as grey boxes.
     pub(super) fn warn_of_unknown_objects(&self, scene: &str) {
         let mut warned = self.warned.lock();
+        // Clients choose the starts of scenes freely, so the set has a bound.
         if warned.len() < limits::LISTED_SCENES && warned.insert(scene.to_owned()) {
             tracing::warn!(scene, "dynamic objects without an @ in their track_id are grey boxes");
         }
@@ -87,6 +90,7 @@ impl OpenVersions {
     pub(super) async fn forget_idle(&self) {
         let mut open = self.versions.lock().await;
         open.retain(|_, version| {
+            // The reservation belongs to the version, and goes with the last of its scenes.
             version.scenes.retain(|_, drawn| drawn.elapsed() < limits::SCENE_IDLE);
             !version.scenes.is_empty()
         });

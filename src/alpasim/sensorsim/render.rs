@@ -62,6 +62,7 @@ impl OpenScene {
                 return Err(SensorsimError::Invalid(must));
             }
         };
+        // The overlay is scaled to the size of the image, which the view has.
         let appearance = self.appearance(request, &view.camera)?;
         Ok(Still { view, appearance, encoding })
     }
@@ -70,6 +71,7 @@ impl OpenScene {
     fn objects(&self, request: &wire::RgbRenderRequest) -> Result<Vec<Object>, SensorsimError> {
         let objects = &request.dynamic_objects;
         let most = PlacedChunk::MAX_ACTORS;
+        // The same bound as a session's, because a frame numbers its actors up to it.
         if objects.len() > most {
             let text = format!("{} dynamic_objects; at most {most} are accepted", objects.len());
             return Err(SensorsimError::Invalid(text));
@@ -83,6 +85,7 @@ impl OpenScene {
         request: &wire::RgbRenderRequest,
         camera: &Camera,
     ) -> Result<Appearance, SensorsimError> {
+        // The mask may be that of another camera than the one that the image is of.
         let logical_id = match (&request.ego_mask_id, &request.camera_intrinsics) {
             (Some(mask), _) if request.insert_ego_mask => mask.camera_logical_id.as_str(),
             (_, Some(spec)) => spec.logical_id.as_str(),
@@ -91,6 +94,8 @@ impl OpenScene {
         let own = camera_name(logical_id)
             .and_then(|name| self.cameras().into_iter().find(|camera| camera.name == name));
         let Some(own) = own else { return Ok(Appearance::default()) };
+        // The exposure applies without the overlay, too. Without one to scale, no size can be
+        // refused.
         if !request.insert_ego_mask || own.appearance.overlay.is_none() {
             return Ok(Appearance { overlay: None, ..own.appearance });
         }
@@ -131,6 +136,7 @@ impl Renderer<'_> {
     /// with the same objects are rendered together.
     pub(super) async fn images(self, requests: &[&wire::RgbRenderRequest]) -> Vec<Image> {
         let mut images: Vec<Option<Image>> = requests.iter().map(|_| None).collect();
+        // A vector keeps the order of the requests; a request has one scene, or a few.
         let mut by_scene: Vec<(&str, Vec<usize>)> = Vec::new();
         for (index, request) in requests.iter().enumerate() {
             match by_scene.iter_mut().find(|(scene, _)| *scene == request.scene_id) {
@@ -156,6 +162,7 @@ impl Renderer<'_> {
         let mut images: Vec<Option<Image>> = requests.iter().map(|_| None).collect();
         let mut groups: Vec<Group> = Vec::new();
         for (index, request) in requests.iter().enumerate() {
+            // An invalid request fills its own place, and the others are rendered.
             let read = opened.still(request).and_then(|still| {
                 let objects = opened.objects(request)?;
                 Ok((still, objects))
@@ -163,6 +170,8 @@ impl Renderer<'_> {
             match read {
                 Err(error) => images[index] = Some(Err(error)),
                 Ok((still, objects)) => {
+                    // A frame draws its actors at one pose each, so that images with other objects
+                    // or other poses are other frames. The images of one rig have the same.
                     let group = match groups.iter().position(|group| group.objects == objects) {
                         Some(group) => group,
                         None => {
@@ -178,6 +187,7 @@ impl Renderer<'_> {
         if groups.iter().any(|group| group.objects.iter().any(Object::is_unknown)) {
             self.open.warn_of_unknown_objects(scene);
         }
+        // Each index is in one group, so that afterwards every place has its image or its error.
         for Group { objects, indices, stills } in groups {
             let encodings: Vec<Encoding> = stills.iter().map(|still| still.encoding).collect();
             let answers: Vec<Image> = match self.render(&opened, scene, &objects, stills).await {
@@ -228,6 +238,7 @@ fn repeated(error: &SensorsimError, count: usize) -> impl Iterator<Item = Image>
 
 /// [3, height, width] from [height, width, 3].
 fn planar(rgb8: &[u8]) -> Vec<u8> {
+    // All of red, then all of green, then all of blue.
     (0..3).flat_map(|channel| rgb8.iter().skip(channel).step_by(3).copied()).collect()
 }
 

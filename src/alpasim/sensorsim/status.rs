@@ -47,6 +47,7 @@ impl From<SceneError> for SensorsimError {
             SceneError::Id { .. } | SceneError::Trajectory { .. } | SceneError::Start { .. } => {
                 Self::UnknownScene(error.to_string())
             }
+            // The scene exists, but a pose within the request is at fault.
             SceneError::Pose { .. } | SceneError::Missing { .. } => Self::Camera(error.into()),
         }
     }
@@ -60,6 +61,7 @@ impl SensorsimError {
             Self::UnknownScene(_) => Status::not_found(text),
             Self::Invalid(_) | Self::Camera(_) | Self::Object(_) => Status::invalid_argument(text),
             Self::Stopping => Status::unavailable(text),
+            // Unlike `unavailable`, this is not worth another try.
             Self::Unimplemented(what) => Status::unimplemented(*what),
             Self::Session(error) => session_status(error, text),
             Self::Repeated(status) => status.clone(),
@@ -68,6 +70,7 @@ impl SensorsimError {
         if text.len() <= limits::STATUS_BYTES {
             return status;
         }
+        // Clients bound the size of headers: a longer one would lose the whole answer.
         let end = text.floor_char_boundary(limits::STATUS_BYTES);
         Status::new(status.code(), &text[..end])
     }
@@ -80,6 +83,7 @@ impl From<SensorsimError> for Status {
 }
 
 fn session_status(error: &SessionError, text: String) -> Status {
+    // The runtime retries by this text, word for word.
     let late = || Status::deadline_exceeded(format!("Stopped waiting for backend: {text}"));
     match error {
         SessionError::Twin(
@@ -94,6 +98,7 @@ fn session_status(error: &SessionError, text: String) -> Status {
         }
         SessionError::Busy { .. } => Status::unavailable(text),
         SessionError::DeadlineExceeded
+        // Too little memory now may be enough later, when other scenes are idle.
         | SessionError::Residency(
             ResidencyError::NoRoom { .. }
             | ResidencyError::NoRoomForActor { .. }
@@ -103,6 +108,7 @@ fn session_status(error: &SessionError, text: String) -> Status {
         SessionError::AnswerTooLarge { .. } | SessionError::OutOfRange { .. } => {
             Status::invalid_argument(text)
         }
+        // What remains is no fault of the request: retrying it does not help.
         _ => Status::internal(text),
     }
 }
@@ -133,6 +139,7 @@ mod tests {
             limit_bytes: 1,
         };
         let too_large =
+            // Any numbers: only the kind of an error decides on its status.
             ResidencyError::TooLarge { twin: twin.clone(), needed_bytes: 2, limit_bytes: 1 };
         let timed_out = ResidencyError::TimedOut {
             twin: twin.clone(),

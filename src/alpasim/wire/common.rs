@@ -2,6 +2,10 @@
 
 #![allow(missing_docs, reason = "the fields are AlpaSim's, and are explained there")]
 
+// Every message field is an `Option`: a sender may leave it out, and the reader names what it
+// misses.
+// A tag that is not here is a field that this project does not read; prost skips it.
+
 #[derive(Clone, Copy, PartialEq, prost::Message)]
 pub struct Empty {}
 

@@ -5,6 +5,8 @@
 use super::common::{Trajectory, Vec3};
 use super::sensorsim::AvailableCamera;
 
+// The tags have gaps: drivers also get fields that wildcity does not have, and read them as absent.
+
 /// State of the ego in the axes of its rig: m/s, rad/s, m/s².
 #[derive(Clone, Copy, PartialEq, prost::Message)]
 pub struct DynamicState {

@@ -8,6 +8,7 @@
 
 use super::common::{Aabb, Pose, Trajectory};
 
+// Success is 0, which is also what a status that was not sent reads as.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, prost::Enumeration)]
 #[repr(i32)]
 pub enum Status {

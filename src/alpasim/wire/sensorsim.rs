@@ -4,6 +4,8 @@
 
 use super::common::{Pose, Trajectory};
 
+// An enumeration is an i32 in its message: a number that is not listed reads as the first entry, 0.
+
 #[derive(Clone, Copy, Debug, PartialEq, Eq, prost::Enumeration)]
 #[repr(i32)]
 pub enum ShutterType {
@@ -118,6 +120,7 @@ pub struct BivariateWindshieldModelParameters {
     pub vertical_poly_inverse: Vec<f64>,
 }
 
+// The tags of a oneof share the numbers of the message that contains it, `CameraSpec`.
 #[derive(Clone, PartialEq, prost::Oneof)]
 pub enum CameraParam {
     #[prost(message, tag = "2")]

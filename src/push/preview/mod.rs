@@ -31,10 +31,13 @@ pub(crate) fn comparison(
     report: &PushReport,
     base: Option<&Arc<Version>>,
 ) -> Result<Option<ProposedChange>, PushError> {
+    // Both sides are in memory at once at full detail, so the larger one decides.
     let replaced: u64 = report.cells.iter().map(|change| change.before).sum();
     let most = limits::PREVIEW_GAUSSIANS;
     let fits = (gaussians.len() as u64).max(replaced) <= most;
     let is_wanted = request.preview_poses.is_some() || request.min_psnr_db.is_some();
+    // A comparison that was asked for must not be left out in silence. Without a wish it is left
+    // out.
     if is_wanted && !fits {
         let must = format!(
             "set, for {} Gaussians in place of {replaced}; at most {most} are compared",
@@ -43,9 +46,12 @@ pub(crate) fn comparison(
         return Err(PushError::OutOfRange { field: "golden".to_owned(), must });
     }
     let Some(base) = base else { return Ok(None) };
+    // The scenes of both sides are rendered with one SH degree, which only a push of all cells may
+    // change.
     if !fits || base.manifest.sh_degree != gaussians.sh_degree {
         return Ok(None);
     }
+    // The profile belongs to the change: a push that sets only the profile changes images, too.
     let cells: BTreeSet<[i32; 2]> = report.cells.iter().map(|change| change.cell).collect();
     let profile = profile_with(base.manifest.profile, &request.profile);
     Ok(Some(ProposedChange {
@@ -61,6 +67,7 @@ fn within(gaussians: &Arc<Gaussians>, cells: &BTreeSet<[i32; 2]>, left_out: u64)
     if left_out == 0 {
         return gaussians.clone();
     }
+    // What lies in other cells is not committed, so that it must not be drawn either.
     let is_within = |&index: &usize| cells.contains(&cell_at(&gaussians.means_m[index]));
     Arc::new(gaussians.select((0..gaussians.len()).filter(is_within)))
 }
@@ -74,11 +81,13 @@ pub(crate) fn check_psnr(
     base: Option<&Version>,
 ) -> Result<(), PushError> {
     let Some(min_db) = request.min_psnr_db else { return Ok(()) };
+    // No image is no proof: the push is refused and not let through.
     if report.preview.is_empty() {
         let why = reason_for_no_preview(request, gaussians, base);
         let must = format!("{min_db}, but nothing can be compared: {why}");
         return Err(PushError::OutOfRange { field: "golden.min_psnr_db".to_owned(), must });
     }
+    // Equal images have an infinite PSNR, which passes every bound.
     let worst = report.preview.iter().find(|pose| pose.psnr_db < min_db);
     if let Some(PsnrPreview { world_from_rig, psnr_db }) = worst {
         let [x, y, z] = world_from_rig.position_m.to_array();
@@ -96,6 +105,7 @@ fn reason_for_no_preview(
     gaussians: &Gaussians,
     base: Option<&Version>,
 ) -> String {
+    // From the most general reason to the most special one; the first that holds is the remedy.
     let Some(Version { manifest, .. }) = base else {
         return "there is no version before it: leave it out".to_owned();
     };

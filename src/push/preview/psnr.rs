@@ -60,7 +60,10 @@ pub(crate) async fn preview_psnr(
 ) -> Result<Vec<PsnrPreview>, PushError> {
     let poses = poses.unwrap_or_else(|| preview_poses(&change));
     let manifest = &change.before.manifest;
+    // Sessions draw a twin without a rig with the same preset.
     let rig = manifest.rig.clone().or_else(|| Rig::preset(wildcity_session::limits::RIG));
+    // One camera that cannot be scaled leaves no preview: an image of the other cameras would have
+    // another PSNR.
     let cameras: Option<Vec<RigCamera>> =
         rig.iter().flat_map(|rig| rig.cameras.iter().map(scaled_down)).collect();
     let cameras = cameras.unwrap_or_default();
@@ -69,6 +72,8 @@ pub(crate) async fn preview_psnr(
     }
 
     let resident = engine.open_version(manifest.twin.clone(), Some(change.before.number)).await?;
+    // A profile says how exact the sky's map is. Baking takes long, so it is done before a frame is
+    // queued.
     for profile in [manifest.profile, change.profile] {
         Engine::bake_sky(resident.clone(), profile).await?;
     }
@@ -83,6 +88,8 @@ pub(crate) async fn preview_psnr(
         sky: resident.sky().cloned(),
         loaded: BTreeMap::new(),
     };
+    // Poses are rendered one after the other, so that no more than one small frame of a push waits
+    // in the queue beside those of the agents.
     let mut previews = Vec::new();
     let total = poses.len() as u64;
     for (done, world_from_rig) in (0..).zip(poses) {
@@ -100,6 +107,7 @@ pub(crate) async fn preview_psnr(
         let before =
             render_small(engine, before, manifest.profile, views.clone(), deadline).await?;
         let after = render_small(engine, after, change.profile, views, deadline).await?;
+        // Two images of nothing but sky are equal and would say that the change is harmless.
         if before.sees_any || after.sees_any {
             let psnr_db = psnr_db_u8(before.rgb8.iter().zip(&after.rgb8));
             previews.push(PsnrPreview { world_from_rig, psnr_db });
@@ -124,11 +132,13 @@ async fn render_small(
     views: Vec<View>,
     deadline: Instant,
 ) -> Result<SmallImages, PushError> {
+    // The queue divides the renderer by pixels, and all pushes count as one session.
     let pixels = views.iter().map(|view| view.camera.pixels() as u64).sum();
     let cost = FrameCost { session: PUSHES, pixels };
     let rendered = engine.run(cost, deadline, move |_, backend| {
         let pixels = || views.iter().map(|view| view.camera.pixels());
         let mut images: Vec<_> = pixels().map(|pixels| vec![0; 3 * pixels]).collect();
+        // The opacity is the only output that distinguishes a Gaussian from the sky behind it.
         let mut opacities: Vec<_> = pixels().map(|pixels| vec![0.0; pixels]).collect();
         let mut targets: Vec<_> = images
             .iter_mut()
@@ -171,6 +181,7 @@ struct SceneReader {
 impl SceneReader {
     /// Both scenes, as far as they are seen from some viewpoints.
     fn scenes(&mut self, viewpoints: &[Viewpoint]) -> Result<BothScenes, StoreError> {
+        // Both scenes share the chunks of `kept` by reference, so the second one costs no memory.
         let kept = self.kept(viewpoints)?;
         let old = self.replaced_in_full_detail()?;
         let with = |cells: &Scene| Scene { sky: self.sky.clone(), ..merged(kept.clone(), cells) };
@@ -191,6 +202,8 @@ impl SceneReader {
         for (chunk, entry) in self.version.manifest.chunks.iter().enumerate() {
             if self.replaced.contains(&entry.cell) {
                 let all = (0..).zip(&entry.sections);
+                // Coarser sections have the same Gaussians merged; with both, a block would be
+                // drawn twice.
                 let full_detail = all.filter(|(_, section)| section.is_full_detail());
                 sections.extend(full_detail.map(|(section, _)| SectionRef { chunk, section }));
             }
@@ -204,6 +217,8 @@ impl SceneReader {
         let mut scene = Scene::default();
         for section in sections {
             let chunk = &manifest.chunks[section.chunk];
+            // Neighbouring poses see mostly the same sections. The map grows to what all poses of
+            // one preview see, and is dropped with it.
             let read = match self.loaded.get(&section) {
                 Some(known) => known.clone(),
                 None => {
@@ -222,6 +237,8 @@ impl SceneReader {
 /// The chunks of both scenes, in order of their cells.
 fn merged(mut kept: Scene, new: &Scene) -> Scene {
     kept.chunks.extend(new.chunks.iter().cloned());
+    // Gaussians of equal depth are drawn in the order of the scene, so both scenes need the order
+    // that a stored version has.
     kept.chunks.sort_by_key(|chunk| {
         let [x, y] = chunk.cell();
         [y, x]
@@ -245,11 +262,13 @@ fn preview_poses(change: &ProposedChange) -> Vec<Pose> {
 
 /// The camera with the same field of view and at most `PREVIEW_SIDE_PX` per side.
 fn scaled_down(camera: &RigCamera) -> Option<RigCamera> {
+    // One factor for both sides keeps the field of view and the aspect ratio.
     let Camera { width_px, height_px, .. } = camera.camera;
     let scale = f64::from(limits::PREVIEW_SIDE_PX) / f64::from(width_px.max(height_px));
     if scale >= 1.0 {
         return Some(camera.clone());
     }
+    // A very wide camera would round to a height of 0.
     let side = |px: u32| (f64::from(px) * scale).round().max(1.0) as u64;
     let camera_scaled = camera.camera.scaled(side(width_px), side(height_px)).ok()?;
     Some(RigCamera { camera: camera_scaled, ..camera.clone() })

@@ -34,11 +34,14 @@ struct Entry {
 /// The part of a message of serde that quotes nothing of the file, where a token may stand in the
 /// wrong place.
 fn hint(message: &str) -> Option<String> {
+    // From the end, because a quoted text may contain the same words.
     let (message, _position) = message.rsplit_once(" at line ")?;
     if message.starts_with("missing field ") || message.starts_with("duplicate field ") {
         // These name fields of the structs above.
         return Some(message.to_owned());
     }
+    // The part before the last `, expected ` may quote a token. The part after it has only names of
+    // fields and types.
     let (_quoted, expected) = message.rsplit_once(", expected ")?;
     Some(format!("expected {expected}"))
 }
@@ -82,6 +85,8 @@ impl Tokens {
         if file.tokens.is_empty() {
             return Err(wrong("tokens".to_owned(), "there is none: no client could connect"));
         }
+        // Names are compared with all earlier ones: quadratic, but a file of 1 MiB has a few
+        // thousand.
         let mut tokens: Vec<Token> = Vec::with_capacity(file.tokens.len());
         for (index, entry) in file.tokens.into_iter().enumerate() {
             let Entry { name, role, token, hash, twins, limits } = entry;
@@ -106,6 +111,7 @@ impl Tokens {
             })?;
             let secret = match (token, hash) {
                 (Some(token), None) if token.len() >= MIN_TOKEN_BYTES => {
+                    // Only the hash is kept, so that a copy of the server's memory has no token.
                     Secret::OfToken(blake3::hash(token.as_bytes()))
                 }
                 (Some(_), None) => {
@@ -135,6 +141,7 @@ mod tests {
     /// A reader of the documentation must replace the token in the example.
     #[test]
     fn the_examples_of_the_documentation_are_no_tokens() {
+        // An example that worked would be a token that everyone knows.
         let page = include_str!("../../../docs/operators.md");
         let examples: Vec<&str> = page.split("```json\n{\"tokens\"").skip(1).collect();
         assert_eq!(examples.len(), 2);
@@ -158,6 +165,7 @@ mod tests {
             )
         };
         assert!(Tokens::parse(with_name(255).as_bytes()).is_ok());
+        // One byte more than a name may have.
         let long_name = with_name(256);
         for (text, location) in [
             (r#"{"tokens": []}"#, "tokens"),

@@ -45,6 +45,8 @@ pub(crate) struct TokenLimits {
 impl Grant {
     /// The grant of every client of a server without tokens.
     pub(crate) fn everything() -> Arc<Self> {
+        // Without tokens the server listens on a loopback address only, so each client is an
+        // administrator.
         let limits = TokenLimits::default();
         Arc::new(Self { name: String::new(), role: Role::Admin, twins: None, limits })
     }
@@ -58,6 +60,7 @@ impl Grant {
         if self.role.includes(role) {
             return Ok(());
         }
+        // The message names both roles: the one there is, and the one to ask the operator for.
         let needs = role.name();
         let reason = format!("its role is {}, not {needs}", self.role.name());
         Err(Fault::Forbidden { field: "authorization", reason })
@@ -108,12 +111,15 @@ impl Grant {
 
     /// Whether the token may use the twin. Lists of twins leave out those that it may not use.
     pub(crate) fn allows_twin(&self, twin: &str) -> bool {
+        // No list allows all twins, and an empty list allows none.
         self.twins.as_ref().is_none_or(|twins| twins.contains(twin))
     }
 }
 
 impl Role {
     fn includes(self, role: Self) -> bool {
+        // `Metrics` is included by `Admin` alone: a monitor needs no scene, and a driver needs no
+        // numbers of others.
         self == role || self == Self::Admin || (self == Self::Push && role == Self::Drive)
     }
 

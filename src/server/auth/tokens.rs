@@ -61,6 +61,8 @@ impl Tokens {
     /// [`Fault::Unauthorized`]: there is no token, or it is unknown.
     pub(crate) fn grant(&self, authorization: Option<&[u8]>) -> Result<Arc<Grant>, Fault> {
         let token = authorization.and_then(bearer).ok_or(Fault::Unauthorized)?;
+        // Both hashes are computed for every request, whichever kind the file has, so that the time
+        // says nothing about the file.
         let of_token = blake3::hash(token);
         let of_sha256 = blake3::hash(&Sha256::digest(token));
         // Compare with all tokens even after a match: the time must not depend on which token
@@ -111,6 +113,7 @@ impl Secret {
         let hash = Hash::from_hex(hex).ok()?;
         match algorithm {
             "blake3" => Some(Self::OfToken(hash)),
+            // Hashed once more, so that both kinds are compared by BLAKE3's type, in constant time.
             "sha-256" => Some(Self::OfSha256(blake3::hash(hash.as_bytes()))),
             _ => None,
         }
@@ -119,6 +122,8 @@ impl Secret {
 
 /// The token of `Bearer TOKEN` (RFC 6750, section 2.1; the scheme is case-insensitive).
 fn bearer(authorization: &[u8]) -> Option<&[u8]> {
+    // Bytes and not text: a header may have any bytes, and a token that is not UTF-8 is only
+    // unknown.
     let (scheme, token) = authorization.split_at_checked("Bearer ".len())?;
     scheme.eq_ignore_ascii_case(b"Bearer ").then(|| token.trim_ascii())
 }
@@ -166,6 +171,7 @@ mod tests {
         let tokens = CurrentTokens::new(Tokens::read(&path).unwrap());
         let knows =
             |token: &str| tokens.get().grant(Some(format!("Bearer {token}").as_bytes())).is_ok();
+        // Writing the file changes nothing until it is read again.
         write("second-second-second");
         assert!(knows("first-first-first") && !knows("second-second-second"));
         assert_eq!(tokens.read_again().unwrap(), Some(path.clone()));

@@ -47,6 +47,7 @@ pub(crate) async fn serve(
     is_forwarded: bool,
 ) {
     let hello_deadline = Instant::now() + state.limits.hello;
+    // Behind a proxy of this machine every client seems to be local.
     let same_machine = if is_forwarded {
         Err("the connection comes through a proxy")
     } else {
@@ -101,6 +102,8 @@ impl Connection {
         loop {
             let handled = match self.next_request(inbox).await {
                 Ok(text) => self.answer(inbox, &text).instrument(trace::request()).await,
+                // A binary frame, for example: it has no number, so its refusal has none either,
+                // and the next message can be read.
                 Err(Disconnect::Fault(fault)) if !fault.is_fatal() => {
                     self.refuse(&mut inbox.socket, None, &fault).await
                 }
@@ -114,6 +117,8 @@ impl Connection {
 
     /// Carries out one request and sends its answer.
     async fn answer(&mut self, inbox: &mut Inbox, text: &str) -> Result<(), Disconnect> {
+        // The request always runs to its end, even if the client leaves meanwhile: a step is
+        // carried out whole or not at all.
         let handled = inbox.during(self.handle(text)).await;
         let send = tracing::debug_span!("send");
         match handled {
@@ -127,9 +132,13 @@ impl Connection {
     async fn next_request(&mut self, inbox: &mut Inbox) -> Result<String, Disconnect> {
         let idle = self.state.limits.idle;
         let awaited = if self.hello_done { "request" } else { "hello" };
+        // Time before `hello` is not extended by pings, or a client without a request could stay
+        // for ever.
         let mut deadline =
             if self.hello_done { Instant::now() + idle } else { self.hello_deadline };
         loop {
+            // Any of the sessions may be taken over, which ends this connection for all of them.
+            // Without sessions this never completes.
             let released = async {
                 if self.slots.is_empty() {
                     return pending().await;
@@ -140,6 +149,7 @@ impl Connection {
             let fault = tokio::select! {
                 incoming = inbox.next() => match incoming? {
                     Incoming::Text(text) => return Ok(text),
+                    // A client that computes for long sends pings to stay.
                     Incoming::Alive => {
                         if self.hello_done {
                             deadline = Instant::now() + idle;
@@ -157,6 +167,8 @@ impl Connection {
 
     /// Carries out one request, or returns the stored answer of a repeated one.
     async fn handle(&mut self, text: &str) -> Result<Answer, Refusal> {
+        // Most requests have some hundred bytes, for which a change of threads costs more than
+        // parsing.
         let parsed = if text.len() <= limits::INLINE_REQUEST_BYTES {
             convert::parse(text)
         } else {
@@ -169,6 +181,7 @@ impl Connection {
             Parsed::Unnumbered(fault) => return Err(Refusal { seq: None, fault }),
         };
 
+        // From here on every refusal has the number, so that the client can match it.
         let refusal = |fault| Refusal { seq: Some(seq), fault };
         // A repeated request gets the stored answer.
         if let Some(last) = &self.last
@@ -184,6 +197,7 @@ impl Connection {
         for slot in &mut self.slots {
             slot.answered_seq = seq;
         }
+        // The number is used up before the command is looked at: a refusal is an answer, too.
         let command = command.map_err(refusal)?;
         trace::note(seq, session.as_deref(), &command);
         // `resume` itself sets the numbers: they continue those of the session.
@@ -198,6 +212,8 @@ impl Connection {
                 slot.answered_seq = seq;
             }
         }
+        // Last, because this may fail for want of memory: the answer is stored by then, and can be
+        // asked for again.
         self.delivered(seq, answer).await.map_err(refusal)
     }
 
@@ -205,9 +221,12 @@ impl Connection {
     /// last answer: all those between them were refused, and can be used again.
     fn check_order(&self, seq: u64) -> Result<(), Fault> {
         let expected = match (&self.last, self.answered_seq) {
+            // `first` is after the last request that was carried out, and `next` after the last one
+            // answered. Both exist as soon as one request was answered.
             (None, None) if seq == 0 => return Ok(()),
             (None, None) => "the first request of a connection is 0".to_owned(),
             (last, answered) => {
+                // u64::MAX is never exceeded, but a client may send it.
                 let first = last.as_ref().map_or(0, |last| last.seq.saturating_add(1));
                 let next = answered.map_or(first, |answered| answered.saturating_add(1));
                 if (first..=next).contains(&seq) {
@@ -235,6 +254,7 @@ impl Connection {
     ) -> Result<Answer, Fault> {
         match command {
             Command::Hello { client } => self.hello(seq, client).await,
+            // Before all other commands, so that none of them has to ask.
             _ if !self.hello_done => Err(Fault::WrongOrder("the first request is hello")),
             Command::ShareMemory { proof: None } => self.offer_memory(seq),
             Command::ShareMemory { proof: Some(proof) } => self.open_memory(seq, &proof),
@@ -254,6 +274,8 @@ impl Connection {
             }
             Command::StepMany { steps } => self.step_many(seq, steps).await,
             Command::Step { movement, options } => {
+                // The session is looked up again by index for each use, because a reference would
+                // borrow all of `self`.
                 let slot = self.slot(named)?;
                 let metrics = &self.state.metrics;
                 let session = self.slots[slot].session.as_mut().ok_or(NO_SESSION)?;
@@ -288,6 +310,8 @@ impl Connection {
             Command::SwitchVersion { version } => {
                 let slot = self.slot(named)?;
                 let max_wait = self.state.limits.step;
+                // A version may have to be read from a slow store; the session stays on its own if
+                // that takes too long.
                 let switched = timeout(max_wait, self.session(slot)?.switch_version(version)).await;
                 switched.map_err(|_| SessionError::DeadlineExceeded)??;
                 self.state.metrics.versions_switched.inc();
@@ -297,6 +321,7 @@ impl Connection {
             }
             Command::Close => {
                 let slot = self.slot(named)?;
+                // The name is free before the record is complete, which may take a while.
                 let session = self.slots[slot].session.take().ok_or(NO_SESSION)?;
                 // Dropping the slot frees the name.
                 drop(self.slots.remove(slot));
@@ -319,6 +344,7 @@ impl Connection {
         }
         let engine = &self.state.engine;
         let mut twins = engine.twins().await?.twins;
+        // A client must not learn the names of twins that it may not use.
         twins.retain(|twin| self.grant.allows_twin(&twin.name));
         let text = convert::welcome(seq, &self.state.limits, engine, &twins)?;
         tracing::debug!(client, "hello");
@@ -330,6 +356,7 @@ impl Connection {
     fn slot(&self, named: Option<&str>) -> Result<usize, Fault> {
         match (named, &self.slots[..]) {
             (_, []) => Err(NO_SESSION),
+            // A client with one session need not name it.
             (None, [_]) => Ok(0),
             (None, _) => Err(Fault::InvalidRequest {
                 field: Some("session".to_owned()),
@@ -354,6 +381,7 @@ impl Connection {
 
     fn observation(&mut self, seq: u64, slot: usize, frame: Observation) -> Result<Answer, Fault> {
         let frame = Arc::new(convert::observation(seq, self.session(slot)?, frame)?);
+        // The view first: a push that commits now loads what this session sees next.
         self.slots[slot].update_view();
         self.slots[slot].show(&frame);
         Ok(Answer::Observation(frame))
@@ -383,6 +411,8 @@ impl Connection {
     /// Parks the session, sends the reason to the client if that is possible, and closes the
     /// socket.
     async fn end(mut self, mut socket: Socket, reason: Disconnect) {
+        // The outcome of each episode, unless the client resumes its session within the grace
+        // period.
         let outcome = match &reason {
             Disconnect::PeerLeft | Disconnect::Fault(Fault::Replaced) => Outcome::AgentLost,
             Disconnect::SendTimedOut | Disconnect::Fault(Fault::TimedOut(_)) => {

@@ -11,6 +11,7 @@ use crate::limits;
 use crate::sessions::{Answer, SlotGuard};
 
 fn new_session_name() -> String {
+    // Version 7 begins with the time, so that names sort by age, and so do the files of episodes.
     format!("s-{}", uuid::Uuid::now_v7().as_simple())
 }
 
@@ -38,8 +39,11 @@ impl Connection {
         drive: Option<DriveRequest>,
     ) -> Result<Answer, Fault> {
         opening.profile = opening.profile.or(&self.state.profile);
+        // Before the reservation, so that a refused request takes no slot.
         self.grant.require_twin(&opening.twin)?;
         let name = name.unwrap_or_else(new_session_name);
+        // The name is taken before the session is opened, which takes seconds: two requests must
+        // not open one name. If opening fails, dropping the slot frees the name.
         let slot = self.state.sessions.reserve(name.clone(), &self.grant)?;
         let opened = Session::open(self.state.engine.clone(), name, opening);
         self.fill(seq, slot, drive, opened).await
@@ -63,6 +67,8 @@ impl Connection {
                 self.fill(seq, slot, None, Session::branch(engine, name, &from)).await
             }
             BranchPoint::Recorded { episode, step } => {
+                // Only the record says which twin it is of, so the token is checked after it is
+                // read.
                 let from = Session::recorded(&engine, &episode, step).await?;
                 self.grant.require_twin(from.twin())?;
                 let slot = self.state.sessions.reserve(name.clone(), &self.grant)?;
@@ -81,6 +87,8 @@ impl Connection {
     ) -> Result<Answer, Fault> {
         let opened = timeout(self.state.limits.step, opening).await;
         let session = opened.map_err(|_| SessionError::DeadlineExceeded)??;
+        // The answer is made before the slot gets the session: if the drive that is asked for does
+        // not exist, nothing is open.
         let text = convert::opened(seq, &session, drive.as_ref())?;
         tracing::info!(session = session.name(), "opened");
         slot.share_snapshots(&session);
@@ -102,6 +110,8 @@ impl Connection {
         let max_wait = self.state.limits.step;
         let owner = &self.grant.name;
         let check = |answered_seq: u64| {
+            // The client claims an answer that was never given: it is not the client of this
+            // session.
             if last_seq > answered_seq {
                 let expected = format!("{answered_seq} is the session's last answer");
                 return Err(Fault::SeqOutOfOrder { field: "last_seq", seq: last_seq, expected });
@@ -118,7 +128,10 @@ impl Connection {
             return Ok(Answer::Text(text.into()));
         }
         let first = self.state.sessions.resume("session", name, owner, max_wait).await?;
+        // A slot that is dropped by an error parks its session again, so a wrong request changes
+        // nothing.
         check(first.answered_seq)?;
+        // All or none: `self.slots` is set at the end only.
         let mut slots = vec![first];
         for (index, name) in also.iter().enumerate() {
             let field = format!("also[{index}]");
@@ -138,6 +151,7 @@ impl Connection {
         let resumed_also: Vec<_> =
             also.iter().map(String::as_str).zip(opened[1..].iter().copied()).map(one).collect();
         let first = &slots[0];
+        // From this number the client sees whether its pending request was carried out.
         let carried_out = first.last.as_ref().map_or(first.answered_seq, |last| last.seq);
         let text = convert::resumed(seq, name, carried_out, Ok(opened[0]), &resumed_also)?;
         for slot in &slots {

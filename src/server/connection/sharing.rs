@@ -13,6 +13,7 @@ impl Connection {
             let reason = format!("{reason}; connect without it");
             Err(Fault::NoSharedMemory { field: "type", reason })
         };
+        // The reasons that the client cannot change come first.
         if !self.state.shares_memory {
             return unavailable("the server was started with --no-shared-memory");
         }
@@ -25,6 +26,7 @@ impl Connection {
         if !self.slots.is_empty() {
             return Err(Fault::SessionState("share_memory comes before open and resume"));
         }
+        // An offer that was not opened is replaced, and its memory freed.
         let memory = SharedMemory::new()?;
         let text = convert::shared_memory(seq, &memory)?;
         self.memory = Some(memory);
@@ -42,6 +44,7 @@ impl Connection {
     /// Returns the message to send for an answer: with shared memory, the location of a binary
     /// message that was written into it.
     pub(super) async fn delivered(&mut self, seq: u64, answer: Answer) -> Result<Answer, Fault> {
+        // Texts stay on the socket: they are short, and say where in the memory the rest is.
         let memory = self.memory.as_mut().filter(|memory| memory.is_open());
         let (Some(memory), false) = (memory, matches!(answer, Answer::Text(_))) else {
             return Ok(answer);
@@ -52,6 +55,7 @@ impl Connection {
                 Ok(Answer::Text(convert::in_memory(seq, place)?.into()))
             }
             Err(error) => {
+                // The client reads either form, so that a full budget costs time and no step.
                 tracing::warn!("no room in shared memory, sent through the socket: {error}");
                 Ok(answer)
             }

@@ -24,6 +24,8 @@ impl Connection {
             return Err(NO_SESSION);
         }
         let open = self.names();
+        // The limit is that of one answer: all observations are in one message. Checked before any
+        // session moves.
         let named = |slot: &&SlotGuard| steps.iter().any(|step| step.session == slot.name());
         let sessions = self.slots.iter().filter(named).filter_map(|slot| slot.session.as_ref());
         let pixels: u64 = sessions.map(Session::step_pixels).sum();
@@ -33,6 +35,8 @@ impl Connection {
         }
 
         let metrics = &self.state.metrics;
+        // Each future takes the exclusive reference to its own slot, so that all can run at once. A
+        // name occurs once, which the conversion has checked.
         let mut slots: Vec<_> = self.slots.iter_mut().map(Some).collect();
         let carried_out = steps.into_iter().map(|SessionStep { session: name, step: asked }| {
             let slot = open.iter().position(|known| *known == name);
@@ -55,6 +59,7 @@ impl Connection {
                 Stepped { session: name, result }
             }
         });
+        // One refused step leaves the others as they are: each has its own result.
         let stepped = join_all(carried_out).await;
         for fault in stepped.iter().filter_map(|step| step.result.as_ref().err()) {
             tracing::debug!(seq, "refused: {fault}");
@@ -72,6 +77,7 @@ pub(super) async fn step(
     options: StepOptions,
 ) -> Result<Observation, Fault> {
     let begun = Instant::now();
+    // A request may simulate several steps, so the difference is counted.
     let done = session.episode().step();
     let frame = session.follow(movement, options).await?;
     metrics.steps.inc_by(session.episode().step() - done);

@@ -7,6 +7,7 @@ use crate::convert::Command;
 
 /// The span of a request, from the arrival of its text until its answer is sent.
 pub(super) fn request() -> Span {
+    // The fields are known after parsing, which belongs to the span.
     tracing::debug_span!("request", r#type = Empty, seq = Empty, session = Empty)
 }
 

@@ -23,6 +23,7 @@ pub(crate) fn new_actor(body: &[u8]) -> Result<AssetRequest, Fault> {
                 http::ActorClass::Bicycle => ActorClass::Bicycle,
                 http::ActorClass::Object => ActorClass::Object,
             },
+            // The default is chosen here, so that the provenance always has a number.
             mesh_gaussians: gaussians.unwrap_or(limits::ACTOR_MESH_GAUSSIANS),
             record: record
                 .map(|text| parse_field("record", &text))
@@ -30,6 +31,7 @@ pub(crate) fn new_actor(body: &[u8]) -> Result<AssetRequest, Fault> {
                 .unwrap_or_default(),
         },
     };
+    // Before any upload is looked up: a refused request pins no file.
     request.check()?;
     Ok(request)
 }
@@ -67,6 +69,7 @@ pub(crate) fn actor(actor: &StoredActor, with_provenance: bool) -> http::ActorAs
             ActorClass::Object => http::ActorClass::Object,
         },
         box_: http::ActorBox { length_m, width_m, height_m },
+        // A token that is limited to some twins must not learn the names of others.
         provenance: Some(provenance).filter(|_| with_provenance),
         gaussians: actor.gaussians(),
         sh_degree: actor.sh_degree,

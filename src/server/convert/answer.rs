@@ -75,12 +75,14 @@ pub(crate) fn opened(
 fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Result<Opened, Fault> {
     let resident = session.resident();
     let Version { number, hash, manifest, .. } = &*resident.version;
+    // The version of the session, which may have been opened before the latest one was made.
     let trajectory = section.map(|section| drive(&resident.version, section, "trajectory."));
     let profile = profile(session)?;
     let (encoding, quality) = encoding(session.encoding());
     let PixelMaps { depth, opacity, normals, instances } = session.maps();
     let names: Vec<_> = session.cameras().iter().map(|camera| camera.name.clone()).collect();
     let period_us = |(index, name): (usize, &String)| (name.clone(), session.period_us(index));
+    // All defaults are filled in: the client reads what applies, and not what it sent.
     let outputs = message::Outputs {
         encoding,
         quality,
@@ -93,6 +95,7 @@ fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Resu
         actors: session.reports_actors().then_some(true),
         period_us: Some(names.iter().enumerate().map(period_us).collect()),
         cameras: Some(names),
+        // The sizes and crops are in the cameras below already.
         images: BTreeMap::new(),
     };
     Ok(Opened {
@@ -173,10 +176,12 @@ pub(crate) fn resumed(
     session: Result<&Session, &ClosedSession>,
     also_resumed: &[AlsoResumed<'_>],
 ) -> Result<String, Fault> {
+    // A closed session has no state any more, only the numbers of its summary.
     let (step, time_us) = match session {
         Ok(open) => (open.episode().step(), open.episode().time_us()),
         Err(closed) => (closed.steps, closed.time_us),
     };
+    // A client that was restarted has lost the answer to `open`, so it is repeated.
     let opened = session.ok().map(|session| settings(seq, session, None)).transpose()?;
     let one = |AlsoResumed { name, session }: &AlsoResumed<'_>| {
         Ok(message::ResumedSession {
@@ -198,7 +203,7 @@ pub(crate) fn resumed(
     })
 }
 
-/// The answer to `prefetch`.
+/// The answer to a request without a result of its own, such as `prefetch` or `snapshot`.
 pub(crate) fn ok(seq: u64) -> Result<String, Fault> {
     text(&Answer::Ok { seq })
 }

@@ -46,6 +46,7 @@ pub(super) fn convert_appearance(
 
 /// Converts an exposure to the wire.
 pub(super) fn exposure_to(Exposure { matrix, offset }: Exposure) -> wire::Exposure {
+    // A gain was made a matrix as it was read, so answers always have the matrix.
     wire::Exposure { matrix: Some(matrix), gain: None, offset }
 }
 

@@ -36,10 +36,12 @@ pub(crate) fn drive(
         let known = drives.iter().map(|drive| drive.name.clone()).collect();
         Fault::UnknownTrajectory { field: format!("{prefix}name"), name: name.clone(), known }
     })?;
+    // The stored drive may be damaged, which is no fault of the request.
     let route = Route::new(recorded).map_err(SessionError::from)?;
     let poses = route.section(*section).map_err(|error| match error {
         RouteError::Value { field, value, must } => Fault::OutOfRange {
             field: format!("{prefix}{field}"),
+            // The field is named as in the request, of which the route knows nothing.
             must: format!("{value}; {must}"),
         },
         other => SessionError::from(other).into(),
@@ -67,6 +69,8 @@ pub(crate) fn drive_body(version: &Version, request: &DriveRequest) -> Result<Va
 pub(crate) fn drive_query(name: String, query: &str) -> Result<(Option<u64>, DriveRequest), Fault> {
     let mut section = RouteSection::default();
     let mut version = None;
+    // Read by hand, because serde would take the last of two values of a field, and ignore unknown
+    // ones.
     for (field, text) in form_urlencoded::parse(query.as_bytes()) {
         let invalid = |reason: &str| Fault::InvalidRequest {
             field: Some(field.clone().into_owned()),
@@ -85,6 +89,7 @@ pub(crate) fn drive_query(name: String, query: &str) -> Result<(Option<u64>, Dri
             "every_m" => &mut section.every_m,
             _ => return Err(invalid("unknown; there are version, from_m, to_m and every_m")),
         };
+        // NaN and infinity are numbers to Rust; the route refuses them by their range.
         let metres = text.parse().map_err(|_| invalid("not a number of metres"))?;
         if target.replace(metres).is_some() {
             return Err(invalid("given twice"));
@@ -101,6 +106,8 @@ mod tests {
     fn queries_are_decoded_and_each_field_is_there_once() {
         let read = |query: &str| drive_query("log".to_owned(), query);
         let (version, request) =
+            // Escaped digits, an escaped underscore, an exponent, an empty part and an escaped
+            // plus.
             read("version=3&from_m=%31%32%2E5&every%5Fm=5e-1&&to_m=%2B13").unwrap();
         let DriveRequest { section, .. } = request;
         assert_eq!(version, Some(3));

@@ -64,6 +64,7 @@ pub(crate) fn close_status(fault: &Fault) -> CloseStatus {
 
 /// The text of a fault's code.
 pub(crate) fn code(fault: &Fault) -> WireCode {
+    // The text is that of the protocol's own serializer, so that both agree.
     let code = serde_json::to_value(wire_fault(fault).code);
     WireCode(code.ok().and_then(|code| code.as_str().map(str::to_owned)).unwrap_or_default())
 }
@@ -80,6 +81,7 @@ pub(crate) fn refused(seq: Option<u64>, fault: &Fault) -> String {
 /// The body of an HTTP answer that refuses.
 pub(crate) fn refusal_body(fault: &Fault) -> Value {
     let WireFault { code, field } = wire_fault(fault);
+    // With the offset the client continues at once, without asking for it.
     let offset = match fault {
         Fault::UploadOffset { held, .. } => Some(*held),
         _ => None,
@@ -195,6 +197,8 @@ pub(super) fn wire_fault(fault: &Fault) -> WireFault {
         Fault::InvalidName { field, .. } => at(Code::InvalidName, field),
         Fault::Pose { field, cause } => {
             let code = match cause {
+                // Not finite has a code of its own, because it comes from a client's own
+                // computation and not from its choice.
                 PoseError::NotFinite { .. } => Code::PoseNotFinite,
                 PoseError::NotARotation { .. } | PoseError::TooFar { .. } => Code::PoseInvalid,
             };
@@ -238,6 +242,8 @@ pub(super) fn wire_fault(fault: &Fault) -> WireFault {
         Fault::UploadDigest { .. } => plain(Code::UploadDigest),
         Fault::StorageFull { .. } => plain(Code::StorageFull),
         Fault::OutOfRange { field, .. } => at(Code::OutOfRange, field),
+        // A full disk is for the operator to mend, and the client may try again later; it is no
+        // defect.
         Fault::Audit { cause, .. } if is_full(cause) => plain(Code::StorageFull),
         Fault::Audit { .. }
         | Fault::SpoolRead { .. }
@@ -257,6 +263,7 @@ pub(super) fn push_fault(error: &PushError) -> WireFault {
         PushError::Content { .. } => plain(Code::PushRefused),
         PushError::UnknownPush { .. } => plain(Code::UnknownPush),
         PushError::Busy { .. } => plain(Code::Busy),
+        // The same push would take as long again.
         PushError::TimedOut { .. } => plain(Code::PushRefused),
         PushError::Cancelled | PushError::TooLate { .. } => plain(Code::Conflict),
         PushError::ShuttingDown => plain(Code::ShuttingDown),
@@ -273,6 +280,7 @@ fn session_fault(error: &SessionError) -> WireFault {
         SessionError::Residency(error) => residency_fault(error),
         SessionError::Route(_) => at(Code::TwinDamaged, "twin"),
         SessionError::Scenario(error) => match error {
+            // An unknown name is the field itself; any other error names a part of the scenario.
             ScenarioError::Unknown { .. } => at(Code::UnknownScenario, "scenario"),
             _ => at(Code::ScenarioInvalid, &error.field()),
         },
@@ -336,6 +344,7 @@ fn store_fault(error: &StoreError) -> WireFault {
         StoreError::Overlap { .. }
         | StoreError::TwinExists { .. }
         | StoreError::Conflict { .. } => plain(Code::Conflict),
+        // The file is one of the store here, and not an upload, which has an error of its own.
         StoreError::Gaussians(IngestError::File(_)) => at(Code::TwinDamaged, "twin"),
         StoreError::Gaussians(_)
         | StoreError::Clamped { .. }
@@ -346,6 +355,7 @@ fn store_fault(error: &StoreError) -> WireFault {
         | StoreError::ManifestSize { .. }
         | StoreError::ViewSize { .. }
         | StoreError::NothingToCut { .. } => plain(Code::PushRefused),
+        // Before the arm of all other errors of the disk.
         StoreError::Io { cause, .. } if is_full(cause) => plain(Code::StorageFull),
         StoreError::NotSynced { .. }
         | StoreError::OutcomeUnknown { .. }
@@ -365,6 +375,7 @@ fn store_fault(error: &StoreError) -> WireFault {
 
 fn residency_fault(error: &ResidencyError) -> WireFault {
     match error {
+        // Memory may be free again when other sessions have ended.
         ResidencyError::NoRoom { .. } | ResidencyError::TooLarge { .. } => at(Code::Busy, "twin"),
         ResidencyError::NoRoomForActor { .. } => at(Code::Busy, "scenario"),
         ResidencyError::TimedOut { .. } => plain(Code::DeadlineExceeded),
@@ -381,6 +392,8 @@ fn render_fault(error: &RenderError) -> WireFault {
         // The device may have room again when other sessions have ended.
         RenderError::DeviceMemory { .. } => at(Code::Busy, "twin"),
         RenderError::ExactRays { .. } => at(Code::OutOfRange, "profile"),
+        // The checks of a request exclude these, so that they are defects, or the device has
+        // failed.
         RenderError::Views { .. }
         | RenderError::TargetSize { .. }
         | RenderError::Normals { .. }
@@ -467,6 +480,8 @@ mod tests {
         let page = std::fs::read_to_string(path).unwrap();
         let section = page.split("\n## Errors").nth(1).expect("a section on errors");
         let section = section.split("\n## ").next().expect("split gives at least one part");
+        // The codes of the page are compared with those of the type, both sorted: neither may have
+        // one more.
         let mut rows: Vec<(String, u16)> = Vec::new();
         for line in section.lines().filter(|line| line.starts_with("| `")) {
             let cells: Vec<&str> = line.split('|').map(str::trim).collect();

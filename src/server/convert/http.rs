@@ -31,6 +31,8 @@ use super::mistake::read_body;
 /// The body of `POST /v1/uploads`.
 pub(crate) fn new_upload(body: &[u8]) -> Result<Announced, Fault> {
     let http::NewUpload { name, size, digest } = read_body(body)?;
+    // The name is not used as a path; it is matched with the names within other files, and written
+    // to logs.
     let is_plain = |c: char| !c.is_control() && c != '/' && c != '\\';
     if name.is_empty() || name.len() > limits::UPLOAD_NAME_BYTES || !name.chars().all(is_plain) {
         let most = limits::UPLOAD_NAME_BYTES;
@@ -79,6 +81,7 @@ pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<PushRequest, Fault> 
         preview,
         drop_bad,
     } = body;
+    // `None` lets the server choose, and an empty list asks for no preview.
     let preview_poses = preview.poses.map(|poses| {
         convert_poses("golden.poses", &poses, wildcity_push::limits::PREVIEW_MAX_POSES)
     });
@@ -120,6 +123,7 @@ pub(super) fn requested_files(files: Vec<http::PushFile>) -> Result<Vec<Requeste
 fn requested_file(index: usize, file: http::PushFile) -> Result<RequestedFile, PushError> {
     let axes = SourceAxes::given(file.axes.as_deref(), file.scale);
     let axes = axes.map_err(|error| {
+        // Both are read together, so that the error has to say which one it is about.
         let part = match error {
             IngestError::InvalidAxes { option: "--scale", .. } => "scale",
             _ => "axes",
@@ -256,6 +260,8 @@ pub(crate) fn survey(survey: &Survey) -> Value {
     let ground = survey.ground.map(|GroundPlane { point, up }| {
         let (across, along) = up.any_orthonormal_pair();
         let radius = survey.extent.radius;
+        // Three points of the plane and one above it, so that the answer can be sent back as the
+        // edit. The radius of the scene keeps them far apart.
         let points = [point, point + radius * across, point + radius * along];
         http::EditGround {
             points: points.map(|point| point.to_array()),
@@ -282,6 +288,7 @@ pub(crate) fn versions(versions: &[LogEntry], held: Option<u64>) -> Value {
         version_hash: entry.hash.clone(),
         created_us: entry.created_us,
         kind: entry.kind_name().to_owned(),
+        // Later versions are committed, but sessions still open the one that is held.
         ready: held.is_none_or(|held| entry.number <= held),
         parent: entry.parent,
     };
@@ -324,6 +331,7 @@ pub(crate) fn episodes(episodes: &[ListedEpisode]) -> Value {
     let episode = |ListedEpisode { listed, file, mcap_error }: &ListedEpisode| {
         let driven = file.driven();
         let last = driven.last();
+        // Not all file systems have the time of the last change.
         let since_1970 = listed.modified.and_then(|time| time.duration_since(UNIX_EPOCH).ok());
         http::EpisodeInfo {
             episode: listed.name.clone(),
@@ -333,6 +341,7 @@ pub(crate) fn episodes(episodes: &[ListedEpisode]) -> Value {
             time_us: last.map_or(0, |frame| frame.time_us),
             bytes: listed.bytes,
             mcap_bytes: listed.mcap_bytes,
+            // A file that exists now was made after the failure.
             mcap_error: mcap_error.clone().filter(|_| listed.mcap_bytes.is_none()),
             modified_us: since_1970.map(|time| time.as_micros() as u64),
             scenario: file.scenario.as_ref().map(|scenario| scenario.name.clone()),

@@ -28,6 +28,8 @@ pub(crate) fn many(seq: u64, steps: Vec<Stepped>) -> Result<ManyAnswer, Fault> {
     let mut header = BTreeMap::new();
     let mut answers = Vec::new();
     let mut frames = Vec::new();
+    // `end` is the length of all observations so far: the tensors follow each other without gaps,
+    // as safetensors requires.
     let mut end = 0;
     for (index, Stepped { session, result }) in steps.into_iter().enumerate() {
         match result {
@@ -47,9 +49,11 @@ pub(crate) fn many(seq: u64, steps: Vec<Stepped>) -> Result<ManyAnswer, Fault> {
             }
         }
     }
+    // JSON within JSON: safetensors allows only texts as metadata.
     let metadata = text(&ManyMetadata { seq, answers })?;
     header.insert("__metadata__".to_owned(), Entry::Metadata { many: metadata });
     let json = text(&header)?;
+    // With the 8 bytes of its length before it, the data begins at a multiple of 8.
     let padded = json.len().next_multiple_of(8);
     let mut header = (padded as u64).to_le_bytes().to_vec();
     header.extend(json.as_bytes());

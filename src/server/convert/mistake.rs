@@ -7,6 +7,7 @@ use crate::fault::Fault;
 impl From<Mistake> for Fault {
     fn from(Mistake { kind, field, reason }: Mistake) -> Self {
         match (kind, field) {
+            // Text that is no JSON has no fields.
             (MistakeKind::NotJson, _) => Self::MalformedJson(reason),
             (MistakeKind::PoseNotFinite, Some(field)) => Self::PoseNotFinite { field },
             (MistakeKind::OutOfRange, Some(field)) => {
@@ -15,6 +16,7 @@ impl From<Mistake> for Fault {
                 Self::OutOfRange { must: must.to_owned(), field }
             }
             (MistakeKind::Defect, _) => Self::Internal(reason),
+            // Also the kinds above without a field, which the decoder does not make.
             (_, field) => Self::InvalidRequest { field, reason },
         }
     }

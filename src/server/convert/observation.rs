@@ -30,6 +30,7 @@ pub(crate) fn observation(
     session: &Session,
     mut frame: wildcity_session::Observation,
 ) -> Result<wildcity_session::Observation, Fault> {
+    // Computed once: each image has up to five tensors, and an entry in the metadata.
     let image_names = image_names(session, &frame);
     let mut header = Header { tensors: BTreeMap::new(), metadata: BTreeMap::new() };
     for tensor in &frame.tensors {
@@ -51,6 +52,7 @@ pub(crate) fn observation(
             DType::U16 => "U16",
         };
         let data_offsets = [tensor.bytes.start, tensor.bytes.end];
+        // The tensors are in the buffer already, at offsets that do not depend on the header.
         header.tensors.insert(name, TensorInfo { dtype, shape: &tensor.shape, data_offsets });
     }
     let observation = text(&metadata(seq, session, &frame, &image_names)?)?;
@@ -88,6 +90,7 @@ struct TensorInfo<'a> {
 
 /// Prefix of the names of each image's tensors: without the `/rgb` at the end.
 fn image_names(session: &Session, frame: &wildcity_session::Observation) -> Vec<String> {
+    // One pose, as in every step, needs no number in its names.
     let several = frame.images.iter().any(|image| image.pose > 0);
     let name = |image: &wildcity_session::ImageInfo| {
         let camera = &session.cameras()[image.camera].name;
@@ -120,6 +123,7 @@ fn metadata(
         let Pinhole { fx, fy, cx, cy } = mounted.camera.pinhole;
         let RigCamera { name: camera, width, height, lens, windshield, camera_to_rig, .. } =
             camera(mounted);
+        // The time of an image is the end of its exposure; a global shutter has no duration.
         let exposed_us = mounted.shutter.map_or(0, |shutter| shutter.duration_us);
         Image {
             camera,
@@ -164,6 +168,7 @@ fn metadata(
     let ms = |duration: std::time::Duration| duration.as_secs_f64() * 1e3;
     let stage = |&(name, ms): &(&str, f64)| Stage { name: name.to_owned(), ms };
     let anchor = version.manifest.geo.as_ref();
+    // Only twins with a place on the earth have one.
     let located = anchor.map(|anchor| anchor.locate(&episode.world_from_rig())).transpose();
     let located = located.map_err(|error| Fault::Internal(error.to_string()))?;
     Ok(ObservationMetadata {
@@ -197,6 +202,7 @@ fn metadata(
             queue_ms: ms(timings.queue),
             render_ms: ms(timings.render),
             encode_ms: ms(timings.encode),
+            // Absent without a model, so that 0 means a repair that took no time.
             repair_ms: session.repair().map(|_| ms(timings.repair)),
             stages_ms: timings.stages_ms.iter().map(stage).collect(),
         },
@@ -235,11 +241,14 @@ fn events(session: &Session) -> Vec<Event> {
             EventKind::Contact(contact) => {
                 told.kind = wire::EventKind::Contact;
                 told.actor = name_of(contact.actor);
+                // A contact that is there at the start comes from no driving, so that it is not
+                // told.
                 told.at_fault = (!contact.at_start).then_some(contact.ego_at_fault);
                 told.impact = Some(contact.impact_mps);
             }
             EventKind::StaticContact { impact_mps, .. } => {
                 told.kind = wire::EventKind::Contact;
+                // What does not move cannot be at fault.
                 told.at_fault = Some(true);
                 told.impact = Some(*impact_mps);
             }
@@ -284,6 +293,7 @@ fn route(traffic: &EpisodeTraffic, episode: &Episode) -> Option<Route> {
 }
 
 fn actors(traffic: &EpisodeTraffic) -> Vec<Actor> {
+    // Actors that have not appeared yet, or have left, keep their state but are not drawn.
     let present = traffic.states().iter().filter(|state| state.present);
     present
         .map(|state| {
@@ -292,6 +302,8 @@ fn actors(traffic: &EpisodeTraffic) -> Vec<Actor> {
             Actor {
                 name: spec.name.clone(),
                 kind: spec.class.name().to_owned(),
+                // The value of the actor's pixels in the map of instances. An index is below 256,
+                // so the sum fits.
                 instance: FIRST_ACTOR_INSTANCE + state.index,
                 size: [length_m, width_m, height_m],
                 pose: pose(&state.world_from_actor),

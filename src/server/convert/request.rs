@@ -164,6 +164,7 @@ fn convert(request: Request) -> Parsed {
         }
         Request::ShareMemory { seq, proof } => general(seq, Ok(Command::ShareMemory { proof })),
         Request::Open(open) => general(open.seq, open_command(*open)),
+        // The three are separate fields on the wire, of which one must be given.
         Request::Step { seq, session, pose, trajectory, action, until_us, notes, terminate } => {
             let movement = convert_movement(pose, trajectory, action);
             let options = StepOptions { until_us, terminate, notes };
@@ -203,6 +204,7 @@ fn convert(request: Request) -> Parsed {
 fn on(seq: u64, session: Option<String>, command: Result<Command, Fault>) -> Parsed {
     match session.map(|name| check_name("session", name)).transpose() {
         Ok(session) => Parsed::Numbered { seq, session, command },
+        // A session that cannot be named is the first fault, whatever the rest of the request is.
         Err(fault) => Parsed::Numbered { seq, session: None, command: Err(fault) },
     }
 }
@@ -215,6 +217,7 @@ fn many_command(steps: Vec<message::SessionStep>) -> Result<Command, Fault> {
         let must = format!("{} steps; 1 to {most} are accepted", steps.len());
         return Err(Fault::OutOfRange { field: "steps".to_owned(), must });
     }
+    // Two steps of one session would have to be ordered, so a list has each session once.
     let mut names = BTreeSet::new();
     let step = |(index, step): (usize, message::SessionStep)| {
         let message::SessionStep { session, pose, trajectory, action, until_us, notes, terminate } =
@@ -225,6 +228,8 @@ fn many_command(steps: Vec<message::SessionStep>) -> Result<Command, Fault> {
             return Err(Fault::SessionTwice { field, name: session });
         }
         let step = match convert_movement(pose, trajectory, action) {
+            // A step with two movements is a mistake of the client's program, and refuses the list.
+            // A pose out of range may come from its model, and refuses its own step.
             Err(Fault::InvalidRequest { field, reason }) => {
                 let field = field.map(|field| format!("steps[{index}].{field}"));
                 return Err(Fault::InvalidRequest { field, reason });
@@ -240,6 +245,7 @@ fn many_command(steps: Vec<message::SessionStep>) -> Result<Command, Fault> {
 
 fn resume_command(session: String, last_seq: u64, also: Vec<String>) -> Result<Command, Fault> {
     let session = check_name("session", session)?;
+    // With the first session these are all that a connection can have had.
     let most = limits::CONNECTION_SESSIONS - 1;
     if also.len() > most {
         let must = format!("{} sessions; at most {most} are accepted", also.len());
@@ -291,6 +297,7 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
             Some(ScenarioOptions {
                 source,
                 values,
+                // The scenario decides what the client leaves open.
                 dynamics: open.dynamics.is_none(),
                 warm_up: open.warm_up_us.is_none(),
                 actors: actors.unwrap_or(false),
@@ -298,6 +305,7 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
         }
     };
     let opening = SessionOptions {
+        // The store checks names again; this error names the field.
         twin: check_name("twin", open.twin)?,
         version: open.version,
         seed: open.seed,
@@ -348,6 +356,7 @@ fn convert_repair(repair: message::Repair) -> RepairOptions {
 fn convert_scenario(
     choice: message::ScenarioChoice,
 ) -> Result<(ScenarioSource, BTreeMap<String, Value>), Fault> {
+    // Three forms: a name, an object with a format, and a name with values.
     let mut object = match choice {
         message::ScenarioChoice::Name(name) => {
             return Ok((ScenarioSource::Named(name), BTreeMap::new()));
@@ -365,6 +374,7 @@ fn convert_scenario(
         Some(Value::String(name)) => name,
         Some(_) => return Err(wrong(".name", "write the name of one of the server's scenarios")),
         None => {
+            // An empty object may be meant as either form.
             let field = if object.is_empty() { "" } else { ".name" };
             let reason = "write the format of a scenario, or the name of one of the server's";
             return Err(wrong(field, reason));
@@ -375,6 +385,7 @@ fn convert_scenario(
         Some(Value::Object(values)) => values,
         Some(_) => return Err(wrong(".values", "write an object of values by their names")),
     };
+    // What was read is removed, so that the rest is unknown.
     if let Some(field) = object.keys().next() {
         return Err(wrong(&format!(".{field}"), "there is no such field; name and values are"));
     }
@@ -416,6 +427,7 @@ fn convert_dynamics(choice: message::DynamicsChoice) -> Result<Dynamics, Fault> 
     let message::Dynamics { model, speed, reverse } = match choice {
         message::DynamicsChoice::Full(dynamics) => dynamics,
         message::DynamicsChoice::Model(model) => {
+            // A model alone starts from rest.
             message::Dynamics { model, speed: 0.0, reverse: false }
         }
     };
@@ -491,6 +503,8 @@ mod tests {
         let step = |x: &str| {
             format!(r#"{{"type":"step","seq":3,"pose":{{"xyz":[0,{x},0],"q":[1,0,0,0]}}}}"#)
         };
+        // Literals of JavaScript and Python, numbers beyond f64, and what JSON writers make of
+        // them.
         for x in ["NaN", "Infinity", "-Infinity", "1e999", "-1e999", "null"] {
             let Parsed::Numbered { seq: 3, command, .. } = parse(&step(x)) else { panic!("{x}") };
             let field = fault_field(command);
@@ -524,6 +538,7 @@ mod tests {
         let bad = r#"{"xyz":[0,0,0],"q":[1,0,NaN,0]}"#;
         let observe = format!(r#"{{"type":"observe","seq":0,"poses":[{unit},{bad}]}}"#);
         assert_eq!(fault_field(command(&observe)), "poses[1].q[2]");
+        // A NaN within a text, with an escaped quotation mark, is no number.
         let camera = format!(r#"{{"name":"NaN \" NaN","camera_to_rig":{bad}}}"#);
         let open = format!(r#"{{"type":"open","seq":1,"rig":{{"cameras":[{camera}]}}}}"#);
         assert_eq!(fault_field(command(&open)), "rig.cameras[0].camera_to_rig.q[2]");

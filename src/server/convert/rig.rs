@@ -40,6 +40,7 @@ fn convert_rig_camera(field: &str, camera: message::RigCamera) -> Result<RigCame
     let message::RigCamera { name, width, height, fx, fy, cx, cy, camera_to_rig, .. } = camera;
     let name = check_name(&format!("{field}.name"), name)?;
     let rig_from_camera = convert_pose(&format!("{field}.camera_to_rig"), &camera_to_rig)?;
+    // Larger sizes become u32::MAX, which the check of the camera refuses.
     let size_px = [width, height].map(|side| u32::try_from(side).unwrap_or(u32::MAX));
     let intrinsics = Intrinsics {
         size_px,
@@ -50,6 +51,7 @@ fn convert_rig_camera(field: &str, camera: message::RigCamera) -> Result<RigCame
         native_size_px: camera.native_size,
     };
     let fault = |cause| Fault::Camera { field: field.to_owned(), cause };
+    // The overlay is decompressed after this check, which bounds its size by that of the image.
     let checked = intrinsics.camera().and_then(|camera| camera.check().map(|()| camera));
     let shutter = camera.shutter.map(convert_shutter).transpose().map_err(fault)?;
     let checked = checked.map_err(fault)?;

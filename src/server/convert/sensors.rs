@@ -65,6 +65,7 @@ pub(super) fn sensors_to(sensors: &Sensors) -> message::Sensors {
         cameras: cameras.iter().map(|(name, camera)| (name.clone(), camera_to(*camera))).collect(),
         imu: imu.as_ref().map(unit),
         wheel_speed: wheel_speed.as_ref().map(wheels),
+        // Left out as in a request without a delay, so that the answer can be sent back.
         delay_us: (*delay_us != 0).then_some(*delay_us),
     }
 }
@@ -98,6 +99,7 @@ pub(super) fn image_sensor(sensor: wildcity_session::ImageSensor) -> ImageSensor
         wildcity_session::SensorReason::Exposure => SensorReason::Exposure,
         wildcity_session::SensorReason::Dirt => SensorReason::Dirt,
     };
+    // The session has a place for each reason, of which most are empty.
     let reasons: Vec<SensorReason> = reasons.into_iter().flatten().map(reason).collect();
     ImageSensor {
         status: if reasons.is_empty() { SensorStatus::Ok } else { SensorStatus::Degraded },

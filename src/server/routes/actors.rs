@@ -54,12 +54,17 @@ pub(super) async fn push(
     body: Bytes,
 ) -> HttpResult {
     grant.require(Role::Push)?;
+    // Any twin may show the asset, so a token for some twins must not add one.
     grant.require_all_twins()?;
     let request = convert::new_actor(&body)?;
+    // The limit of the token first, and then that of the server, so that the error names the one
+    // that is the client's own.
     let open = state.open_pushes.push(&grant)?;
     let push = state.pushes.begin_actor()?;
     let files = find_uploads(&state, &grant.name, &request.files)?;
 
+    // axum drops this future when the client disconnects. The push runs in a task of its own, which
+    // sees the cancellation.
     let _cancelling = CancelWhenDropped(push.clone());
     let made = tokio::spawn(run(state, push, OwnedPush { grant, _open: open }, request, files));
     let made = deadline.extend_during(made).await.map_err(|_| PushError::Crashed)?;
@@ -104,6 +109,7 @@ async fn run(
     let name = request.settings.name.clone();
     let change = Change { what: "actor", target: Target::Actor(name.clone()), id: None };
     if let Err(fault) = state.audit.begin(&owned.grant, &change).await {
+        // Otherwise the push would stay open, and count for ever.
         push.end(Err(PushError::Abandoned { reason: fault.to_string() }));
         return Err(fault);
     }

@@ -27,15 +27,18 @@ pub(super) async fn answer(
     let is_served = |origin: &HeaderValue| {
         state.origins.lists(origin.as_bytes()) || origin.to_str().is_ok_and(is_local_origin)
     };
+    // No header is the refusal: the browser then keeps the answer from the page.
     let Some(origin) = origin.filter(is_served) else {
         return next.run(request).await;
     };
+    // A preflight has no token, so that it must be answered before `authorize`.
     let is_preflight = request.method() == Method::OPTIONS
         && request.headers().contains_key(header::ACCESS_CONTROL_REQUEST_METHOD);
     let mut response =
         if is_preflight { StatusCode::NO_CONTENT.into_response() } else { next.run(request).await };
     let headers = response.headers_mut();
     headers.insert(header::ACCESS_CONTROL_ALLOW_ORIGIN, origin);
+    // The answer names one origin, so a cache must not give it to another one.
     headers.append(header::VARY, HeaderValue::from_static("origin"));
     let mut say = |name, value| headers.insert(name, HeaderValue::from_static(value));
     if is_preflight {

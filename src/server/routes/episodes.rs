@@ -33,6 +33,7 @@ pub(super) async fn list(
         // Files of other builds, and those whose first line is not written yet, are left out.
         let read = newest.filter_map(|listed| {
             let file = EpisodeFile::read(&listed.path).ok()?;
+            // The export runs after the episode, so that its failure is not in the record.
             let mcap_error = state.engine.export_failure(&listed.name);
             let is_allowed = grant.allows_twin(&file.header.twin);
             is_allowed.then_some(ListedEpisode { listed, file, mcap_error })
@@ -67,15 +68,18 @@ pub(super) async fn mcap(
     Path(name): Path<String>,
 ) -> HttpResult {
     grant.require(Role::Admin)?;
+    // The token is checked before the wait, which takes up to 20 s.
     let (checked, its_name) = (state.clone(), name.clone());
     let record = blocking(move || find_record(&checked, &grant, &its_name)).await?;
     let is_over = state.engine.wait_for_exports(Some(&name), limits::MCAP_WAIT).await;
     let bytes = blocking(move || {
+        // The file counts, and not what the engine knows: it may be of an earlier server.
         if let Ok(bytes) = read_mcap(&record, limits::EPISODE_BYTES) {
             return bytes.ok_or_else(too_large);
         }
         let reason = match state.engine.export_failure(&name) {
             Some(reason) => reason,
+            // From the reason that is certain to the one that is left.
             None if !is_over => "it waits for others to be exported".to_owned(),
             None if !state.engine.exports_mcap() => "this server writes none (--mcap)".to_owned(),
             None => "it has not ended, or the server that drove it was killed".to_owned(),
@@ -89,6 +93,7 @@ pub(super) async fn mcap(
 fn find_record(state: &ServerState, grant: &Grant, name: &str) -> Result<PathBuf, Fault> {
     // A name, and so no path to another file.
     let unknown = || Fault::NoEpisode { name: name.to_owned() };
+    // An episode is named SESSION-NUMBER. A session's name may have a `-`, so the last one counts.
     let stem = name.rsplit_once('-').map_or(name, |(session, _)| session);
     if !is_name(stem) || name.contains(['/', '\\']) {
         return Err(unknown());

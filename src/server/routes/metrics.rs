@@ -29,6 +29,7 @@ pub(super) async fn show(
     let spooled = state.spool.as_ref().map(|spool| spool.usage()).unwrap_or_default();
     let gauges = GaugeValues {
         sessions: state.sessions.count(),
+        // The semaphore began with as many permits as the limit, so the difference is not negative.
         connections: state.limits.connections - free_connections,
         frames_queued: state.engine.queued_frames(),
         uploads: spooled.uploads,

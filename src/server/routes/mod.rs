@@ -36,6 +36,8 @@ pub(crate) fn router(state: Arc<ServerState>) -> Router {
     let json_limit = DefaultBodyLimit::max(wildcity_protocol::limits::INBOUND_MESSAGE_BYTES);
     let guarded = table::guarded().into_iter().map(|row| {
         let guard = Guard { state: state.clone(), route: row.operation.path };
+        // A layer for each route and not for the router: `authorize` needs the path of the table,
+        // and paths that do not exist need no token.
         let handler = row.handler.route_layer(from_fn_with_state(guard, authorize));
         Row { handler, ..row }
     });
@@ -44,6 +46,8 @@ pub(crate) fn router(state: Arc<ServerState>) -> Router {
         .fold(Router::new(), |router, row| router.route(row.operation.path, row.handler))
         .fallback(no_route)
         .method_not_allowed_fallback(no_method)
+        // The last layer runs first: CORS answers a preflight, then refusals are counted, and then
+        // the body is limited.
         .layer(json_limit)
         .layer(from_fn_with_state(state.clone(), metrics::count_refusals))
         .layer(from_fn_with_state(state.clone(), cors::answer))
@@ -66,6 +70,7 @@ async fn authorize(
 ) -> Result<Response, Refusal> {
     check_once(&request, header::HOST, "host")?;
     check_once(&request, header::ORIGIN, "origin")?;
+    // An absolute address in the request counts more than the header (RFC 9112, section 3.2.2).
     let header = request.headers().get(header::HOST).map(|host| host.to_str().unwrap_or_default());
     let host = request.uri().authority().map(|authority| authority.as_str()).or(header);
     let has_tokens = state.tokens.is_some();
@@ -73,6 +78,7 @@ async fn authorize(
     // Before the ticket, which only a request that is otherwise good may use up.
     state.origins.check_host(has_tokens, host)?;
     let grant = match &state.tokens {
+        // A ticket counts more than a header, which browsers cannot set for a WebSocket.
         Some(tokens) => match tickets::from_request(&request, route)? {
             Some(ticket) => state.tickets.redeem(ticket)?,
             None => {
@@ -86,6 +92,7 @@ async fn authorize(
         grant.require_more_than_metrics()?;
     }
     if let Some(slot) = request.extensions().get::<Arc<ConnectionSlot>>() {
+        // Only now, so that a connection without a token keeps counting as unauthenticated.
         slot.mark_authenticated()?;
     }
     request.extensions_mut().insert(grant);

@@ -59,6 +59,8 @@ mod tests {
         fn add(&mut self, prefix: &str, name: &str, mut schema: Value, definitions: &Value) {
             let mut named = Vec::new();
             rename(prefix, &mut schema, &mut named);
+            // A schema that is there already has its definitions, too. This also ends a schema that
+            // refers to itself.
             if let Some(before) = self.0.insert(format!("{prefix}{name}"), schema.clone()) {
                 assert_eq!(before, schema, "two schemas are called {prefix}{name}");
                 return;
@@ -111,6 +113,7 @@ mod tests {
     }
 
     fn parameters(operation: &Operation) -> Vec<Value> {
+        // The parts after each `{`, up to their `}`.
         let in_path = operation.path.split('{').skip(1).map(|rest| rest.split('}').next().unwrap());
         let in_path = in_path.map(|name| {
             // A trajectory may have any name.
@@ -137,6 +140,7 @@ mod tests {
 
     fn described(operation: &Operation, schemas: &mut Schemas) -> Value {
         let mut answer = |description: &str, kind: Content| {
+            // An answer to HEAD has the status and the headers alone.
             let kind = if operation.method == Method::Head { Content::None } else { kind };
             let mut answer = json!({ "description": description });
             if let Some(content) = content("", kind, schemas) {
@@ -169,6 +173,7 @@ mod tests {
             "responses": answers,
         });
         if operation.role.is_some() {
+            // Either nothing or a token: a server without tokens takes the requests, too.
             described["security"] = json!([{}, { "token": [] }]);
         }
         if let Some(content) = content(OF_REQUESTS, operation.body, schemas) {
@@ -248,6 +253,7 @@ mod tests {
             if operation.path == "/v1/session" {
                 continue;
             }
+            // The page writes `T` for `{twin}` and `ID` for `{id}`.
             let segments =
                 operation.path.split('/').map(|segment| match segment.strip_prefix('{') {
                     Some(name) => name[..1].to_ascii_uppercase(),

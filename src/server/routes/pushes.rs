@@ -34,6 +34,7 @@ pub(super) async fn begin(
     grant.require(Role::Push)?;
     grant.require_twin(&twin)?;
     let request = convert::new_push(twin, &body)?;
+    // Before the push is begun: a conflict that is certain now needs no upload to be read.
     let latest = {
         let catalog = state.engine.catalog().clone();
         let request = request.clone();
@@ -41,6 +42,8 @@ pub(super) async fn begin(
     };
     let id = request.id.clone().unwrap_or_else(|| wildcity_push::default_id(&request, latest));
     let twin = request.twin.clone();
+    // Counted only for a new push: asking for a known one must not fail because the token has too
+    // many.
     let mut open = None;
     let files = || {
         open = Some(state.open_pushes.push(&grant)?);
@@ -52,6 +55,8 @@ pub(super) async fn begin(
             let target = Target::Twin(twin.clone());
             let change = Change { what: "push", target, id: Some(id.clone()) };
             let owned = OwnedPush { grant, change, _open: open };
+            // A task of its own: a client that disconnects drops this future, but not the push,
+            // which is in the queue by then.
             let logged = tokio::spawn(log_and_run(state, push.clone(), owned, request, files));
             logged.await.map_err(|_| PushError::Crashed)??;
             push
@@ -84,6 +89,8 @@ pub(super) async fn cancel(
     let cancelling = push.clone();
     let change =
         Change { what: "cancel", target: Target::Twin(twin.clone()), id: Some(id.clone()) };
+    // On one thread from the first line of the log to the last, so that a client that disconnects
+    // leaves no line without its end.
     let cancelled = blocking(move || {
         state.audit.begin_now(&grant, &change)?;
         let cancelled = cancelling.cancel();
@@ -130,6 +137,7 @@ async fn run(
     request: PushRequest,
     files: Vec<SourceFile>,
 ) {
+    // `_open` counts until this function returns.
     let OwnedPush { grant, change, _open } = owned;
     let twin = request.twin.clone();
     let viewpoints = |twin: &str| state.sessions.viewpoints_on(twin);
@@ -143,6 +151,7 @@ async fn run(
         result = published => result,
         () = stopped_before_commit(&state, &push) => Err(PushError::ShuttingDown),
     };
+    // The log before the status: a client that sees the push as ready finds its line.
     let made = result.as_ref().map(|version| Made::Version(version.number));
     state.audit.end(&grant, &change, made).await;
     let reason = result.as_ref().err().map(ToString::to_string);
@@ -156,6 +165,7 @@ async fn run(
 /// Completes when the server stops, unless the push can no longer be cancelled: then its result
 /// counts.
 pub(super) async fn stopped_before_commit(state: &ServerState, push: &Push) {
+    // `cancel` decides: if it fails, the version is being written, and the push runs to its end.
     state.stopped().await;
     if push.cancel().is_err() {
         pending().await
@@ -182,6 +192,7 @@ pub(super) fn find_uploads(
     let mut files = Vec::with_capacity(requested.len());
     for (index, file) in requested.iter().enumerate() {
         let field = format!("files[{index}].upload");
+        // The spool does not know in which field the id was.
         let upload = spool.get(owner, &file.upload).map_err(|fault| match fault {
             Fault::UnknownUpload { id, .. } => Fault::UnknownUpload { id, field: Some(field) },
             fault => fault,
@@ -196,6 +207,7 @@ pub(super) fn find_uploads(
             name: file.name.clone().unwrap_or_else(|| upload.announced().name.clone()),
             path: upload.path(),
             bytes: size,
+            // The reference keeps the spool from removing the file while it is read.
             guard: upload,
         });
     }

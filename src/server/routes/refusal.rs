@@ -22,6 +22,7 @@ impl<F: Into<Fault>> From<F> for Refusal {
 
 impl IntoResponse for Refusal {
     fn into_response(self) -> Response {
+        // Debug and not a warning: a client can cause any number of refusals.
         let status = convert::http_status(&self.0);
         tracing::debug!(%status, "refused: {}", self.0);
         let mut response = (status, Json(convert::refusal_body(&self.0))).into_response();

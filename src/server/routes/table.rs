@@ -206,6 +206,7 @@ pub(super) fn guarded() -> Vec<Row> {
     use Content::{Json, List, Media};
     use Method::{Delete, Get, Head, Patch, Post};
     let op = Operation::new;
+    // Each row is both the route and its documentation, so that neither can be forgotten.
     let mut rows = vec![
         op(
             Get,
@@ -392,6 +393,7 @@ pub(super) fn guarded() -> Vec<Row> {
     ])
     .with(UPLOAD_PARAMETERS)
     .does(uploads::append);
+    // This layer is nearer to the handler than that of the router, and so it wins.
     append.handler = append.handler.layer(DefaultBodyLimit::disable());
     rows.push(append);
     rows
@@ -413,6 +415,7 @@ pub(super) fn open() -> Vec<Row> {
             .answers(200, Content::Object)
             .does(openapi::show),
     ];
+    // The page itself is public: it has no data, and asks for a token before it shows any.
     rows.extend(viewer::FILES.iter().map(|&file| {
         let answer = Content::Media(file.media_type());
         let summary = "A file of the viewer.";

@@ -35,6 +35,7 @@ pub(super) fn from_request<'a>(
 ) -> Result<Option<&'a str>, Fault> {
     let Some(protocol) = websocket::subprotocol(route) else { return Ok(None) };
     let query = request.uri().query().unwrap_or_default();
+    // Not decoded: a ticket has hex digits only, which no client escapes.
     let ticket = query.split('&').find_map(|pair| pair.strip_prefix("ticket="));
     if ticket.is_some() {
         websocket::check_handshake(request.headers(), protocol)?;

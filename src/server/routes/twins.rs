@@ -28,6 +28,7 @@ pub(super) async fn list(
 ) -> HttpResult {
     let mut twins = state.engine.twins().await?;
     twins.twins.retain(|twin| grant.allows_twin(&twin.name));
+    // Names of damaged twins are as secret as those of the others.
     twins.damaged.retain(|twin| grant.allows_twin(&twin.name));
     Ok(Json(convert::twins(&twins)).into_response())
 }
@@ -79,6 +80,8 @@ pub(super) async fn trajectory(
 ) -> HttpResult {
     grant.require_twin(&twin)?;
     let (version, section) = convert::drive_query(name, query.as_deref().unwrap_or_default())?;
+    // The version that a session would open now, which is not yet the one that a push has just
+    // committed.
     let version = version.or_else(|| state.engine.pinned_latest(&twin));
     let catalog = state.engine.catalog().clone();
     let body = blocking(move || {
@@ -99,6 +102,7 @@ pub(super) async fn ground(
     grant.require_twin(&name)?;
     // It reads the whole twin, as a push does.
     let _open = state.open_pushes.push(&grant)?;
+    // As for drives: the version that a session would open now.
     let version = state.engine.pinned_latest(&name);
     let survey = wildcity_push::survey(&state.engine, &state.pushes, name, version).await?;
     Ok(Json(convert::survey(&survey)).into_response())
@@ -151,6 +155,8 @@ pub(super) async fn rollback(
         state.audit.begin_now(&grant, &change)?;
         let rolled_back = engine.catalog().rollback(&name, number);
         let made = rolled_back.as_ref().map(|version| Made::Version(version.number));
+        // On one thread, so that a client that disconnects stops nothing between the rollback and
+        // its line in the log.
         state.audit.end_now(&grant, &change, made);
         let version = rolled_back?;
         // A push that is still loading its version has pinned the previous one; move this pin, so

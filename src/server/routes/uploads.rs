@@ -40,6 +40,7 @@ pub(super) async fn begin(
     let spool = state.spool()?.clone();
     let upload = blocking(move || spool.begin(&grant.name, announced)).await?;
     state.metrics.uploads_begun.inc();
+    // The client sees from the status whether it has anything to send.
     let status = if upload.is_complete() { StatusCode::OK } else { StatusCode::CREATED };
     Ok(answer(status, &upload))
 }
@@ -63,6 +64,8 @@ pub(super) async fn delete(
     grant.require(Role::Push)?;
     let spool = state.spool()?.clone();
     let upload = spool.get(&grant.name, &id)?;
+    // Taking the upload over ends the connection that writes to it: its file must not be removed
+    // under its hands.
     let writer = spool.write(&upload).await?;
     blocking(move || {
         spool.remove(&upload);
@@ -89,6 +92,7 @@ pub(super) async fn append(
 
     // The announced bytes must continue the upload.
     let start = number(&headers, &UPLOAD_OFFSET)?;
+    // A body of unknown length is checked as it arrives.
     let length = if headers.contains_key(header::CONTENT_LENGTH) {
         number(&headers, &header::CONTENT_LENGTH)?
     } else {
@@ -96,11 +100,13 @@ pub(super) async fn append(
     };
     let announced_sha256 = sha256_of_content(&headers)?;
     let writer = spool.write(&upload).await?;
+    // Read after the take-over: until then another connection could append.
     let held = upload.offset();
     if start != held {
         return Err(Fault::UploadOffset { given: start, held }.into());
     }
     check_length(upload.announced().size, held.saturating_add(length))?;
+    // A repetition of the last part, whose answer was lost.
     if upload.is_complete() {
         return Ok(answer(StatusCode::OK, &upload));
     }
@@ -132,8 +138,11 @@ async fn receive(
 ) -> Result<Received, Fault> {
     let start = upload.offset();
     let size = upload.announced().size;
+    // Of this body, for `Content-Digest`. The digest of the whole file is computed from the disk,
+    // after its last byte.
     let mut sha256 = Sha256::new();
     let mut buffer = Vec::new();
+    // Made once before the loop, so that a take-over during a write is not missed.
     let mut released = pin!(upload.released());
     loop {
         let frame = tokio::select! {
@@ -142,6 +151,7 @@ async fn receive(
             () = state.stopped() => return Err(Fault::ShuttingDown),
         };
         let frame = match frame {
+            // Trailers are no data, and come after the last byte.
             Ok(Some(Ok(frame))) => frame.into_data().ok(),
             Ok(None) => None,
             // Keep the bytes that have arrived for a client that continues the upload.
@@ -157,11 +167,13 @@ async fn receive(
         deadline.extend();
         let is_last = frame.is_none();
         buffer.extend_from_slice(&frame.unwrap_or_default());
+        // `offset` is at most the announced size, and the buffer is at most 1 MiB and one frame.
         let arrived = upload.offset() + buffer.len() as u64;
         if let Err(fault) = check_length(size, arrived) {
             blocking(move || writer.truncate(start)).await?;
             return Err(fault);
         }
+        // A write for each frame of some KiB would change threads a hundred times as often.
         if is_last || buffer.len() >= limits::UPLOAD_WRITE_BYTES {
             let full = std::mem::take(&mut buffer);
             state.metrics.uploaded_bytes.inc_by(full.len() as u64);
@@ -169,6 +181,7 @@ async fn receive(
             let spool = state.spool()?.clone();
             let upload = upload.clone();
             writer = blocking(move || {
+                // The writer moves to the thread and back: it blocks, and has one user at a time.
                 spool.make_room(&upload, full.len() as u64)?;
                 match writer.append(&full) {
                     Ok(()) => Ok(writer),
@@ -195,6 +208,7 @@ fn check_content_digest(
     received: Sha256,
 ) -> Result<(), Fault> {
     let received = received.finalize();
+    // An absent digest is no mistake: the whole file has one that is checked.
     if let Some(announced) = announced
         && announced != received.as_slice()
     {
@@ -211,6 +225,7 @@ fn check_content_digest(
 /// After the last byte of the upload: checks the whole file, and removes it if it does not match
 /// its digest.
 fn finish(spool: &Spool, upload: Arc<Upload>, mut writer: Writer) -> Result<Arc<Upload>, Fault> {
+    // Bytes are missing otherwise, and the next request continues.
     if upload.offset() == upload.announced().size
         && let Err(fault) = writer.finish()
     {
@@ -267,6 +282,7 @@ fn answer(status: StatusCode, upload: &Upload) -> Response {
     let headers = response.headers_mut();
     headers.insert(UPLOAD_OFFSET, upload.offset().into());
     headers.insert(UPLOAD_LENGTH, upload.announced().size.into());
+    // A cached offset would be that of an earlier moment.
     headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
     if let Ok(location) = location.parse() {
         headers.insert(header::LOCATION, location);

@@ -52,6 +52,7 @@ impl File {
         let headers: [(HeaderName, &'static str); 5] = [
             (header::CONTENT_TYPE, self.content_type),
             (header::CONTENT_SECURITY_POLICY, POLICY),
+            // Browsers must not guess another type, nor tell other sites the address of the page.
             (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
             (header::REFERRER_POLICY, "no-referrer"),
             // The files change with the program only, but their names stay.

@@ -37,6 +37,7 @@ pub(super) async fn upgrade(
     Extension(grant): Extension<Arc<Grant>>,
     request: Request,
 ) -> HttpResult {
+    // The handshake is checked before any counter is taken.
     let accept = accept(request.headers(), convert::SUBPROTOCOL)?;
     grant.require(Role::Drive)?;
     let shared = state.clone();
@@ -58,6 +59,7 @@ pub(super) async fn watch(
 ) -> HttpResult {
     let accept = accept(request.headers(), convert::WATCH_SUBPROTOCOL)?;
     grant.require(Role::Drive)?;
+    // Found before the upgrade, so that an unknown session is an HTTP answer and not a Close frame.
     let watch = state.sessions.watch(&session, &grant)?;
     let shared = state.clone();
     let slots = Slots::take(&state, slot, &grant)?;
@@ -90,6 +92,7 @@ impl Slots {
         connection: Arc<ConnectionSlot>,
         grant: &Grant,
     ) -> Result<Self, Fault> {
+        // The token's own limit first, so that its error is the one that is named.
         let of_token = state.open_connections.connection(grant)?;
         let limit = state.limits.connections;
         let of_server = state.websocket_permits.clone().try_acquire_owned();
@@ -110,6 +113,7 @@ fn hand_over<F>(
 where
     F: Future<Output = ()> + Send,
 {
+    // This completes after the answer below was sent, so it is awaited in another task.
     let upgrade = hyper::upgrade::on(&mut request);
     let send_timeout = state.limits.send;
     tokio::spawn(async move {
@@ -148,6 +152,8 @@ pub(super) fn check_handshake<'a>(
     headers: &'a HeaderMap,
     protocol: &'static str,
 ) -> Result<&'a [u8], Fault> {
+    // Each header may occur several times, and each value may be a list: `Connection: keep-alive,
+    // Upgrade`.
     let any = |name: header::HeaderName, is_wanted: &dyn Fn(&str) -> bool| {
         let values = headers.get_all(name).into_iter().filter_map(|value| value.to_str().ok());
         values.flat_map(|value| value.split(',')).any(|value| is_wanted(value.trim()))
@@ -174,6 +180,8 @@ pub(super) fn check_handshake<'a>(
 
 /// Whether the headers show that the request came through a proxy.
 fn is_forwarded(headers: &HeaderMap) -> bool {
+    // A proxy that sends none of these is not noticed; the proof of the shared memory then fails,
+    // as the client cannot open it.
     ["forwarded", "x-forwarded-for", "x-real-ip", "via"]
         .iter()
         .any(|name| headers.contains_key(*name))
@@ -181,6 +189,7 @@ fn is_forwarded(headers: &HeaderMap) -> bool {
 
 /// Whether a text is base64 of 16 bytes: 22 digits, and padding.
 fn is_key(text: &[u8]) -> bool {
+    // 16 bytes are 128 bits, which take 22 digits of 6 bits, and 2 characters of padding.
     let is_digit = |b: &u8| b.is_ascii_alphanumeric() || b"+/".contains(b);
     matches!(text.strip_suffix(b"=="), Some(digits) if digits.len() == 22 && digits.iter().all(is_digit))
 }

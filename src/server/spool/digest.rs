@@ -22,11 +22,13 @@ enum Algorithm {
 impl Digest {
     /// The id of an upload with this digest, which is also a file name.
     pub(super) fn id(&self) -> String {
+        // A colon is not allowed in file names everywhere.
         String::from(self.clone()).replace(':', "-")
     }
 
     /// The digest of an id.
     pub(super) fn from_id(id: &str) -> Option<Self> {
+        // From the end: `sha-256` has a hyphen itself.
         let (algorithm, hex) = id.rsplit_once('-')?;
         format!("{algorithm}:{hex}").try_into().ok()
     }
@@ -49,6 +51,8 @@ impl Digest {
                 hasher.finalize().into()
             }
         };
+        // A file that lost bytes has another hash, too, but this is a fault of the disk and not of
+        // the content.
         if bytes < size {
             let reason = format!("the file ended after {bytes} of {size} bytes");
             return Err(io::Error::new(ErrorKind::UnexpectedEof, reason));
@@ -65,6 +69,8 @@ impl TryFrom<String> for Digest {
             let algorithm = [Algorithm::Blake3, Algorithm::Sha256]
                 .into_iter()
                 .find(|known| known.name() == algorithm)?;
+            // One spelling for each digest, because the id is a file name. Both algorithms have 32
+            // bytes, so one parser reads both.
             let is_lower_case = hex.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'));
             let hash = blake3::Hash::from_hex(hex).ok().filter(|_| is_lower_case)?;
             Some(Self { algorithm, hash: *hash.as_bytes() })

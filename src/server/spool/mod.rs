@@ -114,6 +114,7 @@ impl Spool {
     /// The upload is too large, there is no space, the disk fails, or the token has a complete
     /// upload of the same digest with a different size.
     pub(crate) fn begin(&self, owner: &str, announced: Announced) -> Result<Arc<Upload>, Fault> {
+        // What can be refused without a lock is refused first.
         if announced.size > self.limits.upload_bytes {
             let must =
                 format!("{}; at most {} are accepted", announced.size, self.limits.upload_bytes);
@@ -124,6 +125,7 @@ impl Spool {
         // Declared before the lock, so that files are deleted after the lock is released.
         let mut removed = Vec::new();
         let mut uploads = self.uploads.lock();
+        // The disk may have an upload that could not be read when the server started.
         if !uploads.contains_key(&stem) {
             let found = self.find(&stem).map_err(|cause| Fault::SpoolRead { cause })?;
             uploads.extend(found.map(|found| (stem.clone(), found)));
@@ -131,6 +133,7 @@ impl Spool {
         if let Some(known) = uploads.get(&stem) {
             let size = upload.announced().size;
             let known_size = known.announced().size;
+            // The same content: the client goes on from the bytes that are there.
             if known_size == size {
                 known.touch();
                 return Ok(known.clone());
@@ -150,6 +153,7 @@ impl Spool {
         self.quota.make_room_for_new(&mut uploads, &upload, &mut removed)?;
         // No file is left of an upload that is refused.
         upload.create().inspect_err(|_| removed.push(upload.set_aside()))?;
+        // Inserted last: what is in the map has its files.
         uploads.insert(stem, upload.clone());
         Ok(upload)
     }
@@ -179,6 +183,7 @@ impl Spool {
     /// # Errors
     /// [`Fault::Busy`]; [`Fault::UnknownUpload`] if it was removed meanwhile.
     pub(crate) async fn write(&self, upload: &Arc<Upload>) -> Result<Writer, Fault> {
+        // The check comes after the wait, in which the upload may have been removed.
         let writer = upload.write().await?;
         // The files of its stem may be those of a newer upload.
         if !is_own(&self.uploads.lock(), upload) {
@@ -205,6 +210,8 @@ impl Spool {
     pub(crate) fn remove_old(&self) {
         let now_us = self.medium.clock.now_us();
         let is_old = |upload: &Arc<Upload>| {
+            // A clock that was set back gives a negative age, which counts as 0: nothing is removed
+            // for it.
             let age_us = u64::try_from(now_us - upload.used_us()).unwrap_or_default();
             Duration::from_micros(age_us) >= self.limits.age && Arc::strong_count(upload) == 1
         };
@@ -238,9 +245,12 @@ impl Spool {
             let (stem, kind) = name.split_once('.')?;
             let is_known = ["json", "part", "data", "gone"].contains(&kind);
             let is_id = |id: &str| Digest::from_id(id).is_some();
+            // With and without a token's name. An operator's own files in the directory match
+            // neither.
             let is_stem = is_id(stem) || stem.rsplit_once('-').is_some_and(|(id, _)| is_id(id));
             (is_known && is_stem).then(|| stem.to_owned())
         };
+        // An upload has up to three files, and is looked at once.
         let stems: BTreeSet<String> = names.iter().filter_map(upload_stem).collect();
         let mut uploads = self.uploads.lock();
         for stem in stems {
@@ -270,6 +280,7 @@ impl Spool {
 
 /// Whether an upload is still in the spool: a newer upload may have the stem of a removed one.
 fn is_own(uploads: &Uploads, upload: &Upload) -> bool {
+    // By address, because both have the same stem and often the same announcement.
     uploads.get(upload.stem()).is_some_and(|known| std::ptr::eq(&**known, upload))
 }
 
@@ -309,6 +320,7 @@ mod tests {
         std::fs::write(file("part"), b"cont").unwrap();
         let announcement = std::fs::read_to_string(file("json")).unwrap();
         // Longer than an announcement can be.
+        // Padded with spaces to 20,000 bytes, and 16 KiB are read at most.
         std::fs::write(file("json"), format!("{announcement:20000}")).unwrap();
         let spool = open(dir.path());
         assert_eq!(spool.usage().uploads, 0);

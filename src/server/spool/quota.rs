@@ -43,6 +43,7 @@ impl Quota {
         // A single token may use all space.
         let share = if tokens > 1 { limits::TOKEN_SHARE } else { 1 };
         let bytes = limits.token_bytes.unwrap_or(all.bytes / share).min(all.bytes);
+        // Rounded up, so that a limit of one upload is not a limit of none.
         let uploads = all.uploads.div_ceil(share as usize);
         Self { all, token: SpoolUsage { uploads, bytes }, own_bytes }
     }
@@ -73,6 +74,7 @@ impl Quota {
             );
             return Err(Fault::StorageFull { reason });
         }
+        // An announcement alone reserves 16 MiB at most, and not its whole size.
         let bytes = size.min(limits::RESERVED_BYTES);
         self.make_room(uploads, Demand { upload, bytes }, removed)
     }
@@ -88,6 +90,8 @@ impl Quota {
         more_bytes: u64,
         removed: &mut Vec<RemovedFiles>,
     ) -> Result<(), Fault> {
+        // Not less than what the upload counts for already, or its reservation would shrink by
+        // asking.
         let bytes = upload.offset().saturating_add(more_bytes).max(upload_bytes(upload));
         self.make_room(uploads, Demand { upload, bytes }, removed)
     }
@@ -100,6 +104,8 @@ impl Quota {
     ) -> Result<(), Fault> {
         let owner = demand.upload.owner();
         let token = self.token_usage(owner);
+        // Each turn removes one upload or returns, so this ends after as many turns as there are
+        // uploads.
         loop {
             let others = || uploads.values().filter(|known| known.stem() != demand.upload.stem());
             let own = usage(others().filter(|known| known.owner() == owner));
@@ -115,6 +121,7 @@ impl Quota {
             };
             let first = others()
                 .filter(is_removable)
+                // In this order: own before others', empty before others, oldest first.
                 .min_by_key(|known| (known.owner() != owner, known.offset() > 0, known.used_us()));
             let Some(stem) = first.map(|known| known.stem().to_owned()) else {
                 let (whose, kept, most) = if is_own_full {
@@ -139,6 +146,7 @@ impl Quota {
 impl SpoolUsage {
     /// Whether one more upload of `bytes` bytes fits.
     fn fits(self, used: Self, bytes: u64) -> bool {
+        // A sum that does not fit a u64 fits no disk.
         let sum = used.bytes.checked_add(bytes);
         used.uploads < self.uploads && sum.is_some_and(|sum| sum <= self.bytes)
     }
@@ -157,6 +165,7 @@ fn upload_bytes(upload: &Upload) -> u64 {
     let held = upload.offset();
     let is_active = upload.idle() < limits::RESERVED_FOR;
     let reserved = if is_active && !upload.is_complete() { limits::RESERVED_BYTES } else { 0 };
+    // More than its size never arrives, so that the last reservation shrinks with the rest.
     held.saturating_add(reserved).min(upload.announced().size)
 }
 
@@ -164,6 +173,7 @@ fn upload_bytes(upload: &Upload) -> u64 {
 /// and must be complete or have been idle for a while. A complete upload of another token must have
 /// been idle as well, because its push may follow soon.
 fn is_removable(upload: &Arc<Upload>, owner: &str) -> bool {
+    // The map has one reference; a connection or a push that uses it has another one.
     if Arc::strong_count(upload) > 1 {
         return false;
     }

@@ -63,6 +63,8 @@ pub(super) fn stem(owner: &str, id: &str) -> String {
     if owner.is_empty() {
         return id.to_owned();
     }
+    // A name of a token may have any characters, and a file name may not. 64 bits do not collide
+    // for some thousand tokens.
     let owner = blake3::hash(owner.as_bytes()).to_hex();
     format!("{id}-{}", &owner[..16])
 }
@@ -79,16 +81,20 @@ impl Upload {
     /// They cannot be read now.
     pub(super) fn found(medium: &SpoolMedium, stem: &str) -> io::Result<Option<Self>> {
         let file = |kind: &str| found_file(medium.disk.info(&path(medium, stem, kind)));
+        // Looked at before the announcement: files without one are removed, which an error of the
+        // disk must prevent.
         let data = file("data")?;
         let part = file("part")?;
         let Some(AnnouncedBy { announced, owner }) = announcement(medium, stem)? else {
             return Ok(None);
         };
+        // Files that were copied or renamed by hand are not those of this upload.
         if self::stem(&owner, &announced.digest.id()) != stem {
             return Ok(None);
         }
         let size = announced.size;
         let data = data.filter(|data| data.bytes == size);
+        // A longer file cannot be continued.
         let part = part.filter(|part| part.bytes <= size);
         let (held, file) = match (data, part) {
             (Some(data), _) => (COMPLETE, data),
@@ -165,6 +171,8 @@ impl Upload {
     /// [`Fault::Busy`]: the other connection did not release it in time.
     pub(crate) async fn write(self: &Arc<Self>) -> Result<Writer, Fault> {
         self.release.notify_waiters();
+        // The other connection ends when it sees the signal, or at the latest when it was silent
+        // for as long.
         let lock = timeout(limits::UPLOAD_SILENCE, self.writing.clone().lock_owned()).await;
         let lock = lock.map_err(|_| Fault::Busy { what: "connections that write it", limit: 1 })?;
         Ok(Writer { upload: self.clone(), _lock: lock, file: None })
@@ -180,6 +188,7 @@ impl Upload {
             self.medium.disk.create(&self.file("part"))
         };
         create().map_err(write_fault)?;
+        // No request with bytes will come, so it is complete at once.
         if self.announced.size == 0 { self.finish() } else { Ok(()) }
     }
 
@@ -208,11 +217,14 @@ impl Upload {
                 });
             }
         }
+        // The order makes it durable: the bytes are synced, then the announcement, and then the
+        // name that says that both are good.
         disk.append(&self.file("json"))
             .and_then(|mut announcement| announcement.sync())
             .and_then(|()| disk.rename(&part, &self.file("data")))
             .and_then(|()| disk.sync_dir(&self.medium.dir))
             .map_err(write_fault)?;
+        // Release and Acquire: what reads COMPLETE finds the file under its new name.
         self.held.store(COMPLETE, Ordering::Release);
         Ok(())
     }
@@ -255,8 +267,11 @@ pub(crate) struct Writer {
 impl Writer {
     /// Appends bytes: all of them, or none if the disk fails.
     pub(crate) fn append(&mut self, bytes: &[u8]) -> Result<(), Fault> {
+        // The writer has the lock, so that no other thread changes the offset.
         let start = self.upload.offset();
         let written = self.file().and_then(|file| {
+            // Bytes of a failed write may be behind the offset. A file that is shorter than the
+            // offset is an error here.
             file.truncate(start)?;
             file.write_all(bytes)
         });
@@ -321,6 +336,7 @@ impl RemovedFiles {
         let gone = path("gone");
         // The announcement is removed last: if the process is killed before, the next start removes
         // the rest.
+        // One of the two exists, as a rule. If both do, the second rename replaces the first.
         for kind in ["part", "data"] {
             log_error(&path(kind), medium.disk.rename(&path(kind), &gone));
         }
@@ -368,12 +384,14 @@ fn announcement(medium: &SpoolMedium, stem: &str) -> io::Result<Option<Announced
                 let reason = format!("{stem}.json has {size} bytes, not at most {most}: remove it");
                 return Err(io::Error::new(ErrorKind::InvalidData, reason));
             }
+            // Bounded by the size that was checked, also if the file grows meanwhile.
             file.take(size).read_to_end(&mut text)?;
             if (text.len() as u64) < size {
                 return Err(ErrorKind::UnexpectedEof.into());
             }
         }
     }
+    // Killed while it was written, it is no JSON: as good as none.
     Ok(serde_json::from_slice(&text).ok())
 }
 
