@@ -20,6 +20,7 @@ pub(super) fn apply<S: Simd>(
     for block in 0..BLOCKS {
         let load = |c: usize| f32x16::load_array_ref(simd, &sums.rgb[c][block]);
         let mut rgb = Vec3x16 { x: load(0), y: load(1), z: load(2) };
+        // The order is that of the camera: the sensor's exposure, then what lies over the image.
         if let Some(exposure) = &appearance.exposure {
             rgb = expose(simd, exposure, rgb);
         }
@@ -39,6 +40,7 @@ fn expose<S: Simd>(simd: S, exposure: &Exposure, rgb: Vec3x16<S>) -> Vec3x16<S> 
     let mut exposed = [f32x16::splat(simd, 0.0); 3];
     for (c, channel) in exposed.iter_mut().enumerate() {
         let [r, g, b] = exposure.matrix[c];
+        // Made for each block and not kept: four broadcasts cost less than a load.
         let [r, g, b, offset] =
             splats(simd, [r as f32, g as f32, b as f32, exposure.offset[c] as f32]);
         *channel = r.mul_add(rgb.x, g.mul_add(rgb.y, b.mul_add(rgb.z, offset)));
@@ -71,6 +73,7 @@ fn blend_overlay<S: Simd>(
         }
     }
     let splat = |value: f32| f32x16::splat(simd, value);
+    // Lanes outside of the image have alpha 0 and remain as they are.
     let load = |c: usize| f32x16::load_array_ref(simd, &over[c]) * splat(1.0 / 255.0);
     let alpha = load(3);
     let color = Vec3x16 { x: load(0), y: load(1), z: load(2) };
