@@ -258,12 +258,12 @@ impl<'a> UnscentedView<'a> {
         if distance_m + radius_m < self.range_m[0] {
             return false;
         }
-        // From here on both arguments of `asin` below are less than 1.
         // The camera may be within the six points: no bound on angles.
         let points_m = 3.0_f64.sqrt() * sigma_m;
         if distance_m - radius_m <= points_m {
             return true;
         }
+        // From here on both arguments of `asin` below are less than 1.
         let least_rad = angle_rad(center_m) - (radius_m / distance_m).asin() - rotation_rad;
         // The centre may be anywhere in the ball: its least angle decides.
         if least_rad > max_center_rad {

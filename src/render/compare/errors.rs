@@ -125,7 +125,7 @@ impl ErrorAccumulator {
         self.errors.extend(pairs.map(|(a, b)| (a - b).abs()));
         self.ssims.push(ssim(image, truth));
         for (pixel, (depth_m, truth_m)) in image.depth_m.iter().zip(&truth.depth_m).enumerate() {
-            // Below one half the depth is that of a faint edge, which no agent measures.
+            // Below one half the depth is a mean of a faint surface and of what lies behind it.
             if image.opacity[pixel] >= 0.5 && truth.opacity[pixel] >= 0.5 {
                 self.depth_sum_m += f64::from((depth_m - truth_m).abs());
                 self.depths += 1;

@@ -40,7 +40,6 @@ fn expose<S: Simd>(simd: S, exposure: &Exposure, rgb: Vec3x16<S>) -> Vec3x16<S> 
     let mut exposed = [f32x16::splat(simd, 0.0); 3];
     for (c, channel) in exposed.iter_mut().enumerate() {
         let [r, g, b] = exposure.matrix[c];
-        // Made for each block and not kept: four broadcasts cost less than a load.
         let [r, g, b, offset] =
             splats(simd, [r as f32, g as f32, b as f32, exposure.offset[c] as f32]);
         *channel = r.mul_add(rgb.x, g.mul_add(rgb.y, b.mul_add(rgb.z, offset)));

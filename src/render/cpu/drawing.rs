@@ -105,7 +105,7 @@ impl Drawing<'_> {
     /// A single view may have as much as its sums would take if it were drawn in slabs.
     fn most_bytes(&self, part: &FramePart<'_>) -> u64 {
         match part.frame.views {
-            // One slab at least has to fit, whatever the limit.
+            // Slabs would need as much for their sums, so that drawing at once may take it, too.
             [view] => self.most_bytes.max(UnfinishedTiles::bytes(view)),
             _ => self.most_bytes,
         }

@@ -73,7 +73,8 @@ mod tests {
     /// of method.
     #[test]
     fn keys_are_sorted_by_depth_and_then_by_index() {
-        // A linear congruential generator (Knuth's MMIX); its high bits are the random ones.
+        // A linear congruential generator with the factor of Knuth's MMIX; its high bits are the
+        // random ones.
         let mut state = 1_u64;
         for count in [0, 1, 255, 256, 1_000, 40_000] {
             for depth_bits in [0, 1, 2, 11, 27, DEPTH_BITS] {

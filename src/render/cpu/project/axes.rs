@@ -55,7 +55,7 @@ impl<S: Simd> Quaternions<S> {
         Self { w, v: Vec3x16::load(simd, columns, column::QUAT + 1) }
     }
 
-    /// The rotations after which `first` is applied to all of them.
+    /// These rotations, each followed by the rotation (x, y, z, w).
     #[inline(always)]
     pub(super) fn after(self, simd: S, [x, y, z, w]: [f32; 4]) -> Self {
         let a = Vec3x16::splat(simd, [x, y, z]);
