@@ -88,7 +88,7 @@ pub(super) fn error_against_time(all: &[Measurement]) -> Result<String, ReportEr
         chart.draw_series(LineSeries::new(front, BLACK.stroke_width(1)))?;
 
         let mut labels = Vec::new();
-        // Points over the line, and labels last, so that no line crosses a text.
+        // Points over the line, and labels last, so that the front's line crosses no text.
         for (m, is_on_front) in shown() {
             let own = color(m.setting.family);
             let fill = if *is_on_front { own } else { GREY };
@@ -209,12 +209,12 @@ fn draw_labels(root: &Area<'_>, mut labels: Vec<Label<'_>>) -> PlotResult<()> {
     let (width_px, height_px) = root.dim_in_pixel();
     let wanted_px: Vec<i32> = labels.iter().map(|label| label.at_px.1).collect();
     let column_px = width_px as i32 - LABELS_PX + 26;
-    // A text's anchor is its middle: 7 px above and below.
     let heights_px = spread(&wanted_px, height_px as i32 - LINE_PX);
     for (y, label) in heights_px.into_iter().zip(labels) {
         let line = [label.at_px, (column_px - 22, y), (column_px - 4, y)];
         root.draw(&PathElement::new(line, label.color.mix(0.35).stroke_width(1)))?;
         let style = ("sans-serif", 12).into_font().color(&label.color);
+        // A text is placed by its upper left corner: half a line above the end of its line.
         root.draw(&Text::new(label.text.to_owned(), (column_px, y - 7), style))?;
     }
     Ok(())
@@ -256,11 +256,12 @@ mod tests {
 
     #[test]
     fn labels_do_not_overlap_and_stay_on_the_page() {
-        // Two crowds, one in the middle and one at the lower edge.
+        // Three crowds: at the top, in the middle and at the lower edge.
         let heights = [10, 11, 11, 12, 200, 201, 390, 395, 399];
         let spread = spread(&heights, 400);
         assert!(spread.windows(2).all(|pair| pair[1] - pair[0] >= LINE_PX), "{spread:?}");
-        // The first of each crowd stays where it was; the last is pushed to the page's end.
+        // The first of the upper two crowds stays where it was; the last label is pushed to the
+        // end.
         assert_eq!((spread[0], spread[4], spread[8]), (10, 200, 400));
         assert_eq!(super::spread(&[5, 300], 400), [5, 300]);
     }

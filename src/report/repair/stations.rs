@@ -55,7 +55,7 @@ impl RepairSampling {
     /// A camera cannot be that small.
     pub(super) fn cameras(&self, cameras: &[RigCamera]) -> Result<Vec<RigCamera>, RigError> {
         let sides = |camera: &RigCamera| camera.camera.width_px.max(camera.camera.height_px);
-        // At least 1, so that a rig without cameras does not divide by 0.
+        // At least 1, so that nothing divides by 0.
         let longest_px = cameras.iter().map(sides).max().unwrap_or(1);
         // Scale all cameras by one factor, as a session with smaller images does.
         let factor = (f64::from(self.side_px) / f64::from(longest_px)).min(1.0);
