@@ -155,8 +155,8 @@ impl Building {
                 // A side is seen at a grazing angle only.
                 painter.coarser(1.25, |painter| facade::paint(painter, &wall, &style, random));
                 self.back(painter, &wall);
-            // The part above a lower neighbour.
             } else if self.neighbours_m[side] < top_m {
+                // The part above a lower neighbour.
                 let us = painter.even(0.0, DEPTH_M, 0.8);
                 let vs = painter.even(self.neighbours_m[side], top_m, 0.8);
                 let paint = self.style.wall.times(0.92);

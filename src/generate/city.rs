@@ -269,8 +269,8 @@ impl Iterator for Streets {
         // Whole metres, so that streets meet on the nodes of their centre lines.
         let long_m = if left_m <= longest_m {
             left_m
-        // Two streets remain: equal halves, so that the last is not too short.
         } else if left_m <= 2.0 * shortest_m {
+            // Two streets remain: equal halves, so that the last is not too short.
             (0.5 * left_m).floor()
         } else {
             let mut random = Random::new(self.seed, "length", self.index);

@@ -225,7 +225,7 @@ mod tests {
             lane = map.lane(next).unwrap();
             count += 1;
         }
-        // Three parts for each of at least three streets of 700 m.
+        // Three parts of each street, and 700 m have at least three streets.
         assert!(count >= 9 && count % 3 == 0, "{count} parts");
         assert!(
             lane.center.last().unwrap()[0]
