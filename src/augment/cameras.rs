@@ -43,6 +43,7 @@ impl CameraModel {
         let mut common: Option<Self> = None;
         for TrainingCamera { name, camera, .. } in cameras {
             let own = Self::from_camera(name, camera)?;
+            // One file has one model: two models that OpenCV's covers become that one.
             common = Some(match (common, own) {
                 (None, own) => own,
                 (Some(common), own) if common == own => own,
@@ -65,6 +66,7 @@ impl CameraModel {
         match &camera.lens {
             Lens::Pinhole => Ok(Self::Pinhole),
             Lens::OpenCv(lens) => {
+                // The rational denominator and the thin prism have no place in the format.
                 let more = lens.k()[2..].iter().chain(&lens.s()).any(|value| *value != 0.0);
                 if more {
                     return refused("OpenCV coefficients beyond k1, k2, p1 and p2");
@@ -106,6 +108,7 @@ impl CameraModel {
             (Self::OpenCvFisheye, Lens::Fisheye(lens)) => {
                 ["k1", "k2", "k3", "k4"].into_iter().zip(lens.k()).collect()
             }
+            // A pinhole among lenses. The lists' lengths are fixed: COLMAP counts on them.
             (Self::OpenCv, _) => ["k1", "k2", "p1", "p2"].map(|name| (name, 0.0)).to_vec(),
             (Self::OpenCvFisheye, _) => ["k1", "k2", "k3", "k4"].map(|name| (name, 0.0)).to_vec(),
         }
@@ -122,15 +125,18 @@ pub fn without_lens(camera: &Camera) -> Camera {
         return *camera;
     }
     let size_px = camera.size_px();
+    // A principal point outside of the image has no row or column in it.
     let center_px = DVec2::new(camera.pinhole.cx, camera.pinhole.cy).clamp(DVec2::ZERO, size_px);
     let slopes = |side_px: DVec2| {
         let at_px = |step: u32| side_px.lerp(center_px, f64::from(step) / f64::from(STEPS));
+        // From the image's edge inwards: the first pixel within the lens' field is where it ends.
         let ray = (0..STEPS).find_map(|step| camera.unproject(at_px(step)));
         // Behind the camera plane the slope is undefined.
         let ray = ray.filter(|ray| ray.z > 0.0);
         ray.map(|ray| ray.truncate() / ray.z)
     };
     let slope = |side_px: DVec2, axis: usize, sign: f64| {
+        // No ray in front of the camera: the field is wider than the largest slope.
         let slope = slopes(side_px).map_or(MOST_SLOPE, |slopes| sign * slopes[axis]);
         slope.clamp(-MOST_SLOPE, MOST_SLOPE)
     };
@@ -138,6 +144,7 @@ pub fn without_lens(camera: &Camera) -> Camera {
     let right = slope(DVec2::new(size_px.x, center_px.y), 0, 1.0);
     let up = slope(DVec2::new(center_px.x, 0.0), 1, -1.0);
     let down = slope(DVec2::new(center_px.x, size_px.y), 1, 1.0);
+    // Slopes to both sides add up to the width over the focal length.
     let fx = size_px.x / (left + right);
     let fy = size_px.y / (up + down);
     let pinhole = Pinhole { fx, fy, cx: fx * left, cy: fy * up };
@@ -174,13 +181,14 @@ mod tests {
         let lens = camera(opencv([-0.1, 0.01, 0.0, 0.0, 0.0, 0.0]));
         let pinhole = without_lens(&lens);
         assert!(pinhole.is_pinhole() && pinhole.check().is_ok());
+        // The edges of the image on the row and the column of the principal point.
         for (at_px, axis) in [([0.0, 140.0], 0), ([400.0, 140.0], 0), ([210.0, 300.0], 1)] {
             let edge = lens.unproject(at_px.into()).unwrap();
             let seen_px = pinhole.project(edge).unwrap();
             assert!((seen_px[axis] - at_px[axis]).abs() < 1e-9, "{at_px:?} {seen_px}");
         }
-        // 400 px of 250 px/rad see 0.8 rad to each side, and 60° are more than 50°.
         let mut wide = camera(fisheye());
+        // Across, 200/190 rad are 60 degrees, which the limit cuts to 50; down, 0.5 rad are kept.
         wide.pinhole = Pinhole { fx: 190.0, fy: 300.0, cx: 200.0, cy: 150.0 };
         let pinhole = without_lens(&wide).pinhole;
         let across_rad = 2.0 * (200.0 / pinhole.fx).atan();

@@ -72,6 +72,7 @@ impl ColmapModel<'_> {
     /// Index of a sample's camera, from 1.
     fn camera_id(&self, sample: &Sample) -> u32 {
         let index = self.cameras.iter().position(|camera| camera.name == sample.camera);
+        // Samples are made of these cameras: 0, which COLMAP lacks, does not occur.
         index.map_or(0, |index| index as u32 + 1)
     }
 
@@ -97,6 +98,7 @@ impl ColmapModel<'_> {
             for value in camera_from_world(&sample.world_from_camera) {
                 let _ = write!(text, " {value}");
             }
+            // The empty line is the image's list of points.
             let _ = write!(text, " {} {}\n\n", self.camera_id(sample), sample.name);
         }
         text
@@ -104,6 +106,7 @@ impl ColmapModel<'_> {
 
     fn points_text(&self) -> String {
         let mut text = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] (none)\n".to_owned();
+        // COLMAP's points count in 64 bits, its cameras and images in 32.
         for (id, Point { at_m: [x, y, z], rgb8: [r, g, b] }) in (1_u64..).zip(self.points) {
             let _ = writeln!(text, "{id} {x} {y} {z} {r} {g} {b} 0");
         }
@@ -130,6 +133,7 @@ impl ColmapModel<'_> {
             bytes.extend(pose.into_iter().flat_map(f64::to_le_bytes));
             bytes.extend(self.camera_id(sample).to_le_bytes());
             bytes.extend(sample.name.as_bytes());
+            // A name ends with a zero byte.
             bytes.push(0);
             // Points in the image.
             bytes.extend(0_u64.to_le_bytes());
@@ -184,6 +188,7 @@ mod tests {
             station_m: 0.0,
             offset_m: 0.5,
             camera: "front".to_owned(),
+            // Camera x south, y down, z east.
             world_from_camera: Pose::checked([1.0, 2.0, 3.0], [0.5, -0.5, 0.5, -0.5]).unwrap(),
             trust: 1.0,
             weight: 0.3,
@@ -211,6 +216,8 @@ mod tests {
 
         let [(_, cameras), (name, images), (_, points)] = made.files(ColmapForm::Binary);
         assert_eq!(name, "images.bin");
+        // A camera: id 4, model 4, two sides of 8, four numbers of 8. A point: id 8, place 24,
+        // colour 3, error and track 16.
         assert_eq!((cameras.len(), points.len()), (8 + 2 * 56, 8 + 8 + 24 + 3 + 16));
         assert_eq!(cameras[64..72], [2, 0, 0, 0, 1, 0, 0, 0]);
         let number =

@@ -67,9 +67,11 @@ impl Folder {
         fs::create_dir_all(dir).map_err(AugmentError::file(dir))?;
         let record = dir.join(RECORD);
         let had_record = record.is_file();
+        // A folder of something else is not touched, not even by a lock.
         if !had_record && !is_empty(dir)? {
             return Err(AugmentError::NotOurs { dir: dir.to_owned() });
         }
+        // Before anything is read: another run may be writing.
         let lock = Lock::take(dir)?;
         let mut found = BTreeMap::new();
         if had_record {
@@ -85,11 +87,13 @@ impl Folder {
                 });
             }
             let journal = read_journal(&dir.join(JOURNAL))?;
+            // The journal comes last: of two entries of a name the newer one stays.
             let all = read.samples.into_iter().chain(journal);
             found.extend(all.map(|sample| (sample.name.clone(), sample)));
         }
         let total = found.len() as u64;
         let mut samples = BTreeMap::new();
+        // From here on only samples whose files are all there with their hashes.
         for (checked, (name, sample)) in (1..).zip(found) {
             if is_sound(dir, &sample)? {
                 samples.insert(name, sample);
@@ -100,6 +104,7 @@ impl Folder {
         let path = dir.join(JOURNAL);
         // Write the samples of the journal to augment.json before the journal is emptied.
         write_record(dir, &header, false, &samples.values().collect::<Vec<_>>())?;
+        // Emptied, as its samples are in augment.json now.
         let journal = File::create(&path).map_err(AugmentError::file(&path))?;
         Ok(Self { dir: dir.to_owned(), header, samples, journal, damaged, _lock: lock })
     }
@@ -124,10 +129,12 @@ impl Folder {
     /// # Errors
     /// A file cannot be written.
     pub fn put(&mut self, mut sample: Sample, files: &SampleFiles) -> Result<(), AugmentError> {
+        // Files first and the line last: a line in the journal means that all files are complete.
         for (path, bytes) in files.named(&sample.name) {
             write(&self.dir.join(&path), bytes)?;
             sample.files.insert(path, hash(bytes));
         }
+        // One write for line and line feed, so that a kill leaves at most one cut line.
         let mut line = serde_json::to_vec(&sample).unwrap_or_default();
         line.push(b'\n');
         self.journal.write_all(&line).map_err(AugmentError::file(&self.dir.join(JOURNAL)))?;
@@ -153,6 +160,7 @@ impl Folder {
     /// # Errors
     /// It cannot be written.
     pub fn finish(self, samples: &[Sample]) -> Result<(), AugmentError> {
+        // In this order: between the two steps the journal only repeats what the record has.
         write_record(&self.dir, &self.header, true, &samples.iter().collect::<Vec<_>>())?;
         let path = self.dir.join(JOURNAL);
         fs::remove_file(&path).map_err(AugmentError::file(&path))
@@ -176,6 +184,8 @@ impl Lock {
     fn take(dir: &Path) -> Result<Self, AugmentError> {
         let path = dir.join(LOCK);
         let in_use = || AugmentError::InUse { dir: dir.to_owned() };
+        // The file has no content: it may be created by several runs, and one of them gets
+        // the lock.
         let file = File::create(&path).map_err(AugmentError::file(&path))?;
         match file.try_lock() {
             Ok(()) => {}
@@ -218,6 +228,8 @@ fn read_record(path: &Path) -> Result<ReadRecord, AugmentError> {
     let file = File::open(path).map_err(AugmentError::file(path))?;
     file.take(RECORD_BYTES).read_to_string(&mut text).map_err(AugmentError::file(path))?;
     let json: Value = serde_json::from_str(&text).map_err(|error| damaged(error.to_string()))?;
+    // Before the fields: another version of the format would fail at one of them, with a
+    // worse message.
     if json["format"] != FORMAT {
         return Err(damaged(format!("its format is {}, and not {FORMAT:?}", json["format"])));
     }
@@ -244,12 +256,14 @@ fn is_sound(dir: &Path, sample: &Sample) -> Result<bool, AugmentError> {
     for (name, expected) in &sample.files {
         let path = dir.join(name);
         match fs::read(&path) {
+            // A whole file at once: a PNG has some MB.
             Ok(bytes) if hash(&bytes) == *expected => {}
             Ok(_) => return Ok(false),
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(false),
             Err(cause) => return Err(AugmentError::File { path, cause }),
         }
     }
+    // A sample without files would pass without a test.
     Ok(!sample.files.is_empty())
 }
 
@@ -287,6 +301,7 @@ fn write(path: &Path, bytes: &[u8]) -> Result<(), AugmentError> {
         fs::create_dir_all(folder).map_err(AugmentError::file(folder))?;
     }
     let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+    // In the same folder, since a rename is atomic only within a file system.
     let temporary = path.with_file_name(temporary_name(name));
     fs::write(&temporary, bytes).map_err(AugmentError::file(&temporary))?;
     fs::rename(&temporary, path).map_err(AugmentError::file(path))
@@ -348,6 +363,7 @@ mod tests {
         folder.put(sample(0), &files(0)).unwrap();
         folder.put(sample(1), &files(1)).unwrap();
         // As kill -9 leaves it, within a line and between two files.
+        // The lock is gone with the process; the journal stays.
         drop(folder);
         let journal = fs::read(cut.join(JOURNAL)).unwrap();
         fs::write(cut.join(JOURNAL), &journal[..journal.len() - 20]).unwrap();
@@ -356,6 +372,7 @@ mod tests {
 
         let mut folder = open(&cut).unwrap();
         assert_eq!((folder.has("front/0.png"), folder.has("front/1.png")), (true, false));
+        // The cut line is no sample, so that nothing counts as damaged.
         assert_eq!((folder.count(), folder.damaged()), (1, 0));
         let mut again = open(&cut);
         assert!(matches!(again, Err(AugmentError::InUse { .. })), "{again:?}");
@@ -376,6 +393,7 @@ mod tests {
         fs::remove_file(dir.path().join("depth/front/0.png")).unwrap();
         fs::write(dir.path().join("rendered/front/2.png"), [2, 3]).unwrap();
         let folder = open(dir.path()).unwrap();
+        // One sample has lost its depth, another has other bytes.
         assert_eq!((folder.count(), folder.damaged()), (1, 2));
         assert!(folder.has("front/1.png"));
         let text = fs::read_to_string(dir.path().join(RECORD)).unwrap();

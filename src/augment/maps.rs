@@ -19,6 +19,7 @@ pub fn counted(camera: &Camera, opacity: &[f32]) -> Result<Vec<bool>, AugmentErr
     if opacity.len() != pixels {
         return Err(AugmentError::Values { what: "opacity", values: opacity.len(), pixels });
     }
+    // A NaN is not opaque.
     let mut counts: Vec<bool> = opacity.iter().map(|opacity| *opacity >= LEAST_OPACITY).collect();
     if let Some(field) = FieldMask::from_camera(camera) {
         field.clear_outside(camera, 1, &mut counts);
@@ -38,6 +39,7 @@ pub fn depth_mm(depth_m: &[f32], counts: &[bool]) -> Result<Vec<u16>, AugmentErr
     }
     let mm = |(depth_m, counts): (&f32, &bool)| {
         let is_told = *counts && *depth_m > 0.0 && *depth_m <= MOST_DEPTH_M;
+        // 65,000 at most: the cast drops nothing.
         if is_told { (f64::from(*depth_m) * 1e3).round() as u16 } else { 0 }
     };
     Ok(depth_m.iter().zip(counts).map(mm).collect())
@@ -57,6 +59,7 @@ pub fn mask_png(counts: &[bool], size_px: [u32; 2]) -> Result<Vec<u8>, AugmentEr
 /// # Errors
 /// [`AugmentError::Png`].
 pub fn millimetres_png(depth_mm: &[u16], size_px: [u32; 2]) -> Result<Vec<u8>, AugmentError> {
+    // In the machine's order, as the encoder expects it; it writes big-endian.
     let bytes: Vec<u8> = depth_mm.iter().flat_map(|mm| mm.to_ne_bytes()).collect();
     png(&bytes, size_px, ExtendedColorType::L16)
 }
@@ -77,6 +80,7 @@ fn png(bytes: &[u8], size_px: [u32; 2], color: ExtendedColorType) -> Result<Vec<
         return Err(AugmentError::Values { what: "an image", values: bytes.len(), pixels });
     }
     let mut file = Vec::new();
+    // Fast: a round may have a million images.
     PngEncoder::new_with_quality(&mut file, CompressionType::Fast, FilterType::Adaptive)
         .write_image(bytes, width, height, color)
         .map_err(|error| AugmentError::Png(error.to_string()))?;
@@ -95,8 +99,10 @@ mod tests {
 
     #[test]
     fn opaque_pixels_count_and_have_depth_up_to_65_m() {
+        // 0.499 is just below the limit, 0.5 on it.
         let counts = counted(&camera(), &[0.0, 0.499, 0.5, 1.0, 1.0, 1.0]).unwrap();
         assert_eq!(counts, [false, false, true, true, true, true]);
+        // The first two pixels do not count, the fifth is beyond 65 m, the last has no depth.
         let mm = depth_mm(&[9.0, 9.0, 12.3456, 65.0, 65.01, 0.0], &counts).unwrap();
         assert_eq!(mm, [0, 0, 12_346, 65_000, 0, 0]);
         let read = image::load_from_memory(&millimetres_png(&mm, [3, 2]).unwrap()).unwrap();

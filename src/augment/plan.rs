@@ -55,8 +55,10 @@ impl Plan {
             let expected = format!("a round from 1 to {MOST_ROUNDS}");
             return Err(number("--round", round.into(), expected));
         }
+        // At least what a name can tell: centimetres.
         let is_offset = |offset_m: &f64| (0.01..=MOST_OFFSET_M).contains(offset_m);
         let wrong = wanted_m.iter().copied().find(|offset_m| !is_offset(offset_m));
+        // A NaN is in no range; an empty list is reported as one.
         if let Some(value) = wrong.or(wanted_m.is_empty().then_some(f64::NAN)) {
             let expected = format!("metres from 0.01 to {MOST_OFFSET_M}, separated by commas");
             return Err(number("--offsets", value, expected));
@@ -90,6 +92,8 @@ impl Plan {
     /// The offsets of the round, in metres, left (positive) and right of the drive: for each
     /// requested one `min(0.5 m x round, wanted)`, without repetitions.
     pub fn offsets_m(&self) -> Vec<f64> {
+        // Ascending, as the wanted ones are: those beyond the round's reach become equal, and
+        // `dedup` removes them.
         let reached_m = ROUND_M * f64::from(self.round);
         let mut offsets_m: Vec<f64> =
             self.offsets_m.iter().map(|wanted_m| wanted_m.min(reached_m)).collect();
@@ -112,6 +116,7 @@ impl Plan {
             // f64.
             let steps = (drive.length_m() / self.every_m + 1e-9).floor() as usize;
             for step in 0..=steps {
+                // The station of the name is exactly that of the pose.
                 let station_m = rounded(step as f64 * self.every_m);
                 let on_drive = drive.at_station(station_m);
                 places.extend(offsets_m.iter().map(|offset_m| Place {
@@ -174,11 +179,14 @@ mod tests {
 
     #[test]
     fn places_are_beside_each_drive_up_to_its_end() {
+        // Round 2 reaches 1 m: 0.3 m as wanted, and 1 m of the 4 m. 2.1 m have four
+        // stations, 0.5 m one.
         let plan = Plan::new(2, &[0.3, 4.0], 0.7).unwrap();
         let places = plan.places(&[drive("a", 2.1), drive("b", 0.5)]).unwrap();
         assert_eq!(places.len(), 4 * (4 + 1));
         let last = &places[4 * 3 + 1];
         assert_eq!((last.station_m, last.offset_m), (2.1, -0.3));
+        // Northwards, the right side is east: 0.3 m along x.
         let expected_m = DVec3::new(0.3, 2.1, 0.0);
         assert!(last.world_from_rig.position_m.distance(expected_m) < 1e-12, "{last:?}");
         assert_eq!(last.image_name("front"), "front/a_00002.10_right0.30.png");

@@ -36,6 +36,7 @@ impl Surroundings {
         let mut places_m: Vec<DVec3> = Vec::new();
         for place in places {
             let at_m = place.world_from_rig.position_m;
+            // Places come in the order of the drive, so that the last one is usually the nearest.
             if places_m.last().is_none_or(|last_m| last_m.distance(at_m) >= APART_M) {
                 places_m.push(at_m);
             }
@@ -51,6 +52,7 @@ impl Surroundings {
     /// The part that is in reach of a group of Gaussians, which are tested much faster with it.
     fn near(&self, gaussians: &Gaussians) -> Self {
         let mut means = Bounds::EMPTY;
+        // The box of the centres; a Gaussian's size does not count.
         for mean_m in &gaussians.means_m {
             means.add(DVec3::from_array(*mean_m), DVec3::ZERO);
         }
@@ -60,6 +62,7 @@ impl Surroundings {
 
     fn contain(&self, point_m: DVec3) -> bool {
         let reach = POINT_REACH_M * POINT_REACH_M;
+        // Squares, without a root per place.
         self.places_m.iter().any(|at_m| at_m.distance_squared(point_m) <= reach)
     }
 }
@@ -99,6 +102,7 @@ impl PartialOrd for Keyed {
 
 impl Ord for Keyed {
     fn cmp(&self, other: &Self) -> std::cmp::Ordering {
+        // The index makes the order total if two keys should be equal.
         (self.key, self.index).cmp(&(other.key, other.index))
     }
 }
@@ -120,7 +124,10 @@ impl PointSample {
                 continue;
             }
             self.seen += 1;
+            // A hash of the number of the Gaussian: those with the smallest keys are a uniform
+            // sample, however many there are.
             let key = mix(self.seed ^ mix(self.seen));
+            // With `most` 0 the heap is empty, and `is_none_or` leaves every point out.
             let is_full = self.kept.len() >= self.most;
             if is_full && self.kept.peek().is_none_or(|largest| key >= largest.key) {
                 continue;
@@ -128,6 +135,7 @@ impl PointSample {
             if is_full {
                 self.kept.pop();
             }
+            // The colour without direction: 0.5 + C0 c, as in `sh`.
             let dc = &gaussians.sh_at(index)[..3];
             let rgb8 = [0, 1, 2].map(|c| {
                 let value = 0.5 + sh::C0 * f64::from(dc[c]);
@@ -161,7 +169,9 @@ mod tests {
             gaussians.means_m.push([f64::from(at), 0.0, 0.0]);
             gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
             gaussians.ln_scales.push([-3.0; 3]);
+            // Every second one is a surface.
             gaussians.logit_opacities.push(if at % 2 == 0 { 1.0 } else { -1.0 });
+            // 0.5 + 0.28 x 10 is above 1, and 0.5 - 2.8 below 0: clamped to 255 and 0.
             gaussians.sh.extend([0.0, 10.0, -10.0]);
         }
         gaussians
@@ -204,16 +214,19 @@ mod tests {
     #[test]
     fn points_are_near_the_views() {
         let near = surroundings(30.0);
+        // Stations 0 to 30 every 2 m; of these one every 6 m is at least 5 m from the last.
         assert_eq!(near.places_m.len(), 6, "{near:?}");
         let mut sample = PointSample::new(1, 1000, near.clone());
         sample.add(&line(1000));
         let farthest_m = sample.into_points().last().unwrap().at_m[0];
+        // The last place kept is near 30 m, and the reach is 100 m.
         assert!((120.0..=131.0).contains(&farthest_m), "{farthest_m}");
         let at = |x_m: f64| {
             let mut bounds = Bounds::EMPTY;
             bounds.add(DVec3::new(x_m, 0.0, 0.0), DVec3::ONE);
             near.meet(&bounds)
         };
+        // A box of 1 m to each side: -100.5 + 1 is within 100 m of 0.
         assert!(at(120.0) && at(-100.5) && !at(140.0));
     }
 }

@@ -175,6 +175,7 @@ pub(crate) fn difference(there: &MadeWith, here: &MadeWith) -> Option<[String; 3
 
 fn leaf(path: &str, there: &Value, here: &Value) -> Option<[String; 3]> {
     match (there, here) {
+        // Objects with other fields differ as a whole: a model against none.
         (Value::Object(a), Value::Object(b)) if a.keys().eq(b.keys()) => {
             a.iter().find_map(|(key, value)| {
                 let path = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
@@ -190,6 +191,7 @@ fn leaf(path: &str, there: &Value, here: &Value) -> Option<[String; 3]> {
 fn short(value: &Value) -> String {
     match value {
         Value::Null => "none".to_owned(),
+        // A repair is named by its model.
         Value::Object(fields) => fields.get("model").unwrap_or(value).to_string(),
         other => other.to_string(),
     }

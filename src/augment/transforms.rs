@@ -19,6 +19,7 @@ pub fn transforms(model: CameraModel, cameras: &[TrainingCamera], samples: &[Sam
         let camera = cameras.iter().find(|camera| camera.name == sample.camera)?;
         Some(frame(model, camera, sample))
     };
+    // A sample without a camera of the list would be a frame without intrinsics.
     let frames: Vec<Value> = samples.iter().filter_map(frame).collect();
     json!({"camera_model": model.name(), "frames": frames})
 }
@@ -48,6 +49,7 @@ fn frame(model: CameraModel, training: &TrainingCamera, sample: &Sample) -> Valu
 
 /// Rows of the 4 x 4 matrix `world_from_camera` with OpenGL's camera axes.
 fn opengl(world_from_camera: &Pose) -> [[f64; 4]; 4] {
+    // OpenCV's camera has y down and z ahead: both change their sign.
     let flipped = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
     let rotation = world_from_camera.rotation_matrix() * flipped;
     let at_m = world_from_camera.position_m;

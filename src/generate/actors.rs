@@ -57,6 +57,7 @@ pub fn actor_models() -> Vec<ActorModel> {
     for (name, kind, paint, detail) in cars {
         let car = Car::model(kind, paint);
         let mut painter = Painter::detailed(&light, detail);
+        // Without the shade below: it belongs to the road, and the car will drive away.
         car.paint_model(&mut painter);
         let DVec3 { x: length_m, y: width_m, z: height_m } = car.size_m();
         models.push(ActorModel {
@@ -66,6 +67,7 @@ pub fn actor_models() -> Vec<ActorModel> {
             gaussians: above_ground(&painter.gaussians),
         });
     }
+    // The spacings of these models are those of a near object already.
     let mut painter = Painter::detailed(&light, 1);
     pedestrian::paint(&mut painter);
     models.push(ActorModel {
@@ -95,10 +97,12 @@ pub fn actor_models() -> Vec<ActorModel> {
 
 /// A crate of boards.
 fn paint_crate(painter: &mut Painter) {
+    // 51 break points: cells of 2 cm on a face of 1 m.
     let ends_m: Vec<f64> = (0..=50).map(|k| -0.5 + 0.02 * f64::from(k)).collect();
     let wood = Paint::matt(0.62, 0.47, 0.30);
     // Outward normal and the two directions of each face, u x v.
     let faces = [
+        // No face below: the crate stands on it.
         (DVec3::X, DVec3::Y, DVec3::Z),
         (DVec3::NEG_X, DVec3::NEG_Y, DVec3::Z),
         (DVec3::Y, DVec3::NEG_X, DVec3::Z),
@@ -108,6 +112,7 @@ fn paint_crate(painter: &mut Painter) {
     for (normal, u, v) in faces {
         let place = |a_m: f64, b_m: f64| 0.5 * DVec3::Z + 0.5 * normal + a_m * u + b_m * v;
         painter.sheet(&ends_m, &ends_m, place, |a_m, b_m| {
+            // A frame of 8 cm, and within it six boards with gaps of a tenth of their width.
             let is_edge = a_m.abs().max(b_m.abs()) > 0.42;
             let is_gap = ((b_m + 0.5) * 6.0).fract() < 0.1;
             Some(match (is_edge, is_gap) {
@@ -143,6 +148,7 @@ mod tests {
                 high_m = high_m.max(DVec3::from_array(mean_m));
             }
             // Door mirrors reach beyond a car's width, as they do beyond the width in its papers.
+            // Surfels reach beyond the box by their size, too.
             let beyond_m = DVec3::new(0.12, 0.2, 0.05);
             let wanted_low_m = DVec3::new(-half_m.x, -half_m.y, 0.0);
             let wanted_high_m = DVec3::new(half_m.x, half_m.y, 2.0 * half_m.z);
@@ -150,6 +156,7 @@ mod tests {
             assert!(high_m.cmple(wanted_high_m + beyond_m).all(), "{name}: {high_m}");
             let fills = (high_m - low_m) / (wanted_high_m - wanted_low_m);
             assert!(fills.cmpge(DVec3::splat(0.8)).all(), "{name} fills {fills} of its box");
+            // From a crate to a bus.
             assert!((4_000..120_000).contains(&gaussians.len()), "{name}: {}", gaussians.len());
         }
     }

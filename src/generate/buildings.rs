@@ -35,10 +35,14 @@ pub(super) fn plan(route: &Route, cross_s_m: f64, seed: u64) -> Vec<Building> {
         let breaks_m = fronts(&mut random, ends_m);
         let first = buildings.len();
         for (index, pair) in breaks_m.windows(2).enumerate() {
+            // A wall is given by two ground points, so that a row may follow a bend.
             let front = Wall::between(at(pair[0]), at(pair[1]));
+            // A stream of its own for each house: another width of one changes no other house.
             let mut random = Random::new(seed, name, index + 1);
             let main = name.starts_with("main");
             let style = style(&mut random, main);
+            // Houses where no camera drives are coarser: 2.5 times the spacing takes a sixth of the
+            // Gaussians.
             let (s_m, _) = route.project(front.at(0.5 * front.width_m, 0.0, 0.0));
             let beyond_m = route.beyond_m(s_m);
             let near = main && beyond_m < 32.0;
@@ -54,12 +58,14 @@ pub(super) fn plan(route: &Route, cross_s_m: f64, seed: u64) -> Vec<Building> {
             buildings.push(Building {
                 front,
                 style,
+                // Only the outer sides of a row's first and last house face a street.
                 open_sides: [open[0] && index == 0, open[1] && last],
                 neighbours_m: [0.0; 2],
                 spacing,
                 random,
             });
         }
+        // Only within the row: corner houses of two rows are not neighbours.
         for index in first..buildings.len() {
             if index > first {
                 buildings[index].neighbours_m[0] = buildings[index - 1].style.height_m();
@@ -82,6 +88,7 @@ pub(super) fn plan(route: &Route, cross_s_m: f64, seed: u64) -> Vec<Building> {
 
     // The side street begins behind the corner houses.
     let crossing = route.at(cross_s_m);
+    // In the axes of the crossing, since the side street is straight.
     let side_point = |t_m: f64, d_m: f64| crossing.beside(t_m, 0.0) + d_m * crossing.forward;
     let (near_m, far_m) = (FRONT_M + DEPTH_M, SIDE_REACH_M);
     let before = |t_m: f64| side_point(t_m, -SIDE_FRONT_M);
@@ -111,11 +118,13 @@ impl Building {
     /// The body that casts the house's shadow.
     pub(super) fn occluder(&self) -> Occluder {
         let Wall { width_m, right, .. } = self.front;
+        // The middle of the ground plan: half the depth behind the front.
         let base_m = self.front.at(0.5 * width_m, 0.0, -0.5 * DEPTH_M);
         let height_m = self.style.height_m() + 1.0;
         Occluder::Block {
             base_m,
             along: right,
+            // 2 cm less deep than the house, or its own front would lie in its shadow.
             size_m: DVec3::new(0.5 * width_m, 0.5 * DEPTH_M - 0.02, height_m),
         }
     }
@@ -143,9 +152,11 @@ impl Building {
             if self.open_sides[side] {
                 let style =
                     Style { balconies: false, ground_floor: GroundFloor::Flats, ..self.style };
+                // A side is seen at a grazing angle only.
                 painter.coarser(1.25, |painter| facade::paint(painter, &wall, &style, random));
                 self.back(painter, &wall);
             } else if self.neighbours_m[side] < top_m {
+                // The part above a lower neighbour.
                 let us = painter.even(0.0, DEPTH_M, 0.8);
                 let vs = painter.even(self.neighbours_m[side], top_m, 0.8);
                 let paint = self.style.wall.times(0.92);
@@ -161,6 +172,7 @@ impl Building {
     fn back(&self, painter: &mut Painter, wall: &Wall) {
         let (inset_m, top_m) = (1.6, self.style.height_m() - 1.6);
         let rotation = DQuat::from_mat3(&DMat3::from_cols(wall.right, DVec3::Z, wall.out));
+        // 2.2 m: nothing but a dark colour is seen of it.
         let us = painter.even(inset_m, wall.width_m - inset_m, 2.2);
         let vs = painter.even(0.6, top_m, 2.2);
         for v in vs.windows(2) {
@@ -193,6 +205,7 @@ impl Building {
         let gable = self.style.wall.times(0.92);
         let depths = [painter.even(-DEPTH_M, 0.0, 0.9), painter.even(0.0, DEPTH_M, 0.9)];
         for (u_m, depths, sign) in [(0.0, &depths[0], 1.0), (wall.width_m, &depths[1], -1.0)] {
+            // A triangle: `rise` above the ridge in the middle of the depth, 0 at both ends.
             let top_m = |depth_m: f64| rise_m * (1.0 - (depth_m / run_m + 1.0).abs());
             let place =
                 |d_m: f64, t: f64| wall.at(u_m, eaves_m + t * top_m(sign * d_m), sign * d_m);
@@ -202,6 +215,7 @@ impl Building {
         let brick = Paint::matt(0.52, 0.36, 0.31);
         for _ in 0..1 + random.below(2) {
             let u_m = random.range(1.5, wall.width_m - 1.5);
+            // Just in front of the ridge, which is half the depth behind the front.
             let at_m = wall.at(u_m, eaves_m, -run_m + 0.3);
             let (half_m, top_m) = (0.38, rise_m + 1.1);
             let vs = painter.even(rise_m - 1.0, top_m, 0.35);
@@ -233,6 +247,7 @@ fn fronts(random: &mut Random, [from_m, to_m]: [f64; 2]) -> Vec<f64> {
         at_m += random.range(FRONTS_M[0], FRONTS_M[1]);
         breaks_m.push(at_m);
     }
+    // A rest of less than half the narrowest front is given to the other houses.
     // Stretch the row so that its last house ends at the end of the row.
     if to_m - at_m > 0.5 * FRONTS_M[0] {
         at_m = to_m;

@@ -20,9 +20,11 @@ const ROUGH_M: f64 = 0.05;
 /// that of the system.
 pub fn canyon(count: usize, progress: &mut dyn FnMut(u64, u64)) -> Gaussians {
     let [half_length, half_width] = HALF_M;
+    // Road, two facades, and two ends.
     let areas_m2 =
         [4.0 * half_length * half_width, 4.0 * half_length * HEIGHT_M, 4.0 * half_width * HEIGHT_M];
     let area_m2: f64 = areas_m2.iter().sum();
+    // Each Gaussian has an equal part of the surface: n s^2 = area.
     let spacing_m = (area_m2 / count.max(1) as f64).sqrt();
     let mut random = Random::new(1, "canyon", 0);
     let mut gaussians = Gaussians::with_capacity(1, count);
@@ -30,6 +32,8 @@ pub fn canyon(count: usize, progress: &mut dyn FnMut(u64, u64)) -> Gaussians {
         if index % (1 << 16) == 0 {
             progress(index as u64, count as u64);
         }
+        // All numbers are drawn for every Gaussian, used or not, so that the stream does not depend
+        // on which surface it lies on.
         let (x, y) =
             (random.range(-half_length, half_length), random.range(-half_width, half_width));
         let (z, off) = (random.range(0.0, HEIGHT_M), random.range(-ROUGH_M, ROUGH_M));
@@ -44,6 +48,7 @@ pub fn canyon(count: usize, progress: &mut dyn FnMut(u64, u64)) -> Gaussians {
         } else {
             ([side * half_length + off, y, z], 0, 0.8)
         };
+        // 0.7 of the spacing in the surface, a tenth of that across it.
         let mut sigma_m = [0.7 * spacing_m; 3];
         sigma_m[across] *= 0.1;
         gaussians.means_m.push(mean_m);

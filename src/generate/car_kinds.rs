@@ -39,6 +39,7 @@ impl Kind {
         features.extend(self.rear_glass);
         features.extend(self.windscreen);
         features.sort_by(f64::total_cmp);
+        // Features closer than 1.2 % of the length, 5 cm of a car, are one.
         features.dedup_by(|b, a| *b - *a < 0.012);
         features
     }
@@ -46,6 +47,7 @@ impl Kind {
     /// A column of the knots at `x`, interpolated linearly.
     fn knotted(&self, x: f64, column: fn(&(f64, f64, f64)) -> f64) -> f64 {
         let last = self.knots.len() - 1;
+        // Between two knots, at an end the outer ones: `after` is 1 or more.
         let after = self.knots.iter().position(|knot| knot.0 >= x).unwrap_or(last).max(1);
         let (low, high) = (&self.knots[after - 1], &self.knots[after]);
         let t = ((x - low.0) / (high.0 - low.0)).clamp(0.0, 1.0);

@@ -40,6 +40,7 @@ impl Car {
             Paint::matt(0.24, 0.36, 0.33),
             Paint::matt(0.74, 0.70, 0.60),
         ]);
+        // Left is up x forward.
         let left = DVec3::Z.cross(forward);
         let tail_m = middle_m - 0.5 * kind.length_m * forward;
         Self { kind, tail_m, forward, left, paint: paint.gloss(0.14), spacing }
@@ -60,6 +61,7 @@ impl Car {
 
     /// Length, width and height, in metres.
     pub(super) fn size_m(&self) -> DVec3 {
+        // The outline is linear between knots, which lie close to hundredths of the length.
         let top_m = (0..=100).map(|i| self.kind.middle_line_m(f64::from(i) / 100.0));
         DVec3::new(self.kind.length_m, self.kind.width_m, top_m.fold(0.0, f64::max))
     }
@@ -82,7 +84,9 @@ impl Car {
                 size_m: DVec3::new(half_m, half_width_m, high_m - low_m),
             }
         };
+        // At 0.45 of the length every kind has its roof.
         let top_m = self.kind.middle_line_m(0.45);
+        // A little smaller than the painted body, which would shade itself otherwise.
         [
             block(0.02, 0.97, 0.10, 0.60, 0.5 * width_m - 0.06),
             block(0.16, 0.62, 0.60, top_m - 0.12, 0.5 * width_m - 0.22),
@@ -118,6 +122,7 @@ impl Car {
     fn inside(&self, painter: &mut Painter) {
         let Kind { length_m, width_m, .. } = *self.kind;
         let rotation = DQuat::from_mat3(&DMat3::from_cols(self.forward, self.left, DVec3::Z));
+        // Three ellipsoids along the body and one in the cabin.
         for (x, z_m, half_m) in
             [(0.22, 0.58, 0.26), (0.5, 0.58, 0.26), (0.78, 0.52, 0.20), (0.37, 0.98, 0.16)]
         {
@@ -137,6 +142,8 @@ impl Car {
         for pair in kind.features().windows(2) {
             let [from_m, to_m] = [pair[0] * kind.length_m, pair[1] * kind.length_m];
             if painter.is_detailed() {
+                // As many cells as the slope is long, not as its projection: the windscreen
+                // is steep.
                 let count = painter.even(0.0, self.slope_m(from_m, to_m), 0.14).len() - 1;
                 let step_m = (to_m - from_m) / count as f64;
                 xs.extend((1..=count).map(|k| from_m + k as f64 * step_m));
@@ -150,6 +157,8 @@ impl Car {
 
     /// Length of the middle line between two places along the car, in metres.
     fn slope_m(&self, from_m: f64, to_m: f64) -> f64 {
+        // Between two features the outline is straight, unless a knot was dropped as too close to
+        // another.
         const PARTS: i32 = 32;
         let part_m = (to_m - from_m) / f64::from(PARTS);
         let top_m =
@@ -173,6 +182,7 @@ impl Car {
         let vs = painter.even(0.0, 1.0, 0.16);
         let place = |x_m: f64, v: f64| {
             let x = x_m / length_m;
+            // 10 % narrower at the sill, 3 % at the shoulder.
             let belly = 1.0 - 0.10 * (1.0 - v) * (1.0 - v) - 0.03 * v * v;
             let z_m = SILL_M + v * (self.kind.belt_m(x) - SILL_M);
             self.place(x_m, side * belly * self.half_width_m(x), z_m)
@@ -187,6 +197,7 @@ impl Car {
             |u, v| {
                 let x_m = -side * u;
                 let z_m = SILL_M + v * (self.kind.belt_m(x_m / length_m) - SILL_M);
+                // A circle around the wheel, 7 cm larger than the tyre.
                 let arch = WHEELS.iter().any(|wheel| {
                     let dx_m = x_m - wheel * length_m;
                     dx_m * dx_m + (z_m - tyre_m).powi(2) < (tyre_m + 0.07).powi(2)
@@ -194,6 +205,7 @@ impl Car {
                 if arch {
                     return None;
                 }
+                // Door seams below the rear edges of the side windows.
                 let seam = self
                     .kind
                     .side_glass
@@ -201,6 +213,7 @@ impl Car {
                     .any(|glass| (x_m / length_m - glass[0]).abs() < 0.008 && z_m > 0.36);
                 let sill = if z_m < 0.34 { 0.45 } else { 1.0 };
                 let shade = if seam { 0.72 } else { 1.0 };
+                // The body near the road gets less light from the sky.
                 let open = 0.62 + 0.38 * smooth((z_m - 0.1) / 0.6);
                 Some(body.times(sill * shade).open(open))
             },
@@ -221,12 +234,14 @@ impl Car {
             let half_m = 0.97 * self.half_width_m(x);
             // The roof's crown is 12 % of the cabin's height above its edge.
             let cabin_m = (top_m - belt_m).max(0.0);
+            // The cabin's side leans in by `lean` of its height above the belt.
             let edge_m = half_m - 0.10 - self.kind.lean * (cabin_m - 0.06).max(0.0);
             let edge_z_m = belt_m + 0.88 * cabin_m;
             let (y_m, z_m) = if v < 1.0 {
                 (half_m + v * (edge_m - half_m), belt_m + v * (edge_z_m - belt_m))
             } else {
                 let inwards = v - 1.0;
+                // A parabola with a level top at the middle line.
                 let rise = 1.0 - (1.0 - inwards) * (1.0 - inwards);
                 (edge_m * (1.0 - inwards), edge_z_m + rise * (top_m - edge_z_m))
             };
@@ -303,6 +318,7 @@ impl Car {
             let count = count * detail;
             let step_rad = std::f64::consts::TAU / count as f64;
             // Outwards for either side: with r as v, u × v points to -left when u turns left.
+            // The last break point closes the circle.
             (0..=count).map(|i| side * i as f64 * step_rad).collect()
         };
         let arch = disc(tyre_m + 0.09, half_m - 0.16);
@@ -312,6 +328,7 @@ impl Car {
         let rings = painter.refined(&[0.0, 0.22, 0.48, 0.68, 0.82, 1.0]);
         let rim = Paint::matt(0.66, 0.67, 0.70).gloss(0.1);
         painter.sheet(&around(15), &rings, disc(tyre_m, half_m - 0.035), |angle_rad, r| {
+            // Five spokes, each 55 % of a fifth.
             let spoke = (angle_rad.abs() * 5.0 / std::f64::consts::TAU).fract() < 0.55;
             Some(if r > 0.68 {
                 Paint::matt(0.14, 0.14, 0.15)
@@ -333,6 +350,7 @@ impl Car {
 
     /// A door mirror: a small box with glass towards the tail.
     fn mirror(&self, painter: &mut Painter, side: f64) {
+        // Just behind the lower end of the windscreen.
         let x = self.kind.windscreen[1] - 0.055;
         let (x_m, z_m) = (x * self.kind.length_m, self.kind.belt_m(x) + 0.03);
         let inner_m = self.half_width_m(x) - 0.04;
@@ -364,6 +382,8 @@ impl Car {
             &ys,
             |x_m, y_m| self.place(x_m, y_m, 0.02),
             |x_m, y_m| {
+                // Darker towards the middle: 0.55 of the light at the edge, 0.15 from half
+                // a metre inwards.
                 let inside_m = (half_m - y_m.abs()).min(x_m).min(length_m - x_m);
                 Some(Paint::matt(0.30, 0.30, 0.31).open(0.55 - 0.4 * smooth(inside_m / 0.5)))
             },

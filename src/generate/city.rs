@@ -83,7 +83,10 @@ pub fn city_drive(settings: &CitySettings) -> Result<Trajectory, GenerateError> 
     let mut station_m = INDENT_M;
     let mut poses: Vec<Pose> = Vec::new();
     for Site { route, .. } in Streets::new(settings) {
+        // Each street up to its end, and the last one to the indent before the end of the route.
         let to_s_m = route.driven_m[1].min(settings.length_m - INDENT_M);
+        // `station_m` goes on from street to street, so that keyframes stay 0.5 m apart
+        // across the joint.
         poses.extend(route.poses(LANE_T_M, &mut station_m, to_s_m));
     }
     Ok(Trajectory { name: "log".into(), keyframes: route::keyframes(poses, settings.speed_m_s) })
@@ -98,6 +101,7 @@ pub fn city_map(settings: &CitySettings) -> Result<MapFile, GenerateError> {
     settings.check()?;
     let sites: Vec<(Route, f64)> = Streets::new(settings)
         .map(|site| {
+            // The same draw as for painting: the map has the crossing where the Gaussians have it.
             let crossing_m = site.crossing_m(&mut site.random(settings.seed));
             (site.route, crossing_m)
         })
@@ -113,6 +117,7 @@ impl Iterator for City {
     type Item = Cell;
 
     fn next(&mut self) -> Option<Cell> {
+        // A batch of streets may complete no cell.
         while self.done.is_empty() && self.paint() {}
         self.done.pop_front()
     }
@@ -123,6 +128,7 @@ impl City {
     /// whether there was a street left.
     fn paint(&mut self) -> bool {
         let count = rayon::current_num_threads().min(PAINTED_AT_ONCE);
+        // `planned[0]` was painted in the previous batch, and stays for its shadows.
         let first = usize::from(self.painted_any);
         // Houses of neighbouring streets cast shadows on each other.
         while self.planned.len() < first + count + 1
@@ -141,8 +147,10 @@ impl City {
         for gaussians in painted {
             self.file(&gaussians);
         }
+        // The last painted one stays as the neighbour of the next.
         self.planned.drain(..last - 1);
         self.painted_any = true;
+        // The west end of the next street; without one, everything is complete.
         let to_come_m =
             self.planned.get(1).map(|next| next.route.at(next.route.ends_m[0]).point_m.x);
         self.close(to_come_m.map_or(f64::INFINITY, |x_m| x_m - ASIDE_M));
@@ -153,6 +161,7 @@ impl City {
     fn file(&mut self, gaussians: &Gaussians) {
         let mut counts: BTreeMap<[i32; 2], usize> = BTreeMap::new();
         for mean_m in &gaussians.means_m {
+            // Counted first, so that each cell grows once and to its exact size.
             *counts.entry(chunk::cell_at(mean_m)).or_default() += 1;
         }
         for (cell, count) in counts {
@@ -178,6 +187,7 @@ impl City {
 
 /// Paints one of the planned streets in the light that its neighbours leave.
 fn paint(planned: &[Plan], at: usize, density: f64) -> Gaussians {
+    // At most one street to each side: a shadow is no longer than a house is high.
     let near = &planned[at.saturating_sub(1)..planned.len().min(at + 2)];
     let light = Light::new(near.iter().flat_map(Plan::occluders).collect());
     let mut painter = Painter::new(&light, density);
@@ -201,6 +211,7 @@ impl Site {
     fn crossing_m(&self, random: &mut Random) -> f64 {
         let [from_m, to_m] = self.route.driven_m;
         let middle_m = 0.5 * (from_m + to_m);
+        // At most a tenth of the length from its middle.
         // A street of 100 m, the shortest, leaves 40 m on either side.
         middle_m + 0.1 * (to_m - from_m) * random.range(-1.0, 1.0)
     }
@@ -259,15 +270,18 @@ impl Iterator for Streets {
         let long_m = if left_m <= longest_m {
             left_m
         } else if left_m <= 2.0 * shortest_m {
+            // Two streets remain: equal halves, so that the last is not too short.
             (0.5 * left_m).floor()
         } else {
             let mut random = Random::new(self.seed, "length", self.index);
+            // A rest of a shortest street must remain.
             random.range(shortest_m, longest_m).min(left_m - shortest_m).floor()
         };
         let driven_m = [self.station_m, self.station_m + long_m];
         let closed = [self.index == 0, driven_m[1] >= self.length_m];
         let beyond_m = closed.map(|closed| if closed { BEYOND_M } else { 0.0 });
         let ends_m = [driven_m[0] - beyond_m[0], driven_m[1] + beyond_m[1]];
+        // Every street has the same bends, and begins where the one before it ends.
         let mut route = Route::line(self.bends, ends_m, self.station_m, self.point_m);
         (route.driven_m, route.closed) = (driven_m, closed);
         self.station_m = driven_m[1];

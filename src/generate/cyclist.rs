@@ -27,6 +27,7 @@ pub(super) fn paint(painter: &mut Painter) {
 /// A tyre, seen from both sides, and its spokes.
 fn wheel(painter: &mut Painter, x_m: f64) {
     for side in [1.0, -1.0] {
+        // Forwards for the left face and backwards for the right, so that both look outwards.
         let turns: Vec<f64> = (0..=96).map(|k| side * TAU * f64::from(k) / 96.0).collect();
         let place = |turn_rad: f64, radius_m: f64| {
             let (sin, cos) = turn_rad.sin_cos();
@@ -35,6 +36,7 @@ fn wheel(painter: &mut Painter, x_m: f64) {
         painter
             .sheet(&turns, &[WHEEL_M - 0.05, WHEEL_M - 0.025, WHEEL_M], place, |_, _| Some(RUBBER));
         painter.sheet(&turns, &[0.03, 0.15, WHEEL_M - 0.05], place, |turn_rad, _| {
+            // 16 spokes, each a fifth of its sector; between them is nothing.
             let is_spoke = (turn_rad.abs() * 16.0 / TAU).fract() < 0.2;
             is_spoke.then_some(Paint::matt(0.6, 0.6, 0.62))
         });

@@ -22,6 +22,7 @@ impl Wall {
     /// The wall between two ground points, `left_m` and `right_m` as seen from outside.
     pub(super) fn between(left_m: DVec3, right_m: DVec3) -> Self {
         let right = (right_m - left_m).normalize();
+        // Right x up.
         let out = right.cross(DVec3::Z);
         Self { corner_m: left_m, right, out, width_m: left_m.distance(right_m) }
     }
@@ -84,6 +85,7 @@ impl Style {
 
 /// Paints a wall with everything in it.
 pub(super) fn paint(painter: &mut Painter, wall: &Wall, style: &Style, random: &mut Random) {
+    // As many bays as fit, at least one; their width is adjusted.
     let count = (wall.width_m / style.bay_m).round().max(1.0) as usize;
     let mut facade = Facade { painter, wall, style, bay_m: wall.width_m / count as f64 };
     let door = random.below(count);
@@ -98,11 +100,13 @@ pub(super) fn paint(painter: &mut Painter, wall: &Wall, style: &Style, random: &
     for floor in 0..style.upper_floors {
         let from_m = GROUND_FLOOR_M + FLOOR_M * floor as f64;
         // Higher floors are farther from every camera.
+        // A third coarser for each floor.
         facade.painter.coarser(1.0 + 0.32 * floor as f64, |painter| {
             let mut facade = Facade { painter, ..facade };
             for bay in 0..count {
                 let u_m = bay as f64 * facade.bay_m;
                 facade.window_bay(u_m, [from_m, from_m + FLOOR_M], 0.85, random);
+                // Every second bay, the same ones on all floors, with one in the middle.
                 let centred = bay % 2 == count / 2 % 2;
                 if style.balconies && style.near && centred {
                     facade.balcony(u_m + 0.5 * facade.bay_m, from_m);
@@ -130,9 +134,11 @@ pub(super) const RECESS_M: f64 = 0.14;
 impl Facade<'_, '_, '_> {
     /// One bay of one floor: wall around a window whose sill is `sill_m` above the floor.
     fn window_bay(&mut self, u_m: f64, v_m: [f64; 2], sill_m: f64, random: &mut Random) {
+        // 42 % of the bay, but 0.9 to 1.5 m wide.
         let half_m = 0.5 * (0.42 * self.bay_m).clamp(0.9, 1.5);
         let middle_m = u_m + 0.5 * self.bay_m;
         let u = [middle_m - half_m, middle_m + half_m];
+        // 35 cm of wall at least above the window.
         let v = [v_m[0] + sill_m, (v_m[0] + sill_m + self.style.window_m).min(v_m[1] - 0.35)];
         self.pier([u_m, u[0]], v_m);
         self.pier([u[1], u_m + self.bay_m], v_m);
@@ -161,12 +167,15 @@ impl Facade<'_, '_, '_> {
         let at_m = self.wall.corner_m;
         self.rect(us, vs, 0.0, |u_m, v_m| {
             // Stains are vertical, and splashes from the pavement darken the bottom of the wall.
+            // A wall of its own pattern, by the place of its corner.
             let seed = (at_m.x * 16.0) as i64 as u64;
             let stain = 0.030 * noise(seed, 1.3 * u_m, 0.25 * v_m)
                 + 0.025 * noise(seed.wrapping_add(1), 0.3 * u_m, 0.3 * v_m);
             let grain = if style.brick {
                 0.06 * noise(
                     seed.wrapping_add(2),
+                    // Courses of 12.5 cm, each moved by half a cell of the noise against the one
+                    // below.
                     3.1 * u_m + (v_m * 8.0).floor() * 0.5,
                     (v_m * 8.0).floor(),
                 )
@@ -214,6 +223,7 @@ impl Facade<'_, '_, '_> {
         let middle_m = 0.5 * (u[0] + u[1]);
         let transom_m = v[1] - 0.30 * (v[1] - v[0]);
         let verticals = [u[0] + 0.5 * rim_m, middle_m, u[1] - 0.5 * rim_m];
+        // From far away a window is a dark rectangle.
         if !self.style.near {
             let us = self.painter.even(u[0], u[1], 0.2);
             let vs = self.painter.even(v[0], v[1], 0.2);
@@ -264,6 +274,7 @@ impl Facade<'_, '_, '_> {
     fn balcony(&mut self, middle_m: f64, floor_m: f64) {
         let (half_m, deep_m) = ((0.42 * self.bay_m).min(1.3), 0.95);
         let u = [middle_m - half_m, middle_m + half_m];
+        // Slab, its lower side, upper rail, bars, and both ends.
         let stone = self.style.trim;
         let us = self.painter.even(u[0], u[1], 0.3);
         self.rect(&us, &[floor_m - 0.12, floor_m + 0.06], deep_m, |_, _| stone);

@@ -16,6 +16,7 @@ pub(super) fn lamp(painter: &mut Painter, foot_m: DVec3, towards_road: DVec3) {
     let head_m = top_m + 1.3 * towards_road + 0.25 * DVec3::Z;
     pole(painter, [top_m, head_m], 0.035, STEEL);
     let along = towards_road.cross(DVec3::Z);
+    // The lamp's head hangs over the road.
     block(painter, head_m + 0.30 * towards_road, along, DVec3::new(0.13, 0.34, 0.09), STEEL);
     let glow = Patch {
         center_m: head_m + 0.30 * towards_road - 0.012 * DVec3::Z,
@@ -29,6 +30,7 @@ pub(super) fn lamp(painter: &mut Painter, foot_m: DVec3, towards_road: DVec3) {
 pub(super) fn traffic_light(painter: &mut Painter, foot_m: DVec3, facing: DVec3, green: bool) {
     pole(painter, [foot_m, foot_m + 3.5 * DVec3::Z], 0.065, STEEL);
     let right = DVec3::Z.cross(facing);
+    // From top to bottom: red, yellow, green.
     let dark = Paint::matt(0.11, 0.12, 0.12);
     let base_m = foot_m + 2.45 * DVec3::Z + 0.17 * facing;
     block(painter, base_m, right, DVec3::new(0.16, 0.13, 0.98), dark);
@@ -86,6 +88,7 @@ pub(super) fn planter(
 fn pole(painter: &mut Painter, ends_m: [DVec3; 2], radius_m: f64, paint: Paint) {
     let axis = (ends_m[1] - ends_m[0]).normalize();
     let (side, front) = axis.any_orthonormal_pair();
+    // Six cells around at the usual spacing: TAU/1.05.
     let around = painter.even(0.0, std::f64::consts::TAU, 1.05);
     let step_m = (5.0 * radius_m).clamp(0.15, 0.40);
     let along = painter.even(0.0, ends_m[0].distance(ends_m[1]), step_m);
@@ -100,6 +103,7 @@ fn pole(painter: &mut Painter, ends_m: [DVec3; 2], radius_m: f64, paint: Paint) 
 fn block(painter: &mut Painter, base_m: DVec3, along: DVec3, size_m: DVec3, paint: Paint) {
     let across = DVec3::Z.cross(along);
     let corner = |i: f64, j: f64| base_m + i * size_m.x * along + j * size_m.y * across;
+    // Counter-clockwise from above, so that every side looks outwards.
     let corners = [corner(-1.0, -1.0), corner(1.0, -1.0), corner(1.0, 1.0), corner(-1.0, 1.0)];
     let vs = painter.graded(0.0, size_m.z, 0.10, 0.22);
     for side in 0..4 {

@@ -21,6 +21,7 @@ impl Facade<'_, '_, '_> {
         let us = self.painter.graded(u[0], u[1], 0.06, 0.16);
         let vs = self.painter.graded(0.0, door_m, 0.06, 0.22);
         self.rect(&us, &vs, -RECESS_M, |at_m, v_m| {
+            // Two sunken panels on either side of the middle.
             let panel = |x: f64, from: f64, to: f64| (from..to).contains(&x);
             let aside_m = (at_m - middle_m).abs() / half_m;
             let inset =
@@ -59,6 +60,7 @@ impl Facade<'_, '_, '_> {
             accent.times(0.7).open(0.7 + 0.5 * v_m)
         });
         // Goods: blurred shelves of colours behind the glass.
+        // Below 2^30, so that adding a channel does not overflow.
         let seed = random.below(1 << 30) as u64;
         let panes = self.painter.graded(plinth_m, head_m, 0.08, 0.22);
         self.rect(&us, &panes, -0.10, |at_m, v_m| {
@@ -78,6 +80,7 @@ impl Facade<'_, '_, '_> {
         // The sign, with blocks in place of letters.
         let signs = self.painter.graded(head_m, sign_m, 0.09, 0.12);
         let letters = self.painter.even(u[0], u[1], 0.13);
+        // Light letters on a dark sign, dark ones on a light sign.
         let lettering = if accent.rgb.element_sum() > 1.5 { 0.25 } else { 0.93 };
         self.rect(&letters, &signs, 0.06, |at_m, v_m| {
             let inside = (v_m - 0.5 * (head_m + sign_m)).abs() < 0.17
@@ -86,6 +89,7 @@ impl Facade<'_, '_, '_> {
             let letter = Paint::matt(lettering, lettering, 0.95 * lettering);
             if inside && ink { letter } else { accent }
         });
+        // Two of three shops have an awning.
         if !seed.is_multiple_of(3) {
             self.awning(u, head_m + 0.05, accent);
         }

@@ -125,6 +125,7 @@ pub fn street(settings: &StreetSettings) -> Result<Street, GenerateError> {
 /// Names the first setting out of range.
 pub fn street_map(settings: &StreetSettings) -> Result<MapFile, GenerateError> {
     settings.check()?;
+    // No Gaussian is made: the map needs only the plan's numbers.
     let route = route::Route::new(settings.length_m);
     Ok(map::build_map(&[map::MappedStreet { route: &route, crossing_m: settings.crossing_m }]))
 }
@@ -152,6 +153,7 @@ impl StreetSettings {
             (
                 "crossing_m",
                 crossing_m,
+                // Room for the junction, the zebra crossings and a house on either side.
                 crossing_m >= 40.0 && crossing_m <= length_m - 40.0,
                 "the crossing is at least 40 m from both ends",
             ),
@@ -198,6 +200,7 @@ impl CitySettings {
         // Pairs of (counted millions of Gaussians per km, density). They are not proportional,
         // because the numbers of leaves and windows do not depend on the density.
         let counted = [(0.826, 0.432), (2.200, 2.0), (4.419, 5.0), (9.261, 12.0)];
+        // The segment around the number; beyond the ends of the list the outer segments go on.
         let above = counted.iter().rposition(|(millions, _)| *millions <= self.millions_per_km);
         let from = above.unwrap_or(0).min(counted.len() - 2);
         let [(low, low_density), (high, high_density)] = [counted[from], counted[from + 1]];

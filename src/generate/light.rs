@@ -57,6 +57,7 @@ pub(super) struct Light {
 impl Light {
     /// The light of a street with these occluders.
     pub(super) fn new(occluders: Vec<Occluder>) -> Self {
+        // Each occluder's shadow on the ground, as a box.
         let reaches: Vec<_> = occluders.iter().map(shadow_box_m).collect();
         let low_m = reaches.iter().fold(DVec2::INFINITY, |low, reach| low.min(reach[0]));
         let high_m = reaches.iter().fold(DVec2::NEG_INFINITY, |high, reach| high.max(reach[1]));
@@ -76,6 +77,7 @@ impl Light {
         let mut cells = vec![Vec::new(); columns * rows];
         for (index, [low_m, high_m]) in reaches.into_iter().enumerate() {
             let (low, high) = (cell_index(low_m), cell_index(high_m));
+            // Into every cell that its box touches: a point is looked up in one cell only.
             for row in low[1]..=high[1] {
                 for column in low[0]..=high[0] {
                     let (row, column) = (row - first_cell[1], column - first_cell[0]);
@@ -96,9 +98,12 @@ impl Light {
     pub(super) fn on(&self, point_m: DVec3, normal: DVec3) -> DVec3 {
         if self.overhead {
             let up = 0.5 + 0.5 * normal.z;
+            // No direction but up, so that a turning car is not lit from a side that turns with it.
             return 0.55 * normal.z.max(0.0) * SUN + 1.35 * (up * SKY + (1.0 - up) * GROUND);
         }
         let facing = normal.dot(TO_SUN).max(0.0);
+        // Not asked for a surface that faces away. 6 cm off the surface, which would shade
+        // itself otherwise.
         let sun = if facing > 0.0 { facing * self.sun_at(point_m + 0.06 * normal) } else { 0.0 };
         let up = 0.5 + 0.5 * normal.z;
         sun * SUN + up * SKY + (1.0 - up) * GROUND
@@ -106,9 +111,13 @@ impl Light {
 
     /// Share of the sunlight that reaches a point through all occluders, 0 to 1.
     fn sun_at(&self, point_m: DVec3) -> f64 {
+        // A point above the ground is shaded by the occluders whose shadow falls where its
+        // own does.
         let shadow_m = on_ground(point_m);
         let cell = cell_index(shadow_m);
         let (column, row) = (cell[0] - self.first_cell[0], cell[1] - self.first_cell[1]);
+        // A row beyond the last is caught by `get`; a column would be taken for one of the
+        // next row.
         if column < 0 || row < 0 || column >= self.columns as i64 {
             return 1.0;
         }
@@ -133,8 +142,12 @@ impl Occluder {
                     (offset_m.dot(across), TO_SUN.dot(across), -size_m.y, size_m.y),
                     (offset_m.z, TO_SUN.z, 0.0, size_m.z),
                 ];
+                // The slab method (Kay and Kajiya 1986): the ray is within the box between the last
+                // entry and the first exit.
                 let (mut enter_m, mut leave_m) = (0.0_f64, f64::INFINITY);
                 for (position_m, slope, low_m, high_m) in slabs {
+                    // A ray parallel to a slab never leaves it: a tiny slope puts entry and
+                    // exit far away.
                     let slope = if slope.abs() < 1e-9 { 1e-9 } else { slope };
                     let (a_m, b_m) = ((low_m - position_m) / slope, (high_m - position_m) / slope);
                     enter_m = enter_m.max(a_m.min(b_m));
@@ -144,6 +157,8 @@ impl Occluder {
                 1.0 - smooth((leave_m - enter_m) / 0.5)
             }
             Self::Crown { center_m, radius_m } => {
+                // Pythagoras: from the ray's distance to the centre follows half the chord
+                // within the ball.
                 let offset_m = center_m - point_m;
                 let ahead_m = offset_m.dot(TO_SUN);
                 let miss_m2 = offset_m.length_squared() - ahead_m * ahead_m;
@@ -152,6 +167,7 @@ impl Occluder {
                     return 1.0;
                 }
                 let half_chord_m = half_chord_m2.sqrt();
+                // Only the part of the chord ahead of the point: it may lie within the crown.
                 let chord_m = (ahead_m + half_chord_m).max(0.0) - (ahead_m - half_chord_m).max(0.0);
                 // Light falls through gaps of about 0.4 m.
                 let shadow_m = on_ground(point_m);
@@ -196,6 +212,7 @@ mod tests {
         let light =
             Light::new(vec![Occluder::Block { base_m: DVec3::ZERO, along: DVec3::X, size_m }]);
         let sun = |x: f64, y: f64| light.sun_at(DVec3::new(x, y, 0.0));
+        // 5 m high: the shadow lies 5/0.693 times the sun's horizontal part away, on the far side.
         // The middle of the shadow of a point at half the height.
         let behind_m = -TO_SUN * (5.0 / TO_SUN.z);
         assert_eq!(sun(behind_m.x, behind_m.y), 0.0);

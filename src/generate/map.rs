@@ -78,6 +78,7 @@ impl MappedStreet<'_> {
     fn add_strip(&self, map: &mut MapFile, index: usize, is_last: bool, strip: &Strip) {
         let [from_m, to_m] = self.route.driven_m;
         let [before_m, after_m] = [self.crossing_m - STOP_M[1], self.crossing_m + STOP_M[1]];
+        // Before, in and after the intersection: a lane of the map lies in it or does not.
         let parts = [[from_m, before_m], [before_m, after_m], [after_m, to_m]];
         let id = |street: usize, side: &str, part: usize| {
             format!("street-{street}/{}-{side}/{part}", strip.name)
@@ -95,6 +96,7 @@ impl MappedStreet<'_> {
                 _ => Some(id(index, "right", part + 1)),
             };
             let next = next.into_iter().filter(|_| drives).collect();
+            // The right side of the street runs with s, so its left edge is the inner one.
             let edges_m = [-strip.inner_m, -strip.middle_m, -strip.outer_m];
             let [left, center, right] = edges_m.map(|t_m| self.line(span_m, t_m, strip.height_m));
             let limit_mps = drives.then_some(LIMIT_MPS);
@@ -117,6 +119,7 @@ impl MappedStreet<'_> {
             };
             let next = next.into_iter().filter(|_| drives).collect();
             let edges_m = [strip.inner_m, strip.middle_m, strip.outer_m];
+            // Against s: the same points in the opposite order.
             let [left, center, right] = edges_m.map(|t_m| {
                 let mut line = self.line(span_m, t_m, strip.height_m);
                 line.reverse();
@@ -177,6 +180,7 @@ impl MappedStreet<'_> {
 
     /// Points along the street at a distance from its centre line, both ends included.
     fn line(&self, [from_m, to_m]: [f64; 2], t_m: f64, height_m: f64) -> Vec<[f64; 3]> {
+        // Equal steps of at most 2 m, so that both ends are points of the line.
         let count = ((to_m - from_m) / SPACING_M).ceil().max(1.0) as usize;
         let station_m = |at: usize| from_m + (to_m - from_m) * at as f64 / count as f64;
         (0..=count).map(|at| self.point(station_m(at), t_m, height_m)).collect()
@@ -209,6 +213,7 @@ mod tests {
             let in_right =
                 lanes.iter().any(|lane| map.file().lanes[*lane].id.contains("lane-right"));
             assert!(in_right, "{point_m}");
+            // The drive is 1.75 m right of the centre line, and each lane 3.6 m wide.
             // 1.85 m to the right and 5.35 m to the left are the edges of the carriageway.
             let at = |left_m: f64| pose.transform_point(left_m * glam::DVec3::Y).truncate();
             assert!(map.is_drivable(at(-1.8)) && map.is_drivable(at(5.3)), "{point_m}");
@@ -220,6 +225,7 @@ mod tests {
             lane = map.lane(next).unwrap();
             count += 1;
         }
+        // Three parts of each street, and 700 m have at least three streets.
         assert!(count >= 9 && count % 3 == 0, "{count} parts");
         assert!(
             lane.center.last().unwrap()[0]
@@ -234,6 +240,8 @@ mod tests {
         let kinds =
             |kind: LaneKind| map.file().lanes.iter().filter(|lane| lane.kind == kind).count();
         let counts = [LaneKind::Driving, LaneKind::Parking, LaneKind::Sidewalk].map(kinds);
+        // Lanes have three parts on both sides; bays and pavements two, as they leave the
+        // intersection out.
         assert_eq!(counts, [6, 4, 4]);
         let crosswalk = map.file().areas.iter().find(|area| area.kind == AreaKind::Crosswalk);
         let corners = crosswalk.unwrap().outline.iter();

@@ -57,6 +57,7 @@ fn leg(painter: &mut Painter, side: f64, ahead: f64) {
     let toe = |along_m: f64, up_m: f64| {
         [ankle_x + along_m, 0.03 + 0.8 * lifted_m + pitch * (along_m - 0.05) + up_m]
     };
+    // No ring below the ground: at least its own half height above it.
     let shoe = |along_m: f64, up_m: f64, half_width_m: f64, half_m: f64| {
         let [x, z] = toe(along_m, up_m);
         ring(x, y, z.max(half_m + 0.004), half_width_m, half_m)
@@ -172,12 +173,14 @@ pub(super) fn tube(painter: &mut Painter, rings: &[Ring], paint: impl Fn(DVec3) 
     // Break points along the tube, by index of the ring.
     let mut along = vec![0.0];
     for (index, pair) in rings.windows(2).enumerate() {
+        // A tube that widens quickly, such as a shoulder, needs cells along its slope.
         let grows_m = pair[1].half_width_m - pair[0].half_width_m;
         let length_m = pair[0].center_m.distance(pair[1].center_m).hypot(grows_m);
         let count = (length_m / CELL_M).ceil().max(1.0);
         along.extend((1..=count as usize).map(|k| index as f64 + k as f64 / count));
     }
     let widest_m = rings.iter().fold(0.0_f64, |most, ring| most.max(ring.half_width_m));
+    // As many cells around as the widest ring needs; narrow rings have smaller ones.
     let count = (std::f64::consts::TAU * widest_m / CELL_M).ceil().max(8.0);
     let turns: Vec<f64> =
         (0..=count as usize).map(|k| std::f64::consts::TAU * k as f64 / count).collect();
@@ -185,6 +188,7 @@ pub(super) fn tube(painter: &mut Painter, rings: &[Ring], paint: impl Fn(DVec3) 
     let at = |position: f64| {
         let index = (position.floor() as usize).min(rings.len() - 2);
         let t = position - index as f64;
+        // Beyond the ends the last ring is repeated.
         let ring = |offset: isize| {
             let index = (index as isize + offset).clamp(0, rings.len() as isize - 1);
             rings[index as usize]
@@ -199,6 +203,7 @@ pub(super) fn tube(painter: &mut Painter, rings: &[Ring], paint: impl Fn(DVec3) 
         let center_m = DVec3::new(of(|r| r.center_m.x), of(|r| r.center_m.y), of(|r| r.center_m.z));
         Ring {
             center_m,
+            // The cubic may overshoot below 0 where a tube ends in a point.
             half_width_m: of(|r| r.half_width_m).max(0.002),
             half_depth_m: of(|r| r.half_depth_m).max(0.002),
         }
@@ -206,6 +211,7 @@ pub(super) fn tube(painter: &mut Painter, rings: &[Ring], paint: impl Fn(DVec3) 
     let last = (rings.len() - 1) as f64;
     let place = |turn_rad: f64, position: f64| {
         let Ring { center_m, half_width_m, half_depth_m } = at(position);
+        // The direction as a central difference of a tenth of a ring, one-sided at the ends.
         let ahead_m = at((position + 0.05).min(last)).center_m;
         let behind_m = at((position - 0.05).max(0.0)).center_m;
         let direction = (ahead_m - behind_m).normalize_or(DVec3::Z);

@@ -43,6 +43,7 @@ impl Tree {
         stem(painter, [self.foot_m, top_m], [0.17, 0.11], bark);
         let turn_rad = random.range(0.0, std::f64::consts::TAU);
         for branch in 0..4 {
+            // Four branches, a quarter turn apart.
             let (sin, cos) = (turn_rad + 1.57 * f64::from(branch)).sin_cos();
             let tip_m = 0.55 * self.crown_m * DVec3::new(cos, sin, 1.6);
             stem(painter, [top_m - 0.3 * DVec3::Z, top_m + tip_m], [0.08, 0.03], bark);
@@ -55,6 +56,8 @@ impl Tree {
             Paint::matt(0.50, 0.57, 0.25),
             Paint::matt(0.34, 0.48, 0.27),
         ]);
+        // Far trees have fewer and larger leaves: 26 x 0.115^2 covers as much as 88 x
+        // 0.057^2 and a fifth more.
         let (leaves, size_m) = if self.near { (88, 0.057) } else { (26, 0.115) };
         for _ in 0..14 {
             let away = ball(&mut random) * DVec3::new(0.64, 0.64, 0.72);
@@ -89,6 +92,7 @@ pub(super) fn hedge(
     let green = Paint::matt(0.34, 0.46, 0.22);
     let count = (size_m.x / 0.22).ceil() as usize;
     for i in 0..count {
+        // The middles of equal parts from -size to +size.
         let x_m = (2.0 * (i as f64 + 0.5) / count as f64 - 1.0) * size_m.x;
         let middle_m = base_m + x_m * along + 0.55 * size_m.z * DVec3::Z;
         let radii_m = DVec3::new(0.30, size_m.y, 0.5 * size_m.z);
@@ -111,6 +115,7 @@ impl Foliage {
         let core = painter.shade(middle_m, DVec3::Z, &green.times(0.45).open(0.8));
         painter.gaussian(middle_m, DQuat::IDENTITY, 0.36 * radii_m, 0.9, core, DVec3::ZERO);
         for _ in 0..self.leaves {
+            // Uniform on the sphere, from a point in the ball.
             let away = ball(random).normalize_or_zero();
             let depth = random.range(0.70, 1.08);
             let mean_m = middle_m + depth * away * radii_m;
@@ -150,6 +155,7 @@ fn stem(painter: &mut Painter, ends_m: [DVec3; 2], radii_m: [f64; 2], bark: Pain
 
 /// Uniform in the unit ball.
 fn ball(random: &mut Random) -> DVec3 {
+    // Rejection: the ball fills pi/6, about half, of the cube.
     loop {
         let mut axis = || random.range(-1.0, 1.0);
         let point = DVec3::new(axis(), axis(), axis());

@@ -9,6 +9,7 @@ pub(super) fn noise(seed: u64, x: f64, y: f64) -> f64 {
     let (column, row) = (x.floor(), y.floor());
     let (tx, ty) = (smooth(x - column), smooth(y - row));
     let corner = |i: f64, j: f64| {
+        // Two rounds of the hash, or points of one diagonal would share their value.
         let key = mix(seed ^ ((column + i) as i64 as u64)) ^ ((row + j) as i64 as u64);
         2.0 * to_unit(mix(key)) - 1.0
     };

@@ -52,6 +52,7 @@ pub(super) fn paint(
     let ground = Ground { route, cross_s_m, seed, covers_seed };
     ground.covers().for_each(|(s_m, t_m)| ground.cover(painter, s_m, t_m));
     let drive = route.driven_m;
+    // The stretches with zebra and stop line before and after the crossing, ascending in s.
     let [approach, leave] = [-1.0, 1.0].map(|side| {
         let (near, far) = (cross_s_m + side * ZEBRA_M[0], cross_s_m + side * STOP_M[1]);
         [near.min(far), near.max(far)]
@@ -66,6 +67,7 @@ pub(super) fn paint(
         ground.verge(painter, side, cross_s_m + SIDE_LANES_M, drive[1]);
         ground.side_street(painter, side);
     }
+    // Beyond the drive's ends, which no camera comes close to.
     painter.coarser(2.2, |painter| {
         let beyond = [[route.ends_m[0], drive[0]], [drive[1], route.ends_m[1]]];
         for [from_m, to_m] in beyond.into_iter().filter(|[from_m, to_m]| from_m < to_m) {
@@ -88,6 +90,7 @@ impl Ground<'_> {
     /// Both lanes, their lines included.
     fn lanes(&self, painter: &mut Painter, from_s_m: f64, to_s_m: f64) {
         let inner = painter.graded(LINE_M, LANES_M - 0.12, 0.10, 0.30);
+        // From the right edge to the left: edge line, lane, centre line, lane, edge line.
         let ts: Vec<_> = [-LANES_M, -LANES_M + 0.06]
             .into_iter()
             .chain(inner.iter().rev().map(|t_m| -t_m))
@@ -100,6 +103,7 @@ impl Ground<'_> {
         let (first, last) = ((from_s_m / cell_m).ceil(), (to_s_m / cell_m).floor());
         let mut ss = vec![from_s_m];
         ss.extend((first as i64..=last as i64).map(|i| i as f64 * cell_m));
+        // Not closer to an end than 0.3 cells: no sliver there.
         ss.retain(|s_m| s_m - from_s_m > 0.3 * cell_m && to_s_m - s_m > 0.3 * cell_m);
         ss.insert(0, from_s_m);
         ss.push(to_s_m);
@@ -125,6 +129,7 @@ impl Ground<'_> {
             let mut random = Random::new(seed, "manhole", index);
             let s_m = from_m + 31.0 * (index as f64 + random.range(0.2, 0.8));
             let t_m = random.pick(&[-1.0, 1.0]) * random.range(1.5, 2.0);
+            // None in the junction, whose marks it would cut.
             ((s_m - cross_s_m).abs() > JUNCTION_M + 1.0).then_some((s_m, t_m))
         })
     }
@@ -191,6 +196,7 @@ impl Ground<'_> {
             + 0.05 * noise(self.seed + 4, 0.35 * s_m, 0.9 * t_m)
             + 0.03 * noise(self.seed + 5, 0.05 * s_m, 0.3 * t_m);
         let off_lane_m = t_m.abs() - LANE_T_M.abs();
+        // Two wheel tracks 0.8 m to either side of the lane's middle, and oil between them.
         let track = 0.03 * (1.0 - smooth((off_lane_m.abs() - 0.8).abs() / 0.35));
         let oil = -0.05 * (1.0 - smooth(off_lane_m.abs() / 0.5));
         // Some areas are repaired trenches.
@@ -206,6 +212,7 @@ impl Ground<'_> {
         let bays = side_of(painter.even(LANES_M, KERB_M, 0.36));
         self.flat(painter, &ss, &bays, 0.0, |s_m, t_m| {
             let gutter = smooth((t_m.abs() - (KERB_M - 0.5)) / 0.5);
+            // The pattern of the asphalt, three times as fine across.
             let tint = self.asphalt(s_m, 3.0 * t_m).times(0.93);
             Some(tint.times(1.0 - 0.15 * gutter).open(1.0 - 0.25 * gutter))
         });
@@ -352,6 +359,7 @@ fn joints(painter: &Painter, from_m: f64, to_m: f64) -> Vec<f64> {
 /// Break points on the side of the street where t has this sign, in increasing order.
 fn oriented(side: f64, mut breaks: Vec<f64>) -> Vec<f64> {
     if side < 0.0 {
+        // Mirrored and reversed: increasing again, as `sheet` needs them.
         breaks.reverse();
         breaks.iter_mut().for_each(|b| *b = -*b);
     }

@@ -107,6 +107,7 @@ impl Route {
     /// The centre line at arc length `s_m`, clamped to the table.
     pub(super) fn at(&self, s_m: f64) -> Station {
         let last = (self.nodes_m.len() - 1) as f64;
+        // Exact at the nodes; from the node on, one more midpoint step.
         let node = ((s_m - self.first_s_m) / NODE_M).floor().clamp(0.0, last);
         let node_s_m = self.first_s_m + node * NODE_M;
         let rest_m = s_m - node_s_m;
@@ -134,6 +135,8 @@ impl Route {
         for _ in 0..3 {
             let station = self.at(s_m);
             let offset_m = point_m - station.point_m;
+            // A step along a curve of radius 1/k is 1/(1 - k t) times as long on the line as at the
+            // offset t. At least 0.3 keeps a step from overshooting far inside of a bend.
             let shrink = 1.0 - self.bends.curvature_per_m(s_m) * offset_m.dot(station.left);
             s_m += offset_m.dot(station.forward) / shrink.max(0.3);
         }

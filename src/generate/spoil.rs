@@ -133,12 +133,16 @@ impl Spoil {
             let mean_m = DVec3::from_array(*mean_m);
             (low_m, high_m) = (low_m.min(mean_m), high_m.max(mean_m));
         }
+        // From the middle of the box. Any point lies within half the diagonal of it, so a camera
+        // that is nearest to some point is at most a whole diagonal farther than the nearest one.
         let distance_m = |camera: &CameraPosition| camera.at_m.distance(0.5 * (low_m + high_m));
         let nearest_m = self.cameras.iter().map(distance_m).fold(f64::INFINITY, f64::min);
         let is_near =
             |camera: &CameraPosition| distance_m(camera) <= nearest_m + low_m.distance(high_m);
         let first = self.cameras.iter().position(is_near).unwrap_or(0);
         let last = self.cameras.iter().rposition(is_near).unwrap_or(0);
+        // Aligned to the stride, so that the coarse search tests the same positions for
+        // every range.
         first.saturating_sub(STRIDE) / STRIDE * STRIDE..(last + STRIDE).min(self.cameras.len())
     }
 
@@ -146,6 +150,7 @@ impl Spoil {
     fn nearest(&self, near: Range<usize>, point_m: DVec3) -> CameraPosition {
         let squared_m2 = |index: &usize| self.cameras[*index].at_m.distance_squared(point_m);
         let by_distance = |a: &usize, b: &usize| squared_m2(a).total_cmp(&squared_m2(b));
+        // Every eighth position first, then those around the best one.
         let coarse = near.clone().step_by(STRIDE).min_by(by_distance).unwrap_or(0);
         let fine = coarse.saturating_sub(STRIDE)..(coarse + STRIDE).min(self.cameras.len());
         self.cameras[fine.min_by(by_distance).unwrap_or(coarse)]
@@ -168,6 +173,7 @@ impl Spoil {
     /// Appends a Gaussian with its damage, and perhaps a sheet in front of it, or nothing.
     fn spoil(&self, near: Range<usize>, whole: &Gaussians, index: usize, out: &mut Gaussians) {
         let mean_m = whole.means_m[index];
+        // The Gaussian's own place is its seed: no other Gaussian has a part in it.
         let key = mean_m.iter().fold(self.seed, |key, m| mix(key ^ m.to_bits()));
         let mut random = Random::new(key, "spoil", 0);
         if random.chance(LOST * self.amount) {
@@ -181,12 +187,14 @@ impl Spoil {
 
         let growth = 1.0 + MOVED * self.amount * self.patch(1, mean_m);
         let moved_m = (viewing.camera_m + growth * viewing.ray_m).to_array();
+        // A Gaussian that would leave its cell stays where it is: cells are spoiled one by one.
         if cell_at(&moved_m) == cell_at(&mean_m) {
             // As large in the image as before.
             out.means_m[at] = moved_m;
             out.ln_scales[at] = out.ln_scales[at].map(|ln| ln + growth.ln() as f32);
         }
 
+        // A log-uniform share from TINT_LEAST to 1.
         let strength = self.amount * TINT * TINT_LEAST.powf(random.unit());
         let mixed = |stream: u64, own: f64| {
             TINT_PATCH * 2.0 * self.patch(stream, mean_m) + (1.0 - TINT_PATCH) * own
@@ -207,6 +215,7 @@ impl Spoil {
         if random.chance(NEEDLES * self.amount) {
             let mut ln_scales = out.ln_scales[at];
             ln_scales.sort_by(f32::total_cmp);
+            // The middle one of the three: a surfel's smaller width, not its thickness.
             let sigma_m = f64::from(ln_scales[1]).exp();
             let long_m = (sigma_m * random.range(1.0, NEEDLE_LENGTH)).min(1.0);
             shape(out, at, axes, [long_m, 0.7 * sigma_m, 0.7 * sigma_m]);
@@ -216,6 +225,7 @@ impl Spoil {
             let sheet_m = (viewing.camera_m + share * viewing.ray_m).to_array();
             if cell_at(&sheet_m) == cell_at(&mean_m) {
                 let at_15_m = SHEET_M * random.range(0.5, 1.5);
+                // As large in the image at any distance, within limits.
                 let long_m = at_15_m * (viewing.ray_m.length() / 15.0).clamp(0.3, 2.0);
                 out.push_from(whole, index);
                 out.means_m[at + 1] = sheet_m;

@@ -27,6 +27,7 @@ pub(super) fn build(settings: &StreetSettings) -> Street {
     let plan = Plan::new(Route::new(length_m), crossing_m, [seed; 2]);
     let light = Light::new(plan.occluders().collect());
     let mut painter = Painter::new(&light, density);
+    // The backdrop belongs to a street by itself; streets of a city have none.
     plan.paint(&mut painter);
     backdrop::paint(&mut painter, &plan.route, seed);
     let trajectory = plan.route.drive("log", LANE_T_M);
@@ -89,6 +90,7 @@ fn park(route: &Route, crossing_m: f64, seed: u64) -> Vec<Car> {
     for (side, name) in [(-1.0, "car, right"), (1.0, "car, left")] {
         for (index, s_m) in along(route, BAY_M).enumerate() {
             let beyond_m = route.beyond_m(s_m);
+            // A stream for each bay, so that a free bay changes no other car.
             let mut random = Random::new(seed, name, index);
             let free =
                 random.chance(0.34) || beyond_m > 45.0 || (s_m - crossing_m).abs() < CLEAR_M + 2.0;
@@ -110,6 +112,7 @@ fn plant(route: &Route, crossing_m: f64, seed: u64) -> Vec<Tree> {
     let mut trees = Vec::new();
     for (side, name) in [(-1.0, "tree, right"), (1.0, "tree, left")] {
         for (index, s_m) in along(route, TREE_M).enumerate() {
+            // The left side is moved by 6 m, so that trees do not face each other.
             let s_m = s_m + if side < 0.0 { 0.0 } else { 6.0 };
             let mut random = Random::new(seed, name, index);
             let free = random.chance(0.12) || (s_m - crossing_m).abs() < CLEAR_M;
@@ -168,10 +171,12 @@ fn furnish(painter: &mut Painter, route: &Route, crossing_m: f64, seed: u64) {
 /// Stations along the whole street, `step_m` apart. They keep clear of the houses that close its
 /// ends; at an open end, the distance to the next street's first station is the same.
 fn along(route: &Route, step_m: f64) -> impl Iterator<Item = f64> + use<> {
+    // 14 m at the start, 10 m at the end; at an open end half a step.
     let [clear, ends] = [[14.0, 10.0], route.ends_m];
     let clear_m = |end: usize| if route.closed[end] { clear[end] } else { 0.5 * step_m };
     let (from_m, to_m) = (ends[0] + clear_m(0), ends[1] - clear_m(1));
     let count = ((to_m - from_m) / step_m) as usize;
+    // Half a step from either end there is one station more than steps between them.
     let count = if route.closed[1] { count } else { count + 1 };
     (0..count).map(move |i| from_m + step_m * i as f64)
 }

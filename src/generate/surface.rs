@@ -108,6 +108,7 @@ impl<'a> Painter<'a> {
     pub(super) fn refined(&self, points: &[f64]) -> Vec<f64> {
         let between = |pair: &[f64]| {
             let [from, to] = [pair[0], pair[1]];
+            // The first point of each pair and those between; the last of all is added below.
             (0..self.detail).map(move |k| from + (to - from) * k as f64 / self.detail as f64)
         };
         let last = points.last().copied();
@@ -124,6 +125,7 @@ impl<'a> Painter<'a> {
 
     /// `from` to `to` in steps of about `step_m`, as break points.
     pub(super) fn even(&self, from_m: f64, to_m: f64, step_m: f64) -> Vec<f64> {
+        // One cell at least, and steps that divide the length.
         let count = ((to_m - from_m) / (step_m * self.spacing)).round().max(1.0);
         (0..=count as usize).map(|i| from_m + (to_m - from_m) * i as f64 / count).collect()
     }
@@ -132,16 +134,19 @@ impl<'a> Painter<'a> {
     pub(super) fn graded(&self, from_m: f64, to_m: f64, edge_m: f64, most_m: f64) -> Vec<f64> {
         let (edge_m, most_m) = (edge_m * self.spacing, most_m * self.spacing);
         let half_m = 0.5 * (to_m - from_m);
+        // Too short for two graded ends.
         if half_m < 0.8 * edge_m {
             return vec![from_m, to_m];
         }
         let (mut reached_m, mut step_m) = (0.0, edge_m);
         let mut ends_m = vec![0.0];
+        // From one end to the middle; less than 0.3 of a step is left to the stretch below.
         while reached_m < half_m - 0.3 * step_m {
             reached_m += step_m;
             ends_m.push(reached_m);
             step_m = (GROWTH * step_m).min(most_m);
         }
+        // Both halves are stretched to meet in the middle, which is one of the break points.
         let fit = half_m / reached_m;
         let first = ends_m.iter().map(|end_m| from_m + fit * end_m);
         let second = ends_m.iter().rev().skip(1).map(|end_m| to_m - fit * end_m);
@@ -163,6 +168,7 @@ impl<'a> Painter<'a> {
             let middle_v = 0.5 * (v[0] + v[1]);
             for u in us.windows(2) {
                 let middle_u = 0.5 * (u[0] + u[1]);
+                // The colour is that of the cell's middle: edges of colours lie on break points.
                 if let Some(paint) = paint(middle_u, middle_v) {
                     let patch = Patch {
                         center_m: place(middle_u, middle_v),
@@ -191,8 +197,10 @@ impl<'a> Painter<'a> {
             return;
         }
         let (xx, xy, yy) = (a * a + shear * shear, shear * b, b * b);
+        // Eigenvalues of [xx xy; xy yy]: half the trace plus and minus this.
         let apart = (0.5 * (xx - yy)).hypot(xy);
         let (major, minor) = (0.5 * (xx + yy) + apart, (0.5 * (xx + yy) - apart).max(1e-6));
+        // The angle of the major axis: tan 2a = 2 xy/(xx - yy).
         let (sin, cos) = (0.5 * (2.0 * xy).atan2(xx - yy)).sin_cos();
         let axes = DMat3::from_cols(cos * along + sin * across, cos * across - sin * along, normal);
         let rotation = DQuat::from_mat3(&axes);
@@ -210,6 +218,7 @@ impl<'a> Painter<'a> {
         // Display values are taken as square roots of light (a gamma of 2), so that shading is
         // linear and `sqrt` is exact everywhere.
         let light = self.light.on(point_m, normal) * paint.open * paint.rgb * paint.rgb;
+        // Light above 1.1 is cut: its display value, 1.05, is white already.
         light.min(DVec3::splat(1.1)).max(DVec3::ZERO).map(f64::sqrt)
     }
 
@@ -224,6 +233,7 @@ impl<'a> Painter<'a> {
         rgb: DVec3,
         slope: DVec3,
     ) {
+        // The inverse of 0.5 + C0 c.
         let dc = (rgb - 0.5) / sh::C0;
         let out = &mut self.gaussians;
         out.means_m.push(mean_m.to_array());

@@ -18,12 +18,14 @@ impl ActorViews {
         if placed.is_empty() {
             return Self::default();
         }
+        // The outer list is per view and not per actor, as the stages go through the views.
         let of_view = |view: &View| placed.iter().map(|placed| view.seen_from(placed)).collect();
         Self { relative: frame.views.iter().map(of_view).collect() }
     }
 
     /// One view of the frame from the axes of each placed chunk, in order.
     pub(crate) fn for_view(&self, view: usize) -> &[View] {
+        // Without actors the outer list is empty, and a view sees none.
         self.relative.get(view).map_or(&[], Vec::as_slice)
     }
 

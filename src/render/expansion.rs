@@ -50,6 +50,7 @@ impl ExpansionBound {
         let backward = camera
             .windshield
             .is_some_and(|windshield| windshield.reference() == WindshieldReference::Backward);
+        // As `UnscentedView::moved` has it for a camera in another motion.
         let turns_far = view.shutter_motion().is_some_and(|motion| motion.rotation_rad > 0.5);
         if profile.lens_error_px == 0.0 || backward || turns_far {
             return None;
@@ -88,14 +89,17 @@ fn max_seen_rad(camera: &Camera) -> f64 {
 /// A lens that is round about its axis, by its radius in pixels.
 fn round(camera: &Camera, radius_px: &dyn Fn(f64) -> f64) -> FieldBounds {
     let step_rad = max_seen_rad(camera) / f64::from(ExpansionBound::STEPS);
+    // The five angles reach from one end of the step to the other.
     let h = 0.25 * step_rad;
     let mut bounds = FieldBounds { px_per_rad: 0.0, second_px: 0.0, third_px: 0.0 };
     for step in 0..ExpansionBound::STEPS {
         // Differences at five angles within the step.
         let rad = (f64::from(step) + 0.5) * step_rad;
         let [a, b, c, d, e] = [-2.0, -1.0, 0.0, 1.0, 2.0].map(|k| radius_px(rad + k * h));
+        // Pixels per radian away from the axis, and around it.
         let slope = ((d - b) / (2.0 * h)).abs().max(c / rad.sin().abs());
         let curvature = (d - 2.0 * c + b) / (h * h);
+        // The central difference of third order over four intervals.
         let third = (e - 2.0 * d + 2.0 * b - a) / (2.0 * h * h * h);
         bounds.px_per_rad = bounds.px_per_rad.max(slope);
         let terms = 0.6 * slope + curvature.abs() / 2.0 + third.abs() / 6.0;
@@ -111,11 +115,13 @@ fn slopes(camera: &Camera) -> FieldBounds {
     let h = 1e-3;
     let at = |slope: DVec2| bare.project_extrapolated(DVec3::new(slope.x, slope.y, 1.0));
     let mut bounds = FieldBounds { px_per_rad: 0.0, second_px: 0.0, third_px: 0.0 };
+    // The grid is a square, the field a disc.
     for slope in grid(most) {
         if slope.length() > most {
             continue;
         }
         let here = at(slope);
+        // Along both axes and the diagonal: a mixed derivative shows along the diagonal only.
         let second = |by: DVec2| (at(slope + h * by) - 2.0 * here + at(slope - h * by)).length();
         let first = |by: DVec2| (at(slope + h * by) - at(slope - h * by)).length() / (2.0 * h);
         let diagonal = DVec2::ONE.normalize();
@@ -123,6 +129,7 @@ fn slopes(camera: &Camera) -> FieldBounds {
         bounds.px_per_rad = bounds.px_per_rad.max(first(DVec2::X).max(first(DVec2::Y)));
         bounds.second_px = bounds.second_px.max(0.5 * bend);
     }
+    // Perspective only: `second_px` stands for the distortion.
     bounds.third_px = 0.6 * bounds.px_per_rad;
     // Differences that are rounding errors and not distortion.
     if bare.is_pinhole() {
@@ -143,6 +150,7 @@ fn windshield_bend(camera: &Camera, windshield: &Windshield) -> f64 {
         for j in 0..=order {
             for i in 0..=order - j {
                 let c = polynomial.coefficient(i, j);
+                // The derivative of x^n: n (n - 1) ... x^(n - times); 0 if times exceeds n.
                 let power = |x: f64, n: usize, times: u32| {
                     let factor: f64 = (0..times as usize).map(|k| n as f64 - k as f64).product();
                     if n < times as usize {
@@ -161,6 +169,7 @@ fn windshield_bend(camera: &Camera, windshield: &Windshield) -> f64 {
             }
         }
         let curved = at.abs().max_element().tan() * first.length();
+        // The form d^2 of both angles, with the mixed term twice.
         second[0].abs() + 2.0 * second[1].abs() + second[2].abs() + 2.0 * curved
     };
     // The rays of a grid of pixels.

@@ -59,9 +59,11 @@ fn render_split(
     targets: &mut [Target<'_>],
     on_view_done: OnViewDone<'_>,
 ) -> Result<FrameStats, RenderError> {
+    // Before the cpu's stages, which would be in vain.
     frame.check(targets)?;
     let (outputs, cpu_stats) = cpu.run_through(frame, last_on_cpu)?;
     let mut stats = gpu.resume(&outputs, frame, targets, on_view_done)?;
+    // The cpu's stages ran first.
     stats.stages_ms.splice(0..0, cpu_stats.stages_ms);
     Ok(stats)
 }
@@ -96,6 +98,7 @@ pub fn bisect(cpu: &Cpu, gpu: &Gpu, frame: &Frame<'_>) -> Result<Bisection, Rend
         let db = match images {
             Ok(images) => images.psnr_db(&truth),
             // A faulty stage may count too many pairs. After bin no stage counts.
+            // The other errors mean that the frame cannot be drawn at all.
             Err(RenderError::TooMany { .. }) if last_on_cpu != Some(Stage::Bin) => f64::NAN,
             Err(error) => return Err(error),
         };
@@ -111,6 +114,8 @@ impl Bisection {
     /// stage that the gpu ran for it is the faulty one.
     pub fn wrong(&self) -> Option<&'static str> {
         let is_right = |(_, db): &&(Option<Stage>, f64)| *db >= MIN_PSNR_DB;
+        // Counted from the one with the most stages on the cpu: `right` images at the end are
+        // right, and the next one adds the faulty stage. With all four right there is no name.
         let right = self.psnr_db.iter().rev().take_while(is_right).count();
         let names = ["rasterize", "bin", "sort", "project"];
         names.get(right).copied()

@@ -73,12 +73,14 @@ impl Cutoffs {
     /// is an exact order; 28 bits reach 2^32 times near.
     #[inline(always)]
     pub fn sort_key(&self, view: usize, depth_m: f32) -> u32 {
+        // Splats nearer than near are culled, so that the difference is not below 0.
         let depth = depth_m.to_bits() - self.near_m.to_bits();
         (view as u32) << DEPTH_BITS | depth.min((1 << DEPTH_BITS) - 1)
     }
 
     /// Largest extent of any splat, in standard deviations: 3.33 for 1/255.
     pub fn max_sigmas(&self) -> f32 {
+        // exp(-k^2/2) = alpha_cut, with ln(cut) = ln 2 log2(cut).
         (2.0 * std::f32::consts::LN_2 * -self.log2_alpha_cut).sqrt()
     }
 }
@@ -133,6 +135,7 @@ impl PixelFilter {
     pub fn new(profile: &RenderProfile, camera: &Camera) -> Self {
         let scale = camera.native_scale();
         let native_px2 = profile.blur * (scale * scale);
+        // Both terms for s times the native size: s^2 blur + (1 - s^2)/15.
         let total_px2 = native_px2 + Self::BOX_PX2 * (1.0 - scale * scale);
         Self { native_px2, total_px2 }
     }
@@ -148,6 +151,7 @@ impl PixelFilter {
     /// filter.
     #[inline(always)]
     pub(super) fn filtered(&self, xx: f64, yy: f64, det_before: f64) -> Filtered {
+        // det(C + diag(u, v)) = det C + u C_yy + v C_xx + u v: a sum of positives.
         // A native image keeps its order of sums, and so its bytes.
         let det_with = |add: DVec2| {
             if self.is_shrunk() {
@@ -208,12 +212,14 @@ impl ChunkView {
     /// The view relative to a chunk.
     pub fn new(view: &View, chunk: &Chunk, profile: &RenderProfile) -> Self {
         let camera_from_world = view.world_from_camera.inverse();
+        // glam has columns: the columns of the transpose are the rows.
         let rotation = camera_from_world.rotation_matrix().transpose();
         let camera_m = view.world_from_camera.position_m - chunk.origin_m();
         let p = &view.camera.pinhole;
         // Slopes of the image's edges, and the slack beyond them.
         let slopes = |size: u32, f: f64, c: f64| {
             let slack = SLOPE_SLACK * 0.5 * f64::from(size) / f;
+            // Pixel 0 is at the slope -c/f, the right edge at (size - c)/f.
             [(-c / f - slack) as f32, ((f64::from(size) - c) / f + slack) as f32]
         };
         let x = slopes(view.camera.width_px, p.fx, p.cx);
@@ -251,6 +257,8 @@ impl ChunkShadow {
     fn new(placed: &PlacedChunk, chunk: &Chunk) -> Option<Self> {
         let shadow = placed.shadow?;
         let actor_from_world = placed.world_from_actor.rotation.inverse();
+        // The difference of positions first, in f64: both may be thousands of kilometres
+        // from the origin.
         let origin_m = actor_from_world * (chunk.origin_m() - placed.world_from_actor.position_m);
         let rows = DMat3::from_quat(actor_from_world).transpose();
         let row = |axis: usize| rows.col(axis).extend(origin_m[axis]).as_vec4().to_array();
@@ -266,6 +274,8 @@ impl ChunkShadow {
     pub fn may_touch(&self, min_m: Vec3, max_m: Vec3) -> bool {
         let center_m = (0.5 * (min_m + max_m)).extend(1.0);
         let half_m = 0.5 * (max_m - min_m);
+        // The box in the actor's axes, as an interval along each of them. Intervals may overlap
+        // where the boxes do not: a doubt.
         (0..3).all(|axis| {
             let row = Vec4::from_array(self.actor_from_chunk[axis]);
             // Larger than any rounding error, which is 1e-5 m at 100 m.
@@ -280,6 +290,7 @@ impl ChunkShadow {
             return Vec::new();
         }
         let of_chunk = |chunk: &Arc<Chunk>| {
+            // The box of the whole chunk: an actor's shadow falls on few chunks.
             let clusters = chunk.clusters().iter();
             let none = (Vec3::INFINITY, Vec3::NEG_INFINITY);
             let (min_m, max_m) =
@@ -321,6 +332,7 @@ impl Frustum {
         let width = f64::from(view.camera.width_px);
         let height = f64::from(view.camera.height_px);
         let sigmas = f64::from(Cutoffs::new(profile).max_sigmas()) + 1e-3;
+        // One pixel more than the blur reaches, for pixel centres and rounding.
         let margin_px = sigmas * PixelFilter::new(profile, &view.camera).max_sigma_px() + 1.0;
         // The largest clamped slope.
         let max_slope = |size: f64, f: f64, c: f64| {
@@ -332,6 +344,7 @@ impl Frustum {
         // Left, right, top, bottom, near, far: normal and offset in camera space, and k √(1 + t²).
         let camera_planes = [
             (DVec3::new(1.0, 0.0, (p.cx + margin_px) / p.fx), 0.0, spread_x),
+            // The right edge: fx x/z + cx > width, mirrored.
             (DVec3::new(-1.0, 0.0, (width - p.cx + margin_px) / p.fx), 0.0, spread_x),
             (DVec3::new(0.0, 1.0, (p.cy + margin_px) / p.fy), 0.0, spread_y),
             (DVec3::new(0.0, -1.0, (height - p.cy + margin_px) / p.fy), 0.0, spread_y),
@@ -342,6 +355,7 @@ impl Frustum {
         let origin = camera_from_world.transform_point(chunk.origin_m());
         // From camera space to the chunk's.
         let plane = |(normal, offset_m, spread): (DVec3, f64, f64)| Plane {
+            // A normal turns with the camera; the offset is that at the chunk's origin.
             normal: (view.world_from_camera.rotation * normal).as_vec3(),
             offset_m: (normal.dot(origin) + offset_m) as f32,
             spread: spread as f32,
@@ -356,8 +370,10 @@ impl Frustum {
         let center = 0.5 * (min_m + max_m);
         let half = 0.5 * (max_m - min_m);
         self.planes.iter().all(|plane| {
+            // The corner of the box that lies farthest along the normal.
             let nearest = plane.normal.dot(center) + plane.normal.abs().dot(half);
             let distance = nearest + plane.offset_m + plane.spread * sigma_m;
+            // Ten times the rounding errors of f32 in three products of this size.
             distance >= -1e-5 * (plane.normal.length() * center.length() + plane.offset_m.abs())
         })
     }
@@ -374,6 +390,7 @@ mod tests {
     /// corner.
     #[test]
     fn no_box_with_a_shadowed_corner_is_skipped() {
+        // 4,000 km from the origin, where f32 resolves half a metre.
         let world_from_actor = Pose {
             position_m: DVec3::new(4.0e6, -3.0, 0.1),
             rotation: DQuat::from_rotation_z(0.7) * DQuat::from_rotation_y(0.1),
@@ -387,6 +404,7 @@ mod tests {
         let relative = ChunkShadow::new(&placed, &chunk).unwrap();
         let mut touched = 0;
         for i in 0..4_000_u32 {
+            // 4,001 is prime: each factor runs through all shares, in another order.
             let share = |k: u32| f64::from(i * k % 4_001) / 4_001.0 - 0.5;
             let at_m = DVec3::new(10.0 * share(37), 10.0 * share(101), 1.5 * share(467));
             let mean_m = (world_from_actor.position_m - chunk.origin_m() + at_m).as_vec3();
@@ -402,6 +420,7 @@ mod tests {
             assert!(may || !(0..8).any(is_shadowed), "{i}");
             touched += u32::from(may);
         }
+        // Neither all nor none of the 4,000 boxes may be rejected, or the test shows nothing.
         assert!((400..2_000).contains(&touched), "{touched}");
     }
 }

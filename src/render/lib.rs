@@ -92,6 +92,7 @@ impl Target<'_> {
     /// normals.
     fn finish(&mut self, view: &View) {
         self.mask(&view.camera);
+        // After the mask: pixels outside of the field have depth 0, and so no normal.
         if let (Some(depth_m), Some(normals)) = (&self.depth_m, &mut self.normals) {
             normals::write(view, depth_m, normals);
         }
@@ -99,6 +100,7 @@ impl Target<'_> {
 
     /// Zeroes the pixels outside of the lens' field. A pinhole has none.
     fn mask(&mut self, camera: &Camera) {
+        // The pixels outside may hold colours: no bound on splats keeps them empty.
         let Some(field) = FieldMask::from_camera(camera) else { return };
         if let Some(rgb8) = &mut self.rgb8 {
             field.clear_outside(camera, 3, rgb8);
@@ -106,6 +108,7 @@ impl Target<'_> {
         if let Some(instances) = &mut self.instances {
             field.clear_outside(camera, 1, instances);
         }
+        // Normals are missing here: they are computed from masked depths.
         for (values, image) in [(4, &mut self.rgba), (1, &mut self.depth_m), (1, &mut self.opacity)]
         {
             if let Some(image) = image {
@@ -289,10 +292,12 @@ impl Frame<'_> {
     /// # Errors
     /// [`RenderError::Sky`].
     pub fn background(&self) -> Result<Option<(DrawableSky, DMat3)>, RenderError> {
+        // A sky of the scene takes precedence over the profile's colour.
         match &self.scene.sky {
             Some(sky) => Ok(Some((sky.drawable(self.profile.sky_error)?, sky.sky_from_world()))),
             None if self.profile.background == [0.0; 3] => Ok(None),
             None => {
+                // One colour as a cube map, so that backends have one way to add a background.
                 let map = CubeMap::uniform(DVec3::from_array(self.profile.background));
                 Ok(Some((DrawableSky::CubeMap(Arc::new(map)), DMat3::IDENTITY)))
             }
@@ -309,6 +314,8 @@ impl Frame<'_> {
         if targets.len() != count {
             return Err(RenderError::Targets { targets: targets.len(), views: count });
         }
+        // In the order of views, and within one in the order of the fields: the first error is the
+        // same every time.
         for (view, (target, View { camera, .. })) in targets.iter().zip(self.views).enumerate() {
             let pixels = camera.pixels();
             let lengths = [
@@ -358,6 +365,7 @@ impl Frame<'_> {
         if placed > limit {
             return Err(RenderError::Actors { placed, limit });
         }
+        // At most 16: the sort key has 4 bits for the view.
         let count = self.views.len();
         if (1..=MAX_VIEWS).contains(&count) { Ok(()) } else { Err(RenderError::Views { count }) }
     }

@@ -36,6 +36,7 @@ const ROWS: usize = 64;
 pub(super) fn write(view: &View, depth_m: &[f32], normals: &mut [f32]) {
     let width = view.camera.width_px as usize;
     let height = view.camera.height_px as usize;
+    // Each band owns its rows of the output and reads all of the depths.
     normals.par_chunks_mut(3 * width * ROWS).enumerate().for_each(|(band, normals)| {
         let first = band * ROWS;
         // Points of three rows, which move down by one each time.
@@ -46,6 +47,7 @@ pub(super) fn write(view: &View, depth_m: &[f32], normals: &mut [f32]) {
             let below = (row + 1 < height).then(|| points(row + 1));
             for (x, normal) in normals.chunks_mut(3).enumerate() {
                 let column_of =
+                    // Above the first row and below the last there are no points.
                     |other: &Option<Vec<Option<Point>>>| other.as_ref().and_then(|o| o[x]);
                 let left = x.checked_sub(1).and_then(|x| here[x]);
                 let right = here.get(x + 1).copied().flatten();
@@ -53,6 +55,7 @@ pub(super) fn write(view: &View, depth_m: &[f32], normals: &mut [f32]) {
                     let across = tangent(left, point, right);
                     let down = tangent(column_of(&above), point, column_of(&below));
                     let of_plane = match (across, down) {
+                        // y x x points to -z: towards the camera, for a surface that faces it.
                         (Some(across), Some(down)) => down.cross(across).try_normalize(),
                         (Some(one), None) | (None, Some(one)) => perpendicular(point.ray, one),
                         (None, None) => None,
@@ -64,6 +67,7 @@ pub(super) fn write(view: &View, depth_m: &[f32], normals: &mut [f32]) {
                 normal.copy_from_slice(&normal_here.unwrap_or_default().as_vec3().to_array());
             }
             match below {
+                // Every row's points are computed once per band.
                 Some(below) => above = Some(std::mem::replace(&mut here, below)),
                 None => break,
             }
@@ -94,6 +98,7 @@ fn points(view: &View, depth_m: &[f32], row: usize) -> Vec<Option<Point>> {
         let depth_m = f64::from(depth_m);
         let at_px = DVec2::new(x as f64 + 0.5, row as f64 + 0.5);
         let direction = view.camera.unproject(at_px)?;
+        // Scaled so that the point has this depth, be it z or the distance.
         let at_exposure_m = direction * (depth_m / view.camera.depth_m(direction));
         let (at_m, ray) = match view.rolling_shutter {
             None => (at_exposure_m, direction),
@@ -121,6 +126,7 @@ fn tangent(before: Option<Point>, here: Point, after: Option<Point>) -> Option<D
     let (to, from) = match (before, after) {
         (Some(before), Some(after)) => {
             let [back, forth] =
+                // On a plane the two differences cancel, as 1/depth is linear along a row.
                 [before, after].map(|other| other.inverse_depth - here.inverse_depth);
             // All three on one surface; else on that of the neighbour with the closer depth.
             if (back + forth).abs() <= EDGE_SHARE * here.inverse_depth {

@@ -70,6 +70,7 @@ pub struct TileLists {
 impl StageOutputs {
     /// The last stage with an output here.
     pub fn last_stage(&self) -> Stage {
+        // Tiles make it bin, with or without an order.
         match (&self.order, &self.tiles) {
             (_, Some(_)) => Stage::Bin,
             (Some(_), None) => Stage::Sort,
@@ -82,6 +83,7 @@ impl TileLists {
     /// The list of one tile; empty if its range lies outside of the instances.
     pub fn list(&self, tile: usize) -> &[u32] {
         let [first, end] = self.ranges[tile];
+        // A faulty stage on another backend may give any range.
         self.instances.get(first as usize..end as usize).unwrap_or_default()
     }
 }

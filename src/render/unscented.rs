@@ -128,6 +128,8 @@ impl<'a> UnscentedView<'a> {
         // The largest extent of any splat, in standard deviations.
         let sigmas = (-2.0 * profile.alpha_cut.ln()).sqrt() + 1e-3;
         let FieldCone { image_rad, least_px_per_rad, scales } =
+            // Several cones, since a wide lens has far more pixels per radian at its edge
+            // than within.
             FieldCone::from_camera(&view.camera);
         let max_center_rad = max_center_angle_rad(&view.camera);
         let cull_bound = CullBound {
@@ -139,6 +141,7 @@ impl<'a> UnscentedView<'a> {
                 rad,
                 px_per_rad: (1.0 + sigmas) * most_px_per_rad,
             }),
+            // 2 px more than the blur, for pixel centres and rounding.
             blur_px: sigmas * PixelFilter::new(profile, &view.camera).max_sigma_px() + 2.0,
             // Both rays of an angle are refracted.
             windshield_rad: view.camera.windshield.map_or(0.0, |glass| 2.0 * glass.most_rad()),
@@ -175,6 +178,7 @@ impl<'a> UnscentedView<'a> {
         let center_m = origin_m + (0.5 * (min_m + max_m)).as_dvec3();
         let half_m = f64::from((0.5 * (max_m - min_m)).length());
         let point_m = self.camera_from_world.transform_point(center_m);
+        // Half the diagonal as a ball's radius, widened by more than the rounding of f32.
         self.may_touch(point_m, half_m * (1.0 + 1e-6), f64::from(sigma_m))
     }
 
@@ -185,6 +189,7 @@ impl<'a> UnscentedView<'a> {
         // The centre: culled outside of the image, nearer than near, beyond far, and far outside of
         // the field.
         let [near_m, far_m] = self.range_m;
+        // The longest axis bounds how far any of the six points is from the centre.
         let sigma_m =
             axes_m.x_axis.length().max(axes_m.y_axis.length()).max(axes_m.z_axis.length());
         let at_end_m = self.camera_from_world.transform_point(mean_m);
@@ -258,12 +263,15 @@ impl<'a> UnscentedView<'a> {
         if distance_m - radius_m <= points_m {
             return true;
         }
+        // From here on both arguments of `asin` below are less than 1.
         let least_rad = angle_rad(center_m) - (radius_m / distance_m).asin() - rotation_rad;
+        // The centre may be anywhere in the ball: its least angle decides.
         if least_rad > max_center_rad {
             return false;
         }
         let spread_rad = (points_m / (distance_m - radius_m)).asin() + windshield_rad;
         let most_rad = least_rad + 2.0 * (radius_m / distance_m).asin() + 2.0 * rotation_rad;
+        // Near the axis' other end the lens is not continued, and the bound does not hold.
         if most_rad + spread_rad >= WIDEST_RAD {
             return true;
         }

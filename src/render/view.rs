@@ -100,6 +100,7 @@ impl View {
         let longest_us = Self::longest_exposure_us(cameras);
         let view = |camera: &RigCamera| {
             let world_from_camera = world_from_rig * camera.rig_from_camera;
+            // A camera at rest is kept as such: a static pinhole has its own, faster path.
             let rolling_shutter = camera.shutter.and_then(|shutter| {
                 let before = world_from_rig_before(shutter.duration_us);
                 let world_from_camera_first = before * camera.rig_from_camera;
@@ -111,6 +112,7 @@ impl View {
             });
             let readout = camera.shutter.map(|shutter| Readout {
                 direction: shutter.direction,
+                // Without any duration all shares are 0 and not NaN.
                 share: shutter.duration_us as f64 / longest_us.max(1) as f64,
             });
             Self { camera: camera.camera, world_from_camera, rolling_shutter, readout }
@@ -134,12 +136,15 @@ impl View {
     /// which is r α²/8 away: 0.6 mm at 20 m, 0.5 rad/s and 30 ms.
     pub fn seen_from(&self, placed: &PlacedChunk) -> Self {
         let last = relative_pose(&placed.world_from_actor, &self.world_from_camera);
+        // A view made without a readout takes the whole exposure of its shutter.
         let from_shutter = self
             .rolling_shutter
             .map(|shutter| Readout { direction: shutter.direction, share: 1.0 });
         let rolling_shutter =
             self.readout.or(from_shutter).and_then(|Readout { direction, share }| {
                 let world_from_actor_first = match placed.world_from_actor_at_start {
+                    // Without an interpolation, which would round, an actor at rest stays
+                    // at rest to the bit.
                     at_start if at_start == placed.world_from_actor => at_start,
                     at_start => placed.world_from_actor.interpolate(&at_start, share),
                 };
@@ -223,6 +228,7 @@ impl View {
         };
         let mut projected =
             project_at(first_guess, self.world_from_camera_at_fraction(first_guess));
+        // Invariant: the moment is not before `earliest` and not after `latest`.
         let mut earliest = 0.0;
         let mut latest = 1.0;
         let mut error_before = f64::INFINITY;
@@ -232,11 +238,14 @@ impl View {
             if error.abs() <= Self::CONVERGED {
                 break;
             }
+            // The row is exposed later than was assumed: the moment was too early.
             if error > 0.0 {
                 earliest = projected.fraction;
             } else {
                 latest = projected.fraction;
             }
+            // The fixed point's own step if it halves the error and stays in the interval, or else
+            // a bisection: 32 rounds give 2^-32 at worst.
             let converges =
                 error.abs() <= 0.5 * error_before && (earliest..=latest).contains(&exposed);
             let next = if converges { exposed } else { 0.5 * (earliest + latest) };
@@ -256,12 +265,14 @@ impl View {
         // row or column, 0 at the middle of the last; a single row is the last one.
         let along = |size_px: u32| {
             let last_px = f64::from(size_px) - 1.0;
+            // At pixel centre 0.5 the value is 1, at last_px + 0.5 it is 0.
             if last_px > 0.0 { [-1.0 / last_px, 1.0 + 0.5 / last_px] } else { [0.0; 2] }
         };
         let columns = along(width_px);
         let rows = along(height_px);
         // Slope and offset for the opposite direction.
         let reversed =
+            // Replace x by size - x.
             |[slope, start]: [f64; 2], size_px: u32| [-slope, start + slope * f64::from(size_px)];
         let remaining = match direction {
             ShutterDirection::TopToBottom => [0.0, rows[0], rows[1]],
@@ -276,6 +287,8 @@ impl View {
             }
         };
         let translation_world_m = last.position_m - first.position_m;
+        // In the camera's own axes. The axis is the same in those of the first pose and of the
+        // last.
         let rotation = first.rotation.inverse() * last.rotation;
         // Take the quaternion of the rotation that has the smaller angle; the other has the
         // opposite sign.
@@ -286,6 +299,7 @@ impl View {
             translation_world_m,
             translation_m: last.rotation.inverse() * translation_world_m,
             axis: if sine > 0.0 { rotation.xyz() / sine } else { DVec3::Z },
+            // atan2 and not acos, which is inaccurate for small angles.
             rotation_rad: 2.0 * sine.atan2(rotation.w),
         })
     }
@@ -307,6 +321,7 @@ impl View {
 fn relative_pose(world_from_a: &Pose, world_from_b: &Pose) -> Pose {
     let a_from_world = world_from_a.rotation.inverse();
     Pose {
+        // In this order; a product of the two poses would cancel large coordinates.
         position_m: a_from_world * (world_from_b.position_m - world_from_a.position_m),
         rotation: (a_from_world * world_from_b.rotation).normalize(),
     }
@@ -314,6 +329,7 @@ fn relative_pose(world_from_a: &Pose, world_from_b: &Pose) -> Pose {
 
 /// Whether two poses differ by rounding at most: a nanometre, and 1e-12 rad.
 fn same_pose(a: &Pose, b: &Pose) -> bool {
+    // q and -q are the same rotation.
     let rotation = (a.rotation - b.rotation).length().min((a.rotation + b.rotation).length());
     a.position_m.distance(b.position_m) <= 1e-9 && rotation <= 1e-12
 }

@@ -48,12 +48,15 @@ pub(crate) fn read(path: &Path) -> Result<ModelFiles, RepairError> {
 pub(crate) fn read_graph(path: &Path, files: &[ModelFile]) -> Result<GraphFiles, RepairError> {
     let folder = path.parent().unwrap_or(Path::new(""));
     let mut contents = Vec::new();
+    // All files share one limit, so that many small ones cannot exceed it together.
     let mut left = MAX_MODEL_BYTES;
     for (at, file) in files.iter().enumerate() {
         let path = folder.join(&file.path);
         let bytes = read_at_most(&path, left)?;
+        // `read_at_most` has checked that it is no more than `left`.
         left -= bytes.len() as u64;
         let found = blake3::hash(&bytes).to_hex().to_string();
+        // The manifest may have the digits in capitals; `Hash::from_hex` accepts both.
         if !found.eq_ignore_ascii_case(&file.blake3) {
             let pinned = file.blake3.clone();
             return Err(RepairError::Changed {
@@ -65,6 +68,7 @@ pub(crate) fn read_graph(path: &Path, files: &[ModelFile]) -> Result<GraphFiles,
         }
         contents.push((file.path.clone(), bytes));
     }
+    // The first file is the graph. `Manifest::parse` refuses an empty list.
     let (name, bytes) = contents.remove(0);
     let weights = contents.into_iter().map(|(name, bytes)| (name, bytes.into())).collect();
     Ok(GraphFiles { path: folder.join(name), bytes, weights })
@@ -78,6 +82,8 @@ fn read_at_most(path: &Path, limit: u64) -> Result<Vec<u8>, RepairError> {
         return Err(error("not a regular file".to_owned()));
     }
     let mut bytes = Vec::new();
+    // One byte more than allowed shows that there is more. The length of the metadata is no bound,
+    // as the file may grow while it is read.
     file.take(limit + 1).read_to_end(&mut bytes).map_err(|e| error(e.to_string()))?;
     if bytes.len() as u64 > limit {
         return Err(error(format!("more than {limit} bytes are not read")));
@@ -89,6 +95,7 @@ fn read_at_most(path: &Path, limit: u64) -> Result<Vec<u8>, RepairError> {
 /// the loader's.
 pub(crate) fn check_library(path: &Path) -> Result<PathBuf, String> {
     let absolute =
+        // Two paths to one file are one library, and `RuntimeLoaded` compares paths.
         fs::canonicalize(path).map_err(|error| format!("{error}; name a libonnxruntime.so"))?;
     if !absolute.is_file() {
         return Err("not a regular file; name a libonnxruntime.so".to_owned());

@@ -23,6 +23,7 @@ impl Fitted {
         let multiple = size.multiple();
         if size.fit == Fit::Resize {
             let [height, width] = fixed.unwrap_or_else(|| {
+                // `check_size` has made sure that there is a number.
                 let pixels = f64::from(size.pixels.unwrap_or(1));
                 resized([height, width], pixels, multiple)
             });
@@ -61,10 +62,14 @@ impl Fitted {
 
 /// The multiples of `multiple` nearest to an image's aspect ratio, with about `pixels` pixels.
 fn resized([height, width]: [usize; 2], pixels: f64, multiple: usize) -> [usize; 2] {
+    // By how much both sides are scaled: pixels = (ratio height)(ratio width).
     let ratio = (pixels / (height as f64 * width as f64)).sqrt();
+    // At least 64 multiples, since a multiple is at most 256 px.
     let largest = MAX_SIDE_PX / multiple;
     [height, width].map(|side| {
         let multiples = (side as f64 * ratio / multiple as f64).round() as usize;
+        // A very long and low image keeps at least one multiple in height, and then has
+        // another ratio.
         multiples.clamp(1, largest) * multiple
     })
 }

@@ -41,10 +41,13 @@ pub(crate) struct Probe {
 impl Probe {
     /// Measures the halo in images that grow until it fits.
     pub(crate) fn halo(&self, run: &mut Run<'_>) -> Result<Halo, RepairError> {
+        // At least four multiples, so that the border is more than one of them away from the
+        // middle.
         let largest = MAX_HALO_PROBE_PX.max(4 * self.multiple_of);
         let mut side = 64_usize.next_multiple_of(self.multiple_of).max(4 * self.multiple_of);
         loop {
             let size = self.fixed.unwrap_or([side; 2]);
+            // A NaN that reaches the border may reach farther: the image is doubled.
             if let Halo::Pixels(halo) = self.halo_at(size, run)? {
                 return Ok(Halo::Pixels(halo));
             }
@@ -60,12 +63,14 @@ impl Probe {
         // The strides of a model of a fixed size are not known: windows of it begin anywhere.
         let phases = if self.fixed.is_some() { FIXED_PHASES } else { self.multiple_of };
         for phase in 0..phases {
+            // A multiple near the middle, so that all phases of the strides are tried in turn.
             let middle = |side: usize| {
                 (side / 2 / self.multiple_of * self.multiple_of + phase).min(side - 1)
             };
             let [y, x] = [middle(height), middle(width)];
             let mut inputs = self.images(height, width);
             for planes in &mut inputs {
+                // All inputs at once: the halo is that of the output on any of them.
                 for channel in 0..planes.channels {
                     planes.row_mut(channel, y)[x] = f32::NAN;
                 }
@@ -84,6 +89,8 @@ impl Probe {
     pub(crate) fn images(&self, height: usize, width: usize) -> Vec<Planes> {
         let image = |(at, (channels, [black, white])): (usize, &(usize, [f32; 2]))| {
             let mut planes = Planes::zeros(*channels, height, width);
+            // The golden ratio's bits; another start for each input, and never 0, which
+            // xorshift keeps.
             let mut state = 0x9e37_79b9_u32 ^ at as u32;
             for value in &mut planes.values {
                 // xorshift32 (Marsaglia 2003); 24 bits are a fraction of f32.
@@ -115,6 +122,8 @@ fn reach(output: &Planes, [y, x]: [usize; 2], scale: usize) -> Option<usize> {
                 if is_border {
                     return None;
                 }
+                // The pixel of the input below this one of the output. The larger of both axes: a
+                // halo is a square.
                 let distance = (at_y / scale).abs_diff(y).max((at_x / scale).abs_diff(x));
                 reach = reach.max(Some(distance));
             }
@@ -130,6 +139,8 @@ mod tests {
     /// A model that takes the mean of 4 x 4 pixels for each of them: from 0 to 3 pixels far, by the
     /// phase.
     fn means_of_four(inputs: &[Planes]) -> Result<Planes, RepairError> {
+        // In whole blocks of 4 x 4, so that the last pixel of a block depends on the first, three
+        // pixels away, and no pixel of a block on the next block.
         let input = &inputs[0];
         let mut output = Planes::zeros(1, input.height, input.width);
         for y in 0..input.height {
@@ -154,6 +165,7 @@ mod tests {
             fixed,
             scale: 1,
         };
+        // Without a fixed size four phases are tried, with one eight; both include the farthest.
         assert_eq!(probe(4, None).halo(&mut means_of_four).unwrap(), Halo::Pixels(3));
         assert_eq!(probe(1, Some([40, 24])).halo(&mut means_of_four).unwrap(), Halo::Pixels(3));
     }

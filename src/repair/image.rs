@@ -73,6 +73,7 @@ impl<'a> View<'a> {
             ("reference", self.reference),
             ("reference_warped", self.reference_warped),
         ];
+        // Before the maps, whose lengths are compared with the size of the image.
         for (field, image) in images {
             let Some(image) = image else { continue };
             let is_equal = image.width == width && image.height == height;
@@ -96,11 +97,13 @@ impl<'a> View<'a> {
         ];
         for (field, values, channels) in planes {
             let Some(values) = values else { continue };
+            // 0 stands for a single value.
             let wanted = if channels == 0 { 1 } else { channels * pixels };
             if values.len() != wanted {
                 let message = format!("{} values; {wanted} are needed", values.len());
                 return Err(RepairError::Input { field: field.to_owned(), message });
             }
+            // A NaN would spread over the output, and be reported as the model's own.
             if let Some(at) = values.iter().position(|value| !value.is_finite()) {
                 let message = format!("value {at} is {}; give finite values", values[at]);
                 return Err(RepairError::Input { field: field.to_owned(), message });

@@ -289,6 +289,7 @@ impl Manifest {
     /// The input of the image itself.
     pub(crate) fn image_input(&self) -> &Input {
         let is_image = |input: &&Input| matches!(input.role, InputRole::Rgb | InputRole::Luma);
+        // `check_inputs` demands exactly one; the first input is never taken in its place.
         self.inputs.iter().find(is_image).unwrap_or(&self.inputs[0])
     }
 

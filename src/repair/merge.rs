@@ -14,13 +14,17 @@ pub(crate) fn merge(manifest: &Manifest, view: &View<'_>, seen: Planes, output: 
     let range = manifest.output().range;
     let height = view.rendered.height * scale;
     let width = view.rendered.width * scale;
+    // From here on values are 0 to 255 in f32, whatever the range of the model.
     let rendered = roles::rgb(view.rendered);
     let merged = if manifest.merge == Merge::Residual {
         let difference = match role {
+            // A difference has no black: it is scaled and not shifted.
             OutputRole::Residual => output.map(|value| value / (range[1] - range[0]) * 255.0),
             OutputRole::Rgb | OutputRole::Luma => {
                 let mut difference = roles::out_of_range(output, range);
                 let seen = roles::out_of_range(seen, manifest.image_input().range);
+                // Both have the size that the model saw. The difference is taken before it is
+                // resampled, so that a model that changes nothing adds exact zeros.
                 let values = difference.values.iter_mut().zip(&seen.values);
                 values.for_each(|(value, seen)| *value -= seen);
                 difference
@@ -54,6 +58,7 @@ fn added(planes: &Planes, more: &Planes) -> Planes {
     let mut sum = planes.clone();
     for channel in 0..sum.channels {
         for y in 0..sum.height {
+            // A plane of one channel is its own last channel.
             let more = more.row(channel.min(more.channels - 1), y);
             sum.row_mut(channel, y).iter_mut().zip(more).for_each(|(sum, more)| *sum += more);
         }
@@ -68,9 +73,11 @@ fn image(planes: &Planes, mask: Option<&[f32]>, scale: usize) -> Image {
     for y in 0..planes.height {
         for x in 0..planes.width {
             let is_inside =
+                // The mask has the size of the rendered image, and the output `scale` times that.
                 mask.is_none_or(|mask| mask[y / scale * source_width + x / scale] > 0.0);
             for channel in 0..3 {
                 let value = if is_inside { planes.at(channel, y, x) } else { 0.0 };
+                // The cast saturates: this is the clamp to 0 to 255.
                 rgb8.push(value.round() as u8);
             }
         }

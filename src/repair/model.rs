@@ -109,6 +109,7 @@ impl Model {
         let manifest = &files.manifest;
         let wrong =
             |field: &str, message: String| RepairError::Input { field: field.to_owned(), message };
+        // What costs nothing to check comes before the session, which may take minutes to build.
         if !(1..=MAX_THREADS).contains(&options.threads) {
             return Err(wrong("threads", format!("{}; 1 to {MAX_THREADS}", options.threads)));
         }
@@ -126,9 +127,11 @@ impl Model {
             gpu_bytes: (manifest.memory_mib as usize) << 20,
             load_timeout: options.load_timeout,
         };
+        // From here on the bytes that were hashed are those that run.
         let (worker, graph) = Worker::start(files.graph, &settings)?;
         signature::check(manifest, &graph, path)?;
         let mut hasher = blake3::Hasher::new();
+        // The manifest pins the hashes of the files, so that its own bytes stand for them.
         hasher.update(&files.manifest_bytes).update(onnx::build_info().as_bytes());
         hasher.update(provider.name().as_bytes());
         let runner = Runner::new(files.manifest, worker);
@@ -150,6 +153,7 @@ impl Model {
     /// from.
     pub fn runtime(&self) -> String {
         let build = onnx::build_info();
+        // `git-branch=..., git-commit-id=..., build type=...`: the words up to the next comma.
         let commit = build.split("git-commit-id=").nth(1).and_then(|rest| rest.split(',').next());
         format!("{}, commit {}", onnx::library_name(), commit.unwrap_or("unknown"))
     }
@@ -208,6 +212,7 @@ impl Model {
         let manifest = self.manifest();
         let size = [view.rendered.height, view.rendered.width];
         let fitted = Fitted::new(&manifest.size, size)?;
+        // Every map is fitted in the same way, so that all inputs have one size.
         let mut inputs = Vec::new();
         for input in self.runner.pixel_inputs() {
             inputs.push(fitted.fit(roles::planes(view, input)?, input.dtype));
@@ -216,6 +221,7 @@ impl Model {
         let windows = self.windows(inputs[0].height, inputs[0].width)?;
         let scale = manifest.output().scale as usize;
         let channels = manifest.output().role.channels();
+        // Tiles are pasted into it; their used parts cover each pixel once.
         let mut output = Planes::zeros(channels, inputs[0].height * scale, inputs[0].width * scale);
         let fitted_at = Instant::now();
         for window in &windows {
@@ -224,12 +230,14 @@ impl Model {
             self.runner.check_finite(&returned)?;
             let used = window.used.scaled(scale);
             let seen = window.seen.scaled(scale);
+            // The used part relative to the window, as the model returned only the window.
             let within = Rect { top: used.top - seen.top, left: used.left - seen.left, ..used };
             output.paste(&returned, within, used.top, used.left);
         }
         let run_at = Instant::now();
         let is_image = |input: &Input| matches!(input.role, InputRole::Rgb | InputRole::Luma);
         let at = self.runner.pixel_inputs().position(is_image).unwrap_or(0);
+        // The padding is dropped on both sides, so that `merge` compares equal sizes.
         let seen = inputs[at].crop(fitted.content);
         let output = output.crop(fitted.content.scaled(scale));
         let image = merge::merge(manifest, view, seen, output);
@@ -245,6 +253,7 @@ impl Model {
 
     /// The tiles of an image that fits, or the image.
     fn windows(&self, height: usize, width: usize) -> Result<Vec<Window>, RepairError> {
+        // Only `Fit::Tile` has a halo.
         let Some(halo) = self.halo else {
             let whole = Rect { top: 0, left: 0, height, width };
             return Ok(vec![Window { seen: whole, used: whole }]);

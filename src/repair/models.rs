@@ -46,6 +46,7 @@ impl Models {
             let entry = Entry { manifest: path.clone(), loaded: Mutex::default() };
             entries.insert(name, entry);
         }
+        // A program without models needs no library.
         if !entries.is_empty() {
             if options.library.as_os_str().is_empty() {
                 return Err(RepairError::RuntimeUnnamed);
@@ -78,12 +79,16 @@ impl Models {
             let known = self.entries.keys().cloned().collect();
             return Err(RepairError::Unknown { name: name.to_owned(), known });
         };
+        // The lock of this entry is held while the model loads: a second caller waits for the same
+        // model instead of loading it again. Other models have locks of their own.
         let mut loaded = entry.loaded.lock();
         if let Some(model) = loaded.as_ref().filter(|model| !model.is_withdrawn()) {
             return Ok(Arc::clone(model));
         }
+        // The withdrawn model is dropped first: two of them may not fit the GPU's memory.
         *loaded = None;
         let model = Arc::new(Model::load(&entry.manifest, &self.options)?);
+        // The manifest is read a second time here, and may have been replaced since the start.
         if model.manifest().name != name {
             let message = format!(
                 "{:?}; it was {name:?} when the program started: restart it, or restore the file",

@@ -122,6 +122,7 @@ impl NetworkManifest {
             return wrong("size", format!("{sides:?}; [height, width] from 1 to {MAX_SIDE_PX}"));
         }
         let count = |role| self.inputs.iter().filter(|input| input.role == role).count();
+        // A network is either a measure of one image or of a pair.
         if count(NetworkRole::Image) != 1 || count(NetworkRole::Truth) > 1 {
             let message = "exactly one must have the role \"image\", at most one \"truth\"";
             return wrong("inputs", message.to_owned());
@@ -189,6 +190,7 @@ impl Network {
             };
             let wrong = |message: String| RepairError::Input { field: field.to_owned(), message };
             let own = own.ok_or_else(|| wrong("missing; the network has this role".to_owned()))?;
+            // All images must have the size of the first: they are compared pixel by pixel.
             let is_sized = [own.width, own.height] == [image.width, image.height];
             if !is_sized || own.rgb8.len() != 3 * own.width * own.height || own.rgb8.is_empty() {
                 return Err(wrong(format!("{} x {} px of another size", own.width, own.height)));
@@ -196,6 +198,7 @@ impl Network {
             feeds.push(self.feed(input, own));
         }
         let limit = Duration::from_millis(self.manifest.timeout_ms);
+        // Held for the run only: values are checked without it.
         let mut worker = self.worker.lock();
         let values = worker.run(feeds, &self.manifest.output, limit)?.values;
         drop(worker);
@@ -218,6 +221,7 @@ impl Network {
             && [height, width] != [image.height, image.width]
         {
             planes = resample(&planes, height, width, Kernel::Lanczos3)
+                // Lanczos overshoots at edges, and networks are trained on 0 to 255.
                 .map(|value| value.clamp(0.0, 255.0));
         }
         let planes = roles::in_range(planes, input.range);
@@ -250,6 +254,7 @@ fn check_ports(manifest: &NetworkManifest, graph: &Graph, file: &Path) -> Result
             return wrong(format!("inputs[{at}].dtype"), message.to_lowercase());
         }
     }
+    // The runtime would refuse a run without one of its inputs; the message here names it.
     let is_given = |name: &str| manifest.inputs.iter().any(|input| input.name == name);
     if let Some(port) = graph.inputs.iter().find(|port| !is_given(&port.name)) {
         return wrong("inputs".to_owned(), format!("{:?} of the graph has no entry", port.name));

@@ -44,8 +44,10 @@ fn environment(path: &Path) -> Result<Environment, RepairError> {
         return Err(RepairError::RuntimeUnnamed);
     }
     let library = files::check_library(path).map_err(refused)?;
+    // Held while the library is opened, so that two models cannot open two.
     let mut runtime = RUNTIME.lock();
     if let Some(runtime) = &*runtime {
+        // The library's global state belongs to the process: a second one cannot be loaded.
         if runtime.library != library {
             let loaded = runtime.library.clone();
             return Err(RepairError::RuntimeLoaded { loaded, asked: library });
@@ -92,6 +94,7 @@ pub(crate) struct Port {
 
 impl Port {
     fn new(outlet: &Outlet) -> Port {
+        // A sequence, a map or an optional value: no type of the manifest.
         let ValueType::Tensor { ty, shape, .. } = outlet.dtype() else {
             let type_name = format!("{:?}", outlet.dtype());
             return Port {
@@ -168,6 +171,7 @@ impl Worker {
     ) -> Result<(Worker, Graph), RepairError> {
         let environment = environment(&settings.library)?;
         let path = files.path.clone();
+        // One channel for the result of the build, another for the jobs that follow.
         let (ready, is_ready) = mpsc::channel();
         let (jobs, next_job) = mpsc::channel::<Job>();
         let session_settings = settings.clone();
@@ -181,10 +185,12 @@ impl Worker {
             .map_err(|error| RepairError::Run { message: format!("no thread: {error}") })?;
         let graph = match is_ready.recv_timeout(settings.load_timeout) {
             Ok(ready) => ready?,
+            // The thread goes on building; it ends when it finds that nothing receives its result.
             Err(RecvTimeoutError::Timeout) => {
                 let limit_s = settings.load_timeout.as_secs();
                 return Err(RepairError::LoadTimeout { path, limit_s });
             }
+            // The thread has panicked: an error would have been sent.
             Err(RecvTimeoutError::Disconnected) => {
                 let message = "the thread of the session ended".to_owned();
                 return Err(RepairError::Graph { path, message });
@@ -205,11 +211,13 @@ impl Worker {
         output: &str,
         limit: Duration,
     ) -> Result<Returned, RepairError> {
+        // The thread may still be in the run that did not stop, and would take no other.
         if let Some(reason) = &self.withdrawn {
             return Err(RepairError::Withdrawn { reason: reason.clone() });
         }
         let failed = |message: String| RepairError::Run { message };
         let options = Arc::new(RunOptions::new().map_err(|error| failed(error.to_string()))?);
+        // A channel for each job: the late answer of an earlier run cannot be taken for this one's.
         let (answer, answers) = mpsc::channel();
         let job = Job { feeds, output: output.to_owned(), options: Arc::clone(&options), answer };
         let ended = || failed("the thread of the session ended".to_owned());
@@ -233,6 +241,7 @@ impl Worker {
         let _ = options.terminate();
         self.timeouts += 1;
         let reason = match answers.recv_timeout(STOP_TIMEOUT) {
+            // Any answer shows that the thread is free again, be it a result or an error.
             Ok(_) if self.timeouts < MAX_TIMEOUTS => return RepairError::TimedOut { limit_ms },
             Ok(_) => format!("{MAX_TIMEOUTS} runs took longer than timeout_ms {limit_ms}"),
             Err(_) => format!("a run took longer than timeout_ms {limit_ms} and did not stop"),
@@ -255,6 +264,8 @@ fn session(
     };
     let mut builder = match builder(environment, &files, settings) {
         Ok(builder) => builder,
+        // A failure of the cpu provider can only be the graph's; with a GPU it is taken as
+        // the provider's.
         Err(error) => return Err(refused(error.to_string())),
     };
     builder.commit_from_memory(&files.bytes).map_err(|error| refused(error.to_string()))
@@ -280,7 +291,10 @@ fn builder(
     }
     let cuda = ort::ep::CUDA::default()
         .with_memory_limit(settings.gpu_bytes)
+        // An exhaustive search measures times, and may choose another algorithm, and other
+        // bits, each time.
         .with_conv_algorithm_search(ConvAlgorithmSearch::Heuristic)
+        // TF32 keeps 10 bits of the mantissa, f32 has 23.
         .with_tf32(false)
         .build()
         .error_on_failure();
@@ -291,6 +305,7 @@ fn builder(
     let providers = match settings.provider {
         Provider::Cpu => return Ok(builder),
         Provider::Cuda => vec![cuda],
+        // In the order of preference: nodes that TensorRT lacks go to CUDA, and none to the cpu.
         Provider::Tensorrt => vec![tensorrt, cuda],
     };
     Ok(builder.with_execution_providers(providers)?.with_disable_cpu_fallback()?)
@@ -302,6 +317,7 @@ fn work(mut session: Session, ready: &Sender<Result<Graph, RepairError>>, jobs: 
         inputs: session.inputs().iter().map(Port::new).collect(),
         outputs: session.outputs().iter().map(Port::new).collect(),
     };
+    // The caller's time was over: the session is dropped, and with it its memory.
     if ready.send(Ok(graph)).is_err() {
         return;
     }
@@ -337,6 +353,7 @@ fn tensor(feed: Feed) -> ort::Result<DynValue> {
             Tensor::from_array((shape, values))?.into_dyn()
         }
         Dtype::I64 => {
+            // Constants such as a time step: whole numbers that f32 has exactly up to 2^24.
             let values: Vec<i64> = values.into_iter().map(|value| value as i64).collect();
             Tensor::from_array((shape, values))?.into_dyn()
         }

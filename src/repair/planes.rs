@@ -69,6 +69,7 @@ impl Planes {
 
     /// Copies the rectangle `from` of `source` to the place that begins at `top`, `left`.
     pub(crate) fn paste(&mut self, source: &Planes, from: Rect, top: usize, left: usize) {
+        // Row by row: a row of the rectangle is contiguous in both.
         for channel in 0..self.channels {
             for y in 0..from.height {
                 let row = &source.row(channel, from.top + y)[from.left..from.left + from.width];
@@ -85,6 +86,7 @@ impl Planes {
         let mut padded = Planes::zeros(self.channels, height, width);
         for channel in 0..self.channels {
             for y in 0..height {
+                // Rows and columns mirror independently of each other.
                 let source = self.row(channel, mirrored(y, self.height));
                 for (x, value) in padded.row_mut(channel, y).iter_mut().enumerate() {
                     *value = source[mirrored(x, self.width)];
@@ -100,6 +102,7 @@ fn mirrored(at: usize, len: usize) -> usize {
     if len == 1 {
         return 0;
     }
+    // Forth and back, without the two ends twice.
     let period = 2 * (len - 1);
     let phase = at % period;
     phase.min(period - phase)

@@ -29,15 +29,18 @@ pub(crate) fn probe(runner: &Runner) -> Result<Probed, RepairError> {
         fixed: size.fixed.map(|sides| sides.map(|side| side as usize)),
         scale: manifest.output().scale as usize,
     };
+    // `scalars` reads nothing of a view but its trust.
     let blank = Image { width: 1, height: 1, rgb8: vec![0; 3] };
     let view = View { trust: Some(0.5), ..View::new(&blank) };
     let scalars = runner.scalars(&view)?;
+    // Any size that the model takes will do; a small one keeps the load short.
     let side = 64_usize.next_multiple_of(probe.multiple_of);
     let [height, width] = probe.fixed.unwrap_or([side; 2]);
     let images = probe.images(height, width);
 
     // Three runs must be equal for the bytes to be called deterministic.
     let first = runner.run(&images, &scalars)?;
+    // A model whose output is not finite for an ordinary image is of no use.
     runner.check_finite(&first)?;
     let again = [runner.run(&images, &scalars)?, runner.run(&images, &scalars)?];
     let is_deterministic = again.iter().all(|again| *again == first);
@@ -53,6 +56,7 @@ pub(crate) fn probe(runner: &Runner) -> Result<Probed, RepairError> {
             return Err(RepairError::Tiles { message });
         }
     };
+    // A model of a fixed size cannot run on a larger image, with which its tiles would be compared.
     if probe.fixed.is_none() {
         check_tiles(runner, &probe, halo, &scalars)?;
     }
@@ -67,6 +71,7 @@ fn check_tiles(
     scalars: &[Feed],
 ) -> Result<(), RepairError> {
     let tiling = runner.tiling(halo);
+    // One multiple more than a tile: two windows along each axis.
     let [height, width] = tiling.tile.map(|side| side + probe.multiple_of);
     let images = probe.images(height, width);
     let whole = runner.run(&images, scalars)?;
@@ -80,6 +85,8 @@ fn check_tiles(
             left: used_out.left - seen_out.left,
             ..used_out
         };
+        // Equal to the bit: a difference means that the halo was too small, or that the kernels
+        // depend on the size.
         if returned.crop(within) != whole.crop(used_out) {
             let message = format!("with the measured halo of {halo} px they differ from the whole");
             return Err(RepairError::Tiles { message });

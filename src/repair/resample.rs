@@ -48,8 +48,11 @@ pub(crate) fn resample(planes: &Planes, height: usize, width: usize, kernel: Ker
     if planes.height == height && planes.width == width {
         return planes.clone();
     }
+    // Taps depend on the column only, and are the same for all rows and channels.
     let across = taps(planes.width, width, kernel);
     let down = taps(planes.height, height, kernel);
+    // Across first, into an image of the old height; then down. Two passes of n taps
+    // instead of n^2.
     let mut wide = Planes::zeros(planes.channels, planes.height, width);
     for channel in 0..planes.channels {
         for y in 0..planes.height {
@@ -63,6 +66,7 @@ pub(crate) fn resample(planes: &Planes, height: usize, width: usize, kernel: Ker
     let mut resampled = Planes::zeros(planes.channels, height, width);
     for channel in 0..planes.channels {
         for (y, taps) in down.iter().enumerate() {
+            // Row by row and not pixel by pixel, so that memory is read in order.
             for (at, weight) in taps.weights.iter().enumerate() {
                 let source = wide.row(channel, taps.first + at);
                 let sums = resampled.row_mut(channel, y).iter_mut().zip(source);
@@ -75,13 +79,16 @@ pub(crate) fn resample(planes: &Planes, height: usize, width: usize, kernel: Ker
 
 fn taps(from: usize, to: usize, kernel: Kernel) -> Vec<Taps> {
     let ratio = from as f64 / to as f64;
+    // A larger image is interpolated with the kernel as it is.
     let widened = ratio.max(1.0);
     let reach = kernel.reach() * widened;
     let tap = |at: usize| {
+        // The centre of the new pixel, in the old image's coordinates.
         let center = (at as f64 + 0.5) * ratio;
         let first = (center - reach).floor().max(0.0) as usize;
         let end = ((center + reach).ceil() as usize).min(from);
         let weight = |source: usize| kernel.weight((source as f64 + 0.5 - center) / widened);
+        // Less than the whole kernel at the border, hence the division.
         let sum: f64 = (first..end).map(weight).sum();
         Taps { first, weights: (first..end).map(|source| (weight(source) / sum) as f32).collect() }
     };

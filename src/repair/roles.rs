@@ -46,6 +46,7 @@ pub(crate) fn rgb(image: &Image) -> Planes {
     let pixels = image.width * image.height;
     for (at, pixel) in image.rgb8.chunks_exact(3).enumerate() {
         for (channel, &value) in pixel.iter().enumerate() {
+            // From interleaved to planar.
             planes.values[channel * pixels + at] = f32::from(value);
         }
     }
@@ -65,6 +66,7 @@ pub(crate) fn luma(rgb: &Planes) -> Planes {
 
 /// Converts 0 to 255 to the model's range.
 pub(crate) fn in_range(planes: Planes, [black, white]: [f32; 2]) -> Planes {
+    // 0 becomes black and 255 white; black may be the larger one.
     planes.map(|value| black + value / 255.0 * (white - black))
 }
 
@@ -85,6 +87,7 @@ fn plain(
 fn depth(metres: Planes, unit: Unit) -> Planes {
     match unit {
         Unit::Metre => metres.map(|depth| depth.max(0.0)),
+        // 0 stands for no surface, which is also that of an infinite distance.
         Unit::Inverse => metres.map(|depth| if depth > 0.0 { depth.recip() } else { 0.0 }),
     }
 }

@@ -39,9 +39,11 @@ impl Runner {
         let inputs = self.manifest.inputs.iter().filter(|input| input.role.channels().is_none());
         let feed = |input: &Input| {
             let shape: Vec<i64> = match input.role {
+                // A batch of one.
                 InputRole::Trust => vec![1, 1],
                 _ => input.shape.iter().map(|side| i64::from(*side)).collect(),
             };
+            // The product of no sides is 1: a scalar. `check_inputs` bounds it.
             let count = shape.iter().product::<i64>() as usize;
             let values = vec![roles::scalar(view, input)?; count];
             Ok(Feed { name: input.name.clone(), shape, dtype: input.dtype, values })
@@ -52,6 +54,7 @@ impl Runner {
     /// The sizes with which images are cut into windows, with a halo in pixels.
     pub(crate) fn tiling(&self, halo: usize) -> Tiling {
         let size = &self.manifest.size;
+        // Without a tile the whole image is one window.
         let tile = size.fixed.or(size.tile).unwrap_or([u32::MAX; 2]).map(|side| side as usize);
         Tiling { tile, multiple_of: size.multiple(), halo }
     }
@@ -75,6 +78,7 @@ impl Runner {
         let height = planes[0].height * scale;
         let width = planes[0].width * scale;
         let limit = Duration::from_millis(self.manifest.timeout_ms);
+        // Held for the run only; a second image waits here.
         let mut worker = self.worker.lock();
         let returned = worker.run(feeds, &output.name, limit)?;
         drop(worker);
@@ -105,6 +109,7 @@ fn to_layout(planes: &Planes, layout: Layout) -> Vec<f32> {
     }
     let pixels = planes.height * planes.width;
     let channels = planes.channels;
+    // Place `at` of the interleaved image is channel at % channels of pixel at / channels.
     (0..pixels * channels).map(|at| planes.values[at % channels * pixels + at / channels]).collect()
 }
 
@@ -119,6 +124,7 @@ fn from_layout(
     }
     let pixels = height * width;
     let planar =
+        // The other way: place `at` of the planes is pixel at % pixels of channel at / pixels.
         (0..pixels * channels).map(|at| values[at % pixels * channels + at / pixels]).collect();
     Planes { channels, height, width, values: planar }
 }

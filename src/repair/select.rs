@@ -50,6 +50,7 @@ impl Selection {
                 return Err((field, format!("{value:?}; trust is 0 to 1")));
             }
         }
+        // Equal thresholds are allowed: no hysteresis.
         if self.above < self.below {
             let Selection { above, below, .. } = self;
             let must = format!("{above:?}, less than below ({below:?}); give at least {below:?}");
@@ -66,6 +67,7 @@ impl Selection {
 
     /// Whether a camera is in repair at a trust, given whether it was after the previous step.
     fn is_on(&self, was_on: bool, trust: f64) -> bool {
+        // `is_on` goes on below `at_least`, so that repair resumes when the trust returns.
         if was_on { trust <= self.above } else { trust < self.below }
     }
 
@@ -84,6 +86,7 @@ impl Selection {
         let is_chosen = |camera: &usize| self.is_candidate(was_on(*camera), trust[*camera]);
         let mut cameras: Vec<usize> = (0..trust.len()).filter(is_chosen).collect();
         let is_on: Vec<bool> = (0..trust.len()).map(is_on).collect();
+        // By trust for the budget, then back to the order of cameras for the caller.
         cameras.sort_by(|a, b| trust[*a].total_cmp(&trust[*b]).then(a.cmp(b)));
         cameras.truncate(self.per_step);
         cameras.sort_unstable();

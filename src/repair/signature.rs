@@ -31,6 +31,7 @@ pub(crate) fn check(manifest: &Manifest, graph: &Graph, file: &Path) -> Result<(
         }
     }
     let is_listed = |port: &&Port| !manifest.inputs.iter().any(|input| input.name == port.name);
+    // An input without an entry would get no value, and the run fail.
     if let Some(port) = graph.inputs.iter().find(is_listed) {
         return wrong("inputs".to_owned(), format!("{:?} of the graph has no entry", port.name));
     }
@@ -45,6 +46,7 @@ pub(crate) fn check(manifest: &Manifest, graph: &Graph, file: &Path) -> Result<(
     }
     let scale = i64::from(output.scale);
     let sides =
+        // -1 for any size: then only rank and channels are compared.
         manifest.size.fixed.map_or([-1, -1], |sides| sides.map(|side| i64::from(side) * scale));
     let shape = image_shape(manifest.layout, output.role.channels() as i64, sides);
     match wrong_shape(&port.shape, &shape) {

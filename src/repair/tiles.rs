@@ -56,6 +56,7 @@ impl Tiling {
 
     /// The windows along one axis.
     fn spans(&self, side: usize, tile: usize) -> Result<Vec<Span>, RepairError> {
+        // The whole side is seen, with the model's own padding at both ends.
         if side <= tile {
             return Ok(vec![Span { start: 0, len: side, used: (0, side) }]);
         }
@@ -72,9 +73,14 @@ impl Tiling {
         let mut start = 0;
         let mut covered = 0;
         loop {
+            // The last window ends with the image. It is moved back rather than made smaller, since
+            // a model of a fixed size takes no other.
             let is_last = start + tile >= side;
             let start_here = if is_last { side - tile } else { start };
+            // A halo before the window's end, except at the image's own border.
             let end = if is_last { side } else { start_here + tile - self.halo };
+            // Invariant: all pixels below `covered` are used once. The next window begins at least
+            // a halo before `covered`.
             spans.push(Span { start: start_here, len: tile, used: (covered, end) });
             if is_last {
                 return Ok(spans);
@@ -99,6 +105,8 @@ mod tests {
 
     #[test]
     fn windows_cover_each_pixel_once_with_a_halo_to_spare() {
+        // Sides that no tile divides; multiples; a halo that leaves 2 px of a tile; a stride of one
+        // multiple.
         for (height, width, tile, multiple_of, halo) in [
             (231, 359, [64, 80], 1, 7),
             (256, 512, [64, 64], 4, 20),
@@ -133,6 +141,7 @@ mod tests {
 
     #[test]
     fn a_halo_that_fills_the_tile_is_refused() {
+        // 64 - 2 x 32 leaves nothing between the halos.
         let tiling = Tiling { tile: [64, 64], multiple_of: 1, halo: 32 };
         let error = tiling.windows(100, 100).unwrap_err();
         assert!(error.to_string().contains("use larger tiles"), "{error}");

@@ -39,6 +39,7 @@ pub(crate) fn read<T: DeserializeOwned>(
         field: field.to_owned(),
         message,
     };
+    // Read twice: first as any JSON, for its format, then as this one's type.
     let value: Value = serde_json::from_slice(bytes).map_err(|error| {
         let must = "give the manifest, a JSON file beside the .onnx file (docs/repair.md)";
         wrong("manifest", format!("{error}; {must}"))
@@ -102,6 +103,8 @@ pub(crate) fn check_files(files: &[ModelFile]) -> Checked {
     }
     for (at, file) in files.iter().enumerate() {
         let is_name =
+            // Equal to its own last part: no folder, no "..", nothing outside the
+            // manifest's folder.
             Path::new(&file.path).file_name().is_some_and(|name| name == file.path.as_str());
         if !is_name {
             let message = format!("{:?}; the name of a file beside the manifest", file.path);
@@ -119,6 +122,7 @@ fn check_size(manifest: &Manifest) -> Checked {
     let wrong = |field: &str, message: String| Err((format!("size.{field}"), message));
     let size = &manifest.size;
     let is_side = |side: &u32| (1..=MAX_SIDE_PX as u32).contains(side);
+    // Exactly one of the two; the first arms are the valid cases.
     let multiple = match (size.fixed, size.multiple_of) {
         (Some(sides), None) if sides.iter().all(is_side) => 1,
         (None, Some(multiple)) if (1..=MAX_MULTIPLE_PX).contains(&multiple) => multiple,
@@ -136,6 +140,7 @@ fn check_size(manifest: &Manifest) -> Checked {
         }
     };
     let needs_pixels = size.fit == Fit::Resize && size.fixed.is_none();
+    // 2^28 pixels are a square of 16,384 px, the largest side.
     let is_count = size.pixels.is_some_and(|pixels| (1..=1 << 28).contains(&pixels));
     if needs_pixels && !is_count {
         return wrong("pixels", "needed with \"fit\": \"resize\": 1 to 268435456".to_owned());
@@ -173,6 +178,7 @@ fn check_inputs(manifest: &Manifest) -> Checked {
         let wrong =
             |field: &str, message: &str| Err((format!("inputs[{at}].{field}"), message.to_owned()));
         let is_constant = input.role == InputRole::Constant;
+        // Exactly one image is repaired; others are references.
         images += usize::from(matches!(input.role, InputRole::Rgb | InputRole::Luma));
         if manifest.inputs[..at].iter().any(|other| other.name == input.name) {
             return wrong("name", "named twice; each input of the graph has one entry");
@@ -180,6 +186,7 @@ fn check_inputs(manifest: &Manifest) -> Checked {
         if !is_range(input.range) {
             return wrong("range", "[black, white]: two finite, different numbers");
         }
+        // A value if and only if the role is `constant`; a NaN counts as no value.
         if is_constant != input.value.is_some_and(f64::is_finite)
             || (!is_constant && !input.shape.is_empty())
         {
@@ -188,6 +195,7 @@ fn check_inputs(manifest: &Manifest) -> Checked {
                 "a finite number, needed with the role \"constant\" and only there",
             );
         }
+        // In f64: a product that is too large for it is infinite, and refused as well.
         let values: f64 = input.shape.iter().map(|side| f64::from(*side)).product();
         if values > MAX_CONSTANT_VALUES as f64 {
             return wrong("shape", "more than 1048576 values");
@@ -221,6 +229,7 @@ fn check_output(manifest: &Manifest) -> Checked {
         return wrong("role", "\"luma\" if and only if an input has the role \"luma\"");
     }
     let adds = output.role == OutputRole::Residual || manifest.merge == Merge::Residual;
+    // The rendered image has no pixels between its own.
     if adds && output.scale != 1 {
         return wrong("scale", "1 with a residual: a larger image has nothing to add to");
     }

@@ -67,12 +67,15 @@ pub fn confidence_by_offset(
     };
     let mut all = Vec::new();
     for offset_m in OFFSETS_M {
+        // Points carry one of the constants of `OFFSETS_M`, so that equality of f64 is safe.
         let at_offset = sample_points.iter().filter(|point| point.offset_m == offset_m);
         let at_offset: Vec<&SamplePoint> = at_offset.collect();
         let mut trusts = Vec::new();
         let mut image = ViewImage::default();
         for (station, point) in at_offset.iter().enumerate() {
             let observed = Observed::new(resident, backend, point, &coverage)?;
+            // One image per distance is enough for the page; encoding all would make it
+            // megabytes larger.
             if station == at_offset.len() / 2 {
                 image = observed.image(point)?;
             }
@@ -100,10 +103,13 @@ impl Observed {
         point: &SamplePoint,
         coverage: &TrainingCoverage,
     ) -> Result<Self, ReportError> {
+        // Without a drive there is no coverage, and this is not called.
         let world_from_rig = point.world_from_rig.ok_or(ReportError::NoSamplePoints)?;
 
         // All cameras, scaled by the same factor.
+        // At least 1, so that nothing divides by 0.
         let widest_px = point.views.iter().map(|view| view.camera.width_px).fold(1, u32::max);
+        // Never enlarged: a larger image has no more content.
         let scale = (WIDTH_PX / f64::from(widest_px)).min(1.0);
         let views = point.views.iter().map(|view| scaled(*view, scale));
         let views = views.collect::<Result<Vec<View>, CameraError>>()?;
@@ -128,6 +134,7 @@ impl Observed {
         let images = views.iter().zip(&opacity);
         let trusts = images.map(|(view, opacity)| coverage.trust(&world_from_rig, view, opacity));
         let trusts = trusts.collect();
+        // A rig has at least one camera.
         Ok(Self { trusts, first_view: views[0], first_rgb8: rgb8.swap_remove(0) })
     }
 
@@ -145,12 +152,14 @@ impl Observed {
 }
 
 fn summarize(offset_m: f64, trusts: &[Trust], image: ViewImage) -> Confidence {
+    // At least 1: without images the means are 0 and not NaN.
     let count = trusts.len().max(1) as f64;
     let mean = |of: &dyn Fn(&Trust) -> f64| trusts.iter().map(of).sum::<f64>() / count;
     let values = || trusts.iter().map(|trust| trust.value);
     Confidence {
         offset_m,
         mean: mean(&|trust| trust.value),
+        // Trust lies between 0 and 1, which are the neutral starts.
         min: values().fold(1.0, f64::min),
         max: values().fold(0.0, f64::max),
         distance_m: mean(&|trust| trust.distance_m),

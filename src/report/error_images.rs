@@ -34,6 +34,7 @@ impl ErrorImages {
             let file = wildcity_session::png(&rgb8, width, height);
             file.map_err(|reason| ReportError::Encode { reason })
         };
+        // The images are displayed ones, clamped to 0 to 1 already.
         let rgb8_of = |image: &Image| -> Vec<u8> {
             image.rgb.iter().map(|value| (255.0 * value).round() as u8).collect()
         };
@@ -50,8 +51,10 @@ impl ErrorImages {
 
 /// The colour of an error: interpolated between [`HEAT_RGB`] by the error's logarithm.
 fn heat(error: f32) -> [u8; 3] {
+    // The last step that the error reaches. A NaN reaches none, and is black.
     let Some(low) = HEAT_STEPS.iter().rposition(|step| error >= *step) else { return HEAT_RGB[0] };
     let Some(next_step) = HEAT_STEPS.get(low + 1) else { return HEAT_RGB[low] };
+    // The steps are powers of four, so that the colour is linear in the logarithm within each.
     let share = (error / HEAT_STEPS[low]).ln() / (next_step / HEAT_STEPS[low]).ln();
     heat_rgb(low as f32 + share)
 }

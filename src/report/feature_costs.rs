@@ -106,12 +106,14 @@ const fn feature(name: &'static str, add: fn(&mut Step)) -> Feature {
 
 const FEATURES: [Feature; 21] = [
     feature("nothing else", |_| {}),
+    // The same colours with more coefficients: only memory and traffic may change, not the image.
     feature("SH degree 1", |step| step.scene = Scene::from_gaussians(&street(1))),
     feature("SH degree 3", |step| step.scene = Scene::from_gaussians(&street(3))),
     feature("levels of detail, 1 m", |step| step.scene = with_levels(&step.scene, 1.0)),
     feature("antialiasing", |step| step.profile.antialiased = true),
     feature("background", |step| step.profile.background = [0.5, 0.6, 0.8]),
     feature("sky of images", |step| {
+        // One colour: the counts do not depend on the content of a map.
         step.set_sky(SkyModel::cube(CubeMap::uniform(DVec3::splat(0.5))));
     }),
     feature("sky, baked", |step| step.set_sky(sky_network())),
@@ -124,6 +126,8 @@ const FEATURES: [Feature; 21] = [
     }),
     feature("windshield", |step| step.view.camera.windshield = Some(windshield())),
     feature("rolling shutter", |step| {
+        // Half a metre during the exposure: more than any rounding that would make it a
+        // camera at rest.
         let mut first = step.view.world_from_camera;
         first.position_m.x -= 0.5;
         let direction = ShutterDirection::TopToBottom;
@@ -170,6 +174,7 @@ pub fn count_features(
     open_device: &dyn Fn() -> Option<Gpu>,
 ) -> Result<Vec<FeatureCounts>, ReportError> {
     let count = |feature: Feature| {
+        // A fresh step and a fresh device for each feature, so that nothing of another is counted.
         let mut step = Step::base();
         (feature.add)(&mut step);
         let counts = step.counts(cpu, open_device())?;
@@ -193,6 +198,7 @@ fn with_levels(scene: &Scene, max_error_m: f32) -> Scene {
     let coarsest = |chunk: &Arc<Chunk>| {
         let levels = lod::levels(chunk).into_iter();
         let allowed = levels.take_while(|level| level.error_m <= max_error_m);
+        // Without a level within the error the chunk is drawn in full.
         allowed.last().map_or_else(|| chunk.clone(), |level| Arc::new(level.chunk))
     };
     Scene { chunks: scene.chunks.iter().map(coarsest).collect(), ..scene.clone() }
@@ -202,6 +208,7 @@ fn with_levels(scene: &Scene, max_error_m: f32) -> Scene {
 /// map.
 fn sky_network() -> SkyModel {
     let layer = |outputs: usize, inputs: usize| {
+        // Fixed numbers without a pattern: the network has to be the same in every run, no more.
         let numbers = |count: usize| (0..count).map(|i| 0.4 * (1.7 * i as f32).sin()).collect();
         Layer { outputs, inputs, weight: numbers(outputs * inputs), bias: numbers(outputs) }
     };
@@ -216,6 +223,7 @@ fn windshield() -> Windshield {
         Bivariate::new(field, &coefficients)
             .expect("three coefficients are a polynomial of order 1")
     };
+    // h(phi, theta) = -0.004 + 1.002 phi and 0.005 + 1.01 theta: nearly the identity.
     let horizontal = plane("horizontal", [-0.004, 1.002, 0.0]);
     let vertical = plane("vertical", [0.005, 0.0, 1.01]);
     Windshield::new(WindshieldReference::Forward, horizontal, vertical)
@@ -252,9 +260,12 @@ impl Step {
     /// Two actors of one asset, with shadows and a tint. `since_start_m` is their way during the
     /// exposure.
     fn place_actors(&mut self, since_start_m: DVec3) {
+        // Standard deviations of 2 cm.
         let size = 0.02_f64.ln() as f32;
         let mut ball = Gaussians::with_capacity(1, 500);
         for i in 0..500 {
+            // 499 is prime: each factor permutes the multiples, and the 500 points fill a box of 4
+            // x 1.8 x 1.5 m.
             let at = |k: usize| (i * k % 499) as f64 / 499.0;
             ball.means_m.push([4.0 * at(31) - 2.0, 1.8 * at(57) - 0.9, 1.5 * at(71)]);
             ball.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
@@ -263,6 +274,7 @@ impl Step {
             ball.sh.extend([0.1; 12]);
         }
         let chunk = Arc::new(Scene::single_chunk(&ball));
+        // Both ahead of the camera at x = -20, one behind the other.
         for (actor, x) in [-8.0, -2.0].into_iter().enumerate() {
             let pose = Pose { position_m: DVec3::new(x, 0.0, 0.0), ..Pose::IDENTITY };
             let placed = PlacedChunk::at_rest(Arc::clone(&chunk), pose, actor as u16);
@@ -282,9 +294,11 @@ impl Step {
     }
 
     fn counts(&self, cpu: &Cpu, device: Option<Gpu>) -> Result<ResourceCounts, ReportError> {
+        // The counts of the cpu backend do not depend on its threads.
         let FrameStats { evaluations, .. } = self.render(cpu)?;
         let device = device.map(|gpu| self.device_counts(&gpu)).transpose()?.flatten();
         let gaussians = self.scene.gaussians() as u64;
+        // Requested planes as 0 or 1, for the sum of their bytes.
         let ids = u64::from(self.instances);
         let floats = u64::from(self.depth) + u64::from(self.opacity) + 3 * u64::from(self.normals);
         let sky_bytes = sky_bytes(&self.scene, &self.profile)?;
@@ -306,6 +320,7 @@ impl Step {
         // counted.
         self.render(gpu)?;
         let dispatches = |usage: &GpuUsage| usage.totals.dispatches;
+        // Totals are since the device was opened; a lost device has no usage.
         let before = gpu.usage().as_ref().map_or(0, dispatches);
         self.render(gpu)?;
         Ok(gpu.usage().map(|usage| DeviceCounts {
@@ -332,6 +347,8 @@ impl Step {
             opacity: opacity.as_deref_mut(),
             normals: normals.as_deref_mut(),
             instances: instances.as_deref_mut(),
+            // A backend gets no appearance at all if it would change nothing: that row has
+            // to cost nothing.
             appearance: (!self.appearance.is_identity()).then_some(&self.appearance),
             ..Target::default()
         };

@@ -65,16 +65,20 @@ impl Benchmark<'_> {
         rays: Rays,
         progress: &mut dyn FnMut(usize),
     ) -> Result<ReferenceImages, ReportError> {
+        // Full detail and no draw distance, so that the error of both shows in every setting.
         let profile = RenderProfile { tau_px: 0.0, reach_m: None, rays, ..self.profile() };
         let pixels = |views: &[View]| views.iter().map(|v| v.camera.pixels()).sum::<usize>();
         let mut windows = Vec::new();
         let mut step_ms = 0.0;
         for (done, point) in self.sample_points.iter().enumerate() {
             progress(done);
+            // Outside of the timed part: loading sections is not the cost of a step.
             let scene = self.scene(&point.views, &profile)?;
             let start = Instant::now();
             let drawings = render_images(&Reference, &scene, &profile, &point.windows)?;
             let windows_ms = start.elapsed().as_secs_f64() * 1e3;
+            // The reference tests every pixel against every splat: its time is proportional
+            // to the pixels.
             let pixel_ratio = pixels(&point.views) as f64 / pixels(&point.windows) as f64;
             step_ms += windows_ms * pixel_ratio / self.sample_points.len() as f64;
             let images = point.windows.iter().zip(&drawings);
@@ -92,8 +96,10 @@ impl Benchmark<'_> {
         setting: &Setting,
         reference: &ReferenceImages,
     ) -> Result<Measurement, ReportError> {
+        // Fails for a setting that the twin's profile does not allow.
         let profile = setting.apply(self.profile())?;
         let backend = &*self.backends[setting.backend];
+        // A device of its own, as the memory of the backend's has held other settings.
         let device = if backend.name() == GPU { (self.open_device)() } else { None };
         let mut errors = ErrorTotals::new();
         let mut costs = CostTotals::new();
@@ -102,6 +108,7 @@ impl Benchmark<'_> {
             // The scene as this setting renders it: its images, its detail, its record format.
             let scaled_point = point.scaled(setting)?;
             let pinned = self.scene(&scaled_point.views, &profile)?;
+            // There and back, so that the Gaussians have what the format has lost.
             let converted = setting.record.map(|record| round_trip(&pinned, record).scene);
             let scene: &Scene = converted.as_ref().unwrap_or(&pinned);
 
@@ -124,6 +131,7 @@ impl Benchmark<'_> {
             let PointErrors { psnr_db, min_db } = errors.add(point, images, references);
 
             // Cost, of whole steps on the drive.
+            // The points off the drive show the error only.
             let is_timed = point.offset_m == 0.0;
             let mut p95_ms = None;
             if is_timed {
@@ -131,6 +139,7 @@ impl Benchmark<'_> {
                 let step =
                     Step { backend, scene, profile: &profile, views, encoding: setting.encoding };
                 let times = self.time(&step, point)?;
+                // At each point by itself: a slow place must not vanish among fast ones.
                 p95_ms = Some(quantile(&times.steps_ms, 0.95));
                 costs.add(&step, times, device.as_ref())?;
             }
@@ -141,6 +150,7 @@ impl Benchmark<'_> {
         let manifest = &self.resident.version.manifest;
         let record = setting.record.unwrap_or(manifest.record);
         let stored_bytes = record.bits(manifest.sh_degree) as f64 / 8.0;
+        // The median, since a single step that was interrupted says nothing of the machine.
         let baseline_ms = quantile(&costs.baseline_ms, 0.5);
         Ok(Measurement {
             setting: setting.clone(),
@@ -158,6 +168,7 @@ impl Benchmark<'_> {
         let profile = self.profile();
         let scene = self.scene(&point.views, &profile)?;
         let baseline = Step {
+            // Always the first backend, so that all settings are compared with one clock.
             backend: &*self.backends[0],
             scene: &scene,
             profile: &profile,
@@ -215,6 +226,8 @@ impl ErrorTotals {
         for (image, reference) in images.into_iter().zip(references) {
             let psnr_db = gathered.add(&image, reference);
             windows_db.push(psnr_db);
+            // `<` and not `<=`: of equal ones the first stays. A NaN is never less, so that its
+            // window is not shown.
             let worst_db = self.worst.as_ref().map_or(f64::INFINITY, |worst| worst.psnr_db);
             if psnr_db < worst_db {
                 let sample_point = point.name.clone();
@@ -222,6 +235,7 @@ impl ErrorTotals {
                 self.worst = Some(WorstWindow { psnr_db, sample_point, image, reference });
             }
         }
+        // A twin without a drive has the offset 0 at all points.
         let offset = OFFSETS_M.iter().position(|offset_m| *offset_m == point.offset_m);
         self.by_offset[offset.unwrap_or(0)].merge(&gathered);
         PointErrors {
@@ -276,6 +290,7 @@ impl CostTotals {
         self.steps_ms.extend(times.steps_ms);
         self.baseline_ms.extend(times.baseline_ms);
         let cost = &mut self.cost;
+        // The largest of the points: this is what a machine has to hold.
         cost.gaussians = cost.gaussians.max(step.scene.gaussians() as u64);
         let scene_bytes = step.scene.bytes() as u64 + sky_bytes(step.scene, step.profile)?;
         cost.scene_bytes = cost.scene_bytes.max(scene_bytes);
@@ -291,6 +306,7 @@ impl CostTotals {
     }
 
     fn cost(&self, stored_bytes_per_gaussian: f64) -> Cost {
+        // Over the steps of all points together.
         let step_ms = quantile(&self.steps_ms, 0.5);
         Cost { step_ms, stored_bytes_per_gaussian, ..self.cost }
     }
@@ -309,10 +325,12 @@ pub(super) fn sky_bytes(scene: &Scene, profile: &RenderProfile) -> Result<u64, R
 /// The image that an agent receives.
 fn received(setting: &Setting, view: &View, drawing: &RenderedImage) -> Result<Image, ReportError> {
     let mut image = displayed(view, drawing);
+    // Without an encoding the values are compared before rounding, see the head of this file.
     if setting.encoding.is_some() {
         let encoded = encode(setting.encoding, view, &drawing.rgb8);
         let encoded = encoded.map_err(|reason| ReportError::Encode { reason })?;
         let rgb8 = match encoded {
+            // `Raw`: the 8 bits themselves.
             None => drawing.rgb8.clone(),
             Some(file) => decode(&file)?,
         };

@@ -92,6 +92,7 @@ impl Measurement {
     /// `--at-most-ms` limits it.
     pub fn p95_ms(&self) -> f64 {
         let all = self.by_sample_point.iter().filter_map(|result| result.p95_ms);
+        // `f64::max` ignores a NaN on one side: the result is NaN only without any time.
         all.fold(f64::NAN, f64::max)
     }
 
@@ -102,6 +103,7 @@ impl Measurement {
             m.by_sample_point.iter().map(|result| [result.psnr_db, result.min_db]).collect()
         };
         let resources = |m: &Self| (m.setting.backend, m.cost.gaussians, m.cost.scene_bytes);
+        // Exactly, to the last bit of all errors: equal images have them, others practically never.
         let same_images = self.errors == served.errors && psnrs_db(self) == psnrs_db(served);
         let same_resources = resources(self) == resources(served);
         self.setting.family != Family::AsServed && same_images && same_resources
@@ -114,8 +116,11 @@ impl Measurement {
 /// of other backends too.
 pub fn normalize_machine_speed(all: &mut [Measurement]) {
     let baselines_ms: Vec<f64> = all.iter().map(|m| m.baseline_ms).collect();
+    // The machine's usual speed; each setting was measured at its own.
     let usual_ms = quantile(&baselines_ms, 0.5);
     for m in all {
+        // Times become longer where the machine was faster than usual, and shorter where it
+        // was slower.
         let factor = usual_ms / m.baseline_ms;
         m.baseline_ms = usual_ms;
         m.cost.step_ms *= factor;

@@ -30,6 +30,7 @@ img{image-rendering:pixelated;margin-right:3px}.view{width:272px}.view img{image
 /// A plot cannot be drawn.
 pub fn render(report: &Report) -> Result<String, ReportError> {
     let title = format!("{}: error against run time", report.subject.twin);
+    // What can fail comes first: markup cannot return an error.
     let plot = plots::error_against_time(&report.settings)?;
     let by_offset = by_offset(&report.settings)?;
     let confidence = confidence(report)?;
@@ -59,6 +60,7 @@ pub fn render(report: &Report) -> Result<String, ReportError> {
             }
         }
     };
+    // A text file ends with a line feed.
     Ok(markup.into_string() + "\n")
 }
 
@@ -207,6 +209,7 @@ fn not_compared(report: &Report) -> Markup {
 
 fn by_offset(all: &[Measurement]) -> Result<Markup, ReportError> {
     let families = [Family::AsServed, Family::Detail, Family::Record, Family::Combined];
+    // Only twins with a drive have a value for each distance.
     let is_shown = |m: &&Measurement| {
         families.contains(&m.setting.family) && m.psnr_db_by_offset.len() == OFFSETS_M.len()
     };
@@ -271,6 +274,7 @@ fn worst_windows(all: &[Measurement]) -> Markup {
         }
         p.key {
             @for (step, [r, g, b]) in HEAT_STEPS.iter().zip(HEAT_RGB) {
+                // Black on light colours, white on dark ones; blue adds little to lightness.
                 @let text = if u32::from(r) + u32::from(g) > 250 { "#000" } else { "#fff" };
                 span style=(format!("background:rgb({r},{g},{b});color:{text}")) { (step) }
             }
@@ -278,6 +282,7 @@ fn worst_windows(all: &[Measurement]) -> Markup {
         @for measurement in all {
             @let ErrorImages { sample_point, size_px: [width, height], files } = &measurement.worst;
             figure {
+                // A setting without any error has no images.
                 @for file in files.iter().filter(|file| !file.is_empty()) {
                     img width=(width) height=(height) alt="" src=(data_url("image/png", file));
                 }

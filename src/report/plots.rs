@@ -53,13 +53,16 @@ pub(super) fn error_against_time(all: &[Measurement]) -> Result<String, ReportEr
     let on_front = pareto_front(all);
     let shown = || {
         let has_psnr = |(m, _): &(&Measurement, &bool)| {
+            // Compared with another reference: its PSNR has no place on this axis.
             m.setting.family != Family::Rays && !m.errors.psnr_db.is_nan()
         };
         all.iter().zip(&on_front).filter(has_psnr)
     };
     let times_ms = || shown().map(|(m, _)| m.cost.step_ms);
+    // The range of the axis. Two equal ends are kept apart by the margin below.
     let min_ms = times_ms().fold(f64::INFINITY, f64::min);
     let max_ms = times_ms().fold(0.0, f64::max);
+    // From the clamped value down, so that an exact setting alone still gives a range.
     let min_db = shown().map(|(m, _)| m.errors.psnr_db).fold(MAX_DB, f64::min);
     plot(all.len(), |root| {
         // The time axis is logarithmic: its coordinate is the exponent of 10.
@@ -80,10 +83,12 @@ pub(super) fn error_against_time(all: &[Measurement]) -> Result<String, ReportEr
         let point = |m: &Measurement| (m.cost.step_ms.log10(), clamped_db(m.errors.psnr_db));
         let front = shown().filter(|(_, is_on_front)| **is_on_front);
         let mut front: Vec<(f64, f64)> = front.map(|(m, _)| point(m)).collect();
+        // The line is drawn in the order of its points.
         front.sort_by(|a, b| a.0.total_cmp(&b.0));
         chart.draw_series(LineSeries::new(front, BLACK.stroke_width(1)))?;
 
         let mut labels = Vec::new();
+        // Points over the line, and labels last, so that the front's line crosses no text.
         for (m, is_on_front) in shown() {
             let own = color(m.setting.family);
             let fill = if *is_on_front { own } else { GREY };
@@ -132,6 +137,7 @@ pub(super) fn trust_by_offset(all: &[Confidence]) -> Result<String, ReportError>
             with_label_column(root).build_cartesian_2d(0.0..OFFSETS_M[3] + 0.2, 0.0..1.05)?;
         draw_axes(&mut chart, OFFSET_AXIS, "trust, from 0 to 1")?;
         let own = color(Family::Detail);
+        // Along the lower edge, and back along the upper one.
         let lowest = all.iter().map(|c| (c.offset_m, c.min));
         let highest = all.iter().rev().map(|c| (c.offset_m, c.max));
         let range: Vec<(f64, f64)> = lowest.chain(highest).collect();
@@ -167,8 +173,10 @@ fn plot(
     let mut svg = String::new();
     let drawn = {
         let (width, height) = SIZE_PX;
+        // Room for all labels below each other, and for the axes.
         let size_px = (width, height.max(60 + LINE_PX as u32 * labels as u32));
         let root = SVGBackend::with_string(&mut svg, size_px).into_drawing_area();
+        // plotters has another error type for each call; all are boxed here.
         root.fill(&WHITE).map_err(Into::into).and_then(|()| draw(&root)).and_then(|()| {
             root.present()?;
             Ok(())
@@ -196,6 +204,7 @@ struct Label<'a> {
 /// Writes labels in a column on the right, in the vertical order of their points and without
 /// overlap. A thin line joins each label to its point.
 fn draw_labels(root: &Area<'_>, mut labels: Vec<Label<'_>>) -> PlotResult<()> {
+    // By height, then from left to right: lines of equal heights do not cross.
     labels.sort_by_key(|label| (label.at_px.1, label.at_px.0));
     let (width_px, height_px) = root.dim_in_pixel();
     let wanted_px: Vec<i32> = labels.iter().map(|label| label.at_px.1).collect();
@@ -205,6 +214,7 @@ fn draw_labels(root: &Area<'_>, mut labels: Vec<Label<'_>>) -> PlotResult<()> {
         let line = [label.at_px, (column_px - 22, y), (column_px - 4, y)];
         root.draw(&PathElement::new(line, label.color.mix(0.35).stroke_width(1)))?;
         let style = ("sans-serif", 12).into_font().color(&label.color);
+        // A text is placed by its upper left corner: half a line above the end of its line.
         root.draw(&Text::new(label.text.to_owned(), (column_px, y - 7), style))?;
     }
     Ok(())
@@ -214,9 +224,11 @@ fn draw_labels(root: &Area<'_>, mut labels: Vec<Label<'_>>) -> PlotResult<()> {
 /// is at most `bottom_px`. Moves them as little as possible.
 fn spread(heights_px: &[i32], bottom_px: i32) -> Vec<i32> {
     let mut spread = heights_px.to_vec();
+    // Down: each label at least a line below the one above.
     for i in 1..spread.len() {
         spread[i] = spread[i].max(spread[i - 1] + LINE_PX);
     }
+    // Then up from the bottom: what was pushed out of the page moves back, and others with it.
     let mut below = bottom_px + LINE_PX;
     for y in spread.iter_mut().rev() {
         *y = (*y).min(below - LINE_PX);
@@ -244,9 +256,12 @@ mod tests {
 
     #[test]
     fn labels_do_not_overlap_and_stay_on_the_page() {
+        // Three crowds: at the top, in the middle and at the lower edge.
         let heights = [10, 11, 11, 12, 200, 201, 390, 395, 399];
         let spread = spread(&heights, 400);
         assert!(spread.windows(2).all(|pair| pair[1] - pair[0] >= LINE_PX), "{spread:?}");
+        // The first of the upper two crowds stays where it was; the last label is pushed to the
+        // end.
         assert_eq!((spread[0], spread[4], spread[8]), (10, 200, 400));
         assert_eq!(super::spread(&[5, 300], 400), [5, 300]);
     }

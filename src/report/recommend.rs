@@ -102,6 +102,7 @@ pub fn pareto_front(all: &[Measurement]) -> Vec<bool> {
         let dominates = |other: &Measurement| {
             let ms = other.cost.step_ms;
             let db = other.errors.psnr_db;
+            // Equal in both is no domination, so that twins of a setting are both on the front.
             (ms < own_ms && db >= own_db) || (ms <= own_ms && db > own_db)
         };
         all.iter().filter(is_comparable).any(dominates)
@@ -131,6 +132,7 @@ pub fn recommend(
 ) -> Result<Recommendation, ReportError> {
     // 1. The settings that may be recommended.
     let served = all.iter().find(|m| m.setting.family == Family::AsServed);
+    // A setting that changes nothing would be recommended for its luck in timing.
     let has_effect = |m: &&Measurement| !served.is_some_and(|served| m.is_equivalent_to(served));
     let servable = all.iter().filter(|m| m.setting.can_be_served()).filter(has_effect);
     let candidates: Vec<Candidate<'_>> = servable
@@ -139,6 +141,7 @@ pub fn recommend(
 
     // 2. The best of those that reach the goal with their margin.
     let Some(best) = best_candidate(goal, &candidates) else {
+        // For the message: how far the best of all is from the goal.
         let guaranteed = candidates.iter().map(|candidate| candidate.assessment.guaranteed);
         let reached = match goal {
             Goal::AtLeastDb(_) => guaranteed.fold(f64::NEG_INFINITY, f64::max),
@@ -175,14 +178,17 @@ pub fn recommend(
 /// The fastest candidate that reaches a required error, or the most exact one that reaches a
 /// required time.
 fn best_candidate<'a>(goal: Goal, candidates: &[Candidate<'a>]) -> Option<Candidate<'a>> {
+    // With the margin: the goal has to be reached at points that were not measured.
     let reaching = candidates.iter().copied();
     let mut reaching = reaching.filter(|c| goal.is_met_by(c.assessment.guaranteed));
     match goal {
         Goal::AtLeastDb(_) => reaching
+            // `min_by` returns the first of equal ones: the order of the list decides.
             .min_by(|a, b| a.measurement.cost.step_ms.total_cmp(&b.measurement.cost.step_ms)),
         Goal::AtMostMs(_) => {
             let worst_db =
                 |c: &Candidate<'_>| Goal::AtLeastDb(0.0).assess(c.measurement).selection_worst;
+            // A NaN compares with nothing: the first candidate must not have one.
             let mut best = reaching.find(|c| !worst_db(c).is_nan())?;
             for candidate in reaching {
                 if worst_db(&candidate) > worst_db(&best) {
@@ -196,11 +202,13 @@ fn best_candidate<'a>(goal: Goal, candidates: &[Candidate<'a>]) -> Option<Candid
 
 impl EncodingCost {
     fn new(measurement: &Measurement) -> Self {
+        // The quality that sessions have if they ask for none.
         let default = ImageEncoding::Jpeg(wildcity_session::limits::JPEG_QUALITY);
         Self {
             encoding: measurement.setting.name.clone(),
             is_default: measurement.setting.encoding == Some(default),
             min_db: measurement.min_db(),
+            // Both were scaled to the same speed of the machine.
             extra_ms: measurement.cost.step_ms - measurement.baseline_ms,
         }
     }
@@ -216,10 +224,12 @@ impl Recommendation {
             |field: &str, reason: String| ProfileError::Change { field: field.to_owned(), reason };
         // A profile with the changes, as JSON; then only the fields that were changed.
         let mut profile = RenderProfile::default();
+        // The text of a change is parsed in one place only, by the profile.
         self.profile.iter().try_for_each(|change| profile.set(change))?;
         let all_fields =
             serde_json::to_value(profile).map_err(|error| bad("profile", error.to_string()))?;
         let changed_field = |change: &String| {
+            // A change has the form field=value; without `=` it would have failed above.
             let key = change.split_once('=').map_or(change.as_str(), |(key, _)| key);
             let value = all_fields.get(key);
             let value = value.ok_or_else(|| bad(key, "it is missing in the JSON".to_owned()))?;
@@ -292,6 +302,7 @@ impl Goal {
         match self {
             Self::AtLeastDb(_) => {
                 let selection_worst = least(&selection);
+                // At least 1 dB: a few points with the same value by chance show no spread.
                 let margin = worse_half_deviation(&selection, f64::lt).max(MIN_MARGIN_DB);
                 Assessment {
                     selection_worst,
@@ -320,11 +331,14 @@ impl Goal {
 fn worse_half_deviation(values: &[f64], is_worse: fn(&f64, &f64) -> bool) -> f64 {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
+    // Without values `at` gives NaN, and so do median and deviation.
     let last = sorted.len().saturating_sub(1);
     let at = |index: usize| sorted.get(index).copied().unwrap_or(f64::NAN);
+    // For an odd number both indices are the middle one.
     let median = 0.5 * (at(last / 2) + at(last.div_ceil(2)));
     let worse: Vec<f64> = sorted.into_iter().filter(|value| is_worse(value, &median)).collect();
     let squares: f64 = worse.iter().map(|value| (value - median).powi(2)).sum();
+    // Without a worse value 0/1: no spread.
     (squares / worse.len().max(1) as f64).sqrt()
 }
 

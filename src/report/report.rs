@@ -84,11 +84,13 @@ impl Report {
     /// except around names. A cell is empty where there is no value: dB at offsets from a drive if
     /// none was recorded, and bytes of a device if the backend has none.
     pub fn csv(&self) -> String {
+        // The distances are a part of the columns' names: another list of them is another file.
         let by_offset = OFFSETS_M.map(|offset_m| format!("psnr_db_at_{offset_m}_m")).join(",");
         let mut csv = format!(
             "setting,family,backend,step_ms,p95_ms,psnr_db,least_db,{by_offset},ssim,max,p99_9,depth_l1_m,\
              gaussians,scene_bytes,device_bytes,stored_bytes_each,sent_bytes,on_front\n"
         );
+        // Fields in the order of the header.
         for (measurement, is_on_front) in self.settings.iter().zip(pareto_front(&self.settings)) {
             csv.push_str(&self.csv_line(measurement, is_on_front));
         }
@@ -100,6 +102,7 @@ impl Report {
         let cost = &measurement.cost;
         let backend = self.backends[measurement.setting.backend].backend;
         let psnr_at = |offset: usize| {
+            // A twin without a drive has one value only.
             measurement.psnr_db_by_offset.get(offset).map_or(String::new(), f64::to_string)
         };
         format!(

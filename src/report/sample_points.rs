@@ -61,9 +61,11 @@ pub fn sample_points(
 /// The rig moves with the mean speed of the whole drive, for cameras with rolling shutters.
 fn along(drive: &Trajectory, cameras: &[RigCamera], sampling: Sampling) -> Vec<SamplePoint> {
     let length_m = drive.length_m();
+    // Constant over the drive: the poses of an exposure must not depend on where it stopped.
     let speed_m_per_us = mean_speed_m_per_us(drive);
     let mut points = Vec::new();
     for station in 0..sampling.stations {
+        // The middle of each of `stations` equal parts of the drive.
         let share = (f64::from(station) + 0.5) / f64::from(sampling.stations);
         let station_m = share * length_m;
         let is_left = (station / 2).is_multiple_of(2);
@@ -75,6 +77,7 @@ fn along(drive: &Trajectory, cameras: &[RigCamera], sampling: Sampling) -> Vec<S
                 position_m: DVec3::new(0.0, sign * offset_m, 0.0),
                 rotation: DQuat::IDENTITY,
             };
+            // The offset is in the rig's axes, and turns with it in a bend.
             let world_from_rig_before = |age_us: i64| {
                 drive.at_station(station_m - speed_m_per_us * age_us as f64) * rig_from_offset_rig
             };
@@ -91,6 +94,7 @@ fn along(drive: &Trajectory, cameras: &[RigCamera], sampling: Sampling) -> Vec<S
                 views: View::from_moving_rig(cameras, world_from_rig, &world_from_rig_before),
                 windows: Vec::new(),
             };
+            // The number of the point continues the sequence of the windows.
             points.push(point.with_windows(points.len(), sampling.window_px, 1.0));
         }
     }
@@ -128,6 +132,7 @@ fn around(bounds: Bounds, sampling: Sampling) -> Vec<SamplePoint> {
     let point_at = |index: u32| {
         let turn = f64::from(index) / f64::from(count);
         let (sin, cos) = (turn * std::f64::consts::TAU).sin_cos();
+        // Height over the horizontal unit vector (cos, sin).
         let slope = AROUND_ELEVATION_DEG.to_radians().tan();
         let toward_camera = DVec3::new(cos, sin, slope).normalize();
         let position_m = middle_m + distance_m * toward_camera;
@@ -159,12 +164,16 @@ impl SamplePoint {
     /// image's sides, around its middle. `index` is the number of this point.
     fn with_windows(mut self, index: usize, window_px: [u32; 2], share: f64) -> Self {
         let window = |(camera, view): (usize, &View)| {
+            // Every camera of every point has its own number.
             let i = (index * CAMERAS_PER_POINT + camera + 1) as f64;
             let image_px = [view.camera.width_px, view.camera.height_px];
+            // An image that is smaller than the window is compared as a whole.
             let size_px = [0, 1].map(|axis| window_px[axis].min(image_px[axis]));
             let corner_px = [0, 1].map(|axis| {
                 let in_unit_square = (0.5 + i * R2_STEPS[axis]).fract();
+                // Drawn together around the middle by `share`.
                 let in_image = 0.5 + share * (in_unit_square - 0.5);
+                // `in_image` is below 1, so that the window ends within the image.
                 (in_image * f64::from(image_px[axis] - size_px[axis])) as i32
             });
             crop_view(*view, corner_px, size_px)
@@ -181,6 +190,7 @@ impl SamplePoint {
         let scale_all = |views: &[View]| -> Result<Vec<View>, CameraError> {
             let mut views: Vec<View> =
                 views.iter().map(|view| scaled(*view, setting.scale)).collect::<Result<_, _>>()?;
+            // Without a native size the pixels count as native ones.
             if setting.own_blur {
                 views.iter_mut().for_each(|view| view.camera.native_size_px = None);
             }
@@ -199,6 +209,7 @@ impl SamplePoint {
 /// # Errors
 /// The camera cannot be scaled to such a small image.
 pub(super) fn scaled(view: View, scale: f64) -> Result<View, CameraError> {
+    // At least 1: no side vanishes.
     let side_px = |px: u32| ((f64::from(px) * scale).round() as u64).max(1);
     let camera = view.camera;
     let camera = camera.scaled(side_px(camera.width_px), side_px(camera.height_px))?;

@@ -38,6 +38,7 @@ impl Setting {
     /// # Errors
     /// Names the change that cannot be made.
     pub fn apply(&self, mut profile: RenderProfile) -> Result<RenderProfile, ProfileError> {
+        // In order: a later change of the same field wins.
         self.profile.iter().try_for_each(|change| profile.set(change))?;
         Ok(profile)
     }

@@ -150,6 +150,7 @@ impl<'a> ListBuilder<'a> {
         Self {
             twin,
             settings: vec![as_served.clone()],
+            // Kept as the base of all others, each of which changes one thing of it.
             as_served,
             skipped: vec![Skipped::new("tile size", TILE_SIZE_REASON)],
         }
@@ -170,6 +171,7 @@ impl<'a> ListBuilder<'a> {
     }
 
     fn add_backends(&mut self, backends: &[&str]) {
+        // The first backend is that of "as served".
         for (backend, name) in backends.iter().enumerate().skip(1) {
             let name = (*name).to_owned();
             let family = Family::Backend;
@@ -182,6 +184,7 @@ impl<'a> ListBuilder<'a> {
             self.skip("tau_px", "the twin has no levels of detail");
             return;
         }
+        // The twin's own value is "as served" already.
         for tau_px in TAUS_PX.into_iter().filter(|tau_px| *tau_px != self.twin.profile.tau_px) {
             self.add_profile_change(Family::Detail, tau_change(tau_px));
         }
@@ -191,6 +194,7 @@ impl<'a> ListBuilder<'a> {
         match self.twin.profile.reach_m {
             None => self.skip("reach_m", "the profile does not limit the draw distance"),
             Some(_) => {
+                // Compared with no limit at all.
                 self.add_profile_change(Family::DrawDistance, "reach_m=none".to_owned());
             }
         }
@@ -219,6 +223,7 @@ impl<'a> ListBuilder<'a> {
         let profile = self.twin.profile;
         let antialiased = format!("antialiased={}", !profile.antialiased);
         self.add_profile_change(Family::Antialiasing, antialiased);
+        // Only coarser values: finer ones cost time, and the reference has the twin's own.
         for alpha_cut in ALPHA_CUTS.into_iter().filter(|cut| *cut > profile.alpha_cut) {
             self.add_profile_change(Family::AlphaCut, alpha_cut_change(alpha_cut));
         }
@@ -235,6 +240,7 @@ impl<'a> ListBuilder<'a> {
             }
             BackgroundKind::Network => {
                 let own = self.twin.profile.sky_error;
+                // 0 is among them: the sky evaluated for every pixel.
                 for error in SKY_ERRORS.into_iter().filter(|error| *error != own) {
                     self.add_profile_change(Family::Sky, format!("sky_error={error}"));
                 }
@@ -275,11 +281,13 @@ impl<'a> ListBuilder<'a> {
     fn add_scales(&mut self) {
         for scale in SCALES {
             let scaled = Setting {
+                // Three decimals: 1/3 is "0.333".
                 name: format!("scale {}", (scale * 1e3).round() / 1e3),
                 family: Family::Scale,
                 scale,
                 ..self.as_served.clone()
             };
+            // Names have to be unique within a report.
             let name = format!("{} with its own blur", scaled.name);
             self.settings.push(scaled.clone());
             self.settings.push(Setting { name, own_blur: true, ..scaled });
@@ -302,6 +310,7 @@ impl<'a> ListBuilder<'a> {
 
     fn add_combinations(&mut self) {
         for Combination { tau_px, alpha_cut } in COMBINED {
+            // In the order in which a reader looks for them: the detail first.
             let mut changes = vec![alpha_cut_change(alpha_cut), stop_change(COMBINED_STOP)];
             if self.twin.has_levels {
                 changes.insert(0, tau_change(tau_px));

@@ -48,6 +48,7 @@ impl Step<'_> {
         let mut times = StepTimes::default();
         let mut own_images = self.empty_images();
         let mut baseline_images = baseline.empty_images();
+        // Own step and baseline alternate, so that both see the same disturbances.
         for run in 0..=repeat {
             let own_run = self.run(&mut own_images)?;
             let baseline_run = baseline.run(&mut baseline_images)?;
@@ -82,8 +83,10 @@ impl Step<'_> {
         let on_finished = |view: usize, target: &Target<'_>| {
             let rgb8 = target.rgb8.as_deref().unwrap_or_default();
             let file = encode(self.encoding, &self.views[view], rgb8);
+            // Not compressed, an image has the size of its pixels.
             let bytes = file.map(|file| file.map_or(rgb8.len(), |file| file.len()) as u64);
             let mut sum = sent_bytes.lock();
+            // The first error stays; later images do not replace it by their sizes.
             *sum = sum.clone().and_then(|sum| Ok(sum + bytes?));
         };
         let frame = Frame { scene: self.scene, profile: self.profile, views: self.views };
@@ -92,6 +95,7 @@ impl Step<'_> {
         self.backend.render(&frame, &mut targets, &on_finished)?;
         let ms = start.elapsed().as_secs_f64() * 1e3;
 
+        // After the time was taken, as the error is of no concern to it.
         let sent_bytes = sent_bytes.into_inner();
         let sent_bytes = sent_bytes.map_err(|reason| ReportError::Encode { reason })?;
         Ok(StepRun { ms, sent_bytes })

@@ -51,12 +51,15 @@ struct Coverage {
 impl Coverage {
     /// The coverage of all `count` new rows over `own` rows.
     fn all(count: u32, own: u32) -> Vec<Self> {
+        // Rows of the own image per row of the smaller one: 1 or more.
         let step = f64::from(own) / f64::from(count);
         let of_one = |i: u32| {
             let begin = f64::from(i) * step;
             let end = begin + step;
             let first = begin.floor() as usize;
+            // Rounding may put the last end just above the own number of rows.
             let last = (end.ceil() as usize).min(own as usize);
+            // The overlap of [begin, end] and the row [k, k + 1].
             let covered = |k: usize| end.min(k as f64 + 1.0) - begin.max(k as f64);
             let shares = (first..last).map(|k| (covered(k).max(0.0) / step) as f32).collect();
             Self { first, shares }
@@ -83,6 +86,7 @@ impl Image {
                 let mut rgb = [0.0; 3];
                 let mut opacity = 0.0;
                 let mut depth = 0.0;
+                // The shares of rows and columns each sum to 1, and so do their products.
                 for (y, down) in row.shares.iter().enumerate() {
                     for (x, across) in column.shares.iter().enumerate() {
                         let pixel = (row.first + y) * own_width as usize + column.first + x;
@@ -96,6 +100,7 @@ impl Image {
                 }
                 new.rgb.extend(rgb);
                 new.opacity.push(opacity);
+                // A pixel without opacity has no depth: 0, as in a rendered image.
                 new.depth_m.push(if opacity > 0.0 { depth / opacity } else { 0.0 });
             }
         }
@@ -120,11 +125,13 @@ impl ErrorAccumulator {
         self.errors.extend(pairs.map(|(a, b)| (a - b).abs()));
         self.ssims.push(ssim(image, truth));
         for (pixel, (depth_m, truth_m)) in image.depth_m.iter().zip(&truth.depth_m).enumerate() {
+            // Below one half the depth is a mean of a faint surface and of what lies behind it.
             if image.opacity[pixel] >= 0.5 && truth.opacity[pixel] >= 0.5 {
                 self.depth_sum_m += f64::from((depth_m - truth_m).abs());
                 self.depths += 1;
             }
         }
+        // Only of the values that this pair has added.
         psnr_db(self.errors[before..].iter().map(|&off| f64::from(off)))
     }
 
@@ -141,12 +148,14 @@ impl ErrorAccumulator {
         let mut sorted = self.errors.clone();
         sorted.sort_unstable_by(f32::total_cmp);
         let max = f64::from(*sorted.last()?);
+        // Rounded up to the next value of the list: a percentile of few values is their largest.
         let at = ((sorted.len() - 1) as f64 * 0.999).ceil() as usize;
         Some(ImageErrors {
             psnr_db: psnr_db(sorted.iter().map(|&off| f64::from(off))),
             ssim: self.ssims.iter().sum::<f64>() / self.ssims.len() as f64,
             max,
             p99_9: f64::from(sorted[at]),
+            // Images without any depth have no error of depth, and not NaN.
             depth_l1_m: self.depth_sum_m / self.depths.max(1) as f64,
         })
     }
@@ -184,6 +193,7 @@ mod tests {
     #[test]
     fn known_errors() {
         let truth = striped(4, 0.0);
+        // Two equal images: no error at all.
         let mut image = striped(4, 0.0);
         let mut accumulator = ErrorAccumulator::default();
         assert_eq!(accumulator.add(&image, &truth), f64::INFINITY);
@@ -191,6 +201,8 @@ mod tests {
         // A tenth everywhere is 20 dB; one value of 3,600 is beyond the 99.9th percentile.
         image.rgb.iter_mut().for_each(|value| *value += 0.1);
         image.rgb[7] += 0.3;
+        // Of 1,200 pixels 600 are off by 0.5 m, which adds up to 300 m. The last pixel is too faint
+        // to count, so that 1,199 remain and its error of a million metres has no effect.
         image.depth_m[..600].fill(5.5);
         image.opacity[1199] = 0.4;
         image.depth_m[1199] = 1e6;
@@ -213,6 +225,7 @@ mod tests {
         };
         let one = ramp.averaged([1, 1]);
         assert!((one.rgb[0] - 0.4).abs() < 1e-6 && (one.opacity[0] - 0.5).abs() < 1e-6);
+        // Weighted by opacity: (0.5 x 1 + 1 x 2)/(0 + 0.5 + 1); the pixel at 5 m is transparent.
         assert!((one.depth_m[0] - 2.5 / 1.5).abs() < 1e-6, "{}", one.depth_m[0]);
         // The second of two pixels covers half of the middle one: (0.15 + 0.9)/1.5.
         let two = ramp.averaged([2, 1]);

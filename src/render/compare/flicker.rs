@@ -8,6 +8,7 @@
 /// above 0 where both images show the same surface.
 pub fn flicker(now: &[u8], previous_warped: &[u8], valid: &[f32]) -> Option<f64> {
     let mut sum = 0_u64;
+    // Integer sums are exact, so that the result does not depend on an order.
     let mut count = 0_u64;
     let pixels = now.chunks_exact(3).zip(previous_warped.chunks_exact(3));
     for ((now, previous), _) in pixels.zip(valid).filter(|(_, valid)| **valid > 0.0) {
@@ -25,6 +26,7 @@ mod tests {
     fn it_is_the_mean_of_the_valid_pixels() {
         let now = [10, 20, 30, 255, 255, 255, 0, 0, 0];
         let previous = [40, 20, 0, 0, 0, 0, 51, 51, 51];
+        // The middle pixel differs by 255, but is not valid.
         let mean = flicker(&now, &previous, &[1.0, 0.0, 1.0]).unwrap();
         assert!((mean - (30.0 + 0.0 + 30.0 + 3.0 * 51.0) / 6.0 / 255.0).abs() < 1e-15, "{mean}");
         assert_eq!(flicker(&now, &previous, &[0.0; 3]), None);

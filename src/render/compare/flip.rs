@@ -54,9 +54,12 @@ pub fn flip(image: &[f32], truth: &[f32], size_px: [u32; 2]) -> Vec<f32> {
     let [width, height] = size_px.map(|px| px as usize);
     assert!(image.len() == 3 * width * height && truth.len() == image.len(), "{size_px:?}");
     let [image, truth] = [image, truth].map(|srgb| Perceived::new(srgb, width));
+    // The paper normalizes by the distance of green and blue, the largest in the gamut.
     let most = hyab(hunt_lab([0.0, 1.0, 0.0]), hunt_lab([0.0, 0.0, 1.0])).powf(COLOR_EXPONENT);
     let knee = KNEE * most;
     let error = |pixel: usize| {
+        // A line from 0 to the knee takes 95 % of the range, and a flatter one the rest: large
+        // differences of colour are all about equally visible.
         let color = hyab(image.lab[pixel], truth.lab[pixel]).powf(COLOR_EXPONENT);
         let color = if color < knee {
             KNEE_VALUE / knee * color
@@ -65,7 +68,9 @@ pub fn flip(image: &[f32], truth: &[f32], size_px: [u32; 2]) -> Vec<f32> {
         };
         let edges = (image.edges[pixel] - truth.edges[pixel]).abs();
         let points = (image.points[pixel] - truth.points[pixel]).abs();
+        // A strength is a hypotenuse of two axes with at most 1 each, hence the division by root 2.
         let feature = (edges.max(points) / 2.0_f32.sqrt()).powf(FEATURE_EXPONENT);
+        // The base is at most 1, so that a smaller exponent raises the error.
         color.powf(1.0 - feature)
     };
     (0..width * height).into_par_iter().map(error).collect()
@@ -90,10 +95,12 @@ impl Perceived {
         let blurred = [0, 1, 2].map(|c| blur(&channel(c), width, SENSITIVITY[c]));
         let lab = |pixel: usize| {
             let color = [0, 1, 2].map(|c: usize| blurred[c][pixel]);
+            // The blur of the opponent channels may leave the gamut of the display.
             hunt_lab(linear_of_opponent(color).map(|value| value.clamp(0.0, 1.0)))
         };
         let lab = (0..opponent.len()).into_par_iter().map(lab).collect();
         let brightness: Plane = opponent.iter().map(|[y, ..]| (y + 16.0) / 116.0).collect();
+        // A feature's kernel along one axis, and the smooth one along the other: both directions.
         let [smooth, edge, point] = feature_kernels();
         let strength = |kernel: &[f32]| -> Plane {
             let across = convolved(&brightness, width, kernel, &smooth);
@@ -151,6 +158,8 @@ fn hyab(a: [f32; 3], b: [f32; 3]) -> f32 {
 
 /// A plane blurred by a sum of two Gaussians. Each is separable, their sum is not.
 fn blur(plane: &[f32], width: usize, gaussians: [(f64, f64); 2]) -> Plane {
+    // A Gaussian exp(-pi^2 x^2/b) has the standard deviation root(b/2)/pi; three of the widest,
+    // from degrees to pixels.
     let reach = (3.0 * (WIDEST / (2.0 * PI * PI)).sqrt() * PIXELS_PER_DEGREE).ceil() as i32;
     let kernel = |scale: f64| -> Vec<f64> {
         let at = |k: i32| (-(PI * f64::from(k) / PIXELS_PER_DEGREE).powi(2) / scale).exp();
@@ -159,12 +168,15 @@ fn blur(plane: &[f32], width: usize, gaussians: [(f64, f64); 2]) -> Plane {
     let parts = gaussians.map(|(amplitude, scale)| {
         let kernel = kernel(scale);
         let along: f64 = kernel.iter().sum();
+        // Weight of this Gaussian in two dimensions: its factor a root(pi/b), times the sum of the
+        // kernel along both axes. What follows works with kernels of sum 1.
         let share = amplitude * (PI / scale).sqrt() * along * along;
         let unit: Vec<f32> = kernel.iter().map(|weight| (weight / along) as f32).collect();
         (share, unit)
     });
     let total: f64 = parts.iter().map(|(share, _)| share).sum();
     let mut sum = vec![0.0; plane.len()];
+    // The first two channels have one Gaussian only, and need no second pass.
     for (share, kernel) in parts.iter().filter(|(share, _)| *share > 0.0) {
         let share = (share / total) as f32;
         let part = convolved(plane, width, kernel, kernel);
@@ -186,11 +198,13 @@ fn feature_kernels() -> [Vec<f32>; 3] {
     let unit = |weights: Vec<f64>| -> Vec<f32> {
         let positive: f64 = weights.iter().filter(|w| **w > 0.0).sum();
         let negative: f64 = -weights.iter().filter(|w| **w < 0.0).sum::<f64>();
+        // Each sign by itself, so that a plane of one brightness has no feature.
         let scaled = |w: &f64| w / if *w < 0.0 { negative } else { positive };
         weights.iter().map(|w| scaled(w) as f32).collect()
     };
     [
         unit(kernel(&|_| 1.0)),
+        // First and second derivative of the Gaussian, up to a factor.
         unit(kernel(&|x| -x)),
         unit(kernel(&|x| x * x / (sigma_px * sigma_px) - 1.0)),
     ]
@@ -204,6 +218,7 @@ fn convolved(plane: &[f32], width: usize, across: &[f32], down: &[f32]) -> Plane
     let mut along_rows = vec![0.0; plane.len()];
     along_rows.par_chunks_exact_mut(width).zip(plane.par_chunks_exact(width)).for_each(
         |(new, row)| {
+            // A padded copy of the row avoids a test of the edges at every weight.
             let first = std::iter::repeat_n(row[0], reach);
             let last = std::iter::repeat_n(row[width - 1], reach);
             let padded: Vec<f32> = first.chain(row.iter().copied()).chain(last).collect();
@@ -214,6 +229,7 @@ fn convolved(plane: &[f32], width: usize, across: &[f32], down: &[f32]) -> Plane
     );
     let mut new = vec![0.0; plane.len()];
     new.par_chunks_exact_mut(width).enumerate().for_each(|(row, new)| {
+        // Whole rows at a time, since a walk down a column misses the caches at every step.
         for (k, weight) in down.iter().enumerate() {
             let from = (row + k).saturating_sub(reach).min(height - 1) * width;
             for (sum, value) in new.iter_mut().zip(&along_rows[from..from + width]) {

@@ -46,6 +46,7 @@ pub fn gaussians_from_specs(specs: &[GaussianSpec]) -> Gaussians {
         g.means_m.push(mean_m.to_array());
         g.quats_wxyz.push([q.w, q.x, q.y, q.z].map(|q| q as f32));
         g.ln_scales.push(sigma_m.to_array().map(|s| s.ln() as f32));
+        // The inverse of the sigmoid, and that of 0.5 + C0 c.
         g.logit_opacities.push((opacity / (1.0 - opacity)).ln() as f32);
         g.sh.extend(rgb.map(|c| ((c - 0.5) / sh::C0) as f32));
     }

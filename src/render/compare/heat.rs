@@ -9,6 +9,7 @@ pub const HEAT_RGB: [[u8; 3]; 6] =
 pub fn heat_rgb(place: f32) -> [u8; 3] {
     let last = HEAT_RGB.len() - 1;
     let place = place.clamp(0.0, last as f32);
+    // The last colour is the upper end of the last interval. A cast of NaN gives 0.
     let low = (place as usize).min(last - 1);
     let share = if place.is_nan() { 0.0 } else { place - low as f32 };
     [0, 1, 2].map(|channel| {

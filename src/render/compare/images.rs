@@ -65,6 +65,7 @@ pub fn view_along(
     down: DVec3,
 ) -> View {
     let z = forward.normalize();
+    // x to the right, y down, z ahead: x = y x z. The given `down` need not be normal to z.
     let x = down.cross(z).normalize();
     let axes = DMat3::from_cols(x, z.cross(x), z);
     let [width_px, height_px] = size_px;
@@ -110,6 +111,7 @@ pub fn max_difference(a: &[f32], b: &[f32]) -> f32 {
     if a.len() != b.len() {
         return f32::INFINITY;
     }
+    // Not `f32::max`, which ignores a NaN.
     a.iter().zip(b).fold(0.0, |most, (a, b)| {
         let difference = (a - b).abs();
         if difference <= most {
@@ -134,6 +136,7 @@ pub const AGREEMENT_DB: f64 = 70.0;
 pub fn agree(image: &RenderedImage, truth: &RenderedImage) -> Result<f64, String> {
     let pairs = image.rgba.iter().zip(&truth.rgba);
     let db = psnr_db(pairs.map(|(a, b)| f64::from(a - b)));
+    // Written so that a NaN fails: no comparison with it holds.
     let off = max_difference(&image.rgba, &truth.rgba);
     let close = db >= AGREEMENT_DB && off <= 2.0 / 255.0;
     if !close {
@@ -149,6 +152,7 @@ pub fn agree(image: &RenderedImage, truth: &RenderedImage) -> Result<f64, String
     let mut off = 0.0;
     let mut covered = 0.0;
     for (pixel, (&depth, &truth_m)) in image.depth_m.iter().zip(&truth.depth_m).enumerate() {
+        // A faint pixel's depth is a quotient of two small sums; it has to be a number, no more.
         if truth.opacity[pixel] < 0.5 {
             if !depth.is_finite() {
                 return Err(format!("pixel {pixel}: depth {depth}"));

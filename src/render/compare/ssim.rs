@@ -54,6 +54,7 @@ impl Ssim {
             .map(|band| pair.band(band * BAND_ROWS, blocked.as_ref()))
             .collect();
         let mut all = Sums::default();
+        // In the order of bands and not of threads, so that the last bits are the same every time.
         for band in &bands {
             all.within += band.within;
             all.windows += band.windows;
@@ -89,6 +90,8 @@ impl Pair<'_> {
         let rows = BAND_ROWS.min(self.height - first_row);
         let mut sums = Sums::default();
         for channel in 0..3 {
+            // The window is separable: means along rows once, and the sums down the columns from
+            // them. The band needs the rows within the window's reach above and below, too.
             let means: Vec<Vec<[f64; 5]>> = (0..rows + 2 * REACH_PX)
                 .map(|k| mirrored((first_row + k) as isize - REACH_PX as isize, self.height))
                 .map(|row| self.row_means(row, channel))
@@ -100,6 +103,7 @@ impl Pair<'_> {
                     sums.mirrored += value;
                     if self.is_within(first_row + row, column, blocked) {
                         sums.within += value;
+                        // Counted once per channel, as are the values of `within`.
                         sums.windows += 1;
                     }
                 }
@@ -125,6 +129,8 @@ impl Pair<'_> {
     /// The index of similarity of one window.
     fn value(&self, rows: &[Vec<[f64; 5]>], column: usize) -> f64 {
         let [ma, mb, aa, bb, ab] = self.weighted(rows.iter().map(|row| &row[column]));
+        // The variance as a mean of squares minus the square of the mean: in f64, and with values
+        // up to 1, rounding is far below C2.
         let va = aa - ma * ma;
         let vb = bb - mb * mb;
         let covariance = ab - ma * mb;
@@ -159,6 +165,8 @@ struct BlockedPixels {
 impl BlockedPixels {
     fn new(counts: &[bool], width: usize) -> Self {
         let stride = width + 1;
+        // A table with one row and one column of zeros before the first, so that a rectangle at the
+        // edge needs no case of its own.
         let mut sums = vec![0; stride];
         for row in counts.chunks_exact(width) {
             let above = sums.len() - stride;
@@ -179,6 +187,7 @@ impl BlockedPixels {
         let bottom = (row + REACH_PX + 1) * self.stride;
         let left = column - REACH_PX;
         let right = column + REACH_PX + 1;
+        // By inclusion and exclusion. The additions come first, so that no difference is negative.
         self.sums[bottom + right] + self.sums[top + left]
             - self.sums[top + right]
             - self.sums[bottom + left]
@@ -189,6 +198,7 @@ impl BlockedPixels {
 /// repeating the last one.
 fn mirrored(at: isize, side: usize) -> usize {
     let last = side as isize - 1;
+    // Back and forth over the pixels has a period of 2 (side - 1); a side of 1 has none.
     let turns = at.rem_euclid((2 * last).max(1));
     if last == 0 { 0 } else { turns.min(2 * last - turns) as usize }
 }
@@ -232,6 +242,8 @@ mod tests {
 
     #[test]
     fn windows_with_a_masked_pixel_do_not_count() {
+        // The noise lies in columns 0 to 9, and only columns from 10 on count: the first window
+        // lies around column 15.
         let counts: Vec<bool> = (0..40 * 30).map(|i| i % 40 >= 10).collect();
         let noisy = striped(10);
         let masked = Ssim::compare(&noisy, &striped(0), [40, 30], Some(&counts));

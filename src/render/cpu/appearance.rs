@@ -20,6 +20,7 @@ pub(super) fn apply<S: Simd>(
     for block in 0..BLOCKS {
         let load = |c: usize| f32x16::load_array_ref(simd, &sums.rgb[c][block]);
         let mut rgb = Vec3x16 { x: load(0), y: load(1), z: load(2) };
+        // The order is that of the camera: the sensor's exposure, then what lies over the image.
         if let Some(exposure) = &appearance.exposure {
             rgb = expose(simd, exposure, rgb);
         }
@@ -71,6 +72,7 @@ fn blend_overlay<S: Simd>(
         }
     }
     let splat = |value: f32| f32x16::splat(simd, value);
+    // Lanes outside of the image have alpha 0 and remain as they are.
     let load = |c: usize| f32x16::load_array_ref(simd, &over[c]) * splat(1.0 / 255.0);
     let alpha = load(3);
     let color = Vec3x16 { x: load(0), y: load(1), z: load(2) };

@@ -51,6 +51,7 @@ impl Background {
     pub(super) fn from_frame(frame: &Frame<'_>) -> Result<Vec<Self>, RenderError> {
         let Some((sky, sky_from_world)) = frame.background()? else { return Ok(Vec::new()) };
         let of_view = |view: &View| {
+            // From the cheapest form to the most general one.
             let rays = if view.is_static_pinhole() {
                 PixelRays::Pinhole(view.sky_from_pixel(sky_from_world))
             } else if let Some(rays) = LensRays::new(view, sky_from_world) {
@@ -97,6 +98,7 @@ impl Background {
         let splat = |value: f32| f32x16::splat(simd, value);
         let transmittance = f32x16::load_array_ref(simd, &sums.transmittance[block]);
         let shows = transmittance.simd_ge(splat(SKY_CUT as f32));
+        // Most blocks of a street end here, before any direction is computed.
         if shows.all_false() {
             return;
         }
@@ -131,6 +133,7 @@ impl Background {
             // `scratch` is made for every network.
             (DrawableSky::Network(_), None) => return,
         };
+        // Pixels of the block below the cut get nothing, as if their block had been skipped.
         let weight = shows.select(transmittance, splat(0.0));
         for (sum, color) in sums.rgb.iter_mut().zip(rgb) {
             let sum = &mut sum[block];
@@ -147,6 +150,7 @@ impl PerPixelRays {
         for lane in 0..LANES {
             let at_px = DVec2::new(f64::from(x_px[lane]), f64::from(y_px[lane]));
             if let Some(ray) = self.view.ray_world(at_px) {
+                // In f64 up to here, since only the direction itself fits f32 without a loss.
                 for (axis, value) in (self.sky_from_world * ray).to_array().into_iter().enumerate()
                 {
                     directions[axis][lane] = value as f32;
@@ -169,6 +173,8 @@ fn sample_cube_map<S: Simd>(simd: S, map: &Arc<CubeMap>, direction: Vec3x16<S>) 
     let ax = x.abs();
     let ay = y.abs();
     let az = z.abs();
+    // Ties go to x, then to y: every direction has exactly one face. `is_y` counts only where
+    // `is_x` is false.
     let is_x = ax.simd_ge(ay) & ax.simd_ge(az);
     let is_y = ay.simd_ge(az);
     let zero = splat(0.0);
@@ -187,6 +193,8 @@ fn sample_cube_map<S: Simd>(simd: S, map: &Arc<CubeMap>, direction: Vec3x16<S>) 
     let middle = splat((0.5 * scale + offset) as f32);
     let u = (right / ahead).mul_add(half, middle);
     let v = (down / ahead).mul_add(half, middle);
+    // A cell needs the texel to the right and the one below, so the last cell begins one before the
+    // last texel. The clamp also bounds the indices of the gather below.
     let last = splat(map.edge() as f32 - 2.0);
     let column = u.floor().max(zero).min(last);
     let row = v.floor().max(zero).min(last);
@@ -214,6 +222,8 @@ fn sample_cube_map<S: Simd>(simd: S, map: &Arc<CubeMap>, direction: Vec3x16<S>) 
     for (c, rgb) in rgb.iter_mut().enumerate() {
         let mut corners = [zero; 4];
         for k in 0..4 {
+            // Red is the lower half of the first word, green its upper half, blue the lower
+            // half of the second.
             let bits = u32x16::load_array_ref(simd, if c < 2 { &red_green[k] } else { &blue[k] });
             let value = if c == 1 { bits >> 16 } else { bits & 0xFFFF };
             corners[k] = value.to_float();

@@ -82,6 +82,7 @@ impl Batch {
         let lane_y = f32x16::from_fn(simd, |lane| (lane as u32 / BLOCK_PX) as f32 - half_px);
         let block_x = (lane_x + splat(half_px)) * splat(BLOCK_PX as f32);
         let block_y = (lane_y + splat(half_px)) * splat(BLOCK_PX as f32);
+        // The centre of the first block: half a pixel to the first pixel's centre, and 1.5 px on.
         let [tile_x, tile_y] = at_px.map(|px| px as f32 + 0.5 + half_px);
 
         for k in 0..len.min(BATCH) {
@@ -89,6 +90,8 @@ impl Batch {
                 &self.splats[k];
             let dx = block_x - splat(mean_px[0] - tile_x);
             let dy = block_y - splat(mean_px[1] - tile_y);
+            // Both forms are linear, so that a block's value and a lane's offset add up to
+            // a pixel's.
             let u = dx.mul_add(splat(*l0), dy * splat(*l1));
             let v = dy * splat(*l2);
             // √power, and the change of u within half a block, both increased by more than the
@@ -108,6 +111,7 @@ impl Batch {
             matched.rgb = *rgb;
             matched.depth_m = *depth_m;
 
+            // 16 lanes give 16 bits, so that the cast drops nothing.
             self.blocks[k] = touches.to_bitmask() as u16;
         }
 

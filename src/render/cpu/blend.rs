@@ -46,6 +46,7 @@ pub(super) fn blend<S: Simd, const DEPTH: bool, const INSTANCES: bool>(
     let mut touching = batch.touching[block];
     let mut count = 0;
     let mut stopped = false;
+    // The bits of a batch are in order of depth, so the lowest bit is the nearest splat.
     while touching != 0 {
         count += 1;
         let index = touching.trailing_zeros() as usize % BATCH;
@@ -60,6 +61,7 @@ pub(super) fn blend<S: Simd, const DEPTH: bool, const INSTANCES: bool>(
         let alpha = exponent.simd_ge(cut).select(alpha, splat(0.0));
 
         // The weight; 0 in pixels that stop here or stopped before.
+        // Each splat is weighted by the transmittance before it: T (1 - alpha) is that after it.
         let after = (-alpha).mul_add(running, running);
         let counts = after.simd_gt(stop);
         let weight = counts.select(alpha * running, splat(0.0));
@@ -73,15 +75,18 @@ pub(super) fn blend<S: Simd, const DEPTH: bool, const INSTANCES: bool>(
         }
         if INSTANCES {
             let half = splat(0.5);
+            // The transmittance passes 1/2 only once, so that at most one splat is noted per pixel.
             let halves = counts & after.simd_le(half) & transmittance.simd_gt(half);
             let mut lanes = halves.to_bitmask();
             while lanes != 0 {
                 let lane = lanes.trailing_zeros() as usize % LANES;
+                // 0 means none, so that places are counted from 1.
                 halved_by[block][lane] = batch.places[index] + 1;
                 lanes &= lanes - 1;
             }
         }
         transmittance = counts.select(after, transmittance);
+        // Only here and not per pixel: one test per splat and block.
         if counts.all_false() {
             stopped = true;
             break;

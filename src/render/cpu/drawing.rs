@@ -28,6 +28,7 @@ pub(super) struct Drawing<'a> {
 /// these, the sums of one view that is drawn in slabs, and each thread's copies of a macro tile.
 pub(super) fn most_held_bytes(most_bytes: u64, views: &[View], threads: usize) -> u64 {
     let sums = views.iter().map(UnfinishedTiles::bytes).max().unwrap_or(0);
+    // A single view may exceed the limit up to the size of its sums, see `Drawing::most_bytes`.
     most_bytes.max(sums) + sums + bin::COPIES_BYTES * threads as u64
 }
 
@@ -53,6 +54,7 @@ impl Stages<'_> {
     ) -> Result<(), PartError> {
         let Self { level, frame, cutoffs, most_bytes } = *self;
         let Scratch { projected, bins, .. } = scratch;
+        // The time of a failed attempt counts, too: the errors are returned after `finish`.
         let mut timer = StageTimer::start();
         // Each splat has one pair at least, nearly always.
         let most_places = most_bytes / limits::LEAST_SPLAT_BYTES;
@@ -78,6 +80,8 @@ impl Drawing<'_> {
         part: FramePart<'_>,
         targets: &mut [Target<'_>],
     ) -> Result<(), RenderError> {
+        // An upper bound of the splats is cheap. If it exceeds the limit, stages that would
+        // overflow are not even begun.
         let most_bytes = self.most_bytes(&part);
         let most_splats = usize::try_from(most_bytes / limits::SPLAT_BYTES).unwrap_or(usize::MAX);
         if part.max_splats(most_splats) <= most_splats {
@@ -91,6 +95,7 @@ impl Drawing<'_> {
         if let [view] = part.frame.views {
             return self.draw_slabs(part, view, targets, most_bytes);
         }
+        // At most 16 views are halved, so that the recursion is at most four deep.
         let [first, second] = part.halves();
         let (of_first, of_second) = targets.split_at_mut(first.frame.views.len());
         self.draw(first, of_first)?;
@@ -100,6 +105,7 @@ impl Drawing<'_> {
     /// A single view may have as much as its sums would take if it were drawn in slabs.
     fn most_bytes(&self, part: &FramePart<'_>) -> u64 {
         match part.frame.views {
+            // Slabs would need as much for their sums, so that drawing at once may take it, too.
             [view] => self.most_bytes.max(UnfinishedTiles::bytes(view)),
             _ => self.most_bytes,
         }
@@ -128,6 +134,7 @@ impl Drawing<'_> {
         targets: &mut [Target<'_>],
         most_bytes: u64,
     ) -> Result<(), RenderError> {
+        // The sums of all tiles, which go on from one slab to the next.
         let tiles = UnfinishedTiles::new(view);
         project::with_jobs(&part.frame, |jobs| {
             let mut timer = StageTimer::start();
@@ -136,6 +143,7 @@ impl Drawing<'_> {
             timer.finish("project", &mut self.stats);
             let mut slabs = Slabs::new(&clusters, most_bytes);
             let mut instances = 0;
+            // From the nearest slab to the farthest: blending goes from front to back.
             while let Some(cut) = slabs.next() {
                 // A slab that cannot be cut any more is one job at one depth.
                 let is_whole = cut.halves().is_none();
@@ -143,6 +151,7 @@ impl Drawing<'_> {
                 let Self { level, cutoffs, .. } = *self;
                 let stages = Stages { level, frame: &part.frame, cutoffs, most_bytes };
                 let slab = Slab { cut: &cut, clusters: &clusters };
+                // Projected again for each slab: only splats within the slab's cut are kept.
                 let run = stages.run(self.scratch, jobs, Some(&slab), Stage::Bin, &mut self.stats);
                 match run {
                     Err(PartError::Overflow) => {
@@ -153,6 +162,7 @@ impl Drawing<'_> {
                     Ok(()) => {}
                 }
                 let Scratch { projected, bins, .. } = &*self.scratch;
+                // The limit applies to the frame, however many slabs it takes.
                 instances += bins.instances();
                 bin::check_instances(instances)?;
                 slabs.drew(bins.held_bytes(projected));
@@ -178,6 +188,7 @@ impl Drawing<'_> {
             |view: usize, target: &Target<'_>| (self.finished)(first_view + view, target);
         let work =
             rasterize::rasterize(self.level, input, continued, rasterizer, targets, &finished);
+        // The copies of each thread's macro tile are not counted: they are bounded beforehand.
         let sums_bytes = continued.map_or(0, |slab| slab.tiles.held_bytes());
         let held_bytes = bins.held_bytes(projected) + sums_bytes;
         self.stats.held_bytes = self.stats.held_bytes.max(held_bytes);
@@ -225,6 +236,7 @@ impl<'a> Slabs<'a> {
             return None;
         }
         // An eighth is reserved for the error of the estimate.
+        // The cut is set in numbers of Gaussians; what each takes is known from the last slab.
         let gaussians = 0.875 * self.most_bytes as f64 / self.bytes_each;
         let (cut, estimated) = self.clusters.next(self.next_key, gaussians);
         self.next_key = cut.keys.end;
@@ -235,6 +247,8 @@ impl<'a> Slabs<'a> {
     /// Records the bytes that the last slab takes.
     fn drew(&mut self, bytes: u64) {
         // A small slab is no basis for the estimate of the next one.
+        // Gaussians outside of the image take nothing, and the next slab may have others: with this
+        // floor it has at most 16 times as many Gaussians as the first estimate allows.
         if self.halves.is_empty() && self.gaussians >= 4096.0 {
             self.bytes_each =
                 (bytes as f64 / self.gaussians).max(limits::SPLAT_BYTES as f64 / 16.0);
@@ -243,8 +257,10 @@ impl<'a> Slabs<'a> {
 
     /// Halves the last slab, which had too many splats.
     fn halve(&mut self, cut: &Cut) {
+        // The estimate was for the whole slab; its last half is the one that is recorded.
         self.gaussians *= 0.5;
         if let Some([near, far]) = cut.halves() {
+            // A stack: the near half is popped first.
             self.halves.extend([far, near]);
         }
     }

@@ -21,10 +21,12 @@ pub(super) fn stage_outputs(
     let mut timer = StageTimer::start();
     let mut outputs = StageOutputs::default();
     // The number of the splat at each place.
+    // Pages are filled in part, so that places have gaps; numbers have none.
     let mut index_of_place = vec![0; projected.places()];
     for unit in projected.units() {
         let first_splat = outputs.splats.len() as u32;
         let instance = unit.instance;
+        // One entry per run of splats of the same instance, and not per splat.
         if outputs.owners.last().is_none_or(|last| last.instance != instance) {
             outputs.owners.push(SplatOwner { first_splat, instance });
         }
@@ -45,6 +47,8 @@ pub(super) fn stage_outputs(
         timer.finish("sort", stats);
     }
     if last >= Stage::Bin {
+        // Bin comes before sort in this backend, so that a macro tile is loaded, and its tiles
+        // sorted, here only for the sake of the plain form.
         let mut lists = TileLists::default();
         let mut loaded = MacroTile::default();
         for (view, grid) in bins.grids().iter().enumerate() {
@@ -56,6 +60,8 @@ pub(super) fn stage_outputs(
                     let start = lists.instances.len() as u32;
                     let places = loaded.tile(within).iter().map(|&splat| loaded.place(splat));
                     lists.instances.extend(places.map(index));
+                    // Tiles of a macro tile are not consecutive in the view: ranges are put at each
+                    // tile's number, and lists lie in the order of macro tiles.
                     let tile = (row * grid.columns + column) as usize;
                     lists.ranges[first_tile + tile] = [start, lists.instances.len() as u32];
                 }

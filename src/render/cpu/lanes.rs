@@ -63,6 +63,8 @@ impl<S: Simd> Vec3x16<S> {
 
     #[inline(always)]
     pub(super) fn cross(self, other: Self) -> Self {
+        // Plain products: a fused difference would round the two products differently, and the
+        // cross product of parallel vectors would not be 0.
         Self {
             x: self.y * other.z - self.z * other.y,
             y: self.z * other.x - self.x * other.z,

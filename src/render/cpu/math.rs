@@ -12,6 +12,7 @@ pub(super) fn atan2<S: Simd>(simd: S, sine: f32x16<S>, cosine: f32x16<S>) -> f32
     let splat = |value: f32| f32x16::splat(simd, value);
     let size = sine.abs();
     let steep = size.simd_gt(cosine);
+    // The smaller of both is at most the root of 1/2, where the arc sine's series converges fast.
     let x = size.min(cosine);
     let z = x * x;
     let series = splat(9.700_31e-2)
@@ -51,6 +52,7 @@ pub(super) fn log2<S: Simd>(simd: S, x: f32x16<S>) -> f32x16<S> {
     let bits: i32x16<S> = x.bitcast();
     // Subtract the bits of √½, so that the exponent rises at √2 and not at 2.
     let shifted = bits - 0x3F35_04F3_i32;
+    // An arithmetic shift: the exponent of a number below 1 is negative.
     let exponent = shifted >> 23;
     let mantissa: f32x16<S> = (bits - (exponent << 23)).bitcast();
     let t = (mantissa - splat(1.0)) / (mantissa + splat(1.0));
@@ -83,6 +85,7 @@ pub(super) fn exp2<S: Simd>(simd: S, x: f32x16<S>) -> f32x16<S> {
         .mul_add(f, splat(1.0));
     let whole: i32x16<S> = whole.to_int();
     let power: i32x16<S> = power.bitcast();
+    // 2^f lies in [1, 2), so that adding to the exponent's bits multiplies by 2^whole.
     (power + (whole << 23)).bitcast()
 }
 
@@ -94,6 +97,7 @@ mod tests {
     #[test]
     fn angles_are_within_two_units_of_f32() {
         for i in -1_000..=1_000 {
+            // From -90 to 90 degrees in steps of 0.09.
             let angle = std::f64::consts::FRAC_PI_2 * f64::from(i) / 1_000.0;
             let found = dispatch!(Level::new(), simd => {
                 let [sine, cosine] = [angle.sin(), angle.cos()].map(|v| f32x16::splat(simd, v as f32));
@@ -120,6 +124,7 @@ mod tests {
     #[test]
     fn exp2_is_within_two_units_of_f32() {
         for i in 0..=16_000 {
+            // Exponents of alpha from 1 down to 1/256, just below the usual cut of 1/255.
             let x = -8.0 * i as f32 / 16_000.0;
             let power = dispatch!(Level::new(), simd => {
                 exp2(simd, f32x16::splat(simd, x)).to_array()[0]

@@ -130,6 +130,7 @@ impl Cpu {
         if threads > limits::RENDER_THREADS {
             return Err(CpuError::TooManyThreads { threads });
         }
+        // A level is only made from the detected one: its existence proves that the machine has it.
         let best = Level::new();
         let level = match simd {
             Simd::Best => Some(best),
@@ -151,10 +152,12 @@ impl Cpu {
     /// A lane that is free, or the main one as soon as it is.
     fn lane(&self) -> BusyLane<'_> {
         let most_bytes = self.lane_bytes.load(Relaxed);
+        // The main lane first: it has four times the memory.
         if let Some(free) = self.main.try_take(most_bytes) {
             return free;
         }
         let threads = self.main.pool.current_num_threads();
+        // Made when two frames first meet. A failure is remembered as well, and such frames wait.
         let side = self.side.get_or_init(|| Lane::new(threads, "render-side").ok());
         let side = side.as_ref().and_then(|side| side.try_take(most_bytes / SIDE_LANE_DIVISOR));
         side.unwrap_or_else(|| self.main.take(most_bytes))
@@ -172,6 +175,7 @@ impl Cpu {
     ) -> Result<(StageOutputs, FrameStats), RenderError> {
         frame.check_views()?;
         frame.check_splats(self.name())?;
+        // The lane's limit does not apply: a comparison needs the outputs of all views at once.
         let BusyLane { pool, mut scratch, .. } = self.lane();
         let scratch = &mut *scratch;
         let cutoffs = Cutoffs::new(frame.profile);
@@ -183,6 +187,7 @@ impl Cpu {
                 stages.run(scratch, jobs, None, last, &mut stats)
             }) {
                 Err(PartError::Render(error)) => return Err(error),
+                // With a limit of u64::MAX no part overflows.
                 Ok(()) | Err(PartError::Overflow) => {}
             }
             let outputs = export::stage_outputs(scratch, last, &cutoffs, &mut stats);
@@ -229,6 +234,8 @@ impl Backend for Cpu {
     }
 
     fn limit_frame_bytes(&self, bytes: u64) {
+        // Clamped and not refused: with less, slabs are not worth their search, and the largest
+        // frames need no more.
         let accepted_bytes = bytes.clamp(limits::LANE_BYTES_MIN, limits::LANE_BYTES);
         self.lane_bytes.store(accepted_bytes, Relaxed);
     }
@@ -269,6 +276,8 @@ impl Backend for Cpu {
             };
             let drawn = drawing.draw(part, targets);
             let stats = drawing.stats;
+            // What one unusual frame has allocated must not stay allocated, beyond a part
+            // of the limit.
             scratch.bins.trim(most_bytes / 2);
             scratch.rasterizer.trim(most_bytes / 4);
             drawn.map(|()| stats)
@@ -298,6 +307,7 @@ impl StageTimer {
         let ms = self.lap_ms();
         let total: u64 = stages.iter().map(|(_, ns)| ns).sum();
         for (name, ns) in stages {
+            // At least 1, so that a frame without any work does not divide by 0.
             Self::add(name, ms * ns as f64 / total.max(1) as f64, stats);
         }
     }

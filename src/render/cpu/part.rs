@@ -25,6 +25,7 @@ impl FramePart<'_> {
     pub(super) fn halves(&self) -> [Self; 2] {
         let middle = self.frame.views.len() / 2;
         let (first, second) = self.frame.views.split_at(middle);
+        // Without a background the slice is empty and cannot be split in the middle.
         let (behind_first, behind_second) = if self.backgrounds.is_empty() {
             (self.backgrounds, self.backgrounds)
         } else {
@@ -46,9 +47,11 @@ impl FramePart<'_> {
     pub(super) fn max_splats(&self, few: usize) -> usize {
         let Frame { scene, views, .. } = self.frame;
         let all = scene.gaussians() * views.len();
+        // The scene as a whole fits, so that no cluster has to be tested.
         if all <= few {
             return all;
         }
+        // Actors are few and small: all of their Gaussians count, for every view.
         let of_actors: usize = scene.placed.iter().map(|placed| placed.chunk.len()).sum();
         let of_twin: usize = views.par_iter().map(|view| self.visible_gaussians(view)).sum();
         of_twin + of_actors * views.len()
@@ -70,6 +73,7 @@ impl FramePart<'_> {
             };
             clusters += chunk.clusters().iter().filter(may_see).count();
         }
+        // A chunk's last cluster may be partly filled, which an upper bound allows.
         clusters * CLUSTER
     }
 }

@@ -98,6 +98,7 @@ pub(super) fn rasterize(
     targets: &mut [Target<'_>],
     on_view_done: OnViewDone<'_>,
 ) -> Work {
+    // Sums only, which no other data depends on: relaxed order is enough.
     let [evaluations, sort_ns, rasterize_ns] = [const { AtomicU64::new(0) }; 3];
     targets.par_iter_mut().zip(input.views).enumerate().with_max_len(1).for_each(
         |(index, (target, view))| {
@@ -114,6 +115,7 @@ pub(super) fn rasterize(
             };
             // `par_bridge` hands them out in this order.
             input.bins.by_work(index).into_iter().par_bridge().for_each(|number| {
+                // A list and not thread-local memory, so that the backend bounds it between frames.
                 let mut scratch = scratches.0.lock().pop().unwrap_or_default();
                 let work = dispatch!(level, simd => {
                     draw_macro_tile(simd, input, continued, &drawing, number, &mut scratch)
@@ -124,6 +126,7 @@ pub(super) fn rasterize(
                 sort_ns.fetch_add(work.sort_ns, Relaxed);
                 rasterize_ns.fetch_add(work.rasterize_ns, Relaxed);
             });
+            // The bands borrow the target's buffers, which `finish` and the caller need as a whole.
             drop(drawing);
             if continued.is_none_or(|slab| slab.is_last) {
                 target.finish(view);
@@ -168,21 +171,26 @@ fn draw_macro_tile<S: Simd>(
     let Drawing { view, wants, background, .. } = *drawing;
     let Scratch { macro_tile, batch } = scratch;
     let start = Instant::now();
+    // Every macro tile is drawn once per slab, so that this lock never waits.
     let mut unfinished = continued.map(|slab| slab.tiles.0[number].lock());
     let is_last = continued.is_none_or(|slab| slab.is_last);
     input.bins.load(view, number, macro_tile);
+    // Nothing changes. In the last slab its tiles are resolved nevertheless: they show the
+    // background, or what earlier slabs have drawn.
     if !is_last && macro_tile.is_empty() {
         return Work::default();
     }
     let sorted = Instant::now();
     macro_tile.copy_splats(input.projected);
 
+    // Once per macro tile and not per tile, since it is allocated for a sky network.
     let mut sky_scratch = background.and_then(Background::scratch);
     let mut halved_by = NOT_HALVED;
     let mut evaluations = 0;
     // Tiles of earlier slabs.
     let has_sums = unfinished.as_ref().is_some_and(|tiles| !tiles.is_empty());
     if let (false, false, Some(tiles)) = (is_last, has_sums, &mut unfinished) {
+        // A vector that grows by doubling would exceed the reserved bytes.
         tiles.reserve_exact(drawing.grid.macro_tile_tiles(number).count());
     }
     for (index, (within, [column, row])) in drawing.grid.macro_tile_tiles(number).enumerate() {
@@ -198,6 +206,7 @@ fn draw_macro_tile<S: Simd>(
         evaluations += rasterize_tile(simd, input, macro_tile, within, at_px, batch, &mut output);
         if wants.instances {
             let mut band = drawing.bands[row as usize].lock();
+            // In every slab: places of splats are those of this slab's projection.
             band.write_instances(&halved_by, at_px[0], input.projected, has_sums);
             halved_by = NOT_HALVED;
         }
@@ -210,6 +219,7 @@ fn draw_macro_tile<S: Simd>(
             }
             continue;
         }
+        // From here on the tile's sums are final.
         if let Some(background) = background {
             background.add(simd, at_px, &mut sky_scratch, &mut sums);
         }
@@ -236,6 +246,7 @@ fn rasterize_tile<S: Simd>(
     batch: &mut Batch,
     output: &mut TileOutput<'_>,
 ) -> u64 {
+    // Invariant: `live` has a bit for each block in which some pixel can still change.
     let mut live = *output.live;
     let mut evaluations = 0;
     for indices in macro_tile.tile(within).chunks(BATCH) {
@@ -266,6 +277,7 @@ fn rasterize_tile<S: Simd>(
             if batch.touching[block] == 0 || live >> block & 1 == 0 {
                 continue;
             }
+            // Four compiled forms of the loop, without a branch on what is wanted in it.
             let TileOutput { sums, halved_by, wants, .. } = &mut *output;
             let cutoffs = input.cutoffs;
             let (stopped, count) = match *wants {
@@ -282,6 +294,7 @@ fn rasterize_tile<S: Simd>(
                     blend::<S, true, true>(simd, batch, block, cutoffs, sums, halved_by)
                 }
             };
+            // `stopped` as 0 or 1: a block's bit is cleared without a branch.
             live &= !(u16::from(stopped) << block);
             evaluations += count as u64 * LANES as u64;
         }

@@ -74,6 +74,7 @@ impl Band<'_> {
         for (block, halved_by) in halved_by.iter().enumerate() {
             let [block_left, row] = block_corner(block).map(|px| px as usize);
             let column = left as usize + block_left;
+            // A block beyond the image's edge has no rows or columns here.
             for y in 0..edge.min(self.rows.saturating_sub(row)) {
                 for x in 0..edge.min(self.width.saturating_sub(column)) {
                     let pixel = (row + y) * self.width + column + x;
@@ -102,6 +103,7 @@ pub(super) fn bands<'a>(target: &'a mut Target<'_>, view: &View) -> Vec<Band<'a>
     let mut rgb8 = target.rgb8.as_mut().map(|b| b.chunks_mut(3 * pixels));
     let mut depth_m = target.depth_m.as_mut().map(|b| b.chunks_mut(pixels));
     let mut opacity = target.opacity.as_mut().map(|b| b.chunks_mut(pixels));
+    // All iterators advance together: band k has the rows of tile row k in every image.
     let mut instances = target.instances.as_mut().map(|b| b.chunks_mut(pixels));
     (0..height)
         .step_by(TILE_PX as usize)
@@ -157,6 +159,7 @@ fn resolve_block<S: Simd>(simd: S, sums: &TileSums, block: usize, left: u32, ban
         let r = to_8_bit(simd, &sums.rgb[0][block]);
         let g = to_8_bit(simd, &sums.rgb[1][block]);
         let b = to_8_bit(simd, &sums.rgb[2][block]);
+        // Each pixel is 0x00BBGGRR; three words take the twelve bytes of four pixels.
         let pixels = (r | g << 8 | b << 16).to_array();
         for (y, of_row) in pixels.chunks_exact(edge).take(rows).enumerate() {
             let first = 3 * ((row + y) * band.width + column);
@@ -170,6 +173,7 @@ fn resolve_block<S: Simd>(simd: S, sums: &TileSums, block: usize, left: u32, ban
             // A slice of a fixed length, so that the compiler makes few stores of it.
             match <&mut [u8; 3 * BLOCK_PX as usize]>::try_from(&mut *to) {
                 Ok(to) => *to = bytes,
+                // The last block of a row may be narrower than four pixels.
                 Err(_) => to.copy_from_slice(&bytes[..to.len()]),
             }
         }
@@ -177,6 +181,7 @@ fn resolve_block<S: Simd>(simd: S, sums: &TileSums, block: usize, left: u32, ban
     if let Some(depth_m) = &mut band.depth_m {
         let sum = &sums.depth_m[block];
         each(&mut |pixel, lane| {
+            // The quotient is 0/0 where no splat was blended.
             let covered = opacity[lane] > 0.0;
             depth_m[pixel] = if covered { sum[lane] / opacity[lane] } else { 0.0 };
         });
@@ -191,5 +196,6 @@ fn resolve_block<S: Simd>(simd: S, sums: &TileSums, block: usize, left: u32, ban
 fn to_8_bit<S: Simd>(simd: S, linear: &[f32; LANES]) -> u32x16<S> {
     let splat = |value: f32| f32x16::splat(simd, value);
     let clamped = f32x16::load_array_ref(simd, linear).max(splat(0.0)).min(splat(1.0));
+    // The conversion truncates: adding 1/2 rounds to the nearest.
     clamped.mul_add(splat(255.0), splat(0.5)).to_int()
 }

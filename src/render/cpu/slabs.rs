@@ -77,6 +77,7 @@ impl DepthClusters {
         visible_clusters: impl Fn(usize) -> C + Sync,
         cutoffs: &Cutoffs,
     ) -> Self {
+        // Keys begin at near: a bound that lies nearer would be below 0.
         let key = |depth_m: f64| cutoffs.sort_key(0, (depth_m as f32).max(cutoffs.near_m));
         let cluster = |(number, [least_m, most_m]): (usize, [f64; 2])| DepthCluster {
             number: number as u32,
@@ -96,6 +97,7 @@ impl DepthClusters {
     fn counted(clusters: Vec<DepthCluster>, ends: Vec<usize>) -> Self {
         let first_key = clusters.iter().map(|cluster| cluster.first_key).min().unwrap_or(0);
         let last_key = clusters.iter().map(|cluster| cluster.last_key).max().unwrap_or(0);
+        // Rounded up, so that the last key is in step 4,095 at most.
         let step = (last_key - first_key) / STEPS as u32 + 1;
         let step_of = |key: u32| ((key - first_key) / step) as usize;
         // The number of Gaussians of each step minus that of the previous one.
@@ -103,9 +105,11 @@ impl DepthClusters {
         for cluster in &clusters {
             let [first, last] = [cluster.first_key, cluster.last_key].map(step_of);
             let each = CLUSTER as f64 / (last - first + 1) as f64;
+            // Differences first, so that a cluster costs two additions however deep it reaches.
             up_to[first] += each;
             up_to[last + 1] -= each;
         }
+        // The first running sum gives the number of each step, the second that up to its end.
         for _ in 0..2 {
             let mut sum = 0.0;
             for value in &mut up_to {
@@ -126,12 +130,15 @@ impl DepthClusters {
     /// estimated number.
     pub(super) fn next(&self, first_key: u32, gaussians: f64) -> (Cut, f64) {
         let first_step = (first_key.saturating_sub(self.first_key) / self.step) as usize;
+        // Gaussians of nearer steps: these are drawn already.
         let before = first_step.checked_sub(1).map_or(0.0, |step| self.up_to[step.min(STEPS - 1)]);
         let end_step = self.up_to.partition_point(|&up_to| up_to <= before + gaussians);
+        // One step at least, so that every cut makes progress; `halves` takes care of a full step.
         let end_step = end_step.max(first_step + 1);
         let end_key = if end_step >= STEPS {
             self.end_key
         } else {
+            // Ends of steps, so that the next cut begins where a step does.
             self.first_key + end_step as u32 * self.step
         };
         let estimated = self.up_to[end_step.min(STEPS) - 1] - before;
@@ -151,9 +158,11 @@ impl Cut {
         if keys.len() > 1 {
             let middle = keys.start + (keys.end - keys.start) / 2;
             let cut = |keys| Self { keys, jobs: jobs.clone() };
+            // Half-open ranges: no splat is in both halves, and none is lost.
             return Some([cut(keys.start..middle), cut(middle..keys.end)]);
         }
         if jobs.len() > 1 {
+            // Within one depth the order is that of global ids, and so of jobs.
             let middle = jobs.start.midpoint(jobs.end);
             let cut = |jobs| Self { keys: keys.clone(), jobs };
             return Some([cut(jobs.start..middle), cut(middle..jobs.end)]);
@@ -187,6 +196,7 @@ impl SlabOfJob<'_> {
     /// Whether a cluster of the chunk may have splats in it.
     pub(super) fn touches(&self, number: usize) -> bool {
         let number = number as u32;
+        // Clusters are listed in the order of their numbers; one that is not seen is missing.
         let found = self.clusters.binary_search_by_key(&number, |cluster| cluster.number);
         found.is_ok_and(|index| self.clusters[index].touches(self.keys))
     }
@@ -195,6 +205,7 @@ impl SlabOfJob<'_> {
     #[inline(always)]
     pub(super) fn keep(&self, cutoffs: &Cutoffs, splats: &mut Vec<Splat>, start: usize) {
         let mut end = start;
+        // In place and in order: `end` is never ahead of `index`.
         for index in start..splats.len() {
             if self.keys.contains(&cutoffs.sort_key(0, splats[index].depth_m)) {
                 splats[end] = splats[index];

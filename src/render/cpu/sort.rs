@@ -31,11 +31,15 @@ pub(super) fn sort_by_depth(keys: &mut Vec<u64>, other: &mut Vec<u64>) {
     }
     // Three digits of the bits in which the depths differ.
     let first = keys[0];
+    // Bits in which no key differs need no pass; neighbouring depths share their high bits.
     let differ = keys.iter().fold(0, |differ, key| differ | (key ^ first)) >> 32;
     let digit_bits = (u64::BITS - differ.leading_zeros()).div_ceil(PASSES).max(1);
     let digit = |key: u64, pass: u32| {
+        // The second mask changes nothing, as a digit has at most 10 bits, and saves the
+        // test of the bound.
         (key >> (32 + pass * digit_bits)) as usize & ((1 << digit_bits) - 1) & (DIGITS - 1)
     };
+    // The counts of all three digits in one pass over the keys: 12 kB.
     let mut cursors = [[0_u32; DIGITS]; PASSES as usize];
     for &key in &*keys {
         for (cursors, pass) in cursors.iter_mut().zip(0..) {
@@ -50,11 +54,13 @@ pub(super) fn sort_by_depth(keys: &mut Vec<u64>, other: &mut Vec<u64>) {
             end += *cursor;
             *cursor = start;
         }
+        // In order, and each to the next place of its digit: the pass is stable.
         for &key in &*keys {
             let cursor = &mut cursors[digit(key, pass)];
             other[*cursor as usize] = key;
             *cursor += 1;
         }
+        // After an odd number of passes, too, the caller's `keys` has the result.
         std::mem::swap(keys, other);
     }
 }
@@ -67,6 +73,8 @@ mod tests {
     /// of method.
     #[test]
     fn keys_are_sorted_by_depth_and_then_by_index() {
+        // A linear congruential generator with the factor of Knuth's MMIX; its high bits are the
+        // random ones.
         let mut state = 1_u64;
         for count in [0, 1, 255, 256, 1_000, 40_000] {
             for depth_bits in [0, 1, 2, 11, 27, DEPTH_BITS] {

@@ -11,6 +11,7 @@ pub(super) fn add(frame: &Frame<'_>, view: &View, row: u32, pixels: &mut [Pixel]
     for (column, pixel) in pixels.iter_mut().enumerate() {
         let at_px = DVec2::new(column as f64 + 0.5, f64::from(row) + 0.5);
         let Some(ray) = view.ray_world(at_px) else { continue };
+        // The cut is a part of the definition, since all backends omit the sky there.
         if pixel.transmittance >= SKY_CUT {
             let background = match &frame.scene.sky {
                 Some(sky) => sky.rgb(ray),

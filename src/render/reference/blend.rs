@@ -24,6 +24,7 @@ pub(super) struct Pixel {
 /// takes a twentieth of the time.
 pub(super) fn row(splats: &[Splat], row: u32, width: usize, profile: &RenderProfile) -> Vec<Pixel> {
     let y_px = f64::from(row) + 0.5;
+    // A splat's box contains all places where it reaches the cut.
     let near_row = |splat: &&Splat| reaches(splat.mean_px.y - y_px, splat.reach_px.y);
     let here: Vec<Splat> = splats.iter().filter(near_row).copied().collect();
     (0..width).map(|column| pixel(&here, DVec2::new(column as f64 + 0.5, y_px), profile)).collect()
@@ -43,6 +44,7 @@ fn pixel(splats: &[Splat], at_px: DVec2, profile: &RenderProfile) -> Pixel {
         if !reaches(d.x, splat.reach_px.x) {
             continue;
         }
+        // -q/2 with the inverse covariance (xx, xy, yy).
         let power = -0.5 * (splat.conic.x * d.x * d.x + splat.conic.z * d.y * d.y)
             - splat.conic.y * d.x * d.y;
         if !pixel.add(splat.opacity * power.exp(), splat, profile) {
@@ -61,11 +63,13 @@ impl Pixel {
     /// before it.
     pub(super) fn add(&mut self, alpha: f64, splat: &Splat, profile: &RenderProfile) -> bool {
         let alpha = alpha.min(profile.alpha_cap);
+        // Negated comparison: a NaN does not touch.
         let touches = alpha >= profile.alpha_cut;
         if !touches {
             return true;
         }
         let after = self.transmittance * (1.0 - alpha);
+        // The splat that would end the pixel is not blended itself (Kerbl et al. 2023).
         if after <= profile.stop {
             return false;
         }

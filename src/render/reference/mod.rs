@@ -44,11 +44,13 @@ impl Backend for Reference {
         let mut project_ms = 0.0;
         let mut blend_ms = 0.0;
         let mut stats = FrameStats::default();
+        // One view after the other; rows run in parallel, and keep their order.
         for (index, (view, target)) in frame.views.iter().zip(targets).enumerate() {
             // Project and sort.
             let start = Instant::now();
             let mut splats = project(frame.scene, frame.profile, view);
             project::sort(&mut splats);
+            // Splats give order, colour and visibility; exact rays take only the shape from these.
             let gaussians = match frame.profile.rays {
                 Rays::Splats => Vec::new(),
                 Rays::Exact => rays::gaussians(frame.scene, &splats),
@@ -95,6 +97,7 @@ fn apply_appearance(appearance: &Appearance, row: u32, pixels: &mut [blend::Pixe
     let Appearance { exposure, overlay } = appearance;
     for (column, pixel) in pixels.iter_mut().enumerate() {
         if let Some(Exposure { matrix, offset }) = exposure {
+            // The matrix is given by rows, and glam has columns.
             let exposed = DMat3::from_cols_array_2d(matrix).transpose() * pixel.rgb;
             pixel.rgb = exposed + DVec3::from_array(*offset);
         }
@@ -113,6 +116,7 @@ fn write(pixels: &[blend::Pixel], target: &mut Target<'_>) {
         let opacity = 1.0 - pixel.transmittance;
         if let Some(rgba) = &mut target.rgba {
             let [r, g, b] = pixel.rgb.to_array();
+            // `zip` ends after the four values of this pixel.
             for (value, to) in [r, g, b, opacity].into_iter().zip(&mut rgba[4 * i..]) {
                 *to = value as f32;
             }

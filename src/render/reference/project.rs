@@ -38,6 +38,7 @@ pub struct Splat {
 /// Projects every Gaussian between near and far with an opacity of at least alpha_cut, on the image
 /// or outside of it, in order of global ids.
 pub fn project(scene: &Scene, profile: &RenderProfile, view: &View) -> Vec<Splat> {
+    // Chunks in parallel; the collection keeps their order, and so that of global ids.
     let twin = scene.chunks.par_iter().enumerate().flat_map_iter(|(number, chunk)| {
         let splat = move |i| {
             let splat = project_one(chunk, i, profile, view)?;
@@ -51,6 +52,7 @@ pub fn project(scene: &Scene, profile: &RenderProfile, view: &View) -> Vec<Splat
         let tint = DVec3::from_array(placed.tint.map(f64::from));
         let splat = move |i| {
             let splat = project_one(&placed.chunk, i, profile, &view)?;
+            // Actors' chunks are numbered after those of the twin.
             let number = scene.chunks.len() + number;
             let instance = FIRST_ACTOR_INSTANCE + placed.actor;
             Some(Splat { gaussian: [number, i], instance, rgb: splat.rgb * tint, ..splat })
@@ -73,6 +75,7 @@ fn shadow_factor(scene: &Scene, at_m: DVec3) -> f64 {
 /// Sorts by depth rounded to f32; ties keep the order of global ids. The rounding is part of the
 /// definition, since backends sort 32 bits: all of them round the exact depth once.
 pub(super) fn sort(splats: &mut [Splat]) {
+    // rayon's `par_sort_by` is stable.
     splats.par_sort_by(|a, b| (a.depth_m as f32).total_cmp(&(b.depth_m as f32)));
 }
 
@@ -103,6 +106,8 @@ fn project_one(chunk: &Chunk, index: usize, profile: &RenderProfile, view: &View
         conic: DVec3::new(yy, -xy, xx) / det,
         opacity,
         rgb: color(chunk, index, mean_world - camera_m),
+        // opacity exp(-k^2/2) = alpha_cut gives k^2 = 2 ln(opacity/cut); times each
+        // variance, its root.
         reach_px: (2.0 * (opacity / profile.alpha_cut).ln() * DVec2::new(xx, yy)).map(f64::sqrt),
     })
 }
@@ -145,6 +150,7 @@ fn project_pinhole(
         return None;
     }
     let m = camera_from_world.rotation_matrix() * axes_m;
+    // (J M) rows: J_i M = M^T J_i.
     let [row_x, row_y] = jacobian(mean, &view.camera).map(|row| m.transpose() * row);
     Some(Footprint {
         depth_m: mean.z,
@@ -178,9 +184,11 @@ fn project_unscented(
     for (i, point_px) in points_px.iter_mut().enumerate() {
         let side = if i % 2 == 0 { 1.0 } else { -1.0 };
         let point = mean_world + side * 3.0_f64.sqrt() * axes_m.col(i / 2);
+        // The search begins anew for each point: simple, and independent of the fast paths.
         *point_px = view.project_extrapolated(point, 1.0).at_px;
     }
     let mean_px = points_px.iter().sum::<DVec2>() / 6.0;
+    // Each with weight 1/6, so that the plain sum of products below is the covariance.
     let off_px = points_px.map(|point_px| (point_px - mean_px) / 6.0_f64.sqrt());
     let pairs = (0..6).flat_map(|i| (0..i).map(move |k| (i, k)));
     Some(Footprint {
@@ -207,9 +215,11 @@ fn jacobian(mean: DVec3, camera: &Camera) -> [DVec3; 2] {
         DVec2::new((width - p.cx) / p.fx + slack_x, (height - p.cy) / p.fy + slack_y),
     );
     let at = (slope * mean.z).extend(mean.z);
+    // In proportion to the distance: rounding 1e-16/1e-5 and curvature 1e-10 are both negligible.
     let h = 1e-5 * mean.z;
     let [dx, dy, dz] =
         DVec3::AXES.map(|axis| (p.project(at + h * axis) - p.project(at - h * axis)) / (2.0 * h));
+    // Columns of derivatives become rows.
     [DVec3::new(dx.x, dy.x, dz.x), DVec3::new(dx.y, dy.y, dz.y)]
 }
 

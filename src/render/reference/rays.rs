@@ -37,11 +37,13 @@ pub(super) fn relative_views(scene: &Scene, view: &View) -> Vec<View> {
 pub(super) fn gaussians(scene: &Scene, splats: &[Splat]) -> Vec<UnprojectedGaussian> {
     let gaussian = |splat: &Splat| {
         let [number, index] = splat.gaussian;
+        // Below the number of the twin's chunks the subtraction fails: a Gaussian of the twin.
         let placed = number.checked_sub(scene.chunks.len());
         let chunk = match placed {
             None => &scene.chunks[number],
             Some(placed) => &scene.placed[placed].chunk,
         };
+        // View 0 is the world's, view k + 1 that of actor k.
         let view = placed.map_or(0, |placed| placed + 1);
         let (mean_m, axes_m) = mean_and_axes(chunk, index);
         let lengths_m = [axes_m.x_axis, axes_m.y_axis, axes_m.z_axis].map(DVec3::length);
@@ -66,11 +68,13 @@ pub(super) fn row(
     let pixel = |column: u32| {
         let mut pixel = Pixel::EMPTY;
         let at_px = DVec2::new(f64::from(column) + 0.5, y_px);
+        // One ray per set of axes, once per pixel and not per Gaussian.
         let rays: Vec<Option<Ray>> =
             views.iter().map(|view| Ray::new(view, at_px, profile)).collect();
         for (splat, gaussian) in splats.iter().zip(gaussians) {
             let Some(ray) = &rays[gaussian.view] else { continue };
             let alpha = ray.alpha(gaussian, profile);
+            // An alpha of 0 means out of sight and is below every cut.
             if alpha > 0.0 && !pixel.add(alpha, splat, profile) {
                 break;
             }
@@ -102,6 +106,7 @@ impl Ray {
         // How the ray changes per pixel, by differences to both sides, or to the one that is within
         // the field.
         let derivative = |axis: DVec2| {
+            // A thousandth of a pixel: f64 leaves ten digits of the difference.
             let h = 1e-3;
             let side = |h: f64| {
                 let ray = view.camera.unproject(at_px + h * axis)?;
@@ -135,6 +140,7 @@ impl Ray {
         let along_m = to_mean_m.dot(self.direction);
         // Skip a Gaussian that is far off the ray whatever its shape: the blur, in metres, is
         // widest at its far end.
+        // Pythagoras: squared distance of the centre from the ray.
         let across_m2 = to_mean_m.length_squared() - along_m * along_m;
         let farthest_m = along_m.max(0.0) + 4.0 * gaussian.sigma_m;
         let blur_px2 = self.filter.total_px2.max_element();
@@ -147,17 +153,21 @@ impl Ray {
         // The point of the ray that is closest in standard deviations.
         let whiten = |v: DVec3| {
             let m = gaussian.axes_m;
+            // The axes are orthogonal, so that the inverse of the matrix needs no elimination. An
+            // axis of length 0 has infinitely many standard deviations; 1e-300 keeps them finite.
             let part = |axis: DVec3| v.dot(axis) / axis.length_squared().max(1e-300);
             DVec3::new(part(m.x_axis), part(m.y_axis), part(m.z_axis))
         };
         let toward = whiten(to_mean_m);
         let step = whiten(self.direction);
+        // The minimum of |toward - s step|^2 over s.
         let closest_m = toward.dot(step) / step.length_squared();
         let in_front = closest_m > 0.0;
         if !in_front {
             return 0.0;
         }
         // The 2D Gaussian on the image around this pixel, with the blur.
+        // Pixels per metre at that distance: pixels per radian over metres.
         let [x, y] = self.px_per_rad.map(|row| row / closest_m);
         let offset_px = DVec2::new(x.dot(to_mean_m), y.dot(to_mean_m));
         let row_x = gaussian.axes_m.transpose() * x;
@@ -169,6 +179,7 @@ impl Ray {
         let Filtered { xx, yy, det, blur_share, shrink_share } =
             self.filter.filtered(xx, yy, det_before);
         let DVec2 { x: dx, y: dy } = offset_px;
+        // The inverse of the covariance is its adjugate over the determinant.
         let power = -0.5 * (yy * dx * dx - 2.0 * xy * dx * dy + xx * dy * dy) / det;
         let mut opacity = gaussian.opacity * shrink_share.powf(PixelFilter::SHRINK_POWER);
         if profile.antialiased {

@@ -60,17 +60,21 @@ impl ReferenceCache {
     /// kept.
     pub fn insert(&self, key: ReferenceKey, reference: Arc<Reference>) {
         let bytes = reference.bytes();
+        // It would evict everything, and then itself.
         if bytes > self.limit_bytes {
             return;
         }
         let mut state = self.state.lock();
         state.clock += 1;
         let used = state.clock;
+        // Two sessions may have made the same reference at the same time.
         if let Some(before) = state.entries.insert(key, Entry { reference, used }) {
             state.bytes -= before.reference.bytes();
         }
         state.bytes += bytes;
         while state.bytes > self.limit_bytes {
+            // Linear in the number of entries, which is about 80 at the default size. The entry
+            // just inserted has the latest use, and so goes last.
             let oldest = state.entries.iter().min_by_key(|(_, entry)| entry.used);
             let Some(key) = oldest.map(|(key, _)| *key) else { break };
             let removed = state.entries.remove(&key).map_or(0, |entry| entry.reference.bytes());

@@ -36,6 +36,7 @@ pub fn resized(image: &Image, width: usize, height: usize) -> Image {
     let mut rgb8 = Vec::with_capacity(3 * width * height);
     for y in 0..height {
         for x in 0..width {
+            // The cast saturates where Lanczos overshoots.
             rgb8.extend([0, 1, 2].map(|channel| planes.at(channel, y, x).round() as u8));
         }
     }
@@ -44,6 +45,7 @@ pub fn resized(image: &Image, width: usize, height: usize) -> Image {
 
 /// A depth map as [`warp`] needs it: in metres, and 0 where the opacity is below [`LEAST_OPACITY`].
 pub fn opaque_depth(depth_m: &[f32], opacity: &[f32]) -> Vec<f32> {
+    // Below it the depth is a mean of a faint surface and of what lies behind it.
     let opaque =
         |(depth_m, opacity): (&f32, &f32)| if *opacity >= LEAST_OPACITY { *depth_m } else { 0.0 };
     depth_m.iter().zip(opacity).map(opaque).collect()

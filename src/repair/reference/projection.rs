@@ -89,6 +89,8 @@ impl Projection {
             Lens::Pinhole([fx, fy, cx, cy]) => {
                 for lane in 0..LANES {
                     let z = points.z[lane];
+                    // A NaN fails every comparison with the image's edges, so that no branch is
+                    // needed later.
                     let inverse = if z > 0.0 { z.recip() } else { f32::NAN };
                     at.u[lane] = fx * points.x[lane] * inverse + cx;
                     at.v[lane] = fy * points.y[lane] * inverse + cy;
@@ -102,14 +104,19 @@ impl Projection {
 
 impl Table {
     fn from_camera(camera: &Camera) -> Self {
+        // The image's corner and what a windshield may add. 2.9 rad are 166 degrees, where the
+        // plane's radius is tan(1.45) = 8.2.
         let widest_rad = (camera.corner_rad() + MARGIN_RAD).min(WIDEST_RAD);
         let reach = (0.5 * widest_rad).tan();
+        // The table is a square from -reach to reach along both axes.
         let step = 2.0 * reach / CELLS as f64;
         let mut at_px = Vec::with_capacity((CELLS + 1) * (CELLS + 1));
         for row in 0..=CELLS {
             for column in 0..=CELLS {
                 let plane = DVec2::new(column as f64, row as f64) * step - reach;
                 let squared = plane.length_squared();
+                // The inverse of the stereographic projection: with s = |plane|^2 the unit vector
+                // is (2 x, 2 y, 1 - s)/(1 + s).
                 let direction = DVec3::new(2.0 * plane.x, 2.0 * plane.y, 1.0 - squared);
                 let at = camera.project_extrapolated(direction / (1.0 + squared));
                 at_px.push([at.x as f32, at.y as f32]);
@@ -122,6 +129,7 @@ impl Table {
     fn project(&self, points: &Points, is_wanted: &[bool; LANES], at: &mut Positions) {
         let middle = (CELLS / 2) as f32;
         for (lane, is_wanted) in is_wanted.iter().enumerate() {
+            // (x, y)/(|p| + z) is the tangent of half the angle off the axis, away from it.
             let by = self.cells_per_unit / (points.distance[lane] + points.z[lane]);
             let column = points.x[lane] * by + middle;
             let row = points.y[lane] * by + middle;
@@ -133,6 +141,8 @@ impl Table {
             }
             let [left, top] = [column as usize, row as usize];
             let [x, y] = [column - left as f32, row - top as f32];
+            // A row has one node more than it has cells; `last` is excluded above, so that
+            // node + 1 exists.
             let first = top * (CELLS + 1) + left;
             let upper = [self.at_px[first], self.at_px[first + 1]];
             let lower = [self.at_px[first + CELLS + 1], self.at_px[first + CELLS + 2]];
@@ -169,6 +179,7 @@ mod tests {
             let projection = Projection::from_camera(&camera);
             let mut seen = 0;
             for step in 0..400 {
+                // 2.4 rad are the golden angle: directions are spread over all azimuths.
                 let angle = f64::from(step) * 2.4;
                 let off_rad = f64::from(step) / 400.0 * 0.9;
                 let direction = DVec3::new(
@@ -187,6 +198,7 @@ mod tests {
                 };
                 let at = projection.project(&points, &[true; LANES]);
                 let [u, v] = [at.u[3], at.v[3]].map(f64::from);
+                // Only directions beyond the table have no place.
                 if u.is_nan() {
                     assert!(off_rad > 0.8, "{off_rad} rad off the axis is within the image");
                     continue;

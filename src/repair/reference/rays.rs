@@ -39,6 +39,7 @@ impl Rays {
             let row = at / camera.width_px as usize;
             let at_px = DVec2::new(column as f64 + 0.5, row as f64 + 0.5);
             let direction = camera.unproject(at_px);
+            // Divided by its own depth, so that a depth in metres scales it to the point.
             let point = direction.map(|direction| direction / camera.depth_m(direction));
             point.map_or([f32::NAN; 3], |point| point.to_array().map(|value| value as f32))
         };
@@ -58,6 +59,7 @@ impl Rays {
         let mut points = RayPoints { x: [0.0; LANES], y: [0.0; LANES], z: [0.0; LANES] };
         match &self.0 {
             Kind::Pinhole([inverse_fx, inverse_fy, cx, cy]) => {
+                // Lanes beyond the image's edge are computed as well, and have a depth of 0.
                 let y = (row as f32 + 0.5 - cy) * inverse_fy;
                 for (lane, depth_m) in depth_m.iter().enumerate() {
                     let x = ((left + lane) as f32 + 0.5 - cx) * inverse_fx;
@@ -67,6 +69,7 @@ impl Rays {
                 }
             }
             Kind::Table(rays) => {
+                // The table ends with the row; lanes beyond it stay 0.
                 let count = LANES.min(width - left);
                 for (lane, ray) in rays[row * width + left..][..count].iter().enumerate() {
                     points.x[lane] = ray[0] * depth_m[lane];

@@ -99,6 +99,7 @@ pub fn warp(target: &WarpTarget<'_>, references: &[Arc<Reference>]) -> Warped {
         pixels: vec![0; references.len()],
     };
     let (groups, poses) = poses(target);
+    // A wrong length would be read out of bounds, or as another pixel.
     let usable = |reference: &&Arc<Reference>| {
         let pixels = reference.projection.width * reference.projection.height;
         reference.depth_m.len() == pixels && reference.image.rgb8.len() == 3 * pixels
@@ -106,6 +107,7 @@ pub fn warp(target: &WarpTarget<'_>, references: &[Arc<Reference>]) -> Warped {
     if target.depth_m.len() != width * height || !references.iter().all(|one| usable(&one)) {
         return warped;
     }
+    // Per reference and pose once, in f64; the rows below then use f32.
     let prepare = |reference: &'_ Arc<Reference>| -> Vec<[f32; 12]> {
         poses.iter().map(|pose| relative(&reference.world_from_camera, pose)).collect()
     };
@@ -136,15 +138,18 @@ pub fn overlaps(target: &WarpTarget<'_>, camera: &Camera, world_from_camera: &Po
         return false;
     }
     let camera_from_world = world_from_camera.inverse();
+    // The middle of the first square, or of a smaller image.
     let first = |side: usize| OVERLAP_STRIDE.min(side) / 2;
     (first(height)..height).step_by(OVERLAP_STRIDE).any(|row| {
         (first(width)..width).step_by(OVERLAP_STRIDE).any(|column| {
             let depth_m = f64::from(target.depth_m[row * width + column]);
             let at_px = DVec2::new(column as f64 + 0.5, row as f64 + 0.5);
+            // A depth of 0 is the sky, which no reference shows at a known place.
             let Some(ray) = target.camera.unproject(at_px).filter(|_| depth_m > 0.0) else {
                 return false;
             };
             let point_m = ray * (depth_m / target.camera.depth_m(ray));
+            // With the pose at the end of the exposure: a test of overlap needs no shutter.
             let point_m = target.world_from_camera.transform_point(point_m);
             let at = camera.project(camera_from_world.transform_point(point_m));
             at.is_some_and(|at| at.cmpge(DVec2::ZERO).all() && at.cmplt(camera.size_px()).all())
@@ -160,6 +165,7 @@ fn poses(target: &WarpTarget<'_>) -> (Groups, Vec<Pose>) {
     let at = |at_px: DVec2| first.interpolate(&last, direction.fraction(at_px, target.camera));
     match direction {
         ShutterDirection::TopToBottom | ShutterDirection::BottomToTop => {
+            // The moment depends on the row only: any column will do.
             let row = |row: u32| at(DVec2::new(0.5 * size_px.x, f64::from(row) + 0.5));
             (Groups::Rows, (0..target.camera.height_px).map(row).collect())
         }
@@ -177,7 +183,9 @@ fn poses(target: &WarpTarget<'_>) -> (Groups, Vec<Pose>) {
 /// there, in metres.
 fn relative(reference: &Pose, target: &Pose) -> [f32; 12] {
     let back = reference.rotation.inverse();
+    // The columns of the transpose are the rows of the matrix.
     let rows = DMat3::from_quat(back * target.rotation).transpose().to_cols_array();
+    // The difference first, in f64: positions are large, and their difference is some metres.
     let offset = back * (target.position_m - reference.position_m);
     let mut values = [0.0; 12];
     for (value, exact) in values.iter_mut().zip(rows.into_iter().chain(offset.to_array())) {
@@ -207,6 +215,7 @@ fn rows(target: &WarpTarget<'_>, groups: Groups, references: &[Prepared<'_>], wa
             let first = row * width + left;
             let mut depth_m = [0.0; LANES];
             depth_m[..count].copy_from_slice(&target.depth_m[first..first + count]);
+            // Sky, in many groups of a street.
             if !depth_m.iter().any(|depth_m| *depth_m > 0.0) {
                 continue;
             }
@@ -217,6 +226,7 @@ fn rows(target: &WarpTarget<'_>, groups: Groups, references: &[Prepared<'_>], wa
             };
             let best = best(target, references, [row, left, pose], &depth_m);
             for lane in 0..count {
+                // `NONE` is no index of the list.
                 let Some(Prepared { index, reference, .. }) = references.get(best.reference[lane])
                 else {
                     continue;
@@ -261,6 +271,8 @@ fn best(
             let point_z = ray_z + m[11];
             let squared = point_x * point_x + point_y * point_y + point_z * point_z;
             let distance = squared.sqrt();
+            // Both rays in the reference's axes: |ray| |point| cos. |ray| is the same for
+            // all references.
             let dot = ray_x * point_x + ray_y * point_y + ray_z * point_z;
             points.x[lane] = point_x;
             points.y[lane] = point_y;
@@ -269,14 +281,17 @@ fn best(
             *similarity = dot / distance;
         }
         let mut is_candidate = [false; LANES];
+        // Without a branch per lane, so that it becomes a vector comparison.
         for (lane, is_candidate) in is_candidate.iter_mut().enumerate() {
             // Comparisons with NaN are false.
+            // `>=`, so that of equal references the later one, which is nearer, counts.
             *is_candidate = (similarity[lane] >= best.similarity[lane]) & (depth_m[lane] > 0.0);
         }
         if !is_candidate.contains(&true) {
             continue;
         }
         let projection = &*reference.projection;
+        // Only candidates: a table is read for each of them.
         let at = projection.project(&points, &is_candidate);
         let size = [projection.width as f32, projection.height as f32];
         for (lane, is_candidate) in is_candidate.iter_mut().enumerate() {
@@ -289,10 +304,12 @@ fn best(
             continue;
         }
         for lane in (0..LANES).filter(|lane| is_candidate[*lane]) {
+            // Within the image, as was just checked; the cast truncates to the pixel.
             let there = at.v[lane] as usize * projection.width + at.u[lane] as usize;
             let there_m = reference.depth_m[there];
             let here_m =
                 if projection.depth_is_distance { points.distance[lane] } else { points.z[lane] };
+            // Behind another surface the reference shows that surface, with another depth.
             let fits = (there_m - here_m).abs() <= DEPTH_M + DEPTH_SHARE * here_m;
             if fits && there_m > 0.0 {
                 best.similarity[lane] = similarity[lane];
@@ -310,6 +327,7 @@ fn best(
 fn bilinear(image: &Image, u: f32, v: f32) -> [u8; 3] {
     // The first of two neighbours, and how near the second is.
     let along = |at: f32, side: usize| {
+        // From pixels to centres of pixels; beyond the outermost centres the edge's colour goes on.
         let at = (at - 0.5).clamp(0.0, (side - 1) as f32);
         let low = (at as usize).min(side.saturating_sub(2));
         (low, at - low as f32)
@@ -328,6 +346,7 @@ fn bilinear(image: &Image, u: f32, v: f32) -> [u8; 3] {
             from + x * (f32::from(row[right + channel]) - from)
         };
         let above = mix(upper);
+        // Values are at least 0, so that adding 1/2 and truncating rounds.
         (above + y * (mix(lower) - above) + 0.5) as u8
     })
 }

@@ -90,6 +90,7 @@ impl Below {
     /// `at_least`.
     pub fn new(below: f64, images: &[Gains]) -> Self {
         let Selection { at_least, .. } = Selection::default();
+        // As `Selection::is_candidate` for a camera that is not in repair yet.
         let is_repaired = |image: &&Gains| image.trust < below && image.trust >= at_least;
         let repaired: Vec<f64> =
             images.iter().filter(is_repaired).map(|image| image.gain_db).collect();
@@ -98,6 +99,7 @@ impl Below {
             below,
             images: images.len(),
             repaired: repaired.len(),
+            // No mean over nothing: the page then says that none is repaired.
             gain_db: (!repaired.is_empty()).then(|| total_db / repaired.len() as f64),
             worse: repaired.iter().filter(|gain_db| **gain_db < 0.0).count(),
             total_db,
@@ -111,6 +113,7 @@ pub fn recommend_below(
     selection: &[Gains],
     verification: &[Gains],
 ) -> RecommendedBelow {
+    // At the verification stations, where the recommended threshold is judged, too.
     let default = Below::new(Selection::default().below, verification);
     let mut recommended = RecommendedBelow {
         model,
@@ -127,9 +130,11 @@ pub fn recommend_below(
             let verified = Below::new(best.below, verification);
             recommended.selection = Some(best);
             recommended.verification = Some(verified);
+            // A threshold that repairs nothing there has gained nothing.
             let verified_db = verified.gain_db.unwrap_or(0.0);
             if verified_db > 0.0 {
                 recommended.below = Some(best.below);
+                // Rounded, since 0.82 + 0.1 is not 0.92 in binary.
                 let above = (100.0 * (best.below + HYSTERESIS)).round() / 100.0;
                 recommended.above = Some(above.min(1.0));
             } else {
@@ -146,14 +151,17 @@ fn best(images: &[Gains]) -> Result<Below, BelowError> {
     if images.is_empty() {
         return Err(BelowError::NoImages);
     }
+    // Below 0 nothing is repaired: a total of 0, which a threshold has to exceed.
     let mut best = Below::new(0.0, images);
     for hundredths in 1..=100 {
         let tried = Below::new(f64::from(hundredths) / 100.0, images);
+        // `>` and not `>=`: the least of equal thresholds stays.
         if tried.total_db > best.total_db {
             best = tried;
         }
     }
     if best.repaired == 0 {
+        // Below 1: all images but those on the drive, for the message.
         let mean_db = Below::new(1.0, images).gain_db.unwrap_or(0.0);
         return Err(BelowError::NoGain { mean_db });
     }
@@ -174,9 +182,11 @@ mod tests {
             images(&[(1.0, -3.0), (0.904, -0.5), (0.818, 1.0), (0.55, 2.0), (0.36, 0.5)]);
         let others = images(&[(0.9, -0.4), (0.81, 0.8), (0.54, -0.2), (0.35, 0.6)]);
         let found = recommend_below("net".into(), &selection, &others);
+        // 0.82 is the least that repairs the image of trust 0.818; 0.91 would add a loss of 0.5 dB.
         assert_eq!((found.below, found.above), (Some(0.82), Some(0.92)));
         let [chosen, verified] = [found.selection, found.verification].map(Option::unwrap);
         assert_eq!((chosen.repaired, chosen.images, chosen.worse), (3, 5, 0));
+        // 0.81, 0.54 and 0.35 are below: (0.8 - 0.2 + 0.6)/3 = 0.4.
         assert_eq!((verified.repaired, verified.worse), (3, 1), "a loss is told");
         assert!((verified.gain_db.unwrap() - 0.4).abs() < 1e-12);
         assert_eq!((found.default.below, found.default.repaired), (0.75, 2));
@@ -187,6 +197,7 @@ mod tests {
         let loses = images(&[(1.0, -1.0), (0.8, -2.0), (0.5, -3.0)]);
         let found = recommend_below("net".into(), &loses, &loses);
         assert_eq!((found.below, found.selection), (None, None));
+        // The images at 0.8 and 0.5; the one on the drive does not count.
         assert!(found.unmet_reason.unwrap().contains("-2.50 dB"));
         let gains = images(&[(0.8, 2.0)]);
         let found = recommend_below("net".into(), &gains, &loses);
@@ -200,6 +211,7 @@ mod tests {
 
     #[test]
     fn what_would_be_invented_is_not_repaired() {
+        // 0.05 is below `at_least`, so that its gain of 5 dB does not count.
         let far = images(&[(0.05, 5.0), (0.3, 1.0)]);
         let found = recommend_below("net".into(), &far, &far);
         assert_eq!(found.below, Some(0.31));

@@ -25,12 +25,14 @@ impl FlickerPair<'_> {
         let [view, view_before] = self.views;
         let width = view.camera.width_px as usize;
         let height = view.camera.height_px as usize;
+        // The earlier frame as the only reference of the later one: the warp is that of repair.
         let earlier = Reference {
             image: Image { width, height, rgb8: before.to_vec() },
             depth_m: self.depth_m[1].to_vec(),
             projection: self.projection.clone(),
             world_from_camera: view_before.world_from_camera,
         };
+        // The shutter of the later view only: the earlier image is taken as exposed at its end.
         let shutter = view.rolling_shutter.as_ref();
         let target = WarpTarget {
             camera: &view.camera,

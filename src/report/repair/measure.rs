@@ -90,6 +90,7 @@ pub fn measure(
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<RepairReport, ReportError> {
     let drive = benchmark.resident.version.manifest.trajectories.first();
+    // Without a drive there is no "beside".
     let drive = drive.ok_or(ReportError::NoDrive)?;
     let cameras = benchmark.sampling.cameras(benchmark.cameras)?;
     let mut measurement = RepairMeasurement::new(benchmark, &cameras)?;
@@ -102,11 +103,14 @@ pub fn measure(
         (ImageKind::Warped, "warped".to_owned()),
     ];
     kinds.extend(models);
+    // Distance by distance, and within each in the order of the kinds: so the table reads.
     let mut rows = Vec::new();
     for (offset, offset_m) in benchmark.sampling.offsets_m.iter().enumerate() {
+        // A linear search per row: some thousand samples at most.
         let of = |kind: usize| -> Vec<&Sample> {
             samples.iter().filter(|one| (one.offset, one.kind) == (offset, kind)).collect()
         };
+        // What all kinds of this distance are compared with.
         let rendered = of(RENDERED);
         for (index, (kind, name)) in kinds.iter().enumerate() {
             rows.push(RepairRow::new(*offset_m, *kind, name.clone(), &of(index), &rendered));
@@ -119,6 +123,7 @@ pub fn measure(
                 let own = |one: &&Sample| {
                     (one.kind, one.for_selection) == (FIRST_MODEL + index, for_selection)
                 };
+                // Each model by itself: they differ in where they begin to gain.
                 let of = |one: &Sample| Some(Gains { trust: one.trust, gain_db: one.gain_db? });
                 samples.iter().filter(own).filter_map(of).collect()
             };
@@ -158,8 +163,11 @@ impl<'a> RepairMeasurement<'a> {
         let RepairBenchmark { resident, catalog, .. } = *benchmark;
         let coverage = TrainingCoverage::new(&resident.version.manifest);
         let coverage = coverage.ok_or(ReportError::NoDrive)?;
+        // References are read as a session does it, without a session.
         let offline = OfflineReferences::open(resident.clone(), catalog.clone(), cameras, &[])?;
+        // Before the first image: a model that does not fit would fail after minutes.
         benchmark.models.iter().try_for_each(|model| offline.check(model, cameras))?;
+        // Tables of 513 x 513 directions: once per camera and not per image.
         let optics = |camera: &RigCamera| {
             (Arc::new(Projection::from_camera(&camera.camera)), Rays::from_camera(&camera.camera))
         };
@@ -194,6 +202,7 @@ impl<'a> RepairMeasurement<'a> {
                 Some(ReferenceSource::Rendered) | None => "rendered",
             },
             read: self.read,
+            // At least 1: nothing was read if all references were in memory.
             read_ms: self.read_ms / self.read.max(1) as f64,
             truth: self.benchmark.truth.map(truth),
             models: self.benchmark.models.iter().map(model).collect(),
@@ -226,11 +235,13 @@ impl<'a> RepairMeasurement<'a> {
         let (mut now, render_ms) = self.render_cameras(resident, &station.views[0])?;
         let mut truths = [Vec::new(), Vec::new()];
         if let Some(truth) = self.benchmark.truth {
+            // The same poses in the twin that is the truth, with its own profile.
             for (images, views) in truths.iter_mut().zip(&station.views) {
                 *images = self.render_cameras(truth, views)?.0;
             }
         }
         let [true_now, true_before] = truths;
+        // From here on camera by camera: images of one camera are independent of the others.
         for camera in 0..self.cameras.len() {
             let frames = [&mut now[camera], &mut before[camera]];
             for (frame, image) in frames.into_iter().enumerate() {
@@ -239,10 +250,12 @@ impl<'a> RepairMeasurement<'a> {
                 image.trust = self.coverage.trust(pose, view, &image.opacity).value;
             }
             let [now, before] = [&now[camera], &before[camera]];
+            // This frame first: references that it reads are in memory for the earlier one.
             let images = self.repair_all_kinds(station, 0, camera, now)?;
             let images_before = self.repair_all_kinds(station, 1, camera, before)?;
             let views = [0, 1].map(|frame| &station.views[frame][camera]);
             let flicker = |images: [&RenderedImage; 2], pixels: [&[u8]; 2]| {
+                // Rendered depth, for repaired pixels as well: a model returns no depth.
                 let depth_m = images.map(|image| opaque_depth(&image.depth_m, &image.opacity));
                 let (projection, rays) = &self.optics[camera];
                 let depth_m = [&depth_m[0][..], &depth_m[1][..]];
@@ -250,9 +263,11 @@ impl<'a> RepairMeasurement<'a> {
             };
             let truth = true_now.get(camera).zip(true_before.get(camera));
             let true_flicker =
+                // The depth of the truth, not of the twin, since its surfaces may lie elsewhere.
                 truth.and_then(|(now, before)| flicker([now, before], [&now.rgb8, &before.rgb8]));
             let true_rgb8 = truth.map(|(now, _)| &now.rgb8[..]);
             let size_px = [views[0].camera.width_px, views[0].camera.height_px];
+            // The baseline of all gains at this camera and pose.
             let rendered_db = true_rgb8.map(|truth| psnr_db(&now.rgb8, truth));
             for kind in 0..images.rgb8.len() {
                 let pixels = &images.rgb8[kind];
@@ -263,9 +278,11 @@ impl<'a> RepairMeasurement<'a> {
                     for_selection: station.for_selection,
                     trust: now.trust,
                     covered: images.covered,
+                    // Cameras are rendered together: each gets an equal share of the time.
                     render_ms: render_ms / self.cameras.len() as f64,
                     repair_ms: images.repair_ms[kind],
                     psnr_db,
+                    // 0 for the rendered image itself.
                     gain_db: psnr_db.zip(rendered_db).map(|(own, rendered)| own - rendered),
                     flip: true_rgb8.map(|truth| mean_flip(pixels, truth, size_px)),
                     flicker: flicker([now, before], [pixels, &images_before.rgb8[kind]]),
@@ -283,6 +300,7 @@ impl<'a> RepairMeasurement<'a> {
         views: &[View],
     ) -> Result<(Vec<RenderedImage>, f64), ReportError> {
         let needs_normals = |model: &Arc<Model>| model.needs(InputRole::Normals);
+        // Normals take time, and only some models read them.
         let needs_normals = self.benchmark.models.iter().any(needs_normals);
         let profile = &resident.version.manifest.profile;
         let scene = resident.scene(&wildcity_session::viewpoints(views), profile)?;
@@ -298,6 +316,8 @@ impl<'a> RepairMeasurement<'a> {
         };
         let mut images: Vec<RenderedImage> = views.iter().map(empty).collect();
         let exposures =
+            // The exposure belongs to the image; the ego vehicle's overlay does not, see
+            // `RepairSampling::cameras`.
             |camera: &RigCamera| Appearance { exposure: camera.appearance.exposure, overlay: None };
         let exposures: Vec<Appearance> = self.cameras.iter().map(exposures).collect();
         let targets = images.iter_mut().zip(&exposures).map(|(image, appearance)| Target {
@@ -313,6 +333,7 @@ impl<'a> RepairMeasurement<'a> {
         let started = Instant::now();
         self.benchmark.backend.render(&frame, &mut targets, &|_, _| {})?;
         let ms = 1e3 * started.elapsed().as_secs_f64();
+        // The targets borrow the images.
         drop(targets);
         Ok((images, ms))
     }
@@ -330,10 +351,13 @@ impl<'a> RepairMeasurement<'a> {
         let RepairBenchmark { resident, backend, references, models, .. } = *self.benchmark;
         let mounted = &self.cameras[camera];
         let (_, rays) = &self.optics[camera];
+        // No kept image: each frame is repaired by itself.
         let of = OfflineView { camera: mounted, rays, view, world_from_rig, rendered, kept: None };
+        // One more image to read, if any model asks for it.
         let nearest = models.iter().any(|model| model.needs(InputRole::Reference));
         let profile = &resident.version.manifest.profile;
         let drawing = OfflineDrawing { profile, backend, cache: references };
+        // Warped always, as it is a kind of its own.
         let needed = NeededReferences { warped: true, nearest };
         let beside = self.offline.beside(&of, needed, drawing)?;
         self.read += beside.read_count;
@@ -351,6 +375,7 @@ impl<'a> RepairMeasurement<'a> {
                 cause: Box::new(cause),
             })?;
             let roles = [InputRole::ReferenceWarped, InputRole::ReferenceValid];
+            // A model that does not read the warped images need not wait for them.
             let is_warped = roles.into_iter().any(|role| model.needs(role));
             repair_ms.push(RepairMs {
                 warp: if is_warped { warp } else { 0.0 },
@@ -370,6 +395,7 @@ fn overlay_warped(rendered: &RenderedImage, beside: &ViewReferences) -> (Vec<u8>
     let Some((warped, valid)) = beside.warped() else { return (rgb8, 0.0) };
     let pixels = rgb8.chunks_exact_mut(3).zip(warped.rgb8.chunks_exact(3)).zip(valid);
     let mut covered = 0;
+    // Only where a reference fits: elsewhere the rendered pixel stays.
     for ((own, recorded), _) in pixels.filter(|(_, valid)| **valid > 0.0) {
         own.copy_from_slice(recorded);
         covered += 1;
@@ -383,6 +409,7 @@ fn psnr_db(rgb8: &[u8], truth: &[u8]) -> f64 {
 }
 
 fn mean_flip(rgb8: &[u8], truth: &[u8], size_px: [u32; 2]) -> f64 {
+    // FLIP takes sRGB from 0 to 1, which the bytes are.
     let [image, truth] = [rgb8, truth]
         .map(|rgb8| rgb8.iter().map(|byte| f32::from(*byte) / 255.0).collect::<Vec<_>>());
     let errors = flip(&image, &truth, size_px);

@@ -20,6 +20,7 @@ pub fn section(report: &RepairReport) -> Markup {
 fn introduction(report: &RepairReport) -> Markup {
     let subject = &report.subject;
     let [width, height] = subject.size_px;
+    // The word of `RepairSubject::references`.
     let images = match subject.references {
         "recorded" => "The twin's recorded images",
         _ => "The twin has no recorded images. Images of the twin itself, drawn on its drive,",
@@ -81,10 +82,12 @@ fn table(report: &RepairReport) -> Markup {
 
 fn table_row(row: &RepairRow, has_truth: bool) -> Markup {
     let is_rendered = row.kind == ImageKind::Rendered;
+    // The rendered image has no repair: empty cells, no zeros.
     let ms = |value: f64| if is_rendered { String::new() } else { format!("{value:.1}") };
     let parts = &row.repair_parts_ms;
     let gain_db = row.gain_db.filter(|_| !is_rendered);
     let is_loss = gain_db.is_some_and(|gain_db| gain_db < 0.0);
+    // The bound of 1.1 is the one in the text above the table.
     let is_unstable = !is_rendered && row.flicker_ratio >= 1.1;
     let worse = row.worse.filter(|_| !is_rendered);
     html! {
@@ -125,6 +128,7 @@ impl RecommendedBelow {
         let of = |at: &Option<Below>| at.as_ref().map_or("nothing".to_owned(), Below::text);
         let default = self.default.text();
         match (self.below, self.above, &self.unmet_reason) {
+            // Both are there if one is recommended, and neither otherwise.
             (Some(below), Some(above), _) => format!(
                 "{}: repair below a trust of {below:.2}, and until it is above {above:.2}. At the stations that \
                  this was selected by: {}. At the others, which verify it: {}. There, the default of {:.2} has: {default}.",

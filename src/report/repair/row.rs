@@ -138,10 +138,13 @@ impl RepairRow {
             quantile(&own.iter().map(|sample| of(sample)).collect::<Vec<f64>>(), 0.5)
         };
         let repair_ms = median(&|sample| sample.repair_ms.total());
+        // NaN without any pair of frames: `serialize_number` writes it as a word.
         let flicker = mean(own, &|sample| sample.flicker).unwrap_or(f64::NAN);
         let rendered_flicker = mean(rendered, &|sample| sample.flicker).unwrap_or(f64::NAN);
         let gain_db = mean(own, &|sample| sample.gain_db);
+        // An image with an equal PSNR is no loss.
         let loses = |sample: &&&Sample| sample.gain_db.is_some_and(|gain_db| gain_db < 0.0);
+        // `None` without a truth: "0 worse" would claim a comparison.
         let worse = gain_db.map(|_| own.iter().filter(loses).count());
         Self {
             offset_m,
@@ -165,6 +168,7 @@ impl RepairRow {
             flicker_ratio: flicker / rendered_flicker,
             true_flicker: mean(own, &|sample| sample.true_flicker),
             db_per_100_ms: gain_db
+                // A rendered image costs nothing: there is nothing to divide by.
                 .filter(|_| kind != ImageKind::Rendered && repair_ms > 0.0)
                 .map(|gain_db| 100.0 * gain_db / repair_ms),
         }
@@ -201,6 +205,8 @@ mod tests {
     #[test]
     fn a_row_has_means_medians_and_the_gain_for_its_time() {
         let rendered = sample(0.0, 0.0, 0.02);
+        // Totals of 50, 40 and 506 ms: the median is 50. The gains' mean is (2 - 0.5 + 3)/3
+        // = 1.5 dB.
         let own = [sample(2.0, 44.0, 0.03), sample(-0.5, 34.0, 0.01), sample(3.0, 500.0, 0.02)];
         let own: Vec<&Sample> = own.iter().collect();
         let name = "net".to_owned();
@@ -208,6 +214,7 @@ mod tests {
         assert_eq!((row.images, row.worse), (3, Some(1)), "a loss is counted");
         assert!((row.gain_db.unwrap() - 1.5).abs() < 1e-12);
         assert_eq!((row.repair_ms, row.repair_parts_ms.model), (50.0, 44.0));
+        // 1.5 dB in 50 ms.
         assert!((row.db_per_100_ms.unwrap() - 3.0).abs() < 1e-12);
         assert!((row.flicker_ratio - 1.0).abs() < 1e-12);
         assert_eq!(row.true_flicker, None);

@@ -41,6 +41,7 @@ impl RepairSampling {
     /// Samples the drive itself and lateral distances from it, which may be in any order.
     pub fn new(stations: u32, beside_m: &[f64], side_px: u32) -> Self {
         let mut offsets_m = vec![0.0];
+        // 0 is there already, and `dedup` needs equal values side by side.
         offsets_m.extend(beside_m.iter().copied().filter(|offset_m| *offset_m != 0.0));
         offsets_m.sort_by(f64::total_cmp);
         offsets_m.dedup();
@@ -54,12 +55,14 @@ impl RepairSampling {
     /// A camera cannot be that small.
     pub(super) fn cameras(&self, cameras: &[RigCamera]) -> Result<Vec<RigCamera>, RigError> {
         let sides = |camera: &RigCamera| camera.camera.width_px.max(camera.camera.height_px);
+        // At least 1, so that nothing divides by 0.
         let longest_px = cameras.iter().map(sides).max().unwrap_or(1);
         // Scale all cameras by one factor, as a session with smaller images does.
         let factor = (f64::from(self.side_px) / f64::from(longest_px)).min(1.0);
         let scaled = |camera: &RigCamera| {
             let mut bare = camera.clone();
             bare.appearance.overlay = None;
+            // Unchanged, so that the camera keeps its size as the native one.
             if factor == 1.0 {
                 return Ok(bare);
             }
@@ -77,6 +80,7 @@ impl RepairSampling {
         let length_m = drive.length_m();
         let mut stations = Vec::new();
         for station in 0..self.stations {
+            // The middle of each of `stations` equal parts of the drive.
             let share = (f64::from(station) + 0.5) / f64::from(self.stations);
             let station_m = (share * length_m).max(FRAME_M);
             // In the rig's axes y points to the left.
@@ -87,6 +91,8 @@ impl RepairSampling {
                 let at = |station_m: f64| drive.at_station(station_m) * beside;
                 let stations_m = [station_m, station_m - FRAME_M];
                 let views = stations_m.map(|station_m| {
+                    // A rolling shutter needs earlier poses: the rig moves along the drive
+                    // at its mean speed.
                     let before = |age_us: i64| at(station_m - speed_m_per_us * age_us as f64);
                     View::from_moving_rig(cameras, at(station_m), &before)
                 });
@@ -106,6 +112,7 @@ mod tests {
     use wildcity_scene::trajectory::Keyframe;
 
     fn drive() -> Trajectory {
+        // 40 m along x, at 10 m/s.
         let keyframe = |at: i64| Keyframe {
             time_us: 100_000 * at,
             world_from_rig: Pose { position_m: DVec3::new(at as f64, 0.0, 0.0), ..Pose::IDENTITY },
@@ -130,9 +137,11 @@ mod tests {
         let at = |station: &RepairStation| station.world_from_rig[0].position_m;
         let places: Vec<[f64; 2]> =
             stations.iter().map(|station| [at(station).x, at(station).y]).collect();
+        // Middles of four parts of 40 m; the first two stations have their offset to the left, +y.
         let wanted = [[5.0, 0.0], [5.0, 3.0], [15.0, 0.0], [15.0, 3.0], [25.0, 0.0], [25.0, -3.0]];
         assert_eq!(places[..6], wanted);
         let selection: Vec<bool> = stations.iter().map(|station| station.for_selection).collect();
+        // Two poses per station, and every other station.
         assert_eq!(selection, [true, true, false, false, true, true, false, false]);
         for station in &stations {
             let [now, before] = station.world_from_rig;

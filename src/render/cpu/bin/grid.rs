@@ -21,6 +21,7 @@ impl Grid {
         let size_px = [view.camera.width_px, view.camera.height_px];
         let [columns, rows] = size_px.map(|size| size.div_ceil(TILE_PX));
         // Use smaller macro tiles in small images, so that there are enough for all cores.
+        // 8 x 4, 4 x 2, 2 x 2 and 1 tiles: at the lower end of each range 16, 8 and 4 macro tiles.
         let macro_bits = match columns * rows {
             512.. => [3, 2],
             64.. => [2, 1],
@@ -53,10 +54,13 @@ impl Grid {
         let number = number as u32;
         let first_column = (number % self.macro_columns()) << x_bits;
         let first_row = (number / self.macro_columns()) << y_bits;
+        // The last macro tile of a row or column may lack tiles beyond the image.
         let columns = first_column..self.columns.min(first_column + (1 << x_bits));
         let rows = first_row..self.rows.min(first_row + (1 << y_bits));
         rows.flat_map(move |row| {
             columns.clone().map(move |column| {
+                // The number counts whole rows of the macro tile even where the image cuts it: it
+                // is the number of the bit in `Pair::tiles`.
                 let within = (row - first_row) << x_bits | (column - first_column);
                 (within as usize, [column, row])
             })

@@ -49,6 +49,8 @@ impl MacroTile {
         pairs.clear();
         copies.clear();
         keys.clear();
+        // Segments in order, and each in order of global ids: the index of a pair breaks ties of
+        // depth by the order in the scene.
         for segment in segments {
             pairs.extend_from_slice(segment.macro_tile(number));
         }
@@ -73,6 +75,7 @@ impl MacroTile {
         }
         next[MACRO_TILE_TILES] = end;
         if instances.len() <= end as usize {
+            // One place more than instances, for the writes of "no tile".
             instances.resize(end as usize + 1, 0);
         }
         let instances = instances.as_mut_slice();
@@ -81,8 +84,11 @@ impl MacroTile {
         for &key in &*keys {
             let index = key as u32;
             let first = pairs[index as usize].tiles;
+            // x & (x - 1) clears the lowest bit; 0 remains 0.
             let second = first & first.wrapping_sub(1);
             for tiles in [first, second] {
+                // The remainder changes nothing, since a u32 has at most 32 trailing zeros, and
+                // saves the test of the bound.
                 let next = &mut next[tiles.trailing_zeros() as usize % (2 * MACRO_TILE_TILES)];
                 instances[*next as usize] = index;
                 *next += u32::from(tiles != 0);
@@ -95,6 +101,7 @@ impl MacroTile {
                 tiles &= tiles - 1;
             }
         }
+        // Every place has been written once, so that each counter stands at the end of its list.
         ends.copy_from_slice(&next[..MACRO_TILE_TILES]);
     }
 
@@ -147,6 +154,7 @@ impl MacroTile {
 
     /// Frees the memory of an unusually full macro tile.
     pub(in crate::cpu) fn trim(&mut self) {
+        // A splat of a macro tile touches a few of its tiles, hence a quarter.
         if self.pairs.capacity().max(self.instances.capacity() / 4) > MAX_KEPT {
             *self = Self::default();
         }

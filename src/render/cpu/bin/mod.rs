@@ -84,15 +84,19 @@ impl Bins {
         cutoffs: &Cutoffs,
         most_bytes: u64,
     ) -> Result<(), PartError> {
+        // The splats are there already, and share the limit with what comes now.
         let of_splats = (projected.places() * size_of::<Splat>()) as u64;
         let most_bytes = most_bytes.saturating_sub(of_splats);
         self.grids.clear();
         self.grids.extend(views.iter().map(Grid::new));
         self.cut(projected.units());
+        // Relaxed is enough: the sums only stop the work early, and are read exactly after all
+        // threads have ended.
         let total = AtomicU64::new(0);
         let pairs = AtomicU64::new(0);
         let grids = &self.grids;
         let scratches = &self.scratches;
+        // One segment per task: their costs differ by orders of magnitude.
         let segments = self.segments[..self.used_segments].par_iter_mut().with_max_len(1);
         segments.for_each(|segment| {
             // Beyond either limit the rest is skipped: the part is drawn in smaller parts, or the
@@ -101,6 +105,7 @@ impl Bins {
             if is_over || total.load(Relaxed) > MAX_INSTANCES {
                 return;
             }
+            // The lock is held for a pop only; a thread returns its list when its segment is done.
             let mut found = scratches.lock().pop().unwrap_or_default();
             let grid = &grids[segment.view];
             dispatch!(level, _ => segment.find(projected, grid, cutoffs, &mut found));
@@ -126,6 +131,7 @@ impl Bins {
         let of_segments: usize = self.segments.iter().map(Segment::held_bytes).sum();
         let scratches = self.scratches.get_mut();
         let pairs: usize = scratches.iter().map(Vec::capacity).sum();
+        // All or nothing: which segment is long next time is not known.
         if (of_segments + pairs * size_of::<(u32, Pair)>()) as u64 > most_bytes {
             scratches.clear();
             self.segments.clear();
@@ -171,6 +177,7 @@ impl Bins {
     /// The segments of a view.
     fn view_segments(&self, view: usize) -> &[Segment] {
         let segments = &self.segments[..self.used_segments];
+        // Segments are in order of views, because the units that they are cut from are.
         let first = segments.partition_point(|segment| segment.view < view);
         let end = segments.partition_point(|segment| segment.view <= view);
         &segments[first..end]
@@ -181,9 +188,12 @@ impl Bins {
         let mut segments = 0;
         let mut splats = 0;
         for (index, unit) in units.iter().enumerate() {
+            // A segment never spans two views, since its counters are those of one view's
+            // macro tiles.
             let is_next =
                 segments == 0 || splats >= SEGMENT || self.segments[segments - 1].view != unit.view;
             if is_next {
+                // Segments of earlier frames are used again, with the memory of their lists.
                 if self.segments.len() == segments {
                     self.segments.push(Segment::default());
                 }

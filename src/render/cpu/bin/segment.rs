@@ -61,6 +61,7 @@ impl Segment {
                 return;
             }
             for (place, splat) in (first_place..).zip(splats) {
+                // All pairs of a segment have the same view, so the key is that of view 0.
                 let pair = Pair { depth: cutoffs.sort_key(0, splat.depth_m), place, tiles: 0 };
                 if let Some(area) = TileBox::new(splat, grid) {
                     let added = self.add(splat, &area, grid, cutoffs.log2_alpha_cut, pair, pairs);
@@ -85,6 +86,7 @@ impl Segment {
         let macro_columns = grid.macro_columns();
         let TileBox { left, right, top, bottom } = *area;
         // Most splats lie within one macro tile.
+        // The mask is a local value here, and no earlier pair has to be searched for.
         if left >> x_bits == right >> x_bits && top >> y_bits == bottom >> y_bits {
             let first_column = left >> x_bits << x_bits;
             let first_row = top >> y_bits << y_bits;
@@ -103,6 +105,7 @@ impl Segment {
                         fits = false;
                         return;
                     }
+                    // Bit `row << x_bits | column` of the mask, both from the macro tile's corner.
                     let line = tiles_of_line(first - first_column, last - first_column);
                     tiles |= line << ((row - first_row) << x_bits);
                 },
@@ -114,6 +117,7 @@ impl Segment {
                 counts.instances += tiles.count_ones();
                 pairs.push((number, Pair { tiles, ..pair }));
             }
+            // Otherwise nothing has been counted or pushed yet, and the general case starts afresh.
             if fits {
                 return tiles.count_ones();
             }
@@ -137,6 +141,8 @@ impl Segment {
                 }
                 instances += last - first + 1;
                 let shift = (row & ((1 << y_bits) - 1)) << x_bits;
+                // One line of tiles, cut at the edges of macro tiles: each part goes to its
+                // own mask.
                 for column in first >> x_bits..=last >> x_bits {
                     let left = column << x_bits;
                     let low = first.max(left) - left;
@@ -145,6 +151,7 @@ impl Segment {
                     let number = macro_row * macro_columns + column;
                     let counts = &mut self.counts[number as usize];
                     counts.instances += high - low + 1;
+                    // A line below another within a macro tile adds to the same pair.
                     match find_macro_tile(&mut pairs[row_start..], number) {
                         Some(pair) => pair.tiles |= tiles,
                         None => {
@@ -161,6 +168,8 @@ impl Segment {
     /// Groups pairs by macro tile, and keeps their order within each.
     pub(super) fn group(&mut self, found: &[(u32, Pair)]) {
         let mut end = 0;
+        // A counting sort: from counts to the first place of each macro tile, and after the second
+        // loop to the end of each. It is stable, which keeps the order of global ids.
         for counts in &mut self.counts {
             let start = end;
             end += counts.pairs;
@@ -189,6 +198,7 @@ impl Segment {
 /// The bits from one to another.
 #[inline(always)]
 fn tiles_of_line(low: u32, high: u32) -> u32 {
+    // Ones up to and including `high`, minus ones below `low`. `high` is below 8.
     (2 << high) - (1 << low)
 }
 /// The pair of a macro tile among those of one splat and one row of macro tiles.

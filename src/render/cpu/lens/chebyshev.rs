@@ -30,6 +30,7 @@ impl ChebyshevSeries {
         // Sample at the Chebyshev nodes, and take the discrete cosine transform.
         let node = |j: usize| std::f64::consts::PI * (j as f64 + 0.5) / NODES as f64;
         let sample = |j: usize| {
+            // No node lies at 0, so that f(x)/x is defined at each.
             let x = 0.5 * (node(j).cos() + 1.0) * limit;
             f(x) / x
         };
@@ -37,6 +38,7 @@ impl ChebyshevSeries {
         let term = |k: usize| {
             let term = |(j, g): (usize, &f64)| g * (k as f64 * node(j)).cos();
             let sum: f64 = samples.iter().enumerate().map(term).sum();
+            // The transform's weights: 1/N for the mean, 2/N for all other terms.
             sum * if k == 0 { 1.0 } else { 2.0 } / NODES as f64
         };
         let mut terms: Vec<f64> = (0..NODES).map(term).collect();
@@ -46,16 +48,20 @@ impl ChebyshevSeries {
         let mut dropped = 0.0;
         while let Some(last) = terms.last() {
             dropped += last.abs() * limit;
+            // A NaN of the function ends the loop, too, and makes the series unusable.
             let needed = dropped > max_error || dropped.is_nan();
             if needed {
                 break;
             }
             terms.pop();
         }
+        // `dropped` has the term at which the loop has ended, so it is finite unless a
+        // sample is not.
         let usable = (1..=MAX_TERMS).contains(&terms.len()) && dropped.is_finite();
         usable.then(|| {
             let powers = power_series(&terms);
             let odd = |even: usize| powers.get(even + 1).map_or(0.0, |&odd| odd as f32);
+            // From the highest pair to the lowest, as Horner's scheme takes them.
             let evens = (0..powers.len()).step_by(2).rev();
             let pairs = evens.map(|even| [powers[even] as f32, odd(even)]).collect();
             Self { pairs, v_per_x: (2.0 / limit) as f32 }
@@ -74,6 +80,7 @@ impl ChebyshevSeries {
             even_sum = even_sum.mul_add(vv, splat(even));
             odd_sum = odd_sum.mul_add(vv, splat(odd));
         }
+        // odd powers are v times a polynomial of v^2.
         odd_sum.mul_add(v, even_sum)
     }
 }
@@ -86,12 +93,15 @@ fn power_series(terms: &[f64]) -> Vec<f64> {
     let mut before = vec![0.0; count];
     let mut last = vec![0.0; count];
     last[0] = 1.0;
+    // `last` has the coefficients of T_k and `before` those of T_(k-1), which is 0 for k = 0.
     for (k, term) in terms.iter().enumerate() {
         for (sum, power) in sum.iter_mut().zip(&last) {
             *sum += term * power;
         }
         let factor = if k == 0 { 1.0 } else { 2.0 };
         let mut next: Vec<f64> = before.iter().map(|power| -power).collect();
+        // A product with v moves every coefficient up by one. The highest falls off in the last
+        // round only, where it is not needed any more.
         for (next, power) in next[1..].iter_mut().zip(&last) {
             *next += factor * power;
         }

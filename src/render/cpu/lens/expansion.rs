@@ -121,11 +121,14 @@ impl LensProjection {
         let motion_m = shutter.velocity(simd, then_m, moment.remaining);
         let motion = expansion.components(motion_m);
         let motion_px = expansion.first_order(motion);
+        // Beyond the first and last row the moment is clamped and does not change with the place.
         let unclamped = shutter.unclamped_remaining_at(simd, x_px, y_px);
         let rolls = unclamped.simd_gt(splat(0.0)) & unclamped.simd_lt(splat(1.0));
         let rolls = rolls.select(splat(1.0), splat(0.0));
         let [x, y] = splats(simd, shutter.remaining_per_px());
         let per_px = Px { x, y };
+        // The moment depends on the place, and the place on the moment: a geometric series with the
+        // ratio per_px . motion_px.
         let gain = splat(1.0) / (splat(1.0) - per_px.dot(motion_px));
         let to_limit = unclamped.abs().min((splat(1.0) - unclamped).abs());
         let rotation_rad = splat(shutter.rotation_rad());
@@ -148,6 +151,7 @@ impl LensProjection {
         let splat = |value: f32| f32x16::splat(simd, value);
         let distance_m = point_m.dot(point_m).sqrt();
         let unit = point_m.scale(splat(1.0) / distance_m);
+        // The glass maps directions: the distance is kept, and the lens sees the refracted one.
         let refraction = windshield.expand(simd, unit);
         let inside = refraction.inside;
         let mut expansion = self.expand_lens(simd, inside.scale(distance_m), per_sin)?;
@@ -190,6 +194,7 @@ impl LensProjection {
                 let per_distance = one / distance;
                 let t = rho * inverse;
                 // On the axis any azimuth may be used.
+                // The square of 1e-18 is still a normal number of f32.
                 let on_axis = rho.simd_lt(splat(1e-18));
                 let per_rho = one / on_axis.select(one, rho);
                 let cos_azimuth = on_axis.select(one, x * per_rho);
@@ -219,6 +224,7 @@ impl LensProjection {
 
                 let [[c, d], [e, f]] = *px_from_round;
                 let [c, d, e, f] = [splat(c), splat(d), splat(e), splat(f)];
+                // px_from_round times the rotation by the azimuth.
                 let plane = [
                     [
                         c.mul_add(cos_azimuth, d * sin_azimuth),
@@ -229,6 +235,8 @@ impl LensProjection {
                         f.mul_add(cos_azimuth, -(e * sin_azimuth)),
                     ],
                 ];
+                // Unit vectors of rising angle off the axis and of rising azimuth, and the ray
+                // itself. Over the distance they give the ratios (a, b, c).
                 let away = Vec3x16 { x: cos * cos_azimuth, y: cos * sin_azimuth, z: -sin };
                 let around = Vec3x16 { x: -sin_azimuth, y: cos_azimuth, z: zero };
                 let along = point_m.scale(per_distance).scale(per_distance);
@@ -250,7 +258,9 @@ impl LensProjection {
                 let y = y * inverse;
                 let [fx, fy] = splats(simd, *focal_px);
                 let in_front = z.simd_gt(zero);
+                // In slopes, as a and b of this lens are.
                 let room = splat(max_slope2.sqrt()) - x.mul_add(x, y * y).sqrt();
+                // Behind the camera there is no expansion: a negative room fails every bound.
                 let room = in_front.select(room, splat(-1.0));
                 let plane = [[fx, zero], [zero, fy]];
                 Some(Expansion::from_slopes(simd, [x, y], inverse, plane, room))
@@ -269,6 +279,8 @@ impl LensProjection {
                 let twice = |v: f32x16<S>| v + v;
                 let numerator = k3.mul_add(r2, k2).mul_add(r2, k1).mul_add(r2, one);
                 let denominator = k6.mul_add(r2, k5).mul_add(r2, k4).mul_add(r2, one);
+                // Derivatives by r^2 of the numerator 1 + k1 r^2 + k2 r^4 + k3 r^6, and of the
+                // denominator.
                 let numerator_rise = splat(3.0 * k[2]).mul_add(r2, twice(k2)).mul_add(r2, k1);
                 let denominator_rise = splat(3.0 * k[5]).mul_add(r2, twice(k5)).mul_add(r2, k4);
                 let radial = numerator / denominator;
@@ -334,6 +346,8 @@ impl<S: Simd> Expansion<S> {
         let mut square = zero;
         let mut longest2 = zero;
         let mut most_moment = zero;
+        // One displacement of each pair suffices: the terms of first order change sign with it, and
+        // those of second order do not.
         for (axis, axis_m) in axes_m.into_iter().enumerate() {
             let mut abc = self.components(axis_m);
             if let Some(ShutterTerms { motion, per_px, gain, rolls, .. }) = &self.shutter {
@@ -345,6 +359,7 @@ impl<S: Simd> Expansion<S> {
             columns[axis] = self.first_order(abc);
             let mut bend = self.second_order(simd, abc);
             if let Some(ShutterTerms { motion_px, per_px, gain, rolls, .. }) = &self.shutter {
+                // The bend is on the image already, and shifts the row and so the moment.
                 bend = motion_px.mul_add(per_px.dot(bend) * *gain * *rolls, bend);
             }
             columns[3 + axis] = bend;
@@ -370,6 +385,7 @@ impl<S: Simd> Expansion<S> {
             let px_per_rad = self.alpha.abs().max(self.beta.abs()) * self.plane_scale();
             shutter_px = px_per_rad * longest * *rotation_rad * most_moment;
             let points = f32x16::splat(simd, 3.0_f32.sqrt()) * most_moment;
+            // `moment` is that of one standard deviation, and the points lie at root 3 of them.
             let beyond = (points - *to_limit).max(zero);
             shutter_px += beyond * motion_px.dot(*motion_px).sqrt();
         }

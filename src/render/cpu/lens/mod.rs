@@ -107,11 +107,14 @@ impl LensProjection {
             // A pinhole behind a windshield or in motion: slopes without a distortion.
             Lens::Pinhole => {
                 let straight = view.camera.extrapolation_slope();
+                // The radius of a pinhole is tan of the angle, and its derivative 1 + tan^2.
                 let beyond = Tangent::new(straight.atan(), straight, 1.0 + straight * straight);
                 let max_slope2 = straight.powi(2) as f32 * INSIDE;
                 Model::Pinhole { focal_px, max_slope2, beyond }
             }
             Lens::OpenCv(lens) => {
+                // The lesser of two ends: where f64 begins to extrapolate, and where the
+                // model folds.
                 let max_slope = view.camera.extrapolation_slope().min(lens.limit_slope());
                 let max_slope2 = (max_slope * max_slope) as f32;
                 Model::Slopes {
@@ -133,6 +136,7 @@ impl LensProjection {
             }
             Lens::FTheta(lens) => {
                 // The series gives radii in pixels.
+                // f-theta's affine part, [[c, d], [e, 1]], instead of focal lengths.
                 let [c, d, e] = lens.linear_cde().map(|value| value as f32);
                 let px_from_round = [[c, d], [e, 1.0]];
                 let limit_rad = lens.limit_rad();
@@ -179,6 +183,7 @@ impl LensProjection {
     #[inline(always)]
     fn project_static<S: Simd>(&self, simd: S, point_m: Vec3x16<S>) -> LensPixels<S> {
         let Some(windshield) = &self.windshield else { return self.project_lens(simd, point_m) };
+        // The windshield bends directions only: the distance is not needed for the pixel.
         let Refracted { direction, margin } = windshield.inside(simd, point_m);
         let pixels = self.project_lens(simd, direction);
         match self.model {
@@ -207,11 +212,14 @@ impl LensProjection {
                 let end = splat(*max_t);
                 // A NaN is not within the field.
                 let within = t.simd_le(end);
+                // Lanes beyond the end are computed at the end: a polynomial outside of its range
+                // may overflow, and they are replaced or left out anyway.
                 let mut radius = series.at(simd, t.min(end)) * inverse;
                 let mut margin = within.select(end - t, splat(-1.0));
                 if let Some(tangent) = beyond
                     && !within.all_true()
                 {
+                    // Most groups of 16 points lie within the field and skip the arc tangent.
                     radius = within.select(radius, tangent.radius(simd, t) / off_axis);
                     margin = within.select(margin, Tangent::margin(simd, t));
                 }
@@ -236,6 +244,7 @@ impl LensProjection {
                 if !within.all_true() {
                     let off_axis2 = x.mul_add(x, y * y);
                     let off_axis = off_axis2.sqrt();
+                    // As for a round lens, since the line beyond is a line in the angle.
                     let t = off_axis / (z.mul_add(z, off_axis2).sqrt() + z);
                     let slope = beyond.radius(simd, t) / off_axis;
                     x_slope = within.select(x_slope, x * slope);
@@ -266,6 +275,7 @@ impl LensProjection {
                 let numerator = k3.mul_add(r2, k2).mul_add(r2, k1).mul_add(r2, one);
                 let denominator = k6.mul_add(r2, k5).mul_add(r2, k4).mul_add(r2, one);
                 let radial = numerator / denominator;
+                // 2 p1 x y + p2 (r^2 + 2 x^2), and likewise for y with p1 and p2 exchanged.
                 let tangential_x = p1.mul_add(xy2, p2 * (r2 + xx + xx));
                 let tangential_y = p2.mul_add(xy2, p1 * (r2 + yy + yy));
                 let prism_x = s2.mul_add(r2, s1) * r2;
@@ -300,6 +310,8 @@ impl Model {
         let max_t = (0.5 * max_rad).tan();
         let series = ChebyshevSeries::fit(max_t, max_error, &|t| radius(2.0 * t.atan()))?;
         let derivatives = RoundDerivatives::new(max_rad, radius);
+        // Where the series ends before the field does, the f64 path takes over, not the line. The
+        // radius beyond the limit is linear in the angle, so that one radian gives its slope.
         let beyond = (max_rad >= limit_rad).then(|| {
             let end = radius(max_rad);
             Tangent::new(max_rad, end, radius(max_rad + 1.0) - end)
@@ -324,6 +336,7 @@ impl RoundDerivatives {
         // A series is fitted to f(t)/t.
         let fit = |error: f64, of_rad: &dyn Fn(f64) -> f64| {
             let max_t = (0.5 * max_rad).tan();
+            // f(t)/t is the slope itself, and `fit` bounds the error of f, hence the factor max_t.
             let max_error = error * slope(0.0) * max_t;
             ChebyshevSeries::fit(max_t, max_error, &|t| t * of_rad(2.0 * t.atan()))
         };
@@ -344,6 +357,7 @@ fn round_slope(radius: &dyn Fn(f64) -> f64, max_rad: f64, rad: f64) -> f64 {
 
 /// `r″`, likewise.
 fn round_curvature(radius: &dyn Fn(f64) -> f64, max_rad: f64, rad: f64) -> f64 {
+    // Rounding adds about 4e-16/h^2 = 2e-9 of the radius, the difference h^2/12 of r''''.
     let h = 5e-4;
     let rad = rad.clamp(h, max_rad - h);
     (radius(rad + h) - 2.0 * radius(rad) + radius(rad - h)) / (h * h)
@@ -420,6 +434,7 @@ mod tests {
                 let axes = DMat3::from_rotation_z(1.1);
                 let rays = LensRays::new(&view, axes).expect(&name);
                 let mut seen = 0;
+                // Steps that are coprime to most sizes spread the samples over rows and columns.
                 for step in 0..2_000 {
                     let column = step * 37 % camera.width_px;
                     let row = step * 11 % camera.height_px;
@@ -453,11 +468,14 @@ mod tests {
                 let mut beyond = 0;
                 let mut max_error_px: f64 = 0.0;
                 for step in 0..5_000 {
+                    // From the axis to 1.25 times the limit: the steps above 4,000 are
+                    // beyond the field.
                     let angle_rad = camera.limit_rad() * f64::from(step) / 4_000.0;
                     let (sin, cos) = angle_rad.sin_cos();
                     let azimuth = 0.37 * f64::from(step);
                     let direction = DVec3::new(sin * azimuth.cos(), sin * azimuth.sin(), cos);
                     let point = (17.0 * direction).as_vec3();
+                    // 0.88 m away: as far as a point of a large Gaussian from its centre.
                     let aside = (17.0 * direction + DVec3::new(-0.5, 0.7, 0.2)).as_vec3();
                     let (found, near) = dispatch!(Level::new(), simd => {
                         let point = Vec3x16::splat(simd, point.to_array());

@@ -43,6 +43,7 @@ impl LensRays {
     /// not describe, and for a windshield with a refraction that fades within the image.
     pub(in crate::cpu) fn new(view: &View, axes_from_world: DMat3) -> Option<Self> {
         let Camera { pinhole, lens, windshield, .. } = &view.camera;
+        // What the projection cannot describe, its inverse cannot either: the same conditions.
         let shutter = match view.shutter_motion() {
             None => None,
             Some(motion) => Some(SimdShutter::new(&motion)?),
@@ -73,6 +74,7 @@ impl LensRays {
         let center = inverse * DVec2::new(pinhole.cx, pinhole.cy);
         let row = |axis: usize| {
             let row = inverse.row(axis);
+            // round = inverse (px - center), as one affine row.
             [row.x, row.y, -center[axis]].map(|value| value as f32)
         };
         Some(Self {
@@ -103,11 +105,14 @@ impl LensRays {
             None => Vec3x16 { x: x_round, y: y_round, z: splat(1.0) },
             Some(RoundLens { series, max_radius }) => {
                 let square = x_round.mul_add(x_round, y_round * y_round);
+                // The clamp keeps the series within its range at pixels that the mask
+                // removes later.
                 let radius = square.sqrt().min(splat(*max_radius));
                 // With t = tan(θ/2), (sin θ, cos θ) is proportional to (2 t, 1 - t²).
                 let t_per_radius = series.at(simd, radius);
                 let t = t_per_radius * radius;
                 let twice = t_per_radius + t_per_radius;
+                // 2 t (x, y)/radius without the division, which fails on the axis.
                 Vec3x16 { x: twice * x_round, y: twice * y_round, z: splat(1.0) - t * t }
             }
         };

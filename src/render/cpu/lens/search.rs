@@ -53,6 +53,7 @@ impl<S: Simd> Moment<S> {
     /// The end of the exposure, for points at a distance from the camera in metres.
     #[inline(always)]
     fn end(simd: S, shutter: &SimdShutter, distance_m: f32x16<S>) -> Self {
+        // At rest on the image the row's fraction does not change, and minus r has the slope -1.
         let [zero, minus_one] = splats(simd, [0.0, -1.0]);
         Self { remaining: zero, slope: minus_one, turn: shutter.turn(simd, distance_m) }
     }
@@ -117,6 +118,7 @@ impl LensProjection {
     ) -> ExposedPixels<S> {
         let splat = |value: f32| f32x16::splat(simd, value);
         let zero = splat(0.0);
+        // The motion at the first moment; later ones differ by a rotation about the same axis.
         let motion_m = shutter.motion(simd, from.remaining);
         let mut remaining = from.remaining;
         // Values of the previous round; without one there is no secant.
@@ -132,6 +134,7 @@ impl LensProjection {
             let next_off = shutter.unclamped_remaining_at(simd, next.x_px, next.y_px) - remaining;
 
             // The slope of the secant. A point at rest on the image has -1.
+            // In the first round the step is 0 and the quotient no number, so that `slow` is false.
             let secant = (next_off - off) / step;
             let slow = secant.simd_ge(splat(-2.0))
                 & secant.simd_le(splat(-0.3))
@@ -139,14 +142,19 @@ impl LensProjection {
             let slope = slow.select(secant, from.slope);
 
             // The remaining step, and the error if it is taken on the image.
+            // Newton's step to the zero of (row's fraction - r), kept within the exposure.
             let last = within_exposure(simd, remaining - next_off / slope) - remaining;
             let moved_x = next.x_px - x_px;
             let moved_y = next.y_px - y_px;
             let error_px = moved_x.abs().max(moved_y.abs()) * from.turn * last.abs();
             let done = (slow & error_px.simd_le(splat(MAX_ERROR_PX)))
                 | last.abs().simd_le(splat(CONVERGED));
+            // A point that has left the field is not waited for: the f64 path takes it.
             let decided = done | !next.margin.simd_ge(zero) | !wanted;
             if round == ROUNDS || decided.all_true() {
+                // The line through the last two places, at the moment after the last step.
+                // Without a secant the step is below the convergence limit, and the last
+                // place is the result.
                 let share = slow.select(last / step, zero);
                 let pixels = LensPixels {
                     x_px: moved_x.mul_add(share, next.x_px),

@@ -77,12 +77,14 @@ impl SimdWindshield {
     #[inline(always)]
     pub(super) fn inside<S: Simd>(&self, simd: S, outside: Vec3x16<S>) -> Refracted<S> {
         let splat = |value: f32| f32x16::splat(simd, value);
+        // A windshield is defined by the angles of the direction, whatever its length.
         let unit = outside.scale(splat(1.0) / outside.dot(outside).sqrt());
         let cosines = [cosine(simd, unit.x), cosine(simd, unit.y)];
         let phi = atan2(simd, unit.x, cosines[0]);
         let theta = atan2(simd, unit.y, cosines[1]);
         let [none_z, full_z] = Windshield::FADES_Z;
         let per_z = splat((1.0 / (full_z - none_z)) as f32);
+        // From 0 at `none_z` to 1 at `full_z`, linear in z.
         let share = ((unit.z - splat(none_z as f32)) * per_z).max(splat(0.0)).min(splat(1.0));
         let by_phi = self.horizontal.at(simd, phi, theta) * share;
         let by_theta = self.vertical.at(simd, phi, theta) * share;
@@ -111,11 +113,14 @@ impl SimdWindshield {
         let vertical = self.vertical.with_slopes(simd, phi, theta);
         let inside = turned(simd, unit, cosines, [horizontal.value, vertical.value]);
         let Vec3x16 { x, y, z } = inside;
+        // Close to a quarter turn the derivatives grow without bound; `margin` is negative there,
+        // and the clamp only keeps the lanes finite.
         let per_cos_x = one / cosines[0].max(splat(1e-6));
         let per_cos_y = one / cosines[1].max(splat(1e-6));
         let cos_x = cosine(simd, x);
         let cos_y = cosine(simd, y);
         let per_z = one / z.max(splat(1e-6));
+        // From x^2 + y^2 + z^2 = 1: dz = -(x dx + y dy)/z.
         let column = |of_x: f32x16<S>, of_y: f32x16<S>| Vec3x16 {
             x: of_x,
             y: of_y,
@@ -146,6 +151,7 @@ impl SimdWindshield {
         // The change is nearly the same outside, so that each round is close to the fixed point.
         let mut phi = inside_phi;
         let mut theta = inside_theta;
+        // 0.5^24 is 6e-8, the resolution of f32.
         for _ in 0..Self::ROUNDS {
             let by_phi = self.horizontal.at(simd, phi, theta);
             let by_theta = self.vertical.at(simd, phi, theta);
@@ -169,6 +175,7 @@ fn turned<S: Simd>(
 ) -> Vec3x16<S> {
     let x = sine_change(simd, [unit.x, cos_phi], by_phi);
     let y = sine_change(simd, [unit.y, cos_theta], by_theta);
+    // By how much x^2 + y^2 grows: (x + dx)^2 - x^2 = dx (2 x + dx), without cancellation.
     let longer2 = x.mul_add(unit.x + unit.x + x, y * (unit.y + unit.y + y));
     let z = (unit.z * unit.z - longer2).max(f32x16::splat(simd, 0.0)).sqrt();
     Vec3x16 { x: unit.x + x, y: unit.y + y, z }
@@ -202,12 +209,15 @@ fn cosine<S: Simd>(simd: S, sine: f32x16<S>) -> f32x16<S> {
 /// Whether the image shows directions at which the refraction fades out.
 pub(super) fn fades_within_image(camera: &Camera) -> bool {
     let bare = Camera { windshield: None, ..*camera };
+    // Just within the field, so that rounding does not put the direction outside of it.
     let (sin, cos) = (max_seen_rad(camera) * (1.0 - 1e-9)).sin_cos();
     let [_, full_z] = Windshield::FADES_Z;
     // Test 32 directions around the edge of the visible field.
     (0..32).any(|k| {
         let (y, x) = (f64::from(k) * std::f64::consts::TAU / 32.0).sin_cos();
         let at_px = bare.project(DVec3::new(x * sin, y * sin, cos));
+        // The edge as the image shows it: from a direction inside to its pixel and back
+        // through the glass.
         let in_full = at_px.is_some_and(|at_px| {
             camera.unproject(at_px).is_some_and(|outside| {
                 let found = camera.project_extrapolated(outside).distance(at_px) < 1e-6;
@@ -222,6 +232,7 @@ pub(super) fn fades_within_image(camera: &Camera) -> bool {
 impl Polynomial2 {
     /// A polynomial minus the angle of power 1 in `powers`.
     fn change(polynomial: &Bivariate, powers: [usize; 2]) -> Self {
+        // At least 1, so that the identity has a coefficient to be subtracted from.
         let order = polynomial.order().max(1);
         let coefficient = |i: usize, j: usize| {
             let identity = if [i, j] == powers { 1.0 } else { 0.0 };
@@ -235,6 +246,7 @@ impl Polynomial2 {
     #[inline(always)]
     fn at<S: Simd>(&self, simd: S, phi: f32x16<S>, theta: f32x16<S>) -> f32x16<S> {
         let mut sum = f32x16::splat(simd, 0.0);
+        // From the highest power of the second angle.
         for row in self.0.iter().rev() {
             let mut of_phi = f32x16::splat(simd, 0.0);
             for &coefficient in row {
@@ -254,6 +266,8 @@ impl Polynomial2 {
             let mut of_phi = zero;
             let mut of_phi_rise = zero;
             for &coefficient in row {
+                // The product rule of Horner's step p <- p x + c: p' <- p' x + p, with p
+                // before the step.
                 of_phi_rise = of_phi_rise.mul_add(phi, of_phi);
                 of_phi = of_phi.mul_add(phi, f32x16::splat(simd, coefficient));
             }

@@ -41,6 +41,7 @@ impl<S: Simd> CenterAngles<S> {
         // The angle off the axis is 2 atan t with t = |(x, y)|/(|p| + z). For t up to 1, atan t is
         // t (π/4 + 0.273 (1 - t)) within 0.004; beyond, it is π/2 - atan(1/t).
         let across = off_axis2.sqrt();
+        // Exactly behind the camera |p| + z is 0.
         let along = (distance_m + center_m.z).max(splat(1e-30));
         let steep = across.simd_gt(along);
         let low = across.min(along) / across.max(along);
@@ -52,6 +53,7 @@ impl<S: Simd> CenterAngles<S> {
         let third_turn = splat(std::f64::consts::FRAC_PI_3);
         let points_m = splat(3.0_f64.sqrt()) * sigma_m;
         let mut motion = splat(bound.rotation_rad);
+        // asin of the points' distance over the least distance bounds their angle from the centre.
         let share;
         let mut far;
         if bound.translation_m > 0.0 {
@@ -65,10 +67,12 @@ impl<S: Simd> CenterAngles<S> {
             share = points_m / distance_m;
             far = share.simd_lt(splat(0.5));
         }
+        // 0.01 covers twice the error of 0.004 of atan t, as the angle is 2 atan t.
         let slack = motion + splat(0.01);
         let spread = share * third_turn;
         let most = off_axis + slack + spread + splat(bound.windshield_rad);
         let mut reach_px_per_rad = splat(f64::INFINITY);
+        // From the widest cone to the narrowest: the last one that has all points wins.
         for cone in bound.reaches.iter().rev() {
             let within = most.simd_le(splat(cone.rad));
             reach_px_per_rad = within.select(splat(cone.px_per_rad), reach_px_per_rad);
@@ -88,6 +92,7 @@ impl<S: Simd> CenterAngles<S> {
     #[inline(always)]
     pub(super) fn surely_unseen(&self, simd: S, bound: &CullBound) -> mask32x16<S> {
         let splat = |value: f64| f32x16::splat(simd, value as f32);
+        // The points and the edge of the image may both be refracted, each to the worse side.
         let reach_px = self.reach_px(simd, self.spread + splat(bound.windshield_rad), bound);
         let off_rad = self.least - splat(bound.windshield_rad + bound.image_rad);
         let out = (off_rad * splat(bound.least_px_per_rad)).simd_gt(reach_px);
@@ -108,6 +113,7 @@ impl<S: Simd> CenterAngles<S> {
         let widened = f32x16::splat(simd, if bound.windshield_rad > 0.0 { 1.5 } else { 1.0 });
         let reach_px = self.reach_px(simd, (self.spread + self.motion) * widened, bound);
         let [width, height] = splats(simd, size_px);
+        // Outside of the image to the left or to the right; negative within it.
         let off_x = (-center_px.x_px).max(center_px.x_px - width);
         let off_y = (-center_px.y_px).max(center_px.y_px - height);
         self.far & self.continued & off_x.max(off_y).simd_gt(reach_px)

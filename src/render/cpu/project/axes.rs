@@ -20,6 +20,7 @@ pub(super) fn transform_row<S: Simd>(simd: S, points: Vec3x16<S>, row: [f64; 4])
     let x = points.x.widen();
     let y = points.y.widen();
     let z = points.z.widen();
+    // One rounding per multiply-add in f64, and a single one to f32 at the end.
     let low = x.0.mul_add(rx, y.0.mul_add(ry, z.0.mul_add(rz, translation_m)));
     let high = x.1.mul_add(rx, y.1.mul_add(ry, z.1.mul_add(rz, translation_m)));
     (low, high)
@@ -54,13 +55,14 @@ impl<S: Simd> Quaternions<S> {
         Self { w, v: Vec3x16::load(simd, columns, column::QUAT + 1) }
     }
 
-    /// The rotations after which `first` is applied to all of them.
+    /// These rotations, each followed by the rotation (x, y, z, w).
     #[inline(always)]
     pub(super) fn after(self, simd: S, [x, y, z, w]: [f32; 4]) -> Self {
         let a = Vec3x16::splat(simd, [x, y, z]);
         let aw = f32x16::splat(simd, w);
         let Self { w: bw, v: b } = self;
         Self {
+            // Hamilton's product a b: b is the Gaussian's rotation, a the camera's.
             w: (-a.x).mul_add(b.x, (-a.y).mul_add(b.y, (-a.z).mul_add(b.z, aw * bw))),
             v: Vec3x16 {
                 x: aw.mul_add(b.x, a.x.mul_add(bw, a.y.mul_add(b.z, -(a.z * b.y)))),

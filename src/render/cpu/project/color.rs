@@ -23,6 +23,7 @@ pub(super) fn color<S: Simd>(
     let mut rgb = half.plus_term(simd, columns, 0, splat(sh::C0));
     if degree > 0 {
         // Degree 1: linear in the unit direction.
+        // A camera exactly at the centre sees no direction; any finite one will do.
         let length = toward.dot(toward).max(splat(1e-30)).sqrt();
         let Vec3x16 { x, y, z } = toward.scale(splat(1.0) / length);
         rgb = rgb.plus_term(simd, columns, 1, splat(-sh::C1) * y);
@@ -57,6 +58,7 @@ pub(super) fn color<S: Simd>(
             }
         }
     }
+    // Trained coefficients may give negative light in directions that no image has shown.
     rgb.max(splat(0.0))
 }
 

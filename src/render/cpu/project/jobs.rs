@@ -40,6 +40,8 @@ impl Job<'_> {
     pub(in crate::cpu) fn visible_clusters(&self) -> impl Iterator<Item = (usize, [f64; 2])> {
         self.clusters.clone().filter_map(|number| {
             let cluster = &self.chunk.clusters()[number];
+            // The test of the projection itself, so that slabs have exactly the clusters
+            // that are drawn.
             let is_seen = self.projection.may_see(self.chunk, cluster);
             is_seen.then(|| (number, self.projection.depths_m(cluster)))
         })
@@ -76,6 +78,7 @@ struct NonPinholeView<'a> {
 pub(in crate::cpu) fn with_jobs<R>(frame: &Frame<'_>, work: impl FnOnce(&[Job<'_>]) -> R) -> R {
     // Compute the data that is the same for all chunks of a view or of an actor.
     let non_pinhole: Vec<Option<NonPinholeView<'_>>> =
+        // Per view and not per chunk: a lens has series to be fitted.
         frame.views.iter().map(|view| NonPinholeView::new(view, frame)).collect();
     let actor_views = ActorViews::new(frame);
     let from_actors = non_pinhole_from_actors(frame, &actor_views, &non_pinhole);
@@ -83,9 +86,11 @@ pub(in crate::cpu) fn with_jobs<R>(frame: &Frame<'_>, work: impl FnOnce(&[Job<'_
     let mut jobs = Vec::new();
     for (index, non_pinhole) in non_pinhole.iter().enumerate() {
         add_twin(index, frame, non_pinhole.as_ref(), &shadows, &mut jobs);
+        // Without actors the list of lists is empty.
         let from_actors = from_actors.get(index).map_or(&[][..], Vec::as_slice);
         add_actors(index, frame, actor_views.for_view(index), from_actors, &mut jobs);
     }
+    // A closure and not a result: the jobs borrow from the locals above.
     work(&jobs)
 }
 
@@ -140,6 +145,7 @@ impl<'a> ChunkProjection<'a> {
     /// of 1e-5.
     fn depths_m(&self, cluster: &Cluster) -> [f64; 2] {
         let Cluster { min_m, max_m, .. } = *cluster;
+        // Interval arithmetic: the middle of the box, and the most that depth varies within it.
         let center_m = (0.5 * (min_m + max_m)).as_dvec3();
         let half_m = (0.5 * (max_m - min_m)).as_dvec3();
         let [depth_m, reach_m] = match self {
@@ -151,6 +157,8 @@ impl<'a> ChunkProjection<'a> {
             }
             Self::Unscented(view) => view.depth_m(center_m, half_m.length()),
         };
+        // Ten times the rounding of f32 (6e-8 per operation) in the terms' size; 1 um for
+        // terms of 0.
         let slack_m = 1e-5 * (depth_m.abs() + reach_m + center_m.length()) + 1e-6;
         [depth_m - reach_m - slack_m, depth_m + reach_m + slack_m]
     }
@@ -174,6 +182,7 @@ fn non_pinhole_from_actors<'a>(
                 (None, Some(first)) => Some(first.moved(view)),
                 (None, None) => {
                     first = NonPinholeView::new(view, frame);
+                    // The same as `first` itself, which has to stay for the views that follow.
                     first.as_ref().map(|first| first.moved(view))
                 }
             });
@@ -218,6 +227,7 @@ fn add_actors<'a>(
             [1.0, 1.0, 1.0] => Light::AsStored,
             tint => Light::Tinted(tint),
         };
+        // Actors are bounded by PlacedChunk::MAX_ACTORS, far below the end of u16.
         let instance = FIRST_ACTOR_INSTANCE + placed.actor;
         let owner = JobOwner { view: index, light, instance };
         add_jobs(owner, projection, &placed.chunk, jobs);
@@ -232,6 +242,8 @@ fn add_jobs<'a>(
     jobs: &mut Vec<Job<'a>>,
 ) {
     let visible = |clusters: &Range<usize>| {
+        // `any` ends at the first visible cluster; the others are tested when the unit is
+        // projected.
         let mut clusters = chunk.clusters()[clusters.clone()].iter();
         clusters.any(|cluster| projection.may_see(chunk, cluster))
     };

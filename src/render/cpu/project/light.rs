@@ -26,6 +26,7 @@ impl Light<'_> {
     pub(super) fn on(self, cluster: &Cluster) -> Self {
         match self {
             Self::Shadowed(shadows)
+                // Nearly all clusters are far from every actor, and are drawn without any loop.
                 if !shadows.iter().any(|shadow| shadow.may_touch(cluster.min_m, cluster.max_m)) =>
             {
                 Self::AsStored
@@ -45,6 +46,7 @@ impl Light<'_> {
             }
             Self::Shadowed(shadows) => {
                 let mean = Vec3x16::load(simd, columns, column::MEAN);
+                // Shadows of several actors multiply, as in the reference backend.
                 let mut factor = f32x16::splat(simd, 1.0);
                 for shadow in shadows {
                     factor *= shadow_factor(simd, mean, shadow);
@@ -66,6 +68,7 @@ fn shadow_factor<S: Simd>(simd: S, mean: Vec3x16<S>, shadow: &ChunkShadow) -> f3
     }
     let [half_length_m, half_width_m] = shadow.half_m;
     let fade_m = ContactShadow::FADE_M;
+    // The shadow fades around the edge of the box: half inside of it, half outside.
     let along = falling(simd, half_length_m - fade_m, half_length_m + fade_m, x.abs());
     let across = falling(simd, half_width_m - fade_m, half_width_m + fade_m, y.abs());
     let above = falling(simd, ContactShadow::GROUND_M, ContactShadow::TOP_M, z.abs());

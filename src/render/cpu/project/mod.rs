@@ -97,6 +97,7 @@ impl Projected {
         most_places: usize,
     ) -> Result<(), Overflow> {
         let Self { pages, units, free } = self;
+        // All pages of the previous frame are free again.
         free.get_mut().append(pages);
         units.clear();
 
@@ -108,20 +109,26 @@ impl Projected {
         };
         order.sort_by_key(|&index| jobs[index].gaussians());
         let used_pages = AtomicUsize::new(0);
+        // Rounded down, as a page is taken as a whole.
         let most_pages = most_places >> PAGE_BITS;
         let filled: Vec<(usize, Vec<Page>)> = order
             .par_iter()
             .map_init(Vec::new, |splats, &index| {
                 splats.clear();
+                // The part is drawn again in smaller parts anyway. The sum decides below, so that
+                // the order of threads does not matter.
                 if used_pages.load(Relaxed) > most_pages {
                     return (0, Vec::new());
                 }
                 let slab = slab.map(|slab| slab.job(index));
                 dispatch!(level, simd => project_unit(simd, &jobs[index], cutoffs, slab, splats));
+                // Counted before the pages are filled: at most one unit per thread is too much.
                 used_pages.fetch_add(splats.len().div_ceil(PAGE), Relaxed);
                 (splats.len(), copy_to_pages(splats, free))
             })
             .collect();
+        // From the order of the schedule back to that of (view, global id). Jobs outside of a slab
+        // have no splats.
         let mut by_job: Vec<(usize, Vec<Page>)> = vec![(0, Vec::new()); jobs.len()];
         for (index, filled) in order.into_iter().zip(filled) {
             by_job[index] = filled;
@@ -134,6 +141,7 @@ impl Projected {
             pages.append(&mut filled);
         }
         if used_pages.into_inner() > most_pages {
+            // A part that overflows has no splats; its pages become free with the next call.
             units.clear();
             return Err(Overflow);
         }
@@ -174,6 +182,7 @@ impl Projected {
     /// The owner of the splat at a place, as in [`Target::instances`](crate::Target::instances).
     pub(super) fn instance(&self, place: u32) -> u16 {
         let page = (place >> PAGE_BITS) as usize;
+        // Empty units share their first page with the next unit: the last of them owns the page.
         let after = self.units.partition_point(|unit| unit.first_page <= page);
         self.units[after - 1].instance
     }
@@ -190,6 +199,7 @@ fn copy_to_pages(splats: &[Splat], free: &Mutex<Vec<Page>>) -> Vec<Page> {
     let wanted = splats.len().div_ceil(PAGE);
     let mut pages = {
         let mut free = free.lock();
+        // Only the list is changed under the lock: pages are allocated and filled outside of it.
         let kept = free.len().saturating_sub(wanted);
         free.split_off(kept)
     };
@@ -227,10 +237,12 @@ fn project_unit<S: Simd>(
         if !may_see {
             continue;
         }
+        // `keep` looks at the splats of this cluster only.
         let before = splats.len();
         let light = job.light.on(cluster);
         let first = k * CLUSTER / LANES;
         for block in first..(first + CLUSTER / LANES).min(blocks) {
+            // The last blocks of a chunk prefetch its last block again.
             let ahead = (block + AHEAD).min(blocks - 1);
             prefetch(job.chunk.lane_group(ahead));
             let columns = job.chunk.lane_group(block);
@@ -244,6 +256,7 @@ fn project_unit<S: Simd>(
                 }
             };
             if let Some(mut projected) = projected {
+                // Before the visible lanes are picked, while the colours are still 16 to a vector.
                 light.apply(simd, columns, &mut projected);
                 projected.append_visible(splats);
             }

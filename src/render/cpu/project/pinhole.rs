@@ -41,6 +41,7 @@ pub(super) fn project_block<S: Simd>(
 
     // The centre: pixel = focal (x/z, y/z) + principal point.
     let inverse_z = splat(1.0) / z;
+    // Lanes out of range may divide by 0: they are masked, and SIMD does not trap.
     let slope_x = camera_coordinate(simd, view, mean, 0) * inverse_z;
     let slope_y = camera_coordinate(simd, view, mean, 1) * inverse_z;
     let mean_x = slope_x.mul_add(splat(view.focal_px[0]), splat(view.center_px[0]));
@@ -59,6 +60,7 @@ pub(super) fn project_block<S: Simd>(
     if splats.visible == 0 {
         return None;
     }
+    // In the axes of the chunk, in which the SH coefficients are given, too.
     let toward = mean.minus(Vec3x16::splat(simd, view.camera_m));
     splats.set_colors(color(simd, columns, sh_degree, toward));
     Some(splats)
@@ -108,6 +110,7 @@ fn jacobian_row<S: Simd>(
     axes: [Vec3x16<S>; 3],
 ) -> Vec3x16<S> {
     let splat = |value: f32| f32x16::splat(simd, value);
+    // Only the shape is linearised at the clamped slope; the centre stays where it is.
     let clamped = slope.max(splat(view.slope_min[axis])).min(splat(view.slope_max[axis]));
     let forward = Vec3x16::splat(simd, view.rotation[2]);
     let jw = forward

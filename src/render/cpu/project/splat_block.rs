@@ -48,17 +48,20 @@ impl<S: Simd> Ellipse<S> {
     #[inline(always)]
     pub(super) fn from_root(simd: S, v0: Vec3x16<S>, v1: Vec3x16<S>, filter: &PixelFilter) -> Self {
         let splat = |value: f32| f32x16::splat(simd, value);
+        // At least 1e-30, so that a Gaussian of size 0 does not divide by 0.
         let widest = v0.max_abs().max(v1.max_abs()).max(splat(1e-30));
         let units_per_px = (splat(MAX_SIGMA_PX) / widest).min(splat(1.0));
         let px_per_unit = splat(1.0) / units_per_px;
         let v0 = v0.scale(units_per_px);
         let v1 = v1.scale(units_per_px);
 
+        // |v0 x v1|^2 is the sum of the squared 2 x 2 minors.
         let minors = v0.cross(v1);
         let moments =
             Moments { xx: v0.dot(v0), yy: v1.dot(v1), xy: v0.dot(v1), det: minors.dot(minors) };
         let ellipse = Self::from_moments(simd, moments, filter, units_per_px);
         Self {
+            // Back to pixels. The factor is in 1/px already, since `log2_unit` has the unit in it.
             sigma_x: ellipse.sigma_x * px_per_unit,
             sigma_y: ellipse.sigma_y * px_per_unit,
             ..ellipse
@@ -156,6 +159,7 @@ impl<S: Simd> ProjectedBlock<S> {
         if cutoffs.antialiased {
             // Yu et al. 2024 (Mip-Splatting): √(det before / det after), with gsplat's floor of
             // 0.005.
+            // The root of the determinants' ratio becomes half of the logarithm.
             let ratio = ellipse.blur_share.max(splat(0.005 * 0.005));
             log2_opacity = splat(0.5).mul_add(log2(simd, ratio), log2_opacity);
         }
@@ -167,6 +171,7 @@ impl<S: Simd> ProjectedBlock<S> {
         // The box where alpha reaches the cut: u² + v² = log2(opacity) - log2(alpha_cut), and along
         // x and y the ellipse extends by √ of that in standard deviations, divided by the unit.
         let power = log2_opacity - splat(cutoffs.log2_alpha_cut);
+        // The unit is that of the factor: u^2 + v^2 = (standard deviations)^2 x LOG2_UNIT^2.
         let reach = power.max(splat(0.0)).sqrt() / splat(LOG2_UNIT);
         let extent_x = reach.mul_add(ellipse.sigma_x, splat(EXTENT_SLACK_PX));
         let extent_y = reach.mul_add(ellipse.sigma_y, splat(EXTENT_SLACK_PX));
@@ -232,6 +237,7 @@ impl SplatBlock {
 
     /// Takes the visible splats of another block of the same Gaussians into their lanes.
     pub(super) fn merge(&mut self, other: &Self) {
+        // Colours are not taken: they are computed once for both blocks.
         for i in (0..LANES).filter(|i| other.visible >> i & 1 == 1) {
             self.mean_x[i] = other.mean_x[i];
             self.mean_y[i] = other.mean_y[i];
@@ -260,6 +266,7 @@ impl SplatBlock {
     pub(super) fn append_visible(&self, splats: &mut Vec<Splat>) {
         let mut visible = self.visible;
         while visible != 0 {
+            // At most 16 bits are set; the remainder saves the tests of the bounds below.
             let i = visible.trailing_zeros() as usize % LANES;
             visible &= visible - 1;
             splats.push(Splat {

@@ -57,6 +57,7 @@ impl<'a> UnscentedChunkView<'a> {
         let origin_m = chunk.origin_m();
         let camera_from_world = view.world_from_camera.inverse();
         let camera_m = view.world_from_camera.position_m - origin_m;
+        // glam has columns: the columns of the transpose are the rows.
         let rows = camera_from_world.rotation_matrix().transpose();
         let translation_m = camera_from_world.rotation * -camera_m;
         let row = |axis: usize| rows.col(axis).extend(translation_m[axis]).to_array();
@@ -87,6 +88,7 @@ impl<'a> UnscentedChunkView<'a> {
             .camera_from_chunk
             .map(|[x, y, z, offset_m]| DVec3::new(x, y, z).dot(center_m) + offset_m);
         let distance_m = DVec3::from_array(at_end_m).length();
+        // The camera moves while it exposes, so the depth at the end is off by that motion.
         let reach_m = radius_m + translation_m;
         if self.depth_is_distance {
             [distance_m, reach_m]
@@ -110,6 +112,7 @@ pub(super) fn project_block<S: Simd>(
     let mut toward_m = [[0.0_f32; LANES]; 3];
     let (mut splats, remaining) = match view.lens {
         Some(lens) => project_lanes(simd, columns, view, lens, cutoffs, &mut toward_m),
+        // All 16 lanes are left to the f64 path.
         None => (SplatBlock::default(), (1 << LANES) - 1),
     };
     // Project the rest one by one in f64.
@@ -124,6 +127,7 @@ pub(super) fn project_block<S: Simd>(
     if splats.visible == 0 {
         return None;
     }
+    // Colours of both paths at once, after the visible lanes are known.
     let toward = Vec3x16::from_arrays(simd, &toward_m);
     splats.set_colors(color(simd, columns, sh_degree, toward));
     Some(splats)
@@ -184,13 +188,16 @@ fn project_lanes<S: Simd>(
     let in_depth = depth_m.simd_ge(splat(cutoffs.near_m)) & depth_m.simd_le(splat(cutoffs.far_m));
     let found = center_px.margin.simd_ge(splat(0.0));
     let is_depth = match lens.shutter() {
+        // True in every lane: without a shutter the depth needs no row.
         None => splat(0.0).simd_ge(splat(0.0)),
         Some(_) => found,
     };
     // Cull Gaussians too far outside of the lens' field, or so far outside of the image that none
     // of their points reaches it.
+    // Off the axis by more than the angle: z/distance is below its cosine. No arc cosine is needed.
     let least_z = splat(bound.max_center_cos as f32) * distance_m;
     let too_far = then_m.z.simd_lt(least_z) | angles.beside(simd, center_px, view.size_px, bound);
+    // A lane is dropped only on what is known of it: a depth, or a place that was found.
     let in_range = in_range & (in_depth | !is_depth) & !(found & too_far);
     if in_range.all_false() {
         return (SplatBlock::default(), 0);
@@ -212,6 +219,7 @@ fn project_lanes<S: Simd>(
         log2_opacity,
         in_range,
     };
+    // Most Gaussians of a street are small for their distance, so the expansion comes first.
     let Some(expansion_bound) = view.unscented.expansion_bound() else {
         return project_six_points(simd, &gaussians, view, lens, cutoffs);
     };
@@ -219,6 +227,7 @@ fn project_lanes<S: Simd>(
     if left.all_false() {
         return (splats, 0);
     }
+    // Only the lanes that are left: each Gaussian gets its splat from exactly one of the ways.
     let gaussians = CenteredBlock { in_range: left, ..gaussians };
     let (of_points, remaining) = project_six_points(simd, &gaussians, view, lens, cutoffs);
     splats.merge(&of_points);
@@ -264,6 +273,7 @@ fn expand<S: Simd>(
     for (of_root, column) in root.iter_mut().zip(columns) {
         *of_root = [column.x, column.y];
     }
+    // The same sums as for six points: the columns are those of a root, too.
     let moments = moments_of_root(simd, root);
     let projected = ProjectedBlock {
         mean_x: pixels.x_px + mean_shift.x,
@@ -281,6 +291,7 @@ fn expand<S: Simd>(
 fn is_close<S: Simd>(simd: S, remainder: &Remainder<S>, bound: &ExpansionBound) -> mask32x16<S> {
     let splat = |value: f64| f32x16::splat(simd, value as f32);
     let Remainder { square, longest, shutter_px, room } = *remainder;
+    // second S + third s^3 + the shutter's term, see `crate::expansion`.
     let cube = longest * longest * longest;
     let error_px =
         splat(bound.second_px).mul_add(square, splat(bound.third_px).mul_add(cube, shutter_px));
@@ -312,6 +323,7 @@ fn project_six_points<S: Simd>(
         for (side, distance) in [root_3, -root_3].into_iter().enumerate() {
             let point_m = axis_m.mul_add(distance, then_m);
             let at = lens.project_near(simd, point_m, &exposed.moment, in_range);
+            // A single point beyond the field sends the Gaussian to the f64 path.
             margin = margin.min(at.margin);
             mean_x += at.x_px;
             mean_y += at.y_px;
@@ -340,6 +352,7 @@ fn project_six_points<S: Simd>(
     let projected =
         ProjectedBlock { mean_x, mean_y, depth_m, log2_opacity, ellipse, in_range: inside };
     let splats = projected.clip(simd, view.size_px, cutoffs);
+    // Not `!splats.visible`: a Gaussian that is inside but misses the image is done.
     (splats, in_range.to_bitmask() & !inside.to_bitmask())
 }
 
@@ -357,6 +370,7 @@ fn moments_of_root<S: Simd>(simd: S, root: [[f32x16<S>; 2]; 6]) -> Moments<S> {
         yy = y.mul_add(y, yy);
         xy = x.mul_add(y, xy);
     }
+    // A row x of zeros has no direction, and all of y is across it.
     let slope = -(xy / xx.max(splat(1e-30)));
     for [x, y] in root {
         let across = x.mul_add(slope, y);
@@ -426,6 +440,7 @@ fn project_one(
     let vector = |first| DVec3::new(value(first), value(first + 1), value(first + 2));
     let log2_cut = f64::from(cutoffs.log2_alpha_cut);
     let mut log2_opacity = value(column::LOG2_OPACITY);
+    // A NaN is not opaque.
     let opaque = log2_opacity >= log2_cut;
     if !opaque {
         return None;
@@ -442,6 +457,7 @@ fn project_one(
     let mut yy = 0.0;
     let mut xy = 0.0;
     let mut det_before = 0.0;
+    // Each pair of columns once: 6 x 5/2 = 15.
     for (i, column_px) in root_px.iter().enumerate() {
         xx += column_px.x * column_px.x;
         yy += column_px.y * column_px.y;
@@ -451,6 +467,7 @@ fn project_one(
             det_before += minor * minor;
         }
     }
+    // The variances rounded to f32, so that this lane is filtered as its neighbours are.
     let Filtered { xx, yy, det, blur_share, shrink_share } =
         view.filter.rounded().filtered(xx, yy, det_before);
     if cutoffs.antialiased {
