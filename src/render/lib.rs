@@ -251,13 +251,14 @@ pub trait Backend: Send + Sync {
         false
     }
 
-    /// Whether the processor's cores are idle while it renders, so that several threads encode an image in parallel.
+    /// Whether the processor's cores are idle while it renders, so that several threads encode an
+    /// image in parallel.
     fn has_idle_cores(&self) -> bool {
         false
     }
 
-    /// Limits the intermediate buffers between the stages of a frame, in bytes. With less memory a frame is drawn in
-    /// more parts, one after the other; its images do not depend on the limit.
+    /// Limits the intermediate buffers between the stages of a frame, in bytes. With less memory a
+    /// frame is drawn in more parts, one after the other; its images do not depend on the limit.
     fn limit_frame_bytes(&self, _bytes: u64) {}
 
     /// Upper bound of its intermediate buffers in the machine's memory for a frame of these views,

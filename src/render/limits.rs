@@ -5,22 +5,23 @@ use std::time::Duration;
 /// Most render threads: above any machine's cores, below what exhausts a machine's processes.
 pub const RENDER_THREADS: usize = 1024;
 
-/// Frames that a GPU holds at once: one is computed, and the next one is ready in its queue, so that it need not wait
-/// for the host. A third would only wait longer.
+/// Frames that a GPU holds at once: one is computed, and the next one is ready in its queue, so
+/// that it need not wait for the host. A third would only wait longer.
 pub const GPU_FRAMES_ON_DEVICE: usize = 2;
 
-/// Most frames that are in flight with a GPU at once. Each holds its images, 27 MB for six full cameras, and those of its
-/// render thread.
+/// Most frames that are in flight with a GPU at once. Each holds its images, 27 MB for six full
+/// cameras, and those of its render thread.
 pub const GPU_FRAMES_MAX: usize = 16;
 
-/// Number of frames in flight with a GPU for this number of threads that encode: two on the device, and one that is
-/// encoded for every two threads. Six JPEGs keep about five threads busy at first, and one in the end.
+/// Number of frames in flight with a GPU for this number of threads that encode: two on the device,
+/// and one that is encoded for every two threads. Six JPEGs keep about five threads busy at first,
+/// and one in the end.
 pub fn gpu_frames(threads: usize) -> usize {
     (GPU_FRAMES_ON_DEVICE + threads.div_ceil(2)).min(GPU_FRAMES_MAX)
 }
 
-/// How long the callbacks of mapped buffers may take to be called once the device has finished: another thread calls
-/// them at once, unless the system does not let it run.
+/// How long the callbacks of mapped buffers may take to be called once the device has finished:
+/// another thread calls them at once, unless the system does not let it run.
 pub const MAP_CALLBACK: Duration = Duration::from_secs(10);
 
 /// Time for which a backend that is dropped waits for devices that have failed: dropping one takes

@@ -52,8 +52,8 @@ impl BuiltIn {
         }
     }
 
-    /// Checks that a scenario has what this agent follows: `log` a recorded drive, which is `drive`,
-    /// and `idm` a route.
+    /// Checks that a scenario has what this agent follows: `log` a recorded drive, which is
+    /// `drive`, and `idm` a route.
     ///
     /// # Errors
     /// Names the field to add.

@@ -71,8 +71,8 @@ fn instances_of_stages_that_ran_on_the_cpu() {
     }
 }
 
-/// All views in one frame: pinholes and lenses, with lenses of actors beside those of views. And in regions, on a
-/// device with small bindings.
+/// All views in one frame: pinholes and lenses, with lenses of actors beside those of views. And in
+/// regions, on a device with small bindings.
 #[test]
 fn all_views_at_once_and_region_by_region() {
     let (scene, _) = placed::street_with_actors();
@@ -95,7 +95,8 @@ fn regions(gpu: &Gpu) -> u64 {
     gpu.usage().unwrap().regions
 }
 
-/// Two placements of one asset take its memory once; a frame without actors uses no pipeline of theirs.
+/// Two placements of one asset take its memory once; a frame without actors uses no pipeline of
+/// theirs.
 #[test]
 fn actors_share_memory_and_cost_nothing_when_absent() {
     let (scene, _) = placed::street_with_actors();

@@ -11,8 +11,8 @@ use wildcity_render::{Backend, Frame, FrameStats, OnViewDone, RenderError, Targe
 use crate::gpu::{gpu, gpu_with};
 use crate::images::cpu;
 
-/// The reference, which draws one frame, keeps its images (linear colour and opacity), and repeats them: it takes
-/// seconds for the frame.
+/// The reference, which draws one frame, keeps its images (linear colour and opacity), and repeats
+/// them: it takes seconds for the frame.
 #[derive(Default)]
 struct Recorder(Mutex<Vec<Vec<f32>>>);
 

@@ -1,5 +1,5 @@
-//! Lenses and rolling shutters on the device against the cpu backend. For static pinhole cameras, nothing
-//! for lenses is compiled.
+//! Lenses and rolling shutters on the device against the cpu backend. For static pinhole cameras,
+//! nothing for lenses is compiled.
 
 use glam::DVec3;
 use wildcity_render::compare::gaussians::{GaussianSpec, scene_from_specs};
@@ -26,8 +26,8 @@ fn straight() -> View {
     view_along([150, 90], 110.0, at, DVec3::new(0.15, 0.03, 1.0), DVec3::Y)
 }
 
-/// Every lens at rest, and rolling shutters in all four directions. One windshield is given by its inverse
-/// polynomials.
+/// Every lens at rest, and rolling shutters in all four directions. One windshield is given by its
+/// inverse polynomials.
 pub(crate) fn lens_views() -> Vec<View> {
     let lenses = lenses();
     let camera = |name: &str| lenses.iter().find(|(known, _)| *known == name).unwrap().1;
@@ -65,7 +65,8 @@ fn lenses_and_shutters_are_drawn_as_by_the_cpu() {
     }
 }
 
-/// Images below the native size, by every lens and shutter, and by pinholes with another share along each axis.
+/// Images below the native size, by every lens and shutter, and by pinholes with another share
+/// along each axis.
 #[test]
 fn small_images_are_drawn_as_by_the_cpu() {
     let street = Scene::from_gaussians(&street(20_000, 1, 31));
@@ -85,11 +86,12 @@ fn small_images_are_drawn_as_by_the_cpu() {
     }
 }
 
-/// Gaussians beyond this distance are left out, in metres: the planes of the road and of the facades start around the
-/// camera.
+/// Gaussians beyond this distance are left out, in metres: the planes of the road and of the
+/// facades start around the camera.
 const NEAR_M: f64 = 30.0;
 
-/// Thousands of surfels of one plane, ordered by z, by distance, and by the depth of a moving camera.
+/// Thousands of surfels of one plane, ordered by z, by distance, and by the depth of a moving
+/// camera.
 #[test]
 fn the_demo_street_through_lenses_and_shutters() {
     let (street, views) = demo_street();

@@ -1,5 +1,5 @@
-//! The definition of each stage in f64, as simple as possible: every tile and every pixel is tested against
-//! every splat.
+//! The definition of each stage in f64, as simple as possible: every tile and every pixel is tested
+//! against every splat.
 
 use glam::DVec2;
 use wildcity_render::constants::{DEPTH_BITS, EXTENT_SLACK_PX, TILE_PX};
@@ -52,8 +52,8 @@ impl Splat {
         }
     }
 
-    /// How far its box reaches inside the image beyond the pixel centres at the nearest edge, in pixels.
-    /// Below 0 the splat is culled.
+    /// How far its box reaches inside the image beyond the pixel centres at the nearest edge, in
+    /// pixels. Below 0 the splat is culled.
     pub(crate) fn inside_px(&self, camera: &Camera) -> f64 {
         let [width, height] = [camera.width_px, camera.height_px].map(f64::from);
         let axis = |k: usize, size: f64| {
@@ -78,8 +78,8 @@ pub(crate) fn splats(between: &StageOutputs) -> Vec<Splat> {
     pairs.map(|(&key, splat)| Splat::from_backend(key, splat)).collect()
 }
 
-/// Stage project by numerical differentiation: all splats in order of (view, global id), including those
-/// outside of the image.
+/// Stage project by numerical differentiation: all splats in order of (view, global id), including
+/// those outside of the image.
 pub(crate) fn project(frame: &Frame<'_>) -> Vec<Splat> {
     let mut all = Vec::new();
     for (index, view) in frame.views.iter().enumerate() {

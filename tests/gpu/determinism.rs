@@ -58,9 +58,9 @@ fn a_frame_does_not_depend_on_the_previous_one() {
     assert!(render(&backend, &street, &profile, &views()) == fresh);
 }
 
-/// Lavapipe takes the size of its subgroups from an environment variable: 4, 8, and 16 threads. On other
-/// devices the variable has no effect. Each size runs in its own process, since a driver reads the variable
-/// once; the process prints the size that it found.
+/// Lavapipe takes the size of its subgroups from an environment variable: 4, 8, and 16 threads. On
+/// other devices the variable has no effect. Each size runs in its own process, since a driver
+/// reads the variable once; the process prints the size that it found.
 #[test]
 fn subgroups_of_any_size() {
     let is_lavapipe = devices()[0].name.contains("llvmpipe");

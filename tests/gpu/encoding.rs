@@ -15,7 +15,8 @@ use crate::gaussians::{GaussianSpec, forward_view, scene_from_specs};
 use crate::gpu::{gpu, gpu_with};
 use crate::scene_files::Random;
 
-/// Three clusters side by side in one chunk, all in front of the camera, with colours of an SH degree.
+/// Three clusters side by side in one chunk, all in front of the camera, with colours of an SH
+/// degree.
 fn wall(sh_degree: u8) -> wildcity_scene::Gaussians {
     let mut random = Random(71);
     let mut wall = crate::gaussians::gaussians_from_specs(&[]);
@@ -32,7 +33,8 @@ fn wall(sh_degree: u8) -> wildcity_scene::Gaussians {
     wall
 }
 
-/// The splats of a scene of which every Gaussian is visible: by the gpu's stage project, and by definition.
+/// The splats of a scene of which every Gaussian is visible: by the gpu's stage project, and by
+/// definition.
 fn projected(gpu: &Gpu, scene: &Scene, view: View) -> (Vec<Splat>, Vec<Splat>) {
     let profile = RenderProfile::default();
     let views = [view];
@@ -43,12 +45,13 @@ fn projected(gpu: &Gpu, scene: &Scene, view: View) -> (Vec<Splat>, Vec<Splat>) {
     (found, truths)
 }
 
-/// Compares colours with a bound. Returns the clusters whose colours exceed it, with their errors, and the
-/// largest error of the second cluster.
+/// Compares colours with a bound. Returns the clusters whose colours exceed it, with their errors,
+/// and the largest error of the second cluster.
 ///
-/// A 16-bit fraction of a cluster's largest value is off by at most half a step of `largest / 32,767`. In
-/// any direction, the absolute values of the `2 l + 1` basis functions of band `l` sum to at most
-/// `(2 l + 1) C0`, since their squares sum to `(2 l + 1) C0²`. So a colour is off by at most
+/// A 16-bit fraction of a cluster's largest value is off by at most half a step of
+/// `largest / 32,767`. In any direction, the absolute values of the `2 l + 1` basis functions of
+/// band `l` sum to at most `(2 l + 1) C0`, since their squares sum to `(2 l + 1) C0²`. So a colour
+/// is off by at most
 ///
 /// ```text
 /// C0 (largest of coefficient 0 + ((degree + 1)² - 1) largest of the others) / 65,534
@@ -112,8 +115,8 @@ fn t10_a_colour_is_off_by_at_most_half_a_step_of_its_clusters_largest_value() {
     assert_eq!(beyond.len(), 3, "an error of two thousandths was not detected: {beyond:?}");
 }
 
-/// An encoded quaternion is off by at most 7e-7 in each of four components: 1.4e-6, or 2.8e-6 rad. The
-/// rounding of the covariance to f32 adds about as much.
+/// An encoded quaternion is off by at most 7e-7 in each of four components: 1.4e-6, or 2.8e-6 rad.
+/// The rounding of the covariance to f32 adds about as much.
 #[test]
 fn t10_a_needle_is_turned_by_less_than_six_millionths() {
     let mut random = Random(72);
@@ -127,7 +130,8 @@ fn t10_a_needle_is_turned_by_less_than_six_millionths() {
         .collect();
     let (found, truths) =
         projected(&gpu(), &scene_from_specs(&needles), forward_view([640, 480], 1000.0));
-    // Angle, modulo pi, of the axis along which the conic `(l0 dx + l1 dy)² + (l2 dy)²` rises least.
+    // Angle, modulo pi, of the axis along which the conic `(l0 dx + l1 dy)² + (l2 dy)²` rises
+    // least.
     let angle_rad = |splat: &Splat| {
         let [l0, l1, l2] = splat.factor;
         0.5 * (2.0 * l0 * l1).atan2(l0 * l0 - l1 * l1 - l2 * l2)

@@ -26,7 +26,8 @@ fn draw(gpu: &Gpu, scene: &Scene, finished: OnViewDone<'_>) -> Vec<u8> {
 
 #[test]
 fn a_frame_is_drawn_while_another_is_encoded() {
-    // The encoder of the first frame waits until as many other frames as the backend allows are drawn.
+    // The encoder of the first frame waits until as many other frames as the backend allows are
+    // drawn.
     let gpu = gpu_on(&AdapterChoice::Best, 1);
     let beside = gpu.frames_in_flight() - 1;
     assert!(beside > 0);
@@ -60,8 +61,8 @@ fn a_frame_is_drawn_while_another_is_encoded() {
     });
 }
 
-/// A thread of a pool that waits takes up other work of the pool. With more callers than threads, this must
-/// not end in a deadlock.
+/// A thread of a pool that waits takes up other work of the pool. With more callers than threads,
+/// this must not end in a deadlock.
 #[test]
 fn many_callers_with_few_threads_do_not_deadlock() {
     let gpu = gpu_on(&AdapterChoice::Best, 1);

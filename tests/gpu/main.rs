@@ -45,8 +45,9 @@ use std::sync::{Arc, Mutex, PoisonError, Weak};
 
 use wildcity_render::compare::gaussians;
 
-/// The best device with the shaders as they are and without limits. Tests that run at the same time share it: software
-/// Vulkan takes seconds to compile the kernels of a lens, and two tests that start together would each compile them.
+/// The best device with the shaders as they are and without limits. Tests that run at the same time
+/// share it: software Vulkan takes seconds to compile the kernels of a lens, and two tests that
+/// start together would each compile them.
 fn shared_gpu() -> Arc<gpu::Watched> {
     static SHARED: Mutex<Weak<gpu::Watched>> = Mutex::new(Weak::new());
     let mut shared = SHARED.lock().unwrap_or_else(PoisonError::into_inner);

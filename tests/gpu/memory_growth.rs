@@ -17,8 +17,8 @@ use crate::streets::street;
 const STEPS: u32 = 1_000;
 /// A step may leak at most 419 B; a bind group or a buffer is larger.
 const GROWTH_BYTES: u64 = 419 * STEPS as u64;
-/// With several threads the allocator's own memory moves by more: in five rounds of three threads, a step may leak at most
-/// 1,412 B.
+/// With several threads the allocator's own memory moves by more: in five rounds of three threads,
+/// a step may leak at most 1,412 B.
 const GROWTH_OF_THREADS_BYTES: u64 = 1_412 * 5 * 3 * ROUND as u64;
 
 #[test]
@@ -58,8 +58,8 @@ fn a_thousand_steps() {
     assert_eq!(device_before, device_after);
 }
 
-/// A thread for each frame in flight, with small bindings: pages of four clusters. Scenes change, so that
-/// pages are freed and allocated again, and some frames exceed the device.
+/// A thread for each frame in flight, with small bindings: pages of four clusters. Scenes change,
+/// so that pages are freed and allocated again, and some frames exceed the device.
 #[test]
 #[ignore = "runs in its own process, started by memory_is_flat_over_changing_scenes_and_frames_that_fail"]
 fn three_at_once() {
@@ -95,8 +95,8 @@ fn three_at_once() {
     let rounds = [(); 6].map(|()| round());
     let [(before, _), .., (after, _)] = rounds;
     assert!(after <= before + GROWTH_OF_THREADS_BYTES, "{before} B grew to {after} B");
-    // The order of the threads decides which scenes share a page, so that a later round may need a few kB more or less. A
-    // leak would grow in every round.
+    // The order of the threads decides which scenes share a page, so that a later round may need a
+    // few kB more or less. A leak would grow in every round.
     let device = rounds.map(|(_, device_bytes)| device_bytes);
     assert!(
         device.windows(2).any(|two| two[1] <= two[0]),
@@ -104,7 +104,8 @@ fn three_at_once() {
     );
 }
 
-/// Draws the largest frame, and a second one from its callback, until `frames` of them are in flight.
+/// Draws the largest frame, and a second one from its callback, until `frames` of them are in
+/// flight.
 fn draw_within(gpu: &Gpu, scene: &Scene, frames: usize) {
     if frames > 0 {
         let one_more = |view: usize, _: &Target<'_>| {

@@ -16,8 +16,9 @@ use crate::streets::{street, turning_views};
 /// Largest number of bytes per resident Gaussian of SH degree 1.
 const BYTES: f64 = 64.0;
 
-/// The demo street in blocks of 16 m as in a twin, for each focal length. Each block is at the coarsest level of detail
-/// whose error is at most one pixel in a camera with this focal length at the start of the street.
+/// The demo street in blocks of 16 m as in a twin, for each focal length. Each block is at the
+/// coarsest level of detail whose error is at most one pixel in a camera with this focal length at
+/// the start of the street.
 fn demo(focals_px: [f32; 3]) -> [Scene; 3] {
     let street = wildcity_generate::street(&StreetSettings::default()).unwrap();
     let (gaussians, eye_m) = (street.gaussians, street.trajectory.at_station(0.0).position_m);
@@ -53,7 +54,8 @@ fn demo(focals_px: [f32; 3]) -> [Scene; 3] {
 
 fn bytes_per_gaussian(scene: &Scene) -> f64 {
     let backend = gpu();
-    // A view into the sky: all chunks of a scene become resident in any view, and none has to be projected.
+    // A view into the sky: all chunks of a scene become resident in any view, and none has to be
+    // projected.
     let view = view_along([64, 64], 50.0, DVec3::new(0.0, 0.0, 500.0), DVec3::Z, DVec3::X);
     render(&backend, scene, &RenderProfile::default(), &[view]);
     backend.usage().unwrap().mirror_bytes as f64 / scene.gaussians() as f64
@@ -97,8 +99,8 @@ fn route() -> Vec<Scene> {
     cells.iter().map(Scene::from_gaussians).collect()
 }
 
-/// A drive back and forth with jumps, under several limits: memory never exceeds the limit, and the images
-/// equal those without a limit.
+/// A drive back and forth with jumps, under several limits: memory never exceeds the limit, and the
+/// images equal those without a limit.
 #[test]
 fn the_least_recently_drawn_chunks_are_evicted() {
     let (cells, profile) = (route(), RenderProfile::default());

@@ -1,5 +1,5 @@
-//! Mutations of each stage's shader, which the comparisons of stages and images must detect: a comparison that cannot
-//! fail proves nothing.
+//! Mutations of each stage's shader, which the comparisons of stages and images must detect: a
+//! comparison that cannot fail proves nothing.
 
 use glam::DVec3;
 use wildcity_render::View;
@@ -120,8 +120,8 @@ pub(crate) const MUTATIONS: &[Mutation] = &[
     mutation("rasterize", "vec4f(255.0)", "vec4f(250.0)", RASTERIZE),
 ];
 
-/// Mutations of lenses and rolling shutters: an expression of `project_unscented`, and a different one of its type; or
-/// a statement, which is left out.
+/// Mutations of lenses and rolling shutters: an expression of `project_unscented`, and a different
+/// one of its type; or a statement, which is left out.
 pub(crate) const LENS_MUTATIONS: &[(&str, &str)] = &[
     ("0.07902598 * square", "0.0 * square"),
     ("select(0.0, 0.25 * HALF_TURN, steep)", "0.0"),
@@ -172,7 +172,8 @@ pub(crate) const LENS_MUTATIONS: &[(&str, &str)] = &[
 ];
 
 /// The shaders with all of [`LENS_MUTATIONS`], of which a frame chooses one by its profile's `far`:
-/// [`far_of_lens_mutation`]. Software Vulkan takes seconds to compile `project_unscented`, so it is compiled once.
+/// [`far_of_lens_mutation`]. Software Vulkan takes seconds to compile `project_unscented`, so it is
+/// compiled once.
 pub(crate) fn shaders_with_lens_mutations() -> Shaders {
     let mut shaders = Shaders::default();
     let mut replace = |original: &str, replacement: &str| {
@@ -181,21 +182,23 @@ pub(crate) fn shaders_with_lens_mutations() -> Shaders {
     };
     for (number, (original, other)) in LENS_MUTATIONS.iter().enumerate() {
         let is_chosen = format!("frame.far_m == {:?}", far_of_lens_mutation(number));
-        match original.ends_with(';') {
-            true => replace(original, &format!("if !({is_chosen}) {{ {original} }}")),
-            false => replace(original, &format!("select({original}, {other}, {is_chosen})")),
+        if original.ends_with(';') {
+            replace(original, &format!("if !({is_chosen}) {{ {original} }}"))
+        } else {
+            replace(original, &format!("select({original}, {other}, {is_chosen})"))
         }
     }
     shaders
 }
 
-/// The `far` of a profile that chooses a mutation, in metres. It lies beyond the scene, so that it changes nothing else.
+/// The `far` of a profile that chooses a mutation, in metres. It lies beyond the scene, so that it
+/// changes nothing else.
 pub(crate) fn far_of_lens_mutation(number: usize) -> f32 {
     50_000.0 + number as f32
 }
 
-/// A street of SH degree 3 with large translucent Gaussians, some over more macro tiles than one thread
-/// emits.
+/// A street of SH degree 3 with large translucent Gaussians, some over more macro tiles than one
+/// thread emits.
 pub(crate) fn misty_street(n: usize) -> Gaussians {
     let mut street = street(n, 3, 41);
     for i in (0..n).step_by(1_000) {

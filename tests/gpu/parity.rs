@@ -22,9 +22,9 @@ fn compare(scene: &Scene, profile: &RenderProfile, views: &[View], what: &str) {
     }
 }
 
-/// Compares colour and opacity only. In dense scenes, an alpha may lie at the cut or a transmittance at the
-/// stop, and two backends may decide differently. That changes a pixel's colour by at most a hundredth, but
-/// its depth by any amount.
+/// Compares colour and opacity only. In dense scenes, an alpha may lie at the cut or a
+/// transmittance at the stop, and two backends may decide differently. That changes a pixel's
+/// colour by at most a hundredth, but its depth by any amount.
 fn compare_colors(scene: &Scene, profile: &RenderProfile, views: &[View], what: &str) {
     let images = render(&gpu(), scene, profile, views);
     let truths = render(&cpu(), scene, profile, views);
@@ -48,8 +48,8 @@ pub(crate) fn streets_of_every_sh_degree() {
 fn the_demo_street_from_its_own_cameras() {
     let (street, views) = demo_street();
     let scene = Scene::from_gaussians(&street);
-    // Thousands of surfels of one plane: both backends order them equally only if depths are rounded
-    // once.
+    // Thousands of surfels of one plane: both backends order them equally only if depths are
+    // rounded once.
     compare_colors(&scene, &RenderProfile::default(), &views, "the demo street");
 }
 

@@ -9,8 +9,8 @@ use crate::images::{agree, cpu, render, render_one, view_along};
 use crate::scene_files::{Random, gaussians};
 use crate::streets::{street, turning_views};
 
-/// A street with large translucent Gaussians over many tiles, so that both splats and instances exceed the
-/// limits.
+/// A street with large translucent Gaussians over many tiles, so that both splats and instances
+/// exceed the limits.
 fn misty(n: usize, step: usize, seed: u64) -> Scene {
     let mut street = street(n, 1, seed);
     for i in (0..street.len()).step_by(step) {
@@ -20,8 +20,8 @@ fn misty(n: usize, step: usize, seed: u64) -> Scene {
     Scene::from_gaussians(&street)
 }
 
-/// A splat takes 32 B and an instance 4 B: many small Gaussians exceed the limit of splats, and few large
-/// ones that of instances.
+/// A splat takes 32 B and an instance 4 B: many small Gaussians exceed the limit of splats, and few
+/// large ones that of instances.
 #[test]
 fn the_image_does_not_depend_on_the_regions() {
     let view = |yaw: f64| {
@@ -104,7 +104,8 @@ fn a_row_of_tiles_that_exceeds_a_device_is_an_error() {
     assert!(image == render_one(&gpu(), &street, &profile, view));
 }
 
-/// A binding of lavapipe holds 4,194,304 splats of 32 B; one of a graphics card holds 16 times as many.
+/// A binding of lavapipe holds 4,194,304 splats of 32 B; one of a graphics card holds 16 times as
+/// many.
 #[test]
 fn more_splats_than_lavapipe_holds_at_once() {
     let width = 640;
@@ -126,7 +127,8 @@ fn more_splats_than_lavapipe_holds_at_once() {
     exceeds_lavapipe(&Scene::from_gaussians(&dust), view);
 }
 
-/// A binding of lavapipe holds 33,554,432 instances of 4 B; one of a graphics card holds four times as many.
+/// A binding of lavapipe holds 33,554,432 instances of 4 B; one of a graphics card holds four times
+/// as many.
 #[test]
 fn more_instances_than_lavapipe_holds_at_once() {
     let mut mist = street(60_000, 0, 37);
@@ -146,14 +148,15 @@ fn exceeds_lavapipe(scene: &Scene, view: View) {
     agree(&image, &truth).unwrap();
 }
 
-/// Lavapipe leaves a loop after 65,535 iterations. A frame whose splats it would not all blend must be
-/// refused, not drawn without them.
+/// Lavapipe leaves a loop after 65,535 iterations. A frame whose splats it would not all blend must
+/// be refused, not drawn without them.
 #[test]
 fn more_splats_in_a_tile_than_software_blends() {
     let view = view_along([16, 16], 4.0, DVec3::ZERO, DVec3::Z, DVec3::Y);
     let profile = RenderProfile { stop: 1e-300, ..RenderProfile::default() };
     for (count, is_refused) in [(83_000, false), (120_000, true)] {
-        // All of them in the third block of 4 x 4 px of the second row: it has every splat of every batch.
+        // All of them in the third block of 4 x 4 px of the second row: it has every splat of every
+        // batch.
         let mut dust = Gaussians::with_capacity(0, count);
         for i in 0..count {
             let depth_m = 5.0 + 1e-5 * i as f64;
@@ -184,8 +187,8 @@ fn more_splats_in_a_tile_than_software_blends() {
     }
 }
 
-/// The loops that list the tiles of huge splats have the same limit: if the image were not drawn in bands,
-/// some of its 10,625 tiles would keep the pixels of the previous frame.
+/// The loops that list the tiles of huge splats have the same limit: if the image were not drawn in
+/// bands, some of its 10,625 tiles would keep the pixels of the previous frame.
 #[test]
 fn huge_splats_on_a_large_image() {
     let mut haze = Gaussians::with_capacity(0, 300);

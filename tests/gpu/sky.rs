@@ -190,7 +190,8 @@ fn exposures_and_overlays() {
     }
 }
 
-/// A compiler may contract products and sums in one variant of the shader and not in another: graphics cards do.
+/// A compiler may contract products and sums in one variant of the shader and not in another:
+/// graphics cards do.
 #[test]
 fn colours_have_the_same_bytes_whatever_else_is_requested() {
     let street = Scene::from_gaussians(&street(3_000, 1, 4));
@@ -217,7 +218,8 @@ fn colours_have_the_same_bytes_whatever_else_is_requested() {
     assert!(draw(false) == draw(true));
 }
 
-/// A shader that is not compiled cannot fail. Here the variant of `rasterize` with a sky does not parse.
+/// A shader that is not compiled cannot fail. Here the variant of `rasterize` with a sky does not
+/// parse.
 #[test]
 fn without_a_sky_nothing_of_it_is_compiled() {
     let broken = || {
@@ -235,7 +237,8 @@ fn without_a_sky_nothing_of_it_is_compiled() {
 /// A comparison that cannot fail proves nothing.
 #[test]
 fn mutations_are_detected() {
-    // One shader with all mutations of a variant, which is compiled once. A frame chooses one by its profile's `far`.
+    // One shader with all mutations of a variant, which is compiled once. A frame chooses one by
+    // its profile's `far`.
     let far = |number: usize| 50_000.0 + number as f32;
     let detects = |variant, profile: &RenderProfile, views: &[View], mutations: &[(&str, &str)]| {
         let mut shaders = Shaders::default();

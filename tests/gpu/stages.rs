@@ -1,6 +1,6 @@
-//! Each stage by itself, on the outputs of the cpu backend's previous stage: gpu against cpu and against f64.
-//! Mutation tests check that each comparison can fail, and that it distinguishes the wrong stage from the
-//! right ones.
+//! Each stage by itself, on the outputs of the cpu backend's previous stage: gpu against cpu and
+//! against f64. Mutation tests check that each comparison can fail, and that it distinguishes the
+//! wrong stage from the right ones.
 
 use std::sync::{LazyLock, OnceLock};
 
@@ -25,7 +25,8 @@ use crate::mutations::{
 use crate::shared_gpu;
 use crate::streets::{demo_street, street, street_views};
 
-/// One frame, the outputs of the cpu backend's stages, and those of the definition on the same input.
+/// One frame, the outputs of the cpu backend's stages, and those of the definition on the same
+/// input.
 struct Truth {
     scene: Scene,
     profile: RenderProfile,
@@ -120,7 +121,8 @@ impl Truth {
         Frame { scene: &self.scene, profile: &self.profile, views: &self.views }
     }
 
-    /// The names of a gpu's wrong stages, with their differences from the twins on the cpu and in f64.
+    /// The names of a gpu's wrong stages, with their differences from the twins on the cpu and in
+    /// f64.
     fn wrong(&self, gpu: &Gpu) -> Vec<(&'static str, Differences)> {
         let [project, sort, bin] = &self.cpu;
         let compare = |done, last, differences: &dyn Fn(&StageOutputs) -> Differences| {
@@ -163,8 +165,8 @@ impl Truth {
         })
     }
 
-    /// How many of the cpu's splats the gpu's are not close to. Where the bound is reached, one backend may expand
-    /// a Gaussian and the other project six points of it.
+    /// How many of the cpu's splats the gpu's are not close to. Where the bound is reached, one
+    /// backend may expand a Gaussian and the other project six points of it.
     fn far_from_cpu(&self, found: &StageOutputs) -> usize {
         let splats = definition::splats(found);
         let mut rest = splats.as_slice();
@@ -184,7 +186,8 @@ impl Truth {
         far + rest.len()
     }
 
-    /// Compares two lists in order. Expected splats within 0.01 px of an image's edge may be missing.
+    /// Compares two lists in order. Expected splats within 0.01 px of an image's edge may be
+    /// missing.
     fn same_splats(&self, found: &[Splat], truths: &[Splat]) -> Result<(), String> {
         let mut next = found.iter().enumerate().peekable();
         let mut exact = 0;
@@ -225,8 +228,8 @@ impl Truth {
         })
     }
 
-    /// The lists must equal the cpu's except for a few roundings. They must contain all splats that f64
-    /// finds, and at most 1 % more.
+    /// The lists must equal the cpu's except for a few roundings. They must contain all splats that
+    /// f64 finds, and at most 1 % more.
     fn compare_bin(&self, found: &StageOutputs) -> Differences {
         let found = found.tiles.as_ref().unwrap();
         let cpu = self.cpu[2].tiles.as_ref().unwrap();
@@ -312,14 +315,15 @@ impl Backend for ResumedGpu<'_> {
     }
 }
 
-/// Largest error of a camera-space x or y, in metres, divided by the depth. It is a sum of f32 with three
-/// products, each of which loses half a step at 64 m, the largest coordinate in a chunk: 3 x 1.9e-6 m.
+/// Largest error of a camera-space x or y, in metres, divided by the depth. It is a sum of f32 with
+/// three products, each of which loses half a step at 64 m, the largest coordinate in a chunk: 3 x
+/// 1.9e-6 m.
 fn slope_bound(truth: &Splat) -> f64 {
     6e-6 / truth.depth_m
 }
 
-/// Largest error of a depth: one step of f32. With a rolling shutter the camera moves 0.9 m here, and the row
-/// that sees a point is known to a millionth of that.
+/// Largest error of a depth: one step of f32. With a rolling shutter the camera moves 0.9 m here,
+/// and the row that sees a point is known to a millionth of that.
 fn depth_bound_m(truth: &Splat, view: &View) -> f64 {
     1.2e-7 * truth.depth_m + if view.rolling_shutter.is_some() { 1e-6 } else { 0.0 }
 }
@@ -371,8 +375,8 @@ fn each_stage_does_what_its_twins_do() {
     assert_eq!(truth.wrong(&gpu()), []);
 }
 
-/// A fault of a lens must be detected in stage project; no other stage uses that shader. Most faults show in few
-/// Gaussians: the others need the whole street, which takes longer.
+/// A fault of a lens must be detected in stage project; no other stage uses that shader. Most
+/// faults show in few Gaussians: the others need the whole street, which takes longer.
 #[test]
 fn a_mutation_of_a_lens_fails_its_projection() {
     let street = LensTruths::new(8_000);
@@ -414,15 +418,16 @@ fn a_mutation_fails_its_own_stage_alone_and_the_bisection_names_it() {
         let both = wrong.iter().all(|(_, twins)| twins.iter().all(Option::is_some));
         assert!(both, "{mutation:?}: only one twin detects it: {wrong:?}");
         let bisection = bisect(&cpu, &broken, &truth.frame()).unwrap();
-        // If several stages are wrong, the image stays wrong until the last of them runs on the cpu.
-        // The bisection does not compare depth.
+        // If several stages are wrong, the image stays wrong until the last of them runs on the
+        // cpu. The bisection does not compare depth.
         let is_depth = original.starts_with("sums.depth");
         let last = stages.last().copied().filter(|_| !is_depth);
         assert_eq!(bisection.wrong(), last, "{mutation:?}: {bisection:?}");
     }
 }
 
-/// Wrong rounding changes the image of this street to 115 dB only, which no comparison of images detects.
+/// Wrong rounding changes the image of this street to 115 dB only, which no comparison of images
+/// detects.
 #[test]
 fn depths_that_are_not_rounded_once_are_detected() {
     let truth = &*TRUTH;

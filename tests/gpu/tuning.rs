@@ -1,4 +1,5 @@
-//! Kernels of which a device chooses one by a threshold: all of them draw the same bytes. Here each runs on every device.
+//! Kernels of which a device chooses one by a threshold: all of them draw the same bytes. Here each
+//! runs on every device.
 
 use std::sync::Arc;
 

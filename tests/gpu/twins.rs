@@ -1,5 +1,5 @@
-//! Constants and layouts are declared both in Rust and in WGSL. These tests parse the WGSL with naga and
-//! check that both sides declare the same ones, with equal values, offsets, and sizes.
+//! Constants and layouts are declared both in Rust and in WGSL. These tests parse the WGSL with
+//! naga and check that both sides declare the same ones, with equal values, offsets, and sizes.
 
 use std::collections::BTreeMap;
 

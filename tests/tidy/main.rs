@@ -1,5 +1,6 @@
-//! Rules for the source that Cargo cannot check: which crate may be used where within a package, no import cycles,
-//! no dialect, plain prose, links that lead to files and headings, licences; the book and the version.
+//! Rules for the source that Cargo cannot check: which crate may be used where within a package, no
+//! import cycles, no dialect, plain prose, links that lead to files and headings, licences; the
+//! book and the version.
 
 mod book;
 mod cycles;

@@ -6,8 +6,8 @@ use std::path::Path;
 
 use crate::root;
 
-/// Words that mean persons. In this project something else is meant nearly always; then "what", "which", "that" or the
-/// name of the thing is right.
+/// Words that mean persons. In this project something else is meant nearly always; then "what",
+/// "which", "that" or the name of the thing is right.
 const PERSONS: &[&str] = &["who", "whom", "whoever", "nobody", "somebody", "everybody", "anybody"];
 
 /// Folders and files that people read.

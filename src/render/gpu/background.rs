@@ -1,8 +1,9 @@
-//! Backgrounds (skies and colours) and camera appearances (exposures and overlays) on the device. The
-//! buffers are created with the first frame that has either, and the shaders compiled then.
+//! Backgrounds (skies and colours) and camera appearances (exposures and overlays) on the device.
+//! The buffers are created with the first frame that has either, and the shaders compiled then.
 //!
-//! Twin of `render/cpu/background.rs` and `render/cpu/appearance.rs`; WGSL: `shaders/background.wgsl` and
-//! the files that it imports, linked into the variants of `rasterize`.
+//! Twin of `render/cpu/background.rs` and `render/cpu/appearance.rs`; WGSL:
+//! `shaders/background.wgsl` and the files that it imports, linked into the variants of
+//! `rasterize`.
 
 use std::sync::Arc;
 
@@ -64,8 +65,8 @@ impl Background {
         }
     }
 
-    /// Uploads the sky and the appearances of a frame. `sky_from_world` rotates directions to the sky's
-    /// axes. A sky or overlays that the device already has are not uploaded again.
+    /// Uploads the sky and the appearances of a frame. `sky_from_world` rotates directions to the
+    /// sky's axes. A sky or overlays that the device already has are not uploaded again.
     ///
     /// # Errors
     /// [`RenderError::TooMany`] if the sky or the overlays are larger than a binding of the device.
@@ -79,9 +80,10 @@ impl Background {
     ) -> Result<(), RenderError> {
         let mut parameters = layout::Background::zeroed();
         for (slot, view) in parameters.sky_from_pixel.iter_mut().zip(frame.views) {
-            let rows = match view.is_static_pinhole() {
-                true => view.sky_from_pixel(sky_from_world),
-                false => view.sky_from_camera(sky_from_world),
+            let rows = if view.is_static_pinhole() {
+                view.sky_from_pixel(sky_from_world)
+            } else {
+                view.sky_from_camera(sky_from_world)
             };
             *slot = rows.map(|[a, b, c]| [a, b, c, 0.0]);
         }
@@ -180,12 +182,12 @@ impl Background {
         ]
     }
 
-    /// Most loop iterations that the background takes of a thread. The end of a loop counts as one, and so does a loop that
-    /// no thread of a vector enters.
+    /// Most loop iterations that the background takes of a thread. The end of a loop counts as one,
+    /// and so does a loop that no thread of a vector enters.
     ///
-    /// Inverting a lens takes up to 504 for each of four pixels, and an overlay 5. A network is evaluated by all threads
-    /// for each of the tile's 64 groups of four pixels; a layer takes an iteration for each four of its inputs, and
-    /// one for each 64 of its outputs.
+    /// Inverting a lens takes up to 504 for each of four pixels, and an overlay 5. A network is
+    /// evaluated by all threads for each of the tile's 64 groups of four pixels; a layer takes an
+    /// iteration for each four of its inputs, and one for each 64 of its outputs.
     pub(super) fn iterations(&self) -> u64 {
         let rays = if self.has_lenses { 4 * 504 + 6 } else { 0 };
         let overlay = 5;

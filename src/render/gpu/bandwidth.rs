@@ -1,5 +1,5 @@
-//! Bandwidth model: the fewest bytes that each stage must move, computed from the counts of a frame. It is
-//! the memory side of the stage's roofline.
+//! Bandwidth model: the fewest bytes that each stage must move, computed from the counts of a
+//! frame. It is the memory side of the stage's roofline.
 
 use super::layout::{
     DIGITS, EXPAND_BATCH, Frame as GpuFrame, GEOMETRY_WORDS, MACRO_COLUMNS, MACRO_ROWS, SOA_BLOCK,
@@ -18,11 +18,11 @@ use wildcity_scene::sh;
 pub struct FrameCounts {
     /// SH degree of the scene.
     pub sh_degree: u8,
-    /// Number of views.
     pub views: u32,
     /// Pixels of all views.
     pub pixels: u64,
-    /// Bytes per pixel of the values that were requested: 3 for colours of 8 bits, 4 for each other value.
+    /// Bytes per pixel of the values that were requested: 3 for colours of 8 bits, 4 for each other
+    /// value.
     pub pixel_bytes: u64,
     /// Tiles of all views.
     pub tiles: u64,
@@ -64,8 +64,8 @@ impl FrameCounts {
         self.evaluations += tile_counters.evaluations();
     }
 
-    /// Name and bytes of each stage: what it reads and writes if each kernel reads and writes every array
-    /// exactly once, and nothing stays in a cache from one kernel to the next.
+    /// Name and bytes of each stage: what it reads and writes if each kernel reads and writes every
+    /// array exactly once, and nothing stays in a cache from one kernel to the next.
     ///
     /// | stage | per | bytes |
     /// |---|---|---|
@@ -88,8 +88,8 @@ impl FrameCounts {
         let geometry = 4 * u64::from(GEOMETRY_WORDS);
         let color = 4 * (3 * sh::coefficients(self.sh_degree) as u64).div_ceil(2);
         let header = 4 * u64::from(SOA_BLOCK);
-        // A counter is written by the histogram, read by the prefix sum's first pass, read and written by
-        // its last pass, and read by the scatter.
+        // A counter is written by the histogram, read by the prefix sum's first pass, read and
+        // written by its last pass, and read by the scatter.
         let counters = |keys: u64| keys.div_ceil(SORT_BLOCK.into()) * u64::from(DIGITS) * 4 * 5;
         let sorted = |keys: u64, bits: u32, values: u64| {
             let pass = keys * (4 + 2 * 4 * (1 + values)) + counters(keys);
@@ -117,9 +117,10 @@ impl FrameCounts {
         ]
     }
 
-    /// Estimated number of multiply-adds, or instructions of the same cost, in stage rasterize: 18 for four
-    /// evaluations, of which six are shared by the four pixels. It is not a bound: pixels that have stopped are counted
-    /// although they take none, and the ten additional ones of each blended pixel are not counted.
+    /// Estimated number of multiply-adds, or instructions of the same cost, in stage rasterize: 18
+    /// for four evaluations, of which six are shared by the four pixels. It is not a bound: pixels
+    /// that have stopped are counted although they take none, and the ten additional ones of each
+    /// blended pixel are not counted.
     pub fn rasterize_operations(&self) -> u64 {
         self.evaluations * 9 / 2
     }

@@ -1,15 +1,16 @@
 //! Stage bin: lists the splats of every tile in order of depth.
 //!
-//! Binning has two levels. Each splat is listed with the macro tiles of 8 x 4 tiles that it touches, and
-//! with one bit for each touched tile, by the same exact test per row of tiles as on the cpu. Such a
-//! (splat, macro tile) pair is a touch. The radix sort orders the touches by macro tile: there are a
-//! quarter as many of them as (splat, tile) pairs, which are called instances. Then one workgroup per
-//! 1,024 touches of a macro tile distributes their splats to its tiles, by transposing a bit matrix.
+//! Binning has two levels. Each splat is listed with the macro tiles of 8 x 4 tiles that it
+//! touches, and with one bit for each touched tile, by the same exact test per row of tiles as on
+//! the cpu. Such a (splat, macro tile) pair is a touch. The radix sort orders the touches by macro
+//! tile: there are a quarter as many of them as (splat, tile) pairs, which are called instances.
+//! Then one workgroup per 1,024 touches of a macro tile distributes their splats to its tiles, by
+//! transposing a bit matrix.
 //!
-//! Binning and its sort take half the time and half the bytes of sorting all instances, and produce the
-//! same lists. The last part is necessary: when each tile of `rasterize` instead picked its splats from
-//! its macro tile's list, the step took longer than with one level, since 32 tiles read every mask.
-//! `BENCHMARKS.md` has the numbers.
+//! Binning and its sort take half the time and half the bytes of sorting all instances, and produce
+//! the same lists. The last part is necessary: when each tile of `rasterize` instead picked its
+//! splats from its macro tile's list, the step took longer than with one level, since 32 tiles read
+//! every mask. `BENCHMARKS.md` has the numbers.
 //!
 //! Twin of `render/cpu/bin`; WGSL: `bin`, `sort`, `ranges`, and `expand` in `shaders`.
 
@@ -173,7 +174,8 @@ impl Bin {
         }
     }
 
-    /// Lists the splats of all tiles; `sorted` is the index of the buffers of the touches that are in order.
+    /// Lists the splats of all tiles; `sorted` is the index of the buffers of the touches that are
+    /// in order.
     pub(super) fn list_instances(
         &self,
         device: &Device,

@@ -1,12 +1,12 @@
-//! Choosing and opening a device, its limits, and its errors. Nothing here panics: a machine without a
-//! driver, a name that no adapter has, and a device that is lost are ordinary errors.
+//! Choosing and opening a device, its limits, and its errors. Nothing here panics: a machine
+//! without a driver, a name that no adapter has, and a device that is lost are ordinary errors.
 //!
 //! # Software devices
 //!
 //! The backend is tested on Mesa's software device, lavapipe. Such devices leave a shader's loops,
 //! without an error, after 65,535 iterations of all of its loops together. The limits
-//! [`Device::max_tile_batches`] and [`Device::max_view_tiles`] keep each shader below that number: frames are
-//! split into more regions, or refused. Other devices have no such limit.
+//! [`Device::max_tile_batches`] and [`Device::max_view_tiles`] keep each shader below that number:
+//! frames are split into more regions, or refused. Other devices have no such limit.
 
 use std::ops::RangeInclusive;
 use std::path::Path;
@@ -46,21 +46,13 @@ pub enum GpuError {
     },
     /// The driver refuses to open the device.
     #[error("cannot open {name:?}: {reason}")]
-    Device {
-        /// The adapter's name.
-        name: String,
-        /// The driver's message.
-        reason: String,
-    },
+    Device { name: String, reason: String },
     /// The device opened, but a shader could not be compiled for it.
     #[error(transparent)]
     Stages(#[from] RenderError),
     /// The threads that copy images could not be started.
     #[error("cannot start the render threads: {reason}")]
-    Threads {
-        /// The system's message.
-        reason: String,
-    },
+    Threads { reason: String },
 }
 
 /// Which adapter to use.
@@ -71,8 +63,8 @@ pub enum AdapterChoice {
     Best,
     /// The fastest kind that is not software.
     Hardware,
-    /// The device with this number in [`devices`], or else the first one whose name contains this text,
-    /// in upper or lower case.
+    /// The device with this number in [`devices`], or else the first one whose name contains this
+    /// text, in upper or lower case.
     Named(String),
 }
 
@@ -184,8 +176,9 @@ impl AdapterChoice {
     }
 }
 
-/// Whether the machine may have a hardware device. Linux has device nodes for them, under separate names
-/// for NVIDIA's driver and for WSL; without any of them, the Vulkan library need not be loaded.
+/// Whether the machine may have a hardware device. Linux has device nodes for them, under separate
+/// names for NVIDIA's driver and for WSL; without any of them, the Vulkan library need not be
+/// loaded.
 fn may_have_hardware() -> bool {
     let nodes = ["/dev/dri", "/dev/nvidiactl", "/dev/dxg"];
     cfg!(not(target_os = "linux")) || nodes.iter().any(|node| Path::new(node).exists())
@@ -202,7 +195,8 @@ pub(super) struct Device {
     tuning: Tuning,
     /// Most bytes of a binding, even if the adapter allows more.
     binding_limit: u64,
-    /// The first error. It stays: several frames may be in flight, and the device is given up after an error.
+    /// The first error. It stays: several frames may be in flight, and the device is given up after
+    /// an error.
     fault: Arc<Mutex<Option<String>>>,
     /// Counts of created objects and dispatches, so that the cost of each feature can be reported.
     totals: AtomicTotals,
@@ -228,7 +222,8 @@ pub struct DeviceTotals {
 }
 
 impl Device {
-    /// Opens a device with its adapter's limits, except that bindings hold at most `binding_limit` bytes.
+    /// Opens a device with its adapter's limits, except that bindings hold at most `binding_limit`
+    /// bytes.
     ///
     /// # Errors
     /// There is no such device, or the driver does not open it.
@@ -299,8 +294,9 @@ impl Device {
         }
     }
 
-    /// How long a frame may take on this device before it counts as lost. Software Vulkan compiles a shader on one
-    /// thread when it runs for the first time, which takes long while other programs run.
+    /// How long a frame may take on this device before it counts as lost. Software Vulkan compiles
+    /// a shader on one thread when it runs for the first time, which takes long while other
+    /// programs run.
     pub(super) fn frame_timeout(&self) -> Duration {
         match self.info.device_type {
             DeviceType::Cpu => Duration::from_secs(300),
@@ -324,23 +320,24 @@ impl Device {
         self.device.generate_allocator_report().map(|report| report.total_allocated_bytes)
     }
 
-    /// Most batches of splats that a tile can blend, if the background takes `background_iterations` loop iterations of a
-    /// thread of `rasterize`.
+    /// Most batches of splats that a tile can blend, if the background takes
+    /// `background_iterations` loop iterations of a thread of `rasterize`.
     ///
-    /// The end of a loop counts as an iteration, and so does a loop that no thread of a vector enters. A batch takes at most
-    /// 95: 1, 3 to load two splats, 17 to transpose a word, 5 for four words, 17 for the 32 splats of each word (two at a
-    /// time), and 1 at their end; 96 leaves one to spare. Besides, a thread takes 17 to find its view among 16, 5 at the
-    /// end of the batches, and 4 x 33 for the owners of four pixels among 2^32: 154 of 160.
+    /// The end of a loop counts as an iteration, and so does a loop that no thread of a vector
+    /// enters. A batch takes at most 95: 1, 3 to load two splats, 17 to transpose a word, 5 for
+    /// four words, 17 for the 32 splats of each word (two at a time), and 1 at their end; 96 leaves
+    /// one to spare. Besides, a thread takes 17 to find its view among 16, 5 at the end of the
+    /// batches, and 4 x 33 for the owners of four pixels among 2^32: 154 of 160.
     pub(super) fn max_tile_batches(&self, background_iterations: u64) -> u32 {
         let batches = |most: u64| most.saturating_sub(160 + background_iterations) / 96;
         self.loop_iterations().map_or(u32::MAX, |most| batches(most) as u32)
     }
 
-    /// Most tiles of a view that can be binned at once, even if all 256 splats of a workgroup of `emit`
-    /// cover all of them.
+    /// Most tiles of a view that can be binned at once, even if all 256 splats of a workgroup of
+    /// `emit` cover all of them.
     ///
-    /// Each splat takes 20 iterations, and 13 for every 256 macro tiles. Macro tiles at the edges of an
-    /// image have fewer tiles; on average at least half of a macro tile's tiles are assumed.
+    /// Each splat takes 20 iterations, and 13 for every 256 macro tiles. Macro tiles at the edges
+    /// of an image have fewer tiles; on average at least half of a macro tile's tiles are assumed.
     pub(super) fn max_view_tiles(&self) -> u64 {
         let splats = u64::from(WORKGROUP);
         let macro_tiles = |most: u64| (most / splats - 20) / 13 * 256;
@@ -348,8 +345,9 @@ impl Device {
         self.loop_iterations().map_or(u64::MAX, |most| macro_tiles(most) * tiles)
     }
 
-    /// Loop iterations of a shader, in all of its loops together, after which Mesa's software devices
-    /// leave every loop without an error (`LP_MAX_TGSI_LOOP_ITERATIONS`). `None` for other devices.
+    /// Loop iterations of a shader, in all of its loops together, after which Mesa's software
+    /// devices leave every loop without an error (`LP_MAX_TGSI_LOOP_ITERATIONS`). `None` for other
+    /// devices.
     fn loop_iterations(&self) -> Option<u64> {
         (self.info.device_type == DeviceType::Cpu).then_some(65_535)
     }
@@ -389,8 +387,8 @@ impl Device {
         })
     }
 
-    /// Copies bytes to a buffer at once, and frees the staging memory of finished copies, so that it does
-    /// not accumulate. [`Device::check`] reports errors.
+    /// Copies bytes to a buffer at once, and frees the staging memory of finished copies, so that
+    /// it does not accumulate. [`Device::check`] reports errors.
     pub(super) fn write_now(&self, buffer: &Buffer, offset: u64, bytes: &[u8]) {
         self.queue.write_buffer(buffer, offset, bytes);
         self.queue.submit([]);

@@ -1,5 +1,5 @@
-//! Devices that have failed. A driver that hangs would block the thread that drops its device, so each is dropped in
-//! its own thread.
+//! Devices that have failed. A driver that hangs would block the thread that drops its device, so
+//! each is dropped in its own thread.
 
 use std::thread::{Builder, JoinHandle};
 use std::time::{Duration, Instant};
@@ -24,7 +24,8 @@ impl Discarded {
     }
 }
 
-/// Waits, but not for a driver that hangs: a process that ends while a device is dropped may crash in the driver.
+/// Waits, but not for a driver that hangs: a process that ends while a device is dropped may crash
+/// in the driver.
 impl Drop for Discarded {
     fn drop(&mut self) {
         let deadline = Instant::now() + limits::DISCARD;

@@ -22,8 +22,8 @@ impl GrowableBuffer {
         Self { label, usage, buffer: device.buffer(label, 0, usage) }
     }
 
-    /// Grows the buffer to at least `bytes` if it is smaller. It then gets a quarter more, so that a
-    /// growing scene does not reallocate in every frame.
+    /// Grows the buffer to at least `bytes` if it is smaller. It then gets a quarter more, so that
+    /// a growing scene does not reallocate in every frame.
     pub(super) fn reserve(&mut self, device: &Device, bytes: u64) {
         if self.buffer.size() < bytes {
             let with_margin = (bytes + bytes / 4).min(device.binding_bytes()).max(bytes);

@@ -18,8 +18,8 @@ pub(super) struct Kernel {
     label: &'static str,
     pipeline: ComputePipeline,
     layout: BindGroupLayout,
-    /// The bind groups of recent runs, the latest one last. Most frames bind what the frame before did: making a bind
-    /// group takes the host as long as recording a dispatch.
+    /// The bind groups of recent runs, the latest one last. Most frames bind what the frame before
+    /// did: making a bind group takes the host as long as recording a dispatch.
     bind_groups: Mutex<Vec<(Vec<BoundBuffer>, BindGroup)>>,
 }
 
@@ -134,8 +134,8 @@ impl Kernel {
 }
 
 impl Kernel {
-    /// The bind group of these resources, that of an earlier run if there is one. Buffers that were destroyed since are
-    /// never bound again, so that their bind groups are forgotten in time.
+    /// The bind group of these resources, that of an earlier run if there is one. Buffers that were
+    /// destroyed since are never bound again, so that their bind groups are forgotten in time.
     fn bind_group(&self, device: &Device, resources: &[(u32, BindingResource<'_>)]) -> BindGroup {
         let mut kept = self.bind_groups.lock();
         let is_same = |bound: &[BoundBuffer]| {
@@ -171,8 +171,8 @@ impl Kernel {
     }
 }
 
-/// Folds workgroups into rows of at most [`MAX_GROUPS`], of about equal length, as `job` in `plan.wgsl`
-/// does. The last row may have surplus workgroups, which do nothing.
+/// Folds workgroups into rows of at most [`MAX_GROUPS`], of about equal length, as `job` in
+/// `plan.wgsl` does. The last row may have surplus workgroups, which do nothing.
 pub(super) fn fold_groups(count: u32) -> [u32; 3] {
     let rows = count.div_ceil(MAX_GROUPS).max(1);
     [count.div_ceil(rows), rows, 1]
@@ -223,7 +223,8 @@ impl<K, const N: usize> LazyShader<K, N> {
         Self { shader, module: None, variants: [const { None }; N] }
     }
 
-    /// Compiles the module now, so that [`Device::check`] reports its errors before the first frame.
+    /// Compiles the module now, so that [`Device::check`] reports its errors before the first
+    /// frame.
     pub(super) fn with_module(mut self, device: &Device) -> Self {
         self.module = Some(module(device, self.shader));
         self

@@ -13,13 +13,13 @@ use crate::layout::{
 use crate::{MAX_VIEWS, View, constants};
 use wildcity_scene::RenderProfile;
 
-/// Threads of a workgroup. wgpu's default limits guarantee 256 on every device; Vulkan itself guarantees
-/// only 128.
+/// Threads of a workgroup. wgpu's default limits guarantee 256 on every device; Vulkan itself
+/// guarantees only 128.
 pub const WORKGROUP: u32 = 256;
 /// Elements per workgroup of the prefix sum.
 pub const SCAN_BLOCK: u32 = 2048;
-/// Keys per workgroup of the radix sort. The 256 counters of a workgroup take 1 KiB of memory, next to
-/// 32 KiB of keys and values, or 48 KiB with masks.
+/// Keys per workgroup of the radix sort. The 256 counters of a workgroup take 1 KiB of memory, next
+/// to 32 KiB of keys and values, or 48 KiB with masks.
 pub const SORT_BLOCK: u32 = 4096;
 /// Number of values of a digit of the radix sort.
 pub const DIGITS: u32 = 256;
@@ -30,20 +30,21 @@ pub const MACRO_COLUMNS: u32 = 8;
 /// Rows of tiles of a macro tile: 8 x 4 tiles are one bit each of a 32-bit word.
 pub const MACRO_ROWS: u32 = 4;
 /// A splat that touches more macro tiles than this is emitted by a whole workgroup. A single thread
-/// writes at most 16 macro tiles of 4 rows of tiles, 64 row masks, while the 255 other threads wait;
-/// beyond that, all 256 threads share the work.
+/// writes at most 16 macro tiles of 4 rows of tiles, 64 row masks, while the 255 other threads
+/// wait; beyond that, all 256 threads share the work.
 pub const LARGE_SPLAT_MACRO_TILES: u32 = 16;
 /// Touches of a macro tile that one workgroup distributes to its tiles: 8 KiB of workgroup memory.
 pub const EXPAND_BATCH: u32 = 1024;
 /// Splats that a tile loads into workgroup memory and blends at a time.
 pub const RASTER_BATCH: u32 = 128;
-/// Most tiles with long lists that have a kernel of their own: 26 MiB of sums. 5 million visible pairs of six full
-/// cameras have 600.
+/// Most tiles with long lists that have a kernel of their own: 26 MiB of sums. 5 million visible
+/// pairs of six full cameras have 600.
 pub const LONG_TILES: u32 = 4096;
 /// Words of such a tile's sums, as in `shaders/shared/tile_blocks.wgsl`.
 pub const LONG_TILE_WORDS: u32 = 6 * constants::TILE_PX * constants::TILE_PX + 64;
-/// Gaussians of a structure-of-arrays block of the mirror, and 32-bit words of one of its lines: 128 B,
-/// which a warp reads in one transaction. A cluster's header is one line, of which three words are used.
+/// Gaussians of a structure-of-arrays block of the mirror, and 32-bit words of one of its lines:
+/// 128 B, which a warp reads in one transaction. A cluster's header is one line, of which three
+/// words are used.
 pub const SOA_BLOCK: u32 = 32;
 /// Bits of [`ChunkView::view`] that are the view's index, in kernels for actors.
 pub const VIEW_BITS: u32 = 4;
@@ -94,7 +95,6 @@ pub struct Frame {
     pub far_m: f32,
     /// 1 if opacity is compensated for the blur, else 0.
     pub antialiased: u32,
-    /// Largest alpha.
     pub alpha_cap: f32,
     /// Base-2 logarithm of the smallest alpha.
     pub log2_alpha_cut: f32,
@@ -104,9 +104,7 @@ pub struct Frame {
     pub batch_limit: u32,
     /// Tiles with more splats than this have a kernel of their own.
     pub long_tile_splats: u32,
-    /// Most such tiles.
     pub long_tiles: u32,
-    /// Zero.
     pub pad: u32,
     /// The views, in order.
     pub view: [FrameView; MAX_VIEWS],
@@ -152,7 +150,7 @@ impl Frame {
     pub(super) fn restrict(&mut self, rows: &TileRows, region: &Region) -> Range<u32> {
         let views = rows.views(region);
         for (index, view) in self.view[..self.views as usize].iter_mut().enumerate() {
-            let Range { start, end } = rows.of_view(index, region);
+            let Range { start, end } = rows.for_view(index, region);
             view.rows = [start, end];
         }
         let first = &self.view[views.start];
@@ -184,8 +182,8 @@ pub struct Background {
     /// Network: 1 if the second layer also reads these values (a skip connection), else 0.
     pub skip: u32,
     /// For each view, the rows of a matrix to a direction (of any length) in the sky's axes. It
-    /// transforms `(x, y, 1)` in pixels or, for a lens or a rolling shutter, a direction in the camera's
-    /// frame at the end of the exposure.
+    /// transforms `(x, y, 1)` in pixels or, for a lens or a rolling shutter, a direction in the
+    /// camera's frame at the end of the exposure.
     pub sky_from_pixel: [[[f32; 4]; 3]; MAX_VIEWS],
 }
 
@@ -209,15 +207,15 @@ pub struct CameraAppearance {
 pub struct ChunkView {
     /// Rows of the rigid transform from the chunk to the camera, translation last, in metres.
     pub camera_from_chunk: [[f32; 4]; 3],
-    /// Terms of the depth, rounded to f32: the camera's forward axis in the chunk's frame and the chunk's
-    /// origin along it. Where depth is distance: the camera's centre in the chunk's frame.
+    /// Terms of the depth, rounded to f32: the camera's forward axis in the chunk's frame and the
+    /// chunk's origin along it. Where depth is distance: the camera's centre in the chunk's frame.
     pub depth_high: [f32; 4],
     /// The rounding errors of `depth_high`.
     pub depth_low: [f32; 4],
     /// The camera's centre relative to the chunk's origin, in world axes, in metres.
     pub camera_m: [f32; 3],
-    /// Index of the view. In kernels for actors, the low [`VIEW_BITS`] bits are that index, and the others the index
-    /// of the [`Lens`].
+    /// Index of the view. In kernels for actors, the low [`VIEW_BITS`] bits are that index, and the
+    /// others the index of the [`Lens`].
     pub view: u32,
     /// Focal lengths, in pixels.
     pub focal_px: [f32; 2],
@@ -225,7 +223,6 @@ pub struct ChunkView {
     pub center_px: [f32; 2],
     /// Smallest slope at which the projection is linearised.
     pub slope_min: [f32; 2],
-    /// Largest slope.
     pub slope_max: [f32; 2],
 }
 
@@ -264,17 +261,14 @@ pub struct ChunkLight {
     pub tint: [f32; 3],
     /// Index of the first contact shadow that falls on the chunk.
     pub first_shadow: u32,
-    /// Number of shadows.
     pub shadows: u32,
-    /// Zero.
     pub pad0: u32,
-    /// Zero.
     pub pad1: u32,
-    /// Zero.
     pub pad2: u32,
 }
 
-/// A contact shadow relative to a chunk of the twin (64 bytes): the content of [`crate::layout::ChunkShadow`].
+/// A contact shadow relative to a chunk of the twin (64 bytes): the content of
+/// [`crate::layout::ChunkShadow`].
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 pub struct ChunkShadow {
@@ -282,7 +276,6 @@ pub struct ChunkShadow {
     pub actor_from_chunk: [[f32; 4]; 3],
     /// Half the length and half the width of the actor's box, in metres.
     pub half_m: [f32; 2],
-    /// Zero.
     pub pad: [f32; 2],
 }
 
@@ -298,22 +291,22 @@ fn low(exact: f64) -> f32 {
     (exact - f64::from(exact as f32)) as f32
 }
 
-/// Lens, windshield, and rolling shutter of a view that is not a static pinhole (368 bytes). Read by
-/// `shaders/lens.wgsl`.
+/// Lens, windshield, and rolling shutter of a view that is not a static pinhole (368 bytes). Read
+/// by `shaders/lens.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Lens {
     /// Image of the optical axis, in pixels.
     pub center_px: [f32; 2],
-    /// Lens model. 0: pinhole; 1: OpenCV; 2: a polynomial from the angle off the axis to the radius on
-    /// the image; 3: a polynomial from the radius to the angle.
+    /// Lens model. 0: pinhole; 1: OpenCV; 2: a polynomial from the angle off the axis to the radius
+    /// on the image; 3: a polynomial from the radius to the angle.
     pub model: u32,
     /// Windshield. 0: none; 1: polynomials from outside directions to inside ones; 2: the inverse.
     pub windshield: u32,
     /// Columns of the matrix from the lens' plane to pixels.
     pub linear: [f32; 4],
-    /// Where the linear extrapolation of the model starts: a slope, an angle in radians, or a radius in
-    /// pixels.
+    /// Where the linear extrapolation of the model starts: a slope, an angle in radians, or a
+    /// radius in pixels.
     pub end: f32,
     /// Value of the model's polynomial at `end`.
     pub end_value: f32,
@@ -327,33 +320,31 @@ pub struct Lens {
     pub by_distance: u32,
     /// 0 for a static pinhole, else 1.
     pub non_pinhole: u32,
-    /// Zero.
     pub pad0: u32,
-    /// OpenCV: k1 to k6, p1 and p2, s1 to s4. Otherwise the polynomial's coefficients from the first power
-    /// on, for a variable that is a fraction of `end`.
+    /// OpenCV: k1 to k6, p1 and p2, s1 to s4. Otherwise the polynomial's coefficients from the
+    /// first power on, for a variable that is a fraction of `end`.
     pub coefficients: [[f32; 4]; 3],
     /// Polynomials of the change of the angles by the windshield: 21 coefficients, horizontal and
     /// vertical.
     pub windshield_shift: [[f32; 2]; 22],
-    /// The fraction of the exposure that remains when pixel (x, y) is exposed: the dot product of the first
-    /// three values with (x, y, 1).
+    /// The fraction of the exposure that remains when pixel (x, y) is exposed: the dot product of
+    /// the first three values with (x, y, 1).
     pub remaining_exposure: [f32; 4],
     /// From the camera's first centre to its last, in the camera's last frame, in metres.
     pub moved_m: [f32; 3],
-    /// Zero.
     pub pad1: u32,
     /// This translation in world axes.
     pub moved_world_m: [f32; 3],
-    /// Zero.
     pub pad2: u32,
     /// The camera's rotation during the exposure: unit axis, and angle in radians.
     pub axis_angle: [f32; 4],
-    /// The fields of [`ExpansionBound`](crate::expansion::ExpansionBound) in order, then zero; all zero for six points
-    /// of every Gaussian.
+    /// The fields of [`ExpansionBound`](crate::expansion::ExpansionBound) in order, then zero; all
+    /// zero for six points of every Gaussian.
     pub expansion: [f32; 4],
 }
 
-/// The owner of the splats from a cluster view on (8 bytes). The first record of a list holds its length as `instance`.
+/// The owner of the splats from a cluster view on (8 bytes). The first record of a list holds its
+/// length as `instance`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 pub struct Owner {
@@ -373,22 +364,21 @@ pub struct ClusterView {
     pub chunk_view: u32,
 }
 
-/// A range (8 bytes): cluster views of a page for `project`, tiles of a page for `rasterize`, or touches
-/// of a splat.
+/// A range (8 bytes): cluster views of a page for `project`, tiles of a page for `rasterize`, or
+/// touches of a splat.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Span {
     /// Index of the first element.
     pub first: u32,
-    /// Number of elements.
     pub count: u32,
 }
 
-/// Number of elements that a stage processes, and the workgroups of its indirect dispatch (16 bytes).
+/// Number of elements that a stage processes, and the workgroups of its indirect dispatch (16
+/// bytes).
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Job {
-    /// Elements.
     pub length: u32,
     /// Workgroups in x, y, z.
     pub groups: [u32; 3],
@@ -398,9 +388,7 @@ pub struct Job {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct JobSlot {
-    /// The job.
     pub job: Job,
-    /// Zero.
     pub pad: [[u32; 4]; 15],
 }
 
@@ -416,20 +404,22 @@ pub struct Counters {
     pub instances: u32,
 }
 
-/// Counters of stage rasterize that the host reads after a frame (8 bytes). They have a buffer of their own: the kernels
-/// that blend tiles would otherwise wait for each other.
+/// Counters of stage rasterize that the host reads after a frame (8 bytes). They have a buffer of
+/// their own: the kernels that blend tiles would otherwise wait for each other.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct TileCounters {
-    /// Pairs of a splat and a block of [`constants::BLOCK_PX`] that its box reaches, in all loaded batches. Blocks that have
-    /// stopped count too.
+    /// Pairs of a splat and a block of [`constants::BLOCK_PX`] that its box reaches, in all loaded
+    /// batches. Blocks that have stopped count too.
     pub block_pairs: u32,
-    /// Most batches of [`RASTER_BATCH`] splats that a tile loaded; [`Frame::batch_limit`] + 1 if a tile needed more.
+    /// Most batches of [`RASTER_BATCH`] splats that a tile loaded; [`Frame::batch_limit`] + 1 if a
+    /// tile needed more.
     pub most_batches: u32,
 }
 
 impl TileCounters {
-    /// Evaluations of a splat at a pixel: all pixels of the blocks that its box reaches. Pixels that have stopped count too.
+    /// Evaluations of a splat at a pixel: all pixels of the blocks that its box reaches. Pixels
+    /// that have stopped count too.
     pub(super) fn evaluations(&self) -> u64 {
         u64::from(self.block_pairs) * u64::from(constants::BLOCK_PX * constants::BLOCK_PX)
     }

@@ -1,14 +1,14 @@
-//! Parameters of lenses, windshields, and rolling shutters on the device, uploaded from the first frame
-//! on that has one of them. Frames with only static pinhole cameras have no such buffer or binding, and
-//! their shaders have no test for them.
+//! Parameters of lenses, windshields, and rolling shutters on the device, uploaded from the first
+//! frame on that has one of them. Frames with only static pinhole cameras have no such buffer or
+//! binding, and their shaders have no test for them.
 //!
-//! f32 suffices, since no large numbers cancel: polynomials take fractions of the lens' field, those of a
-//! windshield give only the change of the angles, and a rolling camera is described by its pose at the end
-//! of the exposure and the small motion back from there. WGSL's `atan2` and `sin` may be off by 2^-11, so
-//! `shaders/shared/angle.wgsl` has fits of its own.
+//! f32 suffices, since no large numbers cancel: polynomials take fractions of the lens' field,
+//! those of a windshield give only the change of the angles, and a rolling camera is described by
+//! its pose at the end of the exposure and the small motion back from there. WGSL's `atan2` and
+//! `sin` may be off by 2^-11, so `shaders/shared/angle.wgsl` has fits of its own.
 //!
-//! WGSL: `shaders/lens.wgsl`. The lens models are in the scene package (`geometry::camera`), the search for
-//! the row that sees a point in `render/view.rs`.
+//! WGSL: `shaders/lens.wgsl`. The lens models are in the scene package (`geometry::camera`), the
+//! search for the row that sees a point in `render/view.rs`.
 
 use bytemuck::Zeroable;
 use glam::{DMat2, DVec2};
@@ -35,22 +35,23 @@ pub(super) struct Lenses {
 }
 
 impl Lenses {
-    /// Uploads the lenses of a frame's views; nothing if all are static pinholes. The views of actors that move
-    /// relative to the camera while a shutter rolls follow, in the order of [`LensIndices`].
+    /// Uploads the lenses of a frame's views; nothing if all are static pinholes. The views of
+    /// actors that move relative to the camera while a shutter rolls follow, in the order of
+    /// [`LensIndices`].
     pub(super) fn upload(&mut self, device: &Device, frame: &Frame<'_>, actors: &ActorViews) {
         let is_own = |(view, relative): &(&View, &View)| has_own_lens(view, relative);
         let pairs = frame.views.iter().zip(actors.all());
         let pairs =
             pairs.flat_map(|(view, relative)| relative.iter().map(move |from| (view, from)));
         let mut own =
-            pairs.filter(is_own).map(|(_, relative)| Lens::of(relative, frame.profile)).peekable();
+            pairs.filter(is_own).map(|(_, relative)| Lens::new(relative, frame.profile)).peekable();
         if frame.views.iter().all(View::is_static_pinhole) && own.peek().is_none() {
             return;
         }
         let mut lenses = vec![Lens::zeroed(); MAX_VIEWS];
         for (lens, view) in lenses.iter_mut().zip(frame.views) {
             if !view.is_static_pinhole() {
-                *lens = Lens::of(view, frame.profile);
+                *lens = Lens::new(view, frame.profile);
             }
         }
         lenses.extend(own);
@@ -66,7 +67,8 @@ impl Lenses {
     }
 }
 
-/// The index of each actor's lens in each view: its own, which follows those of all views, or that of the view.
+/// The index of each actor's lens in each view: its own, which follows those of all views, or that
+/// of the view.
 #[derive(Debug, Default)]
 pub(super) struct LensIndices(Vec<Vec<u32>>);
 
@@ -87,13 +89,13 @@ impl LensIndices {
     }
 
     /// The index of the lens with which a view sees a placed chunk.
-    pub(super) fn of(&self, view: usize, placed: usize) -> u32 {
+    pub(super) fn index(&self, view: usize, placed: usize) -> u32 {
         self.0[view][placed]
     }
 }
 
-/// Whether a view sees an actor with other lens parameters than the twin: those of a rolling shutter depend on the
-/// motion relative to the actor.
+/// Whether a view sees an actor with other lens parameters than the twin: those of a rolling
+/// shutter depend on the motion relative to the actor.
 fn has_own_lens(view: &View, relative: &View) -> bool {
     let rolls = view.rolling_shutter.is_some() || relative.rolling_shutter.is_some();
     rolls && !relative.is_static_pinhole()
@@ -101,7 +103,7 @@ fn has_own_lens(view: &View, relative: &View) -> bool {
 
 impl Lens {
     /// The parameters of a view that is not a static pinhole.
-    fn of(view: &View, profile: &RenderProfile) -> Self {
+    fn new(view: &View, profile: &RenderProfile) -> Self {
         let camera = &view.camera;
         let pinhole = &camera.pinhole;
         let mut lens = Self {
@@ -163,7 +165,8 @@ impl Lens {
         self.set_polynomial(lens.rising());
     }
 
-    /// The polynomial takes a fraction of its end, so that no power of a radius in pixels overflows f32.
+    /// The polynomial takes a fraction of its end, so that no power of a radius in pixels overflows
+    /// f32.
     fn set_polynomial(&mut self, polynomial: &MonotonePolynomial) {
         let end = polynomial.end();
         self.end = end as f32;

@@ -1,10 +1,11 @@
-//! Tiles with long lists, which have a kernel of their own in stage rasterize. WGSL: `shaders/long_tiles.wgsl`,
-//! `shaders/rasterize_long.wgsl`.
+//! Tiles with long lists, which have a kernel of their own in stage rasterize. WGSL:
+//! `shaders/long_tiles.wgsl`, `shaders/rasterize_long.wgsl`.
 //!
-//! A tile where a road meets the horizon has tens of thousands of splats. Blended like the others it takes most of
-//! the stage's time while the rest of the device is idle. So the tiles with long lists are started first, by four
-//! times as many threads each, and the others run beside them: no buffer is written by one of the two kernels and
-//! used by the other, so that wgpu puts no barrier between them. A third kernel then makes pixels of their sums.
+//! A tile where a road meets the horizon has tens of thousands of splats. Blended like the others
+//! it takes most of the stage's time while the rest of the device is idle. So the tiles with long
+//! lists are started first, by four times as many threads each, and the others run beside them: no
+//! buffer is written by one of the two kernels and used by the other, so that wgpu puts no barrier
+//! between them. A third kernel then makes pixels of their sums.
 
 use wgpu::{BindingResource, BufferUsages, ComputePass};
 
@@ -23,7 +24,6 @@ pub(super) struct LongTiles {
     find: Kernel,
     /// By whether depth, and whether owners are wanted.
     blend: LazyShader<Kernel, 4>,
-    /// The tiles.
     tiles: GrowableBuffer,
     /// For each tile of the frame, its place in `tiles`, plus 1; or 0.
     places: GrowableBuffer,

@@ -1,22 +1,24 @@
-//! The gpu backend: WGSL compute shaders in `shaders/`, one per stage, run by wgpu on Vulkan. Each stage
-//! is the twin of the cpu backend's stage of the same name.
+//! The gpu backend: WGSL compute shaders in `shaders/`, one per stage, run by wgpu on Vulkan. Each
+//! stage is the twin of the cpu backend's stage of the same name.
 //!
-//! The backend is deterministic: sorts are stable, the floating-point sums of a pixel are always added in
-//! the same order, and operations that threads execute in any order commute. Nothing is read back in the
-//! middle of a frame: a frame that does not fit its buffers is drawn again in larger ones, and one that
-//! does not fit the device is drawn region by region (`gpu/partition.rs`).
+//! The backend is deterministic: sorts are stable, the floating-point sums of a pixel are always
+//! added in the same order, and operations that threads execute in any order commute. Nothing is
+//! read back in the middle of a frame: a frame that does not fit its buffers is drawn again in
+//! larger ones, and one that does not fit the device is drawn region by region
+//! (`gpu/partition.rs`).
 //!
 //! # Frames in flight
 //!
-//! A frame is prepared, recorded and submitted in its turn, in the order of the calls (`gpu/tickets.rs`). It is
-//! waited for, copied out, hashed and encoded outside of its turn, while the next frames have theirs. The device has at
-//! most two of them, so that it finds the next frame in its queue when one is done (`gpu/slots.rs`). A frame whose
-//! buffers were too small, or that does not fit the device at once, is drawn in one turn.
+//! A frame is prepared, recorded and submitted in its turn, in the order of the calls
+//! (`gpu/tickets.rs`). It is waited for, copied out, hashed and encoded outside of its turn, while
+//! the next frames have theirs. The device has at most two of them, so that it finds the next frame
+//! in its queue when one is done (`gpu/slots.rs`). A frame whose buffers were too small, or that
+//! does not fit the device at once, is drawn in one turn.
 //!
-//! The engine runs a render thread for each frame in flight ([`Backend::frames_in_flight`]), more of them on a machine
-//! with more cores. Preparing runs on the caller's thread, and culling in a thread pool of its own. A rayon thread
-//! that waits takes up other work of its pool; if that were the next frame, it would wait for this one,
-//! which waits for it.
+//! The engine runs a render thread for each frame in flight ([`Backend::frames_in_flight`]), more
+//! of them on a machine with more cores. Preparing runs on the caller's thread, and culling in a
+//! thread pool of its own. A rayon thread that waits takes up other work of its pool; if that were
+//! the next frame, it would wait for this one, which waits for it.
 
 mod background;
 mod bandwidth;
@@ -82,8 +84,8 @@ pub struct Gpu {
     tuning: Option<Tuning>,
     /// Copies images to their targets, and runs the callbacks of finished views.
     deliver: ThreadPool,
-    /// Culls clusters. It has its own pool, so that a frame that is drawn does not wait for one that is
-    /// encoded.
+    /// Culls clusters. It has its own pool, so that a frame that is drawn does not wait for one
+    /// that is encoded.
     cull: ThreadPool,
     queue: TicketQueue,
     /// The frames that the device has.
@@ -98,8 +100,8 @@ pub struct Gpu {
 pub struct MemoryLimits {
     /// Most bytes of resident Gaussians; the least recently drawn chunks are evicted beyond it.
     pub mirror_bytes: u64,
-    /// Most bytes of a binding, at least `limits::BINDING_BYTES_MIN`. Frames that need more are drawn
-    /// region by region.
+    /// Most bytes of a binding, at least `limits::BINDING_BYTES_MIN`. Frames that need more are
+    /// drawn region by region.
     pub binding_bytes: u64,
 }
 
@@ -113,7 +115,6 @@ impl Default for MemoryLimits {
 /// The memory of a device, and the counts of its work since it was opened.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GpuUsage {
-    /// The adapter's name.
     pub name: String,
     /// Bytes of resident Gaussians.
     pub mirror_bytes: u64,
@@ -130,8 +131,8 @@ pub struct GpuUsage {
 }
 
 impl Gpu {
-    /// Opens a device. `threads` is the number of threads that copy images out of its memory; 0 means one
-    /// per core.
+    /// Opens a device. `threads` is the number of threads that copy images out of its memory; 0
+    /// means one per core.
     ///
     /// # Errors
     /// There is no such device, or a shader cannot be compiled for it.
@@ -139,7 +140,8 @@ impl Gpu {
         Self::open(choice, threads, Shaders::default(), MemoryLimits::default(), None)
     }
 
-    /// As [`Gpu::new`] with other shaders: for tests that break a shader and check that it is detected.
+    /// As [`Gpu::new`] with other shaders: for tests that break a shader and check that it is
+    /// detected.
     ///
     /// # Errors
     /// As [`Gpu::new`].
@@ -163,7 +165,8 @@ impl Gpu {
         Self::open(choice, threads, Shaders::default(), limits, None)
     }
 
-    /// As [`Gpu::with_shaders`] with a choice of kernels: for tests of those that the device would not run.
+    /// As [`Gpu::with_shaders`] with a choice of kernels: for tests of those that the device would
+    /// not run.
     ///
     /// # Errors
     /// As [`Gpu::new`].
@@ -258,8 +261,8 @@ impl Gpu {
         })
     }
 
-    /// Runs the stages up to and including `last`, from the beginning or after those whose outputs are
-    /// `done`, and reads their outputs: for tests that compare stages.
+    /// Runs the stages up to and including `last`, from the beginning or after those whose outputs
+    /// are `done`, and reads their outputs: for tests that compare stages.
     ///
     /// # Errors
     /// As [`Gpu::resume`].
@@ -283,8 +286,9 @@ impl Gpu {
     ) -> Result<FrameStats, RenderError> {
         frame.check(targets)?;
         frame.check_splats(self.name())?;
-        let outputs = Outputs::of(targets);
-        // Draw on this thread: a thread of a pool that waits may take up another frame of that pool.
+        let outputs = Outputs::from_targets(targets);
+        // Draw on this thread: a thread of a pool that waits may take up another frame of that
+        // pool.
         let drawn = draw(&outputs)?;
 
         // Copy the pixels. Other frames can be drawn meanwhile.

@@ -1,18 +1,19 @@
 //! A frame that a device cannot hold at once is drawn region by region.
 //!
-//! The rows of tiles of all views, one view after another, form one sequence. A region is a range of
-//! it: some whole views, or a band of rows of one view. Each region is drawn by the same stages, to the
-//! same bytes: no pixel depends on the region in which it is drawn, since its splats are those of the
-//! whole image in the same order.
+//! The rows of tiles of all views, one view after another, form one sequence. A region is a range
+//! of it: some whole views, or a band of rows of one view. Each region is drawn by the same stages,
+//! to the same bytes: no pixel depends on the region in which it is drawn, since its splats are
+//! those of the whole image in the same order.
 //!
 //! Nothing is read back in the middle of a frame. The device counts what a region needs, and draws
-//! nothing if that does not fit; then the region is drawn again, in larger buffers or split into more
-//! regions. The next frame of the same kind starts with the regions that fitted. If a single row of tiles
-//! exceeds the device, drawing is an error.
+//! nothing if that does not fit; then the region is drawn again, in larger buffers or split into
+//! more regions. The next frame of the same kind starts with the regions that fitted. If a single
+//! row of tiles exceeds the device, drawing is an error.
 //!
-//! The alternative would be splats and lists in several pages. Then a splat's index would be a page and an
-//! index in every stage, and a radix sort would scatter into all pages at once. Regions cost nothing when the
-//! frame fits. Gaussians and pixels are in pages nevertheless, because stages only stream through them.
+//! The alternative would be splats and lists in several pages. Then a splat's index would be a page
+//! and an index in every stage, and a radix sort would scatter into all pages at once. Regions cost
+//! nothing when the frame fits. Gaussians and pixels are in pages nevertheless, because stages only
+//! stream through them.
 
 use std::ops::Range;
 
@@ -34,7 +35,8 @@ pub(super) struct Capacity {
 }
 
 impl Capacity {
-    /// The smallest number of regions into which a region with these needs must be split to fit a limit.
+    /// The smallest number of regions into which a region with these needs must be split to fit a
+    /// limit.
     pub(super) fn min_regions(self, limit: Self) -> u64 {
         let Self { splats, touches, instances } = self.combine(limit, u64::div_ceil);
         splats.max(touches).max(instances)
@@ -71,7 +73,7 @@ pub(super) struct TileRows {
 
 impl TileRows {
     /// The rows of a frame.
-    pub(super) fn of(frame: &Frame<'_>) -> Self {
+    pub(super) fn from_frame(frame: &Frame<'_>) -> Self {
         let mut end = 0;
         let view_end = |view: &View| {
             end += view.camera.height_px.div_ceil(TILE_PX);
@@ -92,14 +94,14 @@ impl TileRows {
     }
 
     /// A region's rows of one view, counted from the view's first row; empty if it has none.
-    pub(super) fn of_view(&self, view: usize, region: &Region) -> Range<u32> {
+    pub(super) fn for_view(&self, view: usize, region: &Region) -> Range<u32> {
         let start = if view == 0 { 0 } else { self.ends[view - 1] };
         let within = |row: u32| row.clamp(start, self.ends[view]) - start;
         within(region.start)..within(region.end)
     }
 
-    /// Splits a region into about `count` regions: between views, or into bands if it lies in one view.
-    /// `None` for a single row, which cannot be split.
+    /// Splits a region into about `count` regions: between views, or into bands if it lies in one
+    /// view. `None` for a single row, which cannot be split.
     pub(super) fn split(&self, region: &Region, count: u64) -> Option<Vec<Region>> {
         let views = self.views(region);
         let bounds: Vec<u32> = if views.len() > 1 {
@@ -118,15 +120,16 @@ impl TileRows {
     }
 }
 
-/// The regions in which recent frames fitted, so that the next frame of the same kind starts with them.
+/// The regions in which recent frames fitted, so that the next frame of the same kind starts with
+/// them.
 #[derive(Debug, Default)]
 pub(super) struct PartitionCache {
     /// The most recently drawn one first. Frames that fit at once are not listed.
     entries: Vec<(PartitionKey, Vec<Region>)>,
 }
 
-/// The properties that two frames must share to be drawn in the same regions: the number of Gaussians and
-/// the sizes of the images.
+/// The properties that two frames must share to be drawn in the same regions: the number of
+/// Gaussians and the sizes of the images.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct PartitionKey {
     gaussians: usize,
@@ -134,7 +137,7 @@ pub(super) struct PartitionKey {
 }
 
 impl PartitionKey {
-    pub(super) fn of(frame: &Frame<'_>) -> Self {
+    pub(super) fn from_frame(frame: &Frame<'_>) -> Self {
         let size = |view: &View| [view.camera.width_px, view.camera.height_px];
         Self {
             gaussians: frame.scene.gaussians(),
@@ -150,9 +153,9 @@ impl PartitionCache {
         known.map_or_else(|| vec![rows.all()], |(_, regions)| regions.clone())
     }
 
-    /// Stores the regions of a frame with what each needed. Neighbours that fit together are merged.
-    /// They must fit with an eighth to spare, so that a moving camera does not undo the merge in the
-    /// next frame.
+    /// Stores the regions of a frame with what each needed. Neighbours that fit together are
+    /// merged. They must fit with an eighth to spare, so that a moving camera does not undo the
+    /// merge in the next frame.
     pub(super) fn insert(
         &mut self,
         key: PartitionKey,
@@ -202,7 +205,7 @@ mod tests {
         let rows = rows();
         assert_eq!(rows.views(&(0..12)), 0..3);
         assert_eq!(rows.views(&(5..6)), 1..2);
-        let of = |region: Region| [0, 1, 2].map(|view| rows.of_view(view, &region));
+        let of = |region: Region| [0, 1, 2].map(|view| rows.for_view(view, &region));
         assert_eq!(of(0..12), [0..4, 0..2, 0..6]);
         assert_eq!(of(3..8), [3..4, 0..2, 0..2]);
     }

@@ -1,5 +1,5 @@
-//! The amount of work of each stage, which the device computes itself, so that nothing is read back in
-//! the middle of a frame. WGSL: `shaders/plan.wgsl`.
+//! The amount of work of each stage, which the device computes itself, so that nothing is read back
+//! in the middle of a frame. WGSL: `shaders/plan.wgsl`.
 
 use wgpu::{Buffer, BufferUsages, ComputePass};
 
@@ -29,7 +29,8 @@ pub(super) mod job {
     pub(crate) const COUNT: usize = 13;
 }
 
-/// Counts that are known before the first stage of a frame runs; those that the device computes are zero.
+/// Counts that are known before the first stage of a frame runs; those that the device computes are
+/// zero.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Counts {
     /// (Cluster, view) pairs to project.
@@ -123,24 +124,27 @@ impl Plan {
         self.tile_counters.buffer()
     }
 
-    /// Sets the jobs that depend on the number of splats, after the prefix sum over the visible splats of
-    /// the cluster views.
+    /// Sets the jobs that depend on the number of splats, after the prefix sum over the visible
+    /// splats of the cluster views.
     pub(super) fn set_splats(&self, device: &Device, pass: &mut ComputePass<'_>, sums: &Buffer) {
         self.run(&self.splats, device, pass, sums);
     }
 
-    /// Sets the jobs that depend on the number of touches, after the prefix sum over the splats' touches.
+    /// Sets the jobs that depend on the number of touches, after the prefix sum over the splats'
+    /// touches.
     pub(super) fn set_touches(&self, device: &Device, pass: &mut ComputePass<'_>, sums: &Buffer) {
         self.run(&self.touches, device, pass, sums);
     }
 
-    /// Sets the jobs that depend on the number of batches, after the prefix sum over the batches of macro tiles.
+    /// Sets the jobs that depend on the number of batches, after the prefix sum over the batches of
+    /// macro tiles.
     pub(super) fn set_batches(&self, device: &Device, pass: &mut ComputePass<'_>, sums: &Buffer) {
         let buffers = [(1, self.jobs.bind()), (2, sums.as_entire_binding())];
         self.batches.run(device, pass, Groups::Count(1), &buffers);
     }
 
-    /// Sets the job that depends on the number of instances, after the prefix sum over the tiles' splats.
+    /// Sets the job that depends on the number of instances, after the prefix sum over the tiles'
+    /// splats.
     pub(super) fn set_instances(&self, device: &Device, pass: &mut ComputePass<'_>, sums: &Buffer) {
         self.run(&self.instances, device, pass, sums);
     }

@@ -1,17 +1,18 @@
-//! Stage project: the host culls clusters of Gaussians, and the device projects those that are left, in
-//! order of (view, global id). Twin of `render/cpu/project`; WGSL: `shaders/project.wgsl`.
+//! Stage project: the host culls clusters of Gaussians, and the device projects those that are
+//! left, in order of (view, global id). Twin of `render/cpu/project`; WGSL: `shaders/project.wgsl`.
 //!
 //! Splats stay where they were projected, in order of (view, global id). Sorting and binning move
-//! indices of splats: 8 B each in the sort of splats, 4 B each in the lists of tiles. A copy of the splats
-//! in depth order was no faster to read, and doubled the memory of a frame.
+//! indices of splats: 8 B each in the sort of splats, 4 B each in the lists of tiles. A copy of the
+//! splats in depth order was no faster to read, and doubled the memory of a frame.
 //!
 //! Depth is computed in f32 together with its rounding errors, and rounded once (`exact_z` in
-//! `shaders/project.wgsl`). Thousands of surfels of one facade have equal depths; without compensation
-//! they would be blended in the order of rounding errors. Distance, the depth of wide lenses, is computed
-//! in the same way (`depth` in `shaders/unscented.wgsl`).
+//! `shaders/project.wgsl`). Thousands of surfels of one facade have equal depths; without
+//! compensation they would be blended in the order of rounding errors. Distance, the depth of wide
+//! lenses, is computed in the same way (`depth` in `shaders/unscented.wgsl`).
 //!
-//! Static pinhole cameras have their own kernels, which are identical to those of frames without other cameras.
-//! The kernels for lenses and rolling shutters are compiled with the first view that needs them.
+//! Static pinhole cameras have their own kernels, which are identical to those of frames without
+//! other cameras. The kernels for lenses and rolling shutters are compiled with the first view that
+//! needs them.
 
 use wgpu::{BindingResource, BufferUsages, ComputePass, ShaderModule};
 
@@ -68,9 +69,7 @@ impl SplatBuffers {
 /// The kernels of the stage, and their input.
 #[derive(Debug)]
 pub(super) struct Project {
-    /// By SH degree.
     pinhole: LazyShader<Kernels, 4>,
-    /// By SH degree.
     unscented: LazyShader<Kernels, 4>,
     /// By SH degree, for chunks of actors and those beneath them.
     pinhole_actors: LazyShader<Kernels, 4>,
@@ -143,8 +142,8 @@ impl Project {
         }
     }
 
-    /// Most cluster views that a device can hold. Each takes 32 B of visibility bits and, if every one
-    /// is of a chunk of its own, 128 B of that chunk's [`ChunkView`], which decides.
+    /// Most cluster views that a device can hold. Each takes 32 B of visibility bits and, if every
+    /// one is of a chunk of its own, 128 B of that chunk's [`ChunkView`], which decides.
     pub(super) fn limit(device: &Device) -> u64 {
         device.binding_bytes() / size_of::<ChunkView>() as u64
     }

@@ -1,4 +1,5 @@
-//! The work of stage project: which clusters of Gaussians the host does not cull, and which kernel projects each.
+//! The work of stage project: which clusters of Gaussians the host does not cull, and which kernel
+//! projects each.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -19,15 +20,16 @@ use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::chunk::Cluster;
 use wildcity_scene::{Chunk, RenderProfile};
 
-/// Clusters of a chunk that are tested at a time: a few microseconds. Chunks have 1 to 50,000 clusters, so one that is
-/// tested as a whole would keep a single thread busy.
+/// Clusters of a chunk that are tested at a time: a few microseconds. Chunks have 1 to 50,000
+/// clusters, so one that is tested as a whole would keep a single thread busy.
 const CLUSTERS_AT_A_TIME: usize = 512;
 
 /// The clusters that a region projects.
 #[derive(Debug, Default)]
 pub(super) struct ProjectWork {
     pub(super) cluster_views: Vec<ClusterView>,
-    /// Indices into `cluster_views`, page after page of the mirror, since one page is bound at a time.
+    /// Indices into `cluster_views`, page after page of the mirror, since one page is bound at a
+    /// time.
     pub(super) page_cluster_views: Vec<u32>,
     pub(super) dispatches: Vec<ProjectDispatch>,
     pub(super) chunk_views: Vec<ChunkView>,
@@ -115,9 +117,9 @@ impl ProjectWork {
                 ChunkInView { chunk, view, relative, of: Owner::Twin { shadows } }
             });
             let lenses = &lenses;
-            let placed = frame.scene.placed.iter().zip(actors.of(view)).enumerate();
+            let placed = frame.scene.placed.iter().zip(actors.for_view(view)).enumerate();
             let placed = placed.map(move |(index, (placed, relative))| {
-                let of = Owner::Actor { placed, lens: lenses.of(view, index) };
+                let of = Owner::Actor { placed, lens: lenses.index(view, index) };
                 ChunkInView { chunk: &placed.chunk, view, relative, of }
             });
             twin.chain(placed)
@@ -160,7 +162,8 @@ impl ProjectWork {
         work
     }
 
-    /// Adds some visible clusters of a chunk in a view. `chunk_views` are those of the pair without and with shadows.
+    /// Adds some visible clusters of a chunk in a view. `chunk_views` are those of the pair without
+    /// and with shadows.
     fn add(
         &mut self,
         pair: &ChunkInView<'_>,
@@ -231,7 +234,8 @@ impl ProjectWork {
 }
 
 impl ChunkInView<'_> {
-    /// Those of some clusters that may be visible, in order. `unscented` is that of the frame's view.
+    /// Those of some clusters that may be visible, in order. `unscented` is that of the frame's
+    /// view.
     fn visible(
         &self,
         clusters: Range<usize>,
@@ -256,8 +260,8 @@ impl ChunkInView<'_> {
         })
     }
 
-    /// Those of some clusters of which `may_see` is true; its arguments are the smallest and largest centre, and the largest
-    /// standard deviation, in metres.
+    /// Those of some clusters of which `may_see` is true; its arguments are the smallest and
+    /// largest centre, and the largest standard deviation, in metres.
     fn visible_if(
         &self,
         clusters: Range<usize>,
@@ -284,9 +288,10 @@ impl ChunkInView<'_> {
     }
 
     fn variant(&self, shadowed: bool) -> Variant {
-        let projection = match self.relative.is_static_pinhole() {
-            true => Projection::Pinhole,
-            false => Projection::Unscented,
+        let projection = if self.relative.is_static_pinhole() {
+            Projection::Pinhole
+        } else {
+            Projection::Unscented
         };
         let actors = shadowed || matches!(self.of, Owner::Actor { .. });
         Variant { projection, actors, sh_degree: self.chunk.sh_degree() }

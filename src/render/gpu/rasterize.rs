@@ -1,7 +1,7 @@
 //! Stage rasterize: blends the splats of each tile front to back, and writes the requested pixels.
 //!
-//! Twin of `render/cpu/rasterize.rs`; WGSL: `shaders/rasterize.wgsl`, `shaders/resolve.wgsl`. Tiles with long lists:
-//! `long_tiles.rs`.
+//! Twin of `render/cpu/rasterize.rs`; WGSL: `shaders/rasterize.wgsl`, `shaders/resolve.wgsl`. Tiles
+//! with long lists: `long_tiles.rs`.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -33,7 +33,6 @@ type Shader = LazyShader<TileKernels, { Planes::VARIANTS }>;
 /// The kernels that write pixels.
 #[derive(Debug)]
 struct TileKernels {
-    /// Blends tiles.
     blend: Kernel,
     /// Writes those of long lists, if they have a kernel of their own.
     finish: Option<Kernel>,

@@ -19,13 +19,12 @@ pub(super) const TILE_COUNTERS_OFFSET: u64 = 128;
 /// Offset of the timestamps after the counters, in bytes.
 pub(super) const TIMESTAMP_OFFSET: u64 = 256;
 
-/// The read-back buffers of one frame. The host copies the images of a step out of one set while the device
-/// fills another set with those of the next step.
+/// The read-back buffers of one frame. The host copies the images of a step out of one set while
+/// the device fills another set with those of the next step.
 #[derive(Debug)]
 pub(super) struct ReadBack {
     /// Counters, then timestamps.
     pub(super) head: GrowableBuffer,
-    /// Pixels.
     pub(super) pages: Vec<GrowableBuffer>,
     /// Tiles of a page; the last page may have fewer.
     pub(super) tiles_per_page: u32,
@@ -136,7 +135,8 @@ impl ReadBack {
         let polled = device.device.poll(wait);
         device.check()?;
         polled.map_err(|error| device.failed(error.to_string()))?;
-        // Another thread that waits for the device may have taken the callbacks, and still be calling them.
+        // Another thread that waits for the device may have taken the callbacks, and still be
+        // calling them.
         for _ in self.all() {
             if all_mapped.recv_timeout(limits::MAP_CALLBACK) != Ok(true) {
                 return Err(device.failed("its memory could not be read".to_owned()));

@@ -1,5 +1,5 @@
-//! Stage resolve, the host's part: copies the device's output, which is tile after tile, to the rows of
-//! the targets.
+//! Stage resolve, the host's part: copies the device's output, which is tile after tile, to the
+//! rows of the targets.
 //!
 //! The arithmetic is in `shaders/resolve.wgsl`. Twin of `render/cpu/resolve.rs`.
 
@@ -37,12 +37,12 @@ pub(super) struct Outputs {
 
 impl Outputs {
     /// The outputs that these targets request.
-    pub(super) fn of(targets: &[Target<'_>]) -> Self {
+    pub(super) fn from_targets(targets: &[Target<'_>]) -> Self {
         let appearances = targets.iter().map(|t| t.appearance.cloned().unwrap_or_default());
         let appearances: Vec<Appearance> = appearances.collect();
         let all_identity = appearances.iter().all(Appearance::is_identity);
         let appearances = if all_identity { Vec::new() } else { appearances };
-        Self { planes: Planes::of(targets), appearances }
+        Self { planes: Planes::from_targets(targets), appearances }
     }
 }
 
@@ -51,7 +51,7 @@ impl Planes {
     pub(super) const VARIANTS: usize = 32;
 
     /// The values that these targets request.
-    pub(super) fn of(targets: &[Target<'_>]) -> Self {
+    pub(super) fn from_targets(targets: &[Target<'_>]) -> Self {
         let any = |requests: fn(&Target<'_>) -> bool| targets.iter().any(requests);
         Self {
             rgb8: any(|t| t.rgb8.is_some()),
@@ -89,8 +89,8 @@ impl Planes {
         self.instances
     }
 
-    /// Bytes of the pixels of one tile, at least one plane, so that buffers are never empty. They are a multiple of 256, so
-    /// that a binding may start at any tile.
+    /// Bytes of the pixels of one tile, at least one plane, so that buffers are never empty. They
+    /// are a multiple of 256, so that a binding may start at any tile.
     pub(super) fn tile_bytes(self) -> u64 {
         4 * self.words().max(PLANE - RGB8_PLANE) as u64
     }
@@ -100,7 +100,8 @@ impl Planes {
         self.parts().iter().map(|(requested, words)| usize::from(*requested) * words).sum()
     }
 
-    /// Whether rgb8, rgb, opacity, depth, and instances are requested, and the words that each takes of a tile.
+    /// Whether rgb8, rgb, opacity, depth, and instances are requested, and the words that each
+    /// takes of a tile.
     fn parts(self) -> [(bool, usize); 5] {
         [
             (self.rgb8, RGB8_PLANE),
@@ -111,7 +112,8 @@ impl Planes {
         ]
     }
 
-    /// First word of rgb8, rgb, opacity, depth, and instances in a tile; `None` if it is not requested.
+    /// First word of rgb8, rgb, opacity, depth, and instances in a tile; `None` if it is not
+    /// requested.
     fn starts(self) -> [Option<usize>; 5] {
         let mut next = 0;
         self.parts().map(|(requested, words)| {
@@ -141,8 +143,8 @@ impl Pixels<'_> {
         let [rgb8, rgb, opacity, depth, instances] = self.planes.starts();
         if let (Some(to), Some(plane)) = (&mut target.rgb8, rgb8) {
             self.for_each_row(view, to.par_chunks_mut(3 * row_pixels), |to, at, tile, from| {
-                // The words have the bytes in the order of the pixels on every device: Vulkan is little-endian, and so
-                // are the machines that it runs on.
+                // The words have the bytes in the order of the pixels on every device: Vulkan is
+                // little-endian, and so are the machines that it runs on.
                 let first = 4 * plane + 3 * from.start;
                 let bytes: &[u8] = bytemuck::cast_slice(tile);
                 to[3 * at..][..3 * from.len()].copy_from_slice(&bytes[first..][..3 * from.len()]);
@@ -177,8 +179,9 @@ impl Pixels<'_> {
         }
     }
 
-    /// Calls `copy` for every row of every tile, with the band of the target that the tile's row of tiles
-    /// covers, the index of the first pixel in it, the tile's words, and the row's range of a plane.
+    /// Calls `copy` for every row of every tile, with the band of the target that the tile's row of
+    /// tiles covers, the index of the first pixel in it, the tile's words, and the row's range of a
+    /// plane.
     fn for_each_row<'t, T: Send + 't>(
         &self,
         view: &FrameView,

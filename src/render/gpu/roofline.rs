@@ -11,10 +11,11 @@ use super::kernel::{Groups, Kernel, Recorder, TIMESTAMP_BYTES, module, timestamp
 use super::layout::{Span, WORKGROUP};
 use crate::RenderError;
 
-/// Bytes that are copied, or fewer if a binding holds less: five times the cache of a large graphics card.
+/// Bytes that are copied, or fewer if a binding holds less: five times the cache of a large
+/// graphics card.
 const COPY_BYTES: u64 = 256 << 20;
-/// Workgroups of the multiply-add kernel: 62 for each of the 132 multiprocessors of a large graphics card,
-/// each of which holds 8 workgroups of 256 threads at a time.
+/// Workgroups of the multiply-add kernel: 62 for each of the 132 multiprocessors of a large
+/// graphics card, each of which holds 8 workgroups of 256 threads at a time.
 const GROUPS: u32 = 1 << 13;
 /// Multiply-adds of a thread per round.
 const ROUND: u64 = 64;

@@ -1,6 +1,6 @@
-//! The WGSL source of each shader. `#import NAME` lines are replaced by the file of that name; this one
-//! directive is the whole preprocessor. A NAME in capitals is a placeholder for one of several files, and
-//! each choice makes a variant of the shader.
+//! The WGSL source of each shader. `#import NAME` lines are replaced by the file of that name; this
+//! one directive is the whole preprocessor. A NAME in capitals is a placeholder for one of several
+//! files, and each choice makes a variant of the shader.
 
 use std::sync::Arc;
 
@@ -170,8 +170,8 @@ impl Shaders {
     }
 }
 
-/// Appends a file with its imports, each file once. An import without a file is kept as it is, so that
-/// the shader compiler reports it.
+/// Appends a file with its imports, each file once. An import without a file is kept as it is, so
+/// that the shader compiler reports it.
 fn append(name: &str, choices: &[Choice], appended: &mut Vec<&'static str>, source: &mut String) {
     let Some((name, text)) = FILES.iter().find(|(file, _)| *file == name) else {
         source.push_str(&format!("#import {name}\n"));

@@ -16,8 +16,8 @@ pub(super) struct Slots {
 pub(super) struct Slot<'a>(&'a Slots);
 
 impl Slots {
-    /// Blocks until fewer than [`limits::GPU_FRAMES_ON_DEVICE`] slots are taken. A caller that waits must not hold what
-    /// the frames on the device wait for.
+    /// Blocks until fewer than [`limits::GPU_FRAMES_ON_DEVICE`] slots are taken. A caller that
+    /// waits must not hold what the frames on the device wait for.
     pub(super) fn wait(&self) -> Slot<'_> {
         let mut taken = self.taken.lock();
         self.freed.wait_while(&mut taken, |taken| *taken >= limits::GPU_FRAMES_ON_DEVICE);

@@ -1,6 +1,6 @@
-//! Stage sort: a stable LSD radix sort with 8 bits per pass, of splats by (view, depth) and of touches by
-//! macro tile. Twin of `render/cpu/sort.rs`; WGSL: `shaders/sort.wgsl`, and `shaders/sort_ballots.wgsl` for devices
-//! with subgroups of 32 or 64 threads.
+//! Stage sort: a stable LSD radix sort with 8 bits per pass, of splats by (view, depth) and of
+//! touches by macro tile. Twin of `render/cpu/sort.rs`; WGSL: `shaders/sort.wgsl`, and
+//! `shaders/sort_ballots.wgsl` for devices with subgroups of 32 or 64 threads.
 
 use wgpu::{BufferUsages, ComputePass, ShaderModule};
 
@@ -23,8 +23,9 @@ pub(super) struct Sort {
     ballots: Option<Ballots>,
 }
 
-/// What the kernels with ballots need in addition. They sort the keys of splats. Those of touches differ in few bits, so
-/// that neighbours stay together anyway: on an H100 they would gain between nothing and a tenth.
+/// What the kernels with ballots need in addition. They sort the keys of splats. Those of touches
+/// differ in few bits, so that neighbours stay together anyway: on an H100 they would gain between
+/// nothing and a tenth.
 #[derive(Debug)]
 struct Ballots {
     scan: Kernel,
@@ -68,7 +69,6 @@ impl Pass {
 /// The buffers of a sort. Each pass moves the data from one buffer of a pair to the other.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Columns<'a> {
-    /// The keys.
     pub(super) keys: &'a [GrowableBuffer; 2],
     /// A value for each key.
     pub(super) values: &'a [GrowableBuffer; 2],
@@ -174,7 +174,8 @@ mod tests {
         check(&device, (device.binding_bytes() / 4).min(70_000_000) as u32);
     }
 
-    /// More blocks than the prefix sum of a digit takes in one round. Other numbers leave part of a block.
+    /// More blocks than the prefix sum of a digit takes in one round. Other numbers leave part of a
+    /// block.
     #[test]
     fn t21_with_ballots() {
         let scatter = Scatter::EmulatedBallots;
@@ -191,7 +192,8 @@ mod tests {
     }
 
     fn check(device: &Device, count: u32) {
-        // Half a million distinct keys that differ in all four digits, so that 64 keys and more are equal.
+        // Half a million distinct keys that differ in all four digits, so that 64 keys and more are
+        // equal.
         let key = |i: u32| (i.wrapping_mul(0x9E37_79B9) ^ i >> 7) & 0x700F_F0FF;
         let keys: Vec<u32> = (0..count).map(key).collect();
         let (sorted_keys, sorted_values) = sort_on(device, &keys);

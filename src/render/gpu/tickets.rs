@@ -12,9 +12,9 @@ pub(super) struct TicketQueue {
 
 #[derive(Debug, Default)]
 struct Counts {
-    /// Tickets given out.
     issued: u64,
-    /// Number of tickets whose turn has ended, which is also the number of the ticket that is served now.
+    /// Number of tickets whose turn has ended, which is also the number of the ticket that is
+    /// served now.
     served: u64,
 }
 

@@ -6,11 +6,12 @@ use wgpu::{AdapterInfo, DeviceType, Features, Limits};
 
 use super::layout::RASTER_BATCH;
 
-/// Thresholds between kernels that compute the same. Tests set them to run each kernel on every device.
+/// Thresholds between kernels that compute the same. Tests set them to run each kernel on every
+/// device.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Tuning {
-    /// Tiles with more splats than this are blended by a kernel of their own, with four times as many threads for a tile;
-    /// with the largest number there are no such tiles.
+    /// Tiles with more splats than this are blended by a kernel of their own, with four times as
+    /// many threads for a tile; with the largest number there are no such tiles.
     pub long_tile_splats: u32,
     /// The kernel that moves the keys of a sort.
     pub scatter: Scatter,

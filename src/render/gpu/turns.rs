@@ -11,8 +11,8 @@ use super::resolve::Outputs;
 use crate::{Frame, RenderError};
 
 impl Gpu {
-    /// Runs `work` on the device after all earlier callers. Opens the device again if it was lost. The next caller has
-    /// its turn when this returns.
+    /// Runs `work` on the device after all earlier callers. Opens the device again if it was lost.
+    /// The next caller has its turn when this returns.
     pub(super) fn in_turn<T>(
         &self,
         work: impl FnOnce(&mut Chain) -> Result<T, RenderError>,
@@ -27,8 +27,8 @@ impl Gpu {
         work: impl FnOnce(&mut Chain) -> Result<T, RenderError>,
     ) -> Result<T, RenderError> {
         let mut slot = self.chain.lock();
-        // If `work` panics, the slot stays empty: memory may be half-written then, and the next caller
-        // opens the device again.
+        // If `work` panics, the slot stays empty: memory may be half-written then, and the next
+        // caller opens the device again.
         let mut chain = match slot.take() {
             Some(chain) => chain,
             None => self.reopen()?,
@@ -75,7 +75,8 @@ impl Gpu {
         let waited = in_flight.wait();
         if let Err(RenderError::Device { .. }) = waited {
             let mut slot = self.chain.lock();
-            // Another frame of the same device may have failed before, and the device may be open again.
+            // Another frame of the same device may have failed before, and the device may be open
+            // again.
             if slot.as_ref().is_some_and(|chain| Arc::ptr_eq(&chain.device, &device)) {
                 slot.take().into_iter().for_each(|chain| self.discarded.add(chain));
             }

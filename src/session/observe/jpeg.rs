@@ -1,14 +1,15 @@
 //! JPEG files.
 //!
-//! A GPU draws the images of a step sooner than one thread encodes the largest of them, so these are encoded in strips of
-//! 64 rows, in parallel ([`jpeg_in_strips`]). A strip ends with a restart marker, after which the entropy coding starts
-//! anew (ITU-T T.81, B.2.1), so the strips of a file can be encoded one by one. The file has the coefficients of
-//! [`jpeg`]'s, and the same bytes for any number of threads.
+//! A GPU draws the images of a step sooner than one thread encodes the largest of them, so these
+//! are encoded in strips of 64 rows, in parallel ([`jpeg_in_strips`]). A strip ends with a restart
+//! marker, after which the entropy coding starts anew (ITU-T T.81, B.2.1), so the strips of a file
+//! can be encoded one by one. The file has the coefficients of [`jpeg`]'s, and the same bytes for
+//! any number of threads.
 //!
-//! Two encoders: the crate jpeg-encoder, which is always available, and libjpeg-turbo, with the feature `turbojpeg`.
-//! Both write baseline JPEG, 4:2:0, with the quantisation tables of annex K scaled by the quality as the Independent
-//! JPEG Group does, so that sizes and errors are alike; the bytes are not. With either one the same pixels give the
-//! same bytes.
+//! Two encoders: the crate jpeg-encoder, which is always available, and libjpeg-turbo, with the
+//! feature `turbojpeg`. Both write baseline JPEG, 4:2:0, with the quantisation tables of annex K
+//! scaled by the quality as the Independent JPEG Group does, so that sizes and errors are alike;
+//! the bytes are not. With either one the same pixels give the same bytes.
 
 use rayon::prelude::*;
 

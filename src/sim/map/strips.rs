@@ -19,8 +19,8 @@ const BEYOND_M: f64 = 1.0;
 
 /// A map of one lane and one drivable strip along each drive: from `left_m` to the left of the
 /// drive to `right_m` to its right, both above 0. The owner of the twin gives both: a default would
-/// be a guess that judges. The strip is longer than the lane, since the ego's box reaches beyond the
-/// rear axle, which is on the drive.
+/// be a guess that judges. The strip is longer than the lane, since the ego's box reaches beyond
+/// the rear axle, which is on the drive.
 pub fn strips_beside(drives: &[Trajectory], left_m: f64, right_m: f64) -> MapFile {
     let mut lanes = Vec::new();
     let mut areas = Vec::new();

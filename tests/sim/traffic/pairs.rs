@@ -65,7 +65,8 @@ fn a_distance_is_reached_by_braking_as_the_formula_says() {
             let change_mps = pair[1][1] - pair[0][1];
             assert!((-0.03 - 1e-9..=0.02 + 1e-9).contains(&change_mps), "{from_m}: {change_mps}");
         }
-        // While it brakes with 3 m/s², the speed of approach is √(2 b (way - b τ² / 2)) with τ = 0.5 s.
+        // While it brakes with 3 m/s², the speed of approach is √(2 b (way - b τ² / 2)) with τ =
+        // 0.5 s.
         let is_braking = |pair: &&[[f64; 2]]| pair[1][1] - pair[0][1] < -0.028 && pair[0][0] > 22.0;
         let braking: Vec<_> = states.windows(2).filter(is_braking).collect();
         assert!(braking.len() > 100 || from_m > 160.0, "{from_m}: {}", braking.len());

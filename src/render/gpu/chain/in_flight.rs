@@ -67,8 +67,8 @@ impl Chain {
         outputs: &Outputs,
         cull: &ThreadPool,
     ) -> Result<Turn, RenderError> {
-        let rows = TileRows::of(frame);
-        if self.partitions.get(&PartitionKey::of(frame), &rows).len() > 1 {
+        let rows = TileRows::from_frame(frame);
+        if self.partitions.get(&PartitionKey::from_frame(frame), &rows).len() > 1 {
             return Ok(Turn::Drawn(self.draw(frame, outputs, cull)?));
         }
         let start = Instant::now();

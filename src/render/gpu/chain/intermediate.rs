@@ -1,5 +1,5 @@
-//! Starting or ending in the middle of a frame: the outputs of another backend's stages become the input
-//! of this one's, and tests read the outputs of this one's stages.
+//! Starting or ending in the middle of a frame: the outputs of another backend's stages become the
+//! input of this one's, and tests read the outputs of this one's stages.
 
 use bytemuck::AnyBitPattern;
 use rayon::ThreadPool;
@@ -37,8 +37,8 @@ impl Chain {
         self.finish(current)
     }
 
-    /// Runs the stages up to and including `last`, from the beginning or after those whose outputs are
-    /// `done`, and reads their outputs.
+    /// Runs the stages up to and including `last`, from the beginning or after those whose outputs
+    /// are `done`, and reads their outputs.
     ///
     /// # Errors
     /// The device fails, or the frame needs more than the device can hold at once.
@@ -101,8 +101,8 @@ impl Chain {
         Ok(())
     }
 
-    /// A frame that starts or ends in the middle is not drawn region by region: it must fit the device at
-    /// once.
+    /// A frame that starts or ends in the middle is not drawn region by region: it must fit the
+    /// device at once.
     fn check_room(&self, needs: Capacity) -> Result<(), RenderError> {
         let limit = self.limit();
         for (what, needed, limit) in [
@@ -117,7 +117,8 @@ impl Chain {
         Ok(())
     }
 
-    /// Uploads the outputs of another backend's stages to the buffers that this one's would have filled.
+    /// Uploads the outputs of another backend's stages to the buffers that this one's would have
+    /// filled.
     pub(super) fn fill(&mut self, outputs: &StageOutputs) -> Counts {
         let Self { device, splats, bin, .. } = self;
         let shapes: Vec<SplatShape> = outputs.splats.iter().map(shape).collect();
@@ -139,8 +140,8 @@ impl Chain {
         counts(outputs)
     }
 
-    /// Reads the outputs of the stages up to `last`. `sorted` is the index of the buffers of the sort of
-    /// splats that are in order.
+    /// Reads the outputs of the stages up to `last`. `sorted` is the index of the buffers of the
+    /// sort of splats that are in order.
     fn read(
         &self,
         sorted: usize,

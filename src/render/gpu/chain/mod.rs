@@ -1,11 +1,13 @@
-//! All stages on one device, in order, for all views of a step: one submission per region of a frame.
+//! All stages on one device, in order, for all views of a step: one submission per region of a
+//! frame.
 //!
-//! The device counts what a region needs and draws nothing if its buffers are too small, so nothing is
-//! read back in the middle of a frame. The host reads the counters after each submission; it then
-//! enlarges the buffers, or splits the region, and draws again (see [`super::partition`]).
+//! The device counts what a region needs and draws nothing if its buffers are too small, so nothing
+//! is read back in the middle of a frame. The host reads the counters after each submission; it
+//! then enlarges the buffers, or splits the region, and draws again (see [`super::partition`]).
 //!
-//! A frame that fits is submitted in its turn and waited for outside of it (`in_flight.rs`), so that the next frame
-//! is prepared meanwhile. Submissions run in order, so both may use the same intermediate buffers.
+//! A frame that fits is submitted in its turn and waited for outside of it (`in_flight.rs`), so
+//! that the next frame is prepared meanwhile. Submissions run in order, so both may use the same
+//! intermediate buffers.
 
 mod in_flight;
 mod intermediate;
@@ -180,8 +182,8 @@ impl Chain {
         current.into_mapped(&self.device, self.read_backs.clone())
     }
 
-    /// The needs of a region, and whether the buffers could hold it. If they could not, the next call of
-    /// [`Chain::reserve`] enlarges them, unless the device has no such buffers.
+    /// The needs of a region, and whether the buffers could hold it. If they could not, the next
+    /// call of [`Chain::reserve`] enlarges them, unless the device has no such buffers.
     fn evaluate(&mut self, counters: &Counters, parameters: &GpuFrame) -> (Capacity, bool) {
         let needs = needs(counters);
         let fits = fits(counters, parameters);
@@ -191,7 +193,8 @@ impl Chain {
         (needs, fits)
     }
 
-    /// Makes the next call of [`Chain::reserve`] enlarge the buffers, unless the device has none that are large enough.
+    /// Makes the next call of [`Chain::reserve`] enlarge the buffers, unless the device has none
+    /// that are large enough.
     fn note_overflow(&mut self, needs: Capacity) {
         self.tally.lock().retries += 1;
         tracing::debug!(?needs, "the buffers on the device are too small");
@@ -200,7 +203,8 @@ impl Chain {
         }
     }
 
-    /// Makes room for the largest needs until now, and writes the capacities to the frame's parameters.
+    /// Makes room for the largest needs until now, and writes the capacities to the frame's
+    /// parameters.
     fn reserve(&mut self, parameters: &mut GpuFrame, cluster_views: u32) {
         let Capacity { splats, touches, instances } = self.high_water;
         let device = &self.device;

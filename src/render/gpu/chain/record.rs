@@ -18,8 +18,8 @@ use crate::gpu::sort::{Columns, SortJobs};
 use crate::stage::Stage;
 
 impl Chain {
-    /// Records and submits all stages of a region that must still run. Returns the names of the stages in
-    /// order, and the submission.
+    /// Records and submits all stages of a region that must still run. Returns the names of the
+    /// stages in order, and the submission.
     pub(super) fn submit(
         &mut self,
         source: Source<'_>,
@@ -68,8 +68,8 @@ impl Chain {
         (stages, submission)
     }
 
-    /// Records the stages up to and including `last` that must still run. Returns which of the buffers of
-    /// the sort of splats are in order.
+    /// Records the stages up to and including `last` that must still run. Returns which of the
+    /// buffers of the sort of splats are in order.
     pub(super) fn record(
         &mut self,
         recorder: &mut Recorder,

@@ -1,5 +1,5 @@
-//! Drawing a frame region by region in its turn: one that does not fit the device at once, or whose buffers were too
-//! small.
+//! Drawing a frame region by region in its turn: one that does not fit the device at once, or whose
+//! buffers were too small.
 
 use std::ops::Range;
 use std::time::Instant;
@@ -59,8 +59,8 @@ impl Chain {
         add_time(&mut current.stats, "prepare", start.elapsed());
 
         // The regions that remain, in reverse order, so that the parts of a region take its place.
-        let key = PartitionKey::of(frame);
-        let rows = TileRows::of(frame);
+        let key = PartitionKey::from_frame(frame);
+        let rows = TileRows::from_frame(frame);
         let input = DrawInput { frame, actors: &actors, rows: &rows };
         let mut remaining = self.partitions.get(&key, &rows);
         remaining.reverse();
@@ -81,8 +81,8 @@ impl Chain {
         self.finish(current)
     }
 
-    /// Draws one region of a frame, or splits it if it exceeds a limit of the device. After drawing, the
-    /// read-back buffers are mapped.
+    /// Draws one region of a frame, or splits it if it exceeds a limit of the device. After
+    /// drawing, the read-back buffers are mapped.
     fn draw_or_split(
         &mut self,
         input: DrawInput<'_>,
@@ -105,7 +105,8 @@ impl Chain {
         Ok(RegionOutcome::Split(regions))
     }
 
-    /// Culls the clusters of a region and uploads what it needs, or splits it if it exceeds a limit that the host knows.
+    /// Culls the clusters of a region and uploads what it needs, or splits it if it exceeds a limit
+    /// that the host knows.
     pub(super) fn prepare_region(
         &mut self,
         input: DrawInput<'_>,
@@ -118,7 +119,7 @@ impl Chain {
         let views = rows.views(region);
         let tiles_of = |view: usize| {
             let columns = u64::from(current.parameters.view[view].columns);
-            columns * rows.of_view(view, region).len() as u64
+            columns * rows.for_view(view, region).len() as u64
         };
         let most_tiles = views.clone().map(tiles_of).max().unwrap_or(0);
         let count = most_tiles.div_ceil(self.device.max_view_tiles());
@@ -147,8 +148,9 @@ impl Chain {
         Ok(PreparedRegion::Ready(work, tiles))
     }
 
-    /// Draws some tiles. If the buffers are too small, the device draws nothing, and the host tries again with
-    /// larger ones. Returns the needs of the region. If that exceeds the limit, the pixels are not valid.
+    /// Draws some tiles. If the buffers are too small, the device draws nothing, and the host tries
+    /// again with larger ones. Returns the needs of the region. If that exceeds the limit, the
+    /// pixels are not valid.
     pub(super) fn draw_region(
         &mut self,
         source: Source<'_>,

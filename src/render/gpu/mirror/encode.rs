@@ -1,14 +1,14 @@
 //! Encoding of a cluster of Gaussians on the device.
 //!
-//! A cluster is a line of header, then structure-of-arrays blocks of 32 Gaussians. A line has 32 words
-//! (128 B, which a warp reads in one transaction), one word of each Gaussian of the block. The words of a
-//! Gaussian are: mean (3 x f32), scale (3 x f32), opacity (f32), a quaternion in 64 bits, and colours as
-//! 16-bit fractions of the cluster's largest value, two per word. That is 60 B per Gaussian at SH degree
-//! 1, and 0.5 B for the header of a full cluster.
+//! A cluster is a line of header, then structure-of-arrays blocks of 32 Gaussians. A line has 32
+//! words (128 B, which a warp reads in one transaction), one word of each Gaussian of the block.
+//! The words of a Gaussian are: mean (3 x f32), scale (3 x f32), opacity (f32), a quaternion in 64
+//! bits, and colours as 16-bit fractions of the cluster's largest value, two per word. That is 60 B
+//! per Gaussian at SH degree 1, and 0.5 B for the header of a full cluster.
 //!
-//! A cluster takes as many blocks as it has Gaussians for. Levels of detail have sections of a few hundred
-//! Gaussians; if each cluster took the size of a full one of 256, they would take 81 B per Gaussian
-//! instead of 63.
+//! A cluster takes as many blocks as it has Gaussians for. Levels of detail have sections of a few
+//! hundred Gaussians; if each cluster took the size of a full one of 256, they would take 81 B per
+//! Gaussian instead of 63.
 
 use std::ops::Range;
 
@@ -19,8 +19,8 @@ use wildcity_scene::{Chunk, sh};
 /// Bytes of a line.
 pub(super) const LINE_BYTES: u64 = 4 * SOA_BLOCK as u64;
 
-/// Base-2 logarithm of the opacity of a Gaussian that must never be visible. WGSL implementations may
-/// assume that no number is infinite, so minus infinity is not uploaded.
+/// Base-2 logarithm of the opacity of a Gaussian that must never be visible. WGSL implementations
+/// may assume that no number is infinite, so minus infinity is not uploaded.
 const INVISIBLE: f32 = -1e30;
 
 /// Most lines of a cluster: a header, and 8 blocks of 33 lines at SH degree 3.
@@ -45,8 +45,8 @@ pub(super) fn encode(chunk: &Chunk, index: usize, lines: &mut [u32]) {
     let (header, blocks) = lines.split_at_mut(BLOCK);
     let first = index * CLUSTER;
     let count = (chunk.len() - first).min(CLUSTER);
-    // The header: the scales of the colours (of the constant coefficients, and of all others), and the
-    // number of Gaussians.
+    // The header: the scales of the colours (of the constant coefficients, and of all others), and
+    // the number of Gaussians.
     let largest = |range: Range<usize>| {
         let of = |i| range.clone().map(move |c| chunk.value(first + i, column::SH + c).abs());
         (0..count).flat_map(of).fold(0.0, f32::max).max(f32::MIN_POSITIVE)
@@ -80,11 +80,11 @@ pub(super) fn encode(chunk: &Chunk, index: usize, lines: &mut [u32]) {
     }
 }
 
-/// Encodes a unit quaternion in 62 bits: the index of the largest component, and the other three, whose
-/// absolute values are at most √½, in 20 bits each.
+/// Encodes a unit quaternion in 62 bits: the index of the largest component, and the other three,
+/// whose absolute values are at most √½, in 20 bits each.
 ///
-/// Components are off by at most 7e-7: the end of a needle of 10,000 px moves by less than 0.01 px. With
-/// 16 bits for each of the four components it would move by 0.2 px.
+/// Components are off by at most 7e-7: the end of a needle of 10,000 px moves by less than 0.01 px.
+/// With 16 bits for each of the four components it would move by 0.2 px.
 fn quat_bits(wxyz: [f32; 4]) -> [u32; 2] {
     let mut index = 0;
     for k in 1..4 {

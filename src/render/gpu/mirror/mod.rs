@@ -1,13 +1,14 @@
-//! The mirror: the device's copy of the Gaussians in main memory, encoded (`encode.rs`) and uploaded
-//! once.
+//! The mirror: the device's copy of the Gaussians in main memory, encoded (`encode.rs`) and
+//! uploaded once.
 //!
-//! The mirror consists of pages, one buffer each, whose free lines are allocated cluster by cluster. A
-//! chunk that main memory drops is dropped here too. If there is a limit, the least recently drawn chunks
-//! are evicted to make room. If a scene would fit but its clusters do not fit between others
-//! (fragmentation), everything is evicted and uploaded again.
+//! The mirror consists of pages, one buffer each, whose free lines are allocated cluster by
+//! cluster. A chunk that main memory drops is dropped here too. If there is a limit, the least
+//! recently drawn chunks are evicted to make room. If a scene would fit but its clusters do not fit
+//! between others (fragmentation), everything is evicted and uploaded again.
 //!
-//! A page is made as large as the missing clusters of the frame, or a quarter of the mirror, so that a
-//! twin that is streamed section by section does not end with one page, and one dispatch, per section.
+//! A page is made as large as the missing clusters of the frame, or a quarter of the mirror, so
+//! that a twin that is streamed section by section does not end with one page, and one dispatch,
+//! per section.
 
 mod encode;
 mod free_lines;
@@ -53,7 +54,8 @@ struct Page {
 }
 
 impl Page {
-    /// Frees the memory once the frames on the device are done: bind groups of earlier frames would keep it.
+    /// Frees the memory once the frames on the device are done: bind groups of earlier frames would
+    /// keep it.
     fn free(self) {
         self.buffer.destroy();
     }
@@ -90,7 +92,8 @@ impl Mirror {
         }
     }
 
-    /// Uploads the chunks of a scene that are not resident yet. Drops those that main memory has dropped.
+    /// Uploads the chunks of a scene that are not resident yet. Drops those that main memory has
+    /// dropped.
     ///
     /// # Errors
     /// [`RenderError::DeviceMemory`] if the scene by itself exceeds the limit.
@@ -107,7 +110,7 @@ impl Mirror {
             self.by_last_frame.clear();
             self.pages.drain(..).flatten().for_each(Page::free);
             self.add_missing(device, scene).map_err(|Full| RenderError::DeviceMemory {
-                needed_bytes: scene.distinct_chunks().map(|chunk| lines_of(chunk)).sum::<u64>()
+                needed_bytes: scene.distinct_chunks().map(|chunk| needed_lines(chunk)).sum::<u64>()
                     * LINE_BYTES,
                 limit_bytes: self.limit_bytes,
             })?;
@@ -144,7 +147,7 @@ impl Mirror {
                 None => missing.push(chunk),
             }
         }
-        let mut needed = missing.iter().map(|chunk| lines_of(chunk)).sum();
+        let mut needed = missing.iter().map(|chunk| needed_lines(chunk)).sum();
         for chunk in missing {
             let mut places = Vec::with_capacity(chunk.clusters().len());
             for lines in encode::lines(chunk) {
@@ -167,8 +170,9 @@ impl Mirror {
         Ok(())
     }
 
-    /// Allocates consecutive lines: of an existing page, of a new page, or after evicting chunks that this
-    /// frame does not draw. `needed` is the number of lines that the frame still has to allocate.
+    /// Allocates consecutive lines: of an existing page, of a new page, or after evicting chunks
+    /// that this frame does not draw. `needed` is the number of lines that the frame still has to
+    /// allocate.
     fn allocate(
         &mut self,
         device: &Device,
@@ -187,8 +191,9 @@ impl Mirror {
         }
     }
 
-    /// Adds a page that has room for a cluster of `lines` and, as far as the device and the limit allow,
-    /// for `needed` lines or a quarter of the mirror, whichever is more. Returns whether it could.
+    /// Adds a page that has room for a cluster of `lines` and, as far as the device and the limit
+    /// allow, for `needed` lines or a quarter of the mirror, whichever is more. Returns whether it
+    /// could.
     fn add_page(&mut self, device: &Device, lines: u32, needed: u64) -> bool {
         let held = self.bytes();
         let wanted = needed.max(held / 4 / LINE_BYTES);
@@ -251,8 +256,8 @@ impl Mirror {
         }
     }
 
-    /// Encodes a chunk's clusters in parallel, and uploads them. Clusters on consecutive lines are uploaded
-    /// together, up to [`UPLOAD_LINES`].
+    /// Encodes a chunk's clusters in parallel, and uploads them. Clusters on consecutive lines are
+    /// uploaded together, up to [`UPLOAD_LINES`].
     fn upload(&self, device: &Device, chunk: &Chunk, places: &[ClusterLocation]) {
         let mut next_cluster = 0;
         for run in places.chunk_by(|a, b| a.page == b.page && a.lines.end == b.lines.start) {
@@ -286,6 +291,6 @@ fn address(chunk: &Arc<Chunk>) -> usize {
     Arc::as_ptr(chunk) as usize
 }
 
-fn lines_of(chunk: &Chunk) -> u64 {
+fn needed_lines(chunk: &Chunk) -> u64 {
     encode::lines(chunk).map(u64::from).sum()
 }

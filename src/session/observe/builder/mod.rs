@@ -375,8 +375,8 @@ struct ImageToEncode<'a> {
     is_shown_later: bool,
 }
 
-/// The hash and the file of a camera's image after the effects on its pixels; for raw pixels a copy if there are
-/// effects, and another copy if a later observation shows them.
+/// The hash and the file of a camera's image after the effects on its pixels; for raw pixels a copy
+/// if there are effects, and another copy if a later observation shows them.
 fn encoded(
     layout: &ObservationLayout,
     image: ImageToEncode<'_>,
