@@ -90,7 +90,13 @@ impl Kid {
             let all = |set: &[Vec<f32>]| (0..set.len()).collect::<Vec<usize>>();
             let mean = squared_mmd(a, &all(a), b, &all(b));
             let subset_size = fewest;
-            return Ok(Self { mean, standard_deviation: 0.0, subsets: 1, subset_size, seed: SEED });
+            return Ok(Self {
+                mean: mean_distance,
+                standard_deviation: 0.0,
+                subsets: 1,
+                subset_size,
+                seed: SEED,
+            });
         }
         let subset_size = fewest.min(most);
         let mut random = SplitMix64(SEED);
@@ -100,9 +106,15 @@ impl Kid {
             let of_b = random.choose(subset_size, b.len());
             values.push(squared_mmd(a, &of_a, b, &of_b));
         }
-        let mean = mean(values.iter().copied());
-        let variance = mean(values.iter().map(|value| (value - mean).powi(2)));
-        Ok(Self { mean, standard_deviation: variance.sqrt(), subsets, subset_size, seed: SEED })
+        let mean_distance = mean(values.iter().copied());
+        let variance = mean(values.iter().map(|value| (value - mean_distance).powi(2)));
+        Ok(Self {
+            mean: mean_distance,
+            standard_deviation: variance.sqrt(),
+            subsets,
+            subset_size,
+            seed: SEED,
+        })
     }
 }
 

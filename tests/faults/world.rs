@@ -82,7 +82,7 @@ fn provenance() -> Provenance {
 }
 
 /// The cells of a bit mask, of a content.
-fn cells(mask: u8, content: u64) -> Cells {
+fn masked_cells(mask: u8, content: u64) -> Cells {
     (0..3).filter(|cell| mask & (1 << cell) != 0).map(|cell| ([cell, 0], content)).collect()
 }
 
@@ -101,7 +101,7 @@ fn gaussians(cells: &Cells) -> Gaussians {
     gaussians
 }
 
-fn content(version: &Version) -> Cells {
+fn version_cells(version: &Version) -> Cells {
     version.manifest.chunks.iter().map(|chunk| (chunk.cell, chunk.count)).collect()
 }
 
@@ -172,8 +172,8 @@ impl World {
     fn carry_out(&mut self, operation: Operation) -> Result<(), Failed> {
         match operation {
             Operation::Read { back } => return self.read(back),
-            Operation::Push { cells, content } => self.push(&cells(cells, content)),
-            Operation::Prepare { cells, content } => self.prepare(cells(cells, content)),
+            Operation::Push { cells, content } => self.push(&masked_cells(cells, content)),
+            Operation::Prepare { cells, content } => self.prepare(masked_cells(cells, content)),
             Operation::PublishPrepared => self.publish_prepared(),
             Operation::Rollback { back } => self.rollback(back),
             Operation::Open { back } => self.open_session(back),
@@ -249,14 +249,14 @@ impl World {
             result => result?,
         };
         if !self.medium.is_stopped() {
-            let found = content(&version);
+            let found = version_cells(&version);
             // The version of a stopped process may have arrived, and have what the commit makes
             // already.
             let has_all = |cells: &Cells| *cells == found && content(cells) == found;
             let cells = match version.number {
                 _ if below.iter().any(has_all) => found,
                 number if number <= before + 1 => content(base),
-                number => content(&content(&self.catalog.version(TWIN, Some(number - 1))?)),
+                number => content(&version_cells(&self.catalog.version(TWIN, Some(number - 1))?)),
             };
             self.acknowledged.insert(version.number, cells);
         }
@@ -266,7 +266,7 @@ impl World {
     fn push(&mut self, cells: &Cells) -> Result<(), StoreError> {
         let latest = self.latest()?;
         let before = latest.as_ref().map_or(0, |version| version.number);
-        let base = latest.as_ref().map(content).unwrap_or_default();
+        let base = latest.as_ref().map(version_cells).unwrap_or_default();
         let gaussians = gaussians(cells);
         // A new twin replaces what another process has made of that name meanwhile.
         let content =
@@ -299,7 +299,7 @@ impl World {
         let Some(latest) = self.latest()? else { return Ok(()) };
         let published = self.commit(
             latest.number,
-            &content(&latest),
+            &version_cells(&latest),
             |below| merged(below, &cells),
             |_| commit.change(base, cells_alone()),
         );
@@ -316,7 +316,7 @@ impl World {
         let Some(number) = self.number_before_latest(back)? else { return Ok(()) };
         let latest = self.catalog.latest(TWIN)?;
         let content = match self.catalog.version(TWIN, Some(number)) {
-            Ok(version) => content(&version),
+            Ok(version) => version_cells(&version),
             Err(StoreError::GarbageCollected { .. }) if self.collectable.contains(&number) => {
                 return Ok(());
             }
@@ -335,7 +335,7 @@ impl World {
             }
             Err(error) => return Err(error),
         };
-        let cells = content(&self.catalog.version(TWIN, Some(number))?);
+        let cells = version_cells(&self.catalog.version(TWIN, Some(number))?);
         self.sessions.push(Session { number, cells, lease });
         Ok(())
     }
@@ -436,7 +436,7 @@ impl World {
                 Failed::Refused(error) => format!("a session's version {number}: {error}"),
                 Failed::Broken(promise) => promise,
             })?;
-            if content(&version) != *cells {
+            if version_cells(&version) != *cells {
                 return Err(format!("a session's version {number} changed"));
             }
         }
@@ -463,7 +463,7 @@ impl World {
                 }
                 version => version.map_err(|e| format!("version {number}: {e}"))?,
             };
-            let content = content(&version);
+            let content = version_cells(&version);
             let is_possible = match self.acknowledged.get(&number) {
                 Some(told) => *told == content,
                 None => self

@@ -152,7 +152,7 @@ fn counts_that_no_file_holds_are_refused_before_memory_is_allocated() {
 }
 
 /// The error of a scene of several files, one of which was changed.
-fn refusal(files: &Files, part: &str, change: &dyn Fn(&mut Vec<u8>)) -> String {
+fn part_refusal(files: &Files, part: &str, change: &dyn Fn(&mut Vec<u8>)) -> String {
     let dir = tempfile::tempdir().unwrap();
     for (name, bytes) in files {
         let mut bytes = bytes.clone();
@@ -179,7 +179,7 @@ fn text_change(from: &str, to: &str) -> impl Fn(&mut Vec<u8>) {
 #[test]
 fn a_sog_that_contradicts_itself_is_named_by_file() {
     let files = sog(&gaussians(COUNT, 1, 20.0, 1), 2);
-    let meta = |from: &str, to: &str| refusal(&files, "meta.json", &text_change(from, to));
+    let meta = |from: &str, to: &str| part_refusal(&files, "meta.json", &text_change(from, to));
     let many = format!(r#""count":{}"#, 1u64 << 60);
     for (text, wanted) in [
         (meta(r#""version":2"#, r#""version":3"#), "SOG header, meta.json: version 3; 2, and 1"),
@@ -217,15 +217,16 @@ fn a_sog_that_contradicts_itself_is_named_by_file() {
     ] {
         assert!(text.starts_with(wanted), "{text}\n{wanted}");
     }
-    let image =
-        |name: &str, pixels: &[[u8; 4]]| refusal(&files, name, &|bytes| *bytes = webp(pixels, 4));
+    let image = |name: &str, pixels: &[[u8; 4]]| {
+        part_refusal(&files, name, &|bytes| *bytes = webp(pixels, 4))
+    };
     let text = image("quats.webp", &[[0, 0, 0, 251]; 6]);
     assert!(text.starts_with("SOG body, quats.webp: Gaussian 0: alpha is 251"), "{text}");
-    let text = refusal(&files, "quats.webp", &|bytes| *bytes = b"no image".to_vec());
+    let text = part_refusal(&files, "quats.webp", &|bytes| *bytes = b"no image".to_vec());
     assert!(text.starts_with("SOG body, quats.webp: is a damaged WebP image: "), "{text}");
 
     let files = streamed();
-    let meta = |from: &str, to: &str| refusal(&files, "lod-meta.json", &text_change(from, to));
+    let meta = |from: &str, to: &str| part_refusal(&files, "lod-meta.json", &text_change(from, to));
     for (text, wanted) in [
         (
             meta(r#""file":1,"offset":0"#, r#""file":9,"offset":0"#),

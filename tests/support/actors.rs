@@ -5,7 +5,9 @@
 use std::sync::Arc;
 
 use glam::{DQuat, DVec3};
-use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, gaussians, scene};
+use wildcity_render::compare::gaussians::{
+    GaussianSpec, forward_view, gaussians_from_specs, scene_from_specs,
+};
 use wildcity_render::{
     Backend, FIRST_ACTOR_INSTANCE, Frame, Readout, RollingShutter, TWIN_INSTANCE, Target, View,
 };
@@ -316,7 +318,7 @@ fn through(backend: &dyn Backend, layers: &[[f64; 2]]) -> (u16, f64) {
             twin.push(GaussianSpec { mean_m: at_m, ..wide });
             continue;
         }
-        let chunk = chunk(&gaussians(&[GaussianSpec { mean_m: DVec3::ZERO, ..wide }]));
+        let chunk = chunk(&gaussians_from_specs(&[GaussianSpec { mean_m: DVec3::ZERO, ..wide }]));
         let pose = Pose { position_m: at_m, ..Pose::IDENTITY };
         placed.push(PlacedChunk::at_rest(chunk, pose, id as u16 - FIRST_ACTOR_INSTANCE));
     }

@@ -1,7 +1,7 @@
 //! A camera of every model, and checks of its images.
 
 use glam::{DQuat, DVec2, DVec3};
-use wildcity_render::compare::gaussians::{GaussianSpec, scene};
+use wildcity_render::compare::gaussians::{GaussianSpec, scene_from_specs};
 use wildcity_render::compare::reprojection::centroid;
 use wildcity_render::layout::PixelFilter;
 use wildcity_render::reference;
@@ -106,7 +106,7 @@ pub(crate) fn check_projections(
         }
         let ball = GaussianSpec { mean_m, sigma_m: DVec3::splat(0.003), ..GaussianSpec::default() };
         let view = View::new(camera, Pose::IDENTITY);
-        let image = render_one(backend, &scene(&[ball]), &fine, view);
+        let image = render_one(backend, &scene_from_specs(&[ball]), &fine, view);
         let found_px = centroid(&image.opacity, size_px, at_px, f64::INFINITY);
         let off_px = found_px.unwrap_or(DVec2::INFINITY).distance(at_px);
         // Samples at pixel centres move the centroid of a thin splat by up to 4π σ² exp(-2π² σ²)

@@ -251,9 +251,9 @@ fn the_source_has_no_dialect() {
             }
         }
     }
-    println!("{:52} {lines:>6}", "lines");
-    println!("{:52} {:>6.1} per cent", "plain comments", 100.0 * plain as f64 / lines as f64);
-    rows.iter().for_each(|row| println!("{row}"));
+    eprintln!("{:52} {lines:>6}", "lines");
+    eprintln!("{:52} {:>6.1} per cent", "plain comments", 100.0 * plain as f64 / lines as f64);
+    rows.iter().for_each(|row| eprintln!("{row}"));
     let over = |row: &&Row| row.places.len() > row.most;
     let wrong: Vec<String> = rows
         .iter()

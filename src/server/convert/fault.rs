@@ -42,7 +42,7 @@ pub(crate) fn http_status(fault: &Fault) -> StatusCode {
         Fault::NoUpgrade => StatusCode::UPGRADE_REQUIRED,
         Fault::NoRoute { .. } => StatusCode::NOT_FOUND,
         Fault::NoMethod { .. } => StatusCode::METHOD_NOT_ALLOWED,
-        fault => http_status(wire_fault(fault).code),
+        fault => code_status(wire_fault(fault).code),
     }
 }
 
@@ -110,7 +110,7 @@ fn cells_of_session(error: &SessionError) -> &[[i32; 2]] {
 
 /// The HTTP status of a code. Codes that only occur over WebSocket have a status as well, so that a
 /// new HTTP route can answer with any code.
-fn http_status(code: Code) -> StatusCode {
+fn code_status(code: Code) -> StatusCode {
     match code {
         Code::MalformedJson
         | Code::InvalidRequest
@@ -480,7 +480,7 @@ mod tests {
         for variant in variants {
             let code: Code = serde_json::from_value(variant["const"].clone()).unwrap();
             let name = variant["const"].as_str().expect("a text").to_owned();
-            table.push((name, http_status(code).as_u16()));
+            table.push((name, code_status(code).as_u16()));
         }
         table.sort();
         assert_eq!(rows, table);
