@@ -90,13 +90,7 @@ impl Kid {
             let all = |set: &[Vec<f32>]| (0..set.len()).collect::<Vec<usize>>();
             let mean = squared_mmd(a, &all(a), b, &all(b));
             let subset_size = fewest;
-            return Ok(Self {
-                mean: mean_distance,
-                standard_deviation: 0.0,
-                subsets: 1,
-                subset_size,
-                seed: SEED,
-            });
+            return Ok(Self { mean, standard_deviation: 0.0, subsets: 1, subset_size, seed: SEED });
         }
         let subset_size = fewest.min(most);
         let mut random = SplitMix64(SEED);
