@@ -46,7 +46,7 @@ impl Bisect {
         let mut wrong = None;
         for shot in &ready.shots {
             let views = std::slice::from_ref(&shot.view);
-            let scene = ready.scene(shot)?;
+            let scene = ready.shot_scene(shot)?;
             let frame = Frame { scene: &scene, profile: &shot.profile, views };
             let bisection = bisect(&cpu, &gpu, &frame)?;
             write!(out, "{:<12}", shot.name)?;

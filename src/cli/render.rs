@@ -59,7 +59,7 @@ impl Render {
         let mut out = io::stdout().lock();
         for shot in &ready.shots {
             let pixels = shot.view.camera.pixels();
-            let scene = ready.scene(shot)?;
+            let scene = ready.shot_scene(shot)?;
             let frame = Frame {
                 scene: &scene,
                 profile: &shot.profile,

@@ -141,12 +141,12 @@ impl Source {
 
 impl LoadedScene {
     /// The scene of a frame that has one shot.
-    pub(super) fn scene(&self, shot: &Shot) -> anyhow::Result<FrameScene<'_>> {
+    pub(super) fn shot_scene(&self, shot: &Shot) -> anyhow::Result<FrameScene<'_>> {
         self.source.scene(&[shot.view], &shot.profile)
     }
 
     /// The scene of a frame that has all shots.
-    pub(super) fn scene(&self) -> anyhow::Result<FrameScene<'_>> {
+    pub(super) fn whole_scene(&self) -> anyhow::Result<FrameScene<'_>> {
         let views: Vec<View> = self.shots.iter().map(|shot| shot.view).collect();
         let profile = self.shots.first().map_or(RenderProfile::DEFAULT, |shot| shot.profile);
         self.source.scene(&views, &profile)

@@ -52,7 +52,7 @@ impl Step {
                 ready.shots[0].name
             );
         }
-        let scene = ready.scene()?;
+        let scene = ready.whole_scene()?;
         let frame = Frame { scene: &scene, profile: &profile, views: &views };
         // The first frame allocates buffers, and is not counted.
         time(&*backend, &frame, 1, "rendering")?;
