@@ -39,10 +39,10 @@ impl Bench {
 
     /// Runs `suite.json` into the folder `out`.
     fn run(&self, agent: &str, out: &str, more: &[&str]) -> Output {
-        self.run("suite.json", agent, out, more).output().unwrap()
+        self.run_suite("suite.json", agent, out, more).output().unwrap()
     }
 
-    fn run(&self, suite: &str, agent: &str, out: &str, more: &[&str]) -> Command {
+    fn run_suite(&self, suite: &str, agent: &str, out: &str, more: &[&str]) -> Command {
         let mut command = self.episode(&["run", suite, "--agent", agent, "--out", out]);
         let twins = self.twins.path().to_str().unwrap();
         command.args(["--twins", twins, "--backend", "cpu", "--threads", "1"]).args(more);
@@ -223,7 +223,7 @@ fn agents_and_suites_that_are_none_are_refused() {
         assert!(ends(&refused, 2).1.contains(wanted), "{}", text(&refused.stderr));
     }
     bench.write("roof.json", &suite(json!({ "cameras": ["roof"] })));
-    let refused = bench.run("roof.json", "log", "refused", &[]).output().unwrap();
+    let refused = bench.run_suite("roof.json", "log", "refused", &[]).output().unwrap();
     let (_, error) = ends(&refused, 2);
     assert!(
         error.contains("roof.json: cameras[0]: \"roof\" is no camera of twin \"test\""),
@@ -238,7 +238,7 @@ fn a_driver_that_does_not_listen_is_waited_for_aloud() {
     // A port that was free a moment ago.
     let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
     let agent = format!("egodriver:127.0.0.1:{port}");
-    let mut command = bench.run("suite.json", &agent, "out", &[]);
+    let mut command = bench.run_suite("suite.json", &agent, "out", &[]);
     let mut running = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
     let mut line = String::new();
     BufReader::new(running.stderr.take().unwrap()).read_line(&mut line).unwrap();
