@@ -31,7 +31,7 @@ pub(super) fn print(file: &Path, notes: &FileNotes) -> io::Result<()> {
             counted(count, "Gaussian")
         )?;
     }
-    if let Some(Antialiasing { blur_px2, said_by }) = &notes.antialiasing {
+    if let Some(Antialiasing { blur_px2: Some(blur_px2), said_by }) = &notes.antialiasing {
         writeln!(
             out,
             "note: {file}: {said_by}: the render profile has antialiased=true and blur={blur_px2}, unless --set changes it"

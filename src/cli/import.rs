@@ -11,7 +11,7 @@ use wildcity_push::{SourceAxes, SourceScene, provenance, read_scene};
 use wildcity_scene::geo::GeoAnchor;
 use wildcity_scene::rig::is_name;
 use wildcity_scene::{RecordFormat, RenderProfile};
-use wildcity_twin::store::{NewSky, NewVersion, StorageOptions, StoreError};
+use wildcity_twin::store::{Catalog, NewSky, NewVersion, StorageOptions, StoreError, Version};
 
 use super::directories::Twins;
 use super::file_notes::{self, DropBad};
@@ -59,13 +59,15 @@ pub(super) struct Import {
     /// y-up-z-back: OpenGL, SPZ.
     /// y-up-z-forward: Unity, left-handed.
     ///
-    /// Default: the axes that the file records, as an SPZ may; else identity.
+    /// Default: the axes that the file records, as an SPZ may; else those of the twin's latest
+    /// version; else those of the format's specification (SPZ); else identity.
     #[arg(long, value_name = "AXES", allow_hyphen_values = true, verbatim_doc_comment)]
     axes: Option<String>,
 
-    /// Metres per unit of the file, applied after --axes.
-    #[arg(long, default_value_t = 1.0, allow_negative_numbers = true)]
-    scale: f64,
+    /// Metres per unit of the file, applied after --axes [default: that of the twin's latest
+    /// version, or 1]
+    #[arg(long, allow_negative_numbers = true)]
+    scale: Option<f64>,
 
     /// The vehicle's cameras: a preset (see `wildcity rig show`) or a JSON file (see below). They
     /// become the twin's default rig. A version that is imported without this option has no default
@@ -122,8 +124,8 @@ Formats, and their usual axes. Files of one format differ, so render the twin to
   glTF, GLB           KHR_gaussian_splatting, with the transforms of its    '-1 0 0 0 0 1 0 1 0'
                       nodes; the standard has x left, y up, z to the front.
                       Also compressed as SPZ
-  glTF, GLB of        triangles are covered with 200,000 flat Gaussians     the same
-  ordinary meshes     in their base colour
+  glTF, GLB of        triangles are covered with about 200,000 flat         the same
+  ordinary meshes     Gaussians in their base colour
   NuRec (.usdz)       NVIDIA; static content only. Axes are the payload's,  y-down-z-forward
                       without the transforms of the USD layers around it
 
@@ -150,21 +152,31 @@ impl Import {
         if !is_name(&self.twin) {
             return Err(StoreError::Name { name: self.twin }.into());
         }
-        let axes = SourceAxes::given(self.axes.as_deref(), Some(self.scale))?;
+        let axes = SourceAxes::given(self.axes.as_deref(), self.scale)?;
+        let catalog = self.twins.catalog()?;
+        let latest = self.latest(&catalog, &axes)?;
+        let default_axes = match &latest {
+            Some(latest) if !axes.is_complete() => SourceAxes::from_version(latest)
+                .map_err(anyhow::Error::msg)
+                .with_context(|| format!("twin {} version {}", self.twin, latest.number))?,
+            _ => SourceAxes::default(),
+        };
         let changes = self.profile.load()?;
         changes.apply(RenderProfile::default())?;
-        let given_axes = self.axes.as_deref().unwrap_or("identity");
-        let sky = self.sky.read(given_axes)?;
+        let expected = if self.axes.is_some() { &axes } else { &default_axes };
+        let [expected_axes, _] = expected.options();
+        let expected_axes = expected_axes.trim_start_matches("axes=");
+        let sky = self.sky.read(expected_axes)?;
         let rig = self.rig.as_deref().map(find_rig).transpose()?;
         let trajectories = read_trajectories(&self.trajectory)?;
-        let catalog = self.twins.catalog()?;
         let source = scene_file(self.source)?;
 
         // 2. The scene.
         let cannot = || format!("cannot import {}", source.display());
         let mut phases = Phases::start();
         let bar = progress::bytes("reading");
-        let read = read_scene(&source, &axes, self.bad.drop_bad, &mut progress::show(&bar));
+        let show = &mut progress::show(&bar);
+        let read = read_scene(&source, &axes, &default_axes, self.bad.drop_bad, show);
         let read = file_notes::explained(read).with_context(cannot)?;
         let SourceScene { gaussians, hash, options, notes, .. } = read;
         bar.finish_and_clear();
@@ -173,7 +185,14 @@ impl Import {
         let profile = notes.profile().apply(RenderProfile::default())?;
         let profile = changes.apply(profile)?;
         let used_axes = options[0].trim_start_matches("axes=").to_owned();
-        let sky = if used_axes == given_axes { sky } else { self.sky.read(&used_axes)? };
+        let used_scale = options[1].trim_start_matches("scale=").to_owned();
+        if self.axes.is_none() && notes.axes.is_none() && used_axes == "identity" {
+            writeln!(
+                std::io::stderr(),
+                "note: axes=identity; most captures need --axes y-down-z-forward, and glTF --axes '-1 0 0 0 0 1 0 1 0'"
+            )?;
+        }
+        let sky = if used_axes == expected_axes { sky } else { self.sky.read(&used_axes)? };
         if gaussians.is_empty() {
             let source = source.display();
             writeln!(
@@ -208,11 +227,20 @@ impl Import {
         // The file passed its checks, so a Gaussian that is refused now was changed by the options.
         let version = version.map_err(|error| match error {
             StoreError::Gaussians(error) => anyhow::Error::new(error)
-                .context(format!("after --axes {used_axes:?} --scale {}", self.scale)),
+                .context(format!("after --axes {used_axes:?} --scale {used_scale}")),
             error => error.into(),
         });
         let version = version.with_context(cannot)?;
         bar.finish_and_clear();
+        if let Some(latest) = latest
+            && latest.manifest.alignment()?.is_some()
+        {
+            writeln!(
+                std::io::stderr(),
+                "warning: version {} of the twin was aligned, and this one is not: `wildcity twin align` aligns it",
+                latest.number
+            )?;
+        }
         phases.end("publish");
         writeln!(std::io::stderr(), "{phases}")?;
 
@@ -238,6 +266,17 @@ impl Import {
             version.hash,
         )?;
         Ok(())
+    }
+
+    /// The twin's latest version, whose axes and scale are those that are not given.
+    fn latest(&self, catalog: &Catalog, given: &SourceAxes) -> anyhow::Result<Option<Version>> {
+        match catalog.version(&self.twin, None) {
+            Ok(latest) => Ok(Some(latest)),
+            Err(StoreError::NoTwin { .. }) => Ok(None),
+            // An import mends a twin whose latest version is damaged.
+            Err(_) if given.is_complete() => Ok(None),
+            Err(error) => Err(error.into()),
+        }
     }
 }
 

@@ -67,31 +67,8 @@ pub(crate) fn default_axes(
         return Ok(SourceAxes::default());
     };
     let Some(base) = find_base(catalog, request)? else { return Ok(SourceAxes::default()) };
-    let options = &base.manifest.provenance.options;
-    // The options list one axes and one scale for each file of the base, mostly equal ones. Only
-    // neighbours are merged: `a b a` stays ambiguous, as it should.
-    let found = |key: &str| {
-        let mut found: Vec<&str> =
-            options.iter().filter_map(|option| option.strip_prefix(key)).collect();
-        found.dedup();
-        found
-    };
-    let (axes, scales) = (found("axes="), found("scale="));
-    if axes.len() > 1 || scales.len() > 1 {
-        return Err(PushError::InvalidField {
-            field: format!("files[{index}].axes"),
-            reason: format!(
-                "give axes and scale: the twin was made from files of different ones ({})",
-                options.join(" ")
-            ),
-        });
-    }
-    // A base that was not imported from a file, such as a generated one, has neither option.
-    let scale = scales.first().and_then(|scale| scale.parse().ok());
-    SourceAxes::given(axes.first().copied(), scale).map_err(|error| PushError::InvalidField {
-        field: format!("files[{index}].axes"),
-        reason: format!("give axes and scale: those of the twin cannot be read: {error}"),
-    })
+    SourceAxes::from_version(&base)
+        .map_err(|reason| PushError::InvalidField { field: format!("files[{index}].axes"), reason })
 }
 
 /// The base version of a push; `None` if the push makes a new twin.

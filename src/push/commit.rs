@@ -41,18 +41,24 @@ pub(crate) fn merge_profile(
     };
     let profile = profile_with(own, &request.profile).map_err(StoreError::from)?;
     let is_asked = |key: &str| request.profile.iter().any(|setting| setting.starts_with(key));
-    // The files agree with the profile if applying their settings changes nothing. A setting that
-    // the client gave itself is no surprise either, so it gives no warning.
-    let is_right = of_files.apply(profile).map_err(StoreError::from)? == profile
-        || is_asked("antialiased=")
-        || is_asked("blur=");
-    let warning = antialiasing.filter(|_| !is_right).map(|Antialiasing { blur_px2, said_by }| {
-        format!(
-            "{said_by}: the scene was trained with antialiased=true and blur={blur_px2}, and the twin is rendered with \
-             antialiased={} and blur={}; if its other cells were trained so, too, push with --set antialiased=true --set \
-             blur={blur_px2}",
-            profile.antialiased, profile.blur
-        )
+    let is_asked = is_asked("antialiased=") || is_asked("blur=");
+    let warning = antialiasing.filter(|_| !is_asked).and_then(|said| {
+        let Antialiasing { blur_px2, said_by } = said;
+        let antialiased = profile.antialiased;
+        let blur = profile.blur;
+        match *blur_px2 {
+            Some(blur_px2) if !antialiased || blur != blur_px2 => Some(format!(
+                "{said_by}: the scene was trained with antialiased=true and blur={blur_px2}, and the twin is rendered with \
+                 antialiased={antialiased} and blur={blur}; if its other cells were trained so, too, push with \
+                 --set antialiased=true --set blur={blur_px2}"
+            )),
+            None if antialiased => Some(format!(
+                "{said_by}: the scene was trained without anti-aliasing, and the twin is rendered with \
+                 antialiased=true and blur={blur}; if its other cells were trained so, too, push with \
+                 --set antialiased=false"
+            )),
+            _ => None,
+        }
     });
     Ok((profile, warning))
 }

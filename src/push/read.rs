@@ -22,7 +22,8 @@ pub(crate) struct PushedScene {
     pub(crate) hashes: Vec<String>,
     /// The axes and scale of each file.
     pub(crate) options: Vec<String>,
-    /// How the files say that they were trained.
+    /// How the files say that they were trained; of different ones, that of the first with
+    /// anti-aliasing.
     pub(crate) antialiasing: Option<Antialiasing>,
     pub(crate) report: PushReport,
 }
@@ -109,6 +110,7 @@ pub(crate) fn read(
     reader.join_read(files.len())?;
 
     let mut scene = reader.scene;
+    scene.antialiasing = common_antialiasing(&mut scene.report.files, &reader.antialiasing);
     scene.report.sh_degree = scene.gaussians.sh_degree;
     scene.report.ranges = Ranges::from_gaussians(&scene.gaussians);
     // The report is set before the check for emptiness, because its warnings may say why.
@@ -134,6 +136,8 @@ struct Reader<'a> {
     parts: BTreeSet<String>,
     /// Scenes that are not joined yet, by index of their file.
     read: BTreeMap<usize, SourceScene>,
+    /// How each scene of the report says that it was trained.
+    antialiasing: Vec<Option<Antialiasing>>,
     /// Index of the next file to join.
     next: usize,
     scene: PushedScene,
@@ -167,6 +171,7 @@ impl<'a> Reader<'a> {
             read_bytes: 0,
             parts: BTreeSet::new(),
             read: BTreeMap::new(),
+            antialiasing: Vec::new(),
             next: 0,
             scene: PushedScene {
                 gaussians: Gaussians::default(),
@@ -248,7 +253,7 @@ impl<'a> Reader<'a> {
             let name = &self.files[*entry.key()].name;
             let SourceScene { gaussians, hash, options, notes, .. } = entry.remove();
             let scene = &mut self.scene;
-            scene.antialiasing = scene.antialiasing.take().or(notes.antialiasing);
+            self.antialiasing.push(notes.antialiasing);
             let count = gaussians.len() as u64;
             scene.report.gaussians += count;
             scene.report.files.push(FileReport {
@@ -277,6 +282,36 @@ impl<'a> Reader<'a> {
     }
 }
 
+/// How the files say that they were trained. All Gaussians of a twin are drawn alike, so that files
+/// which say something else than the one that counts get a warning.
+fn common_antialiasing(
+    files: &mut [FileReport],
+    said: &[Option<Antialiasing>],
+) -> Option<Antialiasing> {
+    let is_on = |(_, said): &(usize, &Antialiasing)| said.blur_px2.is_some();
+    let all = || said.iter().enumerate().filter_map(|(i, said)| Some((i, said.as_ref()?)));
+    let (first, used) = all().find(is_on).or_else(|| all().next())?;
+    let name = files.get(first).map(|file| file.name.clone()).unwrap_or_default();
+    for (file, said) in files.iter_mut().zip(said) {
+        let own = said.as_ref().and_then(|said| said.blur_px2);
+        if file.gaussians == 0 || own == used.blur_px2 {
+            continue;
+        }
+        let about = said.as_ref().map_or("it does not say that it was", |said| &said.said_by);
+        let trained = |blur: Option<f64>| {
+            blur.map_or("without anti-aliasing".to_owned(), |blur| format!("with blur {blur}"))
+        };
+        file.warnings.push(format!(
+            "trained {} ({about}), and {name} of the same push {} ({}): all Gaussians of a twin are drawn alike, so push \
+             them to twins of their own, or train them alike",
+            trained(own),
+            trained(used.blur_px2),
+            used.said_by,
+        ));
+    }
+    Some(used.clone())
+}
+
 /// Refuses a push of too many Gaussians; `count` is how many it has with the file `name`.
 fn check_count(name: &str, count: u64, bounds: &ReadBounds) -> Result<(), PushError> {
     let ReadBounds { most_gaussians: most, too_many_fix: fix, .. } = bounds;
@@ -292,6 +327,41 @@ fn check_count(name: &str, count: u64, bounds: &ReadBounds) -> Result<(), PushEr
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn files_that_were_trained_in_another_way_are_warned_of() {
+        let report = |name: &str| FileReport {
+            name: name.to_owned(),
+            gaussians: 1,
+            bad: 0,
+            first_bad: Vec::new(),
+            dropped: 0,
+            warnings: Vec::new(),
+        };
+        let says = |blur_px2: Option<f64>, said_by: &str| {
+            Some(Antialiasing { blur_px2, said_by: said_by.to_owned() })
+        };
+        let warned = |said: &[Option<Antialiasing>]| {
+            let mut files: Vec<FileReport> =
+                ["a.ply", "b.ply"].iter().map(|name| report(name)).collect();
+            let used = common_antialiasing(&mut files, said);
+            (used, files.into_iter().map(|file| file.warnings.join("; ")).collect::<Vec<_>>())
+        };
+        let mip = says(Some(0.1), "comment mip");
+        let default = says(None, "comment default");
+        for plain in [None, default.clone()] {
+            let (used, warnings) = warned(&[mip.clone(), plain.clone()]);
+            assert_eq!((&used, &warnings[0][..]), (&mip, ""));
+            assert!(warnings[1].contains("a.ply of the same push with blur 0.1"), "{warnings:?}");
+            let (used, warnings) = warned(&[plain.clone(), mip.clone()]);
+            assert_eq!((&used, &warnings[1][..]), (&mip, ""));
+            assert!(warnings[0].starts_with("trained without"), "{warnings:?}");
+            assert_eq!(warned(&[plain.clone(), plain.clone()]), (plain, vec![String::new(); 2]));
+        }
+        let (_, warnings) = warned(&[mip.clone(), says(Some(0.3), "antialiased 1")]);
+        assert!(warnings[1].starts_with("trained with blur 0.3 (antialiased 1)"), "{warnings:?}");
+        assert_eq!(warned(&[mip.clone(), mip]).1, ["", ""]);
+    }
 
     #[test]
     fn a_push_has_a_largest_size() {

@@ -10,6 +10,7 @@ use wildcity_scene::manifest::Provenance;
 use wildcity_twin::ingest::{
     self, Axes, FileAxes, FileNotes, IngestError, Progress, ReadLimits, ReadScene, TrackedObject,
 };
+use wildcity_twin::store::Version;
 
 /// The axes and unit of a scene file, and how the user wrote them.
 #[derive(Clone, Debug, Default)]
@@ -66,8 +67,35 @@ impl SourceAxes {
         Ok(Self { axes: axes.map(parsed).transpose()?, metres_per_unit })
     }
 
+    /// The axes and the unit with which the files of a version were imported. Those that it does
+    /// not record are not given.
+    ///
+    /// # Errors
+    /// Says why they cannot be used: its files had different ones, or they cannot be read.
+    pub fn from_version(version: &Version) -> Result<Self, String> {
+        let options = &version.manifest.provenance.options;
+        let found = |key: &str| {
+            let mut found: Vec<&str> =
+                options.iter().filter_map(|option| option.strip_prefix(key)).collect();
+            found.dedup();
+            found
+        };
+        let axes = found("axes=");
+        let scales = found("scale=");
+        if axes.len() > 1 || scales.len() > 1 {
+            return Err(format!(
+                "give axes and scale: the twin was made from files of different ones ({})",
+                options.join(" ")
+            ));
+        }
+        let scale = scales.first().and_then(|scale| scale.parse().ok());
+        Self::given(axes.first().copied(), scale).map_err(|error| {
+            format!("give axes and scale: those of the twin cannot be read: {error}")
+        })
+    }
+
     /// Whether both are given.
-    pub(crate) fn is_complete(&self) -> bool {
+    pub fn is_complete(&self) -> bool {
         self.axes.is_some() && self.metres_per_unit.is_some()
     }
 
@@ -87,37 +115,49 @@ impl SourceAxes {
     /// The given axes, or else those that the file records, or else the default; notes which ones
     /// if that may surprise.
     fn used_axes(&self, default: &Self, notes: &mut FileNotes) -> (Axes, String) {
-        // What the user says counts more than what the file says, and that more than what the twin
-        // was made from.
-        match (&self.axes, &notes.axes, &default.axes) {
-            // Two spellings of one rotation are no contradiction, so rotations are compared.
-            (Some((axes, text)), recorded, _) => {
-                if let Some(FileAxes { axes: recorded, said_by }) =
-                    recorded.as_ref().filter(|recorded| !axes.has_same_rotation(&recorded.axes))
-                {
+        let of_file = notes.axes.as_ref();
+        let other = |axes: &Axes| of_file.filter(|of_file| !axes.has_same_rotation(&of_file.axes));
+        let is_assumed = of_file.is_some_and(|of_file| of_file.is_assumed);
+        let (used, warning) = match (&self.axes, of_file, &default.axes) {
+            // Programs that do not keep to a specification are why the option exists.
+            (Some((axes, text)), ..) => {
+                let recorded = other(axes).filter(|_| !is_assumed);
+                let warning = recorded.map(|FileAxes { axes: recorded, said_by, .. }| {
                     let recorded = recorded.option_text();
-                    notes.warnings.push(format!(
-                        "{said_by} says axes {recorded}; the given ones, {text}, are used"
-                    ));
-                }
-                (*axes, text.clone())
+                    format!("{said_by} says axes {recorded}; the given ones, {text}, are used")
+                });
+                ((*axes, text.clone()), warning)
             }
-            (None, Some(FileAxes { axes, said_by }), _) => {
-                let (axes, text) = (*axes, axes.option_text());
-                notes.warnings.push(format!("{said_by}: axes {text} are used"));
-                (axes, text)
+            (None, Some(FileAxes { axes, said_by, is_assumed: false }), _) => {
+                let text = axes.option_text();
+                let warning = format!("{said_by}: axes {text} are used");
+                ((*axes, text), Some(warning))
             }
-            (None, None, Some((axes, text))) => {
-                // The identity is what a user without axes expects, so it is no surprise.
-                if !axes.has_same_rotation(&Axes::IDENTITY) {
-                    notes
-                        .warnings
-                        .push(format!("no axes are given: those of the twin, {text}, are used"));
-                }
-                (*axes, text.clone())
+            (None, _, Some((axes, text))) => {
+                let also = other(axes).map_or(String::new(), |of_file| {
+                    format!("; {} says {}", of_file.said_by, of_file.axes.option_text())
+                });
+                let is_told = !axes.has_same_rotation(&Axes::IDENTITY) || !also.is_empty();
+                let warning = is_told.then(|| {
+                    format!("no axes are given: those of the twin, {text}, are used{also}")
+                });
+                ((*axes, text.clone()), warning)
             }
-            (None, None, None) => (Axes::IDENTITY, "identity".to_owned()),
+            (None, Some(FileAxes { axes, said_by, .. }), None) => {
+                let text = axes.option_text();
+                let warning = format!(
+                    "no axes are given, and the file records none: {text} are used, as {said_by} says; some programs keep \
+                     the axes of the PLY (y-down-z-forward)"
+                );
+                ((*axes, text), Some(warning))
+            }
+            (None, None, None) => ((Axes::IDENTITY, "identity".to_owned()), None),
+        };
+        notes.warnings.extend(warning);
+        if self.axes.is_none() {
+            notes.warnings.append(&mut notes.axes_hints);
         }
+        used
     }
 
     /// The given metres per unit, or else the default; notes it if that may surprise.
@@ -139,19 +179,20 @@ impl SourceAxes {
 }
 
 /// Reads a scene file of any format, checks every Gaussian, and converts them to the twin's axes.
-/// The scene may name the files below its folder. `drop_bad` leaves out Gaussians outside their
-/// bounds.
+/// `default` has the axes and the scale that are used if none are given. The scene may name the
+/// files below its folder. `drop_bad` leaves out Gaussians outside their bounds.
 ///
 /// # Errors
 /// As [`ingest::read`].
 pub fn read_scene(
     path: &Path,
     axes: &SourceAxes,
+    default: &SourceAxes,
     drop_bad: bool,
     progress: Progress<'_>,
 ) -> Result<SourceScene, IngestError> {
     let limits = ReadLimits { drop_bad, ..ReadLimits::for_own_file() };
-    read_limited(path, axes, &SourceAxes::default(), &limits, progress)
+    read_limited(path, axes, default, &limits, progress)
 }
 
 /// As [`read_scene`], within limits. `default` has the axes of a file for which they are not given.

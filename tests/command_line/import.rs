@@ -51,6 +51,32 @@ fn run(arguments: &[&str], at: &Path, is_accepted: bool) -> String {
     String::from_utf8(output.stderr).unwrap()
 }
 
+/// A second import without axes used to turn and rescale the twin.
+#[test]
+fn a_new_version_has_the_axes_and_the_scale_of_the_last() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = dir.path();
+    let Some(plain) = data::real("cases/ply_dialects/base.ply") else { return };
+    let import = ["import", plain.to_str().unwrap(), "--twin", "street", "--twins", "twins"];
+    let with = |options: &[&str]| run(&[&import[..], options].concat(), at, true);
+    let latest = || Catalog::open(&at.join("twins")).unwrap().version("street", None).unwrap();
+    let told = with(&[]);
+    assert!(told.contains("note: axes=identity; most captures need --axes y-down"), "{told}");
+    with(&["--axes", "y-down-z-forward", "--scale", "0.5"]);
+    let second = latest();
+    let told = with(&[]);
+    assert!(told.contains("those of the twin, y-down-z-forward, are used"), "{told}");
+    assert!(told.contains("that of the twin, 0.5, is used"), "{told}");
+    assert_eq!(latest().manifest.chunks, second.manifest.chunks);
+    assert_eq!(latest().manifest.provenance.options, second.manifest.provenance.options);
+    // Options that are given win.
+    let told = with(&["--axes", "y-up-z-back"]);
+    assert!(!told.contains("those of the twin, y-"), "{told}");
+    assert_eq!(latest().manifest.provenance.options, ["axes=y-up-z-back", "scale=0.5"]);
+    with(&["--scale", "1"]);
+    assert_eq!(latest().manifest.provenance.options, ["axes=y-up-z-back", "scale=1"]);
+}
+
 #[test]
 fn what_a_file_says_goes_into_the_twin() {
     let dir = tempfile::tempdir().unwrap();

@@ -135,7 +135,7 @@ pub(crate) fn capture(data: &[u8]) {
     let dir = tempfile::tempdir().expect("a directory");
     let file = |name: &str| dir.path().join(name);
     fs::write(file("transforms.json"), data).expect("written");
-    let _ = captures::read_nerfstudio_frames(&file("transforms.json"));
+    let _ = captures::read_nerfstudio(&file("transforms.json"));
     let Some(at) = data.windows(4).position(|part| part == b"===\n") else { return };
     // Binary files hide those of text, and come after them.
     for ending in ["txt", "bin"] {

@@ -7,7 +7,7 @@
 use glam::DVec3;
 
 use wildcity_scene::geometry::Camera;
-use wildcity_twin::ingest::capture::{read_colmap, read_nerfstudio_frames};
+use wildcity_twin::ingest::capture::{NerfstudioCapture, read_colmap, read_nerfstudio};
 
 use crate::data::real;
 
@@ -158,8 +158,8 @@ fn from_transforms(fields: &str) -> Result<Camera, String> {
         r#"{"file_path": "a.png", "transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}"#;
     let text = format!(r#"{{"w": 1280, "h": 800, {fields}, "frames": [{frame}]}}"#);
     std::fs::write(&path, text).unwrap();
-    let read = read_nerfstudio_frames(&path).map_err(|error| error.to_string())?;
-    Ok(read[0].posed.camera)
+    let read = read_nerfstudio(&path).map_err(|error| error.to_string())?;
+    Ok(read.frames[0].posed.camera)
 }
 
 #[test]
@@ -210,27 +210,118 @@ fn fields_of_transforms_that_make_another_camera_are_named() {
         (r#""equirectangular": true"#, "equirectangular: is not read"),
         (r#""rolling_shutter": [0, 0, 0.01, 0]"#, "rolling_shutter: is not read"),
         (r#""x_fov": 50"#, "x_fov: says a focal length of"),
+        (r#""orthographic": true"#, "orthographic: is not read"),
+        (r#""k5": 0.1"#, "k5: is not read"),
+        (r#""k6": 0.1"#, "k6: is not read"),
+        (r#""b1": 3"#, "b1: is not read"),
+        (r#""k1": -0.1, "distortion_params": [0, 0, 0, 0, 0, 0]"#, "says k1 0, and k1 is -0.1"),
     ] {
         let text = from_transforms(&format!("{focal}, {fields}")).unwrap_err();
         assert!(text.contains(named), "{text}");
     }
 }
 
+/// What is read of a transforms.json with these fields of the file and of its frame.
+fn transforms(fields: &str, of_frame: &str) -> Result<NerfstudioCapture, String> {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("transforms.json");
+    let frame = format!(
+        r#"{{"file_path": "a.png", "transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]{of_frame}}}"#
+    );
+    let text =
+        format!(r#"{{"w": 1280, "h": 800, "fl_x": 700{fields}, "frames": [{frame}, {frame}]}}"#);
+    std::fs::write(&path, text).unwrap();
+    read_nerfstudio(&path).map_err(|error| error.to_string())
+}
+
+#[test]
+fn a_field_of_a_camera_in_the_file_and_in_its_frames_is_one() {
+    for (of_file, of_frame, named) in [
+        ("", r#", "fl_x": 900"#, "frames[0].fl_x: is 900, and 700 for the whole file"),
+        (r#", "cx": 640"#, r#", "cx": 641"#, "frames[0].cx: is 641"),
+        (r#", "k1": 0.1"#, r#", "k1": 0"#, "frames[0].k1: is 0, and 0.1"),
+        (
+            r#", "k1": 0.1"#,
+            r#", "distortion_params": [0, 0, 0, 0, 0, 0]"#,
+            "frames[0].distortion_params: says k1 0",
+        ),
+        (r#", "is_fisheye": true"#, r#", "is_fisheye": false"#, "frames[0].is_fisheye: is false"),
+    ] {
+        let text = transforms(of_file, of_frame).unwrap_err();
+        assert!(text.contains(named), "{text}");
+    }
+    // Programs write both, with the same values.
+    let of_frame = r#", "fl_x": 700.0, "k1": null, "distortion_params": [0.1, 0, 0, 0, 0, 0]"#;
+    let same = transforms(r#", "k1": 0.1, "camera_model": "OPENCV""#, of_frame).unwrap();
+    assert_eq!(same.frames[0].posed.camera.pinhole.fx, 700.0);
+}
+
+#[test]
+fn times_and_masks_that_are_not_read_are_named() {
+    let warned =
+        |of_file: &str, of_frame: &str| transforms(of_file, of_frame).unwrap().warnings.join("; ");
+    assert_eq!(warned("", ""), "");
+    assert!(warned("", r#", "timestamp": 0.5"#).starts_with("timestamp is not read"));
+    assert!(warned("", r#", "time": 0.5"#).starts_with("time is not read"));
+    assert_eq!(warned("", r#", "time": 0.5, "time_us": 500000"#), "");
+    let crop = warned(r#", "fisheye_crop_radius": 300"#, "");
+    assert!(crop.starts_with("fisheye_crop_radius is not read"), "{crop}");
+    for (time, named) in [("500000.0", "is 500000.0;"), (r#""5""#, r#"is "5";"#)] {
+        let text = transforms("", &format!(r#", "time_us": {time}"#)).unwrap_err();
+        assert!(text.contains(&format!("frames[0].time_us: {named}")), "{text}");
+    }
+    let matrix = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,2]]";
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("transforms.json");
+    let frame = format!(r#"{{"file_path": "a.png", "transform_matrix": {matrix}}}"#);
+    let text = format!(r#"{{"w": 1280, "h": 800, "fl_x": 700, "frames": [{frame}]}}"#);
+    std::fs::write(&path, text).unwrap();
+    let text = read_nerfstudio(&path).unwrap_err().to_string();
+    assert!(text.contains("transform_matrix: the last row must be 0, 0, 0, 1"), "{text}");
+}
+
+/// The names of the images of a COLMAP model whose images.txt has these lines.
+fn colmap_images(lines: &str) -> Result<Vec<String>, String> {
+    let dir = tempfile::tempdir().unwrap();
+    let camera = "1 PINHOLE 1280 800 700 700 640 400\n";
+    std::fs::write(dir.path().join("cameras.txt"), camera).unwrap();
+    std::fs::write(dir.path().join("images.txt"), lines).unwrap();
+    let read = read_colmap(dir.path()).map_err(|error| error.to_string())?;
+    Ok(read.into_iter().map(|image| image.name).collect())
+}
+
+#[test]
+fn images_of_colmap_without_their_points_are_refused() {
+    let image = |number: usize| format!("{number} 1 0 0 0 0 0 0 1 {number}.png\n");
+    let with = |points: &str| [image(1), points.to_owned(), image(2), points.to_owned()].concat();
+    for points in ["\n", "1.5 2.5 -1 3 4 7\n", "  \n", "\r\n"] {
+        assert_eq!(colmap_images(&with(points)).unwrap(), ["1.png", "2.png"], "{points:?}");
+    }
+    assert_eq!(colmap_images(with("\n").trim_end()).unwrap(), ["1.png", "2.png"]);
+    for points in ["", "1.5 2.5\n", "1.5 2.5 a\n"] {
+        let text = colmap_images(&with(points)).unwrap_err();
+        assert!(
+            text.contains("images.txt:2: ") && text.contains("is not a line of points"),
+            "{text}"
+        );
+    }
+}
+
 #[test]
 fn cases_of_captures_are_read_or_refused_by_name() {
     let Some(fisheye) = real("cases/ingp_is_fisheye/ingp_fisheye.json") else { return };
-    let read = read_nerfstudio_frames(&fisheye).unwrap();
-    let at = read[0].posed.camera.project(DVec3::new(1.0, 0.0, 1.0)).unwrap();
+    let read = read_nerfstudio(&fisheye).unwrap();
+    let at = read.frames[0].posed.camera.project(DVec3::new(1.0, 0.0, 1.0)).unwrap();
     // 700 θ (1 + k1 θ² + ..) of 45°.
     let square = std::f64::consts::FRAC_PI_4.powi(2);
     let k = [1.0, -0.03, -0.005, -0.001, 0.0007];
     let radius = k.iter().rev().fold(0.0, |sum, k| sum * square + k) * square.sqrt();
     assert!((at.x - 640.0 - 700.0 * radius).abs() < 1e-6, "{at}");
     let k4 = real("cases/transforms_k4/ns_k4.json").unwrap();
-    assert!(read_nerfstudio_frames(&k4).unwrap_err().to_string().contains("frames[0].k4: is 0.02"));
+    assert!(read_nerfstudio(&k4).unwrap_err().to_string().contains("frames[0].k4: is 0.02"));
     let timed = real("cases/transforms_time_us/tj_time.json").unwrap();
     let times_us: Vec<_> =
-        read_nerfstudio_frames(&timed).unwrap().iter().map(|frame| frame.posed.time_us).collect();
+        read_nerfstudio(&timed).unwrap().frames.iter().map(|frame| frame.posed.time_us).collect();
     assert_eq!(times_us[..3], [Some(0), Some(500_000), Some(1_000_000)]);
     for model in ["SIMPLE_FISHEYE", "bin_fisheye"] {
         let file = if model == "bin_fisheye" { "cameras.bin" } else { "cameras.txt" };

@@ -344,8 +344,10 @@ fn rigid_nodes_are_split_by_point_ids() {
     assert_eq!(names, ["0", "10", "20"]);
     assert_eq!(objects[1].gaussians.logit_opacities, g.select((1..30).step_by(3)).logit_opacities);
     assert_eq!(objects[2].gaussians.sh, g.select((2..30).step_by(3)).sh);
-    // As a scene, the file is read without the numbers.
-    assert_eq!(ingest::read(&path, &mut |_, _| {}).unwrap().len(), 30);
+    // As a scene, the file is read without the numbers, and says so.
+    let scene = ingest::read_limited(&path, &ReadLimits::for_own_file(), &mut |_, _| {}).unwrap();
+    assert_eq!(scene.gaussians.len(), 30);
+    assert!(scene.notes.warnings[0].contains("actor import --tracked"), "{:?}", scene.notes);
     write(None);
     let error = ingest::read_tracked(&path, &mut |_, _| {}).unwrap_err().to_string();
     assert!(error.contains("point_ids"), "{error}");

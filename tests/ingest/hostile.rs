@@ -264,6 +264,7 @@ fn errors_of_archives_and_payloads_say_what_is_missing() {
         "{text}"
     );
     let text = refusal(&zip(&file("archive/data.pkl", b"hello"), false));
+    assert!(text.contains("wildcity.convert CKPT.pt OUT.safetensors"), "{text}");
     assert!(text.contains("python -m wildcity.convert"), "{text}");
     let text = refusal(&zip(&sog(&g, 2)[..3], false));
     assert_eq!(text, "zip body, scales.webp: is not in the archive");

@@ -12,6 +12,7 @@ mod root;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
 
+mod archives;
 mod axes;
 mod captures;
 mod cases;

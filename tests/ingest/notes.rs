@@ -3,7 +3,7 @@
 use wildcity_scene::RenderProfile;
 use wildcity_twin::ingest::{self, FileNotes, ReadLimits};
 
-use crate::format_files::{glb, gltf, gzip, nurec_plain, sog, spz_plain, usdz};
+use crate::format_files::{glb, gltf, gzip, nurec_plain, sog, spz_plain, spz4, usdz};
 use crate::scene_files::{gaussians, gsplat_tensors, inria_columns, ply, ply_header, safetensors};
 
 /// The notes of a scene in these files, the first of which is read.
@@ -26,7 +26,6 @@ fn files_of_usual_writers_need_no_warning() {
     let plain = [
         ply(&g, &inria_columns(1, true)),
         safetensors(&gsplat_tensors(&g), &[]),
-        gzip(&spz_plain(&g, 3)),
         glb(gltf(&g, "", "")),
         usdz(nurec_plain(&g, false)),
     ];
@@ -36,6 +35,11 @@ fn files_of_usual_writers_need_no_warning() {
         assert_eq!(notes, FileNotes::default(), "{start}");
     }
     assert_eq!(notes(&sog(&g, 2)), FileNotes::default());
+    for spz in [spz_plain(&g, 3), gzip(&spz_plain(&g, 2)), spz4(&g)] {
+        let FileNotes { axes, .. } = file_notes(spz);
+        let axes = axes.unwrap();
+        assert_eq!((&axes.axes.option_text()[..], axes.is_assumed), ("y-up-z-back", true));
+    }
 }
 
 #[test]
@@ -60,6 +64,67 @@ fn parts_of_a_ply_that_are_not_read_are_named() {
     }
     let flat = said(&header.replace("made by a test", "SplatRenderMode: 2dgs"), &body);
     assert!(flat.contains("2D Gaussians"), "{flat}");
+}
+
+/// The notes of a PLY with this comment, which may be no UTF-8.
+fn comment_notes(comment: &[u8]) -> FileNotes {
+    let file = ply(&gaussians(6, 0, 5.0, 3), &inria_columns(0, true));
+    let at = file.windows(4).position(|part| part == b"made").unwrap();
+    file_notes([&file[..at], comment, &file[at + "made by a test".len()..]].concat())
+}
+
+#[test]
+fn comments_of_ply_are_understood_or_named() {
+    let latin = comment_notes(b"caf\xe9 scene");
+    assert_eq!(latin.warnings.len(), 1, "{latin:?}");
+    assert!(latin.warnings[0].contains("caf\u{fffd} scene"), "{latin:?}");
+    let vertical = comment_notes(b"Vertical Axis: y");
+    assert!(vertical.warnings.is_empty(), "{vertical:?}");
+    assert!(vertical.axes_hints[0].contains("\"Vertical Axis: y\" says that y is up or down"));
+    let blur_px2 = |comment: &[u8]| comment_notes(comment).antialiasing.unwrap().blur_px2;
+    assert_eq!(blur_px2(b"SplatRenderMode: default"), None);
+    assert_eq!(blur_px2(b"antialiased false"), None);
+    assert_eq!(blur_px2(b"antialiased true"), Some(0.3));
+    let both = b"SplatRenderMode: mip\ncomment SplatRenderMode: default";
+    assert_eq!(blur_px2(both), None, "the last one counts");
+    let told = &comment_notes(both).warnings[0];
+    assert!(told.starts_with("comment \"SplatRenderMode: mip\": has no effect"), "{told}");
+    let profile = comment_notes(both).profile().apply(RenderProfile::DEFAULT).unwrap();
+    assert!(!profile.antialiased);
+    // A byte like that elsewhere is damage.
+    let columns = inria_columns(0, true);
+    let mut file = ply(&gaussians(6, 0, 5.0, 3), &columns);
+    let at = file.windows(9).position(|part| part == b"float nx\n").unwrap();
+    file[at + 6] = 0xe9;
+    assert!(crate::refusal(&file).contains("is not text"));
+}
+
+#[test]
+fn a_3d_filter_that_is_no_number_is_named() {
+    let columns = inria_columns(0, false);
+    let plain = ply(&gaussians(6, 0, 5.0, 3), &columns);
+    let header = ply_header(6, &columns);
+    let rows = plain[header.len()..].chunks_exact(4 * columns.len()).enumerate();
+    let filtered = rows.flat_map(|(index, row)| {
+        let filter = if index == 2 { f32::NAN } else { 0.01 };
+        [row, &filter.to_le_bytes()].concat()
+    });
+    let header = header.replace("end_header", "property float filter_3D\nend_header");
+    let file: Vec<u8> = header.into_bytes().into_iter().chain(filtered).collect();
+    let text = crate::refusal(&file);
+    assert!(text.starts_with("Gaussian 2: filter_3D is NaN; a width is finite"), "{text}");
+}
+
+#[test]
+fn leaving_out_all_gaussians_leaves_no_scene() {
+    let mut g = gaussians(6, 0, 5.0, 3);
+    g.logit_opacities.fill(f32::NAN);
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("scene");
+    std::fs::write(&path, ply(&g, &inria_columns(0, false))).unwrap();
+    let limits = ReadLimits { drop_bad: true, ..ReadLimits::for_own_file() };
+    let text = ingest::read_limited(&path, &limits, &mut |_, _| {}).unwrap_err().to_string();
+    assert!(text.contains("none of its 6 Gaussians can be drawn"), "{text}");
 }
 
 #[test]
@@ -111,6 +176,25 @@ fn flags_and_extensions_of_spz_are_read_or_named() {
         let left_up_forward = extension(0xADBE_0003, &7_u32.to_le_bytes());
         let axes = with(2, &left_up_forward, is_packed).axes.unwrap();
         assert_eq!(axes.axes.option_text(), "-1 0 0 0 0 1 0 1 0", "left-handed east is -x");
+        // splat-types.h: the directions of x, y, z.
+        for (number, letters, wanted) in [
+            (1_u32, "LDB", "-1 0 0 0 0 -1 0 -1 0"),
+            (4, "RUB", "y-up-z-back"),
+            (6, "RDF", "y-down-z-forward"),
+            (9, "LFD", "-1 0 0 0 1 0 0 0 -1"),
+            (12, "RFU", "identity"),
+            (13, "LBD", "-1 0 0 0 -1 0 0 0 -1"),
+            (16, "RBU", "1 0 0 0 -1 0 0 0 1"),
+        ] {
+            let axes = with(2, &extension(0xADBE_0003, &number.to_le_bytes()), is_packed).axes;
+            let axes = axes.unwrap();
+            assert_eq!((&axes.axes.option_text()[..], axes.is_assumed), (wanted, false));
+            assert!(axes.said_by.contains(letters), "{axes:?}");
+        }
+        let unknown = with(2, &extension(0xADBE_0003, &17_u32.to_le_bytes()), is_packed);
+        assert!(unknown.warnings[0].contains("17 is unknown; 1 to 16 are read"), "{unknown:?}");
+        let unspecified = with(2, &extension(0xADBE_0003, &0_u32.to_le_bytes()), is_packed);
+        assert!(unspecified.axes.unwrap().is_assumed);
         let orbit = extension(0xADBE_0002, &[0; 12]);
         let several = [orbit, extension(0x0001_0002, &[1; 5]), left_up_forward].concat();
         let several = with(2, &several, is_packed);
@@ -131,7 +215,7 @@ fn keys_and_tensors_that_are_not_read_are_named() {
         notes(&files)
     };
     for key in [r#""model": "antialiased""#, r#""antialias": true"#] {
-        assert_eq!(with(key).antialiasing.unwrap().blur_px2, 0.3, "{key}");
+        assert_eq!(with(key).antialiasing.unwrap().blur_px2, Some(0.3), "{key}");
     }
     assert!(with(r#""model": "2dgs""#).warnings[0].contains("2D Gaussians"));
     assert!(with(r#""model": "4d""#).warnings[0].contains("\"4d\" is unknown"));
@@ -161,4 +245,94 @@ fn splats_of_gltf_that_are_drawn_in_another_way_are_named() {
     assert!(other.contains("KHR_gaussian_splatting.fog is not read"), "{other}");
     let required = said(r#"{"asset""#, r#"{"extensionsRequired":["EXT_fog"],"asset""#);
     assert!(required.contains("required extensions not read: EXT_fog"), "{required}");
+}
+
+#[test]
+fn a_layer_of_nurec_without_settings_is_named() {
+    let mut plain = nurec_plain(&gaussians(6, 1, 5.0, 3), false);
+    // The first one is the key of its settings.
+    let at = plain.windows(6).position(|part| part == b"street").unwrap();
+    plain[at..at + 6].copy_from_slice(b"avenue");
+    let told = file_notes(usdz(plain)).warnings;
+    assert!(told[0].starts_with("layer street has no settings in config.layers"), "{told:?}");
+}
+
+#[test]
+fn parts_of_gltf_that_are_not_read_are_named() {
+    let g = gaussians(6, 0, 5.0, 3);
+    let instances = r#","skin":0,"extensions":{"EXT_mesh_gpu_instancing":{"attributes":{}}}"#;
+    let node = file_notes(glb(gltf(&g, instances, ""))).warnings;
+    assert_eq!(
+        node,
+        [
+            "extensions of nodes not read: EXT_mesh_gpu_instancing (node 0)",
+            "skins not read: node 0"
+        ]
+    );
+    let (json, buffer) = gltf(&g, "", "");
+    let position = r#""POSITION":0"#;
+    let own = r#""extensions":{"KHR_gaussian_splatting""#;
+    for (from, to, wanted) in [
+        (position, r#""POSITION":0,"_MOTION":0,"COLOR_0":0"#, "attributes not read: _MOTION"),
+        (
+            own,
+            r#""targets":[{"POSITION":0}],"extensions":{"KHR_gaussian_splatting""#,
+            "morph targets not read: node 0, primitive 0",
+        ),
+        (
+            own,
+            r#""extensions":{"EXT_motion":{},"KHR_gaussian_splatting""#,
+            "extensions of primitives not read: EXT_motion",
+        ),
+        (
+            r#"{"asset""#,
+            r#"{"animations":[{},{}],"asset""#,
+            "animations (2) are not read: the scene is drawn as it is stored",
+        ),
+        (
+            r#""primitives":["#,
+            r#""primitives":[{"attributes":{"POSITION":0}},"#,
+            "meshes beside the splats not read: node 0, primitive 0",
+        ),
+    ] {
+        assert!(json.contains(from), "{json}");
+        let changed = glb((json.replacen(from, to, 1), buffer.clone()));
+        assert_eq!(file_notes(changed).warnings, [wanted], "{to}");
+    }
+}
+
+/// An SPZ in a glTF is in the axes that it records, and else in those of the glTF.
+#[test]
+fn the_axes_of_an_spz_in_a_gltf_are_used() {
+    let g = gaussians(6, 1, 5.0, 3);
+    let read = |system: Option<u32>| {
+        let mut spz = spz_plain(&g, 2);
+        if let Some(system) = system {
+            spz[14] = 2;
+            spz.extend(extension(0xADBE_0003, &system.to_le_bytes()));
+        }
+        let buffer = gzip(&spz);
+        let bytes = buffer.len();
+        let json = format!(
+            r#"{{"asset":{{"version":"2.0"}},"scenes":[{{"nodes":[0]}}],"nodes":[{{"mesh":0}}],
+            "meshes":[{{"primitives":[{{"attributes":{{}},"extensions":{{"KHR_gaussian_splatting":{{"extensions":
+            {{"KHR_gaussian_splatting_compression_spz_2":{{"bufferView":0}}}}}}}}}}]}}],
+            "bufferViews":[{{"buffer":0,"byteLength":{bytes}}}],"buffers":[{{"byteLength":{bytes}}}]}}"#
+        );
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("scene.glb");
+        std::fs::write(&path, glb((json, buffer))).unwrap();
+        ingest::read_limited(&path, &ReadLimits::for_own_file(), &mut |_, _| {}).unwrap()
+    };
+    let plain = read(None);
+    assert_eq!((plain.notes.axes, plain.notes.warnings.len()), (None, 1));
+    assert!(plain.notes.warnings[0].contains("those of the glTF are assumed"));
+    // 7 is LUF, glTF's own; 6 is RDF: a half turn about z from it.
+    assert_eq!(read(Some(7)).gaussians, plain.gaussians);
+    let turned = read(Some(6));
+    assert!(turned.notes.warnings[0].contains("6 (RDF): turned to the axes of glTF"));
+    for (turned, plain) in turned.gaussians.means_m.iter().zip(&plain.gaussians.means_m) {
+        assert_eq!(*turned, [-plain[0], -plain[1], plain[2]]);
+    }
+    assert_ne!(turned.gaussians.sh, plain.gaussians.sh);
 }

@@ -376,13 +376,11 @@ pub(crate) fn nurec_plain(g: &Gaussians, with_cars: bool) -> Vec<u8> {
     state.push(("._extra_state".to_owned(), map(vec![("obj_track_ids", tracks)])));
     let state = state.iter().map(|(key, value)| (key.as_str(), value.clone())).collect();
     let settings = map(vec![("density_activation", text("sigmoid")), ("precision", vec![16])]);
-    let config = map(vec![("layers", map(vec![("street", settings)]))]);
-    let data = map(vec![
-        ("version", text("0.2.576")),
-        ("config", config),
-        ("float", [&[0xcb][..], &1.5f64.to_be_bytes()].concat()),
-        ("state_dict", map(state)),
-    ]);
+    let clip = [&[0xcb][..], &0.2f64.to_be_bytes()].concat();
+    let renderer = map(vec![("near_clip_distance", clip)]);
+    let config = map(vec![("layers", map(vec![("street", settings)])), ("renderer", renderer)]);
+    let data =
+        map(vec![("version", text("0.2.576")), ("config", config), ("state_dict", map(state))]);
     map(vec![("nre_data", data)])
 }
 

@@ -346,7 +346,7 @@ def test_checkpoints_of_street_gaussians_and_3dgrut(capsys: pytest.CaptureFixtur
     assert background["means"].shape == (20, 3) and background["shN"].shape == (20, 3, 3)
     np.testing.assert_array_equal(background["means"], convert.load(street)["background"]["xyz"])
     assert convert.main([str(street), str(tmp_path / "out"), "--model", "background"]) == 0
-    assert capsys.readouterr().err == "warning: not converted: semantic\n"
+    assert capsys.readouterr().err == "warning: not converted: semantic, obj_001\n"
 
     grut = convert.splats(folder / "3dgrut.pt")
     saved = convert.load(folder / "3dgrut.pt")
@@ -358,16 +358,122 @@ def test_checkpoints_of_street_gaussians_and_3dgrut(capsys: pytest.CaptureFixtur
 
 def test_3dgrut_says_its_degree_and_its_kernel(tmp_path: Path) -> None:
     g = gaussians()
-    names = {"means": "positions", "quats": "rotation", "scales": "scale", "opacities": "density"}
-    names |= {"sh0": "features_albedo", "shN": "features_specular"}
-    saved: dict[str, Any] = {names[name]: Tensor(values) for name, values in g.items()}
-    saved["features_specular"] = Tensor(g["shN"].reshape(N, 45))
+    saved = grut(g)
     source = save(tmp_path / "ckpt_last.pt", saved | {"n_active_features": 1})
     np.testing.assert_array_equal(convert.splats(source)["shN"], g["shN"][:, :3])
     config = {"render": {"particle_kernel_degree": 4}}
     source = save(tmp_path / "ckpt_4.pt", saved | {"config": config})
     with pytest.raises(CheckpointError, match="particle_kernel_degree is 4"):
         convert.splats(source)
+
+
+class Node:
+    """Stands for a class of OmegaConf, whose objects are pickled with their state."""
+
+    def __init__(self, **state: Any) -> None:
+        self.__dict__.update(state)
+
+
+@pytest.fixture
+def omegaconf(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Makes what `OmegaConf.create` makes of a dictionary."""
+    classes: dict[str, Any] = {}
+    for module, name in [("dictconfig", "DictConfig"), ("listconfig", "ListConfig"), ("nodes", "AnyNode")]:
+        made = types.ModuleType(f"omegaconf.{module}")
+        classes[name] = type(name, (Node,), {"__module__": made.__name__, "__qualname__": name})
+        setattr(made, name, classes[name])
+        monkeypatch.setitem(sys.modules, made.__name__, made)
+    monkeypatch.setitem(sys.modules, "omegaconf", types.ModuleType("omegaconf"))
+
+    def create(value: Any, parent: Any = None) -> Any:
+        if isinstance(value, dict):
+            node = classes["DictConfig"](_metadata=None, _parent=parent)
+            node._content = {key: create(item, node) for key, item in value.items()}
+            return node
+        if isinstance(value, list):
+            node = classes["ListConfig"](_metadata=None, _parent=parent)
+            node._content = [create(item, node) for item in value]
+            return node
+        return classes["AnyNode"](_metadata=None, _parent=parent, _flags_cache=None, _val=value)
+
+    return create
+
+
+def grut(g: dict[str, np.ndarray[Any, Any]]) -> dict[str, Any]:
+    """What 3dgrut saves, without its config."""
+    names = {"means": "positions", "quats": "rotation", "scales": "scale", "opacities": "density"}
+    names |= {"sh0": "features_albedo", "shN": "features_specular"}
+    saved: dict[str, Any] = {names[name]: Tensor(values) for name, values in g.items()}
+    saved["features_specular"] = Tensor(g["shN"].reshape(N, 45))
+    return saved
+
+
+def test_a_config_of_omegaconf_is_read(tmp_path: Path, omegaconf: Any) -> None:
+    usual = {"render": {"particle_kernel_degree": 2, "sizes": [1, "a"]}, "model": {"density_activation": "sigmoid"}}
+    source = save(tmp_path / "ckpt_last.pt", grut(gaussians()) | {"config": omegaconf(usual)})
+    assert len(convert.splats(source)["means"]) == N
+    assert convert.skipped(source) == []
+    config = convert.load(source)["config"]
+    assert config["render"]["particle_kernel_degree"] == 2
+    assert list(config["render"]["sizes"]) == [1, "a"]
+    for section, key, value in [
+        ("render", "particle_kernel_degree", 4),
+        ("render", "primitive_type", "trisurfel"),
+        ("model", "density_activation", "none"),
+        ("model", "scale_activation", "softplus"),
+    ]:
+        for create in (omegaconf, dict):
+            changed = create(usual | {section: {key: value}})
+            source = save(tmp_path / "other.pt", grut(gaussians()) | {"config": changed})
+            with pytest.raises(CheckpointError, match=f"{section}.{key} is {value!r}"):
+                convert.splats(source)
+
+
+def test_a_config_that_cannot_be_read_is_refused(tmp_path: Path, omegaconf: Any) -> None:
+    reference = omegaconf({})
+    reference._content = "${other}"
+    for config in (reference, omegaconf(3), types.SimpleNamespace(render=2)):
+        source = save(tmp_path / "ckpt_last.pt", grut(gaussians()) | {"config": config})
+        with pytest.raises(CheckpointError, match="config is of a class that cannot be read"):
+            convert.splats(source)
+
+
+def test_colours_without_higher_degrees_are_those_of_their_trainer(tmp_path: Path) -> None:
+    g = gaussians(rest=0)
+    names = {"sh0": "features_dc", "shN": "features_rest"}
+    # splatfacto and drivestudio draw sigmoid(features_dc) at degree 0; INRIA, 0.5 + C0 f_dc.
+    colours = 1 / (1 + np.exp(-g["sh0"].astype("<f8")))
+    splatfacto = {f"_model.gauss_params.{names.get(k, k)}": Tensor(v) for k, v in g.items()}
+    drivestudio = {f"_{names.get(k, k)}": Tensor(v) for k, v in g.items()}
+    for saved in ({"pipeline": splatfacto}, {"models": {"Background": drivestudio}}):
+        found = convert.splats(save(tmp_path / "degree_0.ckpt", saved))
+        np.testing.assert_allclose(0.5 + 0.28209479177387814 * found["sh0"], colours, atol=1e-6)
+        assert "shN" not in found
+    order = ("means", "sh0", "shN", "scales", "quats", "opacities")
+    captured = (0, *(Tensor(g[name]) for name in order), Tensor([1.0]), {}, 5.0)
+    inria = convert.splats(save(tmp_path / "chkpnt.pth", (captured, 30000)))
+    np.testing.assert_array_equal(inria["sh0"], g["sh0"])
+
+
+def test_arrays_beside_the_model_are_named_by_their_group(tmp_path: Path) -> None:
+    g = gaussians()
+    one = Tensor(np.ones(4, "<f4"))
+    adam = {"state": {0: {"exp_avg": one}}, "param_groups": [{"lr": 1.0}]}
+
+    def left_out(saved: Any, model: str | None = None) -> list[str]:
+        return convert.skipped(save(tmp_path / "ckpt.pt", saved), model)
+
+    beside = {"bil_grids": {"grids": one}, "pose_adjust": {"embeds.weight": one}, "appearance": [one]}
+    gsplat = {"step": 1, "splats": tensors(g) | {"features": one}, **beside, "optimizers": {"a": one}, "adam": adam}
+    assert left_out(gsplat) == ["features", "bil_grids", "pose_adjust", "appearance"]
+    flat = {f"_model.gauss_params.{k}": Tensor(v) for k, v in g.items()}
+    flat |= {"_model.bil_grids.grids": one, "_model.camera_optimizer.pose_adjustment": one, "_model.lpips.w": one}
+    wanted = ["pipeline._model.bil_grids", "pipeline._model.camera_optimizer"]
+    assert left_out({"pipeline": flat, "optimizers": {"means": adam}}) == wanted
+    street = {"background": tensors(g), "obj_001": tensors(g), "sky_cubemap": {"params": {"sky_cube_map": one}}}
+    assert left_out(street, "background") == ["obj_001", "sky_cubemap"]
+    drive = {"models": {"Background": tensors(g), "Affine": {"embedding.weight": one}}, "optimizer": adam}
+    assert left_out(drive) == ["models.Affine"]
 
 
 def test_what_cannot_be_converted_is_named(tmp_path: Path) -> None:

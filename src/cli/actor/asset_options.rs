@@ -28,7 +28,7 @@ pub(super) struct AssetOptions {
     #[arg(long, default_value_t = 1.0, allow_negative_numbers = true)]
     pub(super) scale: f64,
 
-    /// Number of flat Gaussians that cover the triangles of a mesh, 1,000 to 1,000,000. Small
+    /// About how many flat Gaussians cover the triangles of a mesh, 1,000 to 1,000,000. Small
     /// triangles add more Gaussians.
     #[arg(
         long,

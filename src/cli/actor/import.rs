@@ -72,7 +72,7 @@ impl Import {
         let read = read_actor(&self.source, &axes, settings.mesh_gaussians, show);
         let SourceScene { gaussians, hash, options, mut notes, .. } = read.with_context(cannot)?;
         bar.finish_and_clear();
-        if let Some(Antialiasing { said_by, .. }) = notes.antialiasing.take() {
+        if let Some(Antialiasing { blur_px2: Some(_), said_by }) = notes.antialiasing.take() {
             notes
                 .warnings
                 .push(format!("{said_by}: an actor is rendered with the profile of its twin"));

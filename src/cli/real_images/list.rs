@@ -1,5 +1,6 @@
 //! Lists of real images: their files, masks and cameras.
 
+use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
@@ -108,12 +109,15 @@ fn read(source: &Path) -> anyhow::Result<Listed> {
         return Ok(Listed { images, folder: colmap_images(source), is_in_scene_axes: false });
     }
     if is_dir || has_frames(source)? {
-        let images = capture::read_nerfstudio_frames(source)?;
+        let capture::NerfstudioCapture { frames, warnings } = capture::read_nerfstudio(source)?;
+        for warning in warnings {
+            writeln!(io::stderr(), "warning: {}: {warning}", source.display())?;
+        }
         let listed = |frame: capture::FrameImage| {
             let capture::FrameImage { posed, mask, exposure_stops } = frame;
             ListedImage { posed, mask, near: None, exposure_stops }
         };
-        let images = images.into_iter().map(listed).collect();
+        let images = frames.into_iter().map(listed).collect();
         let folder = if is_dir { source.to_owned() } else { beside };
         return Ok(Listed { images, folder, is_in_scene_axes: false });
     }

@@ -5,7 +5,9 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 
-use wildcity_scene::align::{CaptureOptions, CapturedDrive, PosedImage, captured_drive};
+use wildcity_scene::align::{
+    CaptureOptions, CapturedDrive, DEFAULT_FPS, PosedImage, captured_drive,
+};
 use wildcity_twin::ingest::capture;
 
 use super::files::to_json;
@@ -95,7 +97,13 @@ impl FromColmap {
 
 impl FromNerfstudio {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        self.options.write(&capture::read_nerfstudio(&self.source)?)
+        let capture::NerfstudioCapture { frames, warnings } =
+            capture::read_nerfstudio(&self.source)?;
+        for warning in warnings {
+            writeln!(io::stderr(), "warning: {}: {warning}", self.source.display())?;
+        }
+        let images: Vec<PosedImage> = frames.into_iter().map(|frame| frame.posed).collect();
+        self.options.write(&images)
     }
 }
 
@@ -109,6 +117,12 @@ impl DriveOptions {
         let alignment = placement.alignment()?;
         let options = CaptureOptions { name, fps, camera_height_m, reference, cameras };
         let made = captured_drive(images, &alignment, &options)?;
+        if options.fps.is_none() && images.iter().all(|image| image.time_us.is_none()) {
+            writeln!(
+                io::stderr(),
+                "note: the images have no times: {DEFAULT_FPS} a second are assumed (--fps)"
+            )?;
+        }
         output::create_dir(&out)?;
         let drive = out.join(format!("{}.json", options.name));
         let rig = out.join("rig.json");

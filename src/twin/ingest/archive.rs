@@ -12,32 +12,42 @@ use super::notes::Reading;
 use super::objects::TrackedObject;
 use super::scene_files::SceneFiles;
 use super::unpack_budget::UnpackBudget;
-use super::{IngestError, nurec, sog};
+use super::{IngestError, check_count, nurec, sog};
 
-/// Reads the scene of an archive within a budget of nothing read, found by the first file in it of
-/// a known name.
+/// Reads the scene of an archive within a budget of nothing read: all payloads of NuRec in it, or
+/// else the SOG whose description is in the fewest folders.
 pub(super) fn read(
     bytes: Vec<u8>,
     budget: UnpackBudget,
     reading: &mut Reading,
 ) -> Result<Gaussians, IngestError> {
     let mut archive = Archive::open(bytes, budget)?;
-    if let Some(name) = archive.find(|name| name.ends_with(".nurec")) {
-        let payload = archive.read(&name, limits::SCENE_PART_BYTES)?;
-        return nurec::read(&payload, archive.budget(), reading);
+    let payloads = archive.payloads();
+    if !payloads.is_empty() {
+        archive.warn_layers(reading)?;
+        // 3dgrut splits a large scene into partitions, one payload each.
+        let mut all = Gaussians::default();
+        for name in payloads {
+            let payload = archive.read(&name, limits::SCENE_PART_BYTES)?;
+            all.append(&nurec::read(&payload, archive.budget(), reading)?);
+            check_count(all.len() as u64)?;
+        }
+        return Ok(all);
     }
-    let Some(name) = archive.find(|name| sog::DESCRIPTIONS.contains(&name)) else {
-        let reason = match archive.find(|name| name == "data.pkl") {
-            Some(_) => "it is a checkpoint of PyTorch: convert it to safetensors with \
-                        python -m wildcity.convert"
+    let descriptions = archive.find(|name| sog::DESCRIPTIONS.contains(&name));
+    let Some(name) = descriptions.first() else {
+        let reason = match archive.find(|name| name == "data.pkl")[..] {
+            [_, ..] => "it is a checkpoint of PyTorch: convert it to safetensors with \
+                        python -m wildcity.convert CKPT.pt OUT.safetensors, and read OUT.safetensors"
                 .into(),
-            None => "it holds no meta.json or lod-meta.json, as SOG does, and no .nurec, as USDZ of NuRec \
+            [] => "it holds no meta.json or lod-meta.json, as SOG does, and no .nurec, as USDZ of NuRec \
                      does".into(),
         };
         return Err(error("directory", reason));
     };
+    check_one_scene(name, &descriptions[1..], reading)?;
     let folder = name.rfind('/').map_or("", |slash| &name[..=slash]).to_owned();
-    let json = archive.read(&name, limits::SCENE_JSON_BYTES)?;
+    let json = archive.read(name, limits::SCENE_JSON_BYTES)?;
     sog::read(&json, &folder, &mut archive, reading)
 }
 
@@ -47,10 +57,48 @@ pub(super) fn read_tracked(
     budget: UnpackBudget,
 ) -> Result<Vec<TrackedObject>, IngestError> {
     let mut archive = Archive::open(bytes, budget)?;
-    let Some(name) = archive.find(|name| name.ends_with(".nurec")) else { return Ok(Vec::new()) };
-    let payload = archive.read(&name, limits::SCENE_PART_BYTES)?;
-    nurec::read_tracked(&payload, archive.budget())
+    let mut objects: Vec<TrackedObject> = Vec::new();
+    for name in archive.payloads() {
+        let payload = archive.read(&name, limits::SCENE_PART_BYTES)?;
+        for object in nurec::read_tracked(&payload, archive.budget())? {
+            // Partitions may share an object.
+            match objects.iter_mut().find(|known| known.track == object.track) {
+                Some(known) => known.gaussians.append(&object.gaussians),
+                None => objects.push(object),
+            }
+        }
+    }
+    Ok(objects)
 }
+
+/// Refuses an archive with several scenes, of which only one would be read; scenes in subfolders of
+/// the one that is read are named. Those of a streamed SOG are its parts.
+fn check_one_scene(
+    name: &str,
+    others: &[String],
+    reading: &mut Reading,
+) -> Result<(), IngestError> {
+    let is_streamed = name.ends_with(sog::STREAMED);
+    let is_separate = |other: &&String| !is_streamed || other.ends_with(sog::STREAMED);
+    let others: Vec<&str> = others.iter().filter(is_separate).map(String::as_str).collect();
+    let beside = others.iter().find(|other| depth(other) == depth(name));
+    if let Some(beside) = beside {
+        let reason = format!("it holds several scenes: {name}, {beside}; give one archive each");
+        return Err(error("directory", reason));
+    }
+    if !others.is_empty() {
+        reading.warn_skipped("further scenes in the archive", &others);
+    }
+    Ok(())
+}
+
+/// The number of folders of a name.
+fn depth(name: &str) -> usize {
+    name.matches('/').count()
+}
+
+/// The start of the names of transforms in a USD layer.
+const XFORM: &[u8] = b"xformOp:";
 
 /// An archive in memory.
 struct Archive {
@@ -67,12 +115,36 @@ impl Archive {
         Ok(Self { zip, budget })
     }
 
-    /// The file with a name that, without folders, satisfies the condition; of several, the one in
-    /// the fewest folders.
-    fn find(&self, is_wanted: impl Fn(&str) -> bool) -> Option<String> {
+    /// The files with a name that, without folders, satisfies the condition; first those in the
+    /// fewest folders.
+    fn find(&self, is_wanted: impl Fn(&str) -> bool) -> Vec<String> {
         let names = self.zip.file_names();
         let wanted = names.filter(|name| is_wanted(name.rsplit('/').next().unwrap_or(name)));
-        wanted.min_by_key(|name| (name.matches('/').count(), *name)).map(str::to_owned)
+        let mut found: Vec<String> = wanted.map(str::to_owned).collect();
+        found.sort_by(|a, b| (depth(a), a).cmp(&(depth(b), b)));
+        found
+    }
+
+    /// The payloads of NuRec.
+    fn payloads(&self) -> Vec<String> {
+        self.find(|name| name.ends_with(".nurec"))
+    }
+
+    /// Warns of layers of USD that may place the payloads. 3dgrut writes them as text; what a
+    /// binary one says is unknown.
+    fn warn_layers(&mut self, reading: &mut Reading) -> Result<(), IngestError> {
+        let mut placing = self.find(|name| name.ends_with(".usdc") || name.ends_with(".usd"));
+        for name in self.find(|name| name.ends_with(".usda")) {
+            let bytes = self.read(&name, limits::SCENE_PART_BYTES)?;
+            if bytes.windows(XFORM.len()).any(|part| part == XFORM) {
+                placing.push(name);
+            }
+        }
+        if !placing.is_empty() {
+            let names: Vec<&str> = placing.iter().map(String::as_str).collect();
+            reading.warn_skipped("transforms of USD layers (the axes are the payload's)", &names);
+        }
+        Ok(())
     }
 }
 

@@ -1,7 +1,7 @@
 //! Converts from the axes and unit of a file to a twin's: metres, x east, y north, z up.
 //!
 //! Hardly any file says what its axes are (two PLY files may differ), so an import has options for
-//! them. An SPZ file may say it in an extension.
+//! them. An SPZ file may say it in an extension, and its specification says it for the others.
 
 use std::str::FromStr;
 
@@ -72,6 +72,34 @@ impl Axes {
         let z_right = x.cross(y);
         let z = z_right * z_right.dot(z).signum();
         Some(Self { twin_from_file: DMat3::from_cols(x, y, z).transpose(), ..Self::IDENTITY })
+    }
+
+    /// From the directions of the file's x, y and z: of each pair right or left (R, L), up or down
+    /// (U, D), forward or back (F, B), as in "RDF". Right is east, and forward is north. `None` for
+    /// other letters.
+    pub(super) fn from_letters(name: &str) -> Option<Self> {
+        let letters: [u8; 3] = name.as_bytes().try_into().ok()?;
+        let mut rows = [[0.0; 3]; 3];
+        for (column, letter) in letters.into_iter().enumerate() {
+            let (row, sign) = match letter {
+                b'R' => (0, 1.0),
+                b'L' => (0, -1.0),
+                b'F' => (1, 1.0),
+                b'B' => (1, -1.0),
+                b'U' => (2, 1.0),
+                b'D' => (2, -1.0),
+                _ => return None,
+            };
+            rows[row][column] = sign;
+        }
+        // A direction that occurs twice leaves a row of zeros.
+        Self::orthonormal(rows)
+    }
+
+    /// The change from these axes to those of `other`, without a change of the unit.
+    pub(super) fn to(&self, other: &Self) -> Self {
+        let twin_from_file = other.twin_from_file.transpose() * self.twin_from_file;
+        Self { twin_from_file, ..Self::IDENTITY }
     }
 
     /// These axes, with a unit of `metres_per_unit`.

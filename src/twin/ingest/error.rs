@@ -100,6 +100,9 @@ pub enum IngestError {
     /// Gaussians that no renderer can draw.
     #[error(transparent)]
     Values(#[from] BadGaussians),
+    /// Gaussians that cannot be drawn were to be left out, and there are no others.
+    #[error("none of its {count} Gaussians can be drawn, so that leaving them out leaves nothing")]
+    AllDropped { count: u64 },
     /// A sky that cannot be drawn.
     #[error("sky: {0}")]
     Sky(SkyError),

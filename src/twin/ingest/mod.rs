@@ -151,7 +151,20 @@ pub fn read_limited(
     };
     io::copy(&mut input, &mut io::sink())?;
     let hash = input.into_inner().finish();
-    Ok(ReadScene { gaussians, hash, parts: BTreeSet::new(), notes: reading.into_notes() })
+    let notes = check_dropped(&gaussians, reading)?;
+    Ok(ReadScene { gaussians, hash, parts: BTreeSet::new(), notes })
+}
+
+/// The notes of a scene that was read.
+///
+/// # Errors
+/// All of its Gaussians were left out: the file is no scene, or of another kind than it says.
+fn check_dropped(gaussians: &Gaussians, reading: Reading) -> Result<FileNotes, IngestError> {
+    let notes = reading.into_notes();
+    if gaussians.is_empty() && notes.dropped > 0 {
+        return Err(IngestError::AllDropped { count: notes.dropped });
+    }
+    Ok(notes)
 }
 
 /// Whether a file is of a format in which it may name others.
@@ -191,7 +204,7 @@ fn read_parts(
         }
         MultiFileFormat::Json => sog::read(&first, "", &mut parts, &mut reading)?,
     };
-    let notes = reading.into_notes();
+    let notes = check_dropped(&gaussians, reading)?;
     Ok(ReadScene { gaussians, hash: parts.hash(), parts: parts.into_names(), notes })
 }
 

@@ -20,10 +20,12 @@ const MAX_WARNINGS: usize = 32;
 /// What a scene says besides its Gaussians.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct FileNotes {
-    /// That the scene was trained with anti-aliasing.
+    /// Whether the scene was trained with anti-aliasing, if it says so.
     pub antialiasing: Option<Antialiasing>,
     /// The axes that it is in.
     pub axes: Option<FileAxes>,
+    /// What the scene says about its axes without giving them: warnings if nothing else does.
+    pub axes_hints: Vec<String>,
     /// What was not read, or is drawn in another way than its authors may expect. Each names a part
     /// of the file.
     pub warnings: Vec<String>,
@@ -31,30 +33,32 @@ pub struct FileNotes {
     pub dropped: u64,
 }
 
-/// Training with opacity compensation.
+/// Training with or without opacity compensation.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Antialiasing {
-    /// Variance added to both axes of the screen covariance, in px².
-    pub blur_px2: f64,
+    /// Variance added to both axes of the screen covariance, in px²; none without compensation.
+    pub blur_px2: Option<f64>,
     /// The part of the file that says so.
     pub said_by: String,
 }
 
-/// Axes that a file records.
+/// Axes that a file records, or that its format specifies.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FileAxes {
     pub axes: Axes,
-    /// The part of the file that says so.
+    /// The part of the file that says so, or the format.
     pub said_by: String,
+    /// Whether only the specification of the format says so, to which not all programs keep.
+    pub is_assumed: bool,
 }
 
 impl FileNotes {
     /// The fields of the render profile that the scene was trained with.
     pub fn profile(&self) -> ProfileOverrides {
         let mut fields = Map::new();
-        if let Some(antialiasing) = &self.antialiasing {
+        if let Some(Antialiasing { blur_px2: Some(blur_px2), .. }) = self.antialiasing {
             fields.insert("antialiased".to_owned(), Value::Bool(true));
-            fields.insert("blur".to_owned(), antialiasing.blur_px2.into());
+            fields.insert("blur".to_owned(), blur_px2.into());
         }
         ProfileOverrides::new(fields)
     }
@@ -107,10 +111,16 @@ impl Reading {
 
     /// The scene was trained with opacity compensation.
     pub(super) fn set_antialiased(&mut self, blur_px2: f64, said_by: String) {
+        self.set_antialiasing(Some(blur_px2), said_by);
+    }
+
+    /// The scene was trained with opacity compensation, or without. The last part counts.
+    pub(super) fn set_antialiasing(&mut self, blur_px2: Option<f64>, said_by: String) {
+        let used = said_by.clone();
         let before = self.notes.antialiasing.replace(Antialiasing { blur_px2, said_by });
         if let Some(before) = before.filter(|before| before.blur_px2 != blur_px2) {
             let said_by = before.said_by;
-            self.warn(format!("{said_by}: says another blur than a later part, which is used"));
+            self.warn(format!("{said_by}: has no effect, because {used} says something else"));
         }
     }
 
@@ -123,13 +133,24 @@ impl Reading {
 
     /// The scene is in these axes.
     pub(super) fn set_axes(&mut self, axes: Axes, said_by: String) {
-        self.notes.axes = Some(FileAxes { axes, said_by });
+        self.notes.axes = Some(FileAxes { axes, said_by, is_assumed: false });
     }
 
-    /// Takes back the axes, with a warning.
-    pub(super) fn ignore_axes(&mut self) {
-        if let Some(FileAxes { said_by, .. }) = self.notes.axes.take() {
-            self.warn(format!("{said_by} within the file has no effect"));
+    /// The scene is in the axes that its format specifies, unless it says others.
+    pub(super) fn assume_axes(&mut self, axes: Axes, said_by: String) {
+        let assumed = FileAxes { axes, said_by, is_assumed: true };
+        self.notes.axes.get_or_insert(assumed);
+    }
+
+    /// Takes the axes of a part of the scene.
+    pub(super) fn take_axes(&mut self) -> Option<FileAxes> {
+        self.notes.axes.take()
+    }
+
+    /// The scene says something about its axes, but not what they are.
+    pub(super) fn hint_axes(&mut self, hint: String) {
+        if !self.notes.axes_hints.contains(&hint) && self.notes.axes_hints.len() < MAX_WARNINGS {
+            self.notes.axes_hints.push(hint);
         }
     }
 

@@ -2,7 +2,7 @@
 //!
 //! means [N,3], quats [N,4] (w, x, y, z), scales [N,3] (ln), opacities [N] (logit), sh0 [N,1,3] and
 //! shN [N,K,3], or both in one as coeffs [N,1+K,3]. F32 throughout; means may be F64. Tensors of
-//! other names are named in a warning, but for those of a sky and of tracked objects.
+//! other names are named in a warning, but for those of a sky.
 
 use std::io::{self, Read};
 
@@ -25,6 +25,12 @@ pub(super) fn read(
 ) -> Result<Gaussians, IngestError> {
     let (metadata, body_start) = read_metadata(&mut input, file_bytes)?;
     let plan = ReadPlan::from_metadata(&metadata)?;
+    if metadata.info(POINT_IDS).is_some() {
+        reading.warn(format!(
+            "tensor {POINT_IDS}: these are tracked objects, each in its own axes, and lie in each other at the origin; \
+             `wildcity actor import --tracked` makes an asset of each"
+        ));
+    }
     let skipped = plan.skipped(&metadata);
     if !skipped.is_empty() {
         reading.warn_skipped("tensors", &skipped.iter().map(String::as_str).collect::<Vec<_>>());
@@ -89,7 +95,7 @@ pub(super) fn read_tracked(
     gaussians.clamp_activations();
     validate::check(&gaussians, &|field| file_name(field, one_tensor))?;
     let place = "tensor point_ids";
-    let info = metadata.info("point_ids").ok_or_else(|| bad(place, "is missing".into()))?;
+    let info = metadata.info(POINT_IDS).ok_or_else(|| bad(place, "is missing".into()))?;
     let (start, end) = info.data_offsets;
     let body = bytes.get(body_start as usize + start..body_start as usize + end);
     let body = body.ok_or_else(|| bad(place, "reaches beyond the file".into()))?;
@@ -139,10 +145,11 @@ struct ReadPlan<'a> {
     one_tensor: bool,
 }
 
-/// Prefix of the tensors of a sky, which `--sky` reads, and names of those that only other readers
-/// need.
+/// Prefix of the tensors of a sky, which `--sky` reads, and the name of another one.
 const SKY_PREFIX: &str = "sky_head.";
-const OF_OTHER_READERS: [&str; 2] = ["appearance_embedding.weight", "point_ids"];
+const OF_SKY: &str = "appearance_embedding.weight";
+/// The tensor with the object of each Gaussian.
+const POINT_IDS: &str = "point_ids";
 
 /// The column of Gaussians that a tensor is read into.
 enum Column {
@@ -219,11 +226,8 @@ impl<'a> ReadPlan<'a> {
             let info = metadata.info(name);
             info.is_some_and(|info| self.tensors.iter().any(|(_, read)| std::ptr::eq(*read, info)))
         };
-        let is_skipped = |name: &String| {
-            !is_read(name)
-                && !name.starts_with(SKY_PREFIX)
-                && !OF_OTHER_READERS.contains(&name.as_str())
-        };
+        let is_skipped =
+            |name: &String| !is_read(name) && !name.starts_with(SKY_PREFIX) && name != OF_SKY;
         metadata.offset_keys().into_iter().filter(is_skipped).collect()
     }
 }

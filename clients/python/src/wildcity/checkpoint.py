@@ -2,7 +2,8 @@
 
 A checkpoint of PyTorch 1.6 or later is a zip archive of a pickle and the bytes of its tensors. A pickle is a
 program that may call any function by name. This reader permits only the names that rebuild tensors and ordered
-dictionaries. Every other class becomes an `Opaque`, which holds nothing.
+dictionaries, and the containers of OmegaConf, whose content is read as plain data. Every other class becomes an
+`Opaque`, which holds nothing.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import collections
 import math
 import pickle
 import zipfile
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from typing import Any
@@ -50,6 +52,63 @@ class Opaque:
         pass
 
 
+class _Node:
+    """A node of OmegaConf: a container with `_content`, or a value with `_val`."""
+
+    _state: Mapping[str, Any] = {}
+
+    def __init__(self, *args: object, **kwargs: object) -> None:
+        pass
+
+    def __setstate__(self, state: object) -> None:
+        if isinstance(state, Mapping):
+            self._state = state
+
+
+class ConfigMap(_Node, Mapping[Any, Any]):
+    """A DictConfig. Values are read when they are asked for, because the pickle's nodes refer to their parents."""
+
+    @property
+    def is_readable(self) -> bool:
+        """Whether it has content, and is neither None nor a reference to another part of the configuration."""
+        return isinstance(self._state.get("_content"), Mapping)
+
+    def _values(self) -> Mapping[Any, Any]:
+        content = self._state.get("_content")
+        return content if isinstance(content, Mapping) else {}
+
+    def __getitem__(self, key: Any) -> Any:
+        return _plain(self._values()[key])
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self._values())
+
+    def __len__(self) -> int:
+        return len(self._values())
+
+
+class ConfigList(_Node, Sequence[Any]):
+    """A ListConfig, likewise."""
+
+    def _values(self) -> Sequence[Any]:
+        content = self._state.get("_content")
+        return content if isinstance(content, (list, tuple)) else ()
+
+    def __getitem__(self, index: Any) -> Any:
+        found = self._values()[index]
+        return [_plain(item) for item in found] if isinstance(index, slice) else _plain(found)
+
+    def __len__(self) -> int:
+        return len(self._values())
+
+
+def _plain(value: Any) -> Any:
+    """The value of a node, or the value itself."""
+    if isinstance(value, _Node) and not isinstance(value, (ConfigMap, ConfigList)):
+        return value._state.get("_val")
+    return value
+
+
 @dataclass(frozen=True)
 class _Dtype:
     numpy: np.dtype[Any]
@@ -79,7 +138,7 @@ class _Storage:
 def load(path: str | PathLike[str]) -> Any:
     """The saved objects: dictionaries, lists and numbers, with numpy arrays for tensors.
 
-    bfloat16 becomes float32. Raises `CheckpointError` if the file cannot be read.
+    Configurations of OmegaConf are mappings and sequences. bfloat16 becomes float32. Raises `CheckpointError` if the file cannot be read.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -141,6 +200,12 @@ class _Unpickler(pickle.Unpickler):
             return tuple
         if module == "torch" and name in _DTYPES:
             return _DTYPES[name]
+        if module.partition(".")[0] == "omegaconf" and name == "DictConfig":
+            return ConfigMap
+        if module.partition(".")[0] == "omegaconf" and name == "ListConfig":
+            return ConfigList
+        if module == "omegaconf.nodes":
+            return _Node
         # A class and not an instance, because a pickle can also create objects with NEWOBJ.
         return type(name, (Opaque,), {})
 

@@ -9,8 +9,9 @@ street.safetensors` reads both. The last of these commands writes the moving obj
 that each Gaussian belongs to: `wildcity actor import cars.safetensors --tracked` makes an asset of each. Supported are
 the checkpoints of gsplat (`splats`), drivestudio (`models`, of which one is converted), street_gaussians (`background`
 and one model per object, likewise), nerfstudio's splatfacto, INRIA (a tuple), and 3dgrut, whose particles are Gaussians
-only if they were trained with `render.particle_kernel_degree=2`. Conversion needs numpy but not PyTorch, and runs no
-code from the file.
+only if they were trained with `render.particle_kernel_degree=2` and no surfels. What else a checkpoint has, such as a
+sky, a colour correction or other models, is named in a warning; the state of optimizers is not. Conversion needs numpy
+but not PyTorch, and runs no code from the file.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .checkpoint import CheckpointError, load
+from .checkpoint import CheckpointError, ConfigMap, load
 
 __all__ = ["CheckpointError", "convert", "load", "models", "skipped", "sky", "splats"]
 
@@ -46,6 +47,31 @@ _FIELD_NAMES = {
 _SKY_TENSORS = [f"sky_head.layers.{layer}.{part}" for layer in range(3) for part in ("weight", "bias")]
 """Tensors of drivestudio's SkyModel; it may also have `appearance_embedding.weight`."""
 
+_GRUT_FIELDS = {"positions", "density", "features_albedo"}
+"""Fields by which a checkpoint of 3dgrut is known."""
+
+_GRUT_SETTINGS: dict[tuple[str, str], object] = {
+    ("render", "particle_kernel_degree"): 2,
+    ("model", "density_activation"): "sigmoid",
+    ("model", "scale_activation"): "exp",
+}
+"""Settings of 3dgrut with the values of Gaussians."""
+
+_WITHOUT_EFFECT = {
+    "device_indicator_param",
+    "lpips",
+    "psnr",
+    "ssim",
+    "optimizer",
+    "optimizers",
+    "schedulers",
+    "scalers",
+}
+"""Parts of a checkpoint that change no picture: metrics of nerfstudio, and the state of training."""
+
+_SH_C0 = 0.28209479177387814
+"""The SH function of degree 0."""
+
 _TRAINERS = "gsplat, drivestudio, street_gaussians, splatfacto, INRIA or 3dgrut"
 
 _Arrays = dict[str, npt.NDArray[Any]]
@@ -57,14 +83,32 @@ def convert(source: str | PathLike[str], target: str | PathLike[str], model: str
     Returns the number of Gaussians. `model` selects one of several models of a checkpoint. `target` is written
     completely or not at all. Raises `CheckpointError` if the checkpoint cannot be converted.
     """
-    tensors = splats(source, model)
-    _write_safetensors(target, tensors | sky(source))
+    saved = load(source)
+    tensors = _splats(source, saved, model)
+    _write_safetensors(target, tensors | _float32(_sky_arrays(saved)))
     return len(tensors["means"])
 
 
 def skipped(source: str | PathLike[str], model: str | None = None) -> list[str]:
-    """Names of the arrays of a model that are not converted, such as `semantic`."""
-    return _chosen(source, model)[1].skipped
+    """Names of what is not converted with a model: its other arrays, such as `semantic`, and groups of arrays beside it.
+
+    Groups are paths in the checkpoint, such as `sky_cubemap`, `models.RigidNodes` or `pipeline._model.bil_grids`. The
+    state of optimizers has none.
+    """
+    saved = load(source)
+    found = _chosen(source, saved, model)[1]
+    converted = {id(values) for values in _sky_arrays(saved).values()}
+    converted |= {id(values) for values in found.arrays.values()}
+    names = list(found.skipped)
+    own = found.path
+    for path in _array_paths(saved, (), converted):
+        if path[: len(own)] == own and len(path) == len(own) + 1:
+            continue  # It is one of `found.skipped`, or of the fields of training alone.
+        shared = 0
+        while shared < min(len(own), len(path) - 1) and own[shared] == path[shared]:
+            shared += 1
+        names.append(".".join(path[: shared + 1]))
+    return list(dict.fromkeys(names))
 
 
 def splats(source: str | PathLike[str], model: str | None = None) -> _Arrays:
@@ -74,13 +118,17 @@ def splats(source: str | PathLike[str], model: str | None = None) -> _Arrays:
     shN [N,K,3]; of drivestudio's RigidNodes also point_ids [N], the object of each Gaussian. Raises `CheckpointError`
     if there is no such model, or several and `model` is None.
     """
-    name, found = _chosen(source, model)
-    return _shaped_of(source, name, found.arrays)
+    return _splats(source, load(source), model)
 
 
-def _chosen(source: str | PathLike[str], model: str | None) -> tuple[str, _Found]:
+def _splats(source: str | PathLike[str], saved: Any, model: str | None) -> _Arrays:
+    name, found = _chosen(source, saved, model)
+    return _checked_arrays(source, name, found)
+
+
+def _chosen(source: str | PathLike[str], saved: Any, model: str | None) -> tuple[str, _Found]:
     """The model of a name, or the only one."""
-    found = _found(source)
+    found = _found(source, saved)
     if not found:
         raise CheckpointError(f"{source} has no Gaussians of {_TRAINERS}")
     names = ", ".join(repr(name) for name in found)
@@ -98,14 +146,46 @@ def sky(source: str | PathLike[str]) -> _Arrays:
 
     Empty if there is no sky.
     """
-    for arrays in _mappings(load(source)):
+    return _float32(_sky_arrays(load(source)))
+
+
+def _float32(arrays: _Arrays) -> _Arrays:
+    return {name: values.astype("<f4") for name, values in arrays.items()}
+
+
+def _sky_arrays(saved: Any) -> _Arrays:
+    """The arrays of the sky network, as they are in the checkpoint."""
+    for arrays in _mappings(saved):
         prefixes = {key.removesuffix(_SKY_TENSORS[0]) for key in arrays if key.endswith(_SKY_TENSORS[0])}
         for prefix in sorted(prefixes):
             names = [*_SKY_TENSORS, "appearance_embedding.weight"]
             found = {name: arrays.get(prefix + name) for name in names}
             if all(isinstance(found[name], np.ndarray) for name in _SKY_TENSORS):
-                return {name: values.astype("<f4") for name, values in found.items() if isinstance(values, np.ndarray)}
+                return {name: values for name, values in found.items() if isinstance(values, np.ndarray)}
     return {}
+
+
+def _array_paths(value: Any, path: tuple[str, ...], left_out: set[int]) -> Iterator[tuple[str, ...]]:
+    """Where a checkpoint has arrays that belong to no optimizer, but for objects with the ids of `left_out`."""
+    if id(value) in left_out or len(path) > 64:
+        return
+    if isinstance(value, np.ndarray):
+        if value.size > 0 and not any(step in _WITHOUT_EFFECT for step in path):
+            yield path
+        return
+    if isinstance(value, Mapping):
+        if {"state", "param_groups"} <= value.keys():
+            return  # The state of an optimizer of PyTorch.
+        items: list[tuple[Any, Any]] = list(value.items())
+    elif _is_inria(value):
+        return  # It has nothing but the Gaussians and the state of their training.
+    elif isinstance(value, (list, tuple)):
+        items = list(enumerate(value))
+    else:
+        return
+    left_out.add(id(value))  # A pickle may hold a container many times, also in itself.
+    for key, item in items:
+        yield from _array_paths(item, (*path, *str(key).split(".")), left_out)
 
 
 def _mappings(value: Any, depth: int = 0) -> Iterator[Mapping[str, Any]]:
@@ -118,48 +198,73 @@ def _mappings(value: Any, depth: int = 0) -> Iterator[Mapping[str, Any]]:
 
 def models(source: str | PathLike[str]) -> dict[str, _Arrays]:
     """All models of Gaussians of a checkpoint, by name, each as `splats` returns it."""
-    return {name: _shaped_of(source, name, found.arrays) for name, found in _found(source).items()}
+    found = _found(source, load(source))
+    return {name: _checked_arrays(source, name, model) for name, model in found.items()}
 
 
 @dataclass
 class _Found:
     """Arrays of a model: of the known fields by gsplat's names, and the names of the others."""
 
+    path: tuple[str, ...] = ()
     arrays: _Arrays = field(default_factory=dict)
     skipped: list[str] = field(default_factory=list)
+    has_plain_colours: bool = False
+    """Whether colours of degree 0 are the logits of colours, as splatfacto and drivestudio train them."""
 
 
-def _found(source: str | PathLike[str]) -> dict[str, _Found]:
+def _found(source: str | PathLike[str], saved: Any) -> dict[str, _Found]:
     """All models of a checkpoint, as they are in the file."""
-    saved = load(source)
     _check_kernel(source, saved)
-    return {name or "splats": found for name, found in _candidates(saved, "")}
+    return {name or "splats": found for name, found in _candidates(saved, ())}
 
 
-def _shaped_of(source: str | PathLike[str], name: str, arrays: _Arrays) -> _Arrays:
+def _checked_arrays(source: str | PathLike[str], name: str, found: _Found) -> _Arrays:
     try:
-        return _shaped(arrays)
+        shaped = _shaped(found.arrays)
     except CheckpointError as error:
         raise CheckpointError(f"{source}, model {name!r}: {error}") from error
+    if found.has_plain_colours:
+        colours = 1 / (1 + np.exp(-shaped["sh0"].astype("<f8")))
+        shaped["sh0"] = ((colours - 0.5) / _SH_C0).astype("<f4")
+    return shaped
 
 
 def _check_kernel(source: str | PathLike[str], saved: Any) -> None:
-    """3dgrut's default ray tracer trains particles of degree 4, which are no Gaussians."""
+    """Refuses the particles of 3dgrut that are no Gaussians: its default ray tracer trains a degree of 4."""
     for values in _mappings(saved):
-        degree = values.get("particle_kernel_degree", 2)
-        if degree != 2:
+        config = values.get("config", {})
+        is_readable = config.is_readable if isinstance(config, ConfigMap) else isinstance(config, Mapping)
+        if values.keys() >= _GRUT_FIELDS and not is_readable:
             raise CheckpointError(
-                f"{source}: render.particle_kernel_degree is {degree!r}; only particles of degree 2 are Gaussians: "
-                "train with render.particle_kernel_degree=2"
+                f"{source}: its config is of a class that cannot be read, so the kernel of its particles is unknown: "
+                "save it as a dictionary, or as OmegaConf's DictConfig"
+            )
+        for (section, key), wanted in _GRUT_SETTINGS.items():
+            found = values.get(key, wanted)
+            if found != wanted:
+                raise CheckpointError(
+                    f"{source}: {section}.{key} is {found!r}; only {wanted!r} makes Gaussians: "
+                    f"train with {section}.{key}={wanted}"
+                )
+        if values.get("primitive_type") == "trisurfel":
+            raise CheckpointError(
+                f"{source}: render.primitive_type is 'trisurfel', planar surfels, which are no Gaussians: "
+                "train with another render.primitive_type"
             )
 
 
-def _candidates(value: Any, name: str, depth: int = 0) -> Iterator[tuple[str, _Found]]:
-    """All groups of arrays that have every field of Gaussians, with their path in the checkpoint."""
+def _is_inria(value: Any) -> bool:
+    """Whether it is INRIA's (capture(), iteration): degree, xyz, dc, rest, scaling, rotation, opacity, ..."""
+    return isinstance(value, tuple) and len(value) == 2 and isinstance(value[0], tuple)
+
+
+def _candidates(value: Any, path: tuple[str, ...], name: str = "", depth: int = 0) -> Iterator[tuple[str, _Found]]:
+    """All groups of arrays that have every field of Gaussians, with their name in the checkpoint."""
     if depth > 8:
         return
-    if isinstance(value, tuple) and len(value) == 2 and isinstance(value[0], tuple):
-        # INRIA's (capture(), iteration): degree, xyz, dc, rest, scaling, rotation, opacity, ...
+    is_inria = _is_inria(value)
+    if is_inria:
         keys = ("xyz", "features_dc", "features_rest", "scaling", "rotation", "opacity")
         value = dict(zip(keys, value[0][1:7], strict=False))
     if not isinstance(value, Mapping):
@@ -168,14 +273,18 @@ def _candidates(value: Any, name: str, depth: int = 0) -> Iterator[tuple[str, _F
     for key, item in value.items():
         if isinstance(key, str) and isinstance(item, np.ndarray):
             prefix, _, last = key.rpartition(".")
-            group = groups.setdefault(prefix, _Found())
-            known = [ours for ours, theirs in _FIELD_NAMES.items() if last.lstrip("_") in theirs]
+            steps = tuple(prefix.split(".")) if prefix else ()
+            group = groups.setdefault(prefix, _Found((*path, *steps)))
+            plain = last.lstrip("_")
+            known = [ours for ours, theirs in _FIELD_NAMES.items() if plain in theirs]
             for ours in known:
                 group.arrays[ours] = item
+            if plain == "features_rest" and item.size == 0:
+                group.has_plain_colours = not is_inria
             if not known:
                 group.skipped.append(key)
         elif isinstance(key, str):
-            yield from _candidates(item, key, depth + 1)
+            yield from _candidates(item, (*path, *key.split(".")), key, depth + 1)
     for prefix, found in groups.items():
         if _FIELD_NAMES.keys() - {"shN", "point_ids"} <= found.arrays.keys():
             _cut_to_active(found.arrays, value.get("n_active_features"))

@@ -107,7 +107,15 @@ fn read_images(
             world_from_camera,
             time_us: None,
         });
-        lines.next();
+        // A writer that leaves the second line out would lose every other image.
+        let points = lines.next();
+        if let Some((index, points)) = points.filter(|(_, points)| !is_points(points)) {
+            let reason = format!(
+                "{points:?} is not a line of points (X Y POINT3D_ID, repeated), which must follow each image and may be \
+                 empty: write it again with `colmap model_converter`"
+            );
+            return Err(CaptureError::at(path, Place::Line(index + 1), reason));
+        }
     }
     if images.is_empty() {
         return Err(CaptureError::at(
@@ -117,6 +125,12 @@ fn read_images(
         ));
     }
     Ok(images)
+}
+
+/// Whether a line holds points: three numbers each. Files without points have empty lines.
+fn is_points(line: &str) -> bool {
+    let words: Vec<&str> = line.split_whitespace().collect();
+    words.len().is_multiple_of(3) && words.iter().all(|word| word.parse::<f64>().is_ok())
 }
 
 fn number<T: FromStr>(field: &str, word: &str) -> Result<T, String> {

@@ -17,7 +17,7 @@ use glam::{DMat3, DQuat};
 use wildcity_scene::align::PosedImage;
 
 pub use error::{CaptureError, Place};
-pub use nerfstudio::{FrameImage, read as read_nerfstudio, read_frames as read_nerfstudio_frames};
+pub use nerfstudio::{FrameImage, NerfstudioCapture, read as read_nerfstudio};
 
 /// Reads a COLMAP model: the folder with cameras.bin and images.bin, or with cameras.txt and
 /// images.txt; or a folder that has it in sparse/0 or sparse.

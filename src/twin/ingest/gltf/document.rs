@@ -27,6 +27,8 @@ pub(super) struct Document {
     pub(super) buffer_views: Vec<BufferView>,
     #[serde(default)]
     pub(super) buffers: Vec<Buffer>,
+    #[serde(default)]
+    pub(super) animations: Vec<serde::de::IgnoredAny>,
 }
 
 #[derive(Deserialize)]
@@ -45,6 +47,9 @@ pub(super) struct Node {
     /// x, y, z, w.
     pub(super) rotation: Option<[f64; 4]>,
     pub(super) scale: Option<[f64; 3]>,
+    pub(super) skin: Option<serde::de::IgnoredAny>,
+    #[serde(default)]
+    pub(super) extensions: BTreeMap<String, serde::de::IgnoredAny>,
 }
 
 #[derive(Deserialize)]
@@ -57,6 +62,9 @@ pub(super) struct Primitive {
     pub(super) attributes: BTreeMap<String, usize>,
     #[serde(default)]
     pub(super) extensions: BTreeMap<String, Value>,
+    /// Shapes that an animation mixes in.
+    #[serde(default)]
+    pub(super) targets: Vec<serde::de::IgnoredAny>,
 }
 
 impl Primitive {

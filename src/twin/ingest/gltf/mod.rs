@@ -14,6 +14,7 @@ mod document;
 mod instances;
 mod material;
 mod mesh;
+mod skipped;
 mod splat_settings;
 mod triangle;
 mod uris;
@@ -22,12 +23,13 @@ use std::collections::BTreeMap;
 
 use serde_json::Value;
 
+use wildcity_scene::srgb::stored_from_linear;
 use wildcity_scene::{Gaussians, sh};
 
 use super::notes::Reading;
 use super::scene_files::SceneFiles;
 use super::validate::Field;
-use super::{IngestError, activation, check_count, spz};
+use super::{Axes, FileAxes, IngestError, activation, check_count, spz};
 use accessor::Column;
 use document::{Document, Primitive};
 use uris::Uris;
@@ -159,6 +161,7 @@ pub(super) fn read(
     let mut all = Gaussians::default();
     let mut found = false;
     let placed = instances::mesh_instances(&document)?;
+    skipped::check(&document, &placed, reading);
     for placed in &placed {
         for (index, primitive) in placed.mesh.primitives.iter().enumerate() {
             if !primitive.extensions.contains_key(EXTENSION) {
@@ -195,10 +198,10 @@ fn read_primitive(
             let bytes = view.and_then(|view| document.view_bytes(buffers, view as usize));
             let bytes =
                 bytes.ok_or_else(|| bad(place, format!("{SPZ} has no bufferView that exists")))?;
-            let read = spz::read_gzip_within(bytes, bytes.len() as u64, parts.budget(), reading);
-            // The axes are those of the glTF, whatever the SPZ within says.
-            reading.ignore_axes();
-            return read;
+            let mut part =
+                spz::read_gzip_within(bytes, bytes.len() as u64, parts.budget(), reading)?;
+            turn_compressed(&mut part, reading);
+            return Ok(part);
         }
         Some((extension, _)) => {
             return Err(bad(place, format!("is compressed by {extension}; export it without")));
@@ -217,6 +220,11 @@ fn read_primitive(
     let scales = own("SCALE", 3)?;
     let opacities = own("OPACITY", 1)?;
     let sh_degree = degree(&primitive.attributes);
+    if sh_degree.is_none() {
+        reading.warn(format!(
+            "{place} has no {EXTENSION}:SH_DEGREE_0_COEF_0: COLOR_0 is drawn, which is linear light"
+        ));
+    }
     let mut colours = Vec::new();
     for (degree, n) in (0..=sh_degree.unwrap_or(0)).flat_map(|l| (0..=2 * l).map(move |n| (l, n))) {
         match sh_degree {
@@ -251,12 +259,30 @@ fn read_primitive(
     for i in 0..count {
         for colour in &colours {
             let rgb = colour.row::<3>(i);
-            g.sh.extend(
-                rgb.map(|c| if sh_degree.is_some() { c as f32 } else { activation::dc(c) }),
-            );
+            g.sh.extend(rgb.map(|c| {
+                if sh_degree.is_some() { c as f32 } else { activation::dc(stored_from_linear(c)) }
+            }));
         }
     }
     Ok(g)
+}
+
+/// Turns splats of an SPZ from the axes that it records to those of glTF. If it records none, they
+/// are in those of glTF: writers compress the attributes as they are, although SPZ of its own is
+/// right, up, back.
+fn turn_compressed(part: &mut Gaussians, reading: &mut Reading) {
+    // x left, y up, z to the front of what faces the viewer.
+    let Some(own) = Axes::from_letters("LUF") else { return };
+    match reading.take_axes() {
+        Some(FileAxes { axes, said_by, is_assumed: false }) => {
+            axes.to(&own).apply(part);
+            reading.warn(format!("{said_by}: turned to the axes of glTF, x left, y up, z to the front"));
+        }
+        Some(FileAxes { is_assumed: true, .. }) | None => reading.warn(format!(
+            "{SPZ}: the SPZ records no axes, so that those of the glTF are assumed and not SPZ's right, up, back; if it is \
+             drawn back to front, give the axes with a half turn about y"
+        )),
+    }
 }
 
 /// The highest SH degree with an attribute.

@@ -64,11 +64,18 @@ pub(super) fn read(
         return Err(bad("a layer of static Gaussians", "is missing".into()));
     }
     payload.warn_skipped(reading);
+    if let Some(data) = root.get("nre_data") {
+        settings::check_data(data, reading);
+    }
     let mut all = Gaussians::default();
     for name in layers {
         budget.check_stop()?;
-        if let Some(settings) = payload.settings.get(name) {
-            settings::warn_skipped(settings, name, reading);
+        match payload.settings.get(name) {
+            Some(settings) => settings::warn_skipped(settings, name, reading),
+            None => reading.warn(format!(
+                "layer {name} has no settings in config.layers: it is drawn as Gaussians, whatever kernel it was trained \
+                 with"
+            )),
         }
         all.append(&payload.layer(name)?.read()?);
         check_count(all.len() as u64)?;

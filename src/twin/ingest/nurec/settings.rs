@@ -18,6 +18,61 @@ const KNOWN: [&str; 5] = [
     "radiance_sph_degree",
 ];
 
+/// Other keys of a layer: names, devices, and what only trades speed for accuracy.
+const KNOWN_OF_LAYER: [&str; 8] = [
+    "density_activation",
+    "device",
+    "name",
+    "particle",
+    "precision",
+    "rotation_activation",
+    "scale_activation",
+    "transmittance_threshold",
+];
+
+/// Keys of `nre_data` and its `config`, but for those that say how the whole picture is made.
+const KNOWN_OF_DATA: [&str; 4] = ["config", "model", "state_dict", "version"];
+const KNOWN_OF_CONFIG: [&str; 5] =
+    ["appearance_embedding", "background", "layers", "name", "renderer"];
+
+/// Values of the payload's settings that are drawn. Others are an appearance or a background that
+/// belongs to the picture.
+const DRAWN: [(&[&str], &str); 3] = [
+    (&["model"], "nre"),
+    (&["config", "appearance_embedding", "name"], "skip-appearance"),
+    (&["config", "background", "name"], "skip-background"),
+];
+
+/// Warns of settings of the payload that are drawn in another way, or that are not known.
+pub(super) fn check_data(data: &Value<'_>, reading: &mut Reading) {
+    warn_unknown(data, &KNOWN_OF_DATA, "nre_data", reading);
+    if let Some(config) = data.get("config") {
+        warn_unknown(config, &KNOWN_OF_CONFIG, "config", reading);
+    }
+    for (path, drawn) in DRAWN {
+        let found = path.iter().try_fold(data, |value, key| value.get(key));
+        if let Some(Value::Text(found)) = found
+            && *found != drawn
+        {
+            reading.warn(format!("{} is {found:?}; it is drawn as {drawn:?}", path.join(".")));
+        }
+    }
+    let background = data.get("config").and_then(|config| config.get("background"));
+    let is_linear = background.and_then(|settings| settings.get("composite_in_linear_space"));
+    if matches!(is_linear, Some(Value::Bool(true))) {
+        let key = "config.background.composite_in_linear_space";
+        reading.warn(format!("{key} is true; the sky is blended as stored values, not as light"));
+    }
+}
+
+/// Warns of keys of a map that are not known.
+fn warn_unknown(map: &Value<'_>, known: &[&str], place: &str, reading: &mut Reading) {
+    let unknown: Vec<&str> = map.keys().filter(|key| !known.contains(key)).collect();
+    if !unknown.is_empty() {
+        reading.warn_skipped(&format!("entries of {place}"), &unknown);
+    }
+}
+
 /// Refuses parameters with other activations, and particles with other kernels, than those that are
 /// drawn.
 pub(super) fn check(settings: &Value<'_>, layer: &str) -> Result<(), IngestError> {
@@ -60,11 +115,70 @@ pub(super) fn check(settings: &Value<'_>, layer: &str) -> Result<(), IngestError
     }
 }
 
-/// Warns of settings of particles that are not read.
+/// Warns of settings of a layer and of its particles that are not read.
 pub(super) fn warn_skipped(settings: &Value<'_>, layer: &str, reading: &mut Reading) {
+    warn_unknown(settings, &KNOWN_OF_LAYER, &format!("config.layers.{layer}"), reading);
     let keys = settings.get("particle").into_iter().flat_map(Value::keys);
     let skipped: Vec<&str> = keys.filter(|key| !KNOWN.contains(key)).collect();
     if !skipped.is_empty() {
         reading.warn_skipped(&format!("settings of config.layers.{layer}.particle"), &skipped);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn map<'a>(entries: Vec<(&'a str, Value<'a>)>) -> Value<'a> {
+        Value::Map(entries.into_iter().map(|(key, value)| (Value::Text(key), value)).collect())
+    }
+
+    fn warned(check: impl Fn(&mut Reading)) -> String {
+        let mut reading = Reading::new(false);
+        check(&mut reading);
+        reading.into_notes().warnings.join("; ")
+    }
+
+    #[test]
+    fn settings_of_the_whole_picture_are_named() {
+        let data = |model: &'static str, sky: &'static str, is_linear: bool| {
+            let linear = ("composite_in_linear_space", Value::Bool(is_linear));
+            let background = map(vec![("name", Value::Text(sky)), linear]);
+            let appearance = map(vec![("name", Value::Text("skip-appearance"))]);
+            let config = vec![("background", background), ("appearance_embedding", appearance)];
+            map(vec![("model", Value::Text(model)), ("config", map(config))])
+        };
+        let warned = |data: Value<'_>| warned(|reading| check_data(&data, reading));
+        assert_eq!(warned(data("nre", "skip-background", false)), "");
+        let linear = warned(data("nre", "skip-background", true));
+        assert!(linear.starts_with("config.background.composite_in_linear_space is true"));
+        let sky = warned(data("other", "sky-mlp", false));
+        assert_eq!(
+            sky,
+            "model is \"other\"; it is drawn as \"nre\"; \
+             config.background.name is \"sky-mlp\"; it is drawn as \"skip-background\""
+        );
+        let unknown =
+            map(vec![("fog", Value::Other), ("config", map(vec![("tone", Value::Other)]))]);
+        assert_eq!(
+            warned(unknown),
+            "entries of nre_data not read: fog; entries of config not read: tone"
+        );
+    }
+
+    #[test]
+    fn unknown_settings_of_a_layer_are_named() {
+        let particle =
+            map(vec![("density_kernel_degree", Value::Count(2)), ("noise", Value::Other)]);
+        let settings = map(vec![
+            ("precision", Value::Count(16)),
+            ("opacity_scale", Value::Other),
+            ("particle", particle),
+        ]);
+        assert_eq!(
+            warned(|reading| warn_skipped(&settings, "street", reading)),
+            "entries of config.layers.street not read: opacity_scale; \
+             settings of config.layers.street.particle not read: noise"
+        );
     }
 }

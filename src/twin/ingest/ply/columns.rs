@@ -9,7 +9,7 @@ use crate::ingest::{IngestError, activation};
 /// Columns that are not read and change no picture: the reference code writes normals of zero.
 const WITHOUT_EFFECT: [&str; 3] = ["nx", "ny", "nz"];
 /// The width of the 3D filter of mip-splatting, a standard deviation.
-const FILTER: &str = "filter_3D";
+pub(super) const FILTER: &str = "filter_3D";
 
 /// The columns of a vertex.
 pub(super) struct Columns {
@@ -65,6 +65,11 @@ impl Columns {
     /// Whether the Gaussians have the 3D filter of mip-splatting.
     pub(super) fn has_filter(&self) -> bool {
         self.filter.is_some()
+    }
+
+    /// The width of the 3D filter in a row.
+    pub(super) fn filter(&self, row: &[u8]) -> Option<f64> {
+        self.filter.as_ref().map(|filter| filter.value(row))
     }
 
     /// Names of the columns that are not read, but for those without an effect.

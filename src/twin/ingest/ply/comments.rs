@@ -31,10 +31,16 @@ pub(super) fn read(comment: &str, reading: &mut Reading) {
         // Brush and splat-transform.
         ["splatrendermode", "mip"] => reading.set_antialiased(BLUR_BRUSH_PX2, said_by()),
         ["splatrendermode", "2dgs"] => reading.set_flat(&said_by()),
-        ["splatrendermode", "default"] | [] => {}
+        ["splatrendermode", "default"] => reading.set_antialiasing(None, said_by()),
+        [] => {}
         // Postshot.
-        ["antialiased", "1"] => reading.set_antialiased(BLUR_PX2, said_by()),
-        ["antialiased", "0"] => {}
+        ["antialiased", "1" | "true"] => reading.set_antialiased(BLUR_PX2, said_by()),
+        ["antialiased", "0" | "false"] => reading.set_antialiasing(None, said_by()),
+        // nerfstudio: which of its axes is up, and not where the others point.
+        ["vertical", "axis", axis] => reading.hint_axes(format!(
+            "{} says that {axis} is up or down, and no axes are given: give --axes",
+            said_by()
+        )),
         _ if WITHOUT_EFFECT.iter().any(|start| lower.starts_with(start)) => {}
         _ if is_setting(&lower) => reading.warn(format!("{} has no effect", said_by())),
         _ => {}

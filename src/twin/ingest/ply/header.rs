@@ -2,6 +2,7 @@
 //!
 //! Source: Greg Turk, "The PLY Polygon File Format" (1994).
 
+use std::borrow::Cow;
 use std::io::{BufRead, Read};
 
 use crate::ingest::IngestError;
@@ -16,6 +17,8 @@ pub(super) struct Header {
     pub(super) elements: Vec<Element>,
     /// The texts of the comments.
     pub(super) comments: Vec<String>,
+    /// The comments with bytes that are not UTF-8, which were replaced.
+    pub(super) damaged_comments: Vec<String>,
     /// Where the body starts, in bytes.
     pub(super) bytes: u64,
 }
@@ -66,6 +69,7 @@ impl Header {
         let mut input = input.take(limits::PLY_HEADER_BYTES as u64);
         let mut elements: Vec<Element> = Vec::new();
         let mut comments = Vec::new();
+        let mut damaged_comments = Vec::new();
         let mut bytes = 0;
         let mut number = 0;
         let mut encoding = None;
@@ -82,13 +86,20 @@ impl Header {
                 )));
             }
             // The first word is the kind of the declaration.
-            let text = std::str::from_utf8(&line).map_err(|_| bad("is not text".into()))?.trim();
+            let text = String::from_utf8_lossy(&line);
+            let is_damaged = matches!(text, Cow::Owned(_));
+            let text = text.trim();
             let words: Vec<&str> = text.split_ascii_whitespace().collect();
             match words[..] {
                 ["ply"] if number == 1 => {}
                 _ if number == 1 => return Err(bad(format!("{text:?} must be ply"))),
                 [] => {}
-                ["comment" | "obj_info", ref words @ ..] => comments.push(words.join(" ")),
+                ["comment" | "obj_info", ref words @ ..] => {
+                    comments.push(words.join(" "));
+                    damaged_comments.extend(is_damaged.then(|| words.join(" ")));
+                }
+                // Names in other lines decide what is read.
+                _ if is_damaged => return Err(bad("is not text".into())),
                 ["format", name, "1.0"] => {
                     let known = Encoding::parse(name);
                     encoding = Some(known.ok_or_else(|| bad(format!("{text:?} {FORMATS}")))?);
@@ -124,7 +135,7 @@ impl Header {
         let encoding = encoding.ok_or_else(|| {
             error("end".into(), "there is no line format binary_little_endian 1.0".into())
         })?;
-        Ok(Self { encoding, elements, comments, bytes })
+        Ok(Self { encoding, elements, comments, damaged_comments, bytes })
     }
 
     /// The element of a name.

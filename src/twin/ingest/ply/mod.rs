@@ -14,14 +14,16 @@ mod comments;
 mod compressed;
 mod header;
 
+use std::collections::BTreeMap;
 use std::io::BufRead;
 
 use wildcity_scene::Gaussians;
 
 use super::notes::{BLUR_BRUSH_PX2, Reading};
+use super::validate::NAMED_BAD_GAUSSIANS;
 use super::{IngestError, Progress, check_count};
 use body::Body;
-use columns::{Columns, degree, file_name};
+use columns::{Columns, FILTER, degree, file_name};
 use header::{Element, Header, error};
 
 /// Reads a PLY file of a known size.
@@ -37,6 +39,9 @@ pub(super) fn read(
         return Err(error("end".into(), "there is no element vertex".into()));
     };
     header.comments.iter().for_each(|comment| comments::read(comment, reading));
+    for comment in &header.damaged_comments {
+        reading.warn(format!("comment {comment:?} is not UTF-8: other bytes are read as \u{fffd}"));
+    }
     if vertex.property("packed_position").is_ok() {
         return compressed::read(input, &header, file_bytes, reading, progress);
     }
@@ -53,16 +58,38 @@ pub(super) fn read(
     let mut gaussians = Gaussians::with_capacity(columns.sh_degree, count);
     let encoding = header.encoding;
     let mut body = Body { input, encoding, done: header.bytes, file_bytes, progress };
+    // Scales and opacities are NaN behind such a filter.
+    let mut bad_filters = BTreeMap::new();
     for element in &header.elements {
         body.rows(element, |row| {
             if element.name == vertex.name {
+                let bad = columns.filter(row).filter(|filter| !filter.is_finite());
+                if let Some(bad) = bad.filter(|_| bad_filters.len() < NAMED_BAD_GAUSSIANS) {
+                    bad_filters.insert(gaussians.len(), bad);
+                }
                 columns.push(row, &mut gaussians);
             }
         })?;
     }
     body.check_end()?;
     let sh_degree = columns.sh_degree;
-    reading.accept(gaussians, &|field| file_name(field, sh_degree))
+    let accepted = reading.accept(gaussians, &|field| file_name(field, sh_degree));
+    accepted.map_err(|error| with_filters(error, &bad_filters))
+}
+
+/// The error of Gaussians, with the name of the filter where that is what is wrong.
+fn with_filters(mut error: IngestError, bad_filters: &BTreeMap<usize, f64>) -> IngestError {
+    if let IngestError::Values(bad) = &mut error {
+        for named in &mut bad.first {
+            let filter = bad_filters.get(&named.index);
+            if let Some(filter) = filter.filter(|_| named.field.starts_with("scale_")) {
+                named.field = FILTER.to_owned();
+                named.value = filter.to_string();
+                named.must = "a width is finite";
+            }
+        }
+    }
+    error
 }
 
 /// Notes what the columns say besides the Gaussians.

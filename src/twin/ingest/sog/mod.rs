@@ -30,6 +30,9 @@ const FORMAT: &str = "SOG";
 /// folders as well.
 pub const DESCRIPTIONS: [&str; 2] = [streamed::NAME, "meta.json"];
 
+/// The file that describes a streamed scene.
+pub(super) const STREAMED: &str = streamed::NAME;
+
 /// Reads a scene, given its meta.json or lod-meta.json and the folder of that file, which is empty
 /// or ends in `/`.
 pub(super) fn read(

@@ -13,8 +13,11 @@ const COORDINATE_SYSTEM: u32 = 0xADBE_0003;
 const SAFE_ORBIT_CAMERA: u32 = 0xADBE_0002;
 /// Bytes of the extensions after the payload of versions 2 and 3 that are read.
 pub(super) const LEGACY_BYTES: u64 = 64 << 10;
-/// Coordinate systems by number: the directions of x, y and z. 0 is unspecified.
-const SYSTEMS: [&str; 9] = ["", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"];
+/// Coordinate systems by number (splat-types.h): the directions of x, y and z. 0 is unspecified.
+const SYSTEMS: [&str; 17] = [
+    "", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF", "LFD", "RFD", "LFU", "RFU", "LBD",
+    "RBD", "LBU", "RBU",
+];
 
 /// Reads extensions of so many bytes in all.
 pub(super) fn read(
@@ -52,6 +55,13 @@ pub(super) fn read(
     skip(input, left)
 }
 
+/// Notes the axes of a file that records none: by the specification, right, up, back.
+pub(super) fn assume_system(reading: &mut Reading) {
+    if let Some(axes) = Axes::from_letters("RUB") {
+        reading.assume_axes(axes, "the specification of SPZ".to_owned());
+    }
+}
+
 fn skip(input: &mut impl Read, bytes: u64) -> Result<(), IngestError> {
     io::copy(&mut input.take(bytes), &mut io::sink())?;
     Ok(())
@@ -59,21 +69,13 @@ fn skip(input: &mut impl Read, bytes: u64) -> Result<(), IngestError> {
 
 fn note_system(number: u32, reading: &mut Reading) {
     let name = SYSTEMS.get(number as usize).copied().unwrap_or_default();
-    match axes(name) {
+    match Axes::from_letters(name) {
         Some(axes) => {
             reading.set_axes(axes, format!("SPZ_ADOBE_coordinate_system {number} ({name})"));
         }
         None if number == 0 => {}
         None => reading.warn(format!(
-            "SPZ_ADOBE_coordinate_system {number} is unknown; 1 to 8 are read: give --axes"
+            "SPZ_ADOBE_coordinate_system {number} is unknown; 1 to 16 are read: give --axes"
         )),
     }
-}
-
-/// The axes of a system: right is east, up is up, forward is north.
-fn axes(name: &str) -> Option<Axes> {
-    let [x, y, z] = *name.as_bytes() else { return None };
-    let sign = |letter: u8, positive: u8| if letter == positive { 1.0 } else { -1.0 };
-    let rows = [[sign(x, b'R'), 0.0, 0.0], [0.0, 0.0, sign(z, b'F')], [0.0, sign(y, b'U'), 0.0]];
-    Axes::from_rows(rows).ok()
 }

@@ -6,7 +6,8 @@
 //! and the higher colour coefficients (u8, 128ths from -1; coefficient-major, then red, green,
 //! blue). Version 4 has an uncompressed header of 32 bytes and a table of the streams' sizes after
 //! it. Between the two, or after the payload of earlier versions, there may be extensions: the one
-//! of the coordinate system is read, others are named in a warning.
+//! of the coordinate system is read, others are named in a warning. Without it the system is right,
+//! up, back.
 
 mod extensions;
 
@@ -61,9 +62,11 @@ pub(super) fn read(
         };
         let gaussians = decode(&header, rows, reading)?;
         extensions::read(&mut input, (held - promised) as u64, reading)?;
+        extensions::assume_system(reading);
         return Ok(gaussians);
     }
     let streams = read_table(&mut input, &header, file_bytes, budget, reading)?;
+    extensions::assume_system(reading);
     let rows = |attribute: usize, take: &mut dyn FnMut(&[u8])| {
         let attribute = &attributes[attribute];
         let broken = |error: io::Error| attribute.broken(&error);
@@ -120,6 +123,7 @@ pub(super) fn read_gzip_within(
         (&mut input).take(kept).read_to_end(&mut after).map_err(damaged)?;
         extensions::read(&mut &after[..], after.len() as u64, reading)?;
     }
+    extensions::assume_system(reading);
     let left = limit - (after.len() as u64).min(limit);
     let more = io::copy(&mut (&mut input).take(left), &mut io::sink());
     let more = more.map_err(damaged)? + after.len() as u64;

@@ -31,15 +31,44 @@ const PERSPECTIVE: [&str; 6] =
     ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "perspective"];
 const FISHEYE: [&str; 3] = ["OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE"];
 
-/// Fields of instant-ngp that make another camera than the ones that are read, unless they are
-/// false or zero.
-const REFUSED: [(&str, &str); 6] = [
+/// Fields that make another camera than the ones that are read, unless they are false or zero.
+const REFUSED: [(&str, &str); 12] = [
+    ("orthographic", "a camera without perspective: give images of a perspective one"),
+    ("k5", "a coefficient beyond k1 to k4: calibrate the lens without it, or undistort the images"),
+    ("k6", "a coefficient beyond k1 to k4: calibrate the lens without it, or undistort the images"),
+    ("b1", "an affinity of the pixels: calibrate the lens without it, or undistort the images"),
+    ("b2", "a skew of the pixels: calibrate the lens without it, or undistort the images"),
+    ("skew", "a skew of the pixels: calibrate the lens without it, or undistort the images"),
     ("ftheta_p0", "an f-theta lens: undistort the images"),
     ("latlong", "a panorama: cut pinhole images from it"),
     ("equirectangular", "a panorama: cut pinhole images from it"),
     ("rolling_shutter", "a rolling shutter: give the pose of each image's middle row, without it"),
     ("transform_matrix_start", "a motion during the exposure: give transform_matrix alone"),
     ("transform_matrix_end", "a motion during the exposure: give transform_matrix alone"),
+];
+
+/// Fields of a camera, which programs take from the file or from the frame: nerfstudio from the
+/// file, instant-ngp from the frame.
+const OF_CAMERA: [&str; 19] = [
+    "w",
+    "h",
+    "fl_x",
+    "fl_y",
+    "cx",
+    "cy",
+    "k1",
+    "k2",
+    "k3",
+    "k4",
+    "p1",
+    "p2",
+    "distortion_params",
+    "camera_angle_x",
+    "camera_angle_y",
+    "x_fov",
+    "y_fov",
+    "camera_model",
+    "is_fisheye",
 ];
 
 /// Coefficients of a lens.
@@ -49,11 +78,31 @@ struct Distortion {
 }
 
 impl Intrinsics {
-    /// These fields of a file, with those of a frame in their place.
-    pub(super) fn overridden_by(&self, frame: Self) -> Self {
+    /// These fields of a file, and those of a frame.
+    ///
+    /// # Errors
+    /// Both have a field of the camera, with different values.
+    pub(super) fn joined_with(&self, frame: Self) -> Result<Self, Wrong> {
+        for field in OF_CAMERA {
+            let of_file = self.0.get(field).filter(|value| !value.is_null());
+            let of_frame = frame.0.get(field).filter(|value| !value.is_null());
+            if let (Some(of_file), Some(of_frame)) = (of_file, of_frame)
+                && !is_same(of_file, of_frame)
+            {
+                let reason = format!(
+                    "is {of_frame}, and {of_file} for the whole file: programs read one or the other; remove one"
+                );
+                return Err(Wrong { field, reason });
+            }
+        }
         let mut fields = self.0.clone();
-        fields.extend(frame.0);
-        Self(fields)
+        fields.extend(frame.0.into_iter().filter(|(_, value)| !value.is_null()));
+        Ok(Self(fields))
+    }
+
+    /// Whether a field is given.
+    pub(super) fn has(&self, field: &str) -> bool {
+        self.0.get(field).is_some_and(|value| !value.is_null())
     }
 
     pub(super) fn camera(&self) -> Result<Camera, Wrong> {
@@ -159,7 +208,18 @@ impl Intrinsics {
                 p: [or_zero("p1")?, or_zero("p2")?],
             }),
             Some(list) => match <[f64; 6]>::deserialize(list) {
-                Ok([k1, k2, k3, k4, p1, p2]) => Ok(Distortion { k: [k1, k2, k3, k4], p: [p1, p2] }),
+                Ok(values) => {
+                    let names = ["k1", "k2", "k3", "k4", "p1", "p2"];
+                    for (name, value) in names.into_iter().zip(values) {
+                        if let Some(other) = self.number(name)?.filter(|other| *other != value) {
+                            let reason =
+                                format!("says {name} {value}, and {name} is {other}: remove one");
+                            return Err(Wrong { field, reason });
+                        }
+                    }
+                    let [k1, k2, k3, k4, p1, p2] = values;
+                    Ok(Distortion { k: [k1, k2, k3, k4], p: [p1, p2] })
+                }
                 Err(_) => {
                     let reason =
                         format!("is {list}; six numbers can be read: k1, k2, k3, k4, p1, p2");
@@ -189,6 +249,17 @@ impl Intrinsics {
             );
             Wrong { field, reason }
         })
+    }
+}
+
+/// Whether two values are the same: 700 is 700.0.
+fn is_same(a: &Value, b: &Value) -> bool {
+    match (a, b) {
+        (Value::Array(a), Value::Array(b)) => {
+            a.len() == b.len() && a.iter().zip(b).all(|(a, b)| is_same(a, b))
+        }
+        (Value::Number(_), Value::Number(_)) => a.as_f64() == b.as_f64(),
+        _ => a == b,
     }
 }
 

@@ -1,8 +1,9 @@
 //! transforms.json of nerfstudio and instant-ngp.
 //!
 //! Poses are `world_from_camera` with OpenGL's camera: x right, y up, z backwards. Intrinsics are
-//! of the file or of a frame, which overrides the file's (nerfstudio's data conventions;
-//! instant-ngp's docs/nerf_dataset_tips.md).
+//! of the file or of a frame (nerfstudio's data conventions; instant-ngp's
+//! docs/nerf_dataset_tips.md). If both have them, they must agree: nerfstudio takes those of the
+//! file, instant-ngp those of the frame.
 
 mod intrinsics;
 
@@ -10,6 +11,7 @@ use std::path::Path;
 
 use glam::{DMat3, DVec3};
 use serde::Deserialize;
+use serde_json::Value;
 
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::views::{MOST_STOPS, refused_stops};
@@ -33,7 +35,7 @@ struct Frame {
     file_path: String,
     transform_matrix: Vec<Vec<f64>>,
     mask_path: Option<String>,
-    time_us: Option<i64>,
+    time_us: Option<Value>,
     exposure_stops: Option<f64>,
     #[serde(flatten)]
     intrinsics: Intrinsics,
@@ -50,19 +52,19 @@ pub struct FrameImage {
     pub exposure_stops: Option<f64>,
 }
 
+/// A transforms.json.
+#[derive(Clone, Debug, PartialEq)]
+pub struct NerfstudioCapture {
+    pub frames: Vec<FrameImage>,
+    /// Fields that change the images or their times, and are not read.
+    pub warnings: Vec<String>,
+}
+
 /// Reads the file, or the one in a folder.
 ///
 /// # Errors
 /// The error names the file, the line or the field, and what to do.
-pub fn read(path: &Path) -> Result<Vec<PosedImage>, CaptureError> {
-    Ok(read_frames(path)?.into_iter().map(|frame| frame.posed).collect())
-}
-
-/// The frames with masks and times.
-///
-/// # Errors
-/// As [`read`].
-pub fn read_frames(path: &Path) -> Result<Vec<FrameImage>, CaptureError> {
+pub fn read(path: &Path) -> Result<NerfstudioCapture, CaptureError> {
     let inside = path.join("transforms.json");
     let path = if path.is_dir() { inside.as_path() } else { path };
     let text = read_whole(path, limits::CAPTURE_BYTES)
@@ -77,6 +79,7 @@ pub fn read_frames(path: &Path) -> Result<Vec<FrameImage>, CaptureError> {
         let place = Place::Field("frames".to_owned());
         return Err(CaptureError::at(path, place, "there is no frame: give a file with frames"));
     }
+    let warnings = warnings(&file);
     let frames = file.frames.into_iter().enumerate();
     let read = |(index, mut frame): (usize, Frame)| {
         let mask = frame.mask_path.take();
@@ -89,7 +92,30 @@ pub fn read_frames(path: &Path) -> Result<Vec<FrameImage>, CaptureError> {
         let posed = posed(path, index, frame, &file.intrinsics)?;
         Ok(FrameImage { posed, mask, exposure_stops })
     };
-    frames.map(read).collect()
+    Ok(NerfstudioCapture { frames: frames.map(read).collect::<Result<_, _>>()?, warnings })
+}
+
+/// Warns of fields that are not read.
+fn warnings(file: &Transforms) -> Vec<String> {
+    let has = |field: &str| {
+        file.intrinsics.has(field) || file.frames.iter().any(|frame| frame.intrinsics.has(field))
+    };
+    let is_timed = file.frames.iter().all(|frame| frame.time_us.is_some());
+    let mut warnings = Vec::new();
+    for field in ["timestamp", "timestamps", "time"] {
+        if !is_timed && has(field) {
+            warnings.push(format!(
+                "{field} is not read, because programs differ in its unit: give time_us, in whole microseconds"
+            ));
+        }
+    }
+    if has("fisheye_crop_radius") {
+        warnings.push(
+            "fisheye_crop_radius is not read: images are used up to their corners; give masks (mask_path)"
+                .to_owned(),
+        );
+    }
+    warnings
 }
 
 fn posed(
@@ -106,6 +132,11 @@ fn posed(
     if !is_matrix {
         return Err(matrix("expected 4 rows of 4 numbers: world_from_camera"));
     }
+    if rows.get(3).is_some_and(|bottom| bottom[..] != [0.0, 0.0, 0.0, 1.0]) {
+        return Err(matrix(
+            "the last row must be 0, 0, 0, 1: a pose is a rotation and a translation",
+        ));
+    }
     let row = |at: usize| DVec3::new(rows[at][0], rows[at][1], rows[at][2]);
     let world_from_opengl = DMat3::from_cols(row(0), row(1), row(2)).transpose();
     let rotation =
@@ -120,8 +151,13 @@ fn posed(
     let position = [rows[0][3], rows[1][3], rows[2][3]];
     let world_from_camera =
         Pose::checked(position, q_wxyz).map_err(|cause| matrix(&cause.to_string()))?;
-    let camera = shared.overridden_by(frame.intrinsics).camera();
+    let camera = shared.joined_with(frame.intrinsics).and_then(|fields| fields.camera());
     let camera = camera.map_err(|Wrong { field, reason }| wrong(field, reason))?;
-    let time_us = frame.time_us;
+    let time_us = match frame.time_us {
+        None | Some(Value::Null) => None,
+        Some(time) => Some(time.as_i64().ok_or_else(|| {
+            wrong("time_us", format!("is {time}; give whole microseconds, without a decimal point"))
+        })?),
+    };
     Ok(PosedImage { name: frame.file_path, camera, world_from_camera, time_us })
 }
