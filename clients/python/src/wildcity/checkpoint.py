@@ -138,7 +138,8 @@ class _Storage:
 def load(path: str | PathLike[str]) -> Any:
     """The saved objects: dictionaries, lists and numbers, with numpy arrays for tensors.
 
-    Configurations of OmegaConf are mappings and sequences. bfloat16 becomes float32. Raises `CheckpointError` if the file cannot be read.
+    Configurations of OmegaConf are mappings and sequences. bfloat16 becomes float32. Raises `CheckpointError` if
+    the file cannot be read.
     """
     try:
         with zipfile.ZipFile(path) as archive:

@@ -90,7 +90,7 @@ def convert(source: str | PathLike[str], target: str | PathLike[str], model: str
 
 
 def skipped(source: str | PathLike[str], model: str | None = None) -> list[str]:
-    """Names of what is not converted with a model: its other arrays, such as `semantic`, and groups of arrays beside it.
+    """Names of what is not converted with a model: its other arrays, such as `semantic`, and groups beside it.
 
     Groups are paths in the checkpoint, such as `sky_cubemap`, `models.RigidNodes` or `pipeline._model.bil_grids`. The
     state of optimizers has none.
