@@ -257,8 +257,11 @@ impl Log {
             }
         };
         let begin = || {
+            // The file is gone if it was moved away, or if the last rotation failed after its
+            // renames: then the old files stay where they are, and only a new one begins.
+            let kept = if self.path.try_exists()? { limits::AUDIT_OLD_FILES } else { 0 };
             // Rename the oldest file first, because a rename replaces the target.
-            for number in (0..limits::AUDIT_OLD_FILES).rev() {
+            for number in (0..kept).rev() {
                 match fs::rename(old(number), old(number + 1)) {
                     Err(error) if number > 0 && error.kind() == io::ErrorKind::NotFound => {}
                     renamed => renamed?,

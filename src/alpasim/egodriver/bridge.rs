@@ -140,14 +140,16 @@ pub async fn drive_episode(settings: &EpisodeSettings) -> Result<EpisodeReport, 
     // Both sessions are closed whatever the result is: otherwise the server would wait for the next
     // request until it times out.
     let driven = episode.drive(&mut client, &mut driver, first).await;
-    let closed = client.close().await?;
+    let closed = client.close().await;
     // The driver may be gone; the report then has this error.
     let _ = driver.close_session().await;
+    // After an error of the server, closing fails as well: the first error is the cause.
     let failure = match driven {
         Ok(()) => None,
         Err(StepError::Server(error)) => return Err(error),
         Err(StepError::Driver(error)) => Some(error),
     };
+    let closed = closed?;
     Ok(EpisodeReport {
         seed: settings.seed,
         outcome: failure.as_ref().map_or_else(|| driven_outcome(closed.outcome), outcome),
@@ -421,7 +423,7 @@ impl<'a> Episode<'a> {
             .collect();
         // The tensor has a fixed length. Poses before the start of the episode are filled in, and
         // are no motion, so they are left out.
-        let driven = (seen.metadata().ego.history_count as usize).clamp(1, past.len());
+        let driven = (seen.metadata().ego.history_count as usize).max(1).min(past.len());
         let past = &past[past.len() - driven..];
         let seconds = 1e-6 * HISTORY_US as f64;
         let mut poses = Vec::new();

@@ -55,11 +55,14 @@ impl Route {
 
     /// Station of the nearest point of the polyline.
     fn nearest_m(&self, ego: DVec2) -> f64 {
-        let is_near =
-            |station_m: f64| self.at_m.is_none_or(|at_m| (station_m - at_m).abs() <= NEAR_M);
+        // By both ends: the segment that holds the last station is near, however long it is.
+        let is_near = |stations_m: &[f64]| {
+            self.at_m
+                .is_none_or(|at_m| stations_m[0] - NEAR_M <= at_m && at_m <= stations_m[1] + NEAR_M)
+        };
         let segments = self.points.windows(2).zip(self.stations_m.windows(2));
         let nearest = segments
-            .filter(|(_, stations_m)| is_near(stations_m[0]))
+            .filter(|(_, stations_m)| is_near(stations_m))
             .map(|(points, stations_m)| {
                 let along = points[1] - points[0];
                 // The foot of the perpendicular, as a share of the segment, and clamped to its
@@ -134,5 +137,17 @@ mod tests {
         // The drive goes to the right of an ego that looks to the left, and begins 1 m behind it.
         assert!((ahead[0].x + 1.0).abs() < 1e-6 && ahead[0].y.abs() < 1e-6, "{ahead:?}");
         assert!((ahead[19].y + 80.0).abs() < 1e-4, "{ahead:?}");
+    }
+
+    #[test]
+    fn a_route_of_far_keyframes_goes_on_from_the_last_station() {
+        // A segment of 200 m: at its station 150 both of its ends are farther than `NEAR_M`.
+        let mut route =
+            Route::new((0..=2).map(|k| (200.0 * f64::from(k), [200.0 * f64::from(k), 0.0, 0.0])));
+        for x_m in [100.0, 150.0, 160.0] {
+            let pose = Pose { position_m: DVec3::new(x_m, 0.0, 0.0), ..Pose::IDENTITY };
+            let ahead = route.ahead(&pose);
+            assert!(ahead[0].x.abs() < 1e-4, "{x_m}: {ahead:?}");
+        }
     }
 }

@@ -65,11 +65,13 @@ impl MotionSample {
         let mut axis = |index: usize| {
             let AxisNoise { noise, bias } =
                 if index < 3 { imu.accelerometer } else { imu.gyroscope };
-            let (ideal, axis) = match index {
-                0..3 => (self.specific_force[index], "xyz"),
-                _ => (self.angular_velocity[index - 3], "rpy"),
+            let ideal = match index {
+                0..3 => self.specific_force[index],
+                _ => self.angular_velocity[index - 3],
             };
-            let name = format!("imu/bias/{}", &axis[index % 3..index % 3 + 1]);
+            // Each name is a stream of its own. Two axes of one name would drift alike.
+            let name = ["x", "y", "z", "r", "p", "yaw"][index];
+            let name = format!("imu/bias/{name}");
             let drifted = drift(seed, &name, imu.bias_period_us, self.time_us);
             (ideal + noise * standard_normal(&mut random) + bias * drifted) as f32
         };
@@ -133,6 +135,22 @@ mod tests {
         let expected = [9.80665 * 0.1_f64.sin(), 0.0, 9.80665 * 0.1_f64.cos()];
         for (measured, expected) in [fx, fy, fz].into_iter().zip(expected) {
             assert!((f64::from(measured) - expected).abs() < 1e-5, "{measured} {expected}");
+        }
+    }
+
+    #[test]
+    fn the_biases_of_all_axes_drift_apart() {
+        let axis = AxisNoise { noise: 0.0, bias: 1.0 };
+        let imu = Imu { accelerometer: axis, gyroscope: axis, bias_period_us: 1_000_000 };
+        let still = MotionSample {
+            time_us: 2_500_000,
+            specific_force: DVec3::ZERO,
+            angular_velocity: DVec3::ZERO,
+            speed: 0.0,
+        };
+        let sample = still.imu(&imu, 3);
+        for (at, value) in sample.iter().enumerate() {
+            assert!(!sample[..at].contains(value), "{sample:?}");
         }
     }
 
