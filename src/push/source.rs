@@ -66,8 +66,8 @@ impl SourceAxes {
         Ok(Self { axes: axes.map(parsed).transpose()?, metres_per_unit })
     }
 
-    /// The axes and the unit with which the files of a version were imported. Those that it does not
-    /// record are not given.
+    /// The axes and the unit with which the files of a version were imported. Those that it does
+    /// not record are not given.
     ///
     /// # Errors
     /// Says why they cannot be used: its files had different ones, or they cannot be read.
