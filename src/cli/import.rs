@@ -186,7 +186,8 @@ impl Import {
         let profile = changes.apply(profile)?;
         let used_axes = options[0].trim_start_matches("axes=").to_owned();
         let used_scale = options[1].trim_start_matches("scale=").to_owned();
-        if self.axes.is_none() && notes.axes.is_none() && used_axes == "identity" {
+        let is_identity = used_axes == "identity" && !gaussians.is_empty();
+        if is_identity && self.axes.is_none() && notes.axes.is_none() {
             writeln!(
                 std::io::stderr(),
                 "note: axes=identity; most captures need --axes y-down-z-forward, and glTF --axes '-1 0 0 0 0 1 0 1 0'"

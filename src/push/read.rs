@@ -329,7 +329,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn files_that_were_trained_in_another_way_are_warned_of() {
+    fn files_that_were_trained_in_another_way_get_a_warning() {
         let report = |name: &str| FileReport {
             name: name.to_owned(),
             gaussians: 1,

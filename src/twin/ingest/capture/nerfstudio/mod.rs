@@ -52,7 +52,7 @@ pub struct FrameImage {
     pub exposure_stops: Option<f64>,
 }
 
-/// A transforms.json.
+/// What is read of a transforms.json.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NerfstudioCapture {
     pub frames: Vec<FrameImage>,
