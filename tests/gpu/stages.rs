@@ -16,7 +16,7 @@ use wildcity_scene::{RenderProfile, Scene};
 
 use crate::cameras::lens_views;
 use crate::definition::{self, Splat};
-use crate::gpu::{gpu, gpu_with};
+use crate::gpu::{gpu, gpu_with, gpu_with_tuning};
 use crate::images::{Image, agree, cpu, render};
 use crate::mutations::{
     LENS_MUTATIONS, MUTATIONS, Mutation, far_of_lens_mutation, misty_street,
@@ -24,6 +24,7 @@ use crate::mutations::{
 };
 use crate::shared_gpu;
 use crate::streets::{demo_street, street, street_views};
+use crate::tuning::PLAIN;
 
 /// One frame, the outputs of the cpu backend's stages, and those of the definition on the same
 /// input.
@@ -411,7 +412,8 @@ fn a_mutation_fails_its_own_stage_alone_and_the_bisection_names_it() {
         let Mutation { shader, original, replacement, stages } = *mutation;
         let broken = Shaders::default().with_mutation(shader, original, replacement);
         let broken = broken.unwrap_or_else(|| panic!("{mutation:?}: the shader has no such text"));
-        let broken = gpu_with(broken);
+        // Other kernels would run on hardware: `tuning.rs` breaks those.
+        let broken = gpu_with_tuning(broken, PLAIN);
         let wrong = truth.wrong(&broken);
         let names: Vec<&str> = wrong.iter().map(|(name, _)| *name).collect();
         assert_eq!(names, stages, "{mutation:?}: {wrong:?}");

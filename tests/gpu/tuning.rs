@@ -18,7 +18,7 @@ use crate::streets::{demo_street, street, street_views};
 use crate::{placed, shared_gpu};
 
 /// The kernels that software devices run.
-const PLAIN: Tuning = Tuning { long_tile_splats: u32::MAX, scatter: Scatter::Plain };
+pub(crate) const PLAIN: Tuning = Tuning { long_tile_splats: u32::MAX, scatter: Scatter::Plain };
 
 /// The kernel of hardware that moves the keys of a sort, if the device can run it.
 const BALLOTS: Tuning = Tuning { scatter: Scatter::EmulatedBallots, ..PLAIN };

@@ -322,7 +322,7 @@ fn through(backend: &dyn Backend, layers: &[[f64; 2]]) -> (u16, f64) {
         let pose = Pose { position_m: at_m, ..Pose::IDENTITY };
         placed.push(PlacedChunk::at_rest(chunk, pose, id as u16 - FIRST_ACTOR_INSTANCE));
     }
-    let scene = Scene { placed, ..scene(&twin) };
+    let scene = Scene { placed, ..scene_from_specs(&twin) };
     // The centre of the middle pixel is where all of them are.
     let (ids, opacity) = instances(backend, &scene, forward_view([33, 33], 60.0));
     let middle = 33 * 33 / 2;

@@ -248,7 +248,8 @@ mod tests {
             to
         });
         device.queue.submit([recorder.encoder.finish()]);
-        let [keys, values] = read.map(|buffer| words(device, &buffer));
+        // Buffers are larger than a few keys.
+        let [keys, values] = read.map(|buffer| words(device, &buffer)[..unsorted.len()].to_vec());
         device.check().unwrap();
         (keys, values)
     }

@@ -154,7 +154,7 @@ impl GeoAnchor {
             }
             Self::Projected(origin) => {
                 let zone = UtmZone::named(&origin.projection)?;
-                let [easting_m, northing_m] = zone.from_geodetic(point);
+                let [easting_m, northing_m] = zone.project(point);
                 Ok(DVec3::new(
                     easting_m - origin.easting_m,
                     northing_m - origin.northing_m,

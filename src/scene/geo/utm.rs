@@ -117,7 +117,7 @@ impl UtmZone {
     }
 
     /// Easting and northing of a point of WGS84, in metres.
-    pub(super) fn from_geodetic(self, point: &GeoPoint) -> [f64; 2] {
+    pub(super) fn project(self, point: &GeoPoint) -> [f64; 2] {
         let longitude_rad = (point.longitude_deg - self.central_meridian_deg()).to_radians();
         let tan = conformal_tan(point.latitude_deg.to_radians());
         let (sin_lon, cos_lon) = longitude_rad.sin_cos();
