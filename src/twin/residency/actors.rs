@@ -101,7 +101,10 @@ fn add(
     let bytes = asset.bytes();
     let name = asset.description.name.clone();
     let frame = FrameBytes::default();
+    // The asset takes the place of a version in the budget: all of it is needed at once, so that
+    // `bytes` and `total_bytes` are equal and a second claim of the same hash would cost nothing.
     let claim = Claim { twin: name, version: hash.to_owned(), bytes, total_bytes: bytes, frame };
+    // The budget is asked first: if it refuses, the table is unchanged.
     shared.budget.lock().reserve(&claim).map_err(ResidencyError::for_actor)?;
     shared.pager.with_table(|table| table.add_outside_bytes(bytes));
     let shared = shared.clone();
@@ -124,6 +127,8 @@ impl ResidencyError {
 
 impl Drop for ResidentActor {
     fn drop(&mut self) {
+        // In the reverse order of `add`, so that the budget never grants bytes that the table still
+        // counts.
         self.shared.pager.with_table(|table| table.remove_outside_bytes(self.claim.bytes));
         self.shared.budget.lock().release(&self.claim);
     }
@@ -160,10 +165,13 @@ mod tests {
         let asset = asset();
         let bytes = asset.bytes();
         let dir = tempfile::tempdir().unwrap();
+        // The limit has room for exactly one asset, so that a second one under another key is
+        // refused.
         let cache = Cache::limited(Catalog::open(dir.path()).unwrap(), Some(bytes));
         let first = cache.hold_actor("4x2x1#808080", asset.clone()).unwrap();
         let again = cache.hold_actor("4x2x1#808080", asset.clone()).unwrap();
         assert!(Arc::ptr_eq(&first, &again));
+        // Two holds of one key, counted once.
         assert_eq!(cache.stats().reserved_bytes, bytes);
         let refused = cache.hold_actor("5x2x1#808080", asset.clone()).unwrap_err();
         assert!(matches!(refused, ResidencyError::NoRoomForActor { .. }), "{refused}");

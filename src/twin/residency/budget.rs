@@ -84,8 +84,12 @@ impl Budget {
     pub(super) fn reserve(&mut self, claim: &Claim) -> Result<(), ResidencyError> {
         let held_bytes = self.reserved_bytes();
         let mut after = self.clone();
+        // Only a copy tells what the claim adds: bytes that are shared with other claims cost
+        // nothing. The maps have an entry per open version and per size of frame, a few dozen.
         after.add(claim);
         let needed_bytes = after.reserved_bytes() - held_bytes;
+        // Not `held + needed > limit`, which can overflow. The limit may be below what is held
+        // already.
         if needed_bytes > self.limit_bytes.saturating_sub(held_bytes) {
             let twin = claim.twin.clone();
             let limit_bytes = self.limit_bytes;
@@ -140,12 +144,17 @@ impl Budget {
 
     /// The part of these bytes that frames take in addition to their scenes.
     pub(super) fn frame_bytes(&self) -> u64 {
+        // The server bounds the images of all answers together by the same number.
         self.stages_bytes() + self.images_bytes.min(limits::IMAGE_BYTES)
     }
 
     fn stages_bytes(&self) -> u64 {
+        // The maps are ordered by bytes, so that the last key is the largest, and a removal finds
+        // the next one. A single maximum could not be taken back.
         let most =
             |claims: &BTreeMap<u64, u64>| claims.last_key_value().map_or(0, |(&bytes, _)| bytes);
+        // Without a large frame no two frames are rendered at once, so that nothing is beside
+        // another.
         let beside = if self.large > 0 { most(&self.beside) } else { 0 };
         most(&self.stages).saturating_add(beside)
     }
@@ -176,7 +185,9 @@ pub fn default_memory_bytes() -> u64 {
 /// shorter than the dependency on a crate for system information.
 fn physical_bytes() -> Option<u64> {
     let mut text = String::new();
+    // MemTotal is the first line; 4 kB are more than enough for it.
     File::open("/proc/meminfo").ok()?.take(4096).read_to_string(&mut text).ok()?;
     let line = text.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
+    // The kernel's kB are 1024 bytes.
     line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib << 10)
 }

@@ -90,6 +90,8 @@ impl Cache {
         self.shared.pager.start()?;
         let version = self.catalog.version(name, number)?;
         let slot = self.slot(&version);
+        // Locks are taken in the order slot, skies, table of the pager. No holder of the others
+        // waits for a slot.
         let mut held = slot.lock();
         let resident = match held.upgrade() {
             Some(resident) => resident,
@@ -138,6 +140,8 @@ impl Cache {
             return Ok(None);
         };
         let key = (named.clone(), profile.sky_error);
+        // Locked while the sky is read and baked, so that sessions that open at once do not bake it
+        // twice.
         let mut skies = self.skies.lock();
         skies.retain(|(_, sky)| sky.strong_count() > 0);
         let known = skies.iter().find(|(known, _)| *known == key);
@@ -156,6 +160,8 @@ impl Cache {
     /// as versions come and go.
     fn slot(&self, version: &Version) -> VersionSlot {
         let mut slots = self.slots.lock();
+        // A count above 1 means that a caller has the slot and may hold its lock for seconds. It is
+        // tested first, so that `lock` here never waits.
         slots.retain(|_, slot| Arc::strong_count(slot) > 1 || slot.lock().strong_count() > 0);
         slots.entry((version.hash.clone(), version.number)).or_default().clone()
     }

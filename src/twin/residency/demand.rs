@@ -35,6 +35,8 @@ pub(super) fn coarsest_level(
     // `f e / d <= tau` without the division, so that a distance of 0 needs no special case. Errors
     // rise with the level, and level 0 has none.
     let small = |error_m: f32| focal_px * f64::from(error_m) <= tau_px * distance_m;
+    // From the coarsest level down: the first that passes is drawn. Level 0 passes at every
+    // distance, so that 0 is only for a block without sections.
     block.iter().rposition(|section| small(section.error_m)).unwrap_or(0)
 }
 

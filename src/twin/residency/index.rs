@@ -71,14 +71,19 @@ impl BlockIndex {
             let first_block = blocks.len();
             let mut next_section = 0;
             let mut bounds = Bounds::EMPTY;
+            // Sections are sorted by (block, level), so that a block's are neighbours.
             for block in entry.sections.chunk_by(|a, b| a.block == b.block) {
                 let sections = next_section..next_section + block.len();
                 next_section = sections.end;
+                // The box of level 0 stands for the block at every level, so that the level that is
+                // chosen does not change the distance that it is chosen by.
                 let block = Block { bounds: entry.section_bounds(&block[0]), chunk, sections };
                 bounds = bounds.union(&block.bounds);
                 blocks.push(block);
             }
 
+            // Rounded towards minus infinity: `/` would put cells -15 to 15 into one group around
+            // the origin.
             let group_cell = entry.cell.map(|cell| cell.div_euclid(GROUP_CELLS));
             let empty = || Group { bounds: Bounds::EMPTY, cells: Vec::new() };
             let group = groups.entry(group_cell).or_insert_with(empty);
@@ -104,6 +109,8 @@ impl BlockIndex {
                 let at_m = viewpoint.position_m;
                 at_m.clamp(bounds.min_m, bounds.max_m).distance_squared(at_m)
             };
+            // Without a camera the distance is infinite, and only a profile without reach draws
+            // anything.
             viewpoints.iter().map(squared_m2).fold(f64::INFINITY, f64::min).sqrt()
         };
         let mut sections = Vec::new();
@@ -127,9 +134,12 @@ impl BlockIndex {
         mut see: impl FnMut(&Block, f64),
     ) {
         let is_near = |bounds: &Bounds| reach_m.is_none_or(|reach_m| distance_m(bounds) <= reach_m);
+        // Groups, then cells, then blocks: of 20 km of road, about 20 tests of groups, at most 1024
+        // of cells in the four near ones, and 16 of blocks per near cell.
         let groups = self.groups.iter().filter(|group| is_near(&group.bounds));
         let mut cells: Vec<usize> = groups.flat_map(|group| group.cells.iter().copied()).collect();
         cells.retain(|&cell| is_near(&self.cells[cell].bounds));
+        // Groups are in another order than cells, and a frame draws in the order of cells.
         cells.sort_unstable();
         let near_cells = cells.into_iter().map(|cell| &self.cells[cell]);
         for block in near_cells.flat_map(|cell| &self.blocks[cell.blocks.clone()]) {

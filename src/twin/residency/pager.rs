@@ -83,6 +83,8 @@ impl Pager {
                 .name(format!("load-{number}"))
                 .spawn(move || shared.load_until_closed())
                 .map_err(|error| ResidencyError::Thread { reason: error.to_string() })?;
+            // Set with the first thread. If a later one cannot be started, those that run suffice
+            // for progress.
             state.started = true;
         }
         Ok(())
@@ -106,9 +108,11 @@ impl Pager {
         let mut notifications = Notifications::new();
         let added = self.0.state.lock().requests.add_frame(requested, callback, &mut notifications);
         let number = added?;
+        // Notifications mean that the frame is complete and has queued nothing.
         if notifications.is_empty() {
             self.0.work.notify_all();
         }
+        // Called without the lock, because a callback may request the next frame.
         self.0.notify(notifications);
         Ok(WaitingFrame { shared: self.0.clone(), number })
     }
@@ -173,6 +177,8 @@ impl Pager {
 
 impl Drop for Pager {
     fn drop(&mut self) {
+        // Loaders that read finish their section; then they see the flag. They own the shared
+        // state, so that this need not wait for them.
         self.0.state.lock().closed = true;
         self.0.work.notify_all();
     }
@@ -196,6 +202,8 @@ impl Drop for WaitingFrame {
         };
         // A frame that is complete has released its loads already.
         if cancelled.is_some() {
+            // The load that waits for room may have been for this frame: the next in order may go
+            // on.
             self.shared.work.notify_all();
         }
     }
@@ -218,6 +226,8 @@ impl PinnedScene {
 
 impl Drop for PinnedScene {
     fn drop(&mut self) {
+        // The chunks are released before the loaders wake, because these look for sections with one
+        // `Arc`.
         self.scene.chunks.clear();
         // The flag is read under the lock: a loader that has just found every section pinned sleeps
         // by then, and gets the notification.
@@ -231,11 +241,16 @@ impl Shared {
     /// The main function of a loader thread: loads sections until the pager is dropped.
     fn load_until_closed(self: Arc<Self>) {
         let mut state = self.state.lock();
+        // The lock is held at each test of the flag, and `wait` releases it atomically, so that no
+        // notification is lost.
         while !state.closed {
             match state.requests.next(Instant::now()) {
                 NextLoad::Load { id, section, version } => {
+                    // Reading takes milliseconds to seconds, and the other loaders need the lock.
                     drop(state);
                     let notifications = self.load(id, section, &version);
+                    // The others are woken before the callbacks run, which may take long: a
+                    // finished load may have made sections of other requests loadable.
                     self.work.notify_all();
                     self.notify(notifications);
                     state = self.state.lock();
@@ -259,6 +274,8 @@ impl Shared {
         let began = Instant::now();
         // A defect in loading one section must not end the thread that loads all of them.
         let read = || self.source.section(version, chunk, section);
+        // A panic cannot leave broken state behind: the source gets only shared references, and the
+        // lock is not held.
         let loaded = catch_unwind(AssertUnwindSafe(read));
         let took = began.elapsed();
         let requests = &mut self.state.lock().requests;

@@ -140,6 +140,8 @@ impl<C> Requests<C> {
         callback: C,
         notifications: &mut Notifications<C>,
     ) -> Result<u64, ResidencyError> {
+        // A frame that can never fit is refused now. In the queue it would wait in front of all
+        // others until its deadline.
         let needed_bytes: u64 = requested.ids.iter().map(|&id| self.table.bytes(id)).sum();
         let limit_bytes = self.table.limit_of_sections_bytes();
         if needed_bytes > limit_bytes {
@@ -166,6 +168,7 @@ impl<C> Requests<C> {
         let frame = Frame { callback, requested: Instant::now(), waited_for: missing, missing };
         let requester = Requester::Frame(number);
         if missing == 0 {
+            // A complete frame leaves nothing behind: no request, no waiter, no entry in the queue.
             notifications.push(self.complete(&requested, frame));
         } else {
             self.stats.waits += 1;
@@ -187,6 +190,8 @@ impl<C> Requests<C> {
         let request = self.number;
         let all = requested.ids.iter().zip(&requested.sections).zip(urgencies);
         for (order, ((&id, &section), &urgency)) in (0..).zip(all) {
+            // Touched in any case: that it will be needed soon keeps it from eviction, full queue
+            // or not.
             self.table.touch(id, request);
             if self.table.get(id).is_none() && self.queue.len() < limits::QUEUED_SECTIONS {
                 self.queue.insert(QueueKey { urgency, request, order, id }, section);
@@ -199,6 +204,8 @@ impl<C> Requests<C> {
             Requester::Frame(_) => None,
         };
         let others = || self.requests.values().filter_map(since).min();
+        // If there is no other prefetch, the number of this request itself: everything that was
+        // used before it may go.
         let requester = Requester::Prefetch(before.or_else(others).unwrap_or(request));
         self.requests.insert(request, Request { requested, requester, frame: None });
         request
@@ -214,6 +221,8 @@ impl<C> Requests<C> {
     pub(super) fn pending(&self, number: u64) -> usize {
         let queued = |urgency| self.queue.range(request_keys(urgency, number));
         let entries = queued(Urgency::Imminent).chain(queued(Urgency::Speculative));
+        // Entries of sections that another request has loaded stay in the queue until `next` meets
+        // them.
         entries.filter(|(key, _)| self.table.get(key.id).is_none()).count()
     }
 
@@ -250,6 +259,7 @@ impl<C> Requests<C> {
     /// all attempts, and its slot may be reused for another section. What is requested and not in
     /// memory is in the queue.
     pub(super) fn forget_unrequested_failures(&mut self) {
+        // Usually there are no failures, so that the set of all queued sections is rarely built.
         if !self.failures.is_empty() {
             let queued: BTreeSet<SlotId> = self.queue.keys().map(|key| key.id).collect();
             self.failures.retain(|id, _| queued.contains(id));
@@ -275,12 +285,15 @@ impl<C> Requests<C> {
         let mut found = None;
         // The prefetch that did not find enough memory: the rest of it is dropped as well.
         let mut without_room = None;
+        // The entries that are met are obsolete, being loaded, waiting for a retry, or the one to
+        // load. Obsolete ones are removed below, so that each is met once.
         for (key, section) in &self.queue {
             let QueueKey { urgency, request, id, .. } = *key;
             if self.table.get(id).is_some() || without_room == Some(request) {
                 obsolete.push(*key);
                 continue;
             }
+            // Another thread reads it. The entry stays, because that load may fail.
             let is_loading = !self.table.is_absent(id);
             if is_loading {
                 continue;
@@ -293,6 +306,7 @@ impl<C> Requests<C> {
                 next_retry = Some(next_retry.map_or(not_before, |soonest| soonest.min(not_before)));
                 continue;
             }
+            // The request was cancelled.
             let Some(Request { requester, requested, .. }) = self.requests.get(&request) else {
                 obsolete.push(*key);
                 continue;
@@ -352,6 +366,8 @@ impl<C> Requests<C> {
         self.stats.loads += 1;
         self.load_times.add(took);
         self.failures.remove(&id);
+        // The last number that was given is the present time of use, so that the list stays in
+        // order.
         self.table.loaded(id, chunk, self.number);
 
         // Which frames have all of their sections now.
@@ -359,7 +375,11 @@ impl<C> Requests<C> {
         for number in self.table.waiters(id) {
             let request = self.requests.get_mut(number);
             if let Some(frame) = request.and_then(|request| request.frame.as_mut()) {
+                // No underflow: a frame's `missing` counts its sections that are not in memory, and
+                // this one was not until now.
                 frame.missing -= 1;
+                // A frame is complete at the moment at which all are in memory together, under this
+                // one lock. Its scene gets its `Arc`s before anything can be evicted.
                 if frame.missing == 0 {
                     complete.push(*number);
                 }
@@ -385,6 +405,7 @@ impl<C> Requests<C> {
         requested: &RequestedSections,
         frame: Frame<C>,
     ) -> (C, Result<CompleteFrame, ResidencyError>) {
+        // None is filtered out: `missing` is 0. The filter only avoids a panic.
         let chunks = requested.ids.iter().filter_map(|&id| self.table.get(id).cloned());
         let complete = CompleteFrame {
             scene: Scene {
@@ -408,6 +429,7 @@ impl<C> Requests<C> {
         let cause = self.count_failure(failure);
         let attempts = self.failures.get(&id).map_or(0, |failure| failure.attempts) + 1;
         if attempts < limits::LOAD_ATTEMPTS {
+            // 50 ms after the first failure, then 200 ms.
             let not_before = Instant::now() + limits::LOAD_BACKOFF * 4_u32.pow(attempts - 1);
             self.failures.insert(id, RetryState { attempts, not_before });
             self.forget_unrequested_failures();
@@ -415,6 +437,7 @@ impl<C> Requests<C> {
             return notifications;
         }
         self.failures.remove(&id);
+        // Copied, because cancelling a frame removes it from the list.
         for number in self.table.waiters(id).to_vec() {
             let Some(request) = self.cancel_frame(number) else { continue };
             let Request { requested, frame: Some(frame), .. } = request else { continue };
@@ -435,6 +458,7 @@ impl<C> Requests<C> {
         }
         // Prefetches continue without the section.
         self.queue.retain(|key, _| key.id != id);
+        // Last, because it may release the slot, whose number another section then gets.
         self.table.load_failed(id);
         notifications
     }
@@ -460,6 +484,8 @@ impl<C> Requests<C> {
 
 /// The queue keys of a request's sections.
 fn request_keys(urgency: Urgency, request: u64) -> RangeInclusive<QueueKey> {
+    // Keys are ordered by urgency, then request, so that a request's entries of one urgency are a
+    // range.
     let first = QueueKey { urgency, request, order: 0, id: 0 };
     first..=QueueKey { order: u32::MAX, id: SlotId::MAX, ..first }
 }

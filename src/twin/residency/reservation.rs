@@ -110,6 +110,7 @@ impl Reservation {
 
 impl Drop for Reservation {
     fn drop(&mut self) {
+        // Before the memory is released: a prefetch of an ended session would load into it.
         self.prefetcher.end();
         change_budget(self.resident(), |budget| budget.release(&self.claim));
     }
@@ -134,6 +135,8 @@ impl Prefetcher {
         let mut seen = vec![false; self.resident.sections()];
         for (urgency, viewpoints) in places {
             for section in self.resident.demand(viewpoints, profile) {
+                // A section is prefetched at the urgency of the first place that needs it, which is
+                // the soonest.
                 if !std::mem::replace(&mut seen[self.resident.position(section)], true) {
                     sections.push(section);
                     urgencies.push(*urgency);
@@ -141,6 +144,8 @@ impl Prefetcher {
             }
         }
         let requested = self.resident.requested(sections);
+        // The state is locked during the request, so that `end` cannot fall between the two and
+        // leave a prefetch that is never cancelled.
         if let PrefetchState::Open(number) = &mut *self.state.lock() {
             let pager = &self.resident.shared.pager;
             *number = Some(pager.prefetch(*number, requested, &urgencies));
@@ -172,6 +177,8 @@ impl Drop for Prefetcher {
 
 /// Changes the budget. The memory of frames is taken from the sections at once.
 fn change_budget<R>(resident: &Resident, change: impl FnOnce(&mut Budget) -> R) -> R {
+    // The budget is locked until the table knows the frames' bytes: two changes at once would
+    // otherwise set them in the wrong order.
     let mut budget = resident.shared.budget.lock();
     let changed = change(&mut budget);
     let bytes = budget.frame_bytes();

@@ -77,14 +77,19 @@ impl Resident {
         let mut keys = Vec::new();
         let mut first = Vec::with_capacity(manifest.chunks.len());
         for chunk in &manifest.chunks {
+            // Sections are numbered through all chunks: section s of chunk c is number `first[c] +
+            // s`.
             first.push(keys.len());
             keys.extend(chunk.sections.iter().map(|section| {
+                // The size in memory, not in the file: the table counts what a loaded section will
+                // take.
                 let bytes = Chunk::needed_bytes(manifest.sh_degree, section.count.into());
                 (key(manifest, chunk, section), bytes)
             }));
         }
         let sky_bytes = sky.as_ref().map_or(0, |sky| sky.bytes() as u64);
         let total_bytes = sky_bytes + keys.iter().map(|(_, bytes)| bytes).sum::<u64>();
+        // Under one lock of the pager: a version may have two million sections.
         let ids = shared.pager.with_table(|table| {
             keys.into_iter().map(|(key, bytes)| table.register(key, bytes)).collect()
         });
@@ -224,6 +229,8 @@ impl Resident {
 
 impl Drop for Resident {
     fn drop(&mut self) {
+        // Sections in memory stay. Frames that still wait own an `Arc` of this, so that their slots
+        // are registered.
         self.shared.pager.with_table(|table| self.ids.iter().for_each(|&id| table.unregister(id)));
     }
 }
@@ -252,6 +259,7 @@ fn key(manifest: &Manifest, chunk: &ChunkEntry, section: &Section) -> Key {
     }
     hasher.update(&section.count.to_le_bytes());
     hasher.update(&[section.block, section.level, manifest.sh_degree, manifest.record as u8]);
+    // 128 bits: with 10^9 sections a collision has a probability of about 10^-21.
     let mut key = [0; 16];
     key.copy_from_slice(&hasher.finalize().as_bytes()[..16]);
     Key(key)

@@ -111,6 +111,7 @@ impl SectionTable {
             }
             None => {
                 self.slots.push(slot);
+                // At 64 B each, 2^32 slots would take 256 GiB, so that the cast loses nothing.
                 (self.slots.len() - 1) as SlotId
             }
         };
@@ -146,6 +147,7 @@ impl SectionTable {
     /// Marks the section as just used, so that it is evicted last.
     pub(super) fn touch(&mut self, id: SlotId, stamp: u64) {
         self.slots[id as usize].stamp = stamp;
+        // A section that is being loaded is in no list; `loaded` links it with a later stamp.
         if self.get(id).is_some() {
             self.unlink(id);
             self.link_newest(id);
@@ -154,6 +156,8 @@ impl SectionTable {
 
     /// A frame waits until this section and its others are in memory together.
     pub(super) fn add_waiter(&mut self, id: SlotId, frame: u64) {
+        // Frames are numbered in the order of their requests, so that pushing keeps the list
+        // ascending.
         self.waiters.entry(id).or_default().push(frame);
     }
 
@@ -177,6 +181,8 @@ impl SectionTable {
     /// changes.
     pub(super) fn reserve(&mut self, id: SlotId, requester: Requester) -> Option<Vec<SlotId>> {
         let bytes = self.slots[id as usize].bytes;
+        // In use, kept for frames, and wanted: the sum must not exceed the limit plus what eviction
+        // frees.
         let wanted_bytes = self.held_bytes() + self.frame_bytes + bytes;
         let mut victims = Vec::new();
         let mut gained_bytes = 0;
@@ -200,6 +206,7 @@ impl SectionTable {
             next = slot.newer;
         }
         victims.iter().for_each(|&victim| self.evict(victim));
+        // Counted from here on, although the bytes are not read yet: no other load can take them.
         self.slots[id as usize].state = State::Loading;
         self.held_bytes += bytes;
         Some(victims)
@@ -209,6 +216,7 @@ impl SectionTable {
     pub(super) fn loaded(&mut self, id: SlotId, chunk: Arc<Chunk>, stamp: u64) {
         let slot = &mut self.slots[id as usize];
         slot.state = State::Loaded(chunk);
+        // No stamp in the list is later, because stamps are numbers of requests.
         slot.stamp = stamp;
         self.held_sections += 1;
         self.link_newest(id);
@@ -241,8 +249,11 @@ impl SectionTable {
     pub(super) fn set_frame_bytes(&mut self, bytes: u64) {
         self.frame_bytes = bytes;
         let mut next = self.oldest;
+        // Best effort: what frames draw stays, and later loads wait until it is released.
         while self.held_bytes() + self.frame_bytes > self.limit_bytes && next != NONE {
             let newer = self.slots[next as usize].newer;
+            // No prefetch has this number, so that no stamp protects a section; waiting frames
+            // still do.
             if self.may_evict(next, Requester::Prefetch(u64::MAX)) {
                 self.evict(next);
             }
@@ -270,9 +281,12 @@ impl SectionTable {
         let State::Loaded(chunk) = &self.slots[id as usize].state else { return false };
         let oldest_waiting = self.waiters(id).first();
         let is_protected = match requester {
+            // `<=`, because a frame that evicts what it waits for itself would never be complete.
             Requester::Frame(frame) => oldest_waiting.is_some_and(|&waiting| waiting <= frame),
             Requester::Prefetch(_) => oldest_waiting.is_some(),
         };
+        // The lock is held, and new `Arc`s come only from the table, so that a count of 1 cannot
+        // rise.
         Arc::strong_count(chunk) == 1 && !is_protected
     }
 
@@ -288,6 +302,8 @@ impl SectionTable {
     /// Frees the slot of a section that is absent and in no open version.
     fn release_if_unused(&mut self, id: SlotId) {
         let Slot { key, state, versions, .. } = &self.slots[id as usize];
+        // A section that is being loaded keeps its slot, because the loader thread will report by
+        // its number.
         if *versions == 0 && matches!(state, State::Absent) {
             self.ids.remove(key);
             self.vacant.push(id);
@@ -386,6 +402,8 @@ mod tests {
     fn random_operations_keep_the_invariants_and_never_evict_what_a_frame_holds() {
         for seed in 1..=50 {
             let mut random = Random(seed);
+            // About 40 sections of 25 bytes are 1000 bytes, two to five times the limit, so that
+            // eviction is frequent.
             let sizes: Vec<u64> = (0..40).map(|_| 1 + random.below(50) as u64).collect();
             let mut table = SectionTable::new(200 + random.below(300) as u64);
             let register_all = |table: &mut SectionTable| -> Vec<SlotId> {
@@ -396,6 +414,7 @@ mod tests {
             let mut pinned: Vec<(SlotId, Arc<Chunk>)> = Vec::new();
             let mut loading: Vec<SlotId> = Vec::new();
             let mut evicted = 0;
+            // `now` plays the number of the request, which is the stamp.
             for now in 1..=2_000_u64 {
                 let id = versions[0][random.below(sizes.len())];
                 match random.below(8) {
@@ -427,6 +446,8 @@ mod tests {
                         if let Some(chunk) = table.get(id).cloned() {
                             pinned.push((id, chunk));
                         }
+                        // At most four are pinned: at up to 50 bytes each they fit into the least
+                        // limit, 200.
                         if pinned.len() > 4 {
                             pinned.swap_remove(random.below(pinned.len()));
                         }
@@ -460,6 +481,7 @@ mod tests {
     #[test]
     fn the_least_recently_used_section_is_evicted_first() {
         let (mut table, ids) = full();
+        // Now the order of use is 1, 2, 0.
         table.touch(ids[0], 4);
         assert_eq!(table.reserve(ids[3], Requester::Frame(5)), Some(vec![ids[1]]));
     }
@@ -467,6 +489,7 @@ mod tests {
     #[test]
     fn a_prefetch_evicts_nothing_that_was_used_recently() {
         let (mut table, ids) = full();
+        // All stamps are 1 to 3. A bound of 1 protects all, a bound of 2 all but the first.
         assert_eq!(table.reserve(ids[3], Requester::Prefetch(1)), None);
         assert_eq!(table.reserve(ids[3], Requester::Prefetch(2)), Some(vec![ids[0]]));
     }
@@ -481,7 +504,10 @@ mod tests {
         table.remove_waiter(ids[2], 7);
         assert_eq!(table.reserve(ids[3], Requester::Frame(8)), Some(vec![ids[2]]));
         table.load_failed(ids[3]);
+        // The third section was evicted above and the load of the fourth failed: 20 of 30 bytes are
+        // in use.
         assert_eq!(table.reserve(ids[3], Requester::Frame(6)), Some(vec![]), "there is room now");
+        // Now it is full again. Frame 6 is older than 7, so that it may take the least recent one.
         assert_eq!(table.reserve(ids[2], Requester::Frame(6)), Some(vec![ids[0]]));
     }
 
@@ -497,6 +523,8 @@ mod tests {
         let again = table.register(key(1), 10);
         assert_eq!(again, ids[1]);
         let new = table.register(key(9), 30);
+        // The limit is 30 bytes, so that everything must go for it; section 1 keeps its slot,
+        // because a version still has it.
         assert_eq!(table.reserve(new, Requester::Frame(9)), Some(vec![ids[0], ids[1], ids[2]]));
         table.unregister(again);
         assert_eq!(table.ids.len(), 1);

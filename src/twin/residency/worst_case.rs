@@ -38,17 +38,25 @@ pub(super) fn worst_case_bytes(
     }
     let bound = |area: Bounds| {
         let mut bytes = 0;
+        // A camera may be `radius_m` nearer than the rig's origin, and the triangle inequality
+        // allows no more.
         let distance_m = |bounds: &Bounds| (gap_m(&area, bounds) - extent.radius_m).max(0.0);
         index.visit(profile.reach_m, distance_m, |block, distance_m| {
             let levels = block.levels(manifest);
+            // Bytes rise as the level falls, and the level falls with the distance, so that a lower
+            // bound of the distance is an upper bound of the bytes.
             let level = coarsest_level(levels, extent.focal_px, distance_m, profile.tau_px);
             bytes += Chunk::needed_bytes(manifest.sh_degree, levels[level].count.into());
         });
         Square { bytes, area }
     };
+    // Invariant: the squares in the heap cover the whole map, so that the highest bound is one for
+    // every point.
     let mut squares = BinaryHeap::from([bound(whole)]);
     for _ in 0..limits::WORST_CASE_SQUARES {
         let Some(worst) = squares.pop() else { break };
+        // The largest bound is at its finest: halving further would gain little. Height does not
+        // count, because only x and y are halved.
         if worst.area.size_m().truncate().max_element() <= wildcity_scene::chunk::CELL_M {
             squares.push(worst);
             break;
@@ -83,6 +91,7 @@ impl Ord for Square {
 
 /// The distance between two boxes, in metres; 0 where they touch or overlap.
 fn gap_m(a: &Bounds, b: &Bounds) -> f64 {
+    // Per axis at most one difference is positive. Both are negative where the boxes overlap.
     (a.min_m - b.max_m).max(b.min_m - a.max_m).max(glam::DVec3::ZERO).length()
 }
 
