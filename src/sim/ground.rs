@@ -51,7 +51,10 @@ impl<'a> Ground<'a> {
     /// or no heading.
     pub fn find(&self, world_from_rig: Pose) -> Option<Pose> {
         let point_m = world_from_rig.position_m;
+        // A drive wins even if a lane is nearer: it was on the road, and a map may be off.
         if let Some(plane) = self.drives_plane(point_m) {
+            // No fall-back to the lanes here: a drive that is near but not usable leaves the pose
+            // as it is.
             return plane.place(world_from_rig);
         }
         let plane = self.lanes?.plane_near(point_m, limits::GROUND_NEAR_M)?;
@@ -68,6 +71,8 @@ impl<'a> Ground<'a> {
         let mut under = None;
         for drive in self.drives {
             let poses = drive.keyframes.iter().map(|keyframe| &keyframe.world_from_rig);
+            // Each keyframe with the one before it. The first is paired with itself, so that a
+            // drive of one keyframe counts as a point.
             let before = poses.clone().take(1).chain(poses.clone());
             for (from, to) in before.zip(poses) {
                 let way_m = to.position_m - from.position_m;
@@ -80,6 +85,7 @@ impl<'a> Ground<'a> {
                 }
             }
         }
+        // Only the winner is interpolated, because a rotation costs more than a distance.
         let (from, to, t) = under?;
         let pose = from.interpolate(to, t);
         Some(Plane { point_m: pose.position_m, up: pose.rotation * DVec3::Z })
@@ -121,6 +127,7 @@ mod tests {
     fn the_rig_stands_level_on_the_slope_beside_the_drive() {
         let drives = drives();
         let at = |position_m| Pose { position_m, rotation: DQuat::from_rotation_z(0.3) };
+        // 0.1 · 12 m + 8 m = 9.2 m, for every y: the bridge is level across.
         let settled = Ground::from_drives(&drives).place(at(DVec3::new(12.0, 3.0, 9.0)));
         assert!((settled.position_m - DVec3::new(12.0, 3.0, 9.2)).length() < 1e-12, "{settled:?}");
         let up = settled.rotation * DVec3::Z;
@@ -140,6 +147,7 @@ mod tests {
             let position_m = DVec3::new(25.0, 0.0, z_m);
             Ground::from_drives(&drives).place(Pose { position_m, ..Pose::IDENTITY }).position_m.z
         };
+        // At x = 25 m the bridge is at 10.5 m. From z = 1 m the street is nearer than it.
         assert!((height_m(9.0) - 10.5).abs() < 1e-12 && height_m(1.0).abs() < 1e-12);
     }
 
@@ -150,6 +158,7 @@ mod tests {
         assert_eq!(Ground::from_drives(&drives).place(far), far);
         assert_eq!(Ground::from_drives(&[]).place(far), far);
         assert_eq!(Ground::from_drives(&drives).find(far), None);
+        // A rig that looks straight up has no heading on the street.
         let upwards = Pose {
             position_m: DVec3::new(25.0, 0.0, 0.5),
             rotation: DQuat::from_rotation_y(-std::f64::consts::FRAC_PI_2),
@@ -173,9 +182,11 @@ mod tests {
         // The bridge begins 3 m above the lane's origin.
         assert!((at(0.0).position_m.z - 8.0).abs() < 1e-12);
         let placed = at(60.0);
+        // 1 m + 0.06 · 60 m = 4.6 m. The bridge is farther than 25 m away.
         assert!((placed.position_m.z - 4.6).abs() < 1e-12, "{placed:?}");
         let ahead = placed.rotation * DVec3::X;
         assert!((ahead.z / ahead.y - 0.06).abs() < 1e-12 && ahead.x.abs() < 1e-12, "{ahead}");
+        // At y = 200 m the end of the lane is 100 m away.
         assert_eq!(at(200.0).position_m.z, 5.0);
     }
 

@@ -22,6 +22,7 @@ impl Plane {
         }
         let mut position_m = world_from_rig.position_m;
         let aside_m = position_m - point_m;
+        // Vertical move: n · (p - p0) = 0 solved for z. `up.z` is at least 0.7 here.
         position_m.z = point_m.z - (aside_m.x * up.x + aside_m.y * up.y) / up.z;
         let forward = world_from_rig.rotation * DVec3::X;
         let forward = forward.reject_from_normalized(up);
@@ -30,6 +31,7 @@ impl Plane {
             return None;
         }
         let forward = forward.normalize();
+        // Columns x, y, z of the rotation: y is z × x, so that the axes are right-handed.
         let rotation = DQuat::from_mat3(&DMat3::from_cols(forward, up.cross(forward), up));
         Some(Pose { position_m, rotation: rotation.normalize() })
     }

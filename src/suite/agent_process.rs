@@ -59,8 +59,10 @@ pub(crate) async fn drive(
     })?);
     let tail = Tail::new(running.0.stderr.take());
     let status = wait(&mut running.0, process.timeout).await;
+    // Killed before its text is awaited: a process that hangs would keep the stream open.
     drop(running);
     let stderr = tail.text().await;
+    // Every failure from here on has what the agent said.
     let said = |technical: Technical| Technical { stderr: stderr.clone(), ..technical };
     let status = status.map_err(said)?;
     let Some(drove) = interpret_exit(process, status, record.exists()) else {
@@ -82,8 +84,10 @@ fn interpret_exit(
     let is_no_command =
         status.code().is_some_and(|code| limits::NO_COMMAND_STATUSES.contains(&code));
     let kind = match status.code() {
+        // With a record, a status of 127 is that of the agent and not of the shell.
         _ if is_no_command && !has_driven => return None,
         Some(0) if has_driven => return Some(Ok(())),
+        // A success without a record means that the agent never drove.
         Some(0 | limits::LOST_STATUS) => "agent_lost",
         Some(limits::TIMEOUT_STATUS) => "agent_timeout",
         _ => "agent_error",
@@ -121,6 +125,8 @@ fn start(process: &AgentProcess<'_>, case: &Case) -> std::io::Result<Child> {
         .env("WILDCITY_TWIN", &case.options.twin)
         .env("WILDCITY_SEED", case.seed.to_string())
         .env("WILDCITY_STEPS", case.steps.to_string())
+        // The agent has no terminal: it must not wait for input, and its output must not mix with
+        // that of the run.
         .stdin(Stdio::null())
         .stdout(Stdio::null())
         .stderr(Stdio::piped())
@@ -146,6 +152,7 @@ async fn wait(child: &mut Child, timeout: Duration) -> Result<ExitStatus, Techni
     let lost = |error: std::io::Error| Technical::new("agent_lost", error.to_string());
     let end = Instant::now() + timeout;
     loop {
+        // Looked at before the time: a process that ended in the last moment counts.
         if let Some(status) = child.try_wait().map_err(lost)? {
             return Ok(status);
         }
@@ -162,6 +169,8 @@ async fn wait(child: &mut Child, timeout: Duration) -> Result<ExitStatus, Techni
 async fn wait_for_end(record: &Path) -> Result<(), Technical> {
     let end = Instant::now() + limits::CLOSE_WAIT;
     loop {
+        // The record may be half written while the server closes it, so that an error may pass as
+        // well.
         let last = match EpisodeFile::read(record) {
             Ok(episode) if episode.end.is_some() => return Ok(()),
             Ok(_) => "the agent ended without closing its session".to_owned(),

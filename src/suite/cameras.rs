@@ -42,10 +42,12 @@ fn check_rig(suite: &SuiteFile, rig: &Rig, twin: &str) -> Result<(), FileError> 
     for (index, name) in names.iter().enumerate() {
         let field = format!("cameras[{index}]");
         let Some(camera) = rig.cameras.iter().find(|camera| camera.name == *name) else {
+            // `names` is the suite's own list here: names of the rig are always found.
             let known = known.join(", ");
             let message = format!("{name:?} is no camera of twin {twin:?}, which has {known}");
             return Err(FileError::new(field, message));
         };
+        // Twice the same camera would be twice the same image under one name.
         if names[..index].contains(name) {
             return Err(FileError::new(field, format!("{name:?} is there twice")));
         }

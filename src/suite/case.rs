@@ -75,6 +75,7 @@ pub fn cases(
     for scenario in scenarios {
         let mut combinations: Vec<BTreeMap<String, Value>> = Vec::new();
         for case in seeded(suite, scenario) {
+            // Seeds vary fastest, so that the present combination is the last one of the list.
             if !combinations.contains(&case.values) {
                 combinations.push(case.values.clone());
             }
@@ -92,12 +93,14 @@ pub fn cases(
                 .map_err(|cause| SuiteError::Scenario { path: scenario.path.clone(), cause })?;
             let case = Case::new(suite, (scenario.path.as_path(), name), case, loaded, &version)?;
             cases.push(case);
+            // Checked for each case, before the rest of a far too long list is resolved.
             if cases.len() > limits::EPISODES {
                 return Err(SuiteError::TooMany { count: cases.len() });
             }
         }
     }
     cases.sort_by(|a, b| a.name.cmp(&b.name));
+    // Sorted by name, so that equal names are neighbours.
     match cases.windows(2).find(|pair| pair[0].name == pair[1].name) {
         Some(pair) => Err(SuiteError::SameName { name: pair[0].name.clone() }),
         None => Ok(cases),
@@ -112,6 +115,7 @@ fn chosen(
 ) -> Result<ScenarioFile, SuiteError> {
     let wrong = |cause| SuiteError::File { path: scenario.path.clone(), cause };
     let mut file = scenario.document.with(values).map_err(wrong)?;
+    // The tracks go as well: recorded actors are actors.
     if bare {
         file.actors.clear();
         file.tracks = None;
@@ -122,6 +126,7 @@ fn chosen(
 /// The combinations of a scenario; with the seeds of the suite if the scenario has none.
 fn seeded(suite: &SuiteFile, scenario: &SuiteScenario) -> Vec<Seeded> {
     let own = scenario.document.cases();
+    // Without a sweep of seeds, every case has seed 0.
     let has_own_seeds = own.iter().any(|case| case.seed != 0);
     match (suite.seeds, has_own_seeds) {
         (Some([first, last]), false) => own
@@ -148,11 +153,14 @@ impl Versions<'_> {
     /// the suite.
     fn find(&mut self, file: &ScenarioFile, suite: &SuiteFile) -> Result<Arc<Version>, SuiteError> {
         let wanted = file.twin.version_hash.clone().filter(|_| !self.latest);
+        // The key has the wish and not the version found, so that two scenarios without a wish
+        // share the latest.
         let key = (file.twin.name.clone(), wanted);
         if let Some(version) = self.opened.get(&key) {
             return Ok(version.clone());
         }
         let version = Arc::new(self.open(file, key.1.as_deref())?);
+        // Once for each version, before it is remembered.
         cameras::check(suite, &version)?;
         self.opened.insert(key, version.clone());
         Ok(version)
@@ -162,6 +170,7 @@ impl Versions<'_> {
         let twin = &file.twin.name;
         let Some(wanted) = wanted else { return Ok(self.catalog.version(twin, None)?) };
         let versions = self.catalog.versions(twin)?;
+        // From the latest on: a rollback gives an old hash another number.
         match versions.into_iter().rev().find(|entry| entry.hash == wanted) {
             Some(entry) => Ok(self.catalog.version(twin, Some(entry.number))?),
             None => Err(SuiteError::NoVersion {
@@ -188,6 +197,7 @@ impl Case {
         let drives = &version.manifest.trajectories;
         let on_drive = DriveStart::new(&resolved, drives);
         let line = scenario_line(&resolved, map.as_ref(), &hash, drives);
+        // A map is part of the record's first line, which has a limit.
         if map.is_some() {
             line.check().map_err(|message| SuiteError::File {
                 path: path.to_owned(),
@@ -196,6 +206,7 @@ impl Case {
         }
         let dt_us = suite.dt_us.unwrap_or(session::DT_US);
         let steps = match line.limit_us {
+            // Rounded up, so that the last step ends at the limit or beyond it and not before.
             Some(limit_us) => (limit_us.max(0) as u64).div_ceil(dt_us.max(1) as u64),
             None => limits::STEPS,
         };
@@ -236,6 +247,7 @@ fn outputs(suite: &SuiteFile, version: &Version) -> Outputs {
     // Without a drive there is nothing to compare an image with.
     outputs.trust = !version.manifest.trajectories.is_empty();
     outputs.cameras.clone_from(&suite.cameras);
+    // A size applies to each camera, so that the cameras must be known by name.
     if let Some(size) = suite.size {
         let of_rig = || {
             let rig = version.manifest.rig.as_ref();

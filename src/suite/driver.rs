@@ -82,15 +82,19 @@ impl BuiltIn {
         let teleports = episode.ego().dynamics().model == EgoModel::Teleport;
         let dt_us = case.options.dt_us.unwrap_or(wildcity_session::limits::DT_US);
         match self {
+            // It takes its own pose: a teleport stands by being told where it is.
             Self::Stand if teleports => Ok(Command::Pose(episode.world_from_rig())),
             Self::Stand => {
                 let speed_mps = episode.ego().velocity_m_s().length();
+                // Not more than stops the car within the step, because more would be a request to
+                // drive backwards.
                 let braking = -BRAKING_MPS2.min(speed_mps / (dt_us as f64 * 1e-6));
                 let action = Action::checked(braking, 0.0).map_err(|error| error.to_string())?;
                 Ok(Command::Action(action))
             }
             Self::Log => {
                 let drive = case.drive.as_ref().ok_or("there is no recorded drive to follow")?;
+                // Times of the episode are shifted to the clock of the recording.
                 let at = |time_us: i64| pose_at(drive, case.drive_start_us + time_us);
                 follow(teleports, episode, dt_us, &at)
             }
@@ -114,6 +118,7 @@ fn follow(
         return Ok(Command::Pose(at(now_us + dt_us)));
     }
     let rig_from_world = episode.world_from_rig().inverse();
+    // At least to the end of the step, which the path must cover.
     let count = PLAN_POSES.max(dt_us / PLAN_STEP_US + 1);
     let poses = (1..=count).map(|k| {
         let time_us = k * PLAN_STEP_US;
@@ -152,12 +157,15 @@ fn lead(case: &Case, session: &Session, station_m: f64) -> Option<Lead> {
         let beside = course.nearest(state.world_from_actor.position_m);
         let ahead = course.at(beside.station_m).rotation * DVec3::X;
         let own_forward = state.world_from_actor.rotation * DVec3::X;
+        // Rounding may bring the product above 1, and the root below needs a positive number.
         let cos = own_forward.dot(ahead).abs().min(1.0);
         let sin = (1.0 - cos * cos).sqrt();
         let half_along_m = 0.5 * (spec.box_.length_m * cos + spec.box_.width_m * sin);
         let half_across_m = 0.5 * (spec.box_.length_m * sin + spec.box_.width_m * cos);
+        // Half of both widths and the room on the side: nearer than this, the boxes would meet.
         let reach_m = half_across_m + 0.5 * ego.box_.width_m + SIDE_M;
         let is_ahead = beside.station_m > station_m && beside.left_m.abs() < reach_m;
+        // Where the ego's origin is when its front touches the actor's rear.
         let rear_m = beside.station_m - half_along_m - front_m;
         is_ahead.then(|| Lead { rear_m, speed_mps: state.velocity_mps.dot(ahead).max(0.0) })
     });
@@ -178,6 +186,7 @@ impl<'a> IdmPlan<'a> {
         let length_m = course.length_m();
         let begin = course.nearest(episode.world_from_rig().position_m);
         let whole_s = case.line.limit_us.unwrap_or(0) as f64 * 1e-6;
+        // The speed at which the route takes exactly the time limit.
         let free_speed_mps = if whole_s > 0.0 {
             (length_m / whole_s).max(LEAST_FREE_MPS)
         } else {
@@ -190,12 +199,14 @@ impl<'a> IdmPlan<'a> {
         let mut speed_mps = episode.ego().velocity_m_s().dot(forward).max(0.0);
         let mut station_m = begin.station_m;
         let mut stations_m = vec![station_m];
+        // As long as the longest step and the path after it.
         let plan_us = PLAN_POSES * PLAN_STEP_US + wildcity_session::limits::DT_MAX_US;
         for step in 0..plan_us / IDM_STEP_US {
             let wall_m = length_m - station_m;
             let mut acceleration = idm.acceleration(speed_mps, 0.0, wall_m);
             if let Some(Lead { rear_m, speed_mps: lead_mps }) = lead {
                 let ahead_s = (step * IDM_STEP_US) as f64 * 1e-6;
+                // The lead is assumed to keep its speed.
                 let gap_m = rear_m + lead_mps * ahead_s - station_m;
                 acceleration = acceleration.min(idm.acceleration(speed_mps, lead_mps, gap_m));
             }
@@ -210,6 +221,7 @@ impl<'a> IdmPlan<'a> {
     /// The pose after a time from now.
     fn at(&self, after_us: i64) -> Pose {
         let last = self.stations_m.len() - 1;
+        // A negative time is the present. Beyond the plan its last place holds.
         let step = usize::try_from(after_us / IDM_STEP_US).unwrap_or(0).min(last);
         match &self.case.resolved.route {
             Some(route) => route.course.at(self.stations_m[step]),

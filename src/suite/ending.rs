@@ -42,14 +42,18 @@ impl Ending {
         let has_failed = counts.failed > 0;
         let accepts_off_model = result.accept_unjudged.iter().any(|name| name == OFF_MODEL);
         // Without any verdict, nothing was tested, whatever is accepted.
+        // The criteria that a suite accepts are passes already, so `not_judged` has only the
+        // others.
         let is_unjudged = counts.not_judged > 0
             || (counts.off_model > 0 && !accepts_off_model)
             || result.pass_rate.runs == 0;
+        // The lower end of the interval: with few episodes a high rate proves little.
         let low = result.pass_rate.interval[0];
         let rate_is_low = result.at_least.is_some_and(|least| low < least);
         let is_worse = matches!(against, Some(Ok(comparison)) if comparison.worse);
         let is_not_compared = matches!(against, Some(Err(_)));
         let must_all_pass = result.at_least.is_none() && against.is_none();
+        // In order of precedence.
         let code = if counts.technical > 0 {
             ExitCode::Technical
         } else if is_not_compared {

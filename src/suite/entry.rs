@@ -126,6 +126,8 @@ impl EpisodeEntry {
                 // Without a recorded drive nothing says where the twin was trained.
                 result.not_judged.push(format!("{OFF_MODEL}: {NO_TRUST}"));
             }
+            // An unknown verdict falls to the last arms and is never a pass without an accepted
+            // reason.
             entry.status = match result.verdict.as_str() {
                 "passed" if result.not_judged.is_empty() => Status::Passed,
                 "failed" => Status::Failed,
@@ -136,6 +138,7 @@ impl EpisodeEntry {
             entry.faults = result.faults;
             entry.not_judged = result.not_judged;
             entry.scores = result.scores;
+            // The score must agree with the status, which the suite may have changed.
             match (entry.status, entry.scores.get_mut(own::NAME)) {
                 // It has no value if a criterion was not judged.
                 (Status::Passed, Some(score)) => {
@@ -164,6 +167,7 @@ fn are_accepted(not_judged: &[String], accept_unjudged: &[String]) -> bool {
     let is_accepted = |text: &String| {
         text.split_once(':').is_some_and(|(name, _)| accept_unjudged.iter().any(|one| one == name))
     };
+    // Without a colon the text has no criterion, and is not accepted.
     !not_judged.is_empty() && not_judged.iter().all(is_accepted)
 }
 
@@ -178,6 +182,7 @@ fn fix(not_judged: &str) -> String {
     let name = not_judged.split_once(':').map_or(not_judged, |(name, _)| name);
     let accepted = format!("--accept-unjudged {name}");
     match not_judged {
+        // By the end of the text, because the name of the criterion is in front of it.
         text if text.ends_with(NO_MAP) => format!("add a map, or {accepted}"),
         text if text.ends_with(NO_TRUST) => {
             format!("add a drive with `wildcity twin drive`, or {accepted}")
@@ -202,6 +207,7 @@ impl EpisodeEntry {
         let mcap = mcap_path(Path::new(&self.record));
         self.mcap = Some(match engine.export_failure(&EpisodeFile::episode_name(&mcap)) {
             Some(reason) => Err(reason),
+            // Below `episodes`, as the record is, so that a report can link to it.
             None if episodes.join(&mcap).is_file() => Ok(mcap.display().to_string()),
             None => Err("it was not ready at the end of the run".to_owned()),
         });

@@ -80,6 +80,7 @@ impl SuiteFile {
         let wrong = |cause| SuiteError::File { path: path.to_owned(), cause };
         let value: serde_json::Value = serde_json::from_slice(&bytes)
             .map_err(|error| wrong(FileError::new("suite", format!("not JSON: {error}"))))?;
+        // The format decides and not the name of the file, so that a scenario can be run by itself.
         if value.get("format").and_then(serde_json::Value::as_str) == Some(ScenarioFile::FORMAT) {
             let document = Document::from_json(value).map_err(wrong)?;
             let suite = Self::single(path);
@@ -91,11 +92,14 @@ impl SuiteFile {
         })?;
         suite.path = path.to_owned();
         suite.check().map_err(wrong)?;
+        // Scenarios are beside the suite and not in the working directory.
         let dir = path.parent().unwrap_or(Path::new("."));
         let mut scenarios = Vec::new();
         for (index, file) in suite.scenarios.iter().enumerate() {
             let path = dir.join(file);
             let wrong = |cause| SuiteError::File { path: path.clone(), cause };
+            // A missing scenario is a mistake of the suite; one that is malformed is a mistake of
+            // its own file.
             let bytes = read(&path, limits::FILE_BYTES).map_err(|error| {
                 let cause = FileError::new(format!("scenarios[{index}]"), error.to_string());
                 SuiteError::File { path: suite.path.clone(), cause }
@@ -178,6 +182,7 @@ fn check_alone(document: &Document) -> Result<(), FileError> {
 /// Reads a file of at most `limit_bytes`.
 pub(crate) fn read(path: &Path, limit_bytes: u64) -> Result<Vec<u8>, SuiteError> {
     let failed = |cause| SuiteError::Io { what: "read", path: path.to_owned(), cause };
+    // The size is looked at first, so that a wrong path to a large file is not read into memory.
     let bytes = fs::metadata(path).map_err(failed)?.len();
     if bytes > limit_bytes {
         return Err(SuiteError::TooLarge { path: path.to_owned(), bytes, limit_bytes });

@@ -36,9 +36,11 @@ pub(crate) async fn finish(case: &Case, record: PathBuf) -> Result<Finished, Tec
 fn finish_file(case: &Case, record: &Path) -> Result<Finished, Technical> {
     let episode =
         EpisodeFile::read(record).map_err(|error| Technical::server(error.to_string()))?;
+    // What was driven must be what was ordered, before anything is judged.
     check(case, &episode)?;
     let end = episode.end.clone();
     let end = end.ok_or_else(|| Technical::new("agent_lost", "the record has no end"))?;
+    // By its name in the record: a newer server may write an outcome that this build does not know.
     let outcome = Outcome::deserialize(end.outcome.as_str().into_deserializer());
     let outcome = outcome.map_err(|_: ValueError| {
         let outcome = &end.outcome;
@@ -46,6 +48,7 @@ fn finish_file(case: &Case, record: &Path) -> Result<Finished, Technical> {
             "the session ended as {outcome}, which this program does not know"
         ))
     })?;
+    // An episode that ended by the rules has a verdict. The others say nothing about driving.
     let kind = match outcome {
         Outcome::Completed | Outcome::OffModel | Outcome::DrivingFailure => None,
         Outcome::AgentError => Some("agent_error"),

@@ -15,8 +15,11 @@ use crate::result::SuiteResult;
 /// exit code and its reason.
 pub fn junit(result: &SuiteResult, ending: &Ending) -> String {
     let counts = &result.counts;
+    // The same rule as in the exit code: where the suite accepts these episodes, they are no
+    // errors.
     let accepts_off_model = result.accept_unjudged.iter().any(|name| name == OFF_MODEL);
     let skipped = if accepts_off_model { counts.off_model } else { 0 };
+    // `skipped` is at most `off_model`, so the subtraction is safe.
     let errors = counts.technical + counts.not_judged + counts.off_model - skipped;
     let mut text = String::from("<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n");
     // Writing into a text cannot fail.
@@ -56,9 +59,11 @@ fn case(text: &mut String, result: &SuiteResult, episode: &EpisodeEntry) {
         escaped(&class),
         escaped(&episode.name)
     );
+    // The status decides on the element, and the run's own rule does not.
     let inner = match episode.status {
         Status::Passed => String::new(),
         Status::Failed => {
+            // The first fault names the type, because later ones may follow from it.
             let types: Vec<&str> = episode.faults.iter().map(|fault| &*fault.fault).collect();
             let kind = types.first().copied().unwrap_or("unknown");
             let lines = episode.fault_texts();
@@ -78,6 +83,7 @@ fn case(text: &mut String, result: &SuiteResult, episode: &EpisodeEntry) {
         }
         Status::Technical => {
             let last = episode.errors.last();
+            // The last attempt decided; earlier ones are in the text.
             let kind = last.map_or("server_error", |error| &error.kind);
             let message = last.map_or("", |error| &error.message);
             let lines: Vec<String> = episode.errors.iter().map(TechnicalEntry::text).collect();
@@ -85,6 +91,7 @@ fn case(text: &mut String, result: &SuiteResult, episode: &EpisodeEntry) {
         }
     };
     let inner = inner + &notes(episode);
+    // A test without content is a passed one.
     if inner.is_empty() {
         text.push_str("/>\n");
     } else {
@@ -107,6 +114,7 @@ fn notes(episode: &EpisodeEntry) -> String {
 }
 
 fn element(name: &str, kind: &str, message: &str, body: &str) -> String {
+    // Every text from outside is escaped here, in one place.
     let [kind, message, body] = [kind, message, body].map(escaped);
     format!("<{name} type=\"{kind}\" message=\"{message}\">{body}</{name}>")
 }
@@ -121,6 +129,7 @@ fn escaped(text: &str) -> String {
             '>' => escaped.push_str("&gt;"),
             '"' => escaped.push_str("&quot;"),
             '\t' | '\n' => escaped.push(character),
+            // XML 1.0 cannot have most of them, not even as references.
             control if control.is_control() => escaped.push('\u{fffd}'),
             // The two code points that XML does not allow in addition to controls.
             '\u{fffe}' | '\u{ffff}' => escaped.push('\u{fffd}'),

@@ -100,6 +100,7 @@ fn scenarios(result: &SuiteResult) -> Markup {
 fn not_judged<'a>(result: &'a SuiteResult, scenario: &str) -> Vec<&'a str> {
     let of_scenario = result.episodes.iter().filter(|episode| episode.scenario == scenario);
     let reasons = of_scenario.flat_map(|episode| episode.not_judged.iter().map(String::as_str));
+    // A set, because the same reason comes from every seed.
     reasons.collect::<BTreeSet<&str>>().into_iter().collect()
 }
 

@@ -50,9 +50,11 @@ impl SuiteResult {
     /// only lack progress, and of these those with the earliest fault first. Without duplicates,
     /// which would show the same pictures.
     pub(crate) fn worst(&self) -> Vec<&EpisodeEntry> {
+        // Duplicates are left out before the list is cut, so that they take no place in it.
         let distinct = self.episodes.iter().filter(|episode| episode.duplicate_of.is_none());
         let mut worst: Vec<&EpisodeEntry> =
             distinct.filter(|episode| episode.status == Status::Failed).collect();
+        // Faults by severity, then by time, then by name, so that the order is total.
         worst.sort_by_key(|episode| {
             let worst = worst_fault(episode);
             (worst.map(severity), worst.map_or(i64::MAX, |fault| fault.time_us), &episode.name)
@@ -87,22 +89,27 @@ fn picture(
     let path = episodes.join(&episode.record);
     let mut recording = RecordedEpisode::read(&path).map_err(|error| error.to_string())?;
     let fault_us = worst_fault(episode).map_or(i64::MAX, |fault| fault.time_us);
+    // A request to look again shows a time that was shown before.
     let shown = |frame: &wildcity_session::FrameRecord| {
         frame.request != FrameRequest::Observe && !frame.images.is_empty()
     };
     // The first frame at or after the fault.
     let at = recording.frames.iter().position(|frame| shown(frame) && frame.time_us >= fault_us);
+    // A fault after the last frame is shown by the last one.
     let Some(at) = at.or_else(|| recording.frames.iter().rposition(shown)) else { return Ok(None) };
     // The earlier steps are executed, so that the ego has its pose, but not rendered.
     recording.frames.truncate(at + 1);
+    // The record ends early now, and its end would contradict that.
     recording.end = None;
     for frame in recording.frames.iter_mut().take(at) {
+        // One empty list for each pose, so that the frame keeps its steps but asks for no image.
         frame.cameras = vec![Vec::new(); frame.poses.len()];
         frame.images.clear();
     }
     let step = recording.frames[at].step;
     let mut found: Option<Picture> = None;
     let report = recording.replay(cache, backend, ReplayUntil::End, &mut |image| {
+        // The first camera only; the others of the frame are rendered and dropped.
         if found.is_none() {
             let size = &image.camera.camera;
             let jpeg = jpeg(image.rgb8, size.width_px, size.height_px, session::JPEG_QUALITY)?;

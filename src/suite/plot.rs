@@ -25,6 +25,7 @@ const MARGIN_PX: f64 = 28.0;
 pub(crate) fn plots(episode: &EpisodeEntry, episodes: &Path) -> Option<String> {
     let record = EpisodeFile::read(&episodes.join(&episode.record)).ok()?;
     let drive = drive_record(&record)?;
+    // The samples by index, which both plots share.
     let faults: Vec<usize> =
         episode.faults.iter().filter_map(|fault| sample_at(&drive, fault.time_us)).collect();
     Some(from_above(&drive, &faults) + &speed(&drive, &faults))
@@ -44,12 +45,14 @@ impl Frame {
         let extent = (most - least).max(DVec2::ONE);
         let room_px = SIZE_PX - 2.0 * MARGIN_PX;
         let scale = room_px / extent;
+        // An even scale keeps angles; the smaller one fits both axes.
         let scale = if is_even { DVec2::splat(scale.min_element()) } else { scale };
         Self { least, scale }
     }
 
     fn at(&self, point: DVec2) -> DVec2 {
         let px = (point - self.least) * self.scale;
+        // In SVG y points down.
         DVec2::new(MARGIN_PX + px.x, SIZE_PX.y - MARGIN_PX - px.y)
     }
 }
@@ -58,15 +61,18 @@ impl Frame {
 fn from_above(drive: &DriveRecord, faults: &[usize]) -> String {
     let ego: Vec<DVec2> = drive.ego.iter().map(|sample| sample.origin_m).collect();
     let route = drive.reference.as_ref().map_or(Vec::new(), |drive| drive.line.points_m().to_vec());
+    // Around the drive and the recording only: an actor far away would make both a dot.
     let all: Vec<DVec2> = ego.iter().chain(&route).copied().collect();
     let frame = Frame::around(&all, true);
     let legend =
         [(DRIVEN, "driven"), (RECORDED, "recorded"), (ACTORS, "actors"), (FAULT, "faults")];
     let mut svg = begin("from above", &legend);
     scale_bar(&mut svg, &frame);
+    // Drawn from the back to the front: the recording is the widest and lies below the drive.
     line(&mut svg, &frame, &route, RECORDED, 4.0);
     let tracks = drive.tracks.iter().flatten();
     for track in tracks {
+        // `flatten` leaves out the steps at which the actor is absent.
         let there: Vec<DVec2> =
             track.samples.iter().flatten().map(|sample| sample.footprint.center_m).collect();
         line(&mut svg, &frame, &there, ACTORS, 1.5);
@@ -86,6 +92,7 @@ fn speed(drive: &DriveRecord, faults: &[usize]) -> String {
         .enumerate()
         .map(|(step, sample)| DVec2::new(step as f64 * step_s, sample.speed_mps()))
         .collect();
+    // With the origin, so that standstill is at the bottom and not the lowest speed.
     let with_zero: Vec<DVec2> = points.iter().copied().chain([DVec2::ZERO]).collect();
     let frame = Frame::around(&with_zero, false);
     let most = points.iter().map(|point| point.y).fold(0.0, f64::max);
@@ -103,6 +110,7 @@ fn speed(drive: &DriveRecord, faults: &[usize]) -> String {
 /// The sample at a time, in microseconds; that of a contact within a step is the one before it.
 fn sample_at(drive: &DriveRecord, time_us: i64) -> Option<usize> {
     let last = drive.ego.len() as i64 - 1;
+    // Rounded down: the sample before the time.
     let step = time_us / drive.dt_us.max(1);
     usize::try_from(step.clamp(0, last)).ok()
 }
@@ -141,6 +149,7 @@ fn line(svg: &mut String, frame: &Frame, points: &[DVec2], color: &str, width: f
 /// A bar of 1, 10, 100 .. m, as long as fits into a third of the plot.
 fn scale_bar(svg: &mut String, frame: &Frame) {
     let most_m = SIZE_PX.x / 3.0 / frame.scale.x;
+    // The largest power of ten that is not longer.
     let bar_m = 10.0_f64.powf(most_m.log10().floor());
     let from = DVec2::new(MARGIN_PX, SIZE_PX.y - 8.0);
     let to_x = from.x + bar_m * frame.scale.x;

@@ -116,6 +116,7 @@ impl SuiteResult {
 
     /// The result of some episodes, which are in order of their names.
     pub(crate) fn new(head: RunHead, mut episodes: Vec<EpisodeEntry>) -> Self {
+        // First, because rates and means leave duplicates out.
         mark_duplicates(&mut episodes);
         let mut counts = Counts { episodes: episodes.len() as u64, ..Counts::default() };
         let mut by_scenario: BTreeMap<String, Vec<&EpisodeEntry>> = BTreeMap::new();
@@ -159,12 +160,14 @@ impl SuiteResult {
         let path = if run.is_dir() { run.join(Self::FILE) } else { run.to_owned() };
         let bytes = read(&path, limits::RESULT_BYTES)?;
         let wrong = |reason: String| SuiteError::NoResult { path: path.clone(), reason };
+        // The format alone first: another version may have other fields.
         let Head { format } = serde_json::from_slice(&bytes)
             .map_err(|error| wrong(format!("no JSON object with a format: {error}")))?;
         if format != Self::FORMAT {
             return Err(wrong(format!("its format is {format:?}, not {:?}", Self::FORMAT)));
         }
         let mut reader = serde_json::Deserializer::from_slice(&bytes);
+        // With the path to the mistake, because a result has up to 100,000 episodes.
         serde_path_to_error::deserialize(&mut reader)
             .map_err(|error| wrong(format!("{}: {}", error.path(), error.inner())))
     }
@@ -189,6 +192,7 @@ impl SuiteResult {
 
 /// Means over scenarios: more seeds of one scenario must not outweigh the others.
 fn means(by_scenario: &BTreeMap<String, Vec<&EpisodeEntry>>) -> BTreeMap<String, MeanEntry> {
+    // Two levels: values of a score within a scenario, then the means of scenarios.
     let mut per_scenario: BTreeMap<String, Vec<f64>> = BTreeMap::new();
     for episodes in by_scenario.values() {
         let mut values: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
@@ -204,6 +208,7 @@ fn means(by_scenario: &BTreeMap<String, Vec<&EpisodeEntry>>) -> BTreeMap<String,
             }
         }
     }
+    // No scenario with a value means no entry, instead of a mean of nothing.
     let entry = |name: &str, values: &[f64]| {
         let mean = Mean::from_values(values)?;
         let interval = mean.interval(score_range(name));
@@ -222,6 +227,7 @@ fn means(by_scenario: &BTreeMap<String, Vec<&EpisodeEntry>>) -> BTreeMap<String,
 fn mark_duplicates(episodes: &mut [EpisodeEntry]) {
     let mut first: BTreeMap<(String, Status, String), String> = BTreeMap::new();
     for episode in episodes.iter_mut().filter(|episode| !episode.drive_hash.is_empty()) {
+        // The status too, so that episodes with different verdicts stay apart.
         let drive = (episode.scenario.clone(), episode.status, episode.drive_hash.clone());
         match first.get(&drive) {
             Some(name) => episode.duplicate_of = Some(name.clone()),
@@ -252,6 +258,7 @@ impl Rate {
     }
 
     fn new(passed: u64, runs: u64) -> Self {
+        // No rate instead of 0 / 0. The interval is then all of 0 to 1.
         let rate = (runs > 0).then(|| passed as f64 / runs as f64);
         Self { passed, runs, rate, interval: wilson(passed, runs) }
     }

@@ -117,6 +117,7 @@ impl std::fmt::Debug for RunSettings {
 /// The directory has episodes of another run, a scenario lacks what a built-in agent follows, the
 /// engine or the server cannot be started, or the shell finds no such command as the agent's.
 pub async fn run(settings: RunSettings, cases: Vec<Case>) -> Result<SuiteResult, SuiteError> {
+    // Before the engine starts, since a mistake of the caller costs nothing then.
     check_empty(&settings.episodes)?;
     if let AgentChoice::BuiltIn(agent) = &settings.agent {
         check_agent(*agent, &cases)?;
@@ -134,6 +135,7 @@ pub async fn run(settings: RunSettings, cases: Vec<Case>) -> Result<SuiteResult,
         at_least: settings.at_least,
         accept_unjudged: settings.accept_unjudged.clone(),
     };
+    // At least one, because no job would never end.
     let permits = Arc::new(Semaphore::new(settings.jobs.clamp(1, limits::JOBS)));
     let shared = Arc::new(Shared {
         agent: settings.agent,
@@ -144,6 +146,7 @@ pub async fn run(settings: RunSettings, cases: Vec<Case>) -> Result<SuiteResult,
         host,
         progress: settings.progress,
     });
+    // A task for each case, of which `jobs` run at once: the others wait for a permit.
     let mut tasks = JoinSet::new();
     for case in cases {
         let shared = shared.clone();
@@ -157,6 +160,7 @@ pub async fn run(settings: RunSettings, cases: Vec<Case>) -> Result<SuiteResult,
     }
     let mut entries = Vec::new();
     let mut failed = None;
+    // All tasks are awaited, also after an error: aborted ones must have let go of the host.
     while let Some(ended) = tasks.join_next().await {
         let entry = ended.map_err(|error| SuiteError::Task(error.to_string()));
         match entry.flatten() {
@@ -168,7 +172,9 @@ pub async fn run(settings: RunSettings, cases: Vec<Case>) -> Result<SuiteResult,
             }
         }
     }
+    // The tasks have ended and dropped their handles, so this is the last one.
     if let Some(mut shared) = Arc::into_inner(shared) {
+        // The engine is taken before the server stops, because the exports go on in it.
         let engine = shared.host.engine();
         // The server ends the sessions of agents that went away.
         shared.host.stop().await;
@@ -177,6 +183,7 @@ pub async fn run(settings: RunSettings, cases: Vec<Case>) -> Result<SuiteResult,
             entries.iter_mut().for_each(|entry| entry.add_mcap(&shared.episodes, &engine));
         }
     }
+    // Tasks end in any order.
     entries.sort_by(|a, b| a.name.cmp(&b.name));
     match failed {
         Some(error) => Err(error),
@@ -260,11 +267,13 @@ impl Shared {
     /// The agent is a command that the shell does not find.
     async fn episode(&self, case: &Case) -> Result<EpisodeEntry, SuiteError> {
         let mut errors = Vec::new();
+        // In 64 bits, because `retries + 1` may not fit into 32.
         for attempt in 1..=u64::from(self.retries) + 1 {
             let driven = self.attempt(case, attempt).await;
             let finished = match driven {
                 Ok(record) => finish(case, record).await,
                 Err(NotDriven::Technical(technical)) => Err(technical),
+                // Another attempt, and every other episode, would fail in the same way.
                 Err(NotDriven::NoCommand(reason)) => {
                     return Err(SuiteError::NoAgent {
                         agent: self.agent.name().to_owned(),
@@ -302,6 +311,7 @@ impl Shared {
             1 => case.name.clone(),
             attempt => format!("{}.{attempt}", case.name),
         };
+        // The first episode of the session, as the server names its file.
         let record = self.episodes.join(format!("{session}-1.jsonl"));
         match (&self.host, &self.agent) {
             (Host::Engine(engine), AgentChoice::BuiltIn(agent)) => {
@@ -329,6 +339,7 @@ async fn drive(
     let mut session = Session::open(engine, session, case.options.clone()).await.map_err(failed)?;
     let driven = steps(&mut session, case, agent).await;
     let outcome = if driven.is_ok() { Outcome::Completed } else { Outcome::ServerError };
+    // Closed on failure as well, because the record gets its end from it.
     session.close(outcome).await;
     driven
 }

@@ -28,6 +28,7 @@ impl Tail {
             let lines = lines.clone();
             thread::spawn(move || {
                 read(stream, &lines);
+                // The other side of the channel sees the end, without a message.
                 drop(end);
             });
         }
@@ -60,7 +61,9 @@ fn read(stream: ChildStderr, lines: &Mutex<VecDeque<String>>) {
         // A run continues if its own standard error is closed.
         let _ = io::stderr().write_all(&bytes);
         let line = String::from_utf8_lossy(&bytes).trim_end().to_owned();
+        // Locked for each line and not while reading, which may wait for hours.
         let mut lines = lines.lock().unwrap_or_else(PoisonError::into_inner);
+        // An empty line says nothing and would push out one that does.
         if !line.is_empty() {
             lines.push_back(line);
         }

@@ -18,6 +18,7 @@ pub fn verify(
     backend: &dyn Backend,
 ) -> Vec<String> {
     let cache = Cache::new(catalog.clone());
+    // An episode that was not driven has nothing to repeat.
     let recorded = result.episodes.iter().filter(|episode| !episode.record.is_empty());
     recorded
         .filter_map(|episode| {
@@ -33,12 +34,14 @@ fn differs(path: &Path, cache: &Cache, backend: &dyn Backend) -> Option<String> 
         Ok(recording) => recording,
         Err(error) => return Some(error.to_string()),
     };
+    // Up to the first difference: one is enough to say that the episode does not repeat.
     match recording.replay(cache, backend, ReplayUntil::FirstDifference, &mut |_| Ok(())) {
         Err(error) => Some(error.to_string()),
         Ok(report) => {
             let diverged = report.diverged.map(|diverged| diverged.to_string());
             let image = report.difference.map(|difference| difference.to_string());
             let value = report.wrong_value.map(|value| value.to_string());
+            // Poses first, because images and values follow from them.
             diverged.or(image).or(value)
         }
     }

@@ -32,11 +32,13 @@ impl Body {
             length_m: size.length_m,
             width_m: size.width_m,
         };
+        // An actor's origin and a rig's origin are on the ground, so the box reaches from there up.
         Self { footprint, bottom_m: center.z, top_m: center.z + size.height_m }
     }
 
     /// Whether the heights of two boxes overlap. A bridge and the street below it do not.
     pub fn is_level_with(&self, other: &Self) -> bool {
+        // Closed intervals, as for the outline: boxes that only touch in height are level.
         self.bottom_m <= other.top_m && other.bottom_m <= self.top_m
     }
 

@@ -93,6 +93,7 @@ impl Detector {
             .map(|ego| Body::new(&ego.world_from_rig, &self.ego_box.box_, self.ego_box.center_x_m));
         let mut touching = Vec::new();
         let mut begun = Vec::new();
+        // Both lists have the same actors in the same order, so one pass pairs them.
         for (before, after) in sub_step.before.iter().zip(sub_step.after) {
             let Some(spec) = specs.get(usize::from(after.index)) else { continue };
             if !after.present {
@@ -114,14 +115,19 @@ impl Detector {
             if let Some(after_s) = touch_s
                 && !touched_before
             {
+                // Rounded up, so that the boxes touch at the recorded time. The bound undoes what
+                // rounding adds past the end of the sub-step.
                 let time_us = sub_step.begin_us + (after_s * 1e6).ceil() as i64;
                 let contact = pair.contact(time_us.min(sub_step.end_us), lanes);
                 begun.push(Contact { at_start: appears, ..contact });
             }
+            // Remembers the end and not the sweep: a box that only passed through has left, and may
+            // touch again later.
             if pair.touches_at_end() {
                 touching.push(after.index);
             }
         }
+        // `binary_search` in the next sub-step needs a sorted list.
         touching.sort_unstable();
         self.touching = touching;
         begun
@@ -143,20 +149,28 @@ impl Pair<'_> {
         let way_m = |[from, to]: [Body; 2]| to.footprint.center_m - from.footprint.center_m;
         let ego_way_m = way_m(self.ego);
         let actor_way_m = way_m(self.actor);
+        // A jump of either body is a teleport. Its speed is compared as a distance, because
+        // `step_s` may be 0 at the start.
         let fastest_m = ego_way_m.length().max(actor_way_m.length());
         if step_s <= 0.0 || fastest_m > MAX_SWEPT_SPEED_MPS * step_s {
             return at_end;
         }
+        // The sweep is in the plane, so the heights of the whole sub-step decide first whether the
+        // bodies can meet.
         if !span(self.ego).is_level_with(&span(self.actor)) {
             return at_end;
         }
+        // The sweep counts from the start of the sub-step. So the box at the end, with its heading,
+        // is moved back by the whole way.
         let moving = |to: &Body, way_m: DVec2| Moving {
             footprint: to.footprint.shifted(-way_m),
             velocity_mps: way_m / step_s,
         };
         let ego = moving(&self.ego[1], ego_way_m);
         match overlap_s(&ego, &moving(&self.actor[1], actor_way_m)) {
+            // The overlap may begin before the sub-step; the contact then begins with it.
             Some([first_s, last_s]) if first_s <= step_s && last_s >= 0.0 => Some(first_s.max(0.0)),
+            // The swept boxes miss each other, but rounding may let those at the end touch.
             _ => at_end,
         }
     }

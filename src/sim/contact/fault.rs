@@ -85,6 +85,7 @@ impl CollisionType {
     /// the ego was not in a lane of its own.
     pub fn is_at_fault_in(self, lanes: LanePosition) -> bool {
         match self {
+            // The ego was hit: it stood, or the other came from behind.
             Self::StoppedEgo | Self::ActiveRear => false,
             Self::StoppedTrack | Self::ActiveFront => true,
             Self::ActiveLateral => lanes.in_multiple_lanes || lanes.off_drivable,
@@ -108,9 +109,13 @@ impl FaultInput {
 /// along `normal`, the unit vector from the ego to the other, than the other does.
 pub fn is_ego_at_fault(input: &FaultInput, normal: DVec2, lanes: Option<LanePosition>) -> bool {
     match (CollisionType::classify(input), lanes) {
+        // `normal` points to the other, so the ego closes by `v_ego · n` and the other by
+        // `-v_other · n`.
         (CollisionType::ActiveLateral, None) => {
             input.ego_velocity_mps.dot(normal) > -input.other_velocity_mps.dot(normal)
         }
+        // Kinds other than the lateral one do not depend on the lanes, so the default decides
+        // nothing.
         (kind, lanes) => kind.is_at_fault_in(lanes.unwrap_or_default()),
     }
 }

@@ -76,6 +76,7 @@ impl Footprint {
 
     /// Half the extent of the box along a unit vector, in metres.
     pub fn radius_m(&self, along: DVec2) -> f64 {
+        // A rectangle reaches `(l/2) |f·a| + (w/2) |l·a|` from its centre along an axis a.
         let ahead_m = 0.5 * self.length_m * self.forward.dot(along).abs();
         let aside_m = 0.5 * self.width_m * self.left().dot(along).abs();
         ahead_m + aside_m
@@ -103,6 +104,7 @@ impl Footprint {
         for axis in self.axes_with(other) {
             let along_m = apart_m.dot(axis);
             let gap_m = along_m.abs() - self.radius_m(axis) - other.radius_m(axis);
+            // Strict, so that of equal axes the first wins.
             if gap_m > widest.0 {
                 widest = (gap_m, if along_m < 0.0 { -axis } else { axis });
             }
@@ -132,6 +134,8 @@ impl Footprint {
     /// Distance of a point to the box, in metres; 0 within it.
     pub fn distance_to_m(&self, point_m: DVec2) -> f64 {
         let from_center = point_m - self.center_m;
+        // In the axes of the box the nearest point is the clamped one, so each excess is an
+        // independent leg of a right triangle.
         let ahead_m = (from_center.dot(self.forward).abs() - 0.5 * self.length_m).max(0.0);
         let aside_m = (from_center.dot(self.left()).abs() - 0.5 * self.width_m).max(0.0);
         ahead_m.hypot(aside_m)

@@ -56,6 +56,7 @@ impl SolidPoint {
 /// Whether a centre in the axes of the ego's box lies in the part of the box that is tested.
 pub(super) fn is_in_tested_box(mean_m: DVec3, size_m: DVec3) -> bool {
     let DVec3 { x, y, z } = mean_m;
+    // The box is symmetric in x and y, but its height counts from the ground: z has its own range.
     let within_length = x.abs() <= 0.5 * size_m.x - SIDE_MARGIN_M;
     let within_width = y.abs() <= 0.5 * size_m.y - SIDE_MARGIN_M;
     let within_height = (GROUND_MARGIN_M..=size_m.z).contains(&z);

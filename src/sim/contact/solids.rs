@@ -51,6 +51,8 @@ impl CubePoint {
     fn new(point: SolidPoint) -> Self {
         let cell = cell_at(point.mean_m.truncate());
         let from_corner_m = point.mean_m - corner_m(cell).extend(0.0);
+        // The cube counts from the cell's corner. Its index is 0 to 19 in x and y, and has any sign
+        // in z.
         let cube = (from_corner_m / MERGED_M).floor().as_ivec3().to_array();
         Self { cell, cube, from_corner_m, area_m2: point.area_m2() }
     }
@@ -81,7 +83,11 @@ impl TestedBox {
         let size_m = DVec3::new(ego.box_.length_m, ego.box_.width_m, ego.box_.height_m);
         let up = world_from_rig.rotation * DVec3::Z;
         let tilt_rad = up.angle_between(DVec3::Z).min(FRAC_PI_2);
+        // A tilt θ lifts the end of a horizontal half diagonal d by `d sin θ`. This bounds the
+        // heights of all corners without computing them. Beyond 90° no corner is higher than d.
         let edge_m = 0.5 * size_m.truncate().length() * tilt_rad.sin();
+        // Along the tilted up axis, a height h of the box is `h up.z` above its middle. A rig that
+        // lies on its roof has a negative `up.z`, hence the minimum and maximum below.
         let base_m = GROUND_MARGIN_M * up.z;
         let top_m = size_m.z * up.z;
         Self {
@@ -96,6 +102,8 @@ impl TestedBox {
     /// Smallest and greatest x and y of its points, in metres.
     pub fn extent_m(&self) -> [DVec2; 2] {
         // A box that lies on its side reaches as far as it is high.
+        // The half diagonal covers every heading, and the rise covers every tilt. The extent may be
+        // too large: it only selects cells, and `has` decides.
         let reach_m = DVec2::splat((0.5 * self.size_m.truncate().length()).hypot(self.rise_m()));
         [self.center_m.truncate() - reach_m, self.center_m.truncate() + reach_m]
     }
@@ -122,14 +130,17 @@ impl Solids {
             points.iter().enumerate().map(|(index, point)| (point.key(), index)).collect();
         order.sort_unstable();
         let mut cells: BTreeMap<[i32; 2], Vec<Solid>> = BTreeMap::new();
+        // From here on the Gaussians of a cube are consecutive.
         for cube in order.chunk_by(|a, b| a.0 == b.0) {
             let of_cube = || cube.iter().map(|(_, index)| &points[*index]);
             let area_m2: f64 = of_cube().map(|point| point.area_m2).sum();
+            // Weighted by area, so that a merged cube lies where most of its surface is.
             let moment: DVec3 = of_cube().map(|point| point.area_m2 * point.from_corner_m).sum();
             // A Gaussian without extent has no area, and no contact.
             if area_m2 > 0.0 {
                 let mean_m = (moment / area_m2).as_vec3().to_array();
                 let solid = Solid { mean_m, area_m2: area_m2 as f32 };
+                // `chunk_by` yields no empty chunk, so there is a first key.
                 let (([x, y], _), _) = cube[0];
                 cells.entry([x, y]).or_default().push(solid);
             }
@@ -137,6 +148,7 @@ impl Solids {
         for solids in cells.values_mut() {
             // Stable, so that cubes of equal height keep their order.
             solids.sort_by(|a, b| a.mean_m[2].total_cmp(&b.mean_m[2]));
+            // Solids count towards a memory budget, so that spare capacity would be a waste.
             solids.shrink_to_fit();
         }
         Self { cells }
@@ -148,10 +160,14 @@ impl Solids {
         let [west_south, east_north] = tested.extent_m().map(cell_at);
         let mut area_m2 = 0.0;
         for x in west_south[0]..=east_north[0] {
+            // Keys are ordered by x, then y. So one range query per column of cells is enough, and
+            // cells without Gaussians cost nothing.
             for (cell, solids) in self.cells.range([x, west_south[1]]..=[x, east_north[1]]) {
                 let corner_from_center_m = corner_m(*cell).extend(0.0) - tested.center_m;
                 // Most solid Gaussians are the road, below the box.
                 let first = solids.partition_point(|solid| f64::from(solid.mean_m[2]) < low_m);
+                // A cell is sorted by height, so the loop begins at the lowest Gaussian in reach
+                // and stops above the highest.
                 let in_reach = solids[first..].iter();
                 for solid in in_reach.take_while(|solid| f64::from(solid.mean_m[2]) <= high_m) {
                     let mean_m = DVec3::from_array(solid.mean_m.map(f64::from));
@@ -166,6 +182,8 @@ impl Solids {
 
     /// Memory that it takes, in bytes.
     pub fn bytes(&self) -> usize {
+        // A key of 8 bytes and a vector's header of 24, in nodes of the tree that are at least half
+        // full.
         let of_cell = |solids: &Vec<Solid>| solids.capacity() * size_of::<Solid>() + 64;
         self.cells.values().map(of_cell).sum()
     }

@@ -51,6 +51,7 @@ impl ConstantSpeed {
     ) -> Self {
         let Steering { angle_rad, target_rad, lag_s } = steering;
         let matrix = tyres.matrix(speed_m_s);
+        // G is regular at every speed within the limits of the ego, so both inverses exist.
         let with_lag = matrix + DMat2::from_diagonal(DVec2::splat(speed_m_s.abs() / lag_s));
         let settled = -(matrix.inverse() * tyres.steer) * (speed_m_s * target_rad);
         let lagging = -(with_lag.inverse() * tyres.steer) * (speed_m_s * (angle_rad - target_rad));
@@ -62,6 +63,7 @@ impl ConstantSpeed {
     /// heading until then, in radians.
     pub(super) fn after(&self, time_s: f64) -> (DVec2, f64) {
         let lag = (-time_s / self.lag_s).exp();
+        // Infinite at v = 0. The branch below then takes the faded state.
         let stretch_s2_m = time_s / self.speed_m_s.abs();
         // At very low speed the slowest eigenvalue of G is -178 m/s²: e^-1780 underflows f64.
         let faded = if stretch_s2_m < 10.0 {
@@ -85,14 +87,20 @@ fn exponential(matrix: DMat2) -> DMat2 {
     let rest = matrix - DMat2::from_diagonal(DVec2::splat(mean));
     let square = -rest.determinant();
     let root = square.abs().sqrt();
+    // The series avoid 0 / 0 where both eigenvalues are one. Their next terms, ν⁴/24 and ν⁴/120,
+    // are below 1e-17.
     let (even, odd) = if root < 1e-4 {
         // cosh ν = 1 + ν²/2, sinh ν / ν = 1 + ν²/6, up to 1e-16 of each.
         (mean.exp() * (1.0 + square / 2.0), mean.exp() * (1.0 + square / 6.0))
     } else if square < 0.0 {
         (mean.exp() * root.cos(), mean.exp() * root.sin() / root)
     } else if root < 1.0 {
+        // `cosh` and `sinh` are exact for a small ν, where the difference of two exponentials
+        // cancels.
         (mean.exp() * root.cosh(), mean.exp() * root.sinh() / root)
     } else {
+        // `cosh` alone would overflow for a large ν, although `e^μ cosh ν` is small. So the
+        // exponents are added first.
         let (slow, fast) = ((mean + root).exp(), (mean - root).exp());
         (0.5 * (slow + fast), 0.5 * (slow - fast) / root)
     };
@@ -105,6 +113,8 @@ mod tests {
     use crate::ego::vehicle::Vehicle;
 
     fn series(matrix: DMat2) -> DMat2 {
+        // Scaling and squaring: divided by 2^12 the series converges in twelve terms, and twelve
+        // squarings undo the scaling.
         let scaled = matrix * 2f64.powi(-12);
         let (mut sum, mut term) = (DMat2::IDENTITY, DMat2::IDENTITY);
         for k in 1..12 {
@@ -132,9 +142,13 @@ mod tests {
     fn at_a_crawl_the_car_rolls_as_it_is_steered() {
         let (car, tyres) = (Vehicle::DEFAULT, Vehicle::DEFAULT.tyres());
         let steering = Steering { angle_rad: 0.3, target_rad: 0.3, lag_s: 0.1 };
+        // The square of 1e-300 underflows to 0. The sideways state at the start must fade in all of
+        // them.
         for speed in [0.0, 1e-300, 1e-9, -1e-9, 1e-3] {
             let (z, turned) =
                 ConstantSpeed::new(&tyres, speed, steering, DVec2::new(1.0, -2.0)).after(0.1);
+            // A car that rolls turns by v δ / L. The centre of gravity moves sideways with its
+            // distance from the rear axle.
             let rolls = speed * 0.3 / car.wheelbase_m;
             assert!((z.y - rolls).abs() <= 1e-7 * rolls.abs(), "{speed}: {z}");
             assert!((z.x - rolls * car.rear_to_cg_m).abs() <= 1e-6 * rolls.abs(), "{speed}: {z}");

@@ -37,6 +37,8 @@ pub(super) fn rolled(
         position_m: from.position_m + DVec2::from_angle(from.yaw_rad).rotate(way_m),
         yaw_rad: from.yaw_rad + turned_rad,
         speed_m_s,
+        // As in the dynamic model: the rear axle rolls without slip, so the centre of gravity moves
+        // sideways by yaw rate times distance.
         lateral_m_s: yaw_rate_rad_s * car.rear_to_cg_m,
         yaw_rate_rad_s,
         steering_rad: (curvature_1_m * car.wheelbase_m).atan(),
@@ -55,6 +57,7 @@ pub(super) fn arc(length_m: f64, curvature_1_m: f64) -> (DVec2, f64) {
     } else {
         length_m * half.sin() / half
     };
+    // The chord of an arc leaves at half the angle of the turn.
     (chord_m * DVec2::from_angle(half), 2.0 * half)
 }
 
@@ -64,6 +67,7 @@ mod tests {
 
     #[test]
     fn arcs_are_arcs() {
+        // The last length and curvature give a half angle of 9.95e-5, within the series.
         for (length_m, curvature) in [(3.0, 0.2), (-3.0, 0.2), (6.0, -1e-3), (1.0, 1.99e-4)] {
             let (way_m, turned) = arc(length_m, curvature);
             let angle: f64 = length_m * curvature;

@@ -207,6 +207,7 @@ impl Dynamics {
     pub fn checked(model: EgoModel, speed_m_s: f64, reverse: bool) -> Result<Self, EgoError> {
         let dynamics = Self { model, speed_m_s, reverse };
         let [least, most] = match model {
+            // A teleport has no speed of its own, so only 0 is meaningful.
             EgoModel::Teleport => [0.0, 0.0],
             EgoModel::Kinematic | EgoModel::Dynamic => dynamics.bounds_m_s(),
         };
@@ -219,6 +220,7 @@ impl Dynamics {
     /// # Errors
     /// As [`Dynamics::checked`].
     pub fn with_speed(self, field: &'static str, speed_m_s: f64) -> Result<Self, EgoError> {
+        // The same check, but the message must name the field of the request that had the value.
         let refused = |error| match error {
             EgoError::Range { value, least, most, .. } => {
                 EgoError::Range { field, value, least, most }
@@ -291,6 +293,7 @@ impl Ego {
         step_us: i64,
         ground: &Ground<'_>,
     ) -> Result<Self, EgoError> {
+        // A path that is too short is refused for every model, before any state is computed.
         if let Command::Path(path) = command
             && path.end_us() < step_us
         {
@@ -309,6 +312,8 @@ impl Ego {
                 let car = self.tracked(&path.reference(), self.car, 0, step_us);
                 Ok(self.driven(car, step_s, ground))
             }
+            // The remaining pairs are refusals: the models that move by actions have no use for a
+            // pose, and a teleport none for an action.
             (model, Command::Action(_)) => {
                 let (given, takes) = ("action", "pose or trajectory");
                 Err(EgoError::Command { model: model.name(), given, takes })
@@ -332,8 +337,11 @@ impl Ego {
         steps: usize,
         ground: &Ground<'_>,
     ) -> Result<Vec<Self>, EgoError> {
+        // The first step is computed like any single step, so its errors are the same. It also
+        // checks the kind of the command.
         let mut egos = vec![self.stepped(command, step_us, ground)?];
         let Command::Path(path) = command else {
+            // An action holds for every step, so each step is one of its own.
             for index in 1..steps {
                 egos.push(egos[index - 1].stepped(command, step_us, ground)?);
             }
@@ -343,6 +351,7 @@ impl Ego {
         if path.end_us() < end_us {
             return Err(EgoError::PathShort { end_us: path.end_us(), step_us: end_us });
         }
+        // The reference is derived once for all steps: it depends only on the path.
         let reference = path.reference();
         for index in 1..steps {
             let plan = Plan { path, reference: &reference, world_from_start: self.world_from_rig };
@@ -382,6 +391,9 @@ impl Ego {
                 self.moved_to(*world_from_start * path.at(since_us + step_us), step_s)
             }
             EgoModel::Kinematic | EgoModel::Dynamic => {
+                // The reference stays in the frame of the plan's start. The car is moved into it,
+                // instead of the path into the car's frame, so that no rounding accumulates over
+                // the steps.
                 let start_from_rig = world_from_start.inverse() * self.world_from_rig;
                 let forward = start_from_rig.rotation * DVec3::X;
                 let car = SingleTrackState {
@@ -390,6 +402,8 @@ impl Ego {
                     ..self.car
                 };
                 let after = self.tracked(reference, car, since_us, step_us);
+                // `driven` expects the way since the present pose and not since the start of the
+                // plan.
                 self.driven(after.relative_to(&car), step_s, ground)
             }
         }
@@ -436,6 +450,8 @@ impl Ego {
         // The rotation about z in the swing-twist decomposition: twice the angle of the (w, z)
         // part.
         let turned_rad = path::wrapped(2.0 * turn.z.atan2(turn.w));
+        // Before the first step the velocity is 0 by definition and not by measurement. Its change
+        // would be a false peak.
         let acceleration_m_s2 =
             if self.moved { (velocity_m_s - self.velocity_m_s) / step_s } else { DVec3::ZERO };
         Self {
@@ -461,6 +477,8 @@ impl Ego {
         } else {
             ground.place(self.world_from_rig * start_from_rig)
         };
+        // The state has the velocity of the centre of gravity, and the rig's origin is the rear
+        // axle: u - l_r ω.
         let rear_m_s = car.lateral_m_s - Vehicle::DEFAULT.rear_to_cg_m * car.yaw_rate_rad_s;
         let velocity_m_s = world_from_rig.rotation * DVec3::new(car.speed_m_s, rear_m_s, 0.0);
         Self {
@@ -469,6 +487,8 @@ impl Ego {
             velocity_m_s,
             acceleration_m_s2: (velocity_m_s - self.velocity_m_s) / step_s,
             yaw_rate_rad_s: car.yaw_rate_rad_s,
+            // The pose in the world has the position from here on. The car's own starts at zero
+            // again, so that its numbers stay small.
             car: SingleTrackState { position_m: DVec2::ZERO, yaw_rad: 0.0, ..car },
             moved: true,
         }
@@ -482,6 +502,7 @@ impl Ego {
             return kinematic::rolled(car, &vehicle, action, step_s, bounds_m_s);
         }
         let steering_rad = vehicle.steering_rad(action.curvature_1_m, car.speed_m_s);
+        // At speed, understeer asks for an angle beyond what the wheels reach.
         let most_rad = limits::EGO_STEERING_RAD;
         let setpoint = Setpoint {
             acceleration_m_s2: action.acceleration_m_s2,
@@ -504,6 +525,8 @@ impl Ego {
             EgoModel::Dynamic => Vehicle::DEFAULT.lag_s,
             EgoModel::Teleport | EgoModel::Kinematic => 0.0,
         };
+        // Ticks of equal length of at most `TRACKER_TICK_US`, so that the last one is not a
+        // remnant.
         let ticks = (step_us as u64).div_ceil(limits::TRACKER_TICK_US);
         let tick_s = step_us as f64 * 1e-6 / ticks as f64;
         (0..ticks).fold(car, |car, tick| {

@@ -60,9 +60,7 @@ pub struct Path {
 /// The reference at a time, in the plane of the rig at the start of the step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct ReferenceState {
-    /// Position, in metres.
     pub(super) position_m: DVec2,
-    /// Heading, in radians.
     pub(super) yaw_rad: f64,
     /// Speed along the heading, in m/s; below 0 backwards.
     pub(super) speed_m_s: f64,
@@ -93,6 +91,7 @@ impl Path {
         let mut before_us = 0;
         for (index, pose) in poses.iter().enumerate() {
             let time_us = pose.time_us;
+            // This form also refuses a negative time, since the first bound is 0.
             if time_us <= before_us || time_us > limits::PATH_US {
                 let limit_us = limits::PATH_US;
                 return Err(EgoError::PathTime { index, time_us, before_us, limit_us });
@@ -115,9 +114,12 @@ impl Path {
     /// `rig(start)_from_rig` at a time within the path, interpolated between its poses.
     pub(super) fn at(&self, time_us: i64) -> Pose {
         let mut before = TimedPose { time_us: 0, start_from_rig: Pose::IDENTITY };
+        // Linear, because a path has at most 64 poses.
         for pose in &self.poses {
             if time_us <= pose.time_us {
                 let t = (time_us - before.time_us) as f64 / (pose.time_us - before.time_us) as f64;
+                // An exact pose at its time: interpolation would normalise the rotation and change
+                // its last bits.
                 return if pose.time_us == time_us {
                     pose.start_from_rig
                 } else {
@@ -126,6 +128,7 @@ impl Path {
             }
             before = *pose;
         }
+        // Beyond the end the last pose holds. Callers check the end of the path first.
         before.start_from_rig
     }
 
@@ -144,15 +147,21 @@ impl Path {
                 (pose.time_us as f64 * 1e-6, position_m, forward.y.atan2(forward.x))
             })
             .collect();
+        // `checked` refuses an empty path, and a single pose has the start before it: there are at
+        // least two places.
         let last = places.len() - 1;
         // Central differences at each pose; one-sided at the ends.
         let moved = |k: usize| {
             let (from, to) = (places[k.saturating_sub(1)], places[(k + 1).min(last)]);
             let (way_m, seconds) = (to.1 - from.1, to.0 - from.0);
+            // The projection on the heading gives the sign: a way against the heading is driving
+            // backwards.
             let speed_m_s = way_m.dot(DVec2::from_angle(places[k].2)) / seconds;
             (speed_m_s, wrapped(to.2 - from.2) / seconds)
         };
         let moves: Vec<(f64, f64)> = (0..places.len()).map(moved).collect();
+        // Speeds are complete at this point, so accelerations are their differences, in the same
+        // way.
         let knot = |k: usize| {
             let (from, to) = (k.saturating_sub(1), (k + 1).min(last));
             let (time_s, position_m, yaw_rad) = places[k];
@@ -177,6 +186,8 @@ impl ReferenceTrajectory {
     /// The reference at a time in seconds: interpolated; before the first pose extrapolated
     /// backwards; after the last pose that of the last.
     pub(super) fn at(&self, time_s: f64) -> ReferenceState {
+        // The first knot that is not before the time. `after` is at least 1 in the next line,
+        // because the knots are not empty.
         let after = self.knots.partition_point(|(knot_s, _)| *knot_s < time_s);
         let Some((to_s, to)) = self.knots.get(after) else { return self.knots[after - 1].1 };
         let Some((from_s, from)) = after.checked_sub(1).map(|before| &self.knots[before]) else {
@@ -186,6 +197,7 @@ impl ReferenceTrajectory {
         let between = |from: f64, to: f64| from + t * (to - from);
         ReferenceState {
             position_m: from.position_m.lerp(to.position_m, t),
+            // The short way around: headings of neighbours may lie on both sides of ±π.
             yaw_rad: from.yaw_rad + t * wrapped(to.yaw_rad - from.yaw_rad),
             speed_m_s: between(from.speed_m_s, to.speed_m_s),
             acceleration_m_s2: between(from.acceleration_m_s2, to.acceleration_m_s2),
@@ -200,6 +212,7 @@ impl ReferenceState {
         let speed_m_s = self.speed_m_s - seconds * self.acceleration_m_s2;
         let yaw_rad = self.yaw_rad - seconds * self.yaw_rate_rad_s;
         let way_m = seconds * 0.5 * (speed_m_s + self.speed_m_s);
+        // The chord of the arc has the mean of both headings, as in `kinematic::arc`.
         let between = DVec2::from_angle(0.5 * (yaw_rad + self.yaw_rad));
         Self { position_m: self.position_m - way_m * between, yaw_rad, speed_m_s, ..*self }
     }

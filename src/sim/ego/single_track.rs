@@ -90,10 +90,14 @@ impl SingleTrackState {
             target_rad: setpoint.steering_rad,
             lag_s: car.lag_s,
         };
+        // Speed does not depend on lateral motion, so it is solved for the whole step first. Each
+        // phase then has a known speed.
         let (phases, acceleration_m_s2) = drive.phases(step_s, bounds_m_s);
         let mut next = *self;
         let mut begun_s = 0.0;
         for phase in &phases {
+            // From the start of the step and not from phase to phase, so that rounding does not add
+            // up.
             let angle_rad = steering.after(begun_s);
             next = next.after_phase(car, &tyres, phase, Steering { angle_rad, ..steering });
             begun_s += phase.duration_s;
@@ -108,6 +112,7 @@ impl SingleTrackState {
         phase: &Phase,
         steering: Steering,
     ) -> Self {
+        // The fastest decay at speed v is 438 / v; the first interval is one of its time constants.
         let fastest_1_s =
             tyres.stiffness_m_s2() / phase.drive.speed_m_s.abs().max(MIN_INTERVAL_SPEED_M_S);
         let longest_s = MAX_INTERVAL_LAGS * car.lag_s;
@@ -125,6 +130,7 @@ impl SingleTrackState {
             begun_s = end_s;
             piece_s = (GROWTH * piece_s).min(longest_s);
         }
+        // The exact bound of the phase, without the rounding of the nodes.
         self.speed_m_s = phase.end_m_s;
         if self.speed_m_s == 0.0 {
             // At v = 0 the equation is G z = 0.
@@ -138,10 +144,12 @@ impl SingleTrackState {
     fn drive(&mut self, car: &Vehicle, points: &[Point; POINTS], length_s: f64) {
         let mut way_m = DVec2::ZERO;
         for (point, weight) in points.iter().zip(INTEGRALS[POINTS - 1]) {
+            // Velocity of the rear axle, because the position is that of the rear axle.
             let rear_m_s = point.sideways.x - car.rear_to_cg_m * point.sideways.y;
             let heading = DVec2::from_angle(self.yaw_rad + point.turned_rad);
             way_m += weight * heading.rotate(DVec2::new(point.speed_m_s, rear_m_s));
         }
+        // The last node is at 1, the end of the interval, so the end state needs no extrapolation.
         let end = points[POINTS - 1];
         self.position_m += length_s * way_m;
         self.yaw_rad += end.turned_rad;
@@ -175,18 +183,23 @@ impl Piece {
         if phase.held {
             let speed_m_s = phase.drive.speed_m_s;
             let held = ConstantSpeed::new(tyres, speed_m_s, steering, sideways);
+            // The closed form gives the state at any time; the nodes are needed only for the
+            // quadrature of the pose.
             return NODES.map(|node| {
                 let (sideways, turned_rad) = held.after(node * length_s);
                 Point { speed_m_s, sideways, turned_rad }
             });
         }
         let mut speeds = NODES.map(|node| phase.drive.speed_after(begun_s + node * length_s));
+        // At the end of the phase the speed is exactly a bound or 0. A rounding error of the other
+        // sign would break the equation, which needs speeds of one sign.
         if begun_s + length_s >= phase.duration_s {
             speeds[POINTS - 1] = phase.end_m_s;
         }
         let angles_rad = NODES.map(|node| steering.after(node * length_s));
         let states = solve(tyres, length_s, &speeds, &angles_rad, sideways);
         std::array::from_fn(|point| {
+            // The change of heading at a node is the integral of the yaw rate up to it.
             let weighed = INTEGRALS[point].iter().zip(&states).map(|(w, z)| w * z.y);
             Point {
                 speed_m_s: speeds[point],

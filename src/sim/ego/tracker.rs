@@ -38,16 +38,22 @@ pub(super) fn track(
 ) -> Action {
     let now = reference.at(time_s);
     let soon = reference.at(time_s + lag_s);
+    // In the axes of the reference: x is how far the reference is ahead, y how far it is to the
+    // left.
     let ahead_m = DVec2::from_angle(-now.yaw_rad).rotate(now.position_m - car.position_m);
     let off_rad = wrapped(now.yaw_rad - car.yaw_rad - drift_rad(car));
+    // Critically damped with gain k: `2 k` of the speed's error and `k²` of the position's.
     let acceleration_m_s2 = soon.acceleration_m_s2
         + 2.0 * LONGITUDINAL_GAIN_1_S * (now.speed_m_s - car.speed_m_s)
         + LONGITUDINAL_GAIN_1_S * LONGITUDINAL_GAIN_1_S * ahead_m.x;
+    // The decay length grows with speed, so that a correction lasts a constant time; at low speed
+    // it would steer too sharply.
     let decay_m = (LATERAL_DECAY_S * car.speed_m_s.abs()).max(LATERAL_DECAY_M);
     // When driving backwards, turning left moves the rear to the right.
     let curvature_1_m = curvature(&soon)
         + ahead_m.y / (decay_m * decay_m)
         + 2.0 * off_rad / decay_m * direction(car.speed_m_s, now.speed_m_s);
+    // The clamp of the result and not of its parts: feedforward and feedback may cancel.
     let most_m_s2 = limits::EGO_ACCELERATION_M_S2;
     let most_1_m = limits::EGO_CURVATURE_1_M;
     Action {
@@ -57,6 +63,7 @@ pub(super) fn track(
 }
 
 fn curvature(wanted: &ReferenceState) -> f64 {
+    // Dividing by a speed near zero would turn jitter of the heading into the sharpest curve.
     if wanted.speed_m_s.abs() < MIN_CURVE_SPEED_M_S {
         0.0
     } else {
@@ -68,6 +75,7 @@ fn curvature(wanted: &ReferenceState) -> f64 {
 /// left.
 fn drift_rad(car: &SingleTrackState) -> f64 {
     let rear_m_s = car.lateral_m_s - Vehicle::DEFAULT.rear_to_cg_m * car.yaw_rate_rad_s;
+    // At low speed the quotient is noise as well, and a car that rolls does not drift.
     if car.speed_m_s.abs() < MIN_CURVE_SPEED_M_S { 0.0 } else { (rear_m_s / car.speed_m_s).atan() }
 }
 

@@ -9,7 +9,6 @@ use glam::{DMat2, DVec2};
 /// stiffness is given per wheel and doubled for the axle.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Vehicle {
-    /// Mass, in kg.
     pub mass_kg: f64,
     /// Moment of inertia about the vertical through the centre of gravity, in kg m².
     pub inertia_kg_m2: f64,
@@ -61,8 +60,10 @@ impl Vehicle {
         let Self { mass_kg, rear_to_cg_m, wheelbase_m, .. } = *self;
         let front = self.front_wheel_n_rad;
         let rear = self.rear_wheel_n_rad;
+        // Positive for an understeering car: the rear axle has the larger moment of stiffness.
         let moment = rear_to_cg_m * rear - (wheelbase_m - rear_to_cg_m) * front;
         let understeer_s2_m = mass_kg * moment / (2.0 * wheelbase_m * front * rear);
+        // v |v| and not v²: backwards the same tyres oversteer.
         curvature_1_m * (wheelbase_m + understeer_s2_m * speed_m_s * speed_m_s.abs())
     }
 
@@ -76,6 +77,8 @@ impl Vehicle {
         let moment = front_m * front - rear_m * rear;
         let turn = front_m * front_m * front + rear_m * rear_m * rear;
         LateralDynamics {
+            // By columns, as glam stores them: the first has the forces of lateral velocity, the
+            // second those of yaw rate.
             grip: DMat2::from_cols_array_2d(&[
                 [-(front + rear) / mass, -moment / inertia],
                 [-moment / mass, -turn / inertia],
@@ -89,6 +92,8 @@ impl LateralDynamics {
     /// The matrix G of `|v| dz/dt = G z + v steer δ`, in m/s².
     pub(super) fn matrix(&self, speed_m_s: f64) -> DMat2 {
         let mut matrix = self.grip;
+        // The term -v |v| of the yaw rate is the centripetal part of the lateral acceleration, in
+        // the frame of the car.
         matrix.y_axis.x -= speed_m_s * speed_m_s.abs();
         matrix
     }
@@ -98,6 +103,8 @@ impl LateralDynamics {
     pub(super) fn stiffness_m_s2(&self) -> f64 {
         // The larger magnitude of the two eigenvalues, which are real and negative.
         let half = 0.5 * (self.grip.x_axis.x + self.grip.y_axis.y);
+        // The discriminant is above 0 for real tyres; the bound catches rounding where both
+        // eigenvalues are one.
         -half + (half * half - self.grip.determinant()).max(0.0).sqrt()
     }
 }
@@ -121,6 +128,7 @@ mod tests {
             let delta_rad = car.steering_rad(0.01, speed_m_s);
             let force = tyres.steer * (speed_m_s * delta_rad);
             let steady = -(tyres.matrix(speed_m_s).inverse() * force);
+            // In steady state the yaw rate is κ v.
             assert!((steady.y - 0.01 * speed_m_s).abs() < 1e-12, "{speed_m_s}: {steady}");
         }
     }

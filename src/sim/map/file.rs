@@ -159,9 +159,11 @@ impl MapFile {
                 check_points(name, line, 2).map_err(within)?;
             }
             if let Some(limit_mps) = lane.limit_mps {
+                // From slower than walking to faster than any car, in m/s.
                 in_range("limit_mps", limit_mps, [0.1, 200.0]).map_err(within)?;
             }
         }
+        // A second pass, because a lane may continue in one that the file lists later.
         for (index, lane) in self.lanes.iter().enumerate() {
             for (at, next) in lane.next.iter().enumerate() {
                 if !indices.contains_key(next.as_str()) {
@@ -184,6 +186,8 @@ impl MapFile {
 
     /// The map as JSON, one lane or area per line.
     pub fn to_json(&self) -> String {
+        // One lane per line keeps differences of two maps readable. `serde_json`'s pretty form
+        // would use a line for every number.
         let lines = |items: Vec<String>| items.join(",\n  ");
         // Serializing plain values into memory cannot fail.
         let json = |item: serde_json::Result<String>| item.unwrap_or_default();
@@ -206,6 +210,7 @@ fn check_points(path: &str, points: &[[f64; 3]], least: usize) -> Result<(), Fil
             format!("{} points; {least} to {} are accepted", points.len(), limits::LINE_POINTS);
         return Err(FileError::new(path, message));
     }
+    // The comparison in `in_range` also refuses NaN and infinity, which the geometry cannot use.
     let most_m = wildcity_scene::geometry::Pose::MAX_COORDINATE_M;
     for (index, point) in points.iter().enumerate() {
         for (axis, value) in point.iter().enumerate() {

@@ -75,6 +75,7 @@ impl Map {
 
     /// The indices of the lanes for vehicles that contain a point, edges included.
     pub fn lanes_at(&self, point_m: DVec2) -> impl Iterator<Item = usize> {
+        // Linear over all lanes: the box of an outline refuses most of them with four comparisons.
         let lanes = self.lanes.iter().zip(&self.file.lanes).enumerate();
         lanes
             .filter(move |(_, (outline, lane))| {
@@ -117,6 +118,7 @@ impl Map {
 impl Outline {
     fn from_points<'a>(points: impl Iterator<Item = &'a [f64; 3]>) -> Self {
         let points_m: Vec<DVec2> = points.map(|[x, y, _]| DVec2::new(*x, *y)).collect();
+        // An outline without points has an inverted box, and contains nothing.
         let none = DVec2::INFINITY;
         let min_m = points_m.iter().fold(none, |min_m, point_m| min_m.min(*point_m));
         let max_m = points_m.iter().fold(-none, |max_m, point_m| max_m.max(*point_m));
@@ -135,6 +137,7 @@ impl Outline {
             return false;
         }
         let mut winding = 0;
+        // Starts with the edge from the last point to the first, which closes the outline.
         let last = self.points_m.last().copied();
         let before = last.into_iter().chain(self.points_m.iter().copied());
         for (from_m, to_m) in before.zip(&self.points_m) {
@@ -142,6 +145,8 @@ impl Outline {
             // origin.
             let [from, to] = [from_m - point_m, *to_m - point_m];
             let cross = from.perp_dot(to);
+            // On the line of an edge, and between its ends: the ways to both ends point in opposite
+            // directions.
             let is_on_edge = cross == 0.0 && from.dot(to) <= 0.0;
             if is_on_edge {
                 return true;
@@ -149,6 +154,8 @@ impl Outline {
             // Edges that cross the ray from the point to +x, upwards and downwards.
             let crosses = (from.y > 0.0) != (to.y > 0.0);
             let is_upwards = to.y > from.y;
+            // The sign of the cross product says on which side of the edge the point is. Left of an
+            // upward edge means that the ray crosses it.
             if crosses && (cross > 0.0) == is_upwards {
                 winding += if is_upwards { 1 } else { -1 };
             }
@@ -179,6 +186,7 @@ mod tests {
     fn points_are_in_their_lanes_edges_included() {
         let map = Map::new(MapFile::new(vec![lane("a", 0.0, &["b"]), lane("b", 3.5, &[])], vec![]));
         let map = map.unwrap();
+        // The lanes are 3.5 m wide and touch at y = 1.75 m. The shared edge is in both.
         let at = |x, y| map.lanes_at(DVec2::new(x, y)).collect::<Vec<_>>();
         assert_eq!(at(10.0, 0.0), [0]);
         assert_eq!(at(10.0, 1.75), [0, 1]);
@@ -193,6 +201,8 @@ mod tests {
     #[test]
     fn a_concave_area_excludes_its_bay() {
         let outline = [[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [2.0, 1.0], [0.0, 4.0]];
+        // At 1e7 m a product of two coordinates has steps of 0.016 m², so that only coordinates
+        // relative to the point can decide these.
         let outline = outline.map(|[x, y]| [x + 1e7, y, 0.0]).to_vec();
         let area = Area { kind: AreaKind::Drivable, outline };
         let map = Map::new(MapFile::new(vec![], vec![area])).unwrap();

@@ -32,8 +32,13 @@ pub fn strips_beside(drives: &[Trajectory], left_m: f64, right_m: f64) -> MapFil
         let count = drive.keyframes.len();
         for (index, keyframe) in drive.keyframes.iter().enumerate() {
             let pose = &keyframe.world_from_rig;
+            // Without a previous point the distance is infinite, so that the first keyframe is
+            // always taken.
             let way_m = last_m.map_or(f64::INFINITY, |last_m| pose.position_m.distance(last_m));
             let is_last = index + 1 == count;
+            // The last keyframe is kept even if it is close, so that the lane reaches the end of
+            // the drive. One that repeats the previous point would make an edge without a
+            // direction.
             if way_m < SPACING_M && !(is_last && way_m > 0.01) {
                 continue;
             }
@@ -45,6 +50,8 @@ pub fn strips_beside(drives: &[Trajectory], left_m: f64, right_m: f64) -> MapFil
         if center.len() < 2 {
             continue;
         }
+        // The box reaches `length / 2 - center` behind the rear axle and `length / 2 + center`
+        // ahead of it.
         let EgoBox { box_, center_x_m } = EgoBox::default();
         let behind_m = 0.5 * box_.length_m - center_x_m + BEYOND_M;
         let ahead_m = 0.5 * box_.length_m + center_x_m + BEYOND_M;
@@ -56,6 +63,8 @@ pub fn strips_beside(drives: &[Trajectory], left_m: f64, right_m: f64) -> MapFil
         };
         let [rear_left, rear_right] = end(first, -behind_m);
         let [front_left, front_right] = end(last, ahead_m);
+        // Around the strip: left side forwards, across the front, right side backwards, across the
+        // rear.
         let outline = iter::once(rear_left)
             .chain(left.iter().copied())
             .chain([front_left, front_right])

@@ -58,18 +58,23 @@ impl LaneSurface {
         let mut nearest_m = within_m;
         let mut plane = None;
         for line in &self.lines {
+            // The distance to the box is a lower bound for that to the line, so most lanes are
+            // skipped without a look at their points.
             if line.box_distance_m(point_m) >= nearest_m {
                 continue;
             }
             for pair in line.points.windows(2) {
                 let [from, to] = [pair[0], pair[1]];
                 let way_m = to.position_m - from.position_m;
+                // The parameter of the foot of the perpendicular, clamped to the segment. The
+                // minimum of 1e-12 m² makes a segment without length a point.
                 let t = (point_m - from.position_m).dot(way_m) / way_m.length_squared().max(1e-12);
                 let t = t.clamp(0.0, 1.0);
                 let there_m = from.position_m + t * way_m;
                 let distance_m = there_m.distance(point_m);
                 if distance_m < nearest_m {
                     nearest_m = distance_m;
+                    // Interpolated, so that a car does not tilt at once where two segments meet.
                     let up = from.up.lerp(to.up, t);
                     // Normals of a flat road stay exact.
                     let up = if from.up == to.up { from.up } else { up.normalize() };
@@ -101,6 +106,7 @@ impl SurfaceLine {
 fn surface_points(lane: &Lane) -> Vec<SurfacePoint> {
     let center: Vec<DVec3> = lane.center.iter().map(|point| DVec3::from_array(*point)).collect();
     let [left, right] = [Edge::new(&lane.left), Edge::new(&lane.right)];
+    // By share and not by index: edges may have other numbers of points than the middle.
     let shares = length_shares(&center);
     let last = center.len() - 1;
     let points = center.iter().zip(shares).enumerate();
@@ -123,6 +129,7 @@ fn normal(ahead: DVec3, across: DVec3) -> DVec3 {
     let level = DVec3::new(-ahead.y, ahead.x, 0.0);
     let across = if is_direction(across) { across } else { level };
     let up = ahead.cross(across);
+    // Edges that are swapped or vertical give a normal that points down or sideways.
     let up = if is_upright(up) { up } else { ahead.cross(level) };
     // Exactly vertical on a flat road, so that poses on it stay as they are.
     if up.x == 0.0 && up.y == 0.0 { DVec3::Z } else { up.normalize() }
@@ -148,10 +155,13 @@ impl Edge {
 
     /// The point at a share of the length.
     fn at(&self, share: f64) -> DVec3 {
+        // The format demands two points of an edge, so there is a segment.
         let last = self.points_m.len() - 2;
         let after = self.shares.partition_point(|&before| before <= share);
+        // The segment that begins at or before the share. At a share of 1 it is the last one.
         let segment = after.saturating_sub(1).min(last);
         let [from, to] = [self.shares[segment], self.shares[segment + 1]];
+        // A segment without length has equal shares, and its first point is taken.
         let t = ((share - from) / (to - from).max(f64::MIN_POSITIVE)).clamp(0.0, 1.0);
         self.points_m[segment].lerp(self.points_m[segment + 1], t)
     }
@@ -199,7 +209,10 @@ mod tests {
     #[test]
     fn a_plane_road_has_its_plane_everywhere() {
         let surface = LaneSurface::from_driving_lanes(&[lane(0.08, 0.025)]);
+        // The plane is z = 0.08 x + 0.025 y, whose gradient is (0.08, 0.025).
         let wanted = DVec3::new(-0.08, -0.025, 1.0).normalize();
+        // Beside the lane on both sides, and beyond its end, where the nearest point is the last
+        // one.
         for point_m in [DVec3::new(45.0, 6.0, 3.0), DVec3::new(0.0, -9.0, 0.0), DVec3::X * 104.0] {
             let plane = surface.plane_near(point_m, 25.0).unwrap();
             assert!((plane.up - wanted).length() < 1e-12, "{}", plane.up);
@@ -231,8 +244,11 @@ mod tests {
             let plane = surface.plane_near(point_m, 25.0).unwrap();
             -plane.up.x / plane.up.z
         };
+        // The slope is 1/10 up to x = 50 m and -1/10 from there. At the crest the central
+        // difference is level.
         assert!((pitch(0.0) - 0.1).abs() < 1e-12 && (pitch(100.0) + 0.1).abs() < 1e-12);
         assert_eq!(pitch(50.0), 0.0);
+        // 0.2 m around the crest, on segments of 50 m: the pitch changes by 0.1 · 0.2 / 50 = 4e-4.
         assert!((pitch(49.9) - pitch(50.1)).abs() < 1e-3);
     }
 

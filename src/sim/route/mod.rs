@@ -88,6 +88,8 @@ impl NavigationRoute {
         let [back_m, ahead_m] = limits::ROUTE_SEARCH_M;
         let from_m = before.station_m - back_m;
         let to_m = before.station_m + ahead_m;
+        // A bounded part first: where a route crosses itself, the nearest point of all may be on
+        // another pass.
         let mut beside = self.course.nearest_between(point_m, from_m, to_m);
         if beside.distance_m > limits::ROUTE_LOST_M {
             beside = self.course.nearest(point_m);
@@ -95,6 +97,7 @@ impl NavigationRoute {
         RouteProgress {
             station_m: beside.station_m,
             off_m: beside.distance_m,
+            // Never falls, so that driving back or getting lost takes no progress away.
             farthest_m: before.farthest_m.max(beside.station_m),
             begin_m: before.begin_m,
         }
@@ -117,13 +120,18 @@ impl NavigationRoute {
         let points_m = points_m.collect();
         let (command, text) = match self.next_command(progress.station_m) {
             Some((command, text)) => (command, text),
+            // A route without commands derives them from its own shape, as NeuroNCAP does.
             None if self.commands.is_empty() => {
                 let ahead_m = COMMAND_AHEAD_S * speed_mps.max(COMMAND_SPEED_MPS);
                 let point_m = world_from_rig.transform_point(ahead_m * DVec3::X);
+                // The point ahead is on a straight line, and the route to it may be a curve: twice
+                // the distance covers an arc of up to 3.8 rad, and the slack an ego that is beside
+                // the route.
                 let to_m = progress.station_m + 2.0 * ahead_m + limits::ROUTE_SEARCH_M[0];
                 let beside = self.course.nearest_between(point_m, progress.station_m, to_m);
                 (turn(in_rig_m(beside.station_m).y), None)
             }
+            // Commands exist, but none is near enough yet.
             None => (NavigationCommand::Straight, None),
         };
         RouteView { points_m, command, text }
@@ -131,8 +139,10 @@ impl NavigationRoute {
 
     /// The share of the route that was driven since the start, 0 to 1.
     pub fn share(&self, progress: &RouteProgress) -> f64 {
+        // An episode that begins in the middle of a route is measured against the rest of it.
         let whole_m = self.course.length_m() - progress.begin_m;
         let driven_m = progress.farthest_m - progress.begin_m;
+        // Without a rest there is nothing left to drive. The division would give NaN.
         if whole_m <= 0.0 { 1.0 } else { (driven_m / whole_m).clamp(0.0, 1.0) }
     }
 
@@ -193,12 +203,16 @@ mod tests {
         let view = route.view(&progress, &pose, 8.0);
         assert_eq!(view.points_m.len(), 20);
         assert!((view.points_m[0] - DVec3::new(0.0, -1.0, 0.0)).length() < 1e-9);
+        // The route has 60 m left to the corner. Of 80 m, 20 m go north, and the ego is 1 m north
+        // of the line.
         assert!((view.points_m[19].y - 19.0).abs() < 1e-9, "80 m on: {}", view.points_m[19]);
         let near_end = at(100.0, 90.0, 1.57);
         let progress = route.after(&progress, &near_end);
         assert_eq!(progress.station_m, 190.0);
+        // 190 m, 194.2 m and 198.4 m; the route ends at 200 m.
         assert_eq!(route.view(&progress, &near_end, 8.0).points_m.len(), 3);
         assert!(!route.is_done(&progress, &near_end));
+        // 99.5 m of 100 m northwards, so 159.5 m of 160 m from the start: more than 99 %.
         let end = at(100.0, 99.5, 1.57);
         assert!(route.is_done(&route.after(&progress, &end), &end));
     }
@@ -226,6 +240,7 @@ mod tests {
             let view = route.view(&route.begin(&pose), &pose, 5.0);
             (view.command, view.text)
         };
+        // At 49 m the corner is 51 m away: more than the 50 m at which the command is given.
         assert_eq!(told(49.0), (NavigationCommand::Straight, None));
         let text = Some("Turn left in 30 m".to_owned());
         assert_eq!(told(70.0), (NavigationCommand::Left, text));

@@ -55,6 +55,8 @@ pub(super) fn actors_from(
     for (section, track) in tracks {
         let box_ = box_from("tracks", section.size)?;
         let asset = named_asset("tracks", section.asset.as_deref(), around)?;
+        // A track that names an asset gets it, or none if it names `none`. Only one without a name
+        // gets a default.
         let asset = match &section.asset {
             Some(_) => asset,
             None => default_asset("tracks", section.class, &box_, around)?,
@@ -92,6 +94,8 @@ pub(super) fn actors_from(
     let none = std::iter::repeat_n(Vec::new(), recorded_count);
     let trigger_names: Vec<Vec<String>> = none.chain(trigger_names).collect();
 
+    // Building an actor needs the names of all, and the file is changed while its actors are built:
+    // so the names are copies.
     let references = References { indices: &indices, triggers: &trigger_names };
     for (index, section) in file.actors.iter_mut().enumerate() {
         let own = recorded_count + index;
@@ -112,6 +116,7 @@ fn recorded<'a>(
     let Some(tracks) = around.tracks else {
         return Err(FileError::new("tracks.file", format!("{:?} was not read", section.file)));
     };
+    // A misspelt id would silently keep a track that should be left out.
     for (index, id) in section.without.iter().enumerate() {
         if !tracks.tracks.iter().any(|track| track.id == *id) {
             let known = listed(tracks.tracks.iter().map(|track| track.id.as_str()));
@@ -119,6 +124,7 @@ fn recorded<'a>(
             return Err(FileError::new(format!("tracks.without[{index}]"), message));
         }
     }
+    // Written back, so that a record repeats the episode even if the ego starts elsewhere.
     let start_us = section.start_us.unwrap_or(start_time_us(around, start));
     section.start_us = Some(start_us);
     let kept = tracks.tracks.iter().filter(|track| !section.without.contains(&track.id));
@@ -172,6 +178,7 @@ fn actor_from(
 ) -> Result<Actor, FileError> {
     let asset = named_asset("asset", section.asset.as_deref(), around)?;
     let class = section.class.or(asset.as_ref().map(|asset| asset.class));
+    // Drawn for each actor by its name, so that another actor in the file changes no draw.
     let drawn = drawn(section.jitter.as_ref(), seed, &section.name)?;
     if let Some(jitter) = &mut section.jitter {
         jitter.drawn = Some(drawn);
@@ -185,6 +192,7 @@ fn actor_from(
         section.attack.is_some(),
         section.stand.is_some(),
     ];
+    // All are counted, so that two behaviours are a mistake and not silently the first of them.
     if given.iter().filter(|given| **given).count() != 1 {
         let message = "write exactly one of log, path, idm, collide, attack and stand";
         return Err(FileError::new("name", format!("{:?}: {message}", section.name)));
@@ -218,20 +226,26 @@ fn actor_from(
         let pose = displaced(&pose_from("stand", pose)?, &drawn, along_rad);
         Behaviour::Track(standing(pose))
     } else {
+        // Not reached, because exactly one is given. An error here is safer than a panic in a
+        // server.
         return Err(FileError::new("name", "has no behaviour"));
     };
+    // A follower takes its heading from its course, so that a drawn heading would have no effect.
     let is_follow = matches!(behaviour, Behaviour::Follow(_));
     if is_follow && (drawn.yaw_rad != 0.0 || along_rad.is_some()) {
         let message =
             "yaw_rad and along_rad are for collide, attack and stand: a course has its own heading";
         return Err(FileError::new("jitter", message));
     }
+    // The actor's own class wins, then that of its asset, then that of its track.
     let class = class.or(track_class).unwrap_or(ActorClass::Vehicle);
+    // The box prefers the track to the asset: a recorded size is that of the actor itself.
     let box_ = match (section.size.or(track_size), &asset) {
         (Some(size), _) => box_from("size", size)?,
         (None, Some(asset)) => asset.box_,
         (None, None) => usual_box(class),
     };
+    // The default asset depends on the box, so it is looked up last.
     let asset = match &section.asset {
         Some(_) => asset,
         None => default_asset("asset", class, &box_, around)?,
@@ -249,6 +263,7 @@ fn actor_from(
         script: Vec::new(),
         present: section.present.unwrap_or(true),
     };
+    // Last, because actions may add courses to the behaviour.
     add_script(section, own, &mut actor, courses, references)?;
     Ok(actor)
 }
@@ -313,6 +328,7 @@ fn follower_from(
     let speed_mps = in_range(&format!("{field}.speed"), path.speed, [0.0, most_mps])?;
     Ok(CourseFollower {
         courses: vec![course],
+        // Jitter may draw a place beyond the ends of the course.
         station_m: (station_m + drawn.longitudinal_m).clamp(0.0, length_m),
         // Jitter is to the right, offsets are to the left.
         offset_m: offset_m - drawn.lateral_m,
@@ -365,6 +381,7 @@ fn attack_from(
         return Err(FileError::new("ticks", format!("{ticks}; 1 to 1000 are accepted")));
     }
     let best = section.best_k.unwrap_or(1);
+    // There are 150 plans, so a larger number would have no effect.
     if !(1..=150).contains(&best) {
         return Err(FileError::new("best_k", format!("{best}; 1 to 150 are accepted")));
     }

@@ -84,6 +84,7 @@ impl Surroundings<'_> {
 
 impl std::fmt::Debug for Surroundings<'_> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        // The counts only: a twin has thousands of keyframes, and `dyn Assets` cannot be printed.
         f.debug_struct("Surroundings").field("drives", &self.drives.len()).finish_non_exhaustive()
     }
 }

@@ -42,8 +42,11 @@ fn through_positions(
     for (index, position) in positions.iter().enumerate() {
         let path = format!("positions[{index}]");
         let end_s = limits::END_S;
+        // Before the start of the episode is allowed: the actor may be on its way at time 0.
         let time_s = in_range(&format!("{path}.time_s"), position.time_s, [-end_s, end_s])?;
         let time_us = (time_s * 1e6).round() as i64;
+        // Compared after rounding, because two times within the same microsecond have no speed
+        // between them.
         if times_us.last().is_some_and(|before_us| time_us <= *before_us) {
             let message = format!("{time_s:?} s; later than the position before it is accepted");
             return Err(FileError::new(format!("{path}.time_s"), message));
@@ -56,6 +59,7 @@ fn through_positions(
     }
     let yaw_rad = section.yaw_rad.unwrap_or(0.0);
     let yaw_rad = in_range("yaw_rad", yaw_rad, [-100.0, 100.0])?;
+    // The jitter needs one direction for all positions, so that the shape of the way stays.
     let first_rad = facing_rad(&points_m, 0).unwrap_or(yaw_rad);
     let shift_m = displacement_m(drawn, along_rad.unwrap_or(first_rad));
     let ground = around.ground();
@@ -75,11 +79,13 @@ fn through_positions(
 /// one.
 fn facing_rad(points_m: &[DVec3], index: usize) -> Option<f64> {
     let last = points_m.len() - 1;
+    // Central differences would turn the actor before it reaches a corner.
     let way_m = match index == last {
         false => points_m[index + 1] - points_m[index],
         true if last == 0 => return None,
         true => points_m[last] - points_m[last - 1],
     };
+    // Below 1 mm the direction is rounding and not motion.
     (way_m.truncate().length() > 1e-3).then(|| way_m.y.atan2(way_m.x))
 }
 
@@ -104,6 +110,7 @@ fn meeting(
     let meeting = drive.at_station(station_m);
     let turned = meeting.rotation * DQuat::from_rotation_z(angle_rad);
     let meeting = Pose { rotation: turned.normalize(), ..meeting };
+    // Without a direction, along is the heading of the actor itself, after it was turned.
     let meeting = displaced(&meeting, drawn, Some(along_rad.unwrap_or(heading_rad(&meeting))));
     let ahead = meeting.rotation * DVec3::X;
     let at = |time_us: i64| {
@@ -118,6 +125,8 @@ fn meeting(
 
 fn track_from(keyframes: Vec<TrackKeyframe>) -> Result<Track, FileError> {
     Track::new(keyframes)
+        // A collision course stands before its first and after its last keyframe; a plain track
+        // would be absent.
         .map(Track::held)
         .map_err(|error| FileError::new("positions", error.to_string()))
 }

@@ -35,6 +35,7 @@ pub(super) fn condition(
     own: Option<usize>,
     references: &References<'_>,
 ) -> Result<Condition, FileError> {
+    // Checked beforehand, so that `part` need not know about conditions without an actor.
     if own.is_none() {
         check_without_actor(section)?;
     }
@@ -54,6 +55,8 @@ fn part(
         let message = format!("at most {most} conditions, {deepest} deep, are accepted");
         return Err(FileError::new("all", message));
     }
+    // `count` is shared by all levels, so that the limit is on the whole tree. The depth is of this
+    // branch only.
     let mut parts = |name: &str, parts: &[ConditionSection]| {
         let parts = parts.iter().enumerate().map(|(index, inner)| {
             part(inner, own, references, (depth + 1, &mut *count))
@@ -95,6 +98,7 @@ fn part(
                 Some(PhaseSection::Done) => Phase::Done,
                 Some(PhaseSection::Ended) => Phase::Ended,
             },
+            // The actor and the trigger; phase and delay are written above.
             ..trigger_named(name, own, references)?
         }),
     };
@@ -126,6 +130,7 @@ fn part(
 
 fn measure(section: &MeasureSection, references: &References<'_>) -> Result<Measure, FileError> {
     let body = |field: &str, name: &Option<String>, ahead_m: Option<f64>| {
+        // Both fields exist for the measured body and for the other one, with different names.
         let ahead = if field == "of" { "ahead_m" } else { "to_ahead_m" };
         let actor = match name {
             None => None,
@@ -175,6 +180,7 @@ fn check_measure(section: &MeasureSection) -> Result<(), FileError> {
         matches!(quantity, Distance | Longitudinal | Lateral | Headway | TimeToCollision);
     let is_along = matches!(quantity, Longitudinal | Lateral | Headway | TimeToCollision);
     let is_by_speed = matches!(quantity, Headway | TimeToCollision);
+    // A field without effect would be read as a rule that holds, so it is refused.
     let ignored = [
         ("xyz", section.xyz.is_some() && quantity != Point),
         ("to", section.to.is_some() && !is_relative),
@@ -199,10 +205,12 @@ fn trigger_named(
         let message = format!("there is no trigger {text:?}; write TRIGGER or ACTOR/TRIGGER");
         FileError::new("after", message)
     };
+    // A name without an actor is one of the same actor. The condition of the end has none.
     let (actor, name) = match text.split_once('/') {
         None => (own.ok_or_else(missing)?, text),
         Some((actor, name)) => (*references.indices.get(actor).ok_or_else(missing)?, name),
     };
+    // Both lists have an entry for each actor, so the index is valid.
     let triggers = &references.triggers[actor];
     let trigger = triggers.iter().position(|other| !name.is_empty() && other == name);
     Ok(After { actor, trigger: trigger.ok_or_else(missing)?, phase: Phase::Fired, delay_us: 0 })

@@ -34,6 +34,7 @@ impl<'a> Courses<'a> {
         let none = || "leads nowhere: it needs two places at least 1 cm apart";
         let course = match (along, points, lanes) {
             (Some(name), None, None) => {
+                // The two directions of a drive are two courses.
                 let key = (name.to_owned(), reverse);
                 if let Some(course) = self.drives.get(&key) {
                     return Ok(course.clone());
@@ -57,6 +58,8 @@ impl<'a> Courses<'a> {
                 let surface = map.lane_surface(ids).map_err(|(index, message)| {
                     FileError::new(format!("lanes[{index}]"), message)
                 })?;
+                // The middle lines one after the other. Where one lane ends at the start of the
+                // next, `Course` drops the repeated point.
                 let points = surface.lines().flatten();
                 let points_m: Vec<DVec3> = points.map(|point| point.position_m).collect();
                 // Not of the drives nearby, which may be of another level.
@@ -69,6 +72,7 @@ impl<'a> Courses<'a> {
                 return Err(FileError::new(field, message));
             }
         };
+        // A cached drive has returned above.
         Ok(Arc::new(if reverse { course.reversed() } else { course }))
     }
 }

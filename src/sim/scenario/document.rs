@@ -37,7 +37,9 @@ impl Document {
     /// # Errors
     /// As [`Self::parse`].
     pub fn from_json(mut value: Value) -> Result<Self, FileError> {
+        // The format first: another format's file would fail with a misleading message below.
         check_format(value.get("format").and_then(Value::as_str), ScenarioFile::FORMAT)?;
+        // Before the sweep is taken out, so that it may have notes as well.
         remove_notes(&mut value);
         let sweep = match value.as_object_mut().and_then(|fields| fields.remove("sweep")) {
             None => SweepSection::default(),
@@ -50,9 +52,13 @@ impl Document {
 
     /// Every combination of the sweep: seeds vary fastest, then the values of the last name.
     pub fn cases(&self) -> Vec<Case> {
+        // Starts with one combination of nothing, so that a sweep without values has one case.
         let mut combinations = vec![BTreeMap::new()];
+        // After each name, `combinations` has every choice for the names so far. The check has
+        // bounded the product.
         for (name, values) in &self.sweep.values {
             let mut longer = Vec::with_capacity(combinations.len() * values.len());
+            // The outer loop is over what exists, so that the last name varies fastest.
             for combination in &combinations {
                 for value in values {
                     let mut with = combination.clone();
@@ -86,6 +92,8 @@ impl Document {
     }
 
     fn check_sweep(&self) -> Result<(), FileError> {
+        // First the names in use, then each name of the sweep against them, at last each name in
+        // use against the sweep.
         let mut used = BTreeSet::new();
         collect_names(&self.value, &mut used);
         let mut count: u64 = 1;
@@ -98,6 +106,8 @@ impl Document {
                 let message = format!("is not used: write \"${name}\" in place of a value");
                 return Err(FileError::new(path, message));
             }
+            // Saturating, because the product of a few long lists exceeds 64 bits; it is compared
+            // with a small limit.
             count = count.saturating_mul(values.len() as u64);
         }
         if let Some([first, last]) = self.sweep.seeds {
@@ -105,6 +115,8 @@ impl Document {
                 let message = format!("[{first}, {last}]; write the first and the last seed");
                 return Err(FileError::new("sweep.seeds", message));
             }
+            // The subtraction is safe, because first <= last. All seeds are 2^64, hence the
+            // saturating addition.
             count = count.saturating_mul((last - first).saturating_add(1));
         }
         if count > limits::SWEEP_CASES {
@@ -158,6 +170,7 @@ fn sweep_name(text: &str) -> Option<&str> {
 
 fn collect_names(value: &Value, names: &mut BTreeSet<String>) {
     match value {
+        // Only a whole string is a name: `$` within a text stays as it is.
         Value::String(text) => names.extend(sweep_name(text).map(str::to_owned)),
         Value::Array(items) => items.iter().for_each(|item| collect_names(item, names)),
         Value::Object(fields) => fields.values().for_each(|item| collect_names(item, names)),
@@ -179,6 +192,7 @@ fn replace_names(
                         format!("\"${name}\" has no value: give one, or a sweep over {name:?}");
                     return Err(FileError::new(path.trim_start_matches('.'), message));
                 };
+                // A chosen value is not searched again: it cannot refer to another name.
                 *value = chosen.clone();
             }
         }
@@ -186,6 +200,7 @@ fn replace_names(
             for (index, item) in items.iter_mut().enumerate() {
                 path.push_str(&format!("[{index}]"));
                 replace_names(item, values, path)?;
+                // Back to the path of this value, for the next item and for the caller.
                 path.truncate(length);
             }
         }
@@ -220,6 +235,7 @@ mod tests {
         let document = Document::from_json(scenario(sweep, json!("$v"))).unwrap();
         let cases = document.cases();
         assert_eq!(cases.len(), 6);
+        // Seeds vary fastest, so the second case has the first value and the second seed.
         assert_eq!((cases[1].seed, &cases[1].values["v"]), (4, &json!(6)));
         let file = document.with(&cases[5].values).unwrap();
         assert_eq!(file.actors[0].idm.as_ref().unwrap().speed, 10.0);
@@ -240,6 +256,7 @@ mod tests {
         assert_eq!(path(scenario(json!({}), json!("$v"))), "sweep");
         assert_eq!(path(scenario(json!({"v": 3}), json!("$v"))), "sweep.v");
         assert_eq!(path(scenario(json!({"seeds": [2, 1]}), json!(3))), "sweep.seeds");
+        // 2^64 seeds: the count must saturate and not wrap to 0.
         assert_eq!(path(scenario(json!({"seeds": [0, u64::MAX]}), json!(3))), "sweep");
         assert_eq!(path(scenario(json!({"v": ["fast"]}), json!("$v"))), "actors[0].idm.speed");
         assert_eq!(path(scenario(Value::Null, json!(true))), "sweep");

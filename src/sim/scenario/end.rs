@@ -83,10 +83,13 @@ impl EndRules {
     /// route, stuck, route done, the scenario's condition, time.
     pub fn ended(&self, input: &EndInput, stuck: &mut Stuck) -> Option<EndReason> {
         let is_slow = input.velocity_mps.length() < limits::STUCK_M_S;
+        // The first slow step starts the time; one that is not slow clears it.
         stuck.since_us = is_slow.then(|| stuck.since_us.unwrap_or(input.time_us));
+        // -1 for an ego that moves, so that even a limit of 0 µs does not end it.
         let slow_us = stuck.since_us.map_or(-1, |since_us| input.time_us - since_us);
         let off_route =
             self.off_route_m.zip(input.off_route_m).is_some_and(|(most, off)| off > most);
+        // In order of severity: an ego that arrives with a contact has not passed.
         let holds = [
             (EndReason::Contact, self.contact.is_some() && input.has_contact),
             (EndReason::OffRoute, off_route),
@@ -139,6 +142,7 @@ mod tests {
     fn stuck_counts_from_the_last_motion() {
         let rules = EndRules { stuck_us: Some(200), ..EndRules::default() };
         let stuck = &mut Stuck::default();
+        // 0.1 m/s is not slow, so the time starts again at 300 µs and is over at 500 µs.
         let ended = [(100, 0.0), (200, 0.1), (300, 0.09), (400, 0.0), (500, 0.0)]
             .map(|(time_us, speed_mps)| rules.ended(&after(time_us, speed_mps), stuck));
         assert_eq!(ended, [None, None, None, None, Some(EndReason::Stuck)]);

@@ -18,6 +18,7 @@ impl FileError {
 
     /// This mistake within an outer object.
     pub(crate) fn within(self, outer: &str) -> Self {
+        // A path within a list begins with its index, without a dot.
         let separator = if self.path.starts_with('[') || self.path.is_empty() { "" } else { "." };
         Self { path: format!("{outer}{separator}{}", self.path), message: self.message }
     }
@@ -32,6 +33,7 @@ pub(crate) fn typed<T: serde::de::DeserializeOwned>(
         let path = error.path().to_string();
         let message = error.into_inner().to_string();
         match path.as_str() {
+            // The root of the value itself. `serde_path_to_error` writes it as a dot.
             "." => FileError::new(root, message),
             _ => FileError::new(path, message),
         }
@@ -95,6 +97,7 @@ pub(crate) fn hashed(path: &str, hash: &str) -> Result<(), FileError> {
 
 /// The known names for a message, or `none`.
 pub(crate) fn listed<'a>(names: impl Iterator<Item = &'a str>) -> String {
+    // Twenty names are enough to see a misspelling, and keep the message short.
     let names: Vec<&str> = names.take(20).collect();
     if names.is_empty() { "none".to_owned() } else { names.join(", ") }
 }

@@ -25,6 +25,8 @@ pub(super) fn drawn(
     ] {
         in_range(&format!("jitter.{field}"), value, [0.0, most])?;
     }
+    // A record must repeat the episode even if the generator changes, so a given draw wins over the
+    // seed.
     if let Some(drawn) = section.drawn {
         for (field, value, most) in [
             ("longitudinal_m", drawn.longitudinal_m, section.longitudinal_m),
@@ -35,6 +37,8 @@ pub(super) fn drawn(
         }
         return Ok(drawn);
     }
+    // A stream for each actor, so that the draws of one do not depend on the others or on their
+    // order.
     let mut random = Random::new(seed, &format!("jitter/{name}"), 0);
     let mut within = |most: f64| random.range(-most, most);
     Ok(JitterDraw {
@@ -53,11 +57,14 @@ pub(super) fn displacement_m(drawn: &JitterDraw, along_rad: f64) -> DVec3 {
 
 /// A pose after a displacement.
 pub(super) fn displaced(pose: &Pose, drawn: &JitterDraw, along_rad: Option<f64>) -> Pose {
+    // No change at all, because the product of rotations would be normalised and change in its last
+    // bits.
     if *drawn == JitterDraw::default() {
         return *pose;
     }
     let heading_rad = heading_rad(pose);
     let position_m = pose.position_m + displacement_m(drawn, along_rad.unwrap_or(heading_rad));
+    // About the world's vertical, to the left of the rotation: a tilted pose keeps its tilt.
     let rotation = DQuat::from_rotation_z(drawn.yaw_rad) * pose.rotation;
     Pose { position_m, rotation: rotation.normalize() }
 }
@@ -83,8 +90,10 @@ mod tests {
         let first = draw(7, "target");
         assert!((first.longitudinal_m - (-5.0 + 10.0 * 0.9325253457952264)).abs() < 1e-12);
         assert_eq!(first.yaw_rad, 0.0);
+        // The seed 99 would draw other values, so that equality shows that nothing was drawn.
         let again = JitterSection { drawn: Some(first), ..section };
         assert_eq!(drawn(Some(&again), 99, "target").unwrap(), first);
+        // The draw of the lateral displacement exceeds the smaller bound.
         let outside = JitterSection { lateral_m: 0.1, ..again };
         let error = drawn(Some(&outside), 99, "target").unwrap_err();
         assert_eq!(error.path, "jitter.drawn.lateral_m");

@@ -21,6 +21,8 @@ pub(super) fn keep_distance(
         _ => return Err(FileError::new("gap_m", "write exactly one of gap_m and headway_s")),
     };
     let most_mps2 = limits::ACTOR_ACCELERATION_M_S2;
+    // The acceleration decides between a motion with limits and a jump, so half of the pair is a
+    // mistake.
     let bounds = match (section.acceleration, section.braking) {
         (Some(acceleration), Some(braking)) => Some(Bounds {
             acceleration_mps2: in_range("acceleration", acceleration, [0.01, most_mps2])?,
@@ -30,6 +32,7 @@ pub(super) fn keep_distance(
                 None => limits::ACTOR_SPEED_M_S,
             },
         }),
+        // A largest speed without the other limits would not apply to a jump.
         (None, None) if section.fastest.is_none() => None,
         _ => {
             let message = "write both acceleration and braking, or neither of them and no fastest";
@@ -63,6 +66,8 @@ pub(super) fn arrive_together(
         (Some(speed), None, None) => {
             Some(FinalSpeed::Absolute(in_range("speed", speed, [0.0, most_mps])?))
         }
+        // The speed relative to the other's at the time of arrival: each part has a neutral
+        // default.
         (None, factor, delta) => Some(FinalSpeed::Relative {
             factor: in_range("factor", factor.unwrap_or(1.0), [0.0, 100.0])?,
             delta_mps: in_range("delta", delta.unwrap_or(0.0), [-most_mps, most_mps])?,
@@ -70,6 +75,7 @@ pub(super) fn arrive_together(
         _ => return Err(FileError::new("speed", "write speed, or factor and delta")),
     };
     let steady_m = in_range("steady_m", section.steady_m.unwrap_or(0.0), [0.0, 1e4])?;
+    // Without a final speed there is none to hold over the last metres.
     if steady_m > 0.0 && speed.is_none() {
         return Err(FileError::new("steady_m", "needs the speed of the arrival: write speed"));
     }

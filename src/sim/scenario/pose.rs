@@ -25,6 +25,7 @@ pub struct PoseSection {
 /// A pose of a file, checked.
 pub(super) fn pose_from(path: &str, section: &PoseSection) -> Result<Pose, FileError> {
     let refused = |field: &str, message: String| FileError::new(format!("{path}.{field}"), message);
+    // A quaternion needs no range check here: `Pose::checked` refuses one that is not a rotation.
     let q_wxyz = match (section.q, section.yaw_rad) {
         (Some(_), Some(_)) => {
             return Err(refused("q", "is there beside yaw_rad; write one of them".to_owned()));
@@ -32,6 +33,8 @@ pub(super) fn pose_from(path: &str, section: &PoseSection) -> Result<Pose, FileE
         (Some(q), None) => q,
         (None, yaw_rad) => {
             let yaw_rad = yaw_rad.unwrap_or(0.0);
+            // Sine and cosine of infinity are NaN. The later check would name `q`, which the file
+            // does not have.
             if !yaw_rad.is_finite() {
                 return Err(refused("yaw_rad", format!("{yaw_rad:?}; write a finite number")));
             }

@@ -57,6 +57,7 @@ impl Scenario {
         seed: u64,
         around: &Surroundings<'_>,
     ) -> Result<Self, FileError> {
+        // A resolved file has its own seed, so that it replays whatever the caller passes.
         let seed = *file.seed.get_or_insert(seed);
         check_names(&file)?;
         let start = ego_start(&file.ego, seed, around.drives).map_err(|e| e.within("ego"))?;
@@ -78,6 +79,7 @@ impl Scenario {
                 EgoBox { box_, center_x_m }
             }
         };
+        // One for route and actors, so that all followers of a drive share its course.
         let mut courses = Courses::new(around);
         let route = match &file.route {
             Some(section) => {
@@ -85,9 +87,11 @@ impl Scenario {
             }
             None => default_route(start.as_ref(), &mut courses),
         };
+        // This call writes to the file what it draws and chooses.
         let Actors { actors, trigger_names, indices } =
             actors_from(&mut file, seed, around, start.as_ref(), &mut courses)?;
         let references = References { indices: &indices, triggers: &trigger_names };
+        // The end may name every trigger, so its condition comes after the actors.
         let when = file.end.when.as_ref().map(|when| condition(when, None, &references));
         let when = when.transpose().map_err(|error| error.within("end.when"))?;
         let end = end_rules(&file.end, route.is_some()).map_err(|error| error.within("end"))?;
@@ -134,6 +138,7 @@ fn ego_start(
     }
     let needs_drive = "needs a start along a trajectory: write start.trajectory";
     let Some(start) = &ego.start else {
+        // The request decides on the start then.
         return match frames {
             0 => Ok(None),
             _ => Err(FileError::new("jitter_frames", needs_drive)),
@@ -170,9 +175,11 @@ fn shifted(drive: &Trajectory, station_m: f64, seed: u64, frames: u32) -> Result
     if frames == 0 {
         return Ok(station_m);
     }
+    // Uniform over the 2 n + 1 frames from -n to n. `frames` is at most 100, so nothing overflows.
     let shift = Random::new(seed, "start", 0).below(2 * frames as usize + 1) as i64;
     let shift_us = (shift - i64::from(frames)) * START_FRAME_US;
     let route = Route::new(drive).map_err(|error| error.to_string())?;
+    // `Route::new` has checked that the drive has keyframes.
     let first_us = drive.keyframes[0].time_us;
     let last_us = drive.keyframes[drive.keyframes.len() - 1].time_us;
     let time_us = route.at(station_m).time_us.saturating_add(shift_us).clamp(first_us, last_us);
@@ -180,8 +187,11 @@ fn shifted(drive: &Trajectory, station_m: f64, seed: u64, frames: u32) -> Result
     let last = drive.keyframes.len() - 1;
     let after = drive.keyframes.partition_point(|key| key.time_us < time_us).min(last);
     let stations_m = route.stations_m();
+    // The time is that of the first keyframe.
     let Some(before) = after.checked_sub(1) else { return Ok(0.0) };
     let [from, to] = [&drive.keyframes[before], &drive.keyframes[after]];
+    // In 128 bits, because the difference of two times of 64 bits may not fit. Times rise, so the
+    // span is above 0.
     let span_us = i128::from(to.time_us) - i128::from(from.time_us);
     let since_us = i128::from(time_us) - i128::from(from.time_us);
     let t = since_us as f64 / span_us as f64;
@@ -215,6 +225,7 @@ fn route_from(
         return Err(FileError::new("commands", message));
     }
     let mut commands = Vec::new();
+    // Commands must be in order, since the route takes the first one that is not passed.
     let mut before_m = 0.0;
     for (index, command) in section.commands.iter().enumerate() {
         let path = format!("commands[{index}]");
@@ -236,17 +247,20 @@ fn route_from(
 /// The route of a scenario that names none: the trajectory on which the ego starts.
 fn default_route(start: Option<&EgoStart>, courses: &mut Courses<'_>) -> Option<NavigationRoute> {
     let Some(EgoStart::Station { trajectory, .. }) = start else { return None };
+    // No error here, because the scenario has not asked for a route. A drive that stands has none.
     let course = courses.line("trajectory", Some(trajectory), None, None, false).ok()?;
     Some(NavigationRoute { course: (*course).clone(), commands: Vec::new() })
 }
 
 fn end_rules(section: &EndSection, has_route: bool) -> Result<EndRules, FileError> {
     let microseconds = |path: &str, value_s: Option<f64>| -> Result<Option<i64>, FileError> {
+        // At least one millisecond: an end at 0 would be an episode without a step.
         let value_s = value_s.map(|value_s| in_range(path, value_s, [0.001, limits::END_S]));
         Ok(value_s.transpose()?.map(|value_s| (value_s * 1e6).round() as i64))
     };
     let off_route_m = section.off_route_m.map(|most_m| in_range("off_route_m", most_m, [0.1, 1e6]));
     let off_route_m = off_route_m.transpose()?;
+    // Without a route the distance is unknown and the rule could never end the episode.
     if off_route_m.is_some() && !has_route {
         let message = "there is no route; write one, or start along a trajectory";
         return Err(FileError::new("off_route_m", message));

@@ -43,6 +43,7 @@ pub(super) fn add_script(
             );
             return Err(FileError::new(format!("{path}.do"), message));
         }
+        // Actions stay in order: later ones replace what earlier ones of the same sub-step began.
         let mut then = Vec::with_capacity(trigger.then.len());
         for (at, action) in trigger.then.iter().enumerate() {
             let action = action_from(action, &mut actor.behaviour, courses, (references, own));
@@ -61,6 +62,7 @@ fn profile(section: &ProfileSection) -> Result<(Over, Shape), FileError> {
         ShapeSection::Sinusoidal => Shape::Sinusoidal,
         ShapeSection::Cubic => Shape::Cubic,
     };
+    // The bounds keep a time at least as long as a sub-step of 10 ms, and a rate above 0.
     let given = [
         section.over_s.map(|s| Ok(Over::Time(in_range("over_s", s, [0.01, 1e4])?))),
         section.over_m.map(|m| Ok(Over::Distance(in_range("over_m", m, [0.01, 1e5])?))),
@@ -91,6 +93,7 @@ fn action_from(
     let most_mps2 = limits::ACTOR_ACCELERATION_M_S2;
     let rate_of = |path: &str, rate: f64| in_range(path, rate, [0.01, most_mps2]);
     let action = match section {
+        // These two are for every behaviour, so they return before the check at the end.
         ActionSection::Spawn {} => return Ok(Action::Spawn),
         ActionSection::Remove {} => return Ok(Action::Remove),
         ActionSection::Speed { to, rate } => Action::Speed {
@@ -107,6 +110,7 @@ fn action_from(
         ActionSection::SpeedProfile(section) => {
             let within = |error: FileError| error.within("speed_profile");
             let (over, shape) = profile(section).map_err(within)?;
+            // `profile` is for speeds and offsets. A rate of speed is an acceleration already.
             if section.acceleration.is_some() {
                 return Err(FileError::new(
                     "speed_profile.acceleration",
@@ -132,6 +136,8 @@ fn action_from(
         ActionSection::KeepDistance(section) => {
             let keep = keep_distance(section, (references, own));
             let keep = keep.map_err(|error| error.within("keep_distance"))?;
+            // The model computes the acceleration of an IDM actor, so that a jump would break its
+            // gap.
             let is_idm = matches!(behaviour, Behaviour::Follow(follow) if follow.idm.is_some());
             if is_idm && keep.bounds.is_none() {
                 let message = "is missing, as is braking: an idm actor is not put anywhere at once";
@@ -166,14 +172,17 @@ fn action_from(
             let lanes = line.lanes.as_deref();
             let course = courses.line("along", along, points, lanes, reverse);
             let course = course.map_err(|error| error.within("path"))?;
+            // Both places are on the line of this action and not on the present course.
             let done_m = line.done_m.map(|m| in_range("path.done_m", m, [0.0, course.length_m()]));
             let done_m = done_m.transpose()?;
             let at_m = line.at_m.map(|m| in_range("path.at_m", m, [0.0, course.length_m()]));
             let at_m = at_m.transpose()?;
+            // Courses are only appended, so that the indices of earlier actions stay valid.
             if let Behaviour::Follow(follow) = behaviour {
                 follow.courses.push(course);
                 Action::Course { course: follow.courses.len() - 1, done_m, at_m }
             } else {
+                // The index does not matter: the check below refuses the action.
                 Action::Course { course: 0, done_m, at_m }
             }
         }

@@ -75,6 +75,7 @@ impl TracksFile {
     /// Names the place of the first mistake.
     pub fn check(&self) -> Result<(), FileError> {
         check_format(Some(&self.format), Self::FORMAT)?;
+        // Before any track is built, so that the count bounds the memory of the check.
         let keyframes: usize = self.tracks.iter().map(|track| track.keyframes.len()).sum();
         if keyframes > limits::TRACK_KEYFRAMES {
             let message =
@@ -108,6 +109,7 @@ impl TrackSection {
         let mut keyframes = Vec::with_capacity(self.keyframes.len());
         for (index, keyframe) in self.keyframes.iter().enumerate() {
             let path = format!("keyframes[{index}]");
+            // Both times are any 64-bit numbers of a file.
             let Some(time_us) = keyframe.time_us.checked_sub(start_us) else {
                 let message = format!("{}; too far from the episode's start", keyframe.time_us);
                 return Err(FileError::new(format!("{path}.time_us"), message));

@@ -79,6 +79,8 @@ impl Spline {
         if time_s >= PLAN_S {
             return self.end_mps;
         }
+        // The derivative of the polynomial above with respect to time: each derivative of a basis
+        // function divided by the duration.
         let t = time_s / PLAN_S;
         let begin = DVec2::new(self.begin_mps, 0.0);
         (3.0 * t * t - 4.0 * t + 1.0) * begin
@@ -88,17 +90,20 @@ impl Spline {
 
     /// The points of the plan, without its start.
     pub fn points_m(&self) -> [DVec2; PLAN_POINTS] {
+        // The start is common to all plans and would add the same distance to each.
         std::array::from_fn(|at| self.position_m((at + 1) as f64 * POINT_S))
     }
 
     /// Whether a vehicle could drive it: speeds along its heading, accelerations and yaw rates
     /// between points.
     fn is_drivable(&self) -> bool {
+        // 21 velocities give 20 differences, one for each piece of 0.1 s.
         let velocities: [DVec2; PLAN_POINTS + 1] =
             std::array::from_fn(|at| self.velocity_mps(at as f64 * POINT_S));
         velocities.windows(2).all(|pair| {
             let [before, after] = [pair[0], pair[1]];
             // Below 0.1 m/s the direction of the velocity is no heading.
+            // Both must be fast enough: the angle between them needs two directions.
             let turn_rad = if before.length().min(after.length()) < 0.1 {
                 0.0
             } else {
@@ -122,10 +127,13 @@ pub fn candidates(speed_mps: f64) -> Vec<Spline> {
             let share = f64::from(step) / f64::from(ACCELERATIONS - 1);
             let acceleration =
                 ACCELERATIONS_MPS2[0] + share * (ACCELERATIONS_MPS2[1] - ACCELERATIONS_MPS2[0]);
+            // `v T + a T² / 2`: the end if the plan were straight.
             let ahead_m = speed_mps * PLAN_S + 0.5 * acceleration * PLAN_S * PLAN_S;
             let end_m = DVec2::new(ahead_m, offset_m);
             let end_mps = speed_mps + acceleration * PLAN_S;
             for heading_rad in HEADINGS_RAD {
+                // Relative to the direction towards the end, so that a plan to the side turns by
+                // its own angle in addition.
                 let direction = DVec2::from_angle(end_m.to_angle() + heading_rad);
                 let spline = Spline { begin_mps: speed_mps, end_m, end_mps: end_mps * direction };
                 if spline.is_drivable() {
@@ -140,6 +148,7 @@ pub fn candidates(speed_mps: f64) -> Vec<Spline> {
 /// The cost of a plan in metres: all points are at the same times.
 pub fn cost_m(plan: &[DVec2], attacked: &[DVec2], neighbours: &[Vec<DVec2>]) -> f64 {
     let least_m = |other: &[DVec2]| {
+        // Point by point and not the nearest of all: the cost is of places at the same time.
         let distances = plan.iter().zip(other).map(|(a, b)| a.distance(*b));
         distances.fold(f64::INFINITY, f64::min)
     };
@@ -176,6 +185,8 @@ mod tests {
             assert_eq!(spline.velocity_mps(0.0), DVec2::new(8.0, 0.0));
             assert!((spline.position_m(PLAN_S) - spline.end_m).length() < 1e-12);
             let step_s = 1e-6;
+            // A difference quotient with a step of 1e-6 s has an error of about a · 1e-6, and
+            // rounding adds 1e-9.
             let slope = (spline.position_m(0.7 + step_s) - spline.position_m(0.7)) / step_s;
             assert!((slope - spline.velocity_mps(0.7)).length() < 1e-4, "{slope}");
         }

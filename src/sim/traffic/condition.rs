@@ -36,27 +36,32 @@ impl ConditionState {
         own: &dyn Fn(&Condition) -> bool,
     ) -> bool {
         let count = condition.all.len() + condition.any.len();
+        // States are made at the first evaluation. The list is in the order of `all`, then `any`.
         self.parts.resize_with(count, Self::default);
         let (all, any) = self.parts.split_at_mut(condition.all.len());
         let mut holds = own(condition);
         for (state, part) in all.iter_mut().zip(&condition.all) {
             holds &= state.value(part, time_us, own);
         }
+        // An empty `any` is no restriction.
         let mut holds_any = condition.any.is_empty();
         for (state, part) in any.iter_mut().zip(&condition.any) {
             holds_any |= state.value(part, time_us, own);
         }
+        // Held, edge and delay apply to the whole: a part has its own.
         self.delayed(condition, time_us, holds && holds_any)
     }
 
     /// The value after the edge and the delay.
     fn delayed(&mut self, condition: &Condition, time_us: i64, value: bool) -> bool {
+        // The time of the first evaluation at which the parts held, as long as they do.
         self.since_us = value.then(|| self.since_us.unwrap_or(time_us));
         let since_us = self.since_us;
         let value = since_us.is_some_and(|since_us| time_us - since_us >= condition.held_us);
         let last = self.last.replace(value);
         let value = match condition.edge {
             None => value,
+            // The first evaluation has no last value, so it is no edge.
             Some(Edge::Rising) => value && last == Some(false),
             Some(Edge::Falling) => !value && last == Some(true),
             Some(Edge::Both) => last.is_some_and(|last| last != value),
@@ -64,13 +69,17 @@ impl ConditionState {
         if condition.later_us == 0 {
             return value;
         }
+        // Only changes are stored. An edge is true for one evaluation, so it is two changes.
         if self.changes.back().is_none_or(|(_, before)| *before != value) {
             self.changes.push_back((time_us, value));
         }
         let then_us = time_us.saturating_sub(condition.later_us);
+        // Invariant: the front is the last change at or before the delayed time, or the oldest of
+        // all if there is none.
         while self.changes.get(1).is_some_and(|(at_us, _)| *at_us <= then_us) {
             self.changes.pop_front();
         }
+        // Before the first change is `later_us` old, the delayed condition does not hold.
         self.changes.front().is_some_and(|(at_us, value)| *at_us <= then_us && *value)
     }
 }
@@ -96,10 +105,12 @@ impl Measures<'_> {
 
     fn value(&self, measure: &Measure) -> Option<f64> {
         let of = &measure.of;
+        // An absent body ends the measure: no bound holds then, neither `above` nor `below`.
         let body = self.body(of)?;
         match measure.quantity {
             Quantity::Speed => Some(body.velocity_mps.length()),
             Quantity::Travelled => {
+                // The ego has index 0, so the actors are shifted by one.
                 self.travelled_m.get(of.actor.map_or(0, |actor| actor + 1)).copied()
             }
             Quantity::Point(point_m) => Some(reference_m(body, of).distance(point_m)),
@@ -113,6 +124,7 @@ impl Measures<'_> {
                 } else {
                     self.along_m(body, of, other, true)?
                 };
+                // A body that stands has a very large headway and not an infinite one.
                 Some(way_m / body.velocity_mps.length().max(HEADWAY_MPS))
             }
         }
@@ -125,15 +137,18 @@ impl Measures<'_> {
     /// The distance by the rate at which it becomes less, in seconds.
     fn time_to_collision_s(&self, body: &LeadCandidate, of: &Body, other: Other) -> Option<f64> {
         let to = self.body(&other.to)?;
+        // Between the middles, also where the distance is between reference points.
         let way_m = to.center_m - body.center_m;
         let (distance_m, direction) = if other.is_straight {
             (self.distance_m(body, of, other)?, way_m.normalize_or_zero())
         } else {
             let forward = body.forward();
+            // Closing is along the heading, forwards or backwards, depending on where the other is.
             let sign = if way_m.dot(forward) < 0.0 { -1.0 } else { 1.0 };
             (self.along_m(body, of, other, true)?, sign * forward)
         };
         let closing_mps = (body.velocity_mps - to.velocity_mps).dot(direction);
+        // Infinite and not absent: `above` then holds for bodies that separate.
         Some(if closing_mps > 0.0 { distance_m / closing_mps } else { f64::INFINITY })
     }
 
@@ -157,6 +172,8 @@ impl Measures<'_> {
     ) -> Option<f64> {
         let to = self.body(&other.to)?;
         let [from_m, to_m] = [reference_m(body, of), reference_m(to, &other.to)];
+        // The course is used only if it was asked for. An actor without one falls back to the
+        // heading.
         let (forward, way_m) = match self.course.filter(|_| other.is_on_course) {
             Some(course) => {
                 let [from, to] = [course.nearest(from_m), course.nearest(to_m)];
@@ -174,6 +191,7 @@ impl Measures<'_> {
         if !other.is_free {
             return Some(way_m.abs());
         }
+        // Boxes: the distance of the middles on this axis, less half the extent of both.
         let axis = if is_along { forward } else { DVec3::Z.cross(forward) };
         // The middles of the boxes are not at the reference points.
         let shift_m = (to.center_m - to_m - (body.center_m - from_m)).dot(axis);
@@ -231,6 +249,7 @@ mod tests {
     fn a_break_starts_the_time_again() {
         let held = Condition { held_us: 2_000_000, ..Condition::default() };
         let parts = [true, true, false, true, true, true, true];
+        // Two seconds after 0 s would be at 2 s, but the break there starts again at 3 s.
         assert_eq!(values(&held, parts), [false, false, false, false, false, true, true]);
     }
 
@@ -270,6 +289,7 @@ mod tests {
     fn measures_are_between_reference_points_or_boxes() {
         let bodies = [car(0, [0.0, 0.0], 10.0), car(1, [30.0, 4.0], 6.0)];
         let measures = Measures { bodies: &bodies, travelled_m: &[1.0, 2.0, 3.0], course: None };
+        // The reference points are 1 m and 2 m behind the middles.
         let [of, to] =
             [(0, -1.0), (1, -2.0)].map(|(actor, ahead_m)| Body { actor: Some(actor), ahead_m });
         let value = |quantity: Quantity| {
@@ -288,8 +308,11 @@ mod tests {
         near(value(Quantity::Longitudinal(other(true, false))), 26.0);
         near(value(Quantity::Lateral(other(false, false))), 4.0);
         near(value(Quantity::Lateral(other(true, false))), 2.0);
+        // 26 m at 10 m/s.
         near(value(Quantity::Headway(other(true, false))), 2.6);
+        // 26 m at 10 - 6 m/s.
         near(value(Quantity::TimeToCollision(other(true, false))), 6.5);
+        // There is no actor 7, so even a bound that every speed meets does not hold.
         let absent = Body { actor: Some(7), ahead_m: 0.0 };
         let speed =
             Measure { quantity: Quantity::Speed, of: absent, above: Some(0.0), below: None };

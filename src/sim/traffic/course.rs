@@ -38,6 +38,7 @@ impl Course {
         for pose in poses {
             let before = kept.last().map(|last: &Pose| last.position_m.distance(pose.position_m));
             match before {
+                // Skipped points keep no way: the next one is measured from the last that was kept.
                 Some(way_m) if way_m < SPACING_M => continue,
                 Some(way_m) => stations_m.push(stations_m[stations_m.len() - 1] + way_m),
                 None => stations_m.push(0.0),
@@ -57,6 +58,8 @@ impl Course {
     pub fn from_points(points_m: &[DVec3], ground: &Ground<'_>) -> Option<Self> {
         let mut kept: Vec<DVec3> = Vec::new();
         for point_m in points_m {
+            // Horizontally, because directions and headings are horizontal: two points above each
+            // other have none.
             let is_new =
                 kept.last().is_none_or(|last: &DVec3| flat(*last - *point_m).length() >= SPACING_M);
             if is_new {
@@ -69,6 +72,8 @@ impl Course {
         let direction = |from: usize, to: usize| flat(kept[to] - kept[from]).normalize_or_zero();
         let last = kept.len() - 1;
         let poses = (0..=last).map(|at| {
+            // Unit vectors, so that a long neighbour does not outweigh a short one. At the ends
+            // only one direction counts.
             let before = if at > 0 { direction(at - 1, at) } else { DVec3::ZERO };
             let after = if at < last { direction(at, at + 1) } else { DVec3::ZERO };
             let sum = before + after;
@@ -77,6 +82,8 @@ impl Course {
             let rotation = DQuat::from_rotation_z(ahead.y.atan2(ahead.x));
             ground.place(Pose { position_m: kept[at], rotation })
         });
+        // Again by distance: placing may bring two points together, and stations are along the
+        // ground.
         Self::from_poses(poses)
     }
 
@@ -105,6 +112,7 @@ impl Course {
         let [from, to] = [&self.poses[segment], &self.poses[segment + 1]];
         Pose {
             position_m: from.position_m.lerp(to.position_m, t),
+            // Position continues straight beyond the ends, but the rotation must not turn on.
             rotation: from.rotation.slerp(to.rotation, t.clamp(0.0, 1.0)).normalize(),
         }
     }
@@ -117,6 +125,7 @@ impl Course {
 
     /// Curvature at a station in 1/m, positive to the left: constant between two poses.
     pub fn curvature_1_m(&self, station_m: f64) -> f64 {
+        // Beyond the ends the course is straight. NaN is in no range and has no curvature either.
         if !(0.0..self.length_m()).contains(&station_m) {
             return 0.0;
         }
@@ -142,6 +151,7 @@ impl Course {
             let way = flat(self.poses[segment + 1].position_m - from);
             let offset = flat(point_m - from);
             let length_m2 = way.length_squared();
+            // Two points above each other have no direction on the ground.
             if length_m2 == 0.0 {
                 continue;
             }
@@ -151,6 +161,7 @@ impl Course {
             if distance_m < best.distance_m {
                 let station_m = self.stations_m[segment]
                     + t * (self.stations_m[segment + 1] - self.stations_m[segment]);
+                // Cross product of the unit direction with the offset: positive to the left.
                 let left_m = (way.x * aside.y - way.y * aside.x) / length_m2.sqrt();
                 best = CourseFootPoint { station_m, left_m, distance_m };
             }
@@ -176,6 +187,8 @@ impl Course {
             if missing_m <= 0.0 {
                 return Some(station_m);
             }
+            // At least 0.5 m, because the missing distance approaches 0 near the circle and the
+            // search would not end.
             station_m += missing_m.max(0.5);
         }
         None
@@ -183,8 +196,11 @@ impl Course {
 
     /// The segment of a station, and the place on it: below 0 or above 1 beyond the ends.
     fn segment(&self, station_m: f64) -> (usize, f64) {
+        // A course has at least two points, so there is a segment.
         let last = self.stations_m.len() - 2;
         let after = self.stations_m.partition_point(|&s_m| s_m <= station_m);
+        // Stations rise strictly, so the division below is safe. The clamp extends the first and
+        // the last segment.
         let segment = after.saturating_sub(1).min(last);
         let from_m = self.stations_m[segment];
         let to_m = self.stations_m[segment + 1];
@@ -212,6 +228,7 @@ mod tests {
     /// A quarter circle of radius 20 m to the left, from the origin to the east.
     fn arc() -> Course {
         let pose = |i: i32| {
+            // A hundred chords of 0.9°: their length is short of the arc by 1e-5 of it.
             let angle_rad = f64::from(i) * std::f64::consts::FRAC_PI_2 / 100.0;
             let (sin, cos) = angle_rad.sin_cos();
             Pose {
@@ -228,6 +245,7 @@ mod tests {
         assert!((arc.length_m() - 10.0 * std::f64::consts::PI).abs() < 1e-3);
         assert!((arc.curvature_1_m(12.0) - 0.05).abs() < 1e-5);
         let middle = arc.at(5.0 * std::f64::consts::PI).position_m;
+        // At 0.9 of the radius, 2 m towards the centre, which is to the left.
         let beside = arc.nearest(DVec3::new(0.0, 20.0, 0.0) + 0.9 * (middle - 20.0 * DVec3::Y));
         assert!((beside.left_m - 2.0).abs() < 1e-2 && beside.distance_m >= 1.99, "{beside:?}");
         let back = arc.reversed();
@@ -258,6 +276,7 @@ mod tests {
     fn points_face_along_the_line_and_standing_is_left_out() {
         let points = [DVec3::ZERO, DVec3::ZERO, DVec3::X * 10.0, DVec3::new(10.0, 10.0, 0.0)];
         let course = Course::from_points(&points, &Ground::from_drives(&[])).unwrap();
+        // The repeated first point adds nothing: 10 m east and 10 m north.
         assert_eq!(course.length_m(), 20.0);
         let facing = course.at(10.0).rotation * DVec3::X;
         assert!((facing - DVec3::new(1.0, 1.0, 0.0).normalize()).length() < 1e-12, "{facing}");
@@ -267,6 +286,7 @@ mod tests {
     #[test]
     fn turns_are_small_across_half_a_turn() {
         let yaw = DQuat::from_rotation_z;
+        // From 3.1 to -3.1 the short way is 2π - 6.2, and -q is the same rotation as q.
         assert!((turned_rad(yaw(3.1), yaw(-3.1)) - 0.08318530717958605).abs() < 1e-12);
         assert!((turned_rad(yaw(3.1), -yaw(3.0)) + 0.1).abs() < 1e-12);
     }

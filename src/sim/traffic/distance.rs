@@ -94,6 +94,8 @@ impl KeepDistance {
     ) -> Option<Missing> {
         let body = LeadCandidate::find(bodies, self.of)?;
         let (ahead, way_m) = if self.is_on_course {
+            // The place of the other's middle on the own course, so that bends do not shorten the
+            // distance.
             let beside = place.course.nearest(body.center_m);
             let ahead = place.course.at(beside.station_m).rotation * DVec3::X;
             (ahead, beside.station_m - place.station_m)
@@ -101,6 +103,7 @@ impl KeepDistance {
             (place.forward, (body.center_m - place.center_m).dot(place.forward))
         };
         // Between boxes the middles count, and not the reference points.
+        // In the direction of the way: a reference point ahead of a turned body counts less.
         let shift_m = self.to_ahead_m * body.forward().dot(ahead) - self.ahead_m;
         let way_m = if self.is_free { way_m } else { way_m + shift_m };
         let other_mps = body.velocity_mps.dot(ahead);
@@ -111,12 +114,16 @@ impl KeepDistance {
         let gap_m = match self.gap {
             Gap::Length(gap_m) => gap_m,
             Gap::Headway(headway_s) => {
+                // For a jump the actor takes over the other's speed, so that speed decides on the
+                // headway.
                 let own_mps = follower_mps.unwrap_or(other_mps);
                 headway_s * if is_behind { own_mps } else { other_mps }.max(0.0)
             }
         };
         let half_m =
             if self.is_free { place.half_length_m + body.half_extent_m(ahead) } else { 0.0 };
+        // Positive `way_m` means that the other is ahead: behind it, the wanted way is positive as
+        // well.
         let wanted_m = if is_behind { gap_m + half_m } else { -(gap_m + half_m) };
         Some(Missing { way_m: way_m - wanted_m, speed_mps: other_mps })
     }
@@ -141,6 +148,8 @@ impl KeepDistance {
         let missing = self.missing(place, Some(place.speed_mps), bodies);
         let Some((missing, bounds)) = missing.zip(self.bounds) else { return 0.0 };
         let Bounds { acceleration_mps2, braking_mps2, speed_mps } = bounds;
+        // Too far behind, the actor approaches and must be able to brake. Too close, it falls back
+        // and must be able to accelerate again.
         let most_mps2 = if missing.way_m > 0.0 { braking_mps2 } else { acceleration_mps2 };
         let approach_mps = missing.way_m.signum() * approach_mps(missing.way_m.abs(), most_mps2);
         let aim_mps = (missing.speed_mps + approach_mps).clamp(0.0, speed_mps);
@@ -150,6 +159,7 @@ impl KeepDistance {
     /// Whether the distance was reached, and need not be kept.
     pub(super) fn is_over(&self, place: &Place<'_>, bodies: &[LeadCandidate]) -> bool {
         let reached = || match self.bounds {
+            // A jump is over as soon as it could be made.
             None => LeadCandidate::find(bodies, self.of).is_some(),
             Some(_) => self
                 .missing(place, Some(place.speed_mps), bodies)
@@ -163,6 +173,7 @@ impl KeepDistance {
 /// proportional to the way at the end, and before `√(2 b (way - b τ² / 2))`, which continues it
 /// with the same slope.
 fn approach_mps(way_m: f64, most_mps2: f64) -> f64 {
+    // At `b τ²` the straight line `way / τ` and the root have the same value and slope.
     let settling_m = most_mps2 * SETTLING_S * SETTLING_S;
     if way_m <= settling_m {
         return way_m / SETTLING_S;

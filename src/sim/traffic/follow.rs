@@ -125,11 +125,15 @@ impl CourseFollower {
                 next.by.offset = Some(trigger);
             }
             Action::Course { course, done_m, at_m } => {
+                // The place before the change, so that the actor continues from where it is.
                 let place_m = self.pose(now).position_m;
                 let beside = self.courses[course].nearest(place_m);
                 next.course = course;
                 next.station_m = at_m.unwrap_or(beside.station_m);
+                // An actor that is put somewhere starts on the line. One that continues keeps its
+                // offset, so that it does not jump.
                 next.lateral = Lateral::at(if at_m.is_some() { 0.0 } else { beside.left_m });
+                // A change of offset belongs to the old course, and ends with it.
                 next.by.offset = None;
                 next.by.course = done_m.map(|_| trigger);
                 next.course_done_m = done_m.unwrap_or(0.0);
@@ -152,6 +156,8 @@ impl CourseFollower {
         let course = self.course(now);
         let mut now = *now;
         let mut place = self.place(&now, box_);
+        // A distance without bounds is met before anything else, so that lead and speed below are
+        // those of the new place.
         if let Some(SpeedCommand::Keep(keep)) = &now.speed_command
             && let Some(missing) = keep.jump(&place, bodies)
         {
@@ -166,7 +172,10 @@ impl CourseFollower {
 
         // A line that lies d to the left of one with curvature k is (1 - k d) as long.
         let stretch = 1.0 - course.curvature_1_m(now.station_m) * now.lateral.offset_m();
+        // At least 0.1, because the line has no length at the centre of the curve and the station
+        // would jump.
         let station_m = now.station_m + way_m / stretch.max(0.1);
+        // The mean of both speeds, as for the way of a constant acceleration.
         let lateral = now.lateral.after(duration_s, 0.5 * (now.speed_mps + speed_mps));
         let speed_command = now.speed_command.map(|command| command.after(duration_s));
         let is_over =
@@ -175,6 +184,7 @@ impl CourseFollower {
         let is_kept = |command: &SpeedCommand| command.aim_mps() == Some(0.0) || !is_over;
         let speed_command = speed_command.filter(is_kept);
         let by = Owners {
+            // A change that is over has no owner, from which triggers see that it has ended.
             speed: now.by.speed.filter(|_| !is_over),
             offset: now.by.offset.filter(|_| lateral.is_moving()),
             course: now.by.course.filter(|_| station_m < now.course_done_m),
@@ -202,6 +212,7 @@ impl CourseFollower {
         let commanded =
             now.speed_command.map(|command| command.acceleration_mps2(place, duration_s, bodies));
         let Some(idm) = self.idm else { return commanded.unwrap_or(0.0) };
+        // Without a lead the gap is infinite and its term vanishes, whatever the speed.
         let lead = lead.unwrap_or(Lead { gap_m: f64::INFINITY, speed_mps: now.speed_mps });
         // During a commanded change to a lower speed, the free-road term would brake at its own
         // rate.
@@ -228,6 +239,7 @@ impl CourseFollower {
         let target_m = now.lateral.target_m();
         let corridor = Corridor {
             station_m: now.station_m,
+            // From the present offset to the aimed one, so that a lane change sees both lanes.
             edges_m: [offset_m.min(target_m) - half_width_m, offset_m.max(target_m) + half_width_m],
             half_length_m: 0.5 * box_.length_m,
             height_m: box_.height_m,
@@ -236,10 +248,12 @@ impl CourseFollower {
         };
         let body = lead_ahead(course, &corridor, own, bodies);
         if self.leaves {
+            // No wall at the end of the course for an actor that drives out of the world.
             return body;
         }
         let gap_m = course.length_m() - now.station_m - corridor.half_length_m;
         let end = Lead { gap_m, speed_mps: 0.0 };
+        // The nearer of both; a body beyond the end of the course does not matter.
         Some(body.filter(|body| body.gap_m <= end.gap_m).unwrap_or(end))
     }
 
@@ -262,9 +276,12 @@ impl CourseFollower {
         let offset_m = at.lateral.offset_m();
         let rate_mps = at.lateral.rate_mps(at.speed_mps);
         let position_m = on_course.position_m + on_course.rotation * (offset_m * DVec3::Y);
+        // Exactly the course's rotation without a manoeuvre: a product would change its last bits.
         let rotation = if rate_mps == 0.0 {
             on_course.rotation
         } else {
+            // The heading is the direction of motion: `atan(lateral / forward)`, small because the
+            // manoeuvre slows with the actor.
             on_course.rotation * DQuat::from_rotation_z(rate_mps.atan2(at.speed_mps))
         };
         Pose { position_m, rotation: rotation.normalize() }
@@ -296,6 +313,7 @@ impl CourseFollower {
 impl CourseFollowerState {
     fn command(&mut self, command: SpeedCommand, trigger: usize) {
         let aim_mps = command.aim_mps().unwrap_or(self.speed_mps);
+        // A stop must not become the desired speed, which the model divides by.
         if aim_mps > 0.0 {
             self.free_flow_speed_mps = aim_mps;
         }
@@ -307,6 +325,8 @@ impl CourseFollowerState {
     fn halt(&mut self, trigger: usize) {
         if self.by.speed == Some(trigger) {
             self.speed_command = None;
+            // At least 0.1 m/s, because an actor may be halted while it stands, and the model
+            // divides by this speed.
             self.free_flow_speed_mps = self.speed_mps.max(0.1);
             self.by.speed = None;
         }

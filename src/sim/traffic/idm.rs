@@ -69,6 +69,7 @@ impl Idm {
     /// course, with `gap_m` between bumpers; an infinite gap is a free road.
     pub fn acceleration(&self, speed_mps: f64, lead_mps: f64, gap_m: f64) -> f64 {
         let desired_m = self.desired_gap_m(speed_mps, lead_mps);
+        // A floor, because the term grows without bound as the gap goes to 0 or below.
         let gap_m = gap_m.max(self.gap_floor_m);
         let free = (speed_mps / self.free_speed_mps).powf(self.exponent);
         let near = (desired_m / gap_m) * (desired_m / gap_m);

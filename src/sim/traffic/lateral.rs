@@ -70,11 +70,13 @@ impl Lateral {
     pub(super) fn by_profile(&self, target_m: f64, over: Over, shape: Shape) -> Self {
         let from_m = self.offset_m();
         let extent = shape.extent(target_m - from_m, over);
+        // A step, or a rate without a change, is complete at once.
         if extent <= 0.0 {
             return Self::at(target_m);
         }
         let pace = if matches!(over, Over::Distance(_)) { Pace::Distance } else { Pace::Time };
         let profile = Some(Profile { from_m, shape });
+        // The coefficients hold the start only, because the profile computes the offset.
         Self { duration_s: extent, target_m, pace, profile, ..Self::at(from_m) }
     }
 
@@ -89,6 +91,8 @@ impl Lateral {
     pub(super) fn moving_to(&self, target_m: f64, duration_s: f64, speed_mps: f64) -> Self {
         let [from_m, rate, acceleration] = self.derivatives();
         let way_m = target_m - from_m;
+        // The first three coefficients give offset, rate and acceleration now. The last three make
+        // offset, rate and acceleration at the end those of the aim.
         let t = duration_s;
         let [t2, t3, t4, t5] = [t * t, t.powi(3), t.powi(4), t.powi(5)];
         let cubic = (20.0 * way_m - 12.0 * rate * t - 3.0 * acceleration * t2) / (2.0 * t3);
@@ -108,6 +112,7 @@ impl Lateral {
     /// that the actor never slides sideways.
     pub(super) fn after(&self, duration_s: f64, speed_mps: f64) -> Self {
         let elapsed_s = self.elapsed_s + self.pace.rate(speed_mps) * duration_s;
+        // Also true without a manoeuvre, whose duration is 0: the offset stays at its aim.
         if elapsed_s >= self.duration_s {
             return Self::at(self.target_m);
         }
@@ -139,6 +144,7 @@ impl Lateral {
             return [from_m + way_m * shape.at(x), way_m * shape.slope(x) / self.duration_s, 0.0];
         }
         [
+            // Horner's scheme for the polynomial and its first two derivatives.
             a + t * (b + t * (c + t * (d + t * (e + t * f)))),
             b + t * (2.0 * c + t * (3.0 * d + t * (4.0 * e + t * 5.0 * f))),
             2.0 * c + t * (6.0 * d + t * (12.0 * e + t * 20.0 * f)),
@@ -174,6 +180,7 @@ mod tests {
         let back = lateral.moving_to(0.0, 3.0, 5.0);
         assert!((back.offset_m() - lateral.offset_m()).abs() < 1e-12);
         assert!((back.rate_mps(5.0) - lateral.rate_mps(5.0)).abs() < 1e-12);
+        // Just before the end, where the manoeuvre is still a polynomial.
         let end = back.after(2.999_999, 5.0);
         assert!(end.offset_m().abs() < 1e-9 && end.rate_mps(5.0).abs() < 1e-6, "{end:?}");
     }

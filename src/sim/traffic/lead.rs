@@ -17,7 +17,6 @@ pub(super) struct LeadCandidate {
     half_length_m: f64,
     half_width_m: f64,
     height_m: f64,
-    /// Velocity, in m/s.
     pub(super) velocity_mps: DVec3,
     /// Yaw rate, in rad/s.
     pub(super) yaw_rate_radps: f64,
@@ -65,6 +64,7 @@ impl LeadCandidate {
 
     /// The body of an actor, or of the ego; `None` if it is absent.
     pub(super) fn find(bodies: &[Self], actor: Option<usize>) -> Option<&Self> {
+        // At most 257 bodies, and a script looks for few of them.
         bodies.iter().find(|body| body.actor.map(usize::from) == actor)
     }
 
@@ -85,6 +85,7 @@ impl LeadCandidate {
         if inside {
             return 0.0;
         }
+        // As for footprints: the nearest pair of two separate convex shapes has a corner.
         let corners = self.corners_m().map(|corner_m| other.distance_m(corner_m));
         let others = other.corners_m().map(|corner_m| self.distance_m(corner_m));
         corners.into_iter().chain(others).fold(f64::INFINITY, f64::min)
@@ -150,6 +151,7 @@ pub(super) fn lead_ahead(
         // A box that is farther away than the corridor is long cannot be in it.
         let reach_m = aside_m + body.half_length_m.hypot(body.half_width_m);
         let farthest_m = corridor.ahead_m + reach_m;
+        // Squares, because this test is made for every pair of actors in every sub-step.
         if (body.center_m - own_m).length_squared() > farthest_m * farthest_m {
             continue;
         }
@@ -172,6 +174,7 @@ fn found_in(
     to_m: f64,
 ) -> Option<Lead> {
     let station_m = course.first_within(body.center_m, reach_m, corridor.station_m, to_m)?;
+    // From the first place within reach to its end: the nearest place of the body lies in between.
     let beside = course.nearest_between(body.center_m, station_m, station_m + 2.0 * reach_m);
     if beside.station_m <= corridor.station_m {
         return None;
@@ -185,6 +188,7 @@ fn found_in(
     // The extents of the turned box along and across the course.
     let ahead = flat(pose.rotation * DVec3::X).normalize_or_zero();
     let cos = body.forward.dot(ahead).abs();
+    // Both vectors are horizontal, so z of their product is the sine.
     let sin = body.forward.cross(ahead).z.abs();
     let half_along_m = body.half_length_m * cos + body.half_width_m * sin;
     let half_across_m = body.half_length_m * sin + body.half_width_m * cos;

@@ -211,10 +211,14 @@ impl Shape {
             (_, Self::Step) => 0.0,
             (Over::Time(extent) | Over::Distance(extent), _) => extent,
             (Over::Rate(rate), Self::Linear) => change / rate,
+            // The extent follows from the largest slope of the shape, π/2 in the middle; 3/2 for
+            // the cubic.
             (Over::Rate(rate), Self::Sinusoidal) => 0.5 * PI * change / rate,
             (Over::Rate(rate), Self::Cubic) => 1.5 * change / rate,
             // A linear change has no bounded acceleration: as long as a cubic one.
             (Over::Acceleration(most), Self::Linear | Self::Cubic) => (6.0 * change / most).sqrt(),
+            // The largest second derivative of the half wave is π²/2, at both ends; that of the
+            // cubic is 6.
             (Over::Acceleration(most), Self::Sinusoidal) => PI * (change / (2.0 * most)).sqrt(),
         }
     }

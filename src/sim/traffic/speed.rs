@@ -104,6 +104,7 @@ impl SpeedCommand {
             }
             Self::Profile(profile) => profile.acceleration_mps2(speed_mps, duration_s),
             Self::Match(matched) => {
+                // An absent body keeps the actor at its present speed.
                 (matched.speed_mps(bodies).unwrap_or(speed_mps) - speed_mps) / duration_s
             }
             Self::Keep(keep) => keep.acceleration_mps2(place, duration_s, bodies),

@@ -66,7 +66,9 @@ impl ArriveTogether {
         let other_mps = body.velocity_mps.length();
         let to = self.of_at_m - (body.center_m + self.to_ahead_m * body.forward());
         let to = DVec3::new(to.x, to.y, 0.0);
+        // Way to the place in the axes of the other: ahead of it, and to the side.
         let ahead_m = to.dot(body.forward());
+        // Pythagoras; the maximum catches a negative rounding error.
         let aside_m = (to.length_squared() - ahead_m * ahead_m).max(0.0).sqrt();
         let is_before_it = aside_m < ASIDE_M;
         // On a straight line the way ahead counts, whatever the offset; around bends, the straight
@@ -91,12 +93,15 @@ impl ArriveTogether {
         duration_s: f64,
         bodies: &[LeadCandidate],
     ) -> f64 {
+        // Nothing to arrive with: the speed stays.
         let Some(rest) = self.rest(place, bodies) else { return 0.0 };
         let most_mps2 = limits::ACTOR_ACCELERATION_M_S2;
         let constant_mps2 = |speed_mps: f64| (speed_mps - place.speed_mps) / duration_s;
         let acceleration_mps2 = match rest.speed_mps {
             Some(speed_mps) if self.steady_m > 0.0 && speed_mps > 0.0 => {
                 let way_m = rest.way_m - self.steady_m;
+                // The last metres take `steady / v` at the final speed; the cubic ends where they
+                // begin.
                 let time_s = rest.time_s - self.steady_m / speed_mps;
                 if way_m <= 0.0 || time_s <= duration_s {
                     constant_mps2(speed_mps)
@@ -108,6 +113,8 @@ impl ArriveTogether {
                 towards_mps2([rest.way_m, rest.time_s], [place.speed_mps, speed_mps], duration_s)
             }
             None => {
+                // Mean speed `way / time` of a constant rate is that of both ends:
+                // `v1 = 2 s / t - v0`.
                 let speed_mps = (2.0 * rest.way_m / rest.time_s - place.speed_mps).max(0.0);
                 towards_mps2([rest.way_m, rest.time_s], [place.speed_mps, speed_mps], duration_s)
             }
@@ -126,11 +133,15 @@ impl ArriveTogether {
 /// speed to another; or that of braking to a standstill, if the cubic would lead backwards: the
 /// actor waits, and starts again when there is a cubic from standstill.
 fn towards_mps2([way_m, time_s]: [f64; 2], [from_mps, to_mps]: [f64; 2], duration_s: f64) -> f64 {
+    // There, or too late for another sub-step: the speed stays.
     if way_m <= 0.0 || time_s <= duration_s {
         return 0.0;
     }
+    // Way `v0 t + q t² + c t³` with the given way and final speed at the end. Its speed is
+    // `v0 + 2 q t + 3 c t²`.
     let square = (3.0 * way_m / time_s - 2.0 * from_mps - to_mps) / time_s;
     let cube = (from_mps + to_mps - 2.0 * way_m / time_s) / (time_s * time_s);
+    // The lowest speed is where `2 q + 6 c t = 0`.
     let lowest_s = -square / (3.0 * cube);
     let has_lowest = cube > 0.0 && lowest_s > 0.0 && lowest_s < time_s;
     let lowest_mps = from_mps - square * square / (3.0 * cube);
@@ -139,6 +150,7 @@ fn towards_mps2([way_m, time_s]: [f64; 2], [from_mps, to_mps]: [f64; 2], duratio
         // final speed.
         return -(from_mps * from_mps + to_mps * to_mps) / (2.0 * way_m);
     }
+    // The acceleration `2 q + 6 c t` at the middle of the sub-step.
     2.0 * square + 3.0 * cube * duration_s
 }
 
@@ -189,6 +201,7 @@ mod tests {
 
     #[test]
     fn it_brakes_while_the_other_stands() {
+        // v² / (2 s) = 100 / 100, and (36 + 64) / 100 with a final speed.
         assert_eq!(towards_mps2([50.0, f64::INFINITY], [10.0, 0.0], 0.01), -1.0);
         assert_eq!(towards_mps2([50.0, f64::INFINITY], [6.0, 8.0], 0.01), -1.0);
     }

@@ -99,6 +99,7 @@ impl Track {
         let last = self.keyframes.len() - 1;
         let is_before = time_us < self.keyframes[0].time_us;
         let is_after = time_us > self.keyframes[last].time_us;
+        // A single keyframe has no motion, so it is treated as an end.
         if is_before || is_after || last == 0 {
             let end = self.keyframes[if is_before { 0 } else { last }];
             let is_here = self.held || time_us == end.time_us;
@@ -108,6 +109,8 @@ impl Track {
                 yaw_rate_radps: 0.0,
             });
         }
+        // At the last keyframe `partition_point` is past the end. The clamp makes it the end of the
+        // last segment.
         let after = self.keyframes.partition_point(|key| key.time_us <= time_us).clamp(1, last);
         let [from, to] = [&self.keyframes[after - 1], &self.keyframes[after]];
         // i128, since the difference of two i64 times may overflow i64.
@@ -146,6 +149,7 @@ mod tests {
         assert_eq!(track.at(-1), None);
         assert_eq!(track.at(500_001), None);
         let middle = track.at(250_000).unwrap();
+        // 5 m in 0.5 s: half of it in the middle, at 10 m/s.
         assert_eq!(middle.world_from_actor.position_m.x, 2.5);
         assert_eq!(middle.velocity_mps.x, 10.0);
         assert!((middle.yaw_rate_radps - 0.2).abs() < 1e-12);

@@ -145,6 +145,8 @@ impl World {
         let progress: Vec<ActorProgress> = traffic.actors.iter().map(ActorProgress::new).collect();
         let states = traffic.actors.iter().zip(&progress).enumerate();
         let states = states
+            // An actor that is not there yet has a state as well, so that the list stays in order
+            // of the indices.
             .map(|(index, (actor, progress))| {
                 if progress.spawned { progress.state(index, actor, 0, None) } else { absent(index) }
             })
@@ -205,17 +207,22 @@ impl World {
     /// Advances all actors by `dt_us` microseconds, above 0, in which the ego moves as given. Calls
     /// `each` after each sub-step.
     pub fn step(&mut self, dt_us: i64, ego: &EgoMotion, each: &mut dyn FnMut(&SubStep<'_>)) {
+        // A handle of its own, since `self` is changed while the actors' parameters are read.
         let traffic = self.traffic.clone();
         let begin_us = self.time_us;
         let mut ego_now = ego.from;
         for (since_us, ego_next) in ego.sub_steps(dt_us) {
             let sub_begin_us = self.time_us;
             let sub_end_us = begin_us.saturating_add(since_us);
+            // Everything below reads these bodies and `states`: the instant at the start of the
+            // sub-step.
             let bodies = self.bodies(&ego_now);
             self.look_for_end(&traffic, &ego_now, &bodies);
             self.fire(&traffic, &ego_now, &bodies);
+            // Taken instead of borrowed, because `advance_actors` changes the progress of `self`.
             let before = std::mem::take(&mut self.states);
             let after = self.advance_actors(&traffic, &before, &bodies, sub_end_us);
+            // After the motion: an action may end within the sub-step in which it began.
             self.note_ends(sub_end_us);
             self.travel([&ego_now, &ego_next], &before, &after);
             each(&SubStep {
@@ -243,10 +250,13 @@ impl World {
         let Some(when) = traffic.end.as_ref().filter(|_| self.end.held_us.is_none()) else {
             return;
         };
+        // The end of a step is the start of the next one: the condition must not be evaluated twice
+        // then.
         let is_new = self.end.last_us != Some(self.time_us);
         if !is_new || !when.after.is_none_or(|after| self.is_after(after)) {
             return;
         }
+        // Moved out and back, because `holds` borrows all of `self`.
         let mut state = std::mem::take(&mut self.end.condition);
         let own = |part: &Condition| self.holds(traffic, None, part, ego, bodies);
         let holds = state.value(when, self.time_us, &own);
@@ -266,6 +276,8 @@ impl World {
 
     /// Fires the triggers whose conditions hold at the start of the sub-step.
     fn fire(&mut self, traffic: &Traffic, ego: &EgoState, bodies: &[LeadCandidate]) {
+        // All conditions first and all actions afterwards, so that no trigger sees the effect of
+        // another at the same instant.
         let mut firing: Vec<(usize, usize)> = Vec::new();
         for (index, actor) in traffic.actors.iter().enumerate() {
             for (at, trigger) in actor.script.iter().enumerate() {
@@ -314,6 +326,7 @@ impl World {
         for progress in &mut self.progress {
             let by = match &progress.behaviour {
                 BehaviourState::Follow(now) if progress.spawned => now.by,
+                // An actor that has gone, and one without a course, has nothing under way.
                 _ => Default::default(),
             };
             for (at, fired) in progress.fired.iter_mut().enumerate() {
@@ -330,6 +343,7 @@ impl World {
         let [from, to] = ego.map(|ego| ego.world_from_rig.position_m);
         self.travelled_m[0] += from.distance(to);
         for (index, (from, to)) in before.iter().zip(after).enumerate() {
+            // An actor that appears or disappears in this sub-step has no way in it.
             if from.present && to.present {
                 let [from, to] = [from, to].map(|state| state.world_from_actor.position_m);
                 self.travelled_m[index + 1] += from.distance(to);
@@ -354,6 +368,8 @@ impl World {
         });
         let course = follow.map(|(follow, now)| follow.course(now));
         let measures = Measures { bodies, travelled_m: &self.travelled_m, course };
+        // The cheap comparisons first. The order cannot matter otherwise: none of them remembers
+        // anything.
         when.time_us.is_none_or(|time_us| self.time_us >= time_us)
             && when.ego_speed_above_mps.is_none_or(|least| ego.velocity_mps.length() >= least)
             && when.after.is_none_or(|after| self.is_after(after))
@@ -394,6 +410,7 @@ impl World {
                 None => Some(bodies[0].center_m),
                 Some(other) => {
                     let other = &self.states[other];
+                    // An absent actor has no place, so that it is never near.
                     other.present.then_some(other.world_from_actor.position_m)
                 }
             };
@@ -423,6 +440,7 @@ impl World {
                 let state = &before[index];
                 progress.advance(traffic, actor, state, bodies, [begin_us, end_us]);
                 if progress.spawned {
+                    // Without a previous pose, the yaw rate of the first sub-step is 0.
                     let before = state.present.then_some((state.world_from_actor, duration_s));
                     progress.state(index, actor, end_us, before)
                 } else {
@@ -454,6 +472,7 @@ impl EgoMotion {
     /// The ends of the sub-steps of a step of `dt_us`, above 0: the time since the start of the
     /// step, in microseconds, and the ego then.
     pub fn sub_steps(&self, dt_us: i64) -> impl Iterator<Item = (i64, EgoState)> {
+        // At least one sub-step, so that the end of the step is always reached.
         let count = dt_us.max(1).unsigned_abs().div_ceil(limits::SUB_STEP_US.unsigned_abs()) as i64;
         (1..=count).map(move |sub_step| {
             // i128, since the product may overflow i64.
@@ -471,6 +490,7 @@ impl EgoMotion {
         if since_us >= dt_us {
             return self.to;
         }
+        // Both ends are excluded above, so that 0 < t < 1.
         let t = since_us as f64 / dt_us as f64;
         let [from, to] = [&self.from, &self.to];
         let mut pose = from.world_from_rig.interpolate(&to.world_from_rig, t);
@@ -484,6 +504,7 @@ impl EgoMotion {
                     + dt_s * t * (1.0 - t) * (1.0 - t) * from.velocity_mps
                     - dt_s * t * t * (1.0 - t) * to.velocity_mps;
         }
+        // A teleport has one velocity, the mean over the step, so nothing is interpolated.
         let velocity_mps =
             if self.smooth { from.velocity_mps.lerp(to.velocity_mps, t) } else { to.velocity_mps };
         let yaw_rate_radps = if self.smooth {
@@ -519,6 +540,7 @@ impl ActorProgress {
             (Action::Spawn, ..) => self.spawned = true,
             (Action::Remove, ..) => self.spawned = false,
             (_, Behaviour::Follow(follow), BehaviourState::Follow(now)) => {
+                // Which changes were under way before, to find those that this action replaces.
                 let before = now.by;
                 *now = follow.with_action(now, action, trigger);
                 let lost = (0..self.fired.len()).filter(|at| before.has(*at) && *at != trigger);
@@ -561,6 +583,8 @@ impl ActorProgress {
                         begin_us,
                     );
                 } else if !before.present {
+                    // An attacker that is absent postpones its plan, so that it does not begin in
+                    // the middle of one.
                     now.begin_us = begin_us;
                 }
             }
@@ -610,6 +634,7 @@ impl Attacking {
         time_us: i64,
     ) -> Self {
         let begin = own.world_from_actor;
+        // Along its own axis, so that it may be negative.
         let speed_mps = own.velocity_mps.dot(begin.rotation * DVec3::X);
         let begin_from_world = begin.inverse();
         let predicted = |body: &LeadCandidate| {
@@ -626,7 +651,9 @@ impl Attacking {
             .collect();
         // A stable sort: equal costs keep the order of the candidates.
         plans.sort_by(|a, b| a.0.total_cmp(&b.0));
+        // A stream for each plan of each attacker: `plans` is the number of the draw.
         let mut random = Random::new(seed, &format!("attack/{name}"), self.plans);
+        // No drivable plan is left: it goes straight on.
         let spline = match attack.best.min(plans.len()) {
             0 => Spline::straight(speed_mps),
             count => plans[random.below(count)].1,

@@ -158,15 +158,18 @@ impl Comparison {
         after: &SuiteResult,
         rule: &Rule,
     ) -> Result<Self, CompareError> {
+        // What makes every comparison meaningless comes first.
         check_steps(before.dt_us, after.dt_us)?;
         check_verdicts(before, after)?;
         // Find the pairs, and those of them that are compared.
         let pairs = pair::pairs(before, after)?;
+        // The pairs of drives so far, each by the first episode that was driven so in its run.
         let mut distinct = BTreeSet::new();
         let mut compared = Vec::new();
         let mut episodes = Vec::new();
         for pair in &pairs {
             let mut episode = pair.episode();
+            // A pair that cannot be compared stays in the list, with its reason, but is in no rate.
             if let Some((before, after)) = pair.comparable() {
                 let drives = (before.drive_name(), after.drive_name());
                 episode.duplicate = !distinct.insert(drives);
@@ -176,12 +179,14 @@ impl Comparison {
             }
             episodes.push(episode);
         }
+        // No comparison at all must not look like one without a loss.
         if compared.is_empty() {
             return Err(CompareError::NothingToCompare { reason: why_nothing(&episodes) });
         }
         // Apply the rule.
         let pass_rate = PairedRate::from_pairs(&compared);
         let scores = scores::changes(&compared);
+        // Names are resolved now, since only the compared pairs say which scores there are.
         let rule = rule.resolved(&scores.keys().map(String::as_str).collect::<Vec<_>>())?;
         let reasons = rule.reasons(&episodes, pass_rate, &scores)?;
         Ok(Self {
@@ -205,17 +210,21 @@ impl Comparison {
     /// # Errors
     /// As for [`Comparison::new`].
     pub fn check(before: &SuiteResult, cases: &[Case], rule: &Rule) -> Result<(), CompareError> {
+        // The step is the same for all cases of a suite.
         let dt_us = cases.first().and_then(|case| case.options.dt_us);
         check_steps(before.dt_us, dt_us)?;
+        // The names of the previous run: those of the next one do not exist yet.
         let names = scores::names(before);
         rule.resolved(&names.iter().copied().collect::<Vec<_>>())?;
         let by_key = pair::by_key(before)?;
         let is_there = |case: &&Case| by_key.contains_key(&Key::from_case(case));
         let there: Vec<&Case> = cases.iter().filter(is_there).collect();
         let is_alike = |case: &&&Case| {
+            // `there` has only cases with a key in the map, so the index does not fail.
             let entry = by_key[&Key::from_case(case)];
             entry.version_hash == case.version_hash && entry.scenario_hash == case.line.hash
         };
+        // One comparable episode is enough to start; the others are reported as changed.
         match there.iter().find(is_alike) {
             Some(_) => Ok(()),
             None => Err(CompareError::NothingToCompare {
@@ -264,6 +273,7 @@ impl RunName {
 impl PairedRate {
     /// The rate of the pairs that are compared.
     fn from_pairs(compared: &[(&EpisodeEntry, &EpisodeEntry)]) -> Self {
+        // By the previous run alone: an episode that lost its verdict counts as not passed.
         let judged = compared.iter().filter(|(before, _)| before.status.is_judged());
         let passes = |entry: &EpisodeEntry| u64::from(entry.status == Status::Passed);
         let none = Self { pairs: 0, before: 0, after: 0 };
@@ -280,6 +290,7 @@ fn check_steps(before_us: Option<i64>, after_us: Option<i64>) -> Result<(), Comp
         (Some(before_us), Some(after_us)) if before_us != after_us => {
             Err(CompareError::StepLength { before_us, after_us })
         }
+        // A result of an older build has no step; it is taken as equal.
         _ => Ok(()),
     }
 }
@@ -293,6 +304,7 @@ fn check_verdicts(before: &SuiteResult, after: &SuiteResult) -> Result<(), Compa
     };
     let before = versions(before);
     let after = versions(after);
+    // A run of which nothing was driven has no verdicts to differ.
     if before == after || before.is_empty() || after.is_empty() {
         return Ok(());
     }

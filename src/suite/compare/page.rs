@@ -29,6 +29,7 @@ pub(super) fn page(comparison: &Comparison) -> String {
 }
 
 fn episodes(comparison: &Comparison) -> Markup {
+    // Episodes with the same verdict are shown only if they failed in another way.
     let is_shown = |one: &&ComparedEpisode| one.change != Change::Same || one.has_other_faults();
     let changed: Vec<&ComparedEpisode> = comparison.episodes.iter().filter(is_shown).collect();
     html! {

@@ -87,6 +87,7 @@ pub(super) struct Pair<'a> {
 impl Key {
     fn new(scenario: &str, values: &BTreeMap<String, Value>, seed: u64) -> Self {
         // A map with text keys: writing it into memory cannot fail.
+        // As text, because JSON values have no order. A `BTreeMap` writes its keys in one order.
         let values = serde_json::to_string(values).unwrap_or_default();
         Self { scenario: scenario.to_owned(), values, seed }
     }
@@ -104,6 +105,7 @@ impl Key {
 pub(super) fn by_key(run: &SuiteResult) -> Result<BTreeMap<Key, &EpisodeEntry>, CompareError> {
     let mut by_key: BTreeMap<Key, &EpisodeEntry> = BTreeMap::new();
     for entry in &run.episodes {
+        // Two entries with one key would make the pair depend on their order.
         if let Some(other) = by_key.insert(Key::from_entry(entry), entry) {
             return Err(CompareError::Twice {
                 scenario: entry.scenario.clone(),
@@ -122,6 +124,7 @@ pub(super) fn pairs<'a>(
 ) -> Result<Vec<Pair<'a>>, CompareError> {
     let before = by_key(before)?;
     let after = by_key(after)?;
+    // A set of both, so that episodes of one run alone are listed too.
     let keys: BTreeSet<&Key> = before.keys().chain(after.keys()).collect();
     let pair =
         |key: &Key| Pair { before: before.get(key).copied(), after: after.get(key).copied() };
@@ -132,6 +135,7 @@ pub(super) fn pairs<'a>(
 
 impl<'a> Pair<'a> {
     fn name(&self) -> Option<&'a str> {
+        // The name of the later run wins, since a reader looks for it there.
         self.after.or(self.before).map(|entry| &*entry.name)
     }
 
@@ -146,6 +150,7 @@ impl<'a> Pair<'a> {
         let any = self.after.or(self.before);
         let both = self.before.zip(self.after);
         let differs = both.and_then(|(before, after)| differs(before, after));
+        // From what is missing over what differs to what changed.
         let change = match (both, &differs) {
             (None, _) if self.before.is_some() => Change::OnlyBefore,
             (None, _) => Change::OnlyAfter,
@@ -171,6 +176,7 @@ impl<'a> Pair<'a> {
 fn differs(before: &EpisodeEntry, after: &EpisodeEntry) -> Option<String> {
     let short = |hash: &str| hash.chars().take(8).collect::<String>();
     let [before_version, after_version] = [before, after].map(|entry| short(&entry.version_hash));
+    // The twin first: a scenario that is resolved in another twin may differ for that reason.
     if before.version_hash != after.version_hash {
         return Some(format!(
             "the twin's version was {before_version} before and is {after_version} now"
@@ -187,6 +193,7 @@ fn change(before: Status, after: Status) -> Change {
         // It is not known whether it still passes.
         (Status::Passed, _) => Change::Worse,
         (Status::Failed, Status::Passed) => Change::Better,
+        // A lack of a verdict before, or after a failure, shows neither a loss nor a gain.
         _ => Change::Unknown,
     }
 }
@@ -195,6 +202,7 @@ fn differing_scores(
     before: &EpisodeEntry,
     after: &EpisodeEntry,
 ) -> BTreeMap<String, [Option<f64>; 2]> {
+    // Of both runs, so that a score of one run alone is listed with a missing value.
     let names: BTreeSet<&String> = before.scores.keys().chain(after.scores.keys()).collect();
     let value = |entry: &EpisodeEntry, name: &str| entry.scores.get(name)?.value;
     let both = names.into_iter().map(|name| (name, [value(before, name), value(after, name)]));
@@ -209,6 +217,7 @@ impl Side {
         match entry.status {
             Status::NotJudged => why.extend(entry.not_judged.iter().cloned()),
             Status::Technical => why.extend(
+                // The last attempt decided.
                 entry.errors.last().map(|error| format!("{}: {}", error.kind, error.message)),
             ),
             _ => {}
@@ -231,6 +240,7 @@ impl ComparedEpisode {
     /// The change, in words.
     pub(super) fn text(&self) -> String {
         match (&self.before, &self.after, &self.differs) {
+            // A pair that is not compared has its reason and no change.
             (Some(_), Some(_), Some(differs)) => differs.clone(),
             (Some(before), Some(after), None) => {
                 let after = after.text();

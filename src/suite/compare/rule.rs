@@ -44,6 +44,7 @@ impl FromStr for Tolerance {
         let (name, amount) = text.split_once('=').ok_or(expected)?;
         let amount: f64 =
             amount.parse().map_err(|_| format!("{amount:?} is not a number; {expected}"))?;
+        // NaN is not finite, and a negative tolerance would demand a gain.
         if name.is_empty() || !amount.is_finite() || amount < 0.0 {
             Err(format!("an amount is 0 or more; {expected}"))
         } else {
@@ -63,6 +64,7 @@ impl Rule {
     /// The rule with the full names of its scores, which must be among `known`.
     pub(super) fn resolved(&self, known: &[&str]) -> Result<Self, CompareError> {
         let full = |name: &str| {
+            // The full name first or the name without a version: a rule outlives versions.
             let found = known.iter().find(|full| **full == name || base(full) == name);
             let found = found.copied().or((name == PASS_RATE).then_some(PASS_RATE));
             found.map(str::to_owned).ok_or_else(|| CompareError::UnknownScore {
@@ -82,12 +84,14 @@ impl Rule {
         scores: &BTreeMap<String, ScoreChange>,
     ) -> Result<Vec<String>, CompareError> {
         let mut reasons = Vec::new();
+        // A tolerance of the rate replaces the rule about single episodes.
         match self.worse_by.get(PASS_RATE) {
             None => reasons.extend(lost_passes(episodes)),
             Some(&most) => {
                 // Use one division, so that 10 of 10 and 9 of 10 differ by exactly the value of
                 // "0.1".
                 let lost = rate.before as f64 - rate.after as f64;
+                // Without pairs the fall is 0 / 1.
                 let fall = lost / rate.pairs.max(1) as f64;
                 if fall > most {
                     reasons.push(format!("{}, which is more than {most} lower", rate.text()));
@@ -97,6 +101,8 @@ impl Rule {
         for (name, &most) in self.worse_by.iter().filter(|(name, _)| *name != PASS_RATE) {
             let no_value = || CompareError::NoValue { name: name.clone() };
             let loss = scores.get(name).and_then(ScoreChange::loss).ok_or_else(no_value)?;
+            // Means are sums in floating point, hence the margin. A tolerance of 0 must accept
+            // equal values.
             if loss > most + ROUNDING {
                 reasons.push(format!("{name} is worse by {loss:.4} on average, more than {most}"));
             }
@@ -121,6 +127,7 @@ fn lost_passes(episodes: &[ComparedEpisode]) -> Option<String> {
     let worse = episodes.iter().filter(|episode| episode.change == Change::Worse);
     let names: Vec<&str> = worse.map(|episode| &*episode.name).collect();
     let what = match names.len() {
+        // No text at all, which makes the run not worse.
         0 => return None,
         1 => "1 episode that passed before does not pass now".to_owned(),
         count => format!("{count} episodes that passed before do not pass now"),

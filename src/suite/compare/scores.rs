@@ -71,6 +71,7 @@ pub(super) fn not_compared([before, after]: &[BTreeSet<&str>; 2]) -> Vec<String>
             None => format!("{name} before alone"),
         });
     }
+    // Two versions of one score were told as one line above.
     let is_told = |name: &str| before.iter().any(|other| base(other) == base(name));
     let new = after.difference(before).filter(|name| !is_told(name));
     texts.extend(new.map(|name| format!("{name} now alone")));
@@ -80,6 +81,7 @@ pub(super) fn not_compared([before, after]: &[BTreeSet<&str>; 2]) -> Vec<String>
 /// The change of each score that some pair has.
 pub(super) fn changes(pairs: &[(&EpisodeEntry, &EpisodeEntry)]) -> BTreeMap<String, ScoreChange> {
     let of_pair = |(before, after): &(&EpisodeEntry, &EpisodeEntry)| {
+        // In both runs: a score of one alone is told elsewhere.
         let both = before.scores.keys().filter(|name| after.scores.contains_key(*name));
         both.cloned().collect::<Vec<String>>()
     };
@@ -93,6 +95,7 @@ impl ScoreChange {
         let mut after = Vec::new();
         let mut only = [0, 0];
         for pair in pairs {
+            // Absent and without a value are alike: neither can be compared.
             let value = |entry: &EpisodeEntry| entry.scores.get(name).and_then(|score| score.value);
             match (value(pair.0), value(pair.1)) {
                 (Some(old), Some(new)) => {
@@ -107,11 +110,14 @@ impl ScoreChange {
         let differences: Vec<f64> = before.iter().zip(&after).map(|(old, new)| new - old).collect();
         let mean = Mean::from_values(&differences);
         let [least, most] = score_range(name);
+        // A difference of two values within [least, most] lies within ± (most - least).
         let interval = mean.and_then(|mean| mean.interval([least - most, most - least]));
         let lower_is_better = lower_is_better(name);
         let is_same = differences.iter().all(|difference| *difference == 0.0);
         let direction = match interval {
+            // Before the interval, because equal values have an interval without a width, or none.
             _ if is_same && !differences.is_empty() => Direction::Same,
+            // All of it above zero: the score has risen.
             Some([low, _]) if low > 0.0 => direction(!lower_is_better),
             Some([_, high]) if high < 0.0 => direction(lower_is_better),
             _ => Direction::Unclear,

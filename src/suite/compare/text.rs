@@ -38,6 +38,7 @@ pub(super) fn text(comparison: &Comparison) -> String {
     for line in &comparison.scores_not_compared {
         row("note", &format!("score not compared: {line}"));
     }
+    // The worst news first. Episodes as before are counted and not listed.
     for (change, label) in [
         (Change::Worse, "worse"),
         (Change::Better, "better"),
@@ -89,6 +90,7 @@ fn scores(text: &mut String, comparison: &Comparison) {
 
 /// Whether some pair has different values, or a value in only one run.
 pub(super) fn has_changed(score: &ScoreChange) -> bool {
+    // Without pairs there is nothing that could have changed.
     let is_same = score.pairs == 0 || score.direction == Direction::Same;
     score.only_before + score.only_after > 0 || !is_same
 }
