@@ -88,6 +88,7 @@ impl Catalog {
         };
         let views: Vec<RecordedView> =
             serde_json::from_slice(&bytes).map_err(|error| damaged(error.to_string()))?;
+        // The hashes become paths.
         let wrong = views.iter().flat_map(objects).find(|object| !is_hash(&object.object));
         match wrong.map(|object| object.object.clone()) {
             Some(object) => Err(damaged(format!("{object:?} is not a hash"))),
@@ -100,6 +101,7 @@ impl Catalog {
         let views = self.read_views(manifest)?;
         let images = views.iter().flat_map(objects).map(|object| object.object.clone());
         let table = manifest.views.iter().map(|views| views.object.clone());
+        // A set, because views may share an object, such as a mask.
         Ok(images.chain(table).collect())
     }
 }

@@ -70,6 +70,7 @@ impl Local {
             }
             Err(cause) => cause,
         };
+        // The error of listing does not say whether it is a folder at all.
         match self.disk.info(dir) {
             Err(error) if error.kind() == ErrorKind::NotFound => Ok(Vec::new()),
             Ok(found) if !found.is_dir => {
@@ -107,6 +108,7 @@ impl Local {
         for prefix in entries(&*self.disk, &objects).unwrap_or_default() {
             let _ = self.disk.remove_dir(&objects.join(prefix));
         }
+        // From the inside out. The system refuses to remove a directory that is not empty.
         for dir in [objects, twin.join(LOG), twin] {
             let _ = self.disk.remove_dir(&dir);
         }
@@ -136,8 +138,10 @@ impl Local {
     /// would be without objects, or the log would have a gap.
     pub(super) fn settle(&self, name: &str) -> Result<(), StoreError> {
         let twin = self.root.join(name);
+        // The twin's own directory is last: it has the names of the other two.
         for dir in [twin.join(LOG), twin.join(COLLECTION), twin] {
             match self.disk.sync_dir(&dir) {
+                // A new twin has none of them.
                 Err(e) if matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {}
                 synced => synced.map_err(StoreError::io("sync", &dir))?,
             }

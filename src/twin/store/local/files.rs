@@ -54,6 +54,7 @@ impl<F: Write> Write for HashingFile<F> {
 /// # Errors
 /// The file system fails, or returns fewer bytes than the file's size.
 pub(super) fn read_all(file: Box<dyn ReadFile>, limit_bytes: u64) -> io::Result<Vec<u8>> {
+    // The limit bounds what is allocated, whatever size the file has.
     let size = file.size_bytes()?.min(limit_bytes);
     let mut bytes = Vec::with_capacity(size as usize);
     file.take(limit_bytes).read_to_end(&mut bytes)?;
@@ -104,6 +105,7 @@ pub fn create_dirs(disk: &dyn Disk, dir: &Path) -> Result<(), StoreError> {
             None => Ok(()),
         };
     }
+    // The recursion ends at the first directory that exists.
     create_parent(disk, dir)?;
     create_dir(disk, dir)?;
     sync_parent(disk, dir)

@@ -86,6 +86,7 @@ impl ObjectBackend for Remote {
                 let store = store.clone();
                 let at = at.clone();
                 async move {
+                    // As a stream: an object may have any size.
                     let mut stream = store.get(&at).await?.into_stream();
                     let mut start = Vec::new();
                     let mut hasher = blake3::Hasher::new();
@@ -110,6 +111,7 @@ impl ObjectBackend for Remote {
         bytes: Range<u64>,
         hash: &[u8; 32],
     ) -> Result<Vec<u8>, StoreError> {
+        // A section is cached under the hash of its own bytes, which several chunks may contain.
         let hash = blake3::Hash::from_bytes(*hash).to_hex();
         if let Some(bytes) = self.cache.as_ref().and_then(|cache| cache.get(&hash)) {
             return Ok(bytes);
