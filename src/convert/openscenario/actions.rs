@@ -82,6 +82,7 @@ pub(super) fn speed_match(
 ) -> Result<Option<Act>, ConvertError> {
     let Some(target) = speed.find("SpeedActionTarget")? else { return Ok(None) };
     let target = target.only_child()?;
+    // Otherwise the speed of one moment is the aim, which `speed_change` reads.
     if target.name() != "RelativeTargetSpeed" || !target.find_flag("continuous")?.unwrap_or(false) {
         return Ok(None);
     }
@@ -128,6 +129,7 @@ pub(super) fn speed_change(
     }
     let dynamics = speed.need("SpeedActionDynamics")?;
     let profile = dynamics_from(&dynamics)?;
+    // Over a distance s, only a constant acceleration has a simple course: v² = v0² + 2 a s.
     match (profile.over_m, profile.shape) {
         (None, _) => {}
         (Some(_), ShapeSection::Linear) => {
@@ -151,9 +153,11 @@ fn relative_speed_mps(target: &Element<'_>, context: &Context<'_>) -> Result<f64
     let Some(entity) = context.entities.get(&name) else {
         return Err(target.wrong(&format!("there is no entity {name:?}")));
     };
+    // In the story, the speed of the other is known only when the scenario runs.
     if context.is_in_story {
         return Err(target.wrong("is read in <Init> only; give a speed"));
     }
+    // `Init` reads this action again once the speed of the other is known.
     if context.waiting.contains(&name) || !entity.script.is_empty() {
         return Err(target.wrong(&format!("{name:?} has no speed yet; give it one without a ramp")));
     }
@@ -169,10 +173,12 @@ fn dynamics_from(dynamics: &Element<'_>) -> Result<ProfileSection, ConvertError>
     let shape = shape_from(dynamics)?;
     let dimension = dynamics.text("dynamicsDimension")?;
     let value = dynamics.number("value")?;
+    // A rate has no sign: the aim decides whether the value rises or falls.
     let extent = value.abs();
     if dimension != "rate" && value < 0.0 {
         return Err(dynamics.wrong(&format!("value={value:?}; write 0 or more")));
     }
+    // A change within 10 ms, a step of the simulation, or within 1 cm is immediate.
     if shape == ShapeSection::Step || (dimension != "rate" && extent < 0.01) {
         return Ok(NOWHERE);
     }
@@ -250,6 +256,8 @@ fn lane_change(
             } else if of != name && context.is_in_story {
                 target.note(&format!("counts from lane {lane}, on which {of:?} is then"));
             }
+            // A relative lane counts to the left of the vehicle, while ids count to the left of the
+            // road.
             shifted_id(lane, if spot.is_up { count } else { -count })
         }
         _ => return Err(target.unread()),
@@ -307,11 +315,13 @@ pub(super) fn trajectory_line(
         None => catalogs::declared(&holder.need("Trajectory")?)?,
     };
     let mut line = trajectory::line_from(&trajectory, context)?;
+    // An entry of a catalog is in another file, which the check of the scenario does not visit.
     if holder.find("CatalogReference")?.is_some() {
         trajectory.check_read()?;
     }
     let reference = follow.find("TimeReference")?.map(|reference| reference.only_child());
     let Some(reference) = reference.transpose()? else {
+        // Without a time reference, the times of the points do not count.
         line.times_s = None;
         return Ok(line);
     };

@@ -37,6 +37,7 @@ impl<'a> Element<'a> {
         ledger: &'a Ledger,
         source: Source<'a>,
     ) -> Self {
+        // Whatever is made into an element counts as read; its attributes count one by one.
         ledger.element(source.index, node);
         Self { node, parameters, ledger, source }
     }
@@ -162,6 +163,7 @@ impl<'a> Element<'a> {
 
     /// An attribute with its parameters put in; `None` without it.
     pub(super) fn find_text(&self, name: &str) -> Result<Option<String>, ConvertError> {
+        // The ledger names an attribute by its index in the element.
         let found = self.node.attributes().enumerate().find(|(_, one)| one.name() == name);
         let Some((index, attribute)) = found else { return Ok(None) };
         self.ledger.attribute(self.source.index, self.node, index);
@@ -208,6 +210,7 @@ impl<'a> Element<'a> {
     /// An attribute that is a whole number.
     pub(super) fn whole(&self, name: &str) -> Result<i32, ConvertError> {
         let value = self.number(name)?;
+        // Within 1e9 the cast to i32 is exact.
         if value.fract() == 0.0 && value.abs() < 1e9 {
             Ok(value as i32)
         } else {

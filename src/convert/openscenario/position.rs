@@ -43,6 +43,7 @@ pub(super) fn place_from(
             };
             let [ds, dt] = ["ds", "dt"].map(|name| kind.number(name));
             let mut at = roads.moved(spot.at, ds?, false).map_err(wrong)?;
+            // Both are to the left of the road.
             at.offset += dt?;
             let road_rad = roads.heading_rad(at);
             on_roads(roads.point(at), heading_rad(&kind, road_rad)?, context)
@@ -81,6 +82,7 @@ fn relative_place(kind: &Element<'_>, context: &Context<'_>) -> Result<Place, Co
     let (dx, dy, dz) = (dx?, dy?, dz?);
     let mut xyz_m = match kind.name() {
         "RelativeObjectPosition" => base.shifted(dx, dy).xyz_m,
+        // Along the world's axes, whatever the heading of the entity.
         _ => [base.xyz_m[0] + dx, base.xyz_m[1] + dy, base.xyz_m[2]],
     };
     xyz_m[2] += dz;
