@@ -97,6 +97,7 @@ pub(super) fn speed_match(
         return Err(target.wrong(&format!("there is no other entity {name:?}")));
     }
     let value = target.number("value")?;
+    // The speed is factor * v + delta, with the speed v of the other.
     let (factor, delta_mps) = match target.text("speedTargetValueType")?.as_str() {
         "delta" => (1.0, value),
         "factor" => (value, 0.0),
@@ -245,6 +246,8 @@ fn lane_change(
             let entity = context.entities.get(&of);
             let entity =
                 entity.ok_or_else(|| target.wrong(&format!("there is no entity {of:?}")))?;
+            // The lane is that after the changes that were read so far. The direction is that of
+            // the start.
             let spot = entity.place.and_then(|place| place.spot);
             let (Some(lane), Some(spot)) = (entity.lane, spot) else {
                 return Err(target.wrong(&format!("{of:?} is on no lane")));
@@ -309,6 +312,7 @@ pub(super) fn trajectory_line(
     if let Some(mode) = follow.find("TrajectoryFollowingMode")? {
         mode.expect("followingMode", &["position", "follow"])?;
     }
+    // In 1.0 the action itself has the trajectory, later a <TrajectoryRef> in it.
     let holder = follow.find("TrajectoryRef")?.unwrap_or_else(|| follow.clone());
     let trajectory = match holder.find("CatalogReference")? {
         Some(reference) => context.catalogs.entry(&reference)?,

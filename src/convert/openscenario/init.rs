@@ -178,6 +178,7 @@ fn read_speed(
 
 /// Notes that an action which sets the speed of an entity was read.
 fn is_read(name: &str, context: &mut Context<'_>) {
+    // Only one entry: an entity has as many as it has such actions.
     if let Some(at) = context.waiting.iter().position(|other| other == name) {
         context.waiting.remove(at);
     }
@@ -269,6 +270,7 @@ fn read_other(
     }
     let Some(act) = private_act(action, name, context)? else { return Ok(()) };
     let Some(entity) = context.entities.get_mut(name) else { return Err(action.unread()) };
+    // A later change that is relative to this entity counts from the new lane.
     if let Act::Lane { lane, .. } = &act {
         entity.lane = Some(*lane);
     }
@@ -306,6 +308,7 @@ fn read_entity_action(action: &Element<'_>, context: &mut Context<'_>) -> Result
         set_place(&name, place, context);
     }
     if let Some(entity) = context.entities.get_mut(&name) {
+        // What `Init` deletes is not there from the start on.
         entity.present = place.is_some();
     }
     Ok(())

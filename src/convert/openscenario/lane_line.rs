@@ -193,6 +193,7 @@ fn end_direction(lane: &Lane, is_up: bool) -> Option<DVec3> {
 }
 
 fn turned_rad(from: DVec3, to: DVec3) -> f64 {
-    // The tangent of the angle is the sine, from x * y, by the cosine, from x . y.
+    // The signed angle a: the cross product is |from| |to| sin a, and the dot product is |from|
+    // |to| cos a.
     from.cross(to).z.atan2(from.dot(to))
 }

@@ -365,7 +365,7 @@ impl<'a> EventRead<'_, 'a> {
         let mut then = Vec::new();
         if self.is_overriding && act.is_motion() {
             // Of the other events of this maneuver, what is under way ends.
-            // Names are those of the story, the act, the group and the maneuver.
+            // `names` has the story, the act, the group and, at index 3, the maneuver.
             let key = &self.scope.names[3];
             let maneuver = elements.by_name.get(key).into_iter().flatten();
             let others = maneuver.filter(|index| **index != self.index);
