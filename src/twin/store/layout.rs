@@ -48,6 +48,7 @@ pub(super) fn log_numbers(names: impl IntoIterator<Item = String>) -> Vec<u64> {
 
 /// Whether a text is 64 lower-case hex digits, and so may become a file name.
 pub(super) fn is_hash(text: &str) -> bool {
+    // Upper-case digits would be a second name of the same object.
     text.len() == 64 && text.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'))
 }
 

@@ -90,6 +90,7 @@ impl Local {
         let objects = self.objects_dir(name);
         for prefix in entries(&*self.disk, &objects)? {
             for hash in entries(&*self.disk, &objects.join(&prefix))? {
+                // All versions were read: what none of them names is of a killed commit.
                 if !named.contains(&hash) {
                     let path = objects.join(&prefix).join(&hash);
                     self.disk.remove_file(&path).map_err(StoreError::io("remove", &path))?;
@@ -117,6 +118,7 @@ impl Local {
     /// Creates a directory of which nothing need survive a power cut: of commits in preparation,
     /// and of locks.
     pub(super) fn create_transient(&self, dir: &Path) -> Result<(), StoreError> {
+        // Without a sync: no process that needs it lives through a power cut.
         if self.exists(dir)? { Ok(()) } else { create_dirs(&*self.disk, dir) }
     }
 

@@ -96,6 +96,7 @@ pub fn create_dirs(disk: &dyn Disk, dir: &Path) -> Result<(), StoreError> {
     if dir.as_os_str().is_empty() {
         return Ok(());
     }
+    // It exists, but its name may not be durable yet.
     if is_dir(disk, dir) {
         return match dir.parent().map(|parent| disk.sync_dir(parent)) {
             // This process may not read the directory above, so that another user has created this
@@ -130,6 +131,7 @@ pub(super) fn create_dirs_in(
 /// time.
 fn create_dir(disk: &dyn Disk, dir: &Path) -> Result<(), StoreError> {
     match disk.create_dir(dir) {
+        // Another process may have been first, which is as good, if it made a directory.
         Err(error) if error.kind() != ErrorKind::AlreadyExists || !is_dir(disk, dir) => {
             Err(StoreError::io("create", dir)(error))
         }

@@ -104,6 +104,7 @@ impl Remote {
         let store = self.store.clone();
         let at = self.key(key);
         let wanted = bytes.clone();
+        // Steps wait for sections, so that the short time-out applies.
         let retry = self.runner.retry().for_sections();
         let request = move || {
             let store = store.clone();

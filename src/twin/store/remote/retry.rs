@@ -200,6 +200,7 @@ impl<T> PendingRequest<T> {
 impl Drop for RequestRunner {
     /// Does not wait for running requests: that would panic on threads of a runtime.
     fn drop(&mut self) {
+        // Taken out, because shutting it down needs it by value.
         if let Some(runtime) = self.runtime.take() {
             runtime.shutdown_background();
         }
