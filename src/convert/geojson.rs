@@ -91,6 +91,7 @@ pub fn read(bytes: &[u8], origin: Option<[f64; 2]>) -> Result<MapFile, ConvertEr
         let feature = Feature { index, layer, properties, geometry, origin: origin.as_ref() };
         feature.read(&mut map, &mut nuplan)?;
     }
+    // After all features, because the parts of a lane may come in any order.
     nuplan.add_to(&mut map)?;
     if map.lanes.is_empty() && map.areas.is_empty() {
         return Err(ConvertError::new("features", "there is no lane and no area"));
@@ -172,6 +173,7 @@ impl Feature<'_> {
         Ok(Lane {
             id: self.id("id")?,
             kind,
+            // A positive distance is to the left.
             left: beside(&center, 0.5 * width_m),
             right: beside(&center, -0.5 * width_m),
             center,
@@ -192,6 +194,7 @@ impl Feature<'_> {
         };
         for rings in polygons {
             let rings = rings.as_array().map_or(&[][..], Vec::as_slice);
+            // An area has one outline: a hole would be filled in silence.
             let [outline] = rings else {
                 let message = "an area is one ring; split a polygon with holes";
                 return Err(self.wrong("geometry.coordinates", message));
@@ -210,6 +213,7 @@ impl Feature<'_> {
         let coordinates = &self.geometry["coordinates"];
         match self.geometry["type"].as_str() {
             Some("LineString") => self.points(coordinates),
+            // Of several lines, the order in which a lane passes them is unknown.
             Some("MultiLineString") if coordinates.as_array().is_some_and(|all| all.len() == 1) => {
                 self.points(&coordinates[0])
             }
@@ -222,6 +226,7 @@ impl Feature<'_> {
         let points = value.as_array().ok_or_else(wrong)?;
         let point = |value: &Value| {
             let axes = value.as_array()?;
+            // A missing height is 0.
             let axis = |at: usize| axes.get(at).map_or(Some(0.0), Value::as_f64);
             let point = [axes.first()?.as_f64()?, axes.get(1)?.as_f64()?, axis(2)?];
             Some(self.origin.map_or(point, |origin| origin.to_enu(point)))
@@ -271,6 +276,8 @@ impl NuPlan {
     fn add_to(self, map: &mut MapFile) -> Result<(), ConvertError> {
         let mut next: BTreeMap<String, Vec<String>> = BTreeMap::new();
         for lane in &self.lanes {
+            // A connector follows the lane that it exits from, and leads to the lane that it
+            // enters.
             if let Some([exit, entry]) = &lane.connects {
                 next.entry(exit.clone()).or_default().push(lane.fid.clone());
                 next.entry(lane.fid.clone()).or_default().push(entry.clone());
@@ -292,6 +299,7 @@ impl NuPlan {
                 Ok::<_, ConvertError>(along(center, edge.clone()))
             };
             let mut followers = next.get(&lane.fid).cloned().unwrap_or_default();
+            // A part of a map may name lanes outside of it.
             followers.retain(|fid| known.contains(&fid));
             map.lanes.push(Lane {
                 id: lane.fid.clone(),
@@ -326,6 +334,7 @@ impl Origin {
         let up = DVec3::new(cos_lat * cos_lon, cos_lat * sin_lon, sin_lat);
         Ok(Self {
             at_m: ecef_m([longitude_deg, latitude_deg, 0.0]),
+            // The transpose of a rotation is its inverse.
             enu_from_ecef: DMat3::from_cols(east, north, up).transpose(),
         })
     }
@@ -334,6 +343,8 @@ impl Origin {
     /// is as level as the earth.
     fn to_enu(&self, place: [f64; 3]) -> [f64; 3] {
         let [longitude, latitude, height_m] = place;
+        // The tangent plane is d² / 2 R above the ellipsoid, 8 cm at 1 km. So its own height is not
+        // used.
         let enu_m = self.enu_from_ecef * (ecef_m([longitude, latitude, 0.0]) - self.at_m);
         [enu_m.x, enu_m.y, height_m]
     }
@@ -343,6 +354,7 @@ impl Origin {
 fn ecef_m([longitude_deg, latitude_deg, height_m]: [f64; 3]) -> DVec3 {
     let (sin_lon, cos_lon) = longitude_deg.to_radians().sin_cos();
     let (sin_lat, cos_lat) = latitude_deg.to_radians().sin_cos();
+    // The radius of curvature across the meridian: N = a / sqrt(1 - e² sin² φ).
     let normal_m = EQUATOR_M / (1.0 - ECCENTRICITY_2 * sin_lat * sin_lat).sqrt();
     DVec3::new(
         (normal_m + height_m) * cos_lat * cos_lon,
@@ -356,6 +368,8 @@ fn beside(line: &[[f64; 3]], left_m: f64) -> Vec<[f64; 3]> {
     let point = |at: usize| DVec3::from_array(line[at]);
     let last = line.len().saturating_sub(1);
     let aside = |at: usize| {
+        // The direction is that from the point before to the point after; at an end, that of the
+        // only neighbour. Where it has no length, the point stays.
         let way = point((at + 1).min(last)) - point(at.saturating_sub(1));
         let left = DVec3::new(-way.y, way.x, 0.0).normalize_or_zero();
         (point(at) + left_m * left).to_array()
@@ -371,6 +385,7 @@ fn along(center: &[[f64; 3]], mut edge: Vec<[f64; 3]>) -> Vec<[f64; 3]> {
     };
     let [begin, end] = ends(center);
     let [first, last] = ends(&edge);
+    // The distances of like ends, against those of crossed ends.
     if first.distance(begin) + last.distance(end) > first.distance(end) + last.distance(begin) {
         edge.reverse();
     }
@@ -388,6 +403,8 @@ mod tests {
         // + 0.118 cos 5φ to the east, 111132.92 - 559.82 cos 2φ + 1.175 cos 4φ to the north
         // (American Practical Navigator, table 7).
         let [east_m, _, _] = origin.to_enu([10.001, 48.0, 0.0]);
+        // The formulas give 74,625.33 m for a degree to the east at 48° north, and 111,190.3 m to
+        // the north.
         assert!((east_m - 74.625_33).abs() < 1e-3, "{east_m}");
         let [_, north_m, up_m] = origin.to_enu([10.0, 48.001, 5.0]);
         assert!((north_m - 111.190_3).abs() < 1e-3, "{north_m}");

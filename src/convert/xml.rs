@@ -11,6 +11,7 @@ const DEPTH: usize = 256;
 /// Parses a text of at most so many elements and texts, after [`check`].
 pub(crate) fn parse(text: &str, nodes: u32) -> Result<roxmltree::Document<'_>, ConvertError> {
     check(text)?;
+    // Without a DTD there are no entities, which could expand without bound.
     let options =
         roxmltree::ParsingOptions { allow_dtd: false, nodes_limit: nodes, ..Default::default() };
     roxmltree::Document::parse_with_options(text, options)
@@ -21,11 +22,14 @@ pub(crate) fn parse(text: &str, nodes: u32) -> Result<roxmltree::Document<'_>, C
 pub(crate) fn check(text: &str) -> Result<(), ConvertError> {
     let mut rest = text;
     let mut depth = 0_usize;
+    // Counted only for a message, so that a sound text is passed once.
     let line = |rest: &str| 1 + text[..text.len() - rest.len()].matches('\n').count();
     while let Some(open) = rest.find('<') {
         rest = &rest[open..];
+        // The longer beginnings come first, because `<!` is that of a comment, too.
         let ends = [("<!--", "-->"), ("<![CDATA[", "]]>"), ("<?", "?>"), ("<!", ">")];
         if let Some((_, end)) = ends.iter().find(|(begin, _)| rest.starts_with(begin)) {
+            // It has no end, which the parser reports.
             let Some(at) = rest.find(end) else { return Ok(()) };
             rest = &rest[at + end.len()..];
             continue;
@@ -37,6 +41,7 @@ pub(crate) fn check(text: &str) -> Result<(), ConvertError> {
         }
         let tag = &rest[..length];
         if tag.starts_with("</") {
+            // The parser refuses what closes more than was opened.
             depth = depth.saturating_sub(1);
         } else if !tag.ends_with("/>") {
             depth += 1;
@@ -53,6 +58,7 @@ pub(crate) fn check(text: &str) -> Result<(), ConvertError> {
 /// The number of attributes of the tag at the start of a text, and its length in bytes.
 fn tag(text: &str) -> (usize, usize) {
     let mut attributes = 0;
+    // Within quotes, `=` and `>` are text.
     let mut quote = None;
     for (at, byte) in text.bytes().enumerate() {
         match (quote, byte) {
@@ -77,6 +83,7 @@ mod tests {
         let error = check(&format!("<a>\n<b{attributes}/></a>")).unwrap_err();
         assert_eq!((error.place.as_str(), error.message.contains("30000")), ("line 2", true));
         let quoted = "=".repeat(1000);
+        // Neither a comment nor a quoted text has attributes.
         assert_eq!(check(&format!("<!-- {quoted} --><a b='>{quoted}'/>")), Ok(()));
     }
 

@@ -142,6 +142,8 @@ fn chosen_shift(
             ));
             Ok((offset.xy_m, Some([-x, -y])))
         }
+        // Neither the file's own coordinates nor its offset are near the origin: the error proposes
+        // one.
         (None, _) => {
             let bounds = [0, 1].map(|axis| {
                 let values = places.iter().map(|place| place[axis]);
@@ -150,11 +152,14 @@ fn chosen_shift(
                     values.fold(-f64::INFINITY, f64::max),
                 ]
             });
+            // No origin brings both ends near.
             if bounds.iter().any(|[least, most]| most - least > 2.0 * most_m) {
                 let message =
                     format!("its roads are more than {} m apart; cut the map", 2.0 * most_m);
                 return Err(ConvertError::new("OpenDRIVE", message));
             }
+            // The corner in the south-west, rounded down to a kilometre; for a larger map, its
+            // middle.
             let [east, north] = bounds.map(|[least, most]| {
                 if most - least < most_m {
                     (least / 1000.0).floor() * 1000.0
@@ -174,6 +179,8 @@ fn chosen_shift(
             let offset = offset.filter(|_| is_local);
             offset.map(check_heading).transpose()?;
             let [x, y] = offset.map_or([0.0, 0.0], |offset| offset.xy_m);
+            // Coordinates with the offset are those of the projection, from which those of the
+            // origin are subtracted.
             let shift_m = [x - east, y - north];
             if !is_near(shift_m) {
                 let message = format!(
@@ -197,6 +204,7 @@ fn check_heading(offset: &Offset) -> Result<(), ConvertError> {
 
 /// The text with other coordinates.
 fn moved(text: &str, document: &Document<'_>, shift_m: [f64; 2]) -> String {
+    // Only the numbers are replaced, so that the rest of the text stays as it is, byte for byte.
     let mut edits: Vec<(std::ops::Range<usize>, String)> = Vec::new();
     for node in document.descendants().filter(is_place) {
         for attribute in node.attributes() {
@@ -213,6 +221,7 @@ fn moved(text: &str, document: &Document<'_>, shift_m: [f64; 2]) -> String {
     edits.sort_by_key(|(range, _)| range.start);
     let mut moved = String::with_capacity(text.len());
     let mut at = 0;
+    // Invariant: `moved` has the text up to `at`.
     for (range, value) in edits {
         moved.push_str(&text[at..range.start]);
         moved.push_str(&value);
@@ -233,14 +242,17 @@ fn anchor_from(
     let projection = node.text()?.trim();
     let words: Vec<&str> = projection.split_whitespace().collect();
     let value = |key: &str| words.iter().find_map(|word| word.strip_prefix(key)?.strip_prefix('='));
+    // The ellipsoids WGS84 and GRS80 differ by 0.1 mm.
     let is_wgs84 = value("+datum").is_none_or(|datum| datum == "WGS84")
         && value("+ellps").is_none_or(|ellipsoid| matches!(ellipsoid, "WGS84" | "GRS80"));
     let projection = match value("+proj") {
         Some("utm") => {
             let zone: u32 = value("+zone")?.parse().ok().filter(|zone| (1..=60).contains(zone))?;
+            // EPSG numbers UTM zones from 32601 in the north, and from 32701 in the south.
             format!("EPSG:{}", if words.contains(&"+south") { 32_700 } else { 32_600 } + zone)
         }
         Some(_) => return None,
+        // Without `+proj` it may be a code, such as EPSG:32632.
         None => projection.to_uppercase(),
     };
     let altitude_m = offset.map_or(0.0, |offset| offset.z_m);

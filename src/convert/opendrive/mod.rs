@@ -87,8 +87,10 @@ fn lane_from(network: &RoadNetwork, lane: &xodr::Lane) -> Result<Option<Lane>, C
     let Some(kind) = lane_kind(lane.kind) else { return Ok(None) };
     let points = lane.center.points();
     let tangents = lane.center.tangents();
+    // If there are fewer widths than points, the last one goes on.
     let width_m =
         |at: usize| lane.widths.get(at).or(lane.widths.last()).copied().unwrap_or(lane.width);
+    // The widest place decides, so that a lane that only begins as a wedge is kept.
     let widest_m = (0..points.len()).map(width_m).fold(0.0, f32::max);
     if points.len() < 2 || widest_m < NARROW_M {
         return Ok(None);
@@ -107,6 +109,7 @@ fn lane_from(network: &RoadNetwork, lane: &xodr::Lane) -> Result<Option<Lane>, C
             return Err(ConvertError::new(format!("lane {id}"), message));
         }
         let middle = DVec3::from_array(array(*point));
+        // Across the road, if its place is known; else across the lane's own middle.
         let left_m = across_lane(network, lane, *point).unwrap_or_else(|| {
             let tangent = tangents.get(at).copied().unwrap_or_default();
             DVec3::new(-f64::from(tangent.y), f64::from(tangent.x), 0.0).normalize_or_zero()
@@ -119,12 +122,15 @@ fn lane_from(network: &RoadNetwork, lane: &xodr::Lane) -> Result<Option<Lane>, C
         left.push((middle + aside_m).to_array());
         right.push((middle - aside_m).to_array());
     }
+    // The file's points are in the order of s. A lane against it is turned, so that its lines run
+    // with the traffic, and its left is then its right.
     if lane.direction == Direction::Backward {
         center.reverse();
         left.reverse();
         right.reverse();
         std::mem::swap(&mut left, &mut right);
     }
+    // A lane of a map has one limit: the one where the lane begins.
     let limit_mps = network.speed_limit_at(lane.id, 0.0).and_then(|limit| match limit {
         SpeedLimit::Max(mps) if mps > 0.1 => Some(f64::from(mps)),
         _ => None,
@@ -152,6 +158,7 @@ fn across_lane(network: &RoadNetwork, lane: &xodr::Lane, point: Point) -> Option
 pub(crate) fn across_road(network: &RoadNetwork, road: RoadId, s: f64) -> Option<DVec3> {
     /// Far enough apart that rounding to f32 does not matter.
     const ASIDE_M: f64 = 10.0;
+    // Two points 20 m apart: rounding by 1 mm turns their direction by 5e-5 rad at most.
     let [left, right] =
         [ASIDE_M, -ASIDE_M].map(|t| network.road_point(RoadPosition { road, s, t }));
     let across = left? - right?;

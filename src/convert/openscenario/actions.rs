@@ -82,6 +82,7 @@ pub(super) fn speed_match(
 ) -> Result<Option<Act>, ConvertError> {
     let Some(target) = speed.find("SpeedActionTarget")? else { return Ok(None) };
     let target = target.only_child()?;
+    // Otherwise the speed of one moment is the aim, which `speed_change` reads.
     if target.name() != "RelativeTargetSpeed" || !target.find_flag("continuous")?.unwrap_or(false) {
         return Ok(None);
     }
@@ -96,6 +97,7 @@ pub(super) fn speed_match(
         return Err(target.wrong(&format!("there is no other entity {name:?}")));
     }
     let value = target.number("value")?;
+    // The speed is factor * v + delta, with the speed v of the other.
     let (factor, delta_mps) = match target.text("speedTargetValueType")?.as_str() {
         "delta" => (1.0, value),
         "factor" => (value, 0.0),
@@ -128,6 +130,7 @@ pub(super) fn speed_change(
     }
     let dynamics = speed.need("SpeedActionDynamics")?;
     let profile = dynamics_from(&dynamics)?;
+    // Over a distance s, only a constant acceleration has a simple course: v² = v0² + 2 a s.
     match (profile.over_m, profile.shape) {
         (None, _) => {}
         (Some(_), ShapeSection::Linear) => {
@@ -151,9 +154,11 @@ fn relative_speed_mps(target: &Element<'_>, context: &Context<'_>) -> Result<f64
     let Some(entity) = context.entities.get(&name) else {
         return Err(target.wrong(&format!("there is no entity {name:?}")));
     };
+    // In the story, the speed of the other is known only when the scenario runs.
     if context.is_in_story {
         return Err(target.wrong("is read in <Init> only; give a speed"));
     }
+    // `Init` reads this action again once the speed of the other is known.
     if context.waiting.contains(&name) || !entity.script.is_empty() {
         return Err(target.wrong(&format!("{name:?} has no speed yet; give it one without a ramp")));
     }
@@ -169,10 +174,12 @@ fn dynamics_from(dynamics: &Element<'_>) -> Result<ProfileSection, ConvertError>
     let shape = shape_from(dynamics)?;
     let dimension = dynamics.text("dynamicsDimension")?;
     let value = dynamics.number("value")?;
+    // A rate has no sign: the aim decides whether the value rises or falls.
     let extent = value.abs();
     if dimension != "rate" && value < 0.0 {
         return Err(dynamics.wrong(&format!("value={value:?}; write 0 or more")));
     }
+    // A change within 10 ms, a step of the simulation, or within 1 cm is immediate.
     if shape == ShapeSection::Step || (dimension != "rate" && extent < 0.01) {
         return Ok(NOWHERE);
     }
@@ -239,6 +246,8 @@ fn lane_change(
             let entity = context.entities.get(&of);
             let entity =
                 entity.ok_or_else(|| target.wrong(&format!("there is no entity {of:?}")))?;
+            // The lane is that after the changes that were read so far. The direction is that of
+            // the start.
             let spot = entity.place.and_then(|place| place.spot);
             let (Some(lane), Some(spot)) = (entity.lane, spot) else {
                 return Err(target.wrong(&format!("{of:?} is on no lane")));
@@ -250,6 +259,8 @@ fn lane_change(
             } else if of != name && context.is_in_story {
                 target.note(&format!("counts from lane {lane}, on which {of:?} is then"));
             }
+            // A relative lane counts to the left of the vehicle, while ids count to the left of the
+            // road.
             shifted_id(lane, if spot.is_up { count } else { -count })
         }
         _ => return Err(target.unread()),
@@ -301,17 +312,20 @@ pub(super) fn trajectory_line(
     if let Some(mode) = follow.find("TrajectoryFollowingMode")? {
         mode.expect("followingMode", &["position", "follow"])?;
     }
+    // In 1.0 the action itself has the trajectory, later a <TrajectoryRef> in it.
     let holder = follow.find("TrajectoryRef")?.unwrap_or_else(|| follow.clone());
     let trajectory = match holder.find("CatalogReference")? {
         Some(reference) => context.catalogs.entry(&reference)?,
         None => catalogs::declared(&holder.need("Trajectory")?)?,
     };
     let mut line = trajectory::line_from(&trajectory, context)?;
+    // An entry of a catalog is in another file, which the check of the scenario does not visit.
     if holder.find("CatalogReference")?.is_some() {
         trajectory.check_read()?;
     }
     let reference = follow.find("TimeReference")?.map(|reference| reference.only_child());
     let Some(reference) = reference.transpose()? else {
+        // Without a time reference, the times of the points do not count.
         line.times_s = None;
         return Ok(line);
     };

@@ -26,6 +26,7 @@ const SHORTEST_M: f64 = 100.0;
 
 /// The ego, which starts where its entity does.
 pub(super) fn ego_section(ego: &Entity, ledger: &Ledger) -> EgoSection {
+    // The ego's pose is that of its rear axle.
     let pose = ego.place.map(|place| pose_section(&place.shifted(ego.rear_m, 0.0)));
     let start =
         pose.map(|pose| StartSection { trajectory: None, station_m: None, pose: Some(pose) });
@@ -72,6 +73,8 @@ impl Builder<'_, '_> {
         let place = place.ok_or("has no position in <Init>; add a <TeleportAction>")?;
         let time_s = self.end_s.unwrap_or(USUAL_S);
         let fastest_mps = entity.fastest_mps.max(entity.begin_mps);
+        // As far as the actor can come until the end. Of a standing actor, 100 m are left for its
+        // events.
         let length_m = (fastest_mps * time_s + SHORTEST_M).min(LONGEST_M);
         let mut actor = ActorSection {
             name: entity.name.clone(),
@@ -102,6 +105,7 @@ impl Builder<'_, '_> {
                     ..PathSection::default()
                 });
             }
+            // It never moves, so that a pose is enough.
             None if entity.begin_mps == 0.0 && !moves => {
                 let [ahead_m, left_m, _] = entity.center_m;
                 actor.stand = Some(pose_section(&place.shifted(ahead_m, left_m)));
@@ -146,10 +150,12 @@ impl Builder<'_, '_> {
     fn ahead(&self, drive: &mut Drive<'_>) -> Result<PathSection, String> {
         let Drive { entity, place, length_m, .. } = *drive;
         let [ahead_m, left_m, _] = entity.center_m;
+        // The path begins at the box's middle, which is this far from the reference point.
         let lanes =
             self.context.roads.as_ref().zip(place.spot).map(|(roads, spot)| {
                 (spot, roads.line(spot, length_m + ahead_m.abs(), &entity.route))
             });
+        // Less than two points are no line.
         let Some((spot, line)) = lanes.filter(|(_, line)| line.points.len() >= 2) else {
             if let Some(reason) = &self.context.missing_roads {
                 return Err(format!("drives on roads that were not read: {reason}"));
@@ -165,9 +171,11 @@ impl Builder<'_, '_> {
             });
         };
         self.note_forks(entity, &line);
+        // An offset to the left of the road is to the right of an actor that drives against s.
         let offset_m = side(spot) * spot.at.offset + left_m;
         let path = PathSection {
             points: Some(line.points.clone()),
+            // The station of a box behind the reference point would be negative, which no path has.
             station_m: ahead_m.max(0.0).min(line_length_m(&line.points)),
             offset_m: some_offset(offset_m),
             speed: entity.begin_mps,
@@ -182,6 +190,7 @@ impl Builder<'_, '_> {
             let roads = line.forks.join("; ");
             self.note(entity, &format!("takes the straightest way at forks: {roads}"));
         }
+        // Within 1 m, because a simplified line is a little shorter.
         if line.is_cut && line_length_m(&line.points) + 1.0 >= LONGEST_M {
             self.note(entity, "stands after 20 km");
         }
@@ -199,17 +208,21 @@ impl Builder<'_, '_> {
         let [.., before, last] = points.as_slice() else {
             return Err("has a trajectory of less than two points".into());
         };
+        // The direction of the last piece decides with which lane it goes on.
         let (last, way) = (*last, [last[0] - before[0], last[1] - before[1]]);
         let yaw_rad = way[1].atan2(way[0]);
         let place = Place { xyz_m: last, yaw_rad, spot: None };
         let roads = self.context.roads.as_ref();
         let spot = roads.and_then(|roads| roads.spot(roads.lane_near(last)?, yaw_rad));
+        // The lanes from before the trajectory are left in any case.
         drive.lanes = None;
         match roads.zip(spot) {
             Some((roads, spot)) => {
                 let lanes = roads.line(spot, drive.length_m, &drive.entity.route);
                 self.note_forks(drive.entity, &lanes);
                 let left_m = side(spot) * spot.at.offset;
+                // The lanes begin where the trajectory ends, so that their first point is there
+                // already.
                 points.extend(moved_left(&lanes.points, left_m).into_iter().skip(1));
                 drive.lanes = Some((spot, lanes));
             }
@@ -240,6 +253,8 @@ impl Builder<'_, '_> {
                     then.push(ActionSection::ArriveTogether((**section).clone()))
                 }
                 Act::Offset(profile) => {
+                    // A file's offset is to the left of the road, the scenario's to the left of the
+                    // actor.
                     let sign = drive.lanes.as_ref().map_or(1.0, |(spot, _)| side(*spot));
                     let to = sign * profile.to + left_m;
                     then.push(ActionSection::OffsetProfile(ProfileSection { to, ..*profile }));
@@ -259,6 +274,8 @@ impl Builder<'_, '_> {
                     let sign = side(*spot);
                     let spot = *spot;
                     let points = target.points.clone();
+                    // First the course changes, and then the offset, which is relative to the new
+                    // course.
                     then.push(ActionSection::Path(CourseSection {
                         points: Some(points),
                         ..CourseSection::default()
@@ -276,6 +293,7 @@ impl Builder<'_, '_> {
                         at_m: Some(path.station_m),
                         ..CourseSection::default()
                     }));
+                    // It is at the new place at once, and does not drive there.
                     then.push(step_aside(path.offset_m.unwrap_or(0.0)));
                 }
                 Act::Trajectory(Line { times_s: Some(_), .. }) => {
@@ -301,6 +319,7 @@ impl Builder<'_, '_> {
                 Act::Remove => then.push(ActionSection::Remove {}),
             }
         }
+        // An act makes two actions at most. More come from the events that it ends.
         if then.len() > limits::ACTIONS {
             let most = limits::ACTIONS;
             return Err(format!(
@@ -348,6 +367,7 @@ fn line_length_m(points: &[[f64; 3]]) -> f64 {
 fn moved_left(points: &[[f64; 3]], left_m: f64) -> Vec<[f64; 3]> {
     let last = points.len().saturating_sub(1);
     let moved = (0..points.len()).map(|index| {
+        // The direction at a point is that from the point before to the point after.
         let [from, to] = [points[index.saturating_sub(1)], points[(index + 1).min(last)]];
         let ahead = DVec2::new(to[0] - from[0], to[1] - from[1]).normalize_or_zero();
         let [x, y, z] = points[index];

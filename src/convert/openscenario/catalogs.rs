@@ -35,6 +35,7 @@ pub(super) fn read_texts(
     node: Node<'_, '_>,
     settings: &Settings,
 ) -> Result<Vec<CatalogText>, ConvertError> {
+    // Catalogs to which nothing refers need not exist.
     let is_used = node.descendants().any(|node| node.has_tag_name("CatalogReference"));
     let Some(locations) = root.find("CatalogLocations")? else { return Ok(Vec::new()) };
     let dir = settings.directory.as_ref();
@@ -46,6 +47,7 @@ pub(super) fn read_texts(
         let path = directory.text("path")?;
         if is_used {
             let dir = dir.ok_or_else(|| directory.wrong("needs the directory of the file"))?;
+            // Files that were written on Windows have backslashes.
             directories.insert(dir.join(path.replace('\\', "/")));
         }
     }
@@ -55,6 +57,7 @@ pub(super) fn read_texts(
         for path in xml_files(&directory) {
             let text = read_text(&path)?;
             bytes += text.len();
+            // The sum is bounded, because such a directory may hold any number of files.
             if texts.len() == FILES || bytes > TEXT_BYTES {
                 let place = format!("{}", directory.display());
                 let message = format!("at most {FILES} files, {TEXT_BYTES} bytes are read");
@@ -79,6 +82,7 @@ impl<'a> Catalogs<'a> {
     pub(super) fn new(documents: &'a [(Document<'a>, &'a str)], ledger: &'a Ledger) -> Self {
         let mut entries = BTreeMap::new();
         for (index, (document, label)) in documents.iter().enumerate() {
+            // Index 0 is the scenario itself.
             let source = Source { index: index + 1, label };
             let catalogs = document.root_element().children();
             for catalog in catalogs.filter(|node| node.has_tag_name("Catalog")) {
@@ -86,6 +90,7 @@ impl<'a> Catalogs<'a> {
                 for entry in catalog.children().filter(Node::is_element) {
                     let key =
                         (name.to_owned(), entry.attribute("name").unwrap_or_default().to_owned());
+                    // Of two entries of one name, the first one in the order of the files counts.
                     entries.entry(key).or_insert((entry, source));
                 }
             }
@@ -104,6 +109,7 @@ impl<'a> Catalogs<'a> {
             );
             return Err(reference.wrong(&message));
         };
+        // The entry may use the parameters of the place that refers to it.
         let entry = Element::new(*node, reference.parameters().clone(), self.ledger, *source);
         let entry = declared(&entry)?;
         let mut parameters = BTreeMap::clone(entry.parameters());
@@ -138,6 +144,7 @@ pub(super) fn declared_with<'a>(
     section.only(&["ParameterDeclaration"])?;
     let mut parameters: Parameters = element.parameters().clone();
     for declaration in section.children() {
+        // A declaration may use those before it.
         let declaration = declaration.with_parameters(parameters.clone());
         declaration.only(&["ConstraintGroup"])?;
         // A name with its sign is no reference.
@@ -156,6 +163,7 @@ fn check_constraints(declaration: &Element<'_>, value: &str) -> Result<(), Conve
     if groups.peek().is_none() {
         return Ok(());
     }
+    // Of a group all constraints must hold, and one such group is enough.
     let mut meets_any = false;
     for group in groups {
         group.only(&["ValueConstraint"])?;
@@ -184,6 +192,7 @@ pub(super) fn compare(rule: &str, value: &str, bound: &str) -> Option<bool> {
         "notEqualTo" => return Some(!is_same(value, bound)),
         _ => {}
     }
+    // Only numbers can be compared by size.
     let [value, bound]: [f64; 2] = [value.trim().parse().ok()?, bound.trim().parse().ok()?];
     match rule {
         "greaterThan" => Some(value > bound),
@@ -195,6 +204,7 @@ pub(super) fn compare(rule: &str, value: &str, bound: &str) -> Option<bool> {
 }
 
 fn is_same(value: &str, bound: &str) -> bool {
+    // As numbers if both are: `1` and `1.0` are equal.
     match (value.trim().parse::<f64>(), bound.trim().parse::<f64>()) {
         (Ok(value), Ok(bound)) => value == bound,
         _ => value == bound,

@@ -42,6 +42,7 @@ pub(super) fn group_condition(
 }
 
 pub(super) fn join_all(mut parts: Vec<ConditionSection>) -> ConditionSection {
+    // The default condition always holds, so that it changes nothing in `all`.
     parts.retain(|part| *part != ConditionSection::default());
     match parts.len() {
         0 => ConditionSection::default(),
@@ -54,6 +55,7 @@ pub(super) fn join_any(mut parts: Vec<ConditionSection>) -> ConditionSection {
     match parts.len() {
         0 => ConditionSection::default(),
         1 => parts.remove(0),
+        // If one part always holds, the whole does.
         _ if parts.contains(&ConditionSection::default()) => ConditionSection::default(),
         _ => ConditionSection { any: parts, ..ConditionSection::default() },
     }
@@ -104,6 +106,7 @@ fn by_value(
         "SimulationTimeCondition" => {
             let value_s = kind.number("value")?;
             let rule = kind.text("rule")?;
+            // Files write a time that equals 0 for what begins with the scenario.
             let is_start = rule == "equalTo" && value_s == 0.0;
             if falls || !(is_start || matches!(rule.as_str(), "greaterThan" | "greaterOrEqual")) {
                 return Err(kind.wrong("is read from a time on: greaterThan or greaterOrEqual"));
@@ -113,6 +116,8 @@ fn by_value(
                 let time_s = (value_s.max(0.0)) + delay_s;
                 return Ok(ConditionSection { time_s: Some(time_s), ..Default::default() });
             }
+            // Evaluated later, the time may have passed already. Then there is no edge, so that the
+            // edge must be kept.
             let part = ConditionSection { time_s: Some(value_s.max(0.0)), ..Default::default() };
             Ok(with_edge(part, edge, delay_s))
         }
@@ -131,6 +136,8 @@ fn by_value(
             let name = name.or_else(|_| kind.raw("storyboardElementRef"))?;
             // A name may be a path.
             let name = name.rsplit("::").next().unwrap_or_default();
+            // Its triggers are known only after all stories are read: `elements::resolve` puts them
+            // here.
             Ok(ConditionSection {
                 after: Some(format!("{PENDING}{element}{PENDING}{name}{PENDING}{}", kind.line())),
                 phase: Some(phase),
@@ -162,6 +169,8 @@ fn parameter_condition(
     if !sets.is_empty() {
         let is_set = |value: &str| super::catalogs::compare(&rule, value, &bound) == Some(true);
         let is_plain = sets.iter().all(|(_, value, event)| is_set(value) && !event.is_empty());
+        // It does not hold at first, and each set makes it hold: so it holds from the first of
+        // these events on.
         if holds != Some(false) || !is_plain {
             return Err(
                 kind.wrong("is read if it holds from the first event on that sets the value")
@@ -175,6 +184,7 @@ fn parameter_condition(
         return Ok(join_any(parts.collect()));
     }
     match holds {
+        // It holds from the start on, so that only the delay remains.
         Some(true) => Ok(ConditionSection {
             time_s: (delay_s > 0.0).then_some(delay_s),
             ..ConditionSection::default()
@@ -257,6 +267,7 @@ fn measure_from(
                 return Err(other.unread());
             }
             let measure = to_entity((kind, &other), body(Distance, name, context), context)?;
+            // Boxes touch if the free distance between them is 0.
             Ok(MeasureSection { free: Some(true), below: Some(0.0), ..measure })
         }
         "TraveledDistanceCondition" => {
@@ -309,6 +320,7 @@ fn time_measure(
 ) -> Result<MeasureSection, ConvertError> {
     let along_route = kind.find_flag("alongRoute")?;
     let is_straight = match kind.find_text("relativeDistanceType")?.as_deref() {
+        // Files of 1.0 have `alongRoute` and no type.
         None => along_route != Some(true),
         Some("longitudinal") => false,
         Some("cartesianDistance" | "euclidianDistance") => true,
@@ -322,6 +334,7 @@ fn time_measure(
         _ => measure.on_course,
     };
     let straight = is_straight.then_some(true);
+    // A straight distance follows no course.
     let on_course = on_course.filter(|_| !is_straight);
     bounded(kind, MeasureSection { straight, on_course, ..measure })
 }
@@ -336,6 +349,7 @@ fn to_entity(
     let Some(to_ahead_m) = context.ahead_m(&other) else {
         return Err(kind.wrong(&format!("there is no entity {other:?}")));
     };
+    // A straight distance is the same in all coordinate systems.
     let is_along = measure.quantity != QuantitySection::Distance;
     let is_on_road = match kind.find_text("coordinateSystem")?.as_deref() {
         None | Some("entity") => false,
@@ -355,6 +369,7 @@ fn to_entity(
 fn bounded(kind: &Element<'_>, measure: MeasureSection) -> Result<MeasureSection, ConvertError> {
     let value = kind.number("value")?;
     match kind.text("rule")?.as_str() {
+        // The two rules differ only where a value is exactly the bound.
         "greaterThan" | "greaterOrEqual" => Ok(MeasureSection { above: Some(value), ..measure }),
         "lessThan" | "lessOrEqual" => Ok(MeasureSection { below: Some(value), ..measure }),
         other => Err(kind.wrong(&format!("rule={other:?} is not read; a value is never exact"))),

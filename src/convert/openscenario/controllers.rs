@@ -37,6 +37,8 @@ pub(super) fn assigned(node: roxmltree::Node<'_, '_>) -> Vec<String> {
     let is_assigned = |node: &roxmltree::Node<'_, '_>| node.has_tag_name("AssignControllerAction");
     let mut names = Vec::new();
     for action in node.descendants().filter(is_assigned) {
+        // In `Init` the entity is that of the <Private> around it; in a story, all actors of the
+        // group.
         let around = action.ancestors().find_map(|node| match node.tag_name().name() {
             "Private" => Some(vec![node]),
             "ManeuverGroup" => {

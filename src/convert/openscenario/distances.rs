@@ -117,6 +117,8 @@ pub(super) fn place_at_distance(
     }
     // The follower's speed: an entity at a distance without bounds is as fast as the other.
     let gap_m = section.gap_m.unwrap_or(section.headway_s? * other.begin_mps);
+    // On a bent road, a way along the road changes the distance by less than its length. Each round
+    // moves by what is still missing.
     for _ in 0..100 {
         let missing_m = missing_m(section, gap_m, (entity, &place), (other, &to));
         if missing_m.abs() < NEAR_M {
@@ -142,13 +144,17 @@ fn missing_m(
         let [x, y, _] = place.shifted(ahead_m, left_m).xyz_m;
         DVec2::new(x, y)
     };
+    // Half of the extent of a box in the direction `ahead`: (l |cos a| + w |sin a|) / 2, with the
+    // angle a between the two.
     let half_m = |entity: &Entity, place: &Place| {
         let [length_m, width_m, _] = entity.size;
         let along = forward(place.yaw_rad);
         0.5 * (length_m * along.dot(ahead).abs() + width_m * along.perp_dot(ahead).abs())
     };
+    // Positive if the other is ahead.
     let way_m = (reference(other, to) - reference(entity, place)).dot(ahead);
     let halves_m = if is_free { half_m(entity, place) + half_m(other, to) } else { 0.0 };
+    // Without a side, the one on which it is now.
     let is_behind = match section.side {
         Some(side) => side == SideSection::Behind,
         None => way_m >= 0.0,
@@ -160,6 +166,7 @@ fn missing_m(
 /// A place so far forward along its lane, or straight on.
 fn moved(place: &Place, way_m: f64, roads: Option<&RoadMap>) -> Option<Place> {
     let Some((roads, spot)) = roads.zip(place.spot) else { return Some(place.shifted(way_m, 0.0)) };
+    // The angle to the road stays the same.
     let before_rad = roads.heading_rad(spot.at);
     let way_m = if spot.is_up { way_m } else { -way_m };
     let at = roads.moved(spot.at, way_m, false).ok()?;
@@ -183,6 +190,7 @@ pub(super) fn arrival(
         if tolerance_m.is_some_and(|tolerance_m| tolerance_m < 0.0) {
             return Err(action.wrong(&format!("{name} is below 0")));
         }
+        // A tolerance of 0 is none.
         Ok(tolerance_m.filter(|tolerance_m| *tolerance_m > 0.0))
     };
     let mut section = ArriveTogetherSection {
@@ -218,6 +226,7 @@ pub(super) fn arrival(
         steady.only(&[])?;
         section.steady_m = match (steady.name(), section.speed) {
             ("TargetDistanceSteadyState", _) => Some(steady.number("distance")?),
+            // At a constant speed v, the last t seconds are v t metres.
             ("TargetTimeSteadyState", Some(speed)) => Some(speed * steady.number("time")?),
             _ => return Err(steady.wrong("a time is read with an absolute speed only")),
         };

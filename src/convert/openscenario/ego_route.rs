@@ -89,11 +89,14 @@ fn up_to(points: &[[f64; 3]], point: [f64; 3]) -> Option<Vec<[f64; 3]>> {
     let flat = |point: [f64; 3]| DVec2::new(point[0], point[1]);
     let places = points.windows(2).enumerate().map(|(index, pair)| {
         let (from, way) = (flat(pair[0]), flat(pair[1]) - flat(pair[0]));
+        // The foot of the point on this piece, as a share of its length. `max` is for two equal
+        // points, where 0 / 0 would be NaN.
         let t = (flat(point) - from).dot(way) / way.length_squared().max(1e-12);
         let t = t.clamp(0.0, 1.0);
         ((from + t * way).distance(flat(point)), index, t)
     });
     let places: Vec<(f64, usize, f64)> = places.collect();
+    // It starts from `BESIDE_M`: if all places are farther away, none is found below.
     let nearest_m = places.iter().map(|(beside_m, ..)| *beside_m).fold(BESIDE_M, f64::min);
     // The first time that it passes: the road may lead around.
     let (_, index, t) = *places.iter().find(|(beside_m, ..)| *beside_m <= nearest_m + LAP_M)?;
@@ -111,9 +114,12 @@ mod tests {
     #[test]
     fn a_route_ends_beside_its_last_way_point() {
         let line = [[0.0, 0.0, 0.0], [100.0, 0.0, 2.0], [100.0, 100.0, 2.0]];
+        // The point is 3 m beside the second piece, at 40 of its 100 m.
         let beside = up_to(&line, [103.0, 40.0, 0.0]).unwrap();
         assert_eq!(beside, [line[0], line[1], [100.0, 40.0, 2.0]]);
+        // It is 64 m from the nearest point of the line.
         assert_eq!(up_to(&line, [-50.0, 40.0, 0.0]), None);
+        // Both laps pass the point, and the first one counts.
         let lap = [[0.0; 3], [100.0, 0.0, 0.0], [100.0, 50.0, 0.0], [0.0, 50.0, 0.0]];
         let twice: Vec<[f64; 3]> = [lap, lap].concat();
         assert_eq!(up_to(&twice, [70.0, 0.0, 0.0]).unwrap(), [lap[0], [70.0, 0.0, 0.0]]);

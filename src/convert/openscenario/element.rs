@@ -37,6 +37,7 @@ impl<'a> Element<'a> {
         ledger: &'a Ledger,
         source: Source<'a>,
     ) -> Self {
+        // Whatever is made into an element counts as read; its attributes count one by one.
         ledger.element(source.index, node);
         Self { node, parameters, ledger, source }
     }
@@ -67,6 +68,7 @@ impl<'a> Element<'a> {
 
     /// The child elements.
     pub(super) fn children(&self) -> impl Iterator<Item = Self> + use<'a> {
+        // The iterator owns a copy, so that it borrows nothing of `self`.
         let own = self.clone();
         self.node.children().filter(Node::is_element).map(move |node| own.with_node(node))
     }
@@ -83,6 +85,7 @@ impl<'a> Element<'a> {
     /// The only child with a name; `None` without one.
     pub(super) fn find(&self, name: &str) -> Result<Option<Self>, ConvertError> {
         let mut found = self.all(name);
+        // A second one is looked for, because it would be ignored in silence otherwise.
         let first = found.next();
         match found.next() {
             None => Ok(first),
@@ -107,6 +110,7 @@ impl<'a> Element<'a> {
 
     /// Refuses children of other names.
     pub(super) fn only(&self, known: &[&str]) -> Result<(), ConvertError> {
+        // To look at a child marks it as read, but neither its attributes nor what is in it.
         match self.children().find(|child| !known.contains(&child.name())) {
             None => Ok(()),
             Some(unknown) => Err(unknown.unread()),
@@ -146,6 +150,7 @@ impl<'a> Element<'a> {
 
     /// Tells something about this element.
     pub(super) fn note(&self, message: &str) {
+        // In the form of a mistake, so that it has the place, too.
         self.ledger.note(self.wrong(message).to_string());
     }
 
@@ -162,6 +167,7 @@ impl<'a> Element<'a> {
 
     /// An attribute with its parameters put in; `None` without it.
     pub(super) fn find_text(&self, name: &str) -> Result<Option<String>, ConvertError> {
+        // The ledger names an attribute by its index in the element.
         let found = self.node.attributes().enumerate().find(|(_, one)| one.name() == name);
         let Some((index, attribute)) = found else { return Ok(None) };
         self.ledger.attribute(self.source.index, self.node, index);
@@ -188,6 +194,7 @@ impl<'a> Element<'a> {
     /// An attribute that is a finite number; `None` without it.
     pub(super) fn find_number(&self, name: &str) -> Result<Option<f64>, ConvertError> {
         let Some(text) = self.find_text(name)? else { return Ok(None) };
+        // `inf` and `NaN` are numbers for the parser of Rust.
         let number: Option<f64> = text.parse().ok().filter(|number: &f64| number.is_finite());
         number
             .map(Some)
@@ -208,6 +215,7 @@ impl<'a> Element<'a> {
     /// An attribute that is a whole number.
     pub(super) fn whole(&self, name: &str) -> Result<i32, ConvertError> {
         let value = self.number(name)?;
+        // Within 1e9 the cast to i32 is exact.
         if value.fract() == 0.0 && value.abs() < 1e9 {
             Ok(value as i32)
         } else {

@@ -41,6 +41,7 @@ impl Elements {
         context: &Context<'_>,
         element: &Element<'_>,
     ) -> Result<String, ConvertError> {
+        // A trigger belongs to an actor. A mark has no actions, so that any actor will do.
         let actor = context.entities.iter().find(|(name, _)| **name != context.ego);
         // Without an actor, nothing can wait for it.
         let Some((key, entity)) = actor else { return Ok(String::new()) };
@@ -76,6 +77,7 @@ pub(super) fn resolve(
     // Marks that nothing waits for may have conditions that were not read.
     let mut resolved = Vec::new();
     for (key, mut mark) in marks {
+        // The error counts only if something waits for the mark.
         let error = resolve_condition(&mut mark.when, &elements).err();
         resolved.push((key, mark, error));
     }
@@ -93,6 +95,7 @@ pub(super) fn resolve(
     let mut conditions = Vec::new();
     for (group, mut when) in ends {
         let resolved = resolve_condition(&mut when, &elements);
+        // The groups become the parts of one condition, which counts as well.
         let is_small = || match count(&when) + conditions.iter().map(count).sum::<usize>() {
             sum if sum + 1 < limits::CONDITIONS => Ok(()),
             _ => Err(group.wrong("waits for more events than a condition may have parts")),
@@ -106,6 +109,8 @@ pub(super) fn resolve(
             Err(error) => super::stop::leave_out(&group, error)?,
         }
     }
+    // A wanted mark may wait for others, which are wanted then. Each round takes one mark away, so
+    // that the loop ends.
     loop {
         let is_wanted = |key: &str, mark: &Draft| {
             let actor = context.entities.get(key).map(|entity| &entity.name);
@@ -152,6 +157,7 @@ fn check_marks(
         if let Some(error) = error {
             return Err(error.clone());
         }
+        // Marks may wait for each other in a circle.
         if !seen.contains(&name) {
             collect_names(&mark.when, &mut open);
             seen.push(name);
@@ -173,6 +179,7 @@ fn resolve_condition(when: &mut ConditionSection, elements: &Elements) -> Result
     let Some(pending) = when.after.as_deref().and_then(|after| after.strip_prefix(PENDING)) else {
         return Ok(());
     };
+    // The type, the name and the line, as `conditions` wrote them.
     let mut words = pending.split(PENDING);
     let [kind, name, line] = [(); 3].map(|()| words.next().unwrap_or_default().to_owned());
     let place = format!("line {line}, <StoryboardElementStateCondition>");
@@ -180,6 +187,7 @@ fn resolve_condition(when: &mut ConditionSection, elements: &Elements) -> Result
     let parts = elements.afters(&kind, &name, phase, when.delay_s.unwrap_or(0.0));
     let parts = parts.map_err(|message| ConvertError::new(place, message))?;
     let after = join_all(parts);
+    // What else the condition says must hold in addition.
     *when = ConditionSection { after: None, phase: None, delay_s: None, ..when.clone() };
     *when = if *when == ConditionSection::default() {
         after
@@ -227,6 +235,7 @@ impl Elements {
         let Some(events) = self.by_name.get(&key) else {
             return Err(format!("there is no {kind} {name:?}"));
         };
+        // All other types contain several events.
         let is_one = matches!(kind, "event" | "action");
         if is_one && events.windows(2).any(|pair| pair[0] != pair[1]) {
             return Err(format!("{kind} {name:?} is there several times; rename them"));
@@ -239,10 +248,14 @@ impl Elements {
             let triggers = event.triggers.iter();
             let triggers = triggers.filter(|(_, action)| kind != "action" || action == name);
             parts.extend(triggers.map(|(trigger, _)| after(trigger, phase, delay_s)));
+            // The mark of an event stands for the actions of the ego. An action with a trigger does
+            // not need it.
             let has_own = kind == "action" && !parts.is_empty();
             let Some((mark, duration_s)) = event.mark.as_ref().filter(|_| !has_own) else {
                 continue;
             };
+            // A start has no duration. An end is as long after the start as the longest action that
+            // was left out.
             let duration_s = if is_fired { Some(0.0) } else { *duration_s };
             let Some(duration_s) = duration_s else {
                 let message = format!(

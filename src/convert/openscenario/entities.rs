@@ -26,6 +26,7 @@ pub(super) fn read_entities<'a>(
             "ObjectController",
         ])?;
         for controller in object.all("ObjectController") {
+            // An empty controller does nothing.
             if controller.children().next().is_none() {
                 continue;
             }
@@ -50,6 +51,8 @@ pub(super) fn read_entities<'a>(
         if let Some(trailer) = read_trailer(&what)? {
             context.placed_by_others.push((trailer, Part::Trailers));
         }
+        // An actor's name has a smaller alphabet than an entity's, so that two names may become
+        // one.
         if context.entities.values().any(|other| other.name == entity.name) {
             return Err(object.wrong(&format!("{name:?} is too like another name; rename it")));
         }
@@ -103,6 +106,7 @@ fn entity_from(what: &Element<'_>, name: &str) -> Result<Entity, ConvertError> {
         "TrailerCoupler",
         "Trailer",
     ])?;
+    // Looked up only so that they count as read.
     for part in ["TrailerHitch", "TrailerCoupler"] {
         what.find(part)?;
     }
@@ -125,6 +129,8 @@ fn entity_from(what: &Element<'_>, name: &str) -> Result<Entity, ConvertError> {
     let center = bounds.need("Center")?;
     let [x, y, z] = ["x", "y", "z"].map(|name| center.number(name));
     let center_m = [x?, y?, z?];
+    // The bottom of the box should be at the reference point, but for the clearance above the
+    // ground.
     if (center_m[2] - 0.5 * size[2]).abs() > 0.5 {
         center.note("z is not used: a box stands on the ground");
     }
@@ -132,6 +138,7 @@ fn entity_from(what: &Element<'_>, name: &str) -> Result<Entity, ConvertError> {
         // Limits for drivers; actions have their own dynamics.
         performance.ignore(&["maxSpeed", "maxAcceleration", "maxDeceleration"])?;
     }
+    // Without axles, the reference point is taken for the rear axle.
     let mut rear_m = 0.0;
     if let Some(axles) = what.find("Axles")? {
         axles.only(&["FrontAxle", "RearAxle", "AdditionalAxle"])?;

@@ -29,8 +29,11 @@ fn is_in_name(symbol: char) -> bool {
 
 /// The value of a formula.
 pub(super) fn value(formula: &str, parameters: &BTreeMap<String, String>) -> Result<f64, String> {
+    // By recursive descent: a sum has products, and a product has factors, so that `*` binds before
+    // `+`.
     let mut parser = Parser { rest: formula.trim(), parameters, depth: 0 };
     let value = parser.sum()?;
+    // A formula must be the whole text.
     if !parser.rest.is_empty() {
         return Err(format!("{:?} is not read; + - * / % and parentheses are", parser.rest));
     }
@@ -80,6 +83,7 @@ impl Parser<'_> {
 
     fn factor(&mut self) -> Result<f64, String> {
         let mut sign = 1.0;
+        // A loop and no recursion, because a text may have any number of signs.
         while self.take('-') {
             sign = -sign;
         }
@@ -105,6 +109,7 @@ impl Parser<'_> {
 
     /// Values up to a closing parenthesis.
     fn arguments<const N: usize>(&mut self) -> Result<[f64; N], String> {
+        // Each parenthesis is one level of recursion. The bound keeps the stack small.
         self.depth += 1;
         if self.depth > DEPTH {
             return Err(format!("more than {DEPTH} parentheses"));
@@ -136,6 +141,7 @@ impl Parser<'_> {
             "ceil" => self.arguments::<1>()?[0].ceil(),
             "sqrt" => self.arguments::<1>()?[0].sqrt(),
             "abs" => self.arguments::<1>()?[0].abs(),
+            // `signum` would make 1 of it.
             "sign" => match self.arguments::<1>()?[0] {
                 0.0 => 0.0,
                 value => value.signum(),
@@ -162,10 +168,12 @@ impl Parser<'_> {
 fn number_length(text: &str) -> usize {
     let is_digit = |c: char| c.is_ascii_digit() || c == '.';
     let end = text.find(|c: char| !is_digit(c)).unwrap_or(text.len());
+    // Only a sign after the letter belongs to the number: `2e1-1` is 20 - 1.
     let Some(exponent) = text[end..].strip_prefix(['e', 'E']) else { return end };
     let digits = exponent.strip_prefix(['+', '-']).unwrap_or(exponent);
     let length = digits.find(|c: char| !c.is_ascii_digit()).unwrap_or(digits.len());
     match (end, length) {
+        // Without digits on both sides, the letter is no exponent.
         (0, _) | (_, 0) => end,
         _ => text.len() - digits.len() + length,
     }
@@ -181,6 +189,7 @@ mod tests {
         let of = |formula: &str| value(formula, &parameters);
         assert_eq!(of("$speed / 3.6"), Ok(10.0));
         assert_eq!(of("1 + 2 * 3 - 4 / 2"), Ok(5.0));
+        // -(-3) * 2, then 3 + 20 - 1, then 8 + 6 + 1 - 1, then 3 * -1 + 1 + 3.
         assert_eq!(of("-(2 - 5) * --2"), Ok(6.0));
         assert_eq!(of("7 % 4 + 2e1-1"), Ok(22.0));
         assert_eq!(of("pow(2, 3) + sqrt($speed) + max(1, -2) + sign(-5)"), Ok(14.0));

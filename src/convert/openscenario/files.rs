@@ -13,6 +13,7 @@ pub(super) fn xml_files(directory: &Path) -> Vec<PathBuf> {
     paths.retain(|path| {
         path.extension().is_some_and(|extension| extension == "xosc" || extension == "xml")
     });
+    // A directory has no order of its own, and of two entries of one name the first counts.
     paths.sort();
     paths
 }
@@ -22,12 +23,14 @@ pub(super) fn read_bytes(path: &Path) -> Result<Vec<u8>, ConvertError> {
     let failed = |error: std::io::Error| {
         ConvertError::new(format!("{}", path.display()), format!("{error}; it must be readable"))
     };
+    // To read a pipe could take for ever.
     let is_file = path.metadata().map_err(failed)?.is_file();
     if !is_file {
         return Err(ConvertError::new(format!("{}", path.display()), "is no file"));
     }
     let mut bytes = Vec::new();
     let file = std::fs::File::open(path).map_err(failed)?;
+    // One byte more than the limit, so that `utf8_text` refuses a longer file.
     file.take(TEXT_BYTES as u64 + 1).read_to_end(&mut bytes).map_err(failed)?;
     Ok(bytes)
 }

@@ -24,6 +24,7 @@ pub(super) fn read_init<'a>(
 ) -> Result<(), ConvertError> {
     init.only(&["Actions"])?;
     let actions = init.need("Actions")?;
+    // In this order: speeds and distances refer to places, and all else may refer to both.
     let mut places: Vec<InitAction<'a>> = Vec::new();
     let mut speeds: Vec<InitAction<'a>> = Vec::new();
     let mut others: Vec<InitAction<'a>> = Vec::new();
@@ -52,6 +53,7 @@ pub(super) fn read_init<'a>(
         }
     }
     in_turn(places, context, read_place)?;
+    // A speed that is relative to one of these cannot be read yet.
     context.waiting = speeds.iter().map(|(name, _)| name.clone()).collect();
     in_turn(speeds, context, read_speed)?;
     for (name, action) in &others {
@@ -69,6 +71,7 @@ fn in_turn<'a>(
     loop {
         let count = actions.len();
         let mut first = None;
+        // What fails is read again in the next round, when more entities have a place or a speed.
         let mut waiting = Vec::new();
         for (name, action) in actions {
             if let Err(error) = read(&action, &name, context) {
@@ -78,6 +81,7 @@ fn in_turn<'a>(
         }
         match first {
             None => return Ok(()),
+            // This round has read nothing, so that no further round would.
             Some(error) if waiting.len() == count => return Err(error),
             Some(_) => actions = waiting,
         }
@@ -126,6 +130,7 @@ fn read_speed(
     if !is_ego && let Some(act) = speed_match(&speed, name, context)? {
         let Act::Match { of, factor, delta_mps } = &act else { return Err(speed.unread()) };
         let is_other = |entity: &&Entity| Some(&entity.name) == of.as_ref();
+        // `None` is the ego.
         let other = match of {
             None => context.entities.get(&context.ego),
             Some(_) => context.entities.values().find(is_other),
@@ -137,6 +142,7 @@ fn read_speed(
         context.waiting.retain(|other| other != name);
         let Some(entity) = context.entities.get_mut(name) else { return Err(speed.unread()) };
         entity.begin_mps = begin_mps.clamp(0.0, wildcity_sim::limits::ACTOR_SPEED_M_S);
+        // The other may become as fast as any actor, and this one with it.
         entity.fastest_mps = wildcity_sim::limits::ACTOR_SPEED_M_S;
         add(entity, "init-speed", vec![act]);
         return Ok(());
@@ -161,6 +167,7 @@ fn read_speed(
         entity.fastest_mps = entity.fastest_mps.max(profile.to);
         match is_step {
             true => entity.begin_mps = profile.to,
+            // A ramp without a rate changes nothing.
             false if profile.rate == Some(0.0) => {}
             false => add(entity, "init-speed", vec![Act::Speed(profile)]),
         }
@@ -171,6 +178,7 @@ fn read_speed(
 
 /// Notes that an action which sets the speed of an entity was read.
 fn is_read(name: &str, context: &mut Context<'_>) {
+    // Only one entry: an entity has as many as it has such actions.
     if let Some(at) = context.waiting.iter().position(|other| other == name) {
         context.waiting.remove(at);
     }
@@ -201,9 +209,11 @@ fn read_distance(
         set_place(name, place, context);
     }
     let Some(entity) = context.entities.get_mut(name) else { return Err(action.unread()) };
+    // With bounds it begins at its own speed, and reaches its distance later.
     if keep.acceleration.is_none() {
         entity.begin_mps = other_mps;
     }
+    // Not needed if it begins at its distance and must not keep it.
     if place.is_none() || keep.once != Some(true) {
         entity.fastest_mps = wildcity_sim::limits::ACTOR_SPEED_M_S;
         add(entity, "init-distance", vec![Act::Keep(keep)]);
@@ -260,6 +270,7 @@ fn read_other(
     }
     let Some(act) = private_act(action, name, context)? else { return Ok(()) };
     let Some(entity) = context.entities.get_mut(name) else { return Err(action.unread()) };
+    // A later change that is relative to this entity counts from the new lane.
     if let Act::Lane { lane, .. } = &act {
         entity.lane = Some(*lane);
     }
@@ -297,6 +308,7 @@ fn read_entity_action(action: &Element<'_>, context: &mut Context<'_>) -> Result
         set_place(&name, place, context);
     }
     if let Some(entity) = context.entities.get_mut(&name) {
+        // What `Init` deletes is not there from the start on.
         entity.present = place.is_some();
     }
     Ok(())

@@ -31,8 +31,10 @@ impl RoadMap {
         let mut line = LaneLine { points: vec![self.point(start)], ..LaneLine::default() };
         let Some(mut lane) = self.network.lane(from.at.lane) else { return line };
         let mut is_up = from.is_up;
+        // The place of the start on its lane's middle, in metres from the end where s is least.
         let mut arc_m = self.network.centerline_s(start).map_or(0.0, f64::from);
         let mut left_m = length_m;
+        // Lanes may form a ring, so that only the length or the number of lanes ends this.
         while line.lanes.len() < LANES {
             line.lanes.push((lane.id, is_up));
             left_m -= add_points(lane, is_up, arc_m, &mut line.points);
@@ -44,6 +46,8 @@ impl RoadMap {
             let Some((next, next_is_up)) = next else { break };
             lane = next;
             is_up = next_is_up;
+            // The next lane is entered at its first point, or at its last if it is driven against
+            // s.
             arc_m = if is_up { 0.0 } else { f64::from(lane.center.length()) };
         }
         line.points = simplified(&line.points);
@@ -59,12 +63,15 @@ impl RoadMap {
         route: &[LaneId],
         forks: &mut Vec<String>,
     ) -> Option<(&Lane, bool)> {
+        // Successors are in the direction of traffic. A vehicle against it goes on to the
+        // predecessors.
         let is_with_traffic = is_up == self.drives_up(lane.id);
         let linked = if is_with_traffic { &lane.successors } else { &lane.predecessors };
         let end = end_direction(lane, is_up)?;
         let mut options: Vec<(f64, &Lane, bool)> = linked
             .iter()
             .filter_map(|id| self.network.lane(*id))
+            // From a lane for traffic, a line does not go on to a shoulder or a sidewalk.
             .filter(|next| is_for_traffic(next.kind) || !is_for_traffic(lane.kind))
             .filter_map(|next| {
                 let drives_up = next.direction != Direction::Backward;
@@ -75,6 +82,7 @@ impl RoadMap {
             })
             .collect();
         options.sort_by(|a, b| a.0.total_cmp(&b.0));
+        // A lane beside one of the route will do, because a vehicle may change lanes on its way.
         let on_route = |lane: &Lane| route.iter().any(|other| self.is_beside(*other, lane.id));
         if let Some((_, next, next_is_up)) = options.iter().find(|(_, next, _)| on_route(next)) {
             return Some((*next, *next_is_up));
@@ -110,6 +118,8 @@ impl RoadMap {
             });
             let Some(beside) = beside else { continue };
             if let Some(found) = &found {
+                // On every further road, the id must name the lane that continues the one that was
+                // found.
                 if !found.lanes.iter().any(|(id, _)| *id == beside.id) {
                     let (road, _) = self.ids(*id).unwrap_or_default();
                     let message = format!("lane {lane} of road {road:?} is not the one before it");
@@ -117,6 +127,7 @@ impl RoadMap {
                 }
                 continue;
             }
+            // On its own road from where it is; on a later one from the end at which it arrives.
             let s = match index {
                 0 => start.at.s,
                 _ => self.end_s(*id, !*is_up),
@@ -169,6 +180,7 @@ fn add_points(lane: &Lane, is_up: bool, arc_m: f64, points: &mut Vec<[f64; 3]>) 
     }
     points.extend(ahead);
     let length_m = f64::from(lane.center.length());
+    // What is left of the lane from `arc_m` on, in the direction of driving.
     if is_up { length_m - arc_m } else { arc_m }
 }
 
@@ -181,5 +193,7 @@ fn end_direction(lane: &Lane, is_up: bool) -> Option<DVec3> {
 }
 
 fn turned_rad(from: DVec3, to: DVec3) -> f64 {
+    // The signed angle a: the cross product is |from| |to| sin a, and the dot product is |from|
+    // |to| cos a.
     from.cross(to).z.atan2(from.dot(to))
 }

@@ -131,6 +131,7 @@ impl Ledger {
     /// Tells something that a person should know.
     pub(super) fn note(&self, note: String) {
         let mut notes = self.notes.borrow_mut();
+        // An element that is read for each actor of a group tells the same several times.
         if !notes.contains(&note) {
             notes.push(note);
         }
@@ -147,6 +148,7 @@ impl Ledger {
         node: Node<'_, '_>,
     ) -> Result<(), ConvertError> {
         let key = (file.0, node.id());
+        // With all that is below it.
         if self.left_out.borrow().contains(&key) {
             return Ok(());
         }
@@ -167,6 +169,7 @@ impl Ledger {
                 return Err(ConvertError { message, ..place() });
             }
         }
+        // Its own attributes were checked; what is below it does not matter.
         if HARMLESS_ELEMENTS.contains(&name) {
             return Ok(());
         }

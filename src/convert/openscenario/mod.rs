@@ -104,13 +104,16 @@ pub fn read(bytes: &[u8], settings: &Settings) -> Result<Imported, ConvertError>
         let message = "is a distribution of parameters: import the scenario that it names, with --parameter NAME=VALUE";
         return Err(root.wrong(message));
     }
+    // First the values of the file, so that unknown names are refused; then the given ones.
     let root = catalogs::declared(&root)?;
     let root = with_parameters(&root, &settings.parameters)?;
     check_header(&root)?;
+    // Elements borrow from the texts and the documents, which therefore live here.
     let texts = catalogs::read_texts(&root, document.root_element(), settings)?;
     let documents = catalogs::parse_documents(&texts);
     let catalogs = Catalogs::new(&documents, &ledger);
     let file = file_from((&root, document.root_element()), catalogs, settings, &ledger)?;
+    // Last, when all that was needed has been read.
     root.check_read()?;
     Ok(Imported { file, notes: ledger.notes() })
 }
@@ -161,6 +164,7 @@ fn read_sets(node: roxmltree::Node<'_, '_>) -> Vec<(String, String, String)> {
         };
         let set = node.children().find(|child| child.has_tag_name("SetAction"));
         let value = set.and_then(|set| set.attribute("value")).unwrap_or_default();
+        // There is no event around an action of `Init`.
         let event = node.ancestors().find(|node| node.has_tag_name("Event"));
         let event = event.and_then(|event| event.attribute("name")).unwrap_or_default();
         name.map(|name| (catalogs::plain_parameter(name), value.to_owned(), event.to_owned()))
@@ -202,6 +206,7 @@ fn file_from<'a>(
         controlled: controllers::assigned(node).into_iter().collect(),
         ego_route: None,
     };
+    // In this order: events refer to where `Init` has put entities, and `Init` to entities.
     entities::read_entities(&root.need("Entities")?, &mut context)?;
     if !context.entities.contains_key(&settings.ego) {
         let message = format!("has no entity {:?}; name the ego with --ego", settings.ego);
@@ -219,10 +224,12 @@ fn file_from<'a>(
     let stop = stop.map(|stop| stop::read_stop(&stop, &context)).transpose()?.unwrap_or_default();
     let end_s = stop.time_s;
     let ends = elements::resolve(states, stop.groups, &mut context)?;
+    // Without a condition, only the time ends the scenario.
     let when = (!ends.is_empty()).then(|| conditions::join_any(ends));
     let builder = Builder { context: &context, ledger, end_s };
     let mut actors = Vec::new();
     for (name, entity) in context.entities.iter().filter(|(name, _)| **name != settings.ego) {
+        // A trailer, or an entity of a controller that is left out, need not have a place.
         let by = context.placed_by_others.iter().find(|(other, _)| other == name);
         if let Some((_, part)) = by.filter(|_| entity.place.is_none()) {
             ledger.note(format!("entity {name:?}: is left out ({})", part.name()));
@@ -275,6 +282,7 @@ fn read_roads(
         (None, Some(named)) => {
             let path = Path::new(&named.replace('\\', "/")).to_owned();
             let path = settings.directory.as_ref().map(|dir| dir.join(&path)).unwrap_or(path);
+            // No error yet: whatever needs the roads gives this reason.
             if !path.is_file() {
                 let reason = format!("there is no file {}; name it with --roads", path.display());
                 return Ok((None, Some(reason)));
@@ -295,6 +303,7 @@ fn plain_name(name: &str) -> String {
         c @ ('a'..='z' | '0'..='9' | '_' | '-' | '.') => c,
         _ => '-',
     };
+    // Two names may become one, which `read_entities` refuses.
     let plain: String = name.chars().map(plain).collect();
     plain.trim_start_matches('.').chars().take(64).collect()
 }

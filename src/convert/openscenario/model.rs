@@ -24,6 +24,7 @@ pub(super) struct Place {
 impl Place {
     /// The place straight ahead, and to the left.
     pub(super) fn shifted(&self, ahead_m: f64, left_m: f64) -> Self {
+        // A turn about the vertical: the height stays.
         let (sin, cos) = self.yaw_rad.sin_cos();
         let [x, y, z] = self.xyz_m;
         let xyz_m = [x + ahead_m * cos - left_m * sin, y + ahead_m * sin + left_m * cos, z];

@@ -25,6 +25,7 @@ pub(super) fn place_from(
             let roads = roads(&kind, context)?;
             let [s, t] = ["s", "t"].map(|name| kind.number(name));
             let found = roads.road_place(&kind.text("roadId")?, s?, t?);
+            // Without an orientation, the heading is that of the road.
             let (xyz_m, yaw_rad, _) = found.map_err(|message| kind.wrong(&message))?;
             on_roads(xyz_m, heading_rad(&kind, yaw_rad)?, context)
         }
@@ -43,6 +44,7 @@ pub(super) fn place_from(
             };
             let [ds, dt] = ["ds", "dt"].map(|name| kind.number(name));
             let mut at = roads.moved(spot.at, ds?, false).map_err(wrong)?;
+            // Both are to the left of the road.
             at.offset += dt?;
             let road_rad = roads.heading_rad(at);
             on_roads(roads.point(at), heading_rad(&kind, road_rad)?, context)
@@ -55,6 +57,7 @@ pub(super) fn place_from(
 /// A place with its spot on the roads, if it is on one.
 fn on_roads(xyz_m: [f64; 3], yaw_rad: f64, context: &Context<'_>) -> Place {
     let roads = context.roads.as_ref();
+    // Beside all lanes, or across one, there is no spot.
     let spot = roads.and_then(|roads| roads.spot(roads.lane_near(xyz_m)?, yaw_rad));
     Place { xyz_m, yaw_rad, spot }
 }
@@ -81,6 +84,7 @@ fn relative_place(kind: &Element<'_>, context: &Context<'_>) -> Result<Place, Co
     let (dx, dy, dz) = (dx?, dy?, dz?);
     let mut xyz_m = match kind.name() {
         "RelativeObjectPosition" => base.shifted(dx, dy).xyz_m,
+        // Along the world's axes, whatever the heading of the entity.
         _ => [base.xyz_m[0] + dx, base.xyz_m[1] + dy, base.xyz_m[2]],
     };
     xyz_m[2] += dz;
@@ -103,6 +107,7 @@ fn lane_facing(
     at: xodr::LanePosition,
     roads: &RoadMap,
 ) -> Result<Place, ConvertError> {
+    // Where traffic drives against s, it turns its back on the direction of the road.
     let half_turn = if roads.drives_up(at.lane) { 0.0 } else { std::f64::consts::PI };
     let traffic_rad = roads.heading_rad(at) + half_turn;
     let yaw_rad = heading_rad(kind, traffic_rad)?;
@@ -125,6 +130,7 @@ fn relative_lane_place(kind: &Element<'_>, context: &Context<'_>) -> Result<Plac
     };
     // Along a lane, left is that of its traffic; along a road, that of the road.
     let sign = if is_along_lane && !roads.drives_up(spot.at.lane) { -1 } else { 1 };
+    // From the middle of the lane: the offset of the other entity is not taken over.
     let from = xodr::LanePosition { offset: 0.0, ..spot.at };
     let moved = roads.moved(from, way_m, is_along_lane).map_err(wrong)?;
     let mut at = roads.beside(moved, sign * count).map_err(wrong)?;

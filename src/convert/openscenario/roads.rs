@@ -51,6 +51,8 @@ impl RoadMap {
         }
         let s = s.clamp(0.0, length_m);
         let lanes = self.lanes.get(&(road.to_owned(), lane));
+        // The lanes of one id in all sections of the road. Only that of the section at s has a
+        // point there.
         let places = lanes.into_iter().flatten().map(|id| LanePosition { lane: *id, s, offset });
         let mut places = places.filter(|at| self.network.lane_point(*at).is_some());
         places.next().ok_or_else(|| format!("road {road:?} has no lane {lane} at s {s:?}"))
@@ -81,6 +83,7 @@ impl RoadMap {
 
     fn road_heading_rad(&self, road: xodr::RoadId, s: f64) -> Option<f64> {
         let left = across_road(&self.network, road, s)?;
+        // The left of a heading h is (-sin h, cos h).
         Some((-left.x).atan2(left.y))
     }
 
@@ -122,9 +125,11 @@ impl RoadMap {
         let is_up = self.drives_up(at.lane);
         let (road, lane) = self.ids(at.lane).ok_or("is on no lane")?;
         let ds = if is_along_lane && !is_up { -way_m } else { way_m };
+        // As long as it stays on the road, the lane keeps its id.
         if let Ok(moved) = self.place(&road, lane, at.s + ds, at.offset) {
             return Ok(moved);
         }
+        // `advance` follows the traffic of the lane, while a way along the road follows s.
         let way_m = if ds == way_m && !is_up { -way_m } else { way_m };
         let ends = self.network.advance(at, way_m);
         match ends.as_slice() {
@@ -139,12 +144,14 @@ impl RoadMap {
         let [x, y, z] = xyz_m.map(|axis| axis as f32);
         let at = self.network.lane_position(Point::new(x, y, z))?;
         let lane = self.network.lane(at.lane)?;
+        // Half a metre beside the lane still counts.
         (at.offset.abs() <= 0.5 * f64::from(lane.width) + 0.5).then_some(at)
     }
 
     /// The spot of a vehicle with a heading; `None` if it stands across its lane.
     pub(super) fn spot(&self, at: LanePosition, yaw_rad: f64) -> Option<Spot> {
         let turned = yaw_rad - self.heading_rad(at);
+        // The difference of two headings, from -π to π.
         let turned = (turned + PI).rem_euclid(2.0 * PI) - PI;
         match turned.abs() {
             off if off < ALONG_RAD => Some(Spot { at, is_up: true }),
@@ -180,6 +187,7 @@ impl RoadMap {
                 roads.push((road, self.drives_up(*lane)));
             }
         }
+        // Invariant: `left_m` is what remains of the way where this road begins.
         for (index, (road, is_up)) in roads.into_iter().enumerate() {
             let length_m = self.road_length_m(&road)?;
             let from_s = match (index, waypoints.first()) {

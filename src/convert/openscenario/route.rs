@@ -83,6 +83,7 @@ pub(super) fn lanes_between(
     let mut lanes: Vec<LaneId> = Vec::new();
     for pair in waypoints.windows(2) {
         let way = shortest(pair[0].lane, pair[1].lane, roads)?;
+        // A way begins with the last lane of the way before it.
         let skipped = usize::from(lanes.last() == way.first());
         lanes.extend(way.into_iter().skip(skipped));
     }
@@ -90,10 +91,13 @@ pub(super) fn lanes_between(
 }
 
 fn shortest(from: LaneId, to: LaneId, roads: &RoadMap) -> Result<Vec<LaneId>, String> {
+    // Breadth first: the first way that arrives has the fewest lanes. `before` also marks the lanes
+    // that were seen.
     let mut before: HashMap<LaneId, LaneId> = HashMap::new();
     let mut open = VecDeque::from([from]);
     while let Some(lane) = open.pop_front() {
         if roads.is_beside(lane, to) {
+            // From the end back to the start, by the lane from which each was reached.
             let mut way = vec![lane];
             while let Some(lane) =
                 way.last().filter(|lane| **lane != from).and_then(|lane| before.get(lane))

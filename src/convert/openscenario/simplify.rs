@@ -7,6 +7,7 @@ const NEAR_M: f64 = 0.01;
 
 /// The line without the points that are within [`NEAR_M`] of it, or farther if it is very long.
 pub(super) fn simplified(points: &[[f64; 3]]) -> Vec<[f64; 3]> {
+    // 1 cm, and 1.5 times as much in each further round: the seventh is the first above 0.1 m.
     let mut near_m = NEAR_M;
     loop {
         let line = within(points, near_m);
@@ -26,10 +27,12 @@ fn within(points: &[[f64; 3]], near_m: f64) -> Vec<[f64; 3]> {
     let mut is_kept = vec![false; points.len()];
     is_kept[0] = true;
     is_kept[last] = true;
+    // A stack of spans and no recursion, because a span may be split very unevenly.
     let mut spans = vec![(0, last)];
     while let Some((from, to)) = spans.pop() {
         let way_m = at(to) - at(from);
         let off_m = |index: usize| {
+            // The foot of the point on the chord, as a share of its length.
             let t = (at(index) - at(from)).dot(way_m) / way_m.length_squared().max(1e-12);
             (at(from) + t.clamp(0.0, 1.0) * way_m).distance(at(index))
         };
@@ -53,6 +56,7 @@ mod tests {
         let line: Vec<[f64; 3]> = (0..=1000).map(|i| [f64::from(i), 0.0, 0.0]).collect();
         assert_eq!(simplified(&line), [[0.0; 3], [1000.0, 0.0, 0.0]]);
         let arc = (0..=1000).map(|i| {
+            // An arc of 1 rad, which is 100 m long.
             let angle_rad = f64::from(i) * 1e-3;
             [100.0 * angle_rad.sin(), 100.0 - 100.0 * angle_rad.cos(), 0.0]
         });

@@ -26,6 +26,7 @@ pub(super) fn read_stop<'a>(
     stop.only(&["ConditionGroup"])?;
     let mut read = Stop::default();
     for group in stop.children() {
+        // A group without conditions would end the scenario at once.
         if group.children().next().is_none() {
             return Err(group.wrong("is empty"));
         }
@@ -40,6 +41,7 @@ pub(super) fn read_stop<'a>(
             // A parameter that is another never ends it.
             Some(time_s) if time_s >= limits::END_S => {}
             Some(time_s) => {
+                // Groups are alternatives, so that the earliest time counts.
                 read.time_s = Some(read.time_s.map_or(time_s, |before_s| before_s.min(time_s)));
             }
             None => read.groups.push((group, condition)),
@@ -66,5 +68,6 @@ fn time_s(condition: &ConditionSection) -> Option<f64> {
         return None;
     }
     let parts: Option<Vec<f64>> = all.iter().map(time_s).collect();
+    // All parts must hold, so that the latest time counts.
     Some(parts?.into_iter().fold(own_s.unwrap_or(0.0), f64::max))
 }

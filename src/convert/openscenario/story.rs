@@ -94,6 +94,7 @@ fn act_gate(
     let start = act.find("StartTrigger")?;
     let start = start.map(|start| trigger_condition(&start, context, true)).transpose()?;
     let start = start.unwrap_or_default();
+    // An act that starts at time 0 needs no mark, because its events need not wait for it.
     let at_once = ConditionSection { time_s: Some(0.0), ..ConditionSection::default() };
     let gate = if start == ConditionSection::default() || start == at_once {
         None
@@ -115,6 +116,7 @@ fn read_event<'a>(
     let is_overriding = match priority.as_str() {
         "override" | "overwrite" => true,
         "parallel" => false,
+        // Alone in its maneuver, there is no other event that could make it skip.
         "skip" if scope.maneuver.all("Event").count() == 1 => false,
         _ => {
             let message = format!(
@@ -144,12 +146,14 @@ fn read_event<'a>(
     };
     let when = match &scope.gate {
         None => start,
+        // It waits for its act, and then for its own trigger.
         Some(gate) => {
             let gate = Some(gate.clone());
             ConditionSection { after: gate, all: vec![start], ..ConditionSection::default() }
         }
     };
     let index = elements.events.len();
+    // Before its actions are read, because these add their triggers to it.
     elements.events.push(Event::default());
     let own = ("event".to_owned(), name.clone());
     for key in scope.names.iter().chain([&own]) {
@@ -185,6 +189,7 @@ impl<'a> EventRead<'_, 'a> {
         match kind.name() {
             "PrivateAction" => {
                 let kind = kind.only_child()?;
+                // Each actor of the group does the action.
                 for target in &self.scope.actors {
                     self.add_act(&kind, target, &action_name, context, elements)?;
                 }
@@ -242,6 +247,7 @@ impl<'a> EventRead<'_, 'a> {
         if target == context.ego && !is_controller && !is_look {
             if kind.name() == "RoutingAction" && is_destination(kind) {
                 read_route_of_ego(kind, context)?;
+                // The agent decides how fast it drives, so that the duration is unknown.
                 return self.mark_ego(None, kind, context, elements);
             }
             let duration_s = duration_s(kind)?;
@@ -295,6 +301,8 @@ impl<'a> EventRead<'_, 'a> {
     ) -> Result<(), ConvertError> {
         profile.expect("followingMode", &["position"])?;
         profile.only(&["SpeedProfileEntry"])?;
+        // The first entry waits for the event, and each further one for the end of the one before
+        // it.
         let mut when = self.when.clone();
         for entry in profile.children() {
             let (act, over_s) = profile_entry(&entry)?;
@@ -315,6 +323,7 @@ impl<'a> EventRead<'_, 'a> {
     ) -> Result<(), ConvertError> {
         let mark = match elements.events[self.index].mark.take() {
             Some((mark, before_s)) => {
+                // If one duration is unknown, so is the longest.
                 let longest_s = before_s.zip(duration_s).map(|(a, b)| f64::max(a, b));
                 (mark, longest_s)
             }
@@ -340,6 +349,7 @@ impl<'a> EventRead<'_, 'a> {
                 entity.fastest_mps = wildcity_sim::limits::ACTOR_SPEED_M_S
             }
             Act::Lane { lane, .. } => entity.lane = Some(*lane),
+            // An entity that an event adds is not there before.
             Act::Spawn if entity.script.is_empty() => entity.present = false,
             _ => {}
         }
@@ -355,6 +365,7 @@ impl<'a> EventRead<'_, 'a> {
         let mut then = Vec::new();
         if self.is_overriding && act.is_motion() {
             // Of the other events of this maneuver, what is under way ends.
+            // `names` has the story, the act, the group and, at index 3, the maneuver.
             let key = &self.scope.names[3];
             let maneuver = elements.by_name.get(key).into_iter().flatten();
             let others = maneuver.filter(|index| **index != self.index);
@@ -410,5 +421,6 @@ fn duration_s(kind: &Element<'_>) -> Result<Option<f64>, ConvertError> {
             return dynamics.find_number("value");
         }
     }
+    // A teleport takes no time.
     Ok(matches!(kind.name(), "TeleportAction").then_some(0.0))
 }

@@ -49,6 +49,7 @@ fn polyline(shape: &Element<'_>, context: &Context<'_>) -> Result<Line, ConvertE
             shape.note("headings of points are not used: actors face along their line");
         }
         points.push(place.xyz_m);
+        // If one vertex has no time, the times of the others are of no use.
         match (&mut times_s, vertex.find_number("time")?) {
             (Some(times_s), Some(time_s)) => times_s.push(time_s),
             _ => times_s = None,
@@ -63,6 +64,7 @@ fn clothoid(shape: &Element<'_>, context: &Context<'_>) -> Result<Line, ConvertE
     let curvature = shape.number("curvature")?;
     let slope = match shape.find_number("curvaturePrime")? {
         Some(slope) => slope,
+        // Files of 1.0 name it so.
         None => shape.number("curvatureDot")?,
     };
     let length_m = shape.number("length")?;
@@ -82,6 +84,7 @@ fn clothoid(shape: &Element<'_>, context: &Context<'_>) -> Result<Line, ConvertE
             let s = index as f64 * step_m + way_m;
             place.yaw_rad + curvature * s + 0.5 * slope * s * s
         };
+        // Simpson's rule over a step h: h / 6 (f(0) + 4 f(h / 2) + f(h)).
         let [from, middle, to] = [0.0, 0.5 * step_m, step_m].map(heading_rad);
         x += step_m / 6.0 * (from.cos() + 4.0 * middle.cos() + to.cos());
         y += step_m / 6.0 * (from.sin() + 4.0 * middle.sin() + to.sin());
@@ -107,6 +110,7 @@ fn nurbs(shape: &Element<'_>, context: &Context<'_>) -> Result<Line, ConvertErro
         let [x, y, z] = place_from(&control.need("Position")?, context)?.xyz_m;
         let weight = control.find_number("weight")?.unwrap_or(1.0);
         is_timed |= control.find_number("time")?.is_some();
+        // In homogeneous coordinates, in which a weighted curve is a plain B-spline.
         controls.push([x * weight, y * weight, z * weight, weight]);
     }
     let knots: Result<Vec<f64>, ConvertError> =
@@ -124,7 +128,9 @@ fn nurbs(shape: &Element<'_>, context: &Context<'_>) -> Result<Line, ConvertErro
                        as control points and order";
         return Err(shape.wrong(message));
     }
+    // Where all of `order` basis functions overlap, which is the domain of the curve.
     let [from, to] = [knots[order - 1], knots[controls.len()]];
+    // The polygon of the control points is no shorter than the curve.
     let polygon_m: f64 = controls
         .windows(2)
         .map(|pair| {
@@ -155,9 +161,11 @@ fn de_boor(knots: &[f64], controls: &[[f64; 4]], order: usize, u: f64) -> [f64; 
     let span = span.unwrap_or(degree);
     let mut points: Vec<[f64; 4]> = controls[span - degree..=span].to_vec();
     for level in 1..=degree {
+        // From the back, so that `points[index - 1]` is still that of the level before.
         for index in (level..=degree).rev() {
             let knot = span - degree + index;
             let width = knots[knot + degree + 1 - level] - knots[knot];
+            // A repeated knot makes a span without length, for which 0 / 0 counts as 0.
             let t = if width > 0.0 { (u - knots[knot]) / width } else { 0.0 };
             let before = points[index - 1];
             for (axis, value) in points[index].iter_mut().enumerate() {
@@ -174,6 +182,7 @@ mod tests {
 
     #[test]
     fn a_quarter_circle_is_a_nurbs() {
+        // The middle control point is (1, 1), with the cosine of 45° as its weight.
         let half = std::f64::consts::FRAC_1_SQRT_2;
         let controls = [[1.0, 0.0, 0.0, 1.0], [half, half, 0.0, half], [0.0, 1.0, 0.0, 1.0]];
         let knots = [0.0, 0.0, 0.0, 1.0, 1.0, 1.0];

@@ -210,6 +210,8 @@ impl ObjectListing {
     /// # Errors
     /// The disk fails to list some.
     pub(super) fn whole(self) -> Result<Vec<ListedObject>, StoreError> {
+        // An entry that is no folder is `Damaged`. It holds no objects, so that the list is
+        // complete without it.
         let is_failure = |one: &UnlistedObjects| matches!(one.error, StoreError::Io { .. });
         match self.unlisted.into_iter().find(is_failure) {
             None => Ok(self.objects),

@@ -153,6 +153,7 @@ impl Catalog {
 
     /// These twins, read without the disk cache.
     pub(super) fn uncached(&self) -> Self {
+        // A directory has no cache.
         self.remote.as_ref().map_or_else(|| self.clone(), |remote| Self::remote(remote.uncached()))
     }
 
@@ -185,6 +186,7 @@ impl Catalog {
 
     fn listing(&self, name: &str) -> Result<Option<TwinListing>, StoreError> {
         let numbers = self.objects.version_numbers(name)?;
+        // Only the newest record is read: damage of older ones does not hide the twin.
         let Some(&number) = numbers.last() else { return Ok(None) };
         let hash = self.record(name, number)?.manifest;
         Ok(Some(TwinListing { name: name.to_owned(), number, hash }))
@@ -197,6 +199,7 @@ impl Catalog {
     /// [`StoreError::Name`], [`StoreError::NoTwin`]; the log cannot be listed.
     pub fn latest(&self, name: &str) -> Result<u64, StoreError> {
         let numbers = self.numbers(name)?;
+        // `numbers` returns at least one.
         Ok(numbers[numbers.len() - 1])
     }
 
@@ -213,6 +216,7 @@ impl Catalog {
         if !numbers.contains(&number) {
             return Err(StoreError::NoVersion { name: name.to_owned(), number, latest });
         }
+        // Asked before the manifest is read, which may be gone: that would seem to be damage.
         self.check_not_collected(name, number)?;
         let LogRecord { manifest: hash, created_us, .. } = self.record(name, number)?;
         let mut manifest = self.manifest(name, &hash)?;
@@ -255,6 +259,8 @@ impl Catalog {
         section: &Section,
     ) -> Result<Chunk, StoreError> {
         let Manifest { twin, sh_degree, record, .. } = &version.manifest;
+        // A damaged manifest may have any offset. A sum that saturates lies beyond the end of the
+        // object, which `read_range` refuses.
         let end = section.offset_bytes.saturating_add(section.bytes.into());
         let of_section = |path, reason| {
             let Section { block, level, .. } = section;
@@ -291,6 +297,7 @@ impl Catalog {
     /// # Errors
     /// [`StoreError::Damaged`] if not.
     pub(super) fn check_chunk(&self, name: &str, chunk: &ChunkEntry) -> Result<(), StoreError> {
+        // The table of contents and the page before it.
         let most = limits::CHUNK_TABLE_BYTES + chunk_file::PAGE_BYTES;
         // The hash is compared first, because its error is clearer than one that follows from a
         // damaged table of contents.
@@ -358,6 +365,7 @@ impl Catalog {
         }
         let manifest: Manifest =
             serde_json::from_slice(&bytes).map_err(|e| damaged(e.to_string()))?;
+        // The bytes have the right hash, but a folder may have been copied under another name.
         if manifest.twin != name {
             return Err(damaged(format!("it belongs to twin {:?}", manifest.twin)));
         }
@@ -367,6 +375,8 @@ impl Catalog {
         if let Some(alignment) = manifest.twin_from_capture {
             alignment.check().map_err(|error| damaged(format!("its alignment: {error}")))?;
         }
+        // All hashes of a manifest become paths. They are checked here once, so that none leads out
+        // of the twin.
         let objects = manifest.chunks.iter().map(|chunk| &chunk.object);
         let sky = manifest.sky.iter().map(|sky| &sky.object);
         let views = manifest.views.iter().map(|views| &views.object);

@@ -115,14 +115,18 @@ pub(super) fn pack(
     clamped: &mut Clamped,
 ) -> io::Result<PackedSection> {
     let mut bytes = Vec::new();
+    // Parts are compressed on their own, so that decoding needs memory for one part and not for the
+    // section.
     for start in (0..chunk.len()).step_by(PART_GAUSSIANS) {
         let part = record.encode(chunk, start..chunk.len().min(start + PART_GAUSSIANS), clamped);
         let part = zstd::bulk::compress(&part, ZSTD_LEVEL)?;
+        // 65,536 records of at most 236 B are 15 MB, so that the length fits.
         bytes.extend((part.len() as u32).to_le_bytes());
         bytes.extend(part);
     }
     let mut bounds = Bounds::EMPTY;
     for index in 0..chunk.len() {
+        // Relative to the cell's origin, as all values of a chunk are.
         let mean_m = [0, 1, 2].map(|axis| f64::from(chunk.value(index, axis)));
         bounds.add(DVec3::from_array(mean_m), chunk.half_extent_m(index));
     }
@@ -148,6 +152,8 @@ pub(super) fn write(
     &ChunkHeader { cell, origin_m, sh_degree, record }: &ChunkHeader,
     mut packed: Vec<PackedSection>,
 ) -> io::Result<(Vec<Section>, Bounds)> {
+    // Levels from coarse to fine, and blocks in order within a level: the same content gives the
+    // same bytes.
     packed.sort_by_key(|packed| (std::cmp::Reverse(packed.section.level), packed.section.block));
     let mut contents = Contents {
         cell,
@@ -184,6 +190,7 @@ pub(super) fn write(
         out.write_all(&[0; PAGE_BYTES][..(row.offset_bytes - written) as usize])?;
         out.write_all(&packed.bytes)?;
         written = row.offset_bytes + u64::from(row.bytes);
+        // The cell's box is that of its full detail.
         if packed.section.is_full_detail() {
             bounds = bounds.union(&packed.bounds);
         }
@@ -195,6 +202,7 @@ pub(super) fn write(
 /// The offset of a section of `bytes` that follows one that ends at `end`.
 fn place(end: u64, bytes: u32) -> u64 {
     let page = PAGE_BYTES as u64;
+    // 0 if `end` is the end of a page: any section then begins the next one.
     let rest = end.next_multiple_of(page) - end;
     if u64::from(bytes) <= rest { end } else { end + rest }
 }
@@ -215,12 +223,15 @@ pub(super) fn unpack(
     let count = section.count as usize;
     let mut lanes = LanePages::new(columns(sh_degree), pool);
     let mut rest = bytes;
+    // Invariant: `rest` begins with the length of the next part.
     for start in (0..count).step_by(PART_GAUSSIANS) {
         let here = (count - start).min(PART_GAUSSIANS);
         let (length, after) = rest.split_first_chunk().ok_or("it ends before its last part")?;
         let length = u32::from_le_bytes(*length) as usize;
         let part = after.get(..length).ok_or("it ends within a part")?;
         rest = &after[length..];
+        // The size of a part follows from its count. A part that unpacks to more does not fit into
+        // the buffer, and is refused.
         decompressed(part, record.part_bytes(sh_degree, here), |raw| {
             let raw = raw.map_err(|error| format!("a part does not decompress: {error}"))?;
             record.decode(raw, sh_degree, here, &mut lanes)
@@ -243,6 +254,7 @@ fn decompressed<T>(part: &[u8], capacity: usize, take: impl FnOnce(io::Result<&[
             const { RefCell::new((None, Vec::new())) };
     }
     KEPT.with_borrow_mut(|(decompressor, kept)| {
+        // It grows to the largest part of the process and never shrinks: some megabytes a thread.
         if kept.len() < capacity {
             kept.reserve_exact(capacity - kept.len());
             kept.resize(capacity, 0);
@@ -294,6 +306,7 @@ pub(super) fn fill(
     mut table: &[u8],
 ) -> Result<(), String> {
     for chunk in chunks {
+        // The tables of the chunks follow each other in the order of the manifest.
         let (contents, consumed) = decode(table)?;
         table = &table[consumed..];
         let found = (contents.cell, contents.origin_m, contents.sh_degree, contents.record);
@@ -325,6 +338,7 @@ pub(super) fn check_start(start: &[u8], chunk: &ChunkEntry) -> Result<(), String
     if word(8) != FORMAT {
         return Err(format!("it has format {}; this build reads format {FORMAT}", word(8)));
     }
+    // `rest` has at most [`limits::CHUNK_TABLE_BYTES`], so that this bounds the table, too.
     let table = rest.get(..word(12) as usize).ok_or("its table is longer than it may be")?;
     if page[16..48] != *blake3::hash(table).as_bytes() {
         return Err("its table of contents has another hash".into());
@@ -405,6 +419,7 @@ mod tests {
         let n = 300;
         let gaussians = Gaussians {
             sh_degree: 0,
+            // 299 x 0.04 m are 12 m: all lie in one block of 16 m.
             means_m: (0..n).map(|i| [0.04 * f64::from(i), 1.0, 2.0]).collect(),
             quats_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; n as usize],
             ln_scales: vec![[-2.0; 3]; n as usize],
@@ -452,12 +467,14 @@ mod tests {
 
     #[test]
     fn sections_share_a_page_where_they_fit_and_begin_one_where_not() {
+        // 8192 is a multiple of a page. After 8292, the page has 3996 bytes left.
         assert_eq!(place(8192, 100), 8192);
         assert_eq!(place(8292, 3996), 8292);
         assert_eq!(place(8292, 3997), 12288);
         assert_eq!(place(8292, 50_000), 12288);
         let (bytes, entry) = object();
         let [full, coarse] = &entry.sections[..] else { panic!("{:?}", entry.sections) };
+        // Page 0 is the header and page 1 the table.
         assert_eq!((coarse.offset_bytes, coarse.level), (8192, 1), "coarse levels come first");
         for section in [full, coarse] {
             let start = section.offset_bytes as usize;
@@ -473,6 +490,8 @@ mod tests {
         let table = table(std::slice::from_ref(&entry), 0, RecordFormat::Q32).unwrap();
         assert_eq!(filled(&entry, &table).unwrap(), entry.sections);
         // A row is 78 bytes: `limits::CHUNK_TABLE_BYTES` has room for 29 levels of 16 blocks.
+        // The other 42 bytes are 8 of the cell, 24 of the origin, 1 of the degree, 1 of the record,
+        // and 8 of the number of rows.
         assert_eq!(table.len(), 42 + 2 * 78);
         const { assert!(42 + 16 * 29 * 78 < limits::CHUNK_TABLE_BYTES) };
         for cut in 0..table.len() {
@@ -498,6 +517,7 @@ mod tests {
         }
         // 2^64 sections: nothing is allocated for them.
         let mut many = table.clone();
+        // Bytes 34 to 41 are the number of rows, after the 8 + 24 + 2 bytes in front of it.
         many[34..42].fill(255);
         assert!(filled(&entry, &many).unwrap_err().contains("does not decode"));
     }
@@ -513,7 +533,9 @@ mod tests {
         };
         assert_eq!(refused(0), "it does not start as a chunk");
         assert_eq!(refused(8), "it has format 0; this build reads format 1");
+        // Byte 15 is the highest of the table's length, which becomes 16 MB longer.
         assert_eq!(refused(15), "its table is longer than it may be");
+        // Byte 20 is in the stored hash, and byte 4100 in the table itself.
         assert_eq!(refused(20), "its table of contents has another hash");
         assert_eq!(refused(4100), "its table of contents has another hash");
         assert_eq!(check_start(&bytes[..4000], &entry).unwrap_err(), "it is shorter than a page");
@@ -537,6 +559,7 @@ mod tests {
             refused(&own[..cut], 300);
         }
         assert_eq!(refused(&[own, &[0]].concat(), 300), "1 bytes are left over");
+        // The bytes of 300 Gaussians do not fit into the buffer for 299.
         assert!(refused(own, 299).starts_with("a part does not decompress"));
         assert!(refused(own, 301).starts_with("301 Gaussians take "));
         // 4 G Gaussians, 240 GB: the first part is missing.

@@ -23,6 +23,7 @@ static START: LazyLock<Instant> = LazyLock::new(Instant::now);
 
 impl Clock for SystemClock {
     fn now_us(&self) -> i64 {
+        // A clock before 1970 counts as 1970. As i64, microseconds reach 290,000 years.
         let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         i64::try_from(since.as_micros()).unwrap_or(i64::MAX)
     }

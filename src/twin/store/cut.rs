@@ -69,8 +69,10 @@ impl Catalog {
         option: String,
     ) -> Result<Cut, StoreError> {
         let manifest = &base.manifest;
+        // Inverted once for each box, and not for each of millions of Gaussians.
         let places: Vec<(CutPlace, Pose)> =
             places.iter().map(|place| (*place, place.world_from_box.inverse())).collect();
+        // Only of cells that lose some: a change replaces whole cells, and leaves all others alone.
         let mut staying = Gaussians { sh_degree: manifest.sh_degree, ..Gaussians::default() };
         let mut cut = staying.clone();
         let mut cells = BTreeSet::new();
@@ -87,9 +89,11 @@ impl Catalog {
                     place.has(box_from_world.transform_point(mean_m))
                 })
             });
+            // The box is near, but nothing of this cell is in it: its stored bytes stay.
             if inside.is_empty() {
                 continue;
             }
+            // A change can replace a cell, but cannot remove one.
             if outside.is_empty() {
                 return Err(StoreError::NothingToCut { cell: Some(chunk.cell) });
             }
@@ -100,6 +104,7 @@ impl Catalog {
         if cut.is_empty() {
             return Err(StoreError::NothingToCut { cell: None });
         }
+        // As the twin is stored, because a version has one record format.
         let storage = StorageOptions { record: manifest.record, levels: manifest.has_levels() };
         let mut commit = self.begin(&manifest.twin, CommitKind::Import, storage)?;
         commit.put(&staying, Some(&cells), &mut |_, _| {})?;
@@ -124,6 +129,8 @@ impl CutPlace {
     /// Whether a part of some bounds may be in the box.
     fn is_near(&self, bounds: &Bounds) -> bool {
         let ActorBox { length_m, width_m, height_m } = self.box_;
+        // From the origin, in the middle of the ground face, the farthest corner is at sqrt((l/2)²
+        // + (w/2)² + h²). The diagonal of the box is above that.
         let reach_m = DVec3::new(length_m, width_m, height_m).length();
         bounds.distance_m(self.world_from_box.position_m) <= reach_m
     }

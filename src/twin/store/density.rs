@@ -27,6 +27,7 @@ mod tests {
         let needed = limits::GAUSSIANS_PER_CELL * sparse as u64;
         let error = check_density(100_000, 100_000).unwrap_err();
         assert!(error.to_string().contains("100000 cells"), "{error}");
+        // Beyond 4096 cells, 16 Gaussians per cell are needed. Up to 4096, one in each is enough.
         assert!(check_density(sparse, needed - 1).is_err());
         assert!(check_density(sparse, needed).is_ok());
         assert!(check_density(limits::SPARSE_CELLS, limits::SPARSE_CELLS as u64).is_ok());

@@ -58,6 +58,7 @@ impl Diff {
 
     /// The differences between two manifests.
     pub fn between(before: &Manifest, after: &Manifest) -> Self {
+        // The pair [before, after] by (y, x), which is the order of the result.
         let mut cells: BTreeMap<_, [Option<&ChunkEntry>; 2]> = BTreeMap::new();
         for (which, manifest) in [before, after].into_iter().enumerate() {
             for chunk in &manifest.chunks {
@@ -66,6 +67,7 @@ impl Diff {
             }
         }
         let all = cells.len() as u64;
+        // Objects are named by their content, so that equal names are equal cells.
         cells.retain(|_, [old, new]| old.map(|c| &c.object) != new.map(|c| &c.object));
         let size = |c: &ChunkEntry| CellSize { gaussians: c.count, bytes: c.bytes };
         let cells = cells.into_iter().map(|([y, x], [old, new])| CellDiff {
@@ -86,6 +88,7 @@ impl Diff {
             (Self::ALIGNMENT, before.alignment() != after.alignment()),
         ];
         let settings = differs.into_iter().filter_map(|(field, differs)| differs.then_some(field));
+        // No underflow: the cells that differ are some of all.
         Self { kept: all - cells.len() as u64, cells, settings: settings.collect() }
     }
 }

@@ -56,6 +56,7 @@ impl Catalog {
         trajectories.extend(new);
         let storage = StorageOptions { record: manifest.record, levels: manifest.has_levels() };
         let mut commit = self.begin(&manifest.twin, CommitKind::Import, storage)?;
+        // The Gaussians stay: a change of the other parts keeps the stored bytes.
         if !is_aligned {
             let trajectories = Some(trajectories);
             let change = VersionChange { trajectories, rig, ..VersionChange::edit() };
@@ -65,7 +66,9 @@ impl Catalog {
         let mut provenance = manifest.provenance.for_edit();
         provenance.options.push(format!("align={alignment}"));
         let before = manifest.alignment()?;
+        // Alignments compose: twin_from_capture = new * before.
         let twin_from_capture = before.map_or(alignment, |before| alignment.after(&before));
+        // Checked before all Gaussians are read.
         twin_from_capture.check()?;
         let mut gaussians = Gaussians { sh_degree: manifest.sh_degree, ..Gaussians::default() };
         self.visit_full_detail(base, &|_| true, &mut |section| gaussians.append(&section))?;
@@ -80,6 +83,7 @@ impl Catalog {
             twin_from_capture: Some(twin_from_capture),
             provenance,
         };
+        // The poses of recorded images are in the twin's axes. The objects of the images stay.
         if manifest.views.is_some() {
             let views = commit.put_views(&views::aligned(&self.views(base)?, &alignment))?;
             commit.set_views(Some(views));
@@ -90,7 +94,9 @@ impl Catalog {
 
 /// The sky after the world was turned.
 fn turned(sky: &SkyRef, alignment: &Alignment) -> SkyRef {
+    // The manifest has rows; `DMat3` has columns.
     let rows = DMat3::from_cols_array_2d(&sky.sky_from_world).transpose();
+    // sky_from_new = sky_from_old * old_from_new.
     let turned = rows * alignment.old_from_new();
     SkyRef { sky_from_world: turned.transpose().to_cols_array_2d(), ..sky.clone() }
 }

@@ -279,6 +279,7 @@ impl StoreError {
 }
 
 fn damaged_actor(hash: &str, name: Option<&str>, reason: &str) -> String {
+    // Of a folder only two digits are known.
     let Some(digits) = hash.get(..12) else {
         return format!(
             "no actor whose hash begins with {hash} can be read: {reason}; mend it in the store"

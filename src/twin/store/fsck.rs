@@ -86,6 +86,7 @@ impl Catalog {
         let gaps = (1..last).filter(|number| !present.contains(number)).take(numbers.len());
         let mut records = Vec::new();
         let mut readable = Vec::new();
+        // Collected versions lost their objects on purpose, so that they are no damage.
         let collected = self.collected(name)?;
         for number in numbers.into_iter().filter(|number| !collected.contains(number)) {
             match self.record(name, number) {
@@ -119,6 +120,7 @@ impl Catalog {
     pub fn repair_log(&self, name: &str) -> Result<Vec<RecordSetAside>, StoreError> {
         let mut aside = Vec::new();
         for number in self.numbers(name)?.into_iter().rev() {
+            // Not beyond a sound record: to set an older one aside would leave a gap.
             let Err(error) = self.record(name, number) else { break };
             // A file that the system refuses to read may be sound: its permissions or the disk may
             // be at fault.
@@ -168,6 +170,7 @@ impl Catalog {
         let mut images = BTreeSet::new();
         for &number in numbers {
             let hash = uncached.record(name, number)?.manifest;
+            // After a rollback, two versions have the same manifest.
             if !named.insert(hash.clone()) {
                 continue;
             }
@@ -177,6 +180,7 @@ impl Catalog {
                     named.insert(table.clone());
                     if let Some(SkyRef { object, .. }) = manifest.sky.clone()
                         && named.insert(object.clone())
+                        // With 0 bytes to keep, the object is only hashed.
                         && let Err(error) = uncached.objects.read_start(name, &object, 0)
                     {
                         damaged.push(DamagedObject { object, error });
@@ -193,6 +197,8 @@ impl Catalog {
                             named.append(&mut images);
                         }
                         Err(error) => {
+                            // What the table of images names is unknown, so that only the table is
+                            // reported.
                             let views = manifest.views.iter().map(|views| views.object.clone());
                             let object = views.collect::<String>();
                             if named.insert(object.clone()) {
@@ -210,9 +216,11 @@ impl Catalog {
             }
         }
         let total = chunks.values().map(|chunk| chunk.bytes).sum();
+        // No object counts twice: `named` has no chunks yet.
         let objects = chunks.len() + named.len();
         let mut done = 0;
         for (object, chunk) in chunks {
+            // A damaged table leaves the sections unknown, with which the chunk could be compared.
             let checked = if chunk.sections.is_empty() {
                 uncached.objects.read_start(name, &object, 0).map(|_| ())
             } else {

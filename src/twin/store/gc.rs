@@ -93,6 +93,7 @@ impl Catalog {
         dry_run: bool,
     ) -> Result<CollectionReport, StoreError> {
         check_name(name)?;
+        // One time for the whole run, so that both plans judge ages alike.
         let now_us = self.clock.now_us();
         let before: Candidates = self.read_side_json(name, CANDIDATES)?;
         let mut plan = self.plan(name, keep, &before, now_us)?;
@@ -108,7 +109,9 @@ impl Catalog {
                 Ok(plan.remove.iter().cloned().collect())
             })?;
         }
+        // After the removal: if that fails, the old candidates stay, and the next run tries again.
         self.objects.write_side_file(name, CANDIDATES, &self.encode(&plan.candidates)?)?;
+        // Leases of processes that ended without dropping them.
         for lease in self.leases(name)? {
             if !self.is_live(name, &lease, now_us)? {
                 lease.remove(self, name)?;
@@ -140,6 +143,7 @@ impl Catalog {
         let leases = self.live_leases(name, now_us)?;
         let leased = |lease: &&LeaseRecord| gone.contains(&lease.version);
         let Some(lease) = leases.iter().find(leased) else { return Ok(()) };
+        // Nothing was removed yet, so that all versions are whole.
         self.objects.write_side_file(name, COLLECTED, &self.encode(&before)?)?;
         Err(StoreError::Leased { name: name.to_owned(), number: lease.version })
     }
@@ -159,11 +163,13 @@ impl Catalog {
     ) -> Result<CollectionPlan, StoreError> {
         // Versions to keep: the latest ones, and those in use.
         let numbers = self.numbers(name)?;
+        // The latest version stays in any case.
         let latest = numbers.len().saturating_sub(keep.versions.max(1));
         let mut kept: BTreeSet<u64> = numbers[latest..].iter().copied().collect();
         let live = self.live_leases(name, now_us)?.into_iter();
         kept.extend(live.map(|lease| lease.version).filter(|number| numbers.contains(number)));
         let gone = self.collected(name)?;
+        // A collected version has no objects that could be kept.
         kept.retain(|number| !gone.contains(number));
 
         // Their objects are needed; all others are garbage.
@@ -172,11 +178,13 @@ impl Catalog {
             named.extend(self.named_by(name, &self.record(name, number)?.manifest)?);
         }
         let grace_us = i64::try_from(keep.grace.as_micros()).unwrap_or(i64::MAX);
+        // If the clock jumped back, an age is negative, and the object is not old.
         let is_old = |since_us: i64| now_us.saturating_sub(since_us) >= grace_us;
         let mut found = self.objects.list_objects(name)?.whole()?;
         found.retain(|object| object.is_file && !named.contains(&object.hash));
         let is_removable = |object: &&ListedObject| {
             let noted_us = before.get(&object.hash).copied();
+            // Noted long ago, and not written again by a commit since.
             noted_us.is_some_and(is_old) && is_old(object.written_us)
         };
         let removable = found.iter().filter(is_removable).map(|object| object.hash.clone());
@@ -189,6 +197,7 @@ impl Catalog {
             if plan.remove.contains(&object.hash) {
                 plan.report.removed.add(object.bytes);
             } else if plan.candidates.len() < limits::GC_CANDIDATES {
+                // What does not fit is noted by a later run, after others are gone.
                 plan.report.noted.add(object.bytes);
                 plan.candidates.insert(object.hash.clone(), noted_us.unwrap_or(now_us));
             }
@@ -209,6 +218,7 @@ impl Catalog {
         if plan.remove.is_empty() {
             return Ok(());
         }
+        // Invariant: `needed` has what the versions seen so far name, as far as they stay.
         let mut manifests = Vec::new();
         let mut needed = BTreeSet::new();
         for number in others {
@@ -219,6 +229,7 @@ impl Catalog {
                 record => record?,
             };
             let stays = !plan.remove.contains(&record.manifest) || !is_old(record.created_us);
+            // Versions that share a manifest, as after a rollback, are read once.
             if stays && !needed.contains(&record.manifest) {
                 match self.named_by(name, &record.manifest) {
                     Ok(named) => needed.extend(named),

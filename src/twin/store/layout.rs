@@ -30,6 +30,7 @@ pub(super) const LOCK_ENDING: &str = ".lock";
 
 /// Path of an object below the root.
 pub(super) fn object_key(name: &str, hash: &str) -> String {
+    // 256 folders, so that none of them has very many entries. The caller has checked the hash.
     format!("{name}/{OBJECTS}/{}/{hash}", &hash[..2])
 }
 
@@ -47,6 +48,7 @@ pub(super) fn log_numbers(names: impl IntoIterator<Item = String>) -> Vec<u64> {
 
 /// Whether a text is 64 lower-case hex digits, and so may become a file name.
 pub(super) fn is_hash(text: &str) -> bool {
+    // Upper-case digits would be a second name of the same object.
     text.len() == 64 && text.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'))
 }
 
@@ -80,6 +82,7 @@ mod tests {
 
     #[test]
     fn only_names_that_a_commit_writes_are_versions() {
+        // A version has ten digits with zeros in front, or more digits without.
         let names = ["0000000002", "10000000000", "1", "+1", "+000000003", "00000000004", "x"];
         assert_eq!(log_numbers(names.map(str::to_owned)), [2, 10_000_000_000]);
     }

@@ -58,6 +58,7 @@ impl Catalog {
         let id = uuid::Uuid::now_v7().as_simple().to_string();
         let record = LeaseRecord { version, holder: holder.to_owned(), id, until_us: 0 };
         self.check_not_collected(name, version)?;
+        // Locked before the lease is written: from its first moment on it counts as live.
         let lock = self.objects.hold(name, &record.lock_file())?;
         let catalog = self.clone();
         let mut lease = Lease { catalog, name: name.to_owned(), duration, record, _lock: lock };
@@ -83,6 +84,7 @@ impl Catalog {
             // damaged one is unknown.
             let record =
                 read.and_then(|record| serde_json::from_slice::<LeaseRecord>(&record).ok());
+            // A file under another name is a copy. The lock of its id says nothing about it.
             leases.extend(record.filter(|record| record.id == id));
         }
         Ok(leases)
@@ -110,6 +112,7 @@ impl Catalog {
         lease: &LeaseRecord,
         now_us: i64,
     ) -> Result<bool, StoreError> {
+        // The lock is asked only after the expiry time, because that opens a file.
         Ok(lease.until_us > now_us || self.objects.is_held(name, &lease.lock_file())?)
     }
 }
@@ -140,6 +143,7 @@ impl Drop for Lease {
 
 impl LeaseRecord {
     pub(super) fn remove(&self, catalog: &Catalog, name: &str) -> Result<(), StoreError> {
+        // The lease goes first: a lock without a lease is a leftover, and keeps no version.
         catalog.objects.remove_side_file(name, &self.file())?;
         catalog.objects.remove_side_file(name, &self.lock_file())
     }

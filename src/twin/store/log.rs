@@ -31,6 +31,7 @@ impl LogEntry {
     /// The name of how it was made: `import`, `edit`, `push` or `rollback`.
     pub fn kind_name(&self) -> &'static str {
         match self.kind {
+            // First, because an edit is stored as an import with a parent.
             _ if self.is_edit() => "edit",
             CommitKind::Import => "import",
             CommitKind::Push => "push",

@@ -73,6 +73,7 @@ impl Catalog {
             storage,
         } = new;
         check_name(name)?;
+        // Before anything is written. `put` checks again, which costs little compared with packing.
         validate::check(gaussians, &Field::twin_name).map_err(IngestError::from)?;
         let settings = VersionSettings {
             profile,
@@ -80,6 +81,7 @@ impl Catalog {
             trajectories,
             sky,
             geo,
+            // The scene is in the axes of its capture.
             twin_from_capture: None,
             provenance,
         };

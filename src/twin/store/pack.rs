@@ -81,6 +81,8 @@ impl<'a> CellPacker<'a> {
         let mut done = 0;
         let mut chunks = Vec::with_capacity(self.cells.len());
         let mut rest = &self.cells[..];
+        // A batch bounds the memory: its packed sections are held, and not those of the whole
+        // scene.
         while !rest.is_empty() {
             let (batch, after) = rest.split_at(batch_cells(rest));
             rest = after;
@@ -100,6 +102,7 @@ impl<'a> CellPacker<'a> {
             let mut packed = packed.into_iter();
             for cell in batch {
                 let mut sections = Vec::new();
+                // The results are in the order of `blocks`, cell by cell.
                 for (block, lost) in packed.by_ref().take(cell.blocks.len()) {
                     sections.extend(block);
                     clamped.merge(&lost);
@@ -150,6 +153,7 @@ impl<'a> CellPacker<'a> {
         packed: Vec<PackedSection>,
     ) -> Result<ChunkEntry, StoreError> {
         let CellRun { cell, origin_m, ref run, .. } = *cell;
+        // Set by the closure, whose own result is only whether writing succeeded.
         let mut sections = Vec::new();
         let mut bounds = Bounds::EMPTY;
         let header = ChunkHeader {
@@ -181,5 +185,6 @@ fn batch_cells(cells: &[CellRun]) -> usize {
         gaussians += cell.run.len();
         gaussians < BATCH_GAUSSIANS
     });
+    // The cell that reaches the limit is the last of the batch: at least one, however large it is.
     cells.len().min(few.count() + 1)
 }

@@ -36,6 +36,7 @@ impl Catalog {
     fn named_by_all(&self, name: &str) -> Result<BTreeSet<String>, StoreError> {
         let collected = self.collected(name)?;
         let mut named = BTreeSet::new();
+        // `numbers` would fail for a twin whose first commit was killed.
         for number in self.objects.version_numbers(name)? {
             if !collected.contains(&number) {
                 named.extend(self.named_by(name, &self.record(name, number)?.manifest)?);

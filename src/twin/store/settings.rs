@@ -52,6 +52,7 @@ impl VersionSettings {
     pub(super) fn check(&self) -> Result<(), StoreError> {
         check(Some(&self.profile), self.rig.as_ref(), &self.trajectories)?;
         self.geo.as_ref().map_or(Ok(()), GeoAnchor::check)?;
+        // The sky is last, because baking it takes about a second.
         self.sky.as_ref().map_or(Ok(()), |sky| sky.check(&self.profile))
     }
 }
@@ -80,6 +81,7 @@ impl VersionChange {
     /// Names what cannot be used.
     pub(super) fn check(&self) -> Result<(), StoreError> {
         let trajectories = self.trajectories.as_deref().unwrap_or_default();
+        // `Some(None)` removes the place, and needs no check.
         self.geo.iter().flatten().try_for_each(GeoAnchor::check)?;
         check(self.profile.as_ref(), self.rig.as_ref(), trajectories)
     }
@@ -95,6 +97,7 @@ fn check(
     let mut names = BTreeSet::new();
     for trajectory in trajectories {
         trajectory.check()?;
+        // Drives are named in scenarios, so that two of one name would be ambiguous.
         if !names.insert(&*trajectory.name) {
             return Err(StoreError::DuplicateTrajectory { name: trajectory.name.clone() });
         }

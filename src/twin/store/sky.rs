@@ -42,6 +42,7 @@ impl NewSky {
             Self::Kept(_) => Ok(()),
             Self::Put(SkyBytes { bytes, image, sky_from_world }) => {
                 let sky = Sky::new(sky::decode(bytes, *image)?, *sky_from_world);
+                // Baked once here, so that no version is committed whose sky can never be drawn.
                 sky.drawable(profile.sky_error).map_err(crate::ingest::IngestError::Sky)?;
                 Ok(())
             }
@@ -58,6 +59,7 @@ impl NewSky {
                     object: put.hash,
                     bytes: put.bytes,
                     image: *image,
+                    // The manifest has rows; `DMat3` has columns.
                     sky_from_world: sky_from_world.transpose().to_cols_array_2d(),
                 })
             }
@@ -80,6 +82,7 @@ impl Catalog {
         };
         let model = sky::decode(&bytes, named.image).map_err(|error| damaged(error.to_string()))?;
         let axes = DMat3::from_cols_array_2d(&named.sky_from_world).transpose();
+        // R Rᵀ = I, within far more than the rounding of f64 (1e-16).
         let skew = axes * axes.transpose() - DMat3::IDENTITY;
         let is_orthonormal = skew.to_cols_array().iter().all(|error| error.abs() <= 1e-9);
         if !is_orthonormal {

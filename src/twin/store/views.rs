@@ -28,12 +28,14 @@ impl Commit {
     /// [`StoreError::ViewSize`], or it cannot be written.
     pub fn put_views(&mut self, views: &[RecordedView]) -> Result<ViewsRef, StoreError> {
         let table = self.catalog().encode(&views)?;
+        // Checked before it is written, because no reader would accept it.
         check_size("table", table.len() as u64, limits::VIEWS_TABLE_BYTES)?;
         let ObjectRef { object, bytes } = self.put_object(&table)?;
         Ok(ViewsRef {
             object,
             bytes,
             images: views.len() as u64,
+            // Masks count, too.
             image_bytes: views.iter().flat_map(objects).map(|object| object.bytes).sum(),
         })
     }
@@ -88,6 +90,7 @@ impl Catalog {
         };
         let views: Vec<RecordedView> =
             serde_json::from_slice(&bytes).map_err(|error| damaged(error.to_string()))?;
+        // The hashes become paths.
         let wrong = views.iter().flat_map(objects).find(|object| !is_hash(&object.object));
         match wrong.map(|object| object.object.clone()) {
             Some(object) => Err(damaged(format!("{object:?} is not a hash"))),
@@ -100,6 +103,7 @@ impl Catalog {
         let views = self.read_views(manifest)?;
         let images = views.iter().flat_map(objects).map(|object| object.object.clone());
         let table = manifest.views.iter().map(|views| views.object.clone());
+        // A set, because views may share an object, such as a mask.
         Ok(images.chain(table).collect())
     }
 }
@@ -111,6 +115,7 @@ pub(super) fn objects(view: &RecordedView) -> impl Iterator<Item = &ObjectRef> {
 
 /// The views after the world was turned, moved and scaled.
 pub(super) fn aligned(views: &[RecordedView], alignment: &Alignment) -> Vec<RecordedView> {
+    // The stored image stays; only the place from which it was taken is in other axes.
     let aligned = |view: &RecordedView| RecordedView {
         world_from_camera: alignment.pose(&view.world_from_camera),
         station_m: alignment.metres_per_unit * view.station_m,

@@ -54,6 +54,7 @@ impl DamagedActor {
     fn unlisted(unlisted: UnlistedObjects) -> Self {
         let UnlistedObjects { digits: hash, error } = unlisted;
         let mut reason = skip_reason(error);
+        // Two digits name a folder; an object has 64.
         if hash.len() == 2 {
             reason = format!("the folder of all assets whose hashes begin so: {reason}");
         }
@@ -83,6 +84,7 @@ impl Catalog {
             }
         }
         let ActorList { actors, damaged } = &mut read.list;
+        // A listing is in order of hashes; people look for names.
         actors.sort_by_cached_key(|one| (one.description.name.clone(), one.hash.clone()));
         damaged.sort_by_cached_key(|one| one.hash.clone());
         read
@@ -90,12 +92,16 @@ impl Catalog {
 
     fn read_head(&self, object: ListedObject) -> ReadActor {
         let ListedObject { hash, bytes, is_file, .. } = object;
+        // All bytes are hashed, although only the head is kept: damage anywhere makes an asset
+        // unusable.
         let HashedStart { start, hash: found } =
             match self.objects.read_and_hash(ACTORS, &hash, HEAD_BYTES) {
                 Ok(read) => read,
                 Err(StoreError::Io { cause, .. }) if cause.kind() == ErrorKind::NotFound => {
                     return ReadActor::Removed;
                 }
+                // A file that the system fails to read may be whole. A link or a pipe in its place
+                // is damage.
                 Err(error @ StoreError::Io { .. }) if is_file => return ReadActor::Unread(error),
                 Err(error) => {
                     let reason = skip_reason(error);
@@ -106,6 +112,8 @@ impl Catalog {
             Ok((header, _)) if found == hash => {
                 ReadActor::Whole(StoredActor::new(hash, bytes, header))
             }
+            // The header can be parsed, so that the message can name the asset. The name may be
+            // damaged, too: `is_name` keeps control characters out of the message.
             Ok((header, _)) => {
                 let name = Some(header.description.name).filter(|name| is_name(name));
                 let reason = format!("its bytes hash to {found}");

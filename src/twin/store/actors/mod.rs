@@ -129,6 +129,7 @@ impl Catalog {
         // The other assets cannot change from now on until this one is visible.
         staging.lock_publishing()?;
         let listing = self.objects.list_objects(ACTORS)?;
+        // Whether the bytes of the object are right is not read here, only its kind and its size.
         let is_whole = |known: &ListedObject| known.is_file && known.bytes == bytes.len() as u64;
         let known = listing.objects.iter().find(|known| known.hash == hash);
         let is_new = !known.is_some_and(is_whole);
@@ -179,6 +180,7 @@ impl Catalog {
             listing.unlisted.clear();
         }
         let ActorList { actors, damaged } = self.read_actors(listing).whole()?;
+        // A shorter text is a name only: several hashes would begin with it.
         let is_prefix = text.len() >= 4 && text.bytes().all(|b| b.is_ascii_hexdigit());
         let is_hash_of = |hash: &str| is_prefix && hash.starts_with(text);
         let is_it = |one: &&StoredActor| one.description.name == text || is_hash_of(&one.hash);
@@ -197,6 +199,7 @@ impl Catalog {
             ([], [one]) => return Err((*one).clone().into()),
             _ => {}
         }
+        // Without a match all are named, so that the message shows what there is.
         let listed = if count == 0 { actors.iter().collect() } else { found };
         let named = |one: &StoredActor| format!("{} ({})", one.description.name, digits(&one.hash));
         let damaged = |one: &DamagedActor| format!("a damaged one ({})", digits(&one.hash));
@@ -223,6 +226,8 @@ impl Catalog {
             return find();
         }
         let mut removed = String::new();
+        // Looked up under the lock: until then another process may store a second asset of the
+        // name.
         self.objects.remove_objects(ACTORS, &mut || {
             removed = find()?;
             Ok(vec![removed.clone()])
@@ -248,6 +253,7 @@ impl Catalog {
             Ok(bytes) => bytes,
             // It does not exist, is not a file, or cannot be read.
             Err(error @ StoreError::Io { .. }) => {
+                // `find_actor` knows more about it: that there is none, or that it is damaged.
                 return Err(self.find_actor(hash).err().unwrap_or(error));
             }
             Err(error) => return Err(damaged(None, skip_reason(error))),

@@ -50,6 +50,7 @@ impl Catalog {
         let sh_degree = asset.levels.first().map_or(0, |level| level.chunk.sh_degree());
         for (index, AssetLevel { error_m, chunk }) in asset.levels.iter().enumerate() {
             let mut clamped = Clamped::default();
+            // An asset is stored like block 0 of a cell at the origin.
             let level = LevelOfBlock { block: 0, level: index as u8, error_m: *error_m };
             let packed = chunk_file::pack(chunk, level, record, &mut clamped)
                 .map_err(StoreError::io("compress for", self.dir()))?;
@@ -91,6 +92,7 @@ impl Header {
             return Err(format!("it has format {}; this build reads format {FORMAT}", word(8)));
         }
         let length = word(12) as usize;
+        // `bytes` may be only the first [`HEAD_BYTES`], which have no room for a longer header.
         if length > limits::ACTOR_HEADER_BYTES {
             return Err("its header is longer than it may be".to_owned());
         }
@@ -123,6 +125,7 @@ impl Header {
             let of_level = |reason: String| format!("level {index}: {reason}");
             let own = rest.get(..level.bytes as usize);
             let own = own.ok_or_else(|| of_level("it ends before its last byte".to_owned()))?;
+            // Levels follow each other without gaps: what is left after the last one is damage.
             rest = &rest[own.len()..];
             let (entry, section) = section(level);
             let (degree, record) = (self.sh_degree, self.record);

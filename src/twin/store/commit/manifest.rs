@@ -30,6 +30,7 @@ impl Commit {
             format: Manifest::FORMAT,
             twin: self.name.clone(),
             profile,
+            // If nothing was put, there is no degree to keep.
             sh_degree: self.sh_degree.unwrap_or(0),
             record: self.storage.record,
             table: ObjectRef { object: String::new(), bytes: 0 },
@@ -51,9 +52,11 @@ impl Commit {
         mut manifest: Manifest,
         change: &VersionChange,
     ) -> Result<Manifest, StoreError> {
+        // The chunks of a version have one degree and one record format, which its manifest states.
         self.check_field("sh_degree", self.sh_degree, manifest.sh_degree)?;
         self.check_field("record", Some(self.storage.record), manifest.record)?;
         let VersionChange { profile, rig, trajectories, sky, geo, provenance } = change.clone();
+        // Kept for the comparison below, which only an edit needs.
         let edited = provenance.is_none().then(|| manifest.clone());
         if let Some(sky) = sky {
             manifest.sky = sky.map(|sky| sky.put(&mut *self.staging)).transpose()?;
@@ -65,6 +68,8 @@ impl Commit {
         manifest.geo = geo.unwrap_or(manifest.geo);
         // Before the provenance is replaced, which may be the only place that has it.
         manifest.twin_from_capture = manifest.alignment()?;
+        // By (y, x), the order of a manifest's chunks. What was put takes the place of the old
+        // cell.
         let own = manifest.chunks.into_iter().map(|chunk| ([chunk.cell[1], chunk.cell[0]], chunk));
         let mut chunks: BTreeMap<_, _> = own.collect();
         chunks.extend(self.chunks.clone());
@@ -86,6 +91,7 @@ impl Commit {
         let Manifest { chunks, sh_degree, record, .. } = &manifest;
         let table = chunk_file::table(chunks, *sh_degree, *record)
             .map_err(StoreError::io("encode a table for", self.catalog.dir()))?;
+        // Checked before it is written, because no reader would accept it.
         check_size("table", table.len(), limits::TABLE_BYTES)?;
         let stored = self.staging.put(Box::new(|out| out.write_all(&table)))?;
         manifest.table = ObjectRef { object: stored.hash, bytes: stored.bytes };

@@ -115,17 +115,21 @@ impl Commit {
     ) -> Result<StoredCells, StoreError> {
         validate::check(gaussians, &Field::twin_name).map_err(IngestError::from)?;
         let sh_degree = gaussians.sh_degree;
+        // The first part decides the degree; this one is compared with it.
         self.check_field("sh_degree", Some(sh_degree), self.sh_degree.unwrap_or(sh_degree))?;
         let packer = CellPacker::new(gaussians, self.storage, only);
         check_density(packer.cells().count(), packer.gaussians())?;
         if let Some(cell) = packer.cells().find(|&[x, y]| self.chunks.contains_key(&[y, x])) {
             return Err(StoreError::DuplicateCell { name: self.name.clone(), cell });
         }
+        // If this fails, the commit has changed in nothing: what was written is staged, but not
+        // named.
         let (chunks, clamped) = packer.put(&mut *self.staging, progress)?;
         self.sh_degree = Some(sh_degree);
         self.clamped.merge(&clamped);
         let by_cell = |chunk: &ChunkEntry| ([chunk.cell[1], chunk.cell[0]], chunk.clone());
         self.chunks.extend(chunks.iter().map(by_cell));
+        // No underflow: the packer has a part of these Gaussians.
         Ok(StoredCells { left_out: gaussians.len() as u64 - packer.gaussians(), chunks })
     }
 
@@ -168,6 +172,7 @@ impl Commit {
 
     /// Checks that the record format can hold the Gaussians that were put.
     fn check_clamped(&self) -> Result<(), StoreError> {
+        // Only of the cells that were put: a change is judged by what it adds.
         let gaussians = self.chunks.values().map(|chunk| chunk.count).sum::<u64>();
         match self.clamped.worst() {
             Some((field, count)) if count as f64 > limits::CLAMPED_SHARE * gaussians as f64 => {

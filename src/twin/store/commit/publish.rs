@@ -33,10 +33,12 @@ impl Commit {
         let base = base.map(|base| self.catalog.version(&self.name, Some(base))).transpose()?;
         let parent = base.as_ref().map(|base| base.number);
         self.publish_put(parent, settings, |commit, latest, manifest| match (&base, latest) {
+            // If the latest version is the base itself, others have changed nothing.
             (Some(base), Some(latest)) if latest != base.number => {
                 let latest = commit.catalog.version(&commit.name, Some(latest))?;
                 commit.check_overlap(base, &latest, manifest)
             }
+            // Without a base, or in a new twin, there is nothing of others to revert.
             _ => Ok(()),
         })
     }
@@ -80,6 +82,8 @@ impl Commit {
         change.check()?;
         self.check_clamped()?;
         let base = self.catalog.version(&self.name, Some(base))?;
+        // The sky will be drawn with the profile of the new version: that of the change, or else
+        // that of the base.
         if let Some(Some(sky)) = &change.sky {
             sky.check(&change.profile.unwrap_or(base.manifest.profile))?;
         }
@@ -105,6 +109,8 @@ impl Commit {
             // is not used.
             let uncached = commit.catalog.uncached();
             let Version { hash, manifest, .. } = uncached.version(&commit.name, Some(number))?;
+            // Only presence and size: hashing all chunks would hold the lock for too long, and
+            // `fsck` does it.
             for chunk in &manifest.chunks {
                 uncached.objects.check_present(&commit.name, &chunk.object, chunk.bytes)?;
             }
@@ -133,6 +139,8 @@ impl Commit {
         latest: &Version,
         new: &Manifest,
     ) -> Result<(), StoreError> {
+        // Theirs lead from the base to the latest version, ours from there to the new one. A change
+        // that both made is in the latest version, and so not in ours.
         let theirs = Diff::between(&base.manifest, &latest.manifest);
         let ours = Diff::between(&latest.manifest, new);
         let changed: BTreeSet<_> = ours.cells.iter().map(|differs| differs.cell).collect();
@@ -162,11 +170,15 @@ impl Commit {
         parent: Option<u64>,
         mut build: impl FnMut(&mut Self, Option<u64>) -> Result<HashedManifest, StoreError>,
     ) -> Result<Version, StoreError> {
+        // Held until this commit ends. An object store has no lock: there, the record that is put
+        // if absent decides.
         self.staging.lock_publishing()?;
         let mut tries = 1;
         loop {
             let latest = self.catalog.objects.version_numbers(&self.name)?.last().copied();
             let HashedManifest { manifest, hash } = build(&mut self, latest)?;
+            // What this commit wrote and the manifest names. Objects of the base are in their
+            // places already.
             let own = self.chunks.values().map(|chunk| chunk.object.as_str());
             let sky = manifest.sky.iter().map(|sky| sky.object.as_str());
             let named = [manifest.table.object.as_str(), hash.as_str()];
@@ -174,10 +186,12 @@ impl Commit {
             let objects = own.chain(sky).chain(images).chain(named).collect();
 
             // With the same content as the latest version, that version is the result.
+            // If its record is damaged, the new version follows it.
             if let Some(number) = latest
                 && let Ok(record) = self.catalog.record(&self.name, number)
                 && record.manifest == hash
             {
+                // Even so, the objects are written over those in place, which mends damaged ones.
                 self.staging.restore(&objects, number)?;
                 return Ok(Version { number, hash, created_us: record.created_us, manifest });
             }
@@ -202,6 +216,7 @@ impl Commit {
                     self.staging.restore(&objects, number)?;
                     return Ok(Version { number, hash, created_us, manifest });
                 }
+                // Another commit was first: everything is checked again against its version.
                 Err(StoreError::Conflict { .. }) if tries < limits::PUBLISH_TRIES => tries += 1,
                 Err(error) => return Err(error),
             }

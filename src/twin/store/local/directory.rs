@@ -70,6 +70,7 @@ impl Local {
             }
             Err(cause) => cause,
         };
+        // The error of listing does not say whether it is a folder at all.
         match self.disk.info(dir) {
             Err(error) if error.kind() == ErrorKind::NotFound => Ok(Vec::new()),
             Ok(found) if !found.is_dir => {
@@ -89,6 +90,7 @@ impl Local {
         let objects = self.objects_dir(name);
         for prefix in entries(&*self.disk, &objects)? {
             for hash in entries(&*self.disk, &objects.join(&prefix))? {
+                // All versions were read: what none of them names is of a killed commit.
                 if !named.contains(&hash) {
                     let path = objects.join(&prefix).join(&hash);
                     self.disk.remove_file(&path).map_err(StoreError::io("remove", &path))?;
@@ -107,6 +109,7 @@ impl Local {
         for prefix in entries(&*self.disk, &objects).unwrap_or_default() {
             let _ = self.disk.remove_dir(&objects.join(prefix));
         }
+        // From the inside out. The system refuses to remove a directory that is not empty.
         for dir in [objects, twin.join(LOG), twin] {
             let _ = self.disk.remove_dir(&dir);
         }
@@ -115,6 +118,7 @@ impl Local {
     /// Creates a directory of which nothing need survive a power cut: of commits in preparation,
     /// and of locks.
     pub(super) fn create_transient(&self, dir: &Path) -> Result<(), StoreError> {
+        // Without a sync: no process that needs it lives through a power cut.
         if self.exists(dir)? { Ok(()) } else { create_dirs(&*self.disk, dir) }
     }
 
@@ -136,8 +140,10 @@ impl Local {
     /// would be without objects, or the log would have a gap.
     pub(super) fn settle(&self, name: &str) -> Result<(), StoreError> {
         let twin = self.root.join(name);
+        // The twin's own directory is last: it has the names of the other two.
         for dir in [twin.join(LOG), twin.join(COLLECTION), twin] {
             match self.disk.sync_dir(&dir) {
+                // A new twin has none of them.
                 Err(e) if matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {}
                 synced => synced.map_err(StoreError::io("sync", &dir))?,
             }

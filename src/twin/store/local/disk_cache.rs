@@ -57,6 +57,7 @@ impl DiskCache {
     pub(in crate::store) fn open(dir: &Path, limit_bytes: u64) -> Result<Self, StoreError> {
         create_dirs(&RealDisk, dir)?;
         let cache = Self { dir: dir.to_owned(), limit_bytes, counts: Arc::default() };
+        // The limit may be smaller than at the last start.
         cache.make_room()?;
         Ok(cache)
     }
@@ -85,12 +86,15 @@ impl DiskCache {
     /// but correct.
     pub(in crate::store) fn put(&self, hash: &str, bytes: &[u8]) {
         let size = bytes.len() as u64;
+        // A larger part would evict too many others, and would break the bound of `make_room`.
         if size > self.limit_bytes / SLACK {
             return;
         }
         let begun = self.counts.begun.fetch_add(1, Ordering::Relaxed);
         let writing = self.dir.join(format!("{WRITING}{}.{begun}", std::process::id()));
         let path = self.path(hash);
+        // Written under a name of its own and then renamed, so that other processes see all of it
+        // or nothing.
         let kept = fs::create_dir_all(self.dir.join(&hash[..2]))
             .and_then(|()| fs::write(&writing, bytes))
             .and_then(|()| fs::rename(&writing, &path));
@@ -98,6 +102,7 @@ impl DiskCache {
             let _ = fs::remove_file(&writing);
         }
         let written = self.counts.written.fetch_add(size, Ordering::Relaxed) + size;
+        // So a process is at most 1 / `SLACK` of the limit ahead of the last call.
         if written > self.limit_bytes / SLACK {
             self.counts.written.store(0, Ordering::Relaxed);
             let _ = self.make_room();
@@ -119,6 +124,7 @@ impl DiskCache {
         let path = self.dir.join("lock");
         let lock = File::options().create(true).append(true).open(&path);
         let lock = lock.map_err(StoreError::io("create", &path))?;
+        // Another process or thread is freeing space.
         if lock.try_lock().is_err() {
             return Ok(());
         }
@@ -141,9 +147,11 @@ impl DiskCache {
                 }
             }
         }
+        // Tuples are compared by their first field: the least recently used part is first.
         parts.sort_unstable();
         let mut bytes: u64 = parts.iter().map(|(_, _, bytes)| bytes).sum();
         for (_, path, size) in parts {
+            // The rest of the limit is for what is written until the next call.
             if bytes <= self.limit_bytes - self.limit_bytes / SLACK {
                 break;
             }
@@ -193,6 +201,7 @@ mod tests {
     #[test]
     fn parts_are_shared_by_processes_until_there_is_no_room() {
         let dir = tempfile::tempdir().unwrap();
+        // 1 / `SLACK` of 32,000 bytes is 2000, two parts of 1000 bytes.
         let [one, two] = [(); 2].map(|()| DiskCache::open(dir.path(), 32_000).unwrap());
         for number in 0..100 {
             one.put(&hash(&part(number)), &part(number));
@@ -206,6 +215,7 @@ mod tests {
         assert!(sizes(dir.path()) > 20_000);
         assert_eq!(two.get(&hash(&part(99))), Some(part(99)));
         assert_eq!(two.get(&hash(&part(1))), None);
+        // 100 hits of part 0 and one of part 99, and the miss of part 1.
         assert_eq!(two.hits_and_misses(), (101, 1));
         // Larger than a part may be.
         one.put(&hash(&[7; 3_000]), &[7; 3_000]);
@@ -218,6 +228,7 @@ mod tests {
         let cache = DiskCache::open(dir.path(), 1 << 20).unwrap();
         let name = hash(&part(1));
         cache.put(&name, &part(1));
+        // As a power cut leaves them: half of a part, or nothing.
         for torn in [&part(1)[..500], &[]] {
             fs::write(cache.path(&name), torn).unwrap();
             assert_eq!(cache.get(&name), None);

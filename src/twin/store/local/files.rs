@@ -54,6 +54,7 @@ impl<F: Write> Write for HashingFile<F> {
 /// # Errors
 /// The file system fails, or returns fewer bytes than the file's size.
 pub(super) fn read_all(file: Box<dyn ReadFile>, limit_bytes: u64) -> io::Result<Vec<u8>> {
+    // The limit bounds what is allocated, whatever size the file has.
     let size = file.size_bytes()?.min(limit_bytes);
     let mut bytes = Vec::with_capacity(size as usize);
     file.take(limit_bytes).read_to_end(&mut bytes)?;
@@ -95,6 +96,7 @@ pub fn create_dirs(disk: &dyn Disk, dir: &Path) -> Result<(), StoreError> {
     if dir.as_os_str().is_empty() {
         return Ok(());
     }
+    // It exists, but its name may not be durable yet.
     if is_dir(disk, dir) {
         return match dir.parent().map(|parent| disk.sync_dir(parent)) {
             // This process may not read the directory above, so that another user has created this
@@ -104,6 +106,7 @@ pub fn create_dirs(disk: &dyn Disk, dir: &Path) -> Result<(), StoreError> {
             None => Ok(()),
         };
     }
+    // The recursion ends at the first directory that exists.
     create_parent(disk, dir)?;
     create_dir(disk, dir)?;
     sync_parent(disk, dir)
@@ -128,6 +131,7 @@ pub(super) fn create_dirs_in(
 /// time.
 fn create_dir(disk: &dyn Disk, dir: &Path) -> Result<(), StoreError> {
     match disk.create_dir(dir) {
+        // Another process may have been first, which is as good, if it made a directory.
         Err(error) if error.kind() != ErrorKind::AlreadyExists || !is_dir(disk, dir) => {
             Err(StoreError::io("create", dir)(error))
         }

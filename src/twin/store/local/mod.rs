@@ -41,6 +41,7 @@ impl ObjectBackend for Local {
 
     fn twin_names(&self) -> Result<Vec<String>, StoreError> {
         let mut names = entries(&*self.disk, &self.root)?;
+        // A twin whose log cannot be listed stays in the list, where it is shown as damaged.
         names.retain(|name| {
             is_name(name) && !self.version_numbers(name).is_ok_and(|n| n.is_empty())
         });
@@ -59,6 +60,7 @@ impl ObjectBackend for Local {
 
     fn read_object(&self, name: &str, hash: &str, limit_bytes: u64) -> Result<Vec<u8>, StoreError> {
         let OpenObject { path, file, bytes: size } = self.open(name, hash)?;
+        // `read_all` would cut it off, and the message would name another hash instead of the size.
         if size > limit_bytes {
             let reason = format!("{size} bytes are above {limit_bytes}");
             return Err(StoreError::Damaged { path, reason });
@@ -82,6 +84,7 @@ impl ObjectBackend for Local {
         let mut start = Vec::new();
         (&mut reader).take(most_bytes as u64).read_to_end(&mut start).map_err(failed())?;
         let mut buffer = vec![0; BUFFER_BYTES];
+        // The rest is only hashed.
         while reader.read(&mut buffer).map_err(failed())? > 0 {}
         Ok(HashedStart { start, hash: reader.hasher.finalize().to_hex().to_string() })
     }
@@ -94,6 +97,7 @@ impl ObjectBackend for Local {
         hash: &[u8; 32],
     ) -> Result<Vec<u8>, StoreError> {
         let OpenObject { path, mut file, bytes: size } = self.open(name, object)?;
+        // Before the allocation: a damaged table could ask for any size.
         if bytes.end > size {
             let reason = format!("it has {size} bytes; {} are needed", bytes.end);
             return Err(StoreError::Damaged { path, reason });
@@ -139,6 +143,7 @@ impl ObjectBackend for Local {
             let name = entry.split_once(SEPARATOR).map(|(name, _)| name);
             names.extend(name.filter(|name| is_name(name) || *name == ACTORS).map(str::to_owned));
         }
+        // The entries are sorted, so that equal names are neighbours.
         names.dedup();
         Ok(names)
     }
@@ -227,6 +232,7 @@ impl ObjectBackend for Local {
         name: &str,
         which: &mut dyn FnMut() -> Result<Vec<String>, StoreError>,
     ) -> Result<(), StoreError> {
+        // Held while `which` decides, so that no commit relies on an object that is about to go.
         let _publish_lock = self.lock_publishing(name)?;
         let mut folders = BTreeSet::new();
         for hash in which()? {
@@ -252,6 +258,7 @@ impl ObjectBackend for Local {
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
             opened => opened.map_err(StoreError::io("open", &path))?,
         };
+        // One byte more than the limit, by which a file that is too long is recognised.
         let bytes =
             read_all(file, limits::SIDE_FILE_BYTES + 1).map_err(StoreError::io("read", &path))?;
         if bytes.len() as u64 > limits::SIDE_FILE_BYTES {
@@ -269,6 +276,8 @@ impl ObjectBackend for Local {
         let id = uuid::Uuid::now_v7().as_simple().to_string();
         let writing = path.with_file_name(format!("{WRITING}{id}"));
         let mut file = self.disk.create(&writing).map_err(StoreError::io("write", &writing))?;
+        // The content is durable before it gets its name: a power cut leaves the old file or the
+        // new one.
         file.write_all(bytes)
             .and_then(|()| file.sync())
             .and_then(|()| self.disk.rename(&writing, &path))
@@ -287,6 +296,7 @@ impl ObjectBackend for Local {
                 }
                 None => file.starts_with(WRITING),
             };
+            // A young file may belong to a write or to a lease that is being made.
             let path = dir.join(file);
             if is_leftover && self.disk.info(&path).is_ok_and(|found| found.modified_us < before_us)
             {
@@ -304,6 +314,7 @@ impl ObjectBackend for Local {
 
     fn is_held(&self, name: &str, file: &str) -> Result<bool, StoreError> {
         let path = self.root.join(name).join(file);
+        // If the lock is free, it is taken for a moment, and released with the result.
         match self.disk.lock(&path, Wait::NoAndExisting) {
             Err(error) if error.kind() == ErrorKind::NotFound => Ok(false),
             lock => Ok(lock.map_err(StoreError::io("lock", &path))?.is_none()),

@@ -58,6 +58,7 @@ impl LocalStaging {
     fn place(&mut self, hashes: &BTreeSet<&str>) -> Result<(), StoreError> {
         let disk = &*self.local.disk;
         let mut staged = Vec::new();
+        // What was not put here is in its place already.
         for hash in hashes {
             if self.local.exists(&self.dir.join(hash))? {
                 staged.push((self.dir.join(hash), self.local.object_file(&self.name, hash)));
@@ -72,11 +73,14 @@ impl LocalStaging {
         create_dirs(disk, &objects)?;
         create_dirs_in(disk, &objects, &folders)?;
         for (staged, path) in staged {
+            // Noted before the rename. If that fails, there is nothing to remove, which does no
+            // harm.
             if !self.local.exists(&path)? {
                 self.placed.push(path.clone());
             }
             disk.rename(&staged, &path).map_err(StoreError::io("write", &path))?;
         }
+        // The names are durable before a record relies on them.
         folders.iter().try_for_each(|folder| sync(disk, folder))
     }
 }
@@ -90,6 +94,7 @@ impl Staging for LocalStaging {
         write(&mut writer).map_err(failed())?;
         let HashingFile { inner: mut file, hasher } =
             writer.into_inner().map_err(|e| e.into_error()).map_err(failed())?;
+        // Durable under its temporary name; `place` does the same for the final name.
         file.sync().map_err(failed())?;
         let hash = hasher.finalize().to_hex().to_string();
         let staged = self.dir.join(&hash);
@@ -146,6 +151,7 @@ impl Staging for LocalStaging {
 impl Drop for LocalStaging {
     /// Failures are ignored, because the next start removes whatever remains.
     fn drop(&mut self) {
+        // Without the lock nothing was placed, and another commit could rely on what is removed.
         if self.publish_lock.is_some() {
             for path in &self.placed {
                 let _ = self.local.disk.remove_file(path);

@@ -68,6 +68,7 @@ impl Remote {
     }
 
     pub(super) fn key(&self, below: &str) -> Key {
+        // Part by part, because `join` would encode a slash.
         below.split('/').fold(self.prefix.clone(), |key, part| key.join(part))
     }
 
@@ -75,6 +76,7 @@ impl Remote {
     pub(super) fn get(&self, key: &str, limit_bytes: u64) -> Result<Vec<u8>, StoreError> {
         let store = self.store.clone();
         let at = self.key(key);
+        // Each attempt calls the closure again, and needs handles of its own.
         let read = self.run("read", key, move || {
             let store = store.clone();
             let at = at.clone();
@@ -82,9 +84,11 @@ impl Remote {
                 let found = store.get(&at).await?;
                 let size = found.meta.size;
                 if size > limit_bytes {
+                    // Within `Ok`, so that it is not tried again: the size stays the same.
                     return Ok(Err(size));
                 }
                 let bytes = found.bytes().await?;
+                // A body that ends early is a failure of the connection, which is tried again.
                 if (bytes.len() as u64) < size {
                     let source = format!("it ended after {} of {size} bytes", bytes.len()).into();
                     return Err(object_store::Error::Generic { store: "object store", source });
@@ -100,6 +104,7 @@ impl Remote {
         let store = self.store.clone();
         let at = self.key(key);
         let wanted = bytes.clone();
+        // Steps wait for sections, so that the short time-out applies.
         let retry = self.runner.retry().for_sections();
         let request = move || {
             let store = store.clone();
@@ -173,6 +178,7 @@ impl Remote {
             async move { store.delete(&at).await }
         });
         match deleted {
+            // An earlier attempt has removed it, and its answer was lost; or another process has.
             Err(StoreError::Io { cause, .. }) if cause.kind() == ErrorKind::NotFound => Ok(()),
             deleted => deleted,
         }

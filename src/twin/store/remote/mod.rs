@@ -44,10 +44,12 @@ impl ObjectBackend for Remote {
             let prefix = prefix.clone();
             async move { store.list_with_delimiter(Some(&prefix)).await }
         })?;
+        // A store has no folders: it returns what keys have in front of the next slash.
         let folders = listed.common_prefixes.iter().filter_map(|key| key.filename());
         let mut names: Vec<String> =
             folders.filter(|name| is_name(name)).map(str::to_owned).collect();
         names.sort_unstable();
+        // As in a directory, a twin whose log cannot be listed stays in the list.
         names.retain(|name| !self.version_numbers(name).is_ok_and(|numbers| numbers.is_empty()));
         Ok(names)
     }
@@ -61,6 +63,7 @@ impl ObjectBackend for Remote {
     }
 
     fn read_object(&self, name: &str, hash: &str, limit_bytes: u64) -> Result<Vec<u8>, StoreError> {
+        // The cache compares the bytes with the hash.
         if let Some(bytes) = self.cache.as_ref().and_then(|cache| cache.get(hash)) {
             return Ok(bytes);
         }
@@ -86,6 +89,7 @@ impl ObjectBackend for Remote {
                 let store = store.clone();
                 let at = at.clone();
                 async move {
+                    // As a stream: an object may have any size.
                     let mut stream = store.get(&at).await?.into_stream();
                     let mut start = Vec::new();
                     let mut hasher = blake3::Hasher::new();
@@ -110,6 +114,7 @@ impl ObjectBackend for Remote {
         bytes: Range<u64>,
         hash: &[u8; 32],
     ) -> Result<Vec<u8>, StoreError> {
+        // A section is cached under the hash of its own bytes, which several chunks may contain.
         let hash = blake3::Hash::from_bytes(*hash).to_hex();
         if let Some(bytes) = self.cache.as_ref().and_then(|cache| cache.get(&hash)) {
             return Ok(bytes);
@@ -200,6 +205,7 @@ impl ObjectBackend for Remote {
             Some(ListedObject { hash, bytes: found.size, is_file: true, written_us })
         });
         let mut objects: Vec<ListedObject> = listed.collect();
+        // The order of a listing depends on the store.
         objects.sort_unstable_by(|a, b| a.hash.cmp(&b.hash));
         Ok(ObjectListing { objects, unlisted: Vec::new() })
     }
@@ -209,6 +215,7 @@ impl ObjectBackend for Remote {
         name: &str,
         which: &mut dyn FnMut() -> Result<Vec<String>, StoreError>,
     ) -> Result<(), StoreError> {
+        // An object that is missing is no error, so that a run that was stopped can be repeated.
         which()?.iter().try_for_each(|hash| self.delete(&object_key(name, hash)))
     }
 

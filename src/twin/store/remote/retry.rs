@@ -142,8 +142,11 @@ impl RequestRunner {
                     Ok(done) => return Ok(done),
                     Err(error) => error,
                 };
+                // Only what another attempt may cure. A missing object or a lack of rights stays as
+                // it is.
                 let is_transient = matches!(error.kind(), ErrorKind::Other | ErrorKind::TimedOut);
                 if !is_transient || tries >= retry.tries {
+                    // That an object is missing is an answer.
                     if error.kind() != ErrorKind::NotFound {
                         add(&counts, RequestCounter::Failure);
                     }
@@ -154,6 +157,7 @@ impl RequestRunner {
                     tokio::time::sleep(backoff).await;
                 }
                 tries += 1;
+                // Pauses of b, 2 b, 4 b, 8 b: 15 b for five attempts.
                 backoff = backoff.saturating_mul(2);
             }
         })
@@ -174,6 +178,7 @@ impl RequestRunner {
         &self,
         request: impl Future<Output = io::Result<T>> + Send + 'static,
     ) -> PendingRequest<T> {
+        // Room for one result, so that the task never waits for the caller.
         let (send, receive) = mpsc::sync_channel(1);
         if let Some(runtime) = &self.runtime {
             runtime.spawn(async move {
@@ -195,6 +200,7 @@ impl<T> PendingRequest<T> {
 impl Drop for RequestRunner {
     /// Does not wait for running requests: that would panic on threads of a runtime.
     fn drop(&mut self) {
+        // Taken out, because shutting it down needs it by value.
         if let Some(runtime) = self.runtime.take() {
             runtime.shutdown_background();
         }
@@ -225,10 +231,12 @@ fn to_io(error: &object_store::Error) -> io::Error {
     use object_store::Error;
     let kind = match error {
         Error::NotFound { .. } => ErrorKind::NotFound,
+        // Some stores answer a conditional put in this way, others in that.
         Error::AlreadyExists { .. } | Error::Precondition { .. } => ErrorKind::AlreadyExists,
         Error::PermissionDenied { .. } | Error::Unauthenticated { .. } => {
             ErrorKind::PermissionDenied
         }
+        // All else may be transient: a lost connection, an overloaded store.
         _ => ErrorKind::Other,
     };
     io::Error::new(kind, error.to_string())

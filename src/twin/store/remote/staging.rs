@@ -59,10 +59,12 @@ impl Staging for RemoteStaging {
     /// # Errors
     /// An earlier upload failed.
     fn put(&mut self, write: WriteObject<'_>) -> Result<StoredObject, StoreError> {
+        // In memory, because its key is the hash of all of its bytes.
         let mut object = Vec::new();
         write(&mut object).map_err(StoreError::io("make an object for", &self.remote.root))?;
         let hash = blake3::hash(&object).to_hex().to_string();
         let bytes = object.len() as u64;
+        // At most eight objects are in memory, of about 10 MB each.
         while self.uploads.len() >= limits::UPLOADS_AT_ONCE {
             self.wait_for_oldest()?;
         }
@@ -98,6 +100,7 @@ impl Staging for RemoteStaging {
         number: u64,
         record: &[u8],
     ) -> Result<(), StoreError> {
+        // All objects exist before a record names them.
         self.wait_for_uploads()?;
         let key = record_key(&self.name, number);
         let mut backoff = self.remote.runner.retry().backoff;
@@ -106,6 +109,8 @@ impl Staging for RemoteStaging {
             let store = self.remote.store.clone();
             let at = self.remote.key(&key);
             let payload = PutPayload::from(record.to_vec());
+            // `once`, because an attempt after a lost answer would take its own record for that of
+            // another commit.
             let put = self.remote.runner.once(async move {
                 let options = PutOptions { mode: PutMode::Create, ..PutOptions::default() };
                 store.put_opts(&at, payload, options).await.map(|_| ())
@@ -117,8 +122,10 @@ impl Staging for RemoteStaging {
                 _ => return Err(StoreError::io("write", &self.remote.root.join(&key))(cause)),
             }
             match self.remote.get(&key, limits::LOG_RECORD_BYTES) {
+                // The record has the id of the commit, so that an equal one is this commit's.
                 Ok(found) if found == record => return Ok(()),
                 Ok(_) => return Err(StoreError::Conflict { name: self.name.clone(), number }),
+                // Nothing was written: the attempt failed before the store acted on it.
                 Err(StoreError::Io { cause, .. }) if cause.kind() == ErrorKind::NotFound => {}
                 Err(_) => return Err(self.outcome_unknown(number, cause)),
             }

@@ -25,6 +25,7 @@ pub(super) fn open(url: &str) -> Result<(Arc<dyn ObjectStore>, Key), StoreError>
     provide_tls();
     // Retries are made only in `retry.rs`.
     let retry = RetryConfig { max_retries: 0, ..RetryConfig::default() };
+    // The client's own time-out of 30 s would end a request before `retry.rs` does.
     let timeout = format!("{} s", limits::REMOTE_TIMEOUT.as_secs());
     let store: object_store::Result<Arc<dyn ObjectStore>> = match scheme {
         "s3" | "s3a" => AmazonS3Builder::from_env()
