@@ -18,7 +18,8 @@ use crate::geometry::{Camera, CameraError, Pose};
 /// An image that a camera took on a recorded drive.
 ///
 /// JSON:
-/// `{"trajectory", "station_m", "camera", "width", "height", "fx", "fy", "cx", "cy", "world_from_camera": {"xyz", "q"}, "image": {"object", "bytes"}}`
+/// `{"trajectory", "station_m", "camera", "width", "height", "fx", "fy", "cx", "cy",`
+/// `"world_from_camera": {"xyz", "q"}, "image": {"object", "bytes"}}`
 /// and perhaps `mask`, like `image`, and `exposure_stops`; and, as in rig files, `lens`,
 /// `windshield` and `native_size`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -14,7 +14,8 @@ use crate::limits;
 /// A suite: the scenarios, the agent that drives them, and the rendered images.
 ///
 /// ```json
-/// {"format": "wildcity.suite/1", "name": "streets", "scenarios": ["straight.json", "pedestrian.json"],
+/// {"format": "wildcity.suite/1", "name": "streets",
+///  "scenarios": ["straight.json", "pedestrian.json"],
 ///  "agent": "log", "cameras": ["front"], "size": [320, 180], "seeds": [0, 9]}
 /// ```
 #[derive(Clone, Debug, PartialEq, Deserialize)]
@@ -141,6 +142,14 @@ impl SuiteFile {
             && first > last
         {
             let message = format!("[{first}, {last}]; write the first and the last seed");
+            return Err(FileError::new("seeds", message));
+        }
+        // Before the range becomes a list: 2^64 seeds take all memory.
+        let most = limits::EPISODES as u64;
+        if let Some([first, last]) = self.seeds
+            && last - first >= most
+        {
+            let message = format!("[{first}, {last}] are more than {most} seeds; name fewer");
             return Err(FileError::new("seeds", message));
         }
         check_criteria(&self.accept_unjudged)

@@ -327,6 +327,44 @@ pub(crate) fn on_roads(text: &str, leave_out: &[Part]) -> Result<Imported, Strin
     read(text.as_bytes(), &settings).map_err(|error| error.to_string())
 }
 
+#[test]
+fn positions_in_the_world_move_with_the_roads() {
+    let dir = tempfile::tempdir().unwrap();
+    let roads = dir.path().join("roads.xodr");
+    std::fs::write(&roads, ROADS).unwrap();
+    for roads in [Some(roads), None] {
+        let start = |origin: Option<[f64; 2]>| {
+            let settings = Settings { roads: roads.clone(), origin, ..settings() };
+            read(CUT_IN.as_bytes(), &settings).unwrap().file.ego.start.unwrap().pose.unwrap().xyz
+        };
+        let [x, y, z] = start(None);
+        assert_eq!(start(Some([30.0, -20.0])), [x - 30.0, y + 20.0, z]);
+    }
+}
+
+#[test]
+fn the_shift_of_a_header_is_told_and_applied() {
+    let header = "<header revMajor=\"1\" revMinor=\"6\"/>";
+    let offset = "<header revMajor=\"1\" revMinor=\"6\">\
+                  <offset x=\"-690000\" y=\"-5330000\" z=\"0\" hdg=\"0\"/></header>";
+    let far = ROADS.replacen(header, offset, 1).replacen(
+        "x=\"0\" y=\"0\"",
+        "x=\"690000\" y=\"5330000\"",
+        1,
+    );
+    assert!(far.contains("690000\" y"), "{far}");
+    let dir = tempfile::tempdir().unwrap();
+    let roads = dir.path().join("roads.xodr");
+    std::fs::write(&roads, &far).unwrap();
+    let text =
+        CUT_IN.replacen(EGO_AT, "<WorldPosition x=\"690005\" y=\"5330000\" z=\"0\" h=\"0\"/>", 1);
+    let settings = Settings { roads: Some(roads), ..settings() };
+    let imported = read(text.as_bytes(), &settings).unwrap();
+    let [x, y, _] = imported.file.ego.start.unwrap().pose.unwrap().xyz;
+    assert!((x - 5.0).abs() < 3.0 && y.abs() < 1e-6, "{x} {y}");
+    assert!(imported.notes.iter().any(|note| note.contains("<offset>")), "{:?}", imported.notes);
+}
+
 const EGO_AT: &str = "<WorldPosition x=\"0\" y=\"0\" z=\"0\" h=\"0\"/>";
 
 #[test]

@@ -47,6 +47,7 @@ fn mistakes_name_the_file_and_the_place() {
     for (change, wanted) in [
         (suite(&|value| value["scenarios"] = json!([])), "scenarios: is empty"),
         (suite(&|value| value["seeds"] = json!([4, 3])), "seeds: [4, 3]"),
+        (suite(&|value| value["seeds"] = json!([0, u64::MAX])), "are more than 100000 seeds"),
         (suite(&|value| value["seed"] = json!(4)), "unknown field `seed`"),
         (suite(&|value| value["format"] = json!("wildcity.suite/9")), "write \"wildcity.suite/1\""),
         (suite(&|value| value["at_least"] = json!(90)), "a rate is from 0 to 1"),

@@ -4,7 +4,8 @@
 //! Each session has one camera of 96 x 60 px with raw images. The two ways take turns, and must
 //! give the same images.
 //!
-//! `cargo run --release -p wildcity-client --example many -- ws://127.0.0.1:8080/v1/session TWIN [SESSIONS] [STEPS]`
+//! `cargo run --release -p wildcity-client --example many -- URL TWIN [SESSIONS] [STEPS]`, with a
+//! URL such as ws://127.0.0.1:8080/v1/session
 
 #![allow(clippy::print_stdout, reason = "an example")]
 

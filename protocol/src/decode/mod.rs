@@ -105,7 +105,8 @@ pub enum MistakeKind {
 /// let closing = decode::<Request>(r#"{"type": "close", "seq": 2e0}"#).unwrap();
 /// assert_eq!(closing, Request::Close { seq: 2, session: None });
 ///
-/// let refused = decode::<Request>(r#"{"type": "observe", "seq": 3, "poses": [{"xyz": [0, 0, 0]}]}"#).unwrap_err();
+/// let text = r#"{"type": "observe", "seq": 3, "poses": [{"xyz": [0, 0, 0]}]}"#;
+/// let refused = decode::<Request>(text).unwrap_err();
 /// assert_eq!(refused.seq, Some(3));
 /// assert_eq!(refused.mistake.field.as_deref(), Some("poses[0].q"));
 /// ```

@@ -7,6 +7,7 @@ use anyhow::Context;
 
 use crate::cli::output;
 use wildcity_convert::openscenario;
+use wildcity_sim::scenario::ScenarioFile;
 use wildcity_twin::ingest;
 
 /// Read a scenario of OpenSCENARIO XML 1.0 to 1.3.
@@ -88,7 +89,7 @@ impl Import {
         text.push(b'\n');
         output::write(&self.out, &text)?;
         let mut out = io::stdout().lock();
-        for note in &imported.notes {
+        for note in imported.notes.iter().map(String::as_str).chain(missing(&scenario)) {
             writeln!(out, "note: {note}")?;
         }
         writeln!(
@@ -100,6 +101,24 @@ impl Import {
         )?;
         Ok(())
     }
+}
+
+/// What an OpenSCENARIO file need not say, and an episode needs.
+fn missing(scenario: &ScenarioFile) -> impl Iterator<Item = &'static str> {
+    let end = &scenario.end;
+    let missing = [
+        (scenario.ego.start.is_none(), "the ego has no place at the start: add ego.start"),
+        (
+            scenario.route.is_none(),
+            "there is no route for agents that follow one (idm, log): add \"route\", such as {\"lanes\": [\"0/0/-1\"]}",
+        ),
+        (
+            scenario.map.is_none(),
+            "there is no map to judge the road by: add \"map\", a file that wildcity map import writes",
+        ),
+        (end.time_s.is_none() && end.when.is_none(), "nothing ends it: add end.time_s"),
+    ];
+    missing.into_iter().filter_map(|(is_missing, note)| is_missing.then_some(note))
 }
 
 fn openscenario_bytes() -> u64 {

@@ -32,6 +32,8 @@ const NUMBERS: [(&str, &[&str]); 14] = [
 pub(super) struct Framed {
     /// The text, with coordinates near the origin.
     pub(super) text: String,
+    /// What was added to the x and y of the file, in metres.
+    pub(super) shift_m: [f64; 2],
     /// The place of the origin on the earth, if the file says it.
     pub(super) geo: Option<GeoAnchor>,
     /// What a user should know: by how much the file was moved, and what it lacks.
@@ -53,7 +55,13 @@ pub(super) fn framed(text: &str, origin: Option<[f64; 2]>) -> Result<Framed, Con
     let is_local = places.iter().flatten().all(|axis| axis.abs() <= f64::from(FARTHEST_M));
     let offset = offset.filter(|_| is_local);
     let geo = origin_m.and_then(|origin_m| anchor_from(&document, origin_m, offset.as_ref()));
-    Ok(Framed { text, geo, notes })
+    if let Some((line, projection)) = projection(&document).filter(|_| geo.is_none()) {
+        notes.push(format!(
+            "line {line}, <geoReference>: {projection:?} does not place the origin on the earth; give its place with \
+             `wildcity twin geo`"
+        ));
+    }
+    Ok(Framed { text, shift_m, geo, notes })
 }
 
 /// Where the header's offset moves the file.
@@ -231,6 +239,13 @@ fn moved(text: &str, document: &Document<'_>, shift_m: [f64; 2]) -> String {
     moved
 }
 
+/// The line of the file's projection, and its text, if it has one.
+fn projection<'d>(document: &'d Document<'_>) -> Option<(u32, &'d str)> {
+    let node = document.descendants().find(|node| node.has_tag_name("geoReference"))?;
+    let text = node.text().map(str::trim).filter(|text| !text.is_empty())?;
+    Some((document.text_pos_at(node.range().start).row, text))
+}
+
 /// The anchor of an origin in the map's projection, if that is a UTM zone of WGS84.
 fn anchor_from(
     document: &Document<'_>,
@@ -238,8 +253,7 @@ fn anchor_from(
     offset: Option<&Offset>,
 ) -> Option<GeoAnchor> {
     let is_turned = offset.is_some_and(|offset| offset.hdg_rad != 0.0);
-    let node = document.descendants().find(|node| node.has_tag_name("geoReference"))?;
-    let projection = node.text()?.trim();
+    let (_, projection) = projection(document)?;
     let words: Vec<&str> = projection.split_whitespace().collect();
     let value = |key: &str| words.iter().find_map(|word| word.strip_prefix(key)?.strip_prefix('='));
     // The ellipsoids WGS84 and GRS80 differ by 0.1 mm.

@@ -35,6 +35,11 @@ pub struct Imported {
 pub(crate) struct Roads {
     /// The roads and lanes.
     pub(crate) network: RoadNetwork,
+    /// What was added to the x and y of the file, in metres. Whatever else has coordinates in the
+    /// frame of these roads moves with them.
+    pub(crate) shift_m: [f64; 2],
+    /// By how much the roads were moved, and why.
+    pub(crate) notes: Vec<String>,
     geo: Option<GeoAnchor>,
     warnings: Vec<String>,
 }
@@ -44,9 +49,9 @@ pub(crate) fn roads_from(bytes: &[u8], origin: Option<[f64; 2]>) -> Result<Roads
     let framed = frame::framed(utf8_text(bytes)?, origin)?;
     let (network, provenance) = xodr::load_str_with_provenance(&framed.text)
         .map_err(|error| ConvertError::new("OpenDRIVE", error.to_string()))?;
-    let mut warnings = framed.notes;
-    warnings.extend(provenance.warnings.iter().map(ToString::to_string));
-    Ok(Roads { network, geo: framed.geo, warnings })
+    let warnings = provenance.warnings.iter().map(ToString::to_string).collect();
+    let frame::Framed { shift_m, geo, notes, .. } = framed;
+    Ok(Roads { network, shift_m, notes, geo, warnings })
 }
 
 /// Reads an OpenDRIVE file. `origin` is the easting and the northing of the map's origin in the
@@ -56,7 +61,8 @@ pub(crate) fn roads_from(bytes: &[u8], origin: Option<[f64; 2]>) -> Result<Roads
 /// # Errors
 /// It is not OpenDRIVE, has no lanes, or reaches beyond [`FARTHEST_M`].
 pub fn read(bytes: &[u8], origin: Option<[f64; 2]>) -> Result<Imported, ConvertError> {
-    let Roads { network, geo, warnings } = roads_from(bytes, origin)?;
+    let Roads { network, notes, geo, warnings, .. } = roads_from(bytes, origin)?;
+    let warnings = [notes, warnings].concat();
     let mut lanes = Vec::new();
     for lane in network.lanes() {
         if let Some(lane) = lane_from(&network, lane)? {

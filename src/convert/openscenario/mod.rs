@@ -124,7 +124,9 @@ fn with_parameters<'a>(
     given: &BTreeMap<String, String>,
 ) -> Result<Element<'a>, ConvertError> {
     if let Some(unknown) = given.keys().find(|name| !root.parameters().contains_key(*name)) {
-        return Err(root.wrong(&format!("declares no parameter {unknown:?}")));
+        let known: Vec<&str> = root.parameters().keys().map(String::as_str).collect();
+        let known = if known.is_empty() { "none".to_owned() } else { known.join(", ") };
+        return Err(root.wrong(&format!("declares no parameter {unknown:?}; it declares {known}")));
     }
     if given.is_empty() {
         return Ok(root.clone());
@@ -190,10 +192,12 @@ fn file_from<'a>(
     settings: &Settings,
     ledger: &'a Ledger,
 ) -> Result<ScenarioFile, ConvertError> {
-    let (roads, missing_roads) = read_roads(root, settings)?;
+    let roads = read_roads(root, settings)?;
+    roads.notes.into_iter().for_each(|note| ledger.note(note));
     let mut context = Context {
         entities: BTreeMap::new(),
-        roads,
+        roads: roads.map,
+        shift_m: roads.shift_m,
         catalogs,
         ego: settings.ego.clone(),
         is_in_story: false,
@@ -201,7 +205,7 @@ fn file_from<'a>(
         placed_by_others: Vec::new(),
         variables: read_variables(root)?,
         sets: read_sets(node),
-        missing_roads,
+        missing_roads: roads.missing,
         minor_version: root.need("FileHeader")?.whole("revMinor")?,
         controlled: controllers::assigned(node).into_iter().collect(),
         ego_route: None,
@@ -209,7 +213,9 @@ fn file_from<'a>(
     // In this order: events refer to where `Init` has put entities, and `Init` to entities.
     entities::read_entities(&root.need("Entities")?, &mut context)?;
     if !context.entities.contains_key(&settings.ego) {
-        let message = format!("has no entity {:?}; name the ego with --ego", settings.ego);
+        let known: Vec<&str> = context.entities.keys().map(String::as_str).collect();
+        let known = known.join(", ");
+        let message = format!("has no entity {:?}; name the ego with --ego: {known}", settings.ego);
         return Err(root.wrong(&message));
     }
     let storyboard = root.need("Storyboard")?;
@@ -260,11 +266,23 @@ fn file_from<'a>(
     })
 }
 
+/// The roads of a scenario.
+#[derive(Default)]
+struct ScenarioRoads {
+    map: Option<RoadMap>,
+    /// What is added to coordinates in the world, in metres.
+    shift_m: [f64; 2],
+    /// By how much the roads were moved, and why.
+    notes: Vec<String>,
+    /// Why the roads that the scenario names were not read.
+    missing: Option<String>,
+}
+
 /// The roads that the file or the settings name, or why they were not read.
-fn read_roads(
-    root: &Element<'_>,
-    settings: &Settings,
-) -> Result<(Option<RoadMap>, Option<String>), ConvertError> {
+fn read_roads(root: &Element<'_>, settings: &Settings) -> Result<ScenarioRoads, ConvertError> {
+    // Without roads, the origin is a place in the frame of the positions themselves.
+    let shift_m = settings.origin.map_or([0.0; 2], |[east, north]| [-east, -north]);
+    let without = ScenarioRoads { shift_m, ..ScenarioRoads::default() };
     let section = root.find("RoadNetwork")?;
     let mut named = None;
     if let Some(section) = &section {
@@ -278,14 +296,14 @@ fn read_roads(
     }
     let path = match (&settings.roads, named) {
         (Some(path), _) => path.clone(),
-        (None, None) => return Ok((None, None)),
+        (None, None) => return Ok(without),
         (None, Some(named)) => {
             let path = Path::new(&named.replace('\\', "/")).to_owned();
             let path = settings.directory.as_ref().map(|dir| dir.join(&path)).unwrap_or(path);
             // No error yet: whatever needs the roads gives this reason.
             if !path.is_file() {
                 let reason = format!("there is no file {}; name it with --roads", path.display());
-                return Ok((None, Some(reason)));
+                return Ok(ScenarioRoads { missing: Some(reason), ..without });
             }
             path
         }
@@ -294,7 +312,9 @@ fn read_roads(
     let roads = opendrive::roads_from(&bytes, settings.origin).map_err(|error| {
         ConvertError::new(format!("{}, {}", path.display(), error.place), error.message)
     })?;
-    Ok((Some(RoadMap::new(roads.network)), None))
+    let opendrive::Roads { network, shift_m, notes, .. } = roads;
+    let map = Some(RoadMap::new(network));
+    Ok(ScenarioRoads { map, shift_m, notes, missing: None })
 }
 
 /// A name of `[a-z0-9._-]+`.

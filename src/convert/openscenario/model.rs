@@ -115,6 +115,9 @@ impl Act {
 pub(super) struct Context<'a> {
     pub(super) entities: BTreeMap<String, Entity>,
     pub(super) roads: Option<RoadMap>,
+    /// What is added to the x and y of positions in the world, in metres: they are in the frame of
+    /// the roads' file, and the roads were moved to the twin's origin.
+    pub(super) shift_m: [f64; 2],
     pub(super) catalogs: Catalogs<'a>,
     pub(super) ego: String,
     /// Whether the storyboard's events are read, and not `Init`.

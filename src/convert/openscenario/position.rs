@@ -16,7 +16,9 @@ pub(super) fn place_from(
         "WorldPosition" => {
             kind.only(&[])?;
             note_tilt(&kind)?;
-            let xyz_m = [kind.number("x")?, kind.number("y")?, kind.number_or_0("z")?];
+            let [dx_m, dy_m] = context.shift_m;
+            let [x_m, y_m] = [kind.number("x")? + dx_m, kind.number("y")? + dy_m];
+            let xyz_m = [x_m, y_m, kind.number_or_0("z")?];
             on_roads(xyz_m, kind.number_or_0("h")?, context)
         }
         "RelativeWorldPosition" | "RelativeObjectPosition" => relative_place(&kind, context)?,

@@ -9,7 +9,7 @@
 //!
 //! <twins>/.actors/objects/3f/3f9c...     assets of actors, which all twins share
 //! <twins>/.staging/<name>@<commit>/     objects of a commit in preparation, invisible to readers
-//! <twins>/.staging/<name>@<commit>/lock locked by the commit's process as long as the process lives
+//! <twins>/.staging/<name>@<commit>/lock locked by the commit's process while the process lives
 //! <twins>/.staging/<name>.lock          locked while a version is published
 //! ```
 //!
