@@ -89,7 +89,10 @@ impl Import {
         text.push(b'\n');
         output::write(&self.out, &text)?;
         let mut out = io::stdout().lock();
-        for note in imported.notes.iter().map(String::as_str).chain(missing(&scenario)) {
+        for note in &imported.notes {
+            writeln!(out, "note: {note}")?;
+        }
+        for note in missing(&scenario) {
             writeln!(out, "note: {note}")?;
         }
         writeln!(
