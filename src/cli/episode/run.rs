@@ -24,20 +24,20 @@ use super::{bad_input, exit};
 /// Drive a suite of scenarios with an agent, judge every episode, and report.
 ///
 /// Writes into --out: result.json, junit.xml, report.html, and the records of the episodes. The
-/// exit code is 0 if every episode passed (and those that the suite accepts without a verdict), and
-/// 1 if one failed by driving. It is 2 if the command line, the suite, a scenario or the run of
+/// exit code is 0 if every episode passed, or has no verdict and the suite accepts this. It is 1 if
+/// one failed by driving. It is 2 if the command line, the suite, a scenario or the run of
 /// --against is wrong, or the agent cannot be started. It is 3 if an episode was not driven for
-/// technical reasons. It is 4 if an episode does not repeat (--verify). It is 5 if none failed, but
-/// one has no verdict: a criterion could not be judged, or the ego left the trained area. A suite,
-/// or --accept-unjudged, may accept that by name.
+/// technical reasons. It is 4 if an episode does not repeat (--verify). It is 5 if no episode
+/// failed, but one has no verdict: a criterion could not be judged, or the ego left the trained
+/// area. The suite's `accept_unjudged`, or --accept-unjudged, names what is accepted.
 ///
 /// With --at-least or --against, the exit code can be 0 although episodes failed. --at-least
-/// requires a pass rate, and --against that the run is not worse than an earlier one, as
-/// `wildcity episode compare` judges; it also writes comparison.json and comparison.html. junit.xml
-/// always lists every failure, and has the exit code as a property.
+/// requires a pass rate. --against requires that the run is not worse than an earlier one, as
+/// `wildcity episode compare` judges, and also writes comparison.json and comparison.html.
+/// junit.xml always lists every failure, and has the exit code as a property.
 ///
-/// Episodes of a scenario that were driven alike count once in rates and means: two seeds of a
-/// scenario without jitter are the same episode.
+/// Equal episodes of a scenario count once in rates and means: without jitter, two seeds give the
+/// same episode.
 ///
 /// The shell starts the command of --agent once for each episode, with these variables in its
 /// environment: WILDCITY_URL, WILDCITY_OPEN (fields of its request `open` as JSON), WILDCITY_SEED

@@ -12,10 +12,11 @@ use wildcity_twin::ingest;
 
 /// Read a map from OpenDRIVE or GeoJSON.
 ///
-/// OpenDRIVE: coordinates are those of the twin, at most 16 km from its origin, or with --origin
-/// those of a map projection such as UTM; the offset of the header counts. GeoJSON: features with
-/// the property layer, which is `lane`, `drivable`, `intersection`, `crosswalk`, `stop_line` or a
-/// layer of nuPlan; coordinates are metres of the twin, or degrees with --origin.
+/// OpenDRIVE: without --origin, coordinates are those of the twin, at most 16 km from its origin.
+/// With --origin, they are those of a map projection such as UTM. The offset in the file's header
+/// counts. GeoJSON: every feature has a property layer, which is `lane`, `drivable`,
+/// `intersection`, `crosswalk`, `stop_line` or a layer of nuPlan; coordinates are metres of the
+/// twin, or degrees with --origin.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:

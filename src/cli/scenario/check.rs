@@ -19,10 +19,11 @@ use wildcity_twin::store::Catalog;
 
 /// Check scenarios against their twins, with every combination of their sweeps.
 ///
-/// Prints one line for each scenario, and warns of actors that no image shows, or that look larger
-/// or smaller than they are, and of triggers that can never fire. Notes say what a built-in agent
-/// would need to drive it. The first mistake ends the command with exit code 2, as it ends
-/// `wildcity episode run`; it names the place in the file and what is accepted there.
+/// Prints one line for each scenario. Warns of actors that no image shows, of actors that look
+/// larger or smaller than their boxes, and of triggers that can never fire. Notes say what a
+/// scenario lacks for a built-in agent (log, idm). The first mistake ends the command with exit
+/// code 2, as it ends `wildcity episode run`. The error names the place in the file and the
+/// accepted values.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:
@@ -34,7 +35,7 @@ pub(in crate::cli) struct Check {
     files: Vec<PathBuf>,
 
     /// Accept twins, tracks and maps whose hashes differ from those that the scenario names, and
-    /// say so.
+    /// report the difference.
     #[arg(long)]
     latest: bool,
 

@@ -12,10 +12,12 @@ use wildcity_twin::ingest;
 
 /// Read a scenario of OpenSCENARIO XML 1.0 to 1.3.
 ///
-/// The import supports catalogs, parameters with formulas, positions on roads, changes of speed,
-/// lane and offset, trajectories, and events with conditions, edges and delays. It refuses any
-/// other part, with its name and line, because the scenario would be different without it. Some
-/// parts can be left out on request; each is then listed.
+/// The import supports catalogs, parameters with formulas, positions in the world and on roads,
+/// changes of speed, lane and offset, trajectories, routes, distances that actors keep,
+/// synchronized arrivals, events with conditions, edges, delays and priorities, and stop triggers.
+/// A route of the ego becomes the agent's route. The import refuses any other part, with its name
+/// and line, because the scenario would be different without it. --leave-out leaves out parts, and
+/// lists each of them.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:
@@ -28,7 +30,8 @@ pub(in crate::cli) struct Import {
     #[arg(value_name = "FILE")]
     file: PathBuf,
 
-    /// Name of the twin in which the scenario takes place. Positions of the file are in its axes.
+    /// Name of the twin in which the scenario takes place. The positions in the file are in the
+    /// axes of this twin, unless --origin is given.
     #[arg(long, value_name = "NAME")]
     twin: String,
 
@@ -40,22 +43,23 @@ pub(in crate::cli) struct Import {
     #[arg(long, value_name = "FILE")]
     roads: Option<PathBuf>,
 
-    /// Another directory of catalogs; once for each.
+    /// A further directory of catalogs; may be given again.
     #[arg(long, value_name = "DIR")]
     catalogs: Vec<PathBuf>,
 
-    /// Easting and northing of the twin's origin, as in `wildcity map import --origin` of these
-    /// roads.
+    /// Easting and northing of the twin's origin; give the same values as to
+    /// `wildcity map import --origin` for these roads.
     #[arg(long, value_name = "EAST,NORTH", value_parser = crate::cli::map::origin, allow_hyphen_values = true)]
     origin: Option<[f64; 2]>,
 
-    /// Another value of a parameter that the file declares; once for each.
+    /// Give a parameter that the file declares another value; may be given again.
     #[arg(long = "parameter", value_name = "NAME=VALUE", value_parser = parameter)]
     parameters: Vec<(String, String)>,
 
-    /// Parts to leave out: controllers, ego (actions of the entity that the agent drives),
-    /// environment, appearance, signals, stop (conditions of the end that are no time), distances,
-    /// routes, trailers, custom. Each that is left out is listed.
+    /// Parts to leave out: controllers, ego (actions of the entity that the agent drives, except
+    /// its start and its route), environment, appearance, signals, stop (conditions of a stop
+    /// trigger that the import does not read), distances, routes, trailers, custom. Each part that
+    /// is left out is listed.
     #[arg(long, value_name = "PART,...", value_delimiter = ',', value_parser = part)]
     leave_out: Vec<openscenario::Part>,
 
