@@ -32,11 +32,11 @@ fn count(
     if rank >= job.length {
         return;
     }
-    let reach = reach_of(rank);
-    let macro_rows = macro_rows_of(reach);
+    let reach = read_reach(rank);
+    let macro_rows = reached_macro_rows(reach);
     var count = 0u;
     for (var row = macro_rows.x; row <= macro_rows.y; row++) {
-        count += band_of(reach, row).count;
+        count += band_in_row(reach, row).count;
     }
     offsets[rank] = count;
 }
@@ -91,13 +91,13 @@ fn touch_span(rank: u32) -> Span {
 
 // Emits the touches of one splat by one thread.
 fn emit_alone(rank: u32, span: Span) {
-    let reach = reach_of(rank);
-    let macro_rows = macro_rows_of(reach);
+    let reach = read_reach(rank);
+    let macro_rows = reached_macro_rows(reach);
     let splat = splat_indices[rank];
     var at = span.first;
     let end = span.first + span.count;
     for (var row = macro_rows.x; row <= macro_rows.y; row++) {
-        let band = band_of(reach, row);
+        let band = band_in_row(reach, row);
         for (var i = 0u; i < band.count && at < end; i++) {
             write_touch(at, band, i, splat);
             at++;
@@ -114,8 +114,8 @@ fn emit_alone(rank: u32, span: Span) {
 // row of macro tiles, then each thread writes touches and finds the row of each by binary search.
 fn emit_together(rank: u32, thread: u32) {
     let span = touch_span(rank);
-    let reach = reach_of(rank);
-    let macro_rows = macro_rows_of(reach);
+    let reach = read_reach(rank);
+    let macro_rows = reached_macro_rows(reach);
     let splat = splat_indices[rank];
     let end = span.first + span.count;
     var at = span.first;
@@ -123,7 +123,7 @@ fn emit_together(rank: u32, thread: u32) {
         let row = first_row + i32(thread);
         var band: Band;
         if row <= macro_rows.y {
-            band = band_of(reach, row);
+            band = band_in_row(reach, row);
         }
         inclusive_prefix(thread, band.count);
         bands[thread] = band;
@@ -193,14 +193,14 @@ struct Band {
     count: u32,
 }
 
-fn band_of(reach: Reach, macro_row: i32) -> Band {
+fn band_in_row(reach: Reach, macro_row: i32) -> Band {
     var band: Band;
     var first = reach.view.columns;
     var end = 0u;
     for (var k = 0; k < i32(MACRO_ROWS); k++) {
         let row = macro_row * i32(MACRO_ROWS) + k;
         if row >= reach.first_row && row <= reach.last_row {
-            let columns = columns_of(reach, row);
+            let columns = columns_in_row(reach, row);
             if columns.x < columns.y {
                 first = min(first, columns.x);
                 end = max(end, columns.y);
@@ -219,7 +219,7 @@ fn band_of(reach: Reach, macro_row: i32) -> Band {
 }
 
 // First and last row of macro tiles that a splat's box covers; (0, -1) if it covers none.
-fn macro_rows_of(reach: Reach) -> vec2i {
+fn reached_macro_rows(reach: Reach) -> vec2i {
     if reach.first_row > reach.last_row {
         return vec2i(0, -1);
     }
@@ -246,7 +246,7 @@ struct Reach {
     widest_dy: f32,
 }
 
-fn reach_of(rank: u32) -> Reach {
+fn read_reach(rank: u32) -> Reach {
     var reach: Reach;
     reach.view = frame.view[keys[rank] >> DEPTH_BITS];
     reach.shape = shapes[splat_indices[rank]];
@@ -276,7 +276,7 @@ fn reach_of(rank: u32) -> Reach {
 }
 
 // Columns of the tiles of one row that the ellipse touches: first, and end (exclusive).
-fn columns_of(reach: Reach, row: i32) -> vec2u {
+fn columns_in_row(reach: Reach, row: i32) -> vec2u {
     var columns = vec2i(reach.left, reach.right);
     if !reach.thin {
         let y = reach.shape.mean_px.y;

@@ -27,14 +27,14 @@ fn set_owners(list_indices: vec4u) {
 // The instances of four pixels: 0 none, 1 the twin, k + 2 actor k.
 fn instances() -> vec4u {
     return vec4u(
-        instance_of(halved_by.x),
-        instance_of(halved_by.y),
-        instance_of(halved_by.z),
-        instance_of(halved_by.w),
+        owner_instance(halved_by.x),
+        owner_instance(halved_by.y),
+        owner_instance(halved_by.z),
+        owner_instance(halved_by.w),
     );
 }
 
-fn instance_of(halved_by: u32) -> u32 {
+fn owner_instance(halved_by: u32) -> u32 {
     if halved_by == 0u {
         return 0u;
     }

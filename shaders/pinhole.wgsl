@@ -37,7 +37,7 @@ fn project_shape(gaussian: Geometry, view: ChunkView, decided: bool) -> Projecte
     let minors = cross(v0, v1);
     let covariance = vec3f(dot(v0, v0), dot(v0, v1), dot(v1, v1));
     let foot = Footprint(mean_px, covariance, dot(minors, minors), units_per_px);
-    var projected = shape_of(foot, gaussian.log2_opacity, index_of_view(view));
+    var projected = splat_shape(foot, gaussian.log2_opacity, index_of_view(view));
     projected.depth_m = z;
     projected.from_camera_m = gaussian.mean_m - view.camera_m;
     return projected;

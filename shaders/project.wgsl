@@ -125,7 +125,7 @@ struct Footprint {
 
 // The shape of a footprint after the pixel filter (`PixelFilter` in `src/render/layout.rs`), and whether any
 // of it lies on the rows that are drawn. A native image has its own branch, which keeps its bytes.
-fn shape_of(foot: Footprint, gaussian_log2_opacity: f32, view: u32) -> Projected {
+fn splat_shape(foot: Footprint, gaussian_log2_opacity: f32, view: u32) -> Projected {
     let image = frame.view[view];
     let units2 = foot.units_per_px * foot.units_per_px;
     let blur = image.total_px2.x * foot.units_per_px * foot.units_per_px;

@@ -20,6 +20,7 @@
 #import constants
 #import layout
 #import math
+#import splat_batch
 #import tile_blocks
 #import INSTANCES
 #import resolve
@@ -43,27 +44,14 @@ override LONG_TILES: bool;
 // 64 threads of 4 pixels. A batch takes 44 B per splat, 6 KiB of workgroup memory, so that this memory
 // does not limit how many workgroups a multiprocessor can hold.
 const THREADS: u32 = TILE_PX * TILE_PX / 4;
-// Blocks of a tile: four by four.
-const BLOCKS: u32 = 16;
-const BATCH_WORDS: u32 = RASTER_BATCH / 32;
-// Index of a splat of no opacity, after those of a batch.
-const NO_SPLAT: u32 = RASTER_BATCH;
+const BATCH: u32 = RASTER_BATCH;
+const BATCH_WORDS: u32 = BATCH / 32;
 
-// Mean, and the first row of the Cholesky factor (l0, l1).
-var<workgroup> mean_factors: array<vec4f, RASTER_BATCH + 1>;
-// l2 of the Cholesky factor, and base-2 logarithm of the peak opacity.
-var<workgroup> opacities: array<vec2f, RASTER_BATCH + 1>;
-// Colour, and depth in metres.
-var<workgroup> color_depths: array<vec4f, RASTER_BATCH + 1>;
 // For each two splats of the batch: in the low half one bit per block that the box of the first reaches, in
 // the high half those of the second.
-var<workgroup> blocks_of_two: array<u32, RASTER_BATCH / 2>;
+var<workgroup> blocks_of_two: array<u32, BATCH / 2>;
 // For each block, one bit per splat of the batch. Block after block.
 var<workgroup> block_splats: array<u32, BLOCKS * BATCH_WORDS>;
-// Number of (splat, block) pairs in all loaded batches.
-var<workgroup> block_pairs: atomic<u32>;
-var<workgroup> done_count: atomic<u32>;
-var<workgroup> done_threads: u32;
 
 @compute @workgroup_size(THREADS)
 fn main(
@@ -79,19 +67,15 @@ fn main(
     if LONG_TILES && long_places[tile] != 0u {
         return;
     }
-    let view_index = view_of(tile);
+    let view_index = tile_view(tile);
     let view = frame.view[view_index];
-    let corner = corner_of(tile, view);
+    let corner = tile_corner(tile, view);
     let block = thread / 4u;
-    let first_pixel = first_pixel_of(thread);
+    let first_pixel = thread_pixel(thread);
     let at_px = vec2f(corner + first_pixel) + 0.5;
 
     if thread == 0u {
-        atomicStore(&done_count, 0u);
-        atomicStore(&block_pairs, 0u);
-        mean_factors[NO_SPLAT] = vec4f(0.0);
-        opacities[NO_SPLAT] = vec2f(0.0, -1e30);
-        color_depths[NO_SPLAT] = vec4f(0.0);
+        begin_batches();
     }
     workgroupBarrier();
     var sums = Sums(vec4f(0.0), vec4f(0.0), vec4f(0.0), vec4f(0.0), vec4f(1.0));
@@ -106,7 +90,7 @@ fn main(
     var batches = 0u;
     var pairs = 0u;
     let range = ranges[tile];
-    for (var first = range.x; first < range.y; first += RASTER_BATCH) {
+    for (var first = range.x; first < range.y; first += BATCH) {
         // End when all threads are done.
         workgroupBarrier();
         if thread == 0u {
@@ -121,18 +105,15 @@ fn main(
             break;
         }
         // Load a batch, two splats by each thread. Places after the last splat reach no block.
-        let count = min(range.y - first, RASTER_BATCH);
+        let count = min(range.y - first, BATCH);
         var blocks = 0u;
         for (var i = 0u; i < 2u; i++) {
             let k = 2u * thread + i;
             if k < count {
                 let splat = instance_splats[first + k];
                 let shape = shapes[splat];
-                let color = colors[splat];
-                mean_factors[k] = vec4f(shape.mean_px, shape.factor.xy);
-                opacities[k] = vec2f(shape.factor.z, shape.log2_opacity);
-                color_depths[k] = vec4f(color.rgb, color.depth_m);
-                blocks |= blocks_of(shape, corner) << (i * BLOCKS);
+                store_splat(k, shape, colors[splat]);
+                blocks |= reached_blocks(shape, corner) << (i * BLOCKS);
             }
         }
         blocks_of_two[thread] = blocks;
@@ -147,7 +128,7 @@ fn main(
         block_splats[thread % BLOCKS * BATCH_WORDS + word] = bits;
         pairs += countOneBits(bits);
         workgroupBarrier();
-        // Blend it.
+        // Each word has 32 splats, in order of depth.
         let was_done = done;
         for (var k = 0u; k < BATCH_WORDS && !done; k++) {
             var rest = block_splats[block * BATCH_WORDS + k];
@@ -199,9 +180,9 @@ fn finish(
     if place == 0u {
         return;
     }
-    let view_index = view_of(tile);
-    let first_pixel = first_pixel_of(thread);
-    let at_px = vec2f(corner_of(tile, frame.view[view_index]) + first_pixel) + 0.5;
+    let view_index = tile_view(tile);
+    let first_pixel = thread_pixel(thread);
+    let at_px = vec2f(tile_corner(tile, frame.view[view_index]) + first_pixel) + 0.5;
     let at = ((place - 1u) * LONG_TILE_WORDS + first_pixel.y * TILE_PX + first_pixel.x) / 4u;
     let plane = TILE_PX * TILE_PX / 4u;
     var sums = Sums(
@@ -222,7 +203,7 @@ fn finish(
 }
 
 // The first pixel of the tile that a thread has: one of four in a row.
-fn first_pixel_of(thread: u32) -> vec2u {
+fn thread_pixel(thread: u32) -> vec2u {
     let block = thread / 4u;
     return vec2u(block % 4u, block / 4u) * BLOCK_PX + vec2u(0u, thread % 4u);
 }

@@ -10,6 +10,7 @@
 #import constants
 #import layout
 #import math
+#import splat_batch
 #import tile_blocks
 
 @group(0) @binding(0) var<uniform> frame: Frame;
@@ -28,25 +29,13 @@ override OWNERS: bool;
 const THREADS: u32 = TILE_PX * TILE_PX;
 // Splats of a batch: one for each thread to load.
 const BATCH: u32 = THREADS;
-const BLOCKS: u32 = 16;
 // Parts of a batch whose bits one thread transposes, 16 splats each.
 const PARTS: u32 = BATCH / 16;
-// Index of a splat of no opacity, after those of a batch.
-const NO_SPLAT: u32 = BATCH;
 
-// Mean, and the first row of the Cholesky factor (l0, l1).
-var<workgroup> mean_factors: array<vec4f, BATCH + 1>;
-// l2 of the Cholesky factor, and base-2 logarithm of the peak opacity.
-var<workgroup> opacities: array<vec2f, BATCH + 1>;
-// Colour, and depth in metres.
-var<workgroup> color_depths: array<vec4f, BATCH + 1>;
 // For each splat of the batch, one bit per block that its box reaches.
 var<workgroup> splat_blocks: array<u32, BATCH>;
 // For each block and part of the batch, one bit per splat. Block after block.
 var<workgroup> block_splats: array<u32, BLOCKS * PARTS>;
-var<workgroup> block_pairs: atomic<u32>;
-var<workgroup> done_count: atomic<u32>;
-var<workgroup> done_threads: u32;
 
 // What a pixel has gathered.
 var<private> rgb: vec3f;
@@ -64,8 +53,8 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) th
     if long_places[tile] == 0u {
         return;
     }
-    let view = frame.view[view_of(tile)];
-    let corner = corner_of(tile, view);
+    let view = frame.view[tile_view(tile)];
+    let corner = tile_corner(tile, view);
     let region = thread / 32u;
     let own = vec2u(region % 2u * 8u + thread % 8u, region / 2u * 4u + thread % 32u / 8u);
     let block = own.y / BLOCK_PX * 4u + own.x / BLOCK_PX;
@@ -73,11 +62,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) th
     let first_px = vec2f(corner + vec2u(own.x / 4u * 4u, own.y)) + 0.5;
     let offset_px = f32(own.x % 4u);
     if thread == 0u {
-        atomicStore(&done_count, 0u);
-        atomicStore(&block_pairs, 0u);
-        mean_factors[NO_SPLAT] = vec4f(0.0);
-        opacities[NO_SPLAT] = vec2f(0.0, -1e30);
-        color_depths[NO_SPLAT] = vec4f(0.0);
+        begin_batches();
     }
     workgroupBarrier();
     rgb = vec3f(0.0);
@@ -108,10 +93,8 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) th
         if batches > frame.batch_limit {
             break;
         }
-        mean_factors[thread] = vec4f(next.shape.mean_px, next.shape.factor.xy);
-        opacities[thread] = vec2f(next.shape.factor.z, next.shape.log2_opacity);
-        color_depths[thread] = vec4f(next.color.rgb, next.color.depth_m);
-        splat_blocks[thread] = select(0u, blocks_of(next.shape, corner), thread < count);
+        store_splat(thread, next.shape, next.color);
+        splat_blocks[thread] = select(0u, reached_blocks(next.shape, corner), thread < count);
         workgroupBarrier();
         next = load(range, first + BATCH + thread);
         // Transpose: from bits of blocks per splat to bits of splats per block.
@@ -123,7 +106,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) th
         block_splats[thread % BLOCKS * PARTS + part] = bits;
         pairs += countOneBits(bits);
         workgroupBarrier();
-        // Blend it.
+        // Each word has 32 splats, in order of depth.
         let was_done = done;
         for (var k = 0u; k < BATCH / 32u && !done; k++) {
             let mine = word(block, k);

@@ -70,7 +70,7 @@ fn write(at: u32, four: vec4u) {
     pixels[at / 4u] = four;
 }
 
-// Writes one word.
+// A word lies in one of the four components that are stored together.
 fn write_word(at: u32, word: u32) {
     pixels[at / 4u][at % 4u] = word;
 }

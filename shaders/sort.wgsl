@@ -90,7 +90,7 @@ fn scatter_round(at: u32, end: u32, thread: u32) -> u32 {
     if held {
         key = keys[i];
     }
-    let to = place_of(key, held, thread);
+    let to = key_place(key, held, thread);
     if held {
         sorted_keys[to] = key;
         sorted_values[to] = values[i];
@@ -117,7 +117,7 @@ fn start_block(block: u32, thread: u32) -> vec2u {
 // It is computed from one bit per thread, so the sort is stable for any subgroup size and for any order
 // in which the bits were set. The last thread of a digit advances the digit's next index, and each
 // thread clears the word in which it set a bit.
-fn place_of(key: u32, held: bool, thread: u32) -> u32 {
+fn key_place(key: u32, held: bool, thread: u32) -> u32 {
     let own_word = thread / 32u;
     let own_bit = 1u << (thread % 32u);
     let own_digit = digit(key);

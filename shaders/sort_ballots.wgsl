@@ -120,8 +120,8 @@ fn scatter_block(block: u32, thread: u32, team: Team) {
         }
         all = totals[thread];
     }
-    var before = of_smaller_digits(thread, total);
-    let all_before = of_smaller_digits(thread, all);
+    var before = sum_smaller_digits(thread, total);
+    let all_before = sum_smaller_digits(thread, all);
     if thread < DIGITS {
         starts[thread] = all_before + offsets[thread * block_count + block] - before;
         for (var k = 0u; k < teams; k++) {
@@ -204,7 +204,7 @@ fn write_value(to: u32, place: u32, count: u32) {
 }
 
 // Sum of the counts of smaller digits. The first threads have a digit each; all threads call it.
-fn of_smaller_digits(thread: u32, count: u32) -> u32 {
+fn sum_smaller_digits(thread: u32, count: u32) -> u32 {
     workgroupBarrier();
     if thread < DIGITS {
         starts[thread] = count;

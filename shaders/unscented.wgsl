@@ -108,7 +108,7 @@ fn splat_of_root(
         }
     }
     let foot = Footprint(mean_px, covariance, det_unblurred, units_per_px);
-    var projected = shape_of(foot, log2_opacity, view);
+    var projected = splat_shape(foot, log2_opacity, view);
     projected.depth_m = depth_m;
     projected.from_camera_m = from_camera_m;
     return projected;

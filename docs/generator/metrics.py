@@ -1,9 +1,8 @@
 """docs/reference/metrics.md: what a server says at `GET /metrics`, without values.
 
 A second server has its twins in an object store, an empty one of this program, which adds the metrics of stores. A
-metric with labels is
-listed once it has a value: so the first server is asked for a twin that does not exist, and for a push that it
-refuses."""
+metric with labels is listed once it has a value: so the first server is asked for a twin that does not exist, and for
+a push that it refuses."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 // Blocks of a tile that the box of a splat reaches, a bit each, row by row, by the test with which `bin.wgsl`
 // finds its tiles. `corner` is the first pixel of the tile.
-fn blocks_of(shape: SplatShape, corner: vec2u) -> u32 {
+fn reached_blocks(shape: SplatShape, corner: vec2u) -> u32 {
     let size = f32(TILE_PX);
     let first_px = ceil(shape.mean_px - shape.extent_px - 0.5) - vec2f(corner);
     let last_px = floor(shape.mean_px + shape.extent_px - 0.5) - vec2f(corner);
@@ -20,7 +20,7 @@ fn blocks_of(shape: SplatShape, corner: vec2u) -> u32 {
 }
 
 // Index of the view that a tile belongs to.
-fn view_of(tile: u32) -> u32 {
+fn tile_view(tile: u32) -> u32 {
     var view = 0u;
     while view + 1u < frame.views && frame.view[view + 1u].first_tile <= tile {
         view++;
@@ -29,7 +29,7 @@ fn view_of(tile: u32) -> u32 {
 }
 
 // First pixel of a tile on its image.
-fn corner_of(tile: u32, view: FrameView) -> vec2u {
+fn tile_corner(tile: u32, view: FrameView) -> vec2u {
     let tile_of_view = tile - view.first_tile;
     return vec2u(tile_of_view % view.columns, tile_of_view / view.columns) * TILE_PX;
 }

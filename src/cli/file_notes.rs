@@ -16,13 +16,21 @@ pub(super) struct DropBad {
     pub(super) drop_bad: bool,
 }
 
-/// Prints the notes of a file to standard error.
-pub(super) fn print(file: &Path, notes: &FileNotes) -> io::Result<()> {
+/// Prints the warnings of a file to standard error.
+pub(super) fn print_warnings(file: &Path, warnings: &[String]) -> io::Result<()> {
     let mut out = io::stderr().lock();
     let file = file.display();
-    for warning in &notes.warnings {
+    for warning in warnings {
         writeln!(out, "warning: {file}: {warning}")?;
     }
+    Ok(())
+}
+
+/// Prints the notes of a file to standard error.
+pub(super) fn print(file: &Path, notes: &FileNotes) -> io::Result<()> {
+    print_warnings(file, &notes.warnings)?;
+    let mut out = io::stderr().lock();
+    let file = file.display();
     if notes.dropped > 0 {
         let count = notes.dropped as usize;
         writeln!(

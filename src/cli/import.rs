@@ -51,8 +51,8 @@ pub(super) struct Import {
     #[command(flatten)]
     twins: Twins,
 
-    /// Directions of the file's axes, which hardly any file records: a preset, or the 9 numbers of
-    /// the matrix from the file's axes to the twin's (x east, y north, z up), row by row.
+    /// Directions of the file's axes. Few files record them. Give a preset, or the 9 numbers of the
+    /// matrix from the file's axes to the twin's (x east, y north, z up), row by row.
     ///
     /// identity: z is up already.
     /// y-down-z-forward: OpenCV, COLMAP; most captures.
@@ -233,8 +233,10 @@ impl Import {
         });
         let version = version.with_context(cannot)?;
         bar.finish_and_clear();
+        // An alignment that cannot be read does not stay either. It is no error: the version is
+        // published, and mends the twin.
         if let Some(latest) = latest
-            && latest.manifest.alignment()?.is_some()
+            && !matches!(latest.manifest.alignment(), Ok(None))
         {
             writeln!(
                 std::io::stderr(),

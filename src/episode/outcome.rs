@@ -25,16 +25,14 @@ pub fn result(episode: &EpisodeFile) -> Option<EpisodeResult> {
             _ => None,
         })
     };
-    let fault = |fault: &own::FaultAt| {
-        let is_static = fault.fault == own::Fault::Static;
-        let met = is_static.then(|| met(fault.time_us)).flatten();
+    let fault_line = |found: &own::FaultAt| {
+        let is_static = found.fault == own::Fault::Static;
+        let met = is_static.then(|| met(found.time_us)).flatten();
+        let actor = found.actor.and_then(|actor| actors.get(usize::from(actor)));
         FaultLine {
-            fault: fault.fault.name().to_owned(),
-            time_us: fault.time_us,
-            actor: fault
-                .actor
-                .and_then(|actor| actors.get(usize::from(actor)))
-                .map(|actor| actor.name.clone()),
+            fault: found.fault.name().to_owned(),
+            time_us: found.time_us,
+            actor: actor.map(|actor| actor.name.clone()),
             area_m2: met.map(|(area_m2, _)| area_m2),
             impact_mps: met.map(|(_, impact_mps)| impact_mps),
         }
@@ -51,7 +49,7 @@ pub fn result(episode: &EpisodeFile) -> Option<EpisodeResult> {
     };
     Some(EpisodeResult {
         verdict: judgement.to_owned(),
-        faults: verdict.faults.iter().map(fault).collect(),
+        faults: verdict.faults.iter().map(fault_line).collect(),
         not_judged: verdict.not_judged.iter().map(own::NotJudged::to_string).collect(),
         scores: score(&record).into_iter().map(line).collect(),
     })

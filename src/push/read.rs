@@ -288,10 +288,13 @@ fn common_antialiasing(
     files: &mut [FileReport],
     said: &[Option<Antialiasing>],
 ) -> Option<Antialiasing> {
-    let is_on = |(_, said): &(usize, &Antialiasing)| said.blur_px2.is_some();
-    let all = || said.iter().enumerate().filter_map(|(i, said)| Some((i, said.as_ref()?)));
-    let (first, used) = all().find(is_on).or_else(|| all().next())?;
-    let name = files.get(first).map(|file| file.name.clone()).unwrap_or_default();
+    // A file without Gaussians was not trained, whatever it says.
+    let all = || {
+        let files = files.iter().zip(said).filter(|(file, _)| file.gaussians > 0);
+        files.filter_map(|(file, said)| Some((file.name.clone(), said.as_ref()?)))
+    };
+    let is_on = |(_, said): &(String, &Antialiasing)| said.blur_px2.is_some();
+    let (name, used) = all().find(is_on).or_else(|| all().next())?;
     for (file, said) in files.iter_mut().zip(said) {
         let own = said.as_ref().and_then(|said| said.blur_px2);
         if file.gaussians == 0 || own == used.blur_px2 {

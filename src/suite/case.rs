@@ -197,13 +197,10 @@ impl Case {
         let drives = &version.manifest.trajectories;
         let on_drive = DriveStart::new(&resolved, drives);
         let line = scenario_line(&resolved, map.as_ref(), &hash, drives);
-        // A map is part of the record's first line, which has a limit.
-        if map.is_some() {
-            line.check().map_err(|message| SuiteError::File {
-                path: path.to_owned(),
-                cause: FileError::new("map", format!("is too large: {message}")),
-            })?;
-        }
+        line.check().map_err(|message| SuiteError::File {
+            path: path.to_owned(),
+            cause: FileError::new("map", format!("is too large: {message}")),
+        })?;
         let dt_us = suite.dt_us.unwrap_or(session::DT_US);
         let steps = match line.limit_us {
             // Rounded up, so that the last step ends at the limit or beyond it and not before.

@@ -1,7 +1,6 @@
 //! How a run ended: its exit code, and why.
 
 use crate::compare::{CompareError, Comparison};
-use crate::file::OFF_MODEL;
 use crate::result::SuiteResult;
 
 /// The exit code of a run.
@@ -40,12 +39,11 @@ impl Ending {
     pub fn new(result: &SuiteResult, against: Option<&Result<Comparison, CompareError>>) -> Self {
         let counts = &result.counts;
         let has_failed = counts.failed > 0;
-        let accepts_off_model = result.accept_unjudged.iter().any(|name| name == OFF_MODEL);
         // Without any verdict, nothing was tested, whatever is accepted.
         // The criteria that a suite accepts are passes already, so `not_judged` has only the
         // others.
         let is_unjudged = counts.not_judged > 0
-            || (counts.off_model > 0 && !accepts_off_model)
+            || (counts.off_model > 0 && !result.accepts_off_model())
             || result.pass_rate.runs == 0;
         // The lower end of the interval: with few episodes a high rate proves little.
         let low = result.pass_rate.interval[0];

@@ -4,7 +4,6 @@ use std::fmt::Write as _;
 
 use crate::ending::Ending;
 use crate::entry::{EpisodeEntry, LEFT, Status, TechnicalEntry};
-use crate::file::OFF_MODEL;
 use crate::result::SuiteResult;
 
 /// The result as JUnit XML: `failure` is driving; `error` technical, or an episode without a
@@ -15,10 +14,7 @@ use crate::result::SuiteResult;
 /// exit code and its reason.
 pub fn junit(result: &SuiteResult, ending: &Ending) -> String {
     let counts = &result.counts;
-    // The same rule as in the exit code: where the suite accepts these episodes, they are no
-    // errors.
-    let accepts_off_model = result.accept_unjudged.iter().any(|name| name == OFF_MODEL);
-    let skipped = if accepts_off_model { counts.off_model } else { 0 };
+    let skipped = if result.accepts_off_model() { counts.off_model } else { 0 };
     // `skipped` is at most `off_model`, so the subtraction is safe.
     let errors = counts.technical + counts.not_judged + counts.off_model - skipped;
     let mut text = String::from("<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n");
@@ -59,7 +55,7 @@ fn case(text: &mut String, result: &SuiteResult, episode: &EpisodeEntry) {
         escaped(&class),
         escaped(&episode.name)
     );
-    // The status decides on the element, and the run's own rule does not.
+    // The status decides on the element; for `off_model` also whether the run accepts it.
     let inner = match episode.status {
         Status::Passed => String::new(),
         Status::Failed => {
@@ -71,7 +67,7 @@ fn case(text: &mut String, result: &SuiteResult, episode: &EpisodeEntry) {
         }
         Status::OffModel => {
             let message = LEFT;
-            if result.accept_unjudged.iter().any(|name| name == OFF_MODEL) {
+            if result.accepts_off_model() {
                 format!("<skipped message=\"{message}\"/>")
             } else {
                 element("error", "off_model", message, message)

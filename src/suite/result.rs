@@ -10,7 +10,7 @@ use wildcity_score::statistics::{Mean, wilson};
 
 use crate::entry::{EpisodeEntry, Status};
 use crate::error::SuiteError;
-use crate::file::read;
+use crate::file::{OFF_MODEL, read};
 use crate::limits;
 
 /// All episodes of a run, and their rates and means. It has no clock times, so that the same drives
@@ -113,6 +113,11 @@ impl SuiteResult {
 
     /// The name of its file.
     pub const FILE: &str = "result.json";
+
+    /// Whether an episode that left the trained area is no error of the run.
+    pub(crate) fn accepts_off_model(&self) -> bool {
+        self.accept_unjudged.iter().any(|name| name == OFF_MODEL)
+    }
 
     /// The result of some episodes, which are in order of their names.
     pub(crate) fn new(head: RunHead, mut episodes: Vec<EpisodeEntry>) -> Self {

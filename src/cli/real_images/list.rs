@@ -1,12 +1,12 @@
 //! Lists of real images: their files, masks and cameras.
 
-use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 
+use crate::cli::file_notes;
 use wildcity_scene::align::PosedImage;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_twin::ingest::capture::CaptureError;
@@ -110,9 +110,7 @@ fn read(source: &Path) -> anyhow::Result<Listed> {
     }
     if is_dir || has_frames(source)? {
         let capture::NerfstudioCapture { frames, warnings } = capture::read_nerfstudio(source)?;
-        for warning in warnings {
-            writeln!(io::stderr(), "warning: {}: {warning}", source.display())?;
-        }
+        file_notes::print_warnings(source, &warnings)?;
         let listed = |frame: capture::FrameImage| {
             let capture::FrameImage { posed, mask, exposure_stops } = frame;
             ListedImage { posed, mask, near: None, exposure_stops }

@@ -11,8 +11,8 @@ use wildcity_scene::align::{
 use wildcity_twin::ingest::capture;
 
 use super::files::to_json;
-use crate::cli::output;
 use crate::cli::placement::Placement;
+use crate::cli::{file_notes, output};
 
 /// Make a drive and a rig from the camera poses of a COLMAP model.
 ///
@@ -99,9 +99,7 @@ impl FromNerfstudio {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let capture::NerfstudioCapture { frames, warnings } =
             capture::read_nerfstudio(&self.source)?;
-        for warning in warnings {
-            writeln!(io::stderr(), "warning: {}: {warning}", self.source.display())?;
-        }
+        file_notes::print_warnings(&self.source, &warnings)?;
         let images: Vec<PosedImage> = frames.into_iter().map(|frame| frame.posed).collect();
         self.options.write(&images)
     }

@@ -131,9 +131,7 @@ impl Kernel {
             }
         }
     }
-}
 
-impl Kernel {
     /// The bind group of these resources, that of an earlier run if there is one. Buffers that were
     /// destroyed since are never bound again, so that their bind groups are forgotten in time.
     fn bind_group(&self, device: &Device, resources: &[(u32, BindingResource<'_>)]) -> BindGroup {

@@ -37,7 +37,7 @@ pub const LARGE_SPLAT_MACRO_TILES: u32 = 16;
 pub const EXPAND_BATCH: u32 = 1024;
 /// Splats that a tile loads into workgroup memory and blends at a time.
 pub const RASTER_BATCH: u32 = 128;
-/// Most tiles with long lists that have a kernel of their own: 26 MiB of sums. 5 million visible
+/// Most tiles with long lists that have a kernel of their own: 25 MiB of sums. 5 million visible
 /// pairs of six full cameras have 600.
 pub const LONG_TILES: u32 = 4096;
 /// Words of such a tile's sums, as in `shaders/shared/tile_blocks.wgsl`.

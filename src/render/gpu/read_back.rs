@@ -23,7 +23,7 @@ pub(super) const TIMESTAMP_OFFSET: u64 = 256;
 /// the device fills another set with those of the next step.
 #[derive(Debug)]
 pub(super) struct ReadBack {
-    /// Counters, then timestamps.
+    /// Counters, those of stage rasterize, then timestamps.
     pub(super) head: GrowableBuffer,
     pub(super) pages: Vec<GrowableBuffer>,
     /// Tiles of a page; the last page may have fewer.

@@ -126,6 +126,7 @@ const FILES: &[(&str, &str)] = &[
     ("sky_network", include_str!("../../../shaders/sky_network.wgsl")),
     ("sort", include_str!("../../../shaders/sort.wgsl")),
     ("tile_blocks", include_str!("../../../shaders/shared/tile_blocks.wgsl")),
+    ("splat_batch", include_str!("../../../shaders/shared/splat_batch.wgsl")),
     ("sort_ballots", include_str!("../../../shaders/sort_ballots.wgsl")),
     ("unscented", include_str!("../../../shaders/unscented.wgsl")),
 ];

@@ -86,15 +86,16 @@ impl Gpu {
 
     /// Opens the device again after it was lost.
     fn reopen(&self) -> Result<Chain, RenderError> {
-        let failed = |reason| RenderError::Device { device: self.info.name.clone(), reason };
-        let device =
+        let opened =
             Device::open(&self.choice, &self.shaders, self.limits.binding_bytes, self.tuning);
-        let device = device.map_err(|error| failed(error.to_string()))?;
-        // Another device would draw other bytes, and was not requested.
-        if device.info != self.info {
-            let reason = format!("it was lost, and in its place is {}", device.info.name);
-            return Err(failed(reason));
-        }
+        let device = match opened {
+            Ok(device) if device.info == self.info => Ok(device),
+            // Another device would draw other bytes, and was not requested.
+            Ok(other) => Err(format!("it was lost, and in its place is {}", other.info.name)),
+            Err(error) => Err(error.to_string()),
+        };
+        let device = device
+            .map_err(|reason| RenderError::Device { device: self.info.name.clone(), reason })?;
         tracing::info!(device = device.info.name, "the GPU was opened again");
         Chain::new(device, self.limits.mirror_bytes)
     }

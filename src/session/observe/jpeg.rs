@@ -50,7 +50,7 @@ pub(crate) fn jpeg_in_strips(
 /// One file of the files of strips.
 fn join(strips: &[Vec<u8>], [width, height]: [u16; 2]) -> Result<Vec<u8>, String> {
     let (first, rest) = strips.split_first().ok_or("an image without rows")?;
-    let head = Head::new(first)?;
+    let head = Head::find(first).ok_or(NO_SCAN)?;
     let bytes = strips.iter().map(Vec::len).sum();
     let mut file = Vec::with_capacity(bytes);
     file.extend_from_slice(&first[..head.scan]);
@@ -61,13 +61,16 @@ fn join(strips: &[Vec<u8>], [width, height]: [u16; 2]) -> Result<Vec<u8>, String
     file.extend_from_slice(&units.to_be_bytes());
     file.extend_from_slice(&first[head.scan..first.len() - 2]);
     for (number, strip) in rest.iter().enumerate() {
-        let head = Head::new(strip)?;
+        let head = Head::find(strip).ok_or(NO_SCAN)?;
         file.extend_from_slice(&[0xFF, 0xD0 + (number % 8) as u8]);
         file.extend_from_slice(&strip[head.data..strip.len() - 2]);
     }
     file.extend_from_slice(&[0xFF, 0xD9]);
     Ok(file)
 }
+
+/// The error of a file in which [`Head::find`] finds nothing.
+const NO_SCAN: &str = "the encoder's file has no scan";
 
 /// Where the segments of a file start.
 #[derive(Clone, Copy, Debug)]
@@ -81,28 +84,24 @@ struct Head {
 }
 
 impl Head {
-    fn new(file: &[u8]) -> Result<Self, String> {
-        let failed = || "the encoder's file has no scan".to_owned();
+    /// `None` for a file without a frame header and a scan behind it, or without an end.
+    fn find(file: &[u8]) -> Option<Self> {
         if !file.ends_with(&[0xFF, 0xD9]) {
-            return Err(failed());
+            return None;
         }
         let mut frame = None;
         let mut at = 2;
-        loop {
-            let &[0xFF, marker, high, low, ..] = file.get(at..).ok_or_else(failed)? else {
-                return Err(failed());
-            };
+        while let &[0xFF, marker, high, low, ..] = file.get(at..)? {
+            // The length of a segment counts its own two bytes, and not the marker's.
             let next = at + 2 + usize::from(u16::from_be_bytes([high, low]));
             match marker {
                 0xC0 => frame = Some(at),
-                0xDA => {
-                    let frame = frame.ok_or_else(failed)?;
-                    return Ok(Self { frame, scan: at, data: next });
-                }
+                0xDA => return Some(Self { frame: frame?, scan: at, data: next }),
                 _ => {}
             }
             at = next;
         }
+        None
     }
 }
 

@@ -309,11 +309,8 @@ impl OpenedScenario {
 }
 
 /// Refuses a scenario whose line in a record could not be read back: before anything is driven, and
-/// not afterwards. Without a map, it is far shorter than that.
+/// not afterwards.
 fn check_line(loaded: &LoadedScenario, manifest: &Manifest) -> Result<(), SessionError> {
-    if loaded.map.is_none() {
-        return Ok(());
-    }
     let drives = &manifest.trajectories;
     let line = scenario_line(&loaded.scenario, loaded.map.as_ref(), &loaded.hash, drives);
     line.check().map_err(|reason| {

@@ -108,9 +108,17 @@ impl Session {
         let simulation = SimulationState { episode: &next, traffic: traffic.as_ref() };
         let rendered =
             self.render(&self.version, simulation, captures, Some(frame_history), deadline).await?;
-        let happened = traffic.as_ref().map_or(events.as_slice(), EpisodeTraffic::events);
         // An ego that failed first has not left the area by what came after.
-        let failed_us = next.is_failed().then(|| first_failure_us(happened)).flatten();
+        let failed_us = next.is_failed().then(|| match &traffic {
+            // Only the end tells which of the contacts the scenario judges.
+            Some(traffic) => {
+                let is_end = |event: &&Event| matches!(event.kind, EventKind::End(_));
+                traffic.events().iter().find(is_end).map(|event| event.time_us)
+            }
+            // Without a scenario, any contact fails, and the first one did.
+            None => events.iter().map(|event| event.time_us).min(),
+        });
+        let failed_us = failed_us.flatten();
         let left = left_model(&mut next, met.off_model, &rendered, failed_us);
         if let Some(event) = left {
             add_event(traffic.as_mut(), &mut events, event);
@@ -429,17 +437,6 @@ fn add_event(traffic: Option<&mut EpisodeTraffic>, events: &mut Vec<Event>, even
         Some(traffic) => traffic.add_event(event),
         None => events.push(event),
     }
-}
-
-/// When the first event happened by which an episode may have failed, in microseconds.
-fn first_failure_us(events: &[Event]) -> Option<i64> {
-    let fails = |event: &&Event| {
-        matches!(
-            event.kind,
-            EventKind::Contact(_) | EventKind::StaticContact { .. } | EventKind::End(_)
-        )
-    };
-    events.iter().filter(fails).map(|event| event.time_us).min()
 }
 
 /// The event that an episode leaves the area that the twin was trained on, by a pose or by the

@@ -29,10 +29,9 @@ pub struct Vehicle {
 /// left): `|v| dz/dt = (grip + v |v| turning) z + v steer δ`.
 ///
 /// These are Newton's equations with linear tyres (Rajamani, "Vehicle Dynamics and Control", 2.3),
-/// multiplied by
-/// |v|. The lateral force of a tyre is its stiffness times its slip angle, `(u - v δ) / |v|` for a
-/// wheel with
-/// lateral velocity u. After the multiplication nothing is divided by v, and v = 0 gives z = 0.
+/// multiplied by |v|. The lateral force of a tyre is its stiffness times its slip angle,
+/// `(u - v δ) / |v|` for a wheel with lateral velocity u. After the multiplication nothing is
+/// divided by v, and v = 0 gives z = 0.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct LateralDynamics {
     grip: DMat2,

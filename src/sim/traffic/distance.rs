@@ -102,9 +102,9 @@ impl KeepDistance {
         } else {
             (place.forward, (body.center_m - place.center_m).dot(place.forward))
         };
-        // Between boxes the middles count, and not the reference points.
         // In the direction of the way: a reference point ahead of a turned body counts less.
         let shift_m = self.to_ahead_m * body.forward().dot(ahead) - self.ahead_m;
+        // Between boxes the middles count, and not the reference points.
         let way_m = if self.is_free { way_m } else { way_m + shift_m };
         let other_mps = body.velocity_mps.dot(ahead);
         let is_behind = match self.side {

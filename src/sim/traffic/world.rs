@@ -373,11 +373,11 @@ impl World {
         when.time_us.is_none_or(|time_us| self.time_us >= time_us)
             && when.ego_speed_above_mps.is_none_or(|least| ego.velocity_mps.length() >= least)
             && when.after.is_none_or(|after| self.is_after(after))
-            && when.measure.is_none_or(|measure| measures.holds(&measure))
-            && self.holds_of_own(traffic, index, when, bodies)
             && when
                 .station_m
                 .is_none_or(|least_m| follow.is_some_and(|(_, now)| now.station_m >= least_m))
+            && self.holds_of_own(traffic, index, when, bodies)
+            && when.measure.is_none_or(|measure| measures.holds(&measure))
             && when.ego_station_m.is_none_or(|least_m| {
                 course.is_some_and(|course| course.nearest(bodies[0].center_m).station_m >= least_m)
             })

@@ -83,7 +83,10 @@ def convert(source: str | PathLike[str], target: str | PathLike[str], model: str
     Returns the number of Gaussians. `model` selects one of several models of a checkpoint. `target` is written
     completely or not at all. Raises `CheckpointError` if the checkpoint cannot be converted.
     """
-    saved = load(source)
+    return _convert(source, load(source), target, model)
+
+
+def _convert(source: str | PathLike[str], saved: Any, target: str | PathLike[str], model: str | None) -> int:
     tensors = _splats(source, saved, model)
     _write_safetensors(target, tensors | _float32(_sky_arrays(saved)))
     return len(tensors["means"])
@@ -95,7 +98,10 @@ def skipped(source: str | PathLike[str], model: str | None = None) -> list[str]:
     Groups are paths in the checkpoint, such as `sky_cubemap`, `models.RigidNodes` or `pipeline._model.bil_grids`. The
     state of optimizers has none.
     """
-    saved = load(source)
+    return _skipped(source, load(source), model)
+
+
+def _skipped(source: str | PathLike[str], saved: Any, model: str | None) -> list[str]:
     found = _chosen(source, saved, model)[1]
     converted = {id(values) for values in _sky_arrays(saved).values()}
     converted |= {id(values) for values in found.arrays.values()}
@@ -369,8 +375,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--model", help="name of the model to convert, if there are several")
     chosen = parser.parse_args(arguments)
     try:
-        left_out = skipped(chosen.source, chosen.model)
-        count = convert(chosen.source, chosen.target, chosen.model)
+        # Read once: a checkpoint has gigabytes.
+        saved = load(chosen.source)
+        left_out = _skipped(chosen.source, saved, chosen.model)
+        count = _convert(chosen.source, saved, chosen.target, chosen.model)
     except CheckpointError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

@@ -1,9 +1,8 @@
 """Reads and checks the JSON files of a Difix folder: the sizes of the two networks, and the one step of the scheduler.
 
 Needs no PyTorch. Difix (Wu et al., "Difix3D+: Improving 3D Reconstructions with Single-Step Diffusion Models", CVPR
-2025;
-code: nv-tlabs/Difix3D) is SD-Turbo with skip connections in its autoencoder. Its folder has the layout of diffusers:
-`vae/config.json`, `unet/config.json`, `scheduler/scheduler_config.json`, and the weights next to them.
+2025; code: nv-tlabs/Difix3D) is SD-Turbo with skip connections in its autoencoder. Its folder has the layout of
+diffusers: `vae/config.json`, `unet/config.json`, `scheduler/scheduler_config.json`, and the weights next to them.
 """
 
 from __future__ import annotations
@@ -167,8 +166,7 @@ class Step:
 
     A latent image at time t is sqrt(a) * clean + sqrt(1 - a) * noise (DDPM, Ho et al. 2020, equation 4), where a is the
     product of 1 - beta up to t. The network predicts the noise. There is no step after this one, so the prediction of
-    the
-    clean image is the result, and no noise is added: what DDPMScheduler computes with `timesteps=[199]`.
+    the clean image is the result, and no noise is added: what DDPMScheduler computes with `timesteps=[199]`.
     """
 
     signal_weight: float

@@ -86,8 +86,7 @@ def push(
     server: `http://HOST:PORT` or `https://HOST:PORT`.
     token: for a server that was started with tokens; the default is `$WILDCITY_TOKEN`.
     axes, scale: axis convention and metres per unit of the files, as in `wildcity import`. The default is the axes that
-    a
-        file records, or those with which the twin was imported.
+        a file records, or those with which the twin was imported.
     frame: "twin", which is the default, or "capture": the axes and the unit with which the capture was imported, before
         `wildcity twin align`. `report["frame"]` is the frame that was used; `report["aligned"]` is true if they differ.
     cells: the 64 m cells (x, y) to replace, or "all"; the default is those that contain Gaussians of the files.

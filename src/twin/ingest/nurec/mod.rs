@@ -6,8 +6,8 @@
 //! degrees, coefficient-major, then red, green, blue), of which n_active_features degrees count. A
 //! layer of tracked objects is skipped, because it has no fixed place ([`read_tracked`] reads it:
 //! gaussian_cuboid_ids names the track of each Gaussian, and positions are relative to the middle
-//! of the track's cuboid). Positions are in the
-//! payload's axes; the USD layers around it, which may rotate and move it, are not read.
+//! of the track's cuboid). Positions are in the payload's axes; the USD layers around it, which may
+//! rotate and move it, are not read.
 
 mod msgpack;
 mod settings;
