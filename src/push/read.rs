@@ -363,7 +363,13 @@ mod tests {
         }
         let (_, warnings) = warned(&[mip.clone(), says(Some(0.3), "antialiased 1")]);
         assert!(warnings[1].starts_with("trained with blur 0.3 (antialiased 1)"), "{warnings:?}");
-        assert_eq!(warned(&[mip.clone(), mip]).1, ["", ""]);
+        assert_eq!(warned(&[mip.clone(), mip.clone()]).1, ["", ""]);
+
+        // A file without Gaussians does not count, whatever it says.
+        let empty = FileReport { gaussians: 0, ..report("empty.ply") };
+        let mut files = [empty, report("b.ply")];
+        assert_eq!(common_antialiasing(&mut files, &[mip, default.clone()]), default);
+        assert!(files.iter().all(|file| file.warnings.is_empty()), "{files:?}");
     }
 
     #[test]
