@@ -21,6 +21,7 @@ pub mod constants;
 pub mod cpu;
 pub mod expansion;
 pub mod gpu;
+pub mod gradient;
 pub mod hybrid;
 pub mod layout;
 pub mod limits;

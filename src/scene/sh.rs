@@ -66,6 +66,30 @@ pub fn basis(direction: DVec3) -> [f64; 16] {
     ]
 }
 
+/// The derivatives of [`basis`] by x, y and z, as of polynomials of three independent variables.
+pub fn basis_gradients(direction: DVec3) -> [DVec3; 16] {
+    let DVec3 { x, y, z } = direction;
+    let (xx, yy, zz) = (x * x, y * y, z * z);
+    [
+        DVec3::ZERO,
+        DVec3::new(0.0, -C1, 0.0),
+        DVec3::new(0.0, 0.0, C1),
+        DVec3::new(-C1, 0.0, 0.0),
+        C2[0] * DVec3::new(y, x, 0.0),
+        C2[1] * DVec3::new(0.0, z, y),
+        C2[2] * DVec3::new(-2.0 * x, -2.0 * y, 4.0 * z),
+        C2[3] * DVec3::new(z, 0.0, x),
+        C2[4] * DVec3::new(2.0 * x, -2.0 * y, 0.0),
+        C3[0] * DVec3::new(6.0 * x * y, 3.0 * (xx - yy), 0.0),
+        C3[1] * DVec3::new(y * z, x * z, x * y),
+        C3[2] * DVec3::new(-2.0 * x * y, 4.0 * zz - xx - 3.0 * yy, 8.0 * y * z),
+        C3[3] * DVec3::new(-6.0 * x * z, -6.0 * y * z, 6.0 * zz - 3.0 * (xx + yy)),
+        C3[4] * DVec3::new(4.0 * zz - 3.0 * xx - yy, -2.0 * x * y, 8.0 * x * z),
+        C3[5] * DVec3::new(2.0 * x * z, -2.0 * y * z, xx - yy),
+        C3[6] * DVec3::new(3.0 * (xx - yy), -6.0 * x * y, 0.0),
+    ]
+}
+
 /// Rotation of SH coefficients with the scene, by an orthogonal matrix M (mirrors included): a
 /// colour that was seen along `d` is afterwards seen along `M d`.
 ///

@@ -26,6 +26,7 @@ mod appearance;
 mod cameras;
 mod determinism;
 mod expansion;
+mod gradients;
 mod image_metrics;
 mod models;
 mod normals;

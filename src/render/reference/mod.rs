@@ -6,6 +6,7 @@
 
 mod background;
 mod blend;
+pub mod gradient;
 mod project;
 mod rays;
 
@@ -14,7 +15,7 @@ use std::time::Instant;
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 
-pub use project::{Splat, project};
+pub use project::{Gaussian, Splat, project};
 
 use wildcity_scene::appearance::{Appearance, Exposure};
 

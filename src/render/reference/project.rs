@@ -14,6 +14,9 @@ use wildcity_scene::chunk::column;
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::{Chunk, RenderProfile, Scene, sh};
 
+/// Least share of the determinant before the blur by which opacity is scaled, gsplat's 0.005².
+pub(super) const MIN_BLUR_SHARE: f64 = 0.005 * 0.005;
+
 /// A Gaussian on the image.
 #[derive(Clone, Copy, Debug)]
 pub struct Splat {
@@ -41,8 +44,9 @@ pub fn project(scene: &Scene, profile: &RenderProfile, view: &View) -> Vec<Splat
     // Chunks in parallel; the collection keeps their order, and so that of global ids.
     let twin = scene.chunks.par_iter().enumerate().flat_map_iter(|(number, chunk)| {
         let splat = move |i| {
-            let splat = project_one(chunk, i, profile, view)?;
-            let rgb = splat.rgb * shadow_factor(scene, mean_and_axes(chunk, i).0);
+            let gaussian = Gaussian::from_chunk(chunk, i);
+            let splat = gaussian.project(profile, view)?;
+            let rgb = splat.rgb * shadow_factor(scene, gaussian.mean_m);
             Some(Splat { gaussian: [number, i], rgb, ..splat })
         };
         (0..chunk.len()).filter_map(splat)
@@ -51,7 +55,7 @@ pub fn project(scene: &Scene, profile: &RenderProfile, view: &View) -> Vec<Splat
         let view = view.seen_from(placed);
         let tint = DVec3::from_array(placed.tint.map(f64::from));
         let splat = move |i| {
-            let splat = project_one(&placed.chunk, i, profile, &view)?;
+            let splat = Gaussian::from_chunk(&placed.chunk, i).project(profile, &view)?;
             // Actors' chunks are numbered after those of the twin.
             let number = scene.chunks.len() + number;
             let instance = FIRST_ACTOR_INSTANCE + placed.actor;
@@ -79,61 +83,114 @@ pub(super) fn sort(splats: &mut [Splat]) {
     splats.par_sort_by(|a, b| (a.depth_m as f32).total_cmp(&(b.depth_m as f32)));
 }
 
-/// Projects one Gaussian; `None` if it cannot be seen.
-fn project_one(chunk: &Chunk, index: usize, profile: &RenderProfile, view: &View) -> Option<Splat> {
-    let (mean_world, axes_m) = mean_and_axes(chunk, index);
-    let footprint = if view.is_static_pinhole() {
-        project_pinhole(mean_world, axes_m, profile, view)
-    } else {
-        project_unscented(mean_world, axes_m, profile, view)
-    }?;
-    let Footprint { depth_m, mean_px, xx, xy, yy, det_before, camera_m } = footprint;
-    let filter = PixelFilter::new(profile, &view.camera);
-    let Filtered { xx, yy, det, blur_share, shrink_share } = filter.filtered(xx, yy, det_before);
-
-    let mut opacity = f64::from(chunk.value(index, column::LOG2_OPACITY)).exp2();
-    if profile.antialiased {
-        // Yu et al. 2024 (Mip-Splatting), with gsplat's floor.
-        opacity *= blur_share.max(0.005 * 0.005).sqrt();
-    }
-    opacity *= shrink_share.powf(PixelFilter::SHRINK_POWER);
-    let visible = opacity >= profile.alpha_cut;
-    visible.then(|| Splat {
-        gaussian: [0, index],
-        instance: TWIN_INSTANCE,
-        depth_m,
-        mean_px,
-        conic: DVec3::new(yy, -xy, xx) / det,
-        opacity,
-        rgb: color(chunk, index, mean_world - camera_m),
-        // opacity exp(-k^2/2) = alpha_cut gives k^2 = 2 ln(opacity/cut); times each
-        // variance, its root.
-        reach_px: (2.0 * (opacity / profile.alpha_cut).ln() * DVec2::new(xx, yy)).map(f64::sqrt),
-    })
+/// A Gaussian in f64, in the axes of the world or of its actor.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Gaussian {
+    pub mean_m: DVec3,
+    /// Takes its own axes to those of `mean_m`. Of any length but zero: it is normalised.
+    pub rotation: DQuat,
+    /// Standard deviations along its own axes, in metres.
+    pub scale_m: DVec3,
+    pub log2_opacity: f64,
+    /// Spherical harmonics by [`sh::basis`]; those above its degree are 0.
+    pub sh: [DVec3; 16],
 }
 
-/// A Gaussian's centre in the world, and its axes times their standard deviations as columns, in
-/// metres.
-pub(super) fn mean_and_axes(chunk: &Chunk, index: usize) -> (DVec3, DMat3) {
-    let value = |column| f64::from(chunk.value(index, column));
-    let vector = |first| DVec3::new(value(first), value(first + 1), value(first + 2));
-    let q = column::QUAT;
-    let rotation = DQuat::from_xyzw(value(q + 1), value(q + 2), value(q + 3), value(q)).normalize();
-    let axes_m = DMat3::from_quat(rotation) * DMat3::from_diagonal(vector(column::SCALE));
-    (chunk.origin_m() + vector(column::MEAN), axes_m)
+impl Gaussian {
+    /// A Gaussian of a chunk.
+    pub fn from_chunk(chunk: &Chunk, index: usize) -> Self {
+        let value = |column| f64::from(chunk.value(index, column));
+        let vector = |first| DVec3::new(value(first), value(first + 1), value(first + 2));
+        let q = column::QUAT;
+        let mut coefficients = [DVec3::ZERO; 16];
+        for (k, to) in coefficients[..sh::coefficients(chunk.sh_degree())].iter_mut().enumerate() {
+            *to = vector(column::SH + 3 * k);
+        }
+        Self {
+            mean_m: chunk.origin_m() + vector(column::MEAN),
+            rotation: DQuat::from_xyzw(value(q + 1), value(q + 2), value(q + 3), value(q)),
+            scale_m: vector(column::SCALE),
+            log2_opacity: value(column::LOG2_OPACITY),
+            sh: coefficients,
+        }
+    }
+
+    /// Its axes times their standard deviations, as columns, in metres.
+    pub(super) fn axes_m(&self) -> DMat3 {
+        DMat3::from_quat(self.rotation.normalize()) * DMat3::from_diagonal(self.scale_m)
+    }
+
+    /// Its place and shape on the image; `None` if it is out of the range of depths or angles.
+    pub(super) fn footprint(&self, profile: &RenderProfile, view: &View) -> Option<Footprint> {
+        if view.is_static_pinhole() {
+            project_pinhole(self.mean_m, self.axes_m(), profile, view)
+        } else {
+            project_unscented(self.mean_m, self.axes_m(), profile, view)
+        }
+    }
+
+    /// Projects it; `None` if it cannot be seen.
+    pub(super) fn project(&self, profile: &RenderProfile, view: &View) -> Option<Splat> {
+        let splat = self.project_any_opacity(profile, view)?;
+        let visible = splat.opacity >= profile.alpha_cut;
+        visible.then_some(splat)
+    }
+
+    /// Projects it, however faint it is; `None` if it is out of the range of depths or angles.
+    pub(super) fn project_any_opacity(
+        &self,
+        profile: &RenderProfile,
+        view: &View,
+    ) -> Option<Splat> {
+        let Footprint { depth_m, mean_px, xx, xy, yy, det_before, camera_m } =
+            self.footprint(profile, view)?;
+        let filter = PixelFilter::new(profile, &view.camera);
+        let Filtered { xx, yy, det, blur_share, shrink_share } =
+            filter.filtered(xx, yy, det_before);
+
+        let mut opacity = self.log2_opacity.exp2();
+        if profile.antialiased {
+            // Yu et al. 2024 (Mip-Splatting), with gsplat's floor.
+            opacity *= blur_share.max(MIN_BLUR_SHARE).sqrt();
+        }
+        opacity *= shrink_share.powf(PixelFilter::SHRINK_POWER);
+        Some(Splat {
+            gaussian: [0, 0],
+            instance: TWIN_INSTANCE,
+            depth_m,
+            mean_px,
+            conic: DVec3::new(yy, -xy, xx) / det,
+            opacity,
+            rgb: self.color(self.mean_m - camera_m),
+            // opacity exp(-k^2/2) = alpha_cut gives k^2 = 2 ln(opacity/cut); times each
+            // variance, its root.
+            reach_px: (2.0 * (opacity / profile.alpha_cut).ln() * DVec2::new(xx, yy))
+                .map(f64::sqrt),
+        })
+    }
+
+    /// `max(0, SH(direction) + 0.5)`; `toward` leads from the camera to its centre.
+    fn color(&self, toward: DVec3) -> DVec3 {
+        let basis = sh::basis(toward.normalize());
+        let mut rgb = DVec3::splat(0.5);
+        for (weight, coefficient) in basis.iter().zip(self.sh) {
+            rgb += weight * coefficient;
+        }
+        rgb.max(DVec3::ZERO)
+    }
 }
 
 /// Position and shape of a Gaussian on the image, before the blur.
-struct Footprint {
-    depth_m: f64,
-    mean_px: DVec2,
+pub(super) struct Footprint {
+    pub(super) depth_m: f64,
+    pub(super) mean_px: DVec2,
     /// Covariance, in px².
-    xx: f64,
-    xy: f64,
-    yy: f64,
-    det_before: f64,
+    pub(super) xx: f64,
+    pub(super) xy: f64,
+    pub(super) yy: f64,
+    pub(super) det_before: f64,
     /// The camera's position in the world.
-    camera_m: DVec3,
+    pub(super) camera_m: DVec3,
 }
 
 /// Projection by a static pinhole: linearised at the centre.
@@ -221,16 +278,4 @@ fn jacobian(mean: DVec3, camera: &Camera) -> [DVec3; 2] {
         DVec3::AXES.map(|axis| (p.project(at + h * axis) - p.project(at - h * axis)) / (2.0 * h));
     // Columns of derivatives become rows.
     [DVec3::new(dx.x, dy.x, dz.x), DVec3::new(dx.y, dy.y, dz.y)]
-}
-
-/// `max(0, SH(direction) + 0.5)` of a Gaussian; `toward` leads from the camera to its centre, in
-/// world axes.
-fn color(chunk: &Chunk, index: usize, toward: DVec3) -> DVec3 {
-    let basis = sh::basis(toward.normalize());
-    let mut rgb = DVec3::splat(0.5);
-    for (k, weight) in basis.iter().take(sh::coefficients(chunk.sh_degree())).enumerate() {
-        let value = |c| f64::from(chunk.value(index, column::SH + 3 * k + c));
-        rgb += weight * DVec3::new(value(0), value(1), value(2));
-    }
-    rgb.max(DVec3::ZERO)
 }

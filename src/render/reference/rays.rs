@@ -9,7 +9,7 @@
 use glam::{DMat3, DVec2, DVec3};
 
 use super::blend::Pixel;
-use super::project::{Splat, mean_and_axes};
+use super::project::{Gaussian, Splat};
 use crate::View;
 use crate::layout::{Filtered, PixelFilter};
 use wildcity_scene::{RenderProfile, Scene};
@@ -45,12 +45,12 @@ pub(super) fn gaussians(scene: &Scene, splats: &[Splat]) -> Vec<UnprojectedGauss
         };
         // View 0 is the world's, view k + 1 that of actor k.
         let view = placed.map_or(0, |placed| placed + 1);
-        let (mean_m, axes_m) = mean_and_axes(chunk, index);
+        let gaussian = Gaussian::from_chunk(chunk, index);
+        let axes_m = gaussian.axes_m();
         let lengths_m = [axes_m.x_axis, axes_m.y_axis, axes_m.z_axis].map(DVec3::length);
         let sigma_m = lengths_m.into_iter().fold(0.0, f64::max);
-        let log2_opacity = chunk.value(index, wildcity_scene::chunk::column::LOG2_OPACITY);
-        let opacity = f64::from(log2_opacity).exp2();
-        UnprojectedGaussian { view, mean_m, axes_m, sigma_m, opacity }
+        let opacity = gaussian.log2_opacity.exp2();
+        UnprojectedGaussian { view, mean_m: gaussian.mean_m, axes_m, sigma_m, opacity }
     };
     splats.iter().map(gaussian).collect()
 }
