@@ -225,6 +225,11 @@ impl<'a> UnscentedView<'a> {
         Some(Footprint { mean_px, root_px: [d0, d1, d2, e0, e1, e2], depth_m, camera_m })
     }
 
+    /// The view.
+    pub(super) fn view(&self) -> &'a View {
+        self.view
+    }
+
     /// The bound that culls, for tests of many Gaussians at once.
     pub fn cull_bound(&self) -> &CullBound {
         &self.cull_bound

@@ -1,16 +1,22 @@
 //! Gradients: `reference` against vectors that others computed and against its own differences, and
 //! the fast backends against `reference`.
 
+use std::ops::Range;
+
 use glam::{DMat3, DQuat, DVec3};
 use safetensors::SafeTensors;
-use wildcity_render::View;
-use wildcity_render::reference::Gaussian;
+use wildcity_render::gradient::{Differentiate, GaussianImages, Gradients};
 use wildcity_render::reference::gradient::{Images, Source, SourceGradient, Sources};
-use wildcity_scene::RenderProfile;
+use wildcity_render::reference::{Gaussian, Reference};
+use wildcity_render::{Frame, View};
+use wildcity_scene::chunk::{column, columns};
 use wildcity_scene::geometry::camera::{Fisheye, Lens, Pinhole};
 use wildcity_scene::geometry::{Camera, Pose};
+use wildcity_scene::{RenderProfile, Scene};
 
 use crate::data::real;
+use crate::images::cpu;
+use crate::streets::{street, turning_views};
 
 const SIZE_PX: [u32; 2] = [64, 48];
 
@@ -172,4 +178,109 @@ fn reference_has_the_gradients_of_others() {
     let antialiased = RenderProfile { antialiased: true, ..classic };
     check_case(&vectors, "antialiased", pinhole, &antialiased, true);
     check_case(&vectors, "fisheye_unscented", vectors.view(vectors.fisheye()), &classic, true);
+}
+
+/// Groups of the columns of a lane group.
+fn column_groups(sh_degree: u8) -> [(&'static str, Range<usize>); 5] {
+    [
+        ("mean", column::MEAN..column::SCALE),
+        ("ln scale", column::SCALE..column::QUAT),
+        ("quat", column::QUAT..column::LOG2_OPACITY),
+        ("opacity", column::LOG2_OPACITY..column::SH),
+        ("sh", column::SH..columns(sh_degree)),
+    ]
+}
+
+/// The derivatives by all Gaussians, group by group of columns, and those by all twists.
+fn all_values(gradients: &Gradients) -> Vec<(&'static str, Vec<f64>)> {
+    let degree = gradients.chunks.first().map_or(0, |chunk| chunk.sh_degree());
+    let mut groups: Vec<(&'static str, Vec<f64>)> = Vec::new();
+    for (name, range) in column_groups(degree) {
+        let mut values = Vec::new();
+        for chunk in &gradients.chunks {
+            for index in 0..chunk.len() {
+                values.extend(range.clone().map(|column| f64::from(chunk.value(index, column))));
+            }
+        }
+        groups.push((name, values));
+    }
+    let twists = gradients.twists.iter().flat_map(|twist| twist.to_array()).collect();
+    groups.push(("twist", twists));
+    groups
+}
+
+/// Derivatives of a smooth loss by random images: waves of several lengths.
+fn waves(images: &[GaussianImages]) -> Vec<GaussianImages> {
+    let wave = |len: usize, phase: f32| {
+        (0..len).map(|i| (0.37 * i as f32 + phase).sin() + 0.3 * (0.011 * i as f32).cos()).collect()
+    };
+    images
+        .iter()
+        .map(|images| GaussianImages {
+            rgb: wave(images.rgb.len(), 0.1),
+            opacity: wave(images.opacity.len(), 1.3),
+            depth_sum_m: wave(images.depth_sum_m.len(), 2.1),
+        })
+        .collect()
+}
+
+fn differentiate(
+    backend: &dyn Differentiate,
+    scene: &Scene,
+    profile: &RenderProfile,
+    views: &[View],
+) -> (Vec<GaussianImages>, Gradients) {
+    let mut gradients = Gradients::default();
+    let mut seen = Vec::new();
+    let frame = Frame { scene, profile, views };
+    backend
+        .differentiate(
+            &frame,
+            true,
+            &mut |images| {
+                seen = images.to_vec();
+                waves(images)
+            },
+            &mut gradients,
+        )
+        .expect("gradients");
+    (seen, gradients)
+}
+
+/// The gradients of a backend against those of `reference`: within 1e-4 of the largest entry of each
+/// group of parameters, and with a cosine above 0.99999.
+fn check_against_reference(
+    case: &str,
+    backend: &dyn Differentiate,
+    scene: &Scene,
+    profile: &RenderProfile,
+    views: &[View],
+) {
+    let (_, ours) = differentiate(backend, scene, profile, views);
+    let (_, theirs) = differentiate(&Reference, scene, profile, views);
+    for ((name, ours), (_, theirs)) in all_values(&ours).iter().zip(all_values(&theirs)) {
+        let error = error(ours, &theirs);
+        let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+        let cosine = dot(ours, &theirs) / (dot(ours, ours) * dot(&theirs, &theirs)).sqrt();
+        eprintln!("{case:20} {name:10} {error:.1e} {:.1e}", 1.0 - cosine);
+        assert!(error < 1e-4 && cosine > 0.99999, "{case}: {name} is off by {error:e}, {cosine}");
+    }
+}
+
+#[test]
+fn cpu_has_the_gradients_of_the_reference() {
+    let backend = cpu();
+    let scene = Scene::from_gaussians(&street(3_000, 3, 5));
+    let small = |view: &View| View { camera: view.camera.scaled(120, 80).unwrap(), ..*view };
+    let views: Vec<View> = turning_views().iter().map(small).collect();
+    let native = |view: &View| {
+        let camera = Camera { native_size_px: None, ..view.camera };
+        View { camera, ..*view }
+    };
+    let native: Vec<View> = views.iter().map(native).collect();
+    let classic = RenderProfile::default();
+    let antialiased = RenderProfile { antialiased: true, ..classic };
+    check_against_reference("classic", &backend, &scene, &classic, &native);
+    check_against_reference("antialiased", &backend, &scene, &antialiased, &native);
+    check_against_reference("shrunk", &backend, &scene, &antialiased, &views);
 }

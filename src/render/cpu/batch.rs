@@ -7,6 +7,8 @@
 
 use fearless_simd::{f32x16, prelude::*, u16x32};
 
+use super::bin::MacroTile;
+use super::project::Projected;
 use super::resolve::BLOCKS;
 use crate::constants::BLOCK_PX;
 use crate::layout::{Cutoffs, Splat};
@@ -40,7 +42,7 @@ pub(super) struct Batch {
     pub(super) splats: [Splat; BATCH],
     pub(super) matched: [Matched; BATCH],
     /// For each splat, a bit for each block that it touches.
-    blocks: [u16; BATCH],
+    pub(super) blocks: [u16; BATCH],
     /// For each block, a bit for each splat that touches it.
     pub(super) touching: [u64; BLOCKS],
     /// The place of each splat. Only written if instances are requested.
@@ -60,7 +62,26 @@ impl Default for Batch {
 }
 
 impl Batch {
-    /// Finds the splats among the first `len` that touch each block of the tile at `at_px`.
+    /// Reads the splats of a macro tile with these indices.
+    #[inline(always)]
+    pub(super) fn read(&mut self, macro_tile: &MacroTile, projected: &Projected, indices: &[u32]) {
+        // All splats first: their cache misses overlap, and cost little more than one.
+        let splats = self.splats.iter_mut().zip(indices);
+        match macro_tile.copies() {
+            Some(copies) => {
+                for (splat, &index) in splats {
+                    *splat = copies[index as usize];
+                }
+            }
+            None => {
+                for (splat, &index) in splats {
+                    *splat = *projected.splat(macro_tile.place(index));
+                }
+            }
+        }
+    }
+
+    /// Finds the blocks of the tile at `at_px` that each of the first `len` splats touches.
     ///
     /// A splat's ellipse lies within three slabs: `|dx| <= extent_x`, `|dy| <= extent_y` and
     /// `|u| <= √power`, which together are tight for needles at any angle. A block is touched if
@@ -115,9 +136,14 @@ impl Batch {
             self.blocks[k] = touches.to_bitmask() as u16;
         }
 
-        // Transpose the bits: bit k of `touching[block]` is bit `block` of `blocks[k]`. 32 splats
-        // are compared at a time.
         self.blocks[len.min(BATCH)..].fill(0);
+    }
+
+    /// Finds the splats that touch each block, from the blocks that each splat touches.
+    #[inline(always)]
+    pub(super) fn transpose<S: Simd>(&mut self, simd: S) {
+        // Bit k of `touching[block]` is bit `block` of `blocks[k]`. 32 splats are compared at a
+        // time.
         let (low, high) = self.blocks.split_at(BATCH / 2);
         let low = u16x32::from_slice(simd, low);
         let high = u16x32::from_slice(simd, high);

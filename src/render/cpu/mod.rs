@@ -11,6 +11,7 @@
 //! | `lens` | lenses, windshields and rolling shutters for SIMD |
 //! | `lanes`, `math` | SIMD vectors and elementary functions |
 //! | `export` | outputs of the stages for another backend |
+//! | `gradient`, `blend_gradient`, `project::gradient` | the stages backwards, for training |
 //!
 //! The images are deterministic: parallel work writes to places that do not depend on the schedule,
 //! and every pixel adds its splats in one order. Scratch buffers are kept from frame to frame.
@@ -22,8 +23,10 @@ mod background;
 mod batch;
 mod bin;
 mod blend;
+mod blend_gradient;
 mod drawing;
 mod export;
+mod gradient;
 mod lanes;
 mod lens;
 mod math;

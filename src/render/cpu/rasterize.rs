@@ -143,18 +143,18 @@ pub(super) fn rasterize(
 
 /// The values that are accumulated in addition to colours and transmittance.
 #[derive(Clone, Copy)]
-struct Wants {
-    depth: bool,
-    instances: bool,
+pub(super) struct Wants {
+    pub(super) depth: bool,
+    pub(super) instances: bool,
 }
 
 /// The accumulated values of one tile.
-struct TileOutput<'a> {
-    sums: &'a mut TileSums,
+pub(super) struct TileOutput<'a> {
+    pub(super) sums: &'a mut TileSums,
     /// A bit for each block in which some pixel has not stopped.
-    live: &'a mut u16,
-    halved_by: &'a mut HalvedBy,
-    wants: Wants,
+    pub(super) live: &'a mut u16,
+    pub(super) halved_by: &'a mut HalvedBy,
+    pub(super) wants: Wants,
 }
 
 /// Sorts and draws one macro tile of one view, and resolves its tiles into the target's bands after
@@ -237,7 +237,7 @@ fn draw_macro_tile<S: Simd>(
 
 /// Blends the splats of one tile, batch by batch, until all of its blocks are opaque.
 #[inline(always)]
-fn rasterize_tile<S: Simd>(
+pub(super) fn rasterize_tile<S: Simd>(
     simd: S,
     input: Input<'_>,
     macro_tile: &MacroTile,
@@ -253,21 +253,9 @@ fn rasterize_tile<S: Simd>(
         if live == 0 {
             break;
         }
-        // Read all splats first: their cache misses overlap, and cost little more than one.
-        let splats = batch.splats.iter_mut().zip(indices);
-        match macro_tile.copies() {
-            Some(copies) => {
-                for (splat, &index) in splats {
-                    *splat = copies[index as usize];
-                }
-            }
-            None => {
-                for (splat, &index) in splats {
-                    *splat = *input.projected.splat(macro_tile.place(index));
-                }
-            }
-        }
+        batch.read(macro_tile, input.projected, indices);
         batch.match_blocks(simd, input.cutoffs, indices.len(), at_px);
+        batch.transpose(simd);
         if output.wants.instances {
             for (place, &index) in batch.places.iter_mut().zip(indices) {
                 *place = macro_tile.place(index);

@@ -49,12 +49,13 @@ mod twist;
 use glam::DVec3;
 
 use wildcity_scene::chunk::{LANES, Lanes, column, columns};
+use wildcity_scene::geometry::camera::FieldMask;
 use wildcity_scene::{Chunk, Scene};
 
 pub(crate) use self::shape::FootprintGradient;
 pub use self::twist::{RigTwists, Twist};
 
-use crate::{Backend, Frame, FrameStats, RenderError};
+use crate::{Backend, Frame, FrameStats, RenderError, View};
 
 /// The images of a view that a loss is a function of, or its derivatives by each of their values:
 /// row by row from the top.
@@ -188,6 +189,11 @@ impl ChunkGradients {
         self.visible.resize(groups, 0);
     }
 
+    /// The degree of its spherical harmonics.
+    pub fn sh_degree(&self) -> u8 {
+        self.sh_degree
+    }
+
     /// Number of Gaussians.
     pub fn len(&self) -> usize {
         self.count
@@ -259,6 +265,25 @@ impl GaussianImages {
             ("depth_sum_m", &self.depth_sum_m, pixels),
         ]
     }
+}
+
+/// Checks a frame before it is rendered for its gradients.
+pub(crate) fn check_frame(frame: &Frame<'_>, backend: &'static str) -> Result<(), GradientError> {
+    frame.check_views()?;
+    frame.check_splats(backend)?;
+    if frame.scene.placed.iter().any(|placed| placed.shadow.is_some()) {
+        return Err(GradientError::Shadows);
+    }
+    Ok(())
+}
+
+/// Zeroes the pixels outside of the lens' field: of images, as every backend does, and so of the
+/// derivatives by them. A pinhole has none.
+pub(crate) fn mask(view: &View, images: &mut GaussianImages) {
+    let Some(field) = FieldMask::from_camera(&view.camera) else { return };
+    field.clear_outside(&view.camera, 3, &mut images.rgb);
+    field.clear_outside(&view.camera, 1, &mut images.opacity);
+    field.clear_outside(&view.camera, 1, &mut images.depth_sum_m);
 }
 
 /// Checks the derivatives that a loss gave.

@@ -7,7 +7,7 @@
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
 use super::Twist;
-use crate::constants::SLOPE_SLACK;
+use crate::constants::{MIN_BLUR_SHARE, SLOPE_SLACK};
 use crate::view::ProjectedPoint;
 use crate::{RollingShutter, View};
 use wildcity_scene::geometry::Camera;
@@ -19,8 +19,13 @@ pub(crate) struct FootprintGradient {
     /// By the covariance after the filter (xx, xy, yy), as a symmetric matrix: the change of the
     /// loss is `xx dxx + 2 xy dxy + yy dyy`.
     pub(crate) covariance: DVec3,
-    /// By the logarithm of the determinant before the filter.
-    pub(crate) ln_det_before: f64,
+    /// By the logarithm of the determinant before the blur as a share of that after it, where it
+    /// exceeds [`MIN_BLUR_SHARE`].
+    pub(crate) ln_blur_share: f64,
+    /// By the logarithm of the determinant after the blur of native pixels.
+    pub(crate) ln_det_native: f64,
+    /// That blur.
+    pub(crate) native_px2: DVec2,
     pub(crate) depth_m: f64,
     /// Whether depth is z for every lens, and not [`Camera::depth_m`].
     pub(crate) depth_is_z: bool,
@@ -66,24 +71,31 @@ impl FootprintGradient {
         }
     }
 
-    /// The derivatives by a column of a root of the covariance before the filter: `2 V column`
-    /// for the covariance, and `2 C⁻¹ column` for the logarithm of its determinant.
-    fn root_column(self, column_px: DVec2, [xx, xy, yy]: [f64; 3], det: f64) -> DVec2 {
-        let v = self.covariance;
-        let mut gradient = 2.0
-            * DVec2::new(
-                v.x * column_px.x + v.y * column_px.y,
-                v.y * column_px.x + v.z * column_px.y,
-            );
-        // Nothing where the determinant has no influence: it may be 0 there.
-        if self.ln_det_before != 0.0 {
-            let inverse = DVec2::new(
-                yy * column_px.x - xy * column_px.y,
-                xx * column_px.y - xy * column_px.x,
-            ) / det;
-            gradient += 2.0 * self.ln_det_before * inverse;
+    /// The derivatives by the columns of a root of the covariance before the filter, `2 V column`.
+    ///
+    /// Its determinant is the sum of the squares of the root's minors: `xx yy - xy²` would cancel
+    /// for needles. The logarithm of a determinant has the derivative `C⁻¹`.
+    fn by_root<const N: usize>(self, root: &[DVec2; N]) -> [DVec2; N] {
+        let [mut xx, mut xy, mut yy, mut det] = [0.0; 4];
+        for (i, column) in root.iter().enumerate() {
+            xx += column.x * column.x;
+            xy += column.x * column.y;
+            yy += column.y * column.y;
+            det += root[..i].iter().map(|other| column.perp_dot(*other).powi(2)).sum::<f64>();
         }
-        gradient
+        let native = self.native_px2;
+        let det_native = det + native.x * (yy + native.y) + native.y * xx;
+        let mut by_covariance = self.covariance;
+        let mut by_native = self.ln_det_native;
+        if det > MIN_BLUR_SHARE * det_native {
+            by_covariance += self.ln_blur_share / det * DVec3::new(yy, -xy, xx);
+            by_native -= self.ln_blur_share;
+        }
+        by_covariance += by_native / det_native * DVec3::new(yy + native.y, -xy, xx + native.x);
+        let DVec3 { x: v_xx, y: v_xy, z: v_yy } = by_covariance;
+        root.map(|column| {
+            2.0 * DVec2::new(v_xx * column.x + v_xy * column.y, v_xy * column.x + v_yy * column.y)
+        })
     }
 
     fn to_shape_by_pinhole(self, view: &View, mean_m: DVec3, axes_m: DMat3) -> ShapeGradient {
@@ -97,12 +109,7 @@ impl FootprintGradient {
             let axis = DVec3::from_array(axis);
             DVec2::new(rows[0].dot(axis), rows[1].dot(axis))
         });
-        let moments = moments(&root);
-        // The sum of the squared minors: `xx yy - xy²` would cancel for needles.
-        let det = root[0].perp_dot(root[1]).powi(2)
-            + root[0].perp_dot(root[2]).powi(2)
-            + root[1].perp_dot(root[2]).powi(2);
-        let by_root = root.map(|column| self.root_column(column, moments, det));
+        let by_root = self.by_root(&root);
 
         // By the axes, `Jᵀ v`, and by the rows of J.
         let mut by_axes = DMat3::ZERO;
@@ -147,11 +154,11 @@ impl FootprintGradient {
         };
         let points = [0, 1, 2].map(|k| [project(k, 1.0), project(k, -1.0)]);
         let mean_px = points.iter().flatten().map(|point| point.at_px).sum::<DVec2>() / 6.0;
-        let root: Vec<DVec2> =
-            points.iter().flatten().map(|point| (point.at_px - mean_px) / 6.0_f64.sqrt()).collect();
-        let moments = moments(&root);
-        let pairs = (0..6).flat_map(|i| (0..i).map(move |k| (i, k)));
-        let det = pairs.map(|(i, k)| root[i].perp_dot(root[k]).powi(2)).sum();
+        let mut root = [DVec2::ZERO; 6];
+        for (column, point) in root.iter_mut().zip(points.iter().flatten()) {
+            *column = (point.at_px - mean_px) / 6.0_f64.sqrt();
+        }
+        let by_root = self.by_root(&root);
 
         let mut shape = ShapeGradient::default();
         let mut add = |point: &ProjectedPoint, by_px: DVec2, by_point: DVec3, by_moment: f64| {
@@ -166,8 +173,7 @@ impl FootprintGradient {
         for (k, sides) in points.iter().enumerate() {
             for (side, point) in sides.iter().enumerate() {
                 // The columns add up to 0, so that the mean in each of them has no derivative.
-                let by_column = self.root_column(root[2 * k + side], moments, det);
-                let by_px = self.mean_px / 6.0 + by_column / 6.0_f64.sqrt();
+                let by_px = self.mean_px / 6.0 + by_root[2 * k + side] / 6.0_f64.sqrt();
                 let by_world = add(point, by_px, DVec3::ZERO, 0.0);
                 let side = if side == 0 { 1.0 } else { -1.0 };
                 *by_axes.col_mut(k) += side * 3.0_f64.sqrt() * by_world;
@@ -239,17 +245,6 @@ impl Linearisation {
         }
         Self { rows, is_clamped }
     }
-}
-
-/// The covariance (xx, xy, yy) of a root.
-fn moments(root: &[DVec2]) -> [f64; 3] {
-    let mut moments = [0.0; 3];
-    for column in root {
-        moments[0] += column.x * column.x;
-        moments[1] += column.x * column.y;
-        moments[2] += column.y * column.y;
-    }
-    moments
 }
 
 /// The rows of `∂pixel/∂point` of a camera at rest, in px/m, by central differences.

@@ -10,12 +10,12 @@ use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
 use super::Reference;
-use super::project::{Footprint, Gaussian, MIN_BLUR_SHARE, Splat, sort};
+use super::project::{Footprint, Gaussian, Splat, sort};
 use crate::gradient::{
     Differentiate, FootprintGradient, GaussianGradient, GaussianImages, GradientError, Gradients,
-    LossGradient, Twist, check_loss,
+    LossGradient, Twist, check_frame, check_loss, mask,
 };
-use crate::layout::{Filtered, PixelFilter};
+use crate::layout::PixelFilter;
 use crate::{Backend, Frame, FrameStats, View};
 use wildcity_scene::{Chunk, RenderProfile, Scene, sh};
 
@@ -242,27 +242,14 @@ impl<'a> Sources<'a> {
         let Source { gaussian, tint, .. } = source;
         let view = &self.views[source.view];
         let splat = gaussian.project_any_opacity(self.profile, view)?;
-        let Footprint { xx, xy, yy, det_before, camera_m, .. } =
-            gaussian.footprint(self.profile, view)?;
+        let Footprint { camera_m, .. } = gaussian.footprint(self.profile, view)?;
         let filter = PixelFilter::new(self.profile, &view.camera);
-        let Filtered { det, blur_share, shrink_share, .. } = filter.filtered(xx, yy, det_before);
 
-        // Q = C⁻¹, so that V_C = -Q V_Q Q.
+        // Q = C⁻¹, so that V_C = -Q V_Q Q; and d ln det C = Q dC, for the opacity's scales.
         let by_conic = by.conic * DVec3::new(1.0, 0.5, 1.0);
-        let mut covariance = -congruence(splat.conic, by_conic);
-
-        // The opacity's scales are powers of shares of determinants, and d ln det C = C⁻¹ dC.
         let by_ln_opacity = by.opacity * splat.opacity;
-        let mut by_ln_det_native = PixelFilter::SHRINK_POWER * by_ln_opacity;
-        covariance -= by_ln_det_native * splat.conic;
-        let mut ln_det_before = 0.0;
-        if self.profile.antialiased && blur_share > MIN_BLUR_SHARE {
-            ln_det_before = 0.5 * by_ln_opacity;
-            by_ln_det_native -= 0.5 * by_ln_opacity;
-        }
-        let native = filter.native_px2;
-        let native_inverse = DVec3::new(yy + native.y, -xy, xx + native.x) / (shrink_share * det);
-        covariance += by_ln_det_native * native_inverse;
+        let by_ln_shrink = PixelFilter::SHRINK_POWER * by_ln_opacity;
+        let covariance = -congruence(splat.conic, by_conic) - by_ln_shrink * splat.conic;
 
         let axes_m = gaussian.axes_m();
         let toward = gaussian.mean_m - camera_m;
@@ -270,7 +257,9 @@ impl<'a> Sources<'a> {
         let footprint = FootprintGradient {
             mean_px: by.mean_px,
             covariance,
-            ln_det_before,
+            ln_blur_share: if self.profile.antialiased { 0.5 * by_ln_opacity } else { 0.0 },
+            ln_det_native: by_ln_shrink,
+            native_px2: filter.native_px2,
             depth_m: by.depth_m,
             depth_is_z: self.depth_is_z,
             toward: by_toward,
@@ -379,11 +368,7 @@ impl Differentiate for Reference {
         loss: LossGradient<'_>,
         gradients: &mut Gradients,
     ) -> Result<FrameStats, GradientError> {
-        frame.check_views()?;
-        frame.check_splats(self.name())?;
-        if frame.scene.placed.iter().any(|placed| placed.shadow.is_some()) {
-            return Err(GradientError::Shadows);
-        }
+        check_frame(frame, self.name())?;
         let sources: Vec<Sources<'_>> = frame
             .views
             .iter()
@@ -393,10 +378,17 @@ impl Differentiate for Reference {
         let images: Vec<GaussianImages> = sources
             .iter()
             .zip(&decisions)
-            .map(|(sources, decisions)| sources.images(decisions).to_gaussian_images(depth))
+            .map(|(sources, decisions)| {
+                let mut images = sources.images(decisions).to_gaussian_images(depth);
+                mask(&sources.views[0], &mut images);
+                images
+            })
             .collect();
-        let derivatives = loss(&images);
+        let mut derivatives = loss(&images);
         check_loss(frame, depth, &derivatives)?;
+        for (derivatives, view) in derivatives.iter_mut().zip(frame.views) {
+            mask(view, derivatives);
+        }
 
         gradients.reset(frame.scene, frame.views.len());
         for (view, (sources, decisions)) in sources.iter().zip(&decisions).enumerate() {

@@ -6,6 +6,7 @@
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 
+use crate::constants::MIN_BLUR_SHARE;
 use crate::layout::{Filtered, PixelFilter};
 use crate::unscented::max_center_angle_rad;
 use crate::{FIRST_ACTOR_INSTANCE, TWIN_INSTANCE, View};
@@ -13,9 +14,6 @@ use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::chunk::column;
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::{Chunk, RenderProfile, Scene, sh};
-
-/// Least share of the determinant before the blur by which opacity is scaled, gsplat's 0.005².
-pub(super) const MIN_BLUR_SHARE: f64 = 0.005 * 0.005;
 
 /// A Gaussian on the image.
 #[derive(Clone, Copy, Debug)]

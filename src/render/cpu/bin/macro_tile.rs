@@ -40,6 +40,13 @@ pub(in crate::cpu) struct MacroTile {
     other: Vec<u64>,
 }
 
+/// The sorted lists of the tiles of a macro tile.
+#[derive(Debug, Default)]
+pub(in crate::cpu) struct MacroTileLists {
+    instances: Vec<u32>,
+    ends: [u32; MACRO_TILE_TILES],
+}
+
 impl MacroTile {
     /// Takes the splats of the macro tile `number` of a view, puts them in order of depth, and
     /// lists them by tile.
@@ -103,6 +110,33 @@ impl MacroTile {
         }
         // Every place has been written once, so that each counter stands at the end of its list.
         ends.copy_from_slice(&next[..MACRO_TILE_TILES]);
+    }
+
+    /// Takes its sorted lists, for [`MacroTile::load_with_lists`].
+    pub(in crate::cpu) fn take_lists(&mut self) -> MacroTileLists {
+        let end = self.ends.last().map_or(0, |&end| end as usize);
+        MacroTileLists { instances: self.instances[..end].to_vec(), ends: self.ends }
+    }
+
+    /// As [`MacroTile::load`], with the lists that were found then.
+    pub(super) fn load_with_lists(
+        &mut self,
+        number: usize,
+        segments: &[Segment],
+        lists: MacroTileLists,
+    ) {
+        self.pairs.clear();
+        self.copies.clear();
+        for segment in segments {
+            self.pairs.extend_from_slice(segment.macro_tile(number));
+        }
+        self.instances = lists.instances;
+        self.ends = lists.ends;
+    }
+
+    /// Number of its splats.
+    pub(in crate::cpu) fn len(&self) -> usize {
+        self.pairs.len()
     }
 
     /// Whether no splat touches it.

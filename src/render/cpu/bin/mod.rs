@@ -11,6 +11,7 @@
 //! in parallel. A macro tile takes its pairs from all segments in order, so that they are in order
 //! of global ids; and the order by (depth, index) is unique.
 
+mod gather;
 mod grid;
 mod macro_tile;
 mod rows;
@@ -30,7 +31,7 @@ use crate::layout::{Cutoffs, Splat};
 use crate::{RenderError, View};
 
 pub(super) use grid::Grid;
-pub(super) use macro_tile::{COPIES_BYTES, MacroTile};
+pub(super) use macro_tile::{COPIES_BYTES, MacroTile, MacroTileLists};
 use segment::{Pair, Segment};
 
 /// Most bytes of pairs and instances: each pair once in its segment, and while its macro tile is
@@ -148,6 +149,17 @@ impl Bins {
     #[inline(always)]
     pub(super) fn load(&self, view: usize, number: usize, tile: &mut MacroTile) {
         tile.load(number, self.view_segments(view));
+    }
+
+    /// As [`Bins::load`], with lists that were found then.
+    pub(super) fn load_with_lists(
+        &self,
+        view: usize,
+        number: usize,
+        lists: MacroTileLists,
+        tile: &mut MacroTile,
+    ) {
+        tile.load_with_lists(number, self.view_segments(view), lists);
     }
 
     /// The macro tiles of a view, those with the most instances first: the last ones are small, so

@@ -15,13 +15,15 @@ use wildcity_scene::Chunk;
 use wildcity_scene::chunk::Cluster;
 
 /// Clusters of a unit: 4,096 Gaussians take about 100 µs, long enough to outweigh scheduling them.
-const UNIT_CLUSTERS: usize = 16;
+pub(in crate::cpu) const UNIT_CLUSTERS: usize = 16;
 
 /// The work of one thread at a time, whose output is one [`Unit`](super::Unit).
 pub(in crate::cpu) struct Job<'a> {
     pub(super) view: usize,
     pub(super) chunk: &'a Chunk,
-    pub(super) clusters: Range<usize>,
+    /// Number of the chunk: those of the twin, then those of actors.
+    pub(in crate::cpu) number: usize,
+    pub(in crate::cpu) clusters: Range<usize>,
     pub(super) projection: ChunkProjection<'a>,
     pub(super) light: Light<'a>,
     /// As in [`Unit`](super::Unit).
@@ -52,6 +54,7 @@ impl Job<'_> {
 #[derive(Clone, Copy)]
 struct JobOwner<'a> {
     view: usize,
+    number: usize,
     light: Light<'a>,
     instance: u16,
 }
@@ -207,7 +210,7 @@ fn add_twin<'a>(
             [] => Light::AsStored,
             shadows => Light::Shadowed(shadows),
         };
-        let owner = JobOwner { view: index, light, instance: TWIN_INSTANCE };
+        let owner = JobOwner { view: index, number, light, instance: TWIN_INSTANCE };
         add_jobs(owner, projection, chunk, jobs);
     }
 }
@@ -221,7 +224,9 @@ fn add_actors<'a>(
     non_pinhole: &'a [Option<NonPinholeView<'a>>],
     jobs: &mut Vec<Job<'a>>,
 ) {
-    for ((placed, view), non_pinhole) in frame.scene.placed.iter().zip(relative).zip(non_pinhole) {
+    let first = frame.scene.chunks.len();
+    let placed = (first..).zip(&frame.scene.placed);
+    for (((number, placed), view), non_pinhole) in placed.zip(relative).zip(non_pinhole) {
         let projection = ChunkProjection::new(view, &placed.chunk, non_pinhole.as_ref(), frame);
         let light = match placed.tint {
             [1.0, 1.0, 1.0] => Light::AsStored,
@@ -229,14 +234,14 @@ fn add_actors<'a>(
         };
         // Actors are bounded by PlacedChunk::MAX_ACTORS, far below the end of u16.
         let instance = FIRST_ACTOR_INSTANCE + placed.actor;
-        let owner = JobOwner { view: index, light, instance };
+        let owner = JobOwner { view: index, number, light, instance };
         add_jobs(owner, projection, &placed.chunk, jobs);
     }
 }
 
 /// Adds the jobs of one view and one chunk.
 fn add_jobs<'a>(
-    JobOwner { view, light, instance }: JobOwner<'a>,
+    JobOwner { view, number, light, instance }: JobOwner<'a>,
     projection: ChunkProjection<'a>,
     chunk: &'a Chunk,
     jobs: &mut Vec<Job<'a>>,
@@ -249,6 +254,6 @@ fn add_jobs<'a>(
     };
     let count = chunk.clusters().len();
     let ranges = (0..count).step_by(UNIT_CLUSTERS).map(|k| k..(k + UNIT_CLUSTERS).min(count));
-    let job = |clusters| Job { view, chunk, clusters, projection, light, instance };
+    let job = |clusters| Job { view, chunk, number, clusters, projection, light, instance };
     jobs.extend(ranges.filter(visible).map(job));
 }

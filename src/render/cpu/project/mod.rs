@@ -26,12 +26,14 @@
 mod angles;
 mod axes;
 mod color;
+pub(super) mod gradient;
 mod jobs;
 mod light;
 mod pinhole;
 mod splat_block;
 mod unscented;
 
+use std::ops::Range;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
 use fearless_simd::{Level, dispatch, prelude::*};
@@ -45,7 +47,7 @@ use super::slabs::{Slab, SlabOfJob};
 use crate::layout::{Cutoffs, Splat};
 use wildcity_scene::chunk::{CLUSTER, LANES, Lanes};
 
-pub(super) use self::jobs::{Job, with_jobs};
+pub(super) use self::jobs::{Job, UNIT_CLUSTERS, with_jobs};
 
 /// Number of blocks by which memory is read ahead. The loads of the block itself would come too
 /// late: the processor does not reach the loads of the next block before the computations of the
@@ -158,9 +160,22 @@ impl Projected {
         self.pages.len() * PAGE
     }
 
+    /// The places of the splats of consecutive units.
+    pub(super) fn places_between(&self, units: Range<usize>) -> Range<usize> {
+        let units = &self.units[units];
+        let first = units.first().map_or(0, |unit| unit.first_page);
+        let end = units.last().map_or(0, |unit| unit.first_page + unit.len.div_ceil(PAGE));
+        first << PAGE_BITS..end << PAGE_BITS
+    }
+
     /// The units in order of (view, global id).
     pub(super) fn units(&self) -> &[Unit] {
         &self.units
+    }
+
+    /// The place of the first splat of a unit.
+    pub(super) fn first_place(&self, unit: &Unit) -> usize {
+        unit.first_page << PAGE_BITS
     }
 
     /// Places and splats of one unit, in order of global ids.

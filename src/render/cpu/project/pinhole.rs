@@ -50,8 +50,8 @@ pub(super) fn project_block<S: Simd>(
     // The shape: rows of V = (J W R) S.
     let axes = rotation_columns(simd, columns);
     let scale = Vec3x16::load(simd, columns, column::SCALE);
-    let v0 = jacobian_row(simd, view, 0, slope_x, inverse_z, axes).times(scale);
-    let v1 = jacobian_row(simd, view, 1, slope_y, inverse_z, axes).times(scale);
+    let v0 = along_axes(jacobian_row(simd, view, 0, slope_x, inverse_z), axes).times(scale);
+    let v1 = along_axes(jacobian_row(simd, view, 1, slope_y, inverse_z), axes).times(scale);
     let ellipse = Ellipse::from_root(simd, v0, v1, &view.filter);
 
     // Test against the image; compute colours only if some Gaussian passed.
@@ -74,14 +74,14 @@ pub(super) fn project_block<S: Simd>(
 /// costs 12 instructions for 16 Gaussians. Ties keep the order of global ids, and the backends
 /// agree above 70 dB, with no value off by more than 2/255.
 #[inline(always)]
-fn depth<S: Simd>(simd: S, view: &ChunkView, mean: Vec3x16<S>) -> f32x16<S> {
+pub(super) fn depth<S: Simd>(simd: S, view: &ChunkView, mean: Vec3x16<S>) -> f32x16<S> {
     let (low, high) = transform_row(simd, mean, view.forward);
     low.narrow(high)
 }
 
 /// The camera-space x (axis 0) or y (axis 1) of centres, in metres.
 #[inline(always)]
-fn camera_coordinate<S: Simd>(
+pub(super) fn camera_coordinate<S: Simd>(
     simd: S,
     view: &ChunkView,
     mean: Vec3x16<S>,
@@ -93,28 +93,32 @@ fn camera_coordinate<S: Simd>(
     splat(rx).mul_add(mean.x, splat(ry).mul_add(mean.y, z))
 }
 
-/// A row of `J W R`, in px/m: how a pixel coordinate moves as the centre moves along each of its
-/// own axes.
+/// A row of `J W`, in px/m: how a pixel coordinate moves as the centre moves along each axis of the
+/// world.
 ///
 /// For the pixel coordinate `f x/z + c` the row of `J` is `(f/z)(1, 0, -x/z)`. Times `W` this is
-/// `(f/z)(W_x - (x/z) W_z)` with the rows of `W`; and times `R` its dot products with the own axes.
+/// `(f/z)(W_x - (x/z) W_z)` with the rows of `W`.
 /// Outside of the image the slope x/z is clamped, since the linearisation is wrong there and would
 /// give splats of unbounded size (see [`SLOPE_SLACK`](crate::constants::SLOPE_SLACK)).
 #[inline(always)]
-fn jacobian_row<S: Simd>(
+pub(super) fn jacobian_row<S: Simd>(
     simd: S,
     view: &ChunkView,
     axis: usize,
     slope: f32x16<S>,
     inverse_z: f32x16<S>,
-    axes: [Vec3x16<S>; 3],
 ) -> Vec3x16<S> {
     let splat = |value: f32| f32x16::splat(simd, value);
     // Only the shape is linearised at the clamped slope; the centre stays where it is.
     let clamped = slope.max(splat(view.slope_min[axis])).min(splat(view.slope_max[axis]));
     let forward = Vec3x16::splat(simd, view.rotation[2]);
-    let jw = forward
+    forward
         .mul_add(-clamped, Vec3x16::splat(simd, view.rotation[axis]))
-        .scale(inverse_z * splat(view.focal_px[axis]));
-    Vec3x16 { x: jw.dot(axes[0]), y: jw.dot(axes[1]), z: jw.dot(axes[2]) }
+        .scale(inverse_z * splat(view.focal_px[axis]))
+}
+
+/// The components of vectors along the own axes: `row R`.
+#[inline(always)]
+pub(super) fn along_axes<S: Simd>(row: Vec3x16<S>, axes: [Vec3x16<S>; 3]) -> Vec3x16<S> {
+    Vec3x16 { x: row.dot(axes[0]), y: row.dot(axes[1]), z: row.dot(axes[2]) }
 }

@@ -74,6 +74,29 @@ impl<'a> UnscentedChunkView<'a> {
         }
     }
 
+    /// The view.
+    pub(super) fn view(&self) -> &View {
+        self.unscented.view()
+    }
+
+    /// The chunk's origin in the world, in metres.
+    pub(super) fn origin_m(&self) -> DVec3 {
+        self.origin_m
+    }
+
+    /// The variances that are added to screen covariances.
+    pub(super) fn filter(&self) -> &PixelFilter {
+        &self.filter
+    }
+
+    /// The vector from the camera, when it sees it, to a point of the chunk, in world axes, in
+    /// metres.
+    pub(super) fn toward_m(&self, point_m: DVec3) -> DVec3 {
+        let world_m = self.origin_m + point_m;
+        let seen = self.view().project_extrapolated(world_m, 1.0);
+        world_m - seen.world_from_camera.position_m
+    }
+
     /// Whether a Gaussian with its centre in a box, relative to `origin_m`, can touch the image.
     #[inline(always)]
     pub(super) fn may_see(&self, origin_m: DVec3, min_m: Vec3, max_m: Vec3, sigma_m: f32) -> bool {

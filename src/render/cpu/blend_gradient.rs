@@ -1,0 +1,173 @@
+//! The derivatives of blending: each tile walks its splats from front to back once more, as they
+//! were drawn ([`crate::gradient`] has the formulas).
+//!
+//! Every product that decides (exponent, cut, cap, stop) is computed as in [`super::blend`], so that
+//! the walk takes the same decisions. **One splat after the other, and not one block after the
+//! other as when it is drawn:** its ten sums stay in registers for all of its blocks, and are added
+//! up over the lanes once per tile, while a block's pixels have only two values that change.
+
+use fearless_simd::{f32x16, prelude::*};
+
+use super::batch::Matched;
+use super::math::exp2;
+use super::resolve::{BLOCKS, TileSums};
+use crate::layout::Cutoffs;
+use wildcity_scene::chunk::LANES;
+
+/// Sums over the pixels of a splat within a macro tile, by the places in [`partial`].
+pub(super) type Partial = [f32; partial::COUNT];
+
+/// Places of the sums. `g` is the derivative by the logarithm of alpha, u and v are those of a
+/// splat's exponent.
+pub(super) mod partial {
+    /// Sum of g.
+    pub(in crate::cpu) const G: usize = 0;
+    /// Sum of g u.
+    pub(in crate::cpu) const U: usize = 1;
+    /// Sum of g v.
+    pub(in crate::cpu) const V: usize = 2;
+    /// Sum of g u².
+    pub(in crate::cpu) const UU: usize = 3;
+    /// Sum of g u v.
+    pub(in crate::cpu) const UV: usize = 4;
+    /// Sum of g v².
+    pub(in crate::cpu) const VV: usize = 5;
+    /// Derivatives by red, green and blue.
+    pub(in crate::cpu) const RGB: usize = 6;
+    /// Derivative by the depth.
+    pub(in crate::cpu) const DEPTH: usize = 9;
+    pub(in crate::cpu) const COUNT: usize = 10;
+}
+
+/// The derivatives of a loss by the images, for the 256 pixels of a tile; 0 beyond the image.
+#[derive(Clone, Debug)]
+#[repr(C, align(64))]
+pub(super) struct TileDerivatives {
+    pub(super) rgb: [[[f32; LANES]; BLOCKS]; 3],
+    pub(super) opacity: [[f32; LANES]; BLOCKS],
+    pub(super) depth_m: [[f32; LANES]; BLOCKS],
+}
+
+impl Default for TileDerivatives {
+    fn default() -> Self {
+        let zero = [[0.0; LANES]; BLOCKS];
+        Self { rgb: [zero; 3], opacity: zero, depth_m: zero }
+    }
+}
+
+/// What changes while a tile's splats are walked.
+#[derive(Clone, Debug)]
+#[repr(C, align(64))]
+pub(super) struct TileWalk {
+    /// Transmittance in front of the next splat. It continues to fall after a pixel has stopped, as
+    /// in [`super::blend`].
+    running: [[f32; LANES]; BLOCKS],
+    /// Change of the loss with what lies behind: `Σ w (rgb · v_rgb + depth v_depth)` of all splats
+    /// from the next one on, minus `T_end v_opacity`.
+    behind: [[f32; LANES]; BLOCKS],
+    /// A bit for each block in which some pixel has not stopped.
+    pub(super) live: u16,
+}
+
+impl TileWalk {
+    /// In front of the first splat. `sums` are those of the finished tile, without a background.
+    #[inline(always)]
+    pub(super) fn new<S: Simd, const DEPTH: bool>(
+        simd: S,
+        sums: &TileSums,
+        by: &TileDerivatives,
+    ) -> Self {
+        let load = |values: &[f32; LANES]| f32x16::load_array_ref(simd, values);
+        let mut behind = [[0.0; LANES]; BLOCKS];
+        for (block, behind) in behind.iter_mut().enumerate() {
+            let end = load(&sums.transmittance[block]) * load(&by.opacity[block]);
+            let mut sum = load(&sums.rgb[0][block]).mul_add(load(&by.rgb[0][block]), -end);
+            sum = load(&sums.rgb[1][block]).mul_add(load(&by.rgb[1][block]), sum);
+            sum = load(&sums.rgb[2][block]).mul_add(load(&by.rgb[2][block]), sum);
+            if DEPTH {
+                sum = load(&sums.depth_m[block]).mul_add(load(&by.depth_m[block]), sum);
+            }
+            sum.store_array(behind);
+        }
+        Self { running: [[1.0; LANES]; BLOCKS], behind, live: u16::MAX }
+    }
+
+    /// Walks past one splat in the blocks that it touches, and returns its sums over them.
+    #[inline(always)]
+    pub(super) fn pass<S: Simd, const DEPTH: bool>(
+        &mut self,
+        simd: S,
+        matched: &Matched,
+        touching: u16,
+        cutoffs: &Cutoffs,
+        by: &TileDerivatives,
+    ) -> Partial {
+        let splat = |value: f32| f32x16::splat(simd, value);
+        let load = |values: &[f32; LANES]| f32x16::load_array_ref(simd, values);
+        let zero = splat(0.0);
+        let one = splat(1.0);
+        let cap = splat(cutoffs.alpha_cap);
+        let cut = splat(cutoffs.log2_alpha_cut);
+        let stop = splat(cutoffs.stop);
+        let floor = splat(1e-20);
+        let lane_u = load(&matched.lane_u);
+        let lane_v = load(&matched.lane_v);
+        let log2_opacity = splat(matched.log2_opacity);
+        let [red, green, blue] =
+            [splat(matched.rgb[0]), splat(matched.rgb[1]), splat(matched.rgb[2])];
+        let depth_m = splat(matched.depth_m);
+
+        let mut sums = [zero; partial::COUNT];
+        let mut blocks = touching & self.live;
+        while blocks != 0 {
+            let block = blocks.trailing_zeros() as usize % BLOCKS;
+            blocks &= blocks - 1;
+
+            let u = lane_u + splat(matched.u[block]);
+            let v = lane_v + splat(matched.v[block]);
+            let exponent = (-v).mul_add(v, (-u).mul_add(u, log2_opacity));
+            let raw = exp2(simd, exponent);
+            let alpha = exponent.simd_ge(cut).select(raw.min(cap), zero);
+            let running = load(&self.running[block]);
+            let after = (-alpha).mul_add(running, running);
+            let counts = after.simd_gt(stop);
+            let weight = counts.select(alpha * running, zero);
+            after.max(floor).store_array(&mut self.running[block]);
+
+            let [by_red, by_green, by_blue] =
+                [load(&by.rgb[0][block]), load(&by.rgb[1][block]), load(&by.rgb[2][block])];
+            let mut energy = red.mul_add(by_red, green.mul_add(by_green, blue * by_blue));
+            if DEPTH {
+                let by_depth = load(&by.depth_m[block]);
+                energy = depth_m.mul_add(by_depth, energy);
+                sums[partial::DEPTH] = weight.mul_add(by_depth, sums[partial::DEPTH]);
+            }
+            let behind = (-weight).mul_add(energy, load(&self.behind[block]));
+            behind.store_array(&mut self.behind[block]);
+
+            // 1 - alpha is at least 1 - cap.
+            let by_alpha = running.mul_add(energy, -(behind / (one - alpha)));
+            // Nothing at the cap: alpha does not change there.
+            let g = (counts & raw.simd_le(cap)).select(by_alpha * alpha, zero);
+            let gu = g * u;
+            let gv = g * v;
+            sums[partial::G] += g;
+            sums[partial::U] += gu;
+            sums[partial::V] += gv;
+            sums[partial::UU] = gu.mul_add(u, sums[partial::UU]);
+            sums[partial::UV] = gu.mul_add(v, sums[partial::UV]);
+            sums[partial::VV] = gv.mul_add(v, sums[partial::VV]);
+            sums[partial::RGB] = weight.mul_add(by_red, sums[partial::RGB]);
+            sums[partial::RGB + 1] = weight.mul_add(by_green, sums[partial::RGB + 1]);
+            sums[partial::RGB + 2] = weight.mul_add(by_blue, sums[partial::RGB + 2]);
+            if counts.all_false() {
+                self.live &= !(1 << block);
+            }
+        }
+        let mut partial = [0.0; partial::COUNT];
+        for (to, sum) in partial.iter_mut().zip(sums) {
+            *to = sum.reduce_sum();
+        }
+        partial
+    }
+}

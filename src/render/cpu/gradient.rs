@@ -1,0 +1,351 @@
+//! Gradients of the cpu backend: the stages once more, backwards.
+//!
+//! | step | what it does |
+//! |---|---|
+//! | project, bin | as for an image |
+//! | rasterize | as for an image, and keeps the sums of every tile (24 B a pixel) and the sorted lists of its splats (4 B a tile of a splat) |
+//! | loss | the caller's, on the images |
+//! | blend backwards | macro tile by macro tile: sums for each of its splats ([`super::blend_gradient`]) |
+//! | gather | the sums of a splat's macro tiles ([`super::bin::Bins::gather`]) |
+//! | project backwards | from splats to Gaussians ([`super::project::gradient`]) |
+//!
+//! Between the steps there are 40 B for each pair of a splat and a macro tile (1.3 per splat on a
+//! street), and while they are gathered 40 B for each splat of a segment.
+//!
+//! **The bytes do not depend on threads.** A macro tile is walked by one thread, tile after tile; its
+//! sums have places of their own; a segment of splats adds its macro tiles in order; and a Gaussian
+//! adds its views in order. No sum is added to atomically.
+
+use std::iter::zip;
+
+use fearless_simd::{Simd, dispatch};
+use parking_lot::Mutex;
+use rayon::prelude::*;
+
+use super::batch::{BATCH, Batch};
+use super::bin::{Grid, MacroTile, MacroTileLists};
+use super::blend_gradient::{Partial, TileDerivatives, TileWalk, partial};
+use super::drawing::Stages;
+use super::overflow::PartError;
+use super::project::gradient::{UnitGradients, back_project};
+use super::project::{self, Job, UNIT_CLUSTERS};
+use super::rasterize::{Input, TileOutput, Wants, rasterize_tile};
+use super::resolve::{BLOCKS, NOT_HALVED, TileSums, block_corner};
+use super::{BusyLane, Cpu, Scratch, StageTimer};
+use crate::constants::{BLOCK_PX, TILE_PX};
+use crate::gradient::{
+    ChunkGradients, Differentiate, GaussianImages, GradientError, Gradients, LossGradient, Twist,
+    check_frame, check_loss, mask,
+};
+use crate::layout::Cutoffs;
+use crate::stage::Stage;
+use crate::{Backend, Frame, FrameStats, View};
+use wildcity_scene::chunk::{CLUSTER, LANES, columns};
+
+/// What the forward pass keeps of each macro tile, by its number.
+struct KeptView(Vec<Mutex<KeptMacroTile>>);
+
+#[derive(Default)]
+struct KeptMacroTile {
+    /// In the order of [`Grid::macro_tile_tiles`].
+    tiles: Vec<TileSums>,
+    lists: MacroTileLists,
+}
+
+/// Scratch memory of one thread.
+#[derive(Default)]
+struct Walker {
+    macro_tile: MacroTile,
+    batch: Batch,
+    by: TileDerivatives,
+}
+
+/// A frame between its images and its gradients.
+struct Kept<'a> {
+    input: Input<'a>,
+    depth: bool,
+    views: Vec<KeptView>,
+    walkers: Mutex<Vec<Box<Walker>>>,
+}
+
+impl Differentiate for Cpu {
+    fn differentiate(
+        &self,
+        frame: &Frame<'_>,
+        depth: bool,
+        loss: LossGradient<'_>,
+        gradients: &mut Gradients,
+    ) -> Result<FrameStats, GradientError> {
+        check_frame(frame, self.name())?;
+        let BusyLane { pool, mut scratch, most_bytes } = self.lane();
+        let scratch = &mut *scratch;
+        let cutoffs = Cutoffs::new(frame.profile);
+        let level = self.level;
+        pool.install(|| {
+            let mut stats = FrameStats::default();
+            let stages = Stages { level, frame, cutoffs: &cutoffs, most_bytes };
+            project::with_jobs(frame, |jobs| {
+                match stages.run(scratch, jobs, None, Stage::Bin, &mut stats) {
+                    Err(PartError::Overflow) => {
+                        return Err(GradientError::Memory { limit_bytes: most_bytes });
+                    }
+                    Err(PartError::Render(error)) => return Err(error.into()),
+                    Ok(()) => {}
+                }
+                let Scratch { projected, bins, .. } = &*scratch;
+                let views = frame.views;
+                let cutoffs = &cutoffs;
+                let input = Input { projected, bins, views, backgrounds: &[], cutoffs };
+                let mut timer = StageTimer::start();
+                let kept = dispatch!(level, simd => Kept::rasterize(simd, input, depth));
+                let mut images: Vec<GaussianImages> =
+                    zip(&kept.views, views).map(|(kept, view)| kept.images(view, depth)).collect();
+                for (images, view) in images.iter_mut().zip(views) {
+                    mask(view, images);
+                }
+                timer.finish("rasterize", &mut stats);
+                let mut by_images = loss(&images);
+                timer.finish("loss", &mut stats);
+                check_loss(frame, depth, &by_images)?;
+                for (by_images, view) in by_images.iter_mut().zip(views) {
+                    mask(view, by_images);
+                }
+
+                gradients.reset(frame.scene, views.len());
+                for (view, by_images) in by_images.iter().enumerate() {
+                    let by_macro_tile =
+                        dispatch!(level, simd => kept.blend_backwards(simd, view, by_images));
+                    timer.finish("blend backwards", &mut stats);
+                    let units = units(&mut gradients.chunks);
+                    let twists = bins.gather(view, projected, &by_macro_tile, |jobs_of, sums| {
+                        let mut twist = Twist::default();
+                        for (unit, job) in zip(&projected.units()[jobs_of.clone()], &jobs[jobs_of])
+                        {
+                            let by_splats = sums.splats(projected.first_place(unit), unit.len);
+                            let mut unit = unit_of_job(&units, job).lock();
+                            let UnitGradients { lanes, visible } = &mut *unit;
+                            let to = UnitGradients { lanes, visible };
+                            twist += back_project(level, job, cutoffs, by_splats, to);
+                        }
+                        twist
+                    });
+                    // In the order of the segments.
+                    for twist in twists {
+                        gradients.twists[view] += twist;
+                    }
+                    timer.finish("project backwards", &mut stats);
+                }
+                Ok(())
+            })?;
+            Ok(stats)
+        })
+    }
+}
+
+/// The derivatives by the Gaussians of each unit of each chunk.
+fn units(chunks: &mut [ChunkGradients]) -> Vec<Vec<Mutex<UnitGradients<'_>>>> {
+    chunks.iter_mut().map(units_of_chunk).collect()
+}
+
+fn units_of_chunk(chunk: &mut ChunkGradients) -> Vec<Mutex<UnitGradients<'_>>> {
+    let groups = UNIT_CLUSTERS * CLUSTER / LANES;
+    let width = columns(chunk.sh_degree());
+    let lanes = chunk.lanes.chunks_mut(groups * width);
+    let unit = |(lanes, visible)| Mutex::new(UnitGradients { lanes, visible });
+    lanes.zip(chunk.visible.chunks_mut(groups)).map(unit).collect()
+}
+
+/// Each job of a view has a unit of its own, so that this lock never waits.
+fn unit_of_job<'a, 'b>(
+    units: &'a [Vec<Mutex<UnitGradients<'b>>>],
+    job: &Job<'_>,
+) -> &'a Mutex<UnitGradients<'b>> {
+    &units[job.number][job.clusters.start / UNIT_CLUSTERS]
+}
+
+impl<'a> Kept<'a> {
+    /// Draws all views, and keeps what the way back needs.
+    #[inline(always)]
+    fn rasterize<S: Simd>(simd: S, input: Input<'a>, depth: bool) -> Self {
+        let view = |view: &View| {
+            let macro_tiles = Grid::new(view).macro_tiles();
+            KeptView((0..macro_tiles).map(|_| Mutex::default()).collect())
+        };
+        let views = input.views.iter().map(view).collect();
+        let kept = Self { input, depth, views, walkers: Mutex::default() };
+        for view in 0..input.views.len() {
+            kept.input.bins.by_work(view).into_par_iter().with_max_len(1).for_each(|number| {
+                let mut walker = kept.walkers.lock().pop().unwrap_or_default();
+                simd.vectorize(
+                    #[inline(always)]
+                    || kept.rasterize_macro_tile(simd, view, number, &mut walker),
+                );
+                kept.walkers.lock().push(walker);
+            });
+        }
+        kept
+    }
+
+    #[inline(always)]
+    fn rasterize_macro_tile<S: Simd>(
+        &self,
+        simd: S,
+        view: usize,
+        number: usize,
+        walker: &mut Walker,
+    ) {
+        let Walker { macro_tile, batch, .. } = walker;
+        let Input { bins, projected, views, .. } = self.input;
+        bins.load(view, number, macro_tile);
+        macro_tile.copy_splats(projected);
+        let mut kept = self.views[view].0[number].lock();
+        let wants = Wants { depth: self.depth, instances: false };
+        for (within, [column, row]) in Grid::new(&views[view]).macro_tile_tiles(number) {
+            let mut sums = TileSums::default();
+            let mut live = u16::MAX;
+            let mut halved_by = NOT_HALVED;
+            let mut output =
+                TileOutput { sums: &mut sums, live: &mut live, halved_by: &mut halved_by, wants };
+            let at_px = [column * TILE_PX, row * TILE_PX];
+            rasterize_tile(simd, self.input, macro_tile, within, at_px, batch, &mut output);
+            kept.tiles.push(sums);
+        }
+        kept.lists = macro_tile.take_lists();
+    }
+
+    /// The sums of every pair of every macro tile of a view.
+    #[inline(always)]
+    fn blend_backwards<S: Simd>(
+        &self,
+        simd: S,
+        view: usize,
+        by_images: &GaussianImages,
+    ) -> Vec<Vec<Partial>> {
+        let macro_tiles = &self.views[view].0;
+        let sums: Vec<Mutex<Vec<Partial>>> = macro_tiles.iter().map(|_| Mutex::default()).collect();
+        self.input.bins.by_work(view).into_par_iter().with_max_len(1).for_each(|number| {
+            let mut walker = self.walkers.lock().pop().unwrap_or_default();
+            let partials = simd.vectorize(
+                #[inline(always)]
+                || self.walk_macro_tile(simd, view, number, by_images, &mut walker),
+            );
+            *sums[number].lock() = partials;
+            self.walkers.lock().push(walker);
+        });
+        sums.into_iter().map(Mutex::into_inner).collect()
+    }
+
+    #[inline(always)]
+    fn walk_macro_tile<S: Simd>(
+        &self,
+        simd: S,
+        view: usize,
+        number: usize,
+        by_images: &GaussianImages,
+        walker: &mut Walker,
+    ) -> Vec<Partial> {
+        let Walker { macro_tile, batch, by } = walker;
+        let Input { bins, projected, views, cutoffs, .. } = self.input;
+        let kept = std::mem::take(&mut *self.views[view].0[number].lock());
+        bins.load_with_lists(view, number, kept.lists, macro_tile);
+        macro_tile.copy_splats(projected);
+        let mut partials = vec![[0.0; partial::COUNT]; macro_tile.len()];
+        let grid = Grid::new(&views[view]);
+        let has_depth = !by_images.depth_sum_m.is_empty();
+        for ((within, [column, row]), sums) in grid.macro_tile_tiles(number).zip(&kept.tiles) {
+            let at_px = [column * TILE_PX, row * TILE_PX];
+            by.read(by_images, &views[view], at_px);
+            let mut walk = if has_depth {
+                TileWalk::new::<S, true>(simd, sums, by)
+            } else {
+                TileWalk::new::<S, false>(simd, sums, by)
+            };
+            for indices in macro_tile.tile(within).chunks(BATCH) {
+                if walk.live == 0 {
+                    break;
+                }
+                batch.read(macro_tile, projected, indices);
+                batch.match_blocks(simd, cutoffs, indices.len(), at_px);
+                for (k, &index) in indices.iter().enumerate() {
+                    let touching = batch.blocks[k % BATCH] & walk.live;
+                    if touching == 0 {
+                        continue;
+                    }
+                    let matched = &batch.matched[k % BATCH];
+                    let sums = if has_depth {
+                        walk.pass::<S, true>(simd, matched, touching, cutoffs, by)
+                    } else {
+                        walk.pass::<S, false>(simd, matched, touching, cutoffs, by)
+                    };
+                    for (to, value) in partials[index as usize].iter_mut().zip(sums) {
+                        *to += value;
+                    }
+                }
+            }
+        }
+        partials
+    }
+}
+
+impl KeptView {
+    /// The images of a view.
+    fn images(&self, view: &View, depth: bool) -> GaussianImages {
+        let pixels = view.camera.pixels();
+        let mut images = GaussianImages {
+            rgb: vec![0.0; 3 * pixels],
+            opacity: vec![0.0; pixels],
+            depth_sum_m: vec![0.0; if depth { pixels } else { 0 }],
+        };
+        let grid = Grid::new(view);
+        for (number, kept) in self.0.iter().enumerate() {
+            let kept = kept.lock();
+            for ((_, [column, row]), sums) in grid.macro_tile_tiles(number).zip(&kept.tiles) {
+                let at_px = [column * TILE_PX, row * TILE_PX];
+                for_each_pixel(view, at_px, |pixel, block, lane| {
+                    for channel in 0..3 {
+                        images.rgb[3 * pixel + channel] = sums.rgb[channel][block][lane];
+                    }
+                    images.opacity[pixel] = 1.0 - sums.transmittance[block][lane];
+                    if depth {
+                        images.depth_sum_m[pixel] = sums.depth_m[block][lane];
+                    }
+                });
+            }
+        }
+        images
+    }
+}
+
+impl TileDerivatives {
+    /// Reads the tile at `at_px`; 0 beyond the image.
+    fn read(&mut self, images: &GaussianImages, view: &View, at_px: [u32; 2]) {
+        let [right, bottom] = at_px.map(|px| px + TILE_PX);
+        if right > view.camera.width_px || bottom > view.camera.height_px {
+            *self = Self::default();
+        }
+        for_each_pixel(view, at_px, |pixel, block, lane| {
+            for channel in 0..3 {
+                self.rgb[channel][block][lane] = images.rgb[3 * pixel + channel];
+            }
+            self.opacity[block][lane] = images.opacity[pixel];
+            if let Some(&depth) = images.depth_sum_m.get(pixel) {
+                self.depth_m[block][lane] = depth;
+            }
+        });
+    }
+}
+
+/// Calls `work` with (pixel of the image, block, lane) of each pixel of the tile at `at_px`.
+fn for_each_pixel(view: &View, at_px: [u32; 2], mut work: impl FnMut(usize, usize, usize)) {
+    let [width, height] = [view.camera.width_px, view.camera.height_px];
+    for block in 0..BLOCKS {
+        let [left, top] = block_corner(block);
+        let [left, top] = [at_px[0] + left, at_px[1] + top];
+        for y in top..height.min(top + BLOCK_PX) {
+            for x in left..width.min(left + BLOCK_PX) {
+                let lane = (y - top) * BLOCK_PX + x - left;
+                work((y * width + x) as usize, block, lane as usize);
+            }
+        }
+    }
+}
