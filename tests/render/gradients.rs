@@ -1,21 +1,28 @@
 //! Gradients: `reference` against vectors that others computed and against its own differences, and
 //! the fast backends against `reference`.
 
+use std::iter::zip;
 use std::ops::Range;
+use std::sync::Arc;
 
 use glam::{DMat3, DQuat, DVec3};
 use safetensors::SafeTensors;
-use wildcity_render::gradient::{Differentiate, GaussianImages, Gradients};
-use wildcity_render::reference::gradient::{Images, Source, SourceGradient, Sources};
+use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_render::gradient::{Differentiate, GaussianImages, Gradients, Twist};
+use wildcity_render::reference::gradient::{Decisions, Images, Source, SourceGradient, Sources};
 use wildcity_render::reference::{Gaussian, Reference};
-use wildcity_render::{Frame, View};
+use wildcity_render::{Frame, RollingShutter, View};
+use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::chunk::{column, columns};
-use wildcity_scene::geometry::camera::{Fisheye, Lens, Pinhole};
+use wildcity_scene::geometry::camera::{Fisheye, Lens, Pinhole, ShutterDirection};
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::{RenderProfile, Scene};
 
 use crate::data::real;
 use crate::images::cpu;
+use crate::lenses::{lenses, rolling_view, street_scene};
+use crate::placed::{actor, chunk, on_street, views as placed_views};
+use crate::scene_files::Random;
 use crate::streets::{street, turning_views};
 
 const SIZE_PX: [u32; 2] = [64, 48];
@@ -283,4 +290,226 @@ fn cpu_has_the_gradients_of_the_reference() {
     check_against_reference("classic", &backend, &scene, &classic, &native);
     check_against_reference("antialiased", &backend, &scene, &antialiased, &native);
     check_against_reference("shrunk", &backend, &scene, &antialiased, &views);
+}
+
+#[test]
+fn cpu_has_the_gradients_of_every_lens_and_shutter() {
+    let backend = cpu();
+    let scene = Scene::from_gaussians(&street(1_500, 1, 6));
+    let (_, pose) = street_scene();
+    let directions = [
+        ShutterDirection::TopToBottom,
+        ShutterDirection::RightToLeft,
+        ShutterDirection::BottomToTop,
+        ShutterDirection::LeftToRight,
+    ];
+    let profile = RenderProfile { antialiased: true, ..RenderProfile::default() };
+    for ((name, camera), direction) in lenses().into_iter().zip(directions.into_iter().cycle()) {
+        let camera = Camera { native_size_px: None, ..camera.scaled(80, 50).unwrap() };
+        let views = [View::new(camera, pose), rolling_view(camera, pose, direction)];
+        check_against_reference(name, &backend, &scene, &profile, &views);
+    }
+}
+
+#[test]
+fn cpu_has_the_gradients_of_actors() {
+    let backend = cpu();
+    let car = chunk(&actor(400, 2, 5));
+    let place = |pose, index, tint| PlacedChunk {
+        tint,
+        ..PlacedChunk::at_rest(Arc::clone(&car), pose, index)
+    };
+    let placed = vec![
+        place(on_street(26.0, 1.5, 0.3), 0, [1.0; 3]),
+        place(on_street(30.0, -2.5, 1.4), 1, [0.4, 1.0, 0.7]),
+    ];
+    let scene = Scene { placed, ..Scene::from_gaussians(&street(1_000, 1, 7)) };
+    for (name, view) in placed_views() {
+        let camera = Camera { native_size_px: None, ..view.camera.scaled(80, 48).unwrap() };
+        let view = View { camera, ..view };
+        check_against_reference(name, &backend, &scene, &RenderProfile::default(), &[view]);
+    }
+}
+
+#[test]
+fn gradients_do_not_depend_on_threads_or_on_earlier_frames() {
+    let scene = Scene::from_gaussians(&street(40_000, 1, 12));
+    let profile = RenderProfile::default();
+    let views = turning_views();
+    let differ = |backend: &Cpu, gradients: &mut Gradients| {
+        let frame = Frame { scene: &scene, profile: &profile, views: &views };
+        backend.differentiate(&frame, true, &mut |images| waves(images), gradients).unwrap();
+        let bits = |(_, values): (_, Vec<f64>)| values.into_iter().map(f64::to_bits);
+        all_values(gradients).into_iter().flat_map(bits).collect::<Vec<u64>>()
+    };
+    let one = differ(&Cpu::new(1, Simd::Best).unwrap(), &mut Gradients::default());
+    for threads in [2, 4, 7] {
+        let backend = Cpu::new(threads, Simd::Best).unwrap();
+        let mut gradients = Gradients::default();
+        for repeat in 0..25 {
+            assert!(differ(&backend, &mut gradients) == one, "{threads} threads, {repeat}");
+        }
+    }
+    // AVX2 has the operations of AVX-512, eight lanes at a time.
+    if let Ok(avx2) = Cpu::new(2, Simd::Avx2) {
+        assert!(differ(&avx2, &mut Gradients::default()) == one, "AVX2");
+    }
+}
+
+/// A loss of the images with given decisions: the sum of products with fixed numbers.
+fn loss(sources: &Sources<'_>, decisions: &Decisions, by: &Images) -> f64 {
+    let images = sources.images(decisions);
+    let rgb = zip(&images.rgb, &by.rgb).map(|(a, b)| a.dot(*b)).sum::<f64>();
+    let sum = |a: &[f64], b: &[f64]| zip(a, b).map(|(a, b)| a * b).sum::<f64>();
+    rgb + sum(&images.opacity, &by.opacity) + sum(&images.depth_sum_m, &by.depth_sum_m)
+}
+
+/// The derivative of a function at 0 by central differences of fourth order.
+fn difference(f: impl Fn(f64) -> f64) -> f64 {
+    let h = 1e-4;
+    (8.0 * (f(h) - f(-h)) - (f(2.0 * h) - f(-2.0 * h))) / (12.0 * h)
+}
+
+/// A parameter of a Gaussian, moved by `step`.
+fn moved(gaussian: &Gaussian, parameter: usize, step: f64) -> Gaussian {
+    let mut gaussian = *gaussian;
+    let q = &mut gaussian.rotation;
+    match parameter {
+        0..3 => gaussian.mean_m[parameter] += step,
+        3 => q.w += step,
+        4 => q.x += step,
+        5 => q.y += step,
+        6 => q.z += step,
+        7..10 => gaussian.scale_m[parameter - 7] *= step.exp(),
+        10 => gaussian.log2_opacity += step,
+        _ => gaussian.sh[(parameter - 11) / 3][(parameter - 11) % 3] += step,
+    }
+    gaussian
+}
+
+/// The derivative by that parameter.
+fn derivative(gaussian: &Gaussian, gradient: &SourceGradient, parameter: usize) -> f64 {
+    let geometry = &gradient.geometry;
+    match parameter {
+        0..3 => geometry.mean_m[parameter],
+        3..7 => geometry.quat_wxyz[parameter - 3] / gaussian.rotation.length(),
+        7..10 => geometry.ln_scale[parameter - 7],
+        10 => geometry.log2_opacity,
+        _ => gradient.sh[(parameter - 11) / 3][(parameter - 11) % 3],
+    }
+}
+
+/// A scene of 24 Gaussians in front of a camera; every third lies at an extreme: long and thin, at
+/// the cap, of a quaternion of another length, close to the camera.
+fn random_sources<'a>(random: &mut Random, view: View, profile: &'a RenderProfile) -> Sources<'a> {
+    let source = |i: usize| {
+        let mut number = |low: f64, high: f64| f64::from(random.between(low, high));
+        let depth_m = if i == 5 { number(0.3, 0.6) } else { number(2.0, 9.0) };
+        let in_camera_m = depth_m * DVec3::new(number(-0.8, 0.8), number(-0.6, 0.6), 1.0);
+        let long = if i.is_multiple_of(3) { 20.0 } else { 1.0 };
+        let scale = DVec3::new(long * number(0.02, 0.05), number(0.03, 0.3), number(0.005, 0.3));
+        let length = [1.0, 1e-3, 1e3][i % 3];
+        let rotation = DQuat::from_xyzw(
+            number(-1.0, 1.0),
+            number(-1.0, 1.0),
+            number(-1.0, 1.0),
+            number(0.1, 1.0),
+        );
+        let gaussian = Gaussian {
+            mean_m: view.world_from_camera.transform_point(in_camera_m),
+            rotation: rotation * length,
+            scale_m: scale * depth_m / 4.0,
+            log2_opacity: if i % 5 == 1 { -1e-4 } else { number(-3.0, -0.05) },
+            sh: std::array::from_fn(|_| {
+                0.5 * DVec3::new(number(-0.5, 0.7), number(-0.5, 0.7), number(-0.5, 0.7))
+            }),
+        };
+        Source { gaussian, view: 0, tint: DVec3::new(1.0, 0.8, 1.1) }
+    };
+    let gaussians = (0..24).map(source).collect();
+    Sources { profile, gaussians, views: vec![view], depth_is_z: false }
+}
+
+/// Fifty random scenes, by every kind of camera: every derivative of the reference is that of its
+/// own images with the same decisions.
+#[test]
+fn reference_has_the_derivatives_of_its_own_images() {
+    let mut random = Random(77);
+    let pinhole = Camera::from_pinhole(28, 20, Pinhole { fx: 20.0, fy: 21.0, cx: 13.0, cy: 11.0 });
+    let mut cameras = vec![("pinhole", pinhole)];
+    for (name, camera) in lenses() {
+        let camera = camera.scaled(28, 20).unwrap();
+        cameras.push((name, Camera { native_size_px: None, ..camera }));
+        // A half of its native size.
+        cameras.push(("shrunk", camera.scaled(14, 10).unwrap()));
+    }
+    let profiles =
+        [false, true].map(|antialiased| RenderProfile { antialiased, ..RenderProfile::default() });
+    let mut worst: f64 = 0.0;
+    for scene in 0..50 {
+        let (name, camera) = cameras[scene % cameras.len()];
+        let pose = Twist::from_array([3.0, -1.0, 2.0, 0.3, 0.1 * scene as f64, -0.2]).exp();
+        let mut view = View::new(camera, pose);
+        let rolls = scene % 3 == 1;
+        if rolls {
+            // Without a rotation, since both ends are twisted, and not every moment.
+            let moves_m = pose.rotation * DVec3::new(0.1, 0.02, 0.3);
+            view.rolling_shutter = Some(RollingShutter {
+                direction: ShutterDirection::TopToBottom,
+                world_from_camera_first: Pose { position_m: pose.position_m - moves_m, ..pose },
+            });
+        }
+        let sources = random_sources(&mut random, view, &profiles[scene / 2 % 2]);
+        let decisions = sources.decisions();
+        let pixels = camera.pixels();
+        let mut number = || random.unit() - 0.5;
+        let by = Images {
+            rgb: (0..pixels).map(|_| DVec3::new(number(), number(), number())).collect(),
+            opacity: (0..pixels).map(|_| number()).collect(),
+            depth_sum_m: (0..pixels).map(|_| 0.2 * number()).collect(),
+        };
+        let (gradients, twist) = sources.gradients(&sources.splat_gradients(&decisions, &by));
+        let mut check = |what: String, ours: f64, theirs: f64, scale: f64| {
+            let error = (ours - theirs).abs() / scale;
+            worst = worst.max(error);
+            assert!(error < 2e-6, "scene {scene}, {name}, rolls {rolls}, {what}: {ours} {theirs}");
+        };
+        for parameter in 0..59 {
+            // Quaternions have lengths of three sizes: steps are in proportion to these.
+            let is_quat = (3..7).contains(&parameter);
+            let unit = |i: usize| {
+                if is_quat { sources.gaussians[i].gaussian.rotation.length() } else { 1.0 }
+            };
+            let values: Vec<f64> = (0..24)
+                .map(|i| {
+                    unit(i) * derivative(&sources.gaussians[i].gaussian, &gradients[i], parameter)
+                })
+                .collect();
+            let most = values.iter().fold(1e-3_f64, |most, value| most.max(value.abs()));
+            // Two Gaussians for each parameter, others in every scene.
+            for index in [(7 * parameter + scene) % 24, (5 * parameter + 3 * scene + 1) % 24] {
+                let gaussian = &sources.gaussians[index].gaussian;
+                let theirs = difference(|step| {
+                    let mut sources = sources.clone();
+                    sources.gaussians[index].gaussian =
+                        moved(gaussian, parameter, unit(index) * step);
+                    loss(&sources, &decisions, &by)
+                });
+                check(format!("parameter {parameter} of {index}"), values[index], theirs, most);
+            }
+        }
+        let twist = twist.to_array();
+        let most = twist.iter().fold(0.0_f64, |most, value| most.max(value.abs()));
+        for axis in 0..6 {
+            let theirs = difference(|step| {
+                let mut values = [0.0; 6];
+                values[axis] = step;
+                let mut sources = sources.clone();
+                sources.views[0] = view.twisted(Twist::from_array(values));
+                loss(&sources, &decisions, &by)
+            });
+            check(format!("twist {axis}"), twist[axis], theirs, most);
+        }
+    }
+    eprintln!("largest error of 50 scenes: {worst:.1e}");
 }
