@@ -1,0 +1,29 @@
+//! Losses of all Gaussians, which keep what no image needs small (3DGS-MCMC, eq. 10).
+
+use super::{Loss, Real};
+
+/// The mean opacity. Derivatives are by the logits: `o (1 - o)`.
+pub fn opacity<T: Real>(logits: &[T]) -> Loss<T> {
+    let share = 1.0 / logits.len().max(1) as f64;
+    let mut value = 0.0;
+    let by = logits.iter().map(|&logit| {
+        let opacity = T::one() / (T::one() + (-logit).exp());
+        value += opacity.to_double();
+        opacity * (T::one() - opacity) * T::from_f64(share)
+    });
+    let by = by.collect();
+    Loss { value: value * share, by }
+}
+
+/// The mean of all standard deviations, in metres. Derivatives are by their logarithms.
+pub fn scale<T: Real>(ln_scales: &[T]) -> Loss<T> {
+    let share = 1.0 / ln_scales.len().max(1) as f64;
+    let mut value = 0.0;
+    let by = ln_scales.iter().map(|ln_scale| {
+        let scale_m = ln_scale.exp();
+        value += scale_m.to_double();
+        scale_m * T::from_f64(share)
+    });
+    let by = by.collect();
+    Loss { value: value * share, by }
+}
