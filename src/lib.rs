@@ -18,6 +18,7 @@
 //! | [`wildcity_episode`] | recorded episodes: their lines, reading, scoring and comparing them | scene, score, sim |
 //! | [`wildcity_augment`] | views off the drive as training data: plan, masks, transforms.json, COLMAP, resume | scene |
 //! | [`wildcity_eval`] | rendered images against held-out real ones: scores and their page | render, scene |
+//! | [`wildcity_train`] | training on images: losses, gradients against their definition | render, scene |
 //! | [`wildcity_stress`] | extreme scenes, each with its bound, for every backend | generate, render, scene |
 //! | [`wildcity_twin`] | twins on disk and in memory: import, versioned store, streaming | scene |
 //! | [`wildcity_session`] | episodes: reset, step, observe, record, replay | episode, generate, render, repair, scene, sim, twin |

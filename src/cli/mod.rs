@@ -53,6 +53,7 @@ mod serve;
 mod sky_source;
 mod stress;
 mod time;
+mod train;
 mod twin;
 mod view;
 
@@ -90,6 +91,7 @@ enum Command {
     Eval(Box<eval::Eval>),
     Repair(repair::Repair),
     Augment(Box<augment::Augment>),
+    Train(train::Train),
     Drive(drive::Drive),
     Alpasim(alpasim::Alpasim),
     Replay(replay::Replay),
@@ -125,6 +127,7 @@ pub fn main() -> ExitCode {
         Command::Eval(command) => command.run(),
         Command::Repair(command) => command.run(),
         Command::Augment(command) => command.run(),
+        Command::Train(command) => command.run(),
         Command::Drive(command) => command.run(),
         Command::Alpasim(command) => command.run(),
         Command::Replay(command) => command.run(),

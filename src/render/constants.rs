@@ -30,6 +30,6 @@ pub const MAX_SIGMA_PX: f32 = 1e9;
 /// Bits of the depth key: exact f32 order of z from near up to 2^32 times near.
 pub const DEPTH_BITS: u32 = 28;
 
-/// Least share of the determinant before the blur by whose root opacity is scaled, in twins that are
-/// antialiased: gsplat's 0.005².
+/// Least share of the determinant before the blur by whose root opacity is scaled, in twins that
+/// are antialiased: gsplat's 0.005².
 pub const MIN_BLUR_SHARE: f64 = 0.005 * 0.005;

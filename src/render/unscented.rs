@@ -225,7 +225,7 @@ impl<'a> UnscentedView<'a> {
         Some(Footprint { mean_px, root_px: [d0, d1, d2, e0, e1, e2], depth_m, camera_m })
     }
 
-    /// The view.
+    /// The view that it projects for.
     pub(super) fn view(&self) -> &'a View {
         self.view
     }

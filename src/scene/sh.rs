@@ -69,7 +69,9 @@ pub fn basis(direction: DVec3) -> [f64; 16] {
 /// The derivatives of [`basis`] by x, y and z, as of polynomials of three independent variables.
 pub fn basis_gradients(direction: DVec3) -> [DVec3; 16] {
     let DVec3 { x, y, z } = direction;
-    let (xx, yy, zz) = (x * x, y * y, z * z);
+    let xx = x * x;
+    let yy = y * y;
+    let zz = z * z;
     [
         DVec3::ZERO,
         DVec3::new(0.0, -C1, 0.0),

@@ -1,5 +1,6 @@
 //! From the images of the Gaussians to those of a camera: `E(C + (1 - A) B)` with the colours C and
-//! opacity A of the Gaussians, the background or sky B, and the exposure E, an affine map of colours.
+//! opacity A of the Gaussians, the background or sky B, and the exposure E, an affine map of
+//! colours.
 //!
 //! The renderer leaves the sky out where less than 1/255 of it shows, which a loss of 8 bits cannot
 //! see; here it is added everywhere, so that the derivative by the opacity has no step.
@@ -9,7 +10,6 @@ use crate::loss::Real;
 /// What lies behind the Gaussians.
 #[derive(Clone, Copy, Debug)]
 pub enum Background<'a, T> {
-    /// One colour.
     Color([T; 3]),
     /// `[height, width, 3]`: a colour for each pixel, such as those of a sky.
     Image(&'a [T]),
@@ -32,7 +32,6 @@ pub struct ComposedGradient<T> {
     /// By the background's colour in each pixel, `[height, width, 3]`. Their sum is that by a
     /// background of one colour.
     pub background: Vec<T>,
-    /// By the exposure.
     pub exposure: Exposure<T>,
 }
 

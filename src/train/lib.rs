@@ -2,12 +2,14 @@
 //!
 //! | module | what it is |
 //! |---|---|
+//! | [`check`] | the gradients of this machine against their definition |
 //! | [`loss`] | losses of images, depths and Gaussians, each with its derivatives |
 //! | [`compose`] | from the Gaussians' images to the camera's: background or sky, and exposure |
 //!
-//! The renderer differentiates the images of the Gaussians ([`wildcity_render::gradient`]); all that
-//! lies between these and a number is here. Every function is written for f32 and f64: training
-//! computes in f32, and tests judge the same code in f64 by differences.
+//! The renderer differentiates the images of the Gaussians ([`wildcity_render::gradient`]); all
+//! that lies between these and a number is here. Every function is written for f32 and f64:
+//! training computes in f32, and tests judge the same code in f64 by differences.
 
+pub mod check;
 pub mod compose;
 pub mod loss;

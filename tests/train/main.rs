@@ -1,4 +1,5 @@
-//! The losses of training: each against vectors that others computed, or against differences in f64.
+//! The losses of training: each against vectors that others computed, or against differences in
+//! f64.
 
 #[path = "../support/data.rs"]
 mod data;
@@ -7,5 +8,6 @@ mod root;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
 
+mod check;
 mod losses;
 mod vectors;

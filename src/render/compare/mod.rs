@@ -3,6 +3,7 @@
 //! | module | content |
 //! |---|---|
 //! | [`gaussians`] | small scenes, written as lists of [`GaussianSpec`](gaussians::GaussianSpec) |
+//! | [`gradients`] | how far gradients differ |
 //! | [`images`] | all images of a view by a backend, parts of images, and [`agree`](images::agree): whether two backends drew the same |
 //! | [`psnr`], [`ssim`], [`flip`] | measures of one pair of images, as other packages compute them |
 //! | [`errors`] | PSNR, SSIM, largest errors and depth errors over many images |
@@ -15,6 +16,7 @@ pub mod errors;
 pub mod flicker;
 pub mod flip;
 pub mod gaussians;
+pub mod gradients;
 pub mod heat;
 pub mod images;
 pub mod json_numbers;

@@ -1,15 +1,16 @@
 //! The derivatives of blending: each tile walks its splats from front to back once more, as they
 //! were drawn ([`crate::gradient`] has the formulas).
 //!
-//! Every product that decides (exponent, cut, cap, stop) is computed as in [`super::blend`], so that
-//! the walk takes the same decisions. **One splat after the other, and not one block after the
+//! Every product that decides (exponent, cut, cap, stop) is computed as in [`super::blend`], so
+//! that the walk takes the same decisions. **One splat after the other, and not one block after the
 //! other as when it is drawn:** its ten sums stay in registers for all of its blocks, and are added
 //! up over the lanes once per tile, while a block's pixels have only two values that change.
 
 use fearless_simd::{f32x16, prelude::*};
 
 use super::batch::Matched;
-use super::math::exp2;
+use super::lanes::splats;
+use super::math::{exp2, recip};
 use super::resolve::{BLOCKS, TileSums};
 use crate::layout::Cutoffs;
 use wildcity_scene::chunk::LANES;
@@ -17,24 +18,16 @@ use wildcity_scene::chunk::LANES;
 /// Sums over the pixels of a splat within a macro tile, by the places in [`partial`].
 pub(super) type Partial = [f32; partial::COUNT];
 
-/// Places of the sums. `g` is the derivative by the logarithm of alpha, u and v are those of a
-/// splat's exponent.
+/// Places of the sums of g, g u, g v, g u², g u v and g v², and of the derivatives by colour and
+/// depth. `g` is the derivative by the logarithm of alpha, u and v are those of a splat's exponent.
 pub(super) mod partial {
-    /// Sum of g.
     pub(in crate::cpu) const G: usize = 0;
-    /// Sum of g u.
     pub(in crate::cpu) const U: usize = 1;
-    /// Sum of g v.
     pub(in crate::cpu) const V: usize = 2;
-    /// Sum of g u².
     pub(in crate::cpu) const UU: usize = 3;
-    /// Sum of g u v.
     pub(in crate::cpu) const UV: usize = 4;
-    /// Sum of g v².
     pub(in crate::cpu) const VV: usize = 5;
-    /// Derivatives by red, green and blue.
     pub(in crate::cpu) const RGB: usize = 6;
-    /// Derivative by the depth.
     pub(in crate::cpu) const DEPTH: usize = 9;
     pub(in crate::cpu) const COUNT: usize = 10;
 }
@@ -113,8 +106,7 @@ impl TileWalk {
         let lane_u = load(&matched.lane_u);
         let lane_v = load(&matched.lane_v);
         let log2_opacity = splat(matched.log2_opacity);
-        let [red, green, blue] =
-            [splat(matched.rgb[0]), splat(matched.rgb[1]), splat(matched.rgb[2])];
+        let [red, green, blue] = splats(simd, matched.rgb);
         let depth_m = splat(matched.depth_m);
 
         let mut sums = [zero; partial::COUNT];
@@ -134,8 +126,9 @@ impl TileWalk {
             let weight = counts.select(alpha * running, zero);
             after.max(floor).store_array(&mut self.running[block]);
 
-            let [by_red, by_green, by_blue] =
-                [load(&by.rgb[0][block]), load(&by.rgb[1][block]), load(&by.rgb[2][block])];
+            let by_red = load(&by.rgb[0][block]);
+            let by_green = load(&by.rgb[1][block]);
+            let by_blue = load(&by.rgb[2][block]);
             let mut energy = red.mul_add(by_red, green.mul_add(by_green, blue * by_blue));
             if DEPTH {
                 let by_depth = load(&by.depth_m[block]);
@@ -146,7 +139,7 @@ impl TileWalk {
             behind.store_array(&mut self.behind[block]);
 
             // 1 - alpha is at least 1 - cap.
-            let by_alpha = running.mul_add(energy, -(behind / (one - alpha)));
+            let by_alpha = running.mul_add(energy, -(behind * recip(simd, one - alpha)));
             // Nothing at the cap: alpha does not change there.
             let g = (counts & raw.simd_le(cap)).select(by_alpha * alpha, zero);
             let gu = g * u;
@@ -164,10 +157,31 @@ impl TileWalk {
                 self.live &= !(1 << block);
             }
         }
-        let mut partial = [0.0; partial::COUNT];
-        for (to, sum) in partial.iter_mut().zip(sums) {
-            *to = sum.reduce_sum();
-        }
-        partial
+        lane_sums(sums)
     }
+}
+
+/// The sums over the lanes of ten vectors.
+///
+/// Neighbours are added two vectors at a time, so that one vector holds all sums after four rounds
+/// of 5, 3, 2 and 1 additions; ten vectors one by one would take four each.
+#[inline(always)]
+fn lane_sums<S: Simd>(sums: [f32x16<S>; partial::COUNT]) -> Partial {
+    let [a, b, c, d, e, f, g, h, i, k] = sums;
+    let two = neighbours(i, k);
+    let eight = neighbours(
+        neighbours(neighbours(a, b), neighbours(c, d)),
+        neighbours(neighbours(e, f), neighbours(g, h)),
+    );
+    let two = neighbours(two, two);
+    let all = neighbours(eight, neighbours(two, two)).to_array();
+    let mut partial = [0.0; partial::COUNT];
+    partial.copy_from_slice(&all[..partial::COUNT]);
+    partial
+}
+
+/// Sums of neighbouring lanes: those of `a` in the lower half, those of `b` in the upper half.
+#[inline(always)]
+fn neighbours<S: Simd>(a: f32x16<S>, b: f32x16<S>) -> f32x16<S> {
+    a.unzip_low(b) + a.unzip_high(b)
 }

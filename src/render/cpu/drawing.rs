@@ -180,7 +180,7 @@ impl Drawing<'_> {
         continued: Option<Continued<'_>>,
     ) {
         let FramePart { frame, backgrounds, first_view } = part;
-        let Scratch { projected, bins, rasterizer } = &mut *self.scratch;
+        let Scratch { projected, bins, rasterizer, .. } = &mut *self.scratch;
         let cutoffs = self.cutoffs;
         let mut timer = StageTimer::start();
         let input = rasterize::Input { projected, bins, views: frame.views, backgrounds, cutoffs };

@@ -12,9 +12,9 @@
 //! Between the steps there are 40 B for each pair of a splat and a macro tile (1.3 per splat on a
 //! street), and while they are gathered 40 B for each splat of a segment.
 //!
-//! **The bytes do not depend on threads.** A macro tile is walked by one thread, tile after tile; its
-//! sums have places of their own; a segment of splats adds its macro tiles in order; and a Gaussian
-//! adds its views in order. No sum is added to atomically.
+//! **The bytes do not depend on threads.** A macro tile is walked by one thread, tile after tile;
+//! its sums have places of their own; a segment of splats adds its macro tiles in order; and a
+//! Gaussian adds its views in order. No sum is added to atomically.
 
 use std::iter::zip;
 
@@ -41,19 +41,30 @@ use crate::layout::Cutoffs;
 use crate::stage::Stage;
 use crate::{Backend, Frame, FrameStats, View};
 use wildcity_scene::chunk::{CLUSTER, LANES, columns};
+use wildcity_scene::geometry::Camera;
 
-/// What the forward pass keeps of each macro tile, by its number.
+/// What the forward pass keeps of each macro tile of a view, by its number.
+#[derive(Debug, Default)]
 struct KeptView(Vec<Mutex<KeptMacroTile>>);
 
-#[derive(Default)]
+#[derive(Debug, Default)]
 struct KeptMacroTile {
     /// In the order of [`Grid::macro_tile_tiles`].
     tiles: Vec<TileSums>,
     lists: MacroTileLists,
 }
 
+/// The memory of gradients, which one frame leaves to the next; empty in a backend that computes
+/// none.
+#[derive(Debug, Default)]
+pub(super) struct Buffers {
+    views: Vec<KeptView>,
+    images: Vec<GaussianImages>,
+    walkers: Mutex<Vec<Box<Walker>>>,
+}
+
 /// Scratch memory of one thread.
-#[derive(Default)]
+#[derive(Debug, Default)]
 struct Walker {
     macro_tile: MacroTile,
     batch: Batch,
@@ -61,11 +72,12 @@ struct Walker {
 }
 
 /// A frame between its images and its gradients.
+#[derive(Clone, Copy)]
 struct Kept<'a> {
     input: Input<'a>,
     depth: bool,
-    views: Vec<KeptView>,
-    walkers: Mutex<Vec<Box<Walker>>>,
+    views: &'a [KeptView],
+    walkers: &'a Mutex<Vec<Box<Walker>>>,
 }
 
 impl Differentiate for Cpu {
@@ -92,19 +104,27 @@ impl Differentiate for Cpu {
                     Err(PartError::Render(error)) => return Err(error.into()),
                     Ok(()) => {}
                 }
-                let Scratch { projected, bins, .. } = &*scratch;
+                let Scratch { projected, bins, gradient, .. } = &mut *scratch;
+                let projected = &*projected;
+                let bins = &*bins;
+                let Buffers { views: kept, images, walkers } = gradient;
                 let views = frame.views;
+                kept.resize_with(views.len(), KeptView::default);
+                for (kept, view) in zip(&mut *kept, views) {
+                    kept.0.resize_with(Grid::new(view).macro_tiles(), Mutex::default);
+                }
                 let cutoffs = &cutoffs;
                 let input = Input { projected, bins, views, backgrounds: &[], cutoffs };
+                let kept = Kept { input, depth, views: &*kept, walkers: &*walkers };
                 let mut timer = StageTimer::start();
-                let kept = dispatch!(level, simd => Kept::rasterize(simd, input, depth));
-                let mut images: Vec<GaussianImages> =
-                    zip(&kept.views, views).map(|(kept, view)| kept.images(view, depth)).collect();
-                for (images, view) in images.iter_mut().zip(views) {
+                dispatch!(level, simd => kept.rasterize(simd));
+                images.resize_with(views.len(), GaussianImages::default);
+                for ((images, kept), view) in zip(zip(&mut *images, kept.views), views) {
+                    kept.write_images(view, depth, images);
                     mask(view, images);
                 }
                 timer.finish("rasterize", &mut stats);
-                let mut by_images = loss(&images);
+                let mut by_images = loss(images);
                 timer.finish("loss", &mut stats);
                 check_loss(frame, depth, &by_images)?;
                 for (by_images, view) in by_images.iter_mut().zip(views) {
@@ -112,6 +132,7 @@ impl Differentiate for Cpu {
                 }
 
                 gradients.reset(frame.scene, views.len());
+                timer.finish("check", &mut stats);
                 for (view, by_images) in by_images.iter().enumerate() {
                     let by_macro_tile =
                         dispatch!(level, simd => kept.blend_backwards(simd, view, by_images));
@@ -163,27 +184,20 @@ fn unit_of_job<'a, 'b>(
     &units[job.number][job.clusters.start / UNIT_CLUSTERS]
 }
 
-impl<'a> Kept<'a> {
+impl Kept<'_> {
     /// Draws all views, and keeps what the way back needs.
     #[inline(always)]
-    fn rasterize<S: Simd>(simd: S, input: Input<'a>, depth: bool) -> Self {
-        let view = |view: &View| {
-            let macro_tiles = Grid::new(view).macro_tiles();
-            KeptView((0..macro_tiles).map(|_| Mutex::default()).collect())
-        };
-        let views = input.views.iter().map(view).collect();
-        let kept = Self { input, depth, views, walkers: Mutex::default() };
-        for view in 0..input.views.len() {
-            kept.input.bins.by_work(view).into_par_iter().with_max_len(1).for_each(|number| {
-                let mut walker = kept.walkers.lock().pop().unwrap_or_default();
+    fn rasterize<S: Simd>(&self, simd: S) {
+        for view in 0..self.views.len() {
+            self.input.bins.by_work(view).into_par_iter().with_max_len(1).for_each(|number| {
+                let mut walker = self.walkers.lock().pop().unwrap_or_default();
                 simd.vectorize(
                     #[inline(always)]
-                    || kept.rasterize_macro_tile(simd, view, number, &mut walker),
+                    || self.rasterize_macro_tile(simd, view, number, &mut walker),
                 );
-                kept.walkers.lock().push(walker);
+                self.walkers.lock().push(walker);
             });
         }
-        kept
     }
 
     #[inline(always)]
@@ -199,6 +213,7 @@ impl<'a> Kept<'a> {
         bins.load(view, number, macro_tile);
         macro_tile.copy_splats(projected);
         let mut kept = self.views[view].0[number].lock();
+        kept.tiles.clear();
         let wants = Wants { depth: self.depth, instances: false };
         for (within, [column, row]) in Grid::new(&views[view]).macro_tile_tiles(number) {
             let mut sums = TileSums::default();
@@ -210,7 +225,7 @@ impl<'a> Kept<'a> {
             rasterize_tile(simd, self.input, macro_tile, within, at_px, batch, &mut output);
             kept.tiles.push(sums);
         }
-        kept.lists = macro_tile.take_lists();
+        macro_tile.copy_lists(&mut kept.lists);
     }
 
     /// The sums of every pair of every macro tile of a view.
@@ -246,8 +261,8 @@ impl<'a> Kept<'a> {
     ) -> Vec<Partial> {
         let Walker { macro_tile, batch, by } = walker;
         let Input { bins, projected, views, cutoffs, .. } = self.input;
-        let kept = std::mem::take(&mut *self.views[view].0[number].lock());
-        bins.load_with_lists(view, number, kept.lists, macro_tile);
+        let kept = self.views[view].0[number].lock();
+        bins.load_with_lists(view, number, &kept.lists, macro_tile);
         macro_tile.copy_splats(projected);
         let mut partials = vec![[0.0; partial::COUNT]; macro_tile.len()];
         let grid = Grid::new(&views[view]);
@@ -288,63 +303,125 @@ impl<'a> Kept<'a> {
 }
 
 impl KeptView {
-    /// The images of a view.
-    fn images(&self, view: &View, depth: bool) -> GaussianImages {
+    /// Writes the images of a view.
+    fn write_images(&self, view: &View, depth: bool, images: &mut GaussianImages) {
         let pixels = view.camera.pixels();
-        let mut images = GaussianImages {
-            rgb: vec![0.0; 3 * pixels],
-            opacity: vec![0.0; pixels],
-            depth_sum_m: vec![0.0; if depth { pixels } else { 0 }],
-        };
+        images.rgb.resize(3 * pixels, 0.0);
+        images.opacity.resize(pixels, 0.0);
+        images.depth_sum_m.resize(if depth { pixels } else { 0 }, 0.0);
+        // The macro tile of each tile, and its place within that.
         let grid = Grid::new(view);
-        for (number, kept) in self.0.iter().enumerate() {
-            let kept = kept.lock();
-            for ((_, [column, row]), sums) in grid.macro_tile_tiles(number).zip(&kept.tiles) {
-                let at_px = [column * TILE_PX, row * TILE_PX];
-                for_each_pixel(view, at_px, |pixel, block, lane| {
-                    for channel in 0..3 {
-                        images.rgb[3 * pixel + channel] = sums.rgb[channel][block][lane];
-                    }
-                    images.opacity[pixel] = 1.0 - sums.transmittance[block][lane];
-                    if depth {
-                        images.depth_sum_m[pixel] = sums.depth_m[block][lane];
-                    }
-                });
+        let mut places = vec![(0, 0); grid.tiles()];
+        for number in 0..self.0.len() {
+            for (place, (_, [column, row])) in grid.macro_tile_tiles(number).enumerate() {
+                places[(row * grid.columns + column) as usize] = (number, place);
             }
         }
-        images
+        // A row of tiles at a time.
+        let band = view.camera.width_px as usize * TILE_PX as usize;
+        let depths = images.depth_sum_m.par_chunks_mut(band);
+        let bands = images.rgb.par_chunks_mut(3 * band).zip(images.opacity.par_chunks_mut(band));
+        let write = |row: usize, rgb: &mut [f32], opacity: &mut [f32], depth_m: &mut [f32]| {
+            for column in 0..grid.columns {
+                let (number, place) = places[row * grid.columns as usize + column as usize];
+                let kept = self.0[number].lock();
+                let at_px = [column * TILE_PX, row as u32 * TILE_PX];
+                kept.tiles[place].write(view, at_px, rgb, opacity, depth_m);
+            }
+        };
+        if depth {
+            let bands = bands.zip(depths).enumerate();
+            bands.for_each(|(row, ((rgb, opacity), depth_m))| write(row, rgb, opacity, depth_m));
+        } else {
+            bands.enumerate().for_each(|(row, (rgb, opacity))| write(row, rgb, opacity, &mut []));
+        }
     }
 }
 
-impl TileDerivatives {
-    /// Reads the tile at `at_px`; 0 beyond the image.
-    fn read(&mut self, images: &GaussianImages, view: &View, at_px: [u32; 2]) {
-        let [right, bottom] = at_px.map(|px| px + TILE_PX);
-        if right > view.camera.width_px || bottom > view.camera.height_px {
-            *self = Self::default();
-        }
-        for_each_pixel(view, at_px, |pixel, block, lane| {
-            for channel in 0..3 {
-                self.rgb[channel][block][lane] = images.rgb[3 * pixel + channel];
+impl TileSums {
+    /// Writes the tile at `at_px` into its row of tiles.
+    fn write(
+        &self,
+        view: &View,
+        at_px: [u32; 2],
+        rgb: &mut [f32],
+        opacity: &mut [f32],
+        depth_m: &mut [f32],
+    ) {
+        for_each_span(view, at_px, |Span { pixel, block, lane, len }| {
+            // The row of tiles begins at its first pixel.
+            let pixel = pixel - (at_px[1] * view.camera.width_px) as usize;
+            for k in 0..len {
+                for channel in 0..3 {
+                    rgb[3 * (pixel + k) + channel] = self.rgb[channel][block][lane + k];
+                }
+                opacity[pixel + k] = 1.0 - self.transmittance[block][lane + k];
             }
-            self.opacity[block][lane] = images.opacity[pixel];
-            if let Some(&depth) = images.depth_sum_m.get(pixel) {
-                self.depth_m[block][lane] = depth;
+            if !depth_m.is_empty() {
+                depth_m[pixel..pixel + len].copy_from_slice(&self.depth_m[block][lane..lane + len]);
             }
         });
     }
 }
 
-/// Calls `work` with (pixel of the image, block, lane) of each pixel of the tile at `at_px`.
-fn for_each_pixel(view: &View, at_px: [u32; 2], mut work: impl FnMut(usize, usize, usize)) {
-    let [width, height] = [view.camera.width_px, view.camera.height_px];
+impl TileDerivatives {
+    /// Reads the tile at `at_px`; 0 beyond the image.
+    #[inline(always)]
+    fn read(&mut self, images: &GaussianImages, view: &View, at_px: [u32; 2]) {
+        let [right, bottom] = at_px.map(|px| px + TILE_PX);
+        if right > view.camera.width_px || bottom > view.camera.height_px {
+            *self = Self::default();
+        }
+        let has_depth = !images.depth_sum_m.is_empty();
+        for_each_span(
+            view,
+            at_px,
+            #[inline(always)]
+            |Span { pixel, block, lane, len }| {
+                let rgb = &images.rgb[3 * pixel..3 * (pixel + len)];
+                for (k, rgb) in rgb.as_chunks::<3>().0.iter().enumerate() {
+                    for (channel, &value) in rgb.iter().enumerate() {
+                        self.rgb[channel][block][lane + k] = value;
+                    }
+                }
+                self.opacity[block][lane..lane + len]
+                    .copy_from_slice(&images.opacity[pixel..pixel + len]);
+                if has_depth {
+                    self.depth_m[block][lane..lane + len]
+                        .copy_from_slice(&images.depth_sum_m[pixel..pixel + len]);
+                }
+            },
+        );
+    }
+}
+
+/// Pixels of one row of a block.
+struct Span {
+    /// Index of its first pixel in the image; the lane is that of this pixel, too.
+    pixel: usize,
+    block: usize,
+    lane: usize,
+    len: usize,
+}
+
+/// Calls `work` with the rows of the blocks of the tile at `at_px`, as far as they are on the
+/// image.
+#[inline(always)]
+fn for_each_span(view: &View, at_px: [u32; 2], mut work: impl FnMut(Span)) {
+    let Camera { width_px: width, height_px: height, .. } = view.camera;
     for block in 0..BLOCKS {
-        let [left, top] = block_corner(block);
-        let [left, top] = [at_px[0] + left, at_px[1] + top];
+        let corner = block_corner(block);
+        let left = at_px[0] + corner[0];
+        let top = at_px[1] + corner[1];
+        let len = width.saturating_sub(left).min(BLOCK_PX) as usize;
         for y in top..height.min(top + BLOCK_PX) {
-            for x in left..width.min(left + BLOCK_PX) {
-                let lane = (y - top) * BLOCK_PX + x - left;
-                work((y * width + x) as usize, block, lane as usize);
+            let lane = ((y - top) * BLOCK_PX) as usize;
+            let pixel = (y * width + left) as usize;
+            // Nearly all rows are whole: a length that is known makes a few vector moves of them.
+            if len == BLOCK_PX as usize {
+                work(Span { pixel, block, lane, len: BLOCK_PX as usize });
+            } else if len > 0 {
+                work(Span { pixel, block, lane, len });
             }
         }
     }

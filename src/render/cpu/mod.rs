@@ -121,6 +121,7 @@ struct Scratch {
     projected: project::Projected,
     bins: bin::Bins,
     rasterizer: rasterize::Scratches,
+    gradient: gradient::Buffers,
 }
 
 impl Cpu {

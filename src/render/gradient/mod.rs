@@ -3,8 +3,8 @@
 //! # What is differentiated
 //!
 //! The images of the Gaussians alone: colour on black, opacity, and the sum of depths weighted as
-//! the colours are ([`GaussianImages`]). A loss is a function of them, and background, sky, exposure
-//! and expected depth are functions of them, too (`wildcity-train` has these, with their
+//! the colours are ([`GaussianImages`]). A loss is a function of them, and background, sky,
+//! exposure and expected depth are functions of them, too (`wildcity-train` has these, with their
 //! derivatives), so no backend knows them.
 //!
 //! The parameters are those of [`GaussianGradient`], and a twist of each view ([`Twist`]), which
@@ -47,6 +47,7 @@ mod shape;
 mod twist;
 
 use glam::DVec3;
+use rayon::prelude::*;
 
 use wildcity_scene::chunk::{LANES, Lanes, column, columns};
 use wildcity_scene::geometry::camera::FieldMask;
@@ -63,7 +64,7 @@ use crate::{Backend, Frame, FrameStats, RenderError, View};
 pub struct GaussianImages {
     /// `[height, width, 3]`: linear red, green and blue of the Gaussians, premultiplied, on black.
     pub rgb: Vec<f32>,
-    /// `[height, width]`: opacity.
+    /// `[height, width]`: accumulated opacity of the Gaussians.
     pub opacity: Vec<f32>,
     /// `[height, width]`: sum of depths weighted by contribution, in metres. Divided by the opacity
     /// it is the expected depth. Empty if depth is not asked for.
@@ -94,20 +95,19 @@ pub struct GaussianGradient {
 pub struct Gradients {
     /// By chunk: those of the twin, then those that are placed as actors.
     pub chunks: Vec<ChunkGradients>,
-    /// One per view.
     pub twists: Vec<Twist>,
 }
 
-/// The derivatives of a loss by the Gaussians of one chunk, in the columns of
-/// [`Chunk`] ([`mod@column`]): by the mean, by the **logarithm** of the scales, by the unit quaternion
+/// The derivatives of a loss by the Gaussians of one chunk, in the columns of [`Chunk`]
+/// ([`mod@column`]): by the mean, by the **logarithm** of the scales, by the unit quaternion
 /// tangentially, by the base-2 logarithm of the opacity, and by the spherical harmonics.
 #[derive(Clone, Debug)]
 pub struct ChunkGradients {
     sh_degree: u8,
     count: usize,
     pub(crate) lanes: Vec<Lanes>,
-    /// For each lane group, a bit for each Gaussian that some view shows. Only these groups' columns
-    /// are written.
+    /// For each lane group, a bit for each Gaussian that some view shows. Only these groups'
+    /// columns are written.
     pub(crate) visible: Vec<u16>,
 }
 
@@ -194,12 +194,12 @@ impl ChunkGradients {
         self.sh_degree
     }
 
-    /// Number of Gaussians.
+    /// Number of Gaussians, visible or not.
     pub fn len(&self) -> usize {
         self.count
     }
 
-    /// Whether there are no Gaussians.
+    /// Whether the chunk has no Gaussians.
     pub fn is_empty(&self) -> bool {
         self.count == 0
     }
@@ -222,8 +222,8 @@ impl ChunkGradients {
         }
     }
 
-    /// The columns of a lane group, if some view shows a Gaussian of it, and a bit for each of these.
-    /// Those of its other Gaussians are 0.
+    /// The columns of a lane group, if some view shows a Gaussian of it, and a bit for each of
+    /// these. Those of its other Gaussians are 0.
     pub fn lane_group(&self, group: usize) -> Option<(&[Lanes], u16)> {
         let visible = self.visible[group];
         let width = columns(self.sh_degree);
@@ -303,7 +303,12 @@ pub(crate) fn check_loss(
             if values.len() != wanted && !is_left_out {
                 return Err(GradientError::Size { view, image, given: values.len(), wanted });
             }
-            if let Some(index) = values.iter().position(|value| !value.is_finite()) {
+            // Sums of parts: one that is finite has no value that is not. (0 x is NaN for those.)
+            let is_finite = |part: &[f32]| part.iter().map(|value| 0.0 * value).sum::<f32>() == 0.0;
+            let parts = values.par_chunks(1 << 14);
+            if !parts.all(is_finite)
+                && let Some(index) = values.iter().position(|value| !value.is_finite())
+            {
                 let value = values[index];
                 return Err(GradientError::NotFinite { view, image, index, value });
             }

@@ -24,7 +24,7 @@ pub(crate) struct FootprintGradient {
     pub(crate) ln_blur_share: f64,
     /// By the logarithm of the determinant after the blur of native pixels.
     pub(crate) ln_det_native: f64,
-    /// That blur.
+    /// The variances of that blur, along x and y.
     pub(crate) native_px2: DVec2,
     pub(crate) depth_m: f64,
     /// Whether depth is z for every lens, and not [`Camera::depth_m`].

@@ -1,10 +1,10 @@
-//! Gradients by definition, in f64: every pixel against every Gaussian, and every chain rule written
-//! out.
+//! Gradients by definition, in f64: every pixel against every Gaussian, and every chain rule
+//! written out.
 //!
-//! Order, cut, cap and stop are steps, so that differences of the image are wrong by any amount where
-//! one of them lies between the two images: of 24 differences of a rig half were, with a step of
-//! 1e-6. [`Decisions`] holds them: which Gaussians each pixel blends, in which order, and which of
-//! them are at the cap. An image with given decisions is a smooth function of the parameters.
+//! Order, cut, cap and stop are steps, so that differences of the image are wrong by any amount
+//! where one of them lies between the two images: of 24 differences of a rig half were, with a step
+//! of 1e-6. [`Decisions`] holds them: which Gaussians each pixel blends, in which order, and which
+//! of them are at the cap. An image with given decisions is a smooth function of the parameters.
 
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
@@ -23,9 +23,9 @@ use wildcity_scene::{Chunk, RenderProfile, Scene, sh};
 #[derive(Clone, Copy, Debug)]
 pub struct Source {
     pub gaussian: Gaussian,
-    /// Index in [`Sources::views`].
+    /// Index of the view that sees it in [`Sources::views`].
     pub view: usize,
-    /// Factor of its colour.
+    /// Factor of red, green and blue.
     pub tint: DVec3,
 }
 
@@ -55,7 +55,6 @@ pub struct Decisions(Vec<Vec<Contribution>>);
 
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Contribution {
-    /// Index in [`Sources::gaussians`].
     gaussian: usize,
     is_capped: bool,
 }

@@ -15,7 +15,6 @@ pub struct DepthLoss<T> {
     pub value: f64,
     pub by_opacity: Vec<T>,
     pub by_depth_sum: Vec<T>,
-    /// Number of pixels that were compared.
     pub pixels: usize,
 }
 

@@ -6,12 +6,12 @@ use super::{Loss, Real};
 pub fn opacity<T: Real>(logits: &[T]) -> Loss<T> {
     let share = 1.0 / logits.len().max(1) as f64;
     let mut value = 0.0;
-    let by = logits.iter().map(|&logit| {
+    let mut by = Vec::with_capacity(logits.len());
+    for &logit in logits {
         let opacity = T::one() / (T::one() + (-logit).exp());
         value += opacity.to_double();
-        opacity * (T::one() - opacity) * T::from_f64(share)
-    });
-    let by = by.collect();
+        by.push(opacity * (T::one() - opacity) * T::from_f64(share));
+    }
     Loss { value: value * share, by }
 }
 
@@ -19,11 +19,11 @@ pub fn opacity<T: Real>(logits: &[T]) -> Loss<T> {
 pub fn scale<T: Real>(ln_scales: &[T]) -> Loss<T> {
     let share = 1.0 / ln_scales.len().max(1) as f64;
     let mut value = 0.0;
-    let by = ln_scales.iter().map(|ln_scale| {
+    let mut by = Vec::with_capacity(ln_scales.len());
+    for ln_scale in ln_scales {
         let scale_m = ln_scale.exp();
         value += scale_m.to_double();
-        scale_m * T::from_f64(share)
-    });
-    let by = by.collect();
+        by.push(scale_m * T::from_f64(share));
+    }
     Loss { value: value * share, by }
 }

@@ -9,8 +9,8 @@
 //! | [`opacity`], [`scale`] | all Gaussians | Kheradmand et al. 2024 (3DGS-MCMC), eq. 10 |
 //! | [`ground::Terms`] | Gaussians of the ground | the project's paper, section 4.2 |
 //!
-//! Images are row by row, colours `[height, width, 3]`. A mask has one weight per pixel, and weight 0
-//! leaves a pixel out: of a mean, the weights are part.
+//! Images are row by row, colours `[height, width, 3]`. A mask has one weight per pixel, and weight
+//! 0 leaves a pixel out: of a mean, the weights are part.
 
 mod depth;
 mod gaussians;
@@ -31,9 +31,7 @@ use num_traits::Float;
 pub trait Real:
     Float + Send + Sync + std::iter::Sum + std::ops::AddAssign + std::fmt::Debug
 {
-    /// Rounds an f64.
     fn from_f64(value: f64) -> Self;
-    /// As an f64.
     fn to_double(self) -> f64;
 }
 

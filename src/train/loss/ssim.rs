@@ -1,8 +1,8 @@
 //! The structural similarity of two images (Wang et al. 2004), channel by channel.
 //!
 //! Windows are Gaussians of 11 x 11 px with a standard deviation of 1.5 px, and pixels beyond the
-//! image are 0, as in the training of Kerbl et al. 2023, of gsplat and of brush. With the means `m`,
-//! variances `s` and the covariance `s_xy` of a window, and C₁ = 0.01², C₂ = 0.03²:
+//! image are 0, as in the training of Kerbl et al. 2023, of gsplat and of brush. With the means
+//! `m`, variances `s` and the covariance `s_xy` of a window, and C₁ = 0.01², C₂ = 0.03²:
 //!
 //! ```text
 //! S = (2 m_x m_y + C₁)(2 s_xy + C₂) / ((m_x² + m_y² + C₁)(s_x + s_y + C₂))
@@ -51,7 +51,8 @@ pub fn dssim<T: Real>(size_px: [usize; 2], image: &[T], target: &[T]) -> Loss<T>
             let mut sum = 0.0;
             for k in 0..by_mean.len() {
                 let i = row * width + k;
-                let (mx, my) = (mean_x[i], mean_y[i]);
+                let mx = mean_x[i];
+                let my = mean_y[i];
                 let a1 = two * mx * my + c1;
                 let a2 = two * (xy[i] - mx * my) + c2;
                 let b1 = mx * mx + my * my + c1;

@@ -23,9 +23,9 @@ impl SegmentSums {
 }
 
 impl Bins {
-    /// Adds up what the macro tiles of a view gave for each of their pairs, splat by splat, and hands
-    /// the sums of each segment to `work`, with the numbers of its units. Results are in the order
-    /// of the segments.
+    /// Adds up what the macro tiles of a view gave for each of their pairs, splat by splat, and
+    /// hands the sums of each segment to `work`, with the numbers of its units. Results are in the
+    /// order of the segments.
     ///
     /// Segments run in parallel. Each adds its macro tiles in order, so that no sum depends on the
     /// schedule.

@@ -112,10 +112,12 @@ impl MacroTile {
         ends.copy_from_slice(&next[..MACRO_TILE_TILES]);
     }
 
-    /// Takes its sorted lists, for [`MacroTile::load_with_lists`].
-    pub(in crate::cpu) fn take_lists(&mut self) -> MacroTileLists {
+    /// Copies its sorted lists, for [`MacroTile::load_with_lists`].
+    pub(in crate::cpu) fn copy_lists(&self, to: &mut MacroTileLists) {
         let end = self.ends.last().map_or(0, |&end| end as usize);
-        MacroTileLists { instances: self.instances[..end].to_vec(), ends: self.ends }
+        to.instances.clear();
+        to.instances.extend_from_slice(&self.instances[..end]);
+        to.ends = self.ends;
     }
 
     /// As [`MacroTile::load`], with the lists that were found then.
@@ -123,14 +125,15 @@ impl MacroTile {
         &mut self,
         number: usize,
         segments: &[Segment],
-        lists: MacroTileLists,
+        lists: &MacroTileLists,
     ) {
         self.pairs.clear();
         self.copies.clear();
         for segment in segments {
             self.pairs.extend_from_slice(segment.macro_tile(number));
         }
-        self.instances = lists.instances;
+        self.instances.clear();
+        self.instances.extend_from_slice(&lists.instances);
         self.ends = lists.ends;
     }
 

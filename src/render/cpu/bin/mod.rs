@@ -156,7 +156,7 @@ impl Bins {
         &self,
         view: usize,
         number: usize,
-        lists: MacroTileLists,
+        lists: &MacroTileLists,
         tile: &mut MacroTile,
     ) {
         tile.load_with_lists(number, self.view_segments(view), lists);

@@ -74,7 +74,7 @@ impl<'a> UnscentedChunkView<'a> {
         }
     }
 
-    /// The view.
+    /// The view that it projects for.
     pub(super) fn view(&self) -> &View {
         self.unscented.view()
     }

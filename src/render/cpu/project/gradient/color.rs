@@ -3,7 +3,7 @@
 use fearless_simd::{f32x16, prelude::*};
 
 use super::{Block, add3};
-use crate::cpu::lanes::Vec3x16;
+use crate::cpu::lanes::{Vec3x16, splats};
 use wildcity_scene::chunk::{Lanes, column};
 use wildcity_scene::sh;
 
@@ -22,11 +22,11 @@ pub(super) fn back_project<S: Simd>(
     let splat = |value: f64| f32x16::splat(simd, value as f32);
     let zero = splat(0.0);
     let rgb = block.splats.colors(simd);
-    let by = block.by.rgb(simd).times(Vec3x16::splat(simd, block.tint));
+    let tinted = block.by.rgb(simd).times(Vec3x16::splat(simd, block.tint));
     let by = Vec3x16 {
-        x: rgb.x.simd_gt(zero).select(by.x, zero),
-        y: rgb.y.simd_gt(zero).select(by.y, zero),
-        z: rgb.z.simd_gt(zero).select(by.z, zero),
+        x: rgb.x.simd_gt(zero).select(tinted.x, zero),
+        y: rgb.y.simd_gt(zero).select(tinted.y, zero),
+        z: rgb.z.simd_gt(zero).select(tinted.z, zero),
     };
     let mut terms = Terms { simd, columns: block.columns, by, visible, to, by_direction: None };
     terms.constant(splat(sh::C0));
@@ -43,21 +43,24 @@ pub(super) fn back_project<S: Simd>(
     terms.term(2, c1 * z, [zero, zero, c1]);
     terms.term(3, -c1 * x, [-c1, zero, zero]);
     if block.sh_degree > 1 {
-        let [a, b, c, d, e] = sh::C2;
-        let [a, b, c, d, e] = [splat(a), splat(b), splat(c), splat(d), splat(e)];
-        let (xx, yy, zz) = (x * x, y * y, z * z);
+        let [a, b, c, d, e] = splats(simd, sh::C2.map(|value| value as f32));
+        let xx = x * x;
+        let yy = y * y;
+        let zz = z * z;
         let twice = |v: f32x16<S>| v + v;
         terms.term(4, a * x * y, [a * y, a * x, zero]);
         terms.term(5, b * y * z, [zero, b * z, b * y]);
-        let [cx, cy, cz] = [twice(c) * x, twice(c) * y, twice(c) * z];
-        terms.term(6, c * (twice(zz) - xx - yy), [-cx, -cy, twice(cz)]);
+        let by_z = twice(twice(c) * z);
+        terms.term(6, c * (twice(zz) - xx - yy), [-(twice(c) * x), -(twice(c) * y), by_z]);
         terms.term(7, d * x * z, [d * z, zero, d * x]);
         terms.term(8, e * (xx - yy), [twice(e) * x, -(twice(e) * y), zero]);
         if block.sh_degree > 2 {
             let [k0, k1, k2, k3, k4, k5, k6] = sh::C3;
             let three = splat(3.0);
             let in_plane = xx - yy;
-            let (xy, yz, xz) = (x * y, y * z, x * z);
+            let xy = x * y;
+            let yz = y * z;
+            let xz = x * z;
             let s = splat(k0);
             let by_x = splat(6.0 * k0) * xy;
             terms.term(9, s * y * (three * xx - yy), [by_x, three * s * in_plane, zero]);

@@ -1,5 +1,5 @@
-//! The derivatives of the projection by every camera that is not a static pinhole: one Gaussian after
-//! the other, in f64 ([`FootprintGradient::to_shape`]).
+//! The derivatives of the projection by every camera that is not a static pinhole: one Gaussian
+//! after the other, in f64 ([`FootprintGradient::to_shape`]).
 //!
 //! It differentiates the six points, also of Gaussians that are drawn by the lens' expansion: that
 //! differs from them by at most the profile's `lens_error_px`.
@@ -36,8 +36,8 @@ pub(super) fn back_project<S: Simd>(
         }
     }
     let toward = Vec3x16::from_arrays(simd, &toward_m);
-    let by_toward = color::back_project(simd, block, toward, visible, to);
-    let by_toward = [by_toward.x.to_array(), by_toward.y.to_array(), by_toward.z.to_array()];
+    let Vec3x16 { x, y, z } = color::back_project(simd, block, toward, visible, to);
+    let by_toward = [x.to_array(), y.to_array(), z.to_array()];
 
     let mut by_mean = [[0.0; LANES]; 3];
     let mut by_scale = [[0.0; LANES]; 3];

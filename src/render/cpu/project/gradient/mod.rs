@@ -27,8 +27,8 @@ pub(in crate::cpu) struct UnitGradients<'a> {
     pub(in crate::cpu) visible: &'a mut [u16],
 }
 
-/// The derivatives by 16 splats of a block, by the places of a [`Partial`]; 0 for Gaussians without a
-/// splat.
+/// The derivatives by 16 splats of a block, by the places of a [`Partial`]; 0 for Gaussians without
+/// a splat.
 struct SplatDerivatives([[f32; LANES]; partial::COUNT]);
 
 /// What the projection of a block has beside its Gaussians.

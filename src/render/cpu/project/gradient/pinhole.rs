@@ -13,9 +13,9 @@ use wildcity_scene::chunk::{Lanes, column};
 
 /// Adds the derivatives by a block of 16 Gaussians, and by the view's twist.
 ///
-/// A row of the root is `v_k = jw · r_k s_k`, with the row `jw = (f/z)(W_x - (x/z) W_z)` of J W, and
-/// the own axes r. So with `q = Σ b_k s_k r_k` of the derivatives b by the row, q is the derivative
-/// by jw, and `q × jw` the torque on the axes.
+/// A row of the root is `v_k = jw · r_k s_k`, with the row `jw = (f/z)(W_x - (x/z) W_z)` of J W,
+/// and the own axes r. So with `q = Σ b_k s_k r_k` of the derivatives b by the row, q is the
+/// derivative by jw, and `q × jw` the torque on the axes.
 #[inline(always)]
 pub(super) fn back_project<S: Simd>(
     simd: S,
@@ -48,8 +48,7 @@ pub(super) fn back_project<S: Simd>(
     let l1 = f32x16::load_array_ref(simd, &splats.l1);
     let l2 = f32x16::load_array_ref(simd, &splats.l2);
     let g = by.load(simd, partial::G);
-    let (mut uu, uv, mut vv) =
-        (by.load(simd, partial::UU), by.load(simd, partial::UV), by.load(simd, partial::VV));
+    let uv = by.load(simd, partial::UV);
     let is_shrunk = view.filter.is_shrunk();
     let antialiased = block.cutoffs.antialiased;
     let OpacityScale { total, by_before, by_native } = if antialiased || is_shrunk {
@@ -59,19 +58,26 @@ pub(super) fn back_project<S: Simd>(
     };
     // The total covariance has the inverse 2 ln2 Fᵀ F, which fits into M.
     let per_ln2 = splat(std::f64::consts::LN_2.recip());
-    uu = total.mul_add(-per_ln2, uu);
-    vv = total.mul_add(-per_ln2, vv);
-    let unit = splat(2.0 * std::f64::consts::LN_2 * std::f64::consts::LN_2);
-    let row = uu.mul_add(l1, uv * l2);
-    let by_xx = unit * l0 * l0 * uu + by_native[0];
-    let by_xy = unit * l0 * row + by_native[1];
-    let by_yy = unit * l1.mul_add(row, l2 * uv.mul_add(l1, vv * l2)) + by_native[2];
+    let uu = total.mul_add(-per_ln2, by.load(simd, partial::UU));
+    let vv = total.mul_add(-per_ln2, by.load(simd, partial::VV));
 
-    // By the rows of the root, and of J W.
+    // By the rows of the root. The derivative `2 V v` of a column v is `2 Fᵀ z` with `z = 2 ln2² M
+    // w` and `w = F v`. A needle is a thousand times longer than wide, and so is v, while V is as
+    // large as its width asks for: `v V v` would cancel to nothing, and `w z` does not.
+    let w_u = v0.scale(l0).plus(v1.scale(l1));
+    let w_v = v1.scale(l2);
+    let four = splat(4.0 * std::f64::consts::LN_2 * std::f64::consts::LN_2);
+    let z_u = w_u.scale(uu).plus(w_v.scale(uv)).scale(four);
+    let z_v = w_u.scale(uv).plus(w_v.scale(vv)).scale(four);
     let two = splat(2.0);
-    let by_v0 = v0.scale(by_xx).plus(v1.scale(by_xy)).mul_add(two, by_before[0]);
-    let by_v1 = v0.scale(by_xy).plus(v1.scale(by_yy)).mul_add(two, by_before[1]);
-    let by_ln_scale = by_v0.times(v0).plus(by_v1.times(v1));
+    let of_filter_0 =
+        v0.scale(by_native[0]).plus(v1.scale(by_native[1])).mul_add(two, by_before[0]);
+    let of_filter_1 =
+        v0.scale(by_native[1]).plus(v1.scale(by_native[2])).mul_add(two, by_before[1]);
+    let by_v0 = z_u.mul_add(l0, of_filter_0);
+    let by_v1 = z_u.mul_add(l1, z_v.mul_add(l2, of_filter_1));
+    let of_shape = w_u.times(z_u).plus(w_v.times(z_v));
+    let by_ln_scale = of_shape.plus(of_filter_0.times(v0)).plus(of_filter_1.times(v1));
     let combined = |b: Vec3x16<S>| {
         let b = b.times(scale);
         axes[0].scale(b.x).plus(axes[1].scale(b.y)).plus(axes[2].scale(b.z))
@@ -83,7 +89,8 @@ pub(super) fn back_project<S: Simd>(
     // By the centre, in the camera's axes.
     let [fx, fy] = view.focal_px.map(f64::from).map(splat);
     let two_ln2 = splat(2.0 * std::f64::consts::LN_2);
-    let (gu, gv) = (by.load(simd, partial::U), by.load(simd, partial::V));
+    let gu = by.load(simd, partial::U);
+    let gv = by.load(simd, partial::V);
     let by_mean_x = two_ln2 * l0 * gu;
     let by_mean_y = two_ln2 * l1.mul_add(gu, l2 * gv);
     let forward = Vec3x16::splat(simd, view.rotation[2]);
@@ -160,7 +167,9 @@ impl<S: Simd> OpacityScale<S> {
         let minors = v0.cross(v1);
         let det_before = minors.dot(minors);
         let native = view.filter.native_px2;
-        let (xx, xy, yy) = (v0.dot(v0), v0.dot(v1), v1.dot(v1));
+        let xx = v0.dot(v0);
+        let xy = v0.dot(v1);
+        let yy = v1.dot(v1);
         let det_native =
             splat(native.x).mul_add(yy + splat(native.y), splat(native.y).mul_add(xx, det_before));
         // A splat so wide that its determinant leaves f32 is not changed by any filter.

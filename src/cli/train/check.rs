@@ -1,0 +1,126 @@
+//! `wildcity train check`.
+
+use std::io::{self, Write};
+use std::path::PathBuf;
+
+use anyhow::{Context, ensure};
+use serde::Serialize;
+
+use wildcity_render::gradient::Differentiate;
+use wildcity_train::check::{self, Table, Time, Vectors};
+
+use crate::cli::backend_options::HardwareOptions;
+use crate::cli::progress;
+
+/// Compare the gradients of every backend on this machine with their definition.
+///
+/// The definition is the reference backend, which computes in f64 and is judged by its own
+/// differences. A row is one scene: streets by every kind of camera, and extremes such as needles
+/// and a thousand layers. A number is the largest difference of a derivative, as a share of the
+/// largest one by these parameters. With vectors that others computed, the reference and the
+/// backends are compared with these, too. Ends with 1 if a bound is exceeded.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = EXAMPLES)]
+pub(in crate::cli) struct Check {
+    /// Gradients by PyTorch: vectors.safetensors [default: gradients/vectors.safetensors in
+    /// $WILDCITY_DATA, if it is set]
+    #[arg(long, value_name = "FILE")]
+    vectors: Option<PathBuf>,
+
+    /// Also measure the time of gradients against that of images.
+    #[arg(long)]
+    time: bool,
+
+    /// Numbers of Gaussians to measure, for example 200000,500000,2000000
+    #[arg(
+        long,
+        value_name = "COUNT",
+        value_delimiter = ',',
+        default_values_t = [200_000, 500_000, 2_000_000],
+        value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..=50_000_000)
+    )]
+    gaussians: Vec<usize>,
+
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    json: bool,
+
+    #[command(flatten)]
+    hardware: HardwareOptions,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity train check
+  wildcity train check --time --gaussians 200000
+  wildcity train check --vectors vectors.safetensors --json > gradients.json";
+
+#[derive(Serialize)]
+struct Report {
+    #[serde(flatten)]
+    table: Table,
+    times: Vec<Time>,
+}
+
+impl Check {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        let cpu = self.hardware.cpu()?;
+        let backends: [&dyn Differentiate; 1] = [&cpu];
+        let in_data = || {
+            let data = std::env::var_os("WILDCITY_DATA")?;
+            Some(PathBuf::from(data).join("gradients/vectors.safetensors"))
+        };
+        let path = self.vectors.clone().or_else(in_data);
+        let read = |path: PathBuf| {
+            let bytes = std::fs::read(&path);
+            bytes.map(Vectors::new).with_context(|| format!("cannot read {}", path.display()))
+        };
+        let vectors = path.map(read).transpose()?;
+        let bar = progress::state();
+        let table = Table::new(&backends, vectors.as_ref(), &mut |done, case| {
+            bar.set_position(done as u64);
+            bar.set_message(case.to_owned());
+        })?;
+        let mut times = Vec::new();
+        if self.time {
+            for backend in backends {
+                let mut progress = |what: &str| bar.set_message(what.to_owned());
+                times.extend(check::times(backend, &self.gaussians, &mut progress)?);
+            }
+        }
+        bar.finish_and_clear();
+
+        let exceeded = table.exceeded();
+        let mut out = io::stdout().lock();
+        if self.json {
+            writeln!(out, "{}", serde_json::to_string(&Report { table, times })?)?;
+        } else {
+            write!(out, "{table}")?;
+            if vectors.is_none() {
+                writeln!(out, "without vectors of others: give --vectors, or set $WILDCITY_DATA")?;
+            }
+            print_times(&mut out, &times)?;
+        }
+        ensure!(exceeded == 0, "{exceeded} bounds are exceeded");
+        Ok(())
+    }
+}
+
+fn print_times(out: &mut impl Write, times: &[Time]) -> io::Result<()> {
+    if times.is_empty() {
+        return Ok(());
+    }
+    writeln!(out, "\nbackend  Gaussians  views            pairs     forward    backward  ratio")?;
+    for time in times {
+        let Time { backend, gaussians, size_px: [width, height], views, visible_pairs, .. } = time;
+        let views = format!("{views} x {width}x{height}");
+        writeln!(
+            out,
+            "{backend:7}  {gaussians:>9}  {views:14}  {visible_pairs:>8}  {:>7.1} ms  {:>7.1} ms  {:>5.2}",
+            time.forward_ms,
+            time.backward_ms,
+            time.backward_ms / time.forward_ms,
+        )?;
+    }
+    Ok(())
+}

@@ -1,0 +1,144 @@
+//! The gradients of this machine: every backend against the definition (`reference`), and both
+//! against vectors of others where these are.
+//!
+//! The bound of every row is [`MOST_ERROR`] of the largest derivative of its group of parameters,
+//! and a cosine of [`LEAST_COSINE`]. Extreme scenes may have their own, with the reason beside it.
+
+mod cases;
+mod times;
+mod vectors;
+
+use std::fmt;
+
+use serde::Serialize;
+use wildcity_render::compare::gradients::{GroupError, group_errors, waves};
+use wildcity_render::gradient::{Differentiate, GaussianImages, GradientError, Gradients};
+use wildcity_render::reference::Reference;
+use wildcity_render::{Frame, View};
+use wildcity_scene::{RenderProfile, Scene};
+
+pub use self::cases::cases;
+pub use self::times::{Time, times};
+pub use self::vectors::{VectorError, Vectors};
+
+/// Largest difference of a derivative as a share of the largest one of its group.
+pub const MOST_ERROR: f64 = 1e-4;
+
+/// Least cosine between two gradients of a group.
+pub const LEAST_COSINE: f64 = 0.99999;
+
+/// A scene whose gradients are compared.
+#[derive(Debug)]
+pub struct Case {
+    pub name: &'static str,
+    pub scene: Scene,
+    pub views: Vec<View>,
+    pub profile: RenderProfile,
+    /// Largest error of a row: [`MOST_ERROR`] unless the case says why not.
+    pub most_error: f64,
+}
+
+/// The gradients of one backend in one case.
+#[derive(Clone, Debug, Serialize)]
+pub struct Row {
+    pub case: &'static str,
+    pub backend: &'static str,
+    /// What they are compared with: `reference` or `vectors`.
+    pub against: &'static str,
+    pub groups: Vec<GroupError>,
+    pub most_error: f64,
+    pub is_within: bool,
+}
+
+/// The rows of all cases on all backends.
+#[derive(Clone, Debug, Serialize)]
+pub struct Table {
+    pub rows: Vec<Row>,
+}
+
+impl Row {
+    fn new(
+        case: &'static str,
+        backend: &'static str,
+        against: &'static str,
+        groups: Vec<GroupError>,
+        most_error: f64,
+    ) -> Self {
+        // Written so that a NaN is not within.
+        let holds = |group: &GroupError| group.error <= most_error && group.cosine >= LEAST_COSINE;
+        let is_within = groups.iter().all(holds);
+        Self { case, backend, against, groups, most_error, is_within }
+    }
+}
+
+impl Table {
+    /// Compares some backends with the reference in all cases, and with the vectors, if there are
+    /// any. `progress` is called with the number of cases done and the next one's name.
+    ///
+    /// # Errors
+    /// A backend does not compute gradients, or the vectors cannot be read.
+    pub fn new(
+        backends: &[&dyn Differentiate],
+        vectors: Option<&Vectors>,
+        progress: &mut dyn FnMut(usize, &str),
+    ) -> Result<Self, CheckError> {
+        let mut rows = Vec::new();
+        if let Some(vectors) = vectors {
+            progress(0, "vectors");
+            rows.extend(vectors.rows(backends)?);
+        }
+        for (done, case) in cases().into_iter().enumerate() {
+            progress(done, case.name);
+            let truth = case.gradients(&Reference)?;
+            for backend in backends {
+                let groups = group_errors(&case.gradients(*backend)?, &truth);
+                let row = Row::new(case.name, backend.name(), "reference", groups, case.most_error);
+                rows.push(row);
+            }
+        }
+        Ok(Self { rows })
+    }
+
+    /// Rows that exceed their bound.
+    pub fn exceeded(&self) -> usize {
+        self.rows.iter().filter(|row| !row.is_within).count()
+    }
+}
+
+impl Case {
+    fn gradients(&self, backend: &dyn Differentiate) -> Result<Gradients, GradientError> {
+        let mut gradients = Gradients::default();
+        let frame = Frame { scene: &self.scene, profile: &self.profile, views: &self.views };
+        let mut loss = |images: &[GaussianImages]| waves(images);
+        backend.differentiate(&frame, true, &mut loss, &mut gradients)?;
+        Ok(gradients)
+    }
+}
+
+impl fmt::Display for Table {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:22}  {:9}  {:9}", "case", "backend", "against")?;
+        for group in ["mean", "scale", "quat", "opacity", "sh", "twist"] {
+            write!(f, "  {group:>7}")?;
+        }
+        writeln!(f, "  bound")?;
+        for row in &self.rows {
+            write!(f, "{:22}  {:9}  {:9}", row.case, row.backend, row.against)?;
+            for group in &row.groups {
+                write!(f, "  {:7.0e}", group.error)?;
+            }
+            let verdict = if row.is_within { "" } else { "  EXCEEDED" };
+            writeln!(f, "  {:.0e}{verdict}", row.most_error)?;
+        }
+        Ok(())
+    }
+}
+
+/// Why the gradients were not compared.
+#[derive(Debug, thiserror::Error)]
+pub enum CheckError {
+    #[error(transparent)]
+    Gradient(#[from] GradientError),
+    #[error(transparent)]
+    Vectors(#[from] VectorError),
+}
