@@ -171,25 +171,34 @@ impl Chunk {
         assert_eq!(lanes.width(), width, "lanes of another degree");
         assert_eq!(lanes.len(), count.div_ceil(LANES), "lanes of another count");
         let mut clusters = Vec::with_capacity(count.div_ceil(CLUSTER));
-        // How many Gaussians are left from this group on: lanes from `left` on are padding.
-        let mut left = count;
-        for of_cluster in lanes.clusters_mut() {
-            let mut bounds = LaneBounds::EMPTY;
-            for group in of_cluster.chunks_exact_mut(width) {
-                let mut drawable = drawable_lanes(group);
-                drawable.iter_mut().skip(left).for_each(|drawable| *drawable = false);
-                left = left.saturating_sub(LANES);
-                bounds.add(group, &drawable);
-                for lane in (0..LANES).filter(|&lane| !drawable[lane]) {
-                    group.iter_mut().for_each(|lanes| lanes.0[lane] = 0.0);
-                    // Zeros are finite, so that vector code may compute with this lane; an opacity
-                    // of minus infinity makes its contribution exactly 0.
-                    group[column::LOG2_OPACITY].0[lane] = f32::NEG_INFINITY;
-                }
-            }
-            clusters.push(bounds.cluster());
+        for (index, lanes) in lanes.clusters_mut().iter_mut().enumerate() {
+            clusters.push(bounded(lanes, width, count - CLUSTER * index));
         }
         Self { cell, origin_m, sh_degree, count, lanes, clusters }
+    }
+
+    /// Writes Gaussians anew in place, as a trainer does after each step: cluster by cluster, in
+    /// parallel. `write` gets the lane groups of a cluster and its own of `states`, and returns
+    /// whether it has changed any; the bounds of a cluster follow. Gaussians that cannot be drawn
+    /// are emptied, as by [`Chunk::push_activated`].
+    ///
+    /// # Panics
+    /// If there is not one state for each cluster.
+    pub fn rewrite<T: Send>(
+        &mut self,
+        states: Vec<T>,
+        write: impl Fn(T, &mut [Lanes]) -> bool + Sync,
+    ) {
+        assert_eq!(states.len(), self.clusters.len(), "states of another number of clusters");
+        let width = columns(self.sh_degree);
+        let count = self.count;
+        let pages = self.lanes.clusters_mut().par_iter_mut();
+        let clusters = pages.zip(&mut self.clusters).zip(states).enumerate();
+        clusters.for_each(|(index, ((lanes, cluster), state))| {
+            if write(state, lanes) {
+                *cluster = bounded(lanes, width, count - CLUSTER * index);
+            }
+        });
     }
 
     /// Activates one Gaussian and appends it.
@@ -351,6 +360,25 @@ impl Chunk {
     pub fn bytes(&self) -> usize {
         self.lanes.bytes() + self.clusters.capacity() * size_of::<Cluster>()
     }
+}
+
+/// The bounds of the first `count` Gaussians of a cluster, of which those that cannot be drawn are
+/// emptied, as are the lanes after them.
+fn bounded(lanes: &mut [Lanes], width: usize, count: usize) -> Cluster {
+    let mut bounds = LaneBounds::EMPTY;
+    for (group, lanes) in lanes.chunks_exact_mut(width).enumerate() {
+        let mut drawable = drawable_lanes(lanes);
+        let filled = count.saturating_sub(group * LANES);
+        drawable.iter_mut().skip(filled).for_each(|drawable| *drawable = false);
+        bounds.add(lanes, &drawable);
+        for lane in (0..LANES).filter(|&lane| !drawable[lane]) {
+            lanes.iter_mut().for_each(|lanes| lanes.0[lane] = 0.0);
+            // Zeros are finite, so that vector code may compute with this lane; an opacity of minus
+            // infinity makes its contribution exactly 0.
+            lanes[column::LOG2_OPACITY].0[lane] = f32::NEG_INFINITY;
+        }
+    }
+    bounds.cluster()
 }
 
 /// Bounds of every sixteenth Gaussian of a cluster: lane by lane, so that the compiler makes vector

@@ -177,9 +177,9 @@ impl LanePages {
         &mut self.pages[group / PAGE_GROUPS][first..first + self.width]
     }
 
-    /// The lane groups of each cluster.
-    pub(super) fn clusters_mut(&mut self) -> impl Iterator<Item = &mut [Lanes]> {
-        self.pages.iter_mut().map(Vec::as_mut_slice)
+    /// The lane groups of each cluster, in order.
+    pub(super) fn clusters_mut(&mut self) -> &mut [Page] {
+        &mut self.pages
     }
 
     /// Memory that the pages and their list take, in bytes.

@@ -69,12 +69,14 @@ pub fn compose<T: Real>(
     background: Background<'_, T>,
     exposure: &Exposure<T>,
 ) -> Vec<T> {
-    let pixel = |pixel: usize| {
+    let mut image = vec![T::zero(); rgb.len()];
+    for (pixel, to) in image.chunks_exact_mut(3).enumerate() {
         let shows = T::one() - opacity[pixel];
         let behind = background.rgb(pixel);
-        exposure.apply(std::array::from_fn(|c| rgb[3 * pixel + c] + shows * behind[c]))
-    };
-    (0..opacity.len()).flat_map(pixel).collect()
+        let before = std::array::from_fn(|c| rgb[3 * pixel + c] + shows * behind[c]);
+        to.copy_from_slice(&exposure.apply(before));
+    }
+    image
 }
 
 /// The derivatives of a loss by all that [`compose`] takes, given those by its image.

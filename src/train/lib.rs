@@ -4,6 +4,10 @@
 //! |---|---|
 //! | [`check`] | the gradients of this machine against their definition |
 //! | [`loss`] | losses of images, depths and Gaussians, each with its derivatives |
+//! | [`trainer`] | a run: one image a step |
+//! | [`model`] | the Gaussians of a run, and Adam |
+//! | [`settings`] | the settings of a run |
+//! | `growth` | relocation and growth by Markov chain Monte Carlo |
 //! | [`compose`] | from the Gaussians' images to the camera's: background or sky, and exposure |
 //!
 //! The renderer differentiates the images of the Gaussians ([`wildcity_render::gradient`]); all
@@ -12,4 +16,8 @@
 
 pub mod check;
 pub mod compose;
+mod growth;
 pub mod loss;
+pub mod model;
+pub mod settings;
+pub mod trainer;

@@ -10,4 +10,5 @@ mod scene_files;
 
 mod check;
 mod losses;
+mod training;
 mod vectors;

@@ -1,0 +1,234 @@
+//! Retrains the demo street from its own images, and writes the same images and points for another
+//! program to train on.
+//!
+//! ```text
+//! cargo run --release -p wildcity-train --example street -- STEPS [SCALE] [EXPORT]
+//! ```
+//!
+//! There are 34 keyframes of six cameras, 3 m apart; every eighth keyframe is held out. The sky of
+//! the images is learned as a shell of Gaussians, 400 m away.
+
+#![allow(clippy::print_stdout, reason = "its result")]
+
+use std::collections::HashMap;
+use std::error::Error;
+use std::f64::consts::{PI, TAU};
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::time::Instant;
+
+use glam::DVec3;
+use wildcity_generate::StreetSettings;
+use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_render::{Backend, Frame, Target, View};
+use wildcity_scene::random::Random;
+use wildcity_scene::{Gaussians, RenderProfile, Rig, Scene, sh};
+use wildcity_train::settings::{Growth, Settings};
+use wildcity_train::trainer::{Sample, Trainer};
+
+/// An image of the street.
+struct Recorded {
+    view: View,
+    rgb8: Vec<u8>,
+    rgb: Vec<f32>,
+    is_held_out: bool,
+}
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let steps: usize = arguments.first().map_or("1500", String::as_str).parse()?;
+    let scale: f64 = arguments.get(1).map_or("0.25", String::as_str).parse()?;
+    let cpu = Cpu::new(0, Simd::Best)?;
+    let street = wildcity_generate::street(&StreetSettings::default())?;
+    let truth = Scene::from_gaussians(&street.gaussians);
+    let images = record(&cpu, &truth, &street.trajectory, scale)?;
+    let points = start(&street.gaussians, &images);
+    if let Some(path) = arguments.get(2) {
+        export(path, &images, &points)?;
+    }
+
+    let growth = Growth { cap: 150_000, from: 500, until: 24_000, ..Growth::default() };
+    let settings = Settings { steps, growth, ..Settings::default() };
+    let train: Vec<&Recorded> = images.iter().filter(|image| !image.is_held_out).collect();
+    let held_out: Vec<&Recorded> = images.iter().filter(|image| image.is_held_out).collect();
+    println!("{} images, {} held out, {} points", train.len(), held_out.len(), points.len());
+    let mut trainer = Trainer::new(points, RenderProfile::default(), settings)?;
+    let begin = Instant::now();
+    let mut measured_s = 0.0;
+    while trainer.steps_done() < steps {
+        let image = train[trainer.next_image(train.len())];
+        let sample = Sample {
+            view: image.view,
+            rgb: &image.rgb,
+            weights: None,
+            depth_m: None,
+            background: [0.0; 3],
+        };
+        let report = trainer.step(&cpu, &sample)?;
+        let step = trainer.steps_done();
+        if step.is_multiple_of(250) || step == steps {
+            let pause = Instant::now();
+            let scene = trainer.model().scene();
+            let sum_db: f64 = held_out.iter().map(|image| psnr(&cpu, scene, image)).sum();
+            let db = sum_db / held_out.len() as f64;
+            measured_s += pause.elapsed().as_secs_f64();
+            println!(
+                "step {step:5}  {db:.2} dB held out  l1 {:.4}  {} Gaussians  {:.1} s",
+                report.l1,
+                trainer.model().len(),
+                begin.elapsed().as_secs_f64() - measured_s
+            );
+        }
+    }
+    Ok(())
+}
+
+fn record(
+    cpu: &Cpu,
+    scene: &Scene,
+    drive: &wildcity_scene::Trajectory,
+    scale: f64,
+) -> Result<Vec<Recorded>, Box<dyn Error>> {
+    let rig = Rig::preset("vehicle6").ok_or("no rig")?;
+    let mut images = Vec::new();
+    for keyframe in 0..34 {
+        // Three metres apart, in the middle of the drive.
+        let station_m = 0.5 * drive.length_m() + 3.0 * (f64::from(keyframe) - 16.5);
+        let world_from_rig = drive.at_station(station_m);
+        for mut view in View::from_rig(&rig.cameras, world_from_rig) {
+            let side = |px: u32| (f64::from(px) * scale).round() as u64;
+            view.camera =
+                view.camera.scaled(side(view.camera.width_px), side(view.camera.height_px))?;
+            view.rolling_shutter = None;
+            let mut rgb8 = vec![0; 3 * view.camera.pixels()];
+            let profile =
+                RenderProfile { background: [0.55, 0.68, 0.85], ..RenderProfile::default() };
+            let frame = Frame { scene, profile: &profile, views: &[view] };
+            let target = Target { rgb8: Some(&mut rgb8), ..Target::default() };
+            cpu.render(&frame, &mut [target], &|_, _| {})?;
+            let rgb = rgb8.iter().map(|&value| f32::from(value) / 255.0).collect();
+            // Photographs of this size: what they are trained as.
+            view.camera.native_size_px = None;
+            images.push(Recorded { view, rgb8, rgb, is_held_out: keyframe % 8 == 4 });
+        }
+    }
+    Ok(images)
+}
+
+/// A tenth of a million points of the street, moved by 3 cm, and the shell of the sky.
+fn start(truth: &Gaussians, images: &[Recorded]) -> Gaussians {
+    let mut random = Random::new(0, "points", 0);
+    let near = |mean_m: &DVec3| {
+        images
+            .iter()
+            .step_by(72)
+            .any(|image| image.view.world_from_camera.position_m.distance(*mean_m) < 90.0)
+    };
+    let mut order: Vec<usize> =
+        (0..truth.len()).filter(|&i| near(&DVec3::from_array(truth.means_m[i]))).collect();
+    for k in (1..order.len()).rev() {
+        order.swap(k, random.below(k + 1));
+    }
+    order.truncate(94_000);
+    let mut points: Vec<(DVec3, [f64; 3])> = Vec::new();
+    for i in order {
+        let mut noise = || (0..12).map(|_| random.unit()).sum::<f64>() - 6.0;
+        let moved_m = 0.03 * DVec3::new(noise(), noise(), noise());
+        let rgb = [0, 1, 2].map(|c| (0.5 + sh::C0 * f64::from(truth.sh_at(i)[c])).clamp(0.0, 1.0));
+        points.push((DVec3::from_array(truth.means_m[i]) + moved_m, rgb));
+    }
+    let scales_m = neighbour_distances(&points);
+    let mut gaussians = Gaussians::with_capacity(0, points.len());
+    let mut push = |mean_m: DVec3, rgb: [f64; 3], scale_m: f64| {
+        gaussians.means_m.push(mean_m.to_array());
+        gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+        gaussians.ln_scales.push([scale_m.ln() as f32; 3]);
+        gaussians.logit_opacities.push((0.1_f32 / 0.9).ln());
+        gaussians.sh.extend(rgb.map(|value| ((value - 0.5) / sh::C0) as f32));
+    };
+    for ((mean_m, rgb), scale_m) in points.into_iter().zip(scales_m) {
+        push(mean_m, rgb, scale_m);
+    }
+    let middle = images.iter().map(|image| image.view.world_from_camera.position_m).sum::<DVec3>()
+        / images.len() as f64;
+    let count = 6_000.0;
+    for k in 0..6_000 {
+        let z = 1.0 - (f64::from(k) + 0.5) / count;
+        let angle = PI * (1.0 + 5.0_f64.sqrt()) * (f64::from(k) + 0.5);
+        let across = (1.0 - z * z).sqrt();
+        let direction = DVec3::new(across * angle.cos(), across * angle.sin(), z);
+        push(middle + 400.0 * direction, [0.6, 0.7, 0.85], 400.0 * (TAU / count).sqrt() * 0.6);
+    }
+    gaussians
+}
+
+/// The mean distance of each point to its three nearest neighbours, in cells of 0.5 m.
+fn neighbour_distances(points: &[(DVec3, [f64; 3])]) -> Vec<f64> {
+    let cell = |at_m: DVec3| (at_m / 0.5).floor().as_ivec3().to_array();
+    let mut cells: HashMap<[i32; 3], Vec<usize>> = HashMap::new();
+    for (i, (at_m, _)) in points.iter().enumerate() {
+        cells.entry(cell(*at_m)).or_default().push(i);
+    }
+    let distance = |(i, (at_m, _)): (usize, &(DVec3, [f64; 3]))| {
+        let [x, y, z] = cell(*at_m);
+        let mut near: Vec<f64> = Vec::new();
+        for shift in 0..27 {
+            let at = [x + shift % 3 - 1, y + shift / 3 % 3 - 1, z + shift / 9 - 1];
+            let others = cells.get(&at).into_iter().flatten().take(60);
+            near.extend(others.filter(|&&k| k != i).map(|&k| points[k].0.distance(*at_m)));
+        }
+        near.sort_by(f64::total_cmp);
+        near.truncate(3);
+        let mean = near.iter().sum::<f64>() / near.len().max(1) as f64;
+        if near.is_empty() { 0.5 } else { mean.clamp(0.003, 1.0) }
+    };
+    points.iter().enumerate().map(distance).collect()
+}
+
+fn psnr(cpu: &Cpu, scene: &Scene, image: &Recorded) -> f64 {
+    let mut rgb8 = vec![0; image.rgb8.len()];
+    let frame = Frame { scene, profile: &RenderProfile::default(), views: &[image.view] };
+    let target = Target { rgb8: Some(&mut rgb8), ..Target::default() };
+    if cpu.render(&frame, &mut [target], &|_, _| {}).is_err() {
+        return 0.0;
+    }
+    let square = |(a, b): (&u8, &u8)| (f64::from(*a) - f64::from(*b)).powi(2) / (255.0 * 255.0);
+    let sum: f64 = rgb8.iter().zip(&image.rgb8).map(square).sum();
+    -10.0 * (sum / rgb8.len() as f64).log10()
+}
+
+/// Images and points for the prototype of the project's design.
+fn export(path: &str, images: &[Recorded], points: &Gaussians) -> Result<(), Box<dyn Error>> {
+    let mut file = BufWriter::new(File::create(path)?);
+    let mut words = |words: &[u32]| -> std::io::Result<()> {
+        words.iter().try_for_each(|word| file.write_all(&word.to_le_bytes()))
+    };
+    words(&[images.len() as u32, points.len() as u32])?;
+    let floats = |values: &[f64]| values.iter().map(|&v| (v as f32).to_bits()).collect::<Vec<_>>();
+    let mut parts: Vec<(Vec<u32>, &[u8])> = Vec::new();
+    for image in images {
+        let camera = &image.view.camera;
+        let mut head = vec![camera.width_px, camera.height_px, image.is_held_out.into()];
+        let p = camera.pinhole;
+        head.extend(floats(&[p.fx, p.fy, p.cx, p.cy]));
+        let camera_from_world = image.view.world_from_camera.inverse();
+        let rows = camera_from_world.rotation_matrix().transpose().to_cols_array();
+        head.extend(floats(&rows));
+        head.extend(floats(&camera_from_world.position_m.to_array()));
+        parts.push((head, &image.rgb8));
+    }
+    for (head, pixels) in parts {
+        for word in head {
+            file.write_all(&word.to_le_bytes())?;
+        }
+        file.write_all(pixels)?;
+    }
+    for i in 0..points.len() {
+        let rgb = [0, 1, 2].map(|c| 0.5 + sh::C0 * f64::from(points.sh_at(i)[c]));
+        let scale_m = f64::from(points.ln_scales[i][0]).exp();
+        for word in floats(&[&points.means_m[i][..], &rgb, &[scale_m]].concat()) {
+            file.write_all(&word.to_le_bytes())?;
+        }
+    }
+    Ok(())
+}

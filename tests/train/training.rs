@@ -1,0 +1,100 @@
+//! Runs: Gaussians that learn the images of others.
+
+use glam::DVec3;
+use wildcity_render::compare::gaussians::forward_view;
+use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_render::gradient::{Differentiate, GaussianImages, Gradients};
+use wildcity_render::{Frame, View};
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::{Gaussians, RenderProfile, Scene};
+use wildcity_train::settings::{Growth, Settings};
+use wildcity_train::trainer::{Sample, Trainer};
+
+use crate::scene_files::Random;
+
+/// A wall of coloured patches 5 m ahead, seen from places before it.
+fn wall() -> (Gaussians, Vec<View>) {
+    let mut random = Random(3);
+    let mut gaussians = Gaussians::with_capacity(0, 400);
+    for _ in 0..400 {
+        gaussians.means_m.push([6.0 * random.unit() - 3.0, 4.0 * random.unit() - 2.0, 5.0]);
+        gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+        gaussians.ln_scales.push([random.between(-2.5, -1.0), random.between(-2.5, -1.0), -4.0]);
+        gaussians.logit_opacities.push(random.between(0.0, 4.0));
+        gaussians.sh.extend((0..3).map(|_| random.between(-1.5, 1.5)));
+    }
+    let view = forward_view([80, 60], 70.0);
+    let views = (0..9).map(|k| {
+        let position_m =
+            DVec3::new(0.3 * f64::from(k % 3) - 0.3, 0.3 * f64::from(k / 3) - 0.3, 0.0);
+        View { world_from_camera: Pose { position_m, ..view.world_from_camera }, ..view }
+    });
+    (gaussians, views.collect())
+}
+
+/// The image of a view on black.
+fn image(cpu: &Cpu, scene: &Scene, view: View) -> Vec<f32> {
+    let mut rgb = Vec::new();
+    let frame = Frame { scene, profile: &RenderProfile::default(), views: &[view] };
+    let mut keep = |images: &[GaussianImages]| {
+        rgb = images[0].rgb.clone();
+        images.to_vec()
+    };
+    cpu.differentiate(&frame, false, &mut keep, &mut Gradients::default()).expect("an image");
+    rgb
+}
+
+fn psnr(a: &[f32], b: &[f32]) -> f64 {
+    let square: f64 = a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum();
+    -10.0 * (square / a.len() as f64).log10()
+}
+
+/// A run from points near the wall; the PSNR of the view that was held out, and the Gaussians.
+fn run(threads: usize, steps: usize) -> (f64, Gaussians) {
+    let cpu = Cpu::new(threads, Simd::Best).unwrap();
+    let (truth, views) = wall();
+    let scene = Scene::from_gaussians(&truth);
+    let images: Vec<Vec<f32>> = views.iter().map(|view| image(&cpu, &scene, *view)).collect();
+    let mut random = Random(8);
+    let mut start = Gaussians::with_capacity(0, 300);
+    for _ in 0..300 {
+        let mut near = |m: f64| m + 0.2 * (random.unit() - 0.5);
+        start.means_m.push([near(0.0) * 30.0, near(0.0) * 20.0, near(5.0)]);
+        start.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+        start.ln_scales.push([-2.0; 3]);
+        start.logit_opacities.push(-1.0);
+        start.sh.extend([0.0; 3]);
+    }
+    let growth = Growth { cap: 600, from: 1_500, noise: 50.0, ..Growth::default() };
+    let settings = Settings { steps, sh_degree: 1, growth, ..Settings::default() };
+    let mut trainer = Trainer::new(start, RenderProfile::default(), settings).unwrap();
+    for _ in 0..steps {
+        // The middle one is held out.
+        let mut place = trainer.next_image(8);
+        place += usize::from(place >= 4);
+        let (weights, depth_m) = (None, None);
+        let background = [0.0; 3];
+        let sample =
+            Sample { view: views[place], rgb: &images[place], weights, depth_m, background };
+        trainer.step(&cpu, &sample).expect("a step");
+    }
+    let seen = image(&cpu, trainer.model().scene(), views[4]);
+    (psnr(&seen, &images[4]), trainer.model().to_gaussians())
+}
+
+#[test]
+fn gaussians_learn_the_images_of_others() {
+    let [(before_db, _), (after_db, gaussians)] = [run(0, 1), run(0, 600)];
+    eprintln!("held out: {before_db:.1} dB, then {after_db:.1} dB, {} Gaussians", gaussians.len());
+    assert!(before_db < 15.0 && after_db > 24.0, "{before_db} {after_db}");
+    assert!((350..=600).contains(&gaussians.len()), "{}", gaussians.len());
+}
+
+#[test]
+fn a_run_is_the_same_at_any_number_of_threads() {
+    let (_, one) = run(1, 150);
+    for threads in [2, 4] {
+        let (_, other) = run(threads, 150);
+        assert!(one == other, "{threads} threads");
+    }
+}
