@@ -122,7 +122,7 @@ pub struct SettingError {
 }
 
 impl Settings {
-    /// Checks every field.
+    /// Checks that every field is in its range.
     ///
     /// # Errors
     /// The first field out of its range.

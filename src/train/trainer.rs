@@ -25,7 +25,7 @@ pub struct Sample<'a> {
     pub background: [f32; 3],
 }
 
-/// A training run.
+/// A training run: its Gaussians, and how far it is.
 #[derive(Debug)]
 pub struct Trainer {
     settings: Settings,
@@ -42,7 +42,7 @@ pub struct StepReport {
     pub dssim: f64,
     /// In 1/m; 0 without measured depths.
     pub disparity: f64,
-    /// Visible Gaussians.
+    /// Number of visible Gaussians.
     pub visible: u64,
 }
 
