@@ -38,6 +38,7 @@ fn case(name: &'static str, scene: Scene, view: View) -> Case {
 /// A street by every kind of camera.
 fn streets() -> Vec<Case> {
     let view = forward_view(SIZE_PX, 60.0);
+    let small = forward_view([48, 32], 30.0);
     let street = |sh_degree| Scene::from_gaussians(&street(1_200, sh_degree));
     let with_lens = |lens| View { camera: Camera { lens, ..view.camera }, ..view };
     let opencv = OpenCv::new([-0.12, 0.03, -0.002, 0.0, 0.0, 0.0], [0.0015, -0.001], [0.0; 4]);
@@ -76,6 +77,8 @@ fn streets() -> Vec<Case> {
     vec![
         case("pinhole, SH 0", street(0), view),
         case("pinhole, SH 3", street(3), view),
+        // More than one segment of splats, whose sums are gathered apart.
+        case("60,000 Gaussians", Scene::from_gaussians(&self::street(60_000, 0)), small),
         Case { profile: antialiased, ..case("antialiased", street(1), view) },
         Case { profile: antialiased, ..case("half size", street(1), half(view)) },
         Case { views: six, ..case("six views", street(1), view) },
