@@ -14,7 +14,7 @@ use wildcity_render::stage::Stage;
 
 /// `--backend` and `--cpu-through`, for commands that examine the renderer.
 #[derive(Clone, Debug, clap::Args)]
-pub(super) struct RendererOptions {
+pub struct RendererOptions {
     #[command(flatten)]
     backend: BackendOptions,
 
@@ -28,7 +28,7 @@ pub(super) struct RendererOptions {
 
 /// `--backend`, and the hardware that it runs on.
 #[derive(Clone, Debug, clap::Args)]
-pub(super) struct BackendOptions {
+pub struct BackendOptions {
     /// Backend that renders.
     #[arg(long, value_enum, default_value_t)]
     backend: BackendName,
@@ -39,7 +39,7 @@ pub(super) struct BackendOptions {
 
 /// The hardware that the backends run on.
 #[derive(Clone, Debug, clap::Args)]
-pub(super) struct HardwareOptions {
+pub struct HardwareOptions {
     /// Render threads; 0 for one per core. Pixels do not depend on it.
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = threads)]
     threads: usize,
@@ -122,7 +122,7 @@ impl From<SimdName> for Simd {
 
 impl BackendOptions {
     /// Creates the backend. If it is chosen automatically, prints the choice on standard error.
-    pub(super) fn backend(&self) -> anyhow::Result<Box<dyn Backend>> {
+    pub fn backend(&self) -> anyhow::Result<Box<dyn Backend>> {
         let HardwareOptions { threads, device, simd, .. } = &self.hardware;
         match (self.backend, device) {
             (BackendName::Auto, None) => {
@@ -142,7 +142,7 @@ impl BackendOptions {
     }
 
     /// Creates the backend that rendered a recording, unless `--backend` names another one.
-    pub(super) fn replay_backend(&self, recorded: &str) -> anyhow::Result<Box<dyn Backend>> {
+    pub fn replay_backend(&self, recorded: &str) -> anyhow::Result<Box<dyn Backend>> {
         let recorded = BackendName::from_str(recorded, false);
         match (self.backend, recorded) {
             (BackendName::Auto, Ok(backend)) => Self { backend, ..self.clone() }.backend(),
@@ -153,12 +153,12 @@ impl BackendOptions {
 
 impl HardwareOptions {
     /// Creates the cpu backend.
-    pub(super) fn cpu(&self) -> anyhow::Result<Cpu> {
+    pub fn cpu(&self) -> anyhow::Result<Cpu> {
         Ok(Cpu::new(self.threads, self.simd.into())?)
     }
 
     /// Creates the gpu backend.
-    pub(super) fn gpu(&self) -> anyhow::Result<Gpu> {
+    pub fn gpu(&self) -> anyhow::Result<Gpu> {
         let choice = self.device.clone().map_or(AdapterChoice::Best, AdapterChoice::Named);
         Ok(Gpu::with_limits(&choice, self.threads, self.memory_limits())?)
     }
@@ -173,7 +173,7 @@ impl HardwareOptions {
 
 impl RendererOptions {
     /// Creates the backend.
-    pub(super) fn backend(&self) -> anyhow::Result<Box<dyn Backend>> {
+    pub fn backend(&self) -> anyhow::Result<Box<dyn Backend>> {
         let BackendOptions { backend, hardware } = &self.backend;
         match (self.cpu_through, backend) {
             (None, _) => self.backend.backend(),
@@ -196,7 +196,7 @@ fn threads(text: &str) -> Result<usize, String> {
 }
 
 /// Parses a number of GiB.
-pub(super) fn gib(text: &str) -> Result<f64, String> {
+pub fn gib(text: &str) -> Result<f64, String> {
     match text.parse() {
         Ok(gib) if gib > 0.0 && gib <= 65_536.0 => Ok(gib),
         _ => Err("expected GiB above 0 and up to 65536, for example 2 or 0.5".to_owned()),
@@ -204,6 +204,6 @@ pub(super) fn gib(text: &str) -> Result<f64, String> {
 }
 
 /// GiB in bytes.
-pub(super) fn bytes_of_gib(gib: f64) -> u64 {
+pub fn bytes_of_gib(gib: f64) -> u64 {
     (gib * f64::from(1 << 30)) as u64
 }

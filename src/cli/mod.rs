@@ -15,29 +15,28 @@ use std::process::ExitCode;
 mod actor;
 mod alpasim;
 mod augment;
-mod backend_options;
-mod bench;
+pub mod backend_options;
 mod bisect;
 mod demo;
 mod devices;
-mod directories;
+pub mod directories;
 mod doctor;
 mod drive;
 mod episode;
 mod eval;
-mod exit;
+pub mod exit;
 mod file_notes;
 mod import;
 mod input_files;
 mod inspect;
-mod limits;
+pub mod limits;
 mod lod;
 mod map;
-mod output;
+pub mod output;
 mod packed_folder;
 mod placement;
 mod profile_options;
-mod progress;
+pub mod progress;
 mod push;
 mod real_images;
 mod render;
@@ -48,7 +47,7 @@ mod report;
 mod rig;
 mod route;
 mod scenario;
-mod scene_source;
+pub mod scene_source;
 mod serve;
 mod sky_source;
 mod stress;
@@ -98,12 +97,21 @@ enum Command {
     Route(route::Route),
     Scenario(scenario::ScenarioCommand),
     Map(map::MapCommand),
-    Bench(bench::Bench),
+    /// Moved to the program `wildcity-bench`.
+    #[command(hide = true, disable_help_flag = true)]
+    Bench(Moved),
     Bisect(bisect::Bisect),
     Stress(stress::Stress),
     Report(report::Command),
     Devices(devices::Devices),
     Doctor(doctor::Doctor),
+}
+
+/// The arguments of a command that is elsewhere.
+#[derive(Debug, clap::Args)]
+struct Moved {
+    #[arg(trailing_var_arg = true, allow_hyphen_values = true, hide = true)]
+    _arguments: Vec<String>,
 }
 
 /// Parses the command line, runs the command, and returns the exit code: 0 for success, 1 for a
@@ -133,26 +141,22 @@ pub fn main() -> ExitCode {
         Command::Route(command) => command.run(),
         Command::Scenario(command) => command.run(),
         Command::Map(command) => command.run(),
-        Command::Bench(command) => command.run(),
+        Command::Bench(_) => Err(anyhow::anyhow!(
+            "wildcity bench is a program of its own: in the source of wildcity, run cargo run \
+             --release -p wildcity-bench -- and the arguments after \"bench\""
+        )),
         Command::Bisect(command) => command.run(),
         Command::Stress(command) => command.run(),
         Command::Report(command) => command.run(),
         Command::Devices(command) => command.run(),
         Command::Doctor(command) => command.run(),
     };
-    match result {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            let exit = error.downcast_ref::<exit::Exit>();
-            if exit.is_some_and(|exit| exit.is_finding) {
-                eprintln!("{error}");
-            } else {
-                eprintln!("error: {}", exit::chain(&error));
-            }
-            exit.map_or(ExitCode::FAILURE, |exit| exit.code.into())
-        }
-    }
+    exit::code(result)
 }
+
+#[cfg(test)]
+#[path = "../../tests/support/help.rs"]
+mod help;
 
 #[cfg(test)]
 mod tests {
@@ -160,39 +164,15 @@ mod tests {
 
     use super::*;
 
-    /// The commands without subcommands, each with the words that select it.
-    fn leaf_commands(command: &clap::Command, path: &str) -> Vec<(String, clap::Command)> {
-        let path = format!("{path}{} ", command.get_name());
-        let mut leaves: Vec<_> =
-            command.get_subcommands().flat_map(|sub| leaf_commands(sub, &path)).collect();
-        if leaves.is_empty() {
-            leaves.push((path.trim_end().to_owned(), command.clone()));
-        }
-        leaves
-    }
-
-    fn all_leaves() -> Vec<(String, clap::Command)> {
-        leaf_commands(&Arguments::command(), "")
-    }
-
     #[test]
     fn every_command_and_option_is_explained_and_has_an_example() {
-        let leaves = all_leaves();
-        assert!(leaves.len() > 25, "{} commands", leaves.len());
-        for (path, command) in leaves {
-            let after = command.get_after_long_help().map(ToString::to_string).unwrap_or_default();
-            assert!(command.get_about().is_some(), "{path} has no description");
-            assert!(after.contains(&path) && after.contains("Example"), "{path} has no example");
-            for argument in command.get_arguments() {
-                assert!(argument.get_help().is_some(), "{path}: {} has no help", argument.get_id());
-            }
-        }
+        help::check(&Arguments::command(), 60);
     }
 
     #[test]
     fn profile_is_a_file_and_set_is_a_field_on_every_command() {
         let mut counts = [0; 2];
-        for (path, command) in all_leaves() {
+        for (path, command) in help::leaf_commands(&Arguments::command()) {
             for argument in command.get_arguments() {
                 let names = argument.get_value_names().unwrap_or_default();
                 let names: Vec<&str> = names.iter().map(|name| name.as_str()).collect();
@@ -205,12 +185,7 @@ mod tests {
                 assert_eq!(names, expected.1, "{path} --{}", argument.get_long().unwrap());
             }
         }
-        // serve, import, render, eval, bench step, bisect; and push instead of serve.
-        assert_eq!(counts, [6, 6]);
-    }
-
-    #[test]
-    fn the_arguments_are_consistent() {
-        Arguments::command().debug_assert();
+        // serve, import, render, eval, bisect; and push instead of serve.
+        assert_eq!(counts, [5, 5]);
     }
 }

@@ -21,7 +21,7 @@ use super::progress;
 
 /// A scene, a list of cameras, and changes of the render profile, on the command line.
 #[derive(Debug, clap::Args)]
-pub(super) struct SceneSource {
+pub struct SceneSource {
     /// A scene file in any format that `wildcity import` reads, or the name of a twin: NAME, or
     /// NAME@NUMBER for an older version.
     #[arg(value_name = "SCENE")]
@@ -44,20 +44,20 @@ pub(super) struct SceneSource {
 }
 
 /// A scene and the images of it that a rendering command makes.
-pub(super) struct LoadedScene {
+pub struct LoadedScene {
     source: Source,
-    pub(super) shots: Vec<Shot>,
+    pub shots: Vec<Shot>,
 }
 
 /// A named camera and the profile that it is rendered with.
-pub(super) struct Shot {
-    pub(super) name: String,
-    pub(super) view: View,
-    pub(super) profile: RenderProfile,
+pub struct Shot {
+    pub name: String,
+    pub view: View,
+    pub profile: RenderProfile,
 }
 
 /// Where scenes come from.
-pub(super) enum Source {
+pub enum Source {
     /// A file: always drawn at full detail.
     File(Scene),
     /// A twin: drawn with as much detail as the cameras need.
@@ -65,7 +65,7 @@ pub(super) enum Source {
 }
 
 /// The part of a source that a frame draws. It stays in memory for as long as this value lives.
-pub(super) enum FrameScene<'a> {
+pub enum FrameScene<'a> {
     /// All of a file.
     Whole(Cow<'a, Scene>),
     /// The sections of a twin that the cameras need.
@@ -116,7 +116,7 @@ impl Source {
     }
 
     /// The version of the twin; `None` for a file.
-    pub(super) fn version(&self) -> Option<&Version> {
+    pub fn version(&self) -> Option<&Version> {
         match self {
             Self::Twin(resident) => Some(&resident.version),
             Self::File(_) => None,
@@ -124,11 +124,7 @@ impl Source {
     }
 
     /// The part of the source that a frame of these views draws.
-    pub(super) fn scene(
-        &self,
-        views: &[View],
-        profile: &RenderProfile,
-    ) -> anyhow::Result<FrameScene<'_>> {
+    pub fn scene(&self, views: &[View], profile: &RenderProfile) -> anyhow::Result<FrameScene<'_>> {
         Ok(match self {
             Self::Twin(_) if views.is_empty() => FrameScene::Whole(Cow::default()),
             Self::Twin(resident) => {
@@ -141,12 +137,12 @@ impl Source {
 
 impl LoadedScene {
     /// The scene of a frame that has one shot.
-    pub(super) fn shot_scene(&self, shot: &Shot) -> anyhow::Result<FrameScene<'_>> {
+    pub fn shot_scene(&self, shot: &Shot) -> anyhow::Result<FrameScene<'_>> {
         self.source.scene(&[shot.view], &shot.profile)
     }
 
     /// The scene of a frame that has all shots.
-    pub(super) fn whole_scene(&self) -> anyhow::Result<FrameScene<'_>> {
+    pub fn whole_scene(&self) -> anyhow::Result<FrameScene<'_>> {
         let views: Vec<View> = self.shots.iter().map(|shot| shot.view).collect();
         let profile = self.shots.first().map_or(RenderProfile::DEFAULT, |shot| shot.profile);
         self.source.scene(&views, &profile)
@@ -155,7 +151,7 @@ impl LoadedScene {
 
 impl SceneSource {
     /// Reads the scene, the cameras, and the profile.
-    pub(super) fn open(&self) -> anyhow::Result<LoadedScene> {
+    pub fn open(&self) -> anyhow::Result<LoadedScene> {
         let listed =
             cameras::read(&self.cameras).with_context(|| format!("{}", self.cameras.display()))?;
         let changes = self.profile.load()?;

@@ -57,6 +57,7 @@ const FILES: &[&str] = &[
     "clients/rust/src/upload.rs",
     "src/repair/files.rs",
     "src/convert/openscenario/files.rs",
+    "src/bench",
     "src/cli",
 ];
 

@@ -1,4 +1,4 @@
-//! `wildcity bench sessions`.
+//! `wildcity-bench sessions`.
 
 use std::io::{self, Write};
 use std::sync::Arc;
@@ -56,8 +56,8 @@ pub(super) struct Sessions {
 
 const EXAMPLES: &str = "\
 Examples:
-  wildcity bench sessions demo --size 96x60
-  wildcity bench sessions demo --rig alpamayo2 --size 576x320 --encoding raw --json";
+  wildcity-bench sessions demo --size 96x60
+  wildcity-bench sessions demo --rig alpamayo2 --size 576x320 --encoding raw --json";
 
 /// One step of one session.
 #[derive(Clone, Copy)]

@@ -1,4 +1,4 @@
-//! `wildcity bench drive`.
+//! `wildcity-bench drive`.
 
 mod report;
 mod step;
@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 
-use crate::cli::{output, progress};
+use wildcity::cli::{output, progress};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::route::Route;
 use wildcity_scene::{Manifest, Rig};
@@ -70,8 +70,8 @@ pub(super) struct Drive {
 
 const EXAMPLES: &str = "\
 Examples:
-  wildcity bench drive city --memory-gib 2 --crop 4 --teleports 200
-  wildcity bench drive city --from-m 9000 --steps 600 --json | jq .all";
+  wildcity-bench drive city --memory-gib 2 --crop 4 --teleports 200
+  wildcity-bench drive city --from-m 9000 --steps 600 --json | jq .all";
 
 impl Drive {
     pub(super) fn run(self) -> anyhow::Result<()> {

@@ -190,7 +190,7 @@ pub(super) async fn leave_unread(
 ) -> anyhow::Result<u64> {
     let mut unread = 0;
     while Instant::now() < until {
-        let mut client = Client::connect(&url, "wildcity bench soak, not reading").await?;
+        let mut client = Client::connect(&url, "wildcity-bench soak, not reading").await?;
         let outputs = Outputs { encoding: Encoding::Raw, ..Outputs::default() };
         let rig = Some(RigChoice::Preset("vehicle6".to_owned()));
         let open = Open { rig, outputs, version: Some(version), ..Open::twin(&twin) };

@@ -1,14 +1,13 @@
-//! `wildcity bench gpu` with small scenes: the content of its report, not the speed.
-
-use std::process::Command;
+//! `wildcity-bench gpu` with small scenes: the content of its report, not the speed.
 
 use serde_json::Value;
 
+use crate::bench;
 use crate::gpu::assert_quiet;
 
-fn bench(gaussians: &str, more: &[&str]) -> String {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_wildcity"));
-    command.args(["bench", "gpu", "--gaussians", gaussians, "--repeat", "1"]).args(more);
+fn report(gaussians: &str, more: &[&str]) -> String {
+    let mut command = bench("gpu");
+    command.args(["--gaussians", gaussians, "--repeat", "1"]).args(more);
     let output = command.output().unwrap();
     assert_quiet(&output);
     String::from_utf8(output.stdout).unwrap()
@@ -18,7 +17,7 @@ const STAGES: [&str; 6] = ["project", "sort", "bin", "tile sort", "expand", "ras
 
 #[test]
 fn a_report_has_every_stage_beside_its_rooflines() {
-    let report: Value = serde_json::from_str(&bench("20,3000", &["--json"])).unwrap();
+    let report: Value = serde_json::from_str(&report("20,3000", &["--json"])).unwrap();
     let number = |value: &Value| value.as_f64().unwrap();
     let bytes_per_s = number(&report["roofline"]["bytes_per_s"]);
     let multiply_adds_per_s = number(&report["roofline"]["multiply_adds_per_s"]);
@@ -60,7 +59,7 @@ fn a_report_has_every_stage_beside_its_rooflines() {
 
 #[test]
 fn tables_are_markdown() {
-    let said = bench("20,1000", &["--no-cpu"]);
+    let said = report("20,1000", &["--no-cpu"]);
     assert!(said.contains("GB/s, ") && said.contains("\n1,000 Gaussians ("), "{said}");
     let rows = |name: &str| said.lines().filter(|line| line.starts_with(name)).count();
     for stage in STAGES {

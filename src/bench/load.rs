@@ -1,4 +1,4 @@
-//! `wildcity bench load`.
+//! `wildcity-bench load`.
 
 use std::fs;
 use std::io::{self, Write};
@@ -9,8 +9,8 @@ use std::time::Instant;
 
 use anyhow::Context;
 
-use crate::cli::directories::{TwinVersion, Twins};
-use crate::cli::progress;
+use wildcity::cli::directories::{TwinVersion, Twins};
+use wildcity::cli::progress;
 use wildcity_scene::manifest::{ChunkEntry, Section};
 use wildcity_twin::ingest;
 use wildcity_twin::store::{Catalog, Version};
@@ -50,8 +50,8 @@ pub(super) struct Load {
 
 const EXAMPLES: &str = "\
 Examples:
-  wildcity bench load street --file street.ply
-  sudo wildcity bench load street --cold --twins ./twins";
+  wildcity-bench load street --file street.ply
+  sudo wildcity-bench load street --cold --twins ./twins";
 
 /// One line of the result: the data that was read, and its speed.
 struct Line {

@@ -3,8 +3,8 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use crate::cli::backend_options::{self, BackendOptions};
-use crate::cli::directories::{TwinVersion, Twins};
+use wildcity::cli::backend_options::{self, BackendOptions};
+use wildcity::cli::directories::{TwinVersion, Twins};
 use wildcity_server::{Config, Directories, Limits};
 use wildcity_session::{Engine, EngineSettings, Outputs, Scenarios, SessionOptions};
 use wildcity_twin::residency::Cache;

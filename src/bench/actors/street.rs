@@ -13,7 +13,7 @@ use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{Gaussians, Rig, Trajectory};
 use wildcity_twin::store::{Catalog, NewVersion, StorageOptions, Version};
 
-use crate::cli::progress;
+use wildcity::cli::progress;
 
 /// The twin without cars.
 pub(super) const BARE: &str = "bare";

@@ -1,7 +1,6 @@
-//! `wildcity bench actors` on a short street.
+//! `wildcity-bench actors` on a short street.
 
 use std::fs;
-use std::process::Command;
 
 use serde_json::Value;
 
@@ -9,6 +8,7 @@ use wildcity_generate::StreetSettings;
 use wildcity_scene::manifest::Provenance;
 use wildcity_twin::store::NewVersion;
 
+use crate::bench;
 use crate::versions::commit;
 
 #[test]
@@ -27,8 +27,8 @@ fn cars_cost_something_as_actors_and_within_the_twin() {
     };
     commit(twins.path(), new).unwrap();
     let dir = tempfile::tempdir().unwrap();
-    let output = Command::new(env!("CARGO_BIN_EXE_wildcity"))
-        .args(["bench", "actors", "street", "--backend", "cpu", "--json", "--size", "96x60"])
+    let output = bench("actors")
+        .args(["street", "--backend", "cpu", "--json", "--size", "96x60"])
         .args(["--cars", "6", "--gaussians", "3000", "--pairs", "2"])
         .arg("--twins")
         .arg(twins.path())
@@ -50,10 +50,8 @@ fn cars_cost_something_as_actors_and_within_the_twin() {
     }
     assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 0, "nothing is left");
 
-    let output = Command::new(env!("CARGO_BIN_EXE_wildcity"))
-        .args(["bench", "actors", "street", "--backend", "cpu", "--size", "96by60"])
-        .output()
-        .unwrap();
+    let output =
+        bench("actors").args(["street", "--backend", "cpu", "--size", "96by60"]).output().unwrap();
     let said = String::from_utf8(output.stderr).unwrap();
     assert!(said.contains("expected WxH, for example 96x60"), "{said}");
 }

@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-use crate::cli::progress;
+use wildcity::cli::progress;
 use wildcity_render::{Backend, Frame, FrameStats, Target};
 
 /// The times of a frame that was rendered several times.

@@ -1,4 +1,4 @@
-//! The report of `wildcity bench gpu`, as Markdown and as JSON.
+//! The report of `wildcity-bench gpu`, as Markdown and as JSON.
 
 use std::fmt;
 

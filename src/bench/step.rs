@@ -1,4 +1,4 @@
-//! `wildcity bench step`.
+//! `wildcity-bench step`.
 
 use std::io::{self, Write};
 
@@ -7,8 +7,8 @@ use serde_json::json;
 use wildcity_render::{Backend, Frame, View};
 
 use super::timed::{Timed, time};
-use crate::cli::backend_options::RendererOptions;
-use crate::cli::scene_source::SceneSource;
+use wildcity::cli::backend_options::RendererOptions;
+use wildcity::cli::scene_source::SceneSource;
 
 /// Time one step: all cameras of a list in one frame, rendered to 8-bit colour.
 ///
@@ -35,8 +35,8 @@ pub(super) struct Step {
 
 const EXAMPLES: &str = "\
 Examples:
-  wildcity bench step street.ply --cameras cameras.json --repeat 9
-  wildcity bench step street --cameras cameras.json --json | jq .step_ms";
+  wildcity-bench step street.ply --cameras cameras.json --repeat 9
+  wildcity-bench step street --cameras cameras.json --json | jq .step_ms";
 
 impl Step {
     pub(super) fn run(self) -> anyhow::Result<()> {

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::cli::output;
+use wildcity::cli::output;
 
 /// A temporary directory, which is removed at the end.
 pub(super) struct TemporaryDir(PathBuf);

@@ -1,4 +1,4 @@
-//! `wildcity bench soak`.
+//! `wildcity-bench soak`.
 
 mod agent;
 mod memory;
@@ -21,7 +21,7 @@ use self::memory::Memory;
 use self::others::Pusher;
 use super::benched_twin::BenchedTwin;
 use super::memory::{mib, rss_bytes};
-use crate::cli::exit::Exit;
+use wildcity::cli::exit::Exit;
 
 /// Drive many sessions of small cameras against a server for minutes or hours, and check that
 /// memory does not grow and images do not change.
@@ -62,9 +62,9 @@ pub(super) struct Soak {
 
 const EXAMPLES: &str = "\
 Examples:
-  wildcity bench soak street
-  wildcity bench soak street --minutes 2 --sessions 4 --memory-gib 0.1
-  wildcity bench soak street --minutes 30 --mixed";
+  wildcity-bench soak street
+  wildcity-bench soak street --minutes 2 --sessions 4 --memory-gib 0.1
+  wildcity-bench soak street --minutes 30 --mixed";
 
 /// Time between two lines.
 const LINE_EVERY: Duration = Duration::from_secs(60);
@@ -118,7 +118,7 @@ impl Soak {
             running.stop().await;
             result
         });
-        runtime.shutdown_timeout(crate::cli::limits::SHUTDOWN_TIMEOUT);
+        runtime.shutdown_timeout(wildcity::cli::limits::SHUTDOWN_TIMEOUT);
         result
     }
 
@@ -176,7 +176,7 @@ impl Soak {
         let twin = &self.twin.twin.name;
         // Otherwise garbage collection could remove the version while all agents change rounds.
         let catalog = Catalog::open(&driving.twins)?;
-        let _lease = catalog.lease(twin, driving.version, "wildcity bench soak", self.length())?;
+        let _lease = catalog.lease(twin, driving.version, "wildcity-bench soak", self.length())?;
         let start = driving.route.at_station(0.0);
         let pusher = Pusher {
             url: format!("http://{}", running.address()),

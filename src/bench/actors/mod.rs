@@ -1,4 +1,4 @@
-//! `wildcity bench actors`.
+//! `wildcity-bench actors`.
 
 mod street;
 
@@ -22,8 +22,8 @@ use super::processor::processor_time;
 use super::size::Size;
 use super::temporary_dir::TemporaryDir;
 use super::timed::median;
-use crate::cli::progress;
 use street::Cars;
+use wildcity::cli::progress;
 
 /// Measure the cost of actors: a step among cars that are actors, against one in a twin that
 /// contains the same cars.
@@ -64,8 +64,8 @@ pub(super) struct Actors {
 
 const EXAMPLES: &str = "\
 Examples:
-  wildcity bench actors demo
-  wildcity bench actors demo --backend cpu --cars 10 --pairs 21 --json | jq .ratio";
+  wildcity-bench actors demo
+  wildcity-bench actors demo --backend cpu --cars 10 --pairs 21 --json | jq .ratio";
 
 /// How far the ego drives in one step, in metres: the view must change, and the same cars must stay
 /// in it.

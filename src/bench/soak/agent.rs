@@ -40,7 +40,7 @@ impl Agent {
         let mut first = BTreeMap::new();
         let mut driven = Driven::default();
         while Instant::now() < self.until {
-            let mut client = Client::connect(&self.url, "wildcity bench soak").await?;
+            let mut client = Client::connect(&self.url, "wildcity-bench soak").await?;
             let rig = Some(RigChoice::Full(rig()?));
             let version = Some(self.version);
             client.open(Open { rig, version, ..Open::twin(&self.twin) }).await?;

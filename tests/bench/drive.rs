@@ -1,17 +1,16 @@
-//! `wildcity bench drive` along a city.
+//! `wildcity-bench drive` along a city.
 
 use std::fs;
 use std::path::Path;
-use std::process::Command;
 
 use serde_json::Value;
 
-use crate::in_folder::CITY;
+use crate::{CITY, bench};
 
 #[test]
 fn a_timed_drive_reports_every_kilometre_and_leaves_no_files() {
     let dir = tempfile::tempdir().unwrap();
-    let report = bench_drive(
+    let report = drive(
         dir.path(),
         &["--crop", "16", "--memory-gib", "0.13", "--unpaced", "--from-m", "900", "--steps", "60"],
     );
@@ -37,10 +36,10 @@ fn a_timed_drive_reports_every_kilometre_and_leaves_no_files() {
     assert_eq!(left, ["steps.csv"]);
 }
 
-/// The JSON output of `wildcity bench drive`, with 5 teleports and a CSV file.
-fn bench_drive(dir: &Path, arguments: &[&str]) -> Value {
-    let output = Command::new(env!("CARGO_BIN_EXE_wildcity"))
-        .args(["bench", "drive", "city", "--backend", "cpu", "--json", "--teleports", "5"])
+/// The JSON output of `wildcity-bench drive`, with 5 teleports and a CSV file.
+fn drive(dir: &Path, arguments: &[&str]) -> Value {
+    let output = bench("drive")
+        .args(["city", "--backend", "cpu", "--json", "--teleports", "5"])
         .args(arguments)
         .arg("--twins")
         .arg(CITY.dir.path())

@@ -1,4 +1,4 @@
-//! `wildcity bench gpu`: measures a device with one command.
+//! `wildcity-bench gpu`: measures a device with one command.
 
 mod report;
 
@@ -9,8 +9,7 @@ use anyhow::{Context, ensure};
 
 use self::report::{Images, Report, SceneReport, StageReport};
 use super::timed::{Timed, time};
-use crate::cli::limits;
-use crate::cli::progress;
+use wildcity::cli::progress;
 use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_render::gpu::{self, AdapterChoice, FrameCounts, Roofline};
 use wildcity_render::{Backend, Frame, View};
@@ -39,7 +38,7 @@ pub(super) struct Gpu {
         value_name = "COUNT,...",
         value_delimiter = ',',
         default_value = "1000000,5000000,20000000",
-        value_parser = clap::value_parser!(u32).range(1..=limits::BENCH_GAUSSIANS)
+        value_parser = clap::value_parser!(u32).range(1..=MOST_GAUSSIANS)
     )]
     gaussians: Vec<u32>,
 
@@ -64,10 +63,12 @@ pub(super) struct Gpu {
 
 const EXAMPLES: &str = "\
 Examples:
-  wildcity bench gpu
-  wildcity bench gpu --gaussians 100000 --repeat 3 --device llvmpipe
-  wildcity bench gpu --json > report.json";
+  wildcity-bench gpu
+  wildcity-bench gpu --gaussians 100000 --repeat 3 --device llvmpipe
+  wildcity-bench gpu --json > report.json";
 
+/// Largest number of Gaussians of a street: each takes 200 B while the street is made.
+const MOST_GAUSSIANS: i64 = 100_000_000;
 /// Untimed frames before the timed ones: the first one uploads the scene and allocates buffers.
 const WARM_UP: u32 = 2;
 /// Least time of the untimed frames: a graphics card that was idle needs hundreds of milliseconds

@@ -1,4 +1,4 @@
-//! `wildcity bench delivery`.
+//! `wildcity-bench delivery`.
 
 use std::io::{self, Write};
 use std::time::{Duration, Instant};
@@ -8,7 +8,7 @@ use anyhow::Context as _;
 use super::benched_twin::BenchedTwin;
 use super::processor::threads_processor_time;
 use super::timed::median;
-use crate::cli::progress;
+use wildcity::cli::progress;
 use wildcity_client::{Client, ConnectOptions, Open, Pose as WirePose};
 use wildcity_protocol::message;
 use wildcity_render::View;
@@ -41,8 +41,8 @@ pub(super) struct Delivery {
 
 const EXAMPLES: &str = "\
 Examples:
-  wildcity bench delivery demo
-  wildcity bench delivery demo --rig alpamayo1 --rounds 30";
+  wildcity-bench delivery demo
+  wildcity-bench delivery demo --rig alpamayo1 --rounds 30";
 
 /// The ways, in the order of [`Ways::step`].
 const WAYS: [&str; 4] = ["renderer alone", "session", "socket", "shared memory"];
@@ -78,7 +78,7 @@ impl Delivery {
             running.stop().await;
             costs
         });
-        runtime.shutdown_timeout(crate::cli::limits::SHUTDOWN_TIMEOUT);
+        runtime.shutdown_timeout(wildcity::cli::limits::SHUTDOWN_TIMEOUT);
         print(&mut io::stdout().lock(), &costs?)?;
         Ok(())
     }
