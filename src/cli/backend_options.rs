@@ -5,12 +5,19 @@ use std::io::{self, Write};
 use clap::ValueEnum;
 
 use wildcity_render::Backend;
-use wildcity_render::automatic::{self, Selection};
 use wildcity_render::cpu::{Cpu, Simd};
-use wildcity_render::gpu::{AdapterChoice, Gpu, MemoryLimits};
-use wildcity_render::hybrid::HybridBackend;
 use wildcity_render::reference::Reference;
+#[cfg(feature = "gpu")]
 use wildcity_render::stage::Stage;
+#[cfg(feature = "gpu")]
+use wildcity_render::{
+    automatic::{self, Selection},
+    gpu::{AdapterChoice, Gpu, MemoryLimits},
+    hybrid::HybridBackend,
+};
+
+#[cfg(not(feature = "gpu"))]
+use super::left_out::built_without;
 
 /// `--backend` and `--cpu-through`, for commands that examine the renderer.
 #[derive(Clone, Debug, clap::Args)]
@@ -85,6 +92,7 @@ enum StageName {
     Bin,
 }
 
+#[cfg(feature = "gpu")]
 impl From<StageName> for Stage {
     fn from(name: StageName) -> Self {
         match name {
@@ -123,15 +131,8 @@ impl From<SimdName> for Simd {
 impl BackendOptions {
     /// Creates the backend. If it is chosen automatically, prints the choice on standard error.
     pub fn backend(&self) -> anyhow::Result<Box<dyn Backend>> {
-        let HardwareOptions { threads, device, simd, .. } = &self.hardware;
-        match (self.backend, device) {
-            (BackendName::Auto, None) => {
-                let limits = self.hardware.memory_limits();
-                let Selection { backend, reason } =
-                    automatic::select(*threads, (*simd).into(), limits)?;
-                writeln!(io::stderr(), "backend {reason}")?;
-                Ok(backend)
-            }
+        match (self.backend, &self.hardware.device) {
+            (BackendName::Auto, None) => self.hardware.best(),
             (BackendName::Auto | BackendName::Gpu, _) => Ok(Box::new(self.hardware.gpu()?)),
             (_, Some(device)) => anyhow::bail!(
                 "--device {device:?} belongs to the gpu backend: add --backend gpu, or omit --device"
@@ -157,12 +158,45 @@ impl HardwareOptions {
         Ok(Cpu::new(self.threads, self.simd.into())?)
     }
 
+    /// Creates the best backend, and prints the choice on standard error.
+    #[cfg(feature = "gpu")]
+    fn best(&self) -> anyhow::Result<Box<dyn Backend>> {
+        let limits = self.memory_limits();
+        let Selection { backend, reason } =
+            automatic::select(self.threads, self.simd.into(), limits)?;
+        writeln!(io::stderr(), "backend {reason}")?;
+        Ok(backend)
+    }
+
+    /// Creates the only backend that is fast in this build, and prints that on standard error.
+    #[cfg(not(feature = "gpu"))]
+    fn best(&self) -> anyhow::Result<Box<dyn Backend>> {
+        anyhow::ensure!(
+            self.gpu_memory_gib.is_none(),
+            "--gpu-memory-gib: {}",
+            built_without("gpu")
+        );
+        writeln!(io::stderr(), "backend cpu: {}", built_without("gpu"))?;
+        Ok(Box::new(self.cpu()?))
+    }
+
+    /// The gpu backend is not in this build.
+    ///
+    /// # Errors
+    /// Always: it says what to build.
+    #[cfg(not(feature = "gpu"))]
+    fn gpu(&self) -> anyhow::Result<Cpu> {
+        anyhow::bail!("--backend gpu: {}", built_without("gpu"))
+    }
+
     /// Creates the gpu backend.
+    #[cfg(feature = "gpu")]
     pub fn gpu(&self) -> anyhow::Result<Gpu> {
         let choice = self.device.clone().map_or(AdapterChoice::Best, AdapterChoice::Named);
         Ok(Gpu::with_limits(&choice, self.threads, self.memory_limits())?)
     }
 
+    #[cfg(feature = "gpu")]
     fn memory_limits(&self) -> MemoryLimits {
         MemoryLimits {
             mirror_bytes: self.gpu_memory_gib.map_or(u64::MAX, bytes_of_gib),
@@ -177,9 +211,12 @@ impl RendererOptions {
         let BackendOptions { backend, hardware } = &self.backend;
         match (self.cpu_through, backend) {
             (None, _) => self.backend.backend(),
+            #[cfg(feature = "gpu")]
             (Some(stage), BackendName::Auto | BackendName::Gpu) => {
                 Ok(Box::new(HybridBackend::new(hardware.cpu()?, hardware.gpu()?, stage.into())))
             }
+            #[cfg(not(feature = "gpu"))]
+            (Some(_), BackendName::Auto | BackendName::Gpu) => Ok(Box::new(hardware.gpu()?)),
             (Some(_), BackendName::Cpu | BackendName::Reference) => anyhow::bail!(
                 "--cpu-through leaves the later stages to the GPU: leave --backend away, or give \
                  --backend gpu"

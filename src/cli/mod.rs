@@ -13,36 +13,48 @@
 use std::process::ExitCode;
 
 mod actor;
+#[cfg(feature = "alpasim")]
 mod alpasim;
+#[cfg(feature = "augment")]
 mod augment;
 pub mod backend_options;
+#[cfg(feature = "gpu")]
 mod bisect;
 mod demo;
+#[cfg(feature = "gpu")]
 mod devices;
 pub mod directories;
 mod doctor;
+#[cfg(feature = "alpasim")]
 mod drive;
+#[cfg(feature = "suite")]
 mod episode;
+#[cfg(feature = "eval")]
 mod eval;
 pub mod exit;
 mod file_notes;
 mod import;
 mod input_files;
 mod inspect;
+mod left_out;
 pub mod limits;
 mod lod;
 mod map;
 pub mod output;
+#[cfg_attr(not(feature = "http"), allow(dead_code, reason = "only a push packs a folder"))]
 mod packed_folder;
 mod placement;
 mod profile_options;
 pub mod progress;
+#[cfg(feature = "http")]
 mod push;
+#[cfg(feature = "augment")]
 mod real_images;
 mod render;
 mod repair;
 mod repair_options;
 mod replay;
+#[cfg(feature = "report")]
 mod report;
 mod rig;
 mod route;
@@ -50,12 +62,14 @@ mod scenario;
 pub mod scene_source;
 mod serve;
 mod sky_source;
+#[cfg(feature = "stress")]
 mod stress;
 mod time;
 mod twin;
 mod view;
 
-use clap::{Parser, Subcommand};
+use clap::error::ErrorKind;
+use clap::{CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 
 /// A closed-loop driving simulator server for city twins made of 3D Gaussians.
 #[derive(Debug, Parser)]
@@ -81,17 +95,23 @@ enum Command {
     View(view::View),
     Import(import::Import),
     Inspect(inspect::Inspect),
+    #[cfg(feature = "http")]
     Push(push::Push),
     Lod(lod::Lod),
     Twin(twin::Twin),
     Actor(actor::Actor),
     Render(render::Render),
+    #[cfg(feature = "eval")]
     Eval(Box<eval::Eval>),
     Repair(repair::Repair),
+    #[cfg(feature = "augment")]
     Augment(Box<augment::Augment>),
+    #[cfg(feature = "alpasim")]
     Drive(drive::Drive),
+    #[cfg(feature = "alpasim")]
     Alpasim(alpasim::Alpasim),
     Replay(replay::Replay),
+    #[cfg(feature = "suite")]
     Episode(episode::Episode),
     Rig(rig::RigCommand),
     Route(route::Route),
@@ -100,9 +120,13 @@ enum Command {
     /// Moved to the program `wildcity-bench`.
     #[command(hide = true, disable_help_flag = true)]
     Bench(Moved),
+    #[cfg(feature = "gpu")]
     Bisect(bisect::Bisect),
+    #[cfg(feature = "stress")]
     Stress(stress::Stress),
+    #[cfg(feature = "report")]
     Report(report::Command),
+    #[cfg(feature = "gpu")]
     Devices(devices::Devices),
     Doctor(doctor::Doctor),
 }
@@ -118,40 +142,70 @@ struct Moved {
 /// failure, and 3 for a recording that is cut (`replay --verify`). A command line that cannot be
 /// parsed ends the process with code 2.
 pub fn main() -> ExitCode {
-    let arguments = Arguments::parse();
-    let result = match arguments.command {
-        Command::Demo(command) => command.run(),
-        Command::Serve(command) => command.run(),
-        Command::View(command) => command.run(),
-        Command::Import(command) => command.run(),
-        Command::Inspect(command) => command.run(),
-        Command::Push(command) => command.run(),
-        Command::Lod(command) => command.run(),
-        Command::Twin(command) => command.run(),
-        Command::Actor(command) => command.run(),
-        Command::Render(command) => command.run(),
-        Command::Eval(command) => command.run(),
-        Command::Repair(command) => command.run(),
-        Command::Augment(command) => command.run(),
-        Command::Drive(command) => command.run(),
-        Command::Alpasim(command) => command.run(),
-        Command::Replay(command) => command.run(),
-        Command::Episode(command) => command.run(),
-        Command::Rig(command) => command.run(),
-        Command::Route(command) => command.run(),
-        Command::Scenario(command) => command.run(),
-        Command::Map(command) => command.run(),
-        Command::Bench(_) => Err(anyhow::anyhow!(
-            "wildcity bench is a program of its own: in the source of wildcity, run cargo run \
-             --release -p wildcity-bench -- and the arguments after \"bench\""
-        )),
-        Command::Bisect(command) => command.run(),
-        Command::Stress(command) => command.run(),
-        Command::Report(command) => command.run(),
-        Command::Devices(command) => command.run(),
-        Command::Doctor(command) => command.run(),
+    let mut program = Arguments::command();
+    if let Some(left_out) = left_out::help() {
+        program = program
+            .after_help(left_out.clone())
+            .after_long_help(format!("{EXAMPLES}\n\n{left_out}"));
+    }
+    let parsed = program.try_get_matches().and_then(|found| Arguments::from_arg_matches(&found));
+    let arguments = match parsed {
+        Ok(arguments) => arguments,
+        Err(error) => {
+            match left_out::command().filter(|_| error.kind() == ErrorKind::InvalidSubcommand) {
+                Some(left_out) => return exit::code(Err(left_out)),
+                None => error.exit(),
+            }
+        }
     };
-    exit::code(result)
+    exit::code(arguments.command.run())
+}
+
+impl Command {
+    fn run(self) -> anyhow::Result<()> {
+        match self {
+            Self::Demo(command) => command.run(),
+            Self::Serve(command) => command.run(),
+            Self::View(command) => command.run(),
+            Self::Import(command) => command.run(),
+            Self::Inspect(command) => command.run(),
+            #[cfg(feature = "http")]
+            Self::Push(command) => command.run(),
+            Self::Lod(command) => command.run(),
+            Self::Twin(command) => command.run(),
+            Self::Actor(command) => command.run(),
+            Self::Render(command) => command.run(),
+            #[cfg(feature = "eval")]
+            Self::Eval(command) => command.run(),
+            Self::Repair(command) => command.run(),
+            #[cfg(feature = "augment")]
+            Self::Augment(command) => command.run(),
+            #[cfg(feature = "alpasim")]
+            Self::Drive(command) => command.run(),
+            #[cfg(feature = "alpasim")]
+            Self::Alpasim(command) => command.run(),
+            Self::Replay(command) => command.run(),
+            #[cfg(feature = "suite")]
+            Self::Episode(command) => command.run(),
+            Self::Rig(command) => command.run(),
+            Self::Route(command) => command.run(),
+            Self::Scenario(command) => command.run(),
+            Self::Map(command) => command.run(),
+            Self::Bench(_) => Err(anyhow::anyhow!(
+                "wildcity bench is a program of its own: in the source of wildcity, run cargo run \
+             --release -p wildcity-bench -- and the arguments after \"bench\""
+            )),
+            #[cfg(feature = "gpu")]
+            Self::Bisect(command) => command.run(),
+            #[cfg(feature = "stress")]
+            Self::Stress(command) => command.run(),
+            #[cfg(feature = "report")]
+            Self::Report(command) => command.run(),
+            #[cfg(feature = "gpu")]
+            Self::Devices(command) => command.run(),
+            Self::Doctor(command) => command.run(),
+        }
+    }
 }
 
 #[cfg(test)]
@@ -160,8 +214,6 @@ mod help;
 
 #[cfg(test)]
 mod tests {
-    use clap::CommandFactory;
-
     use super::*;
 
     #[test]

@@ -6,6 +6,7 @@ mod generate;
 mod import;
 mod list;
 mod picture;
+#[cfg(feature = "http")]
 mod push;
 mod remove;
 mod show;
@@ -33,6 +34,7 @@ pub(super) struct Actor {
 #[derive(Debug, clap::Subcommand)]
 enum Subcommand {
     Import(import::Import),
+    #[cfg(feature = "http")]
     Push(push::Push),
     Generate(generate::Generate),
     List(list::List),
@@ -45,6 +47,7 @@ impl Actor {
     pub(super) fn run(self) -> anyhow::Result<()> {
         match self.subcommand {
             Subcommand::Import(import) => import.run(),
+            #[cfg(feature = "http")]
             Subcommand::Push(push) => push.run(),
             Subcommand::Generate(generate) => generate.run(),
             Subcommand::List(list) => list.run(),

@@ -70,9 +70,8 @@ pub(super) fn cameras(
     }
     let is_drawn = |name: &String| named.is_empty() || named.contains(name);
     let cameras = rig.cameras.iter().filter(|camera| is_drawn(&camera.name)).map(|mounted| {
-        let camera = if lenses { mounted.camera } else { without_lens(&mounted.camera) };
-        let camera = sized(camera, side_px);
-        let camera = camera.with_context(|| format!("camera {:?}", mounted.name))?;
+        let drawn = if lenses { mounted.camera } else { without_lens(&mounted.camera) };
+        let camera = sized(drawn, side_px).with_context(|| format!("camera {:?}", mounted.name))?;
         let rig_from_camera = mounted.rig_from_camera;
         Ok(TrainingCamera { name: mounted.name.clone(), camera, rig_from_camera })
     });

@@ -20,8 +20,8 @@ use wildcity_client::protocol::observation::Event;
 use wildcity_client::{Client, Movement, Observation, Open, Pose};
 use wildcity_generate::{Spoil, StreetSettings};
 use wildcity_repair::{LoadOptions, Models};
+use wildcity_scene::Rig;
 use wildcity_scene::manifest::Provenance;
-use wildcity_scene::{RecordFormat, Rig};
 use wildcity_server::{Config, Directories};
 use wildcity_session::generated_actors;
 use wildcity_twin::ingest::sky;
@@ -102,6 +102,7 @@ Examples:
 /// Name of the demo twin.
 pub(super) const TWIN: &str = "demo";
 /// Name of the demo twin that `wildcity report` measures: the same street in record format f32.
+#[cfg(feature = "report")]
 const EXACT_TWIN: &str = "demo-f32";
 /// Name of the degraded copy of the demo twin.
 const SPOILED_TWIN: &str = "demo-spoiled";
@@ -308,11 +309,12 @@ fn wire_pose(pose: &wildcity_scene::geometry::Pose) -> Pose {
 }
 
 /// The demo street in the exact record format f32, under its own name.
+#[cfg(feature = "report")]
 pub(super) fn exact_twin(twins: &Path) -> anyhow::Result<Version> {
     demo_twin(
         twins,
         EXACT_TWIN,
-        StorageOptions { record: RecordFormat::F32, ..StorageOptions::default() },
+        StorageOptions { record: wildcity_scene::RecordFormat::F32, ..StorageOptions::default() },
         None,
     )
 }

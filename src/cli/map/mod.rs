@@ -1,9 +1,11 @@
 //! `wildcity map`.
 
 mod check;
+#[cfg(feature = "convert")]
 mod import;
 mod strips;
 
+#[cfg(feature = "convert")]
 pub(in crate::cli) use import::origin;
 
 /// Make and check maps: lanes and areas of a twin.
@@ -23,6 +25,7 @@ pub(super) struct MapCommand {
 
 #[derive(Debug, clap::Subcommand)]
 enum Subcommand {
+    #[cfg(feature = "convert")]
     Import(import::Import),
     Strips(strips::Strips),
     Check(check::Check),
@@ -31,6 +34,7 @@ enum Subcommand {
 impl MapCommand {
     pub(super) fn run(self) -> anyhow::Result<()> {
         match self.subcommand {
+            #[cfg(feature = "convert")]
             Subcommand::Import(import) => import.run(),
             Subcommand::Strips(strips) => strips.run(),
             Subcommand::Check(check) => check.run(),

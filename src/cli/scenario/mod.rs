@@ -1,6 +1,8 @@
 //! `wildcity scenario`.
 
+#[cfg(feature = "suite")]
 mod check;
+#[cfg(feature = "convert")]
 mod import;
 mod show;
 
@@ -31,16 +33,20 @@ pub(super) struct ScenarioCommand {
 
 #[derive(Debug, clap::Subcommand)]
 enum Subcommand {
+    #[cfg(feature = "suite")]
     Check(check::Check),
     Show(show::Show),
+    #[cfg(feature = "convert")]
     Import(import::Import),
 }
 
 impl ScenarioCommand {
     pub(super) fn run(self) -> anyhow::Result<()> {
         match self.subcommand {
+            #[cfg(feature = "suite")]
             Subcommand::Check(check) => check.run(),
             Subcommand::Show(show) => show.run(),
+            #[cfg(feature = "convert")]
             Subcommand::Import(import) => import.run(),
         }
     }

@@ -1,7 +1,8 @@
-//! Certificate and key of the server, and reading them again while it runs.
+//! Reading a certificate and its key, also again while the server runs.
 
 use std::fmt::Display;
-use std::path::{Path, PathBuf};
+use std::io;
+use std::path::Path;
 use std::sync::Arc;
 use std::time::SystemTime;
 
@@ -9,18 +10,12 @@ use parking_lot::Mutex;
 use rustls::ServerConfig;
 use rustls::pki_types::pem::PemObject as _;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use tokio::net::TcpStream;
 use tokio_rustls::TlsAcceptor;
+use tokio_rustls::server::TlsStream;
 
-use crate::certificate::expiry;
-
-/// The files of a certificate and its key, in PEM.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct TlsFiles {
-    /// The server's certificate first, then the intermediate certificates.
-    pub cert: PathBuf,
-    /// The key, in PKCS#8, PKCS#1 or SEC1.
-    pub key: PathBuf,
-}
+use super::certificate::expiry;
+use super::{TlsError, TlsFiles};
 
 impl TlsFiles {
     /// Reads both files as a server does, and returns when the server's certificate expires.
@@ -33,14 +28,6 @@ impl TlsFiles {
         let reason = "when the certificate expires cannot be read".to_owned();
         expires.ok_or(TlsError { path: self.cert.clone(), reason })
     }
-}
-
-/// Why a certificate or a key cannot be used.
-#[derive(Debug, thiserror::Error)]
-#[error("{}: {reason}", path.display())]
-pub struct TlsError {
-    pub path: PathBuf,
-    pub reason: String,
 }
 
 /// Accepts connections with the certificate that was read last.
@@ -59,8 +46,13 @@ impl Tls {
         Ok(Arc::new(Self { files, acceptor }))
     }
 
-    pub(crate) fn acceptor(&self) -> TlsAcceptor {
-        self.acceptor.lock().clone()
+    /// Does the handshake of a connection.
+    ///
+    /// # Errors
+    /// The client and the server do not agree, or the connection ends.
+    pub(crate) async fn accept(&self, tcp: TcpStream) -> io::Result<TlsStream<TcpStream>> {
+        let acceptor = self.acceptor.lock().clone();
+        acceptor.accept(tcp).await
     }
 
     /// Reads the files again. Existing connections keep their certificate. If the new files cannot
