@@ -20,7 +20,7 @@ const COMMANDS: [(&str, &str, bool); 15] = [
     ("scenario check", "suite", cfg!(feature = "suite")),
     ("scenario import", "convert", cfg!(feature = "convert")),
     ("stress", "stress", cfg!(feature = "stress")),
-    ("twin views", "augment", cfg!(feature = "augment")),
+    ("twin views", "eval", cfg!(feature = "eval")),
 ];
 
 /// How to build a feature.

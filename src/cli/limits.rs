@@ -33,7 +33,3 @@ pub const REPORT_STATIONS: i64 = 64;
 
 /// Largest window of a report, in pixels: with the most stations, 100 million pixels of 40 B.
 pub const REPORT_WINDOW_PX: i64 = 256;
-
-/// Largest file of boxes or LiDAR points. An hour of a LiDAR with 64 rows has 20 GB: give some
-/// minutes of it.
-pub const LABEL_BYTES: u64 = 4 << 30;

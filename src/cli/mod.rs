@@ -48,8 +48,6 @@ mod profile_options;
 pub mod progress;
 #[cfg(feature = "http")]
 mod push;
-#[cfg(feature = "augment")]
-mod real_images;
 mod render;
 mod repair;
 mod repair_options;

@@ -15,6 +15,8 @@
 //! means, csv      their means; the images as CSV
 //! thumbnails      small pictures of a pair
 //! page            the HTML page
+//! images          real images with their cameras, and their files
+//! run             an evaluation: renders, repairs and measures every image of a list
 //! ```
 //!
 //! The measures themselves are in [`wildcity_render::compare`], which the report uses as well.
@@ -27,6 +29,7 @@ mod evaluated_image;
 mod evaluation;
 mod exposure;
 mod extrapolation;
+pub mod images;
 mod kid;
 mod lidar;
 mod mean;
@@ -34,6 +37,7 @@ mod means;
 mod page;
 mod pair;
 mod reprojection;
+mod run;
 mod scores;
 mod thumbnails;
 
@@ -51,5 +55,6 @@ pub use means::{AlignedMeans, CameraMeans, Gain, Means, ScoreMeans};
 pub use page::render as page;
 pub use pair::{Pair, PairError};
 pub use reprojection::Reprojection;
+pub use run::{Evaluator, ProfileChanges, Save, Scene, Settings, run};
 pub use scores::{AlignedScores, PairScores, Scored, Scores};
 pub use thumbnails::{Thumbnails, error_png, jpeg};

@@ -19,7 +19,7 @@ const LEFT_OUT: [(&[&str], &str); 15] = [
     (&["scenario", "check"], "suite"),
     (&["scenario", "import"], "convert"),
     (&["stress"], "stress"),
-    (&["twin", "views"], "augment"),
+    (&["twin", "views"], "eval"),
 ];
 
 const BUILD: &str = "cargo build --release --features full";

@@ -12,7 +12,7 @@ mod list;
 mod log;
 mod rollback;
 mod sky;
-#[cfg(feature = "augment")]
+#[cfg(feature = "eval")]
 mod views;
 
 /// List, generate, check and clean up twins, and manage their versions.
@@ -37,7 +37,7 @@ enum Subcommand {
     Gc(gc::Gc),
     Fsck(fsck::Fsck),
     Sky(sky::Sky),
-    #[cfg(feature = "augment")]
+    #[cfg(feature = "eval")]
     Views(Box<views::Views>),
     Geo(geo::Geo),
     Align(align::Align),
@@ -55,7 +55,7 @@ impl Twin {
             Subcommand::Gc(gc) => gc.run(),
             Subcommand::Fsck(fsck) => fsck.run(),
             Subcommand::Sky(sky) => sky.run(),
-            #[cfg(feature = "augment")]
+            #[cfg(feature = "eval")]
             Subcommand::Views(views) => views.run(),
             Subcommand::Geo(geo) => geo.run(),
             Subcommand::Align(align) => align.run(),

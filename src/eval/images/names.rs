@@ -9,7 +9,7 @@ use super::list::RealImage;
 
 /// The camera of each image: its folder if the images are in several folders, else its file name
 /// without the digits at its end.
-pub(in crate::cli) fn camera_names(images: &[&RealImage]) -> Vec<String> {
+pub fn camera_names(images: &[&RealImage]) -> Vec<String> {
     let folder = |image: &RealImage| Path::new(&image.name).parent().map(Path::to_owned);
     let folders: BTreeSet<Option<PathBuf>> = images.iter().map(|image| folder(image)).collect();
     let name = |image: &&RealImage| {

@@ -1,16 +1,15 @@
-//! The files of `--save-images`.
+//! The files of an evaluation besides its report: compared images and maps of their errors.
 
 use wildcity_augment::mask_png;
-use wildcity_eval::Pair;
 use wildcity_render::View;
 
-use super::Eval;
-use crate::cli::output;
-use crate::cli::real_images::picture;
+use super::Evaluator;
+use crate::Pair;
+use crate::images::picture;
 
-impl Eval {
-    /// Writes the compared pixels and the map of their errors.
-    pub(super) fn save(
+impl Evaluator<'_> {
+    /// Saves the compared pixels and the map of their errors.
+    pub(super) fn save_pair(
         &self,
         name: &str,
         [pixels, errors]: [&str; 2],
@@ -20,11 +19,11 @@ impl Eval {
         let [width, height] = pair.size_px();
         let rendered = wildcity_session::png(pair.rendered(), width, height);
         self.save_file(pixels, name, &rendered.map_err(anyhow::Error::msg)?)?;
-        let map = wildcity_eval::error_png(pair, error_map);
+        let map = crate::error_png(pair, error_map);
         self.save_file(errors, name, &map.map_err(anyhow::Error::msg)?)
     }
 
-    /// Writes the pixels of a view off the trajectory.
+    /// Saves the pixels of a view off the trajectory.
     pub(super) fn save_pixels(
         &self,
         folder: &str,
@@ -36,7 +35,7 @@ impl Eval {
         self.save_file(folder, name, &file.map_err(anyhow::Error::msg)?)
     }
 
-    /// Writes a mask that is white where nothing moves, as `--masks` takes it.
+    /// Saves a mask that is white where nothing moves, in the form of masks of real images.
     pub(super) fn save_mask(
         &self,
         name: &str,
@@ -47,8 +46,8 @@ impl Eval {
     }
 
     fn save_file(&self, folder: &str, name: &str, png: &[u8]) -> anyhow::Result<()> {
-        let path = self.out.join(folder).join(picture::inside(name)).with_extension("png");
-        output::create_dir(path.parent().unwrap_or(&self.out))?;
-        output::write(&path, png)
+        let Some(save) = self.save else { return Ok(()) };
+        let name = picture::inside(name).with_extension("png");
+        save(&std::path::Path::new(folder).join(name), png)
     }
 }

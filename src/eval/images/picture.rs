@@ -16,7 +16,7 @@ const SAME_SHAPE: f64 = 0.01;
 ///
 /// # Errors
 /// The file cannot be read, or has another shape than the camera.
-pub(in crate::cli) fn real(
+pub fn real(
     file: &Path,
     camera: &Camera,
     background: [f64; 3],
@@ -41,7 +41,7 @@ pub(in crate::cli) fn real(
 ///
 /// # Errors
 /// The file cannot be read, or has another size than the image.
-pub(in crate::cli) fn mask(file: &Path, size_px: [u32; 2]) -> anyhow::Result<Vec<bool>> {
+pub fn mask(file: &Path, size_px: [u32; 2]) -> anyhow::Result<Vec<bool>> {
     let mask = read(file)?.into_luma8();
     let own_px = [mask.width(), mask.height()];
     ensure!(
@@ -57,7 +57,7 @@ pub(in crate::cli) fn mask(file: &Path, size_px: [u32; 2]) -> anyhow::Result<Vec
 }
 
 /// A name as a path that stays within a folder.
-pub(in crate::cli) fn inside(name: &str) -> PathBuf {
+pub fn inside(name: &str) -> PathBuf {
     Path::new(name).components().filter(|part| matches!(part, Component::Normal(_))).collect()
 }
 

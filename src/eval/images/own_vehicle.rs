@@ -8,7 +8,7 @@ const SAME_SHAPE: f64 = 0.01;
 
 /// The pixels of an image outside of the overlay of the rig's camera of a name. `None` without such
 /// a camera or overlay, and if the image has another shape: then another camera took it.
-pub(in crate::cli) fn outside(
+pub fn outside(
     rig: Option<&Rig>,
     camera_name: &str,
     [width, height]: [u32; 2],
@@ -38,7 +38,7 @@ pub(in crate::cli) fn outside(
 }
 
 /// The pixels that count in both of two masks, if there are any masks.
-pub(in crate::cli) fn both(one: Option<Vec<bool>>, other: Option<Vec<bool>>) -> Option<Vec<bool>> {
+pub fn both(one: Option<Vec<bool>>, other: Option<Vec<bool>>) -> Option<Vec<bool>> {
     match (one, other) {
         (Some(one), Some(other)) => Some(one.iter().zip(&other).map(|(a, b)| *a && *b).collect()),
         (one, other) => one.or(other),

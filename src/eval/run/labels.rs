@@ -1,47 +1,25 @@
-//! `--boxes` and `--lidar`: labels of images from a driving log.
+//! Boxes and LiDAR points: labels of images from a driving log.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Context, ensure};
 
-use wildcity_eval::{
+use crate::{
     Boxes, BoxesSubject, DepthMap, GROWN_PX, LidarDepth, LidarPoints, LidarSubject, MovingBox,
     WorldPoints, hide,
 };
 use wildcity_render::View;
 use wildcity_scene::align::Alignment;
 use wildcity_scene::trajectory::Keyframe;
-use wildcity_session::RenderedImage;
+use wildcity_session::{OpenScene, RenderedImage};
 use wildcity_twin::ingest;
 
-use crate::cli::limits;
-use crate::cli::real_images::RealImage;
-use crate::cli::scene_source::Source;
+use super::Settings;
+use crate::images::RealImage;
 
-/// Largest value of `--lidar-window`, in seconds.
-const LONGEST_S: f64 = 10.0;
-
-/// `--boxes` and `--lidar`.
-#[derive(Debug, clap::Args)]
-pub(super) struct LabelOptions {
-    /// File of boxes around vehicles and pedestrians, one JSON object per line: time_us, track,
-    /// size (length, width, height in the unit of the poses), world_from_box ({"xyz", "q"}: the
-    /// middle of the box, in the axes of the poses of --images), and optionally velocity. Pixels in
-    /// boxes that move faster than 1 m/s do not count. The images need time_us in their list.
-    #[arg(long, value_name = "FILE")]
-    boxes: Option<PathBuf>,
-
-    /// Points of a LiDAR, a safetensors file: points_m [n, 3], time_us [n]; and optionally
-    /// rig_from_lidar [4, 4], pose_time_us [m] and world_from_rig [m, 4, 4] in the axes of the
-    /// poses of --images [default: the twin's first drive]. The rendered depth is compared with
-    /// these points. The images need time_us in their list, in the same clock.
-    #[arg(long, value_name = "FILE")]
-    lidar: Option<PathBuf>,
-
-    /// Largest time between an image and the LiDAR points that are compared with it, in seconds.
-    #[arg(long, value_name = "S", default_value = "0.05", value_parser = seconds, requires = "lidar")]
-    lidar_window: f64,
-}
+/// Largest file of boxes or LiDAR points. An hour of a LiDAR with 64 rows has 20 GB: give some
+/// minutes of it.
+const LABEL_BYTES: u64 = 4 << 30;
 
 /// The labels of the images.
 pub(super) struct Labels {
@@ -52,19 +30,15 @@ pub(super) struct Labels {
     pub(super) lidar_subject: Option<LidarSubject>,
 }
 
-impl LabelOptions {
-    pub(super) fn needs_depth(&self) -> bool {
-        self.lidar.is_some()
-    }
-
+impl Labels {
     /// Reads the files.
     pub(super) fn load(
-        &self,
-        source: &Source,
+        settings: &Settings,
+        source: &OpenScene,
         alignment: &Alignment,
         images: &[&RealImage],
-    ) -> anyhow::Result<Labels> {
-        for (option, file) in [("--boxes", &self.boxes), ("--lidar", &self.lidar)] {
+    ) -> anyhow::Result<Self> {
+        for (option, file) in [("--boxes", &settings.boxes), ("--lidar", &settings.lidar)] {
             let untimed = images.iter().find(|image| image.time_us.is_none());
             if let (Some(_), Some(image)) = (file, untimed) {
                 anyhow::bail!(
@@ -74,20 +48,20 @@ impl LabelOptions {
                 );
             }
         }
-        let mut labels = Labels {
+        let mut labels = Self {
             boxes: None,
             lidar: None,
-            window_us: (self.lidar_window * 1e6).round() as i64,
+            window_us: (settings.lidar_window_s * 1e6).round() as i64,
             boxes_subject: None,
             lidar_subject: None,
         };
-        if let Some(path) = &self.boxes {
+        if let Some(path) = &settings.boxes {
             let boxes = read_boxes(path).with_context(|| format!("--boxes {}", path.display()))?;
             let file = path.display().to_string();
             labels.boxes_subject = Some(BoxesSubject { file, tracks: boxes.tracks() });
             labels.boxes = Some(boxes.aligned(alignment));
         }
-        if let Some(path) = &self.lidar {
+        if let Some(path) = &settings.lidar {
             let about = || format!("--lidar {}", path.display());
             let points = read_lidar(path, source, alignment).with_context(about)?;
             labels.lidar_subject = Some(LidarSubject {
@@ -99,9 +73,7 @@ impl LabelOptions {
         }
         Ok(labels)
     }
-}
 
-impl Labels {
     /// Masks moving objects in an image. Returns the pixels that count, and the share that is
     /// masked; `None` without boxes.
     pub(super) fn hide(
@@ -147,13 +119,17 @@ impl Labels {
 }
 
 fn read_boxes(path: &Path) -> anyhow::Result<Boxes> {
-    let bytes = ingest::read_whole(path, limits::LABEL_BYTES)?;
+    let bytes = ingest::read_whole(path, LABEL_BYTES)?;
     let text = std::str::from_utf8(&bytes).context("the file is not UTF-8 text")?;
     Ok(Boxes::parse(text)?)
 }
 
-fn read_lidar(path: &Path, source: &Source, alignment: &Alignment) -> anyhow::Result<WorldPoints> {
-    let points = LidarPoints::parse(&ingest::read_whole(path, limits::LABEL_BYTES)?)?;
+fn read_lidar(
+    path: &Path,
+    source: &OpenScene,
+    alignment: &Alignment,
+) -> anyhow::Result<WorldPoints> {
+    let points = LidarPoints::parse(&ingest::read_whole(path, LABEL_BYTES)?)?;
     let drives = source.version().map(|version| &version.manifest.trajectories);
     let drive = drives.and_then(|drives| drives.first()).map(|drive| &drive.keyframes[..]);
     let world = points.in_world(alignment, drive.map(|keys: &[Keyframe]| keys))?;
@@ -163,10 +139,4 @@ fn read_lidar(path: &Path, source: &Source, alignment: &Alignment) -> anyhow::Re
         points.len()
     );
     Ok(world)
-}
-
-fn seconds(text: &str) -> Result<f64, String> {
-    let must = || format!("expected seconds from 0 to {LONGEST_S}");
-    let seconds: f64 = text.parse().map_err(|_| must())?;
-    if (0.0..=LONGEST_S).contains(&seconds) { Ok(seconds) } else { Err(must()) }
 }

@@ -1,10 +1,10 @@
-//! `--extrapolate`: views off the trajectory, for which there is no real image.
+//! Views off the trajectory, for which there is no real image.
 
 use std::sync::Arc;
 
 use glam::DVec3;
 
-use wildcity_eval::{ExtrapolatedView, Extrapolation, Reprojection, ViewScores, jpeg};
+use crate::{ExtrapolatedView, Extrapolation, Reprojection, ViewScores, jpeg};
 use wildcity_render::View;
 use wildcity_render::compare::flicker::flicker;
 use wildcity_repair::Image;
@@ -19,35 +19,6 @@ use wildcity_session::{OfflineView, RenderedImage};
 use super::drive::{DrivePlace, Drives};
 use super::renderer::{Renderer, covered, expose};
 use super::repairer::Repairer;
-
-/// Largest distance from the drive, in metres.
-const FARTHEST_M: f64 = 50.0;
-
-/// Largest number of distances.
-const MOST: usize = 16;
-
-/// The distances of `--extrapolate`, in metres.
-#[derive(Clone, Debug)]
-pub(super) struct Offsets(pub(super) Vec<f64>);
-
-impl std::str::FromStr for Offsets {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let must = || {
-            format!(
-                "expected 1 to {MOST} distances in metres, such as 1,3,5: at most {FARTHEST_M}, not 0"
-            )
-        };
-        let offset = |text: &str| text.trim().parse::<f64>().map_err(|_| must());
-        let offsets = text.split(',').map(offset).collect::<Result<Vec<f64>, String>>()?;
-        let is_offset = |offset: &f64| *offset != 0.0 && offset.abs() <= FARTHEST_M;
-        if offsets.len() > MOST || !offsets.iter().all(is_offset) {
-            return Err(must());
-        }
-        Ok(Self(offsets))
-    }
-}
 
 /// The renderer, the repairer and the recorded drives that the views need.
 #[derive(Clone, Copy)]
@@ -115,10 +86,10 @@ impl Lens {
 }
 
 impl OffTrajectoryViews {
-    pub(super) fn new(offsets: &Offsets) -> Self {
+    pub(super) fn new(offsets_m: &[f64]) -> Self {
         let line =
             |offset_m: &f64| Line { offset_m: *offset_m, views: Vec::new(), pictures: Vec::new() };
-        Self(offsets.0.iter().map(line).collect())
+        Self(offsets_m.iter().map(line).collect())
     }
 
     /// Renders and compares the views of an image. Returns their pixels, distance by distance.

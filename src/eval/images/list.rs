@@ -6,34 +6,35 @@ use anyhow::{Context, anyhow};
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 
-use crate::cli::file_notes;
 use wildcity_scene::align::PosedImage;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_twin::ingest::capture::CaptureError;
 use wildcity_twin::ingest::{self, cameras, capture};
 
 /// A real image and its camera.
-pub(in crate::cli) struct RealImage {
+pub struct RealImage {
     /// Its name in the list.
-    pub(in crate::cli) name: String,
-    pub(in crate::cli) file: PathBuf,
-    pub(in crate::cli) mask: Option<PathBuf>,
-    pub(in crate::cli) camera: Camera,
+    pub name: String,
+    pub file: PathBuf,
+    pub mask: Option<PathBuf>,
+    pub camera: Camera,
     /// Pose in the axes and unit of the list.
-    pub(in crate::cli) world_from_camera: Pose,
+    pub world_from_camera: Pose,
     /// The smallest z that it draws, if the list says one, in units of the scene.
-    pub(in crate::cli) near: Option<f64>,
+    pub near: Option<f64>,
     /// When it was taken, in microseconds, if the list says so.
-    pub(in crate::cli) time_us: Option<i64>,
+    pub time_us: Option<i64>,
     /// Its exposure in stops against the scene's, if the list says so.
-    pub(in crate::cli) exposure_stops: Option<f64>,
+    pub exposure_stops: Option<f64>,
 }
 
 /// Real images, in the order of their names.
-pub(in crate::cli) struct ImageList {
+pub struct ImageList {
     images: Vec<RealImage>,
     /// Whether the poses are in the axes of the scene; else they are in those of a capture.
-    pub(in crate::cli) is_in_scene_axes: bool,
+    pub is_in_scene_axes: bool,
+    /// What the list says and is not used, for a person.
+    pub warnings: Vec<String>,
 }
 
 /// An image of a list.
@@ -51,6 +52,7 @@ struct Listed {
     folder: PathBuf,
     /// As [`ImageList::is_in_scene_axes`].
     is_in_scene_axes: bool,
+    warnings: Vec<String>,
 }
 
 impl ImageList {
@@ -58,12 +60,12 @@ impl ImageList {
     ///
     /// # Errors
     /// The list cannot be read, or an image or a mask is missing.
-    pub(in crate::cli) fn read(
+    pub fn read(
         source: &Path,
         image_dir: Option<&Path>,
         masks: Option<&Path>,
     ) -> anyhow::Result<Self> {
-        let Listed { images, folder, is_in_scene_axes } =
+        let Listed { images, folder, is_in_scene_axes, warnings } =
             read(source).with_context(|| format!("--images {}", source.display()))?;
         let folder = image_dir.unwrap_or(&folder);
         let mut found = Vec::with_capacity(images.len());
@@ -87,11 +89,11 @@ impl ImageList {
             });
         }
         found.sort_by(|a, b| a.name.cmp(&b.name));
-        Ok(Self { images: found, is_in_scene_axes })
+        Ok(Self { images: found, is_in_scene_axes, warnings })
     }
 
     /// Every `step`-th image, starting with the first.
-    pub(in crate::cli) fn every(&self, step: usize) -> Vec<&RealImage> {
+    pub fn every(&self, step: usize) -> Vec<&RealImage> {
         self.images.iter().step_by(step).collect()
     }
 }
@@ -106,18 +108,22 @@ fn read(source: &Path) -> anyhow::Result<Listed> {
         })?;
         let listed = |posed| ListedImage { posed, mask: None, near: None, exposure_stops: None };
         let images = images.into_iter().map(listed).collect();
-        return Ok(Listed { images, folder: colmap_images(source), is_in_scene_axes: false });
+        return Ok(Listed {
+            images,
+            folder: colmap_images(source),
+            is_in_scene_axes: false,
+            warnings: Vec::new(),
+        });
     }
     if is_dir || has_frames(source)? {
         let capture::NerfstudioCapture { frames, warnings } = capture::read_nerfstudio(source)?;
-        file_notes::print_warnings(source, &warnings)?;
         let listed = |frame: capture::FrameImage| {
             let capture::FrameImage { posed, mask, exposure_stops } = frame;
             ListedImage { posed, mask, near: None, exposure_stops }
         };
         let images = frames.into_iter().map(listed).collect();
         let folder = if is_dir { source.to_owned() } else { beside };
-        return Ok(Listed { images, folder, is_in_scene_axes: false });
+        return Ok(Listed { images, folder, is_in_scene_axes: false, warnings });
     }
     let listed = cameras::read(source)?.into_iter().map(|listed| {
         let name = listed.image.unwrap_or(listed.name);
@@ -133,7 +139,12 @@ fn read(source: &Path) -> anyhow::Result<Listed> {
         let posed = PosedImage { name, camera, world_from_camera, time_us };
         ListedImage { posed, mask, near, exposure_stops }
     });
-    Ok(Listed { images: listed.collect(), folder: beside, is_in_scene_axes: true })
+    Ok(Listed {
+        images: listed.collect(),
+        folder: beside,
+        is_in_scene_axes: true,
+        warnings: Vec::new(),
+    })
 }
 
 /// Whether a JSON file has the field `frames`, as transforms.json has.

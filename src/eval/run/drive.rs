@@ -5,9 +5,9 @@ use std::sync::Arc;
 use glam::DVec3;
 
 use wildcity_render::View;
-use wildcity_report::repair::FRAME_M;
 use wildcity_scene::Trajectory;
 use wildcity_scene::geometry::Pose;
+use wildcity_session::limits::FRAME_M;
 use wildcity_session::{RenderedImage, TrainingCoverage};
 use wildcity_twin::store::Version;
 

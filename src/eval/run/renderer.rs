@@ -4,18 +4,18 @@ use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::RenderProfile;
 use wildcity_scene::align::Alignment;
 use wildcity_scene::srgb::change_stops;
-use wildcity_session::RenderedImage;
+use wildcity_session::{OpenScene, RenderedImage};
 
-use crate::cli::profile_options::LoadedProfile;
-use crate::cli::scene_source::Source;
+/// Changes of a render profile, and their check.
+pub type ProfileChanges = dyn Fn(RenderProfile) -> anyhow::Result<RenderProfile>;
 
 /// The renderer of the images.
 pub(super) struct Renderer {
-    pub(super) source: Source,
+    pub(super) source: OpenScene,
     /// The profile of the scene.
     pub(super) own_profile: RenderProfile,
-    /// The changes of the command line.
-    pub(super) changes: LoadedProfile,
+    /// Changes of the profile.
+    pub(super) changes: Box<ProfileChanges>,
     pub(super) backend: Box<dyn Backend>,
     /// The transform from the axes of the images' poses to those of the scene.
     pub(super) alignment: Alignment,
@@ -32,11 +32,11 @@ pub(super) struct Maps {
 }
 
 impl Renderer {
-    /// How an image is rendered: `near` of the list overrides the scene's, and the command line
+    /// How an image is rendered: `near` of the list overrides the scene's, and the changes
     /// both.
     pub(super) fn profile(&self, near: Option<f64>) -> anyhow::Result<RenderProfile> {
         let near = near.unwrap_or(self.own_profile.near);
-        self.changes.apply(RenderProfile { near, ..self.own_profile })
+        (self.changes)(RenderProfile { near, ..self.own_profile })
     }
 
     pub(super) fn render(

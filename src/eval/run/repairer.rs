@@ -1,47 +1,23 @@
 //! The model that repairs the images, if one is asked for.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::{Context, ensure};
 
-use wildcity_eval::RepairSubject;
 use wildcity_repair::reference::ReferenceCache;
 use wildcity_repair::{InputRole, LoadOptions, Model};
 use wildcity_scene::RenderProfile;
 use wildcity_scene::geometry::Pose;
 use wildcity_session::{
-    NeededReferences, OfflineDrawing, OfflineReferences, OfflineView, ReferenceSource,
+    NeededReferences, OfflineDrawing, OfflineReferences, OfflineView, OpenScene, ReferenceSource,
     ViewReferences,
 };
+use wildcity_twin::store::Catalog;
 
+use super::Settings;
 use super::renderer::Renderer;
-use crate::cli::directories::Twins;
-use crate::cli::repair_options::runtime_library;
-use crate::cli::scene_source::Source;
-
-/// Largest number of threads of a network.
-const THREADS: i64 = wildcity_repair::limits::MAX_THREADS as i64;
-
-/// `--repair` and the runtime of networks.
-#[derive(Debug, clap::Args)]
-pub(super) struct RepairerOptions {
-    /// Also repair each image with the model of this manifest (docs/repair.md), and compare the
-    /// repaired image, too. Every image is repaired, at any trust. A model that compares with
-    /// recorded images needs a twin with a drive; the images that are compared here are withheld
-    /// from it.
-    #[arg(long, value_name = "FILE")]
-    repair: Option<PathBuf>,
-
-    /// ONNX Runtime library for --repair, --lpips and --features, version 1.18 or later [default:
-    /// $ORT_DYLIB_PATH]
-    #[arg(long, value_name = "PATH")]
-    onnxruntime: Option<PathBuf>,
-
-    /// Threads of each network on the processor. The results do not depend on it.
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=THREADS))]
-    repair_threads: u16,
-}
+use crate::RepairSubject;
 
 /// A model and the images that it compares with.
 pub(super) struct Repairer {
@@ -59,49 +35,42 @@ pub(super) struct Repaired {
     pub(super) nearest: Option<String>,
 }
 
-impl RepairerOptions {
-    /// How networks are loaded.
-    pub(super) fn load_options(&self) -> LoadOptions {
-        let library = runtime_library(self.onnxruntime.as_ref());
-        LoadOptions { threads: self.repair_threads.into(), ..LoadOptions::new(library) }
-    }
-
+impl Repairer {
     /// Loads the model, if one is asked for. `held_out` are the poses of the images that are
     /// compared.
     pub(super) fn load(
-        &self,
-        source: &Source,
-        twins: &Twins,
+        settings: &Settings,
+        source: &OpenScene,
+        catalog: Option<&Catalog>,
         held_out: &[Pose],
-    ) -> anyhow::Result<Option<Repairer>> {
-        let Some(manifest) = &self.repair else { return Ok(None) };
-        let repairer = self.open(manifest, source, twins, held_out);
+    ) -> anyhow::Result<Option<Self>> {
+        let Some(manifest) = &settings.repair else { return Ok(None) };
+        let repairer = Self::open(manifest, &settings.networks, source, catalog, held_out);
         repairer.with_context(|| format!("--repair {}", manifest.display())).map(Some)
     }
 
     fn open(
-        &self,
         manifest: &Path,
-        source: &Source,
-        twins: &Twins,
+        options: &LoadOptions,
+        source: &OpenScene,
+        catalog: Option<&Catalog>,
         held_out: &[Pose],
-    ) -> anyhow::Result<Repairer> {
-        let options = self.load_options();
-        let model = Arc::new(Model::load(manifest, &options)?);
+    ) -> anyhow::Result<Self> {
+        let model = Arc::new(Model::load(manifest, options)?);
         let needed = NeededReferences::from_model(&model);
         let name = &model.manifest().name;
         let references = match source {
-            Source::Twin(resident) => {
+            OpenScene::Twin(resident) => {
                 let cameras = resident.version.manifest.rig.as_ref().map(|rig| &rig.cameras[..]);
                 let cameras = cameras.unwrap_or_default();
-                let catalog = twins.catalog()?;
+                let catalog = catalog.context("a twin is in a catalog")?.clone();
                 let references =
                     OfflineReferences::open(resident.clone(), catalog, cameras, held_out)?;
                 // The sizes of the images are known later.
                 references.check(&model, &[])?;
                 Some(references)
             }
-            Source::File(_) => {
+            OpenScene::File(_) => {
                 ensure!(
                     !needed.any(),
                     "the model {name:?} needs images of a recorded drive, which a scene file does not have: give a twin, or a \
@@ -117,11 +86,9 @@ impl RepairerOptions {
             "the model {name:?} needs the trust, which only a twin with a recorded drive has: `wildcity twin drive` adds one"
         );
         let cache = ReferenceCache::new(options.reference_bytes);
-        Ok(Repairer { model, needed, references, cache })
+        Ok(Self { model, needed, references, cache })
     }
-}
 
-impl Repairer {
     pub(super) fn needs_depth(&self) -> bool {
         self.needed.warped || self.needs_normals() || self.model.needs(InputRole::Depth)
     }

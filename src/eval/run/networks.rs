@@ -1,26 +1,13 @@
-//! `--lpips` and `--features`: networks of the user that measure images.
+//! Networks of the user that measure images.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Context, ensure};
 
-use wildcity_eval::{Kid, KidScores};
-use wildcity_repair::{Image, LoadOptions, Network};
+use crate::{Kid, KidScores};
+use wildcity_repair::{Image, Network};
 
-/// `--lpips` and `--features`.
-#[derive(Debug, clap::Args)]
-pub(super) struct NetworkOptions {
-    /// Manifest of a network that computes the distance between two images, such as LPIPS
-    /// (docs/evaluation.md). Pixels that do not count are replaced by those of the real image.
-    #[arg(long, value_name = "FILE")]
-    lpips: Option<PathBuf>,
-
-    /// Manifest of a network that computes the features of an image, such as Inception. They give
-    /// KID, the distance between the set of rendered images and the set of real ones; with
-    /// --extrapolate also for the views off the drive.
-    #[arg(long, value_name = "FILE")]
-    features: Option<PathBuf>,
-}
+use super::Settings;
 
 /// Networks that measure images.
 pub(super) struct Networks {
@@ -35,12 +22,12 @@ pub(super) struct FeatureSet {
     pub(super) repaired: Vec<Vec<f32>>,
 }
 
-impl NetworkOptions {
+impl Networks {
     /// Loads the networks.
-    pub(super) fn load(&self, options: &LoadOptions) -> anyhow::Result<Networks> {
+    pub(super) fn load(settings: &Settings) -> anyhow::Result<Self> {
         let load = |option: &str, path: &Path, compares: bool| {
             let about = || format!("{option} {}", path.display());
-            let network = Network::load(path, options).with_context(about)?;
+            let network = Network::load(path, &settings.networks).with_context(about)?;
             let roles =
                 if compares { "roles \"image\" and \"truth\"" } else { "role \"image\" only" };
             ensure!(
@@ -50,14 +37,12 @@ impl NetworkOptions {
             );
             Ok(network)
         };
-        let lpips = self.lpips.as_ref().map(|path| load("--lpips", path, true)).transpose()?;
+        let lpips = settings.lpips.as_ref().map(|path| load("--lpips", path, true)).transpose()?;
         let features =
-            self.features.as_ref().map(|path| load("--features", path, false)).transpose()?;
-        Ok(Networks { lpips, features })
+            settings.features.as_ref().map(|path| load("--features", path, false)).transpose()?;
+        Ok(Self { lpips, features })
     }
-}
 
-impl Networks {
     /// Name of the network of LPIPS, with its version.
     pub(super) fn lpips_name(&self) -> Option<String> {
         self.lpips.as_ref().map(name)
