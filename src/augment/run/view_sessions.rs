@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use anyhow::{Context, ensure};
 
-use wildcity_augment::{Place, RepairedWith, SampleRepair, TrainingCamera};
+use crate::{Place, RepairedWith, SampleRepair, TrainingCamera};
 use wildcity_client::protocol::message::{
     Encoding, OnFailure, OpenedRepair, Outputs, ReferenceSource, Repair, Rig, RigChoice,
 };
@@ -14,7 +14,7 @@ use wildcity_scene::rig::RigCamera;
 use wildcity_twin::store::Version;
 
 /// Time limit for the images of one place: a large model on a processor takes minutes an image.
-pub(super) const PLACE_TIMEOUT: Duration = Duration::from_secs(3600);
+pub const PLACE_TIMEOUT: Duration = Duration::from_secs(3600);
 
 /// The session that renders, and the session that also repairs.
 pub(super) struct ViewSessions {
