@@ -16,6 +16,7 @@
 //! thumbnails      small pictures of a pair
 //! page            the HTML page
 //! images          real images with their cameras, and their files
+//! beside          views beside the drive of a twin with errors, against one without them
 //! run             an evaluation: renders, repairs and measures every image of a list
 //! ```
 //!
@@ -23,6 +24,7 @@
 //! Images are compared in 8 bits, as agents get them and files store them, so that other programs
 //! compute the same numbers from the files.
 
+mod beside;
 mod boxes;
 mod csv;
 mod evaluated_image;
@@ -41,6 +43,7 @@ mod run;
 mod scores;
 mod thumbnails;
 
+pub use beside::{Beside, BesideViews};
 pub use boxes::{Boxes, BoxesError, GROWN_PX, MOVES_M_PER_S, MovingBox, hide};
 pub use evaluated_image::EvaluatedImage;
 pub use evaluation::{BoxesSubject, Evaluation, LidarSubject, RepairSubject, Subject};

@@ -59,6 +59,7 @@ fn an_option_says_what_to_build() {
     for (arguments, feature) in [
         (&["demo", "--backend", "gpu"][..], "gpu"),
         (&["demo", "--gpu-memory-gib", "2"], "gpu"),
+        (&["demo", "--off-trajectory", "3", "--backend", "cpu"], "eval"),
         (&["twin", "list", "--twins", "s3://bucket/twins"], "object-store"),
         (&["serve", "--alpasim", "127.0.0.1:0"], "alpasim"),
         (&["serve", "--mcap", "--backend", "cpu"], "mcap"),
