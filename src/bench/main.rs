@@ -21,7 +21,6 @@ mod sessions;
 mod size;
 mod soak;
 mod step;
-mod temporary_dir;
 mod timed;
 
 /// Measure the speed of the renderer, of sessions, of actors, and of reading twins.

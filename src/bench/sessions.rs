@@ -10,7 +10,6 @@ use serde_json::json;
 use super::benched_twin::BenchedTwin;
 use super::processor::processor_time;
 use super::size::Size;
-use super::temporary_dir::TemporaryDir;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::route::Route;
 use wildcity_scene::{Manifest, Rig};
@@ -79,7 +78,7 @@ struct Row {
 
 impl Sessions {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let episodes = TemporaryDir::new()?;
+        let episodes = tempfile::tempdir()?;
         let (engine, version) = self.twin.start(episodes.path())?;
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
         let mut out = io::stdout().lock();

@@ -62,12 +62,15 @@ mod serve;
 mod sky_source;
 #[cfg(feature = "stress")]
 mod stress;
+mod subcommands;
 mod time;
 mod twin;
 mod view;
 
 use clap::error::ErrorKind;
-use clap::{CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
+use clap::{CommandFactory as _, FromArgMatches as _, Parser};
+
+pub(crate) use subcommands::subcommands;
 
 /// A closed-loop driving simulator server for city twins made of 3D Gaussians.
 #[derive(Debug, Parser)]
@@ -85,10 +88,9 @@ Examples:
   wildcity serve                                  (then an agent can open the twin \"street\")
   wildcity help import                            (options and examples of one command)";
 
-#[derive(Debug, Subcommand)]
-enum Command {
+subcommands! {
+    Command;
     Demo(demo::Demo),
-    // It has the most options.
     Serve(Box<serve::Serve>),
     View(view::View),
     Import(import::Import),
@@ -115,8 +117,6 @@ enum Command {
     Route(route::Route),
     Scenario(scenario::ScenarioCommand),
     Map(map::MapCommand),
-    /// Moved to the program `wildcity-bench`.
-    #[command(hide = true, disable_help_flag = true)]
     Bench(Moved),
     #[cfg(feature = "gpu")]
     Bisect(bisect::Bisect),
@@ -129,11 +129,21 @@ enum Command {
     Doctor(doctor::Doctor),
 }
 
-/// The arguments of a command that is elsewhere.
+/// Moved to the program `wildcity-bench`.
 #[derive(Debug, clap::Args)]
+#[command(hide = true, disable_help_flag = true)]
 struct Moved {
     #[arg(trailing_var_arg = true, allow_hyphen_values = true, hide = true)]
     _arguments: Vec<String>,
+}
+
+impl Moved {
+    fn run(self) -> anyhow::Result<()> {
+        anyhow::bail!(
+            "wildcity bench is a program of its own: in the source of wildcity, run cargo run \
+             --release -p wildcity-bench -- and the arguments after \"bench\""
+        )
+    }
 }
 
 /// Parses the command line, runs the command, and returns the exit code: 0 for success, 1 for a
@@ -157,53 +167,6 @@ pub fn main() -> ExitCode {
         }
     };
     exit::code(arguments.command.run())
-}
-
-impl Command {
-    fn run(self) -> anyhow::Result<()> {
-        match self {
-            Self::Demo(command) => command.run(),
-            Self::Serve(command) => command.run(),
-            Self::View(command) => command.run(),
-            Self::Import(command) => command.run(),
-            Self::Inspect(command) => command.run(),
-            #[cfg(feature = "http")]
-            Self::Push(command) => command.run(),
-            Self::Lod(command) => command.run(),
-            Self::Twin(command) => command.run(),
-            Self::Actor(command) => command.run(),
-            Self::Render(command) => command.run(),
-            #[cfg(feature = "eval")]
-            Self::Eval(command) => command.run(),
-            Self::Repair(command) => command.run(),
-            #[cfg(feature = "augment")]
-            Self::Augment(command) => command.run(),
-            #[cfg(feature = "alpasim")]
-            Self::Drive(command) => command.run(),
-            #[cfg(feature = "alpasim")]
-            Self::Alpasim(command) => command.run(),
-            Self::Replay(command) => command.run(),
-            #[cfg(feature = "suite")]
-            Self::Episode(command) => command.run(),
-            Self::Rig(command) => command.run(),
-            Self::Route(command) => command.run(),
-            Self::Scenario(command) => command.run(),
-            Self::Map(command) => command.run(),
-            Self::Bench(_) => Err(anyhow::anyhow!(
-                "wildcity bench is a program of its own: in the source of wildcity, run cargo run \
-             --release -p wildcity-bench -- and the arguments after \"bench\""
-            )),
-            #[cfg(feature = "gpu")]
-            Self::Bisect(command) => command.run(),
-            #[cfg(feature = "stress")]
-            Self::Stress(command) => command.run(),
-            #[cfg(feature = "report")]
-            Self::Report(command) => command.run(),
-            #[cfg(feature = "gpu")]
-            Self::Devices(command) => command.run(),
-            Self::Doctor(command) => command.run(),
-        }
-    }
 }
 
 #[cfg(test)]

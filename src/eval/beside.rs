@@ -47,7 +47,7 @@ pub struct Beside<'a> {
 /// The views of all kinds: rendered, perhaps repaired, and true.
 #[derive(Debug)]
 pub struct BesideViews {
-    /// Names of the cameras.
+    /// Names of the cameras, in the order of the figures.
     pub cameras: [&'static str; 3],
     /// For each kind but the true one, the mean PSNR of each camera against that one, in dB.
     pub psnr_db: Vec<(&'static str, [f64; 3])>,
@@ -82,11 +82,8 @@ impl Beside<'_> {
         Ok(BesideViews { cameras: CAMERAS, psnr_db, pictures })
     }
 
-    /// Stores recorded images in the degraded twin, unless it has some. They show the street without
-    /// errors.
-    ///
-    /// Their stations are those that the repair of the views searches: from 8 m behind a view to 2 m
-    /// ahead of it.
+    /// Stores images of the truth in the degraded twin, unless it has some. Their stations are
+    /// those that the repair of the views searches: from 8 m behind a view to 2 m ahead of it.
     async fn record_images(&self) -> anyhow::Result<()> {
         let Self { url, catalog, truth, spoiled, drive, .. } = *self;
         let base = catalog.version(spoiled, None)?;

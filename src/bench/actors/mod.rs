@@ -20,7 +20,6 @@ use wildcity_twin::store::Catalog;
 use super::benched_twin::BenchedTwin;
 use super::processor::processor_time;
 use super::size::Size;
-use super::temporary_dir::TemporaryDir;
 use super::timed::median;
 use street::Cars;
 use wildcity::cli::progress;
@@ -91,7 +90,7 @@ struct Row {
 
 impl Actors {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let temporary = TemporaryDir::new()?;
+        let temporary = tempfile::tempdir()?;
         let source = self.twin.twins.catalog()?;
         let version = source.version(&self.twin.twin.name, self.twin.twin.number)?;
         let catalog = Catalog::open(&temporary.path().join("twins"))?;

@@ -18,7 +18,6 @@ use wildcity_twin::residency::Stats;
 
 use super::benched_twin::BenchedTwin;
 use super::memory::rss_bytes;
-use super::temporary_dir::TemporaryDir;
 use report::{Report, Row};
 use step::DriveStep;
 
@@ -75,7 +74,7 @@ Examples:
 
 impl Drive {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let episodes = TemporaryDir::new()?;
+        let episodes = tempfile::tempdir()?;
         let (engine, version) = self.twin.start(episodes.path())?;
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
         let report = runtime.block_on(self.drive(engine, &version.manifest))?;

@@ -31,8 +31,8 @@ pub(super) struct Actor {
     subcommand: Subcommand,
 }
 
-#[derive(Debug, clap::Subcommand)]
-enum Subcommand {
+super::subcommands! {
+    Subcommand;
     Import(import::Import),
     #[cfg(feature = "http")]
     Push(push::Push),
@@ -45,15 +45,6 @@ enum Subcommand {
 
 impl Actor {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        match self.subcommand {
-            Subcommand::Import(import) => import.run(),
-            #[cfg(feature = "http")]
-            Subcommand::Push(push) => push.run(),
-            Subcommand::Generate(generate) => generate.run(),
-            Subcommand::List(list) => list.run(),
-            Subcommand::Show(show) => show.run(),
-            Subcommand::Remove(remove) => remove.run(),
-            Subcommand::Cut(cut) => cut.run(),
-        }
+        self.subcommand.run()
     }
 }

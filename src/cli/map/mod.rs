@@ -23,8 +23,8 @@ pub(super) struct MapCommand {
     subcommand: Subcommand,
 }
 
-#[derive(Debug, clap::Subcommand)]
-enum Subcommand {
+super::subcommands! {
+    Subcommand;
     #[cfg(feature = "convert")]
     Import(import::Import),
     Strips(strips::Strips),
@@ -33,11 +33,6 @@ enum Subcommand {
 
 impl MapCommand {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        match self.subcommand {
-            #[cfg(feature = "convert")]
-            Subcommand::Import(import) => import.run(),
-            Subcommand::Strips(strips) => strips.run(),
-            Subcommand::Check(check) => check.run(),
-        }
+        self.subcommand.run()
     }
 }

@@ -31,8 +31,8 @@ pub(super) struct ScenarioCommand {
     subcommand: Subcommand,
 }
 
-#[derive(Debug, clap::Subcommand)]
-enum Subcommand {
+super::subcommands! {
+    Subcommand;
     #[cfg(feature = "suite")]
     Check(check::Check),
     Show(show::Show),
@@ -42,13 +42,7 @@ enum Subcommand {
 
 impl ScenarioCommand {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        match self.subcommand {
-            #[cfg(feature = "suite")]
-            Subcommand::Check(check) => check.run(),
-            Subcommand::Show(show) => show.run(),
-            #[cfg(feature = "convert")]
-            Subcommand::Import(import) => import.run(),
-        }
+        self.subcommand.run()
     }
 }
 

@@ -27,8 +27,8 @@ pub(super) struct Twin {
     subcommand: Subcommand,
 }
 
-#[derive(Debug, clap::Subcommand)]
-enum Subcommand {
+super::subcommands! {
+    Subcommand;
     List(list::List),
     Generate(generate::Generate),
     Log(log::Log),
@@ -46,20 +46,6 @@ enum Subcommand {
 
 impl Twin {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        match self.subcommand {
-            Subcommand::List(list) => list.run(),
-            Subcommand::Generate(generate) => generate.run(),
-            Subcommand::Log(log) => log.run(),
-            Subcommand::Diff(diff) => diff.run(),
-            Subcommand::Rollback(rollback) => rollback.run(),
-            Subcommand::Gc(gc) => gc.run(),
-            Subcommand::Fsck(fsck) => fsck.run(),
-            Subcommand::Sky(sky) => sky.run(),
-            #[cfg(feature = "eval")]
-            Subcommand::Views(views) => views.run(),
-            Subcommand::Geo(geo) => geo.run(),
-            Subcommand::Align(align) => align.run(),
-            Subcommand::Drive(drive) => drive.run(),
-        }
+        self.subcommand.run()
     }
 }

@@ -70,7 +70,7 @@ pub struct Scene {
     pub source: OpenScene,
     /// The catalog of the twin; `None` for a file.
     pub catalog: Option<Catalog>,
-    /// The profile of the scene.
+    /// The profile of the scene before its changes.
     pub own_profile: RenderProfile,
     /// Changes of that profile.
     pub changes: Box<ProfileChanges>,
