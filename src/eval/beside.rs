@@ -28,7 +28,7 @@ const STATIONS_M: [f64; 4] = [40.0, 90.0, 190.0, 240.0];
 /// The twins, and the server that draws them.
 #[derive(Clone, Copy, Debug)]
 pub struct Beside<'a> {
-    /// The server.
+    /// The URL of the server.
     pub url: &'a str,
     /// The twins of the server.
     pub catalog: &'a Catalog,

@@ -54,7 +54,7 @@ pub struct Settings {
 /// A data set of one round.
 #[derive(Debug)]
 pub struct Round {
-    /// The folder `round_N`.
+    /// The folder `round_N` of the files.
     pub dir: PathBuf,
     /// Offsets of its views, in metres.
     pub offsets_m: Vec<f64>,
