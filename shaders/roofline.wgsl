@@ -1,5 +1,5 @@
 // Measures the device's peak rates of copying memory and of multiply-adds. This is not a stage of the
-// renderer; only `wildcity bench gpu` runs it.
+// renderer; only `wildcity-bench gpu` runs it.
 
 #import constants
 #import layout

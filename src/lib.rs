@@ -16,8 +16,8 @@
 //! | [`wildcity_convert`] | maps and scenarios from OpenDRIVE, GeoJSON and OpenSCENARIO | scene, sim |
 //! | [`wildcity_score`] | scores of driven episodes: other projects', and our verdict | scene, sim |
 //! | [`wildcity_episode`] | recorded episodes: their lines, reading, scoring and comparing them | scene, score, sim |
-//! | [`wildcity_augment`] | views off the drive as training data: plan, masks, transforms.json, COLMAP, resume | scene |
-//! | [`wildcity_eval`] | rendered images against held-out real ones: scores and their page | render, scene |
+//! | [`wildcity_augment`] | views off the drive as training data: plan, masks, transforms.json, COLMAP, resume | client, scene, session, twin |
+//! | [`wildcity_eval`] | rendered images against held-out real ones: scores and their page | augment, client, render, repair, scene, session, twin |
 //! | [`wildcity_train`] | training on images: losses, gradients against their definition | render, scene |
 //! | [`wildcity_stress`] | extreme scenes, each with its bound, for every backend | generate, render, scene |
 //! | [`wildcity_twin`] | twins on disk and in memory: import, versioned store, streaming | scene |
@@ -27,6 +27,7 @@
 //! | [`wildcity_report`] | error against run time of every setting of a twin | generate, render, repair, scene, session, stress, twin |
 //! | [`wildcity_alpasim`] | AlpaSim's gRPC services | client, render, scene, session, sim, twin |
 //! | [`wildcity_server`] | WebSocket and HTTP, and the viewer | episode, heap, protocol, push, render, repair, scene, session, sim, twin |
+//! | [`wildcity_bench`] | the program `wildcity-bench`: speed of steps, sessions, actors and loading | client, generate, protocol, render, scene, server, session, twin |
 //! | [`wildcity_suite`] | suites of scenarios: drives, judges and reports them | episode, render, scene, score, server, session, sim, twin |
 //!
 //! Data goes one way: file, twin, render, session, server, agent. An agent's pose or action goes
@@ -53,6 +54,7 @@
 //!    or effects of sensors there is no buffer, pass, pipeline or library for them.
 //! 10. One table maps each fault to its wire code and its HTTP status, exhaustively.
 //!
+//! [`wildcity_bench`]: ../wildcity_bench/index.html
 //! [`wildcity_heap`]: ../wildcity_heap/index.html
 //! [`wildcity_score`]: ../wildcity_score/index.html
 

@@ -1,6 +1,6 @@
 """Builds a wheel of the Python client that carries the server program.
 
-    cargo build --release
+    cargo build --release --features full,otlp
     python clients/python/build_wheel.py --binary target/release/wildcity --out dist
 
 `pip install` of the wheel puts the program `wildcity` beside `python`. The wheel has no compiled Python, so that one
@@ -30,7 +30,7 @@ EPOCH = (1980, 1, 1, 0, 0, 0)
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--binary", type=Path, required=True, help="the program, built with cargo build --release")
+    parser.add_argument("--binary", type=Path, required=True, help="the program, built as above")
     parser.add_argument("--out", type=Path, default=Path("dist"), help="directory for the wheel")
     chosen = parser.parse_args(arguments)
     try:

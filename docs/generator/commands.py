@@ -1,4 +1,4 @@
-"""docs/reference/commands from the help of the program, one page for each command with its subcommands."""
+"""docs/reference/commands from the help of the programs: one page for each command, and one for `wildcity-bench`."""
 
 from __future__ import annotations
 
@@ -20,14 +20,18 @@ def pages(root: Path, program: Path) -> tuple[dict[str, str], str]:
     for name, summary in subcommands(top):
         index += f"| [`{name}`]({name}.md) | {summary} |\n"
         written[f"{FOLDER}/{name}.md"] = HEAD + page(program, [name]).rstrip() + "\n"
+    bench = program.with_name("wildcity-bench")
+    written[f"{FOLDER}/wildcity-bench.md"] = HEAD + page(bench, []).rstrip() + "\n"
+    index += "\n[`wildcity-bench`](wildcity-bench.md) is a program of its own, which releases do not have.\n"
     written[f"{FOLDER}/index.md"] = index
     return written, FOLDER
 
 
 def page(program: Path, path: list[str]) -> str:
     text = help_of(program, path)
-    level = "#" * min(len(path), 4)
-    written = f"{level} wildcity {' '.join(path)}\n\n```text\n{text}```\n\n"
+    level = "#" * min(max(len(path), 1), 4)
+    name = " ".join([program.name, *path])
+    written = f"{level} {name}\n\n```text\n{text}```\n\n"
     for name, _ in subcommands(text):
         written += page(program, [*path, name])
     return written
@@ -35,10 +39,12 @@ def page(program: Path, path: list[str]) -> str:
 
 def help_of(program: Path, path: list[str]) -> str:
     """What `--help` prints where there is no terminal: lines of 100 columns."""
+    if not program.exists():
+        raise SystemExit(f"{program} is missing: cargo build --workspace --features full")
     with tempfile.TemporaryDirectory() as home:
         environment = {"PATH": os.environ["PATH"], "HOME": home, "NO_COLOR": "1"}
         done = subprocess.run(
-            ["wildcity", *path, "--help"],
+            [program.name, *path, "--help"],
             executable=program,
             env=environment,
             stdin=subprocess.DEVNULL,

@@ -9,12 +9,13 @@
 //! folder        the folder of a round: samples renamed into place, resume, refusals
 //! transforms    transforms.json, as nerfstudio reads it
 //! colmap        sparse/0, as COLMAP reads it
+//! run           a round from start to end
 //! points        Gaussians as COLMAP's points
 //! ```
 //!
-//! This package does not render: `wildcity augment` renders the views through a server, like any
-//! agent. The idea of rounds, in which the views move away from the drive and the newest ones are
-//! trained on, is that of Difix3D+ (Wu et al. 2025).
+//! This package does not render: `run` draws the views through a server, like any agent. The idea
+//! of rounds, in which the views move away from the drive and the newest ones are trained on, is
+//! that of Difix3D+ (Wu et al. 2025).
 
 mod cameras;
 mod colmap;
@@ -25,6 +26,7 @@ mod maps;
 mod plan;
 mod points;
 mod record;
+mod run;
 mod transforms;
 
 pub use cameras::{CameraModel, TrainingCamera, without_lens};
@@ -37,4 +39,5 @@ pub use points::{Point, PointSample, Surroundings};
 pub use record::{
     Header, MadeWith, Options, RepairedWith, Sample, SampleFiles, SampleRepair, weight,
 };
+pub use run::{Augmentation, PLACE_TIMEOUT, Progress, Round, Settings};
 pub use transforms::transforms;

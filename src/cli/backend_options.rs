@@ -5,16 +5,23 @@ use std::io::{self, Write};
 use clap::ValueEnum;
 
 use wildcity_render::Backend;
-use wildcity_render::automatic::{self, Selection};
 use wildcity_render::cpu::{Cpu, Simd};
-use wildcity_render::gpu::{AdapterChoice, Gpu, MemoryLimits};
-use wildcity_render::hybrid::HybridBackend;
 use wildcity_render::reference::Reference;
+#[cfg(feature = "gpu")]
 use wildcity_render::stage::Stage;
+#[cfg(feature = "gpu")]
+use wildcity_render::{
+    automatic::{self, Selection},
+    gpu::{AdapterChoice, Gpu, MemoryLimits},
+    hybrid::HybridBackend,
+};
+
+#[cfg(not(feature = "gpu"))]
+use super::left_out::built_without;
 
 /// `--backend` and `--cpu-through`, for commands that examine the renderer.
 #[derive(Clone, Debug, clap::Args)]
-pub(super) struct RendererOptions {
+pub struct RendererOptions {
     #[command(flatten)]
     backend: BackendOptions,
 
@@ -28,7 +35,7 @@ pub(super) struct RendererOptions {
 
 /// `--backend`, and the hardware that it runs on.
 #[derive(Clone, Debug, clap::Args)]
-pub(super) struct BackendOptions {
+pub struct BackendOptions {
     /// Backend that renders.
     #[arg(long, value_enum, default_value_t)]
     backend: BackendName,
@@ -39,7 +46,7 @@ pub(super) struct BackendOptions {
 
 /// The hardware that the backends run on.
 #[derive(Clone, Debug, clap::Args)]
-pub(super) struct HardwareOptions {
+pub struct HardwareOptions {
     /// Render threads; 0 for one per core. Pixels do not depend on it.
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = threads)]
     threads: usize,
@@ -85,6 +92,7 @@ enum StageName {
     Bin,
 }
 
+#[cfg(feature = "gpu")]
 impl From<StageName> for Stage {
     fn from(name: StageName) -> Self {
         match name {
@@ -122,16 +130,9 @@ impl From<SimdName> for Simd {
 
 impl BackendOptions {
     /// Creates the backend. If it is chosen automatically, prints the choice on standard error.
-    pub(super) fn backend(&self) -> anyhow::Result<Box<dyn Backend>> {
-        let HardwareOptions { threads, device, simd, .. } = &self.hardware;
-        match (self.backend, device) {
-            (BackendName::Auto, None) => {
-                let limits = self.hardware.memory_limits();
-                let Selection { backend, reason } =
-                    automatic::select(*threads, (*simd).into(), limits)?;
-                writeln!(io::stderr(), "backend {reason}")?;
-                Ok(backend)
-            }
+    pub fn backend(&self) -> anyhow::Result<Box<dyn Backend>> {
+        match (self.backend, &self.hardware.device) {
+            (BackendName::Auto, None) => self.hardware.best(),
             (BackendName::Auto | BackendName::Gpu, _) => Ok(Box::new(self.hardware.gpu()?)),
             (_, Some(device)) => anyhow::bail!(
                 "--device {device:?} belongs to the gpu backend: add --backend gpu, or omit --device"
@@ -142,7 +143,7 @@ impl BackendOptions {
     }
 
     /// Creates the backend that rendered a recording, unless `--backend` names another one.
-    pub(super) fn replay_backend(&self, recorded: &str) -> anyhow::Result<Box<dyn Backend>> {
+    pub fn replay_backend(&self, recorded: &str) -> anyhow::Result<Box<dyn Backend>> {
         let recorded = BackendName::from_str(recorded, false);
         match (self.backend, recorded) {
             (BackendName::Auto, Ok(backend)) => Self { backend, ..self.clone() }.backend(),
@@ -153,16 +154,49 @@ impl BackendOptions {
 
 impl HardwareOptions {
     /// Creates the cpu backend.
-    pub(super) fn cpu(&self) -> anyhow::Result<Cpu> {
+    pub fn cpu(&self) -> anyhow::Result<Cpu> {
         Ok(Cpu::new(self.threads, self.simd.into())?)
     }
 
+    /// Creates the best backend, and prints the choice on standard error.
+    #[cfg(feature = "gpu")]
+    fn best(&self) -> anyhow::Result<Box<dyn Backend>> {
+        let limits = self.memory_limits();
+        let Selection { backend, reason } =
+            automatic::select(self.threads, self.simd.into(), limits)?;
+        writeln!(io::stderr(), "backend {reason}")?;
+        Ok(backend)
+    }
+
+    /// Creates the only backend that is fast in this build, and prints that on standard error.
+    #[cfg(not(feature = "gpu"))]
+    fn best(&self) -> anyhow::Result<Box<dyn Backend>> {
+        anyhow::ensure!(
+            self.gpu_memory_gib.is_none(),
+            "--gpu-memory-gib: {}",
+            built_without("gpu")
+        );
+        writeln!(io::stderr(), "backend cpu: {}", built_without("gpu"))?;
+        Ok(Box::new(self.cpu()?))
+    }
+
+    /// The gpu backend is not in this build.
+    ///
+    /// # Errors
+    /// Always: it says what to build.
+    #[cfg(not(feature = "gpu"))]
+    fn gpu(&self) -> anyhow::Result<Cpu> {
+        anyhow::bail!("--backend gpu: {}", built_without("gpu"))
+    }
+
     /// Creates the gpu backend.
-    pub(super) fn gpu(&self) -> anyhow::Result<Gpu> {
+    #[cfg(feature = "gpu")]
+    pub fn gpu(&self) -> anyhow::Result<Gpu> {
         let choice = self.device.clone().map_or(AdapterChoice::Best, AdapterChoice::Named);
         Ok(Gpu::with_limits(&choice, self.threads, self.memory_limits())?)
     }
 
+    #[cfg(feature = "gpu")]
     fn memory_limits(&self) -> MemoryLimits {
         MemoryLimits {
             mirror_bytes: self.gpu_memory_gib.map_or(u64::MAX, bytes_of_gib),
@@ -173,13 +207,16 @@ impl HardwareOptions {
 
 impl RendererOptions {
     /// Creates the backend.
-    pub(super) fn backend(&self) -> anyhow::Result<Box<dyn Backend>> {
+    pub fn backend(&self) -> anyhow::Result<Box<dyn Backend>> {
         let BackendOptions { backend, hardware } = &self.backend;
         match (self.cpu_through, backend) {
             (None, _) => self.backend.backend(),
+            #[cfg(feature = "gpu")]
             (Some(stage), BackendName::Auto | BackendName::Gpu) => {
                 Ok(Box::new(HybridBackend::new(hardware.cpu()?, hardware.gpu()?, stage.into())))
             }
+            #[cfg(not(feature = "gpu"))]
+            (Some(_), BackendName::Auto | BackendName::Gpu) => Ok(Box::new(hardware.gpu()?)),
             (Some(_), BackendName::Cpu | BackendName::Reference) => anyhow::bail!(
                 "--cpu-through leaves the later stages to the GPU: leave --backend away, or give \
                  --backend gpu"
@@ -196,7 +233,7 @@ fn threads(text: &str) -> Result<usize, String> {
 }
 
 /// Parses a number of GiB.
-pub(super) fn gib(text: &str) -> Result<f64, String> {
+pub fn gib(text: &str) -> Result<f64, String> {
     match text.parse() {
         Ok(gib) if gib > 0.0 && gib <= 65_536.0 => Ok(gib),
         _ => Err("expected GiB above 0 and up to 65536, for example 2 or 0.5".to_owned()),
@@ -204,6 +241,6 @@ pub(super) fn gib(text: &str) -> Result<f64, String> {
 }
 
 /// GiB in bytes.
-pub(super) fn bytes_of_gib(gib: f64) -> u64 {
+pub fn bytes_of_gib(gib: f64) -> u64 {
     (gib * f64::from(1 << 30)) as u64
 }

@@ -8,7 +8,7 @@ use wildcity_twin::store::{Catalog, DiskCacheSettings};
 
 /// `--twins` and the disk cache, for every command that reads twins.
 #[derive(Debug, clap::Args)]
-pub(super) struct Twins {
+pub struct Twins {
     /// Directory of the twins, or an object store: s3://BUCKET/FOLDER, gs://BUCKET/FOLDER or
     /// az://CONTAINER/FOLDER, with credentials from the environment (AWS_*, GOOGLE_*, AZURE_*)
     /// [default: $XDG_DATA_HOME/wildcity/twins, or ~/.local/share/wildcity/twins]
@@ -27,12 +27,12 @@ pub(super) struct Twins {
 
 impl Twins {
     /// Opens the catalog of the twins.
-    pub(super) fn catalog(&self) -> anyhow::Result<Catalog> {
+    pub fn catalog(&self) -> anyhow::Result<Catalog> {
         Ok(Catalog::open_cached(&self.dir()?, self.cache().as_ref())?)
     }
 
     /// The cache for twins from an object store. None with size 0, and without a home directory.
-    pub(super) fn cache(&self) -> Option<DiskCacheSettings> {
+    pub fn cache(&self) -> Option<DiskCacheSettings> {
         let limit_bytes = u64::from(self.cache_gib) << 30;
         let default_dir = || Some(xdg_dir("XDG_CACHE_HOME", ".cache")?.join("wildcity"));
         let dir = self.cache_dir.clone().or_else(default_dir)?;
@@ -40,7 +40,7 @@ impl Twins {
     }
 
     /// The directory or URL of `--twins`, or the user's own directory.
-    pub(super) fn dir(&self) -> anyhow::Result<PathBuf> {
+    pub fn dir(&self) -> anyhow::Result<PathBuf> {
         if let Some(dir) = &self.twins {
             return Ok(dir.clone());
         }
@@ -53,7 +53,7 @@ impl Twins {
 
 /// `--episodes`, for every command that records episodes.
 #[derive(Debug, clap::Args)]
-pub(super) struct Episodes {
+pub struct Episodes {
     /// Directory where episodes are recorded [default: $XDG_STATE_HOME/wildcity/episodes, or
     /// ~/.local/state/wildcity/episodes]
     #[arg(long, value_name = "DIR")]
@@ -62,14 +62,14 @@ pub(super) struct Episodes {
 
 impl Episodes {
     /// The directory of `--episodes`, or the user's own.
-    pub(super) fn dir(&self) -> anyhow::Result<PathBuf> {
+    pub fn dir(&self) -> anyhow::Result<PathBuf> {
         state_dir(self.episodes.as_ref(), "episodes")
     }
 }
 
 /// `--scenarios`, for the server.
 #[derive(Debug, clap::Args)]
-pub(super) struct Scenarios {
+pub struct Scenarios {
     /// Directory of the scenarios that sessions can open by name: NAME.json, with the tracks and
     /// maps that they name [default: $XDG_DATA_HOME/wildcity/scenarios, or
     /// ~/.local/share/wildcity/scenarios]
@@ -79,12 +79,12 @@ pub(super) struct Scenarios {
 
 impl Scenarios {
     /// The directory that was given, if it does not exist.
-    pub(super) fn missing(&self) -> Option<&Path> {
+    pub fn missing(&self) -> Option<&Path> {
         self.scenarios.as_deref().filter(|dir| !dir.is_dir())
     }
 
     /// The directory of `--scenarios`, or the user's own.
-    pub(super) fn dir(&self) -> anyhow::Result<PathBuf> {
+    pub fn dir(&self) -> anyhow::Result<PathBuf> {
         if let Some(dir) = &self.scenarios {
             return Ok(dir.clone());
         }
@@ -97,7 +97,7 @@ impl Scenarios {
 
 /// `--uploads`, for every command that accepts uploads.
 #[derive(Debug, clap::Args)]
-pub(super) struct Uploads {
+pub struct Uploads {
     /// Directory where uploads are kept until they are pushed; only one server at a time may use it
     /// [default: $XDG_STATE_HOME/wildcity/uploads, or ~/.local/state/wildcity/uploads]
     #[arg(long, value_name = "DIR")]
@@ -106,30 +106,30 @@ pub(super) struct Uploads {
 
 impl Uploads {
     /// The directory of `--uploads`, or the user's own.
-    pub(super) fn dir(&self) -> anyhow::Result<PathBuf> {
+    pub fn dir(&self) -> anyhow::Result<PathBuf> {
         state_dir(self.uploads.as_ref(), "uploads")
     }
 }
 
 /// The directories of a server, for every command that starts one with the user's own.
 #[derive(Debug, clap::Args)]
-pub(super) struct ServerDirectories {
+pub struct ServerDirectories {
     #[command(flatten)]
-    pub(super) twins: Twins,
+    pub twins: Twins,
 
     #[command(flatten)]
-    pub(super) episodes: Episodes,
+    pub episodes: Episodes,
 
     #[command(flatten)]
-    pub(super) scenarios: Scenarios,
+    pub scenarios: Scenarios,
 
     #[command(flatten)]
-    pub(super) uploads: Uploads,
+    pub uploads: Uploads,
 }
 
 impl ServerDirectories {
     /// All of them: each that is given, or the user's own.
-    pub(super) fn all(&self) -> anyhow::Result<wildcity_server::Directories> {
+    pub fn all(&self) -> anyhow::Result<wildcity_server::Directories> {
         Ok(wildcity_server::Directories {
             twins: self.twins.dir()?,
             episodes: self.episodes.dir()?,
@@ -159,20 +159,20 @@ fn xdg_dir(variable: &str, below_home: &str) -> Option<PathBuf> {
 
 /// A twin and perhaps one of its versions: `street`, or `street@3`.
 #[derive(Clone, Debug)]
-pub(super) struct TwinVersion {
-    pub(super) name: String,
+pub struct TwinVersion {
+    pub name: String,
     /// None for the latest version.
-    pub(super) number: Option<u64>,
+    pub number: Option<u64>,
 }
 
 /// The twin that an edit changes.
 #[derive(Debug, clap::Args)]
-pub(super) struct EditedTwin {
+pub struct EditedTwin {
     /// The twin: NAME, or NAME@NUMBER for the version that the edit is made from [default: the
     /// latest]. Changes of later versions are kept; an edit that would overwrite one of them is
     /// refused.
     #[arg(value_name = "TWIN")]
-    pub(super) twin: TwinVersion,
+    pub twin: TwinVersion,
 }
 
 impl std::str::FromStr for TwinVersion {

@@ -9,6 +9,7 @@ use std::time::SystemTime;
 
 use serde_json::json;
 
+#[cfg(feature = "gpu")]
 use wildcity_render::gpu::devices;
 use wildcity_twin::residency::default_memory_bytes;
 use wildcity_twin::store::StoreError;
@@ -166,6 +167,12 @@ fn twins_found(twins: &Twins) -> Vec<Finding> {
     findings
 }
 
+#[cfg(not(feature = "gpu"))]
+fn devices_found() -> Finding {
+    Finding::new(Level::Note, "gpu", super::left_out::built_without("gpu"))
+}
+
+#[cfg(feature = "gpu")]
 fn devices_found() -> Finding {
     let devices = devices();
     match devices.iter().find(|device| device.kind != "cpu") {

@@ -1,24 +1,26 @@
 //! Ends of the program with an exit code of their own.
 
+use std::process::ExitCode;
+
 /// An end of the program with an exit code of its own.
 #[derive(Debug)]
-pub(super) struct Exit {
+pub struct Exit {
     /// The exit code.
-    pub(super) code: u8,
+    pub code: u8,
     /// What happened.
-    pub(super) message: String,
+    pub message: String,
     /// Whether this is a result and not an error: a result is printed without `error:`.
-    pub(super) is_finding: bool,
+    pub is_finding: bool,
 }
 
 impl Exit {
     /// The program failed.
-    pub(super) fn error(code: u8, message: String) -> Self {
+    pub fn error(code: u8, message: String) -> Self {
         Self { code, message, is_finding: false }
     }
 
     /// The program worked, and the exit code reports what it found.
-    pub(super) fn finding(code: u8, message: String) -> Self {
+    pub fn finding(code: u8, message: String) -> Self {
         Self { code, message, is_finding: true }
     }
 }
@@ -31,9 +33,22 @@ impl std::fmt::Display for Exit {
 
 impl std::error::Error for Exit {}
 
+/// The exit code of a program that ended with this result: 0 for success, 1 for a failure, or the
+/// one of an [`Exit`]. Prints the error.
+pub fn code(result: anyhow::Result<()>) -> ExitCode {
+    let Err(error) = result else { return ExitCode::SUCCESS };
+    let exit = error.downcast_ref::<Exit>();
+    if exit.is_some_and(|exit| exit.is_finding) {
+        eprintln!("{error}");
+    } else {
+        eprintln!("error: {}", chain(&error));
+    }
+    exit.map_or(ExitCode::FAILURE, |exit| exit.code.into())
+}
+
 /// An error with its causes. A cause whose text the error before it already ends with is not said
 /// twice: the `Display` text of many errors includes that of their source.
-pub(super) fn chain(error: &anyhow::Error) -> String {
+pub fn chain(error: &anyhow::Error) -> String {
     error.chain().map(ToString::to_string).fold(String::new(), |text, cause| {
         match (text.is_empty(), text.ends_with(&cause)) {
             (true, _) => cause,

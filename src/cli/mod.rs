@@ -13,51 +13,66 @@
 use std::process::ExitCode;
 
 mod actor;
+#[cfg(feature = "alpasim")]
 mod alpasim;
+#[cfg(feature = "augment")]
 mod augment;
-mod backend_options;
-mod bench;
+pub mod backend_options;
+#[cfg(feature = "gpu")]
 mod bisect;
 mod demo;
+#[cfg(feature = "gpu")]
 mod devices;
-mod directories;
+pub mod directories;
 mod doctor;
+#[cfg(feature = "alpasim")]
 mod drive;
+#[cfg(feature = "suite")]
 mod episode;
+#[cfg(feature = "eval")]
 mod eval;
-mod exit;
+pub mod exit;
 mod file_notes;
 mod import;
 mod input_files;
 mod inspect;
-mod limits;
+mod left_out;
+pub mod limits;
 mod lod;
 mod map;
-mod output;
+pub mod output;
+#[cfg_attr(not(feature = "http"), allow(dead_code, reason = "only a push packs a folder"))]
 mod packed_folder;
 mod placement;
 mod profile_options;
-mod progress;
+pub mod progress;
+#[cfg(feature = "http")]
 mod push;
-mod real_images;
 mod render;
 mod repair;
 mod repair_options;
 mod replay;
+#[cfg(feature = "report")]
 mod report;
 mod rig;
 mod route;
 mod scenario;
-mod scene_source;
+pub mod scene_source;
 mod serve;
 mod sky_source;
+#[cfg(feature = "stress")]
 mod stress;
+mod subcommands;
 mod time;
+#[cfg(feature = "train")]
 mod train;
 mod twin;
 mod view;
 
-use clap::{Parser, Subcommand};
+use clap::error::ErrorKind;
+use clap::{CommandFactory as _, FromArgMatches as _, Parser};
+
+pub(crate) use subcommands::subcommands;
 
 /// A closed-loop driving simulator server for city twins made of 3D Gaussians.
 #[derive(Debug, Parser)]
@@ -75,127 +90,106 @@ Examples:
   wildcity serve                                  (then an agent can open the twin \"street\")
   wildcity help import                            (options and examples of one command)";
 
-#[derive(Debug, Subcommand)]
-enum Command {
+subcommands! {
+    Command;
     Demo(demo::Demo),
-    // It has the most options.
     Serve(Box<serve::Serve>),
     View(view::View),
     Import(import::Import),
     Inspect(inspect::Inspect),
+    #[cfg(feature = "http")]
     Push(push::Push),
     Lod(lod::Lod),
     Twin(twin::Twin),
     Actor(actor::Actor),
     Render(render::Render),
+    #[cfg(feature = "eval")]
     Eval(Box<eval::Eval>),
     Repair(repair::Repair),
+    #[cfg(feature = "augment")]
     Augment(Box<augment::Augment>),
+    #[cfg(feature = "train")]
     Train(train::Train),
+    #[cfg(feature = "alpasim")]
     Drive(drive::Drive),
+    #[cfg(feature = "alpasim")]
     Alpasim(alpasim::Alpasim),
     Replay(replay::Replay),
+    #[cfg(feature = "suite")]
     Episode(episode::Episode),
     Rig(rig::RigCommand),
     Route(route::Route),
     Scenario(scenario::ScenarioCommand),
     Map(map::MapCommand),
-    Bench(bench::Bench),
+    Bench(Moved),
+    #[cfg(feature = "gpu")]
     Bisect(bisect::Bisect),
+    #[cfg(feature = "stress")]
     Stress(stress::Stress),
+    #[cfg(feature = "report")]
     Report(report::Command),
+    #[cfg(feature = "gpu")]
     Devices(devices::Devices),
     Doctor(doctor::Doctor),
+}
+
+/// Moved to the program `wildcity-bench`.
+#[derive(Debug, clap::Args)]
+#[command(hide = true, disable_help_flag = true)]
+struct Moved {
+    #[arg(trailing_var_arg = true, allow_hyphen_values = true, hide = true)]
+    _arguments: Vec<String>,
+}
+
+impl Moved {
+    fn run(self) -> anyhow::Result<()> {
+        anyhow::bail!(
+            "wildcity bench is a program of its own: in the source of wildcity, run cargo run \
+             --release -p wildcity-bench -- and the arguments after \"bench\""
+        )
+    }
 }
 
 /// Parses the command line, runs the command, and returns the exit code: 0 for success, 1 for a
 /// failure, and 3 for a recording that is cut (`replay --verify`). A command line that cannot be
 /// parsed ends the process with code 2.
 pub fn main() -> ExitCode {
-    let arguments = Arguments::parse();
-    let result = match arguments.command {
-        Command::Demo(command) => command.run(),
-        Command::Serve(command) => command.run(),
-        Command::View(command) => command.run(),
-        Command::Import(command) => command.run(),
-        Command::Inspect(command) => command.run(),
-        Command::Push(command) => command.run(),
-        Command::Lod(command) => command.run(),
-        Command::Twin(command) => command.run(),
-        Command::Actor(command) => command.run(),
-        Command::Render(command) => command.run(),
-        Command::Eval(command) => command.run(),
-        Command::Repair(command) => command.run(),
-        Command::Augment(command) => command.run(),
-        Command::Train(command) => command.run(),
-        Command::Drive(command) => command.run(),
-        Command::Alpasim(command) => command.run(),
-        Command::Replay(command) => command.run(),
-        Command::Episode(command) => command.run(),
-        Command::Rig(command) => command.run(),
-        Command::Route(command) => command.run(),
-        Command::Scenario(command) => command.run(),
-        Command::Map(command) => command.run(),
-        Command::Bench(command) => command.run(),
-        Command::Bisect(command) => command.run(),
-        Command::Stress(command) => command.run(),
-        Command::Report(command) => command.run(),
-        Command::Devices(command) => command.run(),
-        Command::Doctor(command) => command.run(),
-    };
-    match result {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            let exit = error.downcast_ref::<exit::Exit>();
-            if exit.is_some_and(|exit| exit.is_finding) {
-                eprintln!("{error}");
-            } else {
-                eprintln!("error: {}", exit::chain(&error));
-            }
-            exit.map_or(ExitCode::FAILURE, |exit| exit.code.into())
-        }
+    let mut program = Arguments::command();
+    if let Some(left_out) = left_out::help() {
+        program = program
+            .after_help(left_out.clone())
+            .after_long_help(format!("{EXAMPLES}\n\n{left_out}"));
     }
+    let parsed = program.try_get_matches().and_then(|found| Arguments::from_arg_matches(&found));
+    let arguments = match parsed {
+        Ok(arguments) => arguments,
+        Err(error) => {
+            match left_out::command().filter(|_| error.kind() == ErrorKind::InvalidSubcommand) {
+                Some(left_out) => return exit::code(Err(left_out)),
+                None => error.exit(),
+            }
+        }
+    };
+    exit::code(arguments.command.run())
 }
 
 #[cfg(test)]
+#[path = "../../tests/support/help.rs"]
+mod help;
+
+#[cfg(test)]
 mod tests {
-    use clap::CommandFactory;
-
     use super::*;
-
-    /// The commands without subcommands, each with the words that select it.
-    fn leaf_commands(command: &clap::Command, path: &str) -> Vec<(String, clap::Command)> {
-        let path = format!("{path}{} ", command.get_name());
-        let mut leaves: Vec<_> =
-            command.get_subcommands().flat_map(|sub| leaf_commands(sub, &path)).collect();
-        if leaves.is_empty() {
-            leaves.push((path.trim_end().to_owned(), command.clone()));
-        }
-        leaves
-    }
-
-    fn all_leaves() -> Vec<(String, clap::Command)> {
-        leaf_commands(&Arguments::command(), "")
-    }
 
     #[test]
     fn every_command_and_option_is_explained_and_has_an_example() {
-        let leaves = all_leaves();
-        assert!(leaves.len() > 25, "{} commands", leaves.len());
-        for (path, command) in leaves {
-            let after = command.get_after_long_help().map(ToString::to_string).unwrap_or_default();
-            assert!(command.get_about().is_some(), "{path} has no description");
-            assert!(after.contains(&path) && after.contains("Example"), "{path} has no example");
-            for argument in command.get_arguments() {
-                assert!(argument.get_help().is_some(), "{path}: {} has no help", argument.get_id());
-            }
-        }
+        help::check(&Arguments::command(), 60);
     }
 
     #[test]
     fn profile_is_a_file_and_set_is_a_field_on_every_command() {
         let mut counts = [0; 2];
-        for (path, command) in all_leaves() {
+        for (path, command) in help::leaf_commands(&Arguments::command()) {
             for argument in command.get_arguments() {
                 let names = argument.get_value_names().unwrap_or_default();
                 let names: Vec<&str> = names.iter().map(|name| name.as_str()).collect();
@@ -208,12 +202,7 @@ mod tests {
                 assert_eq!(names, expected.1, "{path} --{}", argument.get_long().unwrap());
             }
         }
-        // serve, import, render, eval, bench step, bisect; and push instead of serve.
-        assert_eq!(counts, [6, 6]);
-    }
-
-    #[test]
-    fn the_arguments_are_consistent() {
-        Arguments::command().debug_assert();
+        // serve, import, render, eval, bisect; and push instead of serve.
+        assert_eq!(counts, [5, 5]);
     }
 }

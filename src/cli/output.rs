@@ -8,7 +8,7 @@ use anyhow::Context;
 
 /// Writes a file under a temporary name in the same directory, and then renames it. A reader finds
 /// the old file or the new one, even after a full disk.
-pub(super) fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+pub fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let cannot = || format!("cannot write {}", path.display());
     let name = path.file_name().context("the path has no file name").with_context(cannot)?;
     let mut temporary_name = name.to_owned();
@@ -24,13 +24,13 @@ pub(super) fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
 }
 
 /// A number of things: `1 chunk`, `2 chunks`.
-pub(super) fn counted(number: usize, thing: &str) -> String {
+pub fn counted(number: usize, thing: &str) -> String {
     let s = if number == 1 { "" } else { "s" };
     format!("{number} {thing}{s}")
 }
 
 /// Creates the directory of `--out`, if it is missing.
-pub(super) fn create_dir(dir: &Path) -> anyhow::Result<()> {
+pub fn create_dir(dir: &Path) -> anyhow::Result<()> {
     anyhow::ensure!(
         !dir.exists() || dir.is_dir(),
         "--out {} is a file: give a directory",

@@ -3,25 +3,20 @@
 use std::fs;
 use std::io::{self, ErrorKind, Write};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use anyhow::{Context, bail, ensure};
 
 use crate::cli::limits;
+use wildcity_render::Backend;
 use wildcity_render::gpu::Gpu;
-use wildcity_render::{Backend, RenderError};
-use wildcity_report::confidence::confidence_by_offset;
-use wildcity_report::measure::{Benchmark, ReferenceImages};
-use wildcity_report::measurement::{Measurement, normalize_machine_speed};
-use wildcity_report::recommend::{Goal, Recommendation, recommend};
-use wildcity_report::repair::{self, RepairBenchmark, RepairReport, RepairSampling};
-use wildcity_report::sample_points::{SamplePoint, Sampling, sample_points};
-use wildcity_report::settings::{SettingList, Skipped, TwinFeatures, settings_to_compare};
-use wildcity_report::{Report, ReportError, Subject, feature_costs, page};
-use wildcity_scene::{Manifest, Rays, Rig};
-use wildcity_stress::CASES;
-use wildcity_stress::table::{self, Candidate, Column};
-use wildcity_twin::residency::{Cache, Resident};
+use wildcity_report::recommend::{Goal, Recommendation};
+use wildcity_report::repair::RepairSampling;
+use wildcity_report::sample_points::Sampling;
+use wildcity_report::settings::Skipped;
+use wildcity_report::{Machine, Report, Settings, Twin, page};
+use wildcity_scene::{Manifest, Rig};
+use wildcity_stress::table::Candidate;
+use wildcity_twin::residency::Cache;
 
 use super::backend_options::HardwareOptions;
 use super::directories::{TwinVersion, Twins};
@@ -174,16 +169,6 @@ fn offset_m(text: &str) -> Result<f64, String> {
     }
 }
 
-/// Measurements of all settings, and the settings that were skipped.
-struct Compared {
-    measurements: Vec<Measurement>,
-    skipped: Vec<Skipped>,
-    /// Time of a step of the reference, in milliseconds.
-    reference_ms: f64,
-    /// Time with an exact ray for every pixel; `None` if every camera is a pinhole without motion.
-    exact_rays_ms: Option<f64>,
-}
-
 /// The backends that this machine has, and those that it does not have, with the reason.
 struct Backends {
     present: Vec<Box<dyn Backend>>,
@@ -239,112 +224,42 @@ impl Command {
     }
 
     fn measure(&self) -> anyhow::Result<Report> {
-        // 1. The backends, the twin, its cameras, and the sample points.
-        let Backends { present: backends, absent } = self.open_backends()?;
-        let resident = Cache::new(self.twins.catalog()?).open(&self.twin.name, self.twin.number)?;
-        let manifest = &resident.version.manifest;
-        let rig = self.rig(manifest)?;
-        let sampling = Sampling { stations: self.stations, window_px: [self.window; 2] };
-        let points = sample_points(manifest, &rig.cameras, sampling);
-        let names: Vec<String> = backends.iter().map(|backend| backend.name().to_owned()).collect();
-
-        // 2. Repair, which can fail early.
-        let repair = self.measure_repair(&resident, &*backends[0], &rig)?;
-
-        // 3. Errors and times of all settings.
-        let benchmark = Benchmark {
-            resident: &resident,
-            backends: &backends,
-            sample_points: &points,
-            repeat: self.repeat,
-            open_device: &|| self.open_device(),
-        };
-        let mut compared = compare(&benchmark, &resident, &points, &names)?;
-        compared.skipped.extend(absent);
-        let Compared { measurements, skipped, reference_ms, exact_rays_ms } = compared;
-
-        // 4. The setting for the goal.
-        let goal = self.at_least_db.or(self.at_most_ms);
-        let recommended = goal.map(|goal| recommend(goal, &measurements, &names)).transpose();
-        let (recommendation, unmet_reason) = match recommended {
-            Ok(recommendation) => (recommendation, None),
-            Err(error) => (None, Some(error.to_string())),
-        };
-
-        // 5. Trust, extreme scenes, and features.
-        let confidence = confidence_by_offset(&resident, &*backends[0], &points)?;
-        let stress = self.stress()?;
-        let feature_costs =
-            feature_costs::count_features(&self.hardware.cpu()?, &|| self.open_device())?;
-
-        let column = |b: &dyn Backend| Column { backend: b.name(), detail: b.detail() };
-        Ok(Report {
-            subject: Subject {
-                twin: manifest.twin.clone(),
-                version: resident.version.number,
-                version_hash: resident.version.hash.clone(),
-                gaussians: manifest.gaussians(),
-                sh_degree: manifest.sh_degree,
-                record: manifest.record.name(),
-                profile: manifest.profile,
-                cameras: points[0].views.len(),
-                repeat: self.repeat,
-            },
-            backends: backends.iter().map(|backend| column(&**backend)).collect(),
-            sampling,
-            sample_points: points.iter().map(|point| point.name.clone()).collect(),
-            reference_ms,
-            settings: measurements,
-            skipped,
-            exact_rays_ms,
-            confidence,
-            goal,
-            recommendation,
-            unmet_reason,
-            stress,
-            feature_costs,
-            repair,
-        })
-    }
-
-    /// Gains and costs of the models of --repair; none without models.
-    fn measure_repair(
-        &self,
-        resident: &Arc<Resident>,
-        backend: &dyn Backend,
-        rig: &Rig,
-    ) -> anyhow::Result<Option<RepairReport>> {
-        let models = self.repair.models()?;
-        if models.names().next().is_none() {
-            return Ok(None);
-        }
-        let catalog = self.twins.catalog()?;
+        let Backends { present, absent } = self.open_backends()?;
+        let cache = Cache::new(self.twins.catalog()?);
+        let resident = cache.open(&self.twin.name, self.twin.number)?;
         let truth = self.truth.as_ref().map(|TwinVersion { name, number }| {
             Cache::new(self.twins.catalog()?)
                 .open(name, *number)
                 .with_context(|| format!("--truth {name}"))
         });
-        let truth = truth.transpose()?;
-        let loaded = models.names().map(|name| models.get(name));
-        let loaded = loaded.collect::<Result<Vec<_>, _>>()?;
-        let sampling = RepairSampling::new(self.stations, &self.offsets, self.repair_side);
-        let benchmark = RepairBenchmark {
+        let twin = Twin {
+            rig: self.rig(&resident.version.manifest)?,
             resident,
-            catalog: &catalog,
-            truth: truth.as_ref(),
-            backend,
-            cameras: &rig.cameras,
-            models: &loaded,
-            references: models.references(),
-            sampling,
+            catalog: self.twins.catalog()?,
+            models: self.repair.models()?,
+            truth: truth.transpose()?,
         };
-        let bar = progress::count("repair");
-        let report = repair::measure(&benchmark, &mut |done, all| {
-            bar.set_length(all as u64);
-            bar.set_position(done as u64);
+        let machine = Machine {
+            backends: present,
+            absent,
+            cpu: self.hardware.cpu()?,
+            open_device: &|| self.open_device(),
+            stress: self.stress_candidates()?,
+        };
+        let settings = Settings {
+            sampling: Sampling { stations: self.stations, window_px: [self.window; 2] },
+            repeat: self.repeat,
+            goal: self.at_least_db.or(self.at_most_ms),
+            repair: RepairSampling::new(self.stations, &self.offsets, self.repair_side),
+        };
+        let bar = progress::state();
+        let report = wildcity_report::run(&settings, &twin, &machine, &mut |what, done, all| {
+            bar.set_length(all);
+            bar.set_position(done);
+            bar.set_message(what.to_owned());
         })?;
         bar.finish_and_clear();
-        Ok(Some(report))
+        Ok(report)
     }
 
     /// Opens the backends of `--backend`; at least one must be there.
@@ -380,86 +295,15 @@ impl Command {
         if is_wanted { self.hardware.gpu().ok() } else { None }
     }
 
-    /// The stress table, on the reference and on every backend of the report.
-    fn stress(&self) -> anyhow::Result<table::Table> {
-        let mut names = Vec::new();
-        let mut cases = Vec::new();
-        if !self.no_stress {
-            names.push(BackendName::Reference);
-            names.extend(self.backends.iter().map(|name| BackendName::from(*name)));
-            cases.extend(CASES.iter());
+    /// Backends of the stress table: the reference, and every backend of the report.
+    fn stress_candidates(&self) -> anyhow::Result<Vec<Candidate>> {
+        if self.no_stress {
+            return Ok(Vec::new());
         }
-        let candidates = names.into_iter().map(|name| candidate(name, &self.hardware));
-        let candidates = candidates.collect::<anyhow::Result<Vec<Candidate>>>()?;
-        let bar = progress::state();
-        bar.set_length((cases.len() * candidates.len()) as u64);
-        let table = table::run(&cases, &candidates, false, &mut |done, case| {
-            bar.set_position(done as u64);
-            bar.set_message(case.to_owned());
-        });
-        bar.finish_and_clear();
-        Ok(table)
+        let names = self.backends.iter().map(|name| BackendName::from(*name));
+        let all = [BackendName::Reference].into_iter().chain(names);
+        all.map(|name| candidate(name, &self.hardware)).collect()
     }
-}
-
-/// Measures every setting that can affect the twin.
-fn compare(
-    benchmark: &Benchmark<'_>,
-    resident: &Resident,
-    points: &[SamplePoint],
-    backends: &[String],
-) -> anyhow::Result<Compared> {
-    let manifest = &resident.version.manifest;
-    let sky = resident.sky().map(AsRef::as_ref);
-    let twin = TwinFeatures::new(manifest, sky, &points[0].views);
-    let splats = render_reference(benchmark, Rays::Splats, "reference")?;
-    let has_non_pinhole = twin.has_non_pinhole;
-    let rays = has_non_pinhole
-        .then(|| render_reference(benchmark, Rays::Exact, "reference, every ray"))
-        .transpose()?;
-
-    let names: Vec<&str> = backends.iter().map(String::as_str).collect();
-    let SettingList { settings, mut skipped } = settings_to_compare(&twin, &names);
-    let bar = progress::state();
-    bar.set_length(settings.len() as u64);
-    let mut measurements = Vec::new();
-    for setting in &settings {
-        bar.set_message(setting.name.clone());
-        let reference = match (setting.reference_rays, &rays) {
-            (Rays::Exact, Some(rays)) => rays,
-            // Without a non-pinhole camera no setting is compared with exact rays.
-            (Rays::Splats | Rays::Exact, _) => &splats,
-        };
-        match benchmark.measure(setting, reference) {
-            Ok(measurement) => measurements.push(measurement),
-            // The map of a sky with this accuracy would be too large.
-            Err(ReportError::Render(error @ RenderError::Sky(_))) => {
-                skipped.push(Skipped::new(setting.name.clone(), error.to_string()));
-            }
-            Err(error) => return Err(error.into()),
-        }
-        bar.inc(1);
-    }
-    bar.finish_and_clear();
-    normalize_machine_speed(&mut measurements);
-    let reference_ms = splats.step_ms;
-    let exact_rays_ms = rays.map(|rays| rays.step_ms);
-    Ok(Compared { measurements, skipped, reference_ms, exact_rays_ms })
-}
-
-fn render_reference(
-    benchmark: &Benchmark<'_>,
-    rays: Rays,
-    label: &'static str,
-) -> anyhow::Result<ReferenceImages> {
-    let bar = progress::count(label);
-    bar.set_length(benchmark.sample_points.len() as u64);
-    let images = benchmark.render_reference(rays, &mut |done| bar.set_position(done as u64));
-    let images = images.context(
-        "the reference cannot render the whole twin at full detail and without a draw distance",
-    )?;
-    bar.finish_and_clear();
-    Ok(images)
 }
 
 fn print_recommendation(

@@ -1,18 +1,15 @@
 //! The scene, the cameras, and the render profile that the rendering commands share.
 
-use std::borrow::Cow;
-use std::ops::Deref;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use anyhow::Context;
 
 use wildcity_render::View;
 use wildcity_scene::{RenderProfile, Scene};
+use wildcity_session::{FrameScene, OpenScene};
 use wildcity_twin::ingest::cameras::{self, ListedCamera};
 use wildcity_twin::ingest::{self, ReadLimits, ReadScene};
-use wildcity_twin::residency::{Cache, PinnedScene, Resident};
-use wildcity_twin::store::Version;
+use wildcity_twin::residency::Cache;
 
 use super::directories::{TwinVersion, Twins};
 use super::file_notes::{self, DropBad};
@@ -21,7 +18,7 @@ use super::progress;
 
 /// A scene, a list of cameras, and changes of the render profile, on the command line.
 #[derive(Debug, clap::Args)]
-pub(super) struct SceneSource {
+pub struct SceneSource {
     /// A scene file in any format that `wildcity import` reads, or the name of a twin: NAME, or
     /// NAME@NUMBER for an older version.
     #[arg(value_name = "SCENE")]
@@ -44,122 +41,39 @@ pub(super) struct SceneSource {
 }
 
 /// A scene and the images of it that a rendering command makes.
-pub(super) struct LoadedScene {
-    source: Source,
-    pub(super) shots: Vec<Shot>,
+pub struct LoadedScene {
+    source: OpenScene,
+    pub shots: Vec<Shot>,
 }
 
 /// A named camera and the profile that it is rendered with.
-pub(super) struct Shot {
-    pub(super) name: String,
-    pub(super) view: View,
-    pub(super) profile: RenderProfile,
-}
-
-/// Where scenes come from.
-pub(super) enum Source {
-    /// A file: always drawn at full detail.
-    File(Scene),
-    /// A twin: drawn with as much detail as the cameras need.
-    Twin(Arc<Resident>),
-}
-
-/// The part of a source that a frame draws. It stays in memory for as long as this value lives.
-pub(super) enum FrameScene<'a> {
-    /// All of a file.
-    Whole(Cow<'a, Scene>),
-    /// The sections of a twin that the cameras need.
-    Needed(PinnedScene),
-}
-
-impl Deref for FrameScene<'_> {
-    type Target = Scene;
-
-    fn deref(&self) -> &Scene {
-        match self {
-            Self::Whole(scene) => scene,
-            Self::Needed(pinned) => pinned,
-        }
-    }
-}
-
-impl Source {
-    /// Reads the scene of `SCENE`, with the profile that belongs to it: the twin's, or for a file
-    /// the default with what the file says.
-    pub(super) fn open(
-        scene: &str,
-        twins: &Twins,
-        DropBad { drop_bad }: DropBad,
-    ) -> anyhow::Result<(Self, RenderProfile)> {
-        let path = Path::new(scene);
-        // Pipes and devices count as files, so that the reader refuses them by name. A directory
-        // does not: it may have the same name as a twin.
-        if path.exists() && !path.is_dir() {
-            let bar = progress::bytes("reading");
-            let limits = ReadLimits { drop_bad, ..ReadLimits::for_own_file() };
-            let read = ingest::read_limited(path, &limits, &mut progress::show(&bar));
-            let read = file_notes::explained(read);
-            let ReadScene { gaussians, notes, .. } =
-                read.with_context(|| format!("{}", path.display()))?;
-            bar.finish_and_clear();
-            file_notes::print(path, &notes)?;
-            let scene = Scene::from_gaussians(&gaussians);
-            return Ok((Self::File(scene), notes.profile().apply(RenderProfile::default())?));
-        }
-        let named: TwinVersion = scene.parse().map_err(anyhow::Error::msg)?;
-        let cache = Cache::new(twins.catalog()?);
-        let resident = cache.open(&named.name, named.number).with_context(|| {
-            format!("SCENE {scene:?} is not a file, and cannot be opened as a twin")
-        })?;
-        let profile = resident.version.manifest.profile;
-        Ok((Self::Twin(resident), profile))
-    }
-
-    /// The version of the twin; `None` for a file.
-    pub(super) fn version(&self) -> Option<&Version> {
-        match self {
-            Self::Twin(resident) => Some(&resident.version),
-            Self::File(_) => None,
-        }
-    }
-
-    /// The part of the source that a frame of these views draws.
-    pub(super) fn scene(
-        &self,
-        views: &[View],
-        profile: &RenderProfile,
-    ) -> anyhow::Result<FrameScene<'_>> {
-        Ok(match self {
-            Self::Twin(_) if views.is_empty() => FrameScene::Whole(Cow::default()),
-            Self::Twin(resident) => {
-                FrameScene::Needed(resident.scene(&wildcity_session::viewpoints(views), profile)?)
-            }
-            Self::File(scene) => FrameScene::Whole(Cow::Borrowed(scene)),
-        })
-    }
+pub struct Shot {
+    pub name: String,
+    pub view: View,
+    pub profile: RenderProfile,
 }
 
 impl LoadedScene {
     /// The scene of a frame that has one shot.
-    pub(super) fn shot_scene(&self, shot: &Shot) -> anyhow::Result<FrameScene<'_>> {
-        self.source.scene(&[shot.view], &shot.profile)
+    pub fn shot_scene(&self, shot: &Shot) -> anyhow::Result<FrameScene<'_>> {
+        Ok(self.source.scene(&[shot.view], &shot.profile)?)
     }
 
     /// The scene of a frame that has all shots.
-    pub(super) fn whole_scene(&self) -> anyhow::Result<FrameScene<'_>> {
+    pub fn whole_scene(&self) -> anyhow::Result<FrameScene<'_>> {
         let views: Vec<View> = self.shots.iter().map(|shot| shot.view).collect();
         let profile = self.shots.first().map_or(RenderProfile::DEFAULT, |shot| shot.profile);
-        self.source.scene(&views, &profile)
+        Ok(self.source.scene(&views, &profile)?)
     }
 }
 
 impl SceneSource {
     /// Reads the scene, the cameras, and the profile.
-    pub(super) fn open(&self) -> anyhow::Result<LoadedScene> {
+    pub fn open(&self) -> anyhow::Result<LoadedScene> {
         let listed =
             cameras::read(&self.cameras).with_context(|| format!("{}", self.cameras.display()))?;
         let changes = self.profile.load()?;
-        let (source, profile) = Source::open(&self.scene, &self.twins, self.bad)?;
+        let (source, profile) = open_scene(&self.scene, &self.twins, self.bad)?;
         let shots = listed.into_iter().map(|camera| shot(camera, profile, &changes));
         let shots = shots.collect::<anyhow::Result<Vec<_>>>()?;
         Ok(LoadedScene { source, shots })
@@ -177,4 +91,35 @@ fn shot(
     profile.near = near.unwrap_or(profile.near);
     let profile = changes.apply(profile).with_context(|| format!("camera {name:?}"))?;
     Ok(Shot { name, view: View::new(camera, world_from_camera), profile })
+}
+
+/// Reads the scene of `SCENE`, with the profile that belongs to it: the twin's, or for a file
+/// the default with what the file says.
+pub(super) fn open_scene(
+    scene: &str,
+    twins: &Twins,
+    DropBad { drop_bad }: DropBad,
+) -> anyhow::Result<(OpenScene, RenderProfile)> {
+    let path = Path::new(scene);
+    // Pipes and devices count as files, so that the reader refuses them by name. A directory
+    // does not: it may have the same name as a twin.
+    if path.exists() && !path.is_dir() {
+        let bar = progress::bytes("reading");
+        let limits = ReadLimits { drop_bad, ..ReadLimits::for_own_file() };
+        let read = ingest::read_limited(path, &limits, &mut progress::show(&bar));
+        let read = file_notes::explained(read);
+        let ReadScene { gaussians, notes, .. } =
+            read.with_context(|| format!("{}", path.display()))?;
+        bar.finish_and_clear();
+        file_notes::print(path, &notes)?;
+        let scene = Scene::from_gaussians(&gaussians);
+        return Ok((OpenScene::File(scene), notes.profile().apply(RenderProfile::default())?));
+    }
+    let named: TwinVersion = scene.parse().map_err(anyhow::Error::msg)?;
+    let cache = Cache::new(twins.catalog()?);
+    let resident = cache.open(&named.name, named.number).with_context(|| {
+        format!("SCENE {scene:?} is not a file, and cannot be opened as a twin")
+    })?;
+    let profile = resident.version.manifest.profile;
+    Ok((OpenScene::Twin(resident), profile))
 }

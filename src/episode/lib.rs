@@ -29,9 +29,10 @@ mod scenario;
 pub use diff::{Difference, What, diff};
 pub use drive::{drive_record, off_model_us};
 pub use export::{
-    EpisodeExport, ExportError, Exported, ExportedImage, export, export_file, mcap_path,
-    remove_leftovers, write_whole,
+    CAN_EXPORT, ExportError, Exported, export_file, mcap_path, remove_leftovers, write_whole,
 };
+#[cfg(feature = "mcap")]
+pub use export::{EpisodeExport, ExportedImage, export};
 pub use file::{
     CameraHead, Cut, EndLine, EpisodeFile, Frame, Header, ReadError, RigHead, check_no_mcap,
     driven_indices, line_bytes,

@@ -15,18 +15,23 @@
 //! means, csv      their means; the images as CSV
 //! thumbnails      small pictures of a pair
 //! page            the HTML page
+//! images          real images with their cameras, and their files
+//! beside          views beside the drive of a twin with errors, against one without them
+//! run             an evaluation: renders, repairs and measures every image of a list
 //! ```
 //!
 //! The measures themselves are in [`wildcity_render::compare`], which the report uses as well.
 //! Images are compared in 8 bits, as agents get them and files store them, so that other programs
 //! compute the same numbers from the files.
 
+mod beside;
 mod boxes;
 mod csv;
 mod evaluated_image;
 mod evaluation;
 mod exposure;
 mod extrapolation;
+pub mod images;
 mod kid;
 mod lidar;
 mod mean;
@@ -34,9 +39,11 @@ mod means;
 mod page;
 mod pair;
 mod reprojection;
+mod run;
 mod scores;
 mod thumbnails;
 
+pub use beside::{Beside, BesideViews};
 pub use boxes::{Boxes, BoxesError, GROWN_PX, MOVES_M_PER_S, MovingBox, hide};
 pub use evaluated_image::EvaluatedImage;
 pub use evaluation::{BoxesSubject, Evaluation, LidarSubject, RepairSubject, Subject};
@@ -51,5 +58,6 @@ pub use means::{AlignedMeans, CameraMeans, Gain, Means, ScoreMeans};
 pub use page::render as page;
 pub use pair::{Pair, PairError};
 pub use reprojection::Reprojection;
+pub use run::{Evaluator, ProfileChanges, Save, Scene, Settings, run};
 pub use scores::{AlignedScores, PairScores, Scored, Scores};
 pub use thumbnails::{Thumbnails, error_png, jpeg};

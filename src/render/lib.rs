@@ -15,13 +15,16 @@
 //! no number of threads.
 
 mod actor_views;
+#[cfg(feature = "gpu")]
 pub mod automatic;
 pub mod compare;
 pub mod constants;
 pub mod cpu;
 pub mod expansion;
+#[cfg(feature = "gpu")]
 pub mod gpu;
 pub mod gradient;
+#[cfg(feature = "gpu")]
 pub mod hybrid;
 pub mod layout;
 pub mod limits;

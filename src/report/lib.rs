@@ -13,6 +13,7 @@
 //! feature_costs   memory and GPU work of one step, with each feature of a scene and without
 //! repair          what repair gains on and off the drive, and what it costs
 //! plots, page     the HTML page
+//! run             all of it, in order
 //! ```
 //!
 //! Data flows one way: `settings` and `sample_points` go into `measure`, its measurements into
@@ -29,6 +30,7 @@ mod plots;
 pub mod recommend;
 pub mod repair;
 mod report;
+mod run;
 pub mod sample_points;
 pub mod setting;
 pub mod settings;
@@ -38,3 +40,4 @@ mod timing;
 pub use error::ReportError;
 pub use error_images::ErrorImages;
 pub use report::{Report, Subject};
+pub use run::{Machine, Progress, Settings, Twin, run};

@@ -74,7 +74,7 @@ impl Config {
             origins: Origins::default(),
             tls: None,
             audit: None,
-            mcap: true,
+            mcap: wildcity_episode::CAN_EXPORT,
             backend,
             repairs: Arc::default(),
             profile: ProfileOverrides::default(),

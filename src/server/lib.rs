@@ -37,7 +37,6 @@ mod admission;
 mod audit;
 mod auth;
 mod blocking;
-mod certificate;
 mod config;
 mod connection;
 mod convert;

@@ -44,7 +44,7 @@ impl Stream {
             return Some(Self::new(tcp, same_machine));
         };
         // A client that begins no handshake would hold its slot for ever.
-        match timeout(limit, tls.acceptor().accept(tcp)).await {
+        match timeout(limit, tls.accept(tcp)).await {
             Ok(Ok(stream)) => {
                 let reason = "the connection has TLS, and may come through another machine";
                 Some(Self::new(stream, Err(reason)))

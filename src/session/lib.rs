@@ -28,6 +28,7 @@ mod episode;
 mod error;
 pub mod limits;
 mod observe;
+mod open_scene;
 mod options;
 mod pin;
 mod prefetch;
@@ -58,6 +59,7 @@ pub use observe::observation::{
     DType, ImageInfo, Observation, PastImageInfo, ResidencyStats, Tensor, TensorKind, Timings,
 };
 pub use observe::trust::{RecordedPoses, TrainingCoverage, Trust};
+pub use open_scene::{FrameScene, OpenScene};
 pub use options::{
     ContactMode, ImagePart, OnFailure, Outputs, PixelMaps, RandomStart, RepairOptions,
     ResetOptions, RigChoice, ScenarioOptions, SessionOptions, Start, StepOptions,

@@ -272,3 +272,7 @@ const _: () = {
     // Both at once: three quarters of one half.
     assert!(ANSWER_PIXELS * 3 / 8 * (with_instances + NORMAL_BYTES) <= room_bytes);
 };
+
+/// Distance along a drive between two frames whose images are compared for flicker, in metres: 8
+/// m/s and ten frames a second.
+pub const FRAME_M: f64 = 0.8;

@@ -140,7 +140,7 @@ impl Settings {
             ("growth.noise", self.growth.noise),
         ];
         for (field, value) in rates {
-            if !(value >= 0.0 && value <= 1e6) {
+            if !(0.0..=1e6).contains(&value) {
                 let must = "it is a number from 0 to 1e6";
                 return Err(SettingError { field, value: value.to_string(), must });
             }
@@ -148,7 +148,7 @@ impl Settings {
         let weights =
             [("loss.dssim", self.loss.dssim, 1.0), ("growth.rate", self.growth.rate, 1.0)];
         for (field, value, most) in weights {
-            if !(value >= 0.0 && value <= most) {
+            if !(0.0..=most).contains(&value) {
                 let must = "it is a number from 0 to 1";
                 return Err(SettingError { field, value: value.to_string(), must });
             }

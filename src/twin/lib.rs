@@ -7,6 +7,10 @@
 //! limits     limits and defaults, with the arithmetic behind each
 //! ```
 
+#[cfg_attr(
+    not(feature = "mesh"),
+    allow(dead_code, reason = "only meshes use some of what all scenes are given")
+)]
 pub mod ingest;
 pub mod limits;
 pub mod residency;

@@ -3,14 +3,9 @@
 use std::fs;
 use std::path::Path;
 use std::process::Output;
-use std::sync::LazyLock;
 
-use crate::city::{City, city};
 use crate::versions::files;
 use crate::wildcity;
-
-/// The twin "city", of a kilometre and 300 m more.
-pub(crate) static CITY: LazyLock<City> = LazyLock::new(|| city(1_300.0));
 
 fn run(dir: &Path, arguments: &[&str]) -> Output {
     wildcity().args(arguments).current_dir(dir).env("XDG_DATA_HOME", dir).output().unwrap()

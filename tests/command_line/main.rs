@@ -1,7 +1,5 @@
 //! The `wildcity` command, as users run it: files in, files, text and exit codes out.
 
-#[path = "../support/city.rs"]
-mod city;
 #[path = "../support/data.rs"]
 mod data;
 #[path = "../support/drives.rs"]
@@ -43,9 +41,6 @@ mod versions;
 
 mod actor;
 mod augment;
-mod bench_actors;
-mod bench_drive;
-mod bench_gpu;
 mod bisect;
 mod bombs;
 mod capture;

@@ -31,8 +31,6 @@ fn commands_take_a_url() {
     assert!(out.contains("gaussians   500"), "{out}");
     let (code, out, _) = run(&["twin", "log", "street"]);
     assert!(code == Some(0) && out.contains("import"), "{out}");
-    let (code, out, error) = run(&["bench", "load", "street", "--repeat", "1"]);
-    assert!(code == Some(0) && out.contains("bare bytes"), "{out}{error}");
     let mut command = wildcity();
     let output = command.args(["inspect", "street", "--twins", "ftp://bucket/x"]).output().unwrap();
     let said = String::from_utf8(output.stderr).unwrap();

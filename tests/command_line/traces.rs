@@ -6,7 +6,7 @@ fn a_program_without_otlp_says_how_to_build_one_with_it() {
     let arguments = ["serve", "--otlp-endpoint", "http://127.0.0.1:4318"];
     let refused = crate::wildcity().args(arguments).output().unwrap();
     let text = String::from_utf8(refused.stderr).unwrap();
-    assert!(!refused.status.success() && text.contains("--features otlp"), "{text}");
+    assert!(!refused.status.success() && text.contains("--features full,otlp"), "{text}");
 }
 
 #[cfg(feature = "otlp")]

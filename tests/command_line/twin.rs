@@ -218,8 +218,9 @@ fn the_files_that_help_shows_are_accepted() {
 
 #[test]
 fn an_absurd_number_of_threads_is_a_mistake_on_the_command_line() {
-    let bench = ["bench", "step", "street", "--cameras", "none.json", "--threads", "9999999"];
-    let output = wildcity().args(bench).output().unwrap();
+    let render =
+        ["render", "street", "--cameras", "none.json", "--out", "x", "--threads", "9999999"];
+    let output = wildcity().args(render).output().unwrap();
     assert_eq!(output.status.code(), Some(2), "{output:?}");
     let said = String::from_utf8(output.stderr).unwrap();
     assert!(said.contains("--threads") && said.contains("expected 0 to 1024"), "{said}");

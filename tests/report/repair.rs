@@ -13,12 +13,13 @@ use wildcity_repair::Model;
 use wildcity_repair::reference::ReferenceCache;
 use wildcity_report::ReportError;
 use wildcity_report::repair::{
-    FRAME_M, ImageKind, RepairBenchmark, RepairReport, RepairRow, RepairSampling, measure,
+    ImageKind, RepairBenchmark, RepairReport, RepairRow, RepairSampling, measure,
 };
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::views::RecordedView;
 use wildcity_scene::{RecordFormat, RenderProfile};
+use wildcity_session::limits::FRAME_M;
 use wildcity_twin::residency::{Cache, Resident};
 use wildcity_twin::store::{Catalog, CommitKind, NewVersion, StorageOptions, VersionChange};
 

@@ -25,7 +25,7 @@ const CRATES: &[(&str, &[&str])] = &[
     ("object_store", &["src/twin/store/remote", "src/twin/store/catalog.rs"]),
     (
         "rustls",
-        &["src/twin/store/remote", "src/server/tls.rs", "src/cli/serve/log.rs", "clients/rust"],
+        &["src/twin/store/remote", "src/server/tls", "src/cli/serve/log.rs", "clients/rust"],
     ),
     ("opentelemetry", &["src/cli/serve/log.rs"]),
     ("opentelemetry_otlp", &["src/cli/serve/log.rs"]),
@@ -52,11 +52,11 @@ const FILES: &[&str] = &[
     "src/server/memory.rs",
     "src/server/start.rs",
     "src/server/spool",
-    "src/server/tls.rs",
     "clients/rust/src/memory.rs",
     "clients/rust/src/upload.rs",
     "src/repair/files.rs",
     "src/convert/openscenario/files.rs",
+    "src/bench",
     "src/train/examples",
     "src/cli",
 ];

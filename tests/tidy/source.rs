@@ -30,6 +30,8 @@ struct Manifest {
     package: Name,
     lib: Option<Library>,
     #[serde(default)]
+    bin: Vec<Library>,
+    #[serde(default)]
     dependencies: BTreeMap<String, toml::Value>,
     lints: BTreeMap<String, toml::Value>,
 }
@@ -66,7 +68,8 @@ pub(crate) fn packages() -> Vec<Package> {
 fn package(member: &str) -> Package {
     let text = fs::read_to_string(root().join(member).join("Cargo.toml")).unwrap();
     let manifest: Manifest = toml::from_str(&text).unwrap();
-    let library = manifest.lib.and_then(|lib| lib.path).unwrap_or("src/lib.rs".to_owned());
+    let first = manifest.lib.into_iter().chain(manifest.bin).next();
+    let library = first.and_then(|root| root.path).unwrap_or("src/lib.rs".to_owned());
     let folder = match member {
         "" => PathBuf::from("src/cli"),
         _ => Path::new(member).join(Path::new(&library).parent().unwrap()),
@@ -122,7 +125,7 @@ pub(crate) fn paths(file: &str, text: &str) -> Vec<Named> {
 /// The module of a file, as `["cpu", "bin"]`; none for `lib.rs`.
 pub(crate) fn module(file: &str) -> Vec<String> {
     let stem = file.trim_end_matches(".rs");
-    let parts = stem.split('/').filter(|part| !["mod", "lib"].contains(part));
+    let parts = stem.split('/').filter(|part| !["mod", "lib", "main"].contains(part));
     parts.map(str::to_owned).collect()
 }
 

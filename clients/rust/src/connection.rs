@@ -1,20 +1,21 @@
 //! One WebSocket: sends a message and receives its answer, with size limits and time limits.
 
 use std::fmt;
-use std::sync::Arc;
 use std::time::Duration;
 
 use futures_util::{SinkExt, StreamExt};
 use tokio::net::TcpStream;
 use tokio::time::timeout;
+#[cfg(not(feature = "http"))]
+use tokio_tungstenite::connect_async_with_config;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 use tokio_tungstenite::tungstenite::handshake::client::Request as UpgradeRequest;
 use tokio_tungstenite::tungstenite::http::HeaderValue;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::{Bytes, Message};
-use tokio_tungstenite::{
-    Connector, MaybeTlsStream, WebSocketStream, connect_async_tls_with_config,
-};
+#[cfg(feature = "http")]
+use tokio_tungstenite::{Connector, connect_async_tls_with_config};
+use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 
 use wildcity_protocol::PROTOCOL;
 use wildcity_protocol::limits::{HELLO_TIMEOUT, OBSERVATION_BYTES};
@@ -25,13 +26,13 @@ use crate::many::Many;
 use crate::memory::{Offer, SharedMemory};
 use crate::observation::Observation;
 use crate::options::ConnectOptions;
-use crate::tls;
 
 /// A server's address, with all that is needed to connect to it again.
 #[derive(Clone)]
 pub(crate) struct Endpoint {
     url: String,
     upgrade: UpgradeRequest,
+    #[cfg(feature = "http")]
     connector: Connector,
     /// Whether connections share memory.
     pub(crate) shares_memory: bool,
@@ -67,14 +68,26 @@ impl Endpoint {
             headers.insert("Authorization", bearer);
         }
 
-        let connector = if upgrade.uri().scheme_str() == Some("wss") {
-            let config = tls::client_config(&options.root_certificates_pem).map_err(failed)?;
-            Connector::Rustls(Arc::new(config))
+        let has_tls = upgrade.uri().scheme_str() == Some("wss");
+        #[cfg(feature = "http")]
+        let connector = if has_tls {
+            let config = crate::tls::client_config(&options.root_certificates_pem);
+            Connector::Rustls(std::sync::Arc::new(config.map_err(failed)?))
         } else {
             Connector::Plain
         };
-        let shares_memory = options.shared_memory;
-        Ok(Self { url: url.to_owned(), upgrade, connector, shares_memory })
+        #[cfg(not(feature = "http"))]
+        if has_tls {
+            let reason = "built without TLS: build wildcity-client with the feature `http`";
+            return Err(failed(reason.to_owned()));
+        }
+        Ok(Self {
+            url: url.to_owned(),
+            upgrade,
+            #[cfg(feature = "http")]
+            connector,
+            shares_memory: options.shared_memory,
+        })
     }
 
     /// Opens a connection. Fails after [`HELLO_TIMEOUT`].
@@ -86,12 +99,15 @@ impl Endpoint {
         // Sets TCP_NODELAY: in lock step a request must not wait for the acknowledgement of the
         // previous request.
         let no_delay = true;
+        #[cfg(feature = "http")]
         let connecting = connect_async_tls_with_config(
             self.upgrade.clone(),
             Some(limits),
             no_delay,
             Some(self.connector.clone()),
         );
+        #[cfg(not(feature = "http"))]
+        let connecting = connect_async_with_config(self.upgrade.clone(), Some(limits), no_delay);
         match timeout(HELLO_TIMEOUT, connecting).await {
             Ok(Ok((socket, _response))) => Ok(Connection { socket, memory: None }),
             Ok(Err(error)) => Err(failed(error.to_string())),

@@ -3,7 +3,8 @@
 //! [`Client`] drives: it opens a session over one WebSocket and works in lock step, so every call
 //! sends one request and waits for its one answer. [`HttpClient`] uploads scenes and publishes them
 //! as new versions of a twin. Both connect with and without TLS (`wss://`, `https://`), both need a
-//! tokio runtime, and neither uses a proxy.
+//! tokio runtime, and neither uses a proxy. [`HttpClient`] and TLS are the feature `http`, which is
+//! on by default.
 //!
 //! ```no_run
 //! use wildcity_client::{Client, Open, Pose};
@@ -30,22 +31,27 @@
 
 #![warn(missing_docs)]
 
+#[cfg(feature = "http")]
 mod actors;
 mod client;
 mod connection;
 mod decode;
 mod error;
+#[cfg(feature = "http")]
 mod http;
 pub mod limits;
 mod many;
 mod memory;
 mod observation;
 mod options;
+#[cfg(feature = "http")]
 mod tls;
+#[cfg(feature = "http")]
 mod upload;
 
 pub use client::{Client, Movement, ResetOptions, Resumed, StepOptions, Switched, Welcome};
 pub use error::{ClientError, FrameError};
+#[cfg(feature = "http")]
 pub use http::{HttpClient, HttpError};
 pub use many::Stepped;
 pub use observation::{ImageView, Observation};

@@ -6,6 +6,7 @@ mod generate;
 mod import;
 mod list;
 mod picture;
+#[cfg(feature = "http")]
 mod push;
 mod remove;
 mod show;
@@ -30,9 +31,10 @@ pub(super) struct Actor {
     subcommand: Subcommand,
 }
 
-#[derive(Debug, clap::Subcommand)]
-enum Subcommand {
+super::subcommands! {
+    Subcommand;
     Import(import::Import),
+    #[cfg(feature = "http")]
     Push(push::Push),
     Generate(generate::Generate),
     List(list::List),
@@ -43,14 +45,6 @@ enum Subcommand {
 
 impl Actor {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        match self.subcommand {
-            Subcommand::Import(import) => import.run(),
-            Subcommand::Push(push) => push.run(),
-            Subcommand::Generate(generate) => generate.run(),
-            Subcommand::List(list) => list.run(),
-            Subcommand::Show(show) => show.run(),
-            Subcommand::Remove(remove) => remove.run(),
-            Subcommand::Cut(cut) => cut.run(),
-        }
+        self.subcommand.run()
     }
 }

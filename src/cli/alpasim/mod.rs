@@ -9,15 +9,13 @@ pub(super) struct Alpasim {
     command: Command,
 }
 
-#[derive(Debug, clap::Subcommand)]
-enum Command {
+super::subcommands! {
+    Command;
     Export(export::Export),
 }
 
 impl Alpasim {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        match self.command {
-            Command::Export(command) => command.run(),
-        }
+        self.command.run()
     }
 }

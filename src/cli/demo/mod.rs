@@ -2,6 +2,7 @@
 
 mod driver;
 mod mosaic;
+#[cfg(feature = "eval")]
 mod off_trajectory;
 mod scenario;
 
@@ -19,9 +20,11 @@ use wildcity_client::protocol::message::ScenarioChoice;
 use wildcity_client::protocol::observation::Event;
 use wildcity_client::{Client, Movement, Observation, Open, Pose};
 use wildcity_generate::{Spoil, StreetSettings};
-use wildcity_repair::{LoadOptions, Models};
+#[cfg(feature = "eval")]
+use wildcity_repair::LoadOptions;
+use wildcity_repair::Models;
+use wildcity_scene::Rig;
 use wildcity_scene::manifest::Provenance;
-use wildcity_scene::{RecordFormat, Rig};
 use wildcity_server::{Config, Directories};
 use wildcity_session::generated_actors;
 use wildcity_twin::ingest::sky;
@@ -34,6 +37,7 @@ use self::scenario::DemoScenario;
 
 use super::backend_options::BackendOptions;
 use super::directories::Twins;
+#[cfg(feature = "eval")]
 use super::repair_options::runtime_library;
 use super::{output, progress, view};
 
@@ -102,6 +106,7 @@ Examples:
 /// Name of the demo twin.
 pub(super) const TWIN: &str = "demo";
 /// Name of the demo twin that `wildcity report` measures: the same street in record format f32.
+#[cfg(feature = "report")]
 const EXACT_TWIN: &str = "demo-f32";
 /// Name of the degraded copy of the demo twin.
 const SPOILED_TWIN: &str = "demo-spoiled";
@@ -120,12 +125,7 @@ impl Demo {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let twins = self.twins.dir()?;
         output::create_dir(&self.out)?;
-        let repairs = if self.repair {
-            let options = LoadOptions::new(runtime_library(self.onnxruntime.as_ref()));
-            off_trajectory::model(&self.out.join("model"), options)?
-        } else {
-            Models::default()
-        };
+        let repairs = self.models()?;
         let version = demo_twin(&twins, TWIN, StorageOptions::default(), None)?;
         let assets = match self.scenario {
             Some(_) => generated_actors(&self.twins.catalog()?).map_err(anyhow::Error::msg)?,
@@ -152,18 +152,9 @@ impl Demo {
             return view::serve(config, Some(TWIN), true);
         }
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
+        #[cfg(feature = "eval")]
         if let Some(offset_m) = self.off_trajectory {
-            let twins = [TWIN, SPOILED_TWIN];
-            let catalog = self.twins.catalog()?;
-            let drive = &version.manifest.trajectories[0];
-            return runtime.block_on(async {
-                let running = wildcity_server::start(config).await?;
-                let url = running.url();
-                let views = off_trajectory::Views { offset_m, repair: self.repair, out: &self.out };
-                let shown = views.show(&url, &catalog, twins, drive).await;
-                running.stop().await;
-                shown
-            });
+            return runtime.block_on(self.show_off_trajectory(config, &version, offset_m));
         }
         let drive = runtime.block_on(async {
             let running = wildcity_server::start(config).await?;
@@ -172,6 +163,50 @@ impl Demo {
             drive
         })?;
         self.report(&version, &drive)
+    }
+
+    /// The model of --repair, or none.
+    #[cfg(feature = "eval")]
+    fn models(&self) -> anyhow::Result<Models> {
+        if !self.repair {
+            return Ok(Models::default());
+        }
+        let options = LoadOptions::new(runtime_library(self.onnxruntime.as_ref()));
+        off_trajectory::model(&self.out.join("model"), options)
+    }
+
+    /// No model: this build has no --off-trajectory.
+    ///
+    /// # Errors
+    /// It was given; the error says what to build.
+    #[cfg(not(feature = "eval"))]
+    fn models(&self) -> anyhow::Result<Models> {
+        let is_given = self.off_trajectory.is_some() || self.repair || self.onnxruntime.is_some();
+        anyhow::ensure!(!is_given, "--off-trajectory: {}", super::left_out::built_without("eval"));
+        Ok(Models::default())
+    }
+
+    #[cfg(feature = "eval")]
+    async fn show_off_trajectory(
+        &self,
+        config: Config,
+        version: &Version,
+        offset_m: f64,
+    ) -> anyhow::Result<()> {
+        let catalog = self.twins.catalog()?;
+        let running = wildcity_server::start(config).await?;
+        let beside = wildcity_eval::Beside {
+            url: &running.url(),
+            catalog: &catalog,
+            truth: TWIN,
+            spoiled: SPOILED_TWIN,
+            drive: &version.manifest.trajectories[0],
+            offset_m,
+            model: self.repair.then_some(off_trajectory::MODEL_NAME),
+        };
+        let views = beside.run().await;
+        running.stop().await;
+        off_trajectory::show(&views?, &self.out)
     }
 
     /// The agent: follows the recorded trajectory, and checks every frame's hash. Without a
@@ -308,11 +343,12 @@ fn wire_pose(pose: &wildcity_scene::geometry::Pose) -> Pose {
 }
 
 /// The demo street in the exact record format f32, under its own name.
+#[cfg(feature = "report")]
 pub(super) fn exact_twin(twins: &Path) -> anyhow::Result<Version> {
     demo_twin(
         twins,
         EXACT_TWIN,
-        StorageOptions { record: RecordFormat::F32, ..StorageOptions::default() },
+        StorageOptions { record: wildcity_scene::RecordFormat::F32, ..StorageOptions::default() },
         None,
     )
 }

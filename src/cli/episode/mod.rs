@@ -36,8 +36,8 @@ pub(super) struct Episode {
     command: Command,
 }
 
-#[derive(Debug, clap::Subcommand)]
-enum Command {
+super::subcommands! {
+    Command;
     Run(Box<run::Run>),
     Compare(compare::Compare),
     List(list::List),
@@ -50,16 +50,7 @@ enum Command {
 
 impl Episode {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        match self.command {
-            Command::Run(command) => command.run(),
-            Command::Compare(command) => command.run(),
-            Command::List(command) => command.run(),
-            Command::Show(command) => command.run(),
-            Command::Score(command) => command.run(),
-            Command::Diff(command) => command.run(),
-            Command::Export(command) => command.run(),
-            Command::Video(command) => command.run(),
-        }
+        self.command.run()
     }
 }
 

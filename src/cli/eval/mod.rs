@@ -1,39 +1,23 @@
 //! `wildcity eval`.
 
-mod compared;
-mod drive;
-mod labels;
-mod networks;
-mod off_trajectory;
-mod renderer;
-mod repairer;
-mod saved;
+mod options;
 mod summary;
 
 use std::io::{self, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use anyhow::{Context, ensure};
-
-use wildcity_eval::{EvaluatedImage, Evaluation, Subject};
-use wildcity_scene::RenderProfile;
+use wildcity_eval::images::ImageList;
+use wildcity_eval::{Evaluation, Evaluator, Save, Scene, Settings};
 use wildcity_scene::align::Alignment;
-use wildcity_scene::geometry::Pose;
+use wildcity_session::OpenScene;
 
-use self::compared::Compared;
-use self::drive::Drives;
-use self::labels::{LabelOptions, Labels};
-use self::networks::{FeatureSet, NetworkOptions, Networks};
-use self::off_trajectory::{OffTrajectoryImage, OffTrajectoryViews, Offsets, OnDrive, Tools};
-use self::renderer::{Maps, Renderer};
-use self::repairer::{Repairer, RepairerOptions};
+use self::options::{LabelOptions, NetworkOptions, Offsets, RepairerOptions};
 use self::summary::{decibels, print_means, print_off_trajectory};
 use super::backend_options::BackendOptions;
 use super::directories::Twins;
-use super::file_notes::DropBad;
+use super::file_notes::{DropBad, print_warnings};
 use super::profile_options::ProfileOptions;
-use super::real_images::{ImageList, RealImage, camera_names};
-use super::scene_source::Source;
+use super::scene_source::open_scene;
 use super::{output, placement, progress};
 
 /// Compare a twin or a scene file with real images that it was not trained on.
@@ -138,172 +122,66 @@ Examples:
   wildcity eval street --images views.jsonl --save-images
   wildcity eval street --images held-out/transforms.json --repair repair.json --extrapolate 1,3,5";
 
-/// What renders, repairs and measures the images.
-struct Setup {
-    renderer: Renderer,
-    repairer: Option<Repairer>,
-    /// The recorded drives of the twin; `None` without any.
-    drives: Option<Drives>,
-    labels: Labels,
-    networks: Networks,
-}
-
-/// Features of all images, if a network computes them.
-#[derive(Default)]
-struct Features {
-    truth: Vec<Vec<f32>>,
-    images: FeatureSet,
-    /// Features of the views off the trajectory, distance by distance.
-    off_trajectory: Vec<FeatureSet>,
-}
-
 impl Eval {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let list = ImageList::read(&self.images, self.image_dir.as_deref(), self.masks.as_deref())?;
-        let names = camera_names(&list.every(1));
-        let images = list.every(1).into_iter().zip(&names).step_by(self.every as usize);
-        let images: Vec<(&RealImage, &String)> = images.collect();
+        print_warnings(&self.images, &list.warnings)?;
         let changes = self.profile.load()?;
-        let (source, own_profile) = Source::open(&self.scene, &self.twins, self.bad)?;
+        let (source, own_profile) = open_scene(&self.scene, &self.twins, self.bad)?;
         let alignment = self.alignment(&source, &list)?;
-        let held_out: Vec<Pose> =
-            images.iter().map(|(image, _)| alignment.pose(&image.world_from_camera)).collect();
-        let backend = self.backend.backend()?;
-        let repairer = self.repairer.load(&source, &self.twins, &held_out)?;
-        let drives = match &source {
-            Source::Twin(resident) => Drives::from_version(&resident.version),
-            Source::File(_) => None,
+        let catalog = match &source {
+            OpenScene::Twin(_) => Some(self.twins.catalog()?),
+            OpenScene::File(_) => None,
         };
-        ensure!(
-            self.extrapolate.is_none() || drives.is_some(),
-            "--extrapolate {}: views beside the drive need a twin with a recorded drive; `wildcity twin drive` adds one",
-            self.scene
-        );
-        let maps = Maps {
-            depth: self.extrapolate.is_some()
-                || self.labels.needs_depth()
-                || repairer.as_ref().is_some_and(Repairer::needs_depth),
-            normals: repairer.as_ref().is_some_and(Repairer::needs_normals),
+        let scene = Scene {
+            source,
+            catalog,
+            own_profile,
+            changes: Box::new(move |profile| changes.apply(profile)),
+            alignment,
+            backend: self.backend.backend()?,
         };
-        let renderer = Renderer { source, own_profile, changes, backend, alignment, maps };
-        let real: Vec<&RealImage> = images.iter().map(|(image, _)| *image).collect();
-        let labels = self.labels.load(&renderer.source, &renderer.alignment, &real)?;
-        let networks = self.networks.load(&self.repairer.load_options())?;
-        let setup = Setup { renderer, repairer, drives, labels, networks };
-        let profile = setup.renderer.profile(None)?;
+        let settings = self.settings();
+        let save = |path: &Path, png: &[u8]| {
+            let path = self.out.join(path);
+            output::create_dir(path.parent().unwrap_or(&self.out))?;
+            output::write(&path, png)
+        };
+        let save: Option<Save<'_>> = self.save_images.then_some(&save);
+        let evaluator = Evaluator::new(&settings, scene, &list, save)?;
         output::create_dir(&self.out)?;
         let bar = progress::count("comparing");
-        bar.set_length(images.len() as u64);
-        let mut evaluated: Vec<EvaluatedImage> = Vec::with_capacity(images.len());
-        let mut off_trajectory = self.extrapolate.as_ref().map(OffTrajectoryViews::new);
-        let mut features = Features::default();
-        for (at, (image, camera_name)) in images.iter().enumerate() {
-            let about = || format!("image {}", image.name);
-            let compared = self.evaluate(&setup, image, camera_name).with_context(about)?;
-            features.add(&setup.networks, &compared).with_context(about)?;
-            if let Some(views) = &mut off_trajectory {
-                let is_shown = at == images.len() / 2;
-                let drawn = self.render_off_trajectory(&setup, views, &compared, image, is_shown);
-                let drawn = drawn.with_context(about)?;
-                let added = features.add_off_trajectory(&setup.networks, &compared, &drawn);
-                added.with_context(about)?;
-            }
-            evaluated.push(compared.scores);
-            self.forget_better_pictures(&mut evaluated);
-            bar.inc(1);
-        }
+        let evaluation = evaluator.run(&mut progress::show(&bar))?;
         bar.finish_and_clear();
-        let mut evaluation = Evaluation::new(self.subject(&setup, profile), evaluated);
-        let extrapolation = off_trajectory.map(OffTrajectoryViews::finish);
-        evaluation.extrapolation = extrapolation.unwrap_or_default();
-        evaluation.kid = setup.networks.kid(&features.images, &features.truth)?;
-        for (line, set) in evaluation.extrapolation.iter_mut().zip(&features.off_trajectory) {
-            line.kid = setup.networks.kid(set, &features.truth)?;
-        }
         self.write(&evaluation)
     }
 
+    fn settings(&self) -> Settings {
+        Settings {
+            scene: self.scene.clone(),
+            images: self.images.display().to_string(),
+            every: self.every as usize,
+            align_exposure: self.align_exposure,
+            show: self.show,
+            offsets_m: self.extrapolate.clone().map(|offsets| offsets.0).unwrap_or_default(),
+            boxes: self.labels.boxes.clone(),
+            lidar: self.labels.lidar.clone(),
+            lidar_window_s: self.labels.lidar_window,
+            lpips: self.networks.lpips.clone(),
+            features: self.networks.features.clone(),
+            repair: self.repairer.repair.clone(),
+            networks: self.repairer.load_options(),
+        }
+    }
+
     /// The transform from the axes of the poses to those of the scene.
-    fn alignment(&self, source: &Source, list: &ImageList) -> anyhow::Result<Alignment> {
+    fn alignment(&self, source: &OpenScene, list: &ImageList) -> anyhow::Result<Alignment> {
         match (&self.axes, source) {
             (Some(axes), _) => placement::imported(axes, self.scale.unwrap_or(1.0)),
-            (None, Source::Twin(resident)) if !list.is_in_scene_axes => {
+            (None, OpenScene::Twin(resident)) if !list.is_in_scene_axes => {
                 placement::from_version(&self.twins.catalog()?, &resident.version)
             }
             (None, _) => Ok(Alignment::IDENTITY),
-        }
-    }
-
-    /// Renders the views off the trajectory of an image.
-    fn render_off_trajectory(
-        &self,
-        setup: &Setup,
-        views: &mut OffTrajectoryViews,
-        compared: &Compared,
-        image: &RealImage,
-        is_shown: bool,
-    ) -> anyhow::Result<Vec<OffTrajectoryImage>> {
-        let (Some(drives), Some(lens)) = (&setup.drives, &compared.lens) else {
-            return Ok(Vec::new());
-        };
-        let repairer = setup.repairer.as_ref();
-        let tools = Tools { renderer: &setup.renderer, repairer, drives };
-        let on_drive = OnDrive {
-            name: &image.name,
-            camera: &compared.camera,
-            lens,
-            exposure_stops: image.exposure_stops,
-            view: &compared.view,
-            profile: &compared.profile,
-            truth: &compared.truth,
-            rendered: &compared.rendered,
-            counts: compared.counts.as_deref(),
-            is_shown,
-        };
-        let drawn = views.add(tools, &on_drive)?;
-        let offsets = self.extrapolate.iter().flat_map(|offsets| &offsets.0);
-        for (offset_m, OffTrajectoryImage { rendered, repaired }) in offsets.zip(&drawn) {
-            if self.save_images {
-                let name = format!("{offset_m}m/{}", image.name);
-                self.save_pixels("beside", &name, rendered, &compared.view)?;
-                if let Some(repaired) = repaired {
-                    self.save_pixels("beside_repaired", &name, repaired, &compared.view)?;
-                }
-            }
-        }
-        Ok(drawn)
-    }
-
-    /// Keeps only the pictures of the worst images, so that memory does not grow with the number of
-    /// images.
-    fn forget_better_pictures(&self, evaluated: &mut [EvaluatedImage]) {
-        let shown = evaluated.iter().filter(|image| image.thumbnails.is_some()).count();
-        if shown <= self.show {
-            return;
-        }
-        let shown = evaluated.iter_mut().filter(|image| image.thumbnails.is_some());
-        let best = shown.max_by(|a, b| a.compare(b));
-        if let Some(best) = best {
-            best.thumbnails = None;
-        }
-    }
-
-    fn subject(&self, setup: &Setup, profile: RenderProfile) -> Subject {
-        let renderer = &setup.renderer;
-        let version = renderer.source.version();
-        Subject {
-            scene: version.map_or(self.scene.clone(), |version| version.manifest.twin.clone()),
-            version: version.map(|version| version.number),
-            version_hash: version.map(|version| version.hash.clone()),
-            images: self.images.display().to_string(),
-            alignment: renderer.alignment.to_string(),
-            every: self.every as usize,
-            backend: renderer.backend.name(),
-            profile,
-            repair: setup.repairer.as_ref().map(Repairer::subject),
-            lpips_network: setup.networks.lpips_name(),
-            boxes: setup.labels.boxes_subject.clone(),
-            lidar: setup.labels.lidar_subject.clone(),
         }
     }
 
@@ -339,37 +217,6 @@ impl Eval {
         }
         for (name, _) in &files {
             writeln!(out, "{}", self.out.join(name).display())?;
-        }
-        Ok(())
-    }
-}
-
-impl Features {
-    fn add(&mut self, networks: &Networks, compared: &Compared) -> anyhow::Result<()> {
-        let camera = &compared.view.camera;
-        let size_px = [camera.width_px, camera.height_px];
-        self.truth.extend(networks.features(size_px, &compared.truth)?);
-        self.images.rendered.extend(networks.features(size_px, &compared.rendered.rgb8)?);
-        if let Some(repaired) = &compared.repaired {
-            self.images.repaired.extend(networks.features(size_px, repaired)?);
-        }
-        Ok(())
-    }
-
-    fn add_off_trajectory(
-        &mut self,
-        networks: &Networks,
-        compared: &Compared,
-        drawn: &[OffTrajectoryImage],
-    ) -> anyhow::Result<()> {
-        let camera = &compared.view.camera;
-        let size_px = [camera.width_px, camera.height_px];
-        self.off_trajectory.resize_with(drawn.len(), FeatureSet::default);
-        for (set, image) in self.off_trajectory.iter_mut().zip(drawn) {
-            set.rendered.extend(networks.features(size_px, &image.rendered)?);
-            if let Some(repaired) = &image.repaired {
-                set.repaired.extend(networks.features(size_px, repaired)?);
-            }
         }
         Ok(())
     }

@@ -1,9 +1,11 @@
 //! `wildcity map`.
 
 mod check;
+#[cfg(feature = "convert")]
 mod import;
 mod strips;
 
+#[cfg(feature = "convert")]
 pub(in crate::cli) use import::origin;
 
 /// Make and check maps: lanes and areas of a twin.
@@ -21,8 +23,9 @@ pub(super) struct MapCommand {
     subcommand: Subcommand,
 }
 
-#[derive(Debug, clap::Subcommand)]
-enum Subcommand {
+super::subcommands! {
+    Subcommand;
+    #[cfg(feature = "convert")]
     Import(import::Import),
     Strips(strips::Strips),
     Check(check::Check),
@@ -30,10 +33,6 @@ enum Subcommand {
 
 impl MapCommand {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        match self.subcommand {
-            Subcommand::Import(import) => import.run(),
-            Subcommand::Strips(strips) => strips.run(),
-            Subcommand::Check(check) => check.run(),
-        }
+        self.subcommand.run()
     }
 }

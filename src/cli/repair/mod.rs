@@ -20,15 +20,13 @@ pub(super) struct Repair {
     subcommand: Subcommand,
 }
 
-#[derive(Debug, clap::Subcommand)]
-enum Subcommand {
+super::subcommands! {
+    Subcommand;
     Check(check::Check),
 }
 
 impl Repair {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        match self.subcommand {
-            Subcommand::Check(check) => check.run(),
-        }
+        self.subcommand.run()
     }
 }

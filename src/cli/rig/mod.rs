@@ -21,8 +21,8 @@ pub(super) struct RigCommand {
     subcommand: Subcommand,
 }
 
-#[derive(Debug, clap::Subcommand)]
-enum Subcommand {
+super::subcommands! {
+    Subcommand;
     Show(show::Show),
     Check(check::Check),
     Draw(draw::Draw),
@@ -30,10 +30,6 @@ enum Subcommand {
 
 impl RigCommand {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        match self.subcommand {
-            Subcommand::Show(show) => show.run(),
-            Subcommand::Check(check) => check.run(),
-            Subcommand::Draw(draw) => draw.run(),
-        }
+        self.subcommand.run()
     }
 }

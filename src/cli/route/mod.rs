@@ -24,8 +24,8 @@ pub(super) struct Route {
     subcommand: Subcommand,
 }
 
-#[derive(Debug, clap::Subcommand)]
-enum Subcommand {
+super::subcommands! {
+    Subcommand;
     Measure(measure::Measure),
     Subsample(subsample::Subsample),
     Cut(cut::Cut),
@@ -37,14 +37,6 @@ enum Subcommand {
 
 impl Route {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        match self.subcommand {
-            Subcommand::Measure(measure) => measure.run(),
-            Subcommand::Subsample(subsample) => subsample.run(),
-            Subcommand::Cut(cut) => cut.run(),
-            Subcommand::Associate(associate) => associate.run(),
-            Subcommand::Interpolate(interpolate) => interpolate.run(),
-            Subcommand::FromColmap(from) => from.run(),
-            Subcommand::FromNerfstudio(from) => from.run(),
-        }
+        self.subcommand.run()
     }
 }

@@ -1,6 +1,8 @@
 //! `wildcity scenario`.
 
+#[cfg(feature = "suite")]
 mod check;
+#[cfg(feature = "convert")]
 mod import;
 mod show;
 
@@ -29,20 +31,18 @@ pub(super) struct ScenarioCommand {
     subcommand: Subcommand,
 }
 
-#[derive(Debug, clap::Subcommand)]
-enum Subcommand {
+super::subcommands! {
+    Subcommand;
+    #[cfg(feature = "suite")]
     Check(check::Check),
     Show(show::Show),
+    #[cfg(feature = "convert")]
     Import(import::Import),
 }
 
 impl ScenarioCommand {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        match self.subcommand {
-            Subcommand::Check(check) => check.run(),
-            Subcommand::Show(show) => show.run(),
-            Subcommand::Import(import) => import.run(),
-        }
+        self.subcommand.run()
     }
 }
 

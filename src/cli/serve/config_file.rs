@@ -6,6 +6,7 @@
 //! so a flag overrides the file and the file overrides a default. Each option has one description,
 //! one check and one default.
 
+use std::borrow::Cow;
 use std::ffi::OsString;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -163,7 +164,7 @@ impl Resolved {
         let help = help.map(ToString::to_string).unwrap_or_default();
         // Writing to a String does not fail.
         let _ = writeln!(text);
-        for line in help.lines().flat_map(|line| wrapped(line, 98)) {
+        for line in help.lines().flat_map(wrapped) {
             let _ = writeln!(text, "{}", format!("# {line}").trim_end());
         }
         match self.value(id)? {
@@ -189,46 +190,19 @@ impl Resolved {
 }
 
 /// A text as a TOML value: a number or a Boolean if it parses as one, otherwise a string.
-fn literal(text: &str) -> String {
-    let parsed: Option<Table> = format!("x = {text}").parse().ok();
-    let is_scalar = parsed.is_some_and(|table| {
-        let values: Vec<&Value> = table.values().collect();
-        matches!(values[..], [Value::Integer(_) | Value::Float(_) | Value::Boolean(_)])
-    });
-    if is_scalar {
-        return text.to_owned();
+fn literal(text: &str) -> Value {
+    let parsed = format!("x = {text}").parse::<Table>().ok().and_then(|mut one| one.remove("x"));
+    match parsed {
+        Some(scalar @ (Value::Integer(_) | Value::Float(_) | Value::Boolean(_))) => scalar,
+        _ => Value::String(text.to_owned()),
     }
-    let mut quoted = String::from('"');
-    for c in text.chars() {
-        match c {
-            '"' => quoted.push_str("\\\""),
-            '\\' => quoted.push_str("\\\\"),
-            c if c.is_control() => {
-                let _ = write!(quoted, "\\u{:04X}", u32::from(c));
-            }
-            c => quoted.push(c),
-        }
-    }
-    quoted.push('"');
-    quoted
 }
 
-/// A line broken between words where it would be longer than `width` characters.
-fn wrapped(line: &str, width: usize) -> Vec<String> {
-    let mut lines = vec![String::new()];
-    for word in line.split(' ') {
-        let last = lines.len() - 1;
-        let fits = lines[last].chars().count() + 1 + word.chars().count() <= width;
-        if lines[last].is_empty() {
-            lines[last].push_str(word);
-        } else if fits {
-            lines[last].push(' ');
-            lines[last].push_str(word);
-        } else {
-            lines.push(word.to_owned());
-        }
-    }
-    lines
+/// The lines of a comment.
+fn wrapped(line: &str) -> Vec<Cow<'_, str>> {
+    let options = textwrap::Options::new(98).break_words(false);
+    let options = options.word_splitter(textwrap::WordSplitter::NoHyphenation);
+    textwrap::wrap(line, options.word_separator(textwrap::WordSeparator::AsciiSpace))
 }
 
 #[cfg(test)]

@@ -37,8 +37,7 @@ pub(super) fn start(filter: &str, endpoint: Option<&str>) -> anyhow::Result<Opti
     }
     #[cfg(not(feature = "otlp"))]
     anyhow::bail!(
-        "--otlp-endpoint {endpoint}: this program was built without OTLP; build it with `cargo install --path . \
-         --features otlp`"
+        "--otlp-endpoint {endpoint}: built without `otlp`: cargo build --release --features full,otlp"
     )
 }
 

@@ -12,6 +12,7 @@ use std::sync::Arc;
 
 use anyhow::Context as _;
 
+#[cfg(feature = "alpasim")]
 use wildcity_alpasim::sensorsim;
 use wildcity_server::{Origins, TlsFiles, Tokens};
 use wildcity_twin::residency::default_memory_bytes;
@@ -21,6 +22,7 @@ use limit_options::{LimitOptions, bytes_as_gib};
 
 use super::backend_options::{BackendOptions, bytes_of_gib, gib};
 use super::directories::ServerDirectories;
+use super::left_out::built_without;
 use super::profile_options::read_profile;
 use super::repair_options::{RepairOptions, runtime_library};
 
@@ -49,7 +51,7 @@ pub(super) struct Serve {
     /// Export each episode as MCAP when it ends, next to its record: for Foxglove, Rerun and
     /// others. The export takes additional disk space of about half the size of the record, and no
     /// step waits for it.
-    #[arg(long, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = true, num_args = 0..=1, default_missing_value = "true")]
+    #[arg(long, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = wildcity_episode::CAN_EXPORT, num_args = 0..=1, default_missing_value = "true")]
     mcap: bool,
 
     /// JSON file of tokens and what each allows: {"tokens": [{"name": "fleet", "role": "drive",
@@ -188,9 +190,23 @@ impl Serve {
         log.unwrap_or_else(|| "info".to_owned())
     }
 
+    /// Checks that this build has what the options need. TLS and object stores say it themselves.
+    fn check_features(&self) -> anyhow::Result<()> {
+        let needed = [
+            ("--mcap", self.mcap, "mcap", wildcity_episode::CAN_EXPORT),
+            ("--alpasim", self.alpasim.is_some(), "alpasim", cfg!(feature = "alpasim")),
+            ("--alpasim-open", self.alpasim_open, "alpasim", cfg!(feature = "alpasim")),
+        ];
+        for (option, is_given, feature, is_built) in needed {
+            anyhow::ensure!(is_built || !is_given, "{option}: {}", built_without(feature));
+        }
+        Ok(())
+    }
+
     fn serve(self) -> anyhow::Result<()> {
         // Dropped last, so that the end of the server is traced, too.
         let _traces = log::start(&self.log_filter(), self.otlp_endpoint.as_deref())?;
+        self.check_features()?;
         let directories = self.directories.all()?;
         let twins = &directories.twins;
         anyhow::ensure!(
@@ -246,6 +262,7 @@ impl Serve {
             // Before the address is printed: the signal may come right after.
             let stop = wildcity_server::stop_signal()?;
             let running = wildcity_server::start(config).await?;
+            #[cfg(feature = "alpasim")]
             let alpasim = match self.alpasim {
                 Some(listen) => {
                     let engine = running.engine().clone();
@@ -254,12 +271,14 @@ impl Serve {
                 None => None,
             };
             writeln!(io::stdout(), "listening on {}", running.url())?;
+            #[cfg(feature = "alpasim")]
             if let Some(alpasim) = &alpasim {
                 writeln!(io::stdout(), "AlpaSim: listening on {}", alpasim.address())?;
             }
             tracing::info!("viewer at {}", running.page());
             stop.await;
             tracing::info!("stopping");
+            #[cfg(feature = "alpasim")]
             if let Some(alpasim) = alpasim {
                 alpasim.stop().await;
             }

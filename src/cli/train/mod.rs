@@ -2,6 +2,8 @@
 
 mod check;
 
+use super::subcommands::subcommands;
+
 /// Train twins: check the gradients of this machine.
 #[derive(Debug, clap::Args)]
 #[command(subcommand_required = true, arg_required_else_help = true)]
@@ -10,15 +12,12 @@ pub(super) struct Train {
     command: TrainCommand,
 }
 
-#[derive(Debug, clap::Subcommand)]
-enum TrainCommand {
+subcommands! { TrainCommand;
     Check(check::Check),
 }
 
 impl Train {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        match self.command {
-            TrainCommand::Check(command) => command.run(),
-        }
+        self.command.run()
     }
 }

@@ -12,6 +12,7 @@ mod list;
 mod log;
 mod rollback;
 mod sky;
+#[cfg(feature = "eval")]
 mod views;
 
 /// List, generate, check and clean up twins, and manage their versions.
@@ -26,8 +27,8 @@ pub(super) struct Twin {
     subcommand: Subcommand,
 }
 
-#[derive(Debug, clap::Subcommand)]
-enum Subcommand {
+super::subcommands! {
+    Subcommand;
     List(list::List),
     Generate(generate::Generate),
     Log(log::Log),
@@ -36,6 +37,7 @@ enum Subcommand {
     Gc(gc::Gc),
     Fsck(fsck::Fsck),
     Sky(sky::Sky),
+    #[cfg(feature = "eval")]
     Views(Box<views::Views>),
     Geo(geo::Geo),
     Align(align::Align),
@@ -44,19 +46,6 @@ enum Subcommand {
 
 impl Twin {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        match self.subcommand {
-            Subcommand::List(list) => list.run(),
-            Subcommand::Generate(generate) => generate.run(),
-            Subcommand::Log(log) => log.run(),
-            Subcommand::Diff(diff) => diff.run(),
-            Subcommand::Rollback(rollback) => rollback.run(),
-            Subcommand::Gc(gc) => gc.run(),
-            Subcommand::Fsck(fsck) => fsck.run(),
-            Subcommand::Sky(sky) => sky.run(),
-            Subcommand::Views(views) => views.run(),
-            Subcommand::Geo(geo) => geo.run(),
-            Subcommand::Align(align) => align.run(),
-            Subcommand::Drive(drive) => drive.run(),
-        }
+        self.subcommand.run()
     }
 }

@@ -7,6 +7,7 @@ use image::RgbImage;
 use image::imageops::{self, FilterType};
 
 use wildcity_augment::mask_png;
+use wildcity_eval::images::{ImageList, RealImage, camera_names, own_vehicle, picture};
 use wildcity_scene::align::Alignment;
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::manifest::ObjectRef;
@@ -16,8 +17,7 @@ use wildcity_scene::{Manifest, Trajectory};
 use wildcity_twin::store::{Commit, CommitKind, StorageOptions, VersionChange};
 
 use crate::cli::directories::{EditedTwin, Twins};
-use crate::cli::real_images::{ImageList, RealImage, camera_names, own_vehicle, picture};
-use crate::cli::{placement, progress};
+use crate::cli::{file_notes, placement, progress};
 
 use super::change;
 
@@ -118,6 +118,7 @@ impl Views {
                     self.edited.twin.name
                 );
                 let list = ImageList::read(images, self.image_dir.as_deref(), None)?;
+                file_notes::print_warnings(images, &list.warnings)?;
                 let alignment = match &self.axes {
                     Some(axes) => placement::imported(axes, self.scale.unwrap_or(1.0))?,
                     None if list.is_in_scene_axes => Alignment::IDENTITY,

@@ -9,10 +9,13 @@ use std::time::SystemTime;
 
 use tempfile::NamedTempFile;
 
+#[cfg(feature = "mcap")]
 use crate::file::EpisodeFile;
 use crate::limits;
 
-use super::write::{ExportError, Exported, export};
+#[cfg(feature = "mcap")]
+use super::export;
+use super::{ExportError, Exported};
 
 /// Ending of the files of records.
 const ENDING: &str = ".mcap";
@@ -25,10 +28,20 @@ pub fn mcap_path(record: &Path) -> PathBuf {
     record.with_extension("mcap")
 }
 
+/// Exports nothing.
+///
+/// # Errors
+/// Always: it says what to build.
+#[cfg(not(feature = "mcap"))]
+pub fn export_file(_: &Path, _: &Path) -> Result<Exported, ExportError> {
+    Err(ExportError::LeftOut)
+}
+
 /// Exports a record to a file, as [`write_whole`] does.
 ///
 /// # Errors
 /// The record cannot be read or has no frame, or the file cannot be written: no file is left then.
+#[cfg(feature = "mcap")]
 pub fn export_file(record: &Path, mcap: &Path) -> Result<Exported, ExportError> {
     let episode = EpisodeFile::read(record)?;
     let rig = EpisodeFile::rig(record)?;

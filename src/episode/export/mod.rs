@@ -16,15 +16,29 @@
 //! Times are those of the episode plus 1,000 s, because a warm-up has negative times and MCAP does
 //! not allow them.
 
+#[cfg(feature = "mcap")]
 mod calibration;
+#[cfg(feature = "mcap")]
 mod container;
+#[cfg(feature = "mcap")]
 mod convert;
+#[cfg(feature = "mcap")]
 mod descriptors;
+mod error;
 mod file;
+#[cfg(feature = "mcap")]
 mod messages;
+#[cfg(feature = "mcap")]
 mod output;
+#[cfg(feature = "mcap")]
 mod parts;
+#[cfg(feature = "mcap")]
 mod write;
 
+pub use error::{ExportError, Exported};
 pub use file::{export_file, mcap_path, remove_leftovers, write_whole};
-pub use write::{EpisodeExport, ExportError, Exported, ExportedImage, export};
+#[cfg(feature = "mcap")]
+pub use write::{EpisodeExport, ExportedImage, export};
+
+/// Whether this build can write MCAP: it has the feature `mcap`.
+pub const CAN_EXPORT: bool = cfg!(feature = "mcap");

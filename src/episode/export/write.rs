@@ -1,9 +1,8 @@
 //! Writes an episode as MCAP.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::io::{self, Seek, Write};
+use std::io::{Seek, Write};
 use std::iter::Peekable;
-use std::path::PathBuf;
 use std::slice::Iter;
 
 use serde_json::json;
@@ -15,48 +14,11 @@ use wildcity_score::EgoSample;
 use super::calibration::Calibration;
 use super::container::McapFile;
 use super::convert::{camera_frame, color, cube, entity, place, pose, timestamp, transform};
+use super::error::{ExportError, Exported};
 use super::messages as foxglove;
 use super::parts::{command, event_text, motions, odometry, plan};
-use crate::file::{EpisodeFile, Frame, ReadError};
+use crate::file::{EpisodeFile, Frame};
 use crate::lines::{ActorsLine, EventLine, ScenarioLine};
-
-/// Why an episode could not be exported.
-#[derive(Debug, thiserror::Error)]
-pub enum ExportError {
-    /// The record cannot be read.
-    #[error("{0}")]
-    Read(#[from] ReadError),
-    /// The file cannot be written.
-    #[error("cannot write {}: {cause}", path.display())]
-    Io {
-        path: PathBuf,
-        /// The operating system's error.
-        cause: io::Error,
-    },
-    /// The file cannot be written.
-    #[error("cannot write the MCAP file: {0}")]
-    Output(io::Error),
-    /// The file cannot be written.
-    #[error("cannot write the MCAP file: {0}")]
-    Mcap(#[from] mcap::McapError),
-    /// A line cannot be written as JSON.
-    #[error("cannot write a line as JSON: {0}")]
-    Json(#[from] serde_json::Error),
-    /// The images of the episode cannot be made.
-    #[error("{0}")]
-    Images(String),
-    /// The episode has no frame.
-    #[error("the episode has no frame: nothing was driven")]
-    Empty,
-}
-
-/// Result of an export.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Exported {
-    pub messages: u64,
-    /// How far the calibrations are off the lenses at most, in pixels.
-    pub calibration_error_px: f64,
-}
 
 /// An image of an episode.
 #[derive(Clone, Copy, Debug)]

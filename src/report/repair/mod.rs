@@ -24,7 +24,7 @@ pub use below::{Below, BelowError, Gains, RecommendedBelow, recommend_below};
 pub use measure::{RepairBenchmark, RepairSubject, Truth, measure};
 pub use page::section;
 pub use row::{ImageKind, RepairMs, RepairRow, RepairedModel, Sample};
-pub use stations::{FRAME_M, RepairSampling};
+pub use stations::RepairSampling;
 
 use serde::Serialize;
 

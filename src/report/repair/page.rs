@@ -5,7 +5,7 @@ use maud::{Markup, html};
 use super::RepairReport;
 use super::below::{Below, RecommendedBelow};
 use super::row::{ImageKind, RepairRow};
-use super::stations::FRAME_M;
+use wildcity_session::limits::FRAME_M;
 
 /// The section.
 pub fn section(report: &RepairReport) -> Markup {

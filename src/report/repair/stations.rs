@@ -8,11 +8,9 @@ use wildcity_scene::Trajectory;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::{RigCamera, RigError};
 
-use crate::sample_points::mean_speed_m_per_us;
+use wildcity_session::limits::FRAME_M;
 
-/// Distance along the drive between a frame and the previous one, in metres: 8 m/s and ten frames a
-/// second.
-pub const FRAME_M: f64 = 0.8;
+use crate::sample_points::mean_speed_m_per_us;
 
 /// The poses that are measured, and the size of the images.
 #[derive(Clone, Debug, PartialEq, Serialize)]

@@ -1,6 +1,6 @@
 //! The twins in a directory or an object store, and their versions.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 use serde::Deserialize;
@@ -14,9 +14,12 @@ use super::backend::ObjectBackend;
 use super::clock::{Clock, SystemClock};
 use super::disk::Disk;
 use super::layout::is_hash;
-use super::local::{DiskCache, Local, RealDisk};
+use super::local::{Local, RealDisk};
 use super::log::{LogEntry, LogRecord};
-use super::remote::{Remote, RetryPolicy, Traffic};
+use super::object_access::{DiskCacheSettings, Traffic};
+use super::remote::Remote;
+#[cfg(feature = "object-store")]
+use super::remote::RetryPolicy;
 use super::{StoreError, chunk_file};
 
 /// Twins in a directory or an object store.
@@ -24,18 +27,10 @@ use super::{StoreError, chunk_file};
 pub struct Catalog {
     pub(super) objects: Arc<dyn ObjectBackend>,
     pub(super) clock: Arc<dyn Clock>,
+    #[cfg(feature = "object-store")]
     remote: Option<Remote>,
     /// Memory of sections that were evicted, for those that are read next.
     pages: Arc<PagePool>,
-}
-
-/// Where parts of remote twins are cached on the local disk.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct DiskCacheSettings {
-    /// The directory, created if need be. Several processes may share it.
-    pub dir: PathBuf,
-    /// The most that it may hold, in bytes.
-    pub limit_bytes: u64,
 }
 
 /// A twin and its latest version.
@@ -102,7 +97,7 @@ impl Catalog {
         let dir = url.and_then(|url| url.strip_prefix("file://"));
         let catalog = match (url, dir) {
             (_, Some(dir)) => Self::local(Path::new(dir)),
-            (Some(url), None) => Self::remote(Remote::at(url, open_cache(cache)?)?),
+            (Some(url), None) => Self::remote(Remote::at(url, cache)?),
             (None, None) => Self::local(place),
         };
         catalog.remove_abandoned_commits(None)?;
@@ -114,6 +109,7 @@ impl Catalog {
     ///
     /// # Errors
     /// The prefix is invalid, or the cache's directory cannot be created.
+    #[cfg(feature = "object-store")]
     pub fn over(
         store: Arc<dyn object_store::ObjectStore>,
         url: &str,
@@ -121,7 +117,7 @@ impl Catalog {
         cache: Option<&DiskCacheSettings>,
         retry: RetryPolicy,
     ) -> Result<Self, StoreError> {
-        Remote::over(store, url, prefix, open_cache(cache)?, retry).map(Self::remote)
+        Remote::over(store, url, prefix, cache, retry).map(Self::remote)
     }
 
     /// These twins with another clock.
@@ -136,16 +132,32 @@ impl Catalog {
     /// As [`Catalog::open`].
     pub fn on(dir: &Path, disk: Arc<dyn Disk>, clock: Arc<dyn Clock>) -> Result<Self, StoreError> {
         let objects = Arc::new(Local::new(dir, disk));
-        let catalog = Self { objects, clock, remote: None, pages: page_pool() };
+        let catalog = Self::from_local(objects, clock);
         catalog.remove_abandoned_commits(None)?;
         Ok(catalog)
     }
 
     fn local(dir: &Path) -> Self {
         let objects = Arc::new(Local::new(dir, Arc::new(RealDisk)));
-        Self { objects, clock: Arc::new(SystemClock), remote: None, pages: page_pool() }
+        Self::from_local(objects, Arc::new(SystemClock))
     }
 
+    fn from_local(objects: Arc<Local>, clock: Arc<dyn Clock>) -> Self {
+        Self {
+            objects,
+            clock,
+            #[cfg(feature = "object-store")]
+            remote: None,
+            pages: page_pool(),
+        }
+    }
+
+    #[cfg(not(feature = "object-store"))]
+    fn remote(remote: Remote) -> Self {
+        match remote {}
+    }
+
+    #[cfg(feature = "object-store")]
     fn remote(remote: Remote) -> Self {
         let objects = Arc::new(remote.clone());
         Self { objects, clock: Arc::new(SystemClock), remote: Some(remote), pages: page_pool() }
@@ -153,13 +165,21 @@ impl Catalog {
 
     /// These twins, read without the disk cache.
     pub(super) fn uncached(&self) -> Self {
+        #[cfg(feature = "object-store")]
+        if let Some(remote) = &self.remote {
+            return Self::remote(remote.uncached());
+        }
         // A directory has no cache.
-        self.remote.as_ref().map_or_else(|| self.clone(), |remote| Self::remote(remote.uncached()))
+        self.clone()
     }
 
     /// Counts of requests to the object store since it was opened; `None` for a directory.
     pub fn traffic(&self) -> Option<Traffic> {
-        self.remote.as_ref().map(Remote::traffic)
+        #[cfg(feature = "object-store")]
+        if let Some(remote) = &self.remote {
+            return Some(remote.traffic());
+        }
+        None
     }
 
     /// The directory, or the URL.
@@ -400,10 +420,4 @@ pub(super) fn check_name(name: &str) -> Result<(), StoreError> {
 
 fn page_pool() -> Arc<PagePool> {
     Arc::new(PagePool::new(limits::FREE_PAGES_BYTES))
-}
-
-fn open_cache(cache: Option<&DiskCacheSettings>) -> Result<Option<DiskCache>, StoreError> {
-    cache
-        .map(|DiskCacheSettings { dir, limit_bytes }| DiskCache::open(dir, *limit_bytes))
-        .transpose()
 }

@@ -66,15 +66,20 @@ mod lease;
 mod local;
 mod log;
 mod new_version;
+mod object_access;
 mod pack;
 mod recover;
+#[cfg(feature = "object-store")]
+mod remote;
+#[cfg(not(feature = "object-store"))]
+#[path = "no_remote.rs"]
 mod remote;
 mod settings;
 mod sky;
 mod views;
 
 pub use actors::{ActorList, AddedActor, DamagedActor, SameName, StoredActor, StoredLevel};
-pub use catalog::{Catalog, DamagedTwin, DiskCacheSettings, TwinList, TwinListing, Version};
+pub use catalog::{Catalog, DamagedTwin, TwinList, TwinListing, Version};
 pub use commit::{Commit, StoredCells};
 pub use cut::{CUT_ABOVE_M, Cut, CutPlace};
 pub use density::check_density;
@@ -87,7 +92,9 @@ pub use lease::Lease;
 pub use local::{RealDisk, create_dirs};
 pub use log::{CommitKind, LogEntry};
 pub use new_version::NewVersion;
+pub use object_access::{DiskCacheSettings, Traffic};
 pub use pack::StorageOptions;
-pub use remote::{RetryPolicy, Traffic};
+#[cfg(feature = "object-store")]
+pub use remote::RetryPolicy;
 pub use settings::{VersionChange, VersionSettings};
 pub use sky::{NewSky, SkyBytes};

@@ -56,8 +56,8 @@ def binary() -> Path:
     found = shutil.which("wildcity")
     if found is None:
         raise ServeFailed(
-            "there is no program wildcity: install a wheel that has it, or build it with `cargo install --path .`, "
-            "or set WILDCITY_BIN"
+            "there is no program wildcity: install a wheel that has it, or build it with "
+            "`cargo install --path . --features full`, or set WILDCITY_BIN"
         )
     return Path(found)
 

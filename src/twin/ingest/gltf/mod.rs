@@ -12,10 +12,16 @@
 mod accessor;
 mod document;
 mod instances;
+#[cfg(feature = "mesh")]
 mod material;
+#[cfg(feature = "mesh")]
+mod mesh;
+#[cfg(not(feature = "mesh"))]
+#[path = "no_mesh.rs"]
 mod mesh;
 mod skipped;
 mod splat_settings;
+#[cfg(feature = "mesh")]
 mod triangle;
 mod uris;
 

@@ -1,6 +1,7 @@
 //! Twins in a directory. In the store, only this folder opens files.
 
 mod directory;
+#[cfg(feature = "object-store")]
 mod disk_cache;
 mod files;
 mod real_disk;
@@ -24,6 +25,7 @@ use super::layout::{
 };
 
 pub(super) use directory::Local;
+#[cfg(feature = "object-store")]
 pub(super) use disk_cache::DiskCache;
 pub use files::create_dirs;
 pub use real_disk::RealDisk;

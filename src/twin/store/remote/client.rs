@@ -12,8 +12,9 @@ use crate::limits;
 use crate::store::StoreError;
 use crate::store::layout::check_hash;
 use crate::store::local::DiskCache;
+use crate::store::object_access::{DiskCacheSettings, Traffic};
 
-use super::retry::{RequestCounter, RequestRunner, RetryPolicy, Traffic};
+use super::retry::{RequestCounter, RequestRunner, RetryPolicy};
 use super::url;
 
 /// The twins below a prefix of an object store.
@@ -32,7 +33,10 @@ impl Remote {
     ///
     /// # Errors
     /// [`StoreError::Url`] describes the error in the URL or the credentials.
-    pub(in crate::store) fn at(url: &str, cache: Option<DiskCache>) -> Result<Self, StoreError> {
+    pub(in crate::store) fn at(
+        url: &str,
+        cache: Option<&DiskCacheSettings>,
+    ) -> Result<Self, StoreError> {
         let (store, prefix) = url::open(url)?;
         Self::over(store, url, prefix.as_ref(), cache, RetryPolicy::default())
     }
@@ -42,11 +46,13 @@ impl Remote {
         store: Arc<dyn ObjectStore>,
         root: &str,
         prefix: &str,
-        cache: Option<DiskCache>,
+        cache: Option<&DiskCacheSettings>,
         retry: RetryPolicy,
     ) -> Result<Self, StoreError> {
         let prefix = Key::parse(prefix)
             .map_err(|error| StoreError::Url { url: root.to_owned(), reason: error.to_string() })?;
+        let open = |cache: &DiskCacheSettings| DiskCache::open(&cache.dir, cache.limit_bytes);
+        let cache = cache.map(open).transpose()?;
         let root = PathBuf::from(root);
         let runner =
             RequestRunner::new(retry).map_err(StoreError::io("start threads for", &root))?;

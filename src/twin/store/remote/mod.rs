@@ -27,7 +27,7 @@ use super::disk::Lock;
 use super::layout::{LOG, OBJECTS, check_side_file, is_hash, log_numbers, object_key, record_key};
 
 pub(super) use client::Remote;
-pub use retry::{RetryPolicy, Traffic};
+pub use retry::RetryPolicy;
 
 use staging::RemoteStaging;
 

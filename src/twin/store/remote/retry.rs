@@ -12,6 +12,7 @@ use std::time::Duration;
 use tokio::runtime::{Builder, Runtime};
 
 use crate::limits;
+use crate::store::object_access::Traffic;
 
 /// Time-outs, retries and threads of requests to an object store.
 #[derive(Clone, Copy, Debug)]
@@ -50,21 +51,6 @@ impl Default for RetryPolicy {
             threads: limits::REMOTE_THREADS,
         }
     }
-}
-
-/// Counts of requests to a store since it was opened.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Traffic {
-    /// Requests; each attempt counts.
-    pub requests: u64,
-    /// Attempts after a request's first.
-    pub retries: u64,
-    /// Requests that failed after the last attempt. An object that does not exist is not a failure.
-    pub failures: u64,
-    /// Parts that were found in the disk cache.
-    pub cache_hits: u64,
-    /// Parts that were not.
-    pub cache_misses: u64,
 }
 
 /// A counter of [`Traffic`], as an index.

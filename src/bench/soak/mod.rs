@@ -1,0 +1,265 @@
+//! `wildcity-bench soak`.
+
+mod agent;
+mod memory;
+mod others;
+
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use anyhow::Context as _;
+use tokio::task::JoinSet;
+
+use wildcity_client::Pose as WirePose;
+use wildcity_scene::Trajectory;
+use wildcity_server::Running;
+use wildcity_twin::store::Catalog;
+
+use self::agent::{Agent, Driven};
+use self::memory::Memory;
+use self::others::Pusher;
+use super::benched_twin::BenchedTwin;
+use super::memory::{mib, rss_bytes};
+use wildcity::cli::exit::Exit;
+
+/// Drive many sessions of small cameras against a server for minutes or hours, and check that
+/// memory does not grow and images do not change.
+///
+/// The server runs in this process. The twin needs a recorded drive: each session drives the same
+/// stretch of the first one again and again, and compares the hash of every image with that of its
+/// first round. Prints the memory of the process every minute. The exit code is 1 if a request
+/// fails, a hash changes, or memory grows by more than --growth. Growth is the largest median of a
+/// later sixth of the time, compared with the median of the first sixth. With --memory-gib below
+/// what the twin needs, the server evicts and loads all the time.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = EXAMPLES)]
+pub(super) struct Soak {
+    #[command(flatten)]
+    twin: BenchedTwin,
+
+    /// Duration, in minutes.
+    #[arg(long, value_name = "N", default_value_t = 60.0, value_parser = minutes)]
+    minutes: f64,
+
+    /// Number of sessions at a time.
+    #[arg(long, value_name = "K", default_value_t = 16, value_parser = clap::value_parser!(u32).range(1..=256))]
+    sessions: u32,
+
+    /// Steps of a session before it is closed and opened again.
+    #[arg(long, value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    steps: u32,
+
+    /// Push new versions to a copy of the twin and collect garbage, send damaged requests, and open
+    /// sessions that do not read their images, all at the same time.
+    #[arg(long)]
+    mixed: bool,
+
+    /// Largest growth of the memory that is accepted, in per cent.
+    #[arg(long, value_name = "PERCENT", default_value_t = 2.0)]
+    growth: f64,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity-bench soak street
+  wildcity-bench soak street --minutes 2 --sessions 4 --memory-gib 0.1
+  wildcity-bench soak street --minutes 30 --mixed";
+
+/// Time between two lines.
+const LINE_EVERY: Duration = Duration::from_secs(60);
+
+/// Sessions beyond those of the agents: clients that do not read leave theirs to be resumed.
+const OTHER_SESSIONS: usize = 64;
+
+/// The drive of all sessions.
+struct Driving {
+    /// The directory or URL of twins.
+    twins: PathBuf,
+    /// The version that all sessions have.
+    version: u64,
+    route: Trajectory,
+    /// Time at which it ends.
+    until: Instant,
+}
+
+/// Counts of the other load in a mixed soak.
+struct Others {
+    pushes: u64,
+    damaged: u64,
+    unread: u64,
+}
+
+impl Soak {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        let name = &self.twin.twin.name;
+        let version = self.twin.twins.catalog()?.version(name, self.twin.twin.number)?;
+        let Some(route) = version.manifest.trajectories.first().cloned() else {
+            anyhow::bail!("twin {name:?} has no recorded drive to follow");
+        };
+        // Records, scenarios, uploads and the copied twin of this run only.
+        let scratch = tempfile::tempdir()?;
+        let mut twins = self.twin.twins.dir()?;
+        if self.mixed {
+            let copies = scratch.path().join("twins");
+            others::copy_twin(&twins, &copies, name)?;
+            twins = copies;
+        }
+        let mut config = self.twin.server(twins.clone(), scratch.path())?;
+        config.mcap = false;
+        config.limits.sessions =
+            config.limits.sessions.max(self.sessions as usize + OTHER_SESSIONS);
+        let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
+        let result = runtime.block_on(async {
+            let running = wildcity_server::start(config).await?;
+            let until = Instant::now() + self.length();
+            let driving = Driving { twins, version: version.number, route, until };
+            let result = self.soak(&running, &driving, scratch.path()).await;
+            running.stop().await;
+            result
+        });
+        runtime.shutdown_timeout(wildcity::cli::limits::SHUTDOWN_TIMEOUT);
+        result
+    }
+
+    fn length(&self) -> Duration {
+        Duration::from_secs_f64(60.0 * self.minutes)
+    }
+
+    async fn soak(
+        &self,
+        running: &Running,
+        driving: &Driving,
+        scratch: &Path,
+    ) -> anyhow::Result<()> {
+        let mut sessions = JoinSet::new();
+        for number in 0..self.sessions {
+            let agent = Agent {
+                url: running.url(),
+                twin: self.twin.twin.name.clone(),
+                version: driving.version,
+                route: driving.route.clone(),
+                number,
+                steps: self.steps,
+                until: driving.until,
+            };
+            sessions.spawn(agent.drive());
+        }
+        let driven = async {
+            let mut total = Driven::default();
+            while let Some(driven) = sessions.join_next().await {
+                let driven = driven.context("a session crashed")??;
+                total.steps += driven.steps;
+                total.rounds += driven.rounds;
+            }
+            anyhow::Ok(total)
+        };
+        let others = async {
+            if self.mixed {
+                self.others(running, driving, scratch).await.map(Some)
+            } else {
+                Ok(None)
+            }
+        };
+        let watched = self.watch(driving.until);
+        let (driven, others, memory) = tokio::try_join!(driven, others, watched)?;
+        self.judge(&driven, others.as_ref(), &memory)
+    }
+
+    /// Disturbs the server until the end.
+    async fn others(
+        &self,
+        running: &Running,
+        driving: &Driving,
+        scratch: &Path,
+    ) -> anyhow::Result<Others> {
+        let twin = &self.twin.twin.name;
+        // Otherwise garbage collection could remove the version while all agents change rounds.
+        let catalog = Catalog::open(&driving.twins)?;
+        let _lease = catalog.lease(twin, driving.version, "wildcity-bench soak", self.length())?;
+        let start = driving.route.at_station(0.0);
+        let pusher = Pusher {
+            url: format!("http://{}", running.address()),
+            catalog,
+            twin: twin.clone(),
+            at_m: start.position_m,
+            scratch: scratch.to_owned(),
+            until: driving.until,
+        };
+        let pose = WirePose { xyz: start.position_m.to_array(), q: start.q_wxyz() };
+        let unread =
+            others::leave_unread(running.url(), twin.clone(), driving.version, pose, driving.until);
+        let damaged = others::send_damaged(running.address(), driving.until);
+        let (pushes, damaged, unread) = tokio::try_join!(pusher.run(), damaged, unread)?;
+        Ok(Others { pushes, damaged, unread })
+    }
+
+    /// Measures the memory every second until the end, and prints it every minute.
+    async fn watch(&self, until: Instant) -> anyhow::Result<Memory> {
+        let begun = Instant::now();
+        let mut out = io::stdout();
+        let mut memory = Memory::default();
+        let mut next_line = begun;
+        let mut tick = tokio::time::interval(Duration::from_secs(1));
+        while Instant::now() < until {
+            tick.tick().await;
+            let bytes = rss_bytes()?.now;
+            let elapsed = begun.elapsed();
+            memory.add(elapsed.div_duration_f64(self.length()), bytes);
+            if Instant::now() >= next_line {
+                next_line += LINE_EVERY;
+                let minutes = elapsed.as_secs_f64() / 60.0;
+                writeln!(out, "{minutes:>6.1} min  {:>8.1} MiB", mib(bytes))?;
+            }
+        }
+        Ok(memory)
+    }
+
+    /// Prints the counts.
+    ///
+    /// # Errors
+    /// The memory grew by more than is accepted.
+    fn judge(
+        &self,
+        driven: &Driven,
+        others: Option<&Others>,
+        memory: &Memory,
+    ) -> anyhow::Result<()> {
+        let mut out = io::stdout();
+        if let Some(Others { pushes, damaged, unread }) = others {
+            writeln!(
+                out,
+                "{pushes} pushes, each with garbage collection; {damaged} damaged requests; {unread} clients that did \
+                 not read"
+            )?;
+        }
+        let memory = memory
+            .growth()
+            .context("the soak was too short to compare memory: give more --minutes")?;
+        let growth = memory.percent();
+        writeln!(
+            out,
+            "{} steps in {} rounds of {} sessions, every image as in its first round; memory {:.1} MiB in the first \
+             sixth of the time, at most {:.1} MiB in a later one ({growth:+.2} %), medians; {:.1} MiB at most",
+            driven.steps,
+            driven.rounds,
+            self.sessions,
+            mib(memory.first),
+            mib(memory.later),
+            mib(memory.most),
+        )?;
+        if growth > self.growth {
+            let message =
+                format!("memory grew by {growth:.2} %, and {} % is accepted", self.growth);
+            return Err(Exit::finding(1, message).into());
+        }
+        Ok(())
+    }
+}
+
+fn minutes(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(minutes) if minutes > 0.0 && minutes <= 100_000.0 => Ok(minutes),
+        _ => Err("expected minutes above 0, at most 100000".to_owned()),
+    }
+}

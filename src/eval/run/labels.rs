@@ -1,0 +1,142 @@
+//! Boxes and LiDAR points: labels of images from a driving log.
+
+use std::path::Path;
+
+use anyhow::{Context, ensure};
+
+use crate::{
+    Boxes, BoxesSubject, DepthMap, GROWN_PX, LidarDepth, LidarPoints, LidarSubject, MovingBox,
+    WorldPoints, hide,
+};
+use wildcity_render::View;
+use wildcity_scene::align::Alignment;
+use wildcity_scene::trajectory::Keyframe;
+use wildcity_session::{OpenScene, RenderedImage};
+use wildcity_twin::ingest;
+
+use super::Settings;
+use crate::images::RealImage;
+
+/// Largest file of boxes or LiDAR points. An hour of a LiDAR with 64 rows has 20 GB: give some
+/// minutes of it.
+const LABEL_BYTES: u64 = 4 << 30;
+
+/// The labels of the images.
+pub(super) struct Labels {
+    boxes: Option<Boxes>,
+    lidar: Option<WorldPoints>,
+    window_us: i64,
+    pub(super) boxes_subject: Option<BoxesSubject>,
+    pub(super) lidar_subject: Option<LidarSubject>,
+}
+
+impl Labels {
+    /// Reads the files.
+    pub(super) fn load(
+        settings: &Settings,
+        source: &OpenScene,
+        alignment: &Alignment,
+        images: &[&RealImage],
+    ) -> anyhow::Result<Self> {
+        for (option, file) in [("--boxes", &settings.boxes), ("--lidar", &settings.lidar)] {
+            let untimed = images.iter().find(|image| image.time_us.is_none());
+            if let (Some(_), Some(image)) = (file, untimed) {
+                anyhow::bail!(
+                    "{option}: image {} has no time: give \"time_us\" in transforms.json or in the camera list, in the \
+                     clock of this file",
+                    image.name
+                );
+            }
+        }
+        let mut labels = Self {
+            boxes: None,
+            lidar: None,
+            window_us: (settings.lidar_window_s * 1e6).round() as i64,
+            boxes_subject: None,
+            lidar_subject: None,
+        };
+        if let Some(path) = &settings.boxes {
+            let boxes = read_boxes(path).with_context(|| format!("--boxes {}", path.display()))?;
+            let file = path.display().to_string();
+            labels.boxes_subject = Some(BoxesSubject { file, tracks: boxes.tracks() });
+            labels.boxes = Some(boxes.aligned(alignment));
+        }
+        if let Some(path) = &settings.lidar {
+            let about = || format!("--lidar {}", path.display());
+            let points = read_lidar(path, source, alignment).with_context(about)?;
+            labels.lidar_subject = Some(LidarSubject {
+                file: path.display().to_string(),
+                points: points.points_m.len(),
+                left_out: points.skipped,
+            });
+            labels.lidar = Some(points);
+        }
+        Ok(labels)
+    }
+
+    /// Masks moving objects in an image. Returns the pixels that count, and the share that is
+    /// masked; `None` without boxes.
+    pub(super) fn hide(
+        &self,
+        image: &RealImage,
+        view: &View,
+        alignment: &Alignment,
+    ) -> Option<(Vec<bool>, f64)> {
+        let (boxes, time_us) = self.boxes.as_ref().zip(image.time_us)?;
+        let mut counts = vec![true; view.camera.pixels()];
+        let size_px = [view.camera.width_px, view.camera.height_px];
+        let world_from_camera = alignment.pose(&image.world_from_camera);
+        let moving: Vec<MovingBox> = boxes.moving_at(time_us);
+        for one in moving {
+            let hull_px = one.hull_px(&view.camera, &world_from_camera);
+            hide(&hull_px, size_px, GROWN_PX, &mut counts);
+        }
+        let hidden = counts.iter().filter(|counts| !**counts).count();
+        let share = hidden as f64 / counts.len() as f64;
+        Some((counts, share))
+    }
+
+    /// Compares the depth of an image; `None` without LiDAR.
+    pub(super) fn depth(
+        &self,
+        image: &RealImage,
+        view: &View,
+        rendered: &RenderedImage,
+        counts: Option<&[bool]>,
+    ) -> Option<LidarDepth> {
+        let (lidar, time_us) = self.lidar.as_ref().zip(image.time_us)?;
+        let from_us = time_us.saturating_sub(self.window_us);
+        let to_us = time_us.saturating_add(self.window_us);
+        let map = DepthMap {
+            camera: &view.camera,
+            world_from_camera: &view.world_from_camera,
+            depth_m: &rendered.depth_m,
+            opacity: &rendered.opacity,
+            counts,
+        };
+        Some(LidarDepth::compare(lidar.between_us(from_us, to_us), &map))
+    }
+}
+
+fn read_boxes(path: &Path) -> anyhow::Result<Boxes> {
+    let bytes = ingest::read_whole(path, LABEL_BYTES)?;
+    let text = std::str::from_utf8(&bytes).context("the file is not UTF-8 text")?;
+    Ok(Boxes::parse(text)?)
+}
+
+fn read_lidar(
+    path: &Path,
+    source: &OpenScene,
+    alignment: &Alignment,
+) -> anyhow::Result<WorldPoints> {
+    let points = LidarPoints::parse(&ingest::read_whole(path, LABEL_BYTES)?)?;
+    let drives = source.version().map(|version| &version.manifest.trajectories);
+    let drive = drives.and_then(|drives| drives.first()).map(|drive| &drive.keyframes[..]);
+    let world = points.in_world(alignment, drive.map(|keys: &[Keyframe]| keys))?;
+    ensure!(
+        !world.points_m.is_empty(),
+        "none of the {} points has a time between two poses at most 0.2 s apart: points, poses and images need one clock",
+        points.len()
+    );
+    Ok(world)
+}
