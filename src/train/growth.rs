@@ -64,7 +64,7 @@ pub(crate) fn relocate_and_grow(model: &mut Model, growth: &Growth, seed: u64) -
 fn shared(opacity: f64, n: usize, least_opacity: f64) -> [f64; 2] {
     // At 1 the root would be 1, and each copy as opaque as the one.
     let before = opacity.min(1.0 - 1.2e-7);
-    let each = (1.0 - (1.0 - before).powf(1.0 / n as f64)).clamp(least_opacity, 1.0 - 1.2e-7);
+    let each = 1.0 - (1.0 - before).powf(1.0 / n as f64);
     let mut sum = 0.0;
     for i in 1..=n {
         let mut binomial = 1.0;
@@ -74,7 +74,8 @@ fn shared(opacity: f64, n: usize, least_opacity: f64) -> [f64; 2] {
             binomial *= (i - 1 - k) as f64 / (k + 1) as f64;
         }
     }
-    [each, before / sum]
+    // The scale belongs to the opacity before it is raised to the least, as in their code.
+    [each.max(least_opacity), before / sum]
 }
 
 #[cfg(test)]

@@ -6,7 +6,8 @@
 //! **What no view of a step shows costs nothing:** a group without a visible Gaussian is not
 //! touched (gsplat's selective Adam).
 //!
-//! A Gaussian takes four times its columns: at degree 1 368 B, and 92 B of gradients.
+//! A Gaussian takes four times its columns: at degree 1 368 B, and 92 B of gradients. While the
+//! number grows, another 184 B for the old chunk and the new one.
 
 use glam::{DVec3, Quat, Vec3};
 use wildcity_render::gradient::ChunkGradients;
@@ -15,6 +16,8 @@ use wildcity_scene::random::{mix, to_unit};
 use wildcity_scene::{Chunk, Gaussians, LanePages, Scene, sh};
 
 use std::sync::Arc;
+use std::sync::atomic::AtomicUsize;
+use std::sync::atomic::Ordering::Relaxed;
 
 use crate::settings::Settings;
 
@@ -69,8 +72,9 @@ struct ClusterState<'a> {
 }
 
 impl Model {
-    /// Gaussians to begin with, in the degree of the settings.
-    pub fn new(mut gaussians: Gaussians, sh_degree: u8) -> Self {
+    /// Gaussians to begin with, in the degree of the settings or in their own, if it is higher.
+    /// Their values have been checked ([`wildcity_scene::validate`]).
+    pub(crate) fn new(mut gaussians: Gaussians, sh_degree: u8) -> Self {
         gaussians.raise_sh_degree(sh_degree);
         let count = gaussians.len();
         let mut sum = DVec3::ZERO;
@@ -92,7 +96,10 @@ impl Model {
             let mean_m = DVec3::from_array(gaussians.means_m[i]) - origin_m;
             model.set(i, column::MEAN, &mean_m.as_vec3().to_array());
             model.set(i, LN_SCALE, &gaussians.ln_scales[i]);
-            model.set(i, column::QUAT, &gaussians.quats_wxyz[i]);
+            // In f64: squares of an f32 near its limits overflow or vanish in f32.
+            let quat = gaussians.quats_wxyz[i].map(f64::from);
+            let length = quat.iter().map(|q| q * q).sum::<f64>().sqrt();
+            model.set(i, column::QUAT, &quat.map(|q| (q / length) as f32));
             model.set(i, LOGIT, &[gaussians.logit_opacities[i]]);
             model.set(i, column::SH, gaussians.sh_at(i));
         }
@@ -131,8 +138,15 @@ impl Model {
         gaussians
     }
 
-    /// Moves the visible Gaussians by their derivatives.
-    pub(crate) fn step(&mut self, gradients: &ChunkGradients, adam: &AdamStep) {
+    /// The degree of the spherical harmonics.
+    pub fn sh_degree(&self) -> u8 {
+        self.sh_degree
+    }
+
+    /// Moves the visible Gaussians by their derivatives. Returns the index of a Gaussian with a
+    /// derivative that is not finite; the Gaussians of its lane group stay as they are.
+    pub(crate) fn step(&mut self, gradients: &ChunkGradients, adam: &AdamStep) -> Option<usize> {
+        let faulty = AtomicUsize::new(usize::MAX);
         let width = columns(self.sh_degree);
         let of_cluster = CLUSTER / LANES * width;
         let [first, second] = &mut self.moments;
@@ -148,25 +162,30 @@ impl Model {
                 second,
             })
             .collect();
-        // The only reference, since the scene is lent only while this is borrowed.
-        let Some(chunk) = self.scene.chunks.first_mut().map(Arc::make_mut) else { return };
+        // In place, unless a caller has kept a reference to the chunk: then this is a copy.
+        let chunk = self.scene.chunks.first_mut().map(Arc::make_mut)?;
         chunk.rewrite(states, |state, lanes| {
             let mut changes = false;
             for group in 0..state.values.len() / width {
                 let Some((by, visible)) = gradients.lane_group(state.first_group + group) else {
                     continue;
                 };
+                let first_index = (state.first_group + group) * LANES;
+                if let Some(lane) = not_finite(by, visible) {
+                    faulty.fetch_min(first_index + lane, Relaxed);
+                    continue;
+                }
                 changes = true;
                 let range = group * width..(group + 1) * width;
                 let values = &mut state.values[range.clone()];
                 let moments = [&mut state.first[range.clone()], &mut state.second[range.clone()]];
                 adam.apply(values, moments, by, visible);
-                let first_index = (state.first_group + group) * LANES;
                 adam.add_noise(values, visible, first_index);
                 activate(values, &mut lanes[range]);
             }
             changes
         });
+        Some(faulty.into_inner()).filter(|&index| index != usize::MAX)
     }
 
     /// Takes some Gaussians anew: `to[k]` becomes a copy of `sources[k]`, new ones are appended,
@@ -291,8 +310,9 @@ impl AdamStep {
         raw
     }
 
-    /// Moves visible Gaussians that are nearly transparent at random, along their own shape: those
-    /// that show nothing must find a place where they do.
+    /// Moves visible Gaussians that are nearly transparent at random, along their own shape, so
+    /// that they find a place where they show something. (Its authors move all, visible or not.
+    /// Those that no view shows any more become transparent by no derivative either, and stay.)
     fn add_noise(&self, values: &mut [Lanes], visible: u16, first_index: usize) {
         if self.noise == 0.0 {
             return;
@@ -314,6 +334,13 @@ impl AdamStep {
             }
         }
     }
+}
+
+/// The first visible lane with a derivative that is not finite, or whose square is not.
+fn not_finite(by: &[Lanes], visible: u16) -> Option<usize> {
+    let is_finite =
+        |lane: usize| by.iter().all(|lanes| (lanes.0[lane] * lanes.0[lane]).is_finite());
+    (0..LANES).find(|&lane| visible >> lane & 1 == 1 && !is_finite(lane))
 }
 
 /// Columns at the largest degree.
@@ -358,8 +385,7 @@ fn sigmoid(logit: f32) -> f32 {
 }
 
 /// The settings' learning rates, column by column.
-pub(crate) fn rates(settings: &Settings, mean: f32, sh_degree: u8) -> Vec<f32> {
-    let all = columns(settings.sh_degree);
+pub(crate) fn rates(settings: &Settings, mean: f32, sh_degree: u8, all: usize) -> Vec<f32> {
     let trained = columns(sh_degree);
     let rate = |column: usize| match column {
         column::MEAN..LN_SCALE => mean,
@@ -368,7 +394,7 @@ pub(crate) fn rates(settings: &Settings, mean: f32, sh_degree: u8) -> Vec<f32> {
         LOGIT => settings.rates.logit,
         // The constant coefficient, of three colours.
         11..14 => settings.rates.sh,
-        // Degrees that are not trained yet stay 0.
+        // Degrees that are not trained yet stay as they are.
         column if column < trained => settings.rates.sh_rest,
         _ => 0.0,
     };

@@ -2,7 +2,9 @@
 
 use wildcity_render::gradient::{Differentiate, GaussianImages, GradientError, Gradients};
 use wildcity_render::{Frame, View};
+use wildcity_scene::chunk::columns;
 use wildcity_scene::random::mix;
+use wildcity_scene::validate::{self, BadGaussians, Field};
 use wildcity_scene::{Gaussians, RenderProfile};
 
 use crate::compose::{Background, Exposure, compose, compose_gradient};
@@ -56,6 +58,17 @@ pub enum TrainError {
     /// No Gaussian to begin with.
     #[error("there are no points to begin with: give a cloud of points, or a scene to refine")]
     Empty,
+    /// Values that no scene may have.
+    #[error("Gaussians to begin with: {0}")]
+    Invalid(#[from] BadGaussians),
+    /// A derivative that f32 does not hold: the run cannot go on from here.
+    #[error("step {step}: a derivative by Gaussian {gaussian} is not finite")]
+    NotFinite { step: usize, gaussian: usize },
+    /// A colour, weight or depth that counts and is no number of its range.
+    #[error(
+        "value {index} of the {image} is {value}; colours are finite, weights and depths not below 0"
+    )]
+    Value { image: &'static str, index: usize, value: f32 },
     /// An image of another size than its camera's.
     #[error("the {image} has {given} values, and the camera's size asks for {wanted}")]
     Size { image: &'static str, given: usize, wanted: usize },
@@ -75,6 +88,7 @@ impl Trainer {
         if gaussians.means_m.is_empty() {
             return Err(TrainError::Empty);
         }
+        validate::check(&gaussians, &Field::plain_name)?;
         let model = Model::new(gaussians, settings.sh_degree);
         Ok(Self { settings, profile, model, gradients: Gradients::default(), step: 0 })
     }
@@ -90,8 +104,11 @@ impl Trainer {
     }
 
     /// The place of the image of the next step among `count` of them: every image once, in a random
-    /// order, then every image again.
+    /// order, then every image again. 0 if there is none.
     pub fn next_image(&self, count: usize) -> usize {
+        if count == 0 {
+            return 0;
+        }
         let round = (self.step / count) as u64;
         let mut order: Vec<usize> = (0..count).collect();
         order.sort_by_key(|&image| mix(self.settings.seed ^ mix(round << 32 ^ image as u64)));
@@ -122,8 +139,10 @@ impl Trainer {
 
         self.step += 1;
         let adam = self.adam_step();
-        if let Some(gradients) = self.gradients.chunks.first() {
-            self.model.step(gradients, &adam);
+        if let Some(gradients) = self.gradients.chunks.first()
+            && let Some(gaussian) = self.model.step(gradients, &adam)
+        {
+            return Err(TrainError::NotFinite { step: self.step, gaussian });
         }
         self.grow();
         Ok(report)
@@ -137,7 +156,7 @@ impl Trainer {
         let degree = (12 * self.step / steps).min(self.settings.sh_degree.into()) as u8;
         let count = self.model.len() as f32;
         AdamStep {
-            rates: rates(&self.settings, mean, degree),
+            rates: rates(&self.settings, mean, degree, columns(self.model.sh_degree())),
             corrections: [0.9_f32, 0.999].map(|decay| 1.0 - decay.powi(self.step as i32)),
             regularisers: [loss.opacity / count, loss.scale / (3.0 * count)],
             noise: growth.noise * mean,
@@ -171,7 +190,19 @@ impl Sample<'_> {
                 return Err(TrainError::Size { image, given, wanted });
             }
         }
-        Ok(())
+        // Written so that a NaN is out of every range.
+        let out_of_range = |values: &[f32]| values.iter().position(|&value| !(value >= 0.0));
+        for (image, values) in [("mask", self.weights), ("depth", self.depth_m)] {
+            if let Some((values, index)) = values.and_then(|v| Some((v, out_of_range(v)?))) {
+                return Err(TrainError::Value { image, index, value: values[index] });
+            }
+        }
+        let counts = |index: usize| self.weights.is_none_or(|weights| weights[index / 3] > 0.0);
+        let is_fault = |index: &usize| !self.rgb[*index].is_finite() && counts(*index);
+        match (0..self.rgb.len()).find(is_fault) {
+            Some(index) => Err(TrainError::Value { image: "image", index, value: self.rgb[index] }),
+            None => Ok(()),
+        }
     }
 }
 

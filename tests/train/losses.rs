@@ -73,6 +73,28 @@ fn losses_of_colours() {
 }
 
 #[test]
+fn bright_and_flat_images_have_a_similarity() {
+    for level in [1.0_f32, 100.0, 1e4] {
+        let flat = vec![level; 3 * PIXELS];
+        let loss = dssim(SIZE_PX, &flat, &flat);
+        assert!((0.0..0.1).contains(&loss.value.abs()), "{level}: {}", loss.value);
+        assert!(loss.by.iter().all(|by| by.is_finite()), "{level}");
+    }
+}
+
+#[test]
+fn a_pixel_without_weight_may_hold_anything() {
+    let mut image = numbers(3 * PIXELS, 1, 0.0, 1.0);
+    let target = numbers(3 * PIXELS, 2, 0.0, 1.0);
+    let mut weights = vec![1.0; PIXELS];
+    weights[4] = 0.0;
+    let before = l1(&image, &target, Some(&weights));
+    image[13] = f64::NAN;
+    assert_eq!(l1(&image, &target, Some(&weights)), before);
+    assert!(masked(&image, &weights).iter().all(|value| value.is_finite()));
+}
+
+#[test]
 fn images_smaller_than_a_window_have_a_similarity() {
     for size_px in [[1, 1], [3, 2], [2, 12]] {
         let values = 3 * size_px[0] * size_px[1];

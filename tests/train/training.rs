@@ -98,3 +98,72 @@ fn a_run_is_the_same_at_any_number_of_threads() {
         assert!(one == other, "{threads} threads");
     }
 }
+
+#[test]
+fn what_a_run_cannot_use_is_named() {
+    let (gaussians, views) = wall();
+    let faults = [
+        ("steps", Settings { steps: 0, ..Settings::default() }),
+        ("sh_degree", Settings { sh_degree: 4, ..Settings::default() }),
+        ("growth.least_opacity", with_growth(|growth| growth.least_opacity = f32::NAN)),
+        ("growth.from", with_growth(|growth| growth.from = 26_000)),
+        ("growth.until", with_growth(|growth| growth.until = 30_001)),
+        ("growth.noise", with_growth(|growth| growth.noise = -1.0)),
+        ("growth.rate", with_growth(|growth| growth.rate = 1.5)),
+    ];
+    for (field, settings) in faults {
+        let error = settings.check().expect_err(field).to_string();
+        assert!(error.starts_with(field), "{error}");
+    }
+    let run = |gaussians| Trainer::new(gaussians, RenderProfile::default(), Settings::default());
+    let empty = run(Gaussians::default()).expect_err("nothing").to_string();
+    assert!(empty.contains("no points"), "{empty}");
+    let mut invalid = gaussians.clone();
+    invalid.means_m[7][1] = f64::NAN;
+    let invalid = run(invalid).expect_err("a NaN").to_string();
+    assert!(invalid.contains("position[1]"), "{invalid}");
+
+    let cpu = Cpu::new(1, Simd::Best).unwrap();
+    let mut trainer = run(gaussians).unwrap();
+    let mut rgb = vec![0.5; 3 * 80 * 60];
+    rgb[33] = f32::NAN;
+    let mut weights = vec![1.0; 80 * 60];
+    let step = |trainer: &mut Trainer, rgb: &[f32], weights: &[f32]| {
+        let background = [0.0; 3];
+        let weights = Some(weights);
+        trainer.step(&cpu, &Sample { view: views[0], rgb, weights, depth_m: None, background })
+    };
+    let error = step(&mut trainer, &rgb, &weights).expect_err("a NaN").to_string();
+    assert!(error.contains("value 33 of the image"), "{error}");
+    // Where nothing counts it may be anything.
+    weights[11] = 0.0;
+    step(&mut trainer, &rgb, &weights).expect("a step");
+    weights[5] = -1.0;
+    let error = step(&mut trainer, &rgb, &weights).expect_err("a weight").to_string();
+    assert!(error.contains("value 5 of the mask"), "{error}");
+    let error = step(&mut trainer, &rgb[3..], &weights).expect_err("a size").to_string();
+    assert!(error.contains("asks for 14400"), "{error}");
+}
+
+fn with_growth(change: impl Fn(&mut Growth)) -> Settings {
+    let mut settings = Settings::default();
+    change(&mut settings.growth);
+    settings
+}
+
+/// A scene of a higher degree than the settings keeps its own.
+#[test]
+fn a_scene_of_degree_3_is_trained_on() {
+    let (mut gaussians, views) = wall();
+    gaussians.raise_sh_degree(3);
+    let cpu = Cpu::new(0, Simd::Best).unwrap();
+    let rgb = vec![0.5; 3 * 80 * 60];
+    let mut trainer =
+        Trainer::new(gaussians, RenderProfile::default(), Settings::default()).unwrap();
+    let background = [0.0; 3];
+    let sample = Sample { view: views[0], rgb: &rgb, weights: None, depth_m: None, background };
+    for _ in 0..3 {
+        trainer.step(&cpu, &sample).expect("a step");
+    }
+    assert_eq!(trainer.model().sh_degree(), 3);
+}

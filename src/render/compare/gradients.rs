@@ -10,7 +10,8 @@ use wildcity_scene::chunk::{column, columns};
 pub struct GroupError {
     /// `mean`, `ln scale`, `quat`, `opacity`, `sh` or `twist`.
     pub group: &'static str,
-    /// The largest difference as a share of the largest derivative; NaN if one is not finite.
+    /// The largest difference as a share of the largest derivative; NaN if one is
+    /// not finite, or missing.
     pub error: f64,
     /// The cosine between both, as vectors.
     pub cosine: f64,
@@ -21,6 +22,9 @@ impl GroupError {
     /// The largest derivative counts as at least `least`.
     pub fn new(group: &'static str, ours: &[f64], theirs: &[f64], least: f64) -> Self {
         let most = largest(theirs).max(least);
+        if ours.len() != theirs.len() {
+            return Self { group, error: f64::NAN, cosine: f64::NAN };
+        }
         let mut off: f64 = 0.0;
         for (a, b) in ours.iter().zip(theirs) {
             // A NaN must win, and `max` would drop it.

@@ -10,13 +10,16 @@
 //! | project backwards | from splats to Gaussians ([`super::project::gradient`]) |
 //!
 //! Between the steps there are 40 B for each pair of a splat and a macro tile (1.3 per splat on a
-//! street), and while they are gathered 40 B for each splat of a segment.
+//! street), and while they are gathered 40 B for each splat of a segment: about 110 B a splat with
+//! the lists. The images and their derivatives take 32 B a pixel. The limit of a frame's buffers
+//! holds for splats and pairs only.
 //!
 //! **The bytes do not depend on threads.** A macro tile is walked by one thread, tile after tile;
 //! its sums have places of their own; a segment of splats adds its macro tiles in order; and a
 //! Gaussian adds its views in order. No sum is added to atomically.
 
 use std::iter::zip;
+use std::sync::atomic::Ordering::Relaxed;
 
 use fearless_simd::{Simd, dispatch};
 use parking_lot::Mutex;
@@ -89,7 +92,9 @@ impl Differentiate for Cpu {
         gradients: &mut Gradients,
     ) -> Result<FrameStats, GradientError> {
         check_frame(frame, self.name())?;
-        let BusyLane { pool, mut scratch, most_bytes } = self.lane();
+        // Always the main lane: whether a frame fits must not depend on other frames.
+        let most_bytes = self.lane_bytes.load(Relaxed);
+        let BusyLane { pool, mut scratch, .. } = self.main.take(most_bytes);
         let scratch = &mut *scratch;
         let cutoffs = Cutoffs::new(frame.profile);
         let level = self.level;

@@ -72,7 +72,8 @@ pub struct GaussianImages {
 }
 
 /// Computes the derivatives of a loss by the images of all views, given these. Both are in the
-/// order of the views; derivatives by depth may be empty.
+/// order of the views; derivatives by depth may be empty. It must not call the backend, which waits
+/// for it.
 pub type LossGradient<'a> = &'a mut (dyn FnMut(&[GaussianImages]) -> Vec<GaussianImages> + Send);
 
 /// The derivatives of a loss by the parameters of one Gaussian.
@@ -125,7 +126,7 @@ pub enum GradientError {
     /// A loss that has the wrong size.
     #[error("view {view}: {given} derivatives by {image}; the image has {wanted} values")]
     Size { view: usize, image: &'static str, given: usize, wanted: usize },
-    /// A derivative that is NaN or infinite, or of a number of views that differs.
+    /// A derivative that is NaN or infinite.
     #[error("view {view}: the derivative by value {index} of {image} is {value:?}")]
     NotFinite { view: usize, image: &'static str, index: usize, value: f32 },
     /// Another number of derivatives than of views.

@@ -223,6 +223,10 @@ impl<'a> Sources<'a> {
     /// The derivatives of a loss by every Gaussian and by the view's twist, given those by splats.
     pub fn gradients(&self, by_splats: &[SplatGradient]) -> (Vec<SourceGradient>, Twist) {
         let one = |(source, by): (&Source, &SplatGradient)| {
+            // Also of Gaussians that a chunk has emptied, which have no rotation.
+            if *by == SplatGradient::default() {
+                return Default::default();
+            }
             self.back_project(source, by).unwrap_or_default()
         };
         let all: Vec<_> = self.gaussians.par_iter().zip(by_splats).map(one).collect();
@@ -287,6 +291,14 @@ impl<'a> Sources<'a> {
         let rows = 0..camera.height_px;
         rows.flat_map(|row| (0..camera.width_px).map(move |column| center(row, column))).collect()
     }
+}
+
+/// Whether a splat reaches the centre of a pixel of an image of this size.
+fn is_on_image(splat: &Option<Splat>, size_px: DVec2) -> bool {
+    splat.is_some_and(|Splat { mean_px, reach_px, .. }| {
+        (mean_px + reach_px).cmpge(DVec2::splat(0.5)).all()
+            && (mean_px - reach_px).cmple(size_px - 0.5).all()
+    })
 }
 
 /// The splats that a pixel blends.
@@ -390,11 +402,15 @@ impl Differentiate for Reference {
         }
 
         gradients.reset(frame.scene, frame.views.len());
+        let mut stats = FrameStats::default();
         for (view, (sources, decisions)) in sources.iter().zip(&decisions).enumerate() {
             let by = Images::from_derivatives(&derivatives[view]);
             let (by_sources, twist) = sources.gradients(&sources.splat_gradients(decisions, &by));
             gradients.twists[view] = twist;
-            let is_drawn: Vec<bool> = sources.splats().iter().map(Option::is_some).collect();
+            let view_size_px = frame.views[view].camera.size_px();
+            let is_drawn: Vec<bool> =
+                sources.splats().iter().map(|splat| is_on_image(splat, view_size_px)).collect();
+            stats.visible_pairs += is_drawn.iter().filter(|&&is_drawn| is_drawn).count() as u64;
             let mut first = 0;
             for chunk in &mut gradients.chunks {
                 for index in 0..chunk.len() {
@@ -406,6 +422,6 @@ impl Differentiate for Reference {
                 first += chunk.len();
             }
         }
-        Ok(FrameStats::default())
+        Ok(stats)
     }
 }

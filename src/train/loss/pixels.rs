@@ -17,11 +17,18 @@ pub fn l2<T: Real>(image: &[T], target: &[T], weights: Option<&[T]>) -> Loss<T> 
 /// A copy of an image with its pixels times their weights: what a loss of windows, such as
 /// [`dssim`](super::dssim), takes on both sides, so that a masked pixel is equal in both.
 pub fn masked<T: Real>(image: &[T], weights: &[T]) -> Vec<T> {
-    image
-        .chunks_exact(3)
-        .zip(weights)
-        .flat_map(|(rgb, &w)| [rgb[0] * w, rgb[1] * w, rgb[2] * w])
-        .collect()
+    let mut masked = image.to_vec();
+    for (rgb, &weight) in masked.chunks_exact_mut(3).zip(weights) {
+        for value in rgb {
+            *value = weighted(*value, weight);
+        }
+    }
+    masked
+}
+
+/// A value times its weight: 0 for a weight of 0, whatever the value.
+fn weighted<T: Real>(value: T, weight: T) -> T {
+    if weight == T::zero() { weight } else { value * weight }
 }
 
 /// -1, 0 or 1: the derivative of the absolute value, with none at 0.
@@ -55,8 +62,8 @@ fn pixel_mean<T: Real>(
                 let i = first + k;
                 let weight = weights.map_or(T::one(), |weights| weights[i / 3]);
                 let (value, derivative) = f(image[i] - target[i]);
-                sum += (weight * value).to_double();
-                *by = weight * derivative * share;
+                sum += weighted(value, weight).to_double();
+                *by = weighted(derivative, weight) * share;
             }
             sum
         })

@@ -56,12 +56,16 @@ pub fn dssim<T: Real>(size_px: [usize; 2], image: &[T], target: &[T]) -> Loss<T>
                 let a1 = two * mx * my + c1;
                 let a2 = two * (xy[i] - mx * my) + c2;
                 let b1 = mx * mx + my * my + c1;
-                let b2 = (xx[i] - mx * mx) + (yy[i] - my * my) + c2;
+                // A variance of rounding errors may be negative, of bright and flat images.
+                let variance_x = xx[i] - mx * mx;
+                let variance_y = (yy[i] - my * my).max(T::zero());
+                let b2 = variance_x.max(T::zero()) + variance_y + c2;
                 let per_b = T::one() / (b1 * b2);
                 let s = a1 * a2 * per_b;
                 sum += s.to_double();
                 let by_covariance = two * a1 * per_b;
-                let by_variance = -s / b2;
+                let is_positive = variance_x > T::zero();
+                let by_variance = if is_positive { -s / b2 } else { T::zero() };
                 let by_m = two * my * a2 * per_b - two * mx * s / b1;
                 by_mean[k] = per_value * (by_m - two * mx * by_variance - my * by_covariance);
                 by_xx[k] = per_value * by_variance;
