@@ -52,10 +52,22 @@ fn a_thousand_steps() {
         steps.for_each(|step| draw(&gpu, &scene, step).unwrap());
         memory(&gpu)
     };
-    let (before, device_before) = steps(0..300);
-    let (after, device_after) = steps(0..STEPS);
-    assert!(after <= before + GROWTH_BYTES, "{before} B grew to {after} B");
-    assert_eq!(device_before, device_after);
+    let (mut before, device_before) = steps(0..300);
+    // A heap may settle once on a busy machine. A leak goes on: it grows in the second thousand,
+    // too.
+    for last in [false, true] {
+        let (after, device_after) = steps(0..STEPS);
+        assert_eq!(device_before, device_after);
+        let is_flat = after <= before + GROWTH_BYTES;
+        assert!(
+            is_flat || !last,
+            "{before} B grew to {after} B, and so did a thousand steps before"
+        );
+        if is_flat {
+            break;
+        }
+        before = after;
+    }
 }
 
 /// A thread for each frame in flight, with small bindings: pages of four clusters. Scenes change,
