@@ -190,8 +190,9 @@ impl Sample<'_> {
                 return Err(TrainError::Size { image, given, wanted });
             }
         }
-        // Written so that a NaN is out of every range.
-        let out_of_range = |values: &[f32]| values.iter().position(|&value| !(value >= 0.0));
+        // A NaN is in no range.
+        let is_fault = |value: &f32| !(0.0..=f32::MAX).contains(value);
+        let out_of_range = |values: &[f32]| values.iter().position(is_fault);
         for (image, values) in [("mask", self.weights), ("depth", self.depth_m)] {
             if let Some((values, index)) = values.and_then(|v| Some((v, out_of_range(v)?))) {
                 return Err(TrainError::Value { image, index, value: values[index] });
