@@ -56,7 +56,7 @@ pub struct BesideViews {
 }
 
 impl Beside<'_> {
-    /// Draws the views.
+    /// Draws the views of each kind through the server.
     ///
     /// # Errors
     /// The server refuses, or the twin with errors cannot be changed.

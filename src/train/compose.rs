@@ -103,7 +103,6 @@ pub fn compose_gradient<T: Real>(
             }
             gradient.exposure.offset[row] += by;
         }
-        // The transposed matrix.
         let by_before: [T; 3] =
             std::array::from_fn(|c| (0..3).map(|row| exposure.matrix[row][c] * by[row]).sum());
         gradient.rgb.extend(by_before);

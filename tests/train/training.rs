@@ -2,6 +2,7 @@
 
 use glam::DVec3;
 use wildcity_render::compare::gaussians::forward_view;
+use wildcity_render::compare::psnr::psnr_db;
 use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_render::gradient::{Differentiate, GaussianImages, Gradients};
 use wildcity_render::{Frame, View};
@@ -44,11 +45,6 @@ fn image(cpu: &Cpu, scene: &Scene, view: View) -> Vec<f32> {
     rgb
 }
 
-fn psnr(a: &[f32], b: &[f32]) -> f64 {
-    let square: f64 = a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum();
-    -10.0 * (square / a.len() as f64).log10()
-}
-
 /// A run from points near the wall; the PSNR of the view that was held out, and the Gaussians.
 fn run(threads: usize, steps: usize) -> (f64, Gaussians) {
     let cpu = Cpu::new(threads, Simd::Best).unwrap();
@@ -79,7 +75,8 @@ fn run(threads: usize, steps: usize) -> (f64, Gaussians) {
         trainer.step(&cpu, &sample).expect("a step");
     }
     let seen = image(&cpu, trainer.model().scene(), views[4]);
-    (psnr(&seen, &images[4]), trainer.model().to_gaussians())
+    let differences = seen.iter().zip(&images[4]).map(|(a, b)| f64::from(a - b));
+    (psnr_db(differences), trainer.model().to_gaussians())
 }
 
 #[test]

@@ -82,7 +82,7 @@ pub struct Augmentation<'a> {
 pub type Progress<'a> = &'a mut dyn FnMut(&'static str, u64, u64);
 
 impl<'a> Augmentation<'a> {
-    /// Plans the views.
+    /// Plans the views of a round. None is drawn before [`Self::run`].
     ///
     /// # Errors
     /// A setting is out of range, or the version has no drive or no such camera.

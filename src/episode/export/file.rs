@@ -28,7 +28,7 @@ pub fn mcap_path(record: &Path) -> PathBuf {
     record.with_extension("mcap")
 }
 
-/// Exports nothing.
+/// In the place of the export, in a build without `mcap`.
 ///
 /// # Errors
 /// Always: it says what to build.

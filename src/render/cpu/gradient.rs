@@ -149,9 +149,7 @@ impl Differentiate for Cpu {
                         {
                             let by_splats = sums.splats(projected.first_place(unit), unit.len);
                             let mut unit = unit_of_job(&units, job).lock();
-                            let UnitGradients { lanes, visible } = &mut *unit;
-                            let to = UnitGradients { lanes, visible };
-                            twist += back_project(level, job, cutoffs, by_splats, to);
+                            twist += back_project(level, job, cutoffs, by_splats, &mut unit);
                         }
                         twist
                     });

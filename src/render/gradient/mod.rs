@@ -119,8 +119,8 @@ pub enum GradientError {
     Render(#[from] RenderError),
     /// The frame does not fit the memory of one pass.
     #[error(
-        "the splats of a frame exceed {limit_bytes} bytes, which gradients need at once: allow more \
-         with --frame-memory-mib, or train with smaller images or fewer Gaussians"
+        "the splats of a frame exceed {limit_bytes} bytes, and gradients need all at once: use \
+         smaller images, fewer views or fewer Gaussians"
     )]
     Memory { limit_bytes: u64 },
     /// A loss that has the wrong size.
@@ -146,7 +146,8 @@ pub trait Differentiate: Backend {
     /// Depths are rendered if `depth` is set.
     ///
     /// # Errors
-    /// See [`GradientError`].
+    /// The frame does not fit the memory, or is not differentiated; or the loss gave derivatives of
+    /// another size, or some that are not finite.
     fn differentiate(
         &self,
         frame: &Frame<'_>,
@@ -237,11 +238,6 @@ impl ChunkGradients {
             Some((lanes, _)) => lanes[column].0[index % LANES],
             None => 0.0,
         }
-    }
-
-    /// Whether some view shows a Gaussian.
-    pub fn is_visible(&self, index: usize) -> bool {
-        self.visible[index / LANES] >> (index % LANES) & 1 == 1
     }
 
     /// The derivatives by one Gaussian, except those by its colour.

@@ -9,7 +9,7 @@ use tokio::net::TcpStream;
 use super::{TlsError, TlsFiles};
 
 impl TlsFiles {
-    /// Reads nothing.
+    /// In the place of the check of the files, in a build without `tls`.
     ///
     /// # Errors
     /// Always: it says what to build.
@@ -24,7 +24,7 @@ pub(crate) enum Tls {}
 
 impl Tls {
     /// # Errors
-    /// As [`TlsFiles::check`].
+    /// Always, as [`TlsFiles::check`] has them.
     pub(crate) fn load(files: TlsFiles) -> Result<Arc<Self>, TlsError> {
         Err(match files.check() {
             Err(error) => error,

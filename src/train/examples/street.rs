@@ -19,6 +19,7 @@ use std::time::Instant;
 
 use glam::DVec3;
 use wildcity_generate::StreetSettings;
+use wildcity_render::compare::psnr::psnr_db_u8;
 use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::random::Random;
@@ -192,9 +193,7 @@ fn psnr(cpu: &Cpu, scene: &Scene, image: &Recorded) -> f64 {
     if cpu.render(&frame, &mut [target], &|_, _| {}).is_err() {
         return 0.0;
     }
-    let square = |(a, b): (&u8, &u8)| (f64::from(*a) - f64::from(*b)).powi(2) / (255.0 * 255.0);
-    let sum: f64 = rgb8.iter().zip(&image.rgb8).map(square).sum();
-    -10.0 * (sum / rgb8.len() as f64).log10()
+    psnr_db_u8(rgb8.iter().zip(&image.rgb8))
 }
 
 /// Images and points for the prototype of the project's design.

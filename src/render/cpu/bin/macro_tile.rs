@@ -52,15 +52,9 @@ impl MacroTile {
     /// lists them by tile.
     #[inline(always)]
     pub(super) fn load(&mut self, number: usize, segments: &[Segment]) {
-        let Self { pairs, copies, instances, ends, keys, other } = self;
-        pairs.clear();
-        copies.clear();
+        self.load_pairs(number, segments);
+        let Self { pairs, instances, ends, keys, other, .. } = self;
         keys.clear();
-        // Segments in order, and each in order of global ids: the index of a pair breaks ties of
-        // depth by the order in the scene.
-        for segment in segments {
-            pairs.extend_from_slice(segment.macro_tile(number));
-        }
         keys.extend((0..).zip(&*pairs).map(|(index, pair)| u64::from(pair.depth) << 32 | index));
         sort_by_depth(keys, other);
 
@@ -112,6 +106,18 @@ impl MacroTile {
         ends.copy_from_slice(&next[..MACRO_TILE_TILES]);
     }
 
+    /// Takes the pairs of the macro tile, and no copies of its splats.
+    #[inline(always)]
+    fn load_pairs(&mut self, number: usize, segments: &[Segment]) {
+        self.pairs.clear();
+        self.copies.clear();
+        // Segments in order, and each in order of global ids: the index of a pair breaks ties of
+        // depth by the order in the scene.
+        for segment in segments {
+            self.pairs.extend_from_slice(segment.macro_tile(number));
+        }
+    }
+
     /// Copies its sorted lists, for [`MacroTile::load_with_lists`].
     pub(in crate::cpu) fn copy_lists(&self, to: &mut MacroTileLists) {
         let end = self.ends.last().map_or(0, |&end| end as usize);
@@ -127,11 +133,7 @@ impl MacroTile {
         segments: &[Segment],
         lists: &MacroTileLists,
     ) {
-        self.pairs.clear();
-        self.copies.clear();
-        for segment in segments {
-            self.pairs.extend_from_slice(segment.macro_tile(number));
-        }
+        self.load_pairs(number, segments);
         self.instances.clear();
         self.instances.extend_from_slice(&lists.instances);
         self.ends = lists.ends;

@@ -6,7 +6,7 @@ use super::uris::Uris;
 use crate::ingest::IngestError;
 use wildcity_scene::Gaussians;
 
-/// Reads nothing.
+/// In the place of the reader of meshes, in a build without `mesh`.
 ///
 /// # Errors
 /// Always: it says what to build.

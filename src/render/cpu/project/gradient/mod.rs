@@ -68,7 +68,7 @@ pub(in crate::cpu) fn back_project(
     job: &Job<'_>,
     cutoffs: &Cutoffs,
     by_splats: &[Partial],
-    gradients: UnitGradients<'_>,
+    gradients: &mut UnitGradients<'_>,
 ) -> Twist {
     dispatch!(level, simd => back_project_unit(simd, job, cutoffs, by_splats, gradients))
 }
@@ -79,7 +79,7 @@ fn back_project_unit<S: Simd>(
     job: &Job<'_>,
     cutoffs: &Cutoffs,
     by_splats: &[Partial],
-    gradients: UnitGradients<'_>,
+    gradients: &mut UnitGradients<'_>,
 ) -> Twist {
     let sh_degree = job.chunk.sh_degree();
     let width = columns(sh_degree);

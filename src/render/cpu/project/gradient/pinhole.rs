@@ -28,7 +28,6 @@ pub(super) fn back_project<S: Simd>(
     let Block { columns, splats, by, .. } = block;
     let visible = visible_lanes(simd, splats.visible);
 
-    // The projection again.
     let mean = Vec3x16::load(simd, columns, column::MEAN);
     let z = depth(simd, view, mean);
     let x = camera_coordinate(simd, view, mean, 0);
