@@ -45,7 +45,8 @@ def test_a_page_does_what_it_says(page: str, quick_reader: dict[str, str], tmp_p
     port = free_port()
     # Of its own: `wildcity demo` builds its twin again after another page has changed it.
     reader = with_data_of(quick_reader, tmp_path / "home")
-    text = (ROOT / page).read_text().replace("8080", str(port)).replace("127.0.0.1:6000", "127.0.0.1:0")
+    # In this order: the port may itself begin with 6000.
+    text = (ROOT / page).read_text().replace("127.0.0.1:6000", "127.0.0.1:0").replace("8080", str(port))
     # Without a rig of its own, this page's twin has six cameras of 1440 x 928 pixels.
     rig = Path(quick_reader["XDG_DATA_HOME"]).with_name("rig.json")
     text = text.replace("\nwildcity augment lane ", f"\nwildcity twin drive lane --rig {rig}\nwildcity augment lane ")
