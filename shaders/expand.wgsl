@@ -10,9 +10,7 @@
 #import constants
 #import layout
 #import math
-
-const TILES: u32 = MACRO_COLUMNS * MACRO_ROWS;
-const BATCH_WORDS: u32 = EXPAND_BATCH / 32;
+#import touch_batch
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read> macro_ranges: array<vec2u>;
@@ -36,47 +34,6 @@ fn batches(
         let range = macro_ranges[index];
         first_batches[index] = div_ceil(range.y - range.x, EXPAND_BATCH);
     }
-}
-
-// A batch of touches of a macro tile.
-struct Batch {
-    macro_tile: u32,
-    // Its touches.
-    first: u32,
-    end: u32,
-    // `offsets[offset + k * stride]` is its count for tile k of the macro tile.
-    offset: u32,
-    stride: u32,
-    is_first: bool,
-    is_last: bool,
-}
-
-// Batch `number` of the frame: a search for the last macro tile whose first batch is at most `number`.
-fn batch(number: u32) -> Batch {
-    var macro_tile = 0u;
-    var end = frame.macro_tiles;
-    while macro_tile + 1u < end {
-        let middle = (macro_tile + end) / 2u;
-        if first_batches[middle] <= number {
-            macro_tile = middle;
-        } else {
-            end = middle;
-        }
-    }
-    let range = macro_ranges[macro_tile];
-    let first_batch = first_batches[macro_tile];
-    let index = number - first_batch;
-    let first = range.x + index * EXPAND_BATCH;
-    let stride = div_ceil(range.y - range.x, EXPAND_BATCH);
-    return Batch(
-        macro_tile,
-        first,
-        min(first + EXPAND_BATCH, range.y),
-        first_batch * TILES + index,
-        stride,
-        index == 0u,
-        index + 1u == stride,
-    );
 }
 
 var<workgroup> counts: array<atomic<u32>, TILES>;
@@ -107,11 +64,6 @@ fn count(
     }
 }
 
-// For each tile, one bit per splat of the batch, set if the splat touches the tile. Word-major.
-var<workgroup> tile_splats: array<atomic<u32>, TILES * BATCH_WORDS>;
-// Index of the instance of the first set bit of each word.
-var<workgroup> word_starts: array<u32, TILES * BATCH_WORDS>;
-
 @compute @workgroup_size(WORKGROUP)
 fn list(
     @builtin(workgroup_id) group: vec3u,
@@ -122,46 +74,25 @@ fn list(
     if number >= batches_job.length || instances_job.length == 0u {
         return;
     }
-    // Transpose the batch: from one word of tiles per splat to words of splats per tile.
-    for (var k = thread; k < TILES * BATCH_WORDS; k += WORKGROUP) {
-        atomicStore(&tile_splats[k], 0u);
-    }
-    workgroupBarrier();
     let own = batch(number);
-    let own_bit = 1u << (thread % 32u);
-    for (var i = own.first + thread; i < own.end; i += WORKGROUP) {
-        let word = (i - own.first) / 32u * TILES;
-        for (var rest = touch_masks[i]; rest != 0u; rest &= rest - 1u) {
-            atomicOr(&tile_splats[word + firstTrailingBit(rest)], own_bit);
-        }
-    }
-    workgroupBarrier();
-    // For each tile, the index of the first instance of each word. Each of the first 32 threads is
-    // responsible for one tile.
+    transpose(own, thread);
     if thread < TILES {
         let first = offsets[own.offset + thread * own.stride];
-        var next = first;
-        for (var word = thread; word < TILES * BATCH_WORDS; word += TILES) {
-            word_starts[word] = next;
-            next += countOneBits(atomicLoad(&tile_splats[word]));
-        }
+        let end = find_word_starts(first, thread);
         let tile = tile_at(own.macro_tile, thread);
         if tile < frame.tiles && own.is_first {
             ranges[2u * tile] = first;
         }
         if tile < frame.tiles && own.is_last {
-            ranges[2u * tile + 1u] = next;
+            ranges[2u * tile + 1u] = end;
         }
     }
     workgroupBarrier();
-    // Write the instances: each splat follows the nearer ones of its word.
+    // Write the instances.
     for (var i = own.first + thread; i < own.end; i += WORKGROUP) {
         let splat = touch_splats[i];
-        let word = (i - own.first) / 32u * TILES;
         for (var rest = touch_masks[i]; rest != 0u; rest &= rest - 1u) {
-            let at = word + firstTrailingBit(rest);
-            let nearer = countOneBits(atomicLoad(&tile_splats[at]) & (own_bit - 1u));
-            instance_splats[word_starts[at] + nearer] = splat;
+            instance_splats[instance_index(own, i, firstTrailingBit(rest))] = splat;
         }
     }
 }

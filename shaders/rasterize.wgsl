@@ -22,6 +22,7 @@
 #import math
 #import splat_batch
 #import tile_blocks
+#import four_pixels
 #import INSTANCES
 #import resolve
 #import BACKGROUND
@@ -137,8 +138,8 @@ fn main(
                 rest &= rest - 1u;
                 let b = select(NO_SPLAT, k * 32u + firstTrailingBit(rest), rest != 0u);
                 rest &= rest - 1u;
-                let exponent_a = exponents(a, at_px);
-                let exponent_b = exponents(b, at_px);
+                let exponent_a = exponents(a, splat_offsets(a, at_px));
+                let exponent_b = exponents(b, splat_offsets(b, at_px));
                 let touched_a = exponent_a >= vec4f(frame.log2_alpha_cut);
                 let touched_b = exponent_b >= vec4f(frame.log2_alpha_cut);
                 if any(touched_a | touched_b) {
@@ -200,23 +201,6 @@ fn finish(
     }
     sums = composite(sums, view_index, at_px, thread);
     resolve(index, first_pixel.y * TILE_PX + first_pixel.x, sums);
-}
-
-// The first pixel of the tile that a thread has: one of four in a row.
-fn thread_pixel(thread: u32) -> vec2u {
-    let block = thread / 4u;
-    return vec2u(block % 4u, block / 4u) * BLOCK_PX + vec2u(0u, thread % 4u);
-}
-
-// log2(alpha) = log2(opacity) - (l0 dx + l1 dy)^2 - (l2 dy)^2 of a splat of the batch at four pixels.
-fn exponents(k: u32, at_px: vec2f) -> vec4f {
-    let mean_factor = mean_factors[k];
-    let opacity = opacities[k];
-    let d = at_px - mean_factor.xy;
-    let v = opacity.x * d.y;
-    let first_u = fma(mean_factor.z, d.x, mean_factor.w * d.y);
-    let u = fma(vec4f(mean_factor.z), vec4f(0.0, 1.0, 2.0, 3.0), vec4f(first_u));
-    return fma(-u, u, vec4f(fma(-v, v, opacity.y)));
 }
 
 // Opacities from their base-2 logarithms.

@@ -4,6 +4,8 @@
 mod data;
 #[path = "../support/gpu.rs"]
 mod gpu;
+#[path = "../support/gradient_cases.rs"]
+mod gradient_cases;
 #[path = "../support/images.rs"]
 mod images;
 #[allow(dead_code, reason = "the tests of the other backends use another part of it")]
@@ -31,6 +33,7 @@ mod definition;
 mod determinism;
 mod encoding;
 mod frames_in_flight;
+mod gradients;
 mod memory_growth;
 mod mirror;
 mod mutations;

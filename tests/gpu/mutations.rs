@@ -114,7 +114,12 @@ pub(crate) const MUTATIONS: &[Mutation] = &[
     mutation("rasterize", "0x1111u", "0x0111u", RASTERIZE),
     mutation("rasterize", "<< (2u * i)", "<< i", RASTERIZE),
     mutation("rasterize", "<< (i * BLOCKS)", "<< 0u", RASTERIZE),
-    mutation("rasterize", "exponents(b, at_px)", "exponents(a, at_px)", RASTERIZE),
+    mutation(
+        "rasterize",
+        "exponents(b, splat_offsets(b, at_px))",
+        "exponents(a, splat_offsets(a, at_px))",
+        RASTERIZE,
+    ),
     mutation("rasterize", "vec4f(0.0, 1.0, 2.0, 3.0)", "vec4f(0.0, 1.0, 3.0, 2.0)", RASTERIZE),
     mutation("rasterize", "sums.depth / select", "sums.depth * select", RASTERIZE),
     mutation("rasterize", "vec4f(255.0)", "vec4f(250.0)", RASTERIZE),

@@ -16,107 +16,26 @@ use wildcity_scene::geometry::camera::{Pinhole, ShutterDirection};
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::{RenderProfile, Scene};
 
+use crate::gradient_cases::{check_actors, check_lenses, check_pinholes};
 use crate::images::cpu;
 use crate::lenses::{lenses, rolling_view, street_scene};
 use crate::placed::{actor, chunk, on_street, views as placed_views};
 use crate::scene_files::Random;
 use crate::streets::{street, turning_views};
 
-fn differentiate(
-    backend: &dyn Differentiate,
-    scene: &Scene,
-    profile: &RenderProfile,
-    views: &[View],
-) -> (Vec<GaussianImages>, Gradients) {
-    let mut gradients = Gradients::default();
-    let mut seen = Vec::new();
-    let frame = Frame { scene, profile, views };
-    backend
-        .differentiate(
-            &frame,
-            true,
-            &mut |images| {
-                seen = images.to_vec();
-                waves(images)
-            },
-            &mut gradients,
-        )
-        .expect("gradients");
-    (seen, gradients)
-}
-
-/// The gradients of a backend against those of `reference`: within 1e-4 of the largest entry of
-/// each group of parameters, and with a cosine above 0.99999.
-fn check_against_reference(
-    case: &str,
-    backend: &dyn Differentiate,
-    scene: &Scene,
-    profile: &RenderProfile,
-    views: &[View],
-) {
-    let (_, ours) = differentiate(backend, scene, profile, views);
-    let (_, theirs) = differentiate(&Reference, scene, profile, views);
-    for GroupError { group, error, cosine } in group_errors(&ours, &theirs) {
-        eprintln!("{case:20} {group:10} {error:.1e} {:.1e}", 1.0 - cosine);
-        assert!(error < 1e-4 && cosine > 0.99999, "{case}: {group} is off by {error:e}, {cosine}");
-    }
-}
-
 #[test]
 fn cpu_has_the_gradients_of_the_reference() {
-    let backend = cpu();
-    let scene = Scene::from_gaussians(&street(3_000, 3, 5));
-    let small = |view: &View| View { camera: view.camera.scaled(120, 80).unwrap(), ..*view };
-    let views: Vec<View> = turning_views().iter().map(small).collect();
-    let native = |view: &View| {
-        let camera = Camera { native_size_px: None, ..view.camera };
-        View { camera, ..*view }
-    };
-    let native: Vec<View> = views.iter().map(native).collect();
-    let classic = RenderProfile::default();
-    let antialiased = RenderProfile { antialiased: true, ..classic };
-    check_against_reference("classic", &backend, &scene, &classic, &native);
-    check_against_reference("antialiased", &backend, &scene, &antialiased, &native);
-    check_against_reference("shrunk", &backend, &scene, &antialiased, &views);
+    check_pinholes(&cpu());
 }
 
 #[test]
 fn cpu_has_the_gradients_of_every_lens_and_shutter() {
-    let backend = cpu();
-    let scene = Scene::from_gaussians(&street(1_500, 1, 6));
-    let (_, pose) = street_scene();
-    let directions = [
-        ShutterDirection::TopToBottom,
-        ShutterDirection::RightToLeft,
-        ShutterDirection::BottomToTop,
-        ShutterDirection::LeftToRight,
-    ];
-    let profile = RenderProfile { antialiased: true, ..RenderProfile::default() };
-    for ((name, camera), direction) in lenses().into_iter().zip(directions.into_iter().cycle()) {
-        let camera = Camera { native_size_px: None, ..camera.scaled(80, 50).unwrap() };
-        let views = [View::new(camera, pose), rolling_view(camera, pose, direction)];
-        check_against_reference(name, &backend, &scene, &profile, &views);
-    }
+    check_lenses(&cpu());
 }
 
 #[test]
 fn cpu_has_the_gradients_of_actors() {
-    let backend = cpu();
-    let car = chunk(&actor(400, 2, 5));
-    let place = |pose, index, tint| PlacedChunk {
-        tint,
-        ..PlacedChunk::at_rest(Arc::clone(&car), pose, index)
-    };
-    let placed = vec![
-        place(on_street(26.0, 1.5, 0.3), 0, [1.0; 3]),
-        place(on_street(30.0, -2.5, 1.4), 1, [0.4, 1.0, 0.7]),
-    ];
-    let scene = Scene { placed, ..Scene::from_gaussians(&street(1_000, 1, 7)) };
-    for (name, view) in placed_views() {
-        let camera = Camera { native_size_px: None, ..view.camera.scaled(80, 48).unwrap() };
-        let view = View { camera, ..view };
-        check_against_reference(name, &backend, &scene, &RenderProfile::default(), &[view]);
-    }
+    check_actors(&cpu());
 }
 
 #[test]

@@ -2,6 +2,8 @@
 
 #[path = "../support/data.rs"]
 mod data;
+#[path = "../support/gradient_cases.rs"]
+mod gradient_cases;
 #[path = "../support/images.rs"]
 mod images;
 #[path = "../support/lenses.rs"]

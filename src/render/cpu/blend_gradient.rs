@@ -12,25 +12,9 @@ use super::batch::Matched;
 use super::lanes::splats;
 use super::math::{exp2, recip};
 use super::resolve::{BLOCKS, TileSums};
+use crate::gradient::{Partial, partial};
 use crate::layout::Cutoffs;
 use wildcity_scene::chunk::LANES;
-
-/// Sums over the pixels of a splat within a macro tile, by the places in [`partial`].
-pub(super) type Partial = [f32; partial::COUNT];
-
-/// Places of the sums of g, g u, g v, g u², g u v and g v², and of the derivatives by colour and
-/// depth. `g` is the derivative by the logarithm of alpha, u and v are those of a splat's exponent.
-pub(super) mod partial {
-    pub(in crate::cpu) const G: usize = 0;
-    pub(in crate::cpu) const U: usize = 1;
-    pub(in crate::cpu) const V: usize = 2;
-    pub(in crate::cpu) const UU: usize = 3;
-    pub(in crate::cpu) const UV: usize = 4;
-    pub(in crate::cpu) const VV: usize = 5;
-    pub(in crate::cpu) const RGB: usize = 6;
-    pub(in crate::cpu) const DEPTH: usize = 9;
-    pub(in crate::cpu) const COUNT: usize = 10;
-}
 
 /// The derivatives of a loss by the images, for the 256 pixels of a tile; 0 beyond the image.
 #[derive(Clone, Debug)]

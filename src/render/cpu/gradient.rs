@@ -27,7 +27,7 @@ use rayon::prelude::*;
 
 use super::batch::{BATCH, Batch};
 use super::bin::{Grid, MacroTile, MacroTileLists};
-use super::blend_gradient::{Partial, TileDerivatives, TileWalk, partial};
+use super::blend_gradient::{TileDerivatives, TileWalk};
 use super::drawing::Stages;
 use super::overflow::PartError;
 use super::project::gradient::{UnitGradients, back_project};
@@ -37,8 +37,8 @@ use super::resolve::{BLOCKS, NOT_HALVED, TileSums, block_corner};
 use super::{BusyLane, Cpu, Scratch, StageTimer};
 use crate::constants::{BLOCK_PX, TILE_PX};
 use crate::gradient::{
-    ChunkGradients, Differentiate, GaussianImages, GradientError, Gradients, LossGradient, Twist,
-    check_frame, check_loss, mask,
+    ChunkGradients, Differentiate, GaussianImages, GradientError, Gradients, LossGradient, Partial,
+    Twist, check_frame, check_loss, mask, partial,
 };
 use crate::layout::Cutoffs;
 use crate::stage::Stage;

@@ -14,7 +14,7 @@
 //!
 //! Twin of `render/cpu/bin`; WGSL: `bin`, `sort`, `ranges`, and `expand` in `shaders`.
 
-use wgpu::{CommandEncoder, ComputePass};
+use wgpu::{BindingResource, CommandEncoder, ComputePass};
 
 use super::device::Device;
 use super::growable_buffer::{GrowableBuffer, INTERMEDIATE};
@@ -224,6 +224,17 @@ impl Bin {
         ];
         let all: Vec<_> = common.into_iter().chain(outputs).collect();
         self.list_instances.run(device, pass, Groups::Job(batches), &all);
+    }
+
+    /// The lists of touches, for `gather.wgsl`; `sorted` is as in [`Bin::list_instances`].
+    pub(super) fn touch_resources(&self, sorted: usize) -> [(u32, BindingResource<'_>); 5] {
+        [
+            (1, self.macro_ranges.bind()),
+            (2, self.touch_masks[sorted].bind()),
+            (3, self.touch_splats[sorted].bind()),
+            (4, self.first_batches.bind()),
+            (5, self.batch_offsets.bind()),
+        ]
     }
 
     /// Empties the ranges of all macro tiles and tiles, before [`Bin::list_instances`].

@@ -345,6 +345,20 @@ impl Device {
         self.loop_iterations().map_or(u64::MAX, |most| macro_tiles(most) * tiles)
     }
 
+    /// Most splats of a tile whose gradients can be summed.
+    ///
+    /// A batch of 64 takes at most 370 iterations: 1, and for each four splats 1, 5 for their
+    /// loop, and 17 for the blocks of a sum; a thread takes 17 to find its view besides.
+    pub(super) fn max_gradient_splats(&self) -> u64 {
+        self.loop_iterations().map_or(u64::MAX, |most| (most - 40) / 370 * 64)
+    }
+
+    /// Most macro tiles of a view whose sums a splat can gather: a search takes at most 28
+    /// iterations, and 2 to come to it.
+    pub(super) fn max_gradient_macro_tiles(&self) -> u64 {
+        self.loop_iterations().map_or(u64::MAX, |most| most / 30)
+    }
+
     /// Loop iterations of a shader, in all of its loops together, after which Mesa's software
     /// devices leave every loop without an error (`LP_MAX_TGSI_LOOP_ITERATIONS`). `None` for other
     /// devices.

@@ -26,6 +26,7 @@ mod bin;
 mod chain;
 mod device;
 mod discarded;
+mod gradient;
 mod growable_buffer;
 mod kernel;
 pub mod layout;

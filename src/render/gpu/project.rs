@@ -14,7 +14,7 @@
 //! other cameras. The kernels for lenses and rolling shutters are compiled with the first view that
 //! needs them.
 
-use wgpu::{BindingResource, BufferUsages, ComputePass, ShaderModule};
+use wgpu::{BindingResource, Buffer, BufferUsages, ComputePass, ShaderModule};
 
 use super::device::Device;
 use super::growable_buffer::{GrowableBuffer, INTERMEDIATE};
@@ -137,8 +137,8 @@ impl Project {
             page_cluster_views: buffer("cluster views by page", storage),
             chunk_views: buffer("chunk views", storage),
             spans: buffer("project spans", uniform),
-            visible: buffer("visible", storage),
-            offsets: buffer("cluster view offsets", storage),
+            visible: buffer("visible", INTERMEDIATE),
+            offsets: buffer("cluster view offsets", INTERMEDIATE),
         }
     }
 
@@ -197,16 +197,7 @@ impl Project {
             let ProjectDispatch { page, variant, span } = *dispatch;
             let Some(kernels) = self.kernels(variant) else { continue };
             let Some(page) = mirror.page(page) else { continue };
-            let mut resources = vec![
-                (0, plan.frame().as_entire_binding()),
-                (1, slot_binding(self.spans.buffer(), index as u64, size_of::<Span>())),
-                (2, self.page_cluster_views.bind()),
-                (3, self.cluster_views.bind()),
-                (4, self.chunk_views.bind()),
-                (5, page.as_entire_binding()),
-                (6, self.visible.bind()),
-                (7, self.offsets.bind()),
-            ];
+            let mut resources = self.resources(plan, page, &self.spans, index);
             if variant.projection == Projection::Unscented {
                 resources.extend(lenses.bind());
             }
@@ -220,9 +211,7 @@ impl Project {
         scan.run(device, pass, plan.job(job::CLUSTER_VIEWS), self.offsets.buffer());
         plan.set_splats(device, pass, scan.block_sums());
         for (kernels, variant, groups, mut resources) in dispatches {
-            if variant.actors {
-                resources.extend(self.lights.iter().flat_map(Lights::bind));
-            }
+            resources.extend(self.light_resources(variant));
             resources.extend([
                 (8, splats.shapes.bind()),
                 (9, splats.colors.bind()),
@@ -234,8 +223,42 @@ impl Project {
     }
 }
 
+impl Project {
+    /// What the kernels of the stage have in common: slot `index` of some spans on one page.
+    pub(super) fn resources<'a>(
+        &'a self,
+        plan: &'a Plan,
+        page: &'a Buffer,
+        spans: &'a GrowableBuffer,
+        index: usize,
+    ) -> Vec<(u32, BindingResource<'a>)> {
+        vec![
+            (0, plan.frame().as_entire_binding()),
+            (1, slot_binding(spans.buffer(), index as u64, size_of::<Span>())),
+            (2, self.page_cluster_views.bind()),
+            (3, self.cluster_views.bind()),
+            (4, self.chunk_views.bind()),
+            (5, page.as_entire_binding()),
+            (6, self.visible.bind()),
+            (7, self.offsets.bind()),
+        ]
+    }
+
+    /// The lights and shadows, for kernels that read them.
+    pub(super) fn light_resources(&self, variant: Variant) -> Vec<(u32, BindingResource<'_>)> {
+        let lights = self.lights.iter().filter(|_| variant.actors);
+        lights.flat_map(Lights::bind).collect()
+    }
+
+    /// One bit per Gaussian of each cluster view.
+    pub(super) fn visible(&self) -> &GrowableBuffer {
+        &self.visible
+    }
+}
+
 impl Variant {
-    fn degree(self) -> usize {
+    /// The SH degree of its kernels.
+    pub(super) fn degree(self) -> usize {
         usize::from(self.sh_degree.min(3))
     }
 }

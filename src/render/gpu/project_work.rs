@@ -33,6 +33,8 @@ pub(super) struct ProjectWork {
     pub(super) page_cluster_views: Vec<u32>,
     pub(super) dispatches: Vec<ProjectDispatch>,
     pub(super) chunk_views: Vec<ChunkView>,
+    /// For each chunk view the number of its chunk: those of the twin, then those of actors.
+    pub(super) chunk_numbers: Vec<u32>,
     /// One per chunk view if the frame has actors; empty otherwise.
     pub(super) lights: Vec<ChunkLight>,
     pub(super) shadows: Vec<ChunkShadow>,
@@ -72,6 +74,8 @@ pub(super) enum Projection {
 #[derive(Clone, Copy, Debug)]
 struct ChunkInView<'a> {
     chunk: &'a Arc<Chunk>,
+    /// Its number: those of the twin, then those of actors.
+    number: u32,
     /// Index of the view.
     view: usize,
     /// The view in the chunk's axes: the world's, or those of an actor.
@@ -114,13 +118,15 @@ impl ProjectWork {
             let twin = frame.scene.chunks.iter().enumerate().map(move |(index, chunk)| {
                 let shadows = shadows.get(index).map_or(&[][..], Vec::as_slice);
                 let relative = &frame.views[view];
-                ChunkInView { chunk, view, relative, of: Owner::Twin { shadows } }
+                let number = index as u32;
+                ChunkInView { chunk, number, view, relative, of: Owner::Twin { shadows } }
             });
             let lenses = &lenses;
             let placed = frame.scene.placed.iter().zip(actors.for_view(view)).enumerate();
             let placed = placed.map(move |(index, (placed, relative))| {
                 let of = Owner::Actor { placed, lens: lenses.index(view, index) };
-                ChunkInView { chunk: &placed.chunk, view, relative, of }
+                let number = (frame.scene.chunks.len() + index) as u32;
+                ChunkInView { chunk: &placed.chunk, number, view, relative, of }
             });
             twin.chain(placed)
         };
@@ -182,6 +188,7 @@ impl ProjectWork {
             let variant = pair.variant(shadowed);
             let chunk_view = *chunk_views[usize::from(shadowed)].get_or_insert_with(|| {
                 self.chunk_views.push(pair.chunk_view(variant, frame.profile));
+                self.chunk_numbers.push(pair.number);
                 if !frame.scene.placed.is_empty() {
                     self.add_light(pair, shadowed);
                 }
@@ -198,6 +205,11 @@ impl ProjectWork {
     /// Number of (cluster, view) pairs.
     pub(super) fn cluster_views(&self) -> u32 {
         self.cluster_views.len() as u32
+    }
+
+    /// The cluster views of a dispatch.
+    pub(super) fn cluster_views_in(&self, span: Span) -> &[u32] {
+        &self.page_cluster_views[span.first as usize..][..span.count as usize]
     }
 
     /// The owners (twin or actor) of the cluster views, as ranges in order of cluster views.

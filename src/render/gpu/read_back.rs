@@ -3,11 +3,11 @@
 use std::sync::{Arc, mpsc};
 
 use parking_lot::Mutex;
-use wgpu::{BufferUsages, BufferView, MapMode, PollType, SubmissionIndex};
+use wgpu::{Buffer, BufferUsages, BufferView, MapMode, PollType, SubmissionIndex};
 
 use super::device::Device;
 use super::growable_buffer::GrowableBuffer;
-use super::kernel::TIMESTAMP_BYTES;
+use super::kernel::{Recorder, TIMESTAMP_BYTES};
 use super::layout::{Counters, FrameView, TileCounters};
 use super::rasterize::pages;
 use super::resolve::Planes;
@@ -110,6 +110,28 @@ impl ReadBack {
     /// Makes room for the counters and the timestamps.
     pub(super) fn reserve_head(&mut self, device: &Device) {
         self.head.reserve(device, TIMESTAMP_OFFSET + TIMESTAMP_BYTES);
+    }
+
+    /// Ends a recording with copies of buffers, one to each page, and submits it. Returns the names
+    /// of its stages, whose times go to the head by way of `timestamps`.
+    pub(super) fn submit(
+        &mut self,
+        device: &Device,
+        mut recorder: Recorder,
+        sources: &[(&Buffer, u64)],
+        timestamps: &Buffer,
+    ) -> (Vec<&'static str>, SubmissionIndex) {
+        self.reserve_head(device);
+        self.pages.resize_with(sources.len(), || Self::buffer(device, "buffers read back"));
+        let stages = recorder.finish_stages(timestamps);
+        let mut encoder = recorder.encoder;
+        let head = self.head.buffer();
+        encoder.copy_buffer_to_buffer(timestamps, 0, head, TIMESTAMP_OFFSET, TIMESTAMP_BYTES);
+        for ((from, bytes), to) in sources.iter().zip(&mut self.pages) {
+            to.reserve(device, *bytes);
+            encoder.copy_buffer_to_buffer(from, 0, to.buffer(), 0, *bytes);
+        }
+        (stages, device.queue.submit([encoder.finish()]))
     }
 
     /// Waits for a submission, and maps all buffers.

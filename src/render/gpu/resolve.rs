@@ -62,6 +62,11 @@ impl Planes {
         }
     }
 
+    /// Those that a loss is a function of.
+    pub(super) fn for_gradients(depth: bool) -> Self {
+        Self { rgb8: false, rgb: true, opacity: true, depth, instances: false }
+    }
+
     /// A number below [`Planes::VARIANTS`].
     pub(super) fn variant(self) -> usize {
         let bits = [self.rgb8, self.rgb, self.opacity, self.depth, self.instances];

@@ -87,6 +87,10 @@ const VARIANTS: &[Variant] = &[
     variant("instances_map_lens", "rasterize", &[INSTANCES, BACKGROUND, MAP, RAY_LENS]),
     variant("instances_network", "rasterize", &[INSTANCES, BACKGROUND, NETWORK, RAY_PINHOLE]),
     variant("instances_network_lens", "rasterize", &[INSTANCES, BACKGROUND, NETWORK, RAY_LENS]),
+    plain("rasterize_gradient"),
+    plain("gather"),
+    variant("project_gradient", "project_gradient", &[PINHOLE, NO_ACTORS]),
+    variant("project_gradient_actors", "project_gradient", &[PINHOLE, ACTORS]),
     plain("roofline"),
 ];
 
@@ -103,6 +107,8 @@ const FILES: &[(&str, &str)] = &[
     ("expansion", include_str!("../../../shaders/expansion.wgsl")),
     ("expand", include_str!("../../../shaders/expand.wgsl")),
     ("instances", include_str!("../../../shaders/instances.wgsl")),
+    ("four_pixels", include_str!("../../../shaders/shared/four_pixels.wgsl")),
+    ("gather", include_str!("../../../shaders/gather.wgsl")),
     ("layout", include_str!("../../../shaders/shared/layout.wgsl")),
     ("lens", include_str!("../../../shaders/lens.wgsl")),
     ("long_tiles", include_str!("../../../shaders/long_tiles.wgsl")),
@@ -114,8 +120,10 @@ const FILES: &[(&str, &str)] = &[
     ("plan", include_str!("../../../shaders/plan.wgsl")),
     ("prefix", include_str!("../../../shaders/shared/prefix.wgsl")),
     ("project", include_str!("../../../shaders/project.wgsl")),
+    ("project_gradient", include_str!("../../../shaders/project_gradient.wgsl")),
     ("ranges", include_str!("../../../shaders/ranges.wgsl")),
     ("rasterize", include_str!("../../../shaders/rasterize.wgsl")),
+    ("rasterize_gradient", include_str!("../../../shaders/rasterize_gradient.wgsl")),
     ("rasterize_long", include_str!("../../../shaders/rasterize_long.wgsl")),
     ("ray_lens", include_str!("../../../shaders/ray_lens.wgsl")),
     ("ray_pinhole", include_str!("../../../shaders/ray_pinhole.wgsl")),
@@ -127,7 +135,9 @@ const FILES: &[(&str, &str)] = &[
     ("sort", include_str!("../../../shaders/sort.wgsl")),
     ("tile_blocks", include_str!("../../../shaders/shared/tile_blocks.wgsl")),
     ("splat_batch", include_str!("../../../shaders/shared/splat_batch.wgsl")),
+    ("splat_sums", include_str!("../../../shaders/shared/splat_sums.wgsl")),
     ("sort_ballots", include_str!("../../../shaders/sort_ballots.wgsl")),
+    ("touch_batch", include_str!("../../../shaders/shared/touch_batch.wgsl")),
     ("unscented", include_str!("../../../shaders/unscented.wgsl")),
 ];
 

@@ -43,7 +43,9 @@
 //! none, nor has the opacity's scale by `antialiased` at its floor. A slope that is clamped beyond
 //! the image's edges has no derivative of its own.
 
+mod color;
 mod shape;
+mod sums;
 mod twist;
 
 use glam::DVec3;
@@ -53,7 +55,9 @@ use wildcity_scene::chunk::{LANES, Lanes, column, columns};
 use wildcity_scene::geometry::camera::FieldMask;
 use wildcity_scene::{Chunk, Scene};
 
+pub(crate) use self::color::color_gradient;
 pub(crate) use self::shape::FootprintGradient;
+pub(crate) use self::sums::{Partial, partial};
 pub use self::twist::{RigTwists, Twist};
 
 use crate::{Backend, Frame, FrameStats, RenderError, View};

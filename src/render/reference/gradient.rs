@@ -13,11 +13,11 @@ use super::Reference;
 use super::project::{Footprint, Gaussian, Splat, sort};
 use crate::gradient::{
     Differentiate, FootprintGradient, GaussianGradient, GaussianImages, GradientError, Gradients,
-    LossGradient, Twist, check_frame, check_loss, mask,
+    LossGradient, Twist, check_frame, check_loss, color_gradient, mask,
 };
 use crate::layout::PixelFilter;
 use crate::{Backend, Frame, FrameStats, View};
-use wildcity_scene::{Chunk, RenderProfile, Scene, sh};
+use wildcity_scene::{Chunk, RenderProfile, Scene};
 
 /// A Gaussian of a scene, and how it is seen.
 #[derive(Clone, Copy, Debug)]
@@ -256,7 +256,7 @@ impl<'a> Sources<'a> {
 
         let axes_m = gaussian.axes_m();
         let toward = gaussian.mean_m - camera_m;
-        let (sh, by_toward) = color_gradient(gaussian, toward, by.rgb * *tint);
+        let (sh, by_toward) = color_gradient(&gaussian.sh, toward, by.rgb * *tint);
         let footprint = FootprintGradient {
             mean_px: by.mean_px,
             covariance,
@@ -309,24 +309,6 @@ fn drawn<'a>(
     contributions.iter().filter_map(|contribution| {
         splats[contribution.gaussian].as_ref().map(|splat| (splat, contribution))
     })
-}
-
-/// The derivatives by spherical harmonics, and by the vector from the camera to the centre.
-fn color_gradient(gaussian: &Gaussian, toward: DVec3, by_rgb: DVec3) -> ([DVec3; 16], DVec3) {
-    let direction = toward.normalize();
-    let basis = sh::basis(direction);
-    let mut rgb = DVec3::splat(0.5);
-    for (weight, coefficient) in basis.iter().zip(gaussian.sh) {
-        rgb += weight * coefficient;
-    }
-    let by_rgb = DVec3::select(rgb.cmpgt(DVec3::ZERO), by_rgb, DVec3::ZERO);
-    let mut by_direction = DVec3::ZERO;
-    for (gradient, coefficient) in sh::basis_gradients(direction).iter().zip(gaussian.sh) {
-        by_direction += by_rgb.dot(coefficient) * gradient;
-    }
-    // d/|d| has the derivative (I - d dᵀ)/|d|.
-    let by_toward = (by_direction - direction.dot(by_direction) * direction) / toward.length();
-    (basis.map(|weight| weight * by_rgb), by_toward)
 }
 
 /// `Q V Q` of symmetric matrices (xx, xy, yy).

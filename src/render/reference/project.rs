@@ -114,7 +114,7 @@ impl Gaussian {
     }
 
     /// Its axes times their standard deviations, as columns, in metres.
-    pub(super) fn axes_m(&self) -> DMat3 {
+    pub(crate) fn axes_m(&self) -> DMat3 {
         DMat3::from_quat(self.rotation.normalize()) * DMat3::from_diagonal(self.scale_m)
     }
 

@@ -5,8 +5,8 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use super::Bins;
-use crate::cpu::blend_gradient::{Partial, partial};
 use crate::cpu::project::Projected;
+use crate::gradient::{Partial, partial};
 
 /// The sums of the splats of one segment, by their places.
 pub(in crate::cpu) struct SegmentSums {

@@ -72,7 +72,7 @@ impl Chain {
             // Run the stages, and read the counters.
             self.reserve(&mut parameters, source.cluster_views());
             let mut recorder = Recorder::new(&self.device, None);
-            let sorted = self.record(&mut recorder, source, &parameters, last);
+            self.record(&mut recorder, source, &parameters, last);
             let from = self.plan.counters();
             let to = read_back.head.buffer();
             let bytes = size_of::<Counters>() as u64;
@@ -87,7 +87,7 @@ impl Chain {
             let (needs, fits) = self.evaluate(&counters, &parameters);
             self.check_room(needs)?;
             if fits {
-                return self.read(sorted, &counters, parameters.tiles, last);
+                return self.read(&counters, parameters.tiles, last);
             }
         }
     }
@@ -140,17 +140,16 @@ impl Chain {
         counts(outputs)
     }
 
-    /// Reads the outputs of the stages up to `last`. `sorted` is the index of the buffers of the
-    /// sort of splats that are in order.
+    /// Reads the outputs of the stages up to `last`.
     fn read(
         &self,
-        sorted: usize,
         counters: &Counters,
         tiles: u32,
         last: Stage,
     ) -> Result<StageOutputs, RenderError> {
         // Copy the buffers to ones that the host can read.
-        let Self { device, splats, bin, .. } = self;
+        let Self { device, splats, bin, sorted, .. } = self;
+        let sorted = sorted.splats;
         let count = u64::from(counters.splats);
         let mut sources: Vec<(&Buffer, u64)> = vec![
             (splats.shapes.buffer(), count * size_of::<SplatShape>() as u64),

@@ -9,6 +9,7 @@
 //! that the next frame is prepared meanwhile. Submissions run in order, so both may use the same
 //! intermediate buffers.
 
+mod gradient;
 mod in_flight;
 mod intermediate;
 mod record;
@@ -24,6 +25,7 @@ pub(super) use self::in_flight::{InFlight, Turn, Waited};
 use super::bandwidth::FrameCounts;
 use super::bin::{Bin, BinCapacity, BinSizes};
 use super::device::Device;
+use super::gradient::GradientStages;
 use super::growable_buffer::GrowableBuffer;
 use super::kernel::{TIMESTAMP_BYTES, timestamps};
 use super::layout::{Counters, Frame as GpuFrame, LONG_TILES};
@@ -68,8 +70,19 @@ pub(super) struct Chain {
     /// The largest needs of any region until now.
     high_water: Capacity,
     partitions: PartitionCache,
+    /// Of the last frame that was recorded.
+    sorted: Sorted,
+    /// Made with the first frame whose gradients are asked for.
+    gradient: Option<GradientStages>,
     /// Frames in flight count, too, while another is in its turn.
     pub(super) tally: Arc<Mutex<Tally>>,
+}
+
+/// Which of the two buffers of a sort are in order.
+#[derive(Clone, Copy, Debug, Default)]
+struct Sorted {
+    splats: usize,
+    touches: usize,
 }
 
 /// Counts of what the device has drawn.
@@ -147,6 +160,8 @@ impl Chain {
                 instances: INITIAL_INSTANCES.min(Bin::limit(&device)),
             },
             partitions: PartitionCache::default(),
+            sorted: Sorted::default(),
+            gradient: None,
             tally: Arc::default(),
             device: Arc::new(device),
         };

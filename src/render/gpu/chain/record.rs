@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use wgpu::SubmissionIndex;
 
-use super::{Chain, CurrentFrame, Source, add_time};
+use super::{Chain, CurrentFrame, Sorted, Source, add_time};
 use crate::FrameStats;
 use crate::constants::DEPTH_BITS;
 use crate::gpu::device::Device;
@@ -68,15 +68,14 @@ impl Chain {
         (stages, submission)
     }
 
-    /// Records the stages up to and including `last` that must still run. Returns which of the
-    /// buffers of the sort of splats are in order.
+    /// Records the stages up to and including `last` that must still run.
     pub(super) fn record(
         &mut self,
         recorder: &mut Recorder,
         source: Source<'_>,
         parameters: &GpuFrame,
         last: Stage,
-    ) -> usize {
+    ) {
         let must_run = |stage| stage <= last && source.needs(stage);
         let counts = match source {
             Source::Gaussians(work) => {
@@ -93,7 +92,7 @@ impl Chain {
             self.project.run(device, &mut pass, work, inputs, splats);
         }
 
-        let mut sorted = 0;
+        let mut sorted = Sorted::default();
         if must_run(Stage::Sort) {
             let mut pass = recorder.stage("sort");
             let jobs = SortJobs {
@@ -102,13 +101,13 @@ impl Chain {
             };
             let depth_bits = DEPTH_BITS + bits(parameters.views - 1);
             let data = Columns { keys: &splats.keys, values: &splats.indices, masks: None };
-            sorted = self.sort.run(device, &mut pass, scan, jobs, data, depth_bits);
+            sorted.splats = self.sort.run(device, &mut pass, scan, jobs, data, depth_bits);
         }
 
         if must_run(Stage::Bin) {
             self.bin.clear_ranges(&mut recorder.encoder);
             let mut pass = recorder.stage("bin");
-            self.bin.list_touches(device, &mut pass, plan, scan, splats, sorted);
+            self.bin.list_touches(device, &mut pass, plan, scan, splats, sorted.splats);
             drop(pass);
 
             let mut pass = recorder.stage("tile sort");
@@ -119,14 +118,15 @@ impl Chain {
             // Touches of no tile have the number after the last macro tile.
             let macro_tile_bits = bits(parameters.macro_tiles);
             let data = self.bin.touches();
-            let touches = self.sort.run(device, &mut pass, scan, jobs, data, macro_tile_bits);
+            sorted.touches = self.sort.run(device, &mut pass, scan, jobs, data, macro_tile_bits);
             drop(pass);
 
             let mut pass = recorder.stage("expand");
             let macro_tiles = parameters.macro_tiles;
+            let touches = sorted.touches;
             self.bin.list_instances(device, &mut pass, plan, scan, macro_tiles, touches);
         }
-        sorted
+        self.sorted = sorted;
     }
 }
 

@@ -80,20 +80,26 @@ pub(super) fn encode(chunk: &Chunk, index: usize, lines: &mut [u32]) {
     }
 }
 
-/// Encodes a unit quaternion in 62 bits: the index of the largest component, and the other three,
-/// whose absolute values are at most √½, in 20 bits each.
-///
-/// Components are off by at most 7e-7: the end of a needle of 10,000 px moves by less than 0.01 px.
-/// With 16 bits for each of the four components it would move by 0.2 px.
-fn quat_bits(wxyz: [f32; 4]) -> [u32; 2] {
+/// The index of a quaternion's largest component, and its sign: q and -q are the same rotation, so
+/// that the device has the one whose largest component is positive.
+pub(in crate::gpu) fn largest_component(wxyz: [f32; 4]) -> (usize, f32) {
     let mut index = 0;
     for k in 1..4 {
         if wxyz[k].abs() > wxyz[index].abs() {
             index = k;
         }
     }
-    // q and -q are the same rotation, so the largest component can be made positive.
-    let sign = f64::from(wxyz[index].signum());
+    (index, wxyz[index].signum())
+}
+
+/// Encodes a unit quaternion in 62 bits: the index of the largest component, and the other three,
+/// whose absolute values are at most √½, in 20 bits each.
+///
+/// Components are off by at most 7e-7: the end of a needle of 10,000 px moves by less than 0.01 px.
+/// With 16 bits for each of the four components it would move by 0.2 px.
+fn quat_bits(wxyz: [f32; 4]) -> [u32; 2] {
+    let (index, sign) = largest_component(wxyz);
+    let sign = f64::from(sign);
     let steps = |value: f32| {
         let fraction = sign * f64::from(value) * std::f64::consts::SQRT_2 * 0.5 + 0.5;
         (fraction.clamp(0.0, 1.0) * 1_048_575.0).round() as u64

@@ -20,6 +20,7 @@ use std::sync::{Arc, Weak};
 use rayon::prelude::*;
 use wgpu::{Buffer, BufferUsages};
 
+pub(super) use self::encode::largest_component;
 use self::encode::{LINE_BYTES, MAX_LINES};
 use self::free_lines::FreeLines;
 use super::device::Device;

@@ -5,15 +5,13 @@
 //! differs from them by at most the profile's `lens_error_px`.
 
 use fearless_simd::{f32x16, prelude::*};
-use glam::{DMat3, DQuat, DVec2, DVec3};
+use glam::{DMat3, DQuat, DVec3};
 
 use super::{Block, SplatDerivatives, add, add3, color, visible_lanes};
-use crate::cpu::blend_gradient::partial;
 use crate::cpu::lanes::Vec3x16;
 use crate::cpu::project::splat_block::SplatBlock;
 use crate::cpu::project::unscented::UnscentedChunkView;
-use crate::gradient::FootprintGradient;
-use crate::layout::PixelFilter;
+use crate::gradient::{FootprintGradient, partial};
 use wildcity_scene::chunk::{LANES, Lanes, column};
 
 /// Adds the derivatives by a block of 16 Gaussians, and by the view's twist.
@@ -49,7 +47,13 @@ pub(super) fn back_project<S: Simd>(
         let scale_m = DVec3::from_array([0, 1, 2].map(|axis| value(column::SCALE + axis)));
         let axes_m = DMat3::from_quat(rotation) * DMat3::from_diagonal(scale_m);
         let toward = DVec3::from_array([0, 1, 2].map(|axis| by_toward[axis][lane].into()));
-        let footprint = footprint_gradient(block, view, lane, toward);
+        let SplatDerivatives(by) = block.by;
+        let sums = by.map(|values| values[lane]);
+        let SplatBlock { l0, l1, l2, .. } = block.splats;
+        let factor = [l0[lane], l1[lane], l2[lane]];
+        let antialiased = block.cutoffs.antialiased;
+        let footprint =
+            FootprintGradient::from_sums(&sums, factor, &view.filter(), antialiased, toward);
         let center_m = view.origin_m() + mean_m(block.columns, lane);
         let shape = footprint.to_shape(view.view(), center_m, axes_m);
         let (ln_scale, quat) = shape.to_scale_and_rotation(axes_m, rotation);
@@ -77,40 +81,4 @@ pub(super) fn back_project<S: Simd>(
 /// A centre relative to its chunk, in metres.
 fn mean_m(columns: &[Lanes], lane: usize) -> DVec3 {
     DVec3::from_array([0, 1, 2].map(|axis| columns[column::MEAN + axis].0[lane].into()))
-}
-
-/// The derivatives by the place and the covariance of a splat, from the sums over its pixels.
-fn footprint_gradient(
-    block: Block<'_>,
-    view: &UnscentedChunkView<'_>,
-    lane: usize,
-    toward: DVec3,
-) -> FootprintGradient {
-    let SplatDerivatives(by) = block.by;
-    let sum = |place: usize| f64::from(by[place][lane]);
-    let SplatBlock { l0, l1, l2, .. } = block.splats;
-    let [l0, l1, l2] = [l0, l1, l2].map(|l| f64::from(l[lane]));
-    let ln2 = std::f64::consts::LN_2;
-    let g = sum(partial::G);
-    let filter = view.filter();
-    let shrink = if filter.is_shrunk() { PixelFilter::SHRINK_POWER * g } else { 0.0 };
-    // The total covariance has the inverse 2 ln2 Fᵀ F, which fits into the moments.
-    let uu = sum(partial::UU) - shrink / ln2;
-    let vv = sum(partial::VV) - shrink / ln2;
-    let uv = sum(partial::UV);
-    let row = uu * l1 + uv * l2;
-    let unit = 2.0 * ln2 * ln2;
-    let antialiased = if block.cutoffs.antialiased { 0.5 * g } else { 0.0 };
-    FootprintGradient {
-        mean_px: 2.0
-            * ln2
-            * DVec2::new(l0 * sum(partial::U), l1 * sum(partial::U) + l2 * sum(partial::V)),
-        covariance: unit * DVec3::new(l0 * l0 * uu, l0 * row, l1 * row + l2 * (uv * l1 + vv * l2)),
-        ln_blur_share: antialiased,
-        ln_det_native: shrink,
-        native_px2: filter.native_px2,
-        depth_m: sum(partial::DEPTH),
-        depth_is_z: false,
-        toward,
-    }
 }

@@ -13,9 +13,8 @@ use super::jobs::ChunkProjection;
 use super::light::Light;
 use super::splat_block::SplatBlock;
 use super::{CLUSTER, Job, pinhole as pinhole_projection, unscented};
-use crate::cpu::blend_gradient::{Partial, partial};
 use crate::cpu::lanes::Vec3x16;
-use crate::gradient::Twist;
+use crate::gradient::{Partial, Twist, partial};
 use crate::layout::Cutoffs;
 use wildcity_scene::chunk::{LANES, Lanes, column, columns};
 

@@ -4,10 +4,10 @@ use fearless_simd::{f32x16, prelude::*};
 
 use super::{Block, add, add3, by_quaternion, color, visible_lanes};
 use crate::constants::{MAX_SIGMA_PX, MIN_BLUR_SHARE};
-use crate::cpu::blend_gradient::partial;
 use crate::cpu::lanes::Vec3x16;
 use crate::cpu::project::axes::rotation_columns;
 use crate::cpu::project::pinhole::{along_axes, camera_coordinate, depth, jacobian_row};
+use crate::gradient::partial;
 use crate::layout::{ChunkView, PixelFilter};
 use wildcity_scene::chunk::{Lanes, column};
 

@@ -1,0 +1,59 @@
+//! Gradients of the gpu backend: the stages once more, backwards.
+//!
+//! | step | what it does |
+//! |---|---|
+//! | project to rasterize | as for an image of the Gaussians alone |
+//! | loss | the caller's, on the host |
+//! | blend backwards | tile by tile: ten sums for each of its splats (`rasterize_gradient.wgsl`) |
+//! | gather | the sums of a splat's tiles (`gather.wgsl`) |
+//! | project backwards | from splats to Gaussians (`project_gradient.wgsl`), view by view |
+//!
+//! Views of other cameras than static pinholes are projected backwards on the host, in f64, as the
+//! cpu backend does it ([`lens`]): a lens has no derivatives in WGSL.
+//!
+//! **The same input gives the same bytes** on one device: every sum has its place and its order, and
+//! nothing is added atomically.
+//!
+//! Beside the buffers of the frame there are 40 B for each (splat, tile) pair, 44 B for each (splat,
+//! macro tile) pair, 44 B for each splat, 20 B for each pixel, and 1 KiB for each column of each
+//! visible cluster. A frame must fit the device at once.
+//!
+//! The loss sees exact images; the Gaussians that the device projects are those of the mirror, whose
+//! colours are rounded to 16 bits of the cluster's largest and whose rotations to 20.
+
+mod clusters;
+mod lens;
+mod pixels;
+mod stages;
+
+pub(super) use self::clusters::GradientClusters;
+pub(super) use self::lens::{HostSplats, back_project};
+pub(super) use self::pixels::{images, pack};
+pub(super) use self::stages::{BackwardInputs, GradientStages};
+
+use super::Gpu;
+use crate::gradient::{Differentiate, GradientError, Gradients, LossGradient, check_frame};
+use crate::{Backend, Frame, FrameStats};
+use wildcity_scene::{RenderProfile, Scene};
+
+impl Differentiate for Gpu {
+    fn differentiate(
+        &self,
+        frame: &Frame<'_>,
+        depth: bool,
+        loss: LossGradient<'_>,
+        gradients: &mut Gradients,
+    ) -> Result<FrameStats, GradientError> {
+        check_frame(frame, self.name())?;
+        // The images of the Gaussians alone.
+        let scene = Scene { sky: None, ..frame.scene.clone() };
+        let profile = RenderProfile { background: [0.0; 3], ..*frame.profile };
+        let frame = Frame { scene: &scene, profile: &profile, views: frame.views };
+        self.in_turn(|chain| {
+            match chain.differentiate(&frame, depth, loss, gradients, &self.cull) {
+                Err(GradientError::Render(error)) => Err(error),
+                done => Ok(done),
+            }
+        })?
+    }
+}
