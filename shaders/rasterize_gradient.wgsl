@@ -63,7 +63,6 @@ fn main(
     let tile = span.first + index;
     let view = frame.view[tile_view(tile)];
     let corner = tile_corner(tile, view);
-    let block_bit = 1u << (thread / 4u);
     let first_pixel = thread_pixel(thread);
     let at_px = vec2f(corner + first_pixel) + 0.5;
     if thread == 0u {
@@ -103,11 +102,10 @@ fn main(
         workgroupBarrier();
         let was_done = done;
         for (var part = 0u; part < count; part += PART) {
-            for (var k = 0u; k < PART; k++) {
-                if (splat_blocks[part + k] & block_bit) != 0u {
-                    done = pass_splat(part + k, at_px, k * SUMS * THREADS + thread, done);
-                }
-            }
+            done = walk(part, 0u, at_px, thread, done);
+            done = walk(part, 1u, at_px, thread, done);
+            done = walk(part, 2u, at_px, thread, done);
+            done = walk(part, 3u, at_px, thread, done);
             workgroupBarrier();
             if thread < PART * SUMS && part + thread / SUMS < count {
                 instance_sums[(first + part) * SUMS + thread] = block_sum(thread * THREADS, splat_blocks[part + thread / SUMS]);
@@ -120,14 +118,43 @@ fn main(
     }
 }
 
-// The sum of the values from `at` on, one of each thread, over the threads of some blocks.
+// Walks past splat `k` of a part if it reaches the thread's block. Returns whether the thread's pixels have all stopped.
+fn walk(part: u32, k: u32, at_px: vec2f, thread: u32, done: bool) -> bool {
+    if (splat_blocks[part + k] & (1u << (thread / 4u))) == 0u {
+        return done;
+    }
+    return pass_splat(part + k, at_px, k * SUMS * THREADS + thread, done);
+}
+
+// The sum of the values from `at` on, one of each thread, over the threads of some blocks. Without a loop: see
+// `max_gradient_splats` in `src/render/gpu/device.rs`.
 fn block_sum(at: u32, blocks: u32) -> f32 {
     var sum = 0.0;
-    for (var rest = blocks; rest != 0u; rest &= rest - 1u) {
-        let four = at + 4u * firstTrailingBit(rest);
-        sum += (thread_sums[four] + thread_sums[four + 1u]) + (thread_sums[four + 2u] + thread_sums[four + 3u]);
-    }
+    sum = plus_block(sum, at, blocks, 0u);
+    sum = plus_block(sum, at, blocks, 1u);
+    sum = plus_block(sum, at, blocks, 2u);
+    sum = plus_block(sum, at, blocks, 3u);
+    sum = plus_block(sum, at, blocks, 4u);
+    sum = plus_block(sum, at, blocks, 5u);
+    sum = plus_block(sum, at, blocks, 6u);
+    sum = plus_block(sum, at, blocks, 7u);
+    sum = plus_block(sum, at, blocks, 8u);
+    sum = plus_block(sum, at, blocks, 9u);
+    sum = plus_block(sum, at, blocks, 10u);
+    sum = plus_block(sum, at, blocks, 11u);
+    sum = plus_block(sum, at, blocks, 12u);
+    sum = plus_block(sum, at, blocks, 13u);
+    sum = plus_block(sum, at, blocks, 14u);
+    sum = plus_block(sum, at, blocks, 15u);
     return sum;
+}
+
+fn plus_block(sum: f32, at: u32, blocks: u32, block: u32) -> f32 {
+    if (blocks & (1u << block)) == 0u {
+        return sum;
+    }
+    let four = at + 4u * block;
+    return sum + ((thread_sums[four] + thread_sums[four + 1u]) + (thread_sums[four + 2u] + thread_sums[four + 3u]));
 }
 
 // Walks past splat `k` of the batch, and writes the sums over four pixels, `THREADS` apart from `at` on. Returns whether all

@@ -6,13 +6,14 @@ use clap::ValueEnum;
 
 use wildcity_render::Backend;
 use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_render::gradient::Differentiate;
 use wildcity_render::reference::Reference;
 #[cfg(feature = "gpu")]
 use wildcity_render::stage::Stage;
 #[cfg(feature = "gpu")]
 use wildcity_render::{
     automatic::{self, Selection},
-    gpu::{AdapterChoice, Gpu, MemoryLimits},
+    gpu::{AdapterChoice, Gpu, GpuError, MemoryLimits},
     hybrid::HybridBackend,
 };
 
@@ -192,8 +193,30 @@ impl HardwareOptions {
     /// Creates the gpu backend.
     #[cfg(feature = "gpu")]
     pub fn gpu(&self) -> anyhow::Result<Gpu> {
-        let choice = self.device.clone().map_or(AdapterChoice::Best, AdapterChoice::Named);
-        Ok(Gpu::with_limits(&choice, self.threads, self.memory_limits())?)
+        Ok(self.gpu_or(AdapterChoice::Best)?)
+    }
+
+    /// Every backend that computes gradients here: cpu, and gpu if `--device` names a device or the
+    /// machine has a hardware device.
+    pub fn differentiating(&self) -> anyhow::Result<Vec<Box<dyn Differentiate>>> {
+        #[allow(unused_mut, reason = "a build without gpu adds none")]
+        let mut backends: Vec<Box<dyn Differentiate>> = vec![Box::new(self.cpu()?)];
+        #[cfg(feature = "gpu")]
+        match self.gpu_or(AdapterChoice::Hardware) {
+            Ok(gpu) => backends.push(Box::new(gpu)),
+            Err(GpuError::NoAdapter) if self.device.is_none() => {}
+            Err(error) => return Err(error.into()),
+        }
+        #[cfg(not(feature = "gpu"))]
+        anyhow::ensure!(self.device.is_none(), "--device: {}", built_without("gpu"));
+        Ok(backends)
+    }
+
+    /// Creates the gpu backend on the device that `--device` names, or on that of choice.
+    #[cfg(feature = "gpu")]
+    fn gpu_or(&self, choice: AdapterChoice) -> Result<Gpu, GpuError> {
+        let choice = self.device.clone().map_or(choice, AdapterChoice::Named);
+        Gpu::with_limits(&choice, self.threads, self.memory_limits())
     }
 
     #[cfg(feature = "gpu")]

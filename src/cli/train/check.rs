@@ -14,7 +14,8 @@ use crate::cli::progress;
 
 /// Compare the gradients of every backend on this machine with their definition.
 ///
-/// The definition is the reference backend, which computes in f64 and is judged by its own
+/// The backends are cpu, and gpu if there is a hardware device or --device names one. The
+/// definition is the reference backend, which computes in f64 and is judged by its own
 /// differences. A row is one scene: streets by every kind of camera, and extremes such as needles
 /// and a thousand layers. A number is the largest difference of a derivative, as a share of the
 /// largest one by these parameters. With vectors that others computed, the reference and the
@@ -64,8 +65,8 @@ struct Report {
 
 impl Check {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let cpu = self.hardware.cpu()?;
-        let backends: [&dyn Differentiate; 1] = [&cpu];
+        let backends = self.hardware.differentiating()?;
+        let backends: Vec<&dyn Differentiate> = backends.iter().map(AsRef::as_ref).collect();
         let in_data = || {
             let data = std::env::var_os("WILDCITY_DATA")?;
             Some(PathBuf::from(data).join("gradients/vectors.safetensors"))
@@ -83,9 +84,9 @@ impl Check {
         })?;
         let mut times = Vec::new();
         if self.time {
-            for backend in backends {
+            for backend in &backends {
                 let mut progress = |what: &str| bar.set_message(what.to_owned());
-                times.extend(check::times(backend, &self.gaussians, &mut progress)?);
+                times.extend(check::times(*backend, &self.gaussians, &mut progress)?);
             }
         }
         bar.finish_and_clear();

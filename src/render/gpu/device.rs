@@ -347,10 +347,10 @@ impl Device {
 
     /// Most splats of a tile whose gradients can be summed.
     ///
-    /// A batch of 64 takes at most 370 iterations: 1, and for each four splats 1, 5 for their
-    /// loop, and 17 for the blocks of a sum; a thread takes 17 to find its view besides.
+    /// A batch of 64 takes at most 18 iterations: 1, one for each four splats, and 1 at their end;
+    /// a thread takes 17 to find its view besides.
     pub(super) fn max_gradient_splats(&self) -> u64 {
-        self.loop_iterations().map_or(u64::MAX, |most| (most - 40) / 370 * 64)
+        self.loop_iterations().map_or(u64::MAX, |most| (most - 40) / 18 * 64)
     }
 
     /// Most macro tiles of a view whose sums a splat can gather: a search takes at most 28
