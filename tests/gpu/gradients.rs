@@ -1,11 +1,16 @@
 //! Gradients of the gpu backend against `reference`, and that they repeat.
 
 use wildcity_render::Frame;
-use wildcity_render::compare::gradients::{by_group, waves};
+use wildcity_render::compare::gradients::{GroupError, by_group, group_errors, waves};
+use wildcity_render::gpu::shaders::Shaders;
 use wildcity_render::gradient::{Differentiate, Gradients};
+use wildcity_render::reference::Reference;
 use wildcity_scene::{RenderProfile, Scene};
 
-use crate::gradient_cases::{check_actors, check_lenses, check_pinholes};
+use crate::gpu::gpu_with;
+use crate::gradient_cases::{
+    check_actors, check_lenses, check_pinholes, differentiate, mutation_case,
+};
 use crate::shared_gpu;
 use crate::streets::{street, turning_views};
 
@@ -40,5 +45,63 @@ fn gradients_repeat_to_the_byte() {
     let first = differ();
     for repeat in 0..20 {
         assert!(differ() == first, "repeat {repeat}");
+    }
+}
+
+/// Faults of the way back: shader, original text, and its replacement.
+const MUTATIONS: &[(&str, &str, &str)] = &[
+    ("rasterize_gradient", "behind -= weight * energy;", ""),
+    ("rasterize_gradient", "- behind / (1.0 - alpha)", "- behind"),
+    ("rasterize_gradient", "counts & (peak <= vec4f(frame.alpha_cap))", "counts"),
+    ("rasterize_gradient", "color_depth.w * by_depth", "color_depth.w * by_red"),
+    ("rasterize_gradient", "sum_gu * offsets.v", "sum_gu * offsets.v * 1.001"),
+    ("rasterize_gradient", "plus_block(sum, at, blocks, 13u)", "sum"),
+    ("rasterize_gradient", "derivatives[plane + 2u * PLANE]", "derivatives[plane + PLANE]"),
+    ("gather", "touch_ranks[middle] < rank", "touch_ranks[middle] <= rank"),
+    ("gather", "ranks[splat_indices[rank]] = rank", "ranks[splat_indices[rank]] = rank / 2u"),
+    ("gather", "a.vv + b.vv", "a.vv"),
+    ("gather", "column <= last.x", "column < last.x"),
+    ("project_gradient", "sums.uu - scale.total / LN_2", "sums.uu"),
+    ("project_gradient", "2.0 * before / det_before", "before / det_before"),
+    ("project_gradient", "(shrink - before) / det_native", "shrink / det_native"),
+    ("project_gradient", "vec3f(yy + native.y, -xy", "vec3f(yy + native.y, xy"),
+    ("project_gradient", "view.focal_px * (by_px - of_shape)", "view.focal_px * by_px"),
+    ("project_gradient", "sums.depth - along / z", "sums.depth"),
+    ("project_gradient", "cross(q_x, row_x) + cross(q_y, row_y)", "cross(q_x, row_x)"),
+    ("project_gradient", "by_point.z * forward + by_toward", "by_point.z * forward"),
+    ("project_gradient", "colors[slot].rgb > vec3f(0.0)", "colors[slot].rgb > vec3f(-1.0)"),
+    ("project_gradient", "(by_d - dot(d, by_d) * d)", "by_d"),
+    ("project_gradient", "8.0 * d.y * d.z", "-8.0 * d.y * d.z"),
+    ("project_gradient", "-a * vec3f(d.z, 0.0, d.x)", "-a * vec3f(d.x, 0.0, d.z)"),
+    ("project_gradient", "cross(twice, v)", "cross(v, twice)"),
+    ("project_gradient", "rhos[thread] += rhos[thread + half];", ""),
+    ("project_gradient", "cross(point, by_point) + to_camera * torque", "cross(point, by_point)"),
+    ("project_gradient_actors", "rgb * light.tint * factor", "rgb * factor"),
+    (
+        "project_gradient",
+        "gradients[first_value + line * CLUSTER] += value",
+        "gradients[first_value + line * CLUSTER] = value",
+    ),
+];
+
+#[test]
+fn a_fault_of_each_formula_is_noticed() {
+    let case = mutation_case();
+    let frame = case.frame();
+    let truth = differentiate(&Reference, frame.scene, frame.profile, frame.views).1;
+    let undetected: Vec<_> = MUTATIONS
+        .iter()
+        .filter(|(shader, original, replacement)| {
+            let shaders = Shaders::default().with_mutation(shader, original, replacement);
+            let broken = gpu_with(shaders.unwrap_or_else(|| panic!("{shader}: {original}")));
+            let ours = differentiate(&*broken, frame.scene, frame.profile, frame.views).1;
+            let holds = |group: &GroupError| group.error < 1e-4 && group.cosine > 0.99999;
+            group_errors(&ours, &truth).iter().all(holds)
+        })
+        .collect();
+    assert!(undetected.is_empty(), "{undetected:#?}");
+    let ours = differentiate(&**shared_gpu(), frame.scene, frame.profile, frame.views).1;
+    for GroupError { group, error, .. } in group_errors(&ours, &truth) {
+        assert!(error < 1e-4, "without a fault {group} is off by {error:e}");
     }
 }

@@ -5,21 +5,20 @@ use std::iter::zip;
 use std::sync::Arc;
 
 use glam::{DQuat, DVec3};
-use wildcity_render::compare::gradients::{GroupError, by_group, group_errors, waves};
+use wildcity_render::compare::gradients::{by_group, waves};
 use wildcity_render::cpu::{Cpu, Simd};
-use wildcity_render::gradient::{Differentiate, GaussianImages, Gradients, Twist};
+use wildcity_render::gradient::{Differentiate, Gradients, Twist};
+use wildcity_render::reference::Gaussian;
 use wildcity_render::reference::gradient::{Decisions, Images, Source, SourceGradient, Sources};
-use wildcity_render::reference::{Gaussian, Reference};
 use wildcity_render::{Frame, RollingShutter, View};
 use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::geometry::camera::{Pinhole, ShutterDirection};
 use wildcity_scene::geometry::{Camera, Pose};
-use wildcity_scene::{RenderProfile, Scene};
+use wildcity_scene::{Chunk, RenderProfile, Scene};
 
 use crate::gradient_cases::{check_actors, check_lenses, check_pinholes};
 use crate::images::cpu;
-use crate::lenses::{lenses, rolling_view, street_scene};
-use crate::placed::{actor, chunk, on_street, views as placed_views};
+use crate::lenses::lenses;
 use crate::scene_files::Random;
 use crate::streets::{street, turning_views};
 
@@ -53,7 +52,7 @@ fn gradients_do_not_depend_on_threads_or_on_earlier_frames() {
     for threads in [2, 4, 7] {
         let backend = Cpu::new(threads, Simd::Best).unwrap();
         let mut gradients = Gradients::default();
-        for repeat in 0..25 {
+        for repeat in 0..34 {
             assert!(differ(&backend, &mut gradients) == one, "{threads} threads, {repeat}");
         }
     }
@@ -106,12 +105,30 @@ fn derivative(gaussian: &Gaussian, gradient: &SourceGradient, parameter: usize) 
     }
 }
 
+/// An actor that has turned and moves during the exposure. Its Gaussians are those of the test.
+fn turned_actor() -> PlacedChunk {
+    let pose = Pose {
+        position_m: DVec3::new(4.0, -2.0, 1.5),
+        rotation: DQuat::from_rotation_z(0.7) * DQuat::from_rotation_x(0.2),
+    };
+    let before = Pose { position_m: pose.position_m - DVec3::new(0.05, 0.02, 0.0), ..pose };
+    let chunk = Arc::new(Chunk::new([0, 0], DVec3::ZERO, 0, 0));
+    PlacedChunk { world_from_actor_at_start: before, ..PlacedChunk::at_rest(chunk, pose, 0) }
+}
+
 /// A scene of 24 Gaussians in front of a camera; every third lies at an extreme: long and thin, at
-/// the cap, of a quaternion of another length, close to the camera.
+/// the cap, of a quaternion of another length, close to the camera, just beyond the near plane. The
+/// last eight are those of an actor that has turned and, under a rolling shutter, moves.
 fn random_sources<'a>(random: &mut Random, view: View, profile: &'a RenderProfile) -> Sources<'a> {
+    let views = vec![view, view.seen_from(&turned_actor())];
     let source = |i: usize| {
         let mut number = |low: f64, high: f64| f64::from(random.between(low, high));
-        let depth_m = if i == 5 { number(0.3, 0.6) } else { number(2.0, 9.0) };
+        let depth_m = match i {
+            5 => number(0.3, 0.6),
+            // The near plane is at 0.01 m. A camera that moves by 0.3 m would pass it.
+            6 if view.rolling_shutter.is_none() => number(0.0105, 0.011),
+            _ => number(2.0, 9.0),
+        };
         let in_camera_m = depth_m * DVec3::new(number(-0.8, 0.8), number(-0.6, 0.6), 1.0);
         let long = if i.is_multiple_of(3) { 20.0 } else { 1.0 };
         let scale = DVec3::new(long * number(0.02, 0.05), number(0.03, 0.3), number(0.005, 0.3));
@@ -122,8 +139,9 @@ fn random_sources<'a>(random: &mut Random, view: View, profile: &'a RenderProfil
             number(-1.0, 1.0),
             number(0.1, 1.0),
         );
+        let of_view = usize::from(i >= 16);
         let gaussian = Gaussian {
-            mean_m: view.world_from_camera.transform_point(in_camera_m),
+            mean_m: views[of_view].world_from_camera.transform_point(in_camera_m),
             rotation: rotation * length,
             scale_m: scale * depth_m / 4.0,
             log2_opacity: if i % 5 == 1 { -1e-4 } else { number(-3.0, -0.05) },
@@ -131,10 +149,10 @@ fn random_sources<'a>(random: &mut Random, view: View, profile: &'a RenderProfil
                 0.5 * DVec3::new(number(-0.5, 0.7), number(-0.5, 0.7), number(-0.5, 0.7))
             }),
         };
-        Source { gaussian, view: 0, tint: DVec3::new(1.0, 0.8, 1.1) }
+        Source { gaussian, view: of_view, tint: DVec3::new(1.0, 0.8, 1.1) }
     };
     let gaussians = (0..24).map(source).collect();
-    Sources { profile, gaussians, views: vec![view], depth_is_z: false }
+    Sources { profile, gaussians, views: views.clone(), depth_is_z: false }
 }
 
 /// Fifty random scenes, by every kind of camera: every derivative of the reference is that of its
@@ -186,10 +204,12 @@ fn reference_has_the_derivatives_of_its_own_images() {
             assert!(error < 2e-6, "scene {scene}, {name}, rolls {rolls}, {what}: {ours} {theirs}");
         };
         for parameter in 0..59 {
-            // Quaternions have lengths of three sizes: steps are in proportion to these.
-            let is_quat = (3..7).contains(&parameter);
-            let unit = |i: usize| {
-                if is_quat { sources.gaussians[i].gaussian.rotation.length() } else { 1.0 }
+            // Quaternions have lengths of three sizes, and one Gaussian lies at the near plane: steps
+            // are in proportion to these.
+            let unit = |i: usize| match parameter {
+                3..7 => sources.gaussians[i].gaussian.rotation.length(),
+                0..3 if i == 6 => 0.005,
+                _ => 1.0,
             };
             let values: Vec<f64> = (0..24)
                 .map(|i| {
@@ -215,15 +235,20 @@ fn reference_has_the_derivatives_of_its_own_images() {
         }
         let twist = twist.to_array();
         let most = twist.iter().fold(0.0_f64, |most, value| most.max(value.abs()));
+        // Small against the depth of the nearest one.
+        let unit = |axis: usize| if axis < 3 { 0.005 } else { 1.0 };
         for axis in 0..6 {
             let theirs = difference(|step| {
                 let mut values = [0.0; 6];
-                values[axis] = step;
+                values[axis] = unit(axis) * step;
                 let mut sources = sources.clone();
-                sources.views[0] = view.twisted(Twist::from_array(values));
+                for view in &mut sources.views {
+                    *view = view.twisted(Twist::from_array(values));
+                }
                 loss(&sources, &decisions, &by)
             });
-            check(format!("twist {axis}"), twist[axis], theirs, most);
+            let ours = unit(axis) * twist[axis];
+            check(format!("twist {axis}"), ours, theirs, unit(axis) * most);
         }
     }
     eprintln!("largest error of 50 scenes: {worst:.1e}");

@@ -111,3 +111,32 @@ pub(crate) fn check_actors(backend: &dyn Differentiate) {
         check_against_reference(name, backend, &scene, &RenderProfile::default(), &[view]);
     }
 }
+
+/// A scene in which every formula matters: views smaller than their native size, of which each sees
+/// what the others do, a twin and a tinted actor with all spherical harmonics, antialiased.
+pub(crate) struct MutationCase {
+    scene: Scene,
+    profile: RenderProfile,
+    views: Vec<View>,
+}
+
+pub(crate) fn mutation_case() -> MutationCase {
+    let car = chunk(&actor(300, 3, 5));
+    let tint = [0.4, 1.0, 0.7];
+    let placed =
+        vec![PlacedChunk { tint, ..PlacedChunk::at_rest(car, on_street(24.0, 1.5, 0.3), 0) }];
+    let scene = Scene { placed, ..Scene::from_gaussians(&street(800, 3, 7)) };
+    let small = |(_, view): (_, View)| View { camera: view.camera.scaled(96, 64).unwrap(), ..view };
+    let pinholes = placed_views().into_iter().filter(|(_, view)| view.is_static_pinhole());
+    let views: Vec<View> =
+        pinholes.map(small).chain(turning_views().into_iter().map(|v| small(("", v)))).collect();
+    // So low that many pixels reach it.
+    let profile = RenderProfile { antialiased: true, alpha_cap: 0.8, ..RenderProfile::default() };
+    MutationCase { scene, profile, views }
+}
+
+impl MutationCase {
+    pub(crate) fn frame(&self) -> Frame<'_> {
+        Frame { scene: &self.scene, profile: &self.profile, views: &self.views }
+    }
+}

@@ -10,7 +10,7 @@ use fearless_simd::{f32x16, prelude::*};
 
 use super::batch::Matched;
 use super::lanes::splats;
-use super::math::{exp2, recip};
+use super::math::exp2;
 use super::resolve::{BLOCKS, TileSums};
 use crate::gradient::{Partial, partial};
 use crate::layout::Cutoffs;
@@ -44,6 +44,8 @@ pub(super) struct TileWalk {
     behind: [[f32; LANES]; BLOCKS],
     /// A bit for each block in which some pixel has not stopped.
     pub(super) live: u16,
+    /// Whether all derivatives by the tile's pixels are finite.
+    pub(super) is_finite: bool,
 }
 
 impl TileWalk {
@@ -55,18 +57,28 @@ impl TileWalk {
         by: &TileDerivatives,
     ) -> Self {
         let load = |values: &[f32; LANES]| f32x16::load_array_ref(simd, values);
+        let zero = f32x16::splat(simd, 0.0);
         let mut behind = [[0.0; LANES]; BLOCKS];
+        // 0 x is NaN for infinity and NaN, and so is a sum with it.
+        let mut test = zero;
         for (block, behind) in behind.iter_mut().enumerate() {
-            let end = load(&sums.transmittance[block]) * load(&by.opacity[block]);
-            let mut sum = load(&sums.rgb[0][block]).mul_add(load(&by.rgb[0][block]), -end);
-            sum = load(&sums.rgb[1][block]).mul_add(load(&by.rgb[1][block]), sum);
-            sum = load(&sums.rgb[2][block]).mul_add(load(&by.rgb[2][block]), sum);
+            let by_opacity = load(&by.opacity[block]);
+            let mut sum = -(load(&sums.transmittance[block]) * by_opacity);
+            test = by_opacity.mul_add(zero, test);
+            for channel in 0..3 {
+                let by_channel = load(&by.rgb[channel][block]);
+                sum = load(&sums.rgb[channel][block]).mul_add(by_channel, sum);
+                test = by_channel.mul_add(zero, test);
+            }
             if DEPTH {
-                sum = load(&sums.depth_m[block]).mul_add(load(&by.depth_m[block]), sum);
+                let by_depth = load(&by.depth_m[block]);
+                sum = load(&sums.depth_m[block]).mul_add(by_depth, sum);
+                test = by_depth.mul_add(zero, test);
             }
             sum.store_array(behind);
         }
-        Self { running: [[1.0; LANES]; BLOCKS], behind, live: u16::MAX }
+        let is_finite = test.simd_eq(zero).all_true();
+        Self { running: [[1.0; LANES]; BLOCKS], behind, live: u16::MAX, is_finite }
     }
 
     /// Walks past one splat in the blocks that it touches, and returns its sums over them.
@@ -82,7 +94,6 @@ impl TileWalk {
         let splat = |value: f32| f32x16::splat(simd, value);
         let load = |values: &[f32; LANES]| f32x16::load_array_ref(simd, values);
         let zero = splat(0.0);
-        let one = splat(1.0);
         let cap = splat(cutoffs.alpha_cap);
         let cut = splat(cutoffs.log2_alpha_cut);
         let stop = splat(cutoffs.stop);
@@ -108,7 +119,8 @@ impl TileWalk {
             let after = (-alpha).mul_add(running, running);
             let counts = after.simd_gt(stop);
             let weight = counts.select(alpha * running, zero);
-            after.max(floor).store_array(&mut self.running[block]);
+            let after = after.max(floor);
+            after.store_array(&mut self.running[block]);
 
             let by_red = load(&by.rgb[0][block]);
             let by_green = load(&by.rgb[1][block]);
@@ -122,10 +134,10 @@ impl TileWalk {
             let behind = (-weight).mul_add(energy, load(&self.behind[block]));
             behind.store_array(&mut self.behind[block]);
 
-            // 1 - alpha is at least 1 - cap.
-            let by_alpha = running.mul_add(energy, -(behind * recip(simd, one - alpha)));
-            // Nothing at the cap: alpha does not change there.
-            let g = (counts & raw.simd_le(cap)).select(by_alpha * alpha, zero);
+            // T e - behind/(1 - alpha) is (e - behind/T') T with the transmittance T' behind the
+            // splat, and T alpha is the weight. Nothing at the cap: alpha does not change there.
+            let by_weight = energy - behind / after;
+            let g = raw.simd_le(cap).select(weight * by_weight, zero);
             let gu = g * u;
             let gv = g * v;
             sums[partial::G] += g;

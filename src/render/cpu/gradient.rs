@@ -19,10 +19,12 @@
 //! Gaussian adds its views in order. No sum is added to atomically.
 
 use std::iter::zip;
+use std::sync::atomic::AtomicBool;
 use std::sync::atomic::Ordering::Relaxed;
 
 use fearless_simd::{Simd, dispatch};
 use parking_lot::Mutex;
+use prefetch_index::prefetch_index;
 use rayon::prelude::*;
 
 use super::batch::{BATCH, Batch};
@@ -38,7 +40,7 @@ use super::{BusyLane, Cpu, Scratch, StageTimer};
 use crate::constants::{BLOCK_PX, TILE_PX};
 use crate::gradient::{
     ChunkGradients, Differentiate, GaussianImages, GradientError, Gradients, LossGradient, Partial,
-    Twist, check_frame, check_loss, mask, partial,
+    Twist, check_finite, check_frame, check_sizes, mask, partial,
 };
 use crate::layout::Cutoffs;
 use crate::stage::Stage;
@@ -131,16 +133,12 @@ impl Differentiate for Cpu {
                 timer.finish("rasterize", &mut stats);
                 let mut by_images = loss(images);
                 timer.finish("loss", &mut stats);
-                check_loss(frame, depth, &by_images)?;
-                for (by_images, view) in by_images.iter_mut().zip(views) {
-                    mask(view, by_images);
-                }
-
+                check_sizes(frame, depth, &mut by_images)?;
                 gradients.reset(frame.scene, views.len());
                 timer.finish("check", &mut stats);
                 for (view, by_images) in by_images.iter().enumerate() {
                     let by_macro_tile =
-                        dispatch!(level, simd => kept.blend_backwards(simd, view, by_images));
+                        dispatch!(level, simd => kept.blend_backwards(simd, view, by_images))?;
                     timer.finish("blend backwards", &mut stats);
                     let units = units(&mut gradients.chunks);
                     let twists = bins.gather(view, projected, &by_macro_tile, |jobs_of, sums| {
@@ -232,27 +230,38 @@ impl Kept<'_> {
     }
 
     /// The sums of every pair of every macro tile of a view.
+    ///
+    /// # Errors
+    /// A derivative that is not finite.
     #[inline(always)]
     fn blend_backwards<S: Simd>(
         &self,
         simd: S,
         view: usize,
         by_images: &GaussianImages,
-    ) -> Vec<Vec<Partial>> {
+    ) -> Result<Vec<Vec<Partial>>, GradientError> {
         let macro_tiles = &self.views[view].0;
         let sums: Vec<Mutex<Vec<Partial>>> = macro_tiles.iter().map(|_| Mutex::default()).collect();
+        let is_finite = AtomicBool::new(true);
         self.input.bins.by_work(view).into_par_iter().with_max_len(1).for_each(|number| {
             let mut walker = self.walkers.lock().pop().unwrap_or_default();
             let partials = simd.vectorize(
                 #[inline(always)]
                 || self.walk_macro_tile(simd, view, number, by_images, &mut walker),
             );
-            *sums[number].lock() = partials;
+            match partials {
+                Some(partials) => *sums[number].lock() = partials,
+                None => is_finite.store(false, Relaxed),
+            }
             self.walkers.lock().push(walker);
         });
-        sums.into_iter().map(Mutex::into_inner).collect()
+        if !is_finite.into_inner() {
+            check_finite(view, by_images)?;
+        }
+        Ok(sums.into_iter().map(Mutex::into_inner).collect())
     }
 
+    /// `None` if a derivative by its pixels is not finite: they are read here, and nowhere else.
     #[inline(always)]
     fn walk_macro_tile<S: Simd>(
         &self,
@@ -261,7 +270,7 @@ impl Kept<'_> {
         number: usize,
         by_images: &GaussianImages,
         walker: &mut Walker,
-    ) -> Vec<Partial> {
+    ) -> Option<Vec<Partial>> {
         let Walker { macro_tile, batch, by } = walker;
         let Input { bins, projected, views, cutoffs, .. } = self.input;
         let kept = self.views[view].0[number].lock();
@@ -270,14 +279,22 @@ impl Kept<'_> {
         let mut partials = vec![[0.0; partial::COUNT]; macro_tile.len()];
         let grid = Grid::new(&views[view]);
         let has_depth = !by_images.depth_sum_m.is_empty();
-        for ((within, [column, row]), sums) in grid.macro_tile_tiles(number).zip(&kept.tiles) {
+        let mut tiles = grid.macro_tile_tiles(number).zip(&kept.tiles).peekable();
+        while let Some(((within, [column, row]), sums)) = tiles.next() {
             let at_px = [column * TILE_PX, row * TILE_PX];
             by.read(by_images, &views[view], at_px);
+            // Those of the next tile arrive while this one is walked.
+            if let Some(((_, next), sums)) = tiles.peek() {
+                prefetch(by_images, &views[view], next.map(|tile| tile * TILE_PX), sums);
+            }
             let mut walk = if has_depth {
                 TileWalk::new::<S, true>(simd, sums, by)
             } else {
                 TileWalk::new::<S, false>(simd, sums, by)
             };
+            if !walk.is_finite {
+                return None;
+            }
             for indices in macro_tile.tile(within).chunks(BATCH) {
                 if walk.live == 0 {
                     break;
@@ -301,7 +318,7 @@ impl Kept<'_> {
                 }
             }
         }
-        partials
+        Some(partials)
     }
 }
 
@@ -382,9 +399,15 @@ impl TileDerivatives {
             #[inline(always)]
             |Span { pixel, block, lane, len }| {
                 let rgb = &images.rgb[3 * pixel..3 * (pixel + len)];
-                for (k, rgb) in rgb.as_chunks::<3>().0.iter().enumerate() {
-                    for (channel, &value) in rgb.iter().enumerate() {
-                        self.rgb[channel][block][lane + k] = value;
+                for channel in 0..3 {
+                    // A whole row at once: shuffles of vectors, where one value after the other
+                    // took a tenth of the walk.
+                    let to = &mut self.rgb[channel][block][lane..lane + len];
+                    match (rgb.first_chunk::<12>(), to.first_chunk_mut::<4>()) {
+                        (Some(rgb), Some(to)) => *to = [0, 3, 6, 9].map(|k| rgb[k + channel]),
+                        _ => {
+                            to.iter_mut().enumerate().for_each(|(k, to)| *to = rgb[3 * k + channel])
+                        }
                     }
                 }
                 self.opacity[block][lane..lane + len]
@@ -395,6 +418,28 @@ impl TileDerivatives {
                 }
             },
         );
+    }
+}
+
+/// Fetches the derivatives of the tile at `at_px`, and its sums, into the cache.
+#[inline(always)]
+fn prefetch(images: &GaussianImages, view: &View, at_px: [u32; 2], sums: &TileSums) {
+    // Values of a cache line.
+    const LINE: usize = 16;
+    let [left, top] = at_px.map(|px| px as usize);
+    for y in top..top + TILE_PX as usize {
+        let pixel = y * view.camera.width_px as usize + left;
+        for line in 0..3 {
+            prefetch_index(&images.rgb, 3 * pixel + line * LINE);
+        }
+        prefetch_index(&images.opacity, pixel);
+        prefetch_index(&images.depth_sum_m, pixel);
+    }
+    for block in 0..BLOCKS {
+        for channel in &sums.rgb {
+            prefetch_index(channel, block);
+        }
+        prefetch_index(&sums.transmittance, block);
     }
 }
 

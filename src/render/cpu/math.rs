@@ -66,23 +66,6 @@ pub(super) fn log2<S: Simd>(simd: S, x: f32x16<S>) -> f32x16<S> {
     (t * series).mul_add(splat(std::f64::consts::LOG2_E), exponent)
 }
 
-/// `1/x` of positive normal numbers, within 2e-7: seven instructions that take a fourth of a
-/// division's time.
-///
-/// Subtracting the bits from a constant negates the exponent and leaves an error of 12 %. Each step
-/// `r (1 + e + e²)` with the error `e = 1 - x r` cubes it: 2e-3, then 5e-9.
-#[inline(always)]
-pub(super) fn recip<S: Simd>(simd: S, x: f32x16<S>) -> f32x16<S> {
-    let one = f32x16::splat(simd, 1.0);
-    let bits: i32x16<S> = x.bitcast();
-    let mut r: f32x16<S> = (i32x16::splat(simd, 0x7EF3_11C7) - bits).bitcast();
-    for _ in 0..2 {
-        let error = (-x).mul_add(r, one);
-        r = error.mul_add(error, error).mul_add(r, r);
-    }
-    r
-}
-
 /// `2^x` for x in [-126, 0], within 2e-7, and exact for whole x. Elsewhere the result is arbitrary,
 /// and the call is safe.
 ///
@@ -121,19 +104,6 @@ mod tests {
                 atan2(simd, sine, cosine).to_array()[0]
             });
             assert!((f64::from(found) - angle).abs() < 2e-7, "{angle} is {found}");
-        }
-    }
-
-    #[test]
-    fn reciprocals_are_within_two_units_of_f32() {
-        for i in 0..=20_000 {
-            // From 1e-2, what a capped alpha leaves, to 1; and four powers of two beyond.
-            let x = (0.01 + 0.99 * i as f32 / 20_000.0) * [1.0, 16.0, 1e-6][i % 3];
-            let found = dispatch!(Level::new(), simd => {
-                recip(simd, f32x16::splat(simd, x)).to_array()[0]
-            });
-            let error = f64::from(found) * f64::from(x) - 1.0;
-            assert!(error.abs() < 2e-7, "1/{x} is {found}, off by {error:e}");
         }
     }
 

@@ -76,7 +76,8 @@ pub struct GaussianImages {
 }
 
 /// Computes the derivatives of a loss by the images of all views, given these. Both are in the
-/// order of the views; derivatives by depth may be empty. It must not call the backend, which waits
+/// order of the views; derivatives by depth may be empty, and those outside of a lens' field are
+/// not read. It must not call the backend, which waits
 /// for it.
 pub type LossGradient<'a> = &'a mut (dyn FnMut(&[GaussianImages]) -> Vec<GaussianImages> + Send);
 
@@ -287,32 +288,39 @@ pub(crate) fn mask(view: &View, images: &mut GaussianImages) {
     field.clear_outside(&view.camera, 1, &mut images.depth_sum_m);
 }
 
-/// Checks the derivatives that a loss gave.
-pub(crate) fn check_loss(
+/// Checks the sizes of the derivatives that a loss gave, and zeroes those outside of each lens'
+/// field, which no pixel has.
+pub(crate) fn check_sizes(
     frame: &Frame<'_>,
     depth: bool,
-    derivatives: &[GaussianImages],
+    derivatives: &mut [GaussianImages],
 ) -> Result<(), GradientError> {
     let wanted = frame.views.len();
     if derivatives.len() != wanted {
         return Err(GradientError::Views { given: derivatives.len(), wanted });
     }
-    for (view, (images, of_view)) in derivatives.iter().zip(frame.views).enumerate() {
+    for (view, (images, of_view)) in derivatives.iter_mut().zip(frame.views).enumerate() {
         for (image, values, wanted) in images.named(of_view.camera.pixels()) {
             let is_left_out = image == "depth_sum_m" && values.is_empty();
             let wanted = if image == "depth_sum_m" && !depth { 0 } else { wanted };
             if values.len() != wanted && !is_left_out {
                 return Err(GradientError::Size { view, image, given: values.len(), wanted });
             }
-            // Sums of parts: one that is finite has no value that is not. (0 x is NaN for those.)
-            let is_finite = |part: &[f32]| part.iter().map(|value| 0.0 * value).sum::<f32>() == 0.0;
-            let parts = values.par_chunks(1 << 14);
-            if !parts.all(is_finite)
-                && let Some(index) = values.iter().position(|value| !value.is_finite())
-            {
-                let value = values[index];
-                return Err(GradientError::NotFinite { view, image, index, value });
-            }
+        }
+        mask(of_view, images);
+    }
+    Ok(())
+}
+
+/// Checks that the derivatives by the images of a view are finite.
+pub(crate) fn check_finite(view: usize, images: &GaussianImages) -> Result<(), GradientError> {
+    for (image, values, _) in images.named(0) {
+        // Sums of parts: one that is finite has no value that is not. (0 x is NaN for those.)
+        let is_finite = |part: &[f32]| part.iter().map(|value| 0.0 * value).sum::<f32>() == 0.0;
+        if !values.par_chunks(1 << 14).all(is_finite)
+            && let Some(index) = values.iter().position(|value| !value.is_finite())
+        {
+            return Err(GradientError::NotFinite { view, image, index, value: values[index] });
         }
     }
     Ok(())

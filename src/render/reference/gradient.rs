@@ -13,7 +13,7 @@ use super::Reference;
 use super::project::{Footprint, Gaussian, Splat, sort};
 use crate::gradient::{
     Differentiate, FootprintGradient, GaussianGradient, GaussianImages, GradientError, Gradients,
-    LossGradient, Twist, check_frame, check_loss, color_gradient, mask,
+    LossGradient, Twist, check_finite, check_frame, check_sizes, color_gradient, mask,
 };
 use crate::layout::PixelFilter;
 use crate::{Backend, Frame, FrameStats, View};
@@ -330,8 +330,8 @@ impl Splat {
 }
 
 impl Images {
-    /// Derivatives by images of f32. Those by depth may be missing.
-    fn from_derivatives(images: &GaussianImages) -> Self {
+    /// From images of f32, or derivatives by them. Depth may be missing.
+    pub fn from_gaussian_images(images: &GaussianImages) -> Self {
         let rgb =
             images.rgb.chunks_exact(3).map(|c| DVec3::new(c[0].into(), c[1].into(), c[2].into()));
         let mut depth_sum_m: Vec<f64> = images.depth_sum_m.iter().map(|&m| m.into()).collect();
@@ -343,7 +343,8 @@ impl Images {
         }
     }
 
-    fn to_gaussian_images(&self, depth: bool) -> GaussianImages {
+    /// These images in f32.
+    pub fn to_gaussian_images(&self, depth: bool) -> GaussianImages {
         let to_f32 = |values: &[f64]| values.iter().map(|&value| value as f32).collect();
         GaussianImages {
             rgb: self.rgb.iter().flat_map(|rgb| rgb.as_vec3().to_array()).collect(),
@@ -378,15 +379,15 @@ impl Differentiate for Reference {
             })
             .collect();
         let mut derivatives = loss(&images);
-        check_loss(frame, depth, &derivatives)?;
-        for (derivatives, view) in derivatives.iter_mut().zip(frame.views) {
-            mask(view, derivatives);
+        check_sizes(frame, depth, &mut derivatives)?;
+        for (view, derivatives) in derivatives.iter().enumerate() {
+            check_finite(view, derivatives)?;
         }
 
         gradients.reset(frame.scene, frame.views.len());
         let mut stats = FrameStats::default();
         for (view, (sources, decisions)) in sources.iter().zip(&decisions).enumerate() {
-            let by = Images::from_derivatives(&derivatives[view]);
+            let by = Images::from_gaussian_images(&derivatives[view]);
             let (by_sources, twist) = sources.gradients(&sources.splat_gradients(decisions, &by));
             gradients.twists[view] = twist;
             let view_size_px = frame.views[view].camera.size_px();

@@ -118,14 +118,18 @@ impl Case {
 impl fmt::Display for Table {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{:22}  {:9}  {:9}", "case", "backend", "against")?;
-        for group in ["mean", "scale", "quat", "opacity", "sh", "twist"] {
-            write!(f, "  {group:>7}")?;
+        let groups = ["mean", "ln scale", "quat", "opacity", "sh", "twist"];
+        for group in groups {
+            write!(f, "  {:>7}", group.trim_start_matches("ln "))?;
         }
         writeln!(f, "  bound")?;
         for row in &self.rows {
             write!(f, "{:22}  {:9}  {:9}", row.case, row.backend, row.against)?;
-            for group in &row.groups {
-                write!(f, "  {:7.0e}", group.error)?;
+            for name in groups {
+                match row.groups.iter().find(|group| group.group == name) {
+                    Some(group) => write!(f, "  {:7.0e}", group.error)?,
+                    None => write!(f, "  {:7}", "")?,
+                }
             }
             let verdict = if row.is_within { "" } else { "  EXCEEDED" };
             writeln!(f, "  {:.0e}{verdict}", row.most_error)?;

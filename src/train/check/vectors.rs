@@ -1,18 +1,24 @@
 //! Gradients that others computed: PyTorch's, over gsplat's own projection, in f64.
 
+use std::sync::Arc;
+
 use glam::{DMat3, DQuat, DVec3};
 use safetensors::{Dtype, SafeTensors};
 use wildcity_render::compare::gradients::GroupError;
-use wildcity_render::gradient::{Differentiate, GaussianImages, Gradients, Twist};
-use wildcity_render::reference::Gaussian;
+use wildcity_render::gradient::{
+    Differentiate, GaussianGradient, GaussianImages, Gradients, RigTwists, Twist,
+};
 use wildcity_render::reference::gradient::{Images, Source, SourceGradient, Sources};
+use wildcity_render::reference::{Gaussian, Reference};
 use wildcity_render::{Frame, View};
-use wildcity_scene::chunk::column;
+use wildcity_scene::chunk::{RawGaussian, column};
 use wildcity_scene::geometry::camera::{Fisheye, Lens, Pinhole};
 use wildcity_scene::geometry::{Camera, Pose};
-use wildcity_scene::{Gaussians, RenderProfile, Scene};
+use wildcity_scene::{Chunk, RenderProfile, Scene};
 
 use super::{CheckError, MOST_ERROR, Row};
+use crate::compose::{Background, Exposure, compose, compose_gradient};
+use crate::loss::{disparity, dssim, l1};
 
 /// The tensors of `gradients/vectors.safetensors`.
 #[derive(Debug)]
@@ -51,24 +57,79 @@ impl Vectors {
         let classic = RenderProfile::DEFAULT;
         let antialiased = RenderProfile { antialiased: true, ..classic };
         let pinhole = self.pinhole()?;
-        for (case, camera, profile) in [
-            ("classic", pinhole, classic),
-            ("antialiased", pinhole, antialiased),
-            ("fisheye_unscented", self.fisheye()?, classic),
-        ] {
+        let products = self.products()?;
+        let products = |_: &Images| products.clone();
+        let step = self.training_step()?;
+        let step = |images: &Images| step.derivatives(images);
+        let cases: [(&str, Camera, RenderProfile, &ImageLoss<'_>); 4] = [
+            ("classic", pinhole, classic, &products),
+            ("antialiased", pinhole, antialiased, &products),
+            ("fisheye_unscented", self.fisheye()?, classic, &products),
+            ("train_step", pinhole, classic, &step),
+        ];
+        for (case, camera, profile, loss) in cases {
             let view = View::new(camera, self.pose("viewmat")?.inverse());
             let theirs = self.derivatives(case)?;
-            let ours = self.reference(view, &profile)?;
-            let groups = group_errors(&ours, &theirs);
-            rows.push(Row::new(case, "reference", "vectors", groups, MOST_REFERENCE_ERROR));
+            let mut add = |backend, ours: &[Vec<f64>], most_error| {
+                let groups = group_errors(ours, &theirs);
+                rows.push(Row::new(case, backend, "vectors", groups, most_error));
+            };
+            add("reference", &self.reference(view, &profile, loss)?, MOST_REFERENCE_ERROR);
             // Their fisheye has z as its depth, which only the reference can have, too.
             if camera.depth_is_distance() {
                 continue;
             }
             for backend in backends {
-                let ours = self.backend(*backend, view, &profile)?;
-                let groups = group_errors(&ours, &theirs);
-                rows.push(Row::new(case, backend.name(), "vectors", groups, MOST_ERROR));
+                let ours = self.backend(*backend, view, &profile, loss)?;
+                add(backend.name(), &ours, MOST_ERROR);
+            }
+        }
+        rows.extend(self.rig_rows(backends)?);
+        Ok(rows)
+    }
+
+    /// Compares the derivatives by the poses of a rig: two keyframes of two cameras.
+    fn rig_rows(&self, backends: &[&dyn Differentiate]) -> Result<Vec<Row>, CheckError> {
+        // The first pose is that of `viewmat`: rig.ego0 lies column by column in the file.
+        let egos = [self.pose("viewmat")?.inverse(), self.pose("rig.ego1")?];
+        let cameras = [self.pose("rig.rig0")?, self.pose("rig.rig1")?];
+        let by_egos = self.values("rig.d.ego", 12)?;
+        let by_cameras = self.values("rig.d.rig", 12)?;
+        let products = self.products()?;
+        let rgb: Vec<DVec3> = self.points("v.rgb", PIXELS)?;
+        let background = DVec3::from_slice(&self.values("background", 3)?);
+        let reference: &dyn Differentiate = &Reference;
+        let mut rows = Vec::new();
+        for backend in [reference].into_iter().chain(backends.iter().copied()) {
+            let mut ours = [[0.0; 12]; 2];
+            for (time, ego) in egos.iter().enumerate() {
+                for (number, camera) in cameras.iter().enumerate() {
+                    let weight = (1 + time + 2 * number) as f64;
+                    let by = Images {
+                        rgb: rgb.iter().map(|rgb| weight * *rgb).collect(),
+                        opacity: rgb.iter().map(|rgb| -weight * rgb.dot(background)).collect(),
+                        depth_sum_m: vec![0.0; products.depth_sum_m.len()],
+                    };
+                    let view = View::new(self.pinhole()?, *ego * *camera);
+                    let gradients =
+                        self.gradients(backend, view, &RenderProfile::DEFAULT, &|_| by.clone())?;
+                    let twist = gradients.twists.first().copied().unwrap_or_default();
+                    let RigTwists { ego, camera } = twist.on_rig(camera);
+                    for (sums, index, twist) in [(0, time, ego), (1, number, camera)] {
+                        for (sum, value) in ours[sums][6 * index..].iter_mut().zip(twist.to_array())
+                        {
+                            *sum += value;
+                        }
+                    }
+                }
+            }
+            let most_error =
+                if backend.name() == "reference" { MOST_REFERENCE_ERROR } else { MOST_ERROR };
+            for (case, ours, theirs) in
+                [("rig: egos", &ours[0], &by_egos), ("rig: cameras", &ours[1], &by_cameras)]
+            {
+                let group = GroupError::new("twist", ours, theirs, 0.0);
+                rows.push(Row::new(case, backend.name(), "vectors", vec![group], most_error));
             }
         }
         Ok(rows)
@@ -124,7 +185,7 @@ impl Vectors {
 
     /// The derivatives of `v.rgb · rgb + v.alpha · alpha + v.depth · depth` by the Gaussians'
     /// images, where the colours are over the background.
-    fn loss(&self) -> Result<Images, VectorError> {
+    fn products(&self) -> Result<Images, VectorError> {
         let background = DVec3::from_slice(&self.values("background", 3)?);
         let rgb = self.points("v.rgb", PIXELS)?;
         let mut opacity = self.values("v.alpha", PIXELS)?;
@@ -132,6 +193,15 @@ impl Vectors {
             *opacity -= rgb.dot(background);
         }
         Ok(Images { rgb, opacity, depth_sum_m: self.values("v.depth", PIXELS)? })
+    }
+
+    fn training_step(&self) -> Result<TrainingStep, VectorError> {
+        let background = self.values("background", 3)?;
+        Ok(TrainingStep {
+            background: [background[0], background[1], background[2]],
+            target: self.values("target", 3 * PIXELS)?,
+            depth_target_m: self.values("depth_target", PIXELS)?,
+        })
     }
 
     /// The derivatives of a case: [`GROUPS`], and the twist.
@@ -164,20 +234,20 @@ impl Vectors {
     }
 
     /// The derivatives of the reference, by its own f64 parameters.
-    fn reference(&self, view: View, profile: &RenderProfile) -> Result<Vec<Vec<f64>>, VectorError> {
+    fn reference(
+        &self,
+        view: View,
+        profile: &RenderProfile,
+        loss: &ImageLoss<'_>,
+    ) -> Result<Vec<Vec<f64>>, VectorError> {
         let gaussians = self.sources()?;
         let sources = Sources { profile, gaussians, views: vec![view], depth_is_z: true };
-        let by_splats = sources.splat_gradients(&sources.decisions(), &self.loss()?);
-        let (gradients, twist) = sources.gradients(&by_splats);
+        let decisions = sources.decisions();
+        let by = loss(&sources.images(&decisions));
+        let (gradients, twist) = sources.gradients(&sources.splat_gradients(&decisions, &by));
         let one = |(source, by): (&Source, &SourceGradient)| {
-            let geometry = by.geometry;
-            let raw = RawGradient::new(&source.gaussian, geometry.quat_wxyz, geometry.log2_opacity);
-            (
-                geometry.mean_m,
-                geometry.ln_scale,
-                raw,
-                by.sh.iter().flat_map(|c| c.to_array()).collect(),
-            )
+            let sh = by.sh.iter().flat_map(|c| c.to_array()).collect();
+            (source.gaussian, by.geometry, sh)
         };
         Ok(flattened(sources.gaussians.iter().zip(&gradients).map(one), twist))
     }
@@ -188,53 +258,81 @@ impl Vectors {
         backend: &dyn Differentiate,
         view: View,
         profile: &RenderProfile,
+        loss: &ImageLoss<'_>,
     ) -> Result<Vec<Vec<f64>>, CheckError> {
-        let sources = self.sources()?;
-        let mut gaussians = Gaussians::with_capacity(3, COUNT);
-        let logits = self.values("in.logits", COUNT)?;
-        for (Source { gaussian, .. }, logit) in sources.iter().zip(logits) {
-            gaussians.means_m.push(gaussian.mean_m.to_array());
-            let DQuat { x, y, z, w } = gaussian.rotation;
-            gaussians.quats_wxyz.push([w, x, y, z].map(|q| q as f32));
-            gaussians.ln_scales.push(gaussian.scale_m.to_array().map(|s| s.ln() as f32));
-            gaussians.logit_opacities.push(logit as f32);
-            gaussians.sh.extend(gaussian.sh.iter().flat_map(|c| c.as_vec3().to_array()));
-        }
-        let scene = Scene::from_gaussians(&gaussians);
-        let Images { rgb, opacity, depth_sum_m } = self.loss()?;
-        let to_f32 = |values: &[f64]| values.iter().map(|&value| value as f32).collect();
-        let by = GaussianImages {
-            rgb: rgb.iter().flat_map(|rgb| rgb.as_vec3().to_array()).collect(),
-            opacity: to_f32(&opacity),
-            depth_sum_m: to_f32(&depth_sum_m),
-        };
-        let mut gradients = Gradients::default();
-        let frame = Frame { scene: &scene, profile, views: &[view] };
-        backend.differentiate(&frame, true, &mut |_| vec![by.clone()], &mut gradients)?;
-
-        // The chunk has the Gaussians in another order: each is found by its place.
-        let mut found = vec![None; COUNT];
-        for (chunk, by) in scene.chunks.iter().zip(&gradients.chunks) {
-            for index in 0..chunk.len() {
-                let at_m = Gaussian::from_chunk(chunk, index).mean_m;
-                let distance = |i: &usize| sources[*i].gaussian.mean_m.distance(at_m);
-                let nearest = (0..COUNT).min_by(|a, b| distance(a).total_cmp(&distance(b)));
-                if let Some(i) = nearest {
-                    let geometry = by.gaussian(index);
-                    let value = |k| f64::from(by.value(index, column::SH + k));
-                    let sh: Vec<f64> = (0..48).map(value).collect();
-                    found[i] = Some((geometry, sh));
-                }
-            }
-        }
-        let one = |(source, found): (&Source, &Option<_>)| {
-            let (geometry, sh): (wildcity_render::gradient::GaussianGradient, Vec<f64>) =
-                found.clone().unwrap_or_default();
-            let raw = RawGradient::new(&source.gaussian, geometry.quat_wxyz, geometry.log2_opacity);
-            (geometry.mean_m, geometry.ln_scale, raw, sh)
-        };
+        let gradients = self.gradients(backend, view, profile, loss)?;
         let twist = gradients.twists.first().copied().unwrap_or_default();
-        Ok(flattened(sources.iter().zip(&found).map(one), twist))
+        let sources = self.sources()?;
+        let one = |(index, source): (usize, &Source)| {
+            let by = &gradients.chunks[0];
+            let value = |k| f64::from(by.value(index, column::SH + k));
+            (source.gaussian, by.gaussian(index), (0..48).map(value).collect())
+        };
+        Ok(flattened(sources.iter().enumerate().map(one), twist))
+    }
+
+    /// The gradients of a backend. The scene is one chunk, in the order of the vectors.
+    fn gradients(
+        &self,
+        backend: &dyn Differentiate,
+        view: View,
+        profile: &RenderProfile,
+        loss: &ImageLoss<'_>,
+    ) -> Result<Gradients, CheckError> {
+        let logits = self.values("in.logits", COUNT)?;
+        let mut chunk = Chunk::new([0, 0], DVec3::ZERO, 3, COUNT);
+        for (Source { gaussian, .. }, logit) in self.sources()?.iter().zip(logits) {
+            let DQuat { x, y, z, w } = gaussian.rotation;
+            let sh: Vec<f32> = gaussian.sh.iter().flat_map(|c| c.as_vec3().to_array()).collect();
+            chunk.push(&RawGaussian {
+                mean_m: gaussian.mean_m.as_vec3().to_array(),
+                quat_wxyz: [w, x, y, z].map(|q| q as f32),
+                ln_scale: gaussian.scale_m.to_array().map(|s| s.ln() as f32),
+                logit_opacity: logit as f32,
+                sh: &sh,
+            });
+        }
+        let scene = Scene { chunks: vec![Arc::new(chunk)], ..Scene::default() };
+        let frame = Frame { scene: &scene, profile, views: &[view] };
+        let mut gradients = Gradients::default();
+        let mut loss = |images: &[GaussianImages]| {
+            let derivatives =
+                |images| loss(&Images::from_gaussian_images(images)).to_gaussian_images(true);
+            images.iter().map(derivatives).collect()
+        };
+        backend.differentiate(&frame, true, &mut loss, &mut gradients)?;
+        Ok(gradients)
+    }
+}
+
+/// The derivatives of a loss by images, given these.
+type ImageLoss<'a> = dyn Fn(&Images) -> Images + Sync + 'a;
+
+/// The losses of a step: `0.8 L1 + 0.2 D-SSIM` of colours over a background, and
+/// 0.1 of disparity.
+struct TrainingStep {
+    background: [f64; 3],
+    target: Vec<f64>,
+    depth_target_m: Vec<f64>,
+}
+
+impl TrainingStep {
+    fn derivatives(&self, images: &Images) -> Images {
+        let rgb: Vec<f64> = images.rgb.iter().flat_map(|rgb| rgb.to_array()).collect();
+        let background = Background::Color(self.background);
+        let exposure = Exposure::identity();
+        let image = compose(&rgb, &images.opacity, background, &exposure);
+        let similarity = dssim(SIZE_PX.map(|px| px as usize), &image, &self.target).scaled(0.2);
+        let by_image = l1(&image, &self.target, None).scaled(0.8).plus(&similarity).by;
+        let by = compose_gradient(&rgb, &images.opacity, background, &exposure, &by_image);
+        let depth =
+            disparity(&images.opacity, &images.depth_sum_m, &self.depth_target_m).scaled(0.1);
+        let sums = by.opacity.iter().zip(&depth.by_opacity).map(|(a, b)| a + b);
+        Images {
+            rgb: by.rgb.as_chunks().0.iter().map(|&rgb| DVec3::from_array(rgb)).collect(),
+            opacity: sums.collect(),
+            depth_sum_m: depth.by_depth_sum,
+        }
     }
 }
 
@@ -257,13 +355,14 @@ impl RawGradient {
 
 /// Derivatives in the order of [`GROUPS`], and by the twist.
 fn flattened(
-    gaussians: impl Iterator<Item = ([f64; 3], [f64; 3], RawGradient, Vec<f64>)>,
+    gaussians: impl Iterator<Item = (Gaussian, GaussianGradient, Vec<f64>)>,
     twist: Twist,
 ) -> Vec<Vec<f64>> {
     let mut groups = vec![Vec::new(); GROUPS.len()];
-    for (mean_m, ln_scale, raw, sh) in gaussians {
-        groups[0].extend(mean_m);
-        groups[1].extend(ln_scale);
+    for (gaussian, geometry, sh) in gaussians {
+        let raw = RawGradient::new(&gaussian, geometry.quat_wxyz, geometry.log2_opacity);
+        groups[0].extend(geometry.mean_m);
+        groups[1].extend(geometry.ln_scale);
         groups[2].extend(raw.quat_wxyz);
         groups[3].push(raw.logit);
         groups[4].extend(sh);

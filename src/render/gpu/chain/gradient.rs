@@ -21,7 +21,8 @@ use crate::gpu::partition::TileRows;
 use crate::gpu::project_work::{ProjectWork, Projection};
 use crate::gpu::resolve::{Outputs, Pixels, Planes};
 use crate::gradient::{
-    GaussianImages, GradientError, Gradients, LossGradient, Partial, Twist, check_loss, mask,
+    GaussianImages, GradientError, Gradients, LossGradient, Partial, Twist, check_finite,
+    check_sizes,
 };
 use crate::{Frame, FrameStats, RenderError};
 use wildcity_scene::chunk::CLUSTER;
@@ -54,9 +55,9 @@ impl Chain {
         let (mut drawn, images) = self.draw_for_gradients(frame, depth, pool)?;
         let start = Instant::now();
         let mut by_images = loss(&images);
-        check_loss(frame, depth, &by_images)?;
-        for (by_images, view) in by_images.iter_mut().zip(frame.views) {
-            mask(view, by_images);
+        check_sizes(frame, depth, &mut by_images)?;
+        for (view, by_images) in by_images.iter().enumerate() {
+            check_finite(view, by_images)?;
         }
         add_time(&mut drawn.current.stats, "loss", start.elapsed());
 
