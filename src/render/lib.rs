@@ -45,6 +45,8 @@ use wildcity_scene::geometry::camera::FieldMask;
 use wildcity_scene::sky::{CubeMap, DrawableSky, SkyError};
 use wildcity_scene::{Rays, RenderProfile, Rig, Scene};
 
+use crate::gradient::Differentiate;
+
 pub use view::{Readout, RollingShutter, View};
 
 /// The input of a render call: all views of one step.
@@ -259,6 +261,11 @@ pub trait Backend: Send + Sync {
     /// image in parallel.
     fn has_idle_cores(&self) -> bool {
         false
+    }
+
+    /// This backend, if it computes gradients, too.
+    fn as_differentiate(&self) -> Option<&dyn Differentiate> {
+        None
     }
 
     /// Limits the intermediate buffers between the stages of a frame, in bytes. With less memory a

@@ -4,6 +4,7 @@ use std::fmt;
 
 use super::{Case, Outcome, Verdict};
 use wildcity_render::compare::images::{AGREEMENT_DB, RenderedImage, agree, render_images};
+use wildcity_render::gradient::Differentiate;
 use wildcity_render::reference::Reference;
 use wildcity_render::{Backend, Frame, FrameStats, RenderError, Target, View};
 use wildcity_scene::{RenderProfile, Scene};
@@ -113,6 +114,11 @@ impl<'a> CaseRun<'a> {
     /// Records what is rendered instead, if it is less than what the case states.
     pub(super) fn reduce_to(&mut self, what: impl Into<String>) {
         self.reduced_to = Some(what.into());
+    }
+
+    /// The backend, if it computes gradients.
+    pub(super) fn differentiate(&self) -> Option<&'a dyn Differentiate> {
+        self.backend.as_differentiate()
     }
 
     /// Whether the backend is the reference backend.

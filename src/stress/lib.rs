@@ -10,6 +10,7 @@
 //! sizes      nothing, one pixel, 8K, growing buffers, crops, shrunk T14 to T18 T31
 //! lenses     a wide splat, more than 180°, rolling shutters         T22 T23 T24
 //! actors     colours that rotate with an actor, places, motion       T25 T29 T30
+//! gradients  all of these extremes, backwards                        T32
 //! ```
 //!
 //! The reference backend is not compared with itself: its images must be finite, and have the
@@ -32,6 +33,7 @@
 
 mod actors;
 mod case_run;
+mod gradients;
 mod lenses;
 mod opacities;
 mod order;
@@ -73,7 +75,7 @@ enum CaseBody {
 type Body = fn(&mut CaseRun<'_>) -> Result<(), RenderError>;
 
 /// All cases, in order of their numbers.
-pub static CASES: [Case; 31] = [
+pub static CASES: [Case; 32] = [
     shapes::T1,
     shapes::T2,
     shapes::T3,
@@ -105,6 +107,7 @@ pub static CASES: [Case; 31] = [
     actors::T29,
     actors::T30,
     sizes::T31,
+    gradients::T32,
 ];
 
 /// The result of a case on one backend.

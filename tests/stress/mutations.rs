@@ -8,6 +8,7 @@ use glam::{DQuat, DVec3};
 use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_from_specs};
 use wildcity_render::compare::images::{crop_rgba, crop_view, render_images};
 use wildcity_render::cpu::Cpu;
+use wildcity_render::gradient::{Differentiate, GradientError, Gradients, LossGradient};
 use wildcity_render::reference::Reference;
 use wildcity_render::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target, View};
 use wildcity_scene::chunk::{ActivatedGaussian, column, columns};
@@ -156,6 +157,10 @@ impl Backend for MutatedBackend<'_> {
         self.inner.name()
     }
 
+    fn as_differentiate(&self) -> Option<&dyn Differentiate> {
+        Some(self)
+    }
+
     fn render(
         &self,
         frame: &Frame<'_>,
@@ -163,6 +168,55 @@ impl Backend for MutatedBackend<'_> {
         finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
         let count = self.count.fetch_add(1, Relaxed);
+        let (scene, profile, views) = self.mutated(frame);
+        if let Mutation::OtherClamp = self.mutation {
+            let [view] = views[..] else { panic!("one view") };
+            let [width, height] = [view.camera.width_px, view.camera.height_px];
+            let wide = crop_view(view, [-(width as i32), 0], [3 * width, height]);
+            let drawing = render_images(self.inner, &scene, &profile, &[wide])?.remove(0);
+            let rgba = crop_rgba(&drawing, 3 * width, [width, 0], [width, height]);
+            self.inner.render(frame, targets, finished)?;
+            targets[0].rgba.as_mut().unwrap().copy_from_slice(&rgba);
+            return Ok(FrameStats::default());
+        }
+        let frame = Frame { scene: &scene, profile: &profile, views: &views };
+        let mut stats = self.inner.render(&frame, targets, finished)?;
+        stats.instances += u64::from(matches!(self.mutation, Mutation::DuplicateInstance));
+        for target in targets {
+            let Target { rgba: Some(rgba), rgb8: Some(rgb8), opacity: Some(opacity), .. } = target
+            else {
+                continue;
+            };
+            let middle = rgba.len() / 2;
+            let darken =
+                |values: &mut [f32], share: f32| values.iter_mut().for_each(|v| *v *= share);
+            match self.mutation {
+                Mutation::Nondeterministic => rgba[middle] += f32::EPSILON * (count % 3) as f32,
+                Mutation::Flicker if count % 2 == 1 => {
+                    darken(opacity, 0.99);
+                    rgba.iter_mut().for_each(|v| *v = 0.99 * *v - 1e-3);
+                }
+                Mutation::Paler => {
+                    darken(rgba, 0.95);
+                    darken(opacity, 0.95);
+                }
+                Mutation::Background => rgba[middle] += 2e-3,
+                Mutation::OneByte => rgb8[0] ^= 1,
+                Mutation::Unmasked => opacity.iter_mut().for_each(|o| *o = o.max(0.01)),
+                Mutation::Unwritten => {
+                    *rgba.last_mut().unwrap() = f32::NAN;
+                    *opacity.last_mut().unwrap() = f32::NAN;
+                }
+                _ => {}
+            }
+        }
+        Ok(stats)
+    }
+}
+
+impl MutatedBackend<'_> {
+    /// What the mutation makes of the input of a frame.
+    fn mutated(&self, frame: &Frame<'_>) -> (Scene, RenderProfile, Vec<View>) {
         let mut scene = frame.scene.clone();
         let mut profile = *frame.profile;
         let mut views = frame.views.to_vec();
@@ -207,46 +261,24 @@ impl Backend for MutatedBackend<'_> {
             }
             _ => {}
         }
-        if let Mutation::OtherClamp = self.mutation {
-            let [view] = views[..] else { panic!("one view") };
-            let [width, height] = [view.camera.width_px, view.camera.height_px];
-            let wide = crop_view(view, [-(width as i32), 0], [3 * width, height]);
-            let drawing = render_images(self.inner, &scene, &profile, &[wide])?.remove(0);
-            let rgba = crop_rgba(&drawing, 3 * width, [width, 0], [width, height]);
-            self.inner.render(frame, targets, finished)?;
-            targets[0].rgba.as_mut().unwrap().copy_from_slice(&rgba);
-            return Ok(FrameStats::default());
-        }
+        (scene, profile, views)
+    }
+}
+
+impl Differentiate for MutatedBackend<'_> {
+    fn differentiate(
+        &self,
+        frame: &Frame<'_>,
+        depth: bool,
+        loss: LossGradient<'_>,
+        gradients: &mut Gradients,
+    ) -> Result<FrameStats, GradientError> {
+        let inner = self.inner.as_differentiate().expect("a backend with gradients");
+        let (scene, profile, views) = self.mutated(frame);
         let frame = Frame { scene: &scene, profile: &profile, views: &views };
-        let mut stats = self.inner.render(&frame, targets, finished)?;
-        stats.instances += u64::from(matches!(self.mutation, Mutation::DuplicateInstance));
-        for target in targets {
-            let Target { rgba: Some(rgba), rgb8: Some(rgb8), opacity: Some(opacity), .. } = target
-            else {
-                continue;
-            };
-            let middle = rgba.len() / 2;
-            let darken =
-                |values: &mut [f32], share: f32| values.iter_mut().for_each(|v| *v *= share);
-            match self.mutation {
-                Mutation::Nondeterministic => rgba[middle] += f32::EPSILON * (count % 3) as f32,
-                Mutation::Flicker if count % 2 == 1 => {
-                    darken(opacity, 0.99);
-                    rgba.iter_mut().for_each(|v| *v = 0.99 * *v - 1e-3);
-                }
-                Mutation::Paler => {
-                    darken(rgba, 0.95);
-                    darken(opacity, 0.95);
-                }
-                Mutation::Background => rgba[middle] += 2e-3,
-                Mutation::OneByte => rgb8[0] ^= 1,
-                Mutation::Unmasked => opacity.iter_mut().for_each(|o| *o = o.max(0.01)),
-                Mutation::Unwritten => {
-                    *rgba.last_mut().unwrap() = f32::NAN;
-                    *opacity.last_mut().unwrap() = f32::NAN;
-                }
-                _ => {}
-            }
+        let stats = inner.differentiate(&frame, depth, loss, gradients)?;
+        if let Mutation::Unwritten = self.mutation {
+            gradients.twists[0].rho.x = f64::NAN;
         }
         Ok(stats)
     }
@@ -372,6 +404,8 @@ const MUTATIONS: &[(&str, Mutation, &[&str])] = &[
     ("T30", FrozenActors, &["across: exact rays", "across: as f64", "along: as at rest"]),
     ("T30", FrozenActors, &["along: as f64"]),
     ("T31", OwnBlur, &["nearer to native by dB", "as f64"]),
+    ("T32", Unwritten, &["every derivative is finite"]),
+    ("T32", MoreBlur, &["off f64 by"]),
 ];
 
 /// The check that no mutation of a backend affects: the bound of the record format. In the unit

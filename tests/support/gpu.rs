@@ -9,6 +9,7 @@ use std::sync::{Mutex, Once, PoisonError};
 
 use wildcity_render::gpu::shaders::Shaders;
 use wildcity_render::gpu::{AdapterChoice, Gpu, GpuError, MemoryLimits, Tuning};
+use wildcity_render::gradient::Differentiate;
 use wildcity_render::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
 
 /// The best device of this machine.
@@ -84,6 +85,10 @@ impl Backend for Watched {
 
     fn frames_in_flight(&self) -> usize {
         self.deref().frames_in_flight()
+    }
+
+    fn as_differentiate(&self) -> Option<&dyn Differentiate> {
+        self.deref().as_differentiate()
     }
 
     fn render(

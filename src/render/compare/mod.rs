@@ -16,6 +16,7 @@ pub mod errors;
 pub mod flicker;
 pub mod flip;
 pub mod gaussians;
+pub mod gradient_cases;
 pub mod gradients;
 pub mod heat;
 pub mod images;

@@ -47,6 +47,7 @@ use fearless_simd::Level;
 use parking_lot::{Mutex, MutexGuard};
 use rayon::ThreadPool;
 
+use crate::gradient::Differentiate;
 use crate::limits;
 
 use self::background::Background;
@@ -251,6 +252,10 @@ impl Backend for Cpu {
     fn bytes_beside(&self, views: &[View]) -> u64 {
         let most_bytes = self.lane_bytes.load(Relaxed) / SIDE_LANE_DIVISOR;
         drawing::most_held_bytes(most_bytes, views, self.threads())
+    }
+
+    fn as_differentiate(&self) -> Option<&dyn Differentiate> {
+        Some(self)
     }
 
     fn render(

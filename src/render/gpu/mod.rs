@@ -71,6 +71,7 @@ use self::slots::Slots;
 use self::tickets::TicketQueue;
 use super::stage::{Stage, StageOutputs};
 use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
+use crate::gradient::Differentiate;
 use crate::limits;
 
 /// The wgpu backend.
@@ -340,6 +341,10 @@ impl Backend for Gpu {
 
     fn has_idle_cores(&self) -> bool {
         true
+    }
+
+    fn as_differentiate(&self) -> Option<&dyn Differentiate> {
+        Some(self)
     }
 
     fn render(

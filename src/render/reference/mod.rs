@@ -20,6 +20,7 @@ pub use project::{Gaussian, Splat, project};
 use wildcity_scene::appearance::{Appearance, Exposure};
 
 use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
+use crate::gradient::Differentiate;
 use wildcity_scene::Rays;
 
 /// The f64 backend.
@@ -33,6 +34,10 @@ impl Backend for Reference {
 
     fn name(&self) -> &'static str {
         "reference"
+    }
+
+    fn as_differentiate(&self) -> Option<&dyn Differentiate> {
+        Some(self)
     }
 
     fn render(

@@ -4,39 +4,24 @@
 //! The bound of every row is [`MOST_ERROR`] of the largest derivative of its group of parameters,
 //! and a cosine of [`LEAST_COSINE`]. Extreme scenes may have their own, with the reason beside it.
 
-mod cases;
 mod times;
 mod vectors;
 
 use std::fmt;
 
 use serde::Serialize;
-use wildcity_render::compare::gradients::{GroupError, group_errors, waves};
-use wildcity_render::gradient::{Differentiate, GaussianImages, GradientError, Gradients};
+use wildcity_render::compare::gradient_cases::cases;
+use wildcity_render::compare::gradients::{GroupError, group_errors};
+use wildcity_render::gradient::{Differentiate, GradientError};
 use wildcity_render::reference::Reference;
-use wildcity_render::{Frame, View};
-use wildcity_scene::{RenderProfile, Scene};
 
-pub use self::cases::cases;
+pub use wildcity_render::compare::gradient_cases::MOST_ERROR;
+
 pub use self::times::{Time, times};
 pub use self::vectors::{VectorError, Vectors};
 
-/// Largest difference of a derivative as a share of the largest one of its group.
-pub const MOST_ERROR: f64 = 1e-4;
-
 /// Least cosine between two gradients of a group.
 pub const LEAST_COSINE: f64 = 0.99999;
-
-/// A scene whose gradients are compared.
-#[derive(Debug)]
-pub struct Case {
-    pub name: &'static str,
-    pub scene: Scene,
-    pub views: Vec<View>,
-    pub profile: RenderProfile,
-    /// Largest error of a row: [`MOST_ERROR`] unless the case says why not.
-    pub most_error: f64,
-}
 
 /// The gradients of one backend in one case.
 #[derive(Clone, Debug, Serialize)]
@@ -102,16 +87,6 @@ impl Table {
     /// Rows that exceed their bound.
     pub fn exceeded(&self) -> usize {
         self.rows.iter().filter(|row| !row.is_within).count()
-    }
-}
-
-impl Case {
-    fn gradients(&self, backend: &dyn Differentiate) -> Result<Gradients, GradientError> {
-        let mut gradients = Gradients::default();
-        let frame = Frame { scene: &self.scene, profile: &self.profile, views: &self.views };
-        let mut loss = |images: &[GaussianImages]| waves(images);
-        backend.differentiate(&frame, true, &mut loss, &mut gradients)?;
-        Ok(gradients)
     }
 }
 

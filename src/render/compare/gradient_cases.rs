@@ -1,18 +1,48 @@
-//! The scenes whose gradients are compared: streets by every kind of camera, and extremes.
+//! Scenes whose gradients are compared with those of `reference`: streets by every kind of camera,
+//! and extremes.
 
 use std::f64::consts::TAU;
 use std::sync::Arc;
 
 use glam::{DQuat, DVec3};
-use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_from_specs};
-use wildcity_render::{RollingShutter, View};
 use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::geometry::camera::{Fisheye, Lens, OpenCv, ShutterDirection};
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::random::Random;
 use wildcity_scene::{Gaussians, RenderProfile, Scene, sh};
 
-use super::{Case, MOST_ERROR};
+use super::gaussians::{GaussianSpec, forward_view, scene_from_specs};
+use super::gradients::waves;
+use crate::gradient::{Differentiate, GaussianImages, GradientError, Gradients};
+use crate::{Frame, RollingShutter, View};
+
+/// Largest difference of a derivative as a share of the largest one of its group.
+pub const MOST_ERROR: f64 = 1e-4;
+
+/// A scene whose gradients are compared.
+#[derive(Debug)]
+pub struct Case {
+    pub name: &'static str,
+    pub scene: Scene,
+    pub views: Vec<View>,
+    pub profile: RenderProfile,
+    /// Largest error of a group: [`MOST_ERROR`] unless the case says why not.
+    pub most_error: f64,
+}
+
+impl Case {
+    /// The gradients of a backend for a loss of [`waves`].
+    ///
+    /// # Errors
+    /// As [`Differentiate::differentiate`].
+    pub fn gradients(&self, backend: &dyn Differentiate) -> Result<Gradients, GradientError> {
+        let mut gradients = Gradients::default();
+        let frame = Frame { scene: &self.scene, profile: &self.profile, views: &self.views };
+        let mut loss = |images: &[GaussianImages]| waves(images);
+        backend.differentiate(&frame, true, &mut loss, &mut gradients)?;
+        Ok(gradients)
+    }
+}
 
 /// All cases: streets, then extremes.
 pub fn cases() -> Vec<Case> {
@@ -95,7 +125,7 @@ fn streets() -> Vec<Case> {
 }
 
 /// Scenes at which a derivative could overflow, cancel or divide by 0.
-fn extremes() -> Vec<Case> {
+pub fn extremes() -> Vec<Case> {
     let view = forward_view(SIZE_PX, 60.0);
     let mut random = Random::new(1, "extremes", 0);
     let mut around = |depth_m: f64| {
@@ -136,6 +166,10 @@ fn extremes() -> Vec<Case> {
     }
     let far_view =
         View { world_from_camera: Pose { position_m: far_m, ..view.world_from_camera }, ..view };
+    let mut scaled = street(600, 1);
+    for (k, quat) in scaled.quats_wxyz.iter_mut().enumerate() {
+        *quat = quat.map(|q| q * if k % 2 == 0 { 1e-3 } else { 1e3 });
+    }
     let antialiased = RenderProfile { antialiased: true, ..RenderProfile::default() };
     vec![
         Case { most_error: NEEDLES, ..case("needles", scene_from_specs(&needles), view) },
@@ -154,6 +188,7 @@ fn extremes() -> Vec<Case> {
         case("1,000 layers", scene_from_specs(&deep), view),
         Case { most_error: COVERED, ..case("40 in one place", scene_from_specs(&same), view) },
         case("5,400 km away", Scene::from_gaussians(&moved), far_view),
+        case("quaternions of 1e±3", Scene::from_gaussians(&scaled), view),
         case("nothing", scene_from_specs(&[]), view),
     ]
 }
