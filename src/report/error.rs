@@ -6,6 +6,7 @@
 //! each cause once.
 
 use wildcity_render::RenderError;
+use wildcity_render::gradient::GradientError;
 use wildcity_repair::RepairError;
 use wildcity_scene::geometry::CameraError;
 use wildcity_scene::profile::ProfileError;
@@ -22,6 +23,9 @@ pub enum ReportError {
     /// A frame cannot be rendered.
     #[error(transparent)]
     Render(#[from] RenderError),
+    /// Gradients cannot be computed.
+    #[error(transparent)]
+    Gradient(#[from] GradientError),
     /// A camera cannot be scaled to such a small image.
     #[error(transparent)]
     Camera(#[from] CameraError),

@@ -14,9 +14,8 @@ use super::measure::sky_bytes;
 use wildcity_render::compare::images::view_along;
 use wildcity_render::cpu::Cpu;
 use wildcity_render::gpu::{Gpu, GpuUsage};
-use wildcity_render::{
-    Backend, Frame, FrameStats, Readout, RenderError, RollingShutter, Target, View,
-};
+use wildcity_render::gradient::{GaussianImages, Gradients};
+use wildcity_render::{Backend, Frame, FrameStats, Readout, RollingShutter, Target, View};
 use wildcity_scene::actor::{ContactShadow, PlacedChunk};
 use wildcity_scene::appearance::{Appearance, Exposure, Overlay};
 use wildcity_scene::geometry::Pose;
@@ -104,7 +103,7 @@ const fn feature(name: &'static str, add: fn(&mut Step)) -> Feature {
     Feature { name, add }
 }
 
-const FEATURES: [Feature; 21] = [
+const FEATURES: [Feature; 22] = [
     feature("nothing else", |_| {}),
     // The same colours with more coefficients: only memory and traffic may change, not the image.
     feature("SH degree 1", |step| step.scene = Scene::from_gaussians(&street(1))),
@@ -162,6 +161,8 @@ const FEATURES: [Feature; 21] = [
     feature("instance ids", |step| step.instances = true),
     // The host computes the trust from the opacity.
     feature("trust", |step| step.opacity = true),
+    // Only a trainer asks for them.
+    feature("gradients", |step| step.gradients = true),
 ];
 
 /// Renders the street with each feature on the cpu backend and on a device, and counts.
@@ -239,6 +240,7 @@ struct Step {
     opacity: bool,
     normals: bool,
     instances: bool,
+    gradients: bool,
 }
 
 impl Step {
@@ -254,6 +256,7 @@ impl Step {
             opacity: false,
             normals: false,
             instances: false,
+            gradients: false,
         }
     }
 
@@ -295,7 +298,7 @@ impl Step {
 
     fn counts(&self, cpu: &Cpu, device: Option<Gpu>) -> Result<ResourceCounts, ReportError> {
         // The counts of the cpu backend do not depend on its threads.
-        let FrameStats { evaluations, .. } = self.render(cpu)?;
+        let evaluations = self.render(cpu)?.evaluations;
         let device = device.map(|gpu| self.device_counts(&gpu)).transpose()?.flatten();
         let gaussians = self.scene.gaussians() as u64;
         // Requested planes as 0 or 1, for the sum of their bytes.
@@ -307,8 +310,9 @@ impl Step {
             gaussians,
             host_bytes_per_gaussian: self.scene.bytes() as f64 / gaussians as f64,
             other_host_bytes: sky_bytes + hood_bytes as u64,
-            // 8-bit colour, u16 for instance ids, and f32 for the other outputs.
-            host_bytes_per_pixel: 3 + 2 * ids + 4 * floats,
+            // 8-bit colour, u16 for instance ids, and f32 for the other outputs. Gradients take colour
+            // and opacity, and the derivatives by them.
+            host_bytes_per_pixel: if self.gradients { 32 } else { 3 + 2 * ids + 4 * floats },
             evaluations,
             device,
         })
@@ -333,7 +337,15 @@ impl Step {
         }))
     }
 
-    fn render(&self, backend: &dyn Backend) -> Result<FrameStats, RenderError> {
+    fn render(&self, backend: &dyn Backend) -> Result<FrameStats, ReportError> {
+        let views = &[self.view];
+        let frame = Frame { scene: &self.scene, profile: &self.profile, views };
+        if let (true, Some(backend)) = (self.gradients, backend.as_differentiate()) {
+            // The derivatives of half the sum of squares are the images themselves.
+            let mut loss = |images: &[GaussianImages]| images.to_vec();
+            let mut gradients = Gradients::default();
+            return Ok(backend.differentiate(&frame, false, &mut loss, &mut gradients)?);
+        }
         let pixels = self.view.camera.pixels();
         let plane = |wanted: bool, values: usize| wanted.then(|| vec![0.0; values * pixels]);
         let mut rgb8 = vec![0; 3 * pixels];
@@ -352,9 +364,7 @@ impl Step {
             appearance: (!self.appearance.is_identity()).then_some(&self.appearance),
             ..Target::default()
         };
-        let views = &[self.view];
-        let frame = Frame { scene: &self.scene, profile: &self.profile, views };
-        backend.render(&frame, &mut [target], &|_, _| {})
+        Ok(backend.render(&frame, &mut [target], &|_, _| {})?)
     }
 }
 

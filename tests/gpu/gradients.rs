@@ -2,12 +2,13 @@
 
 use wildcity_render::Frame;
 use wildcity_render::compare::gradients::{GroupError, by_group, group_errors, waves};
+use wildcity_render::compare::images::render_images;
 use wildcity_render::gpu::shaders::Shaders;
 use wildcity_render::gradient::{Differentiate, Gradients};
 use wildcity_render::reference::Reference;
 use wildcity_scene::{RenderProfile, Scene};
 
-use crate::gpu::gpu_with;
+use crate::gpu::{gpu, gpu_with};
 use crate::gradient_cases::{
     check_actors, check_lenses, check_pinholes, differentiate, mutation_case,
 };
@@ -46,6 +47,38 @@ fn gradients_repeat_to_the_byte() {
     for repeat in 0..20 {
         assert!(differ() == first, "repeat {repeat}");
     }
+}
+
+#[test]
+fn gradients_cost_nothing_when_absent() {
+    let scene = Scene::from_gaussians(&street(1_000, 1, 12));
+    let profile = RenderProfile::default();
+    let views = turning_views();
+    let frame = Frame { scene: &scene, profile: &profile, views: &views };
+    let backend = gpu();
+    let render = || {
+        render_images(&*backend, &scene, &profile, &views).unwrap();
+        let before = backend.usage().unwrap();
+        render_images(&*backend, &scene, &profile, &views).unwrap();
+        let after = backend.usage().unwrap();
+        let dispatches = after.totals.dispatches - before.totals.dispatches;
+        (after.totals.pipelines, after.allocated_bytes, dispatches)
+    };
+    let (pipelines, bytes, dispatches) = render();
+    backend
+        .differentiate(&frame, true, &mut |images| waves(images), &mut Gradients::default())
+        .unwrap();
+    let (pipelines_after, bytes_after, dispatches_after) = render();
+    // blend, rank, two of gather, one of project; and one of rasterize for images of floats.
+    assert!((5..=7).contains(&(pipelines_after - pipelines)), "{pipelines} {pipelines_after}");
+    assert!(bytes_after > bytes);
+    assert_eq!(dispatches_after, dispatches);
+    // A backend that has computed none has neither kernels nor buffers of gradients.
+    let other = gpu();
+    render_images(&*other, &scene, &profile, &views).unwrap();
+    render_images(&*other, &scene, &profile, &views).unwrap();
+    let usage = other.usage().unwrap();
+    assert_eq!((usage.totals.pipelines, usage.allocated_bytes), (pipelines, bytes));
 }
 
 /// Faults of the way back: shader, original text, and its replacement.

@@ -6,8 +6,9 @@ use std::sync::Arc;
 
 use glam::{DQuat, DVec3};
 use wildcity_render::compare::gradients::{by_group, waves};
+use wildcity_render::compare::images::render_images;
 use wildcity_render::cpu::{Cpu, Simd};
-use wildcity_render::gradient::{Differentiate, Gradients, Twist};
+use wildcity_render::gradient::{Differentiate, GaussianImages, Gradients, Twist};
 use wildcity_render::reference::Gaussian;
 use wildcity_render::reference::gradient::{Decisions, Images, Source, SourceGradient, Sources};
 use wildcity_render::{Frame, RollingShutter, View};
@@ -60,6 +61,52 @@ fn gradients_do_not_depend_on_threads_or_on_earlier_frames() {
     if let Ok(avx2) = Cpu::new(2, Simd::Avx2) {
         assert!(differ(&avx2, &mut Gradients::default()) == one, "AVX2");
     }
+}
+
+/// What a frame's gradients take beside the frame: bytes of each splat and pixel, and the gradients
+/// themselves.
+#[test]
+fn gradients_take_120_bytes_a_splat() {
+    let output = std::process::Command::new(std::env::current_exe().unwrap())
+        .args(["--exact", "gradients::bytes_of_gradients", "--ignored", "--nocapture"])
+        .env("MALLOC_ARENA_MAX", "1")
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&output.stdout);
+    assert!(output.status.success() && said.contains("1 passed"), "{said}");
+}
+
+#[test]
+#[ignore = "runs in its own process, started by gradients_take_120_bytes_a_splat"]
+fn bytes_of_gradients() {
+    let status_bytes = |field: &str| {
+        let status = std::fs::read_to_string("/proc/self/status").unwrap();
+        let line = status.lines().find(|line| line.starts_with(field)).unwrap();
+        1024 * line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap()
+    };
+    let scene = Scene::from_gaussians(&street(1_000_000, 0, 12));
+    let profile = RenderProfile::default();
+    let view = turning_views()[0];
+    let views = [View { camera: view.camera.scaled(720, 464).unwrap(), ..view }];
+    let backend = Cpu::new(1, Simd::Best).unwrap();
+    // The buffers of a frame, which stay.
+    let images = render_images(&backend, &scene, &profile, &views).unwrap();
+    drop(images);
+    let before = status_bytes("VmHWM:");
+    let mut gradients = Gradients::default();
+    let frame = Frame { scene: &scene, profile: &profile, views: &views };
+    let mut loss = |images: &[GaussianImages]| images.to_vec();
+    let stats = backend.differentiate(&frame, false, &mut loss, &mut gradients).unwrap();
+    let taken = status_bytes("VmHWM:") - before;
+    // 16 B a pixel of images, 16 B of derivatives, and 24 B of what a tile keeps; 14 columns of f32
+    // for each Gaussian, visible or not.
+    let pixels = views[0].camera.pixels() as u64;
+    let others = 56 * pixels + 56 * scene.gaussians() as u64;
+    let each = (taken as f64 - others as f64) / stats.visible_pairs as f64;
+    eprintln!("{taken} B, {} splats: {each:.0} B each", stats.visible_pairs);
+    assert!(stats.visible_pairs > 300_000, "{}", stats.visible_pairs);
+    assert!(each > 20.0, "{each} B a splat cannot be all");
+    assert!(each <= 120.0, "{each} B a splat");
 }
 
 /// A loss of the images with given decisions: the sum of products with fixed numbers.
