@@ -38,7 +38,7 @@ pub struct Trainer {
 }
 
 /// The losses of a step, without their weights.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct StepReport {
     pub l1: f64,
     pub dssim: f64,
@@ -46,6 +46,8 @@ pub struct StepReport {
     pub disparity: f64,
     /// Number of visible Gaussians.
     pub visible: u64,
+    /// Wall time of each stage of the frame and its gradients, in milliseconds.
+    pub stages_ms: Vec<(&'static str, f64)>,
 }
 
 /// Why a run cannot go on.
@@ -136,6 +138,7 @@ impl Trainer {
         };
         let stats = backend.differentiate(&frame, depth, &mut loss, &mut self.gradients)?;
         report.visible = stats.visible_pairs;
+        report.stages_ms = stats.stages_ms;
 
         self.step += 1;
         let adam = self.adam_step();

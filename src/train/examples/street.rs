@@ -56,6 +56,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mut trainer = Trainer::new(points, RenderProfile::default(), settings)?;
     let begin = Instant::now();
     let mut measured_s = 0.0;
+    let mut stages: Vec<(&str, f64)> = Vec::new();
     while trainer.steps_done() < steps {
         let image = train[trainer.next_image(train.len())];
         let sample = Sample {
@@ -66,6 +67,12 @@ fn main() -> Result<(), Box<dyn Error>> {
             background: [0.0; 3],
         };
         let report = trainer.step(&cpu, &sample)?;
+        for (stage, ms) in &report.stages_ms {
+            match stages.iter_mut().find(|(name, _)| name == stage) {
+                Some((_, sum)) => *sum += ms,
+                None => stages.push((stage, *ms)),
+            }
+        }
         let step = trainer.steps_done();
         if step.is_multiple_of(250) || step == steps {
             let pause = Instant::now();
@@ -80,6 +87,10 @@ fn main() -> Result<(), Box<dyn Error>> {
                 begin.elapsed().as_secs_f64() - measured_s
             );
         }
+    }
+    // On one core (`taskset -c 0`) these are times of the processor.
+    for (stage, ms) in stages {
+        println!("{stage:18} {:.2} ms a step", ms / steps as f64);
     }
     Ok(())
 }
