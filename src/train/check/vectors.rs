@@ -8,7 +8,9 @@ use wildcity_render::compare::gradients::GroupError;
 use wildcity_render::gradient::{
     Differentiate, GaussianGradient, GaussianImages, Gradients, RigTwists, Twist,
 };
-use wildcity_render::reference::gradient::{Images, Source, SourceGradient, Sources};
+use wildcity_render::reference::gradient::{
+    Images, Source, SourceGradient, Sources, SplatGradient,
+};
 use wildcity_render::reference::{Gaussian, Reference};
 use wildcity_render::{Frame, View};
 use wildcity_scene::chunk::{RawGaussian, column};
@@ -84,8 +86,35 @@ impl Vectors {
                 add(backend.name(), &ours, MOST_ERROR);
             }
         }
+        rows.push(self.splat_row()?);
         rows.extend(self.rig_rows(backends)?);
         Ok(rows)
+    }
+
+    /// Compares the derivatives by splats, which the reference alone has: by their centres, inverse
+    /// covariances, opacities and colours.
+    fn splat_row(&self) -> Result<Row, VectorError> {
+        let view = View::new(self.pinhole()?, self.pose("viewmat")?.inverse());
+        let (profile, gaussians) = (RenderProfile::DEFAULT, self.sources()?);
+        let sources = Sources { profile: &profile, gaussians, views: vec![view], depth_is_z: true };
+        let splats = sources.splat_gradients(&sources.decisions(), &self.products()?);
+        let mut groups = Vec::new();
+        let mut add = |group, name: &str, values: usize, of: fn(&SplatGradient) -> Vec<f64>| {
+            let theirs = self.values(&format!("raster.d.{name}"), values * COUNT)?;
+            let ours: Vec<f64> = splats.iter().flat_map(of).collect();
+            groups.push(GroupError::new(group, &ours, &theirs, 0.0));
+            Ok(())
+        };
+        add("ln scale", "conic", 3, |splat| splat.conic.to_array().to_vec())?;
+        add("opacity", "opacity", 1, |splat| vec![splat.opacity])?;
+        add("sh", "rgb", 3, |splat| splat.rgb.to_array().to_vec())?;
+        // The centres lie column by column in the file.
+        let by_columns = self.values("raster.d.mean_px", 2 * COUNT)?;
+        let theirs: Vec<f64> =
+            (0..COUNT).flat_map(|i| [by_columns[i], by_columns[COUNT + i]]).collect();
+        let ours: Vec<f64> = splats.iter().flat_map(|splat| splat.mean_px.to_array()).collect();
+        groups.push(GroupError::new("mean", &ours, &theirs, 0.0));
+        Ok(Row::new("raster", "reference", "vectors", groups, MOST_REFERENCE_ERROR))
     }
 
     /// Compares the derivatives by the poses of a rig: two keyframes of two cameras.
