@@ -4,7 +4,9 @@
 //! |---|---|
 //! | [`check`] | the gradients of this machine against their definition |
 //! | [`loss`] | losses of images, depths and Gaussians, each with its derivatives |
-//! | [`trainer`] | a run: one image a step |
+//! | [`run`] | a run: from images to Gaussians |
+//! | [`start`] | from points to the Gaussians that it begins with |
+//! | [`trainer`] | a step: what one image teaches |
 //! | [`model`] | the Gaussians of a run, and Adam |
 //! | [`settings`] | the settings of a run |
 //! | `growth` | relocation and growth by Markov chain Monte Carlo |
@@ -19,5 +21,7 @@ pub mod compose;
 mod growth;
 pub mod loss;
 pub mod model;
+pub mod run;
 pub mod settings;
+pub mod start;
 pub mod trainer;

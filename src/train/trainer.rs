@@ -1,7 +1,7 @@
 //! The steps of a training run.
 
 use wildcity_render::gradient::{Differentiate, GaussianImages, GradientError, Gradients};
-use wildcity_render::{Frame, View};
+use wildcity_render::{Frame, RenderError, View};
 use wildcity_scene::chunk::columns;
 use wildcity_scene::random::mix;
 use wildcity_scene::validate::{self, BadGaussians, Field};
@@ -57,6 +57,16 @@ pub enum TrainError {
     Setting(#[from] SettingError),
     #[error(transparent)]
     Gradient(#[from] GradientError),
+    #[error(transparent)]
+    Render(#[from] RenderError),
+    /// An image of the run cannot be read.
+    #[error("{0}")]
+    Image(String),
+    /// Nothing is left to learn from.
+    #[error(
+        "of {images} images {held_out} are held out, and none is left to learn from: give more"
+    )]
+    NoImages { images: usize, held_out: usize },
     /// No Gaussian to begin with.
     #[error("there are no points to begin with: give a cloud of points, or a scene to refine")]
     Empty,
@@ -103,18 +113,6 @@ impl Trainer {
     /// Number of steps that have been made.
     pub fn steps_done(&self) -> usize {
         self.step
-    }
-
-    /// The place of the image of the next step among `count` of them: every image once, in a random
-    /// order, then every image again. 0 if there is none.
-    pub fn next_image(&self, count: usize) -> usize {
-        if count == 0 {
-            return 0;
-        }
-        let round = (self.step / count) as u64;
-        let mut order: Vec<usize> = (0..count).collect();
-        order.sort_by_key(|&image| mix(self.settings.seed ^ mix(round << 32 ^ image as u64)));
-        order[self.step % count]
     }
 
     /// Learns from one image.

@@ -1,16 +1,37 @@
 //! `wildcity train`.
 
 mod check;
+mod scene;
 
 use super::subcommands::subcommands;
 
-/// Train twins: check the gradients of this machine.
+/// Train a scene on photographs with known cameras, without a GPU or with one.
+///
+/// One image a step: it is rendered, compared with the photograph, and every Gaussian is moved by
+/// the derivatives. Gaussians that have become transparent become copies of others, and their number
+/// grows up to --cap. Prints the PSNR of the photographs that were kept from it.
+///
+/// 200 images of 360 x 232 px take a minute and a half for 3,000 steps on two cores.
 #[derive(Debug, clap::Args)]
-#[command(subcommand_required = true, arg_required_else_help = true)]
+#[command(
+    after_long_help = EXAMPLES,
+    args_conflicts_with_subcommands = true,
+    subcommand_negates_reqs = true,
+    arg_required_else_help = true
+)]
 pub(super) struct Train {
     #[command(subcommand)]
-    command: TrainCommand,
+    command: Option<TrainCommand>,
+
+    #[command(flatten)]
+    scene: scene::TrainScene,
 }
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity train capture --out capture.ply --size 0.25 --steps 3000
+  wildcity train capture/transforms.json --points lidar.ply --out scene.ply --lines train.jsonl
+  wildcity import capture.ply --twin capture --axes y-down-z-forward";
 
 subcommands! { TrainCommand;
     Check(check::Check),
@@ -18,6 +39,9 @@ subcommands! { TrainCommand;
 
 impl Train {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        self.command.run()
+        match self.command {
+            Some(command) => command.run(),
+            None => self.scene.run(),
+        }
     }
 }

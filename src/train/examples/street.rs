@@ -10,29 +10,43 @@
 
 #![allow(clippy::print_stdout, reason = "its result")]
 
-use std::collections::HashMap;
 use std::error::Error;
-use std::f64::consts::{PI, TAU};
+use std::f64::consts::PI;
 use std::fs::File;
 use std::io::{BufWriter, Write};
-use std::time::Instant;
 
 use glam::DVec3;
 use wildcity_generate::StreetSettings;
-use wildcity_render::compare::psnr::psnr_db_u8;
 use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::random::Random;
 use wildcity_scene::{Gaussians, RenderProfile, Rig, Scene, sh};
+use wildcity_train::run::{Line, TrainingImage, TrainingImages, run};
 use wildcity_train::settings::{Growth, Settings};
-use wildcity_train::trainer::{Sample, Trainer};
+use wildcity_train::start::{Point, gaussians_from_points};
 
 /// An image of the street.
 struct Recorded {
     view: View,
     rgb8: Vec<u8>,
-    rgb: Vec<f32>,
     is_held_out: bool,
+}
+
+struct Street(Vec<Recorded>);
+
+impl TrainingImages for Street {
+    fn count(&self) -> usize {
+        self.0.len()
+    }
+
+    fn is_held_out(&self, index: usize) -> bool {
+        self.0[index].is_held_out
+    }
+
+    fn load(&self, index: usize) -> Result<TrainingImage, String> {
+        let Recorded { view, rgb8, .. } = &self.0[index];
+        Ok(TrainingImage { view: *view, rgb8: rgb8.clone(), mask: None })
+    }
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -43,51 +57,30 @@ fn main() -> Result<(), Box<dyn Error>> {
     let street = wildcity_generate::street(&StreetSettings::default())?;
     let truth = Scene::from_gaussians(&street.gaussians);
     let images = record(&cpu, &truth, &street.trajectory, scale)?;
-    let points = start(&street.gaussians, &images);
+    let start = start(&street.gaussians, &images);
     if let Some(path) = arguments.get(2) {
-        export(path, &images, &points)?;
+        export(path, &images, &start)?;
     }
 
     let growth = Growth { cap: 150_000, from: 500, until: 24_000, ..Growth::default() };
     let settings = Settings { steps, growth, ..Settings::default() };
-    let train: Vec<&Recorded> = images.iter().filter(|image| !image.is_held_out).collect();
-    let held_out: Vec<&Recorded> = images.iter().filter(|image| image.is_held_out).collect();
-    println!("{} images, {} held out, {} points", train.len(), held_out.len(), points.len());
-    let mut trainer = Trainer::new(points, RenderProfile::default(), settings)?;
-    let begin = Instant::now();
-    let mut measured_s = 0.0;
+    println!("{} images, {} points", images.len(), start.len());
     let mut stages: Vec<(&str, f64)> = Vec::new();
-    while trainer.steps_done() < steps {
-        let image = train[trainer.next_image(train.len())];
-        let sample = Sample {
-            view: image.view,
-            rgb: &image.rgb,
-            weights: None,
-            depth_m: None,
-            background: [0.0; 3],
-        };
-        let report = trainer.step(&cpu, &sample)?;
-        for (stage, ms) in &report.stages_ms {
+    let mut on_step = |line: &Line| {
+        for (stage, ms) in &line.stages_ms {
             match stages.iter_mut().find(|(name, _)| name == stage) {
                 Some((_, sum)) => *sum += ms,
                 None => stages.push((stage, *ms)),
             }
         }
-        let step = trainer.steps_done();
-        if step.is_multiple_of(250) || step == steps {
-            let pause = Instant::now();
-            let scene = trainer.model().scene();
-            let sum_db: f64 = held_out.iter().map(|image| psnr(&cpu, scene, image)).sum();
-            let db = sum_db / held_out.len() as f64;
-            measured_s += pause.elapsed().as_secs_f64();
+        if let Line { step, l1, gaussians, seconds, held_out_db: Some(db), .. } = line {
             println!(
-                "step {step:5}  {db:.2} dB held out  l1 {:.4}  {} Gaussians  {:.1} s",
-                report.l1,
-                trainer.model().len(),
-                begin.elapsed().as_secs_f64() - measured_s
+                "step {step:5}  {db:.2} dB held out  l1 {l1:.4}  {gaussians} Gaussians  {seconds:.1} s"
             );
         }
-    }
+        true
+    };
+    run(start, &Street(images), &cpu, RenderProfile::default(), &settings, 250, &mut on_step)?;
     // On one core (`taskset -c 0`) these are times of the processor.
     for (stage, ms) in stages {
         println!("{stage:18} {:.2} ms a step", ms / steps as f64);
@@ -118,10 +111,9 @@ fn record(
             let frame = Frame { scene, profile: &profile, views: &[view] };
             let target = Target { rgb8: Some(&mut rgb8), ..Target::default() };
             cpu.render(&frame, &mut [target], &|_, _| {})?;
-            let rgb = rgb8.iter().map(|&value| f32::from(value) / 255.0).collect();
             // Photographs of this size: what they are trained as.
             view.camera.native_size_px = None;
-            images.push(Recorded { view, rgb8, rgb, is_held_out: keyframe % 8 == 4 });
+            images.push(Recorded { view, rgb8, is_held_out: keyframe % 8 == 4 });
         }
     }
     Ok(images)
@@ -142,24 +134,12 @@ fn start(truth: &Gaussians, images: &[Recorded]) -> Gaussians {
         order.swap(k, random.below(k + 1));
     }
     order.truncate(94_000);
-    let mut points: Vec<(DVec3, [f64; 3])> = Vec::new();
+    let mut points = Vec::new();
     for i in order {
         let mut noise = || (0..12).map(|_| random.unit()).sum::<f64>() - 6.0;
         let moved_m = 0.03 * DVec3::new(noise(), noise(), noise());
         let rgb = [0, 1, 2].map(|c| (0.5 + sh::C0 * f64::from(truth.sh_at(i)[c])).clamp(0.0, 1.0));
-        points.push((DVec3::from_array(truth.means_m[i]) + moved_m, rgb));
-    }
-    let scales_m = neighbour_distances(&points);
-    let mut gaussians = Gaussians::with_capacity(0, points.len());
-    let mut push = |mean_m: DVec3, rgb: [f64; 3], scale_m: f64| {
-        gaussians.means_m.push(mean_m.to_array());
-        gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
-        gaussians.ln_scales.push([scale_m.ln() as f32; 3]);
-        gaussians.logit_opacities.push((0.1_f32 / 0.9).ln());
-        gaussians.sh.extend(rgb.map(|value| ((value - 0.5) / sh::C0) as f32));
-    };
-    for ((mean_m, rgb), scale_m) in points.into_iter().zip(scales_m) {
-        push(mean_m, rgb, scale_m);
+        points.push(Point { at_m: DVec3::from_array(truth.means_m[i]) + moved_m, rgb });
     }
     let middle = images.iter().map(|image| image.view.world_from_camera.position_m).sum::<DVec3>()
         / images.len() as f64;
@@ -169,42 +149,9 @@ fn start(truth: &Gaussians, images: &[Recorded]) -> Gaussians {
         let angle = PI * (1.0 + 5.0_f64.sqrt()) * (f64::from(k) + 0.5);
         let across = (1.0 - z * z).sqrt();
         let direction = DVec3::new(across * angle.cos(), across * angle.sin(), z);
-        push(middle + 400.0 * direction, [0.6, 0.7, 0.85], 400.0 * (TAU / count).sqrt() * 0.6);
+        points.push(Point { at_m: middle + 400.0 * direction, rgb: [0.6, 0.7, 0.85] });
     }
-    gaussians
-}
-
-/// The mean distance of each point to its three nearest neighbours, in cells of 0.5 m.
-fn neighbour_distances(points: &[(DVec3, [f64; 3])]) -> Vec<f64> {
-    let cell = |at_m: DVec3| (at_m / 0.5).floor().as_ivec3().to_array();
-    let mut cells: HashMap<[i32; 3], Vec<usize>> = HashMap::new();
-    for (i, (at_m, _)) in points.iter().enumerate() {
-        cells.entry(cell(*at_m)).or_default().push(i);
-    }
-    let distance = |(i, (at_m, _)): (usize, &(DVec3, [f64; 3]))| {
-        let [x, y, z] = cell(*at_m);
-        let mut near: Vec<f64> = Vec::new();
-        for shift in 0..27 {
-            let at = [x + shift % 3 - 1, y + shift / 3 % 3 - 1, z + shift / 9 - 1];
-            let others = cells.get(&at).into_iter().flatten().take(60);
-            near.extend(others.filter(|&&k| k != i).map(|&k| points[k].0.distance(*at_m)));
-        }
-        near.sort_by(f64::total_cmp);
-        near.truncate(3);
-        let mean = near.iter().sum::<f64>() / near.len().max(1) as f64;
-        if near.is_empty() { 0.5 } else { mean.clamp(0.003, 1.0) }
-    };
-    points.iter().enumerate().map(distance).collect()
-}
-
-fn psnr(cpu: &Cpu, scene: &Scene, image: &Recorded) -> f64 {
-    let mut rgb8 = vec![0; image.rgb8.len()];
-    let frame = Frame { scene, profile: &RenderProfile::default(), views: &[image.view] };
-    let target = Target { rgb8: Some(&mut rgb8), ..Target::default() };
-    if cpu.render(&frame, &mut [target], &|_, _| {}).is_err() {
-        return 0.0;
-    }
-    psnr_db_u8(rgb8.iter().zip(&image.rgb8))
+    gaussians_from_points(&points)
 }
 
 /// Images and points for the prototype of the project's design.

@@ -48,6 +48,7 @@ pub use error::IngestError;
 pub use file::{FileError, read_whole};
 pub use notes::{Antialiasing, FileAxes, FileNotes};
 pub use objects::TrackedObject;
+pub use ply::write_ply;
 pub use progress::Progress;
 pub use read_limits::{ReadLimits, StopFlag};
 pub use scene_files::{ListedFiles, is_below_folder};

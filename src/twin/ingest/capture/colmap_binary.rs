@@ -1,4 +1,4 @@
-//! cameras.bin and images.bin of COLMAP (src/colmap/scene/reconstruction_io.cc), little-endian.
+//! cameras.bin, images.bin and points3D.bin of COLMAP (src/colmap/scene/reconstruction_io.cc), little-endian.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -6,12 +6,14 @@ use std::path::Path;
 use wildcity_scene::geometry::Camera;
 
 use super::colmap_model::{MODELS, pose};
-use super::{CaptureError, Place, PosedImage};
+use super::{CaptureError, CapturePoint, Place, PosedImage};
 use crate::ingest::file::read_whole;
 use crate::limits;
 
 /// Bytes of a point of an image: x, y, and the number of its 3D point.
 const POINT_BYTES: u64 = 24;
+/// Bytes of a point of an image that a 3D point was made of: the numbers of the image and the point.
+const TRACK_BYTES: u64 = 8;
 
 pub(super) fn read(cameras: &Path, images: &Path) -> Result<Vec<PosedImage>, CaptureError> {
     let known = read_cameras(cameras)?;
@@ -146,4 +148,24 @@ fn read_images(
         ));
     }
     Ok(images)
+}
+
+/// Reads points3D.bin.
+pub(super) fn read_points(path: &Path) -> Result<Vec<CapturePoint>, CaptureError> {
+    let mut bytes = Bytes::open(path)?;
+    let mut points = Vec::new();
+    for _ in 0..bytes.u64()? {
+        let id = bytes.u64()?;
+        let at = [bytes.f64()?, bytes.f64()?, bytes.f64()?];
+        if !at.iter().all(|value| value.is_finite()) {
+            return Err(bytes.wrong(format!("point {id} is at {at:?}: write the model again")));
+        }
+        let rgb8 = bytes.take::<3>()?;
+        let _error_px = bytes.f64()?;
+        let track = bytes.u64()?;
+        bytes.skip(track.saturating_mul(TRACK_BYTES))?;
+        points.push(CapturePoint { at, rgb8 });
+    }
+    bytes.check_end()?;
+    Ok(points)
 }

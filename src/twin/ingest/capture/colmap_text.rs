@@ -1,4 +1,4 @@
-//! cameras.txt and images.txt of COLMAP.
+//! cameras.txt, images.txt and points3D.txt of COLMAP.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -7,7 +7,7 @@ use std::str::FromStr;
 use wildcity_scene::geometry::Camera;
 
 use super::colmap_model::{MODELS, pose};
-use super::{CaptureError, Place, PosedImage};
+use super::{CaptureError, CapturePoint, Place, PosedImage};
 use crate::ingest::file::read_whole;
 use crate::limits;
 
@@ -59,6 +59,27 @@ fn read_cameras(path: &Path) -> Result<BTreeMap<u64, Camera>, CaptureError> {
         }
     }
     Ok(cameras)
+}
+
+/// Reads points3D.txt: `POINT3D_ID X Y Z R G B ERROR TRACK..`
+pub(super) fn read_points(path: &Path) -> Result<Vec<CapturePoint>, CaptureError> {
+    let text = read_text(path)?;
+    let mut points = Vec::new();
+    for (index, line) in text.lines().enumerate() {
+        if line.trim().is_empty() || line.starts_with('#') {
+            continue;
+        }
+        let wrong = |reason: String| CaptureError::at(path, Place::Line(index + 1), reason);
+        let words: Vec<&str> = line.split_whitespace().collect();
+        let [_, x, y, z, r, g, b, ..] = &words[..] else {
+            return Err(wrong("expected POINT3D_ID X Y Z R G B ERROR TRACK..".to_owned()));
+        };
+        let coordinate = |field, word: &str| number::<f64>(field, word).map_err(wrong);
+        let at = [coordinate("X", x)?, coordinate("Y", y)?, coordinate("Z", z)?];
+        let color = |field, word: &str| number::<u8>(field, word).map_err(wrong);
+        points.push(CapturePoint { at, rgb8: [color("R", r)?, color("G", g)?, color("B", b)?] });
+    }
+    Ok(points)
 }
 
 /// Two lines an image: `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, and its points, which are

@@ -1,5 +1,5 @@
-//! Camera poses of training images: COLMAP models, as text and binary, and transforms.json of
-//! nerfstudio and instant-ngp.
+//! Camera poses of training images, and the points that training begins with: COLMAP models, as
+//! text and binary, and transforms.json of nerfstudio and instant-ngp.
 //!
 //! The poses are in the axes and unit of the file, which are those of a scene that was trained from
 //! it.
@@ -9,6 +9,7 @@ mod colmap_model;
 mod colmap_text;
 mod error;
 mod nerfstudio;
+mod points;
 
 use std::path::{Path, PathBuf};
 
@@ -18,6 +19,7 @@ use wildcity_scene::align::PosedImage;
 
 pub use error::{CaptureError, Place};
 pub use nerfstudio::{FrameImage, NerfstudioCapture, read as read_nerfstudio};
+pub use points::{CapturePoint, read_points};
 
 /// Reads a COLMAP model: the folder with cameras.bin and images.bin, or with cameras.txt and
 /// images.txt; or a folder that has it in sparse/0 or sparse.

@@ -13,18 +13,22 @@ mod columns;
 mod comments;
 mod compressed;
 mod header;
+mod write;
 
 use std::collections::BTreeMap;
 use std::io::BufRead;
 
 use wildcity_scene::Gaussians;
 
+use super::capture::CapturePoint;
 use super::notes::{BLUR_BRUSH_PX2, Reading};
 use super::validate::NAMED_BAD_GAUSSIANS;
 use super::{IngestError, Progress, check_count};
 use body::Body;
 use columns::{Columns, FILTER, degree, file_name};
 use header::{Element, Header, error};
+
+pub use write::write_ply;
 
 /// Reads a PLY file of a known size.
 pub(super) fn read(
@@ -75,6 +79,44 @@ pub(super) fn read(
     let sh_degree = columns.sh_degree;
     let accepted = reading.accept(gaussians, &|field| file_name(field, sh_degree));
     accepted.map_err(|error| with_filters(error, &bad_filters))
+}
+
+/// Reads the vertices of a PLY file as points: x, y, z, and red, green and blue of 8 bits, or grey
+/// where it has no colours.
+pub(super) fn read_points(
+    mut input: impl BufRead,
+    file_bytes: u64,
+) -> Result<Vec<CapturePoint>, IngestError> {
+    let header = Header::read(&mut input)?;
+    let Some(vertex) = header.element("vertex") else {
+        return Err(error("end".into(), "there is no element vertex".into()));
+    };
+    let [x, y, z] = ["x", "y", "z"].map(|name| vertex.property(name));
+    let place = [x?, y?, z?];
+    let colors = ["red", "green", "blue"].map(|name| vertex.property(name).ok());
+    header.check_size(file_bytes)?;
+    let mut points = Vec::with_capacity(check_count(vertex.count)?);
+    let mut faulty = None;
+    let encoding = header.encoding;
+    let progress = &mut |_, _| {};
+    let mut body = Body { input, encoding, done: header.bytes, file_bytes, progress };
+    for element in &header.elements {
+        body.rows(element, |row| {
+            if element.name == "vertex" {
+                let at = place.map(|property| property.value(row));
+                if !at.iter().all(|value| value.is_finite()) {
+                    faulty.get_or_insert((points.len(), at));
+                }
+                let rgb8 = colors.map(|color| color.map_or(128, |color| color.value(row) as u8));
+                points.push(CapturePoint { at, rgb8 });
+            }
+        })?;
+    }
+    body.check_end()?;
+    match faulty {
+        Some((row, at)) => Err(error(format!("row {row} of vertex"), format!("is at {at:?}"))),
+        None => Ok(points),
+    }
 }
 
 /// The error of Gaussians, with the name of the filter where that is what is wrong.
