@@ -93,15 +93,17 @@ pub fn compose_gradient<T: Real>(
         background: Vec::with_capacity(rgb.len()),
         exposure: Exposure { matrix: [[T::zero(); 3]; 3], offset: [T::zero(); 3] },
     };
+    // In f64: a million products in f32 would lose three digits.
+    let mut sums = [[0.0; 4]; 3];
     for (pixel, by) in by_image.chunks_exact(3).enumerate() {
         let shows = T::one() - opacity[pixel];
         let behind = background.rgb(pixel);
         let before: [T; 3] = std::array::from_fn(|c| rgb[3 * pixel + c] + shows * behind[c]);
         for (row, &by) in by.iter().enumerate() {
-            for (to, &value) in gradient.exposure.matrix[row].iter_mut().zip(&before) {
-                *to += by * value;
+            for (to, value) in sums[row].iter_mut().zip([before[0], before[1], before[2], T::one()])
+            {
+                *to += by.to_double() * value.to_double();
             }
-            gradient.exposure.offset[row] += by;
         }
         let by_before: [T; 3] =
             std::array::from_fn(|c| (0..3).map(|row| exposure.matrix[row][c] * by[row]).sum());
@@ -109,6 +111,10 @@ pub fn compose_gradient<T: Real>(
         gradient.background.extend(by_before.map(|by| shows * by));
         let by_opacity = by_before.iter().zip(behind).map(|(&by, behind)| by * behind).sum::<T>();
         gradient.opacity.push(-by_opacity);
+    }
+    for (row, [r, g, b, offset]) in sums.into_iter().enumerate() {
+        gradient.exposure.matrix[row] = [r, g, b].map(T::from_f64);
+        gradient.exposure.offset[row] = T::from_f64(offset);
     }
     gradient
 }

@@ -4,14 +4,17 @@ use wildcity_render::Frame;
 use wildcity_render::compare::gradients::{GroupError, by_group, group_errors, waves};
 use wildcity_render::compare::images::render_images;
 use wildcity_render::gpu::shaders::Shaders;
-use wildcity_render::gradient::{Differentiate, Gradients};
+use wildcity_render::gradient::{Differentiate, GradientError, Gradients};
 use wildcity_render::reference::Reference;
+use wildcity_scene::geometry::Camera;
+use wildcity_scene::geometry::camera::ShutterDirection;
 use wildcity_scene::{RenderProfile, Scene};
 
-use crate::gpu::{gpu, gpu_with};
+use crate::gpu::{bindings, gpu, gpu_with, gpu_with_limits};
 use crate::gradient_cases::{
-    check_actors, check_lenses, check_pinholes, differentiate, mutation_case,
+    check_actors, check_lenses, check_pinholes, check_refusals, differentiate, mutation_case,
 };
+use crate::lenses::{lenses, rolling_view};
 use crate::shared_gpu;
 use crate::streets::{street, turning_views};
 
@@ -31,10 +34,35 @@ fn gpu_has_the_gradients_of_actors() {
 }
 
 #[test]
-fn gradients_repeat_to_the_byte() {
+fn losses_that_do_not_fit_are_refused() {
+    check_refusals(&**shared_gpu());
+}
+
+#[test]
+fn a_frame_that_does_not_fit_the_device_is_refused() {
+    let small = gpu_with_limits(bindings(1 << 20));
     let scene = Scene::from_gaussians(&street(20_000, 1, 12));
     let profile = RenderProfile::default();
     let views = turning_views();
+    let differ = |scene: &Scene| {
+        let frame = Frame { scene, profile: &profile, views: &views };
+        small.differentiate(&frame, true, &mut |images| waves(images), &mut Gradients::default())
+    };
+    let refused = differ(&scene);
+    assert!(matches!(refused, Err(GradientError::Memory { .. })), "{refused:?}");
+    // The next frame fits.
+    assert!(differ(&Scene::from_gaussians(&street(50, 0, 12))).is_ok());
+}
+
+#[test]
+fn gradients_repeat_to_the_byte() {
+    let scene = Scene::from_gaussians(&street(20_000, 1, 12));
+    let profile = RenderProfile::default();
+    let mut views = turning_views();
+    let lens = lenses().into_iter().find(|(name, _)| *name == "fisheye").unwrap().1;
+    let lens = Camera { native_size_px: None, ..lens.scaled(80, 50).unwrap() };
+    let pose = views[0].world_from_camera;
+    views.push(rolling_view(lens, pose, ShutterDirection::TopToBottom));
     let gpu = shared_gpu();
     let mut gradients = Gradients::default();
     let mut differ = || {
@@ -129,12 +157,12 @@ fn a_fault_of_each_formula_is_noticed() {
             let broken = gpu_with(shaders.unwrap_or_else(|| panic!("{shader}: {original}")));
             let ours = differentiate(&*broken, frame.scene, frame.profile, frame.views).1;
             let holds = |group: &GroupError| group.error < 1e-4 && group.cosine > 0.99999;
-            group_errors(&ours, &truth).iter().all(holds)
+            group_errors(&ours, std::slice::from_ref(&truth)).iter().all(holds)
         })
         .collect();
     assert!(undetected.is_empty(), "{undetected:#?}");
     let ours = differentiate(&**shared_gpu(), frame.scene, frame.profile, frame.views).1;
-    for GroupError { group, error, .. } in group_errors(&ours, &truth) {
+    for GroupError { group, error, .. } in group_errors(&ours, std::slice::from_ref(&truth)) {
         assert!(error < 1e-4, "without a fault {group} is off by {error:e}");
     }
 }

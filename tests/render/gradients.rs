@@ -8,18 +8,18 @@ use glam::{DQuat, DVec3};
 use wildcity_render::compare::gradients::{by_group, waves};
 use wildcity_render::compare::images::render_images;
 use wildcity_render::cpu::{Cpu, Simd};
-use wildcity_render::gradient::{Differentiate, GaussianImages, Gradients, Twist};
-use wildcity_render::reference::Gaussian;
+use wildcity_render::gradient::{Differentiate, GaussianImages, GradientError, Gradients, Twist};
 use wildcity_render::reference::gradient::{Decisions, Images, Source, SourceGradient, Sources};
-use wildcity_render::{Frame, RollingShutter, View};
+use wildcity_render::reference::{Gaussian, Reference};
+use wildcity_render::{Backend, Frame, RollingShutter, View};
 use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::geometry::camera::{Pinhole, ShutterDirection};
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::{Chunk, RenderProfile, Scene};
 
-use crate::gradient_cases::{check_actors, check_lenses, check_pinholes};
+use crate::gradient_cases::{check_actors, check_lenses, check_pinholes, check_refusals};
 use crate::images::cpu;
-use crate::lenses::lenses;
+use crate::lenses::{lenses, rolling_view};
 use crate::scene_files::Random;
 use crate::streets::{street, turning_views};
 
@@ -39,10 +39,37 @@ fn cpu_has_the_gradients_of_actors() {
 }
 
 #[test]
+fn losses_that_do_not_fit_are_refused() {
+    check_refusals(&cpu());
+    check_refusals(&Reference);
+}
+
+#[test]
+fn a_frame_beyond_the_limit_is_refused() {
+    let backend = cpu();
+    let scene = Scene::from_gaussians(&street(60_000, 1, 12));
+    let profile = RenderProfile::default();
+    let views = turning_views();
+    let frame = Frame { scene: &scene, profile: &profile, views: &views };
+    let differ = || {
+        let mut loss = |images: &[GaussianImages]| images.to_vec();
+        backend.differentiate(&frame, false, &mut loss, &mut Gradients::default())
+    };
+    assert!(differ().is_ok());
+    backend.limit_frame_bytes(1 << 20);
+    let refused = differ();
+    assert!(matches!(refused, Err(GradientError::Memory { .. })), "{refused:?}");
+}
+
+#[test]
 fn gradients_do_not_depend_on_threads_or_on_earlier_frames() {
     let scene = Scene::from_gaussians(&street(40_000, 1, 12));
     let profile = RenderProfile::default();
-    let views = turning_views();
+    let mut views = turning_views();
+    let lens = lenses().into_iter().find(|(name, _)| *name == "fisheye").unwrap().1;
+    let lens = Camera { native_size_px: None, ..lens.scaled(80, 50).unwrap() };
+    let pose = views[0].world_from_camera;
+    views.push(rolling_view(lens, pose, ShutterDirection::TopToBottom));
     let differ = |backend: &Cpu, gradients: &mut Gradients| {
         let frame = Frame { scene: &scene, profile: &profile, views: &views };
         backend.differentiate(&frame, true, &mut |images| waves(images), gradients).unwrap();
@@ -88,10 +115,12 @@ fn bytes_of_gradients() {
     let profile = RenderProfile::default();
     let view = turning_views()[0];
     let views = [View { camera: view.camera.scaled(720, 464).unwrap(), ..view }];
-    let backend = Cpu::new(1, Simd::Best).unwrap();
+    let backend = Cpu::new(4, Simd::Best).unwrap();
     // The buffers of a frame, which stay.
     let images = render_images(&backend, &scene, &profile, &views).unwrap();
     drop(images);
+    // The peak until now is that of making the scene; this begins another.
+    std::fs::write("/proc/self/clear_refs", "5").unwrap();
     let before = status_bytes("VmHWM:");
     let mut gradients = Gradients::default();
     let frame = Frame { scene: &scene, profile: &profile, views: &views };

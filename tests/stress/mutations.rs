@@ -405,7 +405,7 @@ const MUTATIONS: &[(&str, Mutation, &[&str])] = &[
     ("T30", FrozenActors, &["along: as f64"]),
     ("T31", OwnBlur, &["nearer to native by dB", "as f64"]),
     ("T32", Unwritten, &["every derivative is finite"]),
-    ("T32", MoreBlur, &["off f64 by"]),
+    ("T32", MoreBlur, &["off f64 by", "as f64 in direction"]),
 ];
 
 /// The check that no mutation of a backend affects: the bound of the record format. In the unit

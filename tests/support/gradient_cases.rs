@@ -5,10 +5,10 @@
 use std::sync::Arc;
 
 use wildcity_render::compare::gradients::{GroupError, group_errors, waves};
-use wildcity_render::gradient::{Differentiate, GaussianImages, Gradients};
+use wildcity_render::gradient::{Differentiate, GaussianImages, GradientError, Gradients};
 use wildcity_render::reference::Reference;
 use wildcity_render::{Frame, View};
-use wildcity_scene::actor::PlacedChunk;
+use wildcity_scene::actor::{ContactShadow, PlacedChunk};
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::geometry::camera::ShutterDirection;
 use wildcity_scene::{RenderProfile, Scene};
@@ -52,7 +52,7 @@ pub(crate) fn check_against_reference(
 ) {
     let (_, ours) = differentiate(backend, scene, profile, views);
     let (_, theirs) = differentiate(&Reference, scene, profile, views);
-    for GroupError { group, error, cosine } in group_errors(&ours, &theirs) {
+    for GroupError { group, error, cosine } in group_errors(&ours, &[theirs]) {
         eprintln!("{case:20} {group:10} {error:.1e} {:.1e}", 1.0 - cosine);
         assert!(error < 1e-4 && cosine > 0.99999, "{case}: {group} is off by {error:e}, {cosine}");
     }
@@ -110,6 +110,57 @@ pub(crate) fn check_actors(backend: &dyn Differentiate) {
         let view = View { camera, ..view };
         check_against_reference(name, backend, &scene, &RenderProfile::default(), &[view]);
     }
+}
+
+/// Losses that no backend accepts, and a scene that none differentiates.
+pub(crate) fn check_refusals(backend: &dyn Differentiate) {
+    let scene = Scene::from_gaussians(&street(100, 1, 5));
+    let profile = RenderProfile::default();
+    let view = turning_views()[0];
+    let views = [View { camera: view.camera.scaled(40, 30).unwrap(), ..view }];
+    let refused = |scene: &Scene, edit: &(dyn Fn(&mut Vec<GaussianImages>) + Sync)| {
+        let frame = Frame { scene, profile: &profile, views: &views };
+        let mut loss = |images: &[GaussianImages]| {
+            let mut by = images.to_vec();
+            edit(&mut by);
+            by
+        };
+        backend.differentiate(&frame, true, &mut loss, &mut Gradients::default())
+    };
+    assert!(refused(&scene, &|_| {}).is_ok());
+    // Derivatives by depth may be left out.
+    assert!(refused(&scene, &|by| by[0].depth_sum_m.clear()).is_ok());
+    assert_eq!(
+        refused(&scene, &|by| by.clear()),
+        Err(GradientError::Views { given: 0, wanted: 1 })
+    );
+    let given = 3 * 1_200 - 1;
+    assert_eq!(
+        refused(&scene, &|by| by[0].rgb.truncate(given)),
+        Err(GradientError::Size { view: 0, image: "rgb", given, wanted: 3 * 1_200 })
+    );
+    assert_eq!(
+        refused(&scene, &|by| by[0].opacity[17] = f32::INFINITY),
+        Err(GradientError::NotFinite {
+            view: 0,
+            image: "opacity",
+            index: 17,
+            value: f32::INFINITY
+        })
+    );
+    let nan = refused(&scene, &|by| by[0].depth_sum_m[1_199] = f32::NAN);
+    let named = matches!(
+        nan,
+        Err(GradientError::NotFinite { view: 0, image: "depth_sum_m", index: 1_199, .. })
+    );
+    assert!(named, "{nan:?}");
+    let mut shadowed = scene.clone();
+    let car = PlacedChunk::at_rest(chunk(&actor(10, 0, 5)), on_street(26.0, 1.5, 0.3), 0);
+    let shadow = Some(ContactShadow { length_m: 4.0, width_m: 2.0 });
+    shadowed.placed.push(PlacedChunk { shadow, ..car });
+    assert_eq!(refused(&shadowed, &|_| {}), Err(GradientError::Shadows));
+    // And what was refused has left nothing behind.
+    assert!(refused(&scene, &|_| {}).is_ok());
 }
 
 /// A scene in which every formula matters: views smaller than their native size, of which each sees

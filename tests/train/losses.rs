@@ -1,4 +1,4 @@
-//! Each loss against central differences of itself in f64, and in f32 against f64.
+//! Each loss against central differences of itself in f64, and L1 in f32 against f64.
 
 use wildcity_train::compose::{Background, Exposure, compose, compose_gradient};
 use wildcity_train::loss::ground::{Gaussian, Terms};

@@ -14,6 +14,7 @@ use wildcity_scene::{Gaussians, RenderProfile, Scene, sh};
 use super::gaussians::{GaussianSpec, forward_view, scene_from_specs};
 use super::gradients::waves;
 use crate::gradient::{Differentiate, GaussianImages, GradientError, Gradients};
+use crate::reference::Reference;
 use crate::{Frame, RollingShutter, View};
 
 /// Largest difference of a derivative as a share of the largest one of its group.
@@ -31,13 +32,38 @@ pub struct Case {
 }
 
 impl Case {
+    /// The gradients of the reference, then those with its cut and its stop nudged up and down: a
+    /// pixel whose alpha lies within the rounding of a backend of a step may take either.
+    ///
+    /// # Errors
+    /// As [`Case::gradients`].
+    pub fn truths(&self) -> Result<Vec<Gradients>, GradientError> {
+        // Five times what f32 loses of an exponent of 16.
+        const NUDGE: f64 = 1e-5;
+        let profile = self.profile;
+        let cuts = [0.0, NUDGE, -NUDGE]
+            .map(|nudge| RenderProfile { alpha_cut: profile.alpha_cut * (1.0 + nudge), ..profile });
+        let stops = [NUDGE, -NUDGE]
+            .map(|nudge| RenderProfile { stop: profile.stop * (1.0 + nudge), ..profile });
+        let truth = |profile| self.gradients_with(&Reference, &profile);
+        cuts.into_iter().chain(stops).map(truth).collect()
+    }
+
     /// The gradients of a backend for a loss of [`waves`].
     ///
     /// # Errors
     /// As [`Differentiate::differentiate`].
     pub fn gradients(&self, backend: &dyn Differentiate) -> Result<Gradients, GradientError> {
+        self.gradients_with(backend, &self.profile)
+    }
+
+    fn gradients_with(
+        &self,
+        backend: &dyn Differentiate,
+        profile: &RenderProfile,
+    ) -> Result<Gradients, GradientError> {
         let mut gradients = Gradients::default();
-        let frame = Frame { scene: &self.scene, profile: &self.profile, views: &self.views };
+        let frame = Frame { scene: &self.scene, profile, views: &self.views };
         let mut loss = |images: &[GaussianImages]| waves(images);
         backend.differentiate(&frame, true, &mut loss, &mut gradients)?;
         Ok(gradients)
@@ -120,7 +146,16 @@ fn streets() -> Vec<Case> {
             with_lens(Lens::Fisheye(Fisheye::new([-0.03, -0.005, -0.0008, 0.001], None))),
         ),
         case("rolling shutter", street(1), View { rolling_shutter: Some(rolling), ..view }),
-        case("actors", Scene { placed: actors, ..street(1) }, view),
+        case("actors", Scene { placed: actors.clone(), ..street(1) }, view),
+        Case {
+            views: vec![
+                view,
+                with_lens(Lens::Fisheye(Fisheye::new([-0.03, -0.005, -0.0008, 0.001], None))),
+                View { rolling_shutter: Some(rolling), ..view },
+                half(view),
+            ],
+            ..case("all in one frame", Scene { placed: actors, ..street(1) }, view)
+        },
     ]
 }
 
@@ -153,6 +188,8 @@ pub fn extremes() -> Vec<Case> {
     // At 1,000 km the reference is the less accurate one: it linearises the camera by differences.
     let huge = many(8, &depth, DVec3::new(1e3, 3e2, 1e2), 0.3);
     let tiny = many(60, &depth, DVec3::splat(1e-6), 0.8);
+    // Some at the floor of the opacity's scale, some above it.
+    let small = many(200, &depth, DVec3::splat(4e-3), 0.995);
     let opaque = many(40, &depth, DVec3::splat(0.3), 1.0 - 1e-7);
     let faint = many(60, &depth, DVec3::splat(0.5), 1.02 / 255.0);
     let near = many(10, &|k| 0.011 + 0.002 * k as f64, DVec3::splat(1e-3), 0.7);
@@ -181,7 +218,7 @@ pub fn extremes() -> Vec<Case> {
         case("discs", scene_from_specs(&discs), view),
         case("1 km wide", scene_from_specs(&huge), view),
         case("1 µm wide", scene_from_specs(&tiny), view),
-        Case { profile: antialiased, ..case("1 µm, antialiased", scene_from_specs(&tiny), view) },
+        Case { profile: antialiased, ..case("4 mm, antialiased", scene_from_specs(&small), view) },
         case("opaque", scene_from_specs(&opaque), view),
         case("at the cut", scene_from_specs(&faint), view),
         case("at the near plane", scene_from_specs(&near), view),

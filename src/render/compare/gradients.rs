@@ -21,14 +21,24 @@ impl GroupError {
     /// Compares derivatives by the same parameters. Equal ones have no error, also if all are 0.
     /// The largest derivative counts as at least `least`.
     pub fn new(group: &'static str, ours: &[f64], theirs: &[f64], least: f64) -> Self {
+        Self::within(group, ours, &[theirs], least)
+    }
+
+    /// As [`GroupError::new`] with several truths: what lies between them has no error. The cosine
+    /// is that to the first.
+    fn within(group: &'static str, ours: &[f64], truths: &[&[f64]], least: f64) -> Self {
+        let theirs = truths[0];
         let most = largest(theirs).max(least);
-        if ours.len() != theirs.len() {
+        if truths.iter().any(|truth| truth.len() != ours.len()) {
             return Self { group, error: f64::NAN, cosine: f64::NAN };
         }
         let mut off: f64 = 0.0;
-        for (a, b) in ours.iter().zip(theirs) {
+        for (i, ours) in ours.iter().enumerate() {
+            let of_one = truths.iter().map(|truth| truth[i]);
+            let low = of_one.clone().fold(f64::INFINITY, f64::min);
+            let high = of_one.fold(f64::NEG_INFINITY, f64::max);
             // A NaN must win, and `max` would drop it.
-            let difference = (a - b).abs();
+            let difference = (ours - ours.clamp(low, high)).abs();
             off = if difference > off || difference.is_nan() { difference } else { off };
         }
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
@@ -40,19 +50,25 @@ impl GroupError {
     }
 }
 
-/// The differences of all groups.
-pub fn group_errors(ours: &Gradients, theirs: &Gradients) -> Vec<GroupError> {
+/// The differences of all groups to one truth or to several, of which the first is the truth itself
+/// and the others are those of thresholds that are nudged.
+///
+/// # Panics
+/// Without any truth.
+pub fn group_errors(ours: &Gradients, truths: &[Gradients]) -> Vec<GroupError> {
     let ours = by_group(ours);
-    let theirs = by_group(theirs);
+    let truths: Vec<_> = truths.iter().map(by_group).collect();
+    let theirs = &truths[0];
     // A ball has no derivative by its rotation but the rounding errors of terms as large as those
     // by its size: these count with a hundredth.
     let of_size = theirs.iter().filter(|(group, _)| *group == "ln scale");
     let rotation = of_size.map(|(_, values)| 0.01 * largest(values)).sum();
-    let compare = |((group, ours), (_, theirs)): (&(&'static str, Vec<f64>), &(_, Vec<f64>))| {
+    let compare = |(index, (group, ours)): (usize, &(&'static str, Vec<f64>))| {
         let least = if *group == "quat" { rotation } else { 0.0 };
-        GroupError::new(group, ours, theirs, least)
+        let truths: Vec<&[f64]> = truths.iter().map(|truth| &truth[index].1[..]).collect();
+        GroupError::within(group, ours, &truths, least)
     };
-    ours.iter().zip(&theirs).map(compare).collect()
+    ours.iter().enumerate().map(compare).collect()
 }
 
 fn largest(values: &[f64]) -> f64 {

@@ -137,7 +137,7 @@ impl TileWalk {
             // T e - behind/(1 - alpha) is (e - behind/T') T with the transmittance T' behind the
             // splat, and T alpha is the weight. Nothing at the cap: alpha does not change there.
             let by_weight = energy - behind / after;
-            let g = raw.simd_le(cap).select(weight * by_weight, zero);
+            let g = (counts & raw.simd_le(cap)).select(weight * by_weight, zero);
             let gu = g * u;
             let gv = g * v;
             sums[partial::G] += g;

@@ -124,8 +124,8 @@ pub enum GradientError {
     Render(#[from] RenderError),
     /// The frame does not fit the memory of one pass.
     #[error(
-        "the splats of a frame exceed {limit_bytes} bytes, and gradients need all at once: use \
-         smaller images, fewer views or fewer Gaussians"
+        "gradients need all of a frame at once, and this one exceeds a limit of {limit_bytes} bytes: \
+         use smaller images, fewer views or fewer Gaussians"
     )]
     Memory { limit_bytes: u64 },
     /// A loss that has the wrong size.

@@ -28,12 +28,15 @@ pub struct Vectors {
     bytes: Vec<u8>,
 }
 
-/// A tensor that is missing, or of another type or size.
+/// Why vectors cannot be compared with.
 #[derive(Debug, thiserror::Error)]
-#[error("the tensor {tensor} of the vectors is missing, or not {wanted} floats")]
-pub struct VectorError {
-    tensor: String,
-    wanted: usize,
+pub enum VectorError {
+    /// It is no file of safetensors.
+    #[error("not a whole safetensors file: {0}; make_vectors.py writes it")]
+    File(String),
+    /// A tensor that is missing, or of another type or size.
+    #[error("the tensor {tensor} is missing, or not {wanted} floats; make_vectors.py writes it")]
+    Tensor { tensor: String, wanted: usize },
 }
 
 /// Largest error of the reference: it linearises the camera by differences, to 1e-10.
@@ -49,8 +52,14 @@ const GROUPS: [(&str, usize); 5] =
 
 impl Vectors {
     /// The vectors of a file that has been read.
-    pub fn new(bytes: Vec<u8>) -> Self {
-        Self { bytes }
+    ///
+    /// # Errors
+    /// It is no file of safetensors, or it is cut off.
+    pub fn new(bytes: Vec<u8>) -> Result<Self, VectorError> {
+        match SafeTensors::deserialize(&bytes) {
+            Ok(_) => Ok(Self { bytes }),
+            Err(error) => Err(VectorError::File(error.to_string())),
+        }
     }
 
     /// Compares the reference and some backends with all cases.
@@ -166,7 +175,7 @@ impl Vectors {
 
     fn values(&self, name: &str, wanted: usize) -> Result<Vec<f64>, VectorError> {
         let values = self.floats(name).filter(|values| values.len() == wanted);
-        values.ok_or_else(|| VectorError { tensor: name.to_owned(), wanted })
+        values.ok_or_else(|| VectorError::Tensor { tensor: name.to_owned(), wanted })
     }
 
     /// The values of a tensor of floats.

@@ -19,6 +19,7 @@ use crate::gpu::kernel::Recorder;
 use crate::gpu::layout::{Counters, RASTER_BATCH, SplatShape};
 use crate::gpu::partition::TileRows;
 use crate::gpu::project_work::{ProjectWork, Projection};
+use crate::gpu::read_back::ReadBack;
 use crate::gpu::resolve::{Outputs, Pixels, Planes};
 use crate::gradient::{
     GaussianImages, GradientError, Gradients, LossGradient, Partial, Twist, check_finite,
@@ -109,8 +110,15 @@ impl Chain {
         let longest = u64::from(RASTER_BATCH) * u64::from(head.tile_counters.most_batches);
         self.check_loops(&current, longest).inspect_err(|_| current.read_back.unmap())?;
         let images = self.read_images(&current, depth, pool)?;
-        current.read_back.unmap();
         let counters = head.counters;
+        {
+            let mut tally = self.tally.lock();
+            tally.regions += 1;
+            tally.last_frame = current.counts;
+        }
+        current.read_back.unmap();
+        let read_back = std::mem::replace(&mut current.read_back, ReadBack::new(&self.device));
+        self.read_backs.give_back(read_back);
         Ok((Drawn { frame, actors, current, work, clusters, counters }, images))
     }
 

@@ -1,4 +1,5 @@
-//! Projection backwards on the host: views of lenses and rolling shutters.
+//! Projection backwards on the host: views of lenses and rolling shutters. The Gaussians are those
+//! of the chunk, as they are before the mirror rounds them; the splats are the device's.
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -37,6 +38,9 @@ struct Seen<'a> {
     profile: &'a RenderProfile,
     tint: DVec3,
 }
+
+/// Cluster views that are projected backwards before their derivatives are added: 37 MB of these.
+const AT_A_TIME: usize = 256;
 
 /// The derivatives by one Gaussian in one view.
 type OfSplat = (usize, GaussianGradient, [DVec3; 16], Twist);
@@ -83,13 +87,15 @@ pub(in crate::gpu) fn back_project(
         })
         .collect()
     };
-    let all: Vec<Vec<OfSplat>> = cluster_views.par_iter().map(of_cluster_view).collect();
-    for (cluster_view, of_splats) in cluster_views.into_iter().zip(all) {
-        let (chunk, _) = clusters.first_gaussian(cluster_view as usize);
-        let view = clusters.view(work, cluster_view);
-        for (index, geometry, sh, twist) in of_splats {
-            gradients.chunks[chunk].add(index, &geometry, &sh);
-            gradients.twists[view] += twist;
+    for cluster_views in cluster_views.chunks(AT_A_TIME) {
+        let all: Vec<Vec<OfSplat>> = cluster_views.par_iter().map(of_cluster_view).collect();
+        for (&cluster_view, of_splats) in cluster_views.iter().zip(all) {
+            let (chunk, _) = clusters.first_gaussian(cluster_view as usize);
+            let view = clusters.view(work, cluster_view);
+            for (index, geometry, sh, twist) in of_splats {
+                gradients.chunks[chunk].add(index, &geometry, &sh);
+                gradients.twists[view] += twist;
+            }
         }
     }
 }

@@ -18,8 +18,8 @@
 //! macro tile) pair, 44 B for each splat, 20 B for each pixel, and 1 KiB for each column of each
 //! visible cluster. A frame must fit the device at once.
 //!
-//! The loss sees exact images; the Gaussians that the device projects are those of the mirror, whose
-//! colours are rounded to 16 bits of the cluster's largest and whose rotations to 20.
+//! Images and derivatives are those of the Gaussians of the mirror, whose colours are rounded to 16
+//! bits of the cluster's largest and whose rotations to 20.
 
 mod clusters;
 mod lens;
