@@ -15,7 +15,8 @@ fn every_backend_keeps_every_bound() {
     // Without fused multiply-add, other pixels lie on the other side of the cut.
     let sse42 = Cpu::new(0, Simd::Sse42).expect("a backend");
     let gpu = Gpu::new(&AdapterChoice::Best, 0).expect("a Vulkan device: mesa-vulkan-drivers");
-    let table = Table::new(&[&cpu, &sse42, &gpu], vectors.as_ref(), &mut |_, _| {}).expect("a table");
+    let table =
+        Table::new(&[&cpu, &sse42, &gpu], vectors.as_ref(), &mut |_, _| {}).expect("a table");
     eprintln!("{table}");
     assert_eq!(table.exceeded(), 0, "{table}");
     let of_vectors = table.rows.iter().filter(|row| row.against == "vectors").count();

@@ -57,7 +57,7 @@ impl Row {
 
 impl Table {
     /// Compares some backends with the reference in all cases, and with the vectors, if there are
-    /// any. What lies between the reference and itself with thresholds nudged by 1e-5 has no error.
+    /// any. What lies between the reference and itself with thresholds nudged by 1e-4 has no error.
     /// `progress` is called with the number of cases done and the next one's name.
     ///
     /// # Errors
