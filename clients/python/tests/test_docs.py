@@ -33,6 +33,7 @@ PAGES = [
     "docs/scenarios.md",
     "docs/scenes.md",
     "docs/suites.md",
+    "docs/training.md",
     "docs/tutorial.md",
 ]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)

@@ -2,6 +2,7 @@
 
 mod check;
 mod scene;
+mod settings;
 
 use super::subcommands::subcommands;
 
@@ -35,6 +36,7 @@ Examples:
 
 subcommands! { TrainCommand;
     Check(check::Check),
+    Settings(settings::PrintSettings),
 }
 
 impl Train {

@@ -67,8 +67,8 @@ pub(super) struct TrainScene {
     #[arg(long, default_value_t = 0)]
     seed: u64,
 
-    /// TOML file of all settings; --steps, --cap and --seed change it. `--settings ?` prints the
-    /// defaults.
+    /// TOML file of all settings; --steps, --cap and --seed change it. `wildcity train settings`
+    /// prints the defaults.
     #[arg(long, value_name = "FILE")]
     settings: Option<PathBuf>,
 
@@ -96,10 +96,6 @@ struct Listed<'a> {
 
 impl TrainScene {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        if self.settings.as_deref() == Some(Path::new("?")) {
-            write!(io::stdout().lock(), "{}", toml::to_string_pretty(&Settings::default())?)?;
-            return Ok(());
-        }
         // clap requires both.
         let (source, out) = (self.source.as_deref(), self.out.as_deref());
         let source = source.context("give SOURCE: a COLMAP model or a transforms.json")?;
@@ -165,7 +161,9 @@ impl TrainScene {
                 settings.steps
             )?;
         }
-        let axes = if list.is_in_scene_axes { "" } else { " --axes y-down-z-forward" };
+        // COLMAP's world has the axes of its first camera; those of a transforms.json are any.
+        let is_colmap = source.is_dir() && !source.join("transforms.json").is_file();
+        let axes = if is_colmap { " --axes y-down-z-forward" } else { "" };
         writeln!(
             stdout,
             "{}: {} Gaussians; wildcity import {} --twin NAME{axes}",

@@ -1,0 +1,17 @@
+//! `wildcity train settings`.
+
+use std::io::{self, Write};
+
+use wildcity_train::settings::Settings;
+
+/// Print all settings of training with their defaults, as a file for --settings.
+#[derive(Debug, clap::Args)]
+pub(in crate::cli) struct PrintSettings {}
+
+impl PrintSettings {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        let text = toml::to_string_pretty(&Settings::default())?;
+        write!(io::stdout().lock(), "{text}")?;
+        Ok(())
+    }
+}
