@@ -310,8 +310,8 @@ impl Step {
             gaussians,
             host_bytes_per_gaussian: self.scene.bytes() as f64 / gaussians as f64,
             other_host_bytes: sky_bytes + hood_bytes as u64,
-            // 8-bit colour, u16 for instance ids, and f32 for the other outputs. Gradients take colour
-            // and opacity, the derivatives by them, and 24 B that each tile keeps.
+            // 8-bit colour, u16 for instance ids, and f32 for the other outputs. Gradients take
+            // colour and opacity, the derivatives by them, and 24 B that each tile keeps.
             host_bytes_per_pixel: if self.gradients { 56 } else { 3 + 2 * ids + 4 * floats },
             evaluations,
             device,

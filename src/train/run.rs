@@ -21,11 +21,11 @@ use crate::trainer::{Sample, StepReport, TrainError, Trainer};
 /// Images that are decoded ahead of the step.
 const AHEAD: usize = 2;
 
-/// A decoded image.
+/// An image that has been decoded.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TrainingImage {
     pub view: View,
-    /// `[height, width, 3]`.
+    /// `[height, width, 3]`: red, green and blue.
     pub rgb8: Vec<u8>,
     /// `[height, width]`: the pixels that count; all without it.
     pub mask: Option<Vec<bool>>,
@@ -33,7 +33,7 @@ pub struct TrainingImage {
 
 /// The images of a run, by their numbers.
 pub trait TrainingImages: Sync {
-    /// Their number.
+    /// The number of all images.
     fn count(&self) -> usize;
 
     /// Whether an image is kept from the run, to judge it.

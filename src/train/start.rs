@@ -81,8 +81,11 @@ fn find_nearest(
     }
     let off = center_m[axis] - at_m[index][axis];
     let next = (axis + 1) % 3;
-    let [left, right] = [&order[..middle], &order[middle + 1..]];
-    let (near, far) = if off < 0.0 { (left, right) } else { (right, left) };
+    let mut sides = [&order[..middle], &order[middle + 1..]];
+    if off >= 0.0 {
+        sides.reverse();
+    }
+    let [near, far] = sides;
     find_nearest(near, at_m, next, center_m, nearest2);
     if off * off <= nearest2[NEIGHBOURS] {
         find_nearest(far, at_m, next, center_m, nearest2);

@@ -33,7 +33,8 @@ pub(super) struct TrainScene {
     #[arg(long, value_name = "FILE", required = true)]
     out: Option<PathBuf>,
 
-    /// Folder of the images [default: images beside a COLMAP model; the folder of a transforms.json]
+    /// Folder of the images [default: images beside a COLMAP model; the folder of a
+    /// transforms.json]
     #[arg(long, value_name = "DIR")]
     image_dir: Option<PathBuf>,
 
@@ -49,7 +50,7 @@ pub(super) struct TrainScene {
     #[arg(long, default_value_t = 7_000, value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
     steps: u32,
 
-    /// Most Gaussians.
+    /// Most Gaussians at any time.
     #[arg(long, value_name = "COUNT", default_value_t = 1_000_000)]
     cap: usize,
 
@@ -97,9 +98,9 @@ struct Listed<'a> {
 impl TrainScene {
     pub(super) fn run(self) -> anyhow::Result<()> {
         // clap requires both.
-        let (source, out) = (self.source.as_deref(), self.out.as_deref());
+        let source = self.source.as_deref();
         let source = source.context("give SOURCE: a COLMAP model or a transforms.json")?;
-        let out = out.context("give --out FILE.ply")?;
+        let out = self.out.as_deref().context("give --out FILE.ply")?;
         let settings = self.settings()?;
         let list = ImageList::read(source, self.image_dir.as_deref(), self.masks.as_deref())?;
         for warning in &list.warnings {

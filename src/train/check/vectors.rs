@@ -104,7 +104,8 @@ impl Vectors {
     /// covariances, opacities and colours.
     fn splat_row(&self) -> Result<Row, VectorError> {
         let view = View::new(self.pinhole()?, self.pose("viewmat")?.inverse());
-        let (profile, gaussians) = (RenderProfile::DEFAULT, self.sources()?);
+        let profile = RenderProfile::DEFAULT;
+        let gaussians = self.sources()?;
         let sources = Sources { profile: &profile, gaussians, views: vec![view], depth_is_z: true };
         let splats = sources.splat_gradients(&sources.decisions(), &self.products()?);
         let mut groups = Vec::new();

@@ -11,12 +11,12 @@
 //! Views of other cameras than static pinholes are projected backwards on the host, in f64, as the
 //! cpu backend does it ([`lens`]): a lens has no derivatives in WGSL.
 //!
-//! **The same input gives the same bytes** on one device: every sum has its place and its order, and
-//! nothing is added atomically.
+//! **The same input gives the same bytes** on one device: every sum has its place and its order,
+//! and nothing is added atomically.
 //!
-//! Beside the buffers of the frame there are 40 B for each (splat, tile) pair, 44 B for each (splat,
-//! macro tile) pair, 44 B for each splat, 20 B for each pixel, and 1 KiB for each column of each
-//! visible cluster. A frame must fit the device at once.
+//! Beside the buffers of the frame there are 40 B for each (splat, tile) pair, 44 B for each
+//! (splat, macro tile) pair, 44 B for each splat, 20 B for each pixel, and 1 KiB for each column of
+//! each visible cluster. A frame must fit the device at once.
 //!
 //! Images and derivatives are those of the Gaussians of the mirror, whose colours are rounded to 16
 //! bits of the cluster's largest and whose rotations to 20.

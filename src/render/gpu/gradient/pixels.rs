@@ -64,7 +64,8 @@ fn pack_tile(
     let [width, height] = view.size_px.map(|px| px as usize);
     let columns = view.columns as usize;
     let edge = TILE_PX as usize;
-    let [left, top] = [tile % columns * edge, tile / columns * edge];
+    let left = tile % columns * edge;
+    let top = tile / columns * edge;
     for y in 0..edge.min(height - top) {
         for x in 0..edge.min(width - left) {
             let pixel = (top + y) * width + left + x;

@@ -28,7 +28,7 @@ pub(in crate::gpu) struct GradientStages {
     rank: Kernel,
     gather_touches: Kernel,
     gather_splats: Kernel,
-    /// By SH degree.
+    /// By SH degree, for chunks of the twin.
     project: LazyShader<Kernel, 4>,
     /// By SH degree, for chunks of actors.
     project_actors: LazyShader<Kernel, 4>,

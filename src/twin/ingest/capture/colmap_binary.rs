@@ -1,4 +1,5 @@
-//! cameras.bin, images.bin and points3D.bin of COLMAP (src/colmap/scene/reconstruction_io.cc), little-endian.
+//! cameras.bin, images.bin and points3D.bin of COLMAP (src/colmap/scene/reconstruction_io.cc),
+//! little-endian.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -12,7 +13,8 @@ use crate::limits;
 
 /// Bytes of a point of an image: x, y, and the number of its 3D point.
 const POINT_BYTES: u64 = 24;
-/// Bytes of a point of an image that a 3D point was made of: the numbers of the image and the point.
+/// Bytes of a point of an image that a 3D point was made of: the numbers of the image and the
+/// point.
 const TRACK_BYTES: u64 = 8;
 
 pub(super) fn read(cameras: &Path, images: &Path) -> Result<Vec<PosedImage>, CaptureError> {
@@ -150,7 +152,7 @@ fn read_images(
     Ok(images)
 }
 
-/// Reads points3D.bin.
+/// Reads points3D.bin: points with their colours.
 pub(super) fn read_points(path: &Path) -> Result<Vec<CapturePoint>, CaptureError> {
     let mut bytes = Bytes::open(path)?;
     let mut points = Vec::new();

@@ -69,17 +69,23 @@ pub(super) fn read_points(path: &Path) -> Result<Vec<CapturePoint>, CaptureError
         if line.trim().is_empty() || line.starts_with('#') {
             continue;
         }
-        let wrong = |reason: String| CaptureError::at(path, Place::Line(index + 1), reason);
-        let words: Vec<&str> = line.split_whitespace().collect();
-        let [_, x, y, z, r, g, b, ..] = &words[..] else {
-            return Err(wrong("expected POINT3D_ID X Y Z R G B ERROR TRACK..".to_owned()));
-        };
-        let coordinate = |field, word: &str| number::<f64>(field, word).map_err(wrong);
-        let at = [coordinate("X", x)?, coordinate("Y", y)?, coordinate("Z", z)?];
-        let color = |field, word: &str| number::<u8>(field, word).map_err(wrong);
-        points.push(CapturePoint { at, rgb8: [color("R", r)?, color("G", g)?, color("B", b)?] });
+        let point = point(line);
+        points
+            .push(point.map_err(|reason| CaptureError::at(path, Place::Line(index + 1), reason))?);
     }
     Ok(points)
+}
+
+fn point(line: &str) -> Result<CapturePoint, String> {
+    let words: Vec<&str> = line.split_whitespace().collect();
+    let [_, x, y, z, r, g, b, ..] = &words[..] else {
+        return Err("expected POINT3D_ID X Y Z R G B ERROR TRACK..".to_owned());
+    };
+    let at = [number("X", x)?, number("Y", y)?, number("Z", z)?];
+    if !at.iter().all(|value: &f64| value.is_finite()) {
+        return Err(format!("the point is at {at:?}: write the model again"));
+    }
+    Ok(CapturePoint { at, rgb8: [number("R", r)?, number("G", g)?, number("B", b)?] })
 }
 
 /// Two lines an image: `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, and its points, which are

@@ -9,6 +9,7 @@ mod colmap_model;
 mod colmap_text;
 mod error;
 mod nerfstudio;
+mod point;
 mod points;
 
 use std::path::{Path, PathBuf};
@@ -19,7 +20,8 @@ use wildcity_scene::align::PosedImage;
 
 pub use error::{CaptureError, Place};
 pub use nerfstudio::{FrameImage, NerfstudioCapture, read as read_nerfstudio};
-pub use points::{CapturePoint, read_points};
+pub use point::CapturePoint;
+pub use points::read_points;
 
 /// Reads a COLMAP model: the folder with cameras.bin and images.bin, or with cameras.txt and
 /// images.txt; or a folder that has it in sparse/0 or sparse.

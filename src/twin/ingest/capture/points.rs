@@ -3,16 +3,10 @@
 use std::io::BufReader;
 use std::path::Path;
 
+use super::point::CapturePoint;
 use super::{CaptureError, Place, colmap_binary, colmap_text};
 use crate::ingest::file::open;
 use crate::ingest::ply;
-
-/// A point in the axes and unit of the capture.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct CapturePoint {
-    pub at: [f64; 3],
-    pub rgb8: [u8; 3],
-}
 
 /// Reads the points of a COLMAP model (points3D.bin or points3D.txt, in the folder, sparse/0 or
 /// sparse), or of a PLY file with x, y, z and, if it has colours, red, green and blue. `None` if a
@@ -38,8 +32,9 @@ pub fn read_points(source: &Path) -> Result<Option<Vec<CapturePoint>>, CaptureEr
 }
 
 fn read_ply(path: &Path) -> Result<Vec<CapturePoint>, CaptureError> {
-    let failed = |cause| CaptureError::File { path: path.to_owned(), cause };
-    let (file, file_bytes) = open(path).map_err(failed)?;
+    let opened = open(path);
+    let (file, file_bytes) =
+        opened.map_err(|cause| CaptureError::File { path: path.to_owned(), cause })?;
     let points = ply::read_points(BufReader::new(file), file_bytes);
     points.map_err(|error| CaptureError::at(path, Place::File, error.to_string()))
 }

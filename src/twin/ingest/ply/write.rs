@@ -7,9 +7,9 @@ use wildcity_scene::{Gaussians, sh};
 /// Largest rounding of a mean to f32: others are written as f64.
 const MOST_ROUNDING_M: f64 = 1e-4;
 
-/// Writes Gaussians in the layout of Kerbl et al. 2023, little-endian: means, normals (0), spherical
-/// harmonics channel by channel, opacities before the sigmoid, logarithms of the scales, and
-/// quaternions (w, x, y, z). Means far from the origin are of type double.
+/// Writes Gaussians in the layout of Kerbl et al. 2023, little-endian: means, normals (0),
+/// spherical harmonics channel by channel, opacities before the sigmoid, logarithms of the scales,
+/// and quaternions (w, x, y, z). Means far from the origin are of type double.
 ///
 /// # Errors
 /// The writer fails.
