@@ -25,6 +25,7 @@ mod hostile;
 mod materials;
 mod meshes;
 mod notes;
+mod points;
 mod real_scenes;
 mod round_trip;
 mod skies;
