@@ -35,7 +35,8 @@
 //!
 //! # Invariants
 //!
-//! 1. Only `protocol`, `client` and `server::convert` use the messages of the wire.
+//! 1. Only `protocol`, `client`, `server::convert` and `server::fault` use the messages of the
+//!    wire.
 //! 2. Only `twin::store` opens files of a twin; only `render::gpu` names wgpu; only `server` names
 //!    axum; only `repair::onnx` names the ONNX runtime; only `alpasim` names tonic and prost; only
 //!    `heap` has `unsafe`.

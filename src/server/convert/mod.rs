@@ -1,5 +1,5 @@
-//! Conversion between the wire and the session: no other module of the server names the protocol's
-//! types.
+//! Conversion between the wire and the session: no other module of the server but `fault` names
+//! the protocol's types.
 //!
 //! ```text
 //! mistake      mistakes in messages, as faults
@@ -12,14 +12,12 @@
 //! drive        recorded drives
 //! http         bodies of HTTP requests and answers
 //! actor        those about assets of actors
-//! fault        the wire code and the HTTP status of each fault
 //! ```
 
 mod actor;
 mod answer;
 mod camera;
 mod drive;
-mod fault;
 mod field;
 mod http;
 mod many;
@@ -35,7 +33,6 @@ pub(crate) use answer::{
     welcome,
 };
 pub(crate) use drive::{DriveRequest, drive_body, drive_query};
-pub(crate) use fault::{WireCode, close_status, code, http_status, refusal_body, refused};
 pub(crate) use http::{
     ListedEpisode, edited, episodes, new_edit, new_push, new_upload, push, rollback, sessions,
     survey, ticket, upload, version, versions,

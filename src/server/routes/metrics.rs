@@ -9,8 +9,7 @@ use axum::middleware::Next;
 use axum::response::{IntoResponse as _, Response};
 
 use crate::auth::{Grant, Role};
-use crate::convert::WireCode;
-use crate::fault::Fault;
+use crate::fault::{Fault, WireCode};
 use crate::metrics::GaugeValues;
 use crate::state::ServerState;
 
