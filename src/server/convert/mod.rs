@@ -4,11 +4,9 @@
 //! ```text
 //! mistake      mistakes in messages, as faults
 //! request      parses text frames as commands
-//! rig          rigs of requests
 //! answer       answers other than observations
 //! observation  observations
 //! many         observations of several sessions
-//! camera       lenses, windshields, shutters and exposures, to and from the wire
 //! drive        recorded drives
 //! http         bodies of HTTP requests and answers
 //! actor        those about assets of actors
@@ -16,7 +14,6 @@
 
 mod actor;
 mod answer;
-mod camera;
 mod drive;
 mod field;
 mod http;
@@ -24,7 +21,6 @@ mod many;
 mod mistake;
 mod observation;
 mod request;
-mod rig;
 mod sensors;
 
 pub(crate) use actor::{actor, actors, new_actor};

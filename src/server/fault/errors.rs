@@ -3,8 +3,9 @@
 use wildcity_protocol::error::Code;
 use wildcity_push::PushError;
 use wildcity_render::RenderError;
+use wildcity_scene::geometry::PoseError;
 use wildcity_scene::profile::ProfileError;
-use wildcity_scene::rig::RigError;
+use wildcity_scene::rig::{RigError, RigFieldError};
 use wildcity_session::{ScenarioError, SessionError};
 use wildcity_sim::EgoError;
 use wildcity_twin::ingest::IngestError;
@@ -26,11 +27,25 @@ fn at(code: Code, field: &str) -> Place {
     (code, Some(field.to_owned()))
 }
 
-pub(super) fn rig_code(error: &RigError) -> Code {
+pub(super) fn pose_code(error: &PoseError) -> Code {
     match error {
-        RigError::Count { .. } | RigError::Overlays { .. } => Code::OutOfRange,
-        RigError::Name { .. } | RigError::Duplicate { .. } => Code::InvalidName,
-        RigError::Camera { .. } | RigError::Appearance { .. } => Code::CameraInvalid,
+        // Not finite has a code of its own, because it comes from a client's own computation and
+        // not from its choice.
+        PoseError::NotFinite { .. } => Code::PoseNotFinite,
+        PoseError::NotARotation { .. } | PoseError::TooFar { .. } => Code::PoseInvalid,
+    }
+}
+
+fn rig_place(RigFieldError { part, cause }: &RigFieldError) -> Place {
+    let part = format!("rig.{part}");
+    match cause {
+        RigError::Count { .. } | RigError::Overlays { .. } => at(Code::OutOfRange, &part),
+        RigError::Name { .. } | RigError::Duplicate { .. } => at(Code::InvalidName, &part),
+        RigError::Pose { cause, .. } => at(pose_code(cause), &format!("{part}.{}", cause.field())),
+        RigError::Camera { cause, .. } => {
+            at(Code::CameraInvalid, &format!("{part}.{}", cause.field()))
+        }
+        RigError::Appearance { .. } => at(Code::CameraInvalid, &part),
     }
 }
 
@@ -78,8 +93,14 @@ pub(super) fn session_place(error: &SessionError) -> Place {
         SessionError::Scenario(error) => match error {
             // An unknown name is the field itself; any other error names a part of the scenario.
             ScenarioError::Unknown { .. } => at(Code::UnknownScenario, "scenario"),
+            ScenarioError::Choice { field, .. } => at(Code::InvalidRequest, field),
             _ => at(Code::ScenarioInvalid, &error.field()),
         },
+        SessionError::Rig(error) => rig_place(error),
+        SessionError::Pose { field, cause } => {
+            at(pose_code(cause), &format!("{field}.{}", cause.field()))
+        }
+        SessionError::Name { field, .. } => at(Code::InvalidName, field),
         SessionError::UnknownRig { .. } => at(Code::UnknownRig, "rig"),
         SessionError::UnknownRepair { .. } => at(Code::UnknownRepair, "repair.model"),
         SessionError::RepairUnavailable { .. } => at(Code::RepairUnavailable, "repair.model"),

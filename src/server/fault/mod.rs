@@ -18,13 +18,11 @@ use wildcity_protocol::error::Code;
 use wildcity_protocol::http::Refusal;
 use wildcity_protocol::message::Answer;
 use wildcity_push::PushError;
-use wildcity_scene::appearance::AppearanceError;
-use wildcity_scene::geometry::{CameraError, PoseError};
-use wildcity_scene::rig::RigError;
+use wildcity_scene::geometry::PoseError;
 use wildcity_session::SessionError;
 use wildcity_twin::store::StoreError;
 
-use errors::{cells_of_push, cells_of_session, push_place, rig_code, session_place};
+use errors::{cells_of_push, cells_of_session, pose_code, push_place, session_place};
 
 /// Why a request or a connection was refused. Its text is in [`Fault::report`].
 #[derive(Debug)]
@@ -70,12 +68,6 @@ pub(crate) enum Fault {
     Pose { field: String, cause: PoseError },
     /// NaN or infinity in a pose, which JSON cannot express; `field` as `pose.xyz[0]`.
     PoseNotFinite { field: String },
-    /// `field` is the camera, as `rig.cameras[2]`.
-    Camera { field: String, cause: CameraError },
-    /// The exposure or the overlay of a camera cannot be used.
-    Appearance { field: String, cause: AppearanceError },
-    /// The cameras do not form a valid rig.
-    Rig { field: String, cause: RigError },
     /// The count of `what` has reached its maximum.
     Busy { what: &'static str, limit: usize },
     /// The client was silent for too long.
@@ -245,29 +237,16 @@ impl Fault {
                      start with ."
                 ),
             ),
-            Self::Pose { field, cause } => {
-                let code = match cause {
-                    // Not finite has a code of its own, because it comes from a client's own
-                    // computation and not from its choice.
-                    PoseError::NotFinite { .. } => Code::PoseNotFinite,
-                    PoseError::NotARotation { .. } | PoseError::TooFar { .. } => Code::PoseInvalid,
-                };
-                at(code, format!("{field}.{}", cause.field()), format!("{field}: {cause}"))
-            }
+            Self::Pose { field, cause } => at(
+                pose_code(cause),
+                format!("{field}.{}", cause.field()),
+                format!("{field}: {cause}"),
+            ),
             Self::PoseNotFinite { field } => at(
                 Code::PoseNotFinite,
                 field,
                 format!("{field} is not finite; a pose needs finite numbers"),
             ),
-            Self::Camera { field, cause } => at(
-                Code::CameraInvalid,
-                format!("{field}.{}", cause.field()),
-                format!("{field}: {cause}"),
-            ),
-            Self::Appearance { field, cause } => {
-                at(Code::CameraInvalid, field, format!("{field}: {cause}"))
-            }
-            Self::Rig { field, cause } => at(rig_code(cause), field, cause.to_string()),
             Self::Busy { what, limit } => {
                 plain(Code::Busy, format!("there are {limit} {what} already; try again later"))
             }

@@ -8,7 +8,7 @@ use crate::blocking::run_blocking;
 use crate::episode::{Episode, Outcome};
 use crate::error::SessionError;
 use crate::observe::builder::finish::RenderedObservation;
-use crate::options::PixelMaps;
+use crate::observe::encode::PixelMaps;
 use crate::record::error::RecordError;
 use crate::record::format::{
     BUILD, EpisodeHeader, FrameRecord, FrameRequest, Line, RecordedOrigin, RecordedOutputs,

@@ -7,10 +7,11 @@ use serde_json::Value;
 use tokio::time::{Instant, timeout_at};
 use tracing::{Instrument as _, debug_span};
 
+use wildcity_options::{ContactMode, DynamicsChoice, DynamicsModel, Start};
 use wildcity_render::{Backend, Frame, View};
 use wildcity_scene::geometry::Pose;
 use wildcity_sim::scenario::EndReason;
-use wildcity_sim::{Command, Ego, Ground};
+use wildcity_sim::{Command, Dynamics, Ego, Ground};
 
 use super::Session;
 use super::recording::simulation_lines;
@@ -25,15 +26,39 @@ use crate::observe::builder::repair::ObservationRepair;
 use crate::observe::frame_history::FrameHistory;
 use crate::observe::layout::RigCapture;
 use crate::observe::observation::Observation;
-use crate::options::{ContactMode, ResetOptions, Start, StepOptions};
 use crate::pin::pin;
 use crate::record::command::RecordedCommand;
 use crate::record::format::{FrameRequest, Line, RecordedOrigin};
 use crate::record::recorder::NewFile;
 use crate::scenario::assets::FrameDetail;
 use crate::scenario::{EpisodeScenario, EpisodeTraffic, Event, EventKind, settle};
-use crate::start::EpisodeStart;
+use crate::start::{EpisodeStart, checked_pose};
 use crate::state::{EpisodeState, PinnedVersion};
+
+/// Options of a step in addition to its command.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct StepOptions {
+    /// Duration for which the command is followed, in microseconds: a whole number of steps; one
+    /// step if absent.
+    pub until_us: Option<i64>,
+    /// Whether the episode ends with it.
+    pub terminate: bool,
+    /// Notes of the agent, for the record.
+    pub notes: Option<Value>,
+}
+
+/// Changes by `reset` for its episode.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ResetOptions {
+    /// Seed of the episode.
+    pub seed: u64,
+    /// Where it starts; the session's start if absent.
+    pub start: Option<Start>,
+    /// How the ego moves; the session's dynamics if absent.
+    pub dynamics: Option<DynamicsChoice>,
+    /// Speed at the start, in m/s, in place of that of the dynamics.
+    pub speed_m_s: Option<f64>,
+}
 
 /// State that a frame shows in addition to the twin: the ego and its past, and the actors.
 #[derive(Clone, Copy)]
@@ -195,7 +220,11 @@ impl Session {
     /// What contact with the twin does in an episode without a scenario.
     fn contact_mode(&self, episode: &Episode) -> ContactMode {
         let model = episode.ego().dynamics().model;
-        self.settings.contact.unwrap_or_else(|| ContactMode::default_for(model))
+        // A teleported ego is not stopped by what it meets: it is often put into places where no
+        // car drives.
+        let is_teleported = model == DynamicsModel::Teleport;
+        let default = if is_teleported { ContactMode::Report } else { ContactMode::End };
+        self.settings.contact.unwrap_or(default)
     }
 
     /// Number of steps of a plan that is followed for `until_us`.
@@ -260,7 +289,14 @@ impl Session {
     pub async fn reset_with(&mut self, options: ResetOptions) -> Result<Observation, SessionError> {
         let settings = &self.settings;
         let ResetOptions { seed, start, dynamics, speed_m_s } = options;
-        let mut dynamics = dynamics.unwrap_or(settings.dynamics);
+        // Before the dynamics, as in the order of the request's fields.
+        if let Some(Start::Pose { pose }) = &start {
+            checked_pose(*pose)?;
+        }
+        let mut dynamics = match dynamics {
+            Some(asked) => Dynamics::try_from(wildcity_options::Dynamics::from(asked))?,
+            None => settings.dynamics,
+        };
         if let Some(speed_m_s) = speed_m_s {
             dynamics = dynamics.with_speed("speed", speed_m_s)?;
         }
@@ -278,7 +314,7 @@ impl Session {
         // The request, then the session's random start, then the scenario. Without any, the
         // session's start.
         let start = start
-            .or_else(|| settings.random_start.clone().map(Start::Random))
+            .or_else(|| settings.random_start.clone().map(|random| Start::Random { random }))
             .or_else(|| settings.scenario.as_ref()?.start(&loaded.as_ref()?.loaded));
         let manifest = &self.resident().version.manifest;
         let lanes = loaded.as_ref().and_then(|found| found.loaded.lanes());

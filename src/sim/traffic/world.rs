@@ -21,7 +21,7 @@ use super::script::{Action, After, Condition, Near, Phase, Trigger};
 use super::state::{ActorSpec, ActorState, EgoBox, EgoState, SubStep};
 use super::track::Track;
 use crate::limits;
-use crate::{Ego, EgoModel};
+use crate::{DynamicsModel, Ego};
 
 /// The actors of an episode before it begins.
 #[derive(Clone, Debug, PartialEq)]
@@ -454,7 +454,7 @@ impl World {
 impl EgoMotion {
     /// The motion of an ego from a state to its present one.
     pub fn new(from: EgoState, to: &Ego) -> Self {
-        let smooth = to.dynamics().model != EgoModel::Teleport;
+        let smooth = to.dynamics().model != DynamicsModel::Teleport;
         Self { from, to: EgoState::new(to), smooth }
     }
 

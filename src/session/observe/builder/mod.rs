@@ -12,7 +12,7 @@ use tracing::{Span, debug_span};
 use wildcity_render::{Backend, Frame, FrameStats, Target};
 
 use super::buffer::ObservationBuffer;
-use super::encode::{AppliedEffects, EncodedImage, Encoding, encode, hashed};
+use super::encode::{AppliedEffects, EncodedImage, ImageEncoding, PixelMaps, encode, hashed};
 use super::layout::{EffectSeed, InPlaceBytes, ObservationLayout, RigCapture};
 use super::observation::{ResidencyStats, Timings};
 use super::trust::TrainingCoverage;
@@ -20,7 +20,6 @@ use crate::engine::answer_budget::AnswerBudget;
 use crate::engine::render_queue::Scratch;
 use crate::episode::{EgoHistory, Episode};
 use crate::error::SessionError;
-use crate::options::PixelMaps;
 use crate::repair::session_repair::SessionRepair;
 use crate::repair::status::ImageRepair;
 use crate::sensors::pixels::PixelEffects;
@@ -262,7 +261,7 @@ impl ObservationBuilder {
     /// Whether the buffer holds the pixels of a capture as they are, so that the renderer writes
     /// them there.
     fn holds_pixels(&self, capture: &RigCapture) -> bool {
-        self.layout.encoding() == Encoding::Raw && capture.shown
+        self.layout.encoding() == ImageEncoding::Raw && capture.shown
     }
 
     /// Where the pixels of each view of a capture are in the buffer, if the observation holds them
@@ -387,7 +386,7 @@ fn encoded(
     let [height, width] = layout.size_px(camera).map(|side| side as u32);
     let Some(effects) = effects else {
         let mut image = encode(pixels, width, height, layout.encoding(), in_parallel)?;
-        if layout.encoding() == Encoding::Raw && is_shown_later {
+        if layout.encoding() == ImageEncoding::Raw && is_shown_later {
             image.file = pixels.to_vec();
         }
         return Ok(image);
@@ -401,7 +400,7 @@ fn encoded(
     image.took += took;
     image.effects = Some(AppliedEffects { clean_hash, stops: effects.stops });
     // Raw pixels travel in the buffer. A later observation needs a copy of its own.
-    if layout.encoding() == Encoding::Raw {
+    if layout.encoding() == ImageEncoding::Raw {
         if is_shown_later {
             image.file.clone_from(&changed);
         }
