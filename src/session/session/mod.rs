@@ -5,11 +5,13 @@
 //! | `open.rs` | opens, and switches to another version of the twin |
 //! | `branch.rs` | takes and restores snapshots, and opens sessions from a state of another episode |
 //! | `requests.rs` | answers step, observe, reset and close |
+//! | `pending.rs` | records a rendered request, and then changes the session |
 //! | `recording.rs` | writes the episode's file |
 //! | `prefetching.rs` | loads what the next steps will need |
 
 mod branch;
 mod open;
+mod pending;
 mod prefetching;
 mod recording;
 mod reference_images;

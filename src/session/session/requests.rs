@@ -14,7 +14,7 @@ use wildcity_sim::scenario::EndReason;
 use wildcity_sim::{Command, Dynamics, Ego, Ground};
 
 use super::Session;
-use super::recording::simulation_lines;
+use super::pending::{EpisodeFile, NewEpisode, Pending};
 use crate::blocking::run_blocking;
 use crate::engine::render_queue::{FrameCost, Scratch};
 use crate::episode::{Episode, EpisodeSummary, Outcome};
@@ -28,8 +28,7 @@ use crate::observe::layout::RigCapture;
 use crate::observe::observation::Observation;
 use crate::pin::pin;
 use crate::record::command::RecordedCommand;
-use crate::record::format::{FrameRequest, Line, RecordedOrigin};
-use crate::record::recorder::NewFile;
+use crate::record::format::FrameRequest;
 use crate::scenario::assets::FrameDetail;
 use crate::scenario::{EpisodeScenario, EpisodeTraffic, Event, EventKind, settle};
 use crate::start::{EpisodeStart, checked_pose};
@@ -164,14 +163,12 @@ impl Session {
             // Without them, frames before the last one would count as those of a warm-up.
             record.times_us = rendered.captures.iter().map(|capture| capture.time_us).collect();
         }
-        self.record(record, traffic.as_ref(), &events).instrument(debug_span!("record")).await?;
-
-        // Nothing fails from here on.
         next.set_repair_state(rendered.repair_state);
         let frame_history = rendered.frame_history;
-        self.state = EpisodeState { episode: next, frame_history, traffic, events };
-        self.look_ahead();
-        Ok(rendered.observation)
+        let next = EpisodeState { episode: next, frame_history, traffic, events };
+        let file = EpisodeFile::Same;
+        let observation = rendered.observation;
+        Pending { next: Some(next), record, file, observation }.commit(self).await
     }
 
     /// The episode after some steps along a command, and the ego after each of them.
@@ -258,16 +255,14 @@ impl Session {
             let must = format!("{}; 1 to {} are accepted", poses.len(), limits::OBSERVE_POSES);
             return Err(SessionError::OutOfRange { field: "poses", must });
         }
-        // A copy, because recording needs the session mutably.
-        let episode = self.state.episode.clone();
-        let captures = self.settings.layout.captures_at(&episode, poses);
-        let simulation =
-            SimulationState { episode: &episode, traffic: self.state.traffic.as_ref() };
+        let episode = &self.state.episode;
+        let captures = self.settings.layout.captures_at(episode, poses);
+        let simulation = SimulationState { episode, traffic: self.state.traffic.as_ref() };
         let deadline = Instant::now() + self.settings.deadline;
         let rendered = self.render(&self.version, simulation, captures, None, deadline).await?;
-        let record = self.frame_record(FrameRequest::Observe, &episode, &rendered);
-        self.record(record, None, &[]).instrument(debug_span!("record")).await?;
-        Ok(rendered.observation)
+        let record = self.frame_record(FrameRequest::Observe, episode, &rendered);
+        let file = EpisodeFile::Same;
+        Pending { next: None, record, file, observation: rendered.observation }.commit(self).await
     }
 
     /// Starts a new episode at `start`, or where the session started, and renders it.
@@ -361,28 +356,14 @@ impl Session {
         }
 
         let record = self.frame_record(FrameRequest::Reset, &next, &rendered);
-        let before = traffic.as_ref();
-        let mut lines = simulation_lines(before, &events, &record, true);
-        lines.push(Line::Frame(record));
-        // Before the old episode ends: if there is no new file, the old one goes on.
-        let file = self.create_file(&self.version, None, before, &next, lines).await?;
-        self.end_recording(Outcome::Completed).await;
-
+        let version = self.version.clone();
+        let new = NewEpisode { version, bytes: None, origin: None, first: next.clone() };
         next.set_repair_state(rendered.repair_state);
-        self.begin(file, None);
         let frame_history = rendered.frame_history;
-        self.state = EpisodeState { episode: next, frame_history, traffic, events };
-        self.look_ahead();
-        Ok(rendered.observation)
-    }
-
-    /// Goes over to another episode, which has its own file. The caller sets its state.
-    pub(super) fn begin(&mut self, file: NewFile, origin: Option<RecordedOrigin>) {
-        self.recorder = Some(file.recorder);
-        self.episode_number = file.number;
-        self.version_switched = false;
-        self.origin = origin;
-        self.hint.clear();
+        let next = EpisodeState { episode: next, frame_history, traffic, events };
+        let file = EpisodeFile::New(Box::new(new));
+        let observation = rendered.observation;
+        Pending { next: Some(next), record, file, observation }.commit(self).await
     }
 
     /// Ends the session and summarizes its last episode.
