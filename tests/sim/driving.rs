@@ -4,7 +4,9 @@ use glam::{DQuat, DVec2, DVec3};
 use wildcity_scene::Trajectory;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::trajectory::Keyframe;
-use wildcity_sim::ego::{Action, DynamicsModel, Path, Setpoint, SingleTrackState, TimedPose, Vehicle};
+use wildcity_sim::ego::{
+    Action, DynamicsModel, Path, Setpoint, SingleTrackState, TimedPose, Vehicle,
+};
 use wildcity_sim::{Command, Dynamics, Ego, Ground};
 
 const STEP_US: i64 = 100_000;
