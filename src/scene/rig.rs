@@ -463,6 +463,9 @@ mod tests {
         assert_eq!(serde_json::from_str::<Rig>(&text).unwrap(), rig);
         let unknown = text.replace("\"fx\"", "\"k1\":0.1,\"fx\"");
         assert!(serde_json::from_str::<Rig>(&unknown).is_err(), "a lens that is not drawn");
+        let unknown = text.replace("\"q\"", "\"roll\":0.1,\"q\"");
+        let refused = serde_json::from_str::<Rig>(&unknown).unwrap_err().to_string();
+        assert!(refused.contains("`cameras[0].camera_to_rig.roll`"), "{refused}");
     }
 
     /// Cameras are counted before any is checked: a file with 100,000 cameras must not cost more
