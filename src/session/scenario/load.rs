@@ -283,14 +283,22 @@ impl Scenarios {
         version: (&Manifest, &str),
         assets: &dyn Assets,
     ) -> Result<LoadedScenario, ScenarioError> {
+        let file = self.file(source, values)?;
+        self.resolve(file, seed, version, false, assets)
+    }
+
+    /// A scenario with values of its sweep; the first ones where they are absent.
+    pub(crate) fn file(
+        &self,
+        source: &ScenarioSource,
+        values: &BTreeMap<String, Value>,
+    ) -> Result<ScenarioFile, ScenarioError> {
         let document = self.document(source)?;
-        // Values of the caller replace the first ones of the sweep.
         let mut chosen = document.first_values();
         chosen.extend(values.iter().map(|(name, value)| (name.clone(), value.clone())));
-        let file = document.with(&chosen);
-        let file =
-            file.map_err(|cause| ScenarioError::File { file: "scenario".to_owned(), cause })?;
-        self.resolve(file, seed, version, false, assets)
+        document
+            .with(&chosen)
+            .map_err(|cause| ScenarioError::File { file: "scenario".to_owned(), cause })
     }
 
     fn read(

@@ -52,11 +52,7 @@ impl SessionScenario {
         values: &BTreeMap<String, Value>,
         gives_start: bool,
     ) -> Result<Self, ScenarioError> {
-        let document = scenarios.document(source)?;
-        let mut chosen = document.first_values();
-        chosen.extend(values.iter().map(|(name, value)| (name.clone(), value.clone())));
-        let wrong = |cause| ScenarioError::File { file: "scenario".to_owned(), cause };
-        let file = document.with(&chosen).map_err(wrong)?;
+        let file = scenarios.file(source, values)?;
         Ok(Self { scenarios, file, gives_start, generated: Arc::default() })
     }
 
