@@ -100,7 +100,7 @@ class Street:
         Each call has its own connection: a server drops clients that are silent for minutes, while they warp or train.
         """
         import wildcity
-        from wildcity.protocol import ImagePart
+        from wildcity.messages import ImagePart
 
         parts = {camera: ImagePart(size=SIZE) for camera in CAMERAS}
         outputs = wildcity.Outputs(cameras=CAMERAS, encoding="raw", depth=True, opacity=True, images=parts)

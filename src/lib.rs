@@ -6,27 +6,28 @@
 //!
 //! | package | what it is | depends on |
 //! |---|---|---|
-//! | [`wildcity_protocol`] | the wire: messages, schemas, binary observations | nothing of ours |
+//! | [`wildcity_options`] | the options of a session, as the wire and files have them | nothing of ours |
+//! | [`wildcity_protocol`] | the wire: messages, schemas, binary observations | options |
 //! | [`wildcity_client`] | the Rust client of the protocol | protocol |
-//! | [`wildcity_scene`] | what a twin is: geometry, cameras, Gaussians, levels of detail, skies, drives | nothing of ours |
+//! | [`wildcity_scene`] | what a twin is: geometry, cameras, Gaussians, levels of detail, skies, drives | options |
 //! | [`wildcity_render`] | images of a scene: `reference` (f64), `cpu` (SIMD), `gpu` (wgpu) | scene |
 //! | [`wildcity_heap`] | gives free memory back to the operating system | nothing of ours |
 //! | [`wildcity_generate`] | procedural streets and cities, and their maps | scene, sim |
-//! | [`wildcity_sim`] | what moves: ego, traffic, contacts; scenarios, maps and routes | scene |
-//! | [`wildcity_convert`] | maps and scenarios from OpenDRIVE, GeoJSON and OpenSCENARIO | scene, sim |
+//! | [`wildcity_sim`] | what moves: ego, traffic, contacts; scenarios, maps and routes | options, scene |
+//! | [`wildcity_convert`] | maps and scenarios from OpenDRIVE, GeoJSON and OpenSCENARIO | options, scene, sim |
 //! | [`wildcity_score`] | scores of driven episodes: other projects', and our verdict | scene, sim |
 //! | [`wildcity_episode`] | recorded episodes: their lines, reading, scoring and comparing them | scene, score, sim |
 //! | [`wildcity_augment`] | views off the drive as training data: plan, masks, transforms.json, COLMAP, resume | client, scene, session, twin |
 //! | [`wildcity_eval`] | rendered images against held-out real ones: scores and their page | augment, client, render, repair, scene, session, twin |
 //! | [`wildcity_train`] | training on images: losses, gradients against their definition | render, scene |
 //! | [`wildcity_stress`] | extreme scenes, each with its bound, for every backend | generate, render, scene |
-//! | [`wildcity_twin`] | twins on disk and in memory: import, versioned store, streaming | scene |
-//! | [`wildcity_session`] | episodes: reset, step, observe, record, replay | episode, generate, render, repair, scene, sim, twin |
+//! | [`wildcity_twin`] | twins on disk and in memory: import, versioned store, streaming | options, scene |
+//! | [`wildcity_session`] | episodes: reset, step, observe, record, replay | episode, generate, options, render, repair, scene, sim, twin |
 //! | [`wildcity_push`] | new versions from uploaded files: read, check, report, preview, publish | render, scene, session, twin |
 //! | [`wildcity_repair`] | repair of images by an ONNX model: manifest, tiles, checks, hashes | scene |
 //! | [`wildcity_report`] | error against run time of every setting of a twin | generate, render, repair, scene, session, stress, twin |
 //! | [`wildcity_alpasim`] | AlpaSim's gRPC services | client, render, scene, session, sim, twin |
-//! | [`wildcity_server`] | WebSocket and HTTP, and the viewer | episode, heap, protocol, push, render, repair, scene, session, sim, twin |
+//! | [`wildcity_server`] | WebSocket and HTTP, and the viewer | episode, heap, options, protocol, push, render, repair, scene, session, sim, twin |
 //! | [`wildcity_bench`] | the program `wildcity-bench`: speed of steps, sessions, actors and loading | client, generate, protocol, render, scene, server, session, twin |
 //! | [`wildcity_suite`] | suites of scenarios: drives, judges and reports them | episode, render, scene, score, server, session, sim, twin |
 //!
@@ -35,13 +36,15 @@
 //!
 //! # Invariants
 //!
-//! 1. Only `protocol`, `client` and `server::convert` use the messages of the wire.
+//! 1. Only `protocol`, `client`, `server::convert` and `server::fault` use the messages of the
+//!    wire.
 //! 2. Only `twin::store` opens files of a twin; only `render::gpu` names wgpu; only `server` names
 //!    axum; only `repair::onnx` names the ONNX runtime; only `alpasim` names tonic and prost; only
 //!    `heap` has `unsafe`.
 //! 3. `scene`, `render` and `sim` are pure: the same input gives the same bytes at any thread
 //!    count.
-//! 4. Scene data is checked once, when it enters; poses and cameras are checked once, at the wire.
+//! 4. Scene data is checked once, when it enters; poses and cameras are checked once, at
+//!    the wire or by the session that is opened with them.
 //! 5. An image is a function of scene version, render profile, poses, cameras and actors; and,
 //!    where it says so, of the repair model's hash and the episode's history; and of the effects of
 //!    sensors, which a seed, a name and a time decide. Caches change latency, never pixels.
@@ -56,6 +59,7 @@
 //!
 //! [`wildcity_bench`]: ../wildcity_bench/index.html
 //! [`wildcity_heap`]: ../wildcity_heap/index.html
+//! [`wildcity_options`]: ../wildcity_options/index.html
 //! [`wildcity_score`]: ../wildcity_score/index.html
 
 pub mod cli;

@@ -1,5 +1,5 @@
-//! The messages of the protocol `wildcity.v1`. This package has the types that are sent, and
-//! nothing else.
+//! The messages of the protocol `wildcity.v1`. This package has the types that are sent; the
+//! options of a session are those of `wildcity-options`.
 //!
 //! Text frames are JSON: [`message::Request`] from the client, [`message::Answer`] from the server,
 //! matched by `seq`. Binary frames are [observations](observation). [`http`] has the bodies of HTTP
@@ -29,14 +29,14 @@
 
 #![warn(missing_docs)]
 
-pub mod camera;
 pub mod decode;
-mod deserialize;
 pub mod error;
 pub mod http;
 pub mod limits;
 pub mod message;
 pub mod observation;
+
+pub use wildcity_options::camera;
 
 /// Name of the WebSocket subprotocol. It is also the only protocol version so far.
 pub const PROTOCOL: &str = "wildcity.v1";

@@ -6,7 +6,8 @@ use std::sync::Arc;
 use wildcity::cli::backend_options::{self, BackendOptions};
 use wildcity::cli::directories::{TwinVersion, Twins};
 use wildcity_server::{Config, Directories, Limits};
-use wildcity_session::{Engine, EngineSettings, Outputs, Scenarios, SessionOptions};
+use wildcity_session::options::{Open, Outputs};
+use wildcity_session::{Engine, EngineSettings, Scenarios};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, Version};
 
@@ -68,10 +69,7 @@ impl BenchedTwin {
     }
 
     /// Options of a session on the twin.
-    pub(super) fn session(&self, outputs: Outputs) -> SessionOptions {
-        SessionOptions {
-            version: self.twin.number,
-            ..SessionOptions::twin(&self.twin.name, outputs)
-        }
+    pub(super) fn session(&self, outputs: Outputs) -> Open {
+        Open { version: self.twin.number, outputs, ..Open::twin(&self.twin.name) }
     }
 }

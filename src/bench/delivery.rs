@@ -10,13 +10,13 @@ use super::processor::threads_processor_time;
 use super::timed::median;
 use wildcity::cli::progress;
 use wildcity_client::{Client, ConnectOptions, Open, Pose as WirePose};
-use wildcity_protocol::message;
 use wildcity_render::View;
 use wildcity_scene::Rig;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::route::Route;
 use wildcity_server::Running;
-use wildcity_session::{Encoding, Outputs, RigChoice, Session, Still, Stills};
+use wildcity_session::options::{Encoding, Outputs, RigChoice};
+use wildcity_session::{ImageEncoding, Session, Still, Stills};
 
 /// Measure the cost of delivering a step's raw images to an agent on the same machine.
 ///
@@ -121,8 +121,8 @@ impl Delivery {
         let engine = running.engine().clone();
         let rig = Rig::preset(&self.rig);
         let rig = rig.with_context(|| format!("there is no rig {:?}", self.rig))?;
-        let options = wildcity_session::SessionOptions {
-            rig: Some(RigChoice::Full(rig.clone())),
+        let options = Open {
+            rig: Some(RigChoice::Full(rig.clone().into())),
             ..self.twin.session(Outputs::colour(Encoding::Raw))
         };
         let session = Session::open(engine.clone(), "bench".to_owned(), options).await?;
@@ -137,11 +137,10 @@ impl Delivery {
     /// A client with a session of the same rig.
     async fn client(&self, running: &Running, options: &ConnectOptions) -> anyhow::Result<Client> {
         let mut client = Client::connect_with(&running.url(), "bench", options).await?;
-        let outputs =
-            message::Outputs { encoding: message::Encoding::Raw, ..message::Outputs::default() };
+        let outputs = Outputs { encoding: Encoding::Raw, ..Outputs::default() };
         let open = Open {
             version: self.twin.twin.number,
-            rig: Some(message::RigChoice::Preset(self.rig.clone())),
+            rig: Some(RigChoice::Preset(self.rig.clone())),
             outputs,
             ..Open::twin(&self.twin.twin.name)
         };
@@ -159,7 +158,7 @@ impl Ways {
                 let still = |(view, camera): (View, &wildcity_scene::rig::RigCamera)| Still {
                     view,
                     appearance: camera.appearance.clone(),
-                    encoding: Encoding::Raw,
+                    encoding: ImageEncoding::Raw,
                 };
                 let views =
                     View::from_rig(&self.rig.cameras, pose).into_iter().zip(&self.rig.cameras);

@@ -13,7 +13,8 @@ use super::size::Size;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::route::Route;
 use wildcity_scene::{Manifest, Rig};
-use wildcity_session::{Encoding, Engine, Outputs, RigChoice, Session, SessionOptions, Start};
+use wildcity_session::options::{Encoding, Open, Outputs, RigChoice, Start};
+use wildcity_session::{Engine, Session};
 
 /// Measure how many steps per second several sessions on one twin make together, without a network.
 ///
@@ -118,7 +119,7 @@ impl Sessions {
             let name = format!("bench-{number}");
             let options = self.options(manifest)?;
             let mut session = Session::open(engine.clone(), name, options).await?;
-            let start = Start::Pose(poses[at]);
+            let start = Start::from(poses[at]);
             session.reset(0, Some(start)).await?;
             drivers.push(Driver { session, poses: poses.clone(), at });
         }
@@ -150,7 +151,7 @@ impl Sessions {
         })
     }
 
-    fn options(&self, manifest: &Manifest) -> anyhow::Result<SessionOptions> {
+    fn options(&self, manifest: &Manifest) -> anyhow::Result<Open> {
         let preset = |name: &str| {
             let known: Vec<&str> = Rig::preset_names().collect();
             Rig::preset(name).with_context(|| {
@@ -165,8 +166,8 @@ impl Sessions {
         if let Some(size) = self.size {
             size.apply(&mut rig)?;
         }
-        Ok(SessionOptions {
-            rig: Some(RigChoice::Full(rig)),
+        Ok(Open {
+            rig: Some(RigChoice::Full(rig.into())),
             ..self.twin.session(Outputs::colour(self.encoding))
         })
     }
@@ -227,7 +228,7 @@ impl Row {
 
 fn encoding(text: &str) -> Result<Encoding, String> {
     match text {
-        "jpeg" => Ok(Encoding::Jpeg(wildcity_session::limits::JPEG_QUALITY)),
+        "jpeg" => Ok(Encoding::Jpeg),
         "png" => Ok(Encoding::Png),
         "raw" => Ok(Encoding::Raw),
         _ => Err("expected jpeg, png or raw".to_owned()),

@@ -10,7 +10,7 @@ use wildcity_score::{
     Polyline, ReferenceDrive, StaticContact, Track, TrackSample,
 };
 use wildcity_sim::contact::Body;
-use wildcity_sim::ego::{EgoModel, TimedPose};
+use wildcity_sim::ego::{DynamicsModel, TimedPose};
 
 use crate::file::{EpisodeFile, Frame};
 use crate::lines::{ActorsLine, Event, ScenarioLine};
@@ -54,7 +54,7 @@ pub fn drive_record(episode: &EpisodeFile) -> Option<DriveRecord> {
             center_x_m: scenario.ego.center_x,
         }),
         ego: ego_samples(&poses, episode.header.dt_us as f64 * 1e-6),
-        is_driven: episode.header.dynamics.model != EgoModel::Teleport,
+        is_driven: episode.header.dynamics.model != DynamicsModel::Teleport,
         tracks: scenario.map(|scenario| tracks(scenario, &episode.actors, &steps)),
         plans: plans(&frames),
         contacts: contacts.collect(),

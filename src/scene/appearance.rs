@@ -10,7 +10,7 @@ use data_encoding::BASE64;
 use image::codecs::png::PngEncoder;
 use image::imageops::{FilterType, resize};
 use image::{ExtendedColorType, ImageEncoder, ImageFormat, ImageReader, Rgba, Rgba32FImage};
-use serde::{Deserialize, Serialize};
+use wildcity_options::camera;
 
 /// Per-camera changes to a rendered image: first the exposure, then the overlay.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -26,8 +26,7 @@ pub struct Appearance {
 ///
 /// JSON: `{"matrix": [[..], [..], [..]], "offset": [..]}`, or `{"gain": [..], "offset": [..]}` for
 /// a diagonal matrix. `offset` defaults to 0.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(try_from = "ExposureFields", into = "ExposureFields")]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Exposure {
     /// 3 x 3, row by row.
     pub matrix: [[f64; 3]; 3],
@@ -124,10 +123,11 @@ impl Appearance {
     /// # Errors
     /// As [`Overlay::from_data_uri`].
     pub fn new(
-        exposure: Option<Exposure>,
+        exposure: Option<camera::Exposure>,
         overlay: Option<&str>,
         camera_px: [u32; 2],
     ) -> Result<Self, AppearanceError> {
+        let exposure = exposure.map(Exposure::try_from).transpose()?;
         let overlay = overlay.map(|text| Overlay::from_data_uri(text, camera_px)).transpose()?;
         Ok(Self { exposure, overlay: overlay.map(Arc::new) })
     }
@@ -304,28 +304,17 @@ impl std::fmt::Debug for Overlay {
     }
 }
 
-#[derive(Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct ExposureFields {
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    matrix: Option<[[f64; 3]; 3]>,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    gain: Option<[f64; 3]>,
-    #[serde(default)]
-    offset: [f64; 3],
-}
-
-impl TryFrom<ExposureFields> for Exposure {
+impl TryFrom<camera::Exposure> for Exposure {
     type Error = AppearanceError;
 
-    fn try_from(fields: ExposureFields) -> Result<Self, AppearanceError> {
-        let ExposureFields { matrix, gain, offset } = fields;
-        Self::new(matrix, gain, offset)
+    fn try_from(fields: camera::Exposure) -> Result<Self, AppearanceError> {
+        Self::new(fields.matrix, fields.gain, fields.offset)
     }
 }
 
-impl From<Exposure> for ExposureFields {
+impl From<Exposure> for camera::Exposure {
     fn from(Exposure { matrix, offset }: Exposure) -> Self {
+        // A gain was made a matrix as it was read, so answers and files always have the matrix.
         Self { matrix: Some(matrix), gain: None, offset }
     }
 }
@@ -336,6 +325,7 @@ const DATA_URI: &str = "data:image/png;base64,";
 #[cfg(test)]
 mod tests {
     use super::*;
+    use wildcity_options::strict;
 
     #[test]
     fn an_exposure_changes_the_colours_of_an_image() {
@@ -357,20 +347,27 @@ mod tests {
         assert!(text.starts_with("data:image/png;base64,iVBOR"), "{text}");
         assert_eq!(Overlay::from_data_uri(&text, [3, 2]).unwrap(), overlay);
         let gain = r#"{"gain": [2, 3, 4]}"#;
-        let exposure: Exposure = serde_json::from_str(gain).unwrap();
+        let exposure = read(gain).unwrap();
         assert_eq!(exposure.matrix, [[2.0, 0.0, 0.0], [0.0, 3.0, 0.0], [0.0, 0.0, 4.0]]);
         assert_eq!(exposure.offset, [0.0; 3]);
-        let text = serde_json::to_string(&exposure).unwrap();
-        assert_eq!(serde_json::from_str::<Exposure>(&text).unwrap(), exposure);
+        let text = serde_json::to_string(&camera::Exposure::from(exposure)).unwrap();
+        assert_eq!(read(&text), Ok(exposure));
+    }
+
+    /// An exposure of a rig file.
+    fn read(text: &str) -> Result<Exposure, String> {
+        let fields = strict::deserialize(&mut serde_json::Deserializer::from_str(text));
+        let fields: camera::Exposure = fields.map_err(|error| error.to_string())?;
+        Exposure::try_from(fields).map_err(|error| error.to_string())
     }
 
     #[test]
     fn invalid_appearances_are_refused() {
         for exposure in [r#"{"offset": [1, 2, 3]}"#, r#"{"gain": [1, 1]}"#, r#"{"gamma": 2}"#] {
-            assert!(serde_json::from_str::<Exposure>(exposure).is_err(), "{exposure}");
+            assert!(read(exposure).is_err(), "{exposure}");
         }
         let both = r#"{"gain": [1, 1, 1], "matrix": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}"#;
-        let error = serde_json::from_str::<Exposure>(both).unwrap_err().to_string();
+        let error = read(both).unwrap_err();
         assert!(error.contains("either a matrix or a gain"), "{error}");
         for (overlay, wanted) in [
             ("hood.png", "does not begin with data:image/png;base64,"),

@@ -270,6 +270,11 @@ impl RenderProfile {
 }
 
 impl ProfileOverrides {
+    /// The values by field name.
+    pub fn into_fields(self) -> Map<String, Value> {
+        self.0
+    }
+
     /// Overrides from a JSON object. They are checked by [`ProfileOverrides::apply`].
     pub fn new(fields: Map<String, Value>) -> Self {
         Self(fields)

@@ -3,22 +3,23 @@
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-use serde::{Deserialize, Serialize};
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize};
 
-use super::appearance::{Appearance, AppearanceError, Exposure, Overlay};
+use wildcity_options as options;
+use wildcity_options::strict;
+
+use super::appearance::{Appearance, AppearanceError, Overlay};
 use crate::geometry::camera::Shutter;
-use crate::geometry::camera::json::{Intrinsics, LensFields, WindshieldFields};
-use crate::geometry::{Camera, CameraError, Pose};
+use crate::geometry::camera::json::Intrinsics;
+use crate::geometry::{Camera, CameraError, Pose, PoseError};
 
 /// A camera mounted on the vehicle.
 ///
 /// JSON in rig files, manifests and recordings is the same as on the wire:
-/// `{"name", "width", "height", "fx", "fy", "cx", "cy", "camera_to_rig": {"xyz", "q"}}`, sizes and
-/// intrinsics in pixels. Optional fields are `lens`, `windshield` and `shutter`
-/// ([`crate::geometry::camera::json`]), `exposure` and `overlay` ([`Appearance`]), and
-/// `native_size` ([`Camera::native_size_px`]).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(try_from = "CameraFields", into = "CameraFields")]
+/// [`options::RigCamera`].
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[serde(into = "options::RigCamera")]
 pub struct RigCamera {
     /// Name within the rig, `[a-z0-9._-]+`.
     pub name: String,
@@ -93,8 +94,7 @@ impl RigCamera {
 /// assert_eq!((front.name.as_str(), front.camera.width_px), ("front", 720));
 /// # Ok::<(), wildcity_scene::rig::RigError>(())
 /// ```
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(try_from = "RigFields")]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Rig {
     /// Name, `[a-z0-9._-]+`.
     pub name: String,
@@ -129,6 +129,13 @@ pub enum RigError {
         name: String,
         /// Why it was refused.
         cause: AppearanceError,
+    },
+    /// The pose of a camera is invalid.
+    #[error("camera {name:?}: camera_to_rig.{cause}")]
+    Pose {
+        name: String,
+        /// Why it was refused.
+        cause: PoseError,
     },
     /// The overlays together would take too much memory.
     #[error("the overlays of a rig have {pixels} pixels in all; at most {limit} are accepted")]
@@ -241,46 +248,108 @@ pub fn is_name(text: &str) -> bool {
         && text.bytes().all(allowed)
 }
 
-#[derive(Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct CameraFields {
-    name: String,
-    width: u32,
-    height: u32,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    fx: Option<f64>,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    fy: Option<f64>,
-    cx: f64,
-    cy: f64,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    lens: Option<LensFields>,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    windshield: Option<WindshieldFields>,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    shutter: Option<Shutter>,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    exposure: Option<Exposure>,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    overlay: Option<String>,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    native_size: Option<[f64; 2]>,
-    camera_to_rig: Pose,
+/// Why a rig of a request was refused, and where.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[error("{cause}")]
+pub struct RigFieldError {
+    /// The part of the rig, such as `cameras[2]` or `cameras[2].exposure.gain`.
+    pub part: String,
+    pub cause: RigError,
 }
 
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-struct RigFields {
-    name: String,
-    cameras: Vec<CameraFields>,
+impl Rig {
+    /// The rig of a request, checked. Stops at the first camera whose overlay exceeds the limit, so
+    /// that no more overlays are decompressed than a rig may have.
+    ///
+    /// # Errors
+    /// Names the first part that is invalid.
+    pub fn from_request(rig: options::Rig) -> Result<Self, RigFieldError> {
+        let at = |part: &str| {
+            let part = part.to_owned();
+            move |cause| RigFieldError { part, cause }
+        };
+        // Reads no camera of a rig that has too many; `check` refuses one that has none.
+        if rig.cameras.len() > Self::MAX_CAMERAS {
+            check_count(&rig.name, rig.cameras.len()).map_err(at("cameras"))?;
+        }
+        let mut cameras: Vec<RigCamera> = Vec::new();
+        for (index, fields) in rig.cameras.into_iter().enumerate() {
+            let part = format!("cameras[{index}]");
+            let camera = RigCamera::from_request(&part, fields)?;
+            if cameras.iter().any(|other| other.name == camera.name) {
+                let cause = RigError::Duplicate { name: camera.name };
+                return Err(RigFieldError { part: format!("{part}.name"), cause });
+            }
+            cameras.push(camera);
+            check_overlays(&cameras).map_err(at(&format!("{part}.overlay")))?;
+        }
+        if !is_name(&rig.name) {
+            return Err(at("name")(RigError::Name { name: rig.name }));
+        }
+        let rig = Self { name: rig.name, cameras };
+        rig.check().map_err(at("cameras"))?;
+        Ok(rig)
+    }
+}
+
+impl RigCamera {
+    /// A camera of a request, checked; `part` names it in errors.
+    fn from_request(part: &str, fields: options::RigCamera) -> Result<Self, RigFieldError> {
+        let at = |end: &str, cause| RigFieldError { part: format!("{part}{end}"), cause };
+        let name = fields.name.clone();
+        if !is_name(&name) {
+            return Err(at(".name", RigError::Name { name }));
+        }
+        let rig_from_camera = Pose::try_from(fields.camera_to_rig)
+            .map_err(|cause| at(".camera_to_rig", RigError::Pose { name: name.clone(), cause }))?;
+        let refused = |cause| at("", RigError::Camera { name: name.clone(), cause });
+        let camera = intrinsics(&fields).camera().map_err(refused)?;
+        camera.check().map_err(refused)?;
+        let shutter = fields.shutter.map(Shutter::from);
+        shutter.as_ref().map_or(Ok(()), Shutter::check).map_err(refused)?;
+        // Decompressed after the check above, which bounds the size of the overlay by that of the
+        // image.
+        let has_gain = fields.exposure.is_some_and(|exposure| exposure.gain.is_some());
+        let size_px = [camera.width_px, camera.height_px];
+        let appearance = Appearance::new(fields.exposure, fields.overlay.as_deref(), size_px)
+            .and_then(|appearance| appearance.check(size_px).map(|()| appearance))
+            .map_err(|cause| {
+                let field = match &cause {
+                    // A gain stands for a matrix.
+                    AppearanceError::Exposure { field: "matrix", .. } if has_gain => {
+                        ".exposure.gain".to_owned()
+                    }
+                    AppearanceError::Exposure { field, .. } => format!(".exposure.{field}"),
+                    cause => format!(".{}", cause.field()),
+                };
+                at(&field, RigError::Appearance { name: name.clone(), cause })
+            })?;
+        Ok(Self { name, camera, rig_from_camera, shutter, appearance })
+    }
+}
+
+/// Files are read without unknown fields, and refused only if they form no camera at all. Callers
+/// that read a rig also call [`Rig::check`], which checks the values and names the camera at fault.
+impl<'de> Deserialize<'de> for RigCamera {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let fields: options::RigCamera = strict::deserialize(deserializer)?;
+        Self::try_from(fields).map_err(D::Error::custom)
+    }
+}
+
+impl<'de> Deserialize<'de> for Rig {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let fields: options::Rig = strict::deserialize(deserializer)?;
+        Self::try_from(fields).map_err(D::Error::custom)
+    }
 }
 
 /// Counts the cameras first, and stops at the first one whose overlay exceeds the limit, so that no
 /// more overlays are decoded than a rig may have.
-impl TryFrom<RigFields> for Rig {
+impl TryFrom<options::Rig> for Rig {
     type Error = RigError;
 
-    fn try_from(RigFields { name, cameras: fields }: RigFields) -> Result<Self, RigError> {
+    fn try_from(options::Rig { name, cameras: fields }: options::Rig) -> Result<Self, RigError> {
         check_count(&name, fields.len())?;
         let mut cameras = Vec::with_capacity(fields.len());
         for camera in fields {
@@ -293,65 +362,65 @@ impl TryFrom<RigFields> for Rig {
     }
 }
 
-impl From<RigCamera> for CameraFields {
-    fn from(from: RigCamera) -> Self {
-        let RigCamera { name, camera, rig_from_camera: camera_to_rig, shutter, appearance } = from;
-        let Intrinsics { size_px, focal_px, center_px, lens, windshield, native_size_px } =
-            Intrinsics::from_camera(&camera);
-        let [width, height] = size_px;
-        let [fx, fy] = focal_px;
-        let [cx, cy] = center_px;
-        let Appearance { exposure, overlay } = appearance;
-        let overlay = overlay.map(|overlay| overlay.to_data_uri());
-        Self {
-            name,
-            width,
-            height,
-            fx,
-            fy,
-            cx,
-            cy,
-            lens,
-            windshield,
-            shutter,
-            exposure,
-            overlay,
-            native_size: native_size_px,
-            camera_to_rig,
-        }
+impl TryFrom<options::RigCamera> for RigCamera {
+    type Error = RigError;
+
+    fn try_from(fields: options::RigCamera) -> Result<Self, RigError> {
+        let name = fields.name.clone();
+        let camera = intrinsics(&fields)
+            .camera()
+            .map_err(|cause| RigError::Camera { name: name.clone(), cause })?;
+        let rig_from_camera = Pose::try_from(fields.camera_to_rig)
+            .map_err(|cause| RigError::Pose { name: name.clone(), cause })?;
+        // The header of the overlay is compared with the camera's size before a pixel is decoded.
+        let size_px = [camera.width_px, camera.height_px];
+        let appearance = Appearance::new(fields.exposure, fields.overlay.as_deref(), size_px)
+            .map_err(|cause| RigError::Appearance { name: name.clone(), cause })?;
+        let shutter = fields.shutter.map(Shutter::from);
+        Ok(Self { name, camera, rig_from_camera, shutter, appearance })
     }
 }
 
-/// Refuses only fields that form no camera at all. Callers that read a rig also call
-/// [`Rig::check`], which checks the values and names the camera at fault.
-impl TryFrom<CameraFields> for RigCamera {
-    type Error = RigError;
+fn intrinsics(fields: &options::RigCamera) -> Intrinsics {
+    Intrinsics {
+        // Larger sizes become u32::MAX, which the check of the camera refuses.
+        size_px: [fields.width, fields.height].map(|side| u32::try_from(side).unwrap_or(u32::MAX)),
+        focal_px: [fields.fx, fields.fy],
+        center_px: [fields.cx, fields.cy],
+        lens: fields.lens,
+        windshield: fields.windshield.clone(),
+        native_size_px: fields.native_size,
+    }
+}
 
-    fn try_from(fields: CameraFields) -> Result<Self, RigError> {
-        let CameraFields { name, width, height, fx, fy, cx, cy, lens, windshield, .. } = fields;
-        let size_px = [width, height];
-        let focal_px = [fx, fy];
-        let center_px = [cx, cy];
-        let native_size_px = fields.native_size;
-        let intrinsics =
-            Intrinsics { size_px, focal_px, center_px, lens, windshield, native_size_px };
-        let camera = match intrinsics.camera() {
-            Ok(camera) => camera,
-            Err(cause) => return Err(RigError::Camera { name, cause }),
-        };
-        // The header of the overlay is compared with the camera's size before a pixel is decoded.
-        let appearance = match Appearance::new(fields.exposure, fields.overlay.as_deref(), size_px)
-        {
-            Ok(appearance) => appearance,
-            Err(cause) => return Err(RigError::Appearance { name, cause }),
-        };
-        Ok(Self {
+impl From<Rig> for options::Rig {
+    fn from(Rig { name, cameras }: Rig) -> Self {
+        Self { name, cameras: cameras.into_iter().map(Into::into).collect() }
+    }
+}
+
+impl From<RigCamera> for options::RigCamera {
+    fn from(from: RigCamera) -> Self {
+        let RigCamera { name, camera, rig_from_camera, shutter, appearance } = from;
+        let Intrinsics { size_px, focal_px, center_px, lens, windshield, native_size_px } =
+            Intrinsics::from_camera(&camera);
+        let Appearance { exposure, overlay } = appearance;
+        Self {
             name,
-            camera,
-            rig_from_camera: fields.camera_to_rig,
-            shutter: fields.shutter,
-            appearance,
-        })
+            width: size_px[0].into(),
+            height: size_px[1].into(),
+            fx: focal_px[0],
+            fy: focal_px[1],
+            cx: center_px[0],
+            cy: center_px[1],
+            lens,
+            windshield,
+            shutter: shutter.map(Into::into),
+            exposure: exposure.map(Into::into),
+            overlay: overlay.map(|overlay| overlay.to_data_uri()),
+            native_size: native_size_px,
+            camera_to_rig: rig_from_camera.into(),
+        }
     }
 }
 
@@ -394,6 +463,9 @@ mod tests {
         assert_eq!(serde_json::from_str::<Rig>(&text).unwrap(), rig);
         let unknown = text.replace("\"fx\"", "\"k1\":0.1,\"fx\"");
         assert!(serde_json::from_str::<Rig>(&unknown).is_err(), "a lens that is not drawn");
+        let unknown = text.replace("\"q\"", "\"roll\":0.1,\"q\"");
+        let refused = serde_json::from_str::<Rig>(&unknown).unwrap_err().to_string();
+        assert!(refused.contains("`cameras[0].camera_to_rig.roll`"), "{refused}");
     }
 
     /// Cameras are counted before any is checked: a file with 100,000 cameras must not cost more

@@ -12,6 +12,8 @@ use serde::{Deserialize, Serialize};
 
 use super::manifest::ObjectRef;
 use super::rig::is_name;
+use wildcity_options::strict;
+
 use crate::geometry::camera::json::{Intrinsics, LensFields, WindshieldFields};
 use crate::geometry::{Camera, CameraError, Pose};
 
@@ -83,9 +85,17 @@ struct ViewFields {
     fy: Option<f64>,
     cx: f64,
     cy: f64,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(
+        default,
+        deserialize_with = "strict::deserialize",
+        skip_serializing_if = "Option::is_none"
+    )]
     lens: Option<LensFields>,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(
+        default,
+        deserialize_with = "strict::deserialize",
+        skip_serializing_if = "Option::is_none"
+    )]
     windshield: Option<WindshieldFields>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     native_size: Option<[f64; 2]>,

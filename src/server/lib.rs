@@ -27,8 +27,8 @@
 //! memory         observations in memory that a client on the same machine maps
 //! watchers       clients that look at a session without taking part in it
 //! sessions       the sessions of the server: connected, or waiting to be resumed
-//! fault          why a request is refused
-//! convert        conversion between wire and session types; wire code and HTTP status of each fault
+//! fault          why a request is refused, with the wire code, the HTTP status and the text
+//! convert        conversion between wire and session types
 //! ```
 //!
 //! The pipeline of pushes is the package `wildcity-push`; the routes only carry requests to it.

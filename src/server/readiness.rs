@@ -7,7 +7,7 @@ use tokio::sync::Mutex;
 
 use wildcity_session::Engine;
 
-use crate::convert;
+use crate::fault::Fault;
 use crate::limits;
 
 /// The last look at the list of twins.
@@ -25,7 +25,8 @@ impl Readiness {
     pub(crate) async fn refusal(&self, engine: &Engine) -> Option<Value> {
         // A future and not a result: it is polled only if the last look is too old.
         let check = async {
-            engine.check_twins().await.err().map(|error| convert::refusal_body(&error.into()))
+            let error = engine.check_twins().await.err()?;
+            Some(Fault::from(error).report().json())
         };
         self.look(Instant::now(), check).await
     }

@@ -214,8 +214,7 @@ impl SessionRegistry {
         let may_see = |entry: &&Entry| {
             let is_own = entry.owner == grant.name;
             let twin = entry.view.as_ref().map(|view| view.twin.as_str());
-            (is_own || grant.require(Role::Admin).is_ok())
-                && twin.is_none_or(|twin| grant.allows_twin(twin))
+            (is_own || grant.has(Role::Admin)) && twin.is_none_or(|twin| grant.allows_twin(twin))
         };
         // Other clients must not learn that the session exists.
         let entry = entries.get(name).filter(may_see);

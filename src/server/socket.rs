@@ -11,7 +11,7 @@ use tokio_tungstenite::tungstenite::error::{CapacityError, ProtocolError};
 use tokio_tungstenite::tungstenite::protocol::{Role, WebSocketConfig};
 use tokio_tungstenite::tungstenite::{Error, Message};
 
-use crate::fault::Fault;
+use crate::fault::{CloseStatus, Fault};
 use crate::limits;
 use crate::stream::Stream;
 
@@ -23,14 +23,6 @@ pub(crate) struct Socket {
     peer_closed: bool,
     /// Whether a frame was begun and not ended. If that was given up, nothing can follow it.
     is_within_frame: bool,
-}
-
-/// The content of a Close frame (RFC 6455, section 7.4).
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct CloseStatus {
-    pub(crate) code: u16,
-    /// At most 123 bytes.
-    pub(crate) reason: String,
 }
 
 /// A message that arrived.

@@ -68,7 +68,7 @@ pub(crate) async fn serve(stopped: impl Future<Output = ()>, mut socket: Socket,
     drop(watch);
     match reason {
         Disconnect::Fault(fault) => {
-            socket.close(Some(crate::convert::close_status(&fault))).await;
+            socket.close(Some(fault.close_status())).await;
         }
         Disconnect::PeerLeft => socket.close(None).await,
         Disconnect::SendTimedOut => {}

@@ -1,15 +1,17 @@
 //! Errors of sessions.
 
+use wildcity_options::Start;
 use wildcity_render::RenderError;
 use wildcity_repair::RepairError;
+use wildcity_scene::geometry::PoseError;
 use wildcity_scene::profile::ProfileError;
+use wildcity_scene::rig::{RigError, RigFieldError};
 use wildcity_scene::route::RouteError;
 use wildcity_scene::sky::SkyError;
 use wildcity_sim::EgoError;
 use wildcity_twin::residency::ResidencyError;
 use wildcity_twin::store::StoreError;
 
-use crate::options::Start;
 use crate::record::error::RecordError;
 use crate::scenario::load::ScenarioError;
 
@@ -31,6 +33,25 @@ pub enum SessionError {
         name: String,
         /// The names of the presets.
         known: Vec<&'static str>,
+    },
+    /// The rig of the request is invalid.
+    #[error("{}", rig_message(.0))]
+    Rig(#[from] RigFieldError),
+    /// The numbers of a pose are invalid.
+    #[error("{field}: {cause}")]
+    Pose {
+        /// The pose, as `start.pose`.
+        field: String,
+        cause: PoseError,
+    },
+    /// A text is not a name.
+    #[error(
+        "{name:?} is not a name: a name has 1 to 64 of a-z 0-9 . _ - and does not start with ."
+    )]
+    Name {
+        /// The field of the request, as on the wire.
+        field: &'static str,
+        name: String,
     },
     /// The rig has no camera of this name.
     #[error("the rig has no camera {name:?}; it has {}", known.join(", "))]
@@ -177,9 +198,9 @@ impl SessionError {
             // `warm_up_us` belongs to `open`. What a reset can change is its start.
             (Self::OutOfRange { field: "warm_up_us", must }, Some(start)) => {
                 let field = match start {
-                    Start::Pose(_) => "start.pose",
+                    Start::Pose { .. } => "start.pose",
                     Start::Station { .. } => "start.station_m",
-                    Start::Random(_) => "start.random.from_m",
+                    Start::Random { .. } => "start.random.from_m",
                 };
                 let must = format!("too early for the session's warm_up_us, which is {must}");
                 Self::OutOfRange { field, must }
@@ -196,6 +217,16 @@ impl From<ResidencyError> for SessionError {
             ResidencyError::Store(error) => Self::Twin(error),
             other => Self::Residency(other),
         }
+    }
+}
+
+/// The part of the request, for errors that do not name it.
+fn rig_message(RigFieldError { part, cause }: &RigFieldError) -> String {
+    match cause {
+        RigError::Camera { cause, .. } => format!("rig.{part}: {cause}"),
+        RigError::Pose { cause, .. } => format!("rig.{part}: {cause}"),
+        RigError::Appearance { cause, .. } => format!("rig.{part}: {cause}"),
+        cause => cause.to_string(),
     }
 }
 

@@ -7,7 +7,7 @@
 //! | module | contents |
 //! |---|---|
 //! | `session` | a session: opening it, answering its requests |
-//! | `options`, `start` | what a client requests when it opens a session; where episodes start |
+//! | `start` | where episodes start |
 //! | `state`, `episode` | the parts of a session; the ego's pose, the simulated time, and the past poses |
 //! | `contact`, `spatial_index` | contact of the ego with the twin; what of a twin is near a place |
 //! | `snapshot` | named states, to return to and to open other sessions from |
@@ -29,7 +29,6 @@ mod error;
 pub mod limits;
 mod observe;
 mod open_scene;
-mod options;
 mod pin;
 mod prefetch;
 mod record;
@@ -52,7 +51,7 @@ pub use engine::{Engine, EngineSettings, LatestPin, PUSHES};
 pub use episode::{EgoHistory, Episode, EpisodeSummary, Outcome};
 pub use error::SessionError;
 pub use observe::buffer::ObservationBuffer;
-pub use observe::encode::{Encoding, png};
+pub use observe::encode::{ImageEncoding, PixelMaps, png};
 pub use observe::jpeg::jpeg;
 pub use observe::layout::HEADER_PREFIX_BYTES;
 pub use observe::observation::{
@@ -60,10 +59,6 @@ pub use observe::observation::{
 };
 pub use observe::trust::{RecordedPoses, TrainingCoverage, Trust};
 pub use open_scene::{FrameScene, OpenScene};
-pub use options::{
-    ContactMode, ImagePart, OnFailure, Outputs, PixelMaps, RandomStart, RepairOptions,
-    ResetOptions, RigChoice, ScenarioOptions, SessionOptions, Start, StepOptions,
-};
 pub use record::command::RecordedCommand;
 pub use record::continuation::Continuation;
 pub use record::ego_replay::DivergedStep;
@@ -89,13 +84,13 @@ pub use scenario::{
     EpisodeTraffic, Event, EventKind, LoadedScenario, ScenarioError, ScenarioSource, Scenarios,
     StoredAssets, generated_actors,
 };
-pub use sensors::settings::{
-    AxisNoise, CameraSensor, ExposureDrift, FrozenFrames, ImageNoise, Imu, LateFrames, LensDirt,
-    Sensors, WheelSpeed,
-};
 pub use sensors::{ImageSensor, SensorReason};
 pub use session::Session;
+pub use session::requests::{ResetOptions, StepOptions};
 pub use snapshot::{Snapshot, Snapshots};
 pub use start::scenario_start;
 pub use stills::{Still, StillActor, Stills};
 pub use viewpoint::viewpoints;
+
+/// What a session can be asked for: the parts of [`Open`](options::Open).
+pub use wildcity_options as options;

@@ -2,6 +2,7 @@
 
 use glam::{DQuat, DVec3};
 
+use wildcity_options::{RandomStart, Start};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::random::Random;
 use wildcity_scene::route::Route;
@@ -13,8 +14,7 @@ use wildcity_sim::{Dynamics, Ego, Ground};
 use crate::episode::Episode;
 use crate::error::SessionError;
 use crate::limits;
-use crate::options::{RandomStart, Start};
-use crate::scenario::LoadedScenario;
+use crate::scenario::{LoadedScenario, requested_start};
 
 /// The start of an episode, resolved against a version of the twin.
 #[derive(Clone, Debug)]
@@ -32,7 +32,7 @@ pub(crate) struct EpisodeStart {
 /// The scenario's warm-up is out of range, or impossible at its start.
 pub fn scenario_start(loaded: &LoadedScenario, manifest: &Manifest) -> Result<Pose, SessionError> {
     let scenario = &loaded.scenario;
-    let start = scenario.start.as_ref().map(Start::from);
+    let start = scenario.start.as_ref().map(requested_start);
     let warm_up_us = scenario.warm_up_us.unwrap_or(0);
     let dynamics = scenario.dynamics.unwrap_or_default();
     // No start of a scenario is sampled by the session, so that the seed has no effect.
@@ -60,11 +60,11 @@ impl EpisodeStart {
     ) -> Result<Self, SessionError> {
         let drives = &manifest.trajectories;
         let mut resolved = match start {
-            Some(Start::Pose(pose)) => Self::at_pose(*pose, warm_up_us)?,
+            Some(Start::Pose { pose }) => Self::at_pose(checked_pose(*pose)?, warm_up_us)?,
             Some(Start::Station { trajectory, station_m }) => {
                 Self::at_station(drives, trajectory, *station_m, warm_up_us)?
             }
-            Some(Start::Random(random)) => Self::at_random(drives, random, warm_up_us, seed)?,
+            Some(Start::Random { random }) => Self::at_random(drives, random, warm_up_us, seed)?,
             None => Self::at_first_drive(drives, warm_up_us)?,
         };
         // Whatever the kind of start, an ego on wheels is put onto the ground.
@@ -121,8 +121,10 @@ impl EpisodeStart {
                 return Err(SessionError::OutOfRange { field: "start.random", must });
             }
         };
-        check_jitter("start.random.lateral_m", *lateral_m, limits::START_LATERAL_M)?;
-        check_jitter("start.random.heading_rad", *heading_rad, std::f64::consts::PI)?;
+        let lateral_m = lateral_m.unwrap_or(0.0);
+        let heading_rad = heading_rad.unwrap_or(0.0);
+        check_jitter("start.random.lateral_m", lateral_m, limits::START_LATERAL_M)?;
+        check_jitter("start.random.heading_rad", heading_rad, std::f64::consts::PI)?;
 
         // The stations between which the start is sampled.
         let route = Route::new(drive)?;
@@ -151,8 +153,8 @@ impl EpisodeStart {
             if low < high { Random::new(seed, name, 0).range(low, high) } else { low }
         };
         let station_m = draw("start station", first_m, last_m);
-        let aside_m = draw("start lateral", -lateral_m, *lateral_m);
-        let turn_rad = draw("start heading", -heading_rad, *heading_rad);
+        let aside_m = draw("start lateral", -lateral_m, lateral_m);
+        let turn_rad = draw("start heading", -heading_rad, heading_rad);
 
         let drawn = Self::at_station(drives, &drive.name, station_m, warm_up_us)?;
         // In the axes of the rig: y points to the left.
@@ -234,6 +236,12 @@ impl EpisodeStart {
         let ego = Ego::new(dynamics, self.world_from_rig);
         Episode::with_warm_up(seed, ego, &self.warm_up, dt_us)
     }
+}
+
+/// The pose of a start, `world_from_rig`.
+pub(crate) fn checked_pose(pose: wildcity_options::Pose) -> Result<Pose, SessionError> {
+    Pose::try_from(pose)
+        .map_err(|cause| SessionError::Pose { field: "start.pose".to_owned(), cause })
 }
 
 /// The drive of a name; `field` is the field of the request that has the name.

@@ -4,6 +4,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use wildcity_options::{ContactMode, RandomStart};
 use wildcity_scene::{ProfileOverrides, RenderProfile};
 use wildcity_sim::Dynamics;
 use wildcity_sim::traffic::EgoBox;
@@ -15,7 +16,6 @@ use crate::episode::Episode;
 use crate::observe::frame_history::FrameHistory;
 use crate::observe::layout::ObservationLayout;
 use crate::observe::trust::TrainingCoverage;
-use crate::options::{ContactMode, RandomStart};
 use crate::prefetch::recorded_drive::RecordedDrive;
 use crate::record::format::profile_hash;
 use crate::repair::references::ReferenceViews;

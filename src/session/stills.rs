@@ -18,7 +18,7 @@ use crate::blocking::run_blocking;
 use crate::engine::Engine;
 use crate::engine::render_queue::FrameCost;
 use crate::error::SessionError;
-use crate::observe::encode::{Encoding, encode};
+use crate::observe::encode::{ImageEncoding, encode};
 use crate::pin::pin;
 use crate::scenario::assets::{FrameDetail, Placement};
 use crate::viewpoint::viewpoints;
@@ -32,7 +32,7 @@ pub struct Still {
     pub view: View,
     pub appearance: Appearance,
     /// How the image is encoded.
-    pub encoding: Encoding,
+    pub encoding: ImageEncoding,
 }
 
 /// A moving object in the twin, in images of one time.
@@ -174,7 +174,7 @@ fn placements(actors: &[StillActor]) -> impl Iterator<Item = Placement<'_>> {
 }
 
 fn encoded(index: usize, rgb8: Vec<u8>, still: &Still) -> Result<Vec<u8>, SessionError> {
-    if still.encoding == Encoding::Raw {
+    if still.encoding == ImageEncoding::Raw {
         return Ok(rgb8);
     }
     let camera = &still.view.camera;

@@ -14,5 +14,5 @@ pub mod route;
 pub mod scenario;
 pub mod traffic;
 
-pub use ego::{Command, Dynamics, Ego, EgoError, EgoModel};
+pub use ego::{Command, Dynamics, DynamicsModel, Ego, EgoError};
 pub use ground::Ground;

@@ -4,14 +4,15 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
+use serde::Deserialize as _;
 use serde_json::Value;
 
 use wildcity_episode::{DriveStart, ScenarioLine, scenario_line};
 use wildcity_scene::Trajectory;
 use wildcity_scene::geometry::Pose;
+use wildcity_session::options::{Encoding, ImagePart, Open, Outputs, ScenarioChoice};
 use wildcity_session::{
-    Encoding, ImagePart, LoadedScenario, Outputs, ScenarioOptions, ScenarioSource, Scenarios,
-    SessionOptions, StoredAssets, limits as session, scenario_start,
+    LoadedScenario, Scenarios, StoredAssets, limits as session, scenario_start,
 };
 use wildcity_sim::scenario::{Case as Seeded, FileError, Scenario, ScenarioFile};
 use wildcity_twin::store::{Catalog, Version};
@@ -37,7 +38,7 @@ pub struct Case {
     /// The line that heads its record.
     pub line: Arc<ScenarioLine>,
     /// Options of its session.
-    pub options: SessionOptions,
+    pub options: Open,
     /// Where the ego starts, `world_from_rig`.
     pub start: Pose,
     /// The recorded drive that the episode starts on, or that is its route, if there is one.
@@ -207,19 +208,18 @@ impl Case {
             Some(limit_us) => (limit_us.max(0) as u64).div_ceil(dt_us.max(1) as u64),
             None => limits::STEPS,
         };
-        let options = SessionOptions {
+        let scenario = ScenarioChoice::deserialize(&line.scenario).map_err(|error| {
+            let cause = FileError::new("scenario", error.to_string());
+            SuiteError::File { path: path.to_owned(), cause }
+        })?;
+        let options = Open {
             version: Some(version.number),
             seed,
             dt_us: Some(dt_us),
             // The resolved scenario has its seed, so that the session samples the same jitter.
-            scenario: Some(ScenarioOptions {
-                source: ScenarioSource::Inline(line.scenario.clone()),
-                values: BTreeMap::new(),
-                dynamics: true,
-                warm_up: true,
-                actors: false,
-            }),
-            ..SessionOptions::twin(resolved.file.twin.name.clone(), outputs(suite, version))
+            scenario: Some(scenario),
+            outputs: outputs(suite, version),
+            ..Open::twin(resolved.file.twin.name.clone())
         };
         Ok(Self {
             name,
@@ -242,7 +242,7 @@ impl Case {
 fn outputs(suite: &SuiteFile, version: &Version) -> Outputs {
     let mut outputs = Outputs::colour(Encoding::Raw);
     // Without a drive there is nothing to compare an image with.
-    outputs.trust = !version.manifest.trajectories.is_empty();
+    outputs.trust = Some(!version.manifest.trajectories.is_empty());
     outputs.cameras.clone_from(&suite.cameras);
     // A size applies to each camera, so that the cameras must be known by name.
     if let Some(size) = suite.size {

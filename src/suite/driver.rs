@@ -9,7 +9,7 @@ use wildcity_session::{Episode, Session};
 use wildcity_sim::ego::{Action, Path, TimedPose};
 use wildcity_sim::scenario::{FileError, Scenario};
 use wildcity_sim::traffic::{Idm, rolled};
-use wildcity_sim::{Command, EgoModel};
+use wildcity_sim::{Command, DynamicsModel};
 
 use crate::case::Case;
 
@@ -79,7 +79,7 @@ impl BuiltIn {
     /// The scenario has no recorded drive, which this agent follows ([`Self::check`]).
     pub(crate) fn command(self, case: &Case, session: &Session) -> Result<Command, String> {
         let episode = session.episode();
-        let teleports = episode.ego().dynamics().model == EgoModel::Teleport;
+        let teleports = episode.ego().dynamics().model == DynamicsModel::Teleport;
         let dt_us = case.options.dt_us.unwrap_or(wildcity_session::limits::DT_US);
         match self {
             // It takes its own pose: a teleport stands by being told where it is.

@@ -122,7 +122,7 @@ impl EpisodeEntry {
             errors: errors.collect(),
         };
         if let Some(Finished { record, end, mut result, frames_hash, drive_hash }) = finished {
-            if !case.options.outputs.trust {
+            if case.options.outputs.trust != Some(true) {
                 // Without a recorded drive nothing says where the twin was trained.
                 result.not_judged.push(format!("{OFF_MODEL}: {NO_TRUST}"));
             }

@@ -19,8 +19,12 @@ fn schemas_of_files_are_up_to_date() {
     check("map", schema_for!(MapFile));
 }
 
-/// Every object may have a note, and every number may be a value of the sweep.
+/// Every object may have a note, and every number may be a value of the sweep. The types of
+/// `wildcity-options` do not say that files have no other fields.
 fn swept(schema: &mut Schema) {
+    if schema.get("properties").is_some() && schema.get("additionalProperties").is_none() {
+        schema.insert("additionalProperties".to_owned(), false.into());
+    }
     if let Some(properties) = schema.get_mut("properties").and_then(|value| value.as_object_mut()) {
         properties
             .insert("note".to_owned(), json!({"type": "string", "description": "A comment."}));

@@ -9,10 +9,8 @@ use std::time::Duration;
 use serde_json::json;
 use wildcity_client::PushState;
 use wildcity_render::cpu::{Cpu, Simd};
-use wildcity_session::{
-    Encoding, Engine, EngineSettings, Outputs, RecordedEpisode, ReplayUntil, Scenarios, Session,
-    SessionOptions,
-};
+use wildcity_session::options::{Encoding, Open, Outputs};
+use wildcity_session::{Engine, EngineSettings, RecordedEpisode, ReplayUntil, Scenarios, Session};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, Retention};
 
@@ -180,7 +178,7 @@ async fn the_latest_is_the_one_before_until_the_new_one_is_ready() {
     });
     let engine = engine.unwrap();
     let latest = async || {
-        let opening = SessionOptions::twin("test", Outputs::colour(Encoding::Raw));
+        let opening = Open { outputs: Outputs::colour(Encoding::Raw), ..Open::twin("test") };
         let session = Session::open(engine.clone(), "a".to_owned(), opening).await.unwrap();
         session.resident().version.number
     };

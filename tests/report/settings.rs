@@ -21,10 +21,8 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::{Fisheye, Lens};
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{ProfileOverrides, Rays, RecordFormat, RenderProfile, Rig, Scene};
-use wildcity_session::{
-    Encoding, Engine, EngineSettings, Outputs, Scenarios, Session, SessionOptions, Tensor,
-    TensorKind,
-};
+use wildcity_session::options::{Encoding, Open, Outputs};
+use wildcity_session::{Engine, EngineSettings, Scenarios, Session, Tensor, TensorKind};
 use wildcity_twin::residency::{Cache, Resident};
 use wildcity_twin::store::{Catalog, NewSky, NewVersion, SkyBytes, StorageOptions};
 
@@ -408,9 +406,10 @@ async fn least_db_of_session(
     poses: &[Pose],
     truths: &[Vec<f32>],
 ) -> f64 {
-    let opening = SessionOptions {
-        profile,
-        ..SessionOptions::twin("street", Outputs::colour(Encoding::Raw))
+    let opening = Open {
+        profile: profile.into_fields(),
+        outputs: Outputs::colour(Encoding::Raw),
+        ..Open::twin("street")
     };
     let mut session = Session::open(engine.clone(), "agent".to_owned(), opening).await.unwrap();
     session.reset(0, None).await.unwrap();

@@ -48,6 +48,60 @@ fn handshake(host: &str, protocol: &str) -> String {
     )
 }
 
+/// Every route of the document, asked without a token, with each role, and with a token of another
+/// twin: a route whose check is missing or of another role fails. The roles of the document are
+/// compared with the protocol's page in `src/server/routes/openapi.rs`.
+#[tokio::test]
+async fn every_route_refuses_the_tokens_that_may_not_use_it() {
+    let mut tokens: Vec<Value> = ["metrics", "drive", "push", "admin"]
+        .iter()
+        .map(|role| json!({ "name": role, "role": role, "token": format!("{role}-{role}-{role}-{role}") }))
+        .collect();
+    tokens.push(json!({
+        "name": "elsewhere", "role": "admin", "token": "elsewhere-elsewhere", "twins": ["road"],
+    }));
+    let text = json!({ "tokens": tokens }).to_string();
+    let tokens = Tokens::parse(text.as_bytes()).unwrap();
+    let server = TestServer::configured(|config| config.tokens = Some(tokens)).await;
+    let document = include_str!("../../protocol/openapi.json");
+    let document: Value = serde_json::from_str(document).unwrap();
+    for (path, methods) in document["paths"].as_object().unwrap() {
+        let named = path.replace("{twin}", "street").replace(['{', '}'], "");
+        for (method, operation) in methods.as_object().unwrap() {
+            let method = method.to_ascii_uppercase();
+            let ask_as = async |token: Option<&str>| {
+                let header =
+                    token.map_or(String::new(), |token| format!("\nAuthorization: Bearer {token}"));
+                let start = format!("{method} {named} HTTP/1.1\nHost: localhost");
+                ask(&server, &format!("{start}\nContent-Length: 0{header}")).await
+            };
+            let allowed: &[&str] = match operation["description"].as_str().unwrap() {
+                "" => {
+                    let (status, _) = ask_as(None).await;
+                    assert_eq!(status, 200, "{method} {path} without a token");
+                    continue;
+                }
+                "Any token, except those with the role metrics."
+                | "Tokens with the role drive, push or admin." => &["drive", "push", "admin"],
+                "Tokens with the role push or admin." => &["push", "admin"],
+                "Tokens with the role admin or admin." => &["admin"],
+                "Tokens with the role metrics or admin." => &["metrics", "admin"],
+                other => panic!("{method} {path}: {other}"),
+            };
+            assert_eq!(ask_as(None).await.0, 401, "{method} {path} without a token");
+            for role in ["metrics", "drive", "push", "admin"] {
+                let (status, body) = ask_as(Some(&format!("{role}-{role}-{role}-{role}"))).await;
+                let is_refused = status == 403;
+                assert_eq!(is_refused, !allowed.contains(&role), "{role}, {method} {path}: {body}");
+            }
+            let (status, body) = ask_as(Some("elsewhere-elsewhere")).await;
+            let is_refused = status == 403 && body["field"] == "twin";
+            // A token of some twins may add no asset either, which is another field.
+            assert_eq!(is_refused, path.contains("{twin}"), "{method} {path}: {body}");
+        }
+    }
+}
+
 #[tokio::test]
 async fn a_ticket_is_for_a_websocket_and_survives_a_refused_handshake() {
     let server = guarded().await;

@@ -10,11 +10,10 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::trajectory::{Keyframe, Trajectory};
 use wildcity_scene::{ActorBox, ActorClass, Gaussians, RecordFormat, RenderProfile};
-use wildcity_session::{
-    RecordedEpisode, ReplayError, ReplayUntil, ScenarioOptions, ScenarioSource, Start, StepOptions,
-};
+use wildcity_session::options::{ScenarioChoice, Start};
+use wildcity_session::{RecordedEpisode, ReplayError, ReplayUntil, StepOptions};
 use wildcity_sim::ego::Action;
-use wildcity_sim::{Command, Dynamics, EgoModel};
+use wildcity_sim::{Command, Dynamics, DynamicsModel};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, NewVersion, StorageOptions};
 
@@ -72,17 +71,14 @@ async fn a_recorded_episode_is_rendered_again_with_its_actors() {
     ]);
     let mut bundled = options(&actors, true);
     bundled.outputs.frames = Some(3);
-    bundled.dynamics =
-        Dynamics { model: EgoModel::Kinematic, speed_m_s: 6.0, ..Dynamics::default() };
+    let kinematic =
+        Dynamics { model: DynamicsModel::Kinematic, speed_m_s: 6.0, ..Dynamics::default() };
+    bundled.dynamics = Some(kinematic.into());
     bundled.twin = "straight".to_owned();
     bundled.start = Some(Start::Station { trajectory: "log".to_owned(), station_m: 6.0 });
-    bundled.warm_up_us = 400_000;
-    if let Some(ScenarioOptions {
-        source: ScenarioSource::Inline(file), warm_up, dynamics, ..
-    }) = &mut bundled.scenario
-    {
+    bundled.warm_up_us = Some(400_000);
+    if let Some(ScenarioChoice::Object(file)) = &mut bundled.scenario {
         file["twin"]["name"] = "straight".into();
-        (*warm_up, *dynamics) = (false, false);
     }
     let bench = bench(Cache::new(catalog.clone()));
     let still = || Command::Action(Action { acceleration_m_s2: 0.0, curvature_1_m: 0.01 });
@@ -141,9 +137,7 @@ async fn a_record_with_actors_of_another_scenario_is_refused() {
     let mut options = options(&actors, false);
     options.twin = "straight".to_owned();
     options.start = Some(Start::Station { trajectory: "log".to_owned(), station_m: 6.0 });
-    if let Some(ScenarioOptions { source: ScenarioSource::Inline(file), .. }) =
-        &mut options.scenario
-    {
+    if let Some(ScenarioChoice::Object(file)) = &mut options.scenario {
         file["twin"]["name"] = "straight".into();
     }
     let bench = bench(Cache::new(catalog.clone()));

@@ -15,13 +15,15 @@ use wildcity_scene::geometry::camera::{Shutter, ShutterDirection};
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::rig::{Rig, RigCamera};
 use wildcity_scene::{ActorBox, ActorClass, Gaussians, RecordFormat};
+use wildcity_session::options::{
+    CameraSensor, Encoding, LateFrames, Open, Outputs, RigChoice, Sensors, Start,
+};
 use wildcity_session::{
-    CameraSensor, DType, Encoding, Engine, LateFrames, Observation, Outcome, Outputs, RigChoice,
-    ScenarioError, ScenarioOptions, ScenarioSource, Sensors, Session, SessionError, SessionOptions,
-    Start, StepOptions, TensorKind,
+    DType, Engine, Observation, Outcome, ScenarioError, Session, SessionError, StepOptions,
+    TensorKind,
 };
 use wildcity_sim::ego::Action;
-use wildcity_sim::{Command, Dynamics, EgoModel};
+use wildcity_sim::{Command, Dynamics, DynamicsModel};
 use wildcity_twin::residency::{Cache, FrameBytes};
 use wildcity_twin::store::StoredActor;
 
@@ -84,26 +86,21 @@ pub(crate) fn actors(asset: &Value) -> Value {
     ])
 }
 
-pub(crate) fn options(actors: &Value, shutters: bool) -> SessionOptions {
+pub(crate) fn options(actors: &Value, shutters: bool) -> Open {
     let scenario = json!({
         "format": "wildcity.scenario/1", "name": "test", "twin": {"name": "demo"}, "actors": actors,
     });
-    let options = ScenarioOptions {
-        source: ScenarioSource::Inline(scenario),
-        values: Default::default(),
-        dynamics: true,
-        warm_up: true,
-        actors: false,
-    };
-    SessionOptions {
-        start: Some(Start::Pose(demo().at(EGO_M))),
-        rig: Some(RigChoice::Full(Rig { name: "pair".to_owned(), cameras: rig(shutters) })),
+    let options = serde_json::from_value(scenario).unwrap();
+    Open {
+        start: Some(Start::from(demo().at(EGO_M))),
+        rig: Some(RigChoice::Full(Rig { name: "pair".to_owned(), cameras: rig(shutters) }.into())),
         scenario: Some(options),
-        ..SessionOptions::twin("demo", Outputs::colour(Encoding::Raw))
+        outputs: Outputs::colour(Encoding::Raw),
+        ..Open::twin("demo")
     }
 }
 
-pub(crate) async fn open(bench: &Bench, name: &str, options: SessionOptions) -> Session {
+pub(crate) async fn open(bench: &Bench, name: &str, options: Open) -> Session {
     Session::open(bench.engine.clone(), name.to_owned(), options).await.unwrap()
 }
 
@@ -199,7 +196,7 @@ async fn a_late_frame_shows_the_actors_of_when_it_was_taken() {
         };
         let cameras = [("front".to_owned(), late)].into();
         let sensors = Some(Sensors { cameras, ..Sensors::default() });
-        let opening = SessionOptions { sensors, ..options(&actors(&asset), shutters) };
+        let opening = Open { sensors, ..options(&actors(&asset), shutters) };
         let name = format!("late-{shutters}");
         let mut session = open(&bench, &name, opening).await;
         let mut seen = standing(&mut session, 2).await;
@@ -256,7 +253,7 @@ async fn an_asset_may_be_named_and_one_that_is_missing_is_refused() {
 #[tokio::test(flavor = "multi_thread")]
 async fn without_actors_nothing_changes() {
     let bench = bench(unlimited());
-    let bare = SessionOptions { scenario: None, ..options(&json!([]), true) };
+    let bare = Open { scenario: None, ..options(&json!([]), true) };
     let wanted = standing(&mut open(&bench, "bare", bare).await, 2).await;
     let none = options(&json!([]), true);
     assert_eq!(standing(&mut open(&bench, "none", none).await, 2).await, wanted);
@@ -383,7 +380,8 @@ async fn plans_and_warm_ups_draw_the_actors_of_each_frame() {
     let asset = Value::from(&*car().hash);
     let mut bundled = options(&actors(&asset), true);
     bundled.outputs.frames = Some(4);
-    bundled.dynamics = Dynamics { model: EgoModel::Kinematic, ..Dynamics::default() };
+    let kinematic = Dynamics { model: DynamicsModel::Kinematic, ..Dynamics::default() };
+    bundled.dynamics = Some(kinematic.into());
     let mut slow = open(&bench, "slow", bundled.clone()).await;
     let mut fast = open(&bench, "fast", bundled).await;
     slow.reset(0, None).await.unwrap();
@@ -409,7 +407,7 @@ async fn plans_and_warm_ups_draw_the_actors_of_each_frame() {
 async fn instances_tell_whose_pixels_they_are() {
     let bench = bench(unlimited());
     let mut asked = options(&actors(&Value::from(&*car().hash)), false);
-    asked.outputs.maps.instances = true;
+    asked.outputs.instances = Some(true);
     let mut session = open(&bench, "a", asked.clone()).await;
     let seen = session.reset(0, None).await.unwrap();
     let ids = |seen: &Observation| -> Vec<u16> {
@@ -428,7 +426,7 @@ async fn instances_tell_whose_pixels_they_are() {
     assert!(count(&first, 2) > 20, "the car ahead: {}", count(&first, 2));
     assert!(count(&first, 1) > 1000 && first.iter().all(|id| *id <= 3));
     // The colours do not depend on it.
-    asked.outputs.maps.instances = false;
+    asked.outputs.instances = None;
     let mut plain = open(&bench, "b", asked).await;
     assert_eq!(hashes(&plain.reset(0, None).await.unwrap()), hashes(&seen));
 }
@@ -440,7 +438,7 @@ async fn assets_count_against_the_memory_of_twins() {
     let bench_ = bench(unlimited());
     let stats = |engine: &Arc<Engine>| engine.residency();
     let options = options(&actors(&Value::from(&*car().hash)), false);
-    let bare = SessionOptions { scenario: None, ..options.clone() };
+    let bare = Open { scenario: None, ..options.clone() };
     let first = open(&bench_, "bare", bare).await;
     let reserved_bytes = stats(&bench_.engine).reserved_bytes;
     let second = open(&bench_, "a", options.clone()).await;
@@ -458,7 +456,7 @@ async fn assets_count_against_the_memory_of_twins() {
     // Without room for it, the scenario does not open.
     let limit_bytes = first.reserved_bytes() + bytes - 1;
     let small = bench(Cache::limited(demo().catalog(), Some(limit_bytes)));
-    let _held = open(&small, "held", SessionOptions { scenario: None, ..options.clone() }).await;
+    let _held = open(&small, "held", Open { scenario: None, ..options.clone() }).await;
     let opened = Session::open(small.engine.clone(), "a".to_owned(), options).await;
     let error = opened.err().map(|error| error.to_string()).unwrap_or_default();
     assert!(error.contains("red-box") && error.contains("--memory-gib"), "{error}");

@@ -14,7 +14,8 @@ use wildcity_scene::geometry::camera::Pinhole;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::rig::{Rig, RigCamera};
-use wildcity_session::{Encoding, Outputs, RigChoice, Session, SessionOptions, Start};
+use wildcity_session::Session;
+use wildcity_session::options::{Encoding, Open, Outputs, RigChoice, Start};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, NewVersion};
 
@@ -68,10 +69,11 @@ async fn frames_without_actors_are_those_before_there_were_actors() {
     let new = NewVersion::from_gaussians("cloud", &cloud, Provenance::new("test".to_owned()));
     catalog.commit(new, &mut |_, _| {}).unwrap();
     let bench = bench_with(Cache::new(catalog), Arc::new(backend));
-    let options = SessionOptions {
-        start: Some(Start::Pose(at(0))),
-        rig: Some(RigChoice::Full(rig())),
-        ..SessionOptions::twin("cloud", Outputs::colour(Encoding::Raw))
+    let options = Open {
+        start: Some(Start::from(at(0))),
+        rig: Some(RigChoice::Full(rig().into())),
+        outputs: Outputs::colour(Encoding::Raw),
+        ..Open::twin("cloud")
     };
     let mut session = Session::open(bench.engine.clone(), "a".to_owned(), options).await.unwrap();
     let mut found = vec![session.reset(0, None).await.unwrap().frame_hash];

@@ -9,10 +9,8 @@ use wildcity_render::cpu::Cpu;
 use wildcity_render::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::{Rig, RigCamera};
-use wildcity_session::{
-    Encoding, Engine, EngineSettings, Observation, Outputs, RigChoice, Scenarios, Session,
-    SessionError, SessionOptions,
-};
+use wildcity_session::options::{Encoding, Open, Outputs, RigChoice, Start};
+use wildcity_session::{Engine, EngineSettings, Observation, Scenarios, Session, SessionError};
 use wildcity_twin::residency::{Cache, ResidencyError, Resident, SectionRef};
 
 use crate::source::{Fault, Faulty, Place};
@@ -103,11 +101,12 @@ impl Bench {
         name: &str,
         deadline: Option<Duration>,
     ) -> Result<Session, SessionError> {
-        let options = SessionOptions {
-            start: Some(wildcity_session::Start::Pose(demo().at(0.0))),
-            rig: Some(RigChoice::Full(rig())),
-            deadline,
-            ..SessionOptions::twin("demo", Outputs::colour(Encoding::Raw))
+        let options = Open {
+            start: Some(Start::from(demo().at(0.0))),
+            rig: Some(RigChoice::Full(rig().into())),
+            deadline_ms: deadline.map(|deadline| deadline.as_millis() as u64),
+            outputs: Outputs::colour(Encoding::Raw),
+            ..Open::twin("demo")
         };
         Session::open(self.engine.clone(), name.to_owned(), options).await
     }

@@ -12,9 +12,8 @@ use wildcity_scene::geometry::Camera;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::Pinhole;
 use wildcity_scene::rig::{Rig, RigCamera};
-use wildcity_session::{
-    Encoding, Outputs, RigChoice, Session, SessionError, SessionOptions, Start, limits,
-};
+use wildcity_session::options::{Encoding, Open, Outputs, RigChoice, Start};
+use wildcity_session::{Session, SessionError, limits};
 use wildcity_twin::residency::Cache;
 
 use crate::driving::{Bench, bench};
@@ -38,10 +37,11 @@ async fn session(bench: &Bench, name: String, width_px: u32, height_px: u32) -> 
     let ahead =
         Pose { position_m: 1.5 * DVec3::Z, rotation: DQuat::from_xyzw(-0.5, 0.5, -0.5, 0.5) };
     let cameras = vec![RigCamera::new("front", camera, ahead)];
-    let options = SessionOptions {
-        start: Some(Start::Pose(place())),
-        rig: Some(RigChoice::Full(Rig { name: "one".to_owned(), cameras })),
-        ..SessionOptions::twin("demo", Outputs::colour(Encoding::Raw))
+    let options = Open {
+        start: Some(Start::from(place())),
+        rig: Some(RigChoice::Full(Rig { name: "one".to_owned(), cameras }.into())),
+        outputs: Outputs::colour(Encoding::Raw),
+        ..Open::twin("demo")
     };
     Session::open(bench.engine.clone(), name, options).await.unwrap()
 }

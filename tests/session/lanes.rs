@@ -7,9 +7,10 @@ use serde_json::{Value, json};
 use wildcity_scene::Gaussians;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::manifest::Provenance;
-use wildcity_session::{ScenarioOptions, ScenarioSource, Scenarios, Start};
+use wildcity_session::Scenarios;
+use wildcity_session::options::{ScenarioChoice, Start};
 use wildcity_sim::ego::Action;
-use wildcity_sim::{Command, Dynamics, EgoModel};
+use wildcity_sim::{Command, Dynamics, DynamicsModel};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, NewVersion};
 
@@ -64,15 +65,13 @@ async fn the_ego_climbs_with_a_lane_and_its_record_is_driven_again() {
     options.twin = "hill".to_owned();
     // Above the road: the start is placed on it.
     let position_m = DVec3::new(10.0, 0.5, 3.0);
-    options.start = Some(Start::Pose(Pose { position_m, ..Pose::IDENTITY }));
-    options.dynamics =
-        Dynamics { model: EgoModel::Kinematic, speed_m_s: 8.0, ..Dynamics::default() };
-    if let Some(ScenarioOptions { source: ScenarioSource::Inline(file), dynamics, .. }) =
-        &mut options.scenario
-    {
+    options.start = Some(Start::from(Pose { position_m, ..Pose::IDENTITY }));
+    let kinematic =
+        Dynamics { model: DynamicsModel::Kinematic, speed_m_s: 8.0, ..Dynamics::default() };
+    options.dynamics = Some(kinematic.into());
+    if let Some(ScenarioChoice::Object(file)) = &mut options.scenario {
         file["twin"]["name"] = "hill".into();
-        file["map"] = json!({"file": "hill.map.json"});
-        *dynamics = false;
+        file.insert("map".to_owned(), json!({"file": "hill.map.json"}));
     }
     let mut session = open(&bench, "hill", options).await;
     session.reset(0, None).await.unwrap();

@@ -5,7 +5,7 @@ use std::f64::consts::TAU;
 use glam::{DQuat, DVec3};
 use wildcity_scene::geometry::Pose;
 use wildcity_session::Episode;
-use wildcity_sim::ego::{Action, EgoModel};
+use wildcity_sim::ego::{Action, DynamicsModel};
 use wildcity_sim::{Command, Dynamics, Ego, Ground};
 
 const STEPS: u64 = 100_000;
@@ -16,7 +16,7 @@ const STEP_US: i64 = 100_000;
 /// identity, and is rounded itself.
 const MAX_SKEWNESS: f64 = 2e-15;
 
-fn episode(model: EgoModel, start: Pose, speed_m_s: f64) -> Episode {
+fn episode(model: DynamicsModel, start: Pose, speed_m_s: f64) -> Episode {
     let dynamics = Dynamics::checked(model, speed_m_s, false).unwrap();
     Episode::new(7, Ego::new(dynamics, start), STEP_US)
 }
@@ -38,7 +38,7 @@ fn a_thousand_laps_end_where_they_began() {
     for (away_m, bound_m) in [(0.0, 1e-9), (1e5, 1e-6)] {
         let rotation = DQuat::from_euler(glam::EulerRot::ZYX, 0.7, 0.05, -0.02);
         let start = Pose { position_m: DVec3::new(away_m, -away_m, 30.0), rotation };
-        let mut driven = episode(EgoModel::Kinematic, start, 10.0);
+        let mut driven = episode(DynamicsModel::Kinematic, start, 10.0);
         let mut worst_m = 0.0f64;
         for step in 1..=STEPS {
             driven =
@@ -63,7 +63,7 @@ fn a_thousand_laps_end_where_they_began() {
 #[test]
 fn a_dynamic_car_driven_twice_is_bit_identical() {
     let drive = || {
-        let mut driven = episode(EgoModel::Dynamic, Pose::IDENTITY, 5.0);
+        let mut driven = episode(DynamicsModel::Dynamic, Pose::IDENTITY, 5.0);
         let mut hasher = blake3::Hasher::new();
         for step in 0..STEPS {
             // Repeatedly stops, starts and turns.

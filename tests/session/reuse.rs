@@ -3,48 +3,51 @@
 use std::sync::Arc;
 
 use serde_json::Value;
-use wildcity_scene::geometry::camera::Fisheye;
-use wildcity_scene::geometry::{Camera, camera::Lens};
-use wildcity_session::{Encoding, PixelMaps, RigChoice, SessionOptions};
+use wildcity_session::options::camera::Lens;
+use wildcity_session::options::{Encoding, Open, Outputs, RigChoice};
 
 use crate::actors::{actors, car, open, options};
 use crate::driving::{Bench, bench, bench_with};
 use crate::streaming::{demo, unlimited};
 
-const ALL_MAPS: PixelMaps =
-    PixelMaps { depth: true, opacity: true, normals: true, instances: true };
+/// Depth, opacity, normals and instances.
+const ALL_MAPS: [bool; 4] = [true; 4];
 
 /// Sessions whose answers have about the same size and different contents; one has a lens whose
 /// field ends within the image.
-fn sessions() -> Vec<SessionOptions> {
-    let of = |encoding: Encoding, maps: PixelMaps, frames: u64| {
+fn sessions() -> Vec<Open> {
+    let of = |encoding: Encoding, [depth, opacity, normals, instances]: [bool; 4], frames: u64| {
         let mut asked = options(&actors(&Value::from(&*car().hash)), false);
-        asked.outputs.encoding = encoding;
-        asked.outputs.maps = maps;
-        asked.outputs.frames = Some(frames);
+        asked.outputs = Outputs {
+            quality: Some(90),
+            depth,
+            opacity,
+            normals: Some(normals),
+            instances: Some(instances),
+            frames: Some(frames),
+            ..Outputs::colour(encoding)
+        };
         asked
     };
-    let fisheye = |mut asked: SessionOptions| {
+    let fisheye = |mut asked: Open| {
         if let Some(RigChoice::Full(rig)) = &mut asked.rig {
-            let camera = &mut rig.cameras[0].camera;
-            let lens = Lens::Fisheye(Fisheye::new([0.0; 4], Some(0.4)));
-            *camera = Camera { lens, ..*camera };
+            rig.cameras[0].lens = Some(Lens::Fisheye { k: [0.0; 4], max_angle: Some(0.4) });
         }
         asked
     };
-    let depth = PixelMaps { depth: true, ..PixelMaps::default() };
+    let depth = [true, false, false, false];
     vec![
         of(Encoding::Raw, ALL_MAPS, 1),
         fisheye(of(Encoding::Raw, ALL_MAPS, 1)),
         of(Encoding::Png, ALL_MAPS, 1),
         of(Encoding::Raw, depth, 3),
-        fisheye(of(Encoding::Jpeg(90), depth, 1)),
-        of(Encoding::Raw, PixelMaps::default(), 3),
+        fisheye(of(Encoding::Jpeg, depth, 1)),
+        of(Encoding::Raw, [false; 4], 3),
     ]
 }
 
 /// The bytes of the first three observations of a session.
-async fn observations(bench: &Bench, name: &str, options: SessionOptions) -> Vec<Vec<u8>> {
+async fn observations(bench: &Bench, name: &str, options: Open) -> Vec<Vec<u8>> {
     let mut session = open(bench, name, options).await;
     let mut seen = vec![session.reset(0, None).await.unwrap().buffer.bytes().to_vec()];
     for station_m in [101.0, 102.0] {

@@ -7,13 +7,11 @@ use wildcity_scene::Gaussians;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::trajectory::{Keyframe, Trajectory};
-use wildcity_session::{
-    ContactMode, Encoding, EpisodeSummary, Event, EventKind, Outcome, Outputs, RigChoice,
-    ScenarioOptions, ScenarioSource, Session, SessionOptions, Start, StepOptions,
-};
+use wildcity_session::options::{ContactMode, Encoding, Open, Outputs, RigChoice, Start};
+use wildcity_session::{EpisodeSummary, Event, EventKind, Outcome, Session, StepOptions};
 use wildcity_sim::ego::{Action, Path, TimedPose};
 use wildcity_sim::scenario::EndReason;
-use wildcity_sim::{Command, Dynamics, EgoModel};
+use wildcity_sim::{Command, Dynamics, DynamicsModel};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, NewVersion};
 
@@ -64,19 +62,14 @@ async fn open(bench: &Bench, name: &str, version: u64) -> Session {
         "format": "wildcity.scenario/1", "name": "beside", "twin": { "name": "walled" },
         "route": { "points": [[0, 5, 0], [60, 5, 0]] }, "end": { "time_s": 9, "contact": "static" },
     });
-    let options = ScenarioOptions {
-        source: ScenarioSource::Inline(scenario),
-        values: Default::default(),
-        dynamics: true,
-        warm_up: true,
-        actors: false,
-    };
-    let options = SessionOptions {
+    let options = serde_json::from_value(scenario).unwrap();
+    let options = Open {
         version: Some(version),
-        start: Some(Start::Pose(at(0.0))),
-        rig: Some(RigChoice::Full(rig())),
+        start: Some(Start::from(at(0.0))),
+        rig: Some(RigChoice::Full(rig().into())),
         scenario: Some(options),
-        ..SessionOptions::twin("walled", Outputs::colour(Encoding::Raw))
+        outputs: Outputs::colour(Encoding::Raw),
+        ..Open::twin("walled")
     };
     let mut session = Session::open(bench.engine.clone(), name.to_owned(), options).await.unwrap();
     session.reset(0, None).await.unwrap();
@@ -139,12 +132,13 @@ async fn plain(
     dynamics: Dynamics,
     contact: Option<ContactMode>,
 ) -> Session {
-    let options = SessionOptions {
-        start: Some(Start::Pose(at(0.0))),
-        rig: Some(RigChoice::Full(rig())),
-        dynamics,
+    let options = Open {
+        start: Some(Start::from(at(0.0))),
+        rig: Some(RigChoice::Full(rig().into())),
+        dynamics: Some(dynamics.into()),
         contact,
-        ..SessionOptions::twin("walled", Outputs::colour(Encoding::Raw))
+        outputs: Outputs::colour(Encoding::Raw),
+        ..Open::twin("walled")
     };
     let mut session = Session::open(bench.engine.clone(), name.to_owned(), options).await.unwrap();
     session.reset(0, None).await.unwrap();
@@ -157,7 +151,7 @@ async fn straight(mut session: Session) -> (Vec<Event>, EpisodeSummary) {
     let mut events = Vec::new();
     for step in 1..=40 {
         let command = match session.dynamics().model {
-            EgoModel::Teleport => Command::Pose(at(f64::from(step))),
+            DynamicsModel::Teleport => Command::Pose(at(f64::from(step))),
             _ => Command::Action(Action { acceleration_m_s2: 0.0, curvature_1_m: 0.0 }),
         };
         session.step(command, false).await.unwrap();
@@ -173,13 +167,13 @@ async fn straight(mut session: Session) -> (Vec<Event>, EpisodeSummary) {
 async fn every_session_looks_for_contact_with_the_twin() {
     let (_dir, catalog) = walled();
     let bench = bench(Cache::new(catalog));
-    let driven = |model: EgoModel| {
+    let driven = |model: DynamicsModel| {
         Dynamics { model, ..Dynamics::default() }.with_speed("speed", 10.0).unwrap()
     };
     let is_contact = |event: &Event| matches!(event.kind, EventKind::StaticContact { .. });
     let ends = |event: &Event| matches!(event.kind, EventKind::End(EndReason::Contact));
     let mut times_us = Vec::new();
-    for model in [EgoModel::Kinematic, EgoModel::Dynamic] {
+    for model in [DynamicsModel::Kinematic, DynamicsModel::Dynamic] {
         let name = format!("end-{}", model.name());
         let (events, summary) = straight(plain(&bench, &name, driven(model), None).await).await;
         assert_eq!(summary.outcome, Outcome::DrivingFailure);
@@ -258,19 +252,14 @@ async fn a_scenario_decides_what_a_contact_does() {
         let scenario = json!({
             "format": "wildcity.scenario/1", "name": "beside", "twin": { "name": "walled" }, "end": end,
         });
-        let scenario = ScenarioOptions {
-            source: ScenarioSource::Inline(scenario),
-            values: Default::default(),
-            dynamics: true,
-            warm_up: true,
-            actors: false,
-        };
-        SessionOptions {
-            start: Some(Start::Pose(at(0.0))),
-            rig: Some(RigChoice::Full(rig())),
+        let scenario = serde_json::from_value(scenario).unwrap();
+        Open {
+            start: Some(Start::from(at(0.0))),
+            rig: Some(RigChoice::Full(rig().into())),
             scenario: Some(scenario),
             contact: mode,
-            ..SessionOptions::twin("walled", Outputs::colour(Encoding::Raw))
+            outputs: Outputs::colour(Encoding::Raw),
+            ..Open::twin("walled")
         }
     };
     // The rule, what the session asks for, whether there is a contact, and whether it ends the

@@ -4,7 +4,9 @@ use glam::{DQuat, DVec2, DVec3};
 use wildcity_scene::Trajectory;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::trajectory::Keyframe;
-use wildcity_sim::ego::{Action, EgoModel, Path, Setpoint, SingleTrackState, TimedPose, Vehicle};
+use wildcity_sim::ego::{
+    Action, DynamicsModel, Path, Setpoint, SingleTrackState, TimedPose, Vehicle,
+};
 use wildcity_sim::{Command, Dynamics, Ego, Ground};
 
 const STEP_US: i64 = 100_000;
@@ -24,7 +26,7 @@ fn uphill() -> Trajectory {
 fn a_car_is_lifted_and_pitched_by_the_ground() {
     let drives = [uphill()];
     let ground = Ground::from_drives(&drives);
-    for model in [EgoModel::Kinematic, EgoModel::Dynamic] {
+    for model in [DynamicsModel::Kinematic, DynamicsModel::Dynamic] {
         let dynamics = Dynamics::checked(model, 5.0, false).unwrap();
         let start = dynamics.start_pose(Pose::IDENTITY, &ground);
         let mut ego = Ego::new(dynamics, start);
@@ -72,7 +74,7 @@ fn a_path_is_followed_backwards() {
         let position_m = DVec3::new(20.0 * angle_rad.sin(), 20.0 * (1.0 - angle_rad.cos()), 0.0);
         Pose { position_m, rotation: DQuat::from_rotation_z(angle_rad) }
     };
-    for model in [EgoModel::Kinematic, EgoModel::Dynamic] {
+    for model in [DynamicsModel::Kinematic, DynamicsModel::Dynamic] {
         let dynamics = Dynamics::checked(model, -2.0, true).unwrap();
         let mut ego = Ego::new(dynamics, Pose::IDENTITY);
         for step in 0..60 {
@@ -84,7 +86,7 @@ fn a_path_is_followed_backwards() {
             let path = Path::checked((1..=20).map(timed).collect()).unwrap();
             ego = ego.stepped(&Command::Path(path), STEP_US, &Ground::from_drives(&[])).unwrap();
             let off_m = ego.world_from_rig().position_m.distance(place(now_s + 0.1).position_m);
-            let allowed_m = if model == EgoModel::Kinematic { 0.001 } else { 0.1 };
+            let allowed_m = if model == DynamicsModel::Kinematic { 0.001 } else { 0.1 };
             assert!(off_m < allowed_m, "{model:?}, step {step}: {off_m} m off");
         }
     }

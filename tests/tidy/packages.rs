@@ -64,9 +64,9 @@ const FILES: &[&str] = &[
 /// The modules that open files.
 const FILE_MODULES: &[&[&str]] = &[&["std", "fs"], &["tokio", "fs"]];
 
-/// Within the server, only the converter uses the messages of the wire; its limits apply
-/// everywhere.
-const WIRE_IN_SERVER: &[&str] = &["src/server/convert"];
+/// Within the server, only the converter and the table of faults use the messages of the
+/// wire; its limits apply everywhere.
+const WIRE_IN_SERVER: &[&str] = &["src/server/convert", "src/server/fault"];
 
 #[test]
 fn the_table_of_packages_is_that_of_the_manifests() {

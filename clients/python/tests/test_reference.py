@@ -1,4 +1,4 @@
-"""The pages of docs/reference that the program generates."""
+"""The pages of docs/reference that the program generates, and the types that follow from the schemas."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-GENERATE = Path(__file__).resolve().parents[3] / "docs" / "generate.py"
+ROOT = Path(__file__).resolve().parents[3]
+GENERATE = ROOT / "docs" / "generate.py"
 
 
 def test_the_pages_are_as_the_program_generates_them() -> None:
@@ -22,4 +23,10 @@ def test_the_pages_are_as_the_program_generates_them() -> None:
         "metrics",
     ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_types_and_the_blocking_client_are_as_generated() -> None:
+    command = [sys.executable, "-B", str(ROOT / "clients" / "generate.py"), "--check"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr

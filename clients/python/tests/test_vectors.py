@@ -51,8 +51,9 @@ from wildcity import (
     WheelSpeed,
     png_data_uri,
 )
+from wildcity.messages import ANSWERS
 from wildcity.observation import Many
-from wildcity.protocol import ANSWERS, decode_answer, encode
+from wildcity.protocol import decode_answer, encode
 from wildcity.session_protocol import SessionProtocol
 
 SENSORS = Sensors(

@@ -1,7 +1,7 @@
 // A new twin from files of this machine: uploads them, and pushes.
 
 import { el, messageOf } from "./dom";
-import type { Twin } from "./protocol";
+import type { TwinInfo } from "./messages";
 import { append, get, post } from "./server";
 import { Sha256 } from "./sha256";
 import { archive } from "./zip";
@@ -80,7 +80,7 @@ export class Adder {
 
   /** The name of the file if it is free; otherwise the one that the user chooses, or undefined. */
   private async chooseName(wanted: string): Promise<string | undefined> {
-    const { twins, damaged = [] } = await get<{ twins: Twin[]; damaged?: { name: string }[] }>("v1/twins");
+    const { twins, damaged = [] } = await get<{ twins: TwinInfo[]; damaged?: { name: string }[] }>("v1/twins");
     const taken = new Set([...twins, ...damaged].map(({ name }) => name));
     if (!taken.has(wanted)) return wanted;
     const field = el("input", { type: "text", value: freeName(wanted, taken), spellcheck: false, ariaLabel: "name of the twin" });

@@ -1,7 +1,7 @@
 // One session over the WebSocket, in lock step: a request, then its answer.
 
 import { Observation, PROTOCOL, ProtocolError, parseObservation } from "./protocol";
-import type { Closed, Opened, Welcome } from "./protocol";
+import type { Closed, Opened, Welcome } from "./messages";
 import { Refused, socket } from "./server";
 
 type Fields = Record<string, unknown>;

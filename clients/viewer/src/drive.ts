@@ -10,7 +10,8 @@ import { Mosaic } from "./mosaic";
 import type { Page } from "./page";
 import { StagePlot } from "./plot";
 import { clamp, rotate } from "./pose";
-import type { Camera, Metadata, Observation, Opened, Twin } from "./protocol";
+import type { Camera, Metadata, Opened, TwinInfo } from "./messages";
+import type { Observation } from "./protocol";
 import { Refused } from "./server";
 import { drivenSession } from "./session";
 import { Settings } from "./settings";
@@ -117,7 +118,7 @@ export class DrivePage implements Page {
   }
 
   /** Opens the session: once to learn the twin's cameras, and then with images of the wanted size. */
-  private async open(twin: Twin): Promise<void> {
+  private async open(twin: TwinInfo): Promise<void> {
     const client = this.client!;
     const { scenario, width, quality } = this.settings;
     const fields: Record<string, unknown> = { twin: twin.name, dt_us: DT_US, ...this.start };
@@ -136,7 +137,7 @@ export class DrivePage implements Page {
     await this.show(await client.observation({ type: "reset", ...this.start }));
   }
 
-  private async drive(twin: Twin): Promise<void> {
+  private async drive(twin: TwinInfo): Promise<void> {
     let due = performance.now();
     while (!this.ended) {
       if (this.isPaused || (this.last?.terminated && !this.resets)) {

@@ -9,7 +9,7 @@ import type { Page } from "./page";
 import { clamp } from "./pose";
 import { load } from "./record";
 import type { RecordedFrame, Recording } from "./record";
-import type { Metadata, Twin } from "./protocol";
+import type { Metadata, TwinInfo } from "./messages";
 import { get } from "./server";
 import { viewerSession } from "./session";
 
@@ -144,7 +144,7 @@ export class EpisodePage implements Page {
       this.times = [...new Set(recordings.flatMap(({ frames }) => frames.map((frame) => frame.time_us)))].sort((a, b) => a - b);
       this.slider.max = String(this.times.length - 1);
       const [first] = recordings;
-      const { trajectories } = await get<Twin>(`v1/twins/${first!.twin}`);
+      const { trajectories } = await get<TwinInfo>(`v1/twins/${first!.twin}`);
       await this.map.load(first!.twin, first!.frames[0]!.version, trajectories.map(({ name }) => name));
       for (const [at, { frames }] of recordings.entries()) {
         this.map.path(frames.map(({ pose }) => pose.xyz), at === 0 ? "accent" : "warm");

@@ -2,7 +2,7 @@
 
 import { el, fixed } from "./dom";
 import { rotate } from "./pose";
-import type { Metadata } from "./protocol";
+import type { Metadata } from "./messages";
 
 export class Facts {
   readonly element = el("dl.facts");

@@ -4,7 +4,7 @@ import { Adder } from "./add";
 import { count, el, fixed, messageOf, showStatus, showTitle } from "./dom";
 import type { Page } from "./page";
 import type { Pose } from "./pose";
-import type { Twin } from "./protocol";
+import type { TwinInfo } from "./messages";
 import { get, roleOfToken } from "./server";
 import type { Role } from "./server";
 import { isViewers } from "./session";
@@ -63,7 +63,7 @@ export class HomePage implements Page {
     try {
       const role = await roleOfToken();
       showTitle(...(role ? [`role of your token: ${role}`] : []));
-      const { twins, damaged } = await get<{ twins: Twin[]; damaged?: { name: string; reason: string }[] }>("v1/twins");
+      const { twins, damaged } = await get<{ twins: TwinInfo[]; damaged?: { name: string; reason: string }[] }>("v1/twins");
       this.showTwins(twins, damaged ?? [], role);
       this.adder.element.hidden = role === "drive";
       this.own.hidden = role === undefined || role === "admin";
@@ -97,7 +97,7 @@ export class HomePage implements Page {
       el("p.dim", {}, "Sessions are listed for administrators. Your token can watch the sessions that it opened: give the name of one, or open the address #/watch/SESSION."), form);
   }
 
-  private showTwins(twins: Twin[], damaged: { name: string; reason: string }[], role: Role | undefined): void {
+  private showTwins(twins: TwinInfo[], damaged: { name: string; reason: string }[], role: Role | undefined): void {
     const rows = twins.map((twin) => {
       const recorded = twin.trajectories.map(({ name, length_m: length }) => `${name} ${fixed(length, 0)} m`).join(", ");
       const link = (kind: string, text: string): HTMLElement => el("a.action", { href: `#/${kind}/${twin.name}` }, text);

@@ -3,7 +3,7 @@
 import { Drawing, colour, fixed, trustColour } from "./dom";
 import { clamp, heading, transform } from "./pose";
 import type { Pose, Vector } from "./pose";
-import type { Metadata } from "./protocol";
+import type { Metadata } from "./messages";
 import { get } from "./server";
 
 interface DrivePoint {

@@ -1,7 +1,8 @@
 // The images of all cameras, arranged as the cameras look.
 
 import { el, fixed, trustColour } from "./dom";
-import type { Observation, ImageInfo } from "./protocol";
+import type { ImageInfo } from "./messages";
+import type { Observation } from "./protocol";
 import { rotate } from "./pose";
 
 /** Cameras that look farther to the side than this, in radians, are in the second row. */

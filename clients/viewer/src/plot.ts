@@ -1,7 +1,7 @@
 // Where the time of each step went: one stacked bar per step. The legend has the mean of each stage.
 
 import { Drawing, colour, el, fixed } from "./dom";
-import type { Metadata } from "./protocol";
+import type { Metadata } from "./messages";
 
 const BARS = 120;
 /** Colours of the stages, in the order of the stages; further stages begin again. */

@@ -1,7 +1,7 @@
 // The record of an episode: a JSON object a line, as the server writes it.
 
 import type { Pose, Quaternion, Vector } from "./pose";
-import type { Actor, Camera } from "./protocol";
+import type { Actor, Camera } from "./messages";
 import { getText } from "./server";
 
 export interface RecordedFrame {

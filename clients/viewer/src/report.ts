@@ -5,7 +5,7 @@ import { MapView } from "./map";
 import type { Page } from "./page";
 import { add, clamp, rotate } from "./pose";
 import type { Vector } from "./pose";
-import type { Twin } from "./protocol";
+import type { TwinInfo } from "./messages";
 import { parseReport, parseWindows } from "./report-file";
 import type { Report, WorstWindow } from "./report-file";
 import { Refused, get } from "./server";
@@ -75,7 +75,7 @@ export class ReportPage implements Page {
   private async locate({ twin, version, places }: Report): Promise<(Vector | undefined)[]> {
     const nowhere = places.map(() => undefined);
     try {
-      const { trajectories: [drive] } = await get<Twin>(`v1/twins/${encodeURIComponent(twin)}`);
+      const { trajectories: [drive] } = await get<TwinInfo>(`v1/twins/${encodeURIComponent(twin)}`);
       if (!drive) return nowhere;
       await this.map.load(twin, version, [drive.name]);
       showStatus("");

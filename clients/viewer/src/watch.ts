@@ -7,7 +7,8 @@ import { Mosaic } from "./mosaic";
 import type { Page } from "./page";
 import { StagePlot } from "./plot";
 import { WATCH_PROTOCOL, parseObservation } from "./protocol";
-import type { Metadata, Observation, Twin } from "./protocol";
+import type { Metadata, TwinInfo } from "./messages";
+import type { Observation } from "./protocol";
 import { get, socket } from "./server";
 
 export class WatchPage implements Page {
@@ -84,7 +85,7 @@ export class WatchPage implements Page {
     const key = `${twin}@${version}`;
     if (this.loaded === key) return;
     this.loaded = key;
-    const { trajectories } = await get<Twin>(`v1/twins/${twin}`);
+    const { trajectories } = await get<TwinInfo>(`v1/twins/${twin}`);
     await this.map.load(twin, version, trajectories.map(({ name }) => name));
   }
 }

@@ -3,9 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::drive::Drive;
-use super::open::{Dynamics, OnFailure, Outputs, RigCamera};
-use super::pose::Pose;
-use super::sensors::Sensors;
+use super::{Dynamics, OnFailure, Outputs, Pose, RigCamera, Sensors};
 use crate::error::Code;
 
 /// A text message from the server.

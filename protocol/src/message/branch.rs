@@ -1,6 +1,7 @@
 //! The request `branch`: a session that begins in the middle of another episode.
 
-use serde::{Deserialize, Serialize};
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize};
 
 /// Opens a session in a state of another episode, with that episode's settings: version, cameras,
 /// outputs, dynamics.
@@ -40,4 +41,26 @@ pub enum BranchPoint {
         /// Number of steps done there.
         step: u64,
     },
+}
+
+/// Decided by the fields that are present.
+impl<'de> Deserialize<'de> for BranchPoint {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        #[derive(Deserialize)]
+        #[serde(deny_unknown_fields)]
+        struct Either {
+            session: Option<String>,
+            snapshot: Option<String>,
+            episode: Option<String>,
+            step: Option<u64>,
+        }
+        let Either { session, snapshot, episode, step } = Either::deserialize(deserializer)?;
+        match (session, snapshot, episode, step) {
+            (Some(session), Some(snapshot), None, None) => Ok(Self::Snapshot { session, snapshot }),
+            (None, None, Some(episode), Some(step)) => Ok(Self::Recorded { episode, step }),
+            _ => Err(D::Error::custom(
+                "a branch is from either session and snapshot, or episode and step",
+            )),
+        }
+    }
 }

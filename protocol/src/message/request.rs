@@ -3,8 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::branch::Branch;
-use super::open::{DynamicsChoice, Open, Start};
-use super::pose::Pose;
+use super::{DynamicsChoice, Open, Pose, Start};
 
 /// A message from the client. Every request gets exactly one answer with the same `seq`.
 ///

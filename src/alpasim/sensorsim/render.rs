@@ -8,7 +8,7 @@ use wildcity_scene::appearance::Appearance;
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::rig::RigCamera;
 use wildcity_scene::{Manifest, Rig};
-use wildcity_session::{Encoding, Engine, Still};
+use wildcity_session::{Engine, ImageEncoding, Still};
 use wildcity_twin::residency::Resident;
 
 use super::objects::{Object, ObjectAssets};
@@ -53,9 +53,9 @@ impl OpenScene {
     fn still(&self, request: &wire::RgbRenderRequest) -> Result<Still, SensorsimError> {
         let view = view(request, &self.frame)?;
         let encoding = match request.image_format() {
-            wire::ImageFormat::Png => Encoding::Png,
-            wire::ImageFormat::Jpeg => Encoding::Jpeg(jpeg_quality(request.image_quality)),
-            wire::ImageFormat::RgbUint8Planar => Encoding::Raw,
+            wire::ImageFormat::Png => ImageEncoding::Png,
+            wire::ImageFormat::Jpeg => ImageEncoding::Jpeg(jpeg_quality(request.image_quality)),
+            wire::ImageFormat::RgbUint8Planar => ImageEncoding::Raw,
             other => {
                 let must =
                     format!("image_format {other:?}: PNG, JPEG and RGB_UINT8_PLANAR are offered");
@@ -189,7 +189,7 @@ impl Renderer<'_> {
         }
         // Each index is in one group, so that afterwards every place has its image or its error.
         for Group { objects, indices, stills } in groups {
-            let encodings: Vec<Encoding> = stills.iter().map(|still| still.encoding).collect();
+            let encodings: Vec<ImageEncoding> = stills.iter().map(|still| still.encoding).collect();
             let answers: Vec<Image> = match self.render(&opened, scene, &objects, stills).await {
                 Ok(files) => files.into_iter().zip(encodings).map(image).collect(),
                 Err(error) => repeated(&error, indices.len()).collect(),
@@ -217,10 +217,10 @@ impl Renderer<'_> {
     }
 }
 
-fn image((file, encoding): (Vec<u8>, Encoding)) -> Image {
+fn image((file, encoding): (Vec<u8>, ImageEncoding)) -> Image {
     let image_bytes = match encoding {
-        Encoding::Raw => planar(&file),
-        Encoding::Jpeg(_) | Encoding::Png => file,
+        ImageEncoding::Raw => planar(&file),
+        ImageEncoding::Jpeg(_) | ImageEncoding::Png => file,
     };
     Ok(wire::RgbRenderReturn { image_bytes })
 }

@@ -9,12 +9,9 @@ use std::time::{Duration, Instant};
 use serde_json::json;
 
 use wildcity_render::compare::psnr::psnr_db_u8;
-use wildcity_scene::ProfileOverrides;
 use wildcity_scene::geometry::Pose;
-use wildcity_session::{
-    Encoding, Engine, Observation, Outputs, RigChoice, ScenarioOptions, ScenarioSource, Session,
-    SessionOptions, Start,
-};
+use wildcity_session::options::{Encoding, Open, Outputs, RigChoice, Start};
+use wildcity_session::{Engine, Observation, Session};
 use wildcity_twin::store::Catalog;
 
 use super::benched_twin::BenchedTwin;
@@ -124,7 +121,7 @@ impl Actors {
         let mut row =
             Row { tau_px, actors: Times::default(), baked: Times::default(), psnr_db: f64::NAN };
         for session in [&mut actors, &mut baked] {
-            session.reset(0, Some(Start::Pose(cars.ego_at(0.0)))).await?;
+            session.reset(0, Some(Start::from(cars.ego_at(0.0)))).await?;
         }
         let bar = progress::count("stepping");
         bar.set_length(self.pairs.into());
@@ -147,26 +144,19 @@ impl Actors {
         Ok(row)
     }
 
-    fn options(&self, cars: &Cars, tau_px: f64, as_actors: bool) -> anyhow::Result<SessionOptions> {
+    fn options(&self, cars: &Cars, tau_px: f64, as_actors: bool) -> anyhow::Result<Open> {
         let mut rig = cars.rig.clone();
         if let Some(size) = self.size {
             size.apply(&mut rig)?;
         }
-        let scenario = ScenarioOptions {
-            source: ScenarioSource::Inline(cars.scenario()),
-            values: Default::default(),
-            dynamics: false,
-            warm_up: false,
-            actors: false,
-        };
+        let scenario = serde_json::from_value(cars.scenario())?;
         let twin = if as_actors { street::BARE } else { street::BAKED };
-        Ok(SessionOptions {
-            rig: Some(RigChoice::Full(rig)),
-            profile: ProfileOverrides::new(
-                [("tau_px".to_owned(), json!(tau_px))].into_iter().collect(),
-            ),
+        Ok(Open {
+            rig: Some(RigChoice::Full(rig.into())),
+            profile: [("tau_px".to_owned(), json!(tau_px))].into_iter().collect(),
             scenario: as_actors.then_some(scenario),
-            ..SessionOptions::twin(twin, Outputs::colour(Encoding::Raw))
+            outputs: Outputs::colour(Encoding::Raw),
+            ..Open::twin(twin)
         })
     }
 

@@ -13,7 +13,8 @@ use wildcity::cli::{output, progress};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::route::Route;
 use wildcity_scene::{Manifest, Rig};
-use wildcity_session::{Encoding, Outputs, RigChoice, Session, SessionOptions, Start};
+use wildcity_session::Session;
+use wildcity_session::options::{Open, Outputs, RigChoice, Start};
 use wildcity_twin::residency::Stats;
 
 use super::benched_twin::BenchedTwin;
@@ -98,7 +99,7 @@ impl Drive {
         let opened = Instant::now();
         let session = Session::open(engine.clone(), "bench".into(), self.opening(manifest)).await?;
         let open = opened.elapsed();
-        let start = Start::Pose(route.at(self.from_m).world_from_rig);
+        let start = Start::from(route.at(self.from_m).world_from_rig);
         let mut driving = DrivingSession { session, engine, last: Stats::default() };
         let first = Instant::now();
         driving.session.reset(0, Some(start)).await?;
@@ -152,11 +153,11 @@ impl Drive {
         })
     }
 
-    fn opening(&self, manifest: &Manifest) -> SessionOptions {
+    fn opening(&self, manifest: &Manifest) -> Open {
         let rig = manifest.rig.clone().or_else(|| Rig::preset(wildcity_session::limits::RIG));
         let rig = rig.map(|rig| cropped(rig, self.crop));
-        let outputs = Outputs::colour(Encoding::Jpeg(wildcity_session::limits::JPEG_QUALITY));
-        SessionOptions { rig: rig.map(RigChoice::Full), ..self.twin.session(outputs) }
+        let outputs = Outputs::default();
+        Open { rig: rig.map(|rig| RigChoice::Full(rig.into())), ..self.twin.session(outputs) }
     }
 }
 

@@ -2,11 +2,12 @@
 
 use glam::DVec2;
 
+use wildcity_options::{Dynamics, DynamicsModel};
 use wildcity_sim::limits;
 use wildcity_sim::scenario::{
-    ActionSection, ActorSection, CollideSection, CourseSection, DynamicsSection, EgoBoxSection,
-    EgoSection, ModelSection, PathSection, PoseSection, ProfileSection, ShapeSection, StartSection,
-    TimedPosition, TriggerSection,
+    ActionSection, ActorSection, CollideSection, CourseSection, EgoBoxSection, EgoSection,
+    PathSection, PoseSection, ProfileSection, ShapeSection, StartSection, TimedPosition,
+    TriggerSection,
 };
 
 use super::lane_line::LaneLine;
@@ -30,8 +31,7 @@ pub(super) fn ego_section(ego: &Entity, ledger: &Ledger) -> EgoSection {
     let pose = ego.place.map(|place| pose_section(&place.shifted(ego.rear_m, 0.0)));
     let start =
         pose.map(|pose| StartSection { trajectory: None, station_m: None, pose: Some(pose) });
-    let dynamics =
-        DynamicsSection { model: ModelSection::Dynamic, speed: ego.begin_mps, reverse: false };
+    let dynamics = Dynamics { model: DynamicsModel::Dynamic, speed: ego.begin_mps, reverse: false };
     if ego.center_m[1].abs() > 0.01 {
         let name = &ego.name;
         ledger.note(format!("entity {name:?}: the ego's box is in the middle of its axles"));

@@ -161,6 +161,28 @@ impl Mul for Pose {
     }
 }
 
+impl From<Pose> for wildcity_options::Pose {
+    fn from(pose: Pose) -> Self {
+        Self { xyz: pose.position_m.to_array(), q: pose.q_wxyz() }
+    }
+}
+
+impl From<Pose> for wildcity_options::Start {
+    fn from(pose: Pose) -> Self {
+        Self::Pose { pose: pose.into() }
+    }
+}
+
+impl TryFrom<wildcity_options::Pose> for Pose {
+    type Error = PoseError;
+
+    fn try_from(
+        wildcity_options::Pose { xyz, q }: wildcity_options::Pose,
+    ) -> Result<Self, PoseError> {
+        Self::checked(xyz, q)
+    }
+}
+
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct PoseFields {

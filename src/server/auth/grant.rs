@@ -18,6 +18,17 @@ pub enum Role {
     Admin,
 }
 
+/// Which tokens may use a route. No route can be made without it: `Operation::new` requires it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Access {
+    /// Everyone, also without a token.
+    Public,
+    /// Every token, except those with the role [`Role::Metrics`].
+    AnyToken,
+    /// Tokens with this role, or with one that includes it.
+    Role(Role),
+}
+
 /// Rights of a client.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Grant {
@@ -51,31 +62,27 @@ impl Grant {
         Arc::new(Self { name: String::new(), role: Role::Admin, twins: None, limits })
     }
 
-    /// Requires a role, or one that includes it: [`Role::Admin`] includes all, and [`Role::Push`]
-    /// includes [`Role::Drive`].
+    /// Requires what a route requires of a token.
     ///
     /// # Errors
     /// [`Fault::Forbidden`] if the token has another role.
-    pub(crate) fn require(&self, role: Role) -> Result<(), Fault> {
-        if self.role.includes(role) {
+    pub(crate) fn require(&self, access: Access) -> Result<(), Fault> {
+        let Some(needed) = access.role() else { return Ok(()) };
+        if self.has(needed) {
             return Ok(());
         }
         // The message names both roles: the one there is, and the one to ask the operator for.
-        let needs = role.name();
-        let reason = format!("its role is {}, not {needs}", self.role.name());
+        let reason = match self.role {
+            Role::Metrics => "its role is metrics: it may GET /metrics alone".to_owned(),
+            role => format!("its role is {}, not {}", role.name(), needed.name()),
+        };
         Err(Fault::Forbidden { field: "authorization", reason })
     }
 
-    /// Requires any role but [`Role::Metrics`].
-    ///
-    /// # Errors
-    /// [`Fault::Forbidden`] if the token may only read metrics.
-    pub(crate) fn require_more_than_metrics(&self) -> Result<(), Fault> {
-        if self.role != Role::Metrics {
-            return Ok(());
-        }
-        let reason = "its role is metrics: it may GET /metrics alone".to_owned();
-        Err(Fault::Forbidden { field: "authorization", reason })
+    /// Whether the token has a role, or one that includes it: [`Role::Admin`] includes all, and
+    /// [`Role::Push`] includes [`Role::Drive`].
+    pub(crate) fn has(&self, role: Role) -> bool {
+        self.role.includes(role)
     }
 
     /// Requires access to a twin.
@@ -116,6 +123,18 @@ impl Grant {
     }
 }
 
+impl Access {
+    /// The role that a token needs.
+    fn role(self) -> Option<Role> {
+        match self {
+            Self::Public => None,
+            // All roles but `Metrics` include `Drive`.
+            Self::AnyToken => Some(Role::Drive),
+            Self::Role(role) => Some(role),
+        }
+    }
+}
+
 impl Role {
     fn includes(self, role: Self) -> bool {
         // `Metrics` is included by `Admin` alone: a monitor needs no scene, and a driver needs no
@@ -131,7 +150,7 @@ impl Role {
         Self::ALL.into_iter().find(|role| role.name() == name)
     }
 
-    pub(super) fn name(self) -> &'static str {
+    pub(crate) fn name(self) -> &'static str {
         match self {
             Self::Metrics => "metrics",
             Self::Drive => "drive",

@@ -11,5 +11,5 @@ pub use error::TokensError;
 pub use grant::Role;
 pub use tokens::Tokens;
 
-pub(crate) use grant::Grant;
+pub(crate) use grant::{Access, Grant};
 pub(crate) use tokens::CurrentTokens;

@@ -404,8 +404,8 @@ impl Connection {
         fault: &Fault,
     ) -> Result<(), Disconnect> {
         tracing::debug!(seq, "refused: {fault}");
-        self.state.metrics.refused(&convert::code(fault).0);
-        socket.send_text(&convert::refused(seq, fault)).await
+        self.state.metrics.refused(&fault.report().code().0);
+        socket.send_text(&fault.answer(seq)).await
     }
 
     /// Parks the session, sends the reason to the client if that is possible, and closes the
@@ -431,7 +431,7 @@ impl Connection {
         match &reason {
             Disconnect::Fault(fault) => {
                 if self.refuse(&mut socket, None, fault).await.is_ok() {
-                    socket.close(Some(convert::close_status(fault))).await;
+                    socket.close(Some(fault.close_status())).await;
                 }
             }
             Disconnect::PeerLeft => socket.close(None).await,

@@ -2,7 +2,9 @@
 
 use tokio::time::timeout;
 
-use wildcity_session::{Session, SessionError, SessionOptions};
+use wildcity_options::Open;
+use wildcity_scene::ProfileOverrides;
+use wildcity_session::{Session, SessionError};
 
 use super::{Connection, NO_SESSION};
 use crate::convert::{self, AlsoResumed, BranchPoint, DriveRequest};
@@ -35,10 +37,11 @@ impl Connection {
         &mut self,
         seq: u64,
         name: Option<String>,
-        mut opening: SessionOptions,
+        mut opening: Open,
         drive: Option<DriveRequest>,
     ) -> Result<Answer, Fault> {
-        opening.profile = opening.profile.or(&self.state.profile);
+        let profile = ProfileOverrides::new(std::mem::take(&mut opening.profile));
+        opening.profile = profile.or(&self.state.profile).into_fields();
         // Before the reservation, so that a refused request takes no slot.
         self.grant.require_twin(&opening.twin)?;
         let name = name.unwrap_or_else(new_session_name);

@@ -63,7 +63,7 @@ impl Connection {
         let stepped = join_all(carried_out).await;
         for fault in stepped.iter().filter_map(|step| step.result.as_ref().err()) {
             tracing::debug!(seq, "refused: {fault}");
-            metrics.refused(&convert::code(fault).0);
+            metrics.refused(&fault.report().code().0);
         }
         Ok(Answer::Many(Arc::new(convert::many(seq, stepped)?)))
     }

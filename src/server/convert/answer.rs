@@ -16,18 +16,15 @@ use wildcity_protocol::message::{
 };
 use wildcity_repair::Selection;
 use wildcity_scene::Rig;
+use wildcity_scene::appearance::Appearance;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_session::{
-    DamagedSummary, Encoding, Engine, EpisodeSummary, EpisodeTraffic, OnFailure, Outcome,
-    PixelMaps, ReferenceSource, Session, SessionRepair, TrajectorySummary, TwinSummaries,
-    TwinSummary,
+    DamagedSummary, Engine, EpisodeSummary, EpisodeTraffic, ImageEncoding, Outcome, PixelMaps,
+    ReferenceSource, Session, SessionRepair, TrajectorySummary, TwinSummaries, TwinSummary,
 };
-use wildcity_sim::{Dynamics, EgoModel};
 use wildcity_twin::store::Version;
 
-use super::camera::{exposure_to, lens_and_windshield_to, shutter_to};
 use super::drive::{DriveRequest, drive};
-use super::sensors::sensors_to;
 
 /// Name of the server in `welcome`.
 const SERVER_NAME: &str = "wildcity";
@@ -109,7 +106,7 @@ fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Resu
         backend: session.backend().to_owned(),
         seed: session.episode().seed(),
         start: pose(&session.start()),
-        dynamics: dynamics(session.dynamics()),
+        dynamics: session.dynamics().into(),
         dt_us: session.dt_us(),
         deadline_ms: session.deadline().as_millis() as u64,
         decision_us: session.decision_us(),
@@ -124,7 +121,7 @@ fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Resu
             .collect(),
         reserved_bytes: session.reserved_bytes(),
         repair: session.repair().map(|repair| opened_repair(repair, session)),
-        sensors: session.sensors().map(sensors_to),
+        sensors: session.sensors().cloned(),
         scenario: session.traffic().map(opened_scenario),
         trajectory: trajectory.transpose()?,
     })
@@ -143,10 +140,7 @@ fn opened_repair(repair: &SessionRepair, session: &Session) -> message::OpenedRe
         above,
         at_least,
         per_step: per_step as u64,
-        on_failure: match repair.on_failure {
-            OnFailure::Unrepaired => message::OnFailure::Unrepaired,
-            OnFailure::Error => message::OnFailure::Error,
-        },
+        on_failure: repair.on_failure,
         references: session.references().map(|source| match source {
             ReferenceSource::Recorded => message::ReferenceSource::Recorded,
             ReferenceSource::Rendered => message::ReferenceSource::Rendered,
@@ -275,16 +269,6 @@ pub(crate) fn twin(twin: &TwinSummary) -> serde_json::Value {
     serde_json::json!(twin_info(twin))
 }
 
-fn dynamics(dynamics: Dynamics) -> message::Dynamics {
-    let Dynamics { model, speed_m_s, reverse } = dynamics;
-    let model = match model {
-        EgoModel::Teleport => message::DynamicsModel::Teleport,
-        EgoModel::Kinematic => message::DynamicsModel::Kinematic,
-        EgoModel::Dynamic => message::DynamicsModel::Dynamic,
-    };
-    message::Dynamics { model, speed: speed_m_s, reverse }
-}
-
 fn twin_info(twin: &TwinSummary) -> TwinInfo {
     TwinInfo {
         name: twin.name.clone(),
@@ -314,37 +298,21 @@ fn trajectory_info(trajectory: TrajectorySummary) -> TrajectoryInfo {
 
 /// A camera, without its overlay: answers do not repeat it.
 pub(super) fn camera(camera: &wildcity_scene::rig::RigCamera) -> RigCamera {
-    let Camera { width_px, height_px, pinhole, .. } = camera.camera;
-    let (lens, windshield) = lens_and_windshield_to(&camera.camera);
-    RigCamera {
-        name: camera.name.clone(),
-        width: width_px.into(),
-        height: height_px.into(),
-        fx: Some(pinhole.fx),
-        fy: Some(pinhole.fy),
-        cx: pinhole.cx,
-        cy: pinhole.cy,
-        lens,
-        windshield,
-        shutter: camera.shutter.map(shutter_to),
-        exposure: camera.appearance.exposure.map(exposure_to),
-        overlay: None,
-        native_size: camera.camera.native_size_px.map(|size_px| size_px.to_array()),
-        camera_to_rig: pose(&camera.rig_from_camera),
-    }
+    let appearance = Appearance { overlay: None, ..camera.appearance.clone() };
+    wildcity_scene::rig::RigCamera { appearance, ..camera.clone() }.into()
 }
 
 /// A pose.
 pub(super) fn pose(pose: &Pose) -> message::Pose {
-    message::Pose { xyz: pose.position_m.to_array(), q: pose.q_wxyz() }
+    (*pose).into()
 }
 
 /// An image encoding, and the quality of JPEG.
-pub(super) fn encoding(encoding: Encoding) -> (message::Encoding, Option<u8>) {
+pub(super) fn encoding(encoding: ImageEncoding) -> (message::Encoding, Option<u8>) {
     match encoding {
-        Encoding::Jpeg(quality) => (message::Encoding::Jpeg, Some(quality)),
-        Encoding::Png => (message::Encoding::Png, None),
-        Encoding::Raw => (message::Encoding::Raw, None),
+        ImageEncoding::Jpeg(quality) => (message::Encoding::Jpeg, Some(quality)),
+        ImageEncoding::Png => (message::Encoding::Png, None),
+        ImageEncoding::Raw => (message::Encoding::Raw, None),
     }
 }
 

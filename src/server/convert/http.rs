@@ -7,7 +7,7 @@ use std::time::UNIX_EPOCH;
 use glam::DVec3;
 use serde_json::{Value, json};
 
-use crate::fault::Fault;
+use crate::fault::{Fault, Report};
 use crate::limits;
 use crate::sessions::ListedSession;
 use crate::spool::{Announced, Upload};
@@ -24,7 +24,6 @@ use wildcity_twin::ingest::{BadGaussian, IngestError};
 use wildcity_twin::store::{LogEntry, Version};
 
 use super::answer::pose;
-use super::fault::{WireFault, cells_of_push, push_fault};
 use super::field::convert_poses;
 use super::mistake::read_body;
 
@@ -172,8 +171,8 @@ pub(crate) fn push(id: &str, twin: &str, status: &Status) -> Value {
 }
 
 fn push_error(error: &PushError) -> http::PushError {
-    let WireFault { code, .. } = push_fault(error);
-    http::PushError { code, message: error.to_string(), cells: cells_of_push(error).to_vec() }
+    let http::Refusal { code, message, cells, .. } = Report::from_push(error).body;
+    http::PushError { code, message, cells }
 }
 
 fn report(report: &PushReport) -> http::PushReport {

@@ -11,11 +11,11 @@ use serde::Serialize;
 
 use crate::fault::Fault;
 use crate::sessions::ManyAnswer;
+use wildcity_protocol::http::Refusal;
 use wildcity_protocol::observation::{ManyMetadata, SessionAnswer, SessionRefusal};
 use wildcity_session::Observation;
 
 use super::answer::text;
-use super::fault::{WireFault, wire_fault};
 
 /// Result of the step of one session.
 pub(crate) struct Stepped {
@@ -63,12 +63,12 @@ pub(crate) fn many(seq: u64, steps: Vec<Stepped>) -> Result<ManyAnswer, Fault> {
 
 /// A refusal whose field is that of the whole request.
 fn refusal(index: usize, fault: &Fault) -> SessionRefusal {
-    let WireFault { code, field } = wire_fault(fault);
+    let Refusal { code, message, field, .. } = fault.report().body;
     // A step in a list has no type. A step that does not fit the state of a session is a fault of
     // the field `session`.
     let field = field.map(|field| if field == "type" { "session".to_owned() } else { field });
     let field = field.map(|field| format!("steps[{index}].{field}"));
-    SessionRefusal { code, message: fault.to_string(), field }
+    SessionRefusal { code, message, field }
 }
 
 #[derive(Serialize)]

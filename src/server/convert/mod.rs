@@ -1,32 +1,26 @@
-//! Conversion between the wire and the session: no other module of the server names the protocol's
-//! types.
+//! Conversion between the wire and the session: no other module of the server but `fault` names
+//! the protocol's types.
 //!
 //! ```text
 //! mistake      mistakes in messages, as faults
 //! request      parses text frames as commands
-//! rig          rigs of requests
 //! answer       answers other than observations
 //! observation  observations
 //! many         observations of several sessions
-//! camera       lenses, windshields, shutters and exposures, to and from the wire
 //! drive        recorded drives
 //! http         bodies of HTTP requests and answers
 //! actor        those about assets of actors
-//! fault        the wire code and the HTTP status of each fault
 //! ```
 
 mod actor;
 mod answer;
-mod camera;
 mod drive;
-mod fault;
 mod field;
 mod http;
 mod many;
 mod mistake;
 mod observation;
 mod request;
-mod rig;
 mod sensors;
 
 pub(crate) use actor::{actor, actors, new_actor};
@@ -35,7 +29,6 @@ pub(crate) use answer::{
     welcome,
 };
 pub(crate) use drive::{DriveRequest, drive_body, drive_query};
-pub(crate) use fault::{WireCode, close_status, code, http_status, refusal_body, refused};
 pub(crate) use http::{
     ListedEpisode, edited, episodes, new_edit, new_push, new_upload, push, rollback, sessions,
     survey, ticket, upload, version, versions,

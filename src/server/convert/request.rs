@@ -1,30 +1,19 @@
 //! Parses text frames as commands.
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::time::Duration;
-
-use serde_json::Value;
+use std::collections::BTreeSet;
 
 use crate::fault::Fault;
 use crate::limits;
 use wildcity_protocol::PROTOCOL;
 use wildcity_protocol::decode::{Refused, decode};
-use wildcity_protocol::message::{self, Request};
-use wildcity_scene::ProfileOverrides;
+use wildcity_protocol::message::{self, Open, Request};
 use wildcity_scene::geometry::Pose;
 use wildcity_session::is_episode_name;
-use wildcity_session::{
-    ContactMode, Encoding, ImagePart, OnFailure, Outputs, PixelMaps, RandomStart, RepairOptions,
-    ResetOptions, RigChoice, ScenarioOptions, ScenarioSource, SessionError, SessionOptions, Start,
-    StepOptions,
-};
+use wildcity_session::{ResetOptions, SessionError, StepOptions};
 use wildcity_sim::ego::{Action, Path, TimedPose};
-use wildcity_sim::{Dynamics, EgoModel};
 
 use super::drive::DriveRequest;
 use super::field::{check_name, convert_pose, convert_poses};
-use super::rig::convert_rig;
-use super::sensors::convert_sensors;
 
 /// A text frame, checked as far as it can be without a session.
 #[derive(Debug)]
@@ -57,7 +46,7 @@ pub(crate) enum Command {
         /// Its name, if the client chose one.
         name: Option<String>,
         /// Options of the session.
-        opening: Box<SessionOptions>,
+        opening: Box<Open>,
         /// The part of a recorded drive that the answer is to have.
         drive: Option<DriveRequest>,
     },
@@ -180,8 +169,8 @@ fn convert(request: Request) -> Parsed {
             on(seq, session, poses.map(|poses| Command::Prefetch { poses }))
         }
         Request::Reset { seq, session, seed, start, dynamics, speed } => {
-            let options = reset_options(seed, start, dynamics, speed);
-            on(seq, session, options.map(|options| Command::Reset { options }))
+            let options = ResetOptions { seed, start, dynamics, speed_m_s: speed };
+            on(seq, session, Ok(Command::Reset { options }))
         }
         Request::SwitchVersion { seq, session, version } => {
             on(seq, session, Ok(Command::SwitchVersion { version }))
@@ -261,135 +250,11 @@ fn resume_command(session: String, last_seq: u64, also: Vec<String>) -> Result<C
     Ok(Command::Resume { session, last_seq, also })
 }
 
-fn open_command(open: message::Open) -> Result<Command, Fault> {
-    let name = open.session.map(|name| check_name("session", name)).transpose()?;
-    let rig = match open.rig {
-        None => None,
-        Some(message::RigChoice::Preset(name)) => Some(RigChoice::Preset(name)),
-        Some(message::RigChoice::Full(rig)) => Some(RigChoice::Full(convert_rig(rig)?)),
-    };
-    let message::Outputs {
-        cameras,
-        images,
-        encoding,
-        quality,
-        depth,
-        opacity,
-        normals,
-        instances,
-        frames,
-        trust,
-        actors,
-        period_us,
-    } = open.outputs;
-    let part = |message::ImagePart { crop, size }| ImagePart { crop, size };
-    let encoding = match encoding {
-        message::Encoding::Jpeg => {
-            Encoding::Jpeg(quality.unwrap_or(wildcity_session::limits::JPEG_QUALITY))
-        }
-        message::Encoding::Png => Encoding::Png,
-        message::Encoding::Raw => Encoding::Raw,
-    };
-    let scenario = match open.scenario {
-        None => None,
-        Some(choice) => {
-            let (source, values) = convert_scenario(choice)?;
-            Some(ScenarioOptions {
-                source,
-                values,
-                // The scenario decides what the client leaves open.
-                dynamics: open.dynamics.is_none(),
-                warm_up: open.warm_up_us.is_none(),
-                actors: actors.unwrap_or(false),
-            })
-        }
-    };
-    let opening = SessionOptions {
-        // The store checks names again; this error names the field.
-        twin: check_name("twin", open.twin)?,
-        version: open.version,
-        seed: open.seed,
-        start: open.start.map(convert_start).transpose()?,
-        rig,
-        profile: ProfileOverrides::new(open.profile),
-        outputs: Outputs {
-            cameras,
-            images: images.into_iter().map(|(name, image)| (name, part(image))).collect(),
-            encoding,
-            maps: PixelMaps {
-                depth,
-                opacity,
-                normals: normals.unwrap_or(false),
-                instances: instances.unwrap_or(false),
-            },
-            frames,
-            trust: trust.unwrap_or(false),
-            periods_us: period_us.unwrap_or_default(),
-        },
-        scenario,
-        dynamics: open.dynamics.map(convert_dynamics).transpose()?.unwrap_or_default(),
-        dt_us: open.dt_us,
-        deadline: open.deadline_ms.map(Duration::from_millis),
-        decision_us: open.decision_us,
-        repair: open.repair.map(convert_repair),
-        sensors: open.sensors.map(convert_sensors),
-        contact: open.contact.map(|contact| match contact {
-            message::ContactMode::End => ContactMode::End,
-            message::ContactMode::Report => ContactMode::Report,
-            message::ContactMode::Off => ContactMode::Off,
-        }),
-        warm_up_us: open.warm_up_us.unwrap_or(0),
-    };
-    Ok(Command::Open { name, opening: Box::new(opening), drive: open.trajectory.map(Into::into) })
-}
-
-fn convert_repair(repair: message::Repair) -> RepairOptions {
-    let message::Repair { model, below, above, at_least, per_step, on_failure } = repair;
-    let on_failure = match on_failure {
-        None | Some(message::OnFailure::Unrepaired) => OnFailure::Unrepaired,
-        Some(message::OnFailure::Error) => OnFailure::Error,
-    };
-    RepairOptions { model, below, above, at_least, per_step, on_failure }
-}
-
-/// A scenario's name, its name with values, or the scenario itself, which has a format.
-fn convert_scenario(
-    choice: message::ScenarioChoice,
-) -> Result<(ScenarioSource, BTreeMap<String, Value>), Fault> {
-    // Three forms: a name, an object with a format, and a name with values.
-    let mut object = match choice {
-        message::ScenarioChoice::Name(name) => {
-            return Ok((ScenarioSource::Named(name), BTreeMap::new()));
-        }
-        message::ScenarioChoice::Object(object) => object,
-    };
-    if object.contains_key("format") {
-        return Ok((ScenarioSource::Inline(Value::Object(object)), BTreeMap::new()));
-    }
-    let wrong = |field: &str, reason: &str| Fault::InvalidRequest {
-        reason: format!("scenario{field}: {reason}"),
-        field: Some(format!("scenario{field}")),
-    };
-    let name = match object.remove("name") {
-        Some(Value::String(name)) => name,
-        Some(_) => return Err(wrong(".name", "write the name of one of the server's scenarios")),
-        None => {
-            // An empty object may be meant as either form.
-            let field = if object.is_empty() { "" } else { ".name" };
-            let reason = "write the format of a scenario, or the name of one of the server's";
-            return Err(wrong(field, reason));
-        }
-    };
-    let values = match object.remove("values") {
-        None => serde_json::Map::new(),
-        Some(Value::Object(values)) => values,
-        Some(_) => return Err(wrong(".values", "write an object of values by their names")),
-    };
-    // What was read is removed, so that the rest is unknown.
-    if let Some(field) = object.keys().next() {
-        return Err(wrong(&format!(".{field}"), "there is no such field; name and values are"));
-    }
-    Ok((ScenarioSource::Named(name), values.into_iter().collect()))
+/// The session checks the options; the server reads the name and the drive.
+fn open_command(mut open: Open) -> Result<Command, Fault> {
+    let name = open.session.take().map(|name| check_name("session", name)).transpose()?;
+    let drive = open.trajectory.take().map(Into::into);
+    Ok(Command::Open { name, opening: Box::new(open), drive })
 }
 
 fn branch_command(branch: message::Branch) -> Result<Command, Fault> {
@@ -407,36 +272,6 @@ fn branch_command(branch: message::Branch) -> Result<Command, Fault> {
         }
     };
     Ok(Command::Branch { name, from })
-}
-
-fn reset_options(
-    seed: u64,
-    start: Option<message::Start>,
-    dynamics: Option<message::DynamicsChoice>,
-    speed_m_s: Option<f64>,
-) -> Result<ResetOptions, Fault> {
-    Ok(ResetOptions {
-        seed,
-        start: start.map(convert_start).transpose()?,
-        dynamics: dynamics.map(convert_dynamics).transpose()?,
-        speed_m_s,
-    })
-}
-
-fn convert_dynamics(choice: message::DynamicsChoice) -> Result<Dynamics, Fault> {
-    let message::Dynamics { model, speed, reverse } = match choice {
-        message::DynamicsChoice::Full(dynamics) => dynamics,
-        message::DynamicsChoice::Model(model) => {
-            // A model alone starts from rest.
-            message::Dynamics { model, speed: 0.0, reverse: false }
-        }
-    };
-    let model = match model {
-        message::DynamicsModel::Teleport => EgoModel::Teleport,
-        message::DynamicsModel::Kinematic => EgoModel::Kinematic,
-        message::DynamicsModel::Dynamic => EgoModel::Dynamic,
-    };
-    Ok(Dynamics::checked(model, speed, reverse).map_err(SessionError::from)?)
 }
 
 fn convert_movement(
@@ -473,25 +308,6 @@ fn convert_movement(
             Err(Fault::InvalidRequest { field: Some(field.to_owned()), reason })
         }
     }
-}
-
-fn convert_start(start: message::Start) -> Result<Start, Fault> {
-    Ok(match start {
-        message::Start::Pose { pose } => Start::Pose(convert_pose("start.pose", &pose)?),
-        message::Start::Station { trajectory, station_m } => {
-            Start::Station { trajectory, station_m }
-        }
-        message::Start::Random { random } => {
-            let message::RandomStart { trajectory, from_m, to_m, lateral_m, heading_rad } = random;
-            Start::Random(RandomStart {
-                trajectory,
-                from_m,
-                to_m,
-                lateral_m: lateral_m.unwrap_or(0.0),
-                heading_rad: heading_rad.unwrap_or(0.0),
-            })
-        }
-    })
 }
 
 #[cfg(test)]

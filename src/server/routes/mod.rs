@@ -17,33 +17,39 @@ mod websocket;
 
 use std::sync::Arc;
 
-use axum::extract::{DefaultBodyLimit, Request, State};
+use axum::extract::rejection::RawPathParamsRejection;
+use axum::extract::{DefaultBodyLimit, RawPathParams, Request, State};
 use axum::http::{HeaderName, Method, StatusCode, Uri, header};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse as _, Response};
-use axum::{Json, Router};
+use axum::{Json, RequestExt as _, Router};
 
 use crate::admission::ConnectionSlot;
-use crate::auth::Grant;
+use crate::auth::{Access, Grant};
 use crate::fault::Fault;
 use crate::state::ServerState;
 
 use refusal::Refusal;
-use table::Row;
+use table::{Operation, Row};
 
 /// The routes of a server.
 pub(crate) fn router(state: Arc<ServerState>) -> Router {
     let json_limit = DefaultBodyLimit::max(wildcity_protocol::limits::INBOUND_MESSAGE_BYTES);
-    let guarded = table::guarded().into_iter().map(|row| {
-        let guard = Guard { state: state.clone(), route: row.operation.path };
-        // A layer for each route and not for the router: `authorize` needs the path of the table,
-        // and paths that do not exist need no token.
-        let handler = row.handler.route_layer(from_fn_with_state(guard, authorize));
-        Row { handler, ..row }
-    });
-    guarded
-        .chain(table::open())
-        .fold(Router::new(), |router, row| router.route(row.operation.path, row.handler))
+    let mut router = Router::new();
+    for Row { operation, handler } in table::rows() {
+        let Operation { path, access, .. } = operation;
+        let handler = match access {
+            Access::Public => handler,
+            // A layer for each route and not for the router: `authorize` needs the row of the
+            // table, and paths that do not exist need no token.
+            access => {
+                let guard = Guard { state: state.clone(), path, access };
+                handler.route_layer(from_fn_with_state(guard, authorize))
+            }
+        };
+        router = router.route(path, handler);
+    }
+    router
         .fallback(no_route)
         .method_not_allowed_fallback(no_method)
         // The last layer runs first: CORS answers a preflight, then refusals are counted, and then
@@ -59,12 +65,14 @@ pub(crate) fn router(state: Arc<ServerState>) -> Router {
 struct Guard {
     state: Arc<ServerState>,
     /// The route's path, as the table has it.
-    route: &'static str,
+    path: &'static str,
+    access: Access,
 }
 
-/// Refuses requests without a valid token, and passes the token's [`Grant`] to the routes.
+/// Refuses requests without a token that may use the route and the twin in its path. Passes the
+/// token's [`Grant`] to the route.
 async fn authorize(
-    State(Guard { state, route }): State<Guard>,
+    State(Guard { state, path, access }): State<Guard>,
     mut request: Request,
     next: Next,
 ) -> Result<Response, Refusal> {
@@ -79,7 +87,7 @@ async fn authorize(
     state.origins.check_host(has_tokens, host)?;
     let grant = match &state.tokens {
         // A ticket counts more than a header, which browsers cannot set for a WebSocket.
-        Some(tokens) => match tickets::from_request(&request, route)? {
+        Some(tokens) => match tickets::from_request(&request, path)? {
             Some(ticket) => state.tickets.redeem(ticket)?,
             None => {
                 let authorization = request.headers().get(header::AUTHORIZATION);
@@ -88,12 +96,16 @@ async fn authorize(
         },
         None => Grant::everything(),
     };
-    if route != metrics::PATH {
-        grant.require_more_than_metrics()?;
-    }
     if let Some(slot) = request.extensions().get::<Arc<ConnectionSlot>>() {
         // Only now, so that a connection without a token keeps counting as unauthenticated.
         slot.mark_authenticated()?;
+    }
+    grant.require(access)?;
+    // Handlers do not check it again, so that none can forget to.
+    for (name, twin) in &request.extract_parts::<RawPathParams>().await.map_err(no_text)? {
+        if name == "twin" {
+            grant.require_twin(twin)?;
+        }
     }
     request.extensions_mut().insert(grant);
     Ok(next.run(request).await)
@@ -113,6 +125,11 @@ async fn ready(State(state): State<Arc<ServerState>>) -> Response {
         None => "ready\n".into_response(),
         Some(body) => (StatusCode::SERVICE_UNAVAILABLE, Json(body)).into_response(),
     }
+}
+
+/// A path whose escaped bytes are no text.
+fn no_text(error: RawPathParamsRejection) -> Fault {
+    Fault::InvalidRequest { field: None, reason: error.body_text() }
 }
 
 async fn no_route(uri: Uri) -> Refusal {

@@ -20,6 +20,8 @@ mod tests {
 
     use serde_json::{Map, Value, json};
 
+    use crate::auth::{Access, Role};
+
     use super::super::table::{self, Content, Kind, Method, Operation, Parameter};
     use super::*;
 
@@ -156,15 +158,16 @@ mod tests {
             let before = answers.insert(status.to_string(), answer(description, kind));
             assert!(before.is_none(), "{status} of {}", operation.path);
         }
-        if operation.role.is_some() {
+        if operation.access != Access::Public {
             let description = "Refused; nothing changed.";
             answers.insert("default".to_owned(), answer(description, refusal));
         }
-        let role = operation.role.map_or(String::new(), |role| match role {
-            "any" => "Any token, except those with the role metrics.".to_owned(),
-            "drive" => "Tokens with the role drive, push or admin.".to_owned(),
-            role => format!("Tokens with the role {role} or admin."),
-        });
+        let role = match operation.access {
+            Access::Public => String::new(),
+            Access::AnyToken => "Any token, except those with the role metrics.".to_owned(),
+            Access::Role(Role::Drive) => "Tokens with the role drive, push or admin.".to_owned(),
+            Access::Role(role) => format!("Tokens with the role {} or admin.", role.name()),
+        };
         let mut described = json!({
             "summary": operation.summary,
             "operationId": id(operation),
@@ -172,7 +175,7 @@ mod tests {
             "parameters": parameters(operation),
             "responses": answers,
         });
-        if operation.role.is_some() {
+        if operation.access != Access::Public {
             // Either nothing or a token: a server without tokens takes the requests, too.
             described["security"] = json!([{}, { "token": [] }]);
         }
@@ -202,7 +205,7 @@ mod tests {
     }
 
     fn operations() -> Vec<Operation> {
-        table::guarded().iter().chain(&table::open()).map(|row| row.operation).collect()
+        table::rows().iter().map(|row| row.operation).collect()
     }
 
     fn document() -> Value {
@@ -253,23 +256,28 @@ mod tests {
             if operation.path == "/v1/session" {
                 continue;
             }
-            // The page writes `T` for `{twin}` and `ID` for `{id}`.
-            let segments =
-                operation.path.split('/').map(|segment| match segment.strip_prefix('{') {
+            // The page writes `ID` for `{id}`, and `T` for `{twin}`.
+            let segments = operation.path.split('/').map(|segment| match segment {
+                "{id}" => "ID".to_owned(),
+                _ => match segment.strip_prefix('{') {
                     Some(name) => name[..1].to_ascii_uppercase(),
                     None => segment.to_owned(),
-                });
-            let path = segments
-                .collect::<Vec<_>>()
-                .join("/")
-                .replace("/uploads/I", "/uploads/ID")
-                .replace("/pushes/I", "/pushes/ID");
-            let method = verb(operation.method).to_ascii_uppercase();
-            let listed = table.lines().any(|line| {
-                let route = line.split('|').nth(1).unwrap_or_default();
-                route.contains(&method) && (route.contains(&format!("{path}`")))
+                },
             });
-            assert!(listed, "{method} {path} is not on the page");
+            let path = segments.collect::<Vec<_>>().join("/");
+            let method = verb(operation.method).to_ascii_uppercase();
+            let role = match operation.access {
+                Access::Public => "",
+                Access::AnyToken => "any",
+                Access::Role(role) => role.name(),
+            };
+            let listed = table.lines().any(|line| {
+                let cells: Vec<&str> = line.split('|').map(str::trim).collect();
+                // The first line ends the one of the heading, and is empty.
+                let [_, route, its_role, ..] = cells[..] else { return false };
+                route.contains(&method) && route.contains(&format!("{path}`")) && its_role == role
+            });
+            assert!(listed, "{method} {path} with the role {role:?} is not on the page");
         }
     }
 }

@@ -4,7 +4,6 @@ use axum::Json;
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 
-use crate::convert;
 use crate::fault::Fault;
 
 /// The result of a route.
@@ -23,9 +22,10 @@ impl<F: Into<Fault>> From<F> for Refusal {
 impl IntoResponse for Refusal {
     fn into_response(self) -> Response {
         // Debug and not a warning: a client can cause any number of refusals.
-        let status = convert::http_status(&self.0);
-        tracing::debug!(%status, "refused: {}", self.0);
-        let mut response = (status, Json(convert::refusal_body(&self.0))).into_response();
+        let report = self.0.report();
+        let status = report.status;
+        tracing::debug!(%status, "refused: {}", report.body.message);
+        let mut response = (status, Json(report.json())).into_response();
         if status == StatusCode::UNAUTHORIZED {
             let bearer = HeaderValue::from_static("Bearer realm=\"wildcity\"");
             response.headers_mut().insert(header::WWW_AUTHENTICATE, bearer);
@@ -37,7 +37,7 @@ impl IntoResponse for Refusal {
             headers.insert(header::SEC_WEBSOCKET_VERSION, HeaderValue::from_static("13"));
         }
         // The middleware that counts refusals reads the code here, not in the body.
-        response.extensions_mut().insert(convert::code(&self.0));
+        response.extensions_mut().insert(report.code());
         response
     }
 }

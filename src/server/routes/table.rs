@@ -1,5 +1,6 @@
-//! Every route, with its description for `/v1/openapi.json`. The router is made from this table, so
-//! that every route is in the document.
+//! Every route, with the tokens that may use it and its description for `/v1/openapi.json`. The
+//! router is made from this table, so that no route lacks a check of tokens, or is missing in the
+//! document.
 
 use std::sync::Arc;
 
@@ -7,6 +8,7 @@ use axum::extract::DefaultBodyLimit;
 use axum::handler::Handler;
 use axum::routing::{MethodFilter, MethodRouter, on};
 
+use crate::auth::{Access, Role};
 use crate::state::ServerState;
 
 use super::{
@@ -24,8 +26,7 @@ pub(super) struct Operation {
     pub(super) method: Method,
     /// As axum and OpenAPI write it: `/v1/twins/{twin}`.
     pub(super) path: &'static str,
-    /// The role that a token needs; none if no token is needed.
-    pub(super) role: Option<&'static str>,
+    pub(super) access: Access,
     /// Description of the route.
     pub(super) summary: &'static str,
     /// Status of success, and what is sent then.
@@ -105,13 +106,13 @@ impl Operation {
     const fn new(
         method: Method,
         path: &'static str,
-        role: Option<&'static str>,
+        access: Access,
         summary: &'static str,
     ) -> Self {
         Self {
             method,
             path,
-            role,
+            access,
             summary,
             success: 200,
             answer: Content::None,
@@ -146,6 +147,14 @@ impl Operation {
             Method::Delete => MethodFilter::DELETE,
         };
         Row { operation: self, handler: on(method, handler) }
+    }
+}
+
+impl Row {
+    /// Accepts a body of any length. This layer is nearer to the handler than that of the router,
+    /// and so it wins.
+    fn without_body_limit(self) -> Self {
+        Self { handler: self.handler.layer(DefaultBodyLimit::disable()), ..self }
     }
 }
 
@@ -193,16 +202,16 @@ const NO_HANDSHAKE: Other = (426, "The request is no handshake of a WebSocket.")
 const NONE: Other = (404, "There is none.");
 const FULL: Other = (507, "There is no room for it.");
 
-const METRICS: Option<&str> = Some("metrics");
-const DRIVE: Option<&str> = Some("drive");
-const PUSH: Option<&str> = Some("push");
-const ADMIN: Option<&str> = Some("admin");
-const ANY: Option<&str> = Some("any");
+const METRICS: Access = Access::Role(Role::Metrics);
+const DRIVE: Access = Access::Role(Role::Drive);
+const PUSH: Access = Access::Role(Role::Push);
+const ADMIN: Access = Access::Role(Role::Admin);
 
 const TEXT: Content = Content::Media("text/plain");
 
-/// The routes that need a token on a server with tokens.
-pub(super) fn guarded() -> Vec<Row> {
+/// The routes of a server.
+pub(super) fn rows() -> Vec<Row> {
+    use Access::{AnyToken, Public};
     use Content::{Json, List, Media};
     use Method::{Delete, Get, Head, Patch, Post};
     let op = Operation::new;
@@ -234,7 +243,7 @@ pub(super) fn guarded() -> Vec<Row> {
         op(
             Post,
             "/v1/tickets",
-            ANY,
+            AnyToken,
             "A ticket, which stands for the token in the address of one WebSocket.",
         )
         .answers(201, Json("ticket"))
@@ -250,18 +259,18 @@ pub(super) fn guarded() -> Vec<Row> {
             .answers(200, Media("application/vnd.mcap"))
             .or(&[NONE])
             .does(episodes::mcap),
-        op(Get, "/v1/twins", ANY, "The latest version of every twin, and the damaged twins.")
+        op(Get, "/v1/twins", AnyToken, "The latest version of every twin, and the damaged twins.")
             .answers(200, Json("twins"))
             .does(twins::list),
-        op(Get, "/v1/twins/{twin}", ANY, "The latest version of a twin.")
+        op(Get, "/v1/twins/{twin}", AnyToken, "The latest version of a twin.")
             .answers(200, Json("answer#TwinInfo"))
             .or(&[NONE])
             .does(twins::show),
-        op(Get, "/v1/twins/{twin}/versions", ANY, "All versions of a twin, the latest last.")
+        op(Get, "/v1/twins/{twin}/versions", AnyToken, "All versions of a twin, the latest last.")
             .answers(200, List("versions", "version"))
             .or(&[NONE])
             .does(twins::versions),
-        op(Get, "/v1/twins/{twin}/trajectories/{name}", ANY, "Poses of a recorded drive.")
+        op(Get, "/v1/twins/{twin}/trajectories/{name}", AnyToken, "Poses of a recorded drive.")
             .answers(200, Json("drive"))
             .or(&[(400, "The stations are not on the drive, or there are too many poses."), NONE])
             .with(DRIVE_PARAMETERS)
@@ -343,13 +352,13 @@ pub(super) fn guarded() -> Vec<Row> {
             .answers(204, Content::None)
             .or(&[NONE])
             .does(uploads::delete),
-        op(Get, "/v1/actors", ANY, "All assets of actors, and the damaged ones.")
+        op(Get, "/v1/actors", AnyToken, "All assets of actors, and the damaged ones.")
             .answers(200, Json("actors"))
             .does(actors::list),
         op(
             Get,
             "/v1/actors/{actor}",
-            ANY,
+            AnyToken,
             "The asset of an actor of this name, or of a hash that begins so.",
         )
         .answers(200, Json("actors#ActorAsset"))
@@ -374,44 +383,33 @@ pub(super) fn guarded() -> Vec<Row> {
         op(Get, metrics::PATH, METRICS, "Metrics for Prometheus.")
             .answers(200, Media("application/openmetrics-text"))
             .does(metrics::show),
-    ];
-    // The body of an upload is not held in memory: it is written to disk as it arrives.
-    let mut append = op(
-        Patch,
-        "/v1/uploads/{id}",
-        PUSH,
-        "Sends bytes of a file, from the offset that the upload is at.",
-    )
-    .takes(Media("application/octet-stream"))
-    .answers(200, Json("upload"))
-    .or(&[
-        (400, "Content-Digest is none, or Upload-Offset is missing."),
-        NONE,
-        (409, "The upload goes on from another offset."),
-        (422, "The bytes are not those that were announced."),
-        FULL,
-    ])
-    .with(UPLOAD_PARAMETERS)
-    .does(uploads::append);
-    // This layer is nearer to the handler than that of the router, and so it wins.
-    append.handler = append.handler.layer(DefaultBodyLimit::disable());
-    rows.push(append);
-    rows
-}
-
-/// The routes that need no token.
-pub(super) fn open() -> Vec<Row> {
-    use Method::Get;
-    let op = Operation::new;
-    let mut rows = vec![
-        op(Get, "/healthz", None, "Whether the process runs.")
+        op(
+            Patch,
+            "/v1/uploads/{id}",
+            PUSH,
+            "Sends bytes of a file, from the offset that the upload is at.",
+        )
+        .takes(Media("application/octet-stream"))
+        .answers(200, Json("upload"))
+        .or(&[
+            (400, "Content-Digest is none, or Upload-Offset is missing."),
+            NONE,
+            (409, "The upload goes on from another offset."),
+            (422, "The bytes are not those that were announced."),
+            FULL,
+        ])
+        .with(UPLOAD_PARAMETERS)
+        .does(uploads::append)
+        // The body is written to disk as it arrives, and not held in memory.
+        .without_body_limit(),
+        op(Get, "/healthz", Public, "Whether the process runs.")
             .answers(200, TEXT)
             .does(async || "ok\n"),
-        op(Get, "/readyz", None, "Whether sessions can be opened.")
+        op(Get, "/readyz", Public, "Whether sessions can be opened.")
             .answers(200, TEXT)
             .or(&[(503, "The twins cannot be listed.")])
             .does(ready),
-        op(Get, "/v1/openapi.json", None, "This document.")
+        op(Get, "/v1/openapi.json", Public, "This document.")
             .answers(200, Content::Object)
             .does(openapi::show),
     ];
@@ -419,7 +417,7 @@ pub(super) fn open() -> Vec<Row> {
     rows.extend(viewer::FILES.iter().map(|&file| {
         let answer = Content::Media(file.media_type());
         let summary = "A file of the viewer.";
-        op(Get, file.path, None, summary).answers(200, answer).does(async move || file.response())
+        op(Get, file.path, Public, summary).answers(200, answer).does(async move || file.response())
     }));
     rows
 }

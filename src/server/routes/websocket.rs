@@ -12,7 +12,7 @@ use tokio::sync::OwnedSemaphorePermit;
 use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 
 use crate::admission::ConnectionSlot;
-use crate::auth::{Grant, Role};
+use crate::auth::Grant;
 use crate::connection;
 use crate::convert;
 use crate::fault::Fault;
@@ -39,7 +39,6 @@ pub(super) async fn upgrade(
 ) -> HttpResult {
     // The handshake is checked before any counter is taken.
     let accept = accept(request.headers(), convert::SUBPROTOCOL)?;
-    grant.require(Role::Drive)?;
     let shared = state.clone();
     let is_forwarded = is_forwarded(request.headers());
     let slots = Slots::take(&state, slot, &grant)?;
@@ -58,7 +57,6 @@ pub(super) async fn watch(
     request: Request,
 ) -> HttpResult {
     let accept = accept(request.headers(), convert::WATCH_SUBPROTOCOL)?;
-    grant.require(Role::Drive)?;
     // Found before the upgrade, so that an unknown session is an HTTP answer and not a Close frame.
     let watch = state.sessions.watch(&session, &grant)?;
     let shared = state.clone();

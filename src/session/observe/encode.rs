@@ -6,19 +6,64 @@ use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 use serde::{Deserialize, Serialize};
 
+use wildcity_options::{Encoding, Outputs};
+
 use super::jpeg::{jpeg, jpeg_in_strips};
 use super::trust::Trust;
+use crate::limits;
 use crate::repair::status::ImageRepair;
 
 /// How colour images travel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Encoding {
+pub enum ImageEncoding {
     /// JPEG, 4:2:0, of a quality from 1 to 100.
     Jpeg(u8),
     Png,
     /// Pixels as they are.
     Raw,
+}
+
+impl ImageEncoding {
+    /// The encoding that a session asks for.
+    pub fn new(outputs: &Outputs) -> Self {
+        match outputs.encoding {
+            Encoding::Jpeg => Self::Jpeg(outputs.quality.unwrap_or(limits::JPEG_QUALITY)),
+            Encoding::Png => Self::Png,
+            Encoding::Raw => Self::Raw,
+        }
+    }
+}
+
+/// Per-pixel maps of an image in addition to its colour; all but `instances` are f32.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct PixelMaps {
+    /// Expected depth in metres, `[height, width]`.
+    pub depth: bool,
+    /// Accumulated opacity, `[height, width]`.
+    pub opacity: bool,
+    /// Unit normals in the camera's axes, `[height, width, 3]`.
+    pub normals: bool,
+    /// Whose Gaussian each pixel shows, u16 `[height, width]`: 0 none, 1 the twin, and actor k is k
+    /// + 2.
+    pub instances: bool,
+}
+
+impl PixelMaps {
+    /// The maps that a session asks for.
+    pub fn new(outputs: &Outputs) -> Self {
+        Self {
+            depth: outputs.depth,
+            opacity: outputs.opacity,
+            normals: outputs.normals.unwrap_or(false),
+            instances: outputs.instances.unwrap_or(false),
+        }
+    }
+
+    /// f32 values per pixel, all f32 maps together.
+    pub(crate) fn values(self) -> usize {
+        usize::from(self.depth) + usize::from(self.opacity) + 3 * usize::from(self.normals)
+    }
 }
 
 /// An image after hashing and encoding.
@@ -70,15 +115,15 @@ pub(crate) fn encode(
     rgb8: &[u8],
     width: u32,
     height: u32,
-    encoding: Encoding,
+    encoding: ImageEncoding,
     in_parallel: bool,
 ) -> Result<EncodedImage, String> {
     let started = Instant::now();
     let file = || match encoding {
-        Encoding::Raw => Ok(Vec::new()),
-        Encoding::Jpeg(quality) if in_parallel => jpeg_in_strips(rgb8, width, height, quality),
-        Encoding::Jpeg(quality) => jpeg(rgb8, width, height, quality),
-        Encoding::Png => png(rgb8, width, height),
+        ImageEncoding::Raw => Ok(Vec::new()),
+        ImageEncoding::Jpeg(quality) if in_parallel => jpeg_in_strips(rgb8, width, height, quality),
+        ImageEncoding::Jpeg(quality) => jpeg(rgb8, width, height, quality),
+        ImageEncoding::Png => png(rgb8, width, height),
     };
     let (hash, file) = if in_parallel {
         rayon::join(|| blake3::hash(rgb8), file)

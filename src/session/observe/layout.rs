@@ -3,24 +3,24 @@
 
 use std::collections::BTreeMap;
 
+use wildcity_options::{CameraSensor, Sensors};
 use wildcity_render::{MAX_VIEWS, View};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::FieldMask;
 use wildcity_scene::rig::{Rig, RigCamera};
 use wildcity_twin::residency::Viewpoint;
 
-use super::encode::Encoding;
+use super::encode::{ImageEncoding, PixelMaps};
 use super::frame_history::{FrameHistory, PastFrame};
 use super::schedule::Schedule;
 use crate::episode::Episode;
 use crate::error::SessionError;
 use crate::limits;
-use crate::options::PixelMaps;
 use crate::repair::drawn::MAX_REPORTED_REFERENCES;
 use crate::sensors::EpisodeSensors;
 use crate::sensors::delivery::{Delivery, FrameSource};
 use crate::sensors::pixels::PixelEffects;
-use crate::sensors::settings::{CameraSensor, Sensors};
+use crate::sensors::{check, settings};
 use crate::viewpoint::viewpoints;
 
 /// Bytes of the header's length, little-endian, which comes before the header.
@@ -65,7 +65,7 @@ pub(crate) struct ObservationLayout {
     cameras: Vec<RigCamera>,
     /// The share of each camera's image that its lens sees; `None` if that is all of it.
     visible_shares: Vec<Option<f64>>,
-    encoding: Encoding,
+    encoding: ImageEncoding,
     maps: PixelMaps,
     schedule: Schedule,
     /// Room in the header for the state of a scenario.
@@ -143,11 +143,11 @@ impl ObservationLayout {
     /// The JPEG quality is out of range, or the images of one observation have too many pixels.
     pub(crate) fn new(
         cameras: Vec<RigCamera>,
-        encoding: Encoding,
+        encoding: ImageEncoding,
         maps: PixelMaps,
         schedule: Schedule,
     ) -> Result<Self, SessionError> {
-        if let Encoding::Jpeg(quality) = encoding
+        if let ImageEncoding::Jpeg(quality) = encoding
             && !(1..=100).contains(&quality)
         {
             let must = format!("{quality}; 1 to 100 are accepted");
@@ -209,7 +209,7 @@ impl ObservationLayout {
         settings: Sensors,
         dt_us: i64,
     ) -> Result<(), SessionError> {
-        let cameras = settings.check(&self.cameras, &self.schedule, dt_us)?;
+        let cameras = check::check(&settings, &self.cameras, &self.schedule, dt_us)?;
         // Motion sensors alone add nothing to the description of an image.
         if !settings.cameras.is_empty() {
             self.image_bytes += SENSOR_IMAGE_BYTES;
@@ -244,7 +244,7 @@ impl ObservationLayout {
     pub(crate) fn episode_sensors(&self) -> Option<EpisodeSensors> {
         let SensorLayout { settings, cameras } = self.sensors.as_ref()?;
         let reach_us = |(camera, sensor): (usize, &CameraSensor)| {
-            sensor.reach_us(self.schedule.period_us(camera))
+            settings::reach_us(sensor, self.schedule.period_us(camera))
         };
         // The track of poses has to reach back as far as the slowest camera.
         let reach_us = cameras.iter().enumerate().map(reach_us).max().unwrap_or(0);
@@ -254,7 +254,7 @@ impl ObservationLayout {
     /// The frame that a camera delivers in an episode when a frame is due, in microseconds.
     pub(crate) fn delivery(&self, camera: usize, of: EffectSeed, due_us: i64) -> Delivery {
         // Noise alone leaves the times as they are.
-        let changed = self.sensor(camera).filter(|sensor| sensor.changes_times());
+        let changed = self.sensor(camera).filter(|sensor| settings::changes_times(sensor));
         let Some(sensor) = changed else {
             return Delivery { stamp_us: due_us, taken_us: due_us, missing: None };
         };
@@ -287,7 +287,7 @@ impl ObservationLayout {
         self.visible_shares[camera]
     }
 
-    pub(crate) fn encoding(&self) -> Encoding {
+    pub(crate) fn encoding(&self) -> ImageEncoding {
         self.encoding
     }
 
@@ -362,7 +362,7 @@ impl ObservationLayout {
     /// of the rig, so that no image depends on which frames are lost.
     pub(crate) fn detail_for(&self, cameras: &[usize]) -> Vec<usize> {
         let mut sensors = self.sensors.iter().flat_map(|sensors| &sensors.cameras);
-        if sensors.any(CameraSensor::changes_times) {
+        if sensors.any(settings::changes_times) {
             (0..self.cameras.len()).collect()
         } else {
             cameras.to_vec()
@@ -412,8 +412,8 @@ impl ObservationLayout {
         let maps = maps.iter().map(|&(held, bytes)| if held { bytes } else { 0 }).sum::<u64>();
         let colour = match self.encoding {
             // The PNG of an image full of noise is as large as its pixels.
-            Encoding::Raw | Encoding::Png => 3,
-            Encoding::Jpeg(_) => limits::JPEG_PIXEL_BYTES,
+            ImageEncoding::Raw | ImageEncoding::Png => 3,
+            ImageEncoding::Jpeg(_) => limits::JPEG_PIXEL_BYTES,
         };
         2 * self.rig_pixels() * (maps + colour)
     }
@@ -423,7 +423,7 @@ impl ObservationLayout {
     pub(crate) fn rendered_bytes(&self, has_trust: bool) -> u64 {
         let PixelMaps { depth, opacity, normals, .. } = self.maps;
         // Raw pixels are rendered into the answer itself.
-        let pixels = if self.encoding == Encoding::Raw { 0 } else { 3 };
+        let pixels = if self.encoding == ImageEncoding::Raw { 0 } else { 3 };
         let opacity = if has_trust && !opacity { 4 } else { 0 };
         let depth = if normals && !depth { 4 } else { 0 };
         self.rig_pixels() * (pixels + opacity + depth)
@@ -480,7 +480,7 @@ impl ObservationLayout {
             floats: 4 * pixels * self.maps.values(),
             instances: if self.maps.instances { 2 * pixels } else { 0 },
             // Other encodings append their files later.
-            raw: if self.encoding == Encoding::Raw { 3 * pixels } else { 0 },
+            raw: if self.encoding == ImageEncoding::Raw { 3 * pixels } else { 0 },
         }
     }
 
@@ -516,8 +516,8 @@ impl ObservationLayout {
     pub(super) fn colour_shape(&self, camera: usize, file_bytes: usize) -> Vec<usize> {
         let [height, width] = self.size_px(camera);
         match self.encoding {
-            Encoding::Raw => vec![height, width, 3],
-            Encoding::Jpeg(_) | Encoding::Png => vec![file_bytes],
+            ImageEncoding::Raw => vec![height, width, 3],
+            ImageEncoding::Jpeg(_) | ImageEncoding::Png => vec![file_bytes],
         }
     }
 }

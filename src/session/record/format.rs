@@ -14,18 +14,17 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use wildcity_episode::{ActorsLine, EpisodeResult, EventLine, ScenarioLine};
+use wildcity_options::{ContactMode, Sensors, strict};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::is_name;
 use wildcity_scene::{ProfileOverrides, RenderProfile, Rig};
 use wildcity_sim::{Dynamics, Ego};
 
 use crate::episode::{Episode, EpisodeSummary};
-use crate::observe::encode::Encoding;
+use crate::observe::encode::ImageEncoding;
 use crate::observe::schedule::Schedule;
-use crate::options::ContactMode;
 use crate::record::command::RecordedCommand;
 use crate::record::repairs::{RecordedImageRepair, RecordedRepair};
-use crate::sensors::settings::Sensors;
 
 /// This build, as it is named in records.
 pub(crate) const BUILD: &str = concat!("wildcity ", env!("CARGO_PKG_VERSION"));
@@ -98,7 +97,11 @@ pub struct RecordedSettings {
     /// Length of the warm-up, in microseconds.
     pub warm_up_us: i64,
     /// Effects of the sensors; absent without.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(
+        default,
+        deserialize_with = "strict::deserialize",
+        skip_serializing_if = "Option::is_none"
+    )]
     pub sensors: Option<Sensors>,
     /// What contact with the twin does; absent if the session left it to the dynamics.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -119,7 +122,7 @@ pub struct RecordedOrigin {
 #[serde(deny_unknown_fields)]
 pub struct RecordedOutputs {
     /// How colour was encoded.
-    pub encoding: Encoding,
+    pub encoding: ImageEncoding,
     /// Whether observations had depth.
     pub depth: bool,
     /// Whether observations had opacity.

@@ -4,9 +4,9 @@ use serde::{Deserialize, Serialize};
 
 use wildcity_repair::Selection;
 
-use crate::options::OnFailure;
 use crate::repair::session_repair::SessionRepair;
 use crate::repair::status::{ImageRepair, RepairFailure, RepairStatus};
+use wildcity_options::OnFailure;
 
 /// The repair of an episode's images.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -4,8 +4,8 @@ use super::format::{EpisodeHeader, FrameRecord, FrameRequest, RecordedSettings};
 use super::replay_report::ReplayError;
 use crate::episode::Episode;
 use crate::error::SessionError;
+use crate::observe::encode::PixelMaps;
 use crate::observe::layout::{EffectSeed, ObservationLayout};
-use crate::options::PixelMaps;
 
 /// The sensors of an episode that is replayed.
 pub(super) struct SensorReplay {

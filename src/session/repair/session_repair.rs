@@ -3,13 +3,13 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use wildcity_options::{OnFailure, Repair};
 use wildcity_repair::reference::Rays;
 use wildcity_repair::{Image, InputRole, Model, Models, RepairError, RepairTimes, Selection, View};
 use wildcity_scene::geometry::camera::FieldMask;
 use wildcity_scene::rig::RigCamera;
 
 use crate::error::SessionError;
-use crate::options::{OnFailure, RepairOptions};
 
 use super::drawn::{CameraRays, ReferenceInputs};
 use super::references::ReferenceViews;
@@ -35,7 +35,7 @@ impl SessionRepair {
     /// There is no such model, it cannot be loaded or used, or an option is out of range.
     pub(crate) fn open(
         models: &Models,
-        options: &RepairOptions,
+        options: &Repair,
         cameras: &[RigCamera],
         deadline: Duration,
         reports_trust: bool,
@@ -61,7 +61,8 @@ impl SessionRepair {
             return Err(SessionError::OutOfRange { field: "deadline_ms", must });
         }
         let rays = CameraRays::new(cameras.len());
-        Ok(Self { model, selection, on_failure: options.on_failure, reports_trust, rays })
+        let on_failure = options.on_failure.unwrap_or_default();
+        Ok(Self { model, selection, on_failure, reports_trust, rays })
     }
 
     /// Whether the model needs depth; normals are computed from it.
@@ -246,7 +247,7 @@ fn planar(interleaved: &[f32]) -> Vec<f32> {
     axis(0).chain(axis(1)).chain(axis(2)).collect()
 }
 
-fn select(options: &RepairOptions) -> Result<Selection, SessionError> {
+fn select(options: &Repair) -> Result<Selection, SessionError> {
     let default = Selection::default();
     let selection = Selection {
         below: options.below.unwrap_or(default.below),

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
+use wildcity_options::ScenarioChoice;
 use wildcity_scene::Manifest;
 use wildcity_scene::rig::is_name;
 use wildcity_sim::limits::{MAP_BYTES, SCENARIO_BYTES};
@@ -28,6 +29,54 @@ pub enum ScenarioSource {
     Named(String),
     /// The scenario itself, as JSON.
     Inline(Value),
+}
+
+impl ScenarioSource {
+    /// A scenario's name, its name with values, or the scenario itself, which has a format; and the
+    /// values of its sweep.
+    ///
+    /// # Errors
+    /// [`ScenarioError::Choice`]: an object is none of these.
+    pub fn from_choice(
+        choice: ScenarioChoice,
+    ) -> Result<(Self, BTreeMap<String, Value>), ScenarioError> {
+        let mut object = match choice {
+            ScenarioChoice::Name(name) => return Ok((Self::Named(name), BTreeMap::new())),
+            ScenarioChoice::Object(object) => object,
+        };
+        if object.contains_key("format") {
+            return Ok((Self::Inline(Value::Object(object)), BTreeMap::new()));
+        }
+        let wrong = |field: &str, reason| ScenarioError::Choice {
+            field: format!("scenario{field}"),
+            reason,
+        };
+        let name = match object.remove("name") {
+            Some(Value::String(name)) => name,
+            Some(_) => {
+                return Err(wrong(".name", "write the name of one of the server's scenarios"));
+            }
+            None => {
+                // An empty object may be meant as either form.
+                let field = if object.is_empty() { "" } else { ".name" };
+                let reason = "write the format of a scenario, or the name of one of the server's";
+                return Err(wrong(field, reason));
+            }
+        };
+        let values = match object.remove("values") {
+            None => serde_json::Map::new(),
+            Some(Value::Object(values)) => values,
+            Some(_) => {
+                return Err(wrong(".values", "write an object of values by their names"));
+            }
+        };
+        // What was read is removed, so that the rest is unknown.
+        if let Some(field) = object.keys().next() {
+            let field = format!(".{field}");
+            return Err(wrong(&field, "there is no such field; name and values are"));
+        }
+        Ok((Self::Named(name), values.into_iter().collect()))
+    }
 }
 
 /// A scenario that was read for a seed and a version of its twin.
@@ -52,6 +101,13 @@ impl LoadedScenario {
 /// Why a scenario cannot be used.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ScenarioError {
+    /// The object of the request is neither a scenario nor a name with values.
+    #[error("not a request: {field}: {reason}")]
+    Choice {
+        /// The field of the request, as on the wire.
+        field: String,
+        reason: &'static str,
+    },
     /// There is no file of this name.
     #[error("there is no scenario {name:?}; there is {}", joined(known))]
     Unknown {
@@ -99,6 +155,7 @@ impl ScenarioError {
     /// The field at fault, from the scenario on.
     pub fn field(&self) -> String {
         match self {
+            Self::Choice { field, .. } => field.clone(),
             Self::Unknown { .. } => "scenario".to_owned(),
             Self::Read { field, .. } | Self::Hash { field, .. } => format!("scenario.{field}"),
             Self::File { file, cause } if file == "scenario" => format!("scenario.{}", cause.path),
@@ -226,14 +283,22 @@ impl Scenarios {
         version: (&Manifest, &str),
         assets: &dyn Assets,
     ) -> Result<LoadedScenario, ScenarioError> {
+        let file = self.file(source, values)?;
+        self.resolve(file, seed, version, false, assets)
+    }
+
+    /// A scenario with values of its sweep; the first ones where they are absent.
+    pub(crate) fn file(
+        &self,
+        source: &ScenarioSource,
+        values: &BTreeMap<String, Value>,
+    ) -> Result<ScenarioFile, ScenarioError> {
         let document = self.document(source)?;
-        // Values of the caller replace the first ones of the sweep.
         let mut chosen = document.first_values();
         chosen.extend(values.iter().map(|(name, value)| (name.clone(), value.clone())));
-        let file = document.with(&chosen);
-        let file =
-            file.map_err(|cause| ScenarioError::File { file: "scenario".to_owned(), cause })?;
-        self.resolve(file, seed, version, false, assets)
+        document
+            .with(&chosen)
+            .map_err(|cause| ScenarioError::File { file: "scenario".to_owned(), cause })
     }
 
     fn read(

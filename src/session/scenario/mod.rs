@@ -11,6 +11,7 @@ use std::sync::Arc;
 
 use serde_json::Value;
 
+use wildcity_options::Start;
 use wildcity_sim::scenario::{EgoStart, ScenarioFile};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::Version;
@@ -23,7 +24,6 @@ pub use traffic::{EpisodeTraffic, Event, EventKind};
 
 use self::assets::{ActorAssets, GeneratedActors};
 use crate::error::SessionError;
-use crate::options::Start;
 
 /// The scenario of an episode, and the assets of its actors.
 #[derive(Clone, Debug)]
@@ -52,11 +52,7 @@ impl SessionScenario {
         values: &BTreeMap<String, Value>,
         gives_start: bool,
     ) -> Result<Self, ScenarioError> {
-        let document = scenarios.document(source)?;
-        let mut chosen = document.first_values();
-        chosen.extend(values.iter().map(|(name, value)| (name.clone(), value.clone())));
-        let wrong = |cause| ScenarioError::File { file: "scenario".to_owned(), cause };
-        let file = document.with(&chosen).map_err(wrong)?;
+        let file = scenarios.file(source, values)?;
         Ok(Self { scenarios, file, gives_start, generated: Arc::default() })
     }
 
@@ -90,18 +86,16 @@ impl SessionScenario {
 
     /// The start of an episode, if the scenario gives it.
     pub(crate) fn start(&self, loaded: &LoadedScenario) -> Option<Start> {
-        let start = loaded.scenario.start.as_ref().filter(|_| self.gives_start)?;
-        Some(start.into())
+        loaded.scenario.start.as_ref().filter(|_| self.gives_start).map(requested_start)
     }
 }
 
-impl From<&EgoStart> for Start {
-    fn from(start: &EgoStart) -> Self {
-        match start {
-            EgoStart::Pose(pose) => Self::Pose(*pose),
-            EgoStart::Station { trajectory, station_m } => {
-                Self::Station { trajectory: trajectory.clone(), station_m: *station_m }
-            }
+/// The start of a scenario, as a request has it.
+pub(crate) fn requested_start(start: &EgoStart) -> Start {
+    match start {
+        EgoStart::Pose(pose) => Start::Pose { pose: (*pose).into() },
+        EgoStart::Station { trajectory, station_m } => {
+            Start::Station { trajectory: trajectory.clone(), station_m: *station_m }
         }
     }
 }

@@ -4,96 +4,93 @@ use std::ops::RangeInclusive;
 
 use wildcity_scene::rig::RigCamera;
 
-use super::settings::{
+use wildcity_options::{
     CameraSensor, ExposureDrift, FrozenFrames, ImageNoise, LateFrames, LensDirt, Sensors,
     WheelSpeed,
 };
+
+use super::settings::{axes, bias_period_us, reach_us};
 use crate::error::SessionError;
 use crate::limits::{self, SENSOR_REACH_US};
 use crate::observe::schedule::Schedule;
 
-impl Sensors {
-    /// The effects of each camera, by its index.
-    ///
-    /// # Errors
-    /// Names the first value that is out of range, or the first camera that the rig does not have.
-    pub(crate) fn check(
-        &self,
-        cameras: &[RigCamera],
-        schedule: &Schedule,
-        dt_us: i64,
-    ) -> Result<Vec<CameraSensor>, SessionError> {
-        // A camera without settings has the default, which changes nothing.
-        let mut by_index = vec![CameraSensor::default(); cameras.len()];
-        for (name, sensor) in &self.cameras {
-            let field = format!("sensors.cameras.{name}");
-            let Some(index) = cameras.iter().position(|camera| camera.name == *name) else {
-                let known = cameras.iter().map(|camera| camera.name.clone()).collect();
-                return Err(SessionError::UnknownCamera { field, name: name.clone(), known });
-            };
-            sensor.check(&field, schedule.period_us(index))?;
-            by_index[index] = *sensor;
-        }
-        if let Some(imu) = &self.imu {
-            for (name, axis) in [("accelerometer", imu.accelerometer), ("gyroscope", imu.gyroscope)]
-            {
-                let field = |end: &str| format!("sensors.imu.{name}.{end}");
-                number(&field("noise"), axis.noise, 0.0..=100.0)?;
-                number(&field("bias"), axis.bias, 0.0..=100.0)?;
-            }
-            time("sensors.imu.bias_period_us", imu.bias_period_us, limits::DRIFT_PERIOD_US)?;
-        }
-        if let Some(WheelSpeed { noise, scale }) = self.wheel_speed {
-            number("sensors.wheel_speed.noise", noise, 0.0..=100.0)?;
-            number("sensors.wheel_speed.scale", scale, 0.0..=0.5)?;
-        }
-        // The whole delay in steps: decisions take effect at the start of a step.
-        whole("sensors.delay_us", self.delay_us, dt_us, 0..=limits::BUNDLE_PERIOD_US)?;
-        Ok(by_index)
+/// The effects of each camera, by its index.
+///
+/// # Errors
+/// Names the first value that is out of range, or the first camera that the rig does not have.
+pub(crate) fn check(
+    sensors: &Sensors,
+    cameras: &[RigCamera],
+    schedule: &Schedule,
+    dt_us: i64,
+) -> Result<Vec<CameraSensor>, SessionError> {
+    // A camera without settings has the default, which changes nothing.
+    let mut by_index = vec![CameraSensor::default(); cameras.len()];
+    for (name, sensor) in &sensors.cameras {
+        let field = format!("sensors.cameras.{name}");
+        let Some(index) = cameras.iter().position(|camera| camera.name == *name) else {
+            let known = cameras.iter().map(|camera| camera.name.clone()).collect();
+            return Err(SessionError::UnknownCamera { field, name: name.clone(), known });
+        };
+        check_camera(sensor, &field, schedule.period_us(index))?;
+        by_index[index] = *sensor;
     }
+    if let Some(imu) = &sensors.imu {
+        for (name, axis) in ["accelerometer", "gyroscope"].into_iter().zip(axes(imu)) {
+            let field = |end: &str| format!("sensors.imu.{name}.{end}");
+            number(&field("noise"), axis.noise, 0.0..=100.0)?;
+            number(&field("bias"), axis.bias, 0.0..=100.0)?;
+        }
+        time("sensors.imu.bias_period_us", bias_period_us(imu), limits::DRIFT_PERIOD_US)?;
+    }
+    if let Some(WheelSpeed { noise, scale }) = sensors.wheel_speed {
+        number("sensors.wheel_speed.noise", noise, 0.0..=100.0)?;
+        number("sensors.wheel_speed.scale", scale, 0.0..=0.5)?;
+    }
+    // The whole delay in steps: decisions take effect at the start of a step.
+    whole("sensors.delay_us", sensors.delay_us.unwrap_or(0), dt_us, 0..=limits::BUNDLE_PERIOD_US)?;
+    Ok(by_index)
 }
 
-impl CameraSensor {
-    fn check(&self, field: &str, period_us: i64) -> Result<(), SessionError> {
-        let at = |end: &str| format!("{field}.{end}");
-        let reach_us = 0..=SENSOR_REACH_US;
-        if let Some(drop) = self.drop {
-            number(&at("drop"), drop, 0.0..=0.9)?;
-        }
-        if let Some(LateFrames { chance, by_us }) = self.late {
-            number(&at("late.chance"), chance, 0.0..=1.0)?;
-            whole(&at("late.by_us"), by_us, period_us, period_us..=SENSOR_REACH_US)?;
-        }
-        if let Some(FrozenFrames { chance, for_us }) = self.freeze {
-            number(&at("freeze.chance"), chance, 0.0..=1.0)?;
-            whole(&at("freeze.for_us"), for_us, period_us, period_us..=SENSOR_REACH_US)?;
-        }
-        // Each delay is within its limit, but a picture can be late, frozen and replaced.
-        if !reach_us.contains(&self.reach_us(period_us)) {
-            let must = format!(
-                "such that a picture may be {} µs old; at most {SENSOR_REACH_US} µs are accepted",
-                self.reach_us(period_us)
-            );
-            return Err(SessionError::CameraOption { field: field.to_owned(), must });
-        }
-        if let Some(ImageNoise { full_well, read }) = self.noise {
-            number(&at("noise.full_well"), full_well, 10.0..=1e6)?;
-            number(&at("noise.read"), read, 0.0..=1000.0)?;
-        }
-        if let Some(ExposureDrift { stops, period_us }) = self.exposure {
-            number(&at("exposure.stops"), stops, 0.0..=4.0)?;
-            time(&at("exposure.period_us"), period_us, limits::DRIFT_PERIOD_US)?;
-        }
-        if let Some(LensDirt { spots, radius, opacity }) = self.dirt {
-            if !(1..=limits::DIRT_SPOTS).contains(&spots) {
-                let must = format!("{spots}; 1 to {} are accepted", limits::DIRT_SPOTS);
-                return Err(SessionError::CameraOption { field: at("dirt.spots"), must });
-            }
-            number(&at("dirt.radius"), radius, 0.001..=0.5)?;
-            number(&at("dirt.opacity"), opacity, 0.0..=1.0)?;
-        }
-        Ok(())
+fn check_camera(sensor: &CameraSensor, field: &str, period_us: i64) -> Result<(), SessionError> {
+    let at = |end: &str| format!("{field}.{end}");
+    let accepted_us = 0..=SENSOR_REACH_US;
+    if let Some(drop) = sensor.drop {
+        number(&at("drop"), drop, 0.0..=0.9)?;
     }
+    if let Some(LateFrames { chance, by_us }) = sensor.late {
+        number(&at("late.chance"), chance, 0.0..=1.0)?;
+        whole(&at("late.by_us"), by_us, period_us, period_us..=SENSOR_REACH_US)?;
+    }
+    if let Some(FrozenFrames { chance, for_us }) = sensor.freeze {
+        number(&at("freeze.chance"), chance, 0.0..=1.0)?;
+        whole(&at("freeze.for_us"), for_us, period_us, period_us..=SENSOR_REACH_US)?;
+    }
+    // Each delay is within its limit, but a picture can be late, frozen and replaced.
+    if !accepted_us.contains(&reach_us(sensor, period_us)) {
+        let must = format!(
+            "such that a picture may be {} µs old; at most {SENSOR_REACH_US} µs are accepted",
+            reach_us(sensor, period_us)
+        );
+        return Err(SessionError::CameraOption { field: field.to_owned(), must });
+    }
+    if let Some(ImageNoise { full_well, read }) = sensor.noise {
+        number(&at("noise.full_well"), full_well, 10.0..=1e6)?;
+        number(&at("noise.read"), read, 0.0..=1000.0)?;
+    }
+    if let Some(ExposureDrift { stops, period_us }) = sensor.exposure {
+        number(&at("exposure.stops"), stops, 0.0..=4.0)?;
+        time(&at("exposure.period_us"), period_us, limits::DRIFT_PERIOD_US)?;
+    }
+    if let Some(LensDirt { spots, radius, opacity }) = sensor.dirt {
+        if !(1..=limits::DIRT_SPOTS).contains(&spots) {
+            let must = format!("{spots}; 1 to {} are accepted", limits::DIRT_SPOTS);
+            return Err(SessionError::CameraOption { field: at("dirt.spots"), must });
+        }
+        number(&at("dirt.radius"), radius, 0.001..=0.5)?;
+        number(&at("dirt.opacity"), opacity, 0.0..=1.0)?;
+    }
+    Ok(())
 }
 
 fn number(field: &str, value: f64, accepted: RangeInclusive<f64>) -> Result<(), SessionError> {

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use wildcity_scene::geometry::Pose;
 use wildcity_sim::ego::Action;
-use wildcity_sim::{Command, Ego, EgoError, EgoModel, Ground};
+use wildcity_sim::{Command, DynamicsModel, Ego, EgoError, Ground};
 
 use crate::limits::BUNDLE_PERIOD_US;
 use crate::record::command::RecordedCommand;
@@ -101,8 +101,8 @@ impl Decisions {
 /// The command before the first decision.
 fn none_yet(ego: &Ego) -> Command {
     match ego.dynamics().model {
-        EgoModel::Teleport => Command::Pose(ego.world_from_rig()),
-        EgoModel::Kinematic | EgoModel::Dynamic => {
+        DynamicsModel::Teleport => Command::Pose(ego.world_from_rig()),
+        DynamicsModel::Kinematic | DynamicsModel::Dynamic => {
             Command::Action(Action { acceleration_m_s2: 0.0, curvature_1_m: 0.0 })
         }
     }

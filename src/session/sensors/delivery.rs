@@ -3,7 +3,9 @@
 use wildcity_scene::random::Random;
 
 use super::SensorReason;
-use super::settings::CameraSensor;
+use wildcity_options::CameraSensor;
+
+use super::settings::arrival_us;
 
 /// A camera of an episode, as far as its frames depend on it.
 #[derive(Clone, Copy, Debug)]
@@ -37,7 +39,7 @@ impl FrameSource<'_> {
         // The first multiple of the period since the beginning. `min` matters only for a frame from
         // before it.
         let first_us = (self.begin_us + (-self.begin_us).rem_euclid(self.period_us)).min(due_us);
-        let earliest_us = first_us.max(due_us - self.sensor.arrival_us(self.period_us));
+        let earliest_us = first_us.max(due_us - arrival_us(self.sensor, self.period_us));
         let mut stamp_us = due_us;
         // Back from the frame that is due, to the newest one that has arrived. The earliest frame
         // counts as arrived without a test, so that the loop ends.
@@ -89,7 +91,8 @@ impl FrameSource<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sensors::settings::{FrozenFrames, LateFrames};
+    use crate::sensors::settings::reach_us;
+    use wildcity_options::{FrozenFrames, LateFrames};
 
     const PERIOD_US: i64 = 100_000;
 
@@ -166,7 +169,7 @@ mod tests {
                 for due_us in (first_us..2_000_000).step_by(100_000) {
                     let Delivery { stamp_us, taken_us, .. } = source.at(due_us);
                     assert!(first_us <= taken_us && taken_us <= stamp_us && stamp_us <= due_us);
-                    assert!(due_us - taken_us <= sensor.reach_us(PERIOD_US));
+                    assert!(due_us - taken_us <= reach_us(&sensor, PERIOD_US));
                 }
             }
         }

@@ -17,7 +17,7 @@
 //! | `motion` | specific force, angular velocity, and wheel speed |
 //! | `decisions` | the decision that is in effect |
 
-mod check;
+pub(crate) mod check;
 pub(crate) mod decisions;
 pub(crate) mod delivery;
 pub(crate) mod draw;
@@ -26,10 +26,10 @@ pub(crate) mod pixels;
 pub(crate) mod settings;
 
 use serde::{Deserialize, Serialize};
+use wildcity_options::Sensors;
 
 use self::decisions::Decisions;
 use self::motion::MotionSample;
-use self::settings::Sensors;
 use crate::limits::SENSOR_REACH_US;
 
 /// State of an episode's sensors.
@@ -50,8 +50,8 @@ impl EpisodeSensors {
     pub(crate) fn at_start(sensors: &Sensors, reach_us: i64) -> Self {
         Self {
             reach_us,
-            decisions: Decisions::new(sensors.delay_us),
-            motion: sensors.measures_motion().then(Vec::new),
+            decisions: Decisions::new(sensors.delay_us.unwrap_or(0)),
+            motion: settings::measures_motion(sensors).then(Vec::new),
         }
     }
 

@@ -20,7 +20,9 @@ use wildcity_scene::random::Random;
 use wildcity_sim::Ego;
 
 use super::draw::{drift, standard_normal};
-use super::settings::{AxisNoise, Imu, WheelSpeed};
+use wildcity_options::{AxisNoise, Imu, WheelSpeed};
+
+use super::settings::{axes, bias_period_us};
 
 /// Standard gravity, in m/s².
 const GRAVITY_M_S2: f64 = 9.806_65;
@@ -63,8 +65,7 @@ impl MotionSample {
         let mut random = Random::new(seed, "imu/noise", self.time_us as usize);
         // One stream for all axes: they are drawn in order.
         let mut axis = |index: usize| {
-            let AxisNoise { noise, bias } =
-                if index < 3 { imu.accelerometer } else { imu.gyroscope };
+            let AxisNoise { noise, bias } = axes(imu)[index / 3];
             let ideal = match index {
                 0..3 => self.specific_force[index],
                 _ => self.angular_velocity[index - 3],
@@ -72,7 +73,7 @@ impl MotionSample {
             // Each name is a stream of its own. Two axes of one name would drift alike.
             let name = ["x", "y", "z", "r", "p", "yaw"][index];
             let name = format!("imu/bias/{name}");
-            let drifted = drift(seed, &name, imu.bias_period_us, self.time_us);
+            let drifted = drift(seed, &name, bias_period_us(imu), self.time_us);
             (ideal + noise * standard_normal(&mut random) + bias * drifted) as f32
         };
         std::array::from_fn(&mut axis)
@@ -93,18 +94,17 @@ mod tests {
     use super::*;
     use glam::DQuat;
     use wildcity_scene::geometry::Pose;
-    use wildcity_sim::{Command, Dynamics, EgoModel, Ground};
+    use wildcity_sim::{Command, Dynamics, DynamicsModel, Ground};
 
     const DT_US: i64 = 50_000;
 
     fn exact() -> Imu {
-        let none = AxisNoise::default();
-        Imu { accelerometer: none, gyroscope: none, bias_period_us: 1_000_000 }
+        Imu { accelerometer: None, gyroscope: None, bias_period_us: Some(1_000_000) }
     }
 
     #[test]
     fn a_car_in_a_curve_feels_gravity_and_the_centripetal_force() {
-        let dynamics = Dynamics::checked(EgoModel::Kinematic, 10.0, false).unwrap();
+        let dynamics = Dynamics::checked(DynamicsModel::Kinematic, 10.0, false).unwrap();
         let ground = Ground::from_drives(&[]);
         let action = wildcity_sim::ego::Action::checked(0.0, 0.05).unwrap();
         let start = Pose { rotation: DQuat::from_rotation_z(0.7), ..Pose::IDENTITY };
@@ -141,7 +141,7 @@ mod tests {
     #[test]
     fn the_biases_of_all_axes_drift_apart() {
         let axis = AxisNoise { noise: 0.0, bias: 1.0 };
-        let imu = Imu { accelerometer: axis, gyroscope: axis, bias_period_us: 1_000_000 };
+        let imu = Imu { accelerometer: Some(axis), gyroscope: Some(axis), ..exact() };
         let still = MotionSample {
             time_us: 2_500_000,
             specific_force: DVec3::ZERO,
@@ -158,7 +158,7 @@ mod tests {
     fn errors_have_the_variance_that_was_asked_for() {
         let ego = Ego::new(Dynamics::default(), Pose::IDENTITY);
         let axis = AxisNoise { noise: 0.3, bias: 0.4 };
-        let imu = Imu { accelerometer: axis, gyroscope: axis, ..exact() };
+        let imu = Imu { accelerometer: Some(axis), gyroscope: Some(axis), ..exact() };
         let wheels = WheelSpeed { noise: 0.2, scale: 0.01 };
         let count = 10_000;
         let mut squares = [0.0; 7];
@@ -182,7 +182,7 @@ mod tests {
 
     #[test]
     fn the_scale_of_the_wheels_stays_for_an_episode() {
-        let dynamics = Dynamics::checked(EgoModel::Kinematic, 20.0, false).unwrap();
+        let dynamics = Dynamics::checked(DynamicsModel::Kinematic, 20.0, false).unwrap();
         let ego = Ego::new(dynamics, Pose::IDENTITY);
         let wheels = WheelSpeed { noise: 0.0, scale: 0.05 };
         let at = |time_us: i64, seed: u64| {

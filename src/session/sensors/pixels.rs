@@ -22,7 +22,9 @@ use wildcity_scene::random::{Random, mix};
 use wildcity_scene::srgb::{linear_from_stored, stored_from_linear};
 
 use super::draw::{drift, normal_table};
-use super::settings::{CameraSensor, ImageNoise, LensDirt};
+use wildcity_options::{CameraSensor, ImageNoise, LensDirt};
+
+use super::settings::changes_pixels;
 
 /// The effects on one image.
 #[derive(Clone, Debug)]
@@ -67,7 +69,7 @@ impl PixelEffects {
         taken_us: i64,
         [width, height]: [u32; 2],
     ) -> Option<Self> {
-        if !sensor.changes_pixels() {
+        if !changes_pixels(sensor) {
             return None;
         }
         // Lengths are in widths of the image, so that spots are round.
@@ -177,7 +179,7 @@ fn spots(dirt: &LensDirt, seed: u64, camera: &str, aspect: f64) -> Vec<Spot> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sensors::settings::ExposureDrift;
+    use wildcity_options::ExposureDrift;
 
     const WIDTH: u32 = 400;
     const HEIGHT: u32 = 250;

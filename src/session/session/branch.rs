@@ -9,18 +9,17 @@ use wildcity_scene::rig::overlay_bytes;
 
 use super::Session;
 use super::open::{frame_bytes, prepare, rig_extent, solid_ego};
-use super::recording::simulation_lines;
+use super::pending::{EpisodeFile, NewEpisode, Pending};
 use super::requests::SimulationState;
 use crate::blocking::run_blocking;
 use crate::engine::Engine;
-use crate::episode::Outcome;
 use crate::error::SessionError;
+use crate::observe::encode::PixelMaps;
 use crate::observe::layout::ObservationLayout;
 use crate::observe::observation::Observation;
-use crate::options::PixelMaps;
 use crate::record::branch_error::BranchError;
 use crate::record::continuation::{Continuation, KeptFrames};
-use crate::record::format::{FrameRequest, Line, RecordedOrigin, RecordedSettings};
+use crate::record::format::{FrameRequest, RecordedOrigin, RecordedSettings};
 use crate::snapshot::Snapshot;
 use crate::start::EpisodeStart;
 use crate::state::{EpisodeState, SessionSettings};
@@ -82,32 +81,22 @@ impl Session {
         }
 
         let record = self.frame_record(FrameRequest::Restore, &episode, &rendered);
-        let traffic = state.traffic.as_ref();
-        let mut lines = simulation_lines(traffic, &state.events, &record, true);
-        lines.push(Line::Frame(record));
-        let file = self.create_file(version, origin.clone(), traffic, &episode, lines).await?;
-        // Nothing after this can fail. If this does, the file goes again, and the session stays as
-        // it was.
-        if let Some(bytes) = bytes
-            && let Err(error) = self.reservation.exchange(version.resident.clone(), bytes)
-        {
-            file.recorder.discard();
-            return Err(error.into());
-        }
-        self.version = version.clone();
-        self.end_recording(Outcome::Completed).await;
-
+        let new = NewEpisode {
+            version: version.clone(),
+            bytes,
+            origin: origin.clone(),
+            first: episode.clone(),
+        };
         // Only for the least trust: whether the ego has left the area was decided when this state
         // was reached.
         let _mean = episode.add_trusts(rendered.trusts());
         episode.set_repair_state(rendered.repair_state);
-        self.begin(file, origin.clone());
         // After a switch of version, the frames of the present are as the original has them.
         let frame_history = state.frame_history.clone().or(&rendered.frame_history);
-        let (traffic, events) = (state.traffic.clone(), state.events.clone());
-        self.state = EpisodeState { episode, frame_history, traffic, events };
-        self.look_ahead();
-        Ok(rendered.observation)
+        let next = EpisodeState { episode, frame_history, ..state.clone() };
+        let file = EpisodeFile::New(Box::new(new));
+        let observation = rendered.observation;
+        Pending { next: Some(next), record, file, observation }.commit(self).await
     }
 
     /// Opens a session in the state of another one's snapshot, with its settings. The new session

@@ -5,21 +5,24 @@
 //! | `open.rs` | opens, and switches to another version of the twin |
 //! | `branch.rs` | takes and restores snapshots, and opens sessions from a state of another episode |
 //! | `requests.rs` | answers step, observe, reset and close |
+//! | `pending.rs` | records a rendered request, and then changes the session |
 //! | `recording.rs` | writes the episode's file |
 //! | `prefetching.rs` | loads what the next steps will need |
 
 mod branch;
 mod open;
+mod pending;
 mod prefetching;
 mod recording;
 mod reference_images;
-mod requests;
+pub(crate) mod requests;
 
 use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::time::Instant;
 
+use wildcity_options::Sensors;
 use wildcity_render::View;
 use wildcity_scene::RenderProfile;
 use wildcity_scene::geometry::Pose;
@@ -29,15 +32,13 @@ use wildcity_twin::residency::{Reservation, Resident, Viewpoint};
 
 use crate::engine::Engine;
 use crate::episode::Episode;
-use crate::observe::encode::Encoding;
-use crate::options::PixelMaps;
+use crate::observe::encode::{ImageEncoding, PixelMaps};
 use crate::prefetch::latest_task::LatestTask;
 use crate::record::format::RecordedOrigin;
 use crate::record::recorder::Recorder;
 use crate::repair::references::ReferenceSource;
 use crate::repair::session_repair::SessionRepair;
 use crate::scenario::{EpisodeTraffic, Event};
-use crate::sensors::settings::Sensors;
 use crate::snapshot::Snapshots;
 use crate::state::{EpisodeState, PinnedVersion, SessionSettings};
 use crate::viewpoint::viewpoints;
@@ -127,7 +128,7 @@ impl Session {
     }
 
     /// How colour images are encoded.
-    pub fn encoding(&self) -> Encoding {
+    pub fn encoding(&self) -> ImageEncoding {
         self.settings.layout.encoding()
     }
 

@@ -1,16 +1,22 @@
 //! Opening a session, and switching it to another version of the twin.
 
+use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 use std::time::Duration;
 
+use serde_json::Value;
 use tokio::time::Instant;
 
 use wildcity_episode::scenario_line;
+use wildcity_options::{
+    ContactMode, ImagePart, Open, Outputs, RandomStart, Repair, RigChoice, Sensors, Start,
+};
 use wildcity_render::View;
 use wildcity_scene::geometry::Pose;
-use wildcity_scene::rig::{Rig, RigCamera, check_overlay_pixels, overlay_bytes};
-use wildcity_scene::{Manifest, RenderProfile, Trajectory};
+use wildcity_scene::rig::{Rig, RigCamera, check_overlay_pixels, is_name, overlay_bytes};
+use wildcity_scene::{Manifest, ProfileOverrides, RenderProfile, Trajectory};
+use wildcity_sim::Dynamics;
 use wildcity_sim::scenario::Scenario;
 use wildcity_sim::traffic::EgoBox;
 use wildcity_twin::residency::{FrameBytes, Reservation, Resident, RigExtent, Urgency};
@@ -20,25 +26,26 @@ use crate::blocking::run_blocking;
 use crate::engine::Engine;
 use crate::error::SessionError;
 use crate::limits;
+use crate::observe::encode::{ImageEncoding, PixelMaps};
 use crate::observe::layout::ObservationLayout;
 use crate::observe::schedule::Schedule;
 use crate::observe::trust::TrainingCoverage;
-use crate::options::{
-    ContactMode, ImagePart, Outputs, RandomStart, RigChoice, ScenarioOptions, SessionOptions, Start,
-};
 use crate::prefetch::latest_task::LatestTask;
 use crate::prefetch::recorded_drive::RecordedDrive;
 use crate::repair::references::ReferenceViews;
 use crate::repair::session_repair::SessionRepair;
-use crate::scenario::{EpisodeScenario, EpisodeTraffic, LoadedScenario, SessionScenario};
-use crate::sensors::settings::Sensors;
+use crate::scenario::{
+    EpisodeScenario, EpisodeTraffic, LoadedScenario, ScenarioSource, SessionScenario,
+};
+use crate::sensors::settings::used;
 use crate::snapshot::Snapshots;
-use crate::start::EpisodeStart;
+use crate::start::{EpisodeStart, checked_pose};
 use crate::state::{EpisodeState, PinnedVersion, SessionSettings};
 use crate::viewpoint::viewpoints;
 
 impl Session {
-    /// Opens a session, and reserves the memory for its worst frame.
+    /// Opens a session, and reserves the memory for its worst frame. `seq`, `session` and
+    /// `trajectory` of the options are for the answer, and not read.
     ///
     /// # Errors
     /// Names the first field of `options` that is invalid or cannot be satisfied. Nothing stays
@@ -46,33 +53,27 @@ impl Session {
     pub async fn open(
         engine: Arc<Engine>,
         name: String,
-        mut options: SessionOptions,
+        options: Open,
     ) -> Result<Self, SessionError> {
-        // How long a step takes in simulated time, and an answer in real time.
-        let dt_us = check_dt(options.dt_us)?;
-        let deadline = check_deadline(options.deadline, engine.step_timeout())?;
-        check_contact(options.contact, options.scenario.is_some())?;
+        let step_timeout = engine.step_timeout();
+        // The overlays of a rig may take a second to decompress.
+        let mut asked = run_blocking(move || Asked::new(options, step_timeout)).await??;
 
         // The version of the twin. Its Gaussians are loaded frame by frame.
-        let resident = engine.open_version(options.twin.clone(), options.version).await?;
-        let manifest = &resident.version.manifest;
+        let resident = engine.open_version(asked.twin.clone(), asked.version).await?;
 
         // Read the scenario, whose ego section fills in what the request leaves open.
-        let opened = match options.scenario.take() {
-            Some(asked) => {
-                let scenario = OpenedScenario::read(&engine, &resident, asked, &options).await?;
-                scenario.complete(&mut options);
-                Some(scenario)
-            }
+        let opened = match asked.scenario.take() {
+            Some(source) => Some(OpenedScenario::read(&engine, &resident, source, &asked).await?),
             None => None,
         };
+        let ego = AskedEgo::new(&asked, opened.as_ref());
 
         // Select the cameras. Scaling their overlays takes a second at worst.
-        let outputs = options.outputs;
         let rig = {
             let resident = resident.clone();
-            let choice = options.rig;
-            let outputs = outputs.clone();
+            let choice = asked.rig.take();
+            let outputs = asked.outputs.clone();
             run_blocking(move || {
                 let rig = select_cameras(&resident.version.manifest, choice, &outputs)?;
                 crop_and_scale(rig, &outputs)
@@ -83,92 +84,61 @@ impl Session {
         let overlays = engine.answer_budget().reserve(overlay_bytes(&rig.cameras))?;
         let extent = rig_extent(&rig.cameras);
 
-        // Load the repair model, which takes seconds.
-        let repair = match options.repair {
-            None => None,
-            Some(asked) => {
-                let models = engine.repairs().clone();
-                let cameras = rig.cameras.clone();
-                let reports_trust = outputs.trust;
-                let open =
-                    move || SessionRepair::open(&models, &asked, &cameras, deadline, reports_trust);
-                Some(Arc::new(run_blocking(open).await??))
-            }
-        };
-
-        // Decide which images an observation holds, and how they lie in its message.
-        let schedule = Schedule::new(
-            &rig.cameras,
-            dt_us,
-            outputs.frames,
-            &outputs.periods_us,
-            options.decision_us,
-        )?;
-        let mut layout =
-            ObservationLayout::new(rig.cameras, outputs.encoding, outputs.maps, schedule)?;
-        if repair.is_some() {
-            layout.reserve_repair();
-        }
-        if repair.as_ref().is_some_and(|repair| repair.needs_images()) {
-            layout.reserve_references()?;
-        }
-        if let Some(sensors) = options.sensors.and_then(Sensors::used) {
-            layout.add_sensors(sensors, dt_us)?;
-        }
-        // Last, because its check covers what the others have added.
-        if let Some(opened) = &opened {
-            let actors = opened.resolved().traffic.actors.len();
-            layout.reserve_header(if opened.asked.actors { actors } else { 0 })?;
-        }
+        let repair = asked.load_repair(&engine, &rig.cameras).await?;
+        let reports_actors = opened.is_some() && asked.outputs.actors.unwrap_or(false);
+        let actors = opened
+            .as_ref()
+            .map(|opened| if reports_actors { opened.resolved().traffic.actors.len() } else { 0 });
+        let layout = asked.layout(rig.cameras, repair.as_deref(), actors)?;
 
         // Find where episodes start, and the recorded drive that the ego may follow from there.
+        let manifest = &resident.version.manifest;
         let start = EpisodeStart::resolve(
             manifest,
-            options.start.as_ref(),
-            options.warm_up_us,
-            options.dynamics,
-            options.seed,
+            ego.start.as_ref(),
+            ego.warm_up_us,
+            ego.dynamics,
+            asked.seed,
             opened.as_ref().and_then(|opened| opened.episode.loaded.lanes()),
         )?;
-        let drive = drive_to_follow(&manifest.trajectories, options.start.as_ref());
+        let drive = drive_to_follow(&manifest.trajectories, ego.start.as_ref());
         let drive = drive.map(|drive| Arc::new(RecordedDrive::new(drive)));
 
         // The same seed as for the start, as in every later episode.
         let episode = start
-            .episode(options.seed, options.dynamics, dt_us)
+            .episode(asked.seed, ego.dynamics, asked.dt_us)
             .with_sensors(layout.episode_sensors());
-        let reports_actors = opened.as_ref().is_some_and(|opened| opened.asked.actors);
-        let solid_ego = solid_ego(options.contact, opened.as_ref().map(OpenedScenario::resolved));
+        let solid_ego = solid_ego(asked.contact, opened.as_ref().map(OpenedScenario::resolved));
         let (scenario, loaded) = match opened {
-            Some(OpenedScenario { scenario, episode, .. }) => (Some(scenario), Some(episode)),
+            Some(OpenedScenario { scenario, episode }) => (Some(scenario), Some(episode)),
             None => (None, None),
         };
         let settings = SessionSettings {
-            profile_overrides: options.profile,
+            profile_overrides: asked.profile,
             rig_name: rig.name,
             layout: Arc::new(layout),
             _overlays: overlays,
-            dynamics: options.dynamics,
+            dynamics: ego.dynamics,
             start,
-            random_start: match options.start {
-                Some(Start::Random(random)) => Some(random),
+            random_start: match ego.start {
+                Some(Start::Random { random }) => Some(random),
                 _ => None,
             },
-            warm_up_us: options.warm_up_us,
-            dt_us,
-            deadline,
+            warm_up_us: ego.warm_up_us,
+            dt_us: asked.dt_us,
+            deadline: asked.deadline,
             drive,
             scenario,
             reports_actors,
             repair,
-            contact: options.contact,
+            contact: asked.contact,
             solid_ego,
         };
 
         // Prepare the version for its frames, and reserve the memory for the worst frame anywhere
         // in the twin.
         // An error about the coverage names the field that needs it.
-        let coverage_for = match (outputs.trust, &settings.repair) {
+        let coverage_for = match (asked.outputs.trust.unwrap_or(false), &settings.repair) {
             (true, _) => Some("outputs.trust"),
             (false, Some(_)) => Some("repair"),
             (false, None) => None,
@@ -259,9 +229,147 @@ impl Session {
     }
 }
 
-/// The scenario that a session asks for, and its first episode.
+/// The options of a session, checked as far as that needs no twin.
+struct Asked {
+    twin: String,
+    version: Option<u64>,
+    seed: u64,
+    start: Option<Start>,
+    rig: Option<AskedRig>,
+    profile: ProfileOverrides,
+    outputs: Outputs,
+    /// The motion model, if the request names one.
+    dynamics: Option<Dynamics>,
+    dt_us: i64,
+    deadline: Duration,
+    decision_us: Option<i64>,
+    warm_up_us: Option<i64>,
+    scenario: Option<(ScenarioSource, BTreeMap<String, Value>)>,
+    repair: Option<Repair>,
+    sensors: Option<Sensors>,
+    contact: Option<ContactMode>,
+}
+
+enum AskedRig {
+    /// A rig that comes with the program, by name.
+    Preset(String),
+    Full(Rig),
+}
+
+impl Asked {
+    fn new(options: Open, step_timeout: Duration) -> Result<Self, SessionError> {
+        let rig = match options.rig {
+            None => None,
+            Some(RigChoice::Preset(name)) => Some(AskedRig::Preset(name)),
+            Some(RigChoice::Full(rig)) => Some(AskedRig::Full(Rig::from_request(rig)?)),
+        };
+        let scenario = options.scenario.map(ScenarioSource::from_choice).transpose()?;
+        // The store checks names again; this error names the field.
+        if !is_name(&options.twin) {
+            return Err(SessionError::Name { field: "twin", name: options.twin });
+        }
+        if let Some(Start::Pose { pose }) = &options.start {
+            checked_pose(*pose)?;
+        }
+        let dynamics = options.dynamics.map(wildcity_options::Dynamics::from);
+        let dynamics = dynamics.map(Dynamics::try_from).transpose()?;
+        // How long a step takes in simulated time, and an answer in real time.
+        let dt_us = check_dt(options.dt_us)?;
+        let deadline =
+            check_deadline(options.deadline_ms.map(Duration::from_millis), step_timeout)?;
+        check_contact(options.contact, scenario.is_some())?;
+        Ok(Self {
+            twin: options.twin,
+            version: options.version,
+            seed: options.seed,
+            start: options.start,
+            rig,
+            profile: ProfileOverrides::new(options.profile),
+            outputs: options.outputs,
+            dynamics,
+            dt_us,
+            deadline,
+            decision_us: options.decision_us,
+            warm_up_us: options.warm_up_us,
+            scenario,
+            repair: options.repair,
+            sensors: options.sensors.and_then(used),
+            contact: options.contact,
+        })
+    }
+
+    /// Loads the repair model, which takes seconds.
+    async fn load_repair(
+        &self,
+        engine: &Engine,
+        cameras: &[RigCamera],
+    ) -> Result<Option<Arc<SessionRepair>>, SessionError> {
+        let Some(asked) = self.repair.clone() else { return Ok(None) };
+        let models = engine.repairs().clone();
+        let cameras = cameras.to_vec();
+        let deadline = self.deadline;
+        let reports_trust = self.outputs.trust.unwrap_or(false);
+        let open = move || SessionRepair::open(&models, &asked, &cameras, deadline, reports_trust);
+        Ok(Some(Arc::new(run_blocking(open).await??)))
+    }
+
+    /// Which images an observation holds, and how they lie in its message. `actors` is how many
+    /// are reported; `None` without a scenario.
+    fn layout(
+        &self,
+        cameras: Vec<RigCamera>,
+        repair: Option<&SessionRepair>,
+        actors: Option<usize>,
+    ) -> Result<ObservationLayout, SessionError> {
+        let outputs = &self.outputs;
+        let periods_us = outputs.period_us.clone().unwrap_or_default();
+        let schedule =
+            Schedule::new(&cameras, self.dt_us, outputs.frames, &periods_us, self.decision_us)?;
+        let encoding = ImageEncoding::new(outputs);
+        let maps = PixelMaps::new(outputs);
+        let mut layout = ObservationLayout::new(cameras, encoding, maps, schedule)?;
+        if repair.is_some() {
+            layout.reserve_repair();
+        }
+        if repair.is_some_and(SessionRepair::needs_images) {
+            layout.reserve_references()?;
+        }
+        if let Some(sensors) = &self.sensors {
+            layout.add_sensors(sensors.clone(), self.dt_us)?;
+        }
+        // Last, because its check covers what the others have added.
+        if let Some(actors) = actors {
+            layout.reserve_header(actors)?;
+        }
+        Ok(layout)
+    }
+}
+
+/// Where the ego starts and how it moves: as the request says, then as the scenario says.
+struct AskedEgo {
+    start: Option<Start>,
+    dynamics: Dynamics,
+    warm_up_us: i64,
+}
+
+impl AskedEgo {
+    fn new(asked: &Asked, scenario: Option<&OpenedScenario>) -> Self {
+        let resolved = scenario.map(OpenedScenario::resolved);
+        let start = asked.start.clone();
+        let scenario_start =
+            || scenario.and_then(|opened| opened.scenario.start(&opened.episode.loaded));
+        let dynamics = asked.dynamics.or_else(|| resolved?.dynamics);
+        let warm_up_us = asked.warm_up_us.or_else(|| resolved?.warm_up_us);
+        Self {
+            start: start.or_else(scenario_start),
+            dynamics: dynamics.unwrap_or_default(),
+            warm_up_us: warm_up_us.unwrap_or(0),
+        }
+    }
+}
+
+/// The scenario of a session, and its first episode.
 struct OpenedScenario {
-    asked: ScenarioOptions,
     scenario: SessionScenario,
     episode: EpisodeScenario,
 }
@@ -270,41 +378,27 @@ impl OpenedScenario {
     async fn read(
         engine: &Arc<Engine>,
         resident: &Arc<Resident>,
-        asked: ScenarioOptions,
-        options: &SessionOptions,
+        (source, values): (ScenarioSource, BTreeMap<String, Value>),
+        asked: &Asked,
     ) -> Result<Self, SessionError> {
         let engine = engine.clone();
         let version = resident.version.clone();
-        let seed = options.seed;
+        let seed = asked.seed;
         // A start that the request names is that of all its episodes, whatever the scenario says.
-        let gives_start = options.start.is_none();
+        let gives_start = asked.start.is_none();
         run_blocking(move || {
             let scenarios = engine.scenarios().clone();
-            let mut scenario =
-                SessionScenario::read(scenarios, &asked.source, &asked.values, gives_start)?;
+            let mut scenario = SessionScenario::read(scenarios, &source, &values, gives_start)?;
             let episode = scenario.for_episode(seed, &version, engine.cache())?;
             check_line(&episode.loaded, &version.manifest)?;
             scenario.pin_assets(&episode.loaded);
-            Ok(Self { asked, scenario, episode })
+            Ok(Self { scenario, episode })
         })
         .await?
     }
 
     fn resolved(&self) -> &Scenario {
         &self.episode.loaded.scenario
-    }
-
-    /// Adds what the ego section says to what the request leaves open.
-    fn complete(&self, options: &mut SessionOptions) {
-        if options.start.is_none() {
-            options.start = self.scenario.start(&self.episode.loaded);
-        }
-        if let (true, Some(dynamics)) = (self.asked.dynamics, self.resolved().dynamics) {
-            options.dynamics = dynamics;
-        }
-        if let (true, Some(warm_up_us)) = (self.asked.warm_up, self.resolved().warm_up_us) {
-            options.warm_up_us = warm_up_us;
-        }
     }
 }
 
@@ -408,7 +502,7 @@ fn check_deadline(
 /// requested order.
 fn select_cameras(
     manifest: &Manifest,
-    choice: Option<RigChoice>,
+    choice: Option<AskedRig>,
     outputs: &Outputs,
 ) -> Result<Rig, SessionError> {
     let preset = |name: &str| {
@@ -418,8 +512,8 @@ fn select_cameras(
         })
     };
     let rig = match choice {
-        Some(RigChoice::Full(rig)) => rig,
-        Some(RigChoice::Preset(name)) => preset(&name)?,
+        Some(AskedRig::Full(rig)) => rig,
+        Some(AskedRig::Preset(name)) => preset(&name)?,
         None => match &manifest.rig {
             Some(rig) => rig.clone(),
             None => preset(limits::RIG)?,
@@ -513,10 +607,10 @@ fn drive_to_follow<'a>(drives: &'a [Trajectory], start: Option<&Start>) -> Optio
     match start {
         Some(
             Start::Station { trajectory, .. }
-            | Start::Random(RandomStart { trajectory: Some(trajectory), .. }),
+            | Start::Random { random: RandomStart { trajectory: Some(trajectory), .. } },
         ) => drives.iter().find(|drive| drive.name == *trajectory),
         // A pose may be near any drive: the forecast tests whether it is near this one.
-        Some(Start::Pose(_) | Start::Random(_)) | None => drives.first(),
+        Some(Start::Pose { .. } | Start::Random { .. }) | None => drives.first(),
     }
 }
 

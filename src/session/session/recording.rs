@@ -4,11 +4,12 @@ use wildcity_episode::{self as episode, ActorsLine, EventLine, ScenarioLine, sce
 use wildcity_scene::Rig;
 
 use super::Session;
+use super::pending::{EpisodeFile, NewEpisode};
 use crate::blocking::run_blocking;
 use crate::episode::{Episode, Outcome};
 use crate::error::SessionError;
 use crate::observe::builder::finish::RenderedObservation;
-use crate::options::PixelMaps;
+use crate::observe::encode::PixelMaps;
 use crate::record::error::RecordError;
 use crate::record::format::{
     BUILD, EpisodeHeader, FrameRecord, FrameRequest, Line, RecordedOrigin, RecordedOutputs,
@@ -17,45 +18,45 @@ use crate::record::format::{
 use crate::record::recorder::{NewFile, Recorder};
 use crate::record::repairs::{RecordedImageRepair, RecordedRepair};
 use crate::scenario::{EpisodeTraffic, Event, EventKind};
-use crate::state::{PinnedVersion, SessionSettings};
+use crate::state::{EpisodeState, PinnedVersion, SessionSettings};
 
 impl Session {
-    /// Appends a frame to the episode's file. The first frame of an episode creates the file.
-    /// `traffic` is that after a step; `None` for a frame that is not a step. `events` are those of
-    /// a step without a scenario.
+    /// Records a frame, and returns the file if it was created for it: for a new episode, or for
+    /// the first frame of one. `next` is the state after the request; `None` if it stays.
     pub(super) async fn record(
-        &mut self,
+        &self,
         frame: FrameRecord,
-        traffic: Option<&EpisodeTraffic>,
-        events: &[Event],
-    ) -> Result<(), SessionError> {
-        let is_first = self.recorder.is_none();
+        next: Option<&EpisodeState>,
+        file: &EpisodeFile,
+    ) -> Result<Option<NewFile>, SessionError> {
+        let is_first = self.recorder.is_none() || matches!(file, EpisodeFile::New(_));
+        let before = &self.state;
+        let traffic = next.and_then(|next| next.traffic.as_ref());
+        let events = next.map_or(&[][..], |next| &next.events);
         // The first frame of a file also needs the actors of the state that it begins with.
-        let shown = traffic.or(self.state.traffic.as_ref().filter(|_| is_first));
+        let shown = traffic.or(before.traffic.as_ref().filter(|_| is_first));
         let mut lines = simulation_lines(shown, events, &frame, is_first);
         lines.push(Line::Frame(frame));
-        match self.recorder.clone() {
-            Some(recorder) => {
+        let created = match (file, self.recorder.clone()) {
+            (EpisodeFile::New(new), _) => {
+                let NewEpisode { version, origin, first, .. } = &**new;
+                self.create_file(version, origin.clone(), traffic, first, lines).await?
+            }
+            (EpisodeFile::Same, Some(recorder)) => {
                 // Together with the frame, so that a switch before a failed frame is not on record.
                 let version = self.version_switched.then(|| self.version_line());
                 append(recorder, version.into_iter().chain(lines).collect()).await?;
+                return Ok(None);
             }
-            None => {
+            (EpisodeFile::Same, None) => {
                 let origin = self.origin.clone();
                 // The state before the step: a replay begins with it, and executes the command of
                 // the first frame.
-                let before = &self.state;
                 let traffic = before.traffic.as_ref();
-                let file = self
-                    .create_file(&self.version, origin, traffic, &before.episode, lines)
-                    .await?;
-                self.recorder = Some(file.recorder);
-                self.episode_number = file.number;
+                self.create_file(&self.version, origin, traffic, &before.episode, lines).await?
             }
-        }
-        // Only now: after a failure, the next frame has to write the switch.
-        self.version_switched = false;
-        Ok(())
+        };
+        Ok(Some(created))
     }
 
     /// The record of a rendered observation, without the command that led there.
@@ -114,7 +115,7 @@ impl Session {
 
     /// Creates the file of an episode, with its header and its first frame. `episode` is the state
     /// before the step of this frame.
-    pub(super) async fn create_file(
+    async fn create_file(
         &self,
         pinned: &PinnedVersion,
         origin: Option<RecordedOrigin>,
@@ -203,7 +204,7 @@ impl Session {
 
 /// The lines before the frame of a request: with a scenario those of its traffic, otherwise its
 /// events.
-pub(super) fn simulation_lines(
+fn simulation_lines(
     traffic: Option<&EpisodeTraffic>,
     events: &[Event],
     frame: &FrameRecord,

@@ -7,13 +7,14 @@ use serde_json::Value;
 use tokio::time::{Instant, timeout_at};
 use tracing::{Instrument as _, debug_span};
 
+use wildcity_options::{ContactMode, DynamicsChoice, DynamicsModel, Start};
 use wildcity_render::{Backend, Frame, View};
 use wildcity_scene::geometry::Pose;
 use wildcity_sim::scenario::EndReason;
-use wildcity_sim::{Command, Ego, Ground};
+use wildcity_sim::{Command, Dynamics, Ego, Ground};
 
 use super::Session;
-use super::recording::simulation_lines;
+use super::pending::{EpisodeFile, NewEpisode, Pending};
 use crate::blocking::run_blocking;
 use crate::engine::render_queue::{FrameCost, Scratch};
 use crate::episode::{Episode, EpisodeSummary, Outcome};
@@ -25,15 +26,38 @@ use crate::observe::builder::repair::ObservationRepair;
 use crate::observe::frame_history::FrameHistory;
 use crate::observe::layout::RigCapture;
 use crate::observe::observation::Observation;
-use crate::options::{ContactMode, ResetOptions, Start, StepOptions};
 use crate::pin::pin;
 use crate::record::command::RecordedCommand;
-use crate::record::format::{FrameRequest, Line, RecordedOrigin};
-use crate::record::recorder::NewFile;
+use crate::record::format::FrameRequest;
 use crate::scenario::assets::FrameDetail;
 use crate::scenario::{EpisodeScenario, EpisodeTraffic, Event, EventKind, settle};
-use crate::start::EpisodeStart;
+use crate::start::{EpisodeStart, checked_pose};
 use crate::state::{EpisodeState, PinnedVersion};
+
+/// Options of a step in addition to its command.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct StepOptions {
+    /// Duration for which the command is followed, in microseconds: a whole number of steps; one
+    /// step if absent.
+    pub until_us: Option<i64>,
+    /// Whether the episode ends with it.
+    pub terminate: bool,
+    /// Notes of the agent, for the record.
+    pub notes: Option<Value>,
+}
+
+/// Changes by `reset` for its episode.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ResetOptions {
+    /// Seed of the episode.
+    pub seed: u64,
+    /// Where it starts; the session's start if absent.
+    pub start: Option<Start>,
+    /// How the ego moves; the session's dynamics if absent.
+    pub dynamics: Option<DynamicsChoice>,
+    /// Speed at the start, in m/s, in place of that of the dynamics.
+    pub speed_m_s: Option<f64>,
+}
 
 /// State that a frame shows in addition to the twin: the ego and its past, and the actors.
 #[derive(Clone, Copy)]
@@ -139,14 +163,12 @@ impl Session {
             // Without them, frames before the last one would count as those of a warm-up.
             record.times_us = rendered.captures.iter().map(|capture| capture.time_us).collect();
         }
-        self.record(record, traffic.as_ref(), &events).instrument(debug_span!("record")).await?;
-
-        // Nothing fails from here on.
         next.set_repair_state(rendered.repair_state);
         let frame_history = rendered.frame_history;
-        self.state = EpisodeState { episode: next, frame_history, traffic, events };
-        self.look_ahead();
-        Ok(rendered.observation)
+        let next = EpisodeState { episode: next, frame_history, traffic, events };
+        let file = EpisodeFile::Same;
+        let observation = rendered.observation;
+        Pending { next: Some(next), record, file, observation }.commit(self).await
     }
 
     /// The episode after some steps along a command, and the ego after each of them.
@@ -195,7 +217,11 @@ impl Session {
     /// What contact with the twin does in an episode without a scenario.
     fn contact_mode(&self, episode: &Episode) -> ContactMode {
         let model = episode.ego().dynamics().model;
-        self.settings.contact.unwrap_or_else(|| ContactMode::default_for(model))
+        // A teleported ego is not stopped by what it meets: it is often put into places where no
+        // car drives.
+        let is_teleported = model == DynamicsModel::Teleport;
+        let default = if is_teleported { ContactMode::Report } else { ContactMode::End };
+        self.settings.contact.unwrap_or(default)
     }
 
     /// Number of steps of a plan that is followed for `until_us`.
@@ -229,16 +255,14 @@ impl Session {
             let must = format!("{}; 1 to {} are accepted", poses.len(), limits::OBSERVE_POSES);
             return Err(SessionError::OutOfRange { field: "poses", must });
         }
-        // A copy, because recording needs the session mutably.
-        let episode = self.state.episode.clone();
-        let captures = self.settings.layout.captures_at(&episode, poses);
-        let simulation =
-            SimulationState { episode: &episode, traffic: self.state.traffic.as_ref() };
+        let episode = &self.state.episode;
+        let captures = self.settings.layout.captures_at(episode, poses);
+        let simulation = SimulationState { episode, traffic: self.state.traffic.as_ref() };
         let deadline = Instant::now() + self.settings.deadline;
         let rendered = self.render(&self.version, simulation, captures, None, deadline).await?;
-        let record = self.frame_record(FrameRequest::Observe, &episode, &rendered);
-        self.record(record, None, &[]).instrument(debug_span!("record")).await?;
-        Ok(rendered.observation)
+        let record = self.frame_record(FrameRequest::Observe, episode, &rendered);
+        let file = EpisodeFile::Same;
+        Pending { next: None, record, file, observation: rendered.observation }.commit(self).await
     }
 
     /// Starts a new episode at `start`, or where the session started, and renders it.
@@ -260,7 +284,14 @@ impl Session {
     pub async fn reset_with(&mut self, options: ResetOptions) -> Result<Observation, SessionError> {
         let settings = &self.settings;
         let ResetOptions { seed, start, dynamics, speed_m_s } = options;
-        let mut dynamics = dynamics.unwrap_or(settings.dynamics);
+        // Before the dynamics, as in the order of the request's fields.
+        if let Some(Start::Pose { pose }) = &start {
+            checked_pose(*pose)?;
+        }
+        let mut dynamics = match dynamics {
+            Some(asked) => Dynamics::try_from(wildcity_options::Dynamics::from(asked))?,
+            None => settings.dynamics,
+        };
         if let Some(speed_m_s) = speed_m_s {
             dynamics = dynamics.with_speed("speed", speed_m_s)?;
         }
@@ -278,7 +309,7 @@ impl Session {
         // The request, then the session's random start, then the scenario. Without any, the
         // session's start.
         let start = start
-            .or_else(|| settings.random_start.clone().map(Start::Random))
+            .or_else(|| settings.random_start.clone().map(|random| Start::Random { random }))
             .or_else(|| settings.scenario.as_ref()?.start(&loaded.as_ref()?.loaded));
         let manifest = &self.resident().version.manifest;
         let lanes = loaded.as_ref().and_then(|found| found.loaded.lanes());
@@ -325,28 +356,14 @@ impl Session {
         }
 
         let record = self.frame_record(FrameRequest::Reset, &next, &rendered);
-        let before = traffic.as_ref();
-        let mut lines = simulation_lines(before, &events, &record, true);
-        lines.push(Line::Frame(record));
-        // Before the old episode ends: if there is no new file, the old one goes on.
-        let file = self.create_file(&self.version, None, before, &next, lines).await?;
-        self.end_recording(Outcome::Completed).await;
-
+        let version = self.version.clone();
+        let new = NewEpisode { version, bytes: None, origin: None, first: next.clone() };
         next.set_repair_state(rendered.repair_state);
-        self.begin(file, None);
         let frame_history = rendered.frame_history;
-        self.state = EpisodeState { episode: next, frame_history, traffic, events };
-        self.look_ahead();
-        Ok(rendered.observation)
-    }
-
-    /// Goes over to another episode, which has its own file. The caller sets its state.
-    pub(super) fn begin(&mut self, file: NewFile, origin: Option<RecordedOrigin>) {
-        self.recorder = Some(file.recorder);
-        self.episode_number = file.number;
-        self.version_switched = false;
-        self.origin = origin;
-        self.hint.clear();
+        let next = EpisodeState { episode: next, frame_history, traffic, events };
+        let file = EpisodeFile::New(Box::new(new));
+        let observation = rendered.observation;
+        Pending { next: Some(next), record, file, observation }.commit(self).await
     }
 
     /// Ends the session and summarizes its last episode.

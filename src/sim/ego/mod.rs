@@ -49,25 +49,13 @@ use path::ReferenceTrajectory;
 pub use path::{Path, TimedPose};
 pub use single_track::{Setpoint, SingleTrackState};
 pub use vehicle::Vehicle;
-
-/// The motion model of an ego.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum EgoModel {
-    /// Takes the commanded pose.
-    #[default]
-    Teleport,
-    /// Rolls without slip, without lags.
-    Kinematic,
-    /// Linear single-track model with tyre slip and lags of steering and drive.
-    Dynamic,
-}
+pub use wildcity_options::DynamicsModel;
 
 /// A motion model and its initial conditions.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Dynamics {
-    pub model: EgoModel,
+    pub model: DynamicsModel,
     /// Speed at the start of an episode, in m/s along the rig; 0 for a teleport.
     pub speed_m_s: f64,
     /// Whether braking beyond standstill makes the car go backwards; otherwise it stops.
@@ -188,14 +176,23 @@ impl EgoError {
     }
 }
 
-impl EgoModel {
-    /// The name on the wire.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Teleport => "teleport",
-            Self::Kinematic => "kinematic",
-            Self::Dynamic => "dynamic",
-        }
+impl TryFrom<wildcity_options::Dynamics> for Dynamics {
+    type Error = EgoError;
+
+    fn try_from(asked: wildcity_options::Dynamics) -> Result<Self, EgoError> {
+        Self::checked(asked.model, asked.speed, asked.reverse)
+    }
+}
+
+impl From<Dynamics> for wildcity_options::Dynamics {
+    fn from(Dynamics { model, speed_m_s, reverse }: Dynamics) -> Self {
+        Self { model, speed: speed_m_s, reverse }
+    }
+}
+
+impl From<Dynamics> for wildcity_options::DynamicsChoice {
+    fn from(dynamics: Dynamics) -> Self {
+        Self::Full(dynamics.into())
     }
 }
 
@@ -204,12 +201,12 @@ impl Dynamics {
     ///
     /// # Errors
     /// The speed is not finite or not within the bounds of the model.
-    pub fn checked(model: EgoModel, speed_m_s: f64, reverse: bool) -> Result<Self, EgoError> {
+    pub fn checked(model: DynamicsModel, speed_m_s: f64, reverse: bool) -> Result<Self, EgoError> {
         let dynamics = Self { model, speed_m_s, reverse };
         let [least, most] = match model {
             // A teleport has no speed of its own, so only 0 is meaningful.
-            EgoModel::Teleport => [0.0, 0.0],
-            EgoModel::Kinematic | EgoModel::Dynamic => dynamics.bounds_m_s(),
+            DynamicsModel::Teleport => [0.0, 0.0],
+            DynamicsModel::Kinematic | DynamicsModel::Dynamic => dynamics.bounds_m_s(),
         };
         in_range("dynamics.speed", speed_m_s, [least, most])?;
         Ok(dynamics)
@@ -234,8 +231,8 @@ impl Dynamics {
     /// placed on the ground unless the model is a teleport.
     pub fn start_pose(&self, world_from_rig: Pose, ground: &Ground<'_>) -> Pose {
         match self.model {
-            EgoModel::Teleport => world_from_rig,
-            EgoModel::Kinematic | EgoModel::Dynamic => ground.place(world_from_rig),
+            DynamicsModel::Teleport => world_from_rig,
+            DynamicsModel::Kinematic | DynamicsModel::Dynamic => ground.place(world_from_rig),
         }
     }
 
@@ -301,11 +298,11 @@ impl Ego {
         }
         let step_s = step_us as f64 * 1e-6;
         match (self.dynamics.model, command) {
-            (EgoModel::Teleport, Command::Pose(pose)) => Ok(self.moved_to(*pose, step_s)),
-            (EgoModel::Teleport, Command::Path(path)) => {
+            (DynamicsModel::Teleport, Command::Pose(pose)) => Ok(self.moved_to(*pose, step_s)),
+            (DynamicsModel::Teleport, Command::Path(path)) => {
                 Ok(self.moved_to(self.world_from_rig * path.at(step_us), step_s))
             }
-            (_, Command::Action(action)) if self.dynamics.model != EgoModel::Teleport => {
+            (_, Command::Action(action)) if self.dynamics.model != DynamicsModel::Teleport => {
                 Ok(self.driven(self.advanced(&self.car, *action, step_s), step_s, ground))
             }
             (_, Command::Path(path)) => {
@@ -387,10 +384,10 @@ impl Ego {
         let Plan { path, reference, world_from_start } = plan;
         let step_s = step_us as f64 * 1e-6;
         match self.dynamics.model {
-            EgoModel::Teleport => {
+            DynamicsModel::Teleport => {
                 self.moved_to(*world_from_start * path.at(since_us + step_us), step_s)
             }
-            EgoModel::Kinematic | EgoModel::Dynamic => {
+            DynamicsModel::Kinematic | DynamicsModel::Dynamic => {
                 // The reference stays in the frame of the plan's start. The car is moved into it,
                 // instead of the path into the car's frame, so that no rounding accumulates over
                 // the steps.
@@ -440,7 +437,7 @@ impl Ego {
 
     /// Angle of the front wheels, in radians, positive to the left; `None` for a teleport.
     pub fn steering_rad(&self) -> Option<f64> {
-        (self.dynamics.model != EgoModel::Teleport).then_some(self.car.steering_rad)
+        (self.dynamics.model != DynamicsModel::Teleport).then_some(self.car.steering_rad)
     }
 
     fn moved_to(&self, world_from_rig: Pose, step_s: f64) -> Self {
@@ -498,7 +495,7 @@ impl Ego {
     fn advanced(&self, car: &SingleTrackState, action: Action, step_s: f64) -> SingleTrackState {
         let vehicle = Vehicle::DEFAULT;
         let bounds_m_s = self.dynamics.bounds_m_s();
-        if self.dynamics.model == EgoModel::Kinematic {
+        if self.dynamics.model == DynamicsModel::Kinematic {
             return kinematic::rolled(car, &vehicle, action, step_s, bounds_m_s);
         }
         let steering_rad = vehicle.steering_rad(action.curvature_1_m, car.speed_m_s);
@@ -522,8 +519,8 @@ impl Ego {
     ) -> SingleTrackState {
         let from_s = from_us as f64 * 1e-6;
         let lag_s = match self.dynamics.model {
-            EgoModel::Dynamic => Vehicle::DEFAULT.lag_s,
-            EgoModel::Teleport | EgoModel::Kinematic => 0.0,
+            DynamicsModel::Dynamic => Vehicle::DEFAULT.lag_s,
+            DynamicsModel::Teleport | DynamicsModel::Kinematic => 0.0,
         };
         // Ticks of equal length of at most `TRACKER_TICK_US`, so that the last one is not a
         // remnant.

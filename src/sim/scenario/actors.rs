@@ -68,7 +68,7 @@ pub(super) fn actors_from(
                 box_,
                 asset: asset.map(|asset| asset.hash),
             },
-            behaviour: Behaviour::Track(track),
+            behaviour: track.into(),
             script: Vec::new(),
             present: true,
         });
@@ -211,20 +211,20 @@ fn actor_from(
         track_class = Some(track.class);
         track_size = Some(track.size);
         let shifted = track.shifted(start_time_us(around, start));
-        Behaviour::Track(shifted.map_err(|error| error.within("log.track"))?)
+        Behaviour::from(shifted.map_err(|error| error.within("log.track"))?)
     } else if let Some(path) = &section.path {
-        Behaviour::Follow(follower_from("path", path, &drawn, None, courses)?)
+        Behaviour::from(follower_from("path", path, &drawn, None, courses)?)
     } else if let Some(idm) = &section.idm {
         let model = idm_from(idm).map_err(|error| error.within("idm"))?;
-        Behaviour::Follow(follower_from("idm", &path_from_idm(idm), &drawn, Some(model), courses)?)
+        Behaviour::from(follower_from("idm", &path_from_idm(idm), &drawn, Some(model), courses)?)
     } else if let Some(collide) = &section.collide {
         let track = collide_from(collide, &drawn, along_rad, around);
-        Behaviour::Track(track.map_err(|error| error.within("collide"))?)
+        Behaviour::from(track.map_err(|error| error.within("collide"))?)
     } else if let Some(attack) = &section.attack {
         attack_from(attack, &drawn, along_rad).map_err(|error| error.within("attack"))?
     } else if let Some(pose) = &section.stand {
         let pose = displaced(&pose_from("stand", pose)?, &drawn, along_rad);
-        Behaviour::Track(standing(pose))
+        Behaviour::from(standing(pose))
     } else {
         // Not reached, because exactly one is given. An error here is safer than a panic in a
         // server.

@@ -9,6 +9,8 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
+use wildcity_options::{Dynamics, strict};
+
 use super::actor_file::ActorSection;
 use super::pose::PoseSection;
 use super::script_file::ConditionSection;
@@ -88,8 +90,8 @@ pub struct EgoSection {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<StartSection>,
     /// How it moves. If absent, by teleport.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub dynamics: Option<DynamicsSection>,
+    #[serde(deserialize_with = "strict::deserialize", skip_serializing_if = "Option::is_none")]
+    pub dynamics: Option<Dynamics>,
     /// Length of the warm-up before the start, in microseconds.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub warm_up_us: Option<i64>,
@@ -115,34 +117,6 @@ pub struct StartSection {
     /// A pose, instead of a trajectory.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pose: Option<PoseSection>,
-}
-
-/// How the ego moves, as in the request `open`.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[serde(deny_unknown_fields)]
-pub struct DynamicsSection {
-    /// The motion model.
-    pub model: ModelSection,
-    /// Speed at the start of an episode, in m/s.
-    #[serde(default)]
-    pub speed: f64,
-    /// Whether braking beyond standstill drives backwards.
-    #[serde(default)]
-    pub reverse: bool,
-}
-
-/// Motion model of the ego.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[serde(rename_all = "snake_case")]
-pub enum ModelSection {
-    /// Moves to the requested pose.
-    Teleport,
-    /// Rolls without slipping.
-    Kinematic,
-    /// Single-track model.
-    Dynamic,
 }
 
 /// The box of the ego.

@@ -12,15 +12,13 @@ use super::condition::{References, condition};
 use super::courses::Courses;
 use super::end::EndRules;
 use super::error::{FileError, check_format, hashed, in_range, named};
-use super::file::{
-    DynamicsSection, EgoSection, EndSection, FilePin, ModelSection, RouteSection, ScenarioFile,
-};
+use super::file::{EgoSection, EndSection, FilePin, RouteSection, ScenarioFile};
 use super::pose::pose_from;
 use super::tracks::box_from;
+use crate::Dynamics;
 use crate::limits;
 use crate::route::{COMMAND_AHEAD_M, NavigationRoute, RouteCommand};
 use crate::traffic::{EgoBox, Traffic};
-use crate::{Dynamics, EgoModel};
 
 /// A scenario that is ready to run.
 #[derive(Clone, Debug, PartialEq)]
@@ -68,7 +66,7 @@ impl Scenario {
         {
             section.station_m = Some(*station_m);
         }
-        let dynamics = file.ego.dynamics.as_ref().map(dynamics_from).transpose();
+        let dynamics = file.ego.dynamics.map(dynamics_from).transpose();
         let dynamics = dynamics.map_err(|error| error.within("ego"))?;
         let ego_box = match &file.ego.box_ {
             None => EgoBox::default(),
@@ -198,14 +196,8 @@ fn shifted(drive: &Trajectory, station_m: f64, seed: u64, frames: u32) -> Result
     Ok(stations_m[before] + t * (stations_m[after] - stations_m[before]))
 }
 
-fn dynamics_from(section: &DynamicsSection) -> Result<Dynamics, FileError> {
-    let model = match section.model {
-        ModelSection::Teleport => EgoModel::Teleport,
-        ModelSection::Kinematic => EgoModel::Kinematic,
-        ModelSection::Dynamic => EgoModel::Dynamic,
-    };
-    Dynamics::checked(model, section.speed, section.reverse)
-        .map_err(|error| FileError::new(error.field(), error.to_string()))
+fn dynamics_from(asked: wildcity_options::Dynamics) -> Result<Dynamics, FileError> {
+    Dynamics::try_from(asked).map_err(|error| FileError::new(error.field(), error.to_string()))
 }
 
 fn route_from(

@@ -1,5 +1,7 @@
 //! Scripts of actors: what each does when a condition holds.
 
+use std::sync::Arc;
+
 use super::actor_file::ActorSection;
 use super::condition::{References, condition};
 use super::courses::Courses;
@@ -179,6 +181,7 @@ fn action_from(
             let at_m = at_m.transpose()?;
             // Courses are only appended, so that the indices of earlier actions stay valid.
             if let Behaviour::Follow(follow) = behaviour {
+                let follow = Arc::make_mut(follow);
                 follow.courses.push(course);
                 Action::Course { course: follow.courses.len() - 1, done_m, at_m }
             } else {

@@ -3,6 +3,7 @@
 //! | module | what it holds |
 //! |---|---|
 //! | `world` | all actors of an episode, advanced by sub-steps |
+//! | `behaviour` | how an actor moves, with the state of its motion |
 //! | `track` | actors that repeat recorded motion, or timed positions |
 //! | `follow`, `course`, `lateral` | actors on a course, with changes of offset |
 //! | `speed`, `distance`, `together` | changes of speed: to a speed, at a distance from another, and to arrive with another |
@@ -12,6 +13,7 @@
 //! | `state` | the states of actors and ego, as contacts and renderer read them |
 
 pub mod attack;
+mod behaviour;
 mod condition;
 mod course;
 mod distance;
@@ -27,6 +29,7 @@ mod track;
 mod world;
 
 pub use attack::Attack;
+pub use behaviour::Behaviour;
 pub use course::{Course, CourseFootPoint};
 pub use distance::{Bounds, Gap, KeepDistance, Side};
 pub use follow::CourseFollower;
@@ -38,4 +41,4 @@ pub use script::{
 pub use state::{ActorSpec, ActorState, EgoBox, EgoState, SubStep};
 pub use together::{ArriveTogether, FinalSpeed};
 pub use track::{Track, TrackError, TrackKeyframe, Tracked};
-pub use world::{Actor, Behaviour, EgoMotion, Traffic, World};
+pub use world::{Actor, EgoMotion, Traffic, World};

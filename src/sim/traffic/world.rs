@@ -7,21 +7,14 @@
 
 use std::sync::Arc;
 
-use glam::{DQuat, DVec2, DVec3};
-
-use wildcity_scene::geometry::Pose;
-use wildcity_scene::random::Random;
-
-use super::attack::{self, Attack, Spline};
+use super::behaviour::{Behaviour, Motion, MotionStep, absent};
 use super::condition::{ConditionState, Measures};
-use super::course::turned_rad;
-use super::follow::{CourseFollower, CourseFollowerState};
+use super::follow::Owners;
 use super::lead::LeadCandidate;
 use super::script::{Action, After, Condition, Near, Phase, Trigger};
 use super::state::{ActorSpec, ActorState, EgoBox, EgoState, SubStep};
-use super::track::Track;
 use crate::limits;
-use crate::{Ego, EgoModel};
+use crate::{DynamicsModel, Ego};
 
 /// The actors of an episode before it begins.
 #[derive(Clone, Debug, PartialEq)]
@@ -45,21 +38,6 @@ pub struct Actor {
     pub script: Vec<Trigger>,
     /// Whether it is present from the start; otherwise it waits for [`Action::Spawn`].
     pub present: bool,
-}
-
-/// How an actor moves.
-#[derive(Clone, Debug, PartialEq)]
-pub enum Behaviour {
-    /// Along timed poses, whatever others do.
-    Track(Track),
-    Follow(CourseFollower),
-    Attack {
-        attack: Attack,
-        /// Its pose at the start of the episode.
-        world_from_actor: Pose,
-        /// Its speed at the start, in m/s.
-        speed_mps: f64,
-    },
 }
 
 /// The ego's motion during one step.
@@ -101,7 +79,7 @@ struct EndState {
 struct ActorProgress {
     /// Whether the actor is in the world. Its track may be absent at this time nevertheless.
     spawned: bool,
-    behaviour: BehaviourState,
+    motion: Motion,
     /// What has happened to each trigger of its script.
     fired: Vec<FiredTrigger>,
 }
@@ -119,36 +97,16 @@ struct FiredTrigger {
     is_replaced: bool,
 }
 
-#[derive(Clone, Debug, PartialEq)]
-#[expect(
-    clippy::large_enum_variant,
-    reason = "a world has at most 256 actors, and nearly all of them follow"
-)]
-enum BehaviourState {
-    Track,
-    Follow(CourseFollowerState),
-    Attack(Attacking),
-}
-
-/// An attacker and its current plan.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct Attacking {
-    spline: Spline,
-    world_from_begin: Pose,
-    begin_us: i64,
-    plans: usize,
-}
-
 impl World {
     /// The world at the start of an episode, at time 0.
     pub fn new(traffic: Arc<Traffic>) -> Self {
         let progress: Vec<ActorProgress> = traffic.actors.iter().map(ActorProgress::new).collect();
-        let states = traffic.actors.iter().zip(&progress).enumerate();
+        let states = progress.iter().enumerate();
         let states = states
             // An actor that is not there yet has a state as well, so that the list stays in order
             // of the indices.
-            .map(|(index, (actor, progress))| {
-                if progress.spawned { progress.state(index, actor, 0, None) } else { absent(index) }
+            .map(|(index, progress)| {
+                if progress.spawned { progress.motion.state(index, 0, None) } else { absent(index) }
             })
             .collect();
         let travelled_m = vec![0.0; progress.len() + 1];
@@ -174,11 +132,15 @@ impl World {
     /// others in their starting state.
     pub fn states_before(&self, time_us: i64) -> Vec<ActorState> {
         let start = Self::new(self.traffic.clone());
-        let actors = self.traffic.actors.iter().zip(&start.progress).enumerate();
+        let actors = start.progress.iter().enumerate();
         actors
-            .map(|(index, (actor, progress))| match (&actor.behaviour, progress.spawned) {
-                (Behaviour::Track(_), true) => progress.state(index, actor, time_us.min(0), None),
-                _ => start.states[index],
+            .map(|(index, progress)| match &progress.motion {
+                Motion::Track(_) if progress.spawned => {
+                    progress.motion.state(index, time_us.min(0), None)
+                }
+                Motion::Track(_) | Motion::Follow { .. } | Motion::Attack { .. } => {
+                    start.states[index]
+                }
             })
             .collect()
     }
@@ -258,7 +220,7 @@ impl World {
         }
         // Moved out and back, because `holds` borrows all of `self`.
         let mut state = std::mem::take(&mut self.end.condition);
-        let own = |part: &Condition| self.holds(traffic, None, part, ego, bodies);
+        let own = |part: &Condition| self.holds(None, part, ego, bodies);
         let holds = state.value(when, self.time_us, &own);
         let now_us = self.time_us;
         self.end =
@@ -282,7 +244,7 @@ impl World {
         for (index, actor) in traffic.actors.iter().enumerate() {
             for (at, trigger) in actor.script.iter().enumerate() {
                 let waits = self.progress[index].fired[at].fired_us.is_none();
-                if waits && self.is_due(traffic, [index, at], &trigger.when, ego, bodies) {
+                if waits && self.is_due([index, at], &trigger.when, ego, bodies) {
                     firing.push((index, at));
                 }
             }
@@ -291,7 +253,7 @@ impl World {
             let actor = &traffic.actors[index];
             self.progress[index].fired[at].fired_us = Some(self.time_us);
             for action in &actor.script[at].then {
-                self.progress[index].apply_action(actor, *action, at);
+                self.progress[index].apply_action(*action, at);
             }
         }
     }
@@ -299,7 +261,6 @@ impl World {
     /// Whether a trigger that has not fired fires now.
     fn is_due(
         &mut self,
-        traffic: &Traffic,
         [index, at]: [usize; 2],
         when: &Condition,
         ego: &EgoState,
@@ -310,7 +271,7 @@ impl World {
             return false;
         }
         let mut state = std::mem::take(&mut self.progress[index].fired[at].condition);
-        let own = |part: &Condition| self.holds(traffic, Some(index), part, ego, bodies);
+        let own = |part: &Condition| self.holds(Some(index), part, ego, bodies);
         let value = state.value(when, self.time_us, &own);
         self.progress[index].fired[at].condition = state;
         value
@@ -324,11 +285,8 @@ impl World {
     /// Notes the triggers all of whose actions have ended.
     fn note_ends(&mut self, time_us: i64) {
         for progress in &mut self.progress {
-            let by = match &progress.behaviour {
-                BehaviourState::Follow(now) if progress.spawned => now.by,
-                // An actor that has gone, and one without a course, has nothing under way.
-                _ => Default::default(),
-            };
+            // An actor that has gone has nothing under way.
+            let by = if progress.spawned { progress.motion.owners() } else { Owners::default() };
             for (at, fired) in progress.fired.iter_mut().enumerate() {
                 let is_new = fired.fired_us.is_some() && fired.ended_us.is_none();
                 if is_new && !by.has(at) {
@@ -354,19 +312,13 @@ impl World {
     /// Whether the own parts of a condition hold, of an actor by its index, or of no actor.
     fn holds(
         &self,
-        traffic: &Traffic,
         index: Option<usize>,
         when: &Condition,
         ego: &EgoState,
         bodies: &[LeadCandidate],
     ) -> bool {
-        let follow = index.and_then(|index| {
-            match (&traffic.actors[index].behaviour, &self.progress[index].behaviour) {
-                (Behaviour::Follow(follow), BehaviourState::Follow(now)) => Some((follow, now)),
-                _ => None,
-            }
-        });
-        let course = follow.map(|(follow, now)| follow.course(now));
+        let course_and_station = index.and_then(|index| self.progress[index].motion.course());
+        let course = course_and_station.map(|(course, _)| course);
         let measures = Measures { bodies, travelled_m: &self.travelled_m, course };
         // The cheap comparisons first. The order cannot matter otherwise: none of them remembers
         // anything.
@@ -375,8 +327,8 @@ impl World {
             && when.after.is_none_or(|after| self.is_after(after))
             && when
                 .station_m
-                .is_none_or(|least_m| follow.is_some_and(|(_, now)| now.station_m >= least_m))
-            && self.holds_of_own(traffic, index, when, bodies)
+                .is_none_or(|least_m| course_and_station.is_some_and(|(_, at_m)| at_m >= least_m))
+            && self.holds_of_own(index, when, bodies)
             && when.measure.is_none_or(|measure| measures.holds(&measure))
             && when.ego_station_m.is_none_or(|least_m| {
                 course.is_some_and(|course| course.nearest(bodies[0].center_m).station_m >= least_m)
@@ -386,7 +338,6 @@ impl World {
     /// Whether the parts hold that are about the state of the condition's own actor.
     fn holds_of_own(
         &self,
-        traffic: &Traffic,
         index: Option<usize>,
         when: &Condition,
         bodies: &[LeadCandidate],
@@ -400,8 +351,7 @@ impl World {
             let pose = if state.present {
                 state.world_from_actor
             } else {
-                let actor = &traffic.actors[index];
-                self.progress[index].state(index, actor, self.time_us, None).world_from_actor
+                self.progress[index].motion.state(index, self.time_us, None).world_from_actor
             };
             pose.position_m
         };
@@ -438,11 +388,12 @@ impl World {
                     return absent(index);
                 }
                 let state = &before[index];
-                progress.advance(traffic, actor, state, bodies, [begin_us, end_us]);
+                let step = MotionStep { seed: traffic.seed, bodies, begin_us, end_us };
+                progress.spawned = progress.motion.advance(&step, &actor.spec, state);
                 if progress.spawned {
                     // Without a previous pose, the yaw rate of the first sub-step is 0.
                     let before = state.present.then_some((state.world_from_actor, duration_s));
-                    progress.state(index, actor, end_us, before)
+                    progress.motion.state(index, end_us, before)
                 } else {
                     absent(index)
                 }
@@ -454,7 +405,7 @@ impl World {
 impl EgoMotion {
     /// The motion of an ego from a state to its present one.
     pub fn new(from: EgoState, to: &Ego) -> Self {
-        let smooth = to.dynamics().model != EgoModel::Teleport;
+        let smooth = to.dynamics().model != DynamicsModel::Teleport;
         Self { from, to: EgoState::new(to), smooth }
     }
 
@@ -518,186 +469,25 @@ impl EgoMotion {
 
 impl ActorProgress {
     fn new(actor: &Actor) -> Self {
-        let behaviour = match &actor.behaviour {
-            Behaviour::Track(_) => BehaviourState::Track,
-            Behaviour::Follow(follow) => BehaviourState::Follow(follow.begin()),
-            Behaviour::Attack { world_from_actor, speed_mps, .. } => {
-                BehaviourState::Attack(Attacking {
-                    spline: Spline::straight(*speed_mps),
-                    world_from_begin: *world_from_actor,
-                    begin_us: 0,
-                    plans: 0,
-                })
-            }
-        };
         let fired = vec![FiredTrigger::default(); actor.script.len()];
-        Self { spawned: actor.present, behaviour, fired }
+        Self { spawned: actor.present, motion: Motion::begin(&actor.behaviour), fired }
     }
 
     /// Carries out an action of a trigger of the actor's script.
-    fn apply_action(&mut self, actor: &Actor, action: Action, trigger: usize) {
-        match (action, &actor.behaviour, &mut self.behaviour) {
-            (Action::Spawn, ..) => self.spawned = true,
-            (Action::Remove, ..) => self.spawned = false,
-            (_, Behaviour::Follow(follow), BehaviourState::Follow(now)) => {
+    fn apply_action(&mut self, action: Action, trigger: usize) {
+        match action {
+            Action::Spawn => self.spawned = true,
+            Action::Remove => self.spawned = false,
+            action => {
                 // Which changes were under way before, to find those that this action replaces.
-                let before = now.by;
-                *now = follow.with_action(now, action, trigger);
+                let before = self.motion.owners();
+                self.motion.act(action, trigger);
+                let after = self.motion.owners();
                 let lost = (0..self.fired.len()).filter(|at| before.has(*at) && *at != trigger);
                 for at in lost {
-                    self.fired[at].is_replaced |= before.loses(&now.by, at);
+                    self.fired[at].is_replaced |= before.loses(&after, at);
                 }
             }
-            // The scenario's check refuses such scripts.
-            _ => {}
         }
-    }
-
-    fn advance(
-        &mut self,
-        traffic: &Traffic,
-        actor: &Actor,
-        before: &ActorState,
-        bodies: &[LeadCandidate],
-        [begin_us, end_us]: [i64; 2],
-    ) {
-        match (&actor.behaviour, &mut self.behaviour) {
-            (Behaviour::Follow(follow), BehaviourState::Follow(now)) => {
-                let duration_s = (end_us - begin_us) as f64 * 1e-6;
-                let box_ = &actor.spec.box_;
-                match follow.after(now, box_, before.index, bodies, duration_s) {
-                    Some(next) => *now = next,
-                    None => self.spawned = false,
-                }
-            }
-            (Behaviour::Attack { attack, .. }, BehaviourState::Attack(now)) => {
-                let is_first = now.plans == 0;
-                let is_due = begin_us.saturating_sub(now.begin_us) >= attack.plan_us;
-                if before.present && (is_first || is_due) {
-                    *now = now.plan_next(
-                        traffic.seed,
-                        attack,
-                        &actor.spec.name,
-                        before,
-                        bodies,
-                        begin_us,
-                    );
-                } else if !before.present {
-                    // An attacker that is absent postpones its plan, so that it does not begin in
-                    // the middle of one.
-                    now.begin_us = begin_us;
-                }
-            }
-            _ => {}
-        }
-    }
-
-    /// The state at a time. `before` is the previous pose, and the time since then in seconds.
-    fn state(
-        &self,
-        index: usize,
-        actor: &Actor,
-        time_us: i64,
-        before: Option<(Pose, f64)>,
-    ) -> ActorState {
-        match (&actor.behaviour, &self.behaviour) {
-            (Behaviour::Track(track), _) => match track.at(time_us) {
-                None => absent(index),
-                Some(at) => ActorState {
-                    index: index as u16,
-                    world_from_actor: at.world_from_actor,
-                    velocity_mps: at.velocity_mps,
-                    yaw_rate_radps: at.yaw_rate_radps,
-                    present: true,
-                },
-            },
-            (Behaviour::Follow(follow), BehaviourState::Follow(now)) => {
-                follow.state(index as u16, now, before)
-            }
-            (Behaviour::Attack { .. }, BehaviourState::Attack(now)) => {
-                now.state(index, time_us, before)
-            }
-            _ => absent(index),
-        }
-    }
-}
-
-impl Attacking {
-    /// The next plan from where the attacker is.
-    fn plan_next(
-        &self,
-        seed: u64,
-        attack: &Attack,
-        name: &str,
-        own: &ActorState,
-        bodies: &[LeadCandidate],
-        time_us: i64,
-    ) -> Self {
-        let begin = own.world_from_actor;
-        // Along its own axis, so that it may be negative.
-        let speed_mps = own.velocity_mps.dot(begin.rotation * DVec3::X);
-        let begin_from_world = begin.inverse();
-        let predicted = |body: &LeadCandidate| {
-            let at_m = begin_from_world.transform_point(body.center_m).truncate();
-            let velocity_mps = (begin_from_world.rotation * body.velocity_mps).truncate();
-            attack::predicted(at_m, velocity_mps, body.yaw_rate_radps)
-        };
-        let attacked = predicted(&bodies[0]);
-        let others = bodies[1..].iter().filter(|body| body.actor != Some(own.index));
-        let neighbours: Vec<Vec<DVec2>> = others.map(|body| predicted(body).to_vec()).collect();
-        let mut plans: Vec<(f64, Spline)> = attack::candidates(speed_mps)
-            .into_iter()
-            .map(|spline| (attack::cost_m(&spline.points_m(), &attacked, &neighbours), spline))
-            .collect();
-        // A stable sort: equal costs keep the order of the candidates.
-        plans.sort_by(|a, b| a.0.total_cmp(&b.0));
-        // A stream for each plan of each attacker: `plans` is the number of the draw.
-        let mut random = Random::new(seed, &format!("attack/{name}"), self.plans);
-        // No drivable plan is left: it goes straight on.
-        let spline = match attack.best.min(plans.len()) {
-            0 => Spline::straight(speed_mps),
-            count => plans[random.below(count)].1,
-        };
-        Self { spline, world_from_begin: begin, begin_us: time_us, plans: self.plans + 1 }
-    }
-
-    fn state(&self, index: usize, time_us: i64, before: Option<(Pose, f64)>) -> ActorState {
-        let since_s = (time_us - self.begin_us) as f64 * 1e-6;
-        let at_m = self.spline.position_m(since_s);
-        let velocity = self.spline.velocity_mps(since_s);
-        let begin = &self.world_from_begin;
-        let velocity_mps = begin.rotation * velocity.extend(0.0);
-        // The heading is the direction of motion, backwards at a negative speed; below 0.1 m/s it
-        // stays.
-        let ahead = if velocity.x < 0.0 { -velocity } else { velocity };
-        let rotation = if velocity.length() < 0.1 {
-            before.map_or(begin.rotation, |(before, _)| before.rotation)
-        } else {
-            begin.rotation * DQuat::from_rotation_z(ahead.to_angle())
-        };
-        let pose = Pose {
-            position_m: begin.transform_point(at_m.extend(0.0)),
-            rotation: rotation.normalize(),
-        };
-        let yaw_rate_radps = before.map_or(0.0, |(before, duration_s)| {
-            turned_rad(before.rotation, pose.rotation) / duration_s
-        });
-        ActorState {
-            index: index as u16,
-            world_from_actor: pose,
-            velocity_mps,
-            yaw_rate_radps,
-            present: true,
-        }
-    }
-}
-
-fn absent(index: usize) -> ActorState {
-    ActorState {
-        index: index as u16,
-        world_from_actor: Pose::IDENTITY,
-        velocity_mps: DVec3::ZERO,
-        yaw_rate_radps: 0.0,
-        present: false,
     }
 }

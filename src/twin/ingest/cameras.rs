@@ -8,6 +8,7 @@ use serde::Deserialize;
 use serde::de::IgnoredAny;
 
 use crate::limits;
+use wildcity_options::strict;
 use wildcity_scene::geometry::camera::json::{Intrinsics, LensFields, WindshieldFields};
 use wildcity_scene::geometry::{Camera, CameraError, Pose, PoseError};
 use wildcity_scene::views::{MOST_STOPS, refused_stops};
@@ -115,7 +116,9 @@ struct Entry {
     fy: Option<f64>,
     cx: f64,
     cy: f64,
+    #[serde(default, deserialize_with = "strict::deserialize")]
     lens: Option<LensFields>,
+    #[serde(default, deserialize_with = "strict::deserialize")]
     windshield: Option<WindshieldFields>,
     shutter: Option<IgnoredAny>,
     exposure: Option<IgnoredAny>,

@@ -42,7 +42,7 @@ pub(super) fn follow(
     speed_mps: f64,
     idm: Option<Idm>,
 ) -> Behaviour {
-    Behaviour::Follow(CourseFollower {
+    Behaviour::from(CourseFollower {
         courses: vec![course.clone()],
         station_m,
         offset_m: 0.0,
@@ -132,7 +132,7 @@ fn a_car_follows_the_ego_and_brakes_for_what_cuts_in() {
     let front_m = world.states()[0].world_from_actor.position_m.x + 2.25;
     assert!((front_m - (100.0 + 1.3 - 2.25 - 1.0)).abs() < 1e-3, "{front_m}");
     // A car in the next lane is no lead until it moves over.
-    let beside = Behaviour::Follow(CourseFollower {
+    let beside = Behaviour::from(CourseFollower {
         courses: vec![road.clone()],
         station_m: 60.0,
         offset_m: 3.5,
@@ -246,7 +246,7 @@ fn fifty() -> Vec<Actor> {
                         rotation: DQuat::from_rotation_z(1e-7 * time_us as f64),
                     },
                 };
-                Behaviour::Track(Track::new((0..40).map(|k| key(k * 500_000)).collect()).unwrap())
+                Behaviour::from(Track::new((0..40).map(|k| key(k * 500_000)).collect()).unwrap())
             }
             _ => Behaviour::Attack {
                 attack: Attack { plan_us: 750_000, best: 10 },

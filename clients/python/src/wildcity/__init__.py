@@ -20,7 +20,6 @@ from .assets import (
 from .augmented import AugmentedError, AugmentedSample, AugmentedViews
 from .errors import (
     BadFrame,
-    Code,
     ConnectFailed,
     Disconnected,
     ProtocolError,
@@ -30,12 +29,12 @@ from .errors import (
     TimedOut,
     WildCityError,
 )
-from .observation import Observation, View
-from .protocol import (
+from .messages import (
     Action,
     AxisNoise,
     Camera,
     CameraSensor,
+    Code,
     Drive,
     DrivePose,
     DriveSection,
@@ -57,7 +56,6 @@ from .protocol import (
     Metadata,
     Opened,
     Outputs,
-    Pose,
     RandomStart,
     RecordedPoint,
     Repair,
@@ -67,19 +65,19 @@ from .protocol import (
     Shutter,
     SnapshotPoint,
     Station,
-    Step,
     Summary,
     Switched,
     TimedPose,
-    Trajectory,
     TrajectoryInfo,
     Trust,
     TwinInfo,
     Welcome,
     WheelSpeed,
     Windshield,
-    png_data_uri,
 )
+from .observation import Observation, View
+from .pose import Pose
+from .protocol import Step, Trajectory, png_data_uri
 from .pushing import Push, PushProgress, push, recorded_drive, rollback
 from .serving import LocalServer, ServeFailed, serve
 from .sync import Client, Session, connect

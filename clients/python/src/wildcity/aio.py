@@ -1,53 +1,41 @@
-"""The client for asyncio: as `wildcity.sync`, with `await`."""
+"""The client for asyncio.
+
+The blocking client is this file without `await`: clients/generate.py writes it.
+"""
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Mapping, Sequence
 from types import TracebackType
-from typing import Any, TypeVar
-
-from websockets.asyncio.client import ClientConnection
-from websockets.asyncio.client import connect as connect_websocket
-from websockets.exceptions import WebSocketException
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from .authorization import authorization_headers
 from .errors import ConnectFailed, Disconnected, Refused, WildCityError
-from .observation import Observation
-from .protocol import (
-    PROTOCOL,
+from .messages import (
     Action,
-    ContactMode,
-    DriveSection,
     Dynamics,
     Model,
     Opened,
-    Outputs,
-    Pose,
     RandomStart,
     RecordedPoint,
-    Repair,
     Resumed,
-    Rig,
-    Sensors,
     SnapshotPoint,
     Station,
-    Step,
     Summary,
     Switched,
-    Trajectory,
     Welcome,
 )
-from .session_protocol import (
-    CONNECT_OPTIONS,
-    Exchange,
-    Message,
-    SessionProtocol,
-    can_reuse_connection,
-    connect_failed,
-    translate_error,
-)
+from .observation import Observation
+from .pose import Pose
+from .protocol import PROTOCOL, Step, Trajectory
+from .session_protocol import Exchange, SessionProtocol, can_reuse_connection, translate_error
 from .shared_memory import SharedMemory
+from .transport import AsyncTransport
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from .messages import OpenOptions
 
 T = TypeVar("T")
 
@@ -94,30 +82,9 @@ class Client:
         self._copy = copy
         self._headers = authorization_headers(token)
         self._protocol = SessionProtocol(name)
-        self._connection: ClientConnection | None = None
+        self._connection: AsyncTransport | None = None
 
-    async def open(
-        self,
-        twin: str,
-        *,
-        version: int | None = None,
-        session: str | None = None,
-        seed: int = 0,
-        start: Pose | Station | RandomStart | None = None,
-        rig: str | Rig | None = None,
-        profile: Mapping[str, float | bool | None] | None = None,
-        outputs: Outputs | None = None,
-        dynamics: Model | Dynamics | None = None,
-        dt_us: int | None = None,
-        deadline_ms: int | None = None,
-        decision_us: int | None = None,
-        warm_up_us: int | None = None,
-        scenario: str | Mapping[str, Any] | None = None,
-        repair: str | Repair | None = None,
-        sensors: Sensors | None = None,
-        contact: ContactMode | None = None,
-        trajectory: DriveSection | None = None,
-    ) -> Session:
+    async def open(self, twin: str, **options: Unpack[OpenOptions]) -> Session:
         """Opens a session on a twin. Arguments that are None have the default of the server or of the twin.
 
         A connection can have 64 sessions; while one is open, the next needs a name, `session`.
@@ -129,28 +96,7 @@ class Client:
 
         Raises `Refused` if the server refuses.
         """
-        opened = await self._run(
-            self._protocol.open(
-                twin,
-                version=version,
-                session=session,
-                seed=seed,
-                start=start,
-                rig=rig,
-                profile=profile,
-                outputs=outputs,
-                dynamics=dynamics,
-                dt_us=dt_us,
-                deadline_ms=deadline_ms,
-                decision_us=decision_us,
-                warm_up_us=warm_up_us,
-                scenario=scenario,
-                repair=repair,
-                sensors=sensors,
-                contact=contact,
-                trajectory=trajectory,
-            )
-        )
+        opened = await self._run(self._protocol.open(twin, **options))
         return Session(self, opened.session, opened)
 
     async def branch(self, point: SnapshotPoint | RecordedPoint, *, session: str | None = None) -> Session:
@@ -163,12 +109,17 @@ class Client:
         return Session(self, opened.session, opened)
 
     async def resume(self, session: str, last_seq: int) -> Session:
-        """Continues a session that another client opened; see `wildcity.sync`."""
+        """Continues a session that another client opened, for example one in a process that ended.
+
+        `last_seq` is the number of the last answer that the other client received (`metadata.seq`). Call it
+        directly after connecting.
+        """
         resumed = await self._run(self._protocol.resume(session, last_seq))
         return Session(self, session, resumed.opened)
 
     async def step_many(
-        self, steps: Mapping[str, Pose | Trajectory | Action | Step]
+        self,
+        steps: Mapping[str, Pose | Trajectory | Action | Step],
     ) -> dict[str, Observation | Refused]:
         """Steps several sessions of this connection, 1 to 64, in one message: `steps` has their movements by name.
 
@@ -193,12 +144,8 @@ class Client:
 
     async def _connect(self) -> None:
         await self.close()
-        try:
-            connection = await connect_websocket(self.url, additional_headers=self._headers, **CONNECT_OPTIONS)
-        except (OSError, ValueError, WebSocketException) as error:
-            raise connect_failed(self.url, error) from error
-        self._connection = connection
-        if connection.subprotocol != PROTOCOL:
+        self._connection = await AsyncTransport.connect(self.url, self._headers)
+        if self._connection.subprotocol != PROTOCOL:
             await self.close()
             raise ConnectFailed(f"{self.url} does not speak {PROTOCOL}")
         self.welcome = await self._run(self._protocol.hello())
@@ -227,7 +174,7 @@ class Client:
             raise Disconnected("there is no connection, or another call is under way on it")
         keep = False
         try:
-            exchange.send(await asyncio.wait_for(_answer(connection, request), self.timeout))
+            exchange.send(await connection.answer(request, self.timeout))
         except StopIteration as done:
             keep = True
             result: T = done.value
@@ -242,19 +189,12 @@ class Client:
             if keep:
                 self._connection = connection
             else:
-                # Without a closing handshake, because a cancellation must not wait for one.
-                connection.transport.abort()
+                connection.give_up()
         raise AssertionError("an exchange is one message in each direction")
 
 
-async def _answer(connection: ClientConnection, request: str) -> Message:
-    await connection.send(request)
-    return await connection.recv()
-
-
 class Session:
-    """An open session, one of those of its client. An `async with` block closes it at its end, if the connection is
-    still open."""
+    """An open session of its client. An `async with` block closes it at its end, if the connection is still open."""
 
     def __init__(self, client: Client, name: str, opened: Opened | None) -> None:
         self.name = name

@@ -20,8 +20,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from .messages import ImageInfo, ImagePart, Outputs, TimedPose
 from .observation import Observation
-from .protocol import ImageInfo, ImagePart, Outputs, Pose, TimedPose, Trajectory
+from .pose import Pose
+from .protocol import Trajectory
 
 __all__ = ["CAMERAS", "Model", "as_torch", "cameras", "inputs", "session_options", "trajectory"]
 

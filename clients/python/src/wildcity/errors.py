@@ -2,55 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
-Code = Literal[
-    "malformed_json",
-    "invalid_request",
-    "unexpected_binary",
-    "message_too_large",
-    "seq_out_of_order",
-    "wrong_order",
-    "unsupported_protocol",
-    "session_state",
-    "unknown_twin",
-    "unknown_actor",
-    "unknown_version",
-    "twin_damaged",
-    "unknown_rig",
-    "unknown_camera",
-    "unknown_trajectory",
-    "unknown_session",
-    "unknown_state",
-    "unknown_scenario",
-    "scenario_invalid",
-    "unknown_repair",
-    "repair_unavailable",
-    "repair_failed",
-    "shared_memory_unavailable",
-    "session_exists",
-    "invalid_name",
-    "pose_not_finite",
-    "pose_invalid",
-    "camera_invalid",
-    "out_of_range",
-    "answer_too_large",
-    "busy",
-    "deadline_exceeded",
-    "timed_out",
-    "shutting_down",
-    "unauthorized",
-    "forbidden",
-    "unknown_upload",
-    "upload_offset",
-    "upload_digest",
-    "storage_full",
-    "unknown_push",
-    "conflict",
-    "push_refused",
-    "internal",
-]
-"""The closed list of error codes. `protocol/README.md` explains each one and what to do."""
+from .messages import Code
 
 
 class WildCityError(Exception):

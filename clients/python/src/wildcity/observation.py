@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from .errors import BadFrame, ProtocolError, Refused
-from .protocol import Ego, ImageInfo, ManyMetadata, Metadata, decode, parse_json
+from .messages import Ego, ImageInfo, ManyMetadata, Metadata
+from .protocol import decode, parse_json
 
 HEADER_BYTES = 1 << 20
 """Largest header that is accepted: 256 images take a quarter of it."""

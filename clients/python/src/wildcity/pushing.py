@@ -14,10 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
-from .errors import Code, ConnectFailed, PushFailed, Refused
+from .errors import ConnectFailed, PushFailed, Refused
 from .http_client import ATTEMPTS, RETRY_DELAY_S, HttpClient
+from .messages import Code, Drive
 from .packing import packed
-from .protocol import Drive, decode
+from .protocol import decode
 
 CHUNK_BYTES = 1 << 20
 """Bytes of a file that are read at a time."""

@@ -12,47 +12,41 @@ import json
 import warnings
 from collections.abc import Generator, Mapping, Sequence
 from importlib.metadata import version
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.typing import Subprotocol
 
 from .errors import ConnectFailed, Disconnected, ProtocolError, Refused, TimedOut, WildCityError
-from .observation import Many, Observation
-from .protocol import (
-    OBSERVATION_BYTES,
-    PROTOCOL,
+from .messages import (
     Action,
     Closed,
-    ContactMode,
-    DriveSection,
     Dynamics,
     InMemory,
     Model,
     Ok,
     Opened,
+    OpenOptions,
     Outputs,
-    Pose,
     RandomStart,
     RecordedPoint,
     Refusal,
     Repair,
     Resumed,
-    Rig,
-    Sensors,
     SharedMemoryOffer,
     SnapshotPoint,
     Station,
-    Step,
     Summary,
     Switched,
-    Trajectory,
     Welcome,
-    decode_answer,
-    encode,
-    to_json,
 )
+from .observation import Many, Observation
+from .pose import Pose
+from .protocol import OBSERVATION_BYTES, PROTOCOL, Step, Trajectory, decode_answer, encode, to_json
 from .shared_memory import SharedMemory
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 T = TypeVar("T")
 Message = str | bytes
@@ -95,48 +89,18 @@ class SessionProtocol:
         self._begin(self.first_seq + 1)
         self.memory = memory
 
-    def open(
-        self,
-        twin: str,
-        *,
-        version: int | None = None,
-        session: str | None = None,
-        seed: int = 0,
-        start: Pose | Station | RandomStart | None = None,
-        rig: str | Rig | None = None,
-        profile: Mapping[str, float | bool | None] | None = None,
-        outputs: Outputs | None = None,
-        dynamics: Model | Dynamics | None = None,
-        dt_us: int | None = None,
-        deadline_ms: int | None = None,
-        decision_us: int | None = None,
-        warm_up_us: int | None = None,
-        scenario: str | Mapping[str, Any] | None = None,
-        repair: str | Repair | None = None,
-        sensors: Sensors | None = None,
-        contact: ContactMode | None = None,
-        trajectory: DriveSection | None = None,
-    ) -> Exchange[Opened]:
+    def open(self, twin: str, **options: Unpack[OpenOptions]) -> Exchange[Opened]:
         """Opens a session."""
-        optional = {
-            "version": version,
-            "session": session,
-            "start": _start(start),
-            "rig": encode(rig),
-            "dynamics": encode(dynamics),
-            "profile": None if profile is None else dict(profile),
-            "dt_us": dt_us,
-            "deadline_ms": deadline_ms,
-            "decision_us": decision_us,
-            "warm_up_us": warm_up_us,
-            "scenario": scenario if scenario is None or isinstance(scenario, str) else dict(scenario),
-            "repair": encode(Repair(repair) if isinstance(repair, str) else repair),
-            "sensors": encode(sensors),
-            "contact": contact,
-            "trajectory": encode(trajectory),
-        }
-        fields = {name: value for name, value in optional.items() if value is not None}
-        fields |= {"twin": twin, "seed": seed, "outputs": encode(outputs or Outputs())}
+        unknown = options.keys() - OpenOptions.__annotations__.keys()
+        if unknown:
+            raise TypeError(f"open() got an unexpected keyword argument {min(unknown)!r}")
+        given = {name: value for name, value in options.items() if value is not None}
+        repair = given.get("repair")
+        if isinstance(repair, str):
+            given["repair"] = Repair(repair)
+        if "start" in given:
+            given["start"] = _start(options["start"])
+        fields = {"twin": twin, "seed": 0, "outputs": encode(Outputs()), **encode(given)}
         opened = yield from self._next("open", Opened, fields)
         self._add(opened.session)
         return opened

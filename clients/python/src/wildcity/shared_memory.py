@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import ConnectFailed, ProtocolError, SlotInUse
-from .protocol import OBSERVATION_BYTES, InMemory, SharedMemoryOffer
+from .messages import InMemory, SharedMemoryOffer
+from .protocol import OBSERVATION_BYTES
 
 PROOF_BYTES = 1024
 """Longest proof that is read."""

@@ -1,55 +1,38 @@
-"""The blocking client."""
+"""The blocking client. Generated from `aio` by clients/generate.py; do not edit."""
 
 from __future__ import annotations
 
-import socket
-import threading
-import time
 from collections.abc import Mapping, Sequence
 from types import TracebackType
-from typing import Any, TypeVar
-
-from websockets.exceptions import ConnectionClosed, WebSocketException
-from websockets.sync.client import ClientConnection
-from websockets.sync.client import connect as connect_websocket
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from .authorization import authorization_headers
 from .errors import ConnectFailed, Disconnected, Refused, WildCityError
-from .observation import Observation
-from .protocol import (
-    PROTOCOL,
+from .messages import (
     Action,
-    ContactMode,
-    DriveSection,
     Dynamics,
     Model,
     Opened,
-    Outputs,
-    Pose,
     RandomStart,
     RecordedPoint,
-    Repair,
     Resumed,
-    Rig,
-    Sensors,
     SnapshotPoint,
     Station,
-    Step,
     Summary,
     Switched,
-    Trajectory,
     Welcome,
 )
-from .session_protocol import (
-    CONNECT_OPTIONS,
-    Exchange,
-    Message,
-    SessionProtocol,
-    can_reuse_connection,
-    connect_failed,
-    translate_error,
-)
+from .observation import Observation
+from .pose import Pose
+from .protocol import PROTOCOL, Step, Trajectory
+from .session_protocol import Exchange, SessionProtocol, can_reuse_connection, translate_error
 from .shared_memory import SharedMemory
+from .transport import BlockingTransport
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from .messages import OpenOptions
 
 T = TypeVar("T")
 
@@ -76,11 +59,16 @@ def connect(
     Raises `ConnectFailed`, `ProtocolError` if the server speaks another protocol, or `Refused` with the code
     `shared_memory_unavailable`.
     """
-    return Client(url, name=name, timeout=timeout, token=token, shared_memory=shared_memory, copy=copy)
+    client = Client(url, name=name, timeout=timeout, token=token, shared_memory=shared_memory, copy=copy)
+    client._connect()
+    return client
 
 
 class Client:
     """A connection to a server. Use `connect`, and close it or use it in a `with` block."""
+
+    welcome: Welcome
+    """The server's answer to `hello`: its limits and its twins."""
 
     def __init__(
         self, url: str, *, name: str, timeout: float, token: str | None, shared_memory: bool = False, copy: bool = True
@@ -91,65 +79,21 @@ class Client:
         self._copy = copy
         self._headers = authorization_headers(token)
         self._protocol = SessionProtocol(name)
-        self._connection: ClientConnection | None = None
-        self.welcome: Welcome = self._connect()
-        """The server's answer to `hello`: its limits and its twins."""
+        self._connection: BlockingTransport | None = None
 
-    def open(
-        self,
-        twin: str,
-        *,
-        version: int | None = None,
-        session: str | None = None,
-        seed: int = 0,
-        start: Pose | Station | RandomStart | None = None,
-        rig: str | Rig | None = None,
-        profile: Mapping[str, float | bool | None] | None = None,
-        outputs: Outputs | None = None,
-        dynamics: Model | Dynamics | None = None,
-        dt_us: int | None = None,
-        deadline_ms: int | None = None,
-        decision_us: int | None = None,
-        warm_up_us: int | None = None,
-        scenario: str | Mapping[str, Any] | None = None,
-        repair: str | Repair | None = None,
-        sensors: Sensors | None = None,
-        contact: ContactMode | None = None,
-        trajectory: DriveSection | None = None,
-    ) -> Session:
+    def open(self, twin: str, **options: Unpack[OpenOptions]) -> Session:
         """Opens a session on a twin. Arguments that are None have the default of the server or of the twin.
 
         A connection can have 64 sessions; while one is open, the next needs a name, `session`.
 
-        `scenario` is the name of a scenario of the server, `{"name": .., "values": {..}}`, or the scenario itself.
-        `repair` is the name of a model of the server that repairs images, or a `Repair`. `sensors` has effects of
+        `scenario` is the name of one of the server's, `{"name": .., "values": {..}}`, or the scenario itself.
+        `repair` is the name of a model of the server's that repairs images, or a `Repair`. `sensors` has effects of
         cameras and other sensors: lost frames, noise and the like. `contact` says what contact with the twin does:
         "end" the episode, "report" it, or "off"; by default the scenario or the dynamics decide.
 
         Raises `Refused` if the server refuses.
         """
-        opened = self._run(
-            self._protocol.open(
-                twin,
-                version=version,
-                session=session,
-                seed=seed,
-                start=start,
-                rig=rig,
-                profile=profile,
-                outputs=outputs,
-                dynamics=dynamics,
-                dt_us=dt_us,
-                deadline_ms=deadline_ms,
-                decision_us=decision_us,
-                warm_up_us=warm_up_us,
-                scenario=scenario,
-                repair=repair,
-                sensors=sensors,
-                contact=contact,
-                trajectory=trajectory,
-            )
-        )
+        opened = self._run(self._protocol.open(twin, **options))
         return Session(self, opened.session, opened)
 
     def branch(self, point: SnapshotPoint | RecordedPoint, *, session: str | None = None) -> Session:
@@ -170,7 +114,10 @@ class Client:
         resumed = self._run(self._protocol.resume(session, last_seq))
         return Session(self, session, resumed.opened)
 
-    def step_many(self, steps: Mapping[str, Pose | Trajectory | Action | Step]) -> dict[str, Observation | Refused]:
+    def step_many(
+        self,
+        steps: Mapping[str, Pose | Trajectory | Action | Step],
+    ) -> dict[str, Observation | Refused]:
         """Steps several sessions of this connection, 1 to 64, in one message: `steps` has their movements by name.
 
         Returns, by session name, the observation or the `Refused` of that session's step. A refused step does not stop
@@ -192,21 +139,15 @@ class Client:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _connect(self) -> Welcome:
+    def _connect(self) -> None:
         self.close()
-        try:
-            # Entered here and closed in `close`, because it outlives any block.
-            connection = connect_websocket(self.url, additional_headers=self._headers, **CONNECT_OPTIONS).__enter__()
-        except (OSError, ValueError, WebSocketException) as error:
-            raise connect_failed(self.url, error) from error
-        self._connection = connection
-        if connection.subprotocol != PROTOCOL:
+        self._connection = BlockingTransport.connect(self.url, self._headers)
+        if self._connection.subprotocol != PROTOCOL:
             self.close()
             raise ConnectFailed(f"{self.url} does not speak {PROTOCOL}")
-        welcome = self._run(self._protocol.hello())
+        self.welcome = self._run(self._protocol.hello())
         if self._shared_memory:
             self._share_memory()
-        return welcome
 
     def _share_memory(self) -> None:
         try:
@@ -217,7 +158,7 @@ class Client:
             raise
 
     def _reconnect(self) -> Resumed:
-        self.welcome = self._connect()
+        self._connect()
         return self._run(self._protocol.resume_own())
 
     def _run(self, exchange: Exchange[T]) -> T:
@@ -230,7 +171,7 @@ class Client:
             raise Disconnected("there is no connection, or another call is under way on it")
         keep = False
         try:
-            exchange.send(self._answer(connection, request))
+            exchange.send(connection.answer(request, self.timeout))
         except StopIteration as done:
             keep = True
             result: T = done.value
@@ -245,23 +186,8 @@ class Client:
             if keep:
                 self._connection = connection
             else:
-                connection.close()
+                connection.give_up()
         raise AssertionError("an exchange is one message in each direction")
-
-    def _answer(self, connection: ClientConnection, request: str) -> Message:
-        deadline = time.monotonic() + self.timeout
-        # `send` has no time-out: it would block forever on a server that does not read.
-        shutdown_timer = threading.Timer(self.timeout, connection.socket.shutdown, (socket.SHUT_RDWR,))
-        shutdown_timer.start()
-        try:
-            connection.send(request)
-        except ConnectionClosed as error:
-            if time.monotonic() >= deadline:
-                raise TimeoutError from error
-            raise
-        finally:
-            shutdown_timer.cancel()
-        return connection.recv(timeout=max(0.0, deadline - time.monotonic()))
 
 
 class Session:
@@ -291,9 +217,9 @@ class Session:
         """Moves the ego, advances the simulated time by one step, and returns the observation there.
 
         A `Pose` is the next `world_from_rig` of an ego that teleports, an `Action` moves a car, and a `Trajectory`
-        moves both. `until_us` is the time for which a trajectory or an action is followed, in whole steps; the
-        observation is the one at its end. `notes` is anything that `json` can write, up to 65,536 bytes, and goes into
-        the record. `terminate` ends the episode with this step.
+        moves both. `until_us` is for how long a trajectory or an action is followed, in whole steps; the observation
+        is the one at its end. `notes` is anything that `json` can write, up to 65,536 bytes, and goes into the
+        record. `terminate` ends the episode with this step.
         """
         return self._client._run(self._protocol.step(movement, terminate, until_us, notes, on=self.name))
 

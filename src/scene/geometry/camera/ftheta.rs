@@ -1,7 +1,7 @@
 //! NVIDIA's f-theta model: a polynomial between the angle off the axis and the distance in pixels.
 
 use glam::{DMat2, DVec2, DVec3};
-use serde::{Deserialize, Serialize};
+use wildcity_options::camera::FThetaReference;
 
 use super::CameraError;
 use super::fisheye::{at_angle, radial};
@@ -19,16 +19,6 @@ pub struct FTheta {
     linear_cde: [f64; 3],
     max_angle_rad: f64,
     rising: MonotonePolynomial,
-}
-
-/// The direction of the reference polynomial.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum FThetaReference {
-    /// From radians off the axis to pixels from the principal point.
-    AngleToPixel,
-    /// From pixels to radians.
-    PixelToAngle,
 }
 
 impl FTheta {

@@ -9,12 +9,10 @@
 //! ```
 
 use glam::DVec2;
-use serde::{Deserialize, Serialize};
 
-use super::{
-    Bivariate, Camera, CameraError, FTheta, FThetaReference, Fisheye, Lens, OpenCv, Pinhole,
-    Windshield, WindshieldReference,
-};
+use super::{Bivariate, Camera, CameraError, FTheta, Fisheye, Lens, OpenCv, Pinhole, Windshield};
+
+pub use wildcity_options::camera::{Lens as LensFields, Windshield as WindshieldFields};
 
 /// The intrinsics of a camera as JSON holds them.
 #[derive(Clone, Debug, PartialEq)]
@@ -33,52 +31,6 @@ pub struct Intrinsics {
     pub native_size_px: Option<[f64; 2]>,
 }
 
-/// JSON of a lens.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "model", rename_all = "lowercase", deny_unknown_fields)]
-pub enum LensFields {
-    Opencv {
-        /// k1 to k6.
-        k: [f64; 6],
-        /// p1 and p2.
-        #[serde(default)]
-        p: [f64; 2],
-        /// s1 to s4.
-        #[serde(default)]
-        s: [f64; 4],
-    },
-    Fisheye {
-        /// k1 to k4.
-        k: [f64; 4],
-        /// Limit of the field, in radians off the axis; by default where the polynomial stops
-        /// rising.
-        #[serde(default, skip_serializing_if = "Option::is_none")]
-        max_angle: Option<f64>,
-    },
-    Ftheta {
-        /// The direction of the polynomial.
-        reference: FThetaReference,
-        /// Coefficients of powers 0 to 5.
-        polynomial: [f64; 6],
-        /// `[c, d, e]` of `[[c, d], [e, 1]]`.
-        linear_cde: [f64; 3],
-        /// Limit of the field, in radians off the axis.
-        max_angle: f64,
-    },
-}
-
-/// JSON of a windshield.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct WindshieldFields {
-    /// The direction of the polynomials.
-    pub reference: WindshieldReference,
-    /// Coefficients of the angle to the right.
-    pub horizontal: Vec<f64>,
-    /// Coefficients of the angle downwards.
-    pub vertical: Vec<f64>,
-}
-
 impl Intrinsics {
     /// The camera with these intrinsics. The caller checks it with [`Camera::check`].
     ///
@@ -86,7 +38,7 @@ impl Intrinsics {
     /// A focal length is missing, or the number of a windshield's coefficients fits no polynomial.
     pub fn camera(&self) -> Result<Camera, CameraError> {
         // No lens in the file is a pinhole, the default of `Lens`.
-        let lens = self.lens.as_ref().map(LensFields::lens).unwrap_or_default();
+        let lens = self.lens.as_ref().map(lens_from).unwrap_or_default();
         // Only this model knows its focal lengths. Given ones are kept here, and `Camera::check`
         // compares them.
         let own = match &lens {
@@ -99,7 +51,7 @@ impl Intrinsics {
         };
         let [cx, cy] = self.center_px;
         let pinhole = Pinhole { fx: focal("fx", 0)?, fy: focal("fy", 1)?, cx, cy };
-        let windshield = self.windshield.as_ref().map(WindshieldFields::windshield).transpose()?;
+        let windshield = self.windshield.as_ref().map(windshield_from).transpose()?;
         let [width_px, height_px] = self.size_px;
         let native_size_px = self.native_size_px.map(DVec2::from_array);
         Ok(Camera { width_px, height_px, pinhole, lens, windshield, native_size_px })
@@ -112,51 +64,47 @@ impl Intrinsics {
             size_px: [camera.width_px, camera.height_px],
             focal_px: [Some(fx), Some(fy)],
             center_px: [cx, cy],
-            lens: LensFields::from_lens(&camera.lens),
-            windshield: camera.windshield.as_ref().map(WindshieldFields::from_windshield),
+            lens: fields_of_lens(&camera.lens),
+            windshield: camera.windshield.as_ref().map(fields_of_windshield),
             native_size_px: camera.native_size_px.map(|size_px| size_px.to_array()),
         }
     }
 }
 
-impl LensFields {
-    fn lens(&self) -> Lens {
-        match *self {
-            Self::Opencv { k, p, s } => Lens::opencv(OpenCv::new(k, p, s)),
-            Self::Fisheye { k, max_angle } => Lens::Fisheye(Fisheye::new(k, max_angle)),
-            Self::Ftheta { reference, polynomial, linear_cde, max_angle } => {
-                Lens::FTheta(FTheta::new(reference, polynomial, linear_cde, max_angle))
-            }
+fn lens_from(fields: &LensFields) -> Lens {
+    match *fields {
+        LensFields::Opencv { k, p, s } => Lens::opencv(OpenCv::new(k, p, s)),
+        LensFields::Fisheye { k, max_angle } => Lens::Fisheye(Fisheye::new(k, max_angle)),
+        LensFields::Ftheta { reference, polynomial, linear_cde, max_angle } => {
+            Lens::FTheta(FTheta::new(reference, polynomial, linear_cde, max_angle))
         }
-    }
-
-    fn from_lens(lens: &Lens) -> Option<Self> {
-        Some(match lens {
-            Lens::Pinhole => return None,
-            Lens::OpenCv(lens) => Self::Opencv { k: lens.k(), p: lens.p(), s: lens.s() },
-            Lens::Fisheye(lens) => Self::Fisheye { k: lens.k(), max_angle: lens.max_angle_rad() },
-            Lens::FTheta(lens) => Self::Ftheta {
-                reference: lens.reference(),
-                polynomial: lens.polynomial(),
-                linear_cde: lens.linear_cde(),
-                max_angle: lens.max_angle_rad(),
-            },
-        })
     }
 }
 
-impl WindshieldFields {
-    fn windshield(&self) -> Result<Windshield, CameraError> {
-        let horizontal = Bivariate::new("windshield.horizontal", &self.horizontal)?;
-        let vertical = Bivariate::new("windshield.vertical", &self.vertical)?;
-        Ok(Windshield::new(self.reference, horizontal, vertical))
-    }
+fn fields_of_lens(lens: &Lens) -> Option<LensFields> {
+    Some(match lens {
+        Lens::Pinhole => return None,
+        Lens::OpenCv(lens) => LensFields::Opencv { k: lens.k(), p: lens.p(), s: lens.s() },
+        Lens::Fisheye(lens) => LensFields::Fisheye { k: lens.k(), max_angle: lens.max_angle_rad() },
+        Lens::FTheta(lens) => LensFields::Ftheta {
+            reference: lens.reference(),
+            polynomial: lens.polynomial(),
+            linear_cde: lens.linear_cde(),
+            max_angle: lens.max_angle_rad(),
+        },
+    })
+}
 
-    fn from_windshield(windshield: &Windshield) -> Self {
-        Self {
-            reference: windshield.reference(),
-            horizontal: windshield.horizontal().coefficients().to_vec(),
-            vertical: windshield.vertical().coefficients().to_vec(),
-        }
+fn windshield_from(fields: &WindshieldFields) -> Result<Windshield, CameraError> {
+    let horizontal = Bivariate::new("windshield.horizontal", &fields.horizontal)?;
+    let vertical = Bivariate::new("windshield.vertical", &fields.vertical)?;
+    Ok(Windshield::new(fields.reference, horizontal, vertical))
+}
+
+fn fields_of_windshield(windshield: &Windshield) -> WindshieldFields {
+    WindshieldFields {
+        reference: windshield.reference(),
+        horizontal: windshield.horizontal().coefficients().to_vec(),
+        vertical: windshield.vertical().coefficients().to_vec(),
     }
 }

@@ -35,12 +35,13 @@ use glam::{DVec2, DVec3};
 
 pub use field::{FieldCone, FieldMask, ScaleWithin};
 pub use fisheye::Fisheye;
-pub use ftheta::{FTheta, FThetaReference};
+pub use ftheta::FTheta;
 pub use monotone::MonotonePolynomial;
 pub use opencv::OpenCv;
 pub use pinhole::Pinhole;
 pub use shutter::{Shutter, ShutterDirection};
-pub use windshield::{Bivariate, Windshield, WindshieldReference};
+pub use wildcity_options::camera::{FThetaReference, WindshieldReference};
+pub use windshield::{Bivariate, Windshield};
 
 /// Upper limit of the field of every lens, in radians off the axis: 160°. Towards 180° a whole ring
 /// of pixels shows almost the same direction, so that pixels per radian around the ring grow

@@ -1,13 +1,12 @@
 //! Rolling shutters: the rows or columns of an image are exposed one after the other.
 
 use glam::DVec2;
-use serde::{Deserialize, Serialize};
+use wildcity_options::camera as options;
 
 use super::{Camera, CameraError};
 
 /// A rolling shutter. A camera with a global shutter has none.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Shutter {
     /// The order of exposure.
     pub direction: ShutterDirection,
@@ -17,8 +16,7 @@ pub struct Shutter {
 }
 
 /// The order in which a rolling shutter exposes rows or columns.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ShutterDirection {
     /// The top row first.
     TopToBottom,
@@ -28,6 +26,30 @@ pub enum ShutterDirection {
     LeftToRight,
     /// The right column first.
     RightToLeft,
+}
+
+impl From<options::Shutter> for Shutter {
+    fn from(options::Shutter { direction, duration_us }: options::Shutter) -> Self {
+        let direction = match direction {
+            options::ShutterDirection::TopToBottom => ShutterDirection::TopToBottom,
+            options::ShutterDirection::BottomToTop => ShutterDirection::BottomToTop,
+            options::ShutterDirection::LeftToRight => ShutterDirection::LeftToRight,
+            options::ShutterDirection::RightToLeft => ShutterDirection::RightToLeft,
+        };
+        Self { direction, duration_us }
+    }
+}
+
+impl From<Shutter> for options::Shutter {
+    fn from(Shutter { direction, duration_us }: Shutter) -> Self {
+        let direction = match direction {
+            ShutterDirection::TopToBottom => options::ShutterDirection::TopToBottom,
+            ShutterDirection::BottomToTop => options::ShutterDirection::BottomToTop,
+            ShutterDirection::LeftToRight => options::ShutterDirection::LeftToRight,
+            ShutterDirection::RightToLeft => options::ShutterDirection::RightToLeft,
+        };
+        Self { direction, duration_us }
+    }
 }
 
 impl Shutter {

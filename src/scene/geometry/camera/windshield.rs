@@ -2,7 +2,7 @@
 //! angles.
 
 use glam::{DVec2, DVec3};
-use serde::{Deserialize, Serialize};
+use wildcity_options::camera::WindshieldReference;
 
 use super::CameraError;
 
@@ -20,16 +20,6 @@ pub struct Windshield {
     horizontal: Bivariate,
     vertical: Bivariate,
     most_rad: f64,
-}
-
-/// The direction of the reference polynomials.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum WindshieldReference {
-    /// From rays outside to rays at the lens.
-    Forward,
-    /// From rays at the lens to rays outside.
-    Backward,
 }
 
 /// `Σ c φ^i θ^j`. Coefficients are ordered by j, and within the same j by i from 0 to order - j.

@@ -7,18 +7,17 @@ use super::ObservationBuilder;
 use super::repair::ObservationRepair;
 use crate::error::SessionError;
 use crate::limits;
-use crate::observe::encode::{EncodedImage, Encoding};
+use crate::observe::encode::{EncodedImage, ImageEncoding, PixelMaps};
 use crate::observe::frame_history::{FrameHistory, PastFrame};
 use crate::observe::layout::RigCapture;
 use crate::observe::observation::{
     DType, ImageInfo, Observation, PastImageInfo, ResidencyStats, Tensor, TensorKind,
 };
 use crate::observe::trust::Trust;
-use crate::options::PixelMaps;
 use crate::repair::status::{ImageRepair, RepairState};
 use crate::sensors::delivery::Delivery;
-use crate::sensors::settings::CameraSensor;
 use crate::sensors::{ImageSensor, SensorReason};
+use wildcity_options::CameraSensor;
 
 /// A finished observation, and the data of it that its record and later observations need.
 pub(crate) struct RenderedObservation {
@@ -159,8 +158,8 @@ impl ObservationBuilder {
     /// Appends the files of the shown images. Raw pixels are in the buffer already.
     fn append_files(&mut self, shown: &[ShownImage]) -> Result<(), SessionError> {
         let files: Vec<&[u8]> = match self.layout.encoding() {
-            Encoding::Raw => Vec::new(),
-            Encoding::Jpeg(_) | Encoding::Png => {
+            ImageEncoding::Raw => Vec::new(),
+            ImageEncoding::Jpeg(_) | ImageEncoding::Png => {
                 shown.iter().map(|image| &self.encoded[image.encoded].file[..]).collect()
             }
         };

@@ -1,6 +1,8 @@
 //! Builds an observation: lays out its buffer, renders into it, and appends the encoded images.
 
 pub(crate) mod finish;
+mod needed_maps;
+mod plan;
 pub(crate) mod repair;
 
 use std::mem;
@@ -12,19 +14,19 @@ use tracing::{Span, debug_span};
 use wildcity_render::{Backend, Frame, FrameStats, Target};
 
 use super::buffer::ObservationBuffer;
-use super::encode::{AppliedEffects, EncodedImage, Encoding, encode, hashed};
-use super::layout::{EffectSeed, InPlaceBytes, ObservationLayout, RigCapture};
+use super::encode::{AppliedEffects, EncodedImage, ImageEncoding, encode, hashed};
+use super::layout::{EffectSeed, ObservationLayout, RigCapture};
 use super::observation::{ResidencyStats, Timings};
 use super::trust::TrainingCoverage;
 use crate::engine::answer_budget::AnswerBudget;
 use crate::engine::render_queue::Scratch;
 use crate::episode::{EgoHistory, Episode};
 use crate::error::SessionError;
-use crate::options::PixelMaps;
-use crate::repair::session_repair::SessionRepair;
 use crate::repair::status::ImageRepair;
 use crate::sensors::pixels::PixelEffects;
 
+use self::needed_maps::NeededMaps;
+use self::plan::BufferPlan;
 use self::repair::{Finished, ObservationRepair, RenderedCapture};
 
 /// An observation that is being built: one capture after the other is rendered, then `finish`
@@ -42,12 +44,8 @@ pub(crate) struct ObservationBuilder {
     effect_seed: EffectSeed,
     /// Number of samples of the inertial measurement unit and of the wheels; `None` without.
     motion_samples: [Option<usize>; 2],
-    /// Where the next shown image's floats go, in bytes from the buffer's start.
-    floats_at: usize,
-    /// Where the next shown image's instances go, in bytes from the buffer's start.
-    instances_at: usize,
-    /// Where the next shown image's raw pixels go, in bytes from the buffer's start.
-    raw_at: usize,
+    /// Where the next capture goes in the buffer.
+    plan: BufferPlan,
     captures: Vec<RigCapture>,
     /// The images of all captures so far: capture by capture, and in each in the order of its
     /// cameras.
@@ -77,20 +75,11 @@ impl ObservationBuilder {
             [None; 2]
         };
 
-        // | header | ego history, motion | floats of all captures | instances of all | raw pixels of all |
         let header = layout.header_bytes(captures);
-        let floats_at = header + history.len();
-        let in_place = captures.iter().map(|capture| layout.in_place_bytes(capture));
-        // Each kind of all captures together, so that a kind is one block of the buffer.
-        let all = in_place.fold(InPlaceBytes::default(), |sum, one| InPlaceBytes {
-            floats: sum.floats + one.floats,
-            instances: sum.instances + one.instances,
-            raw: sum.raw + one.raw,
-        });
-        let instances_at = floats_at + all.floats;
-        let raw_at = instances_at + all.instances;
-        let mut buffer = ObservationBuffer::new(budget, raw_at + all.raw, header)?;
-        buffer.bytes_mut()[header..floats_at].copy_from_slice(&history);
+        let maps_at = header + history.len();
+        let plan = BufferPlan::new(layout.clone(), captures, maps_at);
+        let mut buffer = ObservationBuffer::new(budget, plan.end(), header)?;
+        buffer.bytes_mut()[header..maps_at].copy_from_slice(&history);
 
         let images = captures.iter().map(|capture| capture.cameras.len()).sum();
         Ok(Self {
@@ -102,9 +91,7 @@ impl ObservationBuilder {
             history_count: count,
             effect_seed: EffectSeed::from_episode(episode),
             motion_samples,
-            floats_at,
-            instances_at,
-            raw_at,
+            plan,
             captures: Vec::with_capacity(captures.len()),
             encoded: Vec::with_capacity(images),
             timings: Timings::default(),
@@ -139,20 +126,8 @@ impl ObservationBuilder {
         };
         let reports_trust = filter.as_ref().is_none_or(|filter| filter.session.reports_trust);
 
-        // Maps that the observation does not hold, but that are needed: trust is computed from
-        // opacity, normals are computed from depth, and a repair model may need each of them.
-        let PixelMaps { depth, opacity, normals, .. } = layout.maps();
-        let model_needs = |needs: fn(&SessionRepair) -> bool| {
-            filter.as_ref().is_some_and(|filter| needs(&filter.session))
-        };
-        let needs_opacity = coverage.is_some() && !(opacity && capture.shown);
-        let uses_depth = (normals && capture.shown) || model_needs(SessionRepair::needs_depth);
-        let needs_depth = uses_depth && !(depth && capture.shown);
-        let needs_normals =
-            model_needs(SessionRepair::needs_normals) && !(normals && capture.shown);
-        // In floats a pixel: opacity and depth take one each, a normal three.
-        let extra_values =
-            u64::from(needs_opacity) + u64::from(needs_depth) + 3 * u64::from(needs_normals);
+        let session = filter.as_ref().map(|filter| &*filter.session);
+        let needed = NeededMaps::new(layout.maps(), capture.shown, coverage.is_some(), session);
         // Noise and the like are computed on copies.
         let effect_seed = self.effect_seed;
         let effects = |camera: &usize| {
@@ -166,24 +141,24 @@ impl ObservationBuilder {
         let has_effects = effects.iter().any(Option::is_some);
         let copied = 3 * pixels * u64::from(has_effects);
         // Returned when the capture is rendered.
-        let _share = self.budget.reserve(4 * pixels * extra_values + copied)?;
+        let _share = self.budget.reserve(4 * pixels * needed.values() + copied)?;
 
-        // Where the renderer writes.
-        // Before `targets` moves `raw_at` on, and borrows the buffer.
-        let raw_at =
-            if filter.is_some() || has_effects { self.raw_places(capture) } else { Vec::new() };
-        let mut targets = self.targets(capture, scratch.images.for_views(frame.views, 3));
-        if needs_opacity {
+        // Before `targets` moves the plan on, and borrows the buffer.
+        let is_changed = filter.is_some() || has_effects;
+        let raw_at = if is_changed { self.plan.raw_places(capture) } else { Vec::new() };
+        let images = scratch.images.for_views(frame.views, 3);
+        let mut targets = self.plan.targets(self.buffer.bytes_mut(), capture, images);
+        if needed.opacity {
             for (target, map) in targets.iter_mut().zip(scratch.opacity.for_views(frame.views, 1)) {
                 target.opacity = Some(map);
             }
         }
-        if needs_depth {
+        if needed.depth {
             for (target, map) in targets.iter_mut().zip(scratch.depth_m.for_views(frame.views, 1)) {
                 target.depth_m = Some(map);
             }
         }
-        if needs_normals {
+        if needed.normals {
             for (target, map) in targets.iter_mut().zip(scratch.normals.for_views(frame.views, 3)) {
                 target.normals = Some(map);
             }
@@ -232,13 +207,31 @@ impl ObservationBuilder {
         self.add_stages(stats);
 
         let first = self.encoded.len();
+        let repairs = self.take(slots, capture, &raw_at)?;
+        // All trusts of the capture are known now, and the selection depends on all of them.
+        if let (Some(repair), Some(filter)) = (&mut self.repair, &filter) {
+            let rendered =
+                RenderedCapture { finished: repairs, views: frame.views, raw_at: &raw_at, first };
+            repair.decide(capture, filter, rendered);
+        }
+        Ok(())
+    }
+
+    /// Takes the finished images of a capture, in the order of its cameras. Returns what the
+    /// selection for repair needs of each.
+    fn take(
+        &mut self,
+        slots: Vec<OnceLock<FinishedView>>,
+        capture: &RigCapture,
+        raw_at: &[Option<usize>],
+    ) -> Result<Vec<Finished>, SessionError> {
         let mut repairs = Vec::new();
         for (view, (slot, &camera)) in slots.into_iter().zip(&capture.cameras).enumerate() {
             let never = || (Err("it was never finished".to_owned()), None);
             let (image, repair) = slot.into_inner().unwrap_or_else(never);
             repairs.extend(repair);
             let mut image = image.map_err(|reason| {
-                let camera = layout.cameras()[camera].name.clone();
+                let camera = self.layout.cameras()[camera].name.clone();
                 SessionError::Encode { camera, reason }
             })?;
             // Effects were computed on a copy while the targets borrowed the buffer. Now it takes
@@ -250,91 +243,7 @@ impl ObservationBuilder {
             self.timings.encode += image.took;
             self.encoded.push(image);
         }
-        // All trusts of the capture are known now, and the selection depends on all of them.
-        if let (Some(repair), Some(filter)) = (&mut self.repair, &filter) {
-            let rendered =
-                RenderedCapture { finished: repairs, views: frame.views, raw_at: &raw_at, first };
-            repair.decide(capture, filter, rendered);
-        }
-        Ok(())
-    }
-
-    /// Whether the buffer holds the pixels of a capture as they are, so that the renderer writes
-    /// them there.
-    fn holds_pixels(&self, capture: &RigCapture) -> bool {
-        self.layout.encoding() == Encoding::Raw && capture.shown
-    }
-
-    /// Where the pixels of each view of a capture are in the buffer, if the observation holds them
-    /// there.
-    fn raw_places(&self, capture: &RigCapture) -> Vec<Option<usize>> {
-        let holds_pixels = self.holds_pixels(capture);
-        // Places of views that are not held are counted as well, but not returned.
-        let mut next = self.raw_at;
-        let place = |camera: &usize| {
-            let at = next;
-            next += 3 * self.layout.cameras()[*camera].camera.pixels();
-            holds_pixels.then_some(at)
-        };
-        capture.cameras.iter().map(place).collect()
-    }
-
-    /// Targets of a capture's images: the buffer for maps and pixels that the observation contains
-    /// as rendered, and `images` for pixels that are encoded first.
-    fn targets<'a>(
-        &'a mut self,
-        capture: &RigCapture,
-        mut images: impl Iterator<Item = &'a mut [u8]>,
-    ) -> Vec<Target<'a>> {
-        let holds_pixels = self.holds_pixels(capture);
-        let layout = &self.layout;
-        let floats_at = self.floats_at;
-        let instances_at = self.instances_at;
-        let raw_at = self.raw_at;
-        let own = layout.in_place_bytes(capture);
-        // Moved on by the whole capture, so that the next one begins behind it.
-        self.floats_at += own.floats;
-        self.instances_at += own.instances;
-        self.raw_at += own.raw;
-        // Disjoint slices for each target: threads can write all of them at once.
-        let (maps_part, raw_part) = self.buffer.bytes_mut().split_at_mut(raw_at);
-        let (float_part, instances_part) = maps_part.split_at_mut(instances_at);
-        let mut float_part = &mut float_part[floats_at..floats_at + own.floats];
-        let mut instances_part = &mut instances_part[..own.instances];
-        let mut raw_part = &mut raw_part[..own.raw];
-
-        let mut targets = Vec::with_capacity(capture.cameras.len());
-        for &camera in &capture.cameras {
-            let camera = &layout.cameras()[camera];
-            let pixels = camera.camera.pixels();
-            let mut map = |held: bool, values: usize| {
-                let bytes = 4 * pixels * values;
-                (held && capture.shown).then(|| as_floats(split_off_front(&mut float_part, bytes)))
-            };
-            // In the order of the tensors.
-            let PixelMaps { depth, opacity, normals, instances } = layout.maps();
-            let depth_m = map(depth, 1);
-            let opacity = map(opacity, 1);
-            let normals = map(normals, 3);
-            let instances = (instances && capture.shown)
-                .then(|| as_ids(split_off_front(&mut instances_part, 2 * pixels)));
-            let rgb8 = if holds_pixels {
-                split_off_front(&mut raw_part, 3 * pixels)
-            } else {
-                // There is one for each camera; the backend would refuse an empty one.
-                images.next().unwrap_or_default()
-            };
-            targets.push(Target {
-                rgba: None,
-                rgb8: Some(rgb8),
-                depth_m,
-                opacity,
-                normals,
-                instances,
-                appearance: Some(&camera.appearance),
-            });
-        }
-        targets
+        Ok(repairs)
     }
 
     fn add_stages(&mut self, stats: FrameStats) {
@@ -387,7 +296,7 @@ fn encoded(
     let [height, width] = layout.size_px(camera).map(|side| side as u32);
     let Some(effects) = effects else {
         let mut image = encode(pixels, width, height, layout.encoding(), in_parallel)?;
-        if layout.encoding() == Encoding::Raw && is_shown_later {
+        if layout.encoding() == ImageEncoding::Raw && is_shown_later {
             image.file = pixels.to_vec();
         }
         return Ok(image);
@@ -401,7 +310,7 @@ fn encoded(
     image.took += took;
     image.effects = Some(AppliedEffects { clean_hash, stops: effects.stops });
     // Raw pixels travel in the buffer. A later observation needs a copy of its own.
-    if layout.encoding() == Encoding::Raw {
+    if layout.encoding() == ImageEncoding::Raw {
         if is_shown_later {
             image.file.clone_from(&changed);
         }
@@ -430,25 +339,4 @@ fn add_motion(
         bytes.extend(measured.flat_map(f32::to_le_bytes));
     }
     [sensors.imu.map(|_| samples.len()), sensors.wheel_speed.map(|_| samples.len())]
-}
-
-/// Splits the first bytes off a slice.
-fn split_off_front<'a>(rest: &mut &'a mut [u8], bytes: usize) -> &'a mut [u8] {
-    // The slice is taken out first, because a borrow through `rest` would not live as long as the
-    // parts.
-    let (front, others) = mem::take(rest).split_at_mut(bytes);
-    *rest = others;
-    front
-}
-
-/// The bytes as floats. They are aligned: the buffer's address is a multiple of 8, and the header's
-/// room, the ego history and the maps before them are multiples of 4 bytes.
-fn as_floats(bytes: &mut [u8]) -> &mut [f32] {
-    bytemuck::cast_slice_mut(bytes)
-}
-
-/// The bytes as instances. They are aligned: all bytes before them are of floats, and of other
-/// instances.
-fn as_ids(bytes: &mut [u8]) -> &mut [u16] {
-    bytemuck::cast_slice_mut(bytes)
 }

@@ -19,12 +19,12 @@ use super::{ImageToEncode, ObservationBuilder, encoded};
 use crate::engine::answer_budget::{AnswerBudget, BudgetShare};
 use crate::error::SessionError;
 use crate::observe::layout::RigCapture;
-use crate::options::OnFailure;
 use crate::repair::drawn::{ReferenceInputs, WarpQuery};
 use crate::repair::references::{ReferenceView, ReferenceViews};
 use crate::repair::rendered_image::RenderedImage;
 use crate::repair::session_repair::SessionRepair;
 use crate::repair::status::{ImageRepair, RepairFailure, RepairState, RepairStatus};
+use wildcity_options::OnFailure;
 
 /// State and data of the repair of an observation's images.
 pub(crate) struct ObservationRepair {

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..protocol import Drive, Pose
+from ..messages import Drive
+from ..pose import Pose
 
 BEHIND_M = 20.0
 AHEAD_M = 40.0

@@ -11,20 +11,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from ..messages import Action, Drive, DriveSection, Dynamics, ImagePart, Model, Opened, Outputs, Rig, Station, Welcome
 from ..observation import Observation
-from ..protocol import (
-    Action,
-    Drive,
-    DriveSection,
-    Dynamics,
-    ImagePart,
-    Model,
-    Opened,
-    Outputs,
-    Rig,
-    Station,
-    Welcome,
-)
 from .route import Route
 
 ACCELERATION_M_S2 = 9.8

@@ -4,10 +4,8 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use super::drive::DriveSection;
-use super::pose::Pose;
-use super::sensors::Sensors;
 use crate::camera::{Exposure, Lens, Shutter, Windshield};
+use crate::{DriveSection, Pose, Sensors};
 
 /// How the ego moves.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -25,17 +23,39 @@ pub struct Dynamics {
 }
 
 /// Motion model of the ego.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 #[cfg_attr(feature = "schema", schemars(rename = "Model"))]
 pub enum DynamicsModel {
     /// Moves to the requested pose.
+    #[default]
     Teleport,
     /// Rolls without slipping, and reaches the requested acceleration and curvature at once.
     Kinematic,
     /// Single-track model with linear tyres. Its steering and drive lag by 0.1 s.
     Dynamic,
+}
+
+impl From<DynamicsChoice> for Dynamics {
+    /// A model alone starts at standstill.
+    fn from(choice: DynamicsChoice) -> Self {
+        match choice {
+            DynamicsChoice::Full(dynamics) => dynamics,
+            DynamicsChoice::Model(model) => Self { model, speed: 0.0, reverse: false },
+        }
+    }
+}
+
+impl DynamicsModel {
+    /// The name on the wire.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Teleport => "teleport",
+            Self::Kinematic => "kinematic",
+            Self::Dynamic => "dynamic",
+        }
+    }
 }
 
 /// Opens a session on a twin.
@@ -46,14 +66,14 @@ pub struct Open {
     /// Number of this request.
     pub seq: u64,
     /// Name of the twin.
-    #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
+    #[cfg_attr(feature = "schema", schemars(regex(pattern = crate::NAME_PATTERN)))]
     pub twin: String,
     /// Version of the twin. If absent, the latest.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub version: Option<u64>,
     /// Name for the session. If absent, the server chooses one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
+    #[cfg_attr(feature = "schema", schemars(regex(pattern = crate::NAME_PATTERN)))]
     pub session: Option<String>,
     /// Seed of the first episode.
     #[serde(default)]
@@ -115,12 +135,12 @@ impl Open {
     /// Opens the latest version of a twin, with every default.
     ///
     /// ```
-    /// use wildcity_protocol::message::{Encoding, Open, Outputs, Request};
+    /// use wildcity_options::{Encoding, Open, Outputs};
     ///
     /// let outputs = Outputs { encoding: Encoding::Png, depth: true, ..Outputs::default() };
-    /// let open = Open { seq: 1, seed: 7, outputs, ..Open::twin("street") };
-    /// let json = serde_json::to_value(Request::Open(Box::new(open)))?;
-    /// assert_eq!(json["type"], "open");
+    /// let open = Open { seed: 7, outputs, ..Open::twin("street") };
+    /// let json = serde_json::to_value(open)?;
+    /// assert_eq!(json["outputs"]["encoding"], "png");
     /// assert_eq!(json["twin"], "street");
     /// # Ok::<(), serde_json::Error>(())
     /// ```
@@ -179,11 +199,12 @@ pub struct Repair {
 }
 
 /// What happens to an image that a model failed to repair.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum OnFailure {
     /// It is delivered as rendered, with the status `failed`.
+    #[default]
     Unrepaired,
     /// The request is refused with `repair_failed`, and nothing changed.
     Error,
@@ -295,7 +316,7 @@ pub enum DynamicsChoice {
 #[serde(deny_unknown_fields)]
 pub struct Rig {
     /// Name.
-    #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
+    #[cfg_attr(feature = "schema", schemars(regex(pattern = crate::NAME_PATTERN)))]
     pub name: String,
     /// The cameras, in the order of the images in observations.
     #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 16)))]
@@ -307,7 +328,7 @@ pub struct Rig {
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct RigCamera {
     /// Name.
-    #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
+    #[cfg_attr(feature = "schema", schemars(regex(pattern = crate::NAME_PATTERN)))]
     pub name: String,
     /// Image width.
     #[cfg_attr(feature = "schema", schemars(range(min = 1, max = 16_384)))]
@@ -361,7 +382,7 @@ pub struct Outputs {
     /// Names of the cameras to render, in this order. If absent, all.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 16)))]
-    #[cfg_attr(feature = "schema", schemars(transform = super::unique_items))]
+    #[cfg_attr(feature = "schema", schemars(transform = crate::unique_items))]
     pub cameras: Option<Vec<String>>,
     /// Crops and sizes of images that differ from the rig's, by camera name. The cameras of
     /// `opened` describe the images as sent.
@@ -398,16 +419,17 @@ pub struct Outputs {
     /// Time between two frames, by camera name, in simulated microseconds: a whole number of steps.
     /// If absent, every camera takes a frame with every step.
     #[serde(skip_serializing_if = "Option::is_none")]
-    #[cfg_attr(feature = "schema", schemars(transform = super::periods))]
+    #[cfg_attr(feature = "schema", schemars(transform = crate::periods))]
     pub period_us: Option<BTreeMap<String, i64>>,
 }
 
-impl Default for Outputs {
-    fn default() -> Self {
+impl Outputs {
+    /// Colour of all cameras at every step.
+    pub fn colour(encoding: Encoding) -> Self {
         Self {
             cameras: None,
             images: BTreeMap::new(),
-            encoding: Encoding::Jpeg,
+            encoding,
             quality: None,
             depth: false,
             opacity: false,
@@ -418,6 +440,12 @@ impl Default for Outputs {
             actors: None,
             period_us: None,
         }
+    }
+}
+
+impl Default for Outputs {
+    fn default() -> Self {
+        Self::colour(Encoding::Jpeg)
     }
 }
 

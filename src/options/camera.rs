@@ -30,7 +30,7 @@ pub enum Lens {
     /// NVIDIA's f-theta model. Its polynomial determines the focal lengths.
     Ftheta {
         /// What the polynomial maps to what.
-        reference: FthetaReference,
+        reference: FThetaReference,
         /// Coefficients of the powers 0 to 5, in radians and pixels.
         polynomial: [f64; 6],
         /// `[c, d, e]` of the matrix `[[c, d], [e, 1]]`, which maps rotationally symmetric pixel
@@ -46,7 +46,7 @@ pub enum Lens {
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 #[cfg_attr(feature = "schema", schemars(rename = "Reference"))]
-pub enum FthetaReference {
+pub enum FThetaReference {
     /// The angle from the optical axis, in radians, to the distance from the principal point, in
     /// pixels.
     AngleToPixel,
@@ -60,7 +60,7 @@ pub enum FthetaReference {
 /// matrix.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[cfg_attr(feature = "schema", schemars(transform = crate::message::matrix_or_gain))]
+#[cfg_attr(feature = "schema", schemars(transform = crate::matrix_or_gain))]
 pub struct Exposure {
     /// The matrix, row by row.
     #[serde(default, skip_serializing_if = "Option::is_none")]

@@ -5,9 +5,9 @@ use std::fmt;
 use serde::de::{Error, IntoDeserializer, MapAccess, Visitor, value::MapAccessDeserializer};
 use serde::{Deserialize, Deserializer};
 
-use crate::message::{
-    BranchPoint, Dynamics, DynamicsChoice, DynamicsModel, Pose, RandomStart, Rig, RigChoice,
-    ScenarioChoice, Start,
+use crate::{
+    Dynamics, DynamicsChoice, DynamicsModel, Pose, RandomStart, Rig, RigChoice, ScenarioChoice,
+    Start,
 };
 
 /// Chosen by the fields that are present. Serde's own `untagged` tries one variant after the other,
@@ -31,28 +31,6 @@ impl<'de> Deserialize<'de> for Start {
             }
             _ => Err(D::Error::custom(
                 "a start has either pose, or trajectory and station_m, or random",
-            )),
-        }
-    }
-}
-
-/// Decided by the fields that are present.
-impl<'de> Deserialize<'de> for BranchPoint {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        #[derive(Deserialize)]
-        #[serde(deny_unknown_fields)]
-        struct Either {
-            session: Option<String>,
-            snapshot: Option<String>,
-            episode: Option<String>,
-            step: Option<u64>,
-        }
-        let Either { session, snapshot, episode, step } = Either::deserialize(deserializer)?;
-        match (session, snapshot, episode, step) {
-            (Some(session), Some(snapshot), None, None) => Ok(Self::Snapshot { session, snapshot }),
-            (None, None, Some(episode), Some(step)) => Ok(Self::Recorded { episode, step }),
-            _ => Err(D::Error::custom(
-                "a branch is from either session and snapshot, or episode and step",
             )),
         }
     }
