@@ -73,7 +73,7 @@ pub struct Growth {
 impl Default for Settings {
     fn default() -> Self {
         Self {
-            steps: 30_000,
+            steps: 7_000,
             seed: 0,
             sh_degree: 1,
             rates: Rates::default(),
@@ -145,8 +145,10 @@ impl Settings {
             ("loss.disparity", self.loss.disparity as f32),
         ];
         for (field, value) in rates {
-            if !(0.0..=1e6).contains(&value) {
-                let must = "it is a number from 0 to 1e6";
+            // A rate of 10 leaves the street in a step.
+            let most = if field.starts_with("rates") { 10.0 } else { 1e6 };
+            if !(0.0..=most).contains(&value) {
+                let must = "it is a number from 0 to 1e6; a rate, to 10";
                 return Err(SettingError { field, value: value.to_string(), must });
             }
         }

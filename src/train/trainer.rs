@@ -64,7 +64,7 @@ pub enum TrainError {
     Image(String),
     /// Nothing is left to learn from.
     #[error(
-        "of {images} images {held_out} are held out, and none is left to learn from: give more"
+        "of {images} images {held_out} are held out, and none is left to learn from: give more images, or hold out none"
     )]
     NoImages { images: usize, held_out: usize },
     /// No Gaussian to begin with.

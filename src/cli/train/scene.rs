@@ -1,7 +1,7 @@
 //! `wildcity train SOURCE`.
 
 use std::fs;
-use std::io::{self, Write};
+use std::io::{self, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
@@ -13,6 +13,7 @@ use wildcity_eval::images::{ImageList, RealImage, picture};
 use wildcity_render::View;
 use wildcity_render::gradient::Differentiate;
 use wildcity_scene::RenderProfile;
+use wildcity_scene::random::Random;
 use wildcity_train::run::{Line, TrainingImage, TrainingImages, run};
 use wildcity_train::settings::Settings;
 use wildcity_train::start::{Point, gaussians_from_points};
@@ -47,26 +48,29 @@ pub(super) struct TrainScene {
     points: Option<PathBuf>,
 
     /// Steps, each on one image. Learning rates and growth are scaled to this number.
-    #[arg(long, default_value_t = 7_000, value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
-    steps: u32,
+    /// [default: that of --settings, or 7000]
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
+    steps: Option<u32>,
 
-    /// Most Gaussians at any time.
-    #[arg(long, value_name = "COUNT", default_value_t = 1_000_000)]
-    cap: usize,
+    /// Most Gaussians at any time; of more points some are chosen [default: that of --settings, or
+    /// 1000000]
+    #[arg(long, value_name = "COUNT", value_parser = clap::value_parser!(u32).range(1..))]
+    cap: Option<u32>,
 
     /// Train on images of this fraction of their width, from 0.05 to 1: a quarter of the pixels at
     /// 0.5 take a quarter of the time.
     #[arg(long, value_name = "FRACTION", default_value_t = 1.0, value_parser = fraction)]
     size: f64,
 
-    /// Keep every so-manieth image from training, to judge the result; 0 keeps none.
+    /// Keep every so-manieth image, in the order of their names, from training, to judge the
+    /// result; 0 keeps none.
     #[arg(long, value_name = "N", default_value_t = 8)]
     held_out_every: usize,
 
     /// Of the order of images and of all random numbers: the same seed and images give the same
-    /// file.
-    #[arg(long, default_value_t = 0)]
-    seed: u64,
+    /// file [default: that of --settings, or 0]
+    #[arg(long)]
+    seed: Option<u64>,
 
     /// TOML file of all settings; --steps, --cap and --seed change it. `wildcity train settings`
     /// prints the defaults.
@@ -101,12 +105,22 @@ impl TrainScene {
         let source = self.source.as_deref();
         let source = source.context("give SOURCE: a COLMAP model or a transforms.json")?;
         let out = self.out.as_deref().context("give --out FILE.ply")?;
+        check_out(out)?;
         let settings = self.settings()?;
         let list = ImageList::read(source, self.image_dir.as_deref(), self.masks.as_deref())?;
         for warning in &list.warnings {
             writeln!(io::stderr(), "warning: {warning}")?;
         }
-        let points = self.points(source)?;
+        let mut points = self.points(source)?;
+        if points.len() > settings.growth.cap {
+            let all = points.len();
+            let mut random = Random::new(settings.seed, "points", 0);
+            for k in (1..all).rev() {
+                points.swap(k, random.below(k + 1));
+            }
+            points.truncate(settings.growth.cap);
+            writeln!(io::stderr(), "{} of {all} points are chosen: --cap", points.len())?;
+        }
         let images =
             Listed { images: list.every(1), size: self.size, held_out_every: self.held_out_every };
         // Every image is looked at before a long run finds one that is missing.
@@ -119,13 +133,15 @@ impl TrainScene {
             Some(backend) => backend.as_ref(),
             None => anyhow::bail!("no backend computes gradients"),
         };
+        let held_out = (0..images.count()).filter(|&index| images.is_held_out(index)).count();
         writeln!(
             io::stderr(),
-            "{}, {}, backend {}",
+            "{}, {held_out} of them held out, {}, backend {}",
             output::counted(images.count(), "image"),
             output::counted(points.len(), "point"),
             backend.name()
         )?;
+        let every = (settings.steps / 10).max(1);
         let mut lines = self.lines.as_deref().map(LinesFile::create).transpose()?;
         let bar = progress::count("training");
         bar.set_length(settings.steps as u64);
@@ -137,13 +153,22 @@ impl TrainScene {
                 bar.set_message(format!("{db:.2} dB"));
                 last = Some(line.clone());
             }
+            // A log has no bar.
+            if line.step.is_multiple_of(every) && !io::stderr().is_terminal() {
+                let Line { step, l1, gaussians, seconds, .. } = line;
+                let db = line.held_out_db.map_or(String::new(), |db| format!(", {db:.2} dB"));
+                let said = writeln!(
+                    io::stderr(),
+                    "step {step}: l1 {l1:.4}, {gaussians} Gaussians, {seconds:.0} s{db}"
+                );
+                failed = said.err().map(anyhow::Error::from);
+            }
             let written = lines.as_mut().map_or(Ok(()), |lines| lines.write(line));
-            failed = written.err();
+            failed = failed.take().or(written.err());
             failed.is_none()
         };
         let start = gaussians_from_points(&points);
         let profile = RenderProfile::default();
-        let every = (settings.steps / 10).max(1);
         let trained = run(start, &images, backend, profile, &settings, every, &mut on_step)?;
         bar.finish_and_clear();
         if let Some(error) = failed {
@@ -162,15 +187,15 @@ impl TrainScene {
                 settings.steps
             )?;
         }
-        // COLMAP's world has the axes of its first camera; those of a transforms.json are any.
-        let is_colmap = source.is_dir() && !source.join("transforms.json").is_file();
-        let axes = if is_colmap { " --axes y-down-z-forward" } else { "" };
         writeln!(
             stdout,
-            "{}: {} Gaussians; wildcity import {} --twin NAME{axes}",
+            "{}: {} Gaussians, in the axes and the unit of {}; make a twin of it:\n\
+             wildcity import {:?} --twin NAME --axes AXES\n\
+             AXES is identity if z is up, and y-down-z-forward for most models of COLMAP",
             out.display(),
             trained.len(),
-            out.display()
+            source.display(),
+            out,
         )?;
         Ok(())
     }
@@ -184,21 +209,24 @@ impl TrainScene {
                 toml::from_str(&text).with_context(cannot)?
             }
         };
-        settings.steps = self.steps as usize;
-        settings.growth.cap = self.cap;
-        settings.seed = self.seed;
+        settings.steps = self.steps.map_or(settings.steps, |steps| steps as usize);
+        settings.growth.cap = self.cap.map_or(settings.growth.cap, |cap| cap as usize);
+        settings.seed = self.seed.unwrap_or(settings.seed);
         settings.check()?;
         Ok(settings)
     }
 
     fn points(&self, source: &Path) -> anyhow::Result<Vec<Point>> {
-        let source = self.points.as_deref().unwrap_or(source);
-        let is_list = source.extension().is_some_and(|extension| extension == "json");
-        let read = if is_list { None } else { capture::read_points(source)? };
+        let source = match &self.points {
+            Some(points) => points.clone(),
+            None => listed_points(source)?,
+        };
+        ensure!(source.exists(), "there are no points at {}", source.display());
+        let read = capture::read_points(&source)?;
         let read = read.filter(|points| !points.is_empty()).with_context(|| {
             format!(
                 "{} has no points to begin with: give --points, a PLY file or a COLMAP model with \
-                 points3D.bin",
+                 points3D.bin or points3D.txt",
                 source.display()
             )
         })?;
@@ -208,6 +236,41 @@ impl TrainScene {
         };
         Ok(read.into_iter().map(point).collect())
     }
+}
+
+/// Checks, before a long run, that its file can be written.
+fn check_out(out: &Path) -> anyhow::Result<()> {
+    let out_name = out.display();
+    let is_ply = out.extension().is_some_and(|extension| extension == "ply");
+    ensure!(is_ply, "--out {out_name}: the file is a PLY: give it a name that ends with .ply");
+    let is_free = !out.exists() || out.is_file();
+    ensure!(is_free, "--out {out_name} is a folder or a device: give the name of a file");
+    // The folder of a bare name is the current one.
+    let folder = out.parent().filter(|folder| !folder.as_os_str().is_empty());
+    let is_there = folder.is_none_or(Path::is_dir);
+    ensure!(is_there, "--out {out_name}: there is no such folder: create it");
+    Ok(())
+}
+
+/// Where the points of a list are: in the PLY file that a transforms.json names, or in its folder,
+/// which may be or have a COLMAP model.
+fn listed_points(source: &Path) -> anyhow::Result<PathBuf> {
+    let mut folder = source;
+    let mut list = source.join("transforms.json");
+    if source.extension().is_some_and(|extension| extension == "json") {
+        folder = source.parent().unwrap_or(source);
+        list = source.to_owned();
+    }
+    if list.is_file() {
+        let cannot = || format!("cannot read {}", list.display());
+        let text = fs::read(&list).with_context(cannot)?;
+        let json: serde_json::Value = serde_json::from_slice(&text).with_context(cannot)?;
+        if let Some(name) = json.get("ply_file_path").and_then(serde_json::Value::as_str) {
+            return Ok(folder.join(name));
+        }
+    }
+    // The folder of a bare name is the current one.
+    Ok(if folder.as_os_str().is_empty() { PathBuf::from(".") } else { folder.to_owned() })
 }
 
 impl TrainingImages for Listed<'_> {
@@ -231,6 +294,12 @@ impl Listed<'_> {
         let own_px = [camera.width_px, camera.height_px];
         let file = image.mask.as_deref();
         let mut mask = file.map(|file| picture::mask(file, own_px)).transpose()?;
+        let is_empty = mask.as_ref().is_some_and(|mask| !mask.contains(&true));
+        ensure!(
+            !is_empty,
+            "the mask {} leaves no pixel: dark pixels do not count",
+            file.unwrap_or(Path::new("")).display()
+        );
         if self.size < 1.0 {
             let [width, height] =
                 own_px.map(|px| ((f64::from(px) * self.size).round() as u32).max(1));

@@ -439,7 +439,7 @@ fn prefetch(images: &GaussianImages, view: &View, at_px: [u32; 2], sums: &TileSu
         for channel in &sums.rgb {
             prefetch_index(channel, block);
         }
-        prefetch_index(&sums.transmittance, block);
+        prefetch_index(sums.transmittance, block);
     }
 }
 

@@ -53,7 +53,7 @@ pub(super) fn back_project<S: Simd>(
         let factor = [l0[lane], l1[lane], l2[lane]];
         let antialiased = block.cutoffs.antialiased;
         let footprint =
-            FootprintGradient::from_sums(&sums, factor, &view.filter(), antialiased, toward);
+            FootprintGradient::from_sums(&sums, factor, view.filter(), antialiased, toward);
         let center_m = view.origin_m() + mean_m(block.columns, lane);
         let shape = footprint.to_shape(view.view(), center_m, axes_m);
         let (ln_scale, quat) = shape.to_scale_and_rotation(axes_m, rotation);
