@@ -19,17 +19,25 @@ RENDER = ROOT / "src" / "render"
 FAULTS = [
     ("cpu/blend_gradient.rs", "(-weight).mul_add(energy, load(&self.behind[block]))", "load(&self.behind[block])"),
     ("cpu/blend_gradient.rs", "energy - behind / after", "energy - behind"),
-    ("cpu/blend_gradient.rs", "raw.simd_le(cap).select(weight * by_weight, zero)", "weight * by_weight"),
+    ("cpu/blend_gradient.rs", "(counts & raw.simd_le(cap)).select(weight * by_weight, zero)", "counts.select(weight * by_weight, zero)"),
     ("cpu/blend_gradient.rs", "gu.mul_add(v, sums[partial::UV])", "gu.mul_add(u, sums[partial::UV])"),
     ("cpu/blend_gradient.rs", "-(load(&sums.transmittance[block]) * by_opacity)", "-by_opacity"),
-    ("cpu/project/gradient/pinhole.rs", "total.mul_add(-per_ln2, by.load(simd, partial::VV))", "by.load(simd, partial::VV)"),
+    (
+        "cpu/project/gradient/pinhole.rs",
+        "total.mul_add(-per_ln2, by.load(simd, partial::VV))",
+        "by.load(simd, partial::VV)",
+    ),
     ("cpu/project/gradient/pinhole.rs", "is_free.select(inverse_z * q.dot(forward), splat(0.0))", "splat(0.0)"),
     ("cpu/project/gradient/pinhole.rs", "- along * inverse_z", ""),
     ("cpu/project/gradient/pinhole.rs", "q_x.cross(jw_x).plus(q_y.cross(jw_y))", "q_x.cross(jw_x)"),
     ("cpu/project/gradient/pinhole.rs", "(shrink - before) / det_native", "shrink / det_native"),
     ("cpu/project/gradient/color.rs", "rgb.x.simd_gt(zero).select(tinted.x, zero)", "tinted.x"),
     ("cpu/project/gradient/color.rs", "unit.mul_add(-unit.dot(by_direction), by_direction)", "by_direction"),
-    ("cpu/project/gradient/color.rs", "[-(twice(s) * xy), by_y, splat(8.0 * k2) * yz]", "[twice(s) * xy, by_y, splat(8.0 * k2) * yz]"),
+    (
+        "cpu/project/gradient/color.rs",
+        "[-(twice(s) * xy), by_y, splat(8.0 * k2) * yz]",
+        "[twice(s) * xy, by_y, splat(8.0 * k2) * yz]",
+    ),
     ("cpu/project/gradient/color.rs", "[d * z, zero, d * x]", "[d * x, zero, d * z]"),
     ("cpu/project/gradient/lens.rs", "view.origin_m() + mean_m(block.columns, lane)", "mean_m(block.columns, lane)"),
     ("cpu/project/gradient/mod.rs", "[-twice.dot(v), x, y, z]", "[twice.dot(v), x, y, z]"),
@@ -75,7 +83,9 @@ def main() -> int:
             path.write_text(sound)
         is_built = not any(line.startswith("error[") or "could not compile" in line for line in failed)
         missed += status == 0 or not is_built
-        verdict = "NOT NOTICED" if status == 0 else ", ".join(failed[:2]) if is_built else f"DOES NOT BUILD: {failed[:1]}"
+        verdict = (
+            "NOT NOTICED" if status == 0 else ", ".join(failed[:2]) if is_built else f"DOES NOT BUILD: {failed[:1]}"
+        )
         print(f"{verdict} | {file}: {' '.join(old.split())[:70]}", flush=True)
     print(f"{len(chosen) - missed} of {len(chosen)} faults are noticed")
     return 1 if missed else 0
