@@ -1,4 +1,4 @@
-"""Plants one fault into each formula of the cpu backend's and the reference's gradients, and says which test notices it.
+"""Plants one fault into each formula of the gradients of cpu and reference, and says which test notices it.
 
     python3 tests/render/plant.py [FILE ..]        (cargo by $CARGO; about a minute for each fault)
 
@@ -19,7 +19,11 @@ RENDER = ROOT / "src" / "render"
 FAULTS = [
     ("cpu/blend_gradient.rs", "(-weight).mul_add(energy, load(&self.behind[block]))", "load(&self.behind[block])"),
     ("cpu/blend_gradient.rs", "energy - behind / after", "energy - behind"),
-    ("cpu/blend_gradient.rs", "(counts & raw.simd_le(cap)).select(weight * by_weight, zero)", "counts.select(weight * by_weight, zero)"),
+    (
+        "cpu/blend_gradient.rs",
+        "(counts & raw.simd_le(cap)).select(weight * by_weight, zero)",
+        "counts.select(weight * by_weight, zero)",
+    ),
     ("cpu/blend_gradient.rs", "gu.mul_add(v, sums[partial::UV])", "gu.mul_add(u, sums[partial::UV])"),
     ("cpu/blend_gradient.rs", "-(load(&sums.transmittance[block]) * by_opacity)", "-by_opacity"),
     (
