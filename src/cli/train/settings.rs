@@ -6,7 +6,12 @@ use wildcity_train::settings::Settings;
 
 /// Print all settings of training with their defaults, as a file for --settings.
 #[derive(Debug, clap::Args)]
+#[command(after_long_help = EXAMPLE)]
 pub(in crate::cli) struct PrintSettings {}
+
+const EXAMPLE: &str = "\
+Example:
+  wildcity train settings > train.toml";
 
 impl PrintSettings {
     pub(super) fn run(self) -> anyhow::Result<()> {

@@ -19,8 +19,8 @@
 //! Gaussian adds its views in order. No sum is added to atomically.
 
 use std::iter::zip;
-use std::sync::atomic::AtomicBool;
 use std::sync::atomic::Ordering::Relaxed;
+use std::sync::atomic::{AtomicBool, AtomicU64};
 
 use fearless_simd::{Simd, dispatch};
 use parking_lot::Mutex;
@@ -124,7 +124,7 @@ impl Differentiate for Cpu {
                 let input = Input { projected, bins, views, backgrounds: &[], cutoffs };
                 let kept = Kept { input, depth, views: &*kept, walkers: &*walkers };
                 let mut timer = StageTimer::start();
-                dispatch!(level, simd => kept.rasterize(simd));
+                stats.evaluations = dispatch!(level, simd => kept.rasterize(simd));
                 images.resize_with(views.len(), GaussianImages::default);
                 for ((images, kept), view) in zip(zip(&mut *images, kept.views), views) {
                     kept.write_images(view, depth, images);
@@ -186,19 +186,23 @@ fn unit_of_job<'a, 'b>(
 }
 
 impl Kept<'_> {
-    /// Draws all views, and keeps what the way back needs.
+    /// Draws all views, and keeps what the way back needs. Returns the number of evaluations.
     #[inline(always)]
-    fn rasterize<S: Simd>(&self, simd: S) {
+    fn rasterize<S: Simd>(&self, simd: S) -> u64 {
+        // A sum only, which no other data depends on: relaxed order is enough.
+        let evaluations = AtomicU64::new(0);
         for view in 0..self.views.len() {
             self.input.bins.by_work(view).into_par_iter().with_max_len(1).for_each(|number| {
                 let mut walker = self.walkers.lock().pop().unwrap_or_default();
-                simd.vectorize(
+                let own = simd.vectorize(
                     #[inline(always)]
                     || self.rasterize_macro_tile(simd, view, number, &mut walker),
                 );
+                evaluations.fetch_add(own, Relaxed);
                 self.walkers.lock().push(walker);
             });
         }
+        evaluations.into_inner()
     }
 
     #[inline(always)]
@@ -208,7 +212,7 @@ impl Kept<'_> {
         view: usize,
         number: usize,
         walker: &mut Walker,
-    ) {
+    ) -> u64 {
         let Walker { macro_tile, batch, .. } = walker;
         let Input { bins, projected, views, .. } = self.input;
         bins.load(view, number, macro_tile);
@@ -216,6 +220,7 @@ impl Kept<'_> {
         let mut kept = self.views[view].0[number].lock();
         kept.tiles.clear();
         let wants = Wants { depth: self.depth, instances: false };
+        let mut evaluations = 0;
         for (within, [column, row]) in Grid::new(&views[view]).macro_tile_tiles(number) {
             let mut sums = TileSums::default();
             let mut live = u16::MAX;
@@ -223,10 +228,12 @@ impl Kept<'_> {
             let mut output =
                 TileOutput { sums: &mut sums, live: &mut live, halved_by: &mut halved_by, wants };
             let at_px = [column * TILE_PX, row * TILE_PX];
-            rasterize_tile(simd, self.input, macro_tile, within, at_px, batch, &mut output);
+            evaluations +=
+                rasterize_tile(simd, self.input, macro_tile, within, at_px, batch, &mut output);
             kept.tiles.push(sums);
         }
         macro_tile.copy_lists(&mut kept.lists);
+        evaluations
     }
 
     /// The sums of every pair of every macro tile of a view.
