@@ -88,7 +88,6 @@ fn list(
         }
     }
     workgroupBarrier();
-    // Write the instances.
     for (var i = own.first + thread; i < own.end; i += WORKGROUP) {
         let splat = touch_splats[i];
         for (var rest = touch_masks[i]; rest != 0u; rest &= rest - 1u) {

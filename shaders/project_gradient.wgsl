@@ -48,14 +48,9 @@ fn back_project(
     }
     let cluster_view_index = page_cluster_views[span.first + index];
     first_value = first_lines[cluster_view_index] * CLUSTER + thread;
-    let own_word = visible[cluster_view_index * MASK_WORDS + thread / 32u];
-    let own_bit = 1u << (thread % 32u);
     var twist = Twist();
-    if (own_word & own_bit) != 0u {
-        var slot = offsets[cluster_view_index] + countOneBits(own_word & (own_bit - 1u));
-        for (var word = 0u; word < thread / 32u; word++) {
-            slot += countOneBits(visible[cluster_view_index * MASK_WORDS + word]);
-        }
+    let slot = splat_slot(cluster_view_index, thread);
+    if slot != INVISIBLE {
         twist = back_project_splat(slot, cluster_views[cluster_view_index], thread);
     }
     // The sums of the cluster, in pairs.
@@ -83,7 +78,7 @@ fn back_project_splat(slot: u32, cluster_view: ClusterView, thread: u32) -> Twis
     let sums = splat_sums[slot];
     let factor = shapes[slot].factor;
 
-    // As in `pinhole.wgsl`.
+    // The projection once more, as in `pinhole.wgsl`: keeping it would take 100 B for each splat.
     let mean = vec4f(gaussian.mean_m, 1.0);
     let x = dot(view.camera_from_chunk[0], mean);
     let y = dot(view.camera_from_chunk[1], mean);

@@ -21,8 +21,7 @@
 @group(0) @binding(4) var<storage, read> shapes: array<SplatShape>;
 @group(0) @binding(5) var<storage, read> colors: array<SplatColor>;
 // For each tile of the span, planes of 256 values: the derivatives by red, green, blue and the sum of depths, and the
-// change of the loss with everything: the sum of weights times (rgb · v_rgb + depth v_depth), minus
-// T_end v_opacity.
+// change of the loss with everything: the sum of weights times (rgb · v_rgb + depth v_depth), minus T_end v_opacity.
 @group(0) @binding(6) var<storage, read> derivatives: array<vec4f>;
 // For each instance, ten sums in the order of `SplatSums`.
 @group(0) @binding(7) var<storage, read_write> instance_sums: array<f32>;

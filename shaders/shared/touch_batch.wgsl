@@ -7,7 +7,7 @@ const BATCH_WORDS: u32 = EXPAND_BATCH / 32;
 // A batch of touches of a macro tile.
 struct Batch {
     macro_tile: u32,
-    // Its touches.
+    // Its touches are `first..end` of all.
     first: u32,
     end: u32,
     // `offsets[offset + k * stride]` is its count for tile k of the macro tile.

@@ -366,6 +366,12 @@ mod tests {
         for exposure in [r#"{"offset": [1, 2, 3]}"#, r#"{"gain": [1, 1]}"#, r#"{"gamma": 2}"#] {
             assert!(read(exposure).is_err(), "{exposure}");
         }
+        // Even an unknown field that says nothing is refused, and a known one is not.
+        assert!(read(r#"{"gain": [1, 1, 1], "matrix": null}"#).is_ok());
+        for absent in ["null", "[]", "{}"] {
+            let error = read(&format!(r#"{{"gain": [1, 1, 1], "gamma": {absent}}}"#)).unwrap_err();
+            assert!(error.contains("unknown field `gamma`"), "{error}");
+        }
         let both = r#"{"gain": [1, 1, 1], "matrix": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}"#;
         let error = read(both).unwrap_err();
         assert!(error.contains("either a matrix or a gain"), "{error}");

@@ -10,7 +10,7 @@ use wildcity_render::reference::Reference;
 use wildcity_render::{Frame, View};
 use wildcity_scene::actor::{ContactShadow, PlacedChunk};
 use wildcity_scene::geometry::Camera;
-use wildcity_scene::geometry::camera::ShutterDirection;
+use wildcity_scene::geometry::camera::{Fisheye, Lens, ShutterDirection};
 use wildcity_scene::{RenderProfile, Scene};
 
 use crate::lenses::{lenses, rolling_view, street_scene};
@@ -50,11 +50,27 @@ pub(crate) fn check_against_reference(
     profile: &RenderProfile,
     views: &[View],
 ) {
-    let (_, ours) = differentiate(backend, scene, profile, views);
-    let (_, theirs) = differentiate(&Reference, scene, profile, views);
+    let (our_images, ours) = differentiate(backend, scene, profile, views);
+    let (their_images, theirs) = differentiate(&Reference, scene, profile, views);
+    for (ours, theirs) in our_images.iter().zip(&their_images) {
+        check_image(case, &ours.rgb, &theirs.rgb);
+        check_image(case, &ours.opacity, &theirs.opacity);
+        check_image(case, &ours.depth_sum_m, &theirs.depth_sum_m);
+    }
     for GroupError { group, error, cosine } in group_errors(&ours, &[theirs]) {
         eprintln!("{case:20} {group:10} {error:.1e} {:.1e}", 1.0 - cosine);
         assert!(error < 1e-4 && cosine > 0.99999, "{case}: {group} is off by {error:e}, {cosine}");
+    }
+}
+
+/// An image that a loss is given against that of `reference`, which is 0 outside of a lens' field:
+/// within what one splat at the cut of alpha changes.
+fn check_image(case: &str, ours: &[f32], theirs: &[f32]) {
+    assert_eq!(ours.len(), theirs.len(), "{case}");
+    let most = theirs.iter().fold(0.0_f32, |most, value| most.max(value.abs()));
+    for (index, (ours, theirs)) in ours.iter().zip(theirs).enumerate() {
+        let is_close = (ours - theirs).abs() <= most / 255.0;
+        assert!(is_close, "{case}: value {index} is {ours} for {theirs}");
     }
 }
 
@@ -86,7 +102,11 @@ pub(crate) fn check_lenses(backend: &dyn Differentiate) {
         ShutterDirection::LeftToRight,
     ];
     let profile = RenderProfile { antialiased: true, ..RenderProfile::default() };
-    for ((name, camera), direction) in lenses().into_iter().zip(directions.into_iter().cycle()) {
+    // A field whose edge cuts splats: without the mask the images would be seen beyond it.
+    let narrow = Lens::Fisheye(Fisheye::new([0.0; 4], Some(0.35)));
+    let narrow = ("narrow fisheye", Camera { lens: narrow, ..lenses()[1].1 });
+    let cases = lenses().into_iter().chain([narrow]);
+    for ((name, camera), direction) in cases.zip(directions.into_iter().cycle()) {
         let camera = Camera { native_size_px: None, ..camera.scaled(80, 50).unwrap() };
         let views = [View::new(camera, pose), rolling_view(camera, pose, direction)];
         check_against_reference(name, backend, &scene, &profile, &views);

@@ -36,7 +36,7 @@ impl Case {
     /// pixel whose alpha lies within the rounding of a backend of a step may take either.
     ///
     /// # Errors
-    /// As [`Case::gradients`].
+    /// Those of [`Differentiate::differentiate`].
     pub fn truths(&self) -> Result<Vec<Gradients>, GradientError> {
         // What f32 loses of the exponent of a thin splat, of which u changes by 10 per pixel, three
         // deviations from a centre that is rounded to 1e-6 px. Of 300,000 pairs of a splat and a
@@ -54,7 +54,7 @@ impl Case {
     /// The gradients of a backend for a loss of [`waves`].
     ///
     /// # Errors
-    /// As [`Differentiate::differentiate`].
+    /// Those of [`Differentiate::differentiate`].
     pub fn gradients(&self, backend: &dyn Differentiate) -> Result<Gradients, GradientError> {
         self.gradients_with(backend, &self.profile)
     }

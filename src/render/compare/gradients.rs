@@ -54,7 +54,7 @@ impl GroupError {
 /// and the others are those of thresholds that are nudged.
 ///
 /// # Panics
-/// Without any truth.
+/// If `truths` is empty: there is nothing to compare with.
 pub fn group_errors(ours: &Gradients, truths: &[Gradients]) -> Vec<GroupError> {
     let ours = by_group(ours);
     let truths: Vec<_> = truths.iter().map(by_group).collect();

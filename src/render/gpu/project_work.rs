@@ -212,6 +212,14 @@ impl ProjectWork {
         &self.page_cluster_views[span.first as usize..][..span.count as usize]
     }
 
+    /// The index of the view of a cluster view.
+    pub(super) fn view(&self, cluster_view: u32) -> usize {
+        let chunk_view = self.cluster_views[cluster_view as usize].chunk_view;
+        // There are at most 16 views, so that the low bits are the view in all kernels.
+        let view = self.chunk_views[chunk_view as usize].view;
+        (view & ((1 << VIEW_BITS) - 1)) as usize
+    }
+
     /// The owners (twin or actor) of the cluster views, as ranges in order of cluster views.
     pub(super) fn owners(&self) -> &[layout::Owner] {
         &self.owners

@@ -92,7 +92,7 @@ impl ReadBack {
     }
 
     /// A buffer to which the device copies and from which the host reads.
-    pub(super) fn buffer(device: &Device, label: &'static str) -> GrowableBuffer {
+    fn buffer(device: &Device, label: &'static str) -> GrowableBuffer {
         GrowableBuffer::new(device, label, BufferUsages::MAP_READ | BufferUsages::COPY_DST)
     }
 

@@ -48,6 +48,8 @@ mod shape;
 mod sums;
 mod twist;
 
+use std::sync::Arc;
+
 use glam::DVec3;
 use rayon::prelude::*;
 
@@ -77,8 +79,7 @@ pub struct GaussianImages {
 
 /// Computes the derivatives of a loss by the images of all views, given these. Both are in the
 /// order of the views; derivatives by depth may be empty, and those outside of a lens' field are
-/// not read. It must not call the backend, which waits
-/// for it.
+/// not read. It must not call the backend, which waits for it.
 pub type LossGradient<'a> = &'a mut (dyn FnMut(&[GaussianImages]) -> Vec<GaussianImages> + Send);
 
 /// The derivatives of a loss by the parameters of one Gaussian.
@@ -165,8 +166,7 @@ pub trait Differentiate: Backend {
 impl Gradients {
     /// Makes it fit a scene and a number of views; no Gaussian is visible.
     pub(crate) fn reset(&mut self, scene: &Scene, views: usize) {
-        let placed = scene.placed.iter().map(|placed| &placed.chunk);
-        let chunks: Vec<&Chunk> = scene.chunks.iter().chain(placed).map(AsRef::as_ref).collect();
+        let chunks = chunks(scene);
         self.chunks.truncate(chunks.len());
         for (index, chunk) in chunks.into_iter().enumerate() {
             match self.chunks.get_mut(index) {
@@ -177,6 +177,11 @@ impl Gradients {
         self.twists.clear();
         self.twists.resize(views, Twist::default());
     }
+}
+
+/// The chunks of a scene in the order of [`Gradients::chunks`].
+pub(crate) fn chunks(scene: &Scene) -> Vec<&Arc<Chunk>> {
+    scene.chunks.iter().chain(scene.placed.iter().map(|placed| &placed.chunk)).collect()
 }
 
 impl ChunkGradients {

@@ -16,16 +16,16 @@ use crate::gpu::gradient::{
     BackwardInputs, GradientClusters, GradientStages, HostSplats, back_project, images, pack,
 };
 use crate::gpu::kernel::Recorder;
-use crate::gpu::layout::{Counters, RASTER_BATCH, SplatShape};
+use crate::gpu::layout::{Counters, FrameView, RASTER_BATCH, SplatShape};
 use crate::gpu::partition::TileRows;
 use crate::gpu::project_work::{ProjectWork, Projection};
 use crate::gpu::read_back::ReadBack;
 use crate::gpu::resolve::{Outputs, Pixels, Planes};
 use crate::gradient::{
     GaussianImages, GradientError, Gradients, LossGradient, Partial, Twist, check_finite,
-    check_sizes,
+    check_sizes, mask,
 };
-use crate::{Frame, FrameStats, RenderError};
+use crate::{Frame, FrameStats, RenderError, View};
 use wildcity_scene::chunk::CLUSTER;
 
 /// A frame that was drawn, and whose buffers still hold it.
@@ -44,7 +44,7 @@ impl Chain {
     /// parameters.
     ///
     /// # Errors
-    /// As [`differentiate`](crate::gradient::Differentiate::differentiate).
+    /// Those of [`differentiate`](crate::gradient::Differentiate::differentiate).
     pub(in crate::gpu) fn differentiate(
         &mut self,
         frame: &Frame<'_>,
@@ -65,16 +65,17 @@ impl Chain {
         let start = Instant::now();
         let views = &drawn.current.parameters.view[..frame.views.len()];
         let derivatives = pool.install(|| pack(views, &images, &by_images));
-        let stages = self.gradient.get_or_insert_with(|| GradientStages::new(&self.device));
+        // After a failure they are not used again: some may still be mapped.
+        let stages = self.gradient.take();
+        let mut stages = stages.unwrap_or_else(|| GradientStages::new(&self.device));
         stages.upload_derivatives(&self.device, &derivatives);
         add_time(&mut drawn.current.stats, "upload", start.elapsed());
 
-        self.run_backwards(&mut drawn)?;
+        self.run_backwards(&mut stages, &mut drawn)?;
         let start = Instant::now();
-        let delivered = self.deliver_gradients(&drawn, gradients, pool);
-        if let Some(stages) = &self.gradient {
-            stages.read_back.unmap();
-        }
+        let delivered = self.deliver_gradients(&stages, &drawn, gradients, pool);
+        stages.read_back.unmap();
+        self.gradient = Some(stages);
         delivered?;
         add_time(&mut drawn.current.stats, "deliver", start.elapsed());
         Ok(drawn.current.stats)
@@ -109,7 +110,7 @@ impl Chain {
         }
         let longest = u64::from(RASTER_BATCH) * u64::from(head.tile_counters.most_batches);
         self.check_loops(&current, longest).inspect_err(|_| current.read_back.unmap())?;
-        let images = self.read_images(&current, depth, pool)?;
+        let images = self.read_images(frame, &current, depth, pool)?;
         let counters = head.counters;
         {
             let mut tally = self.tally.lock();
@@ -145,9 +146,10 @@ impl Chain {
         Ok(())
     }
 
-    /// The images of a frame whose pixels are mapped.
+    /// The images of a frame whose pixels are mapped, 0 outside of each lens' field.
     fn read_images(
         &self,
+        frame: &Frame<'_>,
         current: &CurrentFrame,
         depth: bool,
         pool: &ThreadPool,
@@ -161,13 +163,21 @@ impl Chain {
             planes: current.planes,
         };
         let views = &current.parameters.view[..current.parameters.views as usize];
-        Ok(pool.install(|| views.iter().map(|view| images(&pixels, view, depth)).collect()))
+        let masked = |(layout, view): (&FrameView, &View)| {
+            let mut images = images(&pixels, layout, depth);
+            mask(view, &mut images);
+            images
+        };
+        Ok(pool.install(|| views.iter().zip(frame.views).map(masked).collect()))
     }
 
     /// Runs the way back, and maps what the host reads of it.
-    fn run_backwards(&mut self, drawn: &mut Drawn<'_>) -> Result<(), RenderError> {
+    fn run_backwards(
+        &self,
+        stages: &mut GradientStages,
+        drawn: &mut Drawn<'_>,
+    ) -> Result<(), RenderError> {
         let Self { device, plan, project, mirror, splats, bin, sorted, .. } = self;
-        let stages = self.gradient.get_or_insert_with(|| GradientStages::new(device));
         let Drawn { current, work, clusters, counters, .. } = drawn;
         let inputs = BackwardInputs {
             plan,
@@ -211,11 +221,11 @@ impl Chain {
     /// Copies what is mapped to the gradients.
     fn deliver_gradients(
         &self,
+        stages: &GradientStages,
         drawn: &Drawn<'_>,
         gradients: &mut Gradients,
         pool: &ThreadPool,
     ) -> Result<(), RenderError> {
-        let Some(stages) = &self.gradient else { return Ok(()) };
         let Drawn { frame, actors, work, clusters, .. } = drawn;
         let pages = stages.read_back.pages(&self.device)?;
         let page = |index: usize| pages.get(index).map_or(&[][..], |page| &page[..]);
@@ -226,8 +236,7 @@ impl Chain {
         pool.install(|| clusters.copy_to(frame.scene, work, lines, visible, &mut gradients.chunks));
         // In the order of (view, global id). The device has none of lenses.
         for (cluster_view, twist) in (0..work.cluster_views()).zip(twists) {
-            gradients.twists[clusters.view(work, cluster_view)] +=
-                Twist::from_array(twist.map(f64::from));
+            gradients.twists[work.view(cluster_view)] += Twist::from_array(twist.map(f64::from));
         }
         if has_lenses(work) {
             let splats = HostSplats {

@@ -3,7 +3,7 @@
 
 use bytemuck::AnyBitPattern;
 use rayon::ThreadPool;
-use wgpu::{Buffer, CommandEncoderDescriptor};
+use wgpu::Buffer;
 
 use super::{Chain, Source};
 use crate::actor_views::ActorViews;
@@ -162,15 +162,10 @@ impl Chain {
             sources.push((bin.instances.buffer(), 4 * u64::from(counters.instances)));
         }
         let mut read_back = ReadBack::new(device);
-        let descriptor = CommandEncoderDescriptor { label: Some("stage outputs") };
-        let mut encoder = device.device.create_command_encoder(&descriptor);
-        for (buffer, bytes) in &sources {
-            let mut to = ReadBack::buffer(device, "stage outputs read back");
-            to.reserve(device, *bytes);
-            encoder.copy_buffer_to_buffer(buffer, 0, to.buffer(), 0, *bytes);
-            read_back.pages.push(to);
-        }
-        read_back.map(device, device.queue.submit([encoder.finish()]))?;
+        let recorder = Recorder::new(device, None);
+        let (_, submission) =
+            read_back.submit(device, recorder, &sources, self.timestamps.buffer());
+        read_back.map(device, submission)?;
         device.check()?;
         let pages = read_back.pages(device)?;
         let page = |k: usize| &pages[k][..sources[k].1 as usize];

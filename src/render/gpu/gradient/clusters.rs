@@ -1,14 +1,13 @@
 //! Where the gradients of each cluster lie on the device, and how they come back to the chunks.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
 
-use crate::gpu::layout::{Span, VIEW_BITS};
+use crate::gpu::layout::Span;
 use crate::gpu::mirror::{Mirror, largest_component};
 use crate::gpu::project_work::{ProjectDispatch, ProjectWork, Projection};
-use crate::gradient::ChunkGradients;
+use crate::gradient::{ChunkGradients, chunks};
+use wildcity_scene::Scene;
 use wildcity_scene::chunk::{CLUSTER, LANES, Lanes, column, columns};
-use wildcity_scene::{Chunk, Scene};
 
 /// Words of visible Gaussians of a cluster view.
 const MASK_WORDS: usize = CLUSTER / 32;
@@ -84,11 +83,6 @@ impl GradientClusters {
         (chunk, cluster * CLUSTER)
     }
 
-    /// The view of a cluster view.
-    pub(in crate::gpu) fn view(&self, work: &ProjectWork, cluster_view: u32) -> usize {
-        view(work, cluster_view)
-    }
-
     /// Copies the lines to the chunks. `visible` are the words of each cluster view.
     pub(in crate::gpu) fn copy_to(
         &self,
@@ -143,19 +137,6 @@ fn turn_back(columns: &[Lanes], gradients: &mut [Lanes]) {
     }
 }
 
-/// The chunks of a scene by their numbers.
-pub(super) fn chunks(scene: &Scene) -> Vec<&Arc<Chunk>> {
-    scene.chunks.iter().chain(scene.placed.iter().map(|placed| &placed.chunk)).collect()
-}
-
-/// The view of a cluster view.
-fn view(work: &ProjectWork, cluster_view: u32) -> usize {
-    let chunk_view = work.cluster_views[cluster_view as usize].chunk_view;
-    // There are at most 16 views, so that the low bits are the view in all kernels.
-    let view = work.chunk_views[chunk_view as usize].view;
-    (view & ((1 << VIEW_BITS) - 1)) as usize
-}
-
 /// The dispatches of static pinholes, in the order of their views.
 fn by_view(work: &ProjectWork) -> Vec<ProjectDispatch> {
     let mut dispatches = Vec::new();
@@ -164,12 +145,11 @@ fn by_view(work: &ProjectWork) -> Vec<ProjectDispatch> {
             continue;
         }
         let mut first = dispatch.span.first;
-        for run in
-            work.cluster_views_in(dispatch.span).chunk_by(|&a, &b| view(work, a) == view(work, b))
-        {
+        let cluster_views = work.cluster_views_in(dispatch.span);
+        for run in cluster_views.chunk_by(|&a, &b| work.view(a) == work.view(b)) {
             let span = Span { first, count: run.len() as u32 };
             first += span.count;
-            dispatches.push((view(work, run[0]), ProjectDispatch { span, ..*dispatch }));
+            dispatches.push((work.view(run[0]), ProjectDispatch { span, ..*dispatch }));
         }
     }
     // Stable: the order of pages and kernels stays.

@@ -5,12 +5,11 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use super::GradientClusters;
-use super::clusters::chunks;
 use crate::actor_views::ActorViews;
 use crate::gpu::layout::SplatShape;
 use crate::gpu::project_work::{ProjectWork, Projection};
 use crate::gradient::{
-    FootprintGradient, GaussianGradient, Gradients, Partial, Twist, color_gradient, partial,
+    FootprintGradient, GaussianGradient, Gradients, Partial, Twist, chunks, color_gradient, partial,
 };
 use crate::layout::PixelFilter;
 use crate::reference::Gaussian;
@@ -65,7 +64,7 @@ pub(in crate::gpu) fn back_project(
     let of_cluster_view = |&cluster_view: &u32| -> Vec<OfSplat> {
         let index = cluster_view as usize;
         let (number, first) = clusters.first_gaussian(index);
-        let view_index = clusters.view(work, cluster_view);
+        let view_index = work.view(cluster_view);
         let placed = number.checked_sub(scene.chunks.len());
         let (view, tint) = match placed {
             None => (&frame.views[view_index], DVec3::ONE),
@@ -91,7 +90,7 @@ pub(in crate::gpu) fn back_project(
         let all: Vec<Vec<OfSplat>> = cluster_views.par_iter().map(of_cluster_view).collect();
         for (&cluster_view, of_splats) in cluster_views.iter().zip(all) {
             let (chunk, _) = clusters.first_gaussian(cluster_view as usize);
-            let view = clusters.view(work, cluster_view);
+            let view = work.view(cluster_view);
             for (index, geometry, sh, twist) in of_splats {
                 gradients.chunks[chunk].add(index, &geometry, &sh);
                 gradients.twists[view] += twist;
