@@ -177,7 +177,7 @@ fn hash(bytes: &[u8]) -> String {
 #[derive(Debug)]
 struct Lock {
     path: PathBuf,
-    _file: File,
+    file: File,
 }
 
 impl Lock {
@@ -197,7 +197,7 @@ impl Lock {
         let inode = |metadata: fs::Metadata| metadata.ino();
         let own = file.metadata().map(inode).map_err(AugmentError::file(&path))?;
         match fs::metadata(&path).map(inode) {
-            Ok(there) if there == own => Ok(Self { path, _file: file }),
+            Ok(there) if there == own => Ok(Self { path, file }),
             _ => Err(in_use()),
         }
     }
@@ -207,6 +207,8 @@ impl Drop for Lock {
     fn drop(&mut self) {
         // If it cannot be removed, the next run locks it.
         let _ = fs::remove_file(&self.path);
+        // A process that another thread is starting may have a copy of the file, which would hold the lock.
+        let _ = self.file.unlock();
     }
 }
 

@@ -1,13 +1,17 @@
 //! Commits: put part by part, published at once, rebased, refused, rolled back.
 
 use std::collections::BTreeSet;
+use std::process::Command;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
 
 use wildcity_scene::geo::{GeoAnchor, ProjectedOrigin};
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{Gaussians, Manifest, RecordFormat, RenderProfile, Trajectory};
+use wildcity_twin::store::disk::{Disk, Wait};
 use wildcity_twin::store::{
-    Catalog, CellDiff, CellSize, Commit, CommitKind, NewVersion, StorageOptions, StoreError,
-    Version, VersionChange, VersionSettings,
+    Catalog, CellDiff, CellSize, Commit, CommitKind, NewVersion, RealDisk, StorageOptions,
+    StoreError, Version, VersionChange, VersionSettings,
 };
 
 use crate::scene_files::gaussians;
@@ -522,4 +526,25 @@ fn scattered_gaussians_are_refused() {
     commit.put(&few, None, &mut |_, _| {}).unwrap();
     drop(commit);
     assert!(catalog.twins().unwrap().twins.is_empty());
+}
+
+/// A process that begins while a lock is held has a copy of the locked file until its program runs.
+#[test]
+fn a_lock_ends_with_its_holder_while_other_processes_begin() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("lock");
+    let ended = AtomicBool::new(false);
+    thread::scope(|scope| {
+        scope.spawn(|| {
+            for _ in 0..500 {
+                assert!(Command::new("true").status().unwrap().success());
+            }
+            ended.store(true, Ordering::Relaxed);
+        });
+        while !ended.load(Ordering::Relaxed) {
+            drop(RealDisk.lock(&path, Wait::Yes).unwrap());
+            let lock = RealDisk.lock(&path, Wait::No).unwrap();
+            assert!(lock.is_some(), "the lock outlived its holder");
+        }
+    });
 }

@@ -22,6 +22,7 @@ use crate::store::layout::{check_hash, is_hash};
 
 use super::RealDisk;
 use super::files::{WRITING, create_dirs, entries};
+use super::real_disk::LockedFile;
 
 /// A part gets a new modification time when it is used and the old one is older than this.
 const TOUCH_AFTER: Duration = Duration::from_secs(60);
@@ -128,6 +129,7 @@ impl DiskCache {
         if lock.try_lock().is_err() {
             return Ok(());
         }
+        let _lock = LockedFile(lock);
         let mut parts = Vec::new();
         for folder in entries(&RealDisk, &self.dir)? {
             let path = self.dir.join(&folder);

@@ -84,13 +84,25 @@ impl Disk for RealDisk {
         let file = open_regular(File::options().create(create).append(true), path)?;
         if wait == Wait::Yes {
             file.lock()?;
-            return Ok(Some(Lock::held_by(file)));
+            return Ok(Some(Lock::held_by(LockedFile(file))));
         }
         match file.try_lock() {
-            Ok(()) => Ok(Some(Lock::held_by(file))),
+            Ok(()) => Ok(Some(Lock::held_by(LockedFile(file)))),
             Err(TryLockError::WouldBlock) => Ok(None),
             Err(TryLockError::Error(error)) => Err(error),
         }
+    }
+}
+
+/// A locked file, until it is dropped.
+#[derive(Debug)]
+pub(super) struct LockedFile(pub(super) File);
+
+impl Drop for LockedFile {
+    /// Closing the file is not enough: a process that another thread starts at this moment has a
+    /// copy of it until its program begins, and a lock ends with the last copy.
+    fn drop(&mut self) {
+        let _ = self.0.unlock();
     }
 }
 
