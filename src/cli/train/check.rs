@@ -15,13 +15,17 @@ use crate::cli::progress;
 /// Compare the gradients of every backend on this machine with their definition.
 ///
 /// The backends are cpu, and gpu if there is a hardware device or --device names one. The
-/// definition is the reference backend, which computes in f64 and is judged by its own differences.
-/// A row is one scene: streets by every kind of camera, and extremes such as needles and a thousand
-/// layers. A number is the largest difference of a derivative, as a share of the largest one by
-/// these parameters (of rotations, at least a hundredth of that by sizes: a ball has none). In the
-/// row "raster" scale is by the inverse covariance, and sh by the colour. With vectors that others
-/// computed, the reference and the backends are compared with these, too. Ends with 1 if a bound is
-/// exceeded.
+/// definition is the reference backend, which computes in f64; the tests of the
+/// project compare its derivatives with finite differences. A row is one scene: streets by every
+/// kind of camera, and extremes such as needles and a thousand layers.
+///
+/// A number is the largest error among the derivatives by one group of parameters, divided by the
+/// largest of these derivatives. (Those by rotations may all be 0, as for balls: they are divided
+/// by at least a hundredth of the largest by sizes.) In the row "raster", scale stands for the
+/// inverse covariance and sh for the colour.
+///
+/// With vectors that PyTorch computed, the reference and the backends are compared with these, too.
+/// The command ends with 1 if a bound is exceeded.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(in crate::cli) struct Check {

@@ -5,20 +5,18 @@ use std::io::{self, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
-use image::imageops::{self, FilterType};
-use image::{ImageBuffer, Rgb};
 
 use glam::DVec3;
-use wildcity_eval::images::{ImageList, RealImage, picture};
-use wildcity_render::View;
+use wildcity_eval::images::ImageList;
 use wildcity_render::gradient::Differentiate;
 use wildcity_scene::RenderProfile;
 use wildcity_scene::random::Random;
-use wildcity_train::run::{Line, TrainingImage, TrainingImages, run};
+use wildcity_train::run::{Line, TrainingImages, run};
 use wildcity_train::settings::Settings;
 use wildcity_train::start::{Point, gaussians_from_points};
 use wildcity_twin::ingest::{capture, write_ply};
 
+use super::images::ListedImages;
 use crate::cli::backend_options::HardwareOptions;
 use crate::cli::{output, progress};
 
@@ -62,12 +60,12 @@ pub(super) struct TrainScene {
     #[arg(long, value_name = "FRACTION", default_value_t = 1.0, value_parser = fraction)]
     size: f64,
 
-    /// Keep every so-manieth image, in the order of their names, from training, to judge the
-    /// result; 0 keeps none.
+    /// Hold out one image of N, in the order of their names: the scene is not trained on it but
+    /// judged by it. 0 holds out none.
     #[arg(long, value_name = "N", default_value_t = 8)]
     held_out_every: usize,
 
-    /// Of the order of images and of all random numbers: the same seed and images give the same
+    /// Seed of all random numbers and of the order of images: the same seed and images give the same
     /// file [default: that of --settings, or 0]
     #[arg(long)]
     seed: Option<u64>,
@@ -92,13 +90,6 @@ fn fraction(text: &str) -> Result<f64, String> {
     }
 }
 
-/// Images of a list, at a fraction of their size.
-struct Listed<'a> {
-    images: Vec<&'a RealImage>,
-    size: f64,
-    held_out_every: usize,
-}
-
 impl TrainScene {
     pub(super) fn run(self) -> anyhow::Result<()> {
         // clap requires both.
@@ -112,17 +103,13 @@ impl TrainScene {
             writeln!(io::stderr(), "warning: {warning}")?;
         }
         let mut points = self.points(source)?;
-        if points.len() > settings.growth.cap {
-            let all = points.len();
-            let mut random = Random::new(settings.seed, "points", 0);
-            for k in (1..all).rev() {
-                points.swap(k, random.below(k + 1));
-            }
-            points.truncate(settings.growth.cap);
+        let all = points.len();
+        if all > settings.growth.cap {
+            choose(&mut points, settings.growth.cap, settings.seed);
             writeln!(io::stderr(), "{} of {all} points are chosen: --cap", points.len())?;
         }
-        let images =
-            Listed { images: list.every(1), size: self.size, held_out_every: self.held_out_every };
+        let Self { size, held_out_every, .. } = self;
+        let images = ListedImages { images: list.every(1), size, held_out_every };
         // Every image is looked at before a long run finds one that is missing.
         for index in 0..images.count() {
             let file = &images.images[index].file;
@@ -155,13 +142,7 @@ impl TrainScene {
             }
             // A log has no bar.
             if line.step.is_multiple_of(every) && !io::stderr().is_terminal() {
-                let Line { step, l1, gaussians, seconds, .. } = line;
-                let db = line.held_out_db.map_or(String::new(), |db| format!(", {db:.2} dB"));
-                let said = writeln!(
-                    io::stderr(),
-                    "step {step}: l1 {l1:.4}, {gaussians} Gaussians, {seconds:.0} s{db}"
-                );
-                failed = said.err().map(anyhow::Error::from);
+                failed = log(line).err().map(anyhow::Error::from);
             }
             let written = lines.as_mut().map_or(Ok(()), |lines| lines.write(line));
             failed = failed.take().or(written.err());
@@ -238,6 +219,21 @@ impl TrainScene {
     }
 }
 
+/// Keeps as many points as `count`, at random.
+fn choose(points: &mut Vec<Point>, count: usize, seed: u64) {
+    let mut random = Random::new(seed, "points", 0);
+    for k in (1..points.len()).rev() {
+        points.swap(k, random.below(k + 1));
+    }
+    points.truncate(count);
+}
+
+fn log(line: &Line) -> io::Result<()> {
+    let Line { step, l1, gaussians, seconds, .. } = line;
+    let db = line.held_out_db.map_or(String::new(), |db| format!(", {db:.2} dB"));
+    writeln!(io::stderr(), "step {step}: l1 {l1:.4}, {gaussians} Gaussians, {seconds:.0} s{db}")
+}
+
 /// Checks, before a long run, that its file can be written.
 fn check_out(out: &Path) -> anyhow::Result<()> {
     let out_name = out.display();
@@ -271,62 +267,6 @@ fn listed_points(source: &Path) -> anyhow::Result<PathBuf> {
     }
     // The folder of a bare name is the current one.
     Ok(if folder.as_os_str().is_empty() { PathBuf::from(".") } else { folder.to_owned() })
-}
-
-impl TrainingImages for Listed<'_> {
-    fn count(&self) -> usize {
-        self.images.len()
-    }
-
-    fn is_held_out(&self, index: usize) -> bool {
-        self.held_out_every > 0 && index.is_multiple_of(self.held_out_every)
-    }
-
-    fn load(&self, index: usize) -> Result<TrainingImage, String> {
-        self.decode(self.images[index]).map_err(|error| format!("{error:#}"))
-    }
-}
-
-impl Listed<'_> {
-    fn decode(&self, image: &RealImage) -> anyhow::Result<TrainingImage> {
-        let background = RenderProfile::default().background;
-        let (mut rgb8, mut camera) = picture::real(&image.file, &image.camera, background)?;
-        let own_px = [camera.width_px, camera.height_px];
-        let file = image.mask.as_deref();
-        let mut mask = file.map(|file| picture::mask(file, own_px)).transpose()?;
-        let is_empty = mask.as_ref().is_some_and(|mask| !mask.contains(&true));
-        ensure!(
-            !is_empty,
-            "the mask {} leaves no pixel: dark pixels do not count",
-            file.unwrap_or(Path::new("")).display()
-        );
-        if self.size < 1.0 {
-            let [width, height] =
-                own_px.map(|px| ((f64::from(px) * self.size).round() as u32).max(1));
-            camera = camera.scaled(width.into(), height.into())?;
-            let whole: ImageBuffer<Rgb<u8>, Vec<u8>> =
-                ImageBuffer::from_raw(own_px[0], own_px[1], rgb8).context("an image's size")?;
-            rgb8 = imageops::resize(&whole, width, height, FilterType::Triangle).into_raw();
-            // A pixel counts if the one at its middle does.
-            mask = mask.map(|mask| {
-                let at = |px: u32, size: u32, own: u32| {
-                    ((f64::from(px) + 0.5) * f64::from(own) / f64::from(size)) as usize
-                };
-                let pixel = |y: u32, x: u32| {
-                    let row = at(y, height, own_px[1]) * own_px[0] as usize;
-                    mask[row + at(x, width, own_px[0])]
-                };
-                (0..height)
-                    .flat_map(|y| (0..width).map(move |x| (y, x)))
-                    .map(|(y, x)| pixel(y, x))
-                    .collect()
-            });
-        }
-        // Photographs of this size: what they are trained as.
-        camera.native_size_px = None;
-        let view = View::new(camera, image.world_from_camera);
-        Ok(TrainingImage { view, rgb8, mask })
-    }
 }
 
 /// The file of `--lines`.

@@ -1,0 +1,71 @@
+//! The images of a capture as a run of training reads them.
+
+use std::path::Path;
+
+use anyhow::{Context, ensure};
+use image::imageops::{self, FilterType};
+use image::{ImageBuffer, Rgb};
+
+use wildcity_eval::images::{RealImage, picture};
+use wildcity_render::View;
+use wildcity_scene::RenderProfile;
+use wildcity_train::run::{TrainingImage, TrainingImages};
+
+/// Images of a list, at a fraction of their size.
+pub(super) struct ListedImages<'a> {
+    pub(super) images: Vec<&'a RealImage>,
+    pub(super) size: f64,
+    pub(super) held_out_every: usize,
+}
+
+impl TrainingImages for ListedImages<'_> {
+    fn count(&self) -> usize {
+        self.images.len()
+    }
+
+    fn is_held_out(&self, index: usize) -> bool {
+        self.held_out_every > 0 && index.is_multiple_of(self.held_out_every)
+    }
+
+    fn load(&self, index: usize) -> Result<TrainingImage, String> {
+        self.decode(self.images[index]).map_err(|error| format!("{error:#}"))
+    }
+}
+
+impl ListedImages<'_> {
+    fn decode(&self, image: &RealImage) -> anyhow::Result<TrainingImage> {
+        let background = RenderProfile::default().background;
+        let (mut rgb8, mut camera) = picture::real(&image.file, &image.camera, background)?;
+        let own_px = [camera.width_px, camera.height_px];
+        let mut mask = image.mask.as_deref().map(|file| read_mask(file, own_px)).transpose()?;
+        if self.size < 1.0 {
+            let small_px = own_px.map(|px| ((f64::from(px) * self.size).round() as u32).max(1));
+            camera = camera.scaled(small_px[0].into(), small_px[1].into())?;
+            let whole: ImageBuffer<Rgb<u8>, Vec<u8>> =
+                ImageBuffer::from_raw(own_px[0], own_px[1], rgb8).context("an image's size")?;
+            let small = imageops::resize(&whole, small_px[0], small_px[1], FilterType::Triangle);
+            rgb8 = small.into_raw();
+            mask = mask.map(|mask| shrink(&mask, own_px, small_px));
+        }
+        // The scene is trained at this size: no filter of a larger native size is part of it.
+        camera.native_size_px = None;
+        let view = View::new(camera, image.world_from_camera);
+        Ok(TrainingImage { view, rgb8, mask })
+    }
+}
+
+fn read_mask(file: &Path, size_px: [u32; 2]) -> anyhow::Result<Vec<bool>> {
+    let mask = picture::mask(file, size_px)?;
+    let name = file.display();
+    ensure!(mask.contains(&true), "the mask {name} leaves no pixel: dark pixels do not count");
+    Ok(mask)
+}
+
+/// A mask at a smaller size: a pixel counts if the one at its middle does.
+fn shrink(mask: &[bool], own_px: [u32; 2], small_px: [u32; 2]) -> Vec<bool> {
+    let at = |axis: usize, px: u32| {
+        ((f64::from(px) + 0.5) * f64::from(own_px[axis]) / f64::from(small_px[axis])) as usize
+    };
+    let row = |y: u32| &mask[at(1, y) * own_px[0] as usize..][..own_px[0] as usize];
+    (0..small_px[1]).flat_map(|y| (0..small_px[0]).map(move |x| row(y)[at(0, x)])).collect()
+}
