@@ -1,4 +1,4 @@
-// Gradients, stage rasterize: one workgroup per tile walks the tile's splats from front to back once more, as
+// Gradients, stage rasterize, for a run of macro tiles: one workgroup per tile walks the tile's splats from front to back once more, as
 // `rasterize.wgsl` drew them, and sums for each of them over the tile's pixels what its gradients need. The formulas are
 // in `src/render/gradient/mod.rs`. Twin of `src/render/cpu/blend_gradient.rs`.
 //
@@ -9,22 +9,23 @@
 #import constants
 #import layout
 #import math
+#import macro_tile
 #import splat_batch
 #import tile_blocks
 #import four_pixels
 #import splat_sums
 
 @group(0) @binding(0) var<uniform> frame: Frame;
-@group(0) @binding(1) var<uniform> span: Span;
+@group(0) @binding(1) var<uniform> run: MacroRun;
 @group(0) @binding(2) var<storage, read> ranges: array<vec2u>;
 @group(0) @binding(3) var<storage, read> instance_splats: array<u32>;
 @group(0) @binding(4) var<storage, read> shapes: array<SplatShape>;
 @group(0) @binding(5) var<storage, read> colors: array<SplatColor>;
-// For each tile of the span, planes of 256 values: the derivatives by red, green, blue and the sum of depths, and the
+// For each tile of the page, planes of 256 values: the derivatives by red, green, blue and the sum of depths, and the
 // change of the loss with everything: the sum of weights times (rgb · v_rgb + depth v_depth), minus T_end v_opacity.
 @group(0) @binding(6) var<storage, read> derivatives: array<vec4f>;
-// For each instance, ten sums in the order of `SplatSums`.
-@group(0) @binding(7) var<storage, read_write> instance_sums: array<f32>;
+// Ten sums, in the order of `SplatSums`, of each touch of the run and then of each instance.
+@group(0) @binding(7) var<storage, read_write> run_sums: array<f32>;
 
 const THREADS: u32 = TILE_PX * TILE_PX / 4;
 // Splats of a batch: one for each thread to load.
@@ -56,10 +57,13 @@ fn main(
     @builtin(local_invocation_index) thread: u32,
 ) {
     let index = group_index(group, groups);
-    if index >= span.count {
+    if index >= run.macro_tiles * TILES {
         return;
     }
-    let tile = span.first + index;
+    let tile = tile_at(run.first_macro_tile + index / TILES, index % TILES);
+    if tile == frame.tiles || (run.tiles & (1u << (index % TILES))) == 0u {
+        return;
+    }
     let view = frame.view[tile_view(tile)];
     let corner = tile_corner(tile, view);
     let first_pixel = thread_pixel(thread);
@@ -68,7 +72,7 @@ fn main(
         begin_batches();
     }
     workgroupBarrier();
-    let plane = index * 5u * PLANE + (first_pixel.y * TILE_PX + first_pixel.x) / 4u;
+    let plane = (tile - run.first_tile) * 5u * PLANE + (first_pixel.y * TILE_PX + first_pixel.x) / 4u;
     by_red = derivatives[plane];
     by_green = derivatives[plane + PLANE];
     by_blue = derivatives[plane + 2u * PLANE];
@@ -79,20 +83,23 @@ fn main(
     if done {
         atomicAdd(&done_count, 1u);
     }
-    let range = ranges[tile];
+    let range = ranges[tile] - run.first_instance;
     for (var first = range.x; first < range.y; first += BATCH) {
-        // End when all threads are done. The sums of the splats behind are 0 already.
+        // End when all threads are done: the sums of the splats behind are 0.
         workgroupBarrier();
         if thread == 0u {
             done_threads = atomicLoad(&done_count);
         }
         if workgroupUniformLoad(&done_threads) == THREADS {
+            for (var i = first * SUMS + thread; i < range.y * SUMS; i += THREADS) {
+                run_sums[run.touches * SUMS + i] = 0.0;
+            }
             break;
         }
         let count = min(range.y - first, BATCH);
         var blocks = 0u;
         if thread < count {
-            let splat = instance_splats[first + thread];
+            let splat = instance_splats[run.first_instance + first + thread];
             let shape = shapes[splat];
             store_splat(thread, shape, colors[splat]);
             blocks = reached_blocks(shape, corner);
@@ -107,7 +114,7 @@ fn main(
             done = walk(part, 3u, at_px, thread, done);
             workgroupBarrier();
             if thread < PART * SUMS && part + thread / SUMS < count {
-                instance_sums[(first + part) * SUMS + thread] = block_sum(thread * THREADS, splat_blocks[part + thread / SUMS]);
+                run_sums[(run.touches + first + part) * SUMS + thread] = block_sum(thread * THREADS, splat_blocks[part + thread / SUMS]);
             }
             workgroupBarrier();
         }

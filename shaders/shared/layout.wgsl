@@ -117,6 +117,19 @@ struct Span {
     count: u32,
 }
 
+struct MacroRun {
+    first_macro_tile: u32,
+    macro_tiles: u32,
+    tiles: u32,
+    continues: u32,
+    first_touch: u32,
+    touches: u32,
+    first_instance: u32,
+    first_batch: u32,
+    batches: u32,
+    first_tile: u32,
+}
+
 struct Job {
     length: u32,
     groups: array<u32, 3>,

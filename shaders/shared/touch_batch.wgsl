@@ -1,7 +1,6 @@
 // Batches of the touches of macro tiles, and the indices of the instances that each touch stands for. The importing
-// shader declares `frame`, `macro_ranges`, `touch_masks`, `first_batches` and `offsets`.
+// shader imports `macro_tile`, and declares `frame`, `macro_ranges`, `touch_masks`, `first_batches` and `offsets`.
 
-const TILES: u32 = MACRO_COLUMNS * MACRO_ROWS;
 const BATCH_WORDS: u32 = EXPAND_BATCH / 32;
 
 // A batch of touches of a macro tile.

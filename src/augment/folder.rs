@@ -207,7 +207,8 @@ impl Drop for Lock {
     fn drop(&mut self) {
         // If it cannot be removed, the next run locks it.
         let _ = fs::remove_file(&self.path);
-        // A process that another thread is starting may have a copy of the file, which would hold the lock.
+        // A process that another thread is starting may have a copy of the file, which would hold
+        // the lock.
         let _ = self.file.unlock();
     }
 }

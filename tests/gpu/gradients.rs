@@ -1,11 +1,14 @@
 //! Gradients of the gpu backend against `reference`, and that they repeat.
 
-use wildcity_render::Frame;
+use glam::DVec3;
 use wildcity_render::compare::gradients::{GroupError, by_group, group_errors, waves};
 use wildcity_render::compare::images::render_images;
+use wildcity_render::gpu::Gpu;
 use wildcity_render::gpu::shaders::Shaders;
 use wildcity_render::gradient::{Differentiate, GradientError, Gradients};
 use wildcity_render::reference::Reference;
+use wildcity_render::{Frame, View};
+use wildcity_scene::chunk::{CLUSTER, columns};
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::geometry::camera::ShutterDirection;
 use wildcity_scene::{RenderProfile, Scene};
@@ -14,6 +17,7 @@ use crate::gpu::{bindings, gpu, gpu_with, gpu_with_limits};
 use crate::gradient_cases::{
     check_actors, check_lenses, check_pinholes, check_refusals, differentiate, mutation_case,
 };
+use crate::images::view_along;
 use crate::lenses::{lenses, rolling_view};
 use crate::shared_gpu;
 use crate::streets::{street, turning_views};
@@ -54,6 +58,67 @@ fn a_frame_that_does_not_fit_the_device_is_refused() {
     assert!(differ(&Scene::from_gaussians(&street(50, 0, 12))).is_ok());
 }
 
+/// A frame is summed in runs of macro tiles. Small bindings make them shorter, and divide the macro
+/// tile where the street meets the horizon.
+#[test]
+fn gradients_do_not_depend_on_the_runs_of_macro_tiles() {
+    // Opaque and large, so that tiles end before their last splat.
+    let mut street = street(3_500, 0, 12);
+    street.logit_opacities.fill(6.0);
+    street.ln_scales.iter_mut().flatten().for_each(|ln_scale| *ln_scale += 3.0);
+    let scene = Scene::from_gaussians(&street);
+    let profile = RenderProfile::default();
+    let mut views = turning_views()[..2].to_vec();
+    views.push(along_the_street([120, 90]));
+    let frame = Frame { scene: &scene, profile: &profile, views: &views };
+    let differ = |gpu: &Gpu| {
+        let mut gradients = Gradients::default();
+        let mut differ = || {
+            let before = gpu.usage().unwrap().totals.dispatches;
+            gpu.differentiate(&frame, true, &mut |images| waves(images), &mut gradients).unwrap();
+            gpu.usage().unwrap().totals.dispatches - before
+        };
+        // Buffers grow in the first, which draws again.
+        differ();
+        let dispatches = differ();
+        (bits(&gradients), dispatches)
+    };
+    let (gradients, dispatches) = differ(&gpu());
+    let (of_small, dispatches_of_small) = differ(&gpu_with_limits(bindings(5 << 16)));
+    assert!(dispatches_of_small > dispatches, "{dispatches} {dispatches_of_small}");
+    assert!(of_small == gradients);
+}
+
+/// What gradients take on the device beside the frame, its pixels, and the gradients themselves.
+#[test]
+fn gradients_take_120_bytes_a_splat() {
+    let scene = Scene::from_gaussians(&street(300_000, 0, 12));
+    let profile = RenderProfile::default();
+    let views = [along_the_street([720, 464])];
+    let gpu = gpu();
+    let mut gradients = Gradients::default();
+    let mut differ = |scene: &Scene| {
+        let frame = Frame { scene, profile: &profile, views: &views };
+        gpu.differentiate(&frame, true, &mut |images| waves(images), &mut gradients).unwrap()
+    };
+    // The buffers of the pixels, and those of the frame.
+    differ(&Scene::from_gaussians(&street(1, 0, 12)));
+    render_images(&*gpu, &scene, &profile, &views).unwrap();
+    let allocated = || gpu.usage().unwrap().allocated_bytes.unwrap();
+    let before = allocated();
+    let stats = differ(&scene);
+    let taken = allocated() - before;
+    // Every cluster is seen: its values lie on the device and where the host reads them, and
+    // buffers grow by a quarter more than they need.
+    assert_eq!(stats.visible_pairs, 300_000);
+    let clusters: usize = scene.chunks.iter().map(|chunk| chunk.len().div_ceil(CLUSTER)).sum();
+    let values = 2 * 5 * (CLUSTER * columns(0) * clusters) as u64;
+    let each = (taken as f64 - values as f64) / stats.visible_pairs as f64;
+    eprintln!("{each}");
+    assert!(each > 44.0, "{each} B a splat cannot be all");
+    assert!(each <= 120.0, "{each} B a splat");
+}
+
 #[test]
 fn gradients_repeat_to_the_byte() {
     let scene = Scene::from_gaussians(&street(20_000, 1, 12));
@@ -68,13 +133,24 @@ fn gradients_repeat_to_the_byte() {
     let mut differ = || {
         let frame = Frame { scene: &scene, profile: &profile, views: &views };
         gpu.differentiate(&frame, true, &mut |images| waves(images), &mut gradients).unwrap();
-        let bits = |(_, values): (_, Vec<f64>)| values.into_iter().map(f64::to_bits);
-        by_group(&gradients).into_iter().flat_map(bits).collect::<Vec<u64>>()
+        bits(&gradients)
     };
     let first = differ();
     for repeat in 0..20 {
         assert!(differ() == first, "repeat {repeat}");
     }
+}
+
+/// A view of a whole street: most of it is in one macro tile.
+fn along_the_street(size_px: [u32; 2]) -> View {
+    let from = DVec3::new(0.0, 0.0, -20.0);
+    let focal_px = f64::from(size_px[0]) / 2.4;
+    view_along(size_px, focal_px, from, DVec3::Z, DVec3::Y)
+}
+
+fn bits(gradients: &Gradients) -> Vec<u64> {
+    let bits = |(_, values): (_, Vec<f64>)| values.into_iter().map(f64::to_bits);
+    by_group(gradients).into_iter().flat_map(bits).collect()
 }
 
 #[test]

@@ -105,6 +105,10 @@ fn layouts_are_the_same() {
         ClusterView { line, chunk_view }
         Owner { cluster_view, instance }
         Span { first, count }
+        MacroRun {
+            first_macro_tile, macro_tiles, tiles, continues, first_touch, touches, first_instance,
+            first_batch, batches, first_tile,
+        }
         Job { length, groups }
         JobSlot { job, pad }
         Counters { splats, touches, instances }

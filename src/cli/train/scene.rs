@@ -65,8 +65,8 @@ pub(super) struct TrainScene {
     #[arg(long, value_name = "N", default_value_t = 8)]
     held_out_every: usize,
 
-    /// Seed of all random numbers and of the order of images: the same seed and images give the same
-    /// file [default: that of --settings, or 0]
+    /// Seed of all random numbers and of the order of images: the same seed and images give the
+    /// same file [default: that of --settings, or 0]
     #[arg(long)]
     seed: Option<u64>,
 

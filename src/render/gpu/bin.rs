@@ -44,7 +44,7 @@ pub(super) struct Bin {
     /// For each touch, one bit for each touched tile of the macro tile.
     touch_masks: [GrowableBuffer; 2],
     /// Range of each macro tile's touches.
-    macro_ranges: GrowableBuffer,
+    pub(super) macro_ranges: GrowableBuffer,
     /// For each macro tile, the index of its first batch of touches.
     first_batches: GrowableBuffer,
     /// For each tile of each batch of touches, the index of its first instance.

@@ -1,5 +1,6 @@
 //! Compute kernels (compiled entry points of shaders), and the passes that run them.
 
+use bytemuck::NoUninit;
 use parking_lot::Mutex;
 use wgpu::{
     BindGroup, BindGroupDescriptor, BindGroupEntry, BindGroupLayout, BindingResource, Buffer,
@@ -10,7 +11,7 @@ use wgpu::{
 };
 
 use super::device::Device;
-use super::layout::{Job, JobSlot, MAX_GROUPS, Span};
+use super::layout::{Job, JobSlot, MAX_GROUPS};
 
 /// One entry point of a shader, with its override constants set.
 #[derive(Debug)]
@@ -188,12 +189,12 @@ pub(super) fn slot_binding(buffer: &Buffer, slot: u64, bytes: usize) -> BindingR
     })
 }
 
-/// The content of a buffer with one span per slot.
-pub(super) fn span_slots(spans: impl Iterator<Item = Span>) -> Vec<u8> {
+/// The content of a buffer with one value per slot.
+pub(super) fn slots(values: impl Iterator<Item = impl NoUninit>) -> Vec<u8> {
     let mut bytes = Vec::new();
-    for span in spans {
+    for value in values {
         let end = bytes.len() + SLOT_BYTES as usize;
-        bytes.extend_from_slice(bytemuck::bytes_of(&span));
+        bytes.extend_from_slice(bytemuck::bytes_of(&value));
         bytes.resize(end, 0);
     }
     bytes

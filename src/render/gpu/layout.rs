@@ -374,6 +374,30 @@ pub struct Span {
     pub count: u32,
 }
 
+/// Macro tiles whose gradients are summed at a time (40 bytes). Touches, instances and batches are
+/// those of the frame in the order of their macro tiles.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, Pod, Zeroable)]
+pub struct MacroRun {
+    /// Index of the first macro tile among those of all views.
+    pub first_macro_tile: u32,
+    pub macro_tiles: u32,
+    /// One bit for each tile of a macro tile that is summed.
+    pub tiles: u32,
+    /// 1 if the sums of the touches are those of another run, to be added to, else 0.
+    pub continues: u32,
+    /// Index of the first touch.
+    pub first_touch: u32,
+    pub touches: u32,
+    /// Index of the first instance.
+    pub first_instance: u32,
+    /// Index of the first batch of [`EXPAND_BATCH`] touches.
+    pub first_batch: u32,
+    pub batches: u32,
+    /// Index of the first tile of the page of derivatives by pixels.
+    pub first_tile: u32,
+}
+
 /// Number of elements that a stage processes, and the workgroups of its indirect dispatch (16
 /// bytes).
 #[repr(C)]

@@ -18,7 +18,7 @@ use wgpu::{BindingResource, Buffer, BufferUsages, ComputePass, ShaderModule};
 
 use super::device::Device;
 use super::growable_buffer::{GrowableBuffer, INTERMEDIATE};
-use super::kernel::{Groups, Kernel, LazyShader, slot_binding, span_slots};
+use super::kernel::{Groups, Kernel, LazyShader, slot_binding, slots};
 use super::layout::{ChunkView, Span, SplatColor, SplatShape};
 use super::lens::Lenses;
 use super::mirror::Mirror;
@@ -150,7 +150,7 @@ impl Project {
 
     /// Uploads the work of a region.
     pub(super) fn upload(&mut self, device: &Device, work: &ProjectWork) {
-        let spans = span_slots(work.dispatches.iter().map(|dispatch| dispatch.span));
+        let spans = slots(work.dispatches.iter().map(|dispatch| dispatch.span));
         self.cluster_views.fill(device, bytemuck::cast_slice(&work.cluster_views));
         self.page_cluster_views.fill(device, bytemuck::cast_slice(&work.page_cluster_views));
         self.chunk_views.fill(device, bytemuck::cast_slice(&work.chunk_views));

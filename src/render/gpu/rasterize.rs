@@ -16,7 +16,7 @@ use super::background::{Background, BackgroundShader};
 use super::bin::Bin;
 use super::device::Device;
 use super::growable_buffer::GrowableBuffer;
-use super::kernel::{Groups, Kernel, LazyShader, slot_binding, span_slots};
+use super::kernel::{Groups, Kernel, LazyShader, slot_binding, slots};
 use super::layout::{Owner, Span};
 use super::lens::Lenses;
 use super::long_tiles::LongTiles;
@@ -217,7 +217,7 @@ impl Rasterize {
         }
         let spans = pages(tiles, *tiles_per_page)
             .map(|(_, tiles)| Span { first: tiles.start, count: tiles.len() as u32 });
-        self.spans.fill(device, &span_slots(spans));
+        self.spans.fill(device, &slots(spans));
         if let Some(long_tiles) = &mut self.long_tiles {
             long_tiles.run(device, pass, (plan, splats, bin), frame_tiles, *planes);
         }

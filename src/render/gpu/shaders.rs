@@ -112,6 +112,7 @@ const FILES: &[(&str, &str)] = &[
     ("layout", include_str!("../../../shaders/shared/layout.wgsl")),
     ("lens", include_str!("../../../shaders/lens.wgsl")),
     ("long_tiles", include_str!("../../../shaders/long_tiles.wgsl")),
+    ("macro_tile", include_str!("../../../shaders/shared/macro_tile.wgsl")),
     ("math", include_str!("../../../shaders/shared/math.wgsl")),
     ("no_actors", include_str!("../../../shaders/shared/no_actors.wgsl")),
     ("no_instances", include_str!("../../../shaders/shared/no_instances.wgsl")),

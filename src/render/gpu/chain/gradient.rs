@@ -13,10 +13,11 @@ use super::{Chain, CurrentFrame, Source, add_time};
 use crate::actor_views::ActorViews;
 use crate::gpu::device::Device;
 use crate::gpu::gradient::{
-    BackwardInputs, GradientClusters, GradientStages, HostSplats, back_project, images, pack,
+    BackwardInputs, GradientClusters, GradientStages, HostSplats, MacroRuns, back_project, images,
+    pack,
 };
 use crate::gpu::kernel::Recorder;
-use crate::gpu::layout::{Counters, FrameView, RASTER_BATCH, SplatShape};
+use crate::gpu::layout::{FrameView, RASTER_BATCH, SplatShape};
 use crate::gpu::partition::TileRows;
 use crate::gpu::project_work::{ProjectWork, Projection};
 use crate::gpu::read_back::ReadBack;
@@ -36,7 +37,8 @@ struct Drawn<'a> {
     current: CurrentFrame,
     work: ProjectWork,
     clusters: GradientClusters,
-    counters: Counters,
+    runs: MacroRuns,
+    splat_count: u32,
 }
 
 impl Chain {
@@ -53,7 +55,26 @@ impl Chain {
         gradients: &mut Gradients,
         pool: &ThreadPool,
     ) -> Result<FrameStats, GradientError> {
-        let (mut drawn, images) = self.draw_for_gradients(frame, depth, pool)?;
+        let stages = self.gradient.take();
+        let mut stages = stages.unwrap_or_else(|| GradientStages::new(&self.device));
+        let done = self.differentiate_in(&mut stages, frame, depth, loss, gradients, pool);
+        // After a failure of the device they are not used again: some buffers may still be mapped.
+        if !matches!(done, Err(GradientError::Render(_))) {
+            self.gradient = Some(stages);
+        }
+        done
+    }
+
+    fn differentiate_in(
+        &mut self,
+        stages: &mut GradientStages,
+        frame: &Frame<'_>,
+        depth: bool,
+        loss: LossGradient<'_>,
+        gradients: &mut Gradients,
+        pool: &ThreadPool,
+    ) -> Result<FrameStats, GradientError> {
+        let (mut drawn, images) = self.draw_for_gradients(stages, frame, depth, pool)?;
         let start = Instant::now();
         let mut by_images = loss(&images);
         check_sizes(frame, depth, &mut by_images)?;
@@ -65,18 +86,13 @@ impl Chain {
         let start = Instant::now();
         let views = &drawn.current.parameters.view[..frame.views.len()];
         let derivatives = pool.install(|| pack(views, &images, &by_images));
-        // After a failure they are not used again: some may still be mapped.
-        let stages = self.gradient.take();
-        let mut stages = stages.unwrap_or_else(|| GradientStages::new(&self.device));
-        stages.upload_derivatives(&self.device, &derivatives);
+        stages.upload_derivatives(&self.device, &drawn.runs, &derivatives);
         add_time(&mut drawn.current.stats, "upload", start.elapsed());
 
-        self.run_backwards(&mut stages, &mut drawn)?;
+        self.run_backwards(stages, &mut drawn)?;
         let start = Instant::now();
-        let delivered = self.deliver_gradients(&stages, &drawn, gradients, pool);
+        self.deliver_gradients(stages, &drawn, gradients, pool)?;
         stages.read_back.unmap();
-        self.gradient = Some(stages);
-        delivered?;
         add_time(&mut drawn.current.stats, "deliver", start.elapsed());
         Ok(drawn.current.stats)
     }
@@ -84,6 +100,7 @@ impl Chain {
     /// Draws the images of the Gaussians, and checks that their gradients fit the device.
     fn draw_for_gradients<'a>(
         &mut self,
+        stages: &mut GradientStages,
         frame: &'a Frame<'a>,
         depth: bool,
         pool: &ThreadPool,
@@ -102,16 +119,23 @@ impl Chain {
         };
         let needs = self.draw_region(Source::Gaussians(&work), tiles, &mut current)?;
         let head = current.read_back.head(&self.device)?;
+        if needs.min_regions(self.limit()) > 1 {
+            current.read_back.unmap();
+            return Err(memory);
+        }
         let clusters = GradientClusters::new(&work, frame.scene, &self.mirror);
-        let needed = GradientStages::needed_bytes(&head.counters, &clusters);
-        if needs.min_regions(self.limit()) > 1 || needed > self.device.binding_bytes() {
+        let splat_count = head.counters.splats;
+        let views = &current.parameters.view[..frame.views.len()];
+        let timestamps = self.timestamps.buffer();
+        let runs = stages.divide(&self.device, &self.bin, views, splat_count, timestamps)?;
+        let needed = GradientStages::needed_bytes(splat_count, &runs, &clusters);
+        if needed > self.device.binding_bytes() {
             current.read_back.unmap();
             return Err(memory);
         }
         let longest = u64::from(RASTER_BATCH) * u64::from(head.tile_counters.most_batches);
         self.check_loops(&current, longest).inspect_err(|_| current.read_back.unmap())?;
         let images = self.read_images(frame, &current, depth, pool)?;
-        let counters = head.counters;
         {
             let mut tally = self.tally.lock();
             tally.regions += 1;
@@ -120,7 +144,7 @@ impl Chain {
         current.read_back.unmap();
         let read_back = std::mem::replace(&mut current.read_back, ReadBack::new(&self.device));
         self.read_backs.give_back(read_back);
-        Ok((Drawn { frame, actors, current, work, clusters, counters }, images))
+        Ok((Drawn { frame, actors, current, work, clusters, runs, splat_count }, images))
     }
 
     /// Checks that no loop of the way back is longer than a software device can run. `longest` is
@@ -178,7 +202,7 @@ impl Chain {
         drawn: &mut Drawn<'_>,
     ) -> Result<(), RenderError> {
         let Self { device, plan, project, mirror, splats, bin, sorted, .. } = self;
-        let Drawn { current, work, clusters, counters, .. } = drawn;
+        let Drawn { current, work, clusters, runs, splat_count, .. } = drawn;
         let inputs = BackwardInputs {
             plan,
             project,
@@ -187,12 +211,11 @@ impl Chain {
             bin,
             sorted_splats: sorted.splats,
             sorted_touches: sorted.touches,
-            counters: *counters,
-            tiles: current.parameters.tiles,
+            splat_count: *splat_count,
         };
         let start = Instant::now();
         let mut recorder = Recorder::new(device, self.queries.clone());
-        stages.record(device, &mut recorder, inputs, work, clusters);
+        stages.record(device, &mut recorder, inputs, work, runs, clusters);
 
         let cluster_views = u64::from(work.cluster_views());
         let mut sources: Vec<(&Buffer, u64)> = vec![
@@ -202,7 +225,7 @@ impl Chain {
         ];
         // Splats only if the host projects some of them backwards.
         if has_lenses(work) {
-            let count = u64::from(counters.splats);
+            let count = u64::from(*splat_count);
             sources.extend([
                 (project.first_splats().buffer(), 4 * cluster_views),
                 (splats.shapes.buffer(), size_of::<SplatShape>() as u64 * count),

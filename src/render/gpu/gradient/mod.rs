@@ -8,26 +8,30 @@
 //! | gather | the sums of a splat's tiles (`gather.wgsl`) |
 //! | project backwards | from splats to Gaussians (`project_gradient.wgsl`), view by view |
 //!
+//! The third and fourth step alternate: one run of macro tiles after the other ([`macro_runs`]).
 //! Views of other cameras than static pinholes are projected backwards on the host, in f64, as the
 //! cpu backend does it ([`lens`]): a lens has no derivatives in WGSL.
 //!
 //! **The same input gives the same bytes** on one device: every sum has its place and its order,
 //! and nothing is added atomically.
 //!
-//! Beside the buffers of the frame there are 40 B for each (splat, tile) pair, 44 B for each
-//! (splat, macro tile) pair, 44 B for each splat, 20 B for each pixel, and 1 KiB for each column of
-//! each visible cluster. A frame must fit the device at once.
+//! Beside the buffers of the frame there are at most 116 B for each splat (but the touches of one
+//! macro tile with the instances of one of its tiles, and 1 MiB, may always be summed), 20 B for each pixel, and 1 KiB for each column of each
+//! visible cluster; and for lenses, 72 B of host memory for each splat. A frame must fit the device
+//! at once.
 //!
 //! Images and derivatives are those of the Gaussians of the mirror, whose colours are rounded to 16
 //! bits of the cluster's largest and whose rotations to 20.
 
 mod clusters;
 mod lens;
+mod macro_runs;
 mod pixels;
 mod stages;
 
 pub(super) use self::clusters::GradientClusters;
 pub(super) use self::lens::{HostSplats, back_project};
+pub(super) use self::macro_runs::MacroRuns;
 pub(super) use self::pixels::{images, pack};
 pub(super) use self::stages::{BackwardInputs, GradientStages};
 

@@ -1,25 +1,25 @@
 //! The kernels of the way back, and their buffers.
 
-use wgpu::{BindingResource, BufferUsages, ComputePass};
+use wgpu::{BindingResource, Buffer, BufferUsages, ComputePass};
 
 use super::GradientClusters;
+use super::macro_runs::{MacroRuns, Run, RunLimits, SUMS_BYTES};
 use super::pixels::TILE_DERIVATIVES;
+use crate::RenderError;
 use crate::gpu::bin::Bin;
 use crate::gpu::device::Device;
 use crate::gpu::growable_buffer::{GrowableBuffer, INTERMEDIATE};
-use crate::gpu::kernel::{Groups, Kernel, LazyShader, Recorder, module, slot_binding, span_slots};
-use crate::gpu::layout::{Counters, Span};
+use crate::gpu::kernel::{Groups, Kernel, LazyShader, Recorder, module, slot_binding, slots};
+use crate::gpu::layout::{FrameView, MACRO_COLUMNS, MACRO_ROWS, MacroRun};
 use crate::gpu::mirror::Mirror;
 use crate::gpu::plan::{Plan, job};
 use crate::gpu::project::{Project, SplatBuffers};
 use crate::gpu::project_work::ProjectWork;
-use crate::gpu::rasterize::pages;
 use crate::gpu::read_back::ReadBack;
-use crate::gradient::Partial;
 use wildcity_scene::chunk::CLUSTER;
 
-/// Bytes of the sums of a splat, a touch or an instance.
-const SUMS_BYTES: u64 = size_of::<Partial>() as u64;
+/// Bytes of the derivatives by the pixels of a tile.
+const TILE_BYTES: u64 = 4 * TILE_DERIVATIVES as u64;
 
 /// The kernels of the way back, and their buffers.
 #[derive(Debug)]
@@ -34,11 +34,12 @@ pub(in crate::gpu) struct GradientStages {
     project_actors: LazyShader<Kernel, 4>,
     /// The derivatives by the pixels of each tile, page by page.
     derivatives: Vec<GrowableBuffer>,
-    tile_spans: GrowableBuffer,
-    instance_sums: GrowableBuffer,
+    /// Runs of macro tiles.
+    runs: GrowableBuffer,
+    /// The sums of the touches of a run, then those of its instances.
+    run_sums: GrowableBuffer,
     ranks: GrowableBuffer,
     touch_ranks: GrowableBuffer,
-    touch_sums: GrowableBuffer,
     pub(in crate::gpu) splat_sums: GrowableBuffer,
     project_spans: GrowableBuffer,
     first_lines: GrowableBuffer,
@@ -47,6 +48,8 @@ pub(in crate::gpu) struct GradientStages {
     /// For each cluster view, the derivatives by the view's twist.
     pub(in crate::gpu) twists: GrowableBuffer,
     pub(in crate::gpu) read_back: ReadBack,
+    /// The ranges of touches and instances.
+    lists: ReadBack,
 }
 
 /// What the stages of the frame have left.
@@ -59,9 +62,7 @@ pub(in crate::gpu) struct BackwardInputs<'a> {
     pub(in crate::gpu) bin: &'a Bin,
     pub(in crate::gpu) sorted_splats: usize,
     pub(in crate::gpu) sorted_touches: usize,
-    pub(in crate::gpu) counters: Counters,
-    /// Tiles of the frame.
-    pub(in crate::gpu) tiles: u32,
+    pub(in crate::gpu) splat_count: u32,
 }
 
 impl GradientStages {
@@ -78,35 +79,76 @@ impl GradientStages {
             project: LazyShader::new("project_gradient"),
             project_actors: LazyShader::new("project_gradient_actors"),
             derivatives: Vec::new(),
-            tile_spans: GrowableBuffer::new(device, "gradient tile spans", uniform),
-            instance_sums: buffer("instance sums"),
+            runs: GrowableBuffer::new(device, "runs of macro tiles", uniform),
+            run_sums: buffer("sums of a run"),
             ranks: buffer("splat ranks"),
             touch_ranks: buffer("touch ranks"),
-            touch_sums: buffer("touch sums"),
             splat_sums: buffer("splat sums"),
             project_spans: GrowableBuffer::new(device, "gradient project spans", uniform),
             first_lines: buffer("first gradient lines"),
             lines: buffer("gradient lines"),
             twists: buffer("twists"),
             read_back: ReadBack::new(device),
+            lists: ReadBack::new(device),
         }
     }
 
+    /// Reads how many touches and instances each part of a frame has, and divides the frame.
+    ///
+    /// # Errors
+    /// The device fails.
+    pub(in crate::gpu) fn divide(
+        &mut self,
+        device: &Device,
+        bin: &Bin,
+        views: &[FrameView],
+        splats: u32,
+        timestamps: &Buffer,
+    ) -> Result<MacroRuns, RenderError> {
+        let last = views.last().map_or(0, |view| view.first_tile + view.columns * view.rows[1]);
+        let macro_rows = |view: &FrameView| view.rows[1].div_ceil(MACRO_ROWS);
+        let macro_tile =
+            |view: &FrameView| view.first_macro_tile + view.macro_columns * macro_rows(view);
+        let last_macro_tile = views.last().map_or(0, macro_tile);
+        let sources = [
+            (bin.macro_ranges.buffer(), 8 * u64::from(last_macro_tile)),
+            (bin.ranges.buffer(), 8 * u64::from(last)),
+        ];
+        let recorder = Recorder::new(device, None);
+        let (_, submission) = self.lists.submit(device, recorder, &sources, timestamps);
+        self.lists.map(device, submission)?;
+        let limits = RunLimits {
+            splats,
+            binding_bytes: device.binding_bytes(),
+            tiles_per_page: (device.binding_bytes() / TILE_BYTES).min(u32::MAX.into()) as u32,
+        };
+        let pages = self.lists.pages(device)?;
+        let [touches, instances] = [&pages[0], &pages[1]].map(|page| bytemuck::cast_slice(page));
+        let runs = MacroRuns::new(views, touches, instances, limits);
+        drop(pages);
+        self.lists.unmap();
+        Ok(runs)
+    }
+
     /// Bytes of the largest buffer that a frame needs.
-    pub(in crate::gpu) fn needed_bytes(counters: &Counters, clusters: &GradientClusters) -> u64 {
-        let Counters { splats, touches, instances } = *counters;
-        let most = splats.max(touches).max(instances);
-        (SUMS_BYTES * u64::from(most)).max(clusters.lines * 4 * CLUSTER as u64)
+    pub(in crate::gpu) fn needed_bytes(
+        splats: u32,
+        runs: &MacroRuns,
+        clusters: &GradientClusters,
+    ) -> u64 {
+        let most = u64::from(splats).max(runs.sums());
+        let lines = clusters.lines * 4 * CLUSTER as u64;
+        (SUMS_BYTES * most).max(lines).max(TILE_BYTES * runs.page_tiles())
     }
 
     /// Uploads the derivatives by the pixels of all tiles.
-    pub(in crate::gpu) fn upload_derivatives(&mut self, device: &Device, derivatives: &[f32]) {
-        let tiles = (derivatives.len() / TILE_DERIVATIVES) as u32;
-        let pages: Vec<_> = pages(&(0..tiles), Self::tiles_per_page(device)).collect();
-        let spans =
-            pages.iter().map(|(_, tiles)| Span { first: tiles.start, count: tiles.len() as u32 });
-        self.tile_spans.fill(device, &span_slots(spans));
-        for (page, tiles) in pages {
+    pub(in crate::gpu) fn upload_derivatives(
+        &mut self,
+        device: &Device,
+        runs: &MacroRuns,
+        derivatives: &[f32],
+    ) {
+        for (page, tiles) in runs.pages.iter().enumerate() {
             if page == self.derivatives.len() {
                 let buffer = GrowableBuffer::new(device, "derivatives by pixels", INTERMEDIATE);
                 self.derivatives.push(buffer);
@@ -116,11 +158,6 @@ impl GradientStages {
         }
     }
 
-    fn tiles_per_page(device: &Device) -> u32 {
-        let most = device.binding_bytes() / (4 * TILE_DERIVATIVES as u64);
-        most.min(u64::from(u32::MAX)) as u32
-    }
-
     /// Records the way back, after [`GradientStages::upload_derivatives`].
     pub(in crate::gpu) fn record(
         &mut self,
@@ -128,89 +165,111 @@ impl GradientStages {
         recorder: &mut Recorder,
         inputs: BackwardInputs<'_>,
         work: &ProjectWork,
+        runs: &MacroRuns,
         clusters: &GradientClusters,
     ) {
-        let Counters { splats, touches, instances } = inputs.counters;
-        self.instance_sums.reserve(device, SUMS_BYTES * u64::from(instances));
-        self.ranks.reserve(device, 4 * u64::from(splats));
-        self.touch_ranks.reserve(device, 4 * u64::from(touches));
-        self.touch_sums.reserve(device, SUMS_BYTES * u64::from(touches));
-        self.splat_sums.reserve(device, SUMS_BYTES * u64::from(splats));
+        let splats = u64::from(inputs.splat_count);
+        self.runs.fill(device, &slots(runs.runs.iter().map(|run| run.layout)));
+        self.run_sums.reserve(device, SUMS_BYTES * runs.sums());
+        self.ranks.reserve(device, 4 * splats);
+        self.touch_ranks.reserve(device, 4 * runs.touches());
+        self.splat_sums.reserve(device, SUMS_BYTES * splats);
         self.first_lines.fill(device, bytemuck::cast_slice(&clusters.first_lines()));
         self.lines.reserve(device, clusters.lines * 4 * CLUSTER as u64);
         self.twists.reserve(device, 24 * u64::from(work.cluster_views()));
-        let spans = span_slots(clusters.dispatches.iter().map(|dispatch| dispatch.span));
+        let spans = slots(clusters.dispatches.iter().map(|dispatch| dispatch.span));
         self.project_spans.fill(device, &spans);
-        // Splats behind the last one that a tile blends have no sums, and lines begin at 0.
-        for buffer in [&self.instance_sums, &self.lines, &self.twists] {
+        // Sums begin at 0.
+        for buffer in [&self.splat_sums, &self.lines, &self.twists] {
             recorder.encoder.clear_buffer(buffer.buffer(), 0, None);
         }
 
         let mut pass = recorder.stage("blend backwards");
-        self.blend(device, &mut pass, inputs);
-        drop(pass);
-        let mut pass = recorder.stage("gather");
-        self.gather(device, &mut pass, inputs);
+        self.rank(device, &mut pass, inputs);
+        for (index, run) in runs.runs.iter().enumerate() {
+            self.blend(device, &mut pass, inputs, index, run);
+            self.gather(device, &mut pass, inputs, index, run);
+        }
         drop(pass);
         let mut pass = recorder.stage("project backwards");
         self.project(device, &mut pass, inputs, clusters);
     }
 
-    fn blend(&self, device: &Device, pass: &mut ComputePass<'_>, inputs: BackwardInputs<'_>) {
-        let BackwardInputs { plan, splats, bin, tiles, .. } = inputs;
-        for (page, tiles) in pages(&(0..tiles), Self::tiles_per_page(device)) {
-            let span = slot_binding(self.tile_spans.buffer(), page as u64, size_of::<Span>());
-            let resources = [
-                (0, plan.frame().as_entire_binding()),
-                (1, span),
-                (2, bin.ranges.bind()),
-                (3, bin.instances.bind()),
-                (4, splats.shapes.bind()),
-                (5, splats.colors.bind()),
-                (6, self.derivatives[page].bind()),
-                (7, self.instance_sums.bind()),
-            ];
-            self.blend.run(device, pass, Groups::Count(tiles.len() as u32), &resources);
-        }
+    fn rank(&self, device: &Device, pass: &mut ComputePass<'_>, inputs: BackwardInputs<'_>) {
+        let BackwardInputs { plan, splats, sorted_splats, .. } = inputs;
+        let job = plan.job(job::SPLATS);
+        let splat_indices = splats.indices[sorted_splats].bind();
+        let resources = [(8, job.bind()), (9, splat_indices), (13, self.ranks.bind())];
+        self.rank.run(device, pass, Groups::Job(job), &resources);
     }
 
-    fn gather(&self, device: &Device, pass: &mut ComputePass<'_>, inputs: BackwardInputs<'_>) {
-        let BackwardInputs { plan, splats, bin, sorted_splats, sorted_touches, .. } = inputs;
-        let splats_job = plan.job(job::SPLATS);
-        let splat_indices = (9, splats.indices[sorted_splats].bind());
-        let ranks = (13, self.ranks.bind());
-        let rank = [(8, splats_job.bind()), splat_indices.clone(), ranks.clone()];
-        self.rank.run(device, pass, Groups::Job(splats_job), &rank);
+    fn blend(
+        &self,
+        device: &Device,
+        pass: &mut ComputePass<'_>,
+        inputs: BackwardInputs<'_>,
+        index: usize,
+        run: &Run,
+    ) {
+        let BackwardInputs { plan, splats, bin, .. } = inputs;
+        let resources = [
+            (0, plan.frame().as_entire_binding()),
+            (1, self.run_binding(index)),
+            (2, bin.ranges.bind()),
+            (3, bin.instances.bind()),
+            (4, splats.shapes.bind()),
+            (5, splats.colors.bind()),
+            (6, self.derivatives[run.page].bind()),
+            (7, self.run_sums.bind()),
+        ];
+        let tiles = run.layout.macro_tiles * MACRO_COLUMNS * MACRO_ROWS;
+        self.blend.run(device, pass, Groups::Count(tiles), &resources);
+    }
 
+    fn gather(
+        &self,
+        device: &Device,
+        pass: &mut ComputePass<'_>,
+        inputs: BackwardInputs<'_>,
+        index: usize,
+        run: &Run,
+    ) {
+        let BackwardInputs { plan, splats, bin, sorted_splats, sorted_touches, .. } = inputs;
         let frame = (0, plan.frame().as_entire_binding());
+        let own_run = (6, self.run_binding(index));
         let touch_ranks = (14, self.touch_ranks.bind());
-        let touch_sums = (15, self.touch_sums.bind());
-        let batches = plan.job(job::BATCHES);
+        let run_sums = (12, self.run_sums.bind());
         let touches = bin.touch_resources(sorted_touches).into_iter().chain([
             frame.clone(),
-            (6, batches.bind()),
-            (7, plan.job(job::INSTANCES).bind()),
-            (12, self.instance_sums.bind()),
-            ranks,
+            own_run.clone(),
+            run_sums.clone(),
+            (13, self.ranks.bind()),
             touch_ranks.clone(),
-            touch_sums.clone(),
         ]);
         let touches: Vec<(u32, BindingResource<'_>)> = touches.collect();
-        self.gather_touches.run(device, pass, Groups::Job(batches), &touches);
+        self.gather_touches.run(device, pass, Groups::Count(run.layout.batches), &touches);
 
-        let [macro_ranges, ..] = bin.touch_resources(sorted_touches);
+        if !run.is_last {
+            return;
+        }
+        let splats_job = plan.job(job::SPLATS);
         let of_splats = [
             frame,
-            macro_ranges,
+            (1, bin.macro_ranges.bind()),
+            own_run,
             (8, splats_job.bind()),
-            splat_indices,
+            (9, splats.indices[sorted_splats].bind()),
             (10, splats.keys[sorted_splats].bind()),
             (11, splats.shapes.bind()),
             touch_ranks,
-            touch_sums,
-            (16, self.splat_sums.bind()),
+            run_sums,
+            (15, self.splat_sums.bind()),
         ];
         self.gather_splats.run(device, pass, Groups::Job(splats_job), &of_splats);
+    }
+
+    fn run_binding(&self, index: usize) -> BindingResource<'_> {
+        slot_binding(self.runs.buffer(), index as u64, size_of::<MacroRun>())
     }
 
     fn project(
