@@ -20,7 +20,7 @@ use wildcity_train::start::{Point, gaussians_from_points};
 use wildcity_twin::ingest::{capture, write_ply};
 
 use crate::cli::backend_options::HardwareOptions;
-use crate::cli::{output, progress};
+use crate::cli::{exit, output, progress};
 
 /// What `wildcity train SOURCE` takes.
 #[derive(Debug, clap::Args)]
@@ -283,7 +283,7 @@ impl TrainingImages for Listed<'_> {
     }
 
     fn load(&self, index: usize) -> Result<TrainingImage, String> {
-        self.decode(self.images[index]).map_err(|error| format!("{error:#}"))
+        self.decode(self.images[index]).map_err(|error| exit::chain(&error))
     }
 }
 
