@@ -197,7 +197,7 @@ fn street(degree: u8) -> Gaussians {
 /// Each chunk at its coarsest level that has at most this error, in metres.
 fn with_levels(scene: &Scene, max_error_m: f32) -> Scene {
     let coarsest = |chunk: &Arc<Chunk>| {
-        let levels = lod::levels(chunk).into_iter();
+        let levels = lod::levels(chunk);
         let allowed = levels.take_while(|level| level.error_m <= max_error_m);
         // Without a level within the error the chunk is drawn in full.
         allowed.last().map_or_else(|| chunk.clone(), |level| Arc::new(level.chunk))

@@ -102,7 +102,6 @@ impl ActorAsset {
         // `lod::levels` returns only the coarser levels, with rising errors. The full chunk goes to
         // the front, so that errors rise over the whole list and `level` can search from the back.
         let coarser = lod::levels(&full)
-            .into_iter()
             .map(|lod::Level { error_m, chunk }| AssetLevel { error_m, chunk: Arc::new(chunk) });
         let mut levels: Vec<AssetLevel> = coarser.collect();
         levels.insert(0, AssetLevel { error_m: 0.0, chunk: Arc::new(full) });
