@@ -106,8 +106,9 @@ impl View {
         cameras.iter().map(view).collect()
     }
 
-    /// The time from the first row of a camera's image to its last, in microseconds: how long before
-    /// a frame's time [`PlacedChunk::world_from_actor_at_start`] is. 0 without a rolling shutter.
+    /// The time from the first row of a camera's image to its last, in microseconds: how long
+    /// before a frame's time [`PlacedChunk::world_from_actor_at_start`] is. 0 without a rolling
+    /// shutter.
     pub fn exposure_us(camera: &RigCamera) -> i64 {
         camera.shutter.map_or(0, |shutter| shutter.duration_us)
     }

@@ -23,7 +23,7 @@ use super::actor::PlacedChunk;
 use super::geometry::Pose;
 use super::pages::{LanePages, Page};
 use super::validate::{LN_SCALE, MAX_SH};
-use super::{Gaussians, Selection, Sky, sh};
+use super::{Gaussians, Selection, Sky, ViewSet, sh};
 
 pub use super::pages::{CLUSTER, LANES, Lanes};
 
@@ -676,17 +676,19 @@ impl Scene {
     }
 
     /// The scene that one view of the frame draws.
-    pub fn of_view(&self, view: usize) -> Cow<'_, Self> {
+    pub fn for_view(&self, view: usize) -> Cow<'_, Self> {
         if self.selection.is_none() && self.placed.iter().all(|placed| placed.views.contains(view))
         {
             return Cow::Borrowed(self);
         }
         let chunks = self.chunks.iter().enumerate().filter(|(chunk, _)| self.draws(*chunk, view));
         let placed = self.placed.iter().filter(|placed| placed.views.contains(view));
+        // Drawn by every view of a frame, whatever their number there.
+        let placed = placed.map(|placed| PlacedChunk { views: ViewSet::ALL, ..placed.clone() });
         Cow::Owned(Self {
             chunks: chunks.map(|(_, chunk)| chunk.clone()).collect(),
             selection: None,
-            placed: placed.cloned().collect(),
+            placed: placed.collect(),
             sky: self.sky.clone(),
         })
     }

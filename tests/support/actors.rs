@@ -234,7 +234,7 @@ pub(crate) fn check_selection(backend: &dyn Backend) {
     let images = render(backend, &scene, &profile, &views);
     for (index, (image, view)) in images.iter().zip(&views).enumerate() {
         let name = backend.name();
-        let alone = render_one(backend, &scene.of_view(index), &profile, *view);
+        let alone = render_one(backend, &scene.for_view(index), &profile, *view);
         assert!(alone == *image, "{name}: view {index} among others");
         let other = render_one(backend, &whole, &profile, *view);
         assert!(other != *image, "{name}: view {index} draws everything");

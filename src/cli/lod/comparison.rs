@@ -59,7 +59,7 @@ impl Comparison<'_> {
             let scene = resident.scene(&viewpoints, profile)?;
             by_profile.push(self.render(&scene, profile, &views)?);
             // Of all views together: each draws levels of its own.
-            let drawn: usize = (0..views.len()).map(|view| scene.of_view(view).gaussians()).sum();
+            let drawn: usize = (0..views.len()).map(|view| scene.for_view(view).gaussians()).sum();
             let all = views.len() as f64 * version.manifest.gaussians() as f64;
             let share = 100.0 * drawn as f64 / all;
             let full = &by_profile[0];

@@ -187,12 +187,12 @@ impl SceneReader {
     /// Both scenes, as far as they are seen from some viewpoints.
     fn scenes(&mut self, viewpoints: &[Viewpoint]) -> Result<BothScenes, PushError> {
         let manifest = &self.version.manifest;
-        let selected = self.index.select(manifest, viewpoints, &self.profile);
-        let selected = selected.map_err(SessionError::from)?;
+        let selected =
+            self.index.select(manifest, viewpoints, &self.profile).map_err(SessionError::from)?;
         let is_kept =
             |section: &SectionRef| !self.replaced.contains(&manifest.chunks[section.chunk].cell);
-        let kept: Vec<_> = selected.iter().filter(|(section, _)| is_kept(section)).collect();
-        let kept = self.read(kept)?;
+        let sections = selected.iter().filter(|(section, _)| is_kept(section)).collect();
+        let kept = self.read(sections)?;
         let old = self.read(self.replaced_in_full_detail())?;
         let new = self.new.chunks.iter().map(|chunk| (chunk.clone(), ViewSet::ALL)).collect();
         // Both scenes share the chunks of `kept` by reference, so the second one costs no memory.

@@ -286,7 +286,7 @@ pub(crate) fn check_frame(frame: &Frame<'_>, backend: &'static str) -> Result<()
         return Err(GradientError::Shadows);
     }
     // A view with a selection of its own sees a scene that is made for it.
-    let has_own = |view| matches!(frame.scene.of_view(view), Cow::Owned(_));
+    let has_own = |view| matches!(frame.scene.for_view(view), Cow::Owned(_));
     if (0..frame.views.len()).any(has_own) {
         return Err(GradientError::Levels);
     }

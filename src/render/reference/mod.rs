@@ -54,7 +54,7 @@ impl Backend for Reference {
         for (index, (view, target)) in frame.views.iter().zip(targets).enumerate() {
             // Project and sort.
             let start = Instant::now();
-            let scene = &*frame.scene.of_view(index);
+            let scene = &*frame.scene.for_view(index);
             let mut splats = project(scene, frame.profile, view);
             project::sort(&mut splats);
             // Splats give order, colour and visibility; exact rays take only the shape from these.

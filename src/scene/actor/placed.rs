@@ -20,9 +20,9 @@ pub struct PlacedChunk {
     pub chunk: Arc<Chunk>,
     /// The actor's pose at the end of the exposure.
     pub world_from_actor: Pose,
-    /// The actor's pose at the start of the exposure of the views that draw it. The motion in between
-    /// is that of [`Pose::interpolate`]. The same as `world_from_actor` for an actor at rest, or
-    /// without a rolling shutter.
+    /// The actor's pose at the start of the exposure of the views that draw it. The motion in
+    /// between is that of [`Pose::interpolate`]. The same as `world_from_actor` for an actor at
+    /// rest, or without a rolling shutter.
     pub world_from_actor_at_start: Pose,
     /// Index of the actor, below [`PlacedChunk::MAX_ACTORS`].
     pub actor: u16,
@@ -31,8 +31,8 @@ pub struct PlacedChunk {
     /// The shadow that the actor casts on the twin beneath it, in the views that draw this chunk.
     /// An actor of several chunks has it on one of them for each view.
     pub shadow: Option<ContactShadow>,
-    /// The views of the frame that draw it: each has its own exposure, and its own level of detail of
-    /// an actor.
+    /// The views of the frame that draw it: each has its own exposure, and its own level of detail
+    /// of an actor.
     pub views: ViewSet,
 }
 

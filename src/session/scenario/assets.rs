@@ -145,8 +145,8 @@ pub(crate) struct Placement<'a> {
 }
 
 impl FrameDetail<'_> {
-    /// The actors that a frame draws, with their shadows: a chunk of each for the views that draw it
-    /// at one level of detail, and whose exposures begin at one pose.
+    /// The actors that a frame draws, with their shadows: a chunk of each for the views that draw
+    /// it at one level of detail, and whose exposures begin at one pose.
     pub(crate) fn placed<'a>(
         &self,
         actors: impl Iterator<Item = Placement<'a>>,

@@ -15,11 +15,11 @@ use super::demand::{SectionRef, SelectedSections, Viewpoint, coarsest_level};
 /// cells within 300 m of a viewpoint lie in at most four of them.
 const GROUP_CELLS: i32 = 16;
 
-/// Finds the sections that a frame draws: the blocks of a version in order, below the bounding boxes
-/// of their cells and of groups of cells.
+/// Finds the sections that a frame draws: the blocks of a version in order, below the bounding
+/// boxes of their cells and of groups of cells.
 ///
-/// A view draws one section of every block within `reach_m` of it. Which one depends only on its own
-/// camera, the profile, and the manifest's table, and not on the other views of the frame.
+/// A view draws one section of every block within `reach_m` of it. Which one depends only on its
+/// own camera, the profile, and the manifest's table, and not on the other views of the frame.
 ///
 /// An error of `e` metres at a distance of `d` metres is `f e / d` pixels wide, with `f` the focal
 /// length in pixels. A view draws a block at the coarsest level for which that is at most `tau_px`,

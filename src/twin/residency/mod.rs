@@ -13,9 +13,9 @@
 //!
 //! # Decisions
 //!
-//! A view draws exactly the sections that [`BlockIndex::select`] returns for it; the memory in use and the other
-//! views of its frame only affect how long it waits. A frame gets the sections of all its views at
-//! once, or it waits. It is never drawn with fewer sections.
+//! A view draws exactly the sections that [`BlockIndex::select`] returns for it; the memory in use
+//! and the other views of its frame only affect how long it waits. A frame gets the sections of all
+//! its views at once, or it waits. It is never drawn with fewer sections.
 //!
 //! **Each view has its own levels of detail.** Levels chosen once for all views of a frame made an
 //! image a function of the cameras beside it (35 dB between a wide camera alone and among six), and
