@@ -45,9 +45,10 @@
 //!    count.
 //! 4. Scene data is checked once, when it enters; poses and cameras are checked once, at
 //!    the wire or by the session that is opened with them.
-//! 5. An image is a function of scene version, render profile, poses, cameras and actors; and,
-//!    where it says so, of the repair model's hash and the episode's history; and of the effects of
-//!    sensors, which a seed, a name and a time decide. Caches change latency, never pixels.
+//! 5. An image is a function of scene version, render profile, actors, and its own camera and pose;
+//!    and, where it says so, of the repair model's hash and the episode's history; and of the
+//!    effects of sensors, which a seed, a name and a time decide. Caches, batches and the other
+//!    cameras of a frame change latency, never pixels.
 //! 6. Every observation names the scene version and the render profile that it was made with. A new
 //!    version becomes visible only between two steps, and only to a session that asked for it.
 //! 7. Time is integer microseconds; poses are f64 until the renderer makes them camera-relative

@@ -15,7 +15,7 @@ use wildcity_twin::residency::default_memory_bytes;
 use wildcity_twin::store::StoreError;
 
 use super::directories::{Episodes, Twins, Uploads};
-use super::exit::Exit;
+use super::exit::{self, Exit};
 use super::serve::Serve;
 
 /// Check that this machine can run the server: devices, memory, open files, disks, twins, clock.
@@ -131,7 +131,7 @@ fn twins_found(twins: &Twins) -> Vec<Finding> {
     let bad = |text: String| vec![Finding::new(Level::Bad, "twins", text)];
     let dir = match twins.dir() {
         Ok(dir) => dir,
-        Err(error) => return bad(format!("{error:#}")),
+        Err(error) => return bad(exit::chain(&error)),
     };
     let is_remote = dir.to_string_lossy().contains("://");
     let mut findings = if is_remote { Vec::new() } else { vec![disk("twins", &dir)] };
@@ -162,7 +162,7 @@ fn twins_found(twins: &Twins) -> Vec<Finding> {
                 findings.push(Finding::new(Level::Bad, "actors", text));
             }
         }
-        Err(error) => findings.extend(bad(format!("{}: {error:#}", dir.display()))),
+        Err(error) => findings.extend(bad(format!("{}: {}", dir.display(), exit::chain(&error)))),
     }
     findings
 }

@@ -12,7 +12,7 @@ use wildcity_twin::residency::Cache;
 
 use super::backend_options::BackendOptions;
 use super::directories::Twins;
-use super::exit::Exit;
+use super::exit::{self, Exit};
 use super::repair_options::RepairOptions;
 use super::{output, progress};
 
@@ -84,7 +84,7 @@ impl Replay {
             recording.replay_repaired(&cache, &*backend, &models, extent, &mut |image| {
                 bar.inc(1);
                 match &self.out {
-                    Some(dir) => write_png(dir, image).map_err(|error| format!("{error:#}")),
+                    Some(dir) => write_png(dir, image).map_err(|error| exit::chain(&error)),
                     None => Ok(()),
                 }
             })?;

@@ -11,8 +11,9 @@ use rayon::prelude::*;
 use super::View;
 use super::constants::{DEPTH_BITS, SLOPE_SLACK};
 use wildcity_scene::actor::PlacedChunk;
+use wildcity_scene::chunk::Cluster;
 use wildcity_scene::geometry::Camera;
-use wildcity_scene::{Chunk, RenderProfile, Scene};
+use wildcity_scene::{Chunk, RenderProfile, Scene, ViewSet};
 
 /// A splat: a Gaussian on the image of one view (48 bytes).
 ///
@@ -250,6 +251,8 @@ pub struct ChunkShadow {
     pub half_m: [f32; 2],
     /// Half the size of the box outside of which there is no shadow, in metres.
     reach_m: Vec3,
+    /// The views that show it.
+    pub views: ViewSet,
 }
 
 impl ChunkShadow {
@@ -266,6 +269,7 @@ impl ChunkShadow {
             actor_from_chunk: [row(0), row(1), row(2)],
             half_m: [0.5 * shadow.length_m, 0.5 * shadow.width_m],
             reach_m: shadow.reach_m(),
+            views: placed.views,
         })
     }
 
@@ -282,6 +286,12 @@ impl ChunkShadow {
             let spread_m = row.truncate().abs().dot(half_m) + 1e-3;
             row.dot(center_m).abs() <= self.reach_m[axis] + spread_m
         })
+    }
+
+    /// Whether the shadow can fall on a Gaussian of a cluster in a view; `true` when in doubt.
+    #[inline(always)]
+    pub fn falls_on(&self, cluster: &Cluster, view: usize) -> bool {
+        self.views.contains(view) && self.may_touch(cluster.min_m, cluster.max_m)
     }
 
     /// The shadows that may fall on each chunk of the twin; empty if no actor has one.

@@ -43,11 +43,11 @@ use wildcity_scene::appearance::Appearance;
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::geometry::camera::FieldMask;
 use wildcity_scene::sky::{CubeMap, DrawableSky, SkyError};
-use wildcity_scene::{Rays, RenderProfile, Rig, Scene};
+use wildcity_scene::{Rays, RenderProfile, Rig, Scene, Selection};
 
 use crate::gradient::Differentiate;
 
-pub use view::{Readout, RollingShutter, View};
+pub use view::{RollingShutter, View};
 
 /// The input of a render call: all views of one step.
 #[derive(Clone, Copy, Debug)]
@@ -205,7 +205,17 @@ pub enum RenderError {
     /// The sky cannot be drawn as the profile asks.
     #[error(transparent)]
     Sky(#[from] SkyError),
-    /// More actors than
+    /// The scene has sections for other views.
+    #[error(
+        "the sections of the scene were chosen for {selected_for} views, and the frame has {views}"
+    )]
+    Selection {
+        /// Number of views of the frame.
+        views: usize,
+        /// Number of views of the scene's selection.
+        selected_for: usize,
+    },
+    /// More actors in a view than
     /// [`PlacedChunk::MAX_ACTORS`](wildcity_scene::actor::PlacedChunk::MAX_ACTORS).
     #[error("{placed} chunks of actors are placed; at most {limit} are drawn: remove actors")]
     Actors {
@@ -367,18 +377,27 @@ impl Frame<'_> {
         }
     }
 
-    /// Checks the number of views, and that of placed chunks.
+    /// Checks the number of views, also against the scene's selection, and that of placed chunks.
     ///
     /// # Errors
-    /// [`RenderError::Views`], [`RenderError::Actors`].
+    /// [`RenderError::Views`], [`RenderError::Selection`], [`RenderError::Actors`].
     pub fn check_views(&self) -> Result<(), RenderError> {
-        let placed = self.scene.placed.len();
-        let limit = PlacedChunk::MAX_ACTORS;
-        if placed > limit {
-            return Err(RenderError::Actors { placed, limit });
-        }
         // At most 16: the sort key has 4 bits for the view.
-        let count = self.views.len();
-        if (1..=MAX_VIEWS).contains(&count) { Ok(()) } else { Err(RenderError::Views { count }) }
+        let views = self.views.len();
+        if !(1..=MAX_VIEWS).contains(&views) {
+            return Err(RenderError::Views { count: views });
+        }
+        let Scene { chunks, selection, placed, .. } = self.scene;
+        if let Some(Selection { views: selected_for, by_chunk }) = selection
+            && (*selected_for, by_chunk.len()) != (views, chunks.len())
+        {
+            return Err(RenderError::Selection { views, selected_for: *selected_for });
+        }
+        let in_view = |view| placed.iter().filter(|placed| placed.views.contains(view)).count();
+        let limit = PlacedChunk::MAX_ACTORS;
+        match (0..views).map(in_view).find(|&placed| placed > limit) {
+            Some(placed) => Err(RenderError::Actors { placed, limit }),
+            None => Ok(()),
+        }
     }
 }

@@ -17,18 +17,9 @@ pub struct View {
     /// The camera's motion while its rows are exposed; `None` if all are exposed at once, or the
     /// camera is at rest.
     pub rolling_shutter: Option<RollingShutter>,
-    /// How its rows are exposed, if one after the other: actors move during the exposure even if
-    /// the camera is at rest. Without it, as in `rolling_shutter`.
-    pub readout: Option<Readout>,
-}
-
-/// How a camera exposes its rows or columns, one after the other.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Readout {
-    /// In which order rows or columns are exposed.
-    pub direction: ShutterDirection,
-    /// The duration as a share of the longest one of the frame's cameras, 0 to 1.
-    pub share: f64,
+    /// In which order its rows or columns are exposed, if one after the other: actors move during
+    /// the exposure even if the camera is at rest. Without it, as in `rolling_shutter`.
+    pub readout: Option<ShutterDirection>,
 }
 
 /// The motion of a camera during one exposure: [`Pose::interpolate`] at constant speed.
@@ -97,7 +88,6 @@ impl View {
         world_from_rig: Pose,
         world_from_rig_before: &dyn Fn(i64) -> Pose,
     ) -> Vec<Self> {
-        let longest_us = Self::longest_exposure_us(cameras);
         let view = |camera: &RigCamera| {
             let world_from_camera = world_from_rig * camera.rig_from_camera;
             // A camera at rest is kept as such: a static pinhole has its own, faster path.
@@ -110,22 +100,22 @@ impl View {
                     world_from_camera_first,
                 })
             });
-            let readout = camera.shutter.map(|shutter| Readout {
-                direction: shutter.direction,
-                // Without any duration all shares are 0 and not NaN.
-                share: shutter.duration_us as f64 / longest_us.max(1) as f64,
-            });
+            let readout = camera.shutter.map(|shutter| shutter.direction);
             Self { camera: camera.camera, world_from_camera, rolling_shutter, readout }
         };
         cameras.iter().map(view).collect()
     }
 
-    /// The longest time from the first row of an image to its last among some cameras, in
-    /// microseconds: how long before a frame's time [`PlacedChunk::world_from_actor_at_start`] is.
-    /// 0 without rolling shutters.
+    /// The time from the first row of a camera's image to its last, in microseconds: how long
+    /// before a frame's time [`PlacedChunk::world_from_actor_at_start`] is. 0 without a rolling
+    /// shutter.
+    pub fn exposure_us(camera: &RigCamera) -> i64 {
+        camera.shutter.map_or(0, |shutter| shutter.duration_us)
+    }
+
+    /// The longest exposure of some cameras, in microseconds.
     pub fn longest_exposure_us(cameras: &[RigCamera]) -> i64 {
-        let durations = cameras.iter().filter_map(|camera| camera.shutter);
-        durations.map(|shutter| shutter.duration_us).max().unwrap_or(0)
+        cameras.iter().map(Self::exposure_us).max().unwrap_or(0)
     }
 
     /// This view from an actor's axes: how the camera sees the Gaussians of a placed chunk.
@@ -136,25 +126,15 @@ impl View {
     /// which is r α²/8 away: 0.6 mm at 20 m, 0.5 rad/s and 30 ms.
     pub fn seen_from(&self, placed: &PlacedChunk) -> Self {
         let last = relative_pose(&placed.world_from_actor, &self.world_from_camera);
-        // A view made without a readout takes the whole exposure of its shutter.
-        let from_shutter = self
-            .rolling_shutter
-            .map(|shutter| Readout { direction: shutter.direction, share: 1.0 });
-        let rolling_shutter =
-            self.readout.or(from_shutter).and_then(|Readout { direction, share }| {
-                let world_from_actor_first = match placed.world_from_actor_at_start {
-                    // Without an interpolation, which would round, an actor at rest stays
-                    // at rest to the bit.
-                    at_start if at_start == placed.world_from_actor => at_start,
-                    at_start => placed.world_from_actor.interpolate(&at_start, share),
-                };
-                let world_from_camera_first = self
-                    .rolling_shutter
-                    .map_or(self.world_from_camera, |shutter| shutter.world_from_camera_first);
-                let first = relative_pose(&world_from_actor_first, &world_from_camera_first);
-                let moves = !same_pose(&first, &last);
-                moves.then_some(RollingShutter { direction, world_from_camera_first: first })
-            });
+        let from_shutter = self.rolling_shutter.map(|shutter| shutter.direction);
+        let rolling_shutter = self.readout.or(from_shutter).and_then(|direction| {
+            let world_from_camera_first = self
+                .rolling_shutter
+                .map_or(self.world_from_camera, |shutter| shutter.world_from_camera_first);
+            let first = relative_pose(&placed.world_from_actor_at_start, &world_from_camera_first);
+            let moves = !same_pose(&first, &last);
+            moves.then_some(RollingShutter { direction, world_from_camera_first: first })
+        });
         Self { world_from_camera: last, rolling_shutter, ..*self }
     }
 

@@ -15,7 +15,7 @@ use wildcity_render::compare::images::view_along;
 use wildcity_render::cpu::Cpu;
 use wildcity_render::gpu::{Gpu, GpuUsage};
 use wildcity_render::gradient::{GaussianImages, Gradients};
-use wildcity_render::{Backend, Frame, FrameStats, Readout, RollingShutter, Target, View};
+use wildcity_render::{Backend, Frame, FrameStats, RollingShutter, Target, View};
 use wildcity_scene::actor::{ContactShadow, PlacedChunk};
 use wildcity_scene::appearance::{Appearance, Exposure, Overlay};
 use wildcity_scene::geometry::Pose;
@@ -156,7 +156,7 @@ const FEATURES: [Feature; 22] = [
     // Moving while the rows of a camera at rest are exposed.
     feature("two moving actors", |step| {
         step.place_actors(DVec3::new(0.0, -0.9, 0.0));
-        step.view.readout = Some(Readout { direction: ShutterDirection::TopToBottom, share: 1.0 });
+        step.view.readout = Some(ShutterDirection::TopToBottom);
     }),
     feature("instance ids", |step| step.instances = true),
     // The host computes the trust from the opacity.
@@ -197,7 +197,7 @@ fn street(degree: u8) -> Gaussians {
 /// Each chunk at its coarsest level that has at most this error, in metres.
 fn with_levels(scene: &Scene, max_error_m: f32) -> Scene {
     let coarsest = |chunk: &Arc<Chunk>| {
-        let levels = lod::levels(chunk).into_iter();
+        let levels = lod::levels(chunk);
         let allowed = levels.take_while(|level| level.error_m <= max_error_m);
         // Without a level within the error the chunk is drawn in full.
         allowed.last().map_or_else(|| chunk.clone(), |level| Arc::new(level.chunk))

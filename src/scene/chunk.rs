@@ -11,6 +11,7 @@
 //! only three columns of reads. 256 Gaussians in Morton order form a *cluster* with a bounding box,
 //! which is culled as a unit.
 
+use std::borrow::Cow;
 use std::collections::BTreeSet;
 use std::ops::{Range, RangeInclusive};
 use std::sync::Arc;
@@ -22,7 +23,7 @@ use super::actor::PlacedChunk;
 use super::geometry::Pose;
 use super::pages::{LanePages, Page};
 use super::validate::{LN_SCALE, MAX_SH};
-use super::{Gaussians, Sky, sh};
+use super::{Gaussians, Selection, Sky, ViewSet, sh};
 
 pub use super::pages::{CLUSTER, LANES, Lanes};
 
@@ -624,6 +625,8 @@ fn spread(x: u64) -> u64 {
 pub struct Scene {
     /// Chunks of one SH degree, in order of (cell y, cell x).
     pub chunks: Vec<Arc<Chunk>>,
+    /// Which views of a frame draw which of these chunks; without it, all views draw all of them.
+    pub selection: Option<Selection>,
     /// Actors. Among Gaussians with equal depths, those of the twin are in front, then those of
     /// actors in the order of this list. At most [`PlacedChunk::MAX_ACTORS`] actors.
     pub placed: Vec<PlacedChunk>,
@@ -664,6 +667,30 @@ impl Scene {
             });
         }
         chunk
+    }
+
+    /// Whether a view of the frame draws a chunk of the twin, by their indices.
+    #[inline]
+    pub fn draws(&self, chunk: usize, view: usize) -> bool {
+        self.selection.as_ref().is_none_or(|selection| selection.by_chunk[chunk].contains(view))
+    }
+
+    /// The scene that one view of the frame draws.
+    pub fn for_view(&self, view: usize) -> Cow<'_, Self> {
+        if self.selection.is_none() && self.placed.iter().all(|placed| placed.views.contains(view))
+        {
+            return Cow::Borrowed(self);
+        }
+        let chunks = self.chunks.iter().enumerate().filter(|(chunk, _)| self.draws(*chunk, view));
+        let placed = self.placed.iter().filter(|placed| placed.views.contains(view));
+        // Drawn by every view of a frame, whatever their number there.
+        let placed = placed.map(|placed| PlacedChunk { views: ViewSet::ALL, ..placed.clone() });
+        Cow::Owned(Self {
+            chunks: chunks.map(|(_, chunk)| chunk.clone()).collect(),
+            selection: None,
+            placed: placed.collect(),
+            sky: self.sky.clone(),
+        })
     }
 
     /// Number of Gaussians in all chunks, with those of each actor.

@@ -30,6 +30,7 @@ pub mod sky;
 pub mod srgb;
 pub mod trajectory;
 pub mod validate;
+mod view_set;
 pub mod views;
 
 pub use actor::{ActorBox, ActorClass};
@@ -42,3 +43,4 @@ pub use record::RecordFormat;
 pub use rig::Rig;
 pub use sky::Sky;
 pub use trajectory::Trajectory;
+pub use view_set::{Selection, ViewSet};

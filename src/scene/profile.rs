@@ -63,7 +63,7 @@ pub struct RenderProfile {
     /// Largest error of a level of detail on the screen, in pixels: each block of 16 m is drawn at
     /// the coarsest level whose error stays below it. 0 draws full detail everywhere.
     pub tau_px: f64,
-    /// Blocks farther than this from the nearest camera are not drawn, in metres. `None` draws all.
+    /// Blocks farther than this from the camera are not drawn, in metres. `None` draws all.
     pub reach_m: Option<f64>,
     /// How Gaussians are evaluated. Serialized only if it is not the default.
     #[serde(skip_serializing_if = "Rays::is_splats")]

@@ -36,7 +36,7 @@ pub enum SessionError {
     },
     /// The rig of the request is invalid.
     #[error("{}", rig_message(.0))]
-    Rig(#[from] RigFieldError),
+    Rig(RigFieldError),
     /// The numbers of a pose are invalid.
     #[error("{field}: {cause}")]
     Pose {
@@ -188,6 +188,12 @@ pub enum SessionError {
         /// The operating system's message.
         reason: String,
     },
+}
+
+impl From<RigFieldError> for SessionError {
+    fn from(cause: RigFieldError) -> Self {
+        Self::Rig(cause)
+    }
 }
 
 impl SessionError {

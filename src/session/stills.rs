@@ -43,7 +43,7 @@ pub struct StillActor {
     /// Its pose where the exposures end: its origin is on the ground under its middle, x points
     /// forward.
     pub world_from_actor: Pose,
-    /// Its pose where the longest exposure begins.
+    /// Its pose where the exposures begin.
     pub world_from_actor_at_start: Pose,
 }
 
@@ -130,8 +130,10 @@ impl Stills {
         let resident = self.reservation.resident().clone();
         let profile = self.profile;
         let viewpoints = viewpoints(&views);
-        let detail = FrameDetail { viewpoints: &viewpoints, profile: &profile };
-        let placed = detail.placed(placements(actors));
+        // The poses of the actors at the start are those of every view.
+        let exposures_us = &vec![0; views.len()];
+        let detail = FrameDetail { viewpoints: &viewpoints, exposures_us, profile: &profile };
+        let placed = detail.placed(placements(actors, views.len()));
         let mut scene = pin(resident, profile, deadline, viewpoints).await?;
         scene.place(placed);
         let work = move |_: &mut _, backend: &dyn wildcity_render::Backend| {
@@ -164,12 +166,12 @@ impl Stills {
     }
 }
 
-fn placements(actors: &[StillActor]) -> impl Iterator<Item = Placement<'_>> {
-    (0..).zip(actors).map(|(index, actor)| Placement {
+fn placements(actors: &[StillActor], views: usize) -> impl Iterator<Item = Placement<'_>> {
+    (0..).zip(actors).map(move |(index, actor)| Placement {
         actor: index,
         asset: actor.asset.asset(),
         world_from_actor: actor.world_from_actor,
-        world_from_actor_at_start: actor.world_from_actor_at_start,
+        world_from_actor_at_start: vec![actor.world_from_actor_at_start; views],
     })
 }
 
@@ -199,16 +201,11 @@ fn frame_bytes(engine: &Engine, views: &[View]) -> FrameBytes {
     })
 }
 
-/// The focal length of the finest view, and how far the views are from their middle.
+/// The extent of views around their middle.
 fn extent(views: &[View]) -> RigExtent {
     let viewpoints = viewpoints(views);
     // Without views, the middle is the origin and not NaN.
     let count = viewpoints.len().max(1) as f64;
     let middle_m = viewpoints.iter().map(|one| one.position_m).sum::<DVec3>() / count;
-    RigExtent {
-        focal_px: viewpoints.iter().fold(0.0, |most, one| one.focal_px.max(most)),
-        radius_m: viewpoints
-            .iter()
-            .fold(0.0, |most, one| one.position_m.distance(middle_m).max(most)),
-    }
+    RigExtent::new(&viewpoints, middle_m)
 }

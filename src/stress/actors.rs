@@ -9,7 +9,7 @@ use super::{Case, CaseBody, CaseRun};
 use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, gaussians_from_specs};
 use wildcity_render::compare::images::{RenderedImage, max_difference};
 use wildcity_render::compare::psnr::psnr_db;
-use wildcity_render::{Readout, RenderError, RollingShutter, View};
+use wildcity_render::{RenderError, RollingShutter, View};
 use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::ShutterDirection;
@@ -139,7 +139,7 @@ fn t30(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let direction = ShutterDirection::TopToBottom;
     let still = forward_view([96, 64], 60.0);
     // A readout without a motion of the camera: rows are exposed in turn, and only the actor moves.
-    let view = View { readout: Some(Readout { direction, share: 1.0 }), ..still };
+    let view = View { readout: Some(direction), ..still };
 
     // The camera at rest.
     let image = run.render_and_compare("across", &moving, &profile, view)?;

@@ -72,7 +72,7 @@ pub enum TrainError {
     Empty,
     /// Values that no scene may have.
     #[error("Gaussians to begin with: {0}")]
-    Invalid(#[from] BadGaussians),
+    Invalid(BadGaussians),
     /// A derivative that f32 does not hold: the run cannot go on from here.
     #[error("step {step}: a derivative by Gaussian {gaussian} is not finite")]
     NotFinite { step: usize, gaussian: usize },
@@ -84,6 +84,12 @@ pub enum TrainError {
     /// An image of another size than its camera's.
     #[error("the {image} has {given} values, and the camera's size asks for {wanted}")]
     Size { image: &'static str, given: usize, wanted: usize },
+}
+
+impl From<BadGaussians> for TrainError {
+    fn from(cause: BadGaussians) -> Self {
+        Self::Invalid(cause)
+    }
 }
 
 impl Trainer {

@@ -158,7 +158,7 @@ fn an_image_that_was_spoiled_by_a_known_amount_has_that_error() {
     for name in ["ssim", "ssim_mirrored", "flip"] {
         assert!((made["all"][name].as_f64().unwrap() - mean(name)).abs() < 1e-12, "{name}: {made}");
     }
-    assert!(said.contains("mean of 3 images: PSNR exact, SSIM 0.9"), "{said}");
+    assert!(said.contains("mean of 3 images: PSNR infinite, SSIM 0.9"), "{said}");
     assert!(said.contains("worst: front/b.png, 28.13 dB"), "{said}");
     // The CSV has the same numbers, and the page the pictures of the worst image.
     let csv = fs::read_to_string(dir.path().join("out/eval.csv")).unwrap();
@@ -205,7 +205,7 @@ fn lists_nerfstudio_and_colmap_give_the_same() {
     // Every second image in the order of the names.
     let (said, _) = eval(at, "scene.ply", "transforms.json", &["--every", "2"]);
     assert!(
-        said.contains("mean of 2 images: PSNR exact") || said.contains("worst: front/a.png"),
+        said.contains("mean of 2 images: PSNR infinite") || said.contains("worst: front/a.png"),
         "{said}"
     );
     assert!(!said.contains("front/b.png"), "{said}");

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use wildcity_scene::RenderProfile;
 use wildcity_twin::store::Catalog;
 
 use crate::scene_files::{gaussians, safetensors};
@@ -48,6 +49,14 @@ fn skies_are_imported_replaced_and_removed() {
     let again = catalog.version("street", None).unwrap().manifest.sky.unwrap();
     assert_eq!(again.object, named.object);
     assert_eq!(again.sky_from_world, [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]);
+
+    let coarse = ["twin", "sky", "street", "--sky", sky, "--set", "sky_error=0.05"];
+    let (code, _, error) = run(&coarse);
+    assert_eq!(code, Some(0), "{error}");
+    let coarse = catalog.version("street", None).unwrap().manifest;
+    let before = version.manifest.profile;
+    assert_eq!(coarse.profile, RenderProfile { sky_error: 0.05, ..before });
+    assert_eq!(coarse.chunks, version.manifest.chunks);
 
     let (code, _, error) = run(&["twin", "sky", "street"]);
     assert_eq!(code, Some(2), "neither a sky nor --remove: {error}");

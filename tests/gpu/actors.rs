@@ -32,6 +32,13 @@ fn tints_and_contact_shadows_are_those_of_the_reference() {
 }
 
 #[test]
+fn each_view_draws_what_was_selected_for_it() {
+    placed::check_selection(&*shared_gpu());
+    let own = Gpu::new(&AdapterChoice::Best, 0).unwrap();
+    placed::check_selection(&HybridBackend::new(cpu(), own, Stage::Project));
+}
+
+#[test]
 fn actors_leave_nothing_behind() {
     placed::check_ghosts(&*shared_gpu());
 }

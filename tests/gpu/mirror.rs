@@ -34,7 +34,7 @@ fn demo(focals_px: [f32; 3]) -> [Scene; 3] {
             .iter()
             .map(|cluster| eye_m.distance(eye_m.clamp(cluster.min_m, cluster.max_m)));
         let distance_m = distance_m.fold(f32::INFINITY, f32::min);
-        let levels = lod::levels(&full);
+        let levels: Vec<lod::Level> = lod::levels(&full).collect();
         let full = Arc::new(full);
         focals_px.map(|focal_px| {
             let mut from_coarsest = levels.iter().rev();

@@ -1,6 +1,6 @@
 use glam::DVec3;
 use wildcity_scene::{Manifest, RenderProfile};
-use wildcity_twin::residency::{SectionRef, Viewpoint, demand};
+use wildcity_twin::residency::{BlockIndex, SectionRef, Viewpoint};
 use wildcity_twin::store::StorageOptions;
 
 use crate::{commit, streets, tau};
@@ -9,6 +9,14 @@ fn manifest() -> Manifest {
     let dir = tempfile::tempdir().unwrap();
     let (scene, _) = streets::demo_street();
     commit(dir.path(), &scene, StorageOptions::default()).unwrap().manifest
+}
+
+fn demand(
+    manifest: &Manifest,
+    viewpoints: &[Viewpoint],
+    profile: &RenderProfile,
+) -> Vec<SectionRef> {
+    BlockIndex::new(manifest).demand(manifest, viewpoints, profile)
 }
 
 fn eye(x: f64, focal_px: f64) -> Viewpoint {
@@ -25,14 +33,15 @@ fn levels(manifest: &Manifest, needed: &[SectionRef]) -> Vec<u8> {
 }
 
 #[test]
-fn demand_is_one_level_of_every_block_and_follows_from_the_table() {
+fn every_view_has_one_level_of_every_block_of_its_own() {
     let manifest = manifest();
     let blocks: usize = manifest
         .chunks
         .iter()
         .map(|chunk| chunk.sections.iter().filter(|section| section.level == 0).count())
         .sum();
-    let all = demand(&manifest, &[eye(60.0, 1800.0)], &tau(0.0));
+    let index = BlockIndex::new(&manifest);
+    let all = index.demand(&manifest, &[eye(60.0, 1800.0)], &tau(0.0));
     assert_eq!(all.len(), blocks);
     assert!(all.is_sorted());
     assert!(levels(&manifest, &all).iter().all(|&level| level == 0));
@@ -40,24 +49,31 @@ fn demand_is_one_level_of_every_block_and_follows_from_the_table() {
 
     for tau_px in [0.5, 1.0, 4.0, 16.0] {
         let eyes = [eye(60.0, 1800.0), eye(70.0, 900.0)];
-        let needed = demand(&manifest, &eyes, &tau(tau_px));
-        assert_eq!(needed, demand(&manifest, &[eyes[1], eyes[0]], &tau(tau_px)));
-        assert_eq!(needed.len(), blocks);
-        // The rule again, section by section.
-        for n in &needed {
-            let chunk = &manifest.chunks[n.chunk];
-            let section = &chunk.sections[n.section];
-            let mine = chunk.sections.iter().filter(|other| other.block == section.block);
-            let full = mine.clone().find(|other| other.level == 0).unwrap();
-            let bounds = chunk.section_bounds(full);
-            let distance =
-                eyes.map(|e| bounds.distance_m(e.position_m)).into_iter().fold(f64::MAX, f64::min);
-            let size_px = |error_m: f32| 1800.0 * f64::from(error_m) / distance;
-            assert!(section.level == 0 || size_px(section.error_m) <= tau_px);
-            let coarser = mine.clone().find(|other| other.level == section.level + 1);
-            assert!(coarser.is_none_or(|coarser| size_px(coarser.error_m) > tau_px));
+        let selected = index.select(&manifest, &eyes, &tau(tau_px)).unwrap();
+        assert_eq!(selected.sections, index.demand(&manifest, &eyes, &tau(tau_px)));
+        assert!(selected.sections.is_sorted());
+        for (view, eye) in eyes.into_iter().enumerate() {
+            let own = selected.iter().filter(|(_, views)| views.contains(view));
+            let own: Vec<SectionRef> = own.map(|(section, _)| section).collect();
+            assert_eq!(own, index.demand(&manifest, &[eye], &tau(tau_px)), "as if it were alone");
+            assert_eq!(own.len(), blocks);
+            // The rule again, section by section.
+            for n in &own {
+                let chunk = &manifest.chunks[n.chunk];
+                let section = &chunk.sections[n.section];
+                let mine = chunk.sections.iter().filter(|other| other.block == section.block);
+                let full = mine.clone().find(|other| other.level == 0).unwrap();
+                let distance = chunk.section_bounds(full).distance_m(eye.position_m);
+                let size_px = |error_m: f32| eye.focal_px * f64::from(error_m) / distance;
+                assert!(section.level == 0 || size_px(section.error_m) <= tau_px);
+                let coarser = mine.clone().find(|other| other.level == section.level + 1);
+                assert!(coarser.is_none_or(|coarser| size_px(coarser.error_m) > tau_px));
+            }
         }
     }
+    let many = vec![eye(60.0, 1800.0); Viewpoint::MAX + 1];
+    let refused = index.select(&manifest, &many, &tau(1.0)).unwrap_err().to_string();
+    assert_eq!(refused, "a frame has at most 16 views, not 17");
 }
 
 #[test]

@@ -1,4 +1,5 @@
 use std::fs;
+use std::sync::Arc;
 
 use glam::DVec3;
 use wildcity_generate::StreetSettings;
@@ -9,6 +10,7 @@ use wildcity_scene::rig::{Rig, RigCamera};
 use wildcity_scene::{Chunk, Gaussians, RecordFormat, Scene, lod};
 use wildcity_twin::store::{Catalog, StorageOptions};
 
+use crate::images::view_along;
 use crate::{commit, decibels, eyes, stored, streets, tau};
 
 /// Blocks of a scene at full detail.
@@ -107,6 +109,40 @@ fn every_level_keeps_its_error_bound() {
         }
     }
     assert!(checked > 20, "{checked} levels");
+}
+
+/// Stacks of faint Gaussians: each is only the tip of its bell, and one in place of all of them would
+/// show what they cut off. A level is seen at the distance at which its stated error is a pixel.
+#[test]
+fn stacks_of_faint_gaussians_state_what_their_merger_shows() {
+    for (count, opacity) in
+        [(300, 0.004_f64), (300, 0.02), (3_000, 0.008), (20_000, 0.01), (100_000, 0.006)]
+    {
+        let logit = opacity / (1.0 - opacity);
+        let stack = Gaussians {
+            sh_degree: 0,
+            means_m: vec![[1.0, 2.0, 3.0]; count],
+            quats_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; count],
+            ln_scales: vec![[0.3_f32.ln(); 3]; count],
+            logit_opacities: vec![logit.ln() as f32; count],
+            sh: vec![1.0; 3 * count],
+        };
+        let scene = Scene::from_gaussians(&stack);
+        let full = &scene.chunks[0];
+        for level in lod::levels(full) {
+            // 60 px for the standard deviation at most; farther if its error allows no more.
+            let focal_px = 400.0;
+            let distance_m = (focal_px * f64::from(level.error_m)).max(2.0);
+            let at = DVec3::new(1.0, 2.0, 3.0) - distance_m * DVec3::Z;
+            let view = view_along([200, 200], focal_px, at, DVec3::Z, DVec3::Y);
+            let coarse = Scene { chunks: vec![Arc::new(level.chunk.clone())], ..Scene::default() };
+            let db = decibels(&coarse, &scene, &[view]);
+            let error_m = level.error_m;
+            let left = level.chunk.len();
+            eprintln!("{count} of {opacity}: {left} at {error_m} m: {db:.1} dB");
+            assert!(db > 30.0, "{count} of {opacity}, {left} left at {error_m} m: {db:.1} dB");
+        }
+    }
 }
 
 #[test]

@@ -15,6 +15,7 @@ mod streets;
 mod demand;
 mod levels;
 mod records;
+mod views;
 
 use std::path::Path;
 use std::sync::Arc;

@@ -6,7 +6,7 @@ use glam::DVec3;
 use wildcity_render::compare::psnr::psnr_db;
 use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_render::reference::Reference;
-use wildcity_render::{Backend, Frame, Readout, RenderError, Target, View};
+use wildcity_render::{Backend, Frame, RenderError, Target, View};
 use wildcity_scene::actor::{ContactShadow, PlacedChunk};
 use wildcity_scene::geometry::camera::ShutterDirection;
 use wildcity_scene::{Rays, RenderProfile, Scene};
@@ -49,6 +49,15 @@ fn contact_shadows_are_as_in_the_vectors() {
         // The size is in f32.
         assert!((found - wanted).abs() < 1e-6, "{}: {found}, not {wanted}", case.name);
     }
+}
+
+/// On all cores, and with so little memory that views are drawn one after the other.
+#[test]
+fn each_view_draws_what_was_selected_for_it() {
+    let small = Cpu::new(1, Simd::Best).unwrap();
+    small.limit_frame_bytes(0);
+    let backends: [&dyn Backend; 3] = [&cpu(), &small, &Reference];
+    backends.into_iter().for_each(placed::check_selection);
 }
 
 #[test]
@@ -97,7 +106,7 @@ fn a_crossing_actor_agrees_with_exact_rays() {
     let placed_chunk =
         PlacedChunk { world_from_actor_at_start: start, ..PlacedChunk::at_rest(chunk, pose, 0) };
     let scene = Scene { placed: vec![placed_chunk], ..Scene::default() };
-    let readout = Some(Readout { direction: ShutterDirection::TopToBottom, share: 1.0 });
+    let readout = Some(ShutterDirection::TopToBottom);
     let view = View { readout, ..placed::views()[0].1 };
     let exact = RenderProfile { rays: Rays::Exact, ..RenderProfile::default() };
     let truth = render_one(&Reference, &scene, &exact, view);

@@ -10,7 +10,8 @@ use wildcity_twin::residency::{Cache, FrameBytes, ResidencyError, RigExtent, Sec
 use crate::scene_files::{Random, gaussians};
 use crate::streaming::{PROFILE, TEST_TIMEOUT, commit, demo, eyes, pixels, unlimited, views};
 
-const EXTENT: RigExtent = RigExtent { focal_px: 70.0, radius_m: 1.7 };
+const EXTENT: RigExtent =
+    RigExtent { views: 2, focal_px: 70.0, least_focal_px: 40.0, radius_m: 1.7 };
 
 #[test]
 fn sessions_beyond_the_memory_are_refused_with_the_numbers() {

@@ -88,7 +88,7 @@ fn a_section_takes_the_memory_that_is_computed_for_it() {
 #[test]
 fn a_thousand_sessions_leave_nothing_behind() {
     let cache = Cache::limited(demo().catalog(), Some(32 << 20));
-    let lens = RigExtent { focal_px: 70.0, radius_m: 1.7 };
+    let lens = RigExtent { views: 2, focal_px: 70.0, least_focal_px: 40.0, radius_m: 1.7 };
     let before = cache.stats();
     for session in 0..1_000 {
         let resident = cache.open("demo", None).unwrap();

@@ -1,5 +1,5 @@
-//! Levels of detail are chosen for all cameras of a frame. An image that is rendered again
-//! separately, or instead of a lost frame, must have the same levels as in its frame.
+//! Each camera of a frame has levels of detail of its own, so that its image is the same alone and
+//! among others: in a frame, in a batch of sessions, in a replay, and instead of a lost frame.
 
 use std::sync::Arc;
 
@@ -10,6 +10,8 @@ use wildcity_scene::Gaussians;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::trajectory::{Keyframe, Trajectory};
+use wildcity_session::{RecordedEpisode, ReplayUntil};
+use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, NewVersion};
 
 use crate::branches::assert_all_same;
@@ -93,21 +95,82 @@ fn hash<'a>(seen: &'a Seen, camera: &str) -> &'a Value {
     &images.iter().find(|image| image["camera"] == camera).unwrap()["hash"]
 }
 
-/// The other tests of this file depend on this: together with a camera of long focal length, the
-/// wide camera gets finer levels.
 #[tokio::test]
-async fn cameras_of_a_frame_share_its_levels() {
+async fn a_camera_has_the_same_image_alone_and_among_others() {
     let server = server().await;
-    let mut alone = open(&server, "alone", &["wide"], json!({})).await;
     let mut both = open(&server, "both", &["wide", "tele"], json!({})).await;
-    let alone = alone.step(1.0).await;
-    let both = both.step(1.0).await;
-    assert_ne!(hash(&alone, "wide"), hash(&both, "wide"));
+    both.look(json!({ "type": "reset" })).await;
+    let truth = drive(&mut both, 1, 6).await;
+    let poses: Vec<Value> = (1..=6).map(|step| pose(0.25 * f64::from(step))).collect();
+    for camera in ["wide", "tele"] {
+        let mut alone = open(&server, camera, &[camera], json!({})).await;
+        alone.look(json!({ "type": "reset" })).await;
+        let seen = drive(&mut alone, 1, 6).await;
+        for (alone, truth) in seen.iter().zip(&truth) {
+            assert_eq!(hash(alone, camera), hash(truth, camera), "{camera}");
+        }
+        // Several frames of one answer, each with one camera.
+        let observed = alone.look(json!({ "type": "observe", "poses": poses })).await;
+        let images = observed.meta["images"].as_array().unwrap();
+        let hashes: Vec<&Value> = images.iter().map(|image| &image["hash"]).collect();
+        let wanted: Vec<&Value> = truth.iter().map(|seen| hash(seen, camera)).collect();
+        assert_eq!(hashes, wanted, "{camera}");
+    }
+
+    // The levels differ, or this shows nothing: the wide camera does not draw what the other needs.
+    let full = json!({ "profile": { "tau_px": 0 } });
+    let mut full = open(&server, "full", &["wide"], full).await;
+    full.look(json!({ "type": "reset" })).await;
+    assert_ne!(hash(&full.step(0.25).await, "wide"), hash(&truth[0], "wide"));
+
+    // Its record, rendered again without the other camera.
+    both.ask(json!({ "type": "close" })).await;
+    let path = server.episodes.path().join("both-1.jsonl");
+    let backend = Cpu::new(1, Simd::Best).unwrap();
+    let cache = Cache::new(Catalog::open(server.twins.path()).unwrap());
+    for camera in 0..2 {
+        let mut recording = RecordedEpisode::read(&path).unwrap();
+        for frame in &mut recording.frames {
+            frame.images = frame.images.iter().skip(camera).step_by(2).cloned().collect();
+            frame.cameras = vec![vec![camera]; frame.poses.len()];
+        }
+        let report = recording.replay(&cache, &backend, ReplayUntil::End, &mut |_| Ok(())).unwrap();
+        assert_eq!((report.images, report.difference), (7, None), "camera {camera}");
+    }
+}
+
+/// Sessions whose frames are rendered one after the other, or at once.
+#[tokio::test]
+async fn sessions_of_a_batch_do_not_change_each_others_images() {
+    let server = server().await;
+    let mut truth = open(&server, "truth", &["wide", "tele"], json!({})).await;
+    truth.look(json!({ "type": "reset" })).await;
+    let truth = drive(&mut truth, 1, 4).await;
+    let mut agent = server.agent().await;
+    for (name, cameras) in [("a", &["wide"][..]), ("b", &["tele"]), ("c", &["tele", "wide"])] {
+        let outputs = json!({ "encoding": "raw" });
+        let opened = json!({
+            "twin": "wall", "session": name, "rig": rig(cameras), "outputs": outputs,
+        });
+        agent.open(opened).await;
+    }
+    for (step, truth) in (1..).zip(&truth) {
+        let x_m = 0.25 * f64::from(step);
+        let to = |session: &str| json!({ "session": session, "pose": pose(x_m) });
+        let many = agent.step_many(json!([to("a"), to("b"), to("c")])).await;
+        for ((_, seen), cameras) in
+            many.seen.iter().zip([&["wide"][..], &["tele"], &["tele", "wide"]])
+        {
+            for camera in cameras {
+                assert_eq!(hash(seen, camera), hash(truth, camera), "{camera} at step {step}");
+            }
+        }
+    }
 }
 
 /// A branch of a record renders the frames of its bundles again, camera by camera.
 #[tokio::test]
-async fn a_record_is_continued_with_the_levels_of_its_frames() {
+async fn a_record_is_continued_with_the_images_of_its_frames() {
     let server = server().await;
     let mut agent = open(&server, "original", &["wide", "tele"], json!({})).await;
     agent.look(json!({ "type": "reset" })).await;

@@ -9,10 +9,10 @@ use crate::replay::replay;
 use crate::support::{Agent, Painter, Reply, Seen, TestServer, pose, refused};
 
 /// An answer to `step_many`: its bytes, its metadata, and the observations by session.
-struct Many {
+pub(crate) struct Many {
     bytes: Vec<u8>,
     answers: Vec<Value>,
-    seen: Vec<(String, Seen)>,
+    pub(crate) seen: Vec<(String, Seen)>,
 }
 
 impl Many {
@@ -41,7 +41,7 @@ impl Many {
 }
 
 impl Agent {
-    async fn step_many(&mut self, steps: Value) -> Many {
+    pub(crate) async fn step_many(&mut self, steps: Value) -> Many {
         self.send(json!({ "type": "step_many", "steps": steps })).await;
         match self.receive().await {
             Reply::Binary(bytes) => Many::decode(&bytes),

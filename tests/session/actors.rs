@@ -34,7 +34,7 @@ use crate::streaming::{PROFILE, demo, eyes, unlimited, views};
 /// Where the ego stands, along the street.
 const EGO_M: f64 = 100.0;
 /// Longest exposure of the rig with rolling shutters, in microseconds.
-const EXPOSURE_US: i64 = 60_000;
+const EXPOSURES_US: [i64; 2] = [60_000, 30_000];
 
 /// A coloured box of 400 Gaussians, 4 m long.
 pub(crate) fn car_asset() -> ActorAsset {
@@ -64,7 +64,8 @@ pub(crate) fn car() -> &'static StoredActor {
 
 /// The cameras of the other tests.
 fn rig(shutters: bool) -> Vec<RigCamera> {
-    let cameras = views(Pose::IDENTITY).into_iter().zip([("front", 60_000), ("left", 30_000)]);
+    let named = ["front", "left"].into_iter().zip(EXPOSURES_US);
+    let cameras = views(Pose::IDENTITY).into_iter().zip(named);
     let camera = |(view, (name, duration_us)): (View, (&str, i64))| RigCamera {
         shutter: shutters
             .then_some(Shutter { direction: ShutterDirection::TopToBottom, duration_us }),
@@ -117,34 +118,32 @@ async fn standing(session: &mut Session, steps: u32) -> Vec<Vec<blake3::Hash>> {
     seen
 }
 
-/// Expected images of an ego at rest, with actors at their poses now and at the start of the
-/// exposure.
-fn expected(placed: &[(u16, Pose, Pose)], shutters: bool) -> Vec<blake3::Hash> {
+/// Expected images of an ego at rest, each rendered by itself, with actors at their poses now and at
+/// the start of each camera's exposure.
+fn expected(placed: &[(u16, Pose, [Pose; 2])], shutters: bool) -> Vec<blake3::Hash> {
     let views = View::from_rig(&rig(shutters), demo().at(EGO_M));
     let resident = unlimited().open("demo", None).unwrap();
-    let mut scene = resident.scene(&eyes(&views), &PROFILE).unwrap();
     let asset = demo().catalog().actor(&car().hash).unwrap();
-    let eyes: Vec<ActorViewpoint> = eyes(&views)
-        .iter()
-        .map(|eye| ActorViewpoint { position_m: eye.position_m, focal_px: eye.focal_px })
-        .collect();
-    let place = |&(actor, now, at_start): &(u16, Pose, Pose)| PlacedChunk {
-        world_from_actor_at_start: at_start,
-        shadow: Some(ContactShadow { length_m: 4.0, width_m: 1.8 }),
-        ..PlacedChunk::at_rest(
-            asset.level(&now, &eyes, PROFILE.tau_px, PROFILE.reach_m).unwrap().clone(),
-            now,
-            actor,
-        )
+    let image = |(index, view): (usize, &View)| {
+        let eye = eyes(&[*view])[0];
+        let seen = ActorViewpoint { position_m: eye.position_m, focal_px: eye.focal_px };
+        let place = |&(actor, now, at_start): &(u16, Pose, [Pose; 2])| {
+            let chunk = asset.level(&now, &seen, PROFILE.tau_px, PROFILE.reach_m).unwrap();
+            PlacedChunk {
+                world_from_actor_at_start: at_start[index],
+                shadow: Some(ContactShadow { length_m: 4.0, width_m: 1.8 }),
+                ..PlacedChunk::at_rest(chunk.clone(), now, actor)
+            }
+        };
+        let mut scene = resident.scene(&[eye], &PROFILE).unwrap();
+        scene.place(placed.iter().map(place).collect());
+        let mut rgb8 = vec![0; 3 * view.camera.pixels()];
+        let target = Target { rgb8: Some(&mut rgb8), ..Target::default() };
+        let frame = Frame { scene: &scene, profile: &PROFILE, views: &[*view] };
+        crate::images::cpu().render(&frame, &mut [target], &|_, _| {}).unwrap();
+        blake3::hash(&rgb8)
     };
-    scene.place(placed.iter().map(place).collect());
-    let mut images: Vec<Vec<u8>> =
-        views.iter().map(|view| vec![0; 3 * view.camera.pixels()]).collect();
-    let mut targets: Vec<Target<'_>> =
-        images.iter_mut().map(|rgb8| Target { rgb8: Some(rgb8), ..Target::default() }).collect();
-    let frame = Frame { scene: &scene, profile: &PROFILE, views: &views };
-    crate::images::cpu().render(&frame, &mut targets, &|_, _| {}).unwrap();
-    images.iter().map(|rgb8| blake3::hash(rgb8)).collect()
+    views.iter().enumerate().map(image).collect()
 }
 
 fn poses(session: &Session) -> Vec<Pose> {
@@ -162,19 +161,21 @@ async fn every_frame_draws_the_actors_of_its_time() {
         let mut before = poses(&session);
         assert_eq!(
             first,
-            expected(&[(0, before[0], before[0]), (1, before[1], before[1])], shutters)
+            expected(&[(0, before[0], [before[0]; 2]), (1, before[1], [before[1]; 2])], shutters)
         );
         for step in 1..=3 {
             let seen = hashes(&session.step(demo().at(EGO_M), false).await.unwrap());
             let now = poses(&session);
             assert!((now[0].position_m.distance(before[0].position_m) - 0.9).abs() < 1e-6);
-            // 60 of the step's 100 ms before its end.
-            let since = 1.0 - EXPOSURE_US as f64 * 1e-5;
-            let at_start = if shutters { before[0].interpolate(&now[0], since) } else { now[0] };
-            let drawn = [(0, now[0], at_start), (1, now[1], now[1])];
+            // 60 and 30 of the step's 100 ms before its end.
+            let at_start = EXPOSURES_US.map(|exposure_us| {
+                let since = (100_000 - exposure_us) as f64 / 100_000.0;
+                if shutters { before[0].interpolate(&now[0], since) } else { now[0] }
+            });
+            let drawn = [(0, now[0], at_start), (1, now[1], [now[1]; 2])];
             assert_eq!(seen, expected(&drawn, shutters), "step {step}, shutters {shutters}");
             if shutters {
-                let at_rest = [(0, now[0], now[0]), (1, now[1], now[1])];
+                let at_rest = [(0, now[0], [now[0]; 2]), (1, now[1], [now[1]; 2])];
                 assert_ne!(seen, expected(&at_rest, shutters), "the shutter must be seen");
             }
             before = now;
@@ -469,7 +470,7 @@ fn the_tests_see_the_car() {
         position_m: DVec3::from_array(ahead(x_m, 0.5)),
         rotation: glam::DQuat::from_euler(EulerRot::ZYX, yaw_rad, 0.0, 0.0),
     };
-    let seen = |pose: Pose| expected(&[(0, pose, pose)], false);
+    let seen = |pose: Pose| expected(&[(0, pose, [pose; 2])], false);
     assert_ne!(seen(at(0.0, 12.0)), expected(&[], false));
     assert_ne!(seen(at(0.0, 12.0)), seen(at(0.0, 12.1)));
     assert_ne!(seen(at(0.0, 12.0)), seen(at(0.1, 12.0)));

@@ -134,7 +134,12 @@ fn place(resident: &Resident, SectionRef { chunk, section }: SectionRef) -> Plac
 #[tokio::test(flavor = "multi_thread")]
 async fn at_thirty_metres_a_second_no_frame_waits_after_the_first_seconds() {
     let all = unlimited().open("demo", None).unwrap();
-    let lens = wildcity_twin::residency::RigExtent { focal_px: 70.0, radius_m: 1.7 };
+    let lens = wildcity_twin::residency::RigExtent {
+        views: 2,
+        focal_px: 70.0,
+        least_focal_px: 40.0,
+        radius_m: 1.7,
+    };
     let limit_bytes = all.worst_case_bytes(lens) * 3 / 2;
     assert!(limit_bytes < all.total_bytes() / 2, "otherwise all of it would fit");
     let bench = bench(Cache::limited(demo().catalog(), Some(limit_bytes)));

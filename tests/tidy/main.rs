@@ -5,6 +5,7 @@
 mod book;
 mod cycles;
 mod dialect;
+mod errors;
 mod licences;
 mod links;
 mod packages;

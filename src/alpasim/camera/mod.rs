@@ -29,10 +29,16 @@ pub enum CameraSpecError {
     Field { field: &'static str, must: String },
     /// The numbers are no camera.
     #[error("camera_intrinsics: {0}")]
-    Camera(#[from] CameraError),
+    Camera(CameraError),
     /// A pose is missing or invalid.
     #[error(transparent)]
     Pose(#[from] SceneError),
+}
+
+impl From<CameraError> for CameraSpecError {
+    fn from(cause: CameraError) -> Self {
+        Self::Camera(cause)
+    }
 }
 
 /// The logical id of a camera.

@@ -1,6 +1,6 @@
 //! Cameras and views of requests.
 
-use wildcity_render::{Readout, RollingShutter, View};
+use wildcity_render::{RollingShutter, View};
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::geometry::camera::json::{Intrinsics, LensFields, WindshieldFields};
 use wildcity_scene::geometry::camera::{FThetaReference, ShutterDirection, WindshieldReference};
@@ -67,8 +67,7 @@ pub fn view(request: &wire::RgbRenderRequest, frame: &LocalFrame) -> Result<View
     let rolling_shutter =
         moves.then_some(RollingShutter { direction, world_from_camera_first: first });
     // A request has the poses of its objects at the start and the end of its own exposure.
-    let readout = Some(Readout { direction, share: 1.0 });
-    Ok(View { camera, world_from_camera: end, rolling_shutter, readout })
+    Ok(View { camera, world_from_camera: end, rolling_shutter, readout: Some(direction) })
 }
 
 fn ftheta(lens: &wire::FthetaCameraParam) -> Result<Intrinsics, CameraSpecError> {

@@ -113,10 +113,16 @@ pub enum BridgeError {
     Setting(String),
     /// The server sent an invalid pose.
     #[error("the server sent an invalid pose: {0}")]
-    Pose(#[from] PoseError),
+    Pose(PoseError),
     /// No driver answers, so that no episode began.
     #[error(transparent)]
     Driver(DriverError),
+}
+
+impl From<PoseError> for BridgeError {
+    fn from(cause: PoseError) -> Self {
+        Self::Pose(cause)
+    }
 }
 
 /// Drives one episode.

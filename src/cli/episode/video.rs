@@ -8,7 +8,7 @@ use wildcity_twin::residency::Cache;
 
 use crate::cli::backend_options::BackendOptions;
 use crate::cli::directories::{Episodes, Twins};
-use crate::cli::{output, progress};
+use crate::cli::{exit, output, progress};
 
 use super::kept::{camera_index, keep_cameras};
 
@@ -71,7 +71,7 @@ impl Video {
             bar.inc(1);
             let path = self.out.join(format!("{written:06}.png"));
             written += 1;
-            write_png(&path, image).map_err(|error| format!("{error:#}"))
+            write_png(&path, image).map_err(|error| exit::chain(&error))
         })?;
         bar.finish_and_clear();
 

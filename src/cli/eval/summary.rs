@@ -29,7 +29,7 @@ pub(super) fn print_means(out: &mut impl Write, means: &Means) -> io::Result<()>
 
 fn print_scores(out: &mut impl Write, what: &str, means: &ScoreMeans) -> io::Result<()> {
     let ScoreMeans { psnr_db, ssim, ssim_mirrored, flip, .. } = means;
-    let psnr = decibels(*psnr_db);
+    let psnr = mean_decibels(*psnr_db);
     writeln!(
         out,
         "{what}: PSNR {psnr}, SSIM {ssim:.4} (mirrored edges: {ssim_mirrored:.4}), FLIP {flip:.4}"
@@ -38,7 +38,7 @@ fn print_scores(out: &mut impl Write, what: &str, means: &ScoreMeans) -> io::Res
         writeln!(out, "  LPIPS {lpips:.4}")?;
     }
     if let Some(aligned) = &means.aligned {
-        let psnr = decibels(aligned.psnr_db);
+        let psnr = mean_decibels(aligned.psnr_db);
         writeln!(out, "with aligned exposure: PSNR {psnr}, SSIM {:.4}", aligned.ssim)?;
     }
     Ok(())
@@ -57,12 +57,17 @@ pub(super) fn print_off_trajectory(out: &mut impl Write, one: &Extrapolation) ->
         writeln!(
             out,
             "  {what}: reprojection {} ({:.1} % came back), flicker {:.4}",
-            decibels(means.reprojection_psnr_db),
+            mean_decibels(means.reprojection_psnr_db),
             100.0 * means.reprojection_share,
             means.flicker
         )?;
     }
     Ok(())
+}
+
+/// A mean of decibels. One exact image of many makes it infinite, and the others are not exact.
+fn mean_decibels(db: f64) -> String {
+    if db == f64::INFINITY { "infinite".to_owned() } else { decibels(db) }
 }
 
 pub(super) fn decibels(db: f64) -> String {

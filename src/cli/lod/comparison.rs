@@ -58,7 +58,10 @@ impl Comparison<'_> {
         for profile in &profiles {
             let scene = resident.scene(&viewpoints, profile)?;
             by_profile.push(self.render(&scene, profile, &views)?);
-            let share = 100.0 * scene.gaussians() as f64 / version.manifest.gaussians() as f64;
+            // Of all views together: each draws levels of its own.
+            let drawn: usize = (0..views.len()).map(|view| scene.for_view(view).gaussians()).sum();
+            let all = views.len() as f64 * version.manifest.gaussians() as f64;
+            let share = 100.0 * drawn as f64 / all;
             let full = &by_profile[0];
             let now = &by_profile[by_profile.len() - 1];
             let pairs = full.iter().zip(now).flat_map(|(full, now)| full.iter().zip(now.iter()));

@@ -8,7 +8,7 @@ use anyhow::Context;
 
 use super::opened;
 use crate::cli::directories::Twins;
-use crate::cli::exit::Exit;
+use crate::cli::exit::{Exit, chain};
 use wildcity_episode::DriveStart;
 use wildcity_scene::{ActorBox, Trajectory};
 use wildcity_session::StoredAssets;
@@ -136,7 +136,7 @@ fn lacks(scenario: &Scenario, drives: &[Trajectory]) -> Vec<String> {
 impl Check {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let catalog = self.twins.catalog()?;
-        self.check(&catalog).map_err(|error| Exit::error(BAD_INPUT, format!("{error:#}")).into())
+        self.check(&catalog).map_err(|error| Exit::error(BAD_INPUT, chain(&error)).into())
     }
 
     fn check(&self, catalog: &Catalog) -> anyhow::Result<()> {

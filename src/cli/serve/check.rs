@@ -9,6 +9,7 @@ use std::time::SystemTime;
 use wildcity_server::{TlsFiles, Tokens};
 
 use crate::cli::directories::ServerDirectories;
+use crate::cli::exit;
 
 use super::{Serve, config_file};
 
@@ -69,7 +70,7 @@ impl Serve {
     }
 
     fn check_scenarios(&self) -> Result<String, String> {
-        let dir = self.directories.scenarios.dir().map_err(|error| format!("{error:#}"))?;
+        let dir = self.directories.scenarios.dir().map_err(|error| exit::chain(&error))?;
         let shown = dir.display();
         if !dir.exists() {
             return Ok(format!("there is no {shown}: none can be opened by name"));

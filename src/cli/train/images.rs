@@ -11,6 +11,8 @@ use wildcity_render::View;
 use wildcity_scene::RenderProfile;
 use wildcity_train::run::{TrainingImage, TrainingImages};
 
+use crate::cli::exit;
+
 /// Images of a list, at a fraction of their size.
 pub(super) struct ListedImages<'a> {
     pub(super) images: Vec<&'a RealImage>,
@@ -28,7 +30,7 @@ impl TrainingImages for ListedImages<'_> {
     }
 
     fn load(&self, index: usize) -> Result<TrainingImage, String> {
-        self.decode(self.images[index]).map_err(|error| format!("{error:#}"))
+        self.decode(self.images[index]).map_err(|error| exit::chain(&error))
     }
 }
 

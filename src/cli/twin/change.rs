@@ -3,19 +3,20 @@
 use std::io::{self, Write};
 
 use crate::cli::directories::{TwinVersion, Twins};
+use wildcity_scene::Manifest;
 use wildcity_twin::store::{CommitKind, StorageOptions, Version, VersionChange};
 
-/// Commits a version with the changes that `edit` makes to its base.
+/// Commits a version with the changes that `edit` makes to its base, whose manifest it gets.
 pub(super) fn commit(
     twins: &Twins,
     twin: &TwinVersion,
-    edit: impl FnOnce(&mut VersionChange),
+    edit: impl FnOnce(&Manifest, &mut VersionChange) -> anyhow::Result<()>,
 ) -> anyhow::Result<Version> {
     let catalog = twins.catalog()?;
     let base = catalog.version(&twin.name, twin.number)?;
     // The Gaussians stay, and so does the record of their origin.
     let mut change = VersionChange::edit();
-    edit(&mut change);
+    edit(&base.manifest, &mut change)?;
     let storage = StorageOptions { record: base.manifest.record, ..StorageOptions::default() };
     let commit = catalog.begin(&twin.name, CommitKind::Import, storage)?;
     Ok(commit.change(base.number, change)?)

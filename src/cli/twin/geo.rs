@@ -38,8 +38,10 @@ Examples:
 impl Geo {
     pub(in crate::cli) fn run(self) -> anyhow::Result<()> {
         let anchor = self.anchor;
-        let version =
-            change::commit(&self.twins, &self.edited.twin, |change| change.geo = Some(anchor))?;
+        let version = change::commit(&self.twins, &self.edited.twin, |_, change| {
+            change.geo = Some(anchor);
+            Ok(())
+        })?;
         let anchor = version.manifest.geo.as_ref();
         let what = anchor.map_or(Ok("no place on the earth".to_owned()), serde_json::to_string)?;
         change::print(&version, &what)

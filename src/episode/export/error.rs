@@ -9,7 +9,7 @@ use crate::file::ReadError;
 #[derive(Debug, thiserror::Error)]
 pub enum ExportError {
     /// The record cannot be read.
-    #[error("{0}")]
+    #[error(transparent)]
     Read(#[from] ReadError),
     /// The file cannot be written.
     #[error("cannot write {}: {cause}", path.display())]
@@ -24,10 +24,10 @@ pub enum ExportError {
     /// The file cannot be written.
     #[cfg(feature = "mcap")]
     #[error("cannot write the MCAP file: {0}")]
-    Mcap(#[from] mcap::McapError),
+    Mcap(mcap::McapError),
     /// A line cannot be written as JSON.
     #[error("cannot write a line as JSON: {0}")]
-    Json(#[from] serde_json::Error),
+    Json(serde_json::Error),
     /// The images of the episode cannot be made.
     #[error("{0}")]
     Images(String),
@@ -37,6 +37,19 @@ pub enum ExportError {
     /// This build has no MCAP.
     #[error("built without `mcap`: cargo build --release --features full")]
     LeftOut,
+}
+
+#[cfg(feature = "mcap")]
+impl From<mcap::McapError> for ExportError {
+    fn from(cause: mcap::McapError) -> Self {
+        Self::Mcap(cause)
+    }
+}
+
+impl From<serde_json::Error> for ExportError {
+    fn from(cause: serde_json::Error) -> Self {
+        Self::Json(cause)
+    }
 }
 
 /// Result of an export.

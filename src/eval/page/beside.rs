@@ -3,7 +3,7 @@
 use data_encoding::BASE64;
 use maud::{Markup, html};
 
-use super::numbers::{decibels, percent, share};
+use super::numbers::{mean_decibels, percent, share};
 use crate::evaluation::Evaluation;
 use crate::extrapolation::{Extrapolation, ViewMeans};
 
@@ -57,7 +57,7 @@ fn rows(one: &Extrapolation, has_kid: bool) -> Markup {
 
 fn cells(means: &ViewMeans) -> Markup {
     html! {
-        td { (decibels(means.reprojection_psnr_db)) } td { (share(means.reprojection_flip)) }
+        td { (mean_decibels(means.reprojection_psnr_db)) } td { (share(means.reprojection_flip)) }
         td { (percent(means.reprojection_share)) } td { (share(means.flicker)) }
     }
 }

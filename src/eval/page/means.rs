@@ -2,7 +2,7 @@
 
 use maud::{Markup, html};
 
-use super::numbers::{decibels, metres, share, signed};
+use super::numbers::{decibels, mean_decibels, metres, share, signed};
 use crate::evaluation::{Evaluation, LidarSubject};
 use crate::kid::Kid;
 use crate::lidar::{LidarMeans, NO_LIDAR_POINT};
@@ -71,13 +71,13 @@ fn rows(name: &str, means: &Means, columns: Columns) -> Markup {
 
 fn cells(means: &ScoreMeans, columns: Columns) -> Markup {
     html! {
-        td { (decibels(means.psnr_db)) } td { (share(means.ssim)) } td { (share(means.ssim_mirrored)) }
+        td { (mean_decibels(means.psnr_db)) } td { (share(means.ssim)) } td { (share(means.ssim_mirrored)) }
         td { (share(means.flip)) }
         @if columns.lpips { td { (share(means.lpips.unwrap_or(f64::NAN))) } }
         td { (decibels(means.pooled_psnr_db)) }
         @if columns.aligned {
             @let aligned = means.aligned.as_ref();
-            td { (decibels(aligned.map_or(f64::NAN, |aligned| aligned.psnr_db))) }
+            td { (mean_decibels(aligned.map_or(f64::NAN, |aligned| aligned.psnr_db))) }
             td { (share(aligned.map_or(f64::NAN, |aligned| aligned.ssim))) }
         }
     }

@@ -9,6 +9,12 @@ pub(super) fn decibels(db: f64) -> String {
     }
 }
 
+/// A mean of decibels, without their unit. One exact image of many makes it infinite, and the
+/// others are not exact.
+pub(super) fn mean_decibels(db: f64) -> String {
+    if db == f64::INFINITY { "infinite".to_owned() } else { decibels(db) }
+}
+
 /// Decibels with their unit.
 pub(super) fn with_unit(db: f64) -> String {
     if db.is_finite() { format!("{db:.2} dB") } else { decibels(db) }

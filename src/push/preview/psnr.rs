@@ -10,9 +10,9 @@ use wildcity_render::{Frame, RenderError, Target, View};
 use wildcity_scene::chunk::cell_at;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::rig::RigCamera;
-use wildcity_scene::{Chunk, Gaussians, RenderProfile, Rig, Scene, Sky};
+use wildcity_scene::{Chunk, Gaussians, RenderProfile, Rig, Scene, Selection, Sky, ViewSet};
 use wildcity_session::{Engine, FrameCost, PUSHES, SessionError, viewpoints};
-use wildcity_twin::residency::{SectionRef, Viewpoint, demand};
+use wildcity_twin::residency::{BlockIndex, SectionRef, Viewpoint};
 use wildcity_twin::store::{Catalog, StoreError, Version};
 
 use crate::blocking::run_blocking;
@@ -81,6 +81,7 @@ pub(crate) async fn preview_psnr(
     let gaussians = change.gaussians.clone();
     let mut reader = SceneReader {
         catalog: engine.catalog().clone(),
+        index: BlockIndex::new(&change.before.manifest),
         version: change.before.clone(),
         profile: change.profile,
         replaced: change.cells,
@@ -164,9 +165,13 @@ struct BothScenes {
     after: Scene,
 }
 
+/// Chunks, and the views that draw each.
+type SeenChunks = Vec<(Arc<Chunk>, ViewSet)>;
+
 /// Reads the scenes before and after a change.
 struct SceneReader {
     catalog: Catalog,
+    index: BlockIndex,
     /// The version before the change.
     version: Arc<Version>,
     profile: RenderProfile,
@@ -180,24 +185,25 @@ struct SceneReader {
 
 impl SceneReader {
     /// Both scenes, as far as they are seen from some viewpoints.
-    fn scenes(&mut self, viewpoints: &[Viewpoint]) -> Result<BothScenes, StoreError> {
-        // Both scenes share the chunks of `kept` by reference, so the second one costs no memory.
-        let kept = self.kept(viewpoints)?;
-        let old = self.replaced_in_full_detail()?;
-        let with = |cells: &Scene| Scene { sky: self.sky.clone(), ..merged(kept.clone(), cells) };
-        Ok(BothScenes { before: with(&old), after: with(&self.new) })
-    }
-
-    /// The part of the version that is seen, without the replaced cells.
-    fn kept(&mut self, viewpoints: &[Viewpoint]) -> Result<Scene, StoreError> {
+    fn scenes(&mut self, viewpoints: &[Viewpoint]) -> Result<BothScenes, PushError> {
         let manifest = &self.version.manifest;
-        let mut sections = demand(manifest, viewpoints, &self.profile);
-        sections.retain(|section| !self.replaced.contains(&manifest.chunks[section.chunk].cell));
-        self.read(sections)
+        let selected =
+            self.index.select(manifest, viewpoints, &self.profile).map_err(SessionError::from)?;
+        let is_kept =
+            |section: &SectionRef| !self.replaced.contains(&manifest.chunks[section.chunk].cell);
+        let sections = selected.iter().filter(|(section, _)| is_kept(section)).collect();
+        let kept = self.read(sections)?;
+        let old = self.read(self.replaced_in_full_detail())?;
+        let new = self.new.chunks.iter().map(|chunk| (chunk.clone(), ViewSet::ALL)).collect();
+        // Both scenes share the chunks of `kept` by reference, so the second one costs no memory.
+        let with = |cells: SeenChunks| {
+            scene([kept.clone(), cells].concat(), viewpoints.len(), self.sky.clone())
+        };
+        Ok(BothScenes { before: with(old), after: with(new) })
     }
 
     /// All of the replaced cells before the change, as a push has them: each block at full detail.
-    fn replaced_in_full_detail(&mut self) -> Result<Scene, StoreError> {
+    fn replaced_in_full_detail(&self) -> Vec<(SectionRef, ViewSet)> {
         let mut sections = Vec::new();
         for (chunk, entry) in self.version.manifest.chunks.iter().enumerate() {
             if self.replaced.contains(&entry.cell) {
@@ -205,17 +211,19 @@ impl SceneReader {
                 // Coarser sections have the same Gaussians merged; with both, a block would be
                 // drawn twice.
                 let full_detail = all.filter(|(_, section)| section.is_full_detail());
-                sections.extend(full_detail.map(|(section, _)| SectionRef { chunk, section }));
+                let seen =
+                    full_detail.map(|(section, _)| (SectionRef { chunk, section }, ViewSet::ALL));
+                sections.extend(seen);
             }
         }
-        self.read(sections)
+        sections
     }
 
     /// Some sections. Those that were read before are not read again.
-    fn read(&mut self, sections: Vec<SectionRef>) -> Result<Scene, StoreError> {
+    fn read(&mut self, sections: Vec<(SectionRef, ViewSet)>) -> Result<SeenChunks, StoreError> {
         let manifest = &self.version.manifest;
-        let mut scene = Scene::default();
-        for section in sections {
+        let mut chunks = Vec::with_capacity(sections.len());
+        for (section, views) in sections {
             let chunk = &manifest.chunks[section.chunk];
             // Neighbouring poses see mostly the same sections. The map grows to what all poses of
             // one preview see, and is dropped with it.
@@ -228,22 +236,23 @@ impl SceneReader {
                     read
                 }
             };
-            scene.chunks.push(read);
+            chunks.push((read, views));
         }
-        Ok(scene)
+        Ok(chunks)
     }
 }
 
-/// The chunks of both scenes, in order of their cells.
-fn merged(mut kept: Scene, new: &Scene) -> Scene {
-    kept.chunks.extend(new.chunks.iter().cloned());
+/// Chunks in order of their cells, for a frame of so many views.
+fn scene(mut chunks: SeenChunks, views: usize, sky: Option<Arc<Sky>>) -> Scene {
     // Gaussians of equal depth are drawn in the order of the scene, so both scenes need the order
     // that a stored version has.
-    kept.chunks.sort_by_key(|chunk| {
+    chunks.sort_by_key(|(chunk, _)| {
         let [x, y] = chunk.cell();
         [y, x]
     });
-    kept
+    let (chunks, by_chunk) = chunks.into_iter().unzip();
+    let selection = Some(Selection { views, by_chunk });
+    Scene { chunks, selection, placed: Vec::new(), sky }
 }
 
 /// Poses along the trajectories: spread over the parts that lie in the replaced cells, or over all

@@ -119,7 +119,7 @@ impl Drawing<'_> {
     ) -> Result<(), PartError> {
         let Self { level, cutoffs, .. } = *self;
         let stages = Stages { level, frame: &part.frame, cutoffs, most_bytes };
-        project::with_jobs(&part.frame, |jobs| {
+        project::with_jobs(&part.frame, part.first_view, |jobs| {
             stages.run(self.scratch, jobs, None, Stage::Bin, &mut self.stats)
         })?;
         self.rasterize(part, targets, None);
@@ -136,7 +136,7 @@ impl Drawing<'_> {
     ) -> Result<(), RenderError> {
         // The sums of all tiles, which go on from one slab to the next.
         let tiles = UnfinishedTiles::new(view);
-        project::with_jobs(&part.frame, |jobs| {
+        project::with_jobs(&part.frame, part.first_view, |jobs| {
             let mut timer = StageTimer::start();
             let clusters =
                 DepthClusters::new(jobs.len(), |job| jobs[job].visible_clusters(), self.cutoffs);

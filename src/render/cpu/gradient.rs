@@ -103,7 +103,7 @@ impl Differentiate for Cpu {
         pool.install(|| {
             let mut stats = FrameStats::default();
             let stages = Stages { level, frame, cutoffs: &cutoffs, most_bytes };
-            project::with_jobs(frame, |jobs| {
+            project::with_jobs(frame, 0, |jobs| {
                 match stages.run(scratch, jobs, None, Stage::Bin, &mut stats) {
                     Err(PartError::Overflow) => {
                         return Err(GradientError::Memory { limit_bytes: most_bytes });

@@ -188,7 +188,7 @@ impl Cpu {
             let mut stats = FrameStats::default();
             let stages =
                 Stages { level: self.level, frame, cutoffs: &cutoffs, most_bytes: u64::MAX };
-            match project::with_jobs(frame, |jobs| {
+            match project::with_jobs(frame, 0, |jobs| {
                 stages.run(scratch, jobs, None, last, &mut stats)
             }) {
                 Err(PartError::Render(error)) => return Err(error),

@@ -51,18 +51,18 @@ impl FramePart<'_> {
         if all <= few {
             return all;
         }
-        // Actors are few and small: all of their Gaussians count, for every view.
-        let of_actors: usize = scene.placed.iter().map(|placed| placed.chunk.len()).sum();
-        let of_twin: usize = views.par_iter().map(|view| self.visible_gaussians(view)).sum();
-        of_twin + of_actors * views.len()
+        let views = views.par_iter().enumerate();
+        views.map(|(index, view)| self.visible_gaussians(view, self.first_view + index)).sum()
     }
 
-    /// Gaussians of the twin's clusters that a view may see.
-    fn visible_gaussians(&self, view: &View) -> usize {
+    /// Gaussians of the twin's clusters that a view may see, and of the actors that it draws. The
+    /// index is that in the whole frame.
+    fn visible_gaussians(&self, view: &View, index: usize) -> usize {
         let Frame { scene, profile, .. } = self.frame;
         let unscented = UnscentedView::new(view, profile);
         let mut clusters = 0;
-        for chunk in &scene.chunks {
+        let chunks = scene.chunks.iter().enumerate();
+        for (_, chunk) in chunks.filter(|(number, _)| scene.draws(*number, index)) {
             let frustum = Frustum::new(view, chunk, profile);
             let may_see = |cluster: &&Cluster| {
                 let Cluster { min_m, max_m, sigma_m, .. } = **cluster;
@@ -73,7 +73,10 @@ impl FramePart<'_> {
             };
             clusters += chunk.clusters().iter().filter(may_see).count();
         }
+        // Actors are few and small: all of their Gaussians count.
+        let placed = scene.placed.iter().filter(|placed| placed.views.contains(index));
+        let of_actors: usize = placed.map(|placed| placed.chunk.len()).sum();
         // A chunk's last cluster may be partly filled, which an upper bound allows.
-        clusters * CLUSTER
+        clusters * CLUSTER + of_actors
     }
 }

@@ -115,7 +115,9 @@ impl ProjectWork {
         let shadows = CpuChunkShadow::by_chunk(frame.scene);
         let in_view = |view: usize| {
             let shadows = &shadows;
-            let twin = frame.scene.chunks.iter().enumerate().map(move |(index, chunk)| {
+            let chunks = frame.scene.chunks.iter().enumerate();
+            let drawn = chunks.filter(move |(index, _)| frame.scene.draws(*index, view));
+            let twin = drawn.map(move |(index, chunk)| {
                 let shadows = shadows.get(index).map_or(&[][..], Vec::as_slice);
                 let relative = &frame.views[view];
                 let number = index as u32;
@@ -123,6 +125,7 @@ impl ProjectWork {
             });
             let lenses = &lenses;
             let placed = frame.scene.placed.iter().zip(actors.for_view(view)).enumerate();
+            let placed = placed.filter(move |(_, (placed, _))| placed.views.contains(view));
             let placed = placed.map(move |(index, (placed, relative))| {
                 let of = Owner::Actor { placed, lens: lenses.index(view, index) };
                 let number = (frame.scene.chunks.len() + index) as u32;
@@ -244,7 +247,8 @@ impl ProjectWork {
         match pair.of {
             Owner::Actor { placed, .. } => tint = placed.tint,
             Owner::Twin { shadows } if shadowed => {
-                self.shadows.extend(shadows.iter().map(ChunkShadow::new));
+                let shown = shadows.iter().filter(|shadow| shadow.views.contains(pair.view));
+                self.shadows.extend(shown.map(ChunkShadow::new));
             }
             Owner::Twin { .. } => {}
         }
@@ -300,8 +304,7 @@ impl ChunkInView<'_> {
             may_see(min_m, max_m, sigma_m)
         });
         let place = |(place, cluster): (&ClusterLocation, &Cluster)| {
-            let touches = |s: &CpuChunkShadow| s.may_touch(cluster.min_m, cluster.max_m);
-            let shadowed = shadows.iter().any(touches);
+            let shadowed = shadows.iter().any(|shadow| shadow.falls_on(cluster, self.view));
             ClusterPlace { page: place.page, line: place.lines.start, shadowed }
         };
         visible.map(place).collect()

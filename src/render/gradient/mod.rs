@@ -48,6 +48,7 @@ mod shape;
 mod sums;
 mod twist;
 
+use std::borrow::Cow;
 use std::sync::Arc;
 
 use glam::DVec3;
@@ -141,6 +142,9 @@ pub enum GradientError {
     /// The twin is shadowed by an actor, which is not differentiated.
     #[error("contact shadows have no derivatives: place the actors without shadows")]
     Shadows,
+    /// Views draw different chunks, as those of a twin in levels of detail do.
+    #[error("each view of the frame draws other chunks: differentiate at full detail")]
+    Levels,
 }
 
 /// A backend that computes gradients, too. What a frame needs for them is allocated by this call
@@ -280,6 +284,11 @@ pub(crate) fn check_frame(frame: &Frame<'_>, backend: &'static str) -> Result<()
     frame.check_splats(backend)?;
     if frame.scene.placed.iter().any(|placed| placed.shadow.is_some()) {
         return Err(GradientError::Shadows);
+    }
+    // A view with a selection of its own sees a scene that is made for it.
+    let has_own = |view| matches!(frame.scene.for_view(view), Cow::Owned(_));
+    if (0..frame.views.len()).any(has_own) {
+        return Err(GradientError::Levels);
     }
     Ok(())
 }

@@ -54,16 +54,17 @@ impl Backend for Reference {
         for (index, (view, target)) in frame.views.iter().zip(targets).enumerate() {
             // Project and sort.
             let start = Instant::now();
-            let mut splats = project(frame.scene, frame.profile, view);
+            let scene = &*frame.scene.for_view(index);
+            let mut splats = project(scene, frame.profile, view);
             project::sort(&mut splats);
             // Splats give order, colour and visibility; exact rays take only the shape from these.
             let gaussians = match frame.profile.rays {
                 Rays::Splats => Vec::new(),
-                Rays::Exact => rays::gaussians(frame.scene, &splats),
+                Rays::Exact => rays::gaussians(scene, &splats),
             };
             let views = match frame.profile.rays {
                 Rays::Splats => Vec::new(),
-                Rays::Exact => rays::relative_views(frame.scene, view),
+                Rays::Exact => rays::relative_views(scene, view),
             };
             project_ms += start.elapsed().as_secs_f64() * 1e3;
             stats.visible_pairs += splats.len() as u64;

@@ -102,7 +102,6 @@ impl ActorAsset {
         // `lod::levels` returns only the coarser levels, with rising errors. The full chunk goes to
         // the front, so that errors rise over the whole list and `level` can search from the back.
         let coarser = lod::levels(&full)
-            .into_iter()
             .map(|lod::Level { error_m, chunk }| AssetLevel { error_m, chunk: Arc::new(chunk) });
         let mut levels: Vec<AssetLevel> = coarser.collect();
         levels.insert(0, AssetLevel { error_m: 0.0, chunk: Arc::new(full) });
@@ -124,14 +123,13 @@ impl ActorAsset {
         self.levels.iter().map(|level| level.chunk.bytes() as u64).sum()
     }
 
-    /// The level with which a frame draws an actor: the coarsest one with an error of at most
-    /// `tau_px` pixels at the distance of the nearest camera from the actor's box and at the
-    /// longest focal length, as for the blocks of a twin. `None` for an actor that is beyond the
-    /// profile's `reach_m` of every camera.
+    /// The level with which a view draws an actor: the coarsest one with an error of at most
+    /// `tau_px` pixels at the distance of the camera from the actor's box, as for the blocks of a
+    /// twin. `None` for an actor that is beyond the profile's `reach_m`.
     pub fn level(
         &self,
         world_from_actor: &Pose,
-        viewpoints: &[ActorViewpoint],
+        viewpoint: &ActorViewpoint,
         tau_px: f64,
         reach_m: Option<f64>,
     ) -> Option<&Arc<Chunk>> {
@@ -143,17 +141,14 @@ impl ActorAsset {
             min_m: half_m * DVec3::new(-1.0, -1.0, 0.0),
             max_m: half_m * DVec3::new(1.0, 1.0, 2.0),
         };
-        let distance_m = |viewpoint: &ActorViewpoint| {
-            let from_actor_m = viewpoint.position_m - world_from_actor.position_m;
-            bounds.distance_m(world_from_actor.rotation.inverse() * from_actor_m)
-        };
-        // Without a camera the nearest distance is infinite, beyond every reach.
-        let nearest_m = viewpoints.iter().map(distance_m).fold(f64::INFINITY, f64::min);
-        let focal_px = viewpoints.iter().fold(0.0, |most: f64, seen| most.max(seen.focal_px));
-        let within_reach = reach_m.is_none_or(|reach_m| nearest_m <= reach_m);
+        let ActorViewpoint { position_m, focal_px } = *viewpoint;
+        let from_actor_m = position_m - world_from_actor.position_m;
+        let distance_m = bounds.distance_m(world_from_actor.rotation.inverse() * from_actor_m);
+        let within_reach = reach_m.is_none_or(|reach_m| distance_m <= reach_m);
         // An error of e metres at d metres is f e / d pixels. Multiplied by d, the test holds for a
         // camera inside the box (d = 0): there only the level with an error of 0 passes.
-        let small = |level: &&AssetLevel| focal_px * f64::from(level.error_m) <= tau_px * nearest_m;
+        let small =
+            |level: &&AssetLevel| focal_px * f64::from(level.error_m) <= tau_px * distance_m;
         // Errors rise, so that the last level that passes is the coarsest one. The first level
         // stands in where none passes, such as for a NaN distance.
         let level = self.levels.iter().rfind(small).or(self.levels.first());
@@ -198,15 +193,16 @@ mod tests {
             // box: the distance to the box is exactly `distance_m`.
             let position_m = at.position_m - DVec3::new(2.0 + distance_m, 0.0, -1.0);
             let viewpoint = ActorViewpoint { position_m, focal_px: 1000.0 };
-            asset.level(&at, &[viewpoint], 1.0, reach_m).map(|chunk| chunk.len())
+            asset.level(&at, &viewpoint, 1.0, reach_m).map(|chunk| chunk.len())
         };
         assert_eq!(count(0.0, None), Some(20_000));
         let counts = [0.0, 5.0, 50.0, 500.0, 5000.0].map(|m| count(m, None).unwrap());
         assert!(counts.is_sorted_by(|a, b| a >= b) && counts[4] * 10 < counts[0], "{counts:?}");
         assert_eq!(count(50.1, Some(50.0)), None);
         assert_eq!(count(49.9, Some(50.0)), count(49.9, None));
-        // Within the box: all of it, whatever the focal length.
-        assert_eq!(asset.level(&at, &[], 0.0, None).map(|chunk| chunk.len()), Some(20_000));
+        // Without an error: all of it, however far.
+        let far = ActorViewpoint { position_m: DVec3::X * 1e4, focal_px: 1.0 };
+        assert_eq!(asset.level(&at, &far, 0.0, None).map(|chunk| chunk.len()), Some(20_000));
     }
 
     #[test]

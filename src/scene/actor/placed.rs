@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use glam::{DVec3, Vec3};
 
-use crate::Chunk;
 use crate::geometry::Pose;
+use crate::{Chunk, ViewSet};
 
 /// The Gaussians of an actor at its pose in one frame.
 ///
@@ -20,17 +20,20 @@ pub struct PlacedChunk {
     pub chunk: Arc<Chunk>,
     /// The actor's pose at the end of the exposure.
     pub world_from_actor: Pose,
-    /// The actor's pose at the start of the frame's longest exposure. The motion in between is that
-    /// of [`Pose::interpolate`]. The same as `world_from_actor` for an actor at rest, or if no
-    /// camera has a rolling shutter.
+    /// The actor's pose at the start of the exposure of the views that draw it. The motion in
+    /// between is that of [`Pose::interpolate`]. The same as `world_from_actor` for an actor at
+    /// rest, or without a rolling shutter.
     pub world_from_actor_at_start: Pose,
     /// Index of the actor, below [`PlacedChunk::MAX_ACTORS`].
     pub actor: u16,
     /// Factor on the Gaussians' linear red, green and blue; 1 leaves them as they are.
     pub tint: [f32; 3],
-    /// The shadow that the actor casts on the twin beneath it. An actor of several chunks has it on
-    /// one of them.
+    /// The shadow that the actor casts on the twin beneath it, in the views that draw this chunk.
+    /// An actor of several chunks has it on one of them for each view.
     pub shadow: Option<ContactShadow>,
+    /// The views of the frame that draw it: each has its own exposure, and its own level of detail
+    /// of an actor.
+    pub views: ViewSet,
 }
 
 /// The darkening of the ground under an actor: a factor on the colours of the twin's Gaussians,
@@ -49,10 +52,10 @@ pub struct ContactShadow {
 }
 
 impl PlacedChunk {
-    /// Most actors of a frame.
+    /// Most actors of a view.
     pub const MAX_ACTORS: usize = 256;
 
-    /// A chunk at rest, without a tint or a shadow.
+    /// A chunk at rest, without a tint or a shadow, in all views.
     pub fn at_rest(chunk: Arc<Chunk>, world_from_actor: Pose, actor: u16) -> Self {
         Self {
             chunk,
@@ -61,6 +64,7 @@ impl PlacedChunk {
             actor,
             tint: [1.0; 3],
             shadow: None,
+            views: ViewSet::ALL,
         }
     }
 }

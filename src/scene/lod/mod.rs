@@ -4,7 +4,9 @@
 //! A level is made from the previous one by merging pairs of neighbours in Morton order, weighted
 //! by opacity x area (`merge.rs`). The error of a merged Gaussian is the largest, over all
 //! Gaussians of level 0 that it represents, of the distance that the mean moved plus 3 times the
-//! decrease of the standard deviation.
+//! decrease of the standard deviation; or how far beyond their edges it is seen, if that is more
+//! (`Node::beyond_edge`). Without the latter, a stack of faint Gaussians on one spot, of which
+//! only the tips are drawn, became one large opaque one without an error.
 //!
 //! Levels are merged under a limit of the error and not by halving: limits rise by √2 from 1 mm,
 //! each block merges the pairs below the limit, cheapest first, and a level is kept if it has a
@@ -15,17 +17,18 @@
 mod merge;
 
 use glam::DVec3;
+use rayon::prelude::*;
 
 use super::chunk::{ActivatedGaussian, Chunk, column};
 use super::sh;
 
-use merge::{Node, cost, joined};
+use merge::{Node, StoredNode, area_m2, cost, joined};
 
 /// One level of detail of a block.
 #[derive(Clone, Debug)]
 pub struct Level {
     /// Upper bound, in metres, of how far a Gaussian of level 0 was moved plus 3 times the standard
-    /// deviation that it lost; 0 for level 0.
+    /// deviation that it lost, and of how far beyond its edge it is seen; 0 for level 0.
     pub error_m: f32,
     pub chunk: Chunk,
 }
@@ -40,6 +43,8 @@ const COARSEST_LIMIT_M: f64 = 16.0;
 const KEPT_SHARE: f64 = 0.65;
 /// Merging stops at this number: a block is one chunk with at least one lane group.
 const FEWEST: usize = 16;
+/// The partner of a Gaussian that stays as it is.
+const NO_PARTNER: u32 = u32::MAX;
 /// Number of consecutive Gaussians in Morton order among which pairs are formed.
 const GROUP: usize = 64;
 /// A partner is searched among this many successors in the order.
@@ -54,39 +59,45 @@ const MOST_COST: f64 = 0.02;
 const BLUR_PX2: f64 = 0.3;
 
 /// The levels of a block above level 0, each coarser than the previous one; none if merging reduces
-/// the number of Gaussians too little.
-pub fn levels(block: &Chunk) -> Vec<Level> {
+/// the number of Gaussians too little. One is made at a time, and the block is no longer needed.
+pub fn levels(block: &Chunk) -> impl Iterator<Item = Level> + use<> {
     let mut merging = Merging::new(block);
-    let mut kept = Vec::new();
     let mut last = block.len();
+    let mut before_m = 0.0_f32;
     let mut limit_m = FINEST_LIMIT_M;
-    // At most 29 limits: from 2^-10 to 2^4 in steps of √2.
-    while limit_m <= COARSEST_LIMIT_M && merging.nodes.len() > FEWEST {
-        merging.merge_within(limit_m);
-        if (merging.nodes.len() as f64) <= KEPT_SHARE * last as f64 {
-            last = merging.nodes.len();
-            let before_m = kept.last().map_or(0.0, |level: &Level| level.error_m);
-            // Not below the level before, because a later merge can bring a mean back; `level` and
-            // the reader of a table need rising errors.
-            let error_m = merging.error_m().max(before_m);
-            kept.push(Level { error_m, chunk: merging.chunk(block) });
+    std::iter::from_fn(move || {
+        // At most 29 limits: from 2^-10 to 2^4 in steps of √2.
+        while limit_m <= COARSEST_LIMIT_M && merging.nodes.len() > FEWEST {
+            merging.merge_within(limit_m);
+            limit_m *= std::f64::consts::SQRT_2;
+            if (merging.nodes.len() as f64) <= KEPT_SHARE * last as f64 {
+                last = merging.nodes.len();
+                // Not below the level before, because a later merge can bring a mean back; `level`
+                // and the reader of a table need rising errors.
+                before_m = merging.error_m().max(before_m);
+                return Some(Level { error_m: before_m, chunk: merging.chunk() });
+            }
         }
-        limit_m *= std::f64::consts::SQRT_2;
-    }
-    kept
+        None
+    })
 }
 
-/// The state of merging a block into coarser levels.
+/// The state of merging a block into coarser levels: 80 bytes per Gaussian, its colour, and 20
+/// bytes per Gaussian of level 0.
 struct Merging {
-    nodes: Vec<Node>,
+    cell: [i32; 2],
+    origin_m: DVec3,
+    sh_degree: u8,
+    nodes: Vec<StoredNode>,
     /// Largest error over the Gaussians of level 0 that each node represents, in metres.
     errors_m: Vec<f64>,
     /// SH coefficients, `[node, coefficient, channel]`.
     sh: Vec<f32>,
     /// Number of floats of one node in `sh`.
     stride: usize,
-    /// Mean and largest standard deviation of every Gaussian of level 0 (a leaf), in metres.
-    leaves: Vec<(DVec3, f64)>,
+    /// Mean (x, y, z) and largest standard deviation of every Gaussian of level 0 (a leaf), in
+    /// metres.
+    leaves: Vec<[f32; 4]>,
     /// The node that represents each leaf.
     node_of_leaf: Vec<u32>,
 }
@@ -102,6 +113,9 @@ impl Merging {
     fn new(block: &Chunk) -> Self {
         let stride = 3 * sh::coefficients(block.sh_degree());
         let mut merging = Self {
+            cell: block.cell(),
+            origin_m: block.origin_m(),
+            sh_degree: block.sh_degree(),
             nodes: Vec::with_capacity(block.len()),
             errors_m: vec![0.0; block.len()],
             sh: Vec::with_capacity(block.len() * stride),
@@ -110,13 +124,20 @@ impl Merging {
             node_of_leaf: (0..block.len() as u32).collect(),
         };
         for index in 0..block.len() {
-            let value = |column| f64::from(block.value(index, column));
-            let three = |column| DVec3::new(value(column), value(column + 1), value(column + 2));
-            let quat = [0, 1, 2, 3].map(|i| value(column::QUAT + i));
-            let opacity = value(column::LOG2_OPACITY).exp2();
-            let node = Node::new(three(column::MEAN), three(column::SCALE), quat, opacity);
-            merging.leaves.push((node.mean_m, node.sigma_m()));
-            merging.nodes.push(node);
+            let value = |column| block.value(index, column);
+            let three = |column| [0, 1, 2].map(|axis| value(column + axis));
+            let scale_m = three(column::SCALE);
+            let [x, y, z] = three(column::MEAN);
+            let opacity = f64::from(value(column::LOG2_OPACITY)).exp2();
+            let weight = opacity * area_m2(DVec3::from_array(scale_m.map(f64::from)));
+            merging.leaves.push([x, y, z, scale_m[0].max(scale_m[1]).max(scale_m[2])]);
+            merging.nodes.push(StoredNode {
+                mean_m: DVec3::from_array([x, y, z].map(f64::from)),
+                scale_m,
+                quat_wxyz: [0, 1, 2, 3].map(|i| value(column::QUAT + i)),
+                weight,
+                opaque_weight: weight * opacity,
+            });
             merging.sh.extend((0..stride).map(|k| block.value(index, column::SH + k)));
         }
         merging
@@ -130,14 +151,14 @@ impl Merging {
             // Every other round shifts the groups by half, so that pairs cross the borders of the
             // previous round.
             let first = if round % 2 == 0 { GROUP } else { GROUP / 2 };
-            let mut partner = vec![None; before];
-            let mut start = 0;
-            let mut end = first.min(before);
-            while start < before {
-                self.pair(start..end, limit_m, &mut partner);
-                (start, end) = (end, (end + GROUP).min(before));
-            }
-            if partner.iter().all(Option::is_none) {
+            let mut partner = vec![NO_PARTNER; before];
+            let (of_first, others) = partner.split_at_mut(first.min(before));
+            self.pair(0, limit_m, of_first);
+            // In parallel: groups are independent, and a dense block is merged alone.
+            others.par_chunks_mut(GROUP).enumerate().for_each(|(group, partner)| {
+                self.pair(first + group * GROUP, limit_m, partner);
+            });
+            if partner.iter().all(|&partner| partner == NO_PARTNER) {
                 break;
             }
             self.join(&partner);
@@ -148,15 +169,17 @@ impl Merging {
         }
     }
 
-    /// Chooses disjoint pairs within a group greedily, the cheapest first.
-    fn pair(&self, group: std::ops::Range<usize>, limit_m: f64, partner: &mut [Option<u32>]) {
+    /// Chooses disjoint pairs within the group that begins at a node greedily, the cheapest first.
+    /// Writes the second of each pair to the place of the first.
+    fn pair(&self, start: usize, limit_m: f64, partner: &mut [u32]) {
         let mut pairs = Vec::new();
         // Most pairs are too far apart for any merge; comparing squares saves a square root for
         // each. The margin keeps every pair that `price` may accept in spite of rounding.
         // Half the distance is moved by one of the two, so that pairs beyond twice the limit are
         // out: (2 limit)².
         let farthest_m2 = 4.0 * limit_m * limit_m * (1.0 + 1e-9);
-        let nodes = &self.nodes[group.clone()];
+        let stored = &self.nodes[start..start + partner.len()];
+        let nodes: Vec<Node> = stored.iter().map(StoredNode::node).collect();
         // Coordinate by coordinate, so that the distances to all successors are computed by
         // vectors. There is nothing near behind the last node.
         let mut means_m = [[f64::INFINITY; GROUP + PARTNERS]; 3];
@@ -178,10 +201,9 @@ impl Merging {
                 if distance_m2 > farthest_m2 {
                     continue;
                 }
-                let first = group.start + place;
-                let second = first + 1 + ahead;
-                if let Some(cost) = self.price(first, second, limit_m) {
-                    pairs.push(Pair { cost, first, second });
+                let second = place + 1 + ahead;
+                if let Some(cost) = self.price(&nodes, start, [place, second], limit_m) {
+                    pairs.push(Pair { cost, first: place, second });
                 }
             }
         }
@@ -193,28 +215,44 @@ impl Merging {
         // be out of date.
         let mut taken = [false; GROUP];
         for Pair { first, second, .. } in pairs {
-            let places = [first - group.start, second - group.start];
-            if !places.iter().any(|&place| taken[place]) {
-                places.iter().for_each(|&place| taken[place] = true);
-                partner[first] = Some(second as u32);
+            if !taken[first] && !taken[second] {
+                taken[first] = true;
+                taken[second] = true;
+                partner[first] = (start + second) as u32;
             }
         }
     }
 
-    /// The cost of merging two nodes; `None` if the error would exceed the limit or the cost is too
-    /// high.
-    fn price(&self, first: usize, second: usize, limit_m: f64) -> Option<f64> {
-        let (a, b) = (&self.nodes[first], &self.nodes[second]);
-        let (error_a, error_b) = (self.errors_m[first], self.errors_m[second]);
-        // Quick rejection: one of the two nodes moves by at least half their distance.
+    /// The cost of merging two nodes of the group that begins at `start`; `None` if the error would
+    /// exceed the limit or the cost is too high.
+    fn price(
+        &self,
+        nodes: &[Node],
+        start: usize,
+        [first, second]: [usize; 2],
+        limit_m: f64,
+    ) -> Option<f64> {
+        let (a, b) = (&nodes[first], &nodes[second]);
+        let (error_a, error_b) = (self.errors_m[start + first], self.errors_m[start + second]);
+        // Quick rejection, which most pairs of a dense block meet: by how far each moves, and by a
+        // standard deviation that no axis of the merged node exceeds. The margin keeps every pair
+        // that the test below may accept in spite of rounding.
         let distance_m = a.mean_m.distance(b.mean_m);
-        if 0.5 * distance_m + error_a.min(error_b) > limit_m {
+        let share = if a.weight + b.weight > 0.0 { b.weight / (a.weight + b.weight) } else { 0.5 };
+        let sigma_a = a.sigma_m();
+        let sigma_b = b.sigma_m();
+        let widest_m = ((1.0 - share) * sigma_a * sigma_a
+            + share * (sigma_b * sigma_b + (1.0 - share) * distance_m * distance_m))
+            .sqrt();
+        let at_least_a = error_a + share * distance_m + 3.0 * (sigma_a - widest_m).max(0.0);
+        let at_least_b = error_b + (1.0 - share) * distance_m + 3.0 * (sigma_b - widest_m).max(0.0);
+        if at_least_a.max(at_least_b) > limit_m * (1.0 + 1e-9) {
             return None;
         }
         let merged = joined(a, b);
         // A lower bound of the merged node's largest standard deviation: that along the longest
         // axis of the larger node.
-        let larger = if a.sigma_m() >= b.sigma_m() { a } else { b };
+        let larger = if sigma_a >= sigma_b { a } else { b };
         let axis = longest_axis(larger);
         let sigma_m = axis.dot(merged.cov_m2 * axis).max(0.0).sqrt();
         let error_m = |node: &Node, error_m: f64| {
@@ -222,11 +260,16 @@ impl Merging {
                 + node.mean_m.distance(merged.mean_m)
                 + 3.0 * (node.sigma_m() - sigma_m).max(0.0)
         };
-        let within = error_m(a, error_a).max(error_m(b, error_b)) <= limit_m;
+        // As if the merged node had the area of the two, and grew only along that axis: across it,
+        // it may have more area, be less opaque, and end sooner.
+        let area_m2 = (area_m2(a.scale_m) * (1.0 - share) + area_m2(b.scale_m) * share)
+            * (sigma_m / larger.sigma_m()).max(1.0);
+        let beyond_m = merged.beyond_edge(area_m2) * sigma_m;
+        let within = error_m(a, error_a).max(error_m(b, error_b)).max(beyond_m) <= limit_m;
         if !within {
             return None;
         }
-        let colours = [self.colour(first), self.colour(second)];
+        let colours = [self.colour(start + first), self.colour(start + second)];
         // The limit stands for the size of a pixel at the distance at which this level is drawn, so
         // that the blur of the renderer is 0.3 limit².
         let cost = cost(a, b, &merged, colours, BLUR_PX2 * limit_m * limit_m);
@@ -241,7 +284,7 @@ impl Merging {
     }
 
     /// Merges every node with its partner, compacting all arrays in place.
-    fn join(&mut self, partner: &[Option<u32>]) {
+    fn join(&mut self, partner: &[u32]) {
         let count = self.nodes.len();
         let mut place = vec![u32::MAX; count];
         let mut is_new = Vec::with_capacity(count);
@@ -251,12 +294,18 @@ impl Merging {
                 continue;
             }
             place[node] = end as u32;
-            let mut joint = self.nodes[node];
-            if let Some(second) = partner[node] {
-                let second = second as usize;
+            let is_merged = partner[node] != NO_PARTNER;
+            // An unmerged node keeps its error. That of a merged one is computed from its leaves
+            // below, which is less than the sum of the bounds.
+            let mut error_m = self.errors_m[node];
+            let mut stored = self.nodes[node];
+            if is_merged {
+                let second = partner[node] as usize;
                 place[second] = end as u32;
-                joint = joined(&self.nodes[node], &self.nodes[second]);
+                let mut joint = joined(&stored.node(), &self.nodes[second].node());
                 joint.diagonalise();
+                error_m = joint.beyond_edge(area_m2(joint.scale_m)) * joint.sigma_m();
+                stored = joint.stored();
                 let total = joint.weight;
                 let share = if total > 0.0 { self.nodes[second].weight / total } else { 0.5 };
                 for k in 0..self.stride {
@@ -268,12 +317,10 @@ impl Merging {
             }
             // `end` never exceeds `node`, so no unread entry is overwritten: the second of a pair
             // comes later.
-            self.nodes[end] = joint;
+            self.nodes[end] = stored;
             self.sh.copy_within(node * self.stride..(node + 1) * self.stride, end * self.stride);
-            // An unmerged node keeps its error. That of a merged one is computed from its leaves
-            // below, which is less than the sum of the bounds.
-            self.errors_m[end] = if partner[node].is_some() { 0.0 } else { self.errors_m[node] };
-            is_new.push(partner[node].is_some());
+            self.errors_m[end] = error_m;
+            is_new.push(is_merged);
             end += 1;
         }
         self.nodes.truncate(end);
@@ -281,14 +328,15 @@ impl Merging {
         self.errors_m.truncate(end);
         // Leaves are followed through all merges, so that an error is measured against level 0 and
         // not against the level before.
-        for (node, (mean_m, sigma_m)) in self.node_of_leaf.iter_mut().zip(&self.leaves) {
+        for (node, leaf) in self.node_of_leaf.iter_mut().zip(&self.leaves) {
             *node = place[*node as usize];
             if !is_new[*node as usize] {
                 continue;
             }
+            let [x, y, z, sigma_m] = leaf.map(f64::from);
             let joint = &self.nodes[*node as usize];
             let lost_m = (sigma_m - joint.sigma_m()).max(0.0);
-            let error_m = joint.mean_m.distance(*mean_m) + 3.0 * lost_m;
+            let error_m = joint.mean_m.distance(DVec3::new(x, y, z)) + 3.0 * lost_m;
             let largest = &mut self.errors_m[*node as usize];
             *largest = largest.max(error_m);
         }
@@ -301,15 +349,15 @@ impl Merging {
         (largest as f32).next_up()
     }
 
-    fn chunk(&self, block: &Chunk) -> Chunk {
-        let count = self.nodes.len();
-        let mut chunk = Chunk::new(block.cell(), block.origin_m(), block.sh_degree(), count);
+    fn chunk(&self) -> Chunk {
+        let Self { cell, origin_m, sh_degree, .. } = *self;
+        let mut chunk = Chunk::new(cell, origin_m, sh_degree, self.nodes.len());
         for (node, sh) in self.nodes.iter().zip(self.sh.chunks_exact(self.stride)) {
             let opacity = node.opacity();
             chunk.push_activated(&ActivatedGaussian {
                 mean_m: node.mean_m.as_vec3().to_array(),
-                scale_m: node.scale_m.as_vec3().to_array(),
-                quat_wxyz: node.quat_wxyz().map(|q| q as f32),
+                scale_m: node.scale_m,
+                quat_wxyz: node.quat_wxyz,
                 // Also false for the NaN of a node without extent.
                 log2_opacity: if opacity > 0.0 { opacity.log2() as f32 } else { f32::NEG_INFINITY },
                 sh,

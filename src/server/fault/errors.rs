@@ -199,7 +199,7 @@ fn residency_place(error: &ResidencyError) -> Place {
         ResidencyError::Load { .. } | ResidencyError::Sky { .. } | ResidencyError::Store(_) => {
             at(Code::TwinDamaged, "twin")
         }
-        ResidencyError::Thread { .. } => plain(Code::Internal),
+        ResidencyError::Views { .. } | ResidencyError::Thread { .. } => plain(Code::Internal),
     }
 }
 
@@ -218,6 +218,7 @@ fn render_place(error: &RenderError) -> Place {
         | RenderError::Actors { .. }
         | RenderError::Targets { .. }
         | RenderError::Sky(_)
+        | RenderError::Selection { .. }
         | RenderError::Device { .. } => plain(Code::Internal),
     }
 }

@@ -8,7 +8,6 @@ use wildcity_render::{MAX_VIEWS, View};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::FieldMask;
 use wildcity_scene::rig::{Rig, RigCamera};
-use wildcity_twin::residency::Viewpoint;
 
 use super::encode::{ImageEncoding, PixelMaps};
 use super::frame_history::{FrameHistory, PastFrame};
@@ -21,7 +20,6 @@ use crate::sensors::EpisodeSensors;
 use crate::sensors::delivery::{Delivery, FrameSource};
 use crate::sensors::pixels::PixelEffects;
 use crate::sensors::{check, settings};
-use crate::viewpoint::viewpoints;
 
 /// Bytes of the header's length, little-endian, which comes before the header.
 pub const HEADER_PREFIX_BYTES: usize = 8;
@@ -98,9 +96,6 @@ pub(crate) struct RigCapture {
     pub(crate) has_sensor_effects: bool,
     /// Indices of the cameras; there may be none.
     pub(crate) cameras: Vec<usize>,
-    /// Ascending indices of the cameras for whose views the levels of detail are chosen: at least
-    /// [`Self::cameras`].
-    pub(crate) detail_for: Vec<usize>,
     /// Whether the observation shows the images now. Otherwise they are rendered for the frame
     /// history.
     pub(crate) shown: bool,
@@ -335,7 +330,6 @@ impl ObservationLayout {
             time_us,
             due_us,
             has_sensor_effects: true,
-            detail_for: self.detail_for(&cameras),
             cameras,
             shown: due_us == now_us && self.schedule.is_decision(now_us),
         };
@@ -350,29 +344,16 @@ impl ObservationLayout {
             time_us: episode.time_us(),
             due_us: episode.time_us(),
             has_sensor_effects: false,
-            detail_for: cameras.clone(),
             cameras: cameras.clone(),
             shown: true,
         };
         poses.into_iter().map(capture).collect()
     }
 
-    /// The cameras for whose views the levels of detail of a frame with sensor effects are chosen.
-    /// If a camera may deliver a different picture from the one that is due, these are all cameras
-    /// of the rig, so that no image depends on which frames are lost.
-    pub(crate) fn detail_for(&self, cameras: &[usize]) -> Vec<usize> {
-        let mut sensors = self.sensors.iter().flat_map(|sensors| &sensors.cameras);
-        if sensors.any(settings::changes_times) {
-            (0..self.cameras.len()).collect()
-        } else {
-            cameras.to_vec()
-        }
-    }
-
-    /// The viewpoints for which the levels of detail of a capture are chosen.
-    pub(crate) fn viewpoints(&self, episode: &Episode, capture: &RigCapture) -> Vec<Viewpoint> {
-        let RigCapture { detail_for, world_from_rig, time_us, .. } = capture;
-        viewpoints(&episode.views(&self.cameras, detail_for, *world_from_rig, *time_us))
+    /// How long each view of a capture is exposed, in microseconds.
+    pub(crate) fn exposures_us(&self, capture: &RigCapture) -> Vec<i64> {
+        let cameras = capture.cameras.iter().map(|&camera| &self.cameras[camera]);
+        cameras.map(View::exposure_us).collect()
     }
 
     /// The views of a capture.

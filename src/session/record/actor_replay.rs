@@ -57,8 +57,8 @@ impl<'a> ActorReplay<'a> {
             return Vec::new();
         }
         // A rolling shutter shows an actor from one pose to the other.
-        let at_start = self.past.poses_at(exposure_start_us(taken_us, self.exposure_us));
-        self.assets.placed(&self.past.poses_at(taken_us), &at_start, frame)
+        let before = |exposure_us| self.past.poses_at(exposure_start_us(taken_us, exposure_us));
+        self.assets.placed(&self.past.poses_at(taken_us), &before, frame)
     }
 }
 

@@ -205,7 +205,6 @@ fn frames_taken(
         // `zip` asks the cameras first, so that it takes no hash too many.
         for (&camera, hash) in cameras.iter().zip(&mut hashes) {
             if layout.is_shown_later(capture, camera) {
-                // With the levels of detail that were chosen together with the other cameras.
                 let capture = RigCapture { cameras: vec![camera], shown: false, ..capture.clone() };
                 taken.push(KeptFrame { camera, capture, hash: hash.clone() });
             }

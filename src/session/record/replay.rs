@@ -385,19 +385,19 @@ impl<'a> Replay<'a> {
         let step = frame.step;
         let taken_us = frame.taken_us(pose);
         let episode = self.ego.episode();
-        let views_of =
-            |cameras: &[usize]| episode.views(self.cameras, cameras, frame.poses[pose], taken_us);
-        let views = views_of(selected);
-        // If a camera may lose frames, levels of detail are chosen for more cameras than are drawn.
-        let viewpoints = match &self.sensors {
-            Some(sensors) => viewpoints(&views_of(&sensors.detail_for(frame, selected))),
-            None => viewpoints(&views),
-        };
+        let views = episode.views(self.cameras, selected, frame.poses[pose], taken_us);
+        let viewpoints = viewpoints(&views);
         let mut scene = self
             .resident
             .scene(&viewpoints, self.profile)
             .map_err(|cause| ReplayError::Residency { step, cause })?;
-        let detail = FrameDetail { viewpoints: &viewpoints, profile: self.profile };
+        let exposure_us = |&camera: &usize| View::exposure_us(&self.cameras[camera]);
+        let exposures_us: Vec<i64> = selected.iter().map(exposure_us).collect();
+        let detail = FrameDetail {
+            viewpoints: &viewpoints,
+            exposures_us: &exposures_us,
+            profile: self.profile,
+        };
         scene.place(self.actors.placed(taken_us, detail));
 
         // `selected` rises, so that the targets are in the order of the views.

@@ -70,15 +70,6 @@ impl SensorReplay {
         })
     }
 
-    /// The cameras for whose views the levels of detail of a frame are chosen.
-    pub(super) fn detail_for(&self, frame: &FrameRecord, selected: &[usize]) -> Vec<usize> {
-        // As in the session: what is drawn must not depend on which frames were lost.
-        match frame.request {
-            FrameRequest::Observe => selected.to_vec(),
-            _ => self.layout.detail_for(selected),
-        }
-    }
-
     /// Applies the effects on the pixels of a camera's image of a frame.
     pub(super) fn apply(&self, frame: &FrameRecord, pose: usize, camera: usize, rgb8: &mut [u8]) {
         if frame.request == FrameRequest::Observe {

@@ -6,7 +6,7 @@ use std::sync::{Arc, OnceLock};
 
 use wildcity_scene::actor::{ActorAsset, ActorViewpoint, ContactShadow, PlacedChunk};
 use wildcity_scene::geometry::Pose;
-use wildcity_scene::{ActorBox, ActorClass, RenderProfile};
+use wildcity_scene::{ActorBox, ActorClass, RenderProfile, ViewSet};
 use wildcity_sim::scenario::{AssetInfo, Assets};
 use wildcity_twin::residency::{Cache, ResidencyError, ResidentActor, Viewpoint};
 use wildcity_twin::store::{Catalog, StoredActor};
@@ -18,10 +18,12 @@ use super::default_assets::{generated_actors, nearest};
 #[derive(Clone, Debug, Default)]
 pub(crate) struct ActorAssets(Arc<[Option<Arc<ResidentActor>>]>);
 
-/// Data of a frame by which the levels of detail of its actors are chosen.
+/// Data of a frame by which each of its views chooses the levels of detail of actors.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct FrameDetail<'a> {
     pub(crate) viewpoints: &'a [Viewpoint],
+    /// How long each view is exposed, in microseconds.
+    pub(crate) exposures_us: &'a [i64],
     pub(crate) profile: &'a RenderProfile,
 }
 
@@ -99,26 +101,31 @@ impl ActorAssets {
         self.0.iter().all(Option::is_none)
     }
 
-    /// The actors that a frame draws, given the pose of each at the frame's time and at the start
-    /// of the longest exposure.
+    /// The actors that a frame draws, given the pose of each at the frame's time, and a time before
+    /// it in microseconds at which a view's exposure began.
     ///
-    /// An actor that was absent at the start of the exposure appears during it, and is drawn at
+    /// An actor that was absent at the start of an exposure appears during it, and is drawn at
     /// rest.
     pub(crate) fn placed(
         &self,
         poses: &[Option<Pose>],
-        poses_at_start: &[Option<Pose>],
+        poses_before: &dyn Fn(i64) -> Vec<Option<Pose>>,
         frame: FrameDetail<'_>,
     ) -> Vec<PlacedChunk> {
+        let at_start: BTreeMap<i64, Vec<Option<Pose>>> =
+            frame.exposures_us.iter().map(|&us| (us, poses_before(us))).collect();
         let actors = self.0.iter().zip(poses).enumerate();
         let placements = actors.filter_map(|(index, (actor, pose))| {
             let world_from_actor = (*pose)?;
-            let at_start = poses_at_start.get(index).copied().flatten();
+            let start_of = |exposure_us: &i64| {
+                let before = at_start.get(exposure_us).and_then(|poses| poses.get(index));
+                before.copied().flatten().unwrap_or(world_from_actor)
+            };
             Some(Placement {
                 actor: index as u16,
                 asset: actor.as_ref()?.asset(),
                 world_from_actor,
-                world_from_actor_at_start: at_start.unwrap_or(world_from_actor),
+                world_from_actor_at_start: frame.exposures_us.iter().map(start_of).collect(),
             })
         });
         frame.placed(placements)
@@ -126,45 +133,56 @@ impl ActorAssets {
 }
 
 /// An actor in a frame.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub(crate) struct Placement<'a> {
     /// Its index among the actors.
     pub(crate) actor: u16,
     pub(crate) asset: &'a ActorAsset,
     /// Its pose at the frame's time.
     pub(crate) world_from_actor: Pose,
-    /// Its pose at the start of the longest exposure.
-    pub(crate) world_from_actor_at_start: Pose,
+    /// Its pose at the start of each view's exposure.
+    pub(crate) world_from_actor_at_start: Vec<Pose>,
 }
 
 impl FrameDetail<'_> {
-    /// The actors that a frame draws, each in the level of detail that the frame needs, with its
-    /// shadow.
+    /// The actors that a frame draws, with their shadows: a chunk of each for the views that draw
+    /// it at one level of detail, and whose exposures begin at one pose.
     pub(crate) fn placed<'a>(
         &self,
         actors: impl Iterator<Item = Placement<'a>>,
     ) -> Vec<PlacedChunk> {
-        let viewpoint = |seen: &Viewpoint| ActorViewpoint {
-            position_m: seen.position_m,
-            focal_px: seen.focal_px,
-        };
-        let viewpoints: Vec<ActorViewpoint> = self.viewpoints.iter().map(viewpoint).collect();
+        actors.flat_map(|placement| self.chunks(&placement)).collect()
+    }
+
+    /// The chunks of one actor.
+    fn chunks(&self, placement: &Placement<'_>) -> Vec<PlacedChunk> {
+        let Placement { actor, asset, world_from_actor, world_from_actor_at_start } = placement;
         let RenderProfile { tau_px, reach_m, .. } = *self.profile;
-        let placed = actors.filter_map(|placement| {
-            let Placement { actor, asset, world_from_actor, world_from_actor_at_start } = placement;
-            // Too far from all viewpoints, it is not drawn.
-            let chunk = asset.level(&world_from_actor, &viewpoints, tau_px, reach_m)?;
-            let box_ = asset.description.box_;
-            Some(PlacedChunk {
-                world_from_actor_at_start,
-                shadow: Some(ContactShadow {
-                    length_m: box_.length_m as f32,
-                    width_m: box_.width_m as f32,
+        let box_ = asset.description.box_;
+        let shadow =
+            Some(ContactShadow { length_m: box_.length_m as f32, width_m: box_.width_m as f32 });
+        let mut chunks: Vec<PlacedChunk> = Vec::new();
+        let views = self.viewpoints.iter().zip(world_from_actor_at_start).enumerate();
+        for (view, (&Viewpoint { position_m, focal_px }, &at_start)) in views {
+            let viewpoint = ActorViewpoint { position_m, focal_px };
+            // Too far from the camera, it is not drawn.
+            let Some(chunk) = asset.level(world_from_actor, &viewpoint, tau_px, reach_m) else {
+                continue;
+            };
+            let same = chunks.iter_mut().find(|placed| {
+                Arc::ptr_eq(&placed.chunk, chunk) && placed.world_from_actor_at_start == at_start
+            });
+            match same {
+                Some(placed) => placed.views.insert(view),
+                None => chunks.push(PlacedChunk {
+                    world_from_actor_at_start: at_start,
+                    shadow,
+                    views: ViewSet::from_iter([view]),
+                    ..PlacedChunk::at_rest(chunk.clone(), *world_from_actor, *actor)
                 }),
-                ..PlacedChunk::at_rest(chunk.clone(), world_from_actor, actor)
-            })
-        });
-        placed.collect()
+            }
+        }
+        chunks
     }
 }
 

@@ -126,7 +126,7 @@ pub enum ScenarioError {
         reason: String,
     },
     /// A mistake in a file.
-    #[error("{file}: {cause}")]
+    #[error("{}", file_message(file, cause))]
     File {
         /// Which file: `scenario`, or its name.
         file: String,
@@ -151,6 +151,11 @@ pub enum ScenarioError {
     Twin { wanted: String, requested: String },
 }
 
+/// The place of a mistake is said once if it is the file itself.
+fn file_message(file: &str, cause: &FileError) -> String {
+    if cause.path == file { cause.to_string() } else { format!("{file}: {cause}") }
+}
+
 impl ScenarioError {
     /// The field at fault, from the scenario on.
     pub fn field(&self) -> String {
@@ -158,7 +163,10 @@ impl ScenarioError {
             Self::Choice { field, .. } => field.clone(),
             Self::Unknown { .. } => "scenario".to_owned(),
             Self::Read { field, .. } | Self::Hash { field, .. } => format!("scenario.{field}"),
-            Self::File { file, cause } if file == "scenario" => format!("scenario.{}", cause.path),
+            // The path of a mistake in the file as a whole is that of the file.
+            Self::File { file, cause } if file == "scenario" && cause.path != *file => {
+                format!("scenario.{}", cause.path)
+            }
             Self::File { .. } => "scenario".to_owned(),
             Self::Twin { .. } => "scenario.twin.name".to_owned(),
         }

@@ -307,8 +307,8 @@ impl EpisodeTraffic {
                 self.past.poses_at(time_us)
             }
         };
-        let at_start = poses_at(exposure_start_us(taken_us, self.exposure_us));
-        self.assets.placed(&poses_at(taken_us), &at_start, frame)
+        let before = |exposure_us| poses_at(exposure_start_us(taken_us, exposure_us));
+        self.assets.placed(&poses_at(taken_us), &before, frame)
     }
 
     /// Adds an event to those of the last step.

@@ -5,6 +5,7 @@ use std::ops::RangeInclusive;
 use std::sync::Arc;
 use std::time::Duration;
 
+use glam::DVec3;
 use serde_json::Value;
 use tokio::time::Instant;
 
@@ -583,12 +584,7 @@ fn crop_and_scale(mut rig: Rig, outputs: &Outputs) -> Result<Rig, SessionError> 
 
 /// The properties of a rig that determine how much memory its frames need.
 pub(super) fn rig_extent(cameras: &[RigCamera]) -> RigExtent {
-    // At the origin, the position of a camera is its distance from the rig.
-    let viewpoints = viewpoints(&View::from_rig(cameras, Pose::IDENTITY));
-    RigExtent {
-        focal_px: viewpoints.iter().fold(0.0, |most, one| one.focal_px.max(most)),
-        radius_m: viewpoints.iter().fold(0.0, |most, one| one.position_m.length().max(most)),
-    }
+    RigExtent::new(&viewpoints(&View::from_rig(cameras, Pose::IDENTITY)), DVec3::ZERO)
 }
 
 /// What the frames of a session take beside their scenes.

@@ -33,6 +33,7 @@ use crate::scenario::assets::FrameDetail;
 use crate::scenario::{EpisodeScenario, EpisodeTraffic, Event, EventKind, settle};
 use crate::start::{EpisodeStart, checked_pose};
 use crate::state::{EpisodeState, PinnedVersion};
+use crate::viewpoint::viewpoints;
 
 /// Options of a step in addition to its command.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -406,10 +407,12 @@ impl Session {
                 continue;
             }
             let views = layout.views(episode, &capture);
-            let viewpoints = layout.viewpoints(episode, &capture);
+            let viewpoints = viewpoints(&views);
             let profile = version.profile;
             let placed = traffic.map(|traffic| {
-                let detail = FrameDetail { viewpoints: &viewpoints, profile: &profile };
+                let exposures_us = &layout.exposures_us(&capture);
+                let detail =
+                    FrameDetail { viewpoints: &viewpoints, exposures_us, profile: &profile };
                 traffic.placed(capture.time_us, detail)
             });
             // Load before the job is queued, so that no render thread waits for a disk.

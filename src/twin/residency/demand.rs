@@ -1,10 +1,11 @@
-//! The inputs that determine which level of detail of a block a frame draws.
+//! The inputs that determine which level of detail of a block a view draws.
 
 use glam::DVec3;
 
 use wildcity_scene::manifest::Section;
+use wildcity_scene::{Rig, Selection, ViewSet};
 
-/// The part of a camera that decides which sections a frame draws.
+/// The part of a camera that decides which sections its view draws.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Viewpoint {
     /// The camera's centre in the world, in metres.
@@ -24,6 +25,29 @@ pub struct SectionRef {
     pub section: usize,
 }
 
+/// The sections that a frame draws.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct SelectedSections {
+    /// Those of all views, in order of (cell y, cell x, block, level).
+    pub sections: Vec<SectionRef>,
+    /// Which views draw which of them; `None` if all views draw all.
+    pub selection: Option<Selection>,
+}
+
+impl SelectedSections {
+    /// The sections, and the views that draw each.
+    pub fn iter(&self) -> impl Iterator<Item = (SectionRef, ViewSet)> {
+        let by_chunk = self.selection.as_ref().map(|selection| &selection.by_chunk);
+        let views = move |index: usize| by_chunk.map_or(ViewSet::ALL, |views| views[index]);
+        self.sections.iter().enumerate().map(move |(index, &section)| (section, views(index)))
+    }
+}
+
+impl Viewpoint {
+    /// Most viewpoints of a frame.
+    pub const MAX: usize = Rig::MAX_CAMERAS;
+}
+
 /// The coarsest level of a block with an error of at most `tau_px` pixels at a distance, as an
 /// index into the block's sections in order of level.
 pub(super) fn coarsest_level(
@@ -38,9 +62,4 @@ pub(super) fn coarsest_level(
     // From the coarsest level down: the first that passes is drawn. Level 0 passes at every
     // distance, so that 0 is only for a block without sections.
     block.iter().rposition(|section| small(section.error_m)).unwrap_or(0)
-}
-
-/// The longest focal length of a frame, in pixels.
-pub(super) fn longest_focal_px(viewpoints: &[Viewpoint]) -> f64 {
-    viewpoints.iter().fold(0.0_f64, |longest, viewpoint| longest.max(viewpoint.focal_px))
 }

@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use super::Viewpoint;
 use crate::store::StoreError;
 use wildcity_scene::sky::SkyError;
 
@@ -53,6 +54,9 @@ pub enum ResidencyError {
         /// Bytes that all twins together may use.
         limit_bytes: u64,
     },
+    /// More views than a frame has.
+    #[error("a frame has at most {most} views, not {views}", most = Viewpoint::MAX)]
+    Views { views: usize },
     /// The deadline passed before every section was in memory.
     #[error(
         "{missing} of the {needed} sections of twin {twin:?} that the frame needs were not in memory \

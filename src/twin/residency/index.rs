@@ -6,33 +6,25 @@ use std::ops::Range;
 
 use wildcity_scene::geometry::Bounds;
 use wildcity_scene::manifest::Section;
-use wildcity_scene::{Manifest, RenderProfile};
+use wildcity_scene::{Manifest, RenderProfile, Selection, ViewSet};
 
-use super::demand::{SectionRef, Viewpoint, coarsest_level, longest_focal_px};
+use super::ResidencyError;
+use super::demand::{SectionRef, SelectedSections, Viewpoint, coarsest_level};
 
 /// Cells along the edge of a group: 1 km. 20 km of road are then about twenty groups, and the 200
 /// cells within 300 m of a viewpoint lie in at most four of them.
 const GROUP_CELLS: i32 = 16;
 
-/// The sections that a frame draws, in order of (cell y, cell x, block): one for every block within
-/// `reach_m` of a camera. It depends only on the cameras, the profile, and the manifest's table.
+/// Finds the sections that a frame draws: the blocks of a version in order, below the bounding
+/// boxes of their cells and of groups of cells.
+///
+/// A view draws one section of every block within `reach_m` of it. Which one depends only on its
+/// own camera, the profile, and the manifest's table, and not on the other views of the frame.
 ///
 /// An error of `e` metres at a distance of `d` metres is `f e / d` pixels wide, with `f` the focal
-/// length in pixels. A block is drawn at the coarsest level for which that is at most `tau_px`,
-/// with the longest focal length of the frame, and the distance of the nearest camera from the
-/// bounding box of everything in the block. The amount of memory has no influence.
-///
-/// This looks at every block of the twin; callers that ask often keep a [`BlockIndex`].
-pub fn demand(
-    manifest: &Manifest,
-    viewpoints: &[Viewpoint],
-    profile: &RenderProfile,
-) -> Vec<SectionRef> {
-    BlockIndex::new(manifest).demand(manifest, viewpoints, profile)
-}
-
-/// The blocks of a version in order, below the bounding boxes of their cells and of groups of
-/// cells.
+/// length in pixels. A view draws a block at the coarsest level for which that is at most `tau_px`,
+/// with the view's focal length and its distance from the bounding box of everything in the block.
+/// The amount of memory has no influence.
 #[derive(Debug)]
 pub struct BlockIndex {
     groups: Vec<Group>,
@@ -94,32 +86,77 @@ impl BlockIndex {
         Self { groups: groups.into_values().collect(), cells, blocks }
     }
 
-    /// As [`demand`](super::demand()), for the manifest that this index was built from.
+    /// The sections that views at these viewpoints draw, of all of them together. `manifest` is the
+    /// one that this index was built from.
     pub fn demand(
         &self,
         manifest: &Manifest,
         viewpoints: &[Viewpoint],
         profile: &RenderProfile,
     ) -> Vec<SectionRef> {
-        let focal_px = longest_focal_px(viewpoints);
-        let distance_m = |bounds: &Bounds| {
-            // Square roots round monotonically, so that one of the least square gives the least
-            // distance.
-            let squared_m2 = |viewpoint: &Viewpoint| {
-                let at_m = viewpoint.position_m;
-                at_m.clamp(bounds.min_m, bounds.max_m).distance_squared(at_m)
-            };
-            // Without a camera the distance is infinite, and only a profile without reach draws
-            // anything.
-            viewpoints.iter().map(squared_m2).fold(f64::INFINITY, f64::min).sqrt()
-        };
         let mut sections = Vec::new();
-        self.visit(profile.reach_m, distance_m, |block, distance_m| {
-            let levels = block.levels(manifest);
-            let level = coarsest_level(levels, focal_px, distance_m, profile.tau_px);
-            sections.push(block.section_ref(level));
-        });
+        self.visit_drawn(manifest, viewpoints, profile, |section, _| sections.push(section));
         sections
+    }
+
+    /// The sections that a frame draws, and which of its views draw which. `manifest` is the one
+    /// that this index was built from.
+    ///
+    /// # Errors
+    /// [`ResidencyError::Views`] for more than [`Viewpoint::MAX`] viewpoints.
+    pub fn select(
+        &self,
+        manifest: &Manifest,
+        viewpoints: &[Viewpoint],
+        profile: &RenderProfile,
+    ) -> Result<SelectedSections, ResidencyError> {
+        let views = viewpoints.len();
+        if views > Viewpoint::MAX {
+            return Err(ResidencyError::Views { views });
+        }
+        let mut sections = Vec::new();
+        let mut by_chunk: Vec<ViewSet> = Vec::new();
+        self.visit_drawn(manifest, viewpoints, profile, |section, views| {
+            sections.push(section);
+            by_chunk.push(views.collect());
+        });
+        let all: ViewSet = (0..views).collect();
+        let is_shared = by_chunk.iter().all(|&set| set == all);
+        let selection = (!is_shared).then_some(Selection { views, by_chunk });
+        Ok(SelectedSections { sections, selection })
+    }
+
+    /// Calls `see` with each section that a view draws, and the indices of the views that do.
+    fn visit_drawn(
+        &self,
+        manifest: &Manifest,
+        viewpoints: &[Viewpoint],
+        profile: &RenderProfile,
+        mut see: impl FnMut(SectionRef, &mut dyn Iterator<Item = usize>),
+    ) {
+        let RenderProfile { reach_m, tau_px, .. } = *profile;
+        let nearest_m = |bounds: &Bounds| {
+            let distances_m =
+                viewpoints.iter().map(|viewpoint| bounds.distance_m(viewpoint.position_m));
+            distances_m.fold(f64::INFINITY, f64::min)
+        };
+        // The level that each view draws of a block; none beyond its reach.
+        let mut drawn: Vec<Option<usize>> = vec![None; viewpoints.len()];
+        self.visit(reach_m, nearest_m, |block, _| {
+            let levels = block.levels(manifest);
+            for (drawn, Viewpoint { position_m, focal_px }) in drawn.iter_mut().zip(viewpoints) {
+                let distance_m = block.bounds.distance_m(*position_m);
+                let is_near = reach_m.is_none_or(|reach_m| distance_m <= reach_m);
+                *drawn = is_near.then(|| coarsest_level(levels, *focal_px, distance_m, tau_px));
+            }
+            for level in 0..levels.len() {
+                let draws = |(_, drawn): &(usize, &Option<usize>)| **drawn == Some(level);
+                let mut views = drawn.iter().enumerate().filter(draws).map(|(view, _)| view);
+                if drawn.contains(&Some(level)) {
+                    see(block.section_ref(level), &mut views);
+                }
+            }
+        });
     }
 
     /// Calls `see` with each block within reach and its distance, in order.

@@ -1,7 +1,7 @@
 //! Which sections of twins are in memory.
 //!
 //! ```text
-//! demand, index       which sections a frame draws, computed only from the table of a version
+//! demand, index       which sections each view draws, computed only from the table of a version
 //! cache, resident     the open versions, and requests for the frames of one
 //! pager               loads what frames request and hands each frame all of it at once
 //! requests            which request waits for which section, and which section is loaded next
@@ -13,9 +13,15 @@
 //!
 //! # Decisions
 //!
-//! A frame draws exactly the sections that [`demand`](demand()) returns; the memory in use only
-//! affects how long it waits. A frame therefore gets all of its sections at once, or it waits. It
-//! is never drawn with fewer sections.
+//! A view draws exactly the sections that [`BlockIndex::select`] returns for it; the memory in use
+//! and the other views of its frame only affect how long it waits. A frame gets the sections of all
+//! its views at once, or it waits. It is never drawn with fewer sections.
+//!
+//! **Each view has its own levels of detail.** Levels chosen once for all views of a frame made an
+//! image a function of the cameras beside it (35 dB between a wide camera alone and among six), and
+//! a wide camera drew what only the longest lens beside it needs. Where views need several levels
+//! of a block, all of them are in memory: a third more at most, as each level has about a quarter
+//! of the Gaussians of the one before.
 //!
 //! **A section is in memory once**, under a key made of everything that its chunk depends on:
 //! content hash, cell, block, level, origin, and record. Fifty versions of a twin that differ in
@@ -80,9 +86,9 @@ mod worst_case;
 pub use actors::ResidentActor;
 pub use budget::{FrameBytes, default_memory_bytes};
 pub use cache::Cache;
-pub use demand::{SectionRef, Viewpoint};
+pub use demand::{SectionRef, SelectedSections, Viewpoint};
 pub use error::ResidencyError;
-pub use index::{BlockIndex, demand};
+pub use index::BlockIndex;
 pub use pager::{PinnedScene, SceneCallback};
 pub use requests::Urgency;
 pub use reservation::{Prefetcher, Reservation};

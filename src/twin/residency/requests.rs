@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 use crate::limits;
 use crate::store::{StoreError, Version};
-use wildcity_scene::{Chunk, Scene, Sky};
+use wildcity_scene::{Chunk, Scene, Selection, Sky};
 
 use super::demand::SectionRef;
 use super::load_times::LoadTimes;
@@ -42,6 +42,8 @@ pub(super) struct RequestedSections {
     pub(super) version: Arc<Version>,
     pub(super) sky: Option<Arc<Sky>>,
     pub(super) sections: Vec<SectionRef>,
+    /// Which views of the frame draw which of them; `None` if all views draw all.
+    pub(super) selection: Option<Selection>,
     /// Their slots in the table, in the same order.
     pub(super) ids: Vec<SlotId>,
 }
@@ -410,6 +412,7 @@ impl<C> Requests<C> {
         let complete = CompleteFrame {
             scene: Scene {
                 chunks: chunks.collect(),
+                selection: requested.selection.clone(),
                 placed: Vec::new(),
                 sky: requested.sky.clone(),
             },

@@ -7,7 +7,7 @@ use parking_lot::Mutex;
 use wildcity_scene::RenderProfile;
 
 use super::budget::{Budget, Claim, FrameBytes};
-use super::demand::{SectionRef, Viewpoint};
+use super::demand::{SectionRef, SelectedSections, Viewpoint};
 use super::requests::Urgency;
 use super::{ResidencyError, Resident, RigExtent};
 
@@ -143,7 +143,7 @@ impl Prefetcher {
                 }
             }
         }
-        let requested = self.resident.requested(sections);
+        let requested = self.resident.requested(SelectedSections { sections, selection: None });
         // The state is locked during the request, so that `end` cannot fall between the two and
         // leave a prefetch that is never cancelled.
         if let PrefetchState::Open(number) = &mut *self.state.lock() {

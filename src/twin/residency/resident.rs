@@ -12,7 +12,7 @@ use wildcity_scene::manifest::{ChunkEntry, Section};
 use wildcity_scene::{Chunk, Manifest, RenderProfile, Sky};
 
 use super::budget::Budget;
-use super::demand::{SectionRef, Viewpoint};
+use super::demand::{SectionRef, SelectedSections, Viewpoint};
 use super::pager::{Pager, WaitingFrame};
 use super::requests::RequestedSections;
 use super::table::{Key, SlotId};
@@ -106,8 +106,8 @@ impl Resident {
         }
     }
 
-    /// The sections that a frame of these cameras draws. `profile` is the version's, unless the
-    /// caller overrides it.
+    /// The sections that views of these cameras draw, of all of them together. `profile` is the
+    /// version's, unless the caller overrides it.
     pub fn demand(&self, viewpoints: &[Viewpoint], profile: &RenderProfile) -> Vec<SectionRef> {
         self.index.demand(&self.version.manifest, viewpoints, profile)
     }
@@ -117,14 +117,16 @@ impl Resident {
     /// memory already. Until then the frame holds no memory.
     ///
     /// # Errors
-    /// [`ResidencyError::TooLarge`] if the frame can never fit into memory.
+    /// [`ResidencyError::TooLarge`] if the frame can never fit into memory, or
+    /// [`ResidencyError::Views`].
     pub fn request(
         self: &Arc<Self>,
         viewpoints: &[Viewpoint],
         profile: &RenderProfile,
         callback: SceneCallback,
     ) -> Result<SceneRequest, ResidencyError> {
-        let requested_sections = self.requested(self.demand(viewpoints, profile));
+        let selected = self.index.select(&self.version.manifest, viewpoints, profile)?;
+        let requested_sections = self.requested(selected);
         let sections = requested_sections.sections.len();
         let requested = Instant::now();
         let waiting = self.shared.pager.request_frame(requested_sections, callback)?;
@@ -134,7 +136,8 @@ impl Resident {
     /// Everything that a frame of these cameras draws, in memory. Blocks until it is.
     ///
     /// # Errors
-    /// [`ResidencyError::TooLarge`], or [`ResidencyError::Load`] if a section cannot be read.
+    /// [`ResidencyError::TooLarge`] or [`ResidencyError::Views`], or [`ResidencyError::Load`] if a
+    /// section cannot be read.
     pub fn scene(
         self: &Arc<Self>,
         viewpoints: &[Viewpoint],
@@ -216,13 +219,15 @@ impl Resident {
         self.first[section.chunk] + section.section
     }
 
-    pub(super) fn requested(&self, sections: Vec<SectionRef>) -> RequestedSections {
+    pub(super) fn requested(&self, selected: SelectedSections) -> RequestedSections {
+        let SelectedSections { sections, selection } = selected;
         let id = |&section: &SectionRef| self.ids[self.position(section)];
         RequestedSections {
             version: self.version.clone(),
             sky: self.sky.clone(),
             ids: sections.iter().map(id).collect(),
             sections,
+            selection,
         }
     }
 }

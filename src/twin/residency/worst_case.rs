@@ -3,26 +3,75 @@
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
 
+use glam::DVec3;
+
 use crate::limits;
 use wildcity_scene::geometry::Bounds;
+use wildcity_scene::manifest::Section;
 use wildcity_scene::{Chunk, Manifest, RenderProfile};
 
 use super::BlockIndex;
-use super::demand::coarsest_level;
+use super::demand::{Viewpoint, coarsest_level};
 
 /// The part of a rig's cameras that decides how much detail a frame needs.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RigExtent {
+    /// Number of cameras.
+    pub views: usize,
     /// The longest focal length of a camera, in pixels.
     pub focal_px: f64,
+    /// The shortest focal length of a camera, in pixels.
+    pub least_focal_px: f64,
     /// The distance of the farthest camera from the rig's origin, in metres.
     pub radius_m: f64,
 }
 
+impl RigExtent {
+    /// That of cameras around a rig's origin in the world, in metres.
+    pub fn new(viewpoints: &[Viewpoint], origin_m: DVec3) -> Self {
+        let focal_px = viewpoints.iter().map(|viewpoint| viewpoint.focal_px);
+        let from_origin_m =
+            viewpoints.iter().map(|viewpoint| viewpoint.position_m.distance(origin_m));
+        Self {
+            views: viewpoints.len(),
+            focal_px: focal_px.clone().fold(0.0, f64::max),
+            least_focal_px: focal_px.reduce(f64::min).unwrap_or(0.0),
+            radius_m: from_origin_m.fold(0.0, f64::max),
+        }
+    }
+
+    /// An upper bound of the bytes of a block's levels that cameras need at once if the nearest is
+    /// at least `nearest_m` away. `bytes` are those of each level.
+    ///
+    /// If the finest level that a camera needs is k, level k + 1 is too coarse for it, and so the
+    /// nearest camera is nearer than that level allows for the longest focal length. The others are
+    /// at most the rig's diameter farther, and none of them needs a coarser level than the shortest
+    /// focal length does there.
+    fn most_bytes(
+        &self,
+        levels: &[Section],
+        nearest_m: f64,
+        tau_px: f64,
+        bytes: impl Fn(&Section) -> u64,
+    ) -> u64 {
+        let first = coarsest_level(levels, self.focal_px, nearest_m, tau_px);
+        let with_finest = |finest: usize| {
+            let farthest_m = levels.get(finest + 1).map_or(f64::INFINITY, |coarser| {
+                self.focal_px * f64::from(coarser.error_m) / tau_px + 2.0 * self.radius_m
+            });
+            let coarsest = coarsest_level(levels, self.least_focal_px, farthest_m, tau_px);
+            // A camera needs one level.
+            let needed = levels[finest..=coarsest.max(finest)].iter().take(self.views);
+            needed.map(&bytes).sum()
+        };
+        (first..levels.len()).map(with_finest).max().unwrap_or(0)
+    }
+}
+
 /// An upper bound, in bytes, of the sections that a frame of a rig anywhere needs at once.
 ///
-/// No point in a square is nearer to a block than the square itself is. So the levels that are
-/// chosen by the distance of the square add up to bytes that no frame in the square exceeds. The
+/// No point in a square is nearer to a block than the square itself is. So the levels that cameras
+/// at the distance of the square or farther need add up to bytes that no frame in it exceeds. The
 /// square with the highest bound is halved repeatedly until it is as small as a cell; then no point
 /// anywhere needs more than its bound. A point outside of the bounding box needs no more than the
 /// nearest point in the box, which is nearer to everything.
@@ -42,11 +91,10 @@ pub(super) fn worst_case_bytes(
         // allows no more.
         let distance_m = |bounds: &Bounds| (gap_m(&area, bounds) - extent.radius_m).max(0.0);
         index.visit(profile.reach_m, distance_m, |block, distance_m| {
+            let of_level =
+                |level: &Section| Chunk::needed_bytes(manifest.sh_degree, level.count.into());
             let levels = block.levels(manifest);
-            // Bytes rise as the level falls, and the level falls with the distance, so that a lower
-            // bound of the distance is an upper bound of the bytes.
-            let level = coarsest_level(levels, extent.focal_px, distance_m, profile.tau_px);
-            bytes += Chunk::needed_bytes(manifest.sh_degree, levels[level].count.into());
+            bytes += extent.most_bytes(levels, distance_m, profile.tau_px, of_level);
         });
         Square { bytes, area }
     };
@@ -92,7 +140,7 @@ impl Ord for Square {
 /// The distance between two boxes, in metres; 0 where they touch or overlap.
 fn gap_m(a: &Bounds, b: &Bounds) -> f64 {
     // Per axis at most one difference is positive. Both are negative where the boxes overlap.
-    (a.min_m - b.max_m).max(b.min_m - a.max_m).max(glam::DVec3::ZERO).length()
+    (a.min_m - b.max_m).max(b.min_m - a.max_m).max(DVec3::ZERO).length()
 }
 
 /// The two halves of a box, cut across the longer of its sides along x and y.

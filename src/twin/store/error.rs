@@ -237,7 +237,7 @@ pub enum StoreError {
     Geo(#[from] GeoError),
     /// The alignment of a version cannot be used.
     #[error("the alignment of the twin with its capture: {0}")]
-    Alignment(#[from] AlignmentError),
+    Alignment(AlignmentError),
     /// A trajectory of a commit cannot be used.
     #[error(transparent)]
     Trajectory(#[from] TrajectoryError),
@@ -268,6 +268,12 @@ pub enum StoreError {
         /// The largest size that is read.
         limit: u64,
     },
+}
+
+impl From<AlignmentError> for StoreError {
+    fn from(cause: AlignmentError) -> Self {
+        Self::Alignment(cause)
+    }
 }
 
 impl StoreError {

@@ -21,6 +21,13 @@ use super::chunk_file::{self, ChunkHeader, LevelOfBlock, PackedSection};
 /// compared with a scene.
 const BATCH_GAUSSIANS: usize = 1 << 16;
 
+/// From this number of Gaussians on, a block is packed while no other is: its levels take about 200
+/// bytes for each, and dense captures have millions in a block.
+const LARGE_BLOCK: usize = 1 << 18;
+
+/// The sections of a block, and counts of the values that the record could not hold of level 0.
+type Packed = (Vec<PackedSection>, Clamped);
+
 /// How Gaussians are stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct StorageOptions {
@@ -92,10 +99,7 @@ impl<'a> CellPacker<'a> {
                 .iter()
                 .flat_map(|cell| cell.blocks.iter().map(move |block| (cell, block)))
                 .collect();
-            let packed = blocks.into_par_iter().map(|(cell, (block, run))| {
-                self.pack_block(cell, *block, &self.order[run.clone()])
-            });
-            let packed = packed.collect::<io::Result<Vec<_>>>();
+            let packed = self.pack_blocks(&blocks);
             let packed = packed.map_err(StoreError::io("compress for", staging.dir()))?;
 
             // Their objects, one after the other.
@@ -115,13 +119,22 @@ impl<'a> CellPacker<'a> {
         Ok((chunks, clamped))
     }
 
+    /// All levels of some blocks, in order. Small ones are packed in parallel. Of large ones, there
+    /// is one in memory at a time; its Gaussians are merged in parallel.
+    fn pack_blocks(&self, blocks: &[(&CellRun, &(u8, Range<usize>))]) -> io::Result<Vec<Packed>> {
+        let is_small = |block: &(&CellRun, &(u8, Range<usize>))| block.1.1.len() < LARGE_BLOCK;
+        let mut packed = Vec::with_capacity(blocks.len());
+        for some in blocks.chunk_by(|a, b| is_small(a) && is_small(b)) {
+            let some = some.par_iter().map(|(cell, (block, run))| {
+                self.pack_block(cell, *block, &self.order[run.clone()])
+            });
+            packed.extend(some.collect::<io::Result<Vec<_>>>()?);
+        }
+        Ok(packed)
+    }
+
     /// All levels of one block, and counts of the values that the record could not hold of level 0.
-    fn pack_block(
-        &self,
-        cell: &CellRun,
-        block: u8,
-        order: &[u32],
-    ) -> io::Result<(Vec<PackedSection>, Clamped)> {
+    fn pack_block(&self, cell: &CellRun, block: u8, order: &[u32]) -> io::Result<Packed> {
         let StorageOptions { record, levels } = self.storage;
         let sh_degree = self.gaussians.sh_degree;
         let mut full = Chunk::new(cell.cell, cell.origin_m, sh_degree, order.len());
@@ -136,7 +149,9 @@ impl<'a> CellPacker<'a> {
             &mut clamped,
         )?];
         if levels {
-            for (level, lod::Level { error_m, chunk }) in (1..).zip(lod::levels(&full)) {
+            let coarser = lod::levels(&full);
+            drop(full);
+            for (level, lod::Level { error_m, chunk }) in (1..).zip(coarser) {
                 // Not counted: merged Gaussians are approximations anyway.
                 let lost = &mut Clamped::default();
                 let level = LevelOfBlock { block, level, error_m };

@@ -76,9 +76,13 @@ struct NonPinholeView<'a> {
     lens: Option<LensProjection>,
 }
 
-/// Runs `work` with the jobs of a frame: one for each unit that a view may see, in order of (view,
-/// global id).
-pub(in crate::cpu) fn with_jobs<R>(frame: &Frame<'_>, work: impl FnOnce(&[Job<'_>]) -> R) -> R {
+/// Runs `work` with the jobs of a frame, or of the part of one that begins with the view
+/// `first_view`: one for each unit that a view may see, in order of (view, global id).
+pub(in crate::cpu) fn with_jobs<R>(
+    frame: &Frame<'_>,
+    first_view: usize,
+    work: impl FnOnce(&[Job<'_>]) -> R,
+) -> R {
     // Compute the data that is the same for all chunks of a view or of an actor.
     let non_pinhole: Vec<Option<NonPinholeView<'_>>> =
         // Per view and not per chunk: a lens has series to be fitted.
@@ -88,10 +92,11 @@ pub(in crate::cpu) fn with_jobs<R>(frame: &Frame<'_>, work: impl FnOnce(&[Job<'_
     let shadows = ChunkShadow::by_chunk(frame.scene);
     let mut jobs = Vec::new();
     for (index, non_pinhole) in non_pinhole.iter().enumerate() {
-        add_twin(index, frame, non_pinhole.as_ref(), &shadows, &mut jobs);
+        let views = [index, first_view + index];
+        add_twin(views, frame, non_pinhole.as_ref(), &shadows, &mut jobs);
         // Without actors the list of lists is empty.
         let from_actors = from_actors.get(index).map_or(&[][..], Vec::as_slice);
-        add_actors(index, frame, actor_views.for_view(index), from_actors, &mut jobs);
+        add_actors(views, frame, actor_views.for_view(index), from_actors, &mut jobs);
     }
     // A closure and not a result: the jobs borrow from the locals above.
     work(&jobs)
@@ -196,19 +201,21 @@ fn non_pinhole_from_actors<'a>(
 }
 
 /// Adds the jobs of one view and the twin, in order of global ids. A unit that a view cannot see
-/// has no job; it costs one visibility test per cluster.
+/// has no job; it costs one visibility test per cluster. The view is given by its index in the part
+/// and in the whole frame, by which the scene names its views.
 fn add_twin<'a>(
-    index: usize,
+    [index, view]: [usize; 2],
     frame: &Frame<'a>,
     non_pinhole: Option<&'a NonPinholeView<'a>>,
     shadows: &'a [Vec<ChunkShadow>],
     jobs: &mut Vec<Job<'a>>,
 ) {
-    for (number, chunk) in frame.scene.chunks.iter().enumerate() {
+    let chunks = frame.scene.chunks.iter().enumerate();
+    for (number, chunk) in chunks.filter(|(number, _)| frame.scene.draws(*number, view)) {
         let projection = ChunkProjection::new(&frame.views[index], chunk, non_pinhole, frame);
         let light = match shadows.get(number).map_or(&[][..], Vec::as_slice) {
             [] => Light::AsStored,
-            shadows => Light::Shadowed(shadows),
+            shadows => Light::Shadowed { shadows, view },
         };
         let owner = JobOwner { view: index, number, light, instance: TWIN_INSTANCE };
         add_jobs(owner, projection, chunk, jobs);
@@ -216,17 +223,18 @@ fn add_twin<'a>(
 }
 
 /// Adds the jobs of one view and all actors, in order of global ids. `relative` are the view from
-/// the axes of each actor.
+/// the axes of each actor; the indices are as in [`add_twin`].
 fn add_actors<'a>(
-    index: usize,
+    [index, view_of_frame]: [usize; 2],
     frame: &Frame<'a>,
     relative: &[View],
     non_pinhole: &'a [Option<NonPinholeView<'a>>],
     jobs: &mut Vec<Job<'a>>,
 ) {
     let first = frame.scene.chunks.len();
-    let placed = (first..).zip(&frame.scene.placed);
-    for (((number, placed), view), non_pinhole) in placed.zip(relative).zip(non_pinhole) {
+    let placed = (first..).zip(&frame.scene.placed).zip(relative).zip(non_pinhole);
+    let drawn = placed.filter(|(((_, placed), _), _)| placed.views.contains(view_of_frame));
+    for (((number, placed), view), non_pinhole) in drawn {
         let projection = ChunkProjection::new(view, &placed.chunk, non_pinhole.as_ref(), frame);
         let light = match placed.tint {
             [1.0, 1.0, 1.0] => Light::AsStored,

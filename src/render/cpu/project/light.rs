@@ -16,8 +16,8 @@ pub(super) enum Light<'a> {
     AsStored,
     /// An actor: a factor on red, green and blue.
     Tinted([f32; 3]),
-    /// A chunk of the twin with actors above it.
-    Shadowed(&'a [ChunkShadow]),
+    /// A chunk of the twin with actors above it, some of them in this view.
+    Shadowed { shadows: &'a [ChunkShadow], view: usize },
 }
 
 impl Light<'_> {
@@ -25,9 +25,9 @@ impl Light<'_> {
     #[inline(always)]
     pub(super) fn on(self, cluster: &Cluster) -> Self {
         match self {
-            Self::Shadowed(shadows)
+            Self::Shadowed { shadows, view }
                 // Nearly all clusters are far from every actor, and are drawn without any loop.
-                if !shadows.iter().any(|shadow| shadow.may_touch(cluster.min_m, cluster.max_m)) =>
+                if !shadows.iter().any(|shadow| shadow.falls_on(cluster, view)) =>
             {
                 Self::AsStored
             }
@@ -44,11 +44,11 @@ impl Light<'_> {
                 let tint = Vec3x16::splat(simd, tint);
                 splats.set_colors(splats.colors(simd).times(tint));
             }
-            Self::Shadowed(shadows) => {
+            Self::Shadowed { shadows, view } => {
                 let mean = Vec3x16::load(simd, columns, column::MEAN);
                 // Shadows of several actors multiply, as in the reference backend.
                 let mut factor = f32x16::splat(simd, 1.0);
-                for shadow in shadows {
+                for shadow in shadows.iter().filter(|shadow| shadow.views.contains(view)) {
                     factor *= shadow_factor(simd, mean, shadow);
                 }
                 splats.set_colors(splats.colors(simd).scale(factor));

@@ -87,7 +87,7 @@ fn back_project_unit<S: Simd>(
     let tint = match job.light {
         Light::Tinted(tint) => tint,
         // Shadows have been refused.
-        Light::AsStored | Light::Shadowed(_) => [1.0; 3],
+        Light::AsStored | Light::Shadowed { .. } => [1.0; 3],
     };
     let mut twist = [0.0_f64; 6];
     let mut next = by_splats.iter();
