@@ -1,6 +1,6 @@
 // Gradients, after `rasterize_gradient.wgsl`: adds up the sums of each splat, from instances to touches (`touches`) and
-// from touches to splats (`splats`), for a run of macro tiles after the other. The order is that of tiles within a macro tile, and of macro tiles, whatever thread
-// adds, so the same input gives the same bytes.
+// from touches to splats (`splats`), for one run of macro tiles after the other. The order is that of tiles within a
+// macro tile, and of macro tiles, whatever thread adds, so the same input gives the same bytes.
 //
 // The touches of a macro tile are in order of depth, and so of the ranks of their splats. A splat finds its own by a
 // binary search in each macro tile that its box reaches: nothing is sorted again.

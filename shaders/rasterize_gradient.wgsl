@@ -1,6 +1,6 @@
-// Gradients, stage rasterize, for a run of macro tiles: one workgroup per tile walks the tile's splats from front to back once more, as
-// `rasterize.wgsl` drew them, and sums for each of them over the tile's pixels what its gradients need. The formulas are
-// in `src/render/gradient/mod.rs`. Twin of `src/render/cpu/blend_gradient.rs`.
+// Gradients, stage rasterize, for a run of macro tiles: one workgroup per tile walks the tile's splats from front to
+// back once more, as `rasterize.wgsl` drew them, and sums for each of them over the tile's pixels what its gradients
+// need. The formulas are in `src/render/gradient/mod.rs`. Twin of `src/render/cpu/blend_gradient.rs`.
 //
 // A thread adds up its own four pixels in registers. The sums of a few splats at a time go to workgroup memory, where
 // one thread for each sum adds those of the blocks that the splat reaches, in order: without atomics, and without

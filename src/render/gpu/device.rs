@@ -348,7 +348,8 @@ impl Device {
     /// Most splats of a tile whose gradients can be summed.
     ///
     /// A batch of 64 takes at most 18 iterations: 1, one for each four splats, and 1 at their end;
-    /// a thread takes 17 to find its view besides.
+    /// or 10 where its sums are 0. A thread takes 17 to find its tile and 17 to find its view
+    /// besides.
     pub(super) fn max_gradient_splats(&self) -> u64 {
         self.loop_iterations().map_or(u64::MAX, |most| (most - 40) / 18 * 64)
     }

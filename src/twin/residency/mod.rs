@@ -20,8 +20,9 @@
 //! **Each view has its own levels of detail.** Levels chosen once for all views of a frame made an
 //! image a function of the cameras beside it (35 dB between a wide camera alone and among six), and
 //! a wide camera drew what only the longest lens beside it needs. Where views need several levels
-//! of a block, all of them are in memory: a third more at most, as each level has about a quarter
-//! of the Gaussians of the one before.
+//! of a block, all of them are in memory. A level has at most 0.65 of the Gaussians of the one
+//! before, so that all of them have 2.9 times those of the first; on a dense scene six cameras took
+//! 30 % more than with common levels.
 //!
 //! **A section is in memory once**, under a key made of everything that its chunk depends on:
 //! content hash, cell, block, level, origin, and record. Fifty versions of a twin that differ in

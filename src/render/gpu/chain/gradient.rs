@@ -59,7 +59,7 @@ impl Chain {
         let mut stages = stages.unwrap_or_else(|| GradientStages::new(&self.device));
         let done = self.differentiate_in(&mut stages, frame, depth, loss, gradients, pool);
         // After a failure of the device they are not used again: some buffers may still be mapped.
-        if !matches!(done, Err(GradientError::Render(_))) {
+        if !matches!(done, Err(GradientError::Render(RenderError::Device { .. }))) {
             self.gradient = Some(stages);
         }
         done

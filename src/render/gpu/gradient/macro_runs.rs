@@ -20,8 +20,9 @@ pub(super) const SUMS_BYTES: u64 = size_of::<Partial>() as u64;
 /// are at most 116 B a splat.
 const BYTES_PER_SPLAT: u64 = 44;
 
-/// A small frame is one run.
-const LEAST_BYTES: u64 = 1 << 20;
+/// A small frame is one run: with a few splats that cover many tiles, runs would be too short to
+/// keep a device busy.
+const LEAST_BYTES: u64 = 8 << 20;
 
 /// Tiles of a macro tile.
 const TILES: usize = (MACRO_COLUMNS * MACRO_ROWS) as usize;
@@ -210,4 +211,115 @@ fn macro_rows(view: &FrameView) -> impl Iterator<Item = MacroRow> {
             macro_tiles: first_macro_tile..first_macro_tile + macro_columns,
         }
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use bytemuck::Zeroable;
+    use wildcity_scene::random::Random;
+
+    /// 3 x 2 macro tiles whose last ones are cut off, then one macro tile.
+    fn views() -> [FrameView; 2] {
+        let view = |columns, rows, first_tile, first_macro_tile| FrameView {
+            columns,
+            rows: [0, rows],
+            first_tile,
+            macro_columns: u32::div_ceil(columns, MACRO_COLUMNS),
+            first_macro_tile,
+            ..FrameView::zeroed()
+        };
+        [view(19, 6, 0, 0), view(5, 3, 19 * 6, 6)]
+    }
+
+    /// Tiles of each macro tile, in the order of their bits.
+    fn tiles(macro_tile: u32) -> Vec<(u32, usize)> {
+        let [first, second] = views();
+        let view = if macro_tile < 6 { first } else { second };
+        let own = macro_tile - view.first_macro_tile;
+        let corner =
+            [own % view.macro_columns * MACRO_COLUMNS, own / view.macro_columns * MACRO_ROWS];
+        (0..MACRO_COLUMNS * MACRO_ROWS)
+            .map(|bit| (bit, corner[0] + bit % MACRO_COLUMNS, corner[1] + bit / MACRO_COLUMNS))
+            .filter(|&(_, column, row)| column < view.columns && row < view.rows[1])
+            .map(|(bit, column, row)| {
+                (bit, (view.first_tile + row * view.columns + column) as usize)
+            })
+            .collect()
+    }
+
+    /// Ranges of touches and instances as the device has them: those of nothing are 0.
+    fn ranges(random: &mut Random) -> (Vec<[u32; 2]>, Vec<[u32; 2]>) {
+        let (mut touches, mut instances) = (vec![[0; 2]; 7], vec![[0; 2]; 19 * 6 + 5 * 3]);
+        let mut next = [0, 0];
+        for (macro_tile, range) in touches.iter_mut().enumerate() {
+            if random.below(3) == 0 {
+                continue;
+            }
+            let most = [10, 3_000][random.below(2)];
+            let count = 1 + random.below(most) as u32;
+            *range = [next[0], next[0] + count];
+            next[0] += count;
+            for (_, tile) in tiles(macro_tile as u32) {
+                let count = random.below(count as usize + 1) as u32;
+                if count > 0 {
+                    instances[tile] = [next[1], next[1] + count];
+                    next[1] += count;
+                }
+            }
+        }
+        (touches, instances)
+    }
+
+    #[test]
+    fn runs_have_every_tile_once_and_in_order() {
+        let mut random = Random::new(7, "runs", 0);
+        let mut divided = 0;
+        for _ in 0..200 {
+            let (touches, instances) = ranges(&mut random);
+            let binding_bytes = SUMS_BYTES * (500 + random.below(40_000) as u64);
+            let limits = RunLimits { splats: 1, binding_bytes, tiles_per_page: 80 };
+            let runs = MacroRuns::new(&views(), &touches, &instances, limits);
+            assert_eq!(runs.pages, [0..76, 76..129]);
+            let mut seen: Vec<usize> = Vec::new();
+            let [mut first_touch, mut first_instance, mut first_batch] = [0; 3];
+            for (index, run) in runs.runs.iter().enumerate() {
+                let MacroRun { macro_tiles, tiles: mask, .. } = run.layout;
+                let first = run.layout.first_macro_tile;
+                let is_divided = mask != u32::MAX;
+                divided += u32::from(is_divided);
+                assert!(!is_divided || macro_tiles == 1);
+                let own = first..first + macro_tiles;
+                let most_of_a_tile = instances.iter().map(|[a, b]| b - a).max().unwrap();
+                let least = u64::from(run.layout.touches + most_of_a_tile);
+                assert!(run.sums() <= (binding_bytes / SUMS_BYTES).max(least));
+                assert_eq!(run.layout.first_tile, runs.pages[run.page].start);
+                assert_eq!(run.layout.first_touch, first_touch);
+                assert_eq!(run.layout.first_batch, first_batch);
+                assert_eq!(run.layout.first_instance, first_instance);
+                let has_next =
+                    runs.runs.get(index + 1).is_some_and(|next| next.layout.continues == 1);
+                assert_eq!(run.is_last, !has_next);
+                let length = |[start, end]: [u32; 2]| end - start;
+                let of_run = own.clone().map(|own| length(touches[own as usize]));
+                assert_eq!(of_run.clone().sum::<u32>(), run.layout.touches);
+                let batches = of_run.map(|touches| touches.div_ceil(EXPAND_BATCH)).sum::<u32>();
+                assert_eq!(batches, run.layout.batches);
+                let before = first_instance;
+                for (_, tile) in own.flat_map(tiles).filter(|(bit, _)| mask >> bit & 1 == 1) {
+                    assert!(runs.pages[run.page].contains(&(tile as u32)));
+                    first_instance += length(instances[tile]);
+                    seen.push(tile);
+                }
+                assert_eq!(first_instance - before, run.instances);
+                if run.is_last {
+                    first_touch += run.layout.touches;
+                    first_batch += batches;
+                }
+            }
+            seen.sort_unstable();
+            assert_eq!(seen, (0..129).collect::<Vec<_>>());
+        }
+        assert!(divided > 100, "{divided}");
+    }
 }

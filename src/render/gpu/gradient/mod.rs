@@ -15,10 +15,11 @@
 //! **The same input gives the same bytes** on one device: every sum has its place and its order,
 //! and nothing is added atomically.
 //!
-//! Beside the buffers of the frame there are at most 116 B for each splat (but the touches of one
-//! macro tile with the instances of one of its tiles, and 1 MiB, may always be summed), 20 B for each pixel, and 1 KiB for each column of each
-//! visible cluster; and for lenses, 72 B of host memory for each splat. A frame must fit the device
-//! at once.
+//! Beside the buffers of the frame there are at most 116 B for each splat (but 10 MiB, or the
+//! touches of one macro tile with the instances of one of its tiles, may always be summed), 25 B
+//! for each pixel, and 1.25 KiB for each column of each visible cluster, which the host reads from
+//! as much again; and for lenses, another 90 B for each splat. All include the quarter that buffers
+//! grow beyond their need. A frame must fit the device at once.
 //!
 //! Images and derivatives are those of the Gaussians of the mirror, whose colours are rounded to 16
 //! bits of the cluster's largest and whose rotations to 20.
