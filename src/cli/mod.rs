@@ -202,7 +202,7 @@ mod tests {
                 assert_eq!(names, expected.1, "{path} --{}", argument.get_long().unwrap());
             }
         }
-        // serve, import, render, eval, bisect; and push instead of serve.
-        assert_eq!(counts, [5, 5]);
+        // serve, import, twin sky, render, eval, bisect; and push instead of serve.
+        assert_eq!(counts, [6, 6]);
     }
 }
