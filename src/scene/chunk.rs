@@ -628,7 +628,7 @@ pub struct Scene {
     /// Which views of a frame draw which of these chunks; without it, all views draw all of them.
     pub selection: Option<Selection>,
     /// Actors. Among Gaussians with equal depths, those of the twin are in front, then those of
-    /// actors in the order of this list. At most [`PlacedChunk::MAX_ACTORS`] actors.
+    /// actors in the order of this list. A view has at most [`PlacedChunk::MAX_ACTORS`] of them.
     pub placed: Vec<PlacedChunk>,
     /// The sky; without one, the background colour of the render profile is drawn (black by
     /// default).

@@ -15,9 +15,9 @@ use crate::cli::progress;
 /// Compare the gradients of every backend on this machine with their definition.
 ///
 /// The backends are cpu, and gpu if there is a hardware device or --device names one. The
-/// definition is the reference backend, which computes in f64; the tests of the
-/// project compare its derivatives with finite differences. A row is one scene: streets by every
-/// kind of camera, and extremes such as needles and a thousand layers.
+/// definition is the reference backend, which computes in f64; the tests of the project compare its
+/// derivatives with finite differences. A row is one scene: streets by every kind of camera, and
+/// extremes such as needles and a thousand layers.
 ///
 /// A number is the largest error among the derivatives by one group of parameters, divided by the
 /// largest of these derivatives. (Those by rotations may all be 0, as for balls: they are divided

@@ -2,6 +2,7 @@
 
 use std::sync::{Arc, mpsc};
 
+use bytemuck::AnyBitPattern;
 use parking_lot::Mutex;
 use wgpu::{Buffer, BufferUsages, BufferView, MapMode, PollType, SubmissionIndex};
 
@@ -199,4 +200,14 @@ impl ReadBack {
 fn view(device: &Device, buffer: &GrowableBuffer) -> Result<BufferView, RenderError> {
     let mapped = buffer.buffer().slice(..).get_mapped_range();
     mapped.map_err(|error| device.failed(error.to_string()))
+}
+
+/// Mapped bytes as values, as many as there are whole ones.
+pub(super) fn mapped<'a, T: AnyBitPattern>(
+    device: &Device,
+    bytes: &'a [u8],
+) -> Result<&'a [T], RenderError> {
+    let whole = bytes.len() / size_of::<T>() * size_of::<T>();
+    bytemuck::try_cast_slice(&bytes[..whole])
+        .map_err(|error| device.failed(format!("its memory cannot be read: {error}")))
 }

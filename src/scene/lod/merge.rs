@@ -11,15 +11,13 @@ const HIDDEN_SHARE: f64 = 0.03;
 /// A Gaussian as it is kept between merges: a dense block has millions.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct StoredNode {
-    /// Mean, in metres.
     pub(super) mean_m: DVec3,
     /// Standard deviations along the principal axes, in metres.
     pub(super) scale_m: [f32; 3],
     /// The principal axes as a unit quaternion (w, x, y, z).
     pub(super) quat_wxyz: [f32; 4],
-    /// As in [`Node`].
+    /// This and the next are as in [`Node`].
     pub(super) weight: f64,
-    /// As in [`Node`].
     pub(super) opaque_weight: f64,
 }
 

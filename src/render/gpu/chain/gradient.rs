@@ -3,7 +3,6 @@
 
 use std::time::Instant;
 
-use bytemuck::AnyBitPattern;
 use rayon::ThreadPool;
 use wgpu::Buffer;
 
@@ -11,7 +10,6 @@ use super::record::add_stage_times;
 use super::regions::{DrawInput, PreparedRegion};
 use super::{Chain, CurrentFrame, Source, add_time};
 use crate::actor_views::ActorViews;
-use crate::gpu::device::Device;
 use crate::gpu::gradient::{
     BackwardInputs, GradientClusters, GradientStages, HostSplats, MacroRuns, back_project, images,
     pack,
@@ -20,7 +18,7 @@ use crate::gpu::kernel::Recorder;
 use crate::gpu::layout::{FrameView, RASTER_BATCH, SplatShape};
 use crate::gpu::partition::TileRows;
 use crate::gpu::project_work::{ProjectWork, Projection};
-use crate::gpu::read_back::ReadBack;
+use crate::gpu::read_back::{ReadBack, mapped};
 use crate::gpu::resolve::{Outputs, Pixels, Planes};
 use crate::gradient::{
     GaussianImages, GradientError, Gradients, LossGradient, Partial, Twist, check_finite,
@@ -125,9 +123,9 @@ impl Chain {
         }
         let clusters = GradientClusters::new(&work, frame.scene, &self.mirror);
         let splat_count = head.counters.splats;
-        let views = &current.parameters.view[..frame.views.len()];
         let timestamps = self.timestamps.buffer();
-        let runs = stages.divide(&self.device, &self.bin, views, splat_count, timestamps)?;
+        let parameters = &current.parameters;
+        let runs = stages.divide(&self.device, &self.bin, parameters, splat_count, timestamps)?;
         let needed = GradientStages::needed_bytes(splat_count, &runs, &clusters);
         if needed > self.device.binding_bytes() {
             current.read_back.unmap();
@@ -180,7 +178,7 @@ impl Chain {
     ) -> Result<Vec<GaussianImages>, RenderError> {
         let pages = current.read_back.pages(&self.device)?;
         let words: Vec<&[u32]> =
-            pages.iter().map(|page| slice(&self.device, page)).collect::<Result<_, _>>()?;
+            pages.iter().map(|page| mapped(&self.device, page)).collect::<Result<_, _>>()?;
         let pixels = Pixels {
             pages: &words,
             tiles_per_page: current.read_back.tiles_per_page,
@@ -252,9 +250,9 @@ impl Chain {
         let Drawn { frame, actors, work, clusters, .. } = drawn;
         let pages = stages.read_back.pages(&self.device)?;
         let page = |index: usize| pages.get(index).map_or(&[][..], |page| &page[..]);
-        let lines: &[f32] = slice(&self.device, page(0))?;
-        let twists: &[[f32; 6]] = slice(&self.device, page(1))?;
-        let visible: &[u32] = slice(&self.device, page(2))?;
+        let lines: &[f32] = mapped(&self.device, page(0))?;
+        let twists: &[[f32; 6]] = mapped(&self.device, page(1))?;
+        let visible: &[u32] = mapped(&self.device, page(2))?;
         gradients.reset(frame.scene, frame.views.len());
         pool.install(|| clusters.copy_to(frame.scene, work, lines, visible, &mut gradients.chunks));
         // In the order of (view, global id). The device has none of lenses.
@@ -263,9 +261,9 @@ impl Chain {
         }
         if has_lenses(work) {
             let splats = HostSplats {
-                first_splats: slice(&self.device, page(3))?,
-                shapes: slice(&self.device, page(4))?,
-                sums: slice(&self.device, page(5))?,
+                first_splats: mapped(&self.device, page(3))?,
+                shapes: mapped(&self.device, page(4))?,
+                sums: mapped(&self.device, page(5))?,
                 visible,
             };
             pool.install(|| back_project(frame, actors, work, clusters, splats, gradients));
@@ -277,11 +275,4 @@ impl Chain {
 /// Whether some view is no static pinhole.
 fn has_lenses(work: &ProjectWork) -> bool {
     work.dispatches.iter().any(|dispatch| dispatch.variant.projection == Projection::Unscented)
-}
-
-/// Mapped bytes as values, as many as there are whole ones.
-fn slice<'a, T: AnyBitPattern>(device: &Device, bytes: &'a [u8]) -> Result<&'a [T], RenderError> {
-    let whole = bytes.len() / size_of::<T>() * size_of::<T>();
-    bytemuck::try_cast_slice(&bytes[..whole])
-        .map_err(|error| device.failed(format!("its memory cannot be read: {error}")))
 }

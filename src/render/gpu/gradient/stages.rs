@@ -10,12 +10,12 @@ use crate::gpu::bin::Bin;
 use crate::gpu::device::Device;
 use crate::gpu::growable_buffer::{GrowableBuffer, INTERMEDIATE};
 use crate::gpu::kernel::{Groups, Kernel, LazyShader, Recorder, module, slot_binding, slots};
-use crate::gpu::layout::{FrameView, MACRO_COLUMNS, MACRO_ROWS, MacroRun};
+use crate::gpu::layout::{Frame, MACRO_COLUMNS, MACRO_ROWS, MacroRun};
 use crate::gpu::mirror::Mirror;
 use crate::gpu::plan::{Plan, job};
 use crate::gpu::project::{Project, SplatBuffers};
 use crate::gpu::project_work::ProjectWork;
-use crate::gpu::read_back::ReadBack;
+use crate::gpu::read_back::{ReadBack, mapped};
 use wildcity_scene::chunk::CLUSTER;
 
 /// Bytes of the derivatives by the pixels of a tile.
@@ -96,23 +96,18 @@ impl GradientStages {
     /// Reads how many touches and instances each part of a frame has, and divides the frame.
     ///
     /// # Errors
-    /// The device fails.
+    /// The device fails; buffers may then still be mapped.
     pub(in crate::gpu) fn divide(
         &mut self,
         device: &Device,
         bin: &Bin,
-        views: &[FrameView],
+        frame: &Frame,
         splats: u32,
         timestamps: &Buffer,
     ) -> Result<MacroRuns, RenderError> {
-        let last = views.last().map_or(0, |view| view.first_tile + view.columns * view.rows[1]);
-        let macro_rows = |view: &FrameView| view.rows[1].div_ceil(MACRO_ROWS);
-        let macro_tile =
-            |view: &FrameView| view.first_macro_tile + view.macro_columns * macro_rows(view);
-        let last_macro_tile = views.last().map_or(0, macro_tile);
         let sources = [
-            (bin.macro_ranges.buffer(), 8 * u64::from(last_macro_tile)),
-            (bin.ranges.buffer(), 8 * u64::from(last)),
+            (bin.macro_ranges.buffer(), 8 * u64::from(frame.macro_tiles)),
+            (bin.ranges.buffer(), 8 * u64::from(frame.tiles)),
         ];
         let recorder = Recorder::new(device, None);
         let (_, submission) = self.lists.submit(device, recorder, &sources, timestamps);
@@ -123,7 +118,9 @@ impl GradientStages {
             tiles_per_page: (device.binding_bytes() / TILE_BYTES).min(u32::MAX.into()) as u32,
         };
         let pages = self.lists.pages(device)?;
-        let [touches, instances] = [&pages[0], &pages[1]].map(|page| bytemuck::cast_slice(page));
+        let views = &frame.view[..frame.views as usize];
+        let touches = mapped(device, &pages[0])?;
+        let instances = mapped(device, &pages[1])?;
         let runs = MacroRuns::new(views, touches, instances, limits);
         drop(pages);
         self.lists.unmap();
