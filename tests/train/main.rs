@@ -9,6 +9,7 @@ mod root;
 mod scene_files;
 
 mod check;
+mod loss_vectors;
 mod losses;
 mod training;
 mod vectors;

@@ -42,7 +42,7 @@ pub struct Sources<'a> {
 }
 
 /// The images of a view in f64.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Images {
     pub rgb: Vec<DVec3>,
     pub opacity: Vec<f64>,

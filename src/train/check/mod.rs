@@ -93,9 +93,10 @@ impl Table {
 impl fmt::Display for Table {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{:22}  {:9}  {:9}", "case", "backend", "against")?;
-        let groups = ["mean", "ln scale", "quat", "opacity", "sh", "twist"];
+        let groups =
+            ["mean", "ln scale", "quat", "opacity", "sh", "twist", "depth", "background", "loss"];
         for group in groups {
-            write!(f, "  {:>7}", group.trim_start_matches("ln "))?;
+            write!(f, "  {:>7.7}", group.trim_start_matches("ln "))?;
         }
         writeln!(f, "  bound")?;
         for row in &self.rows {
