@@ -45,6 +45,17 @@ impl<T: Real> Exposure<T> {
         Self { matrix, offset: [T::zero(); 3] }
     }
 
+    /// All colours times a factor.
+    pub fn gain(factor: T) -> Self {
+        let matrix = Self::identity().matrix.map(|row| row.map(|value| value * factor));
+        Self { matrix, offset: [T::zero(); 3] }
+    }
+
+    /// Whether the squares of all values are finite.
+    pub(crate) fn is_finite(&self) -> bool {
+        self.matrix.iter().flatten().chain(&self.offset).all(|&v| (v * v).is_finite())
+    }
+
     fn apply(&self, rgb: [T; 3]) -> [T; 3] {
         std::array::from_fn(|k| {
             let [r, g, b] = self.matrix[k];

@@ -7,21 +7,37 @@
 //! | [`run`] | a run: from images to Gaussians |
 //! | [`start`] | from points to the Gaussians that it begins with |
 //! | [`trainer`] | a step: what one image teaches |
+//! | [`sample`] | what a step learns from |
 //! | [`model`] | the Gaussians of a run, and Adam |
-//! | [`settings`] | the settings of a run |
+//! | [`poses`] | the poses of a rig, trained |
+//! | `exposures`, `sky` | the exposure of each image, and the sky behind all, trained |
+//! | [`ground`] | which Gaussians are of the ground, and their terms |
 //! | `growth` | relocation and growth by Markov chain Monte Carlo |
+//! | [`checkpoint`] | the state of a run in a file |
+//! | [`settings`] | the settings of a run |
+//! | `objective` | the loss of an image, and all its derivatives |
 //! | [`compose`] | from the Gaussians' images to the camera's: background or sky, and exposure |
 //!
 //! The renderer differentiates the images of the Gaussians ([`wildcity_render::gradient`]); all
 //! that lies between these and a number is here. Every function is written for f32 and f64:
 //! training computes in f32, and tests judge the same code in f64 by differences.
 
+mod adam;
 pub mod check;
+pub mod checkpoint;
 pub mod compose;
+mod exposures;
+pub mod ground;
 mod growth;
 pub mod loss;
 pub mod model;
+mod objective;
+pub mod poses;
 pub mod run;
+pub mod sample;
 pub mod settings;
+mod sky;
 pub mod start;
 pub mod trainer;
+
+pub use sky::sky_file;

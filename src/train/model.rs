@@ -10,6 +10,7 @@
 //! number grows, another 184 B for the old chunk and the new one.
 
 use glam::{DVec3, Quat, Vec3};
+use serde::{Deserialize, Serialize};
 use wildcity_render::gradient::ChunkGradients;
 use wildcity_scene::chunk::{CLUSTER, LANES, Lanes, column, columns};
 use wildcity_scene::random::{mix, to_unit};
@@ -36,7 +37,20 @@ pub struct Model {
     values: Vec<Lanes>,
     /// Adam's moving means of the derivatives, and of their squares.
     moments: [Vec<Lanes>; 2],
+    /// Whether each Gaussian is of the ground; empty if none is.
+    is_ground: Vec<bool>,
     scene: Scene,
+}
+
+/// The parameters and moments of a model, as a file has them: lane group by lane group.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(crate) struct ModelState {
+    sh_degree: u8,
+    count: u64,
+    origin_m: [f64; 3],
+    values: Vec<f32>,
+    moments: [Vec<f32>; 2],
+    is_ground: Vec<bool>,
 }
 
 /// What one step of Adam needs beside the derivatives.
@@ -74,7 +88,7 @@ struct ClusterState<'a> {
 impl Model {
     /// Gaussians to begin with, in the degree of the settings or in their own, if it is higher.
     /// Their values have been checked ([`wildcity_scene::validate`]).
-    pub(crate) fn new(mut gaussians: Gaussians, sh_degree: u8) -> Self {
+    pub(crate) fn new(mut gaussians: Gaussians, is_ground: Vec<bool>, sh_degree: u8) -> Self {
         gaussians.raise_sh_degree(sh_degree);
         let count = gaussians.len();
         let mut sum = DVec3::ZERO;
@@ -89,6 +103,7 @@ impl Model {
             origin_m,
             values: Vec::new(),
             moments: [Vec::new(), Vec::new()],
+            is_ground: Vec::new(),
             scene: Scene::default(),
         };
         model.resize(count);
@@ -103,8 +118,45 @@ impl Model {
             model.set(i, LOGIT, &[gaussians.logit_opacities[i]]);
             model.set(i, column::SH, gaussians.sh_at(i));
         }
+        model.is_ground = is_ground;
         model.rebuild();
         model
+    }
+
+    pub(crate) fn state(&self) -> ModelState {
+        let flat = |lanes: &Vec<Lanes>| lanes.iter().flat_map(|Lanes(values)| *values).collect();
+        ModelState {
+            sh_degree: self.sh_degree,
+            count: self.count as u64,
+            origin_m: self.origin_m.to_array(),
+            values: flat(&self.values),
+            moments: self.moments.each_ref().map(flat),
+            is_ground: self.is_ground.clone(),
+        }
+    }
+
+    /// `None` if the numbers of values do not fit each other.
+    pub(crate) fn from_state(state: ModelState) -> Option<Self> {
+        let ModelState { sh_degree, count, origin_m, values, moments, is_ground } = state;
+        let count = count as usize;
+        let is_known = sh_degree <= sh::MAX_DEGREE;
+        let wanted = count.div_ceil(LANES).checked_mul(columns(sh_degree) * LANES)?;
+        let fits = moments.iter().chain([&values]).all(|values| values.len() == wanted);
+        if !is_known || !fits || ![0, count].contains(&is_ground.len()) {
+            return None;
+        }
+        let lanes = |values: Vec<f32>| values.as_chunks().0.iter().map(|v| Lanes(*v)).collect();
+        let mut model = Self {
+            sh_degree,
+            count,
+            origin_m: DVec3::from_array(origin_m),
+            values: lanes(values),
+            moments: moments.map(lanes),
+            is_ground,
+            scene: Scene::default(),
+        };
+        model.rebuild();
+        Some(model)
     }
 
     /// Number of Gaussians of the run.
@@ -199,6 +251,9 @@ impl Model {
                 let value = self.values[source / LANES * width + column].0[source % LANES];
                 self.values[to / LANES * width + column].0[to % LANES] = value;
             }
+            if self.has_ground() {
+                self.is_ground[to] = self.is_ground[source];
+            }
             self.forget(to);
         }
         self.rebuild();
@@ -212,6 +267,16 @@ impl Model {
                 lanes.0[index % LANES] = 0.0;
             }
         }
+    }
+
+    /// Whether some Gaussians are of the ground.
+    pub(crate) fn has_ground(&self) -> bool {
+        !self.is_ground.is_empty()
+    }
+
+    /// Whether a Gaussian is of the ground, or a copy of one that is.
+    pub(crate) fn is_ground(&self, index: usize) -> bool {
+        self.has_ground() && self.is_ground[index]
     }
 
     /// The peak opacity of a Gaussian.
@@ -228,7 +293,7 @@ impl Model {
     }
 
     /// Parameters in consecutive columns of a Gaussian.
-    fn get<const N: usize>(&self, index: usize, first: usize) -> [f32; N] {
+    pub(crate) fn get<const N: usize>(&self, index: usize, first: usize) -> [f32; N] {
         let group = index / LANES * columns(self.sh_degree);
         std::array::from_fn(|k| self.values[group + first + k].0[index % LANES])
     }
@@ -246,6 +311,9 @@ impl Model {
         self.values.resize(lanes, zero);
         for moments in &mut self.moments {
             moments.resize(lanes, zero);
+        }
+        if self.has_ground() {
+            self.is_ground.resize(count, false);
         }
         self.count = count;
     }

@@ -13,10 +13,12 @@ use wildcity_render::compare::psnr::psnr_db_u8;
 use wildcity_render::gradient::Differentiate;
 use wildcity_render::{Frame, Target, View};
 use wildcity_scene::random::mix;
-use wildcity_scene::{Gaussians, RenderProfile, Scene};
+use wildcity_scene::{RenderProfile, Scene};
 
+use crate::poses::Place;
+use crate::sample::Sample;
 use crate::settings::Settings;
-use crate::trainer::{Sample, StepReport, TrainError, Trainer};
+use crate::trainer::{StepReport, TrainError, Trainer};
 
 /// Images that are decoded ahead of the step.
 const AHEAD: usize = 2;
@@ -29,6 +31,10 @@ pub struct TrainingImage {
     pub rgb8: Vec<u8>,
     /// `[height, width]`: the pixels that count; all without it.
     pub mask: Option<Vec<bool>>,
+    /// `[height, width]`: measured depths in metres; 0 where there is none.
+    pub depth_m: Option<Vec<f32>>,
+    /// Recorded factor of all colours against the other images.
+    pub exposure: f32,
 }
 
 /// The images of a run, by their numbers.
@@ -38,6 +44,9 @@ pub trait TrainingImages: Sync {
 
     /// Whether an image is kept from the run, to judge it.
     fn is_held_out(&self, index: usize) -> bool;
+
+    /// The poses of the run's rig that an image has; `None` for images without a rig.
+    fn place(&self, index: usize) -> Option<Place>;
 
     /// Decodes an image.
     ///
@@ -53,6 +62,10 @@ pub struct Line {
     pub step: usize,
     pub l1: f64,
     pub dssim: f64,
+    /// In 1/m; 0 without measured depths.
+    pub disparity: f64,
+    /// The weighted sum of the ground's terms.
+    pub ground: f64,
     pub gaussians: usize,
     /// Since the first step, without evaluations.
     pub seconds: f64,
@@ -63,55 +76,62 @@ pub struct Line {
     pub stages_ms: Vec<(&'static str, f64)>,
 }
 
-/// Trains Gaussians. The images that are held out are looked at every `evaluate_every` steps and
-/// after the last one. `on_step` is called after each step, and ends the run by returning `false`.
+/// Takes a run from the step at which it is to its last. The images that are held out are looked at
+/// every `evaluate_every` steps and after the last one. `on_step` is called after each step, and
+/// ends the run by returning `false`.
 ///
 /// # Errors
-/// An image cannot be read, a setting is out of its range, or nothing is left to learn from.
+/// An image cannot be read, or nothing is left to learn from.
 pub fn run(
-    start: Gaussians,
+    trainer: &mut Trainer,
     images: &dyn TrainingImages,
     backend: &dyn Differentiate,
-    profile: RenderProfile,
-    settings: &Settings,
     evaluate_every: usize,
-    on_step: &mut dyn FnMut(&Line) -> bool,
-) -> Result<Gaussians, TrainError> {
+    on_step: &mut dyn FnMut(&Line, &Trainer) -> bool,
+) -> Result<(), TrainError> {
     let (held_out, learned): (Vec<usize>, Vec<usize>) =
         (0..images.count()).partition(|&index| images.is_held_out(index));
     if learned.is_empty() {
         return Err(TrainError::NoImages { images: images.count(), held_out: held_out.len() });
     }
-    let steps = settings.steps;
-    let mut trainer = Trainer::new(start, profile, settings.clone())?;
-    let evaluator = Evaluator { images, backend, profile, held_out: &held_out };
+    let Settings { steps, seed, .. } = *trainer.settings();
+    let first = trainer.steps_done();
+    let evaluator = Evaluator { images, backend, held_out: &held_out };
     thread::scope(|scope| {
         let (sender, next) = sync_channel(AHEAD);
         scope.spawn(move || {
-            let order = order(&learned, settings.seed, steps);
+            let order = order(&learned, seed, steps).skip(first);
             // A receiver that is gone has ended the run.
-            order.map(|index| images.load(index)).all(|image| sender.send(image).is_ok())
+            let load = |index| images.load(index).map(|image| (index, image));
+            order.map(load).all(|image| sender.send(image).is_ok())
         });
         let begin = Instant::now();
         let mut evaluated_s = 0.0;
         while trainer.steps_done() < steps {
-            let report = step(&mut trainer, backend, &next, &profile)?;
+            let report = step(trainer, backend, &next, images)?;
             let done = trainer.steps_done();
             let seconds = begin.elapsed().as_secs_f64() - evaluated_s;
             let mut held_out_db = None;
             if done == steps || done.is_multiple_of(evaluate_every.max(1)) {
-                held_out_db = evaluator.mean_db(trainer.model().scene())?;
+                held_out_db = evaluator.mean_db(trainer)?;
             }
             evaluated_s = begin.elapsed().as_secs_f64() - seconds;
-            let StepReport { l1, dssim, stages_ms, .. } = report;
-            let gaussians = trainer.model().len();
-            let line = Line { step: done, l1, dssim, gaussians, seconds, held_out_db, stages_ms };
-            if !on_step(&line) {
+            let line = Line::new(trainer, report, seconds, held_out_db);
+            if !on_step(&line, trainer) {
                 break;
             }
         }
-        Ok(trainer.model().to_gaussians())
+        Ok(())
     })
+}
+
+impl Line {
+    fn new(trainer: &Trainer, report: StepReport, seconds: f64, held_out_db: Option<f64>) -> Self {
+        let StepReport { l1, dssim, disparity, ground, stages_ms, .. } = report;
+        let step = trainer.steps_done();
+        let gaussians = trainer.model().len();
+        Self { step, l1, dssim, disparity, ground, gaussians, seconds, held_out_db, stages_ms }
+    }
 }
 
 /// The images of all steps: each once, in a random order, then each again.
@@ -127,20 +147,30 @@ fn order(learned: &[usize], seed: u64, steps: usize) -> impl Iterator<Item = usi
 fn step(
     trainer: &mut Trainer,
     backend: &dyn Differentiate,
-    next: &Receiver<Result<TrainingImage, String>>,
-    profile: &RenderProfile,
+    next: &Receiver<Result<(usize, TrainingImage), String>>,
+    images: &dyn TrainingImages,
 ) -> Result<StepReport, TrainError> {
     let image = next.recv().unwrap_or_else(|_| Err("the thread that decodes has ended".to_owned()));
-    let TrainingImage { view, rgb8, mask } = image.map_err(TrainError::Image)?;
+    let (index, image) = image.map_err(TrainError::Image)?;
+    let TrainingImage { view, rgb8, mask, mut depth_m, exposure } = image;
+    if let Some((depth_m, mask)) = depth_m.as_mut().zip(mask.as_ref()) {
+        // What does not count has no depth either.
+        let left_out = depth_m.iter_mut().zip(mask).filter(|(_, counts)| !**counts);
+        left_out.for_each(|(depth_m, _)| *depth_m = 0.0);
+    }
     let rgb: Vec<f32> = rgb8.iter().map(|&value| f32::from(value) / 255.0).collect();
     let weights: Option<Vec<f32>> =
         mask.map(|mask| mask.iter().map(|&counts| if counts { 1.0 } else { 0.0 }).collect());
+    let background = trainer.profile().background;
     let sample = Sample {
         view,
+        image: index,
+        place: images.place(index),
         rgb: &rgb,
         weights: weights.as_deref(),
-        depth_m: None,
-        background: profile.background.map(|value| value as f32),
+        depth_m: depth_m.as_deref(),
+        background: background.map(|value| value as f32),
+        exposure,
     };
     trainer.step(backend, &sample)
 }
@@ -149,26 +179,46 @@ fn step(
 struct Evaluator<'a> {
     images: &'a dyn TrainingImages,
     backend: &'a dyn Differentiate,
-    profile: RenderProfile,
     held_out: &'a [usize],
 }
 
 impl Evaluator<'_> {
     /// The mean of their PSNR; `None` without any.
-    fn mean_db(&self, scene: &Scene) -> Result<Option<f64>, TrainError> {
+    fn mean_db(&self, trainer: &Trainer) -> Result<Option<f64>, TrainError> {
+        let scene = trainer.scene()?;
         let mut sum_db = 0.0;
         for &index in self.held_out {
-            let TrainingImage { view, rgb8, mask } =
-                self.images.load(index).map_err(TrainError::Image)?;
-            let mut drawn = vec![0; rgb8.len()];
-            let frame = Frame { scene, profile: &self.profile, views: &[view] };
-            let target = Target { rgb8: Some(&mut drawn), ..Target::default() };
-            self.backend.render(&frame, &mut [target], &|_, _| {})?;
-            let counts = |&index: &usize| mask.as_ref().is_none_or(|mask| mask[index / 3]);
-            let pairs = (0..rgb8.len()).filter(counts).map(|i| (&drawn[i], &rgb8[i]));
-            sum_db += psnr_db_u8(pairs);
+            let image = self.images.load(index).map_err(TrainError::Image)?;
+            let drawn = self.draw(trainer, &scene, index, &image)?;
+            let counts = |&index: &usize| image.mask.as_ref().is_none_or(|mask| mask[index / 3]);
+            let values = (0..drawn.len()).filter(counts);
+            sum_db += psnr_db_u8(values.map(|i| (&drawn[i], &image.rgb8[i])));
         }
         let count = self.held_out.len();
         Ok((count > 0).then(|| sum_db / count as f64))
+    }
+
+    /// The image as the scene shows it, at the pose that is trained and with the exposure that was
+    /// recorded.
+    fn draw(
+        &self,
+        trainer: &Trainer,
+        scene: &Scene,
+        index: usize,
+        image: &TrainingImage,
+    ) -> Result<Vec<u8>, TrainError> {
+        let mut drawn = vec![0; image.rgb8.len()];
+        // The sky is evaluated for every pixel: a map would be made for a few images.
+        let profile = RenderProfile { sky_error: 0.0, ..*trainer.profile() };
+        let views = [trainer.view(image.view, index, self.images.place(index))];
+        let frame = Frame { scene, profile: &profile, views: &views };
+        let target = Target { rgb8: Some(&mut drawn), ..Target::default() };
+        self.backend.render(&frame, &mut [target], &|_, _| {})?;
+        if image.exposure != 1.0 {
+            for value in &mut drawn {
+                *value = (f32::from(*value) * image.exposure).round().min(255.0) as u8;
+            }
+        }
+        Ok(drawn)
     }
 }

@@ -6,6 +6,7 @@
 //! steps grow by 0.5 % from step 10,000 to 60,000. The first author's code: the noise.
 
 use serde::{Deserialize, Serialize};
+use wildcity_scene::sky::Network;
 
 /// The settings of a run, as in a file `train.toml`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -20,6 +21,10 @@ pub struct Settings {
     pub rates: Rates,
     pub loss: Weights,
     pub growth: Growth,
+    pub poses: PoseSettings,
+    pub sky: SkySettings,
+    pub exposure: ExposureSettings,
+    pub ground: GroundSettings,
 }
 
 /// Learning rates of Adam, with decay 0.9 and 0.999.
@@ -70,6 +75,85 @@ pub struct Growth {
     pub noise: f32,
 }
 
+/// Which poses are trained.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum PoseMode {
+    /// `Rig` for images of a rig, and `Off` for others.
+    Auto,
+    Off,
+    /// One for each image.
+    Image,
+    /// One for each time of the rig, and one for each of its cameras.
+    Rig,
+}
+
+/// How poses are trained.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PoseSettings {
+    pub mode: PoseMode,
+    /// Learning rate in metres and radians. It falls exponentially to a hundredth.
+    pub rate: f64,
+    /// Of the squared distance to the recorded pose, in metres and radians.
+    pub weight: f64,
+}
+
+/// What lies behind the Gaussians.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum SkyMode {
+    /// `Network` for images of a rig, and `Off` for others.
+    Auto,
+    /// The background of the render profile.
+    Off,
+    /// A network that is trained.
+    Network,
+}
+
+/// The network of a sky, and how it is trained.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SkySettings {
+    pub mode: SkyMode,
+    /// Octaves of sines and cosines of a direction.
+    pub octaves: usize,
+    /// Width of both hidden layers.
+    pub width: usize,
+    /// Numbers of an image's appearance.
+    pub embedding: usize,
+    pub rate: f64,
+    pub embedding_rate: f64,
+}
+
+/// Whether each image has an exposure of its own, and how it is trained.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ExposureSettings {
+    pub on: bool,
+    pub rate: f64,
+    /// Of the squared distance to the identity.
+    pub weight: f64,
+}
+
+/// The terms of the ground, of Gaussians that began on it.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct GroundSettings {
+    /// Weight of the standard deviation of heights in a slice, in 1/m.
+    pub height: f32,
+    /// Weight of `1 - |up · shortest axis|`.
+    pub upright: f32,
+    /// Weight of `(1 - opacity)²`.
+    pub opaque: f32,
+    /// Length of a slice along the direction of driving, in metres.
+    pub slice_m: f32,
+    /// The weights are whole until this step of 30,000.
+    pub whole_until: usize,
+    /// From then they fall to 0 at this step of 30,000.
+    pub until: usize,
+}
+
 impl Default for Settings {
     fn default() -> Self {
         Self {
@@ -79,6 +163,48 @@ impl Default for Settings {
             rates: Rates::default(),
             loss: Weights::default(),
             growth: Growth::default(),
+            poses: PoseSettings::default(),
+            sky: SkySettings::default(),
+            exposure: ExposureSettings::default(),
+            ground: GroundSettings::default(),
+        }
+    }
+}
+
+impl Default for PoseSettings {
+    fn default() -> Self {
+        Self { mode: PoseMode::Auto, rate: 1e-3, weight: 1e-5 }
+    }
+}
+
+impl Default for SkySettings {
+    fn default() -> Self {
+        Self {
+            mode: SkyMode::Auto,
+            octaves: 6,
+            width: 64,
+            embedding: 16,
+            rate: 1e-3,
+            embedding_rate: 1e-2,
+        }
+    }
+}
+
+impl Default for ExposureSettings {
+    fn default() -> Self {
+        Self { on: false, rate: 1e-3, weight: 1e-3 }
+    }
+}
+
+impl Default for GroundSettings {
+    fn default() -> Self {
+        Self {
+            height: 0.01,
+            upright: 0.01,
+            opaque: 0.01,
+            slice_m: 2.0,
+            whole_until: 10_000,
+            until: 20_000,
         }
     }
 }
@@ -118,12 +244,21 @@ impl Default for Growth {
 
 /// Why settings were refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
-#[error("{field} is {value}; {must}")]
+#[error("{field} is {value}; it is from {least} to {most}")]
 pub struct SettingError {
     field: &'static str,
-    value: String,
-    must: &'static str,
+    value: f64,
+    least: f64,
+    most: f64,
 }
+
+/// A rate of 10 leaves the street in a step.
+const MOST_RATE: f64 = 10.0;
+
+const MOST_WEIGHT: f64 = 1e6;
+
+/// Steps for which the schedules are given.
+const SCHEDULE: usize = 30_000;
 
 impl Settings {
     /// Checks that every field is in its range.
@@ -131,50 +266,56 @@ impl Settings {
     /// # Errors
     /// The first field out of its range.
     pub fn check(&self) -> Result<(), SettingError> {
-        let Rates { mean, ln_scale, quat, logit, sh, sh_rest } = self.rates;
+        let Self { rates, loss, growth, poses, sky, exposure, ground, .. } = self;
         let rates = [
-            ("rates.mean", mean),
-            ("rates.ln_scale", ln_scale),
-            ("rates.quat", quat),
-            ("rates.logit", logit),
-            ("rates.sh", sh),
-            ("rates.sh_rest", sh_rest),
-            ("loss.opacity", self.loss.opacity),
-            ("loss.scale", self.loss.scale),
-            ("growth.noise", self.growth.noise),
-            ("loss.disparity", self.loss.disparity as f32),
+            ("rates.mean", rates.mean.into()),
+            ("rates.ln_scale", rates.ln_scale.into()),
+            ("rates.quat", rates.quat.into()),
+            ("rates.logit", rates.logit.into()),
+            ("rates.sh", rates.sh.into()),
+            ("rates.sh_rest", rates.sh_rest.into()),
+            ("poses.rate", poses.rate),
+            ("sky.rate", sky.rate),
+            ("sky.embedding_rate", sky.embedding_rate),
+            ("exposure.rate", exposure.rate),
         ];
-        for (field, value) in rates {
-            // A rate of 10 leaves the street in a step.
-            let most = if field.starts_with("rates") { 10.0 } else { 1e6 };
-            if !(0.0..=most).contains(&value) {
-                let must = "it is a number from 0 to 1e6; a rate, to 10";
-                return Err(SettingError { field, value: value.to_string(), must });
-            }
-        }
-        let least_opacity = f64::from(self.growth.least_opacity);
         let weights = [
-            ("loss.dssim", self.loss.dssim, 1.0),
-            ("growth.rate", self.growth.rate, 1.0),
-            ("growth.least_opacity", least_opacity, 0.5),
+            ("loss.opacity", loss.opacity.into()),
+            ("loss.scale", loss.scale.into()),
+            ("loss.disparity", loss.disparity),
+            ("growth.noise", growth.noise.into()),
+            ("poses.weight", poses.weight),
+            ("exposure.weight", exposure.weight),
+            ("ground.height", ground.height.into()),
+            ("ground.upright", ground.upright.into()),
+            ("ground.opaque", ground.opaque.into()),
         ];
-        for (field, value, most) in weights {
-            if !(0.0..=most).contains(&value) {
-                let must = if most == 1.0 { "it is from 0 to 1" } else { "it is from 0 to 0.5" };
-                return Err(SettingError { field, value: value.to_string(), must });
-            }
-        }
-        let counts = [
-            ("steps", self.steps, 1, 10_000_000, "it is from 1 to 10,000,000"),
-            ("sh_degree", self.sh_degree.into(), 0, 3, "it is from 0 to 3"),
-            ("growth.cap", self.growth.cap, 1, 100_000_000, "it is from 1 to 100,000,000"),
-            ("growth.every", self.growth.every, 1, 30_000, "it is from 1 to 30,000"),
-            ("growth.from", self.growth.from, 0, self.growth.until, "it is not after growth.until"),
-            ("growth.until", self.growth.until, 0, 30_000, "it is at most 30,000"),
+        let range = |field, value: usize, least: usize, most: usize| {
+            (field, value as f64, least as f64, most as f64)
+        };
+        let others = [
+            range("steps", self.steps, 1, 10_000_000),
+            range("sh_degree", self.sh_degree.into(), 0, 3),
+            ("loss.dssim", loss.dssim, 0.0, 1.0),
+            range("growth.cap", growth.cap, 1, 100_000_000),
+            ("growth.rate", growth.rate, 0.0, 1.0),
+            ("growth.least_opacity", growth.least_opacity.into(), 0.0, 0.5),
+            range("growth.every", growth.every, 1, SCHEDULE),
+            range("growth.until", growth.until, 0, SCHEDULE),
+            range("growth.from", growth.from, 0, growth.until),
+            range("sky.octaves", sky.octaves, 0, Network::MAX_OCTAVES),
+            range("sky.width", sky.width, 1, Network::MAX_WIDTH),
+            range("sky.embedding", sky.embedding, 0, Network::MAX_APPEARANCE),
+            ("ground.slice_m", ground.slice_m.into(), 0.1, 1e3),
+            range("ground.until", ground.until, 0, SCHEDULE),
+            range("ground.whole_until", ground.whole_until, 0, ground.until),
         ];
-        for (field, value, least, most, must) in counts {
-            if value < least || value > most {
-                return Err(SettingError { field, value: value.to_string(), must });
+        let rates = rates.map(|(field, value)| (field, value, 0.0, MOST_RATE));
+        let weights = weights.map(|(field, value)| (field, value, 0.0, MOST_WEIGHT));
+        for (field, value, least, most) in rates.into_iter().chain(weights).chain(others) {
+            // A NaN is in no range.
+            if !(least..=most).contains(&value) {
+                return Err(SettingError { field, value, least, most });
             }
         }
         Ok(())
@@ -182,6 +323,22 @@ impl Settings {
 
     /// A step of a schedule of 30,000 as one of this run.
     pub(crate) fn scaled(&self, step: usize) -> usize {
-        (step as f64 * self.steps as f64 / 30_000.0).round() as usize
+        (step as f64 * self.steps as f64 / SCHEDULE as f64).round() as usize
+    }
+
+    /// A step of this run as one of a schedule of 30,000.
+    pub(crate) fn unscaled(&self, step: usize) -> usize {
+        (step as f64 * SCHEDULE as f64 / self.steps as f64).round() as usize
+    }
+}
+
+impl GroundSettings {
+    /// How much the terms count at a step of 30,000: whole, then less and less.
+    pub(crate) fn share(&self, step: usize) -> f32 {
+        if step < self.whole_until {
+            return 1.0;
+        }
+        let fading = (self.until - self.whole_until).max(1) as f32;
+        (self.until.saturating_sub(step) as f32 / fading).min(1.0)
     }
 }

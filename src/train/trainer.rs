@@ -1,40 +1,55 @@
 //! The steps of a training run.
 
+use std::sync::Arc;
+
+use glam::{DMat3, DVec3};
 use wildcity_render::gradient::{Differentiate, GaussianImages, GradientError, Gradients};
 use wildcity_render::{Frame, RenderError, View};
 use wildcity_scene::chunk::columns;
+use wildcity_scene::geometry::Pose;
 use wildcity_scene::random::mix;
+use wildcity_scene::sky::{Network, Sky, SkyError, SkyModel};
 use wildcity_scene::validate::{self, BadGaussians, Field};
-use wildcity_scene::{Gaussians, RenderProfile};
+use wildcity_scene::{Gaussians, RenderProfile, Scene};
 
-use crate::compose::{Background, Exposure, compose, compose_gradient};
+use crate::compose::Exposure;
+use crate::exposures::TrainedExposures;
+use crate::ground;
 use crate::growth::relocate_and_grow;
-use crate::loss::{disparity, dssim, l1, masked};
+use crate::loss::ground::Terms;
 use crate::model::{AdamStep, Model, rates};
-use crate::settings::{SettingError, Settings};
+use crate::objective::{Objective, Outcome};
+use crate::poses::{Place, PoseStep, RigPoses, TrainedPoses};
+use crate::sample::Sample;
+use crate::settings::{PoseMode, SettingError, Settings, SkyMode};
+use crate::sky::TrainedSky;
 
-/// An image to learn from.
-#[derive(Clone, Copy, Debug)]
-pub struct Sample<'a> {
-    pub view: View,
-    /// `[height, width, 3]`: the colours of the image, 0 to 1.
-    pub rgb: &'a [f32],
-    /// `[height, width]`: the weight of each pixel; 0 leaves it out.
-    pub weights: Option<&'a [f32]>,
-    /// `[height, width]`: measured depths in metres; 0 where there is none.
-    pub depth_m: Option<&'a [f32]>,
-    /// The colour behind all Gaussians.
-    pub background: [f32; 3],
+/// What a run begins with.
+#[derive(Clone, Debug, Default)]
+pub struct Start {
+    pub gaussians: Gaussians,
+    /// Whether each Gaussian lies on the ground ([`ground::is_ground`]);
+    /// empty if none does.
+    pub is_ground: Vec<bool>,
+    /// The recorded pose of each image of the run.
+    pub world_from_camera: Vec<Pose>,
+    /// The recorded poses of the rig that took the images.
+    pub rig: Option<RigPoses>,
 }
 
-/// A training run: its Gaussians, and how far it is.
+/// A training run: its Gaussians and all else that it trains, and how far it is.
 #[derive(Debug)]
 pub struct Trainer {
-    settings: Settings,
-    profile: RenderProfile,
-    model: Model,
-    gradients: Gradients,
-    step: usize,
+    pub(crate) settings: Settings,
+    pub(crate) profile: RenderProfile,
+    pub(crate) model: Model,
+    /// As they were recorded.
+    pub(crate) rig: Option<RigPoses>,
+    pub(crate) poses: Option<TrainedPoses>,
+    pub(crate) exposures: Option<TrainedExposures>,
+    pub(crate) sky: Option<TrainedSky>,
+    pub(crate) step: usize,
+    pub(crate) gradients: Gradients,
 }
 
 /// The losses of a step, without their weights.
@@ -44,6 +59,8 @@ pub struct StepReport {
     pub dssim: f64,
     /// In 1/m; 0 without measured depths.
     pub disparity: f64,
+    /// The weighted sum of the ground's terms; 0 without Gaussians of the ground.
+    pub ground: f64,
     /// Number of visible Gaussians.
     pub visible: u64,
     /// Wall time of each stage of the frame and its gradients, in milliseconds.
@@ -73,9 +90,19 @@ pub enum TrainError {
     /// Values that no scene may have.
     #[error("Gaussians to begin with: {0}")]
     Invalid(BadGaussians),
+    /// A number of poses or labels that is not that of the images or Gaussians.
+    #[error("there are {given} {what} for {wanted}")]
+    Count { what: &'static str, given: usize, wanted: usize },
+    /// An image whose poses the run does not have.
+    #[error(
+        "image {image} is at time {} and camera {} of a rig that has fewer of them", place.ego, place.camera
+    )]
+    Place { image: usize, place: Place },
     /// A derivative that f32 does not hold: the run cannot go on from here.
-    #[error("step {step}: a derivative by Gaussian {gaussian} is not finite")]
-    NotFinite { step: usize, gaussian: usize },
+    #[error("step {step}, image {image}: a derivative by {by} is not finite")]
+    NotFinite { step: usize, image: usize, by: String },
+    #[error(transparent)]
+    Sky(#[from] SkyError),
     /// A colour, weight or depth that counts and is no number of its range.
     #[error(
         "value {index} of the {image} is {value}; colours are finite, weights and depths not below 0"
@@ -93,27 +120,96 @@ impl From<BadGaussians> for TrainError {
 }
 
 impl Trainer {
-    /// A run from some Gaussians, with the image formation of a profile.
+    /// A run, with the image formation of a profile.
     ///
     /// # Errors
     /// A setting is out of its range, or there are no Gaussians.
     pub fn new(
-        gaussians: Gaussians,
+        start: Start,
         profile: RenderProfile,
         settings: Settings,
     ) -> Result<Self, TrainError> {
         settings.check()?;
+        let Start { gaussians, is_ground, world_from_camera, rig } = start;
         if gaussians.means_m.is_empty() {
             return Err(TrainError::Empty);
         }
         validate::check(&gaussians, &Field::plain_name)?;
-        let model = Model::new(gaussians, settings.sh_degree);
-        Ok(Self { settings, profile, model, gradients: Gradients::default(), step: 0 })
+        if ![0, gaussians.len()].contains(&is_ground.len()) {
+            let (given, wanted) = (is_ground.len(), gaussians.len());
+            return Err(TrainError::Count { what: "labels of the ground", given, wanted });
+        }
+        let images = world_from_camera.len();
+        let own =
+            RigPoses { world_from_ego: world_from_camera, ego_from_camera: vec![Pose::IDENTITY] };
+        let poses = match settings.poses.mode {
+            PoseMode::Off => None,
+            PoseMode::Image => Some(own),
+            PoseMode::Auto | PoseMode::Rig => rig.clone(),
+        };
+        let has_sky = match settings.sky.mode {
+            SkyMode::Off => false,
+            SkyMode::Network => true,
+            SkyMode::Auto => rig.is_some(),
+        };
+        Ok(Self {
+            model: Model::new(gaussians, is_ground, settings.sh_degree),
+            poses: poses.map(TrainedPoses::new),
+            exposures: settings.exposure.on.then(|| TrainedExposures::new(images)),
+            sky: has_sky.then(|| TrainedSky::new(&settings.sky, images, settings.seed)),
+            gradients: Gradients::default(),
+            step: 0,
+            rig,
+            settings,
+            profile,
+        })
     }
 
     /// The Gaussians as they are now.
     pub fn model(&self) -> &Model {
         &self.model
+    }
+
+    /// The settings of the run.
+    pub fn settings(&self) -> &Settings {
+        &self.settings
+    }
+
+    /// The image formation of the run.
+    pub fn profile(&self) -> &RenderProfile {
+        &self.profile
+    }
+
+    /// The scene as a server would draw it: the Gaussians, and the sky, if the run has one.
+    ///
+    /// # Errors
+    /// As [`Trainer::sky`].
+    pub fn scene(&self) -> Result<Scene, TrainError> {
+        let sky = self
+            .sky()?
+            .map(|network| Arc::new(Sky::new(SkyModel::network(network), DMat3::IDENTITY)));
+        Ok(Scene { sky, ..self.model.scene().clone() })
+    }
+
+    /// The network of the sky with the mean appearance, if the run has one.
+    ///
+    /// # Errors
+    /// A weight has left the range of networks.
+    pub fn sky(&self) -> Result<Option<Network>, TrainError> {
+        Ok(self.sky.as_ref().map(TrainedSky::network).transpose()?)
+    }
+
+    /// The poses as they are now, if they are trained: those of the rig, or of each image.
+    pub fn poses(&self) -> Option<&RigPoses> {
+        self.poses.as_ref().map(TrainedPoses::now)
+    }
+
+    /// A camera of the run at the pose that it has now.
+    pub fn view(&self, view: View, image: usize, place: Option<Place>) -> View {
+        match (&self.poses, self.trained_place(image, place)) {
+            (Some(poses), Some(place)) => poses.view(view, place),
+            _ => view,
+        }
     }
 
     /// Number of steps that have been made.
@@ -131,34 +227,145 @@ impl Trainer {
         sample: &Sample<'_>,
     ) -> Result<StepReport, TrainError> {
         sample.check()?;
-        let views = [sample.view];
-        let mut report = StepReport::default();
+        let place = self.trained_place(sample.image, sample.place);
+        if let Some((poses, place)) = self.poses.as_ref().zip(place)
+            && !poses.now().has(place)
+        {
+            return Err(TrainError::Place { image: sample.image, place });
+        }
+        let objective = Objective {
+            sample,
+            view: self.view(sample.view, sample.image, sample.place),
+            weights: &self.settings.loss,
+            exposure: self.exposure(sample),
+            sky: self.sky.as_ref(),
+        };
         let depth = sample.depth_m.is_some() && self.settings.loss.disparity > 0.0;
+        let views = [objective.view];
         let frame = Frame { scene: self.model.scene(), profile: &self.profile, views: &views };
-        let settings = &self.settings;
-        let mut loss = |images: &[GaussianImages]| match images {
-            [images] => vec![image_loss(images, sample, settings, &mut report)],
-            _ => Vec::new(),
+        let mut outcome = None;
+        let mut loss = |images: &[GaussianImages]| {
+            let mut by_images = Vec::new();
+            for images in images {
+                let (by, at) = objective.at(images);
+                by_images.push(by);
+                outcome = Some(at);
+            }
+            by_images
         };
         let stats = backend.differentiate(&frame, depth, &mut loss, &mut self.gradients)?;
+        self.step += 1;
+        let mut report = StepReport::default();
+        if let Some(outcome) = outcome {
+            report = outcome.report.clone();
+            self.move_cameras(sample, place, &outcome)?;
+        }
+        report.ground = self.add_ground(sample);
+        self.move_gaussians(sample)?;
+        self.grow();
         report.visible = stats.visible_pairs;
         report.stages_ms = stats.stages_ms;
-
-        self.step += 1;
-        let adam = self.adam_step();
-        if let Some(gradients) = self.gradients.chunks.first()
-            && let Some(gaussian) = self.model.step(gradients, &adam)
-        {
-            return Err(TrainError::NotFinite { step: self.step, gaussian });
-        }
-        self.grow();
         Ok(report)
+    }
+
+    /// Which poses are trained of an image: those of the rig, or its own.
+    fn trained_place(&self, image: usize, place: Option<Place>) -> Option<Place> {
+        match self.settings.poses.mode {
+            PoseMode::Image => Some(Place { ego: image, camera: 0 }),
+            _ => place,
+        }
+    }
+
+    fn exposure(&self, sample: &Sample<'_>) -> Exposure<f32> {
+        match &self.exposures {
+            Some(exposures) => exposures.of_image(sample.image, sample.exposure),
+            None => Exposure::gain(sample.exposure),
+        }
+    }
+
+    /// Moves the poses, the exposure and the sky of an image.
+    fn move_cameras(
+        &mut self,
+        sample: &Sample<'_>,
+        place: Option<Place>,
+        outcome: &Outcome,
+    ) -> Result<(), TrainError> {
+        let image = sample.image;
+        let not_finite = |by: &str| {
+            let by = by.to_owned();
+            Err(TrainError::NotFinite { step: self.step, image, by })
+        };
+        let fall = f64::from(self.fall());
+        if let Some((poses, place)) = self.poses.as_mut().zip(place) {
+            let by = self.gradients.twists.first().copied().unwrap_or_default();
+            if !by.to_array().iter().all(|by| (by * by).is_finite()) {
+                return not_finite("its pose");
+            }
+            let settings = &self.settings.poses;
+            let rate = settings.rate * fall;
+            poses.step(&PoseStep { place, by, rate, weight: settings.weight });
+        }
+        if let Some(exposures) = &mut self.exposures {
+            let settings = &self.settings.exposure;
+            if !outcome.by_exposure.is_finite() {
+                return not_finite("its exposure");
+            }
+            let rates = [settings.rate, settings.weight];
+            exposures.step(image, sample.exposure, &outcome.by_exposure, rates);
+        }
+        if let Some((sky, (seen, by))) = self.sky.as_mut().zip(outcome.sky.as_ref()) {
+            let settings = &self.settings.sky;
+            if !sky.step(image, seen, by, [settings.rate, settings.embedding_rate]) {
+                return not_finite("the sky");
+            }
+        }
+        Ok(())
+    }
+
+    /// Adds the derivatives of the terms of the ground.
+    fn add_ground(&mut self, sample: &Sample<'_>) -> f64 {
+        let settings = &self.settings.ground;
+        let share = settings.share(self.settings.unscaled(self.step));
+        let ego = sample.place.and_then(|place| self.rig.as_ref()?.world_from_ego.get(place.ego));
+        let (Some(ego), Some(gradients)) = (ego, self.gradients.chunks.first_mut()) else {
+            return 0.0;
+        };
+        if share == 0.0 || !self.model.has_ground() {
+            return 0.0;
+        }
+        let axis = |axis: DVec3| (ego.rotation * axis).as_vec3().to_array();
+        let terms = Terms {
+            up: axis(DVec3::Z),
+            forward: axis(DVec3::X),
+            slice_m: settings.slice_m,
+            height: share * settings.height,
+            upright: share * settings.upright,
+            opaque: share * settings.opaque,
+        };
+        ground::add_terms(&self.model, &terms, gradients)
+    }
+
+    fn move_gaussians(&mut self, sample: &Sample<'_>) -> Result<(), TrainError> {
+        let adam = self.adam_step();
+        let Some(gradients) = self.gradients.chunks.first() else { return Ok(()) };
+        match self.model.step(gradients, &adam) {
+            None => Ok(()),
+            Some(gaussian) => Err(TrainError::NotFinite {
+                step: self.step,
+                image: sample.image,
+                by: format!("Gaussian {gaussian}"),
+            }),
+        }
+    }
+
+    /// The factor of the learning rates that fall to a hundredth.
+    fn fall(&self) -> f32 {
+        0.01_f32.powf(self.step as f32 / self.settings.steps as f32)
     }
 
     fn adam_step(&self) -> AdamStep {
         let Settings { steps, rates: of, loss, growth, .. } = &self.settings;
-        let share = self.step as f32 / *steps as f32;
-        let mean = of.mean * 0.01_f32.powf(share);
+        let mean = of.mean * self.fall();
         // A degree more every sixth of the first half of the run.
         let degree = (12 * self.step / steps).min(self.settings.sh_degree.into()) as u8;
         let count = self.model.len() as f32;
@@ -182,78 +389,4 @@ impl Trainer {
             relocate_and_grow(&mut self.model, growth, seed);
         }
     }
-}
-
-impl Sample<'_> {
-    fn check(&self) -> Result<(), TrainError> {
-        let pixels = self.view.camera.pixels();
-        let sizes = [
-            ("image", Some(self.rgb.len()), 3 * pixels),
-            ("mask", self.weights.map(<[f32]>::len), pixels),
-            ("depth", self.depth_m.map(<[f32]>::len), pixels),
-        ];
-        for (image, given, wanted) in sizes {
-            if let Some(given) = given.filter(|&given| given != wanted) {
-                return Err(TrainError::Size { image, given, wanted });
-            }
-        }
-        // A NaN is in no range.
-        let is_fault = |value: &f32| !(0.0..=f32::MAX).contains(value);
-        let out_of_range = |values: &[f32]| values.iter().position(is_fault);
-        for (image, values) in [("mask", self.weights), ("depth", self.depth_m)] {
-            if let Some((values, index)) = values.and_then(|v| Some((v, out_of_range(v)?))) {
-                return Err(TrainError::Value { image, index, value: values[index] });
-            }
-        }
-        let counts = |index: usize| self.weights.is_none_or(|weights| weights[index / 3] > 0.0);
-        let is_fault = |index: &usize| !self.rgb[*index].is_finite() && counts(*index);
-        match (0..self.rgb.len()).find(is_fault) {
-            Some(index) => Err(TrainError::Value { image: "image", index, value: self.rgb[index] }),
-            None => Ok(()),
-        }
-    }
-}
-
-/// The derivatives of the loss by the images of the Gaussians.
-fn image_loss(
-    images: &GaussianImages,
-    sample: &Sample<'_>,
-    settings: &Settings,
-    report: &mut StepReport,
-) -> GaussianImages {
-    let background = Background::Color(sample.background);
-    let exposure = Exposure::identity();
-    let image = compose(&images.rgb, &images.opacity, background, &exposure);
-    let weights = &settings.loss;
-    let camera = &sample.view.camera;
-    let size_px = [camera.width_px, camera.height_px].map(|px| px as usize);
-
-    let absolute = l1(&image, sample.rgb, sample.weights);
-    report.l1 = absolute.value;
-    let mut total = absolute.scaled(1.0 - weights.dssim);
-    if weights.dssim > 0.0 {
-        // Masked pixels are 0 on both sides.
-        let mut similarity = match sample.weights {
-            None => dssim(size_px, &image, sample.rgb),
-            Some(mask) => dssim(size_px, &masked(&image, mask), &masked(sample.rgb, mask)),
-        };
-        if let Some(mask) = sample.weights {
-            similarity.by = masked(&similarity.by, mask);
-        }
-        report.dssim = similarity.value;
-        total = total.plus(&similarity.scaled(weights.dssim));
-    }
-    let composed = compose_gradient(&images.rgb, &images.opacity, background, &exposure, &total.by);
-    let mut by =
-        GaussianImages { rgb: composed.rgb, opacity: composed.opacity, depth_sum_m: Vec::new() };
-    if let Some(measured_m) = sample.depth_m.filter(|_| !images.depth_sum_m.is_empty()) {
-        let loss = disparity(&images.opacity, &images.depth_sum_m, measured_m);
-        report.disparity = loss.value;
-        let loss = loss.scaled(weights.disparity);
-        for (by, more) in by.opacity.iter_mut().zip(loss.by_opacity) {
-            *by += more;
-        }
-        by.depth_sum_m = loss.by_depth_sum;
-    }
-    by
 }

@@ -8,6 +8,7 @@ mod root;
 #[path = "../support/scene_files.rs"]
 mod scene_files;
 
+mod cameras;
 mod check;
 mod loss_vectors;
 mod losses;

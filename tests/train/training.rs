@@ -8,13 +8,34 @@ use wildcity_render::gradient::{Differentiate, GaussianImages, Gradients};
 use wildcity_render::{Frame, View};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::{Gaussians, RenderProfile, Scene};
+use wildcity_train::sample::Sample;
 use wildcity_train::settings::{Growth, Settings};
-use wildcity_train::trainer::{Sample, Trainer};
+use wildcity_train::trainer::{Start, Trainer};
 
 use crate::scene_files::Random;
 
+/// An image without a mask, a depth or a rig.
+pub(crate) fn sample(view: View, rgb: &[f32]) -> Sample<'_> {
+    Sample {
+        view,
+        image: 0,
+        place: None,
+        rgb,
+        weights: None,
+        depth_m: None,
+        background: [0.0; 3],
+        exposure: 1.0,
+    }
+}
+
+/// A run of some Gaussians.
+fn trainer(gaussians: Gaussians, settings: Settings) -> Trainer {
+    let start = Start { gaussians, ..Start::default() };
+    Trainer::new(start, RenderProfile::default(), settings).expect("a run")
+}
+
 /// A wall of coloured patches 5 m ahead, seen from places before it.
-fn wall() -> (Gaussians, Vec<View>) {
+pub(crate) fn wall() -> (Gaussians, Vec<View>) {
     let mut random = Random(3);
     let mut gaussians = Gaussians::with_capacity(0, 400);
     for _ in 0..400 {
@@ -34,7 +55,7 @@ fn wall() -> (Gaussians, Vec<View>) {
 }
 
 /// The image of a view on black.
-fn image(cpu: &Cpu, scene: &Scene, view: View) -> Vec<f32> {
+pub(crate) fn image(cpu: &Cpu, scene: &Scene, view: View) -> Vec<f32> {
     let mut rgb = Vec::new();
     let frame = Frame { scene, profile: &RenderProfile::default(), views: &[view] };
     let mut keep = |images: &[GaussianImages]| {
@@ -63,16 +84,12 @@ fn run(threads: usize, steps: usize) -> (f64, Gaussians) {
     }
     let growth = Growth { cap: 600, from: 1_500, noise: 50.0, ..Growth::default() };
     let settings = Settings { steps, sh_degree: 1, growth, ..Settings::default() };
-    let mut trainer = Trainer::new(start, RenderProfile::default(), settings).unwrap();
+    let mut trainer = trainer(start, settings);
     for step in 0..steps {
         // One after the other, but the middle one, which is held out.
         let mut place = 5 * step % 8;
         place += usize::from(place >= 4);
-        let (weights, depth_m) = (None, None);
-        let background = [0.0; 3];
-        let sample =
-            Sample { view: views[place], rgb: &images[place], weights, depth_m, background };
-        trainer.step(&cpu, &sample).expect("a step");
+        trainer.step(&cpu, &sample(views[place], &images[place])).expect("a step");
     }
     let seen = image(&cpu, trainer.model().scene(), views[4]);
     let differences = seen.iter().zip(&images[4]).map(|(a, b)| f64::from(a - b));
@@ -107,12 +124,21 @@ fn what_a_run_cannot_use_is_named() {
         ("growth.until", with_growth(|growth| growth.until = 30_001)),
         ("growth.noise", with_growth(|growth| growth.noise = -1.0)),
         ("growth.rate", with_growth(|growth| growth.rate = 1.5)),
+        ("poses.rate", changed(|settings| settings.poses.rate = 11.0)),
+        ("sky.width", changed(|settings| settings.sky.width = 0)),
+        ("sky.embedding", changed(|settings| settings.sky.embedding = 257)),
+        ("exposure.weight", changed(|settings| settings.exposure.weight = f64::NAN)),
+        ("ground.slice_m", changed(|settings| settings.ground.slice_m = 0.0)),
+        ("ground.whole_until", changed(|settings| settings.ground.whole_until = 25_000)),
     ];
     for (field, settings) in faults {
         let error = settings.check().expect_err(field).to_string();
         assert!(error.starts_with(field), "{error}");
     }
-    let run = |gaussians| Trainer::new(gaussians, RenderProfile::default(), Settings::default());
+    let run = |gaussians| {
+        let start = Start { gaussians, ..Start::default() };
+        Trainer::new(start, RenderProfile::default(), Settings::default())
+    };
     let empty = run(Gaussians::default()).expect_err("nothing").to_string();
     assert!(empty.contains("no points"), "{empty}");
     let mut invalid = gaussians.clone();
@@ -126,9 +152,7 @@ fn what_a_run_cannot_use_is_named() {
     rgb[33] = f32::NAN;
     let mut weights = vec![1.0; 80 * 60];
     let step = |trainer: &mut Trainer, rgb: &[f32], weights: &[f32]| {
-        let background = [0.0; 3];
-        let weights = Some(weights);
-        trainer.step(&cpu, &Sample { view: views[0], rgb, weights, depth_m: None, background })
+        trainer.step(&cpu, &Sample { weights: Some(weights), ..sample(views[0], rgb) })
     };
     let error = step(&mut trainer, &rgb, &weights).expect_err("a NaN").to_string();
     assert!(error.contains("value 33 of the image"), "{error}");
@@ -143,8 +167,12 @@ fn what_a_run_cannot_use_is_named() {
 }
 
 fn with_growth(change: impl Fn(&mut Growth)) -> Settings {
+    changed(|settings| change(&mut settings.growth))
+}
+
+fn changed(change: impl Fn(&mut Settings)) -> Settings {
     let mut settings = Settings::default();
-    change(&mut settings.growth);
+    change(&mut settings);
     settings
 }
 
@@ -155,12 +183,9 @@ fn a_scene_of_degree_3_is_trained_on() {
     gaussians.raise_sh_degree(3);
     let cpu = Cpu::new(0, Simd::Best).unwrap();
     let rgb = vec![0.5; 3 * 80 * 60];
-    let mut trainer =
-        Trainer::new(gaussians, RenderProfile::default(), Settings::default()).unwrap();
-    let background = [0.0; 3];
-    let sample = Sample { view: views[0], rgb: &rgb, weights: None, depth_m: None, background };
+    let mut trainer = trainer(gaussians, Settings::default());
     for _ in 0..3 {
-        trainer.step(&cpu, &sample).expect("a step");
+        trainer.step(&cpu, &sample(views[0], &rgb)).expect("a step");
     }
     assert_eq!(trainer.model().sh_degree(), 3);
 }

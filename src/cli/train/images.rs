@@ -9,6 +9,8 @@ use image::{ImageBuffer, Rgb};
 use wildcity_eval::images::{RealImage, picture};
 use wildcity_render::View;
 use wildcity_scene::RenderProfile;
+use wildcity_scene::geometry::Pose;
+use wildcity_train::poses::Place;
 use wildcity_train::run::{TrainingImage, TrainingImages};
 
 use crate::cli::exit;
@@ -29,17 +31,37 @@ impl TrainingImages for ListedImages<'_> {
         self.held_out_every > 0 && index.is_multiple_of(self.held_out_every)
     }
 
+    fn place(&self, _: usize) -> Option<Place> {
+        None
+    }
+
     fn load(&self, index: usize) -> Result<TrainingImage, String> {
         self.decode(self.images[index]).map_err(|error| exit::chain(&error))
     }
 }
 
 impl ListedImages<'_> {
+    /// The recorded pose of each image.
+    pub(super) fn poses(&self) -> Vec<Pose> {
+        self.images.iter().map(|image| image.world_from_camera).collect()
+    }
+
+    /// A text by which a checkpoint knows its images.
+    pub(super) fn inputs(&self) -> String {
+        let mut text = format!("{} {}\n", self.size, self.held_out_every);
+        for RealImage { name, camera, world_from_camera, .. } in &self.images {
+            text += &format!("{name} {camera:?} {world_from_camera:?}\n");
+        }
+        text
+    }
+
     fn decode(&self, image: &RealImage) -> anyhow::Result<TrainingImage> {
         let background = RenderProfile::default().background;
         let (mut rgb8, mut camera) = picture::real(&image.file, &image.camera, background)?;
         let own_px = [camera.width_px, camera.height_px];
         let mut mask = image.mask.as_deref().map(|file| read_mask(file, own_px)).transpose()?;
+        let mut depth_m =
+            image.depth.as_deref().map(|file| picture::depth_m(file, own_px)).transpose()?;
         if self.size < 1.0 {
             let small_px = own_px.map(|px| ((f64::from(px) * self.size).round() as u32).max(1));
             camera = camera.scaled(small_px[0].into(), small_px[1].into())?;
@@ -48,11 +70,13 @@ impl ListedImages<'_> {
             let small = imageops::resize(&whole, small_px[0], small_px[1], FilterType::Triangle);
             rgb8 = small.into_raw();
             mask = mask.map(|mask| shrink(&mask, own_px, small_px));
+            depth_m = depth_m.map(|depth_m| shrink(&depth_m, own_px, small_px));
         }
         // The scene is trained at this size: no filter of a larger native size is part of it.
         camera.native_size_px = None;
         let view = View::new(camera, image.world_from_camera);
-        Ok(TrainingImage { view, rgb8, mask })
+        let exposure = image.exposure_stops.map_or(1.0, |stops| stops.exp2() as f32);
+        Ok(TrainingImage { view, rgb8, mask, depth_m, exposure })
     }
 }
 
@@ -63,11 +87,11 @@ fn read_mask(file: &Path, size_px: [u32; 2]) -> anyhow::Result<Vec<bool>> {
     Ok(mask)
 }
 
-/// A mask at a smaller size: a pixel counts if the one at its middle does.
-fn shrink(mask: &[bool], own_px: [u32; 2], small_px: [u32; 2]) -> Vec<bool> {
+/// A mask or a depth at a smaller size: a pixel has the value of the one at its middle.
+fn shrink<T: Copy>(values: &[T], own_px: [u32; 2], small_px: [u32; 2]) -> Vec<T> {
     let at = |axis: usize, px: u32| {
         ((f64::from(px) + 0.5) * f64::from(own_px[axis]) / f64::from(small_px[axis])) as usize
     };
-    let row = |y: u32| &mask[at(1, y) * own_px[0] as usize..][..own_px[0] as usize];
+    let row = |y: u32| &values[at(1, y) * own_px[0] as usize..][..own_px[0] as usize];
     (0..small_px[1]).flat_map(|y| (0..small_px[0]).map(move |x| row(y)[at(0, x)])).collect()
 }

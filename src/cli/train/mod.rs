@@ -1,7 +1,10 @@
 //! `wildcity train`.
 
 mod check;
+mod checkpoints;
 mod images;
+mod lines;
+mod result;
 mod scene;
 mod settings;
 

@@ -3,6 +3,7 @@
 use std::fs;
 use std::io::{self, IsTerminal, Write};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering;
 
 use anyhow::{Context, ensure};
 
@@ -12,11 +13,15 @@ use wildcity_render::gradient::Differentiate;
 use wildcity_scene::RenderProfile;
 use wildcity_scene::random::Random;
 use wildcity_train::run::{Line, TrainingImages, run};
-use wildcity_train::settings::Settings;
+use wildcity_train::settings::{Settings, SkyMode};
 use wildcity_train::start::{Point, gaussians_from_points};
-use wildcity_twin::ingest::{capture, write_ply};
+use wildcity_train::trainer::{Start, Trainer};
+use wildcity_twin::ingest::capture;
 
+use super::checkpoints::{self, Checkpoints, stop_flag};
 use super::images::ListedImages;
+use super::lines::{LinesFile, log};
+use super::result::Written;
 use crate::cli::backend_options::HardwareOptions;
 use crate::cli::{output, progress};
 
@@ -65,12 +70,22 @@ pub(super) struct TrainScene {
     #[arg(long, value_name = "N", default_value_t = 8)]
     held_out_every: usize,
 
+    /// What lies behind all Gaussians: a sky network that is trained, or nothing. It is written
+    /// beside OUT [default: that of --settings, or off]
+    #[arg(long, value_name = "network|off", value_parser = sky_mode)]
+    sky: Option<SkyMode>,
+
     /// Seed of all random numbers and of the order of images: the same seed and images give the
     /// same file [default: that of --settings, or 0]
     #[arg(long)]
     seed: Option<u64>,
 
-    /// TOML file of all settings; --steps, --cap and --seed change it. `wildcity train settings`
+    /// Go on with a run that was stopped, from its last checkpoint (beside OUT, each 500 steps and
+    /// when it was stopped), to the bytes that it would have had.
+    #[arg(long)]
+    resume: bool,
+
+    /// TOML file of all settings; --steps, --cap, --seed and --sky change it. `wildcity train settings`
     /// prints the defaults.
     #[arg(long, value_name = "FILE")]
     settings: Option<PathBuf>,
@@ -87,6 +102,14 @@ fn fraction(text: &str) -> Result<f64, String> {
     match text.parse() {
         Ok(fraction) if (0.05..=1.0).contains(&fraction) => Ok(fraction),
         _ => Err("expected a fraction from 0.05 to 1, for example 0.5".to_owned()),
+    }
+}
+
+fn sky_mode(text: &str) -> Result<SkyMode, String> {
+    match text {
+        "network" => Ok(SkyMode::Network),
+        "off" => Ok(SkyMode::Off),
+        _ => Err("expected network or off".to_owned()),
     }
 }
 
@@ -128,57 +151,76 @@ impl TrainScene {
             output::counted(points.len(), "point"),
             backend.name()
         )?;
-        let every = (settings.steps / 10).max(1);
-        let mut lines = self.lines.as_deref().map(LinesFile::create).transpose()?;
+        let profile = RenderProfile::default();
+        let inputs = format!("{}{}", images.inputs(), inputs_of_points(&points));
+        let checkpoints = Checkpoints::new(out, inputs);
+        let mut trainer = match checkpoints.read(self.resume, profile, &settings)? {
+            Some(trainer) => trainer,
+            None => {
+                let start = Start {
+                    gaussians: gaussians_from_points(&points),
+                    world_from_camera: images.poses(),
+                    ..Start::default()
+                };
+                Trainer::new(start, profile, settings)?
+            }
+        };
+        let last = self.train(&mut trainer, &images, backend, &checkpoints)?;
+        let steps = trainer.settings().steps;
+        if trainer.steps_done() < steps {
+            checkpoints.write(&trainer)?;
+            anyhow::bail!(
+                "stopped after {} of {steps} steps: the same command with --resume goes on",
+                trainer.steps_done()
+            );
+        }
+        let written = Written::new(&trainer, out)?;
+        checkpoints.remove()?;
+        if let Some((db, seconds)) = last {
+            let mut stdout = io::stdout().lock();
+            writeln!(stdout, "held out: {db:.2} dB after {steps} steps, {seconds:.0} s")?;
+        }
+        written.print(source, trainer.model().len())?;
+        Ok(())
+    }
+
+    /// Goes on to the last step, or until the process is asked to stop. Returns the PSNR of the
+    /// images that are held out, when it was measured last, and the seconds until then.
+    fn train(
+        &self,
+        trainer: &mut Trainer,
+        images: &ListedImages<'_>,
+        backend: &dyn Differentiate,
+        checkpoints: &Checkpoints,
+    ) -> anyhow::Result<Option<(f64, f64)>> {
+        let every = (trainer.settings().steps / 10).max(1);
+        let lines = self.lines.as_deref();
+        let mut lines = lines.map(|path| LinesFile::open(path, self.resume)).transpose()?;
+        let stops = stop_flag()?;
         let bar = progress::count("training");
-        bar.set_length(settings.steps as u64);
+        bar.set_length(trainer.settings().steps as u64);
         let mut last = None;
         let mut failed = None;
-        let mut on_step = |line: &Line| {
+        let mut on_step = |line: &Line, trainer: &Trainer| {
             bar.set_position(line.step as u64);
             if let Some(db) = line.held_out_db {
                 bar.set_message(format!("{db:.2} dB"));
-                last = Some(line.clone());
+                last = Some((db, line.seconds));
             }
+            let mut said = Ok(());
             // A log has no bar.
             if line.step.is_multiple_of(every) && !io::stderr().is_terminal() {
-                failed = log(line).err().map(anyhow::Error::from);
+                said = log(line).map_err(anyhow::Error::from);
             }
             let written = lines.as_mut().map_or(Ok(()), |lines| lines.write(line));
-            failed = failed.take().or(written.err());
-            failed.is_none()
+            let is_time = line.step.is_multiple_of(checkpoints::EVERY);
+            let kept = if is_time { checkpoints.write(trainer) } else { Ok(()) };
+            failed = said.and(written).and(kept).err();
+            failed.is_none() && !stops.load(Ordering::Relaxed)
         };
-        let start = gaussians_from_points(&points);
-        let profile = RenderProfile::default();
-        let trained = run(start, &images, backend, profile, &settings, every, &mut on_step)?;
+        run(trainer, images, backend, every, &mut on_step)?;
         bar.finish_and_clear();
-        if let Some(error) = failed {
-            return Err(error);
-        }
-
-        let mut bytes = Vec::new();
-        write_ply(&trained, &mut bytes)?;
-        output::write(out, &bytes)?;
-        let mut stdout = io::stdout().lock();
-        let held_out = last.and_then(|line| Some((line.held_out_db?, line.seconds)));
-        if let Some((db, seconds)) = held_out {
-            writeln!(
-                stdout,
-                "held out: {db:.2} dB after {} steps, {seconds:.0} s",
-                settings.steps
-            )?;
-        }
-        writeln!(
-            stdout,
-            "{}: {} Gaussians, in the axes and the unit of {}; make a twin of it:\n\
-             wildcity import {:?} --twin NAME --axes AXES\n\
-             AXES is identity if z is up, and y-down-z-forward for most models of COLMAP",
-            out.display(),
-            trained.len(),
-            source.display(),
-            out,
-        )?;
-        Ok(())
+        failed.map_or(Ok(last), Err)
     }
 
     fn settings(&self) -> anyhow::Result<Settings> {
@@ -193,6 +235,7 @@ impl TrainScene {
         settings.steps = self.steps.map_or(settings.steps, |steps| steps as usize);
         settings.growth.cap = self.cap.map_or(settings.growth.cap, |cap| cap as usize);
         settings.seed = self.seed.unwrap_or(settings.seed);
+        settings.sky.mode = self.sky.unwrap_or(settings.sky.mode);
         settings.check()?;
         Ok(settings)
     }
@@ -219,6 +262,12 @@ impl TrainScene {
     }
 }
 
+/// A text by which a checkpoint knows its points.
+fn inputs_of_points(points: &[Point]) -> String {
+    let sum = points.iter().map(|point| point.at_m).sum::<DVec3>();
+    format!("{} points, {sum:?}\n", points.len())
+}
+
 /// Keeps as many points as `count`, at random.
 fn choose(points: &mut Vec<Point>, count: usize, seed: u64) {
     let mut random = Random::new(seed, "points", 0);
@@ -226,12 +275,6 @@ fn choose(points: &mut Vec<Point>, count: usize, seed: u64) {
         points.swap(k, random.below(k + 1));
     }
     points.truncate(count);
-}
-
-fn log(line: &Line) -> io::Result<()> {
-    let Line { step, l1, gaussians, seconds, .. } = line;
-    let db = line.held_out_db.map_or(String::new(), |db| format!(", {db:.2} dB"));
-    writeln!(io::stderr(), "step {step}: l1 {l1:.4}, {gaussians} Gaussians, {seconds:.0} s{db}")
 }
 
 /// Checks, before a long run, that its file can be written.
@@ -267,23 +310,4 @@ fn listed_points(source: &Path) -> anyhow::Result<PathBuf> {
     }
     // The folder of a bare name is the current one.
     Ok(if folder.as_os_str().is_empty() { PathBuf::from(".") } else { folder.to_owned() })
-}
-
-/// The file of `--lines`.
-struct LinesFile {
-    path: PathBuf,
-    file: fs::File,
-}
-
-impl LinesFile {
-    fn create(path: &Path) -> anyhow::Result<Self> {
-        let cannot = || format!("cannot write {}", path.display());
-        Ok(Self { path: path.to_owned(), file: fs::File::create(path).with_context(cannot)? })
-    }
-
-    fn write(&mut self, line: &Line) -> anyhow::Result<()> {
-        let text = serde_json::to_string(line)?;
-        let cannot = || format!("cannot write {}", self.path.display());
-        writeln!(self.file, "{text}").with_context(cannot)
-    }
 }

@@ -17,6 +17,8 @@ pub struct RealImage {
     pub name: String,
     pub file: PathBuf,
     pub mask: Option<PathBuf>,
+    /// Its depth, if the list says one: a grey PNG of 16 bits in millimetres, 0 where there is none.
+    pub depth: Option<PathBuf>,
     pub camera: Camera,
     /// Pose in the axes and unit of the list.
     pub world_from_camera: Pose,
@@ -41,6 +43,7 @@ pub struct ImageList {
 struct ListedImage {
     posed: PosedImage,
     mask: Option<String>,
+    depth: Option<String>,
     near: Option<f64>,
     exposure_stops: Option<f64>,
 }
@@ -69,7 +72,7 @@ impl ImageList {
             read(source).with_context(|| format!("--images {}", source.display()))?;
         let folder = image_dir.unwrap_or(&folder);
         let mut found = Vec::with_capacity(images.len());
-        for ListedImage { posed, mask, near, exposure_stops } in images {
+        for ListedImage { posed, mask, depth, near, exposure_stops } in images {
             let PosedImage { name, camera, world_from_camera, time_us } = posed;
             let file = image_file(folder, &name)?;
             let mask = match (masks, mask) {
@@ -81,6 +84,7 @@ impl ImageList {
                 name,
                 file,
                 mask,
+                depth: depth.map(|depth| folder.join(depth)),
                 camera,
                 world_from_camera,
                 near,
@@ -106,7 +110,13 @@ fn read(source: &Path) -> anyhow::Result<Listed> {
             CaptureError::NoModel { .. } => anyhow!("{error}; there is no transforms.json either"),
             error => error.into(),
         })?;
-        let listed = |posed| ListedImage { posed, mask: None, near: None, exposure_stops: None };
+        let listed = |posed| ListedImage {
+            posed,
+            mask: None,
+            depth: None,
+            near: None,
+            exposure_stops: None,
+        };
         let images = images.into_iter().map(listed).collect();
         return Ok(Listed {
             images,
@@ -118,8 +128,8 @@ fn read(source: &Path) -> anyhow::Result<Listed> {
     if is_dir || has_frames(source)? {
         let capture::NerfstudioCapture { frames, warnings } = capture::read_nerfstudio(source)?;
         let listed = |frame: capture::FrameImage| {
-            let capture::FrameImage { posed, mask, exposure_stops } = frame;
-            ListedImage { posed, mask, near: None, exposure_stops }
+            let capture::FrameImage { posed, mask, depth, exposure_stops } = frame;
+            ListedImage { posed, mask, depth, near: None, exposure_stops }
         };
         let images = frames.into_iter().map(listed).collect();
         let folder = if is_dir { source.to_owned() } else { beside };
@@ -137,7 +147,7 @@ fn read(source: &Path) -> anyhow::Result<Listed> {
             ..
         } = listed;
         let posed = PosedImage { name, camera, world_from_camera, time_us };
-        ListedImage { posed, mask, near, exposure_stops }
+        ListedImage { posed, mask, depth: None, near, exposure_stops }
     });
     Ok(Listed {
         images: listed.collect(),

@@ -2,7 +2,7 @@
 
 use std::path::{Component, Path, PathBuf};
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
 use image::{DynamicImage, ImageReader, Limits};
 
 use wildcity_scene::geometry::Camera;
@@ -54,6 +54,24 @@ pub fn mask(file: &Path, size_px: [u32; 2]) -> anyhow::Result<Vec<bool>> {
         size_px[1]
     );
     Ok(mask.as_raw().iter().map(|value| *value >= 128).collect())
+}
+
+/// Reads a depth: a grey PNG of 16 bits in thousandths of the scene's unit, millimetres if that is
+/// metres, with 0 where there is none.
+///
+/// # Errors
+/// The file cannot be read, is no grey image of 16 bits, or has another size than the image.
+pub fn depth_m(file: &Path, size_px: [u32; 2]) -> anyhow::Result<Vec<f32>> {
+    let name = file.display();
+    let DynamicImage::ImageLuma16(depth) = read(file)? else {
+        bail!("the depth {name} is no grey PNG of 16 bits, which holds millimetres");
+    };
+    let own_px = [depth.width(), depth.height()];
+    ensure!(
+        own_px == size_px,
+        "the depth {name} has {own_px:?} px, but its image {size_px:?}: a depth has the size of its image"
+    );
+    Ok(depth.as_raw().iter().map(|&mm| f32::from(mm) * 1e-3).collect())
 }
 
 /// A name as a path that stays within a folder.

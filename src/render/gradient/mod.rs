@@ -220,8 +220,13 @@ impl ChunkGradients {
         self.count == 0
     }
 
-    /// Adds the derivatives by a Gaussian that one more view shows.
-    pub(crate) fn add(&mut self, index: usize, geometry: &GaussianGradient, sh: &[DVec3; 16]) {
+    /// Whether some view shows a Gaussian.
+    pub fn visible(&self, index: usize) -> bool {
+        self.visible[index / LANES] >> (index % LANES) & 1 == 1
+    }
+
+    /// Adds the derivatives by a Gaussian that one more view shows, or by one more loss.
+    pub fn add(&mut self, index: usize, geometry: &GaussianGradient, sh: &[DVec3; 16]) {
         let width = columns(self.sh_degree);
         let visible = &mut self.visible[index / LANES];
         let lanes = &mut self.lanes[index / LANES * width..][..width];

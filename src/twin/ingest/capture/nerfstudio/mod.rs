@@ -35,6 +35,7 @@ struct Frame {
     file_path: String,
     transform_matrix: Vec<Vec<f64>>,
     mask_path: Option<String>,
+    depth_file_path: Option<String>,
     time_us: Option<Value>,
     exposure_stops: Option<f64>,
     #[serde(flatten)]
@@ -48,6 +49,9 @@ pub struct FrameImage {
     pub posed: PosedImage,
     /// File of its mask (`mask_path`), if it has one.
     pub mask: Option<String>,
+    /// File of its depth (`depth_file_path`): a grey PNG of 16 bits in millimetres, 0 where there
+    /// is none.
+    pub depth: Option<String>,
     /// Its exposure (`exposure_stops`) in stops relative to the scene's, if the file has it.
     pub exposure_stops: Option<f64>,
 }
@@ -83,6 +87,7 @@ pub fn read(path: &Path) -> Result<NerfstudioCapture, CaptureError> {
     let frames = file.frames.into_iter().enumerate();
     let read = |(index, mut frame): (usize, Frame)| {
         let mask = frame.mask_path.take();
+        let depth = frame.depth_file_path.take();
         let exposure_stops = frame.exposure_stops;
         if let Some(stops) = refused_stops(exposure_stops) {
             let place = Place::Field(format!("frames[{index}].exposure_stops"));
@@ -90,7 +95,7 @@ pub fn read(path: &Path) -> Result<NerfstudioCapture, CaptureError> {
             return Err(CaptureError::at(path, place, reason));
         }
         let posed = posed(path, index, frame, &file.intrinsics)?;
-        Ok(FrameImage { posed, mask, exposure_stops })
+        Ok(FrameImage { posed, mask, depth, exposure_stops })
     };
     Ok(NerfstudioCapture { frames: frames.map(read).collect::<Result<_, _>>()?, warnings })
 }

@@ -1,0 +1,84 @@
+//! The loss of one image, and its derivatives by all that the image is a function of.
+
+use wildcity_render::View;
+use wildcity_render::gradient::GaussianImages;
+
+use crate::compose::{Background, ComposedGradient, Exposure, compose, compose_gradient};
+use crate::loss::{disparity, dssim, l1, masked};
+use crate::sample::Sample;
+use crate::settings::Weights;
+use crate::sky::{SkyImage, TrainedSky};
+use crate::trainer::StepReport;
+
+/// The loss of one image.
+pub(crate) struct Objective<'a> {
+    pub(crate) sample: &'a Sample<'a>,
+    /// The camera at the pose that it has now.
+    pub(crate) view: View,
+    pub(crate) weights: &'a Weights,
+    pub(crate) exposure: Exposure<f32>,
+    pub(crate) sky: Option<&'a TrainedSky>,
+}
+
+/// What a step needs of an objective, beside the derivatives by the Gaussians' images.
+#[derive(Clone, Debug)]
+pub(crate) struct Outcome {
+    pub(crate) report: StepReport,
+    pub(crate) by_exposure: Exposure<f32>,
+    /// The sky behind the image, and the derivatives by its colours.
+    pub(crate) sky: Option<(SkyImage, Vec<f32>)>,
+}
+
+impl Objective<'_> {
+    /// The derivatives by the images of the Gaussians, and by what else the image is made of.
+    pub(crate) fn at(&self, images: &GaussianImages) -> (GaussianImages, Outcome) {
+        let sample = self.sample;
+        let sky = self.sky.map(|sky| sky.image(&self.view, sample.image, &images.opacity));
+        let background = match &sky {
+            Some(sky) => Background::Image(&sky.rgb),
+            None => Background::Color(sample.background),
+        };
+        let GaussianImages { rgb, opacity, depth_sum_m } = images;
+        let image = compose(rgb, opacity, background, &self.exposure);
+        let mut report = StepReport::default();
+        let by_image = self.of_colors(&image, &mut report);
+        let by = compose_gradient(rgb, opacity, background, &self.exposure, &by_image);
+        let ComposedGradient { rgb, mut opacity, background, exposure } = by;
+        let mut by_depth_sum = Vec::new();
+        if let Some(measured_m) = sample.depth_m.filter(|_| !depth_sum_m.is_empty()) {
+            let loss = disparity(&images.opacity, depth_sum_m, measured_m);
+            report.disparity = loss.value;
+            let loss = loss.scaled(self.weights.disparity);
+            for (by, more) in opacity.iter_mut().zip(loss.by_opacity) {
+                *by += more;
+            }
+            by_depth_sum = loss.by_depth_sum;
+        }
+        let by_images = GaussianImages { rgb, opacity, depth_sum_m: by_depth_sum };
+        let sky = sky.map(|sky| (sky, background));
+        (by_images, Outcome { report, by_exposure: exposure, sky })
+    }
+
+    /// The derivatives by the colours of the composed image.
+    fn of_colors(&self, image: &[f32], report: &mut StepReport) -> Vec<f32> {
+        let Sample { rgb, weights, .. } = *self.sample;
+        let absolute = l1(image, rgb, weights);
+        report.l1 = absolute.value;
+        let total = absolute.scaled(1.0 - self.weights.dssim);
+        if self.weights.dssim == 0.0 {
+            return total.by;
+        }
+        let size_px = self.sample.size_px();
+        // Masked pixels are 0 on both sides.
+        let similarity = match weights {
+            None => dssim(size_px, image, rgb),
+            Some(mask) => {
+                let mut similarity = dssim(size_px, &masked(image, mask), &masked(rgb, mask));
+                similarity.by = masked(&similarity.by, mask);
+                similarity
+            }
+        };
+        report.dssim = similarity.value;
+        total.plus(&similarity.scaled(self.weights.dssim)).by
+    }
+}

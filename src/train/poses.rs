@@ -1,0 +1,148 @@
+//! The poses of the cameras as parameters.
+//!
+//! ```text
+//! world_from_camera = world_from_ego exp(e) ego_from_camera exp(c)
+//! ```
+//!
+//! with a twist e for each time of the rig and a twist c for each of its cameras (the project's
+//! paper, section 4.2): six cameras of 100 keyframes have 636 parameters, and not 3,600. Images
+//! without a rig have a "time" each, and one camera at its origin.
+//!
+//! A twist is folded into its pose after each step, so that derivatives are always those at 0. What
+//! keeps a pose near its recorded one is `weight (|t|² + |φ|²)`, with the translation t in metres
+//! and the rotation φ in radians between the two.
+
+use glam::DVec3;
+use serde::{Deserialize, Serialize};
+
+use wildcity_render::gradient::{RigTwists, Twist};
+use wildcity_render::{RollingShutter, View};
+use wildcity_scene::geometry::Pose;
+
+use crate::adam::Adam;
+
+/// The poses of a rig at all times, and of its cameras.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct RigPoses {
+    #[serde(with = "numbers")]
+    pub world_from_ego: Vec<Pose>,
+    #[serde(with = "numbers")]
+    pub ego_from_camera: Vec<Pose>,
+}
+
+/// Which poses of a [`RigPoses`] an image has, by their indices.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Place {
+    pub ego: usize,
+    pub camera: usize,
+}
+
+/// Poses while they are trained.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct TrainedPoses {
+    recorded: RigPoses,
+    now: RigPoses,
+    egos: Vec<Adam>,
+    cameras: Vec<Adam>,
+}
+
+/// Which poses one step moves, and how.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct PoseStep {
+    pub(crate) place: Place,
+    /// The derivatives by the view's twist.
+    pub(crate) by: Twist,
+    /// In metres and radians.
+    pub(crate) rate: f64,
+    /// Of the squared distance to the recorded pose.
+    pub(crate) weight: f64,
+}
+
+impl RigPoses {
+    pub(crate) fn world_from_camera(&self, place: Place) -> Pose {
+        self.world_from_ego[place.ego] * self.ego_from_camera[place.camera]
+    }
+
+    pub(crate) fn has(&self, place: Place) -> bool {
+        place.ego < self.world_from_ego.len() && place.camera < self.ego_from_camera.len()
+    }
+}
+
+impl TrainedPoses {
+    pub(crate) fn new(recorded: RigPoses) -> Self {
+        let moments = |poses: &[Pose]| vec![Adam::new(6); poses.len()];
+        Self {
+            egos: moments(&recorded.world_from_ego),
+            cameras: moments(&recorded.ego_from_camera),
+            now: recorded.clone(),
+            recorded,
+        }
+    }
+
+    pub(crate) fn now(&self) -> &RigPoses {
+        &self.now
+    }
+
+    /// A view at the pose that it has now. What its pose was in the recording goes; its motion
+    /// during the exposure stays.
+    pub(crate) fn view(&self, view: View, place: Place) -> View {
+        let world_from_camera = self.now.world_from_camera(place);
+        let last_from_first = |shutter: RollingShutter| {
+            view.world_from_camera.inverse() * shutter.world_from_camera_first
+        };
+        let rolling_shutter = view.rolling_shutter.map(|shutter| RollingShutter {
+            world_from_camera_first: world_from_camera * last_from_first(shutter),
+            ..shutter
+        });
+        View { world_from_camera, rolling_shutter, ..view }
+    }
+
+    /// Moves the two poses of a view.
+    pub(crate) fn step(&mut self, step: &PoseStep) {
+        let PoseStep { place: Place { ego, camera }, by, rate, weight } = *step;
+        let twists = by.on_rig(&self.now.ego_from_camera[camera]);
+        let RigTwists { ego: by_ego, camera: by_camera } = twists;
+        let RigPoses { world_from_ego, ego_from_camera } = &mut self.now;
+        let recorded = &self.recorded;
+        for (pose, recorded, by, adam) in [
+            (&mut world_from_ego[ego], recorded.world_from_ego[ego], by_ego, &mut self.egos[ego]),
+            (
+                &mut ego_from_camera[camera],
+                recorded.ego_from_camera[camera],
+                by_camera,
+                &mut self.cameras[camera],
+            ),
+        ] {
+            let Pose { position_m, rotation } = recorded.inverse() * *pose;
+            let off = Twist { rho: position_m, phi: rotation.to_scaled_axis() };
+            // Of |t|² in the axes of the pose that moves.
+            let pull = |off: DVec3| 2.0 * weight * (rotation.inverse() * off);
+            let by = Twist { rho: by.rho + pull(off.rho), phi: by.phi + pull(off.phi) };
+            let moves = adam.step(&by.to_array(), rate);
+            let twist = Twist::from_array(std::array::from_fn(|k| moves[k]));
+            let Pose { position_m, rotation } = *pose * twist.exp();
+            *pose = Pose { position_m, rotation: rotation.normalize() };
+        }
+    }
+}
+
+/// Poses as seven numbers each, so that a file keeps every bit of them.
+mod numbers {
+    use glam::{DQuat, DVec3};
+    use serde::{Deserialize, Deserializer, Serialize, Serializer};
+    use wildcity_scene::geometry::Pose;
+
+    pub(super) fn serialize<S: Serializer>(poses: &[Pose], to: S) -> Result<S::Ok, S::Error> {
+        let numbers = |pose: &Pose| (pose.position_m.to_array(), pose.rotation.to_array());
+        poses.iter().map(numbers).collect::<Vec<_>>().serialize(to)
+    }
+
+    pub(super) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<Pose>, D::Error> {
+        let numbers: Vec<([f64; 3], [f64; 4])> = Deserialize::deserialize(from)?;
+        let pose = |(position_m, rotation)| Pose {
+            position_m: DVec3::from_array(position_m),
+            rotation: DQuat::from_array(rotation),
+        };
+        Ok(numbers.into_iter().map(pose).collect())
+    }
+}
