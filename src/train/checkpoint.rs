@@ -3,11 +3,13 @@
 //! The file is bincode after one line of text, and its last 32 bytes are the BLAKE3 hash of all
 //! before: half a file is refused.
 
+use std::sync::Arc;
+
 use bincode::config::{self, Config};
 use serde::{Deserialize, Serialize};
 
 use wildcity_render::gradient::Gradients;
-use wildcity_scene::RenderProfile;
+use wildcity_scene::{RenderProfile, Sky};
 
 use crate::exposures::TrainedExposures;
 use crate::model::{Model, ModelState};
@@ -81,7 +83,8 @@ impl Trainer {
         Ok(bytes)
     }
 
-    /// The run that wrote a file, at the step at which it did.
+    /// The run that wrote a file, at the step at which it did. A sky that is not trained is not in
+    /// the file: it is given again.
     ///
     /// # Errors
     /// The file is damaged, or of a run with other inputs or settings.
@@ -90,6 +93,7 @@ impl Trainer {
         inputs: &str,
         profile: RenderProfile,
         settings: &Settings,
+        fixed_sky: Option<Arc<Sky>>,
     ) -> Result<Self, CheckpointError> {
         let contents = bytes.strip_prefix(FORMAT).ok_or(CheckpointError::Format)?;
         let Some((contents, hash)) = contents.split_last_chunk::<HASH>() else {
@@ -118,6 +122,7 @@ impl Trainer {
             poses,
             exposures,
             sky,
+            fixed_sky,
             step: step as usize,
             gradients: Gradients::default(),
         })

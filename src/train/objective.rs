@@ -2,12 +2,13 @@
 
 use wildcity_render::View;
 use wildcity_render::gradient::GaussianImages;
+use wildcity_scene::Sky;
 
 use crate::compose::{Background, ComposedGradient, Exposure, compose, compose_gradient};
 use crate::loss::{disparity, dssim, l1, masked};
 use crate::sample::Sample;
 use crate::settings::Weights;
-use crate::sky::{SkyImage, TrainedSky};
+use crate::sky::{SkyImage, TrainedSky, fixed_image};
 use crate::trainer::StepReport;
 
 /// The loss of one image.
@@ -18,6 +19,8 @@ pub(crate) struct Objective<'a> {
     pub(crate) weights: &'a Weights,
     pub(crate) exposure: Exposure<f32>,
     pub(crate) sky: Option<&'a TrainedSky>,
+    /// A sky that is not trained.
+    pub(crate) fixed_sky: Option<&'a Sky>,
 }
 
 /// What a step needs of an objective, beside the derivatives by the Gaussians' images.
@@ -34,9 +37,10 @@ impl Objective<'_> {
     pub(crate) fn at(&self, images: &GaussianImages) -> (GaussianImages, Outcome) {
         let sample = self.sample;
         let sky = self.sky.map(|sky| sky.image(&self.view, sample.image, &images.opacity));
-        let background = match &sky {
-            Some(sky) => Background::Image(&sky.rgb),
-            None => Background::Color(sample.background),
+        let fixed = self.fixed_sky.map(|sky| fixed_image(sky, &self.view, &images.opacity));
+        let background = match (&sky, &fixed) {
+            (Some(SkyImage { rgb, .. }), _) | (None, Some(rgb)) => Background::Image(rgb),
+            (None, None) => Background::Color(sample.background),
         };
         let GaussianImages { rgb, opacity, depth_sum_m } = images;
         let image = compose(rgb, opacity, background, &self.exposure);
@@ -48,7 +52,7 @@ impl Objective<'_> {
         if let Some(measured_m) = sample.depth_m.filter(|_| !depth_sum_m.is_empty()) {
             let loss = disparity(&images.opacity, depth_sum_m, measured_m);
             report.disparity = loss.value;
-            let loss = loss.scaled(self.weights.disparity);
+            let loss = loss.scaled(f64::from(sample.weight) * self.weights.disparity);
             for (by, more) in opacity.iter_mut().zip(loss.by_opacity) {
                 *by += more;
             }
@@ -64,7 +68,8 @@ impl Objective<'_> {
         let Sample { rgb, weights, .. } = *self.sample;
         let absolute = l1(image, rgb, weights);
         report.l1 = absolute.value;
-        let total = absolute.scaled(1.0 - self.weights.dssim);
+        let factor = f64::from(self.sample.weight);
+        let total = absolute.scaled(factor * (1.0 - self.weights.dssim));
         if self.weights.dssim == 0.0 {
             return total.by;
         }
@@ -79,6 +84,6 @@ impl Objective<'_> {
             }
         };
         report.dssim = similarity.value;
-        total.plus(&similarity.scaled(self.weights.dssim)).by
+        total.plus(&similarity.scaled(factor * self.weights.dssim)).by
     }
 }

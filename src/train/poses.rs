@@ -52,8 +52,8 @@ pub(crate) struct PoseStep {
     pub(crate) place: Place,
     /// The derivatives by the view's twist.
     pub(crate) by: Twist,
-    /// In metres and radians.
-    pub(crate) rate: f64,
+    /// In metres, and in radians.
+    pub(crate) rates: [f64; 2],
     /// Of the squared distance to the recorded pose.
     pub(crate) weight: f64,
 }
@@ -99,7 +99,8 @@ impl TrainedPoses {
 
     /// Moves the two poses of a view.
     pub(crate) fn step(&mut self, step: &PoseStep) {
-        let PoseStep { place: Place { ego, camera }, by, rate, weight } = *step;
+        let PoseStep { place: Place { ego, camera }, by, rates: [rate, rotation_rate], weight } =
+            *step;
         let twists = by.on_rig(&self.now.ego_from_camera[camera]);
         let RigTwists { ego: by_ego, camera: by_camera } = twists;
         let RigPoses { world_from_ego, ego_from_camera } = &mut self.now;
@@ -118,8 +119,9 @@ impl TrainedPoses {
             // Of |t|² in the axes of the pose that moves.
             let pull = |off: DVec3| 2.0 * weight * (rotation.inverse() * off);
             let by = Twist { rho: by.rho + pull(off.rho), phi: by.phi + pull(off.phi) };
-            let moves = adam.step(&by.to_array(), rate);
-            let twist = Twist::from_array(std::array::from_fn(|k| moves[k]));
+            let moves = adam.step(&by.to_array(), 1.0);
+            let [moved_m, turned] = [0, 3].map(|k| DVec3::from_slice(&moves[k..]));
+            let twist = Twist { rho: rate * moved_m, phi: rotation_rate * turned };
             let Pose { position_m, rotation } = *pose * twist.exp();
             *pose = Pose { position_m, rotation: rotation.normalize() };
         }

@@ -12,7 +12,7 @@ use serde::Serialize;
 use wildcity_render::compare::psnr::psnr_db_u8;
 use wildcity_render::gradient::Differentiate;
 use wildcity_render::{Frame, Target, View};
-use wildcity_scene::random::mix;
+use wildcity_scene::random::{mix, to_unit};
 use wildcity_scene::{RenderProfile, Scene};
 
 use crate::poses::Place;
@@ -33,6 +33,8 @@ pub struct TrainingImage {
     pub mask: Option<Vec<bool>>,
     /// `[height, width]`: measured depths in metres; 0 where there is none.
     pub depth_m: Option<Vec<f32>>,
+    /// Factor of the losses, 1 for an image that was recorded.
+    pub weight: f32,
     /// Recorded factor of all colours against the other images.
     pub exposure: f32,
 }
@@ -44,6 +46,12 @@ pub trait TrainingImages: Sync {
 
     /// Whether an image is kept from the run, to judge it.
     fn is_held_out(&self, index: usize) -> bool;
+
+    /// Whether an image was rendered and repaired, and not recorded: of these,
+    /// [`Settings::augmented_share`] of the steps are made.
+    fn is_augmented(&self, _: usize) -> bool {
+        false
+    }
 
     /// The poses of the run's rig that an image has; `None` for images without a rig.
     fn place(&self, index: usize) -> Option<Place>;
@@ -94,13 +102,13 @@ pub fn run(
     if learned.is_empty() {
         return Err(TrainError::NoImages { images: images.count(), held_out: held_out.len() });
     }
-    let Settings { steps, seed, .. } = *trainer.settings();
+    let steps = trainer.settings().steps;
     let first = trainer.steps_done();
+    let order = Order::new(&learned, images, trainer.settings()).take(steps).skip(first);
     let evaluator = Evaluator { images, backend, held_out: &held_out };
     thread::scope(|scope| {
         let (sender, next) = sync_channel(AHEAD);
         scope.spawn(move || {
-            let order = order(&learned, seed, steps).skip(first);
             // A receiver that is gone has ended the run.
             let load = |index| images.load(index).map(|image| (index, image));
             order.map(load).all(|image| sender.send(image).is_ok())
@@ -134,14 +142,48 @@ impl Line {
     }
 }
 
-/// The images of all steps: each once, in a random order, then each again.
-fn order(learned: &[usize], seed: u64, steps: usize) -> impl Iterator<Item = usize> {
-    let rounds = (0..steps.div_ceil(learned.len()) as u64).flat_map(move |round| {
-        let mut order = learned.to_vec();
-        order.sort_by_key(|&image| mix(seed ^ mix(round << 32 ^ image as u64)));
-        order
-    });
-    rounds.take(steps)
+/// The images of all steps. Each kind of image goes round in an order that is random each time.
+struct Order {
+    /// The images that were recorded, and those that were not.
+    kinds: [Vec<usize>; 2],
+    /// Steps of each kind so far.
+    done: [usize; 2],
+    /// Of the second kind.
+    share: f64,
+    seed: u64,
+    step: u64,
+}
+
+impl Order {
+    fn new(learned: &[usize], images: &dyn TrainingImages, settings: &Settings) -> Self {
+        let (augmented, recorded): (Vec<usize>, Vec<usize>) =
+            learned.iter().partition(|&&index| images.is_augmented(index));
+        let share = if augmented.is_empty() {
+            0.0
+        } else if recorded.is_empty() {
+            1.0
+        } else {
+            settings.augmented_share
+        };
+        Self { kinds: [recorded, augmented], done: [0; 2], share, seed: settings.seed, step: 0 }
+    }
+}
+
+impl Iterator for Order {
+    type Item = usize;
+
+    fn next(&mut self) -> Option<usize> {
+        self.step += 1;
+        let kind = usize::from(to_unit(mix(self.seed ^ mix(!self.step))) < self.share);
+        let images = &mut self.kinds[kind];
+        let place = self.done[kind] % images.len();
+        if place == 0 {
+            let round = (self.done[kind] / images.len()) as u64;
+            images.sort_by_key(|&image| mix(self.seed ^ mix(round << 32 ^ image as u64)));
+        }
+        self.done[kind] += 1;
+        Some(images[place])
+    }
 }
 
 fn step(
@@ -152,7 +194,7 @@ fn step(
 ) -> Result<StepReport, TrainError> {
     let image = next.recv().unwrap_or_else(|_| Err("the thread that decodes has ended".to_owned()));
     let (index, image) = image.map_err(TrainError::Image)?;
-    let TrainingImage { view, rgb8, mask, mut depth_m, exposure } = image;
+    let TrainingImage { view, rgb8, mask, mut depth_m, weight, exposure } = image;
     if let Some((depth_m, mask)) = depth_m.as_mut().zip(mask.as_ref()) {
         // What does not count has no depth either.
         let left_out = depth_m.iter_mut().zip(mask).filter(|(_, counts)| !**counts);
@@ -170,9 +212,23 @@ fn step(
         weights: weights.as_deref(),
         depth_m: depth_m.as_deref(),
         background: background.map(|value| value as f32),
+        weight,
         exposure,
     };
     trainer.step(backend, &sample)
+}
+
+/// The mean PSNR of the images that are held out; `None` without any.
+///
+/// # Errors
+/// An image cannot be read or drawn.
+pub fn held_out_db(
+    trainer: &Trainer,
+    images: &dyn TrainingImages,
+    backend: &dyn Differentiate,
+) -> Result<Option<f64>, TrainError> {
+    let held_out: Vec<usize> = (0..images.count()).filter(|&i| images.is_held_out(i)).collect();
+    Evaluator { images, backend, held_out: &held_out }.mean_db(trainer)
 }
 
 /// The images that are held out.

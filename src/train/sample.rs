@@ -22,6 +22,8 @@ pub struct Sample<'a> {
     pub depth_m: Option<&'a [f32]>,
     /// The colour behind all Gaussians of a run without a sky.
     pub background: [f32; 3],
+    /// Factor of the losses: less than 1 for an image that is trusted less.
+    pub weight: f32,
     /// Recorded factor of all colours: 2 for an image that was exposed a stop more than others.
     pub exposure: f32,
 }

@@ -18,6 +18,9 @@ pub struct Settings {
     pub seed: u64,
     /// Degree of the spherical harmonics, 0 to 3.
     pub sh_degree: u8,
+    /// Share of the steps that are made on images which were rendered and repaired, if there are
+    /// such.
+    pub augmented_share: f64,
     pub rates: Rates,
     pub loss: Weights,
     pub growth: Growth,
@@ -93,8 +96,11 @@ pub enum PoseMode {
 #[serde(deny_unknown_fields, default)]
 pub struct PoseSettings {
     pub mode: PoseMode,
-    /// Learning rate in metres and radians. It falls exponentially to a hundredth.
+    /// Learning rate of positions in metres. It falls exponentially to a hundredth, as that of
+    /// rotations does.
     pub rate: f64,
+    /// Learning rate of rotations in radians.
+    pub rotation_rate: f64,
     /// Of the squared distance to the recorded pose, in metres and radians.
     pub weight: f64,
 }
@@ -160,6 +166,7 @@ impl Default for Settings {
             steps: 7_000,
             seed: 0,
             sh_degree: 1,
+            augmented_share: 0.3,
             rates: Rates::default(),
             loss: Weights::default(),
             growth: Growth::default(),
@@ -173,7 +180,7 @@ impl Default for Settings {
 
 impl Default for PoseSettings {
     fn default() -> Self {
-        Self { mode: PoseMode::Auto, rate: 1e-3, weight: 1e-5 }
+        Self { mode: PoseMode::Auto, rate: 1e-3, rotation_rate: 1e-3, weight: 1e-5 }
     }
 }
 
@@ -275,6 +282,7 @@ impl Settings {
             ("rates.sh", rates.sh.into()),
             ("rates.sh_rest", rates.sh_rest.into()),
             ("poses.rate", poses.rate),
+            ("poses.rotation_rate", poses.rotation_rate),
             ("sky.rate", sky.rate),
             ("sky.embedding_rate", sky.embedding_rate),
             ("exposure.rate", exposure.rate),
@@ -296,6 +304,7 @@ impl Settings {
         let others = [
             range("steps", self.steps, 1, 10_000_000),
             range("sh_degree", self.sh_degree.into(), 0, 3),
+            ("augmented_share", self.augmented_share, 0.0, 1.0),
             ("loss.dssim", loss.dssim, 0.0, 1.0),
             range("growth.cap", growth.cap, 1, 100_000_000),
             ("growth.rate", growth.rate, 0.0, 1.0),

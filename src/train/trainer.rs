@@ -35,6 +35,8 @@ pub struct Start {
     pub world_from_camera: Vec<Pose>,
     /// The recorded poses of the rig that took the images.
     pub rig: Option<RigPoses>,
+    /// A sky that is not trained. With one, no other is.
+    pub sky: Option<Arc<Sky>>,
 }
 
 /// A training run: its Gaussians and all else that it trains, and how far it is.
@@ -48,6 +50,7 @@ pub struct Trainer {
     pub(crate) poses: Option<TrainedPoses>,
     pub(crate) exposures: Option<TrainedExposures>,
     pub(crate) sky: Option<TrainedSky>,
+    pub(crate) fixed_sky: Option<Arc<Sky>>,
     pub(crate) step: usize,
     pub(crate) gradients: Gradients,
 }
@@ -130,7 +133,7 @@ impl Trainer {
         settings: Settings,
     ) -> Result<Self, TrainError> {
         settings.check()?;
-        let Start { gaussians, is_ground, world_from_camera, rig } = start;
+        let Start { gaussians, is_ground, world_from_camera, rig, sky } = start;
         if gaussians.means_m.is_empty() {
             return Err(TrainError::Empty);
         }
@@ -152,11 +155,13 @@ impl Trainer {
             SkyMode::Network => true,
             SkyMode::Auto => rig.is_some(),
         };
+        let has_sky = has_sky && sky.is_none();
         Ok(Self {
             model: Model::new(gaussians, is_ground, settings.sh_degree),
             poses: poses.map(TrainedPoses::new),
             exposures: settings.exposure.on.then(|| TrainedExposures::new(images)),
             sky: has_sky.then(|| TrainedSky::new(&settings.sky, images, settings.seed)),
+            fixed_sky: sky,
             gradients: Gradients::default(),
             step: 0,
             rig,
@@ -185,9 +190,8 @@ impl Trainer {
     /// # Errors
     /// As [`Trainer::sky`].
     pub fn scene(&self) -> Result<Scene, TrainError> {
-        let sky = self
-            .sky()?
-            .map(|network| Arc::new(Sky::new(SkyModel::network(network), DMat3::IDENTITY)));
+        let trained = |network| Arc::new(Sky::new(SkyModel::network(network), DMat3::IDENTITY));
+        let sky = self.sky()?.map(trained).or_else(|| self.fixed_sky.clone());
         Ok(Scene { sky, ..self.model.scene().clone() })
     }
 
@@ -239,6 +243,7 @@ impl Trainer {
             weights: &self.settings.loss,
             exposure: self.exposure(sample),
             sky: self.sky.as_ref(),
+            fixed_sky: self.fixed_sky.as_deref(),
         };
         let depth = sample.depth_m.is_some() && self.settings.loss.disparity > 0.0;
         let views = [objective.view];
@@ -302,8 +307,8 @@ impl Trainer {
                 return not_finite("its pose");
             }
             let settings = &self.settings.poses;
-            let rate = settings.rate * fall;
-            poses.step(&PoseStep { place, by, rate, weight: settings.weight });
+            let rates = [settings.rate, settings.rotation_rate].map(|rate| rate * fall);
+            poses.step(&PoseStep { place, by, rates, weight: settings.weight });
         }
         if let Some(exposures) = &mut self.exposures {
             let settings = &self.settings.exposure;

@@ -137,6 +137,7 @@ fn a_shaken_rig_is_found_again() {
         let mut settings = settings(800);
         settings.poses.mode = mode;
         settings.poses.rate = 5e-3;
+        settings.poses.rotation_rate = 5e-3;
         // The wall would learn the wrong poses meanwhile.
         let none = 0.0;
         settings.rates =
@@ -284,6 +285,7 @@ fn gaussians_of_the_ground_become_flat() {
             is_ground: labels,
             world_from_camera: vec![views[4].world_from_camera],
             rig: Some(rig),
+            sky: None,
         };
         let mut trainer = Trainer::new(start, RenderProfile::default(), settings).unwrap();
         for _ in 0..300 {
@@ -329,7 +331,7 @@ fn a_run_that_stops_goes_on_to_the_same_bytes() {
     let checkpoint = whole.to_checkpoint("street").expect("a checkpoint");
     steps(&mut whole);
     let read = |bytes: &[u8], inputs: &str, settings: &Settings| {
-        Trainer::from_checkpoint(bytes, inputs, profile, settings)
+        Trainer::from_checkpoint(bytes, inputs, profile, settings, None)
     };
     let mut again = read(&checkpoint, "street", &settings).expect("a run");
     assert_eq!(again.steps_done(), 40);

@@ -24,6 +24,7 @@ pub(crate) fn sample(view: View, rgb: &[f32]) -> Sample<'_> {
         weights: None,
         depth_m: None,
         background: [0.0; 3],
+        weight: 1.0,
         exposure: 1.0,
     }
 }

@@ -53,7 +53,7 @@ impl Checkpoints {
             resume,
             "{name} is there: an earlier run was stopped. --resume goes on with it; remove the file to begin anew"
         );
-        let trainer = Trainer::from_checkpoint(&bytes, &self.inputs, profile, settings);
+        let trainer = Trainer::from_checkpoint(&bytes, &self.inputs, profile, settings, None);
         Ok(Some(trainer.with_context(|| format!("{name}"))?))
     }
 

@@ -6,20 +6,29 @@ use anyhow::{Context, ensure};
 use image::imageops::{self, FilterType};
 use image::{ImageBuffer, Rgb};
 
-use wildcity_eval::images::{RealImage, picture};
+use wildcity_eval::images::{ImageList, RealImage, picture};
 use wildcity_render::View;
 use wildcity_scene::RenderProfile;
+use wildcity_scene::align::Alignment;
 use wildcity_scene::geometry::Pose;
 use wildcity_train::poses::Place;
 use wildcity_train::run::{TrainingImage, TrainingImages};
 
 use crate::cli::exit;
 
-/// Images of a list, at a fraction of their size.
+/// Images of lists, at a fraction of their size.
 pub(super) struct ListedImages<'a> {
-    pub(super) images: Vec<&'a RealImage>,
-    pub(super) size: f64,
-    pub(super) held_out_every: usize,
+    images: Vec<ListedImage<'a>>,
+    size: f64,
+    held_out_every: usize,
+}
+
+struct ListedImage<'a> {
+    image: &'a RealImage,
+    /// In the axes and the unit of the scene that is trained.
+    world_from_camera: Pose,
+    /// Whether it was rendered, and not recorded.
+    is_augmented: bool,
 }
 
 impl TrainingImages for ListedImages<'_> {
@@ -27,8 +36,14 @@ impl TrainingImages for ListedImages<'_> {
         self.images.len()
     }
 
+    /// Only recorded images judge a run. They are the first.
     fn is_held_out(&self, index: usize) -> bool {
-        self.held_out_every > 0 && index.is_multiple_of(self.held_out_every)
+        let is_chosen = self.held_out_every > 0 && index.is_multiple_of(self.held_out_every);
+        is_chosen && !self.images[index].is_augmented
+    }
+
+    fn is_augmented(&self, index: usize) -> bool {
+        self.images[index].is_augmented
     }
 
     fn place(&self, _: usize) -> Option<Place> {
@@ -36,26 +51,57 @@ impl TrainingImages for ListedImages<'_> {
     }
 
     fn load(&self, index: usize) -> Result<TrainingImage, String> {
-        self.decode(self.images[index]).map_err(|error| exit::chain(&error))
+        self.decode(&self.images[index]).map_err(|error| exit::chain(&error))
     }
 }
 
-impl ListedImages<'_> {
+impl<'a> ListedImages<'a> {
+    /// No images yet. Of those that were recorded, one of `held_out_every` is held out.
+    pub(super) fn new(size: f64, held_out_every: usize) -> Self {
+        Self { images: Vec::new(), size, held_out_every }
+    }
+
+    /// Adds the images of a list with their poses in the axes of the scene.
+    ///
+    /// # Errors
+    /// An image is missing: each is looked at before a long run finds one that is.
+    pub(super) fn add(
+        &mut self,
+        list: &'a ImageList,
+        alignment: &Alignment,
+        is_augmented: bool,
+    ) -> anyhow::Result<()> {
+        for image in list.every(1) {
+            let file = &image.file;
+            ensure!(file.is_file(), "there is no image {}: give --image-dir", file.display());
+            let world_from_camera = alignment.pose(&image.world_from_camera);
+            self.images.push(ListedImage { image, world_from_camera, is_augmented });
+        }
+        Ok(())
+    }
+
     /// The recorded pose of each image.
     pub(super) fn poses(&self) -> Vec<Pose> {
         self.images.iter().map(|image| image.world_from_camera).collect()
     }
 
+    /// Number of images that are held out.
+    pub(super) fn held_out(&self) -> usize {
+        (0..self.count()).filter(|&index| self.is_held_out(index)).count()
+    }
+
     /// A text by which a checkpoint knows its images.
     pub(super) fn inputs(&self) -> String {
         let mut text = format!("{} {}\n", self.size, self.held_out_every);
-        for RealImage { name, camera, world_from_camera, .. } in &self.images {
-            text += &format!("{name} {camera:?} {world_from_camera:?}\n");
+        for ListedImage { image, world_from_camera, is_augmented } in &self.images {
+            let RealImage { name, camera, .. } = image;
+            text += &format!("{name} {camera:?} {world_from_camera:?} {is_augmented}\n");
         }
         text
     }
 
-    fn decode(&self, image: &RealImage) -> anyhow::Result<TrainingImage> {
+    fn decode(&self, listed: &ListedImage<'_>) -> anyhow::Result<TrainingImage> {
+        let image = listed.image;
         let background = RenderProfile::default().background;
         let (mut rgb8, mut camera) = picture::real(&image.file, &image.camera, background)?;
         let own_px = [camera.width_px, camera.height_px];
@@ -74,9 +120,10 @@ impl ListedImages<'_> {
         }
         // The scene is trained at this size: no filter of a larger native size is part of it.
         camera.native_size_px = None;
-        let view = View::new(camera, image.world_from_camera);
+        let view = View::new(camera, listed.world_from_camera);
+        let weight = image.weight.map_or(1.0, |weight| weight as f32);
         let exposure = image.exposure_stops.map_or(1.0, |stops| stops.exp2() as f32);
-        Ok(TrainingImage { view, rgb8, mask, depth_m, exposure })
+        Ok(TrainingImage { view, rgb8, mask, depth_m, weight, exposure })
     }
 }
 

@@ -4,6 +4,8 @@ mod check;
 mod checkpoints;
 mod images;
 mod lines;
+mod progress;
+mod refine;
 mod result;
 mod scene;
 mod settings;
@@ -39,6 +41,7 @@ Examples:
   wildcity import capture.ply --twin capture --axes y-down-z-forward";
 
 subcommands! { TrainCommand;
+    Refine(refine::Refine),
     Check(check::Check),
     Settings(settings::PrintSettings),
 }

@@ -1,29 +1,30 @@
 //! `wildcity train SOURCE`.
 
 use std::fs;
-use std::io::{self, IsTerminal, Write};
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::Ordering;
 
 use anyhow::{Context, ensure};
 
 use glam::DVec3;
 use wildcity_eval::images::ImageList;
 use wildcity_render::gradient::Differentiate;
-use wildcity_scene::RenderProfile;
+use wildcity_scene::align::Alignment;
 use wildcity_scene::random::Random;
-use wildcity_train::run::{Line, TrainingImages, run};
+use wildcity_scene::{Gaussians, RenderProfile};
+use wildcity_train::run::TrainingImages;
 use wildcity_train::settings::{Settings, SkyMode};
 use wildcity_train::start::{Point, gaussians_from_points};
 use wildcity_train::trainer::{Start, Trainer};
-use wildcity_twin::ingest::capture;
+use wildcity_twin::ingest::{self, ReadLimits, ReadScene, capture};
 
-use super::checkpoints::{self, Checkpoints, stop_flag};
+use super::checkpoints::{self, Checkpoints};
 use super::images::ListedImages;
-use super::lines::{LinesFile, log};
+use super::lines::LinesFile;
+use super::progress::train;
 use super::result::Written;
 use crate::cli::backend_options::HardwareOptions;
-use crate::cli::{output, progress};
+use crate::cli::{file_notes, output, progress};
 
 /// What `wildcity train SOURCE` takes.
 #[derive(Debug, clap::Args)]
@@ -49,6 +50,11 @@ pub(super) struct TrainScene {
     /// Points to begin with: a PLY file, or a COLMAP model [default: those of SOURCE]
     #[arg(long, value_name = "POINTS")]
     points: Option<PathBuf>,
+
+    /// Gaussians to begin with instead: a scene that was trained here or by another program, in any
+    /// format that `wildcity import` reads, in the axes and the unit of SOURCE.
+    #[arg(long, value_name = "SCENE", conflicts_with = "points")]
+    start: Option<PathBuf>,
 
     /// Steps, each on one image. Learning rates and growth are scaled to this number.
     /// [default: that of --settings, or 7000]
@@ -98,7 +104,7 @@ pub(super) struct TrainScene {
     hardware: HardwareOptions,
 }
 
-fn fraction(text: &str) -> Result<f64, String> {
+pub(super) fn fraction(text: &str) -> Result<f64, String> {
     match text.parse() {
         Ok(fraction) if (0.05..=1.0).contains(&fraction) => Ok(fraction),
         _ => Err("expected a fraction from 0.05 to 1, for example 0.5".to_owned()),
@@ -125,47 +131,39 @@ impl TrainScene {
         for warning in &list.warnings {
             writeln!(io::stderr(), "warning: {warning}")?;
         }
-        let mut points = self.points(source)?;
-        let all = points.len();
-        if all > settings.growth.cap {
-            choose(&mut points, settings.growth.cap, settings.seed);
-            writeln!(io::stderr(), "{} of {all} points are chosen: --cap", points.len())?;
-        }
-        let Self { size, held_out_every, .. } = self;
-        let images = ListedImages { images: list.every(1), size, held_out_every };
-        // Every image is looked at before a long run finds one that is missing.
-        for index in 0..images.count() {
-            let file = &images.images[index].file;
-            ensure!(file.is_file(), "there is no image {}: give --image-dir", file.display());
-        }
+        let (gaussians, profile) = self.gaussians(source, &settings)?;
+        let mut images = ListedImages::new(self.size, self.held_out_every);
+        images.add(&list, &Alignment::IDENTITY, false)?;
         let backends = self.hardware.differentiating()?;
         let backend: &dyn Differentiate = match backends.last() {
             Some(backend) => backend.as_ref(),
             None => anyhow::bail!("no backend computes gradients"),
         };
-        let held_out = (0..images.count()).filter(|&index| images.is_held_out(index)).count();
         writeln!(
             io::stderr(),
-            "{}, {held_out} of them held out, {}, backend {}",
+            "{}, {} of them held out, {}, backend {}",
             output::counted(images.count(), "image"),
-            output::counted(points.len(), "point"),
+            images.held_out(),
+            output::counted(gaussians.len(), "Gaussian"),
             backend.name()
         )?;
-        let profile = RenderProfile::default();
-        let inputs = format!("{}{}", images.inputs(), inputs_of_points(&points));
+        let inputs = format!("{}{}", images.inputs(), inputs_of_gaussians(&gaussians));
         let checkpoints = Checkpoints::new(out, inputs);
         let mut trainer = match checkpoints.read(self.resume, profile, &settings)? {
             Some(trainer) => trainer,
             None => {
-                let start = Start {
-                    gaussians: gaussians_from_points(&points),
-                    world_from_camera: images.poses(),
-                    ..Start::default()
-                };
+                let start =
+                    Start { gaussians, world_from_camera: images.poses(), ..Start::default() };
                 Trainer::new(start, profile, settings)?
             }
         };
-        let last = self.train(&mut trainer, &images, backend, &checkpoints)?;
+        let lines = self.lines.as_deref();
+        let mut lines = lines.map(|path| LinesFile::open(path, self.resume)).transpose()?;
+        let last = train(&mut trainer, &images, backend, &mut |line, trainer| {
+            lines.as_mut().map_or(Ok(()), |lines| lines.write(line))?;
+            let is_time = line.step.is_multiple_of(checkpoints::EVERY);
+            if is_time { checkpoints.write(trainer) } else { Ok(()) }
+        })?;
         let steps = trainer.settings().steps;
         if trainer.steps_done() < steps {
             checkpoints.write(&trainer)?;
@@ -184,53 +182,10 @@ impl TrainScene {
         Ok(())
     }
 
-    /// Goes on to the last step, or until the process is asked to stop. Returns the PSNR of the
-    /// images that are held out, when it was measured last, and the seconds until then.
-    fn train(
-        &self,
-        trainer: &mut Trainer,
-        images: &ListedImages<'_>,
-        backend: &dyn Differentiate,
-        checkpoints: &Checkpoints,
-    ) -> anyhow::Result<Option<(f64, f64)>> {
-        let every = (trainer.settings().steps / 10).max(1);
-        let lines = self.lines.as_deref();
-        let mut lines = lines.map(|path| LinesFile::open(path, self.resume)).transpose()?;
-        let stops = stop_flag()?;
-        let bar = progress::count("training");
-        bar.set_length(trainer.settings().steps as u64);
-        let mut last = None;
-        let mut failed = None;
-        let mut on_step = |line: &Line, trainer: &Trainer| {
-            bar.set_position(line.step as u64);
-            if let Some(db) = line.held_out_db {
-                bar.set_message(format!("{db:.2} dB"));
-                last = Some((db, line.seconds));
-            }
-            let mut said = Ok(());
-            // A log has no bar.
-            if line.step.is_multiple_of(every) && !io::stderr().is_terminal() {
-                said = log(line).map_err(anyhow::Error::from);
-            }
-            let written = lines.as_mut().map_or(Ok(()), |lines| lines.write(line));
-            let is_time = line.step.is_multiple_of(checkpoints::EVERY);
-            let kept = if is_time { checkpoints.write(trainer) } else { Ok(()) };
-            failed = said.and(written).and(kept).err();
-            failed.is_none() && !stops.load(Ordering::Relaxed)
-        };
-        run(trainer, images, backend, every, &mut on_step)?;
-        bar.finish_and_clear();
-        failed.map_or(Ok(last), Err)
-    }
-
     fn settings(&self) -> anyhow::Result<Settings> {
         let mut settings = match &self.settings {
             None => Settings::default(),
-            Some(path) => {
-                let cannot = || format!("--settings {}", path.display());
-                let text = fs::read_to_string(path).with_context(cannot)?;
-                toml::from_str(&text).with_context(cannot)?
-            }
+            Some(path) => read_settings(path)?,
         };
         settings.steps = self.steps.map_or(settings.steps, |steps| steps as usize);
         settings.growth.cap = self.cap.map_or(settings.growth.cap, |cap| cap as usize);
@@ -238,6 +193,39 @@ impl TrainScene {
         settings.sky.mode = self.sky.unwrap_or(settings.sky.mode);
         settings.check()?;
         Ok(settings)
+    }
+
+    /// What the run begins with, and its image formation.
+    fn gaussians(
+        &self,
+        source: &Path,
+        settings: &Settings,
+    ) -> anyhow::Result<(Gaussians, RenderProfile)> {
+        let profile = RenderProfile::default();
+        let cap = settings.growth.cap;
+        if let Some(start) = &self.start {
+            let cannot = || format!("--start {}", start.display());
+            let bar = progress::bytes("reading");
+            let limits = ReadLimits::for_own_file();
+            let read = ingest::read_limited(start, &limits, &mut progress::show(&bar));
+            let ReadScene { gaussians, notes, .. } = read.with_context(cannot)?;
+            bar.finish_and_clear();
+            file_notes::print(start, &notes)?;
+            let count = gaussians.len();
+            ensure!(
+                count <= cap,
+                "{} has {count} Gaussians, more than --cap {cap}",
+                start.display()
+            );
+            return Ok((gaussians, notes.profile().apply(profile)?));
+        }
+        let mut points = self.points(source)?;
+        let all = points.len();
+        if all > cap {
+            choose(&mut points, cap, settings.seed);
+            writeln!(io::stderr(), "{cap} of {all} points are chosen: --cap")?;
+        }
+        Ok((gaussians_from_points(&points), profile))
     }
 
     fn points(&self, source: &Path) -> anyhow::Result<Vec<Point>> {
@@ -262,10 +250,17 @@ impl TrainScene {
     }
 }
 
-/// A text by which a checkpoint knows its points.
-fn inputs_of_points(points: &[Point]) -> String {
-    let sum = points.iter().map(|point| point.at_m).sum::<DVec3>();
-    format!("{} points, {sum:?}\n", points.len())
+/// Reads the file of `--settings`.
+pub(super) fn read_settings(path: &Path) -> anyhow::Result<Settings> {
+    let cannot = || format!("--settings {}", path.display());
+    let text = fs::read_to_string(path).with_context(cannot)?;
+    toml::from_str(&text).with_context(cannot)
+}
+
+/// A text by which a checkpoint knows its Gaussians.
+fn inputs_of_gaussians(gaussians: &Gaussians) -> String {
+    let means_m = gaussians.means_m.iter().map(|mean_m| DVec3::from_array(*mean_m));
+    format!("{} Gaussians, {:?}\n", gaussians.len(), means_m.sum::<DVec3>())
 }
 
 /// Keeps as many points as `count`, at random.

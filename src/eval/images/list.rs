@@ -19,6 +19,8 @@ pub struct RealImage {
     pub mask: Option<PathBuf>,
     /// Its depth, if the list says one: a grey PNG of 16 bits in millimetres, 0 where there is none.
     pub depth: Option<PathBuf>,
+    /// Factor of its loss in training, if the list says one.
+    pub weight: Option<f64>,
     pub camera: Camera,
     /// Pose in the axes and unit of the list.
     pub world_from_camera: Pose,
@@ -44,6 +46,7 @@ struct ListedImage {
     posed: PosedImage,
     mask: Option<String>,
     depth: Option<String>,
+    weight: Option<f64>,
     near: Option<f64>,
     exposure_stops: Option<f64>,
 }
@@ -72,7 +75,7 @@ impl ImageList {
             read(source).with_context(|| format!("--images {}", source.display()))?;
         let folder = image_dir.unwrap_or(&folder);
         let mut found = Vec::with_capacity(images.len());
-        for ListedImage { posed, mask, depth, near, exposure_stops } in images {
+        for ListedImage { posed, mask, depth, weight, near, exposure_stops } in images {
             let PosedImage { name, camera, world_from_camera, time_us } = posed;
             let file = image_file(folder, &name)?;
             let mask = match (masks, mask) {
@@ -85,6 +88,7 @@ impl ImageList {
                 file,
                 mask,
                 depth: depth.map(|depth| folder.join(depth)),
+                weight,
                 camera,
                 world_from_camera,
                 near,
@@ -114,6 +118,7 @@ fn read(source: &Path) -> anyhow::Result<Listed> {
             posed,
             mask: None,
             depth: None,
+            weight: None,
             near: None,
             exposure_stops: None,
         };
@@ -128,8 +133,8 @@ fn read(source: &Path) -> anyhow::Result<Listed> {
     if is_dir || has_frames(source)? {
         let capture::NerfstudioCapture { frames, warnings } = capture::read_nerfstudio(source)?;
         let listed = |frame: capture::FrameImage| {
-            let capture::FrameImage { posed, mask, depth, exposure_stops } = frame;
-            ListedImage { posed, mask, depth, near: None, exposure_stops }
+            let capture::FrameImage { posed, mask, depth, weight, exposure_stops } = frame;
+            ListedImage { posed, mask, depth, weight, near: None, exposure_stops }
         };
         let images = frames.into_iter().map(listed).collect();
         let folder = if is_dir { source.to_owned() } else { beside };
@@ -147,7 +152,7 @@ fn read(source: &Path) -> anyhow::Result<Listed> {
             ..
         } = listed;
         let posed = PosedImage { name, camera, world_from_camera, time_us };
-        ListedImage { posed, mask, depth: None, near, exposure_stops }
+        ListedImage { posed, mask, depth: None, weight: None, near, exposure_stops }
     });
     Ok(Listed {
         images: listed.collect(),

@@ -10,6 +10,8 @@
 
 #![allow(clippy::print_stdout, reason = "its result")]
 
+mod demo_street;
+
 use std::error::Error;
 use std::f64::consts::PI;
 use std::fs::File;
@@ -18,36 +20,13 @@ use std::io::{BufWriter, Write};
 use glam::DVec3;
 use wildcity_generate::StreetSettings;
 use wildcity_render::cpu::{Cpu, Simd};
-use wildcity_render::{Backend, Frame, Target, View};
-use wildcity_scene::random::Random;
-use wildcity_scene::{Gaussians, RenderProfile, Rig, Scene, sh};
-use wildcity_train::run::{Line, TrainingImage, TrainingImages, run};
-use wildcity_train::settings::{Growth, Settings};
+use wildcity_scene::{Gaussians, RenderProfile, Scene, sh};
+use wildcity_train::run::{Line, run};
+use wildcity_train::settings::{Growth, PoseMode, Settings, SkyMode};
 use wildcity_train::start::{Point, gaussians_from_points};
+use wildcity_train::trainer::{Start, Trainer};
 
-/// An image of the street.
-struct Recorded {
-    view: View,
-    rgb8: Vec<u8>,
-    is_held_out: bool,
-}
-
-struct Street(Vec<Recorded>);
-
-impl TrainingImages for Street {
-    fn count(&self) -> usize {
-        self.0.len()
-    }
-
-    fn is_held_out(&self, index: usize) -> bool {
-        self.0[index].is_held_out
-    }
-
-    fn load(&self, index: usize) -> Result<TrainingImage, String> {
-        let Recorded { view, rgb8, .. } = &self.0[index];
-        Ok(TrainingImage { view: *view, rgb8: rgb8.clone(), mask: None })
-    }
-}
+use demo_street::{Recorded, Recording, points};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
@@ -56,17 +35,19 @@ fn main() -> Result<(), Box<dyn Error>> {
     let cpu = Cpu::new(0, Simd::Best)?;
     let street = wildcity_generate::street(&StreetSettings::default())?;
     let truth = Scene::from_gaussians(&street.gaussians);
-    let images = record(&cpu, &truth, &street.trajectory, scale)?;
-    let start = start(&street.gaussians, &images);
+    let recording = Recording::new(&cpu, &truth, &street.trajectory, scale)?;
+    let start = start(&street.gaussians, &recording);
     if let Some(path) = arguments.get(2) {
-        export(path, &images, &start)?;
+        export(path, &recording.images, &start)?;
     }
 
     let growth = Growth { cap: 150_000, from: 500, until: 24_000, ..Growth::default() };
-    let settings = Settings { steps, growth, ..Settings::default() };
-    println!("{} images, {} points", images.len(), start.len());
+    let mut settings = Settings { steps, growth, ..Settings::default() };
+    settings.poses.mode = PoseMode::Off;
+    settings.sky.mode = SkyMode::Off;
+    println!("{} images, {} points", recording.images.len(), start.len());
     let mut stages: Vec<(&str, f64)> = Vec::new();
-    let mut on_step = |line: &Line| {
+    let mut on_step = |line: &Line, _: &Trainer| {
         for (stage, ms) in &line.stages_ms {
             match stages.iter_mut().find(|(name, _)| name == stage) {
                 Some((_, sum)) => *sum += ms,
@@ -80,7 +61,9 @@ fn main() -> Result<(), Box<dyn Error>> {
         }
         true
     };
-    run(start, &Street(images), &cpu, RenderProfile::default(), &settings, 250, &mut on_step)?;
+    let start = Start { gaussians: start, ..Start::default() };
+    let mut trainer = Trainer::new(start, RenderProfile::default(), settings)?;
+    run(&mut trainer, &recording, &cpu, 250, &mut on_step)?;
     // On one core (`taskset -c 0`) these are times of the processor.
     for (stage, ms) in stages {
         println!("{stage:18} {:.2} ms a step", ms / steps as f64);
@@ -88,61 +71,11 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-fn record(
-    cpu: &Cpu,
-    scene: &Scene,
-    drive: &wildcity_scene::Trajectory,
-    scale: f64,
-) -> Result<Vec<Recorded>, Box<dyn Error>> {
-    let rig = Rig::preset("vehicle6").ok_or("no rig")?;
-    let mut images = Vec::new();
-    for keyframe in 0..34 {
-        // Three metres apart, in the middle of the drive.
-        let station_m = 0.5 * drive.length_m() + 3.0 * (f64::from(keyframe) - 16.5);
-        let world_from_rig = drive.at_station(station_m);
-        for mut view in View::from_rig(&rig.cameras, world_from_rig) {
-            let side = |px: u32| (f64::from(px) * scale).round() as u64;
-            view.camera =
-                view.camera.scaled(side(view.camera.width_px), side(view.camera.height_px))?;
-            view.rolling_shutter = None;
-            let mut rgb8 = vec![0; 3 * view.camera.pixels()];
-            let profile =
-                RenderProfile { background: [0.55, 0.68, 0.85], ..RenderProfile::default() };
-            let frame = Frame { scene, profile: &profile, views: &[view] };
-            let target = Target { rgb8: Some(&mut rgb8), ..Target::default() };
-            cpu.render(&frame, &mut [target], &|_, _| {})?;
-            // Photographs of this size: what they are trained as.
-            view.camera.native_size_px = None;
-            images.push(Recorded { view, rgb8, is_held_out: keyframe % 8 == 4 });
-        }
-    }
-    Ok(images)
-}
-
-/// A tenth of a million points of the street, moved by 3 cm, and the shell of the sky.
-fn start(truth: &Gaussians, images: &[Recorded]) -> Gaussians {
-    let mut random = Random::new(0, "points", 0);
-    let near = |mean_m: &DVec3| {
-        images
-            .iter()
-            .step_by(72)
-            .any(|image| image.view.world_from_camera.position_m.distance(*mean_m) < 90.0)
-    };
-    let mut order: Vec<usize> =
-        (0..truth.len()).filter(|&i| near(&DVec3::from_array(truth.means_m[i]))).collect();
-    for k in (1..order.len()).rev() {
-        order.swap(k, random.below(k + 1));
-    }
-    order.truncate(94_000);
-    let mut points = Vec::new();
-    for i in order {
-        let mut noise = || (0..12).map(|_| random.unit()).sum::<f64>() - 6.0;
-        let moved_m = 0.03 * DVec3::new(noise(), noise(), noise());
-        let rgb = [0, 1, 2].map(|c| (0.5 + sh::C0 * f64::from(truth.sh_at(i)[c])).clamp(0.0, 1.0));
-        points.push(Point { at_m: DVec3::from_array(truth.means_m[i]) + moved_m, rgb });
-    }
-    let middle = images.iter().map(|image| image.view.world_from_camera.position_m).sum::<DVec3>()
-        / images.len() as f64;
+/// Points of the street, and the shell of the sky.
+fn start(truth: &Gaussians, recording: &Recording) -> Gaussians {
+    let mut points = points(truth, recording);
+    let poses = recording.images.iter().map(|image| image.view.world_from_camera.position_m);
+    let middle = poses.sum::<DVec3>() / recording.images.len() as f64;
     let count = 6_000.0;
     for k in 0..6_000 {
         let z = 1.0 - (f64::from(k) + 0.5) / count;

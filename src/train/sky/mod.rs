@@ -14,10 +14,12 @@ mod layers;
 
 use std::collections::HashMap;
 
-use glam::DVec2;
+use glam::{DVec2, DVec3};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use wildcity_render::View;
+use wildcity_scene::Sky;
 use wildcity_scene::random::{mix, to_unit};
 use wildcity_scene::sky::{Layer, Network, SKY_CUT, SkyError};
 
@@ -73,21 +75,10 @@ impl TrainedSky {
     /// The sky behind an image, where its Gaussians leave something to be seen.
     pub(crate) fn image(&self, view: &View, image: usize, opacity: &[f32]) -> SkyImage {
         let (appearance, _) = &self.appearances[image];
-        let mut nodes = Nodes::new(view);
-        let shows = |pixel: &usize| f64::from(1.0 - opacity[*pixel]) >= SKY_CUT;
-        let pixels: Vec<ShownPixel> =
-            (0..opacity.len()).filter(shows).filter_map(|pixel| nodes.around(pixel)).collect();
-        let inputs = self.layers.inputs(&nodes.directions, appearance);
+        let (directions, pixels) = shown(view, opacity, STRIDE_PX);
+        let inputs = self.layers.inputs(&directions, appearance);
         let colors = self.layers.colors(&inputs);
-        let mut rgb = vec![0.0; 3 * opacity.len()];
-        for ShownPixel { pixel, nodes, weights } in &pixels {
-            for (node, weight) in nodes.iter().zip(weights) {
-                for channel in 0..3 {
-                    rgb[3 * pixel + channel] += weight * colors[3 * node + channel];
-                }
-            }
-        }
-        SkyImage { rgb, inputs, pixels }
+        SkyImage { rgb: interpolated(&colors, &pixels, opacity.len()), inputs, pixels }
     }
 
     /// Moves the network and the appearance of an image, given the derivatives by the image of its
@@ -144,9 +135,44 @@ impl TrainedSky {
     }
 }
 
+/// A sky that is not trained, behind an image: black where it does not show. Images of a sky may
+/// have edges, so that every pixel is evaluated.
+pub(crate) fn fixed_image(sky: &Sky, view: &View, opacity: &[f32]) -> Vec<f32> {
+    let (directions, pixels) = shown(view, opacity, 1);
+    let color = |direction: &[f32; 3]| {
+        sky.rgb(DVec3::from_array(direction.map(f64::from))).as_vec3().to_array()
+    };
+    let colors: Vec<[f32; 3]> = directions.par_iter().map(color).collect();
+    interpolated(colors.as_flattened(), &pixels, opacity.len())
+}
+
+/// The pixels that show sky, and the directions of the nodes that they lie between, which are
+/// `stride_px` apart.
+fn shown(view: &View, opacity: &[f32], stride_px: usize) -> (Vec<[f32; 3]>, Vec<ShownPixel>) {
+    let mut nodes = Nodes::new(view, stride_px);
+    let shows = |pixel: &usize| f64::from(1.0 - opacity[*pixel]) >= SKY_CUT;
+    let pixels = (0..opacity.len()).filter(shows).filter_map(|pixel| nodes.around(pixel));
+    let pixels = pixels.collect();
+    (nodes.directions, pixels)
+}
+
+/// The image `[pixels, 3]` of the colours of nodes.
+fn interpolated(colors: &[f32], shown: &[ShownPixel], pixels: usize) -> Vec<f32> {
+    let mut rgb = vec![0.0; 3 * pixels];
+    for ShownPixel { pixel, nodes, weights } in shown {
+        for (node, weight) in nodes.iter().zip(weights) {
+            for channel in 0..3 {
+                rgb[3 * pixel + channel] += weight * colors[3 * node + channel];
+            }
+        }
+    }
+    rgb
+}
+
 /// The directions of one view at which a network is evaluated.
 struct Nodes<'a> {
     view: &'a View,
+    stride_px: usize,
     width: usize,
     height: usize,
     /// The node of each place of the grid that has been asked for; `None` out of the lens' field.
@@ -155,21 +181,25 @@ struct Nodes<'a> {
 }
 
 impl<'a> Nodes<'a> {
-    fn new(view: &'a View) -> Self {
+    fn new(view: &'a View, stride_px: usize) -> Self {
         let [width, height] = [view.camera.width_px, view.camera.height_px].map(|px| px as usize);
-        Self { view, width, height, grid: HashMap::new(), directions: Vec::new() }
+        Self { view, stride_px, width, height, grid: HashMap::new(), directions: Vec::new() }
     }
 
-    /// The nodes around a pixel; at the edge of a lens' field, the pixel itself. `None` for a pixel
+    /// The nodes around a pixel; at the edge of a lens' field, and at a stride of 1, the pixel itself. `None` for a pixel
     /// outside of it.
     fn around(&mut self, pixel: usize) -> Option<ShownPixel> {
         let at = [pixel % self.width, pixel / self.width];
-        let cell = at.map(|at| at / STRIDE_PX * STRIDE_PX);
+        let stride_px = self.stride_px;
+        let cell = at.map(|at| at / stride_px * stride_px);
         let last = [self.width - 1, self.height - 1];
-        let next = [0, 1].map(|axis| (cell[axis] + STRIDE_PX).min(last[axis]));
+        let next = [0, 1].map(|axis| (cell[axis] + stride_px).min(last[axis]));
         let corners =
             [[cell[0], cell[1]], [next[0], cell[1]], [cell[0], next[1]], [next[0], next[1]]];
-        let nodes = corners.map(|corner| self.node(corner));
+        let mut nodes = [None; 4];
+        if stride_px > 1 {
+            nodes = corners.map(|corner| self.node(corner));
+        }
         let [Some(a), Some(b), Some(c), Some(d)] = nodes else {
             let node = self.node(at)?;
             return Some(ShownPixel { pixel, nodes: [node; 4], weights: [1.0, 0.0, 0.0, 0.0] });

@@ -92,6 +92,44 @@ impl Catalog {
     }
 }
 
+impl Catalog {
+    /// Makes a version with other Gaussians, such as after training, and with all else of an
+    /// existing one. `how` is added to the options of its provenance. `progress` gets the number of
+    /// Gaussians written and in all.
+    ///
+    /// # Errors
+    /// The Gaussians are out of a twin's bounds; others changed the twin since the base
+    /// ([`StoreError::Overlap`]); or as a commit.
+    pub fn replace_gaussians(
+        &self,
+        base: &Version,
+        gaussians: &Gaussians,
+        how: String,
+        progress: &mut dyn FnMut(u64, u64),
+    ) -> Result<Version, StoreError> {
+        let manifest = &base.manifest;
+        let storage = StorageOptions { record: manifest.record, levels: manifest.has_levels() };
+        let mut commit = self.begin(&manifest.twin, CommitKind::Import, storage)?;
+        commit.put(gaussians, None, progress)?;
+        let mut provenance = manifest.provenance.for_edit();
+        provenance.options.push(how);
+        let settings = VersionSettings {
+            profile: manifest.profile,
+            rig: manifest.rig.clone(),
+            trajectories: manifest.trajectories.clone(),
+            sky: manifest.sky.clone().map(NewSky::Kept),
+            geo: manifest.geo.clone(),
+            twin_from_capture: manifest.alignment()?,
+            provenance,
+        };
+        if manifest.views.is_some() {
+            let views = commit.put_views(&self.views(base)?)?;
+            commit.set_views(Some(views));
+        }
+        commit.replace(Some(base.number), settings)
+    }
+}
+
 /// The sky after the world was turned.
 fn turned(sky: &SkyRef, alignment: &Alignment) -> SkyRef {
     // The manifest has rows; `DMat3` has columns.

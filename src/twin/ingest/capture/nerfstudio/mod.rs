@@ -21,6 +21,9 @@ use crate::ingest::file::read_whole;
 use crate::limits;
 use intrinsics::{Intrinsics, Wrong};
 
+/// Largest factor of a loss.
+const MOST_WEIGHT: f64 = 1e3;
+
 /// The file. Fields without an effect on cameras and images, such as `aabb_scale` and
 /// `ply_file_path`, are not listed.
 #[derive(Deserialize)]
@@ -36,6 +39,7 @@ struct Frame {
     transform_matrix: Vec<Vec<f64>>,
     mask_path: Option<String>,
     depth_file_path: Option<String>,
+    weight: Option<f64>,
     time_us: Option<Value>,
     exposure_stops: Option<f64>,
     #[serde(flatten)]
@@ -52,6 +56,8 @@ pub struct FrameImage {
     /// File of its depth (`depth_file_path`): a grey PNG of 16 bits in millimetres, 0 where there
     /// is none.
     pub depth: Option<String>,
+    /// Factor of its loss (`weight`): 1 without it, and less for images that were not recorded.
+    pub weight: Option<f64>,
     /// Its exposure (`exposure_stops`) in stops relative to the scene's, if the file has it.
     pub exposure_stops: Option<f64>,
 }
@@ -89,13 +95,19 @@ pub fn read(path: &Path) -> Result<NerfstudioCapture, CaptureError> {
         let mask = frame.mask_path.take();
         let depth = frame.depth_file_path.take();
         let exposure_stops = frame.exposure_stops;
+        let weight = frame.weight;
+        if let Some(weight) = weight.filter(|weight| !(0.0..=MOST_WEIGHT).contains(weight)) {
+            let place = Place::Field(format!("frames[{index}].weight"));
+            let reason = format!("{weight} is no factor of a loss; give 0 to {MOST_WEIGHT}");
+            return Err(CaptureError::at(path, place, reason));
+        }
         if let Some(stops) = refused_stops(exposure_stops) {
             let place = Place::Field(format!("frames[{index}].exposure_stops"));
             let reason = format!("{stops}; give -{MOST_STOPS} to {MOST_STOPS}");
             return Err(CaptureError::at(path, place, reason));
         }
         let posed = posed(path, index, frame, &file.intrinsics)?;
-        Ok(FrameImage { posed, mask, depth, exposure_stops })
+        Ok(FrameImage { posed, mask, depth, weight, exposure_stops })
     };
     Ok(NerfstudioCapture { frames: frames.map(read).collect::<Result<_, _>>()?, warnings })
 }

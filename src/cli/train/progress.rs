@@ -1,0 +1,47 @@
+//! A run that shows how far it is, and stops when it is asked to.
+
+use std::io::{self, IsTerminal};
+use std::sync::atomic::Ordering;
+
+use wildcity_render::gradient::Differentiate;
+use wildcity_train::run::{Line, run};
+use wildcity_train::trainer::Trainer;
+
+use super::checkpoints::stop_flag;
+use super::images::ListedImages;
+use super::lines::log;
+use crate::cli::progress;
+
+/// Goes on to the last step, or until the process is asked to stop. `each` is called after each
+/// step. Returns the PSNR of the images that are held out, when it was measured last, and the
+/// seconds until then.
+pub(super) fn train(
+    trainer: &mut Trainer,
+    images: &ListedImages<'_>,
+    backend: &dyn Differentiate,
+    each: &mut dyn FnMut(&Line, &Trainer) -> anyhow::Result<()>,
+) -> anyhow::Result<Option<(f64, f64)>> {
+    let every = (trainer.settings().steps / 10).max(1);
+    let stops = stop_flag()?;
+    let bar = progress::count("training");
+    bar.set_length(trainer.settings().steps as u64);
+    let mut last = None;
+    let mut failed = None;
+    let mut on_step = |line: &Line, trainer: &Trainer| {
+        bar.set_position(line.step as u64);
+        if let Some(db) = line.held_out_db {
+            bar.set_message(format!("{db:.2} dB"));
+            last = Some((db, line.seconds));
+        }
+        let mut said = Ok(());
+        // A log has no bar.
+        if line.step.is_multiple_of(every) && !io::stderr().is_terminal() {
+            said = log(line).map_err(anyhow::Error::from);
+        }
+        failed = said.and_then(|()| each(line, trainer)).err();
+        failed.is_none() && !stops.load(Ordering::Relaxed)
+    };
+    run(trainer, images, backend, every, &mut on_step)?;
+    bar.finish_and_clear();
+    failed.map_or(Ok(last), Err)
+}

@@ -1,0 +1,200 @@
+//! `wildcity train refine`.
+
+use std::io::{self, Write};
+use std::path::PathBuf;
+
+use anyhow::{Context, ensure};
+use wildcity_eval::images::ImageList;
+use wildcity_render::gradient::Differentiate;
+use wildcity_scene::align::Alignment;
+use wildcity_scene::{Gaussians, Manifest};
+use wildcity_train::run::TrainingImages;
+use wildcity_train::settings::{PoseMode, Settings, SkyMode};
+use wildcity_train::trainer::{Start, Trainer};
+use wildcity_twin::residency::Cache;
+use wildcity_twin::store::Version;
+
+use super::images::ListedImages;
+use super::progress::train;
+use super::scene::{fraction, read_settings};
+use crate::cli::backend_options::HardwareOptions;
+use crate::cli::directories::{EditedTwin, Twins};
+use crate::cli::{file_notes, output, placement, progress};
+
+/// Train a twin further, on the images of its recording and on views off its drives.
+///
+/// `wildcity augment` renders views off the drives, repairs them with a model and writes them with
+/// masks and weights. This command trains the Gaussians of the twin on them, beside the recorded
+/// images, and makes a new version of the twin. So the twin gets accurate farther off its drives,
+/// round by round (`wildcity train loop` does all rounds). Poses and sky stay as they are, and no
+/// Gaussians are added.
+///
+/// Of the steps, 0.3 are made on the views of --augmented, and the loss of each has the weight that
+/// its list says. Prints the PSNR of the recorded images that were held out, before and after.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = EXAMPLES)]
+pub(in crate::cli) struct Refine {
+    #[command(flatten)]
+    edited: EditedTwin,
+
+    /// The recorded images with their cameras, in the form of `wildcity eval --images`.
+    #[arg(long, value_name = "FILE_OR_DIR")]
+    images: PathBuf,
+
+    /// Folder of the recorded images, as for `wildcity eval`.
+    #[arg(long, value_name = "DIR")]
+    image_dir: Option<PathBuf>,
+
+    /// Folder of masks of the recorded images, as for `wildcity eval`.
+    #[arg(long, value_name = "DIR")]
+    masks: Option<PathBuf>,
+
+    /// Axes of the poses of --images, in the form of `wildcity import --axes` [default: as the twin
+    /// was imported and aligned; identity for a list]
+    #[arg(long, value_name = "AXES", allow_hyphen_values = true)]
+    axes: Option<String>,
+
+    /// Metres per unit of these poses; only with --axes, and applied after it [default: 1]
+    #[arg(long, value_name = "M", requires = "axes")]
+    scale: Option<f64>,
+
+    /// Views off the drives: a folder DIR/round_N of `wildcity augment`. May be given again.
+    #[arg(long, value_name = "DIR")]
+    augmented: Vec<PathBuf>,
+
+    /// Steps, each on one image.
+    #[arg(long, default_value_t = 2_000, value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
+    steps: u32,
+
+    /// Train on images of this fraction of their width, from 0.05 to 1.
+    #[arg(long, value_name = "FRACTION", default_value_t = 1.0, value_parser = fraction)]
+    size: f64,
+
+    /// Hold out one recorded image of N. 0 holds out none.
+    #[arg(long, value_name = "N", default_value_t = 8)]
+    held_out_every: usize,
+
+    /// TOML file of all settings [default: those of `wildcity train settings`, with a tenth of the
+    /// learning rate of means, and without growth]
+    #[arg(long, value_name = "FILE")]
+    settings: Option<PathBuf>,
+
+    #[command(flatten)]
+    twins: Twins,
+
+    #[command(flatten)]
+    hardware: HardwareOptions,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity augment street --repair model.json --round 1 --out augmented
+  wildcity train refine street --images capture --augmented augmented/round_1";
+
+impl Refine {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        let settings = self.training_settings()?;
+        let catalog = self.twins.catalog()?;
+        let base = catalog.version(&self.edited.twin.name, self.edited.twin.number)?;
+        let recorded =
+            ImageList::read(&self.images, self.image_dir.as_deref(), self.masks.as_deref())?;
+        file_notes::print_warnings(&self.images, &recorded.warnings)?;
+        let read = |dir: &PathBuf| {
+            ImageList::read(dir, None, None)
+                .with_context(|| format!("--augmented {}", dir.display()))
+        };
+        let rounds: Vec<ImageList> = self.augmented.iter().map(read).collect::<Result<_, _>>()?;
+        let mut images = ListedImages::new(self.size, self.held_out_every);
+        images.add(&recorded, &self.alignment(&base, &recorded)?, false)?;
+        for round in &rounds {
+            // `augment` writes poses in the twin's axes.
+            images.add(round, &Alignment::IDENTITY, true)?;
+        }
+        let backends = self.hardware.differentiating()?;
+        let backend: &dyn Differentiate = match backends.last() {
+            Some(backend) => backend.as_ref(),
+            None => anyhow::bail!("no backend computes gradients"),
+        };
+
+        let Manifest { sh_degree, profile, .. } = base.manifest;
+        let mut gaussians = Gaussians { sh_degree, ..Gaussians::default() };
+        catalog.visit_full_detail(&base, &|_| true, &mut |section| gaussians.append(&section))?;
+        let name = &self.edited.twin.name;
+        ensure!(!gaussians.is_empty(), "twin {name} has no Gaussians");
+        writeln!(
+            io::stderr(),
+            "twin {name} version {}: {}; {}, {} of them held out; backend {}",
+            base.number,
+            output::counted(gaussians.len(), "Gaussian"),
+            output::counted(images.count(), "image"),
+            images.held_out(),
+            backend.name()
+        )?;
+        let resident = Cache::new(self.twins.catalog()?).open(name, Some(base.number))?;
+        let start = Start {
+            gaussians,
+            world_from_camera: images.poses(),
+            sky: resident.sky().cloned(),
+            ..Start::default()
+        };
+        let mut trainer = Trainer::new(start, profile, settings)?;
+        let before = wildcity_train::run::held_out_db(&trainer, &images, backend)?;
+        let after = train(&mut trainer, &images, backend, &mut |_, _| Ok(()))?;
+        let steps = trainer.settings().steps;
+        let done = trainer.steps_done();
+        ensure!(done == steps, "stopped after {done} of {steps} steps: the twin is as it was");
+
+        let bar = progress::count("writing");
+        let how = format!("refine={}", self.description());
+        let gaussians = trainer.model().to_gaussians();
+        let version =
+            catalog.replace_gaussians(&base, &gaussians, how, &mut progress::show(&bar))?;
+        bar.finish_and_clear();
+        let Version { number, hash, .. } = &version;
+        let mut stdout = io::stdout().lock();
+        if let Some((before, (after, seconds))) = before.zip(after) {
+            writeln!(
+                stdout,
+                "held out: {before:.2} dB, and {after:.2} dB after {steps} steps, {seconds:.0} s"
+            )?;
+        }
+        writeln!(
+            stdout,
+            "twin {name} version {number}: {} Gaussians\nblake3 {hash}",
+            gaussians.len()
+        )?;
+        Ok(())
+    }
+
+    /// What the provenance of the version says.
+    fn description(&self) -> String {
+        let rounds = self.augmented.iter().filter_map(|dir| dir.file_name());
+        let rounds: Vec<String> = rounds.map(|name| name.display().to_string()).collect();
+        format!("{} steps, {}", self.steps, rounds.join(", "))
+    }
+
+    fn training_settings(&self) -> anyhow::Result<Settings> {
+        let mut settings = Settings::default();
+        settings.rates.mean *= 0.1;
+        settings.growth.from = 0;
+        settings.growth.until = 0;
+        settings.growth.noise = 0.0;
+        if let Some(path) = &self.settings {
+            settings = read_settings(path)?;
+        }
+        settings.steps = self.steps as usize;
+        settings.poses.mode = PoseMode::Off;
+        settings.sky.mode = SkyMode::Off;
+        settings.check()?;
+        Ok(settings)
+    }
+
+    /// The transform from the axes of the recorded poses to those of the twin.
+    fn alignment(&self, base: &Version, list: &ImageList) -> anyhow::Result<Alignment> {
+        match &self.axes {
+            Some(axes) => placement::imported(axes, self.scale.unwrap_or(1.0)),
+            None if list.is_in_scene_axes => Ok(Alignment::IDENTITY),
+            None => placement::from_version(&self.twins.catalog()?, base),
+        }
+    }
+}
