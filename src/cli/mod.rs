@@ -150,6 +150,12 @@ impl Moved {
     }
 }
 
+/// Runs a command as from the command line, for commands that are made of others.
+#[cfg(feature = "train")]
+fn run_arguments(arguments: Vec<std::ffi::OsString>) -> anyhow::Result<()> {
+    Arguments::try_parse_from(arguments)?.command.run()
+}
+
 /// Parses the command line, runs the command, and returns the exit code: 0 for success, 1 for a
 /// failure, and 3 for a recording that is cut (`replay --verify`). A command line that cannot be
 /// parsed ends the process with code 2.

@@ -71,6 +71,7 @@ mod served;
 mod sky;
 mod suites;
 mod traces;
+mod train;
 mod twin;
 mod views;
 

@@ -7,6 +7,7 @@ mod lines;
 mod progress;
 mod refine;
 mod result;
+mod rounds;
 mod scene;
 mod settings;
 
@@ -42,6 +43,7 @@ Examples:
 
 subcommands! { TrainCommand;
     Refine(refine::Refine),
+    Loop(rounds::Loop),
     Check(check::Check),
     Settings(settings::PrintSettings),
 }

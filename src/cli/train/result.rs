@@ -31,18 +31,21 @@ impl Written {
         Ok(Self { ply: ply.to_owned(), sky: sky.transpose()? })
     }
 
-    /// What to do with the files.
-    pub(super) fn print(&self, source: &Path, gaussians: usize) -> io::Result<()> {
+    /// Says what was written, and what to do with it.
+    pub(super) fn print(&self, source: &Path, gaussians: usize, help: bool) -> io::Result<()> {
         let Self { ply, sky } = self;
         let mut stdout = io::stdout().lock();
+        let (name, source) = (ply.display(), source.display());
+        writeln!(stdout, "{name}: {gaussians} Gaussians, in the axes and the unit of {source}")?;
+        if !help {
+            return Ok(());
+        }
         let sky = sky.as_ref().map_or(String::new(), |sky| format!(" --sky {sky:?}"));
         writeln!(
             stdout,
-            "{}: {gaussians} Gaussians, in the axes and the unit of {}; make a twin of it:\n\
+            "make a twin of it:\n\
              wildcity import {ply:?} --twin NAME --axes AXES{sky}\n\
              AXES is identity if z is up, and y-down-z-forward for most models of COLMAP",
-            ply.display(),
-            source.display(),
         )
     }
 }

@@ -1,5 +1,6 @@
 //! `wildcity train SOURCE`.
 
+use std::ffi::OsString;
 use std::fs;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
@@ -23,6 +24,7 @@ use super::images::ListedImages;
 use super::lines::LinesFile;
 use super::progress::train;
 use super::result::Written;
+use crate::cli;
 use crate::cli::backend_options::HardwareOptions;
 use crate::cli::{file_notes, output, progress};
 
@@ -37,6 +39,19 @@ pub(super) struct TrainScene {
     /// PLY file to write, which `wildcity import` and other viewers and trainers read.
     #[arg(long, value_name = "FILE", required = true)]
     out: Option<PathBuf>,
+
+    /// Make a twin of the result: the name of a new twin, or of one that gets a new version.
+    #[arg(long, value_name = "NAME")]
+    twin: Option<String>,
+
+    /// Axes of the poses, for --twin, in the form of `wildcity import --axes` [default: those of
+    /// the twin's latest version, or identity]
+    #[arg(long, value_name = "AXES", allow_hyphen_values = true, requires = "twin")]
+    axes: Option<String>,
+
+    /// Directory of the twins, for --twin, as for `wildcity import`.
+    #[arg(long, value_name = "DIR_OR_URL", requires = "twin")]
+    twins: Option<OsString>,
 
     /// Folder of the images [default: images beside a COLMAP model; the folder of a
     /// transforms.json]
@@ -178,8 +193,27 @@ impl TrainScene {
             let mut stdout = io::stdout().lock();
             writeln!(stdout, "held out: {db:.2} dB after {steps} steps, {seconds:.0} s")?;
         }
-        written.print(source, trainer.model().len())?;
-        Ok(())
+        written.print(source, trainer.model().len(), self.twin.is_none())?;
+        match &self.twin {
+            Some(twin) => cli::run_arguments(self.import(twin, written)),
+            None => Ok(()),
+        }
+    }
+
+    /// The command that makes a twin of the result.
+    fn import(&self, twin: &str, written: Written) -> Vec<OsString> {
+        let mut arguments: Vec<OsString> = ["wildcity", "import"].map(OsString::from).to_vec();
+        let Written { ply, sky } = written;
+        arguments.extend([ply.into(), "--twin".into(), twin.into()]);
+        let given = [
+            ("--axes", self.axes.clone().map(OsString::from)),
+            ("--twins", self.twins.clone()),
+            ("--sky", sky.map(OsString::from)),
+        ];
+        for (name, value) in given {
+            arguments.extend(value.into_iter().flat_map(|value| [name.into(), value]));
+        }
+        arguments
     }
 
     fn settings(&self) -> anyhow::Result<Settings> {

@@ -1,0 +1,146 @@
+//! `wildcity train`: from images to a twin, stopped and resumed; a twin that is refined.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use wildcity_twin::store::Catalog;
+
+use crate::in_folder::{done, refused};
+use crate::wildcity;
+
+/// A lane of 100 m, and views of it as if they had been recorded.
+fn recorded(dir: &Path) {
+    done(
+        dir,
+        &[
+            "twin",
+            "generate",
+            "--twin",
+            "lane",
+            "--twins",
+            "twins",
+            "--length-km",
+            "0.1",
+            "--density",
+            "0.3",
+        ],
+    );
+    let views = ["--offsets", "0.01", "--every", "25m", "--side", "160", "--cameras", "front,rear"];
+    let fixed = ["augment", "lane", "--twins", "twins", "--out", "recorded", "--points", "3000"];
+    done(dir, &[&fixed[..], &views].concat());
+}
+
+const SCENE: [&str; 10] = [
+    "train",
+    "recorded/round_1",
+    "--sky",
+    "network",
+    "--threads",
+    "2",
+    "--held-out-every",
+    "5",
+    "--steps",
+    "60",
+];
+
+fn train(out: &str, more: &[&str]) -> Vec<String> {
+    [&SCENE[..], &["--out", out], more].concat().into_iter().map(str::to_owned).collect()
+}
+
+fn as_strs(arguments: &[String]) -> Vec<&str> {
+    arguments.iter().map(String::as_str).collect()
+}
+
+#[test]
+fn a_run_that_is_stopped_goes_on_to_the_same_files() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    recorded(dir);
+    let said = done(dir, &as_strs(&train("whole.ply", &[])));
+    assert!(said.contains("held out: ") && said.contains("wildcity import"), "{said}");
+
+    // Stopped after some steps by SIGTERM.
+    let mut child = wildcity()
+        .args(train("again.ply", &["--lines", "lines.jsonl"]))
+        .current_dir(dir)
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    let began = Instant::now();
+    let lines = || fs::read_to_string(dir.join("lines.jsonl")).unwrap_or_default().lines().count();
+    while lines() < 3 && began.elapsed() < Duration::from_secs(120) {
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let killed = Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap();
+    assert!(killed.success());
+    assert_eq!(child.wait().unwrap().code(), Some(1));
+    assert!(dir.join("again.ply.checkpoint").is_file() && !dir.join("again.ply").exists());
+
+    let error = refused(dir, &as_strs(&train("again.ply", &[])));
+    assert!(error.contains("--resume goes on with it"), "{error}");
+    let error = refused(dir, &as_strs(&train("again.ply", &["--resume", "--seed", "4"])));
+    assert!(error.contains("other settings"), "{error}");
+    let error = refused(dir, &as_strs(&train("again.ply", &["--resume", "--size", "0.5"])));
+    assert!(error.contains("other images"), "{error}");
+    let error = refused(dir, &as_strs(&train("other.ply", &["--resume"])));
+    assert!(error.contains("begin without --resume"), "{error}");
+    done(dir, &as_strs(&train("again.ply", &["--resume", "--lines", "lines.jsonl"])));
+    for name in ["ply", "sky.safetensors"] {
+        let [whole, again] =
+            ["whole", "again"].map(|stem| fs::read(dir.join(format!("{stem}.{name}"))).unwrap());
+        assert!(whole == again, "{name}");
+    }
+    assert_eq!(lines(), 60);
+    assert!(!dir.join("again.ply.checkpoint").exists());
+
+    // A scene that begins where the other ended, and a twin of it.
+    let more =
+        ["--start", "whole.ply", "--twin", "again", "--twins", "twins", "--axes", "identity"];
+    let said = done(dir, &as_strs(&train("further.ply", &more)));
+    assert!(said.contains("twin again version 1"), "{said}");
+    let version = Catalog::open(&dir.join("twins")).unwrap().version("again", None).unwrap();
+    assert!(version.manifest.sky.is_some());
+    assert_eq!(version.manifest.gaussians(), 3_000);
+    let error = refused(dir, &as_strs(&train("x.ply", &["--start", "whole.ply", "--cap", "9"])));
+    assert!(error.contains("more than --cap 9"), "{error}");
+}
+
+#[test]
+fn a_worn_twin_gets_better_by_its_recorded_images() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    recorded(dir);
+    let worn = ["--length-km", "0.1", "--density", "0.3", "--spoil", "1"];
+    done(dir, &[&["twin", "generate", "--twin", "worn", "--twins", "twins"][..], &worn].concat());
+    let images = ["--images", "recorded/round_1", "--axes", "identity"];
+    let fixed = ["train", "loop", "worn", "--twins", "twins", "--out", "rounds", "--rounds", "2"];
+    let small = ["--every", "50", "--offsets", "1", "--side", "160", "--steps", "40"];
+    let said = done(dir, &[&fixed[..], &images, &small].concat());
+    let rounds: Vec<&str> = said.lines().filter(|line| line.starts_with("held out: ")).collect();
+    assert_eq!(rounds.len(), 2, "{said}");
+    let decibels =
+        |line: &str| -> Vec<f64> { line.split(' ').filter_map(|word| word.parse().ok()).collect() };
+    for round in &rounds {
+        let values = decibels(round);
+        assert!(values[1] > values[0] + 0.1, "{round}");
+    }
+    let catalog = Catalog::open(&dir.join("twins")).unwrap();
+    let [first, last] = [1, 3].map(|number| catalog.version("worn", Some(number)).unwrap());
+    assert_eq!(last.manifest.gaussians(), first.manifest.gaussians());
+    assert_eq!(last.manifest.trajectories, first.manifest.trajectories);
+    assert_eq!(last.manifest.rig, first.manifest.rig);
+    let options = &last.manifest.provenance.options;
+    assert!(options.iter().any(|option| option == "refine=40 steps, round_2"), "{options:?}");
+
+    let refine = ["train", "refine", "worn", "--twins", "twins"];
+    let error = refused(dir, &[&refine[..], &images, &["--augmented", "nowhere"]].concat());
+    assert!(error.contains("--augmented nowhere"), "{error}");
+    let error = refused(dir, &[&refine[..], &["--images", "recorded/round_1/images"]].concat());
+    assert!(error.contains("--images"), "{error}");
+    let fixed = ["train", "loop", "worn", "--twins", "twins", "--out", "rounds", "--from", "11"];
+    let error = refused(dir, &[&fixed[..], &images].concat());
+    assert!(error.contains("--from 11 is after the last round"), "{error}");
+}
