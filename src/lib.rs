@@ -19,7 +19,7 @@
 //! | [`wildcity_score`] | scores of driven episodes: other projects', and our verdict | scene, sim |
 //! | [`wildcity_episode`] | recorded episodes: their lines, reading, scoring and comparing them | scene, score, sim |
 //! | [`wildcity_augment`] | views off the drive as training data: plan, masks, transforms.json, COLMAP, resume | client, scene, session, twin |
-//! | [`wildcity_eval`] | rendered images against held-out real ones: scores and their page | augment, client, render, repair, scene, session, twin |
+//! | [`wildcity_eval`] | rendered images against held-out real ones: scores and their page | augment, client, log, render, repair, scene, session, twin |
 //! | [`wildcity_train`] | training on images: losses, gradients against their definition | render, scene |
 //! | [`wildcity_stress`] | extreme scenes, each with its bound, for every backend | generate, render, scene |
 //! | [`wildcity_twin`] | twins on disk and in memory: import, versioned store, streaming | options, scene |

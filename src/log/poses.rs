@@ -2,6 +2,7 @@
 
 use wildcity_scene::Trajectory;
 use wildcity_scene::geometry::Pose;
+use wildcity_scene::route::KEYFRAME_SPACING_M;
 use wildcity_scene::trajectory::Keyframe;
 
 use crate::limits::LARGEST_GAP_US;
@@ -48,9 +49,70 @@ impl Poses {
         Some(before.world_from_rig.interpolate(&next.world_from_rig, share))
     }
 
-    /// The poses as a drive of a twin.
-    pub fn into_trajectory(self, name: impl Into<String>) -> Trajectory {
-        Trajectory { name: name.into(), keyframes: self.keyframes }
+    /// The poses as a drive of a twin: those that are [`KEYFRAME_SPACING_M`] or half of
+    /// [`LARGEST_GAP_US`] after the one before, the first and the last. So poses between them can
+    /// still be interpolated.
+    pub fn drive(&self, name: impl Into<String>) -> Trajectory {
+        let mut keyframes: Vec<Keyframe> = Vec::new();
+        for (at, key) in self.keyframes.iter().enumerate() {
+            let is_last = at + 1 == self.keyframes.len();
+            let is_far = |last: &Keyframe| {
+                let [from_m, to_m] = [last, key].map(|key| key.world_from_rig.position_m);
+                // As `Route::subsample`: in spite of rounding.
+                from_m.distance(to_m) >= 0.999 * KEYFRAME_SPACING_M
+                    || key.time_us.abs_diff(last.time_us) >= LARGEST_GAP_US.unsigned_abs() / 2
+            };
+            if is_last || keyframes.last().is_none_or(is_far) {
+                keyframes.push(*key);
+            }
+        }
+        Trajectory { name: name.into(), keyframes }
+    }
+}
+
+/// Distances along the drive.
+#[derive(Clone, Debug)]
+pub struct Stations<'a> {
+    poses: &'a Poses,
+    /// Distance of each pose from the start, in metres.
+    stations_m: Vec<f64>,
+}
+
+impl<'a> Stations<'a> {
+    /// Distances from the first pose.
+    pub fn new(poses: &'a Poses) -> Self {
+        let mut station_m = 0.0;
+        let steps = poses.keyframes.windows(2).map(|pair| {
+            let [from_m, to_m] = [0, 1].map(|at| pair[at].world_from_rig.position_m);
+            station_m += from_m.distance(to_m);
+            station_m
+        });
+        let stations_m = std::iter::once(0.0).chain(steps).collect();
+        Self { poses, stations_m }
+    }
+
+    /// Length of the drive, in metres.
+    pub fn length_m(&self) -> f64 {
+        self.stations_m.last().copied().unwrap_or(0.0)
+    }
+
+    /// The distance from the start at a time, in metres; `None` where there is no pose.
+    pub fn at(&self, time_us: i64) -> Option<f64> {
+        self.poses.at(time_us)?;
+        let keys = &self.poses.keyframes;
+        let after = keys.partition_point(|key| key.time_us <= time_us);
+        let before = after.checked_sub(1)?;
+        let from_m = self.stations_m[before];
+        let Some(to_m) = self.stations_m.get(after) else { return Some(from_m) };
+        let since_us = |until_us: i64| until_us.abs_diff(keys[before].time_us) as f64;
+        let share = since_us(time_us) / since_us(keys[after].time_us);
+        Some(from_m + share * (to_m - from_m))
+    }
+
+    /// The time of the first pose at a distance or later, in microseconds; `None` beyond the end.
+    pub(crate) fn time_us(&self, station_m: f64) -> Option<i64> {
+        let at = self.stations_m.partition_point(|other_m| *other_m < station_m);
+        self.poses.keyframes.get(at).map(|key| key.time_us)
     }
 }
 

@@ -69,6 +69,9 @@ pub struct ImageRow {
     /// How long each of its rows was exposed, in microseconds, if that is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub exposure_us: Option<i64>,
+    /// Whether it is held out: no scene is trained on it, and evaluations compare with it.
+    #[serde(default, skip_serializing_if = "is_false")]
+    pub held_out: bool,
 }
 
 /// A sweep of a LiDAR: a row of `lidar.jsonl`.
@@ -247,6 +250,10 @@ impl Row for GpsRow {
         check_angle("longitude_deg", self.longitude_deg, 180.0)?;
         check_finite("altitude_m", &[self.altitude_m])
     }
+}
+
+fn is_false(value: &bool) -> bool {
+    !value
 }
 
 fn check_file(field: &str, file: &str) -> Result<(), FieldError> {

@@ -3,5 +3,6 @@
 #[path = "../support/root.rs"]
 mod root;
 
+mod projection;
 mod reading;
 mod schema;

@@ -33,6 +33,7 @@ fn image(time_us: i64, camera: &str) -> ImageRow {
         sky_mask: None,
         exposure_stops: Some(-0.5),
         exposure_us: None,
+        held_out: false,
     }
 }
 
