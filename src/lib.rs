@@ -15,10 +15,11 @@
 //! | [`wildcity_generate`] | procedural streets and cities, and their maps | scene, sim |
 //! | [`wildcity_sim`] | what moves: ego, traffic, contacts; scenarios, maps and routes | options, scene |
 //! | [`wildcity_convert`] | maps and scenarios from OpenDRIVE, GeoJSON and OpenSCENARIO | options, scene, sim |
+//! | [`wildcity_log`] | recorded drives on disk: images, LiDAR, poses, tracks, map, with their times | options, scene, sim |
 //! | [`wildcity_score`] | scores of driven episodes: other projects', and our verdict | scene, sim |
 //! | [`wildcity_episode`] | recorded episodes: their lines, reading, scoring and comparing them | scene, score, sim |
 //! | [`wildcity_augment`] | views off the drive as training data: plan, masks, transforms.json, COLMAP, resume | client, scene, session, twin |
-//! | [`wildcity_eval`] | rendered images against held-out real ones: scores and their page | augment, client, render, repair, scene, session, twin |
+//! | [`wildcity_eval`] | rendered images against held-out real ones: scores and their page | augment, client, log, render, repair, scene, session, twin |
 //! | [`wildcity_train`] | training on images: losses, gradients against their definition | render, scene |
 //! | [`wildcity_stress`] | extreme scenes, each with its bound, for every backend | generate, render, scene |
 //! | [`wildcity_twin`] | twins on disk and in memory: import, versioned store, streaming | options, scene |

@@ -10,7 +10,7 @@ use wildcity_scene::geometry::Pose;
 
 use crate::cameras::{CameraModel, TrainingCamera};
 use crate::points::Point;
-use crate::record::Sample;
+use crate::training_image::TrainingImage;
 
 /// How the files are written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -39,7 +39,7 @@ pub struct ColmapModel<'a> {
     /// The cameras; COLMAP counts them from 1.
     pub cameras: &'a [TrainingCamera],
     /// The images, counted from 1 as well.
-    pub samples: &'a [Sample],
+    pub images: &'a [TrainingImage],
     pub points: &'a [Point],
 }
 
@@ -69,10 +69,10 @@ impl ColmapModel<'_> {
         [pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy].into_iter().chain(more).collect()
     }
 
-    /// Index of a sample's camera, from 1.
-    fn camera_id(&self, sample: &Sample) -> u32 {
-        let index = self.cameras.iter().position(|camera| camera.name == sample.camera);
-        // Samples are made of these cameras: 0, which COLMAP lacks, does not occur.
+    /// Index of an image's camera, from 1.
+    fn camera_id(&self, image: &TrainingImage) -> u32 {
+        let index = self.cameras.iter().position(|camera| camera.name == image.camera);
+        // Images are of these cameras: 0, which COLMAP lacks, does not occur.
         index.map_or(0, |index| index as u32 + 1)
     }
 
@@ -93,13 +93,13 @@ impl ColmapModel<'_> {
         let mut text =
             "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] (none)\n"
                 .to_owned();
-        for (id, sample) in (1..).zip(self.samples) {
+        for (id, image) in (1..).zip(self.images) {
             let _ = write!(text, "{id}");
-            for value in camera_from_world(&sample.world_from_camera) {
+            for value in camera_from_world(&image.world_from_camera) {
                 let _ = write!(text, " {value}");
             }
             // The empty line is the image's list of points.
-            let _ = write!(text, " {} {}\n\n", self.camera_id(sample), sample.name);
+            let _ = write!(text, " {} {}\n\n", self.camera_id(image), image.name);
         }
         text
     }
@@ -126,13 +126,13 @@ impl ColmapModel<'_> {
     }
 
     fn images_binary(&self) -> Vec<u8> {
-        let mut bytes = (self.samples.len() as u64).to_le_bytes().to_vec();
-        for (id, sample) in (1_u32..).zip(self.samples) {
+        let mut bytes = (self.images.len() as u64).to_le_bytes().to_vec();
+        for (id, image) in (1_u32..).zip(self.images) {
             bytes.extend(id.to_le_bytes());
-            let pose = camera_from_world(&sample.world_from_camera);
+            let pose = camera_from_world(&image.world_from_camera);
             bytes.extend(pose.into_iter().flat_map(f64::to_le_bytes));
-            bytes.extend(self.camera_id(sample).to_le_bytes());
-            bytes.extend(sample.name.as_bytes());
+            bytes.extend(self.camera_id(image).to_le_bytes());
+            bytes.extend(image.name.as_bytes());
             // A name ends with a zero byte.
             bytes.push(0);
             // Points in the image.
@@ -182,26 +182,18 @@ mod tests {
         let cameras = [named("left"), named("front")];
         // The camera looks east from (1, 2, 3): the world's origin is 2 m to its right, 3 m below,
         // 1 m behind it.
-        let sample = Sample {
+        let image = TrainingImage {
             name: "front/a.png".to_owned(),
-            trajectory: "log".to_owned(),
-            station_m: 0.0,
-            offset_m: 0.5,
             camera: "front".to_owned(),
             // Camera x south, y down, z east.
             world_from_camera: Pose::checked([1.0, 2.0, 3.0], [0.5, -0.5, 0.5, -0.5]).unwrap(),
-            trust: 1.0,
-            weight: 0.3,
-            counted: 1.0,
-            repair: None,
-            files: Default::default(),
         };
         let points = [Point { at_m: [1.0, -2.5, 3.0], rgb8: [1, 2, 255] }];
-        let samples = [sample];
+        let images = [image];
         let made = ColmapModel {
             model: CameraModel::Pinhole,
             cameras: &cameras,
-            samples: &samples,
+            images: &images,
             points: &points,
         };
         let [(name, cameras), (_, images), (_, points)] = made.files(ColmapForm::Text);

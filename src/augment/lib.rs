@@ -11,6 +11,7 @@
 //! colmap        sparse/0, as COLMAP reads it
 //! run           a round from start to end
 //! points        Gaussians as COLMAP's points
+//! training_image an image of a data set, without what a round says of it
 //! ```
 //!
 //! This package does not render: `run` draws the views through a server, like any agent. The idea
@@ -27,6 +28,7 @@ mod plan;
 mod points;
 mod record;
 mod run;
+mod training_image;
 mod transforms;
 
 pub use cameras::{CameraModel, TrainingCamera, without_lens};
@@ -40,4 +42,5 @@ pub use record::{
     Header, MadeWith, Options, RepairedWith, Sample, SampleFiles, SampleRepair, weight,
 };
 pub use run::{Augmentation, PLACE_TIMEOUT, Progress, Round, Settings};
-pub use transforms::transforms;
+pub use training_image::TrainingImage;
+pub use transforms::{posed_frame, transforms};

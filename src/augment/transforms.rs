@@ -12,6 +12,7 @@ use wildcity_scene::geometry::Pose;
 
 use crate::cameras::{CameraModel, TrainingCamera};
 use crate::record::Sample;
+use crate::training_image::TrainingImage;
 
 /// The file: a frame for each sample, with the intrinsics of its camera.
 pub fn transforms(model: CameraModel, cameras: &[TrainingCamera], samples: &[Sample]) -> Value {
@@ -25,13 +26,26 @@ pub fn transforms(model: CameraModel, cameras: &[TrainingCamera], samples: &[Sam
 }
 
 fn frame(model: CameraModel, training: &TrainingCamera, sample: &Sample) -> Value {
-    let camera = &training.camera;
+    let mut fields = posed_frame(model, training, &TrainingImage::from(sample));
     let name = &sample.name;
-    let mut fields = Map::new();
     let mut set = |field: &str, value: Value| fields.insert(field.to_owned(), value);
-    set("file_path", json!(format!("images/{name}")));
     set("mask_path", json!(format!("masks/{name}")));
     set("depth_file_path", json!(format!("depth/{name}")));
+    set("weight", json!(sample.weight));
+    set("trust", json!(sample.trust));
+    Value::Object(fields)
+}
+
+/// A frame of transforms.json with its file in `images/`, its camera and its pose.
+pub fn posed_frame(
+    model: CameraModel,
+    training: &TrainingCamera,
+    image: &TrainingImage,
+) -> Map<String, Value> {
+    let camera = &training.camera;
+    let mut fields = Map::new();
+    let mut set = |field: &str, value: Value| fields.insert(field.to_owned(), value);
+    set("file_path", json!(format!("images/{}", image.name)));
     set("w", json!(camera.width_px));
     set("h", json!(camera.height_px));
     set("fl_x", json!(camera.pinhole.fx));
@@ -41,10 +55,8 @@ fn frame(model: CameraModel, training: &TrainingCamera, sample: &Sample) -> Valu
     for (field, value) in model.coefficients(camera) {
         set(field, json!(value));
     }
-    set("transform_matrix", json!(opengl(&sample.world_from_camera)));
-    set("weight", json!(sample.weight));
-    set("trust", json!(sample.trust));
-    Value::Object(fields)
+    set("transform_matrix", json!(opengl(&image.world_from_camera)));
+    fields
 }
 
 /// Rows of the 4 x 4 matrix `world_from_camera` with OpenGL's camera axes.

@@ -7,10 +7,12 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 
+#[cfg(feature = "log")]
+use wildcity_log::Log;
 use wildcity_push::{SourceAxes, SourceScene, provenance, read_scene};
 use wildcity_scene::geo::GeoAnchor;
 use wildcity_scene::rig::is_name;
-use wildcity_scene::{RecordFormat, RenderProfile};
+use wildcity_scene::{RecordFormat, RenderProfile, Rig, Trajectory};
 use wildcity_twin::store::{Catalog, NewSky, NewVersion, StorageOptions, StoreError, Version};
 
 use super::directories::Twins;
@@ -22,6 +24,8 @@ use super::profile_options::ProfileOptions;
 use super::progress;
 use super::rig::find_rig;
 use super::sky_source::SkySource;
+#[cfg(feature = "log")]
+use super::twin::views::Views;
 
 /// Make a twin from a trained scene, or a new version of an existing twin.
 ///
@@ -88,6 +92,14 @@ pub(super) struct Import {
     #[arg(long, value_name = "ANCHOR", allow_hyphen_values = true)]
     geo: Option<GeoAnchor>,
 
+    /// Also take from a log (docs/logs.md) what a twin can have of it: its poses as a drive, its
+    /// rig, its place on the earth, and an image of each camera every 2 m as recorded images, which
+    /// make a second version. The scene must be in the axes of the log, and the log's map goes to
+    /// scenarios: see `wildcity scenario from-log`.
+    #[cfg(feature = "log")]
+    #[arg(long, value_name = "LOG", conflicts_with = "trajectory")]
+    log: Option<PathBuf>,
+
     #[command(flatten)]
     sky: SkySource,
 
@@ -133,6 +145,7 @@ Formats, and their usual axes. Files of one format differ, so render the twin to
 Examples:
   wildcity import skull.ply --twin skull --axes y-down-z-forward --set near=0.2
   wildcity import street.safetensors --twin street --rig car.json --trajectory log.json
+  wildcity import trained.ply --twin street --log log
   wildcity import old.ply --twin old --axes '0 0 1 -1 0 0 0 -1 0' --scale 0.01
 
 Rig file: sizes and intrinsics are in pixels, camera_to_rig is in metres. Camera axes are x right,
@@ -168,8 +181,11 @@ impl Import {
         let [expected_axes, _] = expected.options();
         let expected_axes = expected_axes.trim_start_matches("axes=");
         let sky = self.sky.read(expected_axes)?;
-        let rig = self.rig.as_deref().map(find_rig).transpose()?;
-        let trajectories = read_trajectories(&self.trajectory)?;
+        let recorded = self.recorded()?;
+        let rig = self.rig.as_deref().map(find_rig).transpose()?.or(recorded.rig);
+        let mut trajectories = read_trajectories(&self.trajectory)?;
+        trajectories.extend(recorded.drive);
+        let geo = self.geo.clone().or(recorded.geo);
         let source = scene_file(self.source)?;
 
         // 2. The scene.
@@ -213,7 +229,7 @@ impl Import {
             rig,
             trajectories,
             sky: sky.map(NewSky::Put),
-            geo: self.geo.clone(),
+            geo,
             provenance: provenance(&[hash], options.to_vec(), levels),
             storage: StorageOptions { record: self.record, levels },
         };
@@ -269,7 +285,30 @@ impl Import {
             catalog.dir().join(&self.twin).display(),
             version.hash,
         )?;
+        #[cfg(feature = "log")]
+        if let Some(log) = recorded.images {
+            return Views::from_log(&self.twin, log, self.twins).run();
+        }
         Ok(())
+    }
+
+    /// What a twin takes from a log; nothing without `--log`.
+    #[cfg(feature = "log")]
+    fn recorded(&self) -> anyhow::Result<Recorded> {
+        let Some(folder) = &self.log else { return Ok(Recorded::default()) };
+        let log = Log::open(folder)?;
+        Ok(Recorded {
+            drive: Some(log.poses()?.drive(log.header.name.clone())),
+            images: log.images()?.map(|_| folder.clone()),
+            geo: log.header.world.geo.clone(),
+            rig: Some(log.rig),
+        })
+    }
+
+    /// This build reads no logs.
+    #[cfg(not(feature = "log"))]
+    fn recorded(&self) -> anyhow::Result<Recorded> {
+        Ok(Recorded::default())
     }
 
     /// The twin's latest version, whose axes and scale are those that are not given.
@@ -282,6 +321,17 @@ impl Import {
             Err(error) => Err(error.into()),
         }
     }
+}
+
+/// What a twin takes from a log.
+#[derive(Default)]
+struct Recorded {
+    rig: Option<Rig>,
+    drive: Option<Trajectory>,
+    geo: Option<GeoAnchor>,
+    /// The log, if it has images.
+    #[cfg(feature = "log")]
+    images: Option<PathBuf>,
 }
 
 /// The time of each phase of an import.

@@ -5,7 +5,7 @@ use std::env;
 use super::exit::Exit;
 
 /// Commands of a feature: their words, the feature, and whether it is built.
-const COMMANDS: [(&str, &str, bool); 16] = [
+const COMMANDS: [(&str, &str, bool); 18] = [
     ("actor push", "http", cfg!(feature = "http")),
     ("alpasim", "alpasim", cfg!(feature = "alpasim")),
     ("augment", "augment", cfg!(feature = "augment")),
@@ -14,10 +14,12 @@ const COMMANDS: [(&str, &str, bool); 16] = [
     ("drive", "alpasim", cfg!(feature = "alpasim")),
     ("episode", "suite", cfg!(feature = "suite")),
     ("eval", "eval", cfg!(feature = "eval")),
+    ("log", "log", cfg!(feature = "log")),
     ("map import", "convert", cfg!(feature = "convert")),
     ("push", "http", cfg!(feature = "http")),
     ("report", "report", cfg!(feature = "report")),
     ("scenario check", "suite", cfg!(feature = "suite")),
+    ("scenario from-log", "log", cfg!(feature = "log")),
     ("scenario import", "convert", cfg!(feature = "convert")),
     ("stress", "stress", cfg!(feature = "stress")),
     ("train", "train", cfg!(feature = "train")),

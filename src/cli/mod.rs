@@ -39,6 +39,8 @@ mod inspect;
 mod left_out;
 pub mod limits;
 mod lod;
+#[cfg(feature = "log")]
+mod log;
 mod map;
 pub mod output;
 #[cfg_attr(not(feature = "http"), allow(dead_code, reason = "only a push packs a folder"))]
@@ -100,6 +102,8 @@ subcommands! {
     #[cfg(feature = "http")]
     Push(push::Push),
     Lod(lod::Lod),
+    #[cfg(feature = "log")]
+    Log(log::LogCommand),
     Twin(twin::Twin),
     Actor(actor::Actor),
     Render(render::Render),

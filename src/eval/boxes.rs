@@ -7,6 +7,7 @@ use std::collections::BTreeMap;
 
 use glam::{DVec2, DVec3};
 use serde::Deserialize;
+use serde::de::IgnoredAny;
 
 use wildcity_scene::align::Alignment;
 use wildcity_scene::geometry::{Camera, Pose};
@@ -84,6 +85,9 @@ struct Line {
     size: [f64; 3],
     world_from_box: Pose,
     velocity: Option<[f64; 3]>,
+    /// Tables of logs have it; every box that moves is hidden.
+    #[serde(rename = "class")]
+    _class: Option<IgnoredAny>,
 }
 
 /// The name of a track: text, or a number.

@@ -182,6 +182,16 @@ impl LidarPoints {
         Ok(Self { points_m, time_us, rig_from_lidar, poses: poses(&file)? })
     }
 
+    /// Points in the rig's axes, in metres, with their times in microseconds, and the poses of the
+    /// rig. Points that are not finite are left out.
+    pub fn from_rig(points: Vec<(i64, DVec3)>, poses: Vec<Keyframe>) -> Self {
+        let mut timed = points;
+        timed.retain(|(_, point_m)| point_m.is_finite());
+        timed.sort_by_key(|(time_us, _)| *time_us);
+        let (time_us, points_m) = timed.into_iter().unzip();
+        Self { points_m, time_us, rig_from_lidar: Pose::IDENTITY, poses: Some(poses) }
+    }
+
     /// Number of points.
     pub fn len(&self) -> usize {
         self.points_m.len()

@@ -57,6 +57,8 @@ mod import;
 mod in_folder;
 mod kills;
 mod load;
+mod log;
+mod log_twin;
 mod operations;
 mod push;
 mod remote;

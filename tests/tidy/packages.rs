@@ -37,7 +37,7 @@ const CRATES: &[(&str, &[&str])] = &[
 ];
 
 /// Files that may open files: those of a twin only `store/local`; the others scenes and settings of
-/// the user, training data, episodes, uploads, scenarios, their catalogs and roads, pictures, and
+/// the user, training data, logs, episodes, uploads, scenarios, their catalogs and roads, pictures, and
 /// how much memory there is.
 const FILES: &[&str] = &[
     "src/twin/store/local",
@@ -58,6 +58,7 @@ const FILES: &[&str] = &[
     "src/convert/openscenario/files.rs",
     "src/bench",
     "src/train/examples",
+    "src/log",
     "src/cli",
 ];
 

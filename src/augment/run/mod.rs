@@ -18,7 +18,8 @@ use self::samples::write_samples;
 use self::view_sessions::ViewSessions;
 use crate::{
     AugmentError, CameraModel, ColmapForm, ColmapModel, Folder, Header, MadeWith, Options, Place,
-    Plan, Point, PointSample, Sample, Surroundings, TrainingCamera, limits, transforms,
+    Plan, Point, PointSample, Sample, Surroundings, TrainingCamera, TrainingImage, limits,
+    transforms,
 };
 
 pub use view_sessions::PLACE_TIMEOUT;
@@ -197,10 +198,11 @@ impl<'a> Augmentation<'a> {
         let samples = folder.samples(&names);
         let transforms = transforms(self.lens_model, &self.cameras, &samples);
         folder.write("transforms.json", format!("{transforms:#}\n").as_bytes())?;
+        let images: Vec<TrainingImage> = samples.iter().map(TrainingImage::from).collect();
         let colmap = ColmapModel {
             model: self.lens_model,
             cameras: &self.cameras,
-            samples: &samples,
+            images: &images,
             points: &self.sampled_points()?,
         };
         for (name, bytes) in colmap.files(self.settings.colmap) {

@@ -6,8 +6,11 @@ mod summary;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
+use anyhow::Context;
+
 use wildcity_eval::images::ImageList;
 use wildcity_eval::{Evaluation, Evaluator, Save, Scene, Settings};
+use wildcity_log::{Log, Row, TrackRow};
 use wildcity_scene::align::Alignment;
 use wildcity_session::OpenScene;
 
@@ -39,8 +42,14 @@ pub(super) struct Eval {
     /// `wildcity render --cameras`, one camera per line, with "image" (and optionally "mask").
     /// Poses of a list are in the axes of the scene. Other poses are in the axes of the scene file;
     /// for a twin, they get the axes, scale and alignment with which it was made.
-    #[arg(long, value_name = "FILE_OR_DIR")]
-    images: PathBuf,
+    /// Also a log, as for --log.
+    #[arg(long, value_name = "FILE_OR_DIR", required_unless_present = "log")]
+    images: Option<PathBuf>,
+
+    /// Compare with everything that a log has (docs/logs.md): the images that it marks as held out,
+    /// or else every 8th; its LiDAR, and the boxes of its tracks.
+    #[arg(long, value_name = "LOG", conflicts_with_all = ["images", "image_dir", "masks", "boxes", "lidar"])]
+    log: Option<PathBuf>,
 
     /// Folder of the images [default: that of transforms.json or of the list; for COLMAP, `images`
     /// next to the model]. Images may be smaller than their cameras, as in images_4: then the
@@ -56,8 +65,9 @@ pub(super) struct Eval {
 
     /// Compare every Nth image in the order of their names, starting with the first. The trainers
     /// of INRIA and gsplat hold out every 8th.
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
-    every: u32,
+    /// [default: 1; for a log that marks no image as held out, 8]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    every: Option<u32>,
 
     /// Axes of the poses, in the form of `wildcity import --axes` [default: as the twin was
     /// imported and aligned; identity for a file and for a list]
@@ -114,34 +124,50 @@ pub(super) struct Eval {
     backend: BackendOptions,
 }
 
+/// Of a log that marks no image as held out, every 8th is compared, as the trainers of INRIA and
+/// gsplat hold out.
+const LOG_EVERY: u32 = 8;
+
+/// The files of `--boxes` and `--lidar` that a log stands for.
+fn log_labels(log: &Log) -> anyhow::Result<(Option<PathBuf>, Option<PathBuf>)> {
+    let boxes = log.tracks()?.map(|_| log.path(TrackRow::FILE));
+    let lidar = log.sweeps()?.map(|_| log.folder().to_owned());
+    Ok((boxes, lidar))
+}
+
 const EXAMPLES: &str = "\
 Examples:
   wildcity eval street --images held-out/transforms.json
   wildcity eval street --images capture --every 8 --image-dir capture/images_4 --align-exposure
   wildcity eval point_cloud.ply --images capture/sparse/0 --every 8 --masks capture/masks --out eval
   wildcity eval street --images views.jsonl --save-images
+  wildcity eval street --log log
   wildcity eval street --images held-out/transforms.json --repair repair.json --extrapolate 1,3,5";
 
 impl Eval {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let list = ImageList::read(&self.images, self.image_dir.as_deref(), self.masks.as_deref())?;
-        print_warnings(&self.images, &list.warnings)?;
+        let source =
+            self.images.as_ref().or(self.log.as_ref()).context("give --images or --log")?;
+        let list = ImageList::read(source, self.image_dir.as_deref(), self.masks.as_deref())?;
+        print_warnings(source, &list.warnings)?;
+        let default_every = if self.log.is_some() && !list.has_held_out() { LOG_EVERY } else { 1 };
+        let list = if self.log.is_some() { list.held_out() } else { list };
         let changes = self.profile.load()?;
-        let (source, own_profile) = open_scene(&self.scene, &self.twins, self.bad)?;
-        let alignment = self.alignment(&source, &list)?;
-        let catalog = match &source {
+        let (scene, own_profile) = open_scene(&self.scene, &self.twins, self.bad)?;
+        let alignment = self.alignment(&scene, &list)?;
+        let catalog = match &scene {
             OpenScene::Twin(_) => Some(self.twins.catalog()?),
             OpenScene::File(_) => None,
         };
         let scene = Scene {
-            source,
+            source: scene,
             catalog,
             own_profile,
             changes: Box::new(move |profile| changes.apply(profile)),
             alignment,
             backend: self.backend.backend()?,
         };
-        let settings = self.settings();
+        let settings = self.settings(source, self.every.unwrap_or(default_every))?;
         let save = |path: &Path, png: &[u8]| {
             let path = self.out.join(path);
             output::create_dir(path.parent().unwrap_or(&self.out))?;
@@ -156,22 +182,26 @@ impl Eval {
         self.write(&evaluation)
     }
 
-    fn settings(&self) -> Settings {
-        Settings {
+    fn settings(&self, images: &Path, every: u32) -> anyhow::Result<Settings> {
+        let (boxes, lidar) = match &self.log {
+            Some(log) => log_labels(&Log::open(log)?)?,
+            None => (self.labels.boxes.clone(), self.labels.lidar.clone()),
+        };
+        Ok(Settings {
             scene: self.scene.clone(),
-            images: self.images.display().to_string(),
-            every: self.every as usize,
+            images: images.display().to_string(),
+            every: every as usize,
             align_exposure: self.align_exposure,
             show: self.show,
             offsets_m: self.extrapolate.clone().map(|offsets| offsets.0).unwrap_or_default(),
-            boxes: self.labels.boxes.clone(),
-            lidar: self.labels.lidar.clone(),
+            boxes,
+            lidar,
             lidar_window_s: self.labels.lidar_window,
             lpips: self.networks.lpips.clone(),
             features: self.networks.features.clone(),
             repair: self.repairer.repair.clone(),
             networks: self.repairer.load_options(),
-        }
+        })
     }
 
     /// The transform from the axes of the poses to those of the scene.

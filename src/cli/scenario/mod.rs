@@ -2,6 +2,8 @@
 
 #[cfg(feature = "suite")]
 mod check;
+#[cfg(feature = "log")]
+mod from_log;
 #[cfg(feature = "convert")]
 mod import;
 mod show;
@@ -25,7 +27,8 @@ use wildcity_twin::store::{Catalog, Version};
 Examples:
   wildcity scenario check cut-in.json
   wildcity scenario show cut-in.json --seed 7
-  wildcity scenario import cut-in.xosc --twin street --out cut-in.json")]
+  wildcity scenario import cut-in.xosc --twin street --out cut-in.json
+  wildcity scenario from-log log --twin street --at 12.5 --out merge.json")]
 pub(super) struct ScenarioCommand {
     #[command(subcommand)]
     subcommand: Subcommand,
@@ -38,6 +41,8 @@ super::subcommands! {
     Show(show::Show),
     #[cfg(feature = "convert")]
     Import(import::Import),
+    #[cfg(feature = "log")]
+    FromLog(from_log::FromLog),
 }
 
 impl ScenarioCommand {

@@ -13,7 +13,7 @@ mod log;
 mod rollback;
 mod sky;
 #[cfg(feature = "eval")]
-mod views;
+pub(super) mod views;
 
 /// List, generate, check and clean up twins, and manage their versions.
 #[derive(Debug, clap::Args)]

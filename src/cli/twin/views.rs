@@ -16,6 +16,8 @@ use wildcity_scene::views::{RecordedView, reduced_mask};
 use wildcity_scene::{Manifest, Trajectory};
 use wildcity_twin::store::{Commit, CommitKind, StorageOptions, VersionChange};
 
+#[cfg(feature = "log")]
+use crate::cli::directories::TwinVersion;
 use crate::cli::directories::{EditedTwin, Twins};
 use crate::cli::{file_notes, placement, progress};
 
@@ -36,8 +38,8 @@ pub(in crate::cli) struct Views {
     #[command(flatten)]
     edited: EditedTwin,
 
-    /// The images with their cameras: a transforms.json, a COLMAP model, or a camera list, in the
-    /// format of `wildcity eval --images`.
+    /// The images with their cameras: a transforms.json, a COLMAP model, a camera list, or a log,
+    /// in the format of `wildcity eval --images`.
     #[arg(long, value_name = "FILE_OR_DIR")]
     images: Option<PathBuf>,
 
@@ -56,16 +58,16 @@ pub(in crate::cli) struct Views {
 
     /// Smallest distance between two images of a camera along the drive, in metres: 2 or 2m. Images
     /// up to a tenth nearer are kept.
-    #[arg(long, value_name = "M", default_value = "2", value_parser = metres)]
+    #[arg(long, value_name = "M", default_value_t = EVERY_M, value_parser = metres)]
     every: f64,
 
     /// Longest side of a stored image, in pixels. Larger images are scaled down. Six cameras with
     /// an image every 2 m take 0.4 GB per km.
-    #[arg(long, value_name = "PX", default_value_t = 720, value_parser = clap::value_parser!(u32).range(16..=8192))]
+    #[arg(long, value_name = "PX", default_value_t = SIDE_PX, value_parser = clap::value_parser!(u32).range(16..=8192))]
     side: u32,
 
     /// Quality of the JPEGs.
-    #[arg(long, value_name = "Q", default_value_t = 90, value_parser = clap::value_parser!(u8).range(1..=100))]
+    #[arg(long, value_name = "Q", default_value_t = QUALITY, value_parser = clap::value_parser!(u8).range(1..=100))]
     quality: u8,
 
     /// Remove the images.
@@ -81,6 +83,15 @@ Examples:
   wildcity twin views street --images capture/transforms.json
   wildcity twin views street --images capture --image-dir capture/images_2 --every 4m --side 480
   wildcity twin views street --remove";
+
+/// The default of --every, in metres.
+const EVERY_M: f64 = 2.0;
+
+/// The default of --side, in pixels.
+const SIDE_PX: u32 = 720;
+
+/// The default of --quality.
+const QUALITY: u8 = 90;
 
 /// Tolerance of --every: an image is kept if its distance is at most this share below it. In a
 /// bend, a camera travels another distance than the drive; without the tolerance, images that were
@@ -102,6 +113,24 @@ struct Placed<'a> {
 }
 
 impl Views {
+    /// The images of a log for the twin that was just imported with it: one of each camera every
+    /// 2 m.
+    #[cfg(feature = "log")]
+    pub(in crate::cli) fn from_log(twin: &str, log: PathBuf, twins: Twins) -> Self {
+        Self {
+            edited: EditedTwin { twin: TwinVersion { name: twin.to_owned(), number: None } },
+            images: Some(log),
+            image_dir: None,
+            axes: None,
+            scale: None,
+            every: EVERY_M,
+            side: SIDE_PX,
+            quality: QUALITY,
+            remove: false,
+            twins,
+        }
+    }
+
     pub(in crate::cli) fn run(self) -> anyhow::Result<()> {
         let catalog = self.twins.catalog()?;
         let base = catalog.version(&self.edited.twin.name, self.edited.twin.number)?;

@@ -2,10 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, anyhow};
+use anyhow::{Context, anyhow, ensure};
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 
+use wildcity_log::{Log, PlacedImage};
 use wildcity_scene::align::PosedImage;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_twin::ingest::capture::CaptureError;
@@ -30,6 +31,12 @@ pub struct RealImage {
     pub time_us: Option<i64>,
     /// Its exposure in stops against the scene's, if the list says so.
     pub exposure_stops: Option<f64>,
+    /// A mask whose bright pixels show the ground, of a log.
+    pub ground_mask: Option<PathBuf>,
+    /// A mask whose bright pixels show the sky, of a log.
+    pub sky_mask: Option<PathBuf>,
+    /// Whether the log says that no scene was trained on it.
+    pub held_out: bool,
 }
 
 /// Real images, in the order of their names.
@@ -71,6 +78,14 @@ impl ImageList {
         image_dir: Option<&Path>,
         masks: Option<&Path>,
     ) -> anyhow::Result<Self> {
+        if Log::is_log(source) {
+            ensure!(
+                image_dir.is_none() && masks.is_none(),
+                "{} is a log, whose tables name the files: leave --image-dir and --masks out",
+                source.display()
+            );
+            return Self::from_log(&Log::open(source)?);
+        }
         let Listed { images, folder, is_in_scene_axes, warnings } =
             read(source).with_context(|| format!("--images {}", source.display()))?;
         let folder = image_dir.unwrap_or(&folder);
@@ -94,10 +109,57 @@ impl ImageList {
                 near,
                 time_us,
                 exposure_stops,
+                ground_mask: None,
+                sky_mask: None,
+                held_out: false,
             });
         }
         found.sort_by(|a, b| a.name.cmp(&b.name));
         Ok(Self { images: found, is_in_scene_axes, warnings })
+    }
+
+    /// The images of a log, in the axes of a twin that was made of it. Those at times without a
+    /// pose are left out.
+    ///
+    /// # Errors
+    /// A table cannot be used, or an image is missing.
+    pub fn from_log(log: &Log) -> anyhow::Result<Self> {
+        let poses = log.poses()?;
+        let mut images = Vec::new();
+        for placed in log.placed_images(&poses)? {
+            let PlacedImage { row, name, file, camera, world_from_camera } = placed?;
+            ensure!(file.is_file(), "there is no image {}", file.display());
+            let path = |file: Option<String>| file.map(|file| log.path(&file));
+            images.push(RealImage {
+                name,
+                file,
+                mask: path(row.mask),
+                camera,
+                world_from_camera,
+                near: None,
+                time_us: Some(row.time_us),
+                exposure_stops: row.exposure_stops,
+                ground_mask: path(row.ground_mask),
+                sky_mask: path(row.sky_mask),
+                held_out: row.held_out,
+            });
+        }
+        images.sort_by(|a, b| a.name.cmp(&b.name));
+        Ok(Self { images, is_in_scene_axes: true, warnings: Vec::new() })
+    }
+
+    /// The images that a log marks as held out; all if it marks none.
+    #[must_use]
+    pub fn held_out(mut self) -> Self {
+        if self.images.iter().any(|image| image.held_out) {
+            self.images.retain(|image| image.held_out);
+        }
+        self
+    }
+
+    /// Whether a log marks images as held out.
+    pub fn has_held_out(&self) -> bool {
+        self.images.iter().any(|image| image.held_out)
     }
 
     /// Every `step`-th image, starting with the first.

@@ -46,6 +46,9 @@ mod tests {
             near: None,
             time_us: None,
             exposure_stops: None,
+            ground_mask: None,
+            sky_mask: None,
+            held_out: false,
         };
         let images: Vec<RealImage> = names.iter().map(image).collect();
         camera_names(&images.iter().collect::<Vec<_>>())

@@ -3,11 +3,13 @@
 use std::path::Path;
 
 use anyhow::{Context, ensure};
+use glam::DVec3;
 
 use crate::{
     Boxes, BoxesSubject, DepthMap, GROWN_PX, LidarDepth, LidarPoints, LidarSubject, MovingBox,
     WorldPoints, hide,
 };
+use wildcity_log::Log;
 use wildcity_render::View;
 use wildcity_scene::align::Alignment;
 use wildcity_scene::trajectory::Keyframe;
@@ -63,7 +65,12 @@ impl Labels {
         }
         if let Some(path) = &settings.lidar {
             let about = || format!("--lidar {}", path.display());
-            let points = read_lidar(path, source, alignment).with_context(about)?;
+            let read = if Log::is_log(path) {
+                read_log(path, images, labels.window_us).with_context(about)?
+            } else {
+                read_lidar(path)?
+            };
+            let points = in_world(&read, source, alignment).with_context(about)?;
             labels.lidar_subject = Some(LidarSubject {
                 file: path.display().to_string(),
                 points: points.points_m.len(),
@@ -124,12 +131,45 @@ fn read_boxes(path: &Path) -> anyhow::Result<Boxes> {
     Ok(Boxes::parse(text)?)
 }
 
-fn read_lidar(
-    path: &Path,
+fn read_lidar(path: &Path) -> anyhow::Result<LidarPoints> {
+    let about = || format!("--lidar {}", path.display());
+    let bytes = ingest::read_whole(path, LABEL_BYTES).with_context(about)?;
+    LidarPoints::parse(&bytes).with_context(about)
+}
+
+/// The points of a log near the times of the images; sweeps at other times are not read.
+fn read_log(path: &Path, images: &[&RealImage], window_us: i64) -> anyhow::Result<LidarPoints> {
+    let log = Log::open(path)?;
+    let mut times_us: Vec<i64> = images.iter().filter_map(|image| image.time_us).collect();
+    times_us.sort_unstable();
+    let is_near = |from_us: i64, to_us: i64| {
+        let from_us = from_us.saturating_sub(window_us);
+        let first = times_us.partition_point(|time_us| *time_us < from_us);
+        times_us.get(first).is_some_and(|time_us| *time_us <= to_us.saturating_add(window_us))
+    };
+    let mut points = Vec::new();
+    for row in log.sweeps()?.context("the log has no lidar.jsonl")? {
+        let row = row?;
+        if is_near(row.time_us, row.until_us) {
+            let rig_from_lidar = log.rig_from_lidar(&row.lidar)?;
+            let sweep = log.points(&row)?;
+            let timed = sweep.time_us.iter().zip(&sweep.points_m);
+            points.extend(timed.map(|(time_us, point_m)| {
+                let point_m = DVec3::from_array(point_m.map(f64::from));
+                // Points that the source has moved are where they were at that time.
+                let time_us = row.compensated_to_us.unwrap_or(*time_us);
+                (time_us, rig_from_lidar.transform_point(point_m))
+            }));
+        }
+    }
+    Ok(LidarPoints::from_rig(points, log.poses()?.keyframes().to_vec()))
+}
+
+fn in_world(
+    points: &LidarPoints,
     source: &OpenScene,
     alignment: &Alignment,
 ) -> anyhow::Result<WorldPoints> {
-    let points = LidarPoints::parse(&ingest::read_whole(path, LABEL_BYTES)?)?;
     let drives = source.version().map(|version| &version.manifest.trajectories);
     let drive = drives.and_then(|drives| drives.first()).map(|drive| &drive.keyframes[..]);
     let world = points.in_world(alignment, drive.map(|keys: &[Keyframe]| keys))?;
