@@ -1,0 +1,119 @@
+"""The kinds of sources: their names, how they are known by their content, and their converters.
+
+A converter is imported only when it is used, so that what it needs must be installed only then.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol, cast
+
+from .errors import LogError
+from .writer import Report
+
+__all__ = ["KINDS", "Kind", "Options", "detect"]
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a user may choose.
+
+    log: which of several logs of the source. reference: images stay where they are. rig_frame, world_frame: the frames
+    of a bag. odometry: the topic that gives the poses of a bag. rig: a calibration for poses that have none of their
+    own. licence: a note for log.json. values: what the user gave, for the check of a run that goes on.
+    """
+
+    log: str | None = None
+    reference: bool = False
+    rig_frame: str | None = None
+    world_frame: str | None = None
+    odometry: str | None = None
+    rig: Path | None = None
+    licence: str | None = None
+    values: dict[str, str] = field(default_factory=dict)
+
+
+class Converter(Protocol):
+    """What each module of a kind has."""
+
+    def convert(self, source: Path, out: Path, options: Options) -> Report:
+        """Writes the log."""
+
+    def logs(self, source: Path) -> list[str]:
+        """Names of the logs in the source, one of which `Options.log` chooses."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of source. extra: of the package, which has what the converter imports."""
+
+    name: str
+    title: str
+    module: str
+    is_like: Callable[[Path], bool]
+    looks: str
+    extra: str | None = None
+
+    def converter(self) -> Converter:
+        """Its module. Raises `LogError` that names the extra to install."""
+        try:
+            return cast(Converter, importlib.import_module(f".{self.module}", __package__))
+        except ModuleNotFoundError as error:
+            if self.extra is None or str(error.name).startswith("wildcity"):
+                raise
+            problem = f"the kind {self.name} needs the package {error.name}"
+            raise LogError(self.name, problem, f"pip install 'wildcity[{self.extra}]'") from None
+
+
+def _has(*names: str) -> Callable[[Path], bool]:
+    """Whether the folder has a path of each pattern."""
+    return lambda source: source.is_dir() and all(next(source.glob(name), None) is not None for name in names)
+
+
+def _any(*tests: Callable[[Path], bool]) -> Callable[[Path], bool]:
+    return lambda source: any(test(source) for test in tests)
+
+
+KINDS: tuple[Kind, ...] = (
+    Kind(
+        "nuscenes", "nuScenes", "nuscenes", _any(_has("v1.*/sample_data.json"), _has("sample_data.json")),
+        "a folder with v1.0-*/sample_data.json",
+    ),
+)  # fmt: skip
+
+
+def detect(source: Path) -> Kind:
+    """The kind of a source by its content. Raises `LogError` if there is none, or if several fit."""
+    if not source.exists():
+        raise LogError(source, "there is no such file or folder", "give the folder or the file of the source")
+    found = [kind for kind in KINDS if kind.is_like(source)]
+    if len(found) == 1:
+        return found[0]
+    names = ", ".join(kind.name for kind in found or KINDS)
+    if found:
+        raise LogError(source, f"it looks like several kinds: {names}", "choose one with --kind")
+    looks = "; ".join(f"{kind.name} is {kind.looks}" for kind in KINDS)
+    raise LogError(source, f"none of the kinds {names}", f"give --kind, or the folder of one: {looks}")
+
+
+def named(name: str) -> Kind:
+    """A kind by its name."""
+    return next(kind for kind in KINDS if kind.name == name)
+
+
+def choose(names: Iterator[str] | list[str], chosen: str | None, source: Path, what: str) -> str:
+    """The log of a source that the user chose, or the only one."""
+    found = list(names)
+    if not found:
+        raise LogError(source, f"it has no {what}", "give the folder of a whole data set")
+    if chosen is None and len(found) == 1:
+        return found[0]
+    shown = ", ".join(found[:8]) + (f", .. ({len(found)} in all)" if len(found) > 8 else "")
+    if chosen is None:
+        raise LogError(source, f"it has several of {what}: {shown}", "choose one with --log")
+    if chosen not in found:
+        raise LogError(source, f"it has no {what} {chosen!r}, only {shown}", "choose one with --log")
+    return chosen
