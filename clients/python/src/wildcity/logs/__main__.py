@@ -19,6 +19,7 @@ _EXAMPLES = """examples:
   python -m wildcity.logs data/nuscenes --list
   python -m wildcity.logs data/nuscenes --log scene-0061 --out scene-0061
   python -m wildcity.logs data/nuscenes --log scene-0061 --out scene-0061 --reference
+  python -m wildcity.logs drive.mcap --out drive
   wildcity log check scene-0061                       (then: what a twin needs and lacks)
 
 kinds:
@@ -36,6 +37,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--kind", choices=[kind.name for kind in KINDS], help="kind of the source, if it is not found")
     parser.add_argument("--log", metavar="NAME", help="which log of the source: a scene, a drive or a segment")
     parser.add_argument("--reference", action="store_true", help="name the images where they lie, and copy none")
+    bags = parser.add_argument_group("bags")
+    bags.add_argument("--rig-frame", metavar="FRAME", help="frame of the vehicle (else base_footprint, base_link, ..)")
+    bags.add_argument("--world-frame", metavar="FRAME", help="frame of the world (else the root of tf)")
+    bags.add_argument("--odometry", metavar="TOPIC", help="the Odometry topic that gives the poses, of several")
     parser.add_argument("--licence", metavar="TEXT", help="note on the licence, for log.json")
     return parser
 
@@ -61,7 +66,9 @@ def main(arguments: list[str] | None = None) -> int:
         if chosen.list:
             print("\n".join(kind.converter().logs(chosen.source)))
             return 0
-        options = Options(log=chosen.log, reference=chosen.reference, licence=chosen.licence)
+        names = ("log", "rig_frame", "world_frame", "odometry", "licence")
+        given = {name: getattr(chosen, name) for name in names}
+        options = Options(reference=chosen.reference, values=given, **given)
         _print(convert(chosen.source, chosen.out, options, kind.name))
     except LogError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -73,6 +73,11 @@ def _has(*names: str) -> Callable[[Path], bool]:
     return lambda source: source.is_dir() and all(next(source.glob(name), None) is not None for name in names)
 
 
+def _ends(*suffixes: str) -> Callable[[Path], bool]:
+    """Whether it is a file with one of these suffixes."""
+    return lambda source: source.is_file() and source.suffix in suffixes
+
+
 def _any(*tests: Callable[[Path], bool]) -> Callable[[Path], bool]:
     return lambda source: any(test(source) for test in tests)
 
@@ -81,6 +86,10 @@ KINDS: tuple[Kind, ...] = (
     Kind(
         "nuscenes", "nuScenes", "nuscenes", _any(_has("v1.*/sample_data.json"), _has("sample_data.json")),
         "a folder with v1.0-*/sample_data.json",
+    ),
+    Kind(
+        "bag", "ROS 1 bag, rosbag2 or MCAP", "bags", _any(_has("metadata.yaml"), _ends(".bag", ".mcap", ".db3")),
+        "a folder with metadata.yaml, or a .bag, .mcap or .db3 file", "rosbag",
     ),
 )  # fmt: skip
 

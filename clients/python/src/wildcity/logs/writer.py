@@ -30,6 +30,9 @@ __all__ = ["LogWriter", "Report"]
 
 FORMAT = "wildcity.log/1"
 
+MAX_SENSORS = 16
+"""Cameras, and LiDARs, of a log."""
+
 
 @dataclass
 class Report:
@@ -58,6 +61,7 @@ class LogWriter:
         self.geo: dict[str, Any] | None = None
         self.cameras: list[dict[str, Any]] = []
         self.lidars: list[dict[str, Any]] = []
+        self._empty: list[Path] = []
         self._left_out: Counter[str] = Counter()
         self._why: dict[str, str] = {}
         self._spools: dict[str, Spool] = {}
@@ -153,34 +157,50 @@ class LogWriter:
         self.row("images", time_us, {"camera": name_of(camera), "file": file, **fields})
 
     def sweep(
-        self, lidar: str, time_us: int, read: Callable[[], Sweep], *, compensated_to_us: int | None = None
-    ) -> None:
-        """Adds a sweep. time_us: of the sweep, which its file has in its name. Its row begins with its first point."""
+        self,
+        lidar: str,
+        time_us: int,
+        read: Callable[[], Sweep | tuple[Sweep, dict[str, Any]]],
+        *,
+        compensated_to_us: int | None = None,
+    ) -> Any:
+        """Adds a sweep. time_us: of the sweep, which its file has in its name. Its row begins with its first point.
+
+        read: the sweep, and perhaps what else the caller wants to know of it, which is returned as `extra`, also if
+        the file was written by an earlier run.
+        """
         file = self._file("lidar", lidar, time_us, ".safetensors")
-        found = self.payload(file, lambda path: read().write(path, self.epoch_us))
+
+        def write(path: Path) -> dict[str, Any]:
+            made = read()
+            sweep, extra = made if isinstance(made, tuple) else (made, {})
+            return {**sweep.write(path, self.epoch_us), "extra": extra}
+
+        found = self.payload(file, write)
         if found["dropped"]:
             self.left_out(f"points of {name_of(lidar)} that are not finite", found["dropped"], "no position")
         if not found["points"]:
-            (self.part / file).unlink(missing_ok=True)
+            self._empty.append(self.part / file)
             self.left_out(f"sweeps of {name_of(lidar)} without points", 1, "no times")
-            return
+            return found
         fields = {"until_us": found["last_us"] - self.epoch_us, "lidar": name_of(lidar), "file": file}
         if compensated_to_us is not None:
             fields["compensated_to_us"] = compensated_to_us - self.epoch_us
         self.row("lidar", found["first_us"], fields)
+        return found
 
     def box(
         self, time_us: int, track: str, label: str, size: Any, world_from_box: Matrix, velocity: Any = None
     ) -> None:
         """Adds a box of a track. size: length, width, height in metres. velocity: [3] in m/s in the world, or None.
 
-        A box of an unknown class, or of one that rounds to nothing, is left out and counted.
+        A box of an unknown class, without a size up to 100 m, or without a pose is left out and counted.
         """
         ours = class_of(label)
         sizes = [float(value) for value in size]
         if ours is None:
             return self.left_out(f"boxes of class {label}", 1, "no such class of actors")
-        if not min(sizes) > 0 or rotation_error(world_from_box) > 1e-3:
+        if not 0 < min(sizes) <= max(sizes) <= 100 or rotation_error(world_from_box) > 1e-3:
             return self.left_out(f"boxes of class {label} without a size or a pose", 1, "not finite, or 0")
         fields: dict[str, Any] = {"track": track, "class": ours, "size": sizes}
         fields["world_from_box"] = self.world(world_from_box)
@@ -235,6 +255,10 @@ class LogWriter:
                 raise LogError(
                     self.source["id"], f"it has no {what}", "a log needs them: choose a source that has them"
                 )
+        for what, names in (("cameras", self.cameras), ("LiDARs", self.lidars)):
+            if len(names) > MAX_SENSORS:
+                problem = f"{len(names)} {what}; a log has at most {MAX_SENSORS}"
+                raise LogError(self.source["id"], problem, "make a source with fewer of them")
         report = Report(self.out, resumed=self.resumed)
         for table, spool in sorted(self._spools.items()):
             target = self.part / f"{table}.jsonl"
@@ -250,6 +274,8 @@ class LogWriter:
         self._json("log.json", self._head(report))
         self._journal.close()
         shutil.rmtree(self.part / "rows")
+        for path in self._empty:
+            path.unlink()
         for name in ("source.json", "file.part", "done.jsonl"):
             (self.part / name).unlink(missing_ok=True)
         os.rename(self.part, self.out)
