@@ -82,10 +82,21 @@ def _any(*tests: Callable[[Path], bool]) -> Callable[[Path], bool]:
     return lambda source: any(test(source) for test in tests)
 
 
+_IS_KITTI = _any(_has("oxts/timestamps.txt"), _has("*/oxts/timestamps.txt"), _has("*/*/oxts/timestamps.txt"))
+
+
 KINDS: tuple[Kind, ...] = (
     Kind(
         "nuscenes", "nuScenes", "nuscenes", _any(_has("v1.*/sample_data.json"), _has("sample_data.json")),
         "a folder with v1.0-*/sample_data.json",
+    ),
+    Kind(
+        "kitti", "KITTI raw", "kitti", lambda source: _IS_KITTI(source) and not _has("data_poses")(source),
+        "a drive such as 2011_09_26_drive_0001_sync beside calib_*.txt, or a folder of such days",
+    ),
+    Kind(
+        "kitti360", "KITTI-360", "kitti360", _has("calibration/perspective.txt", "data_poses"),
+        "a folder with calibration, data_poses, data_2d_raw and data_3d_raw",
     ),
     Kind(
         "bag", "ROS 1 bag, rosbag2 or MCAP", "bags", _any(_has("metadata.yaml"), _ends(".bag", ".mcap", ".db3")),

@@ -16,7 +16,7 @@ from .errors import LogError
 from .frames import Matrix, pose_json, rotation_error
 from .names import name_of
 
-__all__ = ["Intrinsics", "camera", "fisheye", "lens_of", "opencv"]
+__all__ = ["Intrinsics", "camera", "check_mount", "fisheye", "lens_of", "opencv"]
 
 MAX_FISHEYE_ANGLE = 2.8
 """The largest angle off the axis that a rig file accepts, in radians."""

@@ -22,6 +22,7 @@ import numpy as np
 
 from .errors import LogError
 from .frames import Matrix, pose_json, rotation_error
+from .lenses import check_mount
 from .names import class_of, name_of
 from .points import Sweep
 from .tables import Gap, Spool, compact
@@ -219,7 +220,8 @@ class LogWriter:
         self.row("gps", time_us, {**fields, "altitude_m": float(altitude_m)})
 
     def lidar(self, name: str, rig_from_lidar: Matrix) -> None:
-        """Names a LiDAR and its mount."""
+        """Names a LiDAR and its mount. Raises `LogError` if it is no mount on a vehicle."""
+        check_mount(f"LiDAR {name}", rig_from_lidar, self.source["id"])
         self.lidars.append({"name": name_of(name), "rig_from_lidar": pose_json(rig_from_lidar)})
 
     def left_out(self, what: str, count: int = 1, why: str = "") -> None:
