@@ -99,6 +99,11 @@ KINDS: tuple[Kind, ...] = (
         "a folder with calibration, data_poses, data_2d_raw and data_3d_raw",
     ),
     Kind(
+        "argoverse2", "Argoverse 2", "argoverse2",
+        _any(*(_has(f"{depth}city_SE3_egovehicle.feather") for depth in ("", "*/", "*/*/"))),
+        "a log with city_SE3_egovehicle.feather, or a folder of such logs", "av2",
+    ),
+    Kind(
         "bag", "ROS 1 bag, rosbag2 or MCAP", "bags", _any(_has("metadata.yaml"), _ends(".bag", ".mcap", ".db3")),
         "a folder with metadata.yaml, or a .bag, .mcap or .db3 file", "rosbag",
     ),
