@@ -163,6 +163,8 @@ def views(log: Log) -> list[tuple[str, int, Array, Array]]:
 
 
 def test_points_have_the_pixels_of_the_formula(log: Log) -> None:
+    assert {name: (one["width"], one["height"]) for name, one in log.rig.items()} == {
+        name: size for name, (_, size) in CAMERAS.items()}  # fmt: skip
     for name, time_ns, seen, ours in views(log):
         flat = moved(np.linalg.inv(city(time_ns) @ CAMERAS[name][0]), seen) @ K.T
         np.testing.assert_allclose(ours - 0.5, flat[:, :2] / flat[:, 2:], rtol=0, atol=1e-3)

@@ -70,6 +70,7 @@ def test_points_have_the_pixels_of_other_programs(made: Made) -> None:
     _, _, log, _ = made
     for name, (pose, model, d, _, _) in CAMERAS.items():
         inside = points_seen(K, SIZE)
+        assert (log.rig[f"camera_{name}"]["width"], log.rig[f"camera_{name}"]["height"]) == SIZE
         kind, parameters = COLMAP_MODELS[model]
         values = [K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5, *parameters(d)]  # COLMAP counts as we do.
         judge = pycolmap.Camera(model=kind, width=SIZE[0], height=SIZE[1], params=values)

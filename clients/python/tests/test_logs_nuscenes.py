@@ -147,6 +147,7 @@ def test_points_have_the_pixels_of_the_formula(log: Log) -> None:
     for channel, (pose, focal) in CAMERAS.items():
         times = log.times("images", camera=channel.lower())
         assert len(times) == (4 if channel == "CAM_BACK" else 6)
+        assert (log.rig[channel.lower()]["width"], log.rig[channel.lower()]["height"]) == SIZE
         for time_us in times:
             world = seen(channel, time_us)
             ours = log.project(channel.lower(), poses[time_us], world)

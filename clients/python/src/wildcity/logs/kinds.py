@@ -104,6 +104,14 @@ KINDS: tuple[Kind, ...] = (
         "a log with city_SE3_egovehicle.feather, or a folder of such logs", "av2",
     ),
     Kind(
+        "nuplan", "nuPlan", "nuplan", _any(_has("*.db"), _has("**/splits/*/*.db"), _ends(".db")),
+        "a .db file, or a folder with splits and sensor_blobs",
+    ),
+    Kind(
+        "waymo", "Waymo Open v2", "waymo", _has("camera_image/*.parquet", "camera_calibration/*.parquet"),
+        "a folder with camera_image, camera_calibration, vehicle_pose, .. of Parquet files", "waymo",
+    ),
+    Kind(
         "bag", "ROS 1 bag, rosbag2 or MCAP", "bags", _any(_has("metadata.yaml"), _ends(".bag", ".mcap", ".db3")),
         "a folder with metadata.yaml, or a .bag, .mcap or .db3 file", "rosbag",
     ),
