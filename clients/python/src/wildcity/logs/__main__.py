@@ -37,6 +37,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--kind", choices=[kind.name for kind in KINDS], help="kind of the source, if it is not found")
     parser.add_argument("--log", metavar="NAME", help="which log of the source: a scene, a drive or a segment")
     parser.add_argument("--reference", action="store_true", help="name the images where they lie, and copy none")
+    parser.add_argument("--rig", type=Path, metavar="FILE", help="of poses: rig file, or calibration of Kalibr or ROS")
+    parser.add_argument("--pose-of", choices=["rig", "camera"], help="of poses: whose they are (rig, unless set)")
     bags = parser.add_argument_group("bags")
     bags.add_argument("--rig-frame", metavar="FRAME", help="frame of the vehicle (else base_footprint, base_link, ..)")
     bags.add_argument("--world-frame", metavar="FRAME", help="frame of the world (else the root of tf)")
@@ -66,9 +68,9 @@ def main(arguments: list[str] | None = None) -> int:
         if chosen.list:
             print("\n".join(kind.converter().logs(chosen.source)))
             return 0
-        names = ("log", "rig_frame", "world_frame", "odometry", "licence")
+        names = ("log", "rig_frame", "world_frame", "odometry", "pose_of", "licence")
         given = {name: getattr(chosen, name) for name in names}
-        options = Options(reference=chosen.reference, values=given, **given)
+        options = Options(reference=chosen.reference, rig=chosen.rig, values=given, **given)
         _print(convert(chosen.source, chosen.out, options, kind.name))
     except LogError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -23,7 +23,8 @@ class Options:
 
     log: which of several logs of the source. reference: images stay where they are. rig_frame, world_frame: the frames
     of a bag. odometry: the topic that gives the poses of a bag. rig: a calibration for poses that have none of their
-    own. licence: a note for log.json. values: what the user gave, for the check of a run that goes on.
+    own. pose_of: whose poses a file has, `rig` or `camera`. licence: a note for log.json. values: what the user gave,
+    for the check of a run that goes on.
     """
 
     log: str | None = None
@@ -32,6 +33,7 @@ class Options:
     world_frame: str | None = None
     odometry: str | None = None
     rig: Path | None = None
+    pose_of: str | None = None
     licence: str | None = None
     values: dict[str, str] = field(default_factory=dict)
 
@@ -110,6 +112,15 @@ KINDS: tuple[Kind, ...] = (
     Kind(
         "waymo", "Waymo Open v2", "waymo", _has("camera_image/*.parquet", "camera_calibration/*.parquet"),
         "a folder with camera_image, camera_calibration, vehicle_pose, .. of Parquet files", "waymo",
+    ),
+    Kind(
+        "euroc", "EuRoC (ASL)", "euroc", _any(_has("mav0/cam0/data.csv"), _has("cam0/data.csv", "cam0/sensor.yaml")),
+        "a folder with mav0/cam0/data.csv", "yaml",
+    ),
+    Kind(
+        "poses", "poses of TUM, EuRoC or KITTI", "poses",
+        _any(_has("groundtruth.txt", "rgb.txt"), _ends(".txt", ".tum", ".csv")),
+        "a .txt, .tum or .csv file of poses with --rig FILE, or a TUM folder with groundtruth.txt and rgb.txt", "yaml",
     ),
     Kind(
         "bag", "ROS 1 bag, rosbag2 or MCAP", "bags", _any(_has("metadata.yaml"), _ends(".bag", ".mcap", ".db3")),

@@ -127,6 +127,10 @@ class LogWriter:
             self._spools[table] = Spool(self.part / "rows" / f"{table}.rows")
         self._spools[table].add({"time_us": int(time_us) - self.epoch_us, **fields})
 
+    def has(self, table: str) -> bool:
+        """Whether a table has a row."""
+        return table in self._spools
+
     def pose(self, time_us: int, world_from_rig: Matrix, place: str) -> None:
         """Adds a pose of the vehicle. Raises `LogError` with `place` if it is not finite, or no rotation."""
         if rotation_error(world_from_rig) > 1e-3:
@@ -261,6 +265,9 @@ class LogWriter:
             if len(names) > MAX_SENSORS:
                 problem = f"{len(names)} {what}; a log has at most {MAX_SENSORS}"
                 raise LogError(self.source["id"], problem, "make a source with fewer of them")
+        if not self.cameras:
+            problem = "it has no camera with intrinsics"
+            raise LogError(self.source["id"], problem, "a log needs a rig: choose a source that has cameras")
         report = Report(self.out, resumed=self.resumed)
         for table, spool in sorted(self._spools.items()):
             target = self.part / f"{table}.jsonl"
