@@ -27,6 +27,7 @@ PAGES = [
     "docs/augmentation.md",
     "docs/evaluation.md",
     "docs/gym.md",
+    "docs/logs_from.md",
     "docs/operators.md",
     "docs/pipelines.md",
     "docs/repair.md",

@@ -165,12 +165,14 @@ def test_poses_of_kitti(tmp_path: Path) -> None:
     axes = mount(0, 0, 0, 0)
     poses = [np.linalg.inv(axes) @ np.linalg.inv(at(times_ns()[0])) @ at(time) @ axes for time in times_ns()]
     lines(tmp_path / "00.txt", [pose[:3].reshape(-1).tolist() for pose in poses])
-    lines(tmp_path / "times.txt", [[f"{0.103 * n:.6e}"] for n in range(len(poses))])
+    lines(tmp_path / "times.txt", [[f"{0.001001 + 0.103 * n:.6e}"] for n in range(len(poses))])
     run(tmp_path / "00.txt", "--rig", ros(tmp_path / "camera.yaml"), "--out", tmp_path / "log")
     log = Log(tmp_path / "log")
     first = np.linalg.inv(at(times_ns()[0]))
-    same_poses(log, {103_000 * n: first @ at(time) for n, time in enumerate(times_ns())})
-    assert log.epoch_us == 0 and log.rows("poses")[0]["time_us"] == 0
+    exact = [1_001 + 103_000 * n for n in range(20)]
+    same_poses(log, {time_us: first @ at(time) for time_us, time in zip(exact, times_ns(), strict=True)})
+    # Of a float, 0.001001 s would be 1000 us.
+    assert log.epoch_us == 0 and log.rows("poses")[0]["time_us"] == 1_001
 
 
 def test_poses_of_a_camera_of_a_rig_file(tmp_path: Path) -> None:
