@@ -114,6 +114,11 @@ KINDS: tuple[Kind, ...] = (
         "a folder with camera_image, camera_calibration, vehicle_pose, .. of Parquet files", "waymo",
     ),
     Kind(
+        "pai", "NVIDIA Physical AI AV", "pai", _any(*(_has(f"{depth}calibration/camera_intrinsics*.parquet",
+        f"{depth}labels/*.egomotion*.parquet") for depth in ("", "*/"))),
+        "a clip with calibration, labels and camera, as pai-clip-dl of ncore writes it", "pai",
+    ),
+    Kind(
         "euroc", "EuRoC (ASL)", "euroc", _any(_has("mav0/cam0/data.csv"), _has("cam0/data.csv", "cam0/sensor.yaml")),
         "a folder with mav0/cam0/data.csv", "yaml",
     ),

@@ -34,7 +34,7 @@ CLASSES: dict[str, tuple[str, ...]] = {
         "czone_sign", "misc", "wheeled_device", "pylon", "traffic_sign", "cone", "type_sign", "rolling_container",
         "construction_sign", "road_barrier", "temporary_construction_barrier", "tools", "trash_bin", "box", "pole",
         "traffic_light", "lamp", "street_light", "vending_machine", "small_pole", "big_pole",
-        "mobile_pedestrian_crossing_sign",
+        "mobile_pedestrian_crossing_sign", "protruding_object",
     ),
 }  # fmt: skip
 """Our classes of actors, and the names of each in data sets: lower case, `_` for all but letters and digits."""
