@@ -39,12 +39,22 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--reference", action="store_true", help="name the images where they lie, and copy none")
     parser.add_argument("--rig", type=Path, metavar="FILE", help="of poses: rig file, or calibration of Kalibr or ROS")
     parser.add_argument("--pose-of", choices=["rig", "camera"], help="of poses: whose they are (rig, unless set)")
+    origin = "of maps in degrees: LATITUDE,LONGITUDE[,ALTITUDE] of the twin's origin"
+    parser.add_argument("--origin", type=_place, metavar="PLACE", help=origin)
     bags = parser.add_argument_group("bags")
     bags.add_argument("--rig-frame", metavar="FRAME", help="frame of the vehicle (else base_footprint, base_link, ..)")
     bags.add_argument("--world-frame", metavar="FRAME", help="frame of the world (else the root of tf)")
     bags.add_argument("--odometry", metavar="TOPIC", help="the Odometry topic that gives the poses, of several")
     parser.add_argument("--licence", metavar="TEXT", help="note on the licence, for log.json")
     return parser
+
+
+def _place(text: str) -> tuple[float, float, float]:
+    """LATITUDE,LONGITUDE[,ALTITUDE]. Raises `ValueError`, of which argparse makes a usage error."""
+    latitude, longitude, *rest = (float(part) for part in text.split(","))
+    if not (abs(latitude) < 90 and abs(longitude) <= 180 and len(rest) < 2):
+        raise ValueError(text)
+    return latitude, longitude, rest[0] if rest else 0.0
 
 
 def _print(report: Report) -> None:
@@ -70,7 +80,7 @@ def main(arguments: list[str] | None = None) -> int:
             return 0
         names = ("log", "rig_frame", "world_frame", "odometry", "pose_of", "licence")
         given = {name: getattr(chosen, name) for name in names}
-        options = Options(reference=chosen.reference, rig=chosen.rig, values=given, **given)
+        options = Options(reference=chosen.reference, rig=chosen.rig, origin=chosen.origin, values=given, **given)
         _print(convert(chosen.source, chosen.out, options, kind.name))
     except LogError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -23,8 +23,8 @@ class Options:
 
     log: which of several logs of the source. reference: images stay where they are. rig_frame, world_frame: the frames
     of a bag. odometry: the topic that gives the poses of a bag. rig: a calibration for poses that have none of their
-    own. pose_of: whose poses a file has, `rig` or `camera`. licence: a note for log.json. values: what the user gave,
-    for the check of a run that goes on.
+    own. pose_of: whose poses a file has, `rig` or `camera`. origin: latitude, longitude (degrees) and altitude (m) of
+    the world of a map. licence: a note for log.json. values: what the user gave, for the check of a run that goes on.
     """
 
     log: str | None = None
@@ -34,6 +34,7 @@ class Options:
     odometry: str | None = None
     rig: Path | None = None
     pose_of: str | None = None
+    origin: tuple[float, float, float] | None = None
     licence: str | None = None
     values: dict[str, str] = field(default_factory=dict)
 
@@ -126,6 +127,9 @@ KINDS: tuple[Kind, ...] = (
         "poses", "poses of TUM, EuRoC or KITTI", "poses",
         _any(_has("groundtruth.txt", "rgb.txt"), _ends(".txt", ".tum", ".csv")),
         "a .txt, .tum or .csv file of poses with --rig FILE, or a TUM folder with groundtruth.txt and rgb.txt", "yaml",
+    ),
+    Kind(
+        "lanelet2", "Lanelet2 (a map)", "lanelet2", _ends(".osm"), "an .osm file; OUT is a map file, not a log",
     ),
     Kind(
         "bag", "ROS 1 bag, rosbag2 or MCAP", "bags", _any(_has("metadata.yaml"), _ends(".bag", ".mcap", ".db3")),
