@@ -120,6 +120,9 @@ KINDS: tuple[Kind, ...] = (
         "a clip with calibration, labels and camera, as pai-clip-dl of ncore writes it", "pai",
     ),
     Kind(
+        "nurec", "NVIDIA NuRec (USDZ)", "nurec", _ends(".usdz"), "a .usdz file with rig_trajectories.json",
+    ),
+    Kind(
         "euroc", "EuRoC (ASL)", "euroc", _any(_has("mav0/cam0/data.csv"), _has("cam0/data.csv", "cam0/sensor.yaml")),
         "a folder with mav0/cam0/data.csv", "yaml",
     ),
