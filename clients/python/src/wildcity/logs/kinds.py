@@ -132,6 +132,11 @@ KINDS: tuple[Kind, ...] = (
         "a .txt, .tum or .csv file of poses with --rig FILE, or a TUM folder with groundtruth.txt and rgb.txt", "yaml",
     ),
     Kind(
+        "zod", "Zenseact Open Dataset", "zod",
+        _any(_has("sequences/*/info.json"), _has("drives/*/info.json"), _has("info.json", "calibration.json")),
+        "a folder with sequences or drives, or one of these",
+    ),
+    Kind(
         "lanelet2", "Lanelet2 (a map)", "lanelet2", _ends(".osm"), "an .osm file; OUT is a map file, not a log",
     ),
     Kind(

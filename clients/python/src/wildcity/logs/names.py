@@ -25,7 +25,7 @@ CLASSES: dict[str, tuple[str, ...]] = {
     "pedestrian": (
         "pedestrian", "person", "person_sitting", "human", "adult", "child", "wheelchair", "stroller",
         "personal_mobility", "police_officer", "construction_worker", "official_signaler", "type_pedestrian",
-        "wheeled_rider", "wheelchair_user",
+        "wheeled_rider", "wheelchair_user", "personaltransporter",
     ),
     "bicycle": ("bicycle", "cyclist", "bicyclist", "type_cyclist", "rider", "bike", "pedalcycle"),
     "object": (
@@ -35,6 +35,7 @@ CLASSES: dict[str, tuple[str, ...]] = {
         "construction_sign", "road_barrier", "temporary_construction_barrier", "tools", "trash_bin", "box", "pole",
         "traffic_light", "lamp", "street_light", "vending_machine", "small_pole", "big_pole",
         "mobile_pedestrian_crossing_sign", "protruding_object",
+        "poleobject", "trafficbeacon", "trafficsign", "trafficsignal", "trafficguide", "dynamicbarrier",
     ),
 }  # fmt: skip
 """Our classes of actors, and the names of each in data sets: lower case, `_` for all but letters and digits."""
