@@ -137,6 +137,11 @@ KINDS: tuple[Kind, ...] = (
         "a folder with sequences or drives, or one of these",
     ),
     Kind(
+        "comma2k19", "comma2k19", "comma2k19",
+        _any(*(_has(f"{depth}global_pose/frame_positions") for depth in ("", "*/", "*/*/"))),
+        "a segment with global_pose and video.hevc, or a folder of such segments", "comma",
+    ),
+    Kind(
         "lanelet2", "Lanelet2 (a map)", "lanelet2", _ends(".osm"), "an .osm file; OUT is a map file, not a log",
     ),
     Kind(

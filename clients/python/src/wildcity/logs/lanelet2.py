@@ -10,7 +10,6 @@ This kind makes a map file, not a log: OUT is a JSON file that `wildcity map che
 from __future__ import annotations
 
 import json
-import math
 import os
 from collections import Counter
 from pathlib import Path
@@ -19,6 +18,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from .earth import earth_centred, tangent_plane
 from .errors import LogError
 from .frames import Matrix
 from .kinds import Options
@@ -35,9 +35,6 @@ _LANES = {
 """Subtypes of lanelets, and the users of our lanes. `crosswalk` is an area; others are left out."""
 
 _AREAS = {"parking": "drivable", "keepout": None, "freespace": "drivable", "intersection_area": "intersection"}
-
-EQUATOR_M, FLATTENING = 6378137.0, 1 / 298.257223563
-"""WGS84."""
 
 
 def logs(source: Path) -> list[str]:
@@ -119,7 +116,7 @@ class _Osm:
         self.nodes: dict[str, Matrix] = {}
         self.ways: dict[str, list[str]] = {}
         self.relations: dict[str, tuple[dict[str, str], list[tuple[str, str]]]] = {}
-        self._axes = None if origin is None else _tangent(*origin)
+        self._axes = None if origin is None else tangent_plane(*origin)
         try:
             for _, item in ElementTree.iterparse(path):
                 self._take(item)
@@ -148,7 +145,7 @@ class _Osm:
             problem = "its nodes have latitude and longitude, and no local_x and local_y"
             raise LogError(self.path, problem, "give the twin's origin with --origin LATITUDE,LONGITUDE[,ALTITUDE]")
         middle, axes = self._axes
-        return np.asarray(axes @ (_earth(float(item.attrib["lat"]), float(item.attrib["lon"]), height) - middle))
+        return np.asarray(axes @ (earth_centred(float(item.attrib["lat"]), float(item.attrib["lon"]), height) - middle))
 
     def way(self, number: str, relation: str) -> list[str]:
         """The nodes of a way."""
@@ -184,24 +181,3 @@ class _Osm:
 
 def _tags(item: ElementTree.Element) -> dict[str, str]:
     return {one.attrib["k"]: one.attrib["v"] for one in item.iter("tag")}
-
-
-def _earth(latitude_deg: float, longitude_deg: float, altitude_m: float) -> Matrix:
-    """Earth-centred coordinates [3] of a place on WGS84, in metres."""
-    latitude, longitude = math.radians(latitude_deg), math.radians(longitude_deg)
-    squared = FLATTENING * (2 - FLATTENING)
-    normal = EQUATOR_M / math.sqrt(1 - squared * math.sin(latitude) ** 2)
-    flat = (normal + altitude_m) * math.cos(latitude)
-    up = (normal * (1 - squared) + altitude_m) * math.sin(latitude)
-    return np.array([flat * math.cos(longitude), flat * math.sin(longitude), up])
-
-
-def _tangent(latitude_deg: float, longitude_deg: float, altitude_m: float) -> tuple[Matrix, Matrix]:
-    """The origin in earth-centred coordinates [3], and the axes east, north, up as rows [3, 3]."""
-    a, b = math.radians(latitude_deg), math.radians(longitude_deg)
-    axes = [
-        [-math.sin(b), math.cos(b), 0.0],
-        [-math.sin(a) * math.cos(b), -math.sin(a) * math.sin(b), math.cos(a)],
-        [math.cos(a) * math.cos(b), math.cos(a) * math.sin(b), math.sin(a)],
-    ]
-    return _earth(latitude_deg, longitude_deg, altitude_m), np.array(axes)

@@ -10,22 +10,19 @@ Sweeps are compressed by Draco, which is not read.
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-
-import av
 
 from .arrow_files import parquet_rows
 from .errors import LogError
 from .frames import Matrix, Poses, transform
 from .kinds import Options, choose
 from .pai_lenses import camera_of
-from .progress import Progress
 from .source import opened
 from .tableio import require
+from .videos import add_video
 from .writer import LogWriter, Report
 
 LICENCE = "the licence of nvidia/PhysicalAI-Autonomous-Vehicles"
@@ -131,19 +128,7 @@ class _Clip:
         """Adds the frames of a video."""
         path, video = self.root / "camera" / f"{self.name}.{camera}.timestamps.parquet", self.video(camera)
         times = [int(row["timestamp"]) for row in self.rows(path, ["timestamp"], "the times of a video")]
-        count = 0
-        with Progress(f"pai, {camera}", len(times)) as progress:
-            for frame in _frames(video):
-                if count >= len(times):
-                    raise LogError(path, f"{len(times)} times, but the video has more frames", "download it again")
-                if count and times[count] <= times[count - 1]:
-                    problem = f"the time {times[count]} follows {times[count - 1]}: the clock runs backwards"
-                    raise LogError(path, problem, "download the clip again")
-                writer.image_bytes(camera, times[count], ".png", lambda frame=frame: _png(frame))  # type: ignore[misc]
-                count += 1
-                progress.step()
-        if count != len(times):
-            raise LogError(video, f"{count} frames for {len(times)} times", "download it again: it may be cut off")
+        add_video(writer, camera, video, times, path)
         boxes = path.with_name(path.name.replace(".timestamps.", ".blurred_boxes."))
         writer.left_out(f"blurred boxes of {camera}, files", int(boxes.exists()), "no field for them")
 
@@ -173,18 +158,3 @@ def _pose(row: dict[str, Any], place: str) -> Matrix:
     if not abs((x * x + y * y + z * z + w * w) ** 0.5 - 1) < 1e-3:
         raise LogError(place, f"the quaternion (x, y, z, w) {(x, y, z, w)} has not the length 1", "download it again")
     return transform([float(row[name]) for name in _POSE[4:]], (w, x, y, z))
-
-
-def _frames(video: Path) -> Iterator[Any]:
-    """Frames of a video, decoded one by one."""
-    try:
-        with av.open(str(video)) as container:
-            yield from container.decode(video=0)
-    except (av.FFmpegError, IndexError) as error:
-        raise LogError(video, f"cannot decode the video: {error}", "download it again") from None
-
-
-def _png(frame: Any) -> bytes:
-    out = io.BytesIO()
-    frame.to_image().save(out, "PNG", compress_level=3)
-    return out.getvalue()
