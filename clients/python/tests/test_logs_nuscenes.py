@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from logs_truth import (
     Log,
+    contents,
     drive,
     image_bytes,
     judge,
@@ -26,6 +28,7 @@ from logs_truth import (
     wxyz,
 )
 from scipy.spatial.transform import Rotation
+from wildcity.logs.writer import LogWriter
 
 START_US = 1_532_402_927_647_951
 CAMERAS = {
@@ -293,3 +296,23 @@ def test_a_log_is_not_overwritten_and_other_options_do_not_go_on(dataset: Tables
     assert "other options; remove this folder" in run(dataset.root, "--log", "scene-0001", "--out", out, code=1)
     run(dataset.root, "--log", "scene-0000", "--out", out)
     assert "it exists" in run(dataset.root, "--log", "scene-0000", "--out", out, code=1)
+
+
+def test_a_full_disk_is_an_error_and_the_next_run_goes_on(
+    dataset: Tables, log: Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = [0]
+
+    def full(self: LogWriter, table: str, time_us: int, fields: dict[str, Any]) -> None:
+        written[0] += 1
+        if written[0] > 60:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        row(self, table, time_us, fields)
+
+    row, out = LogWriter.row, tmp_path / "log"
+    with monkeypatch.context() as patched:
+        patched.setattr(LogWriter, "row", full)
+        text = run(dataset.root, "--log", "scene-0000", "--out", out, code=1)
+    assert "No space left on device; make space" in text and not out.exists()
+    assert "went on: " in run(dataset.root, "--log", "scene-0000", "--out", out)
+    assert contents(out) == contents(log.folder)

@@ -85,6 +85,10 @@ def main(arguments: list[str] | None = None) -> int:
     except LogError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+    except OSError as error:
+        # Of a disk that is full or a file that may not be read, wherever it happens: the next run goes on.
+        print(f"error: {error}; make space or change the rights, and run the command again", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print("stopped: the same command goes on", file=sys.stderr)
         return 130

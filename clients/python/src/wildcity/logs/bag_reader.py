@@ -22,7 +22,7 @@ from .errors import LogError
 
 __all__ = ["Bag", "Message"]
 
-_BROKEN = "repair it: `ros2 bag reindex`, `rosbag reindex` or `mcap recover`"
+_BROKEN = "give a bag of ROS (MCAP: profile ros2), or repair it: `ros2 bag reindex`, `rosbag reindex`, `mcap recover`"
 
 
 @dataclass

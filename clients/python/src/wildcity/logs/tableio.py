@@ -12,11 +12,15 @@ import numpy as np
 import numpy.typing as npt
 
 from .errors import LogError
+from .progress import Progress
 
 __all__ = ["field", "json_file", "json_rows", "numbers", "require", "text_of"]
 
 _CHUNK = 1 << 20
 """Characters that are read at once."""
+
+_SLOW_BYTES = 1 << 27
+"""A larger table has a progress bar of its own."""
 
 
 def require(path: Path, what: str) -> Path:
@@ -45,7 +49,10 @@ def json_file(path: Path, what: str) -> Any:
 def json_rows(path: Path, what: str) -> Iterator[dict[str, Any]]:
     """The objects of a JSON array, one by one: the file may be larger than the memory."""
     decoder = json.JSONDecoder()
-    with require(path, what).open(encoding="utf-8") as file:
+    size = require(path, what).stat().st_size
+    # A table of the full data set takes half a minute; of a small one nothing is said.
+    label = Progress(path.name, size // _CHUNK) if size >= _SLOW_BYTES else None
+    with path.open(encoding="utf-8") as file:
         text = file.read(_CHUNK)
         at = _skip(text, 0)
         if text[at : at + 1] != "[":
@@ -63,6 +70,8 @@ def json_rows(path: Path, what: str) -> Iterator[dict[str, Any]]:
                 if not more:
                     raise LogError(path, f"not JSON, or cut off: {error}", "download or unpack it again") from None
                 text, at = text[at:] + more, 0
+                if label is not None:
+                    label.step()
                 continue
             if not isinstance(row, dict):
                 raise LogError(path, f"a row is {row!r:.40}, not an object", "download or unpack it again")
