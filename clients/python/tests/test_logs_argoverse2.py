@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow
 import pyarrow.feather
+import pyproj
 import pytest
 from logs_truth import (
     Array,
@@ -28,6 +29,7 @@ from logs_truth import (
     wxyz,
 )
 from scipy.spatial.transform import Rotation
+from wildcity.logs.argoverse2 import CITIES
 
 NAME = "7fab2350-7eaf-3b7e-a39d-000000000000"
 START_NS = 315_966_253_572_412_942
@@ -218,6 +220,22 @@ def test_boxes_and_the_map(log: Log) -> None:
     assert [area["kind"] for area in found["areas"]] == ["drivable", "crosswalk"]
     middle = np.array(found["lanes"][0]["center"]) + log.origin - START
     np.testing.assert_allclose(middle, [[0, 0, 0], [10, 0, 0], [20, 0, 0]], atol=1e-6)
+
+
+def test_the_place_on_the_earth_is_that_of_the_city(log: Log) -> None:
+    """The origins of av2/geometry/utm.py, by PROJ."""
+    degrees = {
+        "ATX": (30.27464237939507, -97.7404457407424), "DTW": (42.29993066912924, -83.17555750783717),
+        "MIA": (25.77452579915163, -80.19656914449405), "PAO": (37.416065, -122.13571963362166),
+        "PIT": (40.44177902989321, -80.01294377242584), "WDC": (38.889377, -77.0355047439081),
+    }  # fmt: skip
+    for city, (latitude, longitude) in degrees.items():
+        zone, easting, northing = CITIES[city]
+        judge = pyproj.Transformer.from_crs("EPSG:4326", f"EPSG:326{zone:02d}", always_xy=True)
+        np.testing.assert_allclose(judge.transform(longitude, latitude), (easting, northing), rtol=0, atol=1e-3)
+    _, easting, northing = CITIES["PIT"]
+    place = {"easting_m": easting + log.origin[0], "northing_m": northing + log.origin[1]}
+    assert log.head["world"]["geo"] == {"projection": "EPSG:32617", **place}
 
 
 def test_a_killed_run_goes_on(source: Path, log: Log, tmp_path: Path) -> None:

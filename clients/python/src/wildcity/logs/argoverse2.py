@@ -8,6 +8,7 @@ sweep's timestamp; each has its own time after it (`offset_ns`).
 
 from __future__ import annotations
 
+import re
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,16 @@ from .tableio import field, json_file
 from .writer import LogWriter, Report
 
 LICENCE = "CC BY-NC-SA 4.0 (Argoverse 2)"
+
+CITIES = {
+    "ATX": (14, 621150.0275, 3349889.9996),
+    "DTW": (17, 320669.9346, 4685369.9988),
+    "MIA": (17, 580560.0088, 2850959.9999),
+    "PAO": (10, 576480.0006, 4141379.9353),
+    "PIT": (17, 583710.0070, 4477259.9998),
+    "WDC": (18, 323459.9997, 4306469.9870),
+}
+"""UTM zone, easting and northing of each city's origin, of its degrees in av2/geometry/utm.py."""
 
 _POSE = ["qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"]
 _POSES, _MOUNTS = "city_SE3_egovehicle.feather", "calibration/egovehicle_SE3_sensor.feather"
@@ -55,6 +66,7 @@ def convert(source: Path, out: Path, options: Options) -> Report:
     with opened("argoverse2", source, out, options, log=name, licence=LICENCE, decides={"poses": len(times)}) as writer:
         first_us = min([times[0], *(int(path.stem) // 1000 for path in log.glob("sensors/*/*.feather"))])
         writer.begin(first_us, poses[0][:3, 3])
+        writer.geo = _geo(writer, log)
         for time_us, pose in zip(times, poses, strict=True):
             writer.pose(time_us, pose, str(log / _POSES))
         writer.left_out("poses in the same microsecond as the pose before", repeated, "a log has microseconds")
@@ -63,6 +75,23 @@ def convert(source: Path, out: Path, options: Options) -> Report:
         _sweeps(writer, log)
         _boxes(writer, log, Poses(times, poses))
         return writer.finish(_map(writer, log))
+
+
+def _map_path(log: Path) -> Path | None:
+    return next(iter(sorted(log.glob("map/log_map_archive_*.json"))), None)
+
+
+def _geo(writer: LogWriter, log: Path) -> dict[str, Any] | None:
+    """The anchor of the log's origin. The name of the map names the city: log_map_archive_ID____PIT_city_47896.json."""
+    path = _map_path(log)
+    found = re.search(r"____([A-Z]+)_city_", path.name) if path else None
+    if found is None or found[1] not in CITIES:
+        writer.left_out("place on the earth", 1, "the log has no map with the name of its city")
+        return None
+    writer.left_out("height above the ellipsoid", 1, "that of the city's frame is not documented")
+    zone, easting, northing = CITIES[found[1]]
+    east, north = easting + float(writer.origin_m[0]), northing + float(writer.origin_m[1])
+    return {"projection": f"EPSG:326{zone:02d}", "easting_m": east, "northing_m": north}
 
 
 def _pose(row: dict[str, Any], place: str) -> Matrix:
@@ -164,7 +193,7 @@ def _boxes(writer: LogWriter, log: Path, poses: Poses) -> None:
 
 def _map(writer: LogWriter, log: Path) -> dict[str, Any] | None:
     """log_map_archive_*.json: lane segments, drivable areas and crossings, in the city frame."""
-    path = next(iter(sorted(log.glob("map/log_map_archive_*.json"))), None)
+    path = _map_path(log)
     if path is None:
         writer.left_out("map", 1, "the log has no map/log_map_archive_*.json")
         return None
