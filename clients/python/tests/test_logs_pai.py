@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import av
+import DracoPy
 import numpy as np
 import pyarrow
 import pyarrow.parquet
@@ -26,6 +27,7 @@ CAMERAS = {
     "camera_rear_left_70fov": mount(1.0, 0.9, 1.2, 140),
     "camera_front_tele_30fov": mount(1.75, 0, 1.5, 0),
 }
+LIDAR = matrix([1.2, 0.0, 2.0], Rotation.from_euler("ZYX", [1.5, 0.02, 0.01]))
 POLYNOMIAL = [0.0, 944.6 / SCALE, -20.7 / SCALE, 54.1 / SCALE, -87.5 / SCALE, 31.0 / SCALE]
 INVERSE = [0.0, SCALE / 944.6, 1e-5, 0.0, 0.0, 0.0]
 CDE = [0.99976, 5.5e-05, 1.7e-05]
@@ -88,8 +90,8 @@ def make(root: Path) -> Path:
     write(clip / "labels" / f"{CLIP}.egomotion.offline.parquet", {"timestamp": times, **pose_columns(poses)})
     wrong = [matrix([9, 9, 9], Rotation.identity())] * len(times)
     write(clip / "labels" / f"{CLIP}.egomotion.parquet", {"timestamp": times, **pose_columns(wrong)})
-    names, others = [*CAMERAS, "radar_x"], ["another-clip"]
-    mounts = [*CAMERAS.values(), np.eye(4)]
+    names, others = [*CAMERAS, "lidar_top_360fov"], ["another-clip"]
+    mounts = [*CAMERAS.values(), LIDAR]
     write(clip / "calibration" / "sensor_extrinsics.parquet", {
         "clip_id": [CLIP] * len(names) + others, "sensor_name": [*names, "camera_front_wide_120fov"],
         **pose_columns([*mounts, np.eye(4)]),
@@ -114,8 +116,29 @@ def make(root: Path) -> Path:
         "reference_frame": ["rig"] * count, "reference_frame_timestamp_us": [105_000] * count,
         "source": ["autolabel"] * count, **{key: [value] * count for key, value in values.items()},
     })  # fmt: skip
-    write(clip / "lidar" / f"{CLIP}.lidar_top_360fov.parquet", {"draco_encoded_pointcloud": [b"DRACO"]})
+    write_sweeps(clip / "lidar" / f"{CLIP}.lidar_top_360fov.parquet")
     return root
+
+
+def sweep(number: int) -> tuple[Array, Array]:
+    """Points of the world [150, 3] and their times in microseconds."""
+    random = np.random.default_rng(number)
+    times = 100_000 * number + random.permutation(150) * 600
+    return moved(drive(0.1 * number), random.uniform(-20, 20, (150, 3))), times
+
+
+def write_sweeps(path: Path) -> None:
+    rows = []
+    for number in range(3):
+        world, times = sweep(number)
+        poses = [np.linalg.inv(drive(float(time) / 1e6) @ LIDAR) for time in times]
+        xyz = np.array([moved(pose, point[None])[0] for pose, point in zip(poses, world, strict=True)], np.float32)
+        extra = {"intensity": (np.arange(150) % 256).astype(np.uint8)[:, None]}
+        extra |= {"timestamp": times.astype(np.uint32)[:, None], "model_element": np.zeros((150, 2), np.uint16)}
+        rows.append(DracoPy.encode(xyz, generic_attributes=extra, preserve_order=True, quantization_bits=0))
+    starts = [100_000 * number for number in range(3)]
+    bounds = {"spin_start_timestamp": starts, "spin_end_timestamp": [start + 100_000 for start in starts]}
+    write(path, {**bounds, "draco_encoded_pointcloud": rows})
 
 
 @pytest.fixture(scope="module")
@@ -193,8 +216,19 @@ def test_boxes_and_what_is_left_out(log: Log) -> None:
     box = matrix([15, 2, 0.8], Rotation.from_euler("z", 0.5))
     np.testing.assert_allclose(log.pose(rows[0]["world_from_box"]), drive(0.105) @ box, rtol=0, atol=1e-3)
     left_out = " ".join(log.head["left_out"])
-    for part in ("class kraken: 1", "files of sweeps: 1 (Draco", "camera camera_rear_tele_30fov: 1"):
+    for part in ("class kraken: 1", "camera camera_rear_tele_30fov: 1"):
         assert part in left_out
+
+
+def test_the_lidar_is_deskewed_by_its_own_times(log: Log) -> None:
+    rows = log.rows("lidar")
+    assert len(rows) == 3 and "compensated_to_us" not in rows[0]
+    for number, row in enumerate(rows):
+        found, times = log.sweep_in_world(row)
+        world, wanted = sweep(number)
+        order = np.argsort(wanted)
+        assert np.array_equal(times, wanted[order])
+        np.testing.assert_allclose(found, world[order], rtol=0, atol=1e-3)
 
 
 def test_a_killed_run_goes_on(source: Path, log: Log, tmp_path: Path) -> None:
@@ -236,6 +270,14 @@ BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
     "too few times": (edited("camera", f"{WIDE}.timestamps", lambda t: t["timestamp"].pop()), "the video has more"),
     "too many times": (
         edited("camera", f"{WIDE}.timestamps", lambda t: t["timestamp"].append(10**7)), "7 frames for 8 times"),
+    "a broken sweep": (
+        edited("lidar", f"{CLIP}.lidar_top_360fov", lambda t: t["draco_encoded_pointcloud"].__setitem__(0, b"DRACO")),
+        "no point cloud of Draco"),
+    "times of another unit": (
+        edited("lidar", f"{CLIP}.lidar_top_360fov", lambda t: t["spin_start_timestamp"].__setitem__(2, 10**9)),
+        "outside the spin of 1000000000"),
+    "a lost LiDAR": (
+        edited("calibration", "sensor_extrinsics", lambda t: t["sensor_name"].__setitem__(3, "x")), "no row of lidar"),
     "a broken video": (lambda r: (r / CLIP / "camera" / f"{WIDE}.mp4").write_bytes(b"mp4"), "cannot decode the video"),
 }  # fmt: skip
 

@@ -5,27 +5,36 @@ up, on the ground under the rear axle; quaternions (x, y, z, w); times in micros
 end of its readout, which takes `shutter_delay_us`. The `.offline` file of a component is preferred, as ncore does.
 
 Cameras are MP4 videos. Their frames are decoded by PyAV and written as PNG, so that nothing is lost after decoding.
-Sweeps are compressed by Draco, which is not read.
+Points of a sweep are in the axes of the LiDAR at their own times, which are attributes of the points in Draco's format.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+import DracoPy
+import numpy as np
 
 from .arrow_files import parquet_rows
 from .errors import LogError
 from .frames import Matrix, Poses, transform
 from .kinds import Options, choose
 from .pai_lenses import camera_of
+from .points import Sweep
+from .progress import Progress
 from .source import opened
 from .tableio import require
 from .videos import add_video
 from .writer import LogWriter, Report
 
 LICENCE = "the licence of nvidia/PhysicalAI-Autonomous-Vehicles"
+
+SLACK_US = 100_000
+"""How far a point may be outside the bounds of its spin: further ones are in another unit."""
 
 _POSE = ["qx", "qy", "qz", "qw", "x", "y", "z"]
 
@@ -53,9 +62,8 @@ def convert(source: Path, out: Path, options: Options) -> Report:
         for camera in readouts:
             clip.images(writer, camera)
         clip.boxes(writer, Poses(times, poses))
-        lidars, radars = clip.root.glob("lidar/*.parquet"), clip.root.glob("radar/*.parquet")
-        writer.left_out("files of sweeps", len(list(lidars)), "Draco is not read")
-        writer.left_out("files of radars", len(list(radars)), "no table for them")
+        clip.sweeps(writer)
+        writer.left_out("files of radars", len(list(clip.root.glob("radar/*.parquet"))), "no table for them")
         return writer.finish()
 
 
@@ -64,6 +72,8 @@ class _Clip:
 
     def __init__(self, root: Path, name: str) -> None:
         self.root, self.name = root, name
+        self.mounts: dict[str, Matrix] = {}
+        """rig_from_sensor, by the sensor's name."""
 
     def file(self, folder: str, name: str) -> Path:
         """A Parquet file, or its `.offline` variant if there is one."""
@@ -100,7 +110,7 @@ class _Clip:
         """Adds the cameras that have a video. Returns their names."""
         path, mounts_path = self.file("calibration", "camera_intrinsics"), self.file("calibration", "sensor_extrinsics")
         names = ["clip_id", "sensor_name", *_POSE]
-        mounts = {row["sensor_name"]: _pose(row, str(mounts_path))
+        self.mounts = {row["sensor_name"]: _pose(row, str(mounts_path))
                   for row in self.rows(mounts_path, names, "the mounts of the sensors")}  # fmt: skip
         found = []
         names = ["clip_id", "camera_name", "model_type", "model_parameters"]
@@ -111,13 +121,13 @@ class _Clip:
             if not self.video(name).exists():
                 writer.left_out(f"camera {name}", 1, "the clip has no video of it")
                 continue
-            if name not in mounts:
+            if name not in self.mounts:
                 raise LogError(mounts_path, f"no row of {name}", "use calibrations of one clip")
             try:
                 parameters = json.loads(row["model_parameters"])
             except (TypeError, json.JSONDecodeError):
                 raise LogError(place, "model_parameters is no JSON: no intrinsics", "download it again") from None
-            writer.cameras.append(camera_of(name, row["model_type"], parameters, mounts[name], place))
+            writer.cameras.append(camera_of(name, row["model_type"], parameters, self.mounts[name], place))
             found.append(name)
         return found
 
@@ -131,6 +141,21 @@ class _Clip:
         add_video(writer, camera, video, times, path)
         boxes = path.with_name(path.name.replace(".timestamps.", ".blurred_boxes."))
         writer.left_out(f"blurred boxes of {camera}, files", int(boxes.exists()), "no field for them")
+
+    def sweeps(self, writer: LogWriter) -> None:
+        """Adds the spins of each LiDAR: a row has their bounds, and the points as Draco encodes them."""
+        names = ["spin_start_timestamp", "spin_end_timestamp", "draco_encoded_pointcloud"]
+        for path in sorted((self.root / "lidar").glob(f"{self.name}.lidar_*.parquet")):
+            lidar = path.name.removeprefix(f"{self.name}.").partition(".")[0]
+            if lidar not in self.mounts:
+                raise LogError(path, f"sensor_extrinsics has no row of {lidar}", "use calibrations of one clip")
+            writer.lidar(lidar, self.mounts[lidar])
+            with Progress(f"pai, {lidar}", 0) as progress:
+                for row in parquet_rows(path, names, "the sweeps of a LiDAR", rows_at_once=2):
+                    start_us, end_us = (int(row[name].as_py()) for name in names[:2])
+                    read = partial(_sweep, row[names[2]].as_py, (start_us, end_us), f"{path}, spin at {start_us} us")
+                    writer.sweep(lidar, start_us, read)
+                    progress.step()
 
     def boxes(self, writer: LogWriter, poses: Poses) -> None:
         """Adds the obstacles: boxes in the rig's frame at `reference_frame_timestamp_us`."""
@@ -158,3 +183,19 @@ def _pose(row: dict[str, Any], place: str) -> Matrix:
     if not abs((x * x + y * y + z * z + w * w) ** 0.5 - 1) < 1e-3:
         raise LogError(place, f"the quaternion (x, y, z, w) {(x, y, z, w)} has not the length 1", "download it again")
     return transform([float(row[name]) for name in _POSE[4:]], (w, x, y, z))
+
+
+def _sweep(data: Callable[[], bytes], bounds: tuple[int, int], place: str) -> Sweep:
+    """Points of Draco with the attributes `timestamp`, in microseconds as the bounds, and `intensity`."""
+    try:
+        found = DracoPy.decode(data())
+    except (ValueError, TypeError, RuntimeError, DracoPy.FileTypeException) as error:
+        raise LogError(place, f"no point cloud of Draco: {error}", "download the clip again") from None
+    values = {its["name"]: np.asarray(its["data"]).reshape(len(found.points), -1)[:, 0] for its in found.attributes}
+    if "timestamp" not in values:
+        raise LogError(place, "its points have no attribute timestamp", "use a clip of the documented schema")
+    times = values["timestamp"].astype(np.int64)
+    if len(times) and (times.min() < bounds[0] - SLACK_US or times.max() > bounds[1] + SLACK_US):
+        problem = f"points of {times.min()} to {times.max()} us, outside the spin of {bounds[0]} to {bounds[1]} us"
+        raise LogError(place, problem, "use a clip of the documented schema")
+    return Sweep(np.asarray(found.points), times, values.get("intensity"))
