@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -197,6 +198,28 @@ def test_bad_bags_are_refused(name: str, tmp_path: Path) -> None:
     source = write(tmp_path / "bag", "sqlite3", change)
     text = refused(tmp_path, source)
     assert words in text and str(source) in text, text
+
+
+def test_a_camera_without_a_calibration_in_the_bag_takes_that_of_a_rig_file(made: Made, tmp_path: Path) -> None:
+    """Neither its CameraInfo nor its mount is in the bag."""
+
+    def change(m: Maker, found: Recorded) -> Recorded:
+        kept = without("/camera/front/camera_info")(m, found)
+        for _, topic, message in kept:
+            if topic == "/tf_static":
+                message.transforms = [one for one in message.transforms if one.child_frame_id != "front_optical"]
+        return kept
+
+    source = write(tmp_path / "bag", "sqlite3", change)
+    assert "give the camera camera_front with --rig FILE" in refused(tmp_path, source)
+    front = {**made[2].rig["camera_front"], "cx": 111.5}
+    rig = {"name": "r", "cameras": [front, {**front, "name": "roof"}]}
+    (tmp_path / "rig.json").write_text(json.dumps(rig))
+    said = run(source, "--rig", tmp_path / "rig.json", "--out", tmp_path / "log")
+    log = Log(tmp_path / "log")
+    assert log.rig["camera_front"] == front and log.rig["camera_left"] == made[2].rig["camera_left"]
+    assert len(log.times("images", camera="camera_front")) == 11
+    assert "left out: camera roof of --rig: 1 (the bag has camera_front, camera_left, camera_right)" in said
 
 
 @pytest.mark.parametrize("kind", ["mcap_package", "ros1"])

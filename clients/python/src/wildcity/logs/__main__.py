@@ -37,7 +37,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--kind", choices=[kind.name for kind in KINDS], help="kind of the source, if it is not found")
     parser.add_argument("--log", metavar="NAME", help="which log of the source: a scene, a drive or a segment")
     parser.add_argument("--reference", action="store_true", help="name the images where they lie, and copy none")
-    parser.add_argument("--rig", type=Path, metavar="FILE", help="of poses: rig file, or calibration of Kalibr or ROS")
+    parser.add_argument("--rig", type=Path, metavar="FILE", help="rig file or calibration, of poses and bags")
     parser.add_argument("--pose-of", choices=["rig", "camera"], help="of poses: whose they are (rig, unless set)")
     origin = "of maps in degrees: LATITUDE,LONGITUDE[,ALTITUDE] of the twin's origin"
     parser.add_argument("--origin", type=_place, metavar="PLACE", help=origin)

@@ -71,7 +71,9 @@ class Survey:
                 return f"{folder}/camera_info", self.infos[f"{folder}/camera_info"]
         wanted = f"{_camera_topic(topic)}/camera_info"
         problem = f"no CameraInfo for {topic}: the rig has no intrinsics of this camera"
-        raise LogError(self.tree.place, problem, f"record {wanted}")
+        raise LogError(
+            self.tree.place, problem, f"record {wanted}, or give the camera {self.names[topic]} with --rig FILE"
+        )
 
 
 def _camera_topic(topic: str) -> str:

@@ -17,6 +17,7 @@ from .bag_content import camera_of, compressed_suffix, png_of, sweep_of
 from .bag_frames import matrix_of
 from .bag_reader import Bag, Message
 from .bag_survey import Survey, survey
+from .calibrations import cameras_of
 from .errors import LogError
 from .frames import Matrix, inverse
 from .kinds import Options
@@ -24,6 +25,7 @@ from .lenses import check_mount
 from .points import Sweep
 from .progress import Progress
 from .source import opened
+from .tableio import text_of
 from .writer import LogWriter, Report
 
 
@@ -36,7 +38,9 @@ def convert(source: Path, out: Path, options: Options) -> Report:
     """Writes the log of a bag."""
     with Bag(source) as bag:
         found = survey(bag, options)
-        decides = {"bytes": _bytes(source), "messages": bag.count}
+        decides: dict[str, Any] = {"bytes": _bytes(source), "messages": bag.count}
+        if options.rig is not None:
+            decides["rig"] = text_of(options.rig, "the calibration")
         licence = "not stated by the bag"
         with opened("bag", source, out, options, log=source.stem, licence=licence, decides=decides) as writer:
             return _Conversion(bag, found, options, writer).run()
@@ -119,10 +123,18 @@ class _Conversion:
         return rig_from_sensor
 
     def _sensors(self) -> None:
-        """Adds cameras and LiDARs, and the mount of the IMU."""
+        """Adds cameras and LiDARs, and the mount of the IMU. A camera of `--rig` needs no calibration in the bag."""
+        given = {one["name"]: one for one in cameras_of(self.options.rig)} if self.options.rig else {}
+        known = {name for topic, name in self.found.names.items() if self.found.roles[topic] != "cloud"}
+        for name in given.keys() - known:
+            self.writer.left_out(
+                f"camera {name} of --rig", 1, f"the bag has {', '.join(sorted(known)) or 'no cameras'}"
+            )
         for topic, role in sorted(self.found.roles.items()):
             name = self.found.names.get(topic, "")
-            if role in ("image", "compressed"):
+            if role in ("image", "compressed") and name in given:
+                self.writer.cameras.append(given[name])
+            elif role in ("image", "compressed"):
                 info_topic, info = self.found.info_of(topic)
                 mount = self._mount(topic, f"camera {name}")
                 place = f"{self.bag.path}, topic {info_topic}"
