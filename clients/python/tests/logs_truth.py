@@ -207,15 +207,20 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def killed_and_resumed(tmp: Path, whole: Path, *arguments: Any, after: int = 3) -> None:
-    """A run that is killed leaves no OUT; the same command then writes what `whole` has, byte for byte."""
+def killed_and_resumed(tmp: Path, whole: Path, *arguments: Any, after: int = 3, again: int | None = None) -> None:
+    """A run that is killed leaves no OUT; the same command then writes what `whole` has, byte for byte.
+
+    after: files after which it is killed. again: files after which the next run is killed, too.
+    """
     out = tmp / "resumed"
     run_and_kill(after, *arguments, "--out", out)
     assert not out.exists()
     partial = out.with_name("resumed.partial")
     with (partial / "done.jsonl").open("ab") as journal:
         journal.write(b'{"file": "images/to')  # As a kill within the write of a line leaves it.
-    assert f"went on: {after} files were whole" in run(*arguments, "--out", out)
+    if again is not None:
+        run_and_kill(again, *arguments, "--out", out)
+    assert f"went on: {again or after} files were whole" in run(*arguments, "--out", out)
     assert contents(out) == contents(whole)
     assert not partial.exists()
 

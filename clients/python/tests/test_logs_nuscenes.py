@@ -218,7 +218,7 @@ def test_boxes_and_what_is_left_out(log: Log) -> None:
 
 
 def test_a_killed_run_goes_on(dataset: Tables, log: Log, tmp_path: Path) -> None:
-    killed_and_resumed(tmp_path, log.folder, dataset.root, "--log", "scene-0000", after=5)
+    killed_and_resumed(tmp_path, log.folder, dataset.root, "--log", "scene-0000", after=5, again=9)
 
 
 def test_references_name_the_recorded_files(dataset: Tables, tmp_path: Path) -> None:

@@ -98,7 +98,8 @@ def test_transforms_are_those_of_scipy() -> None:
 
 
 def test_poses_are_interpolated_as_by_scipy() -> None:
-    turns = Rotation.from_rotvec([[0, 0, 0], [0, 0, 0.4], [0.1, 0, 3.0], [0.1, 0, 3.0]])
+    # From 3.0 to 3.5 rad the quaternions with w >= 0 change their side.
+    turns = Rotation.from_rotvec([[0, 0, 0], [0, 0, 0.4], [0.1, 0, 3.0], [0, 0, 3.5]])
     times = [0, 100, 250, 300]
     found = [transform((n, n * n, 0), (turn.as_quat()[[3, 0, 1, 2]])) for n, turn in enumerate(turns)]
     poses, judge = Poses(times, found), Slerp(times, turns)
