@@ -58,6 +58,7 @@ def osm(path: Path, *, is_local: bool, change: tuple[str, str] = ("", "")) -> Pa
         pairs = {"type": "lanelet", **tags}
         lines += "".join(f"<tag k='{key}' v='{value}'/>" for key, value in pairs.items())
         text += f"<relation id='{name}'>{lines}</relation>\n"
+    text += "<relation id='7' action='delete'><tag k='type' v='lanelet'/><tag k='subtype' v='road'/></relation>\n"
     path.write_text((text + "</osm>\n").replace(*change) if change[0] else text + "</osm>\n")
     return path
 

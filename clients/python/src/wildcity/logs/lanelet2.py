@@ -126,6 +126,8 @@ class _Osm:
             raise LogError(path, f"a node, way or relation lacks a number: {error}", "export the map again") from None
 
     def _take(self, item: ElementTree.Element) -> None:
+        if item.attrib.get("action") == "delete":
+            return  # JOSM keeps what was deleted.
         if item.tag == "node":
             self.nodes[item.attrib["id"]] = self._position(item)
         elif item.tag == "way":
