@@ -222,6 +222,22 @@ def test_a_camera_without_a_calibration_in_the_bag_takes_that_of_a_rig_file(made
     assert "left out: camera roof of --rig: 1 (the bag has camera_front, camera_left, camera_right)" in said
 
 
+def test_a_topic_can_be_left_out(tmp_path: Path) -> None:
+    """The IMU has no mount: the bag is refused until the user leaves it out."""
+
+    def change(m: Maker, found: Recorded) -> Recorded:
+        for _, topic, message in found:
+            if topic == "/tf_static":
+                message.transforms = [one for one in message.transforms if one.child_frame_id != "imu"]
+        return found
+
+    source = write(tmp_path / "bag", "sqlite3", change)
+    assert "the frame of the IMU" in (text := refused(tmp_path, source)) and "--leave-out TOPIC" in text
+    said = run(source, "--leave-out", "/imu", "--leave-out", "/fix", "--out", tmp_path / "log")
+    assert "messages of /imu: 120 (the user left it out)" in said and not Log(tmp_path / "log").rows("gps")
+    assert "no topic /nothing, only " in refused(tmp_path, source, "--leave-out", "/nothing")
+
+
 @pytest.mark.parametrize("kind", ["mcap_package", "ros1"])
 def test_a_broken_bag_is_refused(kind: str, tmp_path: Path) -> None:
     source = write(tmp_path / "bag", kind)

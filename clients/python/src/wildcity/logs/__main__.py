@@ -45,6 +45,7 @@ def _parser() -> argparse.ArgumentParser:
     bags.add_argument("--rig-frame", metavar="FRAME", help="frame of the vehicle (else base_footprint, base_link, ..)")
     bags.add_argument("--world-frame", metavar="FRAME", help="frame of the world (else the root of tf)")
     bags.add_argument("--odometry", metavar="TOPIC", help="the Odometry topic that gives the poses, of several")
+    bags.add_argument("--leave-out", metavar="TOPIC", action="append", default=[], help="a topic that is not converted")
     parser.add_argument("--licence", metavar="TEXT", help="note on the licence, for log.json")
     return parser
 
@@ -80,7 +81,15 @@ def main(arguments: list[str] | None = None) -> int:
             return 0
         names = ("log", "rig_frame", "world_frame", "odometry", "pose_of", "licence")
         given = {name: getattr(chosen, name) for name in names}
-        options = Options(reference=chosen.reference, rig=chosen.rig, origin=chosen.origin, values=given, **given)
+        values = {**given, "leave_out": ", ".join(chosen.leave_out)}
+        options = Options(
+            reference=chosen.reference,
+            rig=chosen.rig,
+            origin=chosen.origin,
+            values=values,
+            leave_out=tuple(chosen.leave_out),
+            **given,
+        )
         _print(convert(chosen.source, chosen.out, options, kind.name))
     except LogError as error:
         print(f"error: {error}", file=sys.stderr)

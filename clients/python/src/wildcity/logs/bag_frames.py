@@ -96,7 +96,8 @@ class Tree:
         if chain is None:
             known = ", ".join(sorted({*self.edges, *(edge.parent for edge in self.edges.values())})) or "none"
             problem = f"no transform from {target} to {source}, the frame of {what}; frames: {known}"
-            raise LogError(f"{self.place}, tf_static", problem, "record /tf_static, or choose --rig-frame")
+            fix = "record /tf_static, choose --rig-frame, or leave the topic out with --leave-out TOPIC"
+            raise LogError(f"{self.place}, tf_static", problem, fix)
         moving = [child for child in {*chain[0], *chain[1]} if not self.edges[child].is_static]
         if moving:
             problem = f"{what} moves on the rig: the transform of {moving[0]} is not static"

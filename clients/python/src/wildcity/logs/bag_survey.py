@@ -94,6 +94,11 @@ def survey(bag: Bag, options: Options) -> Survey:
             found.left_out[topic] = (count, f"{kind} is not read")
         elif count:
             found.roles[topic] = role
+    for topic in options.leave_out:
+        if topic not in topics:
+            raise LogError(bag.path, f"no topic {topic}, only {', '.join(topics)}", "choose another --leave-out")
+        if found.roles.pop(topic, None):
+            found.left_out[topic] = (topics[topic][1], "the user left it out")
     _one_of(found, topics, "imu", None)
     _one_of(found, topics, "gps", None)
     _one_of(found, topics, "odometry", options.odometry)

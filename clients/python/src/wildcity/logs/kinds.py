@@ -21,10 +21,11 @@ __all__ = ["KINDS", "Kind", "Options", "detect"]
 class Options:
     """What a user may choose.
 
-    log: which of several logs of the source. reference: images stay where they are. rig_frame, world_frame: the frames
-    of a bag. odometry: the topic that gives the poses of a bag. rig: a calibration for poses that have none of their
-    own. pose_of: whose poses a file has, `rig` or `camera`. origin: latitude, longitude (degrees) and altitude (m) of
-    the world of a map. licence: a note for log.json. values: what the user gave, for the check of a run that goes on.
+    log: which of several logs of the source. reference: images stay where they are. rig: a calibration for poses, or
+    for cameras of a bag, that have none of their own. pose_of: whose poses a file has, `rig` or `camera`. origin:
+    latitude, longitude (degrees) and altitude (m) of the world of a map. licence: a note for log.json. Of a bag:
+    rig_frame and world_frame, its frames; odometry, the topic that gives the poses; leave_out, topics that are not
+    converted. values: what the user gave, for the check of a run that goes on.
     """
 
     log: str | None = None
@@ -32,6 +33,7 @@ class Options:
     rig_frame: str | None = None
     world_frame: str | None = None
     odometry: str | None = None
+    leave_out: tuple[str, ...] = ()
     rig: Path | None = None
     pose_of: str | None = None
     origin: tuple[float, float, float] | None = None
