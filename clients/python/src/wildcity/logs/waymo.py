@@ -177,7 +177,7 @@ class _Segment:
         found = {}
         for row in self.rows("lidar_calibration", ["key.laser_name", *names]):
             mount = _transform(row[names[0]], str(self.path("lidar_calibration")))
-            number, values = row["key.laser_name"].as_py(), row[names[1]].as_py()
+            number, values = row["key.laser_name"].as_py(), row[names[1]].as_py() or None
             found[number] = (mount, values, (row[names[2]].as_py(), row[names[3]].as_py()))
             writer.lidar(LASERS[number], mount)
         return found
@@ -232,7 +232,7 @@ class _PixelPoses:
 
 
 def _transform(value: Any, place: str) -> Matrix:
-    """A transform [4, 4] of 16 numbers by row. The rotation is in f32 in the data set, and is made exact here."""
+    """A transform [4, 4] of 16 numbers by row. The rotation, which older files have in f32, is made exact."""
     matrix = numbers(value.as_py(), (16,), "a transform", place).reshape(4, 4)
     if rotation_error(matrix) > 1e-3:
         raise LogError(place, "a transform is no rotation and translation", "download the segment again")
