@@ -28,6 +28,7 @@ PAGES = [
     "docs/evaluation.md",
     "docs/gym.md",
     "docs/logs.md",
+    "docs/logs_from.md",
     "docs/operators.md",
     "docs/pipelines.md",
     "docs/repair.md",

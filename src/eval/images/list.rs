@@ -134,6 +134,8 @@ impl ImageList {
                 name,
                 file,
                 mask: path(row.mask),
+                depth: None,
+                weight: None,
                 camera,
                 world_from_camera,
                 near: None,
