@@ -97,7 +97,7 @@ pub(super) struct Import {
     /// make a second version. The scene must be in the axes of the log, and the log's map goes to
     /// scenarios: see `wildcity scenario from-log`.
     #[cfg(feature = "log")]
-    #[arg(long, value_name = "LOG", conflicts_with = "trajectory")]
+    #[arg(long, value_name = "LOG")]
     log: Option<PathBuf>,
 
     #[command(flatten)]

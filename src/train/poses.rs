@@ -1,10 +1,10 @@
 //! The poses of the cameras as parameters.
 //!
 //! ```text
-//! world_from_camera = world_from_ego exp(e) ego_from_camera exp(c)
+//! world_from_camera = world_from_ego exp(e) motion ego_from_camera exp(c)
 //! ```
 //!
-//! with a twist e for each time of the rig and a twist c for each of its cameras (the project's
+//! with the recorded motion between the time of the ego's pose and that of the image, a twist e for each time of the rig and a twist c for each of its cameras (the project's
 //! paper, section 4.2): six cameras of 100 keyframes have 636 parameters, and not 3,600. Images
 //! without a rig have a "time" each, and one camera at its origin.
 //!
@@ -31,10 +31,20 @@ pub struct RigPoses {
 }
 
 /// Which poses of a [`RigPoses`] an image has, by their indices.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Place {
     pub ego: usize,
     pub camera: usize,
+    /// The recorded motion of the rig from the time of the ego's pose to that of the image: the
+    /// identity if these are the same.
+    pub motion: Pose,
+}
+
+impl Place {
+    /// An image that was taken at the time of the ego's pose.
+    pub fn new(ego: usize, camera: usize) -> Self {
+        Self { ego, camera, motion: Pose::IDENTITY }
+    }
 }
 
 /// Poses while they are trained.
@@ -59,8 +69,12 @@ pub(crate) struct PoseStep {
 }
 
 impl RigPoses {
-    pub(crate) fn world_from_camera(&self, place: Place) -> Pose {
-        self.world_from_ego[place.ego] * self.ego_from_camera[place.camera]
+    /// The pose of the camera of an image.
+    ///
+    /// # Panics
+    /// The rig does not have the place.
+    pub fn world_from_camera(&self, place: Place) -> Pose {
+        self.world_from_ego[place.ego] * place.motion * self.ego_from_camera[place.camera]
     }
 
     pub(crate) fn has(&self, place: Place) -> bool {
@@ -99,9 +113,9 @@ impl TrainedPoses {
 
     /// Moves the two poses of a view.
     pub(crate) fn step(&mut self, step: &PoseStep) {
-        let PoseStep { place: Place { ego, camera }, by, rates: [rate, rotation_rate], weight } =
-            *step;
-        let twists = by.on_rig(&self.now.ego_from_camera[camera]);
+        let PoseStep { place, by, rates: [rate, rotation_rate], weight } = *step;
+        let Place { ego, camera, motion } = place;
+        let twists = by.on_rig(&(motion * self.now.ego_from_camera[camera]));
         let RigTwists { ego: by_ego, camera: by_camera } = twists;
         let RigPoses { world_from_ego, ego_from_camera } = &mut self.now;
         let recorded = &self.recorded;

@@ -276,7 +276,7 @@ impl Trainer {
     /// Which poses are trained of an image: those of the rig, or its own.
     fn trained_place(&self, image: usize, place: Option<Place>) -> Option<Place> {
         match self.settings.poses.mode {
-            PoseMode::Image => Some(Place { ego: image, camera: 0 }),
+            PoseMode::Image => Some(Place::new(image, 0)),
             _ => place,
         }
     }

@@ -52,7 +52,7 @@ impl Rigged {
                 let pose = rigged.rig.world_from_ego[ego] * rigged.rig.ego_from_camera[camera];
                 let view = View { world_from_camera: pose, ..views[0] };
                 rigged.images.push(image(cpu, &scene, view));
-                rigged.views.push((view, Place { ego, camera }));
+                rigged.views.push((view, Place::new(ego, camera)));
             }
         }
         rigged
@@ -79,11 +79,7 @@ impl Rigged {
         let poses = self.views.iter();
         Start {
             gaussians: self.truth.clone(),
-            world_from_camera: poses
-                .map(|(_, Place { ego, camera })| {
-                    rig.world_from_ego[*ego] * rig.ego_from_camera[*camera]
-                })
-                .collect(),
+            world_from_camera: poses.map(|(_, place)| rig.world_from_camera(*place)).collect(),
             rig: Some(rig),
             ..Start::default()
         }
@@ -104,7 +100,7 @@ impl Rigged {
             rig.world_from_ego[place.ego] * rig.ego_from_camera[place.camera]
         };
         for (_, place) in &self.views {
-            let first = Place { ego: 0, camera: 0 };
+            let first = Place::new(0, 0);
             let [ours, theirs] =
                 [rig, &self.rig].map(|rig| pose(rig, first).inverse() * pose(rig, *place));
             let off = theirs.inverse() * ours;
@@ -289,7 +285,7 @@ fn gaussians_of_the_ground_become_flat() {
         };
         let mut trainer = Trainer::new(start, RenderProfile::default(), settings).unwrap();
         for _ in 0..300 {
-            let place = Some(Place { ego: 0, camera: 0 });
+            let place = Some(Place::new(0, 0));
             let sample = Sample { place, ..sample(views[4], &target) };
             trainer.step(&cpu, &sample).expect("a step");
         }
@@ -363,7 +359,7 @@ fn a_place_that_the_rig_does_not_have_is_named() {
     let rigged = Rigged::new(&cpu);
     let start = rigged.start(rigged.rig.clone());
     let mut trainer = Trainer::new(start, RenderProfile::default(), settings(10)).unwrap();
-    let place = Some(Place { ego: 5, camera: 0 });
+    let place = Some(Place::new(5, 0));
     let error = trainer.step(&cpu, &Sample { place, ..rigged.sample(0, &rigged.rig) });
     let error = error.expect_err("no such time");
     assert!(matches!(error, TrainError::Place { image: 0, .. }), "{error}");

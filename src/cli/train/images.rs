@@ -10,7 +10,7 @@ use wildcity_eval::images::{ImageList, RealImage, picture};
 use wildcity_render::View;
 use wildcity_scene::RenderProfile;
 use wildcity_scene::align::Alignment;
-use wildcity_scene::geometry::Pose;
+use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_train::poses::Place;
 use wildcity_train::run::{TrainingImage, TrainingImages};
 
@@ -102,28 +102,51 @@ impl<'a> ListedImages<'a> {
 
     fn decode(&self, listed: &ListedImage<'_>) -> anyhow::Result<TrainingImage> {
         let image = listed.image;
+        let Shrunk { rgb8, mask, camera, own_px } =
+            Shrunk::read(&image.file, image.mask.as_deref(), &image.camera, self.size)?;
+        let depth_m = image.depth.as_deref().map(|file| picture::depth_m(file, own_px));
+        let small_px = [camera.width_px, camera.height_px];
+        let depth_m = depth_m.transpose()?.map(|depth_m| shrink(&depth_m, own_px, small_px));
+        let view = View::new(camera, listed.world_from_camera);
+        let weight = image.weight.map_or(1.0, |weight| weight as f32);
+        let exposure = image.exposure_stops.map_or(1.0, |stops| stops.exp2() as f32);
+        Ok(TrainingImage { view, rgb8, mask, depth_m, weight, exposure })
+    }
+}
+
+/// An image with its mask and its camera, at the size of a run.
+pub(super) struct Shrunk {
+    pub(super) rgb8: Vec<u8>,
+    pub(super) mask: Option<Vec<bool>>,
+    pub(super) camera: Camera,
+    /// Width and height of the file.
+    own_px: [u32; 2],
+}
+
+impl Shrunk {
+    /// Reads an image at a fraction of its size.
+    pub(super) fn read(
+        file: &Path,
+        mask: Option<&Path>,
+        camera: &Camera,
+        size: f64,
+    ) -> anyhow::Result<Self> {
         let background = RenderProfile::default().background;
-        let (mut rgb8, mut camera) = picture::real(&image.file, &image.camera, background)?;
+        let (mut rgb8, mut camera) = picture::real(file, camera, background)?;
         let own_px = [camera.width_px, camera.height_px];
-        let mut mask = image.mask.as_deref().map(|file| read_mask(file, own_px)).transpose()?;
-        let mut depth_m =
-            image.depth.as_deref().map(|file| picture::depth_m(file, own_px)).transpose()?;
-        if self.size < 1.0 {
-            let small_px = own_px.map(|px| ((f64::from(px) * self.size).round() as u32).max(1));
+        let mut mask = mask.map(|file| read_mask(file, own_px)).transpose()?;
+        if size < 1.0 {
+            let small_px = own_px.map(|px| ((f64::from(px) * size).round() as u32).max(1));
             camera = camera.scaled(small_px[0].into(), small_px[1].into())?;
             let whole: ImageBuffer<Rgb<u8>, Vec<u8>> =
                 ImageBuffer::from_raw(own_px[0], own_px[1], rgb8).context("an image's size")?;
             let small = imageops::resize(&whole, small_px[0], small_px[1], FilterType::Triangle);
             rgb8 = small.into_raw();
             mask = mask.map(|mask| shrink(&mask, own_px, small_px));
-            depth_m = depth_m.map(|depth_m| shrink(&depth_m, own_px, small_px));
         }
         // The scene is trained at this size: no filter of a larger native size is part of it.
         camera.native_size_px = None;
-        let view = View::new(camera, listed.world_from_camera);
-        let weight = image.weight.map_or(1.0, |weight| weight as f32);
-        let exposure = image.exposure_stops.map_or(1.0, |stops| stops.exp2() as f32);
-        Ok(TrainingImage { view, rgb8, mask, depth_m, weight, exposure })
+        Ok(Self { rgb8, mask, camera, own_px })
     }
 }
 

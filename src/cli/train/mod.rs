@@ -4,6 +4,7 @@ mod check;
 mod checkpoints;
 mod images;
 mod lines;
+mod log_images;
 mod progress;
 mod refine;
 mod result;

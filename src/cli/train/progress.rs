@@ -4,11 +4,10 @@ use std::io::{self, IsTerminal};
 use std::sync::atomic::Ordering;
 
 use wildcity_render::gradient::Differentiate;
-use wildcity_train::run::{Line, run};
+use wildcity_train::run::{Line, TrainingImages, run};
 use wildcity_train::trainer::Trainer;
 
 use super::checkpoints::stop_flag;
-use super::images::ListedImages;
 use super::lines::log;
 use crate::cli::progress;
 
@@ -17,7 +16,7 @@ use crate::cli::progress;
 /// seconds until then.
 pub(super) fn train(
     trainer: &mut Trainer,
-    images: &ListedImages<'_>,
+    images: &dyn TrainingImages,
     backend: &dyn Differentiate,
     each: &mut dyn FnMut(&Line, &Trainer) -> anyhow::Result<()>,
 ) -> anyhow::Result<Option<(f64, f64)>> {

@@ -3,6 +3,7 @@
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
+use wildcity_scene::{Rig, Trajectory};
 use wildcity_train::sky_file;
 use wildcity_train::trainer::Trainer;
 use wildcity_twin::ingest::write_ply;
@@ -14,11 +15,18 @@ pub(super) struct Written {
     pub(super) ply: PathBuf,
     /// The sky, if one was trained.
     pub(super) sky: Option<PathBuf>,
+    /// The drive and the rig, if their poses were trained.
+    pub(super) drive: Option<PathBuf>,
+    pub(super) rig: Option<PathBuf>,
 }
 
 impl Written {
-    /// Writes the Gaussians to a PLY file, and the sky beside it.
-    pub(super) fn new(trainer: &Trainer, ply: &Path) -> anyhow::Result<Self> {
+    /// Writes the Gaussians to a PLY file, and the sky and the refined poses beside it.
+    pub(super) fn new(
+        trainer: &Trainer,
+        ply: &Path,
+        refined: Option<&(Trajectory, Rig)>,
+    ) -> anyhow::Result<Self> {
         let mut bytes = Vec::new();
         write_ply(&trainer.model().to_gaussians(), &mut bytes)?;
         output::write(ply, &bytes)?;
@@ -28,12 +36,23 @@ impl Written {
             output::write(&path, &sky_file(&network)?)?;
             anyhow::Ok(path)
         });
-        Ok(Self { ply: ply.to_owned(), sky: sky.transpose()? })
+        let mut written =
+            Self { ply: ply.to_owned(), sky: sky.transpose()?, drive: None, rig: None };
+        if let Some((drive, rig)) = refined {
+            let put = |extension: &str, bytes: &[u8]| {
+                let path = ply.with_extension(extension);
+                output::write(&path, bytes)?;
+                anyhow::Ok(Some(path))
+            };
+            written.drive = put("drive.json", &serde_json::to_vec(drive)?)?;
+            written.rig = put("rig.json", &serde_json::to_vec_pretty(rig)?)?;
+        }
+        Ok(written)
     }
 
     /// Says what was written, and what to do with it.
     pub(super) fn print(&self, source: &Path, gaussians: usize, help: bool) -> io::Result<()> {
-        let Self { ply, sky } = self;
+        let Self { ply, sky, .. } = self;
         let mut stdout = io::stdout().lock();
         let (name, source) = (ply.display(), source.display());
         writeln!(stdout, "{name}: {gaussians} Gaussians, in the axes and the unit of {source}")?;

@@ -9,12 +9,14 @@ use anyhow::{Context, ensure};
 
 use glam::DVec3;
 use wildcity_eval::images::ImageList;
+use wildcity_log::{ColoredPoint, Log};
 use wildcity_render::gradient::Differentiate;
 use wildcity_scene::align::Alignment;
 use wildcity_scene::random::Random;
-use wildcity_scene::{Gaussians, RenderProfile};
+use wildcity_scene::{Gaussians, RenderProfile, Rig, Trajectory};
+use wildcity_train::ground::is_ground;
 use wildcity_train::run::TrainingImages;
-use wildcity_train::settings::{Settings, SkyMode};
+use wildcity_train::settings::{PoseMode, Settings, SkyMode};
 use wildcity_train::start::{Point, gaussians_from_points};
 use wildcity_train::trainer::{Start, Trainer};
 use wildcity_twin::ingest::{self, ReadLimits, ReadScene, capture};
@@ -22,6 +24,7 @@ use wildcity_twin::ingest::{self, ReadLimits, ReadScene, capture};
 use super::checkpoints::{self, Checkpoints};
 use super::images::ListedImages;
 use super::lines::LinesFile;
+use super::log_images::LogImages;
 use super::progress::train;
 use super::result::Written;
 use crate::cli;
@@ -31,8 +34,10 @@ use crate::cli::{file_notes, output, progress};
 /// What `wildcity train SOURCE` takes.
 #[derive(Debug, clap::Args)]
 pub(super) struct TrainScene {
-    /// The images and their cameras: a COLMAP model (its folder, or one with sparse/0), a
-    /// transforms.json, or its folder.
+    /// The images and their cameras: a log (docs/logs.md), a COLMAP model (its folder, or one with
+    /// sparse/0), a transforms.json, or its folder. Of a log, the poses of the rig are trained, too,
+    /// the sky, and the ground; points and depths are those of its LiDAR, and what moves is left
+    /// out.
     #[arg(value_name = "SOURCE", required = true)]
     source: Option<PathBuf>,
 
@@ -142,13 +147,52 @@ impl TrainScene {
         let out = self.out.as_deref().context("give --out FILE.ply")?;
         check_out(out)?;
         let settings = self.settings()?;
+        if Log::is_log(source) {
+            return self.train_log(source, out, settings);
+        }
         let list = ImageList::read(source, self.image_dir.as_deref(), self.masks.as_deref())?;
         for warning in &list.warnings {
             writeln!(io::stderr(), "warning: {warning}")?;
         }
-        let (gaussians, profile) = self.gaussians(source, &settings)?;
+        let (mut start, profile) = self.start(source, &settings)?;
         let mut images = ListedImages::new(self.size, self.held_out_every);
         images.add(&list, &Alignment::IDENTITY, false)?;
+        start.world_from_camera = images.poses();
+        let inputs = images.inputs();
+        let trainer =
+            self.train(out, Inputs { images: &images, inputs, start, profile, settings })?;
+        self.write(out, source, &trainer, None)
+    }
+
+    /// Trains on a log: with the poses of its rig, and the points and depths of its LiDAR.
+    fn train_log(&self, source: &Path, out: &Path, settings: Settings) -> anyhow::Result<()> {
+        ensure!(
+            self.image_dir.is_none() && self.masks.is_none(),
+            "{} is a log, whose tables name the files: leave --image-dir and --masks out",
+            source.display()
+        );
+        let images = LogImages::new(Log::open(source)?, self.size, self.held_out_every)?;
+        if images.left_out > 0 {
+            let left_out = output::counted(images.left_out, "image");
+            writeln!(io::stderr(), "{left_out} left out: there is no pose at the time")?;
+        }
+        let (mut start, profile) = match (&self.start, &self.points) {
+            (None, None) => (logged_start(&images, &settings)?, RenderProfile::default()),
+            _ => self.start(source, &settings)?,
+        };
+        start.world_from_camera = images.world_from_camera();
+        start.rig = Some(images.rig.clone());
+        let inputs = images.inputs();
+        let trainer =
+            self.train(out, Inputs { images: &images, inputs, start, profile, settings })?;
+        let is_of_rig = trainer.settings().poses.mode != PoseMode::Image;
+        let refined = trainer.poses().filter(|_| is_of_rig).map(|poses| images.refined(poses));
+        self.write(out, source, &trainer, refined.as_ref())
+    }
+
+    /// Takes the run to its end.
+    fn train(&self, out: &Path, inputs: Inputs<'_>) -> anyhow::Result<Trainer> {
+        let Inputs { images, inputs, start, profile, settings } = inputs;
         let backends = self.hardware.differentiating()?;
         let backend: &dyn Differentiate = match backends.last() {
             Some(backend) => backend.as_ref(),
@@ -158,23 +202,19 @@ impl TrainScene {
             io::stderr(),
             "{}, {} of them held out, {}, backend {}",
             output::counted(images.count(), "image"),
-            images.held_out(),
-            output::counted(gaussians.len(), "Gaussian"),
+            (0..images.count()).filter(|&index| images.is_held_out(index)).count(),
+            output::counted(start.gaussians.len(), "Gaussian"),
             backend.name()
         )?;
-        let inputs = format!("{}{}", images.inputs(), inputs_of_gaussians(&gaussians));
+        let inputs = format!("{inputs}{}", inputs_of_gaussians(&start.gaussians));
         let checkpoints = Checkpoints::new(out, inputs);
         let mut trainer = match checkpoints.read(self.resume, profile, &settings)? {
             Some(trainer) => trainer,
-            None => {
-                let start =
-                    Start { gaussians, world_from_camera: images.poses(), ..Start::default() };
-                Trainer::new(start, profile, settings)?
-            }
+            None => Trainer::new(start, profile, settings)?,
         };
         let lines = self.lines.as_deref();
         let mut lines = lines.map(|path| LinesFile::open(path, self.resume)).transpose()?;
-        let last = train(&mut trainer, &images, backend, &mut |line, trainer| {
+        let last = train(&mut trainer, images, backend, &mut |line, trainer| {
             lines.as_mut().map_or(Ok(()), |lines| lines.write(line))?;
             let is_time = line.step.is_multiple_of(checkpoints::EVERY);
             if is_time { checkpoints.write(trainer) } else { Ok(()) }
@@ -187,28 +227,45 @@ impl TrainScene {
                 trainer.steps_done()
             );
         }
-        let written = Written::new(&trainer, out)?;
-        checkpoints.remove()?;
         if let Some((db, seconds)) = last {
             let mut stdout = io::stdout().lock();
             writeln!(stdout, "held out: {db:.2} dB after {steps} steps, {seconds:.0} s")?;
         }
+        Ok(trainer)
+    }
+
+    /// Writes the result of a run, and makes the twin.
+    fn write(
+        &self,
+        out: &Path,
+        source: &Path,
+        trainer: &Trainer,
+        refined: Option<&(Trajectory, Rig)>,
+    ) -> anyhow::Result<()> {
+        let written = Written::new(trainer, out, refined)?;
+        Checkpoints::new(out, String::new()).remove()?;
         written.print(source, trainer.model().len(), self.twin.is_none())?;
         match &self.twin {
-            Some(twin) => cli::run_arguments(self.import(twin, written)),
+            Some(twin) => cli::run_arguments(self.import(twin, source, written)),
             None => Ok(()),
         }
     }
 
     /// The command that makes a twin of the result.
-    fn import(&self, twin: &str, written: Written) -> Vec<OsString> {
+    fn import(&self, twin: &str, source: &Path, written: Written) -> Vec<OsString> {
         let mut arguments: Vec<OsString> = ["wildcity", "import"].map(OsString::from).to_vec();
-        let Written { ply, sky } = written;
+        let Written { ply, sky, drive, rig } = written;
         arguments.extend([ply.into(), "--twin".into(), twin.into()]);
+        let log: Option<OsString> = Log::is_log(source).then(|| source.into());
+        let axes = self.axes.clone().map(OsString::from);
         let given = [
-            ("--axes", self.axes.clone().map(OsString::from)),
+            // The world of a log has z up.
+            ("--axes", axes.or_else(|| log.is_some().then(|| "identity".into()))),
             ("--twins", self.twins.clone()),
             ("--sky", sky.map(OsString::from)),
+            ("--trajectory", drive.map(OsString::from)),
+            ("--rig", rig.map(OsString::from)),
+            ("--log", log),
         ];
         for (name, value) in given {
             arguments.extend(value.into_iter().flat_map(|value| [name.into(), value]));
@@ -229,12 +286,8 @@ impl TrainScene {
         Ok(settings)
     }
 
-    /// What the run begins with, and its image formation.
-    fn gaussians(
-        &self,
-        source: &Path,
-        settings: &Settings,
-    ) -> anyhow::Result<(Gaussians, RenderProfile)> {
+    /// The Gaussians that the run begins with, and its image formation.
+    fn start(&self, source: &Path, settings: &Settings) -> anyhow::Result<(Start, RenderProfile)> {
         let profile = RenderProfile::default();
         let cap = settings.growth.cap;
         if let Some(start) = &self.start {
@@ -251,7 +304,8 @@ impl TrainScene {
                 "{} has {count} Gaussians, more than --cap {cap}",
                 start.display()
             );
-            return Ok((gaussians, notes.profile().apply(profile)?));
+            let start = Start { gaussians, ..Start::default() };
+            return Ok((start, notes.profile().apply(profile)?));
         }
         let mut points = self.points(source)?;
         let all = points.len();
@@ -259,7 +313,8 @@ impl TrainScene {
             choose(&mut points, cap, settings.seed);
             writeln!(io::stderr(), "{cap} of {all} points are chosen: --cap")?;
         }
-        Ok((gaussians_from_points(&points), profile))
+        let gaussians = gaussians_from_points(&points);
+        Ok((Start { gaussians, ..Start::default() }, profile))
     }
 
     fn points(&self, source: &Path) -> anyhow::Result<Vec<Point>> {
@@ -282,6 +337,44 @@ impl TrainScene {
         };
         Ok(read.into_iter().map(point).collect())
     }
+}
+
+/// What a run needs.
+struct Inputs<'a> {
+    images: &'a dyn TrainingImages,
+    /// A text by which a checkpoint knows the images.
+    inputs: String,
+    start: Start,
+    profile: RenderProfile,
+    settings: Settings,
+}
+
+/// Images of each camera of a log whose points of the LiDAR a run begins with.
+const STARTING_IMAGES: usize = 100;
+
+/// Most points of a LiDAR that a run begins with: more are added where images need them.
+const MOST_LIDAR_POINTS: usize = 500_000;
+
+/// Points of the LiDAR of a log in the colours of its images, and which of them are on the ground.
+fn logged_start(images: &LogImages, settings: &Settings) -> anyhow::Result<Start> {
+    let (log, poses) = (images.log(), images.poses());
+    let most = settings.growth.cap.min(MOST_LIDAR_POINTS);
+    let points = wildcity_log::colored_points(log, poses, STARTING_IMAGES, most)?;
+    ensure!(
+        !points.is_empty(),
+        "the log has no points of a LiDAR that its images show: give --points, a PLY file"
+    );
+    let at_m: Vec<DVec3> = points.iter().map(|point| point.at_m).collect();
+    let point = |point: &ColoredPoint| Point {
+        at_m: point.at_m,
+        rgb: point.rgb8.map(|value| f64::from(value) / 255.0),
+    };
+    let points: Vec<Point> = points.iter().map(point).collect();
+    Ok(Start {
+        gaussians: gaussians_from_points(&points),
+        is_ground: is_ground(&at_m, &images.rig.world_from_ego),
+        ..Start::default()
+    })
 }
 
 /// Reads the file of `--settings`.

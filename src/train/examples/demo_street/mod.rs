@@ -98,7 +98,7 @@ impl Recording {
                 view.camera.native_size_px = None;
                 recording.images.push(Recorded {
                     view,
-                    place: Place { ego, camera },
+                    place: Place::new(ego, camera),
                     rgb8,
                     depth_m,
                     is_held_out: ego % 8 == 4,

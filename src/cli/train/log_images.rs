@@ -1,0 +1,311 @@
+//! The images of a log as a run of training reads them: with the poses of its rig, with depths of
+//! its LiDAR, and without what moves.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, ensure};
+use glam::DVec3;
+use wildcity_eval::{Boxes, GROWN_PX, hide};
+use wildcity_log::check::Projection;
+use wildcity_log::{ImageRow, Log, Poses, SweepRow, Tracks};
+use wildcity_render::View;
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::rig::RigCamera;
+use wildcity_scene::trajectory::Keyframe;
+use wildcity_scene::{Rig, Trajectory};
+use wildcity_train::poses::{Place, RigPoses};
+use wildcity_train::run::{TrainingImage, TrainingImages};
+
+use super::images::Shrunk;
+use crate::cli::exit;
+
+/// Images within this time of the first are of one time of the rig, in microseconds.
+const SAME_TIME_US: i64 = 40_000;
+
+/// A sweep's points are depths of images within this time of them, in microseconds.
+const SWEEP_US: i64 = 60_000;
+
+/// Pixels of a cell in which only the nearest points are seen.
+const CELL_PX: usize = 6;
+
+/// A point farther than the nearest of its cell by this factor is hidden behind it.
+const HIDDEN: f32 = 1.1;
+
+/// The images of a log.
+pub(super) struct LogImages {
+    log: Log,
+    poses: Poses,
+    images: Vec<LoggedImage>,
+    sweeps: Vec<SweepRow>,
+    tracks: Tracks,
+    boxes: Boxes,
+    pub(super) rig: RigPoses,
+    /// The time of each pose of the rig, in microseconds.
+    times_us: Vec<i64>,
+    size: f64,
+    held_out_every: usize,
+    /// Images at times without a pose.
+    pub(super) left_out: usize,
+}
+
+struct LoggedImage {
+    row: ImageRow,
+    place: Place,
+}
+
+impl LogImages {
+    pub(super) fn new(log: Log, size: f64, held_out_every: usize) -> anyhow::Result<Self> {
+        let poses = log.poses()?;
+        let rows = log.images()?.context("the log has no images.jsonl: there is no image")?;
+        let sweeps = log.sweeps()?.map(|rows| rows.collect::<Result<Vec<_>, _>>()).transpose()?;
+        let tracks = Tracks::read(&log, [i64::MIN, i64::MAX])?;
+        let boxes = boxes(&log)?;
+        let cameras = log.rig.cameras.iter().map(|camera| camera.rig_from_camera);
+        let rig = RigPoses { world_from_ego: Vec::new(), ego_from_camera: cameras.collect() };
+        let sweeps = sweeps.unwrap_or_default();
+        let images = Vec::new();
+        let (left_out, times_us) = (0, Vec::new());
+        let mut all = Self {
+            log,
+            poses,
+            images,
+            sweeps,
+            tracks,
+            boxes,
+            rig,
+            times_us,
+            size,
+            held_out_every,
+            left_out,
+        };
+        for row in rows {
+            all.add(row?)?;
+        }
+        ensure!(!all.images.is_empty(), "no image of the log has a pose at its time");
+        Ok(all)
+    }
+
+    fn add(&mut self, row: ImageRow) -> anyhow::Result<()> {
+        let file = self.log.path(&row.file);
+        ensure!(file.is_file(), "there is no image {}", file.display());
+        let camera = self.log.camera_index(&row.camera)?;
+        let Some(world_from_rig) = self.poses.at(row.time_us) else {
+            self.left_out += 1;
+            return Ok(());
+        };
+        let is_later = |before: &i64| row.time_us > before.saturating_add(SAME_TIME_US);
+        if self.times_us.last().is_none_or(is_later) {
+            self.times_us.push(row.time_us);
+            self.rig.world_from_ego.push(world_from_rig);
+        }
+        let ego = self.rig.world_from_ego.len() - 1;
+        let motion = self.rig.world_from_ego[ego].inverse() * world_from_rig;
+        self.images.push(LoggedImage { row, place: Place { ego, camera, motion } });
+        Ok(())
+    }
+
+    /// The drive and the rig with poses that were trained. The drive has the times of images.
+    pub(super) fn refined(&self, poses: &RigPoses) -> (Trajectory, Rig) {
+        let keyframe = |(&time_us, &world_from_rig)| Keyframe { time_us, world_from_rig };
+        let keyframes = self.times_us.iter().zip(&poses.world_from_ego).map(keyframe);
+        let name = format!("{}-refined", self.log.header.name);
+        let mut rig = self.log.rig.clone();
+        for (camera, pose) in rig.cameras.iter_mut().zip(&poses.ego_from_camera) {
+            camera.rig_from_camera = *pose;
+        }
+        (Trajectory { name, keyframes: keyframes.collect() }, rig)
+    }
+
+    /// The recorded pose of each image.
+    pub(super) fn world_from_camera(&self) -> Vec<Pose> {
+        self.images.iter().map(|image| self.rig.world_from_camera(image.place)).collect()
+    }
+
+    /// A text by which a checkpoint knows its images.
+    pub(super) fn inputs(&self) -> String {
+        let mut text = format!("{} {}\n{:?}\n", self.size, self.held_out_every, self.rig);
+        for LoggedImage { row, place } in &self.images {
+            text += &format!("{row:?} {place:?}\n");
+        }
+        text
+    }
+
+    pub(super) fn log(&self) -> &Log {
+        &self.log
+    }
+
+    pub(super) fn poses(&self) -> &Poses {
+        &self.poses
+    }
+
+    fn decode(&self, index: usize) -> anyhow::Result<TrainingImage> {
+        let LoggedImage { row, place } = &self.images[index];
+        let mounted = &self.log.rig.cameras[place.camera];
+        let path = |file: &str| -> PathBuf { self.log.path(file) };
+        let mask = row.mask.as_deref().map(path);
+        let mut shrunk =
+            Shrunk::read(&path(&row.file), mask.as_deref(), &mounted.camera, self.size)?;
+        let [width, height] = [shrunk.camera.width_px, shrunk.camera.height_px];
+        let mounted = RigCamera { camera: shrunk.camera, ..mounted.clone() };
+        let world_from_rig = self.rig.world_from_ego[place.ego] * place.motion;
+        let before =
+            |us: i64| self.poses.at(row.time_us.saturating_sub(us)).unwrap_or(world_from_rig);
+        let views = View::from_moving_rig(&[mounted], world_from_rig, &before);
+        let view = *views.first().context("a view")?;
+        let mut counts = vec![true; shrunk.camera.pixels()];
+        for moving in self.boxes.moving_at(row.time_us) {
+            let hull_px = moving.hull_px(&shrunk.camera, &view.world_from_camera);
+            hide(&hull_px, [width, height], GROWN_PX * self.size, &mut counts);
+        }
+        if counts.contains(&false) {
+            let mask = shrunk.mask.get_or_insert_with(|| vec![true; counts.len()]);
+            mask.iter_mut().zip(&counts).for_each(|(mask, counts)| *mask &= counts);
+        }
+        let depth_m = self.depths(row, place.camera, &view)?;
+        let exposure = row.exposure_stops.map_or(1.0, |stops| stops.exp2() as f32);
+        let Shrunk { rgb8, mask, .. } = shrunk;
+        Ok(TrainingImage { view, rgb8, mask, depth_m, weight: 1.0, exposure })
+    }
+
+    /// The depths of the LiDAR's points near the time of an image, where these are seen.
+    fn depths(
+        &self,
+        row: &ImageRow,
+        camera: usize,
+        view: &View,
+    ) -> anyhow::Result<Option<Vec<f32>>> {
+        if self.sweeps.is_empty() {
+            return Ok(None);
+        }
+        let own = &self.log.rig.cameras[camera];
+        let mounted = RigCamera { camera: view.camera, ..own.clone() };
+        let projection = Projection { poses: &self.poses, mounted: &mounted, time_us: row.time_us };
+        let mut depths = Depths::new([view.camera.width_px, view.camera.height_px]);
+        let near = self.tracks.near(row.time_us);
+        let is_near = |sweep: &&SweepRow| {
+            sweep.time_us <= row.time_us.saturating_add(SWEEP_US)
+                && sweep.until_us >= row.time_us.saturating_sub(SWEEP_US)
+        };
+        for sweep in self.sweeps.iter().filter(is_near) {
+            let rig_from_lidar = self.log.rig_from_lidar(&sweep.lidar)?;
+            let points = self.log.points(sweep)?;
+            for (point_m, time_us) in points.points_m.iter().zip(&points.time_us) {
+                let time_us = sweep.compensated_to_us.unwrap_or(*time_us);
+                if time_us.abs_diff(row.time_us) > SWEEP_US.unsigned_abs() {
+                    continue;
+                }
+                let point_m =
+                    rig_from_lidar.transform_point(DVec3::from_array(point_m.map(f64::from)));
+                let Some(world_from_rig) = self.poses.at(time_us) else { continue };
+                let world_m = world_from_rig.transform_point(point_m);
+                let Some((at_px, _)) = projection.project(world_m) else { continue };
+                let camera_m = view.world_from_camera_at(at_px).inverse().transform_point(world_m);
+                if !near.hides(world_m, time_us) {
+                    depths.add(at_px.as_uvec2().to_array(), view.camera.depth_m(camera_m) as f32);
+                }
+            }
+        }
+        Ok(Some(depths.seen()))
+    }
+}
+
+impl TrainingImages for LogImages {
+    fn count(&self) -> usize {
+        self.images.len()
+    }
+
+    /// Those that the log marks, or one of some if it marks none.
+    fn is_held_out(&self, index: usize) -> bool {
+        if self.images.iter().any(|image| image.row.held_out) {
+            return self.images[index].row.held_out;
+        }
+        self.held_out_every > 0 && index.is_multiple_of(self.held_out_every)
+    }
+
+    fn place(&self, index: usize) -> Option<Place> {
+        Some(self.images[index].place)
+    }
+
+    fn load(&self, index: usize) -> Result<TrainingImage, String> {
+        self.decode(index).map_err(|error| exit::chain(&error))
+    }
+}
+
+/// The boxes of a log, which hide what moves.
+fn boxes(log: &Log) -> anyhow::Result<Boxes> {
+    let path = log.path("tracks.jsonl");
+    if !path.is_file() {
+        return Ok(Boxes::default());
+    }
+    let cannot = || format!("{}", path.display());
+    let text = std::fs::read_to_string(&path).with_context(cannot)?;
+    Boxes::parse(&text).with_context(cannot)
+}
+
+/// Depths of single pixels, of which the near ones hide the far ones around them.
+struct Depths {
+    size_px: [usize; 2],
+    depth_m: Vec<f32>,
+    /// The nearest depth in each cell.
+    nearest_m: Vec<f32>,
+}
+
+impl Depths {
+    fn new(size_px: [u32; 2]) -> Self {
+        let [width, height] = size_px.map(|px| px as usize);
+        let cells = width.div_ceil(CELL_PX) * height.div_ceil(CELL_PX);
+        Self {
+            size_px: [width, height],
+            depth_m: vec![0.0; width * height],
+            nearest_m: vec![f32::INFINITY; cells],
+        }
+    }
+
+    fn cell(&self, [x, y]: [usize; 2]) -> usize {
+        y / CELL_PX * self.size_px[0].div_ceil(CELL_PX) + x / CELL_PX
+    }
+
+    fn add(&mut self, at: [u32; 2], depth_m: f32) {
+        let [x, y] = at.map(|px| px as usize);
+        // Behind a camera that sees more than half of the world, a depth along z is not positive.
+        if x >= self.size_px[0] || y >= self.size_px[1] || depth_m <= 0.0 {
+            return;
+        }
+        let cell = self.cell([x, y]);
+        self.nearest_m[cell] = self.nearest_m[cell].min(depth_m);
+        let own = &mut self.depth_m[y * self.size_px[0] + x];
+        *own = if *own == 0.0 { depth_m } else { own.min(depth_m) };
+    }
+
+    /// The depths that no nearer point hides.
+    fn seen(mut self) -> Vec<f32> {
+        for pixel in 0..self.depth_m.len() {
+            let cell = self.cell([pixel % self.size_px[0], pixel / self.size_px[0]]);
+            if self.depth_m[pixel] > HIDDEN * self.nearest_m[cell] {
+                self.depth_m[pixel] = 0.0;
+            }
+        }
+        self.depth_m
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_lies_behind_a_near_point_is_not_seen() {
+        let mut depths = Depths::new([20, 12]);
+        depths.add([3, 2], 5.0);
+        depths.add([4, 2], 9.0);
+        depths.add([4, 3], 5.3);
+        depths.add([3, 2], 7.0);
+        depths.add([14, 8], 9.0);
+        depths.add([20, 8], 1.0);
+        depths.add([15, 8], -1.0);
+        let seen = depths.seen();
+        let at = |x: usize, y: usize| seen[y * 20 + x];
+        assert_eq!([at(3, 2), at(4, 2), at(4, 3), at(14, 8)], [5.0, 0.0, 5.3, 9.0]);
+        assert_eq!(seen.iter().filter(|depth_m| **depth_m > 0.0).count(), 3);
+    }
+}
