@@ -5,6 +5,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
+use wildcity_scene::Rig;
 use wildcity_twin::store::Catalog;
 
 use crate::in_folder::{done, refused};
@@ -24,7 +25,7 @@ fn recorded(dir: &Path) {
             "--length-km",
             "0.1",
             "--density",
-            "0.3",
+            "1",
         ],
     );
     let views = ["--offsets", "0.01", "--every", "25m", "--side", "160", "--cameras", "front,rear"];
@@ -113,7 +114,7 @@ fn a_worn_twin_gets_better_by_its_recorded_images() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     recorded(dir);
-    let worn = ["--length-km", "0.1", "--density", "0.3", "--spoil", "1"];
+    let worn = ["--length-km", "0.1", "--density", "1", "--spoil", "1"];
     done(dir, &[&["twin", "generate", "--twin", "worn", "--twins", "twins"][..], &worn].concat());
     let images = ["--images", "recorded/round_1", "--axes", "identity"];
     let fixed = ["train", "loop", "worn", "--twins", "twins", "--out", "rounds", "--rounds", "2"];
@@ -143,4 +144,49 @@ fn a_worn_twin_gets_better_by_its_recorded_images() {
     let fixed = ["train", "loop", "worn", "--twins", "twins", "--out", "rounds", "--from", "11"];
     let error = refused(dir, &[&fixed[..], &images].concat());
     assert!(error.contains("--from 11 is after the last round"), "{error}");
+}
+
+#[test]
+fn a_log_becomes_a_twin() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let street = ["--length-km", "0.1", "--density", "1"];
+    done(dir, &[&["twin", "generate", "--twin", "lane", "--twins", "twins"][..], &street].concat());
+    let small = ["--length-m", "12", "--width", "96"];
+    done(
+        dir,
+        &[&["log", "generate", "lane", "--twins", "twins", "--out", "log"][..], &small].concat(),
+    );
+    let train = ["train", "log", "--out", "lane.ply", "--steps", "40", "--cap", "40000"];
+    let twin = ["--twin", "again", "--twins", "twins"];
+    let said = done(dir, &[&train[..], &twin].concat());
+    assert!(said.contains("twin again version 1"), "{said}");
+
+    let catalog = Catalog::open(&dir.join("twins")).unwrap();
+    let manifest = catalog.version("again", None).unwrap().manifest;
+    assert!(manifest.sky.is_some() && manifest.geo.is_some() && manifest.views.is_some());
+    let names: Vec<&str> = manifest.trajectories.iter().map(|drive| &*drive.name).collect();
+    // Sessions begin on the first one.
+    assert_eq!(names, ["log-refined", "log"]);
+    // Poses were right: in 40 steps they hardly move, and move.
+    let [recorded, refined] = [1, 0].map(|drive| &manifest.trajectories[drive].keyframes);
+    let first = refined[3];
+    let before = recorded.iter().find(|key| key.time_us >= first.time_us).unwrap();
+    let moved_m = before.world_from_rig.position_m.distance(first.world_from_rig.position_m);
+    assert!(moved_m < 0.5, "{moved_m}");
+    let rig = manifest.rig.unwrap();
+    let preset = Rig::preset("vehicle6").unwrap();
+    assert_eq!(rig.cameras.len(), 6);
+    assert!(rig.cameras[0].rig_from_camera != preset.cameras[0].rig_from_camera);
+
+    // A round of refinement takes the trained poses.
+    let refine =
+        ["train", "refine", "again", "--twins", "twins", "--images", "log", "--steps", "10"];
+    let said = done(dir, &refine);
+    assert!(said.contains("held out: ") && said.contains("twin again version 3"), "{said}");
+    let error = refused(dir, &[&train[..], &["--masks", "log"]].concat());
+    assert!(error.contains("leave --image-dir and --masks out"), "{error}");
+    fs::remove_file(dir.join("log/lidar.jsonl")).unwrap();
+    let error = refused(dir, &train);
+    assert!(error.contains("--points"), "{error}");
 }

@@ -27,8 +27,6 @@ struct ListedImage<'a> {
     image: &'a RealImage,
     /// In the axes and the unit of the scene that is trained.
     world_from_camera: Pose,
-    /// Whether it was rendered, and not recorded.
-    is_augmented: bool,
 }
 
 impl TrainingImages for ListedImages<'_> {
@@ -36,14 +34,8 @@ impl TrainingImages for ListedImages<'_> {
         self.images.len()
     }
 
-    /// Only recorded images judge a run. They are the first.
     fn is_held_out(&self, index: usize) -> bool {
-        let is_chosen = self.held_out_every > 0 && index.is_multiple_of(self.held_out_every);
-        is_chosen && !self.images[index].is_augmented
-    }
-
-    fn is_augmented(&self, index: usize) -> bool {
-        self.images[index].is_augmented
+        self.held_out_every > 0 && index.is_multiple_of(self.held_out_every)
     }
 
     fn place(&self, _: usize) -> Option<Place> {
@@ -56,7 +48,7 @@ impl TrainingImages for ListedImages<'_> {
 }
 
 impl<'a> ListedImages<'a> {
-    /// No images yet. Of those that were recorded, one of `held_out_every` is held out.
+    /// No images yet. One of `held_out_every` is held out.
     pub(super) fn new(size: f64, held_out_every: usize) -> Self {
         Self { images: Vec::new(), size, held_out_every }
     }
@@ -65,17 +57,12 @@ impl<'a> ListedImages<'a> {
     ///
     /// # Errors
     /// An image is missing: each is looked at before a long run finds one that is.
-    pub(super) fn add(
-        &mut self,
-        list: &'a ImageList,
-        alignment: &Alignment,
-        is_augmented: bool,
-    ) -> anyhow::Result<()> {
+    pub(super) fn add(&mut self, list: &'a ImageList, alignment: &Alignment) -> anyhow::Result<()> {
         for image in list.every(1) {
             let file = &image.file;
             ensure!(file.is_file(), "there is no image {}: give --image-dir", file.display());
             let world_from_camera = alignment.pose(&image.world_from_camera);
-            self.images.push(ListedImage { image, world_from_camera, is_augmented });
+            self.images.push(ListedImage { image, world_from_camera });
         }
         Ok(())
     }
@@ -85,17 +72,12 @@ impl<'a> ListedImages<'a> {
         self.images.iter().map(|image| image.world_from_camera).collect()
     }
 
-    /// Number of images that are held out.
-    pub(super) fn held_out(&self) -> usize {
-        (0..self.count()).filter(|&index| self.is_held_out(index)).count()
-    }
-
     /// A text by which a checkpoint knows its images.
     pub(super) fn inputs(&self) -> String {
         let mut text = format!("{} {}\n", self.size, self.held_out_every);
-        for ListedImage { image, world_from_camera, is_augmented } in &self.images {
+        for ListedImage { image, world_from_camera } in &self.images {
             let RealImage { name, camera, .. } = image;
-            text += &format!("{name} {camera:?} {world_from_camera:?} {is_augmented}\n");
+            text += &format!("{name} {camera:?} {world_from_camera:?}\n");
         }
         text
     }
@@ -111,6 +93,37 @@ impl<'a> ListedImages<'a> {
         let weight = image.weight.map_or(1.0, |weight| weight as f32);
         let exposure = image.exposure_stops.map_or(1.0, |stops| stops.exp2() as f32);
         Ok(TrainingImage { view, rgb8, mask, depth_m, weight, exposure })
+    }
+}
+
+/// Recorded images, then views that were rendered and repaired. Only the first judge a run.
+pub(super) struct WithAugmented<'a> {
+    pub(super) recorded: &'a dyn TrainingImages,
+    pub(super) augmented: &'a dyn TrainingImages,
+}
+
+impl TrainingImages for WithAugmented<'_> {
+    fn count(&self) -> usize {
+        self.recorded.count() + self.augmented.count()
+    }
+
+    fn is_held_out(&self, index: usize) -> bool {
+        !self.is_augmented(index) && self.recorded.is_held_out(index)
+    }
+
+    fn is_augmented(&self, index: usize) -> bool {
+        index >= self.recorded.count()
+    }
+
+    fn place(&self, index: usize) -> Option<Place> {
+        if self.is_augmented(index) { None } else { self.recorded.place(index) }
+    }
+
+    fn load(&self, index: usize) -> Result<TrainingImage, String> {
+        match index.checked_sub(self.recorded.count()) {
+            None => self.recorded.load(index),
+            Some(index) => self.augmented.load(index),
+        }
     }
 }
 

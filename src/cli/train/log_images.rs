@@ -12,7 +12,7 @@ use wildcity_render::View;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::RigCamera;
 use wildcity_scene::trajectory::Keyframe;
-use wildcity_scene::{Rig, Trajectory};
+use wildcity_scene::{Manifest, Rig, Trajectory};
 use wildcity_train::poses::{Place, RigPoses};
 use wildcity_train::run::{TrainingImage, TrainingImages};
 
@@ -104,11 +104,37 @@ impl LogImages {
         Ok(())
     }
 
+    /// Takes the poses that an earlier run has trained, which are in the twin that it made; those of
+    /// the log stay without them. Returns whether there are such.
+    pub(super) fn take_refined(&mut self, twin: &Manifest) -> bool {
+        let name = self.refined_name();
+        let drive = twin.trajectories.iter().find(|drive| drive.name == name);
+        let (Some(drive), Some(rig)) = (drive, &twin.rig) else { return false };
+        let is_of_log =
+            drive.keyframes.iter().map(|key| key.time_us).eq(self.times_us.iter().copied());
+        let cameras = &self.log.rig.cameras;
+        let names = |cameras: &[RigCamera]| -> Vec<String> {
+            cameras.iter().map(|camera| camera.name.clone()).collect()
+        };
+        if !is_of_log || names(&rig.cameras) != names(cameras) {
+            return false;
+        }
+        let poses = drive.keyframes.iter().map(|key| key.world_from_rig);
+        self.rig.world_from_ego = poses.collect();
+        let mounts = rig.cameras.iter().map(|camera| camera.rig_from_camera);
+        self.rig.ego_from_camera = mounts.collect();
+        true
+    }
+
+    fn refined_name(&self) -> String {
+        format!("{}-refined", self.log.header.name)
+    }
+
     /// The drive and the rig with poses that were trained. The drive has the times of images.
     pub(super) fn refined(&self, poses: &RigPoses) -> (Trajectory, Rig) {
         let keyframe = |(&time_us, &world_from_rig)| Keyframe { time_us, world_from_rig };
         let keyframes = self.times_us.iter().zip(&poses.world_from_ego).map(keyframe);
-        let name = format!("{}-refined", self.log.header.name);
+        let name = self.refined_name();
         let mut rig = self.log.rig.clone();
         for (camera, pose) in rig.cameras.iter_mut().zip(&poses.ego_from_camera) {
             camera.rig_from_camera = *pose;
@@ -146,7 +172,8 @@ impl LogImages {
         let mut shrunk =
             Shrunk::read(&path(&row.file), mask.as_deref(), &mounted.camera, self.size)?;
         let [width, height] = [shrunk.camera.width_px, shrunk.camera.height_px];
-        let mounted = RigCamera { camera: shrunk.camera, ..mounted.clone() };
+        let rig_from_camera = self.rig.ego_from_camera[place.camera];
+        let mounted = RigCamera { camera: shrunk.camera, rig_from_camera, ..mounted.clone() };
         let world_from_rig = self.rig.world_from_ego[place.ego] * place.motion;
         let before =
             |us: i64| self.poses.at(row.time_us.saturating_sub(us)).unwrap_or(world_from_rig);

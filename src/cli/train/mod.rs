@@ -14,7 +14,8 @@ mod settings;
 
 use super::subcommands::subcommands;
 
-/// Train a scene on photographs with known cameras, without a GPU or with one.
+/// Make a twin from a log, or a scene from photographs with known cameras, without a GPU or with
+/// one.
 ///
 /// One image a step: it is rendered, compared with the photograph, and every Gaussian is moved by
 /// the derivatives. Gaussians that have become transparent become copies of others, and their
@@ -38,6 +39,7 @@ pub(super) struct Train {
 
 const EXAMPLES: &str = "\
 Examples:
+  wildcity train log --out street.ply --twin street
   wildcity train capture --out capture.ply --size 0.25 --steps 3000
   wildcity train capture/transforms.json --points lidar.ply --out scene.ply --lines train.jsonl
   wildcity import capture.ply --twin capture --axes y-down-z-forward";

@@ -5,16 +5,19 @@ use std::path::PathBuf;
 
 use anyhow::{Context, ensure};
 use wildcity_eval::images::ImageList;
+use wildcity_log::Log;
 use wildcity_render::gradient::Differentiate;
 use wildcity_scene::align::Alignment;
+use wildcity_scene::geometry::Pose;
 use wildcity_scene::{Gaussians, Manifest};
 use wildcity_train::run::TrainingImages;
 use wildcity_train::settings::{PoseMode, Settings, SkyMode};
 use wildcity_train::trainer::{Start, Trainer};
 use wildcity_twin::residency::Cache;
-use wildcity_twin::store::Version;
+use wildcity_twin::store::{Catalog, Version};
 
-use super::images::ListedImages;
+use super::images::{ListedImages, WithAugmented};
+use super::log_images::LogImages;
 use super::progress::train;
 use super::scene::{fraction, read_settings};
 use crate::cli::backend_options::HardwareOptions;
@@ -37,7 +40,8 @@ pub(in crate::cli) struct Refine {
     #[command(flatten)]
     edited: EditedTwin,
 
-    /// The recorded images with their cameras, in the form of `wildcity eval --images`.
+    /// The recorded images with their cameras: the log that the twin was made of, or in the form of
+    /// `wildcity eval --images`.
     #[arg(long, value_name = "FILE_OR_DIR")]
     images: PathBuf,
 
@@ -96,20 +100,53 @@ impl Refine {
         let settings = self.training_settings()?;
         let catalog = self.twins.catalog()?;
         let base = catalog.version(&self.edited.twin.name, self.edited.twin.number)?;
-        let recorded =
-            ImageList::read(&self.images, self.image_dir.as_deref(), self.masks.as_deref())?;
-        file_notes::print_warnings(&self.images, &recorded.warnings)?;
         let read = |dir: &PathBuf| {
-            ImageList::read(dir, None, None)
-                .with_context(|| format!("--augmented {}", dir.display()))
+            let list = ImageList::read(dir, None, None);
+            list.with_context(|| format!("--augmented {}", dir.display()))
         };
         let rounds: Vec<ImageList> = self.augmented.iter().map(read).collect::<Result<_, _>>()?;
-        let mut images = ListedImages::new(self.size, self.held_out_every);
-        images.add(&recorded, &self.alignment(&base, &recorded)?, false)?;
+        let mut augmented = ListedImages::new(self.size, 0);
         for round in &rounds {
             // `augment` writes poses in the twin's axes.
-            images.add(round, &Alignment::IDENTITY, true)?;
+            augmented.add(round, &Alignment::IDENTITY)?;
         }
+        if Log::is_log(&self.images) {
+            let is_whole = self.image_dir.is_none() && self.masks.is_none() && self.axes.is_none();
+            ensure!(
+                is_whole,
+                "{} is a log, which names files and axes: leave --image-dir, --masks and --axes out",
+                self.images.display()
+            );
+            let log = Log::open(&self.images)?;
+            let mut recorded = LogImages::new(log, self.size, self.held_out_every)?;
+            if !recorded.take_refined(&base.manifest) {
+                writeln!(
+                    io::stderr(),
+                    "note: the twin has no trained poses of the log: those of the log are used"
+                )?;
+            }
+            let poses = [recorded.world_from_camera(), augmented.poses()].concat();
+            let images = WithAugmented { recorded: &recorded, augmented: &augmented };
+            return self.refine(&catalog, &base, &images, poses, settings);
+        }
+        let list = ImageList::read(&self.images, self.image_dir.as_deref(), self.masks.as_deref())?;
+        file_notes::print_warnings(&self.images, &list.warnings)?;
+        let mut recorded = ListedImages::new(self.size, self.held_out_every);
+        recorded.add(&list, &self.alignment(&base, &list)?)?;
+        let poses = [recorded.poses(), augmented.poses()].concat();
+        let images = WithAugmented { recorded: &recorded, augmented: &augmented };
+        self.refine(&catalog, &base, &images, poses, settings)
+    }
+
+    /// Trains the twin on the images, and makes a new version of it.
+    fn refine(
+        &self,
+        catalog: &Catalog,
+        base: &Version,
+        images: &dyn TrainingImages,
+        world_from_camera: Vec<Pose>,
+        settings: Settings,
+    ) -> anyhow::Result<()> {
         let backends = self.hardware.differentiating()?;
         let backend: &dyn Differentiate = match backends.last() {
             Some(backend) => backend.as_ref(),
@@ -118,7 +155,7 @@ impl Refine {
 
         let Manifest { sh_degree, profile, .. } = base.manifest;
         let mut gaussians = Gaussians { sh_degree, ..Gaussians::default() };
-        catalog.visit_full_detail(&base, &|_| true, &mut |section| gaussians.append(&section))?;
+        catalog.visit_full_detail(base, &|_| true, &mut |section| gaussians.append(&section))?;
         let name = &self.edited.twin.name;
         ensure!(!gaussians.is_empty(), "twin {name} has no Gaussians");
         writeln!(
@@ -127,19 +164,19 @@ impl Refine {
             base.number,
             output::counted(gaussians.len(), "Gaussian"),
             output::counted(images.count(), "image"),
-            images.held_out(),
+            (0..images.count()).filter(|&index| images.is_held_out(index)).count(),
             backend.name()
         )?;
         let resident = Cache::new(self.twins.catalog()?).open(name, Some(base.number))?;
         let start = Start {
             gaussians,
-            world_from_camera: images.poses(),
+            world_from_camera,
             sky: resident.sky().cloned(),
             ..Start::default()
         };
         let mut trainer = Trainer::new(start, profile, settings)?;
-        let before = wildcity_train::run::held_out_db(&trainer, &images, backend)?;
-        let after = train(&mut trainer, &images, backend, &mut |_, _| Ok(()))?;
+        let before = wildcity_train::run::held_out_db(&trainer, images, backend)?;
+        let after = train(&mut trainer, images, backend, &mut |_, _| Ok(()))?;
         let steps = trainer.settings().steps;
         let done = trainer.steps_done();
         ensure!(done == steps, "stopped after {done} of {steps} steps: the twin is as it was");
@@ -148,7 +185,7 @@ impl Refine {
         let how = format!("refine={}", self.description());
         let gaussians = trainer.model().to_gaussians();
         let version =
-            catalog.replace_gaussians(&base, &gaussians, how, &mut progress::show(&bar))?;
+            catalog.replace_gaussians(base, &gaussians, how, &mut progress::show(&bar))?;
         bar.finish_and_clear();
         let Version { number, hash, .. } = &version;
         let mut stdout = io::stdout().lock();

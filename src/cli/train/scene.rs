@@ -156,7 +156,7 @@ impl TrainScene {
         }
         let (mut start, profile) = self.start(source, &settings)?;
         let mut images = ListedImages::new(self.size, self.held_out_every);
-        images.add(&list, &Alignment::IDENTITY, false)?;
+        images.add(&list, &Alignment::IDENTITY)?;
         start.world_from_camera = images.poses();
         let inputs = images.inputs();
         let trainer =
