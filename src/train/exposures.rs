@@ -22,7 +22,7 @@ impl TrainedExposures {
     }
 
     /// The exposure of an image, after that which was recorded: a factor of all colours.
-    pub(crate) fn of_image(&self, image: usize, recorded: f32) -> Exposure<f32> {
+    pub(crate) fn exposure(&self, image: usize, recorded: f32) -> Exposure<f32> {
         let (values, _) = &self.images[image];
         let value = |k: usize| recorded * values[k] as f32;
         Exposure {

@@ -26,6 +26,7 @@ mod adam;
 pub mod check;
 pub mod checkpoint;
 pub mod compose;
+mod error;
 mod exposures;
 pub mod ground;
 mod growth;

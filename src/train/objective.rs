@@ -9,7 +9,21 @@ use crate::loss::{disparity, dssim, l1, masked};
 use crate::sample::Sample;
 use crate::settings::Weights;
 use crate::sky::{SkyImage, TrainedSky, fixed_image};
-use crate::trainer::StepReport;
+
+/// The losses of a step, without their weights.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct StepReport {
+    pub l1: f64,
+    pub dssim: f64,
+    /// In 1/m; 0 without measured depths.
+    pub disparity: f64,
+    /// The weighted sum of the ground's terms; 0 without Gaussians of the ground.
+    pub ground: f64,
+    /// Number of visible Gaussians.
+    pub visible: u64,
+    /// Wall time of each stage of the frame and its gradients, in milliseconds.
+    pub stages_ms: Vec<(&'static str, f64)>,
+}
 
 /// The loss of one image.
 pub(crate) struct Objective<'a> {
@@ -45,7 +59,7 @@ impl Objective<'_> {
         let GaussianImages { rgb, opacity, depth_sum_m } = images;
         let image = compose(rgb, opacity, background, &self.exposure);
         let mut report = StepReport::default();
-        let by_image = self.of_colors(&image, &mut report);
+        let by_image = self.by_colors(&image, &mut report);
         let by = compose_gradient(rgb, opacity, background, &self.exposure, &by_image);
         let ComposedGradient { rgb, mut opacity, background, exposure } = by;
         let mut by_depth_sum = Vec::new();
@@ -64,7 +78,7 @@ impl Objective<'_> {
     }
 
     /// The derivatives by the colours of the composed image.
-    fn of_colors(&self, image: &[f32], report: &mut StepReport) -> Vec<f32> {
+    fn by_colors(&self, image: &[f32], report: &mut StepReport) -> Vec<f32> {
         let Sample { rgb, weights, .. } = *self.sample;
         let absolute = l1(image, rgb, weights);
         report.l1 = absolute.value;

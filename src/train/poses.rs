@@ -4,9 +4,10 @@
 //! world_from_camera = world_from_ego exp(e) motion ego_from_camera exp(c)
 //! ```
 //!
-//! with the recorded motion between the time of the ego's pose and that of the image, a twist e for each time of the rig and a twist c for each of its cameras (the project's
-//! paper, section 4.2): six cameras of 100 keyframes have 636 parameters, and not 3,600. Images
-//! without a rig have a "time" each, and one camera at its origin.
+//! with the recorded motion between the time of the ego's pose and that of the image, a twist e for
+//! each time of the rig and a twist c for each of its cameras (the project's paper, section 4.2):
+//! six cameras of 100 keyframes have 636 parameters, and not 3,600. Images without a rig have a
+//! "time" each, and one camera at its origin.
 //!
 //! A twist is folded into its pose after each step, so that derivatives are always those at 0. What
 //! keeps a pose near its recorded one is `weight (|t|² + |φ|²)`, with the translation t in metres

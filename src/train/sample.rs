@@ -2,8 +2,8 @@
 
 use wildcity_render::View;
 
+use crate::error::TrainError;
 use crate::poses::Place;
-use crate::trainer::TrainError;
 
 /// An image to learn from.
 #[derive(Clone, Copy, Debug)]

@@ -3,25 +3,27 @@
 use std::sync::Arc;
 
 use glam::{DMat3, DVec3};
-use wildcity_render::gradient::{Differentiate, GaussianImages, GradientError, Gradients};
-use wildcity_render::{Frame, RenderError, View};
+use wildcity_render::gradient::{Differentiate, GaussianImages, Gradients};
+use wildcity_render::{Frame, View};
 use wildcity_scene::chunk::columns;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::random::mix;
-use wildcity_scene::sky::{Network, Sky, SkyError, SkyModel};
-use wildcity_scene::validate::{self, BadGaussians, Field};
+use wildcity_scene::sky::{Network, Sky, SkyModel};
+use wildcity_scene::validate::{self, Field};
 use wildcity_scene::{Gaussians, RenderProfile, Scene};
 
 use crate::compose::Exposure;
+pub use crate::error::TrainError;
 use crate::exposures::TrainedExposures;
 use crate::ground;
 use crate::growth::relocate_and_grow;
 use crate::loss::ground::Terms;
 use crate::model::{AdamStep, Model, rates};
+pub use crate::objective::StepReport;
 use crate::objective::{Objective, Outcome};
 use crate::poses::{Place, PoseStep, RigPoses, TrainedPoses};
 use crate::sample::Sample;
-use crate::settings::{PoseMode, SettingError, Settings, SkyMode};
+use crate::settings::{PoseMode, Settings, SkyMode};
 use crate::sky::TrainedSky;
 
 /// What a run begins with.
@@ -55,73 +57,6 @@ pub struct Trainer {
     pub(crate) gradients: Gradients,
 }
 
-/// The losses of a step, without their weights.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct StepReport {
-    pub l1: f64,
-    pub dssim: f64,
-    /// In 1/m; 0 without measured depths.
-    pub disparity: f64,
-    /// The weighted sum of the ground's terms; 0 without Gaussians of the ground.
-    pub ground: f64,
-    /// Number of visible Gaussians.
-    pub visible: u64,
-    /// Wall time of each stage of the frame and its gradients, in milliseconds.
-    pub stages_ms: Vec<(&'static str, f64)>,
-}
-
-/// Why a run cannot go on.
-#[derive(Debug, thiserror::Error)]
-pub enum TrainError {
-    #[error(transparent)]
-    Setting(#[from] SettingError),
-    #[error(transparent)]
-    Gradient(#[from] GradientError),
-    #[error(transparent)]
-    Render(#[from] RenderError),
-    /// An image of the run cannot be read.
-    #[error("{0}")]
-    Image(String),
-    /// Nothing is left to learn from.
-    #[error(
-        "of {images} images {held_out} are held out, and none is left to learn from: give more images, or hold out none"
-    )]
-    NoImages { images: usize, held_out: usize },
-    /// No Gaussian to begin with.
-    #[error("there are no points to begin with: give a cloud of points, or a scene to refine")]
-    Empty,
-    /// Values that no scene may have.
-    #[error("Gaussians to begin with: {0}")]
-    Invalid(BadGaussians),
-    /// A number of poses or labels that is not that of the images or Gaussians.
-    #[error("there are {given} {what} for {wanted}")]
-    Count { what: &'static str, given: usize, wanted: usize },
-    /// An image whose poses the run does not have.
-    #[error(
-        "image {image} is at time {} and camera {} of a rig that has fewer of them", place.ego, place.camera
-    )]
-    Place { image: usize, place: Place },
-    /// A derivative that f32 does not hold: the run cannot go on from here.
-    #[error("step {step}, image {image}: a derivative by {by} is not finite")]
-    NotFinite { step: usize, image: usize, by: String },
-    #[error(transparent)]
-    Sky(#[from] SkyError),
-    /// A colour, weight or depth that counts and is no number of its range.
-    #[error(
-        "value {index} of the {image} is {value}; colours are finite, weights and depths not below 0"
-    )]
-    Value { image: &'static str, index: usize, value: f32 },
-    /// An image of another size than its camera's.
-    #[error("the {image} has {given} values, and the camera's size asks for {wanted}")]
-    Size { image: &'static str, given: usize, wanted: usize },
-}
-
-impl From<BadGaussians> for TrainError {
-    fn from(cause: BadGaussians) -> Self {
-        Self::Invalid(cause)
-    }
-}
-
 impl Trainer {
     /// A run, with the image formation of a profile.
     ///
@@ -139,8 +74,11 @@ impl Trainer {
         }
         validate::check(&gaussians, &Field::plain_name)?;
         if ![0, gaussians.len()].contains(&is_ground.len()) {
-            let (given, wanted) = (is_ground.len(), gaussians.len());
-            return Err(TrainError::Count { what: "labels of the ground", given, wanted });
+            return Err(TrainError::Count {
+                what: "labels of the ground",
+                given: is_ground.len(),
+                wanted: gaussians.len(),
+            });
         }
         let images = world_from_camera.len();
         let own =
@@ -150,17 +88,17 @@ impl Trainer {
             PoseMode::Image => Some(own),
             PoseMode::Auto | PoseMode::Rig => rig.clone(),
         };
-        let has_sky = match settings.sky.mode {
+        let trains_sky = match settings.sky.mode {
+            _ if sky.is_some() => false,
             SkyMode::Off => false,
             SkyMode::Network => true,
             SkyMode::Auto => rig.is_some(),
         };
-        let has_sky = has_sky && sky.is_none();
         Ok(Self {
             model: Model::new(gaussians, is_ground, settings.sh_degree),
             poses: poses.map(TrainedPoses::new),
             exposures: settings.exposure.on.then(|| TrainedExposures::new(images)),
-            sky: has_sky.then(|| TrainedSky::new(&settings.sky, images, settings.seed)),
+            sky: trains_sky.then(|| TrainedSky::new(&settings.sky, images, settings.seed)),
             fixed_sky: sky,
             gradients: Gradients::default(),
             step: 0,
@@ -283,7 +221,7 @@ impl Trainer {
 
     fn exposure(&self, sample: &Sample<'_>) -> Exposure<f32> {
         match &self.exposures {
-            Some(exposures) => exposures.of_image(sample.image, sample.exposure),
+            Some(exposures) => exposures.exposure(sample.image, sample.exposure),
             None => Exposure::gain(sample.exposure),
         }
     }
@@ -332,9 +270,8 @@ impl Trainer {
         let settings = &self.settings.ground;
         let share = settings.share(self.settings.unscaled(self.step));
         let ego = sample.place.and_then(|place| self.rig.as_ref()?.world_from_ego.get(place.ego));
-        let (Some(ego), Some(gradients)) = (ego, self.gradients.chunks.first_mut()) else {
-            return 0.0;
-        };
+        let Some(ego) = ego else { return 0.0 };
+        let Some(gradients) = self.gradients.chunks.first_mut() else { return 0.0 };
         if share == 0.0 || !self.model.has_ground() {
             return 0.0;
         }

@@ -63,20 +63,18 @@ impl LogImages {
         let cameras = log.rig.cameras.iter().map(|camera| camera.rig_from_camera);
         let rig = RigPoses { world_from_ego: Vec::new(), ego_from_camera: cameras.collect() };
         let sweeps = sweeps.unwrap_or_default();
-        let images = Vec::new();
-        let (left_out, times_us) = (0, Vec::new());
         let mut all = Self {
             log,
             poses,
-            images,
+            images: Vec::new(),
             sweeps,
             tracks,
             boxes,
             rig,
-            times_us,
+            times_us: Vec::new(),
             size,
             held_out_every,
-            left_out,
+            left_out: 0,
         };
         for row in rows {
             all.add(row?)?;
@@ -104,12 +102,13 @@ impl LogImages {
         Ok(())
     }
 
-    /// Takes the poses that an earlier run has trained, which are in the twin that it made; those of
-    /// the log stay without them. Returns whether there are such.
+    /// Takes the poses that an earlier run has trained, which are in the twin that it made. Without
+    /// such, those of the log stay. Returns whether there are such.
     pub(super) fn take_refined(&mut self, twin: &Manifest) -> bool {
         let name = self.refined_name();
         let drive = twin.trajectories.iter().find(|drive| drive.name == name);
-        let (Some(drive), Some(rig)) = (drive, &twin.rig) else { return false };
+        let Some(drive) = drive else { return false };
+        let Some(rig) = &twin.rig else { return false };
         let is_of_log =
             drive.keyframes.iter().map(|key| key.time_us).eq(self.times_us.iter().copied());
         let cameras = &self.log.rig.cameras;
@@ -171,7 +170,7 @@ impl LogImages {
         let mask = row.mask.as_deref().map(path);
         let mut shrunk =
             Shrunk::read(&path(&row.file), mask.as_deref(), &mounted.camera, self.size)?;
-        let [width, height] = [shrunk.camera.width_px, shrunk.camera.height_px];
+        let size_px = [shrunk.camera.width_px, shrunk.camera.height_px];
         let rig_from_camera = self.rig.ego_from_camera[place.camera];
         let mounted = RigCamera { camera: shrunk.camera, rig_from_camera, ..mounted.clone() };
         let world_from_rig = self.rig.world_from_ego[place.ego] * place.motion;
@@ -182,7 +181,7 @@ impl LogImages {
         let mut counts = vec![true; shrunk.camera.pixels()];
         for moving in self.boxes.moving_at(row.time_us) {
             let hull_px = moving.hull_px(&shrunk.camera, &view.world_from_camera);
-            hide(&hull_px, [width, height], GROWN_PX * self.size, &mut counts);
+            hide(&hull_px, size_px, GROWN_PX * self.size, &mut counts);
         }
         if counts.contains(&false) {
             let mask = shrunk.mask.get_or_insert_with(|| vec![true; counts.len()]);

@@ -54,8 +54,12 @@ impl Written {
     pub(super) fn print(&self, source: &Path, gaussians: usize, help: bool) -> io::Result<()> {
         let Self { ply, sky, .. } = self;
         let mut stdout = io::stdout().lock();
-        let (name, source) = (ply.display(), source.display());
-        writeln!(stdout, "{name}: {gaussians} Gaussians, in the axes and the unit of {source}")?;
+        writeln!(
+            stdout,
+            "{}: {gaussians} Gaussians, in the axes and the unit of {}",
+            ply.display(),
+            source.display()
+        )?;
         if !help {
             return Ok(());
         }

@@ -35,8 +35,8 @@ use crate::cli::{file_notes, output, progress};
 #[derive(Debug, clap::Args)]
 pub(super) struct TrainScene {
     /// The images and their cameras: a log (docs/logs.md), a COLMAP model (its folder, or one with
-    /// sparse/0), a transforms.json, or its folder. Of a log, the poses of the rig are trained, too,
-    /// the sky, and the ground; points and depths are those of its LiDAR, and what moves is left
+    /// sparse/0), a transforms.json, or its folder. Of a log, the poses of the rig, the sky and the
+    /// ground are trained, too; points and depths are those of its LiDAR, and what moves is left
     /// out.
     #[arg(value_name = "SOURCE", required = true)]
     source: Option<PathBuf>,
@@ -111,8 +111,8 @@ pub(super) struct TrainScene {
     #[arg(long)]
     resume: bool,
 
-    /// TOML file of all settings; --steps, --cap, --seed and --sky change it. `wildcity train settings`
-    /// prints the defaults.
+    /// TOML file of all settings; --steps, --cap, --seed and --sky change it. `wildcity train
+    /// settings` prints the defaults.
     #[arg(long, value_name = "FILE")]
     settings: Option<PathBuf>,
 
@@ -212,8 +212,8 @@ impl TrainScene {
             Some(trainer) => trainer,
             None => Trainer::new(start, profile, settings)?,
         };
-        let lines = self.lines.as_deref();
-        let mut lines = lines.map(|path| LinesFile::open(path, self.resume)).transpose()?;
+        let open = |path: &PathBuf| LinesFile::open(path, self.resume);
+        let mut lines = self.lines.as_ref().map(open).transpose()?;
         let last = train(&mut trainer, images, backend, &mut |line, trainer| {
             lines.as_mut().map_or(Ok(()), |lines| lines.write(line))?;
             let is_time = line.step.is_multiple_of(checkpoints::EVERY);
@@ -357,9 +357,8 @@ const MOST_LIDAR_POINTS: usize = 500_000;
 
 /// Points of the LiDAR of a log in the colours of its images, and which of them are on the ground.
 fn logged_start(images: &LogImages, settings: &Settings) -> anyhow::Result<Start> {
-    let (log, poses) = (images.log(), images.poses());
     let most = settings.growth.cap.min(MOST_LIDAR_POINTS);
-    let points = wildcity_log::colored_points(log, poses, STARTING_IMAGES, most)?;
+    let points = wildcity_log::colored_points(images.log(), images.poses(), STARTING_IMAGES, most)?;
     ensure!(
         !points.is_empty(),
         "the log has no points of a LiDAR that its images show: give --points, a PLY file"

@@ -18,7 +18,8 @@ pub struct RealImage {
     pub name: String,
     pub file: PathBuf,
     pub mask: Option<PathBuf>,
-    /// Its depth, if the list says one: a grey PNG of 16 bits in millimetres, 0 where there is none.
+    /// Its depth, if the list says one: a grey PNG of 16 bits in millimetres, 0 where there is
+    /// none.
     pub depth: Option<PathBuf>,
     /// Factor of its loss in training, if the list says one.
     pub weight: Option<f64>,

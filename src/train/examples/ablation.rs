@@ -158,7 +158,8 @@ impl Judged {
         truth: &RigPoses,
     ) -> Result<Self, Box<dyn Error>> {
         let scene = trainer.scene()?;
-        let [mut depth, mut road] = [Mean::default(), Mean::default()];
+        let mut depth = Mean::default();
+        let mut road = Mean::default();
         let mut views = Vec::new();
         for (index, image) in recording.images.iter().enumerate() {
             let place = image.place;
@@ -264,8 +265,8 @@ fn evening() -> Result<CubeMap, Box<dyn Error>> {
             let height = direction.normalize().z.clamp(0.0, 1.0).sqrt();
             let glow = (-30.0 * (1.0 - direction.normalize().dot(sun))).exp();
             let color = DVec3::new(0.95, 0.7, 0.5).lerp(DVec3::new(0.25, 0.45, 0.85), height);
-            let color = color + 0.4 * glow * DVec3::new(1.0, 0.9, 0.6);
-            rgb8.extend(color.to_array().map(|value| (255.0 * value.min(1.0)).round() as u8));
+            let lit = color + 0.4 * glow * DVec3::new(1.0, 0.9, 0.6);
+            rgb8.extend(lit.to_array().map(|value| (255.0 * value.min(1.0)).round() as u8));
         }
     }
     Ok(CubeMap::from_faces(SIDE_PX, &rgb8)?)

@@ -151,8 +151,8 @@ pub(crate) fn fixed_image(sky: &Sky, view: &View, opacity: &[f32]) -> Vec<f32> {
 fn shown(view: &View, opacity: &[f32], stride_px: usize) -> (Vec<[f32; 3]>, Vec<ShownPixel>) {
     let mut nodes = Nodes::new(view, stride_px);
     let shows = |pixel: &usize| f64::from(1.0 - opacity[*pixel]) >= SKY_CUT;
-    let pixels = (0..opacity.len()).filter(shows).filter_map(|pixel| nodes.around(pixel));
-    let pixels = pixels.collect();
+    let mut pixels = Vec::new();
+    pixels.extend((0..opacity.len()).filter(shows).filter_map(|pixel| nodes.around(pixel)));
     (nodes.directions, pixels)
 }
 
@@ -186,8 +186,8 @@ impl<'a> Nodes<'a> {
         Self { view, stride_px, width, height, grid: HashMap::new(), directions: Vec::new() }
     }
 
-    /// The nodes around a pixel; at the edge of a lens' field, and at a stride of 1, the pixel itself. `None` for a pixel
-    /// outside of it.
+    /// The nodes around a pixel; at the edge of a lens' field, and at a stride of 1, the pixel
+    /// itself. `None` for a pixel outside of it.
     fn around(&mut self, pixel: usize) -> Option<ShownPixel> {
         let at = [pixel % self.width, pixel / self.width];
         let stride_px = self.stride_px;
@@ -208,7 +208,8 @@ impl<'a> Nodes<'a> {
             let length = (next[axis] - cell[axis]).max(1);
             (at[axis] - cell[axis]) as f32 / length as f32
         };
-        let [x, y] = [share(0), share(1)];
+        let x = share(0);
+        let y = share(1);
         let weights = [(1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y];
         Some(ShownPixel { pixel, nodes: [a, b, c, d], weights })
     }

@@ -72,7 +72,7 @@ impl ImageLoss {
 
 impl Products {
     /// The same loss of the colours alone, times a weight.
-    pub(super) fn of_colors(&self, weight: f64) -> Self {
+    pub(super) fn colors_alone(&self, weight: f64) -> Self {
         Self {
             background: self.background,
             by_rgb: self.by_rgb.iter().map(|by| weight * by).collect(),

@@ -115,7 +115,7 @@ impl Vectors {
             for (time, ego) in egos.iter().enumerate() {
                 for (number, camera) in cameras.iter().enumerate() {
                     let weight = (1 + time + 2 * number) as f64;
-                    let loss = ImageLoss::Products(products.of_colors(weight));
+                    let loss = ImageLoss::Products(products.colors_alone(weight));
                     let view = View::new(self.pinhole()?, *ego * *camera);
                     let profile = RenderProfile::DEFAULT;
                     let (gradients, at) = self.gradients(backend, view, &profile, &loss)?;

@@ -117,7 +117,8 @@ pub(crate) fn render(
 ) -> Result<(Vec<u8>, Vec<f32>), Box<dyn Error>> {
     let pixels = view.camera.pixels();
     let mut rgb8 = vec![0; 3 * pixels];
-    let [mut depth_m, mut opacity] = [vec![0.0; pixels], vec![0.0; pixels]];
+    let mut depth_m = vec![0.0; pixels];
+    let mut opacity = depth_m.clone();
     let background = [0.55, 0.68, 0.85];
     let profile = RenderProfile { background, sky_error: 0.0, ..RenderProfile::default() };
     let frame = Frame { scene, profile: &profile, views: &[view] };
