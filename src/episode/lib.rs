@@ -32,7 +32,7 @@ pub use export::{
     CAN_EXPORT, ExportError, Exported, export_file, mcap_path, remove_leftovers, write_whole,
 };
 #[cfg(feature = "mcap")]
-pub use export::{EpisodeExport, ExportedImage, export};
+pub use export::{EpisodeExport, ExportedImage, Ros2Export, export, export_ros2};
 pub use file::{
     CameraHead, Cut, EndLine, EpisodeFile, Frame, Header, ReadError, RigHead, check_no_mcap,
     driven_indices, line_bytes,

@@ -46,7 +46,7 @@ impl SweepPoints {
         let count = points.len() / 12;
         let sweep = Self {
             points_m: points.chunks_exact(12).map(point).collect(),
-            time_us: values(&tensors.needed(1, Some(count))?, i64::from_le_bytes),
+            time_us: values(tensors.needed(1, Some(count))?, i64::from_le_bytes),
             intensity: tensors.found(2, Some(count))?.map(|b| values(b, f32::from_le_bytes)),
             ring: tensors.found(3, Some(count))?.map(|b| values(b, u16::from_le_bytes)),
         };

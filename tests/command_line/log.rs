@@ -162,6 +162,7 @@ fn a_check_finds_the_clock_of_the_lidar_and_lost_images() {
     let page = fs::read_to_string(street.at("late.html")).unwrap();
     assert_eq!(page.matches("data:image/jpeg;base64,").count(), 2);
     assert_eq!(page.matches("<svg").count(), 3);
+    assert!(!page.contains("Lanes of the map"), "this log has no map");
     let is_alone = !page.contains("src=\"http") && !page.contains("href=");
     assert!(is_alone, "the page loads nothing");
 }

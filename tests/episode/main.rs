@@ -9,5 +9,6 @@ mod calibration;
 mod diff;
 mod export;
 mod files;
+mod ros2;
 mod scores;
 mod written;

@@ -4,7 +4,7 @@
 use std::process::{Command, Output};
 
 /// Commands, and the feature that each needs.
-const LEFT_OUT: [(&[&str], &str); 15] = [
+const LEFT_OUT: [(&[&str], &str); 17] = [
     (&["actor", "push"], "http"),
     (&["alpasim"], "alpasim"),
     (&["augment"], "augment"),
@@ -13,10 +13,12 @@ const LEFT_OUT: [(&[&str], &str); 15] = [
     (&["drive"], "alpasim"),
     (&["episode"], "suite"),
     (&["eval"], "eval"),
+    (&["log"], "log"),
     (&["map", "import"], "convert"),
     (&["push"], "http"),
     (&["report"], "report"),
     (&["scenario", "check"], "suite"),
+    (&["scenario", "from-log"], "log"),
     (&["scenario", "import"], "convert"),
     (&["stress"], "stress"),
     (&["twin", "views"], "eval"),

@@ -4,8 +4,10 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use wildcity_episode::{
-    EpisodeExport, EpisodeFile, ExportError, Exported, ExportedImage, export_file, write_whole,
+    EpisodeExport, EpisodeFile, ExportError, Exported, ExportedImage, Ros2Export, export_file,
+    export_ros2, write_whole,
 };
+use wildcity_scene::Rig;
 use wildcity_session::{
     RecordedEpisode, ReplayReport, ReplayUntil, ReplayedImage, jpeg, limits as session,
 };
@@ -36,6 +38,11 @@ pub(super) struct Export {
     #[arg(long)]
     images: bool,
 
+    /// Write messages of ROS 2 in place of Foxglove's: clock, tf, odometry, camera_info, compressed
+    /// images and plans, for `ros2 bag play` and programs that read bags.
+    #[arg(long)]
+    ros2: bool,
+
     /// A camera whose images are added; may be given several times [default: all cameras of the
     /// episode]
     #[arg(long, value_name = "NAME", requires = "images")]
@@ -55,6 +62,7 @@ const EXAMPLES: &str = "\
 Examples:
   wildcity episode export agent-1 --mcap agent-1.mcap
   wildcity episode export agent-1 --mcap agent-1.mcap --images
+  wildcity episode export agent-1 --mcap agent-1-ros.mcap --images --ros2
   wildcity episode export run/episodes/straight-0-1.jsonl --mcap straight.mcap --images --camera front";
 
 /// Difference of a calibration from its lens above which a note is printed, in pixels.
@@ -75,7 +83,7 @@ impl Export {
         let (exported, report) = if self.images {
             self.with_images(&path).map(|(exported, report)| (exported, Some(report)))?
         } else {
-            (export_file(&path, &self.mcap)?, None)
+            (self.without_images(&path)?, None)
         };
         let mut out = io::stdout().lock();
         writeln!(out, "exported    {} messages to {}", exported.messages, self.mcap.display())?;
@@ -93,6 +101,15 @@ impl Export {
             )?;
         }
         Ok(())
+    }
+
+    fn without_images(&self, path: &Path) -> anyhow::Result<Exported> {
+        if !self.ros2 {
+            return Ok(export_file(path, &self.mcap)?);
+        }
+        let episode = EpisodeFile::read(path)?;
+        let rig = EpisodeFile::rig(path)?;
+        Ok(write_whole(&self.mcap, |out| export_ros2(&episode, rig.as_ref(), out))?)
     }
 
     fn with_images(&self, path: &Path) -> anyhow::Result<(Exported, ReplayReport)> {
@@ -115,7 +132,7 @@ impl Export {
         let bar = progress::count("rendering");
         bar.set_length(recording.frames.iter().map(|frame| frame.images.len() as u64).sum());
         let written = write_whole(&self.mcap, |out| {
-            let mut export = EpisodeExport::begin(&episode, rig.as_ref(), out)?;
+            let mut export = AnyExport::begin(self.ros2, &episode, rig.as_ref(), out)?;
             let mut add = |image: &ReplayedImage<'_>| {
                 bar.inc(1);
                 add_image(&mut export, &recording, image)
@@ -129,9 +146,44 @@ impl Export {
     }
 }
 
+/// An export of one of the two kinds.
+enum AnyExport<'a, W: io::Write + io::Seek> {
+    Foxglove(EpisodeExport<'a, W>),
+    Ros2(Ros2Export<'a, W>),
+}
+
+impl<'a, W: io::Write + io::Seek> AnyExport<'a, W> {
+    fn begin(
+        is_ros2: bool,
+        episode: &'a EpisodeFile,
+        rig: Option<&Rig>,
+        out: W,
+    ) -> Result<Self, ExportError> {
+        Ok(if is_ros2 {
+            Self::Ros2(Ros2Export::begin(episode, rig, out)?)
+        } else {
+            Self::Foxglove(EpisodeExport::begin(episode, rig, out)?)
+        })
+    }
+
+    fn image(&mut self, image: &ExportedImage<'_>) -> Result<(), ExportError> {
+        match self {
+            Self::Foxglove(export) => export.image(image),
+            Self::Ros2(export) => export.image(image),
+        }
+    }
+
+    fn finish(self) -> Result<Exported, ExportError> {
+        match self {
+            Self::Foxglove(export) => export.finish(),
+            Self::Ros2(export) => export.finish(),
+        }
+    }
+}
+
 /// Adds an image, unless it is of a warm-up whose times the record does not have.
 fn add_image<W: io::Write + io::Seek>(
-    export: &mut EpisodeExport<'_, W>,
+    export: &mut AnyExport<'_, W>,
     recording: &RecordedEpisode,
     image: &ReplayedImage<'_>,
 ) -> Result<(), String> {

@@ -28,7 +28,7 @@ super::subcommands! {
     Check(check::Check),
     Split(split::SplitCommand),
     Export(export::Export),
-    Generate(generate::Generate),
+    Generate(Box<generate::Generate>),
 }
 
 impl LogCommand {

@@ -17,6 +17,25 @@ use super::output::{Failure, Output};
 // 64 KiB / (10 x 30) = 218 bytes, about one box of an actor.
 const CHUNK_BYTES: u64 = 64 << 10;
 
+/// The topic of ROS 2 whose last message subscribers get that come later.
+const LATCHED: &str = "/tf_static";
+
+/// Where `rosbag2` keeps the quality of service of a topic.
+const QOS_FIELD: &str = "offered_qos_profiles";
+
+/// Reliable and transient local, as `rosbag2` writes it: what subscribers of `/tf_static` ask for.
+const LATCHED_QOS: &str = "\
+- history: 1
+  depth: 1
+  reliability: 1
+  durability: 1
+  deadline: {sec: 9223372036, nsec: 854775807}
+  lifespan: {sec: 9223372036, nsec: 854775807}
+  liveliness: 1
+  liveliness_lease_duration: {sec: 9223372036, nsec: 854775807}
+  avoid_ros_namespace_conventions: false
+";
+
 pub(super) struct McapFile<W: Write + Seek> {
     writer: Writer<Output<W>>,
     failure: Failure,
@@ -30,7 +49,17 @@ pub(super) struct McapFile<W: Write + Seek> {
 
 impl<W: Write + Seek> McapFile<W> {
     pub(super) fn create(out: W) -> Result<Self, ExportError> {
+        Self::create_with(out, "")
+    }
+
+    /// A file of ROS 2: all of its messages are CDR.
+    pub(super) fn create_ros2(out: W) -> Result<Self, ExportError> {
+        Self::create_with(out, "ros2")
+    }
+
+    fn create_with(out: W, profile: &str) -> Result<Self, ExportError> {
         let options = WriteOptions::new()
+            .profile(profile)
             .compression(Some(Compression::Zstd))
             .chunk_size(Some(CHUNK_BYTES))
             // No additional threads, because a record is small.
@@ -52,7 +81,13 @@ impl<W: Write + Seek> McapFile<W> {
         time_us: i64,
         message: &impl Message,
     ) -> Result<(), ExportError> {
-        let channel = self.channel(topic, schema, "protobuf")?;
+        let channel = match self.channels.get(topic) {
+            Some(&channel) => channel,
+            None => {
+                let descriptors = self.descriptors.clone();
+                self.new_channel(topic, schema, ["protobuf", "protobuf"], &descriptors)?
+            }
+        };
         self.write(channel, time_us, &message.encode_to_vec())
     }
 
@@ -64,8 +99,33 @@ impl<W: Write + Seek> McapFile<W> {
         time_us: i64,
         message: &impl Serialize,
     ) -> Result<(), ExportError> {
-        let channel = self.channel(topic, schema, "json")?;
+        // The lines of the record are read by their keys. A schema of their fields would have to
+        // follow every field that the record gets.
+        let definition = br#"{"type":"object"}"#;
+        let channel = match self.channels.get(topic) {
+            Some(&channel) => channel,
+            None => self.new_channel(topic, schema, ["jsonschema", "json"], definition)?,
+        };
         self.write(channel, time_us, &serde_json::to_vec(message)?)
+    }
+
+    /// Writes a message of ROS 2's. `definition` is called for the first one of a topic.
+    pub(super) fn cdr(
+        &mut self,
+        topic: &str,
+        schema: &'static str,
+        definition: fn(&str) -> String,
+        time_us: i64,
+        message: &[u8],
+    ) -> Result<(), ExportError> {
+        let channel = match self.channels.get(topic) {
+            Some(&channel) => channel,
+            None => {
+                let definition = definition(schema);
+                self.new_channel(topic, schema, ["ros2msg", "cdr"], definition.as_bytes())?
+            }
+        };
+        self.write(channel, time_us, message)
     }
 
     /// Writes the index. Returns the number of messages.
@@ -82,30 +142,29 @@ impl<W: Write + Seek> McapFile<W> {
         self.failure.take().map_or(Ok(()), |cause| Err(ExportError::Output(cause)))
     }
 
-    /// The channel of a topic, created with its first message.
-    fn channel(
+    /// The channel of a topic, with its first message. `encodings` are those of the schema and of
+    /// the messages.
+    fn new_channel(
         &mut self,
         topic: &str,
         schema: &'static str,
-        encoding: &str,
+        encodings: [&str; 2],
+        definition: &[u8],
     ) -> Result<u16, ExportError> {
-        if let Some(&channel) = self.channels.get(topic) {
-            return Ok(channel);
-        }
-        let schema = match self.schemas.get(schema) {
-            Some(&schema) => schema,
+        let [schema_encoding, encoding] = encodings;
+        let schema_id = match self.schemas.get(schema) {
+            Some(&id) => id,
             None => {
-                let id = match encoding {
-                    "protobuf" => self.writer.add_schema(schema, "protobuf", &self.descriptors)?,
-                    // The lines of the record are read by their keys. A schema of their fields
-                    // would have to follow every field that the record gets.
-                    _ => self.writer.add_schema(schema, "jsonschema", br#"{"type":"object"}"#)?,
-                };
+                let id = self.writer.add_schema(schema, schema_encoding, definition)?;
                 self.schemas.insert(schema, id);
                 id
             }
         };
-        let channel = self.writer.add_channel(schema, topic, encoding, &BTreeMap::new())?;
+        let mut metadata = BTreeMap::new();
+        if topic == LATCHED {
+            metadata.insert(QOS_FIELD.to_owned(), LATCHED_QOS.to_owned());
+        }
+        let channel = self.writer.add_channel(schema_id, topic, encoding, &metadata)?;
         self.channels.insert(topic.to_owned(), channel);
         Ok(channel)
     }

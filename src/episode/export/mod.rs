@@ -33,10 +33,14 @@ mod output;
 #[cfg(feature = "mcap")]
 mod parts;
 #[cfg(feature = "mcap")]
+mod ros2;
+#[cfg(feature = "mcap")]
 mod write;
 
 pub use error::{ExportError, Exported};
 pub use file::{export_file, mcap_path, remove_leftovers, write_whole};
+#[cfg(feature = "mcap")]
+pub use ros2::{Ros2Export, export_ros2};
 #[cfg(feature = "mcap")]
 pub use write::{EpisodeExport, ExportedImage, export};
 

@@ -70,6 +70,9 @@ pub struct Report {
     pub tracks: Option<usize>,
     /// Number of lanes, if the log has a map.
     pub lanes: Option<usize>,
+    /// The middles of the lanes around the path, in metres, for its picture.
+    #[serde(skip)]
+    pub lane_lines_m: Vec<Vec<[f64; 2]>>,
     /// Sampled images with LiDAR points, for pictures.
     #[serde(skip)]
     pub samples: Vec<SampledImage>,
@@ -94,6 +97,8 @@ pub fn check(
     let compared = alignment::compare(log, &poses, samples, on_progress)?;
     tables.streams.insert(0, stream::measure("poses", log.pose_rows()?)?);
     let gps = log.gps()?.map(|rows| path::compare_fixes(log, &poses, rows)).transpose()?.flatten();
+    let map = log.map()?;
+    let lane_lines_m = map.as_ref().map_or(Vec::new(), |map| path.lanes_around(map));
     let mut report = Report {
         name: log.header.name.clone(),
         findings: Vec::new(),
@@ -103,7 +108,8 @@ pub fn check(
         alignment: compared.alignment,
         gps,
         tracks: tables.tracks,
-        lanes: log.map()?.map(|map| map.lanes.len()),
+        lanes: map.map(|map| map.lanes.len()),
+        lane_lines_m,
         samples: compared.samples,
     };
     report.findings = findings::find(log, &report, &tables.missing);

@@ -6,6 +6,7 @@ use serde::Serialize;
 
 use wildcity_scene::geo::GeoPoint;
 use wildcity_scene::trajectory::Keyframe;
+use wildcity_sim::map::MapFile;
 
 use crate::error::LogError;
 use crate::limits::LARGEST_GAP_US;
@@ -17,6 +18,12 @@ use crate::table::Rows;
 /// A pose leaps where its speed exceeds that of both neighbours by this much, in m/s: a clock that
 /// jumps, or a position that was corrected.
 const LEAP_M_PER_S: f64 = 5.0;
+
+/// Lanes this far beside the path are drawn, in metres.
+const AROUND_M: f64 = 30.0;
+
+/// Lanes that are drawn.
+const LANES: usize = 5_000;
 
 /// Points of the path that are kept for its picture.
 const DRAWN: usize = 2000;
@@ -80,6 +87,24 @@ impl PathReport {
             unplaced_s: long.fold(0.0, |sum, s| sum + s),
             points_m: drawn.map(point).collect(),
         }
+    }
+}
+
+impl PathReport {
+    /// The middles of the lanes of a map that are near the path, at most 5,000 of them.
+    pub(super) fn lanes_around(&self, map: &MapFile) -> Vec<Vec<[f64; 2]>> {
+        let range = |axis: usize| {
+            let values = self.points_m.iter().map(|point| point[axis]);
+            let least = values.clone().fold(f64::INFINITY, f64::min);
+            least - AROUND_M..values.fold(f64::NEG_INFINITY, f64::max) + AROUND_M
+        };
+        let ranges = [range(0), range(1)];
+        let is_near = |point: &[f64; 2]| ranges.iter().zip(point).all(|(r, v)| r.contains(v));
+        let lines = map
+            .lanes
+            .iter()
+            .map(|lane| -> Vec<[f64; 2]> { lane.center.iter().map(|&[x, y, _]| [x, y]).collect() });
+        lines.filter(|line| line.iter().any(is_near)).take(LANES).collect()
     }
 }
 

@@ -164,10 +164,9 @@ fn is_chosen(place: usize, count: usize, most: usize) -> bool {
     if count <= most {
         return true;
     }
-    // Part k begins at k count / most; its middle is half a part later.
-    let part = (2 * place * most) / (2 * count);
-    let middle = ((2 * part + 1) * count) / (2 * most);
-    place == middle
+    // How many are chosen before a place: its share of all, rounded, as a line is drawn in pixels.
+    let before = |place: usize| (2 * place * most + count) / (2 * count);
+    before(place + 1) > before(place)
 }
 
 #[cfg(test)]

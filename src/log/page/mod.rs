@@ -38,6 +38,7 @@ pub fn page(report: &Report) -> Result<String, LogError> {
                 (introduction(report))
                 (findings(&report.findings))
                 h2 { "Path" }
+                @if report.lanes.is_some() { p { "Lanes of the map are grey; the drive begins at the green dot." } }
                 (PreEscaped(plots::path(report)?))
                 h2 { "Rows in time" }
                 (PreEscaped(plots::timing(report)?))

@@ -27,10 +27,10 @@ fn svg(draw: impl FnOnce(&mut String) -> Drawn) -> Result<String, LogError> {
 
 /// The path from above, x to the right and y upwards, with equal scales.
 pub(super) fn path(report: &Report) -> Result<String, LogError> {
-    svg(|text| draw_path(&report.path.points_m, text))
+    svg(|text| draw_path(&report.path.points_m, &report.lane_lines_m, text))
 }
 
-fn draw_path(points_m: &[[f64; 2]], text: &mut String) -> Drawn {
+fn draw_path(points_m: &[[f64; 2]], lanes_m: &[Vec<[f64; 2]>], text: &mut String) -> Drawn {
     let range = |axis: usize| {
         let values = points_m.iter().map(|point| point[axis]);
         values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)))
@@ -57,6 +57,10 @@ fn draw_path(points_m: &[[f64; 2]], text: &mut String) -> Drawn {
         middle_y - half_y..middle_y + half_y,
     )?;
     chart.configure_mesh().x_desc("x, m").y_desc("y, m").label_style(LABEL).draw()?;
+    for lane_m in lanes_m {
+        let lane = lane_m.iter().map(|[x, y]| (*x, *y));
+        chart.draw_series(LineSeries::new(lane, RGBColor(190, 190, 190).stroke_width(1)))?;
+    }
     let line = points_m.iter().map(|[x, y]| (*x, *y));
     chart.draw_series(LineSeries::new(line, BLUE.stroke_width(2)))?;
     let start = points_m.first().map(|[x, y]| Circle::new((*x, *y), 5, GREEN.filled()));
