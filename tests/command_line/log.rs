@@ -140,19 +140,18 @@ fn a_check_finds_the_clock_of_the_lidar_and_lost_images() {
     assert_eq!(texts(&report, "error"), [""; 0], "{report:#}");
     assert_eq!(texts(&report, "warning"), [""; 0], "{report:#}");
     assert_eq!(texts(&report, "note"), ["not all images have a mask of the ground"]);
-    let late_ms = |report: &Value, camera: &str| {
-        let all = report["alignment"].as_array().unwrap();
-        let one = all.iter().find(|one| one["camera"] == camera).unwrap();
-        one["lidar_late_ms"].as_f64().unwrap()
+    let known_ms = |report: &Value| -> Vec<(String, f64)> {
+        let all = report["alignment"].as_array().unwrap().iter();
+        let known = all.filter_map(|one| Some((one, one["lidar_late_ms"].as_f64()?)));
+        known.map(|(one, ms)| (one["camera"].as_str().unwrap().to_owned(), ms)).collect()
     };
-    for camera in ["left", "right"] {
-        assert!(late_ms(&report, camera).abs() < 5.0, "{report:#}");
-    }
+    // A street looks alike in many places: not every camera tells, but none tells wrong.
+    let found = known_ms(&report);
+    assert!(found.len() >= 3 && found.iter().all(|(_, ms)| ms.abs() < 5.0), "{found:?}");
     let report = street.report("late");
-    for camera in ["left", "right"] {
-        let found_ms = late_ms(&report, camera);
-        assert!((found_ms - LATE_MS).abs() < 5.0, "{camera}: {found_ms}");
-    }
+    let found = known_ms(&report);
+    assert!(found.iter().any(|(camera, _)| camera == "left"), "{found:?}");
+    assert!(found.iter().all(|(_, ms)| (ms - LATE_MS).abs() < 5.0), "{found:?}");
     let warnings = texts(&report, "warning").join("\n");
     assert!(warnings.contains("camera left: the times of the LiDAR are"), "{warnings}");
     // Of 98 images 7 are lost, every 13th.

@@ -40,6 +40,14 @@ const MOST_POINTS: usize = 20_000;
 /// or nothing is known.
 const LEAST_PEAK: f64 = 0.02;
 
+/// The two halves of the images must give the same difference of the clocks to this, in
+/// milliseconds, or it is chance.
+const SAME_MS: f64 = 15.0;
+
+/// With fewer images or points at edges, nothing is known.
+const LEAST_IMAGES: usize = 6;
+const LEAST_EDGES: usize = 1_000;
+
 /// The fit of each part of a log must fall by this share at the best shift of the other part, or
 /// nothing moved.
 const LEAST_DRIFT: f64 = 0.1;
@@ -80,7 +88,8 @@ struct Sums {
     shown: usize,
     edges: usize,
     /// Sum and number of the values at each difference of the clocks.
-    late: BTreeMap<i64, (f64, usize)>,
+    /// They are those of every second image and of the others.
+    late: [BTreeMap<i64, (f64, usize)>; 2],
     /// The same for each third of the log and each shift of the points.
     shifts: [BTreeMap<i32, (f64, usize)>; 3],
     /// Pixels of the camera's image for one of the shrunk one.
@@ -180,7 +189,7 @@ impl Sums {
             let late_us = step * STEP_US;
             let places = points.iter().map(|point| point.world_m(fit.projection.poses, late_us));
             let values = places.filter_map(|world_m| fit.edges.at(fit.place(world_m)?));
-            let (sum, count) = self.late.entry(late_us).or_default();
+            let (sum, count) = self.late[self.images % 2].entry(late_us).or_default();
             for value in values {
                 *sum += value;
                 *count += 1;
@@ -203,8 +212,10 @@ impl Sums {
     }
 
     fn finish(self, camera: String) -> Alignment {
-        let late = self.late.iter();
-        let curve: Vec<[f64; 2]> = late.map(|(us, sums)| [*us as f64 / 1e3, mean(sums)]).collect();
+        let halves = [curve([&self.late[0]]), curve([&self.late[1]])];
+        let whole = curve(&self.late);
+        let is_enough = self.images >= LEAST_IMAGES && self.edges >= LEAST_EDGES;
+        let lidar_late_ms = peak(&whole).filter(|ms| is_enough && are_near(&halves, *ms));
         let [first, _, last] = self.shifts.map(|sums| fits(&sums));
         Alignment {
             camera,
@@ -212,11 +223,30 @@ impl Sums {
             points: self.points,
             shown: self.shown as f64 / self.points.max(1) as f64,
             edges: self.edges,
-            lidar_late_ms: peak(&curve),
-            drift_px: drift(&first, &last).map(|px| px * self.scale),
-            curve,
+            lidar_late_ms,
+            drift_px: drift(&first, &last).filter(|_| is_enough).map(|px| px * self.scale),
+            curve: whole,
         }
     }
+}
+
+/// The mean fit at each difference of the clocks, in milliseconds, of all sums together.
+fn curve<'a>(parts: impl IntoIterator<Item = &'a BTreeMap<i64, (f64, usize)>>) -> Vec<[f64; 2]> {
+    let mut sums: BTreeMap<i64, (f64, usize)> = BTreeMap::new();
+    for (late_us, (sum, count)) in parts.into_iter().flatten() {
+        let both = sums.entry(*late_us).or_default();
+        both.0 += sum;
+        both.1 += count;
+    }
+    sums.iter().map(|(us, sums)| [*us as f64 / 1e3, mean(sums)]).collect()
+}
+
+/// Whether the best differences of both halves are near one.
+fn are_near(halves: &[Vec<[f64; 2]>; 2], late_ms: f64) -> bool {
+    halves.iter().all(|curve| {
+        let best = curve.iter().max_by(|a, b| a[1].total_cmp(&b[1]));
+        best.is_some_and(|[ms, _]| (ms - late_ms).abs() <= SAME_MS)
+    })
 }
 
 /// The place of the largest value of a curve, between its points; `None` if it is no clear peak or
