@@ -113,7 +113,7 @@ subcommands! {
     #[cfg(feature = "augment")]
     Augment(Box<augment::Augment>),
     #[cfg(feature = "train")]
-    Train(train::Train),
+    Train(Box<train::Train>),
     #[cfg(feature = "alpasim")]
     Drive(drive::Drive),
     #[cfg(feature = "alpasim")]

@@ -4,7 +4,7 @@
     python3 tests/train/loss_vectors.py
 
 `tests/train/loss_vectors.rs` compares with it. The losses are written here as their sources have them, in whole tensors
-and without derivatives: Wang et al. 2004 for SSIM (11 x 11, sigma 1.5, zeros beyond the edges), 2DGS eq. 14 for normals,
+and without derivatives: Wang et al. 2004 for SSIM (11 x 11, sigma 1.5, zeros beyond edges), 2DGS eq. 14 for normals,
 3DGS-MCMC eq. 10 for opacity and scale, the project's paper, section 4.2, for the ground.
 """
 

@@ -45,8 +45,8 @@ Examples:
   wildcity import capture.ply --twin capture --axes y-down-z-forward";
 
 subcommands! { TrainCommand;
-    Refine(refine::Refine),
-    Loop(rounds::Loop),
+    Refine(Box<refine::Refine>),
+    Loop(Box<rounds::Loop>),
     Check(check::Check),
     Settings(settings::PrintSettings),
 }

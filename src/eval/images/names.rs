@@ -41,6 +41,8 @@ mod tests {
             name: (*name).to_owned(),
             file: PathBuf::new(),
             mask: None,
+            depth: None,
+            weight: None,
             camera: Camera::from_pinhole(2, 2, pinhole),
             world_from_camera: Pose::IDENTITY,
             near: None,
