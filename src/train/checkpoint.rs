@@ -57,6 +57,7 @@ struct State {
     poses: Option<TrainedPoses>,
     exposures: Option<TrainedExposures>,
     sky: Option<TrainedSky>,
+    images: Option<u64>,
 }
 
 impl Trainer {
@@ -75,6 +76,7 @@ impl Trainer {
             poses: self.poses.clone(),
             exposures: self.exposures.clone(),
             sky: self.sky.clone(),
+            images: self.images.map(|images| images as u64),
         };
         let mut bytes = FORMAT.to_vec();
         bincode::serde::encode_into_std_write(&state, &mut bytes, encoding())
@@ -105,25 +107,24 @@ impl Trainer {
         }
         let (state, _): (State, usize) = bincode::serde::decode_from_slice(contents, encoding())
             .map_err(|error| CheckpointError::Damaged(error.to_string()))?;
-        let State { inputs: own, settings: own_settings, step, model, rig, poses, exposures, sky } =
-            state;
-        if own != *blake3::hash(inputs.as_bytes()).as_bytes() {
+        if state.inputs != *blake3::hash(inputs.as_bytes()).as_bytes() {
             return Err(CheckpointError::OtherInputs);
         }
-        if own_settings != *settings {
+        if state.settings != *settings {
             return Err(CheckpointError::OtherSettings);
         }
-        let model = Model::from_state(model);
+        let model = Model::from_state(state.model);
         Ok(Self {
-            settings: own_settings,
+            settings: state.settings,
             profile,
             model: model.ok_or_else(|| CheckpointError::Damaged("its sizes differ".to_owned()))?,
-            rig,
-            poses,
-            exposures,
-            sky,
+            rig: state.rig,
+            poses: state.poses,
+            exposures: state.exposures,
+            sky: state.sky,
             fixed_sky,
-            step: step as usize,
+            images: state.images.map(|images| images as usize),
+            step: state.step as usize,
             gradients: Gradients::default(),
         })
     }

@@ -2,8 +2,8 @@
 //! opacity A of the Gaussians, the background or sky B, and the exposure E, an affine map of
 //! colours.
 //!
-//! The renderer leaves the sky out where less than 1/255 of it shows, which a loss of 8 bits cannot
-//! see; here it is added everywhere, so that the derivative by the opacity has no step.
+//! As the renderer does, the sky is left out where less than 1/255 of it shows, which a loss of 8
+//! bits cannot see; a background of one colour is added everywhere.
 
 use crate::loss::Real;
 

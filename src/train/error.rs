@@ -34,6 +34,14 @@ pub enum TrainError {
     /// A number of poses or labels that is not that of the images or Gaussians.
     #[error("there are {given} {what} for {wanted}")]
     Count { what: &'static str, given: usize, wanted: usize },
+    /// Poses of a rig are to be trained, and there is none.
+    #[error(
+        "poses.mode is rig, and the images are of no rig: train on a log, or give image or off"
+    )]
+    NoRig,
+    /// An image beyond those that the run began with.
+    #[error("image {image} is not one of those that the run began with")]
+    NoImage { image: usize },
     /// An image whose poses the run does not have.
     #[error(
         "image {image} is at time {} and camera {} of a rig that has fewer of them", place.ego, place.camera

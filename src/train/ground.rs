@@ -1,6 +1,7 @@
 //! Gaussians of the ground: which they are, and the derivatives of their loss.
 
 use glam::{DQuat, DVec3, Quat, Vec3};
+use rayon::prelude::*;
 
 use wildcity_render::gradient::{ChunkGradients, GaussianGradient};
 use wildcity_scene::chunk::column;
@@ -29,7 +30,7 @@ pub fn is_ground(points_m: &[DVec3], world_from_ego: &[Pose]) -> Vec<bool> {
             away_m <= MOST_DISTANCE_M && z.abs() <= at_rig_m + per_m * away_m
         })
     };
-    points_m.iter().map(is_one).collect()
+    points_m.par_iter().map(is_one).collect()
 }
 
 /// Adds the derivatives of the ground's terms by the visible Gaussians of the ground. Returns the

@@ -11,7 +11,7 @@
 //!
 //! A twist is folded into its pose after each step, so that derivatives are always those at 0. What
 //! keeps a pose near its recorded one is `weight (|t|² + |φ|²)`, with the translation t in metres
-//! and the rotation φ in radians between the two.
+//! and the rotation φ in radians between the two. A sky moves no pose: it is smooth.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -98,15 +98,13 @@ impl TrainedPoses {
         &self.now
     }
 
-    /// A view at the pose that it has now. What its pose was in the recording goes; its motion
-    /// during the exposure stays.
+    /// A view at the pose that it has now, with both ends of its exposure moved alike.
     pub(crate) fn view(&self, view: View, place: Place) -> View {
         let world_from_camera = self.now.world_from_camera(place);
-        let last_from_first = |shutter: RollingShutter| {
-            view.world_from_camera.inverse() * shutter.world_from_camera_first
-        };
+        // As a twist moves it (`View::twisted`).
+        let moved = view.world_from_camera.inverse() * world_from_camera;
         let rolling_shutter = view.rolling_shutter.map(|shutter| RollingShutter {
-            world_from_camera_first: world_from_camera * last_from_first(shutter),
+            world_from_camera_first: shutter.world_from_camera_first * moved,
             ..shutter
         });
         View { world_from_camera, rolling_shutter, ..view }

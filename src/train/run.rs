@@ -39,6 +39,13 @@ pub struct TrainingImage {
     pub exposure: f32,
 }
 
+impl TrainingImage {
+    /// Whether some pixel counts: what moves may hide all of an image.
+    fn counts(&self) -> bool {
+        self.mask.as_ref().is_none_or(|mask| mask.contains(&true))
+    }
+}
+
 /// The images of a run, by their numbers.
 pub trait TrainingImages: Sync {
     /// The number of all images.
@@ -194,6 +201,9 @@ fn step(
 ) -> Result<StepReport, TrainError> {
     let image = next.recv().unwrap_or_else(|_| Err("the thread that decodes has ended".to_owned()));
     let (index, image) = image.map_err(TrainError::Image)?;
+    if !image.counts() {
+        return Ok(trainer.skip());
+    }
     let TrainingImage { view, rgb8, mask, mut depth_m, weight, exposure } = image;
     if let Some((depth_m, mask)) = depth_m.as_mut().zip(mask.as_ref()) {
         // What does not count has no depth either.
@@ -239,19 +249,23 @@ struct Evaluator<'a> {
 }
 
 impl Evaluator<'_> {
-    /// The mean of their PSNR; `None` without any.
+    /// The mean of their PSNR, of those with a pixel that counts; `None` without any.
     fn mean_db(&self, trainer: &Trainer) -> Result<Option<f64>, TrainError> {
         let scene = trainer.scene()?;
         let mut sum_db = 0.0;
+        let mut count = 0_u32;
         for &index in self.held_out {
             let image = self.images.load(index).map_err(TrainError::Image)?;
+            if !image.counts() {
+                continue;
+            }
+            count += 1;
             let drawn = self.draw(trainer, &scene, index, &image)?;
             let counts = |&index: &usize| image.mask.as_ref().is_none_or(|mask| mask[index / 3]);
             let values = (0..drawn.len()).filter(counts);
             sum_db += psnr_db_u8(values.map(|i| (&drawn[i], &image.rgb8[i])));
         }
-        let count = self.held_out.len();
-        Ok((count > 0).then(|| sum_db / count as f64))
+        Ok((count > 0).then(|| sum_db / f64::from(count)))
     }
 
     /// The image as the scene shows it, at the pose that is trained and with the exposure that was
@@ -263,18 +277,17 @@ impl Evaluator<'_> {
         index: usize,
         image: &TrainingImage,
     ) -> Result<Vec<u8>, TrainError> {
-        let mut drawn = vec![0; image.rgb8.len()];
+        let mut rgba = vec![0.0; 4 * image.view.camera.pixels()];
         // The sky is evaluated for every pixel: a map would be made for a few images.
         let profile = RenderProfile { sky_error: 0.0, ..*trainer.profile() };
         let views = [trainer.view(image.view, index, self.images.place(index))];
         let frame = Frame { scene, profile: &profile, views: &views };
-        let target = Target { rgb8: Some(&mut drawn), ..Target::default() };
+        let target = Target { rgba: Some(&mut rgba), ..Target::default() };
         self.backend.render(&frame, &mut [target], &|_, _| {})?;
-        if image.exposure != 1.0 {
-            for value in &mut drawn {
-                *value = (f32::from(*value) * image.exposure).round().min(255.0) as u8;
-            }
-        }
-        Ok(drawn)
+        // Exposed before it is rounded to 8 bits, so that nothing is clipped.
+        let to_8_bits =
+            |value: &f32| (255.0 * (value * image.exposure).clamp(0.0, 1.0)).round() as u8;
+        let pixels = rgba.as_chunks::<4>().0.iter();
+        Ok(pixels.flat_map(|[r, g, b, _]| [r, g, b].map(to_8_bits)).collect())
     }
 }

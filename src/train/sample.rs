@@ -46,6 +46,11 @@ impl Sample<'_> {
                 return Err(TrainError::Size { image, given, wanted });
             }
         }
+        for (image, value) in [("weight", self.weight), ("exposure", self.exposure)] {
+            if !(0.0..=f32::MAX).contains(&value) {
+                return Err(TrainError::Value { image, index: 0, value });
+            }
+        }
         // A NaN is in no range.
         let is_fault = |value: &f32| !(0.0..=f32::MAX).contains(value);
         let out_of_range = |values: &[f32]| values.iter().position(is_fault);

@@ -53,6 +53,8 @@ pub struct Trainer {
     pub(crate) exposures: Option<TrainedExposures>,
     pub(crate) sky: Option<TrainedSky>,
     pub(crate) fixed_sky: Option<Arc<Sky>>,
+    /// Number of images, if something is trained of each.
+    pub(crate) images: Option<usize>,
     pub(crate) step: usize,
     pub(crate) gradients: Gradients,
 }
@@ -81,6 +83,9 @@ impl Trainer {
             });
         }
         let images = world_from_camera.len();
+        if settings.poses.mode == PoseMode::Rig && rig.is_none() {
+            return Err(TrainError::NoRig);
+        }
         let own =
             RigPoses { world_from_ego: world_from_camera, ego_from_camera: vec![Pose::IDENTITY] };
         let poses = match settings.poses.mode {
@@ -99,6 +104,7 @@ impl Trainer {
             poses: poses.map(TrainedPoses::new),
             exposures: settings.exposure.on.then(|| TrainedExposures::new(images)),
             sky: trains_sky.then(|| TrainedSky::new(&settings.sky, images, settings.seed)),
+            images: (trains_sky || settings.exposure.on).then_some(images),
             fixed_sky: sky,
             gradients: Gradients::default(),
             step: 0,
@@ -169,6 +175,9 @@ impl Trainer {
         sample: &Sample<'_>,
     ) -> Result<StepReport, TrainError> {
         sample.check()?;
+        if self.images.is_some_and(|images| sample.image >= images) {
+            return Err(TrainError::NoImage { image: sample.image });
+        }
         let place = self.trained_place(sample.image, sample.place);
         if let Some((poses, place)) = self.poses.as_ref().zip(place)
             && !poses.now().has(place)
@@ -209,6 +218,13 @@ impl Trainer {
         report.visible = stats.visible_pairs;
         report.stages_ms = stats.stages_ms;
         Ok(report)
+    }
+
+    /// Goes on to the next step without learning: of an image that shows nothing that counts.
+    pub(crate) fn skip(&mut self) -> StepReport {
+        self.step += 1;
+        self.grow();
+        StepReport::default()
     }
 
     /// Which poses are trained of an image: those of the rig, or its own.

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use wildcity_scene::Rig;
 use wildcity_twin::store::Catalog;
 
+use crate::data::real;
 use crate::in_folder::{done, refused};
 use crate::wildcity;
 
@@ -189,4 +190,18 @@ fn a_log_becomes_a_twin() {
     fs::remove_file(dir.join("log/lidar.jsonl")).unwrap();
     let error = refused(dir, &train);
     assert!(error.contains("--points"), "{error}");
+}
+
+#[test]
+fn a_gradient_that_exceeds_its_bound_ends_with_1() {
+    let Some(vectors) = real("gradients/vectors.safetensors") else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let mut bytes = fs::read(vectors).unwrap();
+    // The last values of the file are derivatives of the loss by a pixel.
+    let last = bytes.len() - 8 * 4;
+    bytes[last - 8..last].copy_from_slice(&0.5_f64.to_le_bytes());
+    fs::write(dir.path().join("vectors.safetensors"), bytes).unwrap();
+    let check = ["train", "check", "--vectors", "vectors.safetensors"];
+    let error = refused(dir.path(), &check);
+    assert!(error.contains("bounds are exceeded"), "{error}");
 }

@@ -3,7 +3,8 @@
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::process;
+use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 
@@ -72,19 +73,52 @@ impl Checkpoints {
     }
 }
 
-/// Becomes true when the process is asked to stop: SIGTERM, or Ctrl-C. A second signal ends the
-/// process at once.
-pub(super) fn stop_flag() -> anyhow::Result<Arc<AtomicBool>> {
-    let runtime = runtime::Builder::new_current_thread().enable_all().build()?;
-    let signal = {
-        let _guard = runtime.enter();
-        wildcity_server::stop_signal()?
-    };
-    let stops = Arc::new(AtomicBool::new(false));
-    let flag = Arc::clone(&stops);
-    thread::Builder::new().name("signals".to_owned()).spawn(move || {
-        runtime.block_on(signal);
-        flag.store(true, Ordering::Relaxed);
-    })?;
-    Ok(stops)
+/// Whether a run is at work, which ends after its step when the process is asked to stop.
+static TRAINS: AtomicBool = AtomicBool::new(false);
+
+/// Whether the process has been asked to stop.
+static STOPS: AtomicBool = AtomicBool::new(false);
+
+/// As long as it lives, the first SIGTERM or Ctrl-C asks the run to stop. Every other one ends the
+/// process, as without it.
+pub(super) struct StopsAtSignal;
+
+impl StopsAtSignal {
+    pub(super) fn new() -> anyhow::Result<Self> {
+        static LISTENS: OnceLock<()> = OnceLock::new();
+        if LISTENS.set(()).is_ok() {
+            let runtime = runtime::Builder::new_current_thread().enable_all().build()?;
+            // Registered before the thread begins, so that no signal is lost.
+            let mut signal = {
+                let _guard = runtime.enter();
+                wildcity_server::stop_signal()?
+            };
+            thread::Builder::new().name("signals".to_owned()).spawn(move || {
+                loop {
+                    runtime.block_on(Box::pin(signal));
+                    let is_first = !STOPS.swap(true, Ordering::Relaxed);
+                    if !is_first || !TRAINS.load(Ordering::Relaxed) {
+                        process::exit(130);
+                    }
+                    let _guard = runtime.enter();
+                    match wildcity_server::stop_signal() {
+                        Ok(next) => signal = next,
+                        Err(_) => return,
+                    }
+                }
+            })?;
+        }
+        TRAINS.store(true, Ordering::Relaxed);
+        Ok(Self)
+    }
+
+    pub(super) fn stops(&self) -> bool {
+        STOPS.load(Ordering::Relaxed)
+    }
+}
+
+impl Drop for StopsAtSignal {
+    fn drop(&mut self) {
+        TRAINS.store(false, Ordering::Relaxed);
+    }
 }

@@ -76,8 +76,14 @@ impl<'a> ListedImages<'a> {
     pub(super) fn inputs(&self) -> String {
         let mut text = format!("{} {}\n", self.size, self.held_out_every);
         for ListedImage { image, world_from_camera } in &self.images {
-            let RealImage { name, camera, .. } = image;
-            text += &format!("{name} {camera:?} {world_from_camera:?}\n");
+            let RealImage { name, camera, file, mask, depth, weight, exposure_stops, .. } = image;
+            text +=
+                &format!("{name} {camera:?} {world_from_camera:?} {weight:?} {exposure_stops:?}");
+            for file in [Some(file), mask.as_ref(), depth.as_ref()] {
+                text +=
+                    &format!(" {:?}", file.and_then(|file| file.metadata().ok()).map(|m| m.len()));
+            }
+            text.push('\n');
         }
         text
     }

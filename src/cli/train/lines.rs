@@ -1,7 +1,7 @@
 //! What a run says while it works.
 
 use std::fs::{self, OpenOptions};
-use std::io::{self, Write};
+use std::io::{self, BufRead, BufReader, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
@@ -14,12 +14,21 @@ pub(super) struct LinesFile {
 }
 
 impl LinesFile {
-    /// Begins the file anew, or goes on at its end.
-    pub(super) fn open(path: &Path, goes_on: bool) -> anyhow::Result<Self> {
+    /// Begins the file anew, or goes on after the line of a step: lines after the checkpoint of a
+    /// run that was killed are written again.
+    pub(super) fn open(path: &Path, done: usize) -> anyhow::Result<Self> {
         let cannot = || format!("cannot write {}", path.display());
         let mut options = OpenOptions::new();
-        options.create(true).write(true).append(goes_on).truncate(!goes_on);
-        Ok(Self { path: path.to_owned(), file: options.open(path).with_context(cannot)? })
+        options.create(true).write(true).read(true).truncate(done == 0);
+        let mut file = options.open(path).with_context(cannot)?;
+        let mut kept = 0;
+        let mut lines = BufReader::new(&file);
+        for _ in 0..done {
+            kept += lines.read_until(b'\n', &mut Vec::new()).with_context(cannot)? as u64;
+        }
+        file.set_len(kept).with_context(cannot)?;
+        file.seek(SeekFrom::End(0)).with_context(cannot)?;
+        Ok(Self { path: path.to_owned(), file })
     }
 
     pub(super) fn write(&mut self, line: &Line) -> anyhow::Result<()> {

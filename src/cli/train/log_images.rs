@@ -44,6 +44,8 @@ pub(super) struct LogImages {
     times_us: Vec<i64>,
     size: f64,
     held_out_every: usize,
+    /// Whether the log marks images as held out.
+    marks_held_out: bool,
     /// Images at times without a pose.
     pub(super) left_out: usize,
 }
@@ -74,6 +76,7 @@ impl LogImages {
             times_us: Vec::new(),
             size,
             held_out_every,
+            marks_held_out: false,
             left_out: 0,
         };
         for row in rows {
@@ -98,6 +101,7 @@ impl LogImages {
         }
         let ego = self.rig.world_from_ego.len() - 1;
         let motion = self.rig.world_from_ego[ego].inverse() * world_from_rig;
+        self.marks_held_out |= row.held_out;
         self.images.push(LoggedImage { row, place: Place { ego, camera, motion } });
         Ok(())
     }
@@ -174,8 +178,12 @@ impl LogImages {
         let rig_from_camera = self.rig.ego_from_camera[place.camera];
         let mounted = RigCamera { camera: shrunk.camera, rig_from_camera, ..mounted.clone() };
         let world_from_rig = self.rig.world_from_ego[place.ego] * place.motion;
-        let before =
-            |us: i64| self.poses.at(row.time_us.saturating_sub(us)).unwrap_or(world_from_rig);
+        // The recorded motion during the exposure, from the pose that it has now.
+        let recorded = self.poses.at(row.time_us).unwrap_or(world_from_rig);
+        let before = |us: i64| match self.poses.at(row.time_us.saturating_sub(us)) {
+            Some(earlier) => world_from_rig * (recorded.inverse() * earlier),
+            None => world_from_rig,
+        };
         let views = View::from_moving_rig(&[mounted], world_from_rig, &before);
         let view = *views.first().context("a view")?;
         let mut counts = vec![true; shrunk.camera.pixels()];
@@ -242,7 +250,7 @@ impl TrainingImages for LogImages {
 
     /// Those that the log marks, or one of some if it marks none.
     fn is_held_out(&self, index: usize) -> bool {
-        if self.images.iter().any(|image| image.row.held_out) {
+        if self.marks_held_out {
             return self.images[index].row.held_out;
         }
         self.held_out_every > 0 && index.is_multiple_of(self.held_out_every)

@@ -1,13 +1,12 @@
 //! A run that shows how far it is, and stops when it is asked to.
 
 use std::io::{self, IsTerminal};
-use std::sync::atomic::Ordering;
 
 use wildcity_render::gradient::Differentiate;
 use wildcity_train::run::{Line, TrainingImages, run};
 use wildcity_train::trainer::Trainer;
 
-use super::checkpoints::stop_flag;
+use super::checkpoints::StopsAtSignal;
 use super::lines::log;
 use crate::cli::progress;
 
@@ -21,7 +20,7 @@ pub(super) fn train(
     each: &mut dyn FnMut(&Line, &Trainer) -> anyhow::Result<()>,
 ) -> anyhow::Result<Option<(f64, f64)>> {
     let every = (trainer.settings().steps / 10).max(1);
-    let stops = stop_flag()?;
+    let signal = StopsAtSignal::new()?;
     let bar = progress::count("training");
     bar.set_length(trainer.settings().steps as u64);
     let mut last = None;
@@ -38,7 +37,7 @@ pub(super) fn train(
             said = log(line).map_err(anyhow::Error::from);
         }
         failed = said.and_then(|()| each(line, trainer)).err();
-        failed.is_none() && !stops.load(Ordering::Relaxed)
+        failed.is_none() && !signal.stops()
     };
     run(trainer, images, backend, every, &mut on_step)?;
     bar.finish_and_clear();

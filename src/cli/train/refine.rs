@@ -78,8 +78,8 @@ pub(in crate::cli) struct Refine {
     #[arg(long, value_name = "N", default_value_t = 8)]
     held_out_every: usize,
 
-    /// TOML file of all settings [default: those of `wildcity train settings`, with a tenth of the
-    /// learning rate of means, and without growth]
+    /// TOML file of all settings, of which growth, poses, sky and exposure stay off [default: those
+    /// of `wildcity train settings`, with a tenth of the learning rate of means]
     #[arg(long, value_name = "FILE")]
     settings: Option<PathBuf>,
 
@@ -213,15 +213,16 @@ impl Refine {
     fn training_settings(&self) -> anyhow::Result<Settings> {
         let mut settings = Settings::default();
         settings.rates.mean *= 0.1;
-        settings.growth.from = 0;
-        settings.growth.until = 0;
-        settings.growth.noise = 0.0;
         if let Some(path) = &self.settings {
             settings = read_settings(path)?;
         }
         settings.steps = self.steps as usize;
         settings.poses.mode = PoseMode::Off;
         settings.sky.mode = SkyMode::Off;
+        settings.exposure.on = false;
+        settings.growth.from = 0;
+        settings.growth.until = 0;
+        settings.growth.noise = 0.0;
         settings.check()?;
         Ok(settings)
     }

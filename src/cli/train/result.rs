@@ -3,6 +3,8 @@
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
+use anyhow::Context;
+use wildcity_scene::validate::{self, Field};
 use wildcity_scene::{Rig, Trajectory};
 use wildcity_train::sky_file;
 use wildcity_train::trainer::Trainer;
@@ -27,8 +29,17 @@ impl Written {
         ply: &Path,
         refined: Option<&(Trajectory, Rig)>,
     ) -> anyhow::Result<Self> {
+        let gaussians = trainer.model().to_gaussians();
+        validate::check(&gaussians, &Field::plain_name)
+            .context("the run has made Gaussians that no scene may have: use smaller rates")?;
+        if trainer.settings().exposure.on {
+            writeln!(
+                io::stderr(),
+                "note: the exposures of images are not written: the scene has the mean one"
+            )?;
+        }
         let mut bytes = Vec::new();
-        write_ply(&trainer.model().to_gaussians(), &mut bytes)?;
+        write_ply(&gaussians, &mut bytes)?;
         output::write(ply, &bytes)?;
         let network = trainer.sky()?;
         let sky = network.map(|network| {

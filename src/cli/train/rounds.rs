@@ -28,6 +28,18 @@ pub(in crate::cli) struct Loop {
     #[arg(long, value_name = "FILE_OR_DIR")]
     images: PathBuf,
 
+    /// Folder of the recorded images, as for `wildcity eval`.
+    #[arg(long, value_name = "DIR")]
+    image_dir: Option<PathBuf>,
+
+    /// Folder of masks of the recorded images, as for `wildcity eval`.
+    #[arg(long, value_name = "DIR")]
+    masks: Option<PathBuf>,
+
+    /// TOML file of all settings, as for `wildcity train refine`.
+    #[arg(long, value_name = "FILE")]
+    settings: Option<PathBuf>,
+
     /// Axes of the poses of --images, as for `wildcity train refine`.
     #[arg(long, value_name = "AXES", allow_hyphen_values = true)]
     axes: Option<String>,
@@ -118,6 +130,16 @@ impl Loop {
         add("--size", self.size.to_string().into());
         if let Some(axes) = &self.axes {
             add("--axes", axes.into());
+        }
+        let files = [
+            ("--image-dir", &self.image_dir),
+            ("--masks", &self.masks),
+            ("--settings", &self.settings),
+        ];
+        for (name, file) in files {
+            if let Some(file) = file {
+                add(name, file.into());
+            }
         }
         arguments
     }

@@ -182,6 +182,9 @@ impl TrainScene {
         };
         start.world_from_camera = images.world_from_camera();
         start.rig = Some(images.rig.clone());
+        let means_m: Vec<DVec3> =
+            start.gaussians.means_m.iter().map(|m| DVec3::from_array(*m)).collect();
+        start.is_ground = is_ground(&means_m, &images.rig.world_from_ego);
         let inputs = images.inputs();
         let trainer =
             self.train(out, Inputs { images: &images, inputs, start, profile, settings })?;
@@ -206,13 +209,15 @@ impl TrainScene {
             output::counted(start.gaussians.len(), "Gaussian"),
             backend.name()
         )?;
-        let inputs = format!("{inputs}{}", inputs_of_gaussians(&start.gaussians));
+        let gaussians = inputs_of_gaussians(&start.gaussians);
+        let inputs = format!("{} {profile:?}\n{inputs}{gaussians}", backend.name());
         let checkpoints = Checkpoints::new(out, inputs);
         let mut trainer = match checkpoints.read(self.resume, profile, &settings)? {
             Some(trainer) => trainer,
             None => Trainer::new(start, profile, settings)?,
         };
-        let open = |path: &PathBuf| LinesFile::open(path, self.resume);
+        let done = trainer.steps_done();
+        let open = |path: &PathBuf| LinesFile::open(path, done);
         let mut lines = self.lines.as_ref().map(open).transpose()?;
         let last = train(&mut trainer, images, backend, &mut |line, trainer| {
             lines.as_mut().map_or(Ok(()), |lines| lines.write(line))?;
@@ -355,7 +360,7 @@ const STARTING_IMAGES: usize = 100;
 /// Most points of a LiDAR that a run begins with: more are added where images need them.
 const MOST_LIDAR_POINTS: usize = 500_000;
 
-/// Points of the LiDAR of a log in the colours of its images, and which of them are on the ground.
+/// Points of the LiDAR of a log in the colours of its images.
 fn logged_start(images: &LogImages, settings: &Settings) -> anyhow::Result<Start> {
     let most = settings.growth.cap.min(MOST_LIDAR_POINTS);
     let points = wildcity_log::colored_points(images.log(), images.poses(), STARTING_IMAGES, most)?;
@@ -363,17 +368,12 @@ fn logged_start(images: &LogImages, settings: &Settings) -> anyhow::Result<Start
         !points.is_empty(),
         "the log has no points of a LiDAR that its images show: give --points, a PLY file"
     );
-    let at_m: Vec<DVec3> = points.iter().map(|point| point.at_m).collect();
     let point = |point: &ColoredPoint| Point {
         at_m: point.at_m,
         rgb: point.rgb8.map(|value| f64::from(value) / 255.0),
     };
     let points: Vec<Point> = points.iter().map(point).collect();
-    Ok(Start {
-        gaussians: gaussians_from_points(&points),
-        is_ground: is_ground(&at_m, &images.rig.world_from_ego),
-        ..Start::default()
-    })
+    Ok(Start { gaussians: gaussians_from_points(&points), ..Start::default() })
 }
 
 /// Reads the file of `--settings`.
@@ -385,8 +385,11 @@ pub(super) fn read_settings(path: &Path) -> anyhow::Result<Settings> {
 
 /// A text by which a checkpoint knows its Gaussians.
 fn inputs_of_gaussians(gaussians: &Gaussians) -> String {
-    let means_m = gaussians.means_m.iter().map(|mean_m| DVec3::from_array(*mean_m));
-    format!("{} Gaussians, {:?}\n", gaussians.len(), means_m.sum::<DVec3>())
+    let Gaussians { sh_degree, means_m, ln_scales, logit_opacities, sh, .. } = gaussians;
+    let means_m = means_m.iter().map(|mean_m| DVec3::from_array(*mean_m)).sum::<DVec3>();
+    let sum = |values: &[f32]| values.iter().map(|&value| f64::from(value)).sum::<f64>();
+    let sums = [ln_scales.as_flattened(), logit_opacities, sh].map(sum);
+    format!("{} Gaussians of degree {sh_degree}, {means_m:?} {sums:?}\n", gaussians.len())
 }
 
 /// Keeps as many points as `count`, at random.

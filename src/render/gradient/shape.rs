@@ -194,6 +194,12 @@ impl FootprintGradient {
     }
 }
 
+/// Least difference between the speed of a point's image and that of the readout, as a share of the
+/// latter, at which the moment of the point has a derivative. Where both are equal, the point is
+/// exposed all the time: its derivative has a pole, and one such point would be all of the view's
+/// twist.
+const LEAST_SLIP: f64 = 0.1;
+
 /// The derivatives of a loss by a point of the camera's frame at the moment of its exposure, given
 /// those by the point's image, directly by the point, and by that moment.
 ///
@@ -214,8 +220,10 @@ fn point_gradient(
         let motion = motion_of_point(view, point);
         let motion_px = DVec2::new(jx.dot(motion), jy.dot(motion));
         by_px += (by_moment + by_point.dot(motion)) * moment_per_px;
-        let gain = 1.0 / (1.0 - moment_per_px.dot(motion_px));
-        by_px += moment_per_px * (motion_px.dot(by_px) * gain);
+        let slip = 1.0 - moment_per_px.dot(motion_px);
+        if slip.abs() >= LEAST_SLIP {
+            by_px += moment_per_px * (motion_px.dot(by_px) / slip);
+        }
     }
     by_point + by_px.x * jx + by_px.y * jy
 }
