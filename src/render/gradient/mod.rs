@@ -41,8 +41,8 @@
 //! gsplat: none. A splat at the cap passes nothing on to its shape and opacity, but its colour
 //! counts; one below the cut or after the stop has no derivative. A colour that is clamped at 0 has
 //! none, nor has the opacity's scale by `antialiased` at its floor. A slope that is clamped beyond
-//! the image's edges has no derivative of its own. With a rolling shutter, a point whose image moves
-//! nearly as fast as the readout has none by its moment.
+//! the image's edges has no derivative of its own. With a rolling shutter, a point whose image
+//! moves nearly as fast as the readout has none by its moment.
 
 mod color;
 mod shape;
