@@ -70,14 +70,19 @@ def lines_of(record: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in whole.splitlines()]
 
 
+def walk(folder: Path, environment: dict[str, str]) -> Path:
+    """The record of an episode in which a pedestrian is hit."""
+    run_suite(write_suite(folder), folder / "run", environment)
+    return folder / "run" / "episodes" / "walk-0-1.jsonl"
+
+
 @pytest.fixture(scope="module")
 def driven(
     quick_reader: dict[str, str], tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[list[dict[str, Any]], bytes]:
     """A record in which a pedestrian is hit, and the same as MCAP."""
     folder = tmp_path_factory.mktemp("walk")
-    run_suite(write_suite(folder), folder / "run", quick_reader)
-    record = folder / "run" / "episodes" / "walk-0-1.jsonl"
+    record = walk(folder, quick_reader)
     mcap = folder / "walk.mcap"
     command = ["wildcity", "episode", "export", str(record), "--mcap", str(mcap)]
     subprocess.run(command, env=quick_reader, check=True, capture_output=True)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from test_episode_records import lines_of, run_suite, write_suite
+from test_episode_records import lines_of, walk
 
 
 @pytest.fixture(scope="module")
@@ -21,8 +21,7 @@ def exported(
 ) -> tuple[list[dict[str, Any]], bytes]:
     """The frames of a record, and the same episode with images for ROS 2."""
     folder = tmp_path_factory.mktemp("ros2")
-    run_suite(write_suite(folder), folder / "run", quick_reader)
-    record = folder / "run" / "episodes" / "walk-0-1.jsonl"
+    record = walk(folder, quick_reader)
     mcap = folder / "walk.mcap"
     command = ["wildcity", "episode", "export", str(record), "--mcap", str(mcap), "--images", "--ros2"]
     subprocess.run(command, env=quick_reader, check=True, capture_output=True)

@@ -22,7 +22,7 @@ import numpy as np
 from .errors import LogError
 from .frames import Matrix, Poses, inverse
 from .kinds import Options, choose
-from .kitti_files import calibration, numbered, rigid, scan, times_us
+from .kitti_files import calibration, numbered, recorded_images, rigid, scan, times_us
 from .lenses import Intrinsics, camera, opencv
 from .points import Sweep
 from .progress import Progress
@@ -154,12 +154,7 @@ def _distorted(found: dict[str, Any], number: int, rig_from_0: Matrix, place: Pa
 
 def _images(writer: LogWriter, drive: Path, name: str) -> None:
     folders = sorted(path for path in drive.glob("image_0?") if path.is_dir())
-    times = {folder: times_us(folder / "timestamps.txt") for folder in folders}
-    with Progress(f"kitti {name}, images", sum(len(its) for its in times.values())) as progress:
-        for folder in folders:
-            for time_us, path in numbered(folder / "data", ".png", times[folder], writer, folder.name):
-                writer.image(folder.name, time_us, path)
-                progress.step()
+    recorded_images(writer, folders, "data", f"kitti {name}, images")
     if not folders:
         raise LogError(drive, "no folder image_00 to image_03", "download the images of the drive")
 

@@ -18,7 +18,7 @@ import numpy as np
 from .errors import LogError
 from .frames import Matrix, inverse
 from .kinds import Options, choose
-from .kitti_files import calibration, matrix34, numbered, scan, times_us
+from .kitti_files import calibration, matrix34, numbered, recorded_images, scan, times_us
 from .lenses import Intrinsics, camera
 from .points import Sweep
 from .progress import Progress
@@ -102,12 +102,7 @@ def _images(writer: LogWriter, images: Path, name: str) -> None:
     folders = [folder for number in ("00", "01") if (folder := images / f"image_{number}").is_dir()]
     if not folders:
         raise LogError(images, "no folder image_00 or image_01", "download the images of the sequence")
-    times = {folder: times_us(folder / "timestamps.txt") for folder in folders}
-    with Progress(f"kitti360 {name}, images", sum(len(its) for its in times.values())) as progress:
-        for folder in folders:
-            for time_us, path in numbered(folder / "data_rect", ".png", times[folder], writer, folder.name):
-                writer.image(folder.name, time_us, path)
-                progress.step()
+    recorded_images(writer, folders, "data_rect", f"kitti360 {name}, images")
     for number in ("02", "03"):
         count = len(list((images / f"image_{number}").glob("data_rgb/*.png")))
         writer.left_out(f"images of image_{number}", count, "the lens model of Mei is none of a rig")

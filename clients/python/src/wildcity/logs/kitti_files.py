@@ -12,10 +12,11 @@ import numpy.typing as npt
 
 from .errors import LogError
 from .frames import Matrix
+from .progress import Progress
 from .tableio import numbers, text_of
 from .writer import LogWriter
 
-__all__ = ["calibration", "numbered", "rigid", "scan", "times_us"]
+__all__ = ["calibration", "numbered", "recorded_images", "rigid", "scan", "times_us"]
 
 _TIME = re.compile(r"(\d{4})-(\d\d)-(\d\d) (\d\d):(\d\d):(\d\d)(?:\.(\d{1,9}))?")
 
@@ -80,6 +81,19 @@ def numbered(folder: Path, suffix: str, times: list[int], writer: LogWriter, wha
         else:
             missing += 1
     writer.left_out(f"times of {what} without a file", missing, "their files are missing")
+
+
+def recorded_images(writer: LogWriter, folders: list[Path], inside: str, title: str) -> None:
+    """The images of cameras, each with a folder of its name: its times, and its numbered files in the folder `inside`.
+
+    The number of files is shown as `title`.
+    """
+    times = {folder: times_us(folder / "timestamps.txt") for folder in folders}
+    with Progress(title, sum(len(its) for its in times.values())) as progress:
+        for folder in folders:
+            for time_us, path in numbered(folder / inside, ".png", times[folder], writer, folder.name):
+                writer.image(folder.name, time_us, path)
+                progress.step()
 
 
 def scan(path: Path) -> npt.NDArray[np.float32]:
