@@ -212,6 +212,13 @@ impl HardwareOptions {
         Ok(backends)
     }
 
+    /// The backend that a run of training uses: the gpu backend where [`Self::differentiating`] has
+    /// it, and cpu elsewhere.
+    #[cfg(feature = "train")]
+    pub fn training(&self) -> anyhow::Result<Box<dyn Differentiate>> {
+        anyhow::Context::context(self.differentiating()?.pop(), "no backend computes gradients")
+    }
+
     /// Creates the gpu backend on the device that `--device` names, or on that of choice.
     #[cfg(feature = "gpu")]
     fn gpu_or(&self, choice: AdapterChoice) -> Result<Gpu, GpuError> {

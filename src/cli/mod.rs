@@ -154,9 +154,18 @@ impl Moved {
     }
 }
 
+/// Options of a command with their values; those without one are left out.
+#[cfg(feature = "train")]
+type Options = Vec<(&'static str, Option<std::ffi::OsString>)>;
+
 /// Runs a command as from the command line, for commands that are made of others.
 #[cfg(feature = "train")]
-fn run_arguments(arguments: Vec<std::ffi::OsString>) -> anyhow::Result<()> {
+fn run_command(words: &[&std::ffi::OsStr], options: Options) -> anyhow::Result<()> {
+    let mut arguments = vec!["wildcity".into()];
+    arguments.extend(words.iter().map(std::ffi::OsString::from));
+    for (name, value) in options {
+        arguments.extend(value.into_iter().flat_map(|value| [name.into(), value]));
+    }
     Arguments::try_parse_from(arguments)?.command.run()
 }
 

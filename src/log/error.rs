@@ -24,7 +24,7 @@ pub enum LogError {
         folder: PathBuf,
         /// Name of the file.
         table: &'static str,
-        /// What needs it.
+        /// What cannot be done without it, as the end of the message.
         needed_for: &'static str,
     },
     /// A field of `log.json` is wrong.

@@ -4,6 +4,7 @@ use std::fs::{self, File};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
+use glam::DVec3;
 use wildcity_scene::Rig;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::trajectory::Keyframe;
@@ -149,6 +150,15 @@ impl Log {
     pub fn points(&self, row: &SweepRow) -> Result<SweepPoints, LogError> {
         let path = self.path(&row.file);
         SweepPoints::parse(&read_whole(&path, limits::SWEEP_BYTES)?, &path)
+    }
+
+    /// The points of a sweep as [`SweepPoints::on_rig`] has them.
+    ///
+    /// # Errors
+    /// As [`Log::points`] and [`Log::rig_from_lidar`].
+    pub fn points_on_rig(&self, row: &SweepRow) -> Result<Vec<(i64, DVec3)>, LogError> {
+        let rig_from_lidar = self.rig_from_lidar(&row.lidar)?;
+        Ok(self.points(row)?.on_rig(row, rig_from_lidar).collect())
     }
 
     /// Where a LiDAR is on the rig.

@@ -3,9 +3,12 @@
 
 use std::path::Path;
 
+use glam::DVec3;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use wildcity_scene::geometry::Pose;
 
 use crate::error::LogError;
+use crate::row::SweepRow;
 
 /// The points of a sweep, in the LiDAR's axes.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -79,7 +82,21 @@ impl SweepPoints {
         safetensors::serialize(views, None).map_err(|error| LogError::malformed(path, error))
     }
 
-    /// Number of points.
+    /// The points in the rig's axes, each with its time; those that the source has moved to a time
+    /// have that one.
+    pub fn on_rig(
+        &self,
+        row: &SweepRow,
+        rig_from_lidar: Pose,
+    ) -> impl Iterator<Item = (i64, DVec3)> {
+        let moved_us = row.compensated_to_us;
+        self.time_us.iter().zip(&self.points_m).map(move |(time_us, point_m)| {
+            let point_m = DVec3::from_array(point_m.map(f64::from));
+            (moved_us.unwrap_or(*time_us), rig_from_lidar.transform_point(point_m))
+        })
+    }
+
+    /// How many points the sweep has.
     pub fn len(&self) -> usize {
         self.points_m.len()
     }

@@ -102,7 +102,7 @@ pub struct TrackRow {
     pub time_us: i64,
     /// The object's id within the log.
     pub track: String,
-    /// The object's kind.
+    /// By which scenarios choose an asset for the object.
     #[cfg_attr(feature = "schema", schemars(with = "ClassSchema"))]
     pub class: ActorClass,
     /// Length, width and height, in metres.

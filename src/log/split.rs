@@ -45,7 +45,7 @@ impl Default for SplitSettings {
     }
 }
 
-/// What `split.json` says.
+/// The parts that a log was cut into, as `split.json` lists them.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Split {
     /// Name of the log.
@@ -64,7 +64,7 @@ pub struct ChunkSummary {
     pub stations_m: [f64; 2],
     /// When it begins, in microseconds, and when the next one does.
     pub times_us: [i64; 2],
-    /// Images of keyframes.
+    /// Images at keyframes; the others of the log are in no chunk.
     pub images: usize,
     /// Those of them that are held out.
     pub held_out: usize,

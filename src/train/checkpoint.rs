@@ -57,7 +57,6 @@ struct State {
     poses: Option<TrainedPoses>,
     exposures: Option<TrainedExposures>,
     sky: Option<TrainedSky>,
-    images: Option<u64>,
 }
 
 impl Trainer {
@@ -76,7 +75,6 @@ impl Trainer {
             poses: self.poses.clone(),
             exposures: self.exposures.clone(),
             sky: self.sky.clone(),
-            images: self.images.map(|images| images as u64),
         };
         let mut bytes = FORMAT.to_vec();
         bincode::serde::encode_into_std_write(&state, &mut bytes, encoding())
@@ -123,7 +121,6 @@ impl Trainer {
             exposures: state.exposures,
             sky: state.sky,
             fixed_sky,
-            images: state.images.map(|images| images as usize),
             step: state.step as usize,
             gradients: Gradients::default(),
         })

@@ -21,6 +21,10 @@ impl TrainedExposures {
         Self { images: vec![(IDENTITY, Adam::new(IDENTITY.len())); images] }
     }
 
+    pub(crate) fn images(&self) -> usize {
+        self.images.len()
+    }
+
     /// The exposure of an image, after that which was recorded: a factor of all colours.
     pub(crate) fn exposure(&self, image: usize, recorded: f32) -> Exposure<f32> {
         let (values, _) = &self.images[image];

@@ -54,6 +54,11 @@ pub trait TrainingImages: Sync {
     /// Whether an image is kept from the run, to judge it.
     fn is_held_out(&self, index: usize) -> bool;
 
+    /// The images that are kept from the run.
+    fn held_out(&self) -> Vec<usize> {
+        (0..self.count()).filter(|&index| self.is_held_out(index)).collect()
+    }
+
     /// Whether an image was rendered and repaired, and not recorded: of these,
     /// [`Settings::augmented_share`] of the steps are made.
     fn is_augmented(&self, _: usize) -> bool {
@@ -237,8 +242,7 @@ pub fn held_out_db(
     images: &dyn TrainingImages,
     backend: &dyn Differentiate,
 ) -> Result<Option<f64>, TrainError> {
-    let held_out: Vec<usize> = (0..images.count()).filter(|&i| images.is_held_out(i)).collect();
-    Evaluator { images, backend, held_out: &held_out }.mean_db(trainer)
+    Evaluator { images, backend, held_out: &images.held_out() }.mean_db(trainer)
 }
 
 /// The images that are held out.

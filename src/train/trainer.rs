@@ -30,8 +30,7 @@ use crate::sky::TrainedSky;
 #[derive(Clone, Debug, Default)]
 pub struct Start {
     pub gaussians: Gaussians,
-    /// Whether each Gaussian lies on the ground ([`ground::is_ground`]);
-    /// empty if none does.
+    /// Whether each Gaussian lies on the ground ([`ground::is_ground`]); empty if none does.
     pub is_ground: Vec<bool>,
     /// The recorded pose of each image of the run.
     pub world_from_camera: Vec<Pose>,
@@ -53,8 +52,6 @@ pub struct Trainer {
     pub(crate) exposures: Option<TrainedExposures>,
     pub(crate) sky: Option<TrainedSky>,
     pub(crate) fixed_sky: Option<Arc<Sky>>,
-    /// Number of images, if something is trained of each.
-    pub(crate) images: Option<usize>,
     pub(crate) step: usize,
     pub(crate) gradients: Gradients,
 }
@@ -82,10 +79,10 @@ impl Trainer {
                 wanted: gaussians.len(),
             });
         }
-        let images = world_from_camera.len();
         if settings.poses.mode == PoseMode::Rig && rig.is_none() {
             return Err(TrainError::NoRig);
         }
+        let images = world_from_camera.len();
         let own =
             RigPoses { world_from_ego: world_from_camera, ego_from_camera: vec![Pose::IDENTITY] };
         let poses = match settings.poses.mode {
@@ -104,7 +101,6 @@ impl Trainer {
             poses: poses.map(TrainedPoses::new),
             exposures: settings.exposure.on.then(|| TrainedExposures::new(images)),
             sky: trains_sky.then(|| TrainedSky::new(&settings.sky, images, settings.seed)),
-            images: (trains_sky || settings.exposure.on).then_some(images),
             fixed_sky: sky,
             gradients: Gradients::default(),
             step: 0,
@@ -175,7 +171,7 @@ impl Trainer {
         sample: &Sample<'_>,
     ) -> Result<StepReport, TrainError> {
         sample.check()?;
-        if self.images.is_some_and(|images| sample.image >= images) {
+        if self.images().is_some_and(|images| sample.image >= images) {
             return Err(TrainError::NoImage { image: sample.image });
         }
         let place = self.trained_place(sample.image, sample.place);
@@ -209,8 +205,8 @@ impl Trainer {
         self.step += 1;
         let mut report = StepReport::default();
         if let Some(outcome) = outcome {
-            report = outcome.report.clone();
             self.move_cameras(sample, place, &outcome)?;
+            report = outcome.report;
         }
         report.ground = self.add_ground(sample);
         self.move_gaussians(sample)?;
@@ -218,6 +214,12 @@ impl Trainer {
         report.visible = stats.visible_pairs;
         report.stages_ms = stats.stages_ms;
         Ok(report)
+    }
+
+    /// Number of images, if something is trained of each.
+    fn images(&self) -> Option<usize> {
+        let exposures = self.exposures.as_ref().map(TrainedExposures::images);
+        exposures.or_else(|| self.sky.as_ref().map(TrainedSky::images))
     }
 
     /// Goes on to the next step without learning: of an image that shows nothing that counts.

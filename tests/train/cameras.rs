@@ -157,7 +157,7 @@ fn a_shaken_rig_is_found_again() {
 }
 
 #[test]
-fn exposures_take_what_one_image_has_more_of() {
+fn an_exposure_explains_a_brighter_image() {
     let cpu = Cpu::new(0, Simd::Best).unwrap();
     let rigged = Rigged::new(&cpu);
     let brighter: Vec<f32> = rigged.images[1].iter().map(|value| 1.25 * value + 0.05).collect();

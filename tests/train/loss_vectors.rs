@@ -23,11 +23,11 @@ struct Case {
 /// What one of our losses gives: its value, and derivatives by inputs.
 type Ours = (f64, Vec<(&'static str, Vec<f64>)>);
 
-fn of_image(loss: Loss<f64>) -> Ours {
+fn by_image(loss: Loss<f64>) -> Ours {
     (loss.value, vec![("image", loss.by)])
 }
 
-fn of_depth(loss: DepthLoss<f64>) -> Ours {
+fn by_depth(loss: DepthLoss<f64>) -> Ours {
     (loss.value, vec![("opacity", loss.by_opacity), ("depth_sum", loss.by_depth_sum)])
 }
 
@@ -43,8 +43,8 @@ impl Case {
     fn ours(&self) -> Ours {
         let input = |name| self.input(name);
         match &*self.name {
-            "l1" => of_image(l1(input("image"), input("target"), Some(input("weights")))),
-            "l2" => of_image(l2(input("image"), input("target"), Some(input("weights")))),
+            "l1" => by_image(l1(input("image"), input("target"), Some(input("weights")))),
+            "l2" => by_image(l2(input("image"), input("target"), Some(input("weights")))),
             "masked dssim" => {
                 let [image, target] =
                     ["image", "target"].map(|name| masked(input(name), input("weights")));
@@ -52,15 +52,15 @@ impl Case {
                 (value, vec![("image", masked(&by, input("weights")))])
             }
             "disparity" => {
-                of_depth(disparity(input("opacity"), input("depth_sum"), input("measured")))
+                by_depth(disparity(input("opacity"), input("depth_sum"), input("measured")))
             }
             "metric depth" => {
-                of_depth(metric_depth(input("opacity"), input("depth_sum"), input("measured")))
+                by_depth(metric_depth(input("opacity"), input("depth_sum"), input("measured")))
             }
             "normals" => {
                 let [rays, given] = ["rays", "given"].map(|name| triples(input(name)));
                 let [opacity, depth_sum] = ["opacity", "depth_sum"].map(input);
-                of_depth(normals(SIZE_PX, &rays, opacity, depth_sum, &given))
+                by_depth(normals(SIZE_PX, &rays, opacity, depth_sum, &given))
             }
             "opacity" => {
                 let Loss { value, by } = opacity(input("values"));

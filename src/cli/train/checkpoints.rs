@@ -21,7 +21,7 @@ pub(super) const EVERY: usize = 500;
 
 /// The checkpoint of one run.
 pub(super) struct Checkpoints {
-    pub(super) path: PathBuf,
+    path: PathBuf,
     /// What names the images, cameras and points of the run.
     inputs: String,
 }
@@ -29,9 +29,7 @@ pub(super) struct Checkpoints {
 impl Checkpoints {
     /// The checkpoint of a run that writes `out`.
     pub(super) fn new(out: &Path, inputs: String) -> Self {
-        let mut name = out.as_os_str().to_owned();
-        name.push(".checkpoint");
-        Self { path: name.into(), inputs }
+        Self { path: path(out), inputs }
     }
 
     /// The run that goes on; `None` if it begins anew, which a checkpoint of an earlier run must
@@ -61,15 +59,23 @@ impl Checkpoints {
     pub(super) fn write(&self, trainer: &Trainer) -> anyhow::Result<()> {
         output::write(&self.path, &trainer.to_checkpoint(&self.inputs)?)
     }
+}
 
-    /// Removes the checkpoint of a run that has reached its end.
-    pub(super) fn remove(&self) -> anyhow::Result<()> {
-        match fs::remove_file(&self.path) {
-            Err(error) if error.kind() != io::ErrorKind::NotFound => {
-                Err(error).with_context(|| format!("cannot remove {}", self.path.display()))
-            }
-            _ => Ok(()),
+/// The file of a run that writes `out`.
+fn path(out: &Path) -> PathBuf {
+    let mut name = out.as_os_str().to_owned();
+    name.push(".checkpoint");
+    name.into()
+}
+
+/// Removes the checkpoint of a run that has reached its end.
+pub(super) fn remove(out: &Path) -> anyhow::Result<()> {
+    let path = path(out);
+    match fs::remove_file(&path) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => {
+            Err(error).with_context(|| format!("cannot remove {}", path.display()))
         }
+        _ => Ok(()),
     }
 }
 
@@ -89,24 +95,21 @@ impl StopsAtSignal {
         if LISTENS.set(()).is_ok() {
             let runtime = runtime::Builder::new_current_thread().enable_all().build()?;
             // Registered before the thread begins, so that no signal is lost.
-            let mut signal = {
+            let first = {
                 let _guard = runtime.enter();
                 wildcity_server::stop_signal()?
             };
-            thread::Builder::new().name("signals".to_owned()).spawn(move || {
-                loop {
-                    runtime.block_on(Box::pin(signal));
-                    let is_first = !STOPS.swap(true, Ordering::Relaxed);
-                    if !is_first || !TRAINS.load(Ordering::Relaxed) {
-                        process::exit(130);
-                    }
-                    let _guard = runtime.enter();
-                    match wildcity_server::stop_signal() {
-                        Ok(next) => signal = next,
-                        Err(_) => return,
-                    }
+            let listen = async move {
+                first.await;
+                STOPS.store(true, Ordering::Relaxed);
+                if TRAINS.load(Ordering::Relaxed) {
+                    let Ok(second) = wildcity_server::stop_signal() else { return };
+                    second.await;
                 }
-            })?;
+                process::exit(130);
+            };
+            let thread = thread::Builder::new().name("signals".to_owned());
+            thread.spawn(move || runtime.block_on(listen))?;
         }
         TRAINS.store(true, Ordering::Relaxed);
         Ok(Self)

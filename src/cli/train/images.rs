@@ -97,7 +97,7 @@ impl<'a> ListedImages<'a> {
         let depth_m = depth_m.transpose()?.map(|depth_m| shrink(&depth_m, own_px, small_px));
         let view = View::new(camera, listed.world_from_camera);
         let weight = image.weight.map_or(1.0, |weight| weight as f32);
-        let exposure = image.exposure_stops.map_or(1.0, |stops| stops.exp2() as f32);
+        let exposure = factor(image.exposure_stops);
         Ok(TrainingImage { view, rgb8, mask, depth_m, weight, exposure })
     }
 }
@@ -167,6 +167,11 @@ impl Shrunk {
         camera.native_size_px = None;
         Ok(Self { rgb8, mask, camera, own_px })
     }
+}
+
+/// The factor of colours of an exposure in stops.
+pub(super) fn factor(exposure_stops: Option<f64>) -> f32 {
+    exposure_stops.map_or(1.0, |stops| stops.exp2() as f32)
 }
 
 fn read_mask(file: &Path, size_px: [u32; 2]) -> anyhow::Result<Vec<bool>> {

@@ -4,7 +4,6 @@
 use std::path::PathBuf;
 
 use anyhow::{Context, ensure};
-use glam::DVec3;
 use wildcity_eval::{Boxes, GROWN_PX, hide};
 use wildcity_log::check::Projection;
 use wildcity_log::{ImageRow, Log, Poses, SweepRow, Tracks};
@@ -16,7 +15,7 @@ use wildcity_scene::{Manifest, Rig, Trajectory};
 use wildcity_train::poses::{Place, RigPoses};
 use wildcity_train::run::{TrainingImage, TrainingImages};
 
-use super::images::Shrunk;
+use super::images::{Shrunk, factor};
 use crate::cli::exit;
 
 /// Images within this time of the first are of one time of the rig, in microseconds.
@@ -186,17 +185,14 @@ impl LogImages {
         };
         let views = View::from_moving_rig(&[mounted], world_from_rig, &before);
         let view = *views.first().context("a view")?;
-        let mut counts = vec![true; shrunk.camera.pixels()];
         for moving in self.boxes.moving_at(row.time_us) {
             let hull_px = moving.hull_px(&shrunk.camera, &view.world_from_camera);
-            hide(&hull_px, size_px, GROWN_PX * self.size, &mut counts);
-        }
-        if counts.contains(&false) {
-            let mask = shrunk.mask.get_or_insert_with(|| vec![true; counts.len()]);
-            mask.iter_mut().zip(&counts).for_each(|(mask, counts)| *mask &= counts);
+            let all = || vec![true; shrunk.camera.pixels()];
+            let counts = shrunk.mask.get_or_insert_with(all);
+            hide(&hull_px, size_px, GROWN_PX * self.size, counts);
         }
         let depth_m = self.depths(row, place.camera, &view)?;
-        let exposure = row.exposure_stops.map_or(1.0, |stops| stops.exp2() as f32);
+        let exposure = factor(row.exposure_stops);
         let Shrunk { rgb8, mask, .. } = shrunk;
         Ok(TrainingImage { view, rgb8, mask, depth_m, weight: 1.0, exposure })
     }
@@ -221,17 +217,12 @@ impl LogImages {
                 && sweep.until_us >= row.time_us.saturating_sub(SWEEP_US)
         };
         for sweep in self.sweeps.iter().filter(is_near) {
-            let rig_from_lidar = self.log.rig_from_lidar(&sweep.lidar)?;
-            let points = self.log.points(sweep)?;
-            for (point_m, time_us) in points.points_m.iter().zip(&points.time_us) {
-                let time_us = sweep.compensated_to_us.unwrap_or(*time_us);
+            for (time_us, rig_m) in self.log.points_on_rig(sweep)? {
                 if time_us.abs_diff(row.time_us) > SWEEP_US.unsigned_abs() {
                     continue;
                 }
-                let point_m =
-                    rig_from_lidar.transform_point(DVec3::from_array(point_m.map(f64::from)));
                 let Some(world_from_rig) = self.poses.at(time_us) else { continue };
-                let world_m = world_from_rig.transform_point(point_m);
+                let world_m = world_from_rig.transform_point(rig_m);
                 let Some((at_px, _)) = projection.project(world_m) else { continue };
                 let camera_m = view.world_from_camera_at(at_px).inverse().transform_point(world_m);
                 if !near.hides(world_m, time_us) {

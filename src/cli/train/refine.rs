@@ -6,7 +6,6 @@ use std::path::PathBuf;
 use anyhow::{Context, ensure};
 use wildcity_eval::images::ImageList;
 use wildcity_log::Log;
-use wildcity_render::gradient::Differentiate;
 use wildcity_scene::align::Alignment;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::{Gaussians, Manifest};
@@ -19,6 +18,7 @@ use wildcity_twin::store::{Catalog, Version};
 use super::images::{ListedImages, WithAugmented};
 use super::log_images::LogImages;
 use super::progress::train;
+use super::recorded::RecordedImages;
 use super::scene::{fraction, read_settings};
 use crate::cli::backend_options::HardwareOptions;
 use crate::cli::directories::{EditedTwin, Twins};
@@ -28,39 +28,20 @@ use crate::cli::{file_notes, output, placement, progress};
 ///
 /// `wildcity augment` renders views off the drives, repairs them with a model and writes them with
 /// masks and weights. This command trains the Gaussians of the twin on them, beside the recorded
-/// images, and makes a new version of the twin. So the twin gets accurate farther off its drives,
-/// round by round (`wildcity train loop` does all rounds). Poses and sky stay as they are, and no
-/// Gaussians are added.
+/// images, and makes a new version of the twin, which is accurate farther off its drives.
+/// `wildcity train loop` does this round by round. Poses, sky and the number of Gaussians stay as
+/// they are.
 ///
-/// Of the steps, 0.3 are made on the views of --augmented, and the loss of each has the weight that
-/// its list says. Prints the PSNR of the recorded images that were held out, before and after.
+/// Three steps of ten are made on the views of --augmented. The loss of each view has the weight
+/// that its list says. Prints the PSNR of the recorded images that were held out, before and after.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(in crate::cli) struct Refine {
     #[command(flatten)]
     edited: EditedTwin,
 
-    /// The recorded images with their cameras: the log that the twin was made of, or in the form of
-    /// `wildcity eval --images`.
-    #[arg(long, value_name = "FILE_OR_DIR")]
-    images: PathBuf,
-
-    /// Folder of the recorded images, as for `wildcity eval`.
-    #[arg(long, value_name = "DIR")]
-    image_dir: Option<PathBuf>,
-
-    /// Folder of masks of the recorded images, as for `wildcity eval`.
-    #[arg(long, value_name = "DIR")]
-    masks: Option<PathBuf>,
-
-    /// Axes of the poses of --images, in the form of `wildcity import --axes` [default: as the twin
-    /// was imported and aligned; identity for a list]
-    #[arg(long, value_name = "AXES", allow_hyphen_values = true)]
-    axes: Option<String>,
-
-    /// Metres per unit of these poses; only with --axes, and applied after it [default: 1]
-    #[arg(long, value_name = "M", requires = "axes")]
-    scale: Option<f64>,
+    #[command(flatten)]
+    recorded: RecordedImages,
 
     /// Views off the drives: a folder DIR/round_N of `wildcity augment`. May be given again.
     #[arg(long, value_name = "DIR")]
@@ -110,14 +91,14 @@ impl Refine {
             // `augment` writes poses in the twin's axes.
             augmented.add(round, &Alignment::IDENTITY)?;
         }
-        if Log::is_log(&self.images) {
-            let is_whole = self.image_dir.is_none() && self.masks.is_none() && self.axes.is_none();
+        let RecordedImages { images, image_dir, masks, axes, .. } = &self.recorded;
+        if Log::is_log(images) {
             ensure!(
-                is_whole,
+                image_dir.is_none() && masks.is_none() && axes.is_none(),
                 "{} is a log, which names files and axes: leave --image-dir, --masks and --axes out",
-                self.images.display()
+                images.display()
             );
-            let log = Log::open(&self.images)?;
+            let log = Log::open(images)?;
             let mut recorded = LogImages::new(log, self.size, self.held_out_every)?;
             if !recorded.take_refined(&base.manifest) {
                 writeln!(
@@ -129,8 +110,8 @@ impl Refine {
             let images = WithAugmented { recorded: &recorded, augmented: &augmented };
             return self.refine(&catalog, &base, &images, poses, settings);
         }
-        let list = ImageList::read(&self.images, self.image_dir.as_deref(), self.masks.as_deref())?;
-        file_notes::print_warnings(&self.images, &list.warnings)?;
+        let list = ImageList::read(images, image_dir.as_deref(), masks.as_deref())?;
+        file_notes::print_warnings(images, &list.warnings)?;
         let mut recorded = ListedImages::new(self.size, self.held_out_every);
         recorded.add(&list, &self.alignment(&base, &list)?)?;
         let poses = [recorded.poses(), augmented.poses()].concat();
@@ -147,11 +128,7 @@ impl Refine {
         world_from_camera: Vec<Pose>,
         settings: Settings,
     ) -> anyhow::Result<()> {
-        let backends = self.hardware.differentiating()?;
-        let backend: &dyn Differentiate = match backends.last() {
-            Some(backend) => backend.as_ref(),
-            None => anyhow::bail!("no backend computes gradients"),
-        };
+        let backend = &*self.hardware.training()?;
 
         let Manifest { sh_degree, profile, .. } = base.manifest;
         let mut gaussians = Gaussians { sh_degree, ..Gaussians::default() };
@@ -164,7 +141,7 @@ impl Refine {
             base.number,
             output::counted(gaussians.len(), "Gaussian"),
             output::counted(images.count(), "image"),
-            (0..images.count()).filter(|&index| images.is_held_out(index)).count(),
+            images.held_out().len(),
             backend.name()
         )?;
         let resident = Cache::new(self.twins.catalog()?).open(name, Some(base.number))?;
@@ -229,8 +206,9 @@ impl Refine {
 
     /// The transform from the axes of the recorded poses to those of the twin.
     fn alignment(&self, base: &Version, list: &ImageList) -> anyhow::Result<Alignment> {
-        match &self.axes {
-            Some(axes) => placement::imported(axes, self.scale.unwrap_or(1.0)),
+        let RecordedImages { axes, scale, .. } = &self.recorded;
+        match axes {
+            Some(axes) => placement::imported(axes, scale.unwrap_or(1.0)),
             None if list.is_in_scene_axes => Ok(Alignment::IDENTITY),
             None => placement::from_version(&self.twins.catalog()?, base),
         }

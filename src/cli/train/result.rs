@@ -10,9 +10,10 @@ use wildcity_train::sky_file;
 use wildcity_train::trainer::Trainer;
 use wildcity_twin::ingest::write_ply;
 
-use crate::cli::output;
+use crate::cli::{Options, output};
 
 /// Where a run's result is.
+#[derive(Clone)]
 pub(super) struct Written {
     pub(super) ply: PathBuf,
     /// The sky, if one was trained.
@@ -61,25 +62,34 @@ impl Written {
         Ok(written)
     }
 
-    /// Says what was written, and what to do with it.
-    pub(super) fn print(&self, source: &Path, gaussians: usize, help: bool) -> io::Result<()> {
-        let Self { ply, sky, .. } = self;
-        let mut stdout = io::stdout().lock();
+    /// Says what was written.
+    pub(super) fn print(&self, source: &Path, gaussians: usize) -> io::Result<()> {
         writeln!(
-            stdout,
+            io::stdout().lock(),
             "{}: {gaussians} Gaussians, in the axes and the unit of {}",
-            ply.display(),
+            self.ply.display(),
             source.display()
-        )?;
-        if !help {
-            return Ok(());
+        )
+    }
+
+    /// Says how to make a twin of it.
+    pub(super) fn print_import(&self, options: &Options) -> io::Result<()> {
+        let mut command = format!("wildcity import {:?} --twin NAME", self.ply);
+        let mut has_axes = false;
+        for (name, value) in options {
+            if let Some(value) = value {
+                command += &format!(" {name} {value:?}");
+                has_axes |= *name == "--axes";
+            }
         }
-        let sky = sky.as_ref().map_or(String::new(), |sky| format!(" --sky {sky:?}"));
+        let mut stdout = io::stdout().lock();
+        if has_axes {
+            return writeln!(stdout, "make a twin of it:\n{command}");
+        }
         writeln!(
             stdout,
-            "make a twin of it:\n\
-             wildcity import {ply:?} --twin NAME --axes AXES{sky}\n\
-             AXES is identity if z is up, and y-down-z-forward for most models of COLMAP",
+            "make a twin of it:\n{command} --axes AXES\n\
+             AXES is identity if z is up, and y-down-z-forward for most models of COLMAP"
         )
     }
 }

@@ -6,8 +6,9 @@ use std::path::PathBuf;
 
 use anyhow::{Context, ensure};
 
+use super::recorded::RecordedImages;
 use super::scene::fraction;
-use crate::cli;
+use crate::cli::{self, Options};
 
 /// Make a twin accurate off its drives, round by round: render views, repair them, train on them.
 ///
@@ -24,25 +25,12 @@ pub(in crate::cli) struct Loop {
     #[arg(value_name = "TWIN")]
     twin: String,
 
-    /// The recorded images with their cameras, as for `wildcity train refine`.
-    #[arg(long, value_name = "FILE_OR_DIR")]
-    images: PathBuf,
-
-    /// Folder of the recorded images, as for `wildcity eval`.
-    #[arg(long, value_name = "DIR")]
-    image_dir: Option<PathBuf>,
-
-    /// Folder of masks of the recorded images, as for `wildcity eval`.
-    #[arg(long, value_name = "DIR")]
-    masks: Option<PathBuf>,
+    #[command(flatten)]
+    recorded: RecordedImages,
 
     /// TOML file of all settings, as for `wildcity train refine`.
     #[arg(long, value_name = "FILE")]
     settings: Option<PathBuf>,
-
-    /// Axes of the poses of --images, as for `wildcity train refine`.
-    #[arg(long, value_name = "AXES", allow_hyphen_values = true)]
-    axes: Option<String>,
 
     /// Manifest of the model that repairs the images (docs/repair.md) [default: none, images are as
     /// rendered]
@@ -99,57 +87,40 @@ impl Loop {
         for round in from..=rounds {
             writeln!(io::stderr(), "round {round} of {rounds}")?;
             let again = || format!("round {round}: --from {round} goes on");
-            cli::run_arguments(self.augment(round)).with_context(again)?;
-            cli::run_arguments(self.refine(round)).with_context(again)?;
+            let twin = self.twin.as_ref();
+            cli::run_command(&["augment".as_ref(), twin], self.augment(round))
+                .with_context(again)?;
+            cli::run_command(&["train".as_ref(), "refine".as_ref(), twin], self.refine(round))
+                .with_context(again)?;
         }
         Ok(())
     }
 
-    fn augment(&self, round: u32) -> Vec<OsString> {
-        let mut arguments = self.common(&["augment", &self.twin]);
-        let mut add = |name: &str, value: OsString| arguments.extend([name.into(), value]);
-        add("--round", round.to_string().into());
-        add("--offsets", self.offsets.clone().into());
-        add("--every", self.every.clone().into());
-        add("--out", self.out.clone().into());
-        if let Some(repair) = &self.repair {
-            add("--repair", repair.into());
-        }
-        if let Some(side) = self.side {
-            add("--side", side.to_string().into());
-        }
-        arguments
+    fn augment(&self, round: u32) -> Options {
+        vec![
+            ("--twins", self.twins.clone()),
+            ("--round", text(round)),
+            ("--offsets", text(&self.offsets)),
+            ("--every", text(&self.every)),
+            ("--out", Some(self.out.clone().into())),
+            ("--repair", self.repair.clone().map(OsString::from)),
+            ("--side", self.side.and_then(text)),
+        ]
     }
 
-    fn refine(&self, round: u32) -> Vec<OsString> {
-        let mut arguments = self.common(&["train", "refine", &self.twin]);
-        let mut add = |name: &str, value: OsString| arguments.extend([name.into(), value]);
-        add("--images", self.images.clone().into());
-        add("--augmented", self.out.join(format!("round_{round}")).into());
-        add("--steps", self.steps.to_string().into());
-        add("--size", self.size.to_string().into());
-        if let Some(axes) = &self.axes {
-            add("--axes", axes.into());
-        }
-        let files = [
-            ("--image-dir", &self.image_dir),
-            ("--masks", &self.masks),
-            ("--settings", &self.settings),
-        ];
-        for (name, file) in files {
-            if let Some(file) = file {
-                add(name, file.into());
-            }
-        }
-        arguments
+    fn refine(&self, round: u32) -> Options {
+        let mut options = self.recorded.options();
+        options.extend([
+            ("--twins", self.twins.clone()),
+            ("--augmented", Some(self.out.join(format!("round_{round}")).into())),
+            ("--steps", text(self.steps)),
+            ("--size", text(self.size)),
+            ("--settings", self.settings.clone().map(OsString::from)),
+        ]);
+        options
     }
+}
 
-    fn common(&self, command: &[&str]) -> Vec<OsString> {
-        let mut arguments: Vec<OsString> = vec!["wildcity".into()];
-        arguments.extend(command.iter().map(OsString::from));
-        if let Some(twins) = &self.twins {
-            arguments.extend(["--twins".into(), twins.clone()]);
-        }
-        arguments
-    }
+fn text(value: impl ToString) -> Option<OsString> {
+    Some(value.to_string().into())
 }

@@ -10,7 +10,6 @@ use anyhow::{Context, ensure};
 use glam::DVec3;
 use wildcity_eval::images::ImageList;
 use wildcity_log::{ColoredPoint, Log};
-use wildcity_render::gradient::Differentiate;
 use wildcity_scene::align::Alignment;
 use wildcity_scene::random::Random;
 use wildcity_scene::{Gaussians, RenderProfile, Rig, Trajectory};
@@ -67,7 +66,8 @@ pub(super) struct TrainScene {
     #[arg(long, value_name = "DIR")]
     masks: Option<PathBuf>,
 
-    /// Points to begin with: a PLY file, or a COLMAP model [default: those of SOURCE]
+    /// Points to begin with: a PLY file, or a COLMAP model [default: those of SOURCE; of a log,
+    /// those of its LiDAR]
     #[arg(long, value_name = "POINTS")]
     points: Option<PathBuf>,
 
@@ -92,12 +92,13 @@ pub(super) struct TrainScene {
     size: f64,
 
     /// Hold out one image of N, in the order of their names: the scene is not trained on it but
-    /// judged by it. 0 holds out none.
+    /// judged by it. 0 holds out none. Of a log that marks images as held out, it holds out these.
     #[arg(long, value_name = "N", default_value_t = 8)]
     held_out_every: usize,
 
-    /// What lies behind all Gaussians: a sky network that is trained, or nothing. It is written
-    /// beside OUT [default: that of --settings, or off]
+    /// What lies behind all Gaussians: a sky network that is trained, or nothing. The sky is
+    /// written beside the file of --out [default: that of --settings; else network for a log, and
+    /// off for photographs]
     #[arg(long, value_name = "network|off", value_parser = sky_mode)]
     sky: Option<SkyMode>,
 
@@ -106,8 +107,8 @@ pub(super) struct TrainScene {
     #[arg(long)]
     seed: Option<u64>,
 
-    /// Go on with a run that was stopped, from its last checkpoint (beside OUT, each 500 steps and
-    /// when it was stopped), to the bytes that it would have had.
+    /// Go on with a run that was stopped. Its state is kept beside the file of --out each 500 steps
+    /// and when it is stopped, and the result has the bytes of a run that was not.
     #[arg(long)]
     resume: bool,
 
@@ -196,16 +197,12 @@ impl TrainScene {
     /// Takes the run to its end.
     fn train(&self, out: &Path, inputs: Inputs<'_>) -> anyhow::Result<Trainer> {
         let Inputs { images, inputs, start, profile, settings } = inputs;
-        let backends = self.hardware.differentiating()?;
-        let backend: &dyn Differentiate = match backends.last() {
-            Some(backend) => backend.as_ref(),
-            None => anyhow::bail!("no backend computes gradients"),
-        };
+        let backend = &*self.hardware.training()?;
         writeln!(
             io::stderr(),
             "{}, {} of them held out, {}, backend {}",
             output::counted(images.count(), "image"),
-            (0..images.count()).filter(|&index| images.is_held_out(index)).count(),
+            images.held_out().len(),
             output::counted(start.gaussians.len(), "Gaussian"),
             backend.name()
         )?;
@@ -248,22 +245,24 @@ impl TrainScene {
         refined: Option<&(Trajectory, Rig)>,
     ) -> anyhow::Result<()> {
         let written = Written::new(trainer, out, refined)?;
-        Checkpoints::new(out, String::new()).remove()?;
-        written.print(source, trainer.model().len(), self.twin.is_none())?;
+        checkpoints::remove(out)?;
+        let options = self.import_options(source, &written);
+        written.print(source, trainer.model().len())?;
         match &self.twin {
-            Some(twin) => cli::run_arguments(self.import(twin, source, written)),
-            None => Ok(()),
+            Some(twin) => cli::run_command(
+                &["import".as_ref(), out.as_os_str(), "--twin".as_ref(), twin.as_ref()],
+                options,
+            ),
+            None => Ok(written.print_import(&options)?),
         }
     }
 
-    /// The command that makes a twin of the result.
-    fn import(&self, twin: &str, source: &Path, written: Written) -> Vec<OsString> {
-        let mut arguments: Vec<OsString> = ["wildcity", "import"].map(OsString::from).to_vec();
-        let Written { ply, sky, drive, rig } = written;
-        arguments.extend([ply.into(), "--twin".into(), twin.into()]);
+    /// The options of the import that makes a twin of the result.
+    fn import_options(&self, source: &Path, written: &Written) -> cli::Options {
+        let Written { sky, drive, rig, .. } = written.clone();
         let log: Option<OsString> = Log::is_log(source).then(|| source.into());
         let axes = self.axes.clone().map(OsString::from);
-        let given = [
+        vec![
             // The world of a log has z up.
             ("--axes", axes.or_else(|| log.is_some().then(|| "identity".into()))),
             ("--twins", self.twins.clone()),
@@ -271,11 +270,7 @@ impl TrainScene {
             ("--trajectory", drive.map(OsString::from)),
             ("--rig", rig.map(OsString::from)),
             ("--log", log),
-        ];
-        for (name, value) in given {
-            arguments.extend(value.into_iter().flat_map(|value| [name.into(), value]));
-        }
-        arguments
+        ]
     }
 
     fn settings(&self) -> anyhow::Result<Settings> {

@@ -3,7 +3,6 @@
 use std::path::Path;
 
 use anyhow::{Context, ensure};
-use glam::DVec3;
 
 use crate::{
     Boxes, BoxesSubject, DepthMap, GROWN_PX, LidarDepth, LidarPoints, LidarSubject, MovingBox,
@@ -151,15 +150,7 @@ fn read_log(path: &Path, images: &[&RealImage], window_us: i64) -> anyhow::Resul
     for row in log.sweeps()?.context("the log has no lidar.jsonl")? {
         let row = row?;
         if is_near(row.time_us, row.until_us) {
-            let rig_from_lidar = log.rig_from_lidar(&row.lidar)?;
-            let sweep = log.points(&row)?;
-            let timed = sweep.time_us.iter().zip(&sweep.points_m);
-            points.extend(timed.map(|(time_us, point_m)| {
-                let point_m = DVec3::from_array(point_m.map(f64::from));
-                // Points that the source has moved are where they were at that time.
-                let time_us = row.compensated_to_us.unwrap_or(*time_us);
-                (time_us, rig_from_lidar.transform_point(point_m))
-            }));
+            points.extend(log.points_on_rig(&row)?);
         }
     }
     Ok(LidarPoints::from_rig(points, log.poses()?.keyframes().to_vec()))

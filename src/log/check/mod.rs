@@ -81,7 +81,7 @@ pub struct Report {
 /// Tells how far a check is: done, and all of it.
 pub type OnProgress<'a> = &'a mut dyn FnMut(u64, u64);
 
-/// Measures a log.
+/// Measures a log, of which only poses and a few images are in memory.
 ///
 /// # Errors
 /// A table, an image or a sweep cannot be used: names the file, and the line and field of a row.

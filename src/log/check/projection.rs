@@ -2,7 +2,6 @@
 
 use glam::{DVec2, DVec3};
 
-use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::RigCamera;
 
 use crate::log::Log;
@@ -78,18 +77,15 @@ pub(super) fn rig_points(
     row: &SweepRow,
 ) -> Result<Vec<RigPoint>, crate::error::LogError> {
     let sweep = log.points(row)?;
-    let rig_from_lidar: Pose = log.rig_from_lidar(&row.lidar)?;
     let ranges: Vec<f32> =
         sweep.points_m.iter().map(|[x, y, z]| (x * x + y * y + z * z).sqrt()).collect();
     let is_edge = super::edges::lidar_edges(&ranges, sweep.ring.as_deref());
-    let compared = (0..sweep.len()).filter(|at| (NEAR_M..=REACH_M).contains(&ranges[*at]));
-    let point = |at: usize| {
-        let [x, y, z] = sweep.points_m[at].map(f64::from);
-        RigPoint {
-            rig_m: rig_from_lidar.transform_point(DVec3::new(x, y, z)),
-            time_us: row.compensated_to_us.unwrap_or(sweep.time_us[at]),
-            is_edge: is_edge[at],
+    let placed = sweep.on_rig(row, log.rig_from_lidar(&row.lidar)?);
+    let mut points = Vec::new();
+    for (at, (time_us, rig_m)) in placed.enumerate() {
+        if (NEAR_M..=REACH_M).contains(&ranges[at]) {
+            points.push(RigPoint { rig_m, time_us, is_edge: is_edge[at] });
         }
-    };
-    Ok(compared.map(point).collect())
+    }
+    Ok(points)
 }

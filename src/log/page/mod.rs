@@ -18,7 +18,7 @@ td:first-child,th:first-child{text-align:left}
 figure{margin:0}figure img{width:100%;height:auto}figcaption{font-size:13px}
 .error{color:#b00020;font-weight:600}.warning{color:#8a5300}svg{max-width:100%;height:auto}";
 
-/// The whole page.
+/// The page of a report, without any other file.
 ///
 /// # Errors
 /// A plot or a picture cannot be made.

@@ -14,7 +14,7 @@ mod layers;
 
 use std::collections::HashMap;
 
-use glam::{DVec2, DVec3};
+use glam::DVec2;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -72,10 +72,14 @@ impl TrainedSky {
         }
     }
 
+    pub(crate) fn images(&self) -> usize {
+        self.appearances.len()
+    }
+
     /// The sky behind an image, where its Gaussians leave something to be seen.
     pub(crate) fn image(&self, view: &View, image: usize, opacity: &[f32]) -> SkyImage {
         let (appearance, _) = &self.appearances[image];
-        let (directions, pixels) = shown(view, opacity, STRIDE_PX);
+        let (directions, pixels) = shown(view, opacity);
         let inputs = self.layers.inputs(&directions, appearance);
         let colors = self.layers.colors(&inputs);
         SkyImage { rgb: interpolated(&colors, &pixels, opacity.len()), inputs, pixels }
@@ -138,21 +142,33 @@ impl TrainedSky {
 /// A sky that is not trained, behind an image: black where it does not show. Images of a sky may
 /// have edges, so that every pixel is evaluated.
 pub(crate) fn fixed_image(sky: &Sky, view: &View, opacity: &[f32]) -> Vec<f32> {
-    let (directions, pixels) = shown(view, opacity, 1);
-    let color = |direction: &[f32; 3]| {
-        sky.rgb(DVec3::from_array(direction.map(f64::from))).as_vec3().to_array()
+    let width = view.camera.width_px as usize;
+    let color = |(pixel, opacity): (usize, &f32)| {
+        if !shows(*opacity) {
+            return [0.0; 3];
+        }
+        let direction = view.ray_world(center_px([pixel % width, pixel / width]));
+        direction.map_or([0.0; 3], |direction| sky.rgb(direction).as_vec3().to_array())
     };
-    let colors: Vec<[f32; 3]> = directions.par_iter().map(color).collect();
-    interpolated(colors.as_flattened(), &pixels, opacity.len())
+    let colors: Vec<[f32; 3]> = opacity.par_iter().enumerate().map(color).collect();
+    colors.concat()
 }
 
-/// The pixels that show sky, and the directions of the nodes that they lie between, which are
-/// `stride_px` apart.
-fn shown(view: &View, opacity: &[f32], stride_px: usize) -> (Vec<[f32; 3]>, Vec<ShownPixel>) {
-    let mut nodes = Nodes::new(view, stride_px);
-    let shows = |pixel: &usize| f64::from(1.0 - opacity[*pixel]) >= SKY_CUT;
+/// Whether something of the sky shows behind an opacity.
+fn shows(opacity: f32) -> bool {
+    f64::from(1.0 - opacity) >= SKY_CUT
+}
+
+fn center_px([column, row]: [usize; 2]) -> DVec2 {
+    DVec2::new(column as f64, row as f64) + 0.5
+}
+
+/// The pixels that show sky, and the directions of the nodes that they lie between.
+fn shown(view: &View, opacity: &[f32]) -> (Vec<[f32; 3]>, Vec<ShownPixel>) {
+    let mut nodes = Nodes::new(view);
     let mut pixels = Vec::new();
-    pixels.extend((0..opacity.len()).filter(shows).filter_map(|pixel| nodes.around(pixel)));
+    let open = (0..opacity.len()).filter(|&pixel| shows(opacity[pixel]));
+    pixels.extend(open.filter_map(|pixel| nodes.around(pixel)));
     (nodes.directions, pixels)
 }
 
@@ -172,7 +188,6 @@ fn interpolated(colors: &[f32], shown: &[ShownPixel], pixels: usize) -> Vec<f32>
 /// The directions of one view at which a network is evaluated.
 struct Nodes<'a> {
     view: &'a View,
-    stride_px: usize,
     width: usize,
     height: usize,
     /// The node of each place of the grid that has been asked for; `None` out of the lens' field.
@@ -181,25 +196,21 @@ struct Nodes<'a> {
 }
 
 impl<'a> Nodes<'a> {
-    fn new(view: &'a View, stride_px: usize) -> Self {
+    fn new(view: &'a View) -> Self {
         let [width, height] = [view.camera.width_px, view.camera.height_px].map(|px| px as usize);
-        Self { view, stride_px, width, height, grid: HashMap::new(), directions: Vec::new() }
+        Self { view, width, height, grid: HashMap::new(), directions: Vec::new() }
     }
 
-    /// The nodes around a pixel; at the edge of a lens' field, and at a stride of 1, the pixel
-    /// itself. `None` for a pixel outside of it.
+    /// The nodes around a pixel; at the edge of a lens' field, the pixel itself. `None` for a pixel
+    /// outside of it.
     fn around(&mut self, pixel: usize) -> Option<ShownPixel> {
         let at = [pixel % self.width, pixel / self.width];
-        let stride_px = self.stride_px;
-        let cell = at.map(|at| at / stride_px * stride_px);
+        let cell = at.map(|at| at / STRIDE_PX * STRIDE_PX);
         let last = [self.width - 1, self.height - 1];
-        let next = [0, 1].map(|axis| (cell[axis] + stride_px).min(last[axis]));
+        let next = [0, 1].map(|axis| (cell[axis] + STRIDE_PX).min(last[axis]));
         let corners =
             [[cell[0], cell[1]], [next[0], cell[1]], [cell[0], next[1]], [next[0], next[1]]];
-        let mut nodes = [None; 4];
-        if stride_px > 1 {
-            nodes = corners.map(|corner| self.node(corner));
-        }
+        let nodes = corners.map(|corner| self.node(corner));
         let [Some(a), Some(b), Some(c), Some(d)] = nodes else {
             let node = self.node(at)?;
             return Some(ShownPixel { pixel, nodes: [node; 4], weights: [1.0, 0.0, 0.0, 0.0] });
@@ -217,8 +228,7 @@ impl<'a> Nodes<'a> {
     fn node(&mut self, at: [usize; 2]) -> Option<usize> {
         let Self { view, grid, directions, .. } = self;
         *grid.entry(at).or_insert_with(|| {
-            let center_px = DVec2::new(at[0] as f64, at[1] as f64) + 0.5;
-            let direction = view.ray_world(center_px)?;
+            let direction = view.ray_world(center_px(at))?;
             directions.push(direction.as_vec3().to_array());
             Some(directions.len() - 1)
         })
