@@ -12,6 +12,7 @@ mod result;
 mod rounds;
 mod scene;
 mod settings;
+mod start;
 
 use super::subcommands::subcommands;
 

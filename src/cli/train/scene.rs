@@ -7,18 +7,13 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
 
-use glam::DVec3;
 use wildcity_eval::images::ImageList;
-use wildcity_log::{ColoredPoint, Log};
+use wildcity_log::Log;
 use wildcity_scene::align::Alignment;
-use wildcity_scene::random::Random;
-use wildcity_scene::{Gaussians, RenderProfile, Rig, Trajectory};
-use wildcity_train::ground::is_ground;
+use wildcity_scene::{RenderProfile, Rig, Trajectory};
 use wildcity_train::run::TrainingImages;
 use wildcity_train::settings::{PoseMode, Settings, SkyMode};
-use wildcity_train::start::{Point, gaussians_from_points};
 use wildcity_train::trainer::{Start, Trainer};
-use wildcity_twin::ingest::{self, ReadLimits, ReadScene, capture};
 
 use super::checkpoints::{self, Checkpoints};
 use super::images::ListedImages;
@@ -26,9 +21,10 @@ use super::lines::LinesFile;
 use super::log_images::LogImages;
 use super::progress::train;
 use super::result::Written;
+use super::start::{self, StartOptions};
 use crate::cli;
 use crate::cli::backend_options::HardwareOptions;
-use crate::cli::{file_notes, output, progress};
+use crate::cli::output;
 
 /// What `wildcity train SOURCE` takes.
 #[derive(Debug, clap::Args)]
@@ -66,15 +62,8 @@ pub(super) struct TrainScene {
     #[arg(long, value_name = "DIR")]
     masks: Option<PathBuf>,
 
-    /// Points to begin with: a PLY file, or a COLMAP model [default: those of SOURCE; of a log,
-    /// those of its LiDAR]
-    #[arg(long, value_name = "POINTS")]
-    points: Option<PathBuf>,
-
-    /// Gaussians to begin with instead: a scene that was trained here or by another program, in any
-    /// format that `wildcity import` reads, in the axes and the unit of SOURCE.
-    #[arg(long, value_name = "SCENE", conflicts_with = "points")]
-    start: Option<PathBuf>,
+    #[command(flatten)]
+    start: StartOptions,
 
     /// Steps, each on one image. Learning rates and growth are scaled to this number.
     /// [default: that of --settings, or 7000]
@@ -155,7 +144,7 @@ impl TrainScene {
         for warning in &list.warnings {
             writeln!(io::stderr(), "warning: {warning}")?;
         }
-        let (mut start, profile) = self.start(source, &settings)?;
+        let (mut start, profile) = self.start.read(source, &settings)?;
         let mut images = ListedImages::new(self.size, self.held_out_every);
         images.add(&list, &Alignment::IDENTITY)?;
         start.world_from_camera = images.poses();
@@ -177,15 +166,7 @@ impl TrainScene {
             let left_out = output::counted(images.left_out, "image");
             writeln!(io::stderr(), "{left_out} left out: there is no pose at the time")?;
         }
-        let (mut start, profile) = match (&self.start, &self.points) {
-            (None, None) => (logged_start(&images, &settings)?, RenderProfile::default()),
-            _ => self.start(source, &settings)?,
-        };
-        start.world_from_camera = images.world_from_camera();
-        start.rig = Some(images.rig.clone());
-        let means_m: Vec<DVec3> =
-            start.gaussians.means_m.iter().map(|m| DVec3::from_array(*m)).collect();
-        start.is_ground = is_ground(&means_m, &images.rig.world_from_ego);
+        let (start, profile) = self.start.read_for_log(source, &images, &settings)?;
         let inputs = images.inputs();
         let trainer =
             self.train(out, Inputs { images: &images, inputs, start, profile, settings })?;
@@ -206,7 +187,7 @@ impl TrainScene {
             output::counted(start.gaussians.len(), "Gaussian"),
             backend.name()
         )?;
-        let gaussians = inputs_of_gaussians(&start.gaussians);
+        let gaussians = start::inputs(&start.gaussians);
         let inputs = format!("{} {profile:?}\n{inputs}{gaussians}", backend.name());
         let checkpoints = Checkpoints::new(out, inputs);
         let mut trainer = match checkpoints.read(self.resume, profile, &settings)? {
@@ -285,58 +266,6 @@ impl TrainScene {
         settings.check()?;
         Ok(settings)
     }
-
-    /// The Gaussians that the run begins with, and its image formation.
-    fn start(&self, source: &Path, settings: &Settings) -> anyhow::Result<(Start, RenderProfile)> {
-        let profile = RenderProfile::default();
-        let cap = settings.growth.cap;
-        if let Some(start) = &self.start {
-            let cannot = || format!("--start {}", start.display());
-            let bar = progress::bytes("reading");
-            let limits = ReadLimits::for_own_file();
-            let read = ingest::read_limited(start, &limits, &mut progress::show(&bar));
-            let ReadScene { gaussians, notes, .. } = read.with_context(cannot)?;
-            bar.finish_and_clear();
-            file_notes::print(start, &notes)?;
-            let count = gaussians.len();
-            ensure!(
-                count <= cap,
-                "{} has {count} Gaussians, more than --cap {cap}",
-                start.display()
-            );
-            let start = Start { gaussians, ..Start::default() };
-            return Ok((start, notes.profile().apply(profile)?));
-        }
-        let mut points = self.points(source)?;
-        let all = points.len();
-        if all > cap {
-            choose(&mut points, cap, settings.seed);
-            writeln!(io::stderr(), "{cap} of {all} points are chosen: --cap")?;
-        }
-        let gaussians = gaussians_from_points(&points);
-        Ok((Start { gaussians, ..Start::default() }, profile))
-    }
-
-    fn points(&self, source: &Path) -> anyhow::Result<Vec<Point>> {
-        let source = match &self.points {
-            Some(points) => points.clone(),
-            None => listed_points(source)?,
-        };
-        ensure!(source.exists(), "there are no points at {}", source.display());
-        let read = capture::read_points(&source)?;
-        let read = read.filter(|points| !points.is_empty()).with_context(|| {
-            format!(
-                "{} has no points to begin with: give --points, a PLY file or a COLMAP model with \
-                 points3D.bin or points3D.txt",
-                source.display()
-            )
-        })?;
-        let point = |point: capture::CapturePoint| Point {
-            at_m: DVec3::from_array(point.at),
-            rgb: point.rgb8.map(|value| f64::from(value) / 255.0),
-        };
-        Ok(read.into_iter().map(point).collect())
-    }
 }
 
 /// What a run needs.
@@ -349,51 +278,11 @@ struct Inputs<'a> {
     settings: Settings,
 }
 
-/// Images of each camera of a log whose points of the LiDAR a run begins with.
-const STARTING_IMAGES: usize = 100;
-
-/// Most points of a LiDAR that a run begins with: more are added where images need them.
-const MOST_LIDAR_POINTS: usize = 500_000;
-
-/// Points of the LiDAR of a log in the colours of its images.
-fn logged_start(images: &LogImages, settings: &Settings) -> anyhow::Result<Start> {
-    let most = settings.growth.cap.min(MOST_LIDAR_POINTS);
-    let points = wildcity_log::colored_points(images.log(), images.poses(), STARTING_IMAGES, most)?;
-    ensure!(
-        !points.is_empty(),
-        "the log has no points of a LiDAR that its images show: give --points, a PLY file"
-    );
-    let point = |point: &ColoredPoint| Point {
-        at_m: point.at_m,
-        rgb: point.rgb8.map(|value| f64::from(value) / 255.0),
-    };
-    let points: Vec<Point> = points.iter().map(point).collect();
-    Ok(Start { gaussians: gaussians_from_points(&points), ..Start::default() })
-}
-
 /// Reads the file of `--settings`.
 pub(super) fn read_settings(path: &Path) -> anyhow::Result<Settings> {
     let cannot = || format!("--settings {}", path.display());
     let text = fs::read_to_string(path).with_context(cannot)?;
     toml::from_str(&text).with_context(cannot)
-}
-
-/// A text by which a checkpoint knows its Gaussians.
-fn inputs_of_gaussians(gaussians: &Gaussians) -> String {
-    let Gaussians { sh_degree, means_m, ln_scales, logit_opacities, sh, .. } = gaussians;
-    let means_m = means_m.iter().map(|mean_m| DVec3::from_array(*mean_m)).sum::<DVec3>();
-    let sum = |values: &[f32]| values.iter().map(|&value| f64::from(value)).sum::<f64>();
-    let sums = [ln_scales.as_flattened(), logit_opacities, sh].map(sum);
-    format!("{} Gaussians of degree {sh_degree}, {means_m:?} {sums:?}\n", gaussians.len())
-}
-
-/// Keeps as many points as `count`, at random.
-fn choose(points: &mut Vec<Point>, count: usize, seed: u64) {
-    let mut random = Random::new(seed, "points", 0);
-    for k in (1..points.len()).rev() {
-        points.swap(k, random.below(k + 1));
-    }
-    points.truncate(count);
 }
 
 /// Checks, before a long run, that its file can be written.
@@ -408,25 +297,4 @@ fn check_out(out: &Path) -> anyhow::Result<()> {
     let is_there = folder.is_none_or(Path::is_dir);
     ensure!(is_there, "--out {out_name}: there is no such folder: create it");
     Ok(())
-}
-
-/// Where the points of a list are: in the PLY file that a transforms.json names, or in its folder,
-/// which may be or have a COLMAP model.
-fn listed_points(source: &Path) -> anyhow::Result<PathBuf> {
-    let mut folder = source;
-    let mut list = source.join("transforms.json");
-    if source.extension().is_some_and(|extension| extension == "json") {
-        folder = source.parent().unwrap_or(source);
-        list = source.to_owned();
-    }
-    if list.is_file() {
-        let cannot = || format!("cannot read {}", list.display());
-        let text = fs::read(&list).with_context(cannot)?;
-        let json: serde_json::Value = serde_json::from_slice(&text).with_context(cannot)?;
-        if let Some(name) = json.get("ply_file_path").and_then(serde_json::Value::as_str) {
-            return Ok(folder.join(name));
-        }
-    }
-    // The folder of a bare name is the current one.
-    Ok(if folder.as_os_str().is_empty() { PathBuf::from(".") } else { folder.to_owned() })
 }
