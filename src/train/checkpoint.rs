@@ -12,6 +12,7 @@ use wildcity_render::gradient::Gradients;
 use wildcity_scene::{RenderProfile, Sky};
 
 use crate::exposures::TrainedExposures;
+use crate::history::History;
 use crate::model::{Model, ModelState};
 use crate::poses::{RigPoses, TrainedPoses};
 use crate::settings::Settings;
@@ -19,7 +20,7 @@ use crate::sky::TrainedSky;
 use crate::trainer::Trainer;
 
 /// The first line of a file.
-const FORMAT: &[u8] = b"wildcity.checkpoint/1\n";
+const FORMAT: &[u8] = b"wildcity.checkpoint/2\n";
 
 /// Bytes of the hash at the end.
 const HASH: usize = blake3::OUT_LEN;
@@ -52,6 +53,7 @@ struct State {
     inputs: [u8; HASH],
     settings: Settings,
     step: u64,
+    history: History,
     model: ModelState,
     rig: Option<RigPoses>,
     poses: Option<TrainedPoses>,
@@ -70,6 +72,7 @@ impl Trainer {
             inputs: *blake3::hash(inputs.as_bytes()).as_bytes(),
             settings: self.settings.clone(),
             step: self.step as u64,
+            history: self.history.clone(),
             model: self.model.state(),
             rig: self.rig.clone(),
             poses: self.poses.clone(),
@@ -122,6 +125,7 @@ impl Trainer {
             sky: state.sky,
             fixed_sky,
             step: state.step as usize,
+            history: state.history,
             gradients: Gradients::default(),
         })
     }

@@ -5,6 +5,8 @@
 //! | [`check`] | the gradients of this machine against their definition |
 //! | [`loss`] | losses of images, depths and Gaussians, each with its derivatives |
 //! | [`run`] | a run: from images to Gaussians |
+//! | [`held_out`] | the images that judge it |
+//! | [`history`], [`page`] | its curves, and all of it as a page |
 //! | [`start`] | from points to the Gaussians that it begins with |
 //! | [`trainer`] | a step: what one image teaches |
 //! | [`sample`] | what a step learns from |
@@ -30,9 +32,12 @@ mod error;
 mod exposures;
 pub mod ground;
 mod growth;
+pub mod held_out;
+pub mod history;
 pub mod loss;
 pub mod model;
 mod objective;
+pub mod page;
 pub mod poses;
 pub mod run;
 pub mod sample;

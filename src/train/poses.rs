@@ -69,6 +69,15 @@ pub(crate) struct PoseStep {
     pub(crate) weight: f64,
 }
 
+/// How far each pose has moved from the recorded one: metres, and radians.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PoseMoves {
+    /// Of each time of the rig, or of each image.
+    pub egos: Vec<[f64; 2]>,
+    /// Of each camera on the rig.
+    pub cameras: Vec<[f64; 2]>,
+}
+
 impl RigPoses {
     /// The pose of the camera of an image.
     ///
@@ -96,6 +105,22 @@ impl TrainedPoses {
 
     pub(crate) fn now(&self) -> &RigPoses {
         &self.now
+    }
+
+    pub(crate) fn moves(&self) -> PoseMoves {
+        let moved = |recorded: &[Pose], now: &[Pose]| {
+            let both = recorded.iter().zip(now);
+            let moved = both.map(|(recorded, now)| {
+                let Pose { position_m, rotation } = recorded.inverse() * *now;
+                [position_m.length(), rotation.to_scaled_axis().length()]
+            });
+            moved.collect()
+        };
+        let Self { recorded, now, .. } = self;
+        PoseMoves {
+            egos: moved(&recorded.world_from_ego, &now.world_from_ego),
+            cameras: moved(&recorded.ego_from_camera, &now.ego_from_camera),
+        }
     }
 
     /// A view at the pose that it has now, with both ends of its exposure moved alike.

@@ -9,12 +9,11 @@ use std::time::Instant;
 
 use serde::Serialize;
 
-use wildcity_render::compare::psnr::psnr_db_u8;
+use wildcity_render::View;
 use wildcity_render::gradient::Differentiate;
-use wildcity_render::{Frame, Target, View};
 use wildcity_scene::random::{mix, to_unit};
-use wildcity_scene::{RenderProfile, Scene};
 
+use crate::held_out::Evaluator;
 use crate::poses::Place;
 use crate::sample::Sample;
 use crate::settings::Settings;
@@ -41,7 +40,7 @@ pub struct TrainingImage {
 
 impl TrainingImage {
     /// Whether some pixel counts: what moves may hide all of an image.
-    fn counts(&self) -> bool {
+    pub(crate) fn counts(&self) -> bool {
         self.mask.as_ref().is_none_or(|mask| mask.contains(&true))
     }
 }
@@ -68,6 +67,9 @@ pub trait TrainingImages: Sync {
     /// The poses of the run's rig that an image has; `None` for images without a rig.
     fn place(&self, index: usize) -> Option<Place>;
 
+    /// The name of an image, for a person.
+    fn name(&self, index: usize) -> String;
+
     /// Decodes an image.
     ///
     /// # Errors
@@ -87,7 +89,7 @@ pub struct Line {
     /// The weighted sum of the ground's terms.
     pub ground: f64,
     pub gaussians: usize,
-    /// Since the first step, without evaluations.
+    /// Since the first step, without evaluations, and without the time that a run was stopped.
     pub seconds: f64,
     /// Mean of the images that are held out, at the steps that are evaluated.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -109,15 +111,15 @@ pub fn run(
     evaluate_every: usize,
     on_step: &mut dyn FnMut(&Line, &Trainer) -> bool,
 ) -> Result<(), TrainError> {
-    let (held_out, learned): (Vec<usize>, Vec<usize>) =
-        (0..images.count()).partition(|&index| images.is_held_out(index));
+    let count = images.count();
+    let learned: Vec<usize> = (0..count).filter(|&index| !images.is_held_out(index)).collect();
     if learned.is_empty() {
-        return Err(TrainError::NoImages { images: images.count(), held_out: held_out.len() });
+        return Err(TrainError::NoImages { images: count, held_out: count });
     }
     let steps = trainer.settings().steps;
     let first = trainer.steps_done();
     let order = Order::new(&learned, images, trainer.settings()).take(steps).skip(first);
-    let evaluator = Evaluator { images, backend, held_out: &held_out };
+    let evaluator = Evaluator::new(images, backend);
     thread::scope(|scope| {
         let (sender, next) = sync_channel(AHEAD);
         scope.spawn(move || {
@@ -126,17 +128,19 @@ pub fn run(
             order.map(load).all(|image| sender.send(image).is_ok())
         });
         let begin = Instant::now();
+        let earlier_s = trainer.history().seconds();
         let mut evaluated_s = 0.0;
         while trainer.steps_done() < steps {
             let report = step(trainer, backend, &next, images)?;
             let done = trainer.steps_done();
-            let seconds = begin.elapsed().as_secs_f64() - evaluated_s;
+            let seconds = earlier_s + begin.elapsed().as_secs_f64() - evaluated_s;
             let mut held_out_db = None;
             if done == steps || done.is_multiple_of(evaluate_every.max(1)) {
                 held_out_db = evaluator.mean_db(trainer)?;
             }
-            evaluated_s = begin.elapsed().as_secs_f64() - seconds;
+            evaluated_s = earlier_s + begin.elapsed().as_secs_f64() - seconds;
             let line = Line::new(trainer, report, seconds, held_out_db);
+            trainer.remember(&line);
             if !on_step(&line, trainer) {
                 break;
             }
@@ -231,67 +235,4 @@ fn step(
         exposure,
     };
     trainer.step(backend, &sample)
-}
-
-/// The mean PSNR of the images that are held out; `None` without any.
-///
-/// # Errors
-/// An image cannot be read or drawn.
-pub fn held_out_db(
-    trainer: &Trainer,
-    images: &dyn TrainingImages,
-    backend: &dyn Differentiate,
-) -> Result<Option<f64>, TrainError> {
-    Evaluator { images, backend, held_out: &images.held_out() }.mean_db(trainer)
-}
-
-/// The images that are held out.
-struct Evaluator<'a> {
-    images: &'a dyn TrainingImages,
-    backend: &'a dyn Differentiate,
-    held_out: &'a [usize],
-}
-
-impl Evaluator<'_> {
-    /// The mean of their PSNR, of those with a pixel that counts; `None` without any.
-    fn mean_db(&self, trainer: &Trainer) -> Result<Option<f64>, TrainError> {
-        let scene = trainer.scene()?;
-        let mut sum_db = 0.0;
-        let mut count = 0_u32;
-        for &index in self.held_out {
-            let image = self.images.load(index).map_err(TrainError::Image)?;
-            if !image.counts() {
-                continue;
-            }
-            count += 1;
-            let drawn = self.draw(trainer, &scene, index, &image)?;
-            let counts = |&index: &usize| image.mask.as_ref().is_none_or(|mask| mask[index / 3]);
-            let values = (0..drawn.len()).filter(counts);
-            sum_db += psnr_db_u8(values.map(|i| (&drawn[i], &image.rgb8[i])));
-        }
-        Ok((count > 0).then(|| sum_db / f64::from(count)))
-    }
-
-    /// The image as the scene shows it, at the pose that is trained and with the exposure that was
-    /// recorded.
-    fn draw(
-        &self,
-        trainer: &Trainer,
-        scene: &Scene,
-        index: usize,
-        image: &TrainingImage,
-    ) -> Result<Vec<u8>, TrainError> {
-        let mut rgba = vec![0.0; 4 * image.view.camera.pixels()];
-        // The sky is evaluated for every pixel: a map would be made for a few images.
-        let profile = RenderProfile { sky_error: 0.0, ..*trainer.profile() };
-        let views = [trainer.view(image.view, index, self.images.place(index))];
-        let frame = Frame { scene, profile: &profile, views: &views };
-        let target = Target { rgba: Some(&mut rgba), ..Target::default() };
-        self.backend.render(&frame, &mut [target], &|_, _| {})?;
-        // Exposed before it is rounded to 8 bits, so that nothing is clipped.
-        let to_8_bits =
-            |value: &f32| (255.0 * (value * image.exposure).clamp(0.0, 1.0)).round() as u8;
-        let pixels = rgba.as_chunks::<4>().0.iter();
-        Ok(pixels.flat_map(|[r, g, b, _]| [r, g, b].map(to_8_bits)).collect())
-    }
 }

@@ -17,11 +17,13 @@ pub use crate::error::TrainError;
 use crate::exposures::TrainedExposures;
 use crate::ground;
 use crate::growth::relocate_and_grow;
+use crate::history::History;
 use crate::loss::ground::Terms;
 use crate::model::{AdamStep, Model, rates};
 pub use crate::objective::StepReport;
 use crate::objective::{Objective, Outcome};
-use crate::poses::{Place, PoseStep, RigPoses, TrainedPoses};
+use crate::poses::{Place, PoseMoves, PoseStep, RigPoses, TrainedPoses};
+use crate::run::Line;
 use crate::sample::Sample;
 use crate::settings::{PoseMode, Settings, SkyMode};
 use crate::sky::TrainedSky;
@@ -53,6 +55,7 @@ pub struct Trainer {
     pub(crate) sky: Option<TrainedSky>,
     pub(crate) fixed_sky: Option<Arc<Sky>>,
     pub(crate) step: usize,
+    pub(crate) history: History,
     pub(crate) gradients: Gradients,
 }
 
@@ -104,6 +107,7 @@ impl Trainer {
             fixed_sky: sky,
             gradients: Gradients::default(),
             step: 0,
+            history: History::default(),
             rig,
             settings,
             profile,
@@ -154,6 +158,21 @@ impl Trainer {
             (Some(poses), Some(place)) => poses.view(view, place),
             _ => view,
         }
+    }
+
+    /// The curves of the run so far.
+    pub fn history(&self) -> &History {
+        &self.history
+    }
+
+    /// Adds a step to the curves.
+    pub(crate) fn remember(&mut self, line: &Line) {
+        self.history.add(line, self.settings.steps);
+    }
+
+    /// How far the poses have moved from the recorded ones, if they are trained.
+    pub fn moves(&self) -> Option<PoseMoves> {
+        self.poses.as_ref().map(TrainedPoses::moves)
     }
 
     /// Number of steps that have been made.

@@ -42,6 +42,10 @@ impl TrainingImages for ListedImages<'_> {
         None
     }
 
+    fn name(&self, index: usize) -> String {
+        self.images[index].image.name.clone()
+    }
+
     fn load(&self, index: usize) -> Result<TrainingImage, String> {
         self.decode(&self.images[index]).map_err(|error| exit::chain(&error))
     }
@@ -123,6 +127,13 @@ impl TrainingImages for WithAugmented<'_> {
 
     fn place(&self, index: usize) -> Option<Place> {
         if self.is_augmented(index) { None } else { self.recorded.place(index) }
+    }
+
+    fn name(&self, index: usize) -> String {
+        match index.checked_sub(self.recorded.count()) {
+            None => self.recorded.name(index),
+            Some(index) => self.augmented.name(index),
+        }
     }
 
     fn load(&self, index: usize) -> Result<TrainingImage, String> {

@@ -114,11 +114,8 @@ impl LogImages {
         let Some(rig) = &twin.rig else { return false };
         let is_of_log =
             drive.keyframes.iter().map(|key| key.time_us).eq(self.times_us.iter().copied());
-        let cameras = &self.log.rig.cameras;
-        let names = |cameras: &[RigCamera]| -> Vec<String> {
-            cameras.iter().map(|camera| camera.name.clone()).collect()
-        };
-        if !is_of_log || names(&rig.cameras) != names(cameras) {
+        let names = rig.cameras.iter().map(|camera| &camera.name);
+        if !is_of_log || !names.eq(&self.camera_names()) {
             return false;
         }
         let poses = drive.keyframes.iter().map(|key| key.world_from_rig);
@@ -142,6 +139,10 @@ impl LogImages {
             camera.rig_from_camera = *pose;
         }
         (Trajectory { name, keyframes: keyframes.collect() }, rig)
+    }
+
+    pub(super) fn camera_names(&self) -> Vec<String> {
+        self.log.rig.cameras.iter().map(|camera| camera.name.clone()).collect()
     }
 
     /// The recorded pose of each image.
@@ -249,6 +250,11 @@ impl TrainingImages for LogImages {
 
     fn place(&self, index: usize) -> Option<Place> {
         Some(self.images[index].place)
+    }
+
+    fn name(&self, index: usize) -> String {
+        let ImageRow { camera, time_us, .. } = &self.images[index].row;
+        format!("{camera} at {time_us} µs")
     }
 
     fn load(&self, index: usize) -> Result<TrainingImage, String> {

@@ -9,6 +9,7 @@ use wildcity_log::Log;
 use wildcity_scene::align::Alignment;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::{Gaussians, Manifest};
+use wildcity_train::held_out::held_out_db;
 use wildcity_train::run::TrainingImages;
 use wildcity_train::settings::{PoseMode, Settings, SkyMode};
 use wildcity_train::trainer::{Start, Trainer};
@@ -152,7 +153,7 @@ impl Refine {
             ..Start::default()
         };
         let mut trainer = Trainer::new(start, profile, settings)?;
-        let before = wildcity_train::run::held_out_db(&trainer, images, backend)?;
+        let before = held_out_db(&trainer, images, backend)?;
         let after = train(&mut trainer, images, backend, &mut |_, _| Ok(()))?;
         let steps = trainer.settings().steps;
         let done = trainer.steps_done();

@@ -16,6 +16,8 @@ use crate::cli::{Options, output};
 #[derive(Clone)]
 pub(super) struct Written {
     pub(super) ply: PathBuf,
+    /// Where the page about the run belongs.
+    pub(super) page: PathBuf,
     /// The sky, if one was trained.
     pub(super) sky: Option<PathBuf>,
     /// The drive and the rig, if their poses were trained.
@@ -48,8 +50,13 @@ impl Written {
             output::write(&path, &sky_file(&network)?)?;
             anyhow::Ok(path)
         });
-        let mut written =
-            Self { ply: ply.to_owned(), sky: sky.transpose()?, drive: None, rig: None };
+        let mut written = Self {
+            ply: ply.to_owned(),
+            page: ply.with_extension("html"),
+            sky: sky.transpose()?,
+            drive: None,
+            rig: None,
+        };
         if let Some((drive, rig)) = refined {
             let put = |extension: &str, bytes: &[u8]| {
                 let path = ply.with_extension(extension);
@@ -66,9 +73,10 @@ impl Written {
     pub(super) fn print(&self, source: &Path, gaussians: usize) -> io::Result<()> {
         writeln!(
             io::stdout().lock(),
-            "{}: {gaussians} Gaussians, in the axes and the unit of {}",
+            "{}: {gaussians} Gaussians, in the axes and the unit of {}\n{}: a page about the run",
             self.ply.display(),
-            source.display()
+            source.display(),
+            self.page.display()
         )
     }
 

@@ -11,6 +11,8 @@ use wildcity_eval::images::ImageList;
 use wildcity_log::Log;
 use wildcity_scene::align::Alignment;
 use wildcity_scene::{RenderProfile, Rig, Trajectory};
+use wildcity_train::held_out::{HeldOut, held_out_images};
+use wildcity_train::page::{Contents, page};
 use wildcity_train::run::TrainingImages;
 use wildcity_train::settings::{PoseMode, Settings, SkyMode};
 use wildcity_train::trainer::{Start, Trainer};
@@ -36,7 +38,8 @@ pub(super) struct TrainScene {
     #[arg(value_name = "SOURCE", required = true)]
     source: Option<PathBuf>,
 
-    /// PLY file to write, which `wildcity import` and other viewers and trainers read.
+    /// PLY file to write, which `wildcity import` and other viewers and trainers read. A page about
+    /// the run is beside it: FILE.html.
     #[arg(long, value_name = "FILE", required = true)]
     out: Option<PathBuf>,
 
@@ -149,9 +152,9 @@ impl TrainScene {
         images.add(&list, &Alignment::IDENTITY)?;
         start.world_from_camera = images.poses();
         let inputs = images.inputs();
-        let trainer =
+        let trained =
             self.train(out, Inputs { images: &images, inputs, start, profile, settings })?;
-        self.write(out, source, &trainer, None)
+        self.write(out, source, &trained, &[], None)
     }
 
     /// Trains on a log: with the poses of its rig, and the points and depths of its LiDAR.
@@ -168,15 +171,16 @@ impl TrainScene {
         }
         let (start, profile) = self.start.read_for_log(source, &images, &settings)?;
         let inputs = images.inputs();
-        let trainer =
+        let trained =
             self.train(out, Inputs { images: &images, inputs, start, profile, settings })?;
+        let trainer = &trained.trainer;
         let is_of_rig = trainer.settings().poses.mode != PoseMode::Image;
         let refined = trainer.poses().filter(|_| is_of_rig).map(|poses| images.refined(poses));
-        self.write(out, source, &trainer, refined.as_ref())
+        self.write(out, source, &trained, &images.camera_names(), refined.as_ref())
     }
 
     /// Takes the run to its end.
-    fn train(&self, out: &Path, inputs: Inputs<'_>) -> anyhow::Result<Trainer> {
+    fn train(&self, out: &Path, inputs: Inputs<'_>) -> anyhow::Result<Trained> {
         let Inputs { images, inputs, start, profile, settings } = inputs;
         let backend = &*self.hardware.training()?;
         writeln!(
@@ -214,7 +218,10 @@ impl TrainScene {
             let mut stdout = io::stdout().lock();
             writeln!(stdout, "held out: {db:.2} dB after {steps} steps, {seconds:.0} s")?;
         }
-        Ok(trainer)
+        let held_out = held_out_images(&trainer, images, backend, PICTURES)?;
+        let held_out_count = images.held_out().len();
+        let counts = [images.count() - held_out_count, held_out_count];
+        Ok(Trained { trainer, held_out, images: counts })
     }
 
     /// Writes the result of a run, and makes the twin.
@@ -222,10 +229,15 @@ impl TrainScene {
         &self,
         out: &Path,
         source: &Path,
-        trainer: &Trainer,
+        trained: &Trained,
+        cameras: &[String],
         refined: Option<&(Trajectory, Rig)>,
     ) -> anyhow::Result<()> {
+        let Trained { trainer, held_out, images } = trained;
         let written = Written::new(trainer, out, refined)?;
+        let name = source.display().to_string();
+        let contents = Contents { source: &name, trainer, images: *images, held_out, cameras };
+        output::write(&written.page, page(&contents)?.as_bytes())?;
         checkpoints::remove(out)?;
         let options = self.import_options(source, &written);
         written.print(source, trainer.model().len())?;
@@ -276,6 +288,17 @@ struct Inputs<'a> {
     start: Start,
     profile: RenderProfile,
     settings: Settings,
+}
+
+/// Held-out images on the page of a run.
+const PICTURES: usize = 6;
+
+/// A run that has reached its end.
+struct Trained {
+    trainer: Trainer,
+    held_out: Vec<HeldOut>,
+    /// Images that it has learned from, and those that were held out.
+    images: [usize; 2],
 }
 
 /// Reads the file of `--settings`.

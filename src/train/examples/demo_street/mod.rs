@@ -45,6 +45,10 @@ impl TrainingImages for Recording {
         Some(self.images[index].place)
     }
 
+    fn name(&self, index: usize) -> String {
+        format!("image {index}")
+    }
+
     fn load(&self, index: usize) -> Result<TrainingImage, String> {
         let Recorded { view, place, rgb8, depth_m, .. } = &self.images[index];
         let measured =
