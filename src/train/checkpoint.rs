@@ -3,13 +3,11 @@
 //! The file is bincode after one line of text, and its last 32 bytes are the BLAKE3 hash of all
 //! before: half a file is refused.
 
-use std::sync::Arc;
-
 use bincode::config::{self, Config};
 use serde::{Deserialize, Serialize};
 
 use wildcity_render::gradient::Gradients;
-use wildcity_scene::{RenderProfile, Sky};
+use wildcity_scene::RenderProfile;
 
 use crate::exposures::TrainedExposures;
 use crate::history::History;
@@ -17,7 +15,7 @@ use crate::model::{Model, ModelState};
 use crate::poses::{RigPoses, TrainedPoses};
 use crate::settings::Settings;
 use crate::sky::TrainedSky;
-use crate::trainer::Trainer;
+use crate::trainer::{Fixed, Trainer};
 
 /// The first line of a file.
 const FORMAT: &[u8] = b"wildcity.checkpoint/2\n";
@@ -86,8 +84,8 @@ impl Trainer {
         Ok(bytes)
     }
 
-    /// The run that wrote a file, at the step at which it did. A sky that is not trained is not in
-    /// the file: it is given again.
+    /// The run that wrote a file, at the step at which it did. What is not trained is not in the
+    /// file: it is given again.
     ///
     /// # Errors
     /// The file is damaged, or of a run with other inputs or settings.
@@ -96,7 +94,7 @@ impl Trainer {
         inputs: &str,
         profile: RenderProfile,
         settings: &Settings,
-        fixed_sky: Option<Arc<Sky>>,
+        fixed: Fixed,
     ) -> Result<Self, CheckpointError> {
         let contents = bytes.strip_prefix(FORMAT).ok_or(CheckpointError::Format)?;
         let Some((contents, hash)) = contents.split_last_chunk::<HASH>() else {
@@ -114,7 +112,8 @@ impl Trainer {
         if state.settings != *settings {
             return Err(CheckpointError::OtherSettings);
         }
-        let model = Model::from_state(state.model);
+        let Fixed { sky, chunks } = fixed;
+        let model = Model::from_state(state.model, chunks);
         Ok(Self {
             settings: state.settings,
             profile,
@@ -123,7 +122,7 @@ impl Trainer {
             poses: state.poses,
             exposures: state.exposures,
             sky: state.sky,
-            fixed_sky,
+            fixed_sky: sky,
             step: state.step as usize,
             history: state.history,
             gradients: Gradients::default(),

@@ -38,6 +38,20 @@ pub fn held_out_db(
     Evaluator::new(images, backend).mean_db(trainer)
 }
 
+/// The mean PSNR of the images that are held out against what another scene shows at the poses of
+/// a run; `None` without any.
+///
+/// # Errors
+/// An image cannot be read or drawn.
+pub fn scene_db(
+    scene: &Scene,
+    trainer: &Trainer,
+    images: &dyn TrainingImages,
+    backend: &dyn Differentiate,
+) -> Result<Option<f64>, TrainError> {
+    Ok(mean(&Evaluator::new(images, backend).each_db(scene, trainer)?))
+}
+
 /// Up to `most` of the images that are held out, from the one with the lowest PSNR to the one with
 /// the highest.
 ///
@@ -50,12 +64,12 @@ pub fn held_out_images(
     most: usize,
 ) -> Result<Vec<HeldOut>, TrainError> {
     let evaluator = Evaluator::new(images, backend);
-    let mut all_db = evaluator.each_db(trainer)?;
+    let scene = trainer.scene()?;
+    let mut all_db = evaluator.each_db(&scene, trainer)?;
     all_db.sort_by(|a, b| a.1.total_cmp(&b.1));
     let count = all_db.len().min(most);
     // The first and the last of all are among them.
     let place = |k: usize| k * (all_db.len() - 1) / (count - 1).max(1);
-    let scene = trainer.scene()?;
     (0..count)
         .map(|k| {
             let (index, psnr_db) = all_db[place(k)];
@@ -85,19 +99,16 @@ impl<'a> Evaluator<'a> {
 
     /// The mean of the PSNR of those with a pixel that counts; `None` without any.
     pub(crate) fn mean_db(&self, trainer: &Trainer) -> Result<Option<f64>, TrainError> {
-        let all_db = self.each_db(trainer)?;
-        let sum_db = all_db.iter().map(|(_, psnr_db)| psnr_db).sum::<f64>();
-        Ok((!all_db.is_empty()).then(|| sum_db / all_db.len() as f64))
+        Ok(mean(&self.each_db(&trainer.scene()?, trainer)?))
     }
 
     /// The PSNR of those with a pixel that counts, with their numbers.
-    fn each_db(&self, trainer: &Trainer) -> Result<Vec<(usize, f64)>, TrainError> {
-        let scene = trainer.scene()?;
+    fn each_db(&self, scene: &Scene, trainer: &Trainer) -> Result<Vec<(usize, f64)>, TrainError> {
         let mut all_db = Vec::new();
         for &index in &self.held_out {
             let image = self.load(index)?;
             if image.counts() {
-                let drawn = self.draw(trainer, &scene, index, &image, false)?;
+                let drawn = self.draw(trainer, scene, index, &image, false)?;
                 all_db.push((index, psnr_db(&image, &drawn.rgb8)));
             }
         }
@@ -159,6 +170,11 @@ impl<'a> Evaluator<'a> {
         let rgb8 = colors.flat_map(|[r, g, b, _]| [r, g, b].map(to_8_bits)).collect();
         Ok(Drawn { rgb8, depth_m, normals })
     }
+}
+
+fn mean(all_db: &[(usize, f64)]) -> Option<f64> {
+    let sum_db = all_db.iter().map(|(_, psnr_db)| psnr_db).sum::<f64>();
+    (!all_db.is_empty()).then(|| sum_db / all_db.len() as f64)
 }
 
 /// Of the pixels that count.

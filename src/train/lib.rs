@@ -7,6 +7,7 @@
 //! | [`run`] | a run: from images to Gaussians |
 //! | [`held_out`] | the images that judge it |
 //! | [`history`], [`page`] | its curves, and all of it as a page |
+//! | [`blocks`] | a route in parts, each of which is a run |
 //! | [`start`] | from points to the Gaussians that it begins with |
 //! | [`trainer`] | a step: what one image teaches |
 //! | [`sample`] | what a step learns from |
@@ -25,6 +26,7 @@
 //! training computes in f32, and tests judge the same code in f64 by differences.
 
 mod adam;
+pub mod blocks;
 pub mod check;
 pub mod checkpoint;
 pub mod compose;

@@ -39,6 +39,9 @@ pub struct Model {
     moments: [Vec<Lanes>; 2],
     /// Whether each Gaussian is of the ground; empty if none is.
     is_ground: Vec<bool>,
+    /// Gaussians that are drawn and stay as they are.
+    fixed: Vec<Arc<Chunk>>,
+    /// The chunk of the Gaussians that are trained, and then those of `fixed`.
     scene: Scene,
 }
 
@@ -88,7 +91,12 @@ struct ClusterState<'a> {
 impl Model {
     /// Gaussians to begin with, in the degree of the settings or in their own, if it is higher.
     /// Their values have been checked ([`wildcity_scene::validate`]).
-    pub(crate) fn new(mut gaussians: Gaussians, is_ground: Vec<bool>, sh_degree: u8) -> Self {
+    pub(crate) fn new(
+        mut gaussians: Gaussians,
+        is_ground: Vec<bool>,
+        sh_degree: u8,
+        fixed: Vec<Arc<Chunk>>,
+    ) -> Self {
         gaussians.raise_sh_degree(sh_degree);
         let count = gaussians.len();
         let mut sum = DVec3::ZERO;
@@ -104,6 +112,7 @@ impl Model {
             values: Vec::new(),
             moments: [Vec::new(), Vec::new()],
             is_ground: Vec::new(),
+            fixed,
             scene: Scene::default(),
         };
         model.resize(count);
@@ -136,7 +145,7 @@ impl Model {
     }
 
     /// `None` if the numbers of values do not fit each other.
-    pub(crate) fn from_state(state: ModelState) -> Option<Self> {
+    pub(crate) fn from_state(state: ModelState, fixed: Vec<Arc<Chunk>>) -> Option<Self> {
         let ModelState { sh_degree, count, origin_m, values, moments, is_ground } = state;
         let count = count as usize;
         let is_known = sh_degree <= sh::MAX_DEGREE;
@@ -153,6 +162,7 @@ impl Model {
             values: lanes(values),
             moments: moments.map(lanes),
             is_ground,
+            fixed,
             scene: Scene::default(),
         };
         model.rebuild();
@@ -327,7 +337,9 @@ impl Model {
         let mut pages = LanePages::new(width, None);
         pages.extend_from_slice(&lanes);
         let chunk = Chunk::from_lanes([0, 0], self.origin_m, self.sh_degree, self.count, pages);
-        self.scene = Scene { chunks: vec![Arc::new(chunk)], ..Scene::default() };
+        let mut chunks = vec![Arc::new(chunk)];
+        chunks.extend_from_slice(&self.fixed);
+        self.scene = Scene { chunks, ..Scene::default() };
     }
 }
 

@@ -67,6 +67,9 @@ pub trait TrainingImages: Sync {
     /// The poses of the run's rig that an image has; `None` for images without a rig.
     fn place(&self, index: usize) -> Option<Place>;
 
+    /// The camera of an image at its whole size, at the recorded pose.
+    fn view(&self, index: usize) -> View;
+
     /// The name of an image, for a person.
     fn name(&self, index: usize) -> String;
 

@@ -10,7 +10,7 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::random::mix;
 use wildcity_scene::sky::{Network, Sky, SkyModel};
 use wildcity_scene::validate::{self, Field};
-use wildcity_scene::{Gaussians, RenderProfile, Scene};
+use wildcity_scene::{Chunk, Gaussians, RenderProfile, Scene};
 
 use crate::compose::Exposure;
 pub use crate::error::TrainError;
@@ -38,8 +38,17 @@ pub struct Start {
     pub world_from_camera: Vec<Pose>,
     /// The recorded poses of the rig that took the images.
     pub rig: Option<RigPoses>,
-    /// A sky that is not trained. With one, no other is.
+    /// What is drawn and not trained.
+    pub fixed: Fixed,
+}
+
+/// What a run draws and does not train.
+#[derive(Clone, Debug, Default)]
+pub struct Fixed {
+    /// A sky. With one, no other is trained.
     pub sky: Option<Arc<Sky>>,
+    /// Gaussians.
+    pub chunks: Vec<Arc<Chunk>>,
 }
 
 /// A training run: its Gaussians and all else that it trains, and how far it is.
@@ -70,7 +79,8 @@ impl Trainer {
         settings: Settings,
     ) -> Result<Self, TrainError> {
         settings.check()?;
-        let Start { gaussians, is_ground, world_from_camera, rig, sky } = start;
+        let Start { gaussians, is_ground, world_from_camera, rig, fixed } = start;
+        let Fixed { sky, chunks } = fixed;
         if gaussians.means_m.is_empty() {
             return Err(TrainError::Empty);
         }
@@ -100,7 +110,7 @@ impl Trainer {
             SkyMode::Auto => rig.is_some(),
         };
         Ok(Self {
-            model: Model::new(gaussians, is_ground, settings.sh_degree),
+            model: Model::new(gaussians, is_ground, settings.sh_degree, chunks),
             poses: poses.map(TrainedPoses::new),
             exposures: settings.exposure.on.then(|| TrainedExposures::new(images)),
             sky: trains_sky.then(|| TrainedSky::new(&settings.sky, images, settings.seed)),

@@ -6,6 +6,7 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use wildcity_scene::Rig;
+use wildcity_scene::manifest::ChunkEntry;
 use wildcity_twin::store::Catalog;
 
 use crate::data::real;
@@ -62,6 +63,10 @@ fn a_run_that_is_stopped_goes_on_to_the_same_files() {
     recorded(dir);
     let said = done(dir, &as_strs(&train("whole.ply", &[])));
     assert!(said.contains("held out: ") && said.contains("wildcity import"), "{said}");
+    let page = fs::read_to_string(dir.join("whole.html")).unwrap();
+    // Four pictures of each of the images that judge the run, and three curves.
+    assert_eq!([page.matches("data:image/jpeg").count(), page.matches("<svg").count()], [16, 3]);
+    assert!(page.contains("steps = 60") && page.contains(" dB on 4 images"), "{}", page.len());
 
     // Stopped after some steps by SIGTERM.
     let mut child = wildcity()
@@ -204,4 +209,39 @@ fn a_gradient_that_exceeds_its_bound_ends_with_1() {
     let check = ["train", "check", "--vectors", "vectors.safetensors"];
     let error = refused(dir.path(), &check);
     assert!(error.contains("bounds are exceeded"), "{error}");
+}
+
+#[test]
+fn blocks_of_a_twin_make_the_same_twin_in_any_order() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let twins = ["--twins", "twins"];
+    let size = ["--length-km", "0.1", "--density", "1"];
+    done(dir, &[&["twin", "generate", "--twin", "lane"], &twins[..], &size].concat());
+    let log = ["log", "generate", "lane", "--out", "log", "--length-m", "20", "--width", "160"];
+    done(dir, &[&log[..], &twins].concat());
+    let block = |block: &str, more: &[&str]| {
+        let fixed = ["train", "block", "lane@1", "--images", "log", "--steps", "3", "--block", block];
+        done(dir, &[&fixed[..], &twins, &["--held-out-every", "3"], more].concat())
+    };
+    let said = block("1/2", &["--checkpoint", "block.checkpoint"]);
+    assert!(said.contains("across the borders") && said.contains("by the twin"), "{said}");
+    assert!(!dir.join("block.checkpoint").exists());
+    block("2/2", &[]);
+    let catalog = Catalog::open(&dir.join("twins")).unwrap();
+    let one = catalog.version("lane", Some(3)).unwrap();
+    done(dir, &[&["twin", "rollback", "lane", "1"], &twins[..]].concat());
+    block("2/2", &[]);
+    block("1/2", &[]);
+    let other = catalog.version("lane", None).unwrap();
+    assert_eq!(other.number, 6);
+    assert_eq!(one.hash, other.hash);
+    let before = catalog.version("lane", Some(1)).unwrap();
+    let changed = |(before, after): (&ChunkEntry, &ChunkEntry)| before.object != after.object;
+    let chunks = before.manifest.chunks.iter().zip(&one.manifest.chunks);
+    assert!(chunks.filter(|pair| changed(*pair)).count() >= 2);
+
+    let fixed = ["train", "block", "lane@1", "--images", "log", "--block", "9/99"];
+    let said = refused(dir, &[&fixed[..], &twins].concat());
+    assert!(said.contains("give at most"), "{said}");
 }

@@ -281,7 +281,7 @@ fn gaussians_of_the_ground_become_flat() {
             is_ground: labels,
             world_from_camera: vec![views[4].world_from_camera],
             rig: Some(rig),
-            sky: None,
+            fixed: Fixed::default(),
         };
         let mut trainer = Trainer::new(start, RenderProfile::default(), settings).unwrap();
         for _ in 0..300 {
@@ -327,7 +327,7 @@ fn a_run_that_stops_goes_on_to_the_same_bytes() {
     let checkpoint = whole.to_checkpoint("street").expect("a checkpoint");
     steps(&mut whole);
     let read = |bytes: &[u8], inputs: &str, settings: &Settings| {
-        Trainer::from_checkpoint(bytes, inputs, profile, settings, None)
+        Trainer::from_checkpoint(bytes, inputs, profile, settings, Fixed::default())
     };
     let mut again = read(&checkpoint, "street", &settings).expect("a run");
     assert_eq!(again.steps_done(), 40);

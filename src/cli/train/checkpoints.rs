@@ -12,7 +12,7 @@ use anyhow::{Context, ensure};
 use tokio::runtime;
 use wildcity_scene::RenderProfile;
 use wildcity_train::settings::Settings;
-use wildcity_train::trainer::Trainer;
+use wildcity_train::trainer::{Fixed, Trainer};
 
 use crate::cli::output;
 
@@ -29,7 +29,12 @@ pub(super) struct Checkpoints {
 impl Checkpoints {
     /// The checkpoint of a run that writes `out`.
     pub(super) fn new(out: &Path, inputs: String) -> Self {
-        Self { path: path(out), inputs }
+        Self::at(&path(out), inputs)
+    }
+
+    /// The checkpoint in a file.
+    pub(super) fn at(path: &Path, inputs: String) -> Self {
+        Self { path: path.to_owned(), inputs }
     }
 
     /// The run that goes on; `None` if it begins anew, which a checkpoint of an earlier run must
@@ -39,6 +44,7 @@ impl Checkpoints {
         resume: bool,
         profile: RenderProfile,
         settings: &Settings,
+        fixed: Fixed,
     ) -> anyhow::Result<Option<Trainer>> {
         let name = self.path.display();
         let bytes = match fs::read(&self.path) {
@@ -52,7 +58,7 @@ impl Checkpoints {
             resume,
             "{name} is there: an earlier run was stopped. --resume goes on with it; remove the file to begin anew"
         );
-        let trainer = Trainer::from_checkpoint(&bytes, &self.inputs, profile, settings, None);
+        let trainer = Trainer::from_checkpoint(&bytes, &self.inputs, profile, settings, fixed);
         Ok(Some(trainer.with_context(|| format!("{name}"))?))
     }
 
@@ -70,8 +76,12 @@ fn path(out: &Path) -> PathBuf {
 
 /// Removes the checkpoint of a run that has reached its end.
 pub(super) fn remove(out: &Path) -> anyhow::Result<()> {
-    let path = path(out);
-    match fs::remove_file(&path) {
+    remove_file(&path(out))
+}
+
+/// Removes a checkpoint, if it is there.
+pub(super) fn remove_file(path: &Path) -> anyhow::Result<()> {
+    match fs::remove_file(path) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => {
             Err(error).with_context(|| format!("cannot remove {}", path.display()))
         }

@@ -17,19 +17,19 @@ use wildcity_train::run::{TrainingImage, TrainingImages};
 use crate::cli::exit;
 
 /// Images of lists, at a fraction of their size.
-pub(super) struct ListedImages<'a> {
-    images: Vec<ListedImage<'a>>,
+pub(super) struct ListedImages {
+    images: Vec<ListedImage>,
     size: f64,
     held_out_every: usize,
 }
 
-struct ListedImage<'a> {
-    image: &'a RealImage,
+struct ListedImage {
+    image: RealImage,
     /// In the axes and the unit of the scene that is trained.
     world_from_camera: Pose,
 }
 
-impl TrainingImages for ListedImages<'_> {
+impl TrainingImages for ListedImages {
     fn count(&self) -> usize {
         self.images.len()
     }
@@ -42,6 +42,11 @@ impl TrainingImages for ListedImages<'_> {
         None
     }
 
+    fn view(&self, index: usize) -> View {
+        let ListedImage { image, world_from_camera } = &self.images[index];
+        View::new(image.camera, *world_from_camera)
+    }
+
     fn name(&self, index: usize) -> String {
         self.images[index].image.name.clone()
     }
@@ -51,7 +56,7 @@ impl TrainingImages for ListedImages<'_> {
     }
 }
 
-impl<'a> ListedImages<'a> {
+impl ListedImages {
     /// No images yet. One of `held_out_every` is held out.
     pub(super) fn new(size: f64, held_out_every: usize) -> Self {
         Self { images: Vec::new(), size, held_out_every }
@@ -61,12 +66,12 @@ impl<'a> ListedImages<'a> {
     ///
     /// # Errors
     /// An image is missing: each is looked at before a long run finds one that is.
-    pub(super) fn add(&mut self, list: &'a ImageList, alignment: &Alignment) -> anyhow::Result<()> {
+    pub(super) fn add(&mut self, list: &ImageList, alignment: &Alignment) -> anyhow::Result<()> {
         for image in list.every(1) {
             let file = &image.file;
             ensure!(file.is_file(), "there is no image {}: give --image-dir", file.display());
             let world_from_camera = alignment.pose(&image.world_from_camera);
-            self.images.push(ListedImage { image, world_from_camera });
+            self.images.push(ListedImage { image: image.clone(), world_from_camera });
         }
         Ok(())
     }
@@ -92,8 +97,8 @@ impl<'a> ListedImages<'a> {
         text
     }
 
-    fn decode(&self, listed: &ListedImage<'_>) -> anyhow::Result<TrainingImage> {
-        let image = listed.image;
+    fn decode(&self, listed: &ListedImage) -> anyhow::Result<TrainingImage> {
+        let image = &listed.image;
         let Shrunk { rgb8, mask, camera, own_px } =
             Shrunk::read(&image.file, image.mask.as_deref(), &image.camera, self.size)?;
         let depth_m = image.depth.as_deref().map(|file| picture::depth_m(file, own_px));
@@ -129,6 +134,13 @@ impl TrainingImages for WithAugmented<'_> {
         if self.is_augmented(index) { None } else { self.recorded.place(index) }
     }
 
+    fn view(&self, index: usize) -> View {
+        match index.checked_sub(self.recorded.count()) {
+            None => self.recorded.view(index),
+            Some(index) => self.augmented.view(index),
+        }
+    }
+
     fn name(&self, index: usize) -> String {
         match index.checked_sub(self.recorded.count()) {
             None => self.recorded.name(index),
@@ -141,6 +153,43 @@ impl TrainingImages for WithAugmented<'_> {
             None => self.recorded.load(index),
             Some(index) => self.augmented.load(index),
         }
+    }
+}
+
+/// Some of all images.
+pub(super) struct ChosenImages<'a> {
+    pub(super) all: &'a dyn TrainingImages,
+    /// Their numbers among all.
+    pub(super) chosen: Vec<usize>,
+}
+
+impl TrainingImages for ChosenImages<'_> {
+    fn count(&self) -> usize {
+        self.chosen.len()
+    }
+
+    fn is_held_out(&self, index: usize) -> bool {
+        self.all.is_held_out(self.chosen[index])
+    }
+
+    fn is_augmented(&self, index: usize) -> bool {
+        self.all.is_augmented(self.chosen[index])
+    }
+
+    fn place(&self, index: usize) -> Option<Place> {
+        self.all.place(self.chosen[index])
+    }
+
+    fn view(&self, index: usize) -> View {
+        self.all.view(self.chosen[index])
+    }
+
+    fn name(&self, index: usize) -> String {
+        self.all.name(self.chosen[index])
+    }
+
+    fn load(&self, index: usize) -> Result<TrainingImage, String> {
+        self.all.load(self.chosen[index])
     }
 }
 

@@ -252,9 +252,15 @@ impl TrainingImages for LogImages {
         Some(self.images[index].place)
     }
 
+    fn view(&self, index: usize) -> View {
+        let place = self.images[index].place;
+        let camera = self.log.rig.cameras[place.camera].camera;
+        View::new(camera, self.rig.world_from_camera(place))
+    }
+
     fn name(&self, index: usize) -> String {
         let ImageRow { camera, time_us, .. } = &self.images[index].row;
-        format!("{camera} at {time_us} µs")
+        format!("{camera} at {:.3} s", *time_us as f64 / 1e6)
     }
 
     fn load(&self, index: usize) -> Result<TrainingImage, String> {

@@ -1,5 +1,6 @@
 //! `wildcity train`.
 
+mod block;
 mod check;
 mod checkpoints;
 mod images;
@@ -47,6 +48,7 @@ Examples:
   wildcity import capture.ply --twin capture --axes y-down-z-forward";
 
 subcommands! { TrainCommand;
+    Block(Box<block::Block>),
     Refine(Box<refine::Refine>),
     Loop(Box<rounds::Loop>),
     Check(check::Check),

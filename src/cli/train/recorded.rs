@@ -1,9 +1,32 @@
 //! The options of the images that a twin was recorded with.
 
 use std::ffi::OsString;
+use std::io::{self, Write};
 use std::path::PathBuf;
 
-use crate::cli::Options;
+use anyhow::ensure;
+use wildcity_eval::images::ImageList;
+use wildcity_log::Log;
+use wildcity_scene::align::Alignment;
+use wildcity_scene::geometry::Pose;
+use wildcity_train::poses::RigPoses;
+use wildcity_train::run::TrainingImages;
+use wildcity_twin::store::{Catalog, Version};
+
+use super::images::ListedImages;
+use super::log_images::LogImages;
+use crate::cli::{Options, file_notes, placement};
+
+/// Recorded images in the axes of a twin.
+pub(super) struct Recording {
+    pub(super) images: Box<dyn TrainingImages>,
+    /// The recorded pose of each image.
+    pub(super) world_from_camera: Vec<Pose>,
+    /// The poses of the rig, of a log.
+    pub(super) rig: Option<RigPoses>,
+    /// A text by which a checkpoint knows the images.
+    pub(super) inputs: String,
+}
 
 /// The recorded images of a twin, with their cameras.
 #[derive(Clone, Debug, clap::Args)]
@@ -42,5 +65,61 @@ impl RecordedImages {
             ("--axes", axes.map(OsString::from)),
             ("--scale", scale.map(|scale| scale.to_string().into())),
         ]
+    }
+
+    /// Opens the images of a twin at a fraction of their size, with its trained poses if it has
+    /// such. One of `held_out_every` is held out.
+    pub(super) fn open(
+        &self,
+        catalog: &Catalog,
+        base: &Version,
+        size: f64,
+        held_out_every: usize,
+    ) -> anyhow::Result<Recording> {
+        let Self { images, image_dir, masks, axes, .. } = self;
+        if !Log::is_log(images) {
+            let list = ImageList::read(images, image_dir.as_deref(), masks.as_deref())?;
+            file_notes::print_warnings(images, &list.warnings)?;
+            let mut listed = ListedImages::new(size, held_out_every);
+            listed.add(&list, &self.alignment(catalog, base, &list)?)?;
+            let world_from_camera = listed.poses();
+            let inputs = listed.inputs();
+            return Ok(Recording {
+                images: Box::new(listed),
+                world_from_camera,
+                rig: None,
+                inputs,
+            });
+        }
+        ensure!(
+            image_dir.is_none() && masks.is_none() && axes.is_none(),
+            "{} is a log, which names files and axes: leave --image-dir, --masks and --axes out",
+            images.display()
+        );
+        let mut logged = LogImages::new(Log::open(images)?, size, held_out_every)?;
+        if !logged.take_refined(&base.manifest) {
+            writeln!(
+                io::stderr(),
+                "note: the twin has no trained poses of the log: those of the log are used"
+            )?;
+        }
+        let world_from_camera = logged.world_from_camera();
+        let inputs = logged.inputs();
+        let rig = Some(logged.rig.clone());
+        Ok(Recording { images: Box::new(logged), world_from_camera, rig, inputs })
+    }
+
+    /// The transform from the axes of the recorded poses to those of the twin.
+    fn alignment(
+        &self,
+        catalog: &Catalog,
+        base: &Version,
+        list: &ImageList,
+    ) -> anyhow::Result<Alignment> {
+        match &self.axes {
+            Some(axes) => placement::imported(axes, self.scale.unwrap_or(1.0)),
+            None if list.is_in_scene_axes => Ok(Alignment::IDENTITY),
+            None => placement::from_version(catalog, base),
+        }
     }
 }

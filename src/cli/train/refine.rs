@@ -5,25 +5,23 @@ use std::path::PathBuf;
 
 use anyhow::{Context, ensure};
 use wildcity_eval::images::ImageList;
-use wildcity_log::Log;
 use wildcity_scene::align::Alignment;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::{Gaussians, Manifest};
 use wildcity_train::held_out::held_out_db;
 use wildcity_train::run::TrainingImages;
 use wildcity_train::settings::{PoseMode, Settings, SkyMode};
-use wildcity_train::trainer::{Start, Trainer};
+use wildcity_train::trainer::{Fixed, Start, Trainer};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, Version};
 
 use super::images::{ListedImages, WithAugmented};
-use super::log_images::LogImages;
 use super::progress::train;
-use super::recorded::RecordedImages;
+use super::recorded::{RecordedImages, Recording};
 use super::scene::{fraction, read_settings};
 use crate::cli::backend_options::HardwareOptions;
 use crate::cli::directories::{EditedTwin, Twins};
-use crate::cli::{file_notes, output, placement, progress};
+use crate::cli::{output, progress};
 
 /// Train a twin further, on the images of its recording and on views off its drives.
 ///
@@ -92,32 +90,11 @@ impl Refine {
             // `augment` writes poses in the twin's axes.
             augmented.add(round, &Alignment::IDENTITY)?;
         }
-        let RecordedImages { images, image_dir, masks, axes, .. } = &self.recorded;
-        if Log::is_log(images) {
-            ensure!(
-                image_dir.is_none() && masks.is_none() && axes.is_none(),
-                "{} is a log, which names files and axes: leave --image-dir, --masks and --axes out",
-                images.display()
-            );
-            let log = Log::open(images)?;
-            let mut recorded = LogImages::new(log, self.size, self.held_out_every)?;
-            if !recorded.take_refined(&base.manifest) {
-                writeln!(
-                    io::stderr(),
-                    "note: the twin has no trained poses of the log: those of the log are used"
-                )?;
-            }
-            let poses = [recorded.world_from_camera(), augmented.poses()].concat();
-            let images = WithAugmented { recorded: &recorded, augmented: &augmented };
-            return self.refine(&catalog, &base, &images, poses, settings);
-        }
-        let list = ImageList::read(images, image_dir.as_deref(), masks.as_deref())?;
-        file_notes::print_warnings(images, &list.warnings)?;
-        let mut recorded = ListedImages::new(self.size, self.held_out_every);
-        recorded.add(&list, &self.alignment(&base, &list)?)?;
-        let poses = [recorded.poses(), augmented.poses()].concat();
-        let images = WithAugmented { recorded: &recorded, augmented: &augmented };
-        self.refine(&catalog, &base, &images, poses, settings)
+        let Recording { images: recorded, mut world_from_camera, .. } =
+            self.recorded.open(&catalog, &base, self.size, self.held_out_every)?;
+        world_from_camera.extend(augmented.poses());
+        let images = WithAugmented { recorded: &*recorded, augmented: &augmented };
+        self.refine(&catalog, &base, &images, world_from_camera, settings)
     }
 
     /// Trains the twin on the images, and makes a new version of it.
@@ -149,7 +126,7 @@ impl Refine {
         let start = Start {
             gaussians,
             world_from_camera,
-            sky: resident.sky().cloned(),
+            fixed: Fixed { sky: resident.sky().cloned(), ..Fixed::default() },
             ..Start::default()
         };
         let mut trainer = Trainer::new(start, profile, settings)?;
@@ -203,15 +180,5 @@ impl Refine {
         settings.growth.noise = 0.0;
         settings.check()?;
         Ok(settings)
-    }
-
-    /// The transform from the axes of the recorded poses to those of the twin.
-    fn alignment(&self, base: &Version, list: &ImageList) -> anyhow::Result<Alignment> {
-        let RecordedImages { axes, scale, .. } = &self.recorded;
-        match axes {
-            Some(axes) => placement::imported(axes, scale.unwrap_or(1.0)),
-            None if list.is_in_scene_axes => Ok(Alignment::IDENTITY),
-            None => placement::from_version(&self.twins.catalog()?, base),
-        }
     }
 }

@@ -15,7 +15,7 @@ use wildcity_train::held_out::{HeldOut, held_out_images};
 use wildcity_train::page::{Contents, page};
 use wildcity_train::run::TrainingImages;
 use wildcity_train::settings::{PoseMode, Settings, SkyMode};
-use wildcity_train::trainer::{Start, Trainer};
+use wildcity_train::trainer::{Fixed, Start, Trainer};
 
 use super::checkpoints::{self, Checkpoints};
 use super::images::ListedImages;
@@ -194,10 +194,11 @@ impl TrainScene {
         let gaussians = start::inputs(&start.gaussians);
         let inputs = format!("{} {profile:?}\n{inputs}{gaussians}", backend.name());
         let checkpoints = Checkpoints::new(out, inputs);
-        let mut trainer = match checkpoints.read(self.resume, profile, &settings)? {
-            Some(trainer) => trainer,
-            None => Trainer::new(start, profile, settings)?,
-        };
+        let mut trainer =
+            match checkpoints.read(self.resume, profile, &settings, Fixed::default())? {
+                Some(trainer) => trainer,
+                None => Trainer::new(start, profile, settings)?,
+            };
         let done = trainer.steps_done();
         let open = |path: &PathBuf| LinesFile::open(path, done);
         let mut lines = self.lines.as_ref().map(open).transpose()?;

@@ -13,6 +13,7 @@ use wildcity_twin::ingest::capture::CaptureError;
 use wildcity_twin::ingest::{self, cameras, capture};
 
 /// A real image and its camera.
+#[derive(Clone, Debug)]
 pub struct RealImage {
     /// Its name in the list.
     pub name: String,

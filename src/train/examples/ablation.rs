@@ -28,7 +28,7 @@ use wildcity_train::poses::RigPoses;
 use wildcity_train::run::{Line, run};
 use wildcity_train::settings::{Growth, PoseMode, Settings, SkyMode};
 use wildcity_train::start::{Point, gaussians_from_points};
-use wildcity_train::trainer::{Start, Trainer};
+use wildcity_train::trainer::{Fixed, Start, Trainer};
 
 use demo_street::{Recording, points, render};
 
@@ -126,7 +126,7 @@ fn train(
         is_ground: is_ground(&at_m, &rig.world_from_ego),
         world_from_camera: recording.images.iter().map(pose).collect(),
         rig: Some(rig.clone()),
-        sky: None,
+        fixed: Fixed::default(),
     };
     let steps = settings.steps;
     let mut trainer = Trainer::new(start, RenderProfile::default(), settings)?;

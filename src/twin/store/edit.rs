@@ -1,6 +1,8 @@
 //! Editing a version: other axes and unit, other drives, another rig. The Gaussians are otherwise
 //! the same.
 
+use std::collections::BTreeSet;
+
 use glam::DMat3;
 
 use wildcity_scene::align::Alignment;
@@ -127,6 +129,34 @@ impl Catalog {
             commit.set_views(Some(views));
         }
         commit.replace(Some(base.number), settings)
+    }
+}
+
+impl Catalog {
+    /// Makes a version with other Gaussians in some cells, such as after training a part of the
+    /// twin, and with all else of an existing one. Gaussians in other cells are left out. What
+    /// others have changed in other cells since the base is kept, so that parts can be trained at
+    /// the same time. `how` is added to the options of its provenance. `progress` gets the number
+    /// of Gaussians written and in all.
+    ///
+    /// # Errors
+    /// The Gaussians are out of a twin's bounds; others changed one of the cells since the base
+    /// ([`StoreError::Overlap`]); or as a commit.
+    pub fn replace_cells(
+        &self,
+        base: &Version,
+        gaussians: &Gaussians,
+        cells: &BTreeSet<[i32; 2]>,
+        how: String,
+        progress: &mut dyn FnMut(u64, u64),
+    ) -> Result<Version, StoreError> {
+        let manifest = &base.manifest;
+        let storage = StorageOptions { record: manifest.record, levels: manifest.has_levels() };
+        let mut commit = self.begin(&manifest.twin, CommitKind::Import, storage)?;
+        commit.put(gaussians, Some(cells), progress)?;
+        let mut provenance = manifest.provenance.for_edit();
+        provenance.options.push(how);
+        commit.change(base.number, VersionChange::new(provenance))
     }
 }
 

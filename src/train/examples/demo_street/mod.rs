@@ -45,6 +45,10 @@ impl TrainingImages for Recording {
         Some(self.images[index].place)
     }
 
+    fn view(&self, index: usize) -> View {
+        self.images[index].view
+    }
+
     fn name(&self, index: usize) -> String {
         format!("image {index}")
     }

@@ -1,0 +1,49 @@
+"""Trains the blocks of a twin as Ray tasks, on as many machines as the cluster has.
+
+    pip install ./clients/python 'ray[default]'
+    wildcity train LOG --out coarse.ply --twin TWIN --size 0.25 --cap 500000
+    python ray_blocks.py TWIN LOG BLOCKS [OPTION..]
+
+Each task runs `wildcity train block TWIN@VERSION --block I/BLOCKS` on its own part of the route, with the options that
+follow, and publishes its cells. A task that fails, or whose machine is lost, is tried again and goes on from its last
+checkpoint. The log, the twins (`--twins`, a folder or an object store) and the working directory are shared. On a
+machine with GPUs, `WILDCITY_GPUS_PER_BLOCK=1` gives each block a GPU.
+
+Versions of the twin are made in the order in which blocks end; the last one is the same in any order.
+"""
+
+import os
+import subprocess
+import sys
+
+import ray
+from wildcity.serving import binary
+
+
+def train_block(twin: str, log: str, block: str, options: list[str]) -> str:
+    """Trains one block, and returns what the program says about it."""
+    checkpoint = f"{twin.replace('@', '-')}-block-{block.replace('/', '-of-')}.checkpoint"
+    command = [str(binary()), "train", "block", twin, "--images", log, "--block", block, "--checkpoint", checkpoint]
+    done = subprocess.run([*command, *options], capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise RuntimeError(f"block {block}: {done.stderr.strip()}")
+    return done.stdout.strip()
+
+
+def main(twin: str, log: str, blocks: int, options: list[str]) -> None:
+    if "@" not in twin:
+        raise SystemExit(f"give the version of the coarse twin, for example {twin}@1: all blocks begin from the same")
+    ray.init(include_dashboard=False, log_to_driver=False)
+    task = ray.remote(max_retries=3, retry_exceptions=True)(train_block)
+    task = task.options(num_cpus=1, num_gpus=float(os.environ.get("WILDCITY_GPUS_PER_BLOCK", "0")))
+    pending = {task.remote(twin, log, f"{k}/{blocks}", options): k for k in range(1, blocks + 1)}
+    while pending:
+        [done], _ = ray.wait(list(pending), num_returns=1)
+        print(f"block {pending.pop(done)}/{blocks}\n{ray.get(done)}", flush=True)
+    ray.shutdown()
+
+
+if __name__ == "__main__":
+    if len(sys.argv) < 4:
+        raise SystemExit(__doc__)
+    main(sys.argv[1], sys.argv[2], int(sys.argv[3]), sys.argv[4:])

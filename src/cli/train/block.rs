@@ -1,0 +1,349 @@
+//! `wildcity train block`.
+
+use std::io::{self, Write};
+use std::path::PathBuf;
+use std::str::FromStr;
+
+use anyhow::{Context, ensure};
+use glam::DVec3;
+use wildcity_render::gradient::Differentiate;
+use wildcity_scene::geometry::Bounds;
+use wildcity_scene::{Gaussians, Scene};
+use wildcity_train::blocks::{Blocks, HALO_M, sees};
+use wildcity_train::ground::is_ground;
+use wildcity_train::held_out::{held_out_db, scene_db};
+use wildcity_train::run::TrainingImages;
+use wildcity_train::settings::{PoseMode, Settings, SkyMode};
+use wildcity_train::trainer::{Fixed, Start, Trainer};
+use wildcity_twin::residency::Cache;
+use wildcity_twin::store::{Catalog, Version};
+
+use super::checkpoints::{self, Checkpoints};
+use super::images::ChosenImages;
+use super::progress::train;
+use super::recorded::{RecordedImages, Recording};
+use super::scene::{fraction, read_settings};
+use super::start;
+use crate::cli::backend_options::HardwareOptions;
+use crate::cli::directories::{EditedTwin, Twins};
+use crate::cli::{output, progress};
+
+/// Train one block of a twin in detail: a part of its route, on any machine and in any order.
+///
+/// First make a coarse twin of the whole recording (`wildcity train LOG --size 0.25 --twin T`),
+/// with its poses and its sky. Then train block 1 of N, 2 of N and so on, here one after the other
+/// or on as many machines at the same time: each learns from the images that see its part, with the
+/// poses and the sky of the coarse twin and its Gaussians around, and replaces only its own cells
+/// of 64 m. Name the version of the coarse twin (T@1), and the result is the same in any order.
+///
+/// Prints the PSNR of held-out images that see both sides of a border, by the block alone and by
+/// the twin: a seam would show as a difference.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = EXAMPLES)]
+pub(in crate::cli) struct Block {
+    #[command(flatten)]
+    edited: EditedTwin,
+
+    #[command(flatten)]
+    recorded: RecordedImages,
+
+    /// Which block of how many, for example 2/4.
+    #[arg(long, value_name = "I/N")]
+    block: BlockOf,
+
+    /// Steps, each on one image [default: that of --settings, or 7000]
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
+    steps: Option<u32>,
+
+    /// Most Gaussians of the block at any time [default: that of --settings, or 1000000]
+    #[arg(long, value_name = "COUNT", value_parser = clap::value_parser!(u32).range(1..))]
+    cap: Option<u32>,
+
+    /// Train on images of this fraction of their width, from 0.05 to 1.
+    #[arg(long, value_name = "FRACTION", default_value_t = 1.0, value_parser = fraction)]
+    size: f64,
+
+    /// Hold out one recorded image of N. 0 holds out none.
+    #[arg(long, value_name = "N", default_value_t = 8)]
+    held_out_every: usize,
+
+    /// Keep the state of the run in this file each 500 steps, and go on from it if it is there: a
+    /// scheduler that repeats the command loses nothing. It is removed at the end.
+    #[arg(long, value_name = "FILE")]
+    checkpoint: Option<PathBuf>,
+
+    /// TOML file of all settings, of which poses, sky and exposure stay off [default: those of
+    /// `wildcity train settings`]
+    #[arg(long, value_name = "FILE")]
+    settings: Option<PathBuf>,
+
+    #[command(flatten)]
+    twins: Twins,
+
+    #[command(flatten)]
+    hardware: HardwareOptions,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity train log --out coarse.ply --twin street --size 0.25 --cap 500000
+  wildcity train block street@1 --images log --block 1/2
+  wildcity train block street@1 --images log --block 2/2";
+
+/// Gaussians of a block, at most, that decide which images see it.
+const SAMPLE: usize = 2_000;
+
+/// Gaussians of the twin are drawn behind a block up to this distance from it, in metres.
+const BEHIND_M: f64 = 300.0;
+
+/// A block by its number, counted from 1, and the number of all.
+#[derive(Clone, Copy, Debug)]
+struct BlockOf {
+    number: usize,
+    all: usize,
+}
+
+impl FromStr for BlockOf {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let numbers = text.split_once('/').and_then(|(number, all)| {
+            Some(Self { number: number.parse().ok()?, all: all.parse().ok()? })
+        });
+        let is_one = |block: &Self| (1..=block.all).contains(&block.number);
+        let expected = || format!("{text:?} is no block: give its number and that of all, as 2/4");
+        numbers.filter(is_one).ok_or_else(expected)
+    }
+}
+
+/// The Gaussians of a twin as a block sees them.
+struct Parts {
+    /// Those in its cells and near them.
+    moving: Gaussians,
+    /// Those around, which stay.
+    around: Gaussians,
+    /// Means of some in its cells, and of some near them, in metres.
+    own_m: Vec<DVec3>,
+    halo_m: Vec<DVec3>,
+}
+
+impl Block {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        let settings = self.training_settings()?;
+        let catalog = self.twins.catalog()?;
+        let base = catalog.version(&self.edited.twin.name, self.edited.twin.number)?;
+        let manifest = &base.manifest;
+        let cells: Vec<([i32; 2], u64)> =
+            manifest.chunks.iter().map(|chunk| (chunk.cell, chunk.count)).collect();
+        let drives = manifest.trajectories.iter().flat_map(|drive| &drive.keyframes);
+        let path_m: Vec<DVec3> = drives.map(|key| key.world_from_rig.position_m).collect();
+        let BlockOf { number, all } = self.block;
+        let blocks = Blocks::new(&cells, &path_m, all).context("--block")?;
+        let parts = Parts::read(&catalog, &base, &blocks, number - 1)?;
+        ensure!(!parts.moving.is_empty(), "block {number}/{all} has no Gaussians");
+
+        let recording = self.recorded.open(&catalog, &base, self.size, self.held_out_every)?;
+        let sees_one =
+            |points_m: &[DVec3], index: usize| sees(&recording.images.view(index), points_m);
+        let seeing: Vec<usize> =
+            (0..recording.images.count()).filter(|&index| sees_one(&parts.own_m, index)).collect();
+        let across = seeing.iter().copied().filter(|&index| sees_one(&parts.halo_m, index));
+        let across = ChosenImages { all: &*recording.images, chosen: across.collect() };
+        let images = ChosenImages { all: &*recording.images, chosen: seeing };
+        ensure!(
+            images.count() > 0,
+            "no image sees block {number}/{all}: are the images of this twin?"
+        );
+
+        let backend = &*self.hardware.training()?;
+        writeln!(
+            io::stderr(),
+            "block {number}/{all}: {} of 64 m; {} of {} that move and {} around; {}, {} of them held out; backend {}",
+            output::counted(blocks.cells(number - 1).len(), "cell"),
+            parts.moving.len(),
+            output::counted(usize::try_from(manifest.gaussians())?, "Gaussian"),
+            parts.around.len(),
+            output::counted(images.count(), "image"),
+            images.held_out().len(),
+            backend.name()
+        )?;
+        let trainer = self.train(&catalog, &base, &images, &parts, &recording, settings)?;
+        self.publish(&catalog, &base, &blocks, &trainer, &across, backend)
+    }
+
+    /// Takes the run to its end.
+    fn train(
+        &self,
+        catalog: &Catalog,
+        base: &Version,
+        images: &ChosenImages<'_>,
+        parts: &Parts,
+        recording: &Recording,
+        settings: Settings,
+    ) -> anyhow::Result<Trainer> {
+        let backend = &*self.hardware.training()?;
+        let name = &self.edited.twin.name;
+        let sky = Cache::new(catalog.clone()).open(name, Some(base.number))?.sky().cloned();
+        let fixed = Fixed { sky, chunks: Scene::from_gaussians(&parts.around).chunks };
+        let profile = base.manifest.profile;
+        let BlockOf { number, all } = self.block;
+        let text = format!(
+            "{} {} {number}/{all} {profile:?}\n{}{}",
+            backend.name(),
+            base.hash,
+            recording.inputs,
+            start::inputs(&parts.moving)
+        );
+        let checkpoints = self.checkpoint.as_deref().map(|path| Checkpoints::at(path, text));
+        let is_there = self.checkpoint.as_ref().is_some_and(|path| path.exists());
+        let resumed = match &checkpoints {
+            Some(checkpoints) => checkpoints.read(is_there, profile, &settings, fixed.clone())?,
+            None => None,
+        };
+        let mut trainer = match resumed {
+            Some(trainer) => trainer,
+            None => {
+                let means_m: Vec<DVec3> =
+                    parts.moving.means_m.iter().map(|m| DVec3::from_array(*m)).collect();
+                let egos = recording.rig.as_ref().map(|rig| &rig.world_from_ego);
+                let start = Start {
+                    is_ground: egos.map(|egos| is_ground(&means_m, egos)).unwrap_or_default(),
+                    gaussians: parts.moving.clone(),
+                    world_from_camera: recording.world_from_camera.clone(),
+                    rig: recording.rig.clone(),
+                    fixed,
+                };
+                Trainer::new(start, profile, settings)?
+            }
+        };
+        let before = held_out_db(&trainer, images, backend)?;
+        let after = train(&mut trainer, images, backend, &mut |line, trainer| {
+            let is_time = line.step.is_multiple_of(checkpoints::EVERY);
+            match &checkpoints {
+                Some(checkpoints) if is_time => checkpoints.write(trainer),
+                _ => Ok(()),
+            }
+        })?;
+        let [done, steps] = [trainer.steps_done(), trainer.settings().steps];
+        if done < steps {
+            let mut how = "begin anew";
+            if let Some(checkpoints) = &checkpoints {
+                checkpoints.write(&trainer)?;
+                how = "the same command goes on";
+            }
+            anyhow::bail!("stopped after {done} of {steps} steps; the twin is as it was: {how}");
+        }
+        if let Some((before, (after, seconds))) = before.zip(after) {
+            writeln!(
+                io::stdout().lock(),
+                "held out: {before:.2} dB, and {after:.2} dB after {steps} steps, {seconds:.0} s"
+            )?;
+        }
+        Ok(trainer)
+    }
+
+    /// Makes the new version, and compares both sides of its borders.
+    fn publish(
+        &self,
+        catalog: &Catalog,
+        base: &Version,
+        blocks: &Blocks,
+        trainer: &Trainer,
+        across: &ChosenImages<'_>,
+        backend: &dyn Differentiate,
+    ) -> anyhow::Result<()> {
+        let BlockOf { number, all } = self.block;
+        let bar = progress::count("writing");
+        // The same for every block, so that their order does not show.
+        let how = format!("blocks={all}: {} steps", trainer.settings().steps);
+        let cells = blocks.cells(number - 1);
+        let gaussians = trainer.model().to_gaussians();
+        let version =
+            catalog.replace_cells(base, &gaussians, cells, how, &mut progress::show(&bar))?;
+        bar.finish_and_clear();
+        if let Some(path) = &self.checkpoint {
+            checkpoints::remove_file(path)?;
+        }
+        let mut stdout = io::stdout().lock();
+        let Version { number: version_number, hash, .. } = &version;
+        writeln!(
+            stdout,
+            "twin {} version {version_number}: block {number}/{all}\nblake3 {hash}",
+            self.edited.twin.name
+        )?;
+        if across.held_out().is_empty() {
+            writeln!(stdout, "no image that is held out sees both sides of a border")?;
+            return Ok(());
+        }
+        let published = Parts::read(catalog, &version, blocks, number - 1)?;
+        let mut gaussians = published.moving;
+        gaussians.append(&published.around);
+        let sky = trainer.scene()?.sky;
+        let scene = Scene { sky, ..Scene::from_gaussians(&gaussians) };
+        let alone = held_out_db(trainer, across, backend)?;
+        let joined = scene_db(&scene, trainer, across, backend)?;
+        if let Some((alone, joined)) = alone.zip(joined) {
+            writeln!(
+                stdout,
+                "across the borders ({}): {alone:.2} dB by the block alone, {joined:.2} dB by the twin",
+                output::counted(across.held_out().len(), "image")
+            )?;
+        }
+        Ok(())
+    }
+
+    fn training_settings(&self) -> anyhow::Result<Settings> {
+        let mut settings = match &self.settings {
+            None => Settings::default(),
+            Some(path) => read_settings(path)?,
+        };
+        settings.steps = self.steps.map_or(settings.steps, |steps| steps as usize);
+        settings.growth.cap = self.cap.map_or(settings.growth.cap, |cap| cap as usize);
+        settings.poses.mode = PoseMode::Off;
+        settings.sky.mode = SkyMode::Off;
+        settings.exposure.on = false;
+        settings.check()?;
+        Ok(settings)
+    }
+}
+
+impl Parts {
+    fn read(
+        catalog: &Catalog,
+        version: &Version,
+        blocks: &Blocks,
+        block: usize,
+    ) -> anyhow::Result<Self> {
+        let sh_degree = version.manifest.sh_degree;
+        let empty = || Gaussians { sh_degree, ..Gaussians::default() };
+        let [mut moving, mut around] = [empty(), empty()];
+        let [mut own_m, mut halo_m] = [Vec::new(), Vec::new()];
+        let is_near = |bounds: &Bounds| {
+            let middle_m = 0.5 * (bounds.min_m + bounds.max_m);
+            let half_m = middle_m.distance(bounds.max_m);
+            blocks.distance_m(block, middle_m) <= BEHIND_M + half_m
+        };
+        catalog.visit_full_detail(version, &is_near, &mut |section| {
+            let distances: Vec<f64> = section
+                .means_m
+                .iter()
+                .map(|mean_m| blocks.distance_m(block, DVec3::from_array(*mean_m)))
+                .collect();
+            let at = |is_one: &dyn Fn(f64) -> bool| {
+                (0..section.len()).filter(|&k| is_one(distances[k])).collect::<Vec<_>>()
+            };
+            let moves = at(&|distance_m| distance_m <= HALO_M);
+            for &k in &moves {
+                let mean_m = DVec3::from_array(section.means_m[k]);
+                if distances[k] > 0.0 { halo_m.push(mean_m) } else { own_m.push(mean_m) }
+            }
+            moving.append(&section.select(moves));
+            around.append(&section.select(at(&|distance_m| distance_m > HALO_M)));
+        })?;
+        let sample = |points_m: Vec<DVec3>| {
+            let every = points_m.len().div_ceil(SAMPLE).max(1);
+            points_m.into_iter().step_by(every).collect()
+        };
+        Ok(Self { moving, around, own_m: sample(own_m), halo_m: sample(halo_m) })
+    }
+}
