@@ -1,6 +1,7 @@
 //! Files that a command writes: afterwards each is complete, or as it was before.
 
 use std::fs;
+use std::io::{BufWriter, Write};
 use std::path::Path;
 use std::process;
 
@@ -9,12 +10,26 @@ use anyhow::Context;
 /// Writes a file under a temporary name in the same directory, and then renames it. A reader finds
 /// the old file or the new one, even after a full disk.
 pub fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    write_by(path, |file| Ok(file.write_all(bytes)?))
+}
+
+/// The same for a file that is written part by part.
+pub fn write_by(
+    path: &Path,
+    contents: impl FnOnce(&mut BufWriter<fs::File>) -> anyhow::Result<()>,
+) -> anyhow::Result<()> {
     let cannot = || format!("cannot write {}", path.display());
     let name = path.file_name().context("the path has no file name").with_context(cannot)?;
     let mut temporary_name = name.to_owned();
     temporary_name.push(format!(".{}.tmp", process::id()));
     let temporary = path.with_file_name(temporary_name);
-    let written = fs::write(&temporary, bytes).and_then(|()| fs::rename(&temporary, path));
+    let write = || {
+        let mut file = BufWriter::new(fs::File::create(&temporary)?);
+        contents(&mut file)?;
+        file.flush()?;
+        Ok(fs::rename(&temporary, path)?)
+    };
+    let written: anyhow::Result<()> = write();
     if written.is_err() {
         // The first error is the one to report. A file that cannot be removed was most likely never
         // made.

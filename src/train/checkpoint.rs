@@ -1,9 +1,13 @@
 //! The whole state of a run in a file, so that a run which is stopped goes on to the same bytes.
 //!
 //! The file is bincode after one line of text, and its last 32 bytes are the BLAKE3 hash of all
-//! before: half a file is refused.
+//! before: half a file is refused. It is written and read as a stream: a run takes no second copy
+//! of its state for it.
+
+use std::io::{self, Read, Write};
 
 use bincode::config::{self, Config};
+use bincode::error::{DecodeError, EncodeError};
 use serde::{Deserialize, Serialize};
 
 use wildcity_render::gradient::Gradients;
@@ -11,7 +15,7 @@ use wildcity_scene::RenderProfile;
 
 use crate::exposures::TrainedExposures;
 use crate::history::History;
-use crate::model::{Model, ModelState};
+use crate::model::{Model, ModelState, SavedModel};
 use crate::poses::{RigPoses, TrainedPoses};
 use crate::settings::Settings;
 use crate::sky::TrainedSky;
@@ -23,7 +27,7 @@ const FORMAT: &[u8] = b"wildcity.checkpoint/2\n";
 /// Bytes of the hash at the end.
 const HASH: usize = blake3::OUT_LEN;
 
-/// Why a run cannot go on from a file.
+/// Why a run cannot be written, or cannot go on from a file.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
     /// Another file, or one of another version of the program.
@@ -42,46 +46,73 @@ pub enum CheckpointError {
         "the checkpoint is of a run with other settings: give those, or begin anew, without --resume"
     )]
     OtherSettings,
+    /// The file cannot be written or read.
+    #[error(transparent)]
+    Io(#[from] io::Error),
+    /// The state cannot be written.
+    #[error(transparent)]
+    Encode(#[from] EncodeError),
 }
 
-/// All that a run must know to go on.
+/// What names a run, at the beginning of a file.
 #[derive(Serialize, Deserialize)]
-struct State {
+struct Header {
     /// The hash of what names images, cameras and points.
     inputs: [u8; HASH],
     settings: Settings,
+}
+
+/// All else that a run must know to go on, as it is read.
+#[derive(Deserialize)]
+struct State {
     step: u64,
     history: History,
-    model: ModelState,
     rig: Option<RigPoses>,
     poses: Option<TrainedPoses>,
     exposures: Option<TrainedExposures>,
     sky: Option<TrainedSky>,
+    model: ModelState,
+}
+
+/// The same, as it is written.
+#[derive(Serialize)]
+struct SavedState<'a> {
+    step: u64,
+    history: &'a History,
+    rig: &'a Option<RigPoses>,
+    poses: &'a Option<TrainedPoses>,
+    exposures: &'a Option<TrainedExposures>,
+    sky: &'a Option<TrainedSky>,
+    model: SavedModel<'a>,
 }
 
 impl Trainer {
-    /// The bytes of a file that [`Trainer::from_checkpoint`] reads. `inputs` is any text that names
-    /// the images, cameras and points of the run, of which the file keeps a hash.
+    /// Writes a file that [`Trainer::from_checkpoint`] reads. `inputs` is any text that names the
+    /// images, cameras and points of the run, of which the file keeps a hash.
     ///
     /// # Errors
-    /// The state is larger than the address space.
-    pub fn to_checkpoint(&self, inputs: &str) -> Result<Vec<u8>, CheckpointError> {
-        let state = State {
-            inputs: *blake3::hash(inputs.as_bytes()).as_bytes(),
-            settings: self.settings.clone(),
+    /// It cannot be written.
+    pub fn write_checkpoint(
+        &self,
+        inputs: &str,
+        mut to: impl Write,
+    ) -> Result<(), CheckpointError> {
+        let mut hashed = Hashed { inner: &mut to, hasher: blake3::Hasher::new() };
+        hashed.write_all(FORMAT)?;
+        let header = Header { inputs: hash(inputs), settings: self.settings.clone() };
+        bincode::serde::encode_into_std_write(&header, &mut hashed, encoding())?;
+        let state = SavedState {
             step: self.step as u64,
-            history: self.history.clone(),
-            model: self.model.state(),
-            rig: self.rig.clone(),
-            poses: self.poses.clone(),
-            exposures: self.exposures.clone(),
-            sky: self.sky.clone(),
+            history: &self.history,
+            rig: &self.rig,
+            poses: &self.poses,
+            exposures: &self.exposures,
+            sky: &self.sky,
+            model: self.model.saved(),
         };
-        let mut bytes = FORMAT.to_vec();
-        bincode::serde::encode_into_std_write(&state, &mut bytes, encoding())
-            .map_err(|error| CheckpointError::Damaged(error.to_string()))?;
-        bytes.extend(blake3::hash(&bytes).as_bytes());
-        Ok(bytes)
+        bincode::serde::encode_into_std_write(&state, &mut hashed, encoding())?;
+        let hash = hashed.hasher.finalize();
+        Ok(to.write_all(hash.as_bytes())?)
     }
 
     /// The run that wrote a file, at the step at which it did. What is not trained is not in the
@@ -90,32 +121,36 @@ impl Trainer {
     /// # Errors
     /// The file is damaged, or of a run with other inputs or settings.
     pub fn from_checkpoint(
-        bytes: &[u8],
+        from: impl Read,
         inputs: &str,
         profile: RenderProfile,
         settings: &Settings,
         fixed: Fixed,
     ) -> Result<Self, CheckpointError> {
-        let contents = bytes.strip_prefix(FORMAT).ok_or(CheckpointError::Format)?;
-        let Some((contents, hash)) = contents.split_last_chunk::<HASH>() else {
-            return Err(CheckpointError::Damaged("it is cut off".to_owned()));
-        };
-        let hashed = &bytes[..bytes.len() - HASH];
-        if blake3::hash(hashed) != blake3::Hash::from_bytes(*hash) {
-            return Err(CheckpointError::Damaged("its hash is another".to_owned()));
+        let mut hashed = Hashed { inner: from, hasher: blake3::Hasher::new() };
+        let mut format = [0; FORMAT.len()];
+        if hashed.read_exact(&mut format).is_err() || format != FORMAT {
+            return Err(CheckpointError::Format);
         }
-        let (state, _): (State, usize) = bincode::serde::decode_from_slice(contents, encoding())
-            .map_err(|error| CheckpointError::Damaged(error.to_string()))?;
-        if state.inputs != *blake3::hash(inputs.as_bytes()).as_bytes() {
+        let header: Header = decode(&mut hashed)?;
+        // Of another run all else may have another form.
+        if header.inputs != hash(inputs) {
             return Err(CheckpointError::OtherInputs);
         }
-        if state.settings != *settings {
+        if header.settings != *settings {
             return Err(CheckpointError::OtherSettings);
+        }
+        let state: State = decode(&mut hashed)?;
+        let Hashed { mut inner, hasher } = hashed;
+        let mut end = Vec::new();
+        inner.by_ref().take(HASH as u64 + 1).read_to_end(&mut end)?;
+        if end != hasher.finalize().as_bytes() {
+            return Err(CheckpointError::Damaged("its hash is another".to_owned()));
         }
         let Fixed { sky, chunks } = fixed;
         let model = Model::from_state(state.model, chunks);
         Ok(Self {
-            settings: state.settings,
+            settings: header.settings,
             profile,
             model: model.ok_or_else(|| CheckpointError::Damaged("its sizes differ".to_owned()))?,
             rig: state.rig,
@@ -128,6 +163,46 @@ impl Trainer {
             gradients: Gradients::default(),
         })
     }
+}
+
+/// A stream of which all bytes are hashed.
+struct Hashed<T> {
+    inner: T,
+    hasher: blake3::Hasher,
+}
+
+impl<T: Write> Write for Hashed<T> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let written = self.inner.write(bytes)?;
+        self.hasher.update(&bytes[..written]);
+        Ok(written)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.inner.flush()
+    }
+}
+
+impl<T: Read> Read for Hashed<T> {
+    fn read(&mut self, bytes: &mut [u8]) -> io::Result<usize> {
+        let read = self.inner.read(bytes)?;
+        self.hasher.update(&bytes[..read]);
+        Ok(read)
+    }
+}
+
+fn hash(inputs: &str) -> [u8; HASH] {
+    *blake3::hash(inputs.as_bytes()).as_bytes()
+}
+
+/// What a stream has next. A length that is damaged takes no memory before its bytes are there.
+fn decode<T: for<'de> Deserialize<'de>>(from: &mut impl Read) -> Result<T, CheckpointError> {
+    bincode::serde::decode_from_std_read(from, encoding()).map_err(|error| match error {
+        DecodeError::Io { inner, .. } if inner.kind() != io::ErrorKind::UnexpectedEof => {
+            inner.into()
+        }
+        error => CheckpointError::Damaged(error.to_string()),
+    })
 }
 
 fn encoding() -> impl Config {

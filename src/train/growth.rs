@@ -29,8 +29,7 @@ pub(crate) fn relocate_and_grow(model: &mut Model, growth: &Growth, seed: u64) -
         return [0, 0];
     }
     let dead: Vec<usize> = (0..count).filter(|index| !is_alive(index)).collect();
-    let wanted = ((1.0 + growth.rate) * count as f64) as usize;
-    let added = wanted.min(growth.cap).saturating_sub(count);
+    let added = growth.added(count);
 
     // Draw in proportion to the opacity, with replacement.
     let mut sums = Vec::with_capacity(alive.len());

@@ -18,6 +18,8 @@ pub struct CurvePoint {
     pub dssim: f64,
     /// In 1/m.
     pub disparity: f64,
+    /// The mean opacity where the sky is.
+    pub sky: f64,
     pub ground: f64,
     pub gaussians: usize,
 }
@@ -57,6 +59,7 @@ impl History {
         self.sums.l1 += line.l1;
         self.sums.dssim += line.dssim;
         self.sums.disparity += line.disparity;
+        self.sums.sky += line.sky;
         self.sums.ground += line.ground;
         self.steps += 1;
         if self.steps < steps.div_ceil(POINTS) && line.step < steps {
@@ -69,6 +72,7 @@ impl History {
             l1: mean(self.sums.l1),
             dssim: mean(self.sums.dssim),
             disparity: mean(self.sums.disparity),
+            sky: mean(self.sums.sky),
             ground: mean(self.sums.ground),
             gaussians: line.gaussians,
         });
@@ -91,6 +95,7 @@ mod tests {
                 l1: step as f64,
                 dssim: 0.5,
                 disparity: 0.0,
+                sky: 0.0,
                 ground: 0.0,
                 gaussians: step,
                 seconds: step as f64,

@@ -5,6 +5,7 @@
 //! | [`check`] | the gradients of this machine against their definition |
 //! | [`loss`] | losses of images, depths and Gaussians, each with its derivatives |
 //! | [`run`] | a run: from images to Gaussians |
+//! | [`cache`] | decoded images that are kept |
 //! | [`held_out`] | the images that judge it |
 //! | [`history`], [`page`] | its curves, and all of it as a page |
 //! | [`blocks`] | a route in parts, each of which is a run |
@@ -27,6 +28,7 @@
 
 mod adam;
 pub mod blocks;
+pub mod cache;
 pub mod check;
 pub mod checkpoint;
 pub mod compose;

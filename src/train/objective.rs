@@ -17,6 +17,8 @@ pub struct StepReport {
     pub dssim: f64,
     /// In 1/m; 0 without measured depths.
     pub disparity: f64,
+    /// The mean opacity where the sky is; 0 without a mask of it.
+    pub sky: f64,
     /// The weighted sum of the ground's terms; 0 without Gaussians of the ground.
     pub ground: f64,
     /// Number of visible Gaussians.
@@ -57,9 +59,13 @@ impl Objective<'_> {
             (None, None) => Background::Color(sample.background),
         };
         let GaussianImages { rgb, opacity, depth_sum_m } = images;
-        let image = compose(rgb, opacity, background, &self.exposure);
+        let mut image = compose(rgb, opacity, background, &self.exposure);
         let mut report = StepReport::default();
-        let by_image = self.by_colors(&image, &mut report);
+        let clipped = clip(&mut image, sample.rgb);
+        let mut by_image = self.by_colors(&image, &mut report);
+        for index in clipped {
+            by_image[index] = 0.0;
+        }
         let by = compose_gradient(rgb, opacity, background, &self.exposure, &by_image);
         let ComposedGradient { rgb, mut opacity, background, exposure } = by;
         let mut by_depth_sum = Vec::new();
@@ -71,6 +77,17 @@ impl Objective<'_> {
                 *by += more;
             }
             by_depth_sum = loss.by_depth_sum;
+        }
+        if let Some(sky) = sample.sky {
+            // The mean opacity of the pixels that show the sky: a Gaussian there would take the
+            // colour of the sky, and move with the camera.
+            let pixels = sky.iter().filter(|is_sky| **is_sky).count().max(1) as f64;
+            let by_each = (f64::from(sample.weight) * self.weights.sky / pixels) as f32;
+            let shown = opacity.iter_mut().zip(&images.opacity).zip(sky);
+            for ((by, opacity), _) in shown.filter(|(_, is_sky)| **is_sky) {
+                report.sky += f64::from(*opacity) / pixels;
+                *by += by_each;
+            }
         }
         let by_images = GaussianImages { rgb, opacity, depth_sum_m: by_depth_sum };
         let sky = sky.map(|sky| (sky, background));
@@ -99,5 +116,33 @@ impl Objective<'_> {
         };
         report.dssim = similarity.value;
         total.plus(&similarity.scaled(factor * self.weights.dssim)).by
+    }
+}
+
+/// Values of the largest number that 8 bits hold: the sensor may have seen more.
+const CLIPPED: f32 = 254.5 / 255.0;
+
+/// Clips an image where the recorded one is clipped: how much brighter it is there is not known,
+/// and an image of 8 stops more would darken all others. Returns the places.
+fn clip(image: &mut [f32], recorded: &[f32]) -> Vec<usize> {
+    let mut clipped = Vec::new();
+    for (index, (value, recorded)) in image.iter_mut().zip(recorded).enumerate() {
+        if *recorded >= CLIPPED && *value > 1.0 {
+            *value = 1.0;
+            clipped.push(index);
+        }
+    }
+    clipped
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_what_is_brighter_than_a_clipped_value_is_clipped() {
+        let mut image = [1.5, 1.5, 0.9, f32::INFINITY];
+        assert_eq!(clip(&mut image, &[1.0, 0.99, 1.0, 1.0]), [0, 3]);
+        assert_eq!(image, [1.0, 1.5, 0.9, 1.0]);
     }
 }

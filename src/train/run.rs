@@ -30,6 +30,8 @@ pub struct TrainingImage {
     pub rgb8: Vec<u8>,
     /// `[height, width]`: the pixels that count; all without it.
     pub mask: Option<Vec<bool>>,
+    /// `[height, width]`: the pixels that show the sky, where that is known.
+    pub sky: Option<Vec<bool>>,
     /// `[height, width]`: measured depths in metres; 0 where there is none.
     pub depth_m: Option<Vec<f32>>,
     /// Factor of the losses, 1 for an image that was recorded.
@@ -39,6 +41,12 @@ pub struct TrainingImage {
 }
 
 impl TrainingImage {
+    /// What it takes in memory.
+    pub(crate) fn bytes(&self) -> usize {
+        let flags = [&self.mask, &self.sky].into_iter().flatten().map(Vec::len).sum::<usize>();
+        self.rgb8.len() + flags + 4 * self.depth_m.as_ref().map_or(0, Vec::len)
+    }
+
     /// Whether some pixel counts: what moves may hide all of an image.
     pub(crate) fn counts(&self) -> bool {
         self.mask.as_ref().is_none_or(|mask| mask.contains(&true))
@@ -89,6 +97,8 @@ pub struct Line {
     pub dssim: f64,
     /// In 1/m; 0 without measured depths.
     pub disparity: f64,
+    /// The mean opacity where the sky is; 0 without a mask of it.
+    pub sky: f64,
     /// The weighted sum of the ground's terms.
     pub ground: f64,
     pub gaussians: usize,
@@ -154,10 +164,10 @@ pub fn run(
 
 impl Line {
     fn new(trainer: &Trainer, report: StepReport, seconds: f64, held_out_db: Option<f64>) -> Self {
-        let StepReport { l1, dssim, disparity, ground, stages_ms, .. } = report;
+        let StepReport { l1, dssim, disparity, sky, ground, stages_ms, .. } = report;
         let step = trainer.steps_done();
         let gaussians = trainer.model().len();
-        Self { step, l1, dssim, disparity, ground, gaussians, seconds, held_out_db, stages_ms }
+        Self { step, l1, dssim, disparity, sky, ground, gaussians, seconds, held_out_db, stages_ms }
     }
 }
 
@@ -216,13 +226,17 @@ fn step(
     if !image.counts() {
         return Ok(trainer.skip());
     }
-    let TrainingImage { view, rgb8, mask, mut depth_m, weight, exposure } = image;
+    let TrainingImage { view, rgb8, mask, mut sky, mut depth_m, weight, exposure } = image;
     if let Some((depth_m, mask)) = depth_m.as_mut().zip(mask.as_ref()) {
         // What does not count has no depth either.
         let left_out = depth_m.iter_mut().zip(mask).filter(|(_, counts)| !**counts);
         left_out.for_each(|(depth_m, _)| *depth_m = 0.0);
     }
     let rgb: Vec<f32> = rgb8.iter().map(|&value| f32::from(value) / 255.0).collect();
+    // What does not count shows no sky either.
+    if let Some((sky, mask)) = sky.as_mut().zip(mask.as_ref()) {
+        sky.iter_mut().zip(mask).for_each(|(is_sky, counts)| *is_sky &= *counts);
+    }
     let weights: Option<Vec<f32>> =
         mask.map(|mask| mask.iter().map(|&counts| if counts { 1.0 } else { 0.0 }).collect());
     let background = trainer.profile().background;
@@ -232,6 +246,7 @@ fn step(
         place: images.place(index),
         rgb: &rgb,
         weights: weights.as_deref(),
+        sky: sky.as_deref(),
         depth_m: depth_m.as_deref(),
         background: background.map(|value| value as f32),
         weight,

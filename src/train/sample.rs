@@ -18,6 +18,8 @@ pub struct Sample<'a> {
     pub rgb: &'a [f32],
     /// `[height, width]`: the weight of each pixel; 0 leaves it out.
     pub weights: Option<&'a [f32]>,
+    /// `[height, width]`: the pixels that show the sky, where that is known.
+    pub sky: Option<&'a [bool]>,
     /// `[height, width]`: measured depths in metres; 0 where there is none.
     pub depth_m: Option<&'a [f32]>,
     /// The colour behind all Gaussians of a run without a sky.
@@ -39,6 +41,7 @@ impl Sample<'_> {
         let sizes = [
             ("image", Some(self.rgb.len()), 3 * pixels),
             ("mask", self.weights.map(<[f32]>::len), pixels),
+            ("sky", self.sky.map(<[bool]>::len), pixels),
             ("depth", self.depth_m.map(<[f32]>::len), pixels),
         ];
         for (image, given, wanted) in sizes {

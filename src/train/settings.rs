@@ -57,6 +57,8 @@ pub struct Weights {
     pub scale: f32,
     /// Of the disparity of measured depths.
     pub disparity: f64,
+    /// Of the mean opacity of the pixels that show the sky.
+    pub sky: f64,
 }
 
 /// How the number of Gaussians grows, after 3D Gaussian splatting as Markov chain Monte Carlo
@@ -231,7 +233,7 @@ impl Default for Rates {
 
 impl Default for Weights {
     fn default() -> Self {
-        Self { dssim: 0.2, opacity: 0.01, scale: 0.01, disparity: 0.1 }
+        Self { dssim: 0.2, opacity: 0.01, scale: 0.01, disparity: 0.1, sky: 0.1 }
     }
 }
 
@@ -291,6 +293,7 @@ impl Settings {
             ("loss.opacity", loss.opacity.into()),
             ("loss.scale", loss.scale.into()),
             ("loss.disparity", loss.disparity),
+            ("loss.sky", loss.sky),
             ("growth.noise", growth.noise.into()),
             ("poses.weight", poses.weight),
             ("exposure.weight", exposure.weight),
@@ -330,6 +333,26 @@ impl Settings {
         Ok(())
     }
 
+    /// The number of Gaussians at each step of a run that begins with `start`, if all stay opaque:
+    /// the most that a run can have.
+    pub fn counts(&self, start: usize) -> impl Iterator<Item = usize> {
+        let mut count = start;
+        (1..=self.steps).map(move |step| {
+            if self.grows_at(step) {
+                count += self.growth.added(count);
+            }
+            count
+        })
+    }
+
+    /// Whether Gaussians are moved and added after a step.
+    pub(crate) fn grows_at(&self, step: usize) -> bool {
+        let Growth { from, until, every, .. } = self.growth;
+        let [from, until] = [from, until].map(|step| self.scaled(step));
+        // In short runs as often as in long ones: opacities take their time to fall.
+        step.is_multiple_of(every) && step >= from && step < until
+    }
+
     /// A step of a schedule of 30,000 as one of this run.
     pub(crate) fn scaled(&self, step: usize) -> usize {
         (step as f64 * self.steps as f64 / SCHEDULE as f64).round() as usize
@@ -338,6 +361,14 @@ impl Settings {
     /// A step of this run as one of a schedule of 30,000.
     pub(crate) fn unscaled(&self, step: usize) -> usize {
         (step as f64 * SCHEDULE as f64 / self.steps as f64).round() as usize
+    }
+}
+
+impl Growth {
+    /// How many Gaussians are added to some.
+    pub(crate) fn added(&self, count: usize) -> usize {
+        let wanted = ((1.0 + self.rate) * count as f64) as usize;
+        wanted.min(self.cap).saturating_sub(count)
     }
 }
 

@@ -162,6 +162,12 @@ impl Trainer {
         self.poses.as_ref().map(TrainedPoses::now)
     }
 
+    /// The exposure of each image as it is now, if it is trained: after the recorded one.
+    pub fn exposures(&self) -> Option<Vec<Exposure<f32>>> {
+        let exposures = self.exposures.as_ref()?;
+        Some((0..exposures.images()).map(|image| exposures.exposure(image, 1.0)).collect())
+    }
+
     /// A camera of the run at the pose that it has now.
     pub fn view(&self, view: View, image: usize, place: Option<Place>) -> View {
         match (&self.poses, self.trained_place(image, place)) {
@@ -369,11 +375,8 @@ impl Trainer {
     }
 
     fn grow(&mut self) {
-        let growth = &self.settings.growth;
-        let [from, until] = [growth.from, growth.until].map(|step| self.settings.scaled(step));
-        // In short runs as often as in long ones: opacities take their time to fall.
-        let is_time = self.step.is_multiple_of(growth.every);
-        if is_time && self.step >= from && self.step < until {
+        if self.settings.grows_at(self.step) {
+            let growth = &self.settings.growth;
             let seed = mix(self.settings.seed ^ mix(!(self.step as u64)));
             relocate_and_grow(&mut self.model, growth, seed);
         }

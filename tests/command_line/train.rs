@@ -221,7 +221,8 @@ fn blocks_of_a_twin_make_the_same_twin_in_any_order() {
     let log = ["log", "generate", "lane", "--out", "log", "--length-m", "20", "--width", "160"];
     done(dir, &[&log[..], &twins].concat());
     let block = |block: &str, more: &[&str]| {
-        let fixed = ["train", "block", "lane@1", "--images", "log", "--steps", "3", "--block", block];
+        let fixed =
+            ["train", "block", "lane@1", "--images", "log", "--steps", "3", "--block", block];
         done(dir, &[&fixed[..], &twins, &["--held-out-every", "3"], more].concat())
     };
     let said = block("1/2", &["--checkpoint", "block.checkpoint"]);

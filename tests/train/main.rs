@@ -12,5 +12,6 @@ mod cameras;
 mod check;
 mod loss_vectors;
 mod losses;
+mod stress;
 mod training;
 mod vectors;

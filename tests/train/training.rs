@@ -22,6 +22,7 @@ pub(crate) fn sample(view: View, rgb: &[f32]) -> Sample<'_> {
         place: None,
         rgb,
         weights: None,
+        sky: None,
         depth_m: None,
         background: [0.0; 3],
         weight: 1.0,

@@ -1,5 +1,6 @@
 //! `wildcity train block`.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::{self, Write};
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -20,9 +21,9 @@ use wildcity_twin::store::{Catalog, Version};
 
 use super::checkpoints::{self, Checkpoints};
 use super::images::ChosenImages;
+use super::options::{fraction, read_settings};
 use super::progress::train;
 use super::recorded::{RecordedImages, Recording};
-use super::scene::{fraction, read_settings};
 use super::start;
 use crate::cli::backend_options::HardwareOptions;
 use crate::cli::directories::{EditedTwin, Twins};
@@ -139,6 +140,7 @@ impl Block {
         let path_m: Vec<DVec3> = drives.map(|key| key.world_from_rig.position_m).collect();
         let BlockOf { number, all } = self.block;
         let blocks = Blocks::new(&cells, &path_m, all).context("--block")?;
+        self.check_unchanged(&catalog, &base, blocks.cells(number - 1))?;
         let parts = Parts::read(&catalog, &base, &blocks, number - 1)?;
         ensure!(!parts.moving.is_empty(), "block {number}/{all} has no Gaussians");
 
@@ -169,6 +171,30 @@ impl Block {
         )?;
         let trainer = self.train(&catalog, &base, &images, &parts, &recording, settings)?;
         self.publish(&catalog, &base, &blocks, &trainer, &across, backend)
+    }
+
+    /// Checks, before a long run, that its result can be published: nobody has changed its cells
+    /// since the version that it begins from.
+    fn check_unchanged(
+        &self,
+        catalog: &Catalog,
+        base: &Version,
+        cells: &BTreeSet<[i32; 2]>,
+    ) -> anyhow::Result<()> {
+        let latest = catalog.version(&self.edited.twin.name, None)?;
+        let objects = |version: &Version| -> BTreeMap<[i32; 2], String> {
+            let own = version.manifest.chunks.iter().filter(|chunk| cells.contains(&chunk.cell));
+            own.map(|chunk| (chunk.cell, chunk.object.clone())).collect()
+        };
+        let BlockOf { number, all } = self.block;
+        ensure!(
+            objects(base) == objects(&latest),
+            "block {number}/{all} of twin {} has changed from version {} to {}: it may have been trained already; to train it              further, begin from version {2}",
+            self.edited.twin.name,
+            base.number,
+            latest.number
+        );
+        Ok(())
     }
 
     /// Takes the run to its end.

@@ -1,7 +1,7 @@
 //! The checkpoint of a run: a file beside its result, from which `--resume` goes on.
 
 use std::fs;
-use std::io;
+use std::io::{self, BufReader};
 use std::path::{Path, PathBuf};
 use std::process;
 use std::sync::OnceLock;
@@ -47,7 +47,7 @@ impl Checkpoints {
         fixed: Fixed,
     ) -> anyhow::Result<Option<Trainer>> {
         let name = self.path.display();
-        let bytes = match fs::read(&self.path) {
+        let file = match fs::File::open(&self.path) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => {
                 ensure!(!resume, "--resume: there is no {name}: begin without --resume");
                 return Ok(None);
@@ -58,12 +58,13 @@ impl Checkpoints {
             resume,
             "{name} is there: an earlier run was stopped. --resume goes on with it; remove the file to begin anew"
         );
-        let trainer = Trainer::from_checkpoint(&bytes, &self.inputs, profile, settings, fixed);
+        let file = BufReader::new(file);
+        let trainer = Trainer::from_checkpoint(file, &self.inputs, profile, settings, fixed);
         Ok(Some(trainer.with_context(|| format!("{name}"))?))
     }
 
     pub(super) fn write(&self, trainer: &Trainer) -> anyhow::Result<()> {
-        output::write(&self.path, &trainer.to_checkpoint(&self.inputs)?)
+        output::write_by(&self.path, |file| Ok(trainer.write_checkpoint(&self.inputs, file)?))
     }
 }
 

@@ -107,7 +107,7 @@ impl ListedImages {
         let view = View::new(camera, listed.world_from_camera);
         let weight = image.weight.map_or(1.0, |weight| weight as f32);
         let exposure = factor(image.exposure_stops);
-        Ok(TrainingImage { view, rgb8, mask, depth_m, weight, exposure })
+        Ok(TrainingImage { view, rgb8, mask, sky: None, depth_m, weight, exposure })
     }
 }
 
@@ -199,7 +199,7 @@ pub(super) struct Shrunk {
     pub(super) mask: Option<Vec<bool>>,
     pub(super) camera: Camera,
     /// Width and height of the file.
-    own_px: [u32; 2],
+    pub(super) own_px: [u32; 2],
 }
 
 impl Shrunk {
@@ -242,7 +242,7 @@ fn read_mask(file: &Path, size_px: [u32; 2]) -> anyhow::Result<Vec<bool>> {
 }
 
 /// A mask or a depth at a smaller size: a pixel has the value of the one at its middle.
-fn shrink<T: Copy>(values: &[T], own_px: [u32; 2], small_px: [u32; 2]) -> Vec<T> {
+pub(super) fn shrink<T: Copy>(values: &[T], own_px: [u32; 2], small_px: [u32; 2]) -> Vec<T> {
     let at = |axis: usize, px: u32| {
         ((f64::from(px) + 0.5) * f64::from(own_px[axis]) / f64::from(small_px[axis])) as usize
     };

@@ -4,6 +4,8 @@
 use std::path::PathBuf;
 
 use anyhow::{Context, ensure};
+use glam::DVec3;
+use wildcity_eval::images::picture;
 use wildcity_eval::{Boxes, GROWN_PX, hide};
 use wildcity_log::check::Projection;
 use wildcity_log::{ImageRow, Log, Poses, SweepRow, Tracks};
@@ -12,10 +14,11 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::RigCamera;
 use wildcity_scene::trajectory::Keyframe;
 use wildcity_scene::{Manifest, Rig, Trajectory};
+use wildcity_train::ground::is_ground;
 use wildcity_train::poses::{Place, RigPoses};
 use wildcity_train::run::{TrainingImage, TrainingImages};
 
-use super::images::{Shrunk, factor};
+use super::images::{Shrunk, factor, shrink};
 use crate::cli::exit;
 
 /// Images within this time of the first are of one time of the rig, in microseconds.
@@ -23,6 +26,13 @@ const SAME_TIME_US: i64 = 40_000;
 
 /// A sweep's points are depths of images within this time of them, in microseconds.
 const SWEEP_US: i64 = 60_000;
+
+/// Ground masks that are looked at, at most.
+const MOST_GROUND_MASKS: usize = 200;
+
+/// A ground mask tells of points this near to its camera, in metres: farther ones are a pixel or
+/// two.
+const GROUND_M: f64 = 25.0;
 
 /// Pixels of a cell in which only the nearest points are seen.
 const CELL_PX: usize = 6;
@@ -159,6 +169,40 @@ impl LogImages {
         text
     }
 
+    /// Whether each point lies on the ground: as most of the ground masks of the log say that show
+    /// it, and by the plane of the wheels where none does.
+    pub(super) fn ground(&self, points_m: &[DVec3]) -> anyhow::Result<Vec<bool>> {
+        let mut labels = is_ground(points_m, &self.rig.world_from_ego);
+        let masked = |image: &&LoggedImage| image.row.ground_mask.is_some();
+        let all: Vec<&LoggedImage> = self.images.iter().filter(masked).collect();
+        let every = all.len().div_ceil(MOST_GROUND_MASKS).max(1);
+        let mut votes = vec![[0_u32; 2]; points_m.len()];
+        for LoggedImage { row, place } in all.into_iter().step_by(every) {
+            let Some(file) = &row.ground_mask else { continue };
+            let camera = self.log.rig.cameras[place.camera].camera;
+            let size_px = [camera.width_px, camera.height_px];
+            let mask = picture::mask(&self.log.path(file), size_px)?;
+            let camera_from_world = self.rig.world_from_camera(*place).inverse();
+            for (point_m, votes) in points_m.iter().zip(&mut votes) {
+                let at_m = camera_from_world.transform_point(*point_m);
+                let near = Some(at_m).filter(|at_m| at_m.length() < GROUND_M);
+                let Some(px) = near.and_then(|at_m| camera.project(at_m)) else { continue };
+                let [x, y] = px.floor().to_array().map(|px| px as i64);
+                let is_within = |px: i64, size: u32| (0..i64::from(size)).contains(&px);
+                if is_within(x, size_px[0]) && is_within(y, size_px[1]) {
+                    let shows = mask[y as usize * size_px[0] as usize + x as usize];
+                    votes[usize::from(shows)] += 1;
+                }
+            }
+        }
+        for (label, [no, yes]) in labels.iter_mut().zip(votes) {
+            if no + yes > 0 {
+                *label = yes > no;
+            }
+        }
+        Ok(labels)
+    }
+
     pub(super) fn log(&self) -> &Log {
         &self.log
     }
@@ -194,8 +238,12 @@ impl LogImages {
         }
         let depth_m = self.depths(row, place.camera, &view)?;
         let exposure = factor(row.exposure_stops);
-        let Shrunk { rgb8, mask, .. } = shrunk;
-        Ok(TrainingImage { view, rgb8, mask, depth_m, weight: 1.0, exposure })
+        let Shrunk { rgb8, mask, own_px, .. } = shrunk;
+        let sky = row.sky_mask.as_deref().map(|file| picture::mask(&path(file), own_px));
+        let sky = sky
+            .transpose()?
+            .map(|sky| shrink(&sky, own_px, [view.camera.width_px, view.camera.height_px]));
+        Ok(TrainingImage { view, rgb8, mask, sky, depth_m, weight: 1.0, exposure })
     }
 
     /// The depths of the LiDAR's points near the time of an image, where these are seen.

@@ -6,6 +6,8 @@ mod checkpoints;
 mod images;
 mod lines;
 mod log_images;
+mod options;
+mod plan;
 mod progress;
 mod recorded;
 mod refine;
@@ -48,6 +50,7 @@ Examples:
   wildcity import capture.ply --twin capture --axes y-down-z-forward";
 
 subcommands! { TrainCommand;
+    Plan(Box<plan::Plan>),
     Block(Box<block::Block>),
     Refine(Box<refine::Refine>),
     Loop(Box<rounds::Loop>),

@@ -3,12 +3,16 @@
 use std::io::{self, IsTerminal};
 
 use wildcity_render::gradient::Differentiate;
+use wildcity_train::cache::CachedImages;
 use wildcity_train::run::{Line, TrainingImages, run};
 use wildcity_train::trainer::Trainer;
 
 use super::checkpoints::StopsAtSignal;
 use super::lines::log;
 use crate::cli::progress;
+
+/// Decoded images are kept up to this size: 4,000 of 360 x 232 px, with depths.
+const CACHE_BYTES: usize = 1 << 30;
 
 /// Goes on to the last step, or until the process is asked to stop. `each` is called after each
 /// step. Returns the PSNR of the images that are held out, when it was measured last, and the
@@ -39,7 +43,8 @@ pub(super) fn train(
         failed = said.and_then(|()| each(line, trainer)).err();
         failed.is_none() && !signal.stops()
     };
-    run(trainer, images, backend, every, &mut on_step)?;
+    let images = CachedImages::new(images, CACHE_BYTES);
+    run(trainer, &images, backend, every, &mut on_step)?;
     bar.finish_and_clear();
     failed.map_or(Ok(last), Err)
 }

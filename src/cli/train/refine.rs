@@ -16,9 +16,9 @@ use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, Version};
 
 use super::images::{ListedImages, WithAugmented};
+use super::options::{fraction, read_settings};
 use super::progress::train;
 use super::recorded::{RecordedImages, Recording};
-use super::scene::{fraction, read_settings};
 use crate::cli::backend_options::HardwareOptions;
 use crate::cli::directories::{EditedTwin, Twins};
 use crate::cli::{output, progress};

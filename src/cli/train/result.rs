@@ -6,6 +6,8 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 use wildcity_scene::validate::{self, Field};
 use wildcity_scene::{Rig, Trajectory};
+use wildcity_train::compose::Exposure;
+use wildcity_train::run::TrainingImages;
 use wildcity_train::sky_file;
 use wildcity_train::trainer::Trainer;
 use wildcity_twin::ingest::write_ply;
@@ -20,27 +22,25 @@ pub(super) struct Written {
     pub(super) page: PathBuf,
     /// The sky, if one was trained.
     pub(super) sky: Option<PathBuf>,
+    /// The exposure of each image, if they were trained.
+    pub(super) exposures: Option<PathBuf>,
     /// The drive and the rig, if their poses were trained.
     pub(super) drive: Option<PathBuf>,
     pub(super) rig: Option<PathBuf>,
 }
 
 impl Written {
-    /// Writes the Gaussians to a PLY file, and the sky and the refined poses beside it.
+    /// Writes the Gaussians to a PLY file, and the sky, the exposures and the refined poses beside
+    /// it.
     pub(super) fn new(
         trainer: &Trainer,
         ply: &Path,
+        images: &dyn TrainingImages,
         refined: Option<&(Trajectory, Rig)>,
     ) -> anyhow::Result<Self> {
         let gaussians = trainer.model().to_gaussians();
         validate::check(&gaussians, &Field::plain_name)
             .context("the run has made Gaussians that no scene may have: use smaller rates")?;
-        if trainer.settings().exposure.on {
-            writeln!(
-                io::stderr(),
-                "note: the exposures of images are not written: the scene has the mean one"
-            )?;
-        }
         let mut bytes = Vec::new();
         write_ply(&gaussians, &mut bytes)?;
         output::write(ply, &bytes)?;
@@ -54,9 +54,15 @@ impl Written {
             ply: ply.to_owned(),
             page: ply.with_extension("html"),
             sky: sky.transpose()?,
+            exposures: None,
             drive: None,
             rig: None,
         };
+        if let Some(exposures) = trainer.exposures() {
+            let path = ply.with_extension("exposures.json");
+            output::write(&path, &to_json(&exposures, images)?)?;
+            written.exposures = Some(path);
+        }
         if let Some((drive, rig)) = refined {
             let put = |extension: &str, bytes: &[u8]| {
                 let path = ply.with_extension(extension);
@@ -100,4 +106,15 @@ impl Written {
              AXES is identity if z is up, and y-down-z-forward for most models of COLMAP"
         )
     }
+}
+
+/// Names of images with their maps of colours: `matrix * rgb + offset`, of linear values 0 to 1.
+fn to_json(exposures: &[Exposure<f32>], images: &dyn TrainingImages) -> anyhow::Result<Vec<u8>> {
+    let entry = |(index, exposure): (usize, &Exposure<f32>)| {
+        let Exposure { matrix, offset } = exposure;
+        (images.name(index), serde_json::json!({ "matrix": matrix, "offset": offset }))
+    };
+    let all: serde_json::Map<String, serde_json::Value> =
+        exposures.iter().enumerate().map(entry).collect();
+    Ok(serde_json::to_vec_pretty(&all)?)
 }

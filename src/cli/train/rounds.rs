@@ -6,8 +6,8 @@ use std::path::PathBuf;
 
 use anyhow::{Context, ensure};
 
+use super::options::fraction;
 use super::recorded::RecordedImages;
-use super::scene::fraction;
 use crate::cli::{self, Options};
 
 /// Make a twin accurate off its drives, round by round: render views, repair them, train on them.

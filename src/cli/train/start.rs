@@ -9,7 +9,6 @@ use glam::DVec3;
 use wildcity_log::ColoredPoint;
 use wildcity_scene::random::Random;
 use wildcity_scene::{Gaussians, RenderProfile};
-use wildcity_train::ground::is_ground;
 use wildcity_train::settings::Settings;
 use wildcity_train::start::{Point, gaussians_from_points};
 use wildcity_train::trainer::Start;
@@ -105,7 +104,7 @@ impl StartOptions {
         start.rig = Some(images.rig.clone());
         let means_m: Vec<DVec3> =
             start.gaussians.means_m.iter().map(|m| DVec3::from_array(*m)).collect();
-        start.is_ground = is_ground(&means_m, &images.rig.world_from_ego);
+        start.is_ground = images.ground(&means_m)?;
         Ok((start, profile))
     }
 }

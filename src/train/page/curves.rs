@@ -26,10 +26,11 @@ pub(super) fn psnr(history: &History) -> Result<String, PageError> {
 
 /// The losses over the steps.
 pub(super) fn losses(history: &History) -> Result<String, PageError> {
-    let values: [(&str, fn(&CurvePoint) -> f64); 4] = [
+    let values: [(&str, fn(&CurvePoint) -> f64); 5] = [
         ("L1", |point| point.l1),
         ("D-SSIM", |point| point.dssim),
         ("disparity, 1/m", |point| point.disparity),
+        ("opacity of the sky", |point| point.sky),
         ("ground, weighted", |point| point.ground),
     ];
     let curve = |(name, value): (&'static str, fn(&CurvePoint) -> f64)| -> Curve<'_> {

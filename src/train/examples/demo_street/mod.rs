@@ -65,6 +65,7 @@ impl TrainingImages for Recording {
             view,
             rgb8: rgb8.clone(),
             mask: None,
+            sky: None,
             depth_m,
             weight: 1.0,
             exposure: 1.0,

@@ -9,23 +9,22 @@
 //! A Gaussian takes four times its columns: at degree 1 368 B, and 92 B of gradients. While the
 //! number grows, another 184 B for the old chunk and the new one.
 
-use glam::{DVec3, Quat, Vec3};
-use serde::{Deserialize, Serialize};
-use wildcity_render::gradient::ChunkGradients;
-use wildcity_scene::chunk::{CLUSTER, LANES, Lanes, column, columns};
-use wildcity_scene::random::{mix, to_unit};
-use wildcity_scene::{Chunk, Gaussians, LanePages, Scene, sh};
+mod adam_step;
+mod saved;
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicUsize;
 use std::sync::atomic::Ordering::Relaxed;
 
-use crate::settings::Settings;
+use glam::{DVec3, Vec3};
+use wildcity_render::gradient::ChunkGradients;
+use wildcity_scene::chunk::{CLUSTER, LANES, Lanes, column, columns};
+use wildcity_scene::{Chunk, Gaussians, LanePages, Scene, sh};
 
-/// Columns of the parameters: those of a chunk, with logarithms of the scales, quaternions of any
-/// length, and logits.
-const LN_SCALE: usize = column::SCALE;
-const LOGIT: usize = column::LOG2_OPACITY;
+pub(crate) use adam_step::{AdamStep, rates};
+use adam_step::{LN_SCALE, LOGIT, not_finite, sigmoid};
+use saved::Flat;
+pub(crate) use saved::{ModelState, SavedModel};
 
 /// The Gaussians of a training run.
 #[derive(Debug)]
@@ -45,40 +44,11 @@ pub struct Model {
     scene: Scene,
 }
 
-/// The parameters and moments of a model, as a file has them: lane group by lane group.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-pub(crate) struct ModelState {
-    sh_degree: u8,
-    count: u64,
-    origin_m: [f64; 3],
-    values: Vec<f32>,
-    moments: [Vec<f32>; 2],
-    is_ground: Vec<bool>,
+/// What a Gaussian of a degree takes while the number grows, in bytes: parameters, two moments,
+/// gradients, the chunk, and a new one with what it is made of.
+pub const fn peak_bytes(sh_degree: u8) -> usize {
+    7 * 4 * columns(sh_degree)
 }
-
-/// What one step of Adam needs beside the derivatives.
-#[derive(Clone, Debug)]
-pub(crate) struct AdamStep {
-    /// The learning rate of each column.
-    pub(crate) rates: Vec<f32>,
-    /// `1 - decay^step` of both moments.
-    pub(crate) corrections: [f32; 2],
-    /// Derivatives of the mean opacity by an opacity, and of the mean scale by a scale.
-    pub(crate) regularisers: [f32; 2],
-    /// Noise of the means, in metres by a variance of 1 m².
-    pub(crate) noise: f32,
-    /// Opacity below which the noise begins.
-    pub(crate) least_opacity: f32,
-    /// Of the noise of this step.
-    pub(crate) seed: u64,
-}
-
-/// Decays of Adam's moments.
-const DECAYS: [f32; 2] = [0.9, 0.999];
-
-/// Added to the root of the second moment. A derivative by a parameter of one of a million
-/// Gaussians is small in all, and 1e-8 would hold it back (gsplat, INRIA).
-const EPSILON: f32 = 1e-15;
 
 /// The parameters, moments and derivatives of one cluster.
 struct ClusterState<'a> {
@@ -132,15 +102,14 @@ impl Model {
         model
     }
 
-    pub(crate) fn state(&self) -> ModelState {
-        let flat = |lanes: &Vec<Lanes>| lanes.iter().flat_map(|Lanes(values)| *values).collect();
-        ModelState {
+    pub(crate) fn saved(&self) -> SavedModel<'_> {
+        SavedModel {
             sh_degree: self.sh_degree,
             count: self.count as u64,
             origin_m: self.origin_m.to_array(),
-            values: flat(&self.values),
-            moments: self.moments.each_ref().map(flat),
-            is_ground: self.is_ground.clone(),
+            values: Flat(&self.values),
+            moments: self.moments.each_ref().map(|lanes| Flat(lanes)),
+            is_ground: &self.is_ground,
         }
     }
 
@@ -343,103 +312,6 @@ impl Model {
     }
 }
 
-impl AdamStep {
-    /// Moves the visible Gaussians of a lane group.
-    fn apply(&self, values: &mut [Lanes], moments: [&mut [Lanes]; 2], by: &[Lanes], visible: u16) {
-        let [first, second] = moments;
-        let derivatives = self.raw(values, by);
-        let shown: [bool; LANES] = std::array::from_fn(|lane| visible >> lane & 1 == 1);
-        for (column, Lanes(derivatives)) in derivatives.iter().enumerate().take(values.len()) {
-            let rate = self.rates[column] / self.corrections[0];
-            let values = &mut values[column].0;
-            let means = &mut first[column].0;
-            let squares = &mut second[column].0;
-            // All lanes, and then a choice: the compiler makes vector instructions of it.
-            for lane in 0..LANES {
-                let by = derivatives[lane];
-                let mean = DECAYS[0] * means[lane] + (1.0 - DECAYS[0]) * by;
-                let square = DECAYS[1] * squares[lane] + (1.0 - DECAYS[1]) * by * by;
-                let value =
-                    values[lane] - rate * mean / ((square / self.corrections[1]).sqrt() + EPSILON);
-                means[lane] = if shown[lane] { mean } else { means[lane] };
-                squares[lane] = if shown[lane] { square } else { squares[lane] };
-                values[lane] = if shown[lane] { value } else { values[lane] };
-            }
-        }
-    }
-
-    /// The derivatives by parameters before activation, with those of the regularisers.
-    fn raw(&self, values: &[Lanes], by: &[Lanes]) -> [Lanes; MAX_COLUMNS] {
-        let mut raw = [Lanes([0.0; LANES]); MAX_COLUMNS];
-        raw[..by.len()].copy_from_slice(by);
-        for lane in 0..LANES {
-            let value = |column: usize| values[column].0[lane];
-            let square: f32 = (0..4).map(|k| value(column::QUAT + k).powi(2)).sum();
-            for lanes in &mut raw[column::QUAT..column::LOG2_OPACITY] {
-                lanes.0[lane] /= square.sqrt();
-            }
-            let opacity = sigmoid(value(LOGIT));
-            let [by_opacity, by_scale] = self.regularisers;
-            let by_log2 = raw[LOGIT].0[lane];
-            raw[LOGIT].0[lane] =
-                (1.0 - opacity) * (by_log2 * std::f32::consts::LOG2_E + by_opacity * opacity);
-            for k in 0..3 {
-                raw[LN_SCALE + k].0[lane] += by_scale * value(LN_SCALE + k).exp();
-            }
-        }
-        raw
-    }
-
-    /// Moves visible Gaussians that are nearly transparent at random, along their own shape, so
-    /// that they find a place where they show something. (Its authors move all, visible or not.
-    /// Those that no view shows any more become transparent by no derivative either, and stay.)
-    fn add_noise(&self, values: &mut [Lanes], visible: u16, first_index: usize) {
-        if self.noise == 0.0 {
-            return;
-        }
-        for lane in (0..LANES).filter(|lane| visible >> lane & 1 == 1) {
-            let value = |column: usize| values[column].0[lane];
-            let opacity = sigmoid(value(LOGIT));
-            let gate = sigmoid(-100.0 * (opacity - self.least_opacity));
-            if gate < 1e-4 {
-                continue;
-            }
-            let [w, x, y, z] = [0, 1, 2, 3].map(|k| value(column::QUAT + k));
-            let rotation = Quat::from_xyzw(x, y, z, w).normalize();
-            let variance = Vec3::from_array([0, 1, 2].map(|k| (2.0 * value(LN_SCALE + k)).exp()));
-            let random = normals(self.seed, first_index + lane);
-            let moved = rotation * (variance * (rotation.inverse() * random));
-            for (axis, moved) in (moved * gate * self.noise).to_array().into_iter().enumerate() {
-                values[column::MEAN + axis].0[lane] += moved;
-            }
-        }
-    }
-}
-
-/// The first visible lane with a derivative that is not finite, or whose square is not.
-fn not_finite(by: &[Lanes], visible: u16) -> Option<usize> {
-    let is_finite =
-        |lane: usize| by.iter().all(|lanes| (lanes.0[lane] * lanes.0[lane]).is_finite());
-    (0..LANES).find(|&lane| visible >> lane & 1 == 1 && !is_finite(lane))
-}
-
-/// Columns at the largest degree.
-const MAX_COLUMNS: usize = columns(sh::MAX_DEGREE);
-
-/// Three numbers of a normal distribution, by a seed and a Gaussian (Box and Muller 1958).
-fn normals(seed: u64, index: usize) -> Vec3 {
-    let bits = |k: u64| mix(seed ^ mix(4 * index as u64 + k));
-    let pair = |k: u64| {
-        // Never 0, of which there is no logarithm.
-        let radius = (-2.0 * (1.0 - to_unit(bits(k))).ln()).sqrt();
-        let angle = std::f64::consts::TAU * to_unit(bits(k + 1));
-        [(radius * angle.cos()) as f32, (radius * angle.sin()) as f32]
-    };
-    let [x, y] = pair(0);
-    let [z, _] = pair(2);
-    Vec3::new(x, y, z)
-}
-
 /// Writes the activated values of a lane group.
 fn activate(values: &[Lanes], lanes: &mut [Lanes]) {
     lanes.copy_from_slice(values);
@@ -458,25 +330,4 @@ fn activate(values: &[Lanes], lanes: &mut [Lanes]) {
         let ln = logit.min(0.0) - (-logit.abs()).exp().ln_1p();
         lanes[column::LOG2_OPACITY].0[lane] = ln * std::f32::consts::LOG2_E;
     }
-}
-
-fn sigmoid(logit: f32) -> f32 {
-    1.0 / (1.0 + (-logit).exp())
-}
-
-/// The settings' learning rates, column by column.
-pub(crate) fn rates(settings: &Settings, mean: f32, sh_degree: u8, all: usize) -> Vec<f32> {
-    let trained = columns(sh_degree);
-    let rate = |column: usize| match column {
-        column::MEAN..LN_SCALE => mean,
-        LN_SCALE..column::QUAT => settings.rates.ln_scale,
-        column::QUAT..LOGIT => settings.rates.quat,
-        LOGIT => settings.rates.logit,
-        // The constant coefficient, of three colours.
-        11..14 => settings.rates.sh,
-        // Degrees that are not trained yet stay as they are.
-        column if column < trained => settings.rates.sh_rest,
-        _ => 0.0,
-    };
-    (0..all).map(rate).collect()
 }
