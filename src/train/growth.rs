@@ -13,13 +13,14 @@
 use wildcity_scene::random::{mix, to_unit};
 
 use crate::model::Model;
-use crate::settings::Growth;
+use crate::settings::Settings;
 
 /// Most copies of one Gaussian at a time, as in the code of its authors.
 const MOST_COPIES: usize = 51;
 
 /// Moves the transparent Gaussians, and adds new ones up to the cap. Returns the number of both.
-pub(crate) fn relocate_and_grow(model: &mut Model, growth: &Growth, seed: u64) -> [usize; 2] {
+pub(crate) fn relocate_and_grow(model: &mut Model, settings: &Settings, seed: u64) -> [usize; 2] {
+    let growth = &settings.growth;
     let count = model.len();
     let opacities: Vec<f32> = (0..count).map(|index| model.opacity(index)).collect();
     // Written so that a NaN counts as transparent.
@@ -29,7 +30,7 @@ pub(crate) fn relocate_and_grow(model: &mut Model, growth: &Growth, seed: u64) -
         return [0, 0];
     }
     let dead: Vec<usize> = (0..count).filter(|index| !is_alive(index)).collect();
-    let added = growth.added(count);
+    let added = settings.added(count);
 
     // Draw in proportion to the opacity, with replacement.
     let mut sums = Vec::with_capacity(alive.len());

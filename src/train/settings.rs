@@ -67,7 +67,7 @@ pub struct Weights {
 #[serde(deny_unknown_fields, default)]
 pub struct Growth {
     pub cap: usize,
-    /// Growth of their number each time.
+    /// Growth of their number each time of a run of 30,000 steps; of shorter ones more.
     pub rate: f64,
     /// Steps from one time to the next, whatever the number of steps.
     pub every: usize,
@@ -339,7 +339,7 @@ impl Settings {
         let mut count = start;
         (1..=self.steps).map(move |step| {
             if self.grows_at(step) {
-                count += self.growth.added(count);
+                count += self.added(count);
             }
             count
         })
@@ -353,6 +353,15 @@ impl Settings {
         step.is_multiple_of(every) && step >= from && step < until
     }
 
+    /// How many Gaussians are added to some at a time. In a run of fewer steps there are fewer
+    /// times, and more are added at each, so that it ends with as many; at most their number
+    /// doubles.
+    pub(crate) fn added(&self, count: usize) -> usize {
+        let Growth { rate, cap, .. } = self.growth;
+        let factor = (1.0 + rate).powf(SCHEDULE as f64 / self.steps as f64).min(2.0);
+        ((factor * count as f64) as usize).min(cap).saturating_sub(count)
+    }
+
     /// A step of a schedule of 30,000 as one of this run.
     pub(crate) fn scaled(&self, step: usize) -> usize {
         (step as f64 * self.steps as f64 / SCHEDULE as f64).round() as usize
@@ -361,14 +370,6 @@ impl Settings {
     /// A step of this run as one of a schedule of 30,000.
     pub(crate) fn unscaled(&self, step: usize) -> usize {
         (step as f64 * SCHEDULE as f64 / self.steps as f64).round() as usize
-    }
-}
-
-impl Growth {
-    /// How many Gaussians are added to some.
-    pub(crate) fn added(&self, count: usize) -> usize {
-        let wanted = ((1.0 + self.rate) * count as f64) as usize;
-        wanted.min(self.cap).saturating_sub(count)
     }
 }
 

@@ -376,9 +376,8 @@ impl Trainer {
 
     fn grow(&mut self) {
         if self.settings.grows_at(self.step) {
-            let growth = &self.settings.growth;
             let seed = mix(self.settings.seed ^ mix(!(self.step as u64)));
-            relocate_and_grow(&mut self.model, growth, seed);
+            relocate_and_grow(&mut self.model, &self.settings, seed);
         }
     }
 }
