@@ -134,6 +134,12 @@ fn a_worn_twin_gets_better_by_its_recorded_images() {
         let values = decibels(round);
         assert!(values[1] > values[0] + 0.1, "{round}");
     }
+    for (round, offset) in [(1, "0.50"), (2, "1.00")] {
+        let judged = format!("{offset} m off the drives, ");
+        assert!(said.lines().any(|line| line.starts_with(&judged)), "{said}");
+        let page = fs::read_to_string(dir.join(format!("rounds/round_{round}.html"))).unwrap();
+        assert!(page.contains("data:image/jpeg"), "{round}");
+    }
     let catalog = Catalog::open(&dir.join("twins")).unwrap();
     let [first, last] = [1, 3].map(|number| catalog.version("worn", Some(number)).unwrap());
     assert_eq!(last.manifest.gaussians(), first.manifest.gaussians());

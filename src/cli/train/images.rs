@@ -67,12 +67,19 @@ impl ListedImages {
     /// # Errors
     /// An image is missing: each is looked at before a long run finds one that is.
     pub(super) fn add(&mut self, list: &ImageList, alignment: &Alignment) -> anyhow::Result<()> {
-        for image in list.every(1) {
-            let file = &image.file;
-            ensure!(file.is_file(), "there is no image {}: give --image-dir", file.display());
-            let world_from_camera = alignment.pose(&image.world_from_camera);
-            self.images.push(ListedImage { image: image.clone(), world_from_camera });
-        }
+        list.every(1).into_iter().try_for_each(|image| self.add_one(image, alignment))
+    }
+
+    /// The same for one of a list.
+    pub(super) fn add_one(
+        &mut self,
+        image: &RealImage,
+        alignment: &Alignment,
+    ) -> anyhow::Result<()> {
+        let file = &image.file;
+        ensure!(file.is_file(), "there is no image {}: give --image-dir", file.display());
+        let world_from_camera = alignment.pose(&image.world_from_camera);
+        self.images.push(ListedImage { image: image.clone(), world_from_camera });
         Ok(())
     }
 

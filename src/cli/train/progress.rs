@@ -11,6 +11,9 @@ use super::checkpoints::StopsAtSignal;
 use super::lines::log;
 use crate::cli::progress;
 
+/// Held-out images on the page of a run.
+pub(super) const PICTURES: usize = 6;
+
 /// Decoded images are kept up to this size: 4,000 of 360 x 232 px, with depths.
 const CACHE_BYTES: usize = 1 << 30;
 

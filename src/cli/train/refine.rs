@@ -1,14 +1,17 @@
 //! `wildcity train refine`.
 
+use std::collections::BTreeMap;
 use std::io::{self, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
 use wildcity_eval::images::ImageList;
+use wildcity_render::gradient::Differentiate;
 use wildcity_scene::align::Alignment;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::{Gaussians, Manifest};
-use wildcity_train::held_out::held_out_db;
+use wildcity_train::held_out::{held_out_db, held_out_images};
+use wildcity_train::page::Contents;
 use wildcity_train::run::TrainingImages;
 use wildcity_train::settings::{PoseMode, Settings, SkyMode};
 use wildcity_train::trainer::{Fixed, Start, Trainer};
@@ -17,7 +20,7 @@ use wildcity_twin::store::{Catalog, Version};
 
 use super::images::{ListedImages, WithAugmented};
 use super::options::{fraction, read_settings};
-use super::progress::train;
+use super::progress::{PICTURES, train};
 use super::recorded::{RecordedImages, Recording};
 use crate::cli::backend_options::HardwareOptions;
 use crate::cli::directories::{EditedTwin, Twins};
@@ -32,7 +35,8 @@ use crate::cli::{output, progress};
 /// they are.
 ///
 /// Three steps of ten are made on the views of --augmented. The loss of each view has the weight
-/// that its list says. Prints the PSNR of the recorded images that were held out, before and after.
+/// that its list says. Prints the PSNR of the recorded images that were held out, and of one view
+/// of eight off the drives, which is not trained on, before and after.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(in crate::cli) struct Refine {
@@ -58,6 +62,10 @@ pub(in crate::cli) struct Refine {
     #[arg(long, value_name = "N", default_value_t = 8)]
     held_out_every: usize,
 
+    /// Write a page about the run: held-out images beside what the twin shows, and curves.
+    #[arg(long, value_name = "FILE.html")]
+    page: Option<PathBuf>,
+
     /// TOML file of all settings, of which growth, poses, sky and exposure stay off [default: those
     /// of `wildcity train settings`, with a tenth of the learning rate of means]
     #[arg(long, value_name = "FILE")]
@@ -75,6 +83,33 @@ Examples:
   wildcity augment street --repair model.json --round 1 --out augmented
   wildcity train refine street --images capture --augmented augmented/round_1";
 
+/// One view of so many off the drives judges a run.
+const JUDGES: usize = 8;
+
+/// Views that judge a run, by their distance from the drives in centimetres.
+type Judges = BTreeMap<u32, ListedImages>;
+
+/// The distance from the drive that the name of a view of `wildcity augment` says, in centimetres:
+/// 150 of `front/log_00012.00_left1.50.png`.
+fn offset_cm(name: &str) -> Option<u32> {
+    let (_, offset) = name.strip_suffix(".png")?.rsplit_once('_')?;
+    let offset = offset.strip_prefix("left").or_else(|| offset.strip_prefix("right"))?;
+    let offset_m: f64 = offset.parse().ok()?;
+    Some((100.0 * offset_m).round() as u32)
+}
+
+/// How well the twin shows them.
+fn judged(
+    judges: &Judges,
+    trainer: &Trainer,
+    backend: &dyn Differentiate,
+) -> anyhow::Result<Vec<(u32, Option<f64>)>> {
+    let judge = |(offset, images): (&u32, &ListedImages)| {
+        Ok((*offset, held_out_db(trainer, images, backend)?))
+    };
+    judges.iter().map(judge).collect()
+}
+
 impl Refine {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let settings = self.training_settings()?;
@@ -86,15 +121,23 @@ impl Refine {
         };
         let rounds: Vec<ImageList> = self.augmented.iter().map(read).collect::<Result<_, _>>()?;
         let mut augmented = ListedImages::new(self.size, 0);
-        for round in &rounds {
+        let mut judges = Judges::new();
+        for (k, image) in rounds.iter().flat_map(|round| round.every(1)).enumerate() {
+            let offset = offset_cm(&image.name).filter(|_| k % JUDGES == JUDGES - 1);
+            let images = match offset {
+                Some(offset) => {
+                    judges.entry(offset).or_insert_with(|| ListedImages::new(self.size, 1))
+                }
+                None => &mut augmented,
+            };
             // `augment` writes poses in the twin's axes.
-            augmented.add(round, &Alignment::IDENTITY)?;
+            images.add_one(image, &Alignment::IDENTITY)?;
         }
         let Recording { images: recorded, mut world_from_camera, .. } =
             self.recorded.open(&catalog, &base, self.size, self.held_out_every)?;
         world_from_camera.extend(augmented.poses());
         let images = WithAugmented { recorded: &*recorded, augmented: &augmented };
-        self.refine(&catalog, &base, &images, world_from_camera, settings)
+        self.refine(&catalog, &base, &images, &judges, world_from_camera, settings)
     }
 
     /// Trains the twin on the images, and makes a new version of it.
@@ -103,6 +146,7 @@ impl Refine {
         catalog: &Catalog,
         base: &Version,
         images: &dyn TrainingImages,
+        judges: &Judges,
         world_from_camera: Vec<Pose>,
         settings: Settings,
     ) -> anyhow::Result<()> {
@@ -131,10 +175,16 @@ impl Refine {
         };
         let mut trainer = Trainer::new(start, profile, settings)?;
         let before = held_out_db(&trainer, images, backend)?;
+        let before_off = judged(judges, &trainer, backend)?;
         let after = train(&mut trainer, images, backend, &mut |_, _| Ok(()))?;
         let steps = trainer.settings().steps;
         let done = trainer.steps_done();
         ensure!(done == steps, "stopped after {done} of {steps} steps: the twin is as it was");
+
+        let after_off = judged(judges, &trainer, backend)?;
+        if let Some(page) = &self.page {
+            self.write_page(page, &trainer, images, backend)?;
+        }
 
         let bar = progress::count("writing");
         let how = format!("refine={}", self.description());
@@ -150,12 +200,42 @@ impl Refine {
                 "held out: {before:.2} dB, and {after:.2} dB after {steps} steps, {seconds:.0} s"
             )?;
         }
+        for ((offset, before), (_, after)) in before_off.into_iter().zip(after_off) {
+            if let Some((before, after)) = before.zip(after) {
+                let views = output::counted(judges[&offset].count(), "view");
+                writeln!(
+                    stdout,
+                    "{:.2} m off the drives, {views} not trained on: {before:.2} dB, and {after:.2} dB",
+                    f64::from(offset) / 100.0
+                )?;
+            }
+        }
         writeln!(
             stdout,
             "twin {name} version {number}: {} Gaussians\nblake3 {hash}",
             gaussians.len()
         )?;
         Ok(())
+    }
+
+    fn write_page(
+        &self,
+        page: &Path,
+        trainer: &Trainer,
+        images: &dyn TrainingImages,
+        backend: &dyn Differentiate,
+    ) -> anyhow::Result<()> {
+        let held_out = held_out_images(trainer, images, backend, PICTURES)?;
+        let source = format!("{}, {}", self.edited.twin.name, self.description());
+        let all_held_out = images.held_out().len();
+        let contents = Contents {
+            source: &source,
+            trainer,
+            images: [images.count() - all_held_out, all_held_out],
+            held_out: &held_out,
+            cameras: &[],
+        };
+        output::write(page, wildcity_train::page::page(&contents)?.as_bytes())
     }
 
     /// What the provenance of the version says.
@@ -180,5 +260,19 @@ impl Refine {
         settings.growth.noise = 0.0;
         settings.check()?;
         Ok(settings)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_of_views_say_how_far_they_are() {
+        assert_eq!(offset_cm("front/log_00012.00_left1.50.png"), Some(150));
+        assert_eq!(offset_cm("images/rear/a_b_00002.10_right0.30.png"), Some(30));
+        for other in ["front/0001.png", "front/log_left1.50.jpg", "front/log_leftx.png"] {
+            assert_eq!(offset_cm(other), None, "{other}");
+        }
     }
 }

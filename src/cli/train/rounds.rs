@@ -15,7 +15,8 @@ use crate::cli::{self, Options};
 /// Round N renders views at min(0.5 m x N, OFFSET) beside the drives (`wildcity augment`), repairs
 /// them with the model of --repair, trains the twin on them and on its recorded images
 /// (`wildcity train refine`), and makes a new version of the twin, from which the next round
-/// renders. A server that is running serves each new version to the sessions that open it.
+/// renders. A server that is running serves each new version to the sessions that open it. Each
+/// round has a page in --out.
 ///
 /// A loop that was stopped goes on with --from N: the views of a round that were drawn are kept.
 #[derive(Debug, clap::Args)]
@@ -52,6 +53,10 @@ pub(in crate::cli) struct Loop {
     /// Distance between two views along a drive, as for `wildcity augment`.
     #[arg(long, value_name = "M", default_value = "2")]
     every: String,
+
+    /// Render views of these cameras of the rig only, as for `wildcity augment` [default: all]
+    #[arg(long, value_name = "NAME,..")]
+    cameras: Option<String>,
 
     /// Longest side of a rendered view, in pixels [default: the rig's]
     #[arg(long, value_name = "PX")]
@@ -104,6 +109,7 @@ impl Loop {
             ("--every", text(&self.every)),
             ("--out", Some(self.out.clone().into())),
             ("--repair", self.repair.clone().map(OsString::from)),
+            ("--cameras", self.cameras.clone().map(OsString::from)),
             ("--side", self.side.and_then(text)),
         ]
     }
@@ -113,6 +119,7 @@ impl Loop {
         options.extend([
             ("--twins", self.twins.clone()),
             ("--augmented", Some(self.out.join(format!("round_{round}")).into())),
+            ("--page", Some(self.out.join(format!("round_{round}.html")).into())),
             ("--steps", text(self.steps)),
             ("--size", text(self.size)),
             ("--settings", self.settings.clone().map(OsString::from)),

@@ -16,7 +16,7 @@ use super::checkpoints::{self, Checkpoints};
 use super::lines::LinesFile;
 use super::log_images::LogImages;
 use super::options::{Inputs, OpenedImages, RunOptions};
-use super::progress::train;
+use super::progress::{PICTURES, train};
 use super::result::Written;
 use super::start;
 use crate::cli;
@@ -161,9 +161,6 @@ impl TrainScene {
         ]
     }
 }
-
-/// Held-out images on the page of a run.
-const PICTURES: usize = 6;
 
 /// A run that has reached its end.
 struct Trained {

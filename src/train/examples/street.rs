@@ -2,7 +2,7 @@
 //! program to train on.
 //!
 //! ```text
-//! cargo run --release -p wildcity-train --example street -- STEPS [SCALE] [EXPORT]
+//! cargo run --release -p wildcity-train --example street -- STEPS [SCALE] [CAP] [EXPORT]
 //! ```
 //!
 //! There are 34 keyframes of six cameras, 3 m apart; every eighth keyframe is held out. The sky of
@@ -32,16 +32,17 @@ fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let steps: usize = arguments.first().map_or("1500", String::as_str).parse()?;
     let scale: f64 = arguments.get(1).map_or("0.25", String::as_str).parse()?;
+    let cap: usize = arguments.get(2).map_or("150000", String::as_str).parse()?;
     let cpu = Cpu::new(0, Simd::Best)?;
     let street = wildcity_generate::street(&StreetSettings::default())?;
     let truth = Scene::from_gaussians(&street.gaussians);
     let recording = Recording::new(&cpu, &truth, &street.trajectory, scale)?;
     let start = start(&street.gaussians, &recording);
-    if let Some(path) = arguments.get(2) {
+    if let Some(path) = arguments.get(3) {
         export(path, &recording.images, &start)?;
     }
 
-    let growth = Growth { cap: 150_000, from: 500, until: 24_000, ..Growth::default() };
+    let growth = Growth { cap, from: 500, until: 24_000, ..Growth::default() };
     let mut settings = Settings { steps, growth, ..Settings::default() };
     settings.poses.mode = PoseMode::Off;
     settings.sky.mode = SkyMode::Off;
