@@ -38,6 +38,15 @@ pub fn write_by(
     written.with_context(cannot)
 }
 
+/// Checks, before a long run, that the folder of a file is there.
+pub fn check_folder(option: &str, file: &Path) -> anyhow::Result<()> {
+    // The folder of a bare name is the current one.
+    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty());
+    let is_there = folder.is_none_or(Path::is_dir);
+    anyhow::ensure!(is_there, "{option} {}: there is no such folder: create it", file.display());
+    Ok(())
+}
+
 /// A number of things: `1 chunk`, `2 chunks`.
 pub fn counted(number: usize, thing: &str) -> String {
     let s = if number == 1 { "" } else { "s" };

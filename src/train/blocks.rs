@@ -73,6 +73,12 @@ impl Blocks {
         Ok(Self { cells: divided })
     }
 
+    /// Number of blocks.
+    #[allow(clippy::len_without_is_empty, reason = "there is always one")]
+    pub fn len(&self) -> usize {
+        self.cells.len()
+    }
+
     /// The cells that a block owns. Blocks are counted from 0.
     pub fn cells(&self, block: usize) -> &BTreeSet<[i32; 2]> {
         &self.cells[block]

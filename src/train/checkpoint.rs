@@ -24,6 +24,9 @@ use crate::trainer::{Fixed, Trainer};
 /// The first line of a file.
 const FORMAT: &[u8] = b"wildcity.checkpoint/2\n";
 
+/// Bytes that are hashed at a time.
+const BUFFER: usize = 1 << 16;
+
 /// Bytes of the hash at the end.
 const HASH: usize = blake3::OUT_LEN;
 
@@ -31,19 +34,19 @@ const HASH: usize = blake3::OUT_LEN;
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
     /// Another file, or one of another version of the program.
-    #[error("no checkpoint of this version of the program: begin anew, without --resume")]
+    #[error("no checkpoint of this version of the program: remove the file to begin anew")]
     Format,
     /// Bytes have changed, or are missing.
-    #[error("the checkpoint is damaged ({0}): begin anew, without --resume")]
+    #[error("the checkpoint is damaged ({0}): remove the file to begin anew")]
     Damaged(String),
     /// The run that wrote it had other images, points or cameras.
     #[error(
-        "the checkpoint is of a run on other images, cameras or points: give those, or begin anew, without --resume"
+        "the checkpoint is of a run on other images, cameras or points: give those, or remove the file to begin anew"
     )]
     OtherInputs,
     /// The run that wrote it had other settings.
     #[error(
-        "the checkpoint is of a run with other settings: give those, or begin anew, without --resume"
+        "the checkpoint is of a run with other settings: give those, or remove the file to begin anew"
     )]
     OtherSettings,
     /// The file cannot be written or read.
@@ -97,7 +100,7 @@ impl Trainer {
         inputs: &str,
         mut to: impl Write,
     ) -> Result<(), CheckpointError> {
-        let mut hashed = Hashed { inner: &mut to, hasher: blake3::Hasher::new() };
+        let mut hashed = Hashed::new(&mut to);
         hashed.write_all(FORMAT)?;
         let header = Header { inputs: hash(inputs), settings: self.settings.clone() };
         bincode::serde::encode_into_std_write(&header, &mut hashed, encoding())?;
@@ -111,7 +114,7 @@ impl Trainer {
             model: self.model.saved(),
         };
         bincode::serde::encode_into_std_write(&state, &mut hashed, encoding())?;
-        let hash = hashed.hasher.finalize();
+        let (_, hash) = hashed.end();
         Ok(to.write_all(hash.as_bytes())?)
     }
 
@@ -127,7 +130,7 @@ impl Trainer {
         settings: &Settings,
         fixed: Fixed,
     ) -> Result<Self, CheckpointError> {
-        let mut hashed = Hashed { inner: from, hasher: blake3::Hasher::new() };
+        let mut hashed = Hashed::new(from);
         let mut format = [0; FORMAT.len()];
         if hashed.read_exact(&mut format).is_err() || format != FORMAT {
             return Err(CheckpointError::Format);
@@ -141,10 +144,10 @@ impl Trainer {
             return Err(CheckpointError::OtherSettings);
         }
         let state: State = decode(&mut hashed)?;
-        let Hashed { mut inner, hasher } = hashed;
+        let (mut inner, hash) = hashed.end();
         let mut end = Vec::new();
         inner.by_ref().take(HASH as u64 + 1).read_to_end(&mut end)?;
-        if end != hasher.finalize().as_bytes() {
+        if end != hash.as_bytes() {
             return Err(CheckpointError::Damaged("its hash is another".to_owned()));
         }
         let Fixed { sky, chunks } = fixed;
@@ -169,12 +172,35 @@ impl Trainer {
 struct Hashed<T> {
     inner: T,
     hasher: blake3::Hasher,
+    /// Bytes that are not hashed yet: numbers come one by one, and a hash of four bytes costs as
+    /// much as one of a thousand.
+    pending: Vec<u8>,
+}
+
+impl<T> Hashed<T> {
+    fn new(inner: T) -> Self {
+        Self { inner, hasher: blake3::Hasher::new(), pending: Vec::with_capacity(BUFFER) }
+    }
+
+    fn add(&mut self, bytes: &[u8]) {
+        self.pending.extend_from_slice(bytes);
+        if self.pending.len() >= BUFFER {
+            self.hasher.update(&self.pending);
+            self.pending.clear();
+        }
+    }
+
+    /// The stream, and the hash of all that went through.
+    fn end(mut self) -> (T, blake3::Hash) {
+        self.hasher.update(&self.pending);
+        (self.inner, self.hasher.finalize())
+    }
 }
 
 impl<T: Write> Write for Hashed<T> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let written = self.inner.write(bytes)?;
-        self.hasher.update(&bytes[..written]);
+        self.add(&bytes[..written]);
         Ok(written)
     }
 
@@ -186,7 +212,7 @@ impl<T: Write> Write for Hashed<T> {
 impl<T: Read> Read for Hashed<T> {
     fn read(&mut self, bytes: &mut [u8]) -> io::Result<usize> {
         let read = self.inner.read(bytes)?;
-        self.hasher.update(&bytes[..read]);
+        self.add(&bytes[..read]);
         Ok(read)
     }
 }

@@ -359,7 +359,7 @@ impl Settings {
     pub(crate) fn added(&self, count: usize) -> usize {
         let Growth { rate, cap, .. } = self.growth;
         let factor = (1.0 + rate).powf(SCHEDULE as f64 / self.steps as f64).min(2.0);
-        ((factor * count as f64) as usize).min(cap).saturating_sub(count)
+        ((factor * count as f64).ceil() as usize).min(cap).saturating_sub(count)
     }
 
     /// A step of a schedule of 30,000 as one of this run.

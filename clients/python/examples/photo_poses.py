@@ -4,8 +4,8 @@
     ffmpeg -i walk.mp4 -vf fps=3 -q:v 2 photos/%04d.jpg     # of a video
     python photo_poses.py photos [OUT]
 
-Writes the model to OUT/sparse/0 (OUT is the folder of the photographs' parent if it is not given), for
-`wildcity train OUT/sparse/0 --image-dir photos --out capture.ply`. The photographs are of one camera whose focal
+Writes models to OUT/sparse and says which is the largest, mostly 0 (without OUT: beside the folder of the photographs),
+for `wildcity train OUT/sparse/0 --image-dir photos --out capture.ply`. The photographs are of one camera whose focal
 length stays, in the order in which they were taken, and each shows much of what the one before it does.
 """
 
@@ -19,14 +19,16 @@ def main(photos: Path, out: Path) -> None:
     database = out / "colmap.db"
     if database.exists():
         raise SystemExit(f"{database} is there: remove it, or give another folder")
+    out.mkdir(parents=True, exist_ok=True)
     pycolmap.extract_features(database, photos, camera_mode=pycolmap.CameraMode.SINGLE)
     pycolmap.match_sequential(database)
     models = pycolmap.incremental_mapping(database, photos, out / "sparse")
     count = sum(1 for photo in photos.iterdir() if photo.is_file())
     if not models:
         raise SystemExit(f"no two of the {count} photographs fit together: take them closer to each other")
-    found = models[0].num_reg_images()
-    print(f"{found} of {count} photographs, {models[0].num_points3D()} points: {out / 'sparse' / '0'}")
+    index, model = max(models.items(), key=lambda item: item[1].num_reg_images())
+    found = model.num_reg_images()
+    print(f"{found} of {count} photographs, {model.num_points3D()} points: {out / 'sparse' / str(index)}")
     if found < count:
         print("the others do not fit: they show what moves, or too little of what their neighbours show")
 

@@ -6,8 +6,8 @@
 
 Each task runs `wildcity train block TWIN@VERSION --block I/BLOCKS` on its own part of the route, with the options that
 follow, and publishes its cells. A task that fails, or whose machine is lost, is tried again and goes on from its last
-checkpoint. The log, the twins (`--twins`, a folder or an object store) and the working directory are shared. On a
-machine with GPUs, `WILDCITY_GPUS_PER_BLOCK=1` gives each block a GPU.
+checkpoint. The log, the twins (`--twins`, a folder or an object store) and the working directory are shared. `WILDCITY_CORES_PER_BLOCK=8`
+gives each block eight cores (1 without it), and `WILDCITY_GPUS_PER_BLOCK=1` a GPU.
 
 Versions of the twin are made in the order in which blocks end; the last one is the same in any order.
 """
@@ -19,11 +19,18 @@ import sys
 import ray
 from wildcity.serving import binary
 
+CORES_PER_BLOCK = int(os.environ.get("WILDCITY_CORES_PER_BLOCK", "1"))
+GPUS_PER_BLOCK = float(os.environ.get("WILDCITY_GPUS_PER_BLOCK", "0"))
+
 
 def train_block(twin: str, log: str, block: str, options: list[str]) -> str:
     """Trains one block, and returns what the program says about it."""
     checkpoint = f"{twin.replace('@', '-')}-block-{block.replace('/', '-of-')}.checkpoint"
     command = [str(binary()), "train", "block", twin, "--images", log, "--block", block, "--checkpoint", checkpoint]
+    # A block has the cores and the GPU of its task.
+    command += ["--threads", str(CORES_PER_BLOCK)]
+    if GPUS_PER_BLOCK > 0:
+        command += ["--device", str(ray.get_gpu_ids()[0])]
     done = subprocess.run([*command, *options], capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise RuntimeError(f"block {block}: {done.stderr.strip()}")
@@ -35,7 +42,7 @@ def main(twin: str, log: str, blocks: int, options: list[str]) -> None:
         raise SystemExit(f"give the version of the coarse twin, for example {twin}@1: all blocks begin from the same")
     ray.init(include_dashboard=False, log_to_driver=False)
     task = ray.remote(max_retries=3, retry_exceptions=True)(train_block)
-    task = task.options(num_cpus=1, num_gpus=float(os.environ.get("WILDCITY_GPUS_PER_BLOCK", "0")))
+    task = task.options(num_cpus=CORES_PER_BLOCK, num_gpus=GPUS_PER_BLOCK)
     pending = {task.remote(twin, log, f"{k}/{blocks}", options): k for k in range(1, blocks + 1)}
     while pending:
         [done], _ = ray.wait(list(pending), num_returns=1)

@@ -11,7 +11,6 @@ use wildcity_render::gradient::Differentiate;
 use wildcity_scene::geometry::Bounds;
 use wildcity_scene::{Gaussians, Scene};
 use wildcity_train::blocks::{Blocks, HALO_M, sees};
-use wildcity_train::ground::is_ground;
 use wildcity_train::held_out::{held_out_db, scene_db};
 use wildcity_train::run::TrainingImages;
 use wildcity_train::settings::{PoseMode, Settings, SkyMode};
@@ -38,7 +37,8 @@ use crate::cli::{output, progress};
 /// of 64 m. Name the version of the coarse twin (T@1), and the result is the same in any order.
 ///
 /// Prints the PSNR of held-out images that see both sides of a border, by the block alone and by
-/// the twin: a seam would show as a difference.
+/// the twin: once the blocks beside it are trained, a seam would show as a difference. A Gaussian
+/// that moves across a border is kept by the side on which it ends.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(in crate::cli) struct Block {
@@ -130,28 +130,44 @@ struct Parts {
 
 impl Block {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let settings = self.training_settings()?;
+        let name = &self.edited.twin.name;
+        ensure!(
+            self.edited.twin.number.is_some(),
+            "{name}: give the version that all blocks begin from, for example {name}@1: blocks are cut by its Gaussians"
+        );
+        if let Some(path) = &self.checkpoint {
+            output::check_folder("--checkpoint", path)?;
+        }
         let catalog = self.twins.catalog()?;
         let base = catalog.version(&self.edited.twin.name, self.edited.twin.number)?;
         let manifest = &base.manifest;
+        let settings = self.training_settings(manifest.sh_degree)?;
         let cells: Vec<([i32; 2], u64)> =
             manifest.chunks.iter().map(|chunk| (chunk.cell, chunk.count)).collect();
         let drives = manifest.trajectories.iter().flat_map(|drive| &drive.keyframes);
         let path_m: Vec<DVec3> = drives.map(|key| key.world_from_rig.position_m).collect();
         let BlockOf { number, all } = self.block;
         let blocks = Blocks::new(&cells, &path_m, all).context("--block")?;
-        self.check_unchanged(&catalog, &base, blocks.cells(number - 1))?;
+        // A run that was stopped after it had published would find its own version here.
+        if self.checkpoint.as_ref().is_none_or(|path| !path.exists()) {
+            self.check_unchanged(&catalog, &base, blocks.cells(number - 1))?;
+        }
         let parts = Parts::read(&catalog, &base, &blocks, number - 1)?;
         ensure!(!parts.moving.is_empty(), "block {number}/{all} has no Gaussians");
+        let [moving, cap] = [parts.moving.len(), settings.growth.cap];
+        ensure!(
+            moving <= cap,
+            "block {number}/{all} has {moving} Gaussians, more than --cap {cap}: give a larger one, or more blocks"
+        );
 
         let recording = self.recorded.open(&catalog, &base, self.size, self.held_out_every)?;
-        let sees_one =
-            |points_m: &[DVec3], index: usize| sees(&recording.images.view(index), points_m);
+        let recorded = recording.images.images();
+        let sees_one = |points_m: &[DVec3], index: usize| sees(&recorded.view(index), points_m);
         let seeing: Vec<usize> =
-            (0..recording.images.count()).filter(|&index| sees_one(&parts.own_m, index)).collect();
+            (0..recorded.count()).filter(|&index| sees_one(&parts.own_m, index)).collect();
         let across = seeing.iter().copied().filter(|&index| sees_one(&parts.halo_m, index));
-        let across = ChosenImages { all: &*recording.images, chosen: across.collect() };
-        let images = ChosenImages { all: &*recording.images, chosen: seeing };
+        let across = ChosenImages { all: recorded, chosen: across.collect() };
+        let images = ChosenImages { all: recorded, chosen: seeing };
         ensure!(
             images.count() > 0,
             "no image sees block {number}/{all}: are the images of this twin?"
@@ -170,7 +186,8 @@ impl Block {
             backend.name()
         )?;
         let trainer = self.train(&catalog, &base, &images, &parts, &recording, settings)?;
-        self.publish(&catalog, &base, &blocks, &trainer, &across, backend)
+        self.publish(&catalog, &base, &blocks, &trainer, &across, backend)?;
+        self.checkpoint.as_deref().map_or(Ok(()), checkpoints::remove_file)
     }
 
     /// Checks, before a long run, that its result can be published: nobody has changed its cells
@@ -189,7 +206,8 @@ impl Block {
         let BlockOf { number, all } = self.block;
         ensure!(
             objects(base) == objects(&latest),
-            "block {number}/{all} of twin {} has changed from version {} to {}: it may have been trained already; to train it              further, begin from version {2}",
+            "block {number}/{all} of twin {} has changed from version {} to {}: it may have been trained already; to \
+             train it further, begin from version {2}",
             self.edited.twin.name,
             base.number,
             latest.number
@@ -231,17 +249,19 @@ impl Block {
             None => {
                 let means_m: Vec<DVec3> =
                     parts.moving.means_m.iter().map(|m| DVec3::from_array(*m)).collect();
-                let egos = recording.rig.as_ref().map(|rig| &rig.world_from_ego);
+                let logged = recording.images.logged();
+                let is_ground = logged.map(|images| images.ground(&means_m)).transpose()?;
                 let start = Start {
-                    is_ground: egos.map(|egos| is_ground(&means_m, egos)).unwrap_or_default(),
+                    is_ground: is_ground.unwrap_or_default(),
                     gaussians: parts.moving.clone(),
                     world_from_camera: recording.world_from_camera.clone(),
-                    rig: recording.rig.clone(),
+                    rig: logged.map(|images| images.rig.clone()),
                     fixed,
                 };
                 Trainer::new(start, profile, settings)?
             }
         };
+        let resumed_at = trainer.steps_done();
         let before = held_out_db(&trainer, images, backend)?;
         let after = train(&mut trainer, images, backend, &mut |line, trainer| {
             let is_time = line.step.is_multiple_of(checkpoints::EVERY);
@@ -259,10 +279,14 @@ impl Block {
             }
             anyhow::bail!("stopped after {done} of {steps} steps; the twin is as it was: {how}");
         }
+        // From here on a repeated command only publishes.
+        checkpoints.as_ref().map_or(Ok(()), |checkpoints| checkpoints.write(&trainer))?;
         if let Some((before, (after, seconds))) = before.zip(after) {
+            let begun =
+                if resumed_at > 0 { format!(" at step {resumed_at}") } else { String::new() };
             writeln!(
                 io::stdout().lock(),
-                "held out: {before:.2} dB, and {after:.2} dB after {steps} steps, {seconds:.0} s"
+                "held out: {before:.2} dB{begun}, and {after:.2} dB after {steps} steps, {seconds:.0} s"
             )?;
         }
         Ok(trainer)
@@ -287,9 +311,6 @@ impl Block {
         let version =
             catalog.replace_cells(base, &gaussians, cells, how, &mut progress::show(&bar))?;
         bar.finish_and_clear();
-        if let Some(path) = &self.checkpoint {
-            checkpoints::remove_file(path)?;
-        }
         let mut stdout = io::stdout().lock();
         let Version { number: version_number, hash, .. } = &version;
         writeln!(
@@ -318,11 +339,17 @@ impl Block {
         Ok(())
     }
 
-    fn training_settings(&self) -> anyhow::Result<Settings> {
+    /// The settings of the run; the harmonics have the degree of the twin.
+    fn training_settings(&self, sh_degree: u8) -> anyhow::Result<Settings> {
         let mut settings = match &self.settings {
-            None => Settings::default(),
+            None => Settings { sh_degree, ..Settings::default() },
             Some(path) => read_settings(path)?,
         };
+        ensure!(
+            settings.sh_degree == sh_degree,
+            "--settings: sh_degree is {}, and that of the twin {sh_degree}: its blocks have one degree",
+            settings.sh_degree
+        );
         settings.steps = self.steps.map_or(settings.steps, |steps| steps as usize);
         settings.growth.cap = self.cap.map_or(settings.growth.cap, |cap| cap as usize);
         settings.poses.mode = PoseMode::Off;
@@ -366,10 +393,12 @@ impl Parts {
             moving.append(&section.select(moves));
             around.append(&section.select(at(&|distance_m| distance_m > HALO_M)));
         })?;
-        let sample = |points_m: Vec<DVec3>| {
-            let every = points_m.len().div_ceil(SAMPLE).max(1);
-            points_m.into_iter().step_by(every).collect()
-        };
         Ok(Self { moving, around, own_m: sample(own_m), halo_m: sample(halo_m) })
     }
+}
+
+/// Some of all points, at equal distances in their list.
+pub(super) fn sample(points_m: Vec<DVec3>) -> Vec<DVec3> {
+    let every = points_m.len().div_ceil(SAMPLE).max(1);
+    points_m.into_iter().step_by(every).collect()
 }

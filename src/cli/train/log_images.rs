@@ -1,10 +1,12 @@
 //! The images of a log as a run of training reads them: with the poses of its rig, with depths of
 //! its LiDAR, and without what moves.
 
+use std::fs;
 use std::path::PathBuf;
 
 use anyhow::{Context, ensure};
 use glam::DVec3;
+use image::image_dimensions;
 use wildcity_eval::images::picture;
 use wildcity_eval::{Boxes, GROWN_PX, hide};
 use wildcity_log::check::Projection;
@@ -160,13 +162,25 @@ impl LogImages {
         self.images.iter().map(|image| self.rig.world_from_camera(image.place)).collect()
     }
 
-    /// A text by which a checkpoint knows its images.
-    pub(super) fn inputs(&self) -> String {
+    /// A text by which a checkpoint knows its images: the lenses, the tables, and the poses.
+    pub(super) fn inputs(&self) -> anyhow::Result<String> {
         let mut text = format!("{} {}\n{:?}\n", self.size, self.held_out_every, self.rig);
         for LoggedImage { row, place } in &self.images {
             text += &format!("{row:?} {place:?}\n");
         }
-        text
+        for name in ["log.json", "rig.json", "lidar.jsonl", "tracks.jsonl"] {
+            let path = self.log.path(name);
+            if path.is_file() {
+                let mut hasher = blake3::Hasher::new();
+                let hashed = fs::File::open(&path).and_then(|file| {
+                    hasher.update_reader(file)?;
+                    Ok(())
+                });
+                hashed.with_context(|| format!("cannot read {}", path.display()))?;
+                text += &format!("{name} {}\n", hasher.finalize());
+            }
+        }
+        Ok(text)
     }
 
     /// Whether each point lies on the ground: as most of the ground masks of the log say that show
@@ -179,9 +193,14 @@ impl LogImages {
         let mut votes = vec![[0_u32; 2]; points_m.len()];
         for LoggedImage { row, place } in all.into_iter().step_by(every) {
             let Some(file) = &row.ground_mask else { continue };
+            let file = self.log.path(file);
+            let (width, height) = image_dimensions(&file)
+                .with_context(|| format!("cannot read {}", file.display()))?;
+            let size_px = [width, height];
+            let mask = picture::mask(&file, size_px)?;
+            // The mask has the size of its image, which may be smaller than the calibrated one.
             let camera = self.log.rig.cameras[place.camera].camera;
-            let size_px = [camera.width_px, camera.height_px];
-            let mask = picture::mask(&self.log.path(file), size_px)?;
+            let camera = camera.scaled(width.into(), height.into())?;
             let camera_from_world = self.rig.world_from_camera(*place).inverse();
             for (point_m, votes) in points_m.iter().zip(&mut votes) {
                 let at_m = camera_from_world.transform_point(*point_m);

@@ -154,7 +154,7 @@ impl RunOptions {
             writeln!(io::stderr(), "{left_out} left out: there is no pose at the time")?;
         }
         let (start, profile) = self.start.read_for_log(source, &images, &settings)?;
-        let inputs = images.inputs();
+        let inputs = images.inputs()?;
         let images = OpenedImages::Logged(Box::new(images));
         Ok(Inputs { images, inputs, start, profile, settings })
     }

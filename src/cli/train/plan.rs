@@ -1,25 +1,30 @@
 //! `wildcity train plan`.
 
+use std::collections::BTreeMap;
 use std::io::{self, Write};
+use std::time::Instant;
 
 use anyhow::Context;
 use glam::DVec3;
+use wildcity_render::gradient::Differentiate;
 use wildcity_scene::chunk::cell_at;
 use wildcity_train::blocks::{Blocks, sees};
+use wildcity_train::cache::CachedImages;
 use wildcity_train::model::peak_bytes;
 use wildcity_train::run::{Line, TrainingImages, run};
 use wildcity_train::trainer::Trainer;
 
-use std::collections::BTreeMap;
-
+use super::block::sample;
+use super::images::ChosenImages;
 use super::options::{Inputs, RunOptions};
+use super::progress::{CACHE_BYTES, EVALUATIONS};
 use crate::cli::output;
 
 /// Say what a run would take, before it runs: images, Gaussians, memory, time, and blocks.
 ///
-/// Takes the options of `wildcity train`. A few steps are made to measure their time on this
-/// machine, and nothing is written. With --blocks, says which cells of 64 m and how many images
-/// each block would have (`wildcity train block`).
+/// A few steps are made to measure their time on this machine, and nothing is written. With
+/// --blocks, says about how many cells of 64 m, Gaussians and images each block would have; blocks
+/// are cut by the Gaussians of the coarse twin (`wildcity train block`), which are not there yet.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(in crate::cli) struct Plan {
@@ -36,17 +41,19 @@ Examples:
   wildcity train plan log --size 0.5 --steps 15000
   wildcity train plan log --blocks 4";
 
-/// Steps that are measured. The first ones are slower: nothing is in the caches yet.
+/// Images that are measured: once to decode them, and once without.
 const MEASURED: usize = 12;
 
-/// Points that decide which images see a block, at most.
-const SAMPLE: usize = 2_000;
+/// Stages whose time is that of the pixels; all else grows with the number of Gaussians.
+const OF_PIXELS: [&str; 3] = ["rasterize", "loss", "blend backwards"];
 
-/// Steps that are measured, in seconds.
+/// What is measured, in seconds.
 struct Measured {
-    /// What depends on the pixels.
-    pixels_s: f64,
-    /// What grows with the number of Gaussians.
+    /// An image, with the sweeps around it.
+    decode_s: f64,
+    /// A step but for what grows with the number of Gaussians.
+    fixed_s: f64,
+    /// What grows with it.
     gaussians_s: f64,
 }
 
@@ -55,110 +62,137 @@ impl Plan {
         let Inputs { images: opened, start, profile, settings, .. } = self.run.open()?;
         let images = opened.images();
         let mut stdout = io::stdout().lock();
-        let held_out = images.held_out().len();
-        let pixels: usize = (0..images.count()).map(|k| images.view(k).camera.pixels()).sum();
-        let size = self.run.size * self.run.size;
-        writeln!(
-            stdout,
-            "images     {} to learn from, {held_out} held out, of {:.2} megapixels on average",
-            images.count() - held_out,
-            1e-6 * size * pixels as f64 / images.count().max(1) as f64
-        )?;
+        let points_m: Vec<DVec3> =
+            start.gaussians.means_m.iter().map(|m| DVec3::from_array(*m)).collect();
+        let path_m: Vec<DVec3> = start.world_from_camera.iter().map(|p| p.position_m).collect();
+        // Before the steps: more blocks than cells are refused.
+        let blocks =
+            Blocks::new(&cells(&points_m), &path_m, self.blocks.into()).context("--blocks")?;
         let begin = start.gaussians.len();
         let end = settings.counts(begin).last().unwrap_or(begin);
+        let backend = &*self.run.hardware.training()?;
+        let mut trainer = Trainer::new(start, profile, settings.clone())?;
+        let measured = Measured::new(&mut trainer, images, backend)?;
+
+        let held_out = images.held_out().len();
+        let learned = images.count() - held_out;
+        let pixels: usize = (0..images.count()).map(|k| images.view(k).camera.pixels()).sum();
+        let pixels = self.run.size * self.run.size * pixels as f64;
+        // Colours, a mask, and depths.
+        let decoded = (8.0 * pixels) as usize;
+        writeln!(
+            stdout,
+            "images     {learned} to learn from, {held_out} held out, of {:.2} megapixels on average",
+            1e-6 * pixels / images.count().max(1) as f64
+        )?;
         writeln!(
             stdout,
             "Gaussians  {begin} at the beginning, at most {end} at the end (--cap {})",
             settings.growth.cap
         )?;
-        let points_m: Vec<DVec3> =
-            start.gaussians.means_m.iter().map(|m| DVec3::from_array(*m)).collect();
-        let path_m: Vec<DVec3> = start.world_from_camera.iter().map(|p| p.position_m).collect();
-        let sh_degree = settings.sh_degree;
-        let backend = &*self.run.hardware.training()?;
-        let mut trainer = Trainer::new(start, profile, settings.clone())?;
-        let measured = Measured::new(&mut trainer, images, backend)?;
-        let resident = peak_resident_bytes();
-        let more = end.saturating_sub(begin) * peak_bytes(sh_degree);
-        match resident {
+        let each = peak_bytes(trainer.model().sh_degree());
+        let more = end.saturating_sub(begin) * each + decoded.min(CACHE_BYTES);
+        match peak_resident_bytes() {
             Some(bytes) => writeln!(
                 stdout,
-                "memory     {:.1} GB: {:.1} now, and {} B for each Gaussian more",
+                "memory     {:.1} GB: {:.1} now, {each} B for each Gaussian more, {:.1} GB of decoded images",
                 1e-9 * (bytes + more) as f64,
                 1e-9 * bytes as f64,
-                peak_bytes(sh_degree)
+                1e-9 * decoded.min(CACHE_BYTES) as f64
             )?,
-            None => writeln!(stdout, "memory     {} B for each Gaussian", peak_bytes(sh_degree))?,
+            None => writeln!(stdout, "memory     {each} B for each Gaussian")?,
         }
-        let seconds: f64 = settings.counts(begin).map(|count| measured.step_s(count, begin)).sum();
+        // Images that are not kept are decoded again each time, beside the step.
+        let is_decoded = |step: usize| step < learned || decoded > CACHE_BYTES;
+        let step_s = |(step, count): (usize, usize)| {
+            let step_s = measured.step_s(count, begin);
+            if is_decoded(step) { step_s.max(measured.decode_s) } else { step_s }
+        };
+        let steps_s: f64 = settings.counts(begin).enumerate().map(step_s).sum();
+        let evaluations_s = (EVALUATIONS * held_out) as f64 * measured.step_s(end, begin) / 2.0;
         let [first_ms, last_ms] = [begin, end].map(|count| 1e3 * measured.step_s(count, begin));
         writeln!(
             stdout,
-            "time       {} for {} steps of {first_ms:.0} to {last_ms:.0} ms, backend {}, as measured on {MEASURED} steps",
-            duration(seconds),
+            "time       about {}: {} steps of {first_ms:.0} to {last_ms:.0} ms, and {:.0} ms to decode an image; backend {}, \
+             measured on {MEASURED} images",
+            duration(steps_s + evaluations_s),
             settings.steps,
+            1e3 * measured.decode_s,
             backend.name()
         )?;
-        self.print_blocks(&mut stdout, images, &points_m, &path_m)
+        print_blocks(&mut stdout, &blocks, images, &points_m)
     }
+}
 
-    fn print_blocks(
-        &self,
-        out: &mut dyn Write,
-        images: &dyn TrainingImages,
-        points_m: &[DVec3],
-        path_m: &[DVec3],
-    ) -> anyhow::Result<()> {
-        let mut cells: BTreeMap<[i32; 2], u64> = BTreeMap::new();
-        for point_m in points_m {
-            *cells.entry(cell_at(&point_m.to_array())).or_default() += 1;
-        }
-        let cells: Vec<([i32; 2], u64)> = cells.into_iter().collect();
-        let blocks = Blocks::new(&cells, path_m, self.blocks.into()).context("--blocks")?;
-        for block in 0..usize::from(self.blocks) {
-            let owned = blocks.cells(block);
-            let is_own = |point_m: &&DVec3| owned.contains(&cell_at(&point_m.to_array()));
-            let own_m: Vec<DVec3> = points_m.iter().filter(is_own).copied().collect();
-            let every = own_m.len().div_ceil(SAMPLE).max(1);
-            let sample_m: Vec<DVec3> = own_m.iter().step_by(every).copied().collect();
-            let seeing = (0..images.count()).filter(|&k| sees(&images.view(k), &sample_m)).count();
-            writeln!(
-                out,
-                "block {}/{}  {} of 64 m, {} to begin with, seen by {}",
-                block + 1,
-                self.blocks,
-                output::counted(owned.len(), "cell"),
-                output::counted(own_m.len(), "Gaussian"),
-                output::counted(seeing, "image")
-            )?;
-        }
-        Ok(())
+/// The cells of some points, with their numbers.
+fn cells(points_m: &[DVec3]) -> Vec<([i32; 2], u64)> {
+    let mut cells: BTreeMap<[i32; 2], u64> = BTreeMap::new();
+    for point_m in points_m {
+        *cells.entry(cell_at(&point_m.to_array())).or_default() += 1;
     }
+    cells.into_iter().collect()
+}
+
+fn print_blocks(
+    out: &mut dyn Write,
+    blocks: &Blocks,
+    images: &dyn TrainingImages,
+    points_m: &[DVec3],
+) -> anyhow::Result<()> {
+    for block in 0..blocks.len() {
+        let owned = blocks.cells(block);
+        let is_own = |point_m: &&DVec3| owned.contains(&cell_at(&point_m.to_array()));
+        let own_m: Vec<DVec3> = points_m.iter().filter(is_own).copied().collect();
+        let count = own_m.len();
+        let sample_m = sample(own_m);
+        let seeing = (0..images.count()).filter(|&k| sees(&images.view(k), &sample_m)).count();
+        writeln!(
+            out,
+            "block {}/{}  {} of 64 m, {} to begin with, seen by {}",
+            block + 1,
+            blocks.len(),
+            output::counted(owned.len(), "cell"),
+            output::counted(count, "Gaussian"),
+            output::counted(seeing, "image")
+        )?;
+    }
+    Ok(())
 }
 
 impl Measured {
     fn new(
         trainer: &mut Trainer,
         images: &dyn TrainingImages,
-        backend: &dyn wildcity_render::gradient::Differentiate,
+        backend: &dyn Differentiate,
     ) -> anyhow::Result<Self> {
+        let learned = (0..images.count()).filter(|&index| !images.is_held_out(index));
+        let every = images.count().div_ceil(MEASURED).max(1);
+        let chosen: Vec<usize> = learned.step_by(every).collect();
+        let count = chosen.len();
+        let chosen = ChosenImages { all: images, chosen };
+        let images = CachedImages::new(&chosen, usize::MAX);
+        let begin = Instant::now();
+        for index in 0..count {
+            images.load(index).map_err(anyhow::Error::msg)?;
+        }
+        let decode_s = begin.elapsed().as_secs_f64() / count.max(1) as f64;
         let mut lines: Vec<Line> = Vec::new();
-        run(trainer, images, backend, usize::MAX, &mut |line, _| {
+        run(trainer, &images, backend, usize::MAX, &mut |line, _| {
             lines.push(line.clone());
             lines.len() < MEASURED
         })?;
-        let whole_s = lines.last().map_or(0.0, |line| line.seconds);
-        let of_pixels = |name: &str| ["rasterize", "loss", "blend backwards"].contains(&name);
-        let stages = lines.iter().flat_map(|line| &line.stages_ms);
-        let pixels_ms: f64 = stages.filter(|(name, _)| of_pixels(name)).map(|(_, ms)| ms).sum();
         let steps = lines.len().max(1) as f64;
-        let pixels_s = (1e-3 * pixels_ms).min(whole_s) / steps;
-        Ok(Self { pixels_s, gaussians_s: whole_s / steps - pixels_s })
+        let step_s = lines.last().map_or(0.0, |line| line.seconds) / steps;
+        let stages = lines.iter().flat_map(|line| &line.stages_ms);
+        let is_of_pixels = |name: &str| OF_PIXELS.contains(&name);
+        let pixels_ms: f64 = stages.filter(|(name, _)| is_of_pixels(name)).map(|(_, ms)| ms).sum();
+        let fixed_s = (1e-3 * pixels_ms / steps).min(step_s);
+        Ok(Self { decode_s, fixed_s, gaussians_s: step_s - fixed_s })
     }
 
     /// The time of a step with some Gaussians, if those that were measured were `measured`.
     fn step_s(&self, count: usize, measured: usize) -> f64 {
-        self.pixels_s + self.gaussians_s * count as f64 / measured.max(1) as f64
+        self.fixed_s + self.gaussians_s * count as f64 / measured.max(1) as f64
     }
 }
 

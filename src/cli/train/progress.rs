@@ -11,11 +11,14 @@ use super::checkpoints::StopsAtSignal;
 use super::lines::log;
 use crate::cli::progress;
 
+/// How often the images that are held out are looked at.
+pub(super) const EVALUATIONS: usize = 10;
+
 /// Held-out images on the page of a run.
 pub(super) const PICTURES: usize = 6;
 
-/// Decoded images are kept up to this size: 4,000 of 360 x 232 px, with depths.
-const CACHE_BYTES: usize = 1 << 30;
+/// Decoded images are kept up to this size: 1,800 of 360 x 232 px with depths.
+pub(super) const CACHE_BYTES: usize = 1 << 30;
 
 /// Goes on to the last step, or until the process is asked to stop. `each` is called after each
 /// step. Returns the PSNR of the images that are held out, when it was measured last, and the
@@ -26,7 +29,7 @@ pub(super) fn train(
     backend: &dyn Differentiate,
     each: &mut dyn FnMut(&Line, &Trainer) -> anyhow::Result<()>,
 ) -> anyhow::Result<Option<(f64, f64)>> {
-    let every = (trainer.settings().steps / 10).max(1);
+    let every = (trainer.settings().steps / EVALUATIONS).max(1);
     let signal = StopsAtSignal::new()?;
     let bar = progress::count("training");
     bar.set_length(trainer.settings().steps as u64);

@@ -9,21 +9,18 @@ use wildcity_eval::images::ImageList;
 use wildcity_log::Log;
 use wildcity_scene::align::Alignment;
 use wildcity_scene::geometry::Pose;
-use wildcity_train::poses::RigPoses;
-use wildcity_train::run::TrainingImages;
 use wildcity_twin::store::{Catalog, Version};
 
 use super::images::ListedImages;
 use super::log_images::LogImages;
+use super::options::OpenedImages;
 use crate::cli::{Options, file_notes, placement};
 
 /// Recorded images in the axes of a twin.
 pub(super) struct Recording {
-    pub(super) images: Box<dyn TrainingImages>,
+    pub(super) images: OpenedImages,
     /// The recorded pose of each image.
     pub(super) world_from_camera: Vec<Pose>,
-    /// The poses of the rig, of a log.
-    pub(super) rig: Option<RigPoses>,
     /// A text by which a checkpoint knows the images.
     pub(super) inputs: String,
 }
@@ -84,12 +81,8 @@ impl RecordedImages {
             listed.add(&list, &self.alignment(catalog, base, &list)?)?;
             let world_from_camera = listed.poses();
             let inputs = listed.inputs();
-            return Ok(Recording {
-                images: Box::new(listed),
-                world_from_camera,
-                rig: None,
-                inputs,
-            });
+            let images = OpenedImages::Listed(listed);
+            return Ok(Recording { images, world_from_camera, inputs });
         }
         ensure!(
             image_dir.is_none() && masks.is_none() && axes.is_none(),
@@ -104,9 +97,9 @@ impl RecordedImages {
             )?;
         }
         let world_from_camera = logged.world_from_camera();
-        let inputs = logged.inputs();
-        let rig = Some(logged.rig.clone());
-        Ok(Recording { images: Box::new(logged), world_from_camera, rig, inputs })
+        let inputs = logged.inputs()?;
+        let images = OpenedImages::Logged(Box::new(logged));
+        Ok(Recording { images, world_from_camera, inputs })
     }
 
     /// The transform from the axes of the recorded poses to those of the twin.

@@ -36,7 +36,8 @@ use crate::cli::{output, progress};
 ///
 /// Three steps of ten are made on the views of --augmented. The loss of each view has the weight
 /// that its list says. Prints the PSNR of the recorded images that were held out, and of one view
-/// of eight off the drives, which is not trained on, before and after.
+/// of eight off the drives, which is not trained on, before and after: how near the twin comes to
+/// what the model has made of it.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(in crate::cli) struct Refine {
@@ -84,7 +85,7 @@ Examples:
   wildcity train refine street --images capture --augmented augmented/round_1";
 
 /// One view of so many off the drives judges a run.
-const JUDGES: usize = 8;
+const JUDGES: u8 = 8;
 
 /// Views that judge a run, by their distance from the drives in centimetres.
 type Judges = BTreeMap<u32, ListedImages>;
@@ -113,6 +114,9 @@ fn judged(
 impl Refine {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let settings = self.training_settings()?;
+        if let Some(page) = &self.page {
+            output::check_folder("--page", page)?;
+        }
         let catalog = self.twins.catalog()?;
         let base = catalog.version(&self.edited.twin.name, self.edited.twin.number)?;
         let read = |dir: &PathBuf| {
@@ -122,8 +126,10 @@ impl Refine {
         let rounds: Vec<ImageList> = self.augmented.iter().map(read).collect::<Result<_, _>>()?;
         let mut augmented = ListedImages::new(self.size, 0);
         let mut judges = Judges::new();
-        for (k, image) in rounds.iter().flat_map(|round| round.every(1)).enumerate() {
-            let offset = offset_cm(&image.name).filter(|_| k % JUDGES == JUDGES - 1);
+        for image in rounds.iter().flat_map(|round| round.every(1)) {
+            // By its name, so that both sides and all cameras have their share.
+            let is_judge = blake3::hash(image.name.as_bytes()).as_bytes()[0] % JUDGES == 0;
+            let offset = offset_cm(&image.name).filter(|_| is_judge);
             let images = match offset {
                 Some(offset) => {
                     judges.entry(offset).or_insert_with(|| ListedImages::new(self.size, 1))
@@ -136,7 +142,7 @@ impl Refine {
         let Recording { images: recorded, mut world_from_camera, .. } =
             self.recorded.open(&catalog, &base, self.size, self.held_out_every)?;
         world_from_camera.extend(augmented.poses());
-        let images = WithAugmented { recorded: &*recorded, augmented: &augmented };
+        let images = WithAugmented { recorded: recorded.images(), augmented: &augmented };
         self.refine(&catalog, &base, &images, &judges, world_from_camera, settings)
     }
 
@@ -182,9 +188,6 @@ impl Refine {
         ensure!(done == steps, "stopped after {done} of {steps} steps: the twin is as it was");
 
         let after_off = judged(judges, &trainer, backend)?;
-        if let Some(page) = &self.page {
-            self.write_page(page, &trainer, images, backend)?;
-        }
 
         let bar = progress::count("writing");
         let how = format!("refine={}", self.description());
@@ -215,7 +218,10 @@ impl Refine {
             "twin {name} version {number}: {} Gaussians\nblake3 {hash}",
             gaussians.len()
         )?;
-        Ok(())
+        match &self.page {
+            Some(page) => self.write_page(page, &trainer, images, backend),
+            None => Ok(()),
+        }
     }
 
     fn write_page(

@@ -177,9 +177,5 @@ fn check_out(out: &Path) -> anyhow::Result<()> {
     ensure!(is_ply, "--out {out_name}: the file is a PLY: give it a name that ends with .ply");
     let is_free = !out.exists() || out.is_file();
     ensure!(is_free, "--out {out_name} is a folder or a device: give the name of a file");
-    // The folder of a bare name is the current one.
-    let folder = out.parent().filter(|folder| !folder.as_os_str().is_empty());
-    let is_there = folder.is_none_or(Path::is_dir);
-    ensure!(is_there, "--out {out_name}: there is no such folder: create it");
-    Ok(())
+    output::check_folder("--out", out)
 }

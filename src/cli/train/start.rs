@@ -133,11 +133,16 @@ fn logged_start(images: &LogImages, settings: &Settings) -> anyhow::Result<Start
 
 /// A text by which a checkpoint knows its Gaussians.
 pub(super) fn inputs(gaussians: &Gaussians) -> String {
-    let Gaussians { sh_degree, means_m, ln_scales, logit_opacities, sh, .. } = gaussians;
-    let means_m = means_m.iter().map(|mean_m| DVec3::from_array(*mean_m)).sum::<DVec3>();
-    let sum = |values: &[f32]| values.iter().map(|&value| f64::from(value)).sum::<f64>();
-    let sums = [ln_scales.as_flattened(), logit_opacities, sh].map(sum);
-    format!("{} Gaussians of degree {sh_degree}, {means_m:?} {sums:?}\n", gaussians.len())
+    let Gaussians { sh_degree, means_m, ln_scales, quats_wxyz, logit_opacities, sh } = gaussians;
+    let mut hasher = blake3::Hasher::new();
+    let mut bytes: Vec<u8> = means_m.as_flattened().iter().flat_map(|m| m.to_le_bytes()).collect();
+    hasher.update(&bytes);
+    for values in [ln_scales.as_flattened(), quats_wxyz.as_flattened(), logit_opacities, sh] {
+        bytes.clear();
+        bytes.extend(values.iter().flat_map(|value| value.to_le_bytes()));
+        hasher.update(&bytes);
+    }
+    format!("{} Gaussians of degree {sh_degree}, {}\n", gaussians.len(), hasher.finalize())
 }
 
 /// Keeps as many points as `count`, at random.

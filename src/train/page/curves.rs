@@ -12,8 +12,16 @@ const SIZE_PX: (u32, u32) = (1_100, 300);
 const LABEL: (&str, i32) = ("sans-serif", 13);
 
 /// Colours that also differ in lightness (Okabe and Ito 2008).
-const COLORS: [RGBColor; 4] =
-    [RGBColor(0, 114, 178), RGBColor(213, 94, 0), RGBColor(0, 158, 115), RGBColor(204, 121, 167)];
+const COLORS: [RGBColor; CURVES] = [
+    RGBColor(0, 114, 178),
+    RGBColor(213, 94, 0),
+    RGBColor(0, 158, 115),
+    RGBColor(204, 121, 167),
+    RGBColor(230, 159, 0),
+];
+
+/// Most curves of a plot.
+const CURVES: usize = 5;
 
 /// A named line.
 type Curve<'a> = (&'a str, Vec<(f64, f64)>);
@@ -26,7 +34,7 @@ pub(super) fn psnr(history: &History) -> Result<String, PageError> {
 
 /// The losses over the steps.
 pub(super) fn losses(history: &History) -> Result<String, PageError> {
-    let values: [(&str, fn(&CurvePoint) -> f64); 5] = [
+    let values: [(&str, fn(&CurvePoint) -> f64); CURVES] = [
         ("L1", |point| point.l1),
         ("D-SSIM", |point| point.dssim),
         ("disparity, 1/m", |point| point.disparity),

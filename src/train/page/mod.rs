@@ -11,6 +11,7 @@ use maud::{DOCTYPE, Markup, PreEscaped, html};
 use crate::held_out::HeldOut;
 use crate::history::Evaluation;
 use crate::poses::PoseMoves;
+use crate::settings::PoseMode;
 use crate::trainer::Trainer;
 
 const STYLE: &str = "\
@@ -41,6 +42,9 @@ pub enum PageError {
     /// A plot cannot be drawn.
     #[error("a plot of the page: {0}")]
     Plot(Box<dyn Error + Send + Sync>),
+    /// A picture has not as many values as pixels.
+    #[error("a picture of the page is not of {0} x {1} px")]
+    Size(u32, u32),
     /// A picture cannot be encoded.
     #[error("a picture of the page: {0}")]
     Picture(#[from] image::ImageError),
@@ -83,9 +87,9 @@ pub fn page(contents: &Contents<'_>) -> Result<String, PageError> {
                 @if !history.evaluations.is_empty() { (PreEscaped(curves::psnr(history)?)) }
                 (PreEscaped(curves::losses(history)?))
                 (PreEscaped(curves::gaussians(history)?))
-                @if let Some(moves) = trainer.moves() { (poses(&moves, cameras)) }
+                @if let Some(moves) = trainer.moves() { (poses(&moves, cameras, trainer.settings().poses.mode != PoseMode::Image)) }
                 h2 { "Settings" }
-                p { "The file of " code { "--settings" } " that repeats the run:" }
+                p { "As a file for " code { "--settings" } ":" }
                 pre { (settings) }
             }
         }
@@ -132,7 +136,7 @@ fn beside(image: &HeldOut) -> Result<Markup, PageError> {
     })
 }
 
-fn poses(moves: &PoseMoves, cameras: &[String]) -> Markup {
+fn poses(moves: &PoseMoves, cameras: &[String], of_rig: bool) -> Markup {
     let row = |name: &str, moved: &[[f64; 2]]| {
         let part = |axis: usize| -> [f64; 2] {
             let mut all: Vec<f64> = moved.iter().map(|moved| moved[axis]).collect();
@@ -148,8 +152,6 @@ fn poses(moves: &PoseMoves, cameras: &[String]) -> Markup {
             }
         }
     };
-    // Poses of single images have one camera, which has no name of a rig.
-    let of_rig = moves.cameras.len() == cameras.len();
     html! {
         h2 { "Poses: how far they have moved from the recorded ones" }
         table {

@@ -2,7 +2,9 @@
 
 use image::codecs::jpeg::JpegEncoder;
 use image::imageops::{self, FilterType};
-use image::{ExtendedColorType, ImageEncoder, ImageResult, RgbImage};
+use image::{ExtendedColorType, ImageEncoder, RgbImage};
+
+use super::PageError;
 
 /// The distance of the last colour of a depth, in metres.
 pub(super) const FAR_M: f32 = 80.0;
@@ -13,10 +15,10 @@ const MOST_PX: u32 = 560;
 const QUALITY: u8 = 88;
 
 /// An image as JPEG, at a width that a page shows.
-pub(super) fn jpeg(size_px: [u32; 2], rgb8: &[u8]) -> ImageResult<Vec<u8>> {
+pub(super) fn jpeg(size_px: [u32; 2], rgb8: &[u8]) -> Result<Vec<u8>, PageError> {
     let [width, height] = size_px;
-    // As many values as pixels: the renderer has written them.
-    let image = RgbImage::from_raw(width, height, rgb8.to_vec()).unwrap_or_default();
+    let image = RgbImage::from_raw(width, height, rgb8.to_vec());
+    let image = image.ok_or(PageError::Size(width, height))?;
     let shown = if width > MOST_PX {
         let shown_height = (height * MOST_PX).div_ceil(width);
         imageops::resize(&image, MOST_PX, shown_height, FilterType::Triangle)

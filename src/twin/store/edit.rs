@@ -134,7 +134,8 @@ impl Catalog {
 
 impl Catalog {
     /// Makes a version with other Gaussians in some cells, such as after training a part of the
-    /// twin, and with all else of an existing one. Gaussians in other cells are left out. What
+    /// twin, and with all else of an existing one. Gaussians in other cells are left out, and a cell
+    /// without any is no longer there. What
     /// others have changed in other cells since the base is kept, so that parts can be trained at
     /// the same time. `how` is added to the options of its provenance. `progress` gets the number
     /// of Gaussians written and in all.
@@ -153,6 +154,7 @@ impl Catalog {
         let manifest = &base.manifest;
         let storage = StorageOptions { record: manifest.record, levels: manifest.has_levels() };
         let mut commit = self.begin(&manifest.twin, CommitKind::Import, storage)?;
+        commit.remove(cells);
         commit.put(gaussians, Some(cells), progress)?;
         let mut provenance = manifest.provenance.for_edit();
         provenance.options.push(how);

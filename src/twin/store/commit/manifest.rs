@@ -72,6 +72,7 @@ impl Commit {
         // cell.
         let own = manifest.chunks.into_iter().map(|chunk| ([chunk.cell[1], chunk.cell[0]], chunk));
         let mut chunks: BTreeMap<_, _> = own.collect();
+        chunks.retain(|cell, _| !self.removed.contains(cell));
         chunks.extend(self.chunks.clone());
         manifest.chunks = chunks.into_values().collect();
         match provenance {

@@ -38,6 +38,8 @@ pub struct Commit {
     images: BTreeSet<String>,
     /// The recorded images of the version, if they differ from those of the base.
     views: Option<Option<ViewsRef>>,
+    /// Cells of the base that the version does not have, as (y, x).
+    removed: BTreeSet<[i32; 2]>,
 }
 
 /// The result of one [`Commit::put`].
@@ -75,6 +77,7 @@ impl Catalog {
             clamped: Clamped::default(),
             images: BTreeSet::new(),
             views: None,
+            removed: BTreeSet::new(),
         })
     }
 
@@ -131,6 +134,12 @@ impl Commit {
         self.chunks.extend(chunks.iter().map(by_cell));
         // No underflow: the packer has a part of these Gaussians.
         Ok(StoredCells { left_out: gaussians.len() as u64 - packer.gaussians(), chunks })
+    }
+
+    /// Leaves cells of the base out of a version that [`Commit::change`] makes, but for those that
+    /// are put.
+    pub(super) fn remove(&mut self, cells: &BTreeSet<[i32; 2]>) {
+        self.removed.extend(cells.iter().map(|[x, y]| [*y, *x]));
     }
 
     /// The catalog that it will be published in.
