@@ -134,6 +134,11 @@ KINDS: tuple[Kind, ...] = (
         "a .txt, .tum or .csv file of poses with --rig FILE, or a TUM folder with groundtruth.txt and rgb.txt", "yaml",
     ),
     Kind(
+        "pandaset", "PandaSet", "pandaset",
+        _any(*(_has(f"{depth}lidar/poses.json", f"{depth}camera/*/intrinsics.json") for depth in ("", "*/"))),
+        "a sequence with camera, lidar and meta, or the folder of the sequences",
+    ),
+    Kind(
         "zod", "Zenseact Open Dataset", "zod",
         _any(_has("sequences/*/info.json"), _has("drives/*/info.json"), _has("info.json", "calibration.json")),
         "a folder with sequences or drives, or one of these",
