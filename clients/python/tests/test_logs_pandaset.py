@@ -152,7 +152,7 @@ CUBOIDS = {
     "yaw": [0.4, 0.0, 0.0, 0.0],
     "stationary": [0, 0, 0, 0],
     "cuboids.sensor_id": [-1, 0, 1, -1],
-    **{f"position.{axis}": [value, value + 1, value + 2, 0.0] for axis, value in zip("xyz", (30.0, 40.0, 1.0), strict=True)},
+    **{f"position.{axis}": [at, at + 1, at + 2, 0.0] for axis, at in zip("xyz", (30.0, 40.0, 1.0), strict=True)},
     **{f"dimensions.{axis}": [value, 0.5, 0.5, 1.0] for axis, value in zip("xyz", (1.9, 4.7, 1.6), strict=True)},
 }  # fmt: skip
 

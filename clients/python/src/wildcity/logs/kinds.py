@@ -122,6 +122,11 @@ KINDS: tuple[Kind, ...] = (
         "a clip with calibration, labels and camera, as pai-clip-dl of ncore writes it", "pai",
     ),
     Kind(
+        "ncore", "NVIDIA ncore V4", "ncore", _any(_ends(".itar"), *(_has(f"{depth}*ncore4*.zarr{ending}")
+        for depth in ("", "*/") for ending in ("", ".itar"))),
+        "a folder with *.ncore4*.zarr.itar or *.ncore4*.zarr, or one of these files", "ncore",
+    ),
+    Kind(
         "nurec", "NVIDIA NuRec (USDZ)", "nurec", _ends(".usdz"), "a .usdz file with rig_trajectories.json",
     ),
     Kind(

@@ -117,7 +117,7 @@ def _fisheye(writer: LogWriter, path: Path, mount: Matrix) -> None:
     try:
         xi, k1, k2, p1, p2, *gamma_and_center, width, height = (float(found[name]) for name in names)
     except (KeyError, ValueError) as error:
-        raise LogError(path, f"no intrinsics: {error} is no number of it", "download the calibrations again") from None
+        raise LogError(path, f"no intrinsics: {error}", "download the calibrations again") from None
     gamma1, gamma2, u0, v0 = gamma_and_center
     lens = Mei(xi, (k1, k2), (p1, p2), (gamma1, gamma2), (u0, v0), int(width), int(height))
     fit = fisheye_of(lens, str(path))

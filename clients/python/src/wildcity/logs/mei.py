@@ -92,4 +92,4 @@ def _field(lens: Mei) -> npt.NDArray[np.float64]:
     side = max(cx / fx, (lens.width - cx) / fx, cy / fy, (lens.height - cy) / fy)
     slopes = np.diff(radii)
     ends = np.flatnonzero((radii[1:] > side) | (slopes < MIN_SLOPE * slopes[0]))
-    return angles[: int(ends[0]) + 2] if len(ends) else angles
+    return np.asarray(angles[: int(ends[0]) + 2] if len(ends) else angles)
