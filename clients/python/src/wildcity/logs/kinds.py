@@ -22,10 +22,10 @@ class Options:
     """What a user may choose.
 
     log: which of several logs of the source. reference: images stay where they are. rig: a calibration for poses, or
-    for cameras of a bag, that have none of their own. pose_of: whose poses a file has, `rig` or `camera`. origin:
-    latitude, longitude (degrees) and altitude (m) of the world of a map. licence: a note for log.json. Of a bag:
-    rig_frame and world_frame, its frames; odometry, the topic that gives the poses; leave_out, topics that are not
-    converted. values: what the user gave, for the check of a run that goes on.
+    for cameras of a bag, that have none of their own. pose_of: whose poses a file has, `rig` or `camera`. rate: images
+    a second, where no times are recorded. origin: latitude, longitude (degrees) and altitude (m) of the world of a map.
+    licence: a note for log.json. Of a bag: rig_frame and world_frame, its frames; odometry, the topic that gives the
+    poses; leave_out, topics that are not converted. values: what the user gave, for the check of a run that goes on.
     """
 
     log: str | None = None
@@ -36,6 +36,7 @@ class Options:
     leave_out: tuple[str, ...] = ()
     rig: Path | None = None
     pose_of: str | None = None
+    rate: float | None = None
     origin: tuple[float, float, float] | None = None
     licence: str | None = None
     values: dict[str, str] = field(default_factory=dict)
@@ -85,6 +86,15 @@ def _ends(*suffixes: str) -> Callable[[Path], bool]:
 
 def _any(*tests: Callable[[Path], bool]) -> Callable[[Path], bool]:
     return lambda source: any(test(source) for test in tests)
+
+
+def _inria_cameras(source: Path) -> bool:
+    """Whether it is a cameras.json of a training, or the folder of a model with one."""
+    path = source / "cameras.json" if source.is_dir() else source
+    if path.name != "cameras.json" or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return b'"img_name"' in file.read(4096)
 
 
 _IS_KITTI = _any(_has("oxts/timestamps.txt"), _has("*/oxts/timestamps.txt"), _has("*/*/oxts/timestamps.txt"))
@@ -152,6 +162,10 @@ KINDS: tuple[Kind, ...] = (
         "comma2k19", "comma2k19", "comma2k19",
         _any(*(_has(f"{depth}global_pose/frame_positions") for depth in ("", "*/", "*/*/"))),
         "a segment with global_pose and video.hevc, or a folder of such segments", "comma",
+    ),
+    Kind(
+        "inria", "cameras of a training (3D Gaussian Splatting)", "inria", _inria_cameras,
+        "cameras.json of a model, with --rate HZ",
     ),
     Kind(
         "lanelet2", "Lanelet2 (a map)", "lanelet2", _ends(".osm"), "an .osm file; OUT is a map file, not a log",
