@@ -1,5 +1,7 @@
 //! Boxes and LiDAR points: labels of images from a driving log.
 
+use std::fs::File;
+use std::io::BufReader;
 use std::path::Path;
 
 use anyhow::{Context, ensure};
@@ -125,9 +127,10 @@ impl Labels {
 }
 
 fn read_boxes(path: &Path) -> anyhow::Result<Boxes> {
-    let bytes = ingest::read_whole(path, LABEL_BYTES)?;
-    let text = std::str::from_utf8(&bytes).context("the file is not UTF-8 text")?;
-    Ok(Boxes::parse(text)?)
+    let file = File::open(path)?;
+    let length = file.metadata()?.len();
+    ensure!(length <= LABEL_BYTES, "the file has {length} bytes; at most {LABEL_BYTES}");
+    Ok(Boxes::read(BufReader::new(file))?)
 }
 
 fn read_lidar(path: &Path) -> anyhow::Result<LidarPoints> {

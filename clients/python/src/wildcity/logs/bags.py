@@ -86,6 +86,8 @@ class _Conversion:
         return self.writer.finish()
 
     def _check_clock(self, topic: str, stamp_ns: int, place: str) -> None:
+        if stamp_ns <= 0:
+            raise LogError(place, f"a header with the stamp {stamp_ns} ns: none was set", "repair its publisher")
         before = self.last_ns.get(topic, 0)
         if stamp_ns // 1000 <= before // 1000:
             problem = f"the clock runs backwards: the stamp {stamp_ns} ns follows {before} ns"
@@ -162,6 +164,11 @@ class _Conversion:
 
     def _imu(self, message: Message, stamp_ns: int, _: str) -> None:
         decoded, turn = message.decode(), self.mounts[message.topic][:3, :3]
+        # By sensor_msgs/Imu: a first covariance of -1 says that there is no such measurement.
+        if -1 in (decoded.angular_velocity_covariance[0], decoded.linear_acceleration_covariance[0]):
+            why = "a covariance of -1: without rates or accelerations"
+            self.writer.left_out(f"messages of {message.topic} without a measurement", 1, why)
+            return
         rate, acceleration = decoded.angular_velocity, decoded.linear_acceleration
         in_rig = [turn @ (vector.x, vector.y, vector.z) for vector in (rate, acceleration)]
         self.writer.imu(stamp_ns // 1000, *in_rig)

@@ -87,7 +87,8 @@ def _rig(writer: LogWriter, folder: Path, images: Path) -> None:
     mounts_path, lens_path = folder / "calib_cam_to_pose.txt", folder / "perspective.txt"
     velodyne_path = folder / "calib_cam_to_velo.txt"
     mounts, lenses = calibration(mounts_path, "mounts of cameras"), calibration(lens_path, "lenses of cameras")
-    velodyne_from_0 = np.array([float(v) for v in text_of(velodyne_path, "the mount of the scanner").split()])
+    words = text_of(velodyne_path, "the mount of the scanner").split()
+    velodyne_from_0 = numbers(words, (12,), "the mount of the scanner", velodyne_path)
     rig_from_0 = IMU_FROM_RIG @ matrix34(mounts.get("image_00"), "image_00", mounts_path)
     rig_from_velodyne = rig_from_0 @ inverse(matrix34(velodyne_from_0, "the mount of the scanner", velodyne_path))
     writer.lidar("velodyne", rig_from_velodyne)
@@ -174,6 +175,8 @@ def _box(writer: LogWriter, item: ElementTree.Element, times: list[int]) -> None
     if frame < 0:
         return writer.left_out("boxes that do not move", 1, "tracks are of what moves, and these have no times")
     transform, corners = _opencv_matrix(item.find("transform")), _opencv_matrix(item.find("vertices"))
+    if not (np.isfinite(corners).all() and (abs(transform) < 1e9).all()):
+        raise ValueError(f"numbers of a {label} that are no metres")
     # transform = R S: the singular value decomposition U D V^T gives R = U V^T and S = V D V^T.
     u, d, v = np.linalg.svd(transform[:3, :3])
     pose, stretch = np.eye(4), v.T @ np.diag(d) @ v

@@ -27,7 +27,7 @@ from .pai_lenses import camera_of
 from .points import Sweep
 from .progress import Progress
 from .source import opened
-from .tableio import field, numbers
+from .tableio import field, integer, numbers
 from .writer import LogWriter, Report
 
 LICENCE = "the licence of the data set, such as nvidia/PhysicalAI-Autonomous-Vehicles"
@@ -122,9 +122,11 @@ class _Frames:
         if key not in moving:
             raise LogError(self.place, "no dynamic pose of rig and world", "give the store that has the poses")
         its = moving[key]
-        self.times = [int(time_us) for time_us in field(its, "timestamps_us", self.place)]
-        found = field(its, "poses", self.place)
-        if not self.times or len(found) != len(self.times):
+        times, found = field(its, "timestamps_us", self.place), field(its, "poses", self.place)
+        if not isinstance(times, list) or not isinstance(found, list) or not times:
+            raise LogError(self.place, "no lists of poses and times", FIX)
+        self.times = [integer(time_us, "timestamps_us", self.place) for time_us in times]
+        if len(found) != len(self.times):
             raise LogError(self.place, f"{len(found)} poses for {len(self.times)} times", FIX)
         _increasing(self.times, self.place)
         poses = [self._pose(value, f"{self.place}, pose {index}") for index, value in enumerate(found)]
@@ -267,7 +269,9 @@ def _boxes(sequence: _Sequence, frames: _Frames, writer: LogWriter) -> None:
     place = f"{store.path}, {node}"
     for one in field(store.attributes(f"{node}/cuboids"), "cuboid_track_observations", place):
         frame, box = str(field(one, "reference_frame_id", place)), field(one, "bbox3", place)
-        world_from_frame = frames.world_from(frame, int(field(one, "reference_frame_timestamp_us", place)))
+        world_from_frame = frames.world_from(
+            frame, integer(field(one, "reference_frame_timestamp_us", place), "reference_frame_timestamp_us", place)
+        )
         if world_from_frame is None:
             writer.left_out(f"boxes in the frame {frame} without a pose", 1, "outside the times, or not on the rig")
             continue
@@ -275,8 +279,9 @@ def _boxes(sequence: _Sequence, frames: _Frames, writer: LogWriter) -> None:
         pose[:3, :3] = _turned(numbers(field(box, "rot", place), (3,), "rot", place))
         pose[:3, 3] = numbers(field(box, "centroid", place), (3,), "centroid", place)
         track, label = str(field(one, "track_id", place)), str(field(one, "class_id", place))
+        time_us = integer(field(one, "timestamp_us", place), "timestamp_us", place)
         writer.box(
-            int(field(one, "timestamp_us", place)), track, label, field(box, "dim", place), world_from_frame @ pose
+            time_us, track, label, numbers(field(box, "dim", place), (3,), "dim", place), world_from_frame @ pose
         )
 
 

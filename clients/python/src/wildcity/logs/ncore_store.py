@@ -101,7 +101,7 @@ class Store:
             raise LogError(place, "missing: an array", FIX)
         try:
             return self._decoded(node, its)
-        except (KeyError, RuntimeError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, RuntimeError, SystemError, TypeError, ValueError) as error:
             raise LogError(place, f"no array of zarr: {type(error).__name__}: {error}", FIX) from None
 
     def _decoded(self, node: str, its: dict[str, Any]) -> npt.NDArray[Any]:

@@ -29,7 +29,7 @@ from .pcd import pcd_points
 from .points import Sweep
 from .progress import Progress
 from .source import opened
-from .tableio import numbers
+from .tableio import integer, numbers
 from .writer import LogWriter, Report
 
 LICENCE = "CC BY-NC-SA 4.0, and the terms of use of nuPlan"
@@ -76,7 +76,7 @@ class _Database:
         try:
             self._connection = sqlite3.connect(f"file:{path}?mode=ro&immutable=1", uri=True)
             rows = self._connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
-        except sqlite3.Error as error:
+        except (sqlite3.Error, UnicodeDecodeError) as error:
             raise LogError(path, f"not a database of SQLite: {error}", "download it again") from None
         self.tables = [str(name) for (name,) in rows]
         missing = [name for name in _TABLES if name not in self.tables]
@@ -92,7 +92,7 @@ class _Database:
         """Rows of a query, one by one."""
         try:
             yield from self._connection.execute(query)
-        except sqlite3.Error as error:
+        except (sqlite3.Error, UnicodeDecodeError) as error:
             raise LogError(self.path, f"cannot read: {error}", "use a database of the documented schema") from None
 
     def count(self, table: str) -> int:
@@ -102,7 +102,7 @@ class _Database:
 def _poses(database: _Database, writer: LogWriter) -> None:
     place, first = f"{database.path}, table ego_pose", True
     for row in database.rows("SELECT * FROM ego_pose ORDER BY timestamp"):
-        time_us = int(row["timestamp"])
+        time_us = integer(row["timestamp"], "timestamp", place)
         if first:
             writer.begin(time_us, [row["x"], row["y"], row["z"]])
             writer.geo, first = _geo(row, writer.origin_m), False

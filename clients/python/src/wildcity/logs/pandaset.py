@@ -80,10 +80,10 @@ def _times(path: Path) -> list[int]:
     """Increasing times in microseconds."""
     values = json_file(path, "the times of a sensor")
     seconds = numbers(values, (len(values) if isinstance(values, list) else 0,), "the list of times", path)
-    times = [round(float(value) * 1e6) for value in seconds]
     # Seconds since 1970 have ten digits; milliseconds would have thirteen.
-    if not times or not 1e14 < times[0] < 1e16:
+    if not len(seconds) or not ((seconds > 1e8) & (seconds < 1e10)).all():
         raise LogError(path, f"times {list(seconds[:2])} are no seconds since 1970", "write times in seconds")
+    times = [round(float(value) * 1e6) for value in seconds]
     for before, after in pairwise(times):
         if after <= before:
             problem = f"the time {after} us follows {before} us: the clock runs backwards"
@@ -105,7 +105,9 @@ def _pose(one: Any, place: str) -> Matrix:
     at, turn = field(one, "position", place), field(one, "heading", place)
     xyz = numbers([field(at, axis, place) for axis in "xyz"], (3,), "position", place)
     q = numbers([field(turn, axis, place) for axis in "wxyz"], (4,), "heading", place)
-    if not abs(float(np.linalg.norm(q)) - 1) < 1e-3:
+    if not (abs(xyz) < 1e9).all():
+        raise LogError(place, f"position {list(xyz)} is on no earth", "download it again")
+    if not ((abs(q) < 2).all() and abs(float(np.linalg.norm(q)) - 1) < 1e-3):
         raise LogError(place, f"heading (w, x, y, z) {list(q)} has not the length 1", "download it again")
     return transform(xyz, q)
 

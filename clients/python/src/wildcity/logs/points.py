@@ -50,7 +50,7 @@ class Sweep:
         """Writes the finite points, sorted by time (points of one time keep their order), in log time.
 
         Returns the first and the last time on the source's clock, how many points were not finite, and how many there
-        are. A sweep without points has no times.
+        are. A sweep without points has no times. Raises `ValueError` for numbers of lasers that are none.
         """
         keep = np.isfinite(self.points_m).all(axis=1)
         order = np.flatnonzero(keep)
@@ -62,7 +62,10 @@ class Sweep:
         if self.intensity is not None:
             tensors["intensity"] = self.intensity[order].astype("<f4")
         if self.ring is not None:
-            tensors["ring"] = self.ring[order].astype("<u2")
+            ring = self.ring[order]
+            if len(ring) and not (ring.min() >= 0 and ring.max() <= 65_535):
+                raise ValueError(f"numbers of lasers from {ring.min()} to {ring.max()}: they are 0 to 65535")
+            tensors["ring"] = ring.astype("<u2")
         write_safetensors(path, tensors)
         found = {"points": len(order), "dropped": int(len(keep) - len(order))}
         if len(order):
