@@ -99,10 +99,12 @@ impl Tables {
     fn named(&mut self, table: &'static str, names: &[&str]) {
         for (index, name) in names.iter().enumerate() {
             let token = self.token(table, index);
-            self.add(
-                table,
-                json!({ "token": token, "name": name, "description": "", "index": index }),
-            );
+            let mut row = json!({ "token": token, "name": name, "description": "" });
+            if table == "category" {
+                // By which labels of points name it.
+                row["index"] = index.into();
+            }
+            self.add(table, row);
         }
     }
 

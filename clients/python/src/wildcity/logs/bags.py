@@ -86,8 +86,6 @@ class _Conversion:
         return self.writer.finish()
 
     def _check_clock(self, topic: str, stamp_ns: int, place: str) -> None:
-        if stamp_ns <= 0:
-            raise LogError(place, f"a header with the stamp {stamp_ns} ns: none was set", "repair its publisher")
         before = self.last_ns.get(topic, 0)
         if stamp_ns // 1000 <= before // 1000:
             problem = f"the clock runs backwards: the stamp {stamp_ns} ns follows {before} ns"
