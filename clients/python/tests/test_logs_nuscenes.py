@@ -290,7 +290,7 @@ def test_a_cut_table_and_a_missing_image_are_refused(dataset: Tables, tmp_path: 
 def test_an_unknown_source_is_named_with_what_is_known(tmp_path: Path) -> None:
     (tmp_path / "data").mkdir()
     text = refused(tmp_path, tmp_path / "data")
-    assert "none of the kinds nuscenes" in text and "v1.0-*/sample_data.json" in text
+    assert "it looks like none of the known kinds" in text and "v1.0-*/sample_data.json" in text
     assert "there is no such file or folder" in refused(tmp_path, tmp_path / "nothing")
 
 

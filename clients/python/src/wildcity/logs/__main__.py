@@ -68,6 +68,8 @@ def _print(report: Report) -> None:
         print(f"gap: {gap}")
     for sentence in report.left_out:
         print(f"left out: {sentence}")
+    if "poses" in report.rows:
+        print(f"next: wildcity log check {report.out}")
 
 
 def main(arguments: list[str] | None = None) -> int:

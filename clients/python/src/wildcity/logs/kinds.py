@@ -184,11 +184,11 @@ def detect(source: Path) -> Kind:
     found = [kind for kind in KINDS if kind.is_like(source)]
     if len(found) == 1:
         return found[0]
-    names = ", ".join(kind.name for kind in found or KINDS)
     if found:
+        names = ", ".join(kind.name for kind in found)
         raise LogError(source, f"it looks like several kinds: {names}", "choose one with --kind")
-    looks = "; ".join(f"{kind.name} is {kind.looks}" for kind in KINDS)
-    raise LogError(source, f"none of the kinds {names}", f"give --kind, or the folder of one: {looks}")
+    looks = "".join(f"\n  {kind.name:<10} {kind.looks}" for kind in KINDS)
+    raise LogError(source, "it looks like none of the known kinds", f"give --kind, or one of these:{looks}")
 
 
 def named(name: str) -> Kind:
