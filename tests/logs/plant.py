@@ -87,7 +87,7 @@ FAULTS = [
     ("pandaset.py", "pandaset", "(math.sqrt(0.5), 0, 0, math.sqrt(0.5))", "(math.sqrt(0.5), 0, 0, -math.sqrt(0.5))"),
     ("pandaset.py", "pandaset", 'for axis in "wxyz"]', 'for axis in "xyzw"]'),
     ("pandaset.py", "pandaset", "@ world_from_rig[:3, :3]", "@ world_from_rig[:3, :3].T"),
-    ("pandaset.py", "pandaset", "inverse(poses.at(time_us)) @ pose", "inverse(poses.at(int(poses.times_us[0]))) @ pose"),
+    ("pandaset.py", "pandaset", "inverse(poses.at(time_us)) @", "inverse(poses.at(int(poses.times_us[0]))) @"),
     ("pandaset.py", "pandaset", "if max(moves) > MAX_MOVE_M", "if False"),
     ("frame_pickles.py", "pandaset", 'raise pickle.UnpicklingError(f"a', "return super().find_class(module, name) #"),
     ("mei.py", "kitti", "lens.k[0] + m2 * lens.k[1]", "lens.k[1] + m2 * lens.k[0]"),

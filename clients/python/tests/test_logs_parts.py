@@ -98,6 +98,9 @@ def test_values_that_no_log_can_have_are_refused(tmp_path: Path) -> None:
     rings = Sweep(points, np.zeros(2, np.int64), ring=np.array([0.0, 70_000.0]))
     assert "numbers of lasers from 0.0 to 70000.0" in refusal(lambda its: its.sweep("top", 1, lambda: rings))
 
+    far_points = Sweep(np.full((3, 3), 30_000.0), np.zeros(3, np.int64))
+    assert "perhaps they are millimetres" in refusal(lambda its: its.sweep("top", 1, lambda: far_points))
+
     def two_of_a_name(writer: LogWriter) -> None:
         writer.pose(1, np.eye(4), "place")
         writer.cameras = [{"name": "front"}, {"name": "front"}]

@@ -1,7 +1,5 @@
 //! Boxes and LiDAR points: labels of images from a driving log.
 
-use std::fs::File;
-use std::io::BufReader;
 use std::path::Path;
 
 use anyhow::{Context, ensure};
@@ -10,7 +8,7 @@ use crate::{
     Boxes, BoxesSubject, DepthMap, GROWN_PX, LidarDepth, LidarPoints, LidarSubject, MovingBox,
     WorldPoints, hide,
 };
-use wildcity_log::Log;
+use wildcity_log::{Log, open_lines};
 use wildcity_render::View;
 use wildcity_scene::align::Alignment;
 use wildcity_scene::trajectory::Keyframe;
@@ -127,10 +125,7 @@ impl Labels {
 }
 
 fn read_boxes(path: &Path) -> anyhow::Result<Boxes> {
-    let file = File::open(path)?;
-    let length = file.metadata()?.len();
-    ensure!(length <= LABEL_BYTES, "the file has {length} bytes; at most {LABEL_BYTES}");
-    Ok(Boxes::read(BufReader::new(file))?)
+    Ok(Boxes::read(open_lines(path, LABEL_BYTES)?)?)
 }
 
 fn read_lidar(path: &Path) -> anyhow::Result<LidarPoints> {

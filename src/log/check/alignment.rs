@@ -256,8 +256,9 @@ fn peak(curve: &[[f64; 2]]) -> Option<f64> {
     let before = curve.get(best.checked_sub(1)?)?;
     let after = curve.get(best + 1)?;
     let [at, fit] = curve[best];
-    // A fit that rises, falls or hardly changes has no peak, as that of a camera along the drive: a
-    // difference of the clocks moves points far less in its images than in those of one to the side.
+    // A fit that rises, falls or hardly changes has no peak, as that of a camera along the drive:
+    // a difference of the clocks moves points far less in its images than in those of one to the
+    // side.
     let is_clear = curve
         .iter()
         .all(|[ms, other]| (ms - at).abs() <= SAME_MS || fit > (1.0 + LEAST_PEAK) * other);

@@ -181,7 +181,7 @@ impl<'a> NuscenesExport<'a> {
             let new = file.replacen("sweeps", "samples", 1);
             let path = self.part.path().join(&new);
             let renamed =
-                make_folder_of(&path).and_then(|()| fs::rename(self.part.path().join(file), &path));
+                make_parent(&path).and_then(|()| fs::rename(self.part.path().join(file), &path));
             renamed.map_err(|cause| failed(&self.out.join(&new), cause))?;
             self.images[index].file = new;
         }
@@ -190,7 +190,7 @@ impl<'a> NuscenesExport<'a> {
 
     fn write(&self, file: &str, data: &[u8]) -> Result<(), ExportError> {
         let path = self.part.path().join(file);
-        let written = make_folder_of(&path).and_then(|()| fs::write(&path, data));
+        let written = make_parent(&path).and_then(|()| fs::write(&path, data));
         written.map_err(|cause| failed(&self.out.join(file), cause))
     }
 }
@@ -229,7 +229,7 @@ fn partial_folder(out: &Path) -> io::Result<TempDir> {
     }
 }
 
-fn make_folder_of(path: &Path) -> io::Result<()> {
+fn make_parent(path: &Path) -> io::Result<()> {
     path.parent().map_or(Ok(()), fs::create_dir_all)
 }
 
