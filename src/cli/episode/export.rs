@@ -28,18 +28,19 @@ use super::kept::{camera_index, driven, keep_cameras};
 /// driven and rendered again, and compared with its record.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
+#[command(group(clap::ArgGroup::new("target").required(true).args(["mcap", "nuscenes"])))]
 pub(super) struct Export {
     /// The episode: its file, or its name as `wildcity episode list` prints it.
     #[arg(value_name = "EPISODE")]
     episode: PathBuf,
 
     /// The MCAP file to write.
-    #[arg(long, value_name = "FILE", required_unless_present = "nuscenes")]
+    #[arg(long, value_name = "FILE")]
     mcap: Option<PathBuf>,
 
     /// Write the tables of nuScenes 1.0 to this folder, which must not exist: samples at 2 Hz,
     /// cameras as pinholes, boxes of actors; and with --images the images.
-    #[arg(long, value_name = "FOLDER", conflicts_with = "mcap")]
+    #[arg(long, value_name = "FOLDER")]
     nuscenes: Option<PathBuf>,
 
     /// Render the images again, and add them as JPEG.
