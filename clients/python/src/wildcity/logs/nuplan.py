@@ -130,7 +130,8 @@ def _geo(row: sqlite3.Row, origin_m: Any) -> dict[str, Any] | None:
 
 
 def _pose(xyz: Any, q: Any, place: str) -> Matrix:
-    if not abs(float(np.linalg.norm(q)) - 1) < 1e-3:
+    q = numbers(q, (4,), "the quaternion", place)
+    if not ((abs(q) < 2).all() and abs(float(np.linalg.norm(q)) - 1) < 1e-3):
         raise LogError(place, f"the quaternion (w, x, y, z) {list(q)} has not the length 1", "download it again")
     return transform(numbers(xyz, (3,), "the position", place), q)
 
