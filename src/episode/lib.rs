@@ -12,7 +12,7 @@
 //! | `outcome` | the result of an episode |
 //! | `scenario` | the line of a scenario |
 //! | `diff` | the first difference of two episodes |
-//! | `export` | an episode as MCAP |
+//! | `export` | an episode as MCAP, or as tables of nuScenes |
 //! | `listing` | the episodes of a directory |
 //! | [`limits`] | limits |
 
@@ -32,7 +32,10 @@ pub use export::{
     CAN_EXPORT, ExportError, Exported, export_file, mcap_path, remove_leftovers, write_whole,
 };
 #[cfg(feature = "mcap")]
-pub use export::{EpisodeExport, ExportedImage, Ros2Export, export, export_ros2};
+pub use export::{
+    EpisodeExport, ExportedImage, NuscenesExport, NuscenesImage, Ros2Export, export,
+    export_nuscenes, export_ros2,
+};
 pub use file::{
     CameraHead, Cut, EndLine, EpisodeFile, Frame, Header, ReadError, RigHead, check_no_mcap,
     driven_indices, line_bytes,

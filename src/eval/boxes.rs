@@ -3,12 +3,15 @@
 //! A twin has no moving vehicles and pedestrians, so pixels where a real image shows one do not
 //! count. An object that stands still may be part of the twin, so its pixels count.
 
+// A map in the order of names, so that results do not depend on a hash.
 use std::collections::BTreeMap;
+use std::io::{BufRead, Read as _};
 
 use glam::{DVec2, DVec3};
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 
+use wildcity_log::{TrackRow, Tracks};
 use wildcity_scene::align::Alignment;
 use wildcity_scene::geometry::{Camera, Pose};
 
@@ -26,6 +29,9 @@ const BEYOND_US: i64 = 100_000;
 
 /// Number of points along an edge that is only in part in front of the camera.
 const EDGE_POINTS: u32 = 64;
+
+/// Longest line, in bytes. A box has some hundred.
+const LINE_BYTES: u64 = 64 << 10;
 
 /// Largest accepted side of a box, in metres.
 const LARGEST_M: f64 = 100.0;
@@ -67,6 +73,9 @@ pub enum BoxesError {
         line: usize,
         reason: String,
     },
+    /// The text cannot be read.
+    #[error("cannot read: {reason}")]
+    Read { reason: String },
     /// A track has two boxes at one time.
     #[error("track {track:?} has two boxes at time_us {time_us}; give one")]
     Twice {
@@ -104,41 +113,81 @@ impl Boxes {
     /// # Errors
     /// Names the first line that is not a valid box, or the track that has two boxes at one time.
     pub fn parse(text: &str) -> Result<Self, BoxesError> {
-        // A map in the order of names, so that results do not depend on a hash.
-        let mut tracks: BTreeMap<String, Vec<Row>> = BTreeMap::new();
+        Self::read(text.as_bytes())
+    }
+
+    /// Reads boxes line by line, as [`Boxes::parse`] does: only the boxes stay in memory.
+    ///
+    /// # Errors
+    /// As [`Boxes::parse`], or the text cannot be read.
+    pub fn read(mut lines: impl BufRead) -> Result<Self, BoxesError> {
+        let mut boxes = Self::default();
+        let mut text = Vec::new();
         // Blank lines are skipped, but counted: the message names the line of the file.
-        for (at, text) in text.lines().enumerate().filter(|(_, text)| !text.trim().is_empty()) {
-            let wrong = |reason: String| BoxesError::Line { line: at + 1, reason };
-            let line: Line =
-                serde_json::from_str(text).map_err(|error| wrong(error.to_string()))?;
-            if let Some(side) = line.size.iter().find(|side| !(0.0..=LARGEST_M).contains(*side)) {
-                return Err(wrong(format!("size has {side:?}; 0 to {LARGEST_M} m")));
+        for line in 1.. {
+            text.clear();
+            let read = (&mut lines).take(LINE_BYTES + 1).read_until(b'\n', &mut text);
+            if read.map_err(|error| BoxesError::Read { reason: error.to_string() })? == 0 {
+                break;
             }
-            if let Some(value) = line.velocity.iter().flatten().find(|value| !value.is_finite()) {
-                return Err(wrong(format!("velocity has {value:?}; give finite numbers")));
+            if text.len() as u64 > LINE_BYTES {
+                let reason = format!("it has more than {LINE_BYTES} bytes");
+                return Err(BoxesError::Line { line, reason });
             }
-            // A number and its text are the same track.
-            let name = match line.track {
-                Track::Text(name) => name,
-                Track::Number(number) => number.to_string(),
-            };
-            tracks.entry(name).or_default().push(Row {
-                time_us: line.time_us,
-                size_m: DVec3::from_array(line.size),
-                world_from_box: line.world_from_box,
-                velocity_m_per_s: line.velocity.map(DVec3::from_array),
-            });
+            if !text.trim_ascii().is_empty() {
+                boxes.add(&text).map_err(|reason| BoxesError::Line { line, reason })?;
+            }
         }
-        for (track, rows) in &mut tracks {
-            // Rows of a track may come in any order. From here on they are sorted, which
-            // `moving_at` relies on.
+        boxes.sort()
+    }
+
+    /// The boxes of a log's tracks, which are in memory already.
+    pub fn from_tracks(tracks: &Tracks) -> Self {
+        let row = |row: &TrackRow| Row {
+            time_us: row.time_us,
+            size_m: DVec3::from_array(row.size),
+            world_from_box: row.world_from_box,
+            velocity_m_per_s: row.velocity.map(DVec3::from_array),
+        };
+        let each = tracks.each();
+        let tracks = each.map(|(name, rows)| (name.to_owned(), rows.iter().map(row).collect()));
+        Self { tracks: tracks.collect() }
+    }
+
+    /// Adds the box of a line.
+    fn add(&mut self, text: &[u8]) -> Result<(), String> {
+        let line: Line = serde_json::from_slice(text).map_err(|error| error.to_string())?;
+        if let Some(side) = line.size.iter().find(|side| !(0.0..=LARGEST_M).contains(*side)) {
+            return Err(format!("size has {side:?}; 0 to {LARGEST_M} m"));
+        }
+        if let Some(value) = line.velocity.iter().flatten().find(|value| !value.is_finite()) {
+            return Err(format!("velocity has {value:?}; give finite numbers"));
+        }
+        // A number and its text are the same track.
+        let name = match line.track {
+            Track::Text(name) => name,
+            Track::Number(number) => number.to_string(),
+        };
+        self.tracks.entry(name).or_default().push(Row {
+            time_us: line.time_us,
+            size_m: DVec3::from_array(line.size),
+            world_from_box: line.world_from_box,
+            velocity_m_per_s: line.velocity.map(DVec3::from_array),
+        });
+        Ok(())
+    }
+
+    /// Rows of a track may come in any order. From here on they are sorted, which `moving_at`
+    /// relies on.
+    fn sort(mut self) -> Result<Self, BoxesError> {
+        for (track, rows) in &mut self.tracks {
             rows.sort_by_key(|row| row.time_us);
             if let Some(pair) = rows.windows(2).find(|pair| pair[0].time_us == pair[1].time_us) {
                 let time_us = pair[0].time_us;
                 return Err(BoxesError::Twice { track: track.clone(), time_us });
             }
         }
-        Ok(Self { tracks })
+        Ok(self)
     }
 
     /// The boxes in other axes and another unit.
@@ -339,6 +388,17 @@ mod tests {
     fn x_m(text: &str, time_us: i64) -> Option<f64> {
         let found = Boxes::parse(text).unwrap().moving_at(time_us);
         found.first().map(|one| one.world_from_box.position_m.x)
+    }
+
+    #[test]
+    fn long_lines_are_refused_and_others_are_read_one_by_one() {
+        let text = row(0, 0.0, "") + &" ".repeat(70_000) + "\n";
+        let said = Boxes::read(text.as_bytes()).unwrap_err().to_string();
+        assert!(said.starts_with("line 2: it has more than 65536 bytes"), "{said}");
+        let said = Boxes::read(&b"\xff\n"[..]).unwrap_err().to_string();
+        assert!(said.starts_with("line 1: "), "{said}");
+        let text = row(0, 0.0, "") + "\r\n \n" + row(100_000, 1.0, "").trim_end();
+        assert_eq!(x_m(&text, 50_000), Some(0.5), "without an end of line");
     }
 
     #[test]

@@ -48,6 +48,6 @@ pub use placed::PlacedImage;
 pub use points::SweepPoints;
 pub use poses::{Poses, Stations};
 pub use row::{GpsRow, ImageRow, ImuRow, Row, SweepRow, TrackRow};
-pub use table::Rows;
+pub use table::{Rows, open_lines};
 pub use tracks::{NearTracks, Tracks};
 pub use writer::LogWriter;

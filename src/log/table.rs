@@ -84,6 +84,20 @@ impl<R: Row> Iterator for Rows<R> {
     }
 }
 
+/// Opens a file of lines, which has at most `limit` bytes, to be read one by one.
+///
+/// # Errors
+/// The file cannot be opened, or is larger.
+pub fn open_lines(path: &Path, limit: u64) -> Result<impl BufRead, LogError> {
+    let failed = |error: std::io::Error| LogError::file(path, &error);
+    let file = File::open(path).map_err(failed)?;
+    let length = file.metadata().map_err(failed)?.len();
+    if length > limit {
+        return Err(LogError::malformed(path, format!("{length} bytes; at most {limit} are read")));
+    }
+    Ok(BufReader::with_capacity(1 << 16, file))
+}
+
 fn parse<R: Row>(text: &[u8]) -> Result<R, FieldError> {
     let mut deserializer = serde_json::Deserializer::from_slice(text);
     serde_path_to_error::deserialize(&mut deserializer).map_err(|error| {

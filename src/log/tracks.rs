@@ -38,10 +38,21 @@ impl Tracks {
         for row in rows {
             let row = row?;
             if (from_us..=until_us).contains(&row.time_us) {
-                tracks.rows.entry(row.track.clone()).or_default().push(row);
+                tracks.add(row);
             }
         }
         Ok(tracks)
+    }
+
+    /// Adds a row. Its name is that of the list in which it is, and so is not kept twice.
+    fn add(&mut self, mut row: TrackRow) {
+        let track = std::mem::take(&mut row.track);
+        self.rows.entry(track).or_default().push(row);
+    }
+
+    /// The name of each track and its rows, which have no names of their own.
+    pub fn each(&self) -> impl Iterator<Item = (&str, &[TrackRow])> {
+        self.rows.iter().map(|(track, rows)| (track.as_str(), rows.as_slice()))
     }
 
     /// The number of different tracks.
@@ -94,17 +105,18 @@ impl NearTracks<'_> {
         self.rows.iter().any(|rows| {
             let after = rows.partition_point(|row| row.time_us <= time_us);
             let around = [after.checked_sub(1), Some(after)].into_iter().flatten();
-            let known = around.filter_map(|at| rows.get(at));
-            let near = known.min_by_key(|row| row.time_us.abs_diff(time_us));
-            near.is_some_and(|row| is_hidden(rows, row, point_m, time_us))
+            let known = around.filter(|at| *at < rows.len());
+            let near = known.min_by_key(|at| rows[*at].time_us.abs_diff(time_us));
+            near.is_some_and(|at| is_hidden(rows, at, point_m, time_us))
         })
     }
 }
 
 /// Whether a point is in the box of the row that is the nearest in time.
-fn is_hidden(rows: &[TrackRow], row: &TrackRow, point_m: DVec3, time_us: i64) -> bool {
+fn is_hidden(rows: &[TrackRow], at: usize, point_m: DVec3, time_us: i64) -> bool {
+    let row = &rows[at];
     let since_us = time_us.saturating_sub(row.time_us);
-    let velocity = velocity(rows, row);
+    let velocity = velocity(rows, at);
     if velocity.length() <= MOVES_M_PER_S || since_us.abs() > NEAR_US {
         return false;
     }
@@ -114,12 +126,23 @@ fn is_hidden(rows: &[TrackRow], row: &TrackRow, point_m: DVec3, time_us: i64) ->
     box_m.abs().cmple(half_m).all()
 }
 
-/// The velocity that a row gives, or that of the first and the last row of its track.
-fn velocity(rows: &[TrackRow], row: &TrackRow) -> DVec3 {
-    if let Some(velocity) = row.velocity {
+/// The velocity that a row gives, or that between the rows around it: those of half a second to
+/// both sides, because labels jitter; or else its neighbours within a second.
+// Not that of the whole track: a car that drives away after an hour, or parks, would stand still.
+fn velocity(rows: &[TrackRow], at: usize) -> DVec3 {
+    if let Some(velocity) = rows[at].velocity {
         return DVec3::from_array(velocity);
     }
-    let [first, .., last] = rows else { return DVec3::ZERO };
+    let time_us = rows[at].time_us;
+    let off_us = |row: &TrackRow| row.time_us.abs_diff(time_us);
+    let mut first = rows[..at].partition_point(|row| off_us(row) > NEAR_US as u64);
+    let mut after = at + rows[at..].partition_point(|row| off_us(row) <= NEAR_US as u64);
+    if after == first + 1 {
+        let is_near = |at: usize| rows.get(at).is_some_and(|row| off_us(row) <= 2 * NEAR_US as u64);
+        first -= usize::from(at > 0 && is_near(at - 1));
+        after += usize::from(is_near(at + 1));
+    }
+    let [first, .., last] = &rows[first..after] else { return DVec3::ZERO };
     let moved_m = last.world_from_box.position_m - first.world_from_box.position_m;
     moved_m / (last.time_us.abs_diff(first.time_us) as f64 / 1e6)
 }
@@ -168,9 +191,7 @@ mod tests {
 
     fn tracks(rows: Vec<TrackRow>) -> Tracks {
         let mut tracks = Tracks::default();
-        for row in rows {
-            tracks.rows.entry(row.track.clone()).or_default().push(row);
-        }
+        rows.into_iter().for_each(|row| tracks.add(row));
         tracks
     }
 
@@ -184,6 +205,18 @@ mod tests {
         assert!(!at(15.0, 1_600_000), "no row is near");
         let standing = tracks(vec![row(0, "a", 0.0), row(1_000_000, "a", 0.5)]);
         assert!(!standing.near(0).hides(DVec3::new(0.0, 0.0, 0.1), 0));
+    }
+
+    #[test]
+    fn a_car_that_parks_hides_points_only_while_it_drives() {
+        // 10 m/s for a second, and then a minute at the same place, at 10 Hz.
+        let at_m = |step: i64| step.min(10) as f64;
+        let rows = (0..610).map(|step| row(100_000 * step, "a", at_m(step))).collect();
+        let car = tracks(rows);
+        let hides =
+            |time_us: i64, x_m: f64| car.near(time_us).hides(DVec3::new(x_m, 0.0, 0.1), time_us);
+        assert!(hides(0, 0.0) && hides(500_000, 5.0) && hides(1_200_000, 10.0));
+        assert!(!hides(3_000_000, 10.0) && !hides(60_000_000, 10.0));
     }
 
     #[test]

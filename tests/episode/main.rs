@@ -9,6 +9,7 @@ mod calibration;
 mod diff;
 mod export;
 mod files;
+mod nuscenes;
 mod ros2;
 mod scores;
 mod written;

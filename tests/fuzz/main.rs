@@ -1,6 +1,6 @@
 //! The fuzz targets with simple mutations, for a bounded time, on stable. A failure prints the
 //! target, the seed and the bytes. `FUZZ_SECONDS=600 FUZZ_SEED=7 cargo test --test fuzz` runs
-//! longer.
+//! longer, and `FUZZ_TARGET=log` gives all of the time to one target.
 
 #[path = "../support/root.rs"]
 mod root;
@@ -97,11 +97,16 @@ fn targets_survive_mutations() {
     let seed = setting("FUZZ_SEED", 1);
     let time = Duration::from_secs(setting("FUZZ_SECONDS", 3));
     let corpus = corpus();
-    for (name, target) in targets::TARGETS {
+    let only = std::env::var("FUZZ_TARGET").ok();
+    let is_chosen = |name: &str| only.as_deref().is_none_or(|only| only == name);
+    let chosen = targets::TARGETS.into_iter().filter(|(name, _)| is_chosen(name));
+    let count = chosen.clone().count() as u32;
+    assert!(count > 0, "no target {only:?}");
+    for (name, target) in chosen {
         let files = &corpus[name];
         assert!(!files.is_empty(), "target {name} has no corpus");
         let mut random = Random(seed);
-        let end = Instant::now() + time / targets::TARGETS.len() as u32;
+        let end = Instant::now() + time / count;
         let mut rounds = 0;
         // The corpus as it is, and then mutations of it.
         while Instant::now() < end || rounds < files.len() + 50 {

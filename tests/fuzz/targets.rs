@@ -8,6 +8,8 @@ use std::fs;
 
 use wildcity_client::Observation;
 use wildcity_convert::{geojson, opendrive, openscenario as xosc};
+use wildcity_log::check::{self, CheckSettings};
+use wildcity_log::{Log, LogError, Poses, Row, Rows, SweepPoints, Tracks};
 use wildcity_protocol::message::Request;
 use wildcity_scene::{Rig, Trajectory};
 use wildcity_server::Tokens;
@@ -21,7 +23,7 @@ use wildcity_twin::store::Catalog;
 type Target = (&'static str, fn(&[u8]));
 
 /// All targets.
-pub(crate) const TARGETS: [Target; 12] = [
+pub(crate) const TARGETS: [Target; 13] = [
     ("scene", scene),
     ("record", record),
     ("observation", observation),
@@ -34,6 +36,7 @@ pub(crate) const TARGETS: [Target; 12] = [
     ("map", map),
     ("openscenario", openscenario),
     ("capture", capture),
+    ("log", log),
 ];
 
 /// A scene file of any format.
@@ -142,5 +145,62 @@ pub(crate) fn capture(data: &[u8]) {
         fs::write(file(&format!("cameras.{ending}")), &data[..at]).expect("written");
         fs::write(file(&format!("images.{ending}")), &data[at + 4..]).expect("written");
         let _ = captures::read_colmap(dir.path());
+    }
+}
+
+/// The files of a log, with a line of `===` between them.
+const LOG_FILES: [&str; 10] = [
+    "log.json",
+    "rig.json",
+    "poses.jsonl",
+    "images.jsonl",
+    "lidar.jsonl",
+    "tracks.jsonl",
+    "imu.jsonl",
+    "gps.jsonl",
+    "a.safetensors",
+    "a.png",
+];
+
+/// A log: its tables, and what is measured of them.
+pub(crate) fn log(data: &[u8]) {
+    let dir = tempfile::tempdir().expect("a directory");
+    let mut rest = data;
+    for name in LOG_FILES {
+        let end = rest.windows(4).position(|part| part == b"===\n");
+        let (file, after) = end.map_or((rest, &[][..]), |at| (&rest[..at], &rest[at + 4..]));
+        fs::write(dir.path().join(name), file).expect("written");
+        rest = after;
+    }
+    let _ = SweepPoints::parse(data, dir.path());
+    let Ok(log) = Log::open(dir.path()) else { return };
+    are_in_order(log.images());
+    are_in_order(log.sweeps());
+    are_in_order(log.tracks());
+    are_in_order(log.imu());
+    are_in_order(log.gps());
+    let Ok(poses) = log.poses() else { return };
+    let _ = log.placed_images(&poses).map(|images| images.for_each(drop));
+    hide_points(&log, &poses);
+    let settings = CheckSettings { images_per_camera: 2 };
+    if let Ok(report) = check::check(&log, &settings, &mut |_, _| {}) {
+        wildcity_log::page(&report).expect("a page of a report");
+        serde_json::to_string(&report).expect("numbers of a report");
+    }
+}
+
+fn are_in_order<R: Row>(rows: Result<Option<Rows<R>>, LogError>) {
+    let Ok(Some(rows)) = rows else { return };
+    let times_us: Vec<i64> = rows.map_while(Result::ok).map(|row| row.time_us()).collect();
+    assert!(times_us.is_sorted());
+}
+
+/// Looks for points in the boxes of the tracks, at the times of the poses.
+fn hide_points(log: &Log, poses: &Poses) {
+    let Ok(tracks) = Tracks::read(log, [i64::MIN, i64::MAX]) else { return };
+    let _ = tracks.recorded_actors().check();
+    for keyframe in poses.keyframes() {
+        let near = tracks.near(keyframe.time_us);
+        near.hides(keyframe.world_from_rig.position_m, keyframe.time_us.saturating_add(1));
     }
 }

@@ -238,6 +238,24 @@ def test_a_topic_can_be_left_out(tmp_path: Path) -> None:
     assert "no topic /nothing, only " in refused(tmp_path, source, "--leave-out", "/nothing")
 
 
+def test_an_imu_without_accelerations_gives_no_zeros(tmp_path: Path) -> None:
+    """By sensor_msgs/Imu, a first covariance of -1 says that the message has no such measurement."""
+
+    def change(_: Maker, found: Recorded) -> Recorded:
+        messages = [message for _, topic, message in found if topic == "/imu"]
+        messages[3].linear_acceleration_covariance[0] = -1
+        messages[4].angular_velocity_covariance[0] = -1
+        messages[5].angular_velocity.x = float("nan")
+        return found
+
+    run(write(tmp_path / "bag", "sqlite3", change), "--out", tmp_path / "log")
+    log = Log(tmp_path / "log")
+    assert len(log.rows("imu")) == 117
+    left_out = " ".join(log.head["left_out"])
+    assert "messages of /imu without a measurement: 2 (a covariance of -1" in left_out
+    assert "rows of the IMU that are not finite: 1" in left_out
+
+
 @pytest.mark.parametrize("kind", ["mcap_package", "ros1"])
 def test_a_broken_bag_is_refused(kind: str, tmp_path: Path) -> None:
     source = write(tmp_path / "bag", kind)

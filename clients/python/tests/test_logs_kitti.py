@@ -282,6 +282,8 @@ def kitti360(root: Path) -> Path:
     lines(calibration / "calib_cam_to_pose.txt",
           [f"image_0{n}: {numbers(pose[:3])}" for n, pose in enumerate(IMU_FROM_CAMERA)])  # fmt: skip
     lines(calibration / "calib_cam_to_velo.txt", [numbers(VELODYNE_FROM_0[:3])])
+    for n in (2, 3):
+        lens360(calibration / f"image_0{n}.yaml", MEI)
     persp = []
     for n in range(2):
         persp += [f"S_rect_0{n}: 1242 375", f"R_rect_0{n}: {numbers(OTHERS[n + 1][:3, :3])}"]
@@ -304,6 +306,42 @@ def kitti360(root: Path) -> Path:
     return root
 
 
+MEI = {"xi": 2.2, "k1": 0.0168, "k2": 1.65, "p1": 0.0, "p2": 0.0,
+       "gamma1": 1336.3, "gamma2": 1335.7, "u0": 716.9, "v0": 705.7}  # fmt: skip
+
+
+def lens360(path: Path, values: dict[str, float]) -> None:
+    """As OpenCV writes it, a space missing."""
+    names = {"mirror": ("xi",), "distortion": ("k1", "k2", "p1", "p2"), "projection": ("gamma1", "gamma2", "u0", "v0")}
+    text = ["%YAML:1.0", "---", "model_type: MEI", "camera_name: image_02", "image_width: 1400", "image_height: 1400"]
+    for part, its in names.items():
+        text += [f"{part}_parameters:", *(f"   {name}:{' ' if name != 'k2' else ''}{values[name]!r}" for name in its)]
+    lines(path, text)
+
+
+def test_fisheyes_have_the_pixels_of_the_devkit(tmp_path: Path) -> None:
+    root = kitti360(tmp_path / "data")
+    run(root, "--out", tmp_path / "log")
+    log = Log(tmp_path / "log")
+    random = np.random.default_rng(3)
+    for n in (2, 3):
+        theta, phi = random.uniform(0, math.radians(97), 100), random.uniform(-math.pi, math.pi, 100)
+        inside = random.uniform(2, 50, (100, 1)) * np.stack(
+            [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)  # fmt: skip
+        seen = moved(drive(0.2) @ DOWN @ IMU_FROM_CAMERA[n], inside)
+        # CameraFisheye.cam2image of helpers/project.py.
+        x, y, z = (inside / np.linalg.norm(inside, axis=1)[:, None]).T
+        x, y = x / (z + MEI["xi"]), y / (z + MEI["xi"])
+        r2 = x * x + y * y
+        bent = 1 + MEI["k1"] * r2 + MEI["k2"] * r2 * r2
+        theirs = np.stack([MEI["gamma1"] * bent * x + MEI["u0"], MEI["gamma2"] * bent * y + MEI["v0"]], axis=1)
+        ours = log.project(f"image_0{n}", log.poses()[frame_us(2)], seen)
+        np.testing.assert_allclose(ours - 0.5, theirs, rtol=0, atol=0.1)
+        stated = next(one for one in log.head["left_out"] if one.startswith(f"lens model of Mei of image_0{n}"))
+        assert abs(ours - 0.5 - theirs).max() < float(stated.partition("up to ")[2].split()[0]) + 1e-3
+        assert log.times("images", camera=f"image_0{n}") == [frame_us(f) - 3_000 + n for f in range(FRAMES)]
+
+
 def box360(label: str, frame: int) -> str:
     pose = drive(0.1) @ matrix([9, -2, 0.4], Rotation.from_euler("z", 0.3))
     pose[:3, :3] = pose[:3, :3] @ np.diag([4.4, 1.9, 1.6])
@@ -322,7 +360,7 @@ def test_kitti360(tmp_path: Path) -> None:
     run(root, "--out", tmp_path / "log")
     log = Log(tmp_path / "log")
     same_poses(log, {frame_us(frame): drive(0.1 * frame) for frame in range(FRAMES) if frame != 5})
-    assert sorted(log.rig) == ["image_00", "image_01"]
+    assert sorted(log.rig) == [f"image_0{n}" for n in range(4)]
     for n in range(2):
         assert log.times("images", camera=f"image_0{n}") == [frame_us(f) - 3_000 + n for f in range(FRAMES)]
         turn = matrix([0, 0, 0], Rotation.from_matrix(OTHERS[n + 1][:3, :3]))
@@ -341,7 +379,7 @@ def test_kitti360(tmp_path: Path) -> None:
     wanted = drive(0.1) @ matrix([9, -2, 0.4], Rotation.from_euler("z", 0.3))
     np.testing.assert_allclose(log.pose(rows[0]["world_from_box"]), wanted, rtol=0, atol=1e-6)
     left_out = " ".join(log.head["left_out"])
-    for part in ("images of image_02: 8 (the lens model of Mei", "boxes that do not move: 1", "class unicorn: 1"):
+    for part in ("lens model of Mei of image_02: 1", "boxes that do not move: 1", "class unicorn: 1"):
         assert part in left_out
 
 
@@ -356,3 +394,26 @@ def test_bad_kitti360_is_refused(tmp_path: Path) -> None:
     poses.write_text(whole)
     (root / "calibration" / "calib_cam_to_velo.txt").unlink()
     assert "calib_cam_to_velo.txt: missing: the mount of the scanner" in refused(tmp_path, root)
+
+
+BAD_LENSES: dict[str, tuple[dict[str, Any], str]] = {
+    "no number": ({"gamma1": "wide"}, "no intrinsics: could not convert string"),
+    "NaN": ({"u0": float("nan")}, "no intrinsics: xi, k, p, gamma and center are"),
+    "no focal length": ({"gamma2": 0.0}, "no intrinsics: xi, k, p, gamma and center are"),
+    "no fisheye": (
+        {"xi": 0.0, "k1": 0.0, "k2": 0.0, "gamma1": 30.0, "gamma2": 30.0},
+        "no fisheye lens is nearer to it than",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD_LENSES)
+def test_bad_lenses_of_kitti360_are_refused(name: str, tmp_path: Path) -> None:
+    root = kitti360(tmp_path / "data")
+    lens360(root / "calibration" / "image_03.yaml", {**MEI, **BAD_LENSES[name][0]})
+    text = refused(tmp_path, root)
+    assert BAD_LENSES[name][1] in text and "image_03.yaml" in text, text
+    lens360(root / "calibration" / "image_03.yaml", MEI)
+    lens = (root / "calibration" / "image_03.yaml").read_text()
+    (root / "calibration" / "image_03.yaml").write_text(lens.replace("MEI", "SCARAMUZZA"))
+    assert "model_type is SCARAMUZZA, not MEI" in refused(tmp_path, root)

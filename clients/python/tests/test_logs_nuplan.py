@@ -34,6 +34,7 @@ NAME = "2021.05.12.22.00.38_veh-35_01008_01518"
 START_US = 1_620_857_889_651_124
 START = (664_430.25, 3_999_650.5, 606.0)
 CAMERAS = {"CAM_F0": mount(1.65, 0, 1.5, 0), "CAM_L0": mount(1.6, 0.2, 1.5, 55), "CAM_B0": mount(-0.5, 0, 1.6, 180)}
+LIDAR = matrix([-0.1, 0.2, 1.9], Rotation.from_euler("ZYX", [0.3, 0.02, -0.01]))
 K = np.array([[1545.0, 0, 960], [0, 1545.0, 560], [0, 0, 1]])
 LENS, SIZE = [-0.356123, 0.172545, -0.00213, 0.000464, -0.05231], (1920, 1080)
 
@@ -46,6 +47,8 @@ CREATE TABLE camera (token BLOB PRIMARY KEY, log_token BLOB, channel VARCHAR, mo
  rotation BLOB, intrinsic BLOB, distortion BLOB, width INTEGER, height INTEGER);
 CREATE TABLE image (token BLOB PRIMARY KEY, next_token BLOB, prev_token BLOB, ego_pose_token BLOB, camera_token BLOB,
  filename_jpg VARCHAR, timestamp INTEGER);
+CREATE TABLE lidar (token BLOB PRIMARY KEY, log_token BLOB, channel VARCHAR, model VARCHAR, translation BLOB,
+ rotation BLOB);
 CREATE TABLE lidar_pc (token BLOB PRIMARY KEY, next_token BLOB, prev_token BLOB, ego_pose_token BLOB,
  lidar_token BLOB, scene_token BLOB, filename VARCHAR, timestamp INTEGER);
 CREATE TABLE lidar_box (token BLOB PRIMARY KEY, lidar_pc_token BLOB, track_token BLOB, next_token BLOB,
@@ -106,10 +109,50 @@ def make(root: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             if (index, n) != (2, 3):
                 blob.parent.mkdir(parents=True, exist_ok=True)
                 blob.write_bytes(image_bytes(10 * n + index))
+    lidar = {"channel": "MergedPointCloud", "rotation": listed("Rotation", wxyz(LIDAR), monkeypatch)}
+    place = listed("Translation", [float(v) for v in LIDAR[:3, 3]], monkeypatch)
+    insert(db, "lidar", token=token("lidar"), translation=place, **lidar)
     boxes(db)
+    for n in (0, 2):
+        write_pcd(root / "nuplan-v1.1" / "sensor_blobs" / sweep_file(n), cloud(n))
     db.commit()
     db.close()
     return root
+
+
+def sweep_file(n: int) -> str:
+    return f"{NAME}/MergedPointCloud/{n:04d}.pcd"
+
+
+def cloud(n: int) -> Array:
+    """Rows of a file: x, y, z, intensity, ring, lidar_info."""
+    random = np.random.default_rng(n)
+    xyz = np.c_[random.uniform(-40, 40, (150, 2)), random.uniform(-2, 3, 150)]
+    return np.c_[xyz, random.uniform(0, 255, 150), random.integers(0, 40, 150), random.integers(0, 5, 150)].astype(
+        "<f4"
+    )
+
+
+def write_pcd(path: Path, rows: Array) -> None:
+    """As PointCloud.save of the devkit writes it, with its bytes of zeros at the end."""
+    kinds = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "f4"), ("ring", "u1"), ("lidar_info", "u2")]
+    table = np.zeros(len(rows), np.dtype(kinds))
+    for (name, _), column in zip(kinds, rows.T, strict=True):
+        table[name] = column
+    header = f"""# .PCD v.7 - Point Cloud Data file format
+VERSION .7
+FIELDS {" ".join(name for name, _ in kinds)}
+SIZE {" ".join(kind[1] for _, kind in kinds)}
+TYPE F F F F U U
+COUNT 1 1 1 1 1 1
+WIDTH {len(rows)}
+HEIGHT 1
+VIEWPOINT 0 0 0 1 0 0 0
+POINTS {len(rows)}
+DATA binary
+"""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(header.encode() + table.tobytes() + bytes(7))
 
 
 def boxes(db: sqlite3.Connection) -> None:
@@ -117,7 +160,8 @@ def boxes(db: sqlite3.Connection) -> None:
         insert(db, "category", token=token(name), name=name)
         insert(db, "track", token=token(f"t{name}"), category_token=token(name))
     for n in range(3):
-        insert(db, "lidar_pc", token=token(f"l{n}"), next_token=token(f"l{n + 1}"), timestamp=START_US + 50_000 * n)
+        keys = {"next_token": token(f"l{n + 1}"), "lidar_token": token("lidar"), "filename": sweep_file(n)}
+        insert(db, "lidar_pc", token=token(f"l{n}"), timestamp=START_US + 50_005 * n, **keys)
         for name in ("vehicle", "bicycle", "pedestrian", "czone_sign", "phantom"):
             size = {"length": 4.7, "width": 1.9, "height": 1.6, "x": START[0] + n, "y": START[1] + 4, "z": START[2] + 1}
             keys = {"lidar_pc_token": token(f"l{n}"), "track_token": token(f"t{name}"), "yaw": 1.1}
@@ -172,8 +216,24 @@ def test_boxes_and_what_is_left_out(log: Log) -> None:
     wanted = matrix([START[0], START[1] + 4, START[2] + 1], Rotation.from_euler("z", 1.1))
     np.testing.assert_allclose(log.pose(one["world_from_box"]), wanted, rtol=0, atol=1e-6)
     left_out = " ".join(log.head["left_out"])
-    for part in ("class phantom: 3", "merged sweeps of the LiDARs: 3", "images of CAM_B0 without a file: 1"):
+    for part in (
+        "class phantom: 3",
+        "merged sweeps of the LiDARs without a file: 1",
+        "images of CAM_B0 without a file: 1",
+    ):
         assert part in left_out
+
+
+def test_sweeps_are_where_the_devkit_has_them(log: Log) -> None:
+    rows = log.rows("lidar")
+    assert [row["lidar"] for row in rows] == ["mergedpointcloud"] * 2
+    for n, row in zip((0, 2), rows, strict=True):
+        time_us = START_US + 50_005 * n
+        found, times = log.sweep_in_world(row)
+        assert set(times) == {time_us}
+        # ego_pose.trans_matrix @ lidar.trans_matrix @ point
+        wanted = moved(ego(time_us) @ LIDAR, cloud(n)[:, :3].astype(np.float64))
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-3)
 
 
 def test_a_killed_run_goes_on(source: Path, log: Log, tmp_path: Path) -> None:
@@ -204,6 +264,7 @@ BAD: dict[str, tuple[Change, str]] = {
         lambda db: db.execute("UPDATE camera SET translation = ?", (pickle.dumps([1650.0, 0.0, 1500.0]),)),
         "perhaps it is millimetres"),
     "no rotation": (lambda db: db.execute("UPDATE ego_pose SET qw = 3"), "has not the length 1"),
+    "a sweep of an unknown LiDAR": (lambda db: db.execute("DELETE FROM lidar"), "that the table lidar lacks"),
     "a missing column": (lambda db: db.execute("ALTER TABLE image DROP COLUMN filename_jpg"), "no such column"),
 }  # fmt: skip
 
@@ -221,6 +282,25 @@ def test_bad_databases_are_refused(
     text = refused(tmp_path, root)
     assert BAD[name][1] in text and str(path) in text, text
     assert "harm" not in capsys.readouterr().out
+
+
+BAD_SWEEPS: dict[str, tuple[Callable[[bytes], bytes], str]] = {
+    "cut off": (lambda data: data[:-300], "it is cut off"),
+    "text": (lambda data: data.replace(b"DATA binary", b"DATA ascii"), "its points are ascii"),
+    "no header": (lambda data: b"\x00" * 5000, "no header of a PCD file"),
+    "a missing field": (lambda data: data.replace(b"intensity", b"brilliant"), "without the fields ['intensity']"),
+    "a wrong size": (lambda data: data.replace(b"SIZE 4 4", b"SIZE 4 x"), "no header of a PCD file"),
+    "too many points": (lambda data: data.replace(b"POINTS 150", b"POINTS 99999999999"), "99999999999 points"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_SWEEPS)
+def test_bad_sweeps_are_refused(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = make(tmp_path / "data", monkeypatch)
+    path = root / "nuplan-v1.1" / "sensor_blobs" / sweep_file(2)
+    path.write_bytes(BAD_SWEEPS[name][0](path.read_bytes()))
+    text = refused(tmp_path, root)
+    assert BAD_SWEEPS[name][1] in text and "0002.pcd" in text, text
 
 
 def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import random
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import pytest
 from logs_truth import refused, run
 from safetensors.numpy import load_file
 from scipy.spatial.transform import Rotation, Slerp
-from wildcity.logs import KINDS, LogError, tableio, tables
+from wildcity.logs import KINDS, LogError, convert, tableio, tables
 from wildcity.logs.earth import earth_centred, geodetic
 from wildcity.logs.frames import Poses, inverse, quaternion, rotation, rotation_error, transform
 from wildcity.logs.lenses import Intrinsics, camera, fisheye, lens_of, opencv
@@ -61,6 +62,61 @@ def test_a_log_with_two_rows_of_a_time_is_refused(tmp_path: Path) -> None:
             writer.pose(10**15, transform((shift, 0, 0)), "a pose")
         with pytest.raises(LogError, match=r"i \(poses\): two different rows of one time"):
             writer.finish()
+
+
+HEAD = {"kind": "test", "id": "one", "licence": "none", "converter": "test"}
+
+
+def test_measurements_that_are_not_finite_are_left_out_and_counted(tmp_path: Path) -> None:
+    nan = float("nan")
+    with LogWriter(tmp_path / "log", HEAD) as writer:
+        writer.imu(1, [0, 0, nan], [0, 0, 9.8])
+        writer.gps(1, 49.0, 8.0, nan)
+        writer.box(1, "a", "car", [4.0, nan, 1.5], np.eye(4))
+        writer.box(2, "a", "car", [4.0, None, 1.5], np.eye(4))
+        writer.box(3, "a", "car", [4.0, 2.0], np.eye(4))
+        left_out = " ".join(writer._sentences())
+        measured = ("rows of the IMU that are not finite: 1", "fixes that are not finite: 1")
+        for part in (*measured, "without a size or a pose: 3"):
+            assert part in left_out
+        assert not writer.has("imu") and not writer.has("gps") and not writer.has("tracks")
+
+
+def test_values_that_no_log_can_have_are_refused(tmp_path: Path) -> None:
+    def refusal(act: Callable[[LogWriter], Any]) -> str:
+        with pytest.raises(LogError) as caught, LogWriter(tmp_path / "log", HEAD) as writer:
+            act(writer)
+        return str(caught.value)
+
+    assert "no degrees" in refusal(lambda its: its.gps(1, 4900.0, 8.0, 1.0))
+    assert "no clock is so far" in refusal(lambda its: its.row("imu", 1 << 62, {}))
+    assert "not finite" in refusal(lambda its: its.row("images", 1, {"exposure_stops": float("inf")}))
+    far = np.eye(4)
+    far[0, 3] = 1e200
+    assert "no finite rotation" in refusal(lambda its: its.pose(1, far, "place"))
+    points = np.zeros((2, 3))
+    rings = Sweep(points, np.zeros(2, np.int64), ring=np.array([0.0, 70_000.0]))
+    assert "numbers of lasers from 0.0 to 70000.0" in refusal(lambda its: its.sweep("top", 1, lambda: rings))
+
+    far_points = Sweep(np.full((3, 3), 30_000.0), np.zeros(3, np.int64))
+    assert "perhaps they are millimetres" in refusal(lambda its: its.sweep("top", 1, lambda: far_points))
+
+    def two_of_a_name(writer: LogWriter) -> None:
+        writer.pose(1, np.eye(4), "place")
+        writer.cameras = [{"name": "front"}, {"name": "front"}]
+        writer.finish()
+
+    assert "two cameras have the name 'front'" in refusal(two_of_a_name)
+
+
+def test_what_no_converter_foresees_is_a_named_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: Any) -> Any:
+        return {}["lost"]
+
+    (tmp_path / "lanes.osm").write_text("<osm/>")
+    monkeypatch.setattr("wildcity.logs.lanelet2.convert", fails)
+    with pytest.raises(LogError, match="does not have so: KeyError: 'lost'; use files of the documented schema"):
+        convert(tmp_path / "lanes.osm", tmp_path / "log")
 
 
 @pytest.mark.parametrize("chunk", [1, 3, 17, 10_000])

@@ -3,9 +3,11 @@
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
+use anyhow::Context as _;
+
 use wildcity_episode::{
-    EpisodeExport, EpisodeFile, ExportError, Exported, ExportedImage, Ros2Export, export_file,
-    export_ros2, write_whole,
+    EpisodeExport, EpisodeFile, ExportError, Exported, ExportedImage, NuscenesExport,
+    NuscenesImage, Ros2Export, export_file, export_nuscenes, export_ros2, write_whole,
 };
 use wildcity_scene::Rig;
 use wildcity_session::{
@@ -19,12 +21,14 @@ use crate::cli::progress;
 
 use super::kept::{camera_index, driven, keep_cameras};
 
-/// Export an episode as MCAP, for Foxglove, Rerun and others: indexed, compressed, with schemas.
+/// Export an episode as MCAP, for Foxglove, Rerun and others: indexed, compressed, with schemas; or
+/// as tables of nuScenes.
 ///
 /// Runs and servers export each episode when it ends, without images. With --images the episode is
 /// driven and rendered again, and compared with its record.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
+#[command(group(clap::ArgGroup::new("target").required(true).args(["mcap", "nuscenes"])))]
 pub(super) struct Export {
     /// The episode: its file, or its name as `wildcity episode list` prints it.
     #[arg(value_name = "EPISODE")]
@@ -32,7 +36,12 @@ pub(super) struct Export {
 
     /// The MCAP file to write.
     #[arg(long, value_name = "FILE")]
-    mcap: PathBuf,
+    mcap: Option<PathBuf>,
+
+    /// Write the tables of nuScenes 1.0 to this folder, which must not exist: samples at 2 Hz,
+    /// cameras as pinholes, boxes of actors; and with --images the images.
+    #[arg(long, value_name = "FOLDER")]
+    nuscenes: Option<PathBuf>,
 
     /// Render the images again, and add them as JPEG.
     #[arg(long)]
@@ -40,7 +49,7 @@ pub(super) struct Export {
 
     /// Write messages of ROS 2 in place of Foxglove's: clock, tf, odometry, camera_info, compressed
     /// images and plans, for `ros2 bag play` and programs that read bags.
-    #[arg(long)]
+    #[arg(long, conflicts_with = "nuscenes")]
     ros2: bool,
 
     /// A camera whose images are added; may be given several times [default: all cameras of the
@@ -63,6 +72,7 @@ Examples:
   wildcity episode export agent-1 --mcap agent-1.mcap
   wildcity episode export agent-1 --mcap agent-1.mcap --images
   wildcity episode export agent-1 --mcap agent-1-ros.mcap --images --ros2
+  wildcity episode export agent-1 --nuscenes agent-1-nuscenes --images
   wildcity episode export run/episodes/straight-0-1.jsonl --mcap straight.mcap --images --camera front";
 
 /// Difference of a calibration from its lens above which a note is printed, in pixels.
@@ -71,14 +81,14 @@ const NOTED_ERROR_PX: f64 = 0.1;
 impl Export {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let path = super::find_record(&self.episode, &self.episodes)?;
-        let is_record = self
-            .mcap
+        let target = self.target()?;
+        let is_record = target
             .canonicalize()
-            .is_ok_and(|mcap| path.canonicalize().is_ok_and(|record| record == mcap));
+            .is_ok_and(|target| path.canonicalize().is_ok_and(|record| record == target));
         anyhow::ensure!(
             !is_record,
-            "--mcap {}: this is the record itself; name another file",
-            self.mcap.display()
+            "{}: this is the record itself; name another file",
+            target.display()
         );
         let (exported, report) = if self.images {
             self.with_images(&path).map(|(exported, report)| (exported, Some(report)))?
@@ -86,7 +96,8 @@ impl Export {
             (self.without_images(&path)?, None)
         };
         let mut out = io::stdout().lock();
-        writeln!(out, "exported    {} messages to {}", exported.messages, self.mcap.display())?;
+        let what = if self.nuscenes.is_some() { "rows" } else { "messages" };
+        writeln!(out, "exported    {} {what} to {}", exported.messages, target.display())?;
         if let Some(report) = &report {
             writeln!(out, "images      {}", report.images)?;
         }
@@ -103,13 +114,23 @@ impl Export {
         Ok(())
     }
 
+    /// The file or the folder to write.
+    fn target(&self) -> anyhow::Result<&Path> {
+        let target = self.nuscenes.as_deref().or(self.mcap.as_deref());
+        target.context("name a file with --mcap, or a folder with --nuscenes")
+    }
+
     fn without_images(&self, path: &Path) -> anyhow::Result<Exported> {
-        if !self.ros2 {
-            return Ok(export_file(path, &self.mcap)?);
+        let target = self.target()?;
+        if self.nuscenes.is_none() && !self.ros2 {
+            return Ok(export_file(path, target)?);
         }
         let episode = EpisodeFile::read(path)?;
         let rig = EpisodeFile::rig(path)?;
-        Ok(write_whole(&self.mcap, |out| export_ros2(&episode, rig.as_ref(), out))?)
+        if self.nuscenes.is_some() {
+            return Ok(export_nuscenes(&episode, rig.as_ref(), target)?);
+        }
+        Ok(write_whole(target, |out| export_ros2(&episode, rig.as_ref(), out))?)
     }
 
     fn with_images(&self, path: &Path) -> anyhow::Result<(Exported, ReplayReport)> {
@@ -131,22 +152,36 @@ impl Export {
         let backend = self.backend.replay_backend(&recording.header.backend)?;
         let bar = progress::count("rendering");
         bar.set_length(recording.frames.iter().map(|frame| frame.images.len() as u64).sum());
-        let written = write_whole(&self.mcap, |out| {
-            let mut export = AnyExport::begin(self.ros2, &episode, rig.as_ref(), out)?;
+        let replay = |add: &mut AddImage<'_>| {
             let mut add = |image: &ReplayedImage<'_>| {
                 bar.inc(1);
-                add_image(&mut export, &recording, image)
+                add(image)
             };
             let report = recording.replay(&cache, &*backend, ReplayUntil::End, &mut add);
-            let report = report.map_err(|error| ExportError::Images(error.to_string()))?;
-            Ok((export.finish()?, report))
-        });
+            report.map_err(|error| ExportError::Images(error.to_string()))
+        };
+        let target = self.target()?;
+        let written = if self.nuscenes.is_some() {
+            NuscenesExport::begin(&episode, rig.as_ref(), target).and_then(|mut export| {
+                let report = replay(&mut |image| add_to_nuscenes(&mut export, &recording, image))?;
+                Ok((export.finish()?, report))
+            })
+        } else {
+            write_whole(target, |out| {
+                let mut export = AnyExport::begin(self.ros2, &episode, rig.as_ref(), out)?;
+                let report = replay(&mut |image| add_to_mcap(&mut export, &recording, image))?;
+                Ok((export.finish()?, report))
+            })
+        };
         bar.finish_and_clear();
         Ok(written?)
     }
 }
 
-/// An export of one of the two kinds.
+/// What is done with each image.
+type AddImage<'a> = dyn FnMut(&ReplayedImage<'_>) -> Result<(), String> + 'a;
+
+/// A file of one of the two kinds.
 enum AnyExport<'a, W: io::Write + io::Seek> {
     Foxglove(EpisodeExport<'a, W>),
     Ros2(Ros2Export<'a, W>),
@@ -182,19 +217,41 @@ impl<'a, W: io::Write + io::Seek> AnyExport<'a, W> {
 }
 
 /// Adds an image, unless it is of a warm-up whose times the record does not have.
-fn add_image<W: io::Write + io::Seek>(
+fn add_to_mcap<W: io::Write + io::Seek>(
     export: &mut AnyExport<'_, W>,
     recording: &RecordedEpisode,
     image: &ReplayedImage<'_>,
 ) -> Result<(), String> {
+    let Some((camera, time_us)) = place_and_time(recording, image) else { return Ok(()) };
+    let jpeg = encoded(image)?;
+    let added = export.image(&ExportedImage { camera, time_us, jpeg: &jpeg });
+    added.map_err(|error| error.to_string())
+}
+
+/// Adds an image with the pose from which it was rendered, as [`add_to_mcap`] does.
+fn add_to_nuscenes(
+    export: &mut NuscenesExport<'_>,
+    recording: &RecordedEpisode,
+    image: &ReplayedImage<'_>,
+) -> Result<(), String> {
+    let Some((camera, time_us)) = place_and_time(recording, image) else { return Ok(()) };
+    let poses = &recording.frames[image.frame].poses;
+    let Some(&world_from_rig) = poses.get(image.pose) else { return Ok(()) };
+    let jpeg = encoded(image)?;
+    let added = export.image(&NuscenesImage { camera, time_us, world_from_rig, jpeg: &jpeg });
+    added.map_err(|error| error.to_string())
+}
+
+/// Index of the camera of an image, and when it was taken; none if the record does not have it.
+fn place_and_time(recording: &RecordedEpisode, image: &ReplayedImage<'_>) -> Option<(usize, i64)> {
     let frame = &recording.frames[image.frame];
     let has_time = !frame.times_us.is_empty() || image.pose + 1 == frame.poses.len();
     let cameras = &recording.header.rig.cameras;
-    let camera = cameras.iter().position(|camera| camera.name == image.camera.name);
-    let (true, Some(camera)) = (has_time, camera) else { return Ok(()) };
+    let camera = cameras.iter().position(|camera| camera.name == image.camera.name)?;
+    has_time.then(|| (camera, frame.taken_us(image.pose)))
+}
+
+fn encoded(image: &ReplayedImage<'_>) -> Result<Vec<u8>, String> {
     let size = &image.camera.camera;
-    let jpeg = jpeg(image.rgb8, size.width_px, size.height_px, session::JPEG_QUALITY)?;
-    let time_us = frame.taken_us(image.pose);
-    let added = export.image(&ExportedImage { camera, time_us, jpeg: &jpeg });
-    added.map_err(|error| error.to_string())
+    jpeg(image.rgb8, size.width_px, size.height_px, session::JPEG_QUALITY)
 }

@@ -71,6 +71,13 @@ impl Calibration {
     }
 }
 
+/// How far a pinhole is off a camera's lens at most, in pixels.
+pub(super) fn pinhole_error_px(camera: &RigCamera) -> f64 {
+    let camera = &camera.camera;
+    let focal_px = DVec2::new(camera.pinhole.fx, camera.pinhole.fy);
+    Nearest { model: Model::Pinhole, focal_px }.error_px(camera)
+}
+
 impl Nearest {
     fn to(camera: &Camera) -> Self {
         let focal_px = DVec2::new(camera.pinhole.fx, camera.pinhole.fy);

@@ -18,6 +18,9 @@ pub enum ExportError {
         /// The operating system's error.
         cause: io::Error,
     },
+    /// The folder to write exists.
+    #[error("{} exists: name another folder, or remove it", .0.display())]
+    Exists(PathBuf),
     /// The file cannot be written.
     #[error("cannot write the MCAP file: {0}")]
     Output(io::Error),

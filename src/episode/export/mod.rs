@@ -29,6 +29,8 @@ mod file;
 #[cfg(feature = "mcap")]
 mod messages;
 #[cfg(feature = "mcap")]
+mod nuscenes;
+#[cfg(feature = "mcap")]
 mod output;
 #[cfg(feature = "mcap")]
 mod parts;
@@ -39,6 +41,8 @@ mod write;
 
 pub use error::{ExportError, Exported};
 pub use file::{export_file, mcap_path, remove_leftovers, write_whole};
+#[cfg(feature = "mcap")]
+pub use nuscenes::{NuscenesExport, NuscenesImage, export_nuscenes};
 #[cfg(feature = "mcap")]
 pub use ros2::{Ros2Export, export_ros2};
 #[cfg(feature = "mcap")]

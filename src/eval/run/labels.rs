@@ -8,7 +8,7 @@ use crate::{
     Boxes, BoxesSubject, DepthMap, GROWN_PX, LidarDepth, LidarPoints, LidarSubject, MovingBox,
     WorldPoints, hide,
 };
-use wildcity_log::Log;
+use wildcity_log::{Log, open_lines};
 use wildcity_render::View;
 use wildcity_scene::align::Alignment;
 use wildcity_scene::trajectory::Keyframe;
@@ -125,9 +125,7 @@ impl Labels {
 }
 
 fn read_boxes(path: &Path) -> anyhow::Result<Boxes> {
-    let bytes = ingest::read_whole(path, LABEL_BYTES)?;
-    let text = std::str::from_utf8(&bytes).context("the file is not UTF-8 text")?;
-    Ok(Boxes::parse(text)?)
+    Ok(Boxes::read(open_lines(path, LABEL_BYTES)?)?)
 }
 
 fn read_lidar(path: &Path) -> anyhow::Result<LidarPoints> {

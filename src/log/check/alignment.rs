@@ -36,8 +36,8 @@ const MOST_EDGES: usize = 4_000;
 /// Points that a picture shows.
 const MOST_POINTS: usize = 20_000;
 
-/// The fit of the best difference must exceed that of the largest ones to both sides by this share,
-/// or nothing is known.
+/// The fit of the best difference must exceed that of all that are farther from it than [`SAME_MS`]
+/// by this share, or nothing is known.
 const LEAST_PEAK: f64 = 0.02;
 
 /// The two halves of the images must give the same difference of the clocks to this, in
@@ -252,13 +252,16 @@ fn are_near(halves: &[Vec<[f64; 2]>; 2], late_ms: f64) -> bool {
 /// The place of the largest value of a curve, between its points; `None` if it is no clear peak or
 /// at an end.
 fn peak(curve: &[[f64; 2]]) -> Option<f64> {
-    let [[_, first], .., [_, last]] = curve else { return None };
     let best = (0..curve.len()).max_by(|a, b| curve[*a][1].total_cmp(&curve[*b][1]))?;
     let before = curve.get(best.checked_sub(1)?)?;
     let after = curve.get(best + 1)?;
     let [at, fit] = curve[best];
-    // A fit that only rises or falls, as ahead of a vehicle that drives straight on, has no peak.
-    let is_clear = fit > (1.0 + LEAST_PEAK) * first.max(*last);
+    // A fit that rises, falls or hardly changes has no peak, as that of a camera along the drive:
+    // a difference of the clocks moves points far less in its images than in those of one to the
+    // side.
+    let is_clear = curve
+        .iter()
+        .all(|[ms, other]| (ms - at).abs() <= SAME_MS || fit > (1.0 + LEAST_PEAK) * other);
     let bend = before[1] + after[1] - 2.0 * fit;
     // The vertex of the parabola through the three points.
     let vertex = if bend < 0.0 { 0.5 * (before[1] - after[1]) / bend } else { 0.0 };
@@ -328,6 +331,7 @@ mod tests {
         assert!((found - 42.0).abs() < 1e-9, "{found}");
         assert_eq!(peak(&curve(200.0, 0.5)), None, "at an end");
         assert_eq!(peak(&curve(0.0, 1e-6)), None, "flat");
+        assert_eq!(peak(&curve(-16.0, 0.03)), None, "0 fits as well to 0.3 %");
         assert_eq!(peak(&[]), None);
     }
 }

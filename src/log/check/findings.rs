@@ -77,8 +77,8 @@ fn find_gaps(report: &Report, found: &mut Findings) {
         found.add(
             Level::Warning,
             format!(
-                "{sensor}: {gaps} gaps, in which about {missing} rows are missing; the longest of \
-                 {length_s:.2} s begins at {from_s:.2} s"
+                "{sensor}: gaps: {gaps}, missing rows: about {missing}; the longest gap, of {length_s:.2} s, \
+                 begins at {from_s:.2} s"
             ),
         );
     }

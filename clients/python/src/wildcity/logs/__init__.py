@@ -23,4 +23,10 @@ def convert(source: Path, out: Path, options: Options | None = None, kind: str |
     A run that was killed leaves `out.partial`; the next run with the same arguments goes on there. Raises `LogError`.
     """
     found = named(kind) if kind else detect(source)
-    return found.converter().convert(source, out, options or Options())
+    converter = found.converter()
+    try:
+        return converter.convert(source, out, options or Options())
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        # Of a value that no converter foresees: a user gets a sentence, and its cause with it.
+        problem = f"a file that the kind {found.name} does not have so: {type(error).__name__}: {error}"
+        raise LogError(source, problem, "use files of the documented schema, and report this if they are") from error

@@ -39,6 +39,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--reference", action="store_true", help="name the images where they lie, and copy none")
     parser.add_argument("--rig", type=Path, metavar="FILE", help="rig file or calibration, of poses and bags")
     parser.add_argument("--pose-of", choices=["rig", "camera"], help="of poses: whose they are (rig, unless set)")
+    parser.add_argument("--rate", type=float, metavar="HZ", help="images a second, of cameras.json without times")
     origin = "of maps in degrees: LATITUDE,LONGITUDE[,ALTITUDE] of the twin's origin"
     parser.add_argument("--origin", type=_place, metavar="PLACE", help=origin)
     bags = parser.add_argument_group("bags")
@@ -67,6 +68,8 @@ def _print(report: Report) -> None:
         print(f"gap: {gap}")
     for sentence in report.left_out:
         print(f"left out: {sentence}")
+    if "poses" in report.rows:
+        print(f"next: wildcity log check {report.out}")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -86,6 +89,7 @@ def main(arguments: list[str] | None = None) -> int:
             reference=chosen.reference,
             rig=chosen.rig,
             origin=chosen.origin,
+            rate=chosen.rate,
             values=values,
             leave_out=tuple(chosen.leave_out),
             **given,

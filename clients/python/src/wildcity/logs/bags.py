@@ -162,6 +162,11 @@ class _Conversion:
 
     def _imu(self, message: Message, stamp_ns: int, _: str) -> None:
         decoded, turn = message.decode(), self.mounts[message.topic][:3, :3]
+        # By sensor_msgs/Imu: a first covariance of -1 says that there is no such measurement.
+        if -1 in (decoded.angular_velocity_covariance[0], decoded.linear_acceleration_covariance[0]):
+            why = "a covariance of -1: without rates or accelerations"
+            self.writer.left_out(f"messages of {message.topic} without a measurement", 1, why)
+            return
         rate, acceleration = decoded.angular_velocity, decoded.linear_acceleration
         in_rig = [turn @ (vector.x, vector.y, vector.z) for vector in (rate, acceleration)]
         self.writer.imu(stamp_ns // 1000, *in_rig)

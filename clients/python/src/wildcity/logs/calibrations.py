@@ -67,7 +67,7 @@ def _rig_file(path: Path) -> list[dict[str, Any]]:
         raise LogError(path, f"not JSON: {error}", "repair the file") from None
     if isinstance(found, list) and found and "img_name" in found[0]:
         problem = "a list of cameras of INRIA's 3D Gaussian Splatting: it has no times, which a log needs"
-        raise LogError(path, problem, "give its poses with times as a TUM file, and its lens as a rig file")
+        raise LogError(path, problem, "convert it as SOURCE with --rate, or give poses with times and a rig file")
     cameras = field(found, "cameras", path)
     if not isinstance(cameras, list) or not cameras:
         raise LogError(path, "no cameras", "give a rig file, such as scenes/rigs/vehicle6.json")

@@ -79,9 +79,13 @@ def inverse(matrix: Matrix) -> Matrix:
 
 
 def rotation_error(matrix: Matrix) -> float:
-    """How far the upper left 3 x 3 part is from a rotation: the largest entry of R R^T - 1; 2 for a reflection."""
+    """How far the upper left 3 x 3 part is from a rotation: the largest entry of R R^T - 1; 2 for a reflection.
+
+    Infinite if an entry is not finite, or more than 1e12.
+    """
     r = np.asarray(matrix, np.float64)[:3, :3]
-    if not np.isfinite(matrix).all():
+    # No place is so far, and squares of larger numbers overflow.
+    if not (np.abs(matrix) < 1e12).all():
         return float("inf")
     return 2.0 if np.linalg.det(r) < 0 else float(np.abs(r @ r.T - np.eye(3)).max())
 

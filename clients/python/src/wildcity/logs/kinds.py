@@ -22,10 +22,10 @@ class Options:
     """What a user may choose.
 
     log: which of several logs of the source. reference: images stay where they are. rig: a calibration for poses, or
-    for cameras of a bag, that have none of their own. pose_of: whose poses a file has, `rig` or `camera`. origin:
-    latitude, longitude (degrees) and altitude (m) of the world of a map. licence: a note for log.json. Of a bag:
-    rig_frame and world_frame, its frames; odometry, the topic that gives the poses; leave_out, topics that are not
-    converted. values: what the user gave, for the check of a run that goes on.
+    for cameras of a bag, that have none of their own. pose_of: whose poses a file has, `rig` or `camera`. rate: images
+    a second, where no times are recorded. origin: latitude, longitude (degrees) and altitude (m) of the world of a map.
+    licence: a note for log.json. Of a bag: rig_frame and world_frame, its frames; odometry, the topic that gives the
+    poses; leave_out, topics that are not converted. values: what the user gave, for the check of a run that goes on.
     """
 
     log: str | None = None
@@ -36,6 +36,7 @@ class Options:
     leave_out: tuple[str, ...] = ()
     rig: Path | None = None
     pose_of: str | None = None
+    rate: float | None = None
     origin: tuple[float, float, float] | None = None
     licence: str | None = None
     values: dict[str, str] = field(default_factory=dict)
@@ -87,6 +88,15 @@ def _any(*tests: Callable[[Path], bool]) -> Callable[[Path], bool]:
     return lambda source: any(test(source) for test in tests)
 
 
+def _inria_cameras(source: Path) -> bool:
+    """Whether it is a cameras.json of a training, or the folder of a model with one."""
+    path = source / "cameras.json" if source.is_dir() else source
+    if path.name != "cameras.json" or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return b'"img_name"' in file.read(4096)
+
+
 _IS_KITTI = _any(_has("oxts/timestamps.txt"), _has("*/oxts/timestamps.txt"), _has("*/*/oxts/timestamps.txt"))
 
 
@@ -122,6 +132,11 @@ KINDS: tuple[Kind, ...] = (
         "a clip with calibration, labels and camera, as pai-clip-dl of ncore writes it", "pai",
     ),
     Kind(
+        "ncore", "NVIDIA ncore V4", "ncore", _any(_ends(".itar"), *(_has(f"{depth}*ncore4*.zarr{ending}")
+        for depth in ("", "*/") for ending in ("", ".itar"))),
+        "a folder with *.ncore4*.zarr.itar or *.ncore4*.zarr, or one of these files", "ncore",
+    ),
+    Kind(
         "nurec", "NVIDIA NuRec (USDZ)", "nurec", _ends(".usdz"), "a .usdz file with rig_trajectories.json",
     ),
     Kind(
@@ -134,6 +149,11 @@ KINDS: tuple[Kind, ...] = (
         "a .txt, .tum or .csv file of poses with --rig FILE, or a TUM folder with groundtruth.txt and rgb.txt", "yaml",
     ),
     Kind(
+        "pandaset", "PandaSet", "pandaset",
+        _any(*(_has(f"{depth}lidar/poses.json", f"{depth}camera/*/intrinsics.json") for depth in ("", "*/"))),
+        "a sequence with camera, lidar and meta, or the folder of the sequences",
+    ),
+    Kind(
         "zod", "Zenseact Open Dataset", "zod",
         _any(_has("sequences/*/info.json"), _has("drives/*/info.json"), _has("info.json", "calibration.json")),
         "a folder with sequences or drives, or one of these",
@@ -142,6 +162,10 @@ KINDS: tuple[Kind, ...] = (
         "comma2k19", "comma2k19", "comma2k19",
         _any(*(_has(f"{depth}global_pose/frame_positions") for depth in ("", "*/", "*/*/"))),
         "a segment with global_pose and video.hevc, or a folder of such segments", "comma",
+    ),
+    Kind(
+        "inria", "cameras of a training (3D Gaussian Splatting)", "inria", _inria_cameras,
+        "cameras.json of a model, with --rate HZ",
     ),
     Kind(
         "lanelet2", "Lanelet2 (a map)", "lanelet2", _ends(".osm"), "an .osm file; OUT is a map file, not a log",
@@ -160,11 +184,11 @@ def detect(source: Path) -> Kind:
     found = [kind for kind in KINDS if kind.is_like(source)]
     if len(found) == 1:
         return found[0]
-    names = ", ".join(kind.name for kind in found or KINDS)
     if found:
+        names = ", ".join(kind.name for kind in found)
         raise LogError(source, f"it looks like several kinds: {names}", "choose one with --kind")
-    looks = "; ".join(f"{kind.name} is {kind.looks}" for kind in KINDS)
-    raise LogError(source, f"none of the kinds {names}", f"give --kind, or the folder of one: {looks}")
+    looks = "".join(f"\n  {kind.name:<10} {kind.looks}" for kind in KINDS)
+    raise LogError(source, "it looks like none of the known kinds", f"give --kind, or one of these:{looks}")
 
 
 def named(name: str) -> Kind:

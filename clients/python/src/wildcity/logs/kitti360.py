@@ -3,11 +3,13 @@
 The GPS/IMU unit has x forward, y right, z down; the rig is that unit turned by half a turn about x, so that y is left
 and z up. poses.txt has the frame and world_from_imu for frames where it is known, at the times of the scanner.
 Rectified images of the cameras 00 and 01 are pinholes, whose axes are those of calib_cam_to_pose turned by R_rect. The
-fisheye cameras 02 and 03 have the unified omnidirectional model (Mei 2007), which rig files lack: they are left out.
+fisheye cameras 02 and 03 have the unified model (Mei 2007) of image_02.yaml and image_03.yaml, by the formula of the
+devkit (helpers/project.py), which has no tangential distortion: mei.py fits a fisheye lens to it.
 """
 
 from __future__ import annotations
 
+import re
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,7 @@ from .frames import Matrix, inverse
 from .kinds import Options, choose
 from .kitti_files import calibration, matrix34, numbered, recorded_images, scan, times_us
 from .lenses import Intrinsics, camera
+from .mei import Mei, fisheye_of
 from .points import Sweep
 from .progress import Progress
 from .source import opened
@@ -29,6 +32,9 @@ from .writer import LogWriter, Report
 LICENCE = "CC BY-NC-SA 3.0 (KITTI-360)"
 
 IMU_FROM_RIG = np.diag([1.0, -1.0, -1.0, 1.0])
+
+_VALUE = re.compile(r"^ *(\w+): *(\S+)", re.MULTILINE)
+"""A name and a value of OpenCV's YAML, which may lack the space between them."""
 
 LABELS = {"rider": "bicycle", "rv": "caravan"}
 """Labels of boxes with another name than other data sets give to the class."""
@@ -81,7 +87,8 @@ def _rig(writer: LogWriter, folder: Path, images: Path) -> None:
     mounts_path, lens_path = folder / "calib_cam_to_pose.txt", folder / "perspective.txt"
     velodyne_path = folder / "calib_cam_to_velo.txt"
     mounts, lenses = calibration(mounts_path, "mounts of cameras"), calibration(lens_path, "lenses of cameras")
-    velodyne_from_0 = np.array([float(v) for v in text_of(velodyne_path, "the mount of the scanner").split()])
+    words = text_of(velodyne_path, "the mount of the scanner").split()
+    velodyne_from_0 = numbers(words, (12,), "the mount of the scanner", velodyne_path)
     rig_from_0 = IMU_FROM_RIG @ matrix34(mounts.get("image_00"), "image_00", mounts_path)
     rig_from_velodyne = rig_from_0 @ inverse(matrix34(velodyne_from_0, "the mount of the scanner", velodyne_path))
     writer.lidar("velodyne", rig_from_velodyne)
@@ -95,17 +102,40 @@ def _rig(writer: LogWriter, folder: Path, images: Path) -> None:
         mount = IMU_FROM_RIG @ matrix34(mounts.get(f"image_{number}"), f"image_{number}", mounts_path)
         intrinsics = Intrinsics.of_matrix(size, p[:, :3])
         writer.cameras.append(camera(f"image_{number}", intrinsics, mount @ inverse(turn), str(lens_path)))
+    for number in ("02", "03"):
+        if (images / f"image_{number}").is_dir():
+            mount = IMU_FROM_RIG @ matrix34(mounts.get(f"image_{number}"), f"image_{number}", mounts_path)
+            _fisheye(writer, folder / f"image_{number}.yaml", mount)
     writer.left_out("height of the rig above the ground", 1, "the rig is the GPS/IMU unit, y left, z up")
 
 
+def _fisheye(writer: LogWriter, path: Path, mount: Matrix) -> None:
+    """Adds a camera with the lens of a file of OpenCV, whose names are each there once."""
+    found = dict(_VALUE.findall(text_of(path, "the lens of a fisheye camera")))
+    if found.get("model_type") != "MEI":
+        raise LogError(path, f"model_type is {found.get('model_type')}, not MEI", "download the calibrations again")
+    names = ("xi", "k1", "k2", "p1", "p2", "gamma1", "gamma2", "u0", "v0", "image_width", "image_height")
+    try:
+        xi, k1, k2, p1, p2, *gamma_and_center, width, height = (float(found[name]) for name in names)
+    except (KeyError, ValueError) as error:
+        raise LogError(path, f"no intrinsics: {error}", "download the calibrations again") from None
+    gamma1, gamma2, u0, v0 = gamma_and_center
+    lens = Mei(xi, (k1, k2), (p1, p2), (gamma1, gamma2), (u0, v0), int(width), int(height))
+    fit = fisheye_of(lens, str(path))
+    writer.cameras.append(camera(path.stem, fit.intrinsics, mount, str(path), lens=fit.lens))
+    why = (
+        f"the fisheye lens is up to {fit.error_px:.3f} pixels from it; the terms p1 and p2, which the devkit leaves out"
+    )
+    writer.left_out(f"lens model of Mei of {path.stem}", 1, f"{why}, too, are up to {fit.tangential_px:.2f} pixels")
+
+
 def _images(writer: LogWriter, images: Path, name: str) -> None:
-    folders = [folder for number in ("00", "01") if (folder := images / f"image_{number}").is_dir()]
-    if not folders:
-        raise LogError(images, "no folder image_00 or image_01", "download the images of the sequence")
-    recorded_images(writer, folders, "data_rect", f"kitti360 {name}, images")
-    for number in ("02", "03"):
-        count = len(list((images / f"image_{number}").glob("data_rgb/*.png")))
-        writer.left_out(f"images of image_{number}", count, "the lens model of Mei is none of a rig")
+    inside = {f"image_{number}": "data_rect" if number < "02" else "data_rgb" for number in ("00", "01", "02", "03")}
+    there = {name: its for name, its in inside.items() if (images / name).is_dir()}
+    if not there:
+        raise LogError(images, "no folder image_00 to image_03", "download the images of the sequence")
+    for name_of_camera, its in there.items():
+        recorded_images(writer, [images / name_of_camera], its, f"kitti360 {name}, {name_of_camera}")
 
 
 def _sweeps(writer: LogWriter, folder: Path, times: list[int]) -> None:
@@ -145,6 +175,8 @@ def _box(writer: LogWriter, item: ElementTree.Element, times: list[int]) -> None
     if frame < 0:
         return writer.left_out("boxes that do not move", 1, "tracks are of what moves, and these have no times")
     transform, corners = _opencv_matrix(item.find("transform")), _opencv_matrix(item.find("vertices"))
+    if not (np.isfinite(corners).all() and (abs(transform) < 1e9).all()):
+        raise ValueError(f"numbers of a {label} that are no metres")
     # transform = R S: the singular value decomposition U D V^T gives R = U V^T and S = V D V^T.
     u, d, v = np.linalg.svd(transform[:3, :3])
     pose, stretch = np.eye(4), v.T @ np.diag(d) @ v

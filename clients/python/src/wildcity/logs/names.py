@@ -21,11 +21,13 @@ CLASSES: dict[str, tuple[str, ...]] = {
         "traffic_light_trailer", "type_vehicle", "pickup", "medium_sized_truck", "semi_truck", "towed_object",
         "other_vehicle", "train", "caravan", "automobile", "heavy_truck", "train_or_tram_car", "trolley_bus",
         "other_large_vehicle", "rider_motorcycle", "moped",
+        "pickup_truck", "emergency_vehicle", "motorized_scooter", "trolley", "subway",
     ),
     "pedestrian": (
         "pedestrian", "person", "person_sitting", "human", "adult", "child", "wheelchair", "stroller",
         "personal_mobility", "police_officer", "construction_worker", "official_signaler", "type_pedestrian",
         "wheeled_rider", "wheelchair_user", "personaltransporter",
+        "pedestrian_with_object", "personal_mobility_device",
     ),
     "bicycle": ("bicycle", "cyclist", "bicyclist", "type_cyclist", "rider", "bike", "pedalcycle"),
     "object": (
@@ -36,6 +38,8 @@ CLASSES: dict[str, tuple[str, ...]] = {
         "traffic_light", "lamp", "street_light", "vending_machine", "small_pole", "big_pole",
         "mobile_pedestrian_crossing_sign", "protruding_object",
         "poleobject", "trafficbeacon", "trafficsign", "trafficsignal", "trafficguide", "dynamicbarrier",
+        "cones", "signs", "construction_signs", "road_barriers", "temporary_construction_barriers", "pylons",
+        "rolling_containers", "animals",
     ),
 }  # fmt: skip
 """Our classes of actors, and the names of each in data sets: lower case, `_` for all but letters and digits."""

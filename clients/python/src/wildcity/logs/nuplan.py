@@ -3,6 +3,9 @@
 The ego has x forward, y left, z up, at the rear axle; the world is UTM (`epsg`). Times are microseconds. Lenses are
 OpenCV's (k1, k2, p1, p2, k3), and images are distorted. Calibrations are pickles of lists; they are read by an
 unpickler that knows lists and the three list classes of the devkit, and runs nothing.
+
+A sweep is a merged cloud (`MergedPointCloud`) in the axes of the row `lidar` that it names, whose place on the ego is
+there: so the devkit moves boxes to it (`get_boxes`, Frame.SENSOR). Its points have no times of their own.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ import pickle
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +25,11 @@ from .errors import LogError
 from .frames import Matrix, transform
 from .kinds import Options, choose
 from .lenses import Intrinsics, camera, opencv
+from .pcd import pcd_points
+from .points import Sweep
 from .progress import Progress
 from .source import opened
-from .tableio import numbers
+from .tableio import integer, numbers
 from .writer import LogWriter, Report
 
 LICENCE = "CC BY-NC-SA 4.0, and the terms of use of nuPlan"
@@ -51,12 +57,11 @@ def convert(source: Path, out: Path, options: Options) -> Report:
         with opened("nuplan", source, out, options, log=name, licence=LICENCE, decides=decides) as writer:
             _check_clock(database)
             _poses(database, writer)
-            images = _images_folder(found[name], source)
-            cameras = _rig(database, writer)
-            _images(database, writer, images, cameras)
+            blobs = _blobs_folder(found[name], source)
+            _rig(database, writer)
+            _images(database, writer, blobs)
             _boxes(database, writer)
-            why = "neither their frame nor the times of their points are documented"
-            writer.left_out("merged sweeps of the LiDARs", database.count("lidar_pc"), why)
+            _sweeps(database, writer, blobs)
             writer.left_out("accelerations and rates", database.count("ego_pose"), "without gravity: no IMU's")
             writer.left_out("map", 1, "in files of its own (maps/), which are not read")
             return writer.finish()
@@ -67,12 +72,14 @@ class _Database:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.tables: list[str] = []
         try:
             self._connection = sqlite3.connect(f"file:{path}?mode=ro&immutable=1", uri=True)
             rows = self._connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
-        except sqlite3.Error as error:
+        except (sqlite3.Error, UnicodeDecodeError) as error:
             raise LogError(path, f"not a database of SQLite: {error}", "download it again") from None
-        missing = [name for name in _TABLES if (name,) not in rows]
+        self.tables = [str(name) for (name,) in rows]
+        missing = [name for name in _TABLES if name not in self.tables]
         if missing:
             self._connection.close()
             raise LogError(path, f"missing: the table {missing[0]}", "download the database again")
@@ -85,7 +92,7 @@ class _Database:
         """Rows of a query, one by one."""
         try:
             yield from self._connection.execute(query)
-        except sqlite3.Error as error:
+        except (sqlite3.Error, UnicodeDecodeError) as error:
             raise LogError(self.path, f"cannot read: {error}", "use a database of the documented schema") from None
 
     def count(self, table: str) -> int:
@@ -95,7 +102,7 @@ class _Database:
 def _poses(database: _Database, writer: LogWriter) -> None:
     place, first = f"{database.path}, table ego_pose", True
     for row in database.rows("SELECT * FROM ego_pose ORDER BY timestamp"):
-        time_us = int(row["timestamp"])
+        time_us = integer(row["timestamp"], "timestamp", place)
         if first:
             writer.begin(time_us, [row["x"], row["y"], row["z"]])
             writer.geo, first = _geo(row, writer.origin_m), False
@@ -123,7 +130,8 @@ def _geo(row: sqlite3.Row, origin_m: Any) -> dict[str, Any] | None:
 
 
 def _pose(xyz: Any, q: Any, place: str) -> Matrix:
-    if not abs(float(np.linalg.norm(q)) - 1) < 1e-3:
+    q = numbers(q, (4,), "the quaternion", place)
+    if not ((abs(q) < 2).all() and abs(float(np.linalg.norm(q)) - 1) < 1e-3):
         raise LogError(place, f"the quaternion (w, x, y, z) {list(q)} has not the length 1", "download it again")
     return transform(numbers(xyz, (3,), "the position", place), q)
 
@@ -148,8 +156,7 @@ def _list(blob: Any, name: str, place: str) -> Any:
         raise LogError(place, f"{name} is no pickle of a list: {error}", "download the database again") from None
 
 
-def _rig(database: _Database, writer: LogWriter) -> set[str]:
-    added = set()
+def _rig(database: _Database, writer: LogWriter) -> None:
     for row in database.rows("SELECT * FROM camera ORDER BY channel"):
         name = str(row["channel"])
         place = f"{database.path}, table camera, {name}"
@@ -159,17 +166,15 @@ def _rig(database: _Database, writer: LogWriter) -> set[str]:
         lens = opencv(list(numbers(values["distortion"], (5,), "distortion", place)))
         intrinsics = Intrinsics.of_matrix((row["width"], row["height"]), k)
         writer.cameras.append(camera(name, intrinsics, pose, place, lens=lens))
-        added.add(name)
-    return added
 
 
-def _images_folder(path: Path, source: Path) -> Path | None:
-    """The folder to which `filename_jpg` is relative: sensor_blobs beside the splits, or in the source."""
+def _blobs_folder(path: Path, source: Path) -> Path | None:
+    """The folder to which names of files are relative: sensor_blobs beside the splits, or in the source."""
     around = [source, *path.parents]
     return next((folder / "sensor_blobs" for folder in around if (folder / "sensor_blobs").is_dir()), None)
 
 
-def _images(database: _Database, writer: LogWriter, folder: Path | None, cameras: set[str]) -> None:
+def _images(database: _Database, writer: LogWriter, folder: Path | None) -> None:
     total = database.count("image")
     if folder is None:
         return writer.left_out("images", total, "no folder sensor_blobs in the source or above the database")
@@ -183,6 +188,40 @@ def _images(database: _Database, writer: LogWriter, folder: Path | None, cameras
             else:
                 writer.left_out(f"images of {row['channel']} without a file", 1, "not downloaded")
             progress.step()
+
+
+def _sweeps(database: _Database, writer: LogWriter, folder: Path | None) -> None:
+    total = database.count("lidar_pc")
+    if folder is None or "lidar" not in database.tables:
+        return writer.left_out("merged sweeps of the LiDARs", total, "no folder sensor_blobs, or no table lidar")
+    mounts: dict[bytes, str] = {}
+    for row in database.rows("SELECT * FROM lidar ORDER BY channel"):
+        name = str(row["channel"])
+        place = f"{database.path}, table lidar, {name}"
+        values = [_list(row[key], key, place) for key in ("translation", "rotation")]
+        writer.lidar(name, _pose(values[0], numbers(values[1], (4,), "rotation", place), place))
+        mounts[row["token"]] = name
+    count = 0
+    with Progress(f"nuplan {database.path.stem}, sweeps", total) as progress:
+        for row in database.rows("SELECT filename, lidar_token, timestamp FROM lidar_pc ORDER BY timestamp"):
+            progress.step()
+            if row["lidar_token"] not in mounts:
+                place = f"{database.path}, table lidar_pc"
+                raise LogError(place, "a sweep of a LiDAR that the table lidar lacks", "download the database again")
+            file, time_us = folder / str(row["filename"]), int(row["timestamp"])
+            if file.is_file():
+                writer.sweep(mounts[row["lidar_token"]], time_us, partial(_sweep, file, time_us))
+                count += 1
+            else:
+                writer.left_out("merged sweeps of the LiDARs without a file", 1, "not downloaded")
+    writer.left_out("times of single points, sweeps", count, "not recorded: all points have the time of the sweep")
+
+
+def _sweep(path: Path, time_us: int) -> Sweep:
+    points = pcd_points(path, ["x", "y", "z", "intensity", "ring"])
+    xyz = np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    times = np.full(len(points), time_us, np.int64)
+    return Sweep(xyz, times, points["intensity"], points["ring"])
 
 
 def _boxes(database: _Database, writer: LogWriter) -> None:

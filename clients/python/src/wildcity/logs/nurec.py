@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,9 @@ from .tableio import field, numbers
 from .writer import LogWriter, Report
 
 LICENCE = "not stated by the archive"
+
+MAX_BYTES = 1 << 30
+"""Of a file of the archive after decompression."""
 
 _RIGS, _TRACKS = "rig_trajectories.json", "sequence_tracks.json"
 
@@ -54,10 +58,21 @@ def convert(source: Path, out: Path, options: Options) -> Report:
 def _json(source: Path, name: str) -> Any:
     try:
         with zipfile.ZipFile(source) as archive:
+            size = archive.getinfo(name).file_size
+            if size > MAX_BYTES:
+                raise LogError(f"{source}, {name}", f"{size} bytes, more than {MAX_BYTES}", "download it again")
             return json.loads(archive.read(name))
     except KeyError:
         raise LogError(source, f"missing: {name}", "give a scene of NuRec, as AlpaSim reads it") from None
-    except (zipfile.BadZipFile, OSError, json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (
+        zipfile.BadZipFile,
+        RuntimeError,
+        EOFError,
+        OSError,
+        zlib.error,
+        json.JSONDecodeError,
+        UnicodeDecodeError,
+    ) as error:
         raise LogError(f"{source}, {name}", f"cannot read: {error}", "download it again") from None
 
 

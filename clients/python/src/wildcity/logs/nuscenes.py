@@ -24,10 +24,27 @@ from .lenses import Intrinsics, camera
 from .points import Sweep
 from .progress import Progress
 from .source import opened
-from .tableio import field, json_rows, numbers, require
+from .tableio import field, integer, json_rows, numbers, require, text
 from .writer import LogWriter, Report
 
 LICENCE = "CC BY-NC-SA 4.0, and the terms of use of nuScenes"
+
+
+_TEXTS = {
+    "scene": ("token", "name"),
+    "sample": ("token", "scene_token"),
+    "sample_data": ("token", "sample_token", "ego_pose_token", "calibrated_sensor_token", "filename"),
+    "calibrated_sensor": ("token", "sensor_token"),
+    "sensor": ("token", "channel", "modality"),
+    "ego_pose": ("token",),
+    "sample_annotation": ("token", "sample_token", "instance_token"),
+    "instance": ("token", "category_token"),
+    "category": ("token", "name"),
+}
+"""Fields of tables that are texts, and not empty."""
+
+_TIMED = ("sample", "sample_data", "ego_pose")
+"""Tables with the field `timestamp`, in microseconds."""
 
 
 class _Tables:
@@ -47,7 +64,12 @@ class _Tables:
     def rows(self, table: str, key: str | None = None, values: Any = None) -> Iterator[dict[str, Any]]:
         """The rows of a table whose field `key` is one of `values`."""
         for row in json_rows(self.folder / f"{table}.json", f"the table {table} of nuScenes"):
-            if key is None or field(row, key, self.place(table)) in values:
+            if key is None or text(field(row, key, self.place(table)), key, self.place(table)) in values:
+                place = f"{self.place(table)}, token {row.get('token')}"
+                for name in _TEXTS.get(table, ()):
+                    text(field(row, name, place), name, place)
+                if table in _TIMED:
+                    integer(field(row, "timestamp", place), "timestamp", place)
                 yield row
 
     def by_token(self, table: str, tokens: Any = None) -> dict[str, dict[str, Any]]:
@@ -70,7 +92,8 @@ class _Tables:
 def logs(source: Path) -> list[str]:
     """Names of the scenes."""
     tables = _Tables(source)
-    return [str(field(row, "name", tables.place("scene"))) for row in tables.rows("scene")]
+    place = tables.place("scene")
+    return [text(field(row, "name", place), "name", place) for row in tables.rows("scene")]
 
 
 def convert(source: Path, out: Path, options: Options) -> Report:

@@ -13,6 +13,9 @@ import numpy.typing as npt
 
 __all__ = ["Sweep", "write_safetensors"]
 
+FARTHEST_M = 2000.0
+"""No LiDAR of a vehicle sees so far."""
+
 _DTYPES = {"<f4": "F32", "<f8": "F64", "<i8": "I64", "<u2": "U16"}
 
 
@@ -50,10 +53,13 @@ class Sweep:
         """Writes the finite points, sorted by time (points of one time keep their order), in log time.
 
         Returns the first and the last time on the source's clock, how many points were not finite, and how many there
-        are. A sweep without points has no times.
+        are. A sweep without points has no times. Raises `ValueError` for points that are no metres, and for numbers of
+        lasers that are none.
         """
         keep = np.isfinite(self.points_m).all(axis=1)
         order = np.flatnonzero(keep)
+        if len(order) and np.median(np.abs(self.points_m[order]).max(axis=1)) > FARTHEST_M:
+            raise ValueError(f"half of its points are farther than {FARTHEST_M:g} m: perhaps they are millimetres")
         order = order[np.argsort(self.time_us[order], kind="stable")]
         tensors: dict[str, npt.NDArray[Any]] = {
             "points_m": self.points_m[order].astype("<f4"),
@@ -62,7 +68,10 @@ class Sweep:
         if self.intensity is not None:
             tensors["intensity"] = self.intensity[order].astype("<f4")
         if self.ring is not None:
-            tensors["ring"] = self.ring[order].astype("<u2")
+            ring = self.ring[order]
+            if len(ring) and not (ring.min() >= 0 and ring.max() <= 65_535):
+                raise ValueError(f"numbers of lasers from {ring.min()} to {ring.max()}: they are 0 to 65535")
+            tensors["ring"] = ring.astype("<u2")
         write_safetensors(path, tensors)
         found = {"points": len(order), "dropped": int(len(keep) - len(order))}
         if len(order):

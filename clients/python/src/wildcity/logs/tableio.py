@@ -14,7 +14,7 @@ import numpy.typing as npt
 from .errors import LogError
 from .progress import Progress
 
-__all__ = ["field", "json_file", "json_rows", "numbers", "require", "text_of"]
+__all__ = ["field", "integer", "json_file", "json_rows", "numbers", "require", "text", "text_of"]
 
 _CHUNK = 1 << 20
 """Characters that are read at once."""
@@ -92,6 +92,20 @@ def field(row: Any, name: str, place: str | Path) -> Any:
     if not isinstance(row, dict) or name not in row:
         raise LogError(place, f"a row has no field {name}: {row!r:.200}", "use files of the documented schema")
     return row[name]
+
+
+def integer(value: Any, name: str, place: str | Path) -> int:
+    """A whole number."""
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise LogError(place, f"{name} is {value!r:.80}, no whole number", "repair the file")
+    return value
+
+
+def text(value: Any, name: str, place: str | Path) -> str:
+    """A text that is not empty."""
+    if not isinstance(value, str) or not value:
+        raise LogError(place, f"{name} is {value!r:.80}, no text", "repair the file")
+    return value
 
 
 def numbers(value: Any, shape: tuple[int, ...], name: str, place: str | Path) -> npt.NDArray[np.float64]:

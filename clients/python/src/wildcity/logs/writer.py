@@ -31,6 +31,9 @@ __all__ = ["LogWriter", "Report"]
 
 FORMAT = "wildcity.log/1"
 
+_LATEST_US = 1 << 61
+"""Rows are sorted by their times as texts of 19 digits."""
+
 MAX_SENSORS = 16
 """Cameras, and LiDARs, of a log."""
 
@@ -122,10 +125,17 @@ class LogWriter:
         return pose_json(moved)
 
     def row(self, table: str, time_us: int, fields: dict[str, Any]) -> None:
-        """Adds a row to a table."""
+        """Adds a row to a table. Raises `LogError` for numbers that are not finite, and times that are none."""
+        if not abs(time_us) < _LATEST_US:
+            problem = f"a time of {time_us} us: no clock is so far"
+            raise LogError(f"{self.source['id']} ({table})", problem, "repair the clock, or its unit")
         if table not in self._spools:
             self._spools[table] = Spool(self.part / "rows" / f"{table}.rows")
-        self._spools[table].add({"time_us": int(time_us) - self.epoch_us, **fields})
+        try:
+            self._spools[table].add({"time_us": int(time_us) - self.epoch_us, **fields})
+        except (ValueError, OverflowError):
+            place, problem = f"{self.source['id']} ({table})", f"a number that is not finite, at {time_us} us: {fields}"
+            raise LogError(place, problem, "repair the source") from None
 
     def has(self, table: str) -> bool:
         """Whether a table has a row."""
@@ -179,7 +189,11 @@ class LogWriter:
         def write(path: Path) -> dict[str, Any]:
             made = read()
             sweep, extra = made if isinstance(made, tuple) else (made, {})
-            return {**sweep.write(path, self.epoch_us), "extra": extra}
+            try:
+                return {**sweep.write(path, self.epoch_us), "extra": extra}
+            except ValueError as error:
+                place = f"{self.source['id']}, sweep of {lidar} at {time_us} us"
+                raise LogError(place, str(error), "download or record it again") from None
 
         found = self.payload(file, write)
         if found["dropped"]:
@@ -202,10 +216,10 @@ class LogWriter:
         A box of an unknown class, without a size up to 100 m, or without a pose is left out and counted.
         """
         ours = class_of(label)
-        sizes = [float(value) for value in size]
+        sizes = [_float(value) for value in size]
         if ours is None:
             return self.left_out(f"boxes of class {label}", 1, "no such class of actors")
-        if not 0 < min(sizes) <= max(sizes) <= 100 or rotation_error(world_from_box) > 1e-3:
+        if len(sizes) != 3 or not all(0 < side <= 100 for side in sizes) or rotation_error(world_from_box) > 1e-3:
             return self.left_out(f"boxes of class {label} without a size or a pose", 1, "not finite, or 0")
         fields: dict[str, Any] = {"track": track, "class": ours, "size": sizes}
         fields["world_from_box"] = self.world(world_from_box)
@@ -214,12 +228,25 @@ class LogWriter:
         self.row("tracks", time_us, fields)
 
     def imu(self, time_us: int, rate: Any, acceleration: Any) -> None:
-        """Adds a row of the IMU. rate [3]: rad/s; acceleration [3]: m/s^2; both in the rig's axes."""
+        """Adds a row of the IMU. rate [3]: rad/s; acceleration [3]: m/s^2; both in the rig's axes.
+
+        One that is not finite is left out and counted.
+        """
+        if not (np.isfinite(rate).all() and np.isfinite(acceleration).all()):
+            return self.left_out("rows of the IMU that are not finite", 1, "no measurement")
         fields = {"angular_velocity_rad_per_s": [float(v) for v in rate]}
         self.row("imu", time_us, {**fields, "acceleration_m_per_s2": [float(v) for v in acceleration]})
 
     def gps(self, time_us: int, latitude_deg: float, longitude_deg: float, altitude_m: float) -> None:
-        """Adds a fix on WGS84."""
+        """Adds a fix on WGS84: degrees, and metres above the ellipsoid. One that is not finite is left out and counted.
+
+        Raises `LogError` for a latitude or a longitude that is no angle in degrees.
+        """
+        if not np.isfinite([latitude_deg, longitude_deg, altitude_m]).all():
+            return self.left_out("fixes that are not finite", 1, "no position")
+        if abs(latitude_deg) > 90 or abs(longitude_deg) > 180:
+            place, problem = f"{self.source['id']} (gps)", f"latitude {latitude_deg}, longitude {longitude_deg}"
+            raise LogError(place, f"{problem}: no degrees", "repair the fixes, or remove them")
         fields = {"latitude_deg": float(latitude_deg), "longitude_deg": float(longitude_deg)}
         self.row("gps", time_us, {**fields, "altitude_m": float(altitude_m)})
 
@@ -265,6 +292,10 @@ class LogWriter:
             if len(names) > MAX_SENSORS:
                 problem = f"{len(names)} {what}; a log has at most {MAX_SENSORS}"
                 raise LogError(self.source["id"], problem, "make a source with fewer of them")
+            twice = [name for name, count in Counter(one["name"] for one in names).items() if count > 1]
+            if twice:
+                problem = f"two {what} have the name {twice[0]!r} in a log, of a-z, 0-9 and . _ -"
+                raise LogError(self.source["id"], problem, "give them other names")
         if not self.cameras:
             problem = "it has no camera with intrinsics"
             raise LogError(self.source["id"], problem, "a log needs a rig: choose a source that has cameras")
@@ -309,6 +340,14 @@ class LogWriter:
     def _json(self, name: str, value: Any) -> None:
         text = json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False)
         (self.part / name).write_text(text + "\n", encoding="utf-8")
+
+
+def _float(value: Any) -> float:
+    """A number, or NaN for what is none."""
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return float("nan")
 
 
 def _copied(source: Path, target: Path) -> dict[str, Any]:

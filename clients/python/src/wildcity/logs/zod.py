@@ -12,6 +12,7 @@ import re
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from .lenses import Intrinsics, camera, fisheye
 from .points import Sweep
 from .progress import Progress
 from .source import opened
-from .tableio import field, json_file, numbers
+from .tableio import field, json_file, numbers, text
 from .writer import LogWriter, Report
 
 LICENCE = "CC BY-SA 4.0 (Zenseact Open Dataset)"
@@ -54,12 +55,12 @@ def convert(source: Path, out: Path, options: Options) -> Report:
     info, place = _plain(json_file(folder / "info.json", "the list of files")), str(folder / "info.json")
     # Paths are relative to the root of the data set, two folders above.
     root = folder.parent.parent
-    times, poses = _poses(root / field(info, "egomotionpath", place))
+    times, poses = _poses(root / text(field(info, "egomotionpath", place), "egomotionpath", place))
     with opened("zod", source, out, options, log=name, licence=LICENCE, decides={"poses": len(times)}) as writer:
         writer.begin(times[0], poses[0][:3, 3])
         for time_us, pose in zip(times, poses, strict=True):
             writer.pose(time_us, pose, "ego_motion")
-        mount = _rig(writer, root / field(info, "calibrationpath", place))
+        mount = _rig(writer, root / text(field(info, "calibrationpath", place), "calibrationpath", place))
         _images(writer, root, field(info, "cameraframes", place), place)
         _sweeps(writer, root, info, place)
         _boxes(writer, root, info, mount, Poses(times, poses))
@@ -92,8 +93,14 @@ def _microseconds(text: Any, place: str) -> int:
 def _poses(path: Path) -> tuple[list[int], list[Matrix]]:
     """Times in microseconds, and poses of the ego."""
     found, place = json_file(path, "the poses of the ego"), str(path)
-    times = [round(float(time) * 1e6) for time in field(found, "timestamps", place)]
-    values = field(found, "poses", place)
+    seconds, values = field(found, "timestamps", place), field(found, "poses", place)
+    if not isinstance(seconds, list) or not isinstance(values, list):
+        raise LogError(place, "timestamps and poses are no lists", "download it again")
+    # Seconds since 1970 have ten digits; milliseconds would have thirteen.
+    known = numbers(seconds, (len(seconds),), "timestamps", place)
+    if not ((known > 0) & (known < 1e10)).all():
+        raise LogError(place, f"times {seconds[:2]} are no seconds since 1970", "download it again")
+    times = [round(float(time) * 1e6) for time in known]
     if not times or len(values) != len(times):
         raise LogError(place, f"{len(values)} poses for {len(times)} times", "download it again")
     for before, after in pairwise(times):
@@ -108,8 +115,12 @@ def _rig(writer: LogWriter, path: Path) -> Matrix:
     """Adds the camera and the LiDAR. Returns rig_from_lidar."""
     place = str(path)
     front = field(json_file(path, "the calibration"), "FC", place)
-    width, height = (int(value) for value in field(front, "image_dimensions", place))
-    k = np.asarray(field(front, "intrinsics", place), np.float64)
+    size = numbers(field(front, "image_dimensions", place), (2,), "image_dimensions", place)
+    width, height = (int(value) for value in size)
+    try:
+        k = np.asarray(field(front, "intrinsics", place), np.float64)
+    except (TypeError, ValueError):
+        k = np.empty(0)
     if k.ndim != 2 or k.shape[0] != 3 or k.shape[1] < 3 or not np.isfinite(k).all():
         raise LogError(place, "camera front has no intrinsics: they are no 3 x 3 or 3 x 4 numbers", "download it again")
     intrinsics = Intrinsics.of_matrix((width, height), k)
@@ -137,7 +148,7 @@ def _images(writer: LogWriter, root: Path, frames: Any, place: str) -> None:
                 raise LogError(
                     place, f"the time {one['time']} is not later: the clock runs backwards", "download it again"
                 )
-            writer.image("front", time_us, root / field(one, "filepath", place))
+            writer.image("front", time_us, root / text(field(one, "filepath", place), "filepath", place))
             last_us = time_us
             progress.step()
 
@@ -146,7 +157,7 @@ def _sweeps(writer: LogWriter, root: Path, info: dict[str, Any], place: str) -> 
     frames = field(info, "lidarframes", place).get("velodyne") or []
     with Progress("zod, sweeps", len(frames)) as progress:
         for one in frames:
-            path = root / field(one, "filepath", place)
+            path = root / text(field(one, "filepath", place), "filepath", place)
             core_us = _microseconds(path.stem.rpartition("_")[2], str(path))
             compensated_us = core_us if field(one, "iscompensated", place) else None
             writer.sweep("velodyne", core_us, partial(_sweep, path, core_us), compensated_to_us=compensated_us)
@@ -162,27 +173,33 @@ def _sweep(path: Path, core_us: int) -> Sweep:
         points = np.stack([found[axis] for axis in "xyz"], axis=1)
         times = core_us + found["timestamp"].astype(np.int64)
         return Sweep(points, times, found["intensity"], found["diode_index"])
-    except (ValueError, IndexError, EOFError, OSError) as error:
+    except (ValueError, IndexError, EOFError, OSError, SyntaxError, TokenError) as error:
         raise LogError(path, f"no sweep of ZOD: {error}", "download it again") from None
 
 
 def _boxes(writer: LogWriter, root: Path, info: dict[str, Any], rig_from_lidar: Matrix, poses: Poses) -> None:
     """Boxes of the key frame, in the axes of the LiDAR at the time of that frame."""
-    its = (info.get("annotations") or {}).get("objectdetection")
+    annotations = info.get("annotations")
+    its = annotations.get("objectdetection") if isinstance(annotations, dict) else None
     if its is None:
         return writer.left_out("boxes", 1, "the sequence has no annotations of objects")
-    path = root / field(its, "filepath", "info.json, annotations")
+    place = "info.json, annotations"
+    path = root / text(field(its, "filepath", place), "filepath", place)
     time_us = _microseconds(field(info, "keyframetime", "info.json"), "info.json")
     if not poses.covers(time_us):
         return writer.left_out("boxes", 1, "no pose at the time of the key frame")
     for one in json_file(path, "the annotations of objects"):
         values = field(one, "properties", path)
+        if not isinstance(values, dict):
+            raise LogError(path, f"properties are {values!r:.40}, no object", "download it again")
         if "location_3d" not in values:
             writer.left_out("objects without a box in space", 1, "boxes of the image only")
             continue
         center = field(field(values, "location_3d", path), "coordinates", path)
-        q = [float(field(values, f"orientation_3d_q{axis}", path)) for axis in "wxyz"]
-        size = [float(field(values, f"size_3d_{side}", path)) for side in ("length", "width", "height")]
+        q = numbers([field(values, f"orientation_3d_q{axis}", path) for axis in "wxyz"], (4,), "orientation_3d", path)
+        if not ((abs(q) < 2).all() and abs(float(np.linalg.norm(q)) - 1) < 1e-3):
+            raise LogError(path, f"orientation_3d (w, x, y, z) {list(q)} has not the length 1", "download it again")
+        size = [field(values, f"size_3d_{side}", path) for side in ("length", "width", "height")]
         label = ".".join(str(values[key]) for key in ("class", "type") if values.get(key))
         pose = poses.at(time_us) @ rig_from_lidar @ transform(numbers(center, (3,), "location_3d", path), q)
         writer.box(time_us, str(field(values, "annotation_uuid", path)), label, size, pose)
