@@ -47,7 +47,9 @@ pub(super) struct LogImages {
     log: Log,
     poses: Poses,
     images: Vec<LoggedImage>,
+    /// In the order of their beginnings.
     sweeps: Vec<SweepRow>,
+    longest_sweep_us: i64,
     tracks: Tracks,
     boxes: Boxes,
     pub(super) rig: RigPoses,
@@ -72,15 +74,19 @@ impl LogImages {
         let rows = log.images()?.context("the log has no images.jsonl: there is no image")?;
         let sweeps = log.sweeps()?.map(|rows| rows.collect::<Result<Vec<_>, _>>()).transpose()?;
         let tracks = Tracks::read(&log, [i64::MIN, i64::MAX])?;
-        let boxes = boxes(&log)?;
+        let boxes = Boxes::from_tracks(&tracks);
         let cameras = log.rig.cameras.iter().map(|camera| camera.rig_from_camera);
         let rig = RigPoses { world_from_ego: Vec::new(), ego_from_camera: cameras.collect() };
-        let sweeps = sweeps.unwrap_or_default();
+        let mut sweeps = sweeps.unwrap_or_default();
+        sweeps.sort_by_key(|sweep| sweep.time_us);
+        let length_us = |sweep: &SweepRow| sweep.until_us.saturating_sub(sweep.time_us);
+        let longest_sweep_us = sweeps.iter().map(length_us).max().unwrap_or(0);
         let mut all = Self {
             log,
             poses,
             images: Vec::new(),
             sweeps,
+            longest_sweep_us,
             tracks,
             boxes,
             rig,
@@ -265,6 +271,16 @@ impl LogImages {
         Ok(TrainingImage { view, rgb8, mask, sky, depth_m, weight: 1.0, exposure })
     }
 
+    /// The sweeps that have points near a time.
+    fn sweeps_near(&self, time_us: i64) -> impl Iterator<Item = &SweepRow> {
+        let from_us = time_us.saturating_sub(SWEEP_US);
+        let until_us = time_us.saturating_add(SWEEP_US);
+        let earliest_us = from_us.saturating_sub(self.longest_sweep_us);
+        let first = self.sweeps.partition_point(|sweep| sweep.time_us < earliest_us);
+        let last = self.sweeps.partition_point(|sweep| sweep.time_us <= until_us);
+        self.sweeps[first..last].iter().filter(move |sweep| sweep.until_us >= from_us)
+    }
+
     /// The depths of the LiDAR's points near the time of an image, where these are seen.
     fn depths(
         &self,
@@ -280,11 +296,7 @@ impl LogImages {
         let projection = Projection { poses: &self.poses, mounted: &mounted, time_us: row.time_us };
         let mut depths = Depths::new([view.camera.width_px, view.camera.height_px]);
         let near = self.tracks.near(row.time_us);
-        let is_near = |sweep: &&SweepRow| {
-            sweep.time_us <= row.time_us.saturating_add(SWEEP_US)
-                && sweep.until_us >= row.time_us.saturating_sub(SWEEP_US)
-        };
-        for sweep in self.sweeps.iter().filter(is_near) {
+        for sweep in self.sweeps_near(row.time_us) {
             for (time_us, rig_m) in self.log.points_on_rig(sweep)? {
                 if time_us.abs_diff(row.time_us) > SWEEP_US.unsigned_abs() {
                     continue;
@@ -333,17 +345,6 @@ impl TrainingImages for LogImages {
     fn load(&self, index: usize) -> Result<TrainingImage, String> {
         self.decode(index).map_err(|error| exit::chain(&error))
     }
-}
-
-/// The boxes of a log, which hide what moves.
-fn boxes(log: &Log) -> anyhow::Result<Boxes> {
-    let path = log.path("tracks.jsonl");
-    if !path.is_file() {
-        return Ok(Boxes::default());
-    }
-    let cannot = || format!("{}", path.display());
-    let text = std::fs::read_to_string(&path).with_context(cannot)?;
-    Boxes::parse(&text).with_context(cannot)
 }
 
 /// Depths of single pixels, of which the near ones hide the far ones around them.
