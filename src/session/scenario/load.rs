@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use serde_json::Value;
 
@@ -303,7 +304,8 @@ impl Scenarios {
     ) -> Result<ScenarioFile, ScenarioError> {
         let document = self.document(source)?;
         let mut chosen = document.first_values();
-        chosen.extend(values.iter().map(|(name, value)| (name.clone(), value.clone())));
+        let given = values.iter().map(|(name, value)| (name.clone(), Arc::new(value.clone())));
+        chosen.extend(given);
         document
             .with(&chosen)
             .map_err(|cause| ScenarioError::File { file: "scenario".to_owned(), cause })
