@@ -57,7 +57,14 @@ def _json(source: Path, name: str) -> Any:
             return json.loads(archive.read(name))
     except KeyError:
         raise LogError(source, f"missing: {name}", "give a scene of NuRec, as AlpaSim reads it") from None
-    except (zipfile.BadZipFile, OSError, json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (
+        zipfile.BadZipFile,
+        OSError,
+        json.JSONDecodeError,
+        UnicodeDecodeError,
+        RecursionError,
+        MemoryError,
+    ) as error:
         raise LogError(f"{source}, {name}", f"cannot read: {error}", "download it again") from None
 
 
