@@ -298,14 +298,14 @@ impl UnreadOverlay {
     /// # Errors
     /// As [`Self::from_png`].
     pub fn from_data_uri(text: &str, camera_px: [u32; 2]) -> Result<Self, AppearanceError> {
-        let bytes = text.strip_prefix(DATA_URI);
-        let bytes =
-            bytes.ok_or_else(|| refused("it does not begin with data:image/png;base64,"))?;
-        let png = BASE64.decode(bytes.as_bytes()).map_err(|_| refused("it is not base64"))?;
+        let encoded = text
+            .strip_prefix(DATA_URI)
+            .ok_or_else(|| refused("it does not begin with data:image/png;base64,"))?;
+        let png = BASE64.decode(encoded.as_bytes()).map_err(|_| refused("it is not base64"))?;
         Self::from_png(png, camera_px)
     }
 
-    /// Its pixels.
+    /// The number of its pixels.
     pub fn pixels(&self) -> u64 {
         pixels(self.size_px)
     }

@@ -31,7 +31,7 @@ pub struct BoxTree {
 
 impl Extent {
     /// The extent of a line between two points.
-    pub fn of_line(from_m: DVec3, to_m: DVec3) -> Self {
+    pub fn from_line(from_m: DVec3, to_m: DVec3) -> Self {
         Self { low_m: from_m.min(to_m), high_m: from_m.max(to_m) }
     }
 
@@ -186,7 +186,7 @@ mod tests {
                     at_m.round()
                 })
                 .collect();
-            let tree = BoxTree::new(points.iter().map(|point| Extent::of_line(*point, *point)));
+            let tree = BoxTree::new(points.iter().map(|point| Extent::from_line(*point, *point)));
             for _ in 0..50 {
                 let wanted_m: DVec3 =
                     std::array::from_fn(|_| (random.range(-10.0, 10.0)).round()).into();
@@ -215,7 +215,7 @@ mod tests {
                 );
                 assert_eq!(found, best, "{count} points, {first}..{end}");
                 assert!(visits <= 200, "{visits} of {count} points were tested");
-                let all = (first..end).map(|at| Extent::of_line(points[at], points[at]));
+                let all = (first..end).map(|at| Extent::from_line(points[at], points[at]));
                 assert_eq!(tree.extent(first..end), all.reduce(Extent::with));
             }
         }

@@ -357,8 +357,8 @@ impl RigCamera {
         // After the check above, which bounds the size of the overlay by that of the image.
         let has_gain = fields.exposure.is_some_and(|exposure| exposure.gain.is_some());
         let size_px = [camera.width_px, camera.height_px];
-        let overlay = fields.overlay.as_deref();
-        let overlay = overlay.map(|text| UnreadOverlay::from_data_uri(text, size_px)).transpose();
+        let uri = fields.overlay.as_deref();
+        let overlay = uri.map(|uri| UnreadOverlay::from_data_uri(uri, size_px)).transpose();
         let (appearance, overlay) = Appearance::new(fields.exposure, None, size_px)
             .and_then(|appearance| appearance.check(size_px).map(|()| appearance))
             .and_then(|appearance| Ok((appearance, overlay?)))

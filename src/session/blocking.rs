@@ -9,8 +9,8 @@ use tracing::Span;
 
 use crate::error::SessionError;
 
-/// Tells work on another thread when nobody waits for it any more: its deadline has passed, or the
-/// request that it is for was dropped because its client left.
+/// Tells work on another thread when its result is of no use any more: its deadline has passed, or
+/// the request that it is for was dropped because its client left.
 #[derive(Clone, Debug)]
 pub(crate) struct Stop {
     is_dropped: Arc<AtomicBool>,
@@ -18,7 +18,7 @@ pub(crate) struct Stop {
 }
 
 impl Stop {
-    /// Breaks the work off if nobody waits for it. Long work asks at least each millisecond.
+    /// Breaks the work off if its result is of no use. Long work asks at least each millisecond.
     pub(crate) fn check(&self) -> ControlFlow<()> {
         let is_over = self.is_dropped.load(Ordering::Relaxed) || Instant::now() >= self.deadline;
         if is_over { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }

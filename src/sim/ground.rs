@@ -53,7 +53,7 @@ fn parts(drive: &Trajectory) -> impl Iterator<Item = (&Pose, &Pose)> {
 }
 
 fn extent((from, to): (&Pose, &Pose)) -> Extent {
-    Extent::of_line(from.position_m, to.position_m)
+    Extent::from_line(from.position_m, to.position_m)
 }
 
 impl<'a> Ground<'a> {
@@ -78,8 +78,8 @@ impl<'a> Ground<'a> {
     ///
     /// The plane is that of the nearest drive in 3D, so a bridge and the street below it are
     /// distinguished; of the nearest lane if no drive is that near. Between keyframes, and between
-    /// points of a lane, it is interpolated. Without boxes, every keyframe is tested: 170,000 take a
-    /// millisecond.
+    /// points of a lane, it is interpolated. Without boxes, every keyframe is tested: 170,000 take
+    /// a millisecond.
     pub fn place(&self, world_from_rig: Pose) -> Pose {
         self.find(world_from_rig).unwrap_or(world_from_rig)
     }

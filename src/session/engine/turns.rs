@@ -16,7 +16,7 @@ pub(crate) struct Turn {
     _permit: OwnedSemaphorePermit,
 }
 
-/// The turns of all sessions. Whoever waits longest is next.
+/// The turns of all sessions. The one that waits longest is next.
 #[derive(Debug)]
 pub(crate) struct Turns {
     simulations: Arc<Semaphore>,

@@ -18,7 +18,7 @@ const LOOK_PERIOD: Duration = Duration::from_secs(10);
 /// The most bytes of records.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RecordLimits {
-    /// Of all records.
+    /// Of the records of all owners together.
     pub bytes: u64,
     /// Of the records of one owner.
     pub owner_bytes: u64,
@@ -125,7 +125,7 @@ impl Held {
             if path.extension().is_none_or(|extension| extension != "jsonl") {
                 continue;
             }
-            // What is no record counts for all, and for nobody.
+            // What is no record counts for all, and for no token.
             let owner = RecordHead::read(&path).map(|head| head.owner).unwrap_or_default();
             let bytes = record_bytes(&path) + record_bytes(&mcap_path(&path));
             held.bytes += bytes;

@@ -135,7 +135,7 @@ impl EpisodeTraffic {
     /// has the contacts with the twin that began in the step.
     ///
     /// # Errors
-    /// Nobody waits for it any more; this traffic is of no use then.
+    /// The step was stopped; this traffic is of no use then.
     fn advance(
         &mut self,
         [from, to]: [&Ego; 2],
@@ -202,7 +202,7 @@ impl EpisodeTraffic {
     /// those of all steps.
     ///
     /// # Errors
-    /// Nobody waits for it any more.
+    /// The steps were stopped.
     pub(crate) fn followed(
         &self,
         from: &Ego,

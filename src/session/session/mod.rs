@@ -52,7 +52,7 @@ pub struct Session {
     /// Prefetches in the background.
     prefetch_task: LatestTask,
     name: String,
-    /// To whom its records belong; empty if nobody asks.
+    /// Name of the token that its records belong to; empty if there is none.
     owner: String,
     /// Tells the render queue whose frames are whose.
     number: u64,
@@ -81,7 +81,7 @@ impl Session {
         &self.name
     }
 
-    /// Says to whom the records of its episodes belong from now on.
+    /// Names the token that the records of its episodes belong to from now on.
     pub fn set_owner(&mut self, owner: &str) {
         owner.clone_into(&mut self.owner);
     }

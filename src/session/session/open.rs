@@ -281,7 +281,7 @@ async fn decoded(
         Some(AskedRig::Unread(unread)) => unread,
     };
     let bytes = unread.decoding_bytes();
-    // Before the turn, so that those who wait hold no more than their messages and this budget.
+    // Before the turn, so that requests that wait hold no more than their messages and this budget.
     let reserved = engine.answer_budget().reserve(bytes)?;
     let turn = if bytes == 0 { None } else { Some(engine.overlay_turn().await?) };
     let decode = move || {

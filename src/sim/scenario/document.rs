@@ -10,7 +10,7 @@ use serde_json::Value;
 
 use super::error::{FileError, check_format, json, typed};
 use super::file::ScenarioFile;
-use super::size::Size;
+use super::size::{Size, Values, sweep_name};
 use crate::limits;
 
 /// A scenario whose `$name` values are not chosen yet.
@@ -19,9 +19,6 @@ pub struct Document {
     value: Value,
     sweep: Sweep,
 }
-
-/// The value of each `$name`. Copies share the values.
-pub type Values = BTreeMap<String, Arc<Value>>;
 
 /// Values as a file has them: nothing is shared.
 pub fn written_values(values: &Values) -> BTreeMap<String, Value> {
@@ -119,7 +116,8 @@ impl Document {
         let mut used = BTreeSet::new();
         collect_names(&self.value, &mut used);
         if self.sweep.values.len() > limits::SWEEP_NAMES {
-            let (count, most) = (self.sweep.values.len(), limits::SWEEP_NAMES);
+            let count = self.sweep.values.len();
+            let most = limits::SWEEP_NAMES;
             let message = format!("{count} names; at most {most} are accepted");
             return Err(FileError::new("sweep", message));
         }
@@ -189,11 +187,6 @@ fn remove_notes(value: &mut Value) {
         Value::Array(items) => items.iter_mut().for_each(remove_notes),
         _ => {}
     }
-}
-
-/// The name of a `$name` string.
-pub(super) fn sweep_name(text: &str) -> Option<&str> {
-    text.strip_prefix('$').filter(|name| !name.is_empty())
 }
 
 fn collect_names(value: &Value, names: &mut BTreeSet<String>) {

@@ -32,11 +32,12 @@ mod tracks;
 
 pub use actor_file::*;
 pub use around::{AssetInfo, Assets, EgoStart, NoAssets, Surroundings};
-pub use document::{Case, Document, Values, written_values};
+pub use document::{Case, Document, written_values};
 pub use end::{EndInput, EndReason, EndRules, Stuck};
 pub use error::{FileError, check_format};
 pub use file::*;
 pub use pose::PoseSection;
 pub use resolve::Scenario;
 pub use script_file::*;
+pub use size::Values;
 pub use tracks::{KeyframeSection, TrackSection, TracksFile};

@@ -1,10 +1,20 @@
 //! How large a scenario is once its values are in place, computed without a copy.
 
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
 use serde_json::Value;
 
-use super::document::{Values, sweep_name};
 use super::error::FileError;
 use crate::limits;
+
+/// The value of each `$name`. Copies share the values.
+pub type Values = BTreeMap<String, Arc<Value>>;
+
+/// The name of a `$name` string.
+pub(super) fn sweep_name(text: &str) -> Option<&str> {
+    text.strip_prefix('$').filter(|name| !name.is_empty())
+}
 
 /// The size of a scenario.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -24,8 +34,8 @@ impl Size {
             size.add(value, &|_| None);
             (name.as_str(), size)
         });
-        let sizes: std::collections::BTreeMap<&str, Self> = sizes.collect();
-        size.add(value, &|name| sizes.get(name).copied());
+        let by_name: BTreeMap<&str, Self> = sizes.collect();
+        size.add(value, &|name| by_name.get(name).copied());
         size
     }
 
@@ -39,8 +49,8 @@ impl Size {
             // The digits are not counted: a number takes the same memory however long it is.
             Value::Number(_) => self.bytes = self.bytes.saturating_add(1),
             Value::String(text) => {
-                let replaced = sweep_name(text).and_then(of_name);
-                let replaced = replaced.unwrap_or(Self { bytes: text.len() + 2, objects: 0 });
+                let of_value = sweep_name(text).and_then(of_name);
+                let replaced = of_value.unwrap_or(Self { bytes: text.len() + 2, objects: 0 });
                 self.bytes = self.bytes.saturating_add(replaced.bytes);
                 self.objects = self.objects.saturating_add(replaced.objects);
             }

@@ -53,11 +53,12 @@ impl Course {
 
     fn new(poses: Vec<Pose>, stations_m: Vec<f64>) -> Self {
         let extents = poses.windows(2).map(|pair| {
-            let [from_m, to_m] = [pair[0].position_m, pair[1].position_m];
+            let from_m = pair[0].position_m;
+            let to_m = pair[1].position_m;
             // A vertical segment has no place on the ground: it is infinitely far from all.
             let is_vertical = flat(to_m - from_m).length_squared() == 0.0;
             let nowhere = Extent { low_m: DVec3::INFINITY, high_m: DVec3::NEG_INFINITY };
-            if is_vertical { nowhere } else { Extent::of_line(from_m, to_m) }
+            if is_vertical { nowhere } else { Extent::from_line(from_m, to_m) }
         });
         let boxes = BoxTree::new(extents);
         Self { poses, stations_m, boxes }
@@ -189,7 +190,7 @@ impl Course {
     pub(super) fn extent(&self, from_m: f64, to_m: f64) -> Extent {
         let (first, _) = self.segment(from_m);
         let (last, _) = self.segment(to_m);
-        let ends = Extent::of_line(self.point_m(from_m), self.point_m(to_m));
+        let ends = Extent::from_line(self.point_m(from_m), self.point_m(to_m));
         self.boxes.extent(first..last + 1).map_or(ends, |extent| extent.with(ends))
     }
 

@@ -4,8 +4,7 @@
 //! state is a kilobyte, so that reading all of them would take longer than anything else. What most
 //! of them wait for fits into a few bytes, and these are in one list.
 
-use super::script::{After, Condition, Near};
-use super::world::Actor;
+use super::script::{After, Condition, Near, Trigger};
 
 /// A trigger that has not fired.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -62,10 +61,9 @@ pub(super) fn is_plain(when: &Condition) -> bool {
 }
 
 /// All triggers, in the order of the actors and of their scripts.
-pub(super) fn waiting(actors: &[Actor]) -> Vec<Waiting> {
-    let scripts = actors.iter().enumerate();
-    let triggers = scripts.flat_map(|(actor, setup)| {
-        setup.script.iter().enumerate().map(move |(at, trigger)| Waiting {
+pub(super) fn waiting<'a>(scripts: impl Iterator<Item = &'a Vec<Trigger>>) -> Vec<Waiting> {
+    let triggers = scripts.enumerate().flat_map(|(actor, script)| {
+        script.iter().enumerate().map(move |(at, trigger)| Waiting {
             actor: actor as u16,
             trigger: at as u16,
             gate: Gate::new(&trigger.when),

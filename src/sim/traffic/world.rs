@@ -73,7 +73,7 @@ pub struct World {
     end: EndState,
 }
 
-/// A trigger that fired.
+/// A trigger that fired in a step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Firing {
     /// When, in microseconds.
@@ -145,7 +145,7 @@ impl World {
             })
             .collect();
         let travelled_m = vec![0.0; progress.len() + 1];
-        let waiting = waiting(&traffic.actors);
+        let waiting = waiting(traffic.actors.iter().map(|actor| &actor.script));
         Self {
             traffic,
             time_us: 0,
