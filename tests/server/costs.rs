@@ -141,7 +141,7 @@ async fn a_recorded_episode_belongs_to_its_token() {
     let mut ann = agent_of(&server, ANN).await;
     ann.open(json!({ "session": "anns", "outputs": { "encoding": "raw" } })).await;
     ann.step(1.0).await;
-    let branch = |episode: &str| json!({ "type": "open", "session": "branch", "from": { "episode": episode, "step": 1 } });
+    let branch = |episode: &str| json!({ "type": "branch", "session": "branch", "from": { "episode": episode, "step": 1 } });
     let mut bob = agent_of(&server, BOB).await;
     let hidden = bob.ask(branch("anns-1")).await;
     let missing = bob.ask(branch("none-1")).await;
@@ -159,7 +159,7 @@ async fn records_of_a_token_have_a_quota() {
     ann.open(json!({ "outputs": { "encoding": "raw" } })).await;
     ann.step(1.0).await;
     let noted =
-        json!({ "type": "step", "pose": pose(2.0), "notes": { "text": "n".repeat(35_000) } });
+        json!({ "type": "step", "pose": pose(2.0), "notes": { "text": "n".repeat(60_000) } });
     let answer = ann.ask(noted).await;
     refused(&answer, "storage_full");
     assert!(answer["message"].as_str().unwrap().contains("--token-records-gib"), "{answer}");

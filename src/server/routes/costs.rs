@@ -80,9 +80,11 @@ const CHECK: Duration = wildcity_push::limits::CHECK_TIMEOUT;
 const MIB: u64 = 1 << 20;
 
 /// Routes, by method and path.
-const ROUTES: [Cost; 31] = [
+const ROUTES: [Cost; 33] = [
     cost("GET /", MIB, NONE, 0, "the page of the viewer"),
-    cost("GET /viewer/{file}", MIB, NONE, 0, "a file of the viewer"),
+    cost("GET /viewer.js", MIB, NONE, 0, "a file of the viewer"),
+    cost("GET /style.css", MIB, NONE, 0, "a file of the viewer"),
+    cost("GET /icon.svg", MIB, NONE, 0, "a file of the viewer"),
     cost("GET /healthz", 0, NONE, 0, "a constant"),
     cost("GET /readyz", MIB, NONE, 0, "the list of twins, once a second"),
     cost("GET /metrics", MIB, NONE, 0, "names of metrics are fixed"),
@@ -102,11 +104,11 @@ const ROUTES: [Cost; 31] = [
     cost("POST /v1/twins/{twin}/edits", JSON, CHECK, MIB, "counts as a push"),
     cost("POST /v1/twins/{twin}/rollback", JSON, NONE, MIB, "a record of the log"),
     cost("POST /v1/twins/{twin}/pushes", JSON, CHECK, limits::UPLOAD_BYTES, "`--push-memory-gib`"),
-    cost("GET /v1/twins/{twin}/pushes", MIB, NONE, 0, "open pushes"),
     cost("GET /v1/twins/{twin}/pushes/{id}", MIB, NONE, 0, "a push"),
     cost("DELETE /v1/twins/{twin}/pushes/{id}", 0, NONE, 0, "a mark"),
     cost("GET /v1/actors", MIB, NONE, 0, "assets"),
-    cost("POST /v1/actors/{actor}/pushes", JSON, CHECK, limits::UPLOAD_BYTES, "counts as a push"),
+    cost("GET /v1/actors/{actor}", MIB, NONE, 0, "an asset"),
+    cost("POST /v1/actors", JSON, CHECK, limits::UPLOAD_BYTES, "counts as a push"),
     cost(
         "POST /v1/uploads",
         JSON,
