@@ -10,7 +10,7 @@ use std::os::unix::process::CommandExt as _;
 use std::process::{Child, ChildStdin, Command, Stdio};
 
 /// Reads until the pipe is closed. Then the group is killed, of which nothing may be left.
-const WATCH: &str = "read -r line; kill -KILL -- \"-$0\" 2>/dev/null";
+const WATCH: &str = "read -r line; kill -s KILL -- \"-$0\" 2>/dev/null";
 
 /// A process with all that it has started.
 pub(crate) struct ProcessGroup {
