@@ -3,6 +3,8 @@
 //! ```text
 //! wire        the messages of AlpaSim 0.54 as Rust types
 //! grpc        one gRPC method over HTTP/2
+//! door        the open connections, and the memory of their requests
+//! shape       how many messages a request contains
 //! scene       scenes: pieces of recorded drives, and their local frames
 //! camera      cameras, poses and shutters, to and from the wire
 //! object      dynamic objects, as their ids describe them
@@ -21,12 +23,14 @@
 //! test calls every method with the stubs of another package.
 
 pub mod camera;
+mod door;
 pub mod egodriver;
 pub mod export;
-pub mod grpc;
+mod grpc;
 pub mod limits;
 pub mod object;
 pub mod physics;
 pub mod scene;
 pub mod sensorsim;
+mod shape;
 pub mod wire;

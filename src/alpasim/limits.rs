@@ -6,6 +6,32 @@ use std::time::Duration;
 /// large batches need an encoding.
 pub const MESSAGE_BYTES: usize = 64 << 20;
 
+/// Messages in one request: 256 images with 250 objects each. One takes up to 700 bytes in memory,
+/// and two on the wire.
+pub const SUBMESSAGES: usize = 1 << 16;
+
+/// Bytes of all requests that are being received, and of those of one connection, in KiB.
+pub const REQUESTS_KIB: usize = 256 << 10;
+/// Bytes of the requests of one connection, in KiB: see [`REQUESTS_KIB`].
+pub const CONNECTION_KIB: usize = 96 << 10;
+
+/// How long a client may take to send one request. 64 MiB take 54 s at 10 Mbit/s.
+pub const RECEIVE: Duration = Duration::from_secs(60);
+
+/// How long a connection may take to its first request.
+pub const HELLO: Duration = Duration::from_secs(10);
+
+/// How long a connection may be without a request afterwards. gRPC clients connect again by
+/// themselves.
+pub const CONNECTION_IDLE: Duration = Duration::from_secs(600);
+
+/// Longest id of a scene: two names of 64 bytes, and two numbers. Rust writes an f64 with up to 327
+/// characters.
+pub const SCENE_ID_BYTES: usize = 512;
+
+/// Scenes of one version that are remembered as drawn.
+pub const DRAWN_SCENES: usize = 1000;
+
 /// How long a request may wait for its images. AlpaSim's renderer waits as long for its backend.
 pub const RENDER_TIMEOUT: Duration = Duration::from_secs(300);
 

@@ -66,7 +66,12 @@ impl FromStr for SceneId {
     type Err = SceneError;
 
     fn from_str(id: &str) -> Result<Self, SceneError> {
-        let refused = || SceneError::Id { id: id.to_owned() };
+        // A longer text is no id, and is not repeated as a whole.
+        let end = id.floor_char_boundary(limits::SCENE_ID_BYTES);
+        let refused = || SceneError::Id { id: id[..end].to_owned() };
+        if end < id.len() {
+            return Err(refused());
+        }
         // Names have neither `@` nor `+`, so the first ones are the separators.
         let (twin, rest) = id.split_once('@').ok_or_else(refused)?;
         let (version, rest) = rest.split_once('+').ok_or_else(refused)?;

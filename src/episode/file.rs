@@ -216,7 +216,7 @@ impl EpisodeFile {
     /// The file cannot be read, or its first line is not a header.
     pub fn read(path: &Path) -> Result<Self, ReadError> {
         let failed = |cause| ReadError::Io { path: path.to_owned(), cause };
-        let mut reader = BufReader::new(File::open(path).map_err(failed)?);
+        let mut reader = BufReader::new(open_record(path).map_err(failed)?);
         let mut text = Vec::new();
         let mut episode = Self {
             header: read_header(&mut reader, path, &mut text)?,
@@ -250,7 +250,7 @@ impl EpisodeFile {
     /// The file cannot be read, or its first line is not a header.
     pub fn header(path: &Path) -> Result<Header, ReadError> {
         let failed = |cause| ReadError::Io { path: path.to_owned(), cause };
-        let mut reader = BufReader::new(File::open(path).map_err(failed)?);
+        let mut reader = BufReader::new(open_record(path).map_err(failed)?);
         read_header(&mut reader, path, &mut Vec::new())
     }
 
@@ -312,7 +312,7 @@ impl EpisodeFile {
             rig: Rig,
         }
         let failed = |cause| ReadError::Io { path: path.to_owned(), cause };
-        let mut reader = BufReader::new(File::open(path).map_err(failed)?);
+        let mut reader = BufReader::new(open_record(path).map_err(failed)?);
         let mut text = Vec::new();
         let line = read_line(&mut reader, line_bytes(1), &mut text).map_err(failed)?;
         let read = line.ok().and_then(|_| serde_json::from_slice::<WithRig>(&text).ok());
@@ -330,6 +330,18 @@ impl EpisodeFile {
     /// The name of the episode: that of its file without the extension.
     pub fn episode_name(path: &Path) -> String {
         path.file_stem().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
+    }
+}
+
+/// Opens a record. A pipe in its place is refused, since opening it would wait for a writer.
+///
+/// # Errors
+/// It cannot be opened, or is no regular file.
+pub fn open_record(path: &Path) -> io::Result<File> {
+    if std::fs::metadata(path)?.is_file() {
+        File::open(path)
+    } else {
+        Err(io::Error::other("it is not a regular file"))
     }
 }
 

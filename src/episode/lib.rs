@@ -13,7 +13,7 @@
 //! | `scenario` | the line of a scenario |
 //! | `diff` | the first difference of two episodes |
 //! | `export` | an episode as MCAP, or as tables of nuScenes |
-//! | `listing` | the episodes of a directory |
+//! | `listing`, `overview` | the episodes of a directory, and what a list shows of each |
 //! | [`limits`] | limits |
 
 mod diff;
@@ -24,6 +24,7 @@ pub mod limits;
 mod lines;
 mod listing;
 mod outcome;
+mod overview;
 mod scenario;
 
 pub use diff::{Difference, What, diff};
@@ -38,7 +39,7 @@ pub use export::{
 };
 pub use file::{
     CameraHead, Cut, EndLine, EpisodeFile, Frame, Header, ReadError, RigHead, check_no_mcap,
-    driven_indices, line_bytes,
+    driven_indices, line_bytes, open_record,
 };
 pub use lines::{
     ActorLine, ActorStateLine, ActorsLine, Collision, ContactEvent, EgoLine, EpisodeResult, Event,
@@ -46,4 +47,5 @@ pub use lines::{
 };
 pub use listing::{Listed, list, read_mcap, read_text, record_bytes};
 pub use outcome::result;
+pub use overview::{Overview, RecordHead};
 pub use scenario::{DriveStart, ground_surface, pose_at, scenario_line};

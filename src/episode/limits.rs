@@ -27,3 +27,10 @@ pub const LEFTOVER_AGE: Duration = Duration::from_secs(3600);
 /// Largest number of episodes of a list.
 // With name and path, an entry takes about 200 bytes: 2 MB in all.
 pub const LISTED: usize = 10_000;
+
+/// The part of a line in which the fields are that a list shows, in bytes: they come first.
+pub const HEAD_FIELDS_BYTES: u64 = 1 << 16;
+
+/// How much of the end of a record is read for its last frame, in bytes; more if the first part has
+/// none. A line has at most [`LINE_BYTES`], and those of one step have less than two.
+pub const TAIL_BYTES: [u64; 2] = [1 << 16, 3 << 20];

@@ -1,11 +1,12 @@
 //! The episodes of a directory.
 
 use std::fs;
-use std::io;
+use std::io::{self, Read as _};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use crate::export::mcap_path;
+use crate::file::open_record;
 use crate::limits;
 
 /// A file of an episode.
@@ -87,10 +88,12 @@ pub fn read_mcap(record: &Path, most: u64) -> io::Result<Option<Vec<u8>>> {
 /// The file cannot be read.
 pub fn read_text(path: &Path, most: u64) -> io::Result<Option<Vec<u8>>> {
     // Tested before the file is read into memory. It may grow by a few lines in between.
-    if fs::metadata(path)?.len() > most {
+    let mut file = open_record(path)?;
+    if file.metadata()?.len() > most {
         return Ok(None);
     }
-    let mut text = fs::read(path)?;
+    let mut text = Vec::new();
+    file.read_to_end(&mut text)?;
     // Without any line break nothing is complete.
     let complete = text.iter().rposition(|&byte| byte == b'\n').map_or(0, |last| last + 1);
     text.truncate(complete);

@@ -76,11 +76,12 @@ pub(crate) fn read_graph(path: &Path, files: &[ModelFile]) -> Result<GraphFiles,
 
 fn read_at_most(path: &Path, limit: u64) -> Result<Vec<u8>, RepairError> {
     let error = |message: String| RepairError::File { path: path.to_owned(), message };
-    let file = fs::File::open(path).map_err(|e| error(e.to_string()))?;
-    let metadata = file.metadata().map_err(|e| error(e.to_string()))?;
+    // Before it is opened: opening a pipe waits for a writer.
+    let metadata = fs::metadata(path).map_err(|e| error(e.to_string()))?;
     if !metadata.is_file() {
         return Err(error("not a regular file".to_owned()));
     }
+    let file = fs::File::open(path).map_err(|e| error(e.to_string()))?;
     let mut bytes = Vec::new();
     // One byte more than allowed shows that there is more. The length of the metadata is no bound,
     // as the file may grow while it is read.

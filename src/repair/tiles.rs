@@ -8,6 +8,10 @@
 use crate::error::RepairError;
 use crate::planes::Rect;
 
+/// Most windows of an image: a 4K image in tiles of 128 px with a halo of 32 px has 2,040. Each is
+/// a run of the model, with a time-out of its own.
+const WINDOWS: usize = 4096;
+
 /// A tile: the window that the model sees, and the part of its output that is used.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Window {
@@ -32,7 +36,16 @@ impl Tiling {
     pub(crate) fn windows(&self, height: usize, width: usize) -> Result<Vec<Window>, RepairError> {
         let rows = self.spans(height, self.tile[0])?;
         let columns = self.spans(width, self.tile[1])?;
-        let mut windows = Vec::with_capacity(rows.len() * columns.len());
+        let count = rows.len() * columns.len();
+        if count > WINDOWS {
+            let [tall, wide] = self.tile;
+            let message = format!(
+                "{tall} x {wide} px make {count} windows of an image of {height} x {width} px; at \
+                 most {WINDOWS} are run: use larger tiles"
+            );
+            return Err(RepairError::Tiles { message });
+        }
+        let mut windows = Vec::with_capacity(count);
         for row in &rows {
             for column in &columns {
                 windows.push(Window {

@@ -44,6 +44,13 @@ pub struct Overlay {
     png: Vec<u8>,
 }
 
+/// An overlay whose header was read, and none of its pixels.
+#[derive(Debug)]
+pub struct UnreadOverlay {
+    size_px: [u32; 2],
+    png: Vec<u8>,
+}
+
 /// Why an appearance was refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum AppearanceError {
@@ -171,18 +178,7 @@ impl Overlay {
     /// # Errors
     /// [`AppearanceError::Size`], [`AppearanceError::Overlay`].
     pub fn from_png(png: Vec<u8>, camera_px: [u32; 2]) -> Result<Self, AppearanceError> {
-        let unreadable = |error: image::ImageError| refused(&error.to_string());
-        // A closure, because `into_dimensions` consumes the reader and the pixels need a second
-        // one.
-        let reader = || ImageReader::with_format(Cursor::new(&png[..]), ImageFormat::Png);
-        let (width_px, height_px) = reader().into_dimensions().map_err(unreadable)?;
-        let overlay_px = [width_px, height_px];
-        if overlay_px != camera_px {
-            return Err(AppearanceError::Size { overlay_px, camera_px });
-        }
-        check_pixels(u64::from(width_px) * u64::from(height_px))?;
-        let rgba8 = reader().decode().map_err(unreadable)?.into_rgba8().into_raw();
-        Ok(Self { width_px, rgba8, png })
+        UnreadOverlay::from_png(png, camera_px)?.decode()
     }
 
     /// Decodes `"data:image/png;base64,.."`, as [`Overlay::from_png`].
@@ -190,11 +186,7 @@ impl Overlay {
     /// # Errors
     /// As [`Overlay::from_png`].
     pub fn from_data_uri(text: &str, camera_px: [u32; 2]) -> Result<Self, AppearanceError> {
-        let bytes = text.strip_prefix(DATA_URI);
-        let bytes =
-            bytes.ok_or_else(|| refused("it does not begin with data:image/png;base64,"))?;
-        let png = BASE64.decode(bytes.as_bytes()).map_err(|_| refused("it is not base64"))?;
-        Self::from_png(png, camera_px)
+        UnreadOverlay::from_data_uri(text, camera_px)?.decode()
     }
 
     /// An overlay from pixels `[height, width, 4]`: red, green, blue (not premultiplied) and alpha.
@@ -283,6 +275,61 @@ impl Overlay {
     pub fn to_data_uri(&self) -> String {
         format!("{DATA_URI}{}", BASE64.encode(&self.png))
     }
+}
+
+impl UnreadOverlay {
+    /// Reads the header of a PNG for a camera's image of this width and height.
+    ///
+    /// # Errors
+    /// As [`Overlay::from_png`], except for what is wrong with the pixels.
+    pub fn from_png(png: Vec<u8>, camera_px: [u32; 2]) -> Result<Self, AppearanceError> {
+        let reader = ImageReader::with_format(Cursor::new(&png[..]), ImageFormat::Png);
+        let dimensions = reader.into_dimensions().map_err(|error| refused(&error.to_string()))?;
+        let overlay_px = dimensions.into();
+        if overlay_px != camera_px {
+            return Err(AppearanceError::Size { overlay_px, camera_px });
+        }
+        check_pixels(pixels(overlay_px))?;
+        Ok(Self { size_px: overlay_px, png })
+    }
+
+    /// Reads the header of `"data:image/png;base64,.."`.
+    ///
+    /// # Errors
+    /// As [`Self::from_png`].
+    pub fn from_data_uri(text: &str, camera_px: [u32; 2]) -> Result<Self, AppearanceError> {
+        let encoded = text
+            .strip_prefix(DATA_URI)
+            .ok_or_else(|| refused("it does not begin with data:image/png;base64,"))?;
+        let png = BASE64.decode(encoded.as_bytes()).map_err(|_| refused("it is not base64"))?;
+        Self::from_png(png, camera_px)
+    }
+
+    /// The number of its pixels.
+    pub fn pixels(&self) -> u64 {
+        pixels(self.size_px)
+    }
+
+    /// The most memory that decoding takes, in bytes: the file, its pixels of 8 bytes at most, and
+    /// those of the overlay.
+    pub fn decoding_bytes(&self) -> u64 {
+        self.png.len() as u64 + 12 * self.pixels()
+    }
+
+    /// The overlay.
+    ///
+    /// # Errors
+    /// [`AppearanceError::Overlay`].
+    pub fn decode(self) -> Result<Overlay, AppearanceError> {
+        let Self { size_px: [width_px, _], png } = self;
+        let reader = ImageReader::with_format(Cursor::new(&png[..]), ImageFormat::Png);
+        let decoded = reader.decode().map_err(|error| refused(&error.to_string()))?;
+        Ok(Overlay { width_px, rgba8: decoded.into_rgba8().into_raw(), png })
+    }
+}
+
+fn pixels([width_px, height_px]: [u32; 2]) -> u64 {
+    u64::from(width_px) * u64::from(height_px)
 }
 
 fn refused(reason: &str) -> AppearanceError {

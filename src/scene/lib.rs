@@ -13,6 +13,7 @@
 pub mod actor;
 pub mod align;
 pub mod appearance;
+pub mod boxes;
 pub mod chunk;
 pub mod gaussian;
 pub mod geo;

@@ -9,7 +9,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 use wildcity_options as options;
 use wildcity_options::strict;
 
-use super::appearance::{Appearance, AppearanceError, Overlay};
+use super::appearance::{Appearance, AppearanceError, Overlay, UnreadOverlay};
 use crate::geometry::camera::Shutter;
 use crate::geometry::camera::json::Intrinsics;
 use crate::geometry::{Camera, CameraError, Pose, PoseError};
@@ -258,8 +258,27 @@ pub struct RigFieldError {
 }
 
 impl Rig {
-    /// The rig of a request, checked. Stops at the first camera whose overlay exceeds the limit, so
-    /// that no more overlays are decompressed than a rig may have.
+    /// The rig of a request, checked.
+    ///
+    /// # Errors
+    /// Names the first part that is invalid.
+    pub fn from_request(rig: options::Rig) -> Result<Self, RigFieldError> {
+        UnreadRig::from_request(rig)?.decode()
+    }
+}
+
+/// A rig of a request that was checked, except for the pixels of its overlays. None of them has
+/// been decoded: a rig that is refused costs no more than its message.
+#[derive(Debug)]
+pub struct UnreadRig {
+    /// The rig without overlays.
+    rig: Rig,
+    /// The index of a camera, and its overlay.
+    overlays: Vec<(usize, UnreadOverlay)>,
+}
+
+impl UnreadRig {
+    /// Reads and checks a rig, without the pixels of its overlays.
     ///
     /// # Errors
     /// Names the first part that is invalid.
@@ -269,32 +288,60 @@ impl Rig {
             move |cause| RigFieldError { part, cause }
         };
         // Reads no camera of a rig that has too many; `check` refuses one that has none.
-        if rig.cameras.len() > Self::MAX_CAMERAS {
+        if rig.cameras.len() > Rig::MAX_CAMERAS {
             check_count(&rig.name, rig.cameras.len()).map_err(at("cameras"))?;
         }
         let mut cameras: Vec<RigCamera> = Vec::new();
+        let mut overlays: Vec<(usize, UnreadOverlay)> = Vec::new();
         for (index, fields) in rig.cameras.into_iter().enumerate() {
             let part = format!("cameras[{index}]");
-            let camera = RigCamera::from_request(&part, fields)?;
+            let (camera, overlay) = RigCamera::from_request(&part, fields)?;
             if cameras.iter().any(|other| other.name == camera.name) {
                 let cause = RigError::Duplicate { name: camera.name };
                 return Err(RigFieldError { part: format!("{part}.name"), cause });
             }
             cameras.push(camera);
-            check_overlays(&cameras).map_err(at(&format!("{part}.overlay")))?;
+            overlays.extend(overlay.map(|overlay| (index, overlay)));
+            let pixels = overlays.iter().map(|(_, overlay)| overlay.pixels()).sum();
+            check_overlay_pixels(pixels).map_err(at(&format!("{part}.overlay")))?;
         }
         if !is_name(&rig.name) {
             return Err(at("name")(RigError::Name { name: rig.name }));
         }
-        let rig = Self { name: rig.name, cameras };
+        let rig = Rig { name: rig.name, cameras };
         rig.check().map_err(at("cameras"))?;
+        Ok(Self { rig, overlays })
+    }
+
+    /// The most memory that decoding takes, in bytes.
+    pub fn decoding_bytes(&self) -> u64 {
+        self.overlays.iter().map(|(_, overlay)| overlay.decoding_bytes()).sum()
+    }
+
+    /// The rig with its overlays.
+    ///
+    /// # Errors
+    /// Names the first overlay that cannot be decoded.
+    pub fn decode(self) -> Result<Rig, RigFieldError> {
+        let Self { mut rig, overlays } = self;
+        for (index, overlay) in overlays {
+            let camera = &mut rig.cameras[index];
+            let decoded = overlay.decode().map_err(|cause| {
+                let cause = RigError::Appearance { name: camera.name.clone(), cause };
+                RigFieldError { part: format!("cameras[{index}].overlay"), cause }
+            })?;
+            camera.appearance.overlay = Some(Arc::new(decoded));
+        }
         Ok(rig)
     }
 }
 
 impl RigCamera {
-    /// A camera of a request, checked; `part` names it in errors.
-    fn from_request(part: &str, fields: options::RigCamera) -> Result<Self, RigFieldError> {
+    /// A camera of a request, checked, and its overlay; `part` names it in errors.
+    fn from_request(
+        part: &str,
+        fields: options::RigCamera,
+    ) -> Result<(Self, Option<UnreadOverlay>), RigFieldError> {
         let at = |end: &str, cause| RigFieldError { part: format!("{part}{end}"), cause };
         let name = fields.name.clone();
         if !is_name(&name) {
@@ -307,12 +354,14 @@ impl RigCamera {
         camera.check().map_err(refused)?;
         let shutter = fields.shutter.map(Shutter::from);
         shutter.as_ref().map_or(Ok(()), Shutter::check).map_err(refused)?;
-        // Decompressed after the check above, which bounds the size of the overlay by that of the
-        // image.
+        // After the check above, which bounds the size of the overlay by that of the image.
         let has_gain = fields.exposure.is_some_and(|exposure| exposure.gain.is_some());
         let size_px = [camera.width_px, camera.height_px];
-        let appearance = Appearance::new(fields.exposure, fields.overlay.as_deref(), size_px)
+        let uri = fields.overlay.as_deref();
+        let overlay = uri.map(|uri| UnreadOverlay::from_data_uri(uri, size_px)).transpose();
+        let (appearance, overlay) = Appearance::new(fields.exposure, None, size_px)
             .and_then(|appearance| appearance.check(size_px).map(|()| appearance))
+            .and_then(|appearance| Ok((appearance, overlay?)))
             .map_err(|cause| {
                 let field = match &cause {
                     // A gain stands for a matrix.
@@ -324,7 +373,7 @@ impl RigCamera {
                 };
                 at(&field, RigError::Appearance { name: name.clone(), cause })
             })?;
-        Ok(Self { name, camera, rig_from_camera, shutter, appearance })
+        Ok((Self { name, camera, rig_from_camera, shutter, appearance }, overlay))
     }
 }
 

@@ -9,6 +9,7 @@ use wildcity_push::QueueLimits;
 use wildcity_render::Backend;
 use wildcity_repair::Models;
 use wildcity_scene::ProfileOverrides;
+use wildcity_session::RecordLimits;
 use wildcity_twin::residency::default_memory_bytes;
 use wildcity_twin::store::DiskCacheSettings;
 
@@ -117,6 +118,8 @@ pub struct Limits {
     /// or pushes run.
     pub memory_release: Duration,
     pub spool: SpoolLimits,
+    /// Bytes of the records of episodes.
+    pub records: RecordLimits,
 }
 
 /// Limits of uploads. The constants in [`crate::limits`] are the defaults.
@@ -167,6 +170,10 @@ impl Default for Limits {
             resident_bytes: None,
             memory_release: limits::MEMORY_RELEASE,
             spool: SpoolLimits::default(),
+            records: RecordLimits {
+                bytes: limits::RECORDS_BYTES,
+                owner_bytes: limits::TOKEN_RECORDS_BYTES,
+            },
         }
     }
 }

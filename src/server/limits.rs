@@ -144,6 +144,16 @@ pub const READY_AGE: Duration = Duration::from_secs(1);
 /// Time between two observations that a watcher is sent; it misses those in between.
 pub const WATCH_PERIOD: Duration = Duration::from_millis(100);
 
+/// Bytes of all records. Notes of a megabyte a step would fill a disk at 10 MB/s: this is two hours
+/// of it, and 2000 hours of driving at 10 Hz.
+pub const RECORDS_BYTES: u64 = 64 << 30;
+
+/// Bytes of the records of one token.
+pub const TOKEN_RECORDS_BYTES: u64 = 32 << 30;
+
+/// Share of all sessions that a token without a limit of its own leaves to others: one in four.
+pub const SESSIONS_FOR_OTHERS: usize = 4;
+
 /// Recorded episodes that are listed over HTTP: each file is read for it.
 pub const LISTED_EPISODES: usize = 100;
 

@@ -6,7 +6,7 @@
 
 use std::net::IpAddr;
 
-use axum::http::{HeaderMap, Uri, header};
+use axum::http::{HeaderMap, HeaderValue, Uri, header};
 
 use crate::fault::Fault;
 
@@ -65,7 +65,16 @@ impl Origins {
     ) -> Result<(), Fault> {
         // Programs send none. Browsers send one with each request that may change something, or
         // whose answer a page can read.
-        let Some(origin) = headers.get(header::ORIGIN) else { return Ok(()) };
+        let Some(origin) = headers.get(header::ORIGIN) else {
+            // An image, a script or a frame in a page of another site comes without: the page
+            // cannot read the answer, but could make the server work for it.
+            return match headers.get("sec-fetch-site").map(HeaderValue::as_bytes) {
+                Some(b"cross-site") => {
+                    Err(Fault::ForbiddenOrigin { origin: "a page of another site".to_owned() })
+                }
+                _ => Ok(()),
+            };
+        };
         // An origin that is no text is neither local nor own, and is refused below.
         let text = origin.to_str().unwrap_or_default();
         let authority = text.split_once("://").map(|(_, authority)| authority);
@@ -118,7 +127,10 @@ fn without_own_port(origin: String) -> String {
 
 /// Whether an origin is a page served from this machine.
 pub(crate) fn is_local_origin(origin: &str) -> bool {
-    origin.split_once("://").is_some_and(|(_, authority)| is_local_authority(authority))
+    // Only the schemes of web pages: an application may register any other.
+    origin.split_once("://").is_some_and(|(scheme, authority)| {
+        ["http", "https"].contains(&scheme) && is_local_authority(authority)
+    })
 }
 
 /// Whether a host, with or without a port, is this machine.
@@ -150,6 +162,7 @@ mod tests {
         }
         for origin in [
             "null",
+            "evil://localhost",
             "http://example.org",
             // Names that only begin, contain or end like a local one, and users that look like a
             // host.
@@ -180,6 +193,21 @@ mod tests {
         ] {
             assert_eq!(is_served(origin, false), without_tokens, "{origin}");
             assert_eq!(is_served(origin, true), with_tokens, "{origin}");
+        }
+    }
+
+    #[test]
+    fn an_image_in_a_page_of_another_site_is_refused() {
+        let is_served = |site: &str| {
+            let headers =
+                HeaderMap::from_iter([("sec-fetch-site".parse().unwrap(), site.parse().unwrap())]);
+            [false, true]
+                .map(|tokens| Origins::default().check_page(&headers, tokens, None).is_ok())
+        };
+        assert_eq!(is_served("cross-site"), [false; 2]);
+        // An address that was typed, and pages of this machine.
+        for site in ["none", "same-origin", "same-site"] {
+            assert_eq!(is_served(site), [true; 2], "{site}");
         }
     }
 

@@ -14,6 +14,7 @@ use wildcity_twin::residency::Viewpoint;
 
 use crate::auth::{Grant, Role};
 use crate::fault::Fault;
+use crate::limits;
 use crate::watchers::{Newest, Watch};
 
 /// How long one attempt to take over a session waits before it notifies the old connection again.
@@ -175,11 +176,13 @@ impl SessionRegistry {
         if entries.len() >= self.limit {
             return Err(Fault::Busy { what: "sessions", limit: self.limit });
         }
-        // Counted only if the token has a limit; there are at most some hundred sessions.
-        let own = || entries.values().filter(|entry| entry.owner == grant.name).count();
-        if let Some(limit) = grant.limits.sessions
-            && own() >= limit
-        {
+        // There are at most some hundred sessions.
+        let own = entries.values().filter(|entry| entry.owner == grant.name).count();
+        // All clients of a server without tokens are one owner, and have all sessions.
+        let left_to_others =
+            if grant.name.is_empty() { 0 } else { self.limit / limits::SESSIONS_FOR_OTHERS };
+        let limit = grant.limits.sessions.unwrap_or(self.limit - left_to_others);
+        if own >= limit {
             return Err(Fault::Busy { what: "sessions of this token", limit });
         }
         let slot = Arc::new(AsyncMutex::new(SessionSlot::default()));

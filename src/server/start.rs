@@ -115,6 +115,8 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         mcap,
     })?;
 
+    engine.limit_records(limits.records);
+
     // The socket.
     let listen_error = |cause| ServerError::Listen { address: listen, cause };
     let listener = TcpListener::bind(listen).await.map_err(listen_error)?;

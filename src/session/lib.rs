@@ -67,6 +67,7 @@ pub use record::format::{
     EpisodeHeader, FrameRecord, FrameRequest, RecordedOrigin, RecordedOutputs, RecordedSettings,
     RecordedVersion, is_episode_name,
 };
+pub use record::quota::RecordLimits;
 pub use record::recorded_episode::RecordedEpisode;
 pub use record::repairs::{RecordedImageRepair, RecordedRepair};
 pub use record::replay_report::{

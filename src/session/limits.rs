@@ -72,6 +72,18 @@ pub const PLAN_STEPS: usize = 1_000;
 /// abandoned: on a GPU in software, or if a driver hangs.
 pub const LAST_FRAME_TIMEOUT: Duration = Duration::from_secs(10);
 
+/// Sub-steps of actors and the ego that a simulation takes without a turn: 0.1 s of 256 actors, or
+/// 25 s of an ego alone. They take about 10 ms.
+pub const SHORT_WORK: u64 = 2_570;
+
+/// Rigs whose overlays are decoded at once: each takes up to 200 MB while it is decoded, and a
+/// second of a processor.
+pub const OVERLAYS_AT_ONCE: usize = 2;
+
+/// Records that are read whole at once, for branches and results: each takes several times the size
+/// of the commands in it.
+pub const RECORDS_AT_ONCE: usize = 2;
+
 /// Longest plan, in microseconds: as long as the longest trajectory.
 pub const PLAN_US: i64 = wildcity_sim::limits::PATH_US;
 

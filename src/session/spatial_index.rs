@@ -9,6 +9,7 @@ use glam::DVec2;
 use wildcity_scene::chunk::{BLOCK_M, CELL_M};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::manifest::{ChunkEntry, Section};
+use wildcity_sim::DriveBoxes;
 use wildcity_twin::store::Version;
 
 use crate::observe::trust::RecordedPoses;
@@ -35,6 +36,7 @@ pub(crate) struct SpatialIndex {
     drives: HashMap<Block, Vec<[usize; 2]>>,
     /// `None` without a recorded drive.
     recorded: Option<Arc<RecordedPoses>>,
+    boxes: DriveBoxes,
 }
 
 impl SpatialIndex {
@@ -73,7 +75,8 @@ impl SpatialIndex {
             }
         }
         let recorded = RecordedPoses::new(manifest).map(Arc::new);
-        Self { version, sections, drives, recorded }
+        let boxes = DriveBoxes::new(&manifest.trajectories);
+        Self { version, sections, drives, recorded, boxes }
     }
 
     pub(crate) fn version(&self) -> &Arc<Version> {
@@ -102,6 +105,11 @@ impl SpatialIndex {
             let keyframes = &drives[*drive].keyframes;
             [keyframes[*key].world_from_rig, keyframes[*key + 1].world_from_rig]
         })
+    }
+
+    /// The boxes of the recorded drives, by which the ground is found.
+    pub(crate) fn boxes(&self) -> &DriveBoxes {
+        &self.boxes
     }
 
     /// The recorded poses; `None` without a recorded drive.

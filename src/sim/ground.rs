@@ -16,19 +16,55 @@ use crate::limits;
 use crate::map::LaneSurface;
 use crate::plane::Plane;
 use wildcity_scene::Trajectory;
+use wildcity_scene::boxes::{BoxTree, Extent};
 use wildcity_scene::geometry::Pose;
 
 /// The ground defined by recorded drives and lanes.
 #[derive(Clone, Copy, Debug)]
 pub struct Ground<'a> {
     drives: &'a [Trajectory],
+    /// The boxes of the drives; without them, every keyframe is tested.
+    boxes: Option<&'a DriveBoxes>,
     lanes: Option<&'a LaneSurface>,
+}
+
+/// Where the parts of recorded drives are: with it, placing a pose does not test every keyframe.
+#[derive(Clone, Debug, Default)]
+pub struct DriveBoxes(Vec<BoxTree>);
+
+impl DriveBoxes {
+    /// The boxes of the parts between the keyframes of drives.
+    pub fn new(drives: &[Trajectory]) -> Self {
+        Self(drives.iter().map(|drive| BoxTree::new(parts(drive).map(extent))).collect())
+    }
+
+    /// Bytes that they take.
+    pub fn bytes(&self) -> usize {
+        self.0.iter().map(BoxTree::bytes).sum()
+    }
+}
+
+/// Each keyframe with the one before it. The first is paired with itself, so that a drive of one
+/// keyframe counts as a point.
+fn parts(drive: &Trajectory) -> impl Iterator<Item = (&Pose, &Pose)> {
+    let poses = drive.keyframes.iter().map(|keyframe| &keyframe.world_from_rig);
+    let before = poses.clone().take(1).chain(poses.clone());
+    before.zip(poses)
+}
+
+fn extent((from, to): (&Pose, &Pose)) -> Extent {
+    Extent::from_line(from.position_m, to.position_m)
 }
 
 impl<'a> Ground<'a> {
     /// The ground of some recorded drives.
     pub fn from_drives(drives: &'a [Trajectory]) -> Self {
-        Self { drives, lanes: None }
+        Self { drives, boxes: None, lanes: None }
+    }
+
+    /// This ground, found by the boxes of its drives.
+    pub fn with_boxes(self, boxes: &'a DriveBoxes) -> Self {
+        Self { boxes: Some(boxes), ..self }
     }
 
     /// This ground, and that of lanes where no drive is near.
@@ -42,7 +78,8 @@ impl<'a> Ground<'a> {
     ///
     /// The plane is that of the nearest drive in 3D, so a bridge and the street below it are
     /// distinguished; of the nearest lane if no drive is that near. Between keyframes, and between
-    /// points of a lane, it is interpolated. Every keyframe is tested: 170,000 take a millisecond.
+    /// points of a lane, it is interpolated. Without boxes, every keyframe is tested: 170,000 take
+    /// a millisecond.
     pub fn place(&self, world_from_rig: Pose) -> Pose {
         self.find(world_from_rig).unwrap_or(world_from_rig)
     }
@@ -69,21 +106,29 @@ impl<'a> Ground<'a> {
     fn drives_plane(&self, point_m: DVec3) -> Option<Plane> {
         let mut nearest_m = limits::GROUND_NEAR_M;
         let mut under = None;
-        for drive in self.drives {
-            let poses = drive.keyframes.iter().map(|keyframe| &keyframe.world_from_rig);
-            // Each keyframe with the one before it. The first is paired with itself, so that a
-            // drive of one keyframe counts as a point.
-            let before = poses.clone().take(1).chain(poses.clone());
-            for (from, to) in before.zip(poses) {
-                let way_m = to.position_m - from.position_m;
-                let t = (point_m - from.position_m).dot(way_m) / way_m.length_squared().max(1e-12);
-                let t = t.clamp(0.0, 1.0);
-                let distance_m = (from.position_m + t * way_m).distance(point_m);
-                if distance_m < nearest_m {
-                    nearest_m = distance_m;
-                    under = Some((from, to, t));
-                }
+        let mut test = |(from, to): (&'a Pose, &'a Pose)| {
+            let way_m = to.position_m - from.position_m;
+            let t = (point_m - from.position_m).dot(way_m) / way_m.length_squared().max(1e-12);
+            let t = t.clamp(0.0, 1.0);
+            let distance_m = (from.position_m + t * way_m).distance(point_m);
+            if distance_m < nearest_m {
+                nearest_m = distance_m;
+                under = Some((from, to, t));
             }
+            nearest_m
+        };
+        let away_m = |extent: &Extent| extent.away_m(point_m).length();
+        let mut bound_m = limits::GROUND_NEAR_M;
+        for (index, drive) in self.drives.iter().enumerate() {
+            let Some(boxes) = self.boxes.and_then(|boxes| boxes.0.get(index)) else {
+                parts(drive).for_each(|part| bound_m = test(part));
+                continue;
+            };
+            let pose = |at: usize| &drive.keyframes[at].world_from_rig;
+            boxes.visit(0..drive.keyframes.len(), bound_m, &away_m, &mut |at| {
+                bound_m = test((pose(at.saturating_sub(1)), pose(at)));
+                bound_m
+            });
         }
         // Only the winner is interpolated, because a rotation costs more than a distance.
         let (from, to, t) = under?;

@@ -15,4 +15,4 @@ pub mod scenario;
 pub mod traffic;
 
 pub use ego::{Command, Dynamics, DynamicsModel, Ego, EgoError};
-pub use ground::Ground;
+pub use ground::{DriveBoxes, Ground};

@@ -69,11 +69,20 @@ pub const LEAD_GAPS: f64 = 4.0;
 /// Least and largest distance within which an IDM actor looks for a lead, in metres.
 pub const LEAD_M: [f64; 2] = [20.0, 400.0];
 
-/// Largest scenario file, in bytes: as large as a message on the wire.
+/// Largest scenario file, in bytes: as large as a message on the wire. With the values of its sweep
+/// in place it is no larger.
 pub const SCENARIO_BYTES: usize = 1 << 20;
+
+/// Most objects of a scenario with the values of its sweep: 256 actors with 64 triggers, each with
+/// a condition and an action, are 49,408. An object takes up to a kilobyte once it has its types,
+/// so that the smallest objects, of three bytes, would take 350 MB without this limit.
+pub const SCENARIO_OBJECTS: usize = 1 << 16;
 
 /// Largest tracks or map file, in bytes.
 pub const MAP_BYTES: usize = 256 << 20;
+
+/// Most names of a sweep: each is in every one of its combinations.
+pub const SWEEP_NAMES: usize = 64;
 
 /// Most combinations of a sweep.
 pub const SWEEP_CASES: u64 = 100_000;

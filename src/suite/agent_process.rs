@@ -11,6 +11,7 @@ use wildcity_episode::EpisodeFile;
 
 use crate::case::Case;
 use crate::limits;
+use crate::process_group::ProcessGroup;
 use crate::stderr::Tail;
 use crate::technical::Technical;
 
@@ -54,11 +55,11 @@ pub(crate) async fn drive(
     case: &Case,
     record: &Path,
 ) -> Result<(), NotDriven> {
-    let mut running = Running(start(process, case).map_err(|error| {
+    let mut running = start(process, case).map_err(|error| {
         Technical::new("agent_lost", format!("the shell cannot be started: {error}"))
-    })?);
-    let tail = Tail::new(running.0.stderr.take());
-    let status = wait(&mut running.0, process.timeout).await;
+    })?;
+    let tail = Tail::new(running.leader.stderr.take());
+    let status = wait(&mut running.leader, process.timeout).await;
     // Killed before its text is awaited: a process that hangs would keep the stream open.
     drop(running);
     let stderr = tail.text().await;
@@ -104,19 +105,9 @@ fn interpret_exit(
     Some(Err(Technical::new(kind, message)))
 }
 
-/// A process that is killed when this is dropped, since the run may end early.
-struct Running(Child);
-
-impl Drop for Running {
-    fn drop(&mut self) {
-        // The process may have ended already; then these calls fail.
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
-fn start(process: &AgentProcess<'_>, case: &Case) -> std::io::Result<Child> {
-    Command::new("sh")
+fn start(process: &AgentProcess<'_>, case: &Case) -> std::io::Result<ProcessGroup> {
+    let mut shell = Command::new("sh");
+    shell
         .arg("-c")
         .arg(process.command)
         .env("WILDCITY_URL", process.url)
@@ -129,8 +120,8 @@ fn start(process: &AgentProcess<'_>, case: &Case) -> std::io::Result<Child> {
         // that of the run.
         .stdin(Stdio::null())
         .stdout(Stdio::null())
-        .stderr(Stdio::piped())
-        .spawn()
+        .stderr(Stdio::piped());
+    ProcessGroup::start(&mut shell)
 }
 
 /// The fields of the request `open` that the scenario gives.

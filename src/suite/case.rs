@@ -5,7 +5,6 @@ use std::path::Path;
 use std::sync::Arc;
 
 use serde::Deserialize as _;
-use serde_json::Value;
 
 use wildcity_episode::{DriveStart, ScenarioLine, scenario_line};
 use wildcity_scene::Trajectory;
@@ -14,7 +13,7 @@ use wildcity_session::options::{Encoding, ImagePart, Open, Outputs, ScenarioChoi
 use wildcity_session::{
     LoadedScenario, Scenarios, StoredAssets, limits as session, scenario_start,
 };
-use wildcity_sim::scenario::{Case as Seeded, FileError, Scenario, ScenarioFile};
+use wildcity_sim::scenario::{Case as Seeded, FileError, Scenario, ScenarioFile, Values};
 use wildcity_twin::store::{Catalog, Version};
 
 use crate::cameras;
@@ -32,7 +31,7 @@ pub struct Case {
     pub scenario: String,
     pub seed: u64,
     /// The values of the sweep.
-    pub values: BTreeMap<String, Value>,
+    pub values: Values,
     /// The scenario, resolved.
     pub resolved: Arc<Scenario>,
     /// The line that heads its record.
@@ -74,10 +73,10 @@ pub fn cases(
     let mut versions = Versions { catalog, latest: options.latest, opened: BTreeMap::new() };
     let mut cases = Vec::new();
     for scenario in scenarios {
-        let mut combinations: Vec<BTreeMap<String, Value>> = Vec::new();
+        let mut combinations: Vec<Values> = Vec::new();
         for case in seeded(suite, scenario) {
             // Seeds vary fastest, so that the present combination is the last one of the list.
-            if !combinations.contains(&case.values) {
+            if combinations.last() != Some(&case.values) {
                 combinations.push(case.values.clone());
             }
             let file = chosen(scenario, &case.values, options.bare)?;
@@ -111,7 +110,7 @@ pub fn cases(
 /// A scenario with the values of its sweep; with `bare`, without its actors.
 fn chosen(
     scenario: &SuiteScenario,
-    values: &BTreeMap<String, Value>,
+    values: &Values,
     bare: bool,
 ) -> Result<ScenarioFile, SuiteError> {
     let wrong = |cause| SuiteError::File { path: scenario.path.clone(), cause };

@@ -9,6 +9,7 @@ use serde_json::Value;
 use wildcity_episode::{EpisodeFile, FaultLine, ScoreLine, mcap_path};
 use wildcity_score::{NO_MAP, own};
 use wildcity_session::Engine;
+use wildcity_sim::scenario::written_values;
 
 use crate::case::Case;
 use crate::file::OFF_MODEL;
@@ -105,7 +106,7 @@ impl EpisodeEntry {
             name: case.name.clone(),
             scenario: case.scenario.clone(),
             seed: case.seed,
-            values: case.values.clone(),
+            values: written_values(&case.values),
             scenario_hash: case.line.hash.clone(),
             version_hash: case.version_hash.clone(),
             status: Status::Technical,

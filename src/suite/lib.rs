@@ -38,6 +38,7 @@ pub mod limits;
 mod page;
 mod picture;
 mod plot;
+mod process_group;
 mod result;
 mod run;
 mod stderr;

@@ -19,6 +19,7 @@ mod appearance;
 mod bad_requests;
 mod branches;
 mod bundles;
+mod costs;
 mod damaged_twin;
 mod drives;
 mod ego;

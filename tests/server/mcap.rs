@@ -4,11 +4,8 @@
 use std::io::Write as _;
 use std::path::Path;
 use std::process::Command;
-use std::sync::mpsc::{Receiver, channel};
-use std::thread::sleep;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, SystemTime};
 
-use rustix::fs::{Mode, OFlags};
 use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
@@ -124,40 +121,21 @@ async fn what_was_cut_has_no_mcap_file_until_it_is_exported_by_hand() {
     assert_eq!((cut, cut), (exported.messages, whole));
 }
 
-/// Ends the reading of a pipe: gives a line to the first reader when it is notified, after
-/// [`TEST_TIMEOUT`], or when the sender is dropped. Then renames a file to the path of the pipe.
-/// Returns whether it was notified.
-///
-/// Readers of the pipe continue in any case, so that a failing test also ends.
-fn release(pipe: &Path, file: &Path, told: &Receiver<()>) -> bool {
-    let is_told = told.recv_timeout(TEST_TIMEOUT).is_ok();
-    let begun = Instant::now();
-    let flags = OFlags::WRONLY | OFlags::NONBLOCK;
-    let write = loop {
-        // A pipe without a reader cannot be opened so.
-        match rustix::fs::open(pipe, flags, Mode::empty()) {
-            Ok(pipe) => break std::fs::File::from(pipe).write_all(b"no record\n"),
-            Err(_) if begun.elapsed() < TEST_TIMEOUT => sleep(Duration::from_millis(5)),
-            Err(error) => break Err(error.into()),
-        }
-    };
-    std::fs::rename(file, pipe).unwrap();
-    is_told && write.is_ok()
-}
-
-/// The export of `a-1` blocks, since a pipe that nothing writes to has the name of its record; the
-/// session goes on writing the record itself.
+/// The export of `a-1` takes long, since its record has 40,000 frames more than were driven.
 #[tokio::test]
 async fn no_request_waits_for_an_export() {
     let server = TestServer::start().await;
     let mut first = server.driver("a").await;
     first.step(1.0).await;
-    let pipe = server.episodes.path().join("a-1.jsonl");
-    let record = server.twins.path().join("a-1.jsonl");
-    std::fs::rename(&pipe, &record).unwrap();
-    assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    let record = server.episodes.path().join("a-1.jsonl");
+    let text = std::fs::read_to_string(&record).unwrap();
+    let frame = format!("{}\n", text.lines().last().unwrap());
+    // The server appends to the same file.
+    let mut file = std::fs::OpenOptions::new().append(true).open(&record).unwrap();
+    file.write_all(frame.repeat(40_000).as_bytes()).unwrap();
     let driven = async {
         first.step(2.0).await;
+        // Its answer has the result of the whole record.
         first.ask(json!({ "type": "close" })).await;
         let mut agent = server.driver("b").await;
         agent.step(1.0).await;
@@ -165,23 +143,32 @@ async fn no_request_waits_for_an_export() {
         agent.step(1.0).await;
         agent.ask(json!({ "type": "close" })).await;
     };
-    let (tell, told) = channel();
-    let pipe_of_thread = pipe.clone();
-    let releasing = std::thread::spawn(move || release(&pipe_of_thread, &record, &told));
-    timeout(TEST_TIMEOUT / 2, driven).await.expect("requests are answered");
-    assert!(!releasing.is_finished(), "the requests waited until the pipe was read");
-    assert_eq!(names(server.episodes.path()), ["a-1.jsonl", "b-1.jsonl", "b-2.jsonl"]);
+    timeout(TEST_TIMEOUT, driven).await.expect("requests are answered");
+    let exported = |name: &String| name.ends_with(".mcap");
+    let found = names(server.episodes.path());
+    assert!(!found.iter().any(exported), "the requests waited: {found:?}");
     let text = std::fs::read_to_string(server.episodes.path().join("b-2.jsonl")).unwrap();
     assert!(text.lines().last().unwrap().contains("\"outcome\":\"completed\""), "{text}");
-
-    // The line from the pipe is not a record: this export fails, and the others follow.
-    tell.send(()).unwrap();
+    // The others follow.
     let (status, _, _) = get(&server, "/v1/episodes/b-2/mcap").await;
     assert_eq!(status, 200);
-    assert!(releasing.join().unwrap(), "nothing read the pipe");
-    assert!(refused(&server, "/v1/episodes/a-1/mcap").await.contains("no header"));
     let entry = listed(&server, "a-1").await;
     assert_eq!((&entry["outcome"], &entry["steps"]), (&"completed".into(), &2.into()), "{entry}");
+}
+
+/// A pipe in place of a record is no record: its export fails at once, and the others follow.
+#[tokio::test]
+async fn a_pipe_in_place_of_a_record_stops_no_export() {
+    let server = TestServer::start().await;
+    let mut first = server.driver("a").await;
+    first.step(1.0).await;
+    let pipe = server.episodes.path().join("a-1.jsonl");
+    std::fs::remove_file(&pipe).unwrap();
+    assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    first.ask(json!({ "type": "close" })).await;
+    drive(&server, "b").await;
+    let (status, _, _) = get(&server, "/v1/episodes/b-1/mcap").await;
+    assert_eq!(status, 200);
 }
 
 #[tokio::test]

@@ -2,10 +2,11 @@
 //! is set.
 
 use std::env;
+use std::time::{Duration, Instant};
 
 use serde_json::Value;
 use wildcity_client::{Client, Open, Pose};
-use wildcity_suite::{AgentChoice, Ending, ExitCode, Status, SuiteError, junit, page};
+use wildcity_suite::{AgentChoice, Ending, ExitCode, RunSettings, Status, SuiteError, junit, page};
 
 use crate::street::Bench;
 
@@ -134,4 +135,77 @@ async fn a_command_that_is_not_there_ends_the_run_at_once() {
     let cases = bench.cases(&bench.path("rails.json")).unwrap();
     let result = wildcity_suite::run(bench.settings(agent, 1, "late"), cases).await.unwrap();
     assert_eq!(result.episodes[0].errors[0].kind, "agent_error");
+}
+
+/// Whether a process runs: one that was killed may still be waited for.
+fn runs(pid: &str) -> bool {
+    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
+    let state = stat.rsplit_once(") ").and_then(|(_, rest)| rest.chars().next());
+    state.is_some_and(|state| state != 'Z')
+}
+
+/// Waits until the processes have ended whose ids are the lines of a file.
+fn assert_ended(pids: &std::path::Path) {
+    let text = std::fs::read_to_string(pids).unwrap();
+    assert!(text.lines().count() > 0, "the agent has not started");
+    let end = Instant::now() + Duration::from_secs(20);
+    while text.lines().any(runs) {
+        assert!(Instant::now() < end, "{text} still run");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+/// An agent that starts a process of its own, and hangs.
+fn hanging(pids: &std::path::Path) -> AgentChoice {
+    let line = format!("sleep 1000 & echo $! >> {0}; echo $$ >> {0}; wait", pids.display());
+    AgentChoice::Command { name: "hangs".to_owned(), line }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_agent_that_hangs_ends_with_all_that_it_has_started() {
+    let bench = Bench::new();
+    bench.suite();
+    let cases = bench.cases(&bench.path("rails.json")).unwrap();
+    let pids = bench.path("pids");
+    let settings = RunSettings {
+        agent_timeout: Duration::from_secs(1),
+        retries: 0,
+        ..bench.settings(hanging(&pids), 1, "hangs")
+    };
+    let result = wildcity_suite::run(settings, cases).await.unwrap();
+    assert_eq!(result.counts.technical, 1, "{}", result.to_json());
+    assert_ended(&pids);
+}
+
+/// Not a test: a suite whose agent hangs, if the test below has started this binary.
+#[tokio::test(flavor = "multi_thread")]
+async fn the_suite_that_is_killed() {
+    let Ok(pids) = env::var("SUITE_PIDS") else { return };
+    let bench = Bench::new();
+    bench.suite();
+    let cases = bench.cases(&bench.path("rails.json")).unwrap();
+    let settings = bench.settings(hanging(std::path::Path::new(&pids)), 1, "hangs");
+    let _ = wildcity_suite::run(settings, cases).await;
+}
+
+#[test]
+fn an_agent_ends_when_its_suite_is_killed() {
+    let dir = tempfile::tempdir().unwrap();
+    let pids = dir.path().join("pids");
+    let mut suite = std::process::Command::new(env::current_exe().unwrap())
+        .args(["dial_in::the_suite_that_is_killed", "--exact", "--nocapture"])
+        .env("SUITE_PIDS", &pids)
+        .stdout(std::process::Stdio::null())
+        .stderr(std::process::Stdio::null())
+        .spawn()
+        .unwrap();
+    let end = Instant::now() + Duration::from_secs(60);
+    let started = || std::fs::read_to_string(&pids).is_ok_and(|text| text.lines().count() == 2);
+    while !started() {
+        assert!(Instant::now() < end, "the agent does not start");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    suite.kill().unwrap();
+    suite.wait().unwrap();
+    assert_ended(&pids);
 }

@@ -30,7 +30,7 @@ fn a_sweep_makes_a_case_of_each_combination() {
     let cases = bench.cases(&bench.write("swept.json", &swept)).unwrap();
     let names: Vec<&str> = cases.iter().map(|case| case.name.as_str()).collect();
     assert_eq!(names, ["swept-0-0", "swept-0-1", "swept-1-0", "swept-1-1"]);
-    assert_eq!(cases[2].values["v"], 10.0);
+    assert_eq!(*cases[2].values["v"], 10.0);
     assert_eq!(cases[2].resolved.dynamics.unwrap().speed_m_s, 10.0);
 }
 

@@ -310,10 +310,19 @@ pub(crate) fn client_limits() -> Option<WebSocketConfig> {
 
 impl Agent {
     pub(crate) async fn connect(address: SocketAddr) -> Self {
+        Self::connect_as(address, None).await
+    }
+
+    /// Connects with a token.
+    pub(crate) async fn connect_as(address: SocketAddr, token: Option<&str>) -> Self {
         let mut request =
             format!("ws://{address}/v1/session").into_client_request().expect("a request");
         let subprotocol = "wildcity.v1".parse().expect("a header");
         request.headers_mut().insert("Sec-WebSocket-Protocol", subprotocol);
+        if let Some(token) = token {
+            let bearer = format!("Bearer {token}").parse().expect("a header");
+            request.headers_mut().insert("Authorization", bearer);
+        }
         let limits = client_limits();
         let connected = tokio_tungstenite::connect_async_with_config(request, limits, true).await;
         Self { socket: connected.expect("a connection").0, seq: 0 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import random
 import sys
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ import pytest
 from logs_truth import refused, run
 from safetensors.numpy import load_file
 from scipy.spatial.transform import Rotation, Slerp
-from wildcity.logs import KINDS, LogError, convert, tableio, tables
+from wildcity.logs import KINDS, LogError, convert, nurec, tableio, tables
 from wildcity.logs.earth import earth_centred, geodetic
 from wildcity.logs.frames import Poses, inverse, quaternion, rotation, rotation_error, transform
 from wildcity.logs.lenses import Intrinsics, camera, fisheye, lens_of, opencv
@@ -273,3 +274,15 @@ def test_a_source_of_several_kinds_needs_the_kind(tmp_path: Path) -> None:
     (data / "x.db").write_bytes(b"")
     assert "it looks like several kinds: " in refused(tmp_path, data)
     assert len({kind.name for kind in KINDS}) == len(KINDS)
+
+
+def test_brackets_within_brackets_are_a_damaged_file(tmp_path: Path) -> None:
+    deep = tmp_path / "deep.json"
+    deep.write_text("[" * 100_000)
+    with pytest.raises(LogError, match="not JSON"):
+        tableio.json_file(deep, "a table")
+    archive = tmp_path / "deep.zip"
+    with zipfile.ZipFile(archive, "w") as file:
+        file.writestr("rig_trajectories.json", "[" * 100_000)
+    with pytest.raises(LogError, match="cannot read"):
+        nurec._json(archive, "rig_trajectories.json")

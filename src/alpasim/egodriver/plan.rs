@@ -2,6 +2,7 @@
 
 use wildcity_client::{Pose as WirePose, TimedPose};
 use wildcity_scene::geometry::Pose;
+use wildcity_sim::limits::PATH_US;
 
 use super::driver::DriverError;
 use crate::limits;
@@ -36,6 +37,11 @@ pub(super) fn trajectory(
         let in_rig = rig_from_world * pose;
         // Not negative, because the filter keeps later poses only.
         let time_us = i64::try_from(last_us - now_us).unwrap_or(i64::MAX);
+        // The server accepts no later pose, and only the step until the next plan is driven.
+        if time_us > PATH_US && planned.last().is_some_and(|last: &TimedPose| last.time_us >= dt_us)
+        {
+            break;
+        }
         let pose = WirePose { xyz: in_rig.position_m.to_array(), q: in_rig.q_wxyz() };
         planned.push(TimedPose { time_us, pose });
         // What is beyond is not driven before the next plan. It is not checked either.

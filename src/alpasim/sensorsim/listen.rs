@@ -10,12 +10,13 @@ use hyper::server::conn::http2;
 use hyper::service::service_fn;
 use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use tokio::net::TcpListener;
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
 use wildcity_session::Engine;
 
 use super::methods::{Sensorsim, stopped};
+use crate::door::{Connection, Door};
 use crate::grpc::{unary, unimplemented};
 use crate::limits;
 use crate::wire::common::Empty;
@@ -48,8 +49,7 @@ pub struct Running {
     address: SocketAddr,
     stop: watch::Sender<bool>,
     listening: JoinHandle<()>,
-    /// One permit per connection.
-    permits: Arc<Semaphore>,
+    door: Arc<Door>,
 }
 
 /// Starts the service within the running tokio runtime, and returns once it listens.
@@ -70,18 +70,18 @@ pub async fn start(
     let address = listener.local_addr().map_err(failed)?;
     let (stop, stopping) = watch::channel(false);
     let sensorsim = Arc::new(Sensorsim::new(engine, stopping.clone()));
-    let permits = Arc::new(Semaphore::new(limits::CONNECTIONS));
-    let free = permits.clone();
+    let door = Door::new(limits::CONNECTIONS);
+    let entered = door.clone();
     let listening = tokio::spawn(async move {
         // All three run until the first ends, which is the stop: the other two never return. The
         // listener is closed as `accept` is dropped.
         tokio::select! {
-            () = accept(sensorsim.clone(), listener, free, stopping.clone()) => {}
+            () = accept(sensorsim.clone(), listener, entered, stopping.clone()) => {}
             () = sensorsim.forget_idle() => {}
             () = stopped(stopping.clone()) => {}
         }
     });
-    Ok(Running { address, stop, listening, permits })
+    Ok(Running { address, stop, listening, door })
 }
 
 impl Running {
@@ -97,9 +97,8 @@ impl Running {
         if let Err(error) = self.listening.await {
             tracing::error!("the AlpaSim listener crashed: {error}");
         }
-        // All permits are free when all connections have ended, and so have sent their answers.
-        let all = self.permits.acquire_many(limits::CONNECTIONS as u32);
-        if tokio::time::timeout(limits::DRAIN, all).await.is_err() {
+        // All connections that have ended have sent their answers.
+        if tokio::time::timeout(limits::DRAIN, self.door.emptied()).await.is_err() {
             tracing::warn!("some AlpaSim clients did not leave within {:?}", limits::DRAIN);
         }
     }
@@ -108,11 +107,10 @@ impl Running {
 async fn accept(
     sensorsim: Arc<Sensorsim>,
     listener: TcpListener,
-    permits: Arc<Semaphore>,
+    door: Arc<Door>,
     stopping: watch::Receiver<bool>,
 ) {
-    // The semaphore is never closed.
-    while let Ok(permit) = permits.clone().acquire_owned().await {
+    loop {
         let stream = match listener.accept().await {
             Ok((stream, _)) => stream,
             Err(error) => {
@@ -122,6 +120,9 @@ async fn accept(
                 continue;
             }
         };
+        // After accepting: a connection that has no place is refused, and does not stay in the
+        // kernel's queue.
+        let Some(place) = door.admit() else { continue };
         if let Err(error) = stream.set_nodelay(true) {
             tracing::warn!("cannot set socket options: {error}");
         }
@@ -130,32 +131,39 @@ async fn accept(
         tokio::spawn(async move {
             // A closure for each connection, and a clone for each request: requests of one
             // connection run at once.
+            let own = place.connection.clone();
             let service = service_fn(move |request| {
                 let sensorsim = sensorsim.clone();
-                async move { Ok::<_, Infallible>(call(sensorsim, request).await) }
+                let own = own.clone();
+                async move { Ok::<_, Infallible>(call(sensorsim, &own, request).await) }
             });
             let connection = http2::Builder::new(TokioExecutor::new())
                 .timer(TokioTimer::new())
-                // Images of a request have megabytes; the default window of 64 KiB would stop at
-                // each part.
-                .initial_stream_window_size(8 << 20)
-                .initial_connection_window_size(16 << 20)
+                // The default window of 64 KiB would stop at each part of a large batch. What is
+                // in the windows is not counted yet.
+                .initial_stream_window_size(1 << 20)
+                .initial_connection_window_size(2 << 20)
                 .max_concurrent_streams(64)
+                .max_header_list_size(16 << 10)
+                // A peer that is gone without a word.
+                .keep_alive_interval(Some(Duration::from_secs(30)))
+                .keep_alive_timeout(Duration::from_secs(30))
                 .serve_connection(TokioIo::new(stream), service);
             tokio::pin!(connection);
             tokio::select! {
                 // Errors are caused by the client, which disconnected or sent no HTTP/2, and are
                 // not logged.
                 _ = &mut connection => {}
+                () = place.connection.to_close() => {}
                 () = stopped(stopping) => {
                     // Running requests see the same signal, and are answered.
                     connection.as_mut().graceful_shutdown();
                     let _ = tokio::time::timeout(limits::DRAIN, connection).await;
                 }
             }
-            // The permit ends with the connection, and not with the last request: `stop` waits for
+            // The place ends with the connection, and not with the last request: `stop` waits for
             // it.
-            drop(permit);
+            drop(place);
         });
     }
 }
@@ -163,41 +171,48 @@ async fn accept(
 /// Calls the method that the path names.
 async fn call(
     sensorsim: Arc<Sensorsim>,
+    own: &Arc<Connection>,
     request: http::Request<hyper::body::Incoming>,
 ) -> http::Response<tonic::body::Body> {
     // HTTP/2 names a method by `/package.Service/method`.
     let path = request.uri().path().to_owned();
     if let Some(method) = path.strip_prefix(PHYSICS) {
-        return call_physics(&sensorsim, method, &path, request).await;
+        return call_physics(&sensorsim, own, method, &path, request).await;
     }
     match path.strip_prefix(SERVICE) {
-        Some("get_version") => unary(request, |_: Empty| async { sensorsim.get_version() }).await,
+        Some("get_version") => {
+            unary(own, request, |_: Empty| async { sensorsim.get_version() }).await
+        }
         Some("get_available_scenes") => {
-            unary(request, |_: Empty| async { sensorsim.get_available_scenes().await }).await
+            unary(own, request, |_: Empty| async { sensorsim.get_available_scenes().await }).await
         }
         Some("get_loaded_scenes") => {
-            unary(request, |_: Empty| async { sensorsim.get_loaded_scenes().await }).await
+            unary(own, request, |_: Empty| async { sensorsim.get_loaded_scenes().await }).await
         }
         Some("get_available_cameras") => {
-            unary(request, |asked| async { sensorsim.get_available_cameras(asked).await }).await
+            unary(own, request, |asked| async { sensorsim.get_available_cameras(asked).await })
+                .await
         }
         Some("get_available_trajectories") => {
-            unary(request, |asked| async { sensorsim.get_available_trajectories(asked).await })
+            unary(own, request, |asked| async { sensorsim.get_available_trajectories(asked).await })
                 .await
         }
         Some("get_available_ego_masks") => {
-            unary(request, |_: Empty| async { sensorsim.get_available_ego_masks().await }).await
+            unary(own, request, |_: Empty| async { sensorsim.get_available_ego_masks().await })
+                .await
         }
         Some("render_rgb") => {
-            unary(request, |asked| async { sensorsim.render_rgb(asked).await }).await
+            unary(own, request, |asked| async { sensorsim.render_rgb(asked).await }).await
         }
         Some("batch_render_rgb") => {
-            unary(request, |asked| async { sensorsim.batch_render_rgb(asked).await }).await
+            unary(own, request, |asked| async { sensorsim.batch_render_rgb(asked).await }).await
         }
         Some("render_aggregated") => {
-            unary(request, |asked| async { sensorsim.render_aggregated(asked).await }).await
+            unary(own, request, |asked| async { sensorsim.render_aggregated(asked).await }).await
         }
-        Some("render_lidar") => unary(request, |_: Empty| async { sensorsim.render_lidar() }).await,
+        Some("render_lidar") => {
+            unary(own, request, |_: Empty| async { sensorsim.render_lidar() }).await
+        }
         _ => unimplemented(&path),
     }
 }
@@ -205,17 +220,18 @@ async fn call(
 /// Calls a method of AlpaSim's physics. Its scenes and its version are those of the renderer.
 async fn call_physics(
     sensorsim: &Sensorsim,
+    own: &Arc<Connection>,
     method: &str,
     path: &str,
     request: http::Request<hyper::body::Incoming>,
 ) -> http::Response<tonic::body::Body> {
     match method {
-        "get_version" => unary(request, |_: Empty| async { sensorsim.get_version() }).await,
+        "get_version" => unary(own, request, |_: Empty| async { sensorsim.get_version() }).await,
         "get_available_scenes" => {
-            unary(request, |_: Empty| async { sensorsim.get_available_scenes().await }).await
+            unary(own, request, |_: Empty| async { sensorsim.get_available_scenes().await }).await
         }
         "ground_intersection" => {
-            unary(request, |asked| async { sensorsim.ground_intersection(asked).await }).await
+            unary(own, request, |asked| async { sensorsim.ground_intersection(asked).await }).await
         }
         _ => unimplemented(path),
     }

@@ -231,6 +231,7 @@ impl Sensorsim {
             let text = format!("{} images; at most {most} are accepted", requests.len());
             return Err(Status::invalid_argument(text));
         }
+        check_raw(requests)?;
         let Self { engine, open, assets, .. } = self;
         let renderer = Renderer { engine, open, assets };
         self.unless_stopped(renderer.images(requests)).await
@@ -243,6 +244,22 @@ impl Sensorsim {
             () = stopped(self.stopping.clone()) => Err(SensorsimError::Stopping.into()),
         }
     }
+}
+
+/// Refuses raw images that no answer can hold, before any of them is rendered.
+fn check_raw(requests: &[&wire::RgbRenderRequest]) -> Result<(), SensorsimError> {
+    let raw =
+        requests.iter().filter(|asked| asked.image_format() == wire::ImageFormat::RgbUint8Planar);
+    let each = raw.map(|asked| 3 * u64::from(asked.resolution_h) * u64::from(asked.resolution_w));
+    let bytes = each.fold(0, u64::saturating_add);
+    let most = limits::MESSAGE_BYTES as u64;
+    if bytes < most {
+        return Ok(());
+    }
+    Err(SensorsimError::Invalid(format!(
+        "the raw images have {bytes} bytes; an answer has less than {most}: ask for PNG or JPEG, or \
+         for fewer images at once"
+    )))
 }
 
 /// Returns when the service stops.

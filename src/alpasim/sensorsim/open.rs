@@ -58,6 +58,12 @@ impl OpenVersions {
         let mut scenes = known.as_ref().map(|version| version.scenes.clone()).unwrap_or_default();
         // The scenes of the version outlive a change of its reservation.
         scenes.insert(scene.to_owned(), Instant::now());
+        if scenes.len() > limits::DRAWN_SCENES {
+            // The list is for display: the one that was drawn first is left out.
+            let first = scenes.iter().min_by_key(|(_, drawn)| **drawn);
+            let oldest = first.map(|(scene, _)| scene.clone());
+            oldest.and_then(|scene| scenes.remove(&scene));
+        }
         let stills = match known {
             Some(version) if enough => version.stills,
             // The smaller reservation is dropped first, so that its memory counts as free.

@@ -8,7 +8,7 @@ use wildcity_scene::appearance::Appearance;
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::rig::RigCamera;
 use wildcity_scene::{Manifest, Rig};
-use wildcity_session::{Engine, ImageEncoding, Still};
+use wildcity_session::{Engine, ImageEncoding, SessionError, Still};
 use wildcity_twin::residency::Resident;
 
 use super::objects::{Object, ObjectAssets};
@@ -159,14 +159,20 @@ impl Renderer<'_> {
             Ok(opened) => opened,
             Err(error) => return repeated(&error, requests.len()).collect(),
         };
+        // Off the threads that answer: an overlay is scaled for each image.
+        let asked: Vec<_> = requests.iter().map(|request| (*request).clone()).collect();
+        let read = tokio::task::spawn_blocking(move || {
+            let still = |asked| Ok((opened.still(asked)?, opened.objects(asked)?));
+            let read: Vec<Result<_, SensorsimError>> = asked.iter().map(still).collect();
+            (opened, read)
+        });
+        let Ok((opened, read)) = read.await else {
+            return repeated(&SessionError::Crashed.into(), requests.len()).collect();
+        };
         let mut images: Vec<Option<Image>> = requests.iter().map(|_| None).collect();
         let mut groups: Vec<Group> = Vec::new();
-        for (index, request) in requests.iter().enumerate() {
+        for (index, read) in read.into_iter().enumerate() {
             // An invalid request fills its own place, and the others are rendered.
-            let read = opened.still(request).and_then(|still| {
-                let objects = opened.objects(request)?;
-                Ok((still, objects))
-            });
             match read {
                 Err(error) => images[index] = Some(Err(error)),
                 Ok((still, objects)) => {

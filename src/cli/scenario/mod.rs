@@ -8,14 +8,14 @@ mod from_log;
 mod import;
 mod show;
 
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use anyhow::Context;
 use serde_json::Value;
 
 use wildcity_session::{ScenarioSource, Scenarios};
-use wildcity_sim::scenario::Document;
+use wildcity_sim::scenario::{Document, Values};
 use wildcity_twin::store::{Catalog, Version};
 
 /// Check scenarios, show one as an episode runs it, and import those of other formats.
@@ -98,8 +98,8 @@ fn find_version(
 }
 
 /// Values of a sweep: NAME=VALUE.
-fn given_values(given: &[(String, Value)]) -> BTreeMap<String, Value> {
-    given.iter().cloned().collect()
+fn given_values(given: &[(String, Value)]) -> Values {
+    given.iter().map(|(name, value)| (name.clone(), Arc::new(value.clone()))).collect()
 }
 
 /// NAME=VALUE, where the value is JSON, or else a text.

@@ -5,6 +5,7 @@ use std::time::Duration;
 use clap::builder::RangedU64ValueParser;
 
 use wildcity_server::{Limits, SpoolLimits};
+use wildcity_session::RecordLimits;
 
 use crate::cli::backend_options::{bytes_of_gib, gib};
 
@@ -99,6 +100,14 @@ pub(super) struct LimitOptions {
     /// Seconds that an upload is kept after its last byte.
     #[arg(long, value_name = "SECONDS", default_value_t = SpoolLimits::default().age.as_secs_f64(), value_parser = seconds)]
     upload_age_s: f64,
+
+    /// Largest total size of all records, in GiB.
+    #[arg(long, value_name = "GIB", default_value_t = bytes_as_gib(Limits::default().records.bytes), value_parser = gib)]
+    records_gib: f64,
+
+    /// Largest total size of the records of one token, in GiB.
+    #[arg(long, value_name = "GIB", default_value_t = bytes_as_gib(Limits::default().records.owner_bytes), value_parser = gib)]
+    token_records_gib: f64,
 }
 
 impl LimitOptions {
@@ -125,6 +134,10 @@ impl LimitOptions {
                 bytes: bytes_of_gib(self.spool_gib),
                 token_bytes: self.token_spool_gib.map(bytes_of_gib),
                 age: seconds(self.upload_age_s),
+            },
+            records: RecordLimits {
+                bytes: bytes_of_gib(self.records_gib),
+                owner_bytes: bytes_of_gib(self.token_records_gib),
             },
         }
     }

@@ -46,6 +46,11 @@ pub(super) fn read_entities<'a>(
             "CatalogReference" => context.catalogs.entry(&what)?,
             _ => declared(&what)?,
         };
+        // Each is compared with all before it, and a scenario can have no more.
+        let most = wildcity_sim::limits::ACTORS + 1;
+        if context.entities.len() >= most {
+            return Err(object.wrong(&format!("is one of more than {most}, the ego included")));
+        }
         let name = object.text("name")?;
         let entity = entity_from(&what, &name)?;
         if let Some(trailer) = read_trailer(&what)? {

@@ -2,11 +2,14 @@
 
 use tokio::time::timeout;
 
+use wildcity_episode::RecordHead;
 use wildcity_options::Open;
 use wildcity_scene::ProfileOverrides;
-use wildcity_session::{Session, SessionError};
+use wildcity_session::{ScenarioError, Session, SessionError};
 
 use super::{Connection, NO_SESSION};
+use crate::auth::{Grant, Role};
+use crate::blocking::blocking;
 use crate::convert::{self, AlsoResumed, BranchPoint, DriveRequest};
 use crate::fault::Fault;
 use crate::limits;
@@ -15,6 +18,17 @@ use crate::sessions::{Answer, SlotGuard};
 fn new_session_name() -> String {
     // Version 7 begins with the time, so that names sort by age, and so do the files of episodes.
     format!("s-{}", uuid::Uuid::now_v7().as_simple())
+}
+
+/// What a token that is limited to some twins is told about a scenario that it may not use: the
+/// same as if there was none, and no names.
+fn hidden(error: SessionError, grant: &Grant) -> SessionError {
+    let is_hidden = match &error {
+        SessionError::Scenario(ScenarioError::Unknown { .. }) => !grant.allows_all_twins(),
+        SessionError::Scenario(ScenarioError::Twin { wanted, .. }) => !grant.allows_twin(wanted),
+        _ => false,
+    };
+    if is_hidden { SessionError::Scenario(ScenarioError::NotForTwin) } else { error }
 }
 
 impl Connection {
@@ -49,6 +63,8 @@ impl Connection {
         // not open one name. If opening fails, dropping the slot frees the name.
         let slot = self.state.sessions.reserve(name.clone(), &self.grant)?;
         let opened = Session::open(self.state.engine.clone(), name, opening);
+        let grant = self.grant.clone();
+        let opened = async move { opened.await.map_err(|error| hidden(error, &grant)) };
         self.fill(seq, slot, drive, opened).await
     }
 
@@ -70,14 +86,33 @@ impl Connection {
                 self.fill(seq, slot, None, Session::branch(engine, name, &from)).await
             }
             BranchPoint::Recorded { episode, step } => {
-                // Only the record says which twin it is of, so the token is checked after it is
-                // read.
+                // Only the record says whose it is, and of which twin: its first fields, before
+                // anything else of it is read.
+                self.check_record(&episode).await?;
                 let from = Session::recorded(&engine, &episode, step).await?;
-                self.grant.require_twin(from.twin())?;
                 let slot = self.state.sessions.reserve(name.clone(), &self.grant)?;
                 self.fill(seq, slot, None, Session::continued(engine, name, from)).await
             }
         }
+    }
+
+    /// Refuses the record of another token, or of a twin that the token may not use, as if there
+    /// was none.
+    async fn check_record(&self, episode: &str) -> Result<(), Fault> {
+        let path = self.state.episodes.join(format!("{episode}.jsonl"));
+        let head = blocking(move || {
+            RecordHead::read(&path).map_err(|error| Fault::Internal(error.to_string()))
+        })
+        .await;
+        let grant = &self.grant;
+        let is_allowed = head.is_ok_and(|head| {
+            let is_own = head.owner.is_empty() || head.owner == grant.name;
+            grant.allows_twin(&head.twin) && (is_own || grant.has(Role::Admin))
+        });
+        if is_allowed {
+            return Ok(());
+        }
+        Err(SessionError::UnknownEpisode { name: episode.to_owned() }.into())
     }
 
     /// Opens a session into a new slot.
@@ -89,7 +124,8 @@ impl Connection {
         opening: impl Future<Output = Result<Session, SessionError>>,
     ) -> Result<Answer, Fault> {
         let opened = timeout(self.state.limits.step, opening).await;
-        let session = opened.map_err(|_| SessionError::DeadlineExceeded)??;
+        let mut session = opened.map_err(|_| SessionError::DeadlineExceeded)??;
+        session.set_owner(&self.grant.name);
         // The answer is made before the slot gets the session: if the drive that is asked for does
         // not exist, nothing is open.
         let text = convert::opened(seq, &session, drive.as_ref())?;

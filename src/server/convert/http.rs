@@ -11,7 +11,7 @@ use crate::fault::{Fault, Report};
 use crate::limits;
 use crate::sessions::ListedSession;
 use crate::spool::{Announced, Upload};
-use wildcity_episode::{EpisodeFile, Listed};
+use wildcity_episode::{Listed, Overview};
 use wildcity_protocol::http;
 use wildcity_push::{
     CellChange, CellSelection, DriveRequest, EditRequest, FileReport, Frame, PushError, PushReport,
@@ -320,32 +320,30 @@ pub(crate) fn ticket(ticket: String) -> Value {
 /// A recorded episode, and its content.
 pub(crate) struct ListedEpisode {
     pub(crate) listed: Listed,
-    pub(crate) file: EpisodeFile,
+    pub(crate) overview: Overview,
     /// Why it has no MCAP file.
     pub(crate) mcap_error: Option<String>,
 }
 
 /// Recorded episodes.
 pub(crate) fn episodes(episodes: &[ListedEpisode]) -> Value {
-    let episode = |ListedEpisode { listed, file, mcap_error }: &ListedEpisode| {
-        let driven = file.driven();
-        let last = driven.last();
+    let episode = |ListedEpisode { listed, overview, mcap_error }: &ListedEpisode| {
         // Not all file systems have the time of the last change.
         let since_1970 = listed.modified.and_then(|time| time.duration_since(UNIX_EPOCH).ok());
         http::EpisodeInfo {
             episode: listed.name.clone(),
-            twin: file.header.twin.clone(),
-            version: file.header.version,
-            steps: last.map_or(0, |frame| frame.step),
-            time_us: last.map_or(0, |frame| frame.time_us),
+            twin: overview.head.twin.clone(),
+            version: overview.head.version,
+            steps: overview.steps,
+            time_us: overview.time_us,
             bytes: listed.bytes,
             mcap_bytes: listed.mcap_bytes,
             // A file that exists now was made after the failure.
             mcap_error: mcap_error.clone().filter(|_| listed.mcap_bytes.is_none()),
             modified_us: since_1970.map(|time| time.as_micros() as u64),
-            scenario: file.scenario.as_ref().map(|scenario| scenario.name.clone()),
-            outcome: file.end.as_ref().map(|end| end.outcome.clone()),
-            verdict: file.result.as_ref().map(|result| result.verdict.clone()),
+            scenario: overview.scenario.clone(),
+            outcome: overview.outcome.clone(),
+            verdict: overview.verdict.clone(),
         }
     };
     json!({ "episodes": episodes.iter().map(episode).collect::<Vec<_>>() })

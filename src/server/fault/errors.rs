@@ -92,7 +92,9 @@ pub(super) fn session_place(error: &SessionError) -> Place {
         SessionError::Route(_) => at(Code::TwinDamaged, "twin"),
         SessionError::Scenario(error) => match error {
             // An unknown name is the field itself; any other error names a part of the scenario.
-            ScenarioError::Unknown { .. } => at(Code::UnknownScenario, "scenario"),
+            ScenarioError::Unknown { .. } | ScenarioError::NotForTwin => {
+                at(Code::UnknownScenario, "scenario")
+            }
             ScenarioError::Choice { field, .. } => at(Code::InvalidRequest, field),
             _ => at(Code::ScenarioInvalid, &error.field()),
         },
@@ -132,12 +134,21 @@ pub(super) fn session_place(error: &SessionError) -> Place {
         SessionError::Busy { .. } => plain(Code::Busy),
         SessionError::DeadlineExceeded => plain(Code::DeadlineExceeded),
         SessionError::Render(error) => render_place(error),
-        SessionError::Record(error) if is_full(&error.cause) => plain(Code::StorageFull),
+        // A disk that takes nothing is, to a client, the same as one that takes no more.
+        SessionError::Record(error) if is_full(&error.cause) || is_closed(&error.cause) => {
+            plain(Code::StorageFull)
+        }
         SessionError::Encode { .. }
         | SessionError::Record(_)
         | SessionError::Crashed
         | SessionError::Thread { .. } => plain(Code::Internal),
     }
+}
+
+/// Whether a folder may not be written.
+fn is_closed(cause: &std::io::Error) -> bool {
+    use std::io::ErrorKind::{PermissionDenied, ReadOnlyFilesystem};
+    matches!(cause.kind(), PermissionDenied | ReadOnlyFilesystem)
 }
 
 fn profile_place(error: &ProfileError) -> Place {

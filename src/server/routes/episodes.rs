@@ -7,9 +7,13 @@ use axum::extract::{Path, State};
 use axum::http::header;
 use axum::response::IntoResponse as _;
 use axum::{Extension, Json};
+use bytes::Bytes;
 
-use wildcity_episode::{EpisodeFile, list as list_dir, read_mcap, read_text};
+use wildcity_episode::{
+    Overview, RecordHead, list as list_dir, mcap_path, read_mcap, read_text, record_bytes,
+};
 use wildcity_scene::rig::is_name;
+use wildcity_session::BudgetShare;
 
 use crate::auth::Grant;
 use crate::blocking::blocking;
@@ -31,11 +35,11 @@ pub(super) async fn list(
         let newest = listed.into_iter().take(limits::LISTED_EPISODES);
         // Files of other builds, and those whose first line is not written yet, are left out.
         let read = newest.filter_map(|listed| {
-            let file = EpisodeFile::read(&listed.path).ok()?;
+            let overview = Overview::read(&listed.path).ok()?;
             // The export runs after the episode, so that its failure is not in the record.
             let mcap_error = state.engine.export_failure(&listed.name);
-            let is_allowed = grant.allows_twin(&file.header.twin);
-            is_allowed.then_some(ListedEpisode { listed, file, mcap_error })
+            let is_allowed = grant.allows_twin(&overview.head.twin);
+            is_allowed.then_some(ListedEpisode { listed, overview, mcap_error })
         });
         Ok::<_, Fault>(read.collect::<Vec<_>>())
     });
@@ -50,8 +54,9 @@ pub(super) async fn show(
 ) -> HttpResult {
     let text = blocking(move || {
         let path = find_record(&state, &grant, &name)?;
+        let share = reserve(&state, &path)?;
         match read_text(&path, limits::EPISODE_BYTES) {
-            Ok(Some(text)) => Ok(text),
+            Ok(Some(text)) => Ok(counted(text, share)),
             Ok(None) => Err(too_large()),
             Err(_) => Err(Fault::NoEpisode { name }),
         }
@@ -71,8 +76,9 @@ pub(super) async fn mcap(
     let is_over = state.engine.wait_for_exports(Some(&name), limits::MCAP_WAIT).await;
     let bytes = blocking(move || {
         // The file counts, and not what the engine knows: it may be of an earlier server.
+        let share = reserve(&state, &mcap_path(&record))?;
         if let Ok(bytes) = read_mcap(&record, limits::EPISODE_BYTES) {
-            return bytes.ok_or_else(too_large);
+            return bytes.map(|bytes| counted(bytes, share)).ok_or_else(too_large);
         }
         let reason = match state.engine.export_failure(&name) {
             Some(reason) => reason,
@@ -96,9 +102,33 @@ fn find_record(state: &ServerState, grant: &Grant, name: &str) -> Result<PathBuf
         return Err(unknown());
     }
     let path = state.episodes.join(format!("{name}.jsonl"));
-    let header = EpisodeFile::header(&path).map_err(|_| unknown())?;
-    grant.require_twin(&header.twin)?;
-    Ok(path)
+    let head = RecordHead::read(&path).map_err(|_| unknown())?;
+    // The same answer as for a name that is not there, so that no token learns what others have
+    // driven.
+    if grant.allows_twin(&head.twin) { Ok(path) } else { Err(unknown()) }
+}
+
+/// Reserves the memory of a file that is sent, as long as the client has not taken all of it.
+fn reserve(state: &ServerState, path: &std::path::Path) -> Result<BudgetShare, Fault> {
+    // One that is too large, or not there, is refused when it is read.
+    let bytes = record_bytes(path).min(limits::EPISODE_BYTES);
+    state.engine.reserve_answer_bytes(bytes).map_err(Fault::from)
+}
+
+/// A file with its share of the memory for answers.
+struct CountedFile {
+    bytes: Vec<u8>,
+    _share: BudgetShare,
+}
+
+impl AsRef<[u8]> for CountedFile {
+    fn as_ref(&self) -> &[u8] {
+        &self.bytes
+    }
+}
+
+fn counted(bytes: Vec<u8>, share: BudgetShare) -> Bytes {
+    Bytes::from_owner(CountedFile { bytes, _share: share })
 }
 
 fn too_large() -> Fault {

@@ -2,11 +2,13 @@
 
 use std::sync::Arc;
 
+use axum::Extension;
 use axum::extract::{Request, State};
 use axum::http::{Method, StatusCode, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse as _, Response};
 
+use crate::auth::{Grant, Role};
 use crate::fault::{Fault, WireCode};
 use crate::metrics::GaugeValues;
 use crate::state::ServerState;
@@ -17,7 +19,15 @@ use super::refusal::{HttpResult, Refusal};
 pub(super) const PATH: &str = "/metrics";
 
 /// `GET /metrics`, in OpenMetrics' text format.
-pub(super) async fn show(State(state): State<Arc<ServerState>>) -> HttpResult {
+pub(super) async fn show(
+    State(state): State<Arc<ServerState>>,
+    Extension(grant): Extension<Arc<Grant>>,
+) -> HttpResult {
+    // They count what happens on all twins.
+    if grant.has(Role::Admin) && !grant.allows_all_twins() {
+        let reason = "it is limited to some twins, and metrics are of all; use one of role metrics";
+        return Err(Fault::Forbidden { field: "authorization", reason: reason.to_owned() }.into());
+    }
     let free_connections = state.websocket_permits.available_permits();
     let spooled = state.spool.as_ref().map(|spool| spool.usage()).unwrap_or_default();
     let gauges = GaugeValues {

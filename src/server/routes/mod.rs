@@ -2,6 +2,8 @@
 
 mod actors;
 mod cors;
+#[cfg(test)]
+mod costs;
 mod episodes;
 mod metrics;
 mod openapi;
@@ -78,6 +80,7 @@ async fn authorize(
 ) -> Result<Response, Refusal> {
     check_once(&request, header::HOST, "host")?;
     check_once(&request, header::ORIGIN, "origin")?;
+    check_once(&request, header::AUTHORIZATION, "authorization")?;
     // An absolute address in the request counts more than the header (RFC 9112, section 3.2.2).
     let header = request.headers().get(header::HOST).map(|host| host.to_str().unwrap_or_default());
     let host = request.uri().authority().map(|authority| authority.as_str()).or(header);

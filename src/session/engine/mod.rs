@@ -7,6 +7,7 @@ mod leases;
 pub(crate) mod render_queue;
 pub(crate) mod solid_blocks;
 pub(crate) mod spare_memory;
+pub(crate) mod turns;
 pub(crate) mod twin_summaries;
 
 use std::collections::BTreeMap;
@@ -34,11 +35,13 @@ use self::exports::Exports;
 use self::leases::Leases;
 use self::render_queue::{FrameCost, RenderQueue, Scratch};
 use self::solid_blocks::SolidBlocks;
+use self::turns::{Turn, Turns};
 use self::twin_summaries::{SummaryCache, TwinSummaries};
 use crate::blocking::run_blocking;
 use crate::contact::TwinSolids;
 use crate::error::SessionError;
 use crate::limits;
+use crate::record::quota::{RecordLimits, RecordQuota};
 use crate::scenario::load::Scenarios;
 use crate::spatial_index::SpatialIndex;
 
@@ -75,6 +78,9 @@ pub struct Engine {
     queue: RenderQueue,
     session_numbers: AtomicU64,
     answer_budget: AnswerBudget,
+    record_quota: Arc<RecordQuota>,
+    /// The turns of long simulations, and of records that are read whole.
+    turns: Turns,
     /// The versions that are open, by place; by the hashes of the versions.
     indexes: Mutex<BTreeMap<String, Weak<SpatialIndex>>>,
     solid_blocks: Arc<SolidBlocks>,
@@ -110,6 +116,7 @@ impl Engine {
             solid_blocks: Arc::new(SolidBlocks::new(
                 (cache.limit_bytes() / limits::SOLID_SHARE) as usize,
             )),
+            record_quota: Arc::new(RecordQuota::new(episodes.clone())),
             cache,
             episodes,
             scenarios,
@@ -119,9 +126,50 @@ impl Engine {
             // The first number belongs to the frames of pushes.
             session_numbers: AtomicU64::new(PUSHES + 1),
             answer_budget: AnswerBudget::default(),
+            turns: Turns::new(),
             exports,
             pins: Mutex::default(),
         }))
+    }
+
+    /// Limits the bytes of records from now on.
+    pub fn limit_records(&self, limits: RecordLimits) {
+        self.record_quota.limit(limits);
+    }
+
+    pub(crate) fn record_quota(&self) -> &Arc<RecordQuota> {
+        &self.record_quota
+    }
+
+    /// Waits for the turn of a simulation of some work; short ones need none.
+    ///
+    /// # Errors
+    /// [`SessionError::DeadlineExceeded`].
+    pub(crate) async fn simulation_turn(
+        &self,
+        work: u64,
+        deadline: Instant,
+    ) -> Result<Option<Turn>, SessionError> {
+        if work <= limits::SHORT_WORK {
+            return Ok(None);
+        }
+        self.turns.simulation(deadline).await.map(Some)
+    }
+
+    /// Waits for the turn to decode the overlays of a rig.
+    ///
+    /// # Errors
+    /// [`SessionError::DeadlineExceeded`] if it takes longer than a step may.
+    pub(crate) async fn overlay_turn(&self) -> Result<Turn, SessionError> {
+        self.turns.overlay(Instant::now() + self.step_timeout).await
+    }
+
+    /// Waits for the turn to read a whole record.
+    ///
+    /// # Errors
+    /// [`SessionError::DeadlineExceeded`] if it takes longer than a step may.
+    pub(crate) async fn record_turn(&self) -> Result<Turn, SessionError> {
+        self.turns.record(Instant::now() + self.step_timeout).await
     }
 
     /// The version of every twin that `latest` stands for, and the damaged twins, which are also

@@ -6,13 +6,14 @@ use std::path::Path;
 use std::sync::Arc;
 
 use wildcity_scene::RenderProfile;
-use wildcity_sim::Ground;
+use wildcity_sim::{DriveBoxes, Ground};
 use wildcity_twin::residency::Resident;
 
 use super::branch_error::BranchError;
 use super::ego_replay::EgoReplay;
 use super::format::{EpisodeHeader, FrameRecord, FrameRequest, RecordedOrigin};
 use super::recorded_episode::RecordedEpisode;
+use crate::engine::turns::Turn;
 use crate::episode::Episode;
 use crate::error::SessionError;
 use crate::observe::layout::{ObservationLayout, RigCapture};
@@ -23,6 +24,8 @@ pub struct Continuation {
     record: RecordedEpisode,
     origin: RecordedOrigin,
     versions: BTreeMap<u64, Arc<Resident>>,
+    /// As long as the record is in memory.
+    _turn: Turn,
 }
 
 /// The state of a recorded episode after one of its steps.
@@ -55,13 +58,17 @@ pub(crate) struct KeptFrame {
 
 impl Continuation {
     /// Reads the record. Blocks.
-    pub(crate) fn read(path: &Path, origin: RecordedOrigin) -> Result<Self, SessionError> {
+    pub(crate) fn read(
+        path: &Path,
+        origin: RecordedOrigin,
+        turn: Turn,
+    ) -> Result<Self, SessionError> {
         let RecordedOrigin { step, ref episode } = origin;
         // The most likely mistake has an error of its own: a wrong name.
         if !path.is_file() {
             return Err(SessionError::UnknownEpisode { name: episode.clone() });
         }
-        let mut record = RecordedEpisode::read(path).map_err(BranchError::Read)?;
+        let mut record = RecordedEpisode::read_until(path, step).map_err(BranchError::Read)?;
         let first = record.header.first_state().step();
         let last = record.frames.last().map_or(first, |frame| frame.step);
         if !(first..=last).contains(&step) {
@@ -73,7 +80,7 @@ impl Continuation {
         let frames = record.frames.len();
         // A switch without a frame after it shows nothing, and its version need not exist.
         record.versions.retain(|(frames_before, _)| *frames_before < frames);
-        Ok(Self { record, origin, versions: BTreeMap::new() })
+        Ok(Self { record, origin, versions: BTreeMap::new(), _turn: turn })
     }
 
     pub(crate) fn header(&self) -> &EpisodeHeader {
@@ -135,6 +142,7 @@ impl Continuation {
         let mut switches = versions.iter().peekable();
         let mut ego = EgoReplay::new(header);
         let mut kept: Vec<KeptFrames> = Vec::new();
+        let mut boxes: BTreeMap<u64, DriveBoxes> = BTreeMap::new();
         for (index, frame) in frames.iter().enumerate() {
             // All switches that stand before this frame in the file: the last one counts.
             while let Some((_, to)) = switches.next_if(|(frames_before, _)| *frames_before <= index)
@@ -146,7 +154,10 @@ impl Continuation {
             if frame.request == FrameRequest::Observe {
                 continue;
             }
-            let ground = Ground::from_drives(&version.version.manifest.trajectories);
+            let drives = &version.version.manifest.trajectories;
+            let boxes =
+                boxes.entry(version.version.number).or_insert_with(|| DriveBoxes::new(drives));
+            let ground = Ground::from_drives(drives).with_boxes(boxes);
             if let Some(diverged) = ego.drive(frame, index + 2, &ground)? {
                 return Err(BranchError::Diverged(diverged.to_string()).into());
             }

@@ -39,6 +39,9 @@ pub struct EpisodeHeader {
     pub build: String,
     /// Name of the session.
     pub session: String,
+    /// Name of the token that the session belongs to; empty on a server without tokens.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub owner: String,
     /// Name of the twin.
     pub twin: String,
     pub version: u64,

@@ -11,6 +11,7 @@ pub(crate) mod continuation;
 pub(crate) mod ego_replay;
 pub(crate) mod error;
 pub(crate) mod format;
+pub(crate) mod quota;
 pub(crate) mod recorded_episode;
 pub(crate) mod recorder;
 mod repair_replay;

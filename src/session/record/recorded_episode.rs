@@ -1,11 +1,10 @@
 //! Reads an episode's file.
 
-use std::fs::File;
 use std::io::{BufRead as _, BufReader, Read as _};
 use std::path::Path;
 
 use wildcity_episode::limits::HEAD_BYTES;
-use wildcity_episode::{ActorsLine, Event, ScenarioLine, check_no_mcap, line_bytes};
+use wildcity_episode::{ActorsLine, Event, ScenarioLine, check_no_mcap, line_bytes, open_record};
 use wildcity_scene::appearance::Overlay;
 
 use super::format::{EpisodeHeader, FrameRecord, Line, RecordedVersion};
@@ -49,8 +48,22 @@ impl RecordedEpisode {
     /// # Errors
     /// Names the first line that is damaged, incomplete or out of place.
     pub fn read(path: &Path) -> Result<Self, ReplayError> {
+        Self::read_part(path, None)
+    }
+
+    /// Reads what a branch after a step needs: the frames up to it, without the agent's notes and
+    /// without actors. Later frames are not read, except that the first of them shows that the
+    /// record has the step.
+    ///
+    /// # Errors
+    /// As [`Self::read`].
+    pub(crate) fn read_until(path: &Path, step: u64) -> Result<Self, ReplayError> {
+        Self::read_part(path, Some(step))
+    }
+
+    fn read_part(path: &Path, until: Option<u64>) -> Result<Self, ReplayError> {
         let failed = |cause| ReplayError::Read { path: path.to_owned(), cause };
-        let mut reader = BufReader::new(File::open(path).map_err(failed)?);
+        let mut reader = BufReader::new(open_record(path).map_err(failed)?);
         let mut header: Option<EpisodeHeader> = None;
         let mut frames = Vec::new();
         let mut versions = Vec::new();
@@ -102,7 +115,15 @@ impl RecordedEpisode {
                     }
                     header = Some(*first);
                 }
-                Line::Frame(frame) if number > 1 => {
+                Line::Frame(mut frame) if number > 1 => {
+                    if let Some(step) = until {
+                        frame.notes = None;
+                        if frame.step > step {
+                            frames.push(frame);
+                            frame_lines.push(number);
+                            break;
+                        }
+                    }
                     // There is a header: line 1 was one, or was refused.
                     let cameras = header.as_ref().map_or(0, |header| header.rig.cameras.len());
                     check_images(&frame, cameras).map_err(wrong)?;
@@ -112,6 +133,9 @@ impl RecordedEpisode {
                 Line::Scenario(line) if number > 1 => scenario = Some(line),
                 Line::Actors(line) if number > 1 => {
                     line.check(actor_count).map_err(wrong)?;
+                    if until.is_some() {
+                        continue;
+                    }
                     // With the number of frames so far, by which a replay finds the frame of the
                     // line.
                     actors.push((frames.len(), line));

@@ -13,6 +13,7 @@ use wildcity_episode::{EpisodeFile, EpisodeResult};
 
 use super::error::RecordError;
 use super::format::Line;
+use super::quota::RecordQuota;
 use crate::episode::EpisodeSummary;
 
 /// An episode's file, open for appending.
@@ -20,6 +21,14 @@ use crate::episode::EpisodeSummary;
 pub(crate) struct Recorder {
     file: Arc<File>,
     path: Arc<Path>,
+    account: Account,
+}
+
+/// Whose records these are, and the quota that they count in.
+#[derive(Clone, Debug)]
+pub(crate) struct Account {
+    pub(crate) owner: Arc<str>,
+    pub(crate) quota: Arc<RecordQuota>,
 }
 
 /// A newly created file, and the number in its name.
@@ -37,6 +46,7 @@ impl Recorder {
         session: &str,
         first_number: u64,
         lines: &[Line],
+        account: Account,
     ) -> Result<NewFile, RecordError> {
         let failed = |path: &Path, cause| RecordError { path: path.to_owned(), cause };
         fs::create_dir_all(dir).map_err(|cause| failed(dir, cause))?;
@@ -51,7 +61,7 @@ impl Recorder {
                 Err(cause) => return Err(failed(&path, cause)),
             }
         };
-        let recorder = Self { file: Arc::new(file), path: path.into() };
+        let recorder = Self { file: Arc::new(file), path: path.into(), account };
         if let Err(error) = recorder.append(lines) {
             // The first error explains more than an error of removing the file would.
             let _ = fs::remove_file(&recorder.path);
@@ -95,9 +105,20 @@ impl Recorder {
             serde_json::to_writer(&mut text, line)?;
             text.push(b'\n');
         }
+        let Account { owner, quota } = &self.account;
+        quota.take(owner, text.len() as u64)?;
+        let written = self.write(&text);
+        if written.is_err() {
+            quota.give_back(owner, text.len() as u64);
+        }
+        written
+    }
+
+    /// Writes all of a text, or nothing.
+    fn write(&self, text: &[u8]) -> io::Result<()> {
         // No other process appends to the file.
         let length_before = self.file.metadata()?.len();
-        let written = (&*self.file).write_all(&text);
+        let written = (&*self.file).write_all(text);
         // A part of a line may be on disk. In append mode, the next line begins at the new end.
         if written.is_err() {
             self.file.set_len(length_before)?;
@@ -121,12 +142,16 @@ mod tests {
         })
     }
 
+    fn account(dir: &Path) -> Account {
+        Account { owner: "".into(), quota: Arc::new(RecordQuota::new(dir.to_owned())) }
+    }
+
     #[test]
     fn files_that_exist_are_left_alone() {
         let dir = tempfile::tempdir().unwrap();
-        let first = Recorder::create(dir.path(), "a", 1, &[end(1)]).unwrap();
+        let first = Recorder::create(dir.path(), "a", 1, &[end(1)], account(dir.path())).unwrap();
         assert_eq!(first.number, 1);
-        let second = Recorder::create(dir.path(), "a", 1, &[end(2)]).unwrap();
+        let second = Recorder::create(dir.path(), "a", 1, &[end(2)], account(dir.path())).unwrap();
         assert_eq!(second.number, 2);
         first.recorder.append(&[end(3)]).unwrap();
         let text = fs::read_to_string(dir.path().join("a-1.jsonl")).unwrap();
@@ -138,7 +163,7 @@ mod tests {
     fn a_directory_that_cannot_be_created_is_named() {
         let file = tempfile::NamedTempFile::new().unwrap();
         let dir = file.path().join("episodes");
-        let error = Recorder::create(&dir, "a", 1, &[end(1)]).unwrap_err();
+        let error = Recorder::create(&dir, "a", 1, &[end(1)], account(&dir)).unwrap_err();
         assert!(error.to_string().contains("episodes"), "{error}");
     }
 
@@ -147,7 +172,7 @@ mod tests {
         // This device refuses every write as a full disk does.
         let full = OpenOptions::new().append(true).open("/dev/full").unwrap();
         let path = Path::new("/dev/full").into();
-        let recorder = Recorder { file: Arc::new(full), path };
+        let recorder = Recorder { file: Arc::new(full), path, account: account(Path::new("/")) };
         let error = recorder.append(&[end(1)]).unwrap_err();
         assert!(error.to_string().contains("/dev/full"), "{error}");
     }

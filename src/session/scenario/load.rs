@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use serde_json::Value;
 
@@ -20,6 +21,8 @@ use wildcity_sim::scenario::{
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Scenarios {
     dir: PathBuf,
+    /// Whether files are named by a scenario of a client and not of the directory.
+    is_inline: bool,
 }
 
 /// Which scenario.
@@ -115,6 +118,9 @@ pub enum ScenarioError {
         /// The names of the directory.
         known: Vec<String>,
     },
+    /// There is no such scenario for a client that may not know the others.
+    #[error("there is no scenario of this name that plays in this twin")]
+    NotForTwin,
     /// A file cannot be read.
     #[error("{field}: cannot read {file:?}: {reason}")]
     Read {
@@ -161,7 +167,7 @@ impl ScenarioError {
     pub fn field(&self) -> String {
         match self {
             Self::Choice { field, .. } => field.clone(),
-            Self::Unknown { .. } => "scenario".to_owned(),
+            Self::Unknown { .. } | Self::NotForTwin => "scenario".to_owned(),
             Self::Read { field, .. } | Self::Hash { field, .. } => format!("scenario.{field}"),
             // The path of a mistake in the file as a whole is that of the file.
             Self::File { file, cause } if file == "scenario" && cause.path != *file => {
@@ -176,7 +182,13 @@ impl ScenarioError {
 impl Scenarios {
     /// The scenarios of a directory, which need not exist.
     pub fn in_dir(dir: impl Into<PathBuf>) -> Self {
-        Self { dir: dir.into() }
+        Self { dir: dir.into(), is_inline: false }
+    }
+
+    /// The directory as an inline scenario sees it: a client may name any file of it, and what is
+    /// wrong with one is the same for all, so that it learns nothing of others.
+    pub(crate) fn for_source(self, source: &ScenarioSource) -> Self {
+        Self { is_inline: matches!(source, ScenarioSource::Inline(_)), ..self }
     }
 
     /// The names of the scenarios, in order.
@@ -251,20 +263,25 @@ impl Scenarios {
         let map = match &mut file.map {
             None => None,
             Some(pin) => {
-                let bytes = self.read("map.file", &pin.file, MAP_BYTES)?;
-                // The hash before the contents, so that a file which was changed is reported as
-                // such.
-                pins.check("map.hash", &mut pin.hash, &hash_bytes(&bytes))?;
-                let map = MapFile::parse(&bytes).and_then(Map::new);
-                Some(map.map_err(wrong(&pin.file))?)
+                let named = pin.file.clone();
+                let found = self.read("map.file", &pin.file, MAP_BYTES).and_then(|bytes| {
+                    // The hash before the contents, so that a file which was changed is reported
+                    // as such.
+                    pins.check("map.hash", &mut pin.hash, &hash_bytes(&bytes))?;
+                    MapFile::parse(&bytes).and_then(Map::new).map_err(wrong(&named))
+                });
+                Some(found.map_err(|error| self.shown("map.file", &named, error))?)
             }
         };
         let tracks = match &mut file.tracks {
             None => None,
             Some(section) => {
-                let bytes = self.read("tracks.file", &section.file, MAP_BYTES)?;
-                pins.check("tracks.hash", &mut section.hash, &hash_bytes(&bytes))?;
-                Some(TracksFile::parse(&bytes).map_err(wrong(&section.file))?)
+                let named = section.file.clone();
+                let found = self.read("tracks.file", &section.file, MAP_BYTES).and_then(|bytes| {
+                    pins.check("tracks.hash", &mut section.hash, &hash_bytes(&bytes))?;
+                    TracksFile::parse(&bytes).map_err(wrong(&named))
+                });
+                Some(found.map_err(|error| self.shown("tracks.file", &named, error))?)
             }
         };
         let around = Surroundings {
@@ -303,10 +320,21 @@ impl Scenarios {
     ) -> Result<ScenarioFile, ScenarioError> {
         let document = self.document(source)?;
         let mut chosen = document.first_values();
-        chosen.extend(values.iter().map(|(name, value)| (name.clone(), value.clone())));
+        let given = values.iter().map(|(name, value)| (name.clone(), Arc::new(value.clone())));
+        chosen.extend(given);
         document
             .with(&chosen)
             .map_err(|cause| ScenarioError::File { file: "scenario".to_owned(), cause })
+    }
+
+    /// What a client is told about a file that its scenario names.
+    fn shown(&self, field: &'static str, file: &str, error: ScenarioError) -> ScenarioError {
+        if !self.is_inline {
+            return error;
+        }
+        let kind = field.trim_end_matches(".file");
+        let reason = format!("there is no {kind} of this name that fits the scenario");
+        ScenarioError::Read { field, file: file.to_owned(), reason }
     }
 
     fn read(
@@ -358,12 +386,12 @@ fn hash_bytes(bytes: &[u8]) -> String {
 }
 
 fn read_at_most(path: &Path, limit_bytes: usize) -> Result<Vec<u8>, String> {
-    let file = File::open(path).map_err(|error| error.to_string())?;
-    let metadata = file.metadata().map_err(|error| error.to_string())?;
-    // Of a pipe or a device, reading might never end.
+    let metadata = std::fs::metadata(path).map_err(|error| error.to_string())?;
+    // Opening a pipe may wait for ever, and reading a device may never end.
     if !metadata.is_file() {
         return Err("it is not a file".to_owned());
     }
+    let file = File::open(path).map_err(|error| error.to_string())?;
     let mut bytes = Vec::new();
     // A byte more than the limit, to tell a file at the limit from a longer one.
     let read = file.take(limit_bytes as u64 + 1).read_to_end(&mut bytes);

@@ -53,6 +53,7 @@ impl SessionScenario {
         gives_start: bool,
     ) -> Result<Self, ScenarioError> {
         let file = scenarios.file(source, values)?;
+        let scenarios = scenarios.for_source(source);
         Ok(Self { scenarios, file, gives_start, generated: Arc::default() })
     }
 

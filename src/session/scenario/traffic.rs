@@ -7,14 +7,17 @@ use wildcity_scene::ActorClass;
 use wildcity_scene::actor::PlacedChunk;
 use wildcity_sim::Ego;
 use wildcity_sim::contact::{Body, Contact, Detector, LanePosition};
+use wildcity_sim::limits::SUB_STEP_US;
 use wildcity_sim::map::Map;
 use wildcity_sim::route::{NavigationRoute, RouteProgress, RouteView};
 use wildcity_sim::scenario::{ContactRule, EndInput, EndReason, Stuck};
-use wildcity_sim::traffic::{ActorSpec, ActorState, EgoBox, EgoMotion, EgoState, World};
+use wildcity_sim::traffic::{ActorSpec, ActorState, EgoBox, EgoMotion, EgoState, Firing, World};
 
 use super::assets::{ActorAssets, FrameDetail, exposure_start_us};
 use super::load::LoadedScenario;
 use super::past::{ActorPast, poses};
+use crate::blocking::Stop;
+use crate::error::SessionError;
 use crate::limits;
 
 /// The traffic of an episode between two steps. A copy continues exactly as the original does.
@@ -128,24 +131,32 @@ impl EpisodeTraffic {
         Self { reach_us, ..self }
     }
 
-    /// The traffic after a step of `dt_us` in which the ego went from one state to another.
-    /// `with_twin` has the contacts with the twin that began in the step.
-    fn stepped(&self, from: &Ego, to: &Ego, dt_us: i64, with_twin: &[Event]) -> Self {
-        // A copy, so that a step which fails later changes nothing.
-        let mut next = self.clone();
+    /// Moves on by a step of `dt_us` in which the ego went from one state to another. `with_twin`
+    /// has the contacts with the twin that began in the step.
+    ///
+    /// # Errors
+    /// The step was stopped; this traffic is of no use then.
+    fn advance(
+        &mut self,
+        [from, to]: [&Ego; 2],
+        dt_us: i64,
+        with_twin: &[Event],
+        stop: &Stop,
+    ) -> Result<(), SessionError> {
+        let next = self;
         next.events.clear();
         let motion = EgoMotion::new(EgoState::new(from), to);
-        let ego_box = self.loaded.scenario.traffic.ego_box;
-        let map = self.loaded.map.as_ref();
-        let specs = &self.specs;
+        let loaded = next.loaded.clone();
+        let ego_box = loaded.scenario.traffic.ego_box;
+        let map = loaded.map.as_ref();
+        let specs = next.specs.clone();
+        let detector = &mut next.detector;
         let mut contacts: Vec<Contact> = Vec::new();
         let mut presence: Vec<Event> = Vec::new();
-        // The world only says when a trigger fired: which ones fire in this step is the difference.
-        let before: Vec<Vec<Option<i64>>> = next.fired_us();
-        next.world.step(dt_us, &motion, &mut |sub_step| {
+        let done = next.world.step_while(dt_us, &motion, &mut |sub_step| {
             // By sub-step, because an actor may appear, be touched and leave within one step.
             let lanes = map.map(|map| lane_position(map, &sub_step.ego[1], &ego_box));
-            contacts.extend(next.detector.advance(sub_step, specs, lanes));
+            contacts.extend(detector.advance(sub_step, &specs, lanes));
             for (before, after) in sub_step.before.iter().zip(sub_step.after) {
                 let kind = match (before.present, after.present) {
                     (false, true) => EventKind::Appeared { actor: after.index },
@@ -154,21 +165,23 @@ impl EpisodeTraffic {
                 };
                 presence.push(Event { time_us: sub_step.end_us, kind });
             }
+            // A sub-step of the largest scenario takes some milliseconds.
+            stop.check()
         });
+        if done.is_break() {
+            return Err(SessionError::DeadlineExceeded);
+        }
 
         // The events of the step, by time; at one time triggers first, since they cause the others.
-        for (actor, (before, after)) in before.iter().zip(next.fired_us()).enumerate() {
-            for (trigger, (before, after)) in before.iter().zip(after).enumerate() {
-                if let (None, Some(time_us)) = (before, after) {
-                    let kind = EventKind::Trigger { actor: actor as u16, trigger };
-                    next.events.push(Event { time_us, kind });
-                }
-            }
-        }
+        let fired = next.world.firings().iter().map(|Firing { time_us, actor, trigger }| {
+            let kind = EventKind::Trigger { actor: *actor, trigger: *trigger };
+            Event { time_us: *time_us, kind }
+        });
+        next.events.extend(fired);
         next.events.append(&mut presence);
         // Before the contacts become events.
-        let has_contact = (self.twin_ends_episode() && !with_twin.is_empty())
-            || contacts.iter().any(|contact| self.ends_episode(contact));
+        let has_contact = (next.twin_ends_episode() && !with_twin.is_empty())
+            || contacts.iter().any(|contact| next.ends_episode(contact));
         next.events.extend_from_slice(with_twin);
         next.events.extend(
             contacts.into_iter().map(|contact| Event {
@@ -181,19 +194,24 @@ impl EpisodeTraffic {
         // After the events that it may be the consequence of.
         next.end(to, has_contact);
         settle(&mut next.events);
-        next
+        Ok(())
     }
 
     /// The traffic after the steps of a plan, each of `dt_us`, in which the ego went through
     /// `egos`. `with_twin` has the contacts with the twin that began in each step. Its events are
     /// those of all steps.
+    ///
+    /// # Errors
+    /// The steps were stopped.
     pub(crate) fn followed(
         &self,
         from: &Ego,
         egos: &[Ego],
         dt_us: i64,
         with_twin: &[Vec<Event>],
-    ) -> Self {
+        stop: &Stop,
+    ) -> Result<Self, SessionError> {
+        // One copy for all steps, so that a step which fails later changes nothing.
         let mut next = self.clone();
         // Frames of this plan are at most as old as its beginning, their exposure and the reach of
         // sensors.
@@ -201,13 +219,24 @@ impl EpisodeTraffic {
         let mut from = from;
         let mut events = Vec::new();
         for (ego, with_twin) in egos.iter().zip(with_twin) {
-            next = next.stepped(from, ego, dt_us, with_twin);
+            next.advance([from, ego], dt_us, with_twin, stop)?;
             // A step forgets the events of the one before it, so that they are collected here.
             events.append(&mut next.events);
+            // The events of a thousand steps may be many, and only some of them are kept.
+            if events.len() > 16 * limits::EVENTS {
+                settle(&mut events);
+            }
             from = ego;
         }
         settle(&mut events);
-        Self { events, ..next }
+        Ok(Self { events, ..next })
+    }
+
+    /// The sub-steps of all actors in `duration_us`: a measure of the work that they are.
+    pub(crate) fn work(&self, duration_us: i64) -> u64 {
+        let actors = self.specs.len() as u64 + 1;
+        let sub_steps = duration_us.max(0) as u64 / SUB_STEP_US.unsigned_abs() + 1;
+        actors.saturating_mul(sub_steps)
     }
 
     /// Advances along the route, and ends the episode if a rule of the scenario applies. The first
@@ -257,15 +286,6 @@ impl EpisodeTraffic {
         };
         // An overlap at the start is no fault of the driving.
         is_meant && !contact.at_start
-    }
-
-    fn fired_us(&self) -> Vec<Vec<Option<i64>>> {
-        let actors = self.world.traffic().actors.iter().enumerate();
-        actors
-            .map(|(actor, setup)| {
-                (0..setup.script.len()).map(|trigger| self.world.fired_us(actor, trigger)).collect()
-            })
-            .collect()
     }
 
     /// The scenario, with this episode's seed.

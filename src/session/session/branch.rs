@@ -134,7 +134,8 @@ impl Session {
     ) -> Result<Continuation, SessionError> {
         let path = engine.episodes().join(format!("{episode}.jsonl"));
         let origin = RecordedOrigin { episode: episode.to_owned(), step };
-        run_blocking(move || Continuation::read(&path, origin)).await?
+        let turn = engine.record_turn().await?;
+        run_blocking(move || Continuation::read(&path, origin, turn)).await?
     }
 
     /// Opens a session in the state that a recorded episode had after one of its steps, with its

@@ -52,6 +52,8 @@ pub struct Session {
     /// Prefetches in the background.
     prefetch_task: LatestTask,
     name: String,
+    /// Name of the token that its records belong to; empty if there is none.
+    owner: String,
     /// Tells the render queue whose frames are whose.
     number: u64,
     settings: Arc<SessionSettings>,
@@ -77,6 +79,11 @@ impl Session {
     /// Its name.
     pub fn name(&self) -> &str {
         &self.name
+    }
+
+    /// Names the token that the records of its episodes belong to from now on.
+    pub fn set_owner(&mut self, owner: &str) {
+        owner.clone_into(&mut self.owner);
     }
 
     /// The version of the twin.

@@ -15,7 +15,9 @@ use wildcity_options::{
 };
 use wildcity_render::View;
 use wildcity_scene::geometry::Pose;
-use wildcity_scene::rig::{Rig, RigCamera, check_overlay_pixels, is_name, overlay_bytes};
+use wildcity_scene::rig::{
+    Rig, RigCamera, UnreadRig, check_overlay_pixels, is_name, overlay_bytes,
+};
 use wildcity_scene::{Manifest, ProfileOverrides, RenderProfile, Trajectory};
 use wildcity_sim::Dynamics;
 use wildcity_sim::scenario::Scenario;
@@ -57,8 +59,11 @@ impl Session {
         options: Open,
     ) -> Result<Self, SessionError> {
         let step_timeout = engine.step_timeout();
-        // The overlays of a rig may take a second to decompress.
+        // Off the threads that answer: a scenario of a megabyte is copied and checked.
         let mut asked = run_blocking(move || Asked::new(options, step_timeout)).await??;
+        // Only then overlays, from whose headers the memory for them is reserved: a rig that is
+        // refused decodes none.
+        let chosen = decoded(&engine, asked.rig.take()).await?;
 
         // The version of the twin. Its Gaussians are loaded frame by frame.
         let resident = engine.open_version(asked.twin.clone(), asked.version).await?;
@@ -73,10 +78,9 @@ impl Session {
         // Select the cameras. Scaling their overlays takes a second at worst.
         let rig = {
             let resident = resident.clone();
-            let choice = asked.rig.take();
             let outputs = asked.outputs.clone();
             run_blocking(move || {
-                let rig = select_cameras(&resident.version.manifest, choice, &outputs)?;
+                let rig = select_cameras(&resident.version.manifest, chosen, &outputs)?;
                 crop_and_scale(rig, &outputs)
             })
             .await??
@@ -177,6 +181,7 @@ impl Session {
             reservation,
             prefetch_task: LatestTask::default(),
             name,
+            owner: String::new(),
             settings,
             version,
             state,
@@ -254,7 +259,37 @@ struct Asked {
 enum AskedRig {
     /// A rig that comes with the program, by name.
     Preset(String),
+    /// Its overlays are not decoded yet.
+    Unread(UnreadRig),
+}
+
+/// A rig that is asked for, with its overlays.
+enum ChosenRig {
+    Preset(String),
     Full(Rig),
+}
+
+/// The rig with its overlays, which may take a second to decompress. Few are decompressed at once,
+/// each within memory that was reserved for it.
+async fn decoded(
+    engine: &Engine,
+    asked: Option<AskedRig>,
+) -> Result<Option<ChosenRig>, SessionError> {
+    let unread = match asked {
+        None => return Ok(None),
+        Some(AskedRig::Preset(name)) => return Ok(Some(ChosenRig::Preset(name))),
+        Some(AskedRig::Unread(unread)) => unread,
+    };
+    let bytes = unread.decoding_bytes();
+    // Before the turn, so that requests that wait hold no more than their messages and this budget.
+    let reserved = engine.answer_budget().reserve(bytes)?;
+    let turn = if bytes == 0 { None } else { Some(engine.overlay_turn().await?) };
+    let decode = move || {
+        let rig = unread.decode();
+        drop((turn, reserved));
+        rig
+    };
+    Ok(Some(ChosenRig::Full(run_blocking(decode).await??)))
 }
 
 impl Asked {
@@ -262,7 +297,7 @@ impl Asked {
         let rig = match options.rig {
             None => None,
             Some(RigChoice::Preset(name)) => Some(AskedRig::Preset(name)),
-            Some(RigChoice::Full(rig)) => Some(AskedRig::Full(Rig::from_request(rig)?)),
+            Some(RigChoice::Full(rig)) => Some(AskedRig::Unread(UnreadRig::from_request(rig)?)),
         };
         let scenario = options.scenario.map(ScenarioSource::from_choice).transpose()?;
         // The store checks names again; this error names the field.
@@ -503,7 +538,7 @@ fn check_deadline(
 /// requested order.
 fn select_cameras(
     manifest: &Manifest,
-    choice: Option<AskedRig>,
+    choice: Option<ChosenRig>,
     outputs: &Outputs,
 ) -> Result<Rig, SessionError> {
     let preset = |name: &str| {
@@ -513,8 +548,8 @@ fn select_cameras(
         })
     };
     let rig = match choice {
-        Some(AskedRig::Full(rig)) => rig,
-        Some(AskedRig::Preset(name)) => preset(&name)?,
+        Some(ChosenRig::Full(rig)) => rig,
+        Some(ChosenRig::Preset(name)) => preset(&name)?,
         None => match &manifest.rig {
             Some(rig) => rig.clone(),
             None => preset(limits::RIG)?,

@@ -6,6 +6,7 @@ use wildcity_scene::Rig;
 use super::Session;
 use super::pending::{EpisodeFile, NewEpisode};
 use crate::blocking::run_blocking;
+use crate::engine::turns::Turn;
 use crate::episode::{Episode, Outcome};
 use crate::error::SessionError;
 use crate::observe::builder::finish::RenderedObservation;
@@ -15,7 +16,7 @@ use crate::record::format::{
     BUILD, EpisodeHeader, FrameRecord, FrameRequest, Line, RecordedOrigin, RecordedOutputs,
     RecordedSettings, RecordedVersion,
 };
-use crate::record::recorder::{NewFile, Recorder};
+use crate::record::recorder::{Account, NewFile, Recorder};
 use crate::record::repairs::{RecordedImageRepair, RecordedRepair};
 use crate::scenario::{EpisodeTraffic, Event, EventKind};
 use crate::state::{EpisodeState, PinnedVersion, SessionSettings};
@@ -131,6 +132,7 @@ impl Session {
             format: EpisodeHeader::FORMAT,
             build: BUILD.to_owned(),
             session: self.name.clone(),
+            owner: self.owner.clone(),
             twin: version.manifest.twin.clone(),
             version: version.number,
             version_hash: version.hash.clone(),
@@ -161,21 +163,27 @@ impl Session {
         let name = self.name.clone();
         // The first number to try; another server may have used it.
         let first_number = self.episode_number + 1;
-        let scenario = traffic.map(|traffic| {
-            let loaded = traffic.loaded();
-            let drives = &version.manifest.trajectories;
-            let line = ScenarioLine {
-                // The session may have switched it off.
-                checks_static: pinned.solids.is_some(),
-                ..scenario_line(&loaded.scenario, loaded.map.as_ref(), &loaded.hash, drives)
-            };
-            Line::Scenario(Box::new(line))
-        });
-        let head = [Line::Episode(Box::new(header))].into_iter().chain(scenario);
-        let lines: Vec<Line> = head.chain(first_lines).collect();
-        let created =
-            run_blocking(move || logged(Recorder::create(&dir, &name, first_number, &lines)));
-        Ok(created.await??)
+        let account = Account {
+            owner: self.owner.as_str().into(),
+            quota: self.engine.record_quota().clone(),
+        };
+        let loaded = traffic.map(|traffic| traffic.loaded().clone());
+        let version = version.clone();
+        // The session may have switched it off.
+        let checks_static = pinned.solids.is_some();
+        let create = move || {
+            // Here, because the line has the whole map.
+            let scenario = loaded.map(|loaded| {
+                let drives = &version.manifest.trajectories;
+                let line =
+                    scenario_line(&loaded.scenario, loaded.map.as_ref(), &loaded.hash, drives);
+                Line::Scenario(Box::new(ScenarioLine { checks_static, ..line }))
+            });
+            let head = [Line::Episode(Box::new(header))].into_iter().chain(scenario);
+            let lines: Vec<Line> = head.chain(first_lines).collect();
+            logged(Recorder::create(&dir, &name, first_number, &lines, account))
+        };
+        Ok(run_blocking(create).await??)
     }
 
     /// Writes the last line of the episode's file, and lets it be exported. A failure is only
@@ -187,8 +195,16 @@ impl Session {
         let mut lines = Vec::new();
         if self.state.traffic.is_some() {
             let recorder = recorder.clone();
+            let turn = self.engine.record_turn().await;
             // Without a result the record is still whole: `wildcity episode score` makes it again.
-            if let Ok(Some(result)) = run_blocking(move || recorder.result(&summary)).await {
+            let result = move |turn: Turn| {
+                let result = recorder.result(&summary);
+                drop(turn);
+                result
+            };
+            if let Ok(turn) = turn
+                && let Ok(Some(result)) = run_blocking(move || result(turn)).await
+            {
                 lines.push(Line::Result(result));
             }
         }

@@ -15,7 +15,8 @@ use wildcity_sim::{Command, Dynamics, Ego, Ground};
 
 use super::Session;
 use super::pending::{EpisodeFile, NewEpisode, Pending};
-use crate::blocking::run_blocking;
+use crate::blocking::{run_blocking, run_until};
+use crate::contact::TwinSolids;
 use crate::engine::render_queue::{FrameCost, Scratch};
 use crate::episode::{Episode, EpisodeSummary, Outcome};
 use crate::error::SessionError;
@@ -31,6 +32,7 @@ use crate::record::command::RecordedCommand;
 use crate::record::format::FrameRequest;
 use crate::scenario::assets::FrameDetail;
 use crate::scenario::{EpisodeScenario, EpisodeTraffic, Event, EventKind, settle};
+use crate::spatial_index::SpatialIndex;
 use crate::start::{EpisodeStart, checked_pose};
 use crate::state::{EpisodeState, PinnedVersion};
 use crate::viewpoint::viewpoints;
@@ -75,6 +77,13 @@ struct Meetings {
     off_model: Option<(i64, f64)>,
 }
 
+/// A session after the steps of a request, before anything is rendered.
+struct Simulated {
+    episode: Episode,
+    traffic: Option<EpisodeTraffic>,
+    met: Meetings,
+}
+
 impl Session {
     /// Moves the ego by one step of `dt_us` and renders.
     ///
@@ -103,13 +112,8 @@ impl Session {
         check_notes(options.notes.as_ref())?;
         let deadline = Instant::now() + self.settings.deadline;
         let now = &self.state.episode;
-        let (mut next, egos) = self.moved(&command, steps, options.terminate)?;
-        // On copies of the states: traffic needs them afterwards.
-        let met = self.meetings(now, egos.clone(), deadline).await?;
-        let traffic = self.state.traffic.as_ref();
-        let dt_us = self.settings.dt_us;
-        let mut traffic =
-            traffic.map(|traffic| traffic.followed(now.ego(), &egos, dt_us, &met.contacts));
+        let Simulated { episode: mut next, mut traffic, met } =
+            self.simulated(command.clone(), steps, options.terminate, deadline).await?;
         let mut events = Vec::new();
         match &traffic {
             Some(traffic) => {
@@ -172,47 +176,38 @@ impl Session {
         Pending { next: Some(next), record, file, observation }.commit(self).await
     }
 
-    /// The episode after some steps along a command, and the ego after each of them.
-    fn moved(
+    /// The session after some steps along a command. Off the threads that answer requests, until a
+    /// deadline: 256 actors take a second for ten, and the twin may have to be read.
+    async fn simulated(
         &self,
-        command: &Command,
+        command: Command,
         steps: usize,
         terminate: bool,
-    ) -> Result<(Episode, Vec<Ego>), SessionError> {
-        let lanes = self.state.traffic.as_ref().and_then(|traffic| traffic.loaded().lanes());
-        let drives = &self.resident().version.manifest.trajectories;
-        let ground = Ground::from_drives(drives).and_lanes(lanes);
-        self.state.episode.followed(command, steps, &ground, terminate)
-    }
-
-    /// What the ego meets of the twin while it goes through `egos`, and whether it leaves the
-    /// trained area. Off the threads that answer requests: it may have to read the twin.
-    async fn meetings(
-        &self,
-        now: &Episode,
-        egos: Vec<Ego>,
         deadline: Instant,
-    ) -> Result<Meetings, SessionError> {
+    ) -> Result<Simulated, SessionError> {
+        let dt_us = self.settings.dt_us;
+        let traffic = self.state.traffic.clone();
+        // Long simulations take turns, so that they leave processors to all others.
+        let work = traffic.as_ref().map_or(0, |traffic| traffic.work(dt_us * steps as i64));
+        let turn = self.engine.simulation_turn(work, deadline).await?;
+        let now = self.state.episode.clone();
+        let index = self.version.index.clone();
         let solids = self.version.solids.clone();
-        // An ego that has left the area once is not looked for again.
-        let recorded = self.version.index.recorded().filter(|_| !now.is_off_model()).cloned();
-        let from = now.ego().clone();
-        let (begin_us, dt_us) = (now.time_us(), self.settings.dt_us);
-        let find = move || {
-            let contacts = match solids {
-                Some(solids) => solids.contacts(&from, &egos, begin_us, dt_us)?,
-                None => vec![Vec::new(); egos.len()],
-            };
-            let trusts = egos.iter().zip(1..).filter_map(|(ego, step)| {
-                Some((begin_us + step * dt_us, recorded.as_ref()?.trust(&ego.world_from_rig())))
-            });
-            let off_model = trusts.into_iter().find(|(_, trust)| *trust < limits::OFF_MODEL_TRUST);
-            Ok::<_, SessionError>(Meetings { contacts, off_model })
-        };
-        // After the deadline the thread still ends its work, and what it has read serves the next
-        // try.
-        let found = timeout_at(deadline, run_blocking(find)).await;
-        found.map_err(|_| SessionError::DeadlineExceeded)??
+        run_until(deadline, move |stop| {
+            let _turn = turn;
+            let lanes = traffic.as_ref().and_then(|traffic| traffic.loaded().lanes());
+            let drives = &index.version().manifest.trajectories;
+            let ground = Ground::from_drives(drives).with_boxes(index.boxes()).and_lanes(lanes);
+            let (episode, egos) = now.followed(&command, steps, &ground, terminate)?;
+            stop.refusal()?;
+            let met = meetings(&now, &egos, solids.as_ref(), &index, dt_us)?;
+            stop.refusal()?;
+            let traffic = traffic
+                .map(|traffic| traffic.followed(now.ego(), &egos, dt_us, &met.contacts, stop))
+                .transpose()?;
+            Ok(Simulated { episode, traffic, met })
+        })
+        .await
     }
 
     /// What contact with the twin does in an episode without a scenario.
@@ -318,7 +313,9 @@ impl Session {
             // Dynamics decide whether a start is placed on the ground.
             None if dynamics.model == settings.dynamics.model => settings.start.clone(),
             None => {
-                let ground = Ground::from_drives(&manifest.trajectories).and_lanes(lanes);
+                let boxes = self.version.index.boxes();
+                let drives = Ground::from_drives(&manifest.trajectories).with_boxes(boxes);
+                let ground = drives.and_lanes(lanes);
                 settings.start.placed(&ground, dynamics)
             }
             Some(start) => EpisodeStart::resolve(
@@ -449,6 +446,29 @@ impl Session {
         let (held_bytes, limit_bytes) = version.resident.memory();
         builder.finish(history, held_bytes, limit_bytes)
     }
+}
+
+/// What an ego meets of the twin while it goes through `egos`, and whether it leaves the trained
+/// area.
+fn meetings(
+    now: &Episode,
+    egos: &[Ego],
+    solids: Option<&TwinSolids>,
+    index: &SpatialIndex,
+    dt_us: i64,
+) -> Result<Meetings, SessionError> {
+    let begin_us = now.time_us();
+    let contacts = match solids {
+        Some(solids) => solids.contacts(now.ego(), egos, begin_us, dt_us)?,
+        None => vec![Vec::new(); egos.len()],
+    };
+    // An ego that has left the area once is not looked for again.
+    let recorded = index.recorded().filter(|_| !now.is_off_model());
+    let mut trusts = egos.iter().zip(1..).filter_map(|(ego, step)| {
+        Some((begin_us + step * dt_us, recorded?.trust(&ego.world_from_rig())))
+    });
+    let off_model = trusts.find(|(_, trust)| *trust < limits::OFF_MODEL_TRUST);
+    Ok(Meetings { contacts, off_model })
 }
 
 /// Adds an event to those of the traffic, or without a scenario to `events`.

@@ -1,26 +1,44 @@
 //! A scenario with its sweep: from text to one file for each combination of values.
+//!
+//! A value stands in the document once, however many `"$name"` it replaces. The size of a scenario
+//! with its values is computed from their sizes, and refused, before anything is copied.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 
 use serde_json::Value;
 
 use super::error::{FileError, check_format, json, typed};
-use super::file::{ScenarioFile, SweepSection};
+use super::file::ScenarioFile;
+use super::size::{Size, Values, sweep_name};
 use crate::limits;
 
 /// A scenario whose `$name` values are not chosen yet.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Document {
     value: Value,
-    sweep: SweepSection,
+    sweep: Sweep,
+}
+
+/// Values as a file has them: nothing is shared.
+pub fn written_values(values: &Values) -> BTreeMap<String, Value> {
+    values.iter().map(|(name, value)| (name.clone(), Value::clone(value))).collect()
 }
 
 /// One combination of a sweep.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Case {
     pub seed: u64,
-    /// The value of each `$name`.
-    pub values: BTreeMap<String, Value>,
+    pub values: Values,
+}
+
+/// The sweep of a document.
+#[derive(Clone, Debug, Default, PartialEq)]
+struct Sweep {
+    /// First and last seed.
+    seeds: Option<[u64; 2]>,
+    /// The values of each `$name`.
+    values: BTreeMap<String, Vec<Arc<Value>>>,
 }
 
 impl Document {
@@ -42,7 +60,7 @@ impl Document {
         // Before the sweep is taken out, so that it may have notes as well.
         remove_notes(&mut value);
         let sweep = match value.as_object_mut().and_then(|fields| fields.remove("sweep")) {
-            None => SweepSection::default(),
+            None => Sweep::default(),
             Some(sweep) => sweep_from(sweep)?,
         };
         let document = Self { value, sweep };
@@ -53,7 +71,7 @@ impl Document {
     /// Every combination of the sweep: seeds vary fastest, then the values of the last name.
     pub fn cases(&self) -> Vec<Case> {
         // Starts with one combination of nothing, so that a sweep without values has one case.
-        let mut combinations = vec![BTreeMap::new()];
+        let mut combinations = vec![Values::new()];
         // After each name, `combinations` has every choice for the names so far. The check has
         // bounded the product.
         for (name, values) in &self.sweep.values {
@@ -69,14 +87,13 @@ impl Document {
             combinations = longer;
         }
         let [first, last] = self.sweep.seeds.unwrap_or([0, 0]);
-        let seeded = |values: BTreeMap<String, Value>| {
-            (first..=last).map(move |seed| Case { seed, values: values.clone() })
-        };
+        let seeded =
+            |values: Values| (first..=last).map(move |seed| Case { seed, values: values.clone() });
         combinations.into_iter().flat_map(seeded).collect()
     }
 
     /// The first value of each name.
-    pub fn first_values(&self) -> BTreeMap<String, Value> {
+    pub fn first_values(&self) -> Values {
         let values = self.sweep.values.iter();
         values.map(|(name, values)| (name.clone(), values[0].clone())).collect()
     }
@@ -84,8 +101,10 @@ impl Document {
     /// The scenario with chosen values.
     ///
     /// # Errors
-    /// A name has no value, or the file with these values is malformed.
-    pub fn with(&self, values: &BTreeMap<String, Value>) -> Result<ScenarioFile, FileError> {
+    /// A name has no value, or the file with these values is malformed or too large.
+    pub fn with(&self, values: &Values) -> Result<ScenarioFile, FileError> {
+        // Before the copy: one value of a kilobyte may stand in thousands of places.
+        Size::with_values(&self.value, values).check()?;
         let mut value = self.value.clone();
         replace_names(&mut value, values, &mut String::new())?;
         typed(value, "scenario")
@@ -96,6 +115,12 @@ impl Document {
         // use against the sweep.
         let mut used = BTreeSet::new();
         collect_names(&self.value, &mut used);
+        if self.sweep.values.len() > limits::SWEEP_NAMES {
+            let count = self.sweep.values.len();
+            let most = limits::SWEEP_NAMES;
+            let message = format!("{count} names; at most {most} are accepted");
+            return Err(FileError::new("sweep", message));
+        }
         let mut count: u64 = 1;
         for (name, values) in &self.sweep.values {
             let path = format!("sweep.{name}");
@@ -134,18 +159,19 @@ impl Document {
 }
 
 /// The sweep, field by field, since the path within a flattened map would be lost.
-fn sweep_from(value: Value) -> Result<SweepSection, FileError> {
+fn sweep_from(value: Value) -> Result<Sweep, FileError> {
     let Value::Object(fields) = value else {
         let message = "is no object; write {\"seeds\": [0, 9], \"NAME\": [values]}";
         return Err(FileError::new("sweep", message));
     };
-    let mut sweep = SweepSection::default();
+    let mut sweep = Sweep::default();
     for (name, value) in fields {
         let path = format!("sweep.{name}");
         if name == "seeds" {
             sweep.seeds = Some(typed(value, &path)?);
         } else {
-            sweep.values.insert(name, typed(value, &path)?);
+            let values: Vec<Value> = typed(value, &path)?;
+            sweep.values.insert(name, values.into_iter().map(Arc::new).collect());
         }
     }
     Ok(sweep)
@@ -163,11 +189,6 @@ fn remove_notes(value: &mut Value) {
     }
 }
 
-/// The name of a `$name` string.
-fn sweep_name(text: &str) -> Option<&str> {
-    text.strip_prefix('$').filter(|name| !name.is_empty())
-}
-
 fn collect_names(value: &Value, names: &mut BTreeSet<String>) {
     match value {
         // Only a whole string is a name: `$` within a text stays as it is.
@@ -178,11 +199,7 @@ fn collect_names(value: &Value, names: &mut BTreeSet<String>) {
     }
 }
 
-fn replace_names(
-    value: &mut Value,
-    values: &BTreeMap<String, Value>,
-    path: &mut String,
-) -> Result<(), FileError> {
+fn replace_names(value: &mut Value, values: &Values, path: &mut String) -> Result<(), FileError> {
     let length = path.len();
     match value {
         Value::String(text) => {
@@ -193,7 +210,7 @@ fn replace_names(
                     return Err(FileError::new(path.trim_start_matches('.'), message));
                 };
                 // A chosen value is not searched again: it cannot refer to another name.
-                *value = chosen.clone();
+                *value = Value::clone(chosen);
             }
         }
         Value::Array(items) => {
@@ -236,7 +253,7 @@ mod tests {
         let cases = document.cases();
         assert_eq!(cases.len(), 6);
         // Seeds vary fastest, so the second case has the first value and the second seed.
-        assert_eq!((cases[1].seed, &cases[1].values["v"]), (4, &json!(6)));
+        assert_eq!((cases[1].seed, &cases[1].values["v"]), (4, &Arc::new(json!(6))));
         let file = document.with(&cases[5].values).unwrap();
         assert_eq!(file.actors[0].idm.as_ref().unwrap().speed, 10.0);
     }
@@ -260,5 +277,36 @@ mod tests {
         assert_eq!(path(scenario(json!({"seeds": [0, u64::MAX]}), json!(3))), "sweep");
         assert_eq!(path(scenario(json!({"v": ["fast"]}), json!("$v"))), "actors[0].idm.speed");
         assert_eq!(path(scenario(Value::Null, json!(true))), "sweep");
+    }
+
+    #[test]
+    fn a_value_in_many_places_is_refused_before_it_is_copied() {
+        let many = |times: usize, length: usize| {
+            let actors = vec![json!("$v"); times];
+            Document::from_json(json!({"format": "wildcity.scenario/1", "name": "bomb",
+                                       "twin": {"name": "street"}, "actors": actors,
+                                       "sweep": {"v": ["x".repeat(length)]}}))
+            .unwrap()
+        };
+        // 10,000 times 100 kB: a gigabyte from 160 kB.
+        let bomb = many(10_000, 100_000);
+        let refused = bomb.with(&bomb.first_values()).unwrap_err();
+        assert!(refused.message.contains("with the values of its sweep"), "{refused}");
+        // A scenario within the limit gets to its types, which are wrong here.
+        let small = many(10, 1000);
+        assert_eq!(small.with(&small.first_values()).unwrap_err().path, "actors[0]");
+        // All cases share the one value.
+        let cases = many(1, 1000).cases();
+        assert_eq!(Arc::strong_count(&cases[0].values["v"]), 1);
+    }
+
+    #[test]
+    fn a_scenario_of_many_objects_is_refused_before_its_types() {
+        let parts = vec![json!({}); limits::SCENARIO_OBJECTS + 1];
+        let crowd = json!({"format": "wildcity.scenario/1", "name": "crowd", "end": {"when": {"any": parts}},
+                           "twin": {"name": "street"}});
+        let document = Document::from_json(crowd).unwrap();
+        let refused = document.with(&document.first_values()).unwrap_err();
+        assert!(refused.message.contains("objects"), "{refused}");
     }
 }

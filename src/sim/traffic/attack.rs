@@ -30,6 +30,8 @@ const DRIVABLE_RADPS: f64 = 8.0;
 const NEIGHBOUR_M: f64 = 2.0;
 /// Cost of such a neighbour, in metres.
 const NEIGHBOUR_COST_M: f64 = 0.1;
+/// Above the rounding of a squared distance, in m².
+const SLACK_M: f64 = 1e-6;
 
 /// Settings of an attacker.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -145,15 +147,46 @@ pub fn candidates(speed_mps: f64) -> Vec<Spline> {
     kept
 }
 
-/// The cost of a plan in metres: all points are at the same times.
-pub fn cost_m(plan: &[DVec2], attacked: &[DVec2], neighbours: &[Vec<DVec2>]) -> f64 {
-    let least_m = |other: &[DVec2]| {
+/// The points of a plan, or of a prediction.
+pub type Points = [DVec2; PLAN_POINTS];
+
+/// The costs of plans in metres: the least distance to the attacked body, and more for each
+/// neighbour that comes near. All points are at the same times.
+pub fn costs_m(plans: &[Points], attacked: &Points, neighbours: &[Points]) -> Vec<f64> {
+    let hull = plan_hull(plans);
+    // The times at which a neighbour may be near any plan, from which most have none.
+    let near: Vec<(&Points, Vec<usize>)> = neighbours
+        .iter()
+        .map(|other| {
+            let times = (0..PLAN_POINTS).filter(|at| {
+                let [low_m, high_m] = hull[*at];
+                let away_m = (low_m - other[*at]).max(other[*at] - high_m).max(DVec2::ZERO);
+                away_m.length_squared() < NEIGHBOUR_M * NEIGHBOUR_M + SLACK_M
+            });
+            (other, times.collect())
+        })
+        .filter(|(_, times): &(_, Vec<usize>)| !times.is_empty())
+        .collect();
+    let costs = plans.iter().map(|plan| {
+        // Squares, which have the same order: the root is drawn once.
+        let distances = plan.iter().zip(attacked).map(|(a, b)| a.distance_squared(*b));
+        let least_m = distances.fold(f64::INFINITY, f64::min).sqrt();
         // Point by point and not the nearest of all: the cost is of places at the same time.
-        let distances = plan.iter().zip(other).map(|(a, b)| a.distance(*b));
-        distances.fold(f64::INFINITY, f64::min)
-    };
-    let near = neighbours.iter().filter(|other| least_m(other) < NEIGHBOUR_M).count();
-    least_m(attacked) + NEIGHBOUR_COST_M * near as f64
+        let comes_near = |(other, times): &&(&Points, Vec<usize>)| {
+            let mut squares = times.iter().map(|at| plan[*at].distance_squared(other[*at]));
+            squares.any(|square_m2| square_m2 < NEIGHBOUR_M * NEIGHBOUR_M)
+        };
+        least_m + NEIGHBOUR_COST_M * near.iter().filter(comes_near).count() as f64
+    });
+    costs.collect()
+}
+
+/// The lowest and the highest coordinates of all plans at each time.
+fn plan_hull(plans: &[Points]) -> [[DVec2; 2]; PLAN_POINTS] {
+    std::array::from_fn(|at| {
+        let none = [DVec2::INFINITY, DVec2::NEG_INFINITY];
+        plans.iter().fold(none, |[low_m, high_m], plan| [low_m.min(plan[at]), high_m.max(plan[at])])
+    })
 }
 
 /// The points at which a body is predicted to be, at constant speed and yaw rate, in the same order

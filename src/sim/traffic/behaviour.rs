@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use glam::{DQuat, DVec2, DVec3};
+use glam::{DQuat, DVec3};
 
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::random::Random;
@@ -191,11 +191,11 @@ impl AttackPlan {
         };
         let attacked = predicted(&bodies[0]);
         let others = bodies[1..].iter().filter(|body| body.actor != Some(own.index));
-        let neighbours: Vec<Vec<DVec2>> = others.map(|body| predicted(body).to_vec()).collect();
-        let mut plans: Vec<(f64, Spline)> = attack::candidates(speed_mps)
-            .into_iter()
-            .map(|spline| (attack::cost_m(&spline.points_m(), &attacked, &neighbours), spline))
-            .collect();
+        let neighbours: Vec<attack::Points> = others.map(predicted).collect();
+        let candidates = attack::candidates(speed_mps);
+        let points: Vec<attack::Points> = candidates.iter().map(Spline::points_m).collect();
+        let costs = attack::costs_m(&points, &attacked, &neighbours);
+        let mut plans: Vec<(f64, Spline)> = costs.into_iter().zip(candidates).collect();
         // A stable sort: equal costs keep the order of the candidates.
         plans.sort_by(|a, b| a.0.total_cmp(&b.0));
         // A stream for each plan of each attacker: `plans` is the number of the draw.

@@ -3,6 +3,7 @@
 use glam::{DQuat, DVec3};
 
 use wildcity_scene::Trajectory;
+use wildcity_scene::boxes::{BoxTree, Extent};
 use wildcity_scene::geometry::Pose;
 
 use crate::Ground;
@@ -17,6 +18,8 @@ pub struct Course {
     poses: Vec<Pose>,
     /// Distance of each pose from the first, in metres along the line.
     stations_m: Vec<f64>,
+    /// The boxes of the segments.
+    boxes: BoxTree,
 }
 
 /// The nearest place of a course to a point, and the point's offset from it.
@@ -45,7 +48,20 @@ impl Course {
             }
             kept.push(pose);
         }
-        (kept.len() >= 2).then_some(Self { poses: kept, stations_m })
+        (kept.len() >= 2).then(|| Self::new(kept, stations_m))
+    }
+
+    fn new(poses: Vec<Pose>, stations_m: Vec<f64>) -> Self {
+        let extents = poses.windows(2).map(|pair| {
+            let from_m = pair[0].position_m;
+            let to_m = pair[1].position_m;
+            // A vertical segment has no place on the ground: it is infinitely far from all.
+            let is_vertical = flat(to_m - from_m).length_squared() == 0.0;
+            let nowhere = Extent { low_m: DVec3::INFINITY, high_m: DVec3::NEG_INFINITY };
+            if is_vertical { nowhere } else { Extent::from_line(from_m, to_m) }
+        });
+        let boxes = BoxTree::new(extents);
+        Self { poses, stations_m, boxes }
     }
 
     /// The course of a recorded drive.
@@ -95,10 +111,8 @@ impl Course {
             rotation: (pose.rotation * half_turn).normalize(),
             position_m: pose.position_m,
         };
-        Self {
-            poses: self.poses.iter().rev().map(turned).collect(),
-            stations_m: self.stations_m.iter().rev().map(|s_m| length_m - s_m).collect(),
-        }
+        let stations_m = self.stations_m.iter().rev().map(|s_m| length_m - s_m);
+        Self::new(self.poses.iter().rev().map(turned).collect(), stations_m.collect())
     }
 
     /// Length, in metres.
@@ -146,14 +160,14 @@ impl Course {
         let (last, _) = self.segment(to_m);
         let mut best =
             CourseFootPoint { station_m: from_m, left_m: 0.0, distance_m: f64::INFINITY };
-        for segment in first..=last {
+        let mut test = |segment: usize| {
             let from = self.poses[segment].position_m;
             let way = flat(self.poses[segment + 1].position_m - from);
             let offset = flat(point_m - from);
             let length_m2 = way.length_squared();
             // Two points above each other have no direction on the ground.
             if length_m2 == 0.0 {
-                continue;
+                return best.distance_m;
             }
             let t = (offset.dot(way) / length_m2).clamp(0.0, 1.0);
             let aside = offset - t * way;
@@ -165,8 +179,19 @@ impl Course {
                 let left_m = (way.x * aside.y - way.y * aside.x) / length_m2.sqrt();
                 best = CourseFootPoint { station_m, left_m, distance_m };
             }
-        }
+            best.distance_m
+        };
+        let away_m = |extent: &Extent| flat(extent.away_m(point_m)).length();
+        self.boxes.visit(first..last + 1, f64::INFINITY, &away_m, &mut test);
         best
+    }
+
+    /// The extent of the part between two stations, straight on beyond the ends.
+    pub(super) fn extent(&self, from_m: f64, to_m: f64) -> Extent {
+        let (first, _) = self.segment(from_m);
+        let (last, _) = self.segment(to_m);
+        let ends = Extent::from_line(self.point_m(from_m), self.point_m(to_m));
+        self.boxes.extent(first..last + 1).map_or(ends, |extent| extent.with(ends))
     }
 
     /// The first station from `from_m` to `to_m` at which the course is within `radius_m` of a

@@ -5,6 +5,9 @@ use glam::DVec3;
 use super::course::{Course, flat};
 use super::state::{ActorSpec, ActorState, EgoBox, EgoState};
 
+/// Above the rounding of distances in a city, in metres.
+const SLACK_M: f64 = 1e-6;
+
 /// A box on the ground that an actor may have to follow.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct LeadCandidate {
@@ -64,8 +67,9 @@ impl LeadCandidate {
 
     /// The body of an actor, or of the ego; `None` if it is absent.
     pub(super) fn find(bodies: &[Self], actor: Option<usize>) -> Option<&Self> {
-        // At most 257 bodies, and a script looks for few of them.
-        bodies.iter().find(|body| body.actor.map(usize::from) == actor)
+        // The ego is first, and the actors follow in order of their indices.
+        let index = bodies.binary_search_by_key(&actor, |body| body.actor.map(usize::from));
+        index.ok().map(|index| &bodies[index])
     }
 
     /// Horizontal direction of its length.
@@ -136,6 +140,9 @@ impl LeadCandidate {
 
 /// The nearest candidate ahead in the corridor. Of equally near ones it is the slowest, so that
 /// their order cannot matter.
+///
+/// Most candidates are refused by the box of the corridor. The others are tested by rising distance
+/// until none that is left can be nearer.
 pub(super) fn lead_ahead(
     course: &Course,
     corridor: &Corridor,
@@ -146,14 +153,35 @@ pub(super) fn lead_ahead(
     let [right_m, left_m] = corridor.edges_m;
     let to_m = corridor.station_m + corridor.ahead_m;
     let aside_m = right_m.abs().max(left_m.abs());
-    let mut lead: Option<Lead> = None;
+    let extent = course.extent(corridor.station_m, to_m);
+    // The least gap that each may have, and the body with its reach.
+    let mut near: Vec<(f64, &LeadCandidate, f64)> = Vec::new();
     for body in bodies.iter().filter(|body| body.actor != Some(own)) {
         // A box that is farther away than the corridor is long cannot be in it.
         let reach_m = aside_m + body.half_length_m.hypot(body.half_width_m);
         let farthest_m = corridor.ahead_m + reach_m;
         // Squares, because this test is made for every pair of actors in every sub-step.
-        if (body.center_m - own_m).length_squared() > farthest_m * farthest_m {
+        let way_m = body.center_m - own_m;
+        if way_m.length_squared() > farthest_m * farthest_m {
             continue;
+        }
+        // Nor one that is farther from the box of the corridor than its reach, with a slack for
+        // the rounding of both distances.
+        if flat(extent.away_m(body.center_m)).length_squared() > reach_m * reach_m + SLACK_M {
+            continue;
+        }
+        // The way along the course is at least the straight way to the place beside the body,
+        // which is within its reach.
+        let half_diagonal_m = body.half_length_m.hypot(body.half_width_m);
+        let least_m =
+            flat(way_m).length() - reach_m - half_diagonal_m - corridor.half_length_m - SLACK_M;
+        near.push((least_m, body, reach_m));
+    }
+    near.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
+    let mut lead: Option<Lead> = None;
+    for (least_m, body, reach_m) in near {
+        if lead.is_some_and(|lead| lead.gap_m < least_m) {
+            break;
         }
         let Some(found) = found_in(course, corridor, body, reach_m, to_m) else { continue };
         let is_nearer =

@@ -9,7 +9,7 @@
 //! | `speed`, `distance`, `together` | changes of speed: to a speed, at a distance from another, and to arrive with another |
 //! | `idm`, `lead` | the Intelligent Driver Model, and what an actor follows |
 //! | `attack` | actors that plan their way towards the ego |
-//! | `script`, `condition` | conditions and actions, and the values of conditions |
+//! | `script`, `condition`, `waiting` | conditions and actions, the values of conditions, and the triggers that wait |
 //! | `state` | the states of actors and ego, as contacts and renderer read them |
 
 pub mod attack;
@@ -26,6 +26,7 @@ mod speed;
 mod state;
 mod together;
 mod track;
+mod waiting;
 mod world;
 
 pub use attack::Attack;
@@ -41,4 +42,4 @@ pub use script::{
 pub use state::{ActorSpec, ActorState, EgoBox, EgoState, SubStep};
 pub use together::{ArriveTogether, FinalSpeed};
 pub use track::{Track, TrackError, TrackKeyframe, Tracked};
-pub use world::{Actor, EgoMotion, Traffic, World};
+pub use world::{Actor, EgoMotion, Firing, Traffic, World};

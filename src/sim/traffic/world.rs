@@ -5,6 +5,8 @@
 //! only the states at the start of the sub-step, and each actor has its own stream of random
 //! numbers. So the order of the actors cannot matter.
 
+use std::cell::OnceCell;
+use std::ops::ControlFlow;
 use std::sync::Arc;
 
 use super::behaviour::{Behaviour, Motion, MotionStep, absent};
@@ -13,6 +15,7 @@ use super::follow::Owners;
 use super::lead::LeadCandidate;
 use super::script::{Action, After, Condition, Near, Phase, Trigger};
 use super::state::{ActorSpec, ActorState, EgoBox, EgoState, SubStep};
+use super::waiting::{Gate, Waiting, is_plain, waiting};
 use crate::limits;
 use crate::{DynamicsModel, Ego};
 
@@ -61,7 +64,39 @@ pub struct World {
     progress: Vec<ActorProgress>,
     /// The distances driven since the start: by the ego, then by each actor, in metres.
     travelled_m: Vec<f64>,
+    /// The triggers that have not fired.
+    waiting: Vec<Waiting>,
+    /// The triggers that have fired, and whose actions have not ended: actor and trigger.
+    under_way: Vec<(u16, u16)>,
+    /// The triggers that fired in the last step.
+    firings: Vec<Firing>,
     end: EndState,
+}
+
+/// A trigger that fired in a step.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Firing {
+    /// When, in microseconds.
+    pub time_us: i64,
+    /// Index of the actor.
+    pub actor: u16,
+    /// Index of the trigger within the actor's script.
+    pub trigger: usize,
+}
+
+/// The instant at the start of a sub-step, as the conditions of one actor see it.
+struct Instant<'a> {
+    ego: &'a EgoState,
+    bodies: &'a [LeadCandidate],
+    /// Where the ego is along the actor's course, once it is known: a search along the course, and
+    /// one for all triggers of the actor.
+    ego_station_m: OnceCell<Option<f64>>,
+}
+
+impl<'a> Instant<'a> {
+    fn new(ego: &'a EgoState, bodies: &'a [LeadCandidate]) -> Self {
+        Self { ego, bodies, ego_station_m: OnceCell::new() }
+    }
 }
 
 /// The values of the condition that ends the episode.
@@ -110,7 +145,18 @@ impl World {
             })
             .collect();
         let travelled_m = vec![0.0; progress.len() + 1];
-        Self { traffic, time_us: 0, states, progress, travelled_m, end: EndState::default() }
+        let waiting = waiting(traffic.actors.iter().map(|actor| &actor.script));
+        Self {
+            traffic,
+            time_us: 0,
+            states,
+            progress,
+            travelled_m,
+            waiting,
+            under_way: Vec::new(),
+            firings: Vec::new(),
+            end: EndState::default(),
+        }
     }
 
     /// The actors as they were set up.
@@ -131,16 +177,12 @@ impl World {
     /// The actors at a time before the episode's start, in a warm-up: tracks at their own times,
     /// others in their starting state.
     pub fn states_before(&self, time_us: i64) -> Vec<ActorState> {
-        let start = Self::new(self.traffic.clone());
-        let actors = start.progress.iter().enumerate();
+        let actors = self.traffic.actors.iter().enumerate();
         actors
-            .map(|(index, progress)| match &progress.motion {
-                Motion::Track(_) if progress.spawned => {
-                    progress.motion.state(index, time_us.min(0), None)
-                }
-                Motion::Track(_) | Motion::Follow { .. } | Motion::Attack { .. } => {
-                    start.states[index]
-                }
+            .map(|(index, actor)| {
+                let motion = Motion::begin(&actor.behaviour);
+                let time_us = if matches!(motion, Motion::Track(_)) { time_us.min(0) } else { 0 };
+                if actor.present { motion.state(index, time_us, None) } else { absent(index) }
             })
             .collect()
     }
@@ -148,6 +190,12 @@ impl World {
     /// When a trigger fired, in microseconds; `None` if it has not.
     pub fn fired_us(&self, actor: usize, trigger: usize) -> Option<i64> {
         self.progress.get(actor)?.fired.get(trigger)?.fired_us
+    }
+
+    /// The triggers that fired in the last step, by time; at one time in the order of the actors
+    /// and of their scripts.
+    pub fn firings(&self) -> &[Firing] {
+        &self.firings
     }
 
     /// When the condition held that ends the episode, in microseconds; `None` if it has not.
@@ -169,6 +217,22 @@ impl World {
     /// Advances all actors by `dt_us` microseconds, above 0, in which the ego moves as given. Calls
     /// `each` after each sub-step.
     pub fn step(&mut self, dt_us: i64, ego: &EgoMotion, each: &mut dyn FnMut(&SubStep<'_>)) {
+        let mut go_on = |sub_step: &SubStep<'_>| {
+            each(sub_step);
+            ControlFlow::Continue(())
+        };
+        // It never breaks off.
+        let _done = self.step_while(dt_us, ego, &mut go_on);
+    }
+
+    /// As [`Self::step`], as long as `each` says so. A world whose step broke off is of no use.
+    pub fn step_while(
+        &mut self,
+        dt_us: i64,
+        ego: &EgoMotion,
+        each: &mut dyn FnMut(&SubStep<'_>) -> ControlFlow<()>,
+    ) -> ControlFlow<()> {
+        self.firings.clear();
         // A handle of its own, since `self` is changed while the actors' parameters are read.
         let traffic = self.traffic.clone();
         let begin_us = self.time_us;
@@ -193,7 +257,7 @@ impl World {
                 ego: [ego_now, ego_next],
                 before: &before,
                 after: &after,
-            });
+            })?;
             self.states = after;
             self.time_us = sub_end_us;
             ego_now = ego_next;
@@ -204,6 +268,7 @@ impl World {
             let bodies = self.bodies(&ego_now);
             self.look_for_end(&traffic, &ego_now, &bodies);
         }
+        ControlFlow::Continue(())
     }
 
     /// Evaluates the condition that ends the episode: at each instant once, as an edge or a delay
@@ -220,7 +285,8 @@ impl World {
         }
         // Moved out and back, because `holds` borrows all of `self`.
         let mut state = std::mem::take(&mut self.end.condition);
-        let own = |part: &Condition| self.holds(None, part, ego, bodies);
+        let instant = Instant::new(ego, bodies);
+        let own = |part: &Condition| self.holds(None, part, &instant);
         let holds = state.value(when, self.time_us, &own);
         let now_us = self.time_us;
         self.end =
@@ -241,37 +307,72 @@ impl World {
         // All conditions first and all actions afterwards, so that no trigger sees the effect of
         // another at the same instant.
         let mut firing: Vec<(usize, usize)> = Vec::new();
-        for (index, actor) in traffic.actors.iter().enumerate() {
-            for (at, trigger) in actor.script.iter().enumerate() {
-                let waits = self.progress[index].fired[at].fired_us.is_none();
-                if waits && self.is_due([index, at], &trigger.when, ego, bodies) {
-                    firing.push((index, at));
-                }
+        let mut instant = Instant::new(ego, bodies);
+        let mut of = 0;
+        // Taken instead of borrowed, because conditions change their states.
+        let mut waiting = std::mem::take(&mut self.waiting);
+        waiting.retain(|waits| {
+            let [index, at] = [waits.actor, waits.trigger].map(usize::from);
+            if of != index {
+                (instant, of) = (Instant::new(ego, bodies), index);
             }
-        }
+            let is_due = self.is_open(index, &waits.gate, &instant)
+                && self.is_due([index, at], &traffic.actors[index].script[at].when, &instant);
+            if is_due {
+                firing.push((index, at));
+            }
+            !is_due
+        });
+        self.waiting = waiting;
         for (index, at) in firing {
             let actor = &traffic.actors[index];
             self.progress[index].fired[at].fired_us = Some(self.time_us);
+            self.under_way.push((index as u16, at as u16));
+            let time_us = self.time_us;
+            self.firings.push(Firing { time_us, actor: index as u16, trigger: at });
             for action in &actor.script[at].then {
                 self.progress[index].apply_action(*action, at);
             }
         }
     }
 
+    /// Whether the gate of a trigger of an actor is open: only then its condition may hold.
+    fn is_open(&self, index: usize, gate: &Gate, instant: &Instant<'_>) -> bool {
+        match *gate {
+            Gate::Time(time_us) => self.time_us >= time_us,
+            Gate::After(after) => self.is_after(after),
+            Gate::EgoStation(least_m) => {
+                self.ego_station_m(index, instant).is_some_and(|at_m| at_m >= least_m)
+            }
+            Gate::Station(least_m) => {
+                let place = self.progress[index].motion.course();
+                place.is_some_and(|(_, at_m)| at_m >= least_m)
+            }
+            Gate::EgoSpeed(least_mps) => instant.ego.velocity_mps.length() >= least_mps,
+            Gate::Near(near) => self.is_near(index, near, instant.bodies),
+            Gate::Open => true,
+        }
+    }
+
+    /// Where the ego's box is along the course of an actor, in metres; `None` without a course.
+    fn ego_station_m(&self, index: usize, instant: &Instant<'_>) -> Option<f64> {
+        *instant.ego_station_m.get_or_init(|| {
+            let (course, _) = self.progress[index].motion.course()?;
+            Some(course.nearest(instant.bodies[0].center_m).station_m)
+        })
+    }
+
     /// Whether a trigger that has not fired fires now.
-    fn is_due(
-        &mut self,
-        [index, at]: [usize; 2],
-        when: &Condition,
-        ego: &EgoState,
-        bodies: &[LeadCandidate],
-    ) -> bool {
+    fn is_due(&mut self, [index, at]: [usize; 2], when: &Condition, instant: &Instant<'_>) -> bool {
         // Edges and delays count from then on.
         if !when.after.is_none_or(|after| self.is_after(after)) {
             return false;
         }
+        if is_plain(when) {
+            return self.holds(Some(index), when, instant);
+        }
         let mut state = std::mem::take(&mut self.progress[index].fired[at].condition);
-        let own = |part: &Condition| self.holds(Some(index), part, ego, bodies);
+        let own = |part: &Condition| self.holds(Some(index), part, instant);
         let value = state.value(when, self.time_us, &own);
         self.progress[index].fired[at].condition = state;
         value
@@ -284,16 +385,17 @@ impl World {
 
     /// Notes the triggers all of whose actions have ended.
     fn note_ends(&mut self, time_us: i64) {
-        for progress in &mut self.progress {
+        self.under_way.retain(|(index, at)| {
+            let [index, at] = [*index, *at].map(usize::from);
+            let progress = &mut self.progress[index];
             // An actor that has gone has nothing under way.
             let by = if progress.spawned { progress.motion.owners() } else { Owners::default() };
-            for (at, fired) in progress.fired.iter_mut().enumerate() {
-                let is_new = fired.fired_us.is_some() && fired.ended_us.is_none();
-                if is_new && !by.has(at) {
-                    fired.ended_us = Some(time_us);
-                }
+            let is_under_way = by.has(at);
+            if !is_under_way {
+                progress.fired[at].ended_us = Some(time_us);
             }
-        }
+            is_under_way
+        });
     }
 
     /// Adds the ways of a sub-step.
@@ -310,13 +412,8 @@ impl World {
     }
 
     /// Whether the own parts of a condition hold, of an actor by its index, or of no actor.
-    fn holds(
-        &self,
-        index: Option<usize>,
-        when: &Condition,
-        ego: &EgoState,
-        bodies: &[LeadCandidate],
-    ) -> bool {
+    fn holds(&self, index: Option<usize>, when: &Condition, instant: &Instant<'_>) -> bool {
+        let Instant { ego, bodies, .. } = *instant;
         let course_and_station = index.and_then(|index| self.progress[index].motion.course());
         let course = course_and_station.map(|(course, _)| course);
         let measures = Measures { bodies, travelled_m: &self.travelled_m, course };
@@ -331,7 +428,8 @@ impl World {
             && self.holds_of_own(index, when, bodies)
             && when.measure.is_none_or(|measure| measures.holds(&measure))
             && when.ego_station_m.is_none_or(|least_m| {
-                course.is_some_and(|course| course.nearest(bodies[0].center_m).station_m >= least_m)
+                let station_m = index.and_then(|index| self.ego_station_m(index, instant));
+                station_m.is_some_and(|at_m| at_m >= least_m)
             })
     }
 
@@ -345,30 +443,32 @@ impl World {
         let Some(index) = index else { return true };
         let state = &self.states[index];
         let speed_mps = state.velocity_mps.length();
-        // While this actor has not appeared yet, its distances are measured from the place where it
-        // will appear.
-        let own_m = || {
-            let pose = if state.present {
-                state.world_from_actor
-            } else {
-                self.progress[index].motion.state(index, self.time_us, None).world_from_actor
-            };
-            pose.position_m
-        };
-        let near = |near: Near| {
-            let other_m = match near.actor {
-                None => Some(bodies[0].center_m),
-                Some(other) => {
-                    let other = &self.states[other];
-                    // An absent actor has no place, so that it is never near.
-                    other.present.then_some(other.world_from_actor.position_m)
-                }
-            };
-            other_m.is_some_and(|other_m| other_m.distance(own_m()) <= near.within_m)
-        };
         when.speed_above_mps.is_none_or(|least| state.present && speed_mps >= least)
             && when.speed_below_mps.is_none_or(|most| state.present && speed_mps <= most)
-            && when.near.is_none_or(near)
+            && when.near.is_none_or(|near| self.is_near(index, near, bodies))
+    }
+
+    /// Whether an actor is near another, or the ego.
+    fn is_near(&self, index: usize, near: Near, bodies: &[LeadCandidate]) -> bool {
+        let other_m = match near.actor {
+            None => Some(bodies[0].center_m),
+            Some(other) => {
+                let other = &self.states[other];
+                // An absent actor has no place, so that it is never near.
+                other.present.then_some(other.world_from_actor.position_m)
+            }
+        };
+        let Some(other_m) = other_m else { return false };
+        let state = &self.states[index];
+        // While this actor has not appeared yet, its distances are measured from the place where it
+        // will appear.
+        let own_m = if state.present {
+            state.world_from_actor.position_m
+        } else {
+            let motion = &self.progress[index].motion;
+            motion.state(index, self.time_us, None).world_from_actor.position_m
+        };
+        other_m.distance(own_m) <= near.within_m
     }
 
     /// Advances all actors to the end of a sub-step. Returns their states then.

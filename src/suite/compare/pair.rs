@@ -5,6 +5,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde::Serialize;
 use serde_json::Value;
 
+use wildcity_sim::scenario::written_values;
+
 use crate::case::Case;
 use crate::entry::{EpisodeEntry, Status};
 use crate::result::SuiteResult;
@@ -97,7 +99,7 @@ impl Key {
     }
 
     pub(super) fn from_case(case: &Case) -> Self {
-        Self::new(&case.scenario, &case.values, case.seed)
+        Self::new(&case.scenario, &written_values(&case.values), case.seed)
     }
 }
 

@@ -17,7 +17,7 @@ use wildcity_sim::traffic::{
 
 use crate::vectors::{assert_near, cases, number};
 
-const CAR: ActorBox = ActorBox { length_m: 4.5, width_m: 1.8, height_m: 1.5 };
+pub(super) const CAR: ActorBox = ActorBox { length_m: 4.5, width_m: 1.8, height_m: 1.5 };
 const EGO_BOX: EgoBox = EgoBox { box_: CAR, center_x_m: 1.3 };
 
 pub(super) fn straight(length_m: f64) -> Arc<Course> {

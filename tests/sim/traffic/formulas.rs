@@ -74,19 +74,17 @@ fn streams_of_random_numbers_are_those_of_the_vectors() {
 #[test]
 fn the_cost_of_an_attack_is_that_of_hugsim() {
     let Some(cases) = cases("hugsim", "attack") else { return };
-    let points = |value: &Value| -> Vec<DVec2> {
-        let points = value.as_array().unwrap().iter();
-        points.map(|point| DVec2::new(number(&point[0]), number(&point[1]))).collect()
+    let points = |value: &Value| -> attack::Points {
+        let points = value.as_array().unwrap();
+        std::array::from_fn(|at| DVec2::new(number(&points[at][0]), number(&points[at][1])))
     };
     for case in cases {
         let attacked = points(&case.input["attacked"]);
         let neighbours = case.input["neighbours"].as_array().unwrap();
         let neighbours: Vec<_> = neighbours.iter().map(points).collect();
         let candidates = case.input["candidates"].as_array().unwrap();
-        let costs_m: Vec<f64> = candidates
-            .iter()
-            .map(|plan| attack::cost_m(&points(plan), &attacked, &neighbours))
-            .collect();
+        let plans: Vec<_> = candidates.iter().map(points).collect();
+        let costs_m = attack::costs_m(&plans, &attacked, &neighbours);
         for (cost_m, expected) in costs_m.iter().zip(case.expected["cost"].as_array().unwrap()) {
             assert_near(*cost_m, expected, &case.name);
         }

@@ -2,4 +2,5 @@
 
 mod episodes;
 mod formulas;
+mod loads;
 mod pairs;

@@ -188,7 +188,7 @@ def _samples(folder: Path) -> Iterator[AugmentedSample]:
 def _json(path: Path) -> Any:
     try:
         return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise AugmentedError(f"{path}: {error}") from error
 
 

@@ -68,7 +68,7 @@ class HttpClient:
             connection.close()
         try:
             answer = json.loads(text)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise ProtocolError(f"the answer with HTTP status {status} is not JSON: {text[:200]!r}") from error
         if 200 <= status < 300:
             return answer

@@ -61,7 +61,7 @@ def _named_files(folder: Path, meta: str) -> set[str]:
             raise ValueError(f"{folder / name} has more than {DESCRIPTION_BYTES} bytes")
         try:
             blocks, images = _files_of(json.loads((folder / name).read_bytes()))
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
             raise ValueError(f"{folder / name} is no description of a SOG: {error}") from error
         beside = name[: name.rfind("/") + 1]
         for named in blocks + images:

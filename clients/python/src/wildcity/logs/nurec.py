@@ -72,6 +72,7 @@ def _json(source: Path, name: str) -> Any:
         zlib.error,
         json.JSONDecodeError,
         UnicodeDecodeError,
+        MemoryError,
     ) as error:
         raise LogError(f"{source}, {name}", f"cannot read: {error}", "download it again") from None
 

@@ -42,7 +42,8 @@ def json_file(path: Path, what: str) -> Any:
     """A small JSON file."""
     try:
         return json.loads(text_of(path, what))
-    except json.JSONDecodeError as error:
+    # Thousands of brackets, each within the one before it, exceed the depth of Python's parser.
+    except (json.JSONDecodeError, RecursionError) as error:
         raise LogError(path, f"not JSON: {error}", "download or unpack it again") from None
 
 
