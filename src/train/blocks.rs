@@ -73,7 +73,7 @@ impl Blocks {
         Ok(Self { cells: divided })
     }
 
-    /// Number of blocks.
+    /// How many blocks there are.
     #[allow(clippy::len_without_is_empty, reason = "there is always one")]
     pub fn len(&self) -> usize {
         self.cells.len()

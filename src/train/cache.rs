@@ -8,8 +8,8 @@ use std::sync::{Mutex, PoisonError};
 
 use wildcity_render::View;
 
+use crate::images::{TrainingImage, TrainingImages};
 use crate::poses::Place;
-use crate::run::{TrainingImage, TrainingImages};
 
 /// Images that are decoded once, as far as the budget has room.
 pub struct CachedImages<'a> {

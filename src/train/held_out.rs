@@ -5,16 +5,16 @@ use wildcity_render::gradient::Differentiate;
 use wildcity_render::{Frame, Target};
 use wildcity_scene::{RenderProfile, Scene};
 
-use crate::run::{TrainingImage, TrainingImages};
+use crate::images::{TrainingImage, TrainingImages};
 use crate::trainer::{TrainError, Trainer};
 
 /// An image that was held out, beside what the scene shows in its place.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HeldOut {
     pub name: String,
-    /// Width and height.
+    /// Its width and its height.
     pub size_px: [u32; 2],
-    /// `[height, width, 3]`.
+    /// `[height, width, 3]`: its own colours.
     pub recorded: Vec<u8>,
     /// `[height, width, 3]`, at the pose that is trained and with the exposure that was recorded.
     pub drawn: Vec<u8>,

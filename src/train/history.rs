@@ -2,7 +2,28 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::run::Line;
+/// A step of a run, as a line of JSON.
+#[derive(Clone, Debug, Serialize)]
+pub struct Line {
+    /// Steps that are done.
+    pub step: usize,
+    pub l1: f64,
+    pub dssim: f64,
+    /// In 1/m; 0 without measured depths.
+    pub disparity: f64,
+    /// The mean opacity where the sky is; 0 without a mask of it.
+    pub sky: f64,
+    /// The weighted sum of the ground's terms.
+    pub ground: f64,
+    pub gaussians: usize,
+    /// Since the first step, without evaluations, and without the time that a run was stopped.
+    pub seconds: f64,
+    /// Mean of the images that are held out, at the steps that are evaluated.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub held_out_db: Option<f64>,
+    /// Wall time of each stage of the frame and its gradients, in milliseconds.
+    pub stages_ms: Vec<(&'static str, f64)>,
+}
 
 /// Points of a curve. A page is 1,100 px wide: more could not be told apart.
 const POINTS: usize = 400;

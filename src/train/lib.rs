@@ -5,7 +5,7 @@
 //! | [`check`] | the gradients of this machine against their definition |
 //! | [`loss`] | losses of images, depths and Gaussians, each with its derivatives |
 //! | [`run`] | a run: from images to Gaussians |
-//! | [`cache`] | decoded images that are kept |
+//! | `images`, [`cache`] | its images, and those that are kept decoded |
 //! | [`held_out`] | the images that judge it |
 //! | [`history`], [`page`] | its curves, and all of it as a page |
 //! | [`blocks`] | a route in parts, each of which is a run |
@@ -38,6 +38,7 @@ pub mod ground;
 mod growth;
 pub mod held_out;
 pub mod history;
+mod images;
 pub mod loss;
 pub mod model;
 mod objective;

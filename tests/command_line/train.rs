@@ -169,6 +169,13 @@ fn a_log_becomes_a_twin() {
         dir,
         &[&["log", "generate", "lane", "--twins", "twins", "--out", "log"][..], &small].concat(),
     );
+    let plan = ["train", "plan", "log", "--steps", "40", "--cap", "40000", "--blocks", "2"];
+    let said = done(dir, &plan);
+    for line in
+        ["images     ", "Gaussians  40000 at the beginning", "time       about ", "block 2/2"]
+    {
+        assert!(said.lines().any(|said| said.starts_with(line)), "{said}");
+    }
     let train = ["train", "log", "--out", "lane.ply", "--steps", "40", "--cap", "40000"];
     let twin = ["--twin", "again", "--twins", "twins"];
     let said = done(dir, &[&train[..], &twin].concat());

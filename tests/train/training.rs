@@ -191,3 +191,44 @@ fn a_scene_of_degree_3_is_trained_on() {
     }
     assert_eq!(trainer.model().sh_degree(), 3);
 }
+
+#[test]
+fn gaussians_become_transparent_where_the_sky_is() {
+    let cpu = Cpu::new(0, Simd::Best).unwrap();
+    let (wall, views) = wall();
+    let rgb = image(&cpu, &Scene::from_gaussians(&wall), views[4]);
+    let pixels = views[4].camera.pixels();
+    let is_sky: Vec<bool> = (0..pixels).map(|pixel| pixel % 80 < 40).collect();
+    let opacity = |weight: f64| {
+        let mut settings = Settings { steps: 100, ..Settings::default() };
+        settings.growth.until = 0;
+        settings.growth.from = 0;
+        settings.loss.sky = weight;
+        let mut run = trainer(wall.clone(), settings);
+        for _ in 0..100 {
+            let sky = Some(&is_sky[..]);
+            run.step(&cpu, &Sample { sky, ..sample(views[4], &rgb) }).expect("a step");
+        }
+        let mut sums = [0.0_f64; 2];
+        let frame = Frame {
+            scene: run.model().scene(),
+            profile: &RenderProfile::default(),
+            views: &views[4..5],
+        };
+        let mut keep = |images: &[GaussianImages]| {
+            for (opacity, is_sky) in images[0].opacity.iter().zip(&is_sky) {
+                sums[usize::from(*is_sky)] += f64::from(*opacity);
+            }
+            images.to_vec()
+        };
+        cpu.differentiate(&frame, false, &mut keep, &mut Gradients::default()).expect("an image");
+        sums.map(|sum| sum / (0.5 * pixels as f64))
+    };
+    let [without, with] = [0.0, 1.0].map(opacity);
+    eprintln!("opacity of the wall and the sky: {without:?} without the term, {with:?} with it");
+    assert!(with[1] < 0.5 * without[1] && with[0] > 0.8 * without[0]);
+    let mut run = trainer(wall.clone(), Settings::default());
+    let sky = Some(&is_sky[1..]);
+    let error = run.step(&cpu, &Sample { sky, ..sample(views[4], &rgb) }).unwrap_err();
+    assert!(error.to_string().contains("the sky has 4799 values"), "{error}");
+}

@@ -8,9 +8,8 @@ use std::str::FromStr;
 use anyhow::{Context, ensure};
 use glam::DVec3;
 use wildcity_render::gradient::Differentiate;
-use wildcity_scene::geometry::Bounds;
 use wildcity_scene::{Gaussians, Scene};
-use wildcity_train::blocks::{Blocks, HALO_M, sees};
+use wildcity_train::blocks::{Blocks, sees};
 use wildcity_train::held_out::{held_out_db, scene_db};
 use wildcity_train::run::TrainingImages;
 use wildcity_train::settings::{PoseMode, Settings, SkyMode};
@@ -18,6 +17,7 @@ use wildcity_train::trainer::{Fixed, Start, Trainer};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, Version};
 
+use super::block_parts::Parts;
 use super::checkpoints::{self, Checkpoints};
 use super::images::ChosenImages;
 use super::options::{fraction, read_settings};
@@ -91,12 +91,6 @@ Examples:
   wildcity train block street@1 --images log --block 1/2
   wildcity train block street@1 --images log --block 2/2";
 
-/// Gaussians of a block, at most, that decide which images see it.
-const SAMPLE: usize = 2_000;
-
-/// Gaussians of the twin are drawn behind a block up to this distance from it, in metres.
-const BEHIND_M: f64 = 300.0;
-
 /// A block by its number, counted from 1, and the number of all.
 #[derive(Clone, Copy, Debug)]
 struct BlockOf {
@@ -115,17 +109,6 @@ impl FromStr for BlockOf {
         let expected = || format!("{text:?} is no block: give its number and that of all, as 2/4");
         numbers.filter(is_one).ok_or_else(expected)
     }
-}
-
-/// The Gaussians of a twin as a block sees them.
-struct Parts {
-    /// Those in its cells and near them.
-    moving: Gaussians,
-    /// Those around, which stay.
-    around: Gaussians,
-    /// Means of some in its cells, and of some near them, in metres.
-    own_m: Vec<DVec3>,
-    halo_m: Vec<DVec3>,
 }
 
 impl Block {
@@ -154,7 +137,8 @@ impl Block {
         }
         let parts = Parts::read(&catalog, &base, &blocks, number - 1)?;
         ensure!(!parts.moving.is_empty(), "block {number}/{all} has no Gaussians");
-        let [moving, cap] = [parts.moving.len(), settings.growth.cap];
+        let moving = parts.moving.len();
+        let cap = settings.growth.cap;
         ensure!(
             moving <= cap,
             "block {number}/{all} has {moving} Gaussians, more than --cap {cap}: give a larger one, or more blocks"
@@ -190,8 +174,8 @@ impl Block {
         self.checkpoint.as_deref().map_or(Ok(()), checkpoints::remove_file)
     }
 
-    /// Checks, before a long run, that its result can be published: nobody has changed its cells
-    /// since the version that it begins from.
+    /// Checks, before a long run, that its result can be published: its cells are as they were
+    /// in the version that it begins from.
     fn check_unchanged(
         &self,
         catalog: &Catalog,
@@ -270,7 +254,8 @@ impl Block {
                 _ => Ok(()),
             }
         })?;
-        let [done, steps] = [trainer.steps_done(), trainer.settings().steps];
+        let done = trainer.steps_done();
+        let steps = trainer.settings().steps;
         if done < steps {
             let mut how = "begin anew";
             if let Some(checkpoints) = &checkpoints {
@@ -358,47 +343,4 @@ impl Block {
         settings.check()?;
         Ok(settings)
     }
-}
-
-impl Parts {
-    fn read(
-        catalog: &Catalog,
-        version: &Version,
-        blocks: &Blocks,
-        block: usize,
-    ) -> anyhow::Result<Self> {
-        let sh_degree = version.manifest.sh_degree;
-        let empty = || Gaussians { sh_degree, ..Gaussians::default() };
-        let [mut moving, mut around] = [empty(), empty()];
-        let [mut own_m, mut halo_m] = [Vec::new(), Vec::new()];
-        let is_near = |bounds: &Bounds| {
-            let middle_m = 0.5 * (bounds.min_m + bounds.max_m);
-            let half_m = middle_m.distance(bounds.max_m);
-            blocks.distance_m(block, middle_m) <= BEHIND_M + half_m
-        };
-        catalog.visit_full_detail(version, &is_near, &mut |section| {
-            let distances: Vec<f64> = section
-                .means_m
-                .iter()
-                .map(|mean_m| blocks.distance_m(block, DVec3::from_array(*mean_m)))
-                .collect();
-            let at = |is_one: &dyn Fn(f64) -> bool| {
-                (0..section.len()).filter(|&k| is_one(distances[k])).collect::<Vec<_>>()
-            };
-            let moves = at(&|distance_m| distance_m <= HALO_M);
-            for &k in &moves {
-                let mean_m = DVec3::from_array(section.means_m[k]);
-                if distances[k] > 0.0 { halo_m.push(mean_m) } else { own_m.push(mean_m) }
-            }
-            moving.append(&section.select(moves));
-            around.append(&section.select(at(&|distance_m| distance_m > HALO_M)));
-        })?;
-        Ok(Self { moving, around, own_m: sample(own_m), halo_m: sample(halo_m) })
-    }
-}
-
-/// Some of all points, at equal distances in their list.
-pub(super) fn sample(points_m: Vec<DVec3>) -> Vec<DVec3> {
-    let every = points_m.len().div_ceil(SAMPLE).max(1);
-    points_m.into_iter().step_by(every).collect()
 }

@@ -1,8 +1,10 @@
 //! `wildcity train`.
 
 mod block;
+mod block_parts;
 mod check;
 mod checkpoints;
+mod depths;
 mod images;
 mod lines;
 mod log_images;

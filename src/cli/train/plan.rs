@@ -14,7 +14,7 @@ use wildcity_train::model::peak_bytes;
 use wildcity_train::run::{Line, TrainingImages, run};
 use wildcity_train::trainer::Trainer;
 
-use super::block::sample;
+use super::block_parts::sample;
 use super::images::ChosenImages;
 use super::options::{Inputs, RunOptions};
 use super::progress::{CACHE_BYTES, EVALUATIONS};

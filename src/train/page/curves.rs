@@ -4,7 +4,7 @@ use std::error::Error;
 
 use plotters::prelude::*;
 
-use super::PageError;
+use super::error::PageError;
 use crate::history::{CurvePoint, History};
 
 const SIZE_PX: (u32, u32) = (1_100, 300);
@@ -23,7 +23,7 @@ const COLORS: [RGBColor; CURVES] = [
 /// Most curves of a plot.
 const CURVES: usize = 5;
 
-/// A named line.
+/// A line with its name.
 type Curve<'a> = (&'a str, Vec<(f64, f64)>);
 
 /// PSNR of the images that are held out, over time.

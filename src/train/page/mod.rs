@@ -1,9 +1,8 @@
 //! A run as one HTML page that loads nothing else: pictures are data URLs.
 
 mod curves;
+mod error;
 mod pictures;
-
-use std::error::Error;
 
 use data_encoding::BASE64;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
@@ -13,6 +12,7 @@ use crate::history::Evaluation;
 use crate::poses::PoseMoves;
 use crate::settings::PoseMode;
 use crate::trainer::Trainer;
+pub use error::PageError;
 
 const STYLE: &str = "\
 body{font:15px/1.45 system-ui,sans-serif;max-width:1160px;margin:2em auto;padding:0 1em;color:#111}
@@ -34,23 +34,6 @@ pub struct Contents<'a> {
     pub held_out: &'a [HeldOut],
     /// Names of the rig's cameras.
     pub cameras: &'a [String],
-}
-
-/// Why there is no page.
-#[derive(Debug, thiserror::Error)]
-pub enum PageError {
-    /// A plot cannot be drawn.
-    #[error("a plot of the page: {0}")]
-    Plot(Box<dyn Error + Send + Sync>),
-    /// A picture has not as many values as pixels.
-    #[error("a picture of the page is not of {0} x {1} px")]
-    Size(u32, u32),
-    /// A picture cannot be encoded.
-    #[error("a picture of the page: {0}")]
-    Picture(#[from] image::ImageError),
-    /// The settings cannot be written.
-    #[error("the settings of the page: {0}")]
-    Settings(#[from] toml::ser::Error),
 }
 
 /// The page of a run, without any other file.
@@ -143,7 +126,8 @@ fn poses(moves: &PoseMoves, cameras: &[String], of_rig: bool) -> Markup {
             all.sort_by(f64::total_cmp);
             [all.len() / 2, all.len().saturating_sub(1)].map(|k| all.get(k).copied().unwrap_or(0.0))
         };
-        let [[middle_m, most_m], [middle, most]] = [part(0), part(1)];
+        let [middle_m, most_m] = part(0);
+        let [middle, most] = part(1);
         html! {
             tr {
                 td { (name) }

@@ -4,7 +4,7 @@ use image::codecs::jpeg::JpegEncoder;
 use image::imageops::{self, FilterType};
 use image::{ExtendedColorType, ImageEncoder, RgbImage};
 
-use super::PageError;
+use super::error::PageError;
 
 /// The distance of the last colour of a depth, in metres.
 pub(super) const FAR_M: f32 = 80.0;
