@@ -74,8 +74,7 @@ impl Blocks {
     }
 
     /// How many blocks there are.
-    #[allow(clippy::len_without_is_empty, reason = "there is always one")]
-    pub fn len(&self) -> usize {
+    pub fn count(&self) -> usize {
         self.cells.len()
     }
 

@@ -139,7 +139,7 @@ fn print_blocks(
     images: &dyn TrainingImages,
     points_m: &[DVec3],
 ) -> anyhow::Result<()> {
-    for block in 0..blocks.len() {
+    for block in 0..blocks.count() {
         let owned = blocks.cells(block);
         let is_own = |point_m: &&DVec3| owned.contains(&cell_at(&point_m.to_array()));
         let own_m: Vec<DVec3> = points_m.iter().filter(is_own).copied().collect();
@@ -150,7 +150,7 @@ fn print_blocks(
             out,
             "block {}/{}  {} of 64 m, {} to begin with, seen by {}",
             block + 1,
-            blocks.len(),
+            blocks.count(),
             output::counted(owned.len(), "cell"),
             output::counted(count, "Gaussian"),
             output::counted(seeing, "image")

@@ -134,11 +134,10 @@ impl Catalog {
 
 impl Catalog {
     /// Makes a version with other Gaussians in some cells, such as after training a part of the
-    /// twin, and with all else of an existing one. Gaussians in other cells are left out, and a cell
-    /// without any is no longer there. What
-    /// others have changed in other cells since the base is kept, so that parts can be trained at
-    /// the same time. `how` is added to the options of its provenance. `progress` gets the number
-    /// of Gaussians written and in all.
+    /// twin, and with all else of an existing one. Gaussians in other cells are left out, and a
+    /// cell without any is no longer there. What others have changed in other cells since the base
+    /// is kept, so that parts can be trained at the same time. `how` is added to the options of its
+    /// provenance. `progress` gets the number of Gaussians written and in all.
     ///
     /// # Errors
     /// The Gaussians are out of a twin's bounds; others changed one of the cells since the base
