@@ -230,8 +230,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, TypedDict, Union
 
-from .pose import Pose
+from .pose import Motion, Pose
 '''
+
+# What a class has besides its fields.
+BASES = {"Ego": "Motion"}
 
 
 def python_type(name: str, schema: Schema) -> str:
@@ -255,7 +258,8 @@ def python_type(name: str, schema: Schema) -> str:
         properties[tag] = {**properties[tag], "enum": [part["properties"][tag]["const"] for part in fields]}
         del properties[tag]["const"]
         schema = {**schema, "properties": properties, "required": [tag], "is_merged": True}
-    lines = [f"@dataclass(frozen=True)\nclass {name}:\n", docstring(text_of(schema), "    ")]
+    base = f"({BASES[name]})" if name in BASES else ""
+    lines = [f"@dataclass(frozen=True)\nclass {name}{base}:\n", docstring(text_of(schema), "    ")]
     blank = "\n"
     for field in ordered(name, schema):
         inner = not_null(schema["properties"][field])

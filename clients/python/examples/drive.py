@@ -1,9 +1,8 @@
 """Drives straight ahead through a twin by teleport, and saves the images of all cameras.
 
-python drive.py ws://127.0.0.1:8080/v1/session TWIN [OUT]
+python drive.py 127.0.0.1:8080 TWIN [OUT]
 """
 
-import math
 import sys
 from pathlib import Path
 
@@ -15,14 +14,11 @@ from wildcity import Outputs, Pose
 def main(url: str, twin: str, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     with wildcity.connect(url) as client, client.open(twin, outputs=Outputs(depth=True)) as session:
-        x, y, z = session.opened.start.xyz
-        qw, qx, qy, qz = session.opened.start.q
-        yaw = math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
+        start = session.opened.start
         session.reset(seed=1)
         for step in range(1, 21):
             ahead = 0.5 * step  # metres: 5 m/s at 10 Hz
-            position = (x + ahead * math.cos(yaw), y + ahead * math.sin(yaw), z)
-            observation = session.step(Pose(position, (qw, qx, qy, qz)))
+            observation = session.step(start @ Pose.flat(ahead, 0.0))
             camera, image = next(iter(observation.images.items()))
             farthest_m = observation.depth[camera].max()
             print(f"{observation}: {camera} {image.shape}, farthest {farthest_m:.1f} m")

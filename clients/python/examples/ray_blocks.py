@@ -6,7 +6,7 @@
 
 Each task runs `wildcity train block TWIN@VERSION --block I/BLOCKS` on its own part of the route, with the options that
 follow, and publishes its cells. A task that fails, or whose machine is lost, is tried again and goes on from its last
-checkpoint. The log, the twins (`--twins`, a folder or an object store) and the working directory are shared. 
+checkpoint. The log, the twins (`--twins`, a folder or an object store) and the working directory are shared.
 `WILDCITY_CORES_PER_BLOCK=8` gives each block eight cores (1 without it), and `WILDCITY_GPUS_PER_BLOCK=1` a GPU.
 
 Versions of the twin are made in the order in which blocks end; the last one is the same in any order.

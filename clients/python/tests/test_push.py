@@ -232,7 +232,7 @@ def test_refusals_raise_typed_errors(server: str, tmp_path: Path) -> None:
     assert refused.value.code == "push_refused" and refused.value.report is not None
     assert refused.value.report["files"][0]["bad"] == 1
     with pytest.raises(ValueError, match="http"):
-        wildcity.push(bad, twin="road", server="localhost:8080")
+        wildcity.push(bad, twin="road", server="localhost:8080/v2")
     # Without a server: nothing is sent.
     wrong: list[Any] = [(0, 0), [(0, 0), "all"], "some", [(1, 2, 3)], [(3.5, 0)], ["37"]]
     for cells in wrong:

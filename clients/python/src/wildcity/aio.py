@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from .address import session_url
 from .authorization import authorization_headers
 from .errors import ConnectFailed, Disconnected, Refused, WildCityError
 from .messages import (
@@ -76,13 +77,18 @@ class Client:
     def __init__(
         self, url: str, *, name: str, timeout: float, token: str | None, shared_memory: bool = False, copy: bool = True
     ) -> None:
-        self.url = url
+        self.url = session_url(url)
         self.timeout = timeout
         self._shared_memory = shared_memory
         self._copy = copy
         self._headers = authorization_headers(token)
         self._protocol = SessionProtocol(name)
         self._connection: AsyncTransport | None = None
+
+    def __repr__(self) -> str:
+        if self._connection is None:
+            return f"<Client of {self.url}: closed>"
+        return f"<Client of {self.url}: twins {', '.join(twin.name for twin in self.welcome.twins) or 'none'}>"
 
     async def open(self, twin: str, **options: Unpack[OpenOptions]) -> Session:
         """Opens a session on a twin. Arguments that are None have the default of the server or of the twin.
@@ -201,6 +207,12 @@ class Session:
         self._client = client
         self._protocol = client._protocol
         self._opened = opened
+
+    def __repr__(self) -> str:
+        if self._opened is None:
+            return f"<Session {self.name}: resumed>"
+        cameras = ", ".join(camera.name for camera in self._opened.cameras)
+        return f"<Session {self.name}: twin {self._opened.twin} version {self._opened.version}, cameras {cameras}>"
 
     @property
     def opened(self) -> Opened:

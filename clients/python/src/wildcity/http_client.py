@@ -10,6 +10,7 @@ import urllib.parse
 from collections.abc import Iterator
 from typing import Any
 
+from .address import server_url
 from .authorization import authorization_headers
 from .errors import ConnectFailed, ProtocolError, Refused
 from .protocol import to_json
@@ -24,12 +25,10 @@ class HttpClient:
     """Sends HTTP requests, each on a connection of its own."""
 
     def __init__(self, server: str, token: str | None, timeout: float) -> None:
-        parts = urllib.parse.urlsplit(server)
-        if parts.scheme not in ("http", "https") or not parts.hostname:
-            raise ValueError(f"{server!r} is not a server; expected http://HOST:PORT or https://HOST:PORT")
+        parts = urllib.parse.urlsplit(server_url(server))
         secure = parts.scheme == "https"
         self._connection_type = http.client.HTTPSConnection if secure else http.client.HTTPConnection
-        self._host = parts.hostname
+        self._host = parts.hostname or ""
         self._port = parts.port
         self._timeout = timeout
         self._headers = authorization_headers(token)

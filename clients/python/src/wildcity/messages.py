@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, TypedDict, Union
 
-from .pose import Pose
+from .pose import Motion, Pose
 
 ContactMode = Literal["end", "report", "off"]
 """What contact with the twin does."""
@@ -852,7 +852,7 @@ class Actor:
 
 
 @dataclass(frozen=True)
-class Ego:
+class Ego(Motion):
     """State of the ego vehicle at one time."""
 
     pose: Pose

@@ -6,6 +6,8 @@ observation, view or array of it is gone.
 
 from __future__ import annotations
 
+import base64
+import html
 import math
 import struct
 from collections.abc import Callable, Iterator, Mapping
@@ -145,6 +147,20 @@ class Observation:
         m = self.metadata
         names = ", ".join(image.camera for image in m.images)
         return f"<Observation {m.seq}: step {m.step} at {m.time_us} us, images {names}>"
+
+    def _repr_html_(self) -> str:
+        """The images side by side, for notebooks."""
+        parts = [f"<div>{html.escape(repr(self))}</div>"]
+        for image in self.metadata.images:
+            if image.pose != 0:
+                continue
+            picture = Image.fromarray(_decode_image(self._content, image))
+            picture.thumbnail((320, 320))
+            png = BytesIO()
+            picture.save(png, "PNG")
+            data = base64.b64encode(png.getvalue()).decode()
+            parts.append(f'<img src="data:image/png;base64,{data}" title="{html.escape(image.camera)}">')
+        return "".join(parts)
 
     def _check(self) -> None:
         self._expect("ego.history_xyz", "F32", (HISTORY_POSES, 3))

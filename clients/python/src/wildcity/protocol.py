@@ -34,6 +34,25 @@ class Trajectory:
 
     poses: tuple[TimedPose, ...]
 
+    @classmethod
+    def from_xy(cls, xy: Any, *, every_us: int = 100_000) -> Trajectory:
+        """A plan in the plane: [n, 2] metres ahead of the rig and to its left, one each `every_us` after the start of
+        the step. Each pose heads along the way from the one before."""
+        poses = []
+        before = (0.0, 0.0)
+        yaw = 0.0
+        for index, (x, y) in enumerate(xy):
+            at = (float(x), float(y))
+            way = (at[0] - before[0], at[1] - before[1])
+            # A car that stands keeps its heading.
+            if math.hypot(*way) > 1e-3:
+                yaw = math.atan2(way[1], way[0])
+            before = at
+            poses.append(TimedPose((index + 1) * every_us, Pose.flat(*at, yaw)))
+        if not 1 <= len(poses) <= 64:
+            raise ValueError(f"xy has {len(poses)} points; a plan has 1 to 64")
+        return cls(tuple(poses))
+
 
 @dataclass(frozen=True)
 class Step:

@@ -282,11 +282,9 @@ CONNECT_OPTIONS: dict[str, Any] = {
 
 
 def connect_failed(url: str, error: Exception) -> ConnectFailed:
-    """The reason why there is no connection, with the form of an address if this one has another form."""
-    is_session = url.startswith(("ws://", "wss://")) and url.endswith("/v1/session")
-    hint = "" if is_session else "; the address of a server is ws://HOST:PORT/v1/session"
+    """The reason why there is no connection."""
     reason = refusal_of(error) if isinstance(error, InvalidStatus) else None
-    return ConnectFailed(f"cannot connect to {url}: {reason or error}{hint}")
+    return ConnectFailed(f"cannot connect to {url}: {reason or error}")
 
 
 def refusal_of(error: InvalidStatus) -> str | None:
