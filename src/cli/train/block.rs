@@ -8,7 +8,7 @@ use std::str::FromStr;
 use anyhow::{Context, ensure};
 use glam::DVec3;
 use wildcity_render::gradient::Differentiate;
-use wildcity_scene::{Gaussians, Scene};
+use wildcity_scene::Scene;
 use wildcity_train::blocks::{Blocks, sees};
 use wildcity_train::held_out::{held_out_db, scene_db};
 use wildcity_train::run::TrainingImages;
@@ -30,8 +30,8 @@ use crate::cli::{output, progress};
 
 /// Train one block of a twin in detail: a part of its route, on any machine and in any order.
 ///
-/// First make a coarse twin of the whole recording (`wildcity train LOG --size 0.25 --twin T`),
-/// with its poses and its sky. Then train block 1 of N, 2 of N and so on, here one after the other
+/// First make a coarse twin of the whole recording (`wildcity train LOG --out coarse.ply --size
+/// 0.25 --twin T`), with its poses and its sky. Then train block 1 of N, 2 of N and so on, here one after the other
 /// or on as many machines at the same time: each learns from the images that see its part, with the
 /// poses and the sky of the coarse twin and its Gaussians around, and replaces only its own cells
 /// of 64 m. Name the version of the coarse twin (T@1), and the result is the same in any order.

@@ -52,8 +52,7 @@ pub(super) struct LogImages {
     times_us: Vec<i64>,
     size: f64,
     held_out_every: usize,
-    /// Whether the log marks images as held out.
-    marks_held_out: bool,
+    held_out: Vec<bool>,
     /// Images at times without a pose.
     pub(super) left_out: usize,
 }
@@ -88,14 +87,32 @@ impl LogImages {
             times_us: Vec::new(),
             size,
             held_out_every,
-            marks_held_out: false,
+            held_out: Vec::new(),
             left_out: 0,
         };
         for row in rows {
             all.add(row?)?;
         }
         ensure!(!all.images.is_empty(), "no image of the log has a pose at its time");
+        all.hold_out();
         Ok(all)
+    }
+
+    /// Chooses the images that are held out: those that the log marks, or else the same as
+    /// `wildcity eval --log`, one of some in the order of cameras and then of times.
+    fn hold_out(&mut self) {
+        self.held_out = self.images.iter().map(|image| image.row.held_out).collect();
+        if self.held_out.contains(&true) || self.held_out_every == 0 {
+            return;
+        }
+        let mut order: Vec<usize> = (0..self.images.len()).collect();
+        order.sort_by_key(|&index| {
+            let ImageRow { camera, time_us, .. } = &self.images[index].row;
+            (camera, *time_us)
+        });
+        for index in order.into_iter().step_by(self.held_out_every) {
+            self.held_out[index] = true;
+        }
     }
 
     fn add(&mut self, row: ImageRow) -> anyhow::Result<()> {
@@ -113,7 +130,6 @@ impl LogImages {
         }
         let ego = self.rig.world_from_ego.len() - 1;
         let motion = self.rig.world_from_ego[ego].inverse() * world_from_rig;
-        self.marks_held_out |= row.held_out;
         self.images.push(LoggedImage { row, place: Place { ego, camera, motion } });
         Ok(())
     }
@@ -316,10 +332,7 @@ impl TrainingImages for LogImages {
 
     /// Those that the log marks, or one of some if it marks none.
     fn is_held_out(&self, index: usize) -> bool {
-        if self.marks_held_out {
-            return self.images[index].row.held_out;
-        }
-        self.held_out_every > 0 && index.is_multiple_of(self.held_out_every)
+        self.held_out[index]
     }
 
     fn place(&self, index: usize) -> Option<Place> {

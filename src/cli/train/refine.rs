@@ -1,6 +1,7 @@
 //! `wildcity train refine`.
 
 use std::collections::BTreeMap;
+use std::fs;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
@@ -99,6 +100,13 @@ fn offset_cm(name: &str) -> Option<u32> {
     Some((100.0 * offset_m).round() as u32)
 }
 
+/// Whether a model has repaired the views of a round.
+fn is_repaired(dir: &Path) -> bool {
+    let text = fs::read(dir.join("augment.json")).unwrap_or_default();
+    let json: serde_json::Value = serde_json::from_slice(&text).unwrap_or_default();
+    json.pointer("/made_with/repair").is_some_and(|repair| !repair.is_null())
+}
+
 /// How well the twin shows them.
 fn judged(
     judges: &Judges,
@@ -128,7 +136,7 @@ impl Refine {
         let mut judges = Judges::new();
         for image in rounds.iter().flat_map(|round| round.every(1)) {
             // By its name, so that both sides and all cameras have their share.
-            let is_judge = blake3::hash(image.name.as_bytes()).as_bytes()[0] % JUDGES == 0;
+            let is_judge = blake3::hash(image.name.as_bytes()).as_bytes()[0].is_multiple_of(JUDGES);
             let offset = offset_cm(&image.name).filter(|_| is_judge);
             let images = match offset {
                 Some(offset) => {
@@ -203,12 +211,15 @@ impl Refine {
                 "held out: {before:.2} dB, and {after:.2} dB after {steps} steps, {seconds:.0} s"
             )?;
         }
+        // A twin that has changed can only be less like its own views.
+        let is_repaired = self.augmented.iter().any(|dir| is_repaired(dir));
+        let note = if is_repaired { "" } else { " (its own views: no model has repaired them)" };
         for ((offset, before), (_, after)) in before_off.into_iter().zip(after_off) {
             if let Some((before, after)) = before.zip(after) {
                 let views = output::counted(judges[&offset].count(), "view");
                 writeln!(
                     stdout,
-                    "{:.2} m off the drives, {views} not trained on: {before:.2} dB, and {after:.2} dB",
+                    "{:.2} m off the drives, {views} not trained on: {before:.2} dB, and {after:.2} dB{note}",
                     f64::from(offset) / 100.0
                 )?;
             }

@@ -89,6 +89,8 @@ impl Loop {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let Self { rounds, from, .. } = self;
         ensure!(from <= rounds, "--from {from} is after the last round: --rounds {rounds}");
+        let images = &self.recorded.images;
+        ensure!(images.exists(), "--images {}: there is no such file or folder", images.display());
         for round in from..=rounds {
             writeln!(io::stderr(), "round {round} of {rounds}")?;
             let again = || format!("round {round}: --from {round} goes on");

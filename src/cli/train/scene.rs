@@ -11,6 +11,7 @@ use wildcity_train::held_out::{HeldOut, held_out_images};
 use wildcity_train::page::{Contents, page};
 use wildcity_train::settings::PoseMode;
 use wildcity_train::trainer::{Fixed, Trainer};
+use wildcity_twin::store::check_name;
 
 use super::checkpoints::{self, Checkpoints};
 use super::lines::LinesFile;
@@ -62,6 +63,8 @@ impl TrainScene {
         // clap requires it.
         let out = self.out.as_deref().context("give --out FILE.ply")?;
         check_out(out)?;
+        self.lines.as_ref().map_or(Ok(()), |lines| output::check_folder("--lines", lines))?;
+        self.twin.as_deref().map_or(Ok(()), check_name).context("--twin")?;
         let inputs = self.run.open()?;
         let (trained, images) = self.train(out, inputs)?;
         let trainer = &trained.trainer;
@@ -114,6 +117,8 @@ impl TrainScene {
             let mut stdout = io::stdout().lock();
             writeln!(stdout, "held out: {db:.2} dB after {steps} steps, {seconds:.0} s")?;
         }
+        // Whatever happens until all files are written: --resume only writes them.
+        checkpoints.write(&trainer)?;
         let held_out = held_out_images(&trainer, images, backend, PICTURES)?;
         let held_out_count = images.held_out().len();
         let counts = [images.count() - held_out_count, held_out_count];

@@ -23,6 +23,9 @@ const COLORS: [RGBColor; CURVES] = [
 /// Most curves of a plot.
 const CURVES: usize = 5;
 
+/// What a curve shows of a point.
+type Value = fn(&CurvePoint) -> f64;
+
 /// A line with its name.
 type Curve<'a> = (&'a str, Vec<(f64, f64)>);
 
@@ -34,14 +37,14 @@ pub(super) fn psnr(history: &History) -> Result<String, PageError> {
 
 /// The losses over the steps.
 pub(super) fn losses(history: &History) -> Result<String, PageError> {
-    let values: [(&str, fn(&CurvePoint) -> f64); CURVES] = [
+    let values: [(&str, Value); CURVES] = [
         ("L1", |point| point.l1),
         ("D-SSIM", |point| point.dssim),
         ("disparity, 1/m", |point| point.disparity),
         ("opacity of the sky", |point| point.sky),
         ("ground, weighted", |point| point.ground),
     ];
-    let curve = |(name, value): (&'static str, fn(&CurvePoint) -> f64)| -> Curve<'_> {
+    let curve = |(name, value): (&'static str, Value)| -> Curve<'_> {
         let points = history.points.iter().map(|point| (point.step as f64, value(point)));
         (name, points.collect())
     };

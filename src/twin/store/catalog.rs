@@ -414,7 +414,10 @@ struct Format {
 }
 
 /// Checks that a name can be a twin's, and part of a path.
-pub(super) fn check_name(name: &str) -> Result<(), StoreError> {
+///
+/// # Errors
+/// [`StoreError::Name`]
+pub fn check_name(name: &str) -> Result<(), StoreError> {
     if is_name(name) { Ok(()) } else { Err(StoreError::Name { name: name.to_owned() }) }
 }
 

@@ -79,7 +79,7 @@ mod sky;
 mod views;
 
 pub use actors::{ActorList, AddedActor, DamagedActor, SameName, StoredActor, StoredLevel};
-pub use catalog::{Catalog, DamagedTwin, TwinList, TwinListing, Version};
+pub use catalog::{Catalog, DamagedTwin, TwinList, TwinListing, Version, check_name};
 pub use commit::{Commit, StoredCells};
 pub use cut::{CUT_ABOVE_M, Cut, CutPlace};
 pub use density::check_density;
