@@ -31,10 +31,11 @@ use crate::cli::{output, progress};
 /// Train one block of a twin in detail: a part of its route, on any machine and in any order.
 ///
 /// First make a coarse twin of the whole recording (`wildcity train LOG --out coarse.ply --size
-/// 0.25 --twin T`), with its poses and its sky. Then train block 1 of N, 2 of N and so on, here one after the other
-/// or on as many machines at the same time: each learns from the images that see its part, with the
-/// poses and the sky of the coarse twin and its Gaussians around, and replaces only its own cells
-/// of 64 m. Name the version of the coarse twin (T@1), and the result is the same in any order.
+/// 0.25 --twin T`), with its poses and its sky. Then train block 1 of N, 2 of N and so on, here one
+/// after the other or on as many machines at the same time: each learns from the images that see
+/// its part, with the poses and the sky of the coarse twin and its Gaussians around, and replaces
+/// only its own cells of 64 m. Name the version of the coarse twin (T@1), and the result is the
+/// same in any order.
 ///
 /// Prints the PSNR of held-out images that see both sides of a border, by the block alone and by
 /// the twin: once the blocks beside it are trained, a seam would show as a difference. A Gaussian
