@@ -42,6 +42,7 @@ mod lod;
 #[cfg(feature = "log")]
 mod log;
 mod map;
+mod memory;
 pub mod output;
 #[cfg_attr(not(feature = "http"), allow(dead_code, reason = "only a push packs a folder"))]
 mod packed_folder;

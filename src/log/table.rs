@@ -89,9 +89,8 @@ impl<R: Row> Iterator for Rows<R> {
 /// # Errors
 /// The file cannot be opened, or is larger.
 pub fn open_lines(path: &Path, limit: u64) -> Result<impl BufRead, LogError> {
-    let failed = |error: std::io::Error| LogError::file(path, &error);
-    let file = File::open(path).map_err(failed)?;
-    let length = file.metadata().map_err(failed)?.len();
+    let opened = File::open(path).and_then(|file| Ok((file.metadata()?.len(), file)));
+    let (length, file) = opened.map_err(|error| LogError::file(path, &error))?;
     if length > limit {
         return Err(LogError::malformed(path, format!("{length} bytes; at most {limit} are read")));
     }

@@ -296,7 +296,7 @@ impl UnreadOverlay {
     /// Reads the header of `"data:image/png;base64,.."`.
     ///
     /// # Errors
-    /// As [`Self::from_png`].
+    /// The text is no such URI, or as [`Self::from_png`].
     pub fn from_data_uri(text: &str, camera_px: [u32; 2]) -> Result<Self, AppearanceError> {
         let encoded = text
             .strip_prefix(DATA_URI)
@@ -316,7 +316,7 @@ impl UnreadOverlay {
         self.png.len() as u64 + 12 * self.pixels()
     }
 
-    /// The overlay.
+    /// Decodes its pixels, which takes [`Self::decoding_bytes`].
     ///
     /// # Errors
     /// [`AppearanceError::Overlay`].

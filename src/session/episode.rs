@@ -316,7 +316,7 @@ impl Episode {
         self.seed
     }
 
-    /// Steps done.
+    /// How many steps the ego has made.
     pub fn step(&self) -> u64 {
         self.step
     }

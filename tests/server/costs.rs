@@ -129,7 +129,7 @@ async fn with_tokens(change: impl FnOnce(&mut wildcity_server::Config)) -> TestS
     .await
 }
 
-async fn agent_of(server: &TestServer, token: &str) -> Agent {
+async fn greeted_agent(server: &TestServer, token: &str) -> Agent {
     let mut agent = Agent::connect_as(server.address(), Some(token)).await;
     agent.hello().await;
     agent
@@ -138,11 +138,11 @@ async fn agent_of(server: &TestServer, token: &str) -> Agent {
 #[tokio::test]
 async fn a_recorded_episode_belongs_to_its_token() {
     let server = with_tokens(|_| {}).await;
-    let mut ann = agent_of(&server, ANN).await;
+    let mut ann = greeted_agent(&server, ANN).await;
     ann.open(json!({ "session": "anns", "outputs": { "encoding": "raw" } })).await;
     ann.step(1.0).await;
     let branch = |episode: &str| json!({ "type": "branch", "session": "branch", "from": { "episode": episode, "step": 1 } });
-    let mut bob = agent_of(&server, BOB).await;
+    let mut bob = greeted_agent(&server, BOB).await;
     let hidden = bob.ask(branch("anns-1")).await;
     let missing = bob.ask(branch("none-1")).await;
     refused(&hidden, "unknown_state");
@@ -155,7 +155,7 @@ async fn a_recorded_episode_belongs_to_its_token() {
 #[tokio::test]
 async fn records_of_a_token_have_a_quota() {
     let server = with_tokens(|config| config.limits.records.owner_bytes = 40_000).await;
-    let mut ann = agent_of(&server, ANN).await;
+    let mut ann = greeted_agent(&server, ANN).await;
     ann.open(json!({ "outputs": { "encoding": "raw" } })).await;
     ann.step(1.0).await;
     let noted =
@@ -165,7 +165,7 @@ async fn records_of_a_token_have_a_quota() {
     assert!(answer["message"].as_str().unwrap().contains("--token-records-gib"), "{answer}");
     // Nothing of it is on the disk, the session goes on, and others have quotas of their own.
     ann.step(2.0).await;
-    let mut bob = agent_of(&server, BOB).await;
+    let mut bob = greeted_agent(&server, BOB).await;
     bob.open(json!({ "session": "bobs", "outputs": { "encoding": "raw" } })).await;
     bob.step(1.0).await;
 }
@@ -173,12 +173,12 @@ async fn records_of_a_token_have_a_quota() {
 #[tokio::test]
 async fn one_token_leaves_sessions_to_others() {
     let server = with_tokens(|config| config.limits.sessions = 4).await;
-    let mut ann = agent_of(&server, ANN).await;
+    let mut ann = greeted_agent(&server, ANN).await;
     for name in ["a", "b", "c"] {
         ann.open(json!({ "session": name })).await;
     }
     refused(&ann.try_open(json!({ "session": "d" })).await, "busy");
-    agent_of(&server, BOB).await.open(json!({ "session": "e" })).await;
+    greeted_agent(&server, BOB).await.open(json!({ "session": "e" })).await;
 }
 
 #[tokio::test]

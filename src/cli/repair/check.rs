@@ -11,8 +11,8 @@ use wildcity_repair::{Halo, Image, InputRole, LoadOptions, Model, Provider};
 
 use super::sample::Sample;
 use super::warp_time;
-use crate::cli::output;
 use crate::cli::repair_options::runtime_library;
+use crate::cli::{memory, output};
 
 /// Load a repair model, probe it, and measure it.
 ///
@@ -184,23 +184,17 @@ impl Peak {
     fn start() -> Peak {
         // 5 resets the peak (proc(5)); where that is refused, no memory is reported.
         let is_reset = fs::write("/proc/self/clear_refs", "5").is_ok();
-        Peak { before_kib: status_kib("VmRSS:").filter(|_| is_reset) }
+        Peak { before_kib: memory::status_kib("VmRSS:").filter(|_| is_reset) }
     }
 
     fn text(&self) -> String {
-        match (self.before_kib, status_kib("VmHWM:")) {
+        match (self.before_kib, memory::status_kib("VmHWM:")) {
             (Some(before), Some(peak)) => {
                 format!("{} MiB", peak.saturating_sub(before).div_ceil(1024))
             }
             _ => "unknown".to_owned(),
         }
     }
-}
-
-fn status_kib(field: &str) -> Option<u64> {
-    let status = fs::read_to_string("/proc/self/status").ok()?;
-    let line = status.lines().find_map(|line| line.strip_prefix(field))?;
-    line.split_whitespace().next()?.parse().ok()
 }
 
 fn read_image(path: &Path) -> anyhow::Result<Image> {

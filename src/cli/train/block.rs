@@ -12,7 +12,7 @@ use wildcity_scene::Scene;
 use wildcity_train::blocks::{Blocks, sees};
 use wildcity_train::held_out::{held_out_db, scene_db};
 use wildcity_train::run::TrainingImages;
-use wildcity_train::settings::{PoseMode, Settings, SkyMode};
+use wildcity_train::settings::Settings;
 use wildcity_train::trainer::{Fixed, Start, Trainer};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, Version};
@@ -20,7 +20,7 @@ use wildcity_twin::store::{Catalog, Version};
 use super::block_parts::Parts;
 use super::checkpoints::{self, Checkpoints};
 use super::images::ChosenImages;
-use super::options::{fraction, read_settings};
+use super::options::{fraction, keep_cameras, read_settings};
 use super::progress::train;
 use super::recorded::{RecordedImages, Recording};
 use super::start;
@@ -112,6 +112,15 @@ impl FromStr for BlockOf {
     }
 }
 
+/// What a block is trained on.
+#[derive(Clone, Copy)]
+struct Trained<'a> {
+    base: &'a Version,
+    images: &'a ChosenImages<'a>,
+    parts: &'a Parts,
+    recording: &'a Recording,
+}
+
 impl Block {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let name = &self.edited.twin.name;
@@ -170,7 +179,8 @@ impl Block {
             images.held_out().len(),
             backend.name()
         )?;
-        let trainer = self.train(&catalog, &base, &images, &parts, &recording, settings)?;
+        let what = Trained { base: &base, images: &images, parts: &parts, recording: &recording };
+        let trainer = self.train(&catalog, &what, settings, backend)?;
         self.publish(&catalog, &base, &blocks, &trainer, &across, backend)?;
         self.checkpoint.as_deref().map_or(Ok(()), checkpoints::remove_file)
     }
@@ -204,13 +214,11 @@ impl Block {
     fn train(
         &self,
         catalog: &Catalog,
-        base: &Version,
-        images: &ChosenImages<'_>,
-        parts: &Parts,
-        recording: &Recording,
+        what: &Trained<'_>,
         settings: Settings,
+        backend: &dyn Differentiate,
     ) -> anyhow::Result<Trainer> {
-        let backend = &*self.hardware.training()?;
+        let Trained { base, images, parts, recording } = *what;
         let name = &self.edited.twin.name;
         let sky = Cache::new(catalog.clone()).open(name, Some(base.number))?.sky().cloned();
         let fixed = Fixed { sky, chunks: Scene::from_gaussians(&parts.around).chunks };
@@ -338,9 +346,7 @@ impl Block {
         );
         settings.steps = self.steps.map_or(settings.steps, |steps| steps as usize);
         settings.growth.cap = self.cap.map_or(settings.growth.cap, |cap| cap as usize);
-        settings.poses.mode = PoseMode::Off;
-        settings.sky.mode = SkyMode::Off;
-        settings.exposure.on = false;
+        keep_cameras(&mut settings);
         settings.check()?;
         Ok(settings)
     }

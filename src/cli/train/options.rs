@@ -11,7 +11,7 @@ use wildcity_log::Log;
 use wildcity_scene::RenderProfile;
 use wildcity_scene::align::Alignment;
 use wildcity_train::run::TrainingImages;
-use wildcity_train::settings::{Settings, SkyMode};
+use wildcity_train::settings::{PoseMode, Settings, SkyMode};
 use wildcity_train::trainer::Start;
 
 use super::images::ListedImages;
@@ -186,6 +186,13 @@ fn sky_mode(text: &str) -> Result<SkyMode, String> {
         "off" => Ok(SkyMode::Off),
         _ => Err("expected network or off".to_owned()),
     }
+}
+
+/// Leaves all but the Gaussians as it is: the poses, the sky and the exposures.
+pub(super) fn keep_cameras(settings: &mut Settings) {
+    settings.poses.mode = PoseMode::Off;
+    settings.sky.mode = SkyMode::Off;
+    settings.exposure.on = false;
 }
 
 /// Reads the file of `--settings`.

@@ -18,7 +18,7 @@ use super::block_parts::sample;
 use super::images::ChosenImages;
 use super::options::{Inputs, RunOptions};
 use super::progress::{CACHE_BYTES, EVALUATIONS};
-use crate::cli::output;
+use crate::cli::{memory, output};
 
 /// Say what a run would take, before it runs: images, Gaussians, memory, time, and blocks.
 ///
@@ -92,12 +92,12 @@ impl Plan {
         )?;
         let each = peak_bytes(trainer.model().sh_degree());
         let more = end.saturating_sub(begin) * each + decoded.min(CACHE_BYTES);
-        match peak_resident_bytes() {
-            Some(bytes) => writeln!(
+        match memory::status_kib("VmHWM:") {
+            Some(kib) => writeln!(
                 stdout,
                 "memory     {:.1} GB: {:.1} now, {each} B for each Gaussian more, {:.1} GB of decoded images",
-                1e-9 * (bytes + more) as f64,
-                1e-9 * bytes as f64,
+                1e-9 * (1024.0 * kib as f64 + more as f64),
+                1e-9 * 1024.0 * kib as f64,
                 1e-9 * decoded.min(CACHE_BYTES) as f64
             )?,
             None => writeln!(stdout, "memory     {each} B for each Gaussian")?,
@@ -194,14 +194,6 @@ impl Measured {
     fn step_s(&self, count: usize, measured: usize) -> f64 {
         self.fixed_s + self.gaussians_s * count as f64 / measured.max(1) as f64
     }
-}
-
-/// The most that this process has had in memory, where the system says it.
-fn peak_resident_bytes() -> Option<usize> {
-    let status = std::fs::read_to_string("/proc/self/status").ok()?;
-    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
-    let kib: usize = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
-    kib.checked_mul(1024)
 }
 
 /// A time for a person: seconds, minutes, or hours.

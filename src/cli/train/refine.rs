@@ -14,13 +14,13 @@ use wildcity_scene::{Gaussians, Manifest};
 use wildcity_train::held_out::{held_out_db, held_out_images};
 use wildcity_train::page::Contents;
 use wildcity_train::run::TrainingImages;
-use wildcity_train::settings::{PoseMode, Settings, SkyMode};
+use wildcity_train::settings::Settings;
 use wildcity_train::trainer::{Fixed, Start, Trainer};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, Version};
 
 use super::images::{ListedImages, WithAugmented};
-use super::options::{fraction, read_settings};
+use super::options::{fraction, keep_cameras, read_settings};
 use super::progress::{PICTURES, train};
 use super::recorded::{RecordedImages, Recording};
 use crate::cli::backend_options::HardwareOptions;
@@ -100,11 +100,11 @@ fn offset_cm(name: &str) -> Option<u32> {
     Some((100.0 * offset_m).round() as u32)
 }
 
-/// Whether a model has repaired the views of a round.
-fn is_repaired(dir: &Path) -> bool {
+/// Whether a round says that no model has repaired its views. Views of other programs say nothing.
+fn is_unrepaired(dir: &Path) -> bool {
     let text = fs::read(dir.join("augment.json")).unwrap_or_default();
     let json: serde_json::Value = serde_json::from_slice(&text).unwrap_or_default();
-    json.pointer("/made_with/repair").is_some_and(|repair| !repair.is_null())
+    json.pointer("/made_with/repair").is_some_and(serde_json::Value::is_null)
 }
 
 /// How well the twin shows them.
@@ -212,8 +212,8 @@ impl Refine {
             )?;
         }
         // A twin that has changed can only be less like its own views.
-        let is_repaired = self.augmented.iter().any(|dir| is_repaired(dir));
-        let note = if is_repaired { "" } else { " (its own views: no model has repaired them)" };
+        let are_own = self.augmented.iter().all(|dir| is_unrepaired(dir));
+        let note = if are_own { " (its own views: no model has repaired them)" } else { "" };
         for ((offset, before), (_, after)) in before_off.into_iter().zip(after_off) {
             if let Some((before, after)) = before.zip(after) {
                 let views = output::counted(judges[&offset].count(), "view");
@@ -269,9 +269,7 @@ impl Refine {
             settings = read_settings(path)?;
         }
         settings.steps = self.steps as usize;
-        settings.poses.mode = PoseMode::Off;
-        settings.sky.mode = SkyMode::Off;
-        settings.exposure.on = false;
+        keep_cameras(&mut settings);
         settings.growth.from = 0;
         settings.growth.until = 0;
         settings.growth.noise = 0.0;

@@ -56,7 +56,7 @@ impl RecordedEpisode {
     /// record has the step.
     ///
     /// # Errors
-    /// As [`Self::read`].
+    /// Those of [`Self::read`], for what is read.
     pub(crate) fn read_until(path: &Path, step: u64) -> Result<Self, ReplayError> {
         Self::read_part(path, Some(step))
     }

@@ -76,7 +76,7 @@ pub struct World {
 /// A trigger that fired in a step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Firing {
-    /// When, in microseconds.
+    /// When it fired, in microseconds since the start of the episode.
     pub time_us: i64,
     /// Index of the actor.
     pub actor: u16,

@@ -6,14 +6,14 @@ use std::collections::BTreeSet;
 use glam::DMat3;
 
 use wildcity_scene::align::Alignment;
-use wildcity_scene::manifest::SkyRef;
+use wildcity_scene::manifest::{Provenance, SkyRef};
 use wildcity_scene::{Gaussians, Rig, Trajectory};
 
 use super::log::CommitKind;
 use super::pack::StorageOptions;
 use super::settings::{VersionChange, VersionSettings};
 use super::sky::NewSky;
-use super::{Catalog, StoreError, Version, views};
+use super::{Catalog, Commit, StoreError, Version, views};
 
 /// The changes of an edit.
 #[derive(Clone, Debug)]
@@ -110,11 +110,8 @@ impl Catalog {
         progress: &mut dyn FnMut(u64, u64),
     ) -> Result<Version, StoreError> {
         let manifest = &base.manifest;
-        let storage = StorageOptions { record: manifest.record, levels: manifest.has_levels() };
-        let mut commit = self.begin(&manifest.twin, CommitKind::Import, storage)?;
+        let (mut commit, provenance) = self.begin_training(base, how)?;
         commit.put(gaussians, None, progress)?;
-        let mut provenance = manifest.provenance.for_edit();
-        provenance.options.push(how);
         let settings = VersionSettings {
             profile: manifest.profile,
             rig: manifest.rig.clone(),
@@ -150,14 +147,25 @@ impl Catalog {
         how: String,
         progress: &mut dyn FnMut(u64, u64),
     ) -> Result<Version, StoreError> {
-        let manifest = &base.manifest;
-        let storage = StorageOptions { record: manifest.record, levels: manifest.has_levels() };
-        let mut commit = self.begin(&manifest.twin, CommitKind::Import, storage)?;
+        let (mut commit, provenance) = self.begin_training(base, how)?;
         commit.remove(cells);
         commit.put(gaussians, Some(cells), progress)?;
+        commit.change(base.number, VersionChange::new(provenance))
+    }
+}
+
+impl Catalog {
+    /// Begins a version with other Gaussians, stored as those of the base, and its provenance.
+    fn begin_training(
+        &self,
+        base: &Version,
+        how: String,
+    ) -> Result<(Commit, Provenance), StoreError> {
+        let manifest = &base.manifest;
+        let storage = StorageOptions { record: manifest.record, levels: manifest.has_levels() };
         let mut provenance = manifest.provenance.for_edit();
         provenance.options.push(how);
-        commit.change(base.number, VersionChange::new(provenance))
+        Ok((self.begin(&manifest.twin, CommitKind::Import, storage)?, provenance))
     }
 }
 

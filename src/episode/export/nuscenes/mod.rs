@@ -110,13 +110,16 @@ impl<'a> NuscenesExport<'a> {
         Ok(Self { episode, cameras, channels, frames, images: Vec::new(), out, part })
     }
 
-    /// Adds an image.
+    /// Adds an image of the episode, in any order.
     ///
     /// # Errors
-    /// The file cannot be written.
+    /// The file cannot be written, or the rig does not have the camera.
     pub fn image(&mut self, image: &NuscenesImage<'_>) -> Result<(), ExportError> {
         let NuscenesImage { camera, time_us, world_from_rig, jpeg } = *image;
-        let Some(channel) = self.channels.get(camera) else { return Ok(()) };
+        let channel = self.channels.get(camera).ok_or_else(|| {
+            let cameras = self.channels.len();
+            ExportError::Images(format!("an image of camera {camera} of a rig with {cameras}"))
+        })?;
         // The number keeps two images of one time apart.
         let name = format!("{}-{}", tables::timestamp_us(time_us), self.images.len());
         let file = format!("sweeps/{channel}/{name}.jpg");

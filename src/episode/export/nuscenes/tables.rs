@@ -272,7 +272,7 @@ impl Tables {
     }
 }
 
-/// Index in [`CATEGORIES`].
+/// The row of [`CATEGORIES`] that a class has.
 fn category(class: ActorClass) -> usize {
     match class {
         ActorClass::Vehicle => 0,
@@ -282,7 +282,7 @@ fn category(class: ActorClass) -> usize {
     }
 }
 
-/// Index in [`ATTRIBUTES`].
+/// The row of [`ATTRIBUTES`] that a class has, at rest or moving.
 fn attribute(class: ActorClass, is_moving: bool) -> Option<usize> {
     match (class, is_moving) {
         (ActorClass::Vehicle, true) => Some(0),
