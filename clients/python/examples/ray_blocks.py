@@ -2,14 +2,14 @@
 
     pip install ./clients/python 'ray[default]'
     wildcity train LOG --out coarse.ply --twin TWIN --size 0.25 --cap 500000
-    python ray_blocks.py TWIN LOG BLOCKS [OPTION..]
+    python ray_blocks.py TWIN@1 LOG BLOCKS [OPTION..]
 
-Each task runs `wildcity train block TWIN@VERSION --block I/BLOCKS` on its own part of the route, with the options that
+Each task runs `wildcity train block TWIN@1 --block I/BLOCKS` on its own part of the route, with the options that
 follow, and publishes its cells. A task that fails, or whose machine is lost, is tried again and goes on from its last
 checkpoint. The log, the twins (`--twins`, a folder or an object store) and the working directory are shared.
 `WILDCITY_CORES_PER_BLOCK=8` gives each block eight cores (1 without it), and `WILDCITY_GPUS_PER_BLOCK=1` a GPU.
 
-Versions of the twin are made in the order in which blocks end; the last one is the same in any order.
+A block makes a new version of the twin when it ends; after the last block the twin is the same in any order.
 """
 
 import os

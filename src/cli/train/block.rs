@@ -38,8 +38,8 @@ use crate::cli::{output, progress};
 /// same in any order.
 ///
 /// Prints the PSNR of held-out images that see both sides of a border, by the block alone and by
-/// the twin: once the blocks beside it are trained, a seam would show as a difference. A Gaussian
-/// that moves across a border is kept by the side on which it ends.
+/// the twin: once the blocks beside it are trained, a seam would show as a difference. Gaussians
+/// that have moved out of the cells of the block are dropped, and those that have moved in stay.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(in crate::cli) struct Block {
