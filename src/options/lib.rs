@@ -13,12 +13,14 @@
 pub mod camera;
 mod deserialize;
 mod drive;
+mod lidar;
 mod open;
 mod pose;
 mod sensors;
 pub mod strict;
 
 pub use drive::DriveSection;
+pub use lidar::{LidarBeams, LidarColumns, RigLidar};
 pub use open::{
     ContactMode, Dynamics, DynamicsChoice, DynamicsModel, Encoding, ImagePart, OnFailure, Open,
     Outputs, RandomStart, Repair, Rig, RigCamera, RigChoice, ScenarioChoice, Start,

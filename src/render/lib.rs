@@ -27,6 +27,7 @@ pub mod gradient;
 #[cfg(feature = "gpu")]
 pub mod hybrid;
 pub mod layout;
+pub mod lidar;
 pub mod limits;
 mod normals;
 pub mod reference;
@@ -46,6 +47,7 @@ use wildcity_scene::sky::{CubeMap, DrawableSky, SkyError};
 use wildcity_scene::{Rays, RenderProfile, Rig, Scene, Selection};
 
 use crate::gradient::Differentiate;
+use crate::lidar::{LidarView, Sweep};
 
 pub use view::{RollingShutter, View};
 
@@ -305,6 +307,21 @@ pub trait Backend: Send + Sync {
         targets: &mut [Target<'_>],
         on_view_done: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError>;
+
+    /// The sweep of a LiDAR: of all chunks of the scene, and of actors as
+    /// [`PlacedChunk`] has them at the start and at the end of the sweep. Backends that have no
+    /// kernel of their own compute it as [`cpu`] does.
+    ///
+    /// # Errors
+    /// As [`Backend::render`].
+    fn sweep(
+        &self,
+        scene: &Scene,
+        profile: &RenderProfile,
+        view: &LidarView,
+    ) -> Result<Sweep, RenderError> {
+        Ok(cpu::lidar::sweep(fearless_simd::Level::new(), scene, profile, view))
+    }
 }
 
 impl Frame<'_> {

@@ -30,6 +30,7 @@ mod determinism;
 mod expansion;
 mod gradients;
 mod image_metrics;
+mod lidar;
 mod models;
 mod normals;
 mod others;

@@ -9,6 +9,7 @@
 //! | `overflow` | why a part of a frame was not drawn |
 //! | `batch`, `blend` | match the splats of a tile with its blocks, and blend them |
 //! | `lens` | lenses, windshields and rolling shutters for SIMD |
+//! | `lidar` | sweeps of LiDARs |
 //! | `lanes`, `math` | SIMD vectors and elementary functions |
 //! | `export` | outputs of the stages for another backend |
 //! | `gradient`, `blend_gradient`, `project::gradient` | the stages backwards, for training |
@@ -29,6 +30,7 @@ mod export;
 mod gradient;
 mod lanes;
 mod lens;
+pub(crate) mod lidar;
 mod math;
 mod overflow;
 mod part;
@@ -48,6 +50,7 @@ use parking_lot::{Mutex, MutexGuard};
 use rayon::ThreadPool;
 
 use crate::gradient::Differentiate;
+use crate::lidar::{LidarView, Sweep};
 use crate::limits;
 
 use self::background::Background;
@@ -57,6 +60,7 @@ use self::part::FramePart;
 use super::layout::Cutoffs;
 use super::stage::{Stage, StageOutputs};
 use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target, View};
+use wildcity_scene::{RenderProfile, Scene};
 
 /// The f32 backend.
 #[derive(Debug)]
@@ -291,6 +295,16 @@ impl Backend for Cpu {
             scratch.rasterizer.trim(most_bytes / 4);
             drawn.map(|()| stats)
         })
+    }
+
+    fn sweep(
+        &self,
+        scene: &Scene,
+        profile: &RenderProfile,
+        view: &LidarView,
+    ) -> Result<Sweep, RenderError> {
+        let BusyLane { pool, .. } = self.lane();
+        Ok(pool.install(|| lidar::sweep(self.level, scene, profile, view)))
     }
 }
 

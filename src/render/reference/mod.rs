@@ -7,6 +7,7 @@
 mod background;
 mod blend;
 pub mod gradient;
+mod lidar;
 mod project;
 mod rays;
 
@@ -21,7 +22,8 @@ use wildcity_scene::appearance::{Appearance, Exposure};
 
 use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
 use crate::gradient::Differentiate;
-use wildcity_scene::Rays;
+use crate::lidar::{LidarView, Sweep};
+use wildcity_scene::{Rays, RenderProfile, Scene};
 
 /// The f64 backend.
 #[derive(Clone, Copy, Debug, Default)]
@@ -96,6 +98,15 @@ impl Backend for Reference {
         }
         stats.stages_ms = vec![("project", project_ms), ("rasterize", blend_ms)];
         Ok(stats)
+    }
+
+    fn sweep(
+        &self,
+        scene: &Scene,
+        profile: &RenderProfile,
+        view: &LidarView,
+    ) -> Result<Sweep, RenderError> {
+        Ok(lidar::sweep(scene, profile, view))
     }
 }
 

@@ -6,8 +6,10 @@
 
 pub mod bounds;
 pub mod camera;
+pub mod lidar;
 pub mod pose;
 
 pub use bounds::Bounds;
 pub use camera::{Camera, CameraError};
+pub use lidar::{Lidar, LidarError};
 pub use pose::{Pose, PoseError};

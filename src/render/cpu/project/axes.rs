@@ -37,7 +37,7 @@ pub(super) fn transform_row<S: Simd>(simd: S, points: Vec3x16<S>, row: [f64; 4])
 /// 2(xz - wy)       2(yz + wx)       1 - 2(xx + yy)
 /// ```
 #[inline(always)]
-pub(super) fn rotation_columns<S: Simd>(simd: S, columns: &[Lanes]) -> [Vec3x16<S>; 3] {
+pub(in crate::cpu) fn rotation_columns<S: Simd>(simd: S, columns: &[Lanes]) -> [Vec3x16<S>; 3] {
     matrix_columns(simd, Quaternions::load(simd, columns))
 }
 

@@ -24,7 +24,7 @@
 //! four times as fast.
 
 mod angles;
-mod axes;
+pub(in crate::cpu) mod axes;
 mod color;
 pub(super) mod gradient;
 mod jobs;

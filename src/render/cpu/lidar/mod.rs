@@ -1,0 +1,49 @@
+//! LiDAR sweeps in f32 with SIMD.
+//!
+//! A sweep is divided into *sectors*, runs of columns that look the same way: at most 128 columns
+//! and one radian. A sector finds its *candidates*, Gaussians whose bounding box in the sector's
+//! axes a beam may meet, 16 at a time; bins them to *tiles* of 16 x 16 beams; and compares a row of
+//! 16 beams at a time with each. Beams keep their hits up to the return in order of range
+//! ([`beam`]), so that candidates need no sort but for speed: the nearest come first, and a tile
+//! ends where all of its beams have returned in front of the next.
+//!
+//! Positions are relative to the LiDAR in the middle of the sector, and a response is computed
+//! around the point of the beam that is nearest to the Gaussian's centre, so that f32 loses 1e-5 m
+//! at 100 m.
+
+mod beam;
+mod candidates;
+mod sector;
+mod tile;
+
+use fearless_simd::Level;
+use rayon::prelude::*;
+
+use self::sector::Sector;
+use crate::lidar::{LidarView, Sweep};
+use wildcity_scene::{RenderProfile, Scene};
+
+/// The sweep of a LiDAR. Runs on the current rayon pool; the result does not depend on it.
+pub(crate) fn sweep(
+    level: Level,
+    scene: &Scene,
+    profile: &RenderProfile,
+    view: &LidarView,
+) -> Sweep {
+    let sectors = Sector::split(view);
+    let parts: Vec<Sweep> =
+        sectors.par_iter().map(|sector| sector.sweep(level, scene, profile, view)).collect();
+    let columns = view.lidar.columns();
+    let mut sweep = Sweep::empty(view.lidar.beams());
+    for (sector, part) in sectors.iter().zip(parts) {
+        let width = sector.columns.len();
+        for row in 0..view.lidar.rows() {
+            let to = row * columns + sector.columns.start;
+            let from = row * width..(row + 1) * width;
+            sweep.range_m[to..to + width].copy_from_slice(&part.range_m[from.clone()]);
+            sweep.intensity[to..to + width].copy_from_slice(&part.intensity[from.clone()]);
+            sweep.instance[to..to + width].copy_from_slice(&part.instance[from]);
+        }
+    }
+    sweep
+}

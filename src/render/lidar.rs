@@ -1,0 +1,130 @@
+//! LiDAR sweeps: what the beams of a LiDAR hit.
+//!
+//! **A return is where a beam has lost half of its light.** A Gaussian's alpha on a beam is its
+//! response at the point of the beam that is closest in standard deviations (Wu et al. 2024,
+//! 3DGUT), at most the profile's cap, and 0 below its cut. Gaussians are blended in the order of
+//! these points. The range is the distance to that of the Gaussian with which the transmittance
+//! falls to a half or less. It is not the mean depth, which lies between two surfaces where a beam
+//! grazes the nearer one. A beam that no Gaussian brings to a half has no return.
+//!
+//! Unlike an image, a sweep has no splats: a flat Gaussian on a road that is 1 m long is hit over
+//! all of its length, and the distance of its centre would be up to 1 m off. So every beam is
+//! compared with the Gaussian itself, and no blur is added: beams are thin.
+//!
+//! **Every column has its own time.** Its beams start where the LiDAR is then, and see actors where
+//! those are then ([`Lidar::fraction`]). So a sweep of a moving LiDAR is skewed, as a real one.
+//!
+//! **Intensity** is the mean luminance (ITU-R BT.709) of the Gaussians that a return is made of,
+//! weighted by what each contributes, without the parts of the colour that depend on the direction:
+//! a twin that is trained on images knows nothing of infrared light.
+//!
+//! The reference backend computes this in f64, each beam against each Gaussian; `cpu::lidar` says how
+//! the cpu backend does.
+
+use std::sync::Arc;
+
+use wildcity_scene::actor::PlacedChunk;
+use wildcity_scene::chunk::column;
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::geometry::lidar::Lidar;
+use wildcity_scene::{Chunk, RenderProfile, Scene, sh};
+
+use crate::{FIRST_ACTOR_INSTANCE, TWIN_INSTANCE};
+
+/// The transmittance at which a beam returns.
+pub(crate) const HALF: f64 = 0.5;
+
+/// Shortest standard deviation that a beam can tell from 0, in metres. It keeps f32 from
+/// overflowing; nothing in a city is as thin.
+pub(crate) const THINNEST_M: f64 = 1e-7;
+
+/// A LiDAR with its motion during a sweep.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LidarView {
+    pub lidar: Arc<Lidar>,
+    /// The LiDAR's pose at the sweep's time, when its last column is fired.
+    pub world_from_lidar: Pose,
+    /// Its pose a sweep earlier, when the last column of the previous sweep was fired.
+    pub world_from_lidar_first: Pose,
+}
+
+/// The returns of a sweep, each `[rows, columns]`, row by row.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Sweep {
+    /// Distance along the beam, in metres; 0 without a return.
+    pub range_m: Vec<f32>,
+    /// Mean luminance of what is hit, from 0 up; 0 without a return.
+    pub intensity: Vec<f32>,
+    /// The owner of what is hit, as in [`Target::instances`](crate::Target::instances).
+    pub instance: Vec<u16>,
+}
+
+impl Sweep {
+    pub(crate) fn empty(beams: usize) -> Self {
+        Self { range_m: vec![0.0; beams], intensity: vec![0.0; beams], instance: vec![0; beams] }
+    }
+}
+
+impl LidarView {
+    /// A LiDAR at rest.
+    pub fn at_rest(lidar: Arc<Lidar>, world_from_lidar: Pose) -> Self {
+        Self { lidar, world_from_lidar, world_from_lidar_first: world_from_lidar }
+    }
+
+    /// The LiDAR's pose when a column is fired.
+    pub fn world_from_lidar_at(&self, column: usize) -> Pose {
+        let fraction = self.lidar.fraction(column);
+        self.world_from_lidar_first.interpolate(&self.world_from_lidar, fraction)
+    }
+}
+
+/// Gaussians that move together: the twin, or an actor.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Body<'a> {
+    /// `None` for the twin, whose axes are the world's.
+    pub(crate) placed: Option<&'a PlacedChunk>,
+    pub(crate) instance: u16,
+}
+
+impl Body<'_> {
+    /// The LiDAR's pose in the body's axes when a column is fired.
+    pub(crate) fn body_from_lidar(&self, view: &LidarView, column: usize) -> Pose {
+        let world_from_lidar = view.world_from_lidar_at(column);
+        let Some(placed) = self.placed else { return world_from_lidar };
+        let world_from_body = placed
+            .world_from_actor_at_start
+            .interpolate(&placed.world_from_actor, view.lidar.fraction(column));
+        // The difference of positions first: both may be thousands of kilometres from the origin.
+        let body_from_world = world_from_body.rotation.inverse();
+        Pose {
+            position_m: body_from_world
+                * (world_from_lidar.position_m - world_from_body.position_m),
+            rotation: body_from_world * world_from_lidar.rotation,
+        }
+    }
+}
+
+/// The chunks of a scene with their bodies, in order of global ids.
+pub(crate) fn chunks(scene: &Scene) -> impl Iterator<Item = (Body<'_>, &Chunk)> {
+    let twin = Body { placed: None, instance: TWIN_INSTANCE };
+    let of_twin = scene.chunks.iter().map(move |chunk| (twin, &**chunk));
+    let of_actors = scene.placed.iter().map(|placed| {
+        let instance = FIRST_ACTOR_INSTANCE + placed.actor;
+        (Body { placed: Some(placed), instance }, &*placed.chunk)
+    });
+    of_twin.chain(of_actors)
+}
+
+/// The luminance of a Gaussian's colour, without the parts that depend on the direction; `value`
+/// returns a column of it.
+pub(crate) fn luminance(body: &Body<'_>, value: impl Fn(usize) -> f32) -> f32 {
+    let tint = body.placed.map_or([1.0; 3], |placed| placed.tint);
+    let channel = |c: usize| tint[c] * (sh::C0 as f32 * value(column::SH + c) + 0.5).max(0.0);
+    0.2126 * channel(0) + 0.7152 * channel(1) + 0.0722 * channel(2)
+}
+
+/// The squared number of standard deviations at which alpha falls below the profile's cut, for a
+/// Gaussian's peak opacity; not positive if it is below the cut itself.
+pub(crate) fn reach2(log2_opacity: f64, profile: &RenderProfile) -> f64 {
+    2.0 * std::f64::consts::LN_2 * (log2_opacity - profile.alpha_cut.log2())
+}

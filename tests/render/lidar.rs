@@ -1,0 +1,367 @@
+//! Sweeps of LiDARs: the cpu backend against the definition, and both against surfaces.
+
+use std::f64::consts::{FRAC_PI_2, TAU};
+use std::sync::Arc;
+
+use glam::{DQuat, DVec3};
+use wildcity_generate::StreetSettings;
+use wildcity_options::{LidarBeams, LidarColumns};
+use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_render::lidar::{LidarView, Sweep};
+use wildcity_render::reference::Reference;
+use wildcity_render::{Backend, FIRST_ACTOR_INSTANCE, TWIN_INSTANCE};
+use wildcity_scene::actor::PlacedChunk;
+use wildcity_scene::geometry::{Lidar, Pose};
+use wildcity_scene::{Gaussians, RenderProfile, Scene};
+
+use crate::data::real;
+use crate::images::cpu;
+use crate::streets::street;
+
+/// The tables of four real LiDARs, with every `each`-th column.
+fn tables(each: usize) -> Option<Vec<(String, Lidar)>> {
+    let table = |lidar: &str| {
+        let model = "row-offset-spinning-lidar-model-parameters";
+        let path = real(&format!("rigs/lidar_tables/{model}{lidar}.json"))?;
+        let json: serde_json::Value =
+            serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+        let numbers =
+            |field: &str| -> Vec<f64> { serde_json::from_value(json[field].clone()).unwrap() };
+        let azimuths = numbers("column_azimuths_rad").into_iter().step_by(each);
+        let beams = LidarBeams {
+            row_elevations_rad: numbers("row_elevations_rad"),
+            row_azimuth_offsets_rad: Some(numbers("row_azimuth_offsets_rad")),
+            column_azimuths_rad: Some(azimuths.collect()),
+            columns: None,
+            duration_us: 100_000,
+            min_range_m: None,
+            max_range_m: None,
+        };
+        Some((lidar.to_owned(), Lidar::from_options(&beams).unwrap()))
+    };
+    ["", "-waymo", "-pandaset", "-hesai-at128"].into_iter().map(table).collect()
+}
+
+/// A LiDAR with rows from 10 degrees above to 30 below, and columns all around, clockwise.
+fn spinning(rows: usize, columns: u64) -> Lidar {
+    let row = |row: usize| (10.0 - 40.0 * row as f64 / (rows.max(2) - 1) as f64).to_radians();
+    Lidar::from_options(&LidarBeams {
+        row_elevations_rad: (0..rows).map(row).collect(),
+        row_azimuth_offsets_rad: None,
+        column_azimuths_rad: None,
+        columns: Some(LidarColumns { count: columns, first_rad: 3.1, last_rad: 3.1 - TAU + 0.01 }),
+        duration_us: 100_000,
+        min_range_m: None,
+        max_range_m: None,
+    })
+    .unwrap()
+}
+
+fn sweep(backend: &dyn Backend, scene: &Scene, view: &LidarView) -> Sweep {
+    backend.sweep(scene, &RenderProfile::default(), view).unwrap()
+}
+
+/// Requires that all but a few beams return from the same place, within a millimetre. A beam for
+/// which half of the light is left within the rounding of f32 may return from the next Gaussian.
+fn check_same(found: &Sweep, wanted: &Sweep, what: &str) {
+    let beams = wanted.range_m.len();
+    assert_eq!(found.range_m.len(), beams);
+    let returns = wanted.range_m.iter().filter(|range_m| **range_m > 0.0).count();
+    assert!(4 * returns > beams, "{what}: {returns} returns of {beams} beams test too little");
+    let differs = |at: &usize| {
+        (found.range_m[*at] - wanted.range_m[*at]).abs() > 1e-3
+            || found.instance[*at] != wanted.instance[*at]
+            || (found.intensity[*at] - wanted.intensity[*at]).abs() > 1e-3
+    };
+    let others: Vec<usize> = (0..beams).filter(differs).collect();
+    let most = beams / 1_000;
+    assert!(
+        others.len() <= most,
+        "{what}: {} of {beams} beams differ; the first: {:?}",
+        others.len(),
+        others
+            .iter()
+            .take(5)
+            .map(|at| (*at, found.range_m[*at], wanted.range_m[*at]))
+            .collect::<Vec<_>>()
+    );
+}
+
+/// A scene whose y points down, as a LiDAR with z up sees it, 20 m down the street.
+fn upright() -> Pose {
+    // x of the LiDAR is z of the scene, y is -x, z is -y.
+    let rotation = DQuat::from_rotation_y(-FRAC_PI_2) * DQuat::from_rotation_x(FRAC_PI_2);
+    Pose { position_m: DVec3::new(0.4, 0.0, 20.0), rotation }
+}
+
+/// A street whose Gaussians are so large that few gaps are left between them.
+fn dense_street(count: usize, seed: u64) -> Gaussians {
+    let mut gaussians = street(count, 1, seed);
+    gaussians.ln_scales.as_flattened_mut().iter_mut().for_each(|ln| *ln += 1.5);
+    gaussians
+}
+
+fn scene_of(count: usize, seed: u64) -> Scene {
+    Scene::from_gaussians(&dense_street(count, seed))
+}
+
+/// The street with an actor of 500 Gaussians that drives and turns during the sweep.
+fn with_actor(seed: u64) -> Scene {
+    let mut scene = scene_of(6_000, seed);
+    let mut body = Gaussians::with_capacity(0, 500);
+    for at in 0..500 {
+        let angle = 0.7 * at as f64;
+        body.means_m.push([angle.cos(), angle.sin(), 0.003 * at as f64]);
+        body.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+        body.ln_scales.push([-2.5; 3]);
+        body.logit_opacities.push(3.0);
+        body.sh.extend([0.5; 3]);
+    }
+    let start = Pose { position_m: DVec3::new(-1.0, 0.5, 27.0), rotation: DQuat::IDENTITY };
+    let end =
+        Pose { position_m: DVec3::new(1.0, 0.5, 26.0), rotation: DQuat::from_rotation_y(0.05) };
+    let chunk = Arc::new(Scene::single_chunk(&body));
+    let placed = PlacedChunk::at_rest(chunk, end, 3);
+    scene.placed.push(PlacedChunk { world_from_actor_at_start: start, ..placed });
+    scene
+}
+
+/// As the actor's own test, with a LiDAR at 30 m/s that turns at half a radian a second.
+fn in_motion(lidar: &Lidar) -> LidarView {
+    let last = upright();
+    let first = Pose {
+        position_m: last.position_m - DVec3::new(0.2, 0.0, 3.0),
+        rotation: DQuat::from_rotation_y(0.05) * last.rotation,
+    };
+    LidarView {
+        lidar: Arc::new(lidar.clone()),
+        world_from_lidar: last,
+        world_from_lidar_first: first,
+    }
+}
+
+#[test]
+fn a_sweep_is_that_of_the_definition() {
+    let lidar = spinning(48, 256);
+    for seed in 0..3 {
+        let scene = with_actor(seed);
+        for view in [LidarView::at_rest(Arc::new(lidar.clone()), upright()), in_motion(&lidar)] {
+            let wanted = sweep(&Reference, &scene, &view);
+            let found = sweep(&cpu(), &scene, &view);
+            check_same(&found, &wanted, &format!("seed {seed}"));
+            for instance in [TWIN_INSTANCE, FIRST_ACTOR_INSTANCE + 3] {
+                let count = found.instance.iter().filter(|one| **one == instance).count();
+                assert!(count > 10, "{count} beams see {instance}");
+            }
+        }
+    }
+}
+
+#[test]
+fn the_tables_of_real_lidars_are_cast() {
+    let Some(tables) = tables(16) else { return };
+    let scene = scene_of(4_000, 7);
+    for (name, lidar) in tables {
+        let view = in_motion(&lidar);
+        check_same(&sweep(&cpu(), &scene, &view), &sweep(&Reference, &scene, &view), &name);
+    }
+}
+
+/// Instruction sets differ in the last bit and threads in nothing.
+#[test]
+fn threads_do_not_change_a_sweep() {
+    let scene = with_actor(5);
+    let view = in_motion(&spinning(64, 512));
+    let of = |threads: usize| {
+        let backend = Cpu::new(threads, Simd::Best).unwrap();
+        sweep(&backend, &scene, &view)
+    };
+    let one = of(1);
+    assert!([2, 3, 7].into_iter().all(|threads| of(threads) == one));
+}
+
+/// Needles, sheets, points, an opacity of exactly the cut, the LiDAR inside of a Gaussian, Gaussians
+/// behind it, above it, and far away.
+#[test]
+fn extreme_gaussians_are_met_as_by_the_definition() {
+    let mut gaussians = Gaussians::with_capacity(0, 64);
+    let mut add = |mean: [f64; 3], ln_scale: [f32; 3], quat: [f32; 4], logit: f32| {
+        gaussians.means_m.push(mean);
+        gaussians.ln_scales.push(ln_scale);
+        gaussians.quats_wxyz.push(quat);
+        gaussians.logit_opacities.push(logit);
+        gaussians.sh.extend([0.3; 3]);
+    };
+    let upright = [1.0, 0.0, 0.0, 0.0];
+    // A road, a wall far away, a needle across, one that is very thin, a point.
+    add([10.0, 0.0, -1.8], [2.0, 2.0, -9.0], upright, 9.0);
+    add([150.0, 0.0, 0.0], [-9.0, 4.0, 4.0], upright, 9.0);
+    add([8.0, 2.0, 0.0], [-6.0, 0.5, -6.0], [0.9, 0.3, 0.1, 0.2], 9.0);
+    add([-12.0, 1.0, 0.0], [-16.0, 1.0, 1.0], upright, 9.0);
+    add([4.0, -3.0, 0.5], [-18.0; 3], upright, 9.0);
+    // Around the LiDAR, straight above it, and just behind a sector's edge.
+    add([0.1, 0.1, 0.0], [0.5; 3], upright, 2.0);
+    add([0.0, 0.0, 5.0], [1.0, 1.0, -5.0], upright, 9.0);
+    add([-0.5, 6.0, 0.0], [0.0, -4.0, 1.0], upright, 9.0);
+    // Opacity exactly at the cut: ln((1/255) / (1 - 1/255)).
+    add([6.0, -6.0, 0.0], [0.0; 3], upright, -(254.0_f32.ln()));
+    // 300 faint ones in one place.
+    (0..300).for_each(|_| add([-6.0, -6.0, 0.0], [0.0; 3], upright, -4.0));
+    let scene = Scene::from_gaussians(&gaussians);
+    let rows = (0..40).map(|row| (90.0 - 4.5 * f64::from(row)).to_radians());
+    let steep = Lidar::from_options(&LidarBeams {
+        row_elevations_rad: rows.collect(),
+        ..spinning(40, 180).to_options()
+    })
+    .unwrap();
+    for lidar in [spinning(64, 256), steep] {
+        let pose = Pose { position_m: DVec3::new(0.0, 0.0, 0.01), rotation: DQuat::IDENTITY };
+        let view = LidarView::at_rest(Arc::new(lidar), pose);
+        let wanted = sweep(&Reference, &scene, &view);
+        check_same(&sweep(&cpu(), &scene, &view), &wanted, "extremes");
+        assert!(wanted.range_m.iter().all(|range_m| range_m.is_finite()));
+    }
+}
+
+/// 4,500 km from the origin a sweep is the same.
+#[test]
+fn a_sweep_does_not_depend_on_the_origin() {
+    let near = dense_street(4_000, 2);
+    let mut far = near.clone();
+    let offset = DVec3::new(4.5e6, -3e5, 1e3);
+    let moved = |mean: &[f64; 3]| (DVec3::from_array(*mean) + offset).to_array();
+    far.means_m = near.means_m.iter().map(moved).collect();
+    let view = in_motion(&spinning(48, 256));
+    let place = |pose: Pose| Pose { position_m: pose.position_m + offset, ..pose };
+    let far_view = LidarView {
+        world_from_lidar: place(view.world_from_lidar),
+        world_from_lidar_first: place(view.world_from_lidar_first),
+        ..view.clone()
+    };
+    let found = sweep(&cpu(), &Scene::from_gaussians(&far), &far_view);
+    check_same(&found, &sweep(&cpu(), &Scene::from_gaussians(&near), &view), "far away");
+}
+
+/// The columns of a sweep of a LiDAR in motion are those of LiDARs at rest where it was then.
+#[test]
+fn each_column_is_fired_where_the_lidar_is_then() {
+    let scene = with_actor(9);
+    let view = in_motion(&spinning(32, 128));
+    let whole = sweep(&cpu(), &scene, &view);
+    for column in [0, 1, 63, 127] {
+        let lidar = view.lidar.clone();
+        let mut still = scene.clone();
+        let placed = &mut still.placed[0];
+        let at = placed
+            .world_from_actor_at_start
+            .interpolate(&placed.world_from_actor, lidar.fraction(column));
+        placed.world_from_actor = at;
+        placed.world_from_actor_at_start = at;
+        let then = LidarView::at_rest(lidar.clone(), view.world_from_lidar_at(column));
+        let at_rest = sweep(&cpu(), &still, &then);
+        for row in 0..lidar.rows() {
+            let at = row * lidar.columns() + column;
+            let [one, other] = [&whole, &at_rest].map(|sweep| sweep.range_m[at]);
+            assert!((one - other).abs() < 1e-3, "row {row}, column {column}: {one}, {other}");
+        }
+    }
+}
+
+/// A flat Gaussian of the generator as the rectangle that it stands for.
+struct Surface {
+    middle_m: DVec3,
+    normal: DVec3,
+    /// Unit edges, and half of their lengths.
+    edges: [(DVec3, f64); 2],
+}
+
+/// Standard deviation of a surfel as a fraction of its rectangle's edge, as the generator has it.
+const OVERLAP: f64 = 0.66;
+
+fn surfaces(gaussians: &Gaussians, around_m: DVec3, reach_m: f64) -> Vec<Surface> {
+    let surface = |at: usize| {
+        let middle_m = DVec3::from_array(gaussians.means_m[at]);
+        let scale_m = gaussians.ln_scales[at].map(|ln| f64::from(ln).exp());
+        let [w, x, y, z] = gaussians.quats_wxyz[at].map(f64::from);
+        let rotation = DQuat::from_xyzw(x, y, z, w).normalize();
+        let axes = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| rotation * axis);
+        let thin = (0..3).min_by(|a, b| scale_m[*a].total_cmp(&scale_m[*b]))?;
+        let is_near = middle_m.distance(around_m) < reach_m && scale_m[thin] < 5e-3;
+        let edge = |k: usize| {
+            let axis = (thin + k) % 3;
+            (axes[axis], 0.5 * scale_m[axis] / OVERLAP)
+        };
+        is_near.then(|| Surface { middle_m, normal: axes[thin], edges: [edge(1), edge(2)] })
+    };
+    (0..gaussians.len()).filter_map(surface).collect()
+}
+
+impl Surface {
+    fn range_m(&self, origin_m: DVec3, direction: DVec3) -> Option<f64> {
+        let range_m = (self.middle_m - origin_m).dot(self.normal) / direction.dot(self.normal);
+        let from_middle = origin_m + range_m * direction - self.middle_m;
+        let is_inside = self.edges.iter().all(|(edge, half)| from_middle.dot(*edge).abs() <= *half);
+        (range_m > 0.5 && is_inside).then_some(range_m)
+    }
+}
+
+/// The demo street's own surfaces, by rays against rectangles, and not its Gaussians.
+#[test]
+fn ranges_are_those_of_the_streets_surfaces() {
+    let settings = StreetSettings { seed: 7, length_m: 150.0, crossing_m: 75.0, density: 1.0 };
+    let street = wildcity_generate::street(&settings).unwrap();
+    let frame = &street.trajectory.keyframes[100];
+    let origin_m = frame.world_from_rig.position_m + DVec3::Z * 1.9;
+    let pose = Pose { position_m: origin_m, ..frame.world_from_rig };
+    let reach_m = 60.0;
+    let lidar = Lidar::from_options(&LidarBeams {
+        max_range_m: Some(reach_m),
+        ..spinning(64, 1024).to_options()
+    })
+    .unwrap();
+    let view = LidarView::at_rest(Arc::new(lidar), pose);
+    let found = sweep(&cpu(), &Scene::from_gaussians(&street.gaussians), &view);
+    let surfaces = surfaces(&street.gaussians, origin_m, reach_m + 5.0);
+    // Errors by what is hit: the road, facades, and anything else.
+    let mut errors: [Vec<f64>; 3] = Default::default();
+    let mut missed = 0;
+    let columns = view.lidar.columns();
+    for at in (0..view.lidar.beams()).step_by(61) {
+        let direction = pose.rotation * view.lidar.direction(at / columns, at % columns);
+        let hits = surfaces
+            .iter()
+            .filter_map(|surface| Some((surface.range_m(origin_m, direction)?, surface.normal)));
+        let Some((wanted_m, normal)) = hits.min_by(|a, b| a.0.total_cmp(&b.0)) else { continue };
+        if wanted_m > reach_m {
+            continue;
+        }
+        let kind = match normal.z.abs() {
+            z if z > 0.95 => 0,
+            z if z < 0.05 => 1,
+            _ => 2,
+        };
+        let found_m = f64::from(found.range_m[at]);
+        if found_m == 0.0 {
+            missed += 1;
+        } else {
+            errors[kind].push((found_m - wanted_m).abs());
+        }
+    }
+    for (name, errors) in ["road", "facades", "others"].into_iter().zip(&mut errors) {
+        errors.sort_by(f64::total_cmp);
+        let quantile = |q: f64| errors[(q * (errors.len() - 1) as f64) as usize];
+        eprintln!(
+            "{name}: {} beams, median {:.4} m, 90 % {:.4} m, 99 % {:.3} m",
+            errors.len(),
+            quantile(0.5),
+            quantile(0.9),
+            quantile(0.99)
+        );
+        if name != "others" {
+            assert!(errors.len() > 100, "{} beams on {name} test too little", errors.len());
+            assert!(quantile(0.5) <= 0.02, "{name}: {}", quantile(0.5));
+        }
+    }
+    eprintln!("{missed} beams without a return");
+    assert!(missed < 20, "{missed} beams have no return");
+}
