@@ -87,6 +87,15 @@ pub(crate) struct Body<'a> {
 }
 
 impl Body<'_> {
+    /// Whether two chunks move together.
+    pub(crate) fn is_same(&self, other: &Self) -> bool {
+        match (self.placed, other.placed) {
+            (None, None) => true,
+            (Some(one), Some(other)) => std::ptr::eq(one, other),
+            _ => false,
+        }
+    }
+
     /// The LiDAR's pose in the body's axes when a column is fired.
     pub(crate) fn body_from_lidar(&self, view: &LidarView, column: usize) -> Pose {
         let world_from_lidar = view.world_from_lidar_at(column);

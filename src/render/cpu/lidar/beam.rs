@@ -7,15 +7,17 @@ use crate::lidar::HALF;
 pub(super) struct Hit {
     pub(super) range_m: f32,
     pub(super) alpha: f32,
-    /// Among the candidates of the sector, which are in order of global ids.
-    pub(super) candidate: u32,
+    /// The global id of the Gaussian: its chunk, then its index.
+    pub(super) id: u64,
+    pub(super) luminance: f32,
+    /// As in [`Sweep::instance`](crate::lidar::Sweep::instance).
+    pub(super) instance: u16,
 }
 
 impl Hit {
     /// Whether it is in front of another; at the same range, the order is that of ids.
     fn is_before(&self, other: &Self) -> bool {
-        self.range_m < other.range_m
-            || (self.range_m == other.range_m && self.candidate < other.candidate)
+        self.range_m < other.range_m || (self.range_m == other.range_m && self.id < other.id)
     }
 }
 
@@ -62,14 +64,14 @@ impl Beam {
         self.hits.last().filter(|_| self.returned).map(|(last, _)| last.range_m)
     }
 
-    /// The hit at which the beam returns, and the mean of a value of the candidates up to it,
-    /// weighted by what each contributes.
-    pub(super) fn returned(&self, value: impl Fn(u32) -> f32) -> Option<(Hit, f32)> {
+    /// The hit at which the beam returns, and the mean luminance of the hits up to it, weighted by
+    /// what each contributes.
+    pub(super) fn returned(&self) -> Option<(Hit, f32)> {
         let (last, after) = self.hits.last().filter(|_| self.returned)?;
         let mut before = 1.0;
         let mut sum = 0.0;
         for (hit, after) in &self.hits {
-            sum += before * hit.alpha * value(hit.candidate);
+            sum += before * hit.alpha * hit.luminance;
             before = *after;
         }
         Some((*last, sum / (1.0 - after)))

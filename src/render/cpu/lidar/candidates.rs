@@ -10,9 +10,8 @@ use glam::{Mat3, Quat, Vec3};
 use super::sector::{BodySector, Sector};
 use crate::cpu::lanes::Vec3x16;
 use crate::cpu::project::axes::rotation_columns;
-use crate::lidar::{THINNEST_M, luminance, reach2};
+use crate::lidar::{Body, THINNEST_M, luminance, reach2};
 use wildcity_scene::chunk::{CLUSTER, Cluster, LANES, Lanes, column};
-use wildcity_scene::geometry::lidar::Lidar;
 use wildcity_scene::{Chunk, RenderProfile};
 
 /// A Gaussian that beams of a sector may meet, in the axes of its body.
@@ -28,18 +27,34 @@ pub(super) struct Candidate {
     /// No beam meets it nearer than this, in metres.
     pub(super) nearest_m: f32,
     pub(super) luminance: f32,
-    /// Among the bodies of the sector.
-    pub(super) body: u32,
+    /// The global id: the chunk, then the index.
+    pub(super) id: u64,
+    pub(super) instance: u16,
     /// The rows that may meet it.
     pub(super) rows: [u16; 2],
     /// Smallest and largest tangent of the azimuths that may meet it.
     azimuths: [f32; 2],
 }
 
-/// The candidates of a sector, in order of global ids.
+/// Candidates of one body in a sector that have not been compared with beams yet.
 #[derive(Default)]
 pub(super) struct Candidates {
     pub(super) list: Vec<Candidate>,
+}
+
+/// Candidates after which they are compared with beams: they, and their places in the lists of
+/// tiles, are in memory at once, 4 MB.
+const BATCH: usize = 1 << 15;
+
+/// A cluster, and whose it is.
+#[derive(Clone, Copy)]
+struct ClusterOfChunk<'a> {
+    body: &'a Body<'a>,
+    chunk: &'a Chunk,
+    /// Number of the chunk in the scene.
+    number: usize,
+    /// Number of the cluster in the chunk.
+    cluster: usize,
 }
 
 /// What the tests of one chunk in one sector share.
@@ -72,49 +87,63 @@ struct Bounds {
 }
 
 impl Candidates {
-    /// Adds the Gaussians of a chunk of the last of `bodies` that beams of the sector may meet.
-    pub(super) fn add(
+    /// Adds the Gaussians of a cluster that beams of the sector may meet.
+    fn add(
         &mut self,
         level: Level,
         sector: &Sector,
-        bodies: &[BodySector<'_>],
-        chunk: &Chunk,
+        part: &ClusterOfChunk<'_>,
+        test: &ChunkTest,
         profile: &RenderProfile,
-        lidar: &Lidar,
     ) {
-        let Some((number, body)) = bodies.iter().enumerate().next_back() else { return };
-        let test = ChunkTest::new(sector, body, chunk, profile, lidar);
-        for (cluster, bounds) in chunk.clusters().iter().enumerate() {
-            if !test.may_meet(bounds) {
+        let ClusterOfChunk { body, chunk, number, cluster } = *part;
+        let first = cluster * CLUSTER / LANES;
+        let groups = chunk.len().div_ceil(LANES);
+        for group in first..(first + CLUSTER / LANES).min(groups) {
+            let columns = chunk.lane_group(group);
+            let Some(found) = dispatch!(level, simd => bounds_of(simd, columns, test)) else {
                 continue;
-            }
-            let first = cluster * CLUSTER / LANES;
-            let groups = chunk.len().div_ceil(LANES);
-            for group in first..(first + CLUSTER / LANES).min(groups) {
-                let columns = chunk.lane_group(group);
-                let Some(found) = dispatch!(level, simd => bounds_of(simd, columns, &test)) else {
+            };
+            let mut lanes = found.lanes;
+            while lanes != 0 {
+                let lane = lanes.trailing_zeros() as usize % LANES;
+                lanes &= lanes - 1;
+                let rows =
+                    sector.rows_between(found.elevation_low[lane], found.elevation_high[lane]);
+                // Between two rows.
+                if rows.is_empty() {
                     continue;
-                };
-                let mut lanes = found.lanes;
-                while lanes != 0 {
-                    let lane = lanes.trailing_zeros() as usize % LANES;
-                    lanes &= lanes - 1;
-                    let rows =
-                        sector.rows_between(found.elevation_low[lane], found.elevation_high[lane]);
-                    // Between two rows.
-                    if rows.is_empty() {
-                        continue;
-                    }
-                    let luminance = luminance(&body.body, |column| columns[column].0[lane]);
-                    let nearest_m = found.nearest_m[lane];
-                    self.list.push(Candidate {
-                        luminance,
-                        nearest_m,
-                        body: number as u32,
-                        rows: [rows.start as u16, rows.end as u16],
-                        azimuths: [found.azimuth_low[lane], found.azimuth_high[lane]],
-                        ..Candidate::new(columns, lane, &test, profile)
-                    });
+                }
+                self.list.push(Candidate {
+                    luminance: luminance(body, |column| columns[column].0[lane]),
+                    nearest_m: found.nearest_m[lane],
+                    id: (number as u64) << 32 | (group * LANES + lane) as u64,
+                    instance: body.instance,
+                    rows: [rows.start as u16, rows.end as u16],
+                    azimuths: [found.azimuth_low[lane], found.azimuth_high[lane]],
+                    ..Candidate::new(columns, lane, test, profile)
+                });
+            }
+        }
+    }
+
+    /// Finds the Gaussians of a chunk that beams of the sector may meet, and calls `compare` with
+    /// them whenever there are many.
+    pub(super) fn find(
+        &mut self,
+        level: Level,
+        seen: &BodySector<'_>,
+        (number, chunk): (usize, &Chunk),
+        profile: &RenderProfile,
+        mut compare: impl FnMut(&mut Self),
+    ) {
+        let test = ChunkTest::new(seen, chunk, profile);
+        for (cluster, bounds) in chunk.clusters().iter().enumerate() {
+            if test.may_meet(bounds) {
+                let part = ClusterOfChunk { body: &seen.body, chunk, number, cluster };
+                self.add(level, seen.sector, &part, &test, profile);
+                if self.list.len() >= BATCH {
+                    compare(self);
                 }
             }
         }
@@ -177,7 +206,8 @@ impl Candidate {
             reach2: reach2(log2_opacity.into(), profile) as f32,
             nearest_m: 0.0,
             luminance: 0.0,
-            body: 0,
+            id: 0,
+            instance: 0,
             rows: [0; 2],
             azimuths: [0.0; 2],
         }
@@ -185,26 +215,21 @@ impl Candidate {
 }
 
 impl ChunkTest {
-    fn new(
-        sector: &Sector,
-        body: &BodySector<'_>,
-        chunk: &Chunk,
-        profile: &RenderProfile,
-        lidar: &Lidar,
-    ) -> Self {
-        let rows = body.sector_from_body.transpose().to_cols_array_2d();
+    fn new(seen: &BodySector<'_>, chunk: &Chunk, profile: &RenderProfile) -> Self {
+        let sector = seen.sector;
+        let rows = seen.sector_from_body.transpose().to_cols_array_2d();
         let spans = &sector.tile_spans;
         let low = spans.iter().map(|span| span[0]).fold(f32::INFINITY, f32::min);
         let high = spans.iter().map(|span| span[1]).fold(f32::NEG_INFINITY, f32::max);
         Self {
             axes: rows.map(|row| row.map(|value| value as f32)),
-            middle_m: body.middle_from(chunk.origin_m()).as_vec3().to_array(),
+            middle_m: seen.middle_from(chunk.origin_m()).as_vec3().to_array(),
             // A millimetre covers the rounding of f32 at a kilometre.
-            moved_m: body.moved_m as f32 + 1e-3,
-            turned_rad: body.turned_rad as f32 + 1e-6,
+            moved_m: seen.moved_m as f32 + 1e-3,
+            turned_rad: seen.turned_rad as f32 + 1e-6,
             azimuths: [low, high],
             elevations: sector.elevation_tangents(),
-            max_range_m: lidar.max_range_m() as f32,
+            max_range_m: seen.sector.max_range_m,
             alpha_cut_log2: profile.alpha_cut.log2() as f32,
             sigmas: reach2(0.0, profile).max(0.0).sqrt() as f32,
         }

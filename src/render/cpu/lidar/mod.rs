@@ -17,9 +17,10 @@ mod sector;
 mod tile;
 
 use fearless_simd::Level;
+use parking_lot::Mutex;
 use rayon::prelude::*;
 
-use self::sector::Sector;
+use self::sector::{Scratch, Sector};
 use crate::lidar::{LidarView, Sweep};
 use wildcity_scene::{RenderProfile, Scene};
 
@@ -31,8 +32,15 @@ pub(crate) fn sweep(
     view: &LidarView,
 ) -> Sweep {
     let sectors = Sector::split(view);
-    let parts: Vec<Sweep> =
-        sectors.par_iter().map(|sector| sector.sweep(level, scene, profile, view)).collect();
+    // As many as there are threads; rayon's own states are made anew for each piece of work.
+    let free: Mutex<Vec<Scratch>> = Mutex::default();
+    let part = |sector: &Sector| {
+        let mut scratch = free.lock().pop().unwrap_or_default();
+        let part = sector.sweep(level, &mut scratch, scene, profile, view);
+        free.lock().push(scratch);
+        part
+    };
+    let parts: Vec<Sweep> = sectors.par_iter().map(part).collect();
     let columns = view.lidar.columns();
     let mut sweep = Sweep::empty(view.lidar.beams());
     for (sector, part) in sectors.iter().zip(parts) {

@@ -10,11 +10,11 @@ use super::tile::Tile;
 use crate::lidar::{Body, LidarView, Sweep, chunks};
 use wildcity_scene::chunk::LANES;
 use wildcity_scene::geometry::Pose;
-use wildcity_scene::{RenderProfile, Scene};
+use wildcity_scene::{Chunk, RenderProfile, Scene};
 
-/// Most columns of a sector: 8 tiles. A tenth of a second of 30 m/s is 3 m, of which a sector of a
-/// sweep of 2,048 columns has 0.19 m.
-const MOST_COLUMNS: usize = 128;
+/// Most columns of a sector: 4 tiles. A tenth of a second of 30 m/s is 3 m, of which a sector of a
+/// sweep of 2,048 columns has 0.09 m.
+const MOST_COLUMNS: usize = 64;
 
 /// Largest angle between the azimuths of a sector, in radians. Row offsets alone may span 1 rad.
 const MOST_RAD: f64 = 1.05;
@@ -35,14 +35,25 @@ pub(super) struct Sector {
     pub(super) tile_spans: Vec<[f32; 2]>,
     /// Tangents of the rows' elevations, rising or falling.
     row_tangents: Vec<f32>,
+    /// The LiDAR's range.
+    pub(super) min_range_m: f32,
+    pub(super) max_range_m: f32,
     /// Cosine and sine of each row's elevation, and those of its azimuth offset.
     row_angles: Vec<[f64; 4]>,
     /// Cosine and sine of the azimuth of each column of the first row.
     column_angles: Vec<[f64; 2]>,
 }
 
+/// Memory that sectors fill one after the other.
+#[derive(Default)]
+pub(super) struct Scratch {
+    candidates: Candidates,
+    tiles: Vec<Tile>,
+}
+
 /// A sector as one body sees it.
 pub(super) struct BodySector<'a> {
+    pub(super) sector: &'a Sector,
     pub(super) body: Body<'a>,
     /// The LiDAR's pose in the body's axes when each column is fired.
     pub(super) poses: Vec<Pose>,
@@ -117,6 +128,8 @@ impl Sector {
             tile_spans: tile_tangents.iter().map(span).collect(),
             tile_tangents,
             row_tangents: view.lidar.row_elevations_rad().iter().map(tangent).collect(),
+            min_range_m: view.lidar.min_range_m() as f32,
+            max_range_m: view.lidar.max_range_m() as f32,
             row_angles: (0..view.lidar.rows()).map(|row| row_angles(view, row)).collect(),
             column_angles: columns.clone().map(|column| column_angles(view, column)).collect(),
             columns,
@@ -160,7 +173,7 @@ impl Sector {
     }
 
     /// This sector as a body sees it.
-    fn seen_from<'a>(&self, body: Body<'a>, view: &LidarView) -> BodySector<'a> {
+    fn seen_from<'a>(&'a self, body: Body<'a>, view: &LidarView) -> BodySector<'a> {
         let at = |column| body.body_from_lidar(view, column);
         let poses: Vec<Pose> = self.columns.clone().map(at).collect();
         let middle = poses[poses.len() / 2];
@@ -173,6 +186,7 @@ impl Sector {
         let lidar_from_sector = DMat3::from_rotation_z(self.middle_rad);
         let body_from_sector = middle.rotation_matrix() * lidar_from_sector;
         BodySector {
+            sector: self,
             body,
             middle,
             sector_from_body: body_from_sector.transpose(),
@@ -186,33 +200,62 @@ impl Sector {
     pub(super) fn sweep(
         &self,
         level: Level,
+        scratch: &mut Scratch,
         scene: &Scene,
         profile: &RenderProfile,
         view: &LidarView,
     ) -> Sweep {
-        let mut candidates = Candidates::default();
-        let mut bodies: Vec<BodySector<'_>> = Vec::new();
-        for (body, chunk) in chunks(scene) {
-            // Chunks of one body follow each other; an actor of several is seen anew for each.
-            if bodies.is_empty() || body.placed.is_some() {
-                bodies.push(self.seen_from(body, view));
+        let rows = view.lidar.rows();
+        let tiles = self.tile_spans.len();
+        let Scratch { candidates, tiles: beams } = scratch;
+        let count = tiles * rows.div_ceil(LANES);
+        beams.resize_with(count.max(beams.len()), Tile::default);
+        let beams = &mut beams[..count];
+        for (at, tile) in beams.iter_mut().enumerate() {
+            let first_column = self.columns.start + at % tiles * LANES;
+            tile.begin(self, view, at / tiles * LANES, first_column);
+        }
+        for chunks in by_body(scene) {
+            let seen = self.seen_from(chunks[0].1, view);
+            let mut compare = |candidates: &mut Candidates| {
+                let lists = candidates.by_tile(level, self, rows);
+                for (tile, list) in beams.iter_mut().zip(lists) {
+                    let listed = &candidates.list;
+                    dispatch!(level, simd => tile.cast(simd, listed, &seen, &list, profile));
+                }
+                candidates.list.clear();
+            };
+            let mut chunks: Vec<_> = chunks
+                .into_iter()
+                .map(|(number, _, chunk)| (seen.distance_m(chunk), number, chunk))
+                .collect();
+            // From the nearest, so that what hides others is met first.
+            chunks.sort_by(|a, b| a.0.total_cmp(&b.0));
+            for (_, number, chunk) in chunks {
+                candidates.find(level, &seen, (number, chunk), profile, &mut compare);
             }
-            candidates.add(level, self, &bodies, chunk, profile, &view.lidar);
+            compare(candidates);
+            beams.iter_mut().for_each(Tile::leave_body);
         }
         let width = self.columns.len();
-        let rows = view.lidar.rows();
         let mut part = Sweep::empty(rows * width);
-        let mut tile = Tile::default();
-        for (at, list) in candidates.by_tile(level, self, rows).into_iter().enumerate() {
-            let tiles = self.tile_tangents.len();
-            let first_row = at / tiles * LANES;
-            let first_column = self.columns.start + at % tiles * LANES;
-            tile.begin(self, view, first_row, first_column);
-            dispatch!(level, simd => tile.cast(simd, &candidates, &bodies, &list, profile));
-            tile.write(&candidates, &bodies, &mut part, width);
+        for tile in beams {
+            tile.write(self, &mut part, width);
         }
         part
     }
+}
+
+/// The chunks of each body, with their numbers.
+fn by_body(scene: &Scene) -> Vec<Vec<(usize, Body<'_>, &Chunk)>> {
+    let mut bodies: Vec<Vec<(usize, Body<'_>, &Chunk)>> = Vec::new();
+    for (number, (body, chunk)) in chunks(scene).enumerate() {
+        match bodies.last_mut() {
+            Some(last) if last[0].1.is_same(&body) => last.push((number, body, chunk)),
+            _ => bodies.push(vec![(number, body, chunk)]),
+        }
+    }
+    bodies
 }
 
 fn row_angles(view: &LidarView, row: usize) -> [f64; 4] {
@@ -231,6 +274,13 @@ impl BodySector<'_> {
     /// A position in the body's axes relative to the LiDAR's middle position, in metres.
     pub(super) fn from_middle(&self, position_m: DVec3) -> DVec3 {
         position_m - self.middle.position_m
+    }
+
+    /// How far a chunk's first Gaussians are from the LiDAR, in metres.
+    fn distance_m(&self, chunk: &Chunk) -> f64 {
+        let middle_m = self.middle_from(chunk.origin_m());
+        let first = chunk.clusters().first().map(|first| 0.5 * (first.min_m + first.max_m));
+        first.map_or(f64::INFINITY, |first| first.as_dvec3().distance(middle_m))
     }
 
     /// The LiDAR's middle position relative to a point of the body, in metres.

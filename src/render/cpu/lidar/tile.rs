@@ -3,7 +3,7 @@
 use fearless_simd::{f32x16, prelude::*};
 
 use super::beam::{Beam, Hit};
-use super::candidates::{Candidate, Candidates};
+use super::candidates::Candidate;
 use super::sector::{BodySector, Sector};
 use crate::cpu::lanes::Vec3x16;
 use crate::cpu::math::exp2;
@@ -14,26 +14,20 @@ use wildcity_scene::chunk::LANES;
 /// Candidates between two looks for the farthest beam that has not returned nearer.
 const LOOKS: usize = 16;
 
-/// A tile that is being cast.
-pub(super) struct Tile<'a> {
-    place: Option<Place<'a>>,
-    /// Of a row after the other. Lanes beyond the last column or row have a range of 0.
+/// The beams of a tile.
+pub(super) struct Tile {
+    first_row: usize,
+    first_column: usize,
+    /// Rows and columns that the LiDAR has here: 16, but for the last ones.
+    size: [usize; 2],
+    /// Of a row after the other.
     beams: Vec<Beam>,
     /// How far each beam is followed: to its return, or the LiDAR's range, in metres.
     ends_m: [[f32; LANES]; LANES],
     /// The largest of each row of `ends_m`.
     row_ends_m: [f32; LANES],
-    /// The beams as each body that was met sees them.
-    rays: Vec<(u32, Rays)>,
-}
-
-/// Where a tile is.
-#[derive(Clone, Copy)]
-struct Place<'a> {
-    sector: &'a Sector,
-    view: &'a LidarView,
-    first_row: usize,
-    first_column: usize,
+    /// The beams as the body sees them that they are compared with, once they are.
+    rays: Option<Box<Rays>>,
 }
 
 /// The beams of a tile in the axes of a body.
@@ -45,40 +39,63 @@ struct Rays {
     directions: [[[f32; LANES]; 3]; LANES],
 }
 
-impl Default for Tile<'_> {
+impl Default for Tile {
     fn default() -> Self {
         Self {
-            place: None,
+            first_row: 0,
+            first_column: 0,
+            size: [0; 2],
             beams: vec![Beam::default(); LANES * LANES],
             ends_m: [[0.0; LANES]; LANES],
             row_ends_m: [0.0; LANES],
-            rays: Vec::new(),
+            rays: None,
         }
     }
 }
 
-impl Place<'_> {
-    fn columns(&self) -> usize {
-        LANES.min(self.sector.columns.end - self.first_column)
+impl Tile {
+    /// Begins the tile at a place of the sweep.
+    pub(super) fn begin(
+        &mut self,
+        sector: &Sector,
+        view: &LidarView,
+        first_row: usize,
+        first_column: usize,
+    ) {
+        let rows = LANES.min(view.lidar.rows() - first_row);
+        let columns = LANES.min(sector.columns.end - first_column);
+        self.first_row = first_row;
+        self.first_column = first_column;
+        self.size = [rows, columns];
+        self.beams.iter_mut().for_each(Beam::clear);
+        // Lanes beyond the last column or row are not followed.
+        self.ends_m = [[0.0; LANES]; LANES];
+        for ends_m in &mut self.ends_m[..rows] {
+            ends_m[..columns].fill(sector.max_range_m);
+        }
+        self.row_ends_m = [0.0; LANES];
+        self.row_ends_m[..rows].fill(sector.max_range_m);
     }
 
-    fn rows(&self) -> usize {
-        LANES.min(self.view.lidar.rows() - self.first_row)
+    /// The beams are compared with another body next.
+    pub(super) fn leave_body(&mut self) {
+        self.rays = None;
     }
 
     fn rays(&self, seen: &BodySector<'_>) -> Rays {
+        let [rows, columns] = self.size;
         let mut rays = Rays { origin_m: [[0.0; LANES]; 3], directions: [[[0.0; LANES]; 3]; LANES] };
         for lane in 0..LANES {
             // Lanes beyond the last column repeat it: they are not followed.
-            let column = self.first_column + lane.min(self.columns() - 1);
-            let pose = &seen.poses[column - self.sector.columns.start];
+            let column = self.first_column + lane.min(columns - 1);
+            let pose = &seen.poses[column - seen.sector.columns.start];
             let origin_m = seen.from_middle(pose.position_m).to_array();
             let axes = pose.rotation_matrix();
             for (axis, value) in origin_m.into_iter().enumerate() {
                 rays.origin_m[axis][lane] = value as f32;
             }
-            for row in 0..self.rows() {
-                let direction = axes * self.sector.direction(self.first_row + row, column);
+            for row in 0..rows {
+                let direction = axes * seen.sector.direction(self.first_row + row, column);
                 for (axis, value) in direction.to_array().into_iter().enumerate() {
                     rays.directions[row][axis][lane] = value as f32;
                 }
@@ -86,77 +103,54 @@ impl Place<'_> {
         }
         rays
     }
-}
 
-impl<'a> Tile<'a> {
-    /// Begins the tile of a place.
-    pub(super) fn begin(
-        &mut self,
-        sector: &'a Sector,
-        view: &'a LidarView,
-        first_row: usize,
-        first_column: usize,
-    ) {
-        let place = Place { sector, view, first_row, first_column };
-        self.place = Some(place);
-        self.beams.iter_mut().for_each(Beam::clear);
-        self.rays.clear();
-        let max_range_m = view.lidar.max_range_m() as f32;
-        self.ends_m = [[0.0; LANES]; LANES];
-        for ends_m in &mut self.ends_m[..place.rows()] {
-            ends_m[..place.columns()].fill(max_range_m);
-        }
-        self.row_ends_m = [0.0; LANES];
-        self.row_ends_m[..place.rows()].fill(max_range_m);
-    }
-
-    /// Compares its beams with candidates, the nearest first.
+    /// Compares its beams with candidates of a body, which are listed from the nearest.
     #[inline(always)]
     pub(super) fn cast<S: Simd>(
         &mut self,
         simd: S,
-        candidates: &Candidates,
-        bodies: &[BodySector<'_>],
+        candidates: &[Candidate],
+        seen: &BodySector<'_>,
         list: &[u32],
         profile: &RenderProfile,
     ) {
-        let Some(place) = self.place else { return };
-        let least_m = place.view.lidar.min_range_m() as f32;
+        let rays = match self.rays.take() {
+            Some(rays) => rays,
+            None if list.is_empty() => return,
+            None => Box::new(self.rays(seen)),
+        };
+        let least_m = seen.sector.min_range_m;
         let cap = profile.alpha_cap as f32;
+        let last_row = self.first_row + self.size[0];
         for listed in list.chunks(LOOKS) {
             // Behind the returns of all beams.
             let farthest_m = self.row_ends_m.iter().copied().fold(0.0, f32::max);
-            if candidates.list[listed[0] as usize].nearest_m > farthest_m {
+            if candidates[listed[0] as usize].nearest_m > farthest_m {
                 break;
             }
             let mut changed_rows = 0_u32;
             for at in listed {
-                let candidate = &candidates.list[*at as usize];
-                let rays = match self.rays.iter().position(|(body, _)| *body == candidate.body) {
-                    Some(known) => known,
-                    None => {
-                        let seen = &bodies[candidate.body as usize];
-                        self.rays.push((candidate.body, place.rays(seen)));
-                        self.rays.len() - 1
-                    }
-                };
-                let rays = &self.rays[rays].1;
+                let candidate = &candidates[*at as usize];
                 let [first, end] = candidate.rows.map(usize::from);
-                let first = first.max(place.first_row) - place.first_row;
-                let end = end.min(place.first_row + place.rows()) - place.first_row;
-                for row in first..end {
+                for row in first.max(self.first_row)..end.min(last_row) {
+                    let row = row - self.first_row;
                     if candidate.nearest_m > self.row_ends_m[row] {
                         continue;
                     }
                     let ends_m = &mut self.ends_m[row];
-                    let met = meet(simd, candidate, rays, row, least_m, ends_m, cap);
+                    let met = meet(simd, candidate, &rays, row, least_m, ends_m, cap);
                     let Some(Met { mut lanes, range_m, alpha }) = met else { continue };
                     changed_rows |= 1 << row;
                     while lanes != 0 {
                         let lane = lanes.trailing_zeros() as usize % LANES;
                         lanes &= lanes - 1;
-                        let hit =
-                            Hit { range_m: range_m[lane], alpha: alpha[lane], candidate: *at };
+                        let hit = Hit {
+                            range_m: range_m[lane],
+                            alpha: alpha[lane],
+                            id: candidate.id,
+                            luminance: candidate.luminance,
+                            instance: candidate.instance,
+                        };
                         if let Some(end_m) = self.beams[row * LANES + lane].add(hit) {
                             ends_m[lane] = end_m;
                         }
@@ -169,28 +163,21 @@ impl<'a> Tile<'a> {
                 self.row_ends_m[row] = self.ends_m[row].iter().copied().fold(0.0, f32::max);
             }
         }
+        self.rays = Some(rays);
     }
 
     /// Writes its returns into a sweep of its sector, which has `width` columns.
-    pub(super) fn write(
-        &self,
-        candidates: &Candidates,
-        bodies: &[BodySector<'_>],
-        part: &mut Sweep,
-        width: usize,
-    ) {
-        let Some(place) = self.place else { return };
-        for row in 0..place.rows() {
-            for lane in 0..place.columns() {
-                let luminance = |at: u32| candidates.list[at as usize].luminance;
+    pub(super) fn write(&self, sector: &Sector, part: &mut Sweep, width: usize) {
+        let [rows, columns] = self.size;
+        for row in 0..rows {
+            for lane in 0..columns {
                 let beam = &self.beams[row * LANES + lane];
-                let Some((hit, intensity)) = beam.returned(luminance) else { continue };
-                let column = place.first_column - place.sector.columns.start + lane;
-                let at = (place.first_row + row) * width + column;
-                let body = candidates.list[hit.candidate as usize].body;
+                let Some((hit, intensity)) = beam.returned() else { continue };
+                let column = self.first_column - sector.columns.start + lane;
+                let at = (self.first_row + row) * width + column;
                 part.range_m[at] = hit.range_m;
                 part.intensity[at] = intensity;
-                part.instance[at] = bodies[body as usize].body.instance;
+                part.instance[at] = hit.instance;
             }
         }
     }
