@@ -81,11 +81,16 @@ ORDER = {
     ],
     "RandomStart": ["trajectory", "from_m", "to_m", "lateral_m", "heading_rad"],
     "Repair": ["model", "below", "above", "at_least", "per_step", "on_failure"],
-    "Sensors": ["cameras", "imu", "wheel_speed", "delay_us"],
+    "Sensors": ["cameras", "imu", "wheel_speed", "delay_us", "lidars"],
     "WheelSpeed": ["noise", "scale"],
 }
 # Defaults in Python other than None and those of the schema.
-DEFAULTS = {("Metadata", "history"): "()", ("Metadata", "events"): "()", ("ImageInfo", "back"): "0"}
+DEFAULTS = {
+    ("Metadata", "history"): "()",
+    ("Metadata", "events"): "()",
+    ("Metadata", "sweeps"): "()",
+    ("ImageInfo", "back"): "0",
+}
 # Fields that Python always has to be given, although the server knows a default for some lenses.
 REQUIRED = {("Camera", "fx"), ("Camera", "fy")}
 # What Python takes for fields of `open` in place of the schema's type.

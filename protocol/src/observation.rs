@@ -9,9 +9,11 @@
 //!
 //! 1. `ego.history_xyz`, f32 `[16, 3]`, and `ego.history_rot`, f32 `[16, 3, 3]`.
 //!    Then, as requested, `sensor.imu`, f32 `[n, 6]`, and `sensor.wheel_speed`, f32 `[n]`.
+//!    For each LiDAR `lidar/<name>/points`, f32 `[n, 3]`, and `lidar/<name>/intensity`, f32 `[n]`.
 //! 2. For each image, as requested, `camera/<name>/depth`, `camera/<name>/opacity` and
 //!    `camera/<name>/normals`, all f32.
-//! 3. If requested, for each image `camera/<name>/instances`, u16.
+//! 3. For each LiDAR `lidar/<name>/row`, `lidar/<name>/column` and `lidar/<name>/instance`, u16 `[n]`.
+//!    If requested, for each image `camera/<name>/instances`, u16.
 //! 4. For each image `camera/<name>/rgb`, u8.
 //! 5. If requested, earlier frames: `camera/<name>/history/<back>/rgb`, u8.
 //!
@@ -55,7 +57,7 @@ pub struct ObservationMetadata {
     pub profile_hash: String,
     /// Name of the backend.
     pub backend: String,
-    /// BLAKE3 of the images' hashes (32 bytes each, in order), in hex.
+    /// BLAKE3 of the hashes of the images and then of the sweeps (32 bytes each, in order), in hex.
     pub frame_hash: String,
     /// State of the ego at this time.
     pub ego: Ego,
@@ -64,6 +66,10 @@ pub struct ObservationMetadata {
     pub geo: Option<Geo>,
     /// The images, in order. Empty between two decisions.
     pub images: Vec<Image>,
+    /// The sweeps of the LiDARs, in the order of the rig. Only of observations of the ego itself,
+    /// not of `observe`, and empty between two decisions.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub sweeps: Vec<Sweep>,
     /// Earlier frames of the same cameras, camera by camera, newest first. Absent if there are
     /// none.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -314,6 +320,31 @@ pub struct Image {
     /// What the camera did to the image, if the session asked for effects of this camera.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sensor: Option<ImageSensor>,
+}
+
+/// One sweep of a LiDAR.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct Sweep {
+    /// Name of the LiDAR. Its tensors are `lidar/<name>/points`, in metres in the rig's axes when
+    /// their column was fired, `lidar/<name>/intensity`, `lidar/<name>/row`,
+    /// `lidar/<name>/column` and `lidar/<name>/instance`.
+    pub lidar: String,
+    /// Time of the first column, in simulated microseconds.
+    pub start_us: i64,
+    /// Time of the last column, in simulated microseconds: that of the observation. The columns
+    /// between are fired at equal distances.
+    pub end_us: i64,
+    /// Number of rows of the beams.
+    pub rows: u64,
+    /// Number of columns of the beams.
+    pub columns: u64,
+    /// Number of returns.
+    pub returns: u64,
+    /// `rig_from_lidar`.
+    pub lidar_to_rig: Pose,
+    /// BLAKE3 of the five tensors in the order above, in hex.
+    pub hash: String,
 }
 
 /// What a camera with effects did to an image.

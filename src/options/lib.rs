@@ -28,7 +28,7 @@ pub use open::{
 pub use pose::Pose;
 pub use sensors::{
     AxisNoise, CameraSensor, ExposureDrift, FrozenFrames, ImageNoise, Imu, LateFrames, LensDirt,
-    Sensors, WheelSpeed,
+    LidarSensor, Sensors, WheelSpeed,
 };
 
 /// Pattern of names, as a regular expression.

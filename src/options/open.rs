@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use crate::camera::{Exposure, Lens, Shutter, Windshield};
-use crate::{DriveSection, Pose, Sensors};
+use crate::{DriveSection, Pose, RigLidar, Sensors};
 
 /// How the ego moves.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -321,6 +321,10 @@ pub struct Rig {
     /// The cameras, in the order of the images in observations.
     #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 16)))]
     pub cameras: Vec<RigCamera>,
+    /// The LiDARs. Every observation of the ego has a sweep of each, which ends at its time.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[cfg_attr(feature = "schema", schemars(length(max = 4)))]
+    pub lidars: Vec<RigLidar>,
 }
 
 /// A camera on the vehicle: a pinhole unless it has a lens. All intrinsics are in pixels.

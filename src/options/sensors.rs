@@ -14,6 +14,9 @@ pub struct Sensors {
     /// Effects on images, by camera name.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub cameras: BTreeMap<String, CameraSensor>,
+    /// Effects on sweeps, by LiDAR name.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub lidars: BTreeMap<String, LidarSensor>,
     /// Adds the tensor `sensor.imu`: specific force and angular velocity.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub imu: Option<Imu>,
@@ -51,6 +54,21 @@ pub struct CameraSensor {
     /// Dirt on the lens.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub dirt: Option<LensDirt>,
+}
+
+/// Effects on the sweeps of a LiDAR.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(default)]
+pub struct LidarSensor {
+    /// Standard deviation of the ranges, in metres.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(range(min = 0.0, max = 10.0)))]
+    pub noise_m: Option<f64>,
+    /// Probability that a beam has no return.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(range(min = 0.0, max = 1.0)))]
+    pub drop: Option<f64>,
 }
 
 /// Frames that arrive late.

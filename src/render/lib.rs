@@ -41,8 +41,8 @@ use glam::{DMat3, DVec3};
 
 use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::appearance::Appearance;
-use wildcity_scene::geometry::Camera;
 use wildcity_scene::geometry::camera::FieldMask;
+use wildcity_scene::geometry::{Camera, Lidar};
 use wildcity_scene::sky::{CubeMap, DrawableSky, SkyError};
 use wildcity_scene::{Rays, RenderProfile, Rig, Scene, Selection};
 
@@ -321,6 +321,11 @@ pub trait Backend: Send + Sync {
         view: &LidarView,
     ) -> Result<Sweep, RenderError> {
         Ok(cpu::lidar::sweep(fearless_simd::Level::new(), scene, profile, view))
+    }
+
+    /// Upper bound of the intermediate buffers of a sweep, whatever the scene, in bytes.
+    fn sweep_bytes(&self, lidar: &Lidar) -> u64 {
+        cpu::lidar::most_bytes(lidar, rayon::current_num_threads())
     }
 }
 

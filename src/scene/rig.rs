@@ -1,4 +1,4 @@
-//! Rigs: the cameras of a vehicle.
+//! Rigs: the cameras and LiDARs of a vehicle.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -12,7 +12,7 @@ use wildcity_options::strict;
 use super::appearance::{Appearance, AppearanceError, Overlay, UnreadOverlay};
 use crate::geometry::camera::Shutter;
 use crate::geometry::camera::json::Intrinsics;
-use crate::geometry::{Camera, CameraError, Pose, PoseError};
+use crate::geometry::{Camera, CameraError, Lidar, LidarError, Pose, PoseError};
 
 /// A camera mounted on the vehicle.
 ///
@@ -81,7 +81,7 @@ impl RigCamera {
     }
 }
 
-/// The cameras of one vehicle, in the order of the images in an observation.
+/// The cameras of one vehicle, in the order of the images in an observation, and its LiDARs.
 ///
 /// ```
 /// use wildcity_scene::Rig;
@@ -100,6 +100,23 @@ pub struct Rig {
     pub name: String,
     /// At least one camera.
     pub cameras: Vec<RigCamera>,
+    /// At most [`Rig::MAX_LIDARS`].
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub lidars: Vec<RigLidar>,
+}
+
+/// A LiDAR mounted on the vehicle.
+///
+/// JSON is the same as on the wire: [`options::RigLidar`].
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[serde(into = "options::RigLidar")]
+pub struct RigLidar {
+    /// Name within the rig, also among the names of its cameras.
+    pub name: String,
+    /// Its beams and range.
+    pub lidar: Arc<Lidar>,
+    /// Pose of the LiDAR on the rig (`lidar_to_rig` on the wire).
+    pub rig_from_lidar: Pose,
 }
 
 /// Why a rig was refused.
@@ -113,9 +130,26 @@ pub enum RigError {
         "{name:?} is not a name: a name has 1 to 64 of a-z 0-9 . _ - and does not start with ."
     )]
     Name { name: String },
-    /// Two cameras share a name.
-    #[error("camera {name:?} occurs twice")]
+    /// Two cameras or LiDARs share a name.
+    #[error("{name:?} occurs twice: every camera and LiDAR needs a name of its own")]
     Duplicate { name: String },
+    /// More LiDARs than [`Rig::MAX_LIDARS`].
+    #[error("rig {rig:?} has {count} LiDARs; at most {limit} are accepted")]
+    Lidars { rig: String, count: usize, limit: usize },
+    /// The beams of a LiDAR are invalid.
+    #[error("LiDAR {name:?}: beams.{cause}")]
+    Lidar {
+        name: String,
+        /// Why it was refused.
+        cause: LidarError,
+    },
+    /// The pose of a LiDAR is invalid.
+    #[error("LiDAR {name:?}: lidar_to_rig.{cause}")]
+    LidarPose {
+        name: String,
+        /// Why it was refused.
+        cause: PoseError,
+    },
     /// The intrinsics or the shutter of a camera are invalid.
     #[error("camera {name:?}: {cause}")]
     Camera {
@@ -170,7 +204,16 @@ impl Rig {
     /// Largest number of cameras: the key of the depth sort has 4 bits for the camera.
     pub const MAX_CAMERAS: usize = 16;
 
-    /// Checks number, names, intrinsics, shutters and appearances of the cameras.
+    /// Largest number of LiDARs.
+    pub const MAX_LIDARS: usize = 4;
+
+    /// A rig without LiDARs.
+    pub fn new(name: impl Into<String>, cameras: Vec<RigCamera>) -> Self {
+        Self { name: name.into(), cameras, lidars: Vec::new() }
+    }
+
+    /// Checks number, names, intrinsics, shutters and appearances of the cameras, and the names of
+    /// LiDARs, whose beams were checked when they were made.
     ///
     /// # Errors
     /// Names the first camera that is invalid.
@@ -196,6 +239,15 @@ impl Rig {
             let looks = appearance.check([camera.width_px, camera.height_px]);
             looks.map_err(|cause| mounted.looks_wrong(cause))?;
         }
+        check_lidar_count(&self.name, self.lidars.len())?;
+        for RigLidar { name, .. } in &self.lidars {
+            if !is_name(name) {
+                return Err(RigError::Name { name: name.clone() });
+            }
+            if !names.insert(name) {
+                return Err(RigError::Duplicate { name: name.clone() });
+            }
+        }
         check_overlays(&self.cameras)
     }
 }
@@ -206,6 +258,15 @@ fn check_count(rig: &str, count: usize) -> Result<(), RigError> {
         Ok(())
     } else {
         Err(RigError::Count { rig: rig.to_owned(), count, limit })
+    }
+}
+
+fn check_lidar_count(rig: &str, count: usize) -> Result<(), RigError> {
+    let limit = Rig::MAX_LIDARS;
+    if count <= limit {
+        Ok(())
+    } else {
+        Err(RigError::Lidars { rig: rig.to_owned(), count, limit })
     }
 }
 
@@ -308,7 +369,20 @@ impl UnreadRig {
         if !is_name(&rig.name) {
             return Err(at("name")(RigError::Name { name: rig.name }));
         }
-        let rig = Rig { name: rig.name, cameras };
+        check_lidar_count(&rig.name, rig.lidars.len()).map_err(at("lidars"))?;
+        let mut lidars: Vec<RigLidar> = Vec::new();
+        for (index, fields) in rig.lidars.into_iter().enumerate() {
+            let part = format!("lidars[{index}]");
+            let lidar = RigLidar::from_request(&part, fields)?;
+            let is_taken = cameras.iter().any(|other| other.name == lidar.name)
+                || lidars.iter().any(|other| other.name == lidar.name);
+            if is_taken {
+                let cause = RigError::Duplicate { name: lidar.name };
+                return Err(RigFieldError { part: format!("{part}.name"), cause });
+            }
+            lidars.push(lidar);
+        }
+        let rig = Rig { name: rig.name, cameras, lidars };
         rig.check().map_err(at("cameras"))?;
         Ok(Self { rig, overlays })
     }
@@ -398,8 +472,11 @@ impl<'de> Deserialize<'de> for Rig {
 impl TryFrom<options::Rig> for Rig {
     type Error = RigError;
 
-    fn try_from(options::Rig { name, cameras: fields }: options::Rig) -> Result<Self, RigError> {
+    fn try_from(
+        options::Rig { name, cameras: fields, lidars }: options::Rig,
+    ) -> Result<Self, RigError> {
         check_count(&name, fields.len())?;
+        check_lidar_count(&name, lidars.len())?;
         let mut cameras = Vec::with_capacity(fields.len());
         for camera in fields {
             cameras.push(camera.try_into()?);
@@ -407,7 +484,48 @@ impl TryFrom<options::Rig> for Rig {
             // more than one.
             check_overlays(&cameras)?;
         }
-        Ok(Self { name, cameras })
+        let lidars = lidars.into_iter().map(RigLidar::try_from).collect::<Result<_, _>>()?;
+        Ok(Self { name, cameras, lidars })
+    }
+}
+
+impl RigLidar {
+    /// A LiDAR of a request, checked; `part` names it in errors.
+    fn from_request(part: &str, fields: options::RigLidar) -> Result<Self, RigFieldError> {
+        let name = fields.name.clone();
+        if !is_name(&name) {
+            return Err(RigFieldError {
+                part: format!("{part}.name"),
+                cause: RigError::Name { name },
+            });
+        }
+        Self::try_from(fields).map_err(|cause| {
+            let field = match &cause {
+                RigError::Lidar { cause, .. } => format!(".beams.{}", cause.field()),
+                RigError::LidarPose { .. } => ".lidar_to_rig".to_owned(),
+                _ => String::new(),
+            };
+            RigFieldError { part: format!("{part}{field}"), cause }
+        })
+    }
+}
+
+impl TryFrom<options::RigLidar> for RigLidar {
+    type Error = RigError;
+
+    fn try_from(fields: options::RigLidar) -> Result<Self, RigError> {
+        let options::RigLidar { name, beams, lidar_to_rig } = fields;
+        let lidar = Lidar::from_options(&beams)
+            .map_err(|cause| RigError::Lidar { name: name.clone(), cause })?;
+        let rig_from_lidar = Pose::try_from(lidar_to_rig)
+            .map_err(|cause| RigError::LidarPose { name: name.clone(), cause })?;
+        Ok(Self { name, lidar: Arc::new(lidar), rig_from_lidar })
+    }
+}
+
+impl From<RigLidar> for options::RigLidar {
+    fn from(RigLidar { name, lidar, rig_from_lidar }: RigLidar) -> Self {
+        Self { name, beams: lidar.to_options(), lidar_to_rig: rig_from_lidar.into() }
     }
 }
 
@@ -443,8 +561,12 @@ fn intrinsics(fields: &options::RigCamera) -> Intrinsics {
 }
 
 impl From<Rig> for options::Rig {
-    fn from(Rig { name, cameras }: Rig) -> Self {
-        Self { name, cameras: cameras.into_iter().map(Into::into).collect() }
+    fn from(Rig { name, cameras, lidars }: Rig) -> Self {
+        Self {
+            name,
+            cameras: cameras.into_iter().map(Into::into).collect(),
+            lidars: lidars.into_iter().map(Into::into).collect(),
+        }
     }
 }
 
@@ -486,9 +608,9 @@ mod tests {
 
     #[test]
     fn a_rig_is_checked() {
-        let rig = |cameras| Rig { name: "test".into(), cameras };
+        let rig = |cameras| Rig::new("test", cameras);
         assert_eq!(rig(vec![camera("front"), camera("rear")]).check(), Ok(()));
-        let nameless = Rig { name: "My car".into(), cameras: vec![camera("front")] };
+        let nameless = Rig::new("My car", vec![camera("front")]);
         assert!(matches!(nameless.check(), Err(RigError::Name { .. })));
         assert!(matches!(rig(vec![]).check(), Err(RigError::Count { count: 0, .. })));
         let twice = rig(vec![camera("front"), camera("front")]);
@@ -500,7 +622,7 @@ mod tests {
 
     #[test]
     fn a_rig_file_says_what_the_wire_says() {
-        let rig = Rig { name: "test".into(), cameras: vec![camera("front")] };
+        let rig = Rig::new("test", vec![camera("front")]);
         let text = serde_json::to_string(&rig).unwrap();
         assert_eq!(
             text,

@@ -55,7 +55,8 @@ pub use observe::encode::{ImageEncoding, PixelMaps, png};
 pub use observe::jpeg::jpeg;
 pub use observe::layout::HEADER_PREFIX_BYTES;
 pub use observe::observation::{
-    DType, ImageInfo, Observation, PastImageInfo, ResidencyStats, Tensor, TensorKind, Timings,
+    DType, ImageInfo, Observation, PastImageInfo, ResidencyStats, SweepInfo, Tensor, TensorKind,
+    Timings,
 };
 pub use observe::trust::{RecordedPoses, TrainingCoverage, Trust};
 pub use open_scene::{FrameScene, OpenScene};

@@ -1,6 +1,7 @@
 //! Converts views of the renderer to viewpoints, which determine the levels of detail.
 
 use wildcity_render::View;
+use wildcity_render::lidar::LidarView;
 use wildcity_twin::residency::Viewpoint;
 
 /// The viewpoint of each view: its position, and its focal length along the finer axis.
@@ -14,4 +15,10 @@ pub fn viewpoints(views: &[View]) -> Vec<Viewpoint> {
         focal_px: view.camera.pinhole.fx.max(view.camera.pinhole.fy),
     };
     views.iter().map(viewpoint).collect()
+}
+
+/// The viewpoint of a LiDAR at the end of its sweep. Its beams are about as wide as a pixel of a
+/// camera with this focal length: a milliradian.
+pub(crate) fn lidar_viewpoint(view: &LidarView) -> Viewpoint {
+    Viewpoint { position_m: view.world_from_lidar.position_m, focal_px: 1_000.0 }
 }

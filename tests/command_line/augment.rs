@@ -49,7 +49,7 @@ fn make_twins(dir: &Path) {
     let mut left = mounted("left", Camera { lens, ..Camera::from_pinhole(160, 120, pinhole) });
     left.shutter = Some(Shutter { direction: ShutterDirection::TopToBottom, duration_us: 30_000 });
     left.appearance.exposure = Some(Exposure::new(None, Some([0.5; 3]), [0.0; 3]).unwrap());
-    let rig = Rig { name: "two".to_owned(), cameras: vec![front, left] };
+    let rig = Rig::new("two", vec![front, left]);
 
     let settings = StreetSettings {
         length_m: 100.0,

@@ -55,7 +55,7 @@ fn camera(lens: Lens) -> RigCamera {
 }
 
 fn alone(lens: Lens) -> (Calibration, f64) {
-    let rig = Rig { name: "one".to_owned(), cameras: vec![camera(lens)] };
+    let rig = Rig::new("one", vec![camera(lens)]);
     calibrations(&rig).remove(0)
 }
 

@@ -68,7 +68,7 @@ fn answers_with_unknown_fields_are_the_same_answers() {
     }
 }
 
-/// Adds a field to every object, except `profile`, `period_us` and the `cameras` of sensors: they
+/// Adds a field to every object, except `profile`, `period_us`, and `cameras` and `lidars` of sensors: they
 /// are maps, so any field is known.
 pub(crate) fn add_unknown_fields(value: &mut Value) {
     match value {
@@ -76,7 +76,7 @@ pub(crate) fn add_unknown_fields(value: &mut Value) {
             for (name, inner) in &mut *fields {
                 match (name.as_str(), inner) {
                     ("profile" | "period_us", _) => {}
-                    ("cameras", Value::Object(by_name)) => {
+                    ("cameras" | "lidars", Value::Object(by_name)) => {
                         by_name.values_mut().for_each(add_unknown_fields);
                     }
                     (_, inner) => add_unknown_fields(inner),
@@ -178,6 +178,7 @@ fn sensors() -> Sensors {
     };
     let axis = |noise, bias| Some(AxisNoise { noise, bias });
     Sensors {
+        lidars: [("top".to_owned(), LidarSensor { noise_m: Some(0.03125), drop: None })].into(),
         cameras: [("front".to_owned(), camera)].into(),
         imu: Some(Imu {
             accelerometer: axis(0.03125, 0.0625),
@@ -189,6 +190,22 @@ fn sensors() -> Sensors {
     }
 }
 
+fn top() -> RigLidar {
+    RigLidar {
+        name: "top".into(),
+        beams: LidarBeams {
+            row_elevations_rad: vec![0.125, 0.0, -0.25],
+            row_azimuth_offsets_rad: Some(vec![0.0, 0.015625, -0.015625]),
+            column_azimuths_rad: None,
+            columns: Some(LidarColumns { count: 1_800, first_rad: 3.125, last_rad: -3.125 }),
+            duration_us: 100_000,
+            min_range_m: Some(0.5),
+            max_range_m: Some(120.0),
+        },
+        lidar_to_rig: Pose { xyz: [1.25, 0.0, 1.875], q: [1.0, 0.0, 0.0, 0.0] },
+    }
+}
+
 fn requests() -> Vec<(&'static str, Request)> {
     let station = Start::Station { trajectory: "log".into(), station_m: 12.5 };
     let seen = RigCamera {
@@ -197,7 +214,7 @@ fn requests() -> Vec<(&'static str, Request)> {
         native_size: Some([8.0, 6.5]),
         ..front()
     };
-    let rig = Rig { name: "pair".into(), cameras: vec![seen, rear()] };
+    let rig = Rig { name: "pair".into(), cameras: vec![seen, rear()], lidars: vec![top()] };
     let section = DriveSection {
         name: "log".into(),
         from_m: Some(12.5),

@@ -94,7 +94,7 @@ pub(crate) fn options(actors: &Value, shutters: bool) -> Open {
     let options = serde_json::from_value(scenario).unwrap();
     Open {
         start: Some(Start::from(demo().at(EGO_M))),
-        rig: Some(RigChoice::Full(Rig { name: "pair".to_owned(), cameras: rig(shutters) }.into())),
+        rig: Some(RigChoice::Full(Rig::new("pair", rig(shutters)).into())),
         scenario: Some(options),
         outputs: Outputs::colour(Encoding::Raw),
         ..Open::twin("demo")

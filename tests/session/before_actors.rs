@@ -53,7 +53,7 @@ fn rig() -> Rig {
         camera("front", [160, 96], 110.0, DQuat::from_xyzw(-0.5, 0.5, -0.5, 0.5)),
         camera("up", [97, 64], 60.0, DQuat::IDENTITY),
     ];
-    Rig { name: "two".to_owned(), cameras }
+    Rig::new("two", cameras)
 }
 
 #[tokio::test(flavor = "multi_thread")]

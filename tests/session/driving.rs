@@ -92,7 +92,7 @@ pub(crate) fn rig() -> Rig {
     let camera = |(view, name): (wildcity_render::View, &str)| {
         RigCamera::new(name, view.camera, view.world_from_camera)
     };
-    Rig { name: "pair".to_owned(), cameras: cameras.map(camera).collect() }
+    Rig::new("pair", cameras.map(camera).collect())
 }
 
 impl Bench {

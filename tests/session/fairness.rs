@@ -39,7 +39,7 @@ async fn session(bench: &Bench, name: String, width_px: u32, height_px: u32) -> 
     let cameras = vec![RigCamera::new("front", camera, ahead)];
     let options = Open {
         start: Some(Start::from(place())),
-        rig: Some(RigChoice::Full(Rig { name: "one".to_owned(), cameras }.into())),
+        rig: Some(RigChoice::Full(Rig::new("one", cameras).into())),
         outputs: Outputs::colour(Encoding::Raw),
         ..Open::twin("demo")
     };

@@ -16,6 +16,7 @@ mod before_actors;
 mod driving;
 mod fairness;
 mod lanes;
+mod lidar;
 mod long;
 mod reuse;
 mod solids;

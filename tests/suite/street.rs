@@ -62,10 +62,7 @@ impl Bench {
                 Pose { position_m, rotation },
             )
         };
-        let rig = Rig {
-            name: "pair".to_owned(),
-            cameras: vec![camera("front", 0.0), camera("left", 1.5)],
-        };
+        let rig = Rig::new("pair", vec![camera("front", 0.0), camera("left", 1.5)]);
         let new = NewVersion {
             rig: Some(rig),
             trajectories: vec![log],

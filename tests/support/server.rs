@@ -172,7 +172,7 @@ pub(crate) fn rig() -> Rig {
         RigCamera::new(name, Camera::from_pinhole(width_px, height_px, pinhole), rig_from_camera)
     };
     let cameras = vec![camera("front", 8, 6, 0.0), camera("rear", 5, 4, std::f64::consts::PI)];
-    Rig { name: "pair".to_owned(), cameras }
+    Rig::new("pair", cameras)
 }
 
 /// A server in this process.

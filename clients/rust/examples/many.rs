@@ -143,7 +143,7 @@ fn open(twin: &str, session: Option<String>) -> Open {
         native_size: None,
         camera_to_rig: Pose { xyz: [1.9, 0.0, 1.65], q: [0.5, -0.5, 0.5, -0.5] },
     };
-    let rig = Rig { name: "one".to_owned(), cameras: vec![camera] };
+    let rig = Rig { name: "one".to_owned(), cameras: vec![camera], lidars: Vec::new() };
     Open {
         session,
         rig: Some(RigChoice::Full(rig)),

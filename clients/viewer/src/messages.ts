@@ -113,9 +113,38 @@ export interface Camera {
   windshield?: Windshield;
 }
 
+/** Columns of a LiDAR at equal distances. */
+export interface LidarColumns {
+  count: number;
+  first_rad: number;
+  last_rad: number;
+}
+
+/**
+ * The beams of a LiDAR, `[rows, columns]`. A beam has the elevation of its row and the azimuth of its column plus the
+ * offset of its row. The tables of NVIDIA's ncore have the same names.
+ */
+export interface LidarBeams {
+  column_azimuths_rad?: number[];
+  columns?: LidarColumns;
+  duration_us: number;
+  max_range_m?: number;
+  min_range_m?: number;
+  row_azimuth_offsets_rad?: number[];
+  row_elevations_rad: number[];
+}
+
+/** A LiDAR on the rig. Its axes are x forward, y left, z up. */
+export interface RigLidar {
+  beams: LidarBeams;
+  lidar_to_rig: Pose;
+  name: string;
+}
+
 /** The cameras of a vehicle. */
 export interface Rig {
   cameras: Camera[];
+  lidars?: RigLidar[];
   name: string;
 }
 
@@ -179,6 +208,12 @@ export interface Imu {
   gyroscope?: AxisNoise;
 }
 
+/** Effects on the sweeps of a LiDAR. */
+export interface LidarSensor {
+  drop?: number;
+  noise_m?: number;
+}
+
 /** Errors of the speed that the wheels measure. */
 export interface WheelSpeed {
   noise?: number;
@@ -190,6 +225,7 @@ export interface Sensors {
   cameras?: Record<string, CameraSensor>;
   delay_us?: number;
   imu?: Imu;
+  lidars?: Record<string, LidarSensor>;
   wheel_speed?: WheelSpeed;
 }
 
@@ -632,6 +668,18 @@ export interface Route {
   text?: string;
 }
 
+/** One sweep of a LiDAR. */
+export interface Sweep {
+  columns: number;
+  end_us: number;
+  hash: string;
+  lidar: string;
+  lidar_to_rig: Pose;
+  returns: number;
+  rows: number;
+  start_us: number;
+}
+
 /** Wall time of a render stage. */
 export interface Stage {
   ms: number;
@@ -664,6 +712,7 @@ export interface Metadata {
   seq: number;
   session: string;
   step: number;
+  sweeps?: Sweep[];
   terminated: boolean;
   time_us: number;
   timings: Timings;

@@ -22,8 +22,8 @@ pub use wildcity_options::NAME_PATTERN;
 pub use wildcity_options::{
     AxisNoise, CameraSensor, ContactMode, DriveSection, Dynamics, DynamicsChoice, DynamicsModel,
     Encoding, ExposureDrift, FrozenFrames, ImageNoise, ImagePart, Imu, LateFrames, LensDirt,
-    OnFailure, Open, Outputs, Pose, RandomStart, Repair, Rig, RigCamera, RigChoice, ScenarioChoice,
-    Sensors, Start, WheelSpeed,
+    LidarBeams, LidarColumns, LidarSensor, OnFailure, Open, Outputs, Pose, RandomStart, Repair,
+    Rig, RigCamera, RigChoice, RigLidar, ScenarioChoice, Sensors, Start, WheelSpeed,
 };
 
 /// Pattern of names of recorded episodes: the name of a session, a hyphen and a number.

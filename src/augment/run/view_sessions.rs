@@ -49,6 +49,7 @@ impl ViewSessions {
         let rig = Rig {
             name: "augment".to_owned(),
             cameras: cameras.iter().map(wire_camera).collect::<anyhow::Result<_>>()?,
+            lidars: Vec::new(),
         };
         let open = |outputs, repair| Open {
             version: Some(version.number),

@@ -89,5 +89,9 @@ fn rig() -> anyhow::Result<Rig> {
         camera("front", 1.9, [0.5, -0.5, 0.5, -0.5]),
         camera("rear", -0.6, [0.5, -0.5, -0.5, 0.5])
     ]);
-    Ok(Rig { name: "soak".to_owned(), cameras: serde_json::from_value(cameras)? })
+    Ok(Rig {
+        name: "soak".to_owned(),
+        cameras: serde_json::from_value(cameras)?,
+        lidars: Vec::new(),
+    })
 }

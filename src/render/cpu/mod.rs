@@ -60,6 +60,7 @@ use self::part::FramePart;
 use super::layout::Cutoffs;
 use super::stage::{Stage, StageOutputs};
 use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target, View};
+use wildcity_scene::geometry::Lidar;
 use wildcity_scene::{RenderProfile, Scene};
 
 /// The f32 backend.
@@ -305,6 +306,10 @@ impl Backend for Cpu {
     ) -> Result<Sweep, RenderError> {
         let BusyLane { pool, .. } = self.lane();
         Ok(pool.install(|| lidar::sweep(self.level, scene, profile, view)))
+    }
+
+    fn sweep_bytes(&self, lidar: &Lidar) -> u64 {
+        lidar::most_bytes(lidar, self.threads())
     }
 }
 

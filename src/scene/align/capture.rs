@@ -194,7 +194,7 @@ pub fn captured_drive(
         let camera_name = camera_name(folder, cameras.len());
         cameras.push(RigCamera::new(camera_name, usual_camera(of_camera), rig_from_camera));
     }
-    let rig = Rig { name: name.clone(), cameras };
+    let rig = Rig::new(name.clone(), cameras);
     rig.check()?;
     let trajectory = Trajectory { name: name.clone(), keyframes };
     Ok(CapturedDrive { trajectory, rig, camera_height_m, most_tilt_rad })

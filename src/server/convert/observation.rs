@@ -8,7 +8,7 @@ use crate::fault::Fault;
 use wildcity_protocol::message::RigCamera;
 use wildcity_protocol::observation::{
     self as wire, Actor, Ego, Event, Geo, Image, NavigationCommand, ObservationMetadata, Residency,
-    Route, Stage, Timings, Trust,
+    Route, Stage, Sweep, Timings, Trust,
 };
 use wildcity_render::FIRST_ACTOR_INSTANCE;
 use wildcity_scene::ActorBox;
@@ -16,7 +16,7 @@ use wildcity_scene::geo::{GeoPoint, GeoPose};
 use wildcity_scene::geometry::camera::Pinhole;
 use wildcity_session::{
     DType, Episode, EpisodeTraffic, EventKind, HEADER_PREFIX_BYTES, PastImageInfo, Session,
-    TensorKind,
+    SweepInfo, TensorKind,
 };
 use wildcity_sim::scenario;
 
@@ -39,6 +39,11 @@ pub(crate) fn observation(
             TensorKind::HistoryRotation => "ego.history_rot".to_owned(),
             TensorKind::Imu => "sensor.imu".to_owned(),
             TensorKind::WheelSpeed => "sensor.wheel_speed".to_owned(),
+            TensorKind::Points(sweep) => sweep_tensor(session, &frame, sweep, "points"),
+            TensorKind::Intensity(sweep) => sweep_tensor(session, &frame, sweep, "intensity"),
+            TensorKind::Rows(sweep) => sweep_tensor(session, &frame, sweep, "row"),
+            TensorKind::Columns(sweep) => sweep_tensor(session, &frame, sweep, "column"),
+            TensorKind::PointInstances(sweep) => sweep_tensor(session, &frame, sweep, "instance"),
             TensorKind::Depth(image) => format!("{}/depth", image_names[image]),
             TensorKind::Opacity(image) => format!("{}/opacity", image_names[image]),
             TensorKind::Normals(image) => format!("{}/normals", image_names[image]),
@@ -101,6 +106,32 @@ fn image_names(session: &Session, frame: &wildcity_session::Observation) -> Vec<
         }
     };
     frame.images.iter().map(name).collect()
+}
+
+/// Name of a tensor of a sweep, by the sweep's index.
+fn sweep_tensor(
+    session: &Session,
+    frame: &wildcity_session::Observation,
+    sweep: usize,
+    tensor: &str,
+) -> String {
+    let name = &session.lidars()[frame.sweeps[sweep].lidar].name;
+    format!("lidar/{name}/{tensor}")
+}
+
+fn sweep(session: &Session, info: &SweepInfo) -> Sweep {
+    let mounted = &session.lidars()[info.lidar];
+    let first_us = mounted.lidar.age_us(0).round() as i64;
+    Sweep {
+        lidar: mounted.name.clone(),
+        start_us: info.time_us - first_us,
+        end_us: info.time_us,
+        rows: mounted.lidar.rows() as u64,
+        columns: mounted.lidar.columns() as u64,
+        returns: info.returns as u64,
+        lidar_to_rig: pose(&mounted.rig_from_lidar),
+        hash: info.hash.to_hex().to_string(),
+    }
 }
 
 fn past_tensor(session: &Session, past: &PastImageInfo) -> String {
@@ -194,6 +225,7 @@ fn metadata(
         },
         geo: located.map(geo),
         images: frame.images.iter().zip(image_names).map(drawn).collect(),
+        sweeps: frame.sweeps.iter().map(|info| sweep(session, info)).collect(),
         history: frame.history.iter().map(past).collect(),
         events: events(session),
         route: session.traffic().and_then(|traffic| route(traffic, episode)),

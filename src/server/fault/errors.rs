@@ -39,13 +39,18 @@ pub(super) fn pose_code(error: &PoseError) -> Code {
 fn rig_place(RigFieldError { part, cause }: &RigFieldError) -> Place {
     let part = format!("rig.{part}");
     match cause {
-        RigError::Count { .. } | RigError::Overlays { .. } => at(Code::OutOfRange, &part),
+        RigError::Count { .. } | RigError::Overlays { .. } | RigError::Lidars { .. } => {
+            at(Code::OutOfRange, &part)
+        }
         RigError::Name { .. } | RigError::Duplicate { .. } => at(Code::InvalidName, &part),
         RigError::Pose { cause, .. } => at(pose_code(cause), &format!("{part}.{}", cause.field())),
         RigError::Camera { cause, .. } => {
             at(Code::CameraInvalid, &format!("{part}.{}", cause.field()))
         }
-        RigError::Appearance { .. } => at(Code::CameraInvalid, &part),
+        RigError::LidarPose { cause, .. } => {
+            at(pose_code(cause), &format!("{part}.{}", cause.field()))
+        }
+        RigError::Appearance { .. } | RigError::Lidar { .. } => at(Code::CameraInvalid, &part),
     }
 }
 

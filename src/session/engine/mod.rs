@@ -22,6 +22,7 @@ use tokio::time::{Instant, sleep};
 use wildcity_render::{Backend, RenderError, View};
 use wildcity_repair::Models;
 use wildcity_scene::actor::ActorAsset;
+use wildcity_scene::geometry::Lidar;
 use wildcity_scene::{Rays, RenderProfile};
 use wildcity_sim::traffic::EgoBox;
 use wildcity_twin::residency::{
@@ -416,6 +417,11 @@ impl Engine {
         // Only small frames are rendered beside another one, see `render_queue`.
         let beside = if is_large { 0 } else { backend.bytes_beside(views) + rendered };
         FrameBytes { stages: backend.frame_bytes(views) + rendered, beside, is_large, images }
+    }
+
+    /// Buffers that a sweep of a LiDAR needs in addition to its scene, in bytes.
+    pub(crate) fn sweep_bytes(&self, lidar: &Lidar) -> u64 {
+        self.queue.backend().sweep_bytes(lidar)
     }
 
     /// Memory that the worst frame of a rig needs, in bytes.

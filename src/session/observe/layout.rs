@@ -3,14 +3,15 @@
 
 use std::collections::BTreeMap;
 
-use wildcity_options::{CameraSensor, Sensors};
+use wildcity_options::{CameraSensor, LidarSensor, Sensors};
 use wildcity_render::{MAX_VIEWS, View};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::FieldMask;
-use wildcity_scene::rig::{Rig, RigCamera};
+use wildcity_scene::rig::{Rig, RigCamera, RigLidar};
 
 use super::encode::{ImageEncoding, PixelMaps};
 use super::frame_history::{FrameHistory, PastFrame};
+use super::point_cloud::POINT_BYTES;
 use super::schedule::Schedule;
 use crate::episode::Episode;
 use crate::error::SessionError;
@@ -61,6 +62,7 @@ const _: () = assert!(Rig::MAX_CAMERAS <= MAX_VIEWS);
 #[derive(Debug)]
 pub(crate) struct ObservationLayout {
     cameras: Vec<RigCamera>,
+    lidars: Vec<RigLidar>,
     /// The share of each camera's image that its lens sees; `None` if that is all of it.
     visible_shares: Vec<Option<f64>>,
     encoding: ImageEncoding,
@@ -155,6 +157,7 @@ impl ObservationLayout {
         let visible_shares = cameras.iter().map(visible_share).collect();
         let layout = Self {
             cameras,
+            lidars: Vec::new(),
             visible_shares,
             encoding,
             maps,
@@ -166,6 +169,28 @@ impl ObservationLayout {
         // The largest answer to a step has all frames of all cameras.
         layout.check_size("outputs", layout.schedule.frames())?;
         Ok(layout)
+    }
+
+    /// Adds the LiDARs of the rig. Comes before [`Self::add_sensors`].
+    #[must_use]
+    pub(crate) fn with_lidars(self, lidars: Vec<RigLidar>) -> Self {
+        Self { lidars, ..self }
+    }
+
+    /// The LiDARs, in the order of the sweeps of an observation.
+    pub(crate) fn lidars(&self) -> &[RigLidar] {
+        &self.lidars
+    }
+
+    /// The effects on a LiDAR's sweeps, if it has any.
+    pub(crate) fn lidar_sensor(&self, lidar: usize) -> Option<&LidarSensor> {
+        self.sensors.as_ref()?.settings.lidars.get(&self.lidars[lidar].name)
+    }
+
+    /// The longest time that a picture or a sweep takes, in microseconds.
+    pub(crate) fn longest_exposure_us(&self) -> i64 {
+        let sweeps = self.lidars.iter().map(|mounted| mounted.lidar.duration_us());
+        sweeps.fold(View::longest_exposure_us(&self.cameras), i64::max)
     }
 
     /// Reserves room in the headers for the results of repair. Comes before
@@ -204,7 +229,7 @@ impl ObservationLayout {
         settings: Sensors,
         dt_us: i64,
     ) -> Result<(), SessionError> {
-        let cameras = check::check(&settings, &self.cameras, &self.schedule, dt_us)?;
+        let cameras = check::check(&settings, &self.cameras, &self.lidars, &self.schedule, dt_us)?;
         // Motion sensors alone add nothing to the description of an image.
         if !settings.cameras.is_empty() {
             self.image_bytes += SENSOR_IMAGE_BYTES;
@@ -396,7 +421,8 @@ impl ObservationLayout {
             ImageEncoding::Raw | ImageEncoding::Png => 3,
             ImageEncoding::Jpeg(_) => limits::JPEG_PIXEL_BYTES,
         };
-        2 * self.rig_pixels() * (maps + colour)
+        let beams: usize = self.lidars.iter().map(|mounted| mounted.lidar.beams()).sum();
+        2 * (self.rig_pixels() * (maps + colour) + (beams * POINT_BYTES) as u64)
     }
 
     /// Bytes of the images outside of the answer while a frame is rendered: pixels that are

@@ -34,5 +34,6 @@ pub(crate) mod frame_history;
 pub(crate) mod jpeg;
 pub(crate) mod layout;
 pub(crate) mod observation;
+pub(crate) mod point_cloud;
 pub(crate) mod schedule;
 pub(crate) mod trust;

@@ -17,9 +17,11 @@ pub struct Observation {
     pub tensors: Vec<Tensor>,
     /// The images, pose by pose, camera by camera.
     pub images: Vec<ImageInfo>,
+    /// The sweeps of the LiDARs, in the order of the rig.
+    pub sweeps: Vec<SweepInfo>,
     /// Earlier frames of the same cameras, camera by camera, the newest first.
     pub history: Vec<PastImageInfo>,
-    /// BLAKE3 of the images' hashes, 32 bytes each, in order.
+    /// BLAKE3 of the hashes of the images and then of the sweeps, 32 bytes each, in order.
     pub frame_hash: blake3::Hash,
     /// How many poses of the ego history were driven.
     pub history_count: usize,
@@ -59,6 +61,19 @@ pub struct ImageInfo {
     pub repair: Option<ImageRepair>,
     /// Effects of its camera on it, if the session asked for effects of this camera.
     pub sensor: Option<ImageSensor>,
+}
+
+/// One sweep of an [`Observation`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SweepInfo {
+    /// Index of the LiDAR among [`crate::Session::lidars`].
+    pub lidar: usize,
+    /// When its last column was fired, in microseconds since the episode's start.
+    pub time_us: i64,
+    /// BLAKE3 of positions, intensities, rows, columns and instances, in this order.
+    pub hash: blake3::Hash,
+    /// Number of returns.
+    pub returns: usize,
 }
 
 /// One earlier image of an [`Observation`].
@@ -104,6 +119,17 @@ pub enum TensorKind {
     Imu,
     /// Speed of the wheels of each step: `[n]`.
     WheelSpeed,
+    /// Positions of a sweep's returns in the rig's axes, in metres: `[n, 3]`. Sweeps by their index
+    /// in [`Observation::sweeps`].
+    Points(usize),
+    /// Intensity of each return: `[n]`.
+    Intensity(usize),
+    /// The row of each return's beam: `[n]`.
+    Rows(usize),
+    /// The column of each return's beam: `[n]`.
+    Columns(usize),
+    /// Whose Gaussian each return is from: `[n]`.
+    PointInstances(usize),
     /// Expected camera z in metres: `[height, width]`.
     Depth(usize),
     /// Accumulated opacity: `[height, width]`.

@@ -5,6 +5,7 @@ use std::slice::Iter;
 
 use wildcity_episode::{ActorStateLine, ActorsLine};
 use wildcity_render::View;
+use wildcity_scene::Rig;
 use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::geometry::Pose;
 use wildcity_sim::traffic::ActorState;
@@ -35,7 +36,7 @@ impl<'a> ActorReplay<'a> {
         Ok(Self {
             assets: ActorAssets::load(cache, actors.iter().map(|actor| actor.asset.as_deref()))?,
             count: actors.len(),
-            exposure_us: View::longest_exposure_us(&episode.header.rig.cameras),
+            exposure_us: longest_exposure_us(&episode.header.rig),
             later: episode.actors.iter().peekable(),
             past: ActorPast::default(),
         })
@@ -60,6 +61,11 @@ impl<'a> ActorReplay<'a> {
         let before = |exposure_us| self.past.poses_at(exposure_start_us(taken_us, exposure_us));
         self.assets.placed(&self.past.poses_at(taken_us), &before, frame)
     }
+}
+
+fn longest_exposure_us(rig: &Rig) -> i64 {
+    let sweeps = rig.lidars.iter().map(|mounted| mounted.lidar.duration_us());
+    sweeps.fold(View::longest_exposure_us(&rig.cameras), i64::max)
 }
 
 /// No request shows frames from longer ago than this, in microseconds.

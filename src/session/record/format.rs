@@ -172,10 +172,13 @@ pub struct FrameRecord {
     pub notes: Option<Value>,
     /// Whether the agent ended the episode with this step.
     pub terminated: bool,
-    /// BLAKE3 of the shown images' hashes, in hex.
+    /// BLAKE3 of the hashes of the shown images and then of the sweeps, in hex.
     pub frame_hash: String,
     /// BLAKE3 of each image's pixels as sent, in hex: pose by pose, camera by camera.
     pub images: Vec<String>,
+    /// BLAKE3 of each sweep's points as sent, in hex, in the order of the rig; absent without LiDARs.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub sweeps: Vec<String>,
     /// Results of the repair model, in the order of `images`; absent if it was used on none of
     /// them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]

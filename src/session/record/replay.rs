@@ -7,7 +7,7 @@ use wildcity_episode::ground_surface;
 use wildcity_render::{Backend, Frame, RenderError, Target, View};
 use wildcity_repair::Models;
 use wildcity_scene::RenderProfile;
-use wildcity_scene::rig::RigCamera;
+use wildcity_scene::rig::{RigCamera, RigLidar};
 use wildcity_sim::Ground;
 use wildcity_sim::map::LaneSurface;
 use wildcity_twin::residency::{Cache, Resident};
@@ -25,9 +25,10 @@ use super::replay_report::{
 };
 use super::sensor_replay::SensorReplay;
 use super::values;
+use crate::observe::point_cloud::{PointCloud, lidar_view};
 use crate::repair::rendered_image::RenderedImage;
 use crate::scenario::assets::FrameDetail;
-use crate::viewpoint::viewpoints;
+use crate::viewpoint::{lidar_viewpoint, viewpoints};
 
 /// The caller's function for each image, which runs before the image is compared with the record.
 type VisitImage<'a> = dyn FnMut(&ReplayedImage<'_>) -> Result<(), String> + 'a;
@@ -79,6 +80,7 @@ impl RecordedEpisode {
             }
             replay.check_values(frame, index);
             replay.render(frame, index, until, visit)?;
+            replay.check_sweeps(frame, index)?;
             if until == ReplayUntil::FirstDifference && replay.report.difference.is_some() {
                 return Ok(replay.report);
             }
@@ -99,6 +101,7 @@ impl RecordedEpisode {
 /// The state of a replay.
 struct Replay<'a> {
     cameras: &'a [RigCamera],
+    lidars: &'a [RigLidar],
     backend: &'a dyn Backend,
     resident: Arc<Resident>,
     profile: &'a RenderProfile,
@@ -153,6 +156,7 @@ impl<'a> Replay<'a> {
         let images = cameras.iter().map(buffers).collect();
         Ok(Self {
             cameras,
+            lidars: &header.rig.lidars,
             backend,
             resident,
             profile: &header.profile,
@@ -321,6 +325,41 @@ impl<'a> Replay<'a> {
                         return Ok(());
                     }
                 }
+            }
+        }
+        Ok(())
+    }
+
+    /// Casts the sweeps of a frame again and compares their points.
+    fn check_sweeps(&mut self, frame: &FrameRecord, index: usize) -> Result<(), ReplayError> {
+        let step = frame.step;
+        // Not every frame has sweeps: `observe` has none. A frame that has one has all.
+        for ((lidar, mounted), recorded) in self.lidars.iter().enumerate().zip(&frame.sweeps) {
+            let view = lidar_view(mounted, self.ego.episode());
+            let viewpoints = [lidar_viewpoint(&view)];
+            let residency = |cause| ReplayError::Residency { step, cause };
+            let mut scene = self.resident.scene(&viewpoints, self.profile).map_err(residency)?;
+            let exposures_us = &[mounted.lidar.duration_us()];
+            let detail =
+                FrameDetail { viewpoints: &viewpoints, exposures_us, profile: self.profile };
+            scene.place(self.actors.placed(frame.time_us, detail));
+            let sweep = self
+                .backend
+                .sweep(&scene, self.profile, &view)
+                .map_err(|cause| ReplayError::Render { step, cause })?;
+            let effects = self.sensors.as_ref().and_then(|sensors| sensors.lidar_effects(lidar));
+            let cloud = PointCloud::new(lidar, mounted, &sweep, frame.time_us, effects);
+            let now = cloud.hash().to_hex().to_string();
+            if now != *recorded && self.report.difference.is_none() {
+                self.report.difference = Some(ImageDifference {
+                    line: self.frame_lines[index],
+                    request: frame.request,
+                    step,
+                    pose: 0,
+                    camera: mounted.name.clone(),
+                    recorded: recorded.clone(),
+                    now,
+                });
             }
         }
         Ok(())

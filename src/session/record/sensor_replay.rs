@@ -1,5 +1,7 @@
 //! The effects of sensors on a recorded episode, decided and computed again.
 
+use wildcity_options::LidarSensor;
+
 use super::format::{EpisodeHeader, FrameRecord, FrameRequest, RecordedSettings};
 use super::replay_report::ReplayError;
 use crate::episode::Episode;
@@ -31,10 +33,15 @@ impl SensorReplay {
         let maps = PixelMaps::default();
         let layout =
             ObservationLayout::new(cameras, header.outputs.encoding, maps, schedule.clone());
-        let mut layout = layout.map_err(wrong)?;
+        let mut layout = layout.map_err(wrong)?.with_lidars(header.rig.lidars.clone());
         layout.add_sensors(sensors.clone(), header.dt_us).map_err(wrong)?;
         let effect_seed = EffectSeed::from_episode(&header.first_state());
         Ok(Some(Self { layout, effect_seed }))
+    }
+
+    /// The effects on a LiDAR's sweeps, if it has any.
+    pub(super) fn lidar_effects(&self, lidar: usize) -> Option<(&LidarSensor, EffectSeed)> {
+        self.layout.lidar_sensor(lidar).map(|sensor| (sensor, self.effect_seed))
     }
 
     /// The first camera of a pose whose picture, by the settings, was taken at a time or place that

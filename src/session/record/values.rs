@@ -45,7 +45,7 @@ fn wrong_frame_hash(frame: &FrameRecord, rig_cameras: usize, line: usize) -> Opt
                 shown.extend(of_pose.into_iter().filter(|_| is_last || is_due));
             }
             shown.sort_by_key(|(camera, _)| *camera);
-            hash_images(shown.into_iter().map(|(_, image)| image))
+            hash_images(shown.into_iter().map(|(_, image)| image).chain(&frame.sweeps))
         }
     };
     // Observations between two decisions show no images, even if a later observation shows images

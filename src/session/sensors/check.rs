@@ -2,11 +2,11 @@
 
 use std::ops::RangeInclusive;
 
-use wildcity_scene::rig::RigCamera;
+use wildcity_scene::rig::{RigCamera, RigLidar};
 
 use wildcity_options::{
-    CameraSensor, ExposureDrift, FrozenFrames, ImageNoise, LateFrames, LensDirt, Sensors,
-    WheelSpeed,
+    CameraSensor, ExposureDrift, FrozenFrames, ImageNoise, LateFrames, LensDirt, LidarSensor,
+    Sensors, WheelSpeed,
 };
 
 use super::settings::{axes, bias_period_us, reach_us};
@@ -21,6 +21,7 @@ use crate::observe::schedule::Schedule;
 pub(crate) fn check(
     sensors: &Sensors,
     cameras: &[RigCamera],
+    lidars: &[RigLidar],
     schedule: &Schedule,
     dt_us: i64,
 ) -> Result<Vec<CameraSensor>, SessionError> {
@@ -34,6 +35,16 @@ pub(crate) fn check(
         };
         check_camera(sensor, &field, schedule.period_us(index))?;
         by_index[index] = *sensor;
+    }
+    for (name, LidarSensor { noise_m, drop }) in &sensors.lidars {
+        let field = format!("sensors.lidars.{name}");
+        if lidars.iter().all(|lidar| lidar.name != *name) {
+            let known: Vec<&str> = lidars.iter().map(|lidar| lidar.name.as_str()).collect();
+            let must = format!("for no LiDAR of the rig, which has {known:?}");
+            return Err(SessionError::CameraOption { field, must });
+        }
+        number(&format!("{field}.noise_m"), noise_m.unwrap_or(0.0), 0.0..=10.0)?;
+        number(&format!("{field}.drop"), drop.unwrap_or(0.0), 0.0..=1.0)?;
     }
     if let Some(imu) = &sensors.imu {
         for (name, axis) in ["accelerometer", "gyroscope"].into_iter().zip(axes(imu)) {

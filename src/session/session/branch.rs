@@ -8,7 +8,7 @@ use tokio::time::Instant;
 use wildcity_scene::rig::overlay_bytes;
 
 use super::Session;
-use super::open::{frame_bytes, prepare, rig_extent, solid_ego};
+use super::open::{frame_bytes, layout_extent, prepare, rig_extent, solid_ego};
 use super::pending::{EpisodeFile, NewEpisode, Pending};
 use super::requests::SimulationState;
 use crate::blocking::run_blocking;
@@ -76,7 +76,7 @@ impl Session {
         let mut bytes = None;
         if !version.has_same_version(&self.version) {
             let resident = version.resident.clone();
-            let extent = rig_extent(layout.cameras());
+            let extent = layout_extent(layout);
             bytes = Some(Engine::worst_case_bytes(resident, extent, version.profile).await?);
         }
 
@@ -110,7 +110,7 @@ impl Session {
         from: &Snapshot,
     ) -> Result<Self, SessionError> {
         let Snapshot { settings, version, state, origin } = from;
-        let extent = rig_extent(settings.layout.cameras());
+        let extent = layout_extent(&settings.layout);
         let frame = frame_bytes(&engine, &settings.layout, version.coverage.is_some());
         // Memory for its own frames: a branch lives on without the session that it comes from.
         let resident = version.resident.clone();
@@ -174,7 +174,7 @@ impl Session {
         // The file may have been changed, so that its values are checked as those of a request are.
         recorded.schedule.check(cameras.len(), header.dt_us)?;
         let overlays = engine.answer_budget().reserve(overlay_bytes(&cameras))?;
-        let extent = rig_extent(&cameras);
+        let extent = rig_extent(&cameras, &header.rig.lidars);
         let outputs = header.outputs;
         let maps = PixelMaps {
             depth: outputs.depth,
@@ -182,8 +182,8 @@ impl Session {
             normals: outputs.normals,
             instances: outputs.instances,
         };
-        let mut layout =
-            ObservationLayout::new(cameras, outputs.encoding, maps, recorded.schedule)?;
+        let layout = ObservationLayout::new(cameras, outputs.encoding, maps, recorded.schedule)?;
+        let mut layout = layout.with_lidars(header.rig.lidars);
         if let Some(sensors) = recorded.sensors {
             layout.add_sensors(sensors, header.dt_us)?;
         }

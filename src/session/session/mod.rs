@@ -16,6 +16,7 @@ mod prefetching;
 mod recording;
 mod reference_images;
 pub(crate) mod requests;
+mod sweeps;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -26,7 +27,7 @@ use wildcity_options::Sensors;
 use wildcity_render::View;
 use wildcity_scene::RenderProfile;
 use wildcity_scene::geometry::Pose;
-use wildcity_scene::rig::RigCamera;
+use wildcity_scene::rig::{RigCamera, RigLidar};
 use wildcity_sim::Dynamics;
 use wildcity_twin::residency::{Reservation, Resident, Viewpoint};
 
@@ -127,6 +128,11 @@ impl Session {
     /// The cameras that are rendered, in the order of the images.
     pub fn cameras(&self) -> &[RigCamera] {
         self.settings.layout.cameras()
+    }
+
+    /// The LiDARs, in the order of the sweeps of an observation.
+    pub fn lidars(&self) -> &[RigLidar] {
+        self.settings.layout.lidars()
     }
 
     /// The share of a camera's image that its lens sees; `None` if that is all of it.

@@ -14,9 +14,10 @@ use wildcity_options::{
     ContactMode, ImagePart, Open, Outputs, RandomStart, Repair, RigChoice, Sensors, Start,
 };
 use wildcity_render::View;
+use wildcity_render::lidar::LidarView;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::{
-    Rig, RigCamera, UnreadRig, check_overlay_pixels, is_name, overlay_bytes,
+    Rig, RigCamera, RigLidar, UnreadRig, check_overlay_pixels, is_name, overlay_bytes,
 };
 use wildcity_scene::{Manifest, ProfileOverrides, RenderProfile, Trajectory};
 use wildcity_sim::Dynamics;
@@ -44,7 +45,7 @@ use crate::sensors::settings::used;
 use crate::snapshot::Snapshots;
 use crate::start::{EpisodeStart, checked_pose};
 use crate::state::{EpisodeState, PinnedVersion, SessionSettings};
-use crate::viewpoint::viewpoints;
+use crate::viewpoint::{lidar_viewpoint, viewpoints};
 
 impl Session {
     /// Opens a session, and reserves the memory for its worst frame. `seq`, `session` and
@@ -87,14 +88,14 @@ impl Session {
         };
         // Counted as long as the settings exist, which the session shares with its branches.
         let overlays = engine.answer_budget().reserve(overlay_bytes(&rig.cameras))?;
-        let extent = rig_extent(&rig.cameras);
+        let extent = rig_extent(&rig.cameras, &rig.lidars);
 
         let repair = asked.load_repair(&engine, &rig.cameras).await?;
         let reports_actors = opened.is_some() && asked.outputs.actors.unwrap_or(false);
         let actors = opened
             .as_ref()
             .map(|opened| if reports_actors { opened.resolved().traffic.actors.len() } else { 0 });
-        let layout = asked.layout(rig.cameras, repair.as_deref(), actors)?;
+        let layout = asked.layout(rig.cameras, rig.lidars, repair.as_deref(), actors)?;
 
         // Find where episodes start, and the recorded drive that the ego may follow from there.
         let manifest = &resident.version.manifest;
@@ -156,7 +157,7 @@ impl Session {
         let references = load_references(&engine, &resident, &settings).await?;
         let version = version.with_references(references);
 
-        let exposure_us = View::longest_exposure_us(settings.layout.cameras());
+        let exposure_us = settings.layout.longest_exposure_us();
         let traffic = loaded.map(|EpisodeScenario { loaded, assets }| {
             EpisodeTraffic::at_start(loaded, assets, episode.ego(), exposure_us)
                 .with_reach(episode.reach_us())
@@ -215,7 +216,7 @@ impl Session {
         if resident.version.number == current.number {
             return Ok(());
         }
-        let extent = rig_extent(self.settings.layout.cameras());
+        let extent = layout_extent(&self.settings.layout);
         let coverage_for = self.version.coverage.as_ref().map(|_| "outputs.trust");
         let profile = resolve_profile(&self.engine, &resident, &self.settings)?;
         let solid_ego = self.settings.solid_ego;
@@ -354,6 +355,7 @@ impl Asked {
     fn layout(
         &self,
         cameras: Vec<RigCamera>,
+        lidars: Vec<RigLidar>,
         repair: Option<&SessionRepair>,
         actors: Option<usize>,
     ) -> Result<ObservationLayout, SessionError> {
@@ -363,7 +365,8 @@ impl Asked {
             Schedule::new(&cameras, self.dt_us, outputs.frames, &periods_us, self.decision_us)?;
         let encoding = ImageEncoding::new(outputs);
         let maps = PixelMaps::new(outputs);
-        let mut layout = ObservationLayout::new(cameras, encoding, maps, schedule)?;
+        let layout = ObservationLayout::new(cameras, encoding, maps, schedule)?;
+        let mut layout = layout.with_lidars(lidars);
         if repair.is_some() {
             layout.reserve_repair();
         }
@@ -573,7 +576,7 @@ fn select_cameras(
         }
         selected.push(camera.clone());
     }
-    Ok(Rig { name: rig.name, cameras: selected })
+    Ok(Rig { cameras: selected, ..rig })
 }
 
 /// The same rig with the requested crops and sizes.
@@ -618,8 +621,18 @@ fn crop_and_scale(mut rig: Rig, outputs: &Outputs) -> Result<Rig, SessionError> 
 }
 
 /// The properties of a rig that determine how much memory its frames need.
-pub(super) fn rig_extent(cameras: &[RigCamera]) -> RigExtent {
-    RigExtent::new(&viewpoints(&View::from_rig(cameras, Pose::IDENTITY)), DVec3::ZERO)
+pub(super) fn rig_extent(cameras: &[RigCamera], lidars: &[RigLidar]) -> RigExtent {
+    let mut places = viewpoints(&View::from_rig(cameras, Pose::IDENTITY));
+    places.extend(lidars.iter().map(|mounted| {
+        let view = LidarView::at_rest(mounted.lidar.clone(), mounted.rig_from_lidar);
+        lidar_viewpoint(&view)
+    }));
+    RigExtent::new(&places, DVec3::ZERO)
+}
+
+/// That of a session's rig.
+pub(super) fn layout_extent(layout: &ObservationLayout) -> RigExtent {
+    rig_extent(layout.cameras(), layout.lidars())
 }
 
 /// What the frames of a session take beside their scenes.
@@ -630,7 +643,12 @@ pub(super) fn frame_bytes(
 ) -> FrameBytes {
     // Buffers depend on sizes and not on places.
     let views = View::from_rig(layout.cameras(), Pose::IDENTITY);
-    engine.frame_bytes(&views, layout.rendered_bytes(has_trust), layout.answers_bytes())
+    let frame =
+        engine.frame_bytes(&views, layout.rendered_bytes(has_trust), layout.answers_bytes());
+    // Sweeps are rendered one after the other, and not beside the session's own images.
+    let lidars = layout.lidars().iter().map(|mounted| engine.sweep_bytes(&mounted.lidar));
+    let sweep = lidars.max().unwrap_or(0);
+    FrameBytes { stages: frame.stages.max(sweep), beside: frame.beside.max(sweep), ..frame }
 }
 
 /// The drive that the start names, else the twin's first.

@@ -98,6 +98,11 @@ impl Session {
             terminated: episode.terminated(),
             frame_hash: observation.frame_hash.to_hex().to_string(),
             images: hashes.iter().map(|hash| hash.to_hex().to_string()).collect(),
+            sweeps: observation
+                .sweeps
+                .iter()
+                .map(|sweep| sweep.hash.to_hex().to_string())
+                .collect(),
             repairs: RecordedImageRepair::list(repairs),
         }
     }
@@ -140,7 +145,11 @@ impl Session {
             profile_hash: pinned.profile_hash.to_hex().to_string(),
             backend: self.engine.backend().to_owned(),
             backend_detail: self.engine.backend_detail(),
-            rig: Rig { name: settings.rig_name.clone(), cameras },
+            rig: Rig {
+                name: settings.rig_name.clone(),
+                cameras,
+                lidars: settings.layout.lidars().to_vec(),
+            },
             outputs: RecordedOutputs {
                 encoding: settings.layout.encoding(),
                 depth,

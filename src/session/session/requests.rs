@@ -8,7 +8,7 @@ use tokio::time::{Instant, timeout_at};
 use tracing::{Instrument as _, debug_span};
 
 use wildcity_options::{ContactMode, DynamicsChoice, DynamicsModel, Start};
-use wildcity_render::{Backend, Frame, View};
+use wildcity_render::{Backend, Frame};
 use wildcity_scene::geometry::Pose;
 use wildcity_sim::scenario::EndReason;
 use wildcity_sim::{Command, Dynamics, Ego, Ground};
@@ -331,7 +331,7 @@ impl Session {
         let mut next = start
             .episode(seed, dynamics, settings.dt_us)
             .with_sensors(settings.layout.episode_sensors());
-        let exposure_us = View::longest_exposure_us(settings.layout.cameras());
+        let exposure_us = settings.layout.longest_exposure_us();
         let mut traffic = loaded.map(|EpisodeScenario { loaded, assets }| {
             EpisodeTraffic::at_start(loaded, assets, next.ego(), exposure_us)
                 .with_reach(next.reach_us())
@@ -385,12 +385,17 @@ impl Session {
     ) -> Result<RenderedObservation, SessionError> {
         let SimulationState { episode, traffic } = simulation;
         let layout = &self.settings.layout;
+        // Poses that the ego is not at have no sweeps, and neither have times between decisions.
+        let is_shown = history.is_some() && captures.last().is_some_and(|capture| capture.shown);
+        let sweeps =
+            if is_shown { self.sweeps(version, simulation, deadline).await? } else { Vec::new() };
         let mut builder = ObservationBuilder::new(
             layout.clone(),
             self.engine.answer_budget(),
             version.coverage.clone(),
             episode,
             &captures,
+            &sweeps,
         )?
         .with_repair(self.settings.repair.clone().map(|repair| {
             // Without history, the poses are not the ego's, and no state of the repair is kept.

@@ -210,6 +210,52 @@ class Camera:
 
 
 @dataclass(frozen=True)
+class LidarColumns:
+    """Columns of a LiDAR at equal distances."""
+
+    count: int
+    """Number of columns."""
+    first_rad: float
+    """Azimuth of the column that is fired first, in radians from x to y."""
+    last_rad: float
+    """Azimuth of the column that is fired last."""
+
+
+@dataclass(frozen=True)
+class LidarBeams:
+    """The beams of a LiDAR, `[rows, columns]`. A beam has the elevation of its row and the azimuth of its column plus
+    the offset of its row. The tables of NVIDIA's ncore have the same names."""
+
+    row_elevations_rad: tuple[float, ...]
+    """Elevation of each row, in radians, rising or falling."""
+    duration_us: int
+    """Time of a revolution, or of a frame of a LiDAR that does not spin, in microseconds. The columns are fired at
+    equal distances, the last one at the time of the observation."""
+    column_azimuths_rad: tuple[float, ...] | None = None
+    """Azimuth of each column, in radians from x to y, in the order in which they are fired."""
+    columns: LidarColumns | None = None
+    """Columns at equal distances, instead of a table."""
+    max_range_m: float | None = None
+    """Nothing farther is returned, in metres. 200 if absent."""
+    min_range_m: float | None = None
+    """Nothing nearer is returned, in metres. 0.5 if absent."""
+    row_azimuth_offsets_rad: tuple[float, ...] | None = None
+    """Added to the azimuths of each row, in radians. 0 if absent."""
+
+
+@dataclass(frozen=True)
+class RigLidar:
+    """A LiDAR on the rig. Its axes are x forward, y left, z up."""
+
+    name: str
+    """Name within the rig, also among the names of its cameras."""
+    beams: LidarBeams
+    """The directions of its beams, and when they are fired."""
+    lidar_to_rig: Pose
+    """Pose of the LiDAR on the rig."""
+
+
+@dataclass(frozen=True)
 class Rig:
     """The cameras of a vehicle."""
 
@@ -217,6 +263,8 @@ class Rig:
     """Name."""
     cameras: tuple[Camera, ...]
     """The cameras, in the order of the images in observations."""
+    lidars: tuple[RigLidar, ...] | None = None
+    """The LiDARs. Every observation of the ego has a sweep of each, which ends at its time."""
 
 
 RigChoice = Union[str, Rig]  # noqa: UP007
@@ -319,6 +367,16 @@ class Imu:
 
 
 @dataclass(frozen=True)
+class LidarSensor:
+    """Effects on the sweeps of a LiDAR."""
+
+    drop: float | None = None
+    """Probability that a beam has no return."""
+    noise_m: float | None = None
+    """Standard deviation of the ranges, in metres."""
+
+
+@dataclass(frozen=True)
 class WheelSpeed:
     """Errors of the speed that the wheels measure."""
 
@@ -340,6 +398,8 @@ class Sensors:
     """Adds the tensor `sensor.wheel_speed`."""
     delay_us: int | None = None
     """Time after which a decision takes effect, in microseconds: a whole number of steps. If absent, 0."""
+    lidars: dict[str, LidarSensor] | None = None
+    """Effects on sweeps, by LiDAR name."""
 
 
 @dataclass(frozen=True)
@@ -1067,6 +1127,30 @@ class Route:
 
 
 @dataclass(frozen=True)
+class Sweep:
+    """One sweep of a LiDAR."""
+
+    lidar: str
+    """Name of the LiDAR. Its tensors are `lidar/<name>/points`, in metres in the rig's axes when their column was
+    fired, `lidar/<name>/intensity`, `lidar/<name>/row`, `lidar/<name>/column` and `lidar/<name>/instance`."""
+    start_us: int
+    """Time of the first column, in simulated microseconds."""
+    end_us: int
+    """Time of the last column, in simulated microseconds: that of the observation. The columns between are fired at
+    equal distances."""
+    rows: int
+    """Number of rows of the beams."""
+    columns: int
+    """Number of columns of the beams."""
+    returns: int
+    """Number of returns."""
+    lidar_to_rig: Pose
+    """`rig_from_lidar`."""
+    hash: str
+    """BLAKE3 of the five tensors in the order above, in hex."""
+
+
+@dataclass(frozen=True)
 class Stage:
     """Wall time of a render stage."""
 
@@ -1119,7 +1203,7 @@ class Metadata:
     backend: str
     """Name of the backend."""
     frame_hash: str
-    """BLAKE3 of the images' hashes (32 bytes each, in order), in hex."""
+    """BLAKE3 of the hashes of the images and then of the sweeps (32 bytes each, in order), in hex."""
     ego: Ego
     """State of the ego at this time."""
     images: tuple[ImageInfo, ...]
@@ -1138,6 +1222,9 @@ class Metadata:
     """Earlier frames of the same cameras, camera by camera, newest first. Absent if there are none."""
     route: Route | None = None
     """Where to drive. Only with a scenario that has a route."""
+    sweeps: tuple[Sweep, ...] = ()
+    """The sweeps of the LiDARs, in the order of the rig. Only of observations of the ego itself, not of `observe`, and
+    empty between two decisions."""
 
 
 @dataclass(frozen=True)

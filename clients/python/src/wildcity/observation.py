@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from .errors import BadFrame, ProtocolError, Refused
-from .messages import Ego, ImageInfo, ManyMetadata, Metadata
+from .messages import Ego, ImageInfo, ManyMetadata, Metadata, Sweep
 from .protocol import decode, parse_json
 
 HEADER_BYTES = 1 << 20
@@ -118,6 +118,11 @@ class Observation:
         """The owner of the Gaussian that each pixel shows, by camera: 0 none, 1 the twin, else `Actor.instance`."""
         return self.views[0].instances
 
+    @property
+    def lidars(self) -> Mapping[str, PointCloud]:
+        """The sweep of each LiDAR of the rig, by its name; empty after `observe`."""
+        return {sweep.lidar: PointCloud(self._content, sweep) for sweep in self.metadata.sweeps}
+
     def frames(self, camera: str) -> NDArray[np.uint8]:
         """uint8 [k, height, width, 3]: the last k frames of a camera, oldest first.
 
@@ -180,6 +185,11 @@ class Observation:
                     self._expect(_sibling(image, output), "F32", shape)
             if _sibling(image, "instances") in self._tensors:
                 self._expect(_sibling(image, "instances"), "U16", size)
+        for sweep in self.metadata.sweeps:
+            self._expect(_of_sweep(sweep, "points"), "F32", (sweep.returns, 3))
+            self._expect(_of_sweep(sweep, "intensity"), "F32", (sweep.returns,))
+            for ids in ("row", "column", "instance"):
+                self._expect(_of_sweep(sweep, ids), "U16", (sweep.returns,))
 
     def _expect(self, name: str, dtype: str, shape: tuple[int, ...] | None) -> None:
         """Checks type and shape of a tensor; with `shape` None, any one-dimensional one."""
@@ -271,6 +281,57 @@ class View:
         return _LazyArrays(present, lambda image: content.tensor(_sibling(image, output)), have)
 
 
+class PointCloud:
+    """The returns of one sweep of a LiDAR, row by row. Arrays are read-only views of the frame."""
+
+    def __init__(self, content: _Content, sweep: Sweep) -> None:
+        self._content = content
+        self.metadata = sweep
+
+    @property
+    def points(self) -> NDArray[np.float32]:
+        """float32 [n, 3]: positions in metres in the rig's axes when each was measured. A sweep of a moving ego is
+        skewed; `times_us` says when, for whoever deskews it."""
+        return self._tensor("points")
+
+    @property
+    def intensity(self) -> NDArray[np.float32]:
+        """float32 [n]: mean luminance of what was hit. Twins are trained on images and know no infrared light."""
+        return self._tensor("intensity")
+
+    @property
+    def rows(self) -> NDArray[np.uint16]:
+        """uint16 [n]: the row of each return's beam, in the order of the rig file."""
+        return self._tensor("row")
+
+    @property
+    def columns(self) -> NDArray[np.uint16]:
+        """uint16 [n]: the column of each return's beam, in the order in which they are fired."""
+        return self._tensor("column")
+
+    @property
+    def instances(self) -> NDArray[np.uint16]:
+        """uint16 [n]: the owner of what was hit: 1 the twin, else `Actor.instance`."""
+        return self._tensor("instance")
+
+    @property
+    def times_us(self) -> NDArray[np.float64]:
+        """float64 [n]: when each return was measured, in simulated microseconds."""
+        sweep = self.metadata
+        step = (sweep.end_us - sweep.start_us) / max(sweep.columns - 1, 1)
+        return sweep.end_us - (sweep.columns - 1 - self.columns.astype(np.float64)) * step
+
+    def _tensor(self, name: str) -> NDArray[Any]:
+        return self._content.tensor(_of_sweep(self.metadata, name))
+
+    def __len__(self) -> int:
+        return self.metadata.returns
+
+    def __repr__(self) -> str:
+        m = self.metadata
+        return f"<PointCloud {m.lidar}: {m.returns} of {m.rows} x {m.columns} beams, to {m.end_us} us>"
+
+
 class _LazyArrays(Mapping[str, NDArray[Any]]):
     """Arrays by camera, made at the first access. `have` says which arrays exist, for errors."""
 
@@ -317,6 +378,10 @@ class _Content:
     def encoded(self, image: ImageInfo) -> memoryview:
         tensor = self.tensors[image.tensor]
         return memoryview(self.frame)[tensor.start : tensor.start + math.prod(tensor.shape)]
+
+
+def _of_sweep(sweep: Sweep, tensor: str) -> str:
+    return f"lidar/{sweep.lidar}/{tensor}"
 
 
 def _sibling(image: ImageInfo, output: str) -> str:

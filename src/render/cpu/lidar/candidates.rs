@@ -44,7 +44,7 @@ pub(super) struct Candidates {
 
 /// Candidates after which they are compared with beams: they, and their places in the lists of
 /// tiles, are in memory at once, 4 MB.
-const BATCH: usize = 1 << 15;
+pub(super) const BATCH: usize = 1 << 15;
 
 /// A cluster, and whose it is.
 #[derive(Clone, Copy)]

@@ -22,6 +22,8 @@ use rayon::prelude::*;
 
 use self::sector::{Scratch, Sector};
 use crate::lidar::{LidarView, Sweep};
+use wildcity_scene::chunk::LANES;
+use wildcity_scene::geometry::Lidar;
 use wildcity_scene::{RenderProfile, Scene};
 
 /// The sweep of a LiDAR. Runs on the current rayon pool; the result does not depend on it.
@@ -54,4 +56,17 @@ pub(crate) fn sweep(
         }
     }
     sweep
+}
+
+/// An upper bound of the memory of a sweep on some threads, in bytes: its returns; and for each
+/// thread the candidates of a batch, and beams full of the faintest hits. Hits have at least an
+/// alpha of the cut, and a beam keeps none behind its return: 177 at 1/255.
+pub(crate) fn most_bytes(lidar: &Lidar, threads: usize) -> u64 {
+    const MOST_HITS: usize = 177;
+    let returns = 2 * lidar.beams() * (4 + 4 + 2);
+    // Vectors grow to twice what they hold.
+    let beams = lidar.rows().next_multiple_of(LANES) * sector::MOST_COLUMNS;
+    let hits = 2 * beams * MOST_HITS * size_of::<(beam::Hit, f32)>();
+    let candidates = 2 * candidates::BATCH * (size_of::<candidates::Candidate>() + 4 * 12);
+    (returns + threads * (hits + candidates)) as u64
 }

@@ -14,7 +14,7 @@ use wildcity_scene::{Chunk, RenderProfile, Scene};
 
 /// Most columns of a sector: 4 tiles. A tenth of a second of 30 m/s is 3 m, of which a sector of a
 /// sweep of 2,048 columns has 0.09 m.
-const MOST_COLUMNS: usize = 64;
+pub(super) const MOST_COLUMNS: usize = 64;
 
 /// Largest angle between the azimuths of a sector, in radians. Row offsets alone may span 1 rad.
 const MOST_RAD: f64 = 1.05;

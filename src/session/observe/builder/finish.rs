@@ -72,12 +72,14 @@ impl ObservationBuilder {
         let mut images: Vec<ImageInfo> = shown.into_iter().map(|image| image.info).collect();
         // A client expects them by pose and camera; the captures come by time.
         images.sort_by_key(|image| [image.pose, image.camera]);
-        let frame_hash = frame_hash(images.iter().map(|image| image.hash));
+        let hashes = images.iter().map(|image| image.hash);
+        let frame_hash = frame_hash(hashes.chain(self.sweeps.iter().map(|sweep| sweep.hash)));
         Ok(RenderedObservation {
             observation: Observation {
                 buffer: self.buffer,
                 tensors: tensors.list,
                 images,
+                sweeps: self.sweeps,
                 history: past_images,
                 frame_hash,
                 history_count: self.history_count,
@@ -180,6 +182,10 @@ impl ObservationBuilder {
         if let Some(samples) = wheel_speed {
             tensors.push(TensorKind::WheelSpeed, DType::F32, vec![samples]);
         }
+        for (index, sweep) in self.sweeps.iter().enumerate() {
+            tensors.push(TensorKind::Points(index), DType::F32, vec![sweep.returns, 3]);
+            tensors.push(TensorKind::Intensity(index), DType::F32, vec![sweep.returns]);
+        }
         let PixelMaps { depth, opacity, normals, instances } = layout.maps();
         // Each with its place among the images.
         // At most 256 images: to compare all pairs is cheap.
@@ -201,6 +207,11 @@ impl ObservationBuilder {
             }
             if normals {
                 tensors.push(TensorKind::Normals(index), DType::F32, vec![height, width, 3]);
+            }
+        }
+        for (index, sweep) in self.sweeps.iter().enumerate() {
+            for kind in [TensorKind::Rows, TensorKind::Columns, TensorKind::PointInstances] {
+                tensors.push(kind(index), DType::U16, vec![sweep.returns]);
             }
         }
         for &(index, image) in placed.iter().filter(|_| instances) {
@@ -297,7 +308,7 @@ impl TensorList {
     }
 }
 
-/// The hash of a frame: BLAKE3 of its images' hashes, in order.
+/// The hash of a frame: BLAKE3 of the hashes of its images and sweeps, in order.
 fn frame_hash(images: impl Iterator<Item = blake3::Hash>) -> blake3::Hash {
     let mut hasher = blake3::Hasher::new();
     for hash in images {

@@ -16,7 +16,8 @@ use wildcity_render::{Backend, Frame, FrameStats, Target};
 use super::buffer::ObservationBuffer;
 use super::encode::{AppliedEffects, EncodedImage, ImageEncoding, encode, hashed};
 use super::layout::{EffectSeed, ObservationLayout, RigCapture};
-use super::observation::{ResidencyStats, Timings};
+use super::observation::{ResidencyStats, SweepInfo, Timings};
+use super::point_cloud::PointCloud;
 use super::trust::TrainingCoverage;
 use crate::engine::answer_budget::AnswerBudget;
 use crate::engine::render_queue::Scratch;
@@ -44,6 +45,8 @@ pub(crate) struct ObservationBuilder {
     effect_seed: EffectSeed,
     /// Number of samples of the inertial measurement unit and of the wheels; `None` without.
     motion_samples: [Option<usize>; 2],
+    /// The sweeps, whose points the buffer has already.
+    sweeps: Vec<SweepInfo>,
     /// Where the next capture goes in the buffer.
     plan: BufferPlan,
     captures: Vec<RigCapture>,
@@ -62,6 +65,7 @@ impl ObservationBuilder {
         coverage: Option<Arc<TrainingCoverage>>,
         episode: &Episode,
         captures: &[RigCapture],
+        sweeps: &[PointCloud],
     ) -> Result<Self, SessionError> {
         // Only `observe` can ask for more than `open` has checked.
         // Refused before memory is reserved, with the limit of pixels and not that of the budget.
@@ -75,11 +79,23 @@ impl ObservationBuilder {
             [None; 2]
         };
 
+        for sweep in sweeps {
+            sweep.float_bytes().into_iter().for_each(|bytes| history.extend_from_slice(bytes));
+        }
         let header = layout.header_bytes(captures);
         let maps_at = header + history.len();
-        let plan = BufferPlan::new(layout.clone(), captures, maps_at);
+        let ids: Vec<u8> =
+            sweeps.iter().flat_map(PointCloud::id_bytes).flatten().copied().collect();
+        let plan = BufferPlan::new(layout.clone(), captures, maps_at, ids.len());
         let mut buffer = ObservationBuffer::new(budget, plan.end(), header)?;
         buffer.bytes_mut()[header..maps_at].copy_from_slice(&history);
+        buffer.bytes_mut()[plan.sweep_ids_at()..][..ids.len()].copy_from_slice(&ids);
+        let sweep_info = |sweep: &PointCloud| SweepInfo {
+            lidar: sweep.lidar,
+            time_us: sweep.time_us,
+            hash: sweep.hash(),
+            returns: sweep.points_m.len(),
+        };
 
         let images = captures.iter().map(|capture| capture.cameras.len()).sum();
         Ok(Self {
@@ -91,6 +107,7 @@ impl ObservationBuilder {
             history_count: count,
             effect_seed: EffectSeed::from_episode(episode),
             motion_samples,
+            sweeps: sweeps.iter().map(sweep_info).collect(),
             plan,
             captures: Vec::with_capacity(captures.len()),
             encoded: Vec::with_capacity(images),

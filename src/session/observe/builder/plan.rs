@@ -12,22 +12,26 @@ use crate::observe::layout::{InPlaceBytes, ObservationLayout, RigCapture};
 /// together, so that a kind is one block of the buffer:
 ///
 /// ```text
-/// | header | ego history, motion | floats of all captures | instances of all | raw pixels of all |
+/// | header | ego history, motion, floats of sweeps | floats of all captures | integers of sweeps |
+/// | instances of all captures | raw pixels of all |
 /// ```
 pub(super) struct BufferPlan {
     layout: Arc<ObservationLayout>,
     floats_at: usize,
+    sweep_ids_at: usize,
     instances_at: usize,
     raw_at: usize,
     end: usize,
 }
 
 impl BufferPlan {
-    /// The plan for some captures, whose maps begin at `floats_at`.
+    /// The plan for some captures, whose maps begin at `floats_at`, and for sweeps with integers of
+    /// so many bytes.
     pub(super) fn new(
         layout: Arc<ObservationLayout>,
         captures: &[RigCapture],
         floats_at: usize,
+        sweep_id_bytes: usize,
     ) -> Self {
         let in_place = captures.iter().map(|capture| layout.in_place_bytes(capture));
         let all = in_place.fold(InPlaceBytes::default(), |sum, one| InPlaceBytes {
@@ -35,9 +39,15 @@ impl BufferPlan {
             instances: sum.instances + one.instances,
             raw: sum.raw + one.raw,
         });
-        let instances_at = floats_at + all.floats;
+        let sweep_ids_at = floats_at + all.floats;
+        let instances_at = sweep_ids_at + sweep_id_bytes;
         let raw_at = instances_at + all.instances;
-        Self { layout, floats_at, instances_at, raw_at, end: raw_at + all.raw }
+        Self { layout, floats_at, sweep_ids_at, instances_at, raw_at, end: raw_at + all.raw }
+    }
+
+    /// Where the integers of sweeps begin: rows, columns and instances of one sweep after the other.
+    pub(super) fn sweep_ids_at(&self) -> usize {
+        self.sweep_ids_at
     }
 
     /// Where the buffer ends before the files of the images are appended.

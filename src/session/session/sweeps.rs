@@ -1,0 +1,58 @@
+//! The sweeps of an observation.
+
+use tokio::time::Instant;
+use tracing::{Instrument, debug_span};
+
+use wildcity_render::Backend;
+
+use super::requests::SimulationState;
+use super::{PinnedVersion, Session};
+use crate::engine::render_queue::{FrameCost, Scratch};
+use crate::error::SessionError;
+use crate::observe::layout::EffectSeed;
+use crate::observe::point_cloud::{PointCloud, lidar_view};
+use crate::pin::pin;
+use crate::scenario::assets::FrameDetail;
+use crate::viewpoint::lidar_viewpoint;
+
+impl Session {
+    /// The sweeps of all LiDARs that end now, each scheduled as a frame of as many pixels as it has
+    /// beams. A rig without LiDARs costs nothing.
+    pub(super) async fn sweeps(
+        &self,
+        version: &PinnedVersion,
+        simulation: SimulationState<'_>,
+        deadline: Instant,
+    ) -> Result<Vec<PointCloud>, SessionError> {
+        let SimulationState { episode, traffic } = simulation;
+        let layout = &self.settings.layout;
+        let mut clouds = Vec::with_capacity(layout.lidars().len());
+        for (index, mounted) in layout.lidars().iter().enumerate() {
+            let view = lidar_view(mounted, episode);
+            let viewpoints = vec![lidar_viewpoint(&view)];
+            let profile = version.profile;
+            let time_us = episode.time_us();
+            let placed = traffic.map(|traffic| {
+                let exposures_us = &[mounted.lidar.duration_us()];
+                let detail =
+                    FrameDetail { viewpoints: &viewpoints, exposures_us, profile: &profile };
+                traffic.placed(time_us, detail)
+            });
+            // Load before the job is queued, so that no render thread waits for a disk.
+            let resident = version.resident.clone();
+            let pinned = pin(resident, profile, deadline, viewpoints);
+            let mut scene = pinned.instrument(debug_span!("load")).await?;
+            scene.place(placed.unwrap_or_default());
+            let pixels = mounted.lidar.beams() as u64;
+            let cost = FrameCost { session: self.number, pixels };
+            let work = move |_: &mut Scratch, backend: &dyn Backend| {
+                backend.sweep(&scene, &profile, &view)
+            };
+            let (sweep, _queued) = self.engine.run(cost, deadline, work).await?;
+            let seed = EffectSeed::from_episode(episode);
+            let effects = layout.lidar_sensor(index).map(|sensor| (sensor, seed));
+            clouds.push(PointCloud::new(index, mounted, &sweep?, time_us, effects));
+        }
+        Ok(clouds)
+    }
+}
