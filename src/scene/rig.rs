@@ -181,8 +181,9 @@ pub enum RigError {
 }
 
 /// Rigs that are part of the program, by name: the JSON files of `scenes/rigs`.
-const PRESETS: [(&str, &str); 4] = [
+const PRESETS: [(&str, &str); 5] = [
     ("vehicle6", include_str!("../../scenes/rigs/vehicle6.json")),
+    ("vehicle6-lidar", include_str!("../../scenes/rigs/vehicle6-lidar.json")),
     ("surround6", include_str!("../../scenes/rigs/surround6.json")),
     ("alpamayo1", include_str!("../../scenes/rigs/alpamayo1.json")),
     ("alpamayo2", include_str!("../../scenes/rigs/alpamayo2.json")),

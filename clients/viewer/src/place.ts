@@ -87,7 +87,7 @@ export class PlacePage implements Page {
     this.distance.addEventListener("input", () => this.refresh());
     this.scaleRow = el("div.buttons.distance", {}, button("−1", more(-1)), button("−0.1", more(-0.1)), this.distance, "m",
       button("+0.1", more(0.1)), button("+1", more(1)));
-    for (const name of ["vehicle6", "surround6", "alpamayo1", "alpamayo2"]) this.rig.append(el("option", { value: name }, name));
+    for (const name of ["vehicle6", "vehicle6-lidar", "surround6", "alpamayo1", "alpamayo2"]) this.rig.append(el("option", { value: name }, name));
     this.up = el("div.buttons.up", {}, "Up is", ...(["z", "-z", "y", "-y", "x", "-x"] as const).map((axis) =>
       button(axis.replace("-", "−"), () => this.setAxis(axisOf(axis)))));
     this.save.addEventListener("click", () => this.confirmAndPublish());
