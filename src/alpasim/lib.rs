@@ -27,6 +27,7 @@ mod door;
 pub mod egodriver;
 pub mod export;
 mod grpc;
+mod lidar;
 pub mod limits;
 pub mod object;
 pub mod physics;

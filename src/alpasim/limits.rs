@@ -44,6 +44,9 @@ pub const OPEN_SCENES: usize = 16;
 /// Images of one request: a minute of a rig of 16 cameras at 4 Hz would be 3,840.
 pub const BATCH_IMAGES: usize = 256;
 
+/// Most sweeps of one request: the largest has 460,800 points of 32 bytes, and an answer 64 MiB.
+pub const BATCH_SWEEPS: usize = 4;
+
 /// Dynamic objects whose assets stay in memory between requests. A box has at most 1,280 Gaussians,
 /// which take about 160 kB with their coarser levels: 384 boxes take 61 MB. All assets count
 /// against the memory of twins.

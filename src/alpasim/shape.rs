@@ -9,7 +9,8 @@ use crate::limits;
 use crate::wire::common::Empty;
 use crate::wire::physics::GroundIntersectionRequest;
 use crate::wire::sensorsim::{
-    AggregatedRenderRequest, BatchRgbRenderRequest, RgbRenderRequest, SceneRequest,
+    AggregatedRenderRequest, BatchRgbRenderRequest, LidarRenderRequest, RgbRenderRequest,
+    SceneRequest,
 };
 
 /// The fields of a message that contain messages: their numbers, whether each counts, and its own
@@ -23,6 +24,7 @@ pub(crate) struct Fields(Shape);
 const LEAF: Fields = Fields(&[]);
 const POSES: Fields = Fields(&[(1, true, LEAF)]);
 const RGB: Fields = Fields(&[(8, true, LEAF)]);
+const LIDAR: Fields = Fields(&[(6, true, LEAF)]);
 const ITEM: Fields = Fields(&[(2, false, RGB)]);
 const EGO: Fields = Fields(&[(3, false, POSES)]);
 
@@ -48,7 +50,11 @@ impl Counted for BatchRgbRenderRequest {
 }
 
 impl Counted for AggregatedRenderRequest {
-    const SHAPE: Shape = &[(1, true, RGB), (2, true, LEAF)];
+    const SHAPE: Shape = &[(1, true, RGB), (2, true, LIDAR)];
+}
+
+impl Counted for LidarRenderRequest {
+    const SHAPE: Shape = LIDAR.0;
 }
 
 impl Counted for GroundIntersectionRequest {

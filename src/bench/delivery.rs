@@ -16,7 +16,7 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::route::Route;
 use wildcity_server::Running;
 use wildcity_session::options::{Encoding, Outputs, RigChoice};
-use wildcity_session::{ImageEncoding, Session, Still, Stills};
+use wildcity_session::{ImageEncoding, Session, Still, StillViews, Stills};
 
 /// Measure the cost of delivering a step's raw images to an agent on the same machine.
 ///
@@ -127,7 +127,12 @@ impl Delivery {
         };
         let session = Session::open(engine.clone(), "bench".to_owned(), options).await?;
         let views = View::from_rig(&rig.cameras, start);
-        let stills = Stills::open(engine, session.resident().clone(), &views).await?;
+        let stills = Stills::open(
+            engine,
+            session.resident().clone(),
+            StillViews { images: &views, sweep: None },
+        )
+        .await?;
         let shared = ConnectOptions { shared_memory: true, ..ConnectOptions::default() };
         let socket = self.client(running, &ConnectOptions::default()).await?;
         let memory = self.client(running, &shared).await?;

@@ -91,7 +91,7 @@ pub use session::Session;
 pub use session::requests::{ResetOptions, StepOptions};
 pub use snapshot::{Snapshot, Snapshots};
 pub use start::scenario_start;
-pub use stills::{Still, StillActor, Stills};
+pub use stills::{Still, StillActor, StillViews, Stills};
 pub use viewpoint::viewpoints;
 
 /// What a session can be asked for: the parts of [`Open`](options::Open).

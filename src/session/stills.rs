@@ -7,6 +7,7 @@ use std::time::Duration;
 use glam::DVec3;
 use tokio::time::Instant;
 
+use wildcity_render::lidar::{LidarView, Sweep};
 use wildcity_render::{Frame, MAX_VIEWS, Target, View};
 use wildcity_scene::RenderProfile;
 use wildcity_scene::actor::PlacedChunk;
@@ -21,10 +22,13 @@ use crate::error::SessionError;
 use crate::observe::encode::{ImageEncoding, encode};
 use crate::pin::pin;
 use crate::scenario::assets::{FrameDetail, Placement};
-use crate::viewpoint::viewpoints;
+use crate::viewpoint::{lidar_viewpoint, viewpoints};
 
 /// Bytes of a pixel of a still: the pixels, and a copy that is encoded.
 const STILL_PIXEL_BYTES: u64 = 6;
+
+/// Bytes of a beam: range, intensity and instance, and then a point of an answer, twice.
+const SWEEP_BEAM_BYTES: u64 = 10 + 32;
 
 /// One image to render.
 #[derive(Clone, Debug)]
@@ -47,6 +51,13 @@ pub struct StillActor {
     pub world_from_actor_at_start: Pose,
 }
 
+/// Views that one request renders.
+#[derive(Clone, Copy, Debug)]
+pub struct StillViews<'a> {
+    pub images: &'a [View],
+    pub sweep: Option<&'a LidarView>,
+}
+
 /// A version that images are rendered of, and the memory for its worst frame.
 #[derive(Debug)]
 pub struct Stills {
@@ -65,7 +76,7 @@ impl Stills {
     pub async fn open(
         engine: Arc<Engine>,
         resident: Arc<Resident>,
-        views: &[View],
+        views: StillViews<'_>,
     ) -> Result<Self, SessionError> {
         let profile = resident.version.manifest.profile;
         Engine::bake_sky(resident.clone(), profile).await?;
@@ -76,7 +87,7 @@ impl Stills {
     }
 
     /// Whether the reserved memory is enough for these views.
-    pub async fn covers(&self, views: &[View]) -> Result<bool, SessionError> {
+    pub async fn covers(&self, views: StillViews<'_>) -> Result<bool, SessionError> {
         let resident = self.reservation.resident().clone();
         let needed = Engine::worst_case_bytes(resident, extent(views), self.profile).await?;
         let FrameBytes { stages, beside, is_large, images } = frame_bytes(&self.engine, views);
@@ -113,6 +124,35 @@ impl Stills {
             images.append(&mut self.render_frame(part.to_vec(), actors, deadline).await?);
         }
         Ok(images)
+    }
+
+    /// Casts a sweep, which shows `actors` as images do.
+    ///
+    /// # Errors
+    /// As [`Stills::render`].
+    pub async fn sweep(
+        &self,
+        view: LidarView,
+        actors: &[StillActor],
+        max_wait: Duration,
+    ) -> Result<Sweep, SessionError> {
+        let deadline = Instant::now() + max_wait;
+        let beams = view.lidar.beams() as u64;
+        let _share = self.engine.answer_budget().reserve(SWEEP_BEAM_BYTES * beams)?;
+        let resident = self.reservation.resident().clone();
+        let profile = self.profile;
+        let viewpoints = vec![lidar_viewpoint(&view)];
+        // The poses of the actors at the start are given.
+        let detail = FrameDetail { viewpoints: &viewpoints, exposures_us: &[0], profile: &profile };
+        let placed = detail.placed(placements(actors, 1));
+        let mut scene = pin(resident, profile, deadline, viewpoints).await?;
+        scene.place(placed);
+        let work = move |_: &mut _, backend: &dyn wildcity_render::Backend| {
+            backend.sweep(&scene, &profile, &view)
+        };
+        let cost = FrameCost { session: self.number, pixels: beams };
+        let (sweep, _queued) = self.engine.run(cost, deadline, work).await?;
+        Ok(sweep?)
     }
 
     async fn render_frame(
@@ -187,23 +227,30 @@ fn encoded(index: usize, rgb8: Vec<u8>, still: &Still) -> Result<Vec<u8>, Sessio
 
 /// Buffers and images that a frame of stills needs in addition to its scene. More than
 /// [`MAX_VIEWS`] views are rendered in several frames.
-fn frame_bytes(engine: &Engine, views: &[View]) -> FrameBytes {
+fn frame_bytes(engine: &Engine, views: StillViews<'_>) -> FrameBytes {
     // Rendered one after the other, frames share the memory of the largest.
-    views.chunks(MAX_VIEWS).fold(FrameBytes::default(), |most, views| {
+    let most = |most: FrameBytes, frame: FrameBytes| FrameBytes {
+        stages: most.stages.max(frame.stages),
+        beside: most.beside.max(frame.beside),
+        is_large: most.is_large || frame.is_large,
+        images: most.images.max(frame.images),
+    };
+    let images = views.images.chunks(MAX_VIEWS).map(|views| {
         let pixels: u64 = views.iter().map(|view| view.camera.pixels() as u64).sum();
-        let frame = engine.frame_bytes(views, 0, STILL_PIXEL_BYTES * pixels);
-        FrameBytes {
-            stages: most.stages.max(frame.stages),
-            beside: most.beside.max(frame.beside),
-            is_large: most.is_large || frame.is_large,
-            images: most.images.max(frame.images),
-        }
-    })
+        engine.frame_bytes(views, 0, STILL_PIXEL_BYTES * pixels)
+    });
+    let sweep = views.sweep.map(|view| {
+        let stages = engine.sweep_bytes(&view.lidar);
+        let images = SWEEP_BEAM_BYTES * view.lidar.beams() as u64;
+        FrameBytes { stages, beside: stages, is_large: false, images }
+    });
+    images.chain(sweep).fold(FrameBytes::default(), most)
 }
 
 /// The extent of views around their middle.
-fn extent(views: &[View]) -> RigExtent {
-    let viewpoints = viewpoints(views);
+fn extent(views: StillViews<'_>) -> RigExtent {
+    let mut viewpoints = viewpoints(views.images);
+    viewpoints.extend(views.sweep.map(lidar_viewpoint));
     // Without views, the middle is the origin and not NaN.
     let count = viewpoints.len().max(1) as f64;
     let middle_m = viewpoints.iter().map(|one| one.position_m).sum::<DVec3>() / count;

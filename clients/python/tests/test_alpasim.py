@@ -352,14 +352,56 @@ def test_errors_have_the_codes_that_the_runtime_knows(
     assert (refused.value.code().name, text in refused.value.details()) == (code, True), refused.value.details()
 
 
-def test_lidars_are_not_rendered(door: Door) -> None:
+def sweep(**changes: Any) -> Any:
+    here = common_pb2.Pose(vec=common_pb2.Vec3(x=3.0, y=0.25, z=1.9), quat=common_pb2.Quat(w=1.0))
+    asked = {
+        "scene_id": SCENE,
+        "lidar_config": sensorsim_pb2.LidarSpec(lidar_type=sensorsim_pb2.AT128),
+        "frame_start_us": AT - 100_000,
+        "frame_end_us": AT,
+        "sensor_pose": sensorsim_pb2.PosePair(start_pose=here, end_pose=here),
+    }
+    return sensorsim_pb2.LidarRenderRequest(**(asked | changes))
+
+
+def test_lidars_are_rendered_as_points(door: Door) -> None:
+    answer = door.stub.render_lidar(sweep())
+    points = np.array(answer.point_xyzs, np.float32).reshape(-1, 3)
+    assert len(points) == answer.num_points == len(answer.point_intensities) > 1_000
+    assert np.array_equal(np.frombuffer(answer.point_xyzs_buffer, "<f4").reshape(-1, 3), points)
+    assert np.array_equal(np.frombuffer(answer.point_intensities_buffer, "<f4"), answer.point_intensities)
+    # AT128 sees 60 degrees to both sides, from 12.93 degrees above to 12.47 below.
+    azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+    elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
+    assert np.abs(azimuth).max() < 60.01 and elevation.max() < 12.94 and elevation.min() > -12.48
+    # The same points at the end of a sweep in which the LiDAR has moved 2 m: they are deskewed.
+    start = common_pb2.Pose(vec=common_pb2.Vec3(x=1.0, y=0.25, z=1.9), quat=common_pb2.Quat(w=1.0))
+    end = common_pb2.Pose(vec=common_pb2.Vec3(x=3.0, y=0.25, z=1.9), quat=common_pb2.Quat(w=1.0))
+    moving = door.stub.render_lidar(sweep(sensor_pose=sensorsim_pb2.PosePair(start_pose=start, end_pose=end)))
+    moved = np.array(moving.point_xyzs, np.float32).reshape(-1, 3)
+    for axis in (1, 2):
+        low, high = np.percentile(points[:, axis], [2, 98]), np.percentile(moved[:, axis], [2, 98])
+        assert np.abs(low - high).max() < 0.3, (axis, low, high)
+    pair = door.stub.render_aggregated(
+        sensorsim_pb2.AggregatedRenderRequest(rgb_requests=[request()], lidar_requests=[sweep()])
+    )
+    assert len(pair.rgb_returns) == 1 and pair.lidar_returns[0] == answer
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"lidar_config": None}, "lidar_config: is missing"),
+        ({"sensor_pose": None}, "sensor_pose"),
+        ({"frame_start_us": AT + 1}, "is after frame_end_us"),
+        ({"frame_start_us": AT - 2_000_000}, "duration_us"),
+    ],
+)
+def test_lidars_that_cannot_be_rendered_are_refused(door: Door, changes: dict[str, Any], text: str) -> None:
     with pytest.raises(grpc.RpcError) as refused:
-        door.stub.render_lidar(sensorsim_pb2.LidarRenderRequest(scene_id=SCENE))
-    assert refused.value.code() == grpc.StatusCode.UNIMPLEMENTED
-    lidar = sensorsim_pb2.LidarRenderRequest(scene_id=SCENE)
-    with pytest.raises(grpc.RpcError) as refused:
-        door.stub.render_aggregated(sensorsim_pb2.AggregatedRenderRequest(lidar_requests=[lidar]))
-    assert refused.value.code() == grpc.StatusCode.UNIMPLEMENTED
+        door.stub.render_lidar(sweep(**changes))
+    assert refused.value.code() == grpc.StatusCode.INVALID_ARGUMENT, refused.value.details()
+    assert text in refused.value.details(), refused.value.details()
 
 
 def test_what_concerns_all_images_fails_the_batch(door: Door) -> None:

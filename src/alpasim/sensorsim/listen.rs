@@ -211,7 +211,7 @@ async fn call(
             unary(own, request, |asked| async { sensorsim.render_aggregated(asked).await }).await
         }
         Some("render_lidar") => {
-            unary(own, request, |_: Empty| async { sensorsim.render_lidar() }).await
+            unary(own, request, |asked| async { sensorsim.render_lidar(asked).await }).await
         }
         _ => unimplemented(&path),
     }

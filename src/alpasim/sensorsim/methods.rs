@@ -194,19 +194,25 @@ impl Sensorsim {
         Ok(wire::BatchRgbRenderReturn { items })
     }
 
-    /// Several images; lidars are not rendered.
+    /// Several images, and sweeps one after the other.
     pub(super) async fn render_aggregated(
         &self,
         asked: wire::AggregatedRenderRequest,
     ) -> Result<wire::AggregatedRenderReturn, Status> {
-        // Images without the lidar that belongs to them would look like a complete answer.
-        if !asked.lidar_requests.is_empty() {
-            return self.render_lidar().map(|_| wire::AggregatedRenderReturn::default());
+        let most = limits::BATCH_SWEEPS;
+        if asked.lidar_requests.len() > most {
+            let text =
+                format!("{} sweeps; at most {most} are accepted", asked.lidar_requests.len());
+            return Err(Status::invalid_argument(text));
         }
         let requests: Vec<_> = asked.rgb_requests.iter().collect();
         let images = self.images(&requests).await?;
         let rgb_returns = images.into_iter().collect::<Result<_, _>>()?;
-        Ok(wire::AggregatedRenderReturn { rgb_returns, ..Default::default() })
+        let mut lidar_returns = Vec::with_capacity(asked.lidar_requests.len());
+        for lidar in asked.lidar_requests {
+            lidar_returns.push(self.render_lidar(lidar).await?);
+        }
+        Ok(wire::AggregatedRenderReturn { rgb_returns, lidar_returns, ..Default::default() })
     }
 
     /// Boxes on the ground, of the service of AlpaSim's physics.
@@ -217,9 +223,14 @@ impl Sensorsim {
         self.unless_stopped(ground_intersection(&self.engine, &self.physics, asked)).await?
     }
 
-    /// Not offered.
-    pub(super) fn render_lidar(&self) -> Result<wire::LidarRenderReturn, Status> {
-        Err(SensorsimError::Unimplemented("wildcity renders no lidar").into())
+    /// The points of a sweep.
+    pub(super) async fn render_lidar(
+        &self,
+        asked: wire::LidarRenderRequest,
+    ) -> Result<wire::LidarRenderReturn, Status> {
+        let Self { engine, open, assets, .. } = self;
+        let renderer = Renderer { engine, open, assets };
+        Ok(self.unless_stopped(renderer.sweep(&asked)).await??)
     }
 
     async fn images(

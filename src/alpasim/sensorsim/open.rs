@@ -6,8 +6,7 @@ use std::time::Instant;
 
 use tokio::sync::Mutex;
 
-use wildcity_render::View;
-use wildcity_session::{Engine, Stills};
+use wildcity_session::{Engine, StillViews, Stills};
 use wildcity_twin::residency::Resident;
 
 use super::status::SensorsimError;
@@ -38,7 +37,7 @@ impl OpenVersions {
         engine: &Arc<Engine>,
         resident: Arc<Resident>,
         scene: &str,
-        views: &[View],
+        views: StillViews<'_>,
     ) -> Result<Arc<Stills>, SensorsimError> {
         let version = &resident.version;
         let key = (version.manifest.twin.clone(), version.number);

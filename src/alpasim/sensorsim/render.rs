@@ -8,13 +8,14 @@ use wildcity_scene::appearance::Appearance;
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::rig::RigCamera;
 use wildcity_scene::{Manifest, Rig};
-use wildcity_session::{Engine, ImageEncoding, SessionError, Still};
+use wildcity_session::{Engine, ImageEncoding, SessionError, Still, StillViews};
 use wildcity_twin::residency::Resident;
 
 use super::objects::{Object, ObjectAssets};
 use super::open::OpenVersions;
 use super::status::SensorsimError;
 use crate::camera::{camera_name, jpeg_quality, view, with_preset};
+use crate::lidar::{answer, lidar_view};
 use crate::limits;
 use crate::scene::{LocalFrame, SceneId};
 use crate::wire::sensorsim as wire;
@@ -67,9 +68,8 @@ impl OpenScene {
         Ok(Still { view, appearance, encoding })
     }
 
-    /// The objects that a request's image shows.
-    fn objects(&self, request: &wire::RgbRenderRequest) -> Result<Vec<Object>, SensorsimError> {
-        let objects = &request.dynamic_objects;
+    /// The objects that a request's image or sweep shows.
+    fn objects(&self, objects: &[wire::DynamicObject]) -> Result<Vec<Object>, SensorsimError> {
         let most = PlacedChunk::MAX_ACTORS;
         // The same bound as a session's, because a frame numbers its actors up to it.
         if objects.len() > most {
@@ -162,7 +162,9 @@ impl Renderer<'_> {
         // Off the threads that answer: an overlay is scaled for each image.
         let asked: Vec<_> = requests.iter().map(|request| (*request).clone()).collect();
         let read = tokio::task::spawn_blocking(move || {
-            let still = |asked| Ok((opened.still(asked)?, opened.objects(asked)?));
+            let still = |asked: &wire::RgbRenderRequest| {
+                Ok((opened.still(asked)?, opened.objects(&asked.dynamic_objects)?))
+            };
             let read: Vec<Result<_, SensorsimError>> = asked.iter().map(still).collect();
             (opened, read)
         });
@@ -207,6 +209,28 @@ impl Renderer<'_> {
         images.into_iter().map(|image| image.unwrap_or_else(no_image)).collect()
     }
 
+    /// The points of a sweep.
+    pub(super) async fn sweep(
+        self,
+        request: &wire::LidarRenderRequest,
+    ) -> Result<wire::LidarRenderReturn, SensorsimError> {
+        let scene = &request.scene_id;
+        let opened = OpenScene::open(self.engine, scene).await?;
+        let view = lidar_view(request, &opened.frame)?;
+        let objects = opened.objects(&request.dynamic_objects)?;
+        if objects.iter().any(Object::is_unknown) {
+            self.open.warn_of_unknown_objects(scene);
+        }
+        let resident = opened.resident.clone();
+        let views = StillViews { images: &[], sweep: Some(&view) };
+        let renderer = self.open.stills(self.engine, resident, scene, views).await?;
+        let actors = self.assets.actors(self.engine, &objects).await?;
+        let sweep = renderer.sweep(view.clone(), &actors, limits::RENDER_TIMEOUT).await?;
+        // Half a million points: off the threads that answer.
+        let answered = tokio::task::spawn_blocking(move || answer(&view, &sweep)).await;
+        answered.map_err(|_| SessionError::Crashed.into())
+    }
+
     async fn render(
         self,
         opened: &OpenScene,
@@ -217,7 +241,8 @@ impl Renderer<'_> {
         // The memory of the largest frame: requests are rendered in frames of at most MAX_VIEWS.
         let views: Vec<_> = stills.iter().map(|still| still.view).take(MAX_VIEWS).collect();
         let resident = opened.resident.clone();
-        let renderer = self.open.stills(self.engine, resident, scene, &views).await?;
+        let views = StillViews { images: &views, sweep: None };
+        let renderer = self.open.stills(self.engine, resident, scene, views).await?;
         let actors = self.assets.actors(self.engine, objects).await?;
         Ok(renderer.render(stills, &actors, limits::RENDER_TIMEOUT).await?)
     }

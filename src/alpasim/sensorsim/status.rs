@@ -34,8 +34,6 @@ pub(crate) enum SensorsimError {
     Session(#[from] SessionError),
     #[error("the server is shutting down")]
     Stopping,
-    #[error("{0}")]
-    Unimplemented(&'static str),
     /// The error of another request of the same scene.
     #[error("{}", .0.message())]
     Repeated(Status),
@@ -62,7 +60,6 @@ impl SensorsimError {
             Self::Invalid(_) | Self::Camera(_) | Self::Object(_) => Status::invalid_argument(text),
             Self::Stopping => Status::unavailable(text),
             // Unlike `unavailable`, this is not worth another try.
-            Self::Unimplemented(what) => Status::unimplemented(*what),
             Self::Session(error) => session_status(error, text),
             Self::Repeated(status) => status.clone(),
         };
@@ -163,7 +160,6 @@ mod tests {
             (session(no_actor.into()), Code::InvalidArgument, "dynamic_objects: "),
             (object.into(), Code::InvalidArgument, "dynamic_objects: track_id"),
             (session(SessionError::Crashed), Code::Internal, ""),
-            (SensorsimError::Unimplemented("no lidar"), Code::Unimplemented, "no lidar"),
         ] {
             let status = error.status();
             assert_eq!(status.code(), code, "{status}");

@@ -258,17 +258,52 @@ pub struct BatchRgbRenderReturnItem {
     pub error_message: String,
 }
 
-/// A lidar request, of which no field is read, because lidars are not rendered.
+/// A LiDAR whose beams are known by its name.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, prost::Enumeration)]
+#[repr(i32)]
+pub enum LidarDeviceType {
+    Pandar128 = 0,
+    At128 = 1,
+}
+
+#[derive(Clone, Copy, PartialEq, prost::Message)]
+pub struct LidarSpec {
+    #[prost(enumeration = "LidarDeviceType", tag = "2")]
+    pub lidar_type: i32,
+}
+
 #[derive(Clone, PartialEq, prost::Message)]
 pub struct LidarRenderRequest {
     #[prost(string, tag = "1")]
     pub scene_id: String,
+    #[prost(message, optional, tag = "2")]
+    pub lidar_config: Option<LidarSpec>,
+    #[prost(fixed64, tag = "3")]
+    pub frame_start_us: u64,
+    #[prost(fixed64, tag = "4")]
+    pub frame_end_us: u64,
+    #[prost(message, optional, tag = "5")]
+    pub sensor_pose: Option<PosePair>,
+    #[prost(message, repeated, tag = "6")]
+    pub dynamic_objects: Vec<DynamicObject>,
 }
 
+/// The points of a sweep, in the LiDAR's axes at its end.
 #[derive(Clone, PartialEq, prost::Message)]
 pub struct LidarRenderReturn {
+    /// x, y and z of one point after the other, in metres.
+    #[prost(float, repeated, tag = "1")]
+    pub point_xyzs: Vec<f32>,
+    /// From 0 to 1.
+    #[prost(float, repeated, tag = "2")]
+    pub point_intensities: Vec<f32>,
     #[prost(uint32, tag = "3")]
     pub num_points: u32,
+    /// The same as little-endian f32.
+    #[prost(bytes = "vec", tag = "4")]
+    pub point_xyzs_buffer: Vec<u8>,
+    #[prost(bytes = "vec", tag = "5")]
+    pub point_intensities_buffer: Vec<u8>,
 }
 
 #[derive(Clone, PartialEq, prost::Message)]
