@@ -2,58 +2,71 @@
 
 use crate::lidar::HALF;
 
-/// Where a beam meets a candidate.
+/// A Gaussian that a beam of a sector has met.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Hit {
-    pub(super) range_m: f32,
-    pub(super) alpha: f32,
-    /// The global id of the Gaussian: its chunk, then its index.
+pub(super) struct Met {
+    /// The global id: the chunk, then the index.
     pub(super) id: u64,
     pub(super) luminance: f32,
     /// As in [`Sweep::instance`](crate::lidar::Sweep::instance).
     pub(super) instance: u16,
 }
 
-impl Hit {
-    /// Whether it is in front of another; at the same range, the order is that of ids.
-    fn is_before(&self, other: &Self) -> bool {
-        self.range_m < other.range_m || (self.range_m == other.range_m && self.id < other.id)
-    }
+/// Where a beam meets a Gaussian: 16 bytes, because the beams of a tile should fit the cache.
+#[derive(Clone, Copy, Debug)]
+struct Hit {
+    range_m: f32,
+    alpha: f32,
+    /// The transmittance behind it.
+    after: f32,
+    /// Among the Gaussians that the sector has met.
+    met: u32,
 }
 
-/// The hits of a beam from the nearest, each with the transmittance after it. A hit behind the
+/// The hits of a beam from the nearest; at the same range, in the order of ids. A hit behind the
 /// return changes nothing and is dropped, so that few are kept.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Beam {
-    hits: Vec<(Hit, f32)>,
+    hits: Vec<Hit>,
     returned: bool,
 }
 
 impl Beam {
+    /// Bytes of a hit.
+    pub(super) const HIT_BYTES: usize = size_of::<Hit>();
+
     pub(super) fn clear(&mut self) {
         self.hits.clear();
         self.returned = false;
     }
 
-    /// Adds a hit. Returns the range of the return, if there is one now.
+    /// Adds a hit of the Gaussian that was met last. Returns the range of the return, if there is
+    /// one now.
     #[inline(always)]
-    pub(super) fn add(&mut self, hit: Hit) -> Option<f32> {
+    pub(super) fn add(&mut self, range_m: f32, alpha: f32, all: &[Met]) -> Option<f32> {
+        let met = all.len() - 1;
+        let is_before = |other: &Hit| {
+            range_m < other.range_m
+                || (range_m == other.range_m && all[met].id < all[other.met as usize].id)
+        };
         // By hand and not `insert`, whose call costs more than the few hits that are moved.
-        self.hits.push((hit, 0.0));
+        let hit = Hit { range_m, alpha, after: 0.0, met: met as u32 };
+        self.hits.push(hit);
         let mut at = self.hits.len() - 1;
-        while at > 0 && hit.is_before(&self.hits[at - 1].0) {
+        while at > 0 && is_before(&self.hits[at - 1]) {
             self.hits[at] = self.hits[at - 1];
             at -= 1;
         }
-        let mut transmittance = if at > 0 { self.hits[at - 1].1 } else { 1.0 };
+        let mut transmittance = if at > 0 { self.hits[at - 1].after } else { 1.0 };
         if transmittance <= HALF as f32 {
             // Behind the return.
             self.hits.pop();
         } else {
-            self.hits[at].0 = hit;
+            self.hits[at] = hit;
             for later in at..self.hits.len() {
-                transmittance *= 1.0 - self.hits[later].0.alpha;
-                self.hits[later].1 = transmittance;
+                let alpha = if later == at { alpha } else { self.hits[later].alpha };
+                transmittance *= 1.0 - alpha;
+                self.hits[later].after = transmittance;
                 if transmittance <= HALF as f32 {
                     self.hits.truncate(later + 1);
                     self.returned = true;
@@ -61,19 +74,19 @@ impl Beam {
                 }
             }
         }
-        self.hits.last().filter(|_| self.returned).map(|(last, _)| last.range_m)
+        self.hits.last().filter(|_| self.returned).map(|last| last.range_m)
     }
 
-    /// The hit at which the beam returns, and the mean luminance of the hits up to it, weighted by
-    /// what each contributes.
-    pub(super) fn returned(&self) -> Option<(Hit, f32)> {
-        let (last, after) = self.hits.last().filter(|_| self.returned)?;
+    /// The range of the return and what is hit there; and the mean luminance of the hits up to it,
+    /// weighted by what each contributes.
+    pub(super) fn returned(&self, all: &[Met]) -> Option<(f32, Met, f32)> {
+        let last = self.hits.last().filter(|_| self.returned)?;
         let mut before = 1.0;
         let mut sum = 0.0;
-        for (hit, after) in &self.hits {
-            sum += before * hit.alpha * hit.luminance;
-            before = *after;
+        for hit in &self.hits {
+            sum += before * hit.alpha * all[hit.met as usize].luminance;
+            before = hit.after;
         }
-        Some((*last, sum / (1.0 - after)))
+        Some((last.range_m, all[last.met as usize], sum / (1.0 - last.after)))
     }
 }

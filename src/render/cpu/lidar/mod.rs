@@ -20,6 +20,7 @@ use fearless_simd::Level;
 use parking_lot::Mutex;
 use rayon::prelude::*;
 
+use self::beam::{Beam, Met};
 use self::sector::{Scratch, Sector};
 use crate::lidar::{LidarView, Sweep};
 use wildcity_scene::chunk::LANES;
@@ -66,7 +67,8 @@ pub(crate) fn most_bytes(lidar: &Lidar, threads: usize) -> u64 {
     let returns = 2 * lidar.beams() * (4 + 4 + 2);
     // Vectors grow to twice what they hold.
     let beams = lidar.rows().next_multiple_of(LANES) * sector::MOST_COLUMNS;
-    let hits = 2 * beams * MOST_HITS * size_of::<(beam::Hit, f32)>();
+    // At worst, every hit is of another Gaussian.
+    let hits = 2 * beams * MOST_HITS * (Beam::HIT_BYTES + size_of::<Met>());
     let candidates = 2 * candidates::BATCH * (size_of::<candidates::Candidate>() + 4 * 12);
     (returns + threads * (hits + candidates)) as u64
 }

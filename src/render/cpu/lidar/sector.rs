@@ -5,6 +5,7 @@ use std::ops::Range;
 use fearless_simd::{Level, dispatch};
 use glam::{DMat3, DVec3};
 
+use super::beam::Met;
 use super::candidates::Candidates;
 use super::tile::Tile;
 use crate::lidar::{Body, LidarView, Sweep, chunks};
@@ -49,6 +50,8 @@ pub(super) struct Sector {
 pub(super) struct Scratch {
     candidates: Candidates,
     tiles: Vec<Tile>,
+    /// The Gaussians that beams have met.
+    met: Vec<Met>,
 }
 
 /// A sector as one body sees it.
@@ -207,7 +210,8 @@ impl Sector {
     ) -> Sweep {
         let rows = view.lidar.rows();
         let tiles = self.tile_spans.len();
-        let Scratch { candidates, tiles: beams } = scratch;
+        let Scratch { candidates, tiles: beams, met } = scratch;
+        met.clear();
         let count = tiles * rows.div_ceil(LANES);
         beams.resize_with(count.max(beams.len()), Tile::default);
         let beams = &mut beams[..count];
@@ -221,7 +225,7 @@ impl Sector {
                 let lists = candidates.by_tile(level, self, rows);
                 for (tile, list) in beams.iter_mut().zip(lists) {
                     let listed = &candidates.list;
-                    dispatch!(level, simd => tile.cast(simd, listed, &seen, &list, profile));
+                    dispatch!(level, simd => tile.cast(simd, listed, met, &seen, &list, profile));
                 }
                 candidates.list.clear();
             };
@@ -240,7 +244,7 @@ impl Sector {
         let width = self.columns.len();
         let mut part = Sweep::empty(rows * width);
         for tile in beams {
-            tile.write(self, &mut part, width);
+            tile.write(self, met, &mut part, width);
         }
         part
     }

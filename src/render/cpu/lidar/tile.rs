@@ -2,7 +2,7 @@
 
 use fearless_simd::{f32x16, prelude::*};
 
-use super::beam::{Beam, Hit};
+use super::beam::{Beam, Met};
 use super::candidates::Candidate;
 use super::sector::{BodySector, Sector};
 use crate::cpu::lanes::Vec3x16;
@@ -110,6 +110,7 @@ impl Tile {
         &mut self,
         simd: S,
         candidates: &[Candidate],
+        all: &mut Vec<Met>,
         seen: &BodySector<'_>,
         list: &[u32],
         profile: &RenderProfile,
@@ -132,6 +133,7 @@ impl Tile {
             for at in listed {
                 let candidate = &candidates[*at as usize];
                 let [first, end] = candidate.rows.map(usize::from);
+                let mut is_met = false;
                 for row in first.max(self.first_row)..end.min(last_row) {
                     let row = row - self.first_row;
                     if candidate.nearest_m > self.row_ends_m[row] {
@@ -139,19 +141,19 @@ impl Tile {
                     }
                     let ends_m = &mut self.ends_m[row];
                     let met = meet(simd, candidate, &rays, row, least_m, ends_m, cap);
-                    let Some(Met { mut lanes, range_m, alpha }) = met else { continue };
+                    let Some(Crossing { mut lanes, range_m, alpha }) = met else { continue };
+                    // Once for each candidate and tile, and only if a beam meets it.
+                    if !is_met {
+                        let Candidate { id, luminance, instance, .. } = *candidate;
+                        all.push(Met { id, luminance, instance });
+                        is_met = true;
+                    }
                     changed_rows |= 1 << row;
                     while lanes != 0 {
                         let lane = lanes.trailing_zeros() as usize % LANES;
                         lanes &= lanes - 1;
-                        let hit = Hit {
-                            range_m: range_m[lane],
-                            alpha: alpha[lane],
-                            id: candidate.id,
-                            luminance: candidate.luminance,
-                            instance: candidate.instance,
-                        };
-                        if let Some(end_m) = self.beams[row * LANES + lane].add(hit) {
+                        let beam = &mut self.beams[row * LANES + lane];
+                        if let Some(end_m) = beam.add(range_m[lane], alpha[lane], all) {
                             ends_m[lane] = end_m;
                         }
                     }
@@ -167,24 +169,24 @@ impl Tile {
     }
 
     /// Writes its returns into a sweep of its sector, which has `width` columns.
-    pub(super) fn write(&self, sector: &Sector, part: &mut Sweep, width: usize) {
+    pub(super) fn write(&self, sector: &Sector, all: &[Met], part: &mut Sweep, width: usize) {
         let [rows, columns] = self.size;
         for row in 0..rows {
             for lane in 0..columns {
                 let beam = &self.beams[row * LANES + lane];
-                let Some((hit, intensity)) = beam.returned() else { continue };
+                let Some((range_m, met, intensity)) = beam.returned(all) else { continue };
                 let column = self.first_column - sector.columns.start + lane;
                 let at = (self.first_row + row) * width + column;
-                part.range_m[at] = hit.range_m;
+                part.range_m[at] = range_m;
                 part.intensity[at] = intensity;
-                part.instance[at] = hit.instance;
+                part.instance[at] = met.instance;
             }
         }
     }
 }
 
 /// Where 16 beams meet a candidate.
-struct Met {
+struct Crossing {
     lanes: u64,
     range_m: [f32; LANES],
     alpha: [f32; LANES],
@@ -200,7 +202,7 @@ fn meet<S: Simd>(
     least_m: f32,
     ends_m: &[f32; LANES],
     cap: f32,
-) -> Option<Met> {
+) -> Option<Crossing> {
     let splat = |value: f32| f32x16::splat(simd, value);
     let direction = Vec3x16::from_arrays(simd, &rays.directions[row]);
     let origin = Vec3x16::from_arrays(simd, &rays.origin_m);
@@ -225,7 +227,7 @@ fn meet<S: Simd>(
     let exponent = squared.mul_add(splat(-log2_e), splat(candidate.log2_opacity));
     // Merged Gaussians may be more opaque than 1.
     let alpha = exp2(simd, exponent.min(splat(0.0))).min(splat(cap));
-    Some(Met {
+    Some(Crossing {
         lanes: u64::from(meets.to_bitmask()),
         range_m: range_m.to_array(),
         alpha: alpha.to_array(),
