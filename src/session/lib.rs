@@ -92,7 +92,7 @@ pub use session::requests::{ResetOptions, StepOptions};
 pub use snapshot::{Snapshot, Snapshots};
 pub use start::scenario_start;
 pub use stills::{Still, StillActor, StillViews, Stills};
-pub use viewpoint::viewpoints;
+pub use viewpoint::{lidar_viewpoint, viewpoints};
 
 /// What a session can be asked for: the parts of [`Open`](options::Open).
 pub use wildcity_options as options;

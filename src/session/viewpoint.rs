@@ -19,6 +19,6 @@ pub fn viewpoints(views: &[View]) -> Vec<Viewpoint> {
 
 /// The viewpoint of a LiDAR at the end of its sweep. Its beams are about as wide as a pixel of a
 /// camera with this focal length: a milliradian.
-pub(crate) fn lidar_viewpoint(view: &LidarView) -> Viewpoint {
+pub fn lidar_viewpoint(view: &LidarView) -> Viewpoint {
     Viewpoint { position_m: view.world_from_lidar.position_m, focal_px: 1_000.0 }
 }

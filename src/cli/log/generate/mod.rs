@@ -6,6 +6,7 @@ mod sensors;
 
 use std::io::{self, Write};
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use anyhow::{Context, ensure};
 
@@ -106,6 +107,7 @@ impl Generate {
             backend: self.backend.backend()?,
             route: Route::new(drive)?,
             rig,
+            lidar: Arc::new(sensors::lidar(recorder::PERIOD_US)?),
             rig_from_lidar: header.lidars[0].rig_from_lidar,
             lidar_late_us: 1000 * self.lidar_late_ms,
             drop_every: self.drop_every as usize,
@@ -137,6 +139,8 @@ impl Generate {
             self.cameras.join(","),
             known.join(", ")
         );
+        // The log has a LiDAR of its own.
+        rig.lidars.clear();
         rig.cameras.retain(|camera| self.cameras.is_empty() || self.cameras.contains(&camera.name));
         for camera in &mut rig.cameras {
             let [width, height] = [camera.camera.width_px, camera.camera.height_px].map(f64::from);

@@ -6,22 +6,24 @@ use anyhow::{anyhow, ensure};
 use indicatif::ProgressBar;
 
 use wildcity_augment::mask_png;
-use wildcity_log::{ImageRow, LogWriter, SweepPoints, SweepRow};
+use wildcity_log::{ImageRow, LogWriter, SweepRow};
+use wildcity_render::lidar::LidarView;
 use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::Rig;
+use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::geo::GeoAnchor;
-use wildcity_scene::geometry::Pose;
+use wildcity_scene::geometry::{Lidar, Pose};
 use wildcity_scene::rig::RigCamera;
 use wildcity_scene::route::Route;
 use wildcity_scene::trajectory::Keyframe;
-use wildcity_session::viewpoints;
+use wildcity_session::{lidar_viewpoint, viewpoints};
 use wildcity_twin::residency::Resident;
 
 use super::actors::MovingActor;
-use super::sensors::{self, LIDAR, SECTORS};
+use super::sensors::{self, LIDAR};
 
 /// Period of cameras, LiDAR, boxes and satellite fixes, in microseconds.
-const PERIOD_US: i64 = 100_000;
+pub(super) const PERIOD_US: i64 = 100_000;
 
 /// Period of poses and of the inertial unit, in microseconds.
 const POSE_US: i64 = 10_000;
@@ -37,6 +39,7 @@ pub(super) struct Recorder<'a> {
     pub(super) backend: Box<dyn Backend>,
     pub(super) route: Route<'a>,
     pub(super) rig: Rig,
+    pub(super) lidar: Arc<Lidar>,
     pub(super) rig_from_lidar: Pose,
     /// What is added to the times of the LiDAR.
     pub(super) lidar_late_us: i64,
@@ -49,7 +52,6 @@ pub(super) struct Recorder<'a> {
 /// An image as it was rendered.
 struct Rendered {
     rgb8: Vec<u8>,
-    depth_m: Vec<f32>,
     opacity: Vec<f32>,
 }
 
@@ -145,22 +147,24 @@ impl Recorder<'_> {
     }
 
     fn record_sweep(&self, begin_us: i64, log: &mut LogWriter) -> anyhow::Result<()> {
-        let mut sweep = SweepPoints::default();
         let late_us = self.lidar_late_us;
-        for step in 0..SECTORS {
-            let time_us = begin_us + i64::from(step) * PERIOD_US / i64::from(SECTORS);
-            let (camera, lidar_from_camera) = sensors::sector(step);
-            let world_from_lidar = self.route.pose_at(time_us)? * self.rig_from_lidar;
-            let view = View::new(camera, world_from_lidar * lidar_from_camera);
-            let Rendered { rgb8, depth_m, opacity } = self.render(&view, time_us)?;
-            let maps = [&depth_m[..], &opacity[..]];
-            sensors::add_points(&mut sweep, step, time_us + late_us, maps, &rgb8);
-        }
+        let end_us = begin_us + PERIOD_US;
+        let at = |time_us| anyhow::Ok(self.route.pose_at(time_us)? * self.rig_from_lidar);
+        let view = LidarView {
+            lidar: self.lidar.clone(),
+            world_from_lidar: at(end_us)?,
+            world_from_lidar_first: at(begin_us)?,
+        };
+        let profile = self.resident.version.manifest.profile;
+        let mut scene = self.resident.scene(&[lidar_viewpoint(&view)], &profile)?;
+        scene.place(self.placed(end_us, begin_us));
+        let sweep = self.backend.sweep(&scene, &profile, &view)?;
+        let points = sensors::points(&self.lidar, &sweep, begin_us + late_us);
         let file = format!("lidar/{begin_us:010}.safetensors");
-        log.put(&file, &sweep.bytes(file.as_ref())?)?;
+        log.put(&file, &points.bytes(file.as_ref())?)?;
         log.add(&SweepRow {
             time_us: begin_us + late_us,
-            until_us: begin_us + late_us + PERIOD_US - 1,
+            until_us: end_us + late_us,
             lidar: LIDAR.to_owned(),
             file,
             compensated_to_us: None,
@@ -168,24 +172,30 @@ impl Recorder<'_> {
         Ok(())
     }
 
+    /// The objects at the end of an exposure, on their way from its start.
+    fn placed(&self, time_us: i64, start_us: i64) -> Vec<PlacedChunk> {
+        let at = |actor: &MovingActor, time_us, index| {
+            actor.placed(&self.route, self.since_start_s(time_us), index)
+        };
+        let placed = (0..).zip(&self.actors).filter_map(|(index, actor)| {
+            let end = at(actor, time_us, index)?;
+            let start = at(actor, start_us, index)
+                .map_or(end.world_from_actor, |start| start.world_from_actor);
+            Some(PlacedChunk { world_from_actor_at_start: start, ..end })
+        });
+        placed.collect()
+    }
+
     /// Renders the twin with the objects at a time.
     fn render(&self, view: &View, time_us: i64) -> anyhow::Result<Rendered> {
         let profile = self.resident.version.manifest.profile;
         let views = [*view];
         let mut scene = self.resident.scene(&viewpoints(&views), &profile)?;
-        let time_s = self.since_start_s(time_us);
-        let actors = (0..).zip(&self.actors);
-        let placed = actors.filter_map(|(at, actor)| actor.placed(&self.route, time_s, at));
-        scene.place(placed.collect());
+        scene.place(self.placed(time_us, time_us));
         let pixels = view.camera.pixels();
-        let mut rendered = Rendered {
-            rgb8: vec![0; 3 * pixels],
-            depth_m: vec![0.0; pixels],
-            opacity: vec![0.0; pixels],
-        };
+        let mut rendered = Rendered { rgb8: vec![0; 3 * pixels], opacity: vec![0.0; pixels] };
         let target = Target {
             rgb8: Some(&mut rendered.rgb8),
-            depth_m: Some(&mut rendered.depth_m),
             opacity: Some(&mut rendered.opacity),
             ..Target::default()
         };

@@ -2,75 +2,68 @@
 
 use std::f64::consts::TAU;
 
-use glam::{DQuat, DVec2, DVec3};
+use glam::DVec3;
 
 use wildcity_log::{GpsRow, ImuRow, SweepPoints};
+use wildcity_render::lidar::Sweep;
 use wildcity_scene::geo::{GeoAnchor, GeoError};
-use wildcity_scene::geometry::camera::Pinhole;
-use wildcity_scene::geometry::{Camera, Pose};
+use wildcity_scene::geometry::{Lidar, LidarError, Pose};
 use wildcity_scene::route::Route;
+use wildcity_session::options::{LidarBeams, LidarColumns};
 
 /// Name of the LiDAR.
 pub(super) const LIDAR: &str = "top";
 
-/// Steps of a turn: a LiDAR that flashes an eighth of its surroundings at once.
-pub(super) const SECTORS: u32 = 8;
+/// Elevations of the highest and the lowest row: 6° above and 25° below the horizon.
+const ELEVATIONS_RAD: [f64; 2] = [0.10, -0.44];
 
-/// Columns and rows of a step.
-const SECTOR_PX: [u32; 2] = [60, 32];
-
-/// Slopes of the highest and the lowest row: 6° above and 25° below the horizon.
-const SLOPES: [f64; 2] = [0.10, -0.47];
-
-/// Farthest point, in metres.
-const REACH_M: f32 = 80.0;
-
-/// Least opacity of a pixel that returns light.
-const OPAQUE: f32 = 0.95;
+/// Rows and columns of a turn.
+const BEAMS: [u32; 2] = [32, 1_800];
 
 /// Time between the three poses of which accelerations are computed, in microseconds.
 const DIFFERENCE_US: i64 = 50_000;
 
 const GRAVITY_M_PER_S2: f64 = 9.81;
 
-/// The camera that renders a step, and its pose in the LiDAR's axes.
-pub(super) fn sector(step: u32) -> (Camera, Pose) {
-    let [width, height] = SECTOR_PX.map(f64::from);
-    let fx = 0.5 * width / (0.5 * TAU / f64::from(SECTORS)).tan();
-    let [above, below] = SLOPES;
-    let fy = height / (above - below);
-    let pinhole = Pinhole { fx, fy, cx: 0.5 * width, cy: above * fy };
-    let camera = Camera::from_pinhole(SECTOR_PX[0], SECTOR_PX[1], pinhole);
-    let azimuth = DQuat::from_rotation_z(TAU * (f64::from(step) + 0.5) / f64::from(SECTORS));
-    // Camera x (right) is -y of the LiDAR, y (down) is -z, z (ahead) is x.
-    let ahead = DQuat::from_xyzw(-0.5, 0.5, -0.5, 0.5);
-    (camera, Pose { position_m: DVec3::ZERO, rotation: azimuth * ahead })
+/// The LiDAR, which turns once in `duration_us`.
+pub(super) fn lidar(duration_us: i64) -> Result<Lidar, LidarError> {
+    let [rows, columns] = BEAMS.map(f64::from);
+    let [above, below] = ELEVATIONS_RAD;
+    let row = |row: u32| above + (below - above) * f64::from(row) / (rows - 1.0);
+    let half = 0.5 * TAU;
+    Lidar::from_options(&LidarBeams {
+        row_elevations_rad: (0..BEAMS[0]).map(row).collect(),
+        row_azimuth_offsets_rad: None,
+        column_azimuths_rad: None,
+        columns: Some(LidarColumns {
+            count: BEAMS[1].into(),
+            first_rad: half,
+            last_rad: TAU / columns - half,
+        }),
+        duration_us,
+        min_range_m: None,
+        max_range_m: Some(80.0),
+    })
 }
 
-/// Adds the points of a rendered step to a sweep, all at one time. Without depth there is no point.
-pub(super) fn add_points(
-    sweep: &mut SweepPoints,
-    step: u32,
-    time_us: i64,
-    [depth_m, opacity]: [&[f32]; 2],
-    rgb8: &[u8],
-) {
-    let (camera, lidar_from_camera) = sector(step);
-    let width = camera.width_px as usize;
-    for (pixel, (depth_m, opacity)) in depth_m.iter().zip(opacity).enumerate() {
-        let at_px = DVec2::new((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5);
-        let Some(direction) = camera.unproject(at_px) else { continue };
-        if *opacity < OPAQUE || *depth_m <= 0.0 || *depth_m > REACH_M {
-            continue;
+/// The points of a sweep that begins at a time, in the order in which they were measured.
+pub(super) fn points(lidar: &Lidar, sweep: &Sweep, begin_us: i64) -> SweepPoints {
+    let mut points = SweepPoints::default();
+    for column in 0..lidar.columns() {
+        let until_end_us = lidar.duration_us() as f64 - lidar.age_us(column);
+        for row in 0..lidar.rows() {
+            let at = row * lidar.columns() + column;
+            let range_m = f64::from(sweep.range_m[at]);
+            if range_m > 0.0 {
+                let point_m = range_m * lidar.direction(row, column);
+                points.points_m.push(point_m.as_vec3().to_array());
+                points.time_us.push(begin_us + until_end_us.round() as i64);
+                points.intensity.get_or_insert_default().push(sweep.intensity[at]);
+                points.ring.get_or_insert_default().push(row as u16);
+            }
         }
-        // A pinhole's depth is z.
-        let point_m = direction / direction.z * f64::from(*depth_m);
-        sweep.points_m.push(lidar_from_camera.transform_point(point_m).as_vec3().to_array());
-        sweep.time_us.push(time_us);
-        let light: u32 = rgb8[3 * pixel..][..3].iter().map(|value| u32::from(*value)).sum();
-        sweep.intensity.get_or_insert_default().push(light as f32 / 765.0);
-        sweep.ring.get_or_insert_default().push((pixel / width) as u16);
     }
+    points
 }
 
 /// What an inertial unit measures, from differences of the drive's poses; `None` at its ends.

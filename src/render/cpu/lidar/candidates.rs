@@ -323,7 +323,7 @@ fn bounds_of<S: Simd>(simd: S, columns: &[Lanes], test: &ChunkTest) -> Option<Bo
         & azimuth_high.simd_ge(splat(test.azimuths[0]))
         & elevation_low.simd_le(splat(test.elevations[1]))
         & elevation_high.simd_ge(splat(test.elevations[0]));
-    let lanes = u64::from(meets.to_bitmask());
+    let lanes = meets.to_bitmask();
     if lanes == 0 {
         return None;
     }

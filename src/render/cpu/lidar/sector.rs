@@ -276,7 +276,7 @@ fn column_angles(view: &LidarView, column: usize) -> [f64; 2] {
 
 impl BodySector<'_> {
     /// A position in the body's axes relative to the LiDAR's middle position, in metres.
-    pub(super) fn from_middle(&self, position_m: DVec3) -> DVec3 {
+    pub(super) fn relative_to_middle(&self, position_m: DVec3) -> DVec3 {
         position_m - self.middle.position_m
     }
 

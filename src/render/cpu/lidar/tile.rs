@@ -89,7 +89,7 @@ impl Tile {
             // Lanes beyond the last column repeat it: they are not followed.
             let column = self.first_column + lane.min(columns - 1);
             let pose = &seen.poses[column - seen.sector.columns.start];
-            let origin_m = seen.from_middle(pose.position_m).to_array();
+            let origin_m = seen.relative_to_middle(pose.position_m).to_array();
             let axes = pose.rotation_matrix();
             for (axis, value) in origin_m.into_iter().enumerate() {
                 rays.origin_m[axis][lane] = value as f32;
@@ -228,7 +228,7 @@ fn meet<S: Simd>(
     // Merged Gaussians may be more opaque than 1.
     let alpha = exp2(simd, exponent.min(splat(0.0))).min(splat(cap));
     Some(Crossing {
-        lanes: u64::from(meets.to_bitmask()),
+        lanes: meets.to_bitmask(),
         range_m: range_m.to_array(),
         alpha: alpha.to_array(),
     })
