@@ -30,7 +30,8 @@ pub(crate) fn lidar_view(
         let must = format!("{}: PANDAR128 and AT128 are offered", spec.lidar_type);
         refused("lidar_config.lidar_type", must)
     })?;
-    let [start_us, end_us] = [request.frame_start_us, request.frame_end_us];
+    let start_us = request.frame_start_us;
+    let end_us = request.frame_end_us;
     let duration_us = end_us.checked_sub(start_us).and_then(|us| i64::try_from(us).ok());
     let duration_us = duration_us.ok_or_else(|| {
         refused("frame_start_us", format!("{start_us} is after frame_end_us {end_us}"))
@@ -87,9 +88,10 @@ pub(crate) fn answer(view: &LidarView, sweep: &Sweep) -> wire::LidarRenderReturn
     let mut point_xyzs = Vec::new();
     let mut point_intensities = Vec::new();
     for (at, &range_m) in sweep.range_m.iter().enumerate().filter(|(_, range_m)| **range_m > 0.0) {
-        let (row, column) = (at / columns, at % columns);
+        let column = at % columns;
         let pose = &poses[column];
-        let from_lidar_m = pose.rotation * (f64::from(range_m) * view.lidar.direction(row, column));
+        let from_lidar_m =
+            pose.rotation * (f64::from(range_m) * view.lidar.direction(at / columns, column));
         // The difference of positions first: both may be far from the origin.
         let from_last_m = from_lidar_m + (pose.position_m - last.position_m);
         point_xyzs.extend((last_from_world * from_last_m).as_vec3().to_array());

@@ -320,7 +320,7 @@ pub trait Backend: Send + Sync {
         profile: &RenderProfile,
         view: &LidarView,
     ) -> Result<Sweep, RenderError> {
-        Ok(cpu::lidar::sweep(fearless_simd::Level::new(), scene, profile, view))
+        Ok(cpu::lidar::best_sweep(scene, profile, view))
     }
 
     /// Upper bound of the intermediate buffers of a sweep, whatever the scene, in bytes.

@@ -11,7 +11,6 @@ use wildcity_scene::rig::{Rig, RigCamera, RigLidar};
 
 use super::encode::{ImageEncoding, PixelMaps};
 use super::frame_history::{FrameHistory, PastFrame};
-use super::point_cloud::POINT_BYTES;
 use super::schedule::Schedule;
 use crate::episode::Episode;
 use crate::error::SessionError;
@@ -422,7 +421,7 @@ impl ObservationLayout {
             ImageEncoding::Jpeg(_) => limits::JPEG_PIXEL_BYTES,
         };
         let beams: usize = self.lidars.iter().map(|mounted| mounted.lidar.beams()).sum();
-        2 * (self.rig_pixels() * (maps + colour) + (beams * POINT_BYTES) as u64)
+        2 * (self.rig_pixels() * (maps + colour) + limits::POINT_BYTES * beams as u64)
     }
 
     /// Bytes of the images outside of the answer while a frame is rendered: pixels that are

@@ -12,9 +12,6 @@ use crate::episode::Episode;
 use crate::observe::layout::EffectSeed;
 use crate::sensors::draw::standard_normal;
 
-/// Bytes of a point: position, intensity, row, column and instance.
-pub(crate) const POINT_BYTES: usize = 4 * 4 + 3 * 2;
-
 /// The returns of a sweep, row by row.
 #[derive(Debug)]
 pub(crate) struct PointCloud {
@@ -73,7 +70,8 @@ impl PointCloud {
             if range_m == 0.0 {
                 continue;
             }
-            let (row, column) = (at / beams.columns(), at % beams.columns());
+            let row = at / beams.columns();
+            let column = at % beams.columns();
             let in_lidar_m = range_m * beams.direction(row, column);
             let in_rig_m = mounted.rig_from_lidar.transform_point(in_lidar_m);
             cloud.points_m.push(in_rig_m.as_vec3().to_array());

@@ -291,7 +291,7 @@ class PointCloud:
     @property
     def points(self) -> NDArray[np.float32]:
         """float32 [n, 3]: positions in metres in the rig's axes when each was measured. A sweep of a moving ego is
-        skewed; `times_us` says when, for whoever deskews it."""
+        skewed; `times_us` says when, to deskew it."""
         return self._tensor("points")
 
     @property

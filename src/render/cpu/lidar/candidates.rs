@@ -101,7 +101,7 @@ impl Candidates {
         let groups = chunk.len().div_ceil(LANES);
         for group in first..(first + CLUSTER / LANES).min(groups) {
             let columns = chunk.lane_group(group);
-            let Some(found) = dispatch!(level, simd => bounds_of(simd, columns, test)) else {
+            let Some(found) = dispatch!(level, simd => block_bounds(simd, columns, test)) else {
                 continue;
             };
             let mut lanes = found.lanes;
@@ -275,7 +275,7 @@ impl ChunkTest {
 
 /// Bounds of 16 Gaussians; `None` if a beam meets none of them.
 #[inline(always)]
-fn bounds_of<S: Simd>(simd: S, columns: &[Lanes], test: &ChunkTest) -> Option<Bounds> {
+fn block_bounds<S: Simd>(simd: S, columns: &[Lanes], test: &ChunkTest) -> Option<Bounds> {
     let splat = |value: f32| f32x16::splat(simd, value);
     let zero = splat(0.0);
     let log2_opacity = f32x16::load_array_ref(simd, &columns[column::LOG2_OPACITY].0);

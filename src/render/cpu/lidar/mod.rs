@@ -13,6 +13,7 @@
 
 mod beam;
 mod candidates;
+mod cast;
 mod sector;
 mod tile;
 
@@ -21,11 +22,17 @@ use parking_lot::Mutex;
 use rayon::prelude::*;
 
 use self::beam::{Beam, Met};
-use self::sector::{Scratch, Sector};
+use self::cast::Scratch;
+use self::sector::Sector;
 use crate::lidar::{LidarView, Sweep};
 use wildcity_scene::chunk::LANES;
 use wildcity_scene::geometry::Lidar;
 use wildcity_scene::{RenderProfile, Scene};
+
+/// As [`sweep`], with the best instruction set of the machine.
+pub(crate) fn best_sweep(scene: &Scene, profile: &RenderProfile, view: &LidarView) -> Sweep {
+    sweep(Level::new(), scene, profile, view)
+}
 
 /// The sweep of a LiDAR. Runs on the current rayon pool; the result does not depend on it.
 pub(crate) fn sweep(
@@ -39,7 +46,7 @@ pub(crate) fn sweep(
     let free: Mutex<Vec<Scratch>> = Mutex::default();
     let part = |sector: &Sector| {
         let mut scratch = free.lock().pop().unwrap_or_default();
-        let part = sector.sweep(level, &mut scratch, scene, profile, view);
+        let part = cast::sweep(sector, level, &mut scratch, scene, profile, view);
         free.lock().push(scratch);
         part
     };

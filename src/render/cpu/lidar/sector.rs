@@ -2,16 +2,12 @@
 
 use std::ops::Range;
 
-use fearless_simd::{Level, dispatch};
 use glam::{DMat3, DVec3};
 
-use super::beam::Met;
-use super::candidates::Candidates;
-use super::tile::Tile;
-use crate::lidar::{Body, LidarView, Sweep, chunks};
+use crate::lidar::{Body, LidarView};
+use wildcity_scene::Chunk;
 use wildcity_scene::chunk::LANES;
 use wildcity_scene::geometry::Pose;
-use wildcity_scene::{Chunk, RenderProfile, Scene};
 
 /// Most columns of a sector: 4 tiles. A tenth of a second of 30 m/s is 3 m, of which a sector of a
 /// sweep of 2,048 columns has 0.09 m.
@@ -43,15 +39,6 @@ pub(super) struct Sector {
     row_angles: Vec<[f64; 4]>,
     /// Cosine and sine of the azimuth of each column of the first row.
     column_angles: Vec<[f64; 2]>,
-}
-
-/// Memory that sectors fill one after the other.
-#[derive(Default)]
-pub(super) struct Scratch {
-    candidates: Candidates,
-    tiles: Vec<Tile>,
-    /// The Gaussians that beams have met.
-    met: Vec<Met>,
 }
 
 /// A sector as one body sees it.
@@ -176,7 +163,7 @@ impl Sector {
     }
 
     /// This sector as a body sees it.
-    fn seen_from<'a>(&'a self, body: Body<'a>, view: &LidarView) -> BodySector<'a> {
+    pub(super) fn seen_from<'a>(&'a self, body: Body<'a>, view: &LidarView) -> BodySector<'a> {
         let at = |column| body.body_from_lidar(view, column);
         let poses: Vec<Pose> = self.columns.clone().map(at).collect();
         let middle = poses[poses.len() / 2];
@@ -198,68 +185,6 @@ impl Sector {
             poses,
         }
     }
-
-    /// The returns of its columns, `[rows, columns of the sector]`.
-    pub(super) fn sweep(
-        &self,
-        level: Level,
-        scratch: &mut Scratch,
-        scene: &Scene,
-        profile: &RenderProfile,
-        view: &LidarView,
-    ) -> Sweep {
-        let rows = view.lidar.rows();
-        let tiles = self.tile_spans.len();
-        let Scratch { candidates, tiles: beams, met } = scratch;
-        met.clear();
-        let count = tiles * rows.div_ceil(LANES);
-        beams.resize_with(count.max(beams.len()), Tile::default);
-        let beams = &mut beams[..count];
-        for (at, tile) in beams.iter_mut().enumerate() {
-            let first_column = self.columns.start + at % tiles * LANES;
-            tile.begin(self, view, at / tiles * LANES, first_column);
-        }
-        for chunks in by_body(scene) {
-            let seen = self.seen_from(chunks[0].1, view);
-            let mut compare = |candidates: &mut Candidates| {
-                let lists = candidates.by_tile(level, self, rows);
-                for (tile, list) in beams.iter_mut().zip(lists) {
-                    let listed = &candidates.list;
-                    dispatch!(level, simd => tile.cast(simd, listed, met, &seen, &list, profile));
-                }
-                candidates.list.clear();
-            };
-            let mut chunks: Vec<_> = chunks
-                .into_iter()
-                .map(|(number, _, chunk)| (seen.distance_m(chunk), number, chunk))
-                .collect();
-            // From the nearest, so that what hides others is met first.
-            chunks.sort_by(|a, b| a.0.total_cmp(&b.0));
-            for (_, number, chunk) in chunks {
-                candidates.find(level, &seen, (number, chunk), profile, &mut compare);
-            }
-            compare(candidates);
-            beams.iter_mut().for_each(Tile::leave_body);
-        }
-        let width = self.columns.len();
-        let mut part = Sweep::empty(rows * width);
-        for tile in beams {
-            tile.write(self, met, &mut part, width);
-        }
-        part
-    }
-}
-
-/// The chunks of each body, with their numbers.
-fn by_body(scene: &Scene) -> Vec<Vec<(usize, Body<'_>, &Chunk)>> {
-    let mut bodies: Vec<Vec<(usize, Body<'_>, &Chunk)>> = Vec::new();
-    for (number, (body, chunk)) in chunks(scene).enumerate() {
-        match bodies.last_mut() {
-            Some(last) if last[0].1.is_same(&body) => last.push((number, body, chunk)),
-            _ => bodies.push(vec![(number, body, chunk)]),
-        }
-    }
-    bodies
 }
 
 fn row_angles(view: &LidarView, row: usize) -> [f64; 4] {
@@ -281,7 +206,7 @@ impl BodySector<'_> {
     }
 
     /// How far a chunk's first Gaussians are from the LiDAR, in metres.
-    fn distance_m(&self, chunk: &Chunk) -> f64 {
+    pub(super) fn distance_m(&self, chunk: &Chunk) -> f64 {
         let middle_m = self.middle_from(chunk.origin_m());
         let first = chunk.clusters().first().map(|first| 0.5 * (first.min_m + first.max_m));
         first.map_or(f64::INFINITY, |first| first.as_dvec3().distance(middle_m))

@@ -1,0 +1,82 @@
+//! The returns of one sector.
+
+use fearless_simd::{Level, dispatch};
+
+use super::beam::Met;
+use super::candidates::Candidates;
+use super::sector::Sector;
+use super::tile::Tile;
+use crate::lidar::{Body, LidarView, Sweep, chunks};
+use wildcity_scene::chunk::LANES;
+use wildcity_scene::{Chunk, RenderProfile, Scene};
+
+/// Memory that sectors fill one after the other.
+#[derive(Default)]
+pub(super) struct Scratch {
+    candidates: Candidates,
+    tiles: Vec<Tile>,
+    /// The Gaussians that beams have met.
+    met: Vec<Met>,
+}
+
+/// The returns of its columns, `[rows, columns of the sector]`.
+pub(super) fn sweep(
+    sector: &Sector,
+    level: Level,
+    scratch: &mut Scratch,
+    scene: &Scene,
+    profile: &RenderProfile,
+    view: &LidarView,
+) -> Sweep {
+    let rows = view.lidar.rows();
+    let tiles = sector.tile_spans.len();
+    let Scratch { candidates, tiles: beams, met } = scratch;
+    met.clear();
+    let count = tiles * rows.div_ceil(LANES);
+    beams.resize_with(count.max(beams.len()), Tile::default);
+    let beams = &mut beams[..count];
+    for (at, tile) in beams.iter_mut().enumerate() {
+        let first_column = sector.columns.start + at % tiles * LANES;
+        tile.begin(sector, view, at / tiles * LANES, first_column);
+    }
+    for chunks in by_body(scene) {
+        let seen = sector.seen_from(chunks[0].1, view);
+        let mut compare = |candidates: &mut Candidates| {
+            let lists = candidates.by_tile(level, sector, rows);
+            for (tile, list) in beams.iter_mut().zip(lists) {
+                let listed = &candidates.list;
+                dispatch!(level, simd => tile.cast(simd, listed, met, &seen, &list, profile));
+            }
+            candidates.list.clear();
+        };
+        let mut chunks: Vec<_> = chunks
+            .into_iter()
+            .map(|(number, _, chunk)| (seen.distance_m(chunk), number, chunk))
+            .collect();
+        // From the nearest, so that what hides others is met first.
+        chunks.sort_by(|a, b| a.0.total_cmp(&b.0));
+        for (_, number, chunk) in chunks {
+            candidates.find(level, &seen, (number, chunk), profile, &mut compare);
+        }
+        compare(candidates);
+        beams.iter_mut().for_each(Tile::leave_body);
+    }
+    let width = sector.columns.len();
+    let mut part = Sweep::empty(rows * width);
+    for tile in beams {
+        tile.write(sector, met, &mut part, width);
+    }
+    part
+}
+
+/// The chunks of each body, with their numbers.
+fn by_body(scene: &Scene) -> Vec<Vec<(usize, Body<'_>, &Chunk)>> {
+    let mut bodies: Vec<Vec<(usize, Body<'_>, &Chunk)>> = Vec::new();
+    for (number, (body, chunk)) in chunks(scene).enumerate() {
+        match bodies.last_mut() {
+            Some(last) if last[0].1.is_same(&body) => last.push((number, body, chunk)),
+            _ => bodies.push(vec![(number, body, chunk)]),
+        }
+    }
+    bodies
+}
