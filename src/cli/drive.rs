@@ -78,11 +78,11 @@ pub(super) struct Drive {
     #[arg(long, value_name = "WxH", requires = "cameras", value_parser = size)]
     size: Option<[u32; 2]>,
 
-    /// How the ego moves
-    #[arg(long, value_name = "MODEL", default_value = "dynamic", value_parser = model)]
-    dynamics: DynamicsModel,
+    /// How the ego moves [default: as the scenario says; without one, dynamic]
+    #[arg(long, value_name = "MODEL", value_parser = model)]
+    dynamics: Option<DynamicsModel>,
 
-    /// Speed at the start, in m/s [default: the recorded one]
+    /// Speed at the start, in m/s [default: that of the scenario; without one, the recorded one]
     #[arg(long, value_name = "M_S")]
     speed: Option<f64>,
 
