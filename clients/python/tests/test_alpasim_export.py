@@ -101,17 +101,17 @@ def test_a_drive_that_is_too_short_is_refused(tmp_path: Path) -> None:
 
 
 @dataclasses.dataclass
+class Flags:
+    use_localhost: bool = False
+
+
+@dataclasses.dataclass
 class Wizard:
     """The shape of the section `wizard` of AlpaSim 3032e0c: types as there, and only the fields that matter here."""
 
     run_sim_services: list[str] | None = MISSING
     external_services: dict[str, list[str]] | None = None
-    debug_flags: Flags = dataclasses.field(default_factory=lambda: Flags())
-
-
-@dataclasses.dataclass
-class Flags:
-    use_localhost: bool = False
+    debug_flags: Flags = dataclasses.field(default_factory=Flags)
 
 
 @dataclasses.dataclass
