@@ -41,6 +41,9 @@ pub struct Config {
     pub directories: Directories,
     /// Where parts of twins at a URL are kept on disk.
     pub cache: Option<DiskCacheSettings>,
+    /// Address of a second listener, which answers `/metrics`, `/healthz` and `/readyz` without
+    /// TLS and without tokens.
+    pub metrics_listen: Option<SocketAddr>,
     /// The tokens of clients; without tokens every client may do everything.
     pub tokens: Option<Tokens>,
     /// Web pages of other sites that may send requests.
@@ -71,6 +74,7 @@ impl Config {
             listen: SocketAddr::from(([127, 0, 0, 1], 0)),
             directories,
             cache: None,
+            metrics_listen: None,
             tokens: None,
             origins: Origins::default(),
             tls: None,
@@ -99,6 +103,8 @@ pub struct Limits {
     pub step: Duration,
     /// How long a session without a connection waits to be resumed.
     pub resume_grace: Duration,
+    /// How long sessions may go on after the server was asked to stop; none is opened then.
+    pub sessions_end: Duration,
     /// Time-out for running steps when the server stops.
     pub drain: Duration,
     /// WebSocket connections at once.
@@ -161,6 +167,7 @@ impl Default for Limits {
             send: wildcity_protocol::limits::SEND_TIMEOUT,
             step: wildcity_protocol::limits::STEP_TIMEOUT,
             resume_grace: limits::RESUME_GRACE,
+            sessions_end: Duration::ZERO,
             drain: limits::DRAIN_TIMEOUT,
             connections: limits::CONNECTIONS,
             sessions: wildcity_session::limits::SESSIONS,
@@ -198,6 +205,7 @@ impl std::fmt::Debug for Config {
             listen,
             directories,
             cache,
+            metrics_listen,
             tokens,
             origins,
             tls,
@@ -213,6 +221,7 @@ impl std::fmt::Debug for Config {
             .field("listen", listen)
             .field("directories", directories)
             .field("cache", cache)
+            .field("metrics_listen", metrics_listen)
             .field("tokens", &tokens.is_some())
             .field("origins", origins)
             .field("tls", tls)

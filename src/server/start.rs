@@ -38,9 +38,11 @@ pub enum ServerError {
     PublicAddress { address: SocketAddr },
     /// The address cannot be used.
     #[error(
-        "cannot listen on {address}: {cause}; stop the program that uses it, or give another --listen"
+        "cannot listen on {address}: {cause}; stop the program that uses it, or give another {option}"
     )]
     Listen {
+        /// The option that has the address.
+        option: &'static str,
         address: SocketAddr,
         /// The operating system's error.
         cause: io::Error,
@@ -81,6 +83,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         listen,
         directories: Directories { twins, episodes, scenarios, uploads },
         cache,
+        metrics_listen,
         tokens,
         origins,
         tls,
@@ -118,9 +121,11 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
     engine.limit_records(limits.records);
 
     // The socket.
-    let listen_error = |cause| ServerError::Listen { address: listen, cause };
-    let listener = TcpListener::bind(listen).await.map_err(listen_error)?;
-    let address = listener.local_addr().map_err(listen_error)?;
+    let listener = Listener::bind("--listen", listen).await?;
+    let metrics_listener = match metrics_listen {
+        Some(address) => Some(Listener::bind("--metrics-listen", address).await?),
+        None => None,
+    };
 
     // Uploads. Agents can drive without them.
     // All clients of a server without tokens share one owner, the empty name.
@@ -155,5 +160,20 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         spool,
         pushes: PushQueue::new(limits.queue()),
     });
-    Ok(Running::new(state, listener, tls, address, stop))
+    Ok(Running::new(state, listener, metrics_listener, tls, stop))
+}
+
+/// A socket that listens, and its address.
+pub(crate) struct Listener {
+    pub(crate) socket: TcpListener,
+    pub(crate) address: SocketAddr,
+}
+
+impl Listener {
+    async fn bind(option: &'static str, address: SocketAddr) -> Result<Self, ServerError> {
+        let listen_error = |cause| ServerError::Listen { option, address, cause };
+        let socket = TcpListener::bind(address).await.map_err(listen_error)?;
+        let address = socket.local_addr().map_err(listen_error)?;
+        Ok(Self { socket, address })
+    }
 }

@@ -71,6 +71,11 @@ pub(super) struct LimitOptions {
     #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().resume_grace.as_secs_f64(), value_parser = seconds)]
     resume_grace_s: f64,
 
+    /// Seconds that sessions may go on after SIGTERM; until then the server opens no new one and is
+    /// not ready. A second SIGTERM stops it at once.
+    #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().sessions_end.as_secs_f64(), value_parser = waiting_seconds)]
+    sessions_end_s: f64,
+
     /// Seconds that running steps may take to finish when the server stops.
     #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().drain.as_secs_f64(), value_parser = seconds)]
     drain_timeout_s: f64,
@@ -120,6 +125,7 @@ impl LimitOptions {
             send: seconds(self.send_timeout_s),
             step: seconds(self.step_timeout_s),
             resume_grace: seconds(self.resume_grace_s),
+            sessions_end: seconds(self.sessions_end_s),
             drain: seconds(self.drain_timeout_s),
             connections: self.connections,
             sessions: self.sessions,
@@ -150,6 +156,11 @@ pub(super) fn bytes_as_gib(bytes: u64) -> f64 {
 
 fn seconds(text: &str) -> Result<f64, String> {
     seconds_up_to(text, MAX_TIMEOUT_S)
+}
+
+/// Seconds, or 0 for no wait.
+fn waiting_seconds(text: &str) -> Result<f64, String> {
+    if text.parse() == Ok(0.0) { Ok(0.0) } else { seconds(text) }
 }
 
 fn send_seconds(text: &str) -> Result<f64, String> {

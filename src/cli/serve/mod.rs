@@ -29,7 +29,8 @@ use super::repair_options::{RepairOptions, runtime_library};
 /// Serve twins to agents over WebSocket.
 ///
 /// Prints `listening on ws://HOST:PORT/v1/session` when agents can connect, and logs to standard
-/// error. Ctrl-C or SIGTERM lets running steps finish, then stops.
+/// error. Ctrl-C or SIGTERM lets sessions end within --sessions-end-s and running steps finish, then
+/// stops.
 ///
 /// Every option can also be set in a TOML file: --memory-gib is memory_gib there, and the options
 /// under Limits are in the table [limits]. A flag overrides the file, and the file overrides a
@@ -89,7 +90,12 @@ pub(super) struct Serve {
     #[arg(long, value_name = "ADDR", default_value = wildcity_server::limits::LISTEN, value_parser = address)]
     listen: SocketAddr,
 
-    /// Address and port of a second listener, for AlpaSim: the gRPC service `sensorsim`, through
+    /// Address and port of a second listener, for Prometheus and probes: /metrics, /healthz and
+    /// /readyz, without TLS and without tokens. The metrics name no twin and no token.
+    #[arg(long, value_name = "ADDR", value_parser = address)]
+    metrics_listen: Option<SocketAddr>,
+
+    /// Address and port of another listener, for AlpaSim: the gRPC service `sensorsim`, through
     /// which AlpaSim uses the twins as scenes of its renderer. AlpaSim sends no tokens.
     #[arg(long, value_name = "ADDR", value_parser = address)]
     alpasim: Option<SocketAddr>,
@@ -243,6 +249,7 @@ impl Serve {
         let config = wildcity_server::Config {
             listen: self.listen,
             cache: self.directories.twins.cache(),
+            metrics_listen: self.metrics_listen,
             directories,
             tokens,
             origins: self.origin.unwrap_or_default(),
@@ -276,7 +283,15 @@ impl Serve {
                 writeln!(io::stdout(), "AlpaSim: listening on {}", alpasim.address())?;
             }
             tracing::info!("viewer at {}", running.page());
+            if let Some(address) = running.metrics_address() {
+                tracing::info!("metrics at http://{address}/metrics");
+            }
             stop.await;
+            let again = wildcity_server::stop_signal()?;
+            tokio::select! {
+                () = running.end_sessions() => {}
+                () = again => {}
+            }
             tracing::info!("stopping");
             #[cfg(feature = "alpasim")]
             if let Some(alpasim) = alpasim {

@@ -101,7 +101,11 @@ impl Machine {
             spool,
             pushes: PushQueue::new(limits.queue()),
         });
-        SimServer { acceptor: Acceptor::new(state.clone()), state, _stop: stop }
+        SimServer {
+            acceptor: Acceptor::new(state.clone(), crate::routes::router(state.clone())),
+            state,
+            _stop: stop,
+        }
     }
 }
 
