@@ -160,10 +160,8 @@ pub fn deploy(scenes: &str, address: &str) -> String {
         "external_services": { "renderer": addresses, "physics": addresses },
         "debug_flags": { "use_localhost": true },
     });
-    let [scenes, runtime] = [
-        json!({ "scene_ids": null, "local_usdz_dir": scenes }),
-        json!({ "simulation_config": { "ego_mask_rig_config_id": null } }),
-    ];
+    let scenes = json!({ "scene_ids": null, "local_usdz_dir": scenes });
+    let runtime = json!({ "simulation_config": { "ego_mask_rig_config_id": null } });
     format!(
         "# @package _global_\n{filesystem}\nwizard: {wizard}\nscenes: {scenes}\nruntime: {runtime}\n"
     )

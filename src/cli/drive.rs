@@ -1,6 +1,6 @@
 //! `wildcity drive`.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::time::Duration;
 
 use serde_json::json;
@@ -14,6 +14,7 @@ use wildcity_client::DynamicsModel;
 use wildcity_client::protocol::message::{Open, RigChoice, ScenarioChoice};
 
 use super::exit::Exit;
+use crate::cli::output;
 
 /// Exit code if the driver did not answer in time: the status of `timeout`.
 const TIMEOUT_EXIT_CODE: u8 = 124;
@@ -158,7 +159,7 @@ impl Drive {
                 if !is_good {
                     failed.push(report.outcome);
                 }
-                writeln!(io::stdout(), "{}", line(&report))?;
+                writeln!(output::stdout(), "{}", line(&report))?;
                 if let (Some(reason), None) = (&report.reason, &self.twin) {
                     // `episode run` shows no output of agents.
                     eprintln!("{reason}");

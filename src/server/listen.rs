@@ -1,6 +1,6 @@
 //! Accepts connections, a bounded number of them.
 
-use std::net::IpAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -18,6 +18,12 @@ use crate::limits;
 use crate::state::ServerState;
 use crate::stream::Stream;
 use crate::tls::Tls;
+
+/// A socket that listens, and its address.
+pub(crate) struct Listener {
+    pub(crate) socket: TcpListener,
+    pub(crate) address: SocketAddr,
+}
 
 /// Serves connections until the server stops.
 pub(crate) async fn listen(

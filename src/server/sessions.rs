@@ -159,8 +159,13 @@ pub(crate) struct SlotGuard {
 
 impl SessionRegistry {
     pub(crate) fn new(limit: usize, resume_grace: Duration) -> Arc<Self> {
-        let (entries, closed) = (Mutex::default(), Mutex::default());
-        Arc::new(Self { limit, resume_grace, is_ending: AtomicBool::new(false), entries, closed })
+        Arc::new(Self {
+            limit,
+            resume_grace,
+            is_ending: AtomicBool::default(),
+            entries: Mutex::default(),
+            closed: Mutex::default(),
+        })
     }
 
     /// Refuses new sessions from now on.
@@ -176,8 +181,8 @@ impl SessionRegistry {
     /// Adds an empty slot under a new name, for the client's token.
     ///
     /// # Errors
-    /// The server will stop, the name is in use, or there are too many sessions, of all tokens or of
-    /// this one.
+    /// The server will stop, the name is in use, or there are too many sessions, of all tokens or
+    /// of this one.
     pub(crate) fn reserve(
         self: &Arc<Self>,
         name: String,

@@ -10,10 +10,9 @@ use tokio::time::timeout;
 
 use wildcity_session::Engine;
 
-use crate::listen::listen;
+use crate::listen::{Listener, listen};
 use crate::reload::reload;
 use crate::routes;
-use crate::start::Listener;
 use crate::state::ServerState;
 use crate::tls::Tls;
 

@@ -16,6 +16,7 @@ use wildcity_twin::store::{Catalog, StoreError};
 use crate::audit::Audit;
 use crate::auth::{CurrentTokens, Tokens};
 use crate::config::{Config, Directories};
+use crate::listen::Listener;
 use crate::metrics::Metrics;
 use crate::readiness::Readiness;
 use crate::sessions::SessionRegistry;
@@ -121,9 +122,9 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
     engine.limit_records(limits.records);
 
     // The socket.
-    let listener = Listener::bind("--listen", listen).await?;
+    let listener = bind("--listen", listen).await?;
     let metrics_listener = match metrics_listen {
-        Some(address) => Some(Listener::bind("--metrics-listen", address).await?),
+        Some(address) => Some(bind("--metrics-listen", address).await?),
         None => None,
     };
 
@@ -138,10 +139,15 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         reason
     });
 
+    let mut disks = vec![("episodes", episodes.clone()), ("uploads", uploads)];
+    // A twin at a URL has no disk here.
+    if !twins.to_string_lossy().contains("://") {
+        disks.push(("twins", twins));
+    }
     // A watch and not a notification: a task that asks later sees the value, too.
     let (stop, stopping) = watch::channel(false);
     let state = Arc::new(ServerState {
-        metrics: Metrics::new(engine.clone()),
+        metrics: Metrics::new(engine.clone(), disks),
         engine,
         sessions: SessionRegistry::new(limits.sessions, limits.resume_grace),
         websocket_permits: Arc::new(Semaphore::new(limits.connections)),
@@ -163,17 +169,9 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
     Ok(Running::new(state, listener, metrics_listener, tls, stop))
 }
 
-/// A socket that listens, and its address.
-pub(crate) struct Listener {
-    pub(crate) socket: TcpListener,
-    pub(crate) address: SocketAddr,
-}
-
-impl Listener {
-    async fn bind(option: &'static str, address: SocketAddr) -> Result<Self, ServerError> {
-        let listen_error = |cause| ServerError::Listen { option, address, cause };
-        let socket = TcpListener::bind(address).await.map_err(listen_error)?;
-        let address = socket.local_addr().map_err(listen_error)?;
-        Ok(Self { socket, address })
-    }
+async fn bind(option: &'static str, address: SocketAddr) -> Result<Listener, ServerError> {
+    let listen_error = |cause| ServerError::Listen { option, address, cause };
+    let socket = TcpListener::bind(address).await.map_err(listen_error)?;
+    let address = socket.local_addr().map_err(listen_error)?;
+    Ok(Listener { socket, address })
 }

@@ -101,7 +101,8 @@ fn check(case: &Case, episode: &EpisodeFile) -> Result<(), Technical> {
     let header = &episode.header;
     let scenario = episode.scenario.as_ref().map(|scenario| scenario.hash.as_str());
     let off_m = header.start.position_m.distance(case.start.position_m);
-    let [driven, ordered] = [header.dynamics, case.resolved.dynamics.unwrap_or_default()];
+    let driven = header.dynamics;
+    let ordered = case.resolved.dynamics.unwrap_or_default();
     // Only the speed is a measured number.
     let is_other_model = Dynamics { speed_m_s: ordered.speed_m_s, ..driven } != ordered;
     let off_m_s = (driven.speed_m_s - ordered.speed_m_s).abs();

@@ -1,6 +1,6 @@
 //! `wildcity alpasim export`.
 
-use std::io::{self, Cursor, Write};
+use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
@@ -69,7 +69,7 @@ impl Export {
         let cameras = offered_cameras(manifest);
         let content =
             SceneContent { cameras: &cameras, tracks: tracks.as_ref(), length_s: self.length_s };
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         for drive in &manifest.trajectories {
             let starts = (drive.length_m() / self.every_m).floor() as u32;
             for start in 0..=starts {

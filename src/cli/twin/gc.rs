@@ -1,10 +1,11 @@
 //! `wildcity twin gc`.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::time::Duration;
 
 use crate::cli::directories::Twins;
 use crate::cli::limits;
+use crate::cli::output;
 use wildcity_twin::store::Retention;
 
 /// Remove objects of a twin that none of the kept versions refers to.
@@ -48,7 +49,7 @@ impl Gc {
         let kept: Vec<_> = found.kept.iter().map(u64::to_string).collect();
         let removed = if self.dry_run { "would be removed" } else { "removed" };
         writeln!(
-            io::stdout(),
+            output::stdout(),
             "kept versions {}\n{removed} {} objects, {} bytes\nnoted {} objects, {} bytes",
             kept.join(" "),
             found.removed.objects,
@@ -58,7 +59,7 @@ impl Gc {
         )?;
         if let Some((number, damage)) = found.blocked_by {
             writeln!(
-                io::stdout(),
+                output::stdout(),
                 "nothing can be removed before the manifest of version {number}, which is damaged: {damage}"
             )?;
         }

@@ -193,7 +193,10 @@ impl Fault {
             Self::UnknownSession { field, name } => at(
                 Code::UnknownSession,
                 field,
-                format!("there is no session {name:?} to resume; it ended, or was never opened"),
+                format!(
+                    "there is no session {name:?} to resume: it ended, was never opened, or the server was \
+                     restarted; branch from {{\"episode\": \"{name}-1\", \"step\": N}} goes on from its record"
+                ),
             ),
             Self::NoSuchSession { field, name } => at(
                 Code::UnknownSession,
