@@ -45,9 +45,9 @@ pub enum StoreError {
     /// Garbage collection removed the version's objects.
     #[error("version {number} of twin {name:?} was removed by `wildcity twin gc`: use a later one")]
     GarbageCollected { name: String, number: u64 },
-    /// A version was leased while garbage collection was about to remove its objects.
+    /// A version is leased that garbage collection was about to remove, or whose twin is to go.
     #[error(
-        "version {number} of twin {name:?} has just come into use: nothing was removed; try again"
+        "version {number} of twin {name:?} is in use: nothing was removed; try again when it is not"
     )]
     Leased { name: String, number: u64 },
     /// Stored bytes differ from what was committed.
