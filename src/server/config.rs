@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use wildcity_episode::Keep;
 use wildcity_push::QueueLimits;
 use wildcity_render::Backend;
 use wildcity_repair::Models;
@@ -126,6 +127,8 @@ pub struct Limits {
     pub spool: SpoolLimits,
     /// Bytes of the records of episodes.
     pub records: RecordLimits,
+    /// Which records stay; the others are removed. By default all.
+    pub keep_records: Keep,
 }
 
 /// Limits of uploads. The constants in [`crate::limits`] are the defaults.
@@ -181,6 +184,7 @@ impl Default for Limits {
                 bytes: limits::RECORDS_BYTES,
                 owner_bytes: limits::TOKEN_RECORDS_BYTES,
             },
+            keep_records: Keep::default(),
         }
     }
 }

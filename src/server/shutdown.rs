@@ -2,14 +2,16 @@
 
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio::time::timeout;
 
+use wildcity_episode::prune;
 use wildcity_session::Engine;
 
+use crate::limits;
 use crate::listen::{Listener, listen};
 use crate::reload::reload;
 use crate::routes;
@@ -41,6 +43,36 @@ async fn remove_old_uploads(state: &ServerState) {
         if tokio::task::spawn_blocking(move || spool.remove_old()).await.is_err() {
             tracing::error!("old uploads were not removed: a task crashed");
         }
+    }
+}
+
+/// Removes records that are beyond a limit, until dropped.
+async fn remove_old_records(state: &ServerState) {
+    let keep = state.limits.keep_records;
+    if keep.keeps_all() {
+        return std::future::pending().await;
+    }
+    loop {
+        let dir = state.episodes.clone();
+        let pruned =
+            tokio::task::spawn_blocking(move || prune(&dir, keep, SystemTime::now(), false)).await;
+        match pruned {
+            Ok(Ok(pruned)) => {
+                if !pruned.removed.is_empty() {
+                    tracing::info!(
+                        "removed {} old records of {} bytes",
+                        pruned.removed.len(),
+                        pruned.bytes
+                    );
+                }
+                for (path, error) in pruned.failed {
+                    tracing::warn!(path = %path.display(), "an old record was not removed: {error}");
+                }
+            }
+            Ok(Err(error)) => tracing::warn!("old records were not removed: {error}"),
+            Err(_) => tracing::error!("old records were not removed: a task crashed"),
+        }
+        tokio::time::sleep(limits::PRUNE_PERIOD).await;
     }
 }
 
@@ -102,6 +134,7 @@ impl Running {
             tokio::select! {
                 () = periodic.sessions.end_expired() => {}
                 () = remove_old_uploads(&periodic) => {}
+                () = remove_old_records(&periodic) => {}
                 () = renew_leases(&periodic) => {}
                 () = release_memory(&periodic) => {}
                 () = reloading => {}

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use clap::builder::RangedU64ValueParser;
 
+use wildcity_episode::Keep;
 use wildcity_server::{Limits, SpoolLimits};
 use wildcity_session::RecordLimits;
 
@@ -17,6 +18,10 @@ const MAX_COUNT: u64 = 65_535;
 
 /// Longest time-out that an option accepts: 30 days.
 const MAX_TIMEOUT_S: f64 = 30.0 * 24.0 * 3600.0;
+
+/// Longest time that records can be kept for: 100 years.
+const MAX_DAYS: f64 = 36_525.0;
+const SECONDS_PER_DAY: f64 = 86_400.0;
 
 fn count() -> RangedU64ValueParser<usize> {
     RangedU64ValueParser::new().range(1..=MAX_COUNT)
@@ -113,6 +118,20 @@ pub(super) struct LimitOptions {
     /// Largest total size of the records of one token, in GiB.
     #[arg(long, value_name = "GIB", default_value_t = bytes_as_gib(Limits::default().records.owner_bytes), value_parser = gib)]
     token_records_gib: f64,
+
+    /// Number of records to keep: the newest ones; older ones are removed [default: all]. An episode
+    /// that is driven, or ended within the last minute, keeps its record.
+    #[arg(long, value_name = "N", value_parser = count())]
+    keep_records: Option<usize>,
+
+    /// Days that a record is kept after its last line [default: for ever]
+    #[arg(long, value_name = "DAYS", value_parser = days)]
+    keep_records_days: Option<f64>,
+
+    /// Size of all records to keep, with their MCAP files, in GiB: the oldest ones beyond it are
+    /// removed [default: any size]. Below --records-gib, so that no episode is refused.
+    #[arg(long, value_name = "GIB", value_parser = gib)]
+    keep_records_gib: Option<f64>,
 }
 
 impl LimitOptions {
@@ -145,6 +164,11 @@ impl LimitOptions {
                 bytes: bytes_of_gib(self.records_gib),
                 owner_bytes: bytes_of_gib(self.token_records_gib),
             },
+            keep_records: Keep {
+                records: self.keep_records,
+                age: self.keep_records_days.map(|days| seconds(days * SECONDS_PER_DAY)),
+                bytes: self.keep_records_gib.map(bytes_of_gib),
+            },
         }
     }
 }
@@ -152,6 +176,13 @@ impl LimitOptions {
 /// Converts bytes to GiB.
 pub(super) fn bytes_as_gib(bytes: u64) -> f64 {
     bytes as f64 / f64::from(1 << 30)
+}
+
+fn days(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(days) if days > 0.0 && days <= MAX_DAYS => Ok(days),
+        _ => Err(format!("expected days above 0 and up to {MAX_DAYS}")),
+    }
 }
 
 fn seconds(text: &str) -> Result<f64, String> {

@@ -133,7 +133,7 @@ pub(super) struct Serve {
     #[arg(long, value_name = "FILTER")]
     log: Option<String>,
 
-    /// How to log.
+    /// How to write the log.
     #[arg(long, value_enum, value_name = "FORMAT", default_value_t)]
     log_format: log::LogFormat,
 
