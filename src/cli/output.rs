@@ -14,7 +14,7 @@ pub fn stdout() -> Stdout {
     Stdout(io::stdout().lock())
 }
 
-/// See [`stdout`].
+/// The output of [`stdout`].
 pub struct Stdout(io::StdoutLock<'static>);
 
 impl Write for Stdout {

@@ -102,6 +102,18 @@ def test_speeding_does_not_pay(server: Server) -> None:
     assert total(full, comfort=0.0, speeding=0.0) >= total(STRAIGHT) - 0.5
 
 
+@pytest.mark.parametrize("record", [False, True])
+def test_a_reset_leaves_a_record_only_if_asked_to(tmp_path: Path, record: bool) -> None:
+    import_corridor(tmp_path)
+    with wildcity.serve(tmp_path / "twins", episodes=tmp_path / "episodes") as running:
+        env = DriveEnv(server=running.url, **SMALL, **({"record": True} if record else {}))
+        for _ in range(2):
+            env.reset(seed=1)
+            env.step(STRAIGHT)
+        env.close()
+    assert len(list((tmp_path / "episodes").glob("*.jsonl"))) == (2 if record else 0)
+
+
 def test_a_twin_that_is_not_there_is_named(server: Server) -> None:
     for kind in (DriveEnv, lambda **arguments: DriveVectorEnv(1, **arguments)):
         env = kind(server=server.url, **{**SMALL, "twin": "nope"})

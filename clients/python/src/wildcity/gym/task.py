@@ -105,6 +105,7 @@ class DriveConfig:
     start_m: episodes start at a random distance along the drive between these two; the default ends 20 m before its
         end.
     waypoint_m: distance between two of the 20 points of the route ahead.
+    record: whether the server records the episodes. A training makes a file with each reset.
     reward: a `Reward` with weights of your own, or any function of the states before and after a step.
 
     Raises `ValueError` that names the argument.
@@ -125,6 +126,7 @@ class DriveConfig:
     off_route_m: float = 4.0
     start_m: tuple[float, float] | None = None
     waypoint_m: float = 4.0
+    record: bool = False
     reward: Callable[[DriveState, DriveState], float] = Reward()
     token: str | None = None
     timeout: float = 90.0
@@ -156,6 +158,7 @@ class DriveConfig:
             # Raw, because small images cost more time to decode than to transfer.
             "outputs": Outputs(cameras=self.cameras, encoding="raw", images=images),
             "dt_us": self.dt_us,
+            "record": self.record,
         }
         if self.scenario is not None:
             return {**options, "scenario": self.scenario}
