@@ -119,8 +119,8 @@ pub(super) struct LimitOptions {
     #[arg(long, value_name = "GIB", default_value_t = bytes_as_gib(Limits::default().records.owner_bytes), value_parser = gib)]
     token_records_gib: f64,
 
-    /// Number of records to keep: the newest ones; older ones are removed [default: all]. An episode
-    /// that is driven, or ended within the last minute, keeps its record.
+    /// Number of records to keep: the newest ones; older ones are removed [default: all]. An
+    /// episode that is driven, or ended within the last minute, keeps its record.
     #[arg(long, value_name = "N", value_parser = count())]
     keep_records: Option<usize>,
 

@@ -204,8 +204,8 @@ impl Session {
         session
     }
 
-    /// Number of the twin's latest version, if it is newer than the session's own. It is known about
-    /// a second after it was made.
+    /// Number of the twin's latest version, if it is newer than the session's own. It is known
+    /// about a second after it was made.
     pub fn newer_version(&self) -> Option<u64> {
         let own = &self.resident().version;
         let latest = self.engine.known_latest(&own.manifest.twin);

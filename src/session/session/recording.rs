@@ -23,7 +23,8 @@ use crate::state::{EpisodeState, PinnedVersion, SessionSettings};
 
 impl Session {
     /// Records a frame, unless the session records nothing, and returns the file if it was created
-    /// for it: for a new episode, or for the first frame of one. `next` is the state after the request; `None` if it stays.
+    /// for it: for a new episode, or for the first frame of one. `next` is the state after the
+    /// request; `None` if it stays.
     pub(super) async fn record(
         &self,
         frame: FrameRecord,
