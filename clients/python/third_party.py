@@ -12,21 +12,6 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 LICENCE_FILE = re.compile(r"(?i)(licen[cs]e|copying|copyright|notice|unlicense)")
 
-MIT = """Permission is hereby granted, free of charge, to any person obtaining a copy of this software and associated
-documentation files (the "Software"), to deal in the Software without restriction, including without limitation the
-rights to use, copy, modify, merge, publish, distribute, sublicense, and/or sell copies of the Software, and to permit
-persons to whom the Software is furnished to do so, subject to the following conditions:
-
-The above copyright notice and this permission notice shall be included in all copies or substantial portions of the
-Software.
-
-THE SOFTWARE IS PROVIDED "AS IS", WITHOUT WARRANTY OF ANY KIND, EXPRESS OR IMPLIED, INCLUDING BUT NOT LIMITED TO THE
-WARRANTIES OF MERCHANTABILITY, FITNESS FOR A PARTICULAR PURPOSE AND NONINFRINGEMENT. IN NO EVENT SHALL THE AUTHORS OR
-COPYRIGHT HOLDERS BE LIABLE FOR ANY CLAIM, DAMAGES OR OTHER LIABILITY, WHETHER IN AN ACTION OF CONTRACT, TORT OR
-OTHERWISE, ARISING FROM, OUT OF OR IN CONNECTION WITH THE SOFTWARE OR THE USE OR OTHER DEALINGS IN THE SOFTWARE.
-"""
-"""Of crates that name the licence and have no file of it."""
-
 
 def licences(features: str) -> str:
     """All crates with their licences, and each text once. Raises `ValueError` for a crate without a licence."""
@@ -88,5 +73,8 @@ def files_of(crate: Any) -> list[str]:
     if "Apache-2.0" in expression:
         return [(ROOT / "LICENSE-APACHE").read_text()]
     if "MIT" in expression:
-        return [f"Copyright (c) the authors of {crate['name']}\n\n{MIT}"]
+        # Ours from its second paragraph on: the first is our copyright.
+        ours = (ROOT / "LICENSE-MIT").read_text()
+        terms = ours[ours.index("Permission is hereby granted") :]
+        return [f"Copyright (c) the authors of {crate['name']}\n\n{terms}"]
     raise ValueError(f"the crate {crate['name']} has no file of its licence {expression!r}: add its text here")
