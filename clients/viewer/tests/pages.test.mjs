@@ -41,6 +41,28 @@ test("a damaged address has a message, and ends the page before", async () => {
   await close();
 });
 
+test("the first page shows each twin ahead and from above, and leaves nothing", async () => {
+  const before = (await (await fetch(`${server.url}v1/episodes`)).json()).episodes.length;
+  const { page, complaints, close } = await open(browser, server, "#/");
+  await page.waitForSelector(".pictures canvas:nth-child(2)");
+  const pictures = await page.$$eval(".pictures canvas", (all) => all.map((canvas) => {
+    const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+    return { text: canvas.title, hash: canvas.dataset.hash, colours: new Set(data).size };
+  }));
+  assert.deepEqual(pictures.map(({ text }) => text), ["demo ahead", "demo from above, with its recorded drives"]);
+  assert.notEqual(pictures[0].hash, pictures[1].hash);
+  assert(pictures.every(({ colours }) => colours > 100), JSON.stringify(pictures));
+  await until(async () => (await sessions()).length === 0);
+  const { episodes } = await (await fetch(`${server.url}v1/episodes`)).json();
+  assert.equal(episodes.length, before);
+  // The list is made again after 3 s, with the same pictures.
+  const first = await page.$(".pictures canvas");
+  await page.waitForTimeout(3500);
+  assert(await first.evaluate((canvas) => canvas.isConnected));
+  assert.deepEqual(complaints, []);
+  await close();
+});
+
 test("damaged settings do not stop the drive", async () => {
   const { page, complaints, close } = await open(browser, server);
   await page.evaluate(() => localStorage.setItem("wildcity-settings", '{"width": 4'));

@@ -82,7 +82,7 @@ impl Machine {
     ) -> SimServer {
         let (stop, stopping) = watch::channel(false);
         let state = Arc::new(ServerState {
-            metrics: Metrics::new(self.engine.clone()),
+            metrics: Metrics::new(self.engine.clone(), Vec::new()),
             engine: self.engine.clone(),
             sessions: SessionRegistry::new(limits.sessions, limits.resume_grace),
             websocket_permits: Arc::new(Semaphore::new(limits.connections)),
