@@ -1,5 +1,7 @@
 // Addresses, settings, new twins and reports.
 import assert from "node:assert/strict";
+import { mkdir, writeFile } from "node:fs/promises";
+import { join } from "node:path";
 import { after, before, test } from "node:test";
 import { home, launch, open, scene, serve, steps } from "./wildcity.mjs";
 
@@ -87,6 +89,26 @@ test("damaged settings do not stop the drive", async () => {
     assert.ok(isFree, `${modifier} and left is taken`);
   }
   assert.equal(await at(), "1");
+  await close();
+});
+
+test("a scenario is chosen from those of the server", async () => {
+  const scenario = {
+    format: "wildcity.scenario/1", name: "brief", twin: { name: "demo" },
+    ego: { start: { trajectory: "log", station_m: 20 }, dynamics: { model: "dynamic", speed: 3 } }, end: { time_s: 60 },
+  };
+  await mkdir(join(place.folder, "scenarios"), { recursive: true });
+  await writeFile(join(place.folder, "scenarios", "brief.json"), JSON.stringify(scenario));
+  const { page, complaints, close } = await open(browser, server, "#/drive/demo");
+  await steps(page, 1);
+  await page.click("text=Settings");
+  await page.getByLabel("scenario").selectOption("brief");
+  await steps(page, 2);
+  const session = await page.getAttribute(".view", "data-session");
+  await page.click("#home");
+  await page.waitForSelector(`text=${session}-1`);
+  await page.waitForSelector("text=brief");
+  assert.deepEqual(complaints, []);
   await close();
 });
 

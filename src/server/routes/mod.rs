@@ -9,6 +9,7 @@ mod metrics;
 mod openapi;
 mod pushes;
 mod refusal;
+mod scenarios;
 mod sessions;
 mod table;
 mod tickets;
