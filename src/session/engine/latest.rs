@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use parking_lot::Mutex;
 
@@ -21,9 +21,9 @@ struct Look {
 }
 
 impl LatestVersions {
-    /// The number that the last look found, and whether the caller has to look again: one caller at
-    /// a time has to.
-    fn ask(&self, twin: &str, now: Instant) -> (Option<u64>, bool) {
+    /// The number that the last look found, and whether the caller has to look again, after `age`:
+    /// one caller at a time has to.
+    fn ask(&self, twin: &str, now: Instant, age: Duration) -> (Option<u64>, bool) {
         let mut looks = self.0.lock();
         let look = looks.entry(twin.to_owned());
         let mut is_old = false;
@@ -31,7 +31,7 @@ impl LatestVersions {
             is_old = true;
             Look { begun: now, is_over: false, number: None }
         });
-        if look.is_over && now.saturating_duration_since(look.begun) >= limits::LATEST_AGE {
+        if look.is_over && now.saturating_duration_since(look.begun) >= age {
             is_old = true;
             look.begun = now;
             look.is_over = false;
@@ -55,7 +55,9 @@ impl Engine {
         if let Some(pinned) = self.pinned_latest(twin) {
             return Some(pinned);
         }
-        let (number, is_old) = self.latest.ask(twin, Instant::now());
+        let is_remote = self.cache.catalog().traffic().is_some();
+        let age = if is_remote { limits::REMOTE_LATEST_AGE } else { limits::LATEST_AGE };
+        let (number, is_old) = self.latest.ask(twin, Instant::now(), age);
         if is_old {
             let engine = self.clone();
             let twin = twin.to_owned();
@@ -75,17 +77,18 @@ mod tests {
     #[test]
     fn one_caller_looks_at_a_time_and_not_too_often() {
         let latest = LatestVersions::default();
+        let ask = |twin: &str, now: Instant| latest.ask(twin, now, limits::LATEST_AGE);
         let begin = Instant::now();
         let old = begin + limits::LATEST_AGE;
-        assert_eq!(latest.ask("a", begin), (None, true));
+        assert_eq!(ask("a", begin), (None, true));
         // The look is still under way.
-        assert_eq!(latest.ask("a", old), (None, false));
+        assert_eq!(ask("a", old), (None, false));
         latest.found("a", Some(3));
-        assert_eq!(latest.ask("a", begin), (Some(3), false));
-        assert_eq!(latest.ask("a", old), (Some(3), true));
+        assert_eq!(ask("a", begin), (Some(3), false));
+        assert_eq!(ask("a", old), (Some(3), true));
         // A store that cannot be read changes nothing.
         latest.found("a", None);
-        assert_eq!(latest.ask("a", old), (Some(3), false));
-        assert_eq!(latest.ask("b", old), (None, true));
+        assert_eq!(ask("a", old), (Some(3), false));
+        assert_eq!(ask("b", old), (None, true));
     }
 }

@@ -205,7 +205,7 @@ impl Session {
     }
 
     /// Number of the twin's latest version, if it is newer than the session's own. It is known
-    /// about a second after it was made.
+    /// about a second after it was made, in an object store ten seconds.
     pub fn newer_version(&self) -> Option<u64> {
         let own = &self.resident().version;
         let latest = self.engine.known_latest(&own.manifest.twin);

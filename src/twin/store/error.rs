@@ -155,9 +155,9 @@ pub enum StoreError {
         /// The value of the twin.
         needed: String,
     },
-    /// Others made the twin that a commit would make.
+    /// The twin that a commit would make exists, perhaps since others made it meanwhile.
     #[error(
-        "twin {name:?} was made by others meanwhile: make the change from its version {latest}"
+        "twin {name:?} exists already: give another name, or make the change from its version {latest}"
     )]
     TwinExists { name: String, latest: u64 },
     /// Other commits changed the same cells or settings since the base of a change.
