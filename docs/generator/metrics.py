@@ -20,7 +20,9 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 HEAD = "<!-- Written by docs/generate.py from a running server. -->\n\n# Metrics\n\n"
-HEAD += "`GET /metrics` has these as OpenMetrics text. Names of counters get the suffix `_total`. "
+HEAD += (
+    "`GET /metrics` has these as OpenMetrics text. Names of counters get the suffix `_total`, of information `_info`. "
+)
 HEAD += "The metrics `wildcity_store_` exist with twins in an object store.\n\n"
 LIMIT_S = 60.0
 EMPTY = b"""<?xml version="1.0" encoding="UTF-8"?>
@@ -109,6 +111,7 @@ def read(text: str, found: dict[str, tuple[str, str]], labels: dict[str, str]) -
     helps = dict(re.findall(r"^# HELP (\S+) (.*)$", text, re.MULTILINE))
     for name, kind in re.findall(r"^# TYPE (\S+) (\S+)$", text, re.MULTILINE):
         found.setdefault(name, (kind, helps[name]))
-        label = re.search(rf'^{name}_total{{(\w+)="', text, re.MULTILINE)
-        if label:
-            labels[name] = f"`{label[1]}`"
+        label = re.search(rf"^{name}(?:_total|_info)?{{([^}}]*)}}", text, re.MULTILINE)
+        of = re.findall(r'(\w+)="', label[1]) if label else []
+        if of and of != ["le"]:
+            labels[name] = ", ".join(f"`{one}`" for one in of)

@@ -53,6 +53,10 @@ pub struct ObservationMetadata {
     pub version: u64,
     /// BLAKE3 of the version's manifest, in hex.
     pub version_hash: String,
+    /// The twin's latest version, if it is newer than `version`: `switch_version` shows it. It is
+    /// known about a second after it was made.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub newer_version: Option<u64>,
     /// BLAKE3 of the render profile's JSON, in hex.
     pub profile_hash: String,
     /// Name of the backend.

@@ -12,6 +12,7 @@ use serde_json::{Value, json};
 
 use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::geometry::Pose;
+use wildcity_scene::geometry::camera::Shutter;
 use wildcity_scene::rig::RigCamera;
 use wildcity_scene::route::{Route, RouteError};
 use wildcity_scene::{ActorBox, ActorClass, Manifest};
@@ -27,6 +28,15 @@ const SEQUENCE: &str = "drive";
 
 /// Time between two poses, in microseconds.
 const PERIOD_US: i64 = 100_000;
+
+/// The pose at which the first frame of each camera ends, where AlpaSim's runtime begins. The step
+/// before it and the exposure, with the shutter of the runtime's own configuration, must not begin
+/// before the first pose: a period for the step, and one for the longest shutter.
+const FIRST_FRAME: usize = 2;
+const _: () = assert!(Shutter::MAX_US <= PERIOD_US);
+
+/// Fewest poses of a scene: those up to the end of the runtime's first step.
+const LEAST_POSES: usize = FIRST_FRAME + 2;
 
 /// Width of a lane, in metres.
 const LANE_M: f64 = 3.5;
@@ -54,9 +64,12 @@ pub enum ExportError {
     /// A recorded actor is damaged.
     #[error(transparent)]
     Tracks(#[from] FileError),
-    /// The scene would have fewer than two poses.
-    #[error("{scene} is shorter than {PERIOD_US} us: choose an earlier start")]
-    Short { scene: String },
+    /// The drive ends before the first step of the runtime.
+    #[error(
+        "{scene} has {poses} poses, one each {PERIOD_US} us, and AlpaSim needs {LEAST_POSES}: choose an earlier \
+         start, or longer scenes"
+    )]
+    Short { scene: String, poses: usize },
     /// More recorded actors are present at the same time than an image may show.
     #[error(
         "{scene} has {count} recorded actors at {since_us} us; an image shows at most {most}: leave some out of the \
@@ -111,8 +124,8 @@ pub fn files(
         poses.push((time_us - start_us, local));
         time_us += PERIOD_US;
     }
-    if poses.len() < 2 {
-        return Err(ExportError::Short { scene: id.to_string() });
+    if poses.len() < LEAST_POSES {
+        return Err(ExportError::Short { scene: id.to_string(), poses: poses.len() });
     }
     let times_us: Vec<i64> = poses.iter().map(|(since_us, _)| *since_us).collect();
     let sections = tracks.map_or(&[][..], |file| &file.tracks);
@@ -131,6 +144,27 @@ pub fn files(
         ("sequence_tracks.json", pretty(&sequence_tracks(&tracks))),
         ("map.xodr", road(&poses)),
     ])
+}
+
+/// The configuration of AlpaSim's wizard for the scenes of a folder, which is absolute, with the
+/// server at `address`: a file of its group `deploy`.
+///
+/// The server is an external renderer and physics, so that the wizard starts neither. The rig of
+/// AlpaSim's own hoods is unset, because the overlays are those of the twin.
+pub fn deploy(scenes: &str, address: &str) -> String {
+    let addresses = json!([address]);
+    // Not as JSON: the wizard computes its value.
+    let filesystem = "defines: {filesystem: \"${repo-relative:'data'}\"}";
+    let wizard = json!({
+        "run_sim_services": ["driver", "trafficsim", "controller", "runtime"],
+        "external_services": { "renderer": addresses, "physics": addresses },
+        "debug_flags": { "use_localhost": true },
+    });
+    let scenes = json!({ "scene_ids": null, "local_usdz_dir": scenes });
+    let runtime = json!({ "simulation_config": { "ego_mask_rig_config_id": null } });
+    format!(
+        "# @package _global_\n{filesystem}\nwizard: {wizard}\nscenes: {scenes}\nruntime: {runtime}\n"
+    )
 }
 
 /// JSON, which is YAML as well.
@@ -158,6 +192,12 @@ fn metadata(id: &SceneId, hash: &str, cameras: &[RigCamera], poses: &[(i64, Pose
     })
 }
 
+/// How long an exposure lasts, in microseconds. The runtime requires an end after the start, even
+/// for global shutters.
+fn open_us(camera: &RigCamera) -> i64 {
+    camera.shutter.map_or(1, |shutter| shutter.duration_us)
+}
+
 fn rig_trajectories(cameras: &[RigCamera], poses: &[(i64, Pose)]) -> Value {
     // All poses are in the local frame already.
     let identity = rows(&Pose::IDENTITY);
@@ -175,9 +215,8 @@ fn rig_trajectories(cameras: &[RigCamera], poses: &[(i64, Pose)]) -> Value {
     let frames: serde_json::Map<_, _> = cameras
         .iter()
         .map(|camera| {
-            // The runtime requires an end after the start, even for global shutters.
-            let open_us = camera.shutter.map_or(1, |shutter| shutter.duration_us);
-            let ranges: Vec<[i64; 2]> = times.iter().map(|&end| [end - open_us, end]).collect();
+            let ends = times.iter().skip(FIRST_FRAME);
+            let ranges: Vec<[i64; 2]> = ends.map(|&end| [end - open_us(camera), end]).collect();
             (unique_id(camera), json!(ranges))
         })
         .collect();

@@ -165,7 +165,7 @@ impl HardwareOptions {
         let limits = self.memory_limits();
         let Selection { backend, reason } =
             automatic::select(self.threads, self.simd.into(), limits)?;
-        writeln!(io::stderr(), "backend {reason}")?;
+        say(&format!("backend {reason}"))?;
         Ok(backend)
     }
 
@@ -177,7 +177,7 @@ impl HardwareOptions {
             "--gpu-memory-gib: {}",
             built_without("gpu")
         );
-        writeln!(io::stderr(), "backend cpu: {}", built_without("gpu"))?;
+        say(&format!("backend cpu: {}", built_without("gpu")))?;
         Ok(Box::new(self.cpu()?))
     }
 
@@ -253,6 +253,15 @@ impl RendererOptions {
             ),
         }
     }
+}
+
+/// Tells the choice of the backend: in the log of a program that has one, else on standard error.
+fn say(text: &str) -> io::Result<()> {
+    if tracing::dispatcher::has_been_set() {
+        tracing::info!("{text}");
+        return Ok(());
+    }
+    writeln!(io::stderr(), "{text}")
 }
 
 fn threads(text: &str) -> Result<usize, String> {

@@ -1,6 +1,6 @@
 //! `wildcity bisect`.
 
-use std::io::{self, Write};
+use std::io::Write;
 
 use wildcity_render::compare::psnr::MIN_PSNR_DB;
 use wildcity_render::hybrid::bisect;
@@ -9,6 +9,7 @@ use wildcity_render::{Backend, Frame};
 use super::backend_options::HardwareOptions;
 use super::progress;
 use super::scene_source::SceneSource;
+use crate::cli::output;
 
 /// Find the stage of the gpu backend that is wrong, if one is.
 ///
@@ -40,7 +41,7 @@ impl Bisect {
         let gpu = self.hardware.gpu()?;
         let bar = progress::count("rendering");
         bar.set_length(ready.shots.len() as u64);
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         writeln!(out, "device       {}", gpu.detail())?;
         writeln!(out, "cpu through      none  project     sort      bin")?;
         let mut wrong = None;

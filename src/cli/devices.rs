@@ -1,9 +1,10 @@
 //! `wildcity devices`.
 
-use std::io::{self, Write};
+use std::io::Write;
 
 use serde_json::json;
 
+use crate::cli::output;
 use wildcity_render::gpu::{DeviceInfo, devices};
 
 /// List the devices that the gpu backend can use, the fastest kind first.
@@ -27,7 +28,7 @@ Examples:
 impl Devices {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let devices = devices();
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         if self.json {
             let devices: Vec<_> = devices.iter().map(device_json).collect();
             writeln!(out, "{}", json!(devices))?;

@@ -1,7 +1,7 @@
 //! `wildcity doctor`.
 
 use std::fs;
-use std::io::{self, Write};
+use std::io::Write;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::thread::available_parallelism;
@@ -17,6 +17,7 @@ use wildcity_twin::store::StoreError;
 use super::directories::{Episodes, Twins, Uploads};
 use super::exit::{self, Exit};
 use super::serve::Serve;
+use crate::cli::output;
 
 /// Check that this machine can run the server: devices, memory, open files, disks, twins, clock.
 ///
@@ -99,16 +100,20 @@ impl Doctor {
         };
         let mut findings = vec![devices_found(), processors(), memory(), open_files(), clock()];
         match &serve {
-            Some(serve) => findings.extend(serve.checks().into_iter().map(|(about, found)| {
-                let level = if found.is_ok() { Level::Good } else { Level::Bad };
-                Finding::new(level, about, found.unwrap_or_else(|wrong| wrong))
-            })),
+            Some(serve) => {
+                findings.extend(serve.checks().into_iter().map(|(about, found)| {
+                    let level = if found.is_ok() { Level::Good } else { Level::Bad };
+                    Finding::new(level, about, found.unwrap_or_else(|wrong| wrong))
+                }));
+                findings.extend(serve.tokens_file().and_then(readable_by_others));
+            }
             None => findings.push(port()),
         }
         let directories = [("episodes", episodes.dir()?), ("uploads", uploads.dir()?)];
+        findings.extend(in_use(&directories[1].1));
         findings.extend(directories.map(|(about, dir)| disk(about, &dir)));
         findings.extend(twins_found(twins));
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         if self.json {
             let of = |Finding { level, about, text }: &Finding| json!({ "level": level.name(), "about": about, "text": text });
             writeln!(out, "{}", json!(findings.iter().map(of).collect::<Vec<_>>()))?;
@@ -251,6 +256,39 @@ fn port() -> Finding {
             Finding::new(Level::Note, "port", text)
         }
     }
+}
+
+/// A note if other users can read the tokens of a file.
+#[cfg(unix)]
+fn readable_by_others(path: &Path) -> Option<Finding> {
+    use std::os::unix::fs::MetadataExt as _;
+    // A file that is not there is a finding of its own.
+    let mode = fs::metadata(path).ok()?.mode();
+    let is_open = mode & 0o077 != 0;
+    let path = path.display();
+    let text = format!(
+        "{path} has mode {:o}: other users can read or change it; chmod 600 {path}",
+        mode & 0o777
+    );
+    is_open.then(|| Finding::new(Level::Note, "tokens", text))
+}
+
+#[cfg(not(unix))]
+fn readable_by_others(_: &Path) -> Option<Finding> {
+    None
+}
+
+/// A note if a server uses the directory of uploads now: it holds a lock there. Its other folders
+/// are most likely those of the same options.
+fn in_use(uploads: &Path) -> Option<Finding> {
+    let lock = fs::File::open(uploads.join("lock")).ok()?;
+    let is_free = lock.try_lock().is_ok();
+    let text = format!(
+        "a server uses {} now: a second one with the same options takes no uploads; give it another --uploads and \
+         --episodes",
+        uploads.display()
+    );
+    (!is_free).then(|| Finding::new(Level::Note, "uploads", text))
 }
 
 /// Whether a directory can be written, and its free space.

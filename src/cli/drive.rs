@@ -1,6 +1,6 @@
 //! `wildcity drive`.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::time::Duration;
 
 use serde_json::json;
@@ -14,6 +14,7 @@ use wildcity_client::DynamicsModel;
 use wildcity_client::protocol::message::{Open, RigChoice, ScenarioChoice};
 
 use super::exit::Exit;
+use crate::cli::output;
 
 /// Exit code if the driver did not answer in time: the status of `timeout`.
 const TIMEOUT_EXIT_CODE: u8 = 124;
@@ -78,11 +79,11 @@ pub(super) struct Drive {
     #[arg(long, value_name = "WxH", requires = "cameras", value_parser = size)]
     size: Option<[u32; 2]>,
 
-    /// How the ego moves
-    #[arg(long, value_name = "MODEL", default_value = "dynamic", value_parser = model)]
-    dynamics: DynamicsModel,
+    /// How the ego moves [default: as the scenario says; without one, dynamic]
+    #[arg(long, value_name = "MODEL", value_parser = model)]
+    dynamics: Option<DynamicsModel>,
 
-    /// Speed at the start, in m/s [default: the recorded one]
+    /// Speed at the start, in m/s [default: that of the scenario; without one, the recorded one]
     #[arg(long, value_name = "M_S")]
     speed: Option<f64>,
 
@@ -158,7 +159,7 @@ impl Drive {
                 if !is_good {
                     failed.push(report.outcome);
                 }
-                writeln!(io::stdout(), "{}", line(&report))?;
+                writeln!(output::stdout(), "{}", line(&report))?;
                 if let (Some(reason), None) = (&report.reason, &self.twin) {
                     // `episode run` shows no output of agents.
                     eprintln!("{reason}");

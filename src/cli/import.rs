@@ -273,7 +273,7 @@ impl Import {
         let manifest = &version.manifest;
         let stored_bytes = manifest.stored_bytes();
         writeln!(
-            std::io::stdout().lock(),
+            output::stdout(),
             "twin {} version {}: {} Gaussians of SH degree {} in {}, {:.1} MB\n\
              {}\nblake3 {}",
             self.twin,

@@ -8,7 +8,7 @@ use wildcity_scene::geometry::Bounds;
 use wildcity_twin::store::Version;
 
 use super::directories::{TwinVersion, Twins};
-use super::output::counted;
+use super::output::{self, counted};
 use super::time::utc;
 
 /// Show the contents of a twin: counts, bounds in metres, hashes, and its chunks.
@@ -36,7 +36,7 @@ impl Inspect {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let catalog = self.twins.catalog()?;
         let version = catalog.version(&self.twin.name, self.twin.number)?;
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         if self.json {
             let Version { number, hash, created_us, manifest } = &version;
             let json = serde_json::json!({

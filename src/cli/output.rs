@@ -1,11 +1,37 @@
-//! Files that a command writes: afterwards each is complete, or as it was before.
+//! Standard output, and files that a command writes: afterwards each file is complete, or as it was
+//! before.
 
 use std::fs;
-use std::io::{BufWriter, Write};
+use std::io::{self, BufWriter, ErrorKind, Write};
 use std::path::Path;
 use std::process;
 
 use anyhow::Context;
+
+/// Standard output. What is written after its reader has gone, as with `| head`, is dropped: the
+/// command ends as it would otherwise, with the exit code of what it found.
+pub fn stdout() -> Stdout {
+    Stdout(io::stdout().lock())
+}
+
+/// The output of [`stdout`].
+pub struct Stdout(io::StdoutLock<'static>);
+
+impl Write for Stdout {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        match self.0.write(bytes) {
+            Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(bytes.len()),
+            written => written,
+        }
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        match self.0.flush() {
+            Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(()),
+            flushed => flushed,
+        }
+    }
+}
 
 /// Writes a file under a temporary name in the same directory, and then renames it. A reader finds
 /// the old file or the new one, even after a full disk.

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 
 use crate::cli::limits;
+use crate::cli::output;
 use wildcity_client::{
     AllCells, CellSelection, ConnectOptions, HttpClient, NewPush, PreviewRequest, Push as Pushed,
     PushFile, PushFrame, PushReport, PushState,
@@ -127,7 +128,7 @@ impl Push {
         let client = self.server.client()?;
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
         let pushed = runtime.block_on(self.push(&client, cells))?;
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         if let Some(report) = &pushed.report {
             print_report(&mut out, report)?;
         }

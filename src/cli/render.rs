@@ -1,6 +1,6 @@
 //! `wildcity render`.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::PathBuf;
 
 use anyhow::Context;
@@ -56,7 +56,7 @@ impl Render {
         output::create_dir(&self.out)?;
         let bar = progress::count("rendering");
         bar.set_length(ready.shots.len() as u64);
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         for shot in &ready.shots {
             let pixels = shot.view.camera.pixels();
             let scene = ready.shot_scene(shot)?;

@@ -62,7 +62,7 @@ Examples:
 impl Replay {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let recording = RecordedEpisode::read(&self.episode)?;
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         summary(&mut out, &recording)?;
         if !self.verify && self.out.is_none() {
             return Ok(());

@@ -205,7 +205,7 @@ impl Command {
             let changes = serde_json::to_value(recommendation.changes()?)?;
             files.push(("profile.json", format!("{changes:#}\n")));
         }
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         for (name, text) in files {
             let path = self.out.join(name);
             output::write(&path, text.as_bytes())?;

@@ -5,7 +5,7 @@
 //! finite, and have the values that a case states. For each check, `tests/stress/mutations.rs`
 //! applies a mutation to the cpu backend and to the reference that the check must detect.
 
-use std::io::{self, Write};
+use std::io::Write;
 
 use anyhow::ensure;
 
@@ -15,6 +15,7 @@ use wildcity_stress::{CASES, Case, Verdict};
 
 use super::backend_options::HardwareOptions;
 use super::progress;
+use crate::cli::output;
 
 /// Render extreme scenes on every backend, and compare each with its bound.
 ///
@@ -83,7 +84,7 @@ impl Stress {
             bar.set_message(case.to_owned());
         });
         bar.finish_and_clear();
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         if self.json {
             writeln!(out, "{}", serde_json::to_string(&table)?)?
         } else {

@@ -1,5 +1,7 @@
 //! Times as text.
 
+use std::time::Duration;
+
 /// A time such as `2026-11-21T08:52:20Z`, from microseconds since 1970.
 ///
 /// The algorithm is Hinnant's ("chrono-Compatible Low-Level Date Algorithms"). Years begin in
@@ -28,9 +30,24 @@ pub(super) fn utc(time_us: i64) -> String {
     format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}Z")
 }
 
+/// A time such as 24h.
+pub(super) fn duration(text: &str) -> Result<Duration, String> {
+    let wrong = || "expected a whole number and s, m, h or d, for example 24h".to_owned();
+    let unit = text.chars().last().ok_or_else(wrong)?;
+    let seconds = match unit {
+        's' => 1,
+        'm' => 60,
+        'h' => 3_600,
+        'd' => 86_400,
+        _ => return Err(wrong()),
+    };
+    let number: u64 = text[..text.len() - 1].parse().map_err(|_| wrong())?;
+    number.checked_mul(seconds).map(Duration::from_secs).ok_or_else(wrong)
+}
+
 #[cfg(test)]
 mod tests {
-    use super::utc;
+    use super::{duration, utc};
 
     #[test]
     fn times_are_of_the_calendar() {
@@ -46,6 +63,17 @@ mod tests {
             (-1, "1969-12-31T23:59:59Z"),
         ] {
             assert_eq!(utc(seconds * 1_000_000), text);
+        }
+    }
+
+    #[test]
+    fn times_have_a_unit() {
+        for (text, seconds) in [("0s", 0), ("90s", 90), ("30m", 1_800), ("24h", 86_400)] {
+            assert_eq!(duration(text).unwrap().as_secs(), seconds);
+        }
+        assert_eq!(duration("7d").unwrap().as_secs(), 7 * 86_400);
+        for text in ["", "24", "h", "-1h", "1.5h", "99999999999999999999d", "1 h", "1µ"] {
+            assert!(duration(text).unwrap_err().contains("for example 24h"), "{text}");
         }
     }
 }

@@ -1,7 +1,7 @@
 //! `wildcity view`.
 
 use std::env;
-use std::io::{self, Write};
+use std::io::Write;
 use std::process::{Command, Stdio};
 use std::sync::Arc;
 
@@ -9,6 +9,7 @@ use wildcity_server::Config;
 
 use super::backend_options::BackendOptions;
 use super::directories::ServerDirectories;
+use crate::cli::output;
 
 /// Look at a twin in the browser, and drive through it by hand.
 ///
@@ -60,7 +61,7 @@ pub(super) fn serve(config: Config, twin: Option<&str>, open: bool) -> anyhow::R
         let running = wildcity_server::start(config).await?;
         let place = twin.map_or(String::new(), |twin| format!("#/drive/{twin}"));
         let url = format!("{}{place}", running.page());
-        writeln!(io::stdout(), "viewer at {url}")?;
+        writeln!(output::stdout(), "viewer at {url}")?;
         if open {
             open_browser(&url);
         }

@@ -14,6 +14,7 @@
 //! | `diff` | the first difference of two episodes |
 //! | `export` | an episode as MCAP, or as tables of nuScenes |
 //! | `listing`, `overview` | the episodes of a directory, and what a list shows of each |
+//! | `prune` | removing old records |
 //! | [`limits`] | limits |
 
 mod diff;
@@ -25,6 +26,7 @@ mod lines;
 mod listing;
 mod outcome;
 mod overview;
+mod prune;
 mod scenario;
 
 pub use diff::{Difference, What, diff};
@@ -48,4 +50,5 @@ pub use lines::{
 pub use listing::{Listed, list, read_mcap, read_text, record_bytes};
 pub use outcome::result;
 pub use overview::{Overview, RecordHead};
+pub use prune::{Keep, Pruned, prune};
 pub use scenario::{DriveStart, ground_surface, pose_at, scenario_line};

@@ -34,3 +34,12 @@ pub const HEAD_FIELDS_BYTES: u64 = 1 << 16;
 /// How much of the end of a record is read for its last frame, in bytes; more if the first part has
 /// none. A line has at most [`LINE_BYTES`], and those of one step have less than two.
 pub const TAIL_BYTES: [u64; 2] = [1 << 16, 3 << 20];
+
+/// How long a record without an end is kept after it was last written to, whatever limit it is
+/// beyond. A session may be silent for its time-out, and then wait to be resumed: minutes, unless
+/// an operator says otherwise.
+pub const UNFINISHED_AGE: Duration = Duration::from_secs(24 * 3600);
+
+/// How long every record is kept after it was last written to: its export begins at once, and takes
+/// seconds.
+pub const FRESH_AGE: Duration = Duration::from_secs(60);

@@ -29,6 +29,14 @@ pub struct Listed {
 /// # Errors
 /// The directory cannot be read.
 pub fn list(dir: &Path) -> io::Result<Vec<Listed>> {
+    let mut listed = list_all(dir)?;
+    // Cut after sorting: which episodes are the newest is not known before.
+    listed.truncate(limits::LISTED);
+    Ok(listed)
+}
+
+/// The same without a limit.
+pub(crate) fn list_all(dir: &Path) -> io::Result<Vec<Listed>> {
     let entries = match fs::read_dir(dir) {
         Ok(entries) => entries,
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
@@ -57,8 +65,6 @@ pub fn list(dir: &Path) -> io::Result<Vec<Listed>> {
     // Names break ties, so that the list does not depend on the order in the directory. An episode
     // without a time counts as the oldest.
     listed.sort_by(|a, b| b.modified.cmp(&a.modified).then_with(|| a.name.cmp(&b.name)));
-    // Cut after sorting: which episodes are the newest is not known before.
-    listed.truncate(limits::LISTED);
     Ok(listed)
 }
 

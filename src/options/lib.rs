@@ -22,8 +22,8 @@ pub mod strict;
 pub use drive::DriveSection;
 pub use lidar::{LidarBeams, LidarColumns, RigLidar};
 pub use open::{
-    ContactMode, Dynamics, DynamicsChoice, DynamicsModel, Encoding, ImagePart, OnFailure, Open,
-    Outputs, RandomStart, Repair, Rig, RigCamera, RigChoice, ScenarioChoice, Start,
+    ContactMode, Dynamics, DynamicsChoice, DynamicsModel, Encoding, Follow, ImagePart, OnFailure,
+    Open, Outputs, RandomStart, Repair, Rig, RigCamera, RigChoice, ScenarioChoice, Start,
 };
 pub use pose::Pose;
 pub use sensors::{

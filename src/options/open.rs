@@ -129,6 +129,23 @@ pub struct Open {
     /// A part of a recorded drive that the answer is to have.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub trajectory: Option<DriveSection>,
+    /// Whether episodes are recorded. If absent, true. An episode without a record cannot be
+    /// replayed, scored, exported or continued.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub record: Option<bool>,
+    /// Which versions of the twin the session shows from its second observation on. If absent, its
+    /// own until `switch_version`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub follow: Option<Follow>,
+}
+
+/// Which versions of its twin a session shows by itself.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(rename_all = "snake_case")]
+pub enum Follow {
+    /// The latest, from the next `step` or `reset` after it became known. Only without `version`.
+    Latest,
 }
 
 impl Open {
@@ -165,6 +182,8 @@ impl Open {
             scenario: None,
             warm_up_us: None,
             trajectory: None,
+            record: None,
+            follow: None,
         }
     }
 }

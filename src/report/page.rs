@@ -17,7 +17,7 @@ use wildcity_stress::Verdict;
 const STYLE: &str = "\
 body{font:15px/1.45 system-ui,sans-serif;max-width:1160px;margin:2em auto;padding:0 1em;color:#111}
 h1{font-size:1.6em}h2{margin-top:2em;font-size:1.2em}
-table{border-collapse:collapse;font-size:13px}td,th{padding:2px 8px;border-bottom:1px solid #ddd;text-align:right}
+table{border-collapse:collapse;font-size:13px;display:block;overflow-x:auto}td,th{padding:2px 8px;border-bottom:1px solid #ddd;text-align:right}
 td:first-child,th:first-child,td.text{text-align:left;vertical-align:top}.cases th{text-align:left}tr.dominated td{color:#999}
 tr.front td:first-child{font-weight:600}.miss{color:#b00020;font-weight:600}.off{color:#999}
 figure{display:inline-block;margin:0 12px 14px 0}figcaption{font-size:12px}
@@ -39,13 +39,14 @@ pub fn render(report: &Report) -> Result<String, ReportError> {
         html lang="en" {
             head {
                 meta charset="utf-8";
+                meta name="viewport" content="width=device-width, initial-scale=1";
                 title { (title) }
                 style { (PreEscaped(STYLE)) }
             }
             body {
                 h1 { (title) }
-                (introduction(report))
                 (recommendation(report))
+                (introduction(report))
                 h2 { "Error against time" }
                 (error_against_time_caption())
                 (PreEscaped(plot))

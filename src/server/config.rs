@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use wildcity_episode::Keep;
 use wildcity_push::QueueLimits;
 use wildcity_render::Backend;
 use wildcity_repair::Models;
@@ -41,6 +42,9 @@ pub struct Config {
     pub directories: Directories,
     /// Where parts of twins at a URL are kept on disk.
     pub cache: Option<DiskCacheSettings>,
+    /// Address of a second listener, which answers `/metrics`, `/healthz` and `/readyz` without
+    /// TLS and without tokens.
+    pub metrics_listen: Option<SocketAddr>,
     /// The tokens of clients; without tokens every client may do everything.
     pub tokens: Option<Tokens>,
     /// Web pages of other sites that may send requests.
@@ -71,6 +75,7 @@ impl Config {
             listen: SocketAddr::from(([127, 0, 0, 1], 0)),
             directories,
             cache: None,
+            metrics_listen: None,
             tokens: None,
             origins: Origins::default(),
             tls: None,
@@ -99,6 +104,8 @@ pub struct Limits {
     pub step: Duration,
     /// How long a session without a connection waits to be resumed.
     pub resume_grace: Duration,
+    /// How long sessions may go on after the server was asked to stop; none is opened then.
+    pub sessions_end: Duration,
     /// Time-out for running steps when the server stops.
     pub drain: Duration,
     /// WebSocket connections at once.
@@ -120,6 +127,8 @@ pub struct Limits {
     pub spool: SpoolLimits,
     /// Bytes of the records of episodes.
     pub records: RecordLimits,
+    /// Which records stay; the others are removed. By default all.
+    pub keep_records: Keep,
 }
 
 /// Limits of uploads. The constants in [`crate::limits`] are the defaults.
@@ -161,6 +170,7 @@ impl Default for Limits {
             send: wildcity_protocol::limits::SEND_TIMEOUT,
             step: wildcity_protocol::limits::STEP_TIMEOUT,
             resume_grace: limits::RESUME_GRACE,
+            sessions_end: Duration::ZERO,
             drain: limits::DRAIN_TIMEOUT,
             connections: limits::CONNECTIONS,
             sessions: wildcity_session::limits::SESSIONS,
@@ -174,6 +184,7 @@ impl Default for Limits {
                 bytes: limits::RECORDS_BYTES,
                 owner_bytes: limits::TOKEN_RECORDS_BYTES,
             },
+            keep_records: Keep::default(),
         }
     }
 }
@@ -198,6 +209,7 @@ impl std::fmt::Debug for Config {
             listen,
             directories,
             cache,
+            metrics_listen,
             tokens,
             origins,
             tls,
@@ -213,6 +225,7 @@ impl std::fmt::Debug for Config {
             .field("listen", listen)
             .field("directories", directories)
             .field("cache", cache)
+            .field("metrics_listen", metrics_listen)
             .field("tokens", &tokens.is_some())
             .field("origins", origins)
             .field("tls", tls)

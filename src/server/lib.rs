@@ -48,6 +48,7 @@ mod listen;
 mod memory;
 mod metrics;
 mod origins;
+mod process;
 mod readiness;
 mod reload;
 mod routes;

@@ -151,6 +151,9 @@ pub const RECORDS_BYTES: u64 = 64 << 30;
 /// Bytes of the records of one token.
 pub const TOKEN_RECORDS_BYTES: u64 = 32 << 30;
 
+/// Time between two looks for records that are beyond a limit: each lists the directory.
+pub const PRUNE_PERIOD: Duration = Duration::from_secs(60);
+
 /// Share of all sessions that a token without a limit of its own leaves to others: one in four.
 pub const SESSIONS_FOR_OTHERS: usize = 4;
 

@@ -1,6 +1,6 @@
 //! Accepts connections, a bounded number of them.
 
-use std::net::IpAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -15,14 +15,24 @@ use tokio::task::JoinHandle;
 use crate::admission::{ConnectionSlot, ConnectionSlots};
 use crate::idle_deadline::IdleDeadline;
 use crate::limits;
-use crate::routes;
 use crate::state::ServerState;
 use crate::stream::Stream;
 use crate::tls::Tls;
 
+/// A socket that listens, and its address.
+pub(crate) struct Listener {
+    pub(crate) socket: TcpListener,
+    pub(crate) address: SocketAddr,
+}
+
 /// Serves connections until the server stops.
-pub(crate) async fn listen(state: Arc<ServerState>, listener: TcpListener, tls: Option<Arc<Tls>>) {
-    let acceptor = Acceptor::new(state.clone());
+pub(crate) async fn listen(
+    state: Arc<ServerState>,
+    listener: TcpListener,
+    tls: Option<Arc<Tls>>,
+    app: Router,
+) {
+    let acceptor = Acceptor::new(state.clone(), app);
     let hello = state.limits.hello;
     loop {
         // The slot is a part of accepting: while there is none, connections wait in the kernel's
@@ -60,12 +70,11 @@ pub(crate) struct Acceptor {
 }
 
 impl Acceptor {
-    pub(crate) fn new(state: Arc<ServerState>) -> Self {
+    pub(crate) fn new(state: Arc<ServerState>, app: Router) -> Self {
         let connections =
             // All WebSockets, and some more for HTTP, or nothing could be asked while all are in
             // use.
             ConnectionSlots::new(state.limits.connections + limits::SPARE_CONNECTIONS);
-        let app = routes::router(state.clone());
         Self { state, connections, app }
     }
 

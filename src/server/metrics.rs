@@ -1,5 +1,6 @@
 //! Counters and gauges for Prometheus. Each server has its own; none is global.
 
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
 
@@ -10,9 +11,12 @@ use prometheus_client::metrics::counter::{ConstCounter, Counter};
 use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::{ConstGauge, Gauge};
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
+use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::{Registry, Unit};
 
 use wildcity_session::Engine;
+
+use crate::process::Process;
 
 /// A counter for each value of one label.
 type CountersByLabel = Family<[(&'static str, String); 1], Counter>;
@@ -26,7 +30,7 @@ pub(crate) struct Metrics {
     pub(crate) uploads_begun: Counter,
     pub(crate) uploaded_bytes: Counter,
     pub(crate) observation_bytes: Counter,
-    pub(crate) memory_bytes: Counter,
+    pub(crate) shared_memory_bytes: Counter,
     pub(crate) versions_switched: Counter,
     pub(crate) reloads: Counter,
     refusals: CountersByLabel,
@@ -54,8 +58,14 @@ pub(crate) struct GaugeValues {
 }
 
 impl Metrics {
-    pub(crate) fn new(engine: Arc<Engine>) -> Self {
-        let mut registry = Registry::with_prefix("wildcity");
+    /// `directories` are those whose free space is measured, each with its name.
+    pub(crate) fn new(engine: Arc<Engine>, directories: Vec<(&'static str, PathBuf)>) -> Self {
+        let mut all = Registry::default();
+        // Names of the process have no prefix: dashboards for any program know them.
+        all.register_collector(Box::new(Process::new(directories)));
+        let registry = all.sub_registry_with_prefix("wildcity");
+        let build = [("version", env!("CARGO_PKG_VERSION")), ("backend", engine.backend())];
+        registry.register("build", "Version and backend of the server", Info::new(build));
         // 16 buckets from 1 ms to 33 s, each twice the previous one: most steps take 0.1 s.
         let seconds = || Histogram::new(exponential_buckets(1e-3, 2.0, 16));
         let metrics = Self {
@@ -68,7 +78,7 @@ impl Metrics {
             uploads_begun: Counter::default(),
             uploaded_bytes: Counter::default(),
             observation_bytes: Counter::default(),
-            memory_bytes: Counter::default(),
+            shared_memory_bytes: Counter::default(),
             versions_switched: Counter::default(),
             reloads: Counter::default(),
             refusals: CountersByLabel::default(),
@@ -94,7 +104,7 @@ impl Metrics {
         let help = "Bytes of observations sent through the socket";
         registry.register("observation_bytes", help, m.observation_bytes.clone());
         let help = "Bytes of observations written into shared memory";
-        registry.register("memory_bytes", help, m.memory_bytes.clone());
+        registry.register("shared_memory_bytes", help, m.shared_memory_bytes.clone());
         let help = "Sessions that switched to another version";
         registry.register("versions_switched", help, m.versions_switched.clone());
         let help = "SIGHUPs after which certificate and tokens were read again";
@@ -112,7 +122,7 @@ impl Metrics {
         );
         registry.register("pushes_open", "Pushes that wait or run", m.pushes_open.clone());
         registry.register_collector(Box::new(Residency(engine)));
-        Self { registry, ..metrics }
+        Self { registry: all, ..metrics }
     }
 
     /// All numbers in OpenMetrics' text format; `gauges` are the values of this moment.

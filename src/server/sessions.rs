@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use parking_lot::Mutex;
@@ -24,6 +25,8 @@ const TAKEOVER_ATTEMPT: Duration = Duration::from_millis(100);
 pub(crate) struct SessionRegistry {
     limit: usize,
     resume_grace: Duration,
+    /// Set once no session is opened any more.
+    is_ending: AtomicBool,
     entries: Mutex<BTreeMap<String, Entry>>,
     /// Sessions that were closed a short while ago, by name: the answer to `close` may be asked for
     /// again.
@@ -156,18 +159,38 @@ pub(crate) struct SlotGuard {
 
 impl SessionRegistry {
     pub(crate) fn new(limit: usize, resume_grace: Duration) -> Arc<Self> {
-        Arc::new(Self { limit, resume_grace, entries: Mutex::default(), closed: Mutex::default() })
+        Arc::new(Self {
+            limit,
+            resume_grace,
+            is_ending: AtomicBool::default(),
+            entries: Mutex::default(),
+            closed: Mutex::default(),
+        })
+    }
+
+    /// Refuses new sessions from now on.
+    pub(crate) fn open_no_more(&self) {
+        self.is_ending.store(true, Ordering::SeqCst);
+    }
+
+    /// Whether new sessions are refused because the server will stop.
+    pub(crate) fn is_ending(&self) -> bool {
+        self.is_ending.load(Ordering::SeqCst)
     }
 
     /// Adds an empty slot under a new name, for the client's token.
     ///
     /// # Errors
-    /// The name is in use, or there are too many sessions, of all tokens or of this one.
+    /// The server will stop, the name is in use, or there are too many sessions, of all tokens or
+    /// of this one.
     pub(crate) fn reserve(
         self: &Arc<Self>,
         name: String,
         grant: &Grant,
     ) -> Result<SlotGuard, Fault> {
+        if self.is_ending() {
+            return Err(Fault::Ending);
+        }
         let mut entries = self.entries.lock();
         // Names are unique over all tokens, because they also name the files of episodes.
         if entries.contains_key(&name) {

@@ -2,25 +2,31 @@
 
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
-use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio::time::timeout;
 
+use wildcity_episode::prune;
 use wildcity_session::Engine;
 
-use crate::listen::listen;
+use crate::limits;
+use crate::listen::{Listener, listen};
 use crate::reload::reload;
+use crate::routes;
 use crate::state::ServerState;
 use crate::tls::Tls;
+
+/// Time between two looks at the sessions that are left.
+const SESSIONS_LOOK: Duration = Duration::from_millis(100);
 
 /// A server that listens. Dropping it stops it without waiting; the last of its tasks to end waits
 /// for the frames that are being rendered.
 pub struct Running {
     state: Arc<ServerState>,
     address: SocketAddr,
+    metrics_address: Option<SocketAddr>,
     has_tls: bool,
     stop: watch::Sender<bool>,
     listening: JoinHandle<()>,
@@ -37,6 +43,36 @@ async fn remove_old_uploads(state: &ServerState) {
         if tokio::task::spawn_blocking(move || spool.remove_old()).await.is_err() {
             tracing::error!("old uploads were not removed: a task crashed");
         }
+    }
+}
+
+/// Removes records that are beyond a limit, until dropped.
+async fn remove_old_records(state: &ServerState) {
+    let keep = state.limits.keep_records;
+    if keep.keeps_all() {
+        return std::future::pending().await;
+    }
+    loop {
+        let dir = state.episodes.clone();
+        let pruned =
+            tokio::task::spawn_blocking(move || prune(&dir, keep, SystemTime::now(), false)).await;
+        match pruned {
+            Ok(Ok(pruned)) => {
+                if !pruned.removed.is_empty() {
+                    tracing::info!(
+                        "removed {} old records of {} bytes",
+                        pruned.removed.len(),
+                        pruned.bytes
+                    );
+                }
+                for (path, error) in pruned.failed {
+                    tracing::warn!(path = %path.display(), "an old record was not removed: {error}");
+                }
+            }
+            Ok(Err(error)) => tracing::warn!("old records were not removed: {error}"),
+            Err(_) => tracing::error!("old records were not removed: a task crashed"),
+        }
+        tokio::time::sleep(limits::PRUNE_PERIOD).await;
     }
 }
 
@@ -76,15 +112,21 @@ impl Running {
     /// Starts the tasks of a server.
     pub(crate) fn new(
         state: Arc<ServerState>,
-        listener: TcpListener,
+        listener: Listener,
+        metrics_listener: Option<Listener>,
         tls: Option<Arc<Tls>>,
-        address: SocketAddr,
         stop: watch::Sender<bool>,
     ) -> Self {
         let has_tls = tls.is_some();
         let reloading = reload(tls.clone(), state.clone());
         // A task of its own, because `stop` waits for it: afterwards no connection is accepted.
-        let listening = tokio::spawn(listen(state.clone(), listener, tls));
+        let app = routes::router(state.clone());
+        let listening = tokio::spawn(listen(state.clone(), listener.socket, tls, app));
+        let metrics_address = metrics_listener.as_ref().map(|listener| listener.address);
+        if let Some(listener) = metrics_listener {
+            let app = routes::open_router(state.clone());
+            tokio::spawn(listen(state.clone(), listener.socket, None, app));
+        }
         let periodic = state.clone();
         tokio::spawn(async move {
             // One task for all: none of them ends before the server, and each spends its time
@@ -92,18 +134,25 @@ impl Running {
             tokio::select! {
                 () = periodic.sessions.end_expired() => {}
                 () = remove_old_uploads(&periodic) => {}
+                () = remove_old_records(&periodic) => {}
                 () = renew_leases(&periodic) => {}
                 () = release_memory(&periodic) => {}
                 () = reloading => {}
                 () = periodic.stopped() => {}
             }
         });
-        Self { state, address, has_tls, stop, listening }
+        let address = listener.address;
+        Self { state, address, metrics_address, has_tls, stop, listening }
     }
 
     /// The address that the server listens on.
     pub fn address(&self) -> SocketAddr {
         self.address
+    }
+
+    /// The address of the second listener, for metrics.
+    pub fn metrics_address(&self) -> Option<SocketAddr> {
+        self.metrics_address
     }
 
     /// The URL that agents connect to.
@@ -137,6 +186,26 @@ impl Running {
     /// Number of WebSocket connections at this moment.
     pub fn connections(&self) -> usize {
         self.state.limits.connections - self.state.websocket_permits.available_permits()
+    }
+
+    /// Opens no session from now on, is not ready any more, and waits until the last session has
+    /// ended, up to the limit of the configuration. Sessions without a connection can be resumed.
+    pub async fn end_sessions(&self) {
+        self.state.sessions.open_no_more();
+        let longest = self.state.limits.sessions_end;
+        let count = || self.sessions();
+        if longest.is_zero() || count() == 0 {
+            return;
+        }
+        tracing::info!("{} sessions may go on for {longest:?}", count());
+        let end = Instant::now() + longest;
+        while count() > 0 && Instant::now() < end {
+            tokio::time::sleep(SESSIONS_LOOK).await;
+        }
+        match count() {
+            0 => tracing::info!("no session is left"),
+            count => tracing::warn!("{count} sessions did not end in time"),
+        }
     }
 
     /// Stops accepting connections, lets running steps finish, notifies every client, and ends

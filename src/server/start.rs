@@ -16,6 +16,7 @@ use wildcity_twin::store::{Catalog, StoreError};
 use crate::audit::Audit;
 use crate::auth::{CurrentTokens, Tokens};
 use crate::config::{Config, Directories};
+use crate::listen::Listener;
 use crate::metrics::Metrics;
 use crate::readiness::Readiness;
 use crate::sessions::SessionRegistry;
@@ -38,9 +39,11 @@ pub enum ServerError {
     PublicAddress { address: SocketAddr },
     /// The address cannot be used.
     #[error(
-        "cannot listen on {address}: {cause}; stop the program that uses it, or give another --listen"
+        "cannot listen on {address}: {cause}; stop the program that uses it, or give another {option}"
     )]
     Listen {
+        /// The option that has the address.
+        option: &'static str,
         address: SocketAddr,
         /// The operating system's error.
         cause: io::Error,
@@ -81,6 +84,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         listen,
         directories: Directories { twins, episodes, scenarios, uploads },
         cache,
+        metrics_listen,
         tokens,
         origins,
         tls,
@@ -118,9 +122,11 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
     engine.limit_records(limits.records);
 
     // The socket.
-    let listen_error = |cause| ServerError::Listen { address: listen, cause };
-    let listener = TcpListener::bind(listen).await.map_err(listen_error)?;
-    let address = listener.local_addr().map_err(listen_error)?;
+    let listener = bind("--listen", listen).await?;
+    let metrics_listener = match metrics_listen {
+        Some(address) => Some(bind("--metrics-listen", address).await?),
+        None => None,
+    };
 
     // Uploads. Agents can drive without them.
     // All clients of a server without tokens share one owner, the empty name.
@@ -133,10 +139,15 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         reason
     });
 
+    let mut disks = vec![("episodes", episodes.clone()), ("uploads", uploads)];
+    // A twin at a URL has no disk here.
+    if !twins.to_string_lossy().contains("://") {
+        disks.push(("twins", twins));
+    }
     // A watch and not a notification: a task that asks later sees the value, too.
     let (stop, stopping) = watch::channel(false);
     let state = Arc::new(ServerState {
-        metrics: Metrics::new(engine.clone()),
+        metrics: Metrics::new(engine.clone(), disks),
         engine,
         sessions: SessionRegistry::new(limits.sessions, limits.resume_grace),
         websocket_permits: Arc::new(Semaphore::new(limits.connections)),
@@ -155,5 +166,12 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         spool,
         pushes: PushQueue::new(limits.queue()),
     });
-    Ok(Running::new(state, listener, tls, address, stop))
+    Ok(Running::new(state, listener, metrics_listener, tls, stop))
+}
+
+async fn bind(option: &'static str, address: SocketAddr) -> Result<Listener, ServerError> {
+    let listen_error = |cause| ServerError::Listen { option, address, cause };
+    let socket = TcpListener::bind(address).await.map_err(listen_error)?;
+    let address = socket.local_addr().map_err(listen_error)?;
+    Ok(Listener { socket, address })
 }

@@ -204,6 +204,13 @@ pub const LEASE: Duration = Duration::from_secs(900);
 /// Time between two renewals of a lease. Two in a row may fail before the lease ends.
 pub const LEASE_RENEWAL: Duration = Duration::from_secs(300);
 
+/// How long the number of a twin's latest version answers the sessions that ask for it after every
+/// step.
+pub const LATEST_AGE: Duration = Duration::from_secs(1);
+
+/// The same for a twin in an object store, where each look is a request that costs money.
+pub const REMOTE_LATEST_AGE: Duration = Duration::from_secs(10);
+
 /// Distances from a viewpoint to a block that a frame computes on the thread of its session, to
 /// find the sections that it draws: 0.1 ms. More of them, as in a city, are computed on another
 /// thread.

@@ -54,6 +54,10 @@ pub(crate) struct SessionSettings {
     pub(crate) contact: Option<ContactMode>,
     /// The size with which contact with the twin is looked for; `None` if it is not.
     pub(crate) solid_ego: Option<EgoBox>,
+    /// Whether episodes are recorded.
+    pub(crate) is_recorded: bool,
+    /// Whether the session switches to newer versions by itself.
+    pub(crate) follows_latest: bool,
 }
 
 /// The version of the twin that a session shows, and how.

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -52,6 +53,9 @@ pub struct EpisodeEntry {
     pub(crate) drive_hash: String,
     /// The file of its record, below `episodes`; empty if nothing was driven.
     pub record: String,
+    /// How long it took, with all attempts. Not in `result.json`, which has no wall-clock times.
+    #[serde(skip)]
+    pub wall: Duration,
     /// The MCAP file of its record, below `episodes`, or why there is none; `None` if none was
     /// asked for. Not in `result.json`: whether an export is ready at the end of a run depends on
     /// the clock.
@@ -118,6 +122,7 @@ impl EpisodeEntry {
             frames_hash: String::new(),
             duplicate_of: None,
             drive_hash: String::new(),
+            wall: Duration::ZERO,
             record: String::new(),
             mcap: None,
             errors: errors.collect(),

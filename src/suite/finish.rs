@@ -8,6 +8,7 @@ use serde::de::value::Error as ValueError;
 
 use wildcity_episode::{EndLine, EpisodeFile, EpisodeResult, result};
 use wildcity_session::{Outcome, run_blocking};
+use wildcity_sim::Dynamics;
 
 use crate::case::Case;
 use crate::technical::Technical;
@@ -100,12 +101,18 @@ fn check(case: &Case, episode: &EpisodeFile) -> Result<(), Technical> {
     let header = &episode.header;
     let scenario = episode.scenario.as_ref().map(|scenario| scenario.hash.as_str());
     let off_m = header.start.position_m.distance(case.start.position_m);
+    let driven = header.dynamics;
+    let ordered = case.resolved.dynamics.unwrap_or_default();
+    // Only the speed is a measured number.
+    let is_other_model = Dynamics { speed_m_s: ordered.speed_m_s, ..driven } != ordered;
+    let off_m_s = (driven.speed_m_s - ordered.speed_m_s).abs();
     let wrong = [
         ("twin", header.twin != case.options.twin),
         ("version", header.version_hash != case.version_hash),
         ("seed", header.seed != case.seed),
         ("scenario", scenario != Some(&case.line.hash)),
-        ("dynamics", header.dynamics != case.resolved.dynamics.unwrap_or_default()),
+        ("dynamics", is_other_model),
+        ("dynamics.speed", off_m_s > SPEED_M_S),
         ("dt_us", Some(header.dt_us) != case.options.dt_us),
         ("start", off_m > START_M),
     ];
@@ -117,6 +124,10 @@ fn check(case: &Case, episode: &EpisodeFile) -> Result<(), Technical> {
         )),
     }
 }
+
+/// Difference between the ordered and the driven speed at the start that counts as the same speed,
+/// in m/s: an agent may have written the number with two decimals.
+const SPEED_M_S: f64 = 0.01;
 
 /// Distance between the ordered and the driven start that counts as the same place, in metres.
 const START_M: f64 = 1.0;

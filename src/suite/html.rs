@@ -3,13 +3,14 @@
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
 const STYLE: &str = "\
-body{font:15px/1.45 system-ui,sans-serif;max-width:1000px;margin:2em auto;padding:0 1em;color:#111}
+body{font:15px/1.45 system-ui,sans-serif;max-width:1160px;margin:2em auto;padding:0 1em;color:#111}
 h1{font-size:1.6em}h2{margin-top:2em;font-size:1.2em}
-table{border-collapse:collapse;font-size:13px}td,th{padding:2px 8px;border-bottom:1px solid #ddd;text-align:left;vertical-align:top}
+table{border-collapse:collapse;font-size:13px;display:block;overflow-x:auto}td,th{padding:2px 8px;border-bottom:1px solid #ddd;text-align:left;vertical-align:top}
 pre{margin:0;white-space:pre-wrap;overflow-wrap:anywhere}
 .passed,.better{color:#00703c}.failed,.worse{color:#b00020;font-weight:600}.technical{color:#b05a00}
 .off_model,.not_judged,.unknown,.changed{color:#777}
-figure{margin:0 0 1.5em 0}img{max-width:420px}svg{border:1px solid #eee;margin-right:6px}";
+figure{margin:0 0 1.5em 0}figure img{width:min(100%,760px);height:auto}svg{border:1px solid #eee;margin-right:6px;max-width:100%;height:auto}
+.verdict{font-size:1.25em;padding:.6em .8em;border-left:6px solid;background:#f6f6f6;overflow-wrap:anywhere}";
 
 /// A page with a title.
 pub(crate) fn document(title: &str, body: &Markup) -> String {
@@ -18,6 +19,7 @@ pub(crate) fn document(title: &str, body: &Markup) -> String {
         html lang="en" {
             head {
                 meta charset="utf-8";
+                meta name="viewport" content="width=device-width, initial-scale=1";
                 title { (title) }
                 style { (PreEscaped(STYLE)) }
             }

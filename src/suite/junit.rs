@@ -10,8 +10,9 @@ use crate::result::SuiteResult;
 /// verdict, since a skipped test counts as a good one; `skipped` an episode that left the trained
 /// area where the suite accepts this.
 ///
-/// A failed episode is a `failure` even if the run passes. The properties of the suite have the
-/// exit code and its reason.
+/// Times are in seconds of wall-clock time; that of the suite is the sum over its episodes,
+/// whatever ran at once. A failed episode is a `failure` even if the run passes. The properties of
+/// the suite have the exit code and its reason.
 pub fn junit(result: &SuiteResult, ending: &Ending) -> String {
     let counts = &result.counts;
     let skipped = if result.accepts_off_model() { counts.off_model } else { 0 };
@@ -21,11 +22,12 @@ pub fn junit(result: &SuiteResult, ending: &Ending) -> String {
     // Writing into a text cannot fail.
     let _ = writeln!(
         text,
-        "<testsuites><testsuite name=\"{}\" tests=\"{}\" failures=\"{}\" errors=\"{}\" skipped=\"{skipped}\">",
+        "<testsuites><testsuite name=\"{}\" tests=\"{}\" failures=\"{}\" errors=\"{}\" skipped=\"{skipped}\" time=\"{:.3}\">",
         escaped(&result.suite),
         counts.episodes,
         counts.failed,
         errors,
+        result.episodes.iter().map(|episode| episode.wall.as_secs_f64()).sum::<f64>(),
     );
     text.push_str("  <properties>\n");
     let at_least = result.at_least.map(|least| least.to_string());
@@ -51,9 +53,10 @@ fn case(text: &mut String, result: &SuiteResult, episode: &EpisodeEntry) {
     let class = format!("{}.{}", result.suite, episode.scenario);
     let _ = write!(
         text,
-        "  <testcase classname=\"{}\" name=\"{}\"",
+        "  <testcase classname=\"{}\" name=\"{}\" time=\"{:.3}\"",
         escaped(&class),
-        escaped(&episode.name)
+        escaped(&episode.name),
+        episode.wall.as_secs_f64()
     );
     // The status decides on the element; for `off_model` also whether the run accepts it.
     let inner = match episode.status {

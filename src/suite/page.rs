@@ -6,7 +6,7 @@ use std::path::Path;
 use data_encoding::BASE64;
 use maud::{Markup, PreEscaped, html};
 
-use crate::ending::Ending;
+use crate::ending::{Ending, ExitCode};
 use crate::entry::{EpisodeEntry, LEFT, Status, TechnicalEntry};
 use crate::html::{document, percent};
 use crate::picture::Picture;
@@ -22,9 +22,11 @@ pub fn page(
 ) -> String {
     let title = format!("{}: {}", result.suite, result.agent);
     let body = html! {
-        (outcome(result, ending))
-        (unjudged(result))
+        (verdict(ending))
         (worst(result, pictures, episodes))
+        h2 { "Run" }
+        (outcome(result))
+        (unjudged(result))
         h2 { "Scenarios" }
         (scenarios(result))
         h2 { "Scores" }
@@ -35,7 +37,24 @@ pub fn page(
     document(&title, &body)
 }
 
-fn outcome(result: &SuiteResult, ending: &Ending) -> Markup {
+/// The answer to the question that the page is opened for.
+fn verdict(ending: &Ending) -> Markup {
+    let passed = ending.code == ExitCode::Passed;
+    let kind = match ending.code {
+        ExitCode::Passed => "passed",
+        ExitCode::Driving | ExitCode::NotVerified | ExitCode::Usage => "failed",
+        ExitCode::Technical => "technical",
+        ExitCode::NotJudged => "not_judged",
+    };
+    html! {
+        p class=(format!("verdict {kind}")) {
+            b { @if passed { "Passed" } @else { "Not passed" } } ": " (ending.why) ". Exit code "
+            (ending.code as u8) "."
+        }
+    }
+}
+
+fn outcome(result: &SuiteResult) -> Markup {
     let counts = &result.counts;
     html! {
         p {
@@ -45,7 +64,6 @@ fn outcome(result: &SuiteResult, ending: &Ending) -> Markup {
         }
         p { "Pass rate: " (rate(&result.pass_rate)) "." }
         @if let Some(text) = result.duplicates_text() { p { "Note: " (text) "." } }
-        p { "Exit code " (ending.code as u8) ": " (ending.why) "." }
         @if result.latest { p { "Run on the latest versions of the twins, whatever the scenarios name." } }
     }
 }
@@ -140,9 +158,13 @@ fn worst(result: &SuiteResult, pictures: &[Picture], episodes: &Path) -> Markup 
     html! {
         @if !worst.is_empty() {
             h2 { "Worst episodes" }
+            p {
+                "To see them again: " code { "wildcity serve --episodes " (shown(episodes)) }
+                ", then a name below opens the episode in the viewer."
+            }
             @for episode in worst {
                 figure {
-                    figcaption { b { (episode.name) } ": " (episode.fault_texts().join("; ")) }
+                    figcaption { b { (viewer_link(episode)) } ": " (episode.fault_texts().join("; ")) }
                     @match pictures.iter().find(|picture| picture.episode == episode.name) {
                         Some(picture) => (image(picture)),
                         None => p { "There is no picture: its frames cannot be rendered again." },
@@ -152,6 +174,19 @@ fn worst(result: &SuiteResult, pictures: &[Picture], episodes: &Path) -> Markup 
             }
         }
     }
+}
+
+/// The folder of the records, as an argument of a command anywhere.
+fn shown(episodes: &Path) -> String {
+    std::path::absolute(episodes).unwrap_or(episodes.to_owned()).display().to_string()
+}
+
+/// The name of an episode, with the address of its record in the viewer of a server with the
+/// default address.
+fn viewer_link(episode: &EpisodeEntry) -> Markup {
+    let name = episode.record.trim_end_matches(".jsonl");
+    let address = format!("http://{}/#/episode/{name}", wildcity_server::limits::LISTEN);
+    html! { @if name.is_empty() { (episode.name) } @else { a href=(address) { (episode.name) } } }
 }
 
 fn image(picture: &Picture) -> Markup {

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
@@ -154,8 +154,11 @@ pub async fn run(settings: RunSettings, cases: Vec<Case>) -> Result<SuiteResult,
         tasks.spawn(async move {
             // The semaphore is never closed.
             let _permit = permits.acquire_owned().await;
-            let entry = shared.episode(&case).await;
-            entry.inspect(|entry| (shared.progress)(entry))
+            let begun = Instant::now();
+            let mut entry = shared.episode(&case).await?;
+            entry.wall = begun.elapsed();
+            (shared.progress)(&entry);
+            Ok(entry)
         });
     }
     let mut entries = Vec::new();

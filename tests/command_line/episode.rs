@@ -151,3 +151,27 @@ fn a_suite_is_driven_and_its_records_are_read() {
     assert_eq!(driven.status.code(), Some(0));
     assert!(!dir.path().join("none/episodes/short-0-1.mcap").exists());
 }
+
+#[test]
+fn old_records_are_pruned() {
+    let dir = tempfile::tempdir().unwrap();
+    let now = std::time::SystemTime::now();
+    for (name, days) in [("new", 1), ("old", 40)] {
+        let path = dir.path().join(format!("{name}-1.jsonl"));
+        std::fs::write(&path, "{\"kind\":\"end\"}\n").unwrap();
+        let file = std::fs::OpenOptions::new().append(true).open(path).unwrap();
+        file.set_modified(now - std::time::Duration::from_secs(days * 86_400)).unwrap();
+    }
+    let prune = |arguments: &[&str]| {
+        let all = [&["prune", "--episodes", "."], arguments].concat();
+        wildcity(&all, dir.path())
+    };
+    let none = prune(&[]);
+    assert_eq!(none.status.code(), Some(2), "a limit is needed: {none:?}");
+    let dry = prune(&["--older-than", "30d", "--dry-run"]);
+    let said = "would be removed old-1\nwould be removed 1 record, 15 bytes\nkept 1 record\n";
+    assert_eq!((dry.status.code(), stdout(&dry).as_str()), (Some(0), said), "{dry:?}");
+    let done = prune(&["--older-than", "30d", "--keep", "5"]);
+    assert_eq!(stdout(&done), said.replace("would be removed", "removed"), "{done:?}");
+    assert!(dir.path().join("new-1.jsonl").exists() && !dir.path().join("old-1.jsonl").exists());
+}

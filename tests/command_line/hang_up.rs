@@ -4,7 +4,7 @@ use std::fs::{self, File};
 use std::path::Path;
 use std::time::Duration;
 
-use serde_json::json;
+use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 
@@ -51,6 +51,26 @@ async fn a_server_without_tls_and_tokens_goes_on() {
     logs(&log, "there is nothing to read again").await;
     served.whole_session(2).await;
     assert_eq!(served.signal_and_wait(), Some(0));
+}
+
+#[tokio::test]
+async fn a_log_of_json_has_an_object_on_each_line() {
+    let dir = tempfile::tempdir().unwrap();
+    let log = dir.path().join("log");
+    let served = logging("info", &log, &["--log-format", "json"]);
+    served.whole_session(2).await;
+    assert_eq!(served.signal_and_wait(), Some(0));
+    let text = fs::read_to_string(&log).unwrap();
+    let lines: Vec<Value> =
+        text.lines().map(|line| serde_json::from_str(line).expect(line)).collect();
+    assert!(lines.len() > 1, "{text}");
+    for line in &lines {
+        let has = |field: &str| line[field].is_string();
+        assert!(
+            has("timestamp") && has("level") && line["fields"]["message"].is_string(),
+            "{line}"
+        );
+    }
 }
 
 #[tokio::test]

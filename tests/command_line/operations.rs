@@ -1,6 +1,7 @@
 //! `wildcity doctor`.
 
 use std::fs;
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::Path;
 use std::process::Output;
 
@@ -86,6 +87,7 @@ fn the_doctor_reads_a_configuration() {
         let text =
             format!(r#"{{"tokens": [{{"name": "a", "role": "drive", "token": "{token}"}}]}}"#);
         fs::write(at("tokens.json"), text).unwrap();
+        fs::set_permissions(at("tokens.json"), fs::Permissions::from_mode(0o600)).unwrap();
     };
     tokens("0123456789abcdef");
     certify(rcgen::date_time_ymd(2999, 1, 1));
@@ -97,6 +99,20 @@ fn the_doctor_reads_a_configuration() {
         assert!(found.iter().all(|(level, _)| level == "ok"), "{subject}: {found:?}");
     }
     assert!(!dir.path().join("audit.jsonl").exists(), "looking creates nothing");
+
+    // Tokens that others can read, and a server that uses the folders, are noted.
+    fs::set_permissions(at("tokens.json"), fs::Permissions::from_mode(0o640)).unwrap();
+    fs::create_dir_all(at("uploads")).unwrap();
+    let lock = fs::File::create(dir.path().join("uploads/lock")).unwrap();
+    lock.lock().unwrap();
+    let noted = config("");
+    assert!(noted.status.success(), "{noted:?}");
+    for (subject, wanted) in [("tokens", "mode 640"), ("uploads", "a server uses")] {
+        let found = about(&noted, subject);
+        let is_noted = |(level, text): &(String, String)| level == "note" && text.contains(wanted);
+        assert!(found.iter().any(is_noted), "{found:?}");
+    }
+    drop(lock);
 
     tokens("short");
     certify(rcgen::date_time_ymd(2020, 1, 1));
@@ -115,6 +131,27 @@ fn the_doctor_reads_a_configuration() {
     fs::write(at("key.pem"), key.serialize_pem()).unwrap();
     let [(level, found)] = &about(&config(""), "certificate")[..] else { panic!("no certificate") };
     assert!(level == "bad" && found.contains("key.pem"), "{found}");
+}
+
+/// The reader of the output has gone, as with `| head`: the exit code is still that of the result.
+#[test]
+fn a_reader_that_has_gone_is_no_error() {
+    let dir = tempfile::tempdir().unwrap();
+    let twins = support::twins();
+    let unheard = |arguments: &[&str]| {
+        let (reader, writer) = std::io::pipe().unwrap();
+        drop(reader);
+        let mut command = wildcity();
+        command.args(arguments).arg("--twins").arg(twins.path()).stdout(writer);
+        command.output().unwrap()
+    };
+    let listed = unheard(&["twin", "list"]);
+    assert!(listed.status.success() && listed.stderr.is_empty(), "{listed:?}");
+    fs::write(twins.path().join("test/log/0000000002"), "").unwrap();
+    let episodes = dir.path().to_str().unwrap();
+    let checked = unheard(&["doctor", "--episodes", episodes, "--uploads", episodes]);
+    assert_eq!(checked.status.code(), Some(1), "{checked:?}");
+    assert!(String::from_utf8_lossy(&checked.stderr).contains("checks failed"), "{checked:?}");
 }
 
 #[test]

@@ -306,3 +306,22 @@ fn an_image_that_cannot_be_written_is_an_error() {
         assert_eq!(fs::read(&picture).unwrap(), good, "the picture of before is whole");
     }
 }
+
+#[test]
+fn a_twin_is_copied_renamed_and_removed() {
+    let twins = crate::support::twins();
+    let run = |arguments: &[&str]| {
+        wildcity().arg("twin").args(arguments).arg("--twins").arg(twins.path()).output().unwrap()
+    };
+    let copied = stdout(&run(&["copy", "test", "copy"]));
+    assert!(copied.starts_with("twin copy version 1\nblake3 "), "{copied}");
+    let taken = refusal(&run(&["copy", "test", "copy"]));
+    assert!(taken.contains("copy") && taken.contains("exists"), "{taken}");
+    let renamed = stdout(&run(&["rename", "copy", "street"]));
+    assert!(renamed.starts_with("twin street version 1\n"), "{renamed}");
+    assert_eq!(stdout(&run(&["remove", "test"])), "removed twin test\n");
+    let listed = stdout(&run(&["list"]));
+    assert!(listed.starts_with("street ") && listed.lines().count() == 1, "{listed}");
+    let unknown = refusal(&run(&["remove", "test"]));
+    assert!(unknown.contains("test") && unknown.contains("street"), "{unknown}");
+}

@@ -43,6 +43,8 @@ fn a_reader_finds_every_message_with_its_schema() {
     assert_eq!(count("/route", "foxglove.PosesInFrame"), 1);
     assert_eq!(count("/ego/path", "foxglove.PosesInFrame"), 1);
     assert_eq!(count("/ego/odometry", "foxglove.Odometry"), 21);
+    assert_eq!(count("/ego/pose", "foxglove.PoseInFrame"), 21);
+    assert_eq!(count("/actors/poses", "foxglove.PosesInFrame"), 21);
     assert_eq!(count("/wildcity/step", "wildcity.Step"), 21);
     assert_eq!(count("/wildcity/episode", "wildcity.Episode"), 1);
     // 2 s after the begin, which is at 1,000 s.
@@ -57,7 +59,7 @@ fn the_file_is_indexed_and_small() {
     eprintln!("{} bytes as MCAP", bytes.len());
     let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
     assert!(summary.chunk_indexes.len() > 3, "{} chunks", summary.chunk_indexes.len());
-    assert_eq!(summary.stats.unwrap().message_count, 201 * 4 + 200 + 3);
+    assert_eq!(summary.stats.unwrap().message_count, 201 * 6 + 200 + 3);
     // A chunk that is damaged is noticed.
     let mut damaged = bytes;
     let at = summary.chunk_indexes[1].chunk_start_offset as usize + 200;

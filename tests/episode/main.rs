@@ -10,6 +10,7 @@ mod diff;
 mod export;
 mod files;
 mod nuscenes;
+mod prune;
 mod ros2;
 mod scores;
 mod written;

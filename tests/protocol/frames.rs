@@ -367,6 +367,7 @@ fn repair(index: u64, hash: &str) -> ImageRepair {
 fn observation(seq: u64, images: Vec<Image>, frame_hash: String) -> ObservationMetadata {
     ObservationMetadata {
         sweeps: Vec::new(),
+        newer_version: None,
         seq,
         step: 2,
         time_us: 200_000,

@@ -53,6 +53,15 @@ async fn events_are_counted() {
     assert!(number("wildcity_residency_loads_total") >= 1.0);
     assert!(number("wildcity_residency_held_sections") >= 1.0);
     assert!(number("wildcity_residency_limit_bytes") > 1e6);
+    assert!(text.contains("\nwildcity_build_info{version=\""), "{text}");
+    // This process has existed for seconds, and has at least the files of the connection.
+    assert!(number("process_start_time_seconds") > 1.7e9);
+    assert!(number("process_resident_memory_bytes") > 1e6);
+    assert!(number("process_cpu_seconds_total") > 0.0);
+    assert!(number("process_open_fds") > 3.0 && number("process_max_fds") > 3.0);
+    for directory in ["episodes", "uploads", "twins"] {
+        assert!(number(&format!("wildcity_disk_free_bytes{{directory=\"{directory}\"}}")) > 1e6);
+    }
     assert!(scrape(&idle).await.lines().any(|line| line == "wildcity_steps_total 0"));
 }
 

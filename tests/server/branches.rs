@@ -77,12 +77,12 @@ async fn drive(agent: &mut Agent, model: &str, done: u64, until: u64) -> Vec<See
 }
 
 /// Asserts that two observations are equal but for the numbers of their requests, names of
-/// sessions, and times that they took.
+/// sessions, versions that came meanwhile, and times that they took.
 fn assert_same(one: &Seen, other: &Seen) {
     let step = &one.meta["step"];
     let meta = |seen: &Seen| {
         let mut meta = seen.meta.clone();
-        for field in ["seq", "session", "timings", "residency"] {
+        for field in ["seq", "session", "newer_version", "timings", "residency"] {
             meta.as_object_mut().unwrap().remove(field);
         }
         meta

@@ -23,6 +23,7 @@ mod costs;
 mod damaged_twin;
 mod drives;
 mod ego;
+mod follow;
 mod guarded;
 mod http;
 mod leases;

@@ -1,9 +1,12 @@
 //! Contents of the records of episodes.
 
+use std::time::{Duration, SystemTime};
+
 use serde_json::json;
+use wildcity_episode::Keep;
 
 use crate::episodes::lines;
-use crate::support::{Agent, TestServer, pose};
+use crate::support::{Agent, TEST_TIMEOUT, TestServer, pose};
 
 async fn close(mut agent: Agent) {
     let closed = agent.ask(json!({ "type": "close" })).await;
@@ -53,6 +56,51 @@ async fn every_frame_is_on_record_before_it_is_answered() {
         "kind": "end", "outcome": "completed", "steps": 1, "time_us": 100_000, "distance_m": 1.5,
     });
     assert_eq!(*end, expected);
+}
+
+#[tokio::test]
+async fn a_session_without_records_leaves_no_file() {
+    let server = TestServer::start().await;
+    let mut agent = server.agent().await;
+    agent.open(json!({ "session": "a", "record": false })).await;
+    for seed in [1, 2] {
+        agent.look(json!({ "type": "reset", "seed": seed })).await;
+        agent.step(1.0).await;
+    }
+    // What it can return to is in memory.
+    agent.ask(json!({ "type": "snapshot", "name": "here" })).await;
+    agent.step(2.0).await;
+    assert_eq!(agent.look(json!({ "type": "restore", "name": "here" })).await.meta["step"], 1);
+    let closed = agent.ask(json!({ "type": "close" })).await;
+    assert_eq!((closed["summary"].get("episode"), &closed["summary"]["steps"]), (None, &json!(1)));
+    assert!(server.recorded().is_empty());
+    // With one, `record` is what it is without the field.
+    let mut agent = server.agent().await;
+    agent.open(json!({ "session": "b", "record": true })).await;
+    agent.look(json!({ "type": "reset", "seed": 1 })).await;
+    assert_eq!(server.recorded().len(), 1);
+}
+
+#[tokio::test]
+async fn old_records_are_removed_while_the_server_runs() {
+    let server = TestServer::configured(|config| {
+        config.limits.keep_records = Keep { records: Some(1), ..Keep::default() };
+        let hour_ago = SystemTime::now() - Duration::from_secs(3600);
+        for name in ["old-1", "old-2"] {
+            let path = config.directories.episodes.join(format!("{name}.jsonl"));
+            std::fs::write(&path, "{\"kind\":\"end\"}\n").unwrap();
+            let file = std::fs::OpenOptions::new().append(true).open(path).unwrap();
+            file.set_modified(hour_ago).unwrap();
+        }
+    })
+    .await;
+    let pruned = async {
+        while server.recorded().len() > 1 {
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    };
+    tokio::time::timeout(TEST_TIMEOUT, pruned).await.expect("a record is removed");
+    server.still_serves().await;
 }
 
 #[tokio::test]

@@ -195,7 +195,10 @@ async fn resuming_takes_over_from_a_dead_connection() {
 #[tokio::test]
 async fn what_cannot_be_resumed() {
     let server = TestServer::start().await;
-    refused(&resume(&server, "no-such", 0).await.1, "unknown_session");
+    let (_, unknown) = resume(&server, "no-such", 0).await;
+    refused(&unknown, "unknown_session");
+    let said = unknown["message"].as_str().unwrap();
+    assert!(said.contains("restarted") && said.contains(r#""episode": "no-such-1""#), "{said}");
     refused(&resume(&server, "../x", 0).await.1, "invalid_name");
     let agent = server.driver("a").await;
     let answer = resume(&server, "a", agent.seq + 5).await.1;

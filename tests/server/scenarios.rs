@@ -4,6 +4,7 @@ use std::fs;
 
 use serde_json::{Value, json};
 
+use crate::http::get;
 use crate::support::{Agent, TestServer, pose, refused};
 
 /// On the 9 m of the twin `test`: a car that stands at 8 m, a walker that appears, and a van next
@@ -41,6 +42,19 @@ fn outputs() -> Value {
 /// The metadata of a step to a place on the drive.
 async fn to(agent: &mut Agent, x_m: f64) -> Value {
     agent.look(json!({ "type": "step", "pose": pose(x_m) })).await.meta
+}
+
+#[tokio::test]
+async fn scenarios_are_listed_by_name() {
+    let server = server().await;
+    let listed = async |server: &TestServer| {
+        let (status, answer) = get(server, "/v1/scenarios").await;
+        assert_eq!(status, 200, "{answer}");
+        serde_json::from_str::<Value>(answer.split("\r\n\r\n").nth(1).unwrap()).unwrap()
+    };
+    assert_eq!(listed(&server).await, json!({ "scenarios": ["short"] }), "a map is none");
+    let without = TestServer::start().await;
+    assert_eq!(listed(&without).await, json!({ "scenarios": [] }));
 }
 
 #[tokio::test]

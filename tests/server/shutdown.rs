@@ -5,6 +5,8 @@ use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use serde_json::json;
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::TcpStream;
 
 use wildcity_server::Limits;
 
@@ -45,6 +47,62 @@ async fn running_steps_are_answered_and_waiting_clients_notified() {
             std::fs::read_to_string(episodes.path().join(format!("{name}-1.jsonl"))).unwrap();
         assert!(text.lines().last().unwrap().contains("server_error"), "{name}: {text}");
     }
+}
+
+/// Sessions go on, and can be resumed, until the last one has ended; no other begins.
+#[tokio::test]
+async fn a_server_that_will_stop_waits_for_its_sessions() {
+    let limits = Limits { sessions_end: 3 * TEST_TIMEOUT, ..Limits::default() };
+    let server = TestServer::with(limits).await;
+    assert_eq!(ready(&server).await, 200);
+    let mut driving = server.driver("driving").await;
+    let mut idle = server.agent().await;
+    let TestServer { running, .. } = &server;
+    let ending = running.end_sessions();
+    let driven = async {
+        // The first poll of `ending` has set the mark.
+        while ready(&server).await == 200 {}
+        assert_eq!(ready(&server).await, 503);
+        let answer = idle.ask(json!({ "type": "open", "session": "late", "twin": "test" })).await;
+        refused(&answer, "shutting_down");
+        assert_eq!(answer["fatal"], false);
+        driving.step(1.0).await;
+        driving.look(json!({ "type": "reset", "seed": 2 })).await;
+        driving.step(1.0).await;
+        assert_eq!(running.sessions(), 1);
+        driving.ask(json!({ "type": "close" })).await;
+    };
+    tokio::time::timeout(TEST_TIMEOUT, async { tokio::join!(ending, driven) })
+        .await
+        .expect("it waits no longer than the last session");
+    server.running.stop().await;
+}
+
+#[tokio::test]
+async fn sessions_that_do_not_end_are_waited_for_as_long_as_said() {
+    for longest_ms in [0, 300] {
+        let sessions_end = Duration::from_millis(longest_ms);
+        let server = TestServer::with(Limits { sessions_end, ..Limits::default() }).await;
+        let mut agent = server.driver("stays").await;
+        agent.step(1.0).await;
+        let begun = std::time::Instant::now();
+        server.running.end_sessions().await;
+        let waited = begun.elapsed();
+        assert!(waited >= sessions_end && waited < sessions_end + TEST_TIMEOUT / 2, "{waited:?}");
+        assert_eq!(server.running.sessions(), 1);
+    }
+}
+
+/// The status of `GET /readyz`.
+async fn ready(server: &TestServer) -> u16 {
+    let mut stream = TcpStream::connect(server.address()).await.unwrap();
+    stream
+        .write_all(b"GET /readyz HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+        .await
+        .unwrap();
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).await.unwrap();
+    answer.split(' ').nth(1).unwrap().parse().unwrap()
 }
 
 /// A GPU's driver crashes if the process ends while another thread drops the device.

@@ -22,3 +22,4 @@ mod remote;
 mod round_trip;
 mod skies;
 mod views;
+mod whole_twins;

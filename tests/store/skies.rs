@@ -107,6 +107,21 @@ fn garbage_collection_and_fsck_include_the_sky() {
 }
 
 #[test]
+fn a_copy_of_a_twin_has_a_sky_of_its_own() {
+    everywhere(|place| {
+        let catalog = place.catalog();
+        let scene = gaussians(300, 1, 10.0, 1);
+        let new = NewVersion { sky: Some(NewSky::Put(sky_bytes(1))), ..street(&scene) };
+        let with = catalog.commit(new, &mut |_, _| {}).unwrap();
+        let copied = catalog.copy("street", None, "avenue").unwrap();
+        catalog.remove("street").unwrap();
+        assert!(copied.manifest.sky.is_some());
+        assert_eq!(copied.manifest.sky, with.manifest.sky);
+        assert!(catalog.verify("avenue", &mut |_, _| {}).unwrap().damaged.is_empty());
+    });
+}
+
+#[test]
 fn a_damaged_sky_is_found_and_repaired() {
     let dir = tempfile::tempdir().unwrap();
     let scene = gaussians(300, 0, 10.0, 1);

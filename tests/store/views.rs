@@ -97,6 +97,23 @@ fn images_come_back_and_later_versions_share_them() {
 }
 
 #[test]
+fn a_copy_of_a_twin_has_images_of_its_own() {
+    everywhere(|place| {
+        let catalog = street(place);
+        let (second, views) = with_views(&catalog);
+        let copied = catalog.copy("street", None, "avenue").unwrap();
+        catalog.remove("street").unwrap();
+        assert_eq!(copied.manifest.views, second.manifest.views);
+        assert_eq!(catalog.views(&copied).unwrap(), views);
+        for (view, bytes) in views.iter().zip(IMAGES) {
+            assert_eq!(catalog.view_image(&copied, view).unwrap(), bytes);
+        }
+        assert_eq!(catalog.view_mask(&copied, &views[1]).unwrap().as_deref(), Some(MASK));
+        assert!(catalog.verify("avenue", &mut |_, _| {}).unwrap().damaged.is_empty());
+    });
+}
+
+#[test]
 fn images_are_garbage_with_their_last_version() {
     everywhere(|place| {
         let catalog = street(place);

@@ -48,7 +48,17 @@ async fn any_number_of_jobs_gives_the_same_bytes() {
     for jobs in [1, 2, 8] {
         let out = format!("jobs{jobs}");
         let result = bench.run(AgentChoice::BuiltIn(BuiltIn::Log), jobs, &out).await;
-        results.push((result.to_json(), junit(&result, &Ending::new(&result, None))));
+        let timed = junit(&result, &Ending::new(&result, None));
+        // Only the times differ: one of the suite, and one of each episode.
+        let pieces: Vec<&str> = timed.split(" time=\"").collect();
+        assert_eq!(pieces.len(), result.episodes.len() + 2, "{timed}");
+        let mut untimed = pieces[0].to_owned();
+        for piece in &pieces[1..] {
+            let (seconds, rest) = piece.split_once('"').unwrap();
+            assert!(seconds.parse::<f64>().unwrap() > 0.0, "{timed}");
+            untimed.push_str(rest);
+        }
+        results.push((result.to_json(), untimed));
     }
     assert_eq!(results[0], results[1]);
     assert_eq!(results[0], results[2]);
@@ -153,10 +163,17 @@ async fn the_report_shows_the_worst_episodes_with_pictures() {
     assert!(html.contains("progress at 2.000 s: 0.") && !html.contains("http://cdn"), "{html}");
     assert!(
         html.contains(
-            "Exit code 1: of 4 episodes: 0 not judged, 0 left the trained area, 4 failed"
+            "<b>Not passed</b>: of 4 episodes: 0 not judged, 0 left the trained area, 4 failed"
         ),
         "{html}"
     );
+    // The verdict, then the pictures with the way to see more, then tables.
+    let at = |text: &str| html.find(text).unwrap_or_else(|| panic!("no {text} in {html}"));
+    let first = [at("class=\"verdict failed\""), at("data:image/jpeg"), at("<h2>Scenarios")];
+    assert!(first.is_sorted(), "{first:?}");
+    assert!(html.contains("href=\"http://127.0.0.1:8080/#/episode/car-3-1\""), "{html}");
+    assert!(html.contains("wildcity serve --episodes /"), "{html}");
+    assert!(html.contains("name=\"viewport\""), "{html}");
     assert!(html.contains("Note: 2 of 4 episodes were driven as another one"), "{html}");
     assert!(html.contains("off_road: the scenario has no map"), "what was not judged: {html}");
     assert_eq!(html.matches("driven as car-3 was, and not counted").count(), 1, "{html}");
@@ -314,7 +331,7 @@ fn exit_codes_are_technical_before_driving() {
     let xml = junit(&rated, &ending);
     assert!(xml.contains("failures=\"1\"") && xml.contains("\"exit_code\" value=\"0\""), "{xml}");
     let html = page(&rated, &ending, &[], &bench.path("log"));
-    assert!(html.contains("Exit code 0: of 4 episodes: 0 not judged"), "{html}");
+    assert!(html.contains("<b>Passed</b>: of 4 episodes: 0 not judged"), "{html}");
     rated.at_least = Some(0.9);
     assert_eq!(code(&rated), ExitCode::Driving);
 }

@@ -13,7 +13,7 @@ const CRATES: &[(&str, &[&str])] = &[
     ("prost", &["src/alpasim", "src/episode/export"]),
     ("tonic", &["src/alpasim"]),
     ("tonic_prost", &["src/alpasim"]),
-    ("prometheus_client", &["src/server/metrics.rs"]),
+    ("prometheus_client", &["src/server/metrics.rs", "src/server/process.rs"]),
     ("bincode", &["src/twin/store/chunk_file.rs", "src/train/checkpoint.rs"]),
     (
         "fearless_simd",
@@ -50,6 +50,7 @@ const FILES: &[&str] = &[
     "src/suite",
     "src/server/audit.rs",
     "src/server/memory.rs",
+    "src/server/process.rs",
     "src/server/start.rs",
     "src/server/spool",
     "clients/rust/src/memory.rs",

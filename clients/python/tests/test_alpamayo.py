@@ -220,6 +220,24 @@ def test_a_route_has_twenty_waypoints() -> None:
         Alpamayo()(data, route=np.zeros((19, 3)))
 
 
+def test_the_text_of_the_route_is_the_instruction_of_model_1_5() -> None:
+    def with_text(text: str | None) -> Callable[[Metadata], None]:
+        route = {"points": [[0, 0, 0]], "command": "left", "station_m": 0.0, "off_m": 0.0, "length_m": 9.0}
+        return lambda metadata: metadata.update(route=route if text is None else {**route, "text": text})
+
+    assert alpamayo.nav_text(observation("1.5")) is None
+    assert alpamayo.nav_text(observation("1.5", with_text(None))) is None
+    seen = observation("1.5", with_text("Turn left in 40m"))
+    said = alpamayo.nav_text(seen)
+    assert said == "Turn left in 40m"
+    data = alpamayo.inputs(seen, "1.5")
+    Alpamayo("1.5")(data, nav_text=said)
+    with pytest.raises(ModelInputError, match="nav_text"):
+        Alpamayo("1.5")(data, nav_text="<|route_end|>")
+    with pytest.raises(ModelInputError, match="model 1.5 takes one"):
+        Alpamayo("1")(alpamayo.inputs(seen, "1"), nav_text=said)
+
+
 def test_an_answer_becomes_the_trajectory_of_the_same_arc() -> None:
     pred_xyz, pred_rot = Alpamayo(speed=8.0, curvature=0.05, samples=2)(alpamayo.inputs(observation("1.5")))
     assert (pred_xyz.shape, pred_rot.shape) == ((1, 1, 2, 64, 3), (1, 1, 2, 64, 3, 3))
@@ -285,7 +303,9 @@ def test_alpamayos_own_code_takes_the_dictionary() -> None:
     sys.path.insert(0, str(Path(checkout) / "src"))
     helper = importlib.import_module("alpamayo1_5.helper")
     data = alpamayo.as_torch(alpamayo.inputs(observation("1.5"), "1.5"))
-    _, user, _ = helper.create_message(data["image_frames"].flatten(0, 1), data["camera_indices"])
+    frames = data["image_frames"].flatten(0, 1)
+    _, user, _ = helper.create_message(frames, data["camera_indices"], nav_text="Turn left in 40m")
+    assert "Turn left in 40m" in user["content"][-1]["text"]
     texts = [part["text"].strip() for part in user["content"][:-1] if part["type"] == "text"]
     images = [part["image"] for part in user["content"] if part["type"] == "image"]
     frames = ["frame 0", "frame 1", "frame 2", "frame 3"]

@@ -190,7 +190,7 @@ def test_a_driver_follows_a_scenario_to_its_end(tmp_path: Path) -> None:
     assert route.shape == (20, 3) and route[:, 1] == pytest.approx([1.0] * 20, abs=0.01)
 
 
-def run_suite(folder: Path, agent: str) -> tuple[int, dict[str, Any]]:
+def run_suite(folder: Path, agent: str, **dynamics: Any) -> tuple[int, dict[str, Any]]:
     """Runs a scenario of 0.6 s along the corridor, and returns the exit code and result.json."""
     binary = os.environ["WILDCITY_BIN"]
     (folder / "rig.json").write_text(json.dumps(wildcity.protocol.encode(PAIR)))
@@ -201,7 +201,7 @@ def run_suite(folder: Path, agent: str) -> tuple[int, dict[str, Any]]:
         "twin": {"name": "corridor"},
         "ego": {
             "start": {"trajectory": "log", "station_m": 2.0},
-            "dynamics": {"model": "dynamic", "speed": 5.0},
+            "dynamics": {"model": "dynamic", "speed": 5.0, **dynamics},
         },
         "end": {"time_s": 0.6, "off_route_m": 10.0},
     }
@@ -216,6 +216,31 @@ def test_a_suite_judges_a_driver(tmp_path: Path) -> None:
     with driver(load_policy("route_follower")) as address:
         status, result = run_suite(tmp_path, f"egodriver:{address}")
     assert (status, result["agent"], result["counts"]["passed"]) == (0, f"egodriver:{address}", 1), result
+
+
+@pytest.mark.parametrize(
+    "dynamics", [{"speed": 3.0}, {"model": "kinematic", "speed": 0.0}, {"model": "teleport", "speed": 0.0}]
+)
+def test_the_scenario_says_how_the_ego_starts(tmp_path: Path, dynamics: dict[str, Any]) -> None:
+    # The recorded drive has 5 m/s.
+    recorder = Recorder()
+    with driver(recorder) as address:
+        status, result = run_suite(tmp_path, f"egodriver:{address}", **dynamics)
+    (episode,) = result["episodes"]
+    assert "errors" not in episode and result["counts"]["technical"] == 0, (status, result)
+    speed = recorder.states[0].linear_velocity.x
+    assert speed == pytest.approx(dynamics["speed"], abs=0.05)
+
+
+@pytest.mark.parametrize(("speed", "is_ordered"), [("5.004", True), ("4.9", False)])
+def test_an_agent_that_starts_at_another_speed_is_not_judged(tmp_path: Path, speed: str, is_ordered: bool) -> None:
+    with driver(load_policy("route_follower")) as address:
+        agent = f"{os.environ['WILDCITY_BIN']} drive --egodriver {address} --speed {speed}"
+        _, result = run_suite(tmp_path, agent)
+    (episode,) = result["episodes"]
+    said = [error["message"] for error in episode.get("errors", [])]
+    expected = [] if is_ordered else ["the agent opened with another dynamics.speed than WILDCITY_OPEN says"]
+    assert said == expected, result
 
 
 def test_a_suite_counts_a_broken_driver_as_not_driven(tmp_path: Path) -> None:

@@ -125,6 +125,8 @@ def test_an_export_is_read_by_the_mcap_package(
         ("/tf", "foxglove.FrameTransforms"): len(frames) + 1,
         ("/actors", "foxglove.SceneUpdate"): len(frames),
         ("/ego/odometry", "foxglove.Odometry"): len(frames),
+        ("/ego/pose", "foxglove.PoseInFrame"): len(frames),
+        ("/actors/poses", "foxglove.PosesInFrame"): len(frames),
         ("/ego/path", "foxglove.PosesInFrame"): 1,
         ("/plan", "foxglove.PosesInFrame"): len(frames) - 1,
         ("/route", "foxglove.PosesInFrame"): 1,

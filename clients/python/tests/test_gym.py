@@ -7,7 +7,8 @@ import stat
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -17,7 +18,7 @@ import wildcity.gym
 from gymnasium.utils.env_checker import check_env
 from test_end_to_end import PAIR, Server, import_corridor, server
 from wildcity import Drive, DrivePose, Pose, Refused, ServeFailed, Station, serving
-from wildcity.gym import DriveConfig, DriveEnv, DriveState, DriveVectorEnv, Route
+from wildcity.gym import DriveConfig, DriveEnv, DriveState, DriveVectorEnv, Reward, Route
 
 SMALL: dict[str, Any] = {"twin": "corridor", "rig": PAIR, "size": (32, 20), "horizon": 30, "speed": 5.0}
 STRAIGHT = np.zeros(2, np.float32)
@@ -50,6 +51,75 @@ def test_driving_straight_makes_progress(env: DriveEnv) -> None:
     assert seen["image_front"].shape == (20, 32, 3) and seen["image_front"].max() > 50
     picture = env.render()
     assert picture is not None and picture.shape == (20, 32, 3)
+
+
+def moved(speed: float, acceleration: float, events: int = 0) -> tuple[DriveState, DriveState]:
+    """States before and after a step of 0.1 s along a drive."""
+
+    def state(time_us: int, station_m: float) -> DriveState:
+        metadata = SimpleNamespace(time_us=time_us, events=[SimpleNamespace(kind="contact")] * events)
+        seen = SimpleNamespace(metadata=metadata, ego=SimpleNamespace(acceleration=(0.0, acceleration, 0.0)))
+        return DriveState(station_m, 0.5, speed, cast(Any, seen))
+
+    return state(0, 0.0), state(100_000, 0.1 * speed)
+
+
+def test_the_terms_of_the_reward() -> None:
+    terms = Reward().terms(*moved(20.0, -5.0, events=2))
+    limit = 50 / 3.6
+    expected = {"progress": 2.0, "beside": -0.05, "speeding": -0.2 * (20 - limit), "comfort": -0.1, "contact": -20.0}
+    assert terms == pytest.approx(expected)
+    assert Reward()(*moved(20.0, -5.0, events=2)) == pytest.approx(sum(expected.values()))
+    for name in expected:
+        off: dict[str, Any] = {name: 0.0}
+        assert Reward(**off).terms(*moved(20.0, -5.0, events=2)) == pytest.approx({**expected, name: 0.0})
+    gentle = Reward().terms(*moved(limit, 3.0))
+    assert gentle["speeding"] == gentle["comfort"] == 0.0
+
+
+def test_speeding_does_not_pay(server: Server) -> None:
+    """On the same 10 m, as fast as the car can go earns less than the recorded speed."""
+
+    def total(action: np.ndarray[Any, Any], **limits: float) -> float:
+        env = DriveEnv(server=server.url, **SMALL, reward=Reward(**limits))
+        env.reset(seed=1, options={"start": 0.0})
+        try:
+            rewards = 0.0
+            while True:
+                _, reward, terminated, truncated, _ = env.step(action)
+                rewards += reward
+                if terminated or truncated:
+                    return rewards
+        finally:
+            env.close()
+
+    full = np.array([1.0, 0.0], np.float32)
+    limits = {"speed_limit_m_s": 6.0}
+    assert total(full, **limits) < total(STRAIGHT, **limits) - 1.0
+    # Each of the two terms alone makes it so; without both it would not.
+    assert total(full, **limits, comfort=0.0) < total(STRAIGHT, **limits)
+    assert total(full, **limits, speeding=0.0) < total(STRAIGHT, **limits)
+    assert total(full, comfort=0.0, speeding=0.0) >= total(STRAIGHT) - 0.5
+
+
+@pytest.mark.parametrize("record", [False, True])
+def test_a_reset_leaves_a_record_only_if_asked_to(tmp_path: Path, record: bool) -> None:
+    import_corridor(tmp_path)
+    with wildcity.serve(tmp_path / "twins", episodes=tmp_path / "episodes") as running:
+        env = DriveEnv(server=running.url, **SMALL, **({"record": True} if record else {}))
+        for _ in range(2):
+            env.reset(seed=1)
+            env.step(STRAIGHT)
+        env.close()
+    assert len(list((tmp_path / "episodes").glob("*.jsonl"))) == (2 if record else 0)
+
+
+def test_a_twin_that_is_not_there_is_named(server: Server) -> None:
+    for kind in (DriveEnv, lambda **arguments: DriveVectorEnv(1, **arguments)):
+        env = kind(server=server.url, **{**SMALL, "twin": "nope"})
+        with pytest.raises(ValueError, match="there is no twin 'nope'; the server has corridor"):
+            env.reset(seed=1)
+        env.close()
 
 
 def test_an_episode_ends_off_the_route_at_its_end_and_at_the_horizon(server: Server) -> None:

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
+import json
 import os
+import re
+import shlex
 import subprocess
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import kubernetes_validate  # type: ignore[import-untyped]
 import pytest
+import wildcity
 import yaml  # type: ignore[import-untyped]
-from test_end_to_end import Server, server
+from test_end_to_end import import_corridor
 
+TOKEN = "a-token-of-the-fleet"
 MANIFESTS = Path(__file__).resolve().parents[2] / "kubernetes"
 KUSTOMIZATION = yaml.safe_load((MANIFESTS / "kustomization.yaml").read_text())
 RESOURCES = KUSTOMIZATION["resources"]
@@ -49,16 +59,143 @@ def test_all_select_the_same_pods() -> None:
     assert manifest("autoscaler.yaml")["spec"]["scaleTargetRef"]["name"] == "wildcity"
 
 
-def test_the_program_has_the_options_routes_and_metrics(server: Server) -> None:
+def container() -> Any:
+    (one,) = manifest("statefulset.yaml")["spec"]["template"]["spec"]["containers"]
+    return one
+
+
+def parsed(toml: str) -> dict[str, Any]:
+    """Texts and numbers, which TOML writes as JSON does. Python 3.10 has no module for TOML."""
+    return {name: json.loads(value) for name, value in re.findall(r"^(\w+) = (.+)$", toml, re.MULTILINE)}
+
+
+def options() -> dict[str, Any]:
+    """The options of the pods' servers."""
+    return parsed((MANIFESTS / "wildcity.toml").read_text())
+
+
+def test_the_program_has_the_options() -> None:
     binary = os.environ["WILDCITY_BIN"]
     printing = [binary, "serve", "--config", str(MANIFESTS / "wildcity.toml"), "--print-config"]
     done = subprocess.run(printing, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    (container,) = manifest("statefulset.yaml")["spec"]["template"]["spec"]["containers"]
-    for probe in ("startupProbe", "readinessProbe", "livenessProbe"):
-        assert server.get(container[probe]["httpGet"]["path"])[0] == 200
-    (metric,) = manifest("autoscaler.yaml")["spec"]["metrics"]
-    names = {line.split()[0] for line in server.get("/metrics")[1].splitlines()}
-    assert metric["pods"]["metric"]["name"] in names
-    hook = container["lifecycle"]["preStop"]["exec"]["command"][-1]
-    assert "/v1/sessions" in hook and '"session"' not in server.get("/v1/sessions")[1]
+    printed = parsed(done.stdout)
+    assert len(options()) > 10
+    for name, value in options().items():
+        assert printed[name] == value, name
+
+
+def test_ports_mounts_and_secrets_are_those_of_the_options() -> None:
+    pods = manifest("statefulset.yaml")["spec"]["template"]
+    ports = {port["name"]: port["containerPort"] for port in container()["ports"]}
+    assert options()["listen"] == f"0.0.0.0:{ports['http']}"
+    assert options()["metrics_listen"] == f"0.0.0.0:{ports['metrics']}"
+    annotations = pods["metadata"]["annotations"]
+    assert annotations["prometheus.io/port"] == str(ports["metrics"])
+    mounts = [mount["mountPath"] for mount in container()["volumeMounts"]]
+    for name in ("cache_dir", "episodes", "uploads", "tokens"):
+        assert any(options()[name].startswith(mount) for mount in mounts), name
+    # The image has a program, and no shell tools: nothing else runs in a pod.
+    assert "lifecycle" not in container()
+    # The server ends before it is killed.
+    grace_s = pods["spec"]["terminationGracePeriodSeconds"]
+    assert grace_s >= options()["sessions_end_s"] + 2 * 10 + 30
+    # A session that lost its connection can be resumed while its pod waits for it.
+    assert manifest("service.yaml")["spec"]["publishNotReadyAddresses"] is True
+
+
+def test_the_commands_of_the_readme_fit_the_manifests() -> None:
+    (block,) = re.findall(r"```\n(.*?)```", (MANIFESTS / "README.md").read_text(), re.DOTALL)
+    commands = [shlex.split(line) for line in block.replace("\\\n", " ").splitlines()]
+    namespace = manifest("namespace.yaml")["metadata"]["name"]
+    assert KUSTOMIZATION["namespace"] == namespace
+    kinds = [command[1:3] for command in commands]
+    # Secrets need the namespace, and pods the secrets.
+    assert kinds == [["apply", "-f"], ["create", "secret"], ["create", "secret"], ["apply", "-k"]]
+    root = MANIFESTS.parents[1]
+    assert root / commands[0][3] == MANIFESTS / "namespace.yaml" and root / commands[3][3] == MANIFESTS
+    made = {}
+    for command in commands[1:3]:
+        assert command[5:7] == ["--namespace", namespace]
+        literals = [value.split("=")[0] for flag, value in itertools.pairwise(command) if flag == "--from-literal"]
+        files = [value for flag, value in itertools.pairwise(command) if flag == "--from-file"]
+        made[command[4]] = {*literals, *files}
+    pod = manifest("statefulset.yaml")["spec"]["template"]["spec"]
+    (environment,) = container()["envFrom"]
+    (secret,) = (volume["secret"]["secretName"] for volume in pod["volumes"] if "secret" in volume)
+    assert made == {
+        secret: {Path(options()["tokens"]).name},
+        environment["secretRef"]["name"]: {"AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_REGION"},
+    }
+
+
+@contextlib.contextmanager
+def serving(folder: Path, *arguments: str) -> Iterator[tuple[subprocess.Popen[str], str, str]]:
+    """A server with tokens and a listener for metrics: its process and the addresses of both listeners."""
+    tokens = {"tokens": [{"name": "fleet", "role": "drive", "token": TOKEN}]}
+    (folder / "tokens.json").write_text(json.dumps(tokens))
+    command = [os.environ["WILDCITY_BIN"], "serve", "--tokens", str(folder / "tokens.json"), "--listen", "127.0.0.1:0"]
+    command += ["--metrics-listen", "127.0.0.1:0", "--backend", "cpu", "--mcap", "false", *import_corridor(folder)]
+    command += ["--episodes", str(folder / "episodes"), "--uploads", str(folder / "uploads"), *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None and process.stderr is not None
+            url = process.stdout.readline().split()[-1]
+            for line in process.stderr:
+                if "metrics at" in line:
+                    break
+            yield process, url, line.split("metrics at ")[1].strip().removesuffix("/metrics")
+        finally:
+            process.kill()
+
+
+def status(address: str) -> int:
+    try:
+        with urllib.request.urlopen(address, timeout=30) as answer:
+            return int(answer.status)
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def test_probes_and_prometheus_need_no_token(tmp_path: Path) -> None:
+    with serving(tmp_path) as (_, url, metrics):
+        served = url.replace("ws://", "http://").removesuffix("/v1/session")
+        assert status(f"{served}/metrics") == 401
+        (metric,) = manifest("autoscaler.yaml")["spec"]["metrics"]
+        path = manifest("statefulset.yaml")["spec"]["template"]["metadata"]["annotations"]["prometheus.io/path"]
+        with urllib.request.urlopen(metrics + path, timeout=30) as answer:
+            text = answer.read().decode()
+        assert metric["pods"]["metric"]["name"] in {line.split()[0] for line in text.splitlines()}
+        assert "corridor" not in text and "fleet" not in text
+        for probe in ("startupProbe", "readinessProbe", "livenessProbe"):
+            asked = container()[probe]["httpGet"]
+            assert asked["port"] == "metrics" and status(metrics + asked["path"]) == 200
+        # Everything else needs the first listener.
+        assert status(f"{metrics}/v1/twins") == 404
+
+
+def test_a_pod_that_stops_waits_for_its_sessions(tmp_path: Path) -> None:
+    with serving(tmp_path, "--sessions-end-s", "60") as (process, url, metrics):
+        with wildcity.connect(url, token=TOKEN) as client:
+            with client.open("corridor") as session:
+                session.reset()
+                process.terminate()
+                while status(f"{metrics}/readyz") == 200:
+                    pass
+                with wildcity.connect(url, token=TOKEN) as other, pytest.raises(wildcity.Refused) as refused:
+                    other.open("corridor")
+                assert refused.value.code == "shutting_down"
+                assert session.step(wildcity.Pose((1.0, 0.0, 0.0))).metadata.step == 1
+                assert process.poll() is None
+            assert process.wait(timeout=30) == 0
+
+
+def test_a_second_signal_ends_the_wait(tmp_path: Path) -> None:
+    with serving(tmp_path, "--sessions-end-s", "600") as (process, url, metrics):
+        client = wildcity.connect(url, token=TOKEN)
+        client.open("corridor").reset()
+        process.terminate()
+        while status(f"{metrics}/readyz") == 200:
+            pass
+        process.terminate()
+        assert process.wait(timeout=30) == 0

@@ -20,6 +20,7 @@ ROOT = CLIENT.parents[1]
 sys.path.insert(0, str(CLIENT))
 
 import build_wheel  # noqa: E402
+import third_party  # noqa: E402
 
 
 def field(file: Path, name: str) -> str:
@@ -54,6 +55,17 @@ def test_a_wheel_carries_the_program(reader: dict[str, str], tmp_path: Path, mon
     with zipfile.ZipFile(wheel) as archive:
         assert archive.testzip() is None
         assert "wildcity/py.typed" in archive.namelist()
+        info = next(name.partition("/")[0] for name in archive.namelist() if ".dist-info/" in name)
+        for name in ("LICENSE-APACHE", "LICENSE-MIT", "NOTICE"):
+            assert archive.read(f"{info}/licenses/{name}") == (ROOT / name).read_bytes()
+        others = archive.read(f"{info}/licenses/THIRD-PARTY").decode()
+        metadata = archive.read(f"{info}/METADATA").decode()
+    # A crate with a file of its licence, one without, and one of the tests, which is not in the program.
+    assert "\nserde 1." in others and "\nmcap 0." in others and "Copyright (c) the authors of mcap" in others
+    assert "\ntempfile-test" not in others and "\nrcgen " not in others
+    assert "Permission is hereby granted" in others and "Apache License" in others
+    assert metadata.count("License-File: ") == 4 and "License-File: THIRD-PARTY\n" in metadata
+    assert "](../" not in metadata, "a link that leads nowhere"
     venv.create(tmp_path / "venv")
     bin_dir = tmp_path / "venv" / "bin"
     # By the pip of this environment, which need not be installed in that one first.
@@ -106,10 +118,54 @@ def test_a_program_of_another_version_is_refused(tmp_path: Path, monkeypatch: py
     assert not (tmp_path / "dist").exists()
 
 
+def test_links_of_the_description_lead_to_the_repository() -> None:
+    metadata = (
+        "Name: wildcity\n\nSee [the docs](../../docs/gym.md#reward), [this](README.md) and [web](https://a.example/b)."
+    )
+    absolute = build_wheel.with_absolute_links(metadata, "https://host.example/o/wildcity/", "1.2.3")
+    at = "https://host.example/o/wildcity/blob/v1.2.3"
+    assert absolute == (
+        f"Name: wildcity\n\nSee [the docs]({at}/docs/gym.md#reward), [this]({at}/clients/python/README.md) "
+        "and [web](https://a.example/b)."
+    )
+    assert build_wheel.with_absolute_links(metadata, None, "1.2.3").endswith(
+        "See the docs, this and [web](https://a.example/b)."
+    )
+    with pytest.raises(ValueError, match=r"nowhere\.md, which does not exist"):
+        build_wheel.with_absolute_links("\n\n[x](../../nowhere.md)", None, "1.2.3")
+
+
+def test_a_crate_without_a_licence_is_refused(tmp_path: Path) -> None:
+    crate = {
+        "name": "odd",
+        "version": "1.0.0",
+        "license": "BSD-3-Clause",
+        "manifest_path": str(tmp_path / "Cargo.toml"),
+    }
+    with pytest.raises(ValueError, match="odd has no file of its licence 'BSD-3-Clause'"):
+        third_party.text_of([crate])
+    (tmp_path / "LICENSES").mkdir()
+    (tmp_path / "LICENSES" / "BSD.txt").write_text("Redistribution and use")
+    assert third_party.text_of([crate]).endswith("odd 1.0.0:\n\nRedistribution and use\n")
+
+
+def test_there_is_no_sdist(tmp_path: Path) -> None:
+    program = f"import sys; sys.path.insert(0, {str(CLIENT)!r}); import build_backend; build_backend.build_sdist('.')"
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 1 and "wildcity has no sdist" in done.stderr, done.stderr
+    assert list(tmp_path.iterdir()) == []
+    assert 'build-backend = "build_backend"' in (CLIENT / "pyproject.toml").read_text()
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="glibc is of Linux")
 def test_the_newest_glibc_symbol_gives_the_platform() -> None:
     tag = build_wheel.platform_tag(b"x GLIBC_2.9\0GLIBC_2.35\0GLIBC_2.17\0")
     assert tag.startswith("manylinux_2_35_")
+    assert build_wheel.platform_tag(b"GLIBC_2.28\0", 28).startswith("manylinux_2_28_")
+    with pytest.raises(
+        ValueError, match=r"needs glibc 2\.29, and the wheel is for 2\.28: build it with `cargo zigbuild"
+    ):
+        build_wheel.platform_tag(b"GLIBC_2.29\0", 28)
     with pytest.raises(ValueError, match="names no glibc"):
         build_wheel.platform_tag(b"static")
 

@@ -70,7 +70,7 @@ class Player {
       this.version = frame.version;
       const outputs = { encoding: "jpeg", quality: 88 };
       await this.client.open({
-        twin, profile, outputs, version: frame.version, session: viewerSession("seek"), rig: { name: "recorded", cameras },
+        twin, profile, outputs, version: frame.version, session: viewerSession("seek"), record: false, rig: { name: "recorded", cameras },
       });
     }
     const observation = await this.client.observation({ type: "observe", poses: [frame.pose] });

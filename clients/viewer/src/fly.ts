@@ -84,6 +84,7 @@ export class FlyPage implements Page {
       const opened = await this.client.open({
         twin: twinName,
         session: viewerSession("fly"),
+        record: false,
         rig: { name: "free", cameras: [camera] },
         outputs: { encoding: "jpeg", quality: 88, trust: twin.trajectories.length > 0 },
       });

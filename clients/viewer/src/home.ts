@@ -8,6 +8,7 @@ import type { TwinInfo } from "./messages";
 import { get, roleOfToken } from "./server";
 import type { Role } from "./server";
 import { isViewers } from "./session";
+import { Thumbnails } from "./thumbnails";
 
 interface Session {
   session: string;
@@ -36,6 +37,7 @@ export class HomePage implements Page {
   readonly element = el("div.home");
   private readonly adder = new Adder(() => void this.load());
   private readonly twins = el("section");
+  private readonly thumbnails = new Thumbnails();
   private readonly sessions = el("section");
   /** For tokens that cannot list sessions. */
   private readonly own = el("section", { hidden: true });
@@ -56,6 +58,7 @@ export class HomePage implements Page {
   end(): void {
     this.ended = true;
     clearTimeout(this.timer);
+    this.thumbnails.end();
   }
 
   private async load(): Promise<void> {
@@ -98,14 +101,15 @@ export class HomePage implements Page {
   }
 
   private showTwins(twins: TwinInfo[], damaged: { name: string; reason: string }[], role: Role | undefined): void {
-    const rows = twins.map((twin) => {
+    const rows = twins.flatMap((twin) => {
       const recorded = twin.trajectories.map(({ name, length_m: length }) => `${name} ${fixed(length, 0)} m`).join(", ");
       const link = (kind: string, text: string): HTMLElement => el("a.action", { href: `#/${kind}/${twin.name}` }, text);
       // Placing makes a version, which the role drive may not.
       const actions = [link("drive", "Drive"), link("fly", "Free camera"), ...(role === "drive" ? [] : [link("place", "Place a drive")])];
       const name = el("a.name", { href: `#/drive/${twin.name}` }, twin.name);
-      return el("tr", {}, el("td", {}, name), el("td.number", {}, `v${twin.version}`),
+      const row = el("tr", {}, el("td", {}, name), el("td.number", {}, `v${twin.version}`),
         el("td.number", {}, count(twin.gaussians)), el("td.drives", {}, recorded || "no recorded drive"), el("td.actions", {}, ...actions));
+      return [row, el("tr.shown", {}, el("td", { colSpan: 5 }, this.thumbnails.of(twin)))];
     });
     const broken = damaged.map(({ name, reason }) => el("p.bad", {}, `${name} is damaged: ${reason}`));
     const head = ["twin", "version", "Gaussians", "recorded drives", ""].map((text) => el("th", {}, text));

@@ -18,6 +18,9 @@ export interface Dynamics {
 /** How the ego moves. */
 export type DynamicsChoice = Model | Dynamics;
 
+/** Which versions of its twin a session shows by itself. */
+export type Follow = "latest";
+
 /** Encoding of colour images. */
 export type Encoding = "jpeg" | "png" | "raw";
 
@@ -705,6 +708,7 @@ export interface Metadata {
   geo?: Geo;
   history?: ImageInfo[];
   images: ImageInfo[];
+  newer_version?: number;
   profile_hash: string;
   residency: Residency;
   route?: Route;

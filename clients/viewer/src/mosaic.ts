@@ -150,7 +150,7 @@ function fromLeft({ yaw }: Cell): number {
   return isRear ? 0.001 : -yaw;
 }
 
-async function decode(observation: Observation, image: ImageInfo): Promise<ImageBitmap | ImageData> {
+export async function decode(observation: Observation, image: ImageInfo): Promise<ImageBitmap | ImageData> {
   const bytes = observation.bytes(image);
   if (image.encoding === "raw") {
     const pixels = new ImageData(image.width, image.height);

@@ -132,7 +132,7 @@ export class PlacePage implements Page {
       const focal = this.focal;
       const camera = { name: "free", width: w, height: h, fx: focal, fy: focal, cx: w / 2, cy: h / 2, camera_to_rig: RIG_FROM_CAMERA };
       await this.client.open({
-        twin: this.twin, version: this.version, session: viewerSession("place"),
+        twin: this.twin, version: this.version, session: viewerSession("place"), record: false,
         rig: { name: "free", cameras: [camera] }, outputs: { encoding: "jpeg", quality: 88, depth: true },
       });
       this.canvas.width = w;

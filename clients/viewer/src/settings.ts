@@ -1,7 +1,8 @@
 // What the driver can choose; remembered by the browser.
 
-import { el } from "./dom";
+import { el, messageOf } from "./dom";
 import { clamp } from "./pose";
+import { get } from "./server";
 
 const KEY = "wildcity-settings";
 const WIDTHS = [320, 480, 640, 960, 1280, 99_999];
@@ -29,6 +30,16 @@ export function parseStored(text: string | null): Stored {
   return stored;
 }
 
+/** Adds the scenarios of the server. */
+async function fillScenarios(select: HTMLSelectElement): Promise<void> {
+  try {
+    const { scenarios } = await get<{ scenarios: string[] }>("v1/scenarios");
+    select.append(...scenarios.map((name) => el("option", { value: name }, name)));
+  } catch (error) {
+    select.title = `The scenarios cannot be listed: ${messageOf(error)}`;
+  }
+}
+
 export class Settings {
   readonly element: HTMLElement;
   keepsPace: boolean;
@@ -45,7 +56,8 @@ export class Settings {
     this.keepsPace = stored.pace ?? true;
     const quality = el("input", { type: "number", min: "1", max: "100", value: String(this.quality) });
     const pace = el("input", { type: "checkbox", checked: this.keepsPace });
-    const scenario = el("input", { type: "text", placeholder: "none", spellcheck: false });
+    const scenario = el("select", {}, el("option", { value: "" }, "none"));
+    void fillScenarios(scenario);
     const change = (then: () => void) => (): void => {
       then();
       this.store();
@@ -53,7 +65,7 @@ export class Settings {
     };
     this.widths.addEventListener("change", change(() => (this.chosenWidth = Number(this.widths.value))));
     quality.addEventListener("change", change(() => (this.quality = clamp(Math.round(Number(quality.value)) || 85, 1, 100))));
-    scenario.addEventListener("change", change(() => (this.scenario = scenario.value.trim())));
+    scenario.addEventListener("change", change(() => (this.scenario = scenario.value)));
     pace.addEventListener("change", () => {
       this.keepsPace = pace.checked;
       this.store();
@@ -62,7 +74,7 @@ export class Settings {
     this.element = el("details.settings", {}, el("summary", {}, "Settings"),
       label("width of the front image", "Smaller images are faster; the other cameras are smaller still", this.widths),
       label("JPEG quality", "1 to 100", quality),
-      label("scenario", "Name of a scenario of the server", scenario),
+      label("scenario", "One of the server's scenarios", scenario),
       label("keep pace", "On a slow server, render fewer images rather than slow time down", pace));
     this.list();
   }

@@ -1,5 +1,7 @@
 // Addresses, settings, new twins and reports.
 import assert from "node:assert/strict";
+import { mkdir, writeFile } from "node:fs/promises";
+import { join } from "node:path";
 import { after, before, test } from "node:test";
 import { home, launch, open, scene, serve, steps } from "./wildcity.mjs";
 
@@ -41,6 +43,28 @@ test("a damaged address has a message, and ends the page before", async () => {
   await close();
 });
 
+test("the first page shows each twin ahead and from above, and leaves nothing", async () => {
+  const before = (await (await fetch(`${server.url}v1/episodes`)).json()).episodes.length;
+  const { page, complaints, close } = await open(browser, server, "#/");
+  await page.waitForSelector(".pictures canvas:nth-child(2)");
+  const pictures = await page.$$eval(".pictures canvas", (all) => all.map((canvas) => {
+    const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+    return { text: canvas.title, hash: canvas.dataset.hash, colours: new Set(data).size };
+  }));
+  assert.deepEqual(pictures.map(({ text }) => text), ["demo ahead", "demo from above, with its recorded drives"]);
+  assert.notEqual(pictures[0].hash, pictures[1].hash);
+  assert(pictures.every(({ colours }) => colours > 100), JSON.stringify(pictures));
+  await until(async () => (await sessions()).length === 0);
+  const { episodes } = await (await fetch(`${server.url}v1/episodes`)).json();
+  assert.equal(episodes.length, before);
+  // The list is made again after 3 s, with the same pictures.
+  const first = await page.$(".pictures canvas");
+  await page.waitForTimeout(3500);
+  assert(await first.evaluate((canvas) => canvas.isConnected));
+  assert.deepEqual(complaints, []);
+  await close();
+});
+
 test("damaged settings do not stop the drive", async () => {
   const { page, complaints, close } = await open(browser, server);
   await page.evaluate(() => localStorage.setItem("wildcity-settings", '{"width": 4'));
@@ -65,6 +89,26 @@ test("damaged settings do not stop the drive", async () => {
     assert.ok(isFree, `${modifier} and left is taken`);
   }
   assert.equal(await at(), "1");
+  await close();
+});
+
+test("a scenario is chosen from those of the server", async () => {
+  const scenario = {
+    format: "wildcity.scenario/1", name: "brief", twin: { name: "demo" },
+    ego: { start: { trajectory: "log", station_m: 20 }, dynamics: { model: "dynamic", speed: 3 } }, end: { time_s: 60 },
+  };
+  await mkdir(join(place.folder, "scenarios"), { recursive: true });
+  await writeFile(join(place.folder, "scenarios", "brief.json"), JSON.stringify(scenario));
+  const { page, complaints, close } = await open(browser, server, "#/drive/demo");
+  await steps(page, 1);
+  await page.click("text=Settings");
+  await page.getByLabel("scenario").selectOption("brief");
+  await steps(page, 2);
+  const session = await page.getAttribute(".view", "data-session");
+  await page.click("#home");
+  await page.waitForSelector(`text=${session}-1`);
+  await page.waitForSelector("text=brief");
+  assert.deepEqual(complaints, []);
   await close();
 });
 

@@ -44,7 +44,6 @@ pub struct EpisodeSettings {
     /// `HOST:PORT` of the driver.
     pub driver: String,
     /// Options of the session: twin, version, rig, scenario, times. Its outputs are not used.
-    /// Without dynamics, the ego is `model` at `speed_m_s`.
     pub open: Open,
     /// Name of the drive to follow; if absent, the drive of the start, or else the first one of the
     /// twin.
@@ -55,9 +54,11 @@ pub struct EpisodeSettings {
     pub cameras: Option<Vec<String>>,
     /// Width and height of the images, in pixels; those of the rig if absent.
     pub size_px: Option<[u32; 2]>,
-    /// How the ego moves.
-    pub model: DynamicsModel,
-    /// Speed at the start, in m/s; as recorded if absent.
+    /// How the ego moves. If this and the speed are absent, as the scenario says; without a
+    /// scenario, `dynamic`.
+    pub model: Option<DynamicsModel>,
+    /// Speed at the start, in m/s. If this and the model are absent, that of the scenario; without
+    /// a scenario, the recorded one.
     pub speed_m_s: Option<f64>,
     /// Frames of each camera before the first decision.
     pub frames: u32,
@@ -236,11 +237,15 @@ fn open(settings: &EpisodeSettings, drive: &Drive) -> Open {
             (name.clone(), ImagePart { crop: None, size })
         })
     });
-    let dynamics = || {
-        let speed = settings.speed_m_s.unwrap_or_else(|| recorded_speed_m_s(drive, settings));
-        DynamicsChoice::Full(Dynamics { model: settings.model, speed, reverse: false })
-    };
     let given = &settings.open;
+    // A scenario says how its ego moves, as it says where it starts.
+    let is_of_scenario =
+        given.scenario.is_some() && settings.model.is_none() && settings.speed_m_s.is_none();
+    let dynamics = || {
+        let model = settings.model.unwrap_or(DynamicsModel::Dynamic);
+        let speed = settings.speed_m_s.unwrap_or_else(|| recorded_speed_m_s(drive, settings));
+        DynamicsChoice::Full(Dynamics { model, speed, reverse: false })
+    };
     Open {
         seed: settings.seed,
         start: start.or_else(|| given.start.clone()),
@@ -250,8 +255,7 @@ fn open(settings: &EpisodeSettings, drive: &Drive) -> Open {
             frames: Some(u64::from(settings.frames)),
             ..Outputs::default()
         },
-        // Trajectories need a vehicle that follows them, so there are dynamics in any case.
-        dynamics: Some(given.dynamics.unwrap_or_else(dynamics)),
+        dynamics: given.dynamics.or_else(|| (!is_of_scenario).then(dynamics)),
         ..given.clone()
     }
 }

@@ -1,6 +1,6 @@
 //! `wildcity actor cut`.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
@@ -19,6 +19,7 @@ use wildcity_twin::store::{Catalog, CutPlace, Version};
 
 use super::asset_options::parse_class;
 use crate::cli::directories::{TwinVersion, Twins};
+use crate::cli::output;
 
 /// Cut the Gaussians in a box out of a twin: makes a new version without them, and an asset of
 /// exactly these Gaussians.
@@ -114,7 +115,7 @@ impl Cut {
         let option = format!("cut={} tracks at {} places", file.tracks.len(), places.len());
         let cut = catalog.cut_all(base, &places, option)?;
         writeln!(
-            io::stdout().lock(),
+            output::stdout(),
             "twin {} version {}: without {} Gaussians that {} tracks swept\nblake3 {}",
             self.twin.name,
             cut.version.number,
@@ -141,7 +142,7 @@ impl Cut {
         let asset = ActorAsset::new(&cut.gaussians, description).context("cannot make an asset")?;
         let stored = catalog.put_actor(&asset, RecordFormat::F32)?;
         writeln!(
-            io::stdout().lock(),
+            output::stdout(),
             "twin {} version {}: without {} Gaussians\nblake3 {}\nactor {}: {} Gaussians, {:.1} MB\nblake3 {}",
             self.twin.name,
             cut.version.number,

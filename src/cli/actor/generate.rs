@@ -1,10 +1,11 @@
 //! `wildcity actor generate`.
 
-use std::io::{self, Write};
+use std::io::Write;
 
 use wildcity_session::generated_actors;
 
 use crate::cli::directories::Twins;
+use crate::cli::output;
 
 /// Make the assets of actors that name none: a hatchback, a sedan, a van, a truck, a bus, a
 /// pedestrian, a cyclist and a crate.
@@ -25,7 +26,7 @@ pub(super) struct Generate {
 
 impl Generate {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         for actor in generated_actors(&self.twins.catalog()?).map_err(anyhow::Error::msg)? {
             writeln!(
                 out,

@@ -20,6 +20,7 @@ use super::asset_options::{AssetOptions, name_from};
 use super::summary::Summary;
 use crate::cli::directories::Twins;
 use crate::cli::file_notes;
+use crate::cli::output;
 use crate::cli::packed_folder::scene_file;
 use crate::cli::progress;
 
@@ -133,5 +134,5 @@ fn print(stored: &StoredActor) -> io::Result<()> {
         bytes: stored.bytes,
         hash: &stored.hash,
     };
-    writeln!(io::stdout().lock(), "{summary}")
+    writeln!(output::stdout(), "{summary}")
 }

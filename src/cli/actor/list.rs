@@ -1,11 +1,12 @@
 //! `wildcity actor list`.
 
-use std::io::{self, Write};
+use std::io::Write;
 
 use wildcity_scene::ActorBox;
 use wildcity_twin::store::{ActorList, DamagedActor};
 
 use crate::cli::directories::Twins;
+use crate::cli::output;
 
 /// List the assets of actors: name, class, size, Gaussians, and hash. An asset that cannot be read
 /// is listed as damaged with the reason: make it again, or remove it, unless the disk or the object
@@ -24,7 +25,7 @@ impl List {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let catalog = self.twins.catalog()?;
         let ActorList { actors, damaged } = catalog.actors()?;
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         if actors.is_empty() && damaged.is_empty() {
             writeln!(
                 out,

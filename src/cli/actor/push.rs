@@ -11,6 +11,7 @@ use wildcity_scene::ActorClass as Class;
 
 use super::asset_options::AssetOptions;
 use super::summary::Summary;
+use crate::cli::output;
 use crate::cli::progress;
 use crate::cli::push::{Server, upload_all};
 
@@ -92,5 +93,5 @@ fn print(actor: &ActorAsset) -> io::Result<()> {
         bytes: actor.bytes,
         hash: &actor.hash,
     };
-    writeln!(io::stdout().lock(), "{summary}")
+    writeln!(output::stdout(), "{summary}")
 }

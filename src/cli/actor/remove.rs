@@ -1,10 +1,11 @@
 //! `wildcity actor remove`.
 
-use std::io::{self, Write};
+use std::io::Write;
 
 use anyhow::Context as _;
 
 use crate::cli::directories::Twins;
+use crate::cli::output;
 
 /// Remove an asset, to free disk space or its name.
 ///
@@ -34,7 +35,7 @@ impl Remove {
         let removed = catalog.remove_actor(&self.actor, self.dry_run);
         let hash = removed.with_context(|| format!("{}", catalog.dir().display()))?;
         let removed = if self.dry_run { "would remove" } else { "removed" };
-        writeln!(io::stdout(), "{removed} actor {}\nblake3 {hash}", self.actor)?;
+        writeln!(output::stdout(), "{removed} actor {}\nblake3 {hash}", self.actor)?;
         Ok(())
     }
 }

@@ -1,6 +1,6 @@
 //! `wildcity actor show`.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::PathBuf;
 
 use anyhow::Context as _;
@@ -59,7 +59,7 @@ impl Show {
             };
             output::write(path, &png)?;
         }
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         if self.json {
             let json = serde_json::json!({
                 "hash": actor.hash,

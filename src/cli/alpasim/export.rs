@@ -1,6 +1,6 @@
 //! `wildcity alpasim export`.
 
-use std::io::{self, Cursor, Write};
+use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
@@ -9,7 +9,7 @@ use zip::{CompressionMethod, ZipWriter};
 
 use crate::cli::directories::Twins;
 use crate::cli::output;
-use wildcity_alpasim::export::{ExportError, SceneContent, files};
+use wildcity_alpasim::export::{ExportError, SceneContent, deploy, files};
 use wildcity_alpasim::scene::SceneId;
 use wildcity_alpasim::sensorsim::offered_cameras;
 use wildcity_scene::ActorBox;
@@ -18,8 +18,8 @@ use wildcity_twin::store::Catalog;
 
 /// Write scenes of a twin as the files that AlpaSim's runtime reads: rig, cameras, tracks and map.
 ///
-/// Writes one file per scene, TWIN@VERSION+TRAJECTORY+START_M.usdz, and prints what AlpaSim's
-/// configuration needs. The images come from `wildcity serve --alpasim`.
+/// Writes one file per scene, TWIN@VERSION+TRAJECTORY+START_M.usdz, and `deploy/wildcity.yaml` for
+/// AlpaSim's wizard. The images come from `wildcity serve --alpasim`.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Example:
@@ -33,6 +33,10 @@ pub(super) struct Export {
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
 
+    /// Where AlpaSim finds `wildcity serve --alpasim`.
+    #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:6000", value_parser = address)]
+    address: String,
+
     /// Distance between the starts of two scenes along a drive, in metres.
     #[arg(long, value_name = "M", default_value_t = 200.0, value_parser = positive)]
     every_m: f64,
@@ -41,8 +45,8 @@ pub(super) struct Export {
     #[arg(long, value_name = "S", default_value_t = 20.0, value_parser = positive)]
     length_s: f64,
 
-    /// Recorded traffic, a file of format wildcity.tracks/1 on the clock of the drive. A track
-    /// without an asset becomes a grey box of its size.
+    /// Recorded traffic, a file of format wildcity.tracks/1 on the clock of the drive. Assets are
+    /// given by name or hash; a track without an asset becomes a grey box of its size.
     #[arg(long, value_name = "FILE")]
     tracks: Option<PathBuf>,
 
@@ -65,7 +69,7 @@ impl Export {
         let cameras = offered_cameras(manifest);
         let content =
             SceneContent { cameras: &cameras, tracks: tracks.as_ref(), length_s: self.length_s };
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         for drive in &manifest.trajectories {
             let starts = (drive.length_m() / self.every_m).floor() as u32;
             for start in 0..=starts {
@@ -76,8 +80,8 @@ impl Export {
                     start_m: f64::from(start) * self.every_m,
                 };
                 let scene = match files(&id, manifest, &version.hash, content) {
-                    // A drive may end less than two poses after the last start.
-                    Err(ExportError::Short { .. }) if start > 0 && start == starts => continue,
+                    // A drive may end soon after its last starts.
+                    Err(ExportError::Short { .. }) if start > 0 => continue,
                     other => other?,
                 };
                 let path = self.out.join(format!("{id}.usdz"));
@@ -85,16 +89,18 @@ impl Export {
                 writeln!(out, "{}", path.display())?;
             }
         }
+        // The wizard runs in a folder of its own.
+        let folder = std::path::absolute(&self.out)?;
+        let scenes =
+            folder.to_str().with_context(|| format!("{} is not UTF-8", folder.display()))?;
+        let deploy_dir = folder.join("deploy");
+        output::create_dir(&deploy_dir)?;
+        output::write(&deploy_dir.join("wildcity.yaml"), deploy(scenes, &self.address).as_bytes())?;
         writeln!(
             out,
-            "AlpaSim: physics=disabled ego_mask_rig_config_id=null \
-             wizard.external_services.renderer=[HOST:6000]"
+            "AlpaSim: alpasim_wizard --config-dir {scenes} deploy=wildcity topology=1gpu driver=DRIVER"
         )?;
-        writeln!(
-            out,
-            "To put vehicles on the ground of the drives, in place of physics=disabled: \
-             wizard.external_services.physics=[HOST:6000]"
-        )?;
+        writeln!(out, "Without the ground of the drives: +physics=disabled")?;
         Ok(())
     }
 }
@@ -108,6 +114,7 @@ fn tracks(path: &Path, catalog: &Catalog) -> anyhow::Result<TracksFile> {
             let found =
                 catalog.find_actor(hash).with_context(|| format!("track {:?}", track.id))?;
             let ActorBox { length_m, width_m, height_m } = found.description.box_;
+            track.asset = Some(found.hash);
             track.size = [length_m, width_m, height_m];
         }
     }
@@ -129,5 +136,14 @@ fn positive(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(number) if number > 0.0 && number.is_finite() => Ok(number),
         _ => Err("expected a positive number".to_owned()),
+    }
+}
+
+/// A host and a port, as AlpaSim's configuration has them.
+fn address(text: &str) -> Result<String, String> {
+    let port = text.rsplit_once(':').filter(|(host, _)| !host.is_empty()).map(|(_, port)| port);
+    match port.map(str::parse::<u16>) {
+        Some(Ok(1..)) => Ok(text.to_owned()),
+        _ => Err("expected HOST:PORT, for example 127.0.0.1:6000".to_owned()),
     }
 }

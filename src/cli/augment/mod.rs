@@ -209,7 +209,7 @@ impl Augment {
         let is_repaired = |sample: &&Sample| {
             sample.repair.as_ref().is_some_and(|repair| repair.status == "repaired")
         };
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         writeln!(
             out,
             "round {}: {} images of {cameras} cameras at {} m beside the drives; {} repaired, {kept} from an earlier run; \

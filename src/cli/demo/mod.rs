@@ -285,7 +285,7 @@ impl Demo {
         }
         let path = self.out.join("report.json");
         output::write(&path, format!("{report:#}\n").as_bytes())?;
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         writeln!(
             out,
             "drove {} steps of six cameras: median {:.0} ms a step, 95 % within {:.0} ms",

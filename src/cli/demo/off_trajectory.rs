@@ -1,7 +1,7 @@
 //! `wildcity demo --off-trajectory`: views off the drive from a degraded copy of the street, as
 //! rendered and repaired.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::Path;
 
 use wildcity_eval::BesideViews;
@@ -28,7 +28,7 @@ pub(super) fn model(dir: &Path, options: LoadOptions) -> anyhow::Result<Models> 
 
 /// Writes a picture for each station, and prints a table.
 pub(super) fn show(views: &BesideViews, dir: &Path) -> anyhow::Result<()> {
-    let mut table = io::stdout().lock();
+    let mut table = output::stdout();
     let names = views.cameras.map(|name| format!("{name:>12}")).join("");
     writeln!(table, "{:<10} {names}", "PSNR in dB")?;
     for (kind, psnr_db) in &views.psnr_db {

@@ -1,6 +1,6 @@
 //! `wildcity episode compare`.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::PathBuf;
 
 use wildcity_suite::{Comparison, SuiteResult, Tolerance};
@@ -65,7 +65,7 @@ impl Compare {
             }
         }
         let conclusion = comparison.conclusion();
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         write!(out, "{}", comparison.to_text())?;
         if comparison.worse {
             return Err(Exit::finding(1, conclusion).into());

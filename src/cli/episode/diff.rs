@@ -1,12 +1,13 @@
 //! `wildcity episode diff`.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::PathBuf;
 
 use wildcity_episode::{What, diff};
 
 use crate::cli::directories::Episodes;
 use crate::cli::exit::Exit;
+use crate::cli::output;
 
 /// Compare two episodes: the first step at which command, ego, actor or image differ.
 ///
@@ -47,7 +48,7 @@ impl Diff {
             return Err(Exit::finding(1, text).into());
         }
         let steps = a.driven().last().map_or(0, |frame| frame.step);
-        writeln!(io::stdout().lock(), "alike       {steps} steps")?;
+        writeln!(output::stdout(), "alike       {steps} steps")?;
         Ok(())
     }
 }

@@ -17,6 +17,7 @@ use wildcity_twin::residency::Cache;
 
 use crate::cli::backend_options::BackendOptions;
 use crate::cli::directories::{Episodes, Twins};
+use crate::cli::output;
 use crate::cli::progress;
 
 use super::kept::{camera_index, driven, keep_cameras};
@@ -95,7 +96,7 @@ impl Export {
         } else {
             (self.without_images(&path)?, None)
         };
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         let what = if self.nuscenes.is_some() { "rows" } else { "messages" };
         writeln!(out, "exported    {} {what} to {}", exported.messages, target.display())?;
         if let Some(report) = &report {

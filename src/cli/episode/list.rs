@@ -1,10 +1,11 @@
 //! `wildcity episode list`.
 
-use std::io::{self, Write};
+use std::io::Write;
 
 use wildcity_episode::{EpisodeFile, list};
 
 use crate::cli::directories::Episodes;
+use crate::cli::output;
 
 use super::bad_input;
 use super::folder::{records, runs_in};
@@ -35,7 +36,7 @@ impl List {
         let dir = records(&self.episodes)?;
         let listed = list(&dir)
             .map_err(|error| bad_input(format!("cannot read {}: {error}", dir.display())))?;
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         if listed.is_empty() {
             writeln!(out, "no episodes in {}", dir.display())?;
             for records in runs_in(&dir) {

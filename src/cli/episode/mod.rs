@@ -6,6 +6,7 @@ mod export;
 mod folder;
 mod kept;
 mod list;
+mod prune;
 mod run;
 mod run_agent;
 mod score;
@@ -41,6 +42,7 @@ super::subcommands! {
     Run(Box<run::Run>),
     Compare(compare::Compare),
     List(list::List),
+    Prune(prune::Prune),
     Show(show::Show),
     Score(score::Score),
     Diff(diff::Diff),

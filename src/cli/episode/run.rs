@@ -1,6 +1,6 @@
 //! `wildcity episode run`.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -257,7 +257,7 @@ impl Run {
         ending: &Ending,
         comparison: Option<&Comparison>,
     ) -> anyhow::Result<()> {
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         for episode in &result.episodes {
             let mut why: Vec<String> =
                 episode.faults.iter().map(|fault| fault.fault.clone()).collect();

@@ -9,6 +9,7 @@ use serde_json::json;
 use wildcity_episode::{EpisodeFile, EpisodeResult, result};
 
 use crate::cli::directories::Episodes;
+use crate::cli::output;
 
 /// Score recorded episodes from their records only, without a renderer or a twin.
 #[derive(Debug, clap::Args)]
@@ -33,7 +34,7 @@ Examples:
 
 impl Score {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         for path in &self.episodes_to_score {
             let episode = super::read(path, &self.episodes)?;
             let name = EpisodeFile::episode_name(path);

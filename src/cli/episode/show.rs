@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use wildcity_episode::{EpisodeFile, Event};
 
 use crate::cli::directories::Episodes;
+use crate::cli::output;
 
 /// Show an episode: its steps, its events, and its end.
 #[derive(Debug, clap::Args)]
@@ -27,7 +28,7 @@ Examples:
 impl Show {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let episode = super::read(&self.episode, &self.episodes)?;
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         head(&mut out, &episode)?;
         for line in &episode.events {
             let seconds = line.time_us as f64 * 1e-6;

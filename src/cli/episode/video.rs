@@ -1,6 +1,6 @@
 //! `wildcity episode video`.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use wildcity_session::{RecordedEpisode, ReplayUntil, ReplayedImage};
@@ -75,7 +75,7 @@ impl Video {
         })?;
         bar.finish_and_clear();
 
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         let name = &header.rig.cameras[camera].name;
         writeln!(out, "written     {written} pictures of camera {name} to {}", self.out.display())?;
         if let Some(difference) = &report.difference {

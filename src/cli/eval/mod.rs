@@ -3,7 +3,7 @@
 mod options;
 mod summary;
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
@@ -225,7 +225,7 @@ impl Eval {
         for (name, text) in &files {
             output::write(&self.out.join(name), text.as_bytes())?;
         }
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         print_means(&mut out, &evaluation.all)?;
         if let Some(kid) = &evaluation.kid {
             let after =

@@ -1,6 +1,6 @@
 //! Images with levels of detail next to images at full detail.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::Path;
 
 use anyhow::Context;
@@ -75,7 +75,7 @@ impl Comparison<'_> {
         bar.finish_and_clear();
 
         // The first line compares full detail with itself.
-        let mut stdout = io::stdout().lock();
+        let mut stdout = output::stdout();
         for line in &lines[1..] {
             writeln!(stdout, "{line}")?;
         }

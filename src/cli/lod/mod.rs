@@ -12,6 +12,7 @@ use comparison::Comparison;
 
 use super::backend_options::BackendOptions;
 use super::directories::{TwinVersion, Twins};
+use crate::cli::output;
 
 /// Show the levels of detail of a twin: Gaussians, bytes, and geometric error of each.
 ///
@@ -54,7 +55,7 @@ impl Lod {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let catalog = self.twins.catalog()?;
         let version = catalog.version(&self.twin.name, self.twin.number)?;
-        table(&mut io::stdout().lock(), &version)?;
+        table(&mut output::stdout(), &version)?;
         let Some(out) = &self.out else { return Ok(()) };
         let comparison = Comparison {
             taus_px: &self.tau,

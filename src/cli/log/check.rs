@@ -49,7 +49,7 @@ impl Check {
         let report = check(&log, &settings, &mut progress::show(&bar))?;
         bar.finish_and_clear();
         output::write(&self.out, page(&report)?.as_bytes())?;
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         if self.json {
             writeln!(out, "{:#}", serde_json::to_value(&report)?)?;
         } else {

@@ -1,7 +1,7 @@
 //! `wildcity log export`.
 
 use std::fs;
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
@@ -60,7 +60,7 @@ impl Export {
         let said = self.write(&log, partial.path())?;
         let cannot = || format!("cannot write {}", self.out.display());
         fs::rename(partial.path(), &self.out).with_context(cannot)?;
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         for line in said {
             writeln!(out, "{line}")?;
         }

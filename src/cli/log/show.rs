@@ -1,12 +1,12 @@
 //! `wildcity log show`.
 
 use std::collections::BTreeMap;
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::PathBuf;
 
 use wildcity_log::{Log, LogError, Row, Rows};
 
-use crate::cli::output::counted;
+use crate::cli::output::{self, counted};
 
 /// Print what a log has: its source, and of each table the rows, their times and their rate.
 ///
@@ -54,7 +54,7 @@ impl Count {
 impl Show {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let log = Log::open(&self.log)?;
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         let header = &log.header;
         let source = &header.source;
         writeln!(out, "{}: {} {}, by {}", header.name, source.kind, source.id, source.converter)?;

@@ -1,13 +1,13 @@
 //! `wildcity log split`.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::PathBuf;
 
 use wildcity_log::Log;
 use wildcity_log::split::{SplitSettings, split};
 use wildcity_scene::route;
 
-use crate::cli::output::counted;
+use crate::cli::output::{self, counted};
 
 /// Split a log into chunks with the images of keyframes, and its drive into sub-trajectories.
 ///
@@ -56,7 +56,7 @@ impl SplitCommand {
             lengths_m: self.length_m,
         };
         let done = split(&log, &self.out, &settings)?;
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         for chunk in &done.chunks {
             let [from_m, to_m] = chunk.stations_m;
             let images = counted(chunk.images, "image");

@@ -1,10 +1,11 @@
 //! `wildcity map check`.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::PathBuf;
 
 use anyhow::Context;
 
+use crate::cli::output;
 use wildcity_sim::map::{Map, MapFile};
 use wildcity_twin::ingest;
 
@@ -27,7 +28,7 @@ impl Check {
         let map = map.with_context(context)?;
         let file = map.file();
         writeln!(
-            io::stdout().lock(),
+            output::stdout(),
             "{}: {} lanes, {} areas, {} stop lines",
             self.file.display(),
             file.lanes.len(),

@@ -1,6 +1,6 @@
 //! `wildcity map import`.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::PathBuf;
 
 use anyhow::Context;
@@ -56,7 +56,7 @@ impl Import {
             (imported.map, imported.geo, imported.warnings)
         };
         output::write(&self.out, map.to_json().as_bytes())?;
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         for warning in &warnings {
             writeln!(out, "note: {warning}")?;
         }

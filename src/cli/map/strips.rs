@@ -1,6 +1,6 @@
 //! `wildcity map strips`.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::PathBuf;
 
 use crate::cli::directories::{TwinVersion, Twins};
@@ -46,7 +46,7 @@ impl Strips {
             self.twin.name
         );
         output::write(&self.out, map.to_json().as_bytes())?;
-        writeln!(io::stdout().lock(), "{}: {} lanes", self.out.display(), map.lanes.len())?;
+        writeln!(output::stdout(), "{}: {} lanes", self.out.display(), map.lanes.len())?;
         Ok(())
     }
 }

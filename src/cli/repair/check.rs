@@ -79,7 +79,7 @@ impl Check {
             output::create_dir(dir)?;
         }
         let model = Model::load(&self.manifest, &self.options())?;
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         self.print_model(&mut out, &model)?;
         writeln!(out, "\n{:<12} {:>10} {:>12}", "size", "time", "memory")?;
         let mut measured = 0;

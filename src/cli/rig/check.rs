@@ -1,9 +1,10 @@
 //! `wildcity rig check`.
 
-use std::io::{self, Write};
+use std::io::Write;
 
 use super::lookup::{camera_view, find_rig};
 use crate::cli::backend_options::BackendOptions;
+use crate::cli::output;
 use wildcity_render::compare::reprojection::ReprojectionErrors;
 
 /// Render points at known pixels, and check that each camera of a rig shows them there.
@@ -32,7 +33,7 @@ impl Check {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let rig = find_rig(&self.rig)?;
         let backend = self.backend.backend()?;
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         let mut wrong = Vec::new();
         for camera in &rig.cameras {
             let ReprojectionErrors { count, worst_px } =

@@ -1,10 +1,11 @@
 //! `wildcity rig show`.
 
-use std::io::{self, Write};
+use std::io::Write;
 
 use glam::{DVec2, DVec3};
 
 use super::lookup::{camera_view, find_rig};
+use crate::cli::output;
 use wildcity_render::View;
 use wildcity_scene::Rig;
 
@@ -24,7 +25,7 @@ pub(super) struct Show {
 
 impl Show {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         let Some(name) = self.rig else {
             for name in Rig::preset_names() {
                 writeln!(out, "{name}")?;

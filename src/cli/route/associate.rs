@@ -1,12 +1,13 @@
 //! `wildcity route associate`.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::PathBuf;
 
 use serde_json::json;
 
 use super::files::read_times_us;
 use crate::cli::input_files::read_trajectory;
+use crate::cli::output;
 use wildcity_scene::route;
 
 /// Match the keyframes of a drive with the times of another clock, for example those of a camera's
@@ -54,7 +55,7 @@ impl Associate {
             "residual_us_median": residuals_us.get(residuals_us.len() / 2),
             "residual_us_largest": residuals_us.iter().map(|us| us.unsigned_abs()).max(),
         });
-        writeln!(io::stdout().lock(), "{report}")?;
+        writeln!(output::stdout(), "{report}")?;
         Ok(())
     }
 }

@@ -132,7 +132,7 @@ impl DriveOptions {
         let CapturedDrive { trajectory, rig: cameras, camera_height_m, most_tilt_rad } = made;
         let names: Vec<&str> = cameras.cameras.iter().map(|camera| camera.name.as_str()).collect();
         writeln!(
-            io::stdout().lock(),
+            output::stdout(),
             "{} keyframes, {:.1} m; camera {camera_height_m:.2} m above the ground, tilted by up to {:.1} degrees\n\
              cameras {}\n{}\n{}",
             trajectory.keyframes.len(),

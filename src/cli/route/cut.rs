@@ -1,7 +1,7 @@
 //! `wildcity route cut`.
 
 use std::collections::BTreeSet;
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::PathBuf;
 
 use serde_json::json;
@@ -60,7 +60,7 @@ impl Cut {
                     "from_us": cut.from_us,
                 }));
             }
-            writeln!(io::stdout(), "{:>6} of {length_m} m", index.len() - before)?;
+            writeln!(output::stdout(), "{:>6} of {length_m} m", index.len() - before)?;
         }
         let index = json!({ "drive": trajectory.name, "cuts": index });
         output::write(&self.out.join("index.json"), format!("{index:#}\n").as_bytes())

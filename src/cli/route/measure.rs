@@ -1,11 +1,12 @@
 //! `wildcity route measure`.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::PathBuf;
 
 use serde_json::json;
 
 use crate::cli::input_files::read_trajectory;
+use crate::cli::output;
 use wildcity_scene::Trajectory;
 use wildcity_scene::route::{Route, RouteChunk};
 
@@ -32,7 +33,7 @@ impl Measure {
         let first = &trajectory.keyframes[0];
         let last = &trajectory.keyframes[trajectory.keyframes.len() - 1];
         let seconds = last.time_us.abs_diff(first.time_us) as f64 * 1e-6;
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         if self.json {
             writeln!(out, "{}", json_report(&trajectory, &route, seconds))?;
             return Ok(());

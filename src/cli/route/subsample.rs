@@ -1,6 +1,6 @@
 //! `wildcity route subsample`.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::PathBuf;
 
 use super::files::to_json;
@@ -34,7 +34,7 @@ impl Subsample {
         output::write(&self.out, &to_json(&kept)?)?;
         let kept_count = kept.keyframes.len();
         let all_count = trajectory.keyframes.len();
-        writeln!(io::stdout(), "{kept_count} of {all_count} keyframes")?;
+        writeln!(output::stdout(), "{kept_count} of {all_count} keyframes")?;
         Ok(())
     }
 }

@@ -1,7 +1,7 @@
 //! `wildcity scenario check`.
 
 use std::collections::BTreeSet;
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::PathBuf;
 
 use anyhow::Context;
@@ -9,6 +9,7 @@ use anyhow::Context;
 use super::opened;
 use crate::cli::directories::Twins;
 use crate::cli::exit::{Exit, chain};
+use crate::cli::output;
 use wildcity_episode::DriveStart;
 use wildcity_scene::{ActorBox, Trajectory};
 use wildcity_session::StoredAssets;
@@ -140,7 +141,7 @@ impl Check {
     }
 
     fn check(&self, catalog: &Catalog) -> anyhow::Result<()> {
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         for path in &self.files {
             let context = || format!("{}", path.display());
             let opened = opened(path, catalog)?;

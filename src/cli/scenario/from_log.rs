@@ -1,6 +1,6 @@
 //! `wildcity scenario from-log`.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::PathBuf;
 
 use anyhow::{Context, ensure};
@@ -86,7 +86,7 @@ impl FromLog {
         output::write(&self.out, format!("{scenario:#}\n").as_bytes())?;
         let out = self.out.display();
         let actors = counted(tracks.len(), "recorded actor");
-        writeln!(io::stdout(), "{out}: {actors}; next: wildcity scenario check {out}")?;
+        writeln!(output::stdout(), "{out}: {actors}; next: wildcity scenario check {out}")?;
         Ok(())
     }
 

@@ -1,6 +1,6 @@
 //! `wildcity scenario import`.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
@@ -92,7 +92,7 @@ impl Import {
         }
         text.push(b'\n');
         output::write(&self.out, &text)?;
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         for note in &imported.notes {
             writeln!(out, "note: {note}")?;
         }

@@ -1,12 +1,13 @@
 //! `wildcity scenario show`.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::PathBuf;
 
 use serde_json::Value;
 
 use super::{given_values, opened, value};
 use crate::cli::directories::Twins;
+use crate::cli::output;
 use wildcity_session::StoredAssets;
 
 /// Show a scenario as an episode runs it: with a seed's jitter, the values of its sweep, and all
@@ -54,7 +55,7 @@ impl Show {
             "hash": loaded.hash,
             "scenario": loaded.scenario.file,
         });
-        writeln!(io::stdout().lock(), "{shown:#}")?;
+        writeln!(output::stdout(), "{shown:#}")?;
         Ok(())
     }
 }

@@ -32,6 +32,11 @@ impl Serve {
         &self.directories
     }
 
+    /// The file of the tokens.
+    pub(in crate::cli) fn tokens_file(&self) -> Option<&Path> {
+        self.tokens.as_deref()
+    }
+
     /// Checks the address and every file that the server reads or writes outside of its
     /// directories. Changes nothing.
     pub(in crate::cli) fn checks(&self) -> Vec<Check> {

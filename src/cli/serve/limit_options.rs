@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use clap::builder::RangedU64ValueParser;
 
+use wildcity_episode::Keep;
 use wildcity_server::{Limits, SpoolLimits};
 use wildcity_session::RecordLimits;
 
@@ -17,6 +18,10 @@ const MAX_COUNT: u64 = 65_535;
 
 /// Longest time-out that an option accepts: 30 days.
 const MAX_TIMEOUT_S: f64 = 30.0 * 24.0 * 3600.0;
+
+/// Longest time that records can be kept for: 100 years.
+const MAX_DAYS: f64 = 36_525.0;
+const SECONDS_PER_DAY: f64 = 86_400.0;
 
 fn count() -> RangedU64ValueParser<usize> {
     RangedU64ValueParser::new().range(1..=MAX_COUNT)
@@ -71,6 +76,11 @@ pub(super) struct LimitOptions {
     #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().resume_grace.as_secs_f64(), value_parser = seconds)]
     resume_grace_s: f64,
 
+    /// Seconds that sessions may go on after SIGTERM; until then the server opens no new one and is
+    /// not ready. A second SIGTERM stops it at once.
+    #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().sessions_end.as_secs_f64(), value_parser = waiting_seconds)]
+    sessions_end_s: f64,
+
     /// Seconds that running steps may take to finish when the server stops.
     #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().drain.as_secs_f64(), value_parser = seconds)]
     drain_timeout_s: f64,
@@ -108,6 +118,20 @@ pub(super) struct LimitOptions {
     /// Largest total size of the records of one token, in GiB.
     #[arg(long, value_name = "GIB", default_value_t = bytes_as_gib(Limits::default().records.owner_bytes), value_parser = gib)]
     token_records_gib: f64,
+
+    /// Number of records to keep: the newest ones; older ones are removed [default: all]. An
+    /// episode that is driven, or ended within the last minute, keeps its record.
+    #[arg(long, value_name = "N", value_parser = count())]
+    keep_records: Option<usize>,
+
+    /// Days that a record is kept after its last line [default: for ever]
+    #[arg(long, value_name = "DAYS", value_parser = days)]
+    keep_records_days: Option<f64>,
+
+    /// Size of all records to keep, with their MCAP files, in GiB: the oldest ones beyond it are
+    /// removed [default: any size]. Below --records-gib, so that no episode is refused.
+    #[arg(long, value_name = "GIB", value_parser = gib)]
+    keep_records_gib: Option<f64>,
 }
 
 impl LimitOptions {
@@ -120,6 +144,7 @@ impl LimitOptions {
             send: seconds(self.send_timeout_s),
             step: seconds(self.step_timeout_s),
             resume_grace: seconds(self.resume_grace_s),
+            sessions_end: seconds(self.sessions_end_s),
             drain: seconds(self.drain_timeout_s),
             connections: self.connections,
             sessions: self.sessions,
@@ -139,6 +164,11 @@ impl LimitOptions {
                 bytes: bytes_of_gib(self.records_gib),
                 owner_bytes: bytes_of_gib(self.token_records_gib),
             },
+            keep_records: Keep {
+                records: self.keep_records,
+                age: self.keep_records_days.map(|days| seconds(days * SECONDS_PER_DAY)),
+                bytes: self.keep_records_gib.map(bytes_of_gib),
+            },
         }
     }
 }
@@ -148,8 +178,20 @@ pub(super) fn bytes_as_gib(bytes: u64) -> f64 {
     bytes as f64 / f64::from(1 << 30)
 }
 
+fn days(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(days) if days > 0.0 && days <= MAX_DAYS => Ok(days),
+        _ => Err(format!("expected days above 0 and up to {MAX_DAYS}")),
+    }
+}
+
 fn seconds(text: &str) -> Result<f64, String> {
     seconds_up_to(text, MAX_TIMEOUT_S)
+}
+
+/// Seconds, or 0 for no wait.
+fn waiting_seconds(text: &str) -> Result<f64, String> {
+    if text.parse() == Ok(0.0) { Ok(0.0) } else { seconds(text) }
 }
 
 fn send_seconds(text: &str) -> Result<f64, String> {

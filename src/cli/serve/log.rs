@@ -11,6 +11,16 @@ use tracing_subscriber::layer::SubscriberExt as _;
 use tracing_subscriber::util::SubscriberInitExt as _;
 use tracing_subscriber::{EnvFilter, Layer as _};
 
+/// How a server writes its log.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub(super) enum LogFormat {
+    /// A line of text for each event.
+    #[default]
+    Text,
+    /// A JSON object for each event, on one line.
+    Json,
+}
+
 #[cfg(feature = "otlp")]
 pub(super) use self::otlp::Traces;
 
@@ -19,11 +29,18 @@ pub(super) use self::otlp::Traces;
 pub(super) struct Traces;
 
 /// Starts to log to standard error, and to send traces to an endpoint, if there is one.
-pub(super) fn start(filter: &str, endpoint: Option<&str>) -> anyhow::Result<Option<Traces>> {
-    let lines = tracing_subscriber::fmt::layer()
-        .with_writer(io::stderr)
-        .with_ansi(io::stderr().is_terminal())
-        .with_filter(EnvFilter::try_new(filter)?);
+pub(super) fn start(
+    filter: &str,
+    format: LogFormat,
+    endpoint: Option<&str>,
+) -> anyhow::Result<Option<Traces>> {
+    let filter = EnvFilter::try_new(filter)?;
+    let layer = tracing_subscriber::fmt::layer().with_writer(io::stderr);
+    let lines = match format {
+        LogFormat::Text => layer.with_ansi(io::stderr().is_terminal()).boxed(),
+        LogFormat::Json => layer.json().with_ansi(false).boxed(),
+    }
+    .with_filter(filter);
     let registry = tracing_subscriber::registry().with(lines);
     let Some(endpoint) = endpoint else {
         registry.init();

@@ -5,7 +5,7 @@ mod config_file;
 mod limit_options;
 mod log;
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -25,11 +25,13 @@ use super::directories::ServerDirectories;
 use super::left_out::built_without;
 use super::profile_options::read_profile;
 use super::repair_options::{RepairOptions, runtime_library};
+use crate::cli::output;
 
 /// Serve twins to agents over WebSocket.
 ///
 /// Prints `listening on ws://HOST:PORT/v1/session` when agents can connect, and logs to standard
-/// error. Ctrl-C or SIGTERM lets running steps finish, then stops.
+/// error. Ctrl-C or SIGTERM lets sessions go on for --sessions-end-s, then running steps finish,
+/// and stops.
 ///
 /// Every option can also be set in a TOML file: --memory-gib is memory_gib there, and the options
 /// under Limits are in the table [limits]. A flag overrides the file, and the file overrides a
@@ -89,7 +91,12 @@ pub(super) struct Serve {
     #[arg(long, value_name = "ADDR", default_value = wildcity_server::limits::LISTEN, value_parser = address)]
     listen: SocketAddr,
 
-    /// Address and port of a second listener, for AlpaSim: the gRPC service `sensorsim`, through
+    /// Address and port of a second listener, for Prometheus and probes: /metrics, /healthz and
+    /// /readyz, without TLS and without tokens. The metrics name no twin and no token.
+    #[arg(long, value_name = "ADDR", value_parser = address)]
+    metrics_listen: Option<SocketAddr>,
+
+    /// Address and port of another listener, for AlpaSim: the gRPC service `sensorsim`, through
     /// which AlpaSim uses the twins as scenes of its renderer. AlpaSim sends no tokens.
     #[arg(long, value_name = "ADDR", value_parser = address)]
     alpasim: Option<SocketAddr>,
@@ -125,6 +132,10 @@ pub(super) struct Serve {
     /// What to log, for example `warn` or `wildcity=debug` [default: $RUST_LOG, or info]
     #[arg(long, value_name = "FILTER")]
     log: Option<String>,
+
+    /// How to write the log.
+    #[arg(long, value_enum, value_name = "FORMAT", default_value_t)]
+    log_format: log::LogFormat,
 
     /// OpenTelemetry collector that receives traces of requests and pushes, by OTLP over HTTP, for
     /// example http://127.0.0.1:4318. Needs a program built with the feature otlp.
@@ -162,7 +173,7 @@ impl Serve {
         // The arguments after `wildcity serve` are parsed again, after those of the file.
         let resolved = config_file::resolve(std::env::args_os().skip(2).collect())?;
         if resolved.serve.print_config {
-            write!(io::stdout(), "{}", resolved.to_toml()?)?;
+            write!(output::stdout(), "{}", resolved.to_toml()?)?;
             return Ok(());
         }
         resolved.serve.serve()
@@ -205,7 +216,8 @@ impl Serve {
 
     fn serve(self) -> anyhow::Result<()> {
         // Dropped last, so that the end of the server is traced, too.
-        let _traces = log::start(&self.log_filter(), self.otlp_endpoint.as_deref())?;
+        let _traces =
+            log::start(&self.log_filter(), self.log_format, self.otlp_endpoint.as_deref())?;
         self.check_features()?;
         let directories = self.directories.all()?;
         let twins = &directories.twins;
@@ -243,6 +255,7 @@ impl Serve {
         let config = wildcity_server::Config {
             listen: self.listen,
             cache: self.directories.twins.cache(),
+            metrics_listen: self.metrics_listen,
             directories,
             tokens,
             origins: self.origin.unwrap_or_default(),
@@ -270,13 +283,21 @@ impl Serve {
                 }
                 None => None,
             };
-            writeln!(io::stdout(), "listening on {}", running.url())?;
+            writeln!(output::stdout(), "listening on {}", running.url())?;
             #[cfg(feature = "alpasim")]
             if let Some(alpasim) = &alpasim {
-                writeln!(io::stdout(), "AlpaSim: listening on {}", alpasim.address())?;
+                writeln!(output::stdout(), "AlpaSim: listening on {}", alpasim.address())?;
             }
             tracing::info!("viewer at {}", running.page());
+            if let Some(address) = running.metrics_address() {
+                tracing::info!("metrics at http://{address}/metrics");
+            }
             stop.await;
+            let again = wildcity_server::stop_signal()?;
+            tokio::select! {
+                () = running.end_sessions() => {}
+                () = again => {}
+            }
             tracing::info!("stopping");
             #[cfg(feature = "alpasim")]
             if let Some(alpasim) = alpasim {

@@ -279,7 +279,7 @@ impl Block {
             let begun =
                 if resumed_at > 0 { format!(" at step {resumed_at}") } else { String::new() };
             writeln!(
-                io::stdout().lock(),
+                output::stdout(),
                 "held out: {before:.2} dB{begun}, and {after:.2} dB after {steps} steps, {seconds:.0} s"
             )?;
         }
@@ -305,7 +305,7 @@ impl Block {
         let version =
             catalog.replace_cells(base, &gaussians, cells, how, &mut progress::show(&bar))?;
         bar.finish_and_clear();
-        let mut stdout = io::stdout().lock();
+        let mut stdout = output::stdout();
         let Version { number: version_number, hash, .. } = &version;
         writeln!(
             stdout,

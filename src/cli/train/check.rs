@@ -10,6 +10,7 @@ use wildcity_render::gradient::Differentiate;
 use wildcity_train::check::{self, Table, Time, Vectors};
 
 use crate::cli::backend_options::HardwareOptions;
+use crate::cli::output;
 use crate::cli::progress;
 
 /// Compare the gradients of every backend on this machine with their definition.
@@ -99,7 +100,7 @@ impl Check {
         bar.finish_and_clear();
 
         let exceeded = table.exceeded();
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         if self.json {
             writeln!(out, "{}", serde_json::to_string(&Report { table, times })?)?;
         } else {

@@ -1,7 +1,7 @@
 //! `wildcity train plan`.
 
 use std::collections::BTreeMap;
-use std::io::{self, Write};
+use std::io::Write;
 use std::time::Instant;
 
 use anyhow::Context;
@@ -61,7 +61,7 @@ impl Plan {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let Inputs { images: opened, start, profile, settings, .. } = self.run.open()?;
         let images = opened.images();
-        let mut stdout = io::stdout().lock();
+        let mut stdout = output::stdout();
         let points_m: Vec<DVec3> =
             start.gaussians.means_m.iter().map(|m| DVec3::from_array(*m)).collect();
         let path_m: Vec<DVec3> = start.world_from_camera.iter().map(|p| p.position_m).collect();

@@ -204,7 +204,7 @@ impl Refine {
             catalog.replace_gaussians(base, &gaussians, how, &mut progress::show(&bar))?;
         bar.finish_and_clear();
         let Version { number, hash, .. } = &version;
-        let mut stdout = io::stdout().lock();
+        let mut stdout = output::stdout();
         if let Some((before, (after, seconds))) = before.zip(after) {
             writeln!(
                 stdout,

@@ -78,7 +78,7 @@ impl Written {
     /// Says what was written.
     pub(super) fn print(&self, source: &Path, gaussians: usize) -> io::Result<()> {
         writeln!(
-            io::stdout().lock(),
+            output::stdout(),
             "{}: {gaussians} Gaussians, in the axes and the unit of {}\n{}: a page about the run",
             self.ply.display(),
             source.display(),
@@ -96,7 +96,7 @@ impl Written {
                 has_axes |= *name == "--axes";
             }
         }
-        let mut stdout = io::stdout().lock();
+        let mut stdout = output::stdout();
         if has_axes {
             return writeln!(stdout, "make a twin of it:\n{command}");
         }

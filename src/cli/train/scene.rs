@@ -114,7 +114,7 @@ impl TrainScene {
             );
         }
         if let Some((db, seconds)) = last {
-            let mut stdout = io::stdout().lock();
+            let mut stdout = output::stdout();
             writeln!(stdout, "held out: {db:.2} dB after {steps} steps, {seconds:.0} s")?;
         }
         // Whatever happens until all files are written: --resume only writes them.

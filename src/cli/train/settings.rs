@@ -1,7 +1,8 @@
 //! `wildcity train settings`.
 
-use std::io::{self, Write};
+use std::io::Write;
 
+use crate::cli::output;
 use wildcity_train::settings::Settings;
 
 /// Print all settings of training with their defaults, as a file for --settings.
@@ -16,7 +17,7 @@ Example:
 impl PrintSettings {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let text = toml::to_string_pretty(&Settings::default())?;
-        write!(io::stdout().lock(), "{text}")?;
+        write!(output::stdout(), "{text}")?;
         Ok(())
     }
 }

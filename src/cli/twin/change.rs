@@ -1,8 +1,9 @@
 //! A new version of a twin with the same Gaussians.
 
-use std::io::{self, Write};
+use std::io::Write;
 
 use crate::cli::directories::{TwinVersion, Twins};
+use crate::cli::output;
 use wildcity_scene::Manifest;
 use wildcity_twin::store::{CommitKind, StorageOptions, Version, VersionChange};
 
@@ -25,10 +26,6 @@ pub(super) fn commit(
 /// Prints the number of a new version, a description of it, and its hash.
 pub(super) fn print(version: &Version, what: &str) -> anyhow::Result<()> {
     let Version { number, hash, manifest, .. } = version;
-    writeln!(
-        io::stdout().lock(),
-        "twin {} version {number}: {what}\nblake3 {hash}",
-        manifest.twin
-    )?;
+    writeln!(output::stdout(), "twin {} version {number}: {what}\nblake3 {hash}", manifest.twin)?;
     Ok(())
 }

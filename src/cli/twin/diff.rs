@@ -1,8 +1,9 @@
 //! `wildcity twin diff`.
 
-use std::io::{self, Write};
+use std::io::Write;
 
 use crate::cli::directories::Twins;
+use crate::cli::output;
 use wildcity_twin::store::{CellDiff, CellSize, Diff as Differences};
 
 /// Show which cells differ between two versions of a twin, with their Gaussians and bytes in each.
@@ -30,7 +31,7 @@ impl Diff {
         let catalog = self.twins.catalog()?;
         let Differences { cells, kept, settings } =
             catalog.diff(&self.twin, self.before, self.after)?;
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         let mut added = 0;
         let mut removed = 0;
         let mut changed = 0;

@@ -3,6 +3,7 @@
 use std::io::{self, Write};
 
 use crate::cli::directories::Twins;
+use crate::cli::output;
 use crate::cli::progress;
 use wildcity_twin::store::{FsckReport, RecordSetAside};
 
@@ -50,7 +51,7 @@ impl Fsck {
         let bar = progress::bytes("checking");
         let checked = catalog.fsck(&self.twin, &mut progress::show(&bar))?;
         bar.finish_and_clear();
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         if self.json {
             writeln!(out, "{}", json(&checked))?;
         } else {

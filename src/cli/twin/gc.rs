@@ -1,10 +1,12 @@
 //! `wildcity twin gc`.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::time::Duration;
 
 use crate::cli::directories::Twins;
 use crate::cli::limits;
+use crate::cli::output;
+use crate::cli::time::duration;
 use wildcity_twin::store::Retention;
 
 /// Remove objects of a twin that none of the kept versions refers to.
@@ -48,7 +50,7 @@ impl Gc {
         let kept: Vec<_> = found.kept.iter().map(u64::to_string).collect();
         let removed = if self.dry_run { "would be removed" } else { "removed" };
         writeln!(
-            io::stdout(),
+            output::stdout(),
             "kept versions {}\n{removed} {} objects, {} bytes\nnoted {} objects, {} bytes",
             kept.join(" "),
             found.removed.objects,
@@ -58,40 +60,10 @@ impl Gc {
         )?;
         if let Some((number, damage)) = found.blocked_by {
             writeln!(
-                io::stdout(),
+                output::stdout(),
                 "nothing can be removed before the manifest of version {number}, which is damaged: {damage}"
             )?;
         }
         Ok(())
-    }
-}
-
-fn duration(text: &str) -> Result<Duration, String> {
-    let wrong = || "expected a whole number and s, m, h or d, for example 24h".to_owned();
-    let unit = text.chars().last().ok_or_else(wrong)?;
-    let seconds = match unit {
-        's' => 1,
-        'm' => 60,
-        'h' => 3_600,
-        'd' => 86_400,
-        _ => return Err(wrong()),
-    };
-    let number: u64 = text[..text.len() - 1].parse().map_err(|_| wrong())?;
-    number.checked_mul(seconds).map(Duration::from_secs).ok_or_else(wrong)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn times_have_a_unit() {
-        for (text, seconds) in [("0s", 0), ("90s", 90), ("30m", 1_800), ("24h", 86_400)] {
-            assert_eq!(duration(text).unwrap().as_secs(), seconds);
-        }
-        assert_eq!(duration("7d").unwrap().as_secs(), 7 * 86_400);
-        for text in ["", "24", "h", "-1h", "1.5h", "99999999999999999999d", "1 h", "1µ"] {
-            assert!(duration(text).unwrap_err().contains("for example 24h"), "{text}");
-        }
     }
 }

@@ -131,7 +131,7 @@ impl Generate {
         let count = manifest.gaussians();
         let stored_bytes = manifest.stored_bytes();
         writeln!(
-            std::io::stdout().lock(),
+            output::stdout(),
             "twin {} version {}: {count} Gaussians in {}, {:.2} GiB, {:.1} bytes each; \
              {seconds:.0} s, {:.0} Gaussians/s\nblake3 {}",
             self.twin,

@@ -1,10 +1,11 @@
 //! `wildcity twin list`.
 
-use std::io::{self, Write};
+use std::io::Write;
 
 use wildcity_twin::store::DamagedTwin;
 
 use crate::cli::directories::Twins;
+use crate::cli::output;
 
 /// List all twins with the number and hash of their latest versions. A twin whose newest log record
 /// cannot be read is listed as damaged; `wildcity twin fsck --repair` sets the record aside.
@@ -23,7 +24,7 @@ pub(super) struct List {
 
 impl List {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         let list = self.twins.catalog()?.twins()?;
         for twin in list.twins {
             if self.json {

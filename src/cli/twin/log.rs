@@ -3,6 +3,7 @@
 use std::io::{self, Write};
 
 use crate::cli::directories::Twins;
+use crate::cli::output;
 use crate::cli::time::utc;
 use wildcity_twin::store::{LogEntry, StoreError};
 
@@ -27,7 +28,7 @@ pub(super) struct Log {
 
 impl Log {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let mut out = io::stdout().lock();
+        let mut out = output::stdout();
         let catalog = self.twins.catalog()?;
         for entry in catalog.versions(&self.twin)? {
             // Older builds, which did not show notes, gave edits the note of their base.

@@ -2,6 +2,7 @@
 
 mod align;
 mod change;
+mod copy;
 mod diff;
 mod drive;
 mod fsck;
@@ -10,6 +11,7 @@ mod generate;
 mod geo;
 mod list;
 mod log;
+mod remove;
 mod rollback;
 mod sky;
 #[cfg(feature = "eval")]
@@ -35,6 +37,9 @@ super::subcommands! {
     Diff(diff::Diff),
     Rollback(rollback::Rollback),
     Gc(gc::Gc),
+    Copy(copy::Copy),
+    Rename(copy::Rename),
+    Remove(remove::Remove),
     Fsck(fsck::Fsck),
     Sky(sky::Sky),
     #[cfg(feature = "eval")]

@@ -1,8 +1,9 @@
 //! `wildcity twin rollback`.
 
-use std::io::{self, Write};
+use std::io::Write;
 
 use crate::cli::directories::Twins;
+use crate::cli::output;
 
 /// Make an old version of a twin the latest version again, under a new number.
 ///
@@ -27,7 +28,7 @@ impl Rollback {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let version = self.twins.catalog()?.rollback(&self.twin, self.number)?;
         writeln!(
-            io::stdout(),
+            output::stdout(),
             "twin {} version {} has the content of version {}\nblake3 {}",
             self.twin,
             version.number,

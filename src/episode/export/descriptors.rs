@@ -39,6 +39,10 @@ const MESSAGES: &[(&str, Fields)] = &[
     ),
     ("FrameTransforms", &[("transforms", 1, "[].foxglove.FrameTransform")]),
     (
+        "PoseInFrame",
+        &[("timestamp", 1, TIMESTAMP), ("frame_id", 2, "string"), ("pose", 3, ".foxglove.Pose")],
+    ),
+    (
         "PosesInFrame",
         &[("timestamp", 1, TIMESTAMP), ("frame_id", 2, "string"), ("poses", 3, "[].foxglove.Pose")],
     ),

@@ -72,6 +72,16 @@ pub(super) struct FrameTransforms {
 }
 
 #[derive(Clone, PartialEq, prost::Message)]
+pub(super) struct PoseInFrame {
+    #[prost(message, optional, tag = "1")]
+    pub(super) timestamp: Option<Timestamp>,
+    #[prost(string, tag = "2")]
+    pub(super) frame_id: String,
+    #[prost(message, optional, tag = "3")]
+    pub(super) pose: Option<Pose>,
+}
+
+#[derive(Clone, PartialEq, prost::Message)]
 pub(super) struct PosesInFrame {
     #[prost(message, optional, tag = "1")]
     pub(super) timestamp: Option<Timestamp>,

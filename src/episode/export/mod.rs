@@ -7,7 +7,9 @@
 //! | `/camera/N/calibration` | `foxglove.CameraCalibration`; `/wildcity/episode` has its deviation from the lens |
 //! | `/actors` | `foxglove.SceneUpdate`: a box for each actor and for the ego |
 //! | `/map` | `foxglove.SceneUpdate`: the outlines of the lanes |
+//! | `/actors/poses` | `foxglove.PosesInFrame`: the middles of the actors' boxes, also for Rerun |
 //! | `/ego/odometry` | `foxglove.Odometry`: pose, velocity, yaw rate |
+//! | `/ego/pose` | `foxglove.PoseInFrame`: the same pose, also for Rerun |
 //! | `/ego/path`, `/route` | `foxglove.PosesInFrame` in the world: the driven path, and the recorded drive |
 //! | `/plan` | `foxglove.PosesInFrame` in the rig: the agent's trajectory, when it was decided |
 //! | `/log` | `foxglove.Log`: events |

@@ -270,6 +270,13 @@ impl<'a, W: Write + Seek> EpisodeExport<'a, W> {
         self.transforms(time_us, vec![transform("world", "rig", time_us, world_from_rig)])?;
         let odometry = odometry(time_us, world_from_rig, motion);
         self.file.proto("/ego/odometry", "foxglove.Odometry", time_us, &odometry)?;
+        // Rerun's converter shows poses, and neither odometry nor boxes.
+        let place = foxglove::PoseInFrame {
+            timestamp: Some(timestamp(time_us)),
+            frame_id: "world".to_owned(),
+            pose: Some(pose(world_from_rig)),
+        };
+        self.file.proto("/ego/pose", "foxglove.PoseInFrame", time_us, &place)?;
         let cameras = &self.episode.header.rig.cameras;
         let line = json!({
             "step": frame.step, "time_us": time_us, "request": frame.request, "command": command(frame),
@@ -296,6 +303,7 @@ impl<'a, W: Write + Seek> EpisodeExport<'a, W> {
         // A viewer keeps an entity until it is deleted: the actors of the step before that are not
         // there now are deleted by name.
         let mut there = BTreeSet::new();
+        let mut centers = Vec::new();
         let states = self.actors.get(&frame.step).map_or(&[][..], |line| &line.actors);
         for state in states.iter().filter_map(|state| state.state()) {
             let Some(actor) = scenario.actors.get(usize::from(state.index)) else { continue };
@@ -306,6 +314,11 @@ impl<'a, W: Write + Seek> EpisodeExport<'a, W> {
                 state.world_from_actor * Pose { position_m: up_m.into(), ..Pose::IDENTITY };
             let orange = color(0.84, 0.37, 0.0, 0.7);
             entities.push(boxed("world", &actor.name, &center, actor.size, orange));
+            centers.push(pose(&center));
+        }
+        // Also without an actor: a viewer keeps the last message.
+        if !scenario.actors.is_empty() {
+            self.poses("/actors/poses", "world", time_us, centers)?;
         }
         let name = |index: &u16| Some(scenario.actors.get(usize::from(*index))?.name.clone());
         let deletions = self.shown.difference(&there).filter_map(name).map(|id| {

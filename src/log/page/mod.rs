@@ -12,7 +12,7 @@ use crate::error::LogError;
 const STYLE: &str = "\
 body{font:15px/1.45 system-ui,sans-serif;max-width:1160px;margin:2em auto;padding:0 1em;color:#111}
 h1{font-size:1.6em}h2{margin-top:2em;font-size:1.2em}
-table{border-collapse:collapse;font-size:13px}td,th{padding:2px 8px;border-bottom:1px solid #ddd;text-align:right}
+table{border-collapse:collapse;font-size:13px;display:block;overflow-x:auto}td,th{padding:2px 8px;border-bottom:1px solid #ddd;text-align:right}
 td:first-child,th:first-child{text-align:left}
 .pictures{display:grid;grid-template-columns:repeat(auto-fit,minmax(340px,1fr));gap:8px}
 figure{margin:0}figure img{width:100%;height:auto}figcaption{font-size:13px}
@@ -30,6 +30,7 @@ pub fn page(report: &Report) -> Result<String, LogError> {
         html lang="en" {
             head {
                 meta charset="utf-8";
+                meta name="viewport" content="width=device-width, initial-scale=1";
                 title { (title) }
                 style { (PreEscaped(STYLE)) }
             }

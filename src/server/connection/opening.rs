@@ -42,7 +42,10 @@ impl Connection {
             ));
         }
         if self.slots.len() >= limit {
-            return Err(Fault::Busy { what: "sessions on this connection", limit });
+            let must = format!(
+                "the one after {limit} on this connection, which has no more: open another connection"
+            );
+            return Err(Fault::OutOfRange { field: "session".to_owned(), must });
         }
         Ok(())
     }

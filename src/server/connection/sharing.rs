@@ -51,7 +51,7 @@ impl Connection {
         };
         match memory.write(&self.state.engine, &answer).await {
             Ok(place) => {
-                self.state.metrics.memory_bytes.inc_by(place.bytes);
+                self.state.metrics.shared_memory_bytes.inc_by(place.bytes);
                 Ok(Answer::Text(convert::in_memory(seq, place)?.into()))
             }
             Err(error) => {

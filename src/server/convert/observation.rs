@@ -212,6 +212,7 @@ fn metadata(
         twin: version.manifest.twin.clone(),
         version: version.number,
         version_hash: version.hash.clone(),
+        newer_version: session.newer_version(),
         profile_hash: session.profile_hash().to_hex().to_string(),
         backend: session.backend().to_owned(),
         frame_hash: frame.frame_hash.to_hex().to_string(),

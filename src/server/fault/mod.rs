@@ -126,6 +126,8 @@ pub(crate) enum Fault {
     SpoolWrite { cause: io::Error },
     /// The audit log cannot be written.
     Audit { path: PathBuf, cause: io::Error },
+    /// The server will stop when the open sessions have ended.
+    Ending,
     /// The server ends all connections.
     ShuttingDown,
     /// An episode or a twin refused it.
@@ -191,7 +193,10 @@ impl Fault {
             Self::UnknownSession { field, name } => at(
                 Code::UnknownSession,
                 field,
-                format!("there is no session {name:?} to resume; it ended, or was never opened"),
+                format!(
+                    "there is no session {name:?} to resume: it ended, was never opened, or the server was \
+                     restarted; branch from {{\"episode\": \"{name}-1\", \"step\": N}} goes on from its record"
+                ),
             ),
             Self::NoSuchSession { field, name } => at(
                 Code::UnknownSession,
@@ -390,6 +395,11 @@ impl Fault {
                     ),
                 )
             }
+            Self::Ending => plain(
+                Code::ShuttingDown,
+                "the server stops when its sessions have ended, and opens no new one: use another server, or open it \
+                 when this one is back",
+            ),
             Self::ShuttingDown => plain(
                 Code::ShuttingDown,
                 "the server is shutting down, and its sessions end: open a new one when it is back",

@@ -80,7 +80,7 @@ const CHECK: Duration = wildcity_push::limits::CHECK_TIMEOUT;
 const MIB: u64 = 1 << 20;
 
 /// Routes, by method and path.
-const ROUTES: [Cost; 33] = [
+const ROUTES: [Cost; 34] = [
     cost("GET /", MIB, NONE, 0, "the page of the viewer"),
     cost("GET /viewer.js", MIB, NONE, 0, "a file of the viewer"),
     cost("GET /style.css", MIB, NONE, 0, "a file of the viewer"),
@@ -106,6 +106,7 @@ const ROUTES: [Cost; 33] = [
     cost("POST /v1/twins/{twin}/pushes", JSON, CHECK, limits::UPLOAD_BYTES, "`--push-memory-gib`"),
     cost("GET /v1/twins/{twin}/pushes/{id}", MIB, NONE, 0, "a push"),
     cost("DELETE /v1/twins/{twin}/pushes/{id}", 0, NONE, 0, "a mark"),
+    cost("GET /v1/scenarios", MIB, NONE, 0, "4 KiB of a file at a time"),
     cost("GET /v1/actors", MIB, NONE, 0, "assets"),
     cost("GET /v1/actors/{actor}", MIB, NONE, 0, "an asset"),
     cost("POST /v1/actors", JSON, CHECK, limits::UPLOAD_BYTES, "counts as a push"),

@@ -9,6 +9,7 @@ mod metrics;
 mod openapi;
 mod pushes;
 mod refusal;
+mod scenarios;
 mod sessions;
 mod table;
 mod tickets;
@@ -24,6 +25,7 @@ use axum::extract::{DefaultBodyLimit, RawPathParams, Request, State};
 use axum::http::{HeaderName, Method, StatusCode, Uri, header};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse as _, Response};
+use axum::routing::get;
 use axum::{Json, RequestExt as _, Router};
 
 use crate::admission::ConnectionSlot;
@@ -59,6 +61,17 @@ pub(crate) fn router(state: Arc<ServerState>) -> Router {
         .layer(json_limit)
         .layer(from_fn_with_state(state.clone(), metrics::count_refusals))
         .layer(from_fn_with_state(state.clone(), cors::answer))
+        .with_state(state)
+}
+
+/// The routes of the listener for metrics, which takes no tokens.
+pub(crate) fn open_router(state: Arc<ServerState>) -> Router {
+    Router::new()
+        .route(metrics::PATH, get(metrics::show_all))
+        .route("/healthz", get(async || "ok\n"))
+        .route("/readyz", get(ready))
+        .fallback(no_route)
+        .method_not_allowed_fallback(no_method)
         .with_state(state)
 }
 
@@ -124,6 +137,9 @@ fn check_once(request: &Request, name: HeaderName, header: &'static str) -> Resu
 
 /// `GET /readyz`: whether sessions can be opened, which needs the list of twins.
 async fn ready(State(state): State<Arc<ServerState>>) -> Response {
+    if state.sessions.is_ending() {
+        return Refusal::from(Fault::Ending).into_response();
+    }
     match state.readiness.refusal(&state.engine).await {
         None => "ready\n".into_response(),
         Some(body) => (StatusCode::SERVICE_UNAVAILABLE, Json(body)).into_response(),

@@ -12,8 +12,8 @@ use crate::auth::{Access, Role};
 use crate::state::ServerState;
 
 use super::{
-    actors, episodes, metrics, openapi, pushes, ready, sessions, tickets, twins, uploads, viewer,
-    websocket,
+    actors, episodes, metrics, openapi, pushes, ready, scenarios, sessions, tickets, twins,
+    uploads, viewer, websocket,
 };
 
 /// A method of a path.
@@ -352,6 +352,14 @@ pub(super) fn rows() -> Vec<Row> {
             .answers(204, Content::None)
             .or(&[NONE])
             .does(uploads::delete),
+        op(
+            Get,
+            "/v1/scenarios",
+            AnyToken,
+            "Names of the scenarios that can be opened by name; none for a token of some twins.",
+        )
+        .answers(200, Content::Object)
+        .does(scenarios::list),
         op(Get, "/v1/actors", AnyToken, "All assets of actors, and the damaged ones.")
             .answers(200, Json("actors"))
             .does(actors::list),

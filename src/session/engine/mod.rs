@@ -3,6 +3,7 @@
 
 pub(crate) mod answer_budget;
 mod exports;
+mod latest;
 mod leases;
 pub(crate) mod render_queue;
 pub(crate) mod solid_blocks;
@@ -33,6 +34,7 @@ use wildcity_twin::store::Catalog;
 
 use self::answer_budget::{AnswerBudget, BudgetShare};
 use self::exports::Exports;
+use self::latest::LatestVersions;
 use self::leases::Leases;
 use self::render_queue::{FrameCost, RenderQueue, Scratch};
 use self::solid_blocks::SolidBlocks;
@@ -89,6 +91,7 @@ pub struct Engine {
     exports: Option<Exports>,
     /// For each twin, the version that counts as its latest while a newer one is loaded.
     pins: Mutex<BTreeMap<String, u64>>,
+    latest: LatestVersions,
 }
 
 /// Pins the version that counts as a twin's latest, until dropped.
@@ -130,6 +133,7 @@ impl Engine {
             turns: Turns::new(),
             exports,
             pins: Mutex::default(),
+            latest: LatestVersions::default(),
         }))
     }
 

@@ -206,6 +206,8 @@ impl Session {
             repair: None,
             contact: recorded.contact,
             solid_ego: solid_ego(recorded.contact, None),
+            is_recorded: true,
+            follows_latest: false,
         };
 
         // The state after the step, and the frames that coming observations show again.

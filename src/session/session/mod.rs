@@ -69,6 +69,8 @@ pub struct Session {
     recorder: Option<Recorder>,
     /// Whether the session has switched versions since the last line of the episode's file.
     version_switched: bool,
+    /// A newer version that the session should follow, and cannot show.
+    not_followed: Option<u64>,
     /// The agent's announced path (`prefetch`): poses (`world_from_rig`), in order.
     hint: Vec<Pose>,
     /// When the last frame was ready, and the time between it and the previous frame.

@@ -11,7 +11,7 @@ use tokio::time::Instant;
 
 use wildcity_episode::scenario_line;
 use wildcity_options::{
-    ContactMode, ImagePart, Open, Outputs, RandomStart, Repair, RigChoice, Sensors, Start,
+    ContactMode, Follow, ImagePart, Open, Outputs, RandomStart, Repair, RigChoice, Sensors, Start,
 };
 use wildcity_render::View;
 use wildcity_render::lidar::LidarView;
@@ -139,6 +139,8 @@ impl Session {
             repair,
             contact: asked.contact,
             solid_ego,
+            is_recorded: asked.is_recorded,
+            follows_latest: asked.follows_latest,
         };
 
         // Prepare the version for its frames, and reserve the memory for the worst frame anywhere
@@ -191,6 +193,7 @@ impl Session {
             episode_number: 0,
             recorder: None,
             version_switched: false,
+            not_followed: None,
             hint: Vec::new(),
             last_frame_at: Instant::now(),
             // Assume real time until a step shows the agent's pace.
@@ -200,6 +203,28 @@ impl Session {
         let here = session.state.episode.world_from_rig();
         session.prefetch_at(vec![(Urgency::Imminent, here)]);
         session
+    }
+
+    /// Number of the twin's latest version, if it is newer than the session's own. It is known
+    /// about a second after it was made, in an object store ten seconds.
+    pub fn newer_version(&self) -> Option<u64> {
+        let own = &self.resident().version;
+        let latest = self.engine.known_latest(&own.manifest.twin);
+        latest.filter(|latest| *latest > own.number)
+    }
+
+    /// Switches to a newer version if there is one and the session follows them. A version that the
+    /// session cannot show is left out: observations say that it is there.
+    pub(super) async fn follow_latest(&mut self) {
+        if !self.settings.follows_latest {
+            return;
+        }
+        let newer = self.newer_version().filter(|newer| self.not_followed != Some(*newer));
+        let Some(newer) = newer else { return };
+        if let Err(error) = self.switch_version(Some(newer)).await {
+            tracing::warn!(session = self.name, "version {newer} cannot be followed: {error}");
+            self.not_followed = Some(newer);
+        }
     }
 
     /// Switches to another version of the twin, or to its latest; the episode goes on.
@@ -255,6 +280,8 @@ struct Asked {
     repair: Option<Repair>,
     sensors: Option<Sensors>,
     contact: Option<ContactMode>,
+    is_recorded: bool,
+    follows_latest: bool,
 }
 
 enum AskedRig {
@@ -315,6 +342,10 @@ impl Asked {
         let deadline =
             check_deadline(options.deadline_ms.map(Duration::from_millis), step_timeout)?;
         check_contact(options.contact, scenario.is_some())?;
+        if let (Some(Follow::Latest), Some(version)) = (options.follow, options.version) {
+            let must = format!("\"latest\", with version {version}: leave one of the two away");
+            return Err(SessionError::OutOfRange { field: "follow", must });
+        }
         Ok(Self {
             twin: options.twin,
             version: options.version,
@@ -332,6 +363,8 @@ impl Asked {
             repair: options.repair,
             sensors: options.sensors.and_then(used),
             contact: options.contact,
+            is_recorded: options.record.unwrap_or(true),
+            follows_latest: options.follow.is_some(),
         })
     }
 

@@ -22,14 +22,18 @@ use crate::scenario::{EpisodeTraffic, Event, EventKind};
 use crate::state::{EpisodeState, PinnedVersion, SessionSettings};
 
 impl Session {
-    /// Records a frame, and returns the file if it was created for it: for a new episode, or for
-    /// the first frame of one. `next` is the state after the request; `None` if it stays.
+    /// Records a frame, unless the session records nothing, and returns the file if it was created
+    /// for it: for a new episode, or for the first frame of one. `next` is the state after the
+    /// request; `None` if it stays.
     pub(super) async fn record(
         &self,
         frame: FrameRecord,
         next: Option<&EpisodeState>,
         file: &EpisodeFile,
     ) -> Result<Option<NewFile>, SessionError> {
+        if !self.settings.is_recorded {
+            return Ok(None);
+        }
         let is_first = self.recorder.is_none() || matches!(file, EpisodeFile::New(_));
         let before = &self.state;
         let traffic = next.and_then(|next| next.traffic.as_ref());

@@ -110,6 +110,7 @@ impl Session {
     ) -> Result<Observation, SessionError> {
         let steps = self.plan_steps(&command, options.until_us)?;
         check_notes(options.notes.as_ref())?;
+        self.follow_latest().await;
         let deadline = Instant::now() + self.settings.deadline;
         let now = &self.state.episode;
         let Simulated { episode: mut next, mut traffic, met } =
@@ -278,6 +279,7 @@ impl Session {
     /// # Errors
     /// As [`Session::reset`], and if the speed is out of range.
     pub async fn reset_with(&mut self, options: ResetOptions) -> Result<Observation, SessionError> {
+        self.follow_latest().await;
         let settings = &self.settings;
         let ResetOptions { seed, start, dynamics, speed_m_s } = options;
         // Before the dynamics, as in the order of the request's fields.

@@ -6,8 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use wildcity_scene::{ActorBox, ActorClass};
 
-use super::actor_file::NOT_DRAWN;
-use super::error::{FileError, check_format, hashed, json, named, typed};
+use super::error::{FileError, check_format, json, named, typed};
 use super::pose::PoseSection;
 use super::pose::pose_from;
 use crate::limits;
@@ -36,7 +35,8 @@ pub struct TrackSection {
     pub class: ActorClass,
     /// Length, width and height, in metres.
     pub size: [f64; 3],
-    /// BLAKE3 of its asset. If absent, the generated asset of its class whose size is the nearest.
+    /// The name of its asset, or its BLAKE3, 64 lower-case hex digits; `none` if it is not drawn.
+    /// If absent, the generated asset of its class whose size is the nearest.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub asset: Option<String>,
     /// Its poses, by rising time. It is absent before the first and after the last.
@@ -90,8 +90,9 @@ impl TracksFile {
                 let message = format!("{:?} is there twice; give each track its own id", track.id);
                 return Err(within(FileError::new("id", message)));
             }
-            if let Some(asset) = track.asset.as_deref().filter(|asset| *asset != NOT_DRAWN) {
-                hashed("asset", asset).map_err(within)?;
+            // A hash is a name of 64 characters, and so is `none`.
+            if let Some(asset) = &track.asset {
+                named("asset", asset).map_err(within)?;
             }
             box_from("size", track.size).map_err(within)?;
             track.shifted(0).map_err(within)?;

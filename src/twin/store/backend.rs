@@ -110,6 +110,14 @@ pub(super) trait ObjectBackend: Debug + Send + Sync {
         which: &mut dyn FnMut() -> Result<Vec<String>, StoreError>,
     ) -> Result<(), StoreError>;
 
+    /// Removes a twin: its objects, its side files and then its log. `mark` is called first, where
+    /// the backend has locks with publishing locked; if it fails, nothing is removed.
+    fn remove_twin(
+        &self,
+        name: &str,
+        mark: &mut dyn FnMut() -> Result<(), StoreError>,
+    ) -> Result<(), StoreError>;
+
     /// File names in a folder of a twin's side files. A side file is small and not part of any
     /// version: a lease, or the state of garbage collection.
     fn list_side_files(&self, name: &str, folder: &str) -> Result<Vec<String>, StoreError>;

@@ -45,9 +45,9 @@ pub enum StoreError {
     /// Garbage collection removed the version's objects.
     #[error("version {number} of twin {name:?} was removed by `wildcity twin gc`: use a later one")]
     GarbageCollected { name: String, number: u64 },
-    /// A version was leased while garbage collection was about to remove its objects.
+    /// A version is leased that garbage collection was about to remove, or whose twin is to go.
     #[error(
-        "version {number} of twin {name:?} has just come into use: nothing was removed; try again"
+        "version {number} of twin {name:?} is in use: nothing was removed; try again when it is not"
     )]
     Leased { name: String, number: u64 },
     /// Stored bytes differ from what was committed.
@@ -155,9 +155,9 @@ pub enum StoreError {
         /// The value of the twin.
         needed: String,
     },
-    /// Others made the twin that a commit would make.
+    /// The twin that a commit would make exists, perhaps since others made it meanwhile.
     #[error(
-        "twin {name:?} was made by others meanwhile: make the change from its version {latest}"
+        "twin {name:?} exists already: give another name, or make the change from its version {latest}"
     )]
     TwinExists { name: String, latest: u64 },
     /// Other commits changed the same cells or settings since the base of a change.

@@ -22,8 +22,8 @@ use crate::limits;
 
 use super::backend::ListedObject;
 use super::catalog::check_name;
-use super::layout::COLLECTION;
-use super::lease::{self, LeaseRecord};
+use super::layout::{COLLECTION, LEASES};
+use super::lease::LeaseRecord;
 use super::{Catalog, StoreError};
 
 /// Which versions are kept, and how long garbage is kept.
@@ -117,7 +117,7 @@ impl Catalog {
                 lease.remove(self, name)?;
             }
         }
-        for folder in [lease::FOLDER, COLLECTION] {
+        for folder in [LEASES, COLLECTION] {
             let before_us = now_us.saturating_sub(LEFTOVER_AGE_US);
             self.objects.remove_leftovers(name, folder, before_us)?;
         }
@@ -131,7 +131,7 @@ impl Catalog {
     /// [`StoreError::Leased`] if one was leased at this moment. A lease is written first and then
     /// reads this record; here, the record is written first and then the leases are read. So at
     /// least one of the two sees the other.
-    fn mark_collected(
+    pub(super) fn mark_collected(
         &self,
         name: &str,
         gone: &BTreeSet<u64>,

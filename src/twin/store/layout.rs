@@ -19,6 +19,9 @@ pub(super) const OBJECTS: &str = "objects";
 /// The folder of the state of garbage collection.
 pub(super) const COLLECTION: &str = "gc";
 
+/// The folder of leases among a twin's side files.
+pub(super) const LEASES: &str = "leases";
+
 /// Path of a log record below the root. The number has ten digits, so that names sort as numbers
 /// do.
 pub(super) fn record_key(name: &str, number: u64) -> String {

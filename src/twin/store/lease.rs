@@ -9,7 +9,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use super::disk::Lock;
-use super::layout::LOCK_ENDING;
+use super::layout::{LEASES, LOCK_ENDING};
 use super::{Catalog, StoreError};
 
 /// A version in use. The lease ends when it is dropped; or when it was not renewed for its
@@ -33,9 +33,6 @@ pub(super) struct LeaseRecord {
     id: String,
     until_us: i64,
 }
-
-/// The folder of leases among a twin's side files.
-pub(super) const FOLDER: &str = "leases";
 
 impl Catalog {
     /// Records that a version of a twin is in use by `holder` (a text for people), until the
@@ -77,9 +74,9 @@ impl Catalog {
     /// All leases of a twin, including expired ones.
     pub(super) fn leases(&self, name: &str) -> Result<Vec<LeaseRecord>, StoreError> {
         let mut leases = Vec::new();
-        let files = self.objects.list_side_files(name, FOLDER)?;
+        let files = self.objects.list_side_files(name, LEASES)?;
         for id in files.into_iter().filter(|file| !file.ends_with(LOCK_ENDING)) {
-            let read = self.objects.read_side_file(name, &format!("{FOLDER}/{id}"))?;
+            let read = self.objects.read_side_file(name, &format!("{LEASES}/{id}"))?;
             // A missing file is a lease that ended meanwhile. The version of a
             // damaged one is unknown.
             let record =
@@ -149,10 +146,10 @@ impl LeaseRecord {
     }
 
     fn lock_file(&self) -> String {
-        format!("{FOLDER}/{}{LOCK_ENDING}", self.id)
+        format!("{LEASES}/{}{LOCK_ENDING}", self.id)
     }
 
     fn file(&self) -> String {
-        format!("{FOLDER}/{}", self.id)
+        format!("{LEASES}/{}", self.id)
     }
 }

@@ -77,6 +77,7 @@ mod remote;
 mod settings;
 mod sky;
 mod views;
+mod whole_twin;
 
 pub use actors::{ActorList, AddedActor, DamagedActor, SameName, StoredActor, StoredLevel};
 pub use catalog::{Catalog, DamagedTwin, TwinList, TwinListing, Version, check_name};

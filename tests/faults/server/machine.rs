@@ -82,7 +82,7 @@ impl Machine {
     ) -> SimServer {
         let (stop, stopping) = watch::channel(false);
         let state = Arc::new(ServerState {
-            metrics: Metrics::new(self.engine.clone()),
+            metrics: Metrics::new(self.engine.clone(), Vec::new()),
             engine: self.engine.clone(),
             sessions: SessionRegistry::new(limits.sessions, limits.resume_grace),
             websocket_permits: Arc::new(Semaphore::new(limits.connections)),
@@ -101,7 +101,11 @@ impl Machine {
             spool,
             pushes: PushQueue::new(limits.queue()),
         });
-        SimServer { acceptor: Acceptor::new(state.clone()), state, _stop: stop }
+        SimServer {
+            acceptor: Acceptor::new(state.clone(), crate::routes::router(state.clone())),
+            state,
+            _stop: stop,
+        }
     }
 }
 

@@ -25,7 +25,7 @@ from .observation import Observation
 from .pose import Pose
 from .protocol import Trajectory
 
-__all__ = ["CAMERAS", "Model", "as_torch", "cameras", "inputs", "session_options", "trajectory"]
+__all__ = ["CAMERAS", "Model", "as_torch", "cameras", "inputs", "nav_text", "session_options", "trajectory"]
 
 Model = Literal["1", "1.5", "2"]
 
@@ -131,6 +131,15 @@ def inputs(seen: Observation, model: Model = "1.5", task: str = "trajectory") ->
     if model == "2":
         data |= _inputs_of_2(seen, infos, t0_us, earliest)
     return data
+
+
+def nav_text(seen: Observation) -> str | None:
+    """The instruction of the route, for `nav_text` of Alpamayo 1.5's `create_message`.
+
+    It is the text of the route's next command, with the distance in metres; None if the scenario gives none now.
+    """
+    route = seen.metadata.route
+    return None if route is None else route.text
 
 
 def as_torch(data: Mapping[str, Any]) -> dict[str, Any]:

@@ -33,6 +33,9 @@ class Dynamics:
 DynamicsChoice = Union[Model, Dynamics]  # noqa: UP007
 """How the ego moves."""
 
+Follow = Literal["latest"]
+"""Which versions of its twin a session shows by itself."""
+
 Encoding = Literal["jpeg", "png", "raw"]
 """Encoding of colour images."""
 
@@ -1220,6 +1223,9 @@ class Metadata:
     """Place and heading of the ego on the earth. Only if the twin says where it lies."""
     history: tuple[ImageInfo, ...] = ()
     """Earlier frames of the same cameras, camera by camera, newest first. Absent if there are none."""
+    newer_version: int | None = None
+    """The twin's latest version, if it is newer than `version`: `switch_version` shows it. It is known about a second
+    after it was made."""
     route: Route | None = None
     """Where to drive. Only with a scenario that has a route."""
     sweeps: tuple[Sweep, ...] = ()
@@ -1276,11 +1282,17 @@ class OpenOptions(TypedDict, total=False):
     """Simulated time of a step, in microseconds. If absent, the server's default."""
     dynamics: DynamicsChoice | None
     """How the ego moves. If absent, by teleport."""
+    follow: Follow | None
+    """Which versions of the twin the session shows from its second observation on. If absent, its own until
+    `switch_version`."""
     outputs: Outputs | None
     """What each observation holds."""
     profile: Mapping[str, float | bool | None] | None
     """Changes of the twin's render profile for this session, for example `{"tau_px": 2.0}`. Fields that are absent keep
     the server's setting, if it has one, or else the twin's."""
+    record: bool | None
+    """Whether episodes are recorded. If absent, true. An episode without a record cannot be replayed, scored, exported
+    or continued."""
     repair: str | Repair | None
     """The repair of images by a model of the server. If absent, images are as rendered."""
     rig: RigChoice | None

@@ -44,13 +44,16 @@ class Alpamayo:
         samples: int = 1,
     ) -> None:
         """`speed` in m/s and `curvature` in 1/m (positive to the left) of the arc; `samples` is the number of arcs."""
+        self.model = model
         self.indices = [alpamayo.CAMERAS[name] for name in alpamayo.cameras(model, task)]
         self.speed = speed
         self.curvature = curvature
         self.samples = samples
         self.calls = 0
 
-    def __call__(self, data: Mapping[str, Any], route: Any = None) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def __call__(
+        self, data: Mapping[str, Any], route: Any = None, nav_text: str | None = None
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """`pred_xyz` (1, 1, S, 64, 3) and `pred_rot` (1, 1, S, 64, 3, 3). Raises `ModelInputError`."""
         arrays = {key: np.asarray(data[key]) if key in data else None for key in _DTYPES}
         self._check_types(arrays)
@@ -59,6 +62,8 @@ class Alpamayo:
         self._check_history(arrays)
         if route is not None and np.asarray(route).shape[:1] != (20,):
             raise ModelInputError(f"the route has {len(route)} waypoints; expected 20")
+        if nav_text is not None and (self.model != "1.5" or "<|" in nav_text):
+            raise ModelInputError(f"nav_text is {nav_text!r}: model 1.5 takes one, without tokens of the model")
         self.calls += 1
         return self._arc()
 

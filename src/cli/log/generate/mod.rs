@@ -4,7 +4,7 @@ mod actors;
 mod recorder;
 mod sensors;
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -22,7 +22,7 @@ use wildcity_twin::residency::Cache;
 use self::recorder::Recorder;
 use crate::cli::backend_options::BackendOptions;
 use crate::cli::directories::{TwinVersion, Twins};
-use crate::cli::output::counted;
+use crate::cli::output::{self, counted};
 use crate::cli::progress;
 
 /// Record a log of a twin: a vehicle repeats the twin's first drive among three moving objects.
@@ -120,7 +120,7 @@ impl Generate {
         bar.finish_and_clear();
         let out = self.out.display();
         writeln!(
-            io::stdout(),
+            output::stdout(),
             "{out}: {}; next: wildcity log check {out}",
             counted(images, "image")
         )?;

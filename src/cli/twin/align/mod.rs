@@ -142,13 +142,9 @@ impl Align {
             picture::before_and_after(gaussians, &alignment, base.manifest.profile)?;
         output::write(&picture, &png)?;
         let picture = picture.display();
-        writeln!(
-            io::stdout().lock(),
-            "picture     {picture}, with a grid of {} m",
-            rounded(step_m)
-        )?;
+        writeln!(output::stdout(), "picture     {picture}, with a grid of {} m", rounded(step_m))?;
         if !self.apply {
-            writeln!(io::stdout().lock(), "nothing is changed: look at it, then give --apply")?;
+            writeln!(output::stdout(), "nothing is changed: look at it, then give --apply")?;
             return Ok(());
         }
 
@@ -190,7 +186,7 @@ fn rounded(step_m: f64) -> f64 {
 }
 
 fn print_proposal(ground: &GroundPlane, alignment: &Alignment) -> anyhow::Result<()> {
-    let mut out = io::stdout().lock();
+    let mut out = output::stdout();
     let DVec3 { x, y, z } = ground.up;
     let tilt_degrees = ground.up.angle_between(DVec3::Z).to_degrees();
     let height = ground.up.dot(ground.point);

@@ -256,7 +256,8 @@ impl ChunkTest {
             return false;
         }
         // Beside the sector: a tangent times x is largest in size at the far side.
-        let [left, right] = [self.azimuths[1], self.azimuths[0]];
+        let right = self.azimuths[0];
+        let left = self.azimuths[1];
         let near_x = (x - half_x).max(0.0);
         let most = |tangent: f32| if tangent > 0.0 { tangent * far_x } else { tangent * near_x };
         let least = |tangent: f32| if tangent > 0.0 { tangent * near_x } else { tangent * far_x };

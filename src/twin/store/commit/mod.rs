@@ -8,10 +8,10 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crate::ingest::IngestError;
 use crate::limits;
-use wildcity_scene::Gaussians;
 use wildcity_scene::manifest::{ChunkEntry, ObjectRef, ViewsRef};
 use wildcity_scene::record::Clamped;
 use wildcity_scene::validate::{self, Field};
+use wildcity_scene::{Gaussians, Manifest};
 
 use super::backend::Staging;
 use super::catalog::check_name;
@@ -134,6 +134,21 @@ impl Commit {
         self.chunks.extend(chunks.iter().map(by_cell));
         // No underflow: the packer has a part of these Gaussians.
         Ok(StoredCells { left_out: gaussians.len() as u64 - packer.gaussians(), chunks })
+    }
+
+    /// Puts the chunks of a manifest as they are, which `read` gives, in place of Gaussians.
+    pub(super) fn put_chunks(
+        &mut self,
+        manifest: &Manifest,
+        read: &mut dyn FnMut(&ChunkEntry) -> Result<Vec<u8>, StoreError>,
+    ) -> Result<(), StoreError> {
+        self.sh_degree = Some(manifest.sh_degree);
+        for chunk in &manifest.chunks {
+            let bytes = read(chunk)?;
+            self.staging.put(Box::new(|out| out.write_all(&bytes)))?;
+            self.chunks.insert([chunk.cell[1], chunk.cell[0]], chunk.clone());
+        }
+        Ok(())
     }
 
     /// Leaves cells of the base out of a version that [`Commit::change`] makes, but for those that

@@ -21,7 +21,8 @@ use super::backend::{
 };
 use super::disk::{FileInfo, Lock, Wait};
 use super::layout::{
-    ACTORS, LOCK_ENDING, LOG, check_hash, check_side_file, is_hash, is_prefix, log_numbers,
+    ACTORS, COLLECTION, LEASES, LOCK_ENDING, LOG, OBJECTS, check_hash, check_side_file, is_hash,
+    is_prefix, log_numbers,
 };
 
 pub(super) use directory::Local;
@@ -246,6 +247,27 @@ impl ObjectBackend for Local {
         folders.iter().try_for_each(|folder| sync(&*self.disk, folder))?;
         self.remove_empty(name);
         Ok(())
+    }
+
+    fn remove_twin(
+        &self,
+        name: &str,
+        mark: &mut dyn FnMut() -> Result<(), StoreError>,
+    ) -> Result<(), StoreError> {
+        let _publish_lock = self.lock_publishing(name)?;
+        mark()?;
+        let twin = self.root.join(name);
+        // The log is last: as long as it has a record, the removal can be repeated.
+        for folder in [OBJECTS, LEASES, COLLECTION, LOG] {
+            let dir = twin.join(folder);
+            match self.disk.remove_all(&dir) {
+                Err(error) if error.kind() == ErrorKind::NotFound => {}
+                removed => removed.map_err(StoreError::io("remove", &dir))?,
+            }
+            sync(&*self.disk, &twin)?;
+        }
+        self.disk.remove_dir(&twin).map_err(StoreError::io("remove", &twin))?;
+        sync(&*self.disk, &self.root)
     }
 
     fn list_side_files(&self, name: &str, folder: &str) -> Result<Vec<String>, StoreError> {

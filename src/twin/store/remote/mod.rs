@@ -24,7 +24,9 @@ use wildcity_scene::rig::is_name;
 use super::StoreError;
 use super::backend::{HashedStart, ListedObject, ObjectBackend, ObjectListing, Staging};
 use super::disk::Lock;
-use super::layout::{LOG, OBJECTS, check_side_file, is_hash, log_numbers, object_key, record_key};
+use super::layout::{
+    COLLECTION, LEASES, LOG, OBJECTS, check_side_file, is_hash, log_numbers, object_key, record_key,
+};
 
 pub(super) use client::Remote;
 pub use retry::RetryPolicy;
@@ -217,6 +219,27 @@ impl ObjectBackend for Remote {
     ) -> Result<(), StoreError> {
         // An object that is missing is no error, so that a run that was stopped can be repeated.
         which()?.iter().try_for_each(|hash| self.delete(&object_key(name, hash)))
+    }
+
+    fn remove_twin(
+        &self,
+        name: &str,
+        mark: &mut dyn FnMut() -> Result<(), StoreError>,
+    ) -> Result<(), StoreError> {
+        mark()?;
+        for object in self.list_objects(name)?.whole()? {
+            self.delete(&object_key(name, &object.hash))?;
+        }
+        for folder in [LEASES, COLLECTION] {
+            for file in self.list_side_files(name, folder)? {
+                self.delete(&format!("{name}/{folder}/{file}"))?;
+            }
+        }
+        // The oldest last: as long as there is a record, the removal can be repeated.
+        for number in self.version_numbers(name)?.into_iter().rev() {
+            self.delete(&record_key(name, number))?;
+        }
+        Ok(())
     }
 
     fn list_side_files(&self, name: &str, folder: &str) -> Result<Vec<String>, StoreError> {

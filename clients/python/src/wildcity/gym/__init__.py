@@ -13,10 +13,10 @@ import gymnasium
 
 from .env import DriveEnv
 from .route import Route
-from .task import DriveConfig, DriveState
+from .task import DriveConfig, DriveState, Reward
 from .vector import DriveVectorEnv
 
-__all__ = ["DriveConfig", "DriveEnv", "DriveState", "DriveVectorEnv", "Route"]
+__all__ = ["DriveConfig", "DriveEnv", "DriveState", "DriveVectorEnv", "Reward", "Route"]
 
 gymnasium.register(
     "wildcity/Drive-v0",

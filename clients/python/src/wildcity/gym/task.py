@@ -22,8 +22,6 @@ CURVATURE_1_M = 0.2
 WAYPOINTS = 20
 HISTORY_POSES = 16
 SPEED_M_S = 60.0
-CONTACT_M = 10.0
-"""Penalty for a contact, in metres of progress."""
 HISTORY_M = 200.0
 """16 poses at 0.1 s and 60 m/s are 90 m."""
 ROUTE_M = 1000.0
@@ -53,9 +51,42 @@ class DriveState:
         return sum(event.kind == "contact" for event in self.observation.metadata.events)
 
 
-def default_reward(before: DriveState, after: DriveState) -> float:
-    """Progress along the drive in metres, minus a tenth of the distance from it, minus 10 for each contact."""
-    return after.station_m - before.station_m - 0.1 * after.distance_m - CONTACT_M * after.contacts
+@dataclass(frozen=True)
+class Reward:
+    """The reward of a step, in metres of progress: a sum of terms, each with its weight. A weight of 0 leaves it out.
+
+    Where a drive ends, speeding cannot pay: its term takes more than the progress that it brings.
+    """
+
+    progress: float = 1.0
+    """Progress along the drive or the route, in metres."""
+    beside: float = 0.1
+    """Minus the distance from it, in metres."""
+    speeding: float = 2.0
+    """Minus the way above the limit: the speed above `speed_limit_m_s`, in m/s, times the time of the step."""
+    comfort: float = 0.5
+    """Minus the acceleration above `comfort_m_s2`, braking and turning too, in m/s², times the time of the step."""
+    contact: float = 10.0
+    """Minus the number of contacts that began in the step."""
+    speed_limit_m_s: float = 50 / 3.6
+    comfort_m_s2: float = 3.0
+
+    def terms(self, before: DriveState, after: DriveState) -> dict[str, float]:
+        """Each term with its weight and its sign."""
+        observation = after.observation
+        time_s = 1e-6 * (observation.metadata.time_us - before.observation.metadata.time_us)
+        acceleration_m_s2 = float(np.linalg.norm(observation.ego.acceleration[:2]))
+        return {
+            "progress": self.progress * (after.station_m - before.station_m),
+            "beside": -self.beside * after.distance_m,
+            "speeding": -self.speeding * max(0.0, after.speed_m_s - self.speed_limit_m_s) * time_s,
+            "comfort": -self.comfort * max(0.0, acceleration_m_s2 - self.comfort_m_s2) * time_s,
+            "contact": -self.contact * after.contacts,
+        }
+
+    def __call__(self, before: DriveState, after: DriveState) -> float:
+        """The sum of the terms."""
+        return sum(self.terms(before, after).values())
 
 
 @dataclass(frozen=True)
@@ -74,7 +105,8 @@ class DriveConfig:
     start_m: episodes start at a random distance along the drive between these two; the default ends 20 m before its
         end.
     waypoint_m: distance between two of the 20 points of the route ahead.
-    reward: a function of the states before and after a step; `default_reward` if None.
+    record: whether the server records the episodes. A training makes a file with each reset.
+    reward: a `Reward` with weights of your own, or any function of the states before and after a step.
 
     Raises `ValueError` that names the argument.
     """
@@ -94,7 +126,8 @@ class DriveConfig:
     off_route_m: float = 4.0
     start_m: tuple[float, float] | None = None
     waypoint_m: float = 4.0
-    reward: Callable[[DriveState, DriveState], float] | None = None
+    record: bool = False
+    reward: Callable[[DriveState, DriveState], float] = Reward()
     token: str | None = None
     timeout: float = 90.0
 
@@ -113,7 +146,10 @@ class DriveConfig:
             raise ValueError(f"horizon is {self.horizon}; an episode has at least one step")
 
     def open_options(self, welcome: Welcome) -> dict[str, Any]:
-        """Arguments of `Client.open`. Raises `ValueError` if the twin has no drive to follow."""
+        """Arguments of `Client.open`. Raises `ValueError` if there is no such twin, or it has no drive to follow."""
+        twins = [twin.name for twin in welcome.twins]
+        if self.twin not in twins:
+            raise ValueError(f"there is no twin {self.twin!r}; the server has {', '.join(sorted(twins)) or 'none'}")
         images = {camera: ImagePart(size=self.size) for camera in self.cameras}
         options = {
             "twin": self.twin,
@@ -122,6 +158,7 @@ class DriveConfig:
             # Raw, because small images cost more time to decode than to transfer.
             "outputs": Outputs(cameras=self.cameras, encoding="raw", images=images),
             "dt_us": self.dt_us,
+            "record": self.record,
         }
         if self.scenario is not None:
             return {**options, "scenario": self.scenario}
@@ -208,7 +245,7 @@ class Task(ABC):
         after = self._state_of(seen, before.station_m)
         self._state = after
         self._steps += 1
-        reward = (self.config.reward or default_reward)(before, after)
+        reward = self.config.reward(before, after)
         terminated, ended = self._ended(after)
         truncated = not terminated and (ended or self._steps >= self.config.horizon)
         return self._arrays(after), float(reward), terminated, truncated, self._info(after)

@@ -1,0 +1,27 @@
+//! The scenarios of a server over HTTP.
+
+use std::sync::Arc;
+
+use axum::extract::State as Shared;
+use axum::response::IntoResponse as _;
+use axum::{Extension, Json};
+use serde_json::json;
+
+use crate::auth::Grant;
+use crate::blocking::blocking;
+use crate::fault::Fault;
+use crate::state::ServerState;
+
+use super::refusal::HttpResult;
+
+/// `GET /v1/scenarios`: names that `open` knows. A token that is limited to some twins gets none,
+/// because a name may tell of others.
+pub(super) async fn list(
+    Shared(state): Shared<Arc<ServerState>>,
+    Extension(grant): Extension<Arc<Grant>>,
+) -> HttpResult {
+    let scenarios = state.engine.scenarios().clone();
+    let names = blocking(move || Ok::<_, Fault>(scenarios.names())).await?;
+    let shown = if grant.allows_all_twins() { names } else { Vec::new() };
+    Ok(Json(json!({ "scenarios": shown })).into_response())
+}
