@@ -23,7 +23,6 @@ pub(crate) fn lidar_view(
     request: &wire::LidarRenderRequest,
     frame: &LocalFrame,
 ) -> Result<LidarView, CameraSpecError> {
-    let refused = |field, must: String| CameraSpecError::Field { field, must };
     let spec = request.lidar_config.as_ref();
     let spec = spec.ok_or_else(|| refused("lidar_config", "is missing".to_owned()))?;
     let device = wire::LidarDeviceType::try_from(spec.lidar_type).map_err(|_| {
@@ -45,6 +44,10 @@ pub(crate) fn lidar_view(
         world_from_lidar_first: frame
             .world_from("sensor_pose.start_pose", pair.start_pose.as_ref())?,
     })
+}
+
+fn refused(field: &'static str, must: String) -> CameraSpecError {
+    CameraSpecError::Field { field, must }
 }
 
 /// The beams of a device that takes `duration_us` for a sweep.

@@ -34,6 +34,9 @@ from wildcity import (
     ImageNoise,
     Imu,
     LensDirt,
+    LidarBeams,
+    LidarColumns,
+    LidarSensor,
     Observation,
     Outputs,
     Pose,
@@ -41,6 +44,7 @@ from wildcity import (
     RecordedPoint,
     Refused,
     Rig,
+    RigLidar,
     Sensors,
     SnapshotPoint,
     Station,
@@ -185,6 +189,41 @@ def test_frames_of_the_recorded_and_the_driven_part(connect: Connect, server: Se
     assert on_route is not None and beside is not None
     assert on_route.distance_m == pytest.approx(0.0, abs=1e-9) and beside.distance_m == pytest.approx(1.0)
     assert beside.value < on_route.value <= 1.0
+
+
+def test_has_the_sweeps_of_its_lidar(connect: Connect, server: Server) -> None:
+    beams = LidarBeams(
+        tuple(math.radians(5 - k) for k in range(24)),
+        100_000,
+        columns=LidarColumns(360, math.pi, math.pi / 180 - math.pi),
+    )
+    top = RigLidar("top", beams, Pose((1.0, 0.0, 1.9), (1.0, 0.0, 0.0, 0.0)))
+    rig = Rig(PAIR.name, PAIR.cameras, (top,))
+    lossy = Sensors(lidars={"top": LidarSensor(noise_m=0.02, drop=0.5)})
+    with connect(server.url) as client:
+        with client.open("corridor", rig=rig, outputs=RAW) as session:
+            first = session.reset().lidars["top"]
+            here = session.opened.start
+            observation = session.step(here @ Pose.flat(2.0, 0.0))
+            cloud = observation.lidars["top"]
+            assert not session.observe([here]).lidars
+        with client.open("corridor", rig=rig, outputs=RAW, sensors=lossy) as session:
+            lost = session.reset().lidars["top"]
+    assert len(first) > 1_000 and 0.45 < len(lost) / len(first) < 0.55, (len(lost), len(first))
+    assert cloud.points.shape == (len(cloud), 3) and cloud.intensity.shape == cloud.rows.shape == (len(cloud),)
+    # The beam of each return, from the LiDAR: elevation of its row and azimuth of its column.
+    from_lidar = cloud.points.astype(float) - [1.0, 0.0, 1.9]
+    range_m = np.linalg.norm(from_lidar, axis=1)
+    assert range_m.min() > 0.5
+    elevation = np.degrees(np.arcsin(from_lidar[:, 2] / range_m))
+    assert np.abs(elevation - (5.0 - cloud.rows)).max() < 0.01
+    azimuth = np.degrees(np.arctan2(from_lidar[:, 1], from_lidar[:, 0]))
+    off = (azimuth - (180.0 - cloud.columns) + 180.0) % 360.0 - 180.0
+    assert np.abs(off).max() < 0.01
+    metadata = observation.metadata.sweeps[0]
+    assert (metadata.end_us, metadata.columns) == (observation.metadata.time_us, 360)
+    assert np.abs(cloud.times_us - (metadata.end_us - (359 - cloud.columns.astype(float)) * 100_000 / 360)).max() < 1.0
+    assert (cloud.instances == 1).all()
 
 
 def test_knows_where_it_is_on_the_earth(connect: Connect, server: Server) -> None:
