@@ -2,7 +2,7 @@
 //!
 //! **A return is where a beam has lost half of its light.** A Gaussian's alpha on a beam is its
 //! response at the point of the beam that is closest in standard deviations (Wu et al. 2024,
-//! 3DGUT), at most the profile's cap, and 0 below its cut. Gaussians are blended in the order of
+//! 3DGUT), at most the profile's cap, and 0 below its cut or 1/255. Gaussians are blended in the order of
 //! these points. The range is the distance to that of the Gaussian with which the transmittance
 //! falls to a half or less. It is not the mean depth, which lies between two surfaces where a beam
 //! grazes the nearer one. A beam that no Gaussian brings to a half has no return.
@@ -132,8 +132,15 @@ pub(crate) fn luminance(body: &Body<'_>, value: impl Fn(usize) -> f32) -> f32 {
     0.2126 * channel(0) + 0.7152 * channel(1) + 0.0722 * channel(2)
 }
 
-/// The squared number of standard deviations at which alpha falls below the profile's cut, for a
-/// Gaussian's peak opacity; not positive if it is below the cut itself.
+/// The least alpha that counts: the profile's cut, but at least 1/255. So a beam has lost half of its
+/// light after 177 hits at most, which bounds its memory.
+pub(crate) fn alpha_cut(profile: &RenderProfile) -> f64 {
+    profile.alpha_cut.max(1.0 / 255.0)
+}
+
+/// The squared number of standard deviations at which alpha falls below the cut, for a Gaussian's
+/// peak opacity; not positive if it is below the cut itself. As for splats, a merged Gaussian with an
+/// opacity above 1 ends where one of opacity 1 does.
 pub(crate) fn reach2(log2_opacity: f64, profile: &RenderProfile) -> f64 {
-    2.0 * std::f64::consts::LN_2 * (log2_opacity - profile.alpha_cut.log2())
+    2.0 * std::f64::consts::LN_2 * (log2_opacity.min(0.0) - alpha_cut(profile).log2())
 }

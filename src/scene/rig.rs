@@ -136,6 +136,9 @@ pub enum RigError {
     /// More LiDARs than [`Rig::MAX_LIDARS`].
     #[error("rig {rig:?} has {count} LiDARs; at most {limit} are accepted")]
     Lidars { rig: String, count: usize, limit: usize },
+    /// The LiDARs have more beams than [`Rig::MAX_BEAMS`] together.
+    #[error("the LiDARs of a rig have {beams} beams in all; at most {limit} are accepted")]
+    Beams { beams: usize, limit: usize },
     /// The beams of a LiDAR are invalid.
     #[error("LiDAR {name:?}: beams.{cause}")]
     Lidar {
@@ -208,6 +211,9 @@ impl Rig {
     /// Largest number of LiDARs.
     pub const MAX_LIDARS: usize = 4;
 
+    /// Most beams of all LiDARs together: those of one of the largest.
+    pub const MAX_BEAMS: usize = Lidar::MAX_ROWS * Lidar::MAX_COLUMNS;
+
     /// A rig without LiDARs.
     pub fn new(name: impl Into<String>, cameras: Vec<RigCamera>) -> Self {
         Self { name: name.into(), cameras, lidars: Vec::new() }
@@ -248,6 +254,10 @@ impl Rig {
             if !names.insert(name) {
                 return Err(RigError::Duplicate { name: name.clone() });
             }
+        }
+        let beams = self.lidars.iter().map(|mounted| mounted.lidar.beams()).sum();
+        if beams > Self::MAX_BEAMS {
+            return Err(RigError::Beams { beams, limit: Self::MAX_BEAMS });
         }
         check_overlays(&self.cameras)
     }
@@ -384,7 +394,10 @@ impl UnreadRig {
             lidars.push(lidar);
         }
         let rig = Rig { name: rig.name, cameras, lidars };
-        rig.check().map_err(at("cameras"))?;
+        rig.check().map_err(|cause| {
+            let part = if matches!(cause, RigError::Beams { .. }) { "lidars" } else { "cameras" };
+            RigFieldError { part: part.to_owned(), cause }
+        })?;
         Ok(Self { rig, overlays })
     }
 

@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use wildcity_scene::Rig;
+
 /// Largest number of events of one observation.
 pub const EVENTS: usize = 64;
 
@@ -284,9 +286,10 @@ const _: () = {
 };
 
 // The largest answer of a session fits a message, with normals at half of the pixels, and with
-// instances at three quarters of them.
+// instances at three quarters of them; each beside the largest sweeps.
 const _: () = {
-    let room_bytes = OBSERVATION_BYTES as u64 - OBSERVATION_HEADER_BYTES;
+    let sweeps_bytes = POINT_BYTES * Rig::MAX_BEAMS as u64;
+    let room_bytes = OBSERVATION_BYTES as u64 - OBSERVATION_HEADER_BYTES - sweeps_bytes;
     assert!(ANSWER_PIXELS * PIXEL_BYTES <= room_bytes);
     let with_instances = PIXEL_BYTES + INSTANCE_BYTES;
     assert!(ANSWER_PIXELS / 2 * (PIXEL_BYTES + NORMAL_BYTES) <= room_bytes);

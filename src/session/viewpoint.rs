@@ -17,8 +17,9 @@ pub fn viewpoints(views: &[View]) -> Vec<Viewpoint> {
     views.iter().map(viewpoint).collect()
 }
 
-/// The viewpoint of a LiDAR at the end of its sweep. Its beams are about as wide as a pixel of a
-/// camera with this focal length: a milliradian.
+/// The viewpoint of a LiDAR at the end of its sweep. A beam is about a milliradian wide: a pixel of
+/// a camera with a focal length of 1,000. Beams that are closer to each other need more detail.
 pub fn lidar_viewpoint(view: &LidarView) -> Viewpoint {
-    Viewpoint { position_m: view.world_from_lidar.position_m, focal_px: 1_000.0 }
+    let focal_px = view.lidar.resolution_rad().recip().max(1_000.0);
+    Viewpoint { position_m: view.world_from_lidar.position_m, focal_px }
 }

@@ -223,6 +223,96 @@ fn extreme_gaussians_are_met_as_by_the_definition() {
     }
 }
 
+/// A LiDAR of some rows and columns, evenly within these angles in radians.
+fn grid(elevations: [f64; 2], rows: usize, azimuths: [f64; 2], columns: u64) -> Lidar {
+    let step = (elevations[1] - elevations[0]) / (rows.max(2) - 1) as f64;
+    Lidar::from_options(&LidarBeams {
+        row_elevations_rad: (0..rows).map(|row| elevations[0] + step * row as f64).collect(),
+        row_azimuth_offsets_rad: None,
+        column_azimuths_rad: None,
+        columns: Some(LidarColumns {
+            count: columns,
+            first_rad: azimuths[0],
+            last_rad: azimuths[1],
+        }),
+        duration_us: 100_000,
+        min_range_m: Some(0.1),
+        max_range_m: None,
+    })
+    .unwrap()
+}
+
+/// One Gaussian.
+fn lone(mean: [f64; 3], ln_scale: [f32; 3], logit: f32) -> Scene {
+    let mut gaussians = Gaussians::with_capacity(0, 1);
+    gaussians.means_m.push(mean);
+    gaussians.ln_scales.push(ln_scale);
+    gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+    gaussians.logit_opacities.push(logit);
+    gaussians.sh.extend([0.3; 3]);
+    Scene::from_gaussians(&gaussians)
+}
+
+/// Beams that are aimed at single Gaussians: every one of them has to return, and from the same
+/// place as by the definition.
+#[test]
+fn beams_that_are_aimed_at_a_gaussian_meet_it() {
+    let cases: [([f64; 3], [f32; 3]); 6] = [
+        ([8.0, 2.0, 0.0], [-6.0, 0.5, -6.0]),
+        ([4.0, -3.0, 0.5], [-7.0; 3]),
+        ([-12.0, 1.0, -2.0], [-16.0, 1.0, 1.0]),
+        ([0.0, 0.0, 0.7], [-1.0, -1.0, -7.0]),
+        ([0.0, 0.0, -0.7], [-1.0, -1.0, -7.0]),
+        ([150.0, -90.0, 3.0], [-3.0; 3]),
+    ];
+    for (mean, ln_scale) in cases {
+        let [x, y, z] = mean;
+        let azimuth = f64::atan2(y, x);
+        let elevation = f64::atan2(z, f64::hypot(x, y));
+        let scene = lone(mean, ln_scale, 9.0);
+        for (rows, columns) in [(1, 1), (3, 3), (1, 40), (40, 1)] {
+            // A hundredth of a standard deviation of the smallest to both sides.
+            let off = 1e-5;
+            let rise = if elevation > 0.0 { -off } else { off };
+            let elevations = [elevation, elevation + rise];
+            let lidar = grid(elevations, rows, [azimuth - off, azimuth + off], columns);
+            let view = LidarView::at_rest(Arc::new(lidar), Pose::IDENTITY);
+            let wanted = sweep(&Reference, &scene, &view);
+            let found = sweep(&cpu(), &scene, &view);
+            for (at, wanted_m) in wanted.range_m.iter().enumerate() {
+                let found_m = found.range_m[at];
+                assert!(
+                    *wanted_m > 0.0 && (found_m - wanted_m).abs() < 1e-3,
+                    "{mean:?}: {found_m}"
+                );
+            }
+        }
+    }
+}
+
+/// A LiDAR of few columns is one sector, and turns by half a radian within it.
+#[test]
+fn few_columns_of_a_turning_lidar_meet_what_they_pass() {
+    for mean in [[5.0, 0.0, -1.8], [9.0, 6.0, -1.8]] {
+        let scene = lone(mean, [2.5, 2.5, -7.0], 9.0);
+        let view = LidarView {
+            lidar: Arc::new(grid([0.3, -0.6], 61, [0.4, -0.4], 16)),
+            world_from_lidar: Pose::IDENTITY,
+            world_from_lidar_first: Pose {
+                position_m: DVec3::new(-1.0, 0.3, 0.1),
+                rotation: DQuat::from_rotation_z(0.5) * DQuat::from_rotation_y(0.1),
+            },
+        };
+        let wanted = sweep(&Reference, &scene, &view);
+        let found = sweep(&cpu(), &scene, &view);
+        let missed: Vec<usize> = (0..wanted.range_m.len())
+            .filter(|at| (found.range_m[*at] - wanted.range_m[*at]).abs() > 1e-3)
+            .collect();
+        assert!(missed.is_empty(), "{missed:?}");
+        assert!(wanted.range_m.iter().filter(|range_m| **range_m > 0.0).count() > 100);
+    }
+}
+
 /// 4,500 km from the origin a sweep is the same.
 #[test]
 fn a_sweep_does_not_depend_on_the_origin() {

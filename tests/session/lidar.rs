@@ -137,6 +137,31 @@ async fn poses_that_are_only_observed_and_rigs_without_lidar_have_no_sweeps() {
     assert!(!observation.tensors.iter().any(|tensor| tensor.kind == TensorKind::Points(0)));
 }
 
+/// Four LiDARs and cameras with long names and every map leave room in the header.
+#[tokio::test(flavor = "multi_thread")]
+async fn the_header_has_room_for_four_lidars() {
+    let bench = bench(unlimited());
+    let mut options = options(None);
+    options.outputs =
+        Outputs { depth: true, opacity: true, normals: Some(true), ..options.outputs };
+    if let Some(RigChoice::Full(rig)) = &mut options.rig {
+        rig.cameras.truncate(1);
+        let first = rig.lidars[0].clone();
+        rig.lidars = (0..4)
+            .map(|number| wildcity_session::options::RigLidar {
+                name: format!("{number}{}", "x".repeat(63)),
+                ..first.clone()
+            })
+            .collect();
+    }
+    let mut session = open(&bench, "four", options).await.unwrap();
+    let observation = session.reset(0, None).await.unwrap();
+    assert_eq!(observation.sweeps.len(), 4);
+    // What the server writes: at most 2,048 bytes for each LiDAR.
+    let mut buffer = observation.buffer;
+    assert!(buffer.header_mut(4_096 + 3_584 + 4 * 2_048).is_some());
+}
+
 /// Noise and lost beams depend on seed and time alone.
 #[tokio::test(flavor = "multi_thread")]
 async fn effects_are_those_of_the_seed() {
@@ -203,6 +228,12 @@ async fn a_replay_casts_the_sweeps_again() {
     std::fs::write(&path, format!("{before}\"sweeps\":[\"{changed}{}", &hash[1..])).unwrap();
     let difference = replay().difference.unwrap();
     assert_eq!(difference.camera, "top");
+
+    // Without the sweeps of a frame the record says less than was sent.
+    let (head, rest) = text.split_once(",\"sweeps\":[\"").unwrap();
+    let (_, tail) = rest.split_once("\"]").unwrap();
+    std::fs::write(&path, format!("{head}{tail}")).unwrap();
+    assert!(replay().wrong_value.is_some());
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -215,7 +246,35 @@ async fn wrong_lidars_are_refused_by_name() {
         }
         open
     };
-    let cases: [(Open, &str); 6] = [
+    let cases: [(Open, &str); 8] = [
+        (
+            changed(&|lidar| {
+                let back_and_forth = (0..400).map(|column| f64::from(column % 2));
+                lidar.beams.columns = None;
+                lidar.beams.column_azimuths_rad = Some(back_and_forth.collect());
+            }),
+            "jumps by more than 0.2 rad 399 times",
+        ),
+        (
+            {
+                let mut open = changed(&|lidar| {
+                    let row = |row: i32| -0.01 * f64::from(row) / 3.0;
+                    lidar.beams.row_elevations_rad = (0..256).map(row).collect();
+                    let count = 4096;
+                    lidar.beams.columns =
+                        Some(LidarColumns { count, first_rad: 3.0, last_rad: -3.0 });
+                });
+                if let Some(RigChoice::Full(rig)) = &mut open.rig {
+                    let second = wildcity_session::options::RigLidar {
+                        name: "two".into(),
+                        ..rig.lidars[0].clone()
+                    };
+                    rig.lidars.push(second);
+                }
+                open
+            },
+            "2097152 beams in all",
+        ),
         (changed(&|lidar| lidar.beams.duration_us = 0), "duration_us is 0"),
         (changed(&|lidar| lidar.beams.row_elevations_rad[3] = 0.5), "rise or fall"),
         (changed(&|lidar| lidar.beams.column_azimuths_rad = Some(vec![0.0])), "give either"),

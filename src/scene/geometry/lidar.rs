@@ -48,6 +48,12 @@ pub enum LidarError {
     /// Rows that do not follow each other.
     #[error("row_elevations_rad[{row}] is {value}: elevations must rise or fall from row to row")]
     Order { row: usize, value: f64 },
+    /// Columns that are in no order of a scan.
+    #[error(
+        "column_azimuths_rad jumps by more than 0.2 rad {jumps} times; at most {limit} are accepted: \
+         list the columns in the order in which they are scanned"
+    )]
+    Jumps { jumps: usize, limit: usize },
     /// Azimuths that are given twice, or not at all.
     #[error("give either column_azimuths_rad or columns")]
     Columns,
@@ -61,6 +67,7 @@ impl LidarError {
             Self::Offsets { .. } => "row_azimuth_offsets_rad",
             Self::Value { field, .. } => field,
             Self::Order { .. } => "row_elevations_rad",
+            Self::Jumps { .. } => "column_azimuths_rad",
             Self::Columns => "columns",
         }
     }
@@ -71,6 +78,11 @@ impl Lidar {
     pub const MAX_ROWS: usize = 256;
     /// Most columns.
     pub const MAX_COLUMNS: usize = 4096;
+    /// An angle between two columns that counts as a jump, in radians. Even columns this far apart
+    /// are 31 in a turn.
+    const JUMP_RAD: f64 = 0.2;
+    /// Most jumps between two columns.
+    const MAX_JUMPS: usize = 64;
     /// Longest time of a sweep, in microseconds: 1 s.
     pub const MAX_DURATION_US: i64 = 1_000_000;
     /// Farthest accepted range, in metres.
@@ -143,6 +155,13 @@ impl Lidar {
             if (pair[1] > pair[0]) != rises || pair[1] == pair[0] {
                 return Err(LidarError::Order { row: row + 1, value: pair[1] });
             }
+        }
+        // A sweep is cast in sectors of columns that look the same way, so that each jump costs as
+        // much as a sector.
+        let jumps = self.column_azimuths_rad.windows(2);
+        let jumps = jumps.filter(|pair| (pair[1] - pair[0]).abs() > Self::JUMP_RAD).count();
+        if jumps > Self::MAX_JUMPS {
+            return Err(LidarError::Jumps { jumps, limit: Self::MAX_JUMPS });
         }
         let duration = self.duration_us as f64;
         if !(1..=Self::MAX_DURATION_US).contains(&self.duration_us) {

@@ -39,9 +39,10 @@ pub(super) fn pose_code(error: &PoseError) -> Code {
 fn rig_place(RigFieldError { part, cause }: &RigFieldError) -> Place {
     let part = format!("rig.{part}");
     match cause {
-        RigError::Count { .. } | RigError::Overlays { .. } | RigError::Lidars { .. } => {
-            at(Code::OutOfRange, &part)
-        }
+        RigError::Count { .. }
+        | RigError::Overlays { .. }
+        | RigError::Lidars { .. }
+        | RigError::Beams { .. } => at(Code::OutOfRange, &part),
         RigError::Name { .. } | RigError::Duplicate { .. } => at(Code::InvalidName, &part),
         RigError::Pose { cause, .. } => at(pose_code(cause), &format!("{part}.{}", cause.field())),
         RigError::Camera { cause, .. } => {

@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 
 use wildcity_options::{CameraSensor, LidarSensor, Sensors};
+use wildcity_render::lidar::LidarView;
 use wildcity_render::{MAX_VIEWS, View};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::FieldMask;
@@ -20,6 +21,8 @@ use crate::sensors::EpisodeSensors;
 use crate::sensors::delivery::{Delivery, FrameSource};
 use crate::sensors::pixels::PixelEffects;
 use crate::sensors::{check, settings};
+use crate::viewpoint::{lidar_viewpoint, viewpoints};
+use wildcity_twin::residency::Viewpoint;
 
 /// Bytes of the header's length, little-endian, which comes before the header.
 pub const HEADER_PREFIX_BYTES: usize = 8;
@@ -32,6 +35,10 @@ const HEADER_BASE_BYTES: usize = 4096;
 /// digits, two names and a hash with their escaped keys, below 1,900 bytes; a lens of 12 numbers
 /// and a windshield of 42 with their keys, below 1,600 bytes.
 const HEADER_IMAGE_BYTES: usize = 3584;
+
+/// Room in the header per LiDAR: five tensors of at most 170 bytes, and a description with two names
+/// and a hash, with their escaped keys, below 700 bytes.
+const HEADER_LIDAR_BYTES: usize = 2048;
 
 /// Room in the header per image for the result of its repair: three texts, one of them a hash.
 const REPAIR_IMAGE_BYTES: usize = 256;
@@ -49,10 +56,12 @@ const IMAGES: usize = limits::OBSERVE_POSES * Rig::MAX_CAMERAS;
 const _: () = assert!(limits::BUNDLE_FRAMES <= limits::OBSERVE_POSES);
 
 // A client accepts the longest header, and the renderer renders any rig in one frame.
-// 4,096 + 256 x (3,584 + 256) = 987,136 bytes, of 1,048,576. Names of references and effects of
+// 4,096 + 4 x 2,048 + 256 x (3,584 + 256) = 995,328 bytes, of 1,048,576. Names of references and effects of
 // sensors are checked when a session asks for them.
 const _: () = assert!(
-    HEADER_BASE_BYTES + IMAGES * (HEADER_IMAGE_BYTES + REPAIR_IMAGE_BYTES)
+    HEADER_BASE_BYTES
+        + Rig::MAX_LIDARS * HEADER_LIDAR_BYTES
+        + IMAGES * (HEADER_IMAGE_BYTES + REPAIR_IMAGE_BYTES)
         <= limits::OBSERVATION_HEADER_BYTES as usize
 );
 const _: () = assert!(Rig::MAX_CAMERAS <= MAX_VIEWS);
@@ -176,6 +185,21 @@ impl ObservationLayout {
         Self { lidars, ..self }
     }
 
+    /// Room in the header for what images and a scenario do not take.
+    fn base_bytes(&self) -> usize {
+        HEADER_BASE_BYTES + self.lidars.len() * HEADER_LIDAR_BYTES
+    }
+
+    /// The viewpoints of all cameras and LiDARs at a pose of the rig.
+    pub(crate) fn viewpoints(&self, world_from_rig: Pose) -> Vec<Viewpoint> {
+        let mut places = viewpoints(&View::from_rig(&self.cameras, world_from_rig));
+        places.extend(self.lidars.iter().map(|mounted| {
+            let world_from_lidar = world_from_rig * mounted.rig_from_lidar;
+            lidar_viewpoint(&LidarView::at_rest(mounted.lidar.clone(), world_from_lidar))
+        }));
+        places
+    }
+
     /// The LiDARs, in the order of the sweeps of an observation.
     pub(crate) fn lidars(&self) -> &[RigLidar] {
         &self.lidars
@@ -207,7 +231,7 @@ impl ObservationLayout {
         self.image_bytes += REFERENCES_IMAGE_BYTES;
         let images = self.schedule.frames() * self.cameras.len();
         let most = limits::OBSERVATION_HEADER_BYTES as usize;
-        let needed = HEADER_BASE_BYTES + images * self.image_bytes;
+        let needed = self.base_bytes() + images * self.image_bytes;
         if needed <= most {
             return Ok(());
         }
@@ -235,7 +259,7 @@ impl ObservationLayout {
         }
         let images = self.schedule.frames() * self.cameras.len();
         let most = limits::OBSERVATION_HEADER_BYTES as usize;
-        let needed = HEADER_BASE_BYTES + images * self.image_bytes;
+        let needed = self.base_bytes() + images * self.image_bytes;
         if needed > most {
             let must = format!(
                 "set for {images} images, whose header would have {needed} bytes; at most {most} are accepted: request \
@@ -455,7 +479,7 @@ impl ObservationLayout {
         // All images and all actors of the scenario in one header.
         let images = self.schedule.frames() * self.cameras.len();
         let most = limits::OBSERVATION_HEADER_BYTES as usize;
-        let needed = HEADER_BASE_BYTES + images * self.image_bytes + self.scenario_bytes;
+        let needed = self.base_bytes() + images * self.image_bytes + self.scenario_bytes;
         if needed <= most {
             return Ok(());
         }
@@ -472,7 +496,7 @@ impl ObservationLayout {
         let rendered: usize = captures.iter().map(|capture| capture.cameras.len()).sum();
         // With several frames per camera, an observation contains more images than it renders.
         let images = rendered.max(self.schedule.frames() * self.cameras.len());
-        HEADER_BASE_BYTES + images * self.image_bytes + self.scenario_bytes
+        self.base_bytes() + images * self.image_bytes + self.scenario_bytes
     }
 
     /// Bytes that the renderer writes into the buffer for a capture.

@@ -53,6 +53,7 @@ impl PointCloud {
             Random::new(seed.seed, &format!("lidar.{}", mounted.name), time_us as usize)
         });
         for (at, &range_m) in sweep.range_m.iter().enumerate() {
+            let has_return = range_m > 0.0;
             let mut range_m = f64::from(range_m);
             if let (Some((sensor, _)), Some(random)) = (effects, &mut random) {
                 // Drawn for every beam, so that what one beam hits changes no other.
@@ -61,13 +62,13 @@ impl PointCloud {
                 if is_lost {
                     continue;
                 }
-                // A return that noise moves in front of the LiDAR's range stays at its nearest.
-                if range_m > 0.0 {
+                // A return that noise moves out of the LiDAR's range stays at its end.
+                if has_return {
                     let noisy_m = range_m + noise * sensor.noise_m.unwrap_or(0.0);
-                    range_m = noisy_m.max(beams.min_range_m());
+                    range_m = noisy_m.clamp(beams.min_range_m(), beams.max_range_m());
                 }
             }
-            if range_m == 0.0 {
+            if !has_return {
                 continue;
             }
             let row = at / beams.columns();

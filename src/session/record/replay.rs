@@ -15,7 +15,9 @@ use wildcity_twin::store::Catalog;
 
 use super::actor_replay::ActorReplay;
 use super::ego_replay::EgoReplay;
-use super::format::{BUILD, FrameRecord, FrameRequest, RecordedVersion, profile_hash};
+use super::format::{
+    BUILD, FrameRecord, FrameRequest, RecordedSettings, RecordedVersion, profile_hash,
+};
 use super::recorded_episode::RecordedEpisode;
 use super::repair_replay::{Drawing, ImageToRepair, RepairReplay};
 use super::repairs::RecordedImageRepair;
@@ -102,6 +104,7 @@ impl RecordedEpisode {
 struct Replay<'a> {
     cameras: &'a [RigCamera],
     lidars: &'a [RigLidar],
+    settings: Option<&'a RecordedSettings>,
     backend: &'a dyn Backend,
     resident: Arc<Resident>,
     profile: &'a RenderProfile,
@@ -157,6 +160,7 @@ impl<'a> Replay<'a> {
         Ok(Self {
             cameras,
             lidars: &header.rig.lidars,
+            settings: header.settings.as_ref(),
             backend,
             resident,
             profile: &header.profile,
@@ -333,7 +337,19 @@ impl<'a> Replay<'a> {
     /// Casts the sweeps of a frame again and compares their points.
     fn check_sweeps(&mut self, frame: &FrameRecord, index: usize) -> Result<(), ReplayError> {
         let step = frame.step;
-        // Not every frame has sweeps: `observe` has none. A frame that has one has all.
+        // As for a session: none of poses that the ego is not at, and none between two decisions.
+        let schedule = self.settings.map(|settings| &settings.schedule);
+        let is_decision = schedule.is_none_or(|schedule| schedule.is_decision(frame.time_us));
+        let is_shown = frame.request != FrameRequest::Observe && is_decision;
+        let expected = if is_shown { self.lidars.len() } else { 0 };
+        if frame.sweeps.len() != expected && self.report.wrong_value.is_none() {
+            self.report.wrong_value = Some(WrongValue {
+                line: self.frame_lines[index],
+                field: "sweeps",
+                recorded: frame.sweeps.len().to_string(),
+                now: expected.to_string(),
+            });
+        }
         for ((lidar, mounted), recorded) in self.lidars.iter().enumerate().zip(&frame.sweeps) {
             let view = lidar_view(mounted, self.ego.episode());
             let viewpoints = [lidar_viewpoint(&view)];

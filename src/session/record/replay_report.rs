@@ -45,7 +45,7 @@ pub struct RepairedImages {
 pub struct WrongValue {
     /// Line of the episode's file, from 1.
     pub line: usize,
-    /// The field: `step`, `time_us`, `frame_hash`, `repairs`, `sensors`, or one of the end:
+    /// The field: `step`, `time_us`, `frame_hash`, `repairs`, `sensors`, `sweeps`, or one of the end:
     /// `outcome`, `steps`, `distance_m` ..
     pub field: &'static str,
     pub recorded: String,

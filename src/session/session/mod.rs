@@ -24,7 +24,6 @@ use std::time::Duration;
 use tokio::time::Instant;
 
 use wildcity_options::Sensors;
-use wildcity_render::View;
 use wildcity_scene::RenderProfile;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::{RigCamera, RigLidar};
@@ -42,7 +41,6 @@ use crate::repair::session_repair::SessionRepair;
 use crate::scenario::{EpisodeTraffic, Event};
 use crate::snapshot::Snapshots;
 use crate::state::{EpisodeState, PinnedVersion, SessionSettings};
-use crate::viewpoint::viewpoints;
 
 /// One agent's session on a twin. It stays on one version until the agent switches to another.
 #[derive(Debug)]
@@ -96,10 +94,7 @@ impl Session {
 
     /// The viewpoints of the next frame if the ego stays where it is.
     pub fn viewpoints(&self) -> Vec<Viewpoint> {
-        viewpoints(&View::from_rig(
-            self.settings.layout.cameras(),
-            self.state.episode.world_from_rig(),
-        ))
+        self.settings.layout.viewpoints(self.state.episode.world_from_rig())
     }
 
     /// Memory that is reserved for the worst frame, in bytes.

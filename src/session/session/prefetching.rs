@@ -2,7 +2,6 @@
 
 use tokio::time::Instant;
 
-use wildcity_render::View;
 use wildcity_scene::geometry::Pose;
 use wildcity_twin::residency::Urgency;
 
@@ -10,7 +9,6 @@ use super::Session;
 use crate::error::SessionError;
 use crate::limits;
 use crate::prefetch::forecast::{EgoForecast, remaining_hint};
-use crate::viewpoint::viewpoints;
 
 impl Session {
     /// Accepts the path that the agent announces: from 1 to [`limits::PREFETCH_POSES`] poses
@@ -81,9 +79,7 @@ impl Session {
                 .collect();
             let places: Vec<_> = places
                 .into_iter()
-                .map(|(urgency, pose)| {
-                    (urgency, viewpoints(&View::from_rig(layout.cameras(), pose)))
-                })
+                .map(|(urgency, pose)| (urgency, layout.viewpoints(pose)))
                 .collect();
             prefetcher.prefetch(&places, &profile);
             if let Some(solids) = solids {

@@ -389,21 +389,28 @@ impl Session {
         let layout = &self.settings.layout;
         // Poses that the ego is not at have no sweeps, and neither have times between decisions.
         let is_shown = history.is_some() && captures.last().is_some_and(|capture| capture.shown);
-        let sweeps =
-            if is_shown { self.sweeps(version, simulation, deadline).await? } else { Vec::new() };
+        let sweeps = if is_shown && !layout.lidars().is_empty() {
+            Some(self.sweeps(version, simulation, deadline).await?)
+        } else {
+            None
+        };
         let mut builder = ObservationBuilder::new(
             layout.clone(),
             self.engine.answer_budget(),
             version.coverage.clone(),
             episode,
             &captures,
-            &sweeps,
+            sweeps.as_ref().map_or(&[][..], |sweeps| &sweeps.clouds),
         )?
         .with_repair(self.settings.repair.clone().map(|repair| {
             // Without history, the poses are not the ego's, and no state of the repair is kept.
             let state = history.is_some().then(|| episode.repair_state());
             ObservationRepair::new(repair, layout.cameras().len(), state)
         }));
+        for (sections, waited, queued) in sweeps.into_iter().flat_map(|sweeps| sweeps.loads) {
+            builder.add_load(sections, waited);
+            builder.add_queue_time(queued);
+        }
         for capture in captures {
             // Nothing is due, but the observation has a time and a history.
             if capture.cameras.is_empty() {

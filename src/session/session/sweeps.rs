@@ -1,5 +1,7 @@
 //! The sweeps of an observation.
 
+use std::time::Duration;
+
 use tokio::time::Instant;
 use tracing::{Instrument, debug_span};
 
@@ -7,13 +9,23 @@ use wildcity_render::Backend;
 
 use super::requests::SimulationState;
 use super::{PinnedVersion, Session};
+use crate::engine::answer_budget::BudgetShare;
 use crate::engine::render_queue::{FrameCost, Scratch};
 use crate::error::SessionError;
+use crate::limits;
 use crate::observe::layout::EffectSeed;
 use crate::observe::point_cloud::{PointCloud, lidar_view};
 use crate::pin::pin;
 use crate::scenario::assets::FrameDetail;
 use crate::viewpoint::lidar_viewpoint;
+
+/// The sweeps of an observation, counted against the budget for answers.
+pub(super) struct Sweeps {
+    pub(super) clouds: Vec<PointCloud>,
+    /// For each, the sections that had to be loaded, how long that took, and how long it was queued.
+    pub(super) loads: Vec<(usize, Duration, Duration)>,
+    _share: BudgetShare,
+}
 
 impl Session {
     /// The sweeps of all LiDARs that end now, each scheduled as a frame of as many pixels as it has
@@ -23,10 +35,14 @@ impl Session {
         version: &PinnedVersion,
         simulation: SimulationState<'_>,
         deadline: Instant,
-    ) -> Result<Vec<PointCloud>, SessionError> {
+    ) -> Result<Sweeps, SessionError> {
         let SimulationState { episode, traffic } = simulation;
         let layout = &self.settings.layout;
-        let mut clouds = Vec::with_capacity(layout.lidars().len());
+        let beams: usize = layout.lidars().iter().map(|mounted| mounted.lidar.beams()).sum();
+        // The returns, the points, and their copy on its way into the answer.
+        let bytes = 3 * limits::POINT_BYTES * beams as u64;
+        let share = self.engine.answer_budget().reserve(bytes)?;
+        let mut sweeps = Sweeps { clouds: Vec::new(), loads: Vec::new(), _share: share };
         for (index, mounted) in layout.lidars().iter().enumerate() {
             let view = lidar_view(mounted, episode);
             let viewpoints = vec![lidar_viewpoint(&view)];
@@ -42,17 +58,19 @@ impl Session {
             let resident = version.resident.clone();
             let pinned = pin(resident, profile, deadline, viewpoints);
             let mut scene = pinned.instrument(debug_span!("load")).await?;
+            let load = (scene.waited_for, scene.waited);
             scene.place(placed.unwrap_or_default());
             let pixels = mounted.lidar.beams() as u64;
             let cost = FrameCost { session: self.number, pixels };
             let work = move |_: &mut Scratch, backend: &dyn Backend| {
                 backend.sweep(&scene, &profile, &view)
             };
-            let (sweep, _queued) = self.engine.run(cost, deadline, work).await?;
+            let (sweep, queued) = self.engine.run(cost, deadline, work).await?;
+            sweeps.loads.push((load.0, load.1, queued));
             let seed = EffectSeed::from_episode(episode);
             let effects = layout.lidar_sensor(index).map(|sensor| (sensor, seed));
-            clouds.push(PointCloud::new(index, mounted, &sweep?, time_us, effects));
+            sweeps.clouds.push(PointCloud::new(index, mounted, &sweep?, time_us, effects));
         }
-        Ok(clouds)
+        Ok(sweeps)
     }
 }

@@ -40,6 +40,11 @@ impl Beam {
         self.returned = false;
     }
 
+    /// Calls `visit` with the place of each hit's Gaussian.
+    pub(super) fn visit_hits(&mut self, visit: &mut impl FnMut(&mut u32)) {
+        self.hits.iter_mut().for_each(|hit| visit(&mut hit.met));
+    }
+
     /// Adds a hit of the Gaussian that was met last. Returns the range of the return, if there is
     /// one now.
     #[inline(always)]

@@ -10,7 +10,7 @@ use glam::{Mat3, Quat, Vec3};
 use super::sector::{BodySector, Sector};
 use crate::cpu::lanes::Vec3x16;
 use crate::cpu::project::axes::rotation_columns;
-use crate::lidar::{Body, THINNEST_M, luminance, reach2};
+use crate::lidar::{Body, THINNEST_M, alpha_cut, luminance, reach2};
 use wildcity_scene::chunk::{CLUSTER, Cluster, LANES, Lanes, column};
 use wildcity_scene::{Chunk, RenderProfile};
 
@@ -71,7 +71,7 @@ struct ChunkTest {
     elevations: [f32; 2],
     max_range_m: f32,
     alpha_cut_log2: f32,
-    /// Standard deviations at which the most opaque Gaussian of a common chunk ends.
+    /// Standard deviations at which an opaque Gaussian ends.
     sigmas: f32,
 }
 
@@ -230,7 +230,7 @@ impl ChunkTest {
             azimuths: [low, high],
             elevations: sector.elevation_tangents(),
             max_range_m: seen.sector.max_range_m,
-            alpha_cut_log2: profile.alpha_cut.log2() as f32,
+            alpha_cut_log2: alpha_cut(profile).log2() as f32,
             sigmas: reach2(0.0, profile).max(0.0).sqrt() as f32,
         }
     }
@@ -240,9 +240,8 @@ impl ChunkTest {
         let center = 0.5 * (cluster.min_m + cluster.max_m) - Vec3::from_array(self.middle_m);
         let half = 0.5 * (cluster.max_m - cluster.min_m);
         let range_m = center.length() + half.length();
-        // Merged Gaussians may be more opaque than 1 and reach farther: by a quarter at 2^4.
-        let reach_m = 1.25 * self.sigmas * cluster.sigma_m;
-        let margin_m = reach_m + self.moved_m + self.turned_rad * range_m;
+        let reach_m = self.sigmas * cluster.sigma_m * (1.0 + 1e-4);
+        let margin_m = reach_m + self.moved_m + self.turned_rad * (range_m + reach_m);
         let along = |axis: usize| {
             let row = Vec3::from_array(self.axes[axis]);
             [row.dot(center), row.abs().dot(half) + margin_m]
@@ -287,19 +286,21 @@ fn block_bounds<S: Simd>(simd: S, columns: &[Lanes], test: &ChunkTest) -> Option
     // The half-size of the ellipsoid's box along each axis of the sector, as in the definition of
     // the reach.
     let ln4 = 2.0 * std::f32::consts::LN_2;
-    let reach2 = ((log2_opacity - splat(test.alpha_cut_log2)) * splat(ln4)).max(zero);
-    let reach = reach2.sqrt();
+    // Never farther than an opacity of 1 reaches, as for splats.
+    let above_cut = log2_opacity.min(zero) - splat(test.alpha_cut_log2);
+    let reach = (above_cut * splat(ln4)).max(zero).sqrt() * splat(1.0 + 1e-4);
     let mean =
         Vec3x16::load(simd, columns, column::MEAN).minus(Vec3x16::splat(simd, test.middle_m));
     let range_m = mean.dot(mean).sqrt();
     let scale = Vec3x16::load(simd, columns, column::SCALE);
     let own = rotation_columns(simd, columns);
-    let margin_m = range_m.mul_add(splat(test.turned_rad), splat(test.moved_m));
-    let reach = reach * splat(1.0 + 1e-4);
+    // A point of the ellipsoid moves by the turn times its own distance.
+    let largest = scale.x.max(scale.y).max(scale.z);
+    let farthest_m = largest.mul_add(reach, range_m);
+    let margin_m = farthest_m.mul_add(splat(test.turned_rad), splat(test.moved_m));
     let [x, half_x] = along(simd, test.axes[0], mean, own, scale, reach, margin_m);
     let [y, half_y] = along(simd, test.axes[1], mean, own, scale, reach, margin_m);
     let [z, half_z] = along(simd, test.axes[2], mean, own, scale, reach, margin_m);
-    let largest = scale.x.max(scale.y).max(scale.z);
     let nearest_m = range_m - largest * reach - margin_m;
     let far_x = x + half_x;
     let near_x = x - half_x;
@@ -313,8 +314,8 @@ fn block_bounds<S: Simd>(simd: S, columns: &[Lanes], test: &ChunkTest) -> Option
     let beside = (y.abs() - half_y).max(zero);
     let beyond = y.abs() + half_y;
     let ahead = near_x.max(zero);
-    let near = ahead.mul_add(ahead, beside * beside).sqrt().max(splat(1e-6));
-    let far = far_x.mul_add(far_x, beyond * beyond).sqrt().max(splat(1e-6));
+    let near = ahead.mul_add(ahead, beside * beside).sqrt().max(splat(1e-9));
+    let far = far_x.mul_add(far_x, beyond * beyond).sqrt().max(splat(1e-9));
     let elevation_low = quotient(simd, z - half_z, far, near);
     let elevation_high = quotient(simd, z + half_z, near, far);
     let meets = visible

@@ -10,6 +10,10 @@ use crate::lidar::{Body, LidarView, Sweep, chunks};
 use wildcity_scene::chunk::LANES;
 use wildcity_scene::{Chunk, RenderProfile, Scene};
 
+/// Gaussians that beams may have met, beside twice those that they were left with, before those are
+/// dropped that no beam has kept.
+pub(super) const MET_SLACK: usize = 1 << 16;
+
 /// Memory that sectors fill one after the other.
 #[derive(Default)]
 pub(super) struct Scratch {
@@ -39,6 +43,7 @@ pub(super) fn sweep(
         let first_column = sector.columns.start + at % tiles * LANES;
         tile.begin(sector, view, at / tiles * LANES, first_column);
     }
+    let mut most_met = MET_SLACK;
     for chunks in by_body(scene) {
         let seen = sector.seen_from(chunks[0].1, view);
         let mut compare = |candidates: &mut Candidates| {
@@ -48,6 +53,10 @@ pub(super) fn sweep(
                 dispatch!(level, simd => tile.cast(simd, listed, met, &seen, &list, profile));
             }
             candidates.list.clear();
+            if met.len() > most_met {
+                drop_unkept(beams, met);
+                most_met = 2 * met.len() + MET_SLACK;
+            }
         };
         let mut chunks: Vec<_> = chunks
             .into_iter()
@@ -67,6 +76,22 @@ pub(super) fn sweep(
         tile.write(sector, met, &mut part, width);
     }
     part
+}
+
+/// Drops the Gaussians that no beam has kept a hit of.
+fn drop_unkept(tiles: &mut [Tile], met: &mut Vec<Met>) {
+    let mut kept = vec![false; met.len()];
+    tiles.iter_mut().for_each(|tile| tile.visit_hits(&mut |at| kept[*at as usize] = true));
+    // The new place of each, which is that of the number of those kept before it.
+    let mut places = Vec::with_capacity(met.len());
+    let mut count = 0;
+    for is_kept in &kept {
+        places.push(count);
+        count += u32::from(*is_kept);
+    }
+    let mut is_kept = kept.iter();
+    met.retain(|_| is_kept.next() == Some(&true));
+    tiles.iter_mut().for_each(|tile| tile.visit_hits(&mut |at| *at = places[*at as usize]));
 }
 
 /// The chunks of each body, with their numbers.

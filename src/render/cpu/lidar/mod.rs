@@ -1,6 +1,6 @@
 //! LiDAR sweeps in f32 with SIMD.
 //!
-//! A sweep is divided into *sectors*, runs of columns that look the same way: at most 128 columns
+//! A sweep is divided into *sectors*, runs of columns that look the same way: at most 64 columns
 //! and one radian. A sector finds its *candidates*, Gaussians whose bounding box in the sector's
 //! axes a beam may meet, 16 at a time; bins them to *tiles* of 16 x 16 beams; and compares a row of
 //! 16 beams at a time with each. Beams keep their hits up to the return in order of range
@@ -67,15 +67,19 @@ pub(crate) fn sweep(
 }
 
 /// An upper bound of the memory of a sweep on some threads, in bytes: its returns; and for each
-/// thread the candidates of a batch, and beams full of the faintest hits. Hits have at least an
-/// alpha of the cut, and a beam keeps none behind its return: 177 at 1/255.
+/// thread the candidates of a batch with their places in lists of tiles, and beams full of the
+/// faintest hits. A beam keeps no hit behind its return, and each has an alpha of 1/255 or more: 177.
 pub(crate) fn most_bytes(lidar: &Lidar, threads: usize) -> u64 {
     const MOST_HITS: usize = 177;
     let returns = 2 * lidar.beams() * (4 + 4 + 2);
-    // Vectors grow to twice what they hold.
-    let beams = lidar.rows().next_multiple_of(LANES) * sector::MOST_COLUMNS;
-    // At worst, every hit is of another Gaussian.
-    let hits = 2 * beams * MOST_HITS * (Beam::HIT_BYTES + size_of::<Met>());
-    let candidates = 2 * candidates::BATCH * (size_of::<candidates::Candidate>() + 4 * 12);
-    (returns + threads * (hits + candidates)) as u64
+    let columns = lidar.columns().min(sector::MOST_COLUMNS).next_multiple_of(LANES);
+    let beams = lidar.rows().next_multiple_of(LANES) * columns;
+    // Vectors grow to twice what they hold. At worst, every hit is of another Gaussian.
+    let hits = 2 * beams * MOST_HITS * Beam::HIT_BYTES;
+    let met = (2 * beams * MOST_HITS + cast::MET_SLACK) * 2 * size_of::<Met>();
+    let tiles = beams / (LANES * LANES);
+    let candidates = 2 * candidates::BATCH * (size_of::<candidates::Candidate>() + tiles * (8 + 4));
+    // A sector has a column at least.
+    let threads = threads.min(lidar.columns());
+    (returns + threads * (hits + met + candidates)) as u64
 }

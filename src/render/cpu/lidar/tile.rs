@@ -77,6 +77,11 @@ impl Tile {
         self.row_ends_m[..rows].fill(sector.max_range_m);
     }
 
+    /// Calls `visit` with the place of each hit's Gaussian among those that the sector has met.
+    pub(super) fn visit_hits(&mut self, visit: &mut impl FnMut(&mut u32)) {
+        self.beams.iter_mut().for_each(|beam| beam.visit_hits(visit));
+    }
+
     /// The beams are compared with another body next.
     pub(super) fn leave_body(&mut self) {
         self.rays = None;
