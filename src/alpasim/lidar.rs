@@ -23,18 +23,20 @@ pub(crate) fn lidar_view(
     request: &wire::LidarRenderRequest,
     frame: &LocalFrame,
 ) -> Result<LidarView, CameraSpecError> {
-    let spec = request.lidar_config.as_ref();
-    let spec = spec.ok_or_else(|| refused("lidar_config", "is missing".to_owned()))?;
+    let Some(spec) = &request.lidar_config else {
+        return Err(refused("lidar_config", "is missing".to_owned()));
+    };
     let device = wire::LidarDeviceType::try_from(spec.lidar_type).map_err(|_| {
         let must = format!("{}: PANDAR128 and AT128 are offered", spec.lidar_type);
         refused("lidar_config.lidar_type", must)
     })?;
     let start_us = request.frame_start_us;
     let end_us = request.frame_end_us;
-    let duration_us = end_us.checked_sub(start_us).and_then(|us| i64::try_from(us).ok());
-    let duration_us = duration_us.ok_or_else(|| {
-        refused("frame_start_us", format!("{start_us} is after frame_end_us {end_us}"))
-    })?;
+    let between_us = end_us.checked_sub(start_us).and_then(|us| i64::try_from(us).ok());
+    let Some(duration_us) = between_us else {
+        let must = format!("{start_us} is after frame_end_us {end_us}");
+        return Err(refused("frame_start_us", must));
+    };
     let lidar = device_lidar(device, duration_us)
         .map_err(|cause| refused("frame_end_us", cause.to_string()))?;
     let pair = request.sensor_pose.ok_or(SceneError::Missing { field: "sensor_pose" })?;

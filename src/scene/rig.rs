@@ -100,7 +100,7 @@ pub struct Rig {
     pub name: String,
     /// At least one camera.
     pub cameras: Vec<RigCamera>,
-    /// At most [`Rig::MAX_LIDARS`].
+    /// The LiDARs, in the order of the sweeps in an observation: at most [`Rig::MAX_LIDARS`].
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub lidars: Vec<RigLidar>,
 }
@@ -113,7 +113,7 @@ pub struct Rig {
 pub struct RigLidar {
     /// Name within the rig, also among the names of its cameras.
     pub name: String,
-    /// Its beams and range.
+    /// Its beams and its range, in the LiDAR's axes.
     pub lidar: Arc<Lidar>,
     /// Pose of the LiDAR on the rig (`lidar_to_rig` on the wire).
     pub rig_from_lidar: Pose,

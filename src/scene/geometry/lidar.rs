@@ -74,9 +74,9 @@ impl LidarError {
 }
 
 impl Lidar {
-    /// Most rows.
+    /// Most rows of a LiDAR, twice those of common ones.
     pub const MAX_ROWS: usize = 256;
-    /// Most columns.
+    /// Most columns of a sweep: 0.09 degrees apart in a turn.
     pub const MAX_COLUMNS: usize = 4096;
     /// An angle between two columns that counts as a jump, in radians. Even columns this far apart
     /// are 31 in a turn.
@@ -158,8 +158,8 @@ impl Lidar {
         }
         // A sweep is cast in sectors of columns that look the same way, so that each jump costs as
         // much as a sector.
-        let jumps = self.column_azimuths_rad.windows(2);
-        let jumps = jumps.filter(|pair| (pair[1] - pair[0]).abs() > Self::JUMP_RAD).count();
+        let is_jump = |pair: &&[f64]| (pair[1] - pair[0]).abs() > Self::JUMP_RAD;
+        let jumps = self.column_azimuths_rad.windows(2).filter(is_jump).count();
         if jumps > Self::MAX_JUMPS {
             return Err(LidarError::Jumps { jumps, limit: Self::MAX_JUMPS });
         }
@@ -188,12 +188,12 @@ impl Lidar {
         Ok(())
     }
 
-    /// Number of rows.
+    /// Number of rows of beams, from 1.
     pub fn rows(&self) -> usize {
         self.row_elevations_rad.len()
     }
 
-    /// Number of columns.
+    /// Number of columns of a sweep, from 1.
     pub fn columns(&self) -> usize {
         self.column_azimuths_rad.len()
     }

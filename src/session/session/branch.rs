@@ -182,8 +182,9 @@ impl Session {
             normals: outputs.normals,
             instances: outputs.instances,
         };
-        let layout = ObservationLayout::new(cameras, outputs.encoding, maps, recorded.schedule)?;
-        let mut layout = layout.with_lidars(header.rig.lidars);
+        let mut layout =
+            ObservationLayout::new(cameras, outputs.encoding, maps, recorded.schedule)?
+                .with_lidars(header.rig.lidars);
         if let Some(sensors) = recorded.sensors {
             layout.add_sensors(sensors, header.dt_us)?;
         }

@@ -398,8 +398,8 @@ impl Asked {
             Schedule::new(&cameras, self.dt_us, outputs.frames, &periods_us, self.decision_us)?;
         let encoding = ImageEncoding::new(outputs);
         let maps = PixelMaps::new(outputs);
-        let layout = ObservationLayout::new(cameras, encoding, maps, schedule)?;
-        let mut layout = layout.with_lidars(lidars);
+        let mut layout =
+            ObservationLayout::new(cameras, encoding, maps, schedule)?.with_lidars(lidars);
         if repair.is_some() {
             layout.reserve_repair();
         }

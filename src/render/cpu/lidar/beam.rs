@@ -8,7 +8,7 @@ pub(super) struct Met {
     /// The global id: the chunk, then the index.
     pub(super) id: u64,
     pub(super) luminance: f32,
-    /// As in [`Sweep::instance`](crate::lidar::Sweep::instance).
+    /// Its owner, as in [`Sweep::instance`](crate::lidar::Sweep::instance).
     pub(super) instance: u16,
 }
 
@@ -32,7 +32,7 @@ pub(super) struct Beam {
 }
 
 impl Beam {
-    /// Bytes of a hit.
+    /// Bytes of a hit of a beam.
     pub(super) const HIT_BYTES: usize = size_of::<Hit>();
 
     pub(super) fn clear(&mut self) {

@@ -351,8 +351,8 @@ fn along<S: Simd>(
     margin_m: f32x16<S>,
 ) -> [f32x16<S>; 2] {
     let row = Vec3x16::splat(simd, axis);
-    let root = Vec3x16 { x: row.dot(own[0]), y: row.dot(own[1]), z: row.dot(own[2]) };
-    let root = root.times(scale);
+    let along_own = Vec3x16 { x: row.dot(own[0]), y: row.dot(own[1]), z: row.dot(own[2]) };
+    let root = along_own.times(scale);
     [row.dot(mean), root.dot(root).sqrt().mul_add(reach, margin_m)]
 }
 

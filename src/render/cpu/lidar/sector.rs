@@ -32,7 +32,7 @@ pub(super) struct Sector {
     pub(super) tile_spans: Vec<[f32; 2]>,
     /// Tangents of the rows' elevations, rising or falling.
     row_tangents: Vec<f32>,
-    /// The LiDAR's range.
+    /// The range of the LiDAR, in metres: nothing nearer or farther returns.
     pub(super) min_range_m: f32,
     pub(super) max_range_m: f32,
     /// Cosine and sine of each row's elevation, and those of its azimuth offset.

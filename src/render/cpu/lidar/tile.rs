@@ -215,8 +215,8 @@ fn meet<S: Simd>(
     // From the point of the beam that is nearest to the centre: what is left is as small as the
     // Gaussian, and loses no digits to the distance.
     let along_m = to_mean.dot(direction);
-    let across = to_mean.minus(direction.scale(along_m));
-    let across = whitened(simd, candidate, across);
+    let across_m = to_mean.minus(direction.scale(along_m));
+    let across = whitened(simd, candidate, across_m);
     let step = whitened(simd, candidate, direction);
     let per_step2 = splat(1.0) / step.dot(step);
     let cross = across.cross(step);
