@@ -12,7 +12,8 @@
 //!    For each LiDAR `lidar/<name>/points`, f32 `[n, 3]`, and `lidar/<name>/intensity`, f32 `[n]`.
 //! 2. For each image, as requested, `camera/<name>/depth`, `camera/<name>/opacity` and
 //!    `camera/<name>/normals`, all f32.
-//! 3. For each LiDAR `lidar/<name>/row`, `lidar/<name>/column` and `lidar/<name>/instance`, u16 `[n]`.
+//! 3. For each LiDAR `lidar/<name>/row`, `lidar/<name>/column` and `lidar/<name>/instance`, u16
+//!    `[n]`.
 //!    If requested, for each image `camera/<name>/instances`, u16.
 //! 4. For each image `camera/<name>/rgb`, u8.
 //! 5. If requested, earlier frames: `camera/<name>/history/<back>/rgb`, u8.

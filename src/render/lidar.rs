@@ -2,10 +2,10 @@
 //!
 //! **A return is where a beam has lost half of its light.** A Gaussian's alpha on a beam is its
 //! response at the point of the beam that is closest in standard deviations (Wu et al. 2024,
-//! 3DGUT), at most the profile's cap, and 0 below its cut or 1/255. Gaussians are blended in the order of
-//! these points. The range is the distance to that of the Gaussian with which the transmittance
-//! falls to a half or less. It is not the mean depth, which lies between two surfaces where a beam
-//! grazes the nearer one. A beam that no Gaussian brings to a half has no return.
+//! 3DGUT), at most the profile's cap, and 0 below its cut or 1/255. Gaussians are blended in the
+//! order of these points. The range is the distance to that of the Gaussian with which the
+//! transmittance falls to a half or less. It is not the mean depth, which lies between two surfaces
+//! where a beam grazes the nearer one. A beam that no Gaussian brings to a half has no return.
 //!
 //! Unlike an image, a sweep has no splats: a flat Gaussian on a road that is 1 m long is hit over
 //! all of its length, and the distance of its centre would be up to 1 m off. So every beam is
@@ -18,8 +18,8 @@
 //! weighted by what each contributes, without the parts of the colour that depend on the direction:
 //! a twin that is trained on images knows nothing of infrared light.
 //!
-//! The reference backend computes this in f64, each beam against each Gaussian; `cpu::lidar` says how
-//! the cpu backend does.
+//! The reference backend computes this in f64, each beam against each Gaussian; `cpu::lidar` says
+//! how the cpu backend does.
 
 use std::sync::Arc;
 
@@ -132,15 +132,15 @@ pub(crate) fn luminance(body: &Body<'_>, value: impl Fn(usize) -> f32) -> f32 {
     0.2126 * channel(0) + 0.7152 * channel(1) + 0.0722 * channel(2)
 }
 
-/// The least alpha that counts: the profile's cut, but at least 1/255. So a beam has lost half of its
-/// light after 177 hits at most, which bounds its memory.
+/// The least alpha that counts: the profile's cut, but at least 1/255. So a beam has lost half of
+/// its light after 177 hits at most, which bounds its memory.
 pub(crate) fn alpha_cut(profile: &RenderProfile) -> f64 {
     profile.alpha_cut.max(1.0 / 255.0)
 }
 
 /// The squared number of standard deviations at which alpha falls below the cut, for a Gaussian's
-/// peak opacity; not positive if it is below the cut itself. As for splats, a merged Gaussian with an
-/// opacity above 1 ends where one of opacity 1 does.
+/// peak opacity; not positive if it is below the cut itself. As for splats, a merged Gaussian with
+/// an opacity above 1 ends where one of opacity 1 does.
 pub(crate) fn reach2(log2_opacity: f64, profile: &RenderProfile) -> f64 {
     2.0 * std::f64::consts::LN_2 * (log2_opacity.min(0.0) - alpha_cut(profile).log2())
 }

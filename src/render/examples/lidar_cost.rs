@@ -1,5 +1,5 @@
-//! The time of a LiDAR sweep of 128 x 2,048 beams on the demo street, and that of six cameras with as
-//! many pixels together, in turn:
+//! The time of a LiDAR sweep of 128 x 2,048 beams on the demo street, and that of six cameras with
+//! as many pixels together, in turn:
 //! `cargo run --release -p wildcity-render --example lidar_cost [ROUNDS]`.
 
 use std::f64::consts::TAU;

@@ -36,8 +36,8 @@ const HEADER_BASE_BYTES: usize = 4096;
 /// and a windshield of 42 with their keys, below 1,600 bytes.
 const HEADER_IMAGE_BYTES: usize = 3584;
 
-/// Room in the header per LiDAR: five tensors of at most 170 bytes, and a description with two names
-/// and a hash, with their escaped keys, below 700 bytes.
+/// Room in the header per LiDAR: five tensors of at most 170 bytes, and a description with two
+/// names and a hash, with their escaped keys, below 700 bytes.
 const HEADER_LIDAR_BYTES: usize = 2048;
 
 /// Room in the header per image for the result of its repair: three texts, one of them a hash.
@@ -56,8 +56,8 @@ const IMAGES: usize = limits::OBSERVE_POSES * Rig::MAX_CAMERAS;
 const _: () = assert!(limits::BUNDLE_FRAMES <= limits::OBSERVE_POSES);
 
 // A client accepts the longest header, and the renderer renders any rig in one frame.
-// 4,096 + 4 x 2,048 + 256 x (3,584 + 256) = 995,328 bytes, of 1,048,576. Names of references and effects of
-// sensors are checked when a session asks for them.
+// 4,096 + 4 x 2,048 + 256 x (3,584 + 256) = 995,328 bytes, of 1,048,576. Names of references and
+// effects of sensors are checked when a session asks for them.
 const _: () = assert!(
     HEADER_BASE_BYTES
         + Rig::MAX_LIDARS * HEADER_LIDAR_BYTES

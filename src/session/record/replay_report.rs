@@ -45,8 +45,8 @@ pub struct RepairedImages {
 pub struct WrongValue {
     /// Line of the episode's file, from 1.
     pub line: usize,
-    /// The field: `step`, `time_us`, `frame_hash`, `repairs`, `sensors`, `sweeps`, or one of the end:
-    /// `outcome`, `steps`, `distance_m` ..
+    /// The field: `step`, `time_us`, `frame_hash`, `repairs`, `sensors`, `sweeps`, or one of the
+    /// end: `outcome`, `steps`, `distance_m` ..
     pub field: &'static str,
     pub recorded: String,
     pub now: String,

@@ -22,7 +22,8 @@ use crate::viewpoint::lidar_viewpoint;
 /// The sweeps of an observation, counted against the budget for answers.
 pub(super) struct Sweeps {
     pub(super) clouds: Vec<PointCloud>,
-    /// For each, the sections that had to be loaded, how long that took, and how long it was queued.
+    /// For each, the sections that had to be loaded, how long that took, and how long it was
+    /// queued.
     pub(super) loads: Vec<(usize, Duration, Duration)>,
     _share: BudgetShare,
 }

@@ -149,8 +149,8 @@ impl Candidates {
         }
     }
 
-    /// The candidates of each tile of `rows` rows, the nearest first: tile after tile of the first 16
-    /// rows, then those of the next.
+    /// The candidates of each tile of `rows` rows, the nearest first: tile after tile of the first
+    /// 16 rows, then those of the next.
     pub(super) fn by_tile(&self, level: Level, sector: &Sector, rows: usize) -> Vec<Vec<u32>> {
         let tiles = sector.tile_tangents.len();
         // Sorted as one integer: positive f32 have the order of their bits.

@@ -68,7 +68,8 @@ pub(crate) fn sweep(
 
 /// An upper bound of the memory of a sweep on some threads, in bytes: its returns; and for each
 /// thread the candidates of a batch with their places in lists of tiles, and beams full of the
-/// faintest hits. A beam keeps no hit behind its return, and each has an alpha of 1/255 or more: 177.
+/// faintest hits. A beam keeps no hit behind its return, and each has an alpha of 1/255 or more:
+/// 177.
 pub(crate) fn most_bytes(lidar: &Lidar, threads: usize) -> u64 {
     const MOST_HITS: usize = 177;
     let returns = 2 * lidar.beams() * (4 + 4 + 2);

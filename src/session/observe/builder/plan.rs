@@ -45,7 +45,8 @@ impl BufferPlan {
         Self { layout, floats_at, sweep_ids_at, instances_at, raw_at, end: raw_at + all.raw }
     }
 
-    /// Where the integers of sweeps begin: rows, columns and instances of one sweep after the other.
+    /// Where the integers of sweeps begin: rows, columns and instances of one sweep after the
+    /// other.
     pub(super) fn sweep_ids_at(&self) -> usize {
         self.sweep_ids_at
     }
