@@ -32,6 +32,9 @@ from wildcity import (
     LateFrames,
     Lens,
     LensDirt,
+    LidarBeams,
+    LidarColumns,
+    LidarSensor,
     Observation,
     Outputs,
     Pose,
@@ -41,6 +44,7 @@ from wildcity import (
     Refused,
     Repair,
     Rig,
+    RigLidar,
     Sensors,
     Shutter,
     SnapshotPoint,
@@ -70,6 +74,19 @@ SENSORS = Sensors(
     imu=Imu(AxisNoise(0.03125, 0.0625), AxisNoise(0.0078125, 0.00390625), 60_000_000),
     wheel_speed=WheelSpeed(0.0625, 0.015625),
     delay_us=200_000,
+    lidars={"top": LidarSensor(noise_m=0.03125)},
+)
+TOP = RigLidar(
+    "top",
+    LidarBeams(
+        (0.125, 0.0, -0.25),
+        100_000,
+        columns=LidarColumns(1_800, 3.125, -3.125),
+        max_range_m=120.0,
+        min_range_m=0.5,
+        row_azimuth_offsets_rad=(0.0, 0.015625, -0.015625),
+    ),
+    Pose((1.25, 0.0, 1.875), (1.0, 0.0, 0.0, 0.0)),
 )
 HERE = Pose((12.5, -3.25, 0.125), (0.8, 0.0, 0.0, 0.6))
 ABOVE = Pose((12.5, -3.25, 30.0))
@@ -97,7 +114,7 @@ REQUESTS: dict[str, Callable[[SessionProtocol], Any]] = {
         session="run-17",
         seed=42,
         start=LOG,
-        rig=Rig("pair", (SEEN, REAR)),
+        rig=Rig("pair", (SEEN, REAR), (TOP,)),
         outputs=Outputs(
             ("front", "rear"),
             "raw",
@@ -221,8 +238,8 @@ def test_observations_of_several_sessions() -> None:
 
 
 def with_unknown_fields(value: Any) -> Any:
-    """Adds a field to every object, except `profile`, `period_us` and the `cameras` of sensors: they are maps, so any
-    field is known."""
+    """Adds a field to every object, except `profile`, `period_us`, and `cameras` and `lidars` of sensors: they are
+    maps, so any field is known."""
     if isinstance(value, list):
         return [with_unknown_fields(item) for item in value]
     if not isinstance(value, dict):
@@ -231,8 +248,8 @@ def with_unknown_fields(value: Any) -> Any:
     def inner(name: str, value: Any) -> Any:
         if name in ("profile", "period_us"):
             return value
-        if name == "cameras" and isinstance(value, dict):
-            return {camera: with_unknown_fields(effects) for camera, effects in value.items()}
+        if name in ("cameras", "lidars") and isinstance(value, dict):
+            return {sensor: with_unknown_fields(effects) for sensor, effects in value.items()}
         return with_unknown_fields(value)
 
     fields = {name: inner(name, value) for name, value in value.items()}
@@ -264,7 +281,7 @@ def test_observations_decode_to_their_contents(name: str) -> None:
 
 def without_absent(metadata: dict[str, Any]) -> dict[str, Any]:
     """Without the fields that the server omits: an empty history, and `back` of current frames."""
-    for name in ("history", "events"):
+    for name in ("history", "events", "sweeps"):
         if not metadata[name]:
             del metadata[name]
     for image in metadata["images"]:
