@@ -166,7 +166,7 @@ fn an_error_names_file_line_field_and_what_is_right() {
         ("log.json", "wildcity.log/1", "wildcity.log/2", "format: \"wildcity.log/2\" is not"),
         ("log.json", "\"licence\"", "\"license\"", "log.json: source.license: unknown field"),
         ("log.json", "\"street\"", "\"../street\"", "name: \"../street\" is no name"),
-        ("rig.json", "\"rear\"", "\"front\"", "rig.json: camera \"front\" occurs twice"),
+        ("rig.json", "\"rear\"", "\"front\"", "rig.json: \"front\" occurs twice"),
     ] {
         let said = refusal(file, |text| text.replace(from, to));
         assert!(said.contains(expected), "{file}: {from} as {to}: {said:?} lacks {expected:?}");
