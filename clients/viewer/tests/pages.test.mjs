@@ -107,6 +107,12 @@ test("a scenario is chosen from those of the server", async () => {
   const session = await page.getAttribute(".view", "data-session");
   await page.click("#home");
   await page.waitForSelector(`text=${session}-1`);
+  // The list has the scenario of an episode once its session has ended, which may be after the page asked for it.
+  for (let tries = 0; tries < 60 && !(await page.isVisible("text=brief")); tries += 1) {
+    await page.waitForTimeout(500);
+    await page.reload();
+    await page.waitForSelector(`text=${session}-1`);
+  }
   await page.waitForSelector("text=brief");
   assert.deepEqual(complaints, []);
   await close();
