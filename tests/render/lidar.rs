@@ -242,14 +242,16 @@ fn grid(elevations: [f64; 2], rows: usize, azimuths: [f64; 2], columns: u64) -> 
     .unwrap()
 }
 
-/// One Gaussian.
-fn lone(mean: [f64; 3], ln_scale: [f32; 3], logit: f32) -> Scene {
-    let mut gaussians = Gaussians::with_capacity(0, 1);
-    gaussians.means_m.push(mean);
-    gaussians.ln_scales.push(ln_scale);
-    gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
-    gaussians.logit_opacities.push(logit);
-    gaussians.sh.extend([0.3; 3]);
+/// Equal Gaussians in one place.
+fn stack(count: usize, mean: [f64; 3], ln_scale: [f32; 3], logit: f32) -> Scene {
+    let mut gaussians = Gaussians::with_capacity(0, count);
+    for _ in 0..count {
+        gaussians.means_m.push(mean);
+        gaussians.ln_scales.push(ln_scale);
+        gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+        gaussians.logit_opacities.push(logit);
+        gaussians.sh.extend([0.3; 3]);
+    }
     Scene::from_gaussians(&gaussians)
 }
 
@@ -269,7 +271,7 @@ fn beams_that_are_aimed_at_a_gaussian_meet_it() {
         let [x, y, z] = mean;
         let azimuth = f64::atan2(y, x);
         let elevation = f64::atan2(z, f64::hypot(x, y));
-        let scene = lone(mean, ln_scale, 9.0);
+        let scene = stack(1, mean, ln_scale, 9.0);
         for (rows, columns) in [(1, 1), (3, 3), (1, 40), (40, 1)] {
             // A hundredth of a standard deviation of the smallest to both sides.
             let off = 1e-5;
@@ -294,7 +296,8 @@ fn beams_that_are_aimed_at_a_gaussian_meet_it() {
 #[test]
 fn few_columns_of_a_turning_lidar_meet_what_they_pass() {
     for mean in [[5.0, 0.0, -1.8], [9.0, 6.0, -1.8]] {
-        let scene = lone(mean, [2.5, 2.5, -7.0], 9.0);
+        // So many that beams return far from the middle, where one alone is too faint.
+        let scene = stack(200, mean, [2.5, 2.5, -7.0], 9.0);
         let view = LidarView {
             lidar: Arc::new(grid([0.3, -0.6], 61, [0.4, -0.4], 16)),
             world_from_lidar: Pose::IDENTITY,
