@@ -1,7 +1,7 @@
 //! The points of a sweep: returns of the renderer with the effects of the sensor, in the rig's
 //! axes.
 
-use blake3::Hash;
+use blake3::{Hash, Hasher};
 
 use wildcity_options::LidarSensor;
 use wildcity_render::lidar::{LidarView, Sweep};
@@ -27,6 +27,8 @@ pub(crate) struct PointCloud {
     pub(crate) columns: Vec<u16>,
     /// As the map of an image.
     pub(crate) instances: Vec<u16>,
+    /// BLAKE3 of its floats and then its integers.
+    pub(crate) hash: Hash,
 }
 
 impl PointCloud {
@@ -47,6 +49,7 @@ impl PointCloud {
             rows: Vec::new(),
             columns: Vec::new(),
             instances: Vec::new(),
+            hash: Hasher::new().finalize(),
         };
         // A stream of its own for each sweep: a lost beam changes no other sweep.
         let mut random = effects.map(|(_, seed)| {
@@ -82,6 +85,7 @@ impl PointCloud {
             cloud.columns.push(column as u16);
             cloud.instances.push(sweep.instance[at]);
         }
+        cloud.hash = cloud.computed_hash();
         cloud
     }
 
@@ -95,9 +99,8 @@ impl PointCloud {
         [&self.rows, &self.columns, &self.instances].map(|ids| bytemuck::cast_slice(ids))
     }
 
-    /// BLAKE3 of its floats and then its integers.
-    pub(crate) fn hash(&self) -> Hash {
-        let mut hasher = blake3::Hasher::new();
+    fn computed_hash(&self) -> Hash {
+        let mut hasher = Hasher::new();
         for bytes in self.float_bytes().into_iter().chain(self.id_bytes()) {
             hasher.update(bytes);
         }

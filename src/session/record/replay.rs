@@ -365,7 +365,7 @@ impl<'a> Replay<'a> {
                 .map_err(|cause| ReplayError::Render { step, cause })?;
             let effects = self.sensors.as_ref().and_then(|sensors| sensors.lidar_effects(lidar));
             let cloud = PointCloud::new(lidar, mounted, &sweep, frame.time_us, effects);
-            let now = cloud.hash().to_hex().to_string();
+            let now = cloud.hash.to_hex().to_string();
             if now != *recorded && self.report.difference.is_none() {
                 self.report.difference = Some(ImageDifference {
                     line: self.frame_lines[index],

@@ -5,7 +5,7 @@ use std::time::Duration;
 use tokio::time::Instant;
 use tracing::{Instrument, debug_span};
 
-use wildcity_render::Backend;
+use wildcity_render::{Backend, RenderError};
 
 use super::requests::SimulationState;
 use super::{PinnedVersion, Session};
@@ -63,14 +63,20 @@ impl Session {
             scene.place(placed.unwrap_or_default());
             let pixels = mounted.lidar.beams() as u64;
             let cost = FrameCost { session: self.number, pixels };
-            let work = move |_: &mut Scratch, backend: &dyn Backend| {
-                backend.sweep(&scene, &profile, &view)
-            };
-            let (sweep, queued) = self.engine.run(cost, deadline, work).await?;
-            sweeps.loads.push((load.0, load.1, queued));
             let seed = EffectSeed::from_episode(episode);
-            let effects = layout.lidar_sensor(index).map(|sensor| (sensor, seed));
-            sweeps.clouds.push(PointCloud::new(index, mounted, &sweep?, time_us, effects));
+            let sensor = layout.lidar_sensor(index).copied();
+            let mounted = mounted.clone();
+            // The points and their hash, too: they would hold up the other sessions of an async
+            // thread.
+            let work = move |_: &mut Scratch, backend: &dyn Backend| {
+                let sweep = backend.sweep(&scene, &profile, &view)?;
+                let effects = sensor.as_ref().map(|sensor| (sensor, seed));
+                Ok(PointCloud::new(index, &mounted, &sweep, time_us, effects))
+            };
+            let (cloud, queued): (Result<_, RenderError>, _) =
+                self.engine.run(cost, deadline, work).await?;
+            sweeps.loads.push((load.0, load.1, queued));
+            sweeps.clouds.push(cloud?);
         }
         Ok(sweeps)
     }

@@ -93,7 +93,7 @@ impl ObservationBuilder {
         let sweep_info = |sweep: &PointCloud| SweepInfo {
             lidar: sweep.lidar,
             time_us: sweep.time_us,
-            hash: sweep.hash(),
+            hash: sweep.hash,
             returns: sweep.points_m.len(),
         };
 
