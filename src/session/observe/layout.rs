@@ -4,7 +4,6 @@
 use std::collections::BTreeMap;
 
 use wildcity_options::{CameraSensor, LidarSensor, Sensors};
-use wildcity_render::lidar::LidarView;
 use wildcity_render::{MAX_VIEWS, View};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::FieldMask;
@@ -21,7 +20,7 @@ use crate::sensors::EpisodeSensors;
 use crate::sensors::delivery::{Delivery, FrameSource};
 use crate::sensors::pixels::PixelEffects;
 use crate::sensors::{check, settings};
-use crate::viewpoint::{lidar_viewpoint, viewpoints};
+use crate::viewpoint::{longest_exposure_us, rig_viewpoints};
 use wildcity_twin::residency::Viewpoint;
 
 /// Bytes of the header's length, little-endian, which comes before the header.
@@ -192,12 +191,7 @@ impl ObservationLayout {
 
     /// The viewpoints of all cameras and LiDARs at a pose of the rig.
     pub(crate) fn viewpoints(&self, world_from_rig: Pose) -> Vec<Viewpoint> {
-        let mut places = viewpoints(&View::from_rig(&self.cameras, world_from_rig));
-        places.extend(self.lidars.iter().map(|mounted| {
-            let world_from_lidar = world_from_rig * mounted.rig_from_lidar;
-            lidar_viewpoint(&LidarView::at_rest(mounted.lidar.clone(), world_from_lidar))
-        }));
-        places
+        rig_viewpoints(&self.cameras, &self.lidars, world_from_rig)
     }
 
     /// The LiDARs, in the order of the sweeps of an observation.
@@ -210,10 +204,9 @@ impl ObservationLayout {
         self.sensors.as_ref()?.settings.lidars.get(&self.lidars[lidar].name)
     }
 
-    /// The longest time that a picture or a sweep takes, in microseconds.
+    /// The longest time that an image or a sweep takes, in microseconds.
     pub(crate) fn longest_exposure_us(&self) -> i64 {
-        let sweeps = self.lidars.iter().map(|mounted| mounted.lidar.duration_us());
-        sweeps.fold(View::longest_exposure_us(&self.cameras), i64::max)
+        longest_exposure_us(&self.cameras, &self.lidars)
     }
 
     /// Reserves room in the headers for the results of repair. Comes before

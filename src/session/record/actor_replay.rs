@@ -4,8 +4,6 @@ use std::iter::Peekable;
 use std::slice::Iter;
 
 use wildcity_episode::{ActorStateLine, ActorsLine};
-use wildcity_render::View;
-use wildcity_scene::Rig;
 use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::geometry::Pose;
 use wildcity_sim::traffic::ActorState;
@@ -14,6 +12,7 @@ use wildcity_twin::residency::{Cache, ResidencyError};
 use super::recorded_episode::RecordedEpisode;
 use crate::scenario::assets::{ActorAssets, FrameDetail, exposure_start_us};
 use crate::scenario::past::ActorPast;
+use crate::viewpoint::longest_exposure_us;
 
 /// Where the actors were up to a frame of a record.
 pub(super) struct ActorReplay<'a> {
@@ -32,11 +31,12 @@ impl<'a> ActorReplay<'a> {
     /// # Errors
     /// An asset cannot be read, or there is no room for it.
     pub(super) fn new(episode: &'a RecordedEpisode, cache: &Cache) -> Result<Self, ResidencyError> {
+        let rig = &episode.header.rig;
         let actors = episode.scenario.as_ref().map_or(&[][..], |scenario| &scenario.actors);
         Ok(Self {
             assets: ActorAssets::load(cache, actors.iter().map(|actor| actor.asset.as_deref()))?,
             count: actors.len(),
-            exposure_us: longest_exposure_us(&episode.header.rig),
+            exposure_us: longest_exposure_us(&rig.cameras, &rig.lidars),
             later: episode.actors.iter().peekable(),
             past: ActorPast::default(),
         })
@@ -61,11 +61,6 @@ impl<'a> ActorReplay<'a> {
         let before = |exposure_us| self.past.poses_at(exposure_start_us(taken_us, exposure_us));
         self.assets.placed(&self.past.poses_at(taken_us), &before, frame)
     }
-}
-
-fn longest_exposure_us(rig: &Rig) -> i64 {
-    let sweeps = rig.lidars.iter().map(|mounted| mounted.lidar.duration_us());
-    sweeps.fold(View::longest_exposure_us(&rig.cameras), i64::max)
 }
 
 /// No request shows frames from longer ago than this, in microseconds.

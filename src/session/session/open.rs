@@ -14,7 +14,6 @@ use wildcity_options::{
     ContactMode, Follow, ImagePart, Open, Outputs, RandomStart, Repair, RigChoice, Sensors, Start,
 };
 use wildcity_render::View;
-use wildcity_render::lidar::LidarView;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::{
     Rig, RigCamera, RigLidar, UnreadRig, check_overlay_pixels, is_name, overlay_bytes,
@@ -45,7 +44,7 @@ use crate::sensors::settings::used;
 use crate::snapshot::Snapshots;
 use crate::start::{EpisodeStart, checked_pose};
 use crate::state::{EpisodeState, PinnedVersion, SessionSettings};
-use crate::viewpoint::{lidar_viewpoint, viewpoints};
+use crate::viewpoint::rig_viewpoints;
 
 impl Session {
     /// Opens a session, and reserves the memory for its worst frame. `seq`, `session` and
@@ -655,12 +654,7 @@ fn crop_and_scale(mut rig: Rig, outputs: &Outputs) -> Result<Rig, SessionError> 
 
 /// The properties of a rig that determine how much memory its frames need.
 pub(super) fn rig_extent(cameras: &[RigCamera], lidars: &[RigLidar]) -> RigExtent {
-    let mut places = viewpoints(&View::from_rig(cameras, Pose::IDENTITY));
-    places.extend(lidars.iter().map(|mounted| {
-        let view = LidarView::at_rest(mounted.lidar.clone(), mounted.rig_from_lidar);
-        lidar_viewpoint(&view)
-    }));
-    RigExtent::new(&places, DVec3::ZERO)
+    RigExtent::new(&rig_viewpoints(cameras, lidars, Pose::IDENTITY), DVec3::ZERO)
 }
 
 /// That of a session's rig.
