@@ -112,15 +112,7 @@ impl Catalog {
         let manifest = &base.manifest;
         let (mut commit, provenance) = self.begin_training(base, how)?;
         commit.put(gaussians, None, progress)?;
-        let settings = VersionSettings {
-            profile: manifest.profile,
-            rig: manifest.rig.clone(),
-            trajectories: manifest.trajectories.clone(),
-            sky: manifest.sky.clone().map(NewSky::Kept),
-            geo: manifest.geo.clone(),
-            twin_from_capture: manifest.alignment()?,
-            provenance,
-        };
+        let settings = VersionSettings::from_manifest(manifest, provenance)?;
         if manifest.views.is_some() {
             let views = commit.put_views(&self.views(base)?)?;
             commit.set_views(Some(views));

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use wildcity_scene::align::Alignment;
 use wildcity_scene::geo::GeoAnchor;
 use wildcity_scene::manifest::Provenance;
-use wildcity_scene::{RenderProfile, Rig, Trajectory};
+use wildcity_scene::{Manifest, RenderProfile, Rig, Trajectory};
 
 use super::StoreError;
 use super::sky::NewSky;
@@ -47,6 +47,25 @@ pub struct VersionChange {
 }
 
 impl VersionSettings {
+    /// All parts of an existing version but its provenance.
+    ///
+    /// # Errors
+    /// The manifest's alignment is damaged.
+    pub(super) fn from_manifest(
+        manifest: &Manifest,
+        provenance: Provenance,
+    ) -> Result<Self, StoreError> {
+        Ok(Self {
+            profile: manifest.profile,
+            rig: manifest.rig.clone(),
+            trajectories: manifest.trajectories.clone(),
+            sky: manifest.sky.clone().map(NewSky::Kept),
+            geo: manifest.geo.clone(),
+            twin_from_capture: manifest.alignment()?,
+            provenance,
+        })
+    }
+
     /// # Errors
     /// Names what cannot be used.
     pub(super) fn check(&self) -> Result<(), StoreError> {

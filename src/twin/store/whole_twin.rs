@@ -6,7 +6,6 @@ use super::catalog::check_name;
 use super::log::CommitKind;
 use super::pack::StorageOptions;
 use super::settings::VersionSettings;
-use super::sky::NewSky;
 use super::{Catalog, Commit, StoreError, Version, views};
 
 impl Catalog {
@@ -110,15 +109,7 @@ impl Catalog {
             let table = commit.put_views(&recorded)?;
             commit.set_views(Some(table));
         }
-        let settings = VersionSettings {
-            profile: manifest.profile,
-            rig: manifest.rig.clone(),
-            trajectories: manifest.trajectories.clone(),
-            sky: manifest.sky.clone().map(NewSky::Kept),
-            geo: manifest.geo.clone(),
-            twin_from_capture: manifest.alignment()?,
-            provenance: manifest.provenance.clone(),
-        };
+        let settings = VersionSettings::from_manifest(manifest, manifest.provenance.clone())?;
         Ok((commit, settings))
     }
 }
