@@ -41,7 +41,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         max_range_m: None,
     })?;
     let top = Pose { position_m: at.position_m + DVec3::Z * 1.9, ..at };
-    // At 30 m/s.
+    // At 30 m/s, a beam starts up to 3 m behind the last one.
     let first = Pose { position_m: top.position_m - top.rotation * DVec3::X * 3.0, ..top };
     let lidar =
         LidarView { lidar: Arc::new(lidar), world_from_lidar: top, world_from_lidar_first: first };

@@ -64,7 +64,7 @@ impl Beam {
         }
         let mut transmittance = if at > 0 { self.hits[at - 1].after } else { 1.0 };
         if transmittance <= HALF as f32 {
-            // Behind the return.
+            // The beam has returned in front of it: nothing behind that changes the return.
             self.hits.pop();
         } else {
             self.hits[at] = hit;

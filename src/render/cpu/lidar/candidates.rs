@@ -110,18 +110,22 @@ impl Candidates {
                 lanes &= lanes - 1;
                 let rows =
                     sector.rows_between(found.elevation_low[lane], found.elevation_high[lane]);
-                // Between two rows.
+                // It lies between two rows, and no beam meets it.
                 if rows.is_empty() {
                     continue;
                 }
+                let log2_opacity = columns[column::LOG2_OPACITY].0[lane];
                 self.list.push(Candidate {
-                    luminance: luminance(body, |column| columns[column].0[lane]),
+                    mean_m: mean_m(columns, lane, test),
+                    whiten: whiten(columns, lane),
+                    log2_opacity,
+                    reach2: reach2(log2_opacity.into(), profile) as f32,
                     nearest_m: found.nearest_m[lane],
+                    luminance: luminance(body, |column| columns[column].0[lane]),
                     id: (number as u64) << 32 | (group * LANES + lane) as u64,
                     instance: body.instance,
                     rows: [rows.start as u16, rows.end as u16],
                     azimuths: [found.azimuth_low[lane], found.azimuth_high[lane]],
-                    ..Candidate::new(columns, lane, test, profile)
                 });
             }
         }
@@ -187,31 +191,22 @@ fn sees<S: Simd>(simd: S, columns: &[[f32; LANES]; 2], [low, high]: [f32; 2]) ->
     !sees.all_false()
 }
 
-impl Candidate {
-    /// The shape and place of a Gaussian.
-    fn new(columns: &[Lanes], lane: usize, test: &ChunkTest, profile: &RenderProfile) -> Self {
-        let value = |column: usize| columns[column].0[lane];
-        let three = |first: usize| Vec3::new(value(first), value(first + 1), value(first + 2));
-        let q = column::QUAT;
-        let rotation = Quat::from_xyzw(value(q + 1), value(q + 2), value(q + 3), value(q));
-        let per_m = three(column::SCALE).max(Vec3::splat(THINNEST_M as f32)).recip();
-        // Rows of the transpose are the columns of the rotation: the Gaussian's own axes.
-        let axes = Mat3::from_quat(rotation);
-        let whiten = [axes.x_axis * per_m.x, axes.y_axis * per_m.y, axes.z_axis * per_m.z];
-        let log2_opacity = value(column::LOG2_OPACITY);
-        Self {
-            mean_m: (three(column::MEAN) - Vec3::from_array(test.middle_m)).to_array(),
-            whiten: whiten.map(|row| row.to_array()),
-            log2_opacity,
-            reach2: reach2(log2_opacity.into(), profile) as f32,
-            nearest_m: 0.0,
-            luminance: 0.0,
-            id: 0,
-            instance: 0,
-            rows: [0; 2],
-            azimuths: [0.0; 2],
-        }
-    }
+/// Three columns of a Gaussian from `first`.
+fn vector(columns: &[Lanes], lane: usize, first: usize) -> Vec3 {
+    Vec3::from_array([first, first + 1, first + 2].map(|column| columns[column].0[lane]))
+}
+
+fn mean_m(columns: &[Lanes], lane: usize, test: &ChunkTest) -> [f32; 3] {
+    (vector(columns, lane, column::MEAN) - Vec3::from_array(test.middle_m)).to_array()
+}
+
+/// Rows of the matrix that takes vectors in metres to standard deviations of a Gaussian.
+fn whiten(columns: &[Lanes], lane: usize) -> [[f32; 3]; 3] {
+    let w = columns[column::QUAT].0[lane];
+    let axes = Mat3::from_quat(Quat::from_vec4(vector(columns, lane, column::QUAT + 1).extend(w)));
+    let per_m = vector(columns, lane, column::SCALE).max(Vec3::splat(THINNEST_M as f32)).recip();
+    // Rows of the transpose are the columns of the rotation: the Gaussian's own axes.
+    [axes.x_axis * per_m.x, axes.y_axis * per_m.y, axes.z_axis * per_m.z].map(|row| row.to_array())
 }
 
 impl ChunkTest {
@@ -223,7 +218,7 @@ impl ChunkTest {
         let high = spans.iter().map(|span| span[1]).fold(f32::NEG_INFINITY, f32::max);
         Self {
             axes: rows.map(|row| row.map(|value| value as f32)),
-            middle_m: seen.middle_from(chunk.origin_m()).as_vec3().to_array(),
+            middle_m: (-seen.relative_to_middle(chunk.origin_m())).as_vec3().to_array(),
             // A millimetre covers the rounding of f32 at a kilometre.
             moved_m: seen.moved_m as f32 + 1e-3,
             turned_rad: seen.turned_rad as f32 + 1e-6,

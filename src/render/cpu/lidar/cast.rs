@@ -28,7 +28,7 @@ pub(super) fn sweep(
     sector: &Sector,
     level: Level,
     scratch: &mut Scratch,
-    scene: &Scene,
+    bodies: &[ChunksOfBody<'_>],
     profile: &RenderProfile,
     view: &LidarView,
 ) -> Sweep {
@@ -44,7 +44,7 @@ pub(super) fn sweep(
         tile.begin(sector, view, at / tiles * LANES, first_column);
     }
     let mut most_met = MET_SLACK;
-    for chunks in by_body(scene) {
+    for chunks in bodies {
         let seen = sector.seen_from(chunks[0].1, view);
         let mut compare = |candidates: &mut Candidates| {
             let lists = candidates.by_tile(level, sector, rows);
@@ -59,8 +59,8 @@ pub(super) fn sweep(
             }
         };
         let mut chunks: Vec<_> = chunks
-            .into_iter()
-            .map(|(number, _, chunk)| (seen.distance_m(chunk), number, chunk))
+            .iter()
+            .map(|(number, _, chunk)| (seen.distance_m(chunk), *number, *chunk))
             .collect();
         // From the nearest, so that what hides others is met first.
         chunks.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -94,9 +94,12 @@ fn drop_unkept(tiles: &mut [Tile], met: &mut Vec<Met>) {
     tiles.iter_mut().for_each(|tile| tile.visit_hits(&mut |at| *at = places[*at as usize]));
 }
 
-/// The chunks of each body, with their numbers.
-fn by_body(scene: &Scene) -> Vec<Vec<(usize, Body<'_>, &Chunk)>> {
-    let mut bodies: Vec<Vec<(usize, Body<'_>, &Chunk)>> = Vec::new();
+/// The chunks of a body, one at least, with their numbers in the scene.
+pub(super) type ChunksOfBody<'a> = Vec<(usize, Body<'a>, &'a Chunk)>;
+
+/// The chunks of each body.
+pub(super) fn by_body(scene: &Scene) -> Vec<ChunksOfBody<'_>> {
+    let mut bodies: Vec<ChunksOfBody<'_>> = Vec::new();
     for (number, (body, chunk)) in chunks(scene).enumerate() {
         match bodies.last_mut() {
             Some(last) if last[0].1.is_same(&body) => last.push((number, body, chunk)),

@@ -42,11 +42,12 @@ pub(crate) fn sweep(
     view: &LidarView,
 ) -> Sweep {
     let sectors = Sector::split(view);
+    let bodies = cast::by_body(scene);
     // As many as there are threads; rayon's own states are made anew for each piece of work.
     let free: Mutex<Vec<Scratch>> = Mutex::default();
     let part = |sector: &Sector| {
         let mut scratch = free.lock().pop().unwrap_or_default();
-        let part = cast::sweep(sector, level, &mut scratch, scene, profile, view);
+        let part = cast::sweep(sector, level, &mut scratch, &bodies, profile, view);
         free.lock().push(scratch);
         part
     };

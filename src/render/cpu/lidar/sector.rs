@@ -207,13 +207,8 @@ impl BodySector<'_> {
 
     /// How far a chunk's first Gaussians are from the LiDAR, in metres.
     pub(super) fn distance_m(&self, chunk: &Chunk) -> f64 {
-        let middle_m = self.middle_from(chunk.origin_m());
+        let middle_m = -self.relative_to_middle(chunk.origin_m());
         let first = chunk.clusters().first().map(|first| 0.5 * (first.min_m + first.max_m));
         first.map_or(f64::INFINITY, |first| first.as_dvec3().distance(middle_m))
-    }
-
-    /// The LiDAR's middle position relative to a point of the body, in metres.
-    pub(super) fn middle_from(&self, origin_m: DVec3) -> DVec3 {
-        self.middle.position_m - origin_m
     }
 }
