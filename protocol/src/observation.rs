@@ -344,7 +344,7 @@ pub struct Sweep {
     pub rows: u64,
     /// Number of columns of the beams.
     pub columns: u64,
-    /// Number of returns.
+    /// Number of points: one for each beam that has a return.
     pub returns: u64,
     /// `rig_from_lidar`.
     pub lidar_to_rig: Pose,

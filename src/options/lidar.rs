@@ -64,7 +64,7 @@ pub struct LidarBeams {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct LidarColumns {
-    /// Number of columns.
+    /// Number of columns in a sweep.
     #[cfg_attr(feature = "schema", schemars(range(min = 1, max = 4096)))]
     pub count: u64,
     /// Azimuth of the column that is fired first, in radians from x to y.

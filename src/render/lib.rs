@@ -313,7 +313,7 @@ pub trait Backend: Send + Sync {
     /// kernel of their own compute it as [`cpu`] does.
     ///
     /// # Errors
-    /// As [`Backend::render`].
+    /// The same as those of [`Backend::render`].
     fn sweep(
         &self,
         scene: &Scene,

@@ -101,13 +101,13 @@ fn dense_street(count: usize, seed: u64) -> Gaussians {
     gaussians
 }
 
-fn scene_of(count: usize, seed: u64) -> Scene {
+fn random_scene(count: usize, seed: u64) -> Scene {
     Scene::from_gaussians(&dense_street(count, seed))
 }
 
 /// The street with an actor of 500 Gaussians that drives and turns during the sweep.
 fn with_actor(seed: u64) -> Scene {
-    let mut scene = scene_of(6_000, seed);
+    let mut scene = random_scene(6_000, seed);
     let mut body = Gaussians::with_capacity(0, 500);
     for at in 0..500 {
         let angle = 0.7 * at as f64;
@@ -160,7 +160,7 @@ fn a_sweep_is_that_of_the_definition() {
 #[test]
 fn the_tables_of_real_lidars_are_cast() {
     let Some(tables) = tables(16) else { return };
-    let scene = scene_of(4_000, 7);
+    let scene = random_scene(4_000, 7);
     for (name, lidar) in tables {
         let view = in_motion(&lidar);
         check_same(&sweep(&cpu(), &scene, &view), &sweep(&Reference, &scene, &view), &name);

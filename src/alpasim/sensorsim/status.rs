@@ -59,7 +59,6 @@ impl SensorsimError {
             Self::UnknownScene(_) => Status::not_found(text),
             Self::Invalid(_) | Self::Camera(_) | Self::Object(_) => Status::invalid_argument(text),
             Self::Stopping => Status::unavailable(text),
-            // Unlike `unavailable`, this is not worth another try.
             Self::Session(error) => session_status(error, text),
             Self::Repeated(status) => status.clone(),
         };

@@ -72,7 +72,7 @@ pub struct SweepInfo {
     pub time_us: i64,
     /// BLAKE3 of positions, intensities, rows, columns and instances, in this order.
     pub hash: blake3::Hash,
-    /// Number of returns.
+    /// Number of points: one for each beam that has a return.
     pub returns: usize,
 }
 

@@ -217,7 +217,7 @@ class LidarColumns:
     """Columns of a LiDAR at equal distances."""
 
     count: int
-    """Number of columns."""
+    """Number of columns in a sweep."""
     first_rad: float
     """Azimuth of the column that is fired first, in radians from x to y."""
     last_rad: float
@@ -1146,7 +1146,7 @@ class Sweep:
     columns: int
     """Number of columns of the beams."""
     returns: int
-    """Number of returns."""
+    """Number of points: one for each beam that has a return."""
     lidar_to_rig: Pose
     """`rig_from_lidar`."""
     hash: str
