@@ -8,6 +8,7 @@ use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::time::timeout;
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::error::{CapacityError, ProtocolError};
+use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 use tokio_tungstenite::tungstenite::protocol::{Role, WebSocketConfig};
 use tokio_tungstenite::tungstenite::{Error, Message};
 
@@ -19,8 +20,8 @@ use crate::stream::Stream;
 pub(crate) struct Socket {
     stream: WebSocketStream<Stream>,
     send_timeout: Duration,
-    /// Whether the client has sent its Close frame, after which it reads nothing.
-    peer_closed: bool,
+    /// Status of the client's Close frame, after which it reads nothing.
+    peer_closed: Option<CloseCode>,
     /// Whether a frame was begun and not ended. If that was given up, nothing can follow it.
     is_within_frame: bool,
 }
@@ -35,8 +36,11 @@ pub(crate) enum Incoming {
 /// Why no more messages can be received or sent.
 #[derive(Debug)]
 pub(crate) enum Disconnect {
-    /// The client closed the connection, or the network failed.
+    /// The client closed the connection, or the network failed. It may come back.
     PeerLeft,
+    /// The client closed the connection as one that goes away (status 1001), as a browser does when
+    /// its page is left: it does not come back.
+    PeerGone,
     /// The client did not read in time. A part of a message may have been sent, so that nothing
     /// else can be sent.
     SendTimedOut,
@@ -58,7 +62,7 @@ impl Socket {
             .max_write_buffer_size(limits::PONGS_BYTES);
         let stream =
             WebSocketStream::from_partially_read(stream, read_ahead, Role::Server, Some(config));
-        Self { stream: stream.await, send_timeout, peer_closed: false, is_within_frame: false }
+        Self { stream: stream.await, send_timeout, peer_closed: None, is_within_frame: false }
     }
 
     /// Whether the other end is on this machine; if not, why.
@@ -76,9 +80,9 @@ impl Socket {
             Some(Ok(Message::Ping(_))) => self.flush().await.map(|()| Incoming::Alive),
             Some(Ok(Message::Pong(_) | Message::Frame(_))) => Ok(Incoming::Alive),
             // tungstenite has prepared the Close frame that answers it (RFC 6455, section 5.5.1).
-            Some(Ok(Message::Close(_))) => {
-                self.peer_closed = true;
-                self.flush().await.and(Err(Disconnect::PeerLeft))
+            Some(Ok(Message::Close(frame))) => {
+                self.peer_closed = Some(frame.map_or(CloseCode::Status, |frame| frame.code));
+                self.flush().await.and(Err(self.left()))
             }
             // The end of the stream, and any error of the network: there is no peer to tell.
             None => Err(Disconnect::PeerLeft),
@@ -104,8 +108,16 @@ impl Socket {
         match timeout(self.send_timeout, self.stream.flush()).await {
             // After the answer to a Close frame there is nothing more to send.
             Ok(Ok(()) | Err(Error::ConnectionClosed)) => Ok(()),
-            Ok(Err(_)) => Err(Disconnect::PeerLeft),
+            Ok(Err(_)) => Err(self.left()),
             Err(_) => Err(Disconnect::SendTimedOut),
+        }
+    }
+
+    /// How the client left.
+    fn left(&self) -> Disconnect {
+        match self.peer_closed {
+            Some(CloseCode::Away) => Disconnect::PeerGone,
+            _ => Disconnect::PeerLeft,
         }
     }
 
@@ -123,8 +135,8 @@ impl Socket {
     /// into its own buffer first. After an error the connection cannot be used.
     async fn send(&mut self, first_byte: u8, payload: &[&[u8]]) -> Result<(), Disconnect> {
         // After either, a frame would be read as something else, or not at all.
-        if self.peer_closed || self.is_within_frame {
-            return Err(Disconnect::PeerLeft);
+        if self.peer_closed.is_some() || self.is_within_frame {
+            return Err(self.left());
         }
         // Set before the first byte: if this future is dropped at any point, the mark stays.
         self.is_within_frame = true;
@@ -153,7 +165,7 @@ impl Socket {
                 self.is_within_frame = false;
                 Ok(())
             }
-            Ok(Err(_)) => Err(Disconnect::PeerLeft),
+            Ok(Err(_)) => Err(self.left()),
             Err(_) => Err(Disconnect::SendTimedOut),
         }
     }

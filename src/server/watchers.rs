@@ -70,7 +70,7 @@ pub(crate) async fn serve(stopped: impl Future<Output = ()>, mut socket: Socket,
         Disconnect::Fault(fault) => {
             socket.close(Some(fault.close_status())).await;
         }
-        Disconnect::PeerLeft => socket.close(None).await,
+        Disconnect::PeerLeft | Disconnect::PeerGone => socket.close(None).await,
         Disconnect::SendTimedOut => {}
     }
 }

@@ -140,6 +140,33 @@ async fn a_close_frame_is_answered_while_a_request_runs() {
     assert_eq!((&resumed["last_seq"], &resumed["step"]), (&json!(2), &json!(1)));
 }
 
+/// A browser closes with 1001 when its page is left. Nobody comes back for these sessions, so none
+/// of them waits, not even if a step was running.
+#[tokio::test]
+async fn a_client_that_goes_away_leaves_no_session() {
+    let server = TestServer::start().await;
+    for in_mid_step in [false, true] {
+        let mut agent = server.driver("a").await;
+        let begun = server.painter.begun.load(Ordering::SeqCst);
+        server.painter.held.store(in_mid_step, Ordering::SeqCst);
+        agent.send(json!({ "type": "step", "pose": pose(1.0) })).await;
+        server.painter.begins(begun + 1).await;
+        if !in_mid_step {
+            agent.seen().await;
+        }
+        let away = CloseFrame { code: 1001.into(), reason: "".into() };
+        agent.socket.send(Message::Close(Some(away.clone()))).await.unwrap();
+        assert_eq!(frame(&mut agent).await, Some(Message::Close(Some(away))));
+        server.painter.held.store(false, Ordering::SeqCst);
+        let ended = async {
+            while server.running.sessions() > 0 {
+                tokio::time::sleep(Duration::from_millis(10)).await;
+            }
+        };
+        tokio::time::timeout(Duration::from_secs(20), ended).await.expect("the session ends");
+    }
+}
+
 #[tokio::test]
 async fn the_servers_own_close_frame_says_why() {
     // A silent client.

@@ -11,6 +11,7 @@ const ATTEMPTS = 6;
 const waitMs = (attempt: number): number => 250 * 2 ** attempt;
 
 export class Client {
+  /** Set by `connect`. */
   welcome!: Welcome;
   /** Called when the connection is lost (true) and when it is back (false). */
   onLost: (lost: boolean) => void = () => {};
@@ -24,10 +25,11 @@ export class Client {
   private last: Promise<unknown> = Promise.resolve();
   private ended = false;
 
-  static async connect(): Promise<Client> {
-    const client = new Client();
-    await client.dial();
-    return client;
+  /** Connects, unless that is done. Separate from the constructor, so that `end` ends a connection that is only being made. */
+  connect(): Promise<void> {
+    return this.queue(async () => {
+      if (!this.welcome) await this.dial();
+    });
   }
 
   open(fields: Fields): Promise<Opened> {
@@ -55,15 +57,20 @@ export class Client {
     });
   }
 
-  /** Closes the session, if there is one, and the connection. */
+  /** Closes the session, if there is one, and the connection. Requests after it fail. */
   async end(): Promise<void> {
     this.ended = true;
-    if (this.session) await this.close().catch(() => {});
+    // A request that is under way may be the one that opens the session.
+    await this.last;
+    if (this.session) await this.ask({ type: "close" }).catch(() => {});
     this.socket?.close(1000);
   }
 
   private queue<T>(run: () => Promise<T>): Promise<T> {
-    const result = this.last.then(run, run);
+    const result = this.last.then(() => {
+      if (this.ended) throw new Lost("the page was left");
+      return run();
+    });
     this.last = result.catch(() => {});
     return result;
   }

@@ -103,7 +103,8 @@ export class DrivePage implements Page {
   private async run(): Promise<void> {
     try {
       showStatus("connecting");
-      this.client = await Client.connect();
+      this.client = new Client();
+      await this.client.connect();
       this.client.onLost = (lost) => showStatus(lost ? "connection lost, resuming" : "resumed", lost ? "bad" : "");
       const { backend, twins, server } = this.client.welcome;
       const twin = twins.find(({ name }) => name === this.twin);

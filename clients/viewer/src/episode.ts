@@ -64,7 +64,8 @@ class Player {
 
   private async render(frame: RecordedFrame): Promise<Metadata> {
     const { twin, cameras, profile } = this.recording;
-    this.client ??= await Client.connect();
+    this.client ??= new Client();
+    await this.client.connect();
     if (this.version !== frame.version) {
       if (this.version) await this.client.close();
       this.version = frame.version;

@@ -70,7 +70,8 @@ export class FlyPage implements Page {
   private async run(twinName: string): Promise<void> {
     try {
       showStatus("connecting");
-      this.client = await Client.connect();
+      this.client = new Client();
+      await this.client.connect();
       const { backend, twins, server } = this.client.welcome;
       const twin = twins.find(({ name }) => name === twinName);
       if (!twin) throw new Error(`there is no twin ${twinName} on this server`);

@@ -42,7 +42,12 @@ export class HomePage implements Page {
   /** For tokens that cannot list sessions. */
   private readonly own = el("section", { hidden: true });
   private readonly episodes = el("section");
-  private listed = false;
+  /** The running sessions when the episodes were listed. */
+  private listedFor: string | undefined;
+  /** Whether they are listed once more: the record of a session that has just ended may still be written. */
+  private listsAgain = false;
+  /** The episodes that are chosen to be compared, during which the list stays. */
+  private chosen: string[] = [];
   private timer = 0;
   private ended = false;
 
@@ -80,11 +85,16 @@ export class HomePage implements Page {
 
   /** Sessions and episodes are listed for administrators alone. */
   private async loadSessions(): Promise<void> {
-    this.showSessions((await get<{ sessions: Session[] }>("v1/sessions")).sessions);
-    // The server reads every record for this list.
-    if (this.listed) return;
-    this.listed = true;
-    this.showEpisodes((await get<{ episodes: Episode[] }>("v1/episodes")).episodes);
+    const { sessions } = await get<{ sessions: Session[] }>("v1/sessions");
+    this.showSessions(sessions);
+    // The server opens every record for this list, so that it is read again only after an episode has begun or ended.
+    const running = sessions.map(({ session }) => session).join();
+    const changed = running !== this.listedFor;
+    if ((!changed && !this.listsAgain) || this.chosen.length > 0) return;
+    this.listedFor = running;
+    this.listsAgain = changed;
+    const { episodes } = await get<{ episodes: Episode[] }>("v1/episodes");
+    if (this.chosen.length === 0) this.showEpisodes(episodes);
   }
 
   /** The server lists sessions for administrators alone, but a token may watch its own ones by their names. */
@@ -132,7 +142,7 @@ export class HomePage implements Page {
   private showEpisodes(episodes: Episode[]): void {
     const drives = episodes.filter(({ episode, steps }) => !isViewers(episode) && steps > 0);
     const compare = el("a.action", { hidden: true }, "Compare");
-    const chosen: string[] = [];
+    const { chosen } = this;
     const rows = drives.map((one) => {
       const box = el("input", { type: "checkbox", ariaLabel: `compare ${one.episode}` });
       box.addEventListener("change", () => {

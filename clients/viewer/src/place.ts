@@ -125,7 +125,8 @@ export class PlacePage implements Page {
       if (this.proposal) this.orbit.up = normalOf(this.proposal);
       const { clientWidth, clientHeight } = this.picture;
       const aspect = clamp(clientWidth / (clientHeight || clientWidth), 0.6, 2.4);
-      this.client = await Client.connect();
+      this.client = new Client();
+      await this.client.connect();
       const width = this.client.welcome.backend === "gpu" ? 1280 : 640;
       this.size = [width, Math.round(width / aspect)];
       const [w, h] = this.size;

@@ -63,8 +63,9 @@ export class Thumbnails {
   private async fill(element: Element, twin: TwinInfo): Promise<void> {
     if (this.ended) return;
     try {
-      const client = await Client.connect();
+      const client = new Client();
       this.client = client;
+      await client.connect();
       const outputs = { encoding: "jpeg", quality: 80 };
       const rig = { name: "thumbnail", cameras: [CAMERA] };
       const opened = await client.open({ twin: twin.name, version: twin.version, session: viewerSession("thumbnail"), record: false, rig, outputs });

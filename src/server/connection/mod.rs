@@ -408,13 +408,15 @@ impl Connection {
         socket.send_text(&fault.answer(seq)).await
     }
 
-    /// Parks the session, sends the reason to the client if that is possible, and closes the
-    /// socket.
+    /// Parks the sessions, or ends them if the client does not come back; sends the reason to the
+    /// client if that is possible, and closes the socket.
     async fn end(mut self, mut socket: Socket, reason: Disconnect) {
         // The outcome of each episode, unless the client resumes its session within the grace
         // period.
         let outcome = match &reason {
-            Disconnect::PeerLeft | Disconnect::Fault(Fault::Replaced) => Outcome::AgentLost,
+            Disconnect::PeerLeft | Disconnect::PeerGone | Disconnect::Fault(Fault::Replaced) => {
+                Outcome::AgentLost
+            }
             Disconnect::SendTimedOut | Disconnect::Fault(Fault::TimedOut(_)) => {
                 Outcome::AgentTimeout
             }
@@ -425,8 +427,15 @@ impl Connection {
         for mut slot in self.slots.drain(..) {
             tracing::info!(?reason, "the connection of a session ended");
             slot.outcome = outcome;
-            // Parks it.
+            let ended = match &reason {
+                Disconnect::PeerGone => slot.session.take(),
+                _ => None,
+            };
+            // Parks the session, or frees its name.
             drop(slot);
+            if let Some(session) = ended {
+                session.close(outcome).await;
+            }
         }
         match &reason {
             Disconnect::Fault(fault) => {
@@ -434,7 +443,7 @@ impl Connection {
                     socket.close(Some(fault.close_status())).await;
                 }
             }
-            Disconnect::PeerLeft => socket.close(None).await,
+            Disconnect::PeerLeft | Disconnect::PeerGone => socket.close(None).await,
             // A part of a message was sent: nothing can follow it.
             Disconnect::SendTimedOut => {}
         }
