@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 
 use wildcity_session::{
-    FrameRequest, RecordedEpisode, RecordedRepair, RepairedImages, ReplayUntil, ReplayedImage,
+    FrameRequest, RecordedEpisode, RecordedRepair, RepairedImages, ReplayUntil, Replayed,
+    ReplayedImage,
 };
 use wildcity_twin::residency::Cache;
 
@@ -81,7 +82,8 @@ impl Replay {
             if self.out.is_some() { ReplayUntil::End } else { ReplayUntil::FirstDifference };
         let models = self.repair.models()?;
         let report =
-            recording.replay_repaired(&cache, &*backend, &models, extent, &mut |image| {
+            recording.replay_repaired(&cache, &*backend, &models, extent, &mut |replayed| {
+                let Replayed::Image(image) = replayed else { return Ok(()) };
                 bar.inc(1);
                 match &self.out {
                     Some(dir) => write_png(dir, image).map_err(|error| exit::chain(&error)),

@@ -36,8 +36,8 @@ pub use export::{
 };
 #[cfg(feature = "mcap")]
 pub use export::{
-    EpisodeExport, ExportedImage, NuscenesExport, NuscenesImage, Ros2Export, export,
-    export_nuscenes, export_ros2,
+    EpisodeExport, ExportedImage, ExportedPoint, ExportedSweep, NuscenesExport, NuscenesImage,
+    Ros2Export, export, export_nuscenes, export_ros2,
 };
 pub use file::{
     CameraHead, Cut, EndLine, EpisodeFile, Frame, Header, ReadError, RigHead, check_no_mcap,

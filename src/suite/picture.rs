@@ -4,7 +4,9 @@ use std::path::Path;
 
 use wildcity_episode::FaultLine;
 use wildcity_render::Backend;
-use wildcity_session::{FrameRequest, RecordedEpisode, ReplayUntil, jpeg, limits as session};
+use wildcity_session::{
+    FrameRequest, RecordedEpisode, ReplayUntil, Replayed, jpeg, limits as session,
+};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::Catalog;
 
@@ -106,9 +108,11 @@ fn picture(
         frame.cameras = vec![Vec::new(); frame.poses.len()];
         frame.images.clear();
     }
+    recording.leave_out_sweeps();
     let step = recording.frames[at].step;
     let mut found: Option<Picture> = None;
-    let report = recording.replay(cache, backend, ReplayUntil::End, &mut |image| {
+    let report = recording.replay(cache, backend, ReplayUntil::End, &mut |replayed| {
+        let Replayed::Image(image) = replayed else { return Ok(()) };
         // The first camera only; the others of the frame are rendered and dropped.
         if found.is_none() {
             let size = &image.camera.camera;

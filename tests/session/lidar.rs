@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use glam::{DQuat, DVec3};
+use glam::{DQuat, DVec3, Vec3};
 use wildcity_render::Backend;
 use wildcity_render::lidar::LidarView;
 use wildcity_scene::geometry::{Lidar, Pose};
@@ -11,7 +11,7 @@ use wildcity_session::options::{
     Encoding, LidarBeams, LidarColumns, LidarSensor, Open, Outputs, RigChoice, Sensors, Start,
 };
 use wildcity_session::{
-    Observation, Outcome, RecordedEpisode, ReplayUntil, Session, SessionError, TensorKind,
+    Observation, Outcome, RecordedEpisode, ReplayUntil, Replayed, Session, SessionError, TensorKind,
 };
 use wildcity_twin::residency::Viewpoint;
 
@@ -234,6 +234,57 @@ async fn a_replay_casts_the_sweeps_again() {
     let (_, tail) = rest.split_once("\"]").unwrap();
     std::fs::write(&path, format!("{head}{tail}")).unwrap();
     assert!(replay().wrong_value.is_some());
+}
+
+/// A replay shows each sweep with the motion of the ego taken out: on a straight drive, each point
+/// is moved back by what the ego drove after it was measured.
+#[tokio::test(flavor = "multi_thread")]
+async fn replayed_points_are_in_the_rig_at_the_end_of_the_sweep() {
+    const MOVED_M: f64 = 3.0;
+    let bench = bench(unlimited());
+    let mut session = open(&bench, "deskewed", options(None)).await.unwrap();
+    session.reset(0, None).await.unwrap();
+    let from = demo().at(20.0);
+    let to = from * Pose { position_m: DVec3::X * MOVED_M, ..Pose::IDENTITY };
+    let observation = session.step(to, false).await.unwrap();
+    session.close(Outcome::Completed).await;
+    let raw = floats(&observation, TensorKind::Points(0));
+    let columns = ids(&observation, TensorKind::Columns(0));
+
+    let path = bench.episodes.path().join("deskewed-1.jsonl");
+    let mut recording = RecordedEpisode::read(&path).unwrap();
+    let mut sweeps = Vec::new();
+    let mut visit = |replayed: &Replayed<'_>| {
+        if let Replayed::Sweep(sweep) = replayed {
+            sweeps.push((sweep.lidar, sweep.time_us, sweep.points()));
+        }
+        Ok(())
+    };
+    recording.replay(&unlimited(), &cpu(), ReplayUntil::End, &mut visit).unwrap();
+    let [(_, 0, _), (0, 100_000, points)] = &sweeps[..] else { panic!("{} sweeps", sweeps.len()) };
+    assert_eq!(points.len(), columns.len());
+    let mut most_m: f64 = 0.0;
+    for ((point, raw), &column) in points.iter().zip(raw.chunks(3)).zip(&columns) {
+        assert_eq!(point.column, column);
+        // 180 columns in 100 ms, the last one at the end.
+        let after = (179.0 - f64::from(column)) / 180.0;
+        assert!((point.offset_us as f64 + after * 1e5).abs() <= 1.0, "{}", point.offset_us);
+        let wanted = [f64::from(raw[0]) - after * MOVED_M, raw[1].into(), raw[2].into()];
+        let off_m = DVec3::from_array(wanted).distance(Vec3::from_array(point.xyz_m).as_dvec3());
+        assert!(off_m < 1e-3, "{off_m} m");
+        most_m = most_m.max(after * MOVED_M);
+    }
+    assert!(most_m > 2.8, "{most_m} m");
+
+    recording.leave_out_sweeps();
+    let mut others = 0;
+    let mut visit = |replayed: &Replayed<'_>| {
+        assert!(matches!(replayed, Replayed::Image(_)));
+        others += 1;
+        Ok(())
+    };
+    let report = recording.replay(&unlimited(), &cpu(), ReplayUntil::End, &mut visit).unwrap();
+    assert!(report.difference.is_none() && others > 0);
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -6,12 +6,14 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 
 use wildcity_episode::{
-    EpisodeExport, EpisodeFile, ExportError, Exported, ExportedImage, NuscenesExport,
-    NuscenesImage, Ros2Export, export_file, export_nuscenes, export_ros2, write_whole,
+    EpisodeExport, EpisodeFile, ExportError, Exported, ExportedImage, ExportedPoint, ExportedSweep,
+    NuscenesExport, NuscenesImage, Ros2Export, export_file, export_nuscenes, export_ros2,
+    write_whole,
 };
 use wildcity_scene::Rig;
 use wildcity_session::{
-    RecordedEpisode, ReplayReport, ReplayUntil, ReplayedImage, jpeg, limits as session,
+    FrameRecord, RecordedEpisode, ReplayReport, ReplayUntil, Replayed, ReplayedImage,
+    ReplayedSweep, SweepPoint, jpeg, limits as session,
 };
 use wildcity_twin::residency::Cache;
 
@@ -25,8 +27,8 @@ use super::kept::{camera_index, driven, keep_cameras};
 /// Export an episode as MCAP, for Foxglove, Rerun and others: indexed, compressed, with schemas; or
 /// as tables of nuScenes.
 ///
-/// Runs and servers export each episode when it ends, without images. With --images the episode is
-/// driven and rendered again, and compared with its record.
+/// Runs and servers export each episode when it ends, without images. With --images or --lidar the
+/// episode is driven and rendered again, and compared with its record.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 #[command(group(clap::ArgGroup::new("target").required(true).args(["mcap", "nuscenes"])))]
@@ -48,8 +50,13 @@ pub(super) struct Export {
     #[arg(long)]
     images: bool,
 
+    /// Cast the sweeps of the LiDARs again, and add them as point clouds in the frame of the rig. The
+    /// ego's motion during a sweep is taken out.
+    #[arg(long, conflicts_with = "nuscenes")]
+    lidar: bool,
+
     /// Write messages of ROS 2 in place of Foxglove's: clock, tf, odometry, camera_info, compressed
-    /// images and plans, for `ros2 bag play` and programs that read bags.
+    /// images, point clouds and plans, for `ros2 bag play` and programs that read bags.
     #[arg(long, conflicts_with = "nuscenes")]
     ros2: bool,
 
@@ -72,7 +79,7 @@ const EXAMPLES: &str = "\
 Examples:
   wildcity episode export agent-1 --mcap agent-1.mcap
   wildcity episode export agent-1 --mcap agent-1.mcap --images
-  wildcity episode export agent-1 --mcap agent-1-ros.mcap --images --ros2
+  wildcity episode export agent-1 --mcap agent-1-ros.mcap --images --lidar --ros2
   wildcity episode export agent-1 --nuscenes agent-1-nuscenes --images
   wildcity episode export run/episodes/straight-0-1.jsonl --mcap straight.mcap --images --camera front";
 
@@ -91,18 +98,21 @@ impl Export {
             "{}: this is the record itself; name another file",
             target.display()
         );
-        let (exported, report) = if self.images {
-            self.with_images(&path).map(|(exported, report)| (exported, Some(report)))?
+        let (exported, replayed) = if self.images || self.lidar {
+            self.replayed(&path).map(|(exported, replayed)| (exported, Some(replayed)))?
         } else {
-            (self.without_images(&path)?, None)
+            (self.from_record(&path)?, None)
         };
         let mut out = output::stdout();
         let what = if self.nuscenes.is_some() { "rows" } else { "messages" };
         writeln!(out, "exported    {} {what} to {}", exported.messages, target.display())?;
-        if let Some(report) = &report {
+        if let Some(Replay { report, sweeps }) = &replayed {
             writeln!(out, "images      {}", report.images)?;
+            if self.lidar {
+                writeln!(out, "sweeps      {sweeps}")?;
+            }
         }
-        if let Some(difference) = report.and_then(|report| report.difference) {
+        if let Some(difference) = replayed.and_then(|replayed| replayed.report.difference) {
             writeln!(out, "differs     {difference}")?;
         }
         let error_px = exported.calibration_error_px;
@@ -121,7 +131,7 @@ impl Export {
         target.context("name a file with --mcap, or a folder with --nuscenes")
     }
 
-    fn without_images(&self, path: &Path) -> anyhow::Result<Exported> {
+    fn from_record(&self, path: &Path) -> anyhow::Result<Exported> {
         let target = self.target()?;
         if self.nuscenes.is_none() && !self.ros2 {
             return Ok(export_file(path, target)?);
@@ -134,44 +144,70 @@ impl Export {
         Ok(write_whole(target, |out| export_ros2(&episode, rig.as_ref(), out))?)
     }
 
-    fn with_images(&self, path: &Path) -> anyhow::Result<(Exported, ReplayReport)> {
+    fn replayed(&self, path: &Path) -> anyhow::Result<(Exported, Replay)> {
         let episode = EpisodeFile::read(path)?;
         let rig = EpisodeFile::rig(path)?;
         let mut recording = RecordedEpisode::read(path)?;
         let count = recording.header.rig.cameras.len();
         let wanted = self.camera.iter().map(|name| camera_index(&recording, name));
         let mut wanted = wanted.collect::<anyhow::Result<Vec<usize>>>()?;
-        if wanted.is_empty() {
+        if wanted.is_empty() && self.images {
             wanted = (0..count).collect();
+        }
+        if self.lidar {
+            anyhow::ensure!(
+                !recording.header.rig.lidars.is_empty(),
+                "--lidar: the rig {:?} of the episode has no LiDAR",
+                recording.header.rig.name
+            );
+        } else {
+            recording.leave_out_sweeps();
         }
         let shown = driven(&recording.frames);
         for (index, frame) in recording.frames.iter_mut().enumerate() {
-            let cameras = if shown.binary_search(&index).is_ok() { &wanted[..] } else { &[] };
-            keep_cameras(frame, cameras, count);
+            // Otherwise the session returned to an earlier state, and drove on from there.
+            let is_shown = shown.binary_search(&index).is_ok();
+            keep_cameras(frame, if is_shown { &wanted } else { &[] }, count);
+            if !is_shown {
+                frame.sweeps.clear();
+            }
         }
         let cache = Cache::new(self.twins.catalog()?);
         let backend = self.backend.replay_backend(&recording.header.backend)?;
         let bar = progress::count("rendering");
-        bar.set_length(recording.frames.iter().map(|frame| frame.images.len() as u64).sum());
-        let replay = |add: &mut AddImage<'_>| {
-            let mut add = |image: &ReplayedImage<'_>| {
+        let parts = |frame: &FrameRecord| (frame.images.len() + frame.sweeps.len()) as u64;
+        bar.set_length(recording.frames.iter().map(parts).sum());
+        let replay = |add: &mut Add<'_>| -> Result<Replay, ExportError> {
+            let mut sweeps = 0;
+            let mut add = |replayed: &Replayed<'_>| {
                 bar.inc(1);
-                add(image)
+                sweeps += u64::from(matches!(replayed, Replayed::Sweep(_)));
+                add(replayed)
             };
             let report = recording.replay(&cache, &*backend, ReplayUntil::End, &mut add);
-            report.map_err(|error| ExportError::Images(error.to_string()))
+            let report = report.map_err(|error| ExportError::Images(error.to_string()))?;
+            Ok(Replay { report, sweeps })
         };
         let target = self.target()?;
         let written = if self.nuscenes.is_some() {
             NuscenesExport::begin(&episode, rig.as_ref(), target).and_then(|mut export| {
-                let report = replay(&mut |image| add_to_nuscenes(&mut export, &recording, image))?;
-                Ok((export.finish()?, report))
+                let replayed = replay(&mut |replayed| match replayed {
+                    Replayed::Image(image) => add_to_nuscenes(&mut export, &recording, image),
+                    // Without --lidar there is none.
+                    Replayed::Sweep(_) => Ok(()),
+                })?;
+                Ok((export.finish()?, replayed))
             })
         } else {
             write_whole(target, |out| {
                 let mut export = AnyExport::begin(self.ros2, &episode, rig.as_ref(), out)?;
-                let report = replay(&mut |image| add_to_mcap(&mut export, &recording, image))?;
-                Ok((export.finish()?, report))
+                let replayed = replay(&mut |replayed| match replayed {
+                    Replayed::Image(image) => add_to_mcap(&mut export, &recording, image),
+                    Replayed::Sweep(sweep) => {
+                        export.sweep(sweep).map_err(|error| error.to_string())
+                    }
+                })?;
+                Ok((export.finish()?, replayed))
             })
         };
         bar.finish_and_clear();
@@ -179,8 +215,15 @@ impl Export {
     }
 }
 
-/// What is done with each image.
-type AddImage<'a> = dyn FnMut(&ReplayedImage<'_>) -> Result<(), String> + 'a;
+/// What is done with each image and sweep.
+type Add<'a> = dyn FnMut(&Replayed<'_>) -> Result<(), String> + 'a;
+
+/// The result of driving and rendering an episode again.
+struct Replay {
+    report: ReplayReport,
+    /// Sweeps that were added.
+    sweeps: u64,
+}
 
 /// A file of one of the two kinds.
 enum AnyExport<'a, W: io::Write + io::Seek> {
@@ -206,6 +249,21 @@ impl<'a, W: io::Write + io::Seek> AnyExport<'a, W> {
         match self {
             Self::Foxglove(export) => export.image(image),
             Self::Ros2(export) => export.image(image),
+        }
+    }
+
+    fn sweep(&mut self, sweep: &ReplayedSweep<'_>) -> Result<(), ExportError> {
+        let point = |point: SweepPoint| {
+            let SweepPoint { xyz_m, intensity, offset_us, row, column, instance } = point;
+            // A sweep takes a second at most.
+            let offset_us = offset_us as i32;
+            ExportedPoint { xyz_m, intensity, offset_us, row, column, instance }
+        };
+        let points: Vec<ExportedPoint> = sweep.points().into_iter().map(point).collect();
+        let sweep = ExportedSweep { lidar: sweep.lidar, time_us: sweep.time_us, points: &points };
+        match self {
+            Self::Foxglove(export) => export.sweep(&sweep),
+            Self::Ros2(export) => export.sweep(&sweep),
         }
     }
 

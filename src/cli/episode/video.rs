@@ -3,7 +3,7 @@
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use wildcity_session::{RecordedEpisode, ReplayUntil, ReplayedImage};
+use wildcity_session::{RecordedEpisode, ReplayUntil, Replayed, ReplayedImage};
 use wildcity_twin::residency::Cache;
 
 use crate::cli::backend_options::BackendOptions;
@@ -59,6 +59,7 @@ impl Video {
         for frame in &mut recording.frames {
             keep_cameras(frame, &[camera], recording.header.rig.cameras.len());
         }
+        recording.leave_out_sweeps();
         output::create_dir(&self.out)?;
         let cache = Cache::new(self.twins.catalog()?);
         let header = &recording.header;
@@ -67,7 +68,8 @@ impl Video {
         let bar = progress::count("rendering");
         bar.set_length(recording.frames.iter().map(|frame| frame.images.len() as u64).sum());
         let mut written = 0_usize;
-        let report = recording.replay(&cache, &*backend, ReplayUntil::End, &mut |image| {
+        let report = recording.replay(&cache, &*backend, ReplayUntil::End, &mut |replayed| {
+            let Replayed::Image(image) = replayed else { return Ok(()) };
             bar.inc(1);
             let path = self.out.join(format!("{written:06}.png"));
             written += 1;

@@ -186,6 +186,21 @@ const MESSAGES: &[(&str, Fields)] = &[
         ],
     ),
     (
+        "PackedElementField",
+        &[("name", 1, "string"), ("offset", 2, "fixed32"), ("type", 3, "=foxglove.NumericType")],
+    ),
+    (
+        "PointCloud",
+        &[
+            ("timestamp", 1, TIMESTAMP),
+            ("frame_id", 2, "string"),
+            ("pose", 3, ".foxglove.Pose"),
+            ("point_stride", 4, "fixed32"),
+            ("fields", 5, "[].foxglove.PackedElementField"),
+            ("data", 6, "bytes"),
+        ],
+    ),
+    (
         "Log",
         &[
             ("timestamp", 1, TIMESTAMP),
@@ -207,6 +222,21 @@ const SOLID: Fields = &[
 ];
 
 const ENUMS: &[(&str, &[&str])] = &[
+    // Values share one space of names, so that this `UNKNOWN` has a longer one than Foxglove's.
+    (
+        "NumericType",
+        &[
+            "UNKNOWN_NUMBER",
+            "UINT8",
+            "INT8",
+            "UINT16",
+            "INT16",
+            "UINT32",
+            "INT32",
+            "FLOAT32",
+            "FLOAT64",
+        ],
+    ),
     ("LineType", &["LINE_STRIP", "LINE_LOOP", "LINE_LIST"]),
     ("SceneEntityDeletionType", &["MATCHING_ID", "ALL"]),
     ("LogLevel", &["UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL"]),
@@ -275,7 +305,7 @@ fn message(name: &str, fields: &[(&str, i32, &str)]) -> DescriptorProto {
 }
 
 fn enumeration(name: &str, values: &[&str]) -> EnumDescriptorProto {
-    // Foxglove's enums count from 0 in order, so that the index is the number. The longest has six
+    // Foxglove's enums count from 0 in order, so that the index is the number. The longest has nine
     // values.
     let value = |(number, value): (usize, &&str)| EnumValueDescriptorProto {
         name: Some((**value).to_owned()),

@@ -196,6 +196,33 @@ pub(super) struct CompressedImage {
 }
 
 #[derive(Clone, PartialEq, prost::Message)]
+pub(super) struct PackedElementField {
+    #[prost(string, tag = "1")]
+    pub(super) name: String,
+    #[prost(fixed32, tag = "2")]
+    pub(super) offset: u32,
+    /// A `NumericType`.
+    #[prost(int32, tag = "3")]
+    pub(super) kind: i32,
+}
+
+#[derive(Clone, PartialEq, prost::Message)]
+pub(super) struct PointCloud {
+    #[prost(message, optional, tag = "1")]
+    pub(super) timestamp: Option<Timestamp>,
+    #[prost(string, tag = "2")]
+    pub(super) frame_id: String,
+    #[prost(message, optional, tag = "3")]
+    pub(super) pose: Option<Pose>,
+    #[prost(fixed32, tag = "4")]
+    pub(super) point_stride: u32,
+    #[prost(message, repeated, tag = "5")]
+    pub(super) fields: Vec<PackedElementField>,
+    #[prost(bytes = "vec", tag = "6")]
+    pub(super) data: Vec<u8>,
+}
+
+#[derive(Clone, PartialEq, prost::Message)]
 pub(super) struct CameraCalibration {
     #[prost(message, optional, tag = "1")]
     pub(super) timestamp: Option<Timestamp>,

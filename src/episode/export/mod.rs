@@ -5,6 +5,7 @@
 //! | `/tf` | `foxglove.FrameTransforms`: world to rig at each step, rig to each camera at the start |
 //! | `/camera/N/image` | `foxglove.CompressedImage`: JPEG, if the caller renders the images |
 //! | `/camera/N/calibration` | `foxglove.CameraCalibration`; `/wildcity/episode` has its deviation from the lens |
+//! | `/lidar/N/points` | `foxglove.PointCloud` in the rig at the sweep's time, if the caller casts the sweeps |
 //! | `/actors` | `foxglove.SceneUpdate`: a box for each actor and for the ego |
 //! | `/map` | `foxglove.SceneUpdate`: the outlines of the lanes |
 //! | `/actors/poses` | `foxglove.PosesInFrame`: the middles of the actors' boxes, also for Rerun |
@@ -39,6 +40,8 @@ mod parts;
 #[cfg(feature = "mcap")]
 mod ros2;
 #[cfg(feature = "mcap")]
+mod sweep;
+#[cfg(feature = "mcap")]
 mod write;
 
 pub use error::{ExportError, Exported};
@@ -47,6 +50,8 @@ pub use file::{export_file, mcap_path, remove_leftovers, write_whole};
 pub use nuscenes::{NuscenesExport, NuscenesImage, export_nuscenes};
 #[cfg(feature = "mcap")]
 pub use ros2::{Ros2Export, export_ros2};
+#[cfg(feature = "mcap")]
+pub use sweep::{ExportedPoint, ExportedSweep};
 #[cfg(feature = "mcap")]
 pub use write::{EpisodeExport, ExportedImage, export};
 

@@ -17,6 +17,7 @@ use super::convert::{camera_frame, color, cube, entity, place, pose, timestamp, 
 use super::error::{ExportError, Exported};
 use super::messages as foxglove;
 use super::parts::{command, event_text, motions, odometry, plan};
+use super::sweep::{ExportedSweep, POINT_BYTES, foxglove_fields, packed};
 use crate::file::{EpisodeFile, Frame};
 use crate::lines::{ActorsLine, EventLine, ScenarioLine};
 
@@ -114,6 +115,24 @@ impl<'a, W: Write + Seek> EpisodeExport<'a, W> {
         };
         let topic = format!("/camera/{}/image", image.camera);
         self.file.proto(&topic, "foxglove.CompressedImage", image.time_us, &message)
+    }
+
+    /// Adds a sweep of a LiDAR, after all messages of earlier times.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn sweep(&mut self, sweep: &ExportedSweep<'_>) -> Result<(), ExportError> {
+        self.write_until(sweep.time_us)?;
+        let message = foxglove::PointCloud {
+            timestamp: Some(timestamp(sweep.time_us)),
+            frame_id: "rig".to_owned(),
+            pose: Some(place([0.0; 3])),
+            point_stride: POINT_BYTES,
+            fields: foxglove_fields(),
+            data: packed(sweep.points),
+        };
+        let topic = format!("/lidar/{}/points", sweep.lidar);
+        self.file.proto(&topic, "foxglove.PointCloud", sweep.time_us, &message)
     }
 
     /// Writes the remaining messages, and the index.

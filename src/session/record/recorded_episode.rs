@@ -61,6 +61,17 @@ impl RecordedEpisode {
         Self::read_part(path, Some(step))
     }
 
+    /// Leaves out the sweeps of LiDARs, for a replay of which only the images are wanted.
+    pub fn leave_out_sweeps(&mut self) {
+        self.header.rig.lidars.clear();
+        if let Some(settings) = &mut self.header.settings
+            && let Some(sensors) = &mut settings.sensors
+        {
+            sensors.lidars.clear();
+        }
+        self.frames.iter_mut().for_each(|frame| frame.sweeps.clear());
+    }
+
     fn read_part(path: &Path, until: Option<u64>) -> Result<Self, ReplayError> {
         let failed = |cause| ReplayError::Read { path: path.to_owned(), cause };
         let mut reader = BufReader::new(open_record(path).map_err(failed)?);

@@ -23,7 +23,7 @@ use super::repair_replay::{Drawing, ImageToRepair, RepairReplay};
 use super::repairs::RecordedImageRepair;
 use super::replay_report::{
     ImageDifference, ProvenanceChange, RepairedImages, ReplayError, ReplayReport, ReplayUntil,
-    ReplayedImage, WrongValue,
+    Replayed, ReplayedImage, ReplayedSweep, WrongValue,
 };
 use super::sensor_replay::SensorReplay;
 use super::values;
@@ -32,8 +32,9 @@ use crate::repair::rendered_image::RenderedImage;
 use crate::scenario::assets::FrameDetail;
 use crate::viewpoint::{lidar_viewpoint, viewpoints};
 
-/// The caller's function for each image, which runs before the image is compared with the record.
-type VisitImage<'a> = dyn FnMut(&ReplayedImage<'_>) -> Result<(), String> + 'a;
+/// The caller's function for each image and sweep, which runs before these are compared with the
+/// record.
+type Visit<'a> = dyn FnMut(&Replayed<'_>) -> Result<(), String> + 'a;
 
 impl RecordedEpisode {
     /// Drives and renders the episode again, on the recorded versions of its twin.
@@ -46,7 +47,7 @@ impl RecordedEpisode {
         cache: &Cache,
         backend: &dyn Backend,
         until: ReplayUntil,
-        visit: &mut VisitImage<'_>,
+        visit: &mut Visit<'_>,
     ) -> Result<ReplayReport, ReplayError> {
         self.replay_repaired(cache, backend, &Models::default(), until, visit)
     }
@@ -62,7 +63,7 @@ impl RecordedEpisode {
         backend: &dyn Backend,
         models: &Models,
         until: ReplayUntil,
-        visit: &mut VisitImage<'_>,
+        visit: &mut Visit<'_>,
     ) -> Result<ReplayReport, ReplayError> {
         let open = |version: u64| cache.open(&self.header.twin, Some(version));
         let actors = ActorReplay::new(self, cache)?;
@@ -82,7 +83,7 @@ impl RecordedEpisode {
             }
             replay.check_values(frame, index);
             replay.render(frame, index, until, visit)?;
-            replay.check_sweeps(frame, index)?;
+            replay.check_sweeps(frame, index, visit)?;
             if until == ReplayUntil::FirstDifference && replay.report.difference.is_some() {
                 return Ok(replay.report);
             }
@@ -228,7 +229,7 @@ impl<'a> Replay<'a> {
         frame: &FrameRecord,
         index: usize,
         until: ReplayUntil,
-        visit: &mut VisitImage<'_>,
+        visit: &mut Visit<'_>,
     ) -> Result<(), ReplayError> {
         let mut next_image = 0;
         for pose in 0..frame.poses.len() {
@@ -307,9 +308,9 @@ impl<'a> Replay<'a> {
                     // What was sent, as far as it can be computed again.
                     rgb8: repaired.as_deref().unwrap_or(rendered_pixels),
                 };
-                visit(&image).map_err(|reason| {
-                    let camera = image.camera.name.clone();
-                    ReplayError::Visit { step: frame.step, camera, reason }
+                visit(&Replayed::Image(image)).map_err(|reason| {
+                    let sensor = format!("camera {:?}", image.camera.name);
+                    ReplayError::Visit { step: frame.step, sensor, reason }
                 })?;
                 self.report.images += 1;
                 // The first of a pair that differs: with other rendered pixels, other repaired ones
@@ -334,8 +335,13 @@ impl<'a> Replay<'a> {
         Ok(())
     }
 
-    /// Casts the sweeps of a frame again and compares their points.
-    fn check_sweeps(&mut self, frame: &FrameRecord, index: usize) -> Result<(), ReplayError> {
+    /// Casts the sweeps of a frame again, shows each to `visit` and compares its points.
+    fn check_sweeps(
+        &mut self,
+        frame: &FrameRecord,
+        index: usize,
+        visit: &mut Visit<'_>,
+    ) -> Result<(), ReplayError> {
         let step = frame.step;
         // As for a session: none of poses that the ego is not at, and none between two decisions.
         let schedule = self.settings.map(|settings| &settings.schedule);
@@ -365,6 +371,12 @@ impl<'a> Replay<'a> {
                 .map_err(|cause| ReplayError::Render { step, cause })?;
             let effects = self.sensors.as_ref().and_then(|sensors| sensors.lidar_effects(lidar));
             let cloud = PointCloud::new(lidar, mounted, &sweep, frame.time_us, effects);
+            let time_us = frame.time_us;
+            let replayed = ReplayedSweep { lidar, time_us, mounted, view: &view, cloud: &cloud };
+            visit(&Replayed::Sweep(replayed)).map_err(|reason| {
+                let sensor = format!("LiDAR {:?}", mounted.name);
+                ReplayError::Visit { step, sensor, reason }
+            })?;
             let now = cloud.hash.to_hex().to_string();
             if now != *recorded && self.report.difference.is_none() {
                 self.report.difference = Some(ImageDifference {

@@ -3,15 +3,18 @@
 use std::io;
 use std::path::PathBuf;
 
+use glam::Vec3;
 use wildcity_episode::ReadError;
 use wildcity_render::RenderError;
+use wildcity_render::lidar::LidarView;
 use wildcity_repair::RepairError;
-use wildcity_scene::rig::{RigCamera, RigError};
+use wildcity_scene::rig::{RigCamera, RigError, RigLidar};
 use wildcity_twin::residency::ResidencyError;
 
 use super::ego_replay::DivergedStep;
 use super::format::FrameRequest;
 use crate::error::SessionError;
+use crate::observe::point_cloud::PointCloud;
 
 /// The result of a replay.
 #[derive(Clone, Debug, PartialEq)]
@@ -104,6 +107,70 @@ pub struct ReplayedImage<'a> {
     pub rgb8: &'a [u8],
 }
 
+/// A sweep that was cast again.
+#[derive(Clone, Copy, Debug)]
+pub struct ReplayedSweep<'a> {
+    /// Index of its LiDAR in the rig.
+    pub lidar: usize,
+    /// The sweep's time, in microseconds since the episode's start.
+    pub time_us: i64,
+    pub(crate) mounted: &'a RigLidar,
+    pub(crate) view: &'a LidarView,
+    pub(crate) cloud: &'a PointCloud,
+}
+
+/// A return of a sweep.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SweepPoint {
+    /// Position in the rig's axes at the time of the sweep, in metres: the motion of the ego during
+    /// the sweep is taken out.
+    pub xyz_m: [f32; 3],
+    /// Mean luminance of what was hit.
+    pub intensity: f32,
+    /// When it was measured, in microseconds after the sweep's time: 0 or less.
+    pub offset_us: i64,
+    pub row: u16,
+    pub column: u16,
+    /// As the map of an image.
+    pub instance: u16,
+}
+
+impl ReplayedSweep<'_> {
+    /// Its returns, row by row.
+    pub fn points(&self) -> Vec<SweepPoint> {
+        let Self { mounted, view, cloud, .. } = self;
+        let beams = &mounted.lidar;
+        let lidar_from_rig = mounted.rig_from_lidar.inverse();
+        let rig_from_world = (view.world_from_lidar * lidar_from_rig).inverse();
+        // Once for each column, and not for each beam.
+        let columns = (0..beams.columns()).map(|column| {
+            let world_from_rig = view.world_from_lidar_at(column) * lidar_from_rig;
+            (rig_from_world * world_from_rig, -(beams.age_us(column).round() as i64))
+        });
+        let columns: Vec<_> = columns.collect();
+        let point = |at: usize| {
+            let (last_from_rig, offset_us) = &columns[usize::from(cloud.columns[at])];
+            let measured_m = Vec3::from_array(cloud.points_m[at]).as_dvec3();
+            SweepPoint {
+                xyz_m: last_from_rig.transform_point(measured_m).as_vec3().to_array(),
+                intensity: cloud.intensity[at],
+                offset_us: *offset_us,
+                row: cloud.rows[at],
+                column: cloud.columns[at],
+                instance: cloud.instances[at],
+            }
+        };
+        (0..cloud.points_m.len()).map(point).collect()
+    }
+}
+
+/// What a replay has computed again.
+#[derive(Clone, Copy, Debug)]
+pub enum Replayed<'a> {
+    Image(ReplayedImage<'a>),
+    Sweep(ReplayedSweep<'a>),
+}
+
 /// Why an episode could not be replayed.
 #[derive(Debug, thiserror::Error)]
 pub enum ReplayError {
@@ -160,12 +227,12 @@ pub enum ReplayError {
     /// The table of recorded images cannot be read, and the model compares with them.
     #[error("the recorded images of the twin cannot be read: {0}")]
     Reference(String),
-    /// The caller's function failed on an image.
-    #[error("step {step}, camera {camera:?}: {reason:#}")]
+    /// The caller's function failed on an image or a sweep.
+    #[error("step {step}, {sensor}: {reason:#}")]
     Visit {
         step: u64,
-        /// Name of the camera.
-        camera: String,
+        /// The camera or the LiDAR.
+        sensor: String,
         reason: String,
     },
 }

@@ -18,8 +18,12 @@ impl Cdr {
         self.bytes
     }
 
+    pub(super) fn put_u8(&mut self, value: u8) {
+        self.bytes.push(value);
+    }
+
     pub(super) fn put_bool(&mut self, value: bool) {
-        self.bytes.push(value.into());
+        self.put_u8(value.into());
     }
 
     pub(super) fn put_i32(&mut self, value: i32) {

@@ -7,6 +7,7 @@ use wildcity_score::EgoSample;
 
 use super::super::convert::nanoseconds;
 use super::super::messages::CameraCalibration;
+use super::super::sweep::{ExportedPoint, FIELDS, Number, POINT_BYTES, packed};
 use super::cdr::Cdr;
 
 /// The frame of the world (REP 105).
@@ -71,6 +72,36 @@ pub(super) fn compressed_image(stamp: Stamp, frame: &str, jpeg: &[u8]) -> Vec<u8
     cdr.put_header(stamp, frame);
     cdr.put_text("jpeg");
     cdr.put_bytes(jpeg);
+    cdr.finish()
+}
+
+/// Points in no order of rows: those without a return are left out.
+pub(super) fn point_cloud(stamp: Stamp, frame: &str, points: &[ExportedPoint]) -> Vec<u8> {
+    // A sweep has 2²⁰ beams at most, whose bytes fit u32.
+    let count = points.len() as u32;
+    let mut cdr = Cdr::new();
+    cdr.put_header(stamp, frame);
+    cdr.put_u32(1);
+    cdr.put_u32(count);
+    cdr.put_len(FIELDS.len());
+    for (name, offset, number) in FIELDS {
+        cdr.put_text(name);
+        cdr.put_u32(offset);
+        // The constants of `sensor_msgs/PointField`.
+        cdr.put_u8(match number {
+            Number::U16 => 4,
+            Number::I32 => 5,
+            Number::F32 => 7,
+        });
+        cdr.put_u32(1);
+    }
+    // Little endian.
+    cdr.put_bool(false);
+    cdr.put_u32(POINT_BYTES);
+    cdr.put_u32(POINT_BYTES * count);
+    cdr.put_bytes(&packed(points));
+    // All points are finite.
+    cdr.put_bool(true);
     cdr.finish()
 }
 

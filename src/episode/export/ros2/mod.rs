@@ -9,6 +9,7 @@
 //! | `/odometry` | `nav_msgs/Odometry`: pose in `map`, velocities in `base_link` |
 //! | `/camera/NAME/camera_info` | `sensor_msgs/CameraInfo`, at the start and with each image |
 //! | `/camera/NAME/compressed` | `sensor_msgs/CompressedImage`: JPEG, if the caller renders the images |
+//! | `/lidar/NAME/points` | `sensor_msgs/PointCloud2` in `base_link` at the sweep's time, if the caller casts the sweeps |
 //! | `/plan` | `nav_msgs/Path` in `base_link`: the agent's trajectory, when it was decided |
 //!
 //! Times are those of the other export: those of the episode plus 1,000 s.
@@ -29,6 +30,7 @@ use super::container::McapFile;
 use super::error::{ExportError, Exported};
 use super::messages as foxglove;
 use super::parts::motions;
+use super::sweep::ExportedSweep;
 use super::write::ExportedImage;
 use crate::file::{EpisodeFile, Frame};
 
@@ -40,6 +42,8 @@ pub struct Ros2Export<'a, W: Write + Seek> {
     /// The frames that are not written yet, each with the ego's motion.
     frames: Peekable<std::vec::IntoIter<(&'a Frame, Option<EgoSample>)>>,
     cameras: Vec<Ros2Camera>,
+    /// Names of the LiDARs in topics.
+    lidars: Vec<String>,
     calibration_error_px: f64,
 }
 
@@ -61,6 +65,7 @@ impl<'a, W: Write + Seek> Ros2Export<'a, W> {
         let begin_us = frames.first().ok_or(ExportError::Empty)?.time_us;
         let motions = motions(&frames, episode.header.dt_us);
         let mounted = rig.map_or(&[][..], |rig| &rig.cameras);
+        let lidars = rig.map_or(&[][..], |rig| &rig.lidars);
         let calibrations: Vec<Calibration> = mounted
             .iter()
             .enumerate()
@@ -74,6 +79,7 @@ impl<'a, W: Write + Seek> Ros2Export<'a, W> {
         });
         let mut export = Self {
             cameras: cameras.collect(),
+            lidars: lidars.iter().map(|lidar| ros_name(&lidar.name)).collect(),
             file: McapFile::create_ros2(out)?,
             frames: frames.iter().copied().zip(motions).collect::<Vec<_>>().into_iter().peekable(),
             calibration_error_px,
@@ -97,6 +103,18 @@ impl<'a, W: Write + Seek> Ros2Export<'a, W> {
         let data = messages::compressed_image(stamp, &optical_frame(&camera.name), image.jpeg);
         let topic = format!("/camera/{}/compressed", camera.name);
         self.put(&topic, "sensor_msgs/msg/CompressedImage", image.time_us, &data)
+    }
+
+    /// Adds a sweep of a LiDAR, after all messages of earlier times.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn sweep(&mut self, sweep: &ExportedSweep<'_>) -> Result<(), ExportError> {
+        self.write_until(sweep.time_us)?;
+        let Some(name) = self.lidars.get(sweep.lidar) else { return Ok(()) };
+        let topic = format!("/lidar/{name}/points");
+        let data = messages::point_cloud(Stamp::new(sweep.time_us), BASE, sweep.points);
+        self.put(&topic, "sensor_msgs/msg/PointCloud2", sweep.time_us, &data)
     }
 
     /// Writes the remaining messages, and the index.

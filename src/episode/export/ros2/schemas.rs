@@ -77,6 +77,20 @@ const DEFINITIONS: &[Definition] = &[
         uses: &[HEADER],
     },
     Definition {
+        name: "sensor_msgs/PointField",
+        fields: "uint8 INT8=1\nuint8 UINT8=2\nuint8 INT16=3\nuint8 UINT16=4\nuint8 INT32=5\n\
+                 uint8 UINT32=6\nuint8 FLOAT32=7\nuint8 FLOAT64=8\nstring name\nuint32 offset\n\
+                 uint8 datatype\nuint32 count\n",
+        uses: &[],
+    },
+    Definition {
+        name: "sensor_msgs/PointCloud2",
+        fields: "std_msgs/Header header\nuint32 height\nuint32 width\n\
+                 sensor_msgs/PointField[] fields\nbool is_bigendian\nuint32 point_step\n\
+                 uint32 row_step\nuint8[] data\nbool is_dense\n",
+        uses: &[HEADER, "sensor_msgs/PointField"],
+    },
+    Definition {
         name: "sensor_msgs/CameraInfo",
         fields: "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\n\
                  float64[] d\nfloat64[9] k\nfloat64[9] r\nfloat64[12] p\nuint32 binning_x\n\
