@@ -89,6 +89,7 @@ DEFAULTS = {
     ("Metadata", "history"): "()",
     ("Metadata", "events"): "()",
     ("Metadata", "sweeps"): "()",
+    ("Opened", "lidars"): "()",
     ("ImageInfo", "back"): "0",
 }
 # Fields that Python always has to be given, although the server knows a default for some lenses.

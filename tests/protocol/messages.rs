@@ -495,6 +495,7 @@ fn answers() -> Vec<(&'static str, Answer)> {
         decision_us: 500_000,
         warm_up_us: 1_600_000,
         cameras: vec![front(), rear()],
+        lidars: Vec::new(),
         outputs: Outputs {
             encoding: Encoding::Raw,
             depth: true,
@@ -512,7 +513,20 @@ fn answers() -> Vec<(&'static str, Answer)> {
         scenario: None,
         trajectory: Some(drive()),
     };
-    let sensed = Opened { trajectory: None, sensors: Some(sensors()), ..opened.clone() };
+    let sensed = Opened {
+        trajectory: None,
+        sensors: Some(sensors()),
+        lidars: vec![OpenedLidar {
+            name: "top".into(),
+            rows: 64,
+            columns: 1_800,
+            duration_us: 100_000,
+            min_range_m: 0.5,
+            max_range_m: 200.0,
+            lidar_to_rig: pose([1.25, 0.0, 1.875], [1.0, 0.0, 0.0, 0.0]),
+        }],
+        ..opened.clone()
+    };
     let repaired = Opened {
         trajectory: None,
         repair: Some(OpenedRepair {

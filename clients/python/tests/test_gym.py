@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 import stat
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -17,7 +19,18 @@ import wildcity
 import wildcity.gym
 from gymnasium.utils.env_checker import check_env
 from test_end_to_end import PAIR, Server, import_corridor, server
-from wildcity import Drive, DrivePose, Pose, Refused, ServeFailed, Station, serving
+from wildcity import (
+    Drive,
+    DrivePose,
+    LidarBeams,
+    LidarColumns,
+    Pose,
+    Refused,
+    RigLidar,
+    ServeFailed,
+    Station,
+    serving,
+)
 from wildcity.gym import DriveConfig, DriveEnv, DriveState, DriveVectorEnv, Reward, Route
 
 SMALL: dict[str, Any] = {"twin": "corridor", "rig": PAIR, "size": (32, 20), "horizon": 30, "speed": 5.0}
@@ -438,3 +451,30 @@ def test_a_server_that_does_not_start_says_why(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(serving.sysconfig, "get_path", lambda _: str(tmp_path))
     with pytest.raises(ServeFailed, match="there is no program wildcity"), wildcity.serve():
         raise AssertionError("it started")
+
+
+def test_ranges_of_a_lidar(server: Server) -> None:
+    elevations = tuple(np.radians(np.linspace(2.0, -24.0, 14)))
+    beams = LidarBeams(elevations, 100_000, columns=LidarColumns(90, 3.1, -3.1), max_range_m=50.0)
+    rig = replace(PAIR, lidars=(RigLidar("roof.top", beams, Pose((0.5, 0.0, 1.6), (1.0, 0.0, 0.0, 0.0))),))
+    given: dict[str, Any] = {**SMALL, "rig": rig, "lidars": {"roof.top": (14, 90)}, "server": server.url}
+    made = gymnasium.make("wildcity/Drive-v0", **given)
+    check_env(made.unwrapped, skip_render_check=True)
+    seen, _ = made.reset(seed=1, options={"start": 1.0})
+    ranges = seen["lidar_roof_top"]
+    assert ranges.shape == (14, 90)
+    hit = ranges > 0
+    assert hit.mean() > 0.5 and ranges[hit].min() > 0.5 and ranges[hit].max() <= 50.0
+    # The road is flat: a beam that looks down meets it at the height over the sine.
+    down = ranges[13, 40:50]
+    assert down[down > 0] == pytest.approx(1.6 / np.sin(np.radians(24.0)), abs=0.15)
+    made.close()
+
+    for lidars, text in [
+        ({"roof.top": (14, 91)}, "14 rows and 90 columns, not (14, 91)"),
+        ({"no": (1, 1)}, "no LiDAR 'no'; it has roof.top"),
+    ]:
+        wrong = gymnasium.make("wildcity/Drive-v0", **{**given, "lidars": lidars})
+        with pytest.raises(ValueError, match=re.escape(text)):
+            wrong.reset()
+        wrong.close()

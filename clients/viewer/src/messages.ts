@@ -331,6 +331,17 @@ export interface Welcome {
   twins: TwinInfo[];
 }
 
+/** A LiDAR of a session's rig. */
+export interface OpenedLidar {
+  columns: number;
+  duration_us: number;
+  lidar_to_rig: Pose;
+  max_range_m: number;
+  min_range_m: number;
+  name: string;
+  rows: number;
+}
+
 /** What a repair model compares images with. */
 export type ReferenceSource = "recorded" | "rendered";
 
@@ -381,6 +392,7 @@ export interface Opened {
   decision_us: number;
   dt_us: number;
   dynamics: Dynamics;
+  lidars?: OpenedLidar[];
   outputs: Outputs;
   profile: Record<string, unknown>;
   profile_hash: string;

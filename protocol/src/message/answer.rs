@@ -219,6 +219,9 @@ pub struct Opened {
     pub warm_up_us: i64,
     /// The cameras in the order of the images, with the intrinsics of the images as sent.
     pub cameras: Vec<RigCamera>,
+    /// The LiDARs, in the order of the sweeps.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub lidars: Vec<OpenedLidar>,
     /// What each observation holds.
     pub outputs: Outputs,
     /// The twin's recorded trajectories.
@@ -238,6 +241,26 @@ pub struct Opened {
     /// The part of a recorded drive that `open` asked for.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub trajectory: Option<Drive>,
+}
+
+/// A LiDAR of a session's rig.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct OpenedLidar {
+    /// Name within the rig.
+    pub name: String,
+    /// Number of rows of its beams.
+    pub rows: u64,
+    /// Number of columns of its beams.
+    pub columns: u64,
+    /// Time of a revolution, or of a frame of a LiDAR that does not spin, in microseconds.
+    pub duration_us: i64,
+    /// Nothing nearer returns, in metres.
+    pub min_range_m: f64,
+    /// Nothing farther returns, in metres.
+    pub max_range_m: f64,
+    /// Pose of the LiDAR on the rig.
+    pub lidar_to_rig: Pose,
 }
 
 /// The repair of a session's images.

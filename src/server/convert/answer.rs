@@ -18,6 +18,7 @@ use wildcity_repair::Selection;
 use wildcity_scene::Rig;
 use wildcity_scene::appearance::Appearance;
 use wildcity_scene::geometry::{Camera, Pose};
+use wildcity_scene::rig::RigLidar;
 use wildcity_session::{
     DamagedSummary, Engine, EpisodeSummary, EpisodeTraffic, ImageEncoding, Outcome, PixelMaps,
     ReferenceSource, Session, SessionRepair, TrajectorySummary, TwinSummaries, TwinSummary,
@@ -112,6 +113,7 @@ fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Resu
         decision_us: session.decision_us(),
         warm_up_us: session.warm_up_us(),
         cameras: session.cameras().iter().map(camera).collect(),
+        lidars: session.lidars().iter().map(opened_lidar).collect(),
         outputs,
         trajectories: manifest
             .trajectories
@@ -125,6 +127,19 @@ fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Resu
         scenario: session.traffic().map(opened_scenario),
         trajectory: trajectory.transpose()?,
     })
+}
+
+fn opened_lidar(mounted: &RigLidar) -> message::OpenedLidar {
+    let RigLidar { name, lidar, rig_from_lidar } = mounted;
+    message::OpenedLidar {
+        name: name.clone(),
+        rows: lidar.rows() as u64,
+        columns: lidar.columns() as u64,
+        duration_us: lidar.duration_us(),
+        min_range_m: lidar.min_range_m(),
+        max_range_m: lidar.max_range_m(),
+        lidar_to_rig: pose(rig_from_lidar),
+    }
 }
 
 fn opened_repair(repair: &SessionRepair, session: &Session) -> message::OpenedRepair {

@@ -573,6 +573,26 @@ class Welcome:
     """Names of the models that can repair images. Absent if there are none."""
 
 
+@dataclass(frozen=True)
+class OpenedLidar:
+    """A LiDAR of a session's rig."""
+
+    name: str
+    """Name within the rig."""
+    rows: int
+    """Number of rows of its beams."""
+    columns: int
+    """Number of columns of its beams."""
+    duration_us: int
+    """Time of a revolution, or of a frame of a LiDAR that does not spin, in microseconds."""
+    min_range_m: float
+    """Nothing nearer returns, in metres."""
+    max_range_m: float
+    """Nothing farther returns, in metres."""
+    lidar_to_rig: Pose
+    """Pose of the LiDAR on the rig."""
+
+
 ReferenceSource = Literal["recorded", "rendered"]
 """What a repair model compares images with."""
 
@@ -687,6 +707,8 @@ class Opened:
     """The twin's recorded trajectories."""
     reserved_bytes: int
     """Memory of the server that is reserved for the largest frame of the session and its images, in bytes."""
+    lidars: tuple[OpenedLidar, ...] = ()
+    """The LiDARs, in the order of the sweeps."""
     repair: OpenedRepair | None = None
     """The repair of the images."""
     scenario: OpenedScenario | None = None

@@ -321,6 +321,14 @@ class PointCloud:
         step = (sweep.end_us - sweep.start_us) / max(sweep.columns - 1, 1)
         return sweep.end_us - (sweep.columns - 1 - self.columns.astype(np.float64)) * step
 
+    @property
+    def ranges(self) -> NDArray[np.float32]:
+        """float32 [rows, columns]: distance from the LiDAR in metres; 0 for beams without a return."""
+        m = self.metadata
+        image = np.zeros((m.rows, m.columns), np.float32)
+        image[self.rows, self.columns] = np.linalg.norm(self.points - np.array(m.lidar_to_rig.xyz, np.float32), axis=1)
+        return image
+
     def _tensor(self, name: str) -> NDArray[Any]:
         return self._content.tensor(_of_sweep(self.metadata, name))
 

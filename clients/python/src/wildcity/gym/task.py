@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,8 @@ SPEED_M_S = 60.0
 HISTORY_M = 200.0
 """16 poses at 0.1 s and 60 m/s are 90 m."""
 ROUTE_M = 1000.0
+RANGE_M = 1000.0
+"""The protocol's limit of a LiDAR's range."""
 ROUTE_SPACING_M = 80 / 19
 """Distance between two points of a scenario's route."""
 
@@ -99,6 +101,7 @@ class DriveConfig:
     scenario: a scenario to drive in, as for `Client.open`. Route, start, dynamics and end are then those of the
         scenario, and trajectory, dynamics, speed, off_route_m, start_m and waypoint_m must have their defaults.
     rig, cameras, size: the rig (the twin's own if None), the cameras to render, and the (width, height) of each image.
+    lidars: the LiDARs of the rig to observe, each with the (rows, columns) of its beams; none if empty.
     dynamics, speed, dt_us: the motion model, the speed at the start in m/s, the time of a step.
     horizon: steps after which an episode is truncated.
     off_route_m: distance from the drive at which an episode terminates.
@@ -119,6 +122,7 @@ class DriveConfig:
     rig: str | Rig | None = None
     cameras: tuple[str, ...] = ("front",)
     size: tuple[int, int] = (96, 60)
+    lidars: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     dynamics: Model = "dynamic"
     speed: float = 5.0
     dt_us: int = 100_000
@@ -169,12 +173,14 @@ class DriveConfig:
         }
 
     def observation_space(self) -> spaces.Dict:
-        """The cameras as `image_NAME`, then history, speed and route, all in SI units."""
+        """The cameras as `image_NAME`, the LiDARs as `lidar_NAME`, then history, speed and route, all in SI units."""
         width, height = self.size
         images = {image_key(camera): spaces.Box(0, 255, (height, width, 3), np.uint8) for camera in self.cameras}
+        ranges = {lidar_key(name): spaces.Box(0.0, RANGE_M, shape, np.float32) for name, shape in self.lidars.items()}
         return spaces.Dict(
             {
                 **images,
+                **ranges,
                 "history": spaces.Box(-HISTORY_M, HISTORY_M, (HISTORY_POSES, 3), np.float32),
                 "speed": spaces.Box(0.0, SPEED_M_S, (1,), np.float32),
                 "route": spaces.Box(-ROUTE_M, ROUTE_M, (WAYPOINTS, 2), np.float32),
@@ -199,8 +205,25 @@ def image_key(camera: str) -> str:
     return f"image_{camera.replace('.', '_')}"
 
 
+def lidar_key(lidar: str) -> str:
+    """The key of a LiDAR's ranges, without dots as that of a camera."""
+    return f"lidar_{lidar.replace('.', '_')}"
+
+
+def check_lidars(config: DriveConfig, opened: Opened) -> None:
+    """Raises `ValueError` if the rig lacks a LiDAR of `config.lidars`, or has it with other beams."""
+    beams = {lidar.name: (lidar.rows, lidar.columns) for lidar in opened.lidars}
+    for name, shape in config.lidars.items():
+        if name not in beams:
+            raise ValueError(f"lidars: the rig has no LiDAR {name!r}; it has {', '.join(sorted(beams)) or 'none'}")
+        if tuple(shape) != beams[name]:
+            rows, columns = beams[name]
+            raise ValueError(f"lidars: {name!r} has {rows} rows and {columns} columns, not {tuple(shape)}")
+
+
 def task_of(config: DriveConfig, opened: Opened) -> Task:
-    """The task of a session that was opened with `open_options`."""
+    """The task of a session that was opened with `open_options`. Raises `ValueError` if its LiDARs are other ones."""
+    check_lidars(config, opened)
     if config.scenario is not None:
         return ScenarioTask(config, opened)
     assert opened.trajectory is not None, "the server left out the drive that was asked for"
@@ -271,8 +294,10 @@ class Task(ABC):
         ahead = self._ahead(state)
         # Copies: arrays of an observation are views of the received message, and read-only.
         images = {image_key(camera): seen.images[camera].copy() for camera in self.config.cameras}
+        ranges = {lidar_key(name): seen.lidars[name].ranges.clip(0.0, RANGE_M) for name in self.config.lidars}
         return {
             **images,
+            **ranges,
             "history": np.clip(seen.history_xyz, -HISTORY_M, HISTORY_M).astype(np.float32),
             "speed": np.array([min(state.speed_m_s, SPEED_M_S)], np.float32),
             "route": np.clip(ahead, -ROUTE_M, ROUTE_M).astype(np.float32),
