@@ -9,6 +9,7 @@ import { MapView } from "./map";
 import { Mosaic } from "./mosaic";
 import type { Page } from "./page";
 import { StagePlot } from "./plot";
+import { PointsView } from "./points";
 import { clamp, rotate } from "./pose";
 import type { Camera, Metadata, Opened, TwinInfo } from "./messages";
 import type { Observation } from "./protocol";
@@ -35,6 +36,7 @@ export class DrivePage implements Page {
   private readonly mosaic = new Mosaic();
   private readonly map = new MapView();
   private readonly plot = new StagePlot();
+  private readonly points = new PointsView();
   private readonly facts = new Facts();
   private readonly settings = new Settings(() => void this.reopen());
   private readonly controls = new Controls((code) => this.key(code));
@@ -65,7 +67,7 @@ export class DrivePage implements Page {
     const keys = el("p.keys", {}, "W A S D or arrows: drive · Space: stop · P: pause · R: start again · click a camera: enlarge · click the drive on the map: start there");
     this.element = el("div.view", {},
       el("div.left", {}, this.mosaic.element, this.controls.pads),
-      el("aside.right", {}, this.map.element, this.facts.element, this.plot.element,
+      el("aside.right", {}, this.map.element, this.points.element, this.facts.element, this.plot.element,
         el("div.buttons", {}, this.pause, again), this.settings.element, keys));
     showTitle(el("b", {}, twin), " · drive");
     void this.run();
@@ -197,6 +199,7 @@ export class DrivePage implements Page {
     const { metadata } = observation;
     this.last = metadata;
     this.map.show(metadata);
+    this.points.show(observation);
     this.plot.show(metadata);
     this.facts.show(metadata, [["pace", this.pace ? `${fixed(this.pace, 2)} ×` : "–"]]);
     this.element.dataset.step = String(metadata.step);

@@ -80,6 +80,10 @@ export function parseObservation(message: ArrayBuffer): Observation {
     if (image.encoding === "raw" ? tensor.shape.join() !== raw : tensor.shape.length !== 1) fail(image.tensor);
     if (image.encoding === "png" && !isPng(tensor.bytes, image)) fail(`${image.tensor} is no PNG of its size`);
   }
+  for (const { lidar, returns } of metadata.sweeps ?? []) {
+    const points = tensors.get(`lidar/${lidar}/points`);
+    if (points?.dtype !== "F32" || points.shape.join() !== `${returns},3`) fail(`lidar/${lidar}/points`);
+  }
   return new Observation(metadata, tensors);
 }
 

@@ -6,6 +6,7 @@ import { MapView } from "./map";
 import { Mosaic } from "./mosaic";
 import type { Page } from "./page";
 import { StagePlot } from "./plot";
+import { PointsView } from "./points";
 import { WATCH_PROTOCOL, parseObservation } from "./protocol";
 import type { Metadata, TwinInfo } from "./messages";
 import type { Observation } from "./protocol";
@@ -16,6 +17,7 @@ export class WatchPage implements Page {
   private readonly mosaic = new Mosaic();
   private readonly map = new MapView();
   private readonly plot = new StagePlot();
+  private readonly points = new PointsView();
   private readonly facts = new Facts();
   private readonly session: string;
   private socket: WebSocket | undefined;
@@ -29,7 +31,7 @@ export class WatchPage implements Page {
     const note = el("p.keys", {}, "At most ten images a second of each camera, as the agent gets them. The session does not wait for you.");
     this.element = el("div.view", {},
       el("div.left", {}, this.mosaic.element),
-      el("aside.right", {}, this.map.element, this.facts.element, this.plot.element, note));
+      el("aside.right", {}, this.map.element, this.points.element, this.facts.element, this.plot.element, note));
     showTitle(el("b", {}, session), " · watch");
     void this.begin();
   }
@@ -68,6 +70,7 @@ export class WatchPage implements Page {
         const { metadata } = observation;
         await this.load(metadata);
         this.map.show(metadata);
+        this.points.show(observation);
         this.plot.show(metadata);
         this.facts.show(metadata);
         this.element.dataset.step = String(metadata.step);

@@ -61,6 +61,74 @@ test("the mosaic is what the Python client decodes", async () => {
   await close();
 });
 
+/** A session with a LiDAR, as an agent drives it; from a page, since Node has no WebSocket. */
+async function agent(name) {
+  const { page, close } = await open(browser, server, "#/report");
+  await page.evaluate(async ({ address, session }) => {
+    const socket = new WebSocket(address, "wildcity.v1");
+    await new Promise((resolve) => (socket.onopen = resolve));
+    let seq = 0;
+    window.ask = (request) => new Promise((resolve) => {
+      socket.onmessage = () => resolve();
+      socket.send(JSON.stringify({ ...request, seq: seq++ }));
+    });
+    await window.ask({ type: "hello", client: { name: "agent", version: "1" }, protocols: ["wildcity.v1"] });
+    const outputs = { encoding: "jpeg", cameras: ["front"], images: { front: { size: [320, 206] } } };
+    await window.ask({ type: "open", twin: "demo", session, rig: "vehicle6-lidar", outputs });
+    await window.ask({ type: "reset" });
+  }, { address: server.socket, session: name });
+  return { observe: () => page.evaluate(() => window.ask({ type: "reset" })), end: close };
+}
+
+test("a watcher sees the points of a LiDAR, and can turn them", async () => {
+  const { observe, end } = await agent("with-lidar");
+  const { page, complaints, close } = await open(browser, server, "#/watch/with-lidar");
+  await observe();
+  await page.waitForSelector(".lidar[data-points]");
+  const points = Number(await page.getAttribute(".lidar", "data-points"));
+  assert.ok(points > 20_000, `${points} points`);
+  assert.match(await page.textContent(".lidar p"), /^top: \d+ of 64 × 1800 beams$/);
+  /** How many pixels have points, and a number that changes with them. */
+  const drawn = () => page.$eval(".points", (canvas) => {
+    const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d", { willReadFrequently: true });
+    copy.drawImage(canvas, 0, 0);
+    const { data } = copy.getImageData(0, 0, canvas.width, canvas.height);
+    let count = 0;
+    let sum = 0;
+    for (let at = 0; at < data.length; at += 4) {
+      if (data[at + 3] === 0) continue;
+      count += 1;
+      sum = (sum * 31 + at + data[at]) % 1_000_003;
+    }
+    return { count, sum };
+  });
+  const changed = async (from) => {
+    for (let tries = 0; tries < 100; tries += 1) {
+      const now = await drawn();
+      if (now.sum !== from.sum) return now;
+      await page.waitForTimeout(50);
+    }
+    assert.fail("the points stay as they are");
+  };
+  const before = await changed({ sum: 0 });
+  assert.ok(before.count > 5_000, `${before.count} pixels`);
+  const box = await page.locator(".points").boundingBox();
+  await page.mouse.move(box.x + 100, box.y + 100);
+  await page.mouse.down();
+  await page.mouse.move(box.x + 180, box.y + 120, { steps: 4 });
+  await page.mouse.up();
+  await changed(before);
+  assert.deepEqual(complaints, []);
+  await close();
+  await end();
+
+  // Without a LiDAR there is no place for its points.
+  const other = await open(browser, server, "#/drive/demo");
+  await steps(other.page, 1);
+  assert.equal(await other.page.isVisible(".lidar"), false);
+  await other.close();
+});
+
 test("keys move the car, watchers see it, and the record has its hashes", async () => {
   const { page, complaints, close } = await open(browser, server, "#/drive/demo");
   await steps(page, 1);
