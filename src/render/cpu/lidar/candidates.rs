@@ -296,7 +296,12 @@ fn block_bounds<S: Simd>(simd: S, columns: &[Lanes], test: &ChunkTest) -> Option
     let [x, half_x] = along(simd, test.axes[0], mean, own, scale, reach, margin_m);
     let [y, half_y] = along(simd, test.axes[1], mean, own, scale, reach, margin_m);
     let [z, half_z] = along(simd, test.axes[2], mean, own, scale, reach, margin_m);
-    let nearest_m = range_m - largest * reach - margin_m;
+    // The nearer of two bounds that contain the ellipsoid, a sphere and the box. A road's Gaussians
+    // are so flat that the sphere is up to their length too near.
+    let sphere_m = range_m - largest * reach - margin_m;
+    let outside = Vec3x16 { x: x.abs() - half_x, y: y.abs() - half_y, z: z.abs() - half_z };
+    let outside = outside.max(zero);
+    let nearest_m = sphere_m.max(outside.dot(outside).sqrt() * splat(1.0 - 1e-6));
     let far_x = x + half_x;
     let near_x = x - half_x;
     // Quotients of a box that reaches behind the LiDAR have no bound.

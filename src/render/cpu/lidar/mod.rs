@@ -21,7 +21,7 @@ use fearless_simd::Level;
 use parking_lot::Mutex;
 use rayon::prelude::*;
 
-use self::beam::{Beam, Met};
+use self::beam::{BeamRow, Met};
 use self::cast::Scratch;
 use self::sector::Sector;
 use crate::lidar::{LidarView, Sweep};
@@ -77,7 +77,7 @@ pub(crate) fn most_bytes(lidar: &Lidar, threads: usize) -> u64 {
     let columns = lidar.columns().min(sector::MOST_COLUMNS).next_multiple_of(LANES);
     let beams = lidar.rows().next_multiple_of(LANES) * columns;
     // Vectors grow to twice what they hold. At worst, every hit is of another Gaussian.
-    let hits = 2 * beams * MOST_HITS * Beam::HIT_BYTES;
+    let hits = 2 * beams * MOST_HITS * BeamRow::HIT_BYTES;
     let met = (2 * beams * MOST_HITS + cast::MET_SLACK) * 2 * size_of::<Met>();
     let tiles = beams / (LANES * LANES);
     let candidates = 2 * candidates::BATCH * (size_of::<candidates::Candidate>() + tiles * (8 + 4));

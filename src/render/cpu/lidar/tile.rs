@@ -2,7 +2,7 @@
 
 use fearless_simd::{f32x16, prelude::*};
 
-use super::beam::{Beam, Met};
+use super::beam::{BeamRow, Crossing, Met, Return};
 use super::candidates::Candidate;
 use super::sector::{BodySector, Sector};
 use crate::cpu::lanes::Vec3x16;
@@ -20,8 +20,8 @@ pub(super) struct Tile {
     first_column: usize,
     /// Rows and columns that the LiDAR has here: 16, but for the last ones.
     size: [usize; 2],
-    /// Of a row after the other.
-    beams: Vec<Beam>,
+    /// A row after the other.
+    beams: [BeamRow; LANES],
     /// How far each beam is followed: to its return, or the LiDAR's range, in metres.
     ends_m: [[f32; LANES]; LANES],
     /// The largest of each row of `ends_m`.
@@ -45,7 +45,7 @@ impl Default for Tile {
             first_row: 0,
             first_column: 0,
             size: [0; 2],
-            beams: vec![Beam::default(); LANES * LANES],
+            beams: Default::default(),
             ends_m: [[0.0; LANES]; LANES],
             row_ends_m: [0.0; LANES],
             rays: None,
@@ -67,7 +67,7 @@ impl Tile {
         self.first_row = first_row;
         self.first_column = first_column;
         self.size = [rows, columns];
-        self.beams.iter_mut().for_each(Beam::clear);
+        self.beams.iter_mut().for_each(BeamRow::clear);
         // Lanes beyond the last column or row are not followed.
         self.ends_m = [[0.0; LANES]; LANES];
         for ends_m in &mut self.ends_m[..rows] {
@@ -79,7 +79,7 @@ impl Tile {
 
     /// Calls `visit` with the place of each hit's Gaussian among those that the sector has met.
     pub(super) fn visit_hits(&mut self, visit: &mut impl FnMut(&mut u32)) {
-        self.beams.iter_mut().for_each(|beam| beam.visit_hits(visit));
+        self.beams.iter_mut().for_each(|row| row.visit_hits(visit));
     }
 
     /// The beams are compared with another body next.
@@ -125,8 +125,9 @@ impl Tile {
             None if list.is_empty() => return,
             None => Box::new(self.rays(seen)),
         };
-        let least_m = seen.sector.min_range_m;
-        let cap = profile.alpha_cap as f32;
+        let origin = Vec3x16::from_arrays(simd, &rays.origin_m);
+        let least_m = f32x16::splat(simd, seen.sector.min_range_m);
+        let cap = f32x16::splat(simd, profile.alpha_cap as f32);
         let last_row = self.first_row + self.size[0];
         for listed in list.chunks(LOOKS) {
             // Behind the returns of all beams.
@@ -137,6 +138,7 @@ impl Tile {
             let mut changed_rows = 0_u32;
             for at in listed {
                 let candidate = &candidates[*at as usize];
+                let aim = Aim::new(simd, candidate, origin);
                 let [first, end] = candidate.rows.map(usize::from);
                 let mut is_met = false;
                 for row in first.max(self.first_row)..end.min(last_row) {
@@ -144,9 +146,10 @@ impl Tile {
                     if candidate.nearest_m > self.row_ends_m[row] {
                         continue;
                     }
+                    let direction = Vec3x16::from_arrays(simd, &rays.directions[row]);
                     let ends_m = &mut self.ends_m[row];
-                    let met = meet(simd, candidate, &rays, row, least_m, ends_m, cap);
-                    let Some(Crossing { mut lanes, range_m, alpha }) = met else { continue };
+                    let met = aim.meet(direction, least_m, ends_m, cap);
+                    let Some(crossing) = met else { continue };
                     // Once for each candidate and tile, and only if a beam meets it.
                     if !is_met {
                         let Candidate { id, luminance, instance, .. } = *candidate;
@@ -154,14 +157,7 @@ impl Tile {
                         is_met = true;
                     }
                     changed_rows |= 1 << row;
-                    while lanes != 0 {
-                        let lane = lanes.trailing_zeros() as usize % LANES;
-                        lanes &= lanes - 1;
-                        let beam = &mut self.beams[row * LANES + lane];
-                        if let Some(end_m) = beam.add(range_m[lane], alpha[lane], all) {
-                            ends_m[lane] = end_m;
-                        }
-                    }
+                    self.beams[row].add(simd, crossing, all, ends_m);
                 }
             }
             while changed_rows != 0 {
@@ -178,74 +174,87 @@ impl Tile {
         let [rows, columns] = self.size;
         for row in 0..rows {
             for lane in 0..columns {
-                let beam = &self.beams[row * LANES + lane];
-                let Some((range_m, met, intensity)) = beam.returned(all) else { continue };
+                let Some(Return { range_m, met, luminance }) = self.beams[row].returned(lane, all)
+                else {
+                    continue;
+                };
                 let column = self.first_column - sector.columns.start + lane;
                 let at = (self.first_row + row) * width + column;
                 part.range_m[at] = range_m;
-                part.intensity[at] = intensity;
+                part.intensity[at] = luminance;
                 part.instance[at] = met.instance;
             }
         }
     }
 }
 
-/// Where 16 beams meet a candidate.
-struct Crossing {
-    lanes: u64,
-    range_m: [f32; LANES],
-    alpha: [f32; LANES],
-}
-
-/// Compares a row of beams with a candidate; `None` if no beam meets it before its end.
-#[inline(always)]
-fn meet<S: Simd>(
+/// A candidate as the columns of a tile see it.
+struct Aim<S: Simd> {
     simd: S,
-    candidate: &Candidate,
-    rays: &Rays,
-    row: usize,
-    least_m: f32,
-    ends_m: &[f32; LANES],
-    cap: f32,
-) -> Option<Crossing> {
-    let splat = |value: f32| f32x16::splat(simd, value);
-    let direction = Vec3x16::from_arrays(simd, &rays.directions[row]);
-    let origin = Vec3x16::from_arrays(simd, &rays.origin_m);
-    let to_mean = Vec3x16::splat(simd, candidate.mean_m).minus(origin);
-    // From the point of the beam that is nearest to the centre: what is left is as small as the
-    // Gaussian, and loses no digits to the distance.
-    let along_m = to_mean.dot(direction);
-    let across_m = to_mean.minus(direction.scale(along_m));
-    let across = whitened(simd, candidate, across_m);
-    let step = whitened(simd, candidate, direction);
-    let per_step2 = splat(1.0) / step.dot(step);
-    let cross = across.cross(step);
-    let squared = cross.dot(cross) * per_step2;
-    let range_m = (across.dot(step)).mul_add(per_step2, along_m);
-    let meets = squared.simd_le(splat(candidate.reach2))
-        & range_m.simd_gt(splat(least_m))
-        & range_m.simd_le(f32x16::load_array_ref(simd, ends_m));
-    if meets.all_false() {
-        return None;
-    }
-    let log2_e = 0.5 * std::f32::consts::LOG2_E;
-    let exponent = squared.mul_add(splat(-log2_e), splat(candidate.log2_opacity));
-    // Merged Gaussians may be more opaque than 1.
-    let alpha = exp2(simd, exponent.min(splat(0.0))).min(splat(cap));
-    Some(Crossing {
-        lanes: meets.to_bitmask(),
-        range_m: range_m.to_array(),
-        alpha: alpha.to_array(),
-    })
+    /// From where each column is fired to the centre, in standard deviations.
+    to_mean: Vec3x16<S>,
+    /// Rows of the matrix that takes vectors in metres to standard deviations.
+    whiten: [Vec3x16<S>; 3],
+    reach2: f32x16<S>,
+    log2_opacity: f32x16<S>,
 }
 
-/// Vectors in metres as standard deviations of a candidate.
-#[inline(always)]
-fn whitened<S: Simd>(simd: S, candidate: &Candidate, v: Vec3x16<S>) -> Vec3x16<S> {
-    let [x, y, z] = candidate.whiten;
-    Vec3x16 {
-        x: Vec3x16::splat(simd, x).dot(v),
-        y: Vec3x16::splat(simd, y).dot(v),
-        z: Vec3x16::splat(simd, z).dot(v),
+impl<S: Simd> Aim<S> {
+    #[inline(always)]
+    fn new(simd: S, candidate: &Candidate, origin_m: Vec3x16<S>) -> Self {
+        let [x, y, z] = candidate.whiten;
+        let whiten = [Vec3x16::splat(simd, x), Vec3x16::splat(simd, y), Vec3x16::splat(simd, z)];
+        Self {
+            simd,
+            to_mean: whitened(whiten, Vec3x16::splat(simd, candidate.mean_m).minus(origin_m)),
+            whiten,
+            reach2: f32x16::splat(simd, candidate.reach2),
+            log2_opacity: f32x16::splat(simd, candidate.log2_opacity),
+        }
     }
+
+    /// Compares a row of beams with the candidate; `None` if no beam meets it before its end.
+    #[inline(always)]
+    fn meet(
+        &self,
+        direction: Vec3x16<S>,
+        least_m: f32x16<S>,
+        ends_m: &[f32; LANES],
+        cap: f32x16<S>,
+    ) -> Option<Crossing<S>> {
+        let simd = self.simd;
+        let step = whitened(self.whiten, direction);
+        let step2 = step.dot(step);
+        // The distance of the beam from the centre, as that of a line from a point. It loses no
+        // digits to a Gaussian that is flat, unlike a difference of two long vectors.
+        let aside = self.to_mean.cross(step);
+        let aside2 = aside.dot(aside);
+        let is_near = aside2.simd_le(self.reach2 * step2);
+        if is_near.all_false() {
+            return None;
+        }
+        let per_step2 = f32x16::splat(simd, 1.0) / step2;
+        let squared = aside2 * per_step2;
+        let range_m = self.to_mean.dot(step) * per_step2;
+        let meets = is_near
+            & range_m.simd_gt(least_m)
+            & range_m.simd_le(f32x16::load_array_ref(simd, ends_m));
+        if meets.all_false() {
+            return None;
+        }
+        let log2_e = f32x16::splat(simd, -0.5 * std::f32::consts::LOG2_E);
+        let exponent = squared.mul_add(log2_e, self.log2_opacity);
+        // Merged Gaussians may be more opaque than 1.
+        let alpha = exp2(simd, exponent.min(f32x16::splat(simd, 0.0))).min(cap);
+        Some(Crossing {
+            range_m: meets.select(range_m, f32x16::splat(simd, f32::INFINITY)),
+            alpha: meets.select(alpha, f32x16::splat(simd, 0.0)),
+        })
+    }
+}
+
+/// Vectors in metres as standard deviations.
+#[inline(always)]
+fn whitened<S: Simd>([x, y, z]: [Vec3x16<S>; 3], v: Vec3x16<S>) -> Vec3x16<S> {
+    Vec3x16 { x: x.dot(v), y: y.dot(v), z: z.dot(v) }
 }
