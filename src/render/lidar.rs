@@ -87,6 +87,11 @@ pub(crate) struct Body<'a> {
 }
 
 impl Body<'_> {
+    /// Factors of its colours.
+    pub(crate) fn tint(&self) -> [f32; 3] {
+        self.placed.map_or([1.0; 3], |placed| placed.tint)
+    }
+
     /// Whether two chunks move together.
     pub(crate) fn is_same(&self, other: &Self) -> bool {
         match (self.placed, other.placed) {
@@ -124,12 +129,15 @@ pub(crate) fn chunks(scene: &Scene) -> impl Iterator<Item = (Body<'_>, &Chunk)> 
     of_twin.chain(of_actors)
 }
 
+/// Shares of red, green and blue in luminance (ITU-R BT.709).
+pub(crate) const LUMINANCE: [f32; 3] = [0.2126, 0.7152, 0.0722];
+
 /// The luminance of a Gaussian's colour, without the parts that depend on the direction; `value`
 /// returns a column of it.
 pub(crate) fn luminance(body: &Body<'_>, value: impl Fn(usize) -> f32) -> f32 {
-    let tint = body.placed.map_or([1.0; 3], |placed| placed.tint);
+    let tint = body.tint();
     let channel = |c: usize| tint[c] * (sh::C0 as f32 * value(column::SH + c) + 0.5).max(0.0);
-    0.2126 * channel(0) + 0.7152 * channel(1) + 0.0722 * channel(2)
+    (0..3).map(|c| LUMINANCE[c] * channel(c)).sum()
 }
 
 /// The least alpha that counts: the profile's cut, but at least 1/255. So a beam has lost half of

@@ -101,7 +101,7 @@ impl Export {
         let (exported, replayed) = if self.images || self.lidar {
             self.replayed(&path).map(|(exported, replayed)| (exported, Some(replayed)))?
         } else {
-            (self.from_record(&path)?, None)
+            (self.without_replay(&path)?, None)
         };
         let mut out = output::stdout();
         let what = if self.nuscenes.is_some() { "rows" } else { "messages" };
@@ -131,7 +131,7 @@ impl Export {
         target.context("name a file with --mcap, or a folder with --nuscenes")
     }
 
-    fn from_record(&self, path: &Path) -> anyhow::Result<Exported> {
+    fn without_replay(&self, path: &Path) -> anyhow::Result<Exported> {
         let target = self.target()?;
         if self.nuscenes.is_none() && !self.ros2 {
             return Ok(export_file(path, target)?);

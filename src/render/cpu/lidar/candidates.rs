@@ -5,22 +5,22 @@
 //! coordinates. No angle has to be computed, and no bound is linearised.
 
 use fearless_simd::{Level, dispatch, f32x16, prelude::*};
-use glam::{Mat3, Quat, Vec3};
+use glam::Vec3;
 
 use super::sector::{BodySector, Sector};
 use crate::cpu::lanes::Vec3x16;
 use crate::cpu::project::axes::rotation_columns;
-use crate::lidar::{Body, THINNEST_M, alpha_cut, luminance, reach2};
+use crate::lidar::{Body, LUMINANCE, THINNEST_M, alpha_cut, reach2};
 use wildcity_scene::chunk::{CLUSTER, Cluster, LANES, Lanes, column};
-use wildcity_scene::{Chunk, RenderProfile};
+use wildcity_scene::{Chunk, RenderProfile, sh};
 
 /// A Gaussian that beams of a sector may meet, in the axes of its body.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Candidate {
     /// Its centre relative to the LiDAR's middle position in the sector, in metres.
     pub(super) mean_m: [f32; 3],
-    /// Rows of the matrix that takes vectors in metres to standard deviations.
-    pub(super) whiten: [[f32; 3]; 3],
+    /// The matrix that takes vectors in metres to standard deviations, row by row.
+    pub(super) whiten: [f32; 9],
     pub(super) log2_opacity: f32,
     /// Squared standard deviations from its centre at which alpha falls below the cut.
     pub(super) reach2: f32,
@@ -40,6 +40,11 @@ pub(super) struct Candidate {
 #[derive(Default)]
 pub(super) struct Candidates {
     pub(super) list: Vec<Candidate>,
+    /// Places in the list of the candidates of each tile, from the nearest.
+    pub(super) lists: Vec<Vec<u32>>,
+    /// Memory to sort them.
+    keys: Vec<u64>,
+    sorted: Vec<Candidate>,
 }
 
 /// Candidates after which they are compared with beams: they, and their places in the lists of
@@ -63,7 +68,8 @@ struct ChunkTest {
     axes: [[f32; 3]; 3],
     /// The LiDAR's middle position relative to the chunk's origin, in the body's axes, in metres.
     middle_m: [f32; 3],
-    moved_m: f32,
+    /// The most that the LiDAR moves along each axis of the sector, in metres.
+    moved_m: [f32; 3],
     turned_rad: f32,
     /// Tangents of the azimuths of all beams: smallest, largest.
     azimuths: [f32; 2],
@@ -73,17 +79,21 @@ struct ChunkTest {
     alpha_cut_log2: f32,
     /// Standard deviations at which an opaque Gaussian ends.
     sigmas: f32,
+    /// Factors of the body's colours.
+    tint: [f32; 3],
 }
 
-/// What a beam may see of 16 Gaussians.
-struct Bounds {
+/// What a beam may see of 16 Gaussians. Fields of one lane are those of a [`Candidate`].
+struct Block {
     /// The lanes that a beam may meet.
     lanes: u64,
-    azimuth_low: [f32; LANES],
-    azimuth_high: [f32; LANES],
-    elevation_low: [f32; LANES],
-    elevation_high: [f32; LANES],
+    azimuths: [[f32; LANES]; 2],
+    elevations: [[f32; LANES]; 2],
     nearest_m: [f32; LANES],
+    mean_m: [[f32; LANES]; 3],
+    /// Row by row.
+    whiten: [[f32; LANES]; 9],
+    luminance: [f32; LANES],
 }
 
 impl Candidates {
@@ -101,31 +111,31 @@ impl Candidates {
         let groups = chunk.len().div_ceil(LANES);
         for group in first..(first + CLUSTER / LANES).min(groups) {
             let columns = chunk.lane_group(group);
-            let Some(found) = dispatch!(level, simd => block_bounds(simd, columns, test)) else {
+            let Some(block) = dispatch!(level, simd => Block::new(simd, columns, test)) else {
                 continue;
             };
-            let mut lanes = found.lanes;
+            let mut lanes = block.lanes;
             while lanes != 0 {
                 let lane = lanes.trailing_zeros() as usize % LANES;
                 lanes &= lanes - 1;
-                let rows =
-                    sector.rows_between(found.elevation_low[lane], found.elevation_high[lane]);
+                let [low, high] = block.elevations.each_ref().map(|tangents| tangents[lane]);
+                let rows = sector.rows.between(low, high);
                 // It lies between two rows, and no beam meets it.
                 if rows.is_empty() {
                     continue;
                 }
                 let log2_opacity = columns[column::LOG2_OPACITY].0[lane];
                 self.list.push(Candidate {
-                    mean_m: mean_m(columns, lane, test),
-                    whiten: whiten(columns, lane),
+                    mean_m: block.mean_m.each_ref().map(|values| values[lane]),
+                    whiten: block.whiten.each_ref().map(|values| values[lane]),
                     log2_opacity,
                     reach2: reach2(log2_opacity.into(), profile) as f32,
-                    nearest_m: found.nearest_m[lane],
-                    luminance: luminance(body, |column| columns[column].0[lane]),
+                    nearest_m: block.nearest_m[lane],
+                    luminance: block.luminance[lane],
                     id: (number as u64) << 32 | (group * LANES + lane) as u64,
                     instance: body.instance,
                     rows: [rows.start as u16, rows.end as u16],
-                    azimuths: [found.azimuth_low[lane], found.azimuth_high[lane]],
+                    azimuths: block.azimuths.each_ref().map(|tangents| tangents[lane]),
                 });
             }
         }
@@ -153,32 +163,46 @@ impl Candidates {
         }
     }
 
-    /// The candidates of each tile of `rows` rows, the nearest first: tile after tile of the first
-    /// 16 rows, then those of the next.
-    pub(super) fn by_tile(&self, level: Level, sector: &Sector, rows: usize) -> Vec<Vec<u32>> {
-        let tiles = sector.tile_tangents.len();
-        // Sorted as one integer: positive f32 have the order of their bits.
-        let mut keys = vec![Vec::new(); tiles * rows.div_ceil(LANES)];
+    /// Sorts the candidates, the nearest first, and lists those of each tile of `rows` rows: tile
+    /// after tile of the first 16 rows, then those of the next.
+    pub(super) fn sort_to_tiles(&mut self, level: Level, sector: &Sector, rows: usize) {
+        self.sort();
+        let tiles = sector.tiles.len();
+        self.lists.resize(tiles * rows.div_ceil(LANES), Vec::new());
+        self.lists.iter_mut().for_each(Vec::clear);
         for (at, candidate) in self.list.iter().enumerate() {
             let [first, end] = candidate.rows.map(usize::from);
-            let key = u64::from(candidate.nearest_m.max(0.0).to_bits()) << 32 | at as u64;
-            for (tile, columns) in sector.tile_tangents.iter().enumerate() {
-                // Most Gaussians far away lie between two columns.
-                let [low, high] = candidate.azimuths;
-                let [least, most] = sector.tile_spans[tile];
-                let is_near = least <= high && most >= low;
-                if is_near && dispatch!(level, simd => sees(simd, columns, [low, high])) {
+            let [low, high] = candidate.azimuths;
+            for (tile, columns) in sector.tiles.iter().enumerate() {
+                let [least, most] = columns.span;
+                if least > high || most < low {
+                    continue;
+                }
+                // Many Gaussians far away lie between two columns.
+                let is_wide = high - low > columns.widest_gap;
+                let tangents = &columns.tangents;
+                if is_wide || dispatch!(level, simd => sees(simd, tangents, [low, high])) {
                     for row in first / LANES..end.div_ceil(LANES) {
-                        keys[row * tiles + tile].push(key);
+                        self.lists[row * tiles + tile].push(at as u32);
                     }
                 }
             }
         }
-        let list = |mut keys: Vec<u64>| {
-            keys.sort_unstable();
-            keys.into_iter().map(|key| key as u32).collect()
+    }
+
+    /// Sorts the candidates themselves, and not their places in the lists of tiles: a tile then
+    /// reads them in the order of memory.
+    fn sort(&mut self) {
+        // As one integer: positive f32 have the order of their bits.
+        let key = |(at, candidate): (usize, &Candidate)| {
+            u64::from(candidate.nearest_m.max(0.0).to_bits()) << 32 | at as u64
         };
-        keys.into_iter().map(list).collect()
+        self.keys.clear();
+        self.keys.extend(self.list.iter().enumerate().map(key));
+        self.keys.sort_unstable();
+        self.sorted.clear();
+        self.sorted.extend(self.keys.iter().map(|key| self.list[*key as u32 as usize]));
+        std::mem::swap(&mut self.list, &mut self.sorted);
     }
 }
 
@@ -191,42 +215,25 @@ fn sees<S: Simd>(simd: S, columns: &[[f32; LANES]; 2], [low, high]: [f32; 2]) ->
     !sees.all_false()
 }
 
-/// Three columns of a Gaussian from `first`.
-fn vector(columns: &[Lanes], lane: usize, first: usize) -> Vec3 {
-    Vec3::from_array([first, first + 1, first + 2].map(|column| columns[column].0[lane]))
-}
-
-fn mean_m(columns: &[Lanes], lane: usize, test: &ChunkTest) -> [f32; 3] {
-    (vector(columns, lane, column::MEAN) - Vec3::from_array(test.middle_m)).to_array()
-}
-
-/// Rows of the matrix that takes vectors in metres to standard deviations of a Gaussian.
-fn whiten(columns: &[Lanes], lane: usize) -> [[f32; 3]; 3] {
-    let w = columns[column::QUAT].0[lane];
-    let axes = Mat3::from_quat(Quat::from_vec4(vector(columns, lane, column::QUAT + 1).extend(w)));
-    let per_m = vector(columns, lane, column::SCALE).max(Vec3::splat(THINNEST_M as f32)).recip();
-    // Rows of the transpose are the columns of the rotation: the Gaussian's own axes.
-    [axes.x_axis * per_m.x, axes.y_axis * per_m.y, axes.z_axis * per_m.z].map(|row| row.to_array())
-}
-
 impl ChunkTest {
     fn new(seen: &BodySector<'_>, chunk: &Chunk, profile: &RenderProfile) -> Self {
         let sector = seen.sector;
         let rows = seen.sector_from_body.transpose().to_cols_array_2d();
-        let spans = &sector.tile_spans;
-        let low = spans.iter().map(|span| span[0]).fold(f32::INFINITY, f32::min);
-        let high = spans.iter().map(|span| span[1]).fold(f32::NEG_INFINITY, f32::max);
+        let spans = sector.tiles.iter().map(|tile| tile.span);
+        let low = spans.clone().map(|span| span[0]).fold(f32::INFINITY, f32::min);
+        let high = spans.map(|span| span[1]).fold(f32::NEG_INFINITY, f32::max);
         Self {
             axes: rows.map(|row| row.map(|value| value as f32)),
             middle_m: (-seen.relative_to_middle(chunk.origin_m())).as_vec3().to_array(),
             // A millimetre covers the rounding of f32 at a kilometre.
-            moved_m: seen.moved_m as f32 + 1e-3,
+            moved_m: (seen.moved_m.as_vec3() + 1e-3).to_array(),
             turned_rad: seen.turned_rad as f32 + 1e-6,
             azimuths: [low, high],
-            elevations: sector.elevation_tangents(),
+            elevations: sector.rows.span(),
             max_range_m: seen.sector.max_range_m,
             alpha_cut_log2: alpha_cut(profile).log2() as f32,
             sigmas: reach2(0.0, profile).max(0.0).sqrt() as f32,
+            tint: seen.body.tint(),
         }
     }
 
@@ -236,16 +243,17 @@ impl ChunkTest {
         let half = 0.5 * (cluster.max_m - cluster.min_m);
         let range_m = center.length() + half.length();
         let reach_m = self.sigmas * cluster.sigma_m * (1.0 + 1e-4);
-        let margin_m = reach_m + self.moved_m + self.turned_rad * (range_m + reach_m);
+        let moved_m = Vec3::from_array(self.moved_m).length();
+        let margin_m = reach_m + self.turned_rad * (range_m + reach_m + moved_m);
         let along = |axis: usize| {
             let row = Vec3::from_array(self.axes[axis]);
-            [row.dot(center), row.abs().dot(half) + margin_m]
+            [row.dot(center), row.abs().dot(half) + margin_m + self.moved_m[axis]]
         };
         let [x, half_x] = along(0);
         let [y, half_y] = along(1);
         let [z, half_z] = along(2);
         let far_x = x + half_x;
-        let nearest_m = center.length() - half.length() - margin_m;
+        let nearest_m = center.length() - half.length() - margin_m - moved_m;
         if far_x < 0.0 || nearest_m > self.max_range_m {
             return false;
         }
@@ -268,89 +276,115 @@ impl ChunkTest {
     }
 }
 
-/// Bounds of 16 Gaussians; `None` if a beam meets none of them.
-#[inline(always)]
-fn block_bounds<S: Simd>(simd: S, columns: &[Lanes], test: &ChunkTest) -> Option<Bounds> {
-    let splat = |value: f32| f32x16::splat(simd, value);
-    let zero = splat(0.0);
-    let log2_opacity = f32x16::load_array_ref(simd, &columns[column::LOG2_OPACITY].0);
-    let visible = log2_opacity.simd_ge(splat(test.alpha_cut_log2));
-    if visible.all_false() {
-        return None;
+impl Block {
+    /// The block of a lane group; `None` if a beam meets none of its Gaussians.
+    #[inline(always)]
+    fn new<S: Simd>(simd: S, columns: &[Lanes], test: &ChunkTest) -> Option<Self> {
+        let splat = |value: f32| f32x16::splat(simd, value);
+        let zero = splat(0.0);
+        let log2_opacity = f32x16::load_array_ref(simd, &columns[column::LOG2_OPACITY].0);
+        let visible = log2_opacity.simd_ge(splat(test.alpha_cut_log2));
+        if visible.all_false() {
+            return None;
+        }
+        // The half-size of the ellipsoid's box along each axis of the sector, as in the definition of
+        // the reach.
+        let ln4 = 2.0 * std::f32::consts::LN_2;
+        // Never farther than an opacity of 1 reaches, as for splats.
+        let above_cut = log2_opacity.min(zero) - splat(test.alpha_cut_log2);
+        let reach = (above_cut * splat(ln4)).max(zero).sqrt() * splat(1.0 + 1e-4);
+        let mean =
+            Vec3x16::load(simd, columns, column::MEAN).minus(Vec3x16::splat(simd, test.middle_m));
+        let range_m = mean.dot(mean).sqrt();
+        let scale = Vec3x16::load(simd, columns, column::SCALE);
+        let own = rotation_columns(simd, columns);
+        // A point of the ellipsoid moves by the turn times its own distance.
+        let largest = scale.x.max(scale.y).max(scale.z);
+        let most_moved_m = splat(Vec3::from_array(test.moved_m).length());
+        let farthest_m = largest.mul_add(reach, range_m) + most_moved_m;
+        let turned_m = farthest_m * splat(test.turned_rad);
+        let [x, half_x] = along(simd, test, 0, mean, own, scale, reach, turned_m);
+        let [y, half_y] = along(simd, test, 1, mean, own, scale, reach, turned_m);
+        let [z, half_z] = along(simd, test, 2, mean, own, scale, reach, turned_m);
+        // The nearer of two bounds that contain the ellipsoid, a sphere and the box. A road's Gaussians
+        // are so flat that the sphere is up to their length too near.
+        let sphere_m = range_m - largest * reach - most_moved_m;
+        let outside = Vec3x16 { x: x.abs() - half_x, y: y.abs() - half_y, z: z.abs() - half_z };
+        let outside = outside.max(zero);
+        let nearest_m = sphere_m.max(outside.dot(outside).sqrt() * splat(1.0 - 1e-6));
+        let far_x = x + half_x;
+        let near_x = x - half_x;
+        // Quotients of a box that reaches behind the LiDAR have no bound.
+        let unbounded = near_x.simd_le(splat(1e-3));
+        let divisor = near_x.max(splat(1e-3));
+        let huge = splat(f32::MAX);
+        let azimuth_low = unbounded.select(-huge, quotient(simd, y - half_y, far_x, divisor));
+        let azimuth_high = unbounded.select(huge, quotient(simd, y + half_y, divisor, far_x));
+        // Horizontal distances of the box. Behind the LiDAR nothing is seen, so that 0 is the nearest.
+        let beside = (y.abs() - half_y).max(zero);
+        let beyond = y.abs() + half_y;
+        let ahead = near_x.max(zero);
+        let near = ahead.mul_add(ahead, beside * beside).sqrt().max(splat(1e-9));
+        let far = far_x.mul_add(far_x, beyond * beyond).sqrt().max(splat(1e-9));
+        let elevation_low = quotient(simd, z - half_z, far, near);
+        let elevation_high = quotient(simd, z + half_z, near, far);
+        let meets = visible
+            & far_x.simd_gt(zero)
+            & nearest_m.simd_le(splat(test.max_range_m))
+            & azimuth_low.simd_le(splat(test.azimuths[1]))
+            & azimuth_high.simd_ge(splat(test.azimuths[0]))
+            & elevation_low.simd_le(splat(test.elevations[1]))
+            & elevation_high.simd_ge(splat(test.elevations[0]));
+        let lanes = meets.to_bitmask();
+        if lanes == 0 {
+            return None;
+        }
+        // Rows of the transposed rotation are its columns: the Gaussian's own axes.
+        let [a, b, c] = own;
+        let per_m = |scale: f32x16<S>| splat(1.0) / scale.max(splat(THINNEST_M as f32));
+        let [a, b, c] = [a.scale(per_m(scale.x)), b.scale(per_m(scale.y)), c.scale(per_m(scale.z))];
+        let whiten = [a.x, a.y, a.z, b.x, b.y, b.z, c.x, c.y, c.z];
+        Some(Self {
+            lanes,
+            azimuths: [azimuth_low.to_array(), azimuth_high.to_array()],
+            elevations: [elevation_low.to_array(), elevation_high.to_array()],
+            nearest_m: nearest_m.to_array(),
+            mean_m: [mean.x.to_array(), mean.y.to_array(), mean.z.to_array()],
+            whiten: whiten.map(|values| values.to_array()),
+            luminance: luminance(simd, columns, test.tint).to_array(),
+        })
     }
-    // The half-size of the ellipsoid's box along each axis of the sector, as in the definition of
-    // the reach.
-    let ln4 = 2.0 * std::f32::consts::LN_2;
-    // Never farther than an opacity of 1 reaches, as for splats.
-    let above_cut = log2_opacity.min(zero) - splat(test.alpha_cut_log2);
-    let reach = (above_cut * splat(ln4)).max(zero).sqrt() * splat(1.0 + 1e-4);
-    let mean =
-        Vec3x16::load(simd, columns, column::MEAN).minus(Vec3x16::splat(simd, test.middle_m));
-    let range_m = mean.dot(mean).sqrt();
-    let scale = Vec3x16::load(simd, columns, column::SCALE);
-    let own = rotation_columns(simd, columns);
-    // A point of the ellipsoid moves by the turn times its own distance.
-    let largest = scale.x.max(scale.y).max(scale.z);
-    let farthest_m = largest.mul_add(reach, range_m);
-    let margin_m = farthest_m.mul_add(splat(test.turned_rad), splat(test.moved_m));
-    let [x, half_x] = along(simd, test.axes[0], mean, own, scale, reach, margin_m);
-    let [y, half_y] = along(simd, test.axes[1], mean, own, scale, reach, margin_m);
-    let [z, half_z] = along(simd, test.axes[2], mean, own, scale, reach, margin_m);
-    // The nearer of two bounds that contain the ellipsoid, a sphere and the box. A road's Gaussians
-    // are so flat that the sphere is up to their length too near.
-    let sphere_m = range_m - largest * reach - margin_m;
-    let outside = Vec3x16 { x: x.abs() - half_x, y: y.abs() - half_y, z: z.abs() - half_z };
-    let outside = outside.max(zero);
-    let nearest_m = sphere_m.max(outside.dot(outside).sqrt() * splat(1.0 - 1e-6));
-    let far_x = x + half_x;
-    let near_x = x - half_x;
-    // Quotients of a box that reaches behind the LiDAR have no bound.
-    let unbounded = near_x.simd_le(splat(1e-3));
-    let divisor = near_x.max(splat(1e-3));
-    let huge = splat(f32::MAX);
-    let azimuth_low = unbounded.select(-huge, quotient(simd, y - half_y, far_x, divisor));
-    let azimuth_high = unbounded.select(huge, quotient(simd, y + half_y, divisor, far_x));
-    // Horizontal distances of the box. Behind the LiDAR nothing is seen, so that 0 is the nearest.
-    let beside = (y.abs() - half_y).max(zero);
-    let beyond = y.abs() + half_y;
-    let ahead = near_x.max(zero);
-    let near = ahead.mul_add(ahead, beside * beside).sqrt().max(splat(1e-9));
-    let far = far_x.mul_add(far_x, beyond * beyond).sqrt().max(splat(1e-9));
-    let elevation_low = quotient(simd, z - half_z, far, near);
-    let elevation_high = quotient(simd, z + half_z, near, far);
-    let meets = visible
-        & far_x.simd_gt(zero)
-        & nearest_m.simd_le(splat(test.max_range_m))
-        & azimuth_low.simd_le(splat(test.azimuths[1]))
-        & azimuth_high.simd_ge(splat(test.azimuths[0]))
-        & elevation_low.simd_le(splat(test.elevations[1]))
-        & elevation_high.simd_ge(splat(test.elevations[0]));
-    let lanes = meets.to_bitmask();
-    if lanes == 0 {
-        return None;
-    }
-    Some(Bounds {
-        lanes,
-        azimuth_low: azimuth_low.to_array(),
-        azimuth_high: azimuth_high.to_array(),
-        elevation_low: elevation_low.to_array(),
-        elevation_high: elevation_high.to_array(),
-        nearest_m: nearest_m.to_array(),
-    })
 }
 
-/// The middle and the half-size of ellipsoids along an axis, in metres.
+/// The luminance of 16 Gaussians, as [`crate::lidar::luminance`] defines it.
 #[inline(always)]
+fn luminance<S: Simd>(simd: S, columns: &[Lanes], tint: [f32; 3]) -> f32x16<S> {
+    let splat = |value: f32| f32x16::splat(simd, value);
+    let mut sum = splat(0.0);
+    for (channel, share) in LUMINANCE.into_iter().enumerate() {
+        let sh = f32x16::load_array_ref(simd, &columns[column::SH + channel].0);
+        let value = sh.mul_add(splat(sh::C0 as f32), splat(0.5)).max(splat(0.0));
+        sum = value.mul_add(splat(share * tint[channel]), sum);
+    }
+    sum
+}
+
+/// The middle and the half-size of ellipsoids along an axis of the sector, in metres, with room for
+/// the motion of the LiDAR.
+#[inline(always)]
+#[allow(clippy::too_many_arguments, reason = "vectors in registers")]
 fn along<S: Simd>(
     simd: S,
-    axis: [f32; 3],
+    test: &ChunkTest,
+    axis: usize,
     mean: Vec3x16<S>,
     own: [Vec3x16<S>; 3],
     scale: Vec3x16<S>,
     reach: f32x16<S>,
-    margin_m: f32x16<S>,
+    turned_m: f32x16<S>,
 ) -> [f32x16<S>; 2] {
-    let row = Vec3x16::splat(simd, axis);
+    let row = Vec3x16::splat(simd, test.axes[axis]);
+    let margin_m = turned_m + f32x16::splat(simd, test.moved_m[axis]);
     let along_own = Vec3x16 { x: row.dot(own[0]), y: row.dot(own[1]), z: row.dot(own[2]) };
     let root = along_own.times(scale);
     [row.dot(mean), root.dot(root).sqrt().mul_add(reach, margin_m)]

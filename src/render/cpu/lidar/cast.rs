@@ -33,7 +33,7 @@ pub(super) fn sweep(
     view: &LidarView,
 ) -> Sweep {
     let rows = view.lidar.rows();
-    let tiles = sector.tile_spans.len();
+    let tiles = sector.tiles.len();
     let Scratch { candidates, tiles: beams, met } = scratch;
     met.clear();
     let count = tiles * rows.div_ceil(LANES);
@@ -47,12 +47,12 @@ pub(super) fn sweep(
     for chunks in bodies {
         let seen = sector.seen_from(chunks[0].1, view);
         let mut compare = |candidates: &mut Candidates| {
-            let lists = candidates.by_tile(level, sector, rows);
-            for (tile, list) in beams.iter_mut().zip(lists) {
-                let listed = &candidates.list;
-                dispatch!(level, simd => tile.cast(simd, listed, met, &seen, &list, profile));
+            candidates.sort_to_tiles(level, sector, rows);
+            let Candidates { list, lists, .. } = candidates;
+            for (tile, of_tile) in beams.iter_mut().zip(&*lists) {
+                dispatch!(level, simd => tile.cast(simd, list, met, &seen, of_tile, profile));
             }
-            candidates.list.clear();
+            list.clear();
             if met.len() > most_met {
                 drop_unkept(beams, met);
                 most_met = 2 * met.len() + MET_SLACK;

@@ -14,6 +14,7 @@
 mod beam;
 mod candidates;
 mod cast;
+mod rows;
 mod sector;
 mod tile;
 
@@ -80,7 +81,8 @@ pub(crate) fn most_bytes(lidar: &Lidar, threads: usize) -> u64 {
     let hits = 2 * beams * MOST_HITS * BeamRow::HIT_BYTES;
     let met = (2 * beams * MOST_HITS + cast::MET_SLACK) * 2 * size_of::<Met>();
     let tiles = beams / (LANES * LANES);
-    let candidates = 2 * candidates::BATCH * (size_of::<candidates::Candidate>() + tiles * (8 + 4));
+    let candidate = 2 * size_of::<candidates::Candidate>() + 8 + 4 * tiles;
+    let candidates = 2 * candidates::BATCH * candidate;
     // A sector has a column at least.
     let threads = threads.min(lidar.columns());
     (returns + threads * (hits + met + candidates)) as u64

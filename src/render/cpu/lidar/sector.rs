@@ -1,9 +1,11 @@
 //! Sectors: runs of columns of a LiDAR that look the same way.
 
 use std::ops::Range;
+use std::sync::Arc;
 
 use glam::{DMat3, DVec3};
 
+use super::rows::Rows;
 use crate::lidar::{Body, LidarView};
 use wildcity_scene::Chunk;
 use wildcity_scene::chunk::LANES;
@@ -16,29 +18,30 @@ pub(super) const MOST_COLUMNS: usize = 64;
 /// Largest angle between the azimuths of a sector, in radians. Row offsets alone may span 1 rad.
 const MOST_RAD: f64 = 1.05;
 
-/// The tangent of a beam that looks straight up or down, which has none. A point 0.1 mm beside such
-/// a beam at 100 m has it.
-const STEEPEST: f64 = 1e6;
-
 /// A run of columns.
 pub(super) struct Sector {
     pub(super) columns: Range<usize>,
     /// The azimuth around which the sector's axes are turned, in radians.
     middle_rad: f64,
-    /// Tangents of the azimuths of each tile's columns in the sector's axes, smallest and largest
-    /// over all rows. A tile's last columns may be missing: those see nothing.
-    pub(super) tile_tangents: Vec<[[f32; LANES]; 2]>,
-    /// The smallest and the largest of each tile.
-    pub(super) tile_spans: Vec<[f32; 2]>,
-    /// Tangents of the rows' elevations, rising or falling.
-    row_tangents: Vec<f32>,
+    /// Its columns, 16 at a time.
+    pub(super) tiles: Vec<TileColumns>,
+    pub(super) rows: Arc<Rows>,
     /// The range of the LiDAR, in metres: nothing nearer or farther returns.
     pub(super) min_range_m: f32,
     pub(super) max_range_m: f32,
-    /// Cosine and sine of each row's elevation, and those of its azimuth offset.
-    row_angles: Vec<[f64; 4]>,
     /// Cosine and sine of the azimuth of each column of the first row.
     column_angles: Vec<[f64; 2]>,
+}
+
+/// The azimuths of 16 columns in a sector's axes.
+pub(super) struct TileColumns {
+    /// Tangents of each column, smallest and largest over all rows. The last columns may be
+    /// missing: those see nothing.
+    pub(super) tangents: [[f32; LANES]; 2],
+    /// The smallest and the largest of all.
+    pub(super) span: [f32; 2],
+    /// The widest gap between columns: an interval within the span that is wider meets a column.
+    pub(super) widest_gap: f32,
 }
 
 /// A sector as one body sees it.
@@ -52,10 +55,30 @@ pub(super) struct BodySector<'a> {
     /// Takes directions in the body's axes to the sector's: x forward, y left, z up, as the middle
     /// column sees them.
     pub(super) sector_from_body: DMat3,
-    /// The most that the LiDAR moves from there, in metres.
-    pub(super) moved_m: f64,
+    /// The most that the LiDAR moves from there along each of the sector's axes, in metres.
+    pub(super) moved_m: DVec3,
     /// The most that it turns from there, in radians.
     pub(super) turned_rad: f64,
+}
+
+impl TileColumns {
+    /// `tangents` has the smallest and the largest of each column.
+    fn new(tangents: &[[f32; 2]]) -> Self {
+        let mut lanes = [[f32::INFINITY; LANES], [f32::NEG_INFINITY; LANES]];
+        for (lane, [low, high]) in tangents.iter().enumerate() {
+            lanes[0][lane] = *low;
+            lanes[1][lane] = *high;
+        }
+        let mut sorted = tangents.to_vec();
+        sorted.sort_by(|a, b| a[0].total_cmp(&b[0]));
+        let mut widest_gap: f32 = 0.0;
+        let mut reached = sorted[0][1];
+        for [low, high] in &sorted {
+            widest_gap = widest_gap.max(low - reached);
+            reached = reached.max(*high);
+        }
+        Self { tangents: lanes, span: [sorted[0][0], reached], widest_gap }
+    }
 }
 
 impl Sector {
@@ -71,6 +94,7 @@ impl Sector {
             let first = lidar.azimuth_rad(0, column);
             [first + least, first + most]
         };
+        let rows = Arc::new(Rows::new(view));
         let mut sectors = Vec::new();
         let mut start = 0;
         let mut span = azimuths(0);
@@ -79,48 +103,40 @@ impl Sector {
             let wider = [span[0].min(low), span[1].max(high)];
             let is_full = column - start == MOST_COLUMNS || wider[1] - wider[0] > MOST_RAD;
             if is_full && column > start {
-                sectors.push(Self::new(view, start..column, span, &azimuths));
+                sectors.push(Self::new(rows.clone(), view, start..column, span, &azimuths));
                 start = column;
                 span = [low, high];
             } else {
                 span = wider;
             }
         }
-        sectors.push(Self::new(view, start..lidar.columns(), span, &azimuths));
+        sectors.push(Self::new(rows, view, start..lidar.columns(), span, &azimuths));
         sectors
     }
 
     fn new(
+        rows: Arc<Rows>,
         view: &LidarView,
         columns: Range<usize>,
         [low, high]: [f64; 2],
         azimuths: &dyn Fn(usize) -> [f64; 2],
     ) -> Self {
         let middle_rad = 0.5 * (low + high);
-        let tile = |start: usize| {
-            let mut tangents = [[f32::INFINITY; LANES], [f32::NEG_INFINITY; LANES]];
-            for column in start..(start + LANES).min(columns.end) {
-                let [low, high] = azimuths(column).map(|azimuth| (azimuth - middle_rad).tan());
-                // Outwards by more than the rounding of f32.
-                tangents[0][column - start] = low as f32 - 1e-6;
-                tangents[1][column - start] = high as f32 + 1e-6;
-            }
-            tangents
+        let tangents = |column| {
+            let [low, high] = azimuths(column).map(|azimuth| (azimuth - middle_rad).tan());
+            // Outwards by more than the rounding of f32.
+            [low as f32 - 1e-6, high as f32 + 1e-6]
         };
-        let tangent = |elevation: &f64| elevation.tan().clamp(-STEEPEST, STEEPEST) as f32;
-        let tile_tangents: Vec<_> = columns.clone().step_by(LANES).map(tile).collect();
-        let span = |[least, most]: &[[f32; LANES]; 2]| {
-            let least = least.iter().copied().fold(f32::INFINITY, f32::min);
-            [least, most.iter().copied().fold(f32::NEG_INFINITY, f32::max)]
+        let tile = |start: usize| {
+            let columns = start..(start + LANES).min(columns.end);
+            TileColumns::new(&columns.map(tangents).collect::<Vec<_>>())
         };
         Self {
             middle_rad,
-            tile_spans: tile_tangents.iter().map(span).collect(),
-            tile_tangents,
-            row_tangents: view.lidar.row_elevations_rad().iter().map(tangent).collect(),
+            tiles: columns.clone().step_by(LANES).map(tile).collect(),
             min_range_m: view.lidar.min_range_m() as f32,
             max_range_m: view.lidar.max_range_m() as f32,
-            row_angles: (0..view.lidar.rows()).map(|row| row_angles(view, row)).collect(),
+            rows,
             column_angles: columns.clone().map(|column| column_angles(view, column)).collect(),
             columns,
         }
@@ -129,37 +145,11 @@ impl Sector {
     /// The direction of a beam in the LiDAR's axes, by the sums of angles: 128 x 2,048 beams have
     /// 2,176 sines and not 500,000.
     pub(super) fn direction(&self, row: usize, column: usize) -> DVec3 {
-        let [cos_e, sin_e, cos_o, sin_o] = self.row_angles[row];
+        let [cos_e, sin_e, cos_o, sin_o] = self.rows.angles[row];
         let [cos_a, sin_a] = self.column_angles[column - self.columns.start];
         let cos = cos_a * cos_o - sin_a * sin_o;
         let sin = sin_a * cos_o + cos_a * sin_o;
         DVec3::new(cos_e * cos, cos_e * sin, sin_e)
-    }
-
-    /// The smallest and the largest tangent of the rows' elevations.
-    pub(super) fn elevation_tangents(&self) -> [f32; 2] {
-        // A LiDAR has rows.
-        let first = self.row_tangents[0];
-        let last = self.row_tangents[self.row_tangents.len() - 1];
-        [first.min(last), first.max(last)]
-    }
-
-    /// The rows whose elevations have tangents from `low` to `high`.
-    pub(super) fn rows_between(&self, low: f32, high: f32) -> Range<usize> {
-        let tangents = &self.row_tangents;
-        let rises = tangents[0] < tangents[tangents.len() - 1];
-        // Tangents at the clamp are equal to each other, so that a test with equality keeps them.
-        let first = if rises {
-            tangents.partition_point(|tangent| *tangent < low)
-        } else {
-            tangents.partition_point(|tangent| *tangent > high)
-        };
-        let end = if rises {
-            tangents.partition_point(|tangent| *tangent <= high)
-        } else {
-            tangents.partition_point(|tangent| *tangent >= low)
-        };
-        first..end.max(first)
     }
 
     /// This sector as a body sees it.
@@ -167,31 +157,18 @@ impl Sector {
         let at = |column| body.body_from_lidar(view, column);
         let poses: Vec<Pose> = self.columns.clone().map(at).collect();
         let middle = poses[poses.len() / 2];
-        let mut moved_m: f64 = 0.0;
-        let mut turned_rad: f64 = 0.0;
-        for pose in &poses {
-            moved_m = moved_m.max(pose.position_m.distance(middle.position_m));
-            turned_rad = turned_rad.max(pose.rotation.angle_between(middle.rotation));
-        }
         let lidar_from_sector = DMat3::from_rotation_z(self.middle_rad);
         let body_from_sector = middle.rotation_matrix() * lidar_from_sector;
-        BodySector {
-            sector: self,
-            body,
-            middle,
-            sector_from_body: body_from_sector.transpose(),
-            moved_m,
-            turned_rad,
-            poses,
+        let sector_from_body = body_from_sector.transpose();
+        let mut moved_m = DVec3::ZERO;
+        let mut turned_rad: f64 = 0.0;
+        for pose in &poses {
+            let by_m = sector_from_body * (pose.position_m - middle.position_m);
+            moved_m = moved_m.max(by_m.abs());
+            turned_rad = turned_rad.max(pose.rotation.angle_between(middle.rotation));
         }
+        BodySector { sector: self, body, middle, sector_from_body, moved_m, turned_rad, poses }
     }
-}
-
-fn row_angles(view: &LidarView, row: usize) -> [f64; 4] {
-    let lidar = &view.lidar;
-    let (sin_e, cos_e) = lidar.row_elevations_rad()[row].sin_cos();
-    let (sin_o, cos_o) = (lidar.azimuth_rad(row, 0) - lidar.azimuth_rad(0, 0)).sin_cos();
-    [cos_e, sin_e, cos_o, sin_o]
 }
 
 fn column_angles(view: &LidarView, column: usize) -> [f64; 2] {

@@ -202,11 +202,16 @@ struct Aim<S: Simd> {
 impl<S: Simd> Aim<S> {
     #[inline(always)]
     fn new(simd: S, candidate: &Candidate, origin_m: Vec3x16<S>) -> Self {
-        let [x, y, z] = candidate.whiten;
-        let whiten = [Vec3x16::splat(simd, x), Vec3x16::splat(simd, y), Vec3x16::splat(simd, z)];
+        let [xx, xy, xz, yx, yy, yz, zx, zy, zz] = candidate.whiten;
+        let whiten = [
+            Vec3x16::splat(simd, [xx, xy, xz]),
+            Vec3x16::splat(simd, [yx, yy, yz]),
+            Vec3x16::splat(simd, [zx, zy, zz]),
+        ];
+        let to_mean_m = Vec3x16::splat(simd, candidate.mean_m).minus(origin_m);
         Self {
             simd,
-            to_mean: whitened(whiten, Vec3x16::splat(simd, candidate.mean_m).minus(origin_m)),
+            to_mean: whitened(whiten, to_mean_m),
             whiten,
             reach2: f32x16::splat(simd, candidate.reach2),
             log2_opacity: f32x16::splat(simd, candidate.log2_opacity),
