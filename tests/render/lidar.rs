@@ -12,6 +12,7 @@ use wildcity_render::reference::Reference;
 use wildcity_render::{Backend, FIRST_ACTOR_INSTANCE, TWIN_INSTANCE};
 use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::geometry::{Lidar, Pose};
+use wildcity_scene::random::Random;
 use wildcity_scene::{Gaussians, RenderProfile, Scene};
 
 use crate::data::real;
@@ -313,6 +314,32 @@ fn few_columns_of_a_turning_lidar_meet_what_they_pass() {
             .collect();
         assert!(missed.is_empty(), "{missed:?}");
         assert!(wanted.range_m.iter().filter(|range_m| **range_m > 0.0).count() > 100);
+    }
+}
+
+/// The same LiDAR passes small Gaussians by: it moves by more than they are large, along each axis.
+#[test]
+fn few_columns_of_a_moving_lidar_meet_small_gaussians() {
+    let mut random = Random::new(3, "small", 0);
+    let mut gaussians = Gaussians::with_capacity(0, 3_000);
+    for _ in 0..3_000 {
+        let place = [random.range(2.0, 16.0), random.range(-8.0, 8.0), random.range(-4.0, 4.0)];
+        gaussians.means_m.push(place);
+        gaussians.ln_scales.push([-2.5, -2.0, -4.0]);
+        gaussians.quats_wxyz.push([0.9, 0.3, -0.2, random.range(-0.3, 0.3) as f32]);
+        gaussians.logit_opacities.push(5.0);
+        gaussians.sh.extend([0.3; 3]);
+    }
+    let scene = Scene::from_gaussians(&gaussians);
+    let lidar = Arc::new(grid([0.3, -0.3], 61, [0.3, -0.3], 16));
+    for moved_m in [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| 2.0 * axis) {
+        let view = LidarView {
+            lidar: lidar.clone(),
+            world_from_lidar: Pose { position_m: 0.5 * moved_m, ..Pose::IDENTITY },
+            world_from_lidar_first: Pose { position_m: -0.5 * moved_m, ..Pose::IDENTITY },
+        };
+        let wanted = sweep(&Reference, &scene, &view);
+        check_same(&sweep(&cpu(), &scene, &view), &wanted, &format!("{moved_m}"));
     }
 }
 
