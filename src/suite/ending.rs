@@ -63,7 +63,7 @@ impl Ending {
         } else {
             ExitCode::Passed
         };
-        let mut why = vec![counted(result)];
+        let mut why = vec![result.counts.to_string()];
         why.extend(result.at_least.map(|least| {
             if rate_is_low {
                 format!("the pass rate is at least {low:.3}, and {least} was wanted")
@@ -82,16 +82,4 @@ impl Ending {
     pub fn not_verified(wrong: &[String]) -> Self {
         Self { code: ExitCode::NotVerified, why: format!("not repeated: {}", wrong.join("; ")) }
     }
-}
-
-/// How many episodes did not pass, and how.
-fn counted(result: &SuiteResult) -> String {
-    let counts = &result.counts;
-    if counts.passed == counts.episodes {
-        return format!("all {} episodes passed", counts.episodes);
-    }
-    format!(
-        "of {} episodes: {} not judged, {} left the trained area, {} failed, {} not driven for technical reasons",
-        counts.episodes, counts.not_judged, counts.off_model, counts.failed, counts.technical
-    )
 }

@@ -55,13 +55,7 @@ fn verdict(ending: &Ending) -> Markup {
 }
 
 fn outcome(result: &SuiteResult) -> Markup {
-    let counts = &result.counts;
     html! {
-        p {
-            (counts.episodes) " episodes: " (counts.not_judged) " not judged, " (counts.off_model)
-            " left the trained area, " (counts.failed) " failed, " (counts.passed) " passed, "
-            (counts.technical) " not driven for technical reasons."
-        }
         p { "Pass rate: " (rate(&result.pass_rate)) "." }
         @if let Some(text) = result.duplicates_text() { p { "Note: " (text) "." } }
         @if result.latest { p { "Run on the latest versions of the twins, whatever the scenarios name." } }

@@ -85,6 +85,30 @@ pub struct Counts {
     pub duplicates: u64,
 }
 
+/// What became of the episodes; what did not happen is left out.
+impl std::fmt::Display for Counts {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { episodes, passed, failed, off_model, not_judged, technical, .. } = *self;
+        let episodes_text = if episodes == 1 { "episode" } else { "episodes" };
+        if passed == episodes {
+            return match episodes {
+                1 => write!(f, "the episode passed"),
+                _ => write!(f, "all {episodes} episodes passed"),
+            };
+        }
+        let parts = [
+            (failed, "failed"),
+            (not_judged, "not judged"),
+            (off_model, "left the trained area"),
+            (technical, "not driven for technical reasons"),
+            (passed, "passed"),
+        ];
+        let happened = parts.into_iter().filter(|(count, _)| *count > 0);
+        let texts: Vec<String> = happened.map(|(count, what)| format!("{count} {what}")).collect();
+        write!(f, "of {episodes} {episodes_text}: {}", texts.join(", "))
+    }
+}
+
 /// A rate with its 95 % interval (Wilson).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Rate {
