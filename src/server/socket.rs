@@ -85,7 +85,7 @@ impl Socket {
                 self.flush().await.and(Err(self.left()))
             }
             // The end of the stream, and any error of the network: there is no peer to tell.
-            None => Err(Disconnect::PeerLeft),
+            None => Err(self.left()),
             Some(Err(error)) => Err(match error {
                 Error::Capacity(CapacityError::MessageTooLong { size, max_size }) => {
                     Disconnect::Fault(Fault::MessageTooLarge { bytes: size, limit: max_size })
@@ -165,9 +165,27 @@ impl Socket {
                 self.is_within_frame = false;
                 Ok(())
             }
-            Ok(Err(_)) => Err(self.left()),
+            Ok(Err(_)) => {
+                self.read_close().await;
+                Err(self.left())
+            }
             Err(_) => Err(Disconnect::SendTimedOut),
         }
+    }
+
+    /// Reads to the client's Close frame, which may have come before the connection ended. Nothing
+    /// is read while something is sent.
+    async fn read_close(&mut self) {
+        let read = async {
+            while let Some(Ok(message)) = self.stream.next().await {
+                if let Message::Close(frame) = message {
+                    return Some(frame.map_or(CloseCode::Status, |frame| frame.code));
+                }
+            }
+            None
+        };
+        let found = timeout(limits::LINGER, read).await;
+        self.peer_closed = self.peer_closed.or(found.unwrap_or_default());
     }
 
     /// Closes the connection, with a Close frame of this status unless the client has closed it

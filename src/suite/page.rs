@@ -25,7 +25,7 @@ pub fn page(
         (verdict(ending))
         (worst(result, pictures, episodes))
         h2 { "Run" }
-        (outcome(result))
+        (outcome(result, ending))
         (unjudged(result))
         h2 { "Scenarios" }
         (scenarios(result))
@@ -54,8 +54,13 @@ fn verdict(ending: &Ending) -> Markup {
     }
 }
 
-fn outcome(result: &SuiteResult) -> Markup {
+fn outcome(result: &SuiteResult, ending: &Ending) -> Markup {
+    let counts = result.counts.to_string();
     html! {
+        // The verdict begins with them, unless it is about something else.
+        @if !ending.why.starts_with(&counts) {
+            p { (counts) "." }
+        }
         p { "Pass rate: " (rate(&result.pass_rate)) "." }
         @if let Some(text) = result.duplicates_text() { p { "Note: " (text) "." } }
         @if result.latest { p { "Run on the latest versions of the twins, whatever the scenarios name." } }

@@ -343,6 +343,30 @@ fn few_columns_of_a_moving_lidar_meet_small_gaussians() {
     }
 }
 
+/// Coincident Gaussians are blended in the order of their ids, whichever a beam meets first.
+#[test]
+fn coincident_gaussians_keep_their_order() {
+    let mut gaussians = Gaussians::with_capacity(0, 40);
+    for at in 0..40 {
+        gaussians.means_m.push([6.0, 0.0, 0.0]);
+        gaussians.ln_scales.push([0.0; 3]);
+        gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+        // An alpha of about a fifth, so that a return is made of some of them.
+        gaussians.logit_opacities.push(-1.4);
+        gaussians.sh.extend([0.08 * at as f32; 3]);
+    }
+    let scene = Scene::from_gaussians(&gaussians);
+    let lidar = Arc::new(grid([0.2, -0.2], 32, [0.2, -0.2], 32));
+    let view = LidarView::at_rest(lidar, Pose::IDENTITY);
+    let wanted = sweep(&Reference, &scene, &view);
+    let found = sweep(&cpu(), &scene, &view);
+    let returns = wanted.range_m.iter().filter(|range_m| **range_m > 0.0).count();
+    assert!(returns > 500, "{returns} returns test too little");
+    for (one, other) in found.intensity.iter().zip(&wanted.intensity) {
+        assert!((one - other).abs() < 1e-3, "{one}, {other}");
+    }
+}
+
 /// 4,500 km from the origin a sweep is the same.
 #[test]
 fn a_sweep_does_not_depend_on_the_origin() {

@@ -140,8 +140,8 @@ async fn a_close_frame_is_answered_while_a_request_runs() {
     assert_eq!((&resumed["last_seq"], &resumed["step"]), (&json!(2), &json!(1)));
 }
 
-/// A browser closes with 1001 when its page is left. Nobody comes back for these sessions, so none
-/// of them waits, not even if a step was running.
+/// A browser closes with 1001 when its page is left. Such sessions do not wait to be resumed,
+/// not even if a step was running.
 #[tokio::test]
 async fn a_client_that_goes_away_leaves_no_session() {
     let server = TestServer::start().await;

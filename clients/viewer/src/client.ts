@@ -62,7 +62,10 @@ export class Client {
     this.ended = true;
     // A request that is under way may be the one that opens the session.
     await this.last;
-    if (this.session) await this.ask({ type: "close" }).catch(() => {});
+    // Two callers may end it; one of them closes the session.
+    const { session } = this;
+    this.session = undefined;
+    if (session) await this.ask({ type: "close" }).catch(() => {});
     this.socket?.close(1000);
   }
 

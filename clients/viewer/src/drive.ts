@@ -135,6 +135,8 @@ export class DrivePage implements Page {
     const trust = twin.trajectories.length > 0;
     fields.outputs = { encoding: "jpeg", quality, trust, images, ...(scenario ? { actors: true } : {}) };
     this.opened = await client.open({ ...fields, session: drivenSession(twin.name) });
+    // The rig may have other LiDARs than before, or none.
+    this.points.clear();
     await this.map.load(twin.name, this.opened.version, twin.trajectories.map(({ name }) => name));
     showTitle(el("b", {}, twin.name), ` v${this.opened.version} · ${count(twin.gaussians)} Gaussians · drive`);
     await this.show(await client.observation({ type: "reset", ...this.start }));

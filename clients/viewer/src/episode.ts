@@ -139,6 +139,7 @@ export class EpisodePage implements Page {
     try {
       showStatus("loading");
       const recordings = await Promise.all(names.map(load));
+      if (this.ended) return;
       const empty = recordings.find(({ frames }) => frames.length === 0);
       if (empty) throw new Error(`${empty.name} has no frames`);
       this.players = recordings.map((recording) => new Player(recording));
@@ -147,6 +148,7 @@ export class EpisodePage implements Page {
       const [first] = recordings;
       const { trajectories } = await get<TwinInfo>(`v1/twins/${first!.twin}`);
       await this.map.load(first!.twin, first!.frames[0]!.version, trajectories.map(({ name }) => name));
+      if (this.ended) return;
       for (const [at, { frames }] of recordings.entries()) {
         this.map.path(frames.map(({ pose }) => pose.xyz), at === 0 ? "accent" : "warm");
       }

@@ -87,14 +87,15 @@ export class HomePage implements Page {
   private async loadSessions(): Promise<void> {
     const { sessions } = await get<{ sessions: Session[] }>("v1/sessions");
     this.showSessions(sessions);
-    // The server opens every record for this list, so that it is read again only after an episode has begun or ended.
+    // The server opens every record for this list, so that it is read again only after a session has begun or ended.
     const running = sessions.map(({ session }) => session).join();
     const changed = running !== this.listedFor;
     if ((!changed && !this.listsAgain) || this.chosen.length > 0) return;
+    const { episodes } = await get<{ episodes: Episode[] }>("v1/episodes");
+    if (this.chosen.length > 0) return;
+    this.showEpisodes(episodes);
     this.listedFor = running;
     this.listsAgain = changed;
-    const { episodes } = await get<{ episodes: Episode[] }>("v1/episodes");
-    if (this.chosen.length === 0) this.showEpisodes(episodes);
   }
 
   /** The server lists sessions for administrators alone, but a token may watch its own ones by their names. */

@@ -118,6 +118,7 @@ export class PlacePage implements Page {
     try {
       showStatus("looking for the ground");
       const survey = await get<Survey>(`v1/twins/${encodeURIComponent(this.twin)}/ground`);
+      if (this.ended) return;
       this.version = survey.version;
       this.proposal = survey.ground ?? undefined;
       const radius = survey.radius || 1;

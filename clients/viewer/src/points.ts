@@ -57,6 +57,13 @@ export class PointsView {
     this.drawing.redraw();
   }
 
+  /** Shows nothing until the next sweep. */
+  clear(): void {
+    this.clouds = [];
+    this.element.hidden = true;
+    delete this.element.dataset.points;
+  }
+
   private draw(context: CanvasRenderingContext2D, shownWidth: number, shownHeight: number): void {
     const { canvas } = this.drawing;
     const { width, height } = canvas;
@@ -66,7 +73,7 @@ export class PointsView {
     const pixels = context.createImageData(width, height);
     const colours = new Uint32Array(pixels.data.buffer);
     const nearest = new Float32Array(width * height).fill(Infinity);
-    // Points are as large as a pixel of the screen.
+    // A point is a pixel of a plain screen, or 3 by 3 of one that is twice as sharp.
     const size = Math.max(1, Math.round(devicePixelRatio * 1.3));
     for (const cloud of this.clouds) {
       for (let at = 0; at < cloud.length; at += 3) {

@@ -107,7 +107,9 @@ impl Export {
         let what = if self.nuscenes.is_some() { "rows" } else { "messages" };
         writeln!(out, "exported    {} {what} to {}", exported.messages, target.display())?;
         if let Some(Replay { report, sweeps }) = &replayed {
-            writeln!(out, "images      {}", report.images)?;
+            if self.images {
+                writeln!(out, "images      {}", report.images)?;
+            }
             if self.lidar {
                 writeln!(out, "sweeps      {sweeps}")?;
             }
@@ -255,8 +257,6 @@ impl<'a, W: io::Write + io::Seek> AnyExport<'a, W> {
     fn sweep(&mut self, sweep: &ReplayedSweep<'_>) -> Result<(), ExportError> {
         let point = |point: SweepPoint| {
             let SweepPoint { xyz_m, intensity, offset_us, row, column, instance } = point;
-            // A sweep takes a second at most.
-            let offset_us = offset_us as i32;
             ExportedPoint { xyz_m, intensity, offset_us, row, column, instance }
         };
         let points: Vec<ExportedPoint> = sweep.points().into_iter().map(point).collect();

@@ -31,7 +31,7 @@ pub enum ExportError {
     /// A line cannot be written as JSON.
     #[error("cannot write a line as JSON: {0}")]
     Json(serde_json::Error),
-    /// The images of the episode cannot be made.
+    /// The images or the sweeps of the episode cannot be made.
     #[error("{0}")]
     Images(String),
     /// The episode has no frame.

@@ -23,6 +23,7 @@ mod trace;
 use std::future::pending;
 use std::sync::Arc;
 
+use futures_util::FutureExt as _;
 use futures_util::future::select_all;
 use tokio::time::{Instant, sleep_until, timeout};
 use tracing::Instrument as _;
@@ -39,7 +40,8 @@ use crate::sessions::{Answer, AnsweredRequest, SlotGuard};
 use crate::socket::{Disconnect, Incoming, Socket};
 use crate::state::ServerState;
 
-/// Serves a client until the connection ends, and then parks its open sessions.
+/// Serves a client until the connection ends, and then parks its open sessions; or ends them, if
+/// the client does not come back.
 pub(crate) async fn serve(
     state: Arc<ServerState>,
     socket: Socket,
@@ -411,8 +413,8 @@ impl Connection {
     /// Parks the sessions, or ends them if the client does not come back; sends the reason to the
     /// client if that is possible, and closes the socket.
     async fn end(mut self, mut socket: Socket, reason: Disconnect) {
-        // The outcome of each episode, unless the client resumes its session within the grace
-        // period.
+        // The outcome of each episode, unless the client may and does resume its session within the
+        // grace period.
         let outcome = match &reason {
             Disconnect::PeerLeft | Disconnect::PeerGone | Disconnect::Fault(Fault::Replaced) => {
                 Outcome::AgentLost
@@ -427,8 +429,10 @@ impl Connection {
         for mut slot in self.slots.drain(..) {
             tracing::info!(?reason, "the connection of a session ended");
             slot.outcome = outcome;
+            // The client may have left this connection for another one, which waits for the slot.
+            let is_resumed = slot.release.notified().now_or_never().is_some();
             let ended = match &reason {
-                Disconnect::PeerGone => slot.session.take(),
+                Disconnect::PeerGone if !is_resumed => slot.session.take(),
                 _ => None,
             };
             // Parks the session, or frees its name.

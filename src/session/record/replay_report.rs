@@ -128,7 +128,7 @@ pub struct SweepPoint {
     /// Mean luminance of what was hit.
     pub intensity: f32,
     /// When it was measured, in microseconds after the sweep's time: 0 or less.
-    pub offset_us: i64,
+    pub offset_us: i32,
     pub row: u16,
     pub column: u16,
     /// As the map of an image.
@@ -145,7 +145,7 @@ impl ReplayedSweep<'_> {
         // Once for each column, and not for each beam.
         let columns = (0..beams.columns()).map(|column| {
             let world_from_rig = view.world_from_lidar_at(column) * lidar_from_rig;
-            (rig_from_world * world_from_rig, -(beams.age_us(column).round() as i64))
+            (rig_from_world * world_from_rig, -(beams.age_us(column).round() as i32))
         });
         let columns: Vec<_> = columns.collect();
         let point = |at: usize| {

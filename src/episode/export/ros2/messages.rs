@@ -75,7 +75,7 @@ pub(super) fn compressed_image(stamp: Stamp, frame: &str, jpeg: &[u8]) -> Vec<u8
     cdr.finish()
 }
 
-/// Points in no order of rows: those without a return are left out.
+/// An unorganised cloud: beams without a return are left out.
 pub(super) fn point_cloud(stamp: Stamp, frame: &str, points: &[ExportedPoint]) -> Vec<u8> {
     // A sweep has 2²⁰ beams at most, whose bytes fit u32.
     let count = points.len() as u32;

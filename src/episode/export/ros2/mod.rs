@@ -73,13 +73,14 @@ impl<'a, W: Write + Seek> Ros2Export<'a, W> {
             .collect();
         let errors_px = calibrations.iter().map(|calibration| calibration.error_px);
         let calibration_error_px = errors_px.fold(0.0, f64::max);
-        let cameras = mounted.iter().zip(calibrations).map(|(camera, calibration)| Ros2Camera {
-            name: ros_name(&camera.name),
-            calibration: calibration.message,
-        });
+        let names = ros_names(mounted.iter().map(|camera| &*camera.name));
+        let cameras = names
+            .into_iter()
+            .zip(calibrations)
+            .map(|(name, calibration)| Ros2Camera { name, calibration: calibration.message });
         let mut export = Self {
             cameras: cameras.collect(),
-            lidars: lidars.iter().map(|lidar| ros_name(&lidar.name)).collect(),
+            lidars: ros_names(lidars.iter().map(|lidar| &*lidar.name)),
             file: McapFile::create_ros2(out)?,
             frames: frames.iter().copied().zip(motions).collect::<Vec<_>>().into_iter().peekable(),
             calibration_error_px,
@@ -111,7 +112,9 @@ impl<'a, W: Write + Seek> Ros2Export<'a, W> {
     /// The file cannot be written.
     pub fn sweep(&mut self, sweep: &ExportedSweep<'_>) -> Result<(), ExportError> {
         self.write_until(sweep.time_us)?;
-        let Some(name) = self.lidars.get(sweep.lidar) else { return Ok(()) };
+        // Without a rig in the header a LiDAR has a number.
+        let number = sweep.lidar.to_string();
+        let name = self.lidars.get(sweep.lidar).unwrap_or(&number);
         let topic = format!("/lidar/{name}/points");
         let data = messages::point_cloud(Stamp::new(sweep.time_us), BASE, sweep.points);
         self.put(&topic, "sensor_msgs/msg/PointCloud2", sweep.time_us, &data)
@@ -158,9 +161,10 @@ impl<'a, W: Write + Seek> Ros2Export<'a, W> {
 
     /// Where the cameras are on the rig.
     fn mounts(&mut self, cameras: &[RigCamera], time_us: i64) -> Result<(), ExportError> {
-        let mounts = cameras.iter().map(|camera| Transform {
+        let names = self.cameras.iter().map(|camera| &camera.name);
+        let mounts = cameras.iter().zip(names).map(|(camera, name)| Transform {
             parent: BASE,
-            child: optical_frame(&ros_name(&camera.name)),
+            child: optical_frame(name),
             pose: camera.rig_from_camera,
         });
         let mounts: Vec<Transform> = mounts.collect();
@@ -199,6 +203,17 @@ pub fn export_ros2<W: Write + Seek>(
     out: W,
 ) -> Result<Exported, ExportError> {
     Ros2Export::begin(episode, rig, out)?.finish()
+}
+
+/// Names as ROS accepts them. One that another has become already gets its number.
+fn ros_names<'a>(names: impl Iterator<Item = &'a str>) -> Vec<String> {
+    let mut known: Vec<String> = Vec::new();
+    for (number, name) in names.enumerate() {
+        let plain = ros_name(name);
+        let is_new = !known.contains(&plain);
+        known.push(if is_new { plain } else { format!("{plain}_{number}") });
+    }
+    known
 }
 
 /// A name as ROS accepts it in topics and frames: letters, digits and underscores.

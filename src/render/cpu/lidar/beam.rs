@@ -148,9 +148,9 @@ impl BeamRow {
         let mut before = 1.0;
         let mut sum = 0.0;
         for slot in &self.slots {
-            // The beam has no hit here, and the place of its Gaussian is out of date.
+            // The beam has no hit here or behind, and the place of its Gaussian is out of date.
             if slot.range_m[lane].is_infinite() {
-                continue;
+                return None;
             }
             let met = all[slot.met[lane] as usize];
             sum += before * slot.alpha[lane] * met.luminance;

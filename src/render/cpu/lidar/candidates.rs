@@ -48,7 +48,7 @@ pub(super) struct Candidates {
 }
 
 /// Candidates after which they are compared with beams: they, and their places in the lists of
-/// tiles, are in memory at once, 4 MB.
+/// tiles, are in memory at once, 6 to 15 MB.
 pub(super) const BATCH: usize = 1 << 15;
 
 /// A cluster, and whose it is.
@@ -306,8 +306,8 @@ impl Block {
         let [x, half_x] = along(simd, test, 0, mean, own, scale, reach, turned_m);
         let [y, half_y] = along(simd, test, 1, mean, own, scale, reach, turned_m);
         let [z, half_z] = along(simd, test, 2, mean, own, scale, reach, turned_m);
-        // The nearer of two bounds that contain the ellipsoid, a sphere and the box. A road's Gaussians
-        // are so flat that the sphere is up to their length too near.
+        // The farther of two lower bounds of its distance, from a sphere and from the box that
+        // contain it. A road's Gaussians are so flat that the sphere is up to their length too near.
         let sphere_m = range_m - largest * reach - most_moved_m;
         let outside = Vec3x16 { x: x.abs() - half_x, y: y.abs() - half_y, z: z.abs() - half_z };
         let outside = outside.max(zero);

@@ -7,9 +7,9 @@
 //! ([`beam`]), so that candidates need no sort but for speed: the nearest come first, and a tile
 //! ends where all of its beams have returned in front of the next.
 //!
-//! Positions are relative to the LiDAR in the middle of the sector, and a response is computed
-//! around the point of the beam that is nearest to the Gaussian's centre, so that f32 loses 1e-5 m
-//! at 100 m.
+//! Positions are relative to the LiDAR in the middle of the sector, and a response is computed from
+//! the distance of a line from a point in standard deviations, so that f32 loses 1e-5 m at 100 m
+//! and nothing to a Gaussian that is flat.
 
 mod beam;
 mod candidates;
@@ -79,8 +79,10 @@ pub(crate) fn most_bytes(lidar: &Lidar, threads: usize) -> u64 {
     let beams = lidar.rows().next_multiple_of(LANES) * columns;
     // Vectors grow to twice what they hold. At worst, every hit is of another Gaussian.
     let hits = 2 * beams * MOST_HITS * BeamRow::HIT_BYTES;
-    let met = (2 * beams * MOST_HITS + cast::MET_SLACK) * 2 * size_of::<Met>();
     let tiles = beams / (LANES * LANES);
+    // With those of a batch, and what it takes to drop those that no beam has kept.
+    let most_met = 2 * beams * MOST_HITS + cast::MET_SLACK + candidates::BATCH * tiles;
+    let met = most_met * (2 * size_of::<Met>() + 5);
     let candidate = 2 * size_of::<candidates::Candidate>() + 8 + 4 * tiles;
     let candidates = 2 * candidates::BATCH * candidate;
     // A sector has a column at least.

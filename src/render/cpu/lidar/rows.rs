@@ -18,12 +18,12 @@ pub(super) struct Rows {
     tangents: Vec<f32>,
     /// Whether the LiDAR's own rows fall: its first is the last here.
     falls: bool,
-    /// Rows below each of the buckets that divide the tangents evenly, but for those below the
-    /// bucket before it, so that no rounding of a bucket's border loses a row.
+    /// The tangents are divided evenly into buckets. For each, the number of rows below the begin
+    /// of the bucket before it, so that no rounding of a begin loses a row.
     below: Vec<u16>,
-    /// Tangent at which the buckets begin, and buckets in a tangent of 1.
+    /// Tangent at which the first bucket begins.
     buckets_from: f32,
-    buckets_per_1: f32,
+    buckets_per_tangent: f32,
     /// Cosine and sine of each row's elevation, and those of its azimuth offset, in the order of
     /// the LiDAR.
     pub(super) angles: Vec<[f64; 4]>,
@@ -40,9 +40,9 @@ impl Rows {
         let buckets_from = tangents[0].clamp(-BUCKETS_TO, BUCKETS_TO);
         let buckets_to = tangents[tangents.len() - 1].clamp(-BUCKETS_TO, BUCKETS_TO);
         let count = 16 * tangents.len();
-        let buckets_per_1 = count as f32 / (buckets_to - buckets_from).max(1e-6);
+        let buckets_per_tangent = count as f32 / (buckets_to - buckets_from).max(1e-6);
         let below = |bucket: usize| {
-            let from = buckets_from + bucket.saturating_sub(1) as f32 / buckets_per_1;
+            let from = buckets_from + bucket.saturating_sub(1) as f32 / buckets_per_tangent;
             // All tangents of the first two buckets may be in question.
             let from = if bucket < 2 { f32::NEG_INFINITY } else { from };
             // A LiDAR has at most 256 rows.
@@ -52,7 +52,7 @@ impl Rows {
             below: (0..=count).map(below).collect(),
             falls,
             buckets_from,
-            buckets_per_1,
+            buckets_per_tangent,
             angles: (0..view.lidar.rows()).map(|row| row_angles(view, row)).collect(),
             tangents,
         }
@@ -82,7 +82,7 @@ impl Rows {
     /// A row that is at most the first one with this tangent.
     fn start(&self, tangent: f32) -> usize {
         // The cast is 0 for what is below, and the largest for what is above.
-        let bucket = ((tangent - self.buckets_from) * self.buckets_per_1) as usize;
+        let bucket = ((tangent - self.buckets_from) * self.buckets_per_tangent) as usize;
         usize::from(self.below[bucket.min(self.below.len() - 1)])
     }
 }

@@ -122,7 +122,7 @@ class DriveConfig:
     rig: str | Rig | None = None
     cameras: tuple[str, ...] = ("front",)
     size: tuple[int, int] = (96, 60)
-    lidars: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    lidars: Mapping[str, tuple[int, int]] = field(default_factory=dict, hash=False)
     dynamics: Model = "dynamic"
     speed: float = 5.0
     dt_us: int = 100_000
@@ -139,6 +139,9 @@ class DriveConfig:
         object.__setattr__(self, "cameras", tuple(self.cameras))
         if not self.cameras:
             raise ValueError("cameras is empty; name at least one camera")
+        keys = [*map(image_key, self.cameras), *map(lidar_key, self.lidars)]
+        if len(set(keys)) < len(keys):
+            raise ValueError(f"cameras and lidars: two of them have one key, in {', '.join(keys)}")
         if self.scenario is not None:
             own = [one for one in fields(self) if one.name in OF_A_DRIVE]
             given = [one.name for one in own if getattr(self, one.name) != one.default]
