@@ -50,7 +50,7 @@ fn there_are_enough_gaussians_and_density_scales_them() {
 
 #[test]
 fn every_value_is_within_the_bounds_of_a_twin() {
-    let Gaussians { sh_degree, means_m, quats_wxyz, ln_scales, logit_opacities, sh } =
+    let Gaussians { sh_degree, means_m, quats_wxyz, ln_scales, logit_opacities, sh, .. } =
         &DEMO.gaussians;
     let count = means_m.len();
     assert_eq!(*sh_degree, 1);
