@@ -129,6 +129,7 @@ impl BufferPlan {
                 opacity,
                 normals,
                 instances,
+                semantics: None,
                 appearance: Some(&camera.appearance),
             });
         }
