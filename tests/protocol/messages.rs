@@ -241,6 +241,7 @@ fn requests() -> Vec<(&'static str, Request)> {
             opacity: true,
             normals: Some(true),
             instances: Some(true),
+            semantics: Some(true),
             frames: Some(4),
             trust: Some(true),
             actors: None,
@@ -510,9 +511,16 @@ fn answers() -> Vec<(&'static str, Answer)> {
         repair: None,
         sensors: None,
         scenario: None,
+        semantics: None,
         trajectory: Some(drive()),
     };
     let sensed = Opened { trajectory: None, sensors: Some(sensors()), ..opened.clone() };
+    let classes = ["none", "unlabelled", "road"].map(str::to_owned).to_vec();
+    let labelled = Opened {
+        trajectory: None,
+        semantics: Some(OpenedSemantics { labelled: true, classes }),
+        ..opened.clone()
+    };
     let repaired = Opened {
         trajectory: None,
         repair: Some(OpenedRepair {
@@ -608,6 +616,7 @@ fn answers() -> Vec<(&'static str, Answer)> {
         ("opened", Answer::Opened(Box::new(opened))),
         ("opened_repair", Answer::Opened(Box::new(repaired))),
         ("opened_sensors", Answer::Opened(Box::new(sensed))),
+        ("opened_semantics", Answer::Opened(Box::new(labelled))),
         ("resumed", resumed),
         ("resumed_also", resumed_also),
         ("ok", Answer::Ok { seq: 6 }),

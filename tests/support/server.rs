@@ -109,6 +109,9 @@ impl Backend for Painter {
             if let Some(instances) = target.instances.as_deref_mut() {
                 instances.fill(7 + k as u16);
             }
+            if let Some(semantics) = target.semantics.as_deref_mut() {
+                semantics.fill(3 + k as u8);
+            }
             finished(k, target);
         }
         Ok(FrameStats { stages_ms: vec![("paint", 0.5)], ..FrameStats::default() })

@@ -15,9 +15,9 @@ use wildcity_protocol::message::{
     self, Answer, Limits, Opened, RigCamera, ServerInfo, TrajectoryInfo, TwinInfo,
 };
 use wildcity_repair::Selection;
-use wildcity_scene::Rig;
 use wildcity_scene::appearance::Appearance;
 use wildcity_scene::geometry::{Camera, Pose};
+use wildcity_scene::{Manifest, Rig, SemanticClass};
 use wildcity_session::{
     DamagedSummary, Engine, EpisodeSummary, EpisodeTraffic, ImageEncoding, Outcome, PixelMaps,
     ReferenceSource, Session, SessionRepair, TrajectorySummary, TwinSummaries, TwinSummary,
@@ -76,7 +76,7 @@ fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Resu
     let trajectory = section.map(|section| drive(&resident.version, section, "trajectory."));
     let profile = profile(session)?;
     let (encoding, quality) = encoding(session.encoding());
-    let PixelMaps { depth, opacity, normals, instances } = session.maps();
+    let PixelMaps { depth, opacity, normals, instances, semantics } = session.maps();
     let names: Vec<_> = session.cameras().iter().map(|camera| camera.name.clone()).collect();
     let period_us = |(index, name): (usize, &String)| (name.clone(), session.period_us(index));
     // All defaults are filled in: the client reads what applies, and not what it sent.
@@ -87,6 +87,7 @@ fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Resu
         opacity,
         normals: Some(normals),
         instances: instances.then_some(true),
+        semantics: semantics.then_some(true),
         frames: Some(session.frames() as u64),
         trust: Some(session.trust()),
         actors: session.reports_actors().then_some(true),
@@ -123,8 +124,17 @@ fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Resu
         repair: session.repair().map(|repair| opened_repair(repair, session)),
         sensors: session.sensors().cloned(),
         scenario: session.traffic().map(opened_scenario),
+        semantics: semantics.then(|| opened_semantics(manifest)),
         trajectory: trajectory.transpose()?,
     })
+}
+
+fn opened_semantics(manifest: &Manifest) -> message::OpenedSemantics {
+    message::OpenedSemantics {
+        labelled: manifest.has_classes(),
+        // In the order of their values, which count up from 0.
+        classes: SemanticClass::ALL.map(|class| class.name().to_owned()).to_vec(),
+    }
 }
 
 fn opened_repair(repair: &SessionRepair, session: &Session) -> message::OpenedRepair {
