@@ -1,28 +1,16 @@
-// Instance ids: whose splat brings a pixel's transmittance to a half or less. The other choice of `INSTANCES`
-// is `no_instances.wgsl`. Twin of `Wants::instances` in `src/render/cpu/rasterize.rs`.
+// Instance ids: whose splat brings a pixel's transmittance to a half or less. The other choices of `INSTANCES`
+// are `owners.wgsl`, which has classes, too, and `no_instances.wgsl`. Twin of `Wants::owners` in `src/render/cpu/rasterize.rs`.
 //
 // Splats are in order of (view, global id), so the chunks of each owner are one range of them. A pixel keeps
 // the index of the splat in its tile's list, and looks up the owner once, at its end.
+
+#import halved_by
 
 const INSTANCE_PLANES: u32 = 1u;
 
 @group(0) @binding(13) var<storage, read> owners: array<Owner>;
 // For each cluster view, the index of its first splat.
 @group(0) @binding(14) var<storage, read> first_splats: array<u32>;
-
-// Index in the tile's list, plus 1, of the splat that halves the transmittance; 0 if none has.
-var<private> halved_by: vec4u;
-
-// Records the splat with this index if it brings the transmittance of pixels to a half or less.
-fn note_owner(list_index: u32, before: vec4f, after: vec4f, counts: vec4<bool>) {
-    let halves = counts & (before > vec4f(0.5)) & (after <= vec4f(0.5));
-    halved_by = select(halved_by, vec4u(list_index + 1u), halves);
-}
-
-// Takes over what another kernel has recorded.
-fn set_owners(list_indices: vec4u) {
-    halved_by = list_indices;
-}
 
 // The instances of four pixels: 0 none, 1 the twin, k + 2 actor k.
 fn instances() -> vec4u {

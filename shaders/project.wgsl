@@ -11,6 +11,7 @@
 #import constants
 #import layout
 #import math
+#import splat_slot
 #import ACTORS
 #import PROJECTION
 
@@ -28,9 +29,6 @@ override SH_DEGREE: u32;
 @group(0) @binding(9) var<storage, read_write> colors: array<SplatColor>;
 @group(0) @binding(10) var<storage, read_write> keys: array<u32>;
 @group(0) @binding(11) var<storage, read_write> splat_indices: array<u32>;
-
-const MASK_WORDS: u32 = CLUSTER / 32;
-const INVISIBLE: u32 = 0xffffffffu;
 
 var<workgroup> mask: array<atomic<u32>, MASK_WORDS>;
 
@@ -95,21 +93,6 @@ fn project(
     let depth = bitcast<u32>(max(projected.depth_m, frame.near_m)) - bitcast<u32>(frame.near_m);
     keys[slot] = (index_of_view(chunk_view) << DEPTH_BITS) | min(depth, (1u << DEPTH_BITS) - 1u);
     splat_indices[slot] = slot;
-}
-
-// The index of a Gaussian's splat, or `INVISIBLE`: by the decision of `cull`, even where this pipeline rounds
-// differently.
-fn splat_slot(cluster_view_index: u32, thread: u32) -> u32 {
-    let own_word = visible[cluster_view_index * MASK_WORDS + thread / 32u];
-    let own_bit = 1u << (thread % 32u);
-    if (own_word & own_bit) == 0u {
-        return INVISIBLE;
-    }
-    var slot = offsets[cluster_view_index] + countOneBits(own_word & (own_bit - 1u));
-    for (var word = 0u; word < thread / 32u; word++) {
-        slot += countOneBits(visible[cluster_view_index * MASK_WORDS + word]);
-    }
-    return slot;
 }
 
 // A splat, and the inputs of its key and its colour.

@@ -13,9 +13,8 @@
 //
 // Tiles with long lists are blended by `rasterize_long.wgsl`: `main` leaves them out, and `finish` writes their pixels.
 //
-// `BACKGROUND` stands for `background.wgsl` or `no_background.wgsl`, and `INSTANCES` for `instances.wgsl` or
-// `no_instances.wgsl`. Twin of
-// `src/render/cpu/rasterize.rs`.
+// `BACKGROUND` stands for `background.wgsl` or `no_background.wgsl`, and `INSTANCES` for `instances.wgsl`,
+// `owners.wgsl` or `no_instances.wgsl`. Twin of `src/render/cpu/rasterize.rs`.
 
 #import constants
 #import layout

@@ -2,7 +2,7 @@
 // `rasterize`, so that the sums stay in registers.
 //
 // The output is tile after tile, and within a tile one plane of 256 values after another, in this order
-// and only if requested: red, green and blue of 8 bits, then red, green, blue, opacity, depth, instance. Twin of
+// and only if requested: red, green and blue of 8 bits, then red, green, blue, opacity, depth, owner. Twin of
 // `src/render/cpu/resolve.rs`.
 
 override RGB8: bool;

@@ -15,6 +15,7 @@
 //! 3. For each LiDAR `lidar/<name>/row`, `lidar/<name>/column` and `lidar/<name>/instance`, u16
 //!    `[n]`.
 //!    If requested, for each image `camera/<name>/instances`, u16.
+//!    If requested, for each image `camera/<name>/semantics`, u8.
 //! 4. For each image `camera/<name>/rgb`, u8.
 //! 5. If requested, earlier frames: `camera/<name>/history/<back>/rgb`, u8.
 //!
@@ -279,8 +280,8 @@ pub struct Image {
     /// Number of this camera's frames since this one. 0, and therefore absent, in `images`.
     #[serde(default, skip_serializing_if = "is_now")]
     pub back: u64,
-    /// Name of the colour tensor. The names of the other tensors have `depth`, `opacity`, `normals`
-    /// or `instances` in place of its final `rgb`.
+    /// Name of the colour tensor. The names of the other tensors have `depth`, `opacity`,
+    /// `normals`, `instances` or `semantics` in place of its final `rgb`.
     pub tensor: String,
     /// Encoding of the colour image.
     pub encoding: Encoding,
@@ -405,8 +406,8 @@ pub enum SensorReason {
     Dirt,
 }
 
-/// What became of an image in a session that asked for repair. Depth, opacity, normals and
-/// instances stay those of the scene.
+/// What became of an image in a session that asked for repair. Depth, opacity, normals,
+/// instances and classes stay those of the scene.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct ImageRepair {

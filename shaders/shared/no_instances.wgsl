@@ -1,4 +1,4 @@
-// Frames without instance ids. The other choice of `INSTANCES` is `instances.wgsl`.
+// Frames without instance ids and classes. The other choices of `INSTANCES` are `instances.wgsl` and `owners.wgsl`.
 
 const INSTANCE_PLANES: u32 = 0u;
 

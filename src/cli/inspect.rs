@@ -71,6 +71,10 @@ fn summary(
     let record = manifest.record;
     let bits = record.bits(manifest.sh_degree);
     writeln!(out, "record      {record}, {bits} bits per Gaussian before compression")?;
+    if manifest.has_classes() {
+        let labelled = manifest.chunks.iter().filter(|chunk| chunk.classes).count();
+        writeln!(out, "classes     in {labelled} of {chunks}")?;
+    }
     let sections = || manifest.chunks.iter().flat_map(|chunk| &chunk.sections);
     let count = sections().count();
     let max_level = sections().map(|section| section.level).max().unwrap_or(0);

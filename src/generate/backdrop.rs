@@ -5,6 +5,7 @@ use glam::{DMat3, DQuat, DVec3};
 use super::random::{Random, noise, smooth};
 use super::route::Route;
 use super::surface::{Paint, Painter};
+use wildcity_scene::SemanticClass;
 
 /// Extent of the land, in metres.
 const LAND_TO_M: f64 = 560.0;
@@ -14,8 +15,8 @@ const LAND_FROM_M: f64 = 27.0;
 /// Paints the whole background around the middle of the street.
 pub(super) fn paint(painter: &mut Painter, route: &Route, seed: u64) {
     let middle_m = route.at(0.5 * route.driven_m[1]).point_m;
-    skyline(painter, middle_m, seed);
-    land(painter, route, middle_m, seed);
+    painter.labelled(SemanticClass::Building, |painter| skyline(painter, middle_m, seed));
+    painter.labelled(SemanticClass::Terrain, |painter| land(painter, route, middle_m, seed));
 }
 
 /// Roofs and towers in the haze.

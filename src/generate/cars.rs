@@ -6,6 +6,7 @@ use super::car_kinds::{HATCHBACK, Kind, SEDAN, VAN, WAGON};
 use super::light::Occluder;
 use super::random::{Random, smooth};
 use super::surface::{Paint, Painter};
+use wildcity_scene::SemanticClass;
 
 /// Height of the sills, in metres.
 const SILL_M: f64 = 0.24;
@@ -100,7 +101,8 @@ impl Car {
 
     fn paint_all(&self, painter: &mut Painter) {
         self.paint_body(painter);
-        self.shade_below(painter);
+        // It darkens the ground.
+        painter.labelled(SemanticClass::Road, |painter| self.shade_below(painter));
         self.inside(painter);
     }
 

@@ -190,7 +190,7 @@ fn paint(planned: &[Plan], at: usize, density: f64) -> Gaussians {
     // At most one street to each side: a shadow is no longer than a house is high.
     let near = &planned[at.saturating_sub(1)..planned.len().min(at + 2)];
     let light = Light::new(near.iter().flat_map(Plan::occluders).collect());
-    let mut painter = Painter::new(&light, density);
+    let mut painter = Painter::new(&light, density).with_classes();
     planned[at].paint(&mut painter);
     painter.gaussians
 }

@@ -5,6 +5,7 @@ use glam::DVec3;
 use super::plants;
 use super::random::Random;
 use super::surface::{Paint, Painter, Patch};
+use wildcity_scene::SemanticClass;
 
 const STEEL: Paint = Paint::matt(0.36, 0.38, 0.39);
 
@@ -17,13 +18,17 @@ pub(super) fn lamp(painter: &mut Painter, foot_m: DVec3, towards_road: DVec3) {
     pole(painter, [top_m, head_m], 0.035, STEEL);
     let along = towards_road.cross(DVec3::Z);
     // The lamp's head hangs over the road.
-    block(painter, head_m + 0.30 * towards_road, along, DVec3::new(0.13, 0.34, 0.09), STEEL);
+    let head_size_m = DVec3::new(0.13, 0.34, 0.09);
     let glow = Patch {
         center_m: head_m + 0.30 * towards_road - 0.012 * DVec3::Z,
         edge_u_m: 0.5 * towards_road,
         edge_v_m: 0.2 * along,
     };
-    painter.patch(&glow, Paint::glowing(0.97, 0.95, 0.86));
+    // A lamp belongs to its pole.
+    painter.labelled(SemanticClass::Pole, |painter| {
+        block(painter, head_m + 0.30 * towards_road, along, head_size_m, STEEL);
+        painter.patch(&glow, Paint::glowing(0.97, 0.95, 0.86));
+    });
 }
 
 /// A traffic light on a pole; its lamps look along `facing`. `green` or red is on.
@@ -33,33 +38,38 @@ pub(super) fn traffic_light(painter: &mut Painter, foot_m: DVec3, facing: DVec3,
     // From top to bottom: red, yellow, green.
     let dark = Paint::matt(0.11, 0.12, 0.12);
     let base_m = foot_m + 2.45 * DVec3::Z + 0.17 * facing;
-    block(painter, base_m, right, DVec3::new(0.16, 0.13, 0.98), dark);
+    let size_m = DVec3::new(0.16, 0.13, 0.98);
     let lamps = [
         (0.80, if green { Paint::matt(0.25, 0.06, 0.06) } else { Paint::glowing(1.0, 0.16, 0.10) }),
         (0.49, Paint::matt(0.30, 0.22, 0.05)),
         (0.18, if green { Paint::glowing(0.20, 1.0, 0.55) } else { Paint::matt(0.04, 0.22, 0.12) }),
     ];
-    for (height_m, paint) in lamps {
-        let center_m = base_m + height_m * DVec3::Z + 0.15 * facing;
-        disc(painter, center_m, facing, 0.105, |_| paint);
-    }
+    painter.labelled(SemanticClass::TrafficLight, |painter| {
+        block(painter, base_m, right, size_m, dark);
+        for (height_m, paint) in lamps {
+            let center_m = base_m + height_m * DVec3::Z + 0.15 * facing;
+            disc(painter, center_m, facing, 0.105, |_| paint);
+        }
+    });
 }
 
 /// A round sign on a pole: white in a red ring.
 pub(super) fn sign(painter: &mut Painter, foot_m: DVec3, facing: DVec3) {
     pole(painter, [foot_m, foot_m + 2.75 * DVec3::Z], 0.035, STEEL.times(1.3));
     let center_m = foot_m + 2.5 * DVec3::Z;
-    disc(painter, center_m + 0.05 * facing, facing, 0.31, |r| {
-        if r > 0.72 { Paint::matt(0.80, 0.10, 0.11) } else { Paint::matt(0.93, 0.93, 0.92) }
+    painter.labelled(SemanticClass::TrafficSign, |painter| {
+        disc(painter, center_m + 0.05 * facing, facing, 0.31, |r| {
+            if r > 0.72 { Paint::matt(0.80, 0.10, 0.11) } else { Paint::matt(0.93, 0.93, 0.92) }
+        });
+        disc(painter, center_m - 0.05 * facing, -facing, 0.31, |_| Paint::matt(0.55, 0.56, 0.57));
     });
-    disc(painter, center_m - 0.05 * facing, -facing, 0.31, |_| Paint::matt(0.55, 0.56, 0.57));
 }
 
 /// A litter bin.
 pub(super) fn bin(painter: &mut Painter, foot_m: DVec3) {
     let green = Paint::matt(0.17, 0.30, 0.24);
-    pole(painter, [foot_m, foot_m + 0.85 * DVec3::Z], 0.21, green);
-    pole(painter, [foot_m + 0.85 * DVec3::Z, foot_m + 0.95 * DVec3::Z], 0.23, green.times(0.6));
+    tube(painter, [foot_m, foot_m + 0.85 * DVec3::Z], 0.21, green);
+    tube(painter, [foot_m + 0.85 * DVec3::Z, foot_m + 0.95 * DVec3::Z], 0.23, green.times(0.6));
 }
 
 /// A short post that keeps cars off the pavement.
@@ -81,11 +91,18 @@ pub(super) fn planter(
     let concrete = Paint::matt(0.62, 0.61, 0.58);
     block(painter, base_m, along, DVec3::new(half_m, 0.32, 0.5), concrete);
     let size_m = DVec3::new(half_m - 0.05, 0.30, 0.75);
-    plants::hedge(painter, base_m + 0.42 * DVec3::Z, along, size_m, random);
+    painter.labelled(SemanticClass::Vegetation, |painter| {
+        plants::hedge(painter, base_m + 0.42 * DVec3::Z, along, size_m, random);
+    });
 }
 
 /// A round pole from end to end.
 fn pole(painter: &mut Painter, ends_m: [DVec3; 2], radius_m: f64, paint: Paint) {
+    painter.labelled(SemanticClass::Pole, |painter| tube(painter, ends_m, radius_m, paint));
+}
+
+/// The surface of a cylinder without its ends.
+fn tube(painter: &mut Painter, ends_m: [DVec3; 2], radius_m: f64, paint: Paint) {
     let axis = (ends_m[1] - ends_m[0]).normalize();
     let (side, front) = axis.any_orthonormal_pair();
     // Six cells around at the usual spacing: TAU/1.05.

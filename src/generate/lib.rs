@@ -17,7 +17,8 @@
 //! | lamps, lights, signs, bins, planters | 15 | 4 to 40 cm |
 //! | skyline, land | 6 | 4.5 m, wider with the distance |
 //!
-//! Behind them is a sky of its own ([`SKY`]).
+//! Behind them is a sky of its own ([`SKY`]). Every Gaussian of a street has a class; the models of
+//! actors have none, since an actor says what it is.
 
 mod actors;
 mod backdrop;
@@ -51,7 +52,7 @@ use wildcity_scene::{Gaussians, Trajectory};
 use wildcity_sim::map::MapFile;
 
 /// Counts the generator's changes: a demo twin of another revision is built again.
-pub const REVISION: u32 = 3;
+pub const REVISION: u32 = 4;
 
 /// The sky over the streets, as safetensors: a clear day with the sun where their light comes from.
 /// Made by `scenes/sky.py`; world axes.

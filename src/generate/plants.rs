@@ -5,6 +5,7 @@ use glam::{DQuat, DVec3};
 use super::light::Occluder;
 use super::random::{Random, noise};
 use super::surface::{Paint, Painter};
+use wildcity_scene::SemanticClass;
 
 /// A street tree, not yet painted.
 #[derive(Clone, Debug)]
@@ -48,7 +49,7 @@ impl Tree {
             let tip_m = 0.55 * self.crown_m * DVec3::new(cos, sin, 1.6);
             stem(painter, [top_m - 0.3 * DVec3::Z, top_m + tip_m], [0.08, 0.03], bark);
         }
-        self.pit(painter);
+        painter.labelled(SemanticClass::Terrain, |painter| self.pit(painter));
 
         let green = random.pick(&[
             Paint::matt(0.44, 0.56, 0.24),

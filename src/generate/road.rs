@@ -5,6 +5,7 @@ use glam::DVec3;
 use super::random::{Random, noise, smooth};
 use super::route::{Route, Station};
 use super::surface::{Paint, Painter};
+use wildcity_scene::SemanticClass;
 
 /// Half width of the two lanes together, in metres: twice 3.6 m.
 pub(super) const LANES_M: f64 = 3.6;
@@ -216,14 +217,21 @@ impl Ground<'_> {
             let tint = self.asphalt(s_m, 3.0 * t_m).times(0.93);
             Some(tint.times(1.0 - 0.15 * gutter).open(1.0 - 0.25 * gutter))
         });
+        painter.labelled(SemanticClass::Sidewalk, |painter| {
+            self.kerb(painter, side, from_s_m, to_s_m);
+            self.slabs(painter, side, from_s_m, to_s_m);
+        });
+    }
 
+    /// The kerb stones of one side.
+    fn kerb(&self, painter: &mut Painter, side: f64, from_s_m: f64, to_s_m: f64) {
         let stone = |s_m: f64| {
             let tone = noise(self.seed + 7, s_m.floor(), side);
             Paint::matt(0.66, 0.65, 0.63).times(1.0 + 0.06 * tone)
         };
         let top_m = [KERB_M, KERB_M + 0.5 * KERB_STONE_M, KERB_M + KERB_STONE_M];
         let stones = painter.even(from_s_m, to_s_m, 0.5);
-        self.flat(painter, &stones, &side_of(top_m.to_vec()), PAVEMENT_M, |s_m, _| {
+        self.flat(painter, &stones, &oriented(side, top_m.to_vec()), PAVEMENT_M, |s_m, _| {
             Some(stone(s_m))
         });
         // The kerb faces the road.
@@ -234,7 +242,6 @@ impl Ground<'_> {
             |s_m, z_m| self.route.at(s_m * side).beside(side * KERB_M, z_m),
             |s_m, z_m| Some(stone(s_m * side).times(0.9).open(0.6 + 3.0 * z_m)),
         );
-        self.slabs(painter, side, from_s_m, to_s_m);
     }
 
     /// The pavement: slabs in slightly different tones with dark joints.
@@ -294,26 +301,28 @@ impl Ground<'_> {
         stretch(24.0, SIDE_REACH_M, 1.8);
 
         // Kerb and pavement along the side street, from the main street's pavement on.
-        painter.coarser(1.5, |painter| {
-            for edge in [-1.0, 1.0] {
-                let xs = painter.even(KERB_M, SIDE_REACH_M, 0.6);
-                let top = [SIDE_LANES_M, SIDE_LANES_M + KERB_STONE_M];
-                let kerb = Paint::matt(0.66, 0.65, 0.63);
-                let flat = |x_m: f64, y_m: f64| place(x_m, y_m, PAVEMENT_M);
-                painter.sheet(&xs, &oriented(edge, top.to_vec()), flat, |_, _| Some(kerb));
-                let face = |x_m: f64, z_m: f64| place(edge * x_m, edge * SIDE_LANES_M, z_m);
-                painter.sheet(&oriented(edge, xs), &[0.0, PAVEMENT_M], face, |_, _| {
-                    Some(kerb.times(0.9).open(0.7))
-                });
-                let xs = painter.even(FRONT_M, SIDE_REACH_M, 0.5);
-                let ys = painter.even(SIDE_LANES_M + KERB_STONE_M, SIDE_FRONT_M, 0.4);
-                painter.sheet(&xs, &oriented(edge, ys), flat, |x_m, y_m| {
-                    let tone = noise(self.seed + 11, 1.4 * x_m, 1.4 * y_m);
-                    let wall = smooth((SIDE_FRONT_M - y_m.abs()) / 0.8);
-                    let slab = Paint::matt(0.590, 0.575, 0.550).times(1.0 + 0.05 * tone);
-                    Some(slab.open(0.75 + 0.25 * wall))
-                });
-            }
+        painter.labelled(SemanticClass::Sidewalk, |painter| {
+            painter.coarser(1.5, |painter| {
+                for edge in [-1.0, 1.0] {
+                    let xs = painter.even(KERB_M, SIDE_REACH_M, 0.6);
+                    let top = [SIDE_LANES_M, SIDE_LANES_M + KERB_STONE_M];
+                    let kerb = Paint::matt(0.66, 0.65, 0.63);
+                    let flat = |x_m: f64, y_m: f64| place(x_m, y_m, PAVEMENT_M);
+                    painter.sheet(&xs, &oriented(edge, top.to_vec()), flat, |_, _| Some(kerb));
+                    let face = |x_m: f64, z_m: f64| place(edge * x_m, edge * SIDE_LANES_M, z_m);
+                    painter.sheet(&oriented(edge, xs), &[0.0, PAVEMENT_M], face, |_, _| {
+                        Some(kerb.times(0.9).open(0.7))
+                    });
+                    let xs = painter.even(FRONT_M, SIDE_REACH_M, 0.5);
+                    let ys = painter.even(SIDE_LANES_M + KERB_STONE_M, SIDE_FRONT_M, 0.4);
+                    painter.sheet(&xs, &oriented(edge, ys), flat, |x_m, y_m| {
+                        let tone = noise(self.seed + 11, 1.4 * x_m, 1.4 * y_m);
+                        let wall = smooth((SIDE_FRONT_M - y_m.abs()) / 0.8);
+                        let slab = Paint::matt(0.590, 0.575, 0.550).times(1.0 + 0.05 * tone);
+                        Some(slab.open(0.75 + 0.25 * wall))
+                    });
+                }
+            });
         });
     }
 

@@ -10,6 +10,7 @@ use super::road::{self, FRONT_M, KERB_M, LANE_T_M, PAVEMENT_M};
 use super::route::Route;
 use super::surface::Painter;
 use super::{Street, StreetSettings, backdrop};
+use wildcity_scene::SemanticClass;
 
 /// Middle of the parking bays, in metres from the centre line.
 const BAY_T_M: f64 = 4.78;
@@ -26,7 +27,7 @@ pub(super) fn build(settings: &StreetSettings) -> Street {
     let StreetSettings { seed, length_m, crossing_m, density } = *settings;
     let plan = Plan::new(Route::new(length_m), crossing_m, [seed; 2]);
     let light = Light::new(plan.occluders().collect());
-    let mut painter = Painter::new(&light, density);
+    let mut painter = Painter::new(&light, density).with_classes();
     // The backdrop belongs to a street by itself; streets of a city have none.
     plan.paint(&mut painter);
     backdrop::paint(&mut painter, &plan.route, seed);
@@ -70,17 +71,21 @@ impl Plan {
     }
 
     pub(super) fn paint(&self, painter: &mut Painter) {
-        road::paint(painter, &self.route, self.crossing_m, [self.grain_seed, self.seed]);
-        for building in &self.buildings {
-            building.paint(painter);
-        }
-        for car in &self.cars {
-            car.paint(painter);
-        }
-        for tree in &self.trees {
-            tree.paint(painter);
-        }
-        furnish(painter, &self.route, self.crossing_m, self.seed);
+        painter.labelled(SemanticClass::Road, |painter| {
+            road::paint(painter, &self.route, self.crossing_m, [self.grain_seed, self.seed]);
+        });
+        painter.labelled(SemanticClass::Building, |painter| {
+            self.buildings.iter().for_each(|building| building.paint(painter));
+        });
+        painter.labelled(SemanticClass::Car, |painter| {
+            self.cars.iter().for_each(|car| car.paint(painter));
+        });
+        painter.labelled(SemanticClass::Vegetation, |painter| {
+            self.trees.iter().for_each(|tree| tree.paint(painter));
+        });
+        painter.labelled(SemanticClass::Static, |painter| {
+            furnish(painter, &self.route, self.crossing_m, self.seed);
+        });
     }
 }
 

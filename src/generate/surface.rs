@@ -2,7 +2,7 @@
 
 use glam::{DMat3, DQuat, DVec3};
 
-use wildcity_scene::{Gaussians, sh};
+use wildcity_scene::{Gaussians, SemanticClass, sh};
 
 use super::light::Light;
 
@@ -76,6 +76,8 @@ pub(super) struct Painter<'a> {
     /// The Gaussians that have been painted; SH degree 1.
     pub(super) gaussians: Gaussians,
     light: &'a Light,
+    /// The class of what is painted next; `None` on a canvas without classes.
+    class: Option<SemanticClass>,
     /// Spacing of everything, as a factor: above 1 is coarser.
     spacing: f64,
     /// Factor on the numbers of cells that do not follow the spacing, such as those around a wheel.
@@ -88,9 +90,17 @@ impl<'a> Painter<'a> {
         Self {
             gaussians: Gaussians { sh_degree: 1, ..Gaussians::default() },
             light,
+            class: None,
             spacing: 1.0 / density.sqrt(),
             detail: 1,
         }
+    }
+
+    /// This canvas with classes, for a street. Objects that move have the classes of actors.
+    pub(super) fn with_classes(mut self) -> Self {
+        self.gaussians.classes = Some(Vec::new());
+        self.class = Some(SemanticClass::Unlabelled);
+        self
     }
 
     /// A canvas for an object that is seen from near by, with `detail` times as many cells along
@@ -121,6 +131,14 @@ impl<'a> Painter<'a> {
         self.spacing *= factor;
         draw(self);
         self.spacing = spacing;
+    }
+
+    /// Paints what `draw` paints as Gaussians of a class, if the canvas has classes.
+    pub(super) fn labelled(&mut self, class: SemanticClass, draw: impl FnOnce(&mut Self)) {
+        let around = self.class;
+        self.class = around.map(|_| class);
+        draw(self);
+        self.class = around;
     }
 
     /// `from` to `to` in steps of about `step_m`, as break points.
@@ -236,6 +254,9 @@ impl<'a> Painter<'a> {
         // The inverse of 0.5 + C0 c.
         let dc = (rgb - 0.5) / sh::C0;
         let out = &mut self.gaussians;
+        if let (Some(classes), Some(class)) = (&mut out.classes, self.class) {
+            classes.push(class);
+        }
         out.means_m.push(mean_m.to_array());
         let DQuat { x, y, z, w } = rotation;
         out.quats_wxyz.push([w, x, y, z].map(|c| c as f32));

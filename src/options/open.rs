@@ -429,6 +429,10 @@ pub struct Outputs {
     /// absent, false.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub instances: Option<bool>,
+    /// Whether to add `semantics`, u8 `[height, width]`: the class of the Gaussian that each pixel
+    /// shows. If absent, false.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub semantics: Option<bool>,
     /// Number of last frames of each camera that an observation holds. If absent, 1.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(range(min = 1, max = 16)))]
@@ -458,6 +462,7 @@ impl Outputs {
             opacity: false,
             normals: None,
             instances: None,
+            semantics: None,
             frames: None,
             trust: None,
             actors: None,

@@ -146,6 +146,7 @@ fn is_refused_content(error: &StoreError) -> bool {
         | StoreError::NoActor { .. }
         | StoreError::ActorDamaged { .. }
         | StoreError::NothingToCut { .. }
+        | StoreError::NothingToLabel
         | StoreError::GarbageCollected { .. }
         | StoreError::Leased { .. }
         | StoreError::Damaged { .. }

@@ -208,6 +208,7 @@ mod tests {
             ln_scales: vec![[0.0; 3], [0.0, -1.0, 1.0]],
             logit_opacities: vec![0.0, 100.0],
             sh: vec![0.0; 6],
+            ..Gaussians::default()
         };
         let ranges = Ranges::from_gaussians(&gaussians).unwrap();
         assert_eq!(ranges.mean_m, [[-1.0, -2.0, 0.0], [1.0, 5.0, 3.0]]);

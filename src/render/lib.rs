@@ -44,7 +44,7 @@ use wildcity_scene::appearance::Appearance;
 use wildcity_scene::geometry::camera::FieldMask;
 use wildcity_scene::geometry::{Camera, Lidar};
 use wildcity_scene::sky::{CubeMap, DrawableSky, SkyError};
-use wildcity_scene::{Rays, RenderProfile, Rig, Scene, Selection};
+use wildcity_scene::{Chunk, Rays, RenderProfile, Rig, Scene, Selection, SemanticClass};
 
 use crate::gradient::Differentiate;
 use crate::lidar::{LidarView, Sweep};
@@ -91,6 +91,10 @@ pub struct Target<'a> {
     /// `[height, width]`: owner of the Gaussian that brings the transmittance to a half or less: 0
     /// none, [`TWIN_INSTANCE`] the twin, and `k` + [`FIRST_ACTOR_INSTANCE`] actor `k`.
     pub instances: Option<&'a mut [u16]>,
+    /// `[height, width]`: the class ([`SemanticClass`]) of the Gaussian that `instances` is the
+    /// owner of; [`SemanticClass::None`], which is 0, where there is none. A Gaussian of an actor
+    /// without a class of its own has that of the actor ([`PlacedChunk::class`]).
+    pub semantics: Option<&'a mut [u8]>,
     /// The camera's exposure and overlay, applied to `rgba` and `rgb8`.
     pub appearance: Option<&'a Appearance>,
 }
@@ -116,6 +120,9 @@ impl Target<'_> {
         if let Some(instances) = &mut self.instances {
             field.clear_outside(camera, 1, instances);
         }
+        if let Some(semantics) = &mut self.semantics {
+            field.clear_outside(camera, 1, semantics);
+        }
         // Normals are missing here: they are computed from masked depths.
         for (values, image) in [(4, &mut self.rgba), (1, &mut self.depth_m), (1, &mut self.opacity)]
         {
@@ -124,6 +131,11 @@ impl Target<'_> {
             }
         }
     }
+}
+
+/// The class of a Gaussian of a chunk, given the class of those that have none.
+pub(crate) fn gaussian_class(chunk: &Chunk, index: usize, default: SemanticClass) -> SemanticClass {
+    chunk.classes().map_or(default, |classes| classes[index].or(default))
 }
 
 /// Called once per view from a worker thread, with the view's index, as soon as its pixels are
@@ -369,6 +381,7 @@ impl Frame<'_> {
                 ("opacity", target.opacity.as_ref().map(|b| b.len()), pixels),
                 ("normals", target.normals.as_ref().map(|b| b.len()), 3 * pixels),
                 ("instances", target.instances.as_ref().map(|b| b.len()), pixels),
+                ("semantics", target.semantics.as_ref().map(|b| b.len()), pixels),
             ];
             if target.normals.is_some() && target.depth_m.is_none() {
                 return Err(RenderError::Normals { view });

@@ -8,6 +8,7 @@
 //! idea is Vello's "CPU up to a stage".)
 
 use super::layout::Splat;
+use wildcity_scene::SemanticClass;
 
 /// A stage with an output for the next one. The last stage, rasterize, produces pixels instead.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -44,7 +45,8 @@ pub struct StageOutputs {
     /// Output of sort: indices of splats in order of their keys, equal keys in order of indices.
     pub order: Option<Vec<u32>>,
     pub tiles: Option<TileLists>,
-    /// Output of project: the owners of the splats, for instance ids, in order of `first_splat`.
+    /// Output of project: the owners of the splats, for instance ids and classes, in order of
+    /// `first_splat`.
     /// Empty on the gpu backend.
     pub owners: Vec<SplatOwner>,
 }
@@ -56,6 +58,8 @@ pub struct SplatOwner {
     pub first_splat: u32,
     /// As in [`Target::instances`](crate::Target::instances).
     pub instance: u16,
+    /// As in [`Target::semantics`](crate::Target::semantics).
+    pub class: SemanticClass,
 }
 
 /// The lists of splats of all tiles.

@@ -23,7 +23,7 @@ use wildcity_scene::geometry::camera::{
     Bivariate, Fisheye, Lens, ShutterDirection, Windshield, WindshieldReference,
 };
 use wildcity_scene::sky::{CubeMap, Layer, Network, SkyModel};
-use wildcity_scene::{Chunk, Gaussians, RenderProfile, Scene, Sky, lod};
+use wildcity_scene::{Chunk, Gaussians, RenderProfile, Scene, SemanticClass, Sky, lod};
 
 /// Counts of the street with one feature.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -103,7 +103,7 @@ const fn feature(name: &'static str, add: fn(&mut Step)) -> Feature {
     Feature { name, add }
 }
 
-const FEATURES: [Feature; 22] = [
+const FEATURES: [Feature; 24] = [
     feature("nothing else", |_| {}),
     // The same colours with more coefficients: only memory and traffic may change, not the image.
     feature("SH degree 1", |step| step.scene = Scene::from_gaussians(&street(1))),
@@ -159,6 +159,12 @@ const FEATURES: [Feature; 22] = [
         step.view.readout = Some(ShutterDirection::TopToBottom);
     }),
     feature("instance ids", |step| step.instances = true),
+    // A scene that has classes, without a target for them.
+    feature("classes", Step::set_classes),
+    feature("semantics", |step| {
+        step.set_classes();
+        step.semantics = true;
+    }),
     // The host computes the trust from the opacity.
     feature("trust", |step| step.opacity = true),
     // Only a trainer asks for them.
@@ -240,6 +246,7 @@ struct Step {
     opacity: bool,
     normals: bool,
     instances: bool,
+    semantics: bool,
     gradients: bool,
 }
 
@@ -256,6 +263,7 @@ impl Step {
             opacity: false,
             normals: false,
             instances: false,
+            semantics: false,
             gradients: false,
         }
     }
@@ -292,6 +300,13 @@ impl Step {
         }
     }
 
+    fn set_classes(&mut self) {
+        for chunk in &mut self.scene.chunks {
+            let classes = vec![SemanticClass::Building; chunk.len()];
+            *chunk = Arc::new(Chunk::clone(chunk).with_classes(Some(classes)));
+        }
+    }
+
     fn set_sky(&mut self, model: SkyModel) {
         self.scene.sky = Some(Arc::new(Sky::new(model, DMat3::IDENTITY)));
     }
@@ -302,7 +317,7 @@ impl Step {
         let device = device.map(|gpu| self.device_counts(&gpu)).transpose()?.flatten();
         let gaussians = self.scene.gaussians() as u64;
         // Requested planes as 0 or 1, for the sum of their bytes.
-        let ids = u64::from(self.instances);
+        let ids = 2 * u64::from(self.instances) + u64::from(self.semantics);
         let floats = u64::from(self.depth) + u64::from(self.opacity) + 3 * u64::from(self.normals);
         let sky_bytes = sky_bytes(&self.scene, &self.profile)?;
         let hood_bytes = self.appearance.overlay.as_ref().map_or(0, |hood| hood.rgba8().len());
@@ -310,9 +325,10 @@ impl Step {
             gaussians,
             host_bytes_per_gaussian: self.scene.bytes() as f64 / gaussians as f64,
             other_host_bytes: sky_bytes + hood_bytes as u64,
-            // 8-bit colour, u16 for instance ids, and f32 for the other outputs. Gradients take
-            // colour and opacity, the derivatives by them, and 24 B that each tile keeps.
-            host_bytes_per_pixel: if self.gradients { 56 } else { 3 + 2 * ids + 4 * floats },
+            // 8-bit colour, u16 for instance ids, u8 for classes, and f32 for the other outputs.
+            // Gradients take colour and opacity, the derivatives by them, and 24 B that each tile
+            // keeps.
+            host_bytes_per_pixel: if self.gradients { 56 } else { 3 + ids + 4 * floats },
             evaluations,
             device,
         })
@@ -353,12 +369,14 @@ impl Step {
         let mut opacity = plane(self.opacity, 1);
         let mut normals = plane(self.normals, 3);
         let mut instances = self.instances.then(|| vec![0; pixels]);
+        let mut semantics = self.semantics.then(|| vec![0; pixels]);
         let target = Target {
             rgb8: Some(&mut rgb8),
             depth_m: depth_m.as_deref_mut(),
             opacity: opacity.as_deref_mut(),
             normals: normals.as_deref_mut(),
             instances: instances.as_deref_mut(),
+            semantics: semantics.as_deref_mut(),
             // A backend gets no appearance at all if it would change nothing: that row has
             // to cost nothing.
             appearance: (!self.appearance.is_identity()).then_some(&self.appearance),

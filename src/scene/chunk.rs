@@ -23,7 +23,7 @@ use super::actor::PlacedChunk;
 use super::geometry::Pose;
 use super::pages::{LanePages, Page};
 use super::validate::{LN_SCALE, MAX_SH};
-use super::{Gaussians, Selection, Sky, ViewSet, sh};
+use super::{Gaussians, Selection, SemanticClass, Sky, ViewSet, sh};
 
 pub use super::pages::{CLUSTER, LANES, Lanes};
 
@@ -142,6 +142,8 @@ pub struct Chunk {
     count: usize,
     lanes: LanePages,
     clusters: Vec<Cluster>,
+    /// One per Gaussian, if the section has classes.
+    classes: Option<Box<[SemanticClass]>>,
 }
 
 impl Chunk {
@@ -151,7 +153,7 @@ impl Chunk {
         let mut lanes = LanePages::new(columns(sh_degree), None);
         lanes.expect(capacity.div_ceil(LANES));
         let clusters = Vec::with_capacity(capacity.div_ceil(CLUSTER));
-        Self { cell, origin_m, sh_degree, count: 0, lanes, clusters }
+        Self { cell, origin_m, sh_degree, count: 0, lanes, clusters, classes: None }
     }
 
     /// A chunk from columns that are already laid out.
@@ -175,7 +177,18 @@ impl Chunk {
         for (index, lanes) in lanes.clusters_mut().iter_mut().enumerate() {
             clusters.push(bounded(lanes, width, count - CLUSTER * index));
         }
-        Self { cell, origin_m, sh_degree, count, lanes, clusters }
+        Self { cell, origin_m, sh_degree, count, lanes, clusters, classes: None }
+    }
+
+    /// The chunk with a class for each of its Gaussians, or without classes.
+    ///
+    /// # Panics
+    /// If there is not one class for each Gaussian.
+    pub fn with_classes(mut self, classes: Option<Vec<SemanticClass>>) -> Self {
+        let is_whole = classes.as_ref().is_none_or(|classes| classes.len() == self.count);
+        assert!(is_whole, "classes of another number of Gaussians");
+        self.classes = classes.map(Vec::into_boxed_slice);
+        self
     }
 
     /// Writes Gaussians anew in place, as a trainer does after each step: cluster by cluster, in
@@ -289,6 +302,11 @@ impl Chunk {
         self.count == 0
     }
 
+    /// The class of each Gaussian; `None` without classes.
+    pub fn classes(&self) -> Option<&[SemanticClass]> {
+        self.classes.as_deref()
+    }
+
     /// The clusters, in order; cluster `k` holds Gaussians `256 k` to `256 k + 255`.
     pub fn clusters(&self) -> &[Cluster] {
         &self.clusters
@@ -346,10 +364,12 @@ impl Chunk {
             let coefficients = (0..count).map(|k| value(column::SH + k));
             gaussians.sh.extend(coefficients.map(|c| c.clamp(-MAX_SH, MAX_SH)));
         }
+        gaussians.classes = self.classes().map(<[_]>::to_vec);
         gaussians
     }
 
-    /// Memory that a chunk of `count` Gaussians of an SH degree needs, in bytes.
+    /// Memory that a chunk of `count` Gaussians of an SH degree needs, in bytes, without classes:
+    /// these take a byte each in addition.
     pub fn needed_bytes(sh_degree: u8, count: u64) -> u64 {
         let lanes = count.div_ceil(LANES as u64) * columns(sh_degree) as u64;
         let clusters = count.div_ceil(CLUSTER as u64);
@@ -359,7 +379,8 @@ impl Chunk {
 
     /// Memory that this chunk has allocated, in bytes.
     pub fn bytes(&self) -> usize {
-        self.lanes.bytes() + self.clusters.capacity() * size_of::<Cluster>()
+        let classes = self.classes.as_ref().map_or(0, |classes| size_of_val(&**classes));
+        self.lanes.bytes() + self.clusters.capacity() * size_of::<Cluster>() + classes
     }
 }
 
@@ -616,6 +637,7 @@ fn spread(x: u64) -> u64 {
 ///     ln_scales: vec![[-3.0; 3]; 2],
 ///     logit_opacities: vec![2.0; 2],
 ///     sh: vec![0.5; 6],
+///     ..Gaussians::default()
 /// };
 /// let scene = Scene::from_gaussians(&gaussians);
 /// assert_eq!(scene.gaussians(), 2);
@@ -645,7 +667,8 @@ impl Scene {
             for &index in &partition.order[cell.run.clone()] {
                 chunk.push(&cell.record(gaussians, index as usize));
             }
-            Arc::new(chunk)
+            let order = partition.order[cell.run.clone()].iter();
+            Arc::new(chunk.with_classes(gaussians.select_classes(order.map(|&i| i as usize))))
         };
         Self { chunks: partition.cells.par_iter().map(chunk).collect(), ..Self::default() }
     }
@@ -657,6 +680,7 @@ impl Scene {
             gaussians.means_m.iter().map(morton).zip(0..gaussians.len()).collect();
         order.par_sort_unstable();
         let mut chunk = Chunk::new([0, 0], DVec3::ZERO, gaussians.sh_degree, gaussians.len());
+        let classes = gaussians.select_classes(order.iter().map(|&(_, index)| index));
         for (_, index) in order {
             chunk.push(&RawGaussian {
                 mean_m: gaussians.means_m[index].map(|m| m as f32),
@@ -666,7 +690,7 @@ impl Scene {
                 sh: gaussians.sh_at(index),
             });
         }
-        chunk
+        chunk.with_classes(classes)
     }
 
     /// Whether a view of the frame draws a chunk of the twin, by their indices.
@@ -734,6 +758,7 @@ mod tests {
             ln_scales: vec![[0.0, -1.0, 1.0]; 3],
             logit_opacities: vec![0.0, 100.0, -100.0],
             sh: vec![0.5; 9],
+            classes: Some(vec![SemanticClass::Car, SemanticClass::Road, SemanticClass::Sky]),
         }
     }
 
@@ -854,6 +879,8 @@ mod tests {
             assert_eq!(again.means_m[index], raw.means_m[from]);
             assert_eq!(again.quats_wxyz[index], [1.0, 0.0, 0.0, 0.0]);
             assert_eq!(again.sh_at(index), raw.sh_at(from));
+            let class = |of: &Gaussians, i: usize| of.classes.as_ref().map(|all| all[i]);
+            assert_eq!(class(&again, index), class(&raw, from));
             for axis in 0..3 {
                 let off = again.ln_scales[index][axis] - raw.ln_scales[from][axis];
                 assert!(off.abs() < 1e-6, "{off}");

@@ -5,6 +5,7 @@ use std::ops::Range;
 use glam::{DQuat, DVec3};
 
 use super::geometry::Pose;
+use super::semantics::SemanticClass;
 use super::sh;
 use super::validate::{FULL_LOGIT, LN_SCALE, MAX_SH};
 
@@ -43,6 +44,8 @@ pub struct Gaussians {
     pub logit_opacities: Vec<f32>,
     /// `[n, (sh_degree + 1)², 3]`: coefficient-major, then red, green, blue; the first is DC.
     pub sh: Vec<f32>,
+    /// The class of each Gaussian, if the scene has classes.
+    pub classes: Option<Vec<SemanticClass>>,
 }
 
 impl Gaussians {
@@ -55,6 +58,7 @@ impl Gaussians {
             ln_scales: Vec::with_capacity(n),
             logit_opacities: Vec::with_capacity(n),
             sh: Vec::with_capacity(n * 3 * sh::coefficients(sh_degree)),
+            classes: None,
         }
     }
 
@@ -67,10 +71,14 @@ impl Gaussians {
         self.ln_scales.reserve_exact(n);
         self.logit_opacities.reserve_exact(n);
         self.sh.reserve_exact(n * 3 * sh::coefficients(self.sh_degree));
+        if let Some(classes) = &mut self.classes {
+            classes.reserve_exact(n);
+        }
     }
 
     /// Appends one Gaussian of `others`, which must have the same SH degree.
     pub fn push_from(&mut self, others: &Self, index: usize) {
+        self.append_classes(others, index..index + 1);
         self.means_m.push(others.means_m[index]);
         self.quats_wxyz.push(others.quats_wxyz[index]);
         self.ln_scales.push(others.ln_scales[index]);
@@ -79,7 +87,8 @@ impl Gaussians {
     }
 
     /// Appends all Gaussians of `others`. Where the SH degrees differ, the result has the higher
-    /// one: the missing coefficients are zero, which changes no colour.
+    /// one: the missing coefficients are zero, which changes no colour. Where one of the two has
+    /// classes, the Gaussians of the other become [`SemanticClass::Unlabelled`].
     pub fn append(&mut self, others: &Self) {
         self.append_range(others, 0..others.len());
     }
@@ -87,6 +96,7 @@ impl Gaussians {
     /// Appends the Gaussians of `others` whose indices are in `range`, as [`Self::append`] does.
     pub fn append_range(&mut self, others: &Self, range: Range<usize>) {
         self.raise_sh_degree(others.sh_degree);
+        self.append_classes(others, range.clone());
         self.means_m.extend_from_slice(&others.means_m[range.clone()]);
         self.quats_wxyz.extend_from_slice(&others.quats_wxyz[range.clone()]);
         self.ln_scales.extend_from_slice(&others.ln_scales[range.clone()]);
@@ -105,10 +115,34 @@ impl Gaussians {
         }
     }
 
+    /// Appends classes of `others`. The Gaussians themselves are appended after them.
+    fn append_classes(&mut self, others: &Self, range: Range<usize>) {
+        let len = self.len();
+        match (&mut self.classes, &others.classes) {
+            (None, None) => {}
+            (own, Some(classes)) => {
+                let unlabelled = || vec![SemanticClass::Unlabelled; len];
+                own.get_or_insert_with(unlabelled).extend_from_slice(&classes[range]);
+            }
+            (Some(own), None) => own.resize(len + range.len(), SemanticClass::Unlabelled),
+        }
+    }
+
+    /// The classes of some indices, in the order of the indices; `None` without classes.
+    pub fn select_classes(
+        &self,
+        indices: impl Iterator<Item = usize>,
+    ) -> Option<Vec<SemanticClass>> {
+        let classes = self.classes.as_ref()?;
+        Some(indices.map(|index| classes[index]).collect())
+    }
+
     /// The Gaussians of some indices, in the order of the indices.
     pub fn select(&self, indices: impl IntoIterator<Item = usize>) -> Self {
         let indices = indices.into_iter();
         let mut selected = Self::with_capacity(self.sh_degree, indices.size_hint().0);
+        // Also where nothing is selected: a part of a scene with classes has them, too.
+        selected.classes = self.classes.as_ref().map(|_| Vec::new());
         for index in indices {
             selected.push_from(self, index);
         }
@@ -268,5 +302,24 @@ mod tests {
         assert_eq!(all.select([3, 0, 0]), numbered(3, &[4, 1, 1]));
         assert_eq!(all.select(0..4), all);
         assert_eq!(all.select([]), Gaussians { sh_degree: 3, ..Gaussians::default() });
+    }
+
+    #[test]
+    fn classes_go_with_their_gaussians() {
+        use SemanticClass::{Car, Road, Unlabelled};
+        let mut labelled = numbered(0, &[1, 2]);
+        labelled.classes = Some(vec![Road, Car]);
+        assert_eq!(labelled.select([1, 0, 1]).classes, Some(vec![Car, Road, Car]));
+        // Whichever of the two has classes.
+        let mut all = numbered(0, &[3]);
+        all.append(&labelled);
+        assert_eq!(all.classes, Some(vec![Unlabelled, Road, Car]));
+        labelled.append_range(&numbered(1, &[4, 5, 6]), 1..3);
+        assert_eq!(labelled.classes, Some(vec![Road, Car, Unlabelled, Unlabelled]));
+        labelled.push_from(&numbered(1, &[7]), 0);
+        assert_eq!(labelled.classes.as_ref().map(Vec::len), Some(labelled.len()));
+        let mut none = numbered(0, &[1]);
+        none.append(&numbered(0, &[2]));
+        assert_eq!(none.classes, None);
     }
 }

@@ -11,7 +11,7 @@ use crate::align::{Alignment, AlignmentError};
 use crate::geo::GeoAnchor;
 use crate::geometry::Bounds;
 
-use super::{RecordFormat, RenderProfile, Rig, Trajectory};
+use super::{Chunk, RecordFormat, RenderProfile, Rig, Trajectory};
 
 /// One immutable version of a twin. Its identity is the BLAKE3 hash of its canonical JSON.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -70,6 +70,10 @@ pub struct ChunkEntry {
     pub bounds: Bounds,
     /// Origin of the cell in the world, in metres: means in the object are relative to it.
     pub origin_m: DVec3,
+    /// Whether its Gaussians have classes. Not written if they have none, so that a twin without
+    /// classes has the same bytes, and the same hash, as before there were any.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub classes: bool,
     /// The sections of the object, in order of (block, level). A route of 20 km has 100,000 and
     /// more, so they are stored in [`Manifest::table`], 78 bytes each, and not in the manifest's
     /// JSON.
@@ -215,6 +219,11 @@ impl Manifest {
         self.chunks.iter().map(|chunk| chunk.count).sum()
     }
 
+    /// Whether any of its Gaussians have classes.
+    pub fn has_classes(&self) -> bool {
+        self.chunks.iter().any(|chunk| chunk.classes)
+    }
+
     /// Whether any section is coarser than full detail.
     pub fn has_levels(&self) -> bool {
         let mut sections = self.chunks.iter().flat_map(|chunk| &chunk.sections);
@@ -247,6 +256,12 @@ impl ChunkEntry {
     /// cell.
     pub fn full_detail(&self) -> impl Iterator<Item = &Section> {
         self.sections.iter().filter(|section| section.is_full_detail())
+    }
+
+    /// Memory that a section needs, in bytes, given the SH degree of the twin.
+    pub fn needed_bytes(&self, sh_degree: u8, section: &Section) -> u64 {
+        let count = u64::from(section.count);
+        Chunk::needed_bytes(sh_degree, count) + if self.classes { count } else { 0 }
     }
 
     /// Union of a section's 3-sigma boxes in the world, in metres.

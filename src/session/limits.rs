@@ -42,13 +42,14 @@ pub const OFF_MODEL_TRUST: f64 = 0.1;
 pub const JPEG_QUALITY: u8 = 90;
 
 /// Largest observation that a client accepts, 1.5 GiB: [`ANSWER_PIXELS`] at [`PIXEL_BYTES`] are
-/// 1,476 MB. Normals add 12 bytes a pixel, so that half as many pixels fit with them; instances 2,
-/// so that three quarters fit. Six raw 1440x928 images with depth and opacity are 88 MB.
+/// 1,476 MB. Normals add 12 bytes a pixel, so that half as many pixels fit with them; instances 2
+/// and classes 1, so that three quarters fit with either or both. Six raw 1440x928 images with
+/// depth and opacity are 88 MB.
 // 2²⁷ pixels x 11 bytes = 1,476,395,008, of 1,610,612,736 bytes.
 pub const OBSERVATION_BYTES: usize = 3 << 29;
 
-/// Largest number of bytes per pixel without normals and instances: raw colour, and depth and
-/// opacity as f32.
+/// Largest number of bytes per pixel without normals, instances and classes: raw colour, and depth
+/// and opacity as f32.
 pub const PIXEL_BYTES: u64 = 3 + 4 + 4;
 
 /// Bytes per pixel of normals.
@@ -56,6 +57,9 @@ pub const NORMAL_BYTES: u64 = 12;
 
 /// Bytes per pixel of instances.
 pub const INSTANCE_BYTES: u64 = 2;
+
+/// Bytes per pixel of classes.
+pub const SEMANTICS_BYTES: u64 = 1;
 
 /// Largest header of an observation that a client accepts: 16 poses of 16 cameras are 256 images
 /// of at most 3.5 kB, together 0.9 MB.
@@ -286,16 +290,16 @@ const _: () = {
 };
 
 // The largest answer of a session fits a message, with normals at half of the pixels, and with
-// instances at three quarters of them; each beside the largest sweeps.
+// instances and classes at three quarters of them; each beside the largest sweeps.
 const _: () = {
     let sweeps_bytes = POINT_BYTES * Rig::MAX_BEAMS as u64;
     let room_bytes = OBSERVATION_BYTES as u64 - OBSERVATION_HEADER_BYTES - sweeps_bytes;
     assert!(ANSWER_PIXELS * PIXEL_BYTES <= room_bytes);
-    let with_instances = PIXEL_BYTES + INSTANCE_BYTES;
+    let with_owners = PIXEL_BYTES + INSTANCE_BYTES + SEMANTICS_BYTES;
     assert!(ANSWER_PIXELS / 2 * (PIXEL_BYTES + NORMAL_BYTES) <= room_bytes);
-    assert!(ANSWER_PIXELS * 3 / 4 * with_instances <= room_bytes);
+    assert!(ANSWER_PIXELS * 3 / 4 * with_owners <= room_bytes);
     // Both at once: three quarters of one half.
-    assert!(ANSWER_PIXELS * 3 / 8 * (with_instances + NORMAL_BYTES) <= room_bytes);
+    assert!(ANSWER_PIXELS * 3 / 8 * (with_owners + NORMAL_BYTES) <= room_bytes);
 };
 
 /// Distance along a drive between two frames whose images are compared for flicker, in metres: 8

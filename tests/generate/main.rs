@@ -50,7 +50,7 @@ fn there_are_enough_gaussians_and_density_scales_them() {
 
 #[test]
 fn every_value_is_within_the_bounds_of_a_twin() {
-    let Gaussians { sh_degree, means_m, quats_wxyz, ln_scales, logit_opacities, sh } =
+    let Gaussians { sh_degree, means_m, quats_wxyz, ln_scales, logit_opacities, sh, classes } =
         &DEMO.gaussians;
     let count = means_m.len();
     assert_eq!(*sh_degree, 1);
@@ -65,6 +65,7 @@ fn every_value_is_within_the_bounds_of_a_twin() {
         assert!((length - 1.0).abs() < 1e-5, "quaternion {index} of length {length}");
         assert!((0.0..10.0).contains(&logit_opacities[index]), "opacity {index}");
     }
+    assert_eq!(classes.as_ref().map(Vec::len), Some(count));
     assert!(sh.iter().all(|c| c.abs() < 1e3));
     // Glass and asphalt depend on the view.
     let glossy = sh.chunks_exact(12).filter(|sh| sh[3..].iter().any(|&c| c != 0.0)).count();
@@ -91,5 +92,7 @@ fn digest(gaussians: &Gaussians) -> blake3::Hash {
     hasher.update(bytemuck::cast_slice(&gaussians.ln_scales));
     hasher.update(bytemuck::cast_slice(&gaussians.logit_opacities));
     hasher.update(bytemuck::cast_slice(&gaussians.sh));
+    let classes = gaussians.classes.iter().flatten();
+    hasher.update(&classes.map(|class| class.value()).collect::<Vec<u8>>());
     hasher.finalize()
 }

@@ -49,6 +49,23 @@ fn instances_are_those_of_the_reference() {
 }
 
 #[test]
+fn classes_are_those_of_the_reference() {
+    placed::check_semantics(&*shared_gpu(), &Reference);
+}
+
+/// In regions, on a device with small bindings.
+#[test]
+fn classes_of_regions_are_those_of_the_whole() {
+    let scene = placed::labelled(&placed::street_with_actors().0);
+    let views: Vec<View> = placed::views().into_iter().map(|(_, view)| view).collect();
+    let small = gpu_with_limits(bindings(512 << 10));
+    let (in_regions, _) = placed::owners(&small, &scene, &views);
+    let (whole, _) = placed::owners(&*shared_gpu(), &scene, &views);
+    assert!(in_regions == whole);
+    assert!(regions(&small) > 1, "the frame fitted at once");
+}
+
+#[test]
 fn instances_are_those_of_the_vectors() {
     placed::check_instance_vectors(&*shared_gpu());
 }
@@ -73,6 +90,25 @@ fn instances_of_stages_that_ran_on_the_cpu() {
         for (ids, view) in all.iter().zip(&views) {
             let (truth, _) = placed::instances(&cpu(), &scene, *view);
             let differing = ids.iter().zip(&truth).filter(|(a, b)| a != b).count();
+            assert!(differing * 500 < ids.len(), "{last:?}: {differing} of {}", ids.len());
+        }
+    }
+}
+
+/// The cpu runs the first stages, the gpu the rest.
+#[test]
+fn classes_of_stages_that_ran_on_the_cpu() {
+    let scene = placed::labelled(&placed::street_with_actors().0);
+    let views: Vec<View> = placed::views().into_iter().map(|(_, view)| view).collect();
+    let (truth, _) = placed::owners(&cpu(), &scene, &views);
+    for last in Stage::ALL {
+        let own = Gpu::new(&AdapterChoice::Best, 0).unwrap();
+        let (owners, _) = placed::owners(&HybridBackend::new(cpu(), own, last), &scene, &views);
+        for ((ids, classes), (true_ids, true_classes)) in owners.iter().zip(&truth) {
+            let same = |pixel: &usize| {
+                (ids[*pixel], classes[*pixel]) == (true_ids[*pixel], true_classes[*pixel])
+            };
+            let differing = ids.len() - (0..ids.len()).filter(same).count();
             assert!(differing * 500 < ids.len(), "{last:?}: {differing} of {}", ids.len());
         }
     }

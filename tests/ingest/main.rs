@@ -16,6 +16,7 @@ mod archives;
 mod axes;
 mod captures;
 mod cases;
+mod classes;
 mod conformance;
 mod corpus;
 mod damage;

@@ -126,6 +126,7 @@ fn stacks_of_faint_gaussians_state_what_their_merger_shows() {
             ln_scales: vec![[0.3_f32.ln(); 3]; count],
             logit_opacities: vec![logit.ln() as f32; count],
             sh: vec![1.0; 3 * count],
+            ..Gaussians::default()
         };
         let scene = Scene::from_gaussians(&stack);
         let full = &scene.chunks[0];

@@ -37,6 +37,7 @@ pub(crate) struct Recipe {
     pub(crate) history: u64,
     pub(crate) normals: bool,
     pub(crate) instances: bool,
+    pub(crate) semantics: bool,
     /// Whether the images come with their trust, the first camera is behind a windshield, and the
     /// georeference is present.
     pub(crate) trust_and_windshield: bool,
@@ -57,6 +58,7 @@ impl Recipe {
         history: 0,
         normals: false,
         instances: false,
+        semantics: false,
         trust_and_windshield: false,
         repair: false,
         sensors: false,
@@ -90,6 +92,11 @@ pub(crate) fn normal(x: u64, y: u64) -> [f32; 3] {
 /// Whose Gaussian a pixel shows.
 pub(crate) fn instance(x: u64, y: u64) -> u16 {
     [0, 1, 2, 257][((x + y) % 4) as usize]
+}
+
+/// The class of the Gaussian that a pixel shows.
+pub(crate) fn class(x: u64, y: u64) -> u8 {
+    [0, 1, 2, 24][((x + 2 * y) % 4) as usize]
 }
 
 /// Opacity of a pixel.
@@ -151,6 +158,14 @@ impl Frame {
                     let shape = vec![camera.height, camera.width];
                     let name = format!("{stem}/instances");
                     tensors.push(Tensor { name, dtype: "U16", shape, bytes });
+                }
+                if recipe.semantics {
+                    let grid =
+                        (0..camera.height).flat_map(|y| (0..camera.width).map(move |x| (x, y)));
+                    let bytes = grid.map(|(x, y)| class(x, y)).collect();
+                    let shape = vec![camera.height, camera.width];
+                    let name = format!("{stem}/semantics");
+                    tensors.push(Tensor { name, dtype: "U8", shape, bytes });
                 }
                 let tensor = format!("{stem}/rgb");
                 let hash = hash.to_hex().to_string();

@@ -241,6 +241,7 @@ fn requests() -> Vec<(&'static str, Request)> {
             opacity: true,
             normals: Some(true),
             instances: Some(true),
+            semantics: Some(true),
             frames: Some(4),
             trust: Some(true),
             actors: None,
@@ -511,6 +512,7 @@ fn answers() -> Vec<(&'static str, Answer)> {
         repair: None,
         sensors: None,
         scenario: None,
+        semantics: None,
         trajectory: Some(drive()),
     };
     let sensed = Opened {
@@ -525,6 +527,12 @@ fn answers() -> Vec<(&'static str, Answer)> {
             max_range_m: 200.0,
             lidar_to_rig: pose([1.25, 0.0, 1.875], [1.0, 0.0, 0.0, 0.0]),
         }],
+        ..opened.clone()
+    };
+    let classes = ["none", "unlabelled", "road"].map(str::to_owned).to_vec();
+    let labelled = Opened {
+        trajectory: None,
+        semantics: Some(OpenedSemantics { labelled: true, classes }),
         ..opened.clone()
     };
     let repaired = Opened {
@@ -622,6 +630,7 @@ fn answers() -> Vec<(&'static str, Answer)> {
         ("opened", Answer::Opened(Box::new(opened))),
         ("opened_repair", Answer::Opened(Box::new(repaired))),
         ("opened_sensors", Answer::Opened(Box::new(sensed))),
+        ("opened_semantics", Answer::Opened(Box::new(labelled))),
         ("resumed", resumed),
         ("resumed_also", resumed_also),
         ("ok", Answer::Ok { seq: 6 }),

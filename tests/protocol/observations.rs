@@ -10,7 +10,7 @@ use super::frames::{self, Frame, Recipe};
 use super::{blessing, check_file, check_json, read};
 
 /// The golden frames: name, `seq` of the request vector that the frame answers, recipe.
-fn golden() -> [(&'static str, u64, Recipe); 11] {
+fn golden() -> [(&'static str, u64, Recipe); 12] {
     let raw = Recipe::RAW;
     [
         ("raw", 3, raw),
@@ -20,6 +20,7 @@ fn golden() -> [(&'static str, u64, Recipe); 11] {
         ("two_poses", 5, Recipe { poses: 2, cameras: 1, depth: false, ..raw }),
         ("normals", 3, Recipe { cameras: 1, normals: true, ..raw }),
         ("instances", 3, Recipe { cameras: 1, depth: false, instances: true, ..raw }),
+        ("semantics", 3, Recipe { cameras: 1, depth: false, semantics: true, ..raw }),
         ("trust", 3, Recipe { depth: false, trust_and_windshield: true, ..raw }),
         ("repair", 3, Recipe { depth: false, repair: true, ..raw }),
         ("sensors", 3, Recipe { depth: false, sensors: true, ..raw }),
@@ -176,6 +177,8 @@ fn check_image(image: &ImageView<'_>, recipe: Recipe, number: u64) {
     assert_eq!(normals.is_some(), recipe.normals);
     let instances = image.instances();
     assert_eq!(instances.is_some(), recipe.instances);
+    let semantics = image.semantics();
+    assert_eq!(semantics.is_some(), recipe.semantics);
     assert_eq!(depth_m.is_some(), recipe.depth);
     assert_eq!(opacity.is_some(), recipe.depth);
     for (pixel, rgb) in rgb.chunks_exact(3).enumerate() {
@@ -198,6 +201,9 @@ fn check_image(image: &ImageView<'_>, recipe: Recipe, number: u64) {
         }
         if let Some(instances) = &instances {
             assert_eq!(instances[pixel], frames::instance(x, y));
+        }
+        if let Some(semantics) = semantics {
+            assert_eq!(semantics[pixel], frames::class(x, y));
         }
     }
     assert_eq!(rgb.len(), 4 * 3 * 3);
@@ -233,6 +239,9 @@ fn expected(frame: &Frame, recipe: Recipe) -> Value {
                 });
                 if recipe.instances {
                     pixel["instance"] = frames::instance(x, y).into();
+                }
+                if recipe.semantics {
+                    pixel["class"] = frames::class(x, y).into();
                 }
                 pixel
             });

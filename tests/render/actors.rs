@@ -71,6 +71,11 @@ fn instances_are_those_of_the_reference() {
 }
 
 #[test]
+fn classes_are_those_of_the_reference() {
+    placed::check_semantics(&cpu(), &Reference);
+}
+
+#[test]
 fn instances_are_those_of_the_vectors() {
     placed::check_instance_vectors(&cpu());
     placed::check_instance_vectors(&Reference);

@@ -3,7 +3,7 @@
 
 use glam::DVec3;
 use wildcity_render::cpu::Cpu;
-use wildcity_render::{Backend, Frame, FrameStats, Target, View};
+use wildcity_render::{Backend, View};
 use wildcity_scene::geometry::camera::ShutterDirection;
 use wildcity_scene::{Gaussians, RenderProfile, Scene};
 
@@ -21,27 +21,20 @@ fn limited() -> Cpu {
     backend
 }
 
-/// The instances of each view, and what the frame took.
-fn instances(backend: &Cpu, scene: &Scene, views: &[View]) -> (Vec<Vec<u16>>, FrameStats) {
-    // Filled with other values first, so that a pixel that is not written shows up.
-    let mut ids: Vec<Vec<u16>> = views.iter().map(|view| vec![77; view.camera.pixels()]).collect();
-    let target = |ids| Target { instances: Some(ids), ..Target::default() };
-    let mut targets: Vec<Target<'_>> = ids.iter_mut().map(|ids| target(&mut ids[..])).collect();
-    let profile = &RenderProfile::default();
-    let frame = Frame { scene, profile, views };
-    let stats = backend.render(&frame, &mut targets, &|_, _| {}).unwrap();
-    (ids, stats)
-}
-
 /// Renders with and without a bound, and compares every output and every count.
 fn check(scene: &Scene, profile: &RenderProfile, views: &[View]) {
     let [bounded, free] = [limited(), cpu()];
     let images = render(&bounded, scene, profile, views);
     assert!(images == render(&free, scene, profile, views), "{views:?}");
     assert!(images.iter().any(|image: &Image| image.rgba.iter().any(|&value| value > 0.0)));
-    let [(bounded_ids, bounded_stats), (free_ids, free_stats)] =
-        [&bounded, &free].map(|backend| instances(backend, scene, views));
-    assert!(bounded_ids == free_ids && !bounded_ids.concat().contains(&77), "{views:?}");
+    // Instances and classes, of a scene that has both.
+    let scene = &placed::labelled(scene);
+    let [(bounded_owners, bounded_stats), (free_owners, free_stats)] =
+        [&bounded, &free].map(|backend| placed::owners(backend, scene, views));
+    let is_written = |(ids, classes): &placed::Owners| {
+        !ids.contains(&77) && !classes.contains(&77) && classes.iter().any(|&class| class > 1)
+    };
+    assert!(bounded_owners == free_owners && bounded_owners.iter().all(is_written), "{views:?}");
     assert_eq!(bounded_stats.visible_pairs, free_stats.visible_pairs);
     assert_eq!(bounded_stats.instances, free_stats.instances);
     assert_eq!(bounded_stats.evaluations, free_stats.evaluations);

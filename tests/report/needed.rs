@@ -129,7 +129,14 @@ fn each_feature_costs_and_the_base_scene_pays_for_none() {
     }
     let [pipelines, buffers, dispatches, planes] = beyond("instance ids");
     assert!(buffers >= 1 && [pipelines, dispatches, planes] == [0, 0, 4]);
+    // A kernel and its dispatch, in place of the search among owners; two buffers at least.
+    let [pipelines, buffers, dispatches, planes] = beyond("semantics");
+    assert!(buffers >= 2 && [pipelines, dispatches, planes] == [1, 1, 4], "{buffers}");
+    // Classes without a target for them take a byte of a Gaussian, and nothing else.
+    assert_eq!(beyond("classes"), [0; 4]);
     let bytes = |with: &str| of(with).unwrap().bytes_per_gaussian;
+    let of_classes = bytes("classes") - bytes("nothing else");
+    assert!((0.5..1.5).contains(&of_classes), "{of_classes}");
     // SH coefficients are f16: 9 values, and 45.
     let colours = ["SH degree 1", "SH degree 3"].map(|with| bytes(with) - bytes("nothing else"));
     assert!(

@@ -597,11 +597,19 @@ fn the_base_scene_pays_for_no_feature() {
             );
         };
         let bytes = own.host_bytes_per_gaussian;
-        more(bytes > base.host_bytes_per_gaussian + 1.0, &["SH degree 1", "SH degree 3"], "bytes");
+        let larger = ["SH degree 1", "SH degree 3", "classes", "semantics"];
+        more(bytes > base.host_bytes_per_gaussian + 0.9, &larger, "bytes");
         let beside = ["sky of images", "sky, baked", "hood"];
         more(own.other_host_bytes > 0, &beside, "bytes beside");
-        let planes =
-            ["depth", "depth and opacity", "normals", "instance ids", "trust", "gradients"];
+        let planes = [
+            "depth",
+            "depth and opacity",
+            "normals",
+            "instance ids",
+            "semantics",
+            "trust",
+            "gradients",
+        ];
         more(own.host_bytes_per_pixel > 3, &planes, "bytes of a pixel");
         // Only features that change Gaussians or their projection, or add some, change the
         // evaluations.

@@ -4,7 +4,6 @@ use std::sync::Arc;
 use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
-use wildcity_scene::Chunk;
 use wildcity_twin::residency::{Cache, FrameBytes, ResidencyError, RigExtent, SectionRef};
 
 use crate::scene_files::{Random, gaussians};
@@ -156,8 +155,9 @@ fn the_end_of_a_frame_makes_room_at_once() {
     let bytes = |station_m: f64| -> u64 {
         let needed = all.demand(&frame(station_m), &PROFILE);
         let chunks = &all.version.manifest.chunks;
-        let count = |n: &SectionRef| chunks[n.chunk].sections[n.section].count;
-        needed.iter().map(|n| Chunk::needed_bytes(1, count(n).into())).sum()
+        let of =
+            |n: &SectionRef| chunks[n.chunk].needed_bytes(1, &chunks[n.chunk].sections[n.section]);
+        needed.iter().map(of).sum()
     };
     // Each of the two fits, but not both together.
     let limit_bytes = bytes(0.0).max(bytes(500.0)) + bytes(0.0) / 4;

@@ -78,7 +78,8 @@ fn a_section_takes_the_memory_that_is_computed_for_it() {
     let resident = unlimited().open("demo", None).unwrap();
     let scene = pin_all(&resident);
     for chunk in &scene.chunks {
-        let said = Chunk::needed_bytes(chunk.sh_degree(), chunk.len() as u64);
+        let classes = chunk.classes().map_or(0, <[_]>::len) as u64;
+        let said = Chunk::needed_bytes(chunk.sh_degree(), chunk.len() as u64) + classes;
         assert_eq!(said, chunk.bytes() as u64);
     }
     let each = scene.bytes() as f64 / scene.gaussians() as f64;

@@ -18,6 +18,7 @@ fn commit(dir: &Path, name: &str) {
         ln_scales: vec![[-1.0; 3]],
         logit_opacities: vec![2.0],
         sh: vec![0.5; 3],
+        ..Gaussians::default()
     };
     let new = NewVersion {
         rig: Some(crate::support::rig()),

@@ -43,6 +43,7 @@ async fn server() -> TestServer {
         ln_scales: vec![[-1.8; 3]; count],
         logit_opacities: vec![1.0; count],
         sh,
+        ..Gaussians::default()
     };
     let keyframe = |k: i64| Keyframe {
         time_us: 100_000 * k,

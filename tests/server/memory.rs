@@ -108,7 +108,8 @@ async fn memory_and_socket_have_the_same_bytes() {
         let mut agent = server.agent().await;
         let mut memory = agent.share_memory().await;
         let outputs = json!({
-            "encoding": encoding, "depth": true, "opacity": true, "normals": true, "instances": true, "frames": 2,
+            "encoding": encoding, "depth": true, "opacity": true, "normals": true, "instances": true,
+            "semantics": true, "frames": 2,
         });
         agent.open(json!({ "session": "a", "outputs": outputs })).await;
         for k in 0..5_u32 {

@@ -76,6 +76,7 @@ async fn raw_pixels_and_maps_are_the_renderers() {
     let server = TestServer::start().await;
     let outputs = json!({
         "encoding": "raw", "depth": true, "opacity": true, "normals": true, "instances": true,
+        "semantics": true,
     });
     let mut agent = open(&server, outputs).await;
     let seen = agent.step(2.0).await;
@@ -99,6 +100,9 @@ async fn raw_pixels_and_maps_are_the_renderers() {
         let instances = tensors.tensor(&format!("camera/{}/instances", camera.name)).unwrap();
         assert_eq!((instances.shape(), instances.dtype()), (&[h, w][..], safetensors::Dtype::U16));
         assert_eq!(instances.data(), [7 + k as u8, 0].repeat(w * h));
+        let semantics = tensors.tensor(&format!("camera/{}/semantics", camera.name)).unwrap();
+        assert_eq!((semantics.shape(), semantics.dtype()), (&[h, w][..], safetensors::Dtype::U8));
+        assert_eq!(semantics.data(), vec![3 + k as u8; w * h]);
 
         let image = &seen.meta["images"][k];
         assert_eq!(image["hash"], blake3::hash(&expected).to_hex().as_str());
@@ -107,7 +111,7 @@ async fn raw_pixels_and_maps_are_the_renderers() {
         assert_eq!((&image["width"], &image["fx"]), (&json!(w), &json!(10.0)));
         assert_eq!(image["shutter_end_us"], 100_000);
     }
-    assert_eq!(tensors.len(), 12);
+    assert_eq!(tensors.len(), 14);
     assert_eq!(seen.meta["timings"]["stages_ms"], json!([{ "name": "paint", "ms": 0.5 }]));
 }
 
@@ -132,7 +136,8 @@ async fn the_header_has_the_size_of_its_contents() {
     }
 }
 
-/// With normals, an answer has half of the pixels, and with instances three quarters.
+/// With normals, an answer has half of the pixels, and with instances, semantics or both three
+/// quarters.
 #[tokio::test]
 async fn normals_halve_the_pixels_of_an_answer() {
     let server = TestServer::start().await;
@@ -141,17 +146,20 @@ async fn normals_halve_the_pixels_of_an_answer() {
     // 8 x 6 and 5 x 4 px: the sizes of the images make up the number of pixels exactly, or one row
     // more.
     let width = 16_384;
-    for (normals, instances, pixels) in [
-        (true, false, most / 2),
-        (true, true, most / 8 * 3),
-        (false, true, most / 4 * 3),
-        (false, false, most),
+    for (normals, [instances, semantics], pixels) in [
+        (true, [false; 2], most / 2),
+        (true, [true; 2], most / 8 * 3),
+        (true, [false, true], most / 8 * 3),
+        (false, [true, false], most / 4 * 3),
+        (false, [false, true], most / 4 * 3),
+        (false, [true; 2], most / 4 * 3),
+        (false, [false; 2], most),
     ] {
         for more in [0, 1] {
             let height = pixels / width + more;
             let outputs = json!({
                 "cameras": ["front"], "normals": normals, "instances": instances,
-                "depth": true, "opacity": true,
+                "semantics": semantics, "depth": true, "opacity": true,
                 "images": { "front": { "size": [width, height] } },
             });
             let answer = agent.try_open(json!({ "outputs": outputs })).await;

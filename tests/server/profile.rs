@@ -92,6 +92,7 @@ fn one_gaussian() -> Gaussians {
         ln_scales: vec![[-1.0; 3]],
         logit_opacities: vec![2.0],
         sh: vec![0.5; 3],
+        ..Gaussians::default()
     }
 }
 

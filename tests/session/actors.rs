@@ -14,7 +14,7 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::{Shutter, ShutterDirection};
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::rig::{Rig, RigCamera};
-use wildcity_scene::{ActorBox, ActorClass, Gaussians, RecordFormat};
+use wildcity_scene::{ActorBox, ActorClass, Gaussians, RecordFormat, SemanticClass};
 use wildcity_session::options::{
     CameraSensor, Encoding, LateFrames, Open, Outputs, RigChoice, Sensors, Start,
 };
@@ -118,8 +118,8 @@ async fn standing(session: &mut Session, steps: u32) -> Vec<Vec<blake3::Hash>> {
     seen
 }
 
-/// Expected images of an ego at rest, each rendered by itself, with actors at their poses now and at
-/// the start of each camera's exposure.
+/// Expected images of an ego at rest, each rendered by itself, with actors at their poses now and
+/// at the start of each camera's exposure.
 fn expected(placed: &[(u16, Pose, [Pose; 2])], shutters: bool) -> Vec<blake3::Hash> {
     let views = View::from_rig(&rig(shutters), demo().at(EGO_M));
     let resident = unlimited().open("demo", None).unwrap();
@@ -430,6 +430,45 @@ async fn instances_tell_whose_pixels_they_are() {
     asked.outputs.instances = None;
     let mut plain = open(&bench, "b", asked).await;
     assert_eq!(hashes(&plain.reset(0, None).await.unwrap()), hashes(&seen));
+}
+
+/// Classes have the boundaries of instances on the actors, pixel by pixel, and the twin has its
+/// own.
+#[tokio::test(flavor = "multi_thread")]
+async fn classes_are_those_of_the_actors_and_of_the_twin() {
+    let bench = bench(unlimited());
+    let mut asked = options(&actors(&Value::from(&*car().hash)), false);
+    asked.outputs.instances = Some(true);
+    asked.outputs.semantics = Some(true);
+    let mut session = open(&bench, "a", asked.clone()).await;
+    let seen = session.reset(0, None).await.unwrap();
+    let bytes = |kind: TensorKind| {
+        let tensor = seen.tensors.iter().find(|tensor| tensor.kind == kind).unwrap();
+        assert_eq!(tensor.shape, [64, 96]);
+        let header = seen.buffer.bytes().len() - seen.tensors.last().unwrap().bytes.end;
+        (tensor.dtype, &seen.buffer.bytes()[header..][tensor.bytes.clone()])
+    };
+    let (dtype, classes) = bytes(TensorKind::Semantics(0));
+    assert_eq!(dtype, DType::U8);
+    let ids = bytes(TensorKind::Instances(0)).1.chunks_exact(2);
+    let ids: Vec<u16> = ids.map(|two| u16::from_le_bytes([two[0], two[1]])).collect();
+    let vehicle = SemanticClass::Vehicle.value();
+    for (id, class) in ids.iter().zip(classes) {
+        // The street has cars, and vehicles of unknown kind are only among the actors.
+        assert_eq!(*id >= 2, *class == vehicle, "{id}, {class}");
+        assert_eq!(*id == 0, *class == SemanticClass::None.value(), "{id}, {class}");
+    }
+    assert!(classes.iter().filter(|class| **class == vehicle).count() > 20);
+    for class in [SemanticClass::Road, SemanticClass::Building, SemanticClass::Car] {
+        assert!(classes.iter().filter(|one| **one == class.value()).count() > 20, "{class}");
+    }
+    assert!(!classes.contains(&SemanticClass::Unlabelled.value()));
+    // Neither the colours nor the instances depend on it.
+    asked.outputs.semantics = None;
+    let mut plain = open(&bench, "b", asked).await;
+    let plain = plain.reset(0, None).await.unwrap();
+    assert_eq!(hashes(&plain), hashes(&seen));
+    assert!(plain.tensors.iter().all(|tensor| tensor.kind != TensorKind::Semantics(0)));
 }
 
 /// Assets take their room from the twins, once for all sessions, and give it back.

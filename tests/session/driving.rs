@@ -54,11 +54,12 @@ impl Backend for ForSections {
         finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
         // A value that is not written would show.
-        for Target { rgb8, depth_m, opacity, normals, instances, .. } in &mut *targets {
+        for Target { rgb8, depth_m, opacity, normals, instances, semantics, .. } in &mut *targets {
             rgb8.iter_mut().for_each(|image| image.fill(77));
             let maps = [depth_m, opacity, normals].into_iter().flatten();
             maps.for_each(|map| map.fill(f32::NAN));
             instances.iter_mut().for_each(|image| image.fill(77));
+            semantics.iter_mut().for_each(|image| image.fill(77));
         }
         self.0.render(frame, targets, finished)
     }

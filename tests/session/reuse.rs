@@ -10,13 +10,14 @@ use crate::actors::{actors, car, open, options};
 use crate::driving::{Bench, bench, bench_with};
 use crate::streaming::{demo, unlimited};
 
-/// Depth, opacity, normals and instances.
-const ALL_MAPS: [bool; 4] = [true; 4];
+/// Depth, opacity, normals, instances and semantics.
+const ALL_MAPS: [bool; 5] = [true; 5];
 
 /// Sessions whose answers have about the same size and different contents; one has a lens whose
 /// field ends within the image.
 fn sessions() -> Vec<Open> {
-    let of = |encoding: Encoding, [depth, opacity, normals, instances]: [bool; 4], frames: u64| {
+    let of = |encoding: Encoding, maps: [bool; 5], frames: u64| {
+        let [depth, opacity, normals, instances, semantics] = maps;
         let mut asked = options(&actors(&Value::from(&*car().hash)), false);
         asked.outputs = Outputs {
             quality: Some(90),
@@ -24,6 +25,7 @@ fn sessions() -> Vec<Open> {
             opacity,
             normals: Some(normals),
             instances: Some(instances),
+            semantics: Some(semantics),
             frames: Some(frames),
             ..Outputs::colour(encoding)
         };
@@ -35,14 +37,14 @@ fn sessions() -> Vec<Open> {
         }
         asked
     };
-    let depth = [true, false, false, false];
+    let depth = [true, false, false, false, false];
     vec![
         of(Encoding::Raw, ALL_MAPS, 1),
         fisheye(of(Encoding::Raw, ALL_MAPS, 1)),
         of(Encoding::Png, ALL_MAPS, 1),
         of(Encoding::Raw, depth, 3),
         fisheye(of(Encoding::Jpeg, depth, 1)),
-        of(Encoding::Raw, [false; 4], 3),
+        of(Encoding::Raw, [false; 5], 3),
     ]
 }
 

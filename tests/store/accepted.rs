@@ -39,6 +39,7 @@ fn gaussian() -> impl Strategy<Value = Gaussians> {
                 ln_scales: vec![ln_scale],
                 logit_opacities: vec![logit],
                 sh,
+                ..Gaussians::default()
             }
         },
     )

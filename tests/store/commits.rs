@@ -33,6 +33,7 @@ static EMPTY: Gaussians = Gaussians {
     ln_scales: Vec::new(),
     logit_opacities: Vec::new(),
     sh: Vec::new(),
+    classes: None,
 };
 
 fn from(source: &str) -> Provenance {

@@ -14,6 +14,7 @@ mod versions;
 mod accepted;
 mod actors;
 mod alignments;
+mod classes;
 mod commits;
 mod damage;
 mod everywhere;

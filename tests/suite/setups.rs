@@ -117,6 +117,7 @@ async fn a_twin_without_a_drive_is_driven_without_trust() {
         ln_scales: vec![[-1.0; 3]],
         logit_opacities: vec![2.0],
         sh: vec![0.0; 3],
+        ..Gaussians::default()
     };
     let rig = bench.catalog().version("street", None).unwrap().manifest.rig;
     let provenance = Provenance::new("test".into());

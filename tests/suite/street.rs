@@ -41,6 +41,7 @@ impl Bench {
             ln_scales: vec![[-1.0; 3]; count as usize],
             logit_opacities: vec![2.0; count as usize],
             sh: (0..count * 3).map(|i| (i % 7) as f32 * 0.3 - 0.9).collect(),
+            ..Gaussians::default()
         };
         let keyframe = |i: i64| Keyframe {
             time_us: 500_000 * i,

@@ -9,12 +9,13 @@ use wildcity_render::compare::gaussians::{
     GaussianSpec, forward_view, gaussians_from_specs, scene_from_specs,
 };
 use wildcity_render::{
-    Backend, FIRST_ACTOR_INSTANCE, Frame, RenderError, RollingShutter, TWIN_INSTANCE, Target, View,
+    Backend, FIRST_ACTOR_INSTANCE, Frame, FrameStats, RenderError, RollingShutter, TWIN_INSTANCE,
+    Target, View,
 };
 use wildcity_scene::actor::{ContactShadow, PlacedChunk};
 use wildcity_scene::geometry::camera::{Fisheye, Lens, Pinhole, ShutterDirection};
 use wildcity_scene::geometry::{Camera, Pose};
-use wildcity_scene::{Chunk, Gaussians, RenderProfile, Scene, Selection, sh};
+use wildcity_scene::{Chunk, Gaussians, RenderProfile, Scene, Selection, SemanticClass, sh};
 
 use crate::images::{Image, agree, max_difference, psnr, render, render_one, try_render};
 use crate::lenses::{lenses, rolling_view};
@@ -308,6 +309,91 @@ pub(crate) fn check_instances(backend: &dyn Backend, reference: &dyn Backend) {
     drop(targets);
     for (ids, view) in all.iter().zip(&views) {
         assert_eq!(*ids, instances(backend, &scene, *view).0);
+    }
+}
+
+/// A scene whose twin has classes, a mixture of those from [`SemanticClass::Road`] to
+/// [`SemanticClass::Bicycle`] and of none. The first actor is a vehicle without classes. The second
+/// is a person, and every other Gaussian of it has another class. The others have neither.
+pub(crate) fn labelled(scene: &Scene) -> Scene {
+    let mut scene = scene.clone();
+    for chunk in &mut scene.chunks {
+        let class = |i: usize| SemanticClass::ALL[1 + (i / 3) % 20];
+        let classes = (0..chunk.len()).map(class).collect();
+        *chunk = Arc::new(Chunk::clone(chunk).with_classes(Some(classes)));
+    }
+    if let [first, second, ..] = &mut scene.placed[..] {
+        first.class = SemanticClass::Vehicle;
+        second.class = SemanticClass::Person;
+        let own = [SemanticClass::Rider, SemanticClass::Unlabelled];
+        let classes = (0..second.chunk.len()).map(|i| own[i % 2]).collect();
+        second.chunk = Arc::new(Chunk::clone(&second.chunk).with_classes(Some(classes)));
+    }
+    scene
+}
+
+/// The instance ids and classes of a view.
+pub(crate) type Owners = (Vec<u16>, Vec<u8>);
+
+/// The instance ids and classes of some views.
+pub(crate) fn owners(
+    backend: &dyn Backend,
+    scene: &Scene,
+    views: &[View],
+) -> (Vec<Owners>, FrameStats) {
+    let pixels = views.iter().map(|view| view.camera.pixels());
+    let mut owners: Vec<_> = pixels.map(|pixels| (vec![77; pixels], vec![77; pixels])).collect();
+    let targets = owners.iter_mut().map(|(ids, classes)| Target {
+        instances: Some(ids),
+        semantics: Some(classes),
+        ..Target::default()
+    });
+    let mut targets: Vec<Target<'_>> = targets.collect();
+    let profile = RenderProfile::default();
+    let frame = Frame { scene, profile: &profile, views };
+    let stats = backend.render(&frame, &mut targets, &|_, _| {}).unwrap();
+    drop(targets);
+    (owners, stats)
+}
+
+/// Asserts that classes are those of the reference backend, that they are of the Gaussians whose
+/// instance ids are there, and that requesting them changes no other image.
+pub(crate) fn check_semantics(backend: &dyn Backend, reference: &dyn Backend) {
+    let scene = labelled(&street_with_actors().0);
+    let unlabelled = street_with_actors().0;
+    let vehicle = SemanticClass::Vehicle.value();
+    let views: Vec<View> = views().into_iter().map(|(_, view)| view).collect();
+    let (all, _) = owners(backend, &scene, &views);
+    for (index, view) in views.iter().enumerate() {
+        let (ids, classes) = &owners(backend, &scene, &[*view]).0[0];
+        assert!((ids, classes) == (&all[index].0, &all[index].1), "view {index} among others");
+        assert_eq!(*ids, instances(backend, &unlabelled, *view).0, "view {index}");
+        let (truth_ids, truth) = &owners(reference, &scene, &[*view]).0[0];
+        // Where the same Gaussian decides. A neighbour decides where a transmittance is near a
+        // half.
+        let differing = classes.iter().zip(truth).filter(|(a, b)| a != b).count();
+        assert!(differing * 500 < ids.len(), "view {index}: {differing} of {} differ", ids.len());
+        for ids_and_classes in [(ids, classes), (truth_ids, truth)] {
+            let (ids, classes) = ids_and_classes;
+            for (&id, &class) in ids.iter().zip(classes) {
+                assert_eq!(class == 0, id == 0);
+                assert_eq!(class == vehicle, id == FIRST_ACTOR_INSTANCE, "{id}, {class}");
+                // Person and rider are among the twin's, too.
+                assert!(id != FIRST_ACTOR_INSTANCE + 1 || [13, 14].contains(&class), "{class}");
+                assert!(id <= FIRST_ACTOR_INSTANCE + 1 || class == 1, "{id}, {class}");
+            }
+        }
+        let mut seen = classes.clone();
+        seen.sort_unstable();
+        seen.dedup();
+        assert!(seen.len() > 15, "view {index}: only {seen:?}");
+        // A twin without classes: the same owners, of which only actors have a class.
+        let twin = Scene { chunks: unlabelled.chunks.clone(), ..scene.clone() };
+        let (bare_ids, bare) = &owners(backend, &twin, &[*view]).0[0];
+        assert_eq!(bare_ids, ids);
+        for (id, (bare, class)) in ids.iter().zip(bare.iter().zip(classes)) {
+            assert_eq!(*bare, if *id == TWIN_INSTANCE { 1 } else { *class });
+        }
     }
 }
 

@@ -109,6 +109,9 @@ impl Backend for Painter {
             if let Some(instances) = target.instances.as_deref_mut() {
                 instances.fill(7 + k as u16);
             }
+            if let Some(semantics) = target.semantics.as_deref_mut() {
+                semantics.fill(3 + k as u8);
+            }
             finished(k, target);
         }
         Ok(FrameStats { stages_ms: vec![("paint", 0.5)], ..FrameStats::default() })
@@ -142,6 +145,7 @@ pub(crate) fn commit_twin_to(catalog: &Catalog, logit_opacity: f32) {
         ln_scales: vec![[-1.0; 3]; 64],
         logit_opacities: vec![logit_opacity; 64],
         sh: (0..64 * 3).map(|i| (i % 7) as f32 * 0.3 - 0.9).collect(),
+        ..Gaussians::default()
     };
     let keyframe = |i: i64| Keyframe {
         time_us: 100_000 * i,

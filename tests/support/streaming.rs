@@ -12,7 +12,7 @@ use wildcity_generate::StreetSettings;
 use wildcity_render::View;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::manifest::Provenance;
-use wildcity_scene::{Chunk, Gaussians, RenderProfile, Scene, Trajectory};
+use wildcity_scene::{Gaussians, RenderProfile, Scene, Trajectory};
 use wildcity_twin::residency::{Cache, Resident, SectionRef, Viewpoint};
 use wildcity_twin::store::{Catalog, NewVersion, Version};
 
@@ -91,8 +91,8 @@ pub(crate) fn pixels(scene: &Scene, world_from_rig: Pose) -> Vec<Vec<u8>> {
 pub(crate) fn bytes(resident: &Resident, needed: &[SectionRef]) -> u64 {
     let manifest = &resident.version.manifest;
     let of = |n: &SectionRef| {
-        let count = manifest.chunks[n.chunk].sections[n.section].count;
-        Chunk::needed_bytes(manifest.sh_degree, count.into())
+        let chunk = &manifest.chunks[n.chunk];
+        chunk.needed_bytes(manifest.sh_degree, &chunk.sections[n.section])
     };
     needed.iter().map(of).sum()
 }

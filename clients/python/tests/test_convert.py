@@ -31,6 +31,7 @@ def fake_torch(monkeypatch: pytest.MonkeyPatch) -> None:
         (torch, "FloatStorage"),
         (torch, "DoubleStorage"),
         (torch, "BFloat16Storage"),
+        (torch, "LongStorage"),
         (utils, "_rebuild_tensor_v2"),
         (utils, "_rebuild_parameter"),
     ]:
@@ -116,7 +117,7 @@ def safetensors(path: Path) -> dict[str, np.ndarray[Any, Any]]:
     tensors = {}
     for name, info in json.loads(data[8 : 8 + length]).items():
         start, end = info["data_offsets"]
-        dtype = {"F32": "<f4", "F64": "<f8"}[info["dtype"]]
+        dtype = {"F32": "<f4", "F64": "<f8", "U8": "u1"}[info["dtype"]]
         tensors[name] = np.frombuffer(body[start:end], dtype).reshape(info["shape"])
     return tensors
 
@@ -137,6 +138,20 @@ def test_gsplat(tmp_path: Path) -> None:
     assert convert.convert(source, tmp_path / "out.safetensors") == N
     assert_same(safetensors(tmp_path / "out.safetensors"), g)
     assert sorted(os.listdir(tmp_path)) == ["ckpt.pt", "out.safetensors"]
+
+
+def test_classes_are_written_as_bytes(tmp_path: Path) -> None:
+    g = gaussians()
+    saved = tensors(g)
+    saved["semantic_class"] = Tensor(np.arange(1, N + 1)[:, None], "LongStorage")
+    source = save(tmp_path / "ckpt.pt", {"splats": saved})
+    convert.convert(source, tmp_path / "out.safetensors")
+    wanted = {**g, "semantic_class": np.arange(1, N + 1, dtype="u1")}
+    assert_same(safetensors(tmp_path / "out.safetensors"), wanted)
+    for wrong, says in ((np.arange(N - 1), "not 20 whole"), (np.full(N, 300), "from 300 to 300")):
+        saved["semantic_class"] = Tensor(wrong, "LongStorage")
+        with pytest.raises(CheckpointError, match=says):
+            convert.splats(save(tmp_path / "ckpt.pt", {"splats": saved}))
 
 
 def test_drivestudio_names_its_models(tmp_path: Path) -> None:

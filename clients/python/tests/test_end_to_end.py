@@ -226,6 +226,24 @@ def test_has_the_sweeps_of_its_lidar(connect: Connect, server: Server) -> None:
     assert (cloud.instances == 1).all()
 
 
+def test_a_twin_without_classes_is_unlabelled(connect: Connect, server: Server) -> None:
+    outputs = Outputs(encoding="raw", instances=True, semantics=True)
+    with connect(server.url) as client:
+        with client.open("corridor", rig=PAIR, outputs=outputs) as session:
+            assert session.opened.semantics is not None
+            assert not session.opened.semantics.labelled
+            assert session.opened.semantics.classes[:3] == ("none", "unlabelled", "road")
+            seen = session.reset()
+        with client.open("corridor", rig=PAIR, outputs=RAW) as session:
+            assert session.opened.semantics is None
+            with pytest.raises(KeyError, match="semantics=True"):
+                session.reset().semantics["front"]
+    for camera, classes in seen.semantics.items():
+        assert classes.dtype == np.uint8
+        assert np.array_equal(classes, seen.instances[camera])
+    assert (seen.semantics["front"] == 1).any()
+
+
 def test_knows_where_it_is_on_the_earth(connect: Connect, server: Server) -> None:
     latitude, longitude, altitude = ORIGIN
     plane = f"+proj=topocentric +ellps=WGS84 +lat_0={latitude} +lon_0={longitude} +h_0={altitude}"

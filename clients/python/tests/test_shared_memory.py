@@ -51,7 +51,7 @@ def test_memory_and_socket_have_the_same_bytes(
     encoding: Any,
     copy: bool,
 ) -> None:
-    outputs = Outputs(encoding=encoding, depth=True, opacity=True, normals=True, instances=True)
+    outputs = Outputs(encoding=encoding, depth=True, opacity=True, normals=True, instances=True, semantics=True)
     client = connect(server.url, shared_memory=True, copy=copy)
     session = client.open("corridor", rig=PAIR, outputs=outputs)
     for k in range(4):
@@ -65,7 +65,7 @@ def test_memory_and_socket_have_the_same_bytes(
         sent = other.step(Pose((float(k), 0.0, 0.0)))
         assert sent.frame == written
         assert sent.metadata.frame_hash == seen.metadata.frame_hash
-        for name in ("images", "depth", "normals", "instances"):
+        for name in ("images", "depth", "normals", "instances", "semantics"):
             for camera in ("front", "rear"):
                 assert np.array_equal(getattr(sent, name)[camera], getattr(seen, name)[camera])
         del seen

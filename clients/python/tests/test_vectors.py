@@ -123,6 +123,7 @@ REQUESTS: dict[str, Callable[[SessionProtocol], Any]] = {
             opacity=True,
             normals=True,
             instances=True,
+            semantics=True,
             images={"front": ImagePart((1, 0, 3, 3), (6, 6))},
             frames=4,
             trust=True,
@@ -258,7 +259,20 @@ def with_unknown_fields(value: Any) -> Any:
 
 @pytest.mark.parametrize(
     "name",
-    ["raw", "png", "jpeg", "two_poses", "bundle", "normals", "instances", "trust", "repair", "sensors", "no_images"],
+    [
+        "raw",
+        "png",
+        "jpeg",
+        "two_poses",
+        "bundle",
+        "normals",
+        "instances",
+        "semantics",
+        "trust",
+        "repair",
+        "sensors",
+        "no_images",
+    ],
 )
 def test_observations_decode_to_their_contents(name: str) -> None:
     expected = vector(f"observations/{name}.expected.json")
@@ -310,6 +324,11 @@ def check_image(observation: Observation, pose: int, camera: str, expected: dict
             assert view.instances[camera][at] == pixel["instance"]
         else:
             assert camera not in view.instances
+        if "class" in pixel:
+            assert view.semantics[camera].dtype == np.uint8
+            assert view.semantics[camera][at] == pixel["class"]
+        else:
+            assert camera not in view.semantics
 
 
 def test_frames_of_a_camera_are_in_the_order_they_were_taken() -> None:
@@ -458,7 +477,8 @@ def test_vectors_obey_the_schemas() -> None:
             del message["type"]
             assert not schema.is_valid(message)
     schema = validator("observation")
-    for name in ("raw", "png", "jpeg", "two_poses", "normals", "instances", "trust", "repair", "sensors", "no_images"):
+    frames = ("raw", "png", "jpeg", "two_poses", "normals", "instances", "semantics", "trust", "repair", "sensors")
+    for name in (*frames, "no_images"):
         metadata = vector(f"observations/{name}.expected.json")["observation"]
         schema.validate(metadata)
         del metadata["frame_hash"]

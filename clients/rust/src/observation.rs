@@ -202,6 +202,10 @@ impl Observation {
             if self.tensors.info(&name).is_some() {
                 self.check_tensor(&name, Dtype::U16, &[height, width])?;
             }
+            let name = image.sibling_tensor("semantics");
+            if self.tensors.info(&name).is_some() {
+                self.check_tensor(&name, Dtype::U8, &[height, width])?;
+            }
         }
         Ok(())
     }
@@ -294,6 +298,15 @@ impl<'a> ImageView<'a> {
         self.observation.tensors.info(&name)?;
         let bytes = self.observation.tensor_bytes(&name);
         Some(bytes.chunks_exact(2).map(|two| u16::from_le_bytes([two[0], two[1]])).collect())
+    }
+
+    /// The class of the Gaussian that each pixel shows, u8 `[height, width]`: an index of
+    /// [`OpenedSemantics::classes`](wildcity_protocol::message::OpenedSemantics::classes). `None`
+    /// if the session did not ask for it.
+    pub fn semantics(&self) -> Option<&'a [u8]> {
+        let name = self.sibling_tensor("semantics");
+        self.observation.tensors.info(&name)?;
+        Some(self.observation.tensor_bytes(&name))
     }
 
     /// Width and height, in pixels.

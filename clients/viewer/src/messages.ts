@@ -43,6 +43,7 @@ export interface Outputs {
   opacity?: boolean;
   period_us?: Record<string, number>;
   quality?: number;
+  semantics?: boolean;
   trust?: boolean;
 }
 
@@ -367,6 +368,12 @@ export interface OpenedScenario {
   name: string;
 }
 
+/** What the values of `semantics` mean. */
+export interface OpenedSemantics {
+  classes: string[];
+  labelled: boolean;
+}
+
 /** A pose of a recorded drive. */
 export interface DrivePose {
   pose: Pose;
@@ -400,6 +407,7 @@ export interface Opened {
   reserved_bytes: number;
   scenario?: OpenedScenario;
   seed: number;
+  semantics?: OpenedSemantics;
   sensors?: Sensors;
   seq: number;
   session: string;
@@ -601,8 +609,8 @@ export type RepairFailure = "timed_out" | "not_finite" | "withdrawn" | "other";
 export type RepairStatus = "kept" | "repaired" | "failed";
 
 /**
- * What became of an image in a session that asked for repair. Depth, opacity, normals and instances stay those of the
- * scene.
+ * What became of an image in a session that asked for repair. Depth, opacity, normals, instances and classes stay
+ * those of the scene.
  */
 export interface ImageRepair {
   failure?: RepairFailure;

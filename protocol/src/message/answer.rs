@@ -238,6 +238,9 @@ pub struct Opened {
     /// The scenario.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scenario: Option<OpenedScenario>,
+    /// What the tensors `semantics` mean, if the session asked for them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub semantics: Option<OpenedSemantics>,
     /// The part of a recorded drive that `open` asked for.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub trajectory: Option<Drive>,
@@ -261,6 +264,17 @@ pub struct OpenedLidar {
     pub max_range_m: f64,
     /// Pose of the LiDAR on the rig.
     pub lidar_to_rig: Pose,
+}
+
+/// What the values of `semantics` mean.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct OpenedSemantics {
+    /// Whether the Gaussians of the twin have classes. Without them, all of the twin is unlabelled,
+    /// and only actors have classes.
+    pub labelled: bool,
+    /// The name of each value, from 0 on: `none`, `unlabelled`, and then the names of Cityscapes.
+    pub classes: Vec<String>,
 }
 
 /// The repair of a session's images.

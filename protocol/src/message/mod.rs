@@ -11,8 +11,8 @@ mod drive;
 mod request;
 
 pub use answer::{
-    Answer, Limits, Opened, OpenedLidar, OpenedRepair, OpenedScenario, Outcome, ReferenceSource,
-    ResumedSession, ServerInfo, Summary, TrajectoryInfo, TwinInfo,
+    Answer, Limits, Opened, OpenedLidar, OpenedRepair, OpenedScenario, OpenedSemantics, Outcome,
+    ReferenceSource, ResumedSession, ServerInfo, Summary, TrajectoryInfo, TwinInfo,
 };
 pub use branch::{Branch, BranchPoint};
 pub use drive::{Drive, DrivePose};

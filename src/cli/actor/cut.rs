@@ -71,9 +71,16 @@ const SWEEP_PLACES: usize = 100_000;
 
 /// A box on the ground.
 #[derive(Clone, Copy, Debug)]
-struct Region {
+pub(in crate::cli) struct Region {
     world_from_box: Pose,
     box_: ActorBox,
+}
+
+impl Region {
+    /// As a place to cut out, or to give a class.
+    pub(in crate::cli) fn place(&self) -> CutPlace {
+        CutPlace { world_from_box: self.world_from_box, box_: self.box_ }
+    }
 }
 
 impl FromStr for Region {
@@ -112,6 +119,7 @@ impl Cut {
         let bytes = ingest::read_whole(path, MAP_BYTES as u64).with_context(context)?;
         let file = TracksFile::parse(&bytes).with_context(context)?;
         let places = swept(&file).with_context(context)?;
+        let places: Vec<CutPlace> = places.into_iter().map(|(place, _)| place).collect();
         let option = format!("cut={} tracks at {} places", file.tracks.len(), places.len());
         let cut = catalog.cut_all(base, &places, option)?;
         writeln!(
@@ -157,14 +165,15 @@ impl Cut {
     }
 }
 
-/// The places of all boxes on their tracks, close enough that nothing is left between two of them.
-fn swept(file: &TracksFile) -> anyhow::Result<Vec<CutPlace>> {
+/// The places of all boxes on their tracks with their classes, close enough that nothing is left
+/// between two of them.
+pub(in crate::cli) fn swept(file: &TracksFile) -> anyhow::Result<Vec<(CutPlace, ActorClass)>> {
     let mut places = Vec::new();
     for section in &file.tracks {
         let [length_m, width_m, height_m] = section.size;
         let box_ = ActorBox { length_m, width_m, height_m };
         let track = section.shifted(0)?;
-        let place = |world_from_box: Pose| CutPlace { world_from_box, box_ };
+        let place = |world_from_box: Pose| (CutPlace { world_from_box, box_ }, section.class);
         for pair in track.keyframes().windows(2) {
             let [from, to] = [pair[0].world_from_actor, pair[1].world_from_actor];
             // The corners also move as the box turns.

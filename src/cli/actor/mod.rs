@@ -12,6 +12,8 @@ mod remove;
 mod show;
 mod summary;
 
+pub(in crate::cli) use cut::{Region, swept};
+
 /// Make, list, show and remove assets of actors, from which other vehicles and pedestrians are
 /// rendered.
 ///

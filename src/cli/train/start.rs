@@ -133,7 +133,8 @@ fn logged_start(images: &LogImages, settings: &Settings) -> anyhow::Result<Start
 
 /// A text by which a checkpoint knows its Gaussians.
 pub(super) fn inputs(gaussians: &Gaussians) -> String {
-    let Gaussians { sh_degree, means_m, ln_scales, quats_wxyz, logit_opacities, sh } = gaussians;
+    let Gaussians { sh_degree, means_m, ln_scales, quats_wxyz, logit_opacities, sh, classes } =
+        gaussians;
     let mut hasher = blake3::Hasher::new();
     let mut bytes: Vec<u8> = means_m.as_flattened().iter().flat_map(|m| m.to_le_bytes()).collect();
     hasher.update(&bytes);
@@ -141,6 +142,9 @@ pub(super) fn inputs(gaussians: &Gaussians) -> String {
         bytes.clear();
         bytes.extend(values.iter().flat_map(|value| value.to_le_bytes()));
         hasher.update(&bytes);
+    }
+    if let Some(classes) = classes {
+        hasher.update(&classes.iter().map(|class| class.value()).collect::<Vec<u8>>());
     }
     format!("{} Gaussians of degree {sh_degree}, {}\n", gaussians.len(), hasher.finalize())
 }

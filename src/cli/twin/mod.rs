@@ -9,6 +9,7 @@ mod fsck;
 mod gc;
 mod generate;
 mod geo;
+mod label;
 mod list;
 mod log;
 mod remove;
@@ -45,6 +46,7 @@ super::subcommands! {
     #[cfg(feature = "eval")]
     Views(Box<views::Views>),
     Geo(geo::Geo),
+    Label(label::Label),
     Align(align::Align),
     Drive(drive::Drive),
 }

@@ -45,7 +45,7 @@ pub(super) struct Batch {
     pub(super) blocks: [u16; BATCH],
     /// For each block, a bit for each splat that touches it.
     pub(super) touching: [u64; BLOCKS],
-    /// The place of each splat. Only written if instances are requested.
+    /// The place of each splat. Only written if owners are wanted.
     pub(super) places: [u32; BATCH],
 }
 

@@ -20,7 +20,7 @@ use wildcity_scene::chunk::LANES;
 /// depends on the previous one by a single multiply-add. The transmittance of the image is a
 /// separate value, which changes only where the test holds.
 #[inline(always)]
-pub(super) fn blend<S: Simd, const DEPTH: bool, const INSTANCES: bool>(
+pub(super) fn blend<S: Simd, const DEPTH: bool, const OWNERS: bool>(
     simd: S,
     batch: &Batch,
     block: usize,
@@ -73,7 +73,7 @@ pub(super) fn blend<S: Simd, const DEPTH: bool, const INSTANCES: bool>(
         if DEPTH {
             depth = weight.mul_add(splat(matched.depth_m), depth);
         }
-        if INSTANCES {
+        if OWNERS {
             let half = splat(0.5);
             // The transmittance passes 1/2 only once, so that at most one splat is noted per pixel.
             let halves = counts & after.simd_le(half) & transmittance.simd_gt(half);

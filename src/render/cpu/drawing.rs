@@ -5,7 +5,7 @@ use fearless_simd::Level;
 
 use super::overflow::PartError;
 use super::part::FramePart;
-use super::project::{self, Job};
+use super::project::{self, Job, ProjectLimits};
 use super::slabs::{Cut, DepthClusters, Slab};
 use super::unfinished::{Continued, UnfinishedTiles};
 use super::{Scratch, StageTimer, bin, rasterize};
@@ -32,6 +32,11 @@ pub(super) fn most_held_bytes(most_bytes: u64, views: &[View], threads: usize) -
     most_bytes.max(sums) + sums + bin::COPIES_BYTES * threads as u64
 }
 
+/// Whether a target asks for classes.
+fn has_semantics(targets: &[Target<'_>]) -> bool {
+    targets.iter().any(|target| target.semantics.is_some())
+}
+
 /// Runs the stages project and bin for a part of a frame.
 pub(super) struct Stages<'a> {
     pub(super) level: Level,
@@ -39,6 +44,8 @@ pub(super) struct Stages<'a> {
     pub(super) cutoffs: &'a Cutoffs,
     /// Most bytes of their outputs.
     pub(super) most_bytes: u64,
+    /// Whether the classes of splats are kept.
+    pub(super) classes: bool,
 }
 
 impl Stages<'_> {
@@ -52,14 +59,15 @@ impl Stages<'_> {
         last: Stage,
         stats: &mut FrameStats,
     ) -> Result<(), PartError> {
-        let Self { level, frame, cutoffs, most_bytes } = *self;
+        let Self { level, frame, cutoffs, most_bytes, classes } = *self;
         let Scratch { projected, bins, .. } = scratch;
         // The time of a failed attempt counts, too: the errors are returned after `finish`.
         let mut timer = StageTimer::start();
         // Each splat has one pair at least, nearly always.
-        let most_places = most_bytes / limits::LEAST_SPLAT_BYTES;
+        let most_places = most_bytes / (limits::LEAST_SPLAT_BYTES + u64::from(classes));
         let most_places = usize::try_from(most_places).unwrap_or(usize::MAX);
-        let done = projected.project(level, jobs, cutoffs, slab, most_places);
+        let limits = ProjectLimits { most_places, classes };
+        let done = projected.project(level, jobs, cutoffs, slab, limits);
         timer.finish("project", stats);
         done?;
         if last >= Stage::Bin {
@@ -118,7 +126,8 @@ impl Drawing<'_> {
         most_bytes: u64,
     ) -> Result<(), PartError> {
         let Self { level, cutoffs, .. } = *self;
-        let stages = Stages { level, frame: &part.frame, cutoffs, most_bytes };
+        let classes = has_semantics(targets);
+        let stages = Stages { level, frame: &part.frame, cutoffs, most_bytes, classes };
         project::with_jobs(&part.frame, part.first_view, |jobs| {
             stages.run(self.scratch, jobs, None, Stage::Bin, &mut self.stats)
         })?;
@@ -149,7 +158,8 @@ impl Drawing<'_> {
                 let is_whole = cut.halves().is_none();
                 let most_bytes = if is_whole { u64::MAX } else { most_bytes };
                 let Self { level, cutoffs, .. } = *self;
-                let stages = Stages { level, frame: &part.frame, cutoffs, most_bytes };
+                let classes = has_semantics(targets);
+                let stages = Stages { level, frame: &part.frame, cutoffs, most_bytes, classes };
                 let slab = Slab { cut: &cut, clusters: &clusters };
                 // Projected again for each slab: only splats within the slab's cut are kept.
                 let run = stages.run(self.scratch, jobs, Some(&slab), Stage::Bin, &mut self.stats);

@@ -24,14 +24,16 @@ pub(super) fn stage_outputs(
     // Pages are filled in part, so that places have gaps; numbers have none.
     let mut index_of_place = vec![0; projected.places()];
     for unit in projected.units() {
-        let first_splat = outputs.splats.len() as u32;
         let instance = unit.instance;
-        // One entry per run of splats of the same instance, and not per splat.
-        if outputs.owners.last().is_none_or(|last| last.instance != instance) {
-            outputs.owners.push(SplatOwner { first_splat, instance });
-        }
         for (place, splat) in projected.unit(unit) {
-            index_of_place[place as usize] = outputs.splats.len() as u32;
+            let first_splat = outputs.splats.len() as u32;
+            index_of_place[place as usize] = first_splat;
+            // One entry per run of splats of the same owner, and not per splat.
+            let class = projected.class_in(unit, place);
+            let is_same = |last: &SplatOwner| (last.instance, last.class) == (instance, class);
+            if !outputs.owners.last().is_some_and(is_same) {
+                outputs.owners.push(SplatOwner { first_splat, instance, class });
+            }
             outputs.splats.push(*splat);
             outputs.keys.push(cutoffs.sort_key(unit.view, splat.depth_m));
         }

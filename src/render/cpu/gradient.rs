@@ -102,7 +102,7 @@ impl Differentiate for Cpu {
         let level = self.level;
         pool.install(|| {
             let mut stats = FrameStats::default();
-            let stages = Stages { level, frame, cutoffs: &cutoffs, most_bytes };
+            let stages = Stages { level, frame, cutoffs: &cutoffs, most_bytes, classes: false };
             project::with_jobs(frame, 0, |jobs| {
                 match stages.run(scratch, jobs, None, Stage::Bin, &mut stats) {
                     Err(PartError::Overflow) => {
@@ -219,7 +219,7 @@ impl Kept<'_> {
         macro_tile.copy_splats(projected);
         let mut kept = self.views[view].0[number].lock();
         kept.tiles.clear();
-        let wants = Wants { depth: self.depth, instances: false };
+        let wants = Wants { depth: self.depth, owners: false };
         let mut evaluations = 0;
         for (within, [column, row]) in Grid::new(&views[view]).macro_tile_tiles(number) {
             let mut sums = TileSums::default();

@@ -191,8 +191,15 @@ impl Cpu {
         let cutoffs = Cutoffs::new(frame.profile);
         pool.install(|| {
             let mut stats = FrameStats::default();
-            let stages =
-                Stages { level: self.level, frame, cutoffs: &cutoffs, most_bytes: u64::MAX };
+            // The other backend may be asked for classes, too.
+            let classes = true;
+            let stages = Stages {
+                level: self.level,
+                frame,
+                cutoffs: &cutoffs,
+                most_bytes: u64::MAX,
+                classes,
+            };
             match project::with_jobs(frame, 0, |jobs| {
                 stages.run(scratch, jobs, None, last, &mut stats)
             }) {

@@ -107,7 +107,7 @@ pub(super) fn rasterize(
                 grid: Grid::new(view),
                 wants: Wants {
                     depth: target.depth_m.is_some(),
-                    instances: target.instances.is_some(),
+                    owners: target.instances.is_some() || target.semantics.is_some(),
                 },
                 appearance: resolve::appearance(target),
                 background: input.backgrounds.get(index),
@@ -145,7 +145,8 @@ pub(super) fn rasterize(
 #[derive(Clone, Copy)]
 pub(super) struct Wants {
     pub(super) depth: bool,
-    pub(super) instances: bool,
+    /// Whose Gaussian halves the transmittance of each pixel.
+    pub(super) owners: bool,
 }
 
 /// The accumulated values of one tile.
@@ -204,10 +205,10 @@ fn draw_macro_tile<S: Simd>(
         let mut output =
             TileOutput { sums: &mut sums, live: &mut live, halved_by: &mut halved_by, wants };
         evaluations += rasterize_tile(simd, input, macro_tile, within, at_px, batch, &mut output);
-        if wants.instances {
+        if wants.owners {
             let mut band = drawing.bands[row as usize].lock();
             // In every slab: places of splats are those of this slab's projection.
-            band.write_instances(&halved_by, at_px[0], input.projected, has_sums);
+            band.write_owners(&halved_by, at_px[0], input.projected, has_sums);
             halved_by = NOT_HALVED;
         }
         if let (false, Some(tiles)) = (is_last, &mut unfinished) {
@@ -256,7 +257,7 @@ pub(super) fn rasterize_tile<S: Simd>(
         batch.read(macro_tile, input.projected, indices);
         batch.match_blocks(simd, input.cutoffs, indices.len(), at_px);
         batch.transpose(simd);
-        if output.wants.instances {
+        if output.wants.owners {
             for (place, &index) in batch.places.iter_mut().zip(indices) {
                 *place = macro_tile.place(index);
             }
@@ -269,16 +270,16 @@ pub(super) fn rasterize_tile<S: Simd>(
             let TileOutput { sums, halved_by, wants, .. } = &mut *output;
             let cutoffs = input.cutoffs;
             let (stopped, count) = match *wants {
-                Wants { depth: false, instances: false } => {
+                Wants { depth: false, owners: false } => {
                     blend::<S, false, false>(simd, batch, block, cutoffs, sums, halved_by)
                 }
-                Wants { depth: true, instances: false } => {
+                Wants { depth: true, owners: false } => {
                     blend::<S, true, false>(simd, batch, block, cutoffs, sums, halved_by)
                 }
-                Wants { depth: false, instances: true } => {
+                Wants { depth: false, owners: true } => {
                     blend::<S, false, true>(simd, batch, block, cutoffs, sums, halved_by)
                 }
-                Wants { depth: true, instances: true } => {
+                Wants { depth: true, owners: true } => {
                     blend::<S, true, true>(simd, batch, block, cutoffs, sums, halved_by)
                 }
             };

@@ -5,6 +5,7 @@ use fearless_simd::{f32x16, prelude::*, u32x16};
 use super::project::Projected;
 use crate::constants::{BLOCK_PX, TILE_PX};
 use crate::{Target, View};
+use wildcity_scene::SemanticClass;
 use wildcity_scene::appearance::Appearance;
 use wildcity_scene::chunk::LANES;
 
@@ -57,19 +58,19 @@ pub(super) struct Band<'a> {
     depth_m: Option<&'a mut [f32]>,
     opacity: Option<&'a mut [f32]>,
     instances: Option<&'a mut [u16]>,
+    semantics: Option<&'a mut [u8]>,
 }
 
 impl Band<'_> {
-    /// Writes the instances of one tile with its left edge at column `left`. If earlier slabs wrote
-    /// some, the instances of pixels that were halved in those slabs stay.
-    pub(super) fn write_instances(
+    /// Writes the instances and classes of one tile with its left edge at column `left`. If earlier
+    /// slabs wrote some, those of pixels that were halved in those slabs stay.
+    pub(super) fn write_owners(
         &mut self,
         halved_by: &HalvedBy,
         left: u32,
         projected: &Projected,
         has_some: bool,
     ) {
-        let Some(instances) = &mut self.instances else { return };
         let edge = BLOCK_PX as usize;
         for (block, halved_by) in halved_by.iter().enumerate() {
             let [block_left, row] = block_corner(block).map(|px| px as usize);
@@ -78,10 +79,16 @@ impl Band<'_> {
             for y in 0..edge.min(self.rows.saturating_sub(row)) {
                 for x in 0..edge.min(self.width.saturating_sub(column)) {
                     let pixel = (row + y) * self.width + column + x;
-                    match halved_by[y * edge + x].checked_sub(1) {
-                        Some(place) => instances[pixel] = projected.instance(place),
-                        None if has_some => {}
-                        None => instances[pixel] = 0,
+                    let place = halved_by[y * edge + x].checked_sub(1);
+                    if place.is_none() && has_some {
+                        continue;
+                    }
+                    if let Some(instances) = &mut self.instances {
+                        instances[pixel] = place.map_or(0, |place| projected.instance(place));
+                    }
+                    if let Some(semantics) = &mut self.semantics {
+                        let class = place.map(|place| projected.class(place));
+                        semantics[pixel] = class.unwrap_or(SemanticClass::None).value();
                     }
                 }
             }
@@ -105,6 +112,7 @@ pub(super) fn bands<'a>(target: &'a mut Target<'_>, view: &View) -> Vec<Band<'a>
     let mut opacity = target.opacity.as_mut().map(|b| b.chunks_mut(pixels));
     // All iterators advance together: band k has the rows of tile row k in every image.
     let mut instances = target.instances.as_mut().map(|b| b.chunks_mut(pixels));
+    let mut semantics = target.semantics.as_mut().map(|b| b.chunks_mut(pixels));
     (0..height)
         .step_by(TILE_PX as usize)
         .map(|top| Band {
@@ -115,6 +123,7 @@ pub(super) fn bands<'a>(target: &'a mut Target<'_>, view: &View) -> Vec<Band<'a>
             depth_m: depth_m.as_mut().and_then(Iterator::next),
             opacity: opacity.as_mut().and_then(Iterator::next),
             instances: instances.as_mut().and_then(Iterator::next),
+            semantics: semantics.as_mut().and_then(Iterator::next),
         })
         .collect()
 }

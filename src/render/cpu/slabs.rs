@@ -16,6 +16,7 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use crate::layout::{Cutoffs, Splat};
+use wildcity_scene::SemanticClass;
 use wildcity_scene::chunk::CLUSTER;
 
 /// Number of steps in which keys of depth are counted.
@@ -201,17 +202,29 @@ impl SlabOfJob<'_> {
         found.is_ok_and(|index| self.clusters[index].touches(self.keys))
     }
 
-    /// Drops the splats from `start` on that are not in it.
+    /// Drops the splats from `start` on that are not in it, and their classes, if there are any.
     #[inline(always)]
-    pub(super) fn keep(&self, cutoffs: &Cutoffs, splats: &mut Vec<Splat>, start: usize) {
+    pub(super) fn keep(
+        &self,
+        cutoffs: &Cutoffs,
+        splats: &mut Vec<Splat>,
+        classes: &mut Vec<SemanticClass>,
+        start: usize,
+    ) {
+        let has_classes = !classes.is_empty();
         let mut end = start;
         // In place and in order: `end` is never ahead of `index`.
         for index in start..splats.len() {
             if self.keys.contains(&cutoffs.sort_key(0, splats[index].depth_m)) {
                 splats[end] = splats[index];
+                if has_classes {
+                    classes[end] = classes[index];
+                }
                 end += 1;
             }
         }
         splats.truncate(end);
+        // Without classes there is nothing to truncate.
+        classes.truncate(end);
     }
 }

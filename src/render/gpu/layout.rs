@@ -11,7 +11,7 @@ use crate::layout::{
     ChunkShadow as CpuChunkShadow, ChunkView as CpuChunkView, Cutoffs, PixelFilter,
 };
 use crate::{MAX_VIEWS, View, constants};
-use wildcity_scene::RenderProfile;
+use wildcity_scene::{RenderProfile, SemanticClass};
 
 /// Threads of a workgroup. wgpu's default limits guarantee 256 on every device; Vulkan itself
 /// guarantees only 128.
@@ -341,6 +341,11 @@ pub struct Lens {
     /// The fields of [`ExpansionBound`](crate::expansion::ExpansionBound) in order, then zero; all
     /// zero for six points of every Gaussian.
     pub expansion: [f32; 4],
+}
+
+/// An instance, and in the high half a class: what `splat_owners.wgsl` writes for each splat.
+pub fn packed_owner(instance: u16, class: SemanticClass) -> u32 {
+    u32::from(instance) | u32::from(class.value()) << 16
 }
 
 /// The owner of the splats from a cluster view on (8 bytes). The first record of a list holds its

@@ -70,7 +70,7 @@ impl LongTiles {
         ];
         self.find.run(device, pass, Groups::Count(tiles.div_ceil(WORKGROUP)), &found);
 
-        let wants = [planes.has_depth(), planes.has_instances()];
+        let wants = [planes.has_depth(), planes.has_owners()];
         let variant = usize::from(wants[0]) + 2 * usize::from(wants[1]);
         let blend = self.blend.variant(device, variant, |module| {
             let constants = [("DEPTH", wants[0]), ("OWNERS", wants[1])];

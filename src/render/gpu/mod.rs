@@ -45,6 +45,7 @@ mod scan;
 pub mod shaders;
 mod slots;
 mod sort;
+mod splat_owners;
 mod tickets;
 mod tuning;
 mod turns;

@@ -250,6 +250,13 @@ impl Project {
         lights.flat_map(Lights::bind).collect()
     }
 
+    /// Spans, cluster views by page, cluster views, their visibility bits, and the index of the
+    /// first splat of each.
+    pub(super) fn cluster_buffers(&self) -> [&GrowableBuffer; 5] {
+        let Self { spans, page_cluster_views, cluster_views, visible, offsets, .. } = self;
+        [spans, page_cluster_views, cluster_views, visible, offsets]
+    }
+
     /// One bit per Gaussian of each cluster view.
     pub(super) fn visible(&self) -> &GrowableBuffer {
         &self.visible

@@ -18,7 +18,7 @@ use crate::unscented::UnscentedView;
 use crate::{FIRST_ACTOR_INSTANCE, Frame, TWIN_INSTANCE, View};
 use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::chunk::Cluster;
-use wildcity_scene::{Chunk, RenderProfile};
+use wildcity_scene::{Chunk, RenderProfile, SemanticClass};
 
 /// Clusters of a chunk that are tested at a time: a few microseconds. Chunks have 1 to 50,000
 /// clusters, so one that is tested as a whole would keep a single thread busy.
@@ -35,6 +35,8 @@ pub(super) struct ProjectWork {
     pub(super) chunk_views: Vec<ChunkView>,
     /// For each chunk view the number of its chunk: those of the twin, then those of actors.
     pub(super) chunk_numbers: Vec<u32>,
+    /// For each chunk view the instance, and in the high half the class of Gaussians without one.
+    pub(super) chunk_owners: Vec<u32>,
     /// One per chunk view if the frame has actors; empty otherwise.
     pub(super) lights: Vec<ChunkLight>,
     pub(super) shadows: Vec<ChunkShadow>,
@@ -192,6 +194,7 @@ impl ProjectWork {
             let chunk_view = *chunk_views[usize::from(shadowed)].get_or_insert_with(|| {
                 self.chunk_views.push(pair.chunk_view(variant, frame.profile));
                 self.chunk_numbers.push(pair.number);
+                self.chunk_owners.push(pair.owner());
                 if !frame.scene.placed.is_empty() {
                     self.add_light(pair, shadowed);
                 }
@@ -230,10 +233,7 @@ impl ProjectWork {
 
     /// Adds the owner of the next cluster view if it differs from that of the last one.
     fn add_owner(&mut self, pair: &ChunkInView<'_>) {
-        let instance = match pair.of {
-            Owner::Twin { .. } => TWIN_INSTANCE.into(),
-            Owner::Actor { placed, .. } => (FIRST_ACTOR_INSTANCE + placed.actor).into(),
-        };
+        let instance = pair.owner() & 0xFFFF;
         let cluster_view = self.cluster_views.len() as u32;
         if self.owners.last().is_none_or(|last| last.instance != instance) {
             self.owners.push(layout::Owner { cluster_view, instance });
@@ -258,6 +258,15 @@ impl ProjectWork {
 }
 
 impl ChunkInView<'_> {
+    /// The instance, and in the high half the class of Gaussians that have none.
+    fn owner(&self) -> u32 {
+        let (instance, class) = match self.of {
+            Owner::Twin { .. } => (TWIN_INSTANCE, SemanticClass::Unlabelled),
+            Owner::Actor { placed, .. } => (FIRST_ACTOR_INSTANCE + placed.actor, placed.class),
+        };
+        layout::packed_owner(instance, class)
+    }
+
     /// Those of some clusters that may be visible, in order. `unscented` is that of the frame's
     /// view.
     fn visible(

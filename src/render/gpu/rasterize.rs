@@ -57,6 +57,8 @@ pub(super) struct Rasterize {
     shaders: BackgroundShaders,
     /// For frames with instance ids; created with the first of them.
     instances: Option<Instances>,
+    /// For frames with classes; created with the first of them.
+    semantics: Option<BackgroundShaders>,
     /// For frames with a background or with appearances; created with the first of them.
     background: Option<Background>,
     /// The background of frames that have appearances only.
@@ -103,6 +105,19 @@ impl Instances {
     }
 }
 
+impl BackgroundShaders {
+    /// Of frames with classes.
+    fn with_classes() -> Self {
+        Self {
+            no_background: Shader::new("owners"),
+            map: Shader::new("owners_map"),
+            network: Shader::new("owners_network"),
+            map_lens: Shader::new("owners_map_lens"),
+            network_lens: Shader::new("owners_network_lens"),
+        }
+    }
+}
+
 /// The part of the output that a region writes.
 #[derive(Clone, Debug)]
 pub(super) struct TileOutput {
@@ -125,6 +140,8 @@ pub(super) struct RasterizeInputs<'a> {
     pub(super) owners: &'a [Owner],
     /// For each cluster view, the index of its first splat.
     pub(super) first_splats: &'a GrowableBuffer,
+    /// The owner of each splat, in frames with classes.
+    pub(super) splat_owners: Option<&'a GrowableBuffer>,
 }
 
 impl Rasterize {
@@ -139,6 +156,7 @@ impl Rasterize {
                 network_lens: Shader::new("rasterize_network_lens"),
             },
             instances: None,
+            semantics: None,
             background: None,
             black: None,
             has_background: false,
@@ -206,10 +224,11 @@ impl Rasterize {
         output: &TileOutput,
         frame_tiles: u32,
     ) {
-        let RasterizeInputs { plan, splats, bin, lenses, owners, first_splats } = inputs;
+        let RasterizeInputs { plan, splats, bin, lenses, owners, first_splats, splat_owners } =
+            inputs;
         let TileOutput { planes, tiles, tiles_per_page } = output;
         self.compile(device, *planes);
-        if planes.has_instances() {
+        if planes.has_owners() && !planes.has_semantics() {
             let instances = self.instances.get_or_insert_with(|| Instances::new(device));
             let count = Owner { cluster_view: 0, instance: owners.len() as u32 };
             let list: Vec<Owner> = [count].iter().chain(owners).copied().collect();
@@ -228,7 +247,8 @@ impl Rasterize {
             Some(long_tiles) => long_tiles.bind_places(),
             None => (15, self.no_places.bind()),
         };
-        let composite = self.composite_resources(*planes, lenses, first_splats);
+        let mut composite = self.composite_resources(*planes, lenses, first_splats);
+        composite.extend(splat_owners.map(|owners| (13, owners.bind())));
         let page_resources = |index: usize, page: usize, tiles: &Range<u32>| {
             let bytes = page_bytes(*planes, tiles, *tiles_per_page);
             let pixels = BufferBinding {
@@ -262,14 +282,15 @@ impl Rasterize {
         for (index, (page, tiles)) in pages(tiles, *tiles_per_page).enumerate() {
             let mut resources = page_resources(index, page, &tiles);
             resources.push(long_tiles.bind_sums());
-            if planes.has_instances() {
+            if planes.has_owners() {
                 resources.push((3, bin.instances.bind()));
             }
             finish.run(device, pass, Groups::Count(tiles.len() as u32), &resources);
         }
     }
 
-    /// What the kernels need for the background, the appearances and the instances.
+    /// What the kernels need for the background, the appearances and the instances, but for the
+    /// owners of frames with classes.
     fn composite_resources<'a>(
         &'a self,
         planes: Planes,
@@ -277,7 +298,7 @@ impl Rasterize {
         first_splats: &'a GrowableBuffer,
     ) -> Vec<(u32, BindingResource<'a>)> {
         let mut resources = Vec::new();
-        if let Some(instances) = self.instances.as_ref().filter(|_| planes.has_instances()) {
+        if let Some(instances) = self.instances(planes) {
             resources.extend([(13, instances.owners.bind()), (14, first_splats.bind())]);
         }
         if let Some(background) = self.shown_background() {
@@ -289,6 +310,11 @@ impl Rasterize {
         resources
     }
 
+    /// The kernels and the input of instance ids, for frames that have those and no classes.
+    fn instances(&self, planes: Planes) -> Option<&Instances> {
+        self.instances.as_ref().filter(|_| planes.has_owners() && !planes.has_semantics())
+    }
+
     /// The background of the current frame.
     fn shown_background(&self) -> Option<&Background> {
         self.background.as_ref().filter(|_| self.has_background)
@@ -296,14 +322,13 @@ impl Rasterize {
 
     /// Compiles the kernels of the current frame, if they are missing.
     fn compile(&mut self, device: &Device, planes: Planes) {
-        if planes.has_instances() {
-            self.instances.get_or_insert_with(|| Instances::new(device));
-        }
         let background = self.shown_background().map(Background::shader);
-        let instances = self.instances.as_mut().filter(|_| planes.has_instances());
-        let shaders = match instances {
-            Some(instances) => &mut instances.shaders,
-            None => &mut self.shaders,
+        let shaders = if planes.has_semantics() {
+            self.semantics.get_or_insert_with(BackgroundShaders::with_classes)
+        } else if planes.has_owners() {
+            &mut self.instances.get_or_insert_with(|| Instances::new(device)).shaders
+        } else {
+            &mut self.shaders
         };
         let shader = match background {
             None => &mut shaders.no_background,
@@ -317,8 +342,9 @@ impl Rasterize {
 
     /// The shader for the current frame's background and these planes.
     fn shader(&self, planes: Planes) -> &Shader {
-        let instances = self.instances.as_ref().filter(|_| planes.has_instances());
-        let shaders = instances.map_or(&self.shaders, |instances| &instances.shaders);
+        let semantics = self.semantics.as_ref().filter(|_| planes.has_semantics());
+        let instances = self.instances(planes).map(|instances| &instances.shaders);
+        let shaders = semantics.or(instances).unwrap_or(&self.shaders);
         match self.shown_background().map(Background::shader) {
             None => &shaders.no_background,
             Some(BackgroundShader::Map) => &shaders.map,

@@ -24,7 +24,10 @@ pub(super) struct Planes {
     rgb: bool,
     opacity: bool,
     depth: bool,
-    instances: bool,
+    /// The owner of each pixel: instance ids, or classes.
+    owners: bool,
+    /// Whether owners have classes.
+    semantics: bool,
 }
 
 /// The outputs that the targets of a frame request.
@@ -58,18 +61,19 @@ impl Planes {
             rgb: any(|t| t.rgba.is_some()),
             opacity: any(|t| t.rgba.is_some() || t.opacity.is_some()),
             depth: any(|t| t.depth_m.is_some()),
-            instances: any(|t| t.instances.is_some()),
+            owners: any(|t| t.instances.is_some() || t.semantics.is_some()),
+            semantics: any(|t| t.semantics.is_some()),
         }
     }
 
     /// Those that a loss is a function of.
     pub(super) fn for_gradients(depth: bool) -> Self {
-        Self { rgb8: false, rgb: true, opacity: true, depth, instances: false }
+        Self { rgb8: false, rgb: true, opacity: true, depth, owners: false, semantics: false }
     }
 
-    /// A number below [`Planes::VARIANTS`].
+    /// A number below [`Planes::VARIANTS`]. Owners with classes have shaders of their own.
     pub(super) fn variant(self) -> usize {
-        let bits = [self.rgb8, self.rgb, self.opacity, self.depth, self.instances];
+        let bits = [self.rgb8, self.rgb, self.opacity, self.depth, self.owners];
         bits.into_iter().fold(0, |number, bit| 2 * number + usize::from(bit))
     }
 
@@ -89,9 +93,14 @@ impl Planes {
         self.depth
     }
 
-    /// Whether instance ids are computed.
-    pub(super) fn has_instances(self) -> bool {
-        self.instances
+    /// Whether the owner of each pixel is computed.
+    pub(super) fn has_owners(self) -> bool {
+        self.owners
+    }
+
+    /// Whether the owners have classes.
+    pub(super) fn has_semantics(self) -> bool {
+        self.semantics
     }
 
     /// Bytes of the pixels of one tile, at least one plane, so that buffers are never empty. They
@@ -105,7 +114,7 @@ impl Planes {
         self.parts().iter().map(|(requested, words)| usize::from(*requested) * words).sum()
     }
 
-    /// Whether rgb8, rgb, opacity, depth, and instances are requested, and the words that each
+    /// Whether rgb8, rgb, opacity, depth, and owners are requested, and the words that each
     /// takes of a tile.
     fn parts(self) -> [(bool, usize); 5] {
         [
@@ -113,11 +122,11 @@ impl Planes {
             (self.rgb, 3 * PLANE),
             (self.opacity, PLANE),
             (self.depth, PLANE),
-            (self.instances, PLANE),
+            (self.owners, PLANE),
         ]
     }
 
-    /// First word of rgb8, rgb, opacity, depth, and instances in a tile; `None` if it is not
+    /// First word of rgb8, rgb, opacity, depth, and owners in a tile; `None` if it is not
     /// requested.
     fn starts(self) -> [Option<usize>; 5] {
         let mut next = 0;
@@ -145,7 +154,7 @@ impl Pixels<'_> {
     /// Copies the pixels of one view to its target.
     pub(super) fn copy_to(&self, view: &FrameView, target: &mut Target<'_>) {
         let row_pixels = (view.size_px[0] * TILE_PX) as usize;
-        let [rgb8, rgb, opacity, depth, instances] = self.planes.starts();
+        let [rgb8, rgb, opacity, depth, owners] = self.planes.starts();
         if let (Some(to), Some(plane)) = (&mut target.rgb8, rgb8) {
             self.for_each_row(view, to.par_chunks_mut(3 * row_pixels), |to, at, tile, from| {
                 // The words have the bytes in the order of the pixels on every device: Vulkan is
@@ -166,10 +175,18 @@ impl Pixels<'_> {
                 }
             });
         }
-        if let (Some(to), Some(plane)) = (&mut target.instances, instances) {
+        if let (Some(to), Some(plane)) = (&mut target.instances, owners) {
             self.for_each_row(view, to.par_chunks_mut(row_pixels), |to, at, tile, from| {
                 for (to, word) in to[at..].iter_mut().zip(row(tile, plane, &from)) {
+                    // The low half; the high half is the class, if there are classes.
                     *to = *word as u16;
+                }
+            });
+        }
+        if let (Some(to), Some(plane)) = (&mut target.semantics, owners) {
+            self.for_each_row(view, to.par_chunks_mut(row_pixels), |to, at, tile, from| {
+                for (to, word) in to[at..].iter_mut().zip(row(tile, plane, &from)) {
+                    *to = (*word >> 16) as u8;
                 }
             });
         }

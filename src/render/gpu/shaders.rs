@@ -52,6 +52,7 @@ const UNSCENTED: Choice = choice("PROJECTION", "unscented");
 const NO_ACTORS: Choice = choice("ACTORS", "no_actors");
 const ACTORS: Choice = choice("ACTORS", "actors");
 const INSTANCES: Choice = choice("INSTANCES", "instances");
+const OWNERS: Choice = choice("INSTANCES", "owners");
 const NO_INSTANCES: Choice = choice("INSTANCES", "no_instances");
 const BACKGROUND: Choice = choice("BACKGROUND", "background");
 const NO_BACKGROUND: Choice = choice("BACKGROUND", "no_background");
@@ -87,6 +88,12 @@ const VARIANTS: &[Variant] = &[
     variant("instances_map_lens", "rasterize", &[INSTANCES, BACKGROUND, MAP, RAY_LENS]),
     variant("instances_network", "rasterize", &[INSTANCES, BACKGROUND, NETWORK, RAY_PINHOLE]),
     variant("instances_network_lens", "rasterize", &[INSTANCES, BACKGROUND, NETWORK, RAY_LENS]),
+    variant("owners", "rasterize", &[OWNERS, NO_BACKGROUND]),
+    variant("owners_map", "rasterize", &[OWNERS, BACKGROUND, MAP, RAY_PINHOLE]),
+    variant("owners_map_lens", "rasterize", &[OWNERS, BACKGROUND, MAP, RAY_LENS]),
+    variant("owners_network", "rasterize", &[OWNERS, BACKGROUND, NETWORK, RAY_PINHOLE]),
+    variant("owners_network_lens", "rasterize", &[OWNERS, BACKGROUND, NETWORK, RAY_LENS]),
+    plain("splat_owners"),
     plain("rasterize_gradient"),
     plain("gather"),
     variant("project_gradient", "project_gradient", &[PINHOLE, NO_ACTORS]),
@@ -106,6 +113,7 @@ const FILES: &[(&str, &str)] = &[
     ("constants", include_str!("../../../shaders/shared/constants.wgsl")),
     ("expansion", include_str!("../../../shaders/expansion.wgsl")),
     ("expand", include_str!("../../../shaders/expand.wgsl")),
+    ("halved_by", include_str!("../../../shaders/shared/halved_by.wgsl")),
     ("instances", include_str!("../../../shaders/instances.wgsl")),
     ("four_pixels", include_str!("../../../shaders/shared/four_pixels.wgsl")),
     ("gather", include_str!("../../../shaders/gather.wgsl")),
@@ -117,6 +125,7 @@ const FILES: &[(&str, &str)] = &[
     ("no_actors", include_str!("../../../shaders/shared/no_actors.wgsl")),
     ("no_instances", include_str!("../../../shaders/shared/no_instances.wgsl")),
     ("no_background", include_str!("../../../shaders/shared/no_background.wgsl")),
+    ("owners", include_str!("../../../shaders/owners.wgsl")),
     ("pinhole", include_str!("../../../shaders/pinhole.wgsl")),
     ("plan", include_str!("../../../shaders/plan.wgsl")),
     ("prefix", include_str!("../../../shaders/shared/prefix.wgsl")),
@@ -136,6 +145,8 @@ const FILES: &[(&str, &str)] = &[
     ("sort", include_str!("../../../shaders/sort.wgsl")),
     ("tile_blocks", include_str!("../../../shaders/shared/tile_blocks.wgsl")),
     ("splat_batch", include_str!("../../../shaders/shared/splat_batch.wgsl")),
+    ("splat_owners", include_str!("../../../shaders/splat_owners.wgsl")),
+    ("splat_slot", include_str!("../../../shaders/shared/splat_slot.wgsl")),
     ("splat_sums", include_str!("../../../shaders/shared/splat_sums.wgsl")),
     ("sort_ballots", include_str!("../../../shaders/sort_ballots.wgsl")),
     ("touch_batch", include_str!("../../../shaders/shared/touch_batch.wgsl")),

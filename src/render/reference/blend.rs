@@ -3,7 +3,7 @@
 use glam::{DVec2, DVec3};
 
 use super::project::Splat;
-use wildcity_scene::RenderProfile;
+use wildcity_scene::{RenderProfile, SemanticClass};
 
 /// Accumulated values of a pixel.
 #[derive(Clone, Copy, Debug)]
@@ -16,6 +16,8 @@ pub(super) struct Pixel {
     pub(super) depth_m: f64,
     /// The owner of the splat that brought the transmittance to a half or less; 0 if none has.
     pub(super) instance: u16,
+    /// The class of that splat.
+    pub(super) class: SemanticClass,
 }
 
 /// One row of pixels, from the left.
@@ -56,8 +58,13 @@ fn pixel(splats: &[Splat], at_px: DVec2, profile: &RenderProfile) -> Pixel {
 
 impl Pixel {
     /// Before any splat is blended.
-    pub(super) const EMPTY: Self =
-        Self { rgb: DVec3::ZERO, transmittance: 1.0, depth_m: 0.0, instance: 0 };
+    pub(super) const EMPTY: Self = Self {
+        rgb: DVec3::ZERO,
+        transmittance: 1.0,
+        depth_m: 0.0,
+        instance: 0,
+        class: SemanticClass::None,
+    };
 
     /// Blends the next splat, with its alpha before the cap. Returns false if the pixel stops
     /// before it.
@@ -78,6 +85,7 @@ impl Pixel {
         self.depth_m += weight * splat.depth_m;
         if self.transmittance > 0.5 && after <= 0.5 {
             self.instance = splat.instance;
+            self.class = splat.class;
         }
         self.transmittance = after;
         true

@@ -153,5 +153,8 @@ fn write(pixels: &[blend::Pixel], target: &mut Target<'_>) {
         if let Some(to) = &mut target.instances {
             to[i] = pixel.instance;
         }
+        if let Some(to) = &mut target.semantics {
+            to[i] = pixel.class.value();
+        }
     }
 }

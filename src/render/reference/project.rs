@@ -9,11 +9,11 @@ use rayon::prelude::*;
 use crate::constants::MIN_BLUR_SHARE;
 use crate::layout::{Filtered, PixelFilter};
 use crate::unscented::max_center_angle_rad;
-use crate::{FIRST_ACTOR_INSTANCE, TWIN_INSTANCE, View};
+use crate::{FIRST_ACTOR_INSTANCE, TWIN_INSTANCE, View, gaussian_class};
 use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::chunk::column;
 use wildcity_scene::geometry::Camera;
-use wildcity_scene::{Chunk, RenderProfile, Scene, sh};
+use wildcity_scene::{Chunk, RenderProfile, Scene, SemanticClass, sh};
 
 /// A Gaussian on the image.
 #[derive(Clone, Copy, Debug)]
@@ -23,6 +23,8 @@ pub struct Splat {
     pub gaussian: [usize; 2],
     /// The owner of the Gaussian, as in [`Target::instances`](crate::Target::instances).
     pub instance: u16,
+    /// The class of the Gaussian, as in [`Target::semantics`](crate::Target::semantics).
+    pub class: SemanticClass,
     /// Depth of the centre, in metres, by which splats are sorted.
     pub depth_m: f64,
     /// Centre, in pixels.
@@ -45,7 +47,8 @@ pub fn project(scene: &Scene, profile: &RenderProfile, view: &View) -> Vec<Splat
             let gaussian = Gaussian::from_chunk(chunk, i);
             let splat = gaussian.project(profile, view)?;
             let rgb = splat.rgb * shadow_factor(scene, gaussian.mean_m);
-            Some(Splat { gaussian: [number, i], rgb, ..splat })
+            let class = gaussian_class(chunk, i, SemanticClass::Unlabelled);
+            Some(Splat { gaussian: [number, i], class, rgb, ..splat })
         };
         (0..chunk.len()).filter_map(splat)
     });
@@ -57,7 +60,9 @@ pub fn project(scene: &Scene, profile: &RenderProfile, view: &View) -> Vec<Splat
             // Actors' chunks are numbered after those of the twin.
             let number = scene.chunks.len() + number;
             let instance = FIRST_ACTOR_INSTANCE + placed.actor;
-            Some(Splat { gaussian: [number, i], instance, rgb: splat.rgb * tint, ..splat })
+            let class = gaussian_class(&placed.chunk, i, placed.class);
+            let rgb = splat.rgb * tint;
+            Some(Splat { gaussian: [number, i], instance, class, rgb, ..splat })
         };
         (0..placed.chunk.len()).filter_map(splat)
     });
@@ -155,6 +160,7 @@ impl Gaussian {
         Some(Splat {
             gaussian: [0, 0],
             instance: TWIN_INSTANCE,
+            class: SemanticClass::Unlabelled,
             depth_m,
             mean_px,
             conic: DVec3::new(yy, -xy, xx) / det,

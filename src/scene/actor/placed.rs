@@ -5,7 +5,7 @@ use std::sync::Arc;
 use glam::{DVec3, Vec3};
 
 use crate::geometry::Pose;
-use crate::{Chunk, ViewSet};
+use crate::{Chunk, SemanticClass, ViewSet};
 
 /// The Gaussians of an actor at its pose in one frame.
 ///
@@ -26,6 +26,8 @@ pub struct PlacedChunk {
     pub world_from_actor_at_start: Pose,
     /// Index of the actor, below [`PlacedChunk::MAX_ACTORS`].
     pub actor: u16,
+    /// The class of its Gaussians that have none of their own.
+    pub class: SemanticClass,
     /// Factor on the Gaussians' linear red, green and blue; 1 leaves them as they are.
     pub tint: [f32; 3],
     /// The shadow that the actor casts on the twin beneath it, in the views that draw this chunk.
@@ -55,13 +57,14 @@ impl PlacedChunk {
     /// Most actors of a view.
     pub const MAX_ACTORS: usize = 256;
 
-    /// A chunk at rest, without a tint or a shadow, in all views.
+    /// A chunk at rest, without a class, a tint or a shadow, in all views.
     pub fn at_rest(chunk: Arc<Chunk>, world_from_actor: Pose, actor: u16) -> Self {
         Self {
             chunk,
             world_from_actor,
             world_from_actor_at_start: world_from_actor,
             actor,
+            class: SemanticClass::Unlabelled,
             tint: [1.0; 3],
             shadow: None,
             views: ViewSet::ALL,

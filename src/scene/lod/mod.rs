@@ -20,7 +20,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use super::chunk::{ActivatedGaussian, Chunk, column};
-use super::sh;
+use super::{SemanticClass, sh};
 
 use merge::{Node, StoredNode, area_m2, cost, joined};
 
@@ -100,6 +100,8 @@ struct Merging {
     leaves: Vec<[f32; 4]>,
     /// The node that represents each leaf.
     node_of_leaf: Vec<u32>,
+    /// The class and the weight of each leaf, if the block has classes.
+    leaf_classes: Option<Vec<(SemanticClass, f32)>>,
 }
 
 /// A candidate pair for merging.
@@ -122,6 +124,7 @@ impl Merging {
             stride,
             leaves: Vec::with_capacity(block.len()),
             node_of_leaf: (0..block.len() as u32).collect(),
+            leaf_classes: block.classes().map(|classes| Vec::with_capacity(classes.len())),
         };
         for index in 0..block.len() {
             let value = |column| block.value(index, column);
@@ -130,6 +133,9 @@ impl Merging {
             let [x, y, z] = three(column::MEAN);
             let opacity = f64::from(value(column::LOG2_OPACITY)).exp2();
             let weight = opacity * area_m2(DVec3::from_array(scale_m.map(f64::from)));
+            if let (Some(all), Some(classes)) = (&mut merging.leaf_classes, block.classes()) {
+                all.push((classes[index], weight as f32));
+            }
             merging.leaves.push([x, y, z, scale_m[0].max(scale_m[1]).max(scale_m[2])]);
             merging.nodes.push(StoredNode {
                 mean_m: DVec3::from_array([x, y, z].map(f64::from)),
@@ -363,7 +369,31 @@ impl Merging {
                 sh,
             });
         }
-        chunk
+        chunk.with_classes(self.classes())
+    }
+
+    /// The class of each node: that with the greatest weight among the Gaussians of level 0 that it
+    /// represents; the first of equal ones.
+    fn classes(&self) -> Option<Vec<SemanticClass>> {
+        // Of leaves and not of the nodes that were merged, among which a class that is in few of
+        // each may lose although it is in most of all.
+        let leaves = self.leaf_classes.as_ref()?;
+        let mut weights = vec![[0.0_f32; SemanticClass::ALL.len()]; self.nodes.len()];
+        // In the order of leaves, so that sums are the same every time.
+        for (&node, &(class, weight)) in self.node_of_leaf.iter().zip(leaves) {
+            // A Gaussian without extent has no weight, and counts where it is alone.
+            weights[node as usize][usize::from(class.value())] += weight.max(f32::MIN_POSITIVE);
+        }
+        let heaviest = |weights: &[f32; SemanticClass::ALL.len()]| {
+            let mut best = SemanticClass::None;
+            for class in SemanticClass::ALL {
+                if weights[usize::from(class.value())] > weights[usize::from(best.value())] {
+                    best = class;
+                }
+            }
+            best
+        };
+        Some(weights.iter().map(heaviest).collect())
     }
 }
 

@@ -40,7 +40,8 @@ pub fn round_trip(scene: &Scene, record: RecordFormat) -> RoundTrip {
             chunk.len(),
             lanes,
         );
-        all.scene.chunks.push(Arc::new(decoded));
+        let classes = chunk.classes().map(<[_]>::to_vec);
+        all.scene.chunks.push(Arc::new(decoded.with_classes(classes)));
     }
     all
 }

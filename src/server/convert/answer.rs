@@ -15,10 +15,10 @@ use wildcity_protocol::message::{
     self, Answer, Limits, Opened, RigCamera, ServerInfo, TrajectoryInfo, TwinInfo,
 };
 use wildcity_repair::Selection;
-use wildcity_scene::Rig;
 use wildcity_scene::appearance::Appearance;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::rig::RigLidar;
+use wildcity_scene::{Manifest, Rig, SemanticClass};
 use wildcity_session::{
     DamagedSummary, Engine, EpisodeSummary, EpisodeTraffic, ImageEncoding, Outcome, PixelMaps,
     ReferenceSource, Session, SessionRepair, TrajectorySummary, TwinSummaries, TwinSummary,
@@ -77,7 +77,7 @@ fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Resu
     let trajectory = section.map(|section| drive(&resident.version, section, "trajectory."));
     let profile = profile(session)?;
     let (encoding, quality) = encoding(session.encoding());
-    let PixelMaps { depth, opacity, normals, instances } = session.maps();
+    let PixelMaps { depth, opacity, normals, instances, semantics } = session.maps();
     let names: Vec<_> = session.cameras().iter().map(|camera| camera.name.clone()).collect();
     let period_us = |(index, name): (usize, &String)| (name.clone(), session.period_us(index));
     // All defaults are filled in: the client reads what applies, and not what it sent.
@@ -88,6 +88,7 @@ fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Resu
         opacity,
         normals: Some(normals),
         instances: instances.then_some(true),
+        semantics: semantics.then_some(true),
         frames: Some(session.frames() as u64),
         trust: Some(session.trust()),
         actors: session.reports_actors().then_some(true),
@@ -125,6 +126,7 @@ fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Resu
         repair: session.repair().map(|repair| opened_repair(repair, session)),
         sensors: session.sensors().cloned(),
         scenario: session.traffic().map(opened_scenario),
+        semantics: semantics.then(|| opened_semantics(manifest)),
         trajectory: trajectory.transpose()?,
     })
 }
@@ -139,6 +141,14 @@ fn opened_lidar(mounted: &RigLidar) -> message::OpenedLidar {
         min_range_m: lidar.min_range_m(),
         max_range_m: lidar.max_range_m(),
         lidar_to_rig: pose(rig_from_lidar),
+    }
+}
+
+fn opened_semantics(manifest: &Manifest) -> message::OpenedSemantics {
+    message::OpenedSemantics {
+        labelled: manifest.has_classes(),
+        // In the order of their values, which count up from 0.
+        classes: SemanticClass::ALL.map(|class| class.name().to_owned()).to_vec(),
     }
 }
 

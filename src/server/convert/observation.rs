@@ -30,7 +30,7 @@ pub(crate) fn observation(
     session: &Session,
     mut frame: wildcity_session::Observation,
 ) -> Result<wildcity_session::Observation, Fault> {
-    // Computed once: each image has up to five tensors, and an entry in the metadata.
+    // Computed once: each image has up to six tensors, and an entry in the metadata.
     let image_names = image_names(session, &frame);
     let mut header = Header { tensors: BTreeMap::new(), metadata: BTreeMap::new() };
     for tensor in &frame.tensors {
@@ -48,6 +48,7 @@ pub(crate) fn observation(
             TensorKind::Opacity(image) => format!("{}/opacity", image_names[image]),
             TensorKind::Normals(image) => format!("{}/normals", image_names[image]),
             TensorKind::Instances(image) => format!("{}/instances", image_names[image]),
+            TensorKind::Semantics(image) => format!("{}/semantics", image_names[image]),
             TensorKind::Rgb(image) => format!("{}/rgb", image_names[image]),
             TensorKind::PastRgb(image) => past_tensor(session, &frame.history[image]),
         };

@@ -188,7 +188,8 @@ fn store_place(error: &StoreError) -> Place {
         | StoreError::Scattered { .. }
         | StoreError::ManifestSize { .. }
         | StoreError::ViewSize { .. }
-        | StoreError::NothingToCut { .. } => plain(Code::PushRefused),
+        | StoreError::NothingToCut { .. }
+        | StoreError::NothingToLabel => plain(Code::PushRefused),
         // Before the arm of all other errors of the disk.
         StoreError::Io { cause, .. } if is_full(cause) => plain(Code::StorageFull),
         StoreError::NotSynced { .. }

@@ -35,7 +35,8 @@ impl ImageEncoding {
     }
 }
 
-/// Per-pixel maps of an image in addition to its colour; all but `instances` are f32.
+/// Per-pixel maps of an image in addition to its colour; all but `instances` and `semantics` are
+/// f32.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct PixelMaps {
     /// Expected depth in metres, `[height, width]`.
@@ -47,6 +48,9 @@ pub struct PixelMaps {
     /// Whose Gaussian each pixel shows, u16 `[height, width]`: 0 none, 1 the twin, and actor k is k
     /// + 2.
     pub instances: bool,
+    /// The class of the Gaussian that each pixel shows, u8 `[height, width]`, as
+    /// [`SemanticClass`](wildcity_scene::SemanticClass).
+    pub semantics: bool,
 }
 
 impl PixelMaps {
@@ -57,6 +61,7 @@ impl PixelMaps {
             opacity: outputs.opacity,
             normals: outputs.normals.unwrap_or(false),
             instances: outputs.instances.unwrap_or(false),
+            semantics: outputs.semantics.unwrap_or(false),
         }
     }
 

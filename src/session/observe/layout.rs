@@ -35,6 +35,9 @@ const HEADER_BASE_BYTES: usize = 4096;
 /// and a windshield of 42 with their keys, below 1,600 bytes.
 const HEADER_IMAGE_BYTES: usize = 3584;
 
+/// Room in the header per image for the tensor of classes, if the session asks for it.
+const SEMANTICS_IMAGE_BYTES: usize = 192;
+
 /// Room in the header per LiDAR: five tensors of at most 170 bytes, and a description with two
 /// names and a hash, with their escaped keys, below 700 bytes.
 const HEADER_LIDAR_BYTES: usize = 2048;
@@ -54,13 +57,13 @@ const SENSOR_IMAGE_BYTES: usize = 512;
 const IMAGES: usize = limits::OBSERVE_POSES * Rig::MAX_CAMERAS;
 const _: () = assert!(limits::BUNDLE_FRAMES <= limits::OBSERVE_POSES);
 
-// A client accepts the longest header, and the renderer renders any rig in one frame.
-// 4,096 + 4 x 2,048 + 256 x (3,584 + 256) = 995,328 bytes, of 1,048,576. Names of references and
+// A client accepts the longest header, and the renderer renders any rig in one frame. 4,096 + 4 x
+// 2,048 + 256 x (3,584 + 192 + 256) = 1,044,480 bytes, of 1,048,576. Names of references and
 // effects of sensors are checked when a session asks for them.
 const _: () = assert!(
     HEADER_BASE_BYTES
         + Rig::MAX_LIDARS * HEADER_LIDAR_BYTES
-        + IMAGES * (HEADER_IMAGE_BYTES + REPAIR_IMAGE_BYTES)
+        + IMAGES * (HEADER_IMAGE_BYTES + SEMANTICS_IMAGE_BYTES + REPAIR_IMAGE_BYTES)
         <= limits::OBSERVATION_HEADER_BYTES as usize
 );
 const _: () = assert!(Rig::MAX_CAMERAS <= MAX_VIEWS);
@@ -131,6 +134,8 @@ pub(super) struct InPlaceBytes {
     pub(super) floats: usize,
     /// Bytes of the instances.
     pub(super) instances: usize,
+    /// Bytes of the classes.
+    pub(super) semantics: usize,
     /// Bytes of raw pixels.
     pub(super) raw: usize,
 }
@@ -162,6 +167,7 @@ impl ObservationLayout {
             FieldMask::from_camera(camera).map(|field| field.visible_share(camera))
         };
         let visible_shares = cameras.iter().map(visible_share).collect();
+        let of_semantics = if maps.semantics { SEMANTICS_IMAGE_BYTES } else { 0 };
         let layout = Self {
             cameras,
             lidars: Vec::new(),
@@ -170,7 +176,7 @@ impl ObservationLayout {
             maps,
             schedule,
             scenario_bytes: 0,
-            image_bytes: HEADER_IMAGE_BYTES,
+            image_bytes: HEADER_IMAGE_BYTES + of_semantics,
             sensors: None,
         };
         // The largest answer to a step has all frames of all cameras.
@@ -413,23 +419,25 @@ impl ObservationLayout {
         Ok(())
     }
 
-    /// Pixels of the largest answer to a step, which take as many bytes without normals and
-    /// instances.
+    /// Pixels of the largest answer to a step, which take as many bytes without normals, instances
+    /// and classes.
     pub(crate) fn step_pixels(&self) -> u64 {
         let pixels = self.rig_pixels() * self.schedule.frames() as u64;
-        // In units of pixels of the full limit: one counts 2 with normals, and 4/3 with instances.
+        // In units of pixels of the full limit: one counts 2 with normals, and 4/3 with instances
+        // or classes.
         pixels * limits::ANSWER_PIXELS / self.pixel_limit()
     }
 
     /// Bytes of a session's answers to steps: the one that is made, and the previous one, which is
     /// kept for a repeated request. Frames of earlier times are not counted.
     pub(crate) fn answers_bytes(&self) -> u64 {
-        let PixelMaps { depth, opacity, normals, instances } = self.maps;
+        let PixelMaps { depth, opacity, normals, instances, semantics } = self.maps;
         let maps = [
             (depth, 4),
             (opacity, 4),
             (normals, limits::NORMAL_BYTES),
             (instances, limits::INSTANCE_BYTES),
+            (semantics, limits::SEMANTICS_BYTES),
         ];
         let maps = maps.iter().map(|&(held, bytes)| if held { bytes } else { 0 }).sum::<u64>();
         let colour = match self.encoding {
@@ -456,11 +464,12 @@ impl ObservationLayout {
         self.cameras.iter().map(|camera| camera.camera.pixels() as u64).sum()
     }
 
-    /// The most pixels of one answer: with normals or instances each takes more bytes.
+    /// The most pixels of one answer: with normals, instances or classes each takes more bytes.
     fn pixel_limit(&self) -> u64 {
         let with_normals =
             if self.maps.normals { limits::ANSWER_PIXELS / 2 } else { limits::ANSWER_PIXELS };
-        if self.maps.instances { with_normals / 4 * 3 } else { with_normals }
+        let has_owners = self.maps.instances || self.maps.semantics;
+        if has_owners { with_normals / 4 * 3 } else { with_normals }
     }
 
     /// Reserves room in the headers for the state of a scenario with `actors` actors.
@@ -502,6 +511,7 @@ impl ObservationLayout {
         InPlaceBytes {
             floats: 4 * pixels * self.maps.values(),
             instances: if self.maps.instances { 2 * pixels } else { 0 },
+            semantics: if self.maps.semantics { pixels } else { 0 },
             // Other encodings append their files later.
             raw: if self.encoding == ImageEncoding::Raw { 3 * pixels } else { 0 },
         }

@@ -4,7 +4,7 @@
 //! hashes and the timings, so the buffer is laid out first, with padding for the header:
 //!
 //! ```text
-//! | header | ego.history_xyz, ego.history_rot | depth, opacity, normals per image | instances | colour per image |
+//! | header | ego.history_xyz, ego.history_rot | depth, opacity, normals per image | instances | classes | colour per image |
 //! | colour of earlier frames |
 //! ```
 //!

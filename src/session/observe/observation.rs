@@ -138,6 +138,8 @@ pub enum TensorKind {
     Normals(usize),
     /// Whose Gaussian each pixel shows: `[height, width]`.
     Instances(usize),
+    /// The class of the Gaussian that each pixel shows: `[height, width]`.
+    Semantics(usize),
     /// Colour: `[height, width, 3]` pixels, or the `[n]` bytes of a file.
     Rgb(usize),
     /// Colour of an earlier image, by its index in [`Observation::history`]; shape as

@@ -136,6 +136,9 @@ pub struct RecordedOutputs {
     /// Whether observations had instances; absent if not.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub instances: bool,
+    /// Whether observations had classes; absent if not.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub semantics: bool,
 }
 
 /// One answer with images.

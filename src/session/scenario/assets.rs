@@ -6,7 +6,7 @@ use std::sync::{Arc, OnceLock};
 
 use wildcity_scene::actor::{ActorAsset, ActorViewpoint, ContactShadow, PlacedChunk};
 use wildcity_scene::geometry::Pose;
-use wildcity_scene::{ActorBox, ActorClass, RenderProfile, ViewSet};
+use wildcity_scene::{ActorBox, ActorClass, RenderProfile, SemanticClass, ViewSet};
 use wildcity_sim::scenario::{AssetInfo, Assets};
 use wildcity_twin::residency::{Cache, ResidencyError, ResidentActor, Viewpoint};
 use wildcity_twin::store::{Catalog, StoredActor};
@@ -176,6 +176,7 @@ impl FrameDetail<'_> {
                 Some(placed) => placed.views.insert(view),
                 None => chunks.push(PlacedChunk {
                     world_from_actor_at_start: at_start,
+                    class: SemanticClass::from_actor(asset.description.class),
                     shadow,
                     views: ViewSet::from_iter([view]),
                     ..PlacedChunk::at_rest(chunk.clone(), *world_from_actor, *actor)

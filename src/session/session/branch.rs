@@ -181,6 +181,7 @@ impl Session {
             opacity: outputs.opacity,
             normals: outputs.normals,
             instances: outputs.instances,
+            semantics: outputs.semantics,
         };
         let mut layout =
             ObservationLayout::new(cameras, outputs.encoding, maps, recorded.schedule)?

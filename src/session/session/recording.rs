@@ -135,7 +135,7 @@ impl Session {
     ) -> Result<NewFile, SessionError> {
         let version = &pinned.resident.version;
         let settings = &self.settings;
-        let PixelMaps { depth, opacity, normals, instances } = settings.layout.maps();
+        let PixelMaps { depth, opacity, normals, instances, semantics } = settings.layout.maps();
         let cameras = settings.layout.cameras().to_vec();
         let header = EpisodeHeader {
             format: EpisodeHeader::FORMAT,
@@ -160,6 +160,7 @@ impl Session {
                 opacity,
                 normals,
                 instances,
+                semantics,
             },
             seed: episode.seed(),
             dynamics: episode.ego().dynamics(),

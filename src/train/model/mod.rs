@@ -19,7 +19,7 @@ use std::sync::atomic::Ordering::Relaxed;
 use glam::{DVec3, Vec3};
 use wildcity_render::gradient::ChunkGradients;
 use wildcity_scene::chunk::{CLUSTER, LANES, Lanes, column, columns};
-use wildcity_scene::{Chunk, Gaussians, LanePages, Scene, sh};
+use wildcity_scene::{Chunk, Gaussians, LanePages, Scene, SemanticClass, sh};
 
 pub(crate) use adam_step::{AdamStep, rates};
 use adam_step::{LN_SCALE, LOGIT, not_finite, sigmoid};
@@ -38,6 +38,8 @@ pub struct Model {
     moments: [Vec<Lanes>; 2],
     /// Whether each Gaussian is of the ground; empty if none is.
     is_ground: Vec<bool>,
+    /// The class of each Gaussian, or of what it is a copy of. Training changes none.
+    classes: Option<Vec<SemanticClass>>,
     /// Gaussians that are drawn and stay as they are.
     fixed: Vec<Arc<Chunk>>,
     /// The chunk of the Gaussians that are trained, and then those of `fixed`.
@@ -82,6 +84,7 @@ impl Model {
             values: Vec::new(),
             moments: [Vec::new(), Vec::new()],
             is_ground: Vec::new(),
+            classes: gaussians.classes.take(),
             fixed,
             scene: Scene::default(),
         };
@@ -110,12 +113,13 @@ impl Model {
             values: Flat(&self.values),
             moments: self.moments.each_ref().map(|lanes| Flat(lanes)),
             is_ground: &self.is_ground,
+            classes: self.classes.as_ref().map(|all| all.iter().map(|one| one.value()).collect()),
         }
     }
 
     /// `None` if the numbers of values do not fit each other.
     pub(crate) fn from_state(state: ModelState, fixed: Vec<Arc<Chunk>>) -> Option<Self> {
-        let ModelState { sh_degree, count, origin_m, values, moments, is_ground } = state;
+        let ModelState { sh_degree, count, origin_m, values, moments, is_ground, classes } = state;
         let count = count as usize;
         let is_known = sh_degree <= sh::MAX_DEGREE;
         let wanted = count.div_ceil(LANES).checked_mul(columns(sh_degree) * LANES)?;
@@ -123,6 +127,14 @@ impl Model {
         if !is_known || !fits || ![0, count].contains(&is_ground.len()) {
             return None;
         }
+        let classes = match classes {
+            None => None,
+            Some(all) if all.len() == count => {
+                let all = all.into_iter().map(SemanticClass::for_gaussian);
+                Some(all.collect::<Option<Vec<_>>>()?)
+            }
+            Some(_) => return None,
+        };
         let lanes = |values: Vec<f32>| values.as_chunks().0.iter().map(|v| Lanes(*v)).collect();
         let mut model = Self {
             sh_degree,
@@ -131,6 +143,7 @@ impl Model {
             values: lanes(values),
             moments: moments.map(lanes),
             is_ground,
+            classes,
             fixed,
             scene: Scene::default(),
         };
@@ -166,6 +179,7 @@ impl Model {
             let values = 3 * sh::coefficients(self.sh_degree);
             gaussians.sh.extend((0..values).map(|k| self.get::<1>(i, column::SH + k)[0]));
         }
+        gaussians.classes.clone_from(&self.classes);
         gaussians
     }
 
@@ -233,6 +247,9 @@ impl Model {
             if self.has_ground() {
                 self.is_ground[to] = self.is_ground[source];
             }
+            if let Some(classes) = &mut self.classes {
+                classes[to] = classes[source];
+            }
             self.forget(to);
         }
         self.rebuild();
@@ -293,6 +310,9 @@ impl Model {
         }
         if self.has_ground() {
             self.is_ground.resize(count, false);
+        }
+        if let Some(classes) = &mut self.classes {
+            classes.resize(count, SemanticClass::Unlabelled);
         }
         self.count = count;
     }

@@ -13,6 +13,7 @@ pub(crate) struct ModelState {
     pub(super) values: Vec<f32>,
     pub(super) moments: [Vec<f32>; 2],
     pub(super) is_ground: Vec<bool>,
+    pub(super) classes: Option<Vec<u8>>,
 }
 
 /// The same, as it is written: without a copy.
@@ -24,6 +25,7 @@ pub(crate) struct SavedModel<'a> {
     pub(super) values: Flat<'a>,
     pub(super) moments: [Flat<'a>; 2],
     pub(super) is_ground: &'a [bool],
+    pub(super) classes: Option<Vec<u8>>,
 }
 
 /// Lanes as one list of numbers.

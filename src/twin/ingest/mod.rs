@@ -15,6 +15,7 @@ mod archive;
 pub mod axes;
 pub mod cameras;
 pub mod capture;
+mod classes;
 mod error;
 mod file;
 mod gltf;

@@ -1,8 +1,9 @@
 //! safetensors with the names of a gsplat checkpoint.
 //!
 //! means [N,3], quats [N,4] (w, x, y, z), scales [N,3] (ln), opacities [N] (logit), sh0 [N,1,3] and
-//! shN [N,K,3], or both in one as coeffs [N,1+K,3]. F32 throughout; means may be F64. Tensors of
-//! other names are named in a warning, but for those of a sky.
+//! shN [N,K,3], or both in one as coeffs [N,1+K,3]. F32 throughout; means may be F64. A tensor
+//! semantic_class [N] of U8 has values of [`SemanticClass`]. Tensors of other names are named in a
+//! warning, but for those of a sky.
 
 use std::io::{self, Read};
 
@@ -10,11 +11,11 @@ use ::safetensors::Dtype;
 use ::safetensors::tensor::{Metadata, TensorInfo};
 
 use crate::limits;
-use wildcity_scene::{Gaussians, sh};
+use wildcity_scene::{Gaussians, SemanticClass, sh};
 
 use super::notes::Reading;
 use super::validate::{self, Field};
-use super::{IngestError, Progress, check_count};
+use super::{IngestError, Progress, check_count, classes};
 
 /// Reads a safetensors file of a known size, from front to back.
 pub(super) fn read(
@@ -61,6 +62,7 @@ fn read_tensors(
             Column::Quats => body.rows(tensor, |row| g.quats_wxyz.push(row.map(|q| q as f32)))?,
             Column::Scales => body.rows(tensor, |row| g.ln_scales.push(row.map(|s| s as f32)))?,
             Column::Opacities => body.rows(tensor, |[o]| g.logit_opacities.push(o as f32))?,
+            Column::Classes => g.classes = Some(body.classes(tensor)?),
             // Coefficient `first` to `first + of_tensor - 1` of each Gaussian, as in memory.
             Column::Colours { first } => {
                 let of_tensor = tensor.shape[1];
@@ -157,6 +159,7 @@ enum Column {
     Quats,
     Scales,
     Opacities,
+    Classes,
     /// SH coefficients, from `first` on.
     Colours {
         first: usize,
@@ -171,9 +174,14 @@ impl<'a> ReadPlan<'a> {
         };
         let shaped = |name: &str, wanted: &[Option<usize>]| {
             let info = find(name)?;
-            let is_float = info.dtype == Dtype::F32 || (info.dtype, name) == (Dtype::F64, "means");
-            if !is_float {
-                let wanted = if name == "means" { "F32 or F64" } else { "F32" };
+            let kinds: &[Dtype] = match name {
+                "means" => &[Dtype::F32, Dtype::F64],
+                classes::NAME => &[Dtype::U8],
+                _ => &[Dtype::F32],
+            };
+            if !kinds.contains(&info.dtype) {
+                let kinds: Vec<_> = kinds.iter().map(|kind| format!("{kind:?}")).collect();
+                let wanted = kinds.join(" or ");
                 let reason = format!("is {:?}; {wanted} is read", info.dtype);
                 return Err(bad(&format!("tensor {name}"), reason));
             }
@@ -214,6 +222,9 @@ impl<'a> ReadPlan<'a> {
             (Column::Scales, shaped("scales", &[n, Some(3)])?),
             (Column::Opacities, shaped("opacities", &[n])?),
         ];
+        if metadata.info(classes::NAME).is_some() {
+            tensors.push((Column::Classes, shaped(classes::NAME, &[n])?));
+        }
         // coeffs and sh0 start at coefficient 0, shN at 1.
         let colours = colours.into_iter().enumerate();
         tensors.extend(colours.map(|(first, tensor)| (Column::Colours { first }, tensor)));
@@ -254,7 +265,15 @@ impl<R: Read> Body<'_, R> {
         let between = (self.body_start + start as u64).saturating_sub(self.done);
         self.done += io::copy(&mut (&mut self.input).take(between), &mut io::sink())?;
         let is_f64 = tensor.dtype == Dtype::F64;
-        let mut row = vec![0; N * if is_f64 { 8 } else { 4 }];
+        let is_byte = tensor.dtype == Dtype::U8;
+        let bytes_each = if is_f64 {
+            8
+        } else if is_byte {
+            1
+        } else {
+            4
+        };
+        let mut row = vec![0; N * bytes_each];
         for index in 0..(end - start) / row.len() {
             self.input.read_exact(&mut row)?;
             let doubles = row.as_chunks::<8>().0;
@@ -262,6 +281,8 @@ impl<R: Read> Body<'_, R> {
             take(std::array::from_fn(|i| {
                 if is_f64 {
                     f64::from_le_bytes(doubles[i])
+                } else if is_byte {
+                    row[i].into()
                 } else {
                     f32::from_le_bytes(singles[i]).into()
                 }
@@ -273,6 +294,26 @@ impl<R: Read> Body<'_, R> {
         }
         (self.progress)(self.done, self.file_bytes);
         Ok(())
+    }
+
+    /// Reads a tensor of classes.
+    fn classes(&mut self, tensor: &TensorInfo) -> Result<Vec<SemanticClass>, IngestError> {
+        let mut all = Vec::new();
+        let mut faulty = None;
+        self.rows(tensor, |[value]| {
+            all.push(classes::class(value).unwrap_or_else(|reason| {
+                faulty.get_or_insert((all.len(), reason));
+                SemanticClass::Unlabelled
+            }));
+        })?;
+        match faulty {
+            None => Ok(all),
+            Some((row, reason)) => Err(IngestError::Body {
+                format: "safetensors",
+                place: format!("row {row} of tensor {}", classes::NAME),
+                reason,
+            }),
+        }
     }
 }
 

@@ -150,6 +150,7 @@ mod tests {
             ln_scales: vec![[-2.0; 3]],
             logit_opacities: vec![1.0],
             sh: vec![0.0; 3],
+            ..Gaussians::default()
         };
         let description = AssetDescription {
             name: "box".to_owned(),

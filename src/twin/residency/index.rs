@@ -204,6 +204,11 @@ impl Block {
         &manifest.chunks[self.chunk].sections[self.sections.clone()]
     }
 
+    /// Memory that one of its sections needs, in bytes.
+    pub(super) fn needed_bytes(&self, manifest: &Manifest, section: &Section) -> u64 {
+        manifest.chunks[self.chunk].needed_bytes(manifest.sh_degree, section)
+    }
+
     fn section_ref(&self, level: usize) -> SectionRef {
         SectionRef { chunk: self.chunk, section: self.sections.start + level }
     }

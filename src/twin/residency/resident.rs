@@ -9,7 +9,7 @@ use parking_lot::Mutex;
 use crate::limits;
 use crate::store::Version;
 use wildcity_scene::manifest::{ChunkEntry, Section};
-use wildcity_scene::{Chunk, Manifest, RenderProfile, Sky};
+use wildcity_scene::{Manifest, RenderProfile, Sky};
 
 use super::budget::Budget;
 use super::demand::{SectionRef, SelectedSections, Viewpoint};
@@ -83,7 +83,7 @@ impl Resident {
             keys.extend(chunk.sections.iter().map(|section| {
                 // The size in memory, not in the file: the table counts what a loaded section will
                 // take.
-                let bytes = Chunk::needed_bytes(manifest.sh_degree, section.count.into());
+                let bytes = chunk.needed_bytes(manifest.sh_degree, section);
                 (key(manifest, chunk, section), bytes)
             }));
         }
@@ -264,6 +264,8 @@ fn key(manifest: &Manifest, chunk: &ChunkEntry, section: &Section) -> Key {
     }
     hasher.update(&section.count.to_le_bytes());
     hasher.update(&[section.block, section.level, manifest.sh_degree, manifest.record as u8]);
+    // The bytes of a section do not say whether they end with classes.
+    hasher.update(&[u8::from(chunk.classes)]);
     // 128 bits: with 10^9 sections a collision has a probability of about 10^-21.
     let mut key = [0; 16];
     key.copy_from_slice(&hasher.finalize().as_bytes()[..16]);

@@ -8,7 +8,7 @@ use glam::DVec3;
 use crate::limits;
 use wildcity_scene::geometry::Bounds;
 use wildcity_scene::manifest::Section;
-use wildcity_scene::{Chunk, Manifest, RenderProfile};
+use wildcity_scene::{Manifest, RenderProfile};
 
 use super::BlockIndex;
 use super::demand::{Viewpoint, coarsest_level};
@@ -91,8 +91,7 @@ pub(super) fn worst_case_bytes(
         // allows no more.
         let distance_m = |bounds: &Bounds| (gap_m(&area, bounds) - extent.radius_m).max(0.0);
         index.visit(profile.reach_m, distance_m, |block, distance_m| {
-            let of_level =
-                |level: &Section| Chunk::needed_bytes(manifest.sh_degree, level.count.into());
+            let of_level = |level: &Section| block.needed_bytes(manifest, level);
             let levels = block.levels(manifest);
             bytes += extent.most_bytes(levels, distance_m, profile.tau_px, of_level);
         });

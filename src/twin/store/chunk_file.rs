@@ -11,7 +11,8 @@
 //!
 //! A section is a sequence of parts of up to 65,536 Gaussians each: a length u32, and that many
 //! bytes of zstd-compressed records (`scene::record`). Any section can be read, checked, and
-//! decoded by itself.
+//! decoded by itself. Where the Gaussians of a cell have classes, the records of a part end with
+//! one byte of class for each; a table of contents says it by a bit beside the record format.
 //!
 //! The tables of all chunks together are the table that a manifest names. It is an object of its
 //! own, 78 bytes a section, because as JSON 100,000 sections would take 25 MB. Each chunk object
@@ -33,6 +34,7 @@ use glam::DVec3;
 use zstd::bulk::Decompressor;
 
 use crate::limits;
+use wildcity_scene::SemanticClass;
 use wildcity_scene::chunk::{Chunk, columns};
 use wildcity_scene::geometry::Bounds;
 use wildcity_scene::manifest::{ChunkEntry, Section};
@@ -44,6 +46,8 @@ const MAGIC: [u8; 8] = *b"WILDCHNK";
 pub(super) const FORMAT: u32 = 1;
 /// Sections that start on pages can be memory-mapped, or read with direct I/O.
 pub(super) const PAGE_BYTES: usize = 4096;
+/// The bit of [`Contents::record`] that says that the Gaussians have classes.
+const CLASSES: u8 = 0x80;
 /// Higher compression levels do not make these columns smaller: they are noise around slow trends.
 const ZSTD_LEVEL: i32 = 1;
 
@@ -69,6 +73,8 @@ pub(super) struct ChunkHeader {
     pub(super) origin_m: DVec3,
     pub(super) sh_degree: u8,
     pub(super) record: RecordFormat,
+    /// Whether the Gaussians have classes.
+    pub(super) classes: bool,
 }
 
 /// One level of detail of one block.
@@ -118,9 +124,12 @@ pub(super) fn pack(
     // Parts are compressed on their own, so that decoding needs memory for one part and not for the
     // section.
     for start in (0..chunk.len()).step_by(PART_GAUSSIANS) {
-        let part = record.encode(chunk, start..chunk.len().min(start + PART_GAUSSIANS), clamped);
+        let run = start..chunk.len().min(start + PART_GAUSSIANS);
+        let mut part = record.encode(chunk, run.clone(), clamped);
+        let classes = chunk.classes().map_or(&[][..], |classes| &classes[run]);
+        part.extend(classes.iter().map(|class| class.value()));
         let part = zstd::bulk::compress(&part, ZSTD_LEVEL)?;
-        // 65,536 records of at most 236 B are 15 MB, so that the length fits.
+        // 65,536 records of at most 237 B are 15 MB, so that the length fits.
         bytes.extend((part.len() as u32).to_le_bytes());
         bytes.extend(part);
     }
@@ -149,7 +158,7 @@ pub(super) fn pack(
 /// its Gaussians in the world.
 pub(super) fn write(
     out: &mut dyn Write,
-    &ChunkHeader { cell, origin_m, sh_degree, record }: &ChunkHeader,
+    &ChunkHeader { cell, origin_m, sh_degree, record, classes }: &ChunkHeader,
     mut packed: Vec<PackedSection>,
 ) -> io::Result<(Vec<Section>, Bounds)> {
     // Levels from coarse to fine, and blocks in order within a level: the same content gives the
@@ -159,7 +168,7 @@ pub(super) fn write(
         cell,
         origin_m: origin_m.to_array(),
         sh_degree,
-        record: record as u8,
+        record: record_byte(record, classes),
         sections: packed.iter().map(|packed| Row::from_section(&packed.section)).collect(),
     };
 
@@ -222,6 +231,7 @@ pub(super) fn unpack(
 ) -> Result<Chunk, String> {
     let count = section.count as usize;
     let mut lanes = LanePages::new(columns(sh_degree), pool);
+    let mut classes = chunk.classes.then(Vec::new);
     let mut rest = bytes;
     // Invariant: `rest` begins with the length of the next part.
     for start in (0..count).step_by(PART_GAUSSIANS) {
@@ -232,15 +242,37 @@ pub(super) fn unpack(
         rest = &after[length..];
         // The size of a part follows from its count. A part that unpacks to more does not fit into
         // the buffer, and is refused.
-        decompressed(part, record.part_bytes(sh_degree, here), |raw| {
+        let classes_bytes = if chunk.classes { here } else { 0 };
+        let capacity = record.part_bytes(sh_degree, here) + classes_bytes;
+        decompressed(part, capacity, |raw| {
             let raw = raw.map_err(|error| format!("a part does not decompress: {error}"))?;
-            record.decode(raw, sh_degree, here, &mut lanes)
+            let (records, values) = raw.split_at(raw.len().saturating_sub(classes_bytes));
+            record.decode(records, sh_degree, here, &mut lanes)?;
+            // Decoded, the records have their size, and so have the classes.
+            classes.as_mut().map_or(Ok(()), |classes| read_classes(values, classes))
         })?;
     }
     if !rest.is_empty() {
         return Err(format!("{} bytes are left over", rest.len()));
     }
-    Ok(Chunk::from_lanes(chunk.cell, chunk.origin_m, sh_degree, count, lanes))
+    let unpacked = Chunk::from_lanes(chunk.cell, chunk.origin_m, sh_degree, count, lanes);
+    Ok(unpacked.with_classes(classes))
+}
+
+/// Appends the classes of a part, given their values.
+fn read_classes(values: &[u8], classes: &mut Vec<SemanticClass>) -> Result<(), String> {
+    classes.reserve_exact(values.len());
+    for &value in values {
+        let class = SemanticClass::for_gaussian(value);
+        classes.push(class.ok_or_else(|| format!("no Gaussian has class {value}"))?);
+    }
+    Ok(())
+}
+
+/// The byte of a table of contents that says how Gaussians are encoded, and whether they have
+/// classes: a reader from before there were any refuses these.
+fn record_byte(record: RecordFormat, classes: bool) -> u8 {
+    record as u8 | if classes { CLASSES } else { 0 }
 }
 
 /// Passes one part of up to `capacity` bytes on, decompressed.
@@ -287,7 +319,7 @@ pub(super) fn table(
             cell: chunk.cell,
             origin_m: chunk.origin_m.to_array(),
             sh_degree,
-            record: record as u8,
+            record: record_byte(record, chunk.classes),
             sections,
         };
         table.extend(encode(&contents)?);
@@ -310,7 +342,8 @@ pub(super) fn fill(
         let (contents, consumed) = decode(table)?;
         table = &table[consumed..];
         let found = (contents.cell, contents.origin_m, contents.sh_degree, contents.record);
-        if found != (chunk.cell, chunk.origin_m.to_array(), sh_degree, record as u8) {
+        let record = record_byte(record, chunk.classes);
+        if found != (chunk.cell, chunk.origin_m.to_array(), sh_degree, record) {
             return Err(format!("it differs from the manifest in cell {:?}", chunk.cell));
         }
         chunk.sections = contents.in_order();
@@ -425,6 +458,7 @@ mod tests {
             ln_scales: vec![[-2.0; 3]; n as usize],
             logit_opacities: vec![1.0; n as usize],
             sh: vec![0.25; 3 * n as usize],
+            ..Gaussians::default()
         };
         let Partition { cells, order } = Partition::new(&gaussians.means_m);
         let cell: &CellRun = &cells[0];
@@ -446,6 +480,7 @@ mod tests {
             origin_m: cell.origin_m,
             sh_degree: 0,
             record: RecordFormat::Q32,
+            classes: false,
         };
         let (sections, bounds) = write(&mut bytes, &header, packed.into()).unwrap();
         let entry = ChunkEntry {
@@ -455,6 +490,7 @@ mod tests {
             bytes: bytes.len() as u64,
             bounds,
             origin_m: cell.origin_m,
+            classes: false,
             sections,
         };
         (bytes, entry)

@@ -115,7 +115,11 @@ impl Catalog {
     }
 
     /// The Gaussians of a cell at full detail, in world axes.
-    fn full_detail(&self, version: &Version, chunk: &ChunkEntry) -> Result<Gaussians, StoreError> {
+    pub(super) fn full_detail(
+        &self,
+        version: &Version,
+        chunk: &ChunkEntry,
+    ) -> Result<Gaussians, StoreError> {
         let sh_degree = version.manifest.sh_degree;
         let mut all = Gaussians { sh_degree, ..Gaussians::default() };
         for section in chunk.full_detail() {
@@ -127,7 +131,7 @@ impl Catalog {
 
 impl CutPlace {
     /// Whether a part of some bounds may be in the box.
-    fn is_near(&self, bounds: &Bounds) -> bool {
+    pub(super) fn is_near(&self, bounds: &Bounds) -> bool {
         let ActorBox { length_m, width_m, height_m } = self.box_;
         // From the origin, in the middle of the ground face, the farthest corner is at sqrt((l/2)²
         // + (w/2)² + h²). The diagonal of the box is above that.
@@ -136,7 +140,7 @@ impl CutPlace {
     }
 
     /// Whether a point in the box's axes is cut, in metres.
-    fn has(&self, at_m: DVec3) -> bool {
+    pub(super) fn has(&self, at_m: DVec3) -> bool {
         let ActorBox { length_m, width_m, height_m } = self.box_;
         at_m.x.abs() <= 0.5 * length_m
             && at_m.y.abs() <= 0.5 * width_m

@@ -113,6 +113,11 @@ pub enum StoreError {
         /// Grid cell (x, y) of which none would stay.
         cell: Option<[i32; 2]>,
     },
+    /// There is nothing to give a class.
+    #[error(
+        "no Gaussian has its centre in one of the boxes or on the ground: check the axes and the unit"
+    )]
+    NothingToLabel,
     /// Another commit took the same number first.
     #[error("version {number} of twin {name:?} was committed by another import; try again")]
     Conflict {

@@ -141,6 +141,8 @@ impl<'a> CellPacker<'a> {
         for &index in order {
             full.push(&cell.record(self.gaussians, index as usize));
         }
+        let indices = order.iter().map(|&index| index as usize);
+        let full = full.with_classes(self.gaussians.select_classes(indices));
         let mut clamped = Clamped::default();
         let mut packed = vec![chunk_file::pack(
             &full,
@@ -176,6 +178,7 @@ impl<'a> CellPacker<'a> {
             origin_m,
             sh_degree: self.gaussians.sh_degree,
             record: self.storage.record,
+            classes: self.gaussians.classes.is_some(),
         };
         let stored = staging.put(Box::new(|out| {
             (sections, bounds) = chunk_file::write(out, &header, packed)?;
@@ -188,6 +191,7 @@ impl<'a> CellPacker<'a> {
             bytes: stored.bytes,
             bounds,
             origin_m,
+            classes: header.classes,
             sections,
         })
     }

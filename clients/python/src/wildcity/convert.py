@@ -41,6 +41,7 @@ _FIELD_NAMES = {
     "sh0": ("sh0", "features_dc", "feature_dc", "features_albedo"),
     "shN": ("shN", "features_rest", "feature_rest", "features_specular"),
     "point_ids": ("point_ids", "points_ids"),
+    "semantic_class": ("semantic_class",),
 }
 """gsplat's names of the fields, and all names of the same field in other checkpoints."""
 
@@ -121,8 +122,9 @@ def splats(source: str | PathLike[str], model: str | None = None) -> _Arrays:
     """The Gaussians of a checkpoint, with gsplat's names and shapes.
 
     means [N,3], quats [N,4] (w, x, y, z), scales [N,3] (natural logarithm), opacities [N] (logit), sh0 [N,1,3],
-    shN [N,K,3]; of drivestudio's RigidNodes also point_ids [N], the object of each Gaussian. Raises `CheckpointError`
-    if there is no such model, or several and `model` is None.
+    shN [N,K,3]; of drivestudio's RigidNodes also point_ids [N], the object of each Gaussian; and semantic_class [N],
+    uint8, if the checkpoint has whole numbers of this name. Raises `CheckpointError` if there is no such model, or
+    several and `model` is None.
     """
     return _splats(source, load(source), model)
 
@@ -292,7 +294,7 @@ def _candidates(value: Any, path: tuple[str, ...], name: str = "", depth: int = 
         elif isinstance(key, str):
             yield from _candidates(item, (*path, *key.split(".")), key, depth + 1)
     for prefix, found in groups.items():
-        if _FIELD_NAMES.keys() - {"shN", "point_ids"} <= found.arrays.keys():
+        if _FIELD_NAMES.keys() - {"shN", "point_ids", "semantic_class"} <= found.arrays.keys():
             _cut_to_active(found.arrays, value.get("n_active_features"))
             yield ".".join(part for part in (name, prefix) if part), found
 
@@ -336,6 +338,13 @@ def _shaped(arrays: _Arrays) -> _Arrays:
         if ids.size != n or not np.issubdtype(ids.dtype, np.integer):
             raise CheckpointError(f"point_ids is {ids.dtype} {ids.shape}, not {n} whole numbers")
         shaped["point_ids"] = ids.reshape(n).astype("<i8")
+    classes = arrays.get("semantic_class")
+    if classes is not None:
+        if classes.size != n or not np.issubdtype(classes.dtype, np.integer):
+            raise CheckpointError(f"semantic_class is {classes.dtype} {classes.shape}, not {n} whole numbers")
+        if n and not 0 <= classes.min() <= classes.max() <= 255:
+            raise CheckpointError(f"semantic_class has values from {classes.min()} to {classes.max()}, not classes")
+        shaped["semantic_class"] = classes.reshape(n).astype("u1")
     return shaped
 
 
@@ -344,7 +353,7 @@ def _write_safetensors(target: str | PathLike[str], tensors: _Arrays) -> None:
     offset = 0
     for name, values in tensors.items():
         header[name] = {
-            "dtype": f"{'I' if values.dtype.kind == 'i' else 'F'}{8 * values.itemsize}",
+            "dtype": f"{values.dtype.kind.upper()}{8 * values.itemsize}",
             "shape": list(values.shape),
             "data_offsets": [offset, offset + values.nbytes],
         }

@@ -80,6 +80,9 @@ class Outputs:
     period_us: dict[str, int] | None = None
     """Time between two frames, by camera name, in simulated microseconds: a whole number of steps. If absent, every
     camera takes a frame with every step."""
+    semantics: bool | None = None
+    """Whether to add `semantics`, u8 `[height, width]`: the class of the Gaussian that each pixel shows. If absent,
+    false."""
 
 
 OnFailure = Literal["unrepaired", "error"]
@@ -638,6 +641,17 @@ class OpenedScenario:
 
 
 @dataclass(frozen=True)
+class OpenedSemantics:
+    """What the values of `semantics` mean."""
+
+    labelled: bool
+    """Whether the Gaussians of the twin have classes. Without them, all of the twin is unlabelled, and only actors have
+    classes."""
+    classes: tuple[str, ...]
+    """The name of each value, from 0 on: `none`, `unlabelled`, and then the names of Cityscapes."""
+
+
+@dataclass(frozen=True)
 class DrivePose:
     """A pose of a recorded drive."""
 
@@ -713,6 +727,8 @@ class Opened:
     """The repair of the images."""
     scenario: OpenedScenario | None = None
     """The scenario."""
+    semantics: OpenedSemantics | None = None
+    """What the tensors `semantics` mean, if the session asked for them."""
     sensors: Sensors | None = None
     """Effects of the sensors, and the delay of the planner."""
     trajectory: Drive | None = None
@@ -1004,8 +1020,8 @@ RepairStatus = Literal["kept", "repaired", "failed"]
 
 @dataclass(frozen=True)
 class ImageRepair:
-    """What became of an image in a session that asked for repair. Depth, opacity, normals and instances stay those of
-    the scene."""
+    """What became of an image in a session that asked for repair. Depth, opacity, normals, instances and classes stay
+    those of the scene."""
 
     status: RepairStatus
     """What became of it."""
@@ -1072,8 +1088,8 @@ class ImageInfo:
     pose: int
     """Index of the request's pose. Always 0 except after `observe`."""
     tensor: str
-    """Name of the colour tensor. The names of the other tensors have `depth`, `opacity`, `normals` or `instances` in
-    place of its final `rgb`."""
+    """Name of the colour tensor. The names of the other tensors have `depth`, `opacity`, `normals`, `instances` or
+    `semantics` in place of its final `rgb`."""
     encoding: Encoding
     """Encoding of the colour image."""
     width: int

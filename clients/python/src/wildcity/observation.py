@@ -119,6 +119,11 @@ class Observation:
         return self.views[0].instances
 
     @property
+    def semantics(self) -> Mapping[str, NDArray[np.uint8]]:
+        """The class of the Gaussian that each pixel shows, by camera: an index of `opened.semantics.classes`."""
+        return self.views[0].semantics
+
+    @property
     def lidars(self) -> Mapping[str, PointCloud]:
         """The sweep of each LiDAR of the rig, by its name; empty after `observe`."""
         return {sweep.lidar: PointCloud(self._content, sweep) for sweep in self.metadata.sweeps}
@@ -185,6 +190,8 @@ class Observation:
                     self._expect(_sibling(image, output), "F32", shape)
             if _sibling(image, "instances") in self._tensors:
                 self._expect(_sibling(image, "instances"), "U16", size)
+            if _sibling(image, "semantics") in self._tensors:
+                self._expect(_sibling(image, "semantics"), "U8", size)
         for sweep in self.metadata.sweeps:
             self._expect(_of_sweep(sweep, "points"), "F32", (sweep.returns, 3))
             self._expect(_of_sweep(sweep, "intensity"), "F32", (sweep.returns,))
@@ -271,6 +278,11 @@ class View:
         """uint16 [height, width] by camera: 0 none, 1 the twin, else `Actor.instance`, if the session asked for
         them."""
         return self._maps("instances")
+
+    @cached_property
+    def semantics(self) -> Mapping[str, NDArray[np.uint8]]:
+        """uint8 [height, width] by camera: an index of `opened.semantics.classes`, if the session asked for them."""
+        return self._maps("semantics")
 
     def _maps(self, output: str) -> Mapping[str, NDArray[Any]]:
         content = self._content

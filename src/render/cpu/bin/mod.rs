@@ -27,7 +27,7 @@ use rayon::prelude::*;
 use super::overflow::{Overflow, PartError};
 use super::project::{Projected, Unit};
 use crate::constants::MAX_INSTANCES;
-use crate::layout::{Cutoffs, Splat};
+use crate::layout::Cutoffs;
 use crate::{RenderError, View};
 
 pub(super) use grid::Grid;
@@ -86,8 +86,7 @@ impl Bins {
         most_bytes: u64,
     ) -> Result<(), PartError> {
         // The splats are there already, and share the limit with what comes now.
-        let of_splats = (projected.places() * size_of::<Splat>()) as u64;
-        let most_bytes = most_bytes.saturating_sub(of_splats);
+        let most_bytes = most_bytes.saturating_sub(projected.held_bytes());
         self.grids.clear();
         self.grids.extend(views.iter().map(Grid::new));
         self.cut(projected.units());
@@ -142,7 +141,7 @@ impl Bins {
 
     /// Most bytes that a part of the frame holds until it is drawn.
     pub(super) fn held_bytes(&self, projected: &Projected) -> u64 {
-        (projected.places() * size_of::<Splat>()) as u64 + needed_bytes(self.pairs, self.instances)
+        projected.held_bytes() + needed_bytes(self.pairs, self.instances)
     }
 
     /// Stage sort of one macro tile: puts its splats in order of depth, and lists them by tile.

@@ -11,8 +11,8 @@ use crate::cpu::lens::LensProjection;
 use crate::layout::{ChunkShadow, ChunkView, Frustum};
 use crate::unscented::UnscentedView;
 use crate::{FIRST_ACTOR_INSTANCE, Frame, TWIN_INSTANCE, View};
-use wildcity_scene::Chunk;
 use wildcity_scene::chunk::Cluster;
+use wildcity_scene::{Chunk, SemanticClass};
 
 /// Clusters of a unit: 4,096 Gaussians take about 100 µs, long enough to outweigh scheduling them.
 pub(in crate::cpu) const UNIT_CLUSTERS: usize = 16;
@@ -28,6 +28,8 @@ pub(in crate::cpu) struct Job<'a> {
     pub(super) light: Light<'a>,
     /// As in [`Unit`](super::Unit).
     pub(super) instance: u16,
+    /// As in [`Unit`](super::Unit).
+    pub(super) class: SemanticClass,
 }
 
 impl Job<'_> {
@@ -57,6 +59,7 @@ struct JobOwner<'a> {
     number: usize,
     light: Light<'a>,
     instance: u16,
+    class: SemanticClass,
 }
 
 /// How one view projects the Gaussians of one chunk.
@@ -217,7 +220,13 @@ fn add_twin<'a>(
             [] => Light::AsStored,
             shadows => Light::Shadowed { shadows, view },
         };
-        let owner = JobOwner { view: index, number, light, instance: TWIN_INSTANCE };
+        let owner = JobOwner {
+            view: index,
+            number,
+            light,
+            instance: TWIN_INSTANCE,
+            class: SemanticClass::Unlabelled,
+        };
         add_jobs(owner, projection, chunk, jobs);
     }
 }
@@ -242,14 +251,15 @@ fn add_actors<'a>(
         };
         // Actors are bounded by PlacedChunk::MAX_ACTORS, far below the end of u16.
         let instance = FIRST_ACTOR_INSTANCE + placed.actor;
-        let owner = JobOwner { view: index, number, light, instance };
+        let class = placed.class;
+        let owner = JobOwner { view: index, number, light, instance, class };
         add_jobs(owner, projection, &placed.chunk, jobs);
     }
 }
 
 /// Adds the jobs of one view and one chunk.
 fn add_jobs<'a>(
-    JobOwner { view, number, light, instance }: JobOwner<'a>,
+    JobOwner { view, number, light, instance, class }: JobOwner<'a>,
     projection: ChunkProjection<'a>,
     chunk: &'a Chunk,
     jobs: &mut Vec<Job<'a>>,
@@ -262,6 +272,6 @@ fn add_jobs<'a>(
     };
     let count = chunk.clusters().len();
     let ranges = (0..count).step_by(UNIT_CLUSTERS).map(|k| k..(k + UNIT_CLUSTERS).min(count));
-    let job = |clusters| Job { view, chunk, number, clusters, projection, light, instance };
+    let job = |clusters| Job { view, chunk, number, clusters, projection, light, instance, class };
     jobs.extend(ranges.filter(visible).map(job));
 }

@@ -45,6 +45,7 @@ use self::jobs::ChunkProjection;
 use super::overflow::Overflow;
 use super::slabs::{Slab, SlabOfJob};
 use crate::layout::{Cutoffs, Splat};
+use wildcity_scene::SemanticClass;
 use wildcity_scene::chunk::{CLUSTER, LANES, Lanes};
 
 pub(super) use self::jobs::{Job, UNIT_CLUSTERS, with_jobs};
@@ -61,6 +62,15 @@ const PAGE_BITS: u32 = 8;
 /// 12 KiB of splats. The units of a frame change as the ego moves; pages pass from one unit to
 /// another, so memory follows the largest frame and not the sum of each unit's largest size.
 type Page = Box<[Splat; PAGE]>;
+
+/// How much is projected.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct ProjectLimits {
+    /// Most places for splats.
+    pub(super) most_places: usize,
+    /// Whether the classes of splats are kept, too.
+    pub(super) classes: bool,
+}
 
 /// All splats of a frame.
 #[derive(Debug, Default)]
@@ -82,21 +92,41 @@ pub(super) struct Unit {
     first_page: usize,
     /// The owner of the splats, as in [`Target::instances`](crate::Target::instances).
     pub(super) instance: u16,
+    /// The class of the splats whose Gaussians have none, as in
+    /// [`Target::semantics`](crate::Target::semantics).
+    class: SemanticClass,
+    /// The class of each splat: empty if classes are not wanted, or its chunk has none.
+    classes: Vec<SemanticClass>,
+}
+
+/// What a thread fills with the splats of one unit after the other.
+#[derive(Debug, Default)]
+struct UnitSplats {
+    splats: Vec<Splat>,
+    /// The class of each splat, if classes are wanted and the chunk has some.
+    classes: Vec<SemanticClass>,
+}
+
+/// The splats of a unit after it was projected.
+#[derive(Debug, Default)]
+struct Filled {
+    len: usize,
+    pages: Vec<Page>,
+    classes: Vec<SemanticClass>,
 }
 
 impl Projected {
     /// Projects the Gaussians of all jobs, or only the splats that are in a slab.
     ///
     /// # Errors
-    /// [`Overflow`]: there are more than `most_places` places for splats. Then nothing is
-    /// projected.
+    /// [`Overflow`]: there are more places for splats than the limit. Then nothing is projected.
     pub(super) fn project(
         &mut self,
         level: Level,
         jobs: &[Job<'_>],
         cutoffs: &Cutoffs,
         slab: Option<&Slab<'_>>,
-        most_places: usize,
+        ProjectLimits { most_places, classes }: ProjectLimits,
     ) -> Result<(), Overflow> {
         let Self { pages, units, free } = self;
         // All pages of the previous frame are free again.
@@ -113,34 +143,40 @@ impl Projected {
         let used_pages = AtomicUsize::new(0);
         // Rounded down, as a page is taken as a whole.
         let most_pages = most_places >> PAGE_BITS;
-        let filled: Vec<(usize, Vec<Page>)> = order
+        let filled: Vec<Filled> = order
             .par_iter()
-            .map_init(Vec::new, |splats, &index| {
-                splats.clear();
+            .map_init(UnitSplats::default, |unit, &index| {
+                unit.splats.clear();
+                unit.classes.clear();
                 // The part is drawn again in smaller parts anyway. The sum decides below, so that
                 // the order of threads does not matter.
                 if used_pages.load(Relaxed) > most_pages {
-                    return (0, Vec::new());
+                    return Filled::default();
                 }
                 let slab = slab.map(|slab| slab.job(index));
-                dispatch!(level, simd => project_unit(simd, &jobs[index], cutoffs, slab, splats));
+                let job = &jobs[index];
+                dispatch!(level, simd => project_unit(simd, job, cutoffs, slab, classes, unit));
+                let UnitSplats { splats, classes } = unit;
                 // Counted before the pages are filled: at most one unit per thread is too much.
                 used_pages.fetch_add(splats.len().div_ceil(PAGE), Relaxed);
-                (splats.len(), copy_to_pages(splats, free))
+                let pages = copy_to_pages(splats, free);
+                Filled { len: splats.len(), pages, classes: classes.as_slice().to_vec() }
             })
             .collect();
         // From the order of the schedule back to that of (view, global id). Jobs outside of a slab
         // have no splats.
-        let mut by_job: Vec<(usize, Vec<Page>)> = vec![(0, Vec::new()); jobs.len()];
+        let mut by_job: Vec<Filled> = Vec::new();
+        by_job.resize_with(jobs.len(), Filled::default);
         for (index, filled) in order.into_iter().zip(filled) {
             by_job[index] = filled;
         }
 
         // In the order of the jobs: list the pages.
-        for (job, (len, mut filled)) in jobs.iter().zip(by_job) {
-            let Job { view, instance, .. } = *job;
-            units.push(Unit { view, len, first_page: pages.len(), instance });
-            pages.append(&mut filled);
+        for (job, filled) in jobs.iter().zip(by_job) {
+            let Job { view, instance, class, .. } = *job;
+            let Filled { len, pages: mut own, classes } = filled;
+            units.push(Unit { view, len, first_page: pages.len(), instance, class, classes });
+            pages.append(&mut own);
         }
         if used_pages.into_inner() > most_pages {
             // A part that overflows has no splats; its pages become free with the next call.
@@ -158,6 +194,12 @@ impl Projected {
     /// Number of places for splats; the last ones of each unit may be empty.
     pub(super) fn places(&self) -> usize {
         self.pages.len() * PAGE
+    }
+
+    /// Memory of the splats and their classes, in bytes.
+    pub(super) fn held_bytes(&self) -> u64 {
+        let of_classes: usize = self.units.iter().map(|unit| unit.classes.len()).sum();
+        (self.places() * size_of::<Splat>() + of_classes) as u64
     }
 
     /// The places of the splats of consecutive units.
@@ -196,10 +238,26 @@ impl Projected {
 
     /// The owner of the splat at a place, as in [`Target::instances`](crate::Target::instances).
     pub(super) fn instance(&self, place: u32) -> u16 {
+        self.unit_with(place).instance
+    }
+
+    /// The class of the splat at a place, as in [`Target::semantics`](crate::Target::semantics).
+    pub(super) fn class(&self, place: u32) -> SemanticClass {
+        self.class_in(self.unit_with(place), place)
+    }
+
+    /// As [`Projected::class`], of a splat of this unit.
+    pub(super) fn class_in(&self, unit: &Unit, place: u32) -> SemanticClass {
+        let own = unit.classes.get(place as usize - self.first_place(unit));
+        own.map_or(unit.class, |own| own.or(unit.class))
+    }
+
+    /// The unit of the splat at a place.
+    fn unit_with(&self, place: u32) -> &Unit {
         let page = (place >> PAGE_BITS) as usize;
         // Empty units share their first page with the next unit: the last of them owns the page.
         let after = self.units.partition_point(|unit| unit.first_page <= page);
-        self.units[after - 1].instance
+        &self.units[after - 1]
     }
 
     /// The splat at a place: the high bits are the page, the low 8 bits the splat of the page.
@@ -234,15 +292,17 @@ fn prefetch(columns: &[Lanes]) {
 }
 
 /// Projects the visible clusters of a job, one block of 16 Gaussians after the other; of a slab
-/// only its splats.
+/// only its splats. `with_classes` keeps the classes of the splats, if the chunk has some.
 #[inline(always)]
 fn project_unit<S: Simd>(
     simd: S,
     job: &Job<'_>,
     cutoffs: &Cutoffs,
     slab: Option<SlabOfJob<'_>>,
-    splats: &mut Vec<Splat>,
+    with_classes: bool,
+    UnitSplats { splats, classes }: &mut UnitSplats,
 ) {
+    let own_classes = job.chunk.classes().filter(|_| with_classes);
     let blocks = job.chunk.len().div_ceil(LANES);
     for (k, cluster) in (job.clusters.clone()).zip(&job.chunk.clusters()[job.clusters.clone()]) {
         let may_see = match &slab {
@@ -274,10 +334,13 @@ fn project_unit<S: Simd>(
                 // Before the visible lanes are picked, while the colours are still 16 to a vector.
                 light.apply(simd, columns, &mut projected);
                 projected.append_visible(splats);
+                if let Some(own) = own_classes {
+                    projected.append_classes(&own[block * LANES..], classes);
+                }
             }
         }
         if let Some(slab) = &slab {
-            slab.keep(cutoffs, splats, before);
+            slab.keep(cutoffs, splats, classes, before);
         }
     }
 }

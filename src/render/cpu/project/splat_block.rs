@@ -14,6 +14,7 @@ use crate::constants::{EXTENT_SLACK_PX, MAX_SIGMA_PX};
 use crate::cpu::lanes::Vec3x16;
 use crate::cpu::math::log2;
 use crate::layout::{Cutoffs, PixelFilter, Splat};
+use wildcity_scene::SemanticClass;
 use wildcity_scene::chunk::LANES;
 
 /// `√(log2(e)/2)`: converts standard deviations to the unit of [`Splat::factor`], because
@@ -259,6 +260,15 @@ impl SplatBlock {
             y: f32x16::load_array_ref(simd, &self.green),
             z: f32x16::load_array_ref(simd, &self.blue),
         }
+    }
+
+    /// Appends the classes of the visible splats, in their order; `own` begins with the class of
+    /// the first lane.
+    pub(super) fn append_classes(&self, own: &[SemanticClass], classes: &mut Vec<SemanticClass>) {
+        // The lanes after the last Gaussian of a chunk are never visible.
+        let visible =
+            own.iter().take(LANES).enumerate().filter(|(i, _)| self.visible >> i & 1 == 1);
+        classes.extend(visible.map(|(_, class)| *class));
     }
 
     /// Appends the visible splats, in order of lanes and so of global ids.

@@ -72,7 +72,7 @@ impl Chain {
             // Run the stages, and read the counters.
             self.reserve(&mut parameters, source.cluster_views());
             let mut recorder = Recorder::new(&self.device, None);
-            self.record(&mut recorder, source, &parameters, last);
+            self.record(&mut recorder, source, &parameters, last, false);
             let from = self.plan.counters();
             let to = read_back.head.buffer();
             let bytes = size_of::<Counters>() as u64;

@@ -40,6 +40,7 @@ use super::read_back::{Head, MappedFrame, ReadBack, ReadBackPool};
 use super::resolve::{Outputs, Planes};
 use super::scan::Scan;
 use super::sort::Sort;
+use super::splat_owners::SplatOwners;
 use crate::actor_views::ActorViews;
 use crate::stage::{Stage, StageOutputs};
 use crate::{Frame, FrameStats, RenderError};
@@ -61,6 +62,8 @@ pub(super) struct Chain {
     bin: Bin,
     rasterize: Rasterize,
     splats: SplatBuffers,
+    /// Made with the first frame that has classes.
+    splat_owners: Option<SplatOwners>,
     lenses: Lenses,
     /// Timestamp queries, if the device has a clock.
     queries: Option<QuerySet>,
@@ -150,6 +153,7 @@ impl Chain {
             bin: Bin::new(&device),
             rasterize: Rasterize::new(&device),
             splats: SplatBuffers::new(&device),
+            splat_owners: None,
             lenses: Lenses::default(),
             queries: timestamps(&device),
             timestamps: GrowableBuffer::new(&device, "timestamps", timestamp_usage),

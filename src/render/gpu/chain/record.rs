@@ -15,6 +15,7 @@ use crate::gpu::project::ProjectInputs;
 use crate::gpu::rasterize::{RasterizeInputs, TileOutput};
 use crate::gpu::read_back::{TILE_COUNTERS_OFFSET, TIMESTAMP_OFFSET};
 use crate::gpu::sort::{Columns, SortJobs};
+use crate::gpu::splat_owners::SplatOwners;
 use crate::stage::Stage;
 
 impl Chain {
@@ -27,14 +28,20 @@ impl Chain {
         output: &TileOutput,
     ) -> (Vec<&'static str>, SubmissionIndex) {
         let mut recorder = Recorder::new(&self.device, self.queries.clone());
-        self.record(&mut recorder, source, &current.parameters, Stage::Bin);
+        if output.planes.has_semantics() {
+            let device = &self.device;
+            self.splat_owners.get_or_insert_with(|| SplatOwners::new(device));
+        }
+        let with_classes = output.planes.has_semantics();
+        self.record(&mut recorder, source, &current.parameters, Stage::Bin, with_classes);
         let Self { device, plan, project, splats, bin, lenses, timestamps, .. } = self;
+        let splat_owners = self.splat_owners.as_ref().filter(|_| with_classes);
 
-        // The owners of the splats. Only instance ids read them.
+        // The owners of the splats. Only instance ids without classes read them.
         let mut resumed = Vec::new();
         let owners = match source {
             Source::Gaussians(work) => work.owners(),
-            Source::Stages(outputs) if output.planes.has_instances() => {
+            Source::Stages(outputs) if output.planes.has_owners() && !with_classes => {
                 let first_splats = outputs.owners.iter().map(|owner| owner.first_splat);
                 project.set_first_splats(device, &first_splats.collect::<Vec<u32>>());
                 resumed.extend(outputs.owners.iter().zip(0..).map(|(owner, cluster_view)| Owner {
@@ -48,7 +55,9 @@ impl Chain {
         let first_splats = project.first_splats();
 
         let mut pass = recorder.stage("rasterize");
-        let inputs = RasterizeInputs { plan, splats, bin, lenses, owners, first_splats };
+        let splat_owners = splat_owners.map(SplatOwners::splats);
+        let inputs =
+            RasterizeInputs { plan, splats, bin, lenses, owners, first_splats, splat_owners };
         self.rasterize.run(device, &mut pass, inputs, output, current.parameters.tiles);
         drop(pass);
 
@@ -68,13 +77,15 @@ impl Chain {
         (stages, submission)
     }
 
-    /// Records the stages up to and including `last` that must still run.
+    /// Records the stages up to and including `last` that must still run. `with_classes` also
+    /// writes the owner of each splat.
     pub(super) fn record(
         &mut self,
         recorder: &mut Recorder,
         source: Source<'_>,
         parameters: &GpuFrame,
         last: Stage,
+        with_classes: bool,
     ) {
         let must_run = |stage| stage <= last && source.needs(stage);
         let counts = match source {
@@ -83,13 +94,20 @@ impl Chain {
             }
             Source::Stages(outputs) => self.fill(outputs),
         };
-        let Self { device, mirror, plan, scan, splats, lenses, .. } = self;
+        let Self { device, mirror, plan, scan, splats, splat_owners, lenses, .. } = self;
+        let splat_owners = splat_owners.as_mut().filter(|_| with_classes);
         plan.start(device, parameters, &counts);
 
         if let Source::Gaussians(work) = source {
             let mut pass = recorder.stage("project");
             let inputs = ProjectInputs { plan, scan, mirror, lenses };
             self.project.run(device, &mut pass, work, inputs, splats);
+            if let Some(owners) = splat_owners {
+                let stage = (&*plan, &self.project, &*mirror);
+                owners.run(device, &mut pass, stage, work, parameters.splat_capacity);
+            }
+        } else if let (Source::Stages(outputs), Some(owners)) = (source, splat_owners) {
+            owners.fill(device, outputs);
         }
 
         let mut sorted = Sorted::default();

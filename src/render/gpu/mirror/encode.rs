@@ -9,6 +9,9 @@
 //! A cluster takes as many blocks as it has Gaussians for. Levels of detail have sections of a few
 //! hundred Gaussians; if each cluster took the size of a full one of 256, they would take 81 B per
 //! Gaussian instead of 63.
+//!
+//! The classes of a chunk that has some follow the blocks of each cluster, a byte for each
+//! Gaussian. The header says how many lines after it they begin; 0 without classes.
 
 use std::ops::Range;
 
@@ -23,14 +26,24 @@ pub(super) const LINE_BYTES: u64 = 4 * SOA_BLOCK as u64;
 /// may assume that no number is infinite, so minus infinity is not uploaded.
 const INVISIBLE: f32 = -1e30;
 
-/// Most lines of a cluster: a header, and 8 blocks of 33 lines at SH degree 3.
-pub(super) const MAX_LINES: u32 = 1 + (CLUSTER as u32 / SOA_BLOCK) * 33;
+/// Most lines of a cluster: a header, 8 blocks of 33 lines at SH degree 3, and classes.
+pub(super) const MAX_LINES: u32 =
+    1 + (CLUSTER as u32 / SOA_BLOCK) * 33 + class_lines(CLUSTER) as u32;
 
 /// Number of lines of each cluster of a chunk, in order.
 pub(super) fn lines(chunk: &Chunk) -> impl Iterator<Item = u32> {
     let words = words(chunk.sh_degree());
     let counts = (0..chunk.len()).step_by(CLUSTER).map(|first| (chunk.len() - first).min(CLUSTER));
-    counts.map(move |count| 1 + (count.div_ceil(SOA_BLOCK as usize) * words) as u32)
+    let has_classes = chunk.classes().is_some();
+    counts.map(move |count| {
+        let of_classes = if has_classes { class_lines(count) } else { 0 };
+        (1 + count.div_ceil(SOA_BLOCK as usize) * words + of_classes) as u32
+    })
+}
+
+/// Lines of the classes of a cluster of `count` Gaussians.
+const fn class_lines(count: usize) -> usize {
+    count.div_ceil(LINE_BYTES as usize)
 }
 
 /// Words of a Gaussian of an SH degree.
@@ -54,6 +67,14 @@ pub(super) fn encode(chunk: &Chunk, index: usize, lines: &mut [u32]) {
     let scales = [largest(0..3), largest(3..values)];
     header[..2].copy_from_slice(&scales.map(f32::to_bits));
     header[2] = count as u32;
+    if let Some(classes) = chunk.classes() {
+        let lines = count.div_ceil(BLOCK) * words(chunk.sh_degree());
+        header[3] = 1 + lines as u32;
+        let words = &mut blocks[lines * BLOCK..];
+        for (i, class) in classes[first..first + count].iter().enumerate() {
+            words[i / 4] |= u32::from(class.value()) << (8 * (i % 4));
+        }
+    }
     let blocks = blocks.chunks_exact_mut(BLOCK * words(chunk.sh_degree()));
     for (index, words) in (0..count).step_by(BLOCK).zip(blocks) {
         for i in 0..(count - index).min(BLOCK) {

@@ -186,7 +186,7 @@ impl ObservationBuilder {
             tensors.push(TensorKind::Points(index), DType::F32, vec![sweep.returns, 3]);
             tensors.push(TensorKind::Intensity(index), DType::F32, vec![sweep.returns]);
         }
-        let PixelMaps { depth, opacity, normals, instances } = layout.maps();
+        let PixelMaps { depth, opacity, normals, instances, semantics } = layout.maps();
         // Each with its place among the images.
         // At most 256 images: to compare all pairs is cheap.
         let place = |image: &ShownImage| {
@@ -217,6 +217,10 @@ impl ObservationBuilder {
         for &(index, image) in placed.iter().filter(|_| instances) {
             let [height, width] = layout.size_px(image.info.camera);
             tensors.push(TensorKind::Instances(index), DType::U16, vec![height, width]);
+        }
+        for &(index, image) in placed.iter().filter(|_| semantics) {
+            let [height, width] = layout.size_px(image.info.camera);
+            tensors.push(TensorKind::Semantics(index), DType::U8, vec![height, width]);
         }
         for &(index, image) in &placed {
             let file_bytes = self.encoded[image.encoded].file.len();

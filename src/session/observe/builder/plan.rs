@@ -13,13 +13,14 @@ use crate::observe::layout::{InPlaceBytes, ObservationLayout, RigCapture};
 ///
 /// ```text
 /// | header | ego history, motion, floats of sweeps | floats of all captures | integers of sweeps |
-/// | instances of all captures | raw pixels of all |
+/// | instances of all captures | classes of all | raw pixels of all |
 /// ```
 pub(super) struct BufferPlan {
     layout: Arc<ObservationLayout>,
     floats_at: usize,
     sweep_ids_at: usize,
     instances_at: usize,
+    semantics_at: usize,
     raw_at: usize,
     end: usize,
 }
@@ -37,12 +38,15 @@ impl BufferPlan {
         let all = in_place.fold(InPlaceBytes::default(), |sum, one| InPlaceBytes {
             floats: sum.floats + one.floats,
             instances: sum.instances + one.instances,
+            semantics: sum.semantics + one.semantics,
             raw: sum.raw + one.raw,
         });
         let sweep_ids_at = floats_at + all.floats;
         let instances_at = sweep_ids_at + sweep_id_bytes;
-        let raw_at = instances_at + all.instances;
-        Self { layout, floats_at, sweep_ids_at, instances_at, raw_at, end: raw_at + all.raw }
+        let semantics_at = instances_at + all.instances;
+        let raw_at = semantics_at + all.semantics;
+        let end = raw_at + all.raw;
+        Self { layout, floats_at, sweep_ids_at, instances_at, semantics_at, raw_at, end }
     }
 
     /// Where the integers of sweeps begin: rows, columns and instances of one sweep after the
@@ -88,17 +92,21 @@ impl BufferPlan {
         let layout = &self.layout;
         let floats_at = self.floats_at;
         let instances_at = self.instances_at;
+        let semantics_at = self.semantics_at;
         let raw_at = self.raw_at;
         let own = layout.in_place_bytes(capture);
         // Moved on by the whole capture, so that the next one begins behind it.
         self.floats_at += own.floats;
         self.instances_at += own.instances;
+        self.semantics_at += own.semantics;
         self.raw_at += own.raw;
         // Disjoint slices for each target: threads can write all of them at once.
         let (maps_part, raw_part) = buffer.split_at_mut(raw_at);
+        let (maps_part, semantics_part) = maps_part.split_at_mut(semantics_at);
         let (float_part, instances_part) = maps_part.split_at_mut(instances_at);
         let mut float_part = &mut float_part[floats_at..floats_at + own.floats];
         let mut instances_part = &mut instances_part[..own.instances];
+        let mut semantics_part = &mut semantics_part[..own.semantics];
         let mut raw_part = &mut raw_part[..own.raw];
 
         let mut targets = Vec::with_capacity(capture.cameras.len());
@@ -110,12 +118,14 @@ impl BufferPlan {
                 (held && capture.shown).then(|| as_floats(split_off_front(&mut float_part, bytes)))
             };
             // In the order of the tensors.
-            let PixelMaps { depth, opacity, normals, instances } = layout.maps();
+            let PixelMaps { depth, opacity, normals, instances, semantics } = layout.maps();
             let depth_m = map(depth, 1);
             let opacity = map(opacity, 1);
             let normals = map(normals, 3);
             let instances = (instances && capture.shown)
                 .then(|| as_ids(split_off_front(&mut instances_part, 2 * pixels)));
+            let semantics =
+                (semantics && capture.shown).then(|| split_off_front(&mut semantics_part, pixels));
             let rgb8 = if holds_pixels {
                 split_off_front(&mut raw_part, 3 * pixels)
             } else {
@@ -129,6 +139,7 @@ impl BufferPlan {
                 opacity,
                 normals,
                 instances,
+                semantics,
                 appearance: Some(&camera.appearance),
             });
         }

@@ -6,8 +6,8 @@
 //! degrees, coefficient-major, then red, green, blue), of which n_active_features degrees count. A
 //! layer of tracked objects is skipped, because it has no fixed place ([`read_tracked`] reads it:
 //! gaussian_cuboid_ids names the track of each Gaussian, and positions are relative to the middle
-//! of the track's cuboid). Positions are in the payload's axes; the USD layers around it, which may
-//! rotate and move it, are not read.
+//! of the track's cuboid). A layer whose name is a class (`road`) has this class. Positions are in
+//! the payload's axes; the USD layers around it, which may rotate and move it, are not read.
 
 mod msgpack;
 mod settings;
@@ -19,7 +19,7 @@ use flate2::bufread::GzDecoder;
 use half::f16;
 
 use crate::limits;
-use wildcity_scene::{Gaussians, sh};
+use wildcity_scene::{Gaussians, SemanticClass, sh};
 
 use super::notes::Reading;
 use super::objects::{self, TrackedObject};
@@ -77,7 +77,9 @@ pub(super) fn read(
                  with"
             )),
         }
-        all.append(&payload.layer(name)?.read()?);
+        let mut layer = payload.layer(name)?.read()?;
+        layer.classes = layer_class(name).map(|class| vec![class; layer.len()]);
+        all.append(&layer);
         check_count(all.len() as u64)?;
     }
     reading.accept(all, &Field::plain_name)
@@ -112,6 +114,12 @@ pub(super) fn read_tracked(
         found.extend(objects::split(&gaussians, &ids, track));
     }
     Ok(found)
+}
+
+/// The class of the Gaussians of a layer, if its name is that of one: `road` is one in the scenes
+/// of NVIDIA's reconstructions, and `background`, which has all else, is none.
+fn layer_class(name: &str) -> Option<SemanticClass> {
+    SemanticClass::from_name(name).filter(|class| *class != SemanticClass::None)
 }
 
 /// The bytes of a gzip stream.

@@ -1,10 +1,10 @@
 //! The columns of a Gaussian in a PLY file, and what they mean.
 
-use wildcity_scene::{Gaussians, sh};
+use wildcity_scene::{Gaussians, SemanticClass, sh};
 
 use super::header::{Element, Property, Scalar, error};
 use crate::ingest::validate::{Field, LN_SCALE};
-use crate::ingest::{IngestError, activation};
+use crate::ingest::{IngestError, activation, classes};
 
 /// Columns that are not read and change no picture: the reference code writes normals of zero.
 const WITHOUT_EFFECT: [&str; 3] = ["nx", "ny", "nz"];
@@ -23,6 +23,7 @@ pub(super) struct Columns {
     /// Above degree 0; coefficient-major, then red, green, blue, which is the order in memory.
     rest: Vec<Property>,
     filter: Option<Property>,
+    class: Option<Property>,
 }
 
 /// The colour of degree 0.
@@ -54,6 +55,7 @@ impl Columns {
             dc: BaseColour::find(vertex)?,
             rest: find(&rest)?,
             filter: vertex.property(FILTER).ok().cloned(),
+            class: vertex.property(classes::NAME).ok().cloned(),
         })
     }
 
@@ -81,6 +83,7 @@ impl Columns {
         let read: Vec<&str> = read
             .chain([&self.opacity])
             .chain(&self.filter)
+            .chain(&self.class)
             .map(|property| property.name.as_str())
             .chain(WITHOUT_EFFECT)
             .collect();
@@ -88,6 +91,19 @@ impl Columns {
         names.filter(|name| !read.contains(name)).collect()
     }
 
+    /// Whether the Gaussians have classes.
+    pub(super) fn has_classes(&self) -> bool {
+        self.class.is_some()
+    }
+
+    /// The class in a row; unlabelled without the property. The error says what is wrong with it.
+    pub(super) fn class(&self, row: &[u8]) -> Result<SemanticClass, String> {
+        self.class
+            .as_ref()
+            .map_or(Ok(SemanticClass::Unlabelled), |class| classes::class(class.value(row)))
+    }
+
+    /// Appends the Gaussian of a row, without its class.
     pub(super) fn push(&self, row: &[u8], gaussians: &mut Gaussians) {
         let value = |property: &Property| property.value(row);
         let single = |property: &Property| property.value(row) as f32;

@@ -5,8 +5,9 @@
 //! scale_0..2 (ln), opacity (logit), f_dc_0..2, and f_rest_0.. of 0, 9, 24 or 45 coefficients,
 //! channel-major: all of red, then green, then blue. Dialects: no scale_2 (2D Gaussian splatting),
 //! filter_3D (mip-splatting), red green blue of bytes in place of f_dc (nerfstudio), and an element
-//! vertex_background with one more per moving object (street_gaussians). Normals are skipped; other
-//! columns, elements and comments are named in a warning.
+//! vertex_background with one more per moving object (street_gaussians). A column semantic_class
+//! has values of [`SemanticClass`]. Normals are skipped; other columns, elements and comments are
+//! named in a warning.
 
 mod body;
 mod columns;
@@ -18,7 +19,7 @@ mod write;
 use std::collections::BTreeMap;
 use std::io::BufRead;
 
-use wildcity_scene::Gaussians;
+use wildcity_scene::{Gaussians, SemanticClass};
 
 use super::capture::CapturePoint;
 use super::notes::{BLUR_BRUSH_PX2, Reading};
@@ -62,6 +63,8 @@ pub(super) fn read(
     let mut gaussians = Gaussians::with_capacity(columns.sh_degree, count);
     let encoding = header.encoding;
     let mut body = Body { input, encoding, done: header.bytes, file_bytes, progress };
+    let mut classes = columns.has_classes().then(|| Vec::with_capacity(count));
+    let mut bad_class = None;
     // Scales and opacities are NaN behind such a filter.
     let mut bad_filters = BTreeMap::new();
     for element in &header.elements {
@@ -71,11 +74,25 @@ pub(super) fn read(
                 if let Some(bad) = bad.filter(|_| bad_filters.len() < NAMED_BAD_GAUSSIANS) {
                     bad_filters.insert(gaussians.len(), bad);
                 }
+                if let Some(classes) = &mut classes {
+                    let class = columns.class(row).unwrap_or_else(|reason| {
+                        bad_class.get_or_insert((gaussians.len(), reason));
+                        SemanticClass::Unlabelled
+                    });
+                    classes.push(class);
+                }
                 columns.push(row, &mut gaussians);
             }
         })?;
     }
     body.check_end()?;
+    // Not left out with the Gaussians that cannot be drawn: a wrong number is of another table of
+    // classes, in which the others would mean something else, too.
+    if let Some((row, reason)) = bad_class {
+        let place = format!("row {row} of {}", vertex.name);
+        return Err(IngestError::Body { format: "PLY", place, reason });
+    }
+    gaussians.classes = classes;
     let sh_degree = columns.sh_degree;
     let accepted = reading.accept(gaussians, &|field| file_name(field, sh_degree));
     accepted.map_err(|error| with_filters(error, &bad_filters))

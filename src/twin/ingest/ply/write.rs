@@ -4,12 +4,15 @@ use std::io::{self, Write};
 
 use wildcity_scene::{Gaussians, sh};
 
+use crate::ingest::classes;
+
 /// Largest rounding of a mean to f32: others are written as f64.
 const MOST_ROUNDING_M: f64 = 1e-4;
 
 /// Writes Gaussians in the layout of Kerbl et al. 2023, little-endian: means, normals (0),
 /// spherical harmonics channel by channel, opacities before the sigmoid, logarithms of the scales,
-/// and quaternions (w, x, y, z). Means far from the origin are of type double.
+/// quaternions (w, x, y, z), and classes as uchar if there are some. Means far from the origin are
+/// of type double.
 ///
 /// # Errors
 /// The writer fails.
@@ -35,6 +38,9 @@ pub fn write_ply(gaussians: &Gaussians, out: &mut impl Write) -> io::Result<()> 
     for column in columns.iter().flatten() {
         writeln!(out, "property float {column}")?;
     }
+    if gaussians.classes.is_some() {
+        writeln!(out, "property uchar {}", classes::NAME)?;
+    }
     writeln!(out, "end_header")?;
     for i in 0..gaussians.len() {
         for m in gaussians.means_m[i] {
@@ -56,6 +62,9 @@ pub fn write_ply(gaussians: &Gaussians, out: &mut impl Write) -> io::Result<()> 
             .chain(gaussians.quats_wxyz[i]);
         for value in values {
             out.write_all(&value.to_le_bytes())?;
+        }
+        if let Some(classes) = &gaussians.classes {
+            out.write_all(&[classes[i].value()])?;
         }
     }
     Ok(())

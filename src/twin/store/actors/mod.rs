@@ -280,7 +280,7 @@ impl From<DamagedActor> for StoreError {
 
 impl StoredActor {
     fn new(hash: String, bytes: u64, header: Header) -> Self {
-        let Header { description, sh_degree, record, levels } = header;
+        let Header { description, sh_degree, record, levels, .. } = header;
         Self { hash, bytes, description, sh_degree, record, levels }
     }
 

@@ -31,6 +31,9 @@ pub(super) struct Header {
     pub(super) description: AssetDescription,
     pub(super) sh_degree: u8,
     pub(super) record: RecordFormat,
+    /// Whether its Gaussians have classes; as in a chunk's entry of a manifest.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub(super) classes: bool,
     pub(super) levels: Vec<StoredLevel>,
 }
 
@@ -48,6 +51,7 @@ impl Catalog {
         let mut content = Vec::new();
         let mut levels = Vec::with_capacity(asset.levels.len());
         let sh_degree = asset.levels.first().map_or(0, |level| level.chunk.sh_degree());
+        let classes = asset.levels.first().is_some_and(|level| level.chunk.classes().is_some());
         for (index, AssetLevel { error_m, chunk }) in asset.levels.iter().enumerate() {
             let mut clamped = Clamped::default();
             // An asset is stored like block 0 of a cell at the origin.
@@ -66,7 +70,8 @@ impl Catalog {
             levels.push(StoredLevel { count, error_m: *error_m, bytes: own.len() as u32 });
             content.extend(own);
         }
-        let header = Header { description: asset.description.clone(), sh_degree, record, levels };
+        let description = asset.description.clone();
+        let header = Header { description, sh_degree, record, classes, levels };
         let json = self.encode(&header)?;
         let mut bytes = MAGIC.to_vec();
         bytes.extend(FORMAT.to_le_bytes());
@@ -127,7 +132,7 @@ impl Header {
             let own = own.ok_or_else(|| of_level("it ends before its last byte".to_owned()))?;
             // Levels follow each other without gaps: what is left after the last one is damage.
             rest = &rest[own.len()..];
-            let (entry, section) = section(level);
+            let (entry, section) = section(level, self.classes);
             let (degree, record) = (self.sh_degree, self.record);
             let chunk = chunk_file::unpack(own, &entry, &section, degree, record, None);
             let chunk = Arc::new(chunk.map_err(of_level)?);
@@ -142,8 +147,8 @@ impl Header {
 }
 
 /// A level in the form of a chunk's section: what [`chunk_file::unpack`] reads of it is the count,
-/// the cell and the origin.
-fn section(level: &StoredLevel) -> (ChunkEntry, Section) {
+/// the cell, the origin and whether there are classes.
+fn section(level: &StoredLevel, classes: bool) -> (ChunkEntry, Section) {
     let entry = ChunkEntry {
         cell: [0, 0],
         object: String::new(),
@@ -151,6 +156,7 @@ fn section(level: &StoredLevel) -> (ChunkEntry, Section) {
         bytes: level.bytes.into(),
         bounds: Bounds::EMPTY,
         origin_m: DVec3::ZERO,
+        classes,
         sections: Vec::new(),
     };
     let section = Section {
