@@ -198,7 +198,7 @@ def test_answers_keep_everything(name: str) -> None:
     golden = vector(f"answers/{name}.json")
     answer = decode_answer(json.dumps(golden))
     assert type(answer) is ANSWERS[golden.pop("type")]
-    assert plain(answer) == golden
+    assert without_lidars(plain(answer)) == golden
 
 
 @pytest.mark.parametrize("name", names("answers"))
@@ -301,6 +301,15 @@ def without_absent(metadata: dict[str, Any]) -> dict[str, Any]:
     for image in metadata["images"]:
         assert image.pop("back") == 0
     return metadata
+
+
+def without_lidars(value: Any) -> Any:
+    """Without empty lists of LiDARs, which the server omits, in the settings of sessions wherever they stand."""
+    if isinstance(value, list):
+        return [without_lidars(item) for item in value]
+    if isinstance(value, dict):
+        return {key: without_lidars(item) for key, item in value.items() if (key, item) != ("lidars", [])}
+    return value
 
 
 def check_image(observation: Observation, pose: int, camera: str, expected: dict[str, Any], tolerance: int) -> None:

@@ -50,8 +50,8 @@ pub(super) struct Export {
     #[arg(long)]
     images: bool,
 
-    /// Cast the sweeps of the LiDARs again, and add them as point clouds in the frame of the rig. The
-    /// ego's motion during a sweep is taken out.
+    /// Cast the sweeps of the LiDARs again, and add them as point clouds in the frame of the rig.
+    /// The ego's motion during a sweep is taken out.
     #[arg(long, conflicts_with = "nuscenes")]
     lidar: bool,
 
@@ -186,8 +186,8 @@ impl Export {
                 sweeps += u64::from(matches!(replayed, Replayed::Sweep(_)));
                 add(replayed)
             };
-            let report = recording.replay(&cache, &*backend, ReplayUntil::End, &mut add);
-            let report = report.map_err(|error| ExportError::Images(error.to_string()))?;
+            let replayed = recording.replay(&cache, &*backend, ReplayUntil::End, &mut add);
+            let report = replayed.map_err(|error| ExportError::Images(error.to_string()))?;
             Ok(Replay { report, sweeps })
         };
         let target = self.target()?;

@@ -287,8 +287,8 @@ impl Block {
         if visible.all_false() {
             return None;
         }
-        // The half-size of the ellipsoid's box along each axis of the sector, as in the definition of
-        // the reach.
+        // The half-size of the ellipsoid's box along each axis of the sector, as in the definition
+        // of the reach.
         let ln4 = 2.0 * std::f32::consts::LN_2;
         // Never farther than an opacity of 1 reaches, as for splats.
         let above_cut = log2_opacity.min(zero) - splat(test.alpha_cut_log2);
@@ -307,10 +307,11 @@ impl Block {
         let [y, half_y] = along(simd, test, 1, mean, own, scale, reach, turned_m);
         let [z, half_z] = along(simd, test, 2, mean, own, scale, reach, turned_m);
         // The farther of two lower bounds of its distance, from a sphere and from the box that
-        // contain it. A road's Gaussians are so flat that the sphere is up to their length too near.
+        // contain it. A road's Gaussians are so flat that the sphere is up to their length too
+        // near.
         let sphere_m = range_m - largest * reach - most_moved_m;
-        let outside = Vec3x16 { x: x.abs() - half_x, y: y.abs() - half_y, z: z.abs() - half_z };
-        let outside = outside.max(zero);
+        let beyond_box = Vec3x16 { x: x.abs() - half_x, y: y.abs() - half_y, z: z.abs() - half_z };
+        let outside = beyond_box.max(zero);
         let nearest_m = sphere_m.max(outside.dot(outside).sqrt() * splat(1.0 - 1e-6));
         let far_x = x + half_x;
         let near_x = x - half_x;
@@ -320,7 +321,8 @@ impl Block {
         let huge = splat(f32::MAX);
         let azimuth_low = unbounded.select(-huge, quotient(simd, y - half_y, far_x, divisor));
         let azimuth_high = unbounded.select(huge, quotient(simd, y + half_y, divisor, far_x));
-        // Horizontal distances of the box. Behind the LiDAR nothing is seen, so that 0 is the nearest.
+        // Horizontal distances of the box. Behind the LiDAR nothing is seen, so that 0 is the
+        // nearest.
         let beside = (y.abs() - half_y).max(zero);
         let beyond = y.abs() + half_y;
         let ahead = near_x.max(zero);
@@ -340,9 +342,10 @@ impl Block {
             return None;
         }
         // Rows of the transposed rotation are its columns: the Gaussian's own axes.
-        let [a, b, c] = own;
         let per_m = |scale: f32x16<S>| splat(1.0) / scale.max(splat(THINNEST_M as f32));
-        let [a, b, c] = [a.scale(per_m(scale.x)), b.scale(per_m(scale.y)), c.scale(per_m(scale.z))];
+        let a = own[0].scale(per_m(scale.x));
+        let b = own[1].scale(per_m(scale.y));
+        let c = own[2].scale(per_m(scale.z));
         let whiten = [a.x, a.y, a.z, b.x, b.y, b.z, c.x, c.y, c.z];
         Some(Self {
             lanes,

@@ -8,8 +8,8 @@ use crate::lidar::LidarView;
 /// a beam at 100 m has it.
 const STEEPEST: f64 = 1e6;
 
-/// Buckets begin and end at most at these tangents: rows that are steeper, of which LiDARs have few,
-/// share the outer ones.
+/// Buckets begin and end at most at these tangents: rows that are steeper, of which LiDARs have
+/// few, share the outer ones.
 const BUCKETS_TO: f32 = 4.0;
 
 /// The rows of a LiDAR.
@@ -42,9 +42,11 @@ impl Rows {
         let count = 16 * tangents.len();
         let buckets_per_tangent = count as f32 / (buckets_to - buckets_from).max(1e-6);
         let below = |bucket: usize| {
-            let from = buckets_from + bucket.saturating_sub(1) as f32 / buckets_per_tangent;
             // All tangents of the first two buckets may be in question.
-            let from = if bucket < 2 { f32::NEG_INFINITY } else { from };
+            let from = match bucket {
+                0 | 1 => f32::NEG_INFINITY,
+                _ => buckets_from + (bucket - 1) as f32 / buckets_per_tangent,
+            };
             // A LiDAR has at most 256 rows.
             tangents.partition_point(|tangent| *tangent < from) as u16
         };
