@@ -36,7 +36,7 @@ fn main(
     }
     let cluster_view = cluster_views[cluster_view_index];
     let owner = chunk_owners[cluster_view.chunk_view];
-    let own_class = class_of(cluster_view.line, thread);
+    let own_class = gaussian_class(cluster_view.line, thread);
     splat_owners[slot] = select(owner, (owner & 0xFFFFu) | (own_class << 16u), own_class > UNLABELLED);
 }
 
@@ -44,7 +44,7 @@ const UNLABELLED: u32 = 1u;
 
 // The class of a Gaussian, one byte; 0 in a cluster without classes. The header's fourth word is the number of lines
 // from the cluster's first line to its classes, or 0.
-fn class_of(line: u32, thread: u32) -> u32 {
+fn gaussian_class(line: u32, thread: u32) -> u32 {
     let lines = gaussians[line * SOA_BLOCK + 3u];
     if lines == 0u {
         return 0u;

@@ -28,6 +28,7 @@ mod outcome;
 mod overview;
 mod prune;
 mod scenario;
+mod sweep_point;
 
 pub use diff::{Difference, What, diff};
 pub use drive::{drive_record, off_model_us};
@@ -36,8 +37,8 @@ pub use export::{
 };
 #[cfg(feature = "mcap")]
 pub use export::{
-    EpisodeExport, ExportedImage, ExportedPoint, ExportedSweep, NuscenesExport, NuscenesImage,
-    Ros2Export, export, export_nuscenes, export_ros2,
+    EpisodeExport, ExportedImage, ExportedSweep, NuscenesExport, NuscenesImage, Ros2Export, export,
+    export_nuscenes, export_ros2,
 };
 pub use file::{
     CameraHead, Cut, EndLine, EpisodeFile, Frame, Header, ReadError, RigHead, check_no_mcap,
@@ -52,3 +53,4 @@ pub use outcome::result;
 pub use overview::{Overview, RecordHead};
 pub use prune::{Keep, Pruned, prune};
 pub use scenario::{DriveStart, ground_surface, pose_at, scenario_line};
+pub use sweep_point::SweepPoint;

@@ -58,7 +58,7 @@ pub struct SplatOwner {
     pub first_splat: u32,
     /// As in [`Target::instances`](crate::Target::instances).
     pub instance: u16,
-    /// As in [`Target::semantics`](crate::Target::semantics).
+    /// The class that [`Target::semantics`](crate::Target::semantics) shows of these splats.
     pub class: SemanticClass,
 }
 

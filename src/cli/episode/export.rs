@@ -6,14 +6,14 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 
 use wildcity_episode::{
-    EpisodeExport, EpisodeFile, ExportError, Exported, ExportedImage, ExportedPoint, ExportedSweep,
+    EpisodeExport, EpisodeFile, ExportError, Exported, ExportedImage, ExportedSweep,
     NuscenesExport, NuscenesImage, Ros2Export, export_file, export_nuscenes, export_ros2,
     write_whole,
 };
 use wildcity_scene::Rig;
 use wildcity_session::{
     FrameRecord, RecordedEpisode, ReplayReport, ReplayUntil, Replayed, ReplayedImage,
-    ReplayedSweep, SweepPoint, jpeg, limits as session,
+    ReplayedSweep, jpeg, limits as session,
 };
 use wildcity_twin::residency::Cache;
 
@@ -255,11 +255,7 @@ impl<'a, W: io::Write + io::Seek> AnyExport<'a, W> {
     }
 
     fn sweep(&mut self, sweep: &ReplayedSweep<'_>) -> Result<(), ExportError> {
-        let point = |point: SweepPoint| {
-            let SweepPoint { xyz_m, intensity, offset_us, row, column, instance } = point;
-            ExportedPoint { xyz_m, intensity, offset_us, row, column, instance }
-        };
-        let points: Vec<ExportedPoint> = sweep.points().into_iter().map(point).collect();
+        let points = sweep.points();
         let sweep = ExportedSweep { lidar: sweep.lidar, time_us: sweep.time_us, points: &points };
         match self {
             Self::Foxglove(export) => export.sweep(&sweep),

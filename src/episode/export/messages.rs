@@ -201,7 +201,7 @@ pub(super) struct PackedElementField {
     pub(super) name: String,
     #[prost(fixed32, tag = "2")]
     pub(super) offset: u32,
-    /// A `NumericType`.
+    /// A value of Foxglove's `NumericType`.
     #[prost(int32, tag = "3")]
     pub(super) kind: i32,
 }

@@ -51,7 +51,7 @@ pub use nuscenes::{NuscenesExport, NuscenesImage, export_nuscenes};
 #[cfg(feature = "mcap")]
 pub use ros2::{Ros2Export, export_ros2};
 #[cfg(feature = "mcap")]
-pub use sweep::{ExportedPoint, ExportedSweep};
+pub use sweep::ExportedSweep;
 #[cfg(feature = "mcap")]
 pub use write::{EpisodeExport, ExportedImage, export};
 

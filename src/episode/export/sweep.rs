@@ -1,22 +1,7 @@
 //! Sweeps of LiDARs as point clouds: 28 bytes a point, the same for Foxglove and for ROS 2.
 
 use super::messages::PackedElementField;
-
-/// A return of a LiDAR.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ExportedPoint {
-    /// Position in the rig's axes at the time of the sweep, in metres: the motion of the ego during
-    /// the sweep is taken out.
-    pub xyz_m: [f32; 3],
-    /// Mean luminance of what was hit.
-    pub intensity: f32,
-    /// When it was measured, in microseconds after the sweep's time: 0 or less.
-    pub offset_us: i32,
-    pub row: u16,
-    pub column: u16,
-    /// The owner of what was hit, as in the map of an image.
-    pub instance: u16,
-}
+use crate::sweep_point::SweepPoint;
 
 /// A sweep of an episode.
 #[derive(Clone, Copy, Debug)]
@@ -25,7 +10,7 @@ pub struct ExportedSweep<'a> {
     pub lidar: usize,
     /// The sweep's time, that of its last column, in microseconds.
     pub time_us: i64,
-    pub points: &'a [ExportedPoint],
+    pub points: &'a [SweepPoint],
 }
 
 /// Kinds of numbers in a point.
@@ -52,10 +37,10 @@ pub(super) const FIELDS: [(&str, u32, Number); 8] = [
 ];
 
 /// The points, one after the other, little endian.
-pub(super) fn packed(points: &[ExportedPoint]) -> Vec<u8> {
+pub(super) fn packed(points: &[SweepPoint]) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(points.len() * POINT_BYTES as usize);
     for point in points {
-        let ExportedPoint { xyz_m, intensity, offset_us, row, column, instance } = *point;
+        let SweepPoint { xyz_m, intensity, offset_us, row, column, instance } = *point;
         for value in xyz_m.into_iter().chain([intensity]) {
             bytes.extend(value.to_le_bytes());
         }

@@ -179,8 +179,8 @@ pub struct FrameRecord {
     pub frame_hash: String,
     /// BLAKE3 of each image's pixels as sent, in hex: pose by pose, camera by camera.
     pub images: Vec<String>,
-    /// BLAKE3 of each sweep's points as sent, in hex, in the order of the rig; absent without
-    /// LiDARs.
+    /// BLAKE3 of each sweep's points as sent, in hex, in the order of the rig. Absent for a rig
+    /// without LiDAR.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub sweeps: Vec<String>,
     /// Results of the repair model, in the order of `images`; absent if it was used on none of

@@ -4,7 +4,7 @@ use std::io;
 use std::path::PathBuf;
 
 use glam::Vec3;
-use wildcity_episode::ReadError;
+use wildcity_episode::{ReadError, SweepPoint};
 use wildcity_render::RenderError;
 use wildcity_render::lidar::LidarView;
 use wildcity_repair::RepairError;
@@ -117,22 +117,6 @@ pub struct ReplayedSweep<'a> {
     pub(crate) mounted: &'a RigLidar,
     pub(crate) view: &'a LidarView,
     pub(crate) cloud: &'a PointCloud,
-}
-
-/// A return of a sweep.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct SweepPoint {
-    /// Position in the rig's axes at the time of the sweep, in metres: the motion of the ego during
-    /// the sweep is taken out.
-    pub xyz_m: [f32; 3],
-    /// Mean luminance of what was hit.
-    pub intensity: f32,
-    /// When it was measured, in microseconds after the sweep's time: 0 or less.
-    pub offset_us: i32,
-    pub row: u16,
-    pub column: u16,
-    /// As the map of an image.
-    pub instance: u16,
 }
 
 impl ReplayedSweep<'_> {

@@ -61,7 +61,7 @@ impl Catalog {
                 continue;
             }
             let mut all = self.full_detail(base, chunk)?;
-            let class_of = |mean_m: &[f64; 3]| {
+            let class_at = |mean_m: &[f64; 3]| {
                 let at_m = DVec3::from_array(*mean_m);
                 let last = near.iter().rfind(|(place, box_from_world, _)| {
                     place.has(box_from_world.transform_point(at_m))
@@ -69,7 +69,7 @@ impl Catalog {
                 let ground = labels.ground.filter(|(_, is_ground)| is_ground(at_m));
                 last.map(|(.., class)| *class).or(ground.map(|(class, _)| class))
             };
-            let given: Vec<Option<SemanticClass>> = all.means_m.iter().map(class_of).collect();
+            let given: Vec<Option<SemanticClass>> = all.means_m.iter().map(class_at).collect();
             let count = given.iter().flatten().count() as u64;
             if count == 0 {
                 continue;

@@ -7,8 +7,9 @@ use wildcity_score::EgoSample;
 
 use super::super::convert::nanoseconds;
 use super::super::messages::CameraCalibration;
-use super::super::sweep::{ExportedPoint, FIELDS, Number, POINT_BYTES, packed};
+use super::super::sweep::{FIELDS, Number, POINT_BYTES, packed};
 use super::cdr::Cdr;
+use crate::sweep_point::SweepPoint;
 
 /// The frame of the world (REP 105).
 pub(super) const MAP: &str = "map";
@@ -76,7 +77,7 @@ pub(super) fn compressed_image(stamp: Stamp, frame: &str, jpeg: &[u8]) -> Vec<u8
 }
 
 /// An unorganised cloud: beams without a return are left out.
-pub(super) fn point_cloud(stamp: Stamp, frame: &str, points: &[ExportedPoint]) -> Vec<u8> {
+pub(super) fn point_cloud(stamp: Stamp, frame: &str, points: &[SweepPoint]) -> Vec<u8> {
     // A sweep has 2²⁰ beams at most, whose bytes fit u32.
     let count = points.len() as u32;
     let mut cdr = Cdr::new();
@@ -95,7 +96,7 @@ pub(super) fn point_cloud(stamp: Stamp, frame: &str, points: &[ExportedPoint]) -
         });
         cdr.put_u32(1);
     }
-    // Little endian.
+    // The numbers are not big-endian.
     cdr.put_bool(false);
     cdr.put_u32(POINT_BYTES);
     cdr.put_u32(POINT_BYTES * count);

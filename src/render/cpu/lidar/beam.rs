@@ -177,7 +177,7 @@ fn is_before<S: Simd>(
     if is_equal.all_false() {
         return is_nearer;
     }
-    // Coincident Gaussians.
+    // Gaussians in one place: the order of ids makes the return the same at any number of threads.
     let mut lanes = is_equal.to_bitmask();
     let mut earlier = 0;
     while lanes != 0 {

@@ -91,7 +91,6 @@ struct Block {
     elevations: [[f32; LANES]; 2],
     nearest_m: [f32; LANES],
     mean_m: [[f32; LANES]; 3],
-    /// Row by row.
     whiten: [[f32; LANES]; 9],
     luminance: [f32; LANES],
 }
