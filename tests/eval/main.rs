@@ -7,3 +7,4 @@ mod boxes;
 mod kid;
 mod lidar;
 mod means;
+mod sweep;
