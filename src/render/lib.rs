@@ -47,7 +47,7 @@ use wildcity_scene::sky::{CubeMap, DrawableSky, SkyError};
 use wildcity_scene::{Chunk, Rays, RenderProfile, Rig, Scene, Selection, SemanticClass};
 
 use crate::gradient::Differentiate;
-use crate::lidar::{LidarView, Sweep};
+use crate::lidar::{LidarView, Sweep, Task};
 
 pub use view::{RollingShutter, View};
 
@@ -332,7 +332,7 @@ pub trait Backend: Send + Sync {
         profile: &RenderProfile,
         view: &LidarView,
     ) -> Result<Sweep, RenderError> {
-        Ok(cpu::lidar::best_sweep(scene, profile, view))
+        Ok(cpu::lidar::best_sweep(&Task::new(scene, profile, view)?))
     }
 
     /// Upper bound of the intermediate buffers of a sweep, whatever the scene, in bytes.

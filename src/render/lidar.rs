@@ -18,8 +18,8 @@
 //! weighted by what each contributes, without the parts of the colour that depend on the direction:
 //! a twin that is trained on images knows nothing of infrared light.
 //!
-//! The reference backend computes this in f64, each beam against each Gaussian; `cpu::lidar` says
-//! how the cpu backend does.
+//! The reference backend computes this in f64, each beam against each Gaussian; `cpu::lidar` and
+//! `gpu::lidar` say how the others do.
 
 use std::sync::Arc;
 
@@ -29,7 +29,7 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::lidar::Lidar;
 use wildcity_scene::{Chunk, RenderProfile, Scene, sh};
 
-use crate::{FIRST_ACTOR_INSTANCE, TWIN_INSTANCE};
+use crate::{FIRST_ACTOR_INSTANCE, RenderError, TWIN_INSTANCE};
 
 /// The transmittance at which a beam returns.
 pub(crate) const HALF: f64 = 0.5;
@@ -129,6 +129,81 @@ pub(crate) fn chunks(scene: &Scene) -> impl Iterator<Item = (Body<'_>, &Chunk)> 
     of_twin.chain(of_actors)
 }
 
+/// The places of Gaussians among all of a scene, by which those at the same range are ordered.
+#[derive(Debug)]
+pub(crate) struct Keys {
+    /// That of the first Gaussian of each chunk.
+    firsts: Vec<u32>,
+    /// The owner of each chunk, as in [`Sweep::instance`].
+    instances: Vec<u16>,
+}
+
+impl Keys {
+    /// # Errors
+    /// The scene has more than 2^32 Gaussians.
+    pub(crate) fn new(scene: &Scene) -> Result<Self, RenderError> {
+        let mut keys = Self { firsts: Vec::new(), instances: Vec::new() };
+        let mut next = 0_u32;
+        for (body, chunk) in chunks(scene) {
+            keys.firsts.push(next);
+            keys.instances.push(body.instance);
+            let after = u32::try_from(chunk.len()).ok().and_then(|len| next.checked_add(len));
+            let limit = u64::from(u32::MAX);
+            let what = "Gaussians in a scene with LiDARs";
+            next = after.ok_or(RenderError::TooMany { what, limit })?;
+        }
+        Ok(keys)
+    }
+
+    /// The key of the first Gaussian of a chunk, which is given by its number in the scene.
+    pub(crate) fn first(&self, chunk: usize) -> u32 {
+        self.firsts[chunk]
+    }
+
+    /// The owner of a Gaussian.
+    pub(crate) fn instance(&self, key: u32) -> u16 {
+        // Of the last chunk that begins at the key or before; empty chunks begin where the next
+        // one does.
+        let chunk = self.firsts.partition_point(|first| *first <= key).saturating_sub(1);
+        self.instances[chunk]
+    }
+}
+
+/// What a sweep is computed of.
+pub(crate) struct Task<'a> {
+    pub(crate) profile: &'a RenderProfile,
+    pub(crate) view: &'a LidarView,
+    pub(crate) bodies: Vec<ChunksOfBody<'a>>,
+    pub(crate) keys: Keys,
+}
+
+impl<'a> Task<'a> {
+    /// # Errors
+    /// The scene has more than 2^32 Gaussians.
+    pub(crate) fn new(
+        scene: &'a Scene,
+        profile: &'a RenderProfile,
+        view: &'a LidarView,
+    ) -> Result<Self, RenderError> {
+        Ok(Self { profile, view, bodies: by_body(scene), keys: Keys::new(scene)? })
+    }
+}
+
+/// The chunks of a body, one at least, with their numbers in the scene.
+pub(crate) type ChunksOfBody<'a> = Vec<(usize, Body<'a>, &'a Chunk)>;
+
+/// The chunks of each body.
+fn by_body(scene: &Scene) -> Vec<ChunksOfBody<'_>> {
+    let mut bodies: Vec<ChunksOfBody<'_>> = Vec::new();
+    for (number, (body, chunk)) in chunks(scene).enumerate() {
+        match bodies.last_mut() {
+            Some(last) if last[0].1.is_same(&body) => last.push((number, body, chunk)),
+            _ => bodies.push(vec![(number, body, chunk)]),
+        }
+    }
+    bodies
+}
+
 /// Shares of red, green and blue in luminance (ITU-R BT.709).
 pub(crate) const LUMINANCE: [f32; 3] = [0.2126, 0.7152, 0.0722];
 
@@ -140,11 +215,15 @@ pub(crate) fn luminance(body: &Body<'_>, value: impl Fn(usize) -> f32) -> f32 {
     (0..3).map(|c| LUMINANCE[c] * channel(c)).sum()
 }
 
-/// The least alpha that counts: the profile's cut, but at least 1/255. So a beam has lost half of
-/// its light after 177 hits at most, which bounds its memory.
+/// The least alpha that counts: the profile's cut, but at least 1/255, which bounds the hits of a
+/// beam ([`MOST_HITS`]).
 pub(crate) fn alpha_cut(profile: &RenderProfile) -> f64 {
     profile.alpha_cut.max(1.0 / 255.0)
 }
+
+/// Most hits of a beam up to its return: 0.5 = (254/255)^177, and one more if the last alpha is
+/// rounded below the cut.
+pub(crate) const MOST_HITS: usize = 178;
 
 /// The squared number of standard deviations at which alpha falls below the cut, for a Gaussian's
 /// peak opacity; not positive if it is below the cut itself. As for splats, a merged Gaussian with

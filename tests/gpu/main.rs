@@ -11,6 +11,8 @@ mod images;
 #[allow(dead_code, reason = "the tests of the other backends use another part of it")]
 #[path = "../support/lenses.rs"]
 mod lenses;
+#[path = "../support/lidars.rs"]
+mod lidars;
 #[path = "../support/actors.rs"]
 mod placed;
 #[path = "../support/root.rs"]
@@ -34,6 +36,7 @@ mod determinism;
 mod encoding;
 mod frames_in_flight;
 mod gradients;
+mod lidar;
 mod memory_growth;
 mod mirror;
 mod mutations;

@@ -1,145 +1,23 @@
 //! Sweeps of LiDARs: the cpu backend against the definition, and both against surfaces.
 
-use std::f64::consts::{FRAC_PI_2, TAU};
 use std::sync::Arc;
 
 use glam::{DQuat, DVec3};
 use wildcity_generate::StreetSettings;
-use wildcity_options::{LidarBeams, LidarColumns};
+use wildcity_options::LidarBeams;
 use wildcity_render::cpu::{Cpu, Simd};
-use wildcity_render::lidar::{LidarView, Sweep};
+use wildcity_render::lidar::LidarView;
 use wildcity_render::reference::Reference;
-use wildcity_render::{Backend, FIRST_ACTOR_INSTANCE, TWIN_INSTANCE};
-use wildcity_scene::actor::PlacedChunk;
+use wildcity_render::{FIRST_ACTOR_INSTANCE, TWIN_INSTANCE};
 use wildcity_scene::geometry::{Lidar, Pose};
 use wildcity_scene::random::Random;
-use wildcity_scene::{Gaussians, RenderProfile, Scene};
+use wildcity_scene::{Gaussians, Scene};
 
-use crate::data::real;
 use crate::images::cpu;
-use crate::streets::street;
-
-/// The tables of four real LiDARs, with every `each`-th column.
-fn tables(each: usize) -> Option<Vec<(String, Lidar)>> {
-    let table = |lidar: &str| {
-        let model = "row-offset-spinning-lidar-model-parameters";
-        let path = real(&format!("rigs/lidar_tables/{model}{lidar}.json"))?;
-        let json: serde_json::Value =
-            serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
-        let numbers =
-            |field: &str| -> Vec<f64> { serde_json::from_value(json[field].clone()).unwrap() };
-        let azimuths = numbers("column_azimuths_rad").into_iter().step_by(each);
-        let beams = LidarBeams {
-            row_elevations_rad: numbers("row_elevations_rad"),
-            row_azimuth_offsets_rad: Some(numbers("row_azimuth_offsets_rad")),
-            column_azimuths_rad: Some(azimuths.collect()),
-            columns: None,
-            duration_us: 100_000,
-            min_range_m: None,
-            max_range_m: None,
-        };
-        Some((lidar.to_owned(), Lidar::from_options(&beams).unwrap()))
-    };
-    ["", "-waymo", "-pandaset", "-hesai-at128"].into_iter().map(table).collect()
-}
-
-/// A LiDAR with rows from 10 degrees above to 30 below, and columns all around, clockwise.
-fn spinning(rows: usize, columns: u64) -> Lidar {
-    let row = |row: usize| (10.0 - 40.0 * row as f64 / (rows.max(2) - 1) as f64).to_radians();
-    Lidar::from_options(&LidarBeams {
-        row_elevations_rad: (0..rows).map(row).collect(),
-        row_azimuth_offsets_rad: None,
-        column_azimuths_rad: None,
-        columns: Some(LidarColumns { count: columns, first_rad: 3.1, last_rad: 3.1 - TAU + 0.01 }),
-        duration_us: 100_000,
-        min_range_m: None,
-        max_range_m: None,
-    })
-    .unwrap()
-}
-
-fn sweep(backend: &dyn Backend, scene: &Scene, view: &LidarView) -> Sweep {
-    backend.sweep(scene, &RenderProfile::default(), view).unwrap()
-}
-
-/// Requires that all but a few beams return from the same place, within a millimetre. A beam for
-/// which half of the light is left within the rounding of f32 may return from the next Gaussian.
-fn check_same(found: &Sweep, wanted: &Sweep, what: &str) {
-    let beams = wanted.range_m.len();
-    assert_eq!(found.range_m.len(), beams);
-    let returns = wanted.range_m.iter().filter(|range_m| **range_m > 0.0).count();
-    assert!(4 * returns > beams, "{what}: {returns} returns of {beams} beams test too little");
-    let differs = |at: &usize| {
-        (found.range_m[*at] - wanted.range_m[*at]).abs() > 1e-3
-            || found.instance[*at] != wanted.instance[*at]
-            || (found.intensity[*at] - wanted.intensity[*at]).abs() > 1e-3
-    };
-    let others: Vec<usize> = (0..beams).filter(differs).collect();
-    let most = beams / 1_000;
-    assert!(
-        others.len() <= most,
-        "{what}: {} of {beams} beams differ; the first: {:?}",
-        others.len(),
-        others
-            .iter()
-            .take(5)
-            .map(|at| (*at, found.range_m[*at], wanted.range_m[*at]))
-            .collect::<Vec<_>>()
-    );
-}
-
-/// A scene whose y points down, as a LiDAR with z up sees it, 20 m down the street.
-fn upright() -> Pose {
-    // x of the LiDAR is z of the scene, y is -x, z is -y.
-    let rotation = DQuat::from_rotation_y(-FRAC_PI_2) * DQuat::from_rotation_x(FRAC_PI_2);
-    Pose { position_m: DVec3::new(0.4, 0.0, 20.0), rotation }
-}
-
-/// A street whose Gaussians are so large that few gaps are left between them.
-fn dense_street(count: usize, seed: u64) -> Gaussians {
-    let mut gaussians = street(count, 1, seed);
-    gaussians.ln_scales.as_flattened_mut().iter_mut().for_each(|ln| *ln += 1.5);
-    gaussians
-}
-
-fn random_scene(count: usize, seed: u64) -> Scene {
-    Scene::from_gaussians(&dense_street(count, seed))
-}
-
-/// The street with an actor of 500 Gaussians that drives and turns during the sweep.
-fn with_actor(seed: u64) -> Scene {
-    let mut scene = random_scene(6_000, seed);
-    let mut body = Gaussians::with_capacity(0, 500);
-    for at in 0..500 {
-        let angle = 0.7 * at as f64;
-        body.means_m.push([angle.cos(), angle.sin(), 0.003 * at as f64]);
-        body.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
-        body.ln_scales.push([-2.5; 3]);
-        body.logit_opacities.push(3.0);
-        body.sh.extend([0.5; 3]);
-    }
-    let start = Pose { position_m: DVec3::new(-1.0, 0.5, 27.0), rotation: DQuat::IDENTITY };
-    let end =
-        Pose { position_m: DVec3::new(1.0, 0.5, 26.0), rotation: DQuat::from_rotation_y(0.05) };
-    let chunk = Arc::new(Scene::single_chunk(&body));
-    let placed = PlacedChunk::at_rest(chunk, end, 3);
-    scene.placed.push(PlacedChunk { world_from_actor_at_start: start, ..placed });
-    scene
-}
-
-/// As the actor's own test, with a LiDAR at 30 m/s that turns at half a radian a second.
-fn in_motion(lidar: &Lidar) -> LidarView {
-    let last = upright();
-    let first = Pose {
-        position_m: last.position_m - DVec3::new(0.2, 0.0, 3.0),
-        rotation: DQuat::from_rotation_y(0.05) * last.rotation,
-    };
-    LidarView {
-        lidar: Arc::new(lidar.clone()),
-        world_from_lidar: last,
-        world_from_lidar_first: first,
-    }
-}
+use crate::lidars::{
+    check_intensities, check_same, coincident, dense_street, extremes, grid, in_motion,
+    random_scene, spinning, stack, sweep, tables, turning, upright, with_actor,
+};
 
 #[test]
 fn a_sweep_is_that_of_the_definition() {
@@ -185,75 +63,11 @@ fn threads_do_not_change_a_sweep() {
 /// behind it, above it, and far away.
 #[test]
 fn extreme_gaussians_are_met_as_by_the_definition() {
-    let mut gaussians = Gaussians::with_capacity(0, 64);
-    let mut add = |mean: [f64; 3], ln_scale: [f32; 3], quat: [f32; 4], logit: f32| {
-        gaussians.means_m.push(mean);
-        gaussians.ln_scales.push(ln_scale);
-        gaussians.quats_wxyz.push(quat);
-        gaussians.logit_opacities.push(logit);
-        gaussians.sh.extend([0.3; 3]);
-    };
-    let upright = [1.0, 0.0, 0.0, 0.0];
-    // A road, a wall far away, a needle across, one that is very thin, a point.
-    add([10.0, 0.0, -1.8], [2.0, 2.0, -9.0], upright, 9.0);
-    add([150.0, 0.0, 0.0], [-9.0, 4.0, 4.0], upright, 9.0);
-    add([8.0, 2.0, 0.0], [-6.0, 0.5, -6.0], [0.9, 0.3, 0.1, 0.2], 9.0);
-    add([-12.0, 1.0, 0.0], [-16.0, 1.0, 1.0], upright, 9.0);
-    add([4.0, -3.0, 0.5], [-18.0; 3], upright, 9.0);
-    // Around the LiDAR, straight above it, and just behind a sector's edge.
-    add([0.1, 0.1, 0.0], [0.5; 3], upright, 2.0);
-    add([0.0, 0.0, 5.0], [1.0, 1.0, -5.0], upright, 9.0);
-    add([-0.5, 6.0, 0.0], [0.0, -4.0, 1.0], upright, 9.0);
-    // Opacity exactly at the cut: ln((1/255) / (1 - 1/255)).
-    add([6.0, -6.0, 0.0], [0.0; 3], upright, -(254.0_f32.ln()));
-    // 300 faint ones in one place.
-    (0..300).for_each(|_| add([-6.0, -6.0, 0.0], [0.0; 3], upright, -4.0));
-    let scene = Scene::from_gaussians(&gaussians);
-    let rows = (0..40).map(|row| (90.0 - 4.5 * f64::from(row)).to_radians());
-    let steep = Lidar::from_options(&LidarBeams {
-        row_elevations_rad: rows.collect(),
-        ..spinning(40, 180).to_options()
-    })
-    .unwrap();
-    for lidar in [spinning(64, 256), steep] {
-        let pose = Pose { position_m: DVec3::new(0.0, 0.0, 0.01), rotation: DQuat::IDENTITY };
-        let view = LidarView::at_rest(Arc::new(lidar), pose);
+    for (scene, view) in extremes() {
         let wanted = sweep(&Reference, &scene, &view);
         check_same(&sweep(&cpu(), &scene, &view), &wanted, "extremes");
         assert!(wanted.range_m.iter().all(|range_m| range_m.is_finite()));
     }
-}
-
-/// A LiDAR of some rows and columns, evenly within these angles in radians.
-fn grid(elevations: [f64; 2], rows: usize, azimuths: [f64; 2], columns: u64) -> Lidar {
-    let step = (elevations[1] - elevations[0]) / (rows.max(2) - 1) as f64;
-    Lidar::from_options(&LidarBeams {
-        row_elevations_rad: (0..rows).map(|row| elevations[0] + step * row as f64).collect(),
-        row_azimuth_offsets_rad: None,
-        column_azimuths_rad: None,
-        columns: Some(LidarColumns {
-            count: columns,
-            first_rad: azimuths[0],
-            last_rad: azimuths[1],
-        }),
-        duration_us: 100_000,
-        min_range_m: Some(0.1),
-        max_range_m: None,
-    })
-    .unwrap()
-}
-
-/// Equal Gaussians in one place.
-fn stack(count: usize, mean: [f64; 3], ln_scale: [f32; 3], logit: f32) -> Scene {
-    let mut gaussians = Gaussians::with_capacity(0, count);
-    for _ in 0..count {
-        gaussians.means_m.push(mean);
-        gaussians.ln_scales.push(ln_scale);
-        gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
-        gaussians.logit_opacities.push(logit);
-        gaussians.sh.extend([0.3; 3]);
-    }
-    Scene::from_gaussians(&gaussians)
 }
 
 /// Beams that are aimed at single Gaussians: every one of them has to return, and from the same
@@ -296,17 +110,7 @@ fn beams_that_are_aimed_at_a_gaussian_meet_it() {
 /// A LiDAR of few columns is one sector, and turns by half a radian within it.
 #[test]
 fn few_columns_of_a_turning_lidar_meet_what_they_pass() {
-    for mean in [[5.0, 0.0, -1.8], [9.0, 6.0, -1.8]] {
-        // So many that beams return far from the middle, where one alone is too faint.
-        let scene = stack(200, mean, [2.5, 2.5, -7.0], 9.0);
-        let view = LidarView {
-            lidar: Arc::new(grid([0.3, -0.6], 61, [0.4, -0.4], 16)),
-            world_from_lidar: Pose::IDENTITY,
-            world_from_lidar_first: Pose {
-                position_m: DVec3::new(-1.0, 0.3, 0.1),
-                rotation: DQuat::from_rotation_z(0.5) * DQuat::from_rotation_y(0.1),
-            },
-        };
+    for (scene, view) in turning() {
         let wanted = sweep(&Reference, &scene, &view);
         let found = sweep(&cpu(), &scene, &view);
         let missed: Vec<usize> = (0..wanted.range_m.len())
@@ -346,25 +150,8 @@ fn few_columns_of_a_moving_lidar_meet_small_gaussians() {
 /// Coincident Gaussians are blended in the order of their ids, whichever a beam meets first.
 #[test]
 fn coincident_gaussians_keep_their_order() {
-    let mut gaussians = Gaussians::with_capacity(0, 40);
-    for at in 0..40 {
-        gaussians.means_m.push([6.0, 0.0, 0.0]);
-        gaussians.ln_scales.push([0.0; 3]);
-        gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
-        // An alpha of about a fifth, so that a return is made of some of them.
-        gaussians.logit_opacities.push(-1.4);
-        gaussians.sh.extend([0.08 * at as f32; 3]);
-    }
-    let scene = Scene::from_gaussians(&gaussians);
-    let lidar = Arc::new(grid([0.2, -0.2], 32, [0.2, -0.2], 32));
-    let view = LidarView::at_rest(lidar, Pose::IDENTITY);
-    let wanted = sweep(&Reference, &scene, &view);
-    let found = sweep(&cpu(), &scene, &view);
-    let returns = wanted.range_m.iter().filter(|range_m| **range_m > 0.0).count();
-    assert!(returns > 500, "{returns} returns test too little");
-    for (one, other) in found.intensity.iter().zip(&wanted.intensity) {
-        assert!((one - other).abs() < 1e-3, "{one}, {other}");
-    }
+    let (scene, view) = coincident();
+    check_intensities(&sweep(&cpu(), &scene, &view), &sweep(&Reference, &scene, &view));
 }
 
 /// 4,500 km from the origin a sweep is the same.

@@ -8,6 +8,8 @@ mod gradient_cases;
 mod images;
 #[path = "../support/lenses.rs"]
 mod lenses;
+#[path = "../support/lidars.rs"]
+mod lidars;
 #[path = "../support/actors.rs"]
 mod placed;
 #[path = "../support/root.rs"]

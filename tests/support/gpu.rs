@@ -10,7 +10,9 @@ use std::sync::{Mutex, Once, PoisonError};
 use wildcity_render::gpu::shaders::Shaders;
 use wildcity_render::gpu::{AdapterChoice, Gpu, GpuError, MemoryLimits, Tuning};
 use wildcity_render::gradient::Differentiate;
+use wildcity_render::lidar::{LidarView, Sweep};
 use wildcity_render::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
+use wildcity_scene::{RenderProfile, Scene};
 
 /// The best device of this machine.
 pub(crate) fn gpu() -> Watched {
@@ -98,6 +100,15 @@ impl Backend for Watched {
         finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
         self.deref().render(frame, targets, finished)
+    }
+
+    fn sweep(
+        &self,
+        scene: &Scene,
+        profile: &RenderProfile,
+        view: &LidarView,
+    ) -> Result<Sweep, RenderError> {
+        self.deref().sweep(scene, profile, view)
     }
 }
 

@@ -50,7 +50,7 @@ use parking_lot::{Mutex, MutexGuard};
 use rayon::ThreadPool;
 
 use crate::gradient::Differentiate;
-use crate::lidar::{LidarView, Sweep};
+use crate::lidar::{LidarView, Sweep, Task};
 use crate::limits;
 
 use self::background::Background;
@@ -312,7 +312,8 @@ impl Backend for Cpu {
         view: &LidarView,
     ) -> Result<Sweep, RenderError> {
         let BusyLane { pool, .. } = self.lane();
-        Ok(pool.install(|| lidar::sweep(self.level, scene, profile, view)))
+        let task = Task::new(scene, profile, view)?;
+        Ok(pool.install(|| lidar::sweep(self.level, &task)))
     }
 
     fn sweep_bytes(&self, lidar: &Lidar) -> u64 {

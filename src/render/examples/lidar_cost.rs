@@ -1,6 +1,6 @@
 //! The time of a LiDAR sweep of 128 x 2,048 beams on the demo street, and that of six cameras with
 //! as many pixels together, in turn:
-//! `cargo run --release -p wildcity-render --example lidar_cost [ROUNDS]`.
+//! `cargo run --release -p wildcity-render --example lidar_cost [ROUNDS [cpu|gpu]]`.
 
 use std::f64::consts::TAU;
 use std::sync::Arc;
@@ -10,6 +10,7 @@ use glam::DVec3;
 use wildcity_generate::StreetSettings;
 use wildcity_options::{LidarBeams, LidarColumns};
 use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_render::gpu::{AdapterChoice, Gpu};
 use wildcity_render::lidar::LidarView;
 use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::geometry::{Lidar, Pose};
@@ -24,7 +25,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let profile = RenderProfile::default();
     let frames = &street.trajectory.keyframes;
     let at = frames[frames.len() / 2].world_from_rig;
-    let backend = Cpu::new(0, Simd::Best)?;
+    let backend: Box<dyn Backend> = match std::env::args().nth(2).as_deref() {
+        None | Some("cpu") => Box::new(Cpu::new(0, Simd::Best)?),
+        Some("gpu") => Box::new(Gpu::new(&AdapterChoice::Best, 0)?),
+        Some(other) => return Err(format!("there is no backend {other:?}: cpu or gpu").into()),
+    };
 
     let row = |row: u32| (10.0 - 40.0 * f64::from(row) / 127.0).to_radians();
     let lidar = Lidar::from_options(&LidarBeams {

@@ -26,6 +26,7 @@ use super::layout::{MACRO_COLUMNS, MACRO_ROWS, WORKGROUP};
 use super::shaders::Shaders;
 use super::tuning::Tuning;
 use crate::RenderError;
+use crate::lidar::MOST_HITS;
 
 /// Why there is no GPU to render on.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -358,6 +359,16 @@ impl Device {
     /// iterations, and 2 to come to it.
     pub(super) fn max_gradient_macro_tiles(&self) -> u64 {
         self.loop_iterations().map_or(u64::MAX, |most| most / 30)
+    }
+
+    /// Most candidates of a tile that its beams can be compared with at once.
+    ///
+    /// A candidate takes at most 2 x 179 iterations: one for each hit of its beam that it is put in
+    /// front of, one for each that is counted, and one at the end of both; and 3 of the two loops
+    /// over candidates.
+    pub(super) fn max_traced_candidates(&self) -> u64 {
+        let of_one = 2 * (MOST_HITS as u64 + 1) + 3;
+        self.loop_iterations().map_or(u64::from(u32::MAX), |most| (most - 2) / of_one)
     }
 
     /// Loop iterations of a shader, in all of its loops together, after which Mesa's software

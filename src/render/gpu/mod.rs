@@ -31,6 +31,7 @@ mod growable_buffer;
 mod kernel;
 pub mod layout;
 mod lens;
+mod lidar;
 mod long_tiles;
 mod mirror;
 mod partition;
@@ -65,6 +66,7 @@ pub use tuning::{Scatter, Tuning};
 use self::chain::Chain;
 use self::device::Device;
 use self::discarded::Discarded;
+use self::lidar::SweepKernels;
 use self::read_back::MappedFrame;
 use self::resolve::{Outputs, Pixels};
 use self::shaders::Shaders;
@@ -73,7 +75,10 @@ use self::tickets::TicketQueue;
 use super::stage::{Stage, StageOutputs};
 use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
 use crate::gradient::Differentiate;
+use crate::lidar::{LidarView, Sweep, Task};
 use crate::limits;
+use wildcity_scene::geometry::Lidar;
+use wildcity_scene::{RenderProfile, Scene};
 
 /// The wgpu backend.
 #[derive(Debug)]
@@ -355,6 +360,20 @@ impl Backend for Gpu {
         finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
         self.render_with(frame, targets, finished, |outputs| self.draw(frame, outputs))
+    }
+
+    fn sweep(
+        &self,
+        scene: &Scene,
+        profile: &RenderProfile,
+        view: &LidarView,
+    ) -> Result<Sweep, RenderError> {
+        let task = Task::new(scene, profile, view)?;
+        self.in_turn(|chain| chain.sweep(&task, &self.cull))
+    }
+
+    fn sweep_bytes(&self, lidar: &Lidar) -> u64 {
+        SweepKernels::host_bytes(lidar, self.cull.current_num_threads())
     }
 }
 

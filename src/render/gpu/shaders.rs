@@ -98,6 +98,7 @@ const VARIANTS: &[Variant] = &[
     plain("gather"),
     variant("project_gradient", "project_gradient", &[PINHOLE, NO_ACTORS]),
     variant("project_gradient_actors", "project_gradient", &[PINHOLE, ACTORS]),
+    plain("lidar"),
     plain("roofline"),
 ];
 
@@ -119,6 +120,7 @@ const FILES: &[(&str, &str)] = &[
     ("gather", include_str!("../../../shaders/gather.wgsl")),
     ("layout", include_str!("../../../shaders/shared/layout.wgsl")),
     ("lens", include_str!("../../../shaders/lens.wgsl")),
+    ("lidar", include_str!("../../../shaders/lidar.wgsl")),
     ("long_tiles", include_str!("../../../shaders/long_tiles.wgsl")),
     ("macro_tile", include_str!("../../../shaders/shared/macro_tile.wgsl")),
     ("math", include_str!("../../../shaders/shared/math.wgsl")),

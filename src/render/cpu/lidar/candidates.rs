@@ -10,38 +10,37 @@ use glam::Vec3;
 use super::sector::{BodySector, Sector};
 use crate::cpu::lanes::Vec3x16;
 use crate::cpu::project::axes::rotation_columns;
-use crate::lidar::{Body, LUMINANCE, THINNEST_M, alpha_cut, reach2};
+use crate::lidar::{LUMINANCE, THINNEST_M, alpha_cut, reach2};
 use wildcity_scene::chunk::{CLUSTER, Cluster, LANES, Lanes, column};
 use wildcity_scene::{Chunk, RenderProfile, sh};
 
 /// A Gaussian that beams of a sector may meet, in the axes of its body.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Candidate {
+pub(crate) struct Candidate {
     /// Its centre relative to the LiDAR's middle position in the sector, in metres.
-    pub(super) mean_m: [f32; 3],
+    pub(crate) mean_m: [f32; 3],
     /// The matrix that takes vectors in metres to standard deviations, row by row.
-    pub(super) whiten: [f32; 9],
-    pub(super) log2_opacity: f32,
+    pub(crate) whiten: [f32; 9],
+    pub(crate) log2_opacity: f32,
     /// Squared standard deviations from its centre at which alpha falls below the cut.
-    pub(super) reach2: f32,
+    pub(crate) reach2: f32,
     /// No beam meets it nearer than this, in metres.
-    pub(super) nearest_m: f32,
-    pub(super) luminance: f32,
-    /// The global id: the chunk, then the index.
-    pub(super) id: u64,
-    pub(super) instance: u16,
+    pub(crate) nearest_m: f32,
+    pub(crate) luminance: f32,
+    /// Its place among all Gaussians of the scene.
+    pub(crate) key: u32,
     /// The rows that may meet it.
-    pub(super) rows: [u16; 2],
+    pub(crate) rows: [u16; 2],
     /// Smallest and largest tangent of the azimuths that may meet it.
     azimuths: [f32; 2],
 }
 
 /// Candidates of one body in a sector that have not been compared with beams yet.
 #[derive(Default)]
-pub(super) struct Candidates {
-    pub(super) list: Vec<Candidate>,
+pub(crate) struct Candidates {
+    pub(crate) list: Vec<Candidate>,
     /// Places in the list of the candidates of each tile, from the nearest.
-    pub(super) lists: Vec<Vec<u32>>,
+    pub(crate) lists: Vec<Vec<u32>>,
     /// Memory to sort them.
     keys: Vec<u64>,
     sorted: Vec<Candidate>,
@@ -49,15 +48,17 @@ pub(super) struct Candidates {
 
 /// Candidates after which they are compared with beams: they, and their places in the lists of
 /// tiles, are in memory at once, 6 to 15 MB.
-pub(super) const BATCH: usize = 1 << 15;
+const BATCH: usize = 1 << 15;
 
-/// A cluster, and whose it is.
+/// Most candidates at once: a batch is full after a cluster.
+pub(crate) const MOST_CANDIDATES: usize = BATCH + CLUSTER;
+
+/// A cluster of a chunk.
 #[derive(Clone, Copy)]
 struct ClusterOfChunk<'a> {
-    body: &'a Body<'a>,
     chunk: &'a Chunk,
-    /// Number of the chunk in the scene.
-    number: usize,
+    /// Key of the chunk's first Gaussian.
+    first_key: u32,
     /// Number of the cluster in the chunk.
     cluster: usize,
 }
@@ -105,7 +106,7 @@ impl Candidates {
         test: &ChunkTest,
         profile: &RenderProfile,
     ) {
-        let ClusterOfChunk { body, chunk, number, cluster } = *part;
+        let ClusterOfChunk { chunk, first_key, cluster } = *part;
         let first = cluster * CLUSTER / LANES;
         let groups = chunk.len().div_ceil(LANES);
         for group in first..(first + CLUSTER / LANES).min(groups) {
@@ -131,8 +132,7 @@ impl Candidates {
                     reach2: reach2(log2_opacity.into(), profile) as f32,
                     nearest_m: block.nearest_m[lane],
                     luminance: block.luminance[lane],
-                    id: (number as u64) << 32 | (group * LANES + lane) as u64,
-                    instance: body.instance,
+                    key: first_key + (group * LANES + lane) as u32,
                     rows: [rows.start as u16, rows.end as u16],
                     azimuths: block.azimuths.each_ref().map(|tangents| tangents[lane]),
                 });
@@ -146,14 +146,14 @@ impl Candidates {
         &mut self,
         level: Level,
         seen: &BodySector<'_>,
-        (number, chunk): (usize, &Chunk),
+        (first_key, chunk): (u32, &Chunk),
         profile: &RenderProfile,
         mut compare: impl FnMut(&mut Self),
     ) {
         let test = ChunkTest::new(seen, chunk, profile);
         for (cluster, bounds) in chunk.clusters().iter().enumerate() {
             if test.may_meet(bounds) {
-                let part = ClusterOfChunk { body: &seen.body, chunk, number, cluster };
+                let part = ClusterOfChunk { chunk, first_key, cluster };
                 self.add(level, seen.sector, &part, &test, profile);
                 if self.list.len() >= BATCH {
                     compare(self);

@@ -22,33 +22,34 @@ use fearless_simd::Level;
 use parking_lot::Mutex;
 use rayon::prelude::*;
 
-use self::beam::{BeamRow, Met};
+use self::beam::BeamRow;
+pub(crate) use self::candidates::{Candidate, Candidates, MOST_CANDIDATES};
 use self::cast::Scratch;
-use self::sector::Sector;
-use crate::lidar::{LidarView, Sweep};
+pub(crate) use self::cast::search;
+pub(crate) use self::sector::{BodySector, MOST_COLUMNS, Sector};
+use crate::lidar::{MOST_HITS, Sweep, Task};
 use wildcity_scene::chunk::LANES;
 use wildcity_scene::geometry::Lidar;
-use wildcity_scene::{RenderProfile, Scene};
 
 /// As [`sweep`], with the best instruction set of the machine.
-pub(crate) fn best_sweep(scene: &Scene, profile: &RenderProfile, view: &LidarView) -> Sweep {
-    sweep(Level::new(), scene, profile, view)
+pub(crate) fn best_sweep(task: &Task<'_>) -> Sweep {
+    sweep(best_level(), task)
+}
+
+/// The best instruction set of the machine.
+pub(crate) fn best_level() -> Level {
+    Level::new()
 }
 
 /// The sweep of a LiDAR. Runs on the current rayon pool; the result does not depend on it.
-pub(crate) fn sweep(
-    level: Level,
-    scene: &Scene,
-    profile: &RenderProfile,
-    view: &LidarView,
-) -> Sweep {
+pub(crate) fn sweep(level: Level, task: &Task<'_>) -> Sweep {
+    let view = task.view;
     let sectors = Sector::split(view);
-    let bodies = cast::by_body(scene);
     // As many as there are threads; rayon's own states are made anew for each piece of work.
     let free: Mutex<Vec<Scratch>> = Mutex::default();
     let part = |sector: &Sector| {
         let mut scratch = free.lock().pop().unwrap_or_default();
-        let part = cast::sweep(sector, level, &mut scratch, &bodies, profile, view);
+        let part = cast::sweep(sector, level, &mut scratch, task);
         free.lock().push(scratch);
         part
     };
@@ -69,23 +70,27 @@ pub(crate) fn sweep(
 }
 
 /// An upper bound of the memory of a sweep on some threads, in bytes: its returns; and for each
-/// thread the candidates of a batch with their places in lists of tiles, and beams full of the
-/// faintest hits. A beam keeps no hit behind its return, and each has an alpha of 1/255 or more:
-/// 177.
+/// thread its candidates, and beams full of the faintest hits.
 pub(crate) fn most_bytes(lidar: &Lidar, threads: usize) -> u64 {
-    const MOST_HITS: usize = 177;
-    let returns = 2 * lidar.beams() * (4 + 4 + 2);
-    let columns = lidar.columns().min(sector::MOST_COLUMNS).next_multiple_of(LANES);
-    let beams = lidar.rows().next_multiple_of(LANES) * columns;
-    // Vectors grow to twice what they hold. At worst, every hit is of another Gaussian.
+    let beams = most_beams(lidar);
+    // Vectors grow to twice what they hold.
     let hits = 2 * beams * MOST_HITS * BeamRow::HIT_BYTES;
-    let tiles = beams / (LANES * LANES);
-    // With those of a batch, and what it takes to drop those that no beam has kept.
-    let most_met = 2 * beams * MOST_HITS + cast::MET_SLACK + candidates::BATCH * tiles;
-    let met = most_met * (2 * size_of::<Met>() + 5);
-    let candidate = 2 * size_of::<candidates::Candidate>() + 8 + 4 * tiles;
-    let candidates = 2 * candidates::BATCH * candidate;
+    let returns = 2 * lidar.beams() * (4 + 4 + 2);
     // A sector has a column at least.
     let threads = threads.min(lidar.columns());
-    (returns + threads * (hits + met + candidates)) as u64
+    (returns + threads * (hits + most_candidate_bytes(lidar))) as u64
+}
+
+/// An upper bound of the memory of the candidates of a sector, with their places in the lists of
+/// tiles, in bytes.
+pub(crate) fn most_candidate_bytes(lidar: &Lidar) -> usize {
+    let tiles = most_beams(lidar) / (LANES * LANES);
+    let candidate = 2 * size_of::<Candidate>() + 8 + 4 * tiles;
+    2 * MOST_CANDIDATES * candidate
+}
+
+/// Most beams of a sector, in whole tiles.
+fn most_beams(lidar: &Lidar) -> usize {
+    let columns = lidar.columns().min(MOST_COLUMNS).next_multiple_of(LANES);
+    lidar.rows().next_multiple_of(LANES) * columns
 }

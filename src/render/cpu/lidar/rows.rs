@@ -13,7 +13,7 @@ const STEEPEST: f64 = 1e6;
 const BUCKETS_TO: f32 = 4.0;
 
 /// The rows of a LiDAR.
-pub(super) struct Rows {
+pub(crate) struct Rows {
     /// Tangents of the elevations, rising.
     tangents: Vec<f32>,
     /// Whether the LiDAR's own rows fall: its first is the last here.
@@ -26,7 +26,7 @@ pub(super) struct Rows {
     buckets_per_tangent: f32,
     /// Cosine and sine of each row's elevation, and those of its azimuth offset, in the order of
     /// the LiDAR.
-    pub(super) angles: Vec<[f64; 4]>,
+    pub(crate) angles: Vec<[f64; 4]>,
 }
 
 impl Rows {

@@ -13,22 +13,22 @@ use wildcity_scene::geometry::Pose;
 
 /// Most columns of a sector: 4 tiles. A tenth of a second of 30 m/s is 3 m, of which a sector of a
 /// sweep of 2,048 columns has 0.09 m.
-pub(super) const MOST_COLUMNS: usize = 64;
+pub(crate) const MOST_COLUMNS: usize = 64;
 
 /// Largest angle between the azimuths of a sector, in radians. Row offsets alone may span 1 rad.
 const MOST_RAD: f64 = 1.05;
 
 /// A run of columns.
-pub(super) struct Sector {
-    pub(super) columns: Range<usize>,
+pub(crate) struct Sector {
+    pub(crate) columns: Range<usize>,
     /// The azimuth around which the sector's axes are turned, in radians.
     middle_rad: f64,
     /// Its columns, 16 at a time.
     pub(super) tiles: Vec<TileColumns>,
-    pub(super) rows: Arc<Rows>,
+    pub(crate) rows: Arc<Rows>,
     /// The range of the LiDAR, in metres: nothing nearer or farther returns.
-    pub(super) min_range_m: f32,
-    pub(super) max_range_m: f32,
+    pub(crate) min_range_m: f32,
+    pub(crate) max_range_m: f32,
     /// Cosine and sine of the azimuth of each column of the first row.
     column_angles: Vec<[f64; 2]>,
 }
@@ -45,11 +45,11 @@ pub(super) struct TileColumns {
 }
 
 /// A sector as one body sees it.
-pub(super) struct BodySector<'a> {
-    pub(super) sector: &'a Sector,
+pub(crate) struct BodySector<'a> {
+    pub(crate) sector: &'a Sector,
     pub(super) body: Body<'a>,
     /// The LiDAR's pose in the body's axes when each column is fired.
-    pub(super) poses: Vec<Pose>,
+    pub(crate) poses: Vec<Pose>,
     /// That of the middle column.
     pub(super) middle: Pose,
     /// Takes directions in the body's axes to the sector's: x forward, y left, z up, as the middle
@@ -83,7 +83,7 @@ impl TileColumns {
 
 impl Sector {
     /// The sectors of a LiDAR, in order of columns.
-    pub(super) fn split(view: &LidarView) -> Vec<Self> {
+    pub(crate) fn split(view: &LidarView) -> Vec<Self> {
         let lidar = &view.lidar;
         // A row's offset is that of its azimuth in any column.
         let offset = |row| lidar.azimuth_rad(row, 0) - lidar.azimuth_rad(0, 0);
@@ -146,10 +146,15 @@ impl Sector {
     /// 2,176 sines and not 500,000.
     pub(super) fn direction(&self, row: usize, column: usize) -> DVec3 {
         let [cos_e, sin_e, cos_o, sin_o] = self.rows.angles[row];
-        let [cos_a, sin_a] = self.column_angles[column - self.columns.start];
+        let [cos_a, sin_a] = self.azimuth(column);
         let cos = cos_a * cos_o - sin_a * sin_o;
         let sin = sin_a * cos_o + cos_a * sin_o;
         DVec3::new(cos_e * cos, cos_e * sin, sin_e)
+    }
+
+    /// Cosine and sine of the azimuth of a column of the first row.
+    pub(crate) fn azimuth(&self, column: usize) -> [f64; 2] {
+        self.column_angles[column - self.columns.start]
     }
 
     /// This sector as a body sees it.
@@ -178,7 +183,7 @@ fn column_angles(view: &LidarView, column: usize) -> [f64; 2] {
 
 impl BodySector<'_> {
     /// A position in the body's axes relative to the LiDAR's middle position, in metres.
-    pub(super) fn relative_to_middle(&self, position_m: DVec3) -> DVec3 {
+    pub(crate) fn relative_to_middle(&self, position_m: DVec3) -> DVec3 {
         position_m - self.middle.position_m
     }
 

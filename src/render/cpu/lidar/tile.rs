@@ -2,12 +2,12 @@
 
 use fearless_simd::{f32x16, prelude::*};
 
-use super::beam::{BeamRow, Crossing, Met, Return};
+use super::beam::{BeamRow, Crossing};
 use super::candidates::Candidate;
 use super::sector::{BodySector, Sector};
 use crate::cpu::lanes::Vec3x16;
 use crate::cpu::math::exp2;
-use crate::lidar::{LidarView, Sweep};
+use crate::lidar::{Keys, LidarView, Sweep};
 use wildcity_scene::RenderProfile;
 use wildcity_scene::chunk::LANES;
 
@@ -77,11 +77,6 @@ impl Tile {
         self.row_ends_m[..rows].fill(sector.max_range_m);
     }
 
-    /// Calls `visit` with the place of each hit's Gaussian among those that the sector has met.
-    pub(super) fn visit_hits(&mut self, visit: &mut impl FnMut(&mut u32)) {
-        self.beams.iter_mut().for_each(|row| row.visit_hits(visit));
-    }
-
     /// The beams are compared with another body next.
     pub(super) fn leave_body(&mut self) {
         self.rays = None;
@@ -115,7 +110,6 @@ impl Tile {
         &mut self,
         simd: S,
         candidates: &[Candidate],
-        all: &mut Vec<Met>,
         seen: &BodySector<'_>,
         list: &[u32],
         profile: &RenderProfile,
@@ -140,7 +134,6 @@ impl Tile {
                 let candidate = &candidates[*at as usize];
                 let aim = Aim::new(simd, candidate, origin);
                 let [first, end] = candidate.rows.map(usize::from);
-                let mut is_met = false;
                 for row in first.max(self.first_row)..end.min(last_row) {
                     let row = row - self.first_row;
                     if candidate.nearest_m > self.row_ends_m[row] {
@@ -150,14 +143,8 @@ impl Tile {
                     let ends_m = &mut self.ends_m[row];
                     let met = aim.meet(direction, least_m, ends_m, cap);
                     let Some(crossing) = met else { continue };
-                    // Once for each candidate and tile, and only if a beam meets it.
-                    if !is_met {
-                        let Candidate { id, luminance, instance, .. } = *candidate;
-                        all.push(Met { id, luminance, instance });
-                        is_met = true;
-                    }
                     changed_rows |= 1 << row;
-                    self.beams[row].add(simd, crossing, all, ends_m);
+                    self.beams[row].add(simd, &crossing, ends_m);
                 }
             }
             while changed_rows != 0 {
@@ -170,19 +157,27 @@ impl Tile {
     }
 
     /// Writes its returns into a sweep of its sector, which has `width` columns.
-    pub(super) fn write(&self, sector: &Sector, all: &[Met], part: &mut Sweep, width: usize) {
+    #[inline(always)]
+    pub(super) fn write<S: Simd>(
+        &self,
+        simd: S,
+        sector: &Sector,
+        keys: &Keys,
+        part: &mut Sweep,
+        width: usize,
+    ) {
         let [rows, columns] = self.size;
         for row in 0..rows {
-            for lane in 0..columns {
-                let Some(Return { range_m, met, luminance }) = self.beams[row].returned(lane, all)
-                else {
-                    continue;
-                };
-                let column = self.first_column - sector.columns.start + lane;
-                let at = (self.first_row + row) * width + column;
-                part.range_m[at] = range_m;
-                part.intensity[at] = luminance;
-                part.instance[at] = met.instance;
+            let returns = self.beams[row].returns(simd);
+            let first = (self.first_row + row) * width + self.first_column - sector.columns.start;
+            let to = first..first + columns;
+            part.range_m[to.clone()].copy_from_slice(&returns.range_m[..columns]);
+            part.intensity[to.clone()].copy_from_slice(&returns.luminance[..columns]);
+            let found = returns.range_m.iter().zip(&returns.key);
+            for (instance, (range_m, key)) in part.instance[to].iter_mut().zip(found) {
+                if *range_m > 0.0 {
+                    *instance = keys.instance(*key);
+                }
             }
         }
     }
@@ -197,6 +192,8 @@ struct Aim<S: Simd> {
     whiten: [Vec3x16<S>; 3],
     reach2: f32x16<S>,
     log2_opacity: f32x16<S>,
+    luminance: f32,
+    key: u32,
 }
 
 impl<S: Simd> Aim<S> {
@@ -215,6 +212,8 @@ impl<S: Simd> Aim<S> {
             whiten,
             reach2: f32x16::splat(simd, candidate.reach2),
             log2_opacity: f32x16::splat(simd, candidate.log2_opacity),
+            luminance: candidate.luminance,
+            key: candidate.key,
         }
     }
 
@@ -254,6 +253,8 @@ impl<S: Simd> Aim<S> {
         Some(Crossing {
             range_m: meets.select(range_m, f32x16::splat(simd, f32::INFINITY)),
             alpha: meets.select(alpha, f32x16::splat(simd, 0.0)),
+            luminance: self.luminance,
+            key: self.key,
         })
     }
 }

@@ -19,6 +19,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use parking_lot::Mutex;
+use rayon::ThreadPool;
 use wgpu::{BufferUsages, QuerySet};
 
 pub(super) use self::in_flight::{InFlight, Turn, Waited};
@@ -30,6 +31,7 @@ use super::growable_buffer::GrowableBuffer;
 use super::kernel::{TIMESTAMP_BYTES, timestamps};
 use super::layout::{Counters, Frame as GpuFrame, LONG_TILES};
 use super::lens::Lenses;
+use super::lidar::SweepKernels;
 use super::mirror::Mirror;
 use super::partition::{Capacity, PartitionCache};
 use super::plan::Plan;
@@ -42,6 +44,8 @@ use super::scan::Scan;
 use super::sort::Sort;
 use super::splat_owners::SplatOwners;
 use crate::actor_views::ActorViews;
+use crate::cpu;
+use crate::lidar::{Sweep, Task};
 use crate::stage::{Stage, StageOutputs};
 use crate::{Frame, FrameStats, RenderError};
 
@@ -77,6 +81,8 @@ pub(super) struct Chain {
     sorted: Sorted,
     /// Made with the first frame whose gradients are asked for.
     gradient: Option<GradientStages>,
+    /// Made with the first sweep.
+    sweeps: Option<SweepKernels>,
     /// Frames in flight count, too, while another is in its turn.
     pub(super) tally: Arc<Mutex<Tally>>,
 }
@@ -166,11 +172,32 @@ impl Chain {
             partitions: PartitionCache::default(),
             sorted: Sorted::default(),
             gradient: None,
+            sweeps: None,
             tally: Arc::default(),
             device: Arc::new(device),
         };
         chain.device.check()?;
         Ok(chain)
+    }
+
+    /// The sweep of a LiDAR. A device whose bindings cannot hold the hits of a sector leaves it to
+    /// the cpu backend.
+    ///
+    /// # Errors
+    /// The device fails.
+    pub(super) fn sweep(
+        &mut self,
+        task: &Task<'_>,
+        pool: &ThreadPool,
+    ) -> Result<Sweep, RenderError> {
+        let device = &self.device;
+        if !SweepKernels::fit(device, &task.view.lidar) {
+            return Ok(pool.install(|| cpu::lidar::best_sweep(task)));
+        }
+        self.timestamps.reserve(device, TIMESTAMP_BYTES);
+        let kernels = self.sweeps.get_or_insert_with(|| SweepKernels::new(device));
+        device.check()?;
+        kernels.sweep(device, self.timestamps.buffer(), pool, task)
     }
 
     /// Uploads the data that the whole frame shares, and makes room for its pixels.
