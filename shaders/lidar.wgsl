@@ -1,5 +1,5 @@
 // LiDAR sweeps: what the beams of a sector hit. The host lists the Gaussians that each tile of 16 x 16 beams may meet,
-// the nearest first: the candidates of `src/render/cpu/lidar`, whose tiles this is the twin of.
+// its candidates, the nearest first. Twin of `src/render/cpu/lidar/tile.rs`.
 //
 // `trace`: a workgroup per tile, a thread per beam. A beam keeps its hits up to its return, in order of range.
 // `finish`: a thread per beam, after the last candidates of a sector. It writes the returns.
@@ -99,15 +99,15 @@ struct Return {
 const HALF: f32 = 0.5;
 const HALF_LOG2_E: f32 = 0.7213475204;
 
-// Candidates that a tile loads at a time. Before each such batch it looks for the farthest beam that has not returned
-// nearer.
-const BATCH: u32 = 32;
+// Candidates that a tile loads at a time. Before it compares them, it looks whether all of its beams have returned in
+// front of them.
+const LOADED: u32 = 32;
 
-var<workgroup> batch: array<Candidate, BATCH>;
+var<workgroup> loaded: array<Candidate, LOADED>;
 
 // Of the ends of the tile's beams, in metres, the bits: those of positive numbers have their order.
 var<workgroup> farthest_bits: atomic<u32>;
-var<workgroup> farthest_m: f32;
+var<workgroup> is_behind: u32;
 
 @compute @workgroup_size(WORKGROUP)
 fn trace(
@@ -138,10 +138,10 @@ fn trace(
     }
     let first = lists[tile] + sector.first_entry;
     let end = min(lists[tile + 1u], first + sector.entries);
-    for (var at = first; at < end; at += BATCH) {
-        let count = min(end - at, BATCH);
+    for (var at = first; at < end; at += LOADED) {
+        let count = min(end - at, LOADED);
         if thread < count {
-            batch[thread] = candidates[entries[at + thread]];
+            loaded[thread] = candidates[entries[at + thread]];
         }
         if thread == 0u {
             atomicStore(&farthest_bits, 0u);
@@ -150,10 +150,10 @@ fn trace(
         atomicMax(&farthest_bits, bitcast<u32>(seen.end_m));
         workgroupBarrier();
         if thread == 0u {
-            farthest_m = bitcast<f32>(atomicLoad(&farthest_bits));
+            is_behind = u32(loaded[0].nearest_m > bitcast<f32>(atomicLoad(&farthest_bits)));
         }
-        // All that follow are behind the returns of all beams.
-        if batch[0].nearest_m > workgroupUniformLoad(&farthest_m) {
+        // So are all that follow.
+        if workgroupUniformLoad(&is_behind) == 1u {
             break;
         }
         for (var i = 0u; i < count; i++) {
@@ -175,14 +175,14 @@ fn beam_direction(row: u32, column: u32) -> vec3f {
     return angles.x * (cosine * at.forward + sine * at.left) + angles.y * at.up;
 }
 
-// The beam after it was compared with a candidate of the batch.
+// The beam after it was compared with a candidate that is loaded.
 fn compare(i: u32, row: u32, beam: u32, origin_m: vec3f, direction: vec3f, seen: Beam) -> Beam {
-    let rows_of = batch[i].rows;
-    let is_in_reach = row >= (rows_of & 0xFFFFu) && row < (rows_of >> 16u) && batch[i].nearest_m <= seen.end_m;
+    let rows_of = loaded[i].rows;
+    let is_in_reach = row >= (rows_of & 0xFFFFu) && row < (rows_of >> 16u) && loaded[i].nearest_m <= seen.end_m;
     if !is_in_reach {
         return seen;
     }
-    let candidate = batch[i];
+    let candidate = loaded[i];
     let to_mean_m = candidate.mean_m - origin_m;
     let to_mean = vec3f(dot(candidate.whiten_x, to_mean_m), dot(candidate.whiten_y, to_mean_m), dot(candidate.whiten_z, to_mean_m));
     let step = vec3f(dot(candidate.whiten_x, direction), dot(candidate.whiten_y, direction), dot(candidate.whiten_z, direction));
@@ -192,7 +192,8 @@ fn compare(i: u32, row: u32, beam: u32, origin_m: vec3f, direction: vec3f, seen:
     let aside = cross(to_mean, step);
     let aside2 = dot(aside, aside);
     let range_m = dot(to_mean, step) / step2;
-    if aside2 > candidate.reach2 * step2 || range_m <= sector.min_range_m || range_m > seen.end_m {
+    let meets = aside2 <= candidate.reach2 * step2 && range_m > sector.min_range_m && range_m <= seen.end_m;
+    if !meets {
         return seen;
     }
     let peak = exp2(candidate.log2_opacity - HALF_LOG2_E * (aside2 / step2));
@@ -210,6 +211,9 @@ fn is_before(a: Hit, b: Hit) -> bool {
 
 // Adds a hit of a beam, and drops those behind its return.
 fn insert(hit: Hit, beam: u32, seen: Beam) -> Beam {
+    if seen.hits == sector.most_hits && !is_before(hit, hits[place(beam, seen.hits - 1u)]) {
+        return seen;
+    }
     var at = min(seen.hits, sector.most_hits - 1u);
     while at > 0u {
         let before = hits[place(beam, at - 1u)];

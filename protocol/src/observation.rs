@@ -334,7 +334,8 @@ pub struct Image {
 pub struct Sweep {
     /// Name of the LiDAR. Its tensors are `lidar/<name>/points`, in metres in the rig's axes when
     /// their column was fired, `lidar/<name>/intensity`, `lidar/<name>/row`,
-    /// `lidar/<name>/column` and `lidar/<name>/instance`.
+    /// `lidar/<name>/column` and `lidar/<name>/instance`; with `outputs.semantics`, u8
+    /// `lidar/<name>/class`, too, as in the semantics of an image.
     pub lidar: String,
     /// Time of the first column, in simulated microseconds.
     pub start_us: i64,
@@ -349,7 +350,7 @@ pub struct Sweep {
     pub returns: u64,
     /// `rig_from_lidar`.
     pub lidar_to_rig: Pose,
-    /// BLAKE3 of the five tensors in the order above, in hex.
+    /// BLAKE3 of these tensors in the order above, in hex.
     pub hash: String,
 }
 

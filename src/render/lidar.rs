@@ -27,9 +27,9 @@ use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::chunk::column;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::lidar::Lidar;
-use wildcity_scene::{Chunk, RenderProfile, Scene, sh};
+use wildcity_scene::{Chunk, RenderProfile, Scene, SemanticClass, sh};
 
-use crate::{FIRST_ACTOR_INSTANCE, RenderError, TWIN_INSTANCE};
+use crate::{FIRST_ACTOR_INSTANCE, RenderError, TWIN_INSTANCE, gaussian_class};
 
 /// The transmittance at which a beam returns.
 pub(crate) const HALF: f64 = 0.5;
@@ -57,11 +57,42 @@ pub struct Sweep {
     pub intensity: Vec<f32>,
     /// The owner of what is hit, as in [`Target::instances`](crate::Target::instances).
     pub instance: Vec<u16>,
+    /// What is hit: the number of the Gaussian among all of the scene's, in the order of its chunks
+    /// and then those of its actors; 0 without a return.
+    pub gaussian: Vec<u32>,
 }
 
 impl Sweep {
+    /// Bytes of a beam.
+    pub(crate) const BEAM_BYTES: usize = 4 + 4 + 2 + 4;
+
     pub(crate) fn empty(beams: usize) -> Self {
-        Self { range_m: vec![0.0; beams], intensity: vec![0.0; beams], instance: vec![0; beams] }
+        Self {
+            range_m: vec![0.0; beams],
+            intensity: vec![0.0; beams],
+            instance: vec![0; beams],
+            gaussian: vec![0; beams],
+        }
+    }
+
+    /// The class of what each beam hits in the scene that the sweep is of, as in
+    /// [`Target::semantics`](crate::Target::semantics).
+    ///
+    /// # Errors
+    /// The scene has 2^32 Gaussians or more.
+    pub fn classes(&self, scene: &Scene) -> Result<Vec<SemanticClass>, RenderError> {
+        let keys = Keys::new(scene)?;
+        let chunks: Vec<(Body<'_>, &Chunk)> = chunks(scene).collect();
+        let class = |(range_m, key): (&f32, &u32)| {
+            if *range_m == 0.0 {
+                return SemanticClass::None;
+            }
+            let number = keys.chunk(*key);
+            let (body, chunk) = chunks[number];
+            let default = body.placed.map_or(SemanticClass::Unlabelled, |placed| placed.class);
+            gaussian_class(chunk, (key - keys.first(number)) as usize, default)
+        };
+        Ok(self.range_m.iter().zip(&self.gaussian).map(class).collect())
     }
 }
 
@@ -140,7 +171,7 @@ pub(crate) struct Keys {
 
 impl Keys {
     /// # Errors
-    /// The scene has more than 2^32 Gaussians.
+    /// The scene has 2^32 Gaussians or more.
     pub(crate) fn new(scene: &Scene) -> Result<Self, RenderError> {
         let mut keys = Self { firsts: Vec::new(), instances: Vec::new() };
         let mut next = 0_u32;
@@ -160,12 +191,15 @@ impl Keys {
         self.firsts[chunk]
     }
 
+    /// The number of a Gaussian's chunk.
+    fn chunk(&self, key: u32) -> usize {
+        // The last one that begins at the key or before; empty ones begin where the next one does.
+        self.firsts.partition_point(|first| *first <= key).saturating_sub(1)
+    }
+
     /// The owner of a Gaussian.
     pub(crate) fn instance(&self, key: u32) -> u16 {
-        // Of the last chunk that begins at the key or before; empty chunks begin where the next
-        // one does.
-        let chunk = self.firsts.partition_point(|first| *first <= key).saturating_sub(1);
-        self.instances[chunk]
+        self.instances[self.chunk(key)]
     }
 }
 
@@ -179,7 +213,7 @@ pub(crate) struct Task<'a> {
 
 impl<'a> Task<'a> {
     /// # Errors
-    /// The scene has more than 2^32 Gaussians.
+    /// The scene has 2^32 Gaussians or more.
     pub(crate) fn new(
         scene: &'a Scene,
         profile: &'a RenderProfile,
@@ -221,8 +255,7 @@ pub(crate) fn alpha_cut(profile: &RenderProfile) -> f64 {
     profile.alpha_cut.max(1.0 / 255.0)
 }
 
-/// Most hits of a beam up to its return: 0.5 = (254/255)^177, and one more if the last alpha is
-/// rounded below the cut.
+/// Most hits of a beam up to its return: (254/255)^177 < 0.5, and one to spare.
 pub(crate) const MOST_HITS: usize = 178;
 
 /// The squared number of standard deviations at which alpha falls below the cut, for a Gaussian's

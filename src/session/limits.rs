@@ -178,8 +178,8 @@ pub const JPEG_PIXEL_BYTES: u64 = 1;
 // 2 x 256 = 512.
 pub const QUEUED_FRAMES: usize = 2 * SESSIONS;
 
-/// Bytes of a return of a LiDAR in an answer: position, intensity, row, column and instance.
-pub const POINT_BYTES: u64 = 4 * 4 + 3 * 2;
+/// Bytes of a return of a LiDAR in an answer: position, intensity, row, column, instance, class.
+pub const POINT_BYTES: u64 = 4 * 4 + 3 * 2 + 1;
 
 /// A frame of more pixels takes a second and more on processors, so small frames are rendered at
 /// the same time. Sixteen 1440x928 images are 21 million.

@@ -15,8 +15,8 @@ use wildcity_scene::{Gaussians, Scene};
 
 use crate::images::cpu;
 use crate::lidars::{
-    check_intensities, check_same, coincident, dense_street, extremes, grid, in_motion,
-    random_scene, spinning, stack, sweep, tables, turning, upright, with_actor,
+    check_classes, check_intensities, check_same, coincident, dense_street, extremes, grid,
+    in_motion, random_scene, spinning, stack, sweep, tables, turning, upright, with_actor,
 };
 
 #[test]
@@ -28,6 +28,7 @@ fn a_sweep_is_that_of_the_definition() {
             let wanted = sweep(&Reference, &scene, &view);
             let found = sweep(&cpu(), &scene, &view);
             check_same(&found, &wanted, &format!("seed {seed}"));
+            check_classes(&scene, &found, &wanted);
             for instance in [TWIN_INSTANCE, FIRST_ACTOR_INSTANCE + 3] {
                 let count = found.instance.iter().filter(|one| **one == instance).count();
                 assert!(count > 10, "{count} beams see {instance}");

@@ -1,5 +1,6 @@
 //! The sweeps of a session: where its LiDAR was, their effects, records and branches.
 
+use std::path::Path;
 use std::sync::Arc;
 
 use glam::{DQuat, DVec3, Vec3};
@@ -11,7 +12,8 @@ use wildcity_session::options::{
     Encoding, LidarBeams, LidarColumns, LidarSensor, Open, Outputs, RigChoice, Sensors, Start,
 };
 use wildcity_session::{
-    Observation, Outcome, RecordedEpisode, ReplayUntil, Replayed, Session, SessionError, TensorKind,
+    Observation, Outcome, RecordedEpisode, ReplayReport, ReplayUntil, Replayed, Session,
+    SessionError, TensorKind,
 };
 use wildcity_twin::residency::Viewpoint;
 
@@ -72,6 +74,11 @@ fn bytes(observation: &Observation, kind: TensorKind) -> Vec<u8> {
     observation.buffer.bytes()[tensor.bytes.clone()].to_vec()
 }
 
+fn replay(path: &Path) -> ReplayReport {
+    let recording = RecordedEpisode::read(path).unwrap();
+    recording.replay(&unlimited(), &cpu(), ReplayUntil::End, &mut |_| Ok(())).unwrap()
+}
+
 /// At 30 m/s the points of a sweep are those of a LiDAR on its way between the two poses.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_sweep_is_cast_on_the_way_to_the_present_pose() {
@@ -121,6 +128,36 @@ async fn a_sweep_is_cast_on_the_way_to_the_present_pose() {
     };
     let most_m = (0..sweep.returns).map(moved).fold(0.0, f64::max);
     assert!((2.8..3.2).contains(&most_m), "the first columns are {most_m} m skewed");
+}
+
+/// With `outputs.semantics`, points have the class of what they hit; a replay computes them again.
+#[tokio::test(flavor = "multi_thread")]
+async fn points_have_classes_if_they_are_asked_for() {
+    let bench = bench(unlimited());
+    let mut plain = open(&bench, "plain", options(None)).await.unwrap();
+    let without = plain.reset(0, None).await.unwrap();
+    let is_class = |kind| matches!(kind, TensorKind::PointClasses(_));
+    assert!(!without.tensors.iter().any(|tensor| is_class(tensor.kind)));
+
+    let mut asked = options(None);
+    asked.outputs.semantics = Some(true);
+    let mut session = open(&bench, "classes", asked).await.unwrap();
+    let seen = session.reset(0, None).await.unwrap();
+    let classes = bytes(&seen, TensorKind::PointClasses(0));
+    let points = floats(&seen, TensorKind::Points(0));
+    assert_eq!(points, floats(&without, TensorKind::Points(0)));
+    assert_eq!(classes.len(), seen.sweeps[0].returns);
+    assert_ne!(seen.sweeps[0].hash, without.sweeps[0].hash);
+    let road: Vec<bool> = classes.iter().map(|class| *class == 2).collect();
+    // In front of the car within the lane there is nothing but road.
+    let ahead = |point: &[f32]| (4.0..9.0).contains(&point[0]) && point[1].abs() < 1.0;
+    let lane = points.chunks(3).zip(&road).filter(|(point, _)| ahead(point) && point[2] < 0.1);
+    let lane: Vec<bool> = lane.map(|(_, is_road)| *is_road).collect();
+    assert!(lane.len() > 20 && lane.iter().all(|is_road| *is_road), "{lane:?}");
+    assert!(road.iter().filter(|is_road| !**is_road).count() > 100);
+    session.close(Outcome::Completed).await;
+    let report = replay(&bench.episodes.path().join("classes-1.jsonl"));
+    assert!(report.difference.is_none(), "{:?}", report.difference);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -214,11 +251,7 @@ async fn a_replay_casts_the_sweeps_again() {
     }
     session.close(Outcome::Completed).await;
     let path = bench.episodes.path().join("record-1.jsonl");
-    let replay = || {
-        let recording = RecordedEpisode::read(&path).unwrap();
-        recording.replay(&unlimited(), &cpu(), ReplayUntil::End, &mut |_| Ok(())).unwrap()
-    };
-    let report = replay();
+    let report = replay(&path);
     assert!(report.difference.is_none(), "{:?}", report.difference);
     assert!(report.wrong_value.is_none(), "{:?}", report.wrong_value);
 
@@ -226,14 +259,14 @@ async fn a_replay_casts_the_sweeps_again() {
     let (before, hash) = text.split_once("\"sweeps\":[\"").unwrap();
     let changed = if hash.starts_with('0') { "1" } else { "0" };
     std::fs::write(&path, format!("{before}\"sweeps\":[\"{changed}{}", &hash[1..])).unwrap();
-    let difference = replay().difference.unwrap();
+    let difference = replay(&path).difference.unwrap();
     assert_eq!(difference.camera, "top");
 
     // Without the sweeps of a frame the record says less than was sent.
     let (head, rest) = text.split_once(",\"sweeps\":[\"").unwrap();
     let (_, tail) = rest.split_once("\"]").unwrap();
     std::fs::write(&path, format!("{head}{tail}")).unwrap();
-    assert!(replay().wrong_value.is_some());
+    assert!(replay(&path).wrong_value.is_some());
 }
 
 /// A replay shows each sweep with the motion of the ego taken out: each point is where it was in

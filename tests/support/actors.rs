@@ -322,8 +322,10 @@ pub(crate) fn labelled(scene: &Scene) -> Scene {
         let classes = (0..chunk.len()).map(class).collect();
         *chunk = Arc::new(Chunk::clone(chunk).with_classes(Some(classes)));
     }
-    if let [first, second, ..] = &mut scene.placed[..] {
+    if let Some(first) = scene.placed.first_mut() {
         first.class = SemanticClass::Vehicle;
+    }
+    if let Some(second) = scene.placed.get_mut(1) {
         second.class = SemanticClass::Person;
         let own = [SemanticClass::Rider, SemanticClass::Unlabelled];
         let classes = (0..second.chunk.len()).map(|i| own[i % 2]).collect();

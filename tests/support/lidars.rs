@@ -2,18 +2,20 @@
 
 #![allow(dead_code, reason = "the tests of the backends use different parts of it")]
 
+use std::collections::BTreeSet;
 use std::f64::consts::{FRAC_PI_2, TAU};
 use std::sync::Arc;
 
 use glam::{DQuat, DVec3};
 use wildcity_options::{LidarBeams, LidarColumns};
-use wildcity_render::Backend;
 use wildcity_render::lidar::{LidarView, Sweep};
+use wildcity_render::{Backend, FIRST_ACTOR_INSTANCE};
 use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::geometry::{Lidar, Pose};
-use wildcity_scene::{Gaussians, RenderProfile, Scene};
+use wildcity_scene::{Gaussians, RenderProfile, Scene, SemanticClass};
 
 use crate::data::real;
+use crate::placed::labelled;
 use crate::streets::street;
 
 /// The tables of four real LiDARs, with every `each`-th column.
@@ -94,6 +96,21 @@ pub(crate) fn check_same(found: &Sweep, wanted: &Sweep, what: &str) {
     );
 }
 
+/// Requires that all but a few beams return from Gaussians of the same class, and that an actor is
+/// a vehicle.
+pub(crate) fn check_classes(scene: &Scene, found: &Sweep, wanted: &Sweep) {
+    let [classes, wanted] = [found, wanted].map(|sweep| sweep.classes(scene).unwrap());
+    let others = classes.iter().zip(&wanted).filter(|(one, other)| one != other).count();
+    assert!(others <= classes.len() / 500, "{others} of {} beams differ", classes.len());
+    for (at, class) in classes.iter().enumerate() {
+        let is_actor = found.instance[at] >= FIRST_ACTOR_INSTANCE;
+        assert_eq!(*class == SemanticClass::Vehicle, is_actor, "beam {at}");
+        assert_eq!(*class == SemanticClass::None, found.range_m[at] == 0.0, "beam {at}");
+    }
+    let kinds: BTreeSet<u8> = classes.iter().map(|class| class.value()).collect();
+    assert!(kinds.len() > 10, "{} classes test too little", kinds.len());
+}
+
 /// A scene whose y points down, as a LiDAR with z up sees it, 20 m down the street.
 pub(crate) fn upright() -> Pose {
     // x of the LiDAR is z of the scene, y is -x, z is -y.
@@ -130,7 +147,7 @@ pub(crate) fn with_actor(seed: u64) -> Scene {
     let chunk = Arc::new(Scene::single_chunk(&body));
     let placed = PlacedChunk::at_rest(chunk, end, 3);
     scene.placed.push(PlacedChunk { world_from_actor_at_start: start, ..placed });
-    scene
+    labelled(&scene)
 }
 
 /// As the actor's own test, with a LiDAR at 30 m/s that turns at half a radian a second.

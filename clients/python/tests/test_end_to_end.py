@@ -207,9 +207,14 @@ def test_has_the_sweeps_of_its_lidar(connect: Connect, server: Server) -> None:
             observation = session.step(here @ Pose.flat(2.0, 0.0))
             cloud = observation.lidars["top"]
             assert not session.observe([here]).lidars
+        with client.open("corridor", rig=rig, outputs=dataclasses.replace(RAW, semantics=True)) as session:
+            labelled = session.reset().lidars["top"]
         with client.open("corridor", rig=rig, outputs=RAW, sensors=lossy) as session:
             lost = session.reset().lidars["top"]
     assert len(first) > 1_000 and 0.45 < len(lost) / len(first) < 0.55, (len(lost), len(first))
+    assert labelled.classes.tolist() == [1] * len(first), "a twin without classes is unlabelled"
+    with pytest.raises(KeyError, match="semantics=True"):
+        _ = first.classes
     assert cloud.points.shape == (len(cloud), 3) and cloud.intensity.shape == cloud.rows.shape == (len(cloud),)
     # The beam of each return, from the LiDAR: elevation of its row and azimuth of its column.
     from_lidar = cloud.points.astype(float) - [1.0, 0.0, 1.9]

@@ -5,8 +5,9 @@
 //!
 //! The backend is tested on Mesa's software device, lavapipe. Such devices leave a shader's loops,
 //! without an error, after 65,535 iterations of all of its loops together. The limits
-//! [`Device::max_tile_batches`] and [`Device::max_view_tiles`] keep each shader below that number:
-//! frames are split into more regions, or refused. Other devices have no such limit.
+//! [`Device::max_tile_batches`], [`Device::max_view_tiles`] and [`Device::max_traced_candidates`]
+//! keep each shader below that number: frames are split into more regions, or refused, and sweeps
+//! into more dispatches. Other devices have no such limit.
 
 use std::ops::RangeInclusive;
 use std::path::Path;

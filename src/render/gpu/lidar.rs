@@ -1,19 +1,21 @@
 //! LiDAR sweeps on the device.
 //!
 //! The host finds the candidates of each tile of 16 x 16 beams as the cpu backend does
-//! ([`crate::cpu::lidar`]), sector by sector on all cores, and the device compares them with the
-//! beams, which takes most of the time. Both compute the same in f32, so that their ranges differ
-//! by rounding alone. WGSL: `shaders/lidar.wgsl`.
+//! ([`crate::cpu::lidar`]), sector by sector on all cores, and the device compares the beams with
+//! them. Both backends do that in f32, so that their ranges differ by rounding alone. WGSL:
+//! `shaders/lidar.wgsl`. A sweep takes one turn of the device: see `gpu/mod.rs`.
 //!
 //! The device has the hits of one sector at a time, up to [`MOST_HITS`] of each beam: 23 MB for 128
 //! rows and 64 columns. Submissions run in order, so the next sector overwrites them. A device on
 //! which nothing asks for a sweep has neither the kernels nor these buffers.
 
+use std::collections::VecDeque;
+
 use bytemuck::{Pod, Zeroable};
 use parking_lot::Mutex;
 use rayon::ThreadPool;
 use rayon::prelude::*;
-use wgpu::{Buffer, BufferUsages, CommandEncoderDescriptor};
+use wgpu::{Buffer, BufferUsages, CommandEncoderDescriptor, PollType, SubmissionIndex};
 
 use super::device::Device;
 use super::growable_buffer::GrowableBuffer;
@@ -106,6 +108,23 @@ pub(super) struct SweepKernels {
     beams: GrowableBuffer,
     returns: GrowableBuffer,
     read_back: ReadBack,
+    /// The last submissions. The device must be done with the first of [`IN_FLIGHT`] of them before
+    /// the next one, so that copies of candidates do not accumulate.
+    pending: VecDeque<SubmissionIndex>,
+}
+
+/// Submissions that the device may have at once.
+const IN_FLIGHT: usize = 4;
+
+/// What the device gets of a sector at a time: candidates of one body.
+struct Batch {
+    candidates: Vec<GpuCandidate>,
+    /// For each tile, the place of its first entry; then the number of all.
+    lists: Vec<u32>,
+    entries: Vec<u32>,
+    columns: Vec<GpuColumn>,
+    /// Length of the longest list.
+    longest: usize,
 }
 
 impl SweepKernels {
@@ -130,23 +149,25 @@ impl SweepKernels {
             beams: state("beams"),
             returns: GrowableBuffer::new(device, "returns", returned),
             read_back: ReadBack::new(device),
+            pending: VecDeque::new(),
         }
     }
 
-    /// Whether a device can hold the hits of a sector.
-    pub(super) fn fit(device: &Device, lidar: &Lidar) -> bool {
+    /// Whether a device can bind the hits and the candidates of a sector, and the returns.
+    pub(super) fn fit(binding_bytes: u64, lidar: &Lidar) -> bool {
         let beams = lidar.rows() * lidar.columns().min(MOST_COLUMNS);
         let hits = HIT_BYTES * (beams * MOST_HITS) as u64;
         let returns = (size_of::<GpuReturn>() * lidar.beams()) as u64;
-        hits.max(returns).max(most_candidate_bytes(lidar) as u64) <= device.binding_bytes()
+        hits.max(returns).max(most_candidate_bytes(lidar) as u64) <= binding_bytes
     }
 
-    /// An upper bound of the memory that the host takes for a sweep, in bytes: its returns, and for
-    /// each thread its candidates, and the copy that the device gets of them.
+    /// An upper bound of the memory that the host takes for a sweep, in bytes: its returns, the
+    /// candidates of each thread, and the copies of them that the device has not taken.
     pub(super) fn host_bytes(lidar: &Lidar, threads: usize) -> u64 {
-        let returns = lidar.beams() * (4 + 4 + 2 + size_of::<GpuReturn>());
+        let returns = lidar.beams() * (Sweep::BEAM_BYTES + size_of::<GpuReturn>());
         let threads = threads.min(lidar.columns());
-        (returns + threads * 2 * most_candidate_bytes(lidar)) as u64
+        // Each thread makes a copy, too.
+        (returns + (2 * threads + IN_FLIGHT) * most_candidate_bytes(lidar)) as u64
     }
 
     /// The sweep of a LiDAR. The candidates are found in `pool`.
@@ -171,15 +192,14 @@ impl SweepKernels {
                 // Held from the first candidates of the sector to the last.
                 let mut held = None;
                 search(level, sector, &mut candidates, task, |seen, candidates, _| {
-                    if candidates.list.is_empty() {
-                        return;
-                    }
+                    // Gaussians between two columns are in no list.
+                    let Some(batch) = Batch::new(seen, candidates) else { return };
                     let is_first = held.is_none();
                     let kernels = held.get_or_insert_with(|| kernels.lock());
-                    kernels.trace(device, task, seen, candidates, is_first);
+                    kernels.trace(device, &batch, &gpu_sector(task, sector), is_first);
                 });
                 if let Some(mut kernels) = held {
-                    kernels.finish(device, task, sector);
+                    kernels.finish(device, &gpu_sector(task, sector));
                 }
                 free.lock().push(candidates);
             });
@@ -194,47 +214,31 @@ impl SweepKernels {
         self.hits.reserve(device, HIT_BYTES * (rows * widest * MOST_HITS) as u64);
         self.beams.reserve(device, BEAM_BYTES * (rows * widest) as u64);
         self.returns.reserve(device, (size_of::<GpuReturn>() * lidar.beams()) as u64);
-        if let Some(sector) = sectors.first() {
-            let angles: Vec<[f32; 4]> =
-                sector.rows.angles.iter().map(|angles| angles.map(|value| value as f32)).collect();
-            self.rows.fill(device, bytemuck::cast_slice(&angles));
-        }
+        // A LiDAR has a sector at least.
+        let angles: Vec<[f32; 4]> =
+            sectors[0].rows.angles.iter().map(|angles| angles.map(|value| value as f32)).collect();
+        self.rows.fill(device, bytemuck::cast_slice(&angles));
         let descriptor = CommandEncoderDescriptor { label: Some("sweep") };
         let mut encoder = device.device.create_command_encoder(&descriptor);
         encoder.clear_buffer(self.returns.buffer(), 0, None);
         device.queue.submit([encoder.finish()]);
     }
 
-    /// Compares candidates with the beams of a sector.
-    fn trace(
-        &mut self,
-        device: &Device,
-        task: &Task<'_>,
-        seen: &BodySector<'_>,
-        candidates: &Candidates,
-        is_first: bool,
-    ) {
-        let list: Vec<GpuCandidate> = candidates.list.iter().map(GpuCandidate::new).collect();
-        let mut firsts = vec![0_u32];
-        for entries in &candidates.lists {
-            firsts.push(firsts[firsts.len() - 1] + entries.len() as u32);
-        }
-        let columns: Vec<GpuColumn> =
-            seen.sector.columns.clone().map(|c| column(seen, c)).collect();
-        self.candidates.fill(device, bytemuck::cast_slice(&list));
-        self.lists.fill(device, bytemuck::cast_slice(&firsts));
-        self.entries.fill(device, bytemuck::cast_slice(&candidates.lists.concat()));
-        self.columns.fill(device, bytemuck::cast_slice(&columns));
-        let longest = candidates.lists.iter().map(Vec::len).max().unwrap_or(0);
+    /// Compares the beams of a sector with a batch of candidates. The first batch begins the sector.
+    fn trace(&mut self, device: &Device, batch: &Batch, sector: &GpuSector, is_first: bool) {
+        self.candidates.fill(device, bytemuck::cast_slice(&batch.candidates));
+        self.lists.fill(device, bytemuck::cast_slice(&batch.lists));
+        self.entries.fill(device, bytemuck::cast_slice(&batch.entries));
+        self.columns.fill(device, bytemuck::cast_slice(&batch.columns));
         let at_once = device.max_traced_candidates() as usize;
-        for first in (0..longest).step_by(at_once) {
+        for first in (0..batch.longest).step_by(at_once) {
             let sector = GpuSector {
                 first_entry: first as u32,
-                entries: at_once.min(longest - first) as u32,
+                entries: at_once.min(batch.longest - first) as u32,
                 is_first: u32::from(is_first && first == 0),
-                ..gpu_sector(task, seen.sector)
+                ..*sector
             };
-            let tiles = candidates.lists.len() as u32;
+            let tiles = batch.lists.len() as u32 - 1;
             self.run(device, &sector, |kernels, recorder| {
                 let resources = [
                     (0, kernels.sector.bind()),
@@ -253,9 +257,8 @@ impl SweepKernels {
     }
 
     /// Writes the returns of a sector whose candidates have all been compared.
-    fn finish(&mut self, device: &Device, task: &Task<'_>, sector: &Sector) {
-        let sector = gpu_sector(task, sector);
-        self.run(device, &sector, |kernels, recorder| {
+    fn finish(&mut self, device: &Device, sector: &GpuSector) {
+        self.run(device, sector, |kernels, recorder| {
             let resources = [
                 (0, kernels.sector.bind()),
                 (6, kernels.hits.bind()),
@@ -278,7 +281,13 @@ impl SweepKernels {
         self.sector.fill(device, bytemuck::bytes_of(sector));
         let mut recorder = Recorder::new(device, None);
         record(self, &mut recorder);
-        device.queue.submit([recorder.encoder.finish()]);
+        if self.pending.len() == IN_FLIGHT {
+            let timeout = Some(device.frame_timeout());
+            let wait = PollType::Wait { submission_index: self.pending.pop_front(), timeout };
+            // A device that fails or does not answer is noticed when the returns are read.
+            let _ = device.device.poll(wait);
+        }
+        self.pending.push_back(device.queue.submit([recorder.encoder.finish()]));
     }
 
     fn read(
@@ -293,6 +302,7 @@ impl SweepKernels {
         let sources = [(self.returns.buffer(), bytes)];
         let (_, submission) = self.read_back.submit(device, recorder, &sources, timestamps);
         self.read_back.map(device, submission)?;
+        self.pending.clear();
         let mut sweep = Sweep::empty(beams);
         {
             let pages = self.read_back.pages(device)?;
@@ -301,6 +311,7 @@ impl SweepKernels {
                 sweep.range_m[at] = found.range_m;
                 sweep.intensity[at] = found.luminance;
                 sweep.instance[at] = keys.instance(found.key);
+                sweep.gaussian[at] = found.key;
             }
         }
         self.read_back.unmap();
@@ -320,6 +331,26 @@ fn gpu_sector(task: &Task<'_>, sector: &Sector) -> GpuSector {
         max_range_m: sector.max_range_m,
         alpha_cap: task.profile.alpha_cap as f32,
         ..GpuSector::zeroed()
+    }
+}
+
+impl Batch {
+    /// `None` if no tile has a candidate.
+    fn new(seen: &BodySector<'_>, candidates: &Candidates) -> Option<Self> {
+        let longest = candidates.lists.iter().map(Vec::len).max().filter(|longest| *longest > 0)?;
+        let mut lists = vec![0];
+        let mut count = 0;
+        for entries in &candidates.lists {
+            count += entries.len() as u32;
+            lists.push(count);
+        }
+        Some(Self {
+            candidates: candidates.list.iter().map(GpuCandidate::new).collect(),
+            lists,
+            entries: candidates.lists.concat(),
+            columns: seen.sector.columns.clone().map(|at| column(seen, at)).collect(),
+            longest,
+        })
     }
 }
 
@@ -359,5 +390,84 @@ fn column(seen: &BodySector<'_>, column: usize) -> GpuColumn {
         padding: 0.0,
         origin_m: seen.relative_to_middle(pose.position_m).as_vec3().to_array(),
         padding_too: 0.0,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::mem::offset_of;
+
+    use naga::{Module, TypeInner};
+
+    use super::*;
+    use crate::gpu::shaders::Shaders;
+
+    /// Offsets of the fields of a struct, and its size.
+    fn layout(module: &Module, name: &str) -> (Vec<usize>, u64) {
+        let named = |(_, ty): &(_, &naga::Type)| ty.name.as_deref() == Some(name);
+        match &module.types.iter().find(named).unwrap().1.inner {
+            TypeInner::Struct { members, span } => {
+                let offsets = members.iter().map(|member| member.offset as usize);
+                (offsets.collect(), u64::from(*span))
+            }
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn structs_are_those_of_the_shader() {
+        let module = naga::front::wgsl::parse_str(Shaders::default().get("lidar")).unwrap();
+        macro_rules! check {
+            ($rust:ident, $wgsl:literal, $($field:ident),+) => {
+                let offsets = vec![$(offset_of!($rust, $field)),+];
+                assert_eq!(layout(&module, $wgsl), (offsets, size_of::<$rust>() as u64));
+            };
+        }
+        check!(
+            GpuSector,
+            "Sector",
+            rows,
+            width,
+            columns,
+            first_column,
+            first_entry,
+            entries,
+            most_hits,
+            is_first,
+            min_range_m,
+            max_range_m,
+            alpha_cap,
+            padding
+        );
+        check!(
+            GpuCandidate,
+            "Candidate",
+            mean_m,
+            log2_opacity,
+            whiten_x,
+            reach2,
+            whiten_y,
+            nearest_m,
+            whiten_z,
+            luminance,
+            rows,
+            key,
+            padding
+        );
+        check!(
+            GpuColumn,
+            "Column",
+            forward,
+            cos_azimuth,
+            left,
+            sin_azimuth,
+            up,
+            padding,
+            origin_m,
+            padding_too
+        );
+        check!(GpuReturn, "Return", range_m, luminance, key);
+        assert_eq!(layout(&module, "Hit").1, HIT_BYTES);
+        assert_eq!(layout(&module, "Beam").1, BEAM_BYTES);
     }
 }

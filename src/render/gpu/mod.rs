@@ -19,6 +19,8 @@
 //! of them on a machine with more cores. Preparing runs on the caller's thread, and culling in a
 //! thread pool of its own. A rayon thread that waits takes up other work of its pool; if that were
 //! the next frame, it would wait for this one, which waits for it.
+//!
+//! A sweep of a LiDAR takes one turn from the search for candidates to its returns.
 
 mod background;
 mod bandwidth;
@@ -72,6 +74,7 @@ use self::resolve::{Outputs, Pixels};
 use self::shaders::Shaders;
 use self::slots::Slots;
 use self::tickets::TicketQueue;
+use super::cpu;
 use super::stage::{Stage, StageOutputs};
 use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
 use crate::gradient::Differentiate;
@@ -86,13 +89,15 @@ pub struct Gpu {
     choice: AdapterChoice,
     /// The device and its driver. A backend never changes to another device.
     info: AdapterInfo,
+    /// Most bytes of its bindings.
+    binding_bytes: u64,
     shaders: Shaders,
     limits: MemoryLimits,
     /// Which kernels run, if that was chosen.
     tuning: Option<Tuning>,
     /// Copies images to their targets, and runs the callbacks of finished views.
     deliver: ThreadPool,
-    /// Culls clusters. It has its own pool, so that a frame that is drawn does not wait for one
+    /// Culls clusters, and finds candidates of LiDARs. It has its own pool, so that a frame that is drawn does not wait for one
     /// that is encoded.
     cull: ThreadPool,
     queue: TicketQueue,
@@ -212,6 +217,7 @@ impl Gpu {
         Ok(Self {
             choice: choice.clone(),
             info: device.info.clone(),
+            binding_bytes: device.binding_bytes(),
             limits,
             tuning,
             deliver: pool("deliver")?,
@@ -238,6 +244,11 @@ impl Gpu {
             last_frame: tally.last_frame,
             totals: chain.device.totals(),
         })
+    }
+
+    /// Whether the device's bindings can hold a sweep; the cpu backend's code computes it otherwise.
+    fn can_hold(&self, lidar: &Lidar) -> bool {
+        SweepKernels::fit(self.binding_bytes, lidar)
     }
 
     /// Measures the device's peak rates, in about a second.
@@ -369,11 +380,19 @@ impl Backend for Gpu {
         view: &LidarView,
     ) -> Result<Sweep, RenderError> {
         let task = Task::new(scene, profile, view)?;
-        self.in_turn(|chain| chain.sweep(&task, &self.cull))
+        if self.can_hold(&view.lidar) {
+            self.in_turn(|chain| chain.sweep(&task, &self.cull))
+        } else {
+            Ok(self.deliver.install(|| cpu::lidar::best_sweep(&task)))
+        }
     }
 
     fn sweep_bytes(&self, lidar: &Lidar) -> u64 {
-        SweepKernels::host_bytes(lidar, self.cull.current_num_threads())
+        if self.can_hold(lidar) {
+            SweepKernels::host_bytes(lidar, self.cull.current_num_threads())
+        } else {
+            cpu::lidar::most_bytes(lidar, self.threads())
+        }
     }
 }
 

@@ -25,6 +25,8 @@ struct Hit {
     alpha: f64,
     luminance: f32,
     instance: u16,
+    /// As in [`Sweep::gaussian`].
+    gaussian: u32,
 }
 
 /// The sweep of a LiDAR.
@@ -48,6 +50,7 @@ pub(super) fn sweep(scene: &Scene, profile: &RenderProfile, view: &LidarView) ->
             sweep.range_m[at] = hit.range_m as f32;
             sweep.intensity[at] = hit.luminance;
             sweep.instance[at] = hit.instance;
+            sweep.gaussian[at] = hit.gaussian;
         }
     }
     sweep
@@ -78,16 +81,19 @@ fn beam(
     column: usize,
 ) -> Option<Hit> {
     let mut hits = Vec::new();
+    let mut first = 0;
     for (body, ellipsoids) in bodies {
         let pose = body.body_from_lidar(view, column);
         let direction = pose.rotation * view.lidar.direction(row, column);
-        hits.extend(ellipsoids.iter().filter_map(|ellipsoid| {
+        hits.extend(ellipsoids.iter().zip(first..).filter_map(|(ellipsoid, gaussian)| {
             let [range_m, alpha] = ellipsoid.meet(pose.position_m, direction, profile)?;
             let is_within =
                 range_m > view.lidar.min_range_m() && range_m <= view.lidar.max_range_m();
             let Ellipsoid { luminance, .. } = *ellipsoid;
-            is_within.then_some(Hit { range_m, alpha, luminance, instance: body.instance })
+            let instance = body.instance;
+            is_within.then_some(Hit { range_m, alpha, luminance, instance, gaussian })
         }));
+        first += ellipsoids.len() as u32;
     }
     // Stable: Gaussians at the same range keep the order of their ids.
     hits.sort_by(|a, b| a.range_m.total_cmp(&b.range_m));

@@ -44,6 +44,7 @@ pub(crate) fn observation(
             TensorKind::Rows(sweep) => sweep_tensor(session, &frame, sweep, "row"),
             TensorKind::Columns(sweep) => sweep_tensor(session, &frame, sweep, "column"),
             TensorKind::PointInstances(sweep) => sweep_tensor(session, &frame, sweep, "instance"),
+            TensorKind::PointClasses(sweep) => sweep_tensor(session, &frame, sweep, "class"),
             TensorKind::Depth(image) => format!("{}/depth", image_names[image]),
             TensorKind::Opacity(image) => format!("{}/opacity", image_names[image]),
             TensorKind::Normals(image) => format!("{}/normals", image_names[image]),

@@ -130,6 +130,8 @@ pub enum TensorKind {
     Columns(usize),
     /// Whose Gaussian each return is from: `[n]`.
     PointInstances(usize),
+    /// The class of that Gaussian: `[n]`.
+    PointClasses(usize),
     /// Expected camera z in metres: `[height, width]`.
     Depth(usize),
     /// Accumulated opacity: `[height, width]`.

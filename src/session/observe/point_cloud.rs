@@ -5,6 +5,7 @@ use blake3::{Hash, Hasher};
 
 use wildcity_options::LidarSensor;
 use wildcity_render::lidar::{LidarView, Sweep};
+use wildcity_scene::SemanticClass;
 use wildcity_scene::random::Random;
 use wildcity_scene::rig::RigLidar;
 
@@ -27,16 +28,19 @@ pub(crate) struct PointCloud {
     pub(crate) columns: Vec<u16>,
     /// As the map of an image.
     pub(crate) instances: Vec<u16>,
+    /// Class of each point, as in the map of an image; empty if they are not asked for.
+    pub(crate) classes: Vec<SemanticClass>,
     /// BLAKE3 of its floats and then its integers.
     pub(crate) hash: Hash,
 }
 
 impl PointCloud {
-    /// The points of a sweep at a time, with the effects of the sensor if it has any.
+    /// The points of a sweep at a time, with the effects of the sensor if it has any, and with the
+    /// classes of its beams if they are asked for.
     pub(crate) fn new(
         lidar: usize,
         mounted: &RigLidar,
-        sweep: &Sweep,
+        (sweep, classes): (&Sweep, Option<&[SemanticClass]>),
         time_us: i64,
         effects: Option<(&LidarSensor, EffectSeed)>,
     ) -> Self {
@@ -49,6 +53,7 @@ impl PointCloud {
             rows: Vec::new(),
             columns: Vec::new(),
             instances: Vec::new(),
+            classes: Vec::new(),
             hash: Hasher::new().finalize(),
         };
         // A stream of its own for each sweep: a lost beam changes no other sweep.
@@ -84,6 +89,7 @@ impl PointCloud {
             cloud.rows.push(row as u16);
             cloud.columns.push(column as u16);
             cloud.instances.push(sweep.instance[at]);
+            cloud.classes.extend(classes.map(|classes| classes[at]));
         }
         cloud.hash = cloud.computed_hash();
         cloud
@@ -99,11 +105,17 @@ impl PointCloud {
         [&self.rows, &self.columns, &self.instances].map(|ids| bytemuck::cast_slice(ids))
     }
 
+    /// The bytes of its classes.
+    pub(crate) fn class_bytes(&self) -> impl ExactSizeIterator<Item = u8> {
+        self.classes.iter().map(|class| class.value())
+    }
+
     fn computed_hash(&self) -> Hash {
         let mut hasher = Hasher::new();
         for bytes in self.float_bytes().into_iter().chain(self.id_bytes()) {
             hasher.update(bytes);
         }
+        hasher.update(&self.class_bytes().collect::<Vec<u8>>());
         hasher.finalize()
     }
 }

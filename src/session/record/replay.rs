@@ -106,6 +106,8 @@ struct Replay<'a> {
     cameras: &'a [RigCamera],
     lidars: &'a [RigLidar],
     settings: Option<&'a RecordedSettings>,
+    /// Whether observations had classes.
+    has_classes: bool,
     backend: &'a dyn Backend,
     resident: Arc<Resident>,
     profile: &'a RenderProfile,
@@ -162,6 +164,7 @@ impl<'a> Replay<'a> {
             cameras,
             lidars: &header.rig.lidars,
             settings: header.settings.as_ref(),
+            has_classes: header.outputs.semantics,
             backend,
             resident,
             profile: &header.profile,
@@ -370,7 +373,10 @@ impl<'a> Replay<'a> {
                 .sweep(&scene, self.profile, &view)
                 .map_err(|cause| ReplayError::Render { step, cause })?;
             let effects = self.sensors.as_ref().and_then(|sensors| sensors.lidar_effects(lidar));
-            let cloud = PointCloud::new(lidar, mounted, &sweep, frame.time_us, effects);
+            let classes = self.has_classes.then(|| sweep.classes(&scene)).transpose();
+            let classes = classes.map_err(|cause| ReplayError::Render { step, cause })?;
+            let sweep = (&sweep, classes.as_deref());
+            let cloud = PointCloud::new(lidar, mounted, sweep, frame.time_us, effects);
             let time_us = frame.time_us;
             let replayed = ReplayedSweep { lidar, time_us, mounted, view: &view, cloud: &cloud };
             visit(&Replayed::Sweep(replayed)).map_err(|reason| {

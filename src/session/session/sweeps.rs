@@ -64,14 +64,17 @@ impl Session {
             let pixels = mounted.lidar.beams() as u64;
             let cost = FrameCost { session: self.number, pixels };
             let seed = EffectSeed::from_episode(episode);
+            let has_classes = layout.maps().semantics;
             let sensor = layout.lidar_sensor(index).copied();
             let mounted = mounted.clone();
             // The points and their hash, too: they would hold up the other sessions of an async
             // thread.
             let work = move |_: &mut Scratch, backend: &dyn Backend| {
                 let sweep = backend.sweep(&scene, &profile, &view)?;
+                let classes = has_classes.then(|| sweep.classes(&scene)).transpose()?;
                 let effects = sensor.as_ref().map(|sensor| (sensor, seed));
-                Ok(PointCloud::new(index, &mounted, &sweep, time_us, effects))
+                let sweep = (&sweep, classes.as_deref());
+                Ok(PointCloud::new(index, &mounted, sweep, time_us, effects))
             };
             let (cloud, queued): (Result<_, RenderError>, _) =
                 self.engine.run(cost, deadline, work).await?;

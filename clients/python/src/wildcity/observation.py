@@ -197,6 +197,8 @@ class Observation:
             self._expect(_of_sweep(sweep, "intensity"), "F32", (sweep.returns,))
             for ids in ("row", "column", "instance"):
                 self._expect(_of_sweep(sweep, ids), "U16", (sweep.returns,))
+            if _of_sweep(sweep, "class") in self._tensors:
+                self._expect(_of_sweep(sweep, "class"), "U8", (sweep.returns,))
 
     def _expect(self, name: str, dtype: str, shape: tuple[int, ...] | None) -> None:
         """Checks type and shape of a tensor; with `shape` None, any one-dimensional one."""
@@ -325,6 +327,13 @@ class PointCloud:
     def instances(self) -> NDArray[np.uint16]:
         """uint16 [n]: the owner of what was hit: 1 the twin, else `Actor.instance`."""
         return self._tensor("instance")
+
+    @property
+    def classes(self) -> NDArray[np.uint8]:
+        """uint8 [n]: the class of what was hit, an index of `opened.semantics.classes`, if the session asked for them."""
+        if _of_sweep(self.metadata, "class") not in self._content.tensors:
+            raise KeyError("there are no classes: open the session with outputs=Outputs(semantics=True)")
+        return self._tensor("class")
 
     @property
     def times_us(self) -> NDArray[np.float64]:

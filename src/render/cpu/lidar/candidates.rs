@@ -51,7 +51,7 @@ pub(crate) struct Candidates {
 const BATCH: usize = 1 << 15;
 
 /// Most candidates at once: a batch is full after a cluster.
-pub(crate) const MOST_CANDIDATES: usize = BATCH + CLUSTER;
+pub(super) const MOST_CANDIDATES: usize = BATCH + CLUSTER;
 
 /// A cluster of a chunk.
 #[derive(Clone, Copy)]

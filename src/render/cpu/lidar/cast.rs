@@ -1,4 +1,4 @@
-//! The returns of one sector.
+//! The candidates and the returns of one sector.
 
 use fearless_simd::{Level, dispatch};
 
@@ -51,7 +51,7 @@ pub(super) fn sweep(
 }
 
 /// Finds the candidates of a sector body by body, and calls `compare` with them whenever there are
-/// many, and with the last ones of each body.
+/// many, and with the last ones of each body: then its third argument is `true`.
 pub(crate) fn search(
     level: Level,
     sector: &Sector,

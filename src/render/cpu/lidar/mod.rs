@@ -23,7 +23,8 @@ use parking_lot::Mutex;
 use rayon::prelude::*;
 
 use self::beam::BeamRow;
-pub(crate) use self::candidates::{Candidate, Candidates, MOST_CANDIDATES};
+use self::candidates::MOST_CANDIDATES;
+pub(crate) use self::candidates::{Candidate, Candidates};
 use self::cast::Scratch;
 pub(crate) use self::cast::search;
 pub(crate) use self::sector::{BodySector, MOST_COLUMNS, Sector};
@@ -63,7 +64,8 @@ pub(crate) fn sweep(level: Level, task: &Task<'_>) -> Sweep {
             let from = row * width..(row + 1) * width;
             sweep.range_m[to..to + width].copy_from_slice(&part.range_m[from.clone()]);
             sweep.intensity[to..to + width].copy_from_slice(&part.intensity[from.clone()]);
-            sweep.instance[to..to + width].copy_from_slice(&part.instance[from]);
+            sweep.instance[to..to + width].copy_from_slice(&part.instance[from.clone()]);
+            sweep.gaussian[to..to + width].copy_from_slice(&part.gaussian[from]);
         }
     }
     sweep
@@ -75,7 +77,7 @@ pub(crate) fn most_bytes(lidar: &Lidar, threads: usize) -> u64 {
     let beams = most_beams(lidar);
     // Vectors grow to twice what they hold.
     let hits = 2 * beams * MOST_HITS * BeamRow::HIT_BYTES;
-    let returns = 2 * lidar.beams() * (4 + 4 + 2);
+    let returns = 2 * lidar.beams() * Sweep::BEAM_BYTES;
     // A sector has a column at least.
     let threads = threads.min(lidar.columns());
     (returns + threads * (hits + most_candidate_bytes(lidar))) as u64

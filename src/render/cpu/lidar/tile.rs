@@ -173,6 +173,7 @@ impl Tile {
             let to = first..first + columns;
             part.range_m[to.clone()].copy_from_slice(&returns.range_m[..columns]);
             part.intensity[to.clone()].copy_from_slice(&returns.luminance[..columns]);
+            part.gaussian[to.clone()].copy_from_slice(&returns.key[..columns]);
             let found = returns.range_m.iter().zip(&returns.key);
             for (instance, (range_m, key)) in part.instance[to].iter_mut().zip(found) {
                 if *range_m > 0.0 {

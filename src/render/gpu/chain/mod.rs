@@ -44,7 +44,6 @@ use super::scan::Scan;
 use super::sort::Sort;
 use super::splat_owners::SplatOwners;
 use crate::actor_views::ActorViews;
-use crate::cpu;
 use crate::lidar::{Sweep, Task};
 use crate::stage::{Stage, StageOutputs};
 use crate::{Frame, FrameStats, RenderError};
@@ -180,8 +179,7 @@ impl Chain {
         Ok(chain)
     }
 
-    /// The sweep of a LiDAR. A device whose bindings cannot hold the hits of a sector leaves it to
-    /// the cpu backend.
+    /// The sweep of a LiDAR.
     ///
     /// # Errors
     /// The device fails.
@@ -191,9 +189,6 @@ impl Chain {
         pool: &ThreadPool,
     ) -> Result<Sweep, RenderError> {
         let device = &self.device;
-        if !SweepKernels::fit(device, &task.view.lidar) {
-            return Ok(pool.install(|| cpu::lidar::best_sweep(task)));
-        }
         self.timestamps.reserve(device, TIMESTAMP_BYTES);
         let kernels = self.sweeps.get_or_insert_with(|| SweepKernels::new(device));
         device.check()?;

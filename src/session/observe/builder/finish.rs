@@ -218,6 +218,9 @@ impl ObservationBuilder {
             let [height, width] = layout.size_px(image.info.camera);
             tensors.push(TensorKind::Instances(index), DType::U16, vec![height, width]);
         }
+        for (index, sweep) in self.sweeps.iter().enumerate().filter(|_| semantics) {
+            tensors.push(TensorKind::PointClasses(index), DType::U8, vec![sweep.returns]);
+        }
         for &(index, image) in placed.iter().filter(|_| semantics) {
             let [height, width] = layout.size_px(image.info.camera);
             tensors.push(TensorKind::Semantics(index), DType::U8, vec![height, width]);

@@ -86,10 +86,13 @@ impl ObservationBuilder {
         let maps_at = header + history.len();
         let ids: Vec<u8> =
             sweeps.iter().flat_map(PointCloud::id_bytes).flatten().copied().collect();
-        let plan = BufferPlan::new(layout.clone(), captures, maps_at, ids.len());
+        let classes: Vec<u8> = sweeps.iter().flat_map(PointCloud::class_bytes).collect();
+        let sweep_bytes = [ids.len(), classes.len()];
+        let plan = BufferPlan::new(layout.clone(), captures, maps_at, sweep_bytes);
         let mut buffer = ObservationBuffer::new(budget, plan.end(), header)?;
         buffer.bytes_mut()[header..maps_at].copy_from_slice(&history);
         buffer.bytes_mut()[plan.sweep_ids_at()..][..ids.len()].copy_from_slice(&ids);
+        buffer.bytes_mut()[plan.sweep_classes_at()..][..classes.len()].copy_from_slice(&classes);
         let sweep_info = |sweep: &PointCloud| SweepInfo {
             lidar: sweep.lidar,
             time_us: sweep.time_us,

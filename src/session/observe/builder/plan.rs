@@ -13,26 +13,27 @@ use crate::observe::layout::{InPlaceBytes, ObservationLayout, RigCapture};
 ///
 /// ```text
 /// | header | ego history, motion, floats of sweeps | floats of all captures | integers of sweeps |
-/// | instances of all captures | classes of all | raw pixels of all |
+/// | instances of all captures | classes of sweeps | classes of all captures | raw pixels of all |
 /// ```
 pub(super) struct BufferPlan {
     layout: Arc<ObservationLayout>,
     floats_at: usize,
     sweep_ids_at: usize,
     instances_at: usize,
+    sweep_classes_at: usize,
     semantics_at: usize,
     raw_at: usize,
     end: usize,
 }
 
 impl BufferPlan {
-    /// The plan for some captures, whose maps begin at `floats_at`, and for sweeps with integers of
-    /// so many bytes.
+    /// The plan for some captures, whose maps begin at `floats_at`, and for sweeps with integers and
+    /// classes of so many bytes.
     pub(super) fn new(
         layout: Arc<ObservationLayout>,
         captures: &[RigCapture],
         floats_at: usize,
-        sweep_id_bytes: usize,
+        [sweep_id_bytes, sweep_class_bytes]: [usize; 2],
     ) -> Self {
         let in_place = captures.iter().map(|capture| layout.in_place_bytes(capture));
         let all = in_place.fold(InPlaceBytes::default(), |sum, one| InPlaceBytes {
@@ -43,16 +44,31 @@ impl BufferPlan {
         });
         let sweep_ids_at = floats_at + all.floats;
         let instances_at = sweep_ids_at + sweep_id_bytes;
-        let semantics_at = instances_at + all.instances;
+        let sweep_classes_at = instances_at + all.instances;
+        let semantics_at = sweep_classes_at + sweep_class_bytes;
         let raw_at = semantics_at + all.semantics;
         let end = raw_at + all.raw;
-        Self { layout, floats_at, sweep_ids_at, instances_at, semantics_at, raw_at, end }
+        Self {
+            layout,
+            floats_at,
+            sweep_ids_at,
+            instances_at,
+            sweep_classes_at,
+            semantics_at,
+            raw_at,
+            end,
+        }
     }
 
     /// Where the integers of sweeps begin: rows, columns and instances of one sweep after the
     /// other.
     pub(super) fn sweep_ids_at(&self) -> usize {
         self.sweep_ids_at
+    }
+
+    /// Where the classes of sweeps begin, of one sweep after the other.
+    pub(super) fn sweep_classes_at(&self) -> usize {
+        self.sweep_classes_at
     }
 
     /// Where the buffer ends before the files of the images are appended.
