@@ -35,7 +35,8 @@ use super::{demo, output, progress};
 /// that cannot affect this twin are skipped, and the report lists them. The report also has the
 /// trust of images off the drive, the stress table, and the cost of each feature of a scene.
 ///
-/// Writes report.html (a single self-contained file), report.json and report.csv.
+/// Says first how long it will take. Writes report.html (a single self-contained file, which begins
+/// with the setting to use), report.json and report.csv.
 ///
 /// With --at-least-db or --at-most-ms it recommends a setting: selected at some sample points,
 /// verified at the others, and written as profile.json for `wildcity serve --profile`. If no
@@ -214,6 +215,7 @@ impl Command {
         for Skipped { what, reason } in &report.skipped {
             writeln!(out, "not compared: {what} ({reason})")?;
         }
+        writeln!(out, "{}", report.answer())?;
         for recommended in report.repair.iter().flat_map(|repair| &repair.below) {
             writeln!(out, "{}", recommended.text())?;
         }
@@ -252,6 +254,9 @@ impl Command {
             goal: self.at_least_db.or(self.at_most_ms),
             repair: RepairSampling::new(self.stations, &self.offsets, self.repair_side),
         };
+        let expected = wildcity_report::expect(&settings, &twin, &machine)?;
+        let rest = if self.no_stress { "" } else { ", then the extreme scenes" };
+        writeln!(io::stderr(), "this takes {expected}{rest}")?;
         let bar = progress::state();
         let report = wildcity_report::run(&settings, &twin, &machine, &mut |what, done, all| {
             bar.set_length(all);
