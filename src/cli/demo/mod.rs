@@ -1,5 +1,6 @@
 //! `wildcity demo`.
 
+mod caption;
 mod driver;
 mod mosaic;
 #[cfg(feature = "eval")]
