@@ -19,10 +19,10 @@ use wildcity_stress::table::Candidate;
 use wildcity_twin::residency::Cache;
 
 use super::backend_options::HardwareOptions;
+use super::dev::{BackendName, candidate};
 use super::directories::{TwinVersion, Twins};
 use super::repair_options::RepairOptions;
-use super::rig::find_rig;
-use super::stress::{BackendName, candidate};
+use super::twin::find_rig;
 use super::{demo, output, progress};
 
 /// Measure the run time and the error of each setting of the renderer, on one twin and this
@@ -87,8 +87,8 @@ pub(super) struct Command {
     #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
     repeat: u32,
 
-    /// Cameras to use instead of the twin's own: a preset (see `wildcity rig show`), or a JSON file
-    /// as `wildcity import --rig` reads it.
+    /// Cameras to use instead of the twin's own: a preset (see `wildcity twin rig show`), or a JSON
+    /// file as `wildcity import --rig` reads it.
     #[arg(long, value_name = "RIG")]
     rig: Option<String>,
 

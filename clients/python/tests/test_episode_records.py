@@ -283,7 +283,7 @@ def test_kill_9_of_a_server_loses_at_most_the_step_under_way(quick_reader: dict[
         # Every answer that was sent is on record; beside them at most the step under way.
         assert recorded[: len(answered)] == answered and len(recorded) <= len(answered) + 1
         verified = subprocess.run(
-            ["wildcity", "replay", str(record), "--verify"], env=quick_reader, capture_output=True, text=True
+            ["wildcity", "episode", "verify", str(record)], env=quick_reader, capture_output=True, text=True
         )
         assert verified.returncode == 3, f"{verified.stdout}\n{verified.stderr}"
         assert f"verified to step {frames[-1]['step']}" in verified.stderr, verified.stderr
