@@ -15,7 +15,7 @@ LISTED = re.compile(r"^  ([a-z][a-z0-9-]*)  +(\S.*)$")
 
 def pages(root: Path, program: Path) -> tuple[dict[str, str], str]:
     top = help_of(program, [])
-    index = f"{HEAD}# Commands\n\n| command | |\n|---|---|\n"
+    index = f"{HEAD}# Commands\n\nThe pages have what `--help-all` prints.\n\n| command | |\n|---|---|\n"
     written = {}
     for name, summary in subcommands(top):
         index += f"| [`{name}`]({name}.md) | {summary} |\n"
@@ -38,13 +38,13 @@ def page(program: Path, path: list[str]) -> str:
 
 
 def help_of(program: Path, path: list[str]) -> str:
-    """What `--help` prints where there is no terminal: lines of 100 columns."""
+    """What `--help-all` prints where there is no terminal: all options, in lines of 100 columns."""
     if not program.exists():
         raise SystemExit(f"{program} is missing: cargo build --workspace --features full")
     with tempfile.TemporaryDirectory() as home:
         environment = {"PATH": os.environ["PATH"], "HOME": home, "NO_COLOR": "1"}
         done = subprocess.run(
-            [program.name, *path, "--help"],
+            [program.name, *path, "--help-all"],
             executable=program,
             env=environment,
             stdin=subprocess.DEVNULL,
@@ -53,7 +53,7 @@ def help_of(program: Path, path: list[str]) -> str:
         )
         if done.returncode != 0 or home in done.stdout:
             raise SystemExit(
-                f"{program} {' '.join(path)} --help ends with {done.returncode}:\n{done.stdout}{done.stderr}"
+                f"{program} {' '.join(path)} --help-all ends with {done.returncode}:\n{done.stdout}{done.stderr}"
             )
     return "\n".join(line.rstrip() for line in done.stdout.strip().splitlines()) + "\n"
 

@@ -26,6 +26,8 @@ BODIES = [
 BODIES += ["new_actor", "actor", "actors", "session", "episode", "ticket", "refusal"]
 HEAD = "<!-- Written by docs/generate.py from protocol/. -->\n\n"
 DEFINITIONS = "#/$defs/"
+# What a field is that says which variant of a union an object is.
+CONSTANTS = {"type": "the kind of the message", "kind": "the kind of the line", "event": "the kind of the event"}
 SIMPLE = {
     "string": "text",
     "integer": "integer",
@@ -57,6 +59,7 @@ def pages(root: Path) -> tuple[dict[str, str], str]:
         "http": http(
             json.loads((root / "protocol" / "openapi.json").read_text()), {name: schemas[name] for name in BODIES}
         ),
+        "record": record(json.loads((root / "protocol" / "record.json").read_text())),
         "types": "# Types of messages\n\n" + "".join(section(name, types[name]) for name in sorted(types)),
     }
     return {f"{FOLDER}/{name}.md": HEAD + text.rstrip() + "\n" for name, text in written.items()}, FOLDER
@@ -108,6 +111,18 @@ def observation(metadata: Schema, many: Schema) -> str:
     )
 
 
+def record(schema: Schema) -> str:
+    """The lines of a record, and their types, which are not those of messages."""
+    text = f"# Lines of a record\n\n`protocol/record.json`. {prose(schema)}\n\n"
+    for variant in schema["oneOf"]:
+        title = variant["title"]
+        kind = variant["properties"]["kind"]["const"]
+        text += f"## {title if kind == title else f'{kind}: {title}'}\n\n{prose(variant)}\n\n{fields(variant)}"
+    for name, definition in schema["$defs"].items():
+        text += section(name, definition)
+    return text.replace("](types.md#", "](#")
+
+
 def http(document: Schema, bodies: dict[str, Schema]) -> str:
     text = "# HTTP\n\n## Routes\n\n| route | statuses | |\n|---|---|---|\n"
     for path, operations in sorted(document["paths"].items()):
@@ -134,7 +149,7 @@ def fields(schema: Schema) -> str:
             if "const" in field:
                 field = {
                     **field,
-                    "description": field.get("description", "the kind of the message" if name == "type" else ""),
+                    "description": field.get("description", CONSTANTS.get(name, "")),
                 }
             needed = " (required)" if name in schema.get("required", []) and "const" not in field else ""
             text += f"| `{name}`{needed} | {kind(field)} | {cell(field.get('description', ''))}{default(field)} |\n"

@@ -59,12 +59,12 @@ pub enum AugmentError {
     },
     /// A folder with files, but without augment.json.
     #[error(
-        "{} has files, but no augment.json: give an empty folder as --out, or one that `wildcity augment` made",
+        "{} has files, but no augment.json: give an empty folder as --out, or one that `wildcity train augment` made",
         dir.display()
     )]
     NotOurs { dir: PathBuf },
     /// Another run writes to the folder.
-    #[error("another `wildcity augment` writes to {}: wait for it, or give another --out", dir.display())]
+    #[error("another `wildcity train augment` writes to {}: wait for it, or give another --out", dir.display())]
     InUse { dir: PathBuf },
     /// A file that cannot be understood.
     #[error("{}: {reason}. Delete the folder, and it is made anew", path.display())]

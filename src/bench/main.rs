@@ -5,9 +5,9 @@
 
 use std::process::ExitCode;
 
-use clap::Parser as _;
+use clap::{CommandFactory as _, FromArgMatches as _};
 
-use wildcity::cli::exit;
+use wildcity::cli::{exit, help_all};
 
 mod actors;
 mod benched_twin;
@@ -71,7 +71,11 @@ impl Bench {
 }
 
 fn main() -> ExitCode {
-    exit::code(Bench::parse().run())
+    let matches = help_all::program(Bench::command(), help_all::is_asked()).get_matches();
+    match Bench::from_arg_matches(&matches) {
+        Ok(bench) => exit::code(bench.run()),
+        Err(error) => error.exit(),
+    }
 }
 
 #[cfg(test)]

@@ -28,9 +28,9 @@ pub struct RendererOptions {
 
     /// Run the stages up to and including this one on the cpu backend, and the rest on --device,
     /// even if that device is software. If an image is wrong with --cpu-through project and right
-    /// with --cpu-through sort, the fault is in the GPU's sort stage. `wildcity bisect` tries all
-    /// stages.
-    #[arg(long, value_name = "STAGE", value_enum)]
+    /// with --cpu-through sort, the fault is in the GPU's sort stage. `wildcity dev bisect` tries
+    /// all stages.
+    #[arg(long, hide = true, value_name = "STAGE", value_enum)]
     cpu_through: Option<StageName>,
 }
 
@@ -49,21 +49,21 @@ pub struct BackendOptions {
 #[derive(Clone, Debug, clap::Args)]
 pub struct HardwareOptions {
     /// Render threads; 0 for one per core. Pixels do not depend on it.
-    #[arg(long, value_name = "N", default_value_t = 0, value_parser = threads)]
+    #[arg(long, hide = true, value_name = "N", default_value_t = 0, value_parser = threads)]
     threads: usize,
 
-    /// Device of the gpu backend: its number in `wildcity devices`, or a part of its name [default:
-    /// the fastest kind]
+    /// Device of the gpu backend: its number in `wildcity dev devices`, or a part of its name
+    /// [default: the fastest kind]
     #[arg(long, value_name = "DEVICE")]
     device: Option<String>,
 
     /// GPU memory for Gaussians, in GiB. If they need more, the least recently drawn ones are
     /// evicted. Buffers of the render stages need additional memory [default: all that the GPU has]
-    #[arg(long, value_name = "GIB", value_parser = gib)]
+    #[arg(long, hide = true, value_name = "GIB", value_parser = gib)]
     gpu_memory_gib: Option<f64>,
 
     /// Instruction set of the cpu backend.
-    #[arg(long, value_enum, default_value_t)]
+    #[arg(long, hide = true, value_enum, default_value_t)]
     simd: SimdName,
 }
 

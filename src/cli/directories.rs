@@ -17,11 +17,11 @@ pub struct Twins {
 
     /// Directory that caches parts of twins from an object store [default:
     /// $XDG_CACHE_HOME/wildcity, or ~/.cache/wildcity]
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, hide = true, value_name = "DIR")]
     cache_dir: Option<PathBuf>,
 
     /// Size of that cache, in GiB; 0 for no cache.
-    #[arg(long, value_name = "GIB", default_value_t = limits::CACHE_GIB)]
+    #[arg(long, hide = true, value_name = "GIB", default_value_t = limits::CACHE_GIB)]
     cache_gib: u32,
 }
 
@@ -100,7 +100,7 @@ impl Scenarios {
 pub struct Uploads {
     /// Directory where uploads are kept until they are pushed; only one server at a time may use it
     /// [default: $XDG_STATE_HOME/wildcity/uploads, or ~/.local/state/wildcity/uploads]
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, hide = true, value_name = "DIR")]
     uploads: Option<PathBuf>,
 }
 

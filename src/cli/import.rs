@@ -22,8 +22,8 @@ use super::output;
 use super::packed_folder::scene_file;
 use super::profile_options::ProfileOptions;
 use super::progress;
-use super::rig::find_rig;
 use super::sky_source::SkySource;
+use super::twin::find_rig;
 #[cfg(feature = "log")]
 use super::twin::views::Views;
 
@@ -74,9 +74,9 @@ pub(super) struct Import {
     #[arg(long, allow_negative_numbers = true)]
     scale: Option<f64>,
 
-    /// The vehicle's cameras: a preset (see `wildcity rig show`) or a JSON file (see below). They
-    /// become the twin's default rig. A version that is imported without this option has no default
-    /// rig, even if the previous version has one.
+    /// The vehicle's cameras: a preset (see `wildcity twin rig show`) or a JSON file (see below).
+    /// They become the twin's default rig. A version that is imported without this option has no
+    /// default rig, even if the previous version has one.
     #[arg(long, value_name = "RIG")]
     rig: Option<String>,
 

@@ -5,24 +5,22 @@ use std::env;
 use super::exit::Exit;
 
 /// Commands of a feature: their words, the feature, and whether it is built.
-const COMMANDS: [(&str, &str, bool); 18] = [
+const COMMANDS: [(&str, &str, bool); 16] = [
     ("actor push", "http", cfg!(feature = "http")),
     ("alpasim", "alpasim", cfg!(feature = "alpasim")),
-    ("augment", "augment", cfg!(feature = "augment")),
-    ("bisect", "gpu", cfg!(feature = "gpu")),
-    ("devices", "gpu", cfg!(feature = "gpu")),
-    ("drive", "alpasim", cfg!(feature = "alpasim")),
+    ("dev bisect", "gpu", cfg!(feature = "gpu")),
+    ("dev devices", "gpu", cfg!(feature = "gpu")),
+    ("dev stress", "stress", cfg!(feature = "stress")),
     ("episode", "suite", cfg!(feature = "suite")),
     ("eval", "eval", cfg!(feature = "eval")),
     ("log", "log", cfg!(feature = "log")),
-    ("map import", "convert", cfg!(feature = "convert")),
     ("push", "http", cfg!(feature = "http")),
     ("report", "report", cfg!(feature = "report")),
     ("scenario check", "suite", cfg!(feature = "suite")),
     ("scenario from-log", "log", cfg!(feature = "log")),
     ("scenario import", "convert", cfg!(feature = "convert")),
-    ("stress", "stress", cfg!(feature = "stress")),
     ("train", "train", cfg!(feature = "train")),
+    ("twin map import", "convert", cfg!(feature = "convert")),
     ("twin views", "eval", cfg!(feature = "eval")),
 ];
 
@@ -33,10 +31,10 @@ pub(super) fn built_without(feature: &str) -> String {
 
 /// The error of a command that the parser does not know, if this build leaves it out.
 pub(super) fn command() -> Option<anyhow::Error> {
-    let words: Vec<String> = env::args().skip(1).take(2).collect();
+    let words: Vec<String> = env::args().skip(1).collect();
     let is_asked = |command: &str| {
-        words.iter().map(String::as_str).eq(command.split(' '))
-            || words.first().is_some_and(|word| word == command)
+        let asked: Vec<&str> = command.split(' ').collect();
+        words.len() >= asked.len() && asked.iter().zip(&words).all(|(asked, word)| asked == word)
     };
     let (command, feature, _) =
         COMMANDS.iter().find(|(command, _, is_built)| !is_built && is_asked(command))?;

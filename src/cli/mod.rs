@@ -15,34 +15,28 @@ use std::process::ExitCode;
 mod actor;
 #[cfg(feature = "alpasim")]
 mod alpasim;
-#[cfg(feature = "augment")]
-mod augment;
 pub mod backend_options;
-#[cfg(feature = "gpu")]
-mod bisect;
+mod browser;
+mod completions;
 mod demo;
-#[cfg(feature = "gpu")]
-mod devices;
+mod dev;
 pub mod directories;
 mod doctor;
-#[cfg(feature = "alpasim")]
-mod drive;
 #[cfg(feature = "suite")]
 mod episode;
 #[cfg(feature = "eval")]
 mod eval;
 pub mod exit;
 mod file_notes;
+pub mod help_all;
 mod import;
 mod input_files;
-mod inspect;
 mod left_out;
 pub mod limits;
-mod lod;
 #[cfg(feature = "log")]
 mod log;
-mod map;
 mod memory;
+mod moved;
 pub mod output;
 #[cfg_attr(not(feature = "http"), allow(dead_code, reason = "only a push packs a folder"))]
 mod packed_folder;
@@ -52,25 +46,18 @@ pub mod progress;
 #[cfg(feature = "http")]
 mod push;
 mod render;
-mod repair;
 mod repair_options;
-mod replay;
 #[cfg(feature = "report")]
 mod report;
-mod rig;
-mod route;
 mod scenario;
 pub mod scene_source;
 mod serve;
 mod sky_source;
-#[cfg(feature = "stress")]
-mod stress;
 mod subcommands;
 mod time;
 #[cfg(feature = "train")]
 mod train;
 mod twin;
-mod view;
 
 use clap::error::ErrorKind;
 use clap::{CommandFactory as _, FromArgMatches as _, Parser};
@@ -91,68 +78,36 @@ Examples:
   wildcity demo --view                            (drive through it by hand, in the browser)
   wildcity import street.ply --twin street --axes y-down-z-forward
   wildcity serve                                  (then an agent can open the twin \"street\")
-  wildcity help import                            (options and examples of one command)";
+  wildcity help import                            (options and examples of one command)
+  wildcity serve --help-all                       (also the options that few need)";
 
+// In the order of the tasks: to start, twins, drives, images and their errors, the program itself.
 subcommands! {
     Command;
     Demo(demo::Demo),
     Serve(Box<serve::Serve>),
-    View(view::View),
+    Doctor(doctor::Doctor),
     Import(import::Import),
-    Inspect(inspect::Inspect),
     #[cfg(feature = "http")]
     Push(push::Push),
-    Lod(lod::Lod),
-    #[cfg(feature = "log")]
-    Log(log::LogCommand),
     Twin(twin::Twin),
     Actor(actor::Actor),
+    #[cfg(feature = "log")]
+    Log(log::LogCommand),
+    #[cfg(feature = "train")]
+    Train(Box<train::Train>),
+    Scenario(scenario::ScenarioCommand),
+    #[cfg(feature = "suite")]
+    Episode(episode::Episode),
+    #[cfg(feature = "alpasim")]
+    Alpasim(alpasim::Alpasim),
     Render(render::Render),
     #[cfg(feature = "eval")]
     Eval(Box<eval::Eval>),
-    Repair(repair::Repair),
-    #[cfg(feature = "augment")]
-    Augment(Box<augment::Augment>),
-    #[cfg(feature = "train")]
-    Train(Box<train::Train>),
-    #[cfg(feature = "alpasim")]
-    Drive(drive::Drive),
-    #[cfg(feature = "alpasim")]
-    Alpasim(alpasim::Alpasim),
-    Replay(replay::Replay),
-    #[cfg(feature = "suite")]
-    Episode(episode::Episode),
-    Rig(rig::RigCommand),
-    Route(route::Route),
-    Scenario(scenario::ScenarioCommand),
-    Map(map::MapCommand),
-    Bench(Moved),
-    #[cfg(feature = "gpu")]
-    Bisect(bisect::Bisect),
-    #[cfg(feature = "stress")]
-    Stress(stress::Stress),
     #[cfg(feature = "report")]
     Report(report::Command),
-    #[cfg(feature = "gpu")]
-    Devices(devices::Devices),
-    Doctor(doctor::Doctor),
-}
-
-/// Moved to the program `wildcity-bench`.
-#[derive(Debug, clap::Args)]
-#[command(hide = true, disable_help_flag = true)]
-struct Moved {
-    #[arg(trailing_var_arg = true, allow_hyphen_values = true, hide = true)]
-    _arguments: Vec<String>,
-}
-
-impl Moved {
-    fn run(self) -> anyhow::Result<()> {
-        anyhow::bail!(
-            "wildcity bench is a program of its own: in the source of wildcity, run cargo run \
-             --release -p wildcity-bench -- and the arguments after \"bench\""
-        )
-    }
+    Dev(dev::Dev),
+    Completions(completions::Completions),
 }
 
 /// Options of a command with their values; those without one are left out.
@@ -171,26 +126,34 @@ fn run_command(words: &[&std::ffi::OsStr], options: Options) -> anyhow::Result<(
 }
 
 /// Parses the command line, runs the command, and returns the exit code: 0 for success, 1 for a
-/// failure, and 3 for a recording that is cut (`replay --verify`). A command line that cannot be
+/// failure, and 3 for a recording that is cut (`episode verify`). A command line that cannot be
 /// parsed ends the process with code 2.
 pub fn main() -> ExitCode {
-    let mut program = Arguments::command();
-    if let Some(left_out) = left_out::help() {
-        program = program
-            .after_help(left_out.clone())
-            .after_long_help(format!("{EXAMPLES}\n\n{left_out}"));
-    }
-    let parsed = program.try_get_matches().and_then(|found| Arguments::from_arg_matches(&found));
-    let arguments = match parsed {
-        Ok(arguments) => arguments,
-        Err(error) => {
-            match left_out::command().filter(|_| error.kind() == ErrorKind::InvalidSubcommand) {
-                Some(left_out) => return exit::code(Err(left_out)),
+    let whole = help_all::program(program(), help_all::is_asked());
+    let parsed = whole.try_get_matches().and_then(|found| Arguments::from_arg_matches(&found));
+    match parsed {
+        Ok(arguments) => exit::code(arguments.command.run()),
+        Err(error) if error.kind() == ErrorKind::InvalidSubcommand => {
+            let moved = moved::command(std::env::args_os().skip(1)).map(anyhow::Error::from);
+            match moved.or_else(left_out::command) {
+                Some(elsewhere) => exit::code(Err(elsewhere)),
                 None => error.exit(),
             }
         }
-    };
-    exit::code(arguments.command.run())
+        Err(error) => error.exit(),
+    }
+}
+
+/// The program with the help of this build.
+fn program() -> clap::Command {
+    let program = Arguments::command();
+    match left_out::help() {
+        Some(left_out) => {
+            let after = format!("{EXAMPLES}\n\n{left_out}");
+            program.after_help(left_out).after_long_help(after)
+        }
+        None => program,
+    }
 }
 
 #[cfg(test)]
@@ -203,7 +166,10 @@ mod tests {
 
     #[test]
     fn every_command_and_option_is_explained_and_has_an_example() {
-        help::check(&Arguments::command(), 60);
+        let program = help_all::program(program(), false);
+        help::check(&program, 60);
+        let top = program.get_subcommands().filter(|command| command.get_name() != "help");
+        assert!(top.count() <= 17, "a new command belongs to one of those that are there");
     }
 
     #[test]

@@ -14,7 +14,7 @@ const THREADS: i64 = wildcity_repair::limits::MAX_THREADS as i64;
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct RepairOptions {
     /// Manifests of models that repair images, separated by commas (docs/repair.md);
-    /// `wildcity repair check` checks one. A model and the runtime are loaded when a session or a
+    /// `wildcity dev repair` checks one. A model and the runtime are loaded when a session or a
     /// record asks for it by name.
     #[arg(long, value_name = "FILES")]
     repair: Option<Manifests>,
@@ -24,12 +24,12 @@ pub(super) struct RepairOptions {
     onnxruntime: Option<PathBuf>,
 
     /// Threads of each repair model on the processor. The images do not depend on it.
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=THREADS))]
+    #[arg(long, hide = true, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=THREADS))]
     repair_threads: u16,
 
     /// Memory for recorded images that repair models compare with, in MiB. Images that do not fit
     /// are read again when needed.
-    #[arg(long, value_name = "MIB", default_value_t = 512, value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, hide = true, value_name = "MIB", default_value_t = 512, value_parser = clap::value_parser!(u32).range(1..))]
     views_mib: u32,
 }
 

@@ -19,10 +19,10 @@ use wildcity_stress::table::Candidate;
 use wildcity_twin::residency::Cache;
 
 use super::backend_options::HardwareOptions;
+use super::dev::{BackendName, candidate};
 use super::directories::{TwinVersion, Twins};
 use super::repair_options::RepairOptions;
-use super::rig::find_rig;
-use super::stress::{BackendName, candidate};
+use super::twin::find_rig;
 use super::{demo, output, progress};
 
 /// Measure the run time and the error of each setting of the renderer, on one twin and this
@@ -35,7 +35,8 @@ use super::{demo, output, progress};
 /// that cannot affect this twin are skipped, and the report lists them. The report also has the
 /// trust of images off the drive, the stress table, and the cost of each feature of a scene.
 ///
-/// Writes report.html (a single self-contained file), report.json and report.csv.
+/// Says first how long it will take. Writes report.html (a single self-contained file, which begins
+/// with the setting to use), report.json and report.csv.
 ///
 /// With --at-least-db or --at-most-ms it recommends a setting: selected at some sample points,
 /// verified at the others, and written as profile.json for `wildcity serve --profile`. If no
@@ -86,8 +87,8 @@ pub(super) struct Command {
     #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
     repeat: u32,
 
-    /// Cameras to use instead of the twin's own: a preset (see `wildcity rig show`), or a JSON file
-    /// as `wildcity import --rig` reads it.
+    /// Cameras to use instead of the twin's own: a preset (see `wildcity twin rig show`), or a JSON
+    /// file as `wildcity import --rig` reads it.
     #[arg(long, value_name = "RIG")]
     rig: Option<String>,
 
@@ -214,6 +215,7 @@ impl Command {
         for Skipped { what, reason } in &report.skipped {
             writeln!(out, "not compared: {what} ({reason})")?;
         }
+        writeln!(out, "{}", report.answer())?;
         for recommended in report.repair.iter().flat_map(|repair| &repair.below) {
             writeln!(out, "{}", recommended.text())?;
         }
@@ -252,6 +254,9 @@ impl Command {
             goal: self.at_least_db.or(self.at_most_ms),
             repair: RepairSampling::new(self.stations, &self.offsets, self.repair_side),
         };
+        let expected = wildcity_report::expect(&settings, &twin, &machine)?;
+        let rest = if self.no_stress { "" } else { ", then the extreme scenes" };
+        writeln!(io::stderr(), "this takes {expected}{rest}")?;
         let bar = progress::state();
         let report = wildcity_report::run(&settings, &twin, &machine, &mut |what, done, all| {
             bar.set_length(all);

@@ -2,8 +2,8 @@
 //! give and take.
 //!
 //! The cpu backend gives them after any stage, and the gpu backend continues from them
-//! ([`hybrid`](crate::hybrid)), so that a wrong image is traced to its stage (`wildcity bisect`).
-//! Tests compare single stages on the same buffers: each mutation of the shaders in
+//! ([`hybrid`](crate::hybrid)), so that a wrong image is traced to its stage (`wildcity dev
+//! bisect`). Tests compare single stages on the same buffers: each mutation of the shaders in
 //! `tests/gpu/mutations.rs` must fail the stages that share the mutated shader, and no other. (The
 //! idea is Vello's "CPU up to a stage".)
 

@@ -7,6 +7,7 @@
 //! sample_points   the poses to compare at: on the recorded drive, at offsets from it, or around a capture
 //! measure         renders each setting and the f64 reference, and compares them
 //! measurement     the error of a setting, and its cost
+//! expected        how long a report will take
 //! timing          how long a step takes, in turn with the twin as it is served
 //! recommend       the Pareto front, and the setting for a required error or time
 //! confidence      trust in the images, over the distance from the recorded drive
@@ -22,6 +23,7 @@
 pub mod confidence;
 mod error;
 mod error_images;
+mod expected;
 pub mod feature_costs;
 pub mod measure;
 pub mod measurement;
@@ -39,5 +41,6 @@ mod timing;
 
 pub use error::ReportError;
 pub use error_images::ErrorImages;
+pub use expected::Expected;
 pub use report::{Report, Subject};
-pub use run::{Machine, Progress, Settings, Twin, run};
+pub use run::{Machine, Progress, Settings, Twin, expect, run};

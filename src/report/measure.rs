@@ -178,11 +178,15 @@ impl Benchmark<'_> {
         step.time(&baseline, self.repeat)
     }
 
-    fn profile(&self) -> RenderProfile {
+    pub(super) fn profile(&self) -> RenderProfile {
         self.resident.version.manifest.profile
     }
 
-    fn scene(&self, views: &[View], profile: &RenderProfile) -> Result<PinnedScene, ReportError> {
+    pub(super) fn scene(
+        &self,
+        views: &[View],
+        profile: &RenderProfile,
+    ) -> Result<PinnedScene, ReportError> {
         Ok(self.resident.scene(&wildcity_session::viewpoints(views), profile)?)
     }
 }

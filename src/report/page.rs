@@ -22,7 +22,8 @@ td:first-child,th:first-child,td.text{text-align:left;vertical-align:top}.cases 
 tr.front td:first-child{font-weight:600}.miss{color:#b00020;font-weight:600}.off{color:#999}
 figure{display:inline-block;margin:0 12px 14px 0}figcaption{font-size:12px}
 img{image-rendering:pixelated;margin-right:3px}.view{width:272px}.view img{image-rendering:auto;width:272px}svg{max-width:100%;height:auto}.wide{overflow-x:auto}
-.key span{display:inline-block;padding:1px 8px;font-size:12px}";
+.key span{display:inline-block;padding:1px 8px;font-size:12px}
+.verdict{font-size:1.25em;padding:.6em .8em;border-left:6px solid;background:#f6f6f6;overflow-wrap:anywhere}";
 
 /// The whole page.
 ///
@@ -45,7 +46,8 @@ pub fn render(report: &Report) -> Result<String, ReportError> {
             }
             body {
                 h1 { (title) }
-                (recommendation(report))
+                p.verdict { b { "Which setting should I use? " } (capitalized(&report.answer())) "." }
+                @if let Some(found) = &report.recommendation { (recommended(found)) }
                 (introduction(report))
                 h2 { "Error against time" }
                 (error_against_time_caption())
@@ -102,15 +104,10 @@ fn introduction(report: &Report) -> Markup {
     }
 }
 
-fn recommendation(report: &Report) -> Markup {
-    html! {
-        @if let Some(recommendation) = &report.recommendation {
-            (recommended(recommendation))
-        }
-        @if let (Some(goal), Some(reason)) = (report.goal, &report.unmet_reason) {
-            p.miss { b { (goal) } ": nothing is recommended: " (reason) "." }
-        }
-    }
+/// A sentence with its first letter in upper case.
+fn capitalized(text: &str) -> String {
+    let mut letters = text.chars();
+    letters.next().map_or(String::new(), |first| first.to_uppercase().chain(letters).collect())
 }
 
 fn recommended(recommendation: &Recommendation) -> Markup {

@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::confidence::Confidence;
 use super::feature_costs::FeatureCounts;
 use super::measurement::Measurement;
-use super::recommend::{Goal, Recommendation, pareto_front};
+use super::recommend::{Goal, Recommendation, pareto_front, recommend};
 use super::repair::RepairReport;
 use super::sample_points::{OFFSETS_M, Sampling};
 use super::settings::Skipped;
@@ -79,7 +79,52 @@ pub struct Subject {
     pub repeat: u32,
 }
 
+/// Least PSNR of the setting that is named if no goal is given, in dB: an error of 1 % of the
+/// range.
+const NO_GOAL_DB: f64 = 40.0;
+/// How much of the time of the twin as it is served that setting takes at most: less of a gain may
+/// be the luck of its timing.
+const NO_GOAL_SHARE: f64 = 0.9;
+
 impl Report {
+    /// The answer to the question which setting to use, in one sentence.
+    pub fn answer(&self) -> String {
+        match (&self.recommendation, self.goal, &self.unmet_reason) {
+            (Some(Recommendation { setting, backend, goal, .. }), ..) => {
+                format!("use {setting} on {backend}: {goal} at every sample point")
+            }
+            (None, Some(goal), Some(reason)) => {
+                format!("nothing is recommended for {goal}: {reason}")
+            }
+            (None, ..) => self.answer_without_goal(),
+        }
+    }
+
+    /// The fastest setting with [`NO_GOAL_DB`], if it is faster than the twin as it is served.
+    fn answer_without_goal(&self) -> String {
+        let backends: Vec<String> =
+            self.backends.iter().map(|column| column.backend.to_owned()).collect();
+        let found = recommend(Goal::AtLeastDb(NO_GOAL_DB), &self.settings, &backends).ok();
+        let step_ms = |name: &str| {
+            let of_name = self.settings.iter().find(|measured| measured.setting.name == name);
+            of_name.map_or(f64::NAN, |measured| measured.cost.step_ms)
+        };
+        let served_ms = self.settings.first().map_or(f64::NAN, |served| served.cost.step_ms);
+        let faster = found.filter(|found| step_ms(&found.setting) < NO_GOAL_SHARE * served_ms);
+        let other = "--at-least-db or --at-most-ms find one for a goal of yours";
+        match faster {
+            Some(Recommendation { setting, backend, .. }) => format!(
+                "use {setting} on {backend}: {:.1} ms a step instead of {served_ms:.1}, and at \
+                 least {NO_GOAL_DB} dB in every window; {other}",
+                step_ms(&setting)
+            ),
+            None => format!(
+                "the twin as it is served, {served_ms:.1} ms a step: no setting is faster and has \
+                 at least {NO_GOAL_DB} dB in every window; {other}"
+            ),
+        }
+    }
+
     /// The settings as CSV: a header, and one line per setting, with decimal points and no quotes
     /// except around names. A cell is empty where there is no value: dB at offsets from a drive if
     /// none was recorded, and bytes of a device if the backend has none.

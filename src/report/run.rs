@@ -22,7 +22,7 @@ use crate::recommend::{Goal, recommend};
 use crate::repair::{self, RepairBenchmark, RepairReport, RepairSampling};
 use crate::sample_points::{Sampling, sample_points};
 use crate::settings::{SettingList, Skipped, TwinFeatures, settings_to_compare};
-use crate::{Report, ReportError, Subject, feature_costs};
+use crate::{Expected, Report, ReportError, Subject, feature_costs};
 
 /// What is measured, and how often.
 #[derive(Clone, Debug)]
@@ -76,6 +76,26 @@ struct Compared {
     exact_rays_ms: Option<f64>,
 }
 
+/// How long [`run`] will take, after a try of a second or two.
+///
+/// # Errors
+/// The twin cannot be read or rendered.
+pub fn expect(settings: &Settings, twin: &Twin, machine: &Machine<'_>) -> anyhow::Result<Expected> {
+    let Machine { backends, open_device, .. } = machine;
+    let manifest = &twin.resident.version.manifest;
+    let points = sample_points(manifest, &twin.rig.cameras, settings.sampling);
+    let benchmark = Benchmark {
+        resident: &twin.resident,
+        backends,
+        sample_points: &points,
+        repeat: settings.repeat,
+        open_device,
+    };
+    let (features, listed) = list_settings(&benchmark);
+    let references = 1 + usize::from(features.has_non_pinhole);
+    Ok(Expected::new(&benchmark, &listed.settings, references)?)
+}
+
 /// Measures a twin. A goal that no setting reaches is no error: the report has the reason.
 ///
 /// # Errors
@@ -100,7 +120,7 @@ pub fn run(
         repeat: settings.repeat,
         open_device,
     };
-    let mut compared = compare(&benchmark, &names, progress)?;
+    let mut compared = compare(&benchmark, progress)?;
     compared.skipped.extend(machine.absent.iter().cloned());
     let recommended = settings.goal.map(|goal| recommend(goal, &compared.measurements, &names));
     let (recommendation, unmet_reason) = match recommended.transpose() {
@@ -171,22 +191,13 @@ fn measure_repair(
 }
 
 /// Measures every setting that can affect the twin.
-fn compare(
-    benchmark: &Benchmark<'_>,
-    backends: &[String],
-    progress: Progress<'_>,
-) -> anyhow::Result<Compared> {
-    let resident = benchmark.resident;
-    let views = &benchmark.sample_points[0].views;
-    let sky = resident.sky().map(AsRef::as_ref);
-    let twin = TwinFeatures::new(&resident.version.manifest, sky, views);
+fn compare(benchmark: &Benchmark<'_>, progress: Progress<'_>) -> anyhow::Result<Compared> {
+    let (twin, SettingList { settings, mut skipped }) = list_settings(benchmark);
     let splats = render_reference(benchmark, Rays::Splats, "reference", progress)?;
     let rays = twin
         .has_non_pinhole
         .then(|| render_reference(benchmark, Rays::Exact, "every ray", progress))
         .transpose()?;
-    let names: Vec<&str> = backends.iter().map(String::as_str).collect();
-    let SettingList { settings, mut skipped } = settings_to_compare(&twin, &names);
     let mut measurements = Vec::new();
     for (done, setting) in settings.iter().enumerate() {
         progress(&setting.name, done as u64, settings.len() as u64);
@@ -211,6 +222,17 @@ fn compare(
         reference_ms: splats.step_ms,
         exact_rays_ms: rays.map(|rays| rays.step_ms),
     })
+}
+
+/// What the settings of a twin depend on, and the settings.
+fn list_settings(benchmark: &Benchmark<'_>) -> (TwinFeatures, SettingList) {
+    let resident = benchmark.resident;
+    let views = &benchmark.sample_points[0].views;
+    let sky = resident.sky().map(AsRef::as_ref);
+    let twin = TwinFeatures::new(&resident.version.manifest, sky, views);
+    let names: Vec<&str> = benchmark.backends.iter().map(|backend| backend.name()).collect();
+    let list = settings_to_compare(&twin, &names);
+    (twin, list)
 }
 
 fn render_reference(

@@ -1,5 +1,5 @@
 //! Stress cases: extreme scenes, each of which has broken a published renderer, with the bound that
-//! every backend must keep. `wildcity stress` runs them and prints the table, so that a faulty
+//! every backend must keep. `wildcity dev stress` runs them and prints the table, so that a faulty
 //! driver is found on the machine that has it. Tests run them as well.
 //!
 //! ```text

@@ -10,6 +10,7 @@ pre{margin:0;white-space:pre-wrap;overflow-wrap:anywhere}
 .passed,.better{color:#00703c}.failed,.worse{color:#b00020;font-weight:600}.technical{color:#b05a00}
 .off_model,.not_judged,.unknown,.changed{color:#777}
 figure{margin:0 0 1.5em 0}figure img{width:min(100%,760px);height:auto}svg{border:1px solid #eee;margin-right:6px;max-width:100%;height:auto}
+.beside{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,320px),1fr));gap:0 16px}h3{font-size:1em;margin:1.4em 0 0}
 .verdict{font-size:1.25em;padding:.6em .8em;border-left:6px solid;background:#f6f6f6;overflow-wrap:anywhere}";
 
 /// A page with a title.

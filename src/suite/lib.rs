@@ -47,8 +47,8 @@ mod verify;
 
 pub use case::{Case, CaseOptions, cases};
 pub use compare::{
-    Change, ChangeCounts, CompareError, ComparedEpisode, Comparison, Direction, PASS_RATE,
-    PairedRate, Rule, RunName, ScoreChange, Side, Tolerance,
+    Change, ChangeCounts, CompareError, ComparedEpisode, Comparison, Direction, DrivenRun,
+    PASS_RATE, PairedRate, Rule, RunName, ScoreChange, Side, Tolerance,
 };
 pub use driver::BuiltIn;
 pub use ending::{Ending, ExitCode};

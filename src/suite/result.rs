@@ -1,7 +1,7 @@
 //! The result of a run, `result.json`.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
@@ -199,6 +199,12 @@ impl SuiteResult {
         // With the path to the mistake, because a result has up to 100,000 episodes.
         serde_path_to_error::deserialize(&mut reader)
             .map_err(|error| wrong(format!("{}: {}", error.path(), error.inner())))
+    }
+
+    /// The folder with the records of a run; `run` as for [`SuiteResult::read`].
+    pub fn records(run: &Path) -> PathBuf {
+        let dir = if run.is_dir() { run } else { run.parent().unwrap_or(Path::new("")) };
+        dir.join("episodes")
     }
 
     /// The note about duplicates; `None` if there are none.

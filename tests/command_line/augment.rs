@@ -1,5 +1,5 @@
-//! `wildcity augment`: views off a drive, read back by `wildcity eval`; runs continued after damage
-//! and kills.
+//! `wildcity train augment`: views off a drive, read back by `wildcity eval`; runs continued after
+//! damage and kills.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -75,7 +75,7 @@ fn make_twins(dir: &Path) {
 const COMMON: [&str; 6] = ["--twins", "twins", "--backend", "cpu", "--threads", "2"];
 
 fn arguments<'a>(twin: &'a str, out: &'a str, more: &[&'a str]) -> Vec<&'a str> {
-    let fixed = ["augment", twin, "--offsets", "0.4,3", "--every", "25m", "--out", out];
+    let fixed = ["train", "augment", twin, "--offsets", "0.4,3", "--every", "25m", "--out", out];
     [&fixed[..], &COMMON, more].concat()
 }
 
@@ -210,7 +210,7 @@ fn a_killed_run_is_continued_to_the_same_bytes() {
     let at = dir.path();
     twins(at);
     let more = ["--every", "5m", "--round", "6"];
-    let fixed = ["augment", "street", "--offsets", "0.4,3"];
+    let fixed = ["train", "augment", "street", "--offsets", "0.4,3"];
     let run = |out| [&fixed[..], &COMMON, &more, &["--out", out]].concat();
     done(at, &run("whole"));
     let whole = contents(&at.join("whole/round_6"));

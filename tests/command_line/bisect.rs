@@ -1,4 +1,4 @@
-//! `--cpu-through` and `wildcity bisect` on the command line.
+//! `--cpu-through` and `wildcity dev bisect` on the command line.
 
 use std::fs;
 use std::path::Path;
@@ -40,7 +40,7 @@ fn said(output: &Output) -> String {
 #[test]
 fn bisect_reports_every_camera() {
     let dir = scene();
-    let said = said(&run(dir.path(), &["bisect"]));
+    let said = said(&run(dir.path(), &["dev", "bisect"]));
     let lines: Vec<Vec<&str>> =
         said.lines().map(|line| line.split_whitespace().collect()).collect();
     assert_eq!(lines[1], ["cpu", "through", "none", "project", "sort", "bin"]);

@@ -1,4 +1,4 @@
-//! `wildcity twin align`, `wildcity route from-colmap` and `from-nerfstudio`,
+//! `wildcity twin align`, `wildcity twin route from-colmap` and `from-nerfstudio`,
 //! `wildcity twin drive`.
 
 use std::fmt::Write as _;
@@ -153,7 +153,8 @@ fn a_capture_becomes_a_street_that_can_be_driven() {
     // 2. The cameras of its training images are a drive on that ground.
     let poses = camera_poses(&street_drive);
     write_colmap_text(&at.join("model/sparse/0"), &poses);
-    let said = done(at, &["route", "from-colmap", "model", "--twin", "street", "--out", "drive"]);
+    let said =
+        done(at, &["twin", "route", "from-colmap", "model", "--twin", "street", "--out", "drive"]);
     assert!(said.contains("40 keyframes, 19.") && said.contains("cameras front-view"), "{said}");
     let drive: Trajectory = read(&at.join("drive/capture.json"));
     drive.check().unwrap();
@@ -171,10 +172,19 @@ fn a_capture_becomes_a_street_that_can_be_driven() {
     // 3. The binary model and transforms.json give the same.
     write_colmap_binary(&at.join("binary"), &poses);
     fs::write(at.join("transforms.json"), transforms(&poses).to_string()).unwrap();
-    done(at, &["route", "from-colmap", "binary", "--twin", "street", "--out", "two"]);
+    done(at, &["twin", "route", "from-colmap", "binary", "--twin", "street", "--out", "two"]);
     done(
         at,
-        &["route", "from-nerfstudio", "transforms.json", "--twin", "street", "--out", "three"],
+        &[
+            "twin",
+            "route",
+            "from-nerfstudio",
+            "transforms.json",
+            "--twin",
+            "street",
+            "--out",
+            "three",
+        ],
     );
     for other in ["two", "three"] {
         let same: Trajectory = read(&at.join(other).join("capture.json"));
@@ -216,7 +226,7 @@ fn a_capture_becomes_a_street_that_can_be_driven() {
     let mut other = Provenance::new("block8.ply".into());
     other.options.push("axes=y-down-z-forward".to_owned());
     push(4, other);
-    let route = |twin, out| ["route", "from-colmap", "model", "--twin", twin, "--out", out];
+    let route = |twin, out| ["twin", "route", "from-colmap", "model", "--twin", twin, "--out", out];
     let told = refused(at, &route("street", "five"));
     assert!(told.contains("version 5 was pushed") && told.contains("give --axes"), "{told}");
     assert!(!at.join("five").exists());
@@ -246,7 +256,7 @@ fn damaged_captures_name_the_file_the_place_and_the_fix() {
     let at = dir.path();
     let (_, street_drive) = captured_street();
     let poses = camera_poses(&street_drive);
-    let colmap = ["route", "from-colmap", "m", "--camera-height-m", "1.6", "--out", "out"];
+    let colmap = ["twin", "route", "from-colmap", "m", "--camera-height-m", "1.6", "--out", "out"];
     fs::create_dir(at.join("m")).unwrap();
     let told = refused(at, &colmap);
     assert!(told.contains("no COLMAP model") && told.contains("model_converter"), "{told}");
@@ -290,7 +300,7 @@ fn damaged_captures_name_the_file_the_place_and_the_fix() {
     assert!(refused(at, &colmap).contains("4 bytes after the last entry"));
 
     let nerfstudio =
-        ["route", "from-nerfstudio", "t.json", "--camera-height-m", "1.6", "--out", "out"];
+        ["twin", "route", "from-nerfstudio", "t.json", "--camera-height-m", "1.6", "--out", "out"];
     let whole = transforms(&poses);
     let told = |change: &dyn Fn(&mut Value)| {
         let mut changed = whole.clone();
@@ -315,7 +325,14 @@ fn times_of_frames_are_those_of_the_drive() {
     let dir = tempfile::tempdir().unwrap();
     let run = |more: &[&str]| {
         let mut command = crate::wildcity();
-        command.args(["route", "from-nerfstudio", timed.to_str().unwrap(), "--axes", "identity"]);
+        command.args([
+            "twin",
+            "route",
+            "from-nerfstudio",
+            timed.to_str().unwrap(),
+            "--axes",
+            "identity",
+        ]);
         command.args(["--out", "out"]).args(more).current_dir(dir.path()).output().unwrap()
     };
     let output = run(&[]);

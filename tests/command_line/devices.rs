@@ -75,7 +75,7 @@ fn without_a_driver_it_is_an_ordinary_error() {
         let output = command.output().unwrap();
         (output.status.success(), String::from_utf8_lossy(&output.stdout).into_owned())
     };
-    let (listed, said) = without(env!("CARGO_BIN_EXE_wildcity"), &["devices"]);
+    let (listed, said) = without(env!("CARGO_BIN_EXE_wildcity"), &["dev", "devices"]);
     assert!(listed && said.contains("mesa-vulkan-drivers"), "{said}");
     // Here `software_is_not_taken_for_hardware` sees no device at all.
     let this = std::env::current_exe().unwrap();

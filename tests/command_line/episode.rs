@@ -97,7 +97,8 @@ fn a_suite_is_driven_and_its_records_are_read() {
     assert!(error.contains("short-0-1.mcap is an MCAP export"), "{error}");
     assert!(error.contains("log/episodes/short-0-1.jsonl"), "{error}");
     let mut replay = Command::new(env!("CARGO_BIN_EXE_wildcity"));
-    let replayed = replay.args(["replay", "log/episodes/short-0-1.mcap"]).current_dir(dir.path());
+    let replayed =
+        replay.args(["episode", "verify", "log/episodes/short-0-1.mcap"]).current_dir(dir.path());
     let error = String::from_utf8(replayed.output().unwrap().stderr).unwrap();
     assert!(error.contains("short-0-1.mcap is an MCAP export"), "{error}");
 

@@ -169,6 +169,13 @@ fn an_image_that_was_spoiled_by_a_known_amount_has_that_error() {
     let page = fs::read_to_string(dir.path().join("out/report.html")).unwrap();
     assert_eq!(page.matches("data:image/jpeg;base64,").count(), 3, "one image, three pictures");
     assert!(page.contains("<b>front/b.png</b> 28.13 dB"), "the worst image is shown");
+    let verdict = page.find("On average a rendered image has ").unwrap();
+    assert!(verdict < page.find("<table").unwrap(), "the result is first");
+    assert!(
+        page.contains("; the worst is front/b.png with 28.13 dB"),
+        "{}",
+        &page[verdict..][..200]
+    );
     for outside in ["src=\"http", "href=\"http", "<link", "<script", "@import"] {
         assert!(!page.contains(outside), "{outside}");
     }

@@ -124,7 +124,7 @@ fn a_twin_takes_drive_rig_images_and_place_from_a_log() {
     ]);
     assert!(said.contains("version 2") && said.contains("recorded images"), "{said}");
     let shown: Value =
-        serde_json::from_str(&street.done(&["inspect", "recorded", "--json"])).unwrap();
+        serde_json::from_str(&street.done(&["twin", "show", "recorded", "--json"])).unwrap();
     let manifest = &shown["manifest"];
     assert_eq!(manifest["geo"]["latitude_deg"], 52.5162, "{manifest:#}");
     assert_eq!(manifest["rig"]["cameras"][1]["name"], "front_left");

@@ -63,7 +63,6 @@ mod operations;
 mod push;
 mod remote;
 mod repair;
-mod replay;
 mod report;
 mod report_repair;
 mod rig;
@@ -75,6 +74,7 @@ mod suites;
 mod traces;
 mod train;
 mod twin;
+mod verify;
 mod views;
 
 use std::process::Command;

@@ -155,11 +155,56 @@ fn a_reader_that_has_gone_is_no_error() {
 }
 
 #[test]
-fn bench_says_where_it_is() {
-    for arguments in [&["bench"][..], &["bench", "step", "--help"], &["bench", "gpu", "--json"]] {
-        let output = wildcity().args(arguments).output().unwrap();
-        assert_eq!(output.status.code(), Some(1), "{output:?}");
+fn an_old_command_says_what_to_run() {
+    for (line, new) in [
+        (&["bench", "step", "--help"][..], "cargo run --release -p wildcity-bench -- step --help"),
+        (&["inspect", "street", "--json"], "wildcity twin show street --json"),
+        (&["help", "replay"], "wildcity episode verify --help"),
+    ] {
+        let output = wildcity().args(line).output().unwrap();
+        assert_eq!(output.status.code(), Some(2), "{output:?}");
         let said = String::from_utf8(output.stderr).unwrap();
-        assert!(said.contains("cargo run --release -p wildcity-bench --"), "{said}");
+        assert!(said.contains("has moved") && said.ends_with(&format!("  {new}\n")), "{said}");
     }
+}
+
+#[test]
+fn rare_options_are_in_the_whole_help_alone() {
+    let help = |arguments: &[&str]| {
+        let output = wildcity().args(arguments).output().unwrap();
+        assert!(output.status.success(), "{output:?}");
+        String::from_utf8(output.stdout).unwrap()
+    };
+    for command in [&["serve"][..], &["twin", "list"], &["render"]] {
+        let short = help(&[command, &["--help"]].concat());
+        let whole = help(&[command, &["--help-all"]].concat());
+        assert!(short.contains("--help-all") && !short.contains("--cache-gib"), "{short}");
+        assert!(whole.contains("--cache-gib") && whole.contains("--twins"), "{whole}");
+    }
+    let whole = help(&["serve", "--help-all"]);
+    assert!(whole.contains("--idle-timeout-s") && whole.contains("Limits:"), "{whole}");
+    // A command without rare options takes it, too, and does not mention it.
+    assert_eq!(help(&["twin", "--help"]), help(&["twin", "--help-all"]));
+    assert!(!help(&["twin", "--help"]).contains("--help-all"));
+}
+
+#[test]
+fn completions_have_every_command_and_option() {
+    for shell in ["bash", "elvish", "fish", "powershell", "zsh"] {
+        let output = wildcity().args(["completions", shell]).output().unwrap();
+        assert!(output.status.success(), "{output:?}");
+        let script = String::from_utf8(output.stdout).unwrap();
+        for word in ["from-colmap", "cache-gib"] {
+            assert!(script.contains(word), "{shell}: {word}");
+        }
+    }
+    let syntax = "source /dev/stdin && complete -p wildcity";
+    let mut bash = std::process::Command::new("bash");
+    bash.args(["-ec", syntax]).stdin(std::process::Stdio::piped());
+    let mut running = bash.stdout(std::process::Stdio::piped()).spawn().unwrap();
+    let script = wildcity().args(["completions", "bash"]).output().unwrap().stdout;
+    std::io::Write::write_all(&mut running.stdin.take().unwrap(), &script).unwrap();
+    let completed = running.wait_with_output().unwrap();
+    assert!(completed.status.success(), "{completed:?}");
+    assert!(String::from_utf8_lossy(&completed.stdout).contains("wildcity"), "{completed:?}");
 }

@@ -87,7 +87,7 @@ async fn the_frame_of_a_push_is_said_and_the_log_has_its_note() {
     let (ok, wrong) = wildcity(&["push", block, "--twin", "test", "--frame", "world"]);
     assert!(!ok && wrong.contains("--frame"), "{wrong}");
 
-    let (_, inspected) = wildcity(&["inspect", "test", "--twins", &twins]);
+    let (_, inspected) = wildcity(&["twin", "show", "test", "--twins", &twins]);
     assert!(inspected.contains("alignment   2.000000 m per unit of the capture"), "{inspected}");
     assert!(inspected.contains("objects     1 chunk,"), "{inspected}");
     // The note of a push is not that of a later edit.

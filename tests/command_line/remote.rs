@@ -26,13 +26,14 @@ fn commands_take_a_url() {
     let (code, out, error) = run(&["import", source.to_str().unwrap(), "--twin", "street"]);
     assert_eq!(code, Some(0), "{error}");
     assert!(out.contains("s3://bucket/twins/street"), "{out}");
-    let (code, out, error) = run(&["inspect", "street"]);
+    let (code, out, error) = run(&["twin", "show", "street"]);
     assert_eq!(code, Some(0), "{error}");
     assert!(out.contains("gaussians   500"), "{out}");
     let (code, out, _) = run(&["twin", "log", "street"]);
     assert!(code == Some(0) && out.contains("import"), "{out}");
     let mut command = wildcity();
-    let output = command.args(["inspect", "street", "--twins", "ftp://bucket/x"]).output().unwrap();
+    let output =
+        command.args(["twin", "show", "street", "--twins", "ftp://bucket/x"]).output().unwrap();
     let said = String::from_utf8(output.stderr).unwrap();
     assert!(said.contains("cannot use ftp://bucket/x for twins: one of s3://"), "{said}");
 }

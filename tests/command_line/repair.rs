@@ -1,4 +1,4 @@
-//! `wildcity repair check`, and that other commands do not load the runtime.
+//! `wildcity dev repair`, and that other commands do not load the runtime.
 
 use std::fs;
 use std::io::{BufRead, BufReader};
@@ -33,7 +33,7 @@ fn mistakes_are_told_before_and_with_the_runtime_library() {
     let folder = folder();
     let refused = |arguments: &[&str]| {
         let mut command = wildcity();
-        command.args(["repair", "check"]).args(arguments).env_remove("ORT_DYLIB_PATH");
+        command.args(["dev", "repair"]).args(arguments).env_remove("ORT_DYLIB_PATH");
         let output = command.current_dir(folder.path()).output().unwrap();
         assert_eq!(output.status.code(), Some(1));
         assert!(output.stdout.is_empty());
@@ -138,7 +138,7 @@ async fn only_a_session_that_asks_loads_the_library_and_its_record_is_repaired_a
 
     let replay = |arguments: &[&str]| {
         let mut command = wildcity();
-        command.arg("replay").arg(episodes.path().join("a-1.jsonl")).arg("--verify");
+        command.args(["episode", "verify"]).arg(episodes.path().join("a-1.jsonl"));
         command.arg("--twins").arg(twins.path()).args(arguments);
         let output = command.output().unwrap();
         let text = String::from_utf8_lossy(&output.stdout).into_owned();

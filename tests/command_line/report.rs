@@ -188,10 +188,20 @@ fn without_a_recommendation_no_profile_is_left_and_the_report_says_why() {
         (&500.0.into(), &Value::Null)
     );
     assert!(report["unmet"].as_str().unwrap().contains("the best reaches"), "{}", report["unmet"]);
-    assert!(read("report.html").contains("<b>at least 500 dB</b>: nothing is recommended"));
+    let answer = "Which setting should I use? </b>Nothing is recommended for at least 500 dB: ";
+    let page = read("report.html");
+    assert!(page.find(answer).unwrap() < page.find("<h2").unwrap());
     // The old profile is also removed if there is no goal.
     an_earlier_one();
-    assert!(run_report(dir.path(), SMALLEST, &[]).status.success() && !file.exists());
+    let without = run_report(dir.path(), SMALLEST, &[]);
+    assert!(without.status.success() && !file.exists());
+    let said = String::from_utf8_lossy(&without.stderr);
+    assert!(
+        said.starts_with("this takes about ") && said.contains("for the reference, "),
+        "{said}"
+    );
+    let answer = String::from_utf8_lossy(&without.stdout);
+    assert!(answer.contains(" ms a step") && answer.contains("find one for a goal"), "{answer}");
     let report: Value = serde_json::from_str(&read("report.json")).unwrap();
     assert_eq!(report["wanted"], Value::Null);
 }

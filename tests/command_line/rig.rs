@@ -1,4 +1,4 @@
-//! `wildcity rig`: every preset is shown, drawn, and checked.
+//! `wildcity twin rig`: every preset is shown, drawn, and checked.
 
 use std::process::{Command, Output};
 
@@ -11,7 +11,11 @@ use wildcity_scene::geometry::Pose;
 use crate::images::cpu;
 
 fn wildcity(arguments: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_wildcity")).arg("rig").args(arguments).output().unwrap()
+    Command::new(env!("CARGO_BIN_EXE_wildcity"))
+        .args(["twin", "rig"])
+        .args(arguments)
+        .output()
+        .unwrap()
 }
 
 fn said(output: &Output) -> String {

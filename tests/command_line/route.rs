@@ -1,4 +1,4 @@
-//! `wildcity route`, file in, file out.
+//! `wildcity twin route`, file in, file out.
 
 use std::fs;
 use std::path::Path;
@@ -11,7 +11,7 @@ use crate::drives::straight;
 
 fn route(arguments: &[&str], dir: &Path) -> Output {
     let mut command = Command::new(env!("CARGO_BIN_EXE_wildcity"));
-    command.arg("route").args(arguments).current_dir(dir).output().unwrap()
+    command.args(["twin", "route"]).args(arguments).current_dir(dir).output().unwrap()
 }
 
 fn done(arguments: &[&str], dir: &Path) -> String {

@@ -1,4 +1,4 @@
-//! `wildcity scenario` and `wildcity map`: files in, files and errors with their place out.
+//! `wildcity scenario` and `wildcity twin map`: files in, files and errors with their place out.
 
 use std::fs;
 use std::path::Path;
@@ -44,10 +44,20 @@ fn a_scenario_is_checked_and_shown_with_its_map() {
     let dir = support::twins();
     let at = dir.path();
     let twins = ["--twins", "."];
-    let strips =
-        ["map", "strips", "test", "--left-m", "3", "--right-m", "2", "--out", "test.map.json"];
+    let strips = [
+        "twin",
+        "map",
+        "strips",
+        "test",
+        "--left-m",
+        "3",
+        "--right-m",
+        "2",
+        "--out",
+        "test.map.json",
+    ];
     assert!(done(&[&strips[..], &twins].concat(), at).contains("1 lanes"));
-    assert!(done(&["map", "check", "test.map.json"], at).contains("1 lanes, 1 areas"));
+    assert!(done(&["twin", "map", "check", "test.map.json"], at).contains("1 lanes, 1 areas"));
     fs::write(at.join("two.json"), scenario().to_string()).unwrap();
     let checked = done(&[&["scenario", "check", "two.json"][..], &twins].concat(), at);
     assert!(checked.contains("6 episodes in test@1, 2 actors"), "{checked}");
@@ -193,9 +203,9 @@ fn files_of_others_become_maps_and_scenarios() {
                       "geometry": {"type": "Polygon", "coordinates": square}});
     let collection = json!({"type": "FeatureCollection", "features": [area]});
     fs::write(at.join("a.geojson"), collection.to_string()).unwrap();
-    let import = ["map", "import", "a.geojson", "--out", "a.map.json"];
+    let import = ["twin", "map", "import", "a.geojson", "--out", "a.map.json"];
     assert!(done(&import, at).contains("0 lanes, 1 areas"));
-    assert!(done(&["map", "check", "a.map.json"], at).contains("1 areas"));
+    assert!(done(&["twin", "map", "check", "a.map.json"], at).contains("1 areas"));
     fs::write(at.join("a.geojson"), collection.to_string().replace("drivable", "lava")).unwrap();
     let error = refused(&import, at);
     assert!(
@@ -210,7 +220,7 @@ fn files_of_others_become_maps_and_scenarios() {
          <Storyboard><Init><Actions/></Init></Storyboard>\n</OpenSCENARIO>"
     );
     fs::write(at.join("a.xosc"), &xosc).unwrap();
-    let error = refused(&["map", "import", "a.xosc", "--out", "b.map.json"], at);
+    let error = refused(&["twin", "map", "import", "a.xosc", "--out", "b.map.json"], at);
     assert!(error.contains("a.xosc is OpenSCENARIO: `wildcity scenario import`"), "{error}");
     let import = ["scenario", "import", "a.xosc", "--twin", "street", "--out", "a.json"];
     assert!(done(&import, at).contains("wildcity scenario check"));

@@ -35,7 +35,7 @@ fn skies_are_imported_replaced_and_removed() {
     // A sky network has the axes of its scene: z of the world (up) is -y of the file.
     let named = version.manifest.sky.clone().unwrap();
     assert_eq!(named.sky_from_world, [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]);
-    let (_, said, _) = run(&["inspect", "street"]);
+    let (_, said, _) = run(&["twin", "show", "street"]);
     assert!(said.contains(&format!("sky         {}", &named.object[..16])), "{said}");
 
     let (code, _, error) = run(&["twin", "sky", "street", "--remove"]);

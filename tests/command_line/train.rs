@@ -31,7 +31,8 @@ fn recorded(dir: &Path) {
         ],
     );
     let views = ["--offsets", "0.01", "--every", "25m", "--side", "160", "--cameras", "front,rear"];
-    let fixed = ["augment", "lane", "--twins", "twins", "--out", "recorded", "--points", "3000"];
+    let fixed =
+        ["train", "augment", "lane", "--twins", "twins", "--out", "recorded", "--points", "3000"];
     done(dir, &[&fixed[..], &views].concat());
 }
 

@@ -67,7 +67,7 @@ fn import_inspect_and_verify_print_the_contents() {
         let twins = dir.path().join("twins");
         stdout(
             &wildcity()
-                .args(["inspect", "street", "--twins"])
+                .args(["twin", "show", "street", "--twins"])
                 .arg(twins)
                 .args(more)
                 .output()
@@ -246,7 +246,7 @@ fn help_has_examples() {
         ("import", "wildcity import skull.ply --twin skull --axes y-down-z-forward"),
         ("import", "Memory: twice the uncompressed scene"),
         ("import", "streamed SOG        a folder, or one .zip"),
-        ("inspect", "wildcity inspect street@2"),
+        ("twin show", "wildcity twin show street@2"),
         ("twin fsck", "wildcity twin fsck street"),
         ("twin gc", "wildcity twin gc street --keep 20 --dry-run"),
     ] {

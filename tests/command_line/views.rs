@@ -77,7 +77,7 @@ fn images_are_stored_scaled_along_the_drive_and_removed() {
         assert!(image.iter().all(|value| value.abs_diff(grey) <= 3), "{index}");
     }
     assert!(stored.iter().all(|view| view.mask.is_none() && view.exposure_stops.is_none()));
-    let said = done(at, &["inspect", "street", "--twins", "twins"]);
+    let said = done(at, &["twin", "show", "street", "--twins", "twins"]);
     assert!(said.contains("views       6 recorded images"), "{said}");
 
     let said = refused(at, &views("bare"));

@@ -4,23 +4,22 @@
 use std::process::{Command, Output};
 
 /// Commands, and the feature that each needs.
-const LEFT_OUT: [(&[&str], &str); 17] = [
+const LEFT_OUT: [(&[&str], &str); 16] = [
     (&["actor", "push"], "http"),
     (&["alpasim"], "alpasim"),
-    (&["augment"], "augment"),
-    (&["bisect"], "gpu"),
-    (&["devices"], "gpu"),
-    (&["drive"], "alpasim"),
+    (&["dev", "bisect"], "gpu"),
+    (&["dev", "devices"], "gpu"),
+    (&["dev", "stress"], "stress"),
     (&["episode"], "suite"),
     (&["eval"], "eval"),
     (&["log"], "log"),
-    (&["map", "import"], "convert"),
     (&["push"], "http"),
     (&["report"], "report"),
     (&["scenario", "check"], "suite"),
     (&["scenario", "from-log"], "log"),
     (&["scenario", "import"], "convert"),
-    (&["stress"], "stress"),
+    (&["train"], "train"),
+    (&["twin", "map", "import"], "convert"),
     (&["twin", "views"], "eval"),
 ];
 

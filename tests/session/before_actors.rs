@@ -1,7 +1,7 @@
 //! Frames without actors are those of the builds before there were actors: the images of commit
 //! 4f2fba29, which served the same file with the cpu backend to an agent that sent the same poses.
 //! Its demo street had the same images as well: 13 frames of six full-size cameras, and today's
-//! `wildcity replay --verify` finds no difference in its record.
+//! `wildcity episode verify` finds no difference in its record.
 //!
 //! A change of the images of pinhole cameras on purpose changes the hashes. Then compare such a
 //! build with the previous one, and write the new hashes into this file.

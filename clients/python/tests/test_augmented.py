@@ -1,4 +1,4 @@
-"""Views of `wildcity augment`: read by the data set class, by pycolmap, and by geometry that is written here alone."""
+"""Views of `wildcity train augment`: read by the data set class, by pycolmap, and by geometry of this file alone."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def augment(reader: dict[str, str], out: Path, *more: str) -> None:
-    command = ["wildcity", "augment", "demo", "--offsets", "1", "--side", "480", "--points", "2000"]
+    command = ["wildcity", "train", "augment", "demo", "--offsets", "1", "--side", "480", "--points", "2000"]
     command += ["--cameras", "front,left", "--out", str(out), *more]
     done = subprocess.run(command, env=reader, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""nerfstudio's own parser and loaders read the views of `wildcity augment`.
+"""nerfstudio's own parser and loaders read the views of `wildcity train augment`.
 
 Needs PyTorch (some gigabytes), so it is optional. It was run with torch 2.5.1 and numpy 1.26 after
 
@@ -62,8 +62,8 @@ def folders(reader: dict[str, str], tmp_path_factory: pytest.TempPathFactory) ->
     run(reader, "twin", "drive", "fisheyes", "--rig", str(at / "rig.json"))
     options = ["--offsets", "1", "--every", "40m", "--points", "100", "--out"]
     # The images of `front` and `left` differ in size and focal length.
-    run(reader, "augment", "demo", "--cameras", "front,left", *options, str(at / "pinholes"))
-    run(reader, "augment", "fisheyes", "--lenses", *options, str(at / "lenses"))
+    run(reader, "train", "augment", "demo", "--cameras", "front,left", *options, str(at / "pinholes"))
+    run(reader, "train", "augment", "fisheyes", "--lenses", *options, str(at / "lenses"))
     return {kind: at / kind for kind in ("pinholes", "lenses")}
 
 

@@ -88,7 +88,7 @@ def double(elements: int) -> bytes:
 
 def check(manifest: Path, *options: str) -> subprocess.CompletedProcess[str]:
     library = next((Path(onnxruntime.__file__).parent / "capi").glob("libonnxruntime.so*"))
-    command = [binary(), "repair", "check", manifest, "--onnxruntime", library, *options]
+    command = [binary(), "dev", "repair", manifest, "--onnxruntime", library, *options]
     return subprocess.run(command, capture_output=True, text=True)
 
 

@@ -52,7 +52,9 @@ def test_a_page_does_what_it_says(page: str, quick_reader: dict[str, str], tmp_p
     text = (ROOT / page).read_text().replace("127.0.0.1:6000", "127.0.0.1:0").replace("8080", str(port))
     # Without a rig of its own, this page's twin has six cameras of 1440 x 928 pixels.
     rig = Path(quick_reader["XDG_DATA_HOME"]).with_name("rig.json")
-    text = text.replace("\nwildcity augment lane ", f"\nwildcity twin drive lane --rig {rig}\nwildcity augment lane ")
+    text = text.replace(
+        "\nwildcity train augment lane ", f"\nwildcity twin drive lane --rig {rig}\nwildcity train augment lane "
+    )
     blocks = [block for block in BLOCK.findall(text) if block[0] in ("sh", "python")]
     assert blocks, f"{page} has nothing to run"
     servers: list[subprocess.Popen[str]] = []
@@ -145,4 +147,4 @@ def test_the_demo_suite_tells_drivers_apart(quick_reader: dict[str, str], tmp_pa
 
 def test_a_page_that_says_something_else_fails(quick_reader: dict[str, str], tmp_path: Path) -> None:
     with pytest.raises(AssertionError, match="no-such-twin"):
-        run(["bash", "-euc", "wildcity inspect no-such-twin"], tmp_path, quick_reader)
+        run(["bash", "-euc", "wildcity twin show no-such-twin"], tmp_path, quick_reader)

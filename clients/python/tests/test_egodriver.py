@@ -1,4 +1,4 @@
-"""`wildcity drive`: stock drivers of the package carla-driver-interface drive in a twin."""
+"""`wildcity alpasim drive`: stock drivers of the package carla-driver-interface drive in a twin."""
 
 from __future__ import annotations
 
@@ -31,7 +31,18 @@ def driver(policy: BaseDriver) -> Iterator[str]:
 
 def drive(server: Server, address: str, *arguments: str) -> tuple[int, list[dict[str, Any]], str]:
     binary = os.environ["WILDCITY_BIN"]
-    command = [binary, "drive", "corridor", "--egodriver", address, "--server", server.url, *COMMON, *arguments]
+    command = [
+        binary,
+        "alpasim",
+        "drive",
+        "corridor",
+        "--egodriver",
+        address,
+        "--server",
+        server.url,
+        *COMMON,
+        *arguments,
+    ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     return done.returncode, [json.loads(line) for line in done.stdout.splitlines()], done.stderr
 
@@ -235,7 +246,7 @@ def test_the_scenario_says_how_the_ego_starts(tmp_path: Path, dynamics: dict[str
 @pytest.mark.parametrize(("speed", "is_ordered"), [("5.004", True), ("4.9", False)])
 def test_an_agent_that_starts_at_another_speed_is_not_judged(tmp_path: Path, speed: str, is_ordered: bool) -> None:
     with driver(load_policy("route_follower")) as address:
-        agent = f"{os.environ['WILDCITY_BIN']} drive --egodriver {address} --speed {speed}"
+        agent = f"{os.environ['WILDCITY_BIN']} alpasim drive --egodriver {address} --speed {speed}"
         _, result = run_suite(tmp_path, agent)
     (episode,) = result["episodes"]
     said = [error["message"] for error in episode.get("errors", [])]
@@ -271,7 +282,7 @@ def street(quick_reader: dict[str, str]) -> Iterator[Server]:
 @pytest.mark.parametrize("policy", ["route_follower", "constant_speed"])
 def test_a_stock_policy_drives_60_steps_of_the_demo_street(street: Server, policy: str) -> None:
     options = ["--steps", "60", "--cameras", "front", "--size", "96x62"]
-    command = [os.environ["WILDCITY_BIN"], "drive", "demo", "--server", street.url, *options]
+    command = [os.environ["WILDCITY_BIN"], "alpasim", "drive", "demo", "--server", street.url, *options]
     with driver(load_policy(policy)) as address:
         runs = [
             subprocess.run([*command, "--egodriver", address], capture_output=True, text=True, timeout=240)

@@ -13,12 +13,14 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import numpy as np
 import pytest
 import wildcity
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
+ROOT = Path(__file__).resolve().parents[3]
 PEDESTRIAN = {
     "format": "wildcity.scenario/1",
     "name": "walk",
@@ -88,6 +90,34 @@ def driven(
     subprocess.run(command, env=quick_reader, check=True, capture_output=True)
     assert encoded(record.with_suffix(".mcap").read_bytes()) == encoded(mcap.read_bytes()), "the run wrote the same"
     return lines_of(record), mcap.read_bytes()
+
+
+def strict(schema: Any) -> Any:
+    """A schema that refuses fields that it does not describe, unless it says that there are others."""
+    if isinstance(schema, list):
+        return [strict(value) for value in schema]
+    if not isinstance(schema, dict):
+        return schema
+    closed = {"additionalProperties": False} if "properties" in schema else {}
+    return {**closed, **{key: strict(value) for key, value in schema.items()}}
+
+
+def test_every_line_of_a_record_is_in_the_schema(
+    driven: tuple[list[dict[str, Any]], bytes], quick_reader: dict[str, str], tmp_path: Path
+) -> None:
+    schema = strict(json.loads((ROOT / "protocol" / "record.json").read_text()))
+    jsonschema.Draft202012Validator.check_schema(schema)
+    validator = jsonschema.Draft202012Validator(schema)
+    lines, _ = driven
+    kinds = Counter(line["kind"] for line in lines)
+    assert kinds.keys() == {"episode", "scenario", "actors", "event", "frame", "result", "end"}, kinds
+    for line in lines:
+        kind = line["kind"]
+        validator.validate(line)
+        assert not validator.is_valid({**line, "unknown": 1}), kind
+        required = schema["oneOf"][[one["title"] for one in schema["oneOf"]].index(line.get("event", kind))]["required"]
+        for name in required:
+            assert not validator.is_valid({key: line[key] for key in line if key != name}), f"{kind} without {name}"
 
 
 def encoded(data: bytes) -> list[tuple[str, int, bytes]]:
@@ -253,7 +283,7 @@ def test_kill_9_of_a_server_loses_at_most_the_step_under_way(quick_reader: dict[
         # Every answer that was sent is on record; beside them at most the step under way.
         assert recorded[: len(answered)] == answered and len(recorded) <= len(answered) + 1
         verified = subprocess.run(
-            ["wildcity", "replay", str(record), "--verify"], env=quick_reader, capture_output=True, text=True
+            ["wildcity", "episode", "verify", str(record)], env=quick_reader, capture_output=True, text=True
         )
         assert verified.returncode == 3, f"{verified.stdout}\n{verified.stderr}"
         assert f"verified to step {frames[-1]['step']}" in verified.stderr, verified.stderr

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import stat
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -127,12 +128,14 @@ def test_a_reset_leaves_a_record_only_if_asked_to(tmp_path: Path, record: bool) 
     assert len(list((tmp_path / "episodes").glob("*.jsonl"))) == (2 if record else 0)
 
 
-def test_a_twin_that_is_not_there_is_named(server: Server) -> None:
-    for kind in (DriveEnv, lambda **arguments: DriveVectorEnv(1, **arguments)):
-        env = kind(server=server.url, **{**SMALL, "twin": "nope"})
+def test_a_twin_that_is_not_there_is_named_when_it_is_asked_for(server: Server) -> None:
+    threads = threading.active_count()
+    for make in (gymnasium.make, gymnasium.make_vec):
         with pytest.raises(ValueError, match="there is no twin 'nope'; the server has corridor"):
-            env.reset(seed=1)
-        env.close()
+            make("wildcity/Drive-v0", server=server.url, **{**SMALL, "twin": "nope"})
+        with pytest.raises(wildcity.ConnectFailed):
+            make("wildcity/Drive-v0", server="127.0.0.1:9", **SMALL)
+    assert threading.active_count() == threads
 
 
 def test_an_episode_ends_off_the_route_at_its_end_and_at_the_horizon(server: Server) -> None:

@@ -88,7 +88,7 @@ def test_lanes_and_areas(is_local: bool, tmp_path: Path) -> None:
     assert len(next(area for area in found["areas"] if area["kind"] == "drivable")["outline"]) == 3
     program = os.environ.get("WILDCITY_BIN")
     assert program, "set WILDCITY_BIN to the built wildcity binary"
-    done = subprocess.run([program, "map", "check", str(out)], capture_output=True, text=True)
+    done = subprocess.run([program, "twin", "map", "check", str(out)], capture_output=True, text=True)
     assert done.returncode == 0 and "3 lanes, 2 areas" in done.stdout, done.stderr
 
 

@@ -84,7 +84,7 @@ def test_a_scene(tmp_path: Path) -> None:
         wanted = world(row["time_us"] + log.epoch_us) @ BOX
         np.testing.assert_allclose(log.pose(row["world_from_box"]), wanted, rtol=0, atol=1e-6)
     left_out = " ".join(log.head["left_out"])
-    for part in (f"images of {WIDE}: 20", "class gremlin: 3", "map.xodr: 1 (`wildcity map import`", "archive: 1"):
+    for part in (f"images of {WIDE}: 20", "class gremlin: 3", "map.xodr: 1 (`wildcity twin map import`", "archive: 1"):
         assert part in left_out
 
 

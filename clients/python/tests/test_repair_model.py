@@ -47,8 +47,8 @@ def test_the_server_takes_the_file_and_draws_it_in_tiles_that_equal_the_whole() 
     library = next((Path(onnxruntime.__file__).parent / "capi").glob("libonnxruntime.so*"))
     command = [
         binary(),
+        "dev",
         "repair",
-        "check",
         ROOT / "scenes" / "repair.json",
         "--onnxruntime",
         library,

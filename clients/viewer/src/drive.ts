@@ -209,6 +209,7 @@ export class DrivePage implements Page {
     this.element.dataset.session = metadata.session;
     const end = metadata.events?.find(({ kind }) => kind === "end");
     if (end) showStatus(`the episode ended: ${end.name}. R: start again`, end.name === "route_done" ? "good" : "bad");
+    this.mosaic.drives(metadata.time_us, forwardSpeed(metadata));
     await this.mosaic.show(observation);
   }
 }

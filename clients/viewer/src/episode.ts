@@ -6,7 +6,7 @@ import { el, fixed, messageOf, showStatus, showTitle } from "./dom";
 import { MapView } from "./map";
 import { Mosaic } from "./mosaic";
 import type { Page } from "./page";
-import { clamp } from "./pose";
+import { clamp, length, subtract } from "./pose";
 import { load } from "./record";
 import type { RecordedFrame, Recording } from "./record";
 import type { Metadata, TwinInfo } from "./messages";
@@ -62,6 +62,15 @@ class Player {
     }
   }
 
+  /** The speed between a frame and the one before it, in m/s. */
+  private speedAt(frame: RecordedFrame): number {
+    const { frames } = this.recording;
+    const at = frames.indexOf(frame);
+    const [before, after] = [frames[Math.max(0, at - 1)]!, frames[Math.max(1, at)] ?? frame];
+    const seconds = (after.time_us - before.time_us) * 1e-6;
+    return seconds > 0 ? length(subtract(after.pose.xyz, before.pose.xyz)) / seconds : 0;
+  }
+
   private async render(frame: RecordedFrame): Promise<Metadata> {
     const { twin, cameras, profile } = this.recording;
     this.client ??= new Client();
@@ -89,6 +98,7 @@ class Player {
     this.verdict.textContent = compared.length === 0 ? "no images recorded here"
       : isSame ? `${equal.length} of ${compared.length} images have the recorded hash`
       : `${compared.length - equal.length} of ${compared.length} images differ${reason && ` (${reason})`}`;
+    this.mosaic.drives(frame.time_us, this.speedAt(frame));
     await this.mosaic.show(observation);
     this.element.dataset.same = String(isSame);
     this.element.dataset.timeUs = String(frame.time_us);

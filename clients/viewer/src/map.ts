@@ -1,5 +1,7 @@
-// The map: recorded drives, route, trail by trust, actors and the ego, seen from above with north up.
+// The map: recorded drives, route, trail by trust, actors and the ego, over a picture from above, with north up.
 
+import { aerial } from "./aerial";
+import type { Aerial } from "./aerial";
 import { Drawing, colour, fixed, trustColour } from "./dom";
 import { clamp, heading, transform } from "./pose";
 import type { Pose, Vector } from "./pose";
@@ -35,6 +37,8 @@ const TRAIL_POINTS = 20_000;
 /** How far beside a drive a click still means it, in pixels. */
 const CLICK_PX = 14;
 const MARK_PX = 5;
+/** Of the picture from above, so that what is drawn over it is seen. */
+const GROUND_ALPHA = 0.75;
 const FIT_SHARE = 0.8;
 
 export class MapView {
@@ -45,6 +49,7 @@ export class MapView {
 
   private readonly drawing = new Drawing((context, width, height) => this.draw(context, width, height));
   private drives: Drive[] = [];
+  private ground: Aerial | undefined;
   private trail: TrailPoint[] = [];
   private ghosts: { points: Vector[]; colour: string }[] = [];
   private now: Metadata | undefined;
@@ -89,6 +94,15 @@ export class MapView {
       const { poses } = await get<{ poses: DrivePoint[] }>(`${path}&every_m=${everyM}`);
       return { name, points: poses };
     }));
+    this.drawing.redraw();
+    void this.loadGround(twin, version);
+  }
+
+  /** The map is drawn without a picture until the server has rendered one, and where it does not. */
+  private async loadGround(twin: string, version: number): Promise<void> {
+    const places = this.drives.flatMap(({ points }) => points.map(({ pose }) => pose.xyz));
+    this.ground = await aerial(twin, version, places).catch(() => undefined);
+    this.element.dataset.ground = this.ground?.picture.dataset.hash ?? "";
     this.drawing.redraw();
   }
 
@@ -232,11 +246,12 @@ export class MapView {
     };
     context.lineJoin = "round";
     context.lineCap = "round";
+    if (this.ground) this.paint(context, toScreen, this.ground);
     for (const outline of this.outlines) line([...outline, outline[0]!], colour("dim"), 0.5);
     for (const { points } of this.drives) {
       const path = points.map(({ pose }) => pose.xyz);
-      line(path, colour("line"), Math.max(5, 3 * this.pixelsPerM));
-      line(path, colour("dim"), 1, [5, 5]);
+      if (!this.ground) line(path, colour("line"), Math.max(5, 3 * this.pixelsPerM));
+      line(path, this.ground ? "#fff" : colour("dim"), 1, [5, 5]);
     }
     for (const ghost of this.ghosts) line(ghost.points, colour(ghost.colour), 1.5);
     for (let at = 1; at < this.trail.length; at++) {
@@ -264,6 +279,16 @@ export class MapView {
       this.box(context, toScreen, now.ego.pose, ends, EGO_WIDTH_M, colour("accent"));
     }
     this.scaleBar(context, height);
+  }
+
+  private paint(context: CanvasRenderingContext2D, toScreen: (point: Vector) => [number, number], ground: Aerial): void {
+    const { picture, middle, metresPerPixel } = ground;
+    const scale = metresPerPixel * this.pixelsPerM;
+    const [x, y] = toScreen([...middle, 0]);
+    const [width, height] = [picture.width * scale, picture.height * scale];
+    context.globalAlpha = GROUND_ALPHA;
+    context.drawImage(picture, x - width / 2, y - height / 2, width, height);
+    context.globalAlpha = 1;
   }
 
   private box(
@@ -297,6 +322,8 @@ export class MapView {
     const wanted = 90 / this.pixelsPerM;
     const decade = 10 ** Math.floor(Math.log10(wanted));
     const metres = [5, 2, 1].map((step) => step * decade).find((step) => step <= wanted) ?? decade;
+    context.fillStyle = colour("panel");
+    context.fillRect(4, height - 30, metres * this.pixelsPerM + 12, 24);
     context.fillStyle = colour("dim");
     context.fillRect(10, height - 12, metres * this.pixelsPerM, 2);
     context.font = `11px ${colour("font")}`;

@@ -1,4 +1,4 @@
-// The images of all cameras, arranged as the cameras look.
+// The images of all cameras in the order of the rig, with what is driven on the large one: time and speed.
 
 import { el, fixed, trustColour } from "./dom";
 import type { ImageInfo } from "./messages";
@@ -30,6 +30,7 @@ export class Mosaic {
   /** Called once for each image that has been drawn. */
   private note: (image: ImageInfo) => string = () => "";
   private main: Cell | undefined;
+  private readonly hud = el("span.hud", { hidden: true });
 
   constructor() {
     new ResizeObserver(() => this.layOut()).observe(this.element);
@@ -38,6 +39,12 @@ export class Mosaic {
   /** A text to be shown on each image. */
   annotate(note: (image: ImageInfo) => string): void {
     this.note = note;
+  }
+
+  /** Shows the time and the speed, in m/s, over the large image. */
+  drives(timeUs: number, speed: number): void {
+    this.hud.hidden = false;
+    this.hud.textContent = `${fixed(timeUs * 1e-6, 1)} s · ${fixed(speed, 1)} m/s · ${fixed(speed * 3.6, 0)} km/h`;
   }
 
   /** Decodes and draws an observation. Images of cameras without a new frame stay. */
@@ -75,6 +82,7 @@ export class Mosaic {
     for (const image of images) this.cells.set(image.camera, this.cell(image));
     this.main = [...this.cells.values()].sort((a, b) => Math.abs(a.yaw) - Math.abs(b.yaw))[0];
     this.main?.element.classList.add("main");
+    this.main?.element.append(this.hud);
     if (this.large && !this.cells.has(this.large)) this.enlarge(undefined);
     this.layOut();
   }
@@ -84,7 +92,7 @@ export class Mosaic {
     const { main } = this;
     if (!main) return;
     const { clientWidth: width, clientHeight: height } = this.element;
-    const cells = [...this.cells.values()].sort((a, b) => fromLeft(a) - fromLeft(b));
+    const cells = [...this.cells.values()];
     const others = cells.filter((cell) => cell !== main);
     const isFront = ({ yaw }: Cell): boolean => Math.abs(yaw) < FRONT_RAD;
     const rows = [cells.filter(isFront), cells.filter((cell) => !isFront(cell))].filter((row) => row.length > 0);
@@ -139,16 +147,11 @@ export class Mosaic {
     this.large = camera;
     this.element.classList.toggle("one", camera !== undefined);
     for (const [name, { element }] of this.cells) element.classList.toggle("large", name === camera);
+    (this.cells.get(camera ?? "") ?? this.main)?.element.append(this.hud);
   }
 }
 
 const aspectOf = (cells: Cell[]): number => cells.reduce((sum, { aspect }) => sum + aspect, 0);
-
-/** Order of the cells: those in front from left to right, then those behind as if turned around: left, rear, right. */
-function fromLeft({ yaw }: Cell): number {
-  const isRear = Math.abs(yaw) > 3.1;
-  return isRear ? 0.001 : -yaw;
-}
 
 export async function decode(observation: Observation, image: ImageInfo): Promise<ImageBitmap | ImageData> {
   const bytes = observation.bytes(image);

@@ -29,6 +29,8 @@ const HELP: Record<Step, string> = {
   scale: "Click the two ends of something whose size you know, and give the size. Skip it if the twin is in metres.",
   path: "Click places of the ground along the way that the vehicle shall drive, at least two.",
 };
+/** A path that is shorter than a car is a wrong scale more often than a short drive. */
+const CAR_M = 4.6;
 /** Pixels that the pointer may move within a click. */
 const CLICK_PX = 5;
 const SAVE = "Save and drive";
@@ -271,14 +273,21 @@ export class PlacePage implements Page {
 
   /** The place of the twin that a pixel of the window shows. */
   private placeAt(clientX: number, clientY: number): Vector | undefined {
-    const { shown, shownPose } = this;
+    const { shownPose } = this;
     const pixel = this.pixelAt(clientX, clientY);
     const ray = this.rayTo(clientX, clientY);
-    const tensor = [...(shown?.tensors ?? [])].find(([name]) => name.endsWith("depth"))?.[1];
-    if (!tensor || !pixel || !ray || !shownPose) return undefined;
-    const depths = new DataView(tensor.bytes.buffer, tensor.bytes.byteOffset, tensor.bytes.byteLength);
-    const depth = depths.getFloat32(4 * (pixel[1] * this.size[0] + pixel[0]), true);
+    if (!pixel || !ray || !shownPose) return undefined;
+    const depth = this.depths()(...pixel);
     return depth > 0 ? add(shownPose.xyz, scaled(ray, depth)) : undefined;
+  }
+
+  /** The depth of the shown picture at a pixel; 0 where there is no surface, and beside the picture. */
+  private depths(): (column: number, row: number) => number {
+    const tensor = [...(this.shown?.tensors ?? [])].find(([name]) => name.endsWith("depth"))?.[1];
+    if (!tensor) return () => 0;
+    const depths = new DataView(tensor.bytes.buffer, tensor.bytes.byteOffset, tensor.bytes.byteLength);
+    const [w, h] = this.size;
+    return (column, row) => (column >= 0 && row >= 0 && column < w && row < h ? depths.getFloat32(4 * (row * w + column), true) : 0);
   }
 
   private click(x: number, y: number): void {
@@ -359,10 +368,13 @@ export class PlacePage implements Page {
     let units = 0;
     for (let at = 1; at < path.length; at++) units += length(subtract(path[at]!, path[at - 1]!));
     const scaleText = scale.state === "assumed" ? "no distance: 1 m per unit" : scale.missing || `${fixed(scale.metresPerUnit, 4)} m per unit`;
+    const metres = units * scale.metresPerUnit;
+    const isShort = path.length > 1 && metres < CAR_M;
     const found = {
       ground: this.groundText(),
       scale: scaleText,
-      path: `${count(path.length)} places, ${fixed(units * scale.metresPerUnit, 1)} m${scale.state === "given" ? "" : ` · ${scaleText}`}`,
+      path: `${count(path.length)} places, ${fixed(metres, 1)} m${isShort ? `, shorter than a car of ${CAR_M} m: is the scale right?` : ""}${
+        scale.state === "given" ? "" : ` · ${scaleText}`}`,
     };
     this.found.textContent = found[this.step];
     this.assumesMetres = false;
@@ -382,7 +394,7 @@ export class PlacePage implements Page {
 
   private drawOverlay(): void {
     const { shownPose: pose, size, focal } = this;
-    this.overlay.draw(pose && { pose, size, focal, box: this.shownBox() }, this.clicks, this.ground, this.orbit);
+    this.overlay.draw(pose && { pose, size, focal, box: this.shownBox(), depthAt: this.depths() }, this.clicks, this.ground, this.orbit);
   }
 
   /** Saves; without a known distance only when the user has read that it is missing, and presses again. */

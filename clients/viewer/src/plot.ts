@@ -4,6 +4,8 @@ import { Drawing, colour, el, fixed } from "./dom";
 import type { Metadata } from "./messages";
 
 const BARS = 120;
+/** The line above the bars. */
+const CAPTION_PX = 18;
 /** Colours of the stages, in the order of the stages; further stages begin again. */
 const COLOURS = ["#5b8fd1", "#4fb0a5", "#a7c957", "#e0ae4e", "#de7c4b", "#c2557a", "#8a6fc9", "#7d8a97"];
 
@@ -62,9 +64,10 @@ export class StagePlot {
     this.bars.forEach(({ parts }, at) => {
       let y = height;
       for (const { name, ms } of parts) {
-        const tall = (ms / top) * height;
+        const tall = (ms / top) * (height - CAPTION_PX);
         context.fillStyle = this.colourOf(name);
-        context.fillRect(width - (this.bars.length - at) * step, y - tall, Math.max(1, step - 0.6), tall);
+        const up = Math.max(CAPTION_PX, y - tall);
+        context.fillRect(width - (this.bars.length - at) * step, up, Math.max(1, step - 0.6), Math.max(0, y - up));
         y -= tall;
       }
     });

@@ -1,7 +1,7 @@
 // Watch a running session: its newest observations, without taking part in it.
 
 import { el, messageOf, showStatus, showTitle } from "./dom";
-import { Facts } from "./facts";
+import { Facts, forwardSpeed } from "./facts";
 import { MapView } from "./map";
 import { Mosaic } from "./mosaic";
 import type { Page } from "./page";
@@ -74,6 +74,7 @@ export class WatchPage implements Page {
         this.plot.show(metadata);
         this.facts.show(metadata);
         this.element.dataset.step = String(metadata.step);
+        this.mosaic.drives(metadata.time_us, forwardSpeed(metadata));
         await this.mosaic.show(observation);
         showStatus(`${metadata.twin} v${metadata.version}, ${metadata.backend}`, "good");
       }

@@ -61,6 +61,20 @@ test("the mosaic is what the Python client decodes", async () => {
   await close();
 });
 
+test("cameras are in the rig's order, the large one has time and speed, and the map a picture", async () => {
+  const { page, complaints, close } = await open(browser, server, "#/drive/demo");
+  await steps(page, 1);
+  const cameras = await page.$$eval(".cell canvas", (all) => all.map(({ dataset }) => dataset.camera));
+  assert.deepEqual(cameras, ["front", "front_left", "front_right", "left", "right", "rear"]);
+  assert.match(await page.textContent(".cell.main .hud"), /^\d+\.\d s · -?\d+\.\d m\/s · -?\d+ km\/h$/);
+  await page.waitForSelector(".map:not([data-ground=''])[data-ground]");
+  await page.click("canvas[data-camera=rear]");
+  assert.ok(await page.isVisible(".cell.large .hud"));
+  assert.equal(await page.$(".cell.main .hud"), null);
+  assert.deepEqual(complaints, []);
+  await close();
+});
+
 /** A session with a LiDAR, as an agent drives it; from a page, since Node has no WebSocket. */
 async function agent(name) {
   const { page, close } = await open(browser, server, "#/report");

@@ -137,7 +137,7 @@ impl ViewSessions {
 }
 
 async fn client(url: &str) -> anyhow::Result<Client> {
-    let mut client = Client::connect(url, "wildcity augment").await?;
+    let mut client = Client::connect(url, "wildcity train augment").await?;
     client.set_answer_timeout(PLACE_TIMEOUT + Duration::from_secs(60));
     Ok(client)
 }

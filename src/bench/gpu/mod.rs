@@ -42,8 +42,8 @@ pub(super) struct Gpu {
     )]
     gaussians: Vec<u32>,
 
-    /// The device: its number in `wildcity devices`, or a part of its name. Default: the fastest
-    /// kind.
+    /// The device: its number in `wildcity dev devices`, or a part of its name. Default: the
+    /// fastest kind.
     #[arg(long, value_name = "DEVICE")]
     device: Option<String>,
 

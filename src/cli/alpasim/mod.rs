@@ -1,8 +1,11 @@
 //! `wildcity alpasim`.
 
+mod drive;
 mod export;
 
-/// Files for AlpaSim.
+/// Drive with drivers of AlpaSim, and export scenes for its runtime.
+///
+/// `wildcity serve --alpasim` is a renderer for its runtime.
 #[derive(Debug, clap::Args)]
 pub(super) struct Alpasim {
     #[command(subcommand)]
@@ -11,6 +14,7 @@ pub(super) struct Alpasim {
 
 super::subcommands! {
     Command;
+    Drive(Box<drive::Drive>),
     Export(export::Export),
 }
 

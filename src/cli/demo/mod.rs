@@ -1,5 +1,6 @@
 //! `wildcity demo`.
 
+mod caption;
 mod driver;
 mod mosaic;
 #[cfg(feature = "eval")]
@@ -39,7 +40,7 @@ use super::backend_options::BackendOptions;
 use super::directories::Twins;
 #[cfg(feature = "eval")]
 use super::repair_options::runtime_library;
-use super::{output, progress, view};
+use super::{browser, output, progress};
 
 /// Build a demo street, drive through it as an agent, and write images of the drive.
 ///
@@ -149,7 +150,7 @@ impl Demo {
             ..Config::local(directories, Arc::from(self.backend.backend()?))
         };
         if self.view {
-            return view::serve(config, Some(TWIN), true);
+            return browser::serve(config, TWIN);
         }
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
         #[cfg(feature = "eval")]

@@ -3,7 +3,7 @@
 use std::io::Write;
 use std::path::PathBuf;
 
-use wildcity_suite::{Comparison, SuiteResult, Tolerance};
+use wildcity_suite::{Comparison, DrivenRun, SuiteResult, Tolerance};
 
 use crate::cli::exit::Exit;
 use crate::cli::output;
@@ -42,7 +42,7 @@ pub(super) struct Compare {
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
 
-    /// Write the comparison as a web page.
+    /// Write the comparison as a web page, with the drives of both runs side by side.
     #[arg(long, value_name = "FILE")]
     html: Option<PathBuf>,
 }
@@ -59,10 +59,13 @@ impl Compare {
         let after = SuiteResult::read(&self.after).map_err(bad_input)?;
         let rule = self.worse_by.into_iter().collect();
         let comparison = Comparison::new(&before, &after, &rule).map_err(bad_input)?;
-        for (path, text) in [(self.json, comparison.to_json()), (self.html, comparison.to_page())] {
-            if let Some(path) = path {
-                output::write(&path, text.as_bytes())?;
-            }
+        if let Some(path) = &self.json {
+            output::write(path, comparison.to_json().as_bytes())?;
+        }
+        if let Some(path) = &self.html {
+            let run = |result, run| DrivenRun { result, episodes: SuiteResult::records(run) };
+            let runs = [run(&before, &self.before), run(&after, &self.after)];
+            output::write(path, comparison.to_page(&runs).as_bytes())?;
         }
         let conclusion = comparison.conclusion();
         let mut out = output::stdout();

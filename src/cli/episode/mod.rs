@@ -11,6 +11,7 @@ mod run;
 mod run_agent;
 mod score;
 mod show;
+mod verify;
 mod video;
 
 use std::path::{Path, PathBuf};
@@ -22,12 +23,13 @@ use super::directories::Episodes;
 use super::exit::Exit;
 use folder::record_file;
 
-/// Drive suites of scenarios; compare runs; list, score, compare and export recorded episodes.
+/// Drive suites of scenarios; compare runs; list, score, verify and export recorded episodes.
 ///
 /// Exit codes of all of these commands: 0 for success; 1 if an episode failed (run), a run is worse
-/// (compare), two episodes differ (diff), or an episode cannot be scored, rendered or written; 2
-/// for a mistake in the command line, and for a file or folder that is missing or cannot be read.
-/// `run` also has 3 and 4, which its help explains.
+/// (compare), two episodes differ (diff), images differ from the recorded ones (verify), or an
+/// episode cannot be scored, rendered or written; 2 for a mistake in the command line, and for a
+/// file or folder that is missing or cannot be read. `run` also has 3 and 4, and `verify` 3, which
+/// their help explains.
 ///
 /// A record is named SCENARIO-SEED-1, with a sweep SCENARIO-COMBINATION-SEED-1. SCENARIO-SEED.2-1
 /// is the second attempt, after a technical failure of the first.
@@ -44,6 +46,7 @@ super::subcommands! {
     List(list::List),
     Prune(prune::Prune),
     Show(show::Show),
+    Verify(verify::Verify),
     Score(score::Score),
     Diff(diff::Diff),
     Export(Box<export::Export>),

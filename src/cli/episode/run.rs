@@ -7,9 +7,9 @@ use std::time::{Duration, Instant};
 
 use wildcity_render::Backend;
 use wildcity_suite::{
-    CaseOptions, CompareError, Comparison, Ending, EpisodeEntry, ExitCode, Rule, RunSettings,
-    SuiteError, SuiteFile, SuiteResult, TechnicalEntry, Tolerance, cases, check_criteria, junit,
-    page, pictures, verify,
+    CaseOptions, CompareError, Comparison, DrivenRun, Ending, EpisodeEntry, ExitCode, Rule,
+    RunSettings, SuiteError, SuiteFile, SuiteResult, TechnicalEntry, Tolerance, cases,
+    check_criteria, junit, page, pictures, verify,
 };
 use wildcity_twin::store::Catalog;
 
@@ -194,10 +194,13 @@ impl Run {
         bar.finish_and_clear();
 
         // Report.
-        let compared = before.map(|before| Comparison::new(&before, &result, &rule));
+        let compared = before.as_ref().map(|before| Comparison::new(before, &result, &rule));
         let ending = self.ending(&result, compared.as_ref(), &catalog, &*backend);
         let comparison = compared.and_then(Result::ok);
-        self.write_files(&result, &ending, comparison.as_ref(), &catalog, &*backend)?;
+        self.write_files(&result, &ending, &catalog, &*backend)?;
+        if let (Some(comparison), Some(before)) = (&comparison, &before) {
+            self.write_comparison(comparison, before, &result)?;
+        }
         self.print(&result, &ending, comparison.as_ref())?;
         match ending.code {
             ExitCode::Passed => Ok(()),
@@ -231,19 +234,28 @@ impl Run {
         &self,
         result: &SuiteResult,
         ending: &Ending,
-        comparison: Option<&Comparison>,
         catalog: &Catalog,
         backend: &dyn Backend,
     ) -> anyhow::Result<()> {
         let pictures = pictures(result, &self.episodes(), catalog, backend);
         self.write(SuiteResult::FILE, &result.to_json())?;
         self.write("junit.xml", &junit(result, ending))?;
-        self.write("report.html", &page(result, ending, &pictures, &self.episodes()))?;
-        if let Some(comparison) = comparison {
-            self.write("comparison.json", &comparison.to_json())?;
-            self.write("comparison.html", &comparison.to_page())?;
-        }
-        Ok(())
+        self.write("report.html", &page(result, ending, &pictures, &self.episodes()))
+    }
+
+    fn write_comparison(
+        &self,
+        comparison: &Comparison,
+        before: &SuiteResult,
+        after: &SuiteResult,
+    ) -> anyhow::Result<()> {
+        let earlier = self.against.as_deref().map_or(PathBuf::new(), SuiteResult::records);
+        let runs = [
+            DrivenRun { result: before, episodes: earlier },
+            DrivenRun { result: after, episodes: self.episodes() },
+        ];
+        self.write("comparison.json", &comparison.to_json())?;
+        self.write("comparison.html", &comparison.to_page(&runs))
     }
 
     fn write(&self, name: &str, text: &str) -> anyhow::Result<()> {

@@ -32,7 +32,7 @@ pub(super) fn choice(agent: &str) -> anyhow::Result<AgentChoice> {
                 ))
             })?;
             let program = std::env::current_exe().map_err(bad_input)?;
-            format!("'{}' drive --egodriver '{address}'", program.display())
+            format!("'{}' alpasim drive --egodriver '{address}'", program.display())
         }
         None if agent.trim().is_empty() => {
             return Err(bad_input(format!("the agent is empty: an agent is {AGENTS}")));

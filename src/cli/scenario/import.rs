@@ -48,8 +48,8 @@ pub(in crate::cli) struct Import {
     catalogs: Vec<PathBuf>,
 
     /// Easting and northing of the twin's origin; give the same values as to
-    /// `wildcity map import --origin` for these roads.
-    #[arg(long, value_name = "EAST,NORTH", value_parser = crate::cli::map::origin, allow_hyphen_values = true)]
+    /// `wildcity twin map import --origin` for these roads.
+    #[arg(long, value_name = "EAST,NORTH", value_parser = crate::cli::twin::map_origin, allow_hyphen_values = true)]
     origin: Option<[f64; 2]>,
 
     /// Give a parameter that the file declares another value; may be given again.
@@ -121,7 +121,7 @@ fn missing(scenario: &ScenarioFile) -> impl Iterator<Item = &'static str> {
         ),
         (
             scenario.map.is_none(),
-            "there is no map to judge the road by: add \"map\", a file that wildcity map import writes",
+            "there is no map to judge the road by: add \"map\", a file that wildcity twin map import writes",
         ),
         (end.time_s.is_none() && end.when.is_none(), "nothing ends it: add end.time_s"),
     ];

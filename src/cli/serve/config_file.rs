@@ -26,7 +26,7 @@ use super::limit_options::HEADING;
 const LIMITS: &str = "limits";
 
 /// Options that cannot be keys of a configuration file.
-const NOT_KEYS: [&str; 3] = ["config", "print_config", "help"];
+const NOT_KEYS: [&str; 5] = ["config", "help", "open", "print_config", "twin"];
 
 /// The options of one run.
 #[derive(Debug)]

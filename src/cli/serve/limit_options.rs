@@ -32,105 +32,105 @@ fn count() -> RangedU64ValueParser<usize> {
 #[command(next_help_heading = HEADING)]
 pub(super) struct LimitOptions {
     /// Largest number of sessions at a time, connected or waiting to be resumed.
-    #[arg(long, value_name = "N", default_value_t = Limits::default().sessions, value_parser = count())]
+    #[arg(long, hide = true, value_name = "N", default_value_t = Limits::default().sessions, value_parser = count())]
     sessions: usize,
 
     /// Largest number of WebSocket connections at a time; 64 more connections are accepted for HTTP
     /// requests only.
-    #[arg(long, value_name = "N", default_value_t = Limits::default().connections, value_parser = count())]
+    #[arg(long, hide = true, value_name = "N", default_value_t = Limits::default().connections, value_parser = count())]
     connections: usize,
 
     /// Largest number of pushes that wait or run at a time.
-    #[arg(long, value_name = "N", default_value_t = Limits::default().pushes, value_parser = count())]
+    #[arg(long, hide = true, value_name = "N", default_value_t = Limits::default().pushes, value_parser = count())]
     pushes: usize,
 
     /// Memory that running pushes may take together, in GiB [default: a third of --memory-gib]. A
     /// push waits until the memory that it may need is free: 24 times the size of its files, plus
     /// 0.25 GiB.
-    #[arg(long, value_name = "GIB", value_parser = gib)]
+    #[arg(long, hide = true, value_name = "GIB", value_parser = gib)]
     push_memory_gib: Option<f64>,
 
     /// Seconds that reading and checking one push may take.
-    #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().push.as_secs_f64(), value_parser = seconds)]
+    #[arg(long, hide = true, value_name = "SECONDS", default_value_t = Limits::default().push.as_secs_f64(), value_parser = seconds)]
     push_timeout_s: f64,
 
     /// Seconds within which a new connection must send its first message.
-    #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().hello.as_secs_f64(), value_parser = seconds)]
+    #[arg(long, hide = true, value_name = "SECONDS", default_value_t = Limits::default().hello.as_secs_f64(), value_parser = seconds)]
     hello_timeout_s: f64,
 
     /// Seconds that a connection may be silent between requests.
-    #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().idle.as_secs_f64(), value_parser = seconds)]
+    #[arg(long, hide = true, value_name = "SECONDS", default_value_t = Limits::default().idle.as_secs_f64(), value_parser = seconds)]
     idle_timeout_s: f64,
 
     /// Seconds within which a client must read an answer; at most 30, because clients wait for an
     /// answer for 90 s, of which a step may take 60.
-    #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().send.as_secs_f64(), value_parser = send_seconds)]
+    #[arg(long, hide = true, value_name = "SECONDS", default_value_t = Limits::default().send.as_secs_f64(), value_parser = send_seconds)]
     send_timeout_s: f64,
 
     /// Seconds for one step, including the time that it waits for other sessions; at most 60,
     /// because clients wait for an answer for 90 s.
-    #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().step.as_secs_f64(), value_parser = step_seconds)]
+    #[arg(long, hide = true, value_name = "SECONDS", default_value_t = Limits::default().step.as_secs_f64(), value_parser = step_seconds)]
     step_timeout_s: f64,
 
     /// Seconds that a session without a connection waits to be resumed.
-    #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().resume_grace.as_secs_f64(), value_parser = seconds)]
+    #[arg(long, hide = true, value_name = "SECONDS", default_value_t = Limits::default().resume_grace.as_secs_f64(), value_parser = seconds)]
     resume_grace_s: f64,
 
     /// Seconds that sessions may go on after SIGTERM; until then the server opens no new one and is
     /// not ready. A second SIGTERM stops it at once.
-    #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().sessions_end.as_secs_f64(), value_parser = waiting_seconds)]
+    #[arg(long, hide = true, value_name = "SECONDS", default_value_t = Limits::default().sessions_end.as_secs_f64(), value_parser = waiting_seconds)]
     sessions_end_s: f64,
 
     /// Seconds that running steps may take to finish when the server stops.
-    #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().drain.as_secs_f64(), value_parser = seconds)]
+    #[arg(long, hide = true, value_name = "SECONDS", default_value_t = Limits::default().drain.as_secs_f64(), value_parser = seconds)]
     drain_timeout_s: f64,
 
     /// Seconds between two returns of free memory to the system, while Gaussians are evicted or
     /// pushes run.
-    #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().memory_release.as_secs_f64(), value_parser = seconds)]
+    #[arg(long, hide = true, value_name = "SECONDS", default_value_t = Limits::default().memory_release.as_secs_f64(), value_parser = seconds)]
     memory_release_s: f64,
 
     /// Largest number of uploads that are kept at a time, finished or not.
-    #[arg(long, value_name = "N", default_value_t = SpoolLimits::default().uploads, value_parser = count())]
+    #[arg(long, hide = true, value_name = "N", default_value_t = SpoolLimits::default().uploads, value_parser = count())]
     max_uploads: usize,
 
     /// Largest size of an upload, in GiB.
-    #[arg(long, value_name = "GIB", default_value_t = bytes_as_gib(SpoolLimits::default().upload_bytes), value_parser = gib)]
+    #[arg(long, hide = true, value_name = "GIB", default_value_t = bytes_as_gib(SpoolLimits::default().upload_bytes), value_parser = gib)]
     upload_gib: f64,
 
     /// Largest total size of all uploads, in GiB.
-    #[arg(long, value_name = "GIB", default_value_t = bytes_as_gib(SpoolLimits::default().bytes), value_parser = gib)]
+    #[arg(long, hide = true, value_name = "GIB", default_value_t = bytes_as_gib(SpoolLimits::default().bytes), value_parser = gib)]
     spool_gib: f64,
 
     /// Largest total size of the uploads of one token, in GiB [default: half of --spool-gib if
     /// several tokens may upload, else all]
-    #[arg(long, value_name = "GIB", value_parser = gib)]
+    #[arg(long, hide = true, value_name = "GIB", value_parser = gib)]
     token_spool_gib: Option<f64>,
 
     /// Seconds that an upload is kept after its last byte.
-    #[arg(long, value_name = "SECONDS", default_value_t = SpoolLimits::default().age.as_secs_f64(), value_parser = seconds)]
+    #[arg(long, hide = true, value_name = "SECONDS", default_value_t = SpoolLimits::default().age.as_secs_f64(), value_parser = seconds)]
     upload_age_s: f64,
 
     /// Largest total size of all records, in GiB.
-    #[arg(long, value_name = "GIB", default_value_t = bytes_as_gib(Limits::default().records.bytes), value_parser = gib)]
+    #[arg(long, hide = true, value_name = "GIB", default_value_t = bytes_as_gib(Limits::default().records.bytes), value_parser = gib)]
     records_gib: f64,
 
     /// Largest total size of the records of one token, in GiB.
-    #[arg(long, value_name = "GIB", default_value_t = bytes_as_gib(Limits::default().records.owner_bytes), value_parser = gib)]
+    #[arg(long, hide = true, value_name = "GIB", default_value_t = bytes_as_gib(Limits::default().records.owner_bytes), value_parser = gib)]
     token_records_gib: f64,
 
     /// Number of records to keep: the newest ones; older ones are removed [default: all]. An
     /// episode that is driven, or ended within the last minute, keeps its record.
-    #[arg(long, value_name = "N", value_parser = count())]
+    #[arg(long, hide = true, value_name = "N", value_parser = count())]
     keep_records: Option<usize>,
 
     /// Days that a record is kept after its last line [default: for ever]
-    #[arg(long, value_name = "DAYS", value_parser = days)]
+    #[arg(long, hide = true, value_name = "DAYS", value_parser = days)]
     keep_records_days: Option<f64>,
 
     /// Size of all records to keep, with their MCAP files, in GiB: the oldest ones beyond it are
     /// removed [default: any size]. Below --records-gib, so that no episode is refused.
-    #[arg(long, value_name = "GIB", value_parser = gib)]
+    #[arg(long, hide = true, value_name = "GIB", value_parser = gib)]
     keep_records_gib: Option<f64>,
 }
 

@@ -25,7 +25,7 @@ use super::directories::ServerDirectories;
 use super::left_out::built_without;
 use super::profile_options::read_profile;
 use super::repair_options::{RepairOptions, runtime_library};
-use crate::cli::output;
+use crate::cli::{browser, output};
 
 /// Serve twins to agents over WebSocket.
 ///
@@ -33,12 +33,20 @@ use crate::cli::output;
 /// error. Ctrl-C or SIGTERM lets sessions go on for --sessions-end-s, then running steps finish,
 /// and stops.
 ///
-/// Every option can also be set in a TOML file: --memory-gib is memory_gib there, and the options
-/// under Limits are in the table [limits]. A flag overrides the file, and the file overrides a
-/// default.
+/// Every option can also be set in a TOML file: --memory-gib is memory_gib there. --print-config
+/// prints all of them, also those that only --help-all shows: the table [limits] has time-outs,
+/// counts and bytes. A flag overrides the file, and the file overrides a default.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Serve {
+    /// Twin whose page --open shows; without it, the page lists all.
+    #[arg(value_name = "TWIN", requires = "open")]
+    twin: Option<String>,
+
+    /// Open the viewer in the browser, to look at a twin and to drive by hand.
+    #[arg(long)]
+    open: bool,
+
     /// TOML file of options; `wildcity serve --print-config` prints one.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
@@ -103,12 +111,12 @@ pub(super) struct Serve {
 
     /// Allow an address of --alpasim that is not loopback: every machine that can connect to it can
     /// then read the twins.
-    #[arg(long, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = false, num_args = 0..=1, default_missing_value = "true")]
+    #[arg(long, hide = true, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = false, num_args = 0..=1, default_missing_value = "true")]
     alpasim_open: bool,
 
     /// Refuse shared memory to clients on this machine: they then receive observations through the
     /// socket only.
-    #[arg(long, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = false, num_args = 0..=1, default_missing_value = "true")]
+    #[arg(long, hide = true, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = false, num_args = 0..=1, default_missing_value = "true")]
     no_shared_memory: bool,
 
     /// Memory for the Gaussians of all twins and for the frames that are rendered from them, in
@@ -134,12 +142,12 @@ pub(super) struct Serve {
     log: Option<String>,
 
     /// How to write the log.
-    #[arg(long, value_enum, value_name = "FORMAT", default_value_t)]
+    #[arg(long, hide = true, value_enum, value_name = "FORMAT", default_value_t)]
     log_format: log::LogFormat,
 
     /// OpenTelemetry collector that receives traces of requests and pushes, by OTLP over HTTP, for
     /// example http://127.0.0.1:4318. Needs a program built with the feature otlp.
-    #[arg(long, value_name = "URL")]
+    #[arg(long, hide = true, value_name = "URL")]
     otlp_endpoint: Option<String>,
 
     #[command(flatten)]
@@ -149,6 +157,7 @@ pub(super) struct Serve {
 const EXAMPLES: &str = "\
 Examples:
   wildcity serve
+  wildcity serve --open street
   wildcity serve --memory-gib 2
   wildcity serve --twins ./twins --listen 127.0.0.1:0 --log debug
   wildcity serve --tokens tokens.json --listen 0.0.0.0:8080
@@ -226,7 +235,12 @@ impl Serve {
             "--twins {} is not a directory",
             twins.display()
         );
-        let found = self.directories.twins.catalog()?.twins()?;
+        let catalog = self.directories.twins.catalog()?;
+        if let Some(twin) = &self.twin {
+            // An unknown or damaged twin is reported here, and not by the page.
+            catalog.version(twin, None)?;
+        }
+        let found = catalog.twins()?;
         for DamagedTwin { name, error } in &found.damaged {
             tracing::error!(twin = name, "damaged, not served: {error}");
         }
@@ -288,7 +302,11 @@ impl Serve {
             if let Some(alpasim) = &alpasim {
                 writeln!(output::stdout(), "AlpaSim: listening on {}", alpasim.address())?;
             }
-            tracing::info!("viewer at {}", running.page());
+            if self.open {
+                browser::open(&running, self.twin.as_deref())?;
+            } else {
+                tracing::info!("viewer at {}", running.page());
+            }
             if let Some(address) = running.metrics_address() {
                 tracing::info!("metrics at http://{address}/metrics");
             }

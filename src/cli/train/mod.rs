@@ -1,5 +1,6 @@
 //! `wildcity train`.
 
+mod augment;
 mod block;
 mod block_parts;
 mod check;
@@ -54,6 +55,7 @@ Examples:
 subcommands! { TrainCommand;
     Plan(Box<plan::Plan>),
     Block(Box<block::Block>),
+    Augment(Box<augment::Augment>),
     Refine(Box<refine::Refine>),
     Loop(Box<rounds::Loop>),
     Check(check::Check),

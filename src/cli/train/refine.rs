@@ -29,9 +29,9 @@ use crate::cli::{output, progress};
 
 /// Train a twin further, on the images of its recording and on views off its drives.
 ///
-/// `wildcity augment` renders views off the drives, repairs them with a model and writes them with
-/// masks and weights. This command trains the Gaussians of the twin on them, beside the recorded
-/// images, and makes a new version of the twin, which is accurate farther off its drives.
+/// `wildcity train augment` renders views off the drives, repairs them with a model and writes them
+/// with masks and weights. This command trains the Gaussians of the twin on them, beside the
+/// recorded images, and makes a new version of the twin, which is accurate farther off its drives.
 /// `wildcity train loop` does this round by round. Poses, sky and the number of Gaussians stay as
 /// they are.
 ///
@@ -48,7 +48,7 @@ pub(in crate::cli) struct Refine {
     #[command(flatten)]
     recorded: RecordedImages,
 
-    /// Views off the drives: a folder DIR/round_N of `wildcity augment`. May be given again.
+    /// Views off the drives: a folder DIR/round_N of `wildcity train augment`. May be given again.
     #[arg(long, value_name = "DIR")]
     augmented: Vec<PathBuf>,
 
@@ -82,7 +82,7 @@ pub(in crate::cli) struct Refine {
 
 const EXAMPLES: &str = "\
 Examples:
-  wildcity augment street --repair model.json --round 1 --out augmented
+  wildcity train augment street --repair model.json --round 1 --out augmented
   wildcity train refine street --images capture --augmented augmented/round_1";
 
 /// One view of so many off the drives judges a run.
@@ -91,8 +91,8 @@ const JUDGES: u8 = 8;
 /// Views that judge a run, by their distance from the drives in centimetres.
 type Judges = BTreeMap<u32, ListedImages>;
 
-/// The distance from the drive that the name of a view of `wildcity augment` says, in centimetres:
-/// 150 of `front/log_00012.00_left1.50.png`.
+/// The distance from the drive that the name of a view of `wildcity train augment` says, in
+/// centimetres: 150 of `front/log_00012.00_left1.50.png`.
 fn offset_cm(name: &str) -> Option<u32> {
     let (_, offset) = name.strip_suffix(".png")?.rsplit_once('_')?;
     let offset = offset.strip_prefix("left").or_else(|| offset.strip_prefix("right"))?;

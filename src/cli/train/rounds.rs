@@ -12,8 +12,8 @@ use crate::cli::{self, Options};
 
 /// Make a twin accurate off its drives, round by round: render views, repair them, train on them.
 ///
-/// Round N renders views at min(0.5 m x N, OFFSET) beside the drives (`wildcity augment`), repairs
-/// them with the model of --repair, trains the twin on them and on its recorded images
+/// Round N renders views at min(0.5 m x N, OFFSET) beside the drives (`wildcity train augment`),
+/// repairs them with the model of --repair, trains the twin on them and on its recorded images
 /// (`wildcity train refine`), and makes a new version of the twin, from which the next round
 /// renders. A server that is running serves each new version to the sessions that open it. Each
 /// round has a page in --out.
@@ -46,15 +46,16 @@ pub(in crate::cli) struct Loop {
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1_000))]
     from: u32,
 
-    /// Lateral offsets that the rounds lead to, as for `wildcity augment`.
+    /// Lateral offsets that the rounds lead to, as for `wildcity train augment`.
     #[arg(long, value_name = "M,..", default_value = "1,3,5")]
     offsets: String,
 
-    /// Distance between two views along a drive, as for `wildcity augment`.
+    /// Distance between two views along a drive, as for `wildcity train augment`.
     #[arg(long, value_name = "M", default_value = "2")]
     every: String,
 
-    /// Render views of these cameras of the rig only, as for `wildcity augment` [default: all]
+    /// Render views of these cameras of the rig only, as for `wildcity train augment` [default:
+    /// all]
     #[arg(long, value_name = "NAME,..")]
     cameras: Option<String>,
 
@@ -95,7 +96,7 @@ impl Loop {
             writeln!(io::stderr(), "round {round} of {rounds}")?;
             let again = || format!("round {round}: --from {round} goes on");
             let twin = self.twin.as_ref();
-            cli::run_command(&["augment".as_ref(), twin], self.augment(round))
+            cli::run_command(&["train".as_ref(), "augment".as_ref(), twin], self.augment(round))
                 .with_context(again)?;
             cli::run_command(&["train".as_ref(), "refine".as_ref(), twin], self.refine(round))
                 .with_context(again)?;

@@ -8,7 +8,7 @@ use wildcity_twin::store::Edit;
 use super::change;
 use crate::cli::directories::{EditedTwin, Twins};
 use crate::cli::input_files::read_trajectories;
-use crate::cli::rig::find_rig;
+use crate::cli::twin::find_rig;
 
 /// Give a twin recorded drives and a rig: makes a new version with the same Gaussians.
 ///
@@ -29,7 +29,7 @@ pub(in crate::cli) struct Drive {
     #[arg(long, value_name = "FILE")]
     trajectory: Vec<PathBuf>,
 
-    /// The vehicle's cameras: a preset (see `wildcity rig show`), or a JSON file as
+    /// The vehicle's cameras: a preset (see `wildcity twin rig show`), or a JSON file as
     /// `wildcity import --help` shows it.
     #[arg(long, value_name = "RIG")]
     rig: Option<String>,

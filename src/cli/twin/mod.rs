@@ -12,17 +12,26 @@ mod geo;
 mod label;
 mod list;
 mod log;
+mod map;
 mod remove;
+mod rig;
 mod rollback;
+mod route;
+mod show;
 mod sky;
 #[cfg(feature = "eval")]
 pub(super) mod views;
 
-/// List, generate, check and clean up twins, and manage their versions.
+#[cfg(feature = "convert")]
+pub(super) use map::origin as map_origin;
+pub(super) use rig::find_rig;
+
+/// List, show, generate, check and clean up twins; their versions, cameras, drives and maps.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:
   wildcity twin list
+  wildcity twin show street
   wildcity twin log street
   wildcity twin fsck street")]
 pub(super) struct Twin {
@@ -33,6 +42,7 @@ pub(super) struct Twin {
 super::subcommands! {
     Subcommand;
     List(list::List),
+    Show(show::Show),
     Generate(generate::Generate),
     Log(log::Log),
     Diff(diff::Diff),
@@ -49,6 +59,9 @@ super::subcommands! {
     Label(label::Label),
     Align(align::Align),
     Drive(drive::Drive),
+    Rig(rig::RigCommand),
+    Route(route::Route),
+    Map(map::MapCommand),
 }
 
 impl Twin {

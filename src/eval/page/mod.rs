@@ -7,9 +7,10 @@ mod numbers;
 use data_encoding::BASE64;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
-use self::numbers::{decibels, metres, percent, share, signed, with_unit};
+use self::numbers::{decibels, mean_with_unit, metres, percent, share, signed, with_unit};
 use super::evaluated_image::EvaluatedImage;
 use super::evaluation::Evaluation;
+use super::means::ScoreMeans;
 use super::scores::Scored;
 use super::thumbnails::Thumbnails;
 use wildcity_render::compare::heat::HEAT_RGB;
@@ -23,7 +24,8 @@ figure{margin:0 0 18px}figure div{display:grid;grid-template-columns:repeat(3,1f
 figure div.row{grid-template-columns:repeat(auto-fit,minmax(180px,1fr))}figure img{width:100%;min-width:0;height:auto}
 .gain td{font-weight:600}
 figcaption{font-size:13px;margin-bottom:3px}.key span{display:inline-block;padding:1px 8px;font-size:12px}
-.miss{color:#b00020;font-weight:600}";
+.miss{color:#b00020;font-weight:600}
+.verdict{font-size:1.25em;padding:.6em .8em;border-left:6px solid;background:#f6f6f6;overflow-wrap:anywhere}";
 
 /// Share of covered pixels below which the page warns that the camera may look past the scene.
 const BARELY_COVERED: f64 = 0.05;
@@ -43,6 +45,7 @@ pub fn render(evaluation: &Evaluation) -> String {
             }
             body {
                 h1 { (title) }
+                p.verdict { (verdict(evaluation, &worst_first)) }
                 (introduction(evaluation))
                 (means::table(evaluation))
                 (means::kid(evaluation))
@@ -55,6 +58,33 @@ pub fn render(evaluation: &Evaluation) -> String {
         }
     };
     markup.into_string() + "\n"
+}
+
+/// The answer to the question that the page is opened for, in one sentence: how close the images
+/// are, where they are worst, and what a repair gains.
+fn verdict(evaluation: &Evaluation, worst_first: &[&EvaluatedImage]) -> String {
+    let means = &evaluation.all;
+    let Some(worst) = worst_first.first().filter(|_| means.images > 0) else {
+        return "Nothing is compared: no pixel of the images counts.".to_owned();
+    };
+    let ScoreMeans { psnr_db, ssim, flip, .. } = means.rendered;
+    let mut text = format!(
+        "On average a rendered image has {} against the real one (more is closer), SSIM {}, FLIP {}; the worst is {} with {}",
+        mean_with_unit(psnr_db),
+        share(ssim),
+        share(flip),
+        worst.name,
+        with_unit(worst.rendered.scores.psnr_db)
+    );
+    let by_camera = evaluation.cameras.iter().map(|one| (&one.camera, one.means.rendered.psnr_db));
+    let weakest = by_camera.filter(|(_, db)| db.is_finite()).min_by(|a, b| a.1.total_cmp(&b.1));
+    if let Some((camera, db)) = weakest.filter(|_| evaluation.cameras.len() > 1) {
+        text += &format!(", and the worst camera {camera} with {}", with_unit(db));
+    }
+    if let Some(gain) = &means.gain {
+        text += &format!("; the repair gains {} dB", signed(gain.psnr_db, 2));
+    }
+    text + "."
 }
 
 fn introduction(evaluation: &Evaluation) -> Markup {

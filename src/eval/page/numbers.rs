@@ -20,6 +20,11 @@ pub(super) fn with_unit(db: f64) -> String {
     if db.is_finite() { format!("{db:.2} dB") } else { decibels(db) }
 }
 
+/// A mean of decibels with their unit.
+pub(super) fn mean_with_unit(db: f64) -> String {
+    if db.is_finite() { with_unit(db) } else { mean_decibels(db) }
+}
+
 /// A number from 0 to 1.
 pub(super) fn share(value: f64) -> String {
     if value.is_nan() { "none".to_owned() } else { format!("{value:.4}") }

@@ -35,7 +35,7 @@ pub enum GpuError {
     /// The machine has no Vulkan driver, or the driver has no device.
     #[error(
         "no Vulkan device: install the GPU's driver, or mesa-vulkan-drivers for a software device; \
-         `wildcity devices` lists the devices that are found"
+         `wildcity dev devices` lists the devices that are found"
     )]
     NoAdapter,
     /// No device has this name or number.

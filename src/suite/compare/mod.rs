@@ -28,6 +28,7 @@ use crate::case::Case;
 use crate::entry::{EpisodeEntry, Status};
 use crate::result::SuiteResult;
 
+pub use page::DrivenRun;
 pub use pair::{Change, ComparedEpisode, Side};
 pub use rule::{PASS_RATE, Rule, Tolerance};
 pub use scores::{Direction, ScoreChange};
@@ -258,9 +259,10 @@ impl Comparison {
         text::text(self)
     }
 
-    /// The comparison as a page that loads nothing else.
-    pub fn to_page(&self) -> String {
-        page::page(self)
+    /// The comparison as a page that loads nothing else. `runs` are the earlier and the later run:
+    /// the drives of the episodes that changed are drawn from their records, side by side.
+    pub fn to_page(&self, runs: &[DrivenRun<'_>; 2]) -> String {
+        page::page(self, runs)
     }
 }
 

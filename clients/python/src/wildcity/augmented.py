@@ -1,4 +1,4 @@
-"""Views that `wildcity augment` wrote, as a data set of a trainer.
+"""Views that `wildcity train augment` wrote, as a data set of a trainer.
 
 `AugmentedViews` is a map data set as PyTorch knows them: it has a length, and an item is a dict of numpy arrays, of
 which `torch.utils.data.DataLoader` makes tensors. It does not need PyTorch. docs/augmentation.md of the project shows
@@ -28,7 +28,7 @@ Item = dict[str, npt.NDArray[Any]]
 
 
 class AugmentedError(WildCityError):
-    """A folder was not made by `wildcity augment`, is not complete, or has a file that differs from its hash."""
+    """A folder was not made by `wildcity train augment`, is not complete, or has a file that differs from its hash."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class AugmentedViews:
         folder = Path(folder)
         there = sorted(_rounds(folder))
         if not there:
-            raise AugmentedError(f"{folder} has no round_N: give the --out of `wildcity augment`")
+            raise AugmentedError(f"{folder} has no round_N: give the --out of `wildcity train augment`")
         if rounds == "all":
             chosen = there
         elif rounds == "newest":
@@ -141,9 +141,11 @@ class AugmentedViews:
             for name, expected in sample.files.items():
                 path = sample.folder / name
                 if not path.is_file():
-                    raise AugmentedError(f"{path} is missing: run `wildcity augment` again")
+                    raise AugmentedError(f"{path} is missing: run `wildcity train augment` again")
                 if hashlib.sha256(path.read_bytes()).hexdigest() != expected:
-                    raise AugmentedError(f"{path} differs from its hash in augment.json: run `wildcity augment` again")
+                    raise AugmentedError(
+                        f"{path} differs from its hash in augment.json: run `wildcity train augment` again"
+                    )
 
 
 def _rounds(folder: Path) -> Iterator[int]:
@@ -158,7 +160,7 @@ def _samples(folder: Path) -> Iterator[AugmentedSample]:
     if record.get("format") != FORMAT:
         raise AugmentedError(f"{folder / 'augment.json'}: format {record.get('format')!r}, not {FORMAT}")
     if not record["complete"]:
-        raise AugmentedError(f"{folder} is not complete: run `wildcity augment` again")
+        raise AugmentedError(f"{folder} is not complete: run `wildcity train augment` again")
     transforms = _json(folder / "transforms.json")
     frames = {frame["file_path"]: frame for frame in transforms["frames"]}
     model = transforms["camera_model"]

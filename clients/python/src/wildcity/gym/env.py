@@ -13,17 +13,26 @@ from ..sync import Session, connect
 from .task import DriveConfig, Seen, Task, task_of
 
 
+def checked(config: DriveConfig) -> DriveConfig:
+    """The same, after its server was asked. Raises `ValueError` if there is no such twin, or it has no drive."""
+    with connect(config.server, name="wildcity-gym", timeout=config.timeout, token=config.token) as client:
+        config.open_options(client.welcome)
+    return config
+
+
 class DriveEnv(gymnasium.Env[Any, Any]):
     """Follow a recorded drive, or drive in a scenario. The arguments are those of `DriveConfig`, and `render_mode`.
 
-    The session is opened by the first `reset`, whose options are `start`, a distance along the drive in metres (or a
-    `Station`), and `version`, the version of the twin to show from then on. `render` returns the images side by side.
+    The server is asked here for the twin: `ValueError` if it has none of this name, `wildcity.ConnectFailed` if it does
+    not answer. The session is opened by the first `reset`, whose options are `start`, a distance along the drive in
+    metres (or a `Station`), and `version`, the version of the twin to show from then on. `render` returns the images
+    side by side.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
 
     def __init__(self, render_mode: str | None = None, **arguments: Any) -> None:
-        self.config = DriveConfig(**arguments)
+        self.config = checked(DriveConfig(**arguments))
         self.render_mode = render_mode
         self.observation_space = self.config.observation_space()
         self.action_space = self.config.action_space()

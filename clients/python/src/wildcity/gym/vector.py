@@ -15,6 +15,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from ..aio import Client, Session, connect
+from .env import checked
 from .task import DriveConfig, Seen, Task, task_of
 
 T = TypeVar("T")
@@ -30,7 +31,7 @@ class DriveVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10, "autoreset_mode": AutoresetMode.NEXT_STEP}
 
     def __init__(self, num_envs: int = 1, render_mode: str | None = None, **arguments: Any) -> None:
-        self.config = DriveConfig(**arguments)
+        self.config = checked(DriveConfig(**arguments))
         self.num_envs = num_envs
         self.render_mode = render_mode
         self.single_observation_space = self.config.observation_space()

@@ -4,7 +4,7 @@ A way is a line string; a relation of type `lanelet` has the members `left` and 
 `multipolygon` has members `outer`. Positions of nodes are the tags `local_x`, `local_y` and `ele` if they have them
 (Autoware), else latitude and longitude, which become x east, y north, z up on the tangent plane (WGS84) of the origin.
 
-This kind makes a map file, not a log: OUT is a JSON file that `wildcity map check` and scenarios read.
+This kind makes a map file, not a log: OUT is a JSON file that `wildcity twin map check` and scenarios read.
 """
 
 from __future__ import annotations

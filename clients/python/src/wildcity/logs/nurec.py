@@ -50,7 +50,7 @@ def convert(source: Path, out: Path, options: Options) -> Report:
         _boxes(writer, source, name, inverse(numbers(world_to_nre, (4, 4), "world_to_nre", place)))
         with zipfile.ZipFile(source) as archive:
             others = [one for one in archive.namelist() if one not in (_RIGS, _TRACKS)]
-        writer.left_out("map.xodr", "map.xodr" in others, "`wildcity map import` reads it")
+        writer.left_out("map.xodr", "map.xodr" in others, "`wildcity twin map import` reads it")
         writer.left_out("other files of the archive", len([one for one in others if one != "map.xodr"]), "not read")
         return writer.finish()
 

@@ -1,0 +1,86 @@
+//! `wildcity twin rig show`.
+
+use std::io::Write;
+
+use glam::{DVec2, DVec3};
+
+use super::lookup::{camera_view, find_rig};
+use crate::cli::output;
+use wildcity_render::View;
+use wildcity_scene::Rig;
+
+/// Print the cameras of a rig; without RIG, the names of the presets.
+///
+/// Positions are in the rig's axes, in metres: x forward, y left, z up. Yaw is positive to the left
+/// of straight ahead and pitch is positive above the horizon, both in degrees. A field of view is
+/// the angle between the rays of the midpoints of opposite edges, in degrees, or `-` if the lens
+/// shows nothing there.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_long_help = "Examples:\n  wildcity twin rig show\n  wildcity twin rig show vehicle6"
+)]
+pub(super) struct Show {
+    /// A preset, or a JSON file.
+    #[arg(value_name = "RIG")]
+    rig: Option<String>,
+}
+
+impl Show {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        let mut out = output::stdout();
+        let Some(name) = self.rig else {
+            for name in Rig::preset_names() {
+                writeln!(out, "{name}")?;
+            }
+            return Ok(());
+        };
+        let rig = find_rig(&name)?;
+        writeln!(out, "{}: {} cameras", rig.name, rig.cameras.len())?;
+        let headings =
+            ["#", "camera", "size px", "field deg", "x m", "y m", "z m", "yaw deg", "pitch deg"];
+        let [index, camera, size, field, x, y, z, yaw, pitch] = headings;
+        writeln!(
+            out,
+            "{index:>2} {camera:<24} {size:>9} {field:>11} {x:>6} {y:>6} {z:>6} {yaw:>7} {pitch:>9}"
+        )?;
+        for (index, camera) in rig.cameras.iter().enumerate() {
+            let view = camera_view(camera);
+            let width_px = camera.camera.width_px;
+            let height_px = camera.camera.height_px;
+            let [x, y, z] = camera.rig_from_camera.position_m.to_array();
+            let forward = camera.rig_from_camera.rotation * DVec3::Z;
+            let yaw = forward.y.atan2(forward.x).to_degrees();
+            let pitch = forward.z.clamp(-1.0, 1.0).asin().to_degrees();
+            writeln!(
+                out,
+                "{index:>2} {:<24} {:>9} {:>11} {x:>6.2} {y:>6.2} {z:>6.2} {yaw:>7.1} {pitch:>9.1}",
+                camera.name,
+                format!("{width_px}x{height_px}"),
+                fields_of_view(&view),
+            )?;
+        }
+        Ok(())
+    }
+}
+
+/// Horizontal and vertical field of view in degrees, as text.
+fn fields_of_view(view: &View) -> String {
+    let width = f64::from(view.camera.width_px);
+    let height = f64::from(view.camera.height_px);
+    let left = DVec2::new(0.0, height / 2.0);
+    let right = DVec2::new(width, height / 2.0);
+    let top = DVec2::new(width / 2.0, 0.0);
+    let bottom = DVec2::new(width / 2.0, height);
+    let text = |angle: Option<f64>| angle.map_or("-".to_owned(), |deg| format!("{deg:.1}"));
+    let horizontal = text(angle_between_deg(view, left, right));
+    let vertical = text(angle_between_deg(view, top, bottom));
+    format!("{horizontal}x{vertical}")
+}
+
+/// Angle between the rays of two points of an image, in degrees. None if the lens shows nothing at
+/// one of them.
+fn angle_between_deg(view: &View, a_px: DVec2, b_px: DVec2) -> Option<f64> {
+    let a = view.ray_world(a_px)?;
+    let b = view.ray_world(b_px)?;
+    Some(a.angle_between(b).to_degrees())
+}
