@@ -1173,7 +1173,8 @@ class Sweep:
 
     lidar: str
     """Name of the LiDAR. Its tensors are `lidar/<name>/points`, in metres in the rig's axes when their column was
-    fired, `lidar/<name>/intensity`, `lidar/<name>/row`, `lidar/<name>/column` and `lidar/<name>/instance`."""
+    fired, `lidar/<name>/intensity`, `lidar/<name>/row`, `lidar/<name>/column` and `lidar/<name>/instance`; with
+    `outputs.semantics`, u8 `lidar/<name>/class`, too, as in the semantics of an image."""
     start_us: int
     """Time of the first column, in simulated microseconds."""
     end_us: int
@@ -1188,7 +1189,7 @@ class Sweep:
     lidar_to_rig: Pose
     """`rig_from_lidar`."""
     hash: str
-    """BLAKE3 of the five tensors in the order above, in hex."""
+    """BLAKE3 of these tensors in the order above, in hex."""
 
 
 @dataclass(frozen=True)

@@ -330,7 +330,7 @@ class PointCloud:
 
     @property
     def classes(self) -> NDArray[np.uint8]:
-        """uint8 [n]: the class of what was hit, an index of `opened.semantics.classes`, if the session asked for them."""
+        """uint8 [n]: the class of what was hit, an index of `opened.semantics.classes`, if they were asked for."""
         if _of_sweep(self.metadata, "class") not in self._content.tensors:
             raise KeyError("there are no classes: open the session with outputs=Outputs(semantics=True)")
         return self._tensor("class")
