@@ -368,15 +368,20 @@ impl<'a> Replay<'a> {
             let detail =
                 FrameDetail { viewpoints: &viewpoints, exposures_us, profile: self.profile };
             scene.place(self.actors.placed(frame.time_us, detail));
-            let sweep = self
-                .backend
-                .sweep(&scene, self.profile, &view)
-                .map_err(|cause| ReplayError::Render { step, cause })?;
+            let cast = || {
+                let sweep = self.backend.sweep(&scene, self.profile, &view)?;
+                let classes = self.has_classes.then(|| sweep.classes(&scene)).transpose()?;
+                Ok((sweep, classes))
+            };
+            let (sweep, classes) = cast().map_err(|cause| ReplayError::Render { step, cause })?;
             let effects = self.sensors.as_ref().and_then(|sensors| sensors.lidar_effects(lidar));
-            let classes = self.has_classes.then(|| sweep.classes(&scene)).transpose();
-            let classes = classes.map_err(|cause| ReplayError::Render { step, cause })?;
-            let sweep = (&sweep, classes.as_deref());
-            let cloud = PointCloud::new(lidar, mounted, sweep, frame.time_us, effects);
+            let cloud = PointCloud::new(
+                lidar,
+                mounted,
+                (&sweep, classes.as_deref()),
+                frame.time_us,
+                effects,
+            );
             let time_us = frame.time_us;
             let replayed = ReplayedSweep { lidar, time_us, mounted, view: &view, cloud: &cloud };
             visit(&Replayed::Sweep(replayed)).map_err(|reason| {
