@@ -131,7 +131,7 @@ fn splat_shape(foot: Footprint, gaussian_log2_opacity: f32, view: u32) -> Projec
         det_native = det_with(foot, image.native_px2 * units2);
         det = det_with(foot, image.total_px2 * units2);
         c = yy + image.total_px2.y * units2;
-        log2_opacity += 0.75 * log2(det_native / det);
+        log2_opacity += 0.5 * log2(det_native / det);
     }
     if frame.antialiased != 0u {
         log2_opacity += 0.5 * log2(max(foot.det_unblurred / det_native, 0.005 * 0.005));

@@ -22,7 +22,7 @@ const SH_LINE: u32 = 11u;
 
 const LN_2: f32 = 0.69314718055994530942;
 // `PixelFilter::SHRINK_POWER`.
-const SHRINK_POWER: f32 = 0.75;
+const SHRINK_POWER: f32 = 0.5;
 const MIN_BLUR_SHARE: f32 = 0.005 * 0.005;
 
 // Derivatives by a twist of the view.

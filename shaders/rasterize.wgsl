@@ -23,8 +23,10 @@
 #import tile_blocks
 #import four_pixels
 #import INSTANCES
+#import has_samples
 #import resolve
 #import BACKGROUND
+#import samples
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<uniform> span: Span;
@@ -160,8 +162,7 @@ fn main(
         atomicAdd(&counters.block_pairs, atomicLoad(&block_pairs));
         atomicMax(&counters.most_batches, batches);
     }
-    sums = composite(sums, view_index, at_px, thread);
-    resolve(index, first_pixel.y * TILE_PX + first_pixel.x, sums);
+    finish_tile(index, view_index, corner, thread, sums);
 }
 
 // Writes the pixels of a tile with a long list.
@@ -182,10 +183,10 @@ fn finish(
     }
     let view_index = tile_view(tile);
     let first_pixel = thread_pixel(thread);
-    let at_px = vec2f(tile_corner(tile, frame.view[view_index]) + first_pixel) + 0.5;
+    let corner = tile_corner(tile, frame.view[view_index]);
     let at = ((place - 1u) * LONG_TILE_WORDS + first_pixel.y * TILE_PX + first_pixel.x) / 4u;
     let plane = TILE_PX * TILE_PX / 4u;
-    var sums = Sums(
+    let sums = Sums(
         bitcast<vec4f>(long_sums[at]),
         bitcast<vec4f>(long_sums[at + plane]),
         bitcast<vec4f>(long_sums[at + 2u * plane]),
@@ -198,8 +199,7 @@ fn finish(
         atomicAdd(&counters.block_pairs, counts.x);
         atomicMax(&counters.most_batches, counts.y);
     }
-    sums = composite(sums, view_index, at_px, thread);
-    resolve(index, first_pixel.y * TILE_PX + first_pixel.x, sums);
+    finish_tile(index, view_index, corner, thread, sums);
 }
 
 // Opacities from their base-2 logarithms.

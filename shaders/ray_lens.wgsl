@@ -13,7 +13,8 @@ fn sky_rays(view_index: u32, at_px: vec2f) -> Rays {
     let rows = background.sky_from_pixel[view_index];
     var directions: Rays;
     for (var k = 0u; k < 4u; k++) {
-        let pixel_px = at_px + vec2f(f32(k), 0.0);
+        // A view of samples has the lens of these.
+        let pixel_px = (at_px + vec2f(f32(k), 0.0)) * samples(view_index);
         let in_camera = unproject(view_index, pixel_px);
         let ray = in_camera + rotation_shift(view_index, in_camera, -remaining_exposure(view_index, pixel_px));
         directions.x[k] = dot(rows[0].xyz, ray);

@@ -28,7 +28,7 @@ struct Frame {
     batch_limit: u32,
     long_tile_splats: u32,
     long_tiles: u32,
-    pad: u32,
+    sampled: u32,
     view: array<FrameView, MAX_VIEWS>,
 }
 

@@ -95,12 +95,9 @@ impl Cutoffs {
 /// `s² (n² - 1)/12 = (1 - s²)/12`. The mean keeps a splat's sum over all pixels, so its peak
 /// becomes lower as its area becomes larger, by `√(det before/det after)` of the average.
 ///
-/// Both are exact for a single splat. Where layers of splats end at the same edge, every layer
-/// covers the same part of a pixel, but blending multiplies what the layers let through as if their
-/// parts were independent, and so lets through too little. Measured best on two scenes at a half, a
-/// third and a quarter of the size: a spread of `(1 - s²)/15`, and a peak lower by the power 3/4 of
-/// the determinants' ratio instead of 1/2. That is 1.3 to 2.2 dB better, and makes a single splat
-/// lose a part of its sum (BENCHMARKS.md, "Small images").
+/// Both are exact for a single splat, and not for many: see `samples.rs`. A smaller spread with a
+/// peak lower by another power, (1 - s²)/15 and 3/4, is 1 to 2 dB better where layers of large
+/// splats end at one edge, and 6 to 13 dB worse where most splats are smaller than a pixel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PixelFilter {
     /// The profile's blur of native pixels.
@@ -127,16 +124,16 @@ pub(super) struct Filtered {
 
 impl PixelFilter {
     /// Variance of a pixel that averages very many native ones.
-    const BOX_PX2: f64 = 1.0 / 15.0;
+    const BOX_PX2: f64 = 1.0 / 12.0;
 
     /// Opacity is multiplied by the shrink share of a splat to this power.
-    pub const SHRINK_POWER: f64 = 0.75;
+    pub const SHRINK_POWER: f64 = 0.5;
 
     /// The filter of a camera's pixels.
     pub fn new(profile: &RenderProfile, camera: &Camera) -> Self {
         let scale = camera.native_scale();
         let native_px2 = profile.blur * (scale * scale);
-        // Both terms for s times the native size: s^2 blur + (1 - s^2)/15.
+        // Both terms for s times the native size: s^2 blur + (1 - s^2)/12.
         let total_px2 = native_px2 + Self::BOX_PX2 * (1.0 - scale * scale);
         Self { native_px2, total_px2 }
     }

@@ -31,6 +31,7 @@ pub mod lidar;
 pub mod limits;
 mod normals;
 pub mod reference;
+mod samples;
 pub mod stage;
 pub mod unscented;
 pub mod view;

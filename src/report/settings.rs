@@ -7,7 +7,8 @@
 //! of pixels, one level of tiles or two).
 //!
 //! **Small images are compared with the reference's image shrunk** to their size, because they
-//! replace that image. "Own blur" is the same image with the profile's blur in its own pixels, as a
+//! replace that image. "shrink=filter" is the same image with one sample a pixel, where it has
+//! several otherwise. "Own blur" is the same image with the profile's blur in its own pixels, as a
 //! camera of that size without a native size renders it.
 //!
 //! **Non-pinhole cameras have two references.** All settings are compared with splats, so that
@@ -19,7 +20,7 @@ use serde::Serialize;
 use super::setting::{Family, ImageEncoding, Setting};
 use wildcity_render::View;
 use wildcity_scene::sky::{Sky, SkyModel};
-use wildcity_scene::{Manifest, Rays, RecordFormat, RenderProfile};
+use wildcity_scene::{Manifest, Rays, RecordFormat, RenderProfile, Shrink};
 
 /// Properties of a twin and its cameras that decide which settings can affect it.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -290,6 +291,12 @@ impl<'a> ListBuilder<'a> {
             // Names have to be unique within a report.
             let name = format!("{} with its own blur", scaled.name);
             self.settings.push(scaled.clone());
+            // Larger images have one sample a pixel with either.
+            if scale < 0.45 && self.twin.profile.shrink == Shrink::Samples {
+                let change = "shrink=filter".to_owned();
+                let name = format!("{} {change}", scaled.name);
+                self.settings.push(Setting { name, profile: vec![change], ..scaled.clone() });
+            }
             self.settings.push(Setting { name, own_blur: true, ..scaled });
         }
     }

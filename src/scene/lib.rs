@@ -40,7 +40,7 @@ pub use chunk::{Chunk, Scene};
 pub use gaussian::Gaussians;
 pub use manifest::Manifest;
 pub use pages::{LanePages, PagePool};
-pub use profile::{ProfileOverrides, Rays, RenderProfile};
+pub use profile::{ProfileOverrides, Rays, RenderProfile, Shrink};
 pub use record::RecordFormat;
 pub use rig::Rig;
 pub use semantics::SemanticClass;

@@ -42,6 +42,7 @@ mod mirror;
 mod mutations;
 mod parity;
 mod regions;
+mod samples;
 mod sky;
 mod stages;
 mod tuning;

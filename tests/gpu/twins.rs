@@ -86,7 +86,7 @@ fn layouts_are_the_same() {
         }
         Frame {
             splat_capacity, touch_capacity, instance_capacity, views, tiles, macro_tiles, near_m, far_m,
-            antialiased, alpha_cap, log2_alpha_cut, stop, batch_limit, long_tile_splats, long_tiles, pad, view,
+            antialiased, alpha_cap, log2_alpha_cut, stop, batch_limit, long_tile_splats, long_tiles, sampled, view,
         }
         Background {
             scale, offset, edge, width, octaves, encoded, identity, skip, sky_from_pixel,

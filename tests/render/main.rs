@@ -1,5 +1,7 @@
 //! The backends against each other, against images made by others, and at the extremes.
 
+#[path = "../support/captures.rs"]
+mod captures;
 #[path = "../support/data.rs"]
 mod data;
 #[path = "../support/gradient_cases.rs"]

@@ -43,13 +43,24 @@ fn check(scene: &Scene, profile: &RenderProfile, views: &[View]) {
     assert!(free_stats.held_bytes > 2 * LEAST_BYTES, "nothing to cut: {free_stats:?}");
 }
 
+/// The view with an image of 0.4 of its size, of which each pixel has four samples.
+fn small(view: &View) -> View {
+    let [width, height] =
+        [view.camera.width_px, view.camera.height_px].map(|px| (2 * px / 5).into());
+    View { camera: view.camera.scaled(width, height).unwrap(), ..*view }
+}
+
 #[test]
 fn slabs_of_pinholes_have_the_bytes_of_the_whole() {
     let mut scene = Scene::from_gaussians(&street(200_000, 1, 41));
     check(&scene, &RenderProfile::default(), &turning_views());
     let profile = RenderProfile { background: [0.2, 0.4, 0.9], ..RenderProfile::default() };
     check(&scene, &profile, &turning_views()[..1]);
+    // Pixels of several samples.
+    let small: Vec<View> = turning_views()[..2].iter().map(self::small).collect();
+    check(&scene, &profile, &small);
     scene.placed = placed::street_with_actors().0.placed;
+    check(&scene, &RenderProfile::default(), &small);
     check(&scene, &RenderProfile::default(), &turning_views()[..2]);
 }
 

@@ -199,8 +199,10 @@ pub(crate) fn mutation_case() -> MutationCase {
     let scene = Scene { placed, ..Scene::from_gaussians(&street(800, 3, 7)) };
     let small = |(_, view): (_, View)| View { camera: view.camera.scaled(96, 64).unwrap(), ..view };
     let pinholes = placed_views().into_iter().filter(|(_, view)| view.is_static_pinhole());
-    let views: Vec<View> =
+    let mut views: Vec<View> =
         pinholes.map(small).chain(turning_views().into_iter().map(|v| small(("", v)))).collect();
+    // One of native size: below it, the root of the determinant after the native blur cancels.
+    views.extend(turning_views().first());
     // So low that many pixels reach it.
     let profile = RenderProfile { antialiased: true, alpha_cap: 0.8, ..RenderProfile::default() };
     MutationCase { scene, profile, views }

@@ -11,7 +11,7 @@ use wildcity_scene::geometry::camera::{
     Windshield, WindshieldReference,
 };
 use wildcity_scene::geometry::{Camera, Pose};
-use wildcity_scene::{Rays, RenderProfile, Scene};
+use wildcity_scene::{Rays, RenderProfile, Scene, Shrink};
 
 use crate::images::{psnr, render_one, view_along};
 use crate::streets::street;
@@ -94,7 +94,8 @@ pub(crate) fn check_projections(
 ) -> usize {
     // A ball is so small that its image is as wide as the blur, and its centroid is that of its
     // centre.
-    let fine = RenderProfile { alpha_cut: 1e-5, ..RenderProfile::default() };
+    let fine =
+        RenderProfile { alpha_cut: 1e-5, shrink: Shrink::Filter, ..RenderProfile::default() };
     let size_px = [camera.width_px, camera.height_px];
     let steps = |most_m: f64| (-(most_m / apart_m) as i32)..=(most_m / apart_m) as i32;
     let points = steps(1.2).flat_map(|i| steps(0.6).map(move |k| (f64::from(i), f64::from(k))));
@@ -110,8 +111,8 @@ pub(crate) fn check_projections(
         let found_px = centroid(&image.opacity, size_px, at_px, f64::INFINITY);
         let off_px = found_px.unwrap_or(DVec2::INFINITY).distance(at_px);
         // Samples at pixel centres move the centroid of a thin splat by up to 4π σ² exp(-2π² σ²)
-        // along each axis: by 0.13 and 0.10 px in an image of 96 x 50 px, and by 0.17 px in one of
-        // 64 x 40.
+        // along each axis: by 0.08 and 0.11 px in an image of 96 x 50 px, and by 0.14 px in one of
+        // 64 x 40. (The mean of two samples of each axis moves it by up to exp(-2π² σ²)/2.)
         let pi = std::f64::consts::PI;
         let moved_px =
             |variance_px2: f64| 4.0 * pi * variance_px2 * (-2.0 * pi * pi * variance_px2).exp();

@@ -4,20 +4,21 @@
 use fearless_simd::{f32x16, prelude::*};
 
 use super::lanes::{Vec3x16, splats};
-use super::resolve::{BLOCKS, TileSums, block_corner};
+use super::resolve::{TilePixels, TileSums, block_corner};
 use crate::constants::BLOCK_PX;
 use wildcity_scene::appearance::{Appearance, Exposure, Overlay};
 use wildcity_scene::chunk::LANES;
 
-/// Applies exposure, then the overlay, to the colours of a tile with its top left pixel at `at_px`.
+/// Applies exposure, then the overlay, to the colours of the pixels of a tile.
 #[inline(always)]
 pub(super) fn apply<S: Simd>(
     simd: S,
     appearance: &Appearance,
-    at_px: [u32; 2],
+    pixels: &TilePixels,
     sums: &mut TileSums,
 ) {
-    for block in 0..BLOCKS {
+    let at_px = pixels.at_px;
+    for &block in pixels.blocks {
         let load = |c: usize| f32x16::load_array_ref(simd, &sums.rgb[c][block]);
         let mut rgb = Vec3x16 { x: load(0), y: load(1), z: load(2) };
         // The order is that of the camera: the sensor's exposure, then what lies over the image.

@@ -12,7 +12,7 @@ use glam::{DMat3, DVec2};
 
 use super::lanes::Vec3x16;
 use super::lens::LensRays;
-use super::resolve::{BLOCKS, TileSums, block_corner};
+use super::resolve::{TilePixels, TileSums, block_corner};
 use crate::constants::BLOCK_PX;
 use crate::{Frame, RenderError, View};
 use wildcity_scene::chunk::LANES;
@@ -72,17 +72,17 @@ impl Background {
         }
     }
 
-    /// Adds the background that is visible through a tile with its top left pixel at `at_px`.
+    /// Adds the background that is visible through the pixels of a tile.
     #[inline(always)]
     pub(super) fn add<S: Simd>(
         &self,
         simd: S,
-        at_px: [u32; 2],
+        pixels: &TilePixels,
         scratch: &mut Option<Scratch>,
         sums: &mut TileSums,
     ) {
-        for block in 0..BLOCKS {
-            self.add_to_block(simd, at_px, block, scratch, sums);
+        for &block in pixels.blocks {
+            self.add_to_block(simd, pixels.at_px, block, scratch, sums);
         }
     }
 

@@ -84,8 +84,10 @@ impl Batch {
     /// Finds the blocks of the tile at `at_px` that each of the first `len` splats touches.
     ///
     /// A splat's ellipse lies within three slabs: `|dx| <= extent_x`, `|dy| <= extent_y` and
-    /// `|u| <= √power`, which together are tight for needles at any angle. A block is touched if
-    /// its centre lies within the slabs, each widened by half a block.
+    /// `|u| <= √power`, which together are tight for needles at any angle; and it is the disc
+    /// `u² + v² <= power`, which leaves out the corners of the box of a round splat, a fifth of it.
+    /// A block is touched if its centre lies within the slabs, each widened by half a block, and
+    /// within the disc, widened by how far the block's pixels are from its centre in `(u, v)`.
     #[inline(always)]
     pub(super) fn match_blocks<S: Simd>(
         &mut self,
@@ -115,13 +117,15 @@ impl Batch {
             // a pixel's.
             let u = dx.mul_add(splat(*l0), dy * splat(*l1));
             let v = dy * splat(*l2);
-            // √power, and the change of u within half a block, both increased by more than the
+            // √power, and the change of (u, v) within half a block, both increased by more than the
             // rounding error of f32.
-            let reach_u = (log2_opacity - cutoffs.log2_alpha_cut).sqrt() * (1.0 + 1e-5)
-                + (half_px + 2e-3) * (l0.abs() + l1.abs());
+            let [half_u, half_v] = [l0.abs() + l1.abs(), *l2].map(|l| (half_px + 2e-3) * l);
+            let root = (log2_opacity - cutoffs.log2_alpha_cut).sqrt() * (1.0 + 1e-5);
+            let reach = root + (half_u * half_u + half_v * half_v).sqrt();
             let touches = dx.abs().simd_le(splat(extent_px[0] + half_px))
                 & dy.abs().simd_le(splat(extent_px[1] + half_px))
-                & u.abs().simd_le(splat(reach_u));
+                & u.abs().simd_le(splat(root + half_u))
+                & u.mul_add(u, v * v).simd_le(splat(reach * reach));
 
             let matched = &mut self.matched[k];
             u.store_array(&mut matched.u);

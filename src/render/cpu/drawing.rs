@@ -10,6 +10,7 @@ use super::slabs::{Cut, DepthClusters, Slab};
 use super::unfinished::{Continued, UnfinishedTiles};
 use super::{Scratch, StageTimer, bin, rasterize};
 use crate::layout::Cutoffs;
+use crate::samples::{is_sampled, sample_view};
 use crate::stage::Stage;
 use crate::{Frame, FrameStats, OnViewDone, RenderError, Target, View, limits};
 
@@ -27,7 +28,12 @@ pub(super) struct Drawing<'a> {
 /// Most bytes that are held while such views are drawn with `most_bytes` of intermediate buffers:
 /// these, the sums of one view that is drawn in slabs, and each thread's copies of a macro tile.
 pub(super) fn most_held_bytes(most_bytes: u64, views: &[View], threads: usize) -> u64 {
-    let sums = views.iter().map(UnfinishedTiles::bytes).max().unwrap_or(0);
+    // With samples, which take more than pixels: the profile is not known.
+    let sums = |view: &View| {
+        let samples = sample_view(view);
+        UnfinishedTiles::bytes(samples.as_ref().unwrap_or(view), samples.is_some())
+    };
+    let sums = views.iter().map(sums).max().unwrap_or(0);
     // A single view may exceed the limit up to the size of its sums, see `Drawing::most_bytes`.
     most_bytes.max(sums) + sums + bin::COPIES_BYTES * threads as u64
 }
@@ -112,9 +118,11 @@ impl Drawing<'_> {
 
     /// A single view may have as much as its sums would take if it were drawn in slabs.
     fn most_bytes(&self, part: &FramePart<'_>) -> u64 {
-        match part.frame.views {
+        match (part.frame.views, part.shown) {
             // Slabs would need as much for their sums, so that drawing at once may take it, too.
-            [view] => self.most_bytes.max(UnfinishedTiles::bytes(view)),
+            ([view], [shown]) => {
+                self.most_bytes.max(UnfinishedTiles::bytes(view, is_sampled(view, shown)))
+            }
             _ => self.most_bytes,
         }
     }
@@ -189,11 +197,12 @@ impl Drawing<'_> {
         targets: &mut [Target<'_>],
         continued: Option<Continued<'_>>,
     ) {
-        let FramePart { frame, backgrounds, first_view } = part;
+        let FramePart { frame, shown, backgrounds, first_view } = part;
         let Scratch { projected, bins, rasterizer, .. } = &mut *self.scratch;
         let cutoffs = self.cutoffs;
         let mut timer = StageTimer::start();
-        let input = rasterize::Input { projected, bins, views: frame.views, backgrounds, cutoffs };
+        let views = frame.views;
+        let input = rasterize::Input { projected, bins, views, shown, backgrounds, cutoffs };
         let finished =
             |view: usize, target: &Target<'_>| (self.finished)(first_view + view, target);
         let work =

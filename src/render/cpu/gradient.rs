@@ -121,7 +121,8 @@ impl Differentiate for Cpu {
                     kept.0.resize_with(Grid::new(view).macro_tiles(), Mutex::default);
                 }
                 let cutoffs = &cutoffs;
-                let input = Input { projected, bins, views, backgrounds: &[], cutoffs };
+                let backgrounds = &[];
+                let input = Input { projected, bins, views, shown: views, backgrounds, cutoffs };
                 let kept = Kept { input, depth, views: &*kept, walkers: &*walkers };
                 let mut timer = StageTimer::start();
                 stats.evaluations = dispatch!(level, simd => kept.rasterize(simd));

@@ -58,6 +58,7 @@ use self::drawing::{Drawing, Stages};
 use self::overflow::PartError;
 use self::part::FramePart;
 use super::layout::Cutoffs;
+use super::samples::SampledViews;
 use super::stage::{Stage, StageOutputs};
 use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target, View};
 use wildcity_scene::geometry::Lidar;
@@ -189,6 +190,8 @@ impl Cpu {
         let BusyLane { pool, mut scratch, .. } = self.lane();
         let scratch = &mut *scratch;
         let cutoffs = Cutoffs::new(frame.profile);
+        let sampled = SampledViews::new(frame);
+        let frame = &sampled.frame(frame);
         pool.install(|| {
             let mut stats = FrameStats::default();
             // The other backend may be asked for classes, too.
@@ -284,8 +287,14 @@ impl Backend for Cpu {
         let BusyLane { pool, mut scratch, most_bytes } = self.lane();
         let scratch = &mut *scratch;
         let cutoffs = Cutoffs::new(frame.profile);
+        let sampled = SampledViews::new(frame);
         pool.install(|| {
-            let part = FramePart { frame: *frame, backgrounds: &backgrounds, first_view: 0 };
+            let part = FramePart {
+                frame: sampled.frame(frame),
+                shown: frame.views,
+                backgrounds: &backgrounds,
+                first_view: 0,
+            };
             let stats = FrameStats::default();
             let mut drawing = Drawing {
                 level: self.level,

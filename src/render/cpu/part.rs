@@ -12,8 +12,10 @@ use wildcity_scene::chunk::{CLUSTER, Cluster};
 /// Some of a frame's views, which are rendered together.
 #[derive(Clone, Copy)]
 pub(super) struct FramePart<'a> {
-    /// The frame with only these views.
+    /// The frame with only these views: those of the samples, where pixels have several.
     pub(super) frame: Frame<'a>,
+    /// The views of the images.
+    pub(super) shown: &'a [View],
     /// One per view of the part, or none.
     pub(super) backgrounds: &'a [Background],
     /// Index of the part's first view in the whole frame.
@@ -25,20 +27,22 @@ impl FramePart<'_> {
     pub(super) fn halves(&self) -> [Self; 2] {
         let middle = self.frame.views.len() / 2;
         let (first, second) = self.frame.views.split_at(middle);
+        let (first_shown, second_shown) = self.shown.split_at(middle);
         // Without a background the slice is empty and cannot be split in the middle.
         let (behind_first, behind_second) = if self.backgrounds.is_empty() {
             (self.backgrounds, self.backgrounds)
         } else {
             self.backgrounds.split_at(middle)
         };
-        let part = |views, backgrounds, first_view| Self {
+        let part = |views, shown, backgrounds, first_view| Self {
             frame: Frame { views, ..self.frame },
+            shown,
             backgrounds,
             first_view,
         };
         [
-            part(first, behind_first, self.first_view),
-            part(second, behind_second, self.first_view + middle),
+            part(first, first_shown, behind_first, self.first_view),
+            part(second, second_shown, behind_second, self.first_view + middle),
         ]
     }
 

@@ -24,10 +24,13 @@ use super::batch::{BATCH, Batch};
 use super::bin::{Bins, Grid, MacroTile};
 use super::blend::blend;
 use super::project::Projected;
-use super::resolve::{self, BLOCKS, Band, HalvedBy, NOT_HALVED, TileSums};
+use super::resolve::{
+    self, BLOCKS, Band, HalvedBy, NOT_HALVED, SampleOwners, TilePixels, TileSums,
+};
 use super::unfinished::{Continued, UnfinishedTile};
 use crate::constants::TILE_PX;
 use crate::layout::Cutoffs;
+use crate::samples::is_sampled;
 use crate::{OnViewDone, Target, View};
 use wildcity_scene::appearance::Appearance;
 use wildcity_scene::chunk::LANES;
@@ -37,7 +40,10 @@ use wildcity_scene::chunk::LANES;
 pub(super) struct Input<'a> {
     pub(super) projected: &'a Projected,
     pub(super) bins: &'a Bins,
+    /// Those of the samples, where pixels have several.
     pub(super) views: &'a [View],
+    /// The views of the images.
+    pub(super) shown: &'a [View],
     /// One per view, or none.
     pub(super) backgrounds: &'a [Background],
     pub(super) cutoffs: &'a Cutoffs,
@@ -80,6 +86,7 @@ pub(super) struct Work {
 struct Drawing<'a> {
     view: usize,
     grid: Grid,
+    is_sampled: bool,
     wants: Wants,
     /// Exposure and overlay of the camera; `None` if they change nothing.
     appearance: Option<&'a Appearance>,
@@ -100,18 +107,20 @@ pub(super) fn rasterize(
 ) -> Work {
     // Sums only, which no other data depends on: relaxed order is enough.
     let [evaluations, sort_ns, rasterize_ns] = [const { AtomicU64::new(0) }; 3];
-    targets.par_iter_mut().zip(input.views).enumerate().with_max_len(1).for_each(
-        |(index, (target, view))| {
+    targets.par_iter_mut().zip(input.shown).enumerate().with_max_len(1).for_each(
+        |(index, (target, shown))| {
+            let view = &input.views[index];
             let drawing = Drawing {
                 view: index,
                 grid: Grid::new(view),
+                is_sampled: is_sampled(view, shown),
                 wants: Wants {
                     depth: target.depth_m.is_some(),
                     owners: target.instances.is_some() || target.semantics.is_some(),
                 },
                 appearance: resolve::appearance(target),
                 background: input.backgrounds.get(index),
-                bands: resolve::bands(target, view).into_iter().map(Mutex::new).collect(),
+                bands: resolve::bands(target, shown).into_iter().map(Mutex::new).collect(),
             };
             // `par_bridge` hands them out in this order.
             input.bins.by_work(index).into_iter().par_bridge().for_each(|number| {
@@ -129,7 +138,7 @@ pub(super) fn rasterize(
             // The bands borrow the target's buffers, which `finish` and the caller need as a whole.
             drop(drawing);
             if continued.is_none_or(|slab| slab.is_last) {
-                target.finish(view);
+                target.finish(shown);
                 on_view_done(index, target);
             }
         },
@@ -187,6 +196,7 @@ fn draw_macro_tile<S: Simd>(
     // Once per macro tile and not per tile, since it is allocated for a sky network.
     let mut sky_scratch = background.and_then(Background::scratch);
     let mut halved_by = NOT_HALVED;
+    let mut means = TileSums::default();
     let mut evaluations = 0;
     // Tiles of earlier slabs.
     let has_sums = unfinished.as_ref().is_some_and(|tiles| !tiles.is_empty());
@@ -198,21 +208,28 @@ fn draw_macro_tile<S: Simd>(
         let at_px = [column * TILE_PX, row * TILE_PX];
         let mut sums = TileSums::default();
         let mut live = u16::MAX;
+        let mut owners = None;
         if let (true, Some(tiles)) = (has_sums, &mut unfinished) {
             sums = tiles[index].sums;
             live = tiles[index].live;
+            owners = tiles[index].owners.take();
         }
         let mut output =
             TileOutput { sums: &mut sums, live: &mut live, halved_by: &mut halved_by, wants };
         evaluations += rasterize_tile(simd, input, macro_tile, within, at_px, batch, &mut output);
-        if wants.owners {
-            let mut band = drawing.bands[row as usize].lock();
-            // In every slab: places of splats are those of this slab's projection.
+        let pixels = TilePixels::new([column, row], drawing.is_sampled);
+        // In every slab: places of splats are those of this slab's projection.
+        if wants.owners && drawing.is_sampled {
+            let owners = owners.get_or_insert_with(Box::<SampleOwners>::default);
+            owners.note(&halved_by, input.projected);
+            halved_by = NOT_HALVED;
+        } else if wants.owners {
+            let mut band = drawing.bands[pixels.band].lock();
             band.write_owners(&halved_by, at_px[0], input.projected, has_sums);
             halved_by = NOT_HALVED;
         }
         if let (false, Some(tiles)) = (is_last, &mut unfinished) {
-            let tile = UnfinishedTile { sums, live };
+            let tile = UnfinishedTile { sums, live, owners };
             if has_sums {
                 tiles[index] = tile
             } else {
@@ -221,13 +238,23 @@ fn draw_macro_tile<S: Simd>(
             continue;
         }
         // From here on the tile's sums are final.
+        let sums = if drawing.is_sampled {
+            sums.write_means(&pixels, wants.depth, &mut means);
+            &mut means
+        } else {
+            &mut sums
+        };
         if let Some(background) = background {
-            background.add(simd, at_px, &mut sky_scratch, &mut sums);
+            background.add(simd, &pixels, &mut sky_scratch, sums);
         }
         if let Some(appearance) = drawing.appearance {
-            appearance::apply(simd, appearance, at_px, &mut sums);
+            appearance::apply(simd, appearance, &pixels, sums);
         }
-        resolve::resolve(simd, &sums, at_px[0], &mut drawing.bands[row as usize].lock());
+        let mut band = drawing.bands[pixels.band].lock();
+        if let Some(owners) = owners {
+            band.write_sampled_owners(&owners, &pixels);
+        }
+        resolve::resolve(simd, sums, &pixels, &mut band);
     }
     Work {
         evaluations,

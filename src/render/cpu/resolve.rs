@@ -4,6 +4,7 @@ use fearless_simd::{f32x16, prelude::*, u32x16};
 
 use super::project::Projected;
 use crate::constants::{BLOCK_PX, TILE_PX};
+use crate::samples::{SAMPLES, most_frequent};
 use crate::{Target, View};
 use wildcity_scene::SemanticClass;
 use wildcity_scene::appearance::Appearance;
@@ -17,6 +18,72 @@ pub(super) const BLOCKS: usize = (TILE_PX / BLOCK_PX * (TILE_PX / BLOCK_PX)) as 
 pub(super) fn block_corner(block: usize) -> [u32; 2] {
     let per_row = TILE_PX / BLOCK_PX;
     [block as u32 % per_row * BLOCK_PX, block as u32 / per_row * BLOCK_PX]
+}
+
+/// The blocks of a tile, row by row.
+const ALL_BLOCKS: [usize; BLOCKS] = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15];
+
+/// The blocks of each quarter of a tile.
+const QUARTERS: [[usize; 4]; 4] = [[0, 1, 4, 5], [2, 3, 6, 7], [8, 9, 12, 13], [10, 11, 14, 15]];
+
+/// The pixels of an image that a tile becomes.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct TilePixels {
+    /// The first pixel of the image's tile that has them.
+    pub(super) at_px: [u32; 2],
+    /// Their blocks in it.
+    pub(super) blocks: &'static [usize],
+    /// Row of tiles of the image.
+    pub(super) band: usize,
+    /// Which quarter of the image's tile they are, for a tile of samples.
+    quarter: usize,
+}
+
+impl TilePixels {
+    /// Of a tile by its column and row, which has the image's pixels, or 2 x 2 samples of each.
+    pub(super) fn new([column, row]: [u32; 2], is_sampled: bool) -> Self {
+        if !is_sampled {
+            let at_px = [column * TILE_PX, row * TILE_PX];
+            return Self { at_px, blocks: &ALL_BLOCKS, band: row as usize, quarter: 0 };
+        }
+        let at_px = [column / SAMPLES * TILE_PX, row / SAMPLES * TILE_PX];
+        let quarter = (row % SAMPLES * SAMPLES + column % SAMPLES) as usize;
+        let band = (row / SAMPLES) as usize;
+        Self { at_px, blocks: &QUARTERS[quarter], band, quarter }
+    }
+
+    /// Where the 2 x 2 pixels of a block of samples lie: their block, and the lane of the first.
+    fn sample_pixels(&self, block: usize) -> (usize, u32) {
+        let [left, top] = block_corner(block).map(|px| px / SAMPLES);
+        let into = QUARTERS[self.quarter][(top / BLOCK_PX * 2 + left / BLOCK_PX) as usize];
+        (into, top % BLOCK_PX * BLOCK_PX + left % BLOCK_PX)
+    }
+}
+
+/// The lane of the first sample of each of a block's 2 x 2 pixels; the others are 1, 4 and 5 after
+/// it.
+const FIRST_SAMPLES: [usize; 4] = [0, 2, 8, 10];
+
+/// The lanes of 2 x 2 pixels, given the first.
+fn four_lanes(first: u32) -> [u32; 4] {
+    [first, first + 1, first + BLOCK_PX, first + BLOCK_PX + 1]
+}
+
+/// The owner of each sample of a tile, block by block: the instance, and the class in the high
+/// half.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct SampleOwners([[u32; LANES]; BLOCKS]);
+
+impl SampleOwners {
+    /// Records the owners of samples that were halved.
+    pub(super) fn note(&mut self, halved_by: &HalvedBy, projected: &Projected) {
+        for (owner, place) in self.0.as_flattened_mut().iter_mut().zip(halved_by.as_flattened()) {
+            if let Some(place) = place.checked_sub(1) {
+                let class = u32::from(projected.class(place).value());
+                *owner = u32::from(projected.instance(place)) | class << 16;
+            }
+        }
+    }
 }
 
 /// For each pixel of a tile, the place of the splat that brings its transmittance to a half or
@@ -45,6 +112,31 @@ impl Default for TileSums {
         let zero = [[0.0; LANES]; BLOCKS];
         let one = [[1.0; LANES]; BLOCKS];
         Self { rgb: [zero; 3], depth_m: zero, transmittance: one, running: one }
+    }
+}
+
+impl TileSums {
+    /// Writes the sums of the pixels that a tile of samples becomes to their blocks: the means of
+    /// 2 x 2 samples. `depth` tells whether depth is requested.
+    #[inline(always)]
+    pub(super) fn write_means(&self, pixels: &TilePixels, depth: bool, means: &mut Self) {
+        let each = |from: &[[f32; LANES]; BLOCKS], to: &mut [[f32; LANES]; BLOCKS]| {
+            for (block, from) in from.iter().enumerate() {
+                let (into, first) = pixels.sample_pixels(block);
+                let to = &mut to[into];
+                for (k, lane) in FIRST_SAMPLES.into_iter().zip(four_lanes(first)) {
+                    to[lane as usize % LANES] =
+                        0.25 * ((from[k] + from[k + 1]) + (from[k + 4] + from[k + 5]));
+                }
+            }
+        };
+        for (from, to) in self.rgb.iter().zip(&mut means.rgb) {
+            each(from, to);
+        }
+        if depth {
+            each(&self.depth_m, &mut means.depth_m);
+        }
+        each(&self.transmittance, &mut means.transmittance);
     }
 }
 
@@ -96,6 +188,33 @@ impl Band<'_> {
     }
 }
 
+impl Band<'_> {
+    /// Writes the instances and classes of the pixels that a tile of samples becomes.
+    pub(super) fn write_sampled_owners(&mut self, owners: &SampleOwners, pixels: &TilePixels) {
+        for (block, owners) in owners.0.iter().enumerate() {
+            let (into, first) = pixels.sample_pixels(block);
+            let [left, top] = block_corner(into);
+            for (k, lane) in FIRST_SAMPLES.into_iter().zip(four_lanes(first)) {
+                let column = (pixels.at_px[0] + left + lane % BLOCK_PX) as usize;
+                let row = (top + lane / BLOCK_PX) as usize;
+                // Beyond the image's edge there are no pixels.
+                if column >= self.width || row >= self.rows {
+                    continue;
+                }
+                let pixel = row * self.width + column;
+                let samples = [owners[k], owners[k + 1], owners[k + 4], owners[k + 5]];
+                // Each by itself, so that neither depends on whether the other is asked for.
+                if let Some(instances) = &mut self.instances {
+                    instances[pixel] = most_frequent(samples.map(|owner| owner as u16));
+                }
+                if let Some(semantics) = &mut self.semantics {
+                    semantics[pixel] = most_frequent(samples.map(|owner| (owner >> 16) as u8));
+                }
+            }
+        }
+    }
+}
+
 /// Exposure and overlay of a target's camera; `None` if they change nothing.
 pub(super) fn appearance<'a>(target: &Target<'a>) -> Option<&'a Appearance> {
     target.appearance.filter(|appearance| !appearance.is_identity())
@@ -128,11 +247,11 @@ pub(super) fn bands<'a>(target: &'a mut Target<'_>, view: &View) -> Vec<Band<'a>
         .collect()
 }
 
-/// Writes one tile with its left edge at column `left`.
+/// Writes the pixels of one tile.
 #[inline(always)]
-pub(super) fn resolve<S: Simd>(simd: S, sums: &TileSums, left: u32, band: &mut Band<'_>) {
-    for block in 0..BLOCKS {
-        resolve_block(simd, sums, block, left, band);
+pub(super) fn resolve<S: Simd>(simd: S, sums: &TileSums, pixels: &TilePixels, band: &mut Band<'_>) {
+    for &block in pixels.blocks {
+        resolve_block(simd, sums, block, pixels.at_px[0], band);
     }
 }
 

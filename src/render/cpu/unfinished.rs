@@ -3,7 +3,7 @@
 use parking_lot::Mutex;
 
 use super::bin::Grid;
-use super::resolve::TileSums;
+use super::resolve::{SampleOwners, TileSums};
 use crate::View;
 
 /// A slab of a view: its tiles continue from the previous slab.
@@ -22,18 +22,25 @@ pub(super) struct UnfinishedTile {
     pub(super) sums: TileSums,
     /// A bit for each block in which some pixel has not stopped.
     pub(super) live: u16,
+    /// If the tile has samples whose owners are wanted.
+    pub(super) owners: Option<Box<SampleOwners>>,
 }
 
 impl UnfinishedTiles {
-    /// Most bytes of the sums of a view.
-    pub(super) fn bytes(view: &View) -> u64 {
-        (Grid::new(view).tiles() * size_of::<UnfinishedTile>()) as u64
+    /// Most bytes of the sums of a view, which may be the samples of another one.
+    pub(super) fn bytes(view: &View, is_sampled: bool) -> u64 {
+        let owners = if is_sampled { size_of::<SampleOwners>() } else { 0 };
+        (Grid::new(view).tiles() * (size_of::<UnfinishedTile>() + owners)) as u64
     }
 
     /// Bytes of the present sums.
     pub(super) fn held_bytes(&self) -> u64 {
-        let tiles: usize = self.0.iter().map(|tiles| tiles.lock().capacity()).sum();
-        (tiles * size_of::<UnfinishedTile>()) as u64
+        let of_macro_tile = |tiles: &Mutex<Vec<UnfinishedTile>>| {
+            let tiles = tiles.lock();
+            let owners = tiles.iter().filter(|tile| tile.owners.is_some()).count();
+            tiles.capacity() * size_of::<UnfinishedTile>() + owners * size_of::<SampleOwners>()
+        };
+        self.0.iter().map(of_macro_tile).sum::<usize>() as u64
     }
 
     /// The sums of a view before the first slab.

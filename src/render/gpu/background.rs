@@ -14,6 +14,8 @@ use wgpu::{BindingResource, BufferUsages};
 use super::device::Device;
 use super::growable_buffer::GrowableBuffer;
 use super::layout;
+use super::resolve::Outputs;
+use crate::samples::SAMPLES;
 use crate::{Frame, MAX_VIEWS, RenderError, View};
 use wildcity_scene::appearance::{Appearance, Exposure, Overlay};
 use wildcity_scene::sky::{DrawableSky, InferenceNetwork};
@@ -76,16 +78,18 @@ impl Background {
         frame: &Frame<'_>,
         sky: DrawableSky,
         sky_from_world: DMat3,
-        appearances: &[Appearance],
+        outputs: &Outputs,
     ) -> Result<(), RenderError> {
         let mut parameters = layout::Background::zeroed();
-        for (slot, view) in parameters.sky_from_pixel.iter_mut().zip(frame.views) {
+        for (index, view) in frame.views.iter().enumerate() {
             let rows = if view.is_static_pinhole() {
-                view.sky_from_pixel(sky_from_world)
+                // Pixels of the image; the view may be that of their samples.
+                let px = if outputs.sampled.contains(index) { SAMPLES as f32 } else { 1.0 };
+                view.sky_from_pixel(sky_from_world).map(|[x, y, one]| [x * px, y * px, one])
             } else {
                 view.sky_from_camera(sky_from_world)
             };
-            *slot = rows.map(|[a, b, c]| [a, b, c, 0.0]);
+            parameters.sky_from_pixel[index] = rows.map(|[a, b, c]| [a, b, c, 0.0]);
         }
         match &sky {
             DrawableSky::CubeMap(map) => {
@@ -114,7 +118,7 @@ impl Background {
             self.sky = Some(sky);
         }
         self.parameters.fill(device, bytemuck::bytes_of(&parameters));
-        self.upload_appearances(device, appearances)
+        self.upload_appearances(device, &outputs.appearances)
     }
 
     fn upload_appearances(

@@ -213,7 +213,8 @@ pub(super) fn module(device: &Device, shader: &str) -> ShaderModule {
 pub(super) struct LazyShader<K, const N: usize> {
     shader: &'static str,
     module: Option<ShaderModule>,
-    variants: [Option<K>; N],
+    /// In boxes: 96 of them by value, in 15 shaders, would not fit the stack of a thread.
+    variants: [Option<Box<K>>; N],
 }
 
 impl<K, const N: usize> LazyShader<K, N> {
@@ -237,12 +238,12 @@ impl<K, const N: usize> LazyShader<K, N> {
         compile: impl FnOnce(&ShaderModule) -> K,
     ) -> &K {
         let module = self.module.get_or_insert_with(|| module(device, self.shader));
-        self.variants[variant].get_or_insert_with(|| compile(module))
+        self.variants[variant].get_or_insert_with(|| Box::new(compile(module)))
     }
 
     /// The kernels of a variant that was compiled before.
     pub(super) fn compiled(&self, variant: usize) -> Option<&K> {
-        self.variants[variant].as_ref()
+        self.variants[variant].as_deref()
     }
 }
 

@@ -105,7 +105,8 @@ pub struct Frame {
     /// Tiles with more splats than this have a kernel of their own.
     pub long_tile_splats: u32,
     pub long_tiles: u32,
-    pub pad: u32,
+    /// A bit for each view whose tiles are those of 2 x 2 samples a pixel.
+    pub sampled: u32,
     /// The views, in order.
     pub view: [FrameView; MAX_VIEWS],
 }

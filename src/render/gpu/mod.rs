@@ -80,6 +80,7 @@ use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
 use crate::gradient::Differentiate;
 use crate::lidar::{LidarView, Sweep, Task};
 use crate::limits;
+use crate::samples::SampledViews;
 use wildcity_scene::geometry::Lidar;
 use wildcity_scene::{RenderProfile, Scene};
 
@@ -275,8 +276,8 @@ impl Gpu {
         targets: &mut [Target<'_>],
         finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
-        self.render_with(frame, targets, finished, |outputs| {
-            self.in_turn(|chain| chain.resume(done, frame, outputs))
+        self.render_with(frame, targets, finished, |drawn, outputs| {
+            self.in_turn(|chain| chain.resume(done, drawn, outputs))
         })
     }
 
@@ -292,23 +293,27 @@ impl Gpu {
         last: Stage,
     ) -> Result<StageOutputs, RenderError> {
         frame.check_views()?;
+        let sampled = SampledViews::new(frame);
+        let frame = &sampled.frame(frame);
         self.in_turn(|chain| chain.run_through(frame, done, last, &self.cull))
     }
 
-    /// Draws a frame with `draw`, and copies its pixels to the targets.
+    /// Draws a frame with `draw`, which gets it with the views of the samples, and copies its
+    /// pixels to the targets.
     fn render_with(
         &self,
         frame: &Frame<'_>,
         targets: &mut [Target<'_>],
         finished: OnViewDone<'_>,
-        draw: impl FnOnce(&Outputs) -> Result<MappedFrame, RenderError>,
+        draw: impl FnOnce(&Frame<'_>, &Outputs) -> Result<MappedFrame, RenderError>,
     ) -> Result<FrameStats, RenderError> {
         frame.check(targets)?;
         frame.check_splats(self.name())?;
-        let outputs = Outputs::from_targets(targets);
+        let sampled = SampledViews::new(frame);
+        let outputs = Outputs::from_targets(targets, sampled.sampled);
         // Draw on this thread: a thread of a pool that waits may take up another frame of that
         // pool.
-        let drawn = draw(&outputs)?;
+        let drawn = draw(&sampled.frame(frame), &outputs)?;
 
         // Copy the pixels. Other frames can be drawn meanwhile.
         let start = Instant::now();
@@ -326,7 +331,7 @@ impl Gpu {
         self.deliver.install(|| {
             let views = drawn.views.par_iter().zip(targets.par_iter_mut()).enumerate();
             views.with_max_len(1).for_each(|(index, (view, target))| {
-                pixels.copy_to(view, target);
+                pixels.copy_to(view, outputs.sampled.contains(index), target);
                 target.finish(&frame.views[index]);
                 finished(index, target);
             });
@@ -370,7 +375,7 @@ impl Backend for Gpu {
         targets: &mut [Target<'_>],
         finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
-        self.render_with(frame, targets, finished, |outputs| self.draw(frame, outputs))
+        self.render_with(frame, targets, finished, |drawn, outputs| self.draw(drawn, outputs))
     }
 
     fn sweep(

@@ -22,9 +22,8 @@ use super::lens::Lenses;
 use super::long_tiles::LongTiles;
 use super::plan::Plan;
 use super::project::SplatBuffers;
-use super::resolve::Planes;
+use super::resolve::{Outputs, Planes};
 use crate::{Frame, RenderError};
-use wildcity_scene::appearance::Appearance;
 use wildcity_scene::sky::{CubeMap, DrawableSky};
 
 /// The stage with one kind of background; one kernel for each combination of planes.
@@ -168,7 +167,6 @@ impl Rasterize {
     }
 
     /// Uploads the background of a frame and the appearances of its cameras, if there is either.
-    /// `appearances` is empty if no camera changes colours.
     ///
     /// # Errors
     /// The sky cannot be drawn as the profile demands, or is larger than a binding.
@@ -176,10 +174,10 @@ impl Rasterize {
         &mut self,
         device: &Device,
         frame: &Frame<'_>,
-        appearances: &[Appearance],
+        outputs: &Outputs,
     ) -> Result<(), RenderError> {
         let background = match frame.background()? {
-            None if !appearances.is_empty() => {
+            None if !outputs.appearances.is_empty() => {
                 let black =
                     self.black.get_or_insert_with(|| Arc::new(CubeMap::uniform(DVec3::ZERO)));
                 Some((DrawableSky::CubeMap(black.clone()), DMat3::IDENTITY))
@@ -189,7 +187,7 @@ impl Rasterize {
         self.has_background = background.is_some();
         let Some((sky, sky_from_world)) = background else { return Ok(()) };
         let held = self.background.get_or_insert_with(|| Background::new(device));
-        held.upload(device, frame, sky, sky_from_world, appearances)
+        held.upload(device, frame, sky, sky_from_world, outputs)
     }
 
     /// Most loop iterations that the background takes of a thread.

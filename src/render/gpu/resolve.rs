@@ -10,12 +10,14 @@ use rayon::prelude::*;
 use super::layout::FrameView;
 use crate::Target;
 use crate::constants::TILE_PX;
+use crate::samples::SAMPLES;
+use wildcity_scene::ViewSet;
 use wildcity_scene::appearance::Appearance;
 
 /// Pixels of a tile, and words of a plane of 32-bit values.
 const PLANE: usize = (TILE_PX * TILE_PX) as usize;
-/// Words of the plane of 8-bit colours.
-const RGB8_PLANE: usize = 3 * PLANE / 4;
+/// A tile takes a multiple of this many words.
+const TILE_WORDS: usize = 64;
 
 /// Which values of a pixel the device computes and the host reads: those that any target requests.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -28,6 +30,16 @@ pub(super) struct Planes {
     owners: bool,
     /// Whether owners have classes.
     semantics: bool,
+    tiles: TileKinds,
+}
+
+/// What the tiles of a frame have: the pixels of its images, or 2 x 2 samples of each.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum TileKinds {
+    Pixels,
+    /// Some have pixels, and some samples.
+    Both,
+    Samples,
 }
 
 /// The outputs that the targets of a frame request.
@@ -36,25 +48,39 @@ pub(super) struct Outputs {
     pub(super) planes: Planes,
     /// Exposure and overlay of each camera; empty if no camera has either.
     pub(super) appearances: Vec<Appearance>,
+    /// The views whose tiles have samples.
+    pub(super) sampled: ViewSet,
 }
 
 impl Outputs {
-    /// The outputs that these targets request.
-    pub(super) fn from_targets(targets: &[Target<'_>]) -> Self {
+    /// The outputs that these targets request. The tiles of the views `sampled` have samples.
+    pub(super) fn from_targets(targets: &[Target<'_>], sampled: ViewSet) -> Self {
         let appearances = targets.iter().map(|t| t.appearance.cloned().unwrap_or_default());
         let appearances: Vec<Appearance> = appearances.collect();
         let all_identity = appearances.iter().all(Appearance::is_identity);
         let appearances = if all_identity { Vec::new() } else { appearances };
-        Self { planes: Planes::from_targets(targets), appearances }
+        Self { planes: Planes::from_targets(targets, sampled), appearances, sampled }
+    }
+
+    /// The outputs that a loss is a function of.
+    pub(super) fn for_gradients(depth: bool) -> Self {
+        let planes = Planes::for_gradients(depth);
+        Self { planes, appearances: Vec::new(), sampled: ViewSet::default() }
     }
 }
 
 impl Planes {
     /// Number of combinations.
-    pub(super) const VARIANTS: usize = 32;
+    pub(super) const VARIANTS: usize = 3 * 32;
 
     /// The values that these targets request.
-    pub(super) fn from_targets(targets: &[Target<'_>]) -> Self {
+    fn from_targets(targets: &[Target<'_>], sampled: ViewSet) -> Self {
+        let samples = (0..targets.len()).filter(|&view| sampled.contains(view)).count();
+        let tiles = match samples {
+            0 => TileKinds::Pixels,
+            _ if samples == targets.len() => TileKinds::Samples,
+            _ => TileKinds::Both,
+        };
         let any = |requests: fn(&Target<'_>) -> bool| targets.iter().any(requests);
         Self {
             rgb8: any(|t| t.rgb8.is_some()),
@@ -63,29 +89,47 @@ impl Planes {
             depth: any(|t| t.depth_m.is_some()),
             owners: any(|t| t.instances.is_some() || t.semantics.is_some()),
             semantics: any(|t| t.semantics.is_some()),
+            tiles,
         }
     }
 
     /// Those that a loss is a function of.
-    pub(super) fn for_gradients(depth: bool) -> Self {
-        Self { rgb8: false, rgb: true, opacity: true, depth, owners: false, semantics: false }
+    fn for_gradients(depth: bool) -> Self {
+        let tiles = TileKinds::Pixels;
+        Self {
+            rgb8: false,
+            rgb: true,
+            opacity: true,
+            depth,
+            owners: false,
+            semantics: false,
+            tiles,
+        }
     }
 
     /// A number below [`Planes::VARIANTS`]. Owners with classes have shaders of their own.
     pub(super) fn variant(self) -> usize {
         let bits = [self.rgb8, self.rgb, self.opacity, self.depth, self.owners];
-        bits.into_iter().fold(0, |number, bit| 2 * number + usize::from(bit))
+        bits.into_iter().fold(self.tiles as usize, |number, bit| 2 * number + usize::from(bit))
     }
 
-    /// The override constants of `shaders/resolve.wgsl`.
-    pub(super) fn constants(self) -> [(&'static str, f64); 4] {
+    /// The override constants of `shaders/resolve.wgsl` and `has_samples.wgsl`.
+    pub(super) fn constants(self) -> [(&'static str, f64); 6] {
         let switch = |name, on| (name, f64::from(u8::from(on)));
         [
             switch("RGB8", self.rgb8),
             switch("RGB", self.rgb),
             switch("OPACITY", self.opacity),
             switch("DEPTH", self.depth),
+            switch("SAMPLES", self.tiles != TileKinds::Pixels),
+            switch("QUARTER_TILES", self.tiles == TileKinds::Samples),
         ]
+    }
+
+    /// Words of a plane of 32-bit values: a tile of samples has a quarter of the pixels. In frames
+    /// with both kinds each has the larger size.
+    fn plane(self) -> usize {
+        if self.tiles == TileKinds::Samples { PLANE / 4 } else { PLANE }
     }
 
     /// Whether depth is computed.
@@ -106,7 +150,7 @@ impl Planes {
     /// Bytes of the pixels of one tile, at least one plane, so that buffers are never empty. They
     /// are a multiple of 256, so that a binding may start at any tile.
     pub(super) fn tile_bytes(self) -> u64 {
-        4 * self.words().max(PLANE - RGB8_PLANE) as u64
+        4 * self.words().max(1).next_multiple_of(TILE_WORDS) as u64
     }
 
     /// Words of a tile.
@@ -118,11 +162,11 @@ impl Planes {
     /// takes of a tile.
     fn parts(self) -> [(bool, usize); 5] {
         [
-            (self.rgb8, RGB8_PLANE),
-            (self.rgb, 3 * PLANE),
-            (self.opacity, PLANE),
-            (self.depth, PLANE),
-            (self.owners, PLANE),
+            (self.rgb8, 3 * self.plane() / 4),
+            (self.rgb, 3 * self.plane()),
+            (self.opacity, self.plane()),
+            (self.depth, self.plane()),
+            (self.owners, self.plane()),
         ]
     }
 
@@ -139,6 +183,17 @@ impl Planes {
     }
 }
 
+/// The tiles of one image.
+struct TileGrid {
+    size_px: [usize; 2],
+    /// Tiles of a row.
+    columns: u32,
+    /// Index of the first tile among those of all views.
+    first_tile: u32,
+    /// Edge of a tile, in pixels of the image.
+    edge: usize,
+}
+
 /// All pixels of a frame in the device's order.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Pixels<'a> {
@@ -151,9 +206,17 @@ pub(super) struct Pixels<'a> {
 }
 
 impl Pixels<'_> {
-    /// Copies the pixels of one view to its target.
-    pub(super) fn copy_to(&self, view: &FrameView, target: &mut Target<'_>) {
-        let row_pixels = (view.size_px[0] * TILE_PX) as usize;
+    /// Copies the pixels of one view to its target. Its tiles may have samples.
+    pub(super) fn copy_to(&self, view: &FrameView, is_sampled: bool, target: &mut Target<'_>) {
+        let samples = if is_sampled { SAMPLES } else { 1 };
+        let view = &TileGrid {
+            size_px: view.size_px.map(|px| (px / samples) as usize),
+            columns: view.columns,
+            first_tile: view.first_tile,
+            edge: (TILE_PX / samples) as usize,
+        };
+        let row_pixels = view.size_px[0] * view.edge;
+        let plane_words = self.planes.plane();
         let [rgb8, rgb, opacity, depth, owners] = self.planes.starts();
         if let (Some(to), Some(plane)) = (&mut target.rgb8, rgb8) {
             self.for_each_row(view, to.par_chunks_mut(3 * row_pixels), |to, at, tile, from| {
@@ -166,7 +229,7 @@ impl Pixels<'_> {
         }
         if let (Some(to), Some(rgb), Some(opacity)) = (&mut target.rgba, rgb, opacity) {
             self.for_each_row(view, to.par_chunks_mut(4 * row_pixels), |to, at, tile, from| {
-                let planes = [rgb, rgb + PLANE, rgb + 2 * PLANE, opacity];
+                let planes = [rgb, rgb + plane_words, rgb + 2 * plane_words, opacity];
                 for (channel, plane) in planes.into_iter().enumerate() {
                     let to = to[4 * at..].chunks_exact_mut(4);
                     for (to, word) in to.zip(row(tile, plane, &from)) {
@@ -206,12 +269,13 @@ impl Pixels<'_> {
     /// plane.
     fn for_each_row<'t, T: Send + 't>(
         &self,
-        view: &FrameView,
+        view: &TileGrid,
         bands: impl IndexedParallelIterator<Item = &'t mut [T]>,
         copy: impl Fn(&mut [T], usize, &[u32], Range<usize>) + Sync,
     ) {
-        let [width, height] = view.size_px.map(|size| size as usize);
-        let edge = TILE_PX as usize;
+        let TileGrid { size_px: [width, height], edge, .. } = *view;
+        // Pixels of a row of a tile's planes.
+        let stride = self.planes.plane().isqrt();
         bands.enumerate().for_each(|(tile_row, band)| {
             for column in 0..view.columns {
                 let tile = view.first_tile + tile_row as u32 * view.columns + column;
@@ -219,7 +283,7 @@ impl Pixels<'_> {
                 let left = column as usize * edge;
                 let columns = edge.min(width - left);
                 for y in 0..edge.min(height - tile_row * edge) {
-                    copy(band, y * width + left, words, y * edge..y * edge + columns);
+                    copy(band, y * width + left, words, y * stride..y * stride + columns);
                 }
             }
         });

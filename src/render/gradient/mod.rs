@@ -7,6 +7,8 @@
 //! exposure and expected depth are functions of them, too (`wildcity-train` has these, with their
 //! derivatives), so no backend knows them.
 //!
+//! Pixels have one sample, as with the profile's `shrink=filter`, whatever it says.
+//!
 //! The parameters are those of [`GaussianGradient`], and a twist of each view ([`Twist`]), which
 //! [`Twist::on_rig`] takes to the poses of a rig.
 //!

@@ -3,6 +3,7 @@
 use glam::{DVec2, DVec3};
 
 use super::project::Splat;
+use crate::samples::most_frequent;
 use wildcity_scene::{RenderProfile, SemanticClass};
 
 /// Accumulated values of a pixel.
@@ -30,6 +31,12 @@ pub(super) fn row(splats: &[Splat], row: u32, width: usize, profile: &RenderProf
     let near_row = |splat: &&Splat| reaches(splat.mean_px.y - y_px, splat.reach_px.y);
     let here: Vec<Splat> = splats.iter().filter(near_row).copied().collect();
     (0..width).map(|column| pixel(&here, DVec2::new(column as f64 + 0.5, y_px), profile)).collect()
+}
+
+/// A row of pixels with 2 x 2 samples each, from the rows of their samples.
+pub(super) fn means(upper: &[Pixel], lower: &[Pixel]) -> Vec<Pixel> {
+    let rows = upper.chunks_exact(2).zip(lower.chunks_exact(2));
+    rows.map(|(upper, lower)| Pixel::mean([upper[0], upper[1], lower[0], lower[1]])).collect()
 }
 
 /// Whether a splat may reach alpha_cut at this distance along one axis.
@@ -65,6 +72,18 @@ impl Pixel {
         instance: 0,
         class: SemanticClass::None,
     };
+
+    /// The mean of a pixel's samples; its owner is that of most.
+    fn mean(samples: [Self; 4]) -> Self {
+        let mean = |value: fn(&Self) -> f64| samples.iter().map(value).sum::<f64>() / 4.0;
+        Self {
+            rgb: samples.iter().map(|sample| sample.rgb).sum::<DVec3>() / 4.0,
+            transmittance: mean(|sample| sample.transmittance),
+            depth_m: mean(|sample| sample.depth_m),
+            instance: most_frequent(samples.map(|sample| sample.instance)),
+            class: most_frequent(samples.map(|sample| sample.class)),
+        }
+    }
 
     /// Blends the next splat, with its alpha before the cap. Returns false if the pixel stops
     /// before it.

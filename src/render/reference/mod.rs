@@ -20,6 +20,7 @@ pub use project::{Gaussian, Splat, project};
 
 use wildcity_scene::appearance::{Appearance, Exposure};
 
+use super::samples::{SAMPLES, SampledViews};
 use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
 use crate::gradient::Differentiate;
 use crate::lidar::{LidarView, Sweep};
@@ -52,12 +53,16 @@ impl Backend for Reference {
         let mut project_ms = 0.0;
         let mut blend_ms = 0.0;
         let mut stats = FrameStats::default();
+        let sampled = SampledViews::new(frame);
+        let drawn = sampled.frame(frame);
         // One view after the other; rows run in parallel, and keep their order.
         for (index, (view, target)) in frame.views.iter().zip(targets).enumerate() {
+            // The view whose pixels are blended: `view`, or that of its samples.
+            let drawn = &drawn.views[index];
             // Project and sort.
             let start = Instant::now();
             let scene = &*frame.scene.for_view(index);
-            let mut splats = project(scene, frame.profile, view);
+            let mut splats = project(scene, frame.profile, drawn);
             project::sort(&mut splats);
             // Splats give order, colour and visibility; exact rays take only the shape from these.
             let gaussians = match frame.profile.rays {
@@ -66,7 +71,7 @@ impl Backend for Reference {
             };
             let views = match frame.profile.rays {
                 Rays::Splats => Vec::new(),
-                Rays::Exact => rays::relative_views(scene, view),
+                Rays::Exact => rays::relative_views(scene, drawn),
             };
             project_ms += start.elapsed().as_secs_f64() * 1e3;
             stats.visible_pairs += splats.len() as u64;
@@ -74,14 +79,19 @@ impl Backend for Reference {
             // Blend row by row, then add the background, and apply exposure and overlay of the
             // camera.
             let start = Instant::now();
-            let width = view.camera.width_px as usize;
+            let width = drawn.camera.width_px as usize;
+            let blend = |row: u32| match frame.profile.rays {
+                Rays::Splats => blend::row(&splats, row, width, frame.profile),
+                Rays::Exact => rays::row(&splats, &gaussians, row, &views, frame.profile),
+            };
             let appearance = target.appearance;
             let pixels: Vec<blend::Pixel> = (0..view.camera.height_px)
                 .into_par_iter()
                 .flat_map_iter(|row| {
-                    let mut pixels = match frame.profile.rays {
-                        Rays::Splats => blend::row(&splats, row, width, frame.profile),
-                        Rays::Exact => rays::row(&splats, &gaussians, row, &views, frame.profile),
+                    let mut pixels = if sampled.sampled.contains(index) {
+                        blend::means(&blend(SAMPLES * row), &blend(SAMPLES * row + 1))
+                    } else {
+                        blend(row)
                     };
                     background::add(frame, view, row, &mut pixels);
                     if let Some(appearance) = appearance {
@@ -91,7 +101,7 @@ impl Backend for Reference {
                 })
                 .collect();
             blend_ms += start.elapsed().as_secs_f64() * 1e3;
-            stats.evaluations += pixels.len() as u64 * splats.len() as u64;
+            stats.evaluations += drawn.camera.pixels() as u64 * splats.len() as u64;
             write(&pixels, target);
             target.finish(view);
             on_view_done(index, target);

@@ -4,9 +4,10 @@ use glam::{DMat3, DQuat, DVec3};
 
 /// The alpha below which a splat is not drawn, of the default profile.
 const ALPHA_CUT: f64 = 1.0 / 255.0;
-/// Share of its bell that a Gaussian may show beyond the edges of those in whose place it is,
-/// without an error: it is reached only by Gaussians of an opacity below 0.13.
-const HIDDEN_SHARE: f64 = 0.03;
+/// Alpha that a merged Gaussian may show beyond the edges of those in whose place it is, without an
+/// error. Two of one spot show the cut; one of a hundred pairs on that spot would show a hundred
+/// times as much with the others, and knows nothing of them.
+const MOST_SHOWN: f64 = ALPHA_CUT / 2.0;
 
 /// A Gaussian as it is kept between merges: a dense block has millions.
 #[derive(Clone, Copy, Debug)]
@@ -18,7 +19,7 @@ pub(super) struct StoredNode {
     pub(super) quat_wxyz: [f32; 4],
     /// This and the next are as in [`Node`].
     pub(super) weight: f64,
-    pub(super) opaque_weight: f64,
+    pub(super) hidden_weight: f64,
 }
 
 impl StoredNode {
@@ -28,10 +29,10 @@ impl StoredNode {
         let [w, x, y, z] = self.quat_wxyz.map(f64::from);
         let axes = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
         let root = axes * DMat3::from_diagonal(scale_m);
-        let &Self { mean_m, weight, opaque_weight, .. } = self;
+        let &Self { mean_m, weight, hidden_weight, .. } = self;
         // The covariance as root times its transpose is symmetric and has no negative eigenvalue,
         // also after rounding.
-        Node { mean_m, cov_m2: root * root.transpose(), scale_m, axes, weight, opaque_weight }
+        Node { mean_m, cov_m2: root * root.transpose(), scale_m, axes, weight, hidden_weight }
     }
 
     /// Largest standard deviation, in metres.
@@ -60,8 +61,9 @@ pub(super) struct Node {
     pub(super) axes: DMat3,
     /// Opacity times [`area_m2`].
     pub(super) weight: f64,
-    /// The sum of weight times opacity of the Gaussians of level 0 that it represents.
-    pub(super) opaque_weight: f64,
+    /// The part of the weight that the Gaussians of level 0 that it represents hide: the sum of
+    /// weight times [`hidden_share`].
+    pub(super) hidden_weight: f64,
 }
 
 /// A measure of the area that a Gaussian covers: proportional to the mean area of its projections
@@ -81,7 +83,7 @@ impl Node {
             scale_m: self.scale_m.as_vec3().to_array(),
             quat_wxyz: [q.w, q.x, q.y, q.z].map(|q| q as f32),
             weight: self.weight,
-            opaque_weight: self.opaque_weight,
+            hidden_weight: self.hidden_weight,
         }
     }
 
@@ -95,27 +97,33 @@ impl Node {
     ///
     /// A Gaussian of opacity `o` ends where its alpha falls below the cut, `√(2 ln(o / cut))`
     /// standard deviations from its centre, with a share of `cut / o` of its bell beyond: a faint
-    /// one is only the tip of its bell. Of many on one spot, the merged one is more opaque than
-    /// each and ends later. It shows what all of them cut off, however many of its kind lie there.
-    /// Of Gaussians that cut off little, that is not seen.
+    /// one is only the tip of its bell. Of several on one spot, the merged one is more opaque than
+    /// each and ends later, and shows what all of them cut off. What they cut off together is a
+    /// share of their bells, too, and their edge is that of Gaussians which all hide that share.
     pub(super) fn beyond_edge(&self, area_m2: f64) -> f64 {
-        // Weighted by what each contributes. Comparisons with the NaN of an invisible one are
-        // false.
-        let [before, now] =
-            [self.opaque_weight / self.weight, self.weight / area_m2].map(|o| o / ALPHA_CUT);
-        if before.recip().min(1.0) - now.recip().min(1.0) <= HIDDEN_SHARE {
+        let opacity = self.weight / area_m2;
+        let before = self.hidden_weight / self.weight;
+        let now = hidden_share(opacity);
+        // The comparison with the NaN of an invisible one is false.
+        let shows = opacity * (before - now) > MOST_SHOWN;
+        if !shows {
             return 0.0;
         }
-        let edge = |ratio: f64| (2.0 * ratio.ln()).max(0.0).sqrt();
-        (edge(now) - edge(before)).max(0.0)
+        let edge = |share: f64| (-2.0 * share.ln()).max(0.0).sqrt();
+        edge(now) - edge(before)
     }
+}
+
+/// The share of its bell that a Gaussian of this opacity hides: where its alpha is below the cut.
+pub(super) fn hidden_share(opacity: f64) -> f64 {
+    (ALPHA_CUT / opacity).min(1.0)
 }
 
 /// The merge of two Gaussians: the first two moments of their weighted mixture. `scale_m` and
 /// `axes` are invalid until [`Node::diagonalise`] is called.
 pub(super) fn joined(a: &Node, b: &Node) -> Node {
     let weight = a.weight + b.weight;
-    let opaque_weight = a.opaque_weight + b.opaque_weight;
+    let hidden_weight = a.hidden_weight + b.hidden_weight;
     // Two invisible Gaussians get equal shares.
     let share = if weight > 0.0 { b.weight / weight } else { 0.5 };
     let offset = b.mean_m - a.mean_m;
@@ -124,7 +132,7 @@ pub(super) fn joined(a: &Node, b: &Node) -> Node {
     let spread = outer(offset) * (share * (1.0 - share));
     // The law of total variance: the mean of the covariances plus the covariance of the means.
     let cov_m2 = a.cov_m2 * (1.0 - share) + b.cov_m2 * share + spread;
-    Node { mean_m, cov_m2, weight, opaque_weight, ..*a }
+    Node { mean_m, cov_m2, weight, hidden_weight, ..*a }
 }
 
 impl Node {
@@ -215,9 +223,9 @@ mod tests {
         let scale_m = DVec3::splat(sigma_m);
         let cov_m2 = DMat3::from_diagonal(scale_m * scale_m);
         let weight = opacity * area_m2(scale_m);
-        let opaque_weight = weight * opacity;
+        let hidden_weight = weight * hidden_share(opacity);
         let axes = DMat3::IDENTITY;
-        Node { mean_m: DVec3::X * x, cov_m2, scale_m, axes, weight, opaque_weight }
+        Node { mean_m: DVec3::X * x, cov_m2, scale_m, axes, weight, hidden_weight }
     }
 
     #[test]

@@ -22,7 +22,7 @@ use rayon::prelude::*;
 use super::chunk::{ActivatedGaussian, Chunk, column};
 use super::{SemanticClass, sh};
 
-use merge::{Node, StoredNode, area_m2, cost, joined};
+use merge::{Node, StoredNode, area_m2, cost, hidden_share, joined};
 
 /// One level of detail of a block.
 #[derive(Clone, Debug)]
@@ -142,7 +142,7 @@ impl Merging {
                 scale_m,
                 quat_wxyz: [0, 1, 2, 3].map(|i| value(column::QUAT + i)),
                 weight,
-                opaque_weight: weight * opacity,
+                hidden_weight: weight * hidden_share(opacity),
             });
             merging.sh.extend((0..stride).map(|k| block.value(index, column::SH + k)));
         }

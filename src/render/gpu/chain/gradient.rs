@@ -19,7 +19,7 @@ use crate::gpu::layout::{FrameView, RASTER_BATCH, SplatShape};
 use crate::gpu::partition::TileRows;
 use crate::gpu::project_work::{ProjectWork, Projection};
 use crate::gpu::read_back::{ReadBack, mapped};
-use crate::gpu::resolve::{Outputs, Pixels, Planes};
+use crate::gpu::resolve::{Outputs, Pixels};
 use crate::gradient::{
     GaussianImages, GradientError, Gradients, LossGradient, Partial, Twist, check_finite,
     check_sizes, mask,
@@ -103,7 +103,7 @@ impl Chain {
         depth: bool,
         pool: &ThreadPool,
     ) -> Result<(Drawn<'a>, Vec<GaussianImages>), GradientError> {
-        let outputs = Outputs { planes: Planes::for_gradients(depth), appearances: Vec::new() };
+        let outputs = Outputs::for_gradients(depth);
         pool.install(|| self.mirror.make_resident(&self.device, frame.scene))?;
         let actors = ActorViews::new(frame);
         let mut current = self.begin(frame, &actors, &outputs)?;

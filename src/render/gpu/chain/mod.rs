@@ -204,8 +204,10 @@ impl Chain {
     ) -> Result<CurrentFrame, RenderError> {
         let planes = outputs.planes;
         self.lenses.upload(&self.device, frame, actors);
-        self.rasterize.upload_background(&self.device, frame, &outputs.appearances)?;
+        self.rasterize.upload_background(&self.device, frame, outputs)?;
         let mut parameters = GpuFrame::new(frame.views, frame.profile);
+        let sampled = (0..frame.views.len()).filter(|&view| outputs.sampled.contains(view));
+        parameters.sampled = sampled.fold(0, |bits, view| bits | 1 << view);
         let background_iterations = self.rasterize.background_iterations();
         parameters.batch_limit = self.device.max_tile_batches(background_iterations);
         parameters.long_tile_splats = self.device.tuning().long_tile_splats;

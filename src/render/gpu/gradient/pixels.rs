@@ -25,7 +25,7 @@ pub(in crate::gpu) fn images(pixels: &Pixels<'_>, view: &FrameView, depth: bool)
         depth_m: depth.then_some(&mut depth_m),
         ..Target::default()
     };
-    pixels.copy_to(view, &mut target);
+    pixels.copy_to(view, false, &mut target);
     let (colors, _) = rgba.as_chunks::<4>();
     // The device divides by the opacity.
     depth_m.iter_mut().zip(colors).for_each(|(depth_m, color)| *depth_m *= color[3]);
