@@ -29,11 +29,11 @@ pub(super) struct Drawing<'a> {
 /// these, the sums of one view that is drawn in slabs, and each thread's copies of a macro tile.
 pub(super) fn most_held_bytes(most_bytes: u64, views: &[View], threads: usize) -> u64 {
     // With samples, which take more than pixels: the profile is not known.
-    let sums = |view: &View| {
+    let sums_of_one = |view: &View| {
         let samples = sample_view(view);
         UnfinishedTiles::bytes(samples.as_ref().unwrap_or(view), samples.is_some())
     };
-    let sums = views.iter().map(sums).max().unwrap_or(0);
+    let sums = views.iter().map(sums_of_one).max().unwrap_or(0);
     // A single view may exceed the limit up to the size of its sums, see `Drawing::most_bytes`.
     most_bytes.max(sums) + sums + bin::COPIES_BYTES * threads as u64
 }
