@@ -224,7 +224,7 @@ impl SweepKernels {
         device.queue.submit([encoder.finish()]);
     }
 
-    /// Compares the beams of a sector with a batch of candidates. The first batch begins the sector.
+    /// Compares the beams of a sector with a batch of candidates; the first batch begins it.
     fn trace(&mut self, device: &Device, batch: &Batch, sector: &GpuSector, is_first: bool) {
         self.candidates.fill(device, bytemuck::cast_slice(&batch.candidates));
         self.lists.fill(device, bytemuck::cast_slice(&batch.lists));

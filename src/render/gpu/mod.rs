@@ -98,8 +98,8 @@ pub struct Gpu {
     tuning: Option<Tuning>,
     /// Copies images to their targets, and runs the callbacks of finished views.
     deliver: ThreadPool,
-    /// Culls clusters, and finds candidates of LiDARs. It has its own pool, so that a frame that is drawn does not wait for one
-    /// that is encoded.
+    /// Culls clusters, and finds candidates of LiDARs. It has its own pool, so that a frame that is
+    /// drawn does not wait for one that is encoded.
     cull: ThreadPool,
     queue: TicketQueue,
     /// The frames that the device has.
@@ -247,7 +247,7 @@ impl Gpu {
         })
     }
 
-    /// Whether the device's bindings can hold a sweep; the cpu backend's code computes it otherwise.
+    /// Whether the device's bindings can hold a sweep; if not, the cpu backend's code computes it.
     fn can_hold(&self, lidar: &Lidar) -> bool {
         SweepKernels::fit(self.binding_bytes, lidar)
     }

@@ -27,7 +27,7 @@ pub(super) struct BufferPlan {
 }
 
 impl BufferPlan {
-    /// The plan for some captures, whose maps begin at `floats_at`, and for sweeps with integers and
+    /// The plan for some captures, whose maps begin at `floats_at`, and for sweeps with ids and
     /// classes of so many bytes.
     pub(super) fn new(
         layout: Arc<ObservationLayout>,
