@@ -1,7 +1,7 @@
 // Stage resolve: computes the requested values from a pixel's sums. It runs in the threads of
 // `rasterize`, so that the sums stay in registers.
 //
-// The output is tile after tile, and within a tile one plane of 256 values (64) after another, in this order
+// The output is tile after tile, and within a tile one plane of 256 values (64 of QUARTER_TILES) after another, in this order
 // and only if requested: red, green and blue of 8 bits, then red, green, blue, opacity, depth, owner. Twin of
 // `src/render/cpu/resolve.rs`.
 

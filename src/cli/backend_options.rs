@@ -49,7 +49,7 @@ pub struct BackendOptions {
 #[derive(Clone, Debug, clap::Args)]
 pub struct HardwareOptions {
     /// Render threads; 0 for one per core. Pixels do not depend on it.
-    #[arg(long, hide = true, value_name = "N", default_value_t = 0, value_parser = threads)]
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = threads)]
     threads: usize,
 
     /// Device of the gpu backend: its number in `wildcity dev devices`, or a part of its name

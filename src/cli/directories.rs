@@ -100,7 +100,7 @@ impl Scenarios {
 pub struct Uploads {
     /// Directory where uploads are kept until they are pushed; only one server at a time may use it
     /// [default: $XDG_STATE_HOME/wildcity/uploads, or ~/.local/state/wildcity/uploads]
-    #[arg(long, hide = true, value_name = "DIR")]
+    #[arg(long, value_name = "DIR")]
     uploads: Option<PathBuf>,
 }
 

@@ -31,11 +31,11 @@ const MOVED: [Moved; 14] = [
     moved("lod", "wildcity dev lod"),
     moved("map", "wildcity twin map"),
     Moved { old: "repair", new: "wildcity dev repair", without: "check" },
-    Moved { old: "replay", new: "wildcity episode verify", without: "--verify" },
+    Moved { old: "replay", new: "wildcity episode show", without: "" },
     moved("rig", "wildcity twin rig"),
     moved("route", "wildcity twin route"),
     moved("stress", "wildcity dev stress"),
-    Moved { old: "view", new: "wildcity serve --open", without: "--no-open" },
+    moved("view", "wildcity serve --listen 127.0.0.1:0 --open"),
 ];
 
 /// The error of an old command: where it went, and the new command line. None for other arguments
@@ -45,9 +45,17 @@ pub(super) fn command(arguments: impl Iterator<Item = OsString>) -> Option<Exit>
     let is_help = words.first().is_some_and(|word| word == "help");
     let (name, rest) = words[usize::from(is_help)..].split_first()?;
     let Moved { old, new, without } = MOVED.iter().find(|moved| moved.old == *name)?;
-    let mut line = (*new).to_owned();
-    for word in rest.iter().filter(|word| word != without) {
-        line = format!("{line} {}", quoted(word));
+    let is_verified = rest.iter().any(|word| word == "--verify" || word.starts_with("--out"));
+    let [new, without] = match *old {
+        "replay" if is_verified => ["wildcity episode verify", "--verify"],
+        _ => [*new, *without],
+    };
+    let mut line = new.to_owned();
+    let left_out = rest.iter().position(|word| word == without);
+    for (at, word) in rest.iter().enumerate() {
+        if left_out != Some(at) {
+            line = format!("{line} {}", quoted(word));
+        }
     }
     if is_help {
         line += " --help";
@@ -80,7 +88,9 @@ mod tests {
         for (line, new) in [
             (&["lod", "street", "--tau", "1,4"][..], "wildcity dev lod street --tau 1,4"),
             (&["replay", "a b.jsonl", "--verify"], "wildcity episode verify 'a b.jsonl'"),
-            (&["view", "street", "--no-open"], "wildcity serve --open street"),
+            (&["replay", "a.jsonl"], "wildcity episode show a.jsonl"),
+            (&["view", "street"], "wildcity serve --listen 127.0.0.1:0 --open street"),
+            (&["repair", "check", "check"], "wildcity dev repair check"),
             (&["repair", "check", "it's.json"], r"wildcity dev repair 'it'\''s.json'"),
             (&["bench", "step", "--json"], "cargo run --release -p wildcity-bench -- step --json"),
             (&["help", "drive"], "wildcity alpasim drive --help"),
@@ -99,10 +109,8 @@ mod tests {
         for Moved { old, new, .. } in &MOVED {
             assert!(program.find_subcommand(old).is_none(), "{old} is still there");
             let Some(words) = new.strip_prefix("wildcity ") else { continue };
-            let found = words.split(' ').try_fold(&program, |command, word| {
-                let is_option = word.starts_with("--");
-                if is_option { Some(command) } else { command.find_subcommand(word) }
-            });
+            let mut names = words.split(' ').take_while(|word| !word.starts_with("--"));
+            let found = names.try_fold(&program, |command, name| command.find_subcommand(name));
             assert!(found.is_some() || !cfg!(feature = "full"), "{new} is no command");
         }
     }

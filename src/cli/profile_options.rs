@@ -20,7 +20,7 @@ pub(super) struct ProfileOptions {
     /// overrides --profile. Fields: near, far (metres), blur (px²), antialiased (true or false),
     /// alpha_cap, alpha_cut, stop (0 to 1), tau_px (largest error of a level of detail, in pixels;
     /// 0 draws full detail), reach_m (draw distance in metres, or none), rays (splats, or exact:
-    /// only the reference backend), shrink (images of less than half of their native size: samples,
+    /// only the reference backend), shrink (images of at most 0.45 of their native sides: samples,
     /// or filter, which is faster and less exact), sky_error (0 evaluates the sky for every pixel;
     /// otherwise the largest colour error of the map that it is baked into), background (linear
     /// red,green,blue).

@@ -255,8 +255,11 @@ impl Command {
             repair: RepairSampling::new(self.stations, &self.offsets, self.repair_side),
         };
         let expected = wildcity_report::expect(&settings, &twin, &machine)?;
-        let rest = if self.no_stress { "" } else { ", then the extreme scenes" };
-        writeln!(io::stderr(), "this takes {expected}{rest}")?;
+        let stress = if self.no_stress { "" } else { ", extreme scenes" };
+        writeln!(
+            io::stderr(),
+            "this takes {expected}; then come trust and costs of features{stress}"
+        )?;
         let bar = progress::state();
         let report = wildcity_report::run(&settings, &twin, &machine, &mut |what, done, all| {
             bar.set_length(all);

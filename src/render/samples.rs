@@ -1,4 +1,4 @@
-//! Small images: of less than half of their native size, each pixel is the mean of 2 x 2 samples.
+//! Small images: of at most 0.45 of the native sides, each pixel is the mean of 2 x 2 samples.
 //!
 //! The samples are the pixels of the same camera with twice the size ([`sample_view`]), which its
 //! own [`PixelFilter`](crate::layout::PixelFilter) filters. Splats are projected, sorted, binned
@@ -8,16 +8,17 @@
 //! **Why.** The filter makes each splat as wide as a pixel, and the sum of wide splats is the mean
 //! of native pixels only if they do not hide each other. Many splats smaller than a pixel do: each
 //! covers its own part of the pixel, but blending multiplies what they let through as if each
-//! covered all of it a little. No filter of single splats mends this. Samples are closer to native
-//! pixels, and have less of it: 44 to 62 dB in place of 36 to 50 at a quarter of the native size
-//! (BENCHMARKS.md, "Small images").
+//! covered all of it a little. No filter of single splats changes this. Samples are closer to
+//! native pixels, and have less of it: 45 to 62 dB in place of 37 to 50 at a quarter of the native
+//! size (BENCHMARKS.md, "Small images").
 //!
-//! **Depth** is that of the mean sums, and so weighted by opacity. **The owner of a pixel**, and
-//! its class, is the one that most of its samples have, of equally many the first (row by row).
+//! **Depth** is that of the mean sums, and so weighted by opacity. **The owner of a pixel** is the
+//! one that most of its samples have, of equally many the first (row by row). So is its class,
+//! which may be that of another sample.
 //!
 //! Larger images have one sample a pixel: the filter alone reaches 40 dB, and samples, nearly as
-//! many as native pixels, would take the time of a native image. So have gradients, whatever the
-//! profile says.
+//! many as native pixels, would take the time of a native image. Gradients have one sample a pixel,
+//! too, whatever the profile says.
 
 use std::borrow::Cow;
 
@@ -39,7 +40,7 @@ pub(crate) fn sample_view(view: &View) -> Option<View> {
         return None;
     }
     let [width, height] = [camera.width_px, camera.height_px].map(|px| u64::from(SAMPLES * px));
-    // Beyond the largest size there are no samples.
+    // Twice 0.45 of a native size is a size that a camera may have.
     let camera = camera.scaled(width, height).ok()?;
     Some(View { camera, ..*view })
 }

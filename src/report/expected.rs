@@ -12,7 +12,7 @@ use super::measure::Benchmark;
 use super::setting::Setting;
 use super::timing::Step;
 
-/// What a report is expected to take, without repair and without extreme scenes.
+/// What a report is expected to take without repair, trust, costs of features and extreme scenes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Expected {
     /// The images of the reference, in seconds.

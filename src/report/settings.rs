@@ -292,7 +292,7 @@ impl<'a> ListBuilder<'a> {
             let name = format!("{} with its own blur", scaled.name);
             self.settings.push(scaled.clone());
             // Larger images have one sample a pixel with either.
-            if scale < 0.45 && self.twin.profile.shrink == Shrink::Samples {
+            if scale <= 0.45 && self.twin.profile.shrink == Shrink::Samples {
                 let change = "shrink=filter".to_owned();
                 let name = format!("{} {change}", scaled.name);
                 self.settings.push(Setting { name, profile: vec![change], ..scaled.clone() });

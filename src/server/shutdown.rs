@@ -1,6 +1,6 @@
 //! A running server, and stopping it without losing running steps.
 
-use std::net::SocketAddr;
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -164,7 +164,13 @@ impl Running {
     /// The URL of the viewer.
     pub fn page(&self) -> String {
         let scheme = if self.has_tls { "https" } else { "http" };
-        format!("{scheme}://{}/", self.address)
+        // All addresses are no place to go to; this machine's own is one of them.
+        let ip = match self.address.ip() {
+            IpAddr::V4(ip) if ip.is_unspecified() => Ipv4Addr::LOCALHOST.into(),
+            IpAddr::V6(ip) if ip.is_unspecified() => Ipv6Addr::LOCALHOST.into(),
+            ip => ip,
+        };
+        format!("{scheme}://{}/", SocketAddr::new(ip, self.address.port()))
     }
 
     /// The renderer and the twins, for other services of the same process.

@@ -32,7 +32,7 @@ fn count() -> RangedU64ValueParser<usize> {
 #[command(next_help_heading = HEADING)]
 pub(super) struct LimitOptions {
     /// Largest number of sessions at a time, connected or waiting to be resumed.
-    #[arg(long, hide = true, value_name = "N", default_value_t = Limits::default().sessions, value_parser = count())]
+    #[arg(long, value_name = "N", default_value_t = Limits::default().sessions, value_parser = count())]
     sessions: usize,
 
     /// Largest number of WebSocket connections at a time; 64 more connections are accepted for HTTP
@@ -78,7 +78,7 @@ pub(super) struct LimitOptions {
 
     /// Seconds that sessions may go on after SIGTERM; until then the server opens no new one and is
     /// not ready. A second SIGTERM stops it at once.
-    #[arg(long, hide = true, value_name = "SECONDS", default_value_t = Limits::default().sessions_end.as_secs_f64(), value_parser = waiting_seconds)]
+    #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().sessions_end.as_secs_f64(), value_parser = waiting_seconds)]
     sessions_end_s: f64,
 
     /// Seconds that running steps may take to finish when the server stops.

@@ -111,7 +111,7 @@ pub(super) struct Serve {
 
     /// Allow an address of --alpasim that is not loopback: every machine that can connect to it can
     /// then read the twins.
-    #[arg(long, hide = true, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = false, num_args = 0..=1, default_missing_value = "true")]
+    #[arg(long, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = false, num_args = 0..=1, default_missing_value = "true")]
     alpasim_open: bool,
 
     /// Refuse shared memory to clients on this machine: they then receive observations through the

@@ -329,9 +329,10 @@ impl Device {
     /// enters. A batch takes at most 95: 1, 3 to load two splats, 17 to transpose a word, 5 for
     /// four words, 17 for the 32 splats of each word (two at a time), and 1 at their end; 96 leaves
     /// one to spare. Besides, a thread takes 17 to find its view among 16, 5 at the end of the
-    /// batches, and 4 x 33 for the owners of four pixels among 2^32: 154 of 160.
+    /// batches, 4 x 33 for the owners of four pixels among 2^32, and 8 x 5 for those that most
+    /// samples have: 194 of 200.
     pub(super) fn max_tile_batches(&self, background_iterations: u64) -> u32 {
-        let batches = |most: u64| most.saturating_sub(160 + background_iterations) / 96;
+        let batches = |most: u64| most.saturating_sub(200 + background_iterations) / 96;
         self.loop_iterations().map_or(u32::MAX, |most| batches(most) as u32)
     }
 

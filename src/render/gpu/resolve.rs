@@ -147,7 +147,7 @@ impl Planes {
         self.semantics
     }
 
-    /// Bytes of the pixels of one tile, at least one plane, so that buffers are never empty. They
+    /// Bytes of the pixels of one tile, at least 64 words, so that buffers are never empty. They
     /// are a multiple of 256, so that a binding may start at any tile.
     pub(super) fn tile_bytes(self) -> u64 {
         4 * self.words().max(1).next_multiple_of(TILE_WORDS) as u64

@@ -5,8 +5,8 @@ use glam::{DMat3, DQuat, DVec3};
 /// The alpha below which a splat is not drawn, of the default profile.
 const ALPHA_CUT: f64 = 1.0 / 255.0;
 /// Alpha that a merged Gaussian may show beyond the edges of those in whose place it is, without an
-/// error. Two of one spot show the cut; one of a hundred pairs on that spot would show a hundred
-/// times as much with the others, and knows nothing of them.
+/// error. Two equal ones on one spot, merged, show an alpha of one cut beyond their edge; a hundred
+/// pairs there would show a hundred times as much, and a pair does not know of the others.
 const MOST_SHOWN: f64 = ALPHA_CUT / 2.0;
 
 /// A Gaussian as it is kept between merges: a dense block has millions.
