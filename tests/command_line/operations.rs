@@ -159,7 +159,7 @@ fn an_old_command_says_what_to_run() {
     for (line, new) in [
         (&["bench", "step", "--help"][..], "cargo run --release -p wildcity-bench -- step --help"),
         (&["inspect", "street", "--json"], "wildcity twin show street --json"),
-        (&["help", "replay"], "wildcity episode verify --help"),
+        (&["replay", "a.jsonl", "--verify"], "wildcity episode verify a.jsonl"),
     ] {
         let output = wildcity().args(line).output().unwrap();
         assert_eq!(output.status.code(), Some(2), "{output:?}");
