@@ -19,9 +19,9 @@ fn finish_tile(index: u32, view: u32, corner: vec2u, thread: u32, sums: Sums) {
 fn finish_samples(index: u32, view: u32, corner: vec2u, thread: u32, sums: Sums) {
     workgroupBarrier();
     // Sums of two neighbours of a row.
-    mean_factors[thread] = vec4f(of_two(sums.red), of_two(sums.green));
-    mean_factors[THREADS + thread] = vec4f(of_two(sums.blue), of_two(sums.depth));
-    color_depths[thread] = vec4f(of_two(sums.transmittance), 0.0, 0.0);
+    mean_factors[thread] = vec4f(pair_sums(sums.red), pair_sums(sums.green));
+    mean_factors[THREADS + thread] = vec4f(pair_sums(sums.blue), pair_sums(sums.depth));
+    color_depths[thread] = vec4f(pair_sums(sums.transmittance), 0.0, 0.0);
     // Exact: owners have 24 bits.
     color_depths[THREADS + thread] = vec4f(instances());
     workgroupBarrier();
@@ -30,8 +30,8 @@ fn finish_samples(index: u32, view: u32, corner: vec2u, thread: u32, sums: Sums)
     // follow them.
     let first = min(pixel.y / 2u * 16u + pixel.x * 2u + pixel.y % 2u * 2u, THREADS - 6u);
     let second = first + 4u;
-    let red_green = array(of_four(0u, first), of_four(0u, second));
-    let blue_depth = array(of_four(THREADS, first), of_four(THREADS, second));
+    let red_green = array(pixel_means(0u, first), pixel_means(0u, second));
+    let blue_depth = array(pixel_means(THREADS, first), pixel_means(THREADS, second));
     let through = array(
         color_depths[first] + color_depths[first + 1u],
         color_depths[second] + color_depths[second + 1u],
@@ -53,12 +53,12 @@ fn finish_samples(index: u32, view: u32, corner: vec2u, thread: u32, sums: Sums)
     }
 }
 
-fn of_two(values: vec4f) -> vec2f {
+fn pair_sums(values: vec4f) -> vec2f {
     return values.xz + values.yw;
 }
 
 // The mean of four samples of each of two pixels.
-fn of_four(values: u32, first: u32) -> vec4f {
+fn pixel_means(values: u32, first: u32) -> vec4f {
     return 0.25 * (mean_factors[values + first] + mean_factors[values + first + 1u]);
 }
 
@@ -71,15 +71,15 @@ fn sampled_owners(first: u32) -> vec4u {
     let upper = array(vec4u(color_depths[at]), vec4u(color_depths[at + 4u]));
     let lower = array(vec4u(color_depths[at + 1u]), vec4u(color_depths[at + 5u]));
     return vec4u(
-        owner_of(vec4u(upper[0].xy, lower[0].xy)),
-        owner_of(vec4u(upper[0].zw, lower[0].zw)),
-        owner_of(vec4u(upper[1].xy, lower[1].xy)),
-        owner_of(vec4u(upper[1].zw, lower[1].zw)),
+        most_frequent_owner(vec4u(upper[0].xy, lower[0].xy)),
+        most_frequent_owner(vec4u(upper[0].zw, lower[0].zw)),
+        most_frequent_owner(vec4u(upper[1].xy, lower[1].xy)),
+        most_frequent_owner(vec4u(upper[1].zw, lower[1].zw)),
     );
 }
 
 // The instance and the class that most of four samples have, of equally many the first, each by itself.
-fn owner_of(samples: vec4u) -> u32 {
+fn most_frequent_owner(samples: vec4u) -> u32 {
     return most_frequent(samples & vec4u(0xFFFFu)) | (most_frequent(samples >> vec4u(16u)) << 16u);
 }
 

@@ -19,7 +19,7 @@ pub struct Expected {
     pub reference_s: f64,
     /// Errors and times of all settings, in seconds.
     pub settings_s: f64,
-    /// Number of settings.
+    /// How many settings are measured in that time.
     pub settings: usize,
 }
 

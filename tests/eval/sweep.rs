@@ -101,11 +101,11 @@ fn a_sweep_at_30_m_s_deskews_to_what_a_lidar_at_rest_sees() {
     assert_eq!(world.skipped, 0);
 
     let errors = |points_m: &[DVec3]| -> Vec<f64> {
-        let error = |point_m: &DVec3| {
+        let miss_m = |point_m: &DVec3| {
             let [seen_m, range_m] = ranges_m(&cpu, &scene, last, *point_m);
             (seen_m - range_m).abs()
         };
-        let mut errors: Vec<f64> = points_m.iter().map(error).collect();
+        let mut errors: Vec<f64> = points_m.iter().map(miss_m).collect();
         errors.sort_by(f64::total_cmp);
         errors
     };

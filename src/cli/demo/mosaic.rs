@@ -52,7 +52,7 @@ fn row(seen: &Observation, cameras: &[&'static str]) -> anyhow::Result<Row> {
     named.collect()
 }
 
-/// Time and speed.
+/// The line above the images: the time and the speed at which they were taken.
 fn headline(seen: &Observation) -> String {
     let metadata = seen.metadata();
     let speed_m_s = metadata.ego.velocity.iter().map(|v| v * v).sum::<f64>().sqrt();

@@ -173,7 +173,7 @@ impl SweepKernels {
     /// The sweep of a LiDAR. The candidates are found in `pool`.
     ///
     /// # Errors
-    /// The device fails.
+    /// The device fails, or is lost meanwhile.
     pub(super) fn sweep(
         &mut self,
         device: &Device,

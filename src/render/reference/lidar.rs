@@ -25,7 +25,7 @@ struct Hit {
     alpha: f64,
     luminance: f32,
     instance: u16,
-    /// As in [`Sweep::gaussian`].
+    /// Its number among all Gaussians of the scene.
     gaussian: u32,
 }
 

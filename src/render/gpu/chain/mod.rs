@@ -182,7 +182,7 @@ impl Chain {
     /// The sweep of a LiDAR.
     ///
     /// # Errors
-    /// The device fails.
+    /// The device fails, or is lost meanwhile.
     pub(super) fn sweep(
         &mut self,
         task: &Task<'_>,
