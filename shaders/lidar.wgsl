@@ -1,5 +1,5 @@
 // LiDAR sweeps: what the beams of a sector hit. The host lists the Gaussians that each tile of 16 x 16 beams may meet,
-// its candidates, the nearest first. Twin of `src/render/cpu/lidar/tile.rs`.
+// its candidates, almost from the nearest. Twin of `src/render/cpu/lidar/tile.rs`.
 //
 // `trace`: a workgroup per tile, a thread per beam. A beam keeps its hits up to its return, in order of range.
 // `finish`: a thread per beam, after the last candidates of a sector. It writes the returns.
@@ -99,14 +99,15 @@ struct Return {
 const HALF: f32 = 0.5;
 const HALF_LOG2_E: f32 = 0.7213475204;
 
-// Candidates that a tile loads at a time. Before it compares them, it looks whether all of its beams have returned in
-// front of them.
+// Candidates that a tile loads at a time. It compares them unless all of its beams have returned in front of all of them.
 const LOADED: u32 = 32;
 
 var<workgroup> loaded: array<Candidate, LOADED>;
 
-// Of the ends of the tile's beams, in metres, the bits: those of positive numbers have their order.
+// The bits of the farthest end of the tile's beams, and of the nearest distance of what is loaded, in metres: those of
+// positive numbers have their order.
 var<workgroup> farthest_bits: atomic<u32>;
+var<workgroup> nearest_bits: atomic<u32>;
 var<workgroup> is_behind: u32;
 
 @compute @workgroup_size(WORKGROUP)
@@ -145,19 +146,21 @@ fn trace(
         }
         if thread == 0u {
             atomicStore(&farthest_bits, 0u);
+            atomicStore(&nearest_bits, 0xFFFFFFFFu);
         }
         workgroupBarrier();
         atomicMax(&farthest_bits, bitcast<u32>(seen.end_m));
+        if thread < count {
+            atomicMin(&nearest_bits, bitcast<u32>(max(loaded[thread].nearest_m, 0.0)));
+        }
         workgroupBarrier();
         if thread == 0u {
-            is_behind = u32(loaded[0].nearest_m > bitcast<f32>(atomicLoad(&farthest_bits)));
+            is_behind = u32(atomicLoad(&nearest_bits) > atomicLoad(&farthest_bits));
         }
-        // So are all that follow.
-        if workgroupUniformLoad(&is_behind) == 1u {
-            break;
-        }
-        for (var i = 0u; i < count; i++) {
-            seen = compare(i, row, beam, origin_m, direction, seen);
+        if workgroupUniformLoad(&is_behind) == 0u {
+            for (var i = 0u; i < count; i++) {
+                seen = compare(i, row, beam, origin_m, direction, seen);
+            }
         }
         workgroupBarrier();
     }

@@ -165,19 +165,21 @@ pub(crate) fn chunks(scene: &Scene) -> impl Iterator<Item = (Body<'_>, &Chunk)> 
 pub(crate) struct Keys {
     /// That of the first Gaussian of each chunk.
     firsts: Vec<u32>,
-    /// The owner of each chunk, as in [`Sweep::instance`].
-    instances: Vec<u16>,
+    /// The key of the first Gaussian of each owner, and the owner as in [`Sweep::instance`].
+    owners: Vec<(u32, u16)>,
 }
 
 impl Keys {
     /// # Errors
     /// The scene has 2^32 Gaussians or more.
     pub(crate) fn new(scene: &Scene) -> Result<Self, RenderError> {
-        let mut keys = Self { firsts: Vec::new(), instances: Vec::new() };
+        let mut keys = Self { firsts: Vec::new(), owners: Vec::new() };
         let mut next = 0_u32;
         for (body, chunk) in chunks(scene) {
             keys.firsts.push(next);
-            keys.instances.push(body.instance);
+            if keys.owners.last().is_none_or(|(_, owner)| *owner != body.instance) {
+                keys.owners.push((next, body.instance));
+            }
             let after = u32::try_from(chunk.len()).ok().and_then(|len| next.checked_add(len));
             let limit = u64::from(u32::MAX);
             let what = "Gaussians in a scene with LiDARs";
@@ -199,7 +201,9 @@ impl Keys {
 
     /// The owner of a Gaussian.
     pub(crate) fn instance(&self, key: u32) -> u16 {
-        self.instances[self.chunk(key)]
+        // As for chunks.
+        let after = self.owners.partition_point(|(first, _)| *first <= key);
+        self.owners[after.saturating_sub(1)].1
     }
 }
 

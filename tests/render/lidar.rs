@@ -16,7 +16,7 @@ use wildcity_scene::{Gaussians, Scene};
 use crate::images::cpu;
 use crate::lidars::{
     check_classes, check_intensities, check_same, coincident, dense_street, extremes, grid,
-    in_motion, random_scene, spinning, stack, sweep, tables, turning, upright, with_actor,
+    in_motion, layers, random_scene, spinning, stack, sweep, tables, turning, upright, with_actor,
 };
 
 #[test]
@@ -153,6 +153,13 @@ fn few_columns_of_a_moving_lidar_meet_small_gaussians() {
 fn coincident_gaussians_keep_their_order() {
     let (scene, view) = coincident();
     check_intensities(&sweep(&cpu(), &scene, &view), &sweep(&Reference, &scene, &view));
+}
+
+/// What is hidden is not searched, and nothing else is left out.
+#[test]
+fn layers_are_met_as_by_the_definition() {
+    let (scene, view) = layers();
+    check_same(&sweep(&cpu(), &scene, &view), &sweep(&Reference, &scene, &view), "layers");
 }
 
 /// 4,500 km from the origin a sweep is the same.

@@ -12,6 +12,7 @@ use wildcity_render::lidar::{LidarView, Sweep};
 use wildcity_render::{Backend, FIRST_ACTOR_INSTANCE};
 use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::geometry::{Lidar, Pose};
+use wildcity_scene::random::Random;
 use wildcity_scene::{Gaussians, RenderProfile, Scene, SemanticClass};
 
 use crate::data::real;
@@ -234,20 +235,45 @@ pub(crate) fn extremes() -> [(Scene, LidarView); 2] {
     })
 }
 
-/// Gaussians in one place, of different colours, in front of a LiDAR.
+/// Gaussians in one place, of different colours, in front of a LiDAR: a cluster, and more of a second
+/// one that has a bound nearer to the LiDAR, so that beams are compared with it first.
 pub(crate) fn coincident() -> (Scene, LidarView) {
-    let mut gaussians = Gaussians::with_capacity(0, 40);
-    for at in 0..40 {
-        gaussians.means_m.push([6.0, 0.0, 0.0]);
+    let mut gaussians = Gaussians::with_capacity(0, 300);
+    for at in 0..300 {
+        // The last one is beside what the LiDAR sees.
+        gaussians.means_m.push([6.0, if at == 299 { 20.0 } else { 0.0 }, 0.0]);
         gaussians.ln_scales.push([0.0; 3]);
         gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
-        // An alpha of about a fifth, so that a return is made of some of them. The last ones reach
-        // farthest, so that beams are compared with them first.
-        gaussians.logit_opacities.push(-1.4 + 0.01 * at as f32);
-        gaussians.sh.extend([0.08 * at as f32; 3]);
+        // An alpha of about a fifth, so that a return is made of some of them.
+        gaussians.logit_opacities.push(-1.4);
+        gaussians.sh.extend([0.005 * at as f32; 3]);
     }
     let lidar = Arc::new(grid([0.2, -0.2], 32, [0.2, -0.2], 32));
     (Scene::from_gaussians(&gaussians), LidarView::at_rest(lidar, Pose::IDENTITY))
+}
+
+/// Layers behind each other, in any order, of more Gaussians than are compared at a time, and a
+/// LiDAR that drives past them: most of them are hidden.
+pub(crate) fn layers() -> (Scene, LidarView) {
+    let count = 30_000;
+    let mut gaussians = Gaussians::with_capacity(0, count);
+    let mut random = Random::new(5, "layers", 0);
+    for _ in 0..count {
+        let range_m = 6.0 + 2.0 * random.below(12) as f64;
+        let [y, z] = [0, 1].map(|_| 0.5 * range_m * random.range(-1.0, 1.0));
+        gaussians.means_m.push([range_m, y, z]);
+        let ln_scale = (0.012 * range_m as f32).ln();
+        gaussians.ln_scales.push([ln_scale - 2.0, ln_scale, ln_scale]);
+        gaussians.quats_wxyz.push([1.0, 0.0, 0.1, 0.05]);
+        gaussians.logit_opacities.push(random.range(-1.0, 4.0) as f32);
+        gaussians.sh.extend([random.range(0.0, 0.5) as f32; 3]);
+    }
+    let view = LidarView {
+        lidar: Arc::new(grid([0.35, -0.35], 40, [0.35, -0.35], 40)),
+        world_from_lidar: Pose::IDENTITY,
+        world_from_lidar_first: Pose { position_m: DVec3::new(-2.0, 0.5, 0.1), ..Pose::IDENTITY },
+    };
+    (Scene::from_gaussians(&gaussians), view)
 }
 
 /// Requires that all beams see the same luminance.

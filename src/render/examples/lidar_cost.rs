@@ -14,7 +14,7 @@ use wildcity_render::gpu::{AdapterChoice, Gpu};
 use wildcity_render::lidar::LidarView;
 use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::geometry::{Lidar, Pose};
-use wildcity_scene::{RenderProfile, Rig, Scene};
+use wildcity_scene::{RenderProfile, Rig, Scene, Shrink};
 
 #[allow(clippy::print_stdout, reason = "the output of the example")]
 fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -22,7 +22,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let settings = StreetSettings { seed: 7, length_m: 350.0, crossing_m: 180.0, density: 1.0 };
     let street = wildcity_generate::street(&settings)?;
     let scene = Scene::from_gaussians(&street.gaussians);
-    let profile = RenderProfile::default();
+    // A pixel has one sample, as a beam is one ray: small images have four otherwise.
+    let profile = RenderProfile { shrink: Shrink::Filter, ..RenderProfile::default() };
     let frames = &street.trajectory.keyframes;
     let at = frames[frames.len() / 2].world_from_rig;
     let backend: Box<dyn Backend> = match std::env::args().nth(2).as_deref() {

@@ -24,8 +24,8 @@ use super::layout::WORKGROUP;
 use super::read_back::{ReadBack, mapped};
 use crate::RenderError;
 use crate::cpu::lidar::{
-    BodySector, Candidate, Candidates, MOST_COLUMNS, Sector, best_level, most_candidate_bytes,
-    search,
+    BodySector, Candidate, Candidates, MOST_COLUMNS, Reach, Sector, best_level,
+    most_candidate_bytes, search,
 };
 use crate::lidar::{Keys, MOST_HITS, Sweep, Task};
 use wildcity_scene::geometry::Lidar;
@@ -116,6 +116,10 @@ pub(super) struct SweepKernels {
 /// Submissions that the device may have at once.
 const IN_FLIGHT: usize = 4;
 
+/// Candidates of a sector that the device gets at a time, with room for a cluster more. They, and
+/// their places in the lists of tiles, are in memory at once, 6 to 15 MB.
+const BATCH: usize = 1 << 15;
+
 /// What the device gets of a sector at a time: candidates of one body.
 struct Batch {
     candidates: Vec<GpuCandidate>,
@@ -158,7 +162,7 @@ impl SweepKernels {
         let beams = lidar.rows() * lidar.columns().min(MOST_COLUMNS);
         let hits = HIT_BYTES * (beams * MOST_HITS) as u64;
         let returns = (size_of::<GpuReturn>() * lidar.beams()) as u64;
-        hits.max(returns).max(most_candidate_bytes(lidar) as u64) <= binding_bytes
+        hits.max(returns).max(most_candidate_bytes(lidar, BATCH) as u64) <= binding_bytes
     }
 
     /// An upper bound of the memory that the host takes for a sweep, in bytes: its returns, the
@@ -167,7 +171,7 @@ impl SweepKernels {
         let returns = lidar.beams() * (Sweep::BEAM_BYTES + size_of::<GpuReturn>());
         let threads = threads.min(lidar.columns());
         // Each thread makes a copy, too.
-        (returns + (2 * threads + IN_FLIGHT) * most_candidate_bytes(lidar)) as u64
+        (returns + (2 * threads + IN_FLIGHT) * most_candidate_bytes(lidar, BATCH)) as u64
     }
 
     /// The sweep of a LiDAR. The candidates are found in `pool`.
@@ -191,7 +195,7 @@ impl SweepKernels {
                 let mut candidates = free.lock().pop().unwrap_or_default();
                 // Held from the first candidates of the sector to the last.
                 let mut held = None;
-                search(level, sector, &mut candidates, task, |seen, candidates, _| {
+                search(level, sector, &mut candidates, task, BATCH, |_, seen, candidates| {
                     // Gaussians between two columns are in no list.
                     let Some(batch) = Batch::new(seen, candidates) else { return };
                     let is_first = held.is_none();
@@ -345,7 +349,12 @@ impl Batch {
             lists.push(count);
         }
         Some(Self {
-            candidates: candidates.list.iter().map(GpuCandidate::new).collect(),
+            candidates: candidates
+                .list
+                .iter()
+                .zip(&candidates.reaches)
+                .map(|(candidate, reach)| GpuCandidate::new(candidate, reach))
+                .collect(),
             lists,
             entries: candidates.lists.concat(),
             columns: seen.sector.columns.clone().map(|at| column(seen, at)).collect(),
@@ -355,18 +364,17 @@ impl Batch {
 }
 
 impl GpuCandidate {
-    fn new(candidate: &Candidate) -> Self {
-        let Candidate { mean_m, whiten, log2_opacity, reach2, nearest_m, luminance, key, .. } =
-            *candidate;
+    fn new(candidate: &Candidate, reach: &Reach) -> Self {
+        let Candidate { mean_m, whiten, log2_opacity, reach2, luminance, key } = *candidate;
         let [xx, xy, xz, yx, yy, yz, zx, zy, zz] = whiten;
-        let [first, end] = candidate.rows.map(u32::from);
+        let [first, end] = reach.rows.map(u32::from);
         Self {
             mean_m,
             log2_opacity,
             whiten_x: [xx, xy, xz],
             reach2,
             whiten_y: [yx, yy, yz],
-            nearest_m,
+            nearest_m: reach.nearest_m,
             whiten_z: [zx, zy, zz],
             luminance,
             rows: first | end << 16,
@@ -447,7 +455,7 @@ mod tests {
             whiten_x,
             reach2,
             whiten_y,
-            nearest_m,
+            nearest_m: reach.nearest_m,
             whiten_z,
             luminance,
             rows,

@@ -1,16 +1,19 @@
 //! The hits of 16 beams of a row, up to their returns.
 //!
 //! The beams of a row are compared with a Gaussian together, and so they keep its hits together:
-//! one insertion into sorted lists for 16 beams.
+//! one insertion into sorted lists for 16 beams. A beam also keeps the light that reaches its
+//! return: only a hit that leaves half of that light or less moves the return.
 
 use fearless_simd::{f32x16, mask32x16, prelude::*, u32x16};
 
+use super::tile::LOOKS;
 use crate::lidar::HALF;
 use wildcity_scene::chunk::LANES;
 
 /// Where 16 beams meet a Gaussian.
 pub(super) struct Crossing<S: Simd> {
-    /// Infinite for a beam that does not meet it.
+    /// The beams that meet it.
+    pub(super) meets: mask32x16<S>,
     pub(super) range_m: f32x16<S>,
     /// 0 for a beam that does not meet it.
     pub(super) alpha: f32x16<S>,
@@ -22,21 +25,32 @@ pub(super) struct Crossing<S: Simd> {
 /// The n-th hit of each beam. A beam that has fewer hits has one here that is infinitely far away,
 /// with an alpha of 0.
 #[derive(Clone, Copy, Debug)]
+#[repr(align(64))]
 struct Slot {
     range_m: [f32; LANES],
     alpha: [f32; LANES],
-    /// The transmittance behind it.
-    after: [f32; LANES],
     luminance: [f32; LANES],
     key: [u32; LANES],
 }
 
 /// The hits of each beam from the nearest; at the same range, in the order of keys. A hit behind
 /// the return changes nothing and is dropped, so that few are kept.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
+#[repr(align(64))]
 pub(super) struct BeamRow {
+    /// The first `len` have hits; there is room for more.
     slots: Vec<Slot>,
+    len: usize,
+    /// What is left of the light of each beam in front of its return: more than half.
+    light: [f32; LANES],
+    /// How far each beam is followed: to its return, or the LiDAR's range, in metres.
+    pub(super) ends_m: [f32; LANES],
+    /// What each beam meets at its return; [`NO_KEY`] without one.
+    end_keys: [u32; LANES],
 }
+
+/// Larger than any key.
+const NO_KEY: u32 = u32::MAX;
 
 /// The returns of 16 beams.
 pub(super) struct Returns {
@@ -46,6 +60,15 @@ pub(super) struct Returns {
     pub(super) luminance: [f32; LANES],
     /// What it meets there.
     pub(super) key: [u32; LANES],
+}
+
+impl Slot {
+    const EMPTY: Self = Self {
+        range_m: [f32::INFINITY; LANES],
+        alpha: [0.0; LANES],
+        luminance: [0.0; LANES],
+        key: [NO_KEY; LANES],
+    };
 }
 
 /// Hits that look for their slots, one of each beam.
@@ -61,131 +84,169 @@ impl BeamRow {
     /// Bytes of a hit of a beam.
     pub(super) const HIT_BYTES: usize = size_of::<Slot>() / LANES;
 
-    pub(super) fn clear(&mut self) {
-        self.slots.clear();
+    /// Most hits for which a beam has room and that it has not.
+    pub(super) const SPARE_HITS: usize = 2 * LOOKS;
+
+    /// Beams without hits that are followed over `ends_m`.
+    pub(super) fn begin(&mut self, ends_m: [f32; LANES]) {
+        self.len = 0;
+        self.light = [1.0; LANES];
+        self.ends_m = ends_m;
+        self.end_keys = [NO_KEY; LANES];
     }
 
-    /// Adds the hits of a Gaussian. `ends_m` becomes the ranges of the returns, for beams that have
-    /// one.
-    #[inline(always)]
-    pub(super) fn add<S: Simd>(
-        &mut self,
-        simd: S,
-        crossing: &Crossing<S>,
-        ends_m: &mut [f32; LANES],
-    ) {
-        let half = f32x16::splat(simd, HALF as f32);
-        let never = f32x16::splat(simd, f32::INFINITY);
-        let zero = f32x16::splat(simd, 0.0);
-        let one = f32x16::splat(simd, 1.0);
-        let load = |values: &[f32; LANES]| f32x16::load_array_ref(simd, values);
-        let mut added = Hits {
-            range_m: crossing.range_m,
-            alpha: crossing.alpha,
-            luminance: f32x16::splat(simd, crossing.luminance),
-            key: u32x16::splat(simd, crossing.key),
-        };
+    /// Makes room for the hits of [`LOOKS`] Gaussians: [`BeamRow::add`] keeps less in registers if
+    /// it calls an allocator.
+    pub(super) fn reserve(&mut self) {
+        if self.slots.len() < self.len + LOOKS {
+            self.slots.resize(self.len + Self::SPARE_HITS, Slot::EMPTY);
+        }
+    }
 
+    /// Adds the hits of a Gaussian. Returns whether a beam ends nearer than before.
+    #[inline(always)]
+    pub(super) fn add<S: Simd>(&mut self, simd: S, crossing: &Crossing<S>) -> bool {
+        let end_m = f32x16::load_array_ref(simd, &self.ends_m);
+        let end_key = u32x16::load_array_ref(simd, &self.end_keys);
+        let key = u32x16::splat(simd, crossing.key);
+        let is_behind = crossing.range_m.simd_eq(end_m) & key.simd_gt(end_key);
+        let meets = crossing.meets & !is_behind;
+        let light = f32x16::load_array_ref(simd, &self.light);
+        let left = light * (f32x16::splat(simd, 1.0) - crossing.alpha);
+        self.light = meets.select(left, light).to_array();
+        self.insert(
+            meets,
+            Hits {
+                range_m: meets.select(crossing.range_m, f32x16::splat(simd, f32::INFINITY)),
+                alpha: meets.select(crossing.alpha, f32x16::splat(simd, 0.0)),
+                luminance: f32x16::splat(simd, crossing.luminance),
+                // After all others that are infinitely far away.
+                key: meets.select(key, u32x16::splat(simd, NO_KEY)),
+            },
+        );
+        let ends = meets & left.simd_le(f32x16::splat(simd, HALF as f32));
+        if ends.any_true() {
+            self.end(simd, ends);
+            return true;
+        }
+        false
+    }
+
+    #[inline(always)]
+    fn insert<S: Simd>(&mut self, meets: mask32x16<S>, mut added: Hits<S>) {
+        let never = f32x16::splat(added.range_m.simd, f32::INFINITY);
         // Slots in front of all that is added stay as they are.
-        let mut first = self.slots.len();
-        while first > 0 {
-            let slot = &self.slots[first - 1];
-            if added
-                .is_before(load(&slot.range_m), u32x16::load_array_ref(simd, &slot.key))
-                .all_false()
-            {
-                break;
-            }
+        let mut first = self.len;
+        let may_go_before = |slot: &Slot| {
+            let slot_m = f32x16::load_array_ref(added.range_m.simd, &slot.range_m);
+            (meets & added.range_m.simd_le(slot_m)).any_true()
+        };
+        while first > 0 && may_go_before(&self.slots[first - 1]) {
             first -= 1;
         }
-        let mut after = match first.checked_sub(1) {
-            Some(last) => load(&self.slots[last].after),
-            None => one,
-        };
-        let mut end_m = load(ends_m);
-        for slot in &mut self.slots[first..] {
-            let old = Hits {
-                range_m: load(&slot.range_m),
-                alpha: load(&slot.alpha),
-                luminance: load(&slot.luminance),
-                key: u32x16::load_array_ref(simd, &slot.key),
-            };
+        for slot in &mut self.slots[first..self.len] {
             // What comes first takes the slot; the other goes on to the next.
-            let goes_here = added.is_before(old.range_m, old.key);
-            let has_returned = after.simd_le(half);
-            let here = added.or(old, goes_here);
-            let here_m = has_returned.select(never, here.range_m);
-            let here_alpha = has_returned.select(zero, here.alpha);
+            let goes_here = added.is_before(slot);
+            let old = Hits::load(added.range_m.simd, slot);
+            *slot = added.or(old, goes_here).store();
             added = old.or(added, goes_here);
-            after *= one - here_alpha;
-            end_m = (after.simd_le(half) & !has_returned).select(here_m, end_m);
-            slot.range_m = here_m.to_array();
-            slot.alpha = here_alpha.to_array();
-            slot.after = after.to_array();
-            slot.luminance = here.luminance.to_array();
-            slot.key = here.key.to_array();
-        }
-        let is_kept = added.range_m.simd_lt(never) & after.simd_gt(half);
-        if is_kept.any_true() {
-            let range_m = is_kept.select(added.range_m, never);
-            let alpha = is_kept.select(added.alpha, zero);
-            after *= one - alpha;
-            end_m = (after.simd_le(half) & is_kept).select(range_m, end_m);
-            self.slots.push(Slot {
-                range_m: range_m.to_array(),
-                alpha: alpha.to_array(),
-                after: after.to_array(),
-                luminance: added.luminance.to_array(),
-                key: added.key.to_array(),
-            });
-        } else {
-            while self
-                .slots
-                .last()
-                .is_some_and(|slot| load(&slot.range_m).simd_ge(never).all_true())
-            {
-                self.slots.pop();
+            if added.range_m.simd_ge(never).all_true() {
+                return;
             }
         }
-        *ends_m = end_m.to_array();
+        self.slots[self.len] = added.store();
+        self.len += 1;
+    }
+
+    /// Finds the returns of beams of which the hits in front of the old one leave half of the light
+    /// or less, and drops what is behind.
+    #[inline(always)]
+    fn end<S: Simd>(&mut self, simd: S, ends: mask32x16<S>) {
+        let half = f32x16::splat(simd, HALF as f32);
+        let one = f32x16::splat(simd, 1.0);
+        let never = f32x16::splat(simd, f32::INFINITY);
+        let mut light = f32x16::load_array_ref(simd, &self.light);
+        let mut end_m = f32x16::load_array_ref(simd, &self.ends_m);
+        let mut end_key = u32x16::load_array_ref(simd, &self.end_keys);
+        let mut before = one;
+        for slot in &mut self.slots[..self.len] {
+            let hit = Hits::load(simd, slot);
+            let is_behind = ends & before.simd_le(half);
+            let after = before * (one - hit.alpha);
+            let is_end = ends & after.simd_le(half) & !is_behind;
+            light = is_end.select(before, light);
+            end_m = is_end.select(hit.range_m, end_m);
+            end_key = is_end.select(hit.key, end_key);
+            if is_behind.any_true() {
+                slot.range_m = is_behind.select(never, hit.range_m).to_array();
+                slot.alpha = is_behind.select(f32x16::splat(simd, 0.0), hit.alpha).to_array();
+            }
+            before = after;
+        }
+        self.light = light.to_array();
+        self.ends_m = end_m.to_array();
+        self.end_keys = end_key.to_array();
+        let is_empty =
+            |slot: &Slot| f32x16::load_array_ref(simd, &slot.range_m).simd_ge(never).all_true();
+        while self.len > 0 && is_empty(&self.slots[self.len - 1]) {
+            self.len -= 1;
+        }
     }
 
     /// The returns of the beams.
     #[inline(always)]
     pub(super) fn returns<S: Simd>(&self, simd: S) -> Returns {
-        let half = f32x16::splat(simd, HALF as f32);
         let load = |values: &[f32; LANES]| f32x16::load_array_ref(simd, values);
-        let mut before = f32x16::splat(simd, 1.0);
+        let one = f32x16::splat(simd, 1.0);
+        let mut before = one;
         let mut sum = f32x16::splat(simd, 0.0);
-        let mut range_m = f32x16::splat(simd, 0.0);
-        let mut luminance = f32x16::splat(simd, 0.0);
-        let mut key = u32x16::splat(simd, 0);
-        for slot in &self.slots {
-            sum += before * load(&slot.alpha) * load(&slot.luminance);
-            let after = load(&slot.after);
-            let returns = before.simd_gt(half) & after.simd_le(half);
-            range_m = returns.select(load(&slot.range_m), range_m);
-            luminance = returns.select(sum / (f32x16::splat(simd, 1.0) - after), luminance);
-            key = returns.select(u32x16::load_array_ref(simd, &slot.key), key);
-            before = after;
+        for slot in &self.slots[..self.len] {
+            let alpha = load(&slot.alpha);
+            sum += before * alpha * load(&slot.luminance);
+            before *= one - alpha;
         }
+        let end_keys = u32x16::load_array_ref(simd, &self.end_keys);
+        let returns = !end_keys.simd_eq(u32x16::splat(simd, NO_KEY));
+        let zero = f32x16::splat(simd, 0.0);
         Returns {
-            range_m: range_m.to_array(),
-            luminance: luminance.to_array(),
-            key: key.to_array(),
+            range_m: returns.select(load(&self.ends_m), zero).to_array(),
+            luminance: returns.select(sum / (one - before), zero).to_array(),
+            key: returns.select(end_keys, u32x16::splat(simd, 0)).to_array(),
         }
     }
 }
 
 impl<S: Simd> Hits<S> {
-    /// Whether hits come before others on their beams.
     #[inline(always)]
-    fn is_before(&self, other_m: f32x16<S>, other: u32x16<S>) -> mask32x16<S> {
+    fn load(simd: S, slot: &Slot) -> Self {
+        let load = |values: &[f32; LANES]| f32x16::load_array_ref(simd, values);
+        Self {
+            range_m: load(&slot.range_m),
+            alpha: load(&slot.alpha),
+            luminance: load(&slot.luminance),
+            key: u32x16::load_array_ref(simd, &slot.key),
+        }
+    }
+
+    #[inline(always)]
+    fn store(self) -> Slot {
+        Slot {
+            range_m: self.range_m.to_array(),
+            alpha: self.alpha.to_array(),
+            luminance: self.luminance.to_array(),
+            key: self.key.to_array(),
+        }
+    }
+
+    /// Whether hits come before those of a slot on their beams.
+    #[inline(always)]
+    fn is_before(&self, slot: &Slot) -> mask32x16<S> {
+        let simd = self.range_m.simd;
+        let slot_m = f32x16::load_array_ref(simd, &slot.range_m);
         // Gaussians in one place: the order of keys makes the return the same at any number of
         // threads.
-        let is_equal = self.range_m.simd_eq(other_m)
-            & self.range_m.simd_lt(f32x16::splat(self.range_m.simd, f32::INFINITY));
-        self.range_m.simd_lt(other_m) | (is_equal & self.key.simd_lt(other))
+        let is_first = self.key.simd_lt(u32x16::load_array_ref(simd, &slot.key));
+        self.range_m.simd_lt(slot_m) | (self.range_m.simd_eq(slot_m) & is_first)
     }
 
     /// These hits where chosen, and others elsewhere.
@@ -196,6 +257,18 @@ impl<S: Simd> Hits<S> {
             alpha: chosen.select(self.alpha, other.alpha),
             luminance: chosen.select(self.luminance, other.luminance),
             key: chosen.select(self.key, other.key),
+        }
+    }
+}
+
+impl Default for BeamRow {
+    fn default() -> Self {
+        Self {
+            slots: Vec::new(),
+            len: 0,
+            light: [1.0; LANES],
+            ends_m: [0.0; LANES],
+            end_keys: [NO_KEY; LANES],
         }
     }
 }

@@ -3,19 +3,24 @@
 //! A Gaussian ends where its alpha falls below the cut: an ellipsoid. Its box in the sector's axes
 //! contains it, and the tangents of the azimuths and elevations of a box are quotients of its
 //! coordinates. No angle has to be computed, and no bound is linearised.
+//!
+//! Clusters are searched from the nearest, and beams are compared with what was found whenever it
+//! is a batch. So beams have returned from the fronts of houses before what is behind them is
+//! searched: most of it is never read.
 
 use fearless_simd::{Level, dispatch, f32x16, prelude::*};
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 
-use super::sector::{BodySector, Sector};
+use super::sector::{BodySector, Sector, TileColumns};
 use crate::cpu::lanes::Vec3x16;
 use crate::cpu::project::axes::rotation_columns;
-use crate::lidar::{LUMINANCE, THINNEST_M, alpha_cut, reach2};
+use crate::lidar::{ChunksOfBody, LUMINANCE, THINNEST_M, Task, alpha_cut, reach2};
 use wildcity_scene::chunk::{CLUSTER, Cluster, LANES, Lanes, column};
 use wildcity_scene::{Chunk, RenderProfile, sh};
 
 /// A Gaussian that beams of a sector may meet, in the axes of its body.
 #[derive(Clone, Copy, Debug)]
+#[repr(align(64))]
 pub(crate) struct Candidate {
     /// Its centre relative to the LiDAR's middle position in the sector, in metres.
     pub(crate) mean_m: [f32; 3],
@@ -24,34 +29,65 @@ pub(crate) struct Candidate {
     pub(crate) log2_opacity: f32,
     /// Squared standard deviations from its centre at which alpha falls below the cut.
     pub(crate) reach2: f32,
-    /// No beam meets it nearer than this, in metres.
-    pub(crate) nearest_m: f32,
     pub(crate) luminance: f32,
     /// Its place among all Gaussians of the scene.
     pub(crate) key: u32,
-    /// The rows that may meet it.
+}
+
+/// The beams that may meet something.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Reach {
+    /// None meets it nearer than this, in metres.
+    pub(crate) nearest_m: f32,
+    /// Their first row, and the one after the last.
     pub(crate) rows: [u16; 2],
-    /// Smallest and largest tangent of the azimuths that may meet it.
-    azimuths: [f32; 2],
+    /// A bit for each tile along a row.
+    tiles: u16,
+    /// The bucket of the distance to its middle.
+    bucket: u16,
 }
 
 /// Candidates of one body in a sector that have not been compared with beams yet.
 #[derive(Default)]
 pub(crate) struct Candidates {
     pub(crate) list: Vec<Candidate>,
-    /// Places in the list of the candidates of each tile, from the nearest.
+    /// The beams that may meet each.
+    pub(crate) reaches: Vec<Reach>,
+    /// Places in the list of the candidates of each tile, almost from the nearest. Tile after tile
+    /// of the first 16 rows, then those of the next.
     pub(crate) lists: Vec<Vec<u32>>,
+    /// How far the beams of each tile are followed, in metres: what is beyond is no candidate of
+    /// it. It becomes less where beams return.
+    pub(crate) ends_m: Vec<f32>,
+    clusters: Vec<SeenCluster>,
     /// Memory to sort them.
-    keys: Vec<u64>,
-    sorted: Vec<Candidate>,
+    buckets: Vec<u32>,
+    places: Vec<u32>,
 }
 
-/// Candidates after which they are compared with beams: they, and their places in the lists of
-/// tiles, are in memory at once, 6 to 15 MB.
-const BATCH: usize = 1 << 15;
+/// What is searched for candidates.
+#[derive(Clone, Copy)]
+pub(super) struct Search<'a> {
+    pub(super) level: Level,
+    pub(super) seen: &'a BodySector<'a>,
+    pub(super) chunks: &'a ChunksOfBody<'a>,
+    pub(super) task: &'a Task<'a>,
+    /// Candidates after which beams are compared with them.
+    pub(super) batch: usize,
+}
 
-/// Most candidates at once: a batch is full after a cluster.
-pub(super) const MOST_CANDIDATES: usize = BATCH + CLUSTER;
+/// Most clusters that are sorted at once, which bounds their memory.
+pub(super) const MOST_CLUSTERS: usize = 1 << 15;
+
+/// A cluster of which beams may meet a Gaussian.
+#[derive(Clone, Copy)]
+pub(super) struct SeenCluster {
+    reach: Reach,
+    /// Its chunk's place among those of the body.
+    chunk: u32,
+    /// Its number in the chunk.
+    cluster: u32,
+}
 
 /// A cluster of a chunk.
 #[derive(Clone, Copy)]
@@ -63,17 +99,36 @@ struct ClusterOfChunk<'a> {
     cluster: usize,
 }
 
+/// Where beams may meet something: it is within these bounds, in the axes of a sector.
+#[derive(Clone, Copy)]
+struct Span {
+    /// Smallest and largest tangent of the azimuths.
+    azimuths: [f32; 2],
+    /// Smallest and largest tangent of the elevations.
+    elevations: [f32; 2],
+    nearest_m: f32,
+    middle_m: f32,
+}
+
 /// What the tests of one chunk in one sector share.
-struct ChunkTest {
-    /// Rows of `sector_from_body`, in f32.
-    axes: [[f32; 3]; 3],
+struct ChunkTest<'a> {
+    body: &'a BodyTest,
     /// The LiDAR's middle position relative to the chunk's origin, in the body's axes, in metres.
     middle_m: [f32; 3],
+}
+
+/// What the tests of all chunks of a body in one sector share.
+struct BodyTest {
+    /// Rows of `sector_from_body`, in f32.
+    axes: [[f32; 3]; 3],
     /// The most that the LiDAR moves along each axis of the sector, in metres.
     moved_m: [f32; 3],
     turned_rad: f32,
     /// Tangents of the azimuths of all beams: smallest, largest.
     azimuths: [f32; 2],
+    /// Directions that are horizontal in the sector's axes and at right angles to its sides, away
+    /// from it: x and y, of length 1 at most.
+    beside: [[f32; 2]; 2],
     /// Tangents of the elevations of all beams: smallest, largest.
     elevations: [f32; 2],
     max_range_m: f32,
@@ -84,138 +139,243 @@ struct ChunkTest {
     tint: [f32; 3],
 }
 
-/// What a beam may see of 16 Gaussians. Fields of one lane are those of a [`Candidate`].
-struct Block {
+/// Where beams may meet 16 Gaussians.
+struct Bounds<S: Simd> {
     /// The lanes that a beam may meet.
     lanes: u64,
+    /// Their centres relative to the LiDAR's middle position in the sector, in metres.
+    mean: Vec3x16<S>,
+    /// Their own axes.
+    own: [Vec3x16<S>; 3],
+    scale: Vec3x16<S>,
     azimuths: [[f32; LANES]; 2],
     elevations: [[f32; LANES]; 2],
     nearest_m: [f32; LANES],
+    middle_m: [f32; LANES],
+}
+
+/// What beams are compared with. Fields of one lane are those of a [`Candidate`].
+struct Shapes {
     mean_m: [[f32; LANES]; 3],
     whiten: [[f32; LANES]; 9],
+    reach2: [f32; LANES],
     luminance: [f32; LANES],
 }
 
 impl Candidates {
-    /// Adds the Gaussians of a cluster that beams of the sector may meet.
-    fn add(
+    /// Forgets what beams were compared with, and follows all of them to the LiDAR's range.
+    pub(super) fn begin(&mut self, sector: &Sector, rows: usize) {
+        let tiles = sector.tiles.len() * rows.div_ceil(LANES);
+        self.ends_m.clear();
+        self.ends_m.resize(tiles, sector.max_range_m);
+        self.lists.resize(tiles, Vec::new());
+    }
+
+    /// Finds the Gaussians of a body that beams of the sector may meet, and calls `compare` with
+    /// them whenever there are as many as a batch.
+    pub(super) fn find(&mut self, search: &Search<'_>, mut compare: impl FnMut(&mut Self)) {
+        let Search { seen, task, .. } = *search;
+        let body = BodyTest::new(seen, task.profile);
+        let mut clusters = std::mem::take(&mut self.clusters);
+        for (place, (_, _, chunk)) in search.chunks.iter().enumerate() {
+            let test = body.chunk(seen, chunk);
+            for (cluster, bounds) in chunk.clusters().iter().enumerate() {
+                let Some(span) = test.span(bounds) else { continue };
+                let overlaps = |columns: &TileColumns| columns.overlap(span.azimuths);
+                let Some(reach) = self.reach(seen.sector, &span, overlaps) else { continue };
+                // A body has fewer than 2^32 Gaussians.
+                clusters.push(SeenCluster { reach, chunk: place as u32, cluster: cluster as u32 });
+                if clusters.len() == MOST_CLUSTERS {
+                    self.add_clusters(search, &body, &mut clusters, &mut compare);
+                }
+            }
+        }
+        self.add_clusters(search, &body, &mut clusters, &mut compare);
+        self.compare(seen.sector, &mut compare);
+        self.clusters = clusters;
+    }
+
+    /// Adds the Gaussians of clusters that beams of the sector may meet, from the nearest cluster.
+    fn add_clusters(
         &mut self,
-        level: Level,
+        search: &Search<'_>,
+        body: &BodyTest,
+        clusters: &mut Vec<SeenCluster>,
+        compare: &mut impl FnMut(&mut Self),
+    ) {
+        let sector = search.seen.sector;
+        clusters.sort_unstable_by(|a, b| {
+            let by_place = || (a.chunk, a.cluster).cmp(&(b.chunk, b.cluster));
+            a.reach.nearest_m.total_cmp(&b.reach.nearest_m).then_with(by_place)
+        });
+        for SeenCluster { reach, chunk, cluster } in clusters.drain(..) {
+            if !self.is_followed(sector, &reach) {
+                continue;
+            }
+            let (number, _, chunk) = search.chunks[chunk as usize];
+            let test = body.chunk(search.seen, chunk);
+            let first_key = search.task.keys.first(number);
+            let part = ClusterOfChunk { chunk, first_key, cluster: cluster as usize };
+            dispatch!(search.level, simd => self.add(simd, sector, &part, &test));
+            if self.list.len() >= search.batch {
+                self.compare(sector, compare);
+            }
+        }
+    }
+
+    /// Compares beams with what was found, and forgets it.
+    fn compare(&mut self, sector: &Sector, compare: &mut impl FnMut(&mut Self)) {
+        self.list_by_tile(sector.tiles.len());
+        compare(self);
+        self.list.clear();
+        self.reaches.clear();
+    }
+
+    /// Adds the Gaussians of a cluster that beams of the sector may meet.
+    #[inline(always)]
+    fn add<S: Simd>(
+        &mut self,
+        simd: S,
         sector: &Sector,
         part: &ClusterOfChunk<'_>,
-        test: &ChunkTest,
-        profile: &RenderProfile,
+        test: &ChunkTest<'_>,
     ) {
         let ClusterOfChunk { chunk, first_key, cluster } = *part;
         let first = cluster * CLUSTER / LANES;
         let groups = chunk.len().div_ceil(LANES);
         for group in first..(first + CLUSTER / LANES).min(groups) {
             let columns = chunk.lane_group(group);
-            let Some(block) = dispatch!(level, simd => Block::new(simd, columns, test)) else {
-                continue;
-            };
-            let mut lanes = block.lanes;
+            let Some(bounds) = Bounds::new(simd, columns, test) else { continue };
+            let mut found = [(0, Reach::default()); LANES];
+            let mut count = 0;
+            let mut lanes = bounds.lanes;
             while lanes != 0 {
                 let lane = lanes.trailing_zeros() as usize % LANES;
                 lanes &= lanes - 1;
-                let [low, high] = block.elevations.each_ref().map(|tangents| tangents[lane]);
-                let rows = sector.rows.between(low, high);
-                // It lies between two rows, and no beam meets it.
-                if rows.is_empty() {
-                    continue;
+                let span = bounds.span(lane);
+                let see = |columns: &TileColumns| columns.see(simd, span.azimuths);
+                if let Some(reach) = self.reach(sector, &span, see) {
+                    found[count] = (lane, reach);
+                    count += 1;
                 }
-                let log2_opacity = columns[column::LOG2_OPACITY].0[lane];
+            }
+            if count == 0 {
+                continue;
+            }
+            let shapes = Shapes::new(simd, columns, &bounds, test.body);
+            for (lane, reach) in &found[..count] {
+                let lane = *lane;
                 self.list.push(Candidate {
-                    mean_m: block.mean_m.each_ref().map(|values| values[lane]),
-                    whiten: block.whiten.each_ref().map(|values| values[lane]),
-                    log2_opacity,
-                    reach2: reach2(log2_opacity.into(), profile) as f32,
-                    nearest_m: block.nearest_m[lane],
-                    luminance: block.luminance[lane],
+                    mean_m: shapes.mean_m.each_ref().map(|values| values[lane]),
+                    whiten: shapes.whiten.each_ref().map(|values| values[lane]),
+                    log2_opacity: columns[column::LOG2_OPACITY].0[lane],
+                    reach2: shapes.reach2[lane],
+                    luminance: shapes.luminance[lane],
                     key: first_key + (group * LANES + lane) as u32,
-                    rows: [rows.start as u16, rows.end as u16],
-                    azimuths: block.azimuths.each_ref().map(|tangents| tangents[lane]),
                 });
+                self.reaches.push(*reach);
             }
         }
     }
 
-    /// Finds the Gaussians of a chunk that beams of the sector may meet, and calls `compare` with
-    /// them whenever there are many.
-    pub(super) fn find(
-        &mut self,
-        level: Level,
-        seen: &BodySector<'_>,
-        (first_key, chunk): (u32, &Chunk),
-        profile: &RenderProfile,
-        mut compare: impl FnMut(&mut Self),
-    ) {
-        let test = ChunkTest::new(seen, chunk, profile);
-        for (cluster, bounds) in chunk.clusters().iter().enumerate() {
-            if test.may_meet(bounds) {
-                let part = ClusterOfChunk { chunk, first_key, cluster };
-                self.add(level, seen.sector, &part, &test, profile);
-                if self.list.len() >= BATCH {
-                    compare(self);
-                }
-            }
+    /// The beams that may meet what is within bounds, in the tiles along a row that `see` it; `None`
+    /// if there is none.
+    #[inline(always)]
+    fn reach(
+        &self,
+        sector: &Sector,
+        span: &Span,
+        see: impl Fn(&TileColumns) -> bool,
+    ) -> Option<Reach> {
+        let [low, high] = span.elevations;
+        let rows = sector.rows.between(low, high);
+        // It lies between two rows, and no beam meets it.
+        if rows.is_empty() {
+            return None;
         }
-    }
-
-    /// Sorts the candidates, the nearest first, and lists those of each tile of `rows` rows: tile
-    /// after tile of the first 16 rows, then those of the next.
-    pub(super) fn sort_to_tiles(&mut self, level: Level, sector: &Sector, rows: usize) {
-        self.sort();
-        let tiles = sector.tiles.len();
-        self.lists.resize(tiles * rows.div_ceil(LANES), Vec::new());
-        self.lists.iter_mut().for_each(Vec::clear);
-        for (at, candidate) in self.list.iter().enumerate() {
-            let [first, end] = candidate.rows.map(usize::from);
-            let [low, high] = candidate.azimuths;
-            for (tile, columns) in sector.tiles.iter().enumerate() {
-                let [least, most] = columns.span;
-                if least > high || most < low {
-                    continue;
-                }
-                // Many Gaussians far away lie between two columns.
-                let is_wide = high - low > columns.widest_gap;
-                let tangents = &columns.tangents;
-                if is_wide || dispatch!(level, simd => sees(simd, tangents, [low, high])) {
-                    for row in first / LANES..end.div_ceil(LANES) {
-                        self.lists[row * tiles + tile].push(at as u32);
-                    }
-                }
-            }
-        }
-    }
-
-    /// Sorts the candidates themselves, and not their places in the lists of tiles: a tile then
-    /// reads them in the order of memory.
-    fn sort(&mut self) {
-        // As one integer: positive f32 have the order of their bits.
-        let key = |(at, candidate): (usize, &Candidate)| {
-            u64::from(candidate.nearest_m.max(0.0).to_bits()) << 32 | at as u64
+        let mut reach = Reach {
+            nearest_m: span.nearest_m,
+            // A LiDAR has at most 256 rows.
+            rows: [rows.start as u16, rows.end as u16],
+            tiles: 0,
+            bucket: bucket(span.middle_m),
         };
-        self.keys.clear();
-        self.keys.extend(self.list.iter().enumerate().map(key));
-        self.keys.sort_unstable();
-        self.sorted.clear();
-        self.sorted.extend(self.keys.iter().map(|key| self.list[*key as u32 as usize]));
-        std::mem::swap(&mut self.list, &mut self.sorted);
+        for (tile, columns) in sector.tiles.iter().enumerate() {
+            if see(columns) {
+                reach.tiles |= 1 << tile;
+            }
+        }
+        self.is_followed(sector, &reach).then_some(reach)
+    }
+
+    /// Whether a beam is followed far enough to meet it.
+    #[inline(always)]
+    fn is_followed(&self, sector: &Sector, reach: &Reach) -> bool {
+        let mut lists = reach.lists(sector.tiles.len());
+        lists.any(|list| self.ends_m[list] >= reach.nearest_m)
+    }
+
+    /// Lists the candidates of each tile, from the nearest middle: hits are then found almost in
+    /// order.
+    fn list_by_tile(&mut self, tiles: usize) {
+        // A counting sort by their buckets.
+        self.buckets.clear();
+        self.buckets.resize(BUCKETS + 1, 0);
+        for reach in &self.reaches {
+            self.buckets[usize::from(reach.bucket) + 1] += 1;
+        }
+        let mut sum = 0;
+        for count in &mut self.buckets {
+            sum += *count;
+            *count = sum;
+        }
+        self.places.clear();
+        self.places.resize(self.reaches.len(), 0);
+        for (at, reach) in self.reaches.iter().enumerate() {
+            let next = &mut self.buckets[usize::from(reach.bucket)];
+            self.places[*next as usize] = at as u32;
+            *next += 1;
+        }
+        self.lists.iter_mut().for_each(Vec::clear);
+        for at in &self.places {
+            let reach = &self.reaches[*at as usize];
+            for list in reach.lists(tiles) {
+                if self.ends_m[list] >= reach.nearest_m {
+                    self.lists[list].push(*at);
+                }
+            }
+        }
     }
 }
 
-/// Whether a column of a tile sees azimuths with these tangents.
-#[inline(always)]
-fn sees<S: Simd>(simd: S, columns: &[[f32; LANES]; 2], [low, high]: [f32; 2]) -> bool {
-    let [least, most] = columns;
-    let sees = f32x16::load_array_ref(simd, least).simd_le(f32x16::splat(simd, high))
-        & f32x16::load_array_ref(simd, most).simd_ge(f32x16::splat(simd, low));
-    !sees.all_false()
+impl Reach {
+    /// The lists of its tiles, of which a row has `count`.
+    #[inline(always)]
+    fn lists(&self, count: usize) -> impl Iterator<Item = usize> {
+        let [first, end] = self.rows.map(usize::from);
+        let tiles = self.tiles;
+        let seen = (0..count).filter(move |tile| tiles >> tile & 1 == 1);
+        seen.flat_map(move |tile| {
+            (first / LANES..end.div_ceil(LANES)).map(move |row| row * count + tile)
+        })
+    }
 }
 
-impl ChunkTest {
-    fn new(seen: &BodySector<'_>, chunk: &Chunk, profile: &RenderProfile) -> Self {
+/// Buckets of distances: 64 for each doubling from [`FIRST_BUCKET`], and one for what is nearer.
+const BUCKETS: usize = 1024;
+/// Bits of an f32 that differ within a bucket.
+const BUCKET_BITS: u32 = 17;
+/// The other bits of the least distance of the second bucket, 0.25 m.
+const FIRST_BUCKET: u32 = 0.25_f32.to_bits() >> BUCKET_BITS;
+
+/// The bucket of a distance. Positive f32 have the order of their bits.
+fn bucket(distance_m: f32) -> u16 {
+    let bits = distance_m.to_bits() >> BUCKET_BITS;
+    bits.saturating_sub(FIRST_BUCKET - 1).min(BUCKETS as u32 - 1) as u16
+}
+
+impl BodyTest {
+    fn new(seen: &BodySector<'_>, profile: &RenderProfile) -> Self {
         let sector = seen.sector;
         let rows = seen.sector_from_body.transpose().to_cols_array_2d();
         let spans = sector.tiles.iter().map(|tile| tile.span);
@@ -223,11 +383,13 @@ impl ChunkTest {
         let high = spans.map(|span| span[1]).fold(f32::NEG_INFINITY, f32::max);
         Self {
             axes: rows.map(|row| row.map(|value| value as f32)),
-            middle_m: (-seen.relative_to_middle(chunk.origin_m())).as_vec3().to_array(),
             // A millimetre covers the rounding of f32 at a kilometre.
             moved_m: (seen.moved_m.as_vec3() + 1e-3).to_array(),
             turned_rad: seen.turned_rad as f32 + 1e-6,
             azimuths: [low, high],
+            // Shorter than 1 by more than rounding.
+            beside: [[low, -1.0], [-high, 1.0]]
+                .map(|side| (Vec2::from(side).normalize() * (1.0 - 1e-5)).to_array()),
             elevations: sector.rows.span(),
             max_range_m: seen.sector.max_range_m,
             alpha_cut_log2: alpha_cut(profile).log2() as f32,
@@ -236,75 +398,97 @@ impl ChunkTest {
         }
     }
 
-    /// Whether a beam may meet a Gaussian of a cluster; `true` when in doubt.
-    fn may_meet(&self, cluster: &Cluster) -> bool {
+    fn chunk(&self, seen: &BodySector<'_>, chunk: &Chunk) -> ChunkTest<'_> {
+        let middle_m = -seen.relative_to_middle(chunk.origin_m());
+        ChunkTest { body: self, middle_m: middle_m.as_vec3().to_array() }
+    }
+
+    /// The squared standard deviations at which 16 Gaussians end, as [`crate::lidar::reach2`]
+    /// defines it.
+    #[inline(always)]
+    fn reach2<S: Simd>(&self, simd: S, log2_opacity: f32x16<S>) -> f32x16<S> {
+        let splat = |value: f32| f32x16::splat(simd, value);
+        let above_cut = log2_opacity.min(splat(0.0)) - splat(self.alpha_cut_log2);
+        above_cut * splat(2.0 * std::f32::consts::LN_2)
+    }
+}
+
+impl ChunkTest<'_> {
+    /// Where beams may meet the Gaussians of a cluster; `None` if none meets any.
+    fn span(&self, cluster: &Cluster) -> Option<Span> {
         let center = 0.5 * (cluster.min_m + cluster.max_m) - Vec3::from_array(self.middle_m);
         let half = 0.5 * (cluster.max_m - cluster.min_m);
         let range_m = center.length() + half.length();
-        let reach_m = self.sigmas * cluster.sigma_m * (1.0 + 1e-4);
-        let moved_m = Vec3::from_array(self.moved_m).length();
-        let margin_m = reach_m + self.turned_rad * (range_m + reach_m + moved_m);
+        let reach_m = self.body.sigmas * cluster.sigma_m * (1.0 + 1e-4);
+        let moved_m = Vec3::from_array(self.body.moved_m).length();
+        let margin_m = reach_m + self.body.turned_rad * (range_m + reach_m + moved_m);
         let along = |axis: usize| {
-            let row = Vec3::from_array(self.axes[axis]);
-            [row.dot(center), row.abs().dot(half) + margin_m + self.moved_m[axis]]
+            let row = Vec3::from_array(self.body.axes[axis]);
+            [row.dot(center), row.abs().dot(half) + margin_m + self.body.moved_m[axis]]
         };
         let [x, half_x] = along(0);
         let [y, half_y] = along(1);
         let [z, half_z] = along(2);
         let far_x = x + half_x;
+        let near_x = x - half_x;
         let nearest_m = center.length() - half.length() - margin_m - moved_m;
-        if far_x < 0.0 || nearest_m > self.max_range_m {
-            return false;
+        if far_x < 0.0 || nearest_m > self.body.max_range_m {
+            return None;
         }
-        // Beside the sector: a tangent times x is largest in size at the far side.
-        let right = self.azimuths[0];
-        let left = self.azimuths[1];
-        let near_x = (x - half_x).max(0.0);
-        let most = |tangent: f32| if tangent > 0.0 { tangent * far_x } else { tangent * near_x };
-        let least = |tangent: f32| if tangent > 0.0 { tangent * near_x } else { tangent * far_x };
-        if y - half_y > most(left) || y + half_y < least(right) {
-            return false;
-        }
-        // Above or below: by the horizontal distance.
-        let far_m = far_x.hypot(y.abs() + half_y);
-        let near_m = near_x.hypot((y.abs() - half_y).max(0.0));
-        let [low, high] = self.elevations;
-        let highest = if high > 0.0 { high * far_m } else { high * near_m };
-        let lowest = if low > 0.0 { low * near_m } else { low * far_m };
-        z - half_z <= highest && z + half_z >= lowest
+        let quotient = |edge: f32, positive: f32, negative: f32| {
+            edge / if edge > 0.0 { positive } else { negative }
+        };
+        // As for single Gaussians: see `Bounds::new`.
+        let azimuths = if near_x > 1e-3 {
+            [quotient(y - half_y, far_x, near_x), quotient(y + half_y, near_x, far_x)]
+        } else {
+            [-f32::MAX, f32::MAX]
+        };
+        let near_m = near_x.max(0.0).hypot((y.abs() - half_y).max(0.0)).max(1e-9);
+        let far_m = far_x.hypot(y.abs() + half_y).max(1e-9);
+        let elevations = [quotient(z - half_z, far_m, near_m), quotient(z + half_z, near_m, far_m)];
+        Some(Span { azimuths, elevations, nearest_m, middle_m: center.length() })
     }
 }
 
-impl Block {
-    /// The block of a lane group; `None` if a beam meets none of its Gaussians.
+impl<S: Simd> Bounds<S> {
+    /// The bounds of a lane group; `None` if a beam meets none of its Gaussians.
     #[inline(always)]
-    fn new<S: Simd>(simd: S, columns: &[Lanes], test: &ChunkTest) -> Option<Self> {
+    fn new(simd: S, columns: &[Lanes], test: &ChunkTest<'_>) -> Option<Self> {
+        let body = test.body;
         let splat = |value: f32| f32x16::splat(simd, value);
         let zero = splat(0.0);
         let log2_opacity = f32x16::load_array_ref(simd, &columns[column::LOG2_OPACITY].0);
-        let visible = log2_opacity.simd_ge(splat(test.alpha_cut_log2));
+        let visible = log2_opacity.simd_ge(splat(body.alpha_cut_log2));
         if visible.all_false() {
             return None;
         }
         // The half-size of the ellipsoid's box along each axis of the sector, as in the definition
         // of the reach.
-        let ln4 = 2.0 * std::f32::consts::LN_2;
-        // Never farther than an opacity of 1 reaches, as for splats.
-        let above_cut = log2_opacity.min(zero) - splat(test.alpha_cut_log2);
-        let reach = (above_cut * splat(ln4)).max(zero).sqrt() * splat(1.0 + 1e-4);
+        let reach = body.reach2(simd, log2_opacity).max(zero).sqrt() * splat(1.0 + 1e-4);
         let mean =
             Vec3x16::load(simd, columns, column::MEAN).minus(Vec3x16::splat(simd, test.middle_m));
         let range_m = mean.dot(mean).sqrt();
         let scale = Vec3x16::load(simd, columns, column::SCALE);
-        let own = rotation_columns(simd, columns);
         // A point of the ellipsoid moves by the turn times its own distance.
         let largest = scale.x.max(scale.y).max(scale.z);
-        let most_moved_m = splat(Vec3::from_array(test.moved_m).length());
+        let most_moved_m = splat(Vec3::from_array(body.moved_m).length());
         let farthest_m = largest.mul_add(reach, range_m) + most_moved_m;
-        let turned_m = farthest_m * splat(test.turned_rad);
-        let [x, half_x] = along(simd, test, 0, mean, own, scale, reach, turned_m);
-        let [y, half_y] = along(simd, test, 1, mean, own, scale, reach, turned_m);
-        let [z, half_z] = along(simd, test, 2, mean, own, scale, reach, turned_m);
+        let turned_m = farthest_m * splat(body.turned_rad);
+        // Most lie beside the sector, even as spheres: those need no axes of their own.
+        let sphere_m = largest.mul_add(reach, turned_m + most_moved_m);
+        let is_beside = |[x, y]: [f32; 2]| {
+            let normal = Vec3::from_array(body.axes[0]) * x + Vec3::from_array(body.axes[1]) * y;
+            Vec3x16::splat(simd, normal.to_array()).dot(mean).simd_gt(sphere_m)
+        };
+        let visible = visible & !(is_beside(body.beside[0]) | is_beside(body.beside[1]));
+        if visible.all_false() {
+            return None;
+        }
+        let own = rotation_columns(simd, columns);
+        let [x, half_x] = along(simd, body, 0, mean, own, scale, reach, turned_m);
+        let [y, half_y] = along(simd, body, 1, mean, own, scale, reach, turned_m);
+        let [z, half_z] = along(simd, body, 2, mean, own, scale, reach, turned_m);
         // The farther of two lower bounds of its distance, from a sphere and from the box that
         // contain it. A road's Gaussians are so flat that the sphere is up to their length too
         // near.
@@ -331,30 +515,58 @@ impl Block {
         let elevation_high = quotient(simd, z + half_z, near, far);
         let meets = visible
             & far_x.simd_gt(zero)
-            & nearest_m.simd_le(splat(test.max_range_m))
-            & azimuth_low.simd_le(splat(test.azimuths[1]))
-            & azimuth_high.simd_ge(splat(test.azimuths[0]))
-            & elevation_low.simd_le(splat(test.elevations[1]))
-            & elevation_high.simd_ge(splat(test.elevations[0]));
+            & nearest_m.simd_le(splat(body.max_range_m))
+            & azimuth_low.simd_le(splat(body.azimuths[1]))
+            & azimuth_high.simd_ge(splat(body.azimuths[0]))
+            & elevation_low.simd_le(splat(body.elevations[1]))
+            & elevation_high.simd_ge(splat(body.elevations[0]));
         let lanes = meets.to_bitmask();
         if lanes == 0 {
             return None;
         }
+        Some(Self {
+            lanes,
+            mean,
+            own,
+            scale,
+            azimuths: [azimuth_low.to_array(), azimuth_high.to_array()],
+            elevations: [elevation_low.to_array(), elevation_high.to_array()],
+            nearest_m: nearest_m.to_array(),
+            middle_m: range_m.to_array(),
+        })
+    }
+}
+
+impl<S: Simd> Bounds<S> {
+    #[inline(always)]
+    fn span(&self, lane: usize) -> Span {
+        Span {
+            azimuths: self.azimuths.each_ref().map(|tangents| tangents[lane]),
+            elevations: self.elevations.each_ref().map(|tangents| tangents[lane]),
+            nearest_m: self.nearest_m[lane],
+            middle_m: self.middle_m[lane],
+        }
+    }
+}
+
+impl Shapes {
+    #[inline(always)]
+    fn new<S: Simd>(simd: S, columns: &[Lanes], bounds: &Bounds<S>, body: &BodyTest) -> Self {
+        let Bounds { mean, own, scale, .. } = bounds;
         // Rows of the transposed rotation are its columns: the Gaussian's own axes.
-        let per_m = |scale: f32x16<S>| splat(1.0) / scale.max(splat(THINNEST_M as f32));
+        let log2_opacity = f32x16::load_array_ref(simd, &columns[column::LOG2_OPACITY].0);
+        let one = f32x16::splat(simd, 1.0);
+        let per_m = |scale: f32x16<S>| one / scale.max(f32x16::splat(simd, THINNEST_M as f32));
         let a = own[0].scale(per_m(scale.x));
         let b = own[1].scale(per_m(scale.y));
         let c = own[2].scale(per_m(scale.z));
         let whiten = [a.x, a.y, a.z, b.x, b.y, b.z, c.x, c.y, c.z];
-        Some(Self {
-            lanes,
-            azimuths: [azimuth_low.to_array(), azimuth_high.to_array()],
-            elevations: [elevation_low.to_array(), elevation_high.to_array()],
-            nearest_m: nearest_m.to_array(),
+        Self {
             mean_m: [mean.x.to_array(), mean.y.to_array(), mean.z.to_array()],
             whiten: whiten.map(|values| values.to_array()),
-            luminance: luminance(simd, columns, test.tint).to_array(),
-        })
+            reach2: body.reach2(simd, log2_opacity).to_array(),
+            luminance: luminance(simd, columns, body.tint).to_array(),
+        }
     }
 }
 
@@ -377,7 +589,7 @@ fn luminance<S: Simd>(simd: S, columns: &[Lanes], tint: [f32; 3]) -> f32x16<S> {
 #[allow(clippy::too_many_arguments, reason = "vectors in registers")]
 fn along<S: Simd>(
     simd: S,
-    test: &ChunkTest,
+    body: &BodyTest,
     axis: usize,
     mean: Vec3x16<S>,
     own: [Vec3x16<S>; 3],
@@ -385,8 +597,8 @@ fn along<S: Simd>(
     reach: f32x16<S>,
     turned_m: f32x16<S>,
 ) -> [f32x16<S>; 2] {
-    let row = Vec3x16::splat(simd, test.axes[axis]);
-    let margin_m = turned_m + f32x16::splat(simd, test.moved_m[axis]);
+    let row = Vec3x16::splat(simd, body.axes[axis]);
+    let margin_m = turned_m + f32x16::splat(simd, body.moved_m[axis]);
     let along_own = Vec3x16 { x: row.dot(own[0]), y: row.dot(own[1]), z: row.dot(own[2]) };
     let root = along_own.times(scale);
     [row.dot(mean), root.dot(root).sqrt().mul_add(reach, margin_m)]

@@ -2,11 +2,15 @@
 
 use fearless_simd::{Level, dispatch};
 
-use super::candidates::Candidates;
+use super::candidates::{Candidates, Search};
 use super::sector::{BodySector, Sector};
 use super::tile::Tile;
 use crate::lidar::{Sweep, Task};
 use wildcity_scene::chunk::LANES;
+
+/// Candidates after which they are compared with beams: so few that beams have returned before what
+/// is hidden is searched, and so many that a tile has some.
+pub(super) const BATCH: usize = 1 << 12;
 
 /// Memory that sectors fill one after the other.
 #[derive(Default)]
@@ -33,13 +37,14 @@ pub(super) fn sweep(
         let first_column = sector.columns.start + at % tiles * LANES;
         tile.begin(sector, view, at / tiles * LANES, first_column);
     }
-    search(level, sector, candidates, task, |seen, candidates, is_last| {
-        for (tile, list) in beams.iter_mut().zip(&candidates.lists) {
-            let all = &candidates.list;
-            dispatch!(level, simd => tile.cast(simd, all, seen, list, task.profile));
-            if is_last {
-                tile.leave_body();
-            }
+    let mut last = None;
+    search(level, sector, candidates, task, BATCH, |number, seen, candidates| {
+        if last.replace(number) != Some(number) {
+            beams.iter_mut().for_each(Tile::leave_body);
+        }
+        for (at, tile) in beams.iter_mut().enumerate() {
+            dispatch!(level, simd => tile.cast(simd, candidates, at, seen, task.profile));
+            candidates.ends_m[at] = tile.end_m();
         }
     });
     let width = sector.columns.len();
@@ -50,33 +55,20 @@ pub(super) fn sweep(
     part
 }
 
-/// Finds the candidates of a sector body by body, and calls `compare` with them whenever there are
-/// many, and with the last ones of each body: then its third argument is `true`.
+/// Finds the candidates of a sector body by body, and calls `compare` with the body's number and
+/// its candidates whenever there are as many as a batch, and with the last ones of each body.
 pub(crate) fn search(
     level: Level,
     sector: &Sector,
     candidates: &mut Candidates,
     task: &Task<'_>,
-    mut compare: impl FnMut(&BodySector<'_>, &Candidates, bool),
+    batch: usize,
+    mut compare: impl FnMut(usize, &BodySector<'_>, &mut Candidates),
 ) {
-    let rows = task.view.lidar.rows();
-    for chunks in &task.bodies {
+    candidates.begin(sector, task.view.lidar.rows());
+    for (number, chunks) in task.bodies.iter().enumerate() {
         let seen = sector.seen_from(chunks[0].1, task.view);
-        let mut compare = |candidates: &mut Candidates, is_last| {
-            candidates.sort_to_tiles(level, sector, rows);
-            compare(&seen, candidates, is_last);
-            candidates.list.clear();
-        };
-        let mut chunks: Vec<_> = chunks
-            .iter()
-            .map(|(number, _, chunk)| (seen.distance_m(chunk), *number, *chunk))
-            .collect();
-        // From the nearest, so that what hides others is met first.
-        chunks.sort_by(|a, b| a.0.total_cmp(&b.0));
-        for (_, number, chunk) in chunks {
-            let chunk = (task.keys.first(number), chunk);
-            candidates.find(level, &seen, chunk, task.profile, |many| compare(many, false));
-        }
-        compare(candidates, true);
+        let search = Search { level, seen: &seen, chunks, task, batch };
+        candidates.find(&search, |many| compare(number, &seen, many));
     }
 }

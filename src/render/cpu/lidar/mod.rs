@@ -4,8 +4,8 @@
 //! and one radian. A sector finds its *candidates*, Gaussians whose bounding box in the sector's
 //! axes a beam may meet, 16 at a time; bins them to *tiles* of 16 x 16 beams; and compares a row of
 //! 16 beams at a time with each. Beams keep their hits up to the return in order of range
-//! ([`beam`]), so that candidates need no sort but for speed: the nearest come first, and a tile
-//! ends where all of its beams have returned in front of the next.
+//! ([`beam`]), so that the order of candidates changes no return, but the time: the nearest come
+//! first, and what lies behind the returns of a tile is not compared with it.
 //!
 //! Positions are relative to the LiDAR in the middle of the sector, and a response is computed from
 //! the distance of a line from a point in standard deviations, so that f32 loses 1e-5 m at 100 m
@@ -23,13 +23,13 @@ use parking_lot::Mutex;
 use rayon::prelude::*;
 
 use self::beam::BeamRow;
-use self::candidates::MOST_CANDIDATES;
-pub(crate) use self::candidates::{Candidate, Candidates};
+pub(crate) use self::candidates::{Candidate, Candidates, Reach};
+use self::candidates::{MOST_CLUSTERS, SeenCluster};
 use self::cast::Scratch;
 pub(crate) use self::cast::search;
 pub(crate) use self::sector::{BodySector, MOST_COLUMNS, Sector};
 use crate::lidar::{MOST_HITS, Sweep, Task};
-use wildcity_scene::chunk::LANES;
+use wildcity_scene::chunk::{CLUSTER, LANES};
 use wildcity_scene::geometry::Lidar;
 
 /// As [`sweep`], with the best instruction set of the machine.
@@ -76,19 +76,20 @@ pub(crate) fn sweep(level: Level, task: &Task<'_>) -> Sweep {
 pub(crate) fn most_bytes(lidar: &Lidar, threads: usize) -> u64 {
     let beams = most_beams(lidar);
     // Vectors grow to twice what they hold.
-    let hits = 2 * beams * MOST_HITS * BeamRow::HIT_BYTES;
+    let hits = 2 * beams * (MOST_HITS + BeamRow::SPARE_HITS) * BeamRow::HIT_BYTES;
     let returns = 2 * lidar.beams() * Sweep::BEAM_BYTES;
     // A sector has a column at least.
     let threads = threads.min(lidar.columns());
-    (returns + threads * (hits + most_candidate_bytes(lidar))) as u64
+    (returns + threads * (hits + most_candidate_bytes(lidar, cast::BATCH))) as u64
 }
 
 /// An upper bound of the memory of the candidates of a sector, with their places in the lists of
 /// tiles, in bytes.
-pub(crate) fn most_candidate_bytes(lidar: &Lidar) -> usize {
+pub(crate) fn most_candidate_bytes(lidar: &Lidar, batch: usize) -> usize {
     let tiles = most_beams(lidar) / (LANES * LANES);
-    let candidate = 2 * size_of::<Candidate>() + 8 + 4 * tiles;
-    2 * MOST_CANDIDATES * candidate
+    let place = size_of::<u32>();
+    let candidate = size_of::<Candidate>() + size_of::<Reach>() + place + place * tiles;
+    2 * (batch + CLUSTER) * candidate + MOST_CLUSTERS * size_of::<SeenCluster>()
 }
 
 /// Most beams of a sector, in whole tiles.

@@ -3,11 +3,11 @@
 use std::ops::Range;
 use std::sync::Arc;
 
+use fearless_simd::{f32x16, prelude::*};
 use glam::{DMat3, DVec3};
 
 use super::rows::Rows;
 use crate::lidar::{Body, LidarView};
-use wildcity_scene::Chunk;
 use wildcity_scene::chunk::LANES;
 use wildcity_scene::geometry::Pose;
 
@@ -78,6 +78,28 @@ impl TileColumns {
             reached = reached.max(*high);
         }
         Self { tangents: lanes, span: [sorted[0][0], reached], widest_gap }
+    }
+
+    /// Whether its columns look between and beyond azimuths with these tangents.
+    pub(super) fn overlap(&self, [low, high]: [f32; 2]) -> bool {
+        let [least, most] = self.span;
+        least <= high && most >= low
+    }
+
+    /// Whether a column sees azimuths with these tangents.
+    #[inline(always)]
+    pub(super) fn see<S: Simd>(&self, simd: S, azimuths: [f32; 2]) -> bool {
+        if !self.overlap(azimuths) {
+            return false;
+        }
+        let [low, high] = azimuths;
+        // Many Gaussians far away lie between two columns.
+        let [least, most] = &self.tangents;
+        let sees = || {
+            f32x16::load_array_ref(simd, least).simd_le(f32x16::splat(simd, high))
+                & f32x16::load_array_ref(simd, most).simd_ge(f32x16::splat(simd, low))
+        };
+        high - low > self.widest_gap || !sees().all_false()
     }
 }
 
@@ -185,12 +207,5 @@ impl BodySector<'_> {
     /// A position in the body's axes relative to the LiDAR's middle position, in metres.
     pub(crate) fn relative_to_middle(&self, position_m: DVec3) -> DVec3 {
         position_m - self.middle.position_m
-    }
-
-    /// How far a chunk's first Gaussians are from the LiDAR, in metres.
-    pub(super) fn distance_m(&self, chunk: &Chunk) -> f64 {
-        let middle_m = -self.relative_to_middle(chunk.origin_m());
-        let first = chunk.clusters().first().map(|first| 0.5 * (first.min_m + first.max_m));
-        first.map_or(f64::INFINITY, |first| first.as_dvec3().distance(middle_m))
     }
 }

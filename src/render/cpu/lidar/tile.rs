@@ -3,7 +3,7 @@
 use fearless_simd::{f32x16, prelude::*};
 
 use super::beam::{BeamRow, Crossing};
-use super::candidates::Candidate;
+use super::candidates::{Candidate, Candidates};
 use super::sector::{BodySector, Sector};
 use crate::cpu::lanes::Vec3x16;
 use crate::cpu::math::exp2;
@@ -11,8 +11,8 @@ use crate::lidar::{Keys, LidarView, Sweep};
 use wildcity_scene::RenderProfile;
 use wildcity_scene::chunk::LANES;
 
-/// Candidates between two looks for the farthest beam that has not returned nearer.
-const LOOKS: usize = 16;
+/// Candidates between two looks for the farthest beam of each row that has not returned nearer.
+pub(super) const LOOKS: usize = 16;
 
 /// The beams of a tile.
 pub(super) struct Tile {
@@ -22,15 +22,14 @@ pub(super) struct Tile {
     size: [usize; 2],
     /// A row after the other.
     beams: [BeamRow; LANES],
-    /// How far each beam is followed: to its return, or the LiDAR's range, in metres.
-    ends_m: [[f32; LANES]; LANES],
-    /// The largest of each row of `ends_m`.
+    /// How far the farthest beam of each row is followed, in metres.
     row_ends_m: [f32; LANES],
     /// The beams as the body sees them that they are compared with, once they are.
     rays: Option<Box<Rays>>,
 }
 
 /// The beams of a tile in the axes of a body.
+#[repr(align(64))]
 struct Rays {
     /// The LiDAR's position when each column is fired, relative to that of the sector's middle, in
     /// metres.
@@ -46,7 +45,6 @@ impl Default for Tile {
             first_column: 0,
             size: [0; 2],
             beams: Default::default(),
-            ends_m: [[0.0; LANES]; LANES],
             row_ends_m: [0.0; LANES],
             rays: None,
         }
@@ -67,12 +65,11 @@ impl Tile {
         self.first_row = first_row;
         self.first_column = first_column;
         self.size = [rows, columns];
-        self.beams.iter_mut().for_each(BeamRow::clear);
         // Lanes beyond the last column or row are not followed.
-        self.ends_m = [[0.0; LANES]; LANES];
-        for ends_m in &mut self.ends_m[..rows] {
-            ends_m[..columns].fill(sector.max_range_m);
-        }
+        let mut ends_m = [0.0; LANES];
+        ends_m[..columns].fill(sector.max_range_m);
+        self.beams.iter_mut().for_each(|beams| beams.begin([0.0; LANES]));
+        self.beams[..rows].iter_mut().for_each(|beams| beams.begin(ends_m));
         self.row_ends_m = [0.0; LANES];
         self.row_ends_m[..rows].fill(sector.max_range_m);
     }
@@ -80,6 +77,11 @@ impl Tile {
     /// The beams are compared with another body next.
     pub(super) fn leave_body(&mut self) {
         self.rays = None;
+    }
+
+    /// How far its beams are followed, in metres.
+    pub(super) fn end_m(&self) -> f32 {
+        self.row_ends_m.iter().copied().fold(0.0, f32::max)
     }
 
     fn rays(&self, seen: &BodySector<'_>) -> Rays {
@@ -104,16 +106,17 @@ impl Tile {
         rays
     }
 
-    /// Compares its beams with candidates of a body, which are listed from the nearest.
+    /// Compares its beams with the candidates of a tile of a body.
     #[inline(always)]
     pub(super) fn cast<S: Simd>(
         &mut self,
         simd: S,
-        candidates: &[Candidate],
+        candidates: &Candidates,
+        tile: usize,
         seen: &BodySector<'_>,
-        list: &[u32],
         profile: &RenderProfile,
     ) {
+        let list = &candidates.lists[tile];
         let rays = match self.rays.take() {
             Some(rays) => rays,
             None if list.is_empty() => return,
@@ -124,33 +127,30 @@ impl Tile {
         let cap = f32x16::splat(simd, profile.alpha_cap as f32);
         let last_row = self.first_row + self.size[0];
         for listed in list.chunks(LOOKS) {
-            // Behind the returns of all beams.
-            let farthest_m = self.row_ends_m.iter().copied().fold(0.0, f32::max);
-            if candidates[listed[0] as usize].nearest_m > farthest_m {
-                break;
-            }
+            self.beams.iter_mut().for_each(BeamRow::reserve);
             let mut changed_rows = 0_u32;
             for at in listed {
-                let candidate = &candidates[*at as usize];
-                let aim = Aim::new(simd, candidate, origin);
-                let [first, end] = candidate.rows.map(usize::from);
+                let reach = &candidates.reaches[*at as usize];
+                let aim = Aim::new(simd, &candidates.list[*at as usize], origin);
+                let [first, end] = reach.rows.map(usize::from);
                 for row in first.max(self.first_row)..end.min(last_row) {
                     let row = row - self.first_row;
-                    if candidate.nearest_m > self.row_ends_m[row] {
+                    if reach.nearest_m > self.row_ends_m[row] {
                         continue;
                     }
                     let direction = Vec3x16::from_arrays(simd, &rays.directions[row]);
-                    let ends_m = &mut self.ends_m[row];
-                    let met = aim.meet(direction, least_m, ends_m, cap);
+                    let beams = &mut self.beams[row];
+                    let met = aim.meet(direction, least_m, &beams.ends_m, cap);
                     let Some(crossing) = met else { continue };
-                    changed_rows |= 1 << row;
-                    self.beams[row].add(simd, &crossing, ends_m);
+                    if beams.add(simd, &crossing) {
+                        changed_rows |= 1 << row;
+                    }
                 }
             }
             while changed_rows != 0 {
                 let row = changed_rows.trailing_zeros() as usize % LANES;
                 changed_rows &= changed_rows - 1;
-                self.row_ends_m[row] = self.ends_m[row].iter().copied().fold(0.0, f32::max);
+                self.row_ends_m[row] = self.beams[row].ends_m.iter().copied().fold(0.0, f32::max);
             }
         }
         self.rays = Some(rays);
@@ -252,7 +252,8 @@ impl<S: Simd> Aim<S> {
         // Merged Gaussians may be more opaque than 1.
         let alpha = exp2(simd, exponent.min(f32x16::splat(simd, 0.0))).min(cap);
         Some(Crossing {
-            range_m: meets.select(range_m, f32x16::splat(simd, f32::INFINITY)),
+            meets,
+            range_m,
             alpha: meets.select(alpha, f32x16::splat(simd, 0.0)),
             luminance: self.luminance,
             key: self.key,
