@@ -252,14 +252,14 @@ pub(crate) fn coincident() -> (Scene, LidarView) {
     (Scene::from_gaussians(&gaussians), LidarView::at_rest(lidar, Pose::IDENTITY))
 }
 
-/// Layers behind each other, in any order, of more Gaussians than are compared at a time, and a
-/// LiDAR that drives past them: most of them are hidden.
-pub(crate) fn layers() -> (Scene, LidarView) {
+/// A cloud of more Gaussians than are compared at a time, most of them hidden by others, and a LiDAR
+/// that drives towards it.
+pub(crate) fn cloud() -> (Scene, LidarView) {
     let count = 30_000;
     let mut gaussians = Gaussians::with_capacity(0, count);
-    let mut random = Random::new(5, "layers", 0);
+    let mut random = Random::new(5, "cloud", 0);
     for _ in 0..count {
-        let range_m = 6.0 + 2.0 * random.below(12) as f64;
+        let range_m = random.range(6.0, 30.0);
         let [y, z] = [0, 1].map(|_| 0.5 * range_m * random.range(-1.0, 1.0));
         gaussians.means_m.push([range_m, y, z]);
         let ln_scale = (0.012 * range_m as f32).ln();
