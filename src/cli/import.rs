@@ -41,8 +41,8 @@ use super::twin::views::Views;
 /// packing cells with their levels of detail, and publishing.
 ///
 /// Memory: twice the uncompressed scene (56 bytes per Gaussian without SH, 236 with SH degree 3),
-/// up to two and a half times if most of it lies within 16 m, and in addition the contents of an
-/// archive, a glTF buffer, or a NuRec payload.
+/// three times if most of it lies within 64 m, and in addition the contents of an archive, a glTF
+/// buffer, or a NuRec payload.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Import {
