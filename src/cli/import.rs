@@ -1,5 +1,6 @@
 //! `wildcity import`.
 
+use std::borrow::Cow;
 use std::fmt;
 use std::io::Write;
 use std::path::PathBuf;
@@ -224,7 +225,7 @@ impl Import {
         let bar = progress::count("writing");
         let new = NewVersion {
             name: &self.twin,
-            gaussians: &gaussians,
+            gaussians: Cow::Owned(gaussians),
             profile,
             rig,
             trajectories,

@@ -5,6 +5,7 @@
 //! twice. It is used only if both images have the same bytes and agree with those of the cpu
 //! backend.
 
+use glam::DVec2;
 use wildcity_scene::geometry::camera::Pinhole;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::{Gaussians, RenderProfile, Scene, sh};
@@ -119,13 +120,16 @@ fn test_scene() -> Scene {
     Scene::from_gaussians(&gaussians)
 }
 
-/// Two image sizes, neither a multiple of the tile's; the larger has 30 macro tiles.
+/// Two image sizes, neither a multiple of the tile's; the larger has 30 macro tiles. The smaller
+/// has a third of the native sides, and so several samples a pixel.
 fn test_views() -> [View; 2] {
-    [[717, 301], [90, 75]].map(|[width_px, height_px]: [u32; 2]| {
+    [[717, 301, 1], [90, 75, 3]].map(|[width_px, height_px, native]: [u32; 3]| {
         let [cx, cy] = [width_px, height_px].map(|size| 0.5 * f64::from(size));
         // A focal length of 0.6 widths: the image ends at a slope of 1/1.2, just within 0.9.
         let pinhole = Pinhole { fx: 1.2 * cx, fy: 1.2 * cx, cx, cy };
-        View::new(Camera::from_pinhole(width_px, height_px, pinhole), Pose::IDENTITY)
+        let native_size_px = Some(f64::from(native) * DVec2::new(2.0 * cx, 2.0 * cy));
+        let camera = Camera::from_pinhole(width_px, height_px, pinhole);
+        View::new(Camera { native_size_px, ..camera }, Pose::IDENTITY)
     })
 }
 

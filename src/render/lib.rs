@@ -50,6 +50,7 @@ use wildcity_scene::{Chunk, Rays, RenderProfile, Rig, Scene, Selection, Semantic
 use crate::gradient::Differentiate;
 use crate::lidar::{LidarView, Sweep, Task};
 
+pub use samples::sample_count;
 pub use view::{RollingShutter, View};
 
 /// The input of a render call: all views of one step.
@@ -297,14 +298,14 @@ pub trait Backend: Send + Sync {
     /// frame is drawn in more parts, one after the other; its images do not depend on the limit.
     fn limit_frame_bytes(&self, _bytes: u64) {}
 
-    /// Upper bound of its intermediate buffers in the machine's memory for a frame of these views,
-    /// whatever the scene, in bytes.
-    fn frame_bytes(&self, _views: &[View]) -> u64 {
+    /// Upper bound of its intermediate buffers in the machine's memory for a frame of these views
+    /// with a profile, whatever the scene, in bytes.
+    fn frame_bytes(&self, _views: &[View], _profile: &RenderProfile) -> u64 {
         0
     }
 
     /// As [`Backend::frame_bytes`], for a small frame that is rendered while a large one is.
-    fn bytes_beside(&self, _views: &[View]) -> u64 {
+    fn bytes_beside(&self, _views: &[View], _profile: &RenderProfile) -> u64 {
         0
     }
 

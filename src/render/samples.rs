@@ -23,7 +23,7 @@
 use std::borrow::Cow;
 
 use crate::{Frame, View};
-use wildcity_scene::{Shrink, ViewSet};
+use wildcity_scene::{RenderProfile, Shrink, ViewSet};
 
 /// Samples of a pixel along each axis.
 pub(crate) const SAMPLES: u32 = 2;
@@ -32,11 +32,21 @@ pub(crate) const SAMPLES: u32 = 2;
 /// of 1920 x 1080 px are 0.3.
 const MOST_SHARE: f64 = 0.45;
 
+/// Number of samples of the images of some views with a profile: what they cost.
+pub fn sample_count(views: &[View], profile: &RenderProfile) -> u64 {
+    let samples = |view: &View| {
+        let camera = sample_view(view, profile).map_or(view.camera, |samples| samples.camera);
+        camera.pixels() as u64
+    };
+    views.iter().map(samples).sum()
+}
+
 /// The view whose pixels are the samples of another one's, row by row; `None` if that has one
 /// sample a pixel.
-pub(crate) fn sample_view(view: &View) -> Option<View> {
+pub(crate) fn sample_view(view: &View, profile: &RenderProfile) -> Option<View> {
     let camera = &view.camera;
-    if camera.native_scale().max_element() > MOST_SHARE {
+    let is_small = camera.native_scale().max_element() <= MOST_SHARE;
+    if !is_small || profile.shrink == Shrink::Filter {
         return None;
     }
     let [width, height] = [camera.width_px, camera.height_px].map(|px| u64::from(SAMPLES * px));
@@ -60,11 +70,9 @@ pub(crate) struct SampledViews<'a> {
 
 impl<'a> SampledViews<'a> {
     pub(crate) fn new(frame: &Frame<'a>) -> Self {
-        let views = frame.views;
-        if frame.profile.shrink == Shrink::Filter {
-            return Self { views: Cow::Borrowed(views), sampled: ViewSet::default() };
-        }
-        let samples: Vec<Option<View>> = views.iter().map(sample_view).collect();
+        let Frame { views, profile, .. } = *frame;
+        let samples: Vec<Option<View>> =
+            views.iter().map(|view| sample_view(view, profile)).collect();
         let sampled = (0..).zip(&samples).filter_map(|(view, samples)| samples.and(Some(view)));
         let sampled: ViewSet = sampled.collect();
         if sampled == ViewSet::default() {

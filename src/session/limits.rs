@@ -181,10 +181,10 @@ pub const QUEUED_FRAMES: usize = 2 * SESSIONS;
 /// Bytes of a return of a LiDAR in an answer: position, intensity, row, column, instance, class.
 pub const POINT_BYTES: u64 = 4 * 4 + 3 * 2 + 1;
 
-/// A frame of more pixels takes a second and more on processors, so small frames are rendered at
-/// the same time. Sixteen 1440x928 images are 21 million.
-// 16 x 1440 x 928 = 21,381,120 pixels are below 24 x 2²⁰ = 25,165,824.
-pub const LARGE_PIXELS: u64 = 24 << 20;
+/// A frame of more samples takes a second and more on processors, so small frames are rendered at
+/// the same time. Sixteen 1440x928 images, of a sample a pixel, are 21 million.
+// 16 x 1440 x 928 = 21,381,120 samples are below 24 x 2²⁰ = 25,165,824.
+pub const LARGE_SAMPLES: u64 = 24 << 20;
 
 /// Bytes of all answers that are being made, sent, or kept for a repeated `seq`, and of the
 /// sessions' overlays, which take 134 MB per session at worst. Enough for 100 sessions with six raw

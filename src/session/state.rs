@@ -60,6 +60,13 @@ pub(crate) struct SessionSettings {
     pub(crate) follows_latest: bool,
 }
 
+impl SessionSettings {
+    /// Whether frames may be drawn view by view: images to repair are chosen among all of a frame.
+    pub(crate) fn may_split(&self) -> bool {
+        self.repair.is_none()
+    }
+}
+
 /// The version of the twin that a session shows, and how.
 #[derive(Clone, Debug)]
 pub(crate) struct PinnedVersion {

@@ -80,8 +80,9 @@ impl Stills {
     ) -> Result<Self, SessionError> {
         let profile = resident.version.manifest.profile;
         Engine::bake_sky(resident.clone(), profile).await?;
-        let frame = frame_bytes(&engine, views);
-        let reservation = Engine::reserve(resident, extent(views), profile, frame).await?;
+        let frame = frame_bytes(&engine, views, &profile);
+        let scenes = Engine::scene_bytes(resident.clone(), extent(views), profile, true).await?;
+        let reservation = resident.reserve_scenes(scenes, frame)?;
         let number = engine.new_session_number();
         Ok(Self { engine, reservation, profile, number })
     }
@@ -89,15 +90,9 @@ impl Stills {
     /// Whether the reserved memory is enough for these views.
     pub async fn covers(&self, views: StillViews<'_>) -> Result<bool, SessionError> {
         let resident = self.reservation.resident().clone();
-        let needed = Engine::worst_case_bytes(resident, extent(views), self.profile).await?;
-        let FrameBytes { stages, beside, is_large, images } = frame_bytes(&self.engine, views);
-        let frame = self.reservation.frame();
-        // Each purpose by itself: memory of one is not lent to another.
-        let frame_fits = stages <= frame.stages
-            && beside <= frame.beside
-            && (frame.is_large || !is_large)
-            && images <= frame.images;
-        Ok(frame_fits && needed <= self.reservation.scene_bytes())
+        let scenes = Engine::scene_bytes(resident, extent(views), self.profile, true).await?;
+        let frame = frame_bytes(&self.engine, views, &self.profile);
+        Ok(self.reservation.covers(scenes, frame))
     }
 
     /// Renders images, and returns a JPEG or PNG file, or raw pixels, for each. More than
@@ -120,7 +115,7 @@ impl Stills {
         // One deadline for all frames together.
         let deadline = Instant::now() + max_wait;
         let mut images = Vec::with_capacity(stills.len());
-        for part in stills.chunks(MAX_VIEWS) {
+        for part in stills.chunks(MAX_VIEWS.min(self.reservation.views_at_once())) {
             images.append(&mut self.render_frame(part.to_vec(), actors, deadline).await?);
         }
         Ok(images)
@@ -150,7 +145,7 @@ impl Stills {
         let work = move |_: &mut _, backend: &dyn wildcity_render::Backend| {
             backend.sweep(&scene, &profile, &view)
         };
-        let cost = FrameCost { session: self.number, pixels: beams };
+        let cost = FrameCost { session: self.number, samples: beams };
         let (sweep, _queued) = self.engine.run(cost, deadline, work).await?;
         Ok(sweep?)
     }
@@ -176,6 +171,7 @@ impl Stills {
         let placed = detail.placed(placements(actors, views.len()));
         let mut scene = pin(resident, profile, deadline, viewpoints).await?;
         scene.place(placed);
+        let cost = FrameCost::new(self.number, &views, &profile);
         let work = move |_: &mut _, backend: &dyn wildcity_render::Backend| {
             // The renderer writes every pixel; zeros are only there to make the memory valid.
             let zeroed = |view: &View| vec![0; 3 * view.camera.pixels()];
@@ -194,7 +190,6 @@ impl Stills {
             let rendered = backend.render(&frame, &mut targets, &|_, _| {});
             rendered.map(|_| (images, stills))
         };
-        let cost = FrameCost { session: self.number, pixels };
         let (rendered, _queued) = self.engine.run(cost, deadline, work).await?;
         let (images, stills) = rendered?;
         // Off the render thread, which renders for sessions meanwhile.
@@ -227,7 +222,7 @@ fn encoded(index: usize, rgb8: Vec<u8>, still: &Still) -> Result<Vec<u8>, Sessio
 
 /// Buffers and images that a frame of stills needs in addition to its scene. More than
 /// [`MAX_VIEWS`] views are rendered in several frames.
-fn frame_bytes(engine: &Engine, views: StillViews<'_>) -> FrameBytes {
+fn frame_bytes(engine: &Engine, views: StillViews<'_>, profile: &RenderProfile) -> FrameBytes {
     // Rendered one after the other, frames share the memory of the largest.
     let most = |most: FrameBytes, frame: FrameBytes| FrameBytes {
         stages: most.stages.max(frame.stages),
@@ -237,7 +232,7 @@ fn frame_bytes(engine: &Engine, views: StillViews<'_>) -> FrameBytes {
     };
     let images = views.images.chunks(MAX_VIEWS).map(|views| {
         let pixels: u64 = views.iter().map(|view| view.camera.pixels() as u64).sum();
-        engine.frame_bytes(views, 0, STILL_PIXEL_BYTES * pixels)
+        engine.frame_bytes(views, profile, 0, STILL_PIXEL_BYTES * pixels)
     });
     let sweep = views.sweep.map(|view| {
         let stages = engine.sweep_bytes(&view.lidar);

@@ -156,9 +156,10 @@ pub const RESIDENT_BYTES: u64 = 16 << 30;
 pub const LOADERS: usize = 8;
 
 /// Memory of evicted sections that is kept for the next ones. A load evicts just before it reads,
-/// so this is needed only for what the loader threads read at the same time: eight sections of up
-/// to 9 MB.
-pub const FREE_PAGES_BYTES: usize = 64 << 20;
+/// so that what is kept and what is in memory were in memory together before, within the limit. The
+/// largest section of a dense capture has 140 MB; what is given back to the heap instead stays with
+/// the threads that took it.
+pub const FREE_PAGES_BYTES: usize = 256 << 20;
 
 /// Number of attempts to load a section before the frames that wait for it get the error.
 pub const LOAD_ATTEMPTS: u32 = 3;
@@ -178,9 +179,18 @@ pub const ROOM_POLL: Duration = Duration::from_secs(1);
 /// reach of 300 m has some thousands of sections.
 pub const QUEUED_SECTIONS: usize = 1 << 18;
 
-/// Most squares that the search for a twin's worst frame tests. 20 km of road are 320 cells
-/// of 64 m in a row; the larger squares above them are at most twice as many.
-pub const WORST_CASE_SQUARES: usize = 4096;
+/// Bytes, as stored, of the sections that are read at once; a larger one is read alone. They are
+/// in memory until they are decoded, beyond the limit of memory: those of a dense capture have 50
+/// MB and more, those of a street 100 kB.
+pub const READING_BYTES: u64 = 16 << 20;
+
+/// How long a section waits for others that are being read: longer than 100 MB take from a
+/// disk of 100 MB/s.
+pub const READING_WAIT: Duration = Duration::from_secs(2);
+
+/// Most areas that the search for a twin's worst frame halves. 20 km of road are 320 cells of 64 m
+/// in a row; the larger areas above them are at most twice as many.
+pub const WORST_CASE_AREAS: usize = 4096;
 
 /// Number of worst frames, by rig and profile, that are remembered of a twin, so that further
 /// sessions open without the search.

@@ -70,6 +70,9 @@ fn a_wrong_device_fails() {
         ("bin", "i - prefix_before(band_index)", "i"),
         ("expand", "next += countOneBits", "next = first + countOneBits"),
         ("rasterize", "(*sums).green = fma(weight", "(*sums).green = fma(1.02 * weight"),
+        // Only of pixels with several samples.
+        ("rasterize", "return values.xz + values.yw;", "return values.xz + values.xz;"),
+        ("rasterize", "let second = first + 4u;", "let second = first;"),
     ] {
         let broken = gpu_with(Shaders::default().with_mutation(stage, part, mutation).unwrap());
         let result = self_test(&*broken, &cpu());

@@ -38,7 +38,7 @@ fn check(scene: &Scene, profile: &RenderProfile, views: &[View]) {
     assert_eq!(bounded_stats.visible_pairs, free_stats.visible_pairs);
     assert_eq!(bounded_stats.instances, free_stats.instances);
     assert_eq!(bounded_stats.evaluations, free_stats.evaluations);
-    let most_bytes = bounded.frame_bytes(views);
+    let most_bytes = bounded.frame_bytes(views, profile);
     assert!(bounded_stats.held_bytes <= most_bytes, "{bounded_stats:?}: {most_bytes}");
     assert!(free_stats.held_bytes > 2 * LEAST_BYTES, "nothing to cut: {free_stats:?}");
 }

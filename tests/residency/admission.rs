@@ -4,7 +4,9 @@ use std::sync::Arc;
 use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
-use wildcity_twin::residency::{Cache, FrameBytes, ResidencyError, RigExtent, SectionRef};
+use wildcity_twin::residency::{
+    Cache, FrameBytes, ResidencyError, RigExtent, SceneBytes, SectionRef,
+};
 
 use crate::scene_files::{Random, gaussians};
 use crate::streaming::{PROFILE, TEST_TIMEOUT, commit, demo, eyes, pixels, unlimited, views};
@@ -65,7 +67,8 @@ fn frames_take_memory_from_the_sections() {
     let scenes_bytes = (2 * scene_bytes).min(resident.total_bytes());
     assert_eq!(cache.stats().reserved_bytes, scenes_bytes + stages + 2 * images);
     let frame = second.frame();
-    second.exchange(resident.clone(), scene_bytes).unwrap();
+    let scenes = SceneBytes { together: scene_bytes, by_view: None };
+    second.exchange(resident.clone(), scenes, frame).unwrap();
     assert_eq!(second.frame(), frame);
     drop(first);
     assert_eq!(cache.stats().reserved_bytes, scene_bytes + stages / 2 + images);
@@ -107,9 +110,11 @@ fn an_exchanged_version_takes_the_memory_of_the_one_before() {
     let [old, new] = [1, 2].map(|number| cache.open("street", Some(number)).unwrap());
     let mut reservation = old.reserve(EXTENT).unwrap();
     assert!(new.reserve(EXTENT).is_err(), "there is no room for both");
-    reservation.exchange(new.clone(), new.worst_case_bytes(EXTENT)).unwrap();
+    let frame = FrameBytes::default();
+    let scenes = |together| SceneBytes { together, by_view: None };
+    reservation.exchange(new.clone(), scenes(new.worst_case_bytes(EXTENT)), frame).unwrap();
     // A refused exchange changes nothing.
-    assert!(reservation.exchange(old, limit_bytes + 1).is_err());
+    assert!(reservation.exchange(old, scenes(limit_bytes + 1), frame).is_err());
     assert!(Arc::ptr_eq(reservation.resident(), &new));
     assert_eq!(new.stats().reserved_bytes, reservation.bytes());
     drop(reservation);

@@ -290,12 +290,39 @@ async fn a_session_that_does_not_fit_is_refused_until_another_closes() {
     let reserved_bytes = probe.session("probe", None).await.unwrap().reserved_bytes();
     assert!(2 * reserved_bytes < all.total_bytes());
     // The renderer's intermediate buffers count once.
-    let bench = bench(Cache::limited(demo().catalog(), Some(reserved_bytes * 3 / 2)));
+    let bench = bench(Cache::limited(demo().catalog(), Some(reserved_bytes * 11 / 10)));
     let first = bench.session("first", None).await.unwrap();
     let refused = bench.session("second", None).await.unwrap_err();
     assert!(refused.to_string().contains(&reserved_bytes.to_string()), "{refused}");
     first.close(wildcity_session::Outcome::Completed).await;
     bench.session("second", None).await.unwrap();
+}
+
+/// A budget without room for all views of a frame at once: the frame is drawn view by view, with
+/// the same images.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_frame_is_drawn_in_parts_before_its_session_is_refused() {
+    let truth = bench(unlimited());
+    let mut whole = truth.session("whole", None).await.unwrap();
+    assert_eq!(whole.reservation().views_at_once(), wildcity_twin::residency::Viewpoint::MAX);
+    let limit_bytes = whole.reserved_bytes() - 1;
+    let bench = bench(Cache::limited(demo().catalog(), Some(limit_bytes)));
+    let mut session = bench.session("parts", None).await.unwrap();
+    assert_eq!(session.reservation().views_at_once(), 1);
+    assert!(session.reserved_bytes() < limit_bytes);
+    for step in 0..6 {
+        let pose = demo().at(60.0 * f64::from(step));
+        let frame = session.step(pose, false).await.unwrap();
+        let wanted = whole.step(pose, false).await.unwrap();
+        assert_eq!(hashes(&frame), hashes(&wanted), "step {step}");
+        assert!(frame.residency.held_bytes <= limit_bytes);
+    }
+    // There is a limit below which no view fits.
+    drop(session);
+    let by_view_bytes = bench.session("again", None).await.unwrap().reserved_bytes();
+    let less = crate::driving::bench(Cache::limited(demo().catalog(), Some(by_view_bytes - 1)));
+    let refused = less.session("refused", None).await.unwrap_err();
+    assert!(refused.to_string().contains(&by_view_bytes.to_string()), "{refused}");
 }
 
 /// The renderer's intermediate buffers stay within the reserved memory, whose size the budget
@@ -310,7 +337,7 @@ async fn a_session_reserves_what_its_frames_hold() {
         let session = bench.session("a", None).await.unwrap();
         let frame = session.reservation().frame();
         let views = views(demo().at(0.0));
-        assert!(frame.stages >= backend.frame_bytes(&views), "{frame:?}");
+        assert!(frame.stages >= backend.frame_bytes(&views, &PROFILE), "{frame:?}");
         assert!(frame.images > 0 && frame.stages > limit_bytes / 8, "{frame:?}");
         assert!(frame.alone() + session.reservation().scene_bytes() == session.reserved_bytes());
         assert_eq!(session.reserved_bytes(), bench.engine.residency().reserved_bytes);

@@ -73,7 +73,7 @@ async fn a_small_session_keeps_driving_beside_large_ones() {
     let size = setting("FAIRNESS_SIZE", "6144x4608");
     let (width_px, height_px) = size.split_once('x').unwrap();
     let [width_px, height_px] = [width_px, height_px].map(|side| side.parse::<u32>().unwrap());
-    assert!(u64::from(width_px) * u64::from(height_px) > limits::LARGE_PIXELS);
+    assert!(u64::from(width_px) * u64::from(height_px) > limits::LARGE_SAMPLES);
     let bench = Arc::new(bench(Cache::new(demo().catalog())));
 
     // The large sessions without the small one, if the full size is requested, and then with it.

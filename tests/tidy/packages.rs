@@ -17,7 +17,13 @@ const CRATES: &[(&str, &[&str])] = &[
     ("bincode", &["src/twin/store/chunk_file.rs", "src/train/checkpoint.rs"]),
     (
         "fearless_simd",
-        &["src/render/cpu", "src/scene/record", "src/scene/sky", "src/repair/reference/warp.rs"],
+        &[
+            "src/render/cpu",
+            "src/scene/lod",
+            "src/scene/record",
+            "src/scene/sky",
+            "src/repair/reference/warp.rs",
+        ],
     ),
     ("wgpu", &["src/render/gpu"]),
     ("libc", &["src/heap"]),

@@ -133,9 +133,8 @@ async fn render_small(
     views: Vec<View>,
     deadline: Instant,
 ) -> Result<SmallImages, PushError> {
-    // The queue divides the renderer by pixels, and all pushes count as one session.
-    let pixels = views.iter().map(|view| view.camera.pixels() as u64).sum();
-    let cost = FrameCost { session: PUSHES, pixels };
+    // The queue divides the renderer by samples, and all pushes count as one session.
+    let cost = FrameCost::new(PUSHES, &views, &profile);
     let rendered = engine.run(cost, deadline, move |_, backend| {
         let pixels = || views.iter().map(|view| view.camera.pixels());
         let mut images: Vec<_> = pixels().map(|pixels| vec![0; 3 * pixels]).collect();

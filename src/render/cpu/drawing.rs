@@ -13,6 +13,7 @@ use crate::layout::Cutoffs;
 use crate::samples::{is_sampled, sample_view};
 use crate::stage::Stage;
 use crate::{Frame, FrameStats, OnViewDone, RenderError, Target, View, limits};
+use wildcity_scene::RenderProfile;
 
 /// A frame that is being drawn.
 pub(super) struct Drawing<'a> {
@@ -25,17 +26,20 @@ pub(super) struct Drawing<'a> {
     pub(super) stats: FrameStats,
 }
 
-/// Most bytes that are held while such views are drawn with `most_bytes` of intermediate buffers:
-/// these, the sums of one view that is drawn in slabs, and each thread's copies of a macro tile.
-pub(super) fn most_held_bytes(most_bytes: u64, views: &[View], threads: usize) -> u64 {
-    // With samples, which take more than pixels: the profile is not known.
+/// Most bytes that are held while views are drawn with `most_bytes` of intermediate buffers: these,
+/// the sums of one view that is drawn in slabs, and each thread's copies of a macro tile.
+pub(super) fn most_held_bytes(most_bytes: u64, sums_bytes: u64, threads: usize) -> u64 {
+    // A single view may exceed the limit up to the size of its sums, see `Drawing::most_bytes`.
+    most_bytes.max(sums_bytes) + sums_bytes + bin::COPIES_BYTES * threads as u64
+}
+
+/// Most bytes of the sums of one of some views.
+pub(super) fn sums_bytes(views: &[View], profile: &RenderProfile) -> u64 {
     let sums_of_one = |view: &View| {
-        let samples = sample_view(view);
+        let samples = sample_view(view, profile);
         UnfinishedTiles::bytes(samples.as_ref().unwrap_or(view), samples.is_some())
     };
-    let sums = views.iter().map(sums_of_one).max().unwrap_or(0);
-    // A single view may exceed the limit up to the size of its sums, see `Drawing::most_bytes`.
-    most_bytes.max(sums) + sums + bin::COPIES_BYTES * threads as u64
+    views.iter().map(sums_of_one).max().unwrap_or(0)
 }
 
 /// Whether a target asks for classes.

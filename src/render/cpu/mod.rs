@@ -260,13 +260,15 @@ impl Backend for Cpu {
         self.lane_bytes.store(accepted_bytes, Relaxed);
     }
 
-    fn frame_bytes(&self, views: &[View]) -> u64 {
-        drawing::most_held_bytes(self.lane_bytes.load(Relaxed), views, self.threads())
+    fn frame_bytes(&self, views: &[View], profile: &RenderProfile) -> u64 {
+        let sums_bytes = drawing::sums_bytes(views, profile);
+        drawing::most_held_bytes(self.lane_bytes.load(Relaxed), sums_bytes, self.threads())
     }
 
-    fn bytes_beside(&self, views: &[View]) -> u64 {
+    fn bytes_beside(&self, views: &[View], profile: &RenderProfile) -> u64 {
         let most_bytes = self.lane_bytes.load(Relaxed) / SIDE_LANE_DIVISOR;
-        drawing::most_held_bytes(most_bytes, views, self.threads())
+        let sums_bytes = drawing::sums_bytes(views, profile);
+        drawing::most_held_bytes(most_bytes, sums_bytes, self.threads())
     }
 
     fn as_differentiate(&self) -> Option<&dyn Differentiate> {

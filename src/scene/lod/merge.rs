@@ -10,7 +10,7 @@ const ALPHA_CUT: f64 = 1.0 / 255.0;
 const MOST_SHOWN: f64 = ALPHA_CUT / 2.0;
 
 /// A Gaussian as it is kept between merges: a dense block has millions.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 pub(super) struct StoredNode {
     pub(super) mean_m: DVec3,
     /// Standard deviations along the principal axes, in metres.

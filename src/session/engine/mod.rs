@@ -20,14 +20,14 @@ use std::time::Duration;
 use parking_lot::Mutex;
 use tokio::time::{Instant, sleep};
 
-use wildcity_render::{Backend, RenderError, View};
+use wildcity_render::{Backend, RenderError, View, sample_count};
 use wildcity_repair::Models;
 use wildcity_scene::actor::ActorAsset;
 use wildcity_scene::geometry::Lidar;
 use wildcity_scene::{Rays, RenderProfile};
 use wildcity_sim::traffic::EgoBox;
 use wildcity_twin::residency::{
-    Cache, FrameBytes, Prefetcher, Reservation, ResidencyError, Resident, ResidentActor, RigExtent,
+    Cache, FrameBytes, Prefetcher, ResidencyError, Resident, ResidentActor, RigExtent, SceneBytes,
     Stats, Urgency, Viewpoint,
 };
 use wildcity_twin::store::Catalog;
@@ -398,29 +398,21 @@ impl Engine {
         TwinSolids::new(self.catalog().clone(), index, self.solid_blocks.clone(), ego_box)
     }
 
-    /// Reserves the memory that the worst frame of a rig needs, wherever in the twin the ego is,
-    /// and the buffers and images that the frame needs in addition to the scene.
-    ///
-    /// # Errors
-    /// Too little memory is left.
-    pub(crate) async fn reserve(
-        resident: Arc<Resident>,
-        extent: RigExtent,
-        profile: RenderProfile,
-        frame: FrameBytes,
-    ) -> Result<Reservation, SessionError> {
-        Ok(run_blocking(move || resident.reserve_with(extent, &profile, frame)).await??)
-    }
-
     /// Buffers and images that a frame of some views needs in addition to its scene. The frame
     /// renders `rendered` bytes of images, and its session holds `images` bytes of them.
-    pub(crate) fn frame_bytes(&self, views: &[View], rendered: u64, images: u64) -> FrameBytes {
-        let pixels: u64 = views.iter().map(|view| view.camera.pixels() as u64).sum();
-        let is_large = pixels > limits::LARGE_PIXELS;
+    pub(crate) fn frame_bytes(
+        &self,
+        views: &[View],
+        profile: &RenderProfile,
+        rendered: u64,
+        images: u64,
+    ) -> FrameBytes {
+        let is_large = sample_count(views, profile) > limits::LARGE_SAMPLES;
         let backend = self.queue.backend();
         // Only small frames are rendered beside another one, see `render_queue`.
-        let beside = if is_large { 0 } else { backend.bytes_beside(views) + rendered };
-        FrameBytes { stages: backend.frame_bytes(views) + rendered, beside, is_large, images }
+        let beside = if is_large { 0 } else { backend.bytes_beside(views, profile) + rendered };
+        let stages = backend.frame_bytes(views, profile) + rendered;
+        FrameBytes { stages, beside, is_large, images }
     }
 
     /// Buffers that a sweep of a LiDAR needs in addition to its scene, in bytes.
@@ -428,13 +420,15 @@ impl Engine {
         self.queue.backend().sweep_bytes(lidar)
     }
 
-    /// Memory that the worst frame of a rig needs, in bytes.
-    pub(crate) async fn worst_case_bytes(
+    /// Memory that the scene of a rig's worst frame needs, wherever in the twin the rig is.
+    /// `may_split` tells whether its frames may be drawn view by view.
+    pub(crate) async fn scene_bytes(
         resident: Arc<Resident>,
         extent: RigExtent,
         profile: RenderProfile,
-    ) -> Result<u64, SessionError> {
-        run_blocking(move || resident.worst_case_bytes_with(extent, &profile)).await
+        may_split: bool,
+    ) -> Result<SceneBytes, SessionError> {
+        run_blocking(move || resident.scene_bytes(extent, &profile, may_split)).await
     }
 
     /// Runs `work` on a render thread when its session is next. Returns its result and how long it

@@ -73,17 +73,19 @@ impl Session {
         let deadline = Instant::now() + self.settings.deadline;
         let rendered = self.render(version, simulation, captures, Some(earlier), deadline).await?;
         // Another version needs other memory for its worst frame.
-        let mut bytes = None;
+        let mut memory = None;
         if !version.has_same_version(&self.version) {
             let resident = version.resident.clone();
             let extent = layout_extent(layout);
-            bytes = Some(Engine::worst_case_bytes(resident, extent, version.profile).await?);
+            let may_split = self.settings.may_split();
+            let scenes = Engine::scene_bytes(resident, extent, version.profile, may_split).await?;
+            memory = Some((scenes, frame_bytes(&self.engine, layout, version)));
         }
 
         let record = self.frame_record(FrameRequest::Restore, &episode, &rendered);
         let new = NewEpisode {
             version: version.clone(),
-            bytes,
+            memory,
             origin: origin.clone(),
             first: episode.clone(),
         };
@@ -111,10 +113,12 @@ impl Session {
     ) -> Result<Self, SessionError> {
         let Snapshot { settings, version, state, origin } = from;
         let extent = layout_extent(&settings.layout);
-        let frame = frame_bytes(&engine, &settings.layout, version.coverage.is_some());
+        let frame = frame_bytes(&engine, &settings.layout, version);
         // Memory for its own frames: a branch lives on without the session that it comes from.
         let resident = version.resident.clone();
-        let reservation = Engine::reserve(resident, extent, version.profile, frame).await?;
+        let scenes =
+            Engine::scene_bytes(resident, extent, version.profile, settings.may_split()).await?;
+        let reservation = version.resident.reserve_scenes(scenes, frame)?;
         let (settings, version, state) = (settings.clone(), version.clone(), state.clone());
         let mut session = Self::assembled(engine, name, settings, reservation, version, state);
         session.origin.clone_from(origin);
@@ -223,8 +227,11 @@ impl Session {
             settings.solid_ego,
         )
         .await?;
-        let frame = frame_bytes(&engine, &settings.layout, version.coverage.is_some());
-        let reservation = Engine::reserve(driven.version, extent, driven.profile, frame).await?;
+        let frame = frame_bytes(&engine, &settings.layout, &version);
+        let may_split = settings.may_split();
+        let resident = driven.version.clone();
+        let scenes = Engine::scene_bytes(resident, extent, driven.profile, may_split).await?;
+        let reservation = driven.version.reserve_scenes(scenes, frame)?;
         // A record with a scenario was refused, so that there is no traffic.
         let state = EpisodeState::at_start(driven.episode.clone());
         let mut session =

@@ -152,9 +152,11 @@ impl Session {
         };
         let profile = resolve_profile(&engine, &resident, &settings)?;
         let version = prepare(&engine, resident.clone(), profile, coverage_for, solid_ego).await?;
-        let frame = frame_bytes(&engine, &settings.layout, version.coverage.is_some());
+        let frame = frame_bytes(&engine, &settings.layout, &version);
         // After the profile is known: coarser levels of detail need less memory.
-        let reservation = Engine::reserve(resident.clone(), extent, version.profile, frame).await?;
+        let scenes =
+            Engine::scene_bytes(resident.clone(), extent, version.profile, settings.may_split());
+        let reservation = resident.reserve_scenes(scenes.await?, frame)?;
         let references = load_references(&engine, &resident, &settings).await?;
         let version = version.with_references(references);
 
@@ -246,10 +248,13 @@ impl Session {
         let solid_ego = self.settings.solid_ego;
         let version =
             prepare(&self.engine, resident.clone(), profile, coverage_for, solid_ego).await?;
-        let bytes = Engine::worst_case_bytes(resident.clone(), extent, version.profile).await?;
+        let may_split = self.settings.may_split();
+        let scenes =
+            Engine::scene_bytes(resident.clone(), extent, version.profile, may_split).await?;
+        let frame = frame_bytes(&self.engine, &self.settings.layout, &version);
         let references = load_references(&self.engine, &resident, &self.settings).await?;
         // There is no `await` from here on, so that a dropped future cannot leave half a switch.
-        self.reservation.exchange(resident, bytes)?;
+        self.reservation.exchange(resident, scenes, frame)?;
         self.version = version.with_references(references);
         self.version_switched = true;
         // Where the ego is comes first, because the next frame is there.
@@ -666,12 +671,12 @@ pub(super) fn layout_extent(layout: &ObservationLayout) -> RigExtent {
 pub(super) fn frame_bytes(
     engine: &Engine,
     layout: &ObservationLayout,
-    has_trust: bool,
+    version: &PinnedVersion,
 ) -> FrameBytes {
     // Buffers depend on sizes and not on places.
     let views = View::from_rig(layout.cameras(), Pose::IDENTITY);
-    let frame =
-        engine.frame_bytes(&views, layout.rendered_bytes(has_trust), layout.answers_bytes());
+    let rendered = layout.rendered_bytes(version.coverage.is_some());
+    let frame = engine.frame_bytes(&views, &version.profile, rendered, layout.answers_bytes());
     // Sweeps are rendered one after the other, and not beside the session's own images.
     let lidars = layout.lidars().iter().map(|mounted| engine.sweep_bytes(&mounted.lidar));
     let sweep = lidars.max().unwrap_or(0);

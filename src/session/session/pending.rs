@@ -12,6 +12,7 @@ use crate::error::SessionError;
 use crate::observe::observation::Observation;
 use crate::record::format::{FrameRecord, RecordedOrigin};
 use crate::state::{EpisodeState, PinnedVersion};
+use wildcity_twin::residency::{FrameBytes, SceneBytes};
 
 /// What a request has rendered, and what it changes.
 pub(super) struct Pending {
@@ -34,7 +35,7 @@ pub(super) enum EpisodeFile {
 pub(super) struct NewEpisode {
     pub(super) version: PinnedVersion,
     /// Memory for the worst frame of the version, if it is another one.
-    pub(super) bytes: Option<u64>,
+    pub(super) memory: Option<(SceneBytes, FrameBytes)>,
     /// The recorded episode that it is a branch of.
     pub(super) origin: Option<RecordedOrigin>,
     /// The state with which the file begins.
@@ -53,9 +54,9 @@ impl Pending {
         let created = recorded.instrument(debug_span!("record")).await?;
         if let EpisodeFile::New(new) = file {
             // A file that was just created goes again.
-            if let Some(bytes) = new.bytes
+            if let Some((scenes, frame)) = new.memory
                 && let Err(error) =
-                    session.reservation.exchange(new.version.resident.clone(), bytes)
+                    session.reservation.exchange(new.version.resident.clone(), scenes, frame)
             {
                 if let Some(created) = created {
                     created.recorder.discard();

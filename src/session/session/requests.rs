@@ -357,7 +357,7 @@ impl Session {
 
         let record = self.frame_record(FrameRequest::Reset, &next, &rendered);
         let version = self.version.clone();
-        let new = NewEpisode { version, bytes: None, origin: None, first: next.clone() };
+        let new = NewEpisode { version, memory: None, origin: None, first: next.clone() };
         next.set_repair_state(rendered.repair_state);
         let frame_history = rendered.frame_history;
         let next = EpisodeState { episode: next, frame_history, traffic, events };
@@ -385,7 +385,7 @@ impl Session {
         history: Option<FrameHistory>,
         deadline: Instant,
     ) -> Result<RenderedObservation, SessionError> {
-        let SimulationState { episode, traffic } = simulation;
+        let SimulationState { episode, .. } = simulation;
         let layout = &self.settings.layout;
         // Poses that the ego is not at have no sweeps, and neither have times between decisions.
         let is_shown = history.is_some() && captures.last().is_some_and(|capture| capture.shown);
@@ -412,39 +412,14 @@ impl Session {
             builder.add_queue_time(queued);
         }
         for capture in captures {
-            // Nothing is due, but the observation has a time and a history.
-            if capture.cameras.is_empty() {
-                builder.add_capture(capture);
-                continue;
+            // All cameras, or one after the other if there is only memory for one view's scene.
+            for cameras in capture.cameras.chunks(self.reservation.views_at_once()) {
+                let part = RigCapture { cameras: cameras.to_vec(), ..capture.clone() };
+                builder = self.render_part(version, simulation, part, builder, deadline).await?;
             }
-            let views = layout.views(episode, &capture);
-            let viewpoints = viewpoints(&views);
-            let profile = version.profile;
-            let placed = traffic.map(|traffic| {
-                let exposures_us = &layout.exposures_us(&capture);
-                let detail =
-                    FrameDetail { viewpoints: &viewpoints, exposures_us, profile: &profile };
-                traffic.placed(capture.time_us, detail)
-            });
-            // Load before the job is queued, so that no render thread waits for a disk.
-            let resident = version.resident.clone();
-            let pinned = pin(resident, profile, deadline, viewpoints);
-            let mut pinned = pinned.instrument(debug_span!("load")).await?;
-            pinned.place(placed.unwrap_or_default());
-            builder.add_load(pinned.waited_for, pinned.waited);
-            let pixels = views.iter().map(|view| view.camera.pixels() as u64).sum();
-            let cost = FrameCost { session: self.number, pixels };
-            // The builder goes to the render thread with the work, and comes back with the result.
-            let work = move |scratch: &mut Scratch, backend: &dyn Backend| {
-                let frame = Frame { scene: &pinned, profile: &profile, views: &views };
-                let rendered = builder.render(&capture, &frame, backend, scratch);
-                // In any case, and before the repair, which looks at the last capture.
-                builder.add_capture(capture);
-                rendered.map(|()| builder)
-            };
-            let (rendered, queued) = self.engine.run(cost, deadline, work).await?;
-            builder = rendered?;
-            builder.add_queue_time(queued);
+            // Also if nothing is due: the observation has a time and a history.
+            // Before the repair, which looks at the last capture.
+            builder.add_capture(capture);
             if builder.has_candidates() {
                 if let Some(references) = &version.references {
                     builder = self.find_references(version, references, builder, deadline).await?;
@@ -459,6 +434,43 @@ impl Session {
         }
         let (held_bytes, limit_bytes) = version.resident.memory();
         builder.finish(history, held_bytes, limit_bytes)
+    }
+
+    /// Renders the cameras of a part of a capture, in one frame.
+    async fn render_part(
+        &self,
+        version: &PinnedVersion,
+        simulation: SimulationState<'_>,
+        part: RigCapture,
+        mut builder: ObservationBuilder,
+        deadline: Instant,
+    ) -> Result<ObservationBuilder, SessionError> {
+        let SimulationState { episode, traffic } = simulation;
+        let layout = &self.settings.layout;
+        let views = layout.views(episode, &part);
+        let viewpoints = viewpoints(&views);
+        let profile = version.profile;
+        let placed = traffic.map(|traffic| {
+            let exposures_us = &layout.exposures_us(&part);
+            let detail = FrameDetail { viewpoints: &viewpoints, exposures_us, profile: &profile };
+            traffic.placed(part.time_us, detail)
+        });
+        // Load before the job is queued, so that no render thread waits for a disk.
+        let resident = version.resident.clone();
+        let pinned = pin(resident, profile, deadline, viewpoints);
+        let mut pinned = pinned.instrument(debug_span!("load")).await?;
+        pinned.place(placed.unwrap_or_default());
+        builder.add_load(pinned.waited_for, pinned.waited);
+        let cost = FrameCost::new(self.number, &views, &profile);
+        // The builder goes to the render thread with the work, and comes back with the result.
+        let work = move |scratch: &mut Scratch, backend: &dyn Backend| {
+            let frame = Frame { scene: &pinned, profile: &profile, views: &views };
+            builder.render(&part, &frame, backend, scratch).map(|()| builder)
+        };
+        let (rendered, queued) = self.engine.run(cost, deadline, work).await?;
+        let mut rendered = rendered?;
+        rendered.add_queue_time(queued);
+        Ok(rendered)
     }
 }
 

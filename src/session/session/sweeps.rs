@@ -29,8 +29,8 @@ pub(super) struct Sweeps {
 }
 
 impl Session {
-    /// The sweeps of all LiDARs that end now, each scheduled as a frame of as many pixels as it has
-    /// beams. A rig without LiDARs costs nothing.
+    /// The sweeps of all LiDARs that end now, each scheduled as a frame of as many samples as it
+    /// has beams. A rig without LiDARs costs nothing.
     pub(super) async fn sweeps(
         &self,
         version: &PinnedVersion,
@@ -61,8 +61,8 @@ impl Session {
             let mut scene = pinned.instrument(debug_span!("load")).await?;
             let load = (scene.waited_for, scene.waited);
             scene.place(placed.unwrap_or_default());
-            let pixels = mounted.lidar.beams() as u64;
-            let cost = FrameCost { session: self.number, pixels };
+            let samples = mounted.lidar.beams() as u64;
+            let cost = FrameCost { session: self.number, samples };
             let seed = EffectSeed::from_episode(episode);
             let has_classes = layout.maps().semantics;
             let sensor = layout.lidar_sensor(index).copied();

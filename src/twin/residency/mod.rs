@@ -92,7 +92,7 @@ pub use error::ResidencyError;
 pub use index::BlockIndex;
 pub use pager::{PinnedScene, SceneCallback};
 pub use requests::Urgency;
-pub use reservation::{Prefetcher, Reservation};
+pub use reservation::{Prefetcher, Reservation, SceneBytes};
 pub use resident::{Resident, SceneRequest};
 pub use source::SectionSource;
 pub use stats::Stats;

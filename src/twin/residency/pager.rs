@@ -53,6 +53,16 @@ struct Shared {
     state: Mutex<State>,
     /// Notified when there may be a section to load, or memory for one.
     work: Condvar,
+    /// Bytes, as stored, of the sections that are being read. They are not part of the budget.
+    reading_bytes: Mutex<u64>,
+    /// Notified when a section was read.
+    was_read: Condvar,
+}
+
+/// A section that is being read. Dropped when it was.
+struct Reading<'a> {
+    shared: &'a Shared,
+    bytes: u64,
 }
 
 struct State {
@@ -65,7 +75,13 @@ impl Pager {
     pub(super) fn new(source: Arc<dyn SectionSource>, limit_bytes: u64) -> Self {
         let requests = Requests::new(SectionTable::new(limit_bytes));
         let state = State { requests, started: false, closed: false };
-        Self(Arc::new(Shared { source, state: Mutex::new(state), work: Condvar::new() }))
+        Self(Arc::new(Shared {
+            source,
+            state: Mutex::new(state),
+            work: Condvar::new(),
+            reading_bytes: Mutex::default(),
+            was_read: Condvar::new(),
+        }))
     }
 
     /// Starts the loader threads, unless they run.
@@ -268,15 +284,31 @@ impl Shared {
         }
     }
 
+    /// Waits until the sections that are being read leave room for one of so many bytes, or there
+    /// are none; a read that hangs does not keep others waiting for ever.
+    fn begin_reading(&self, bytes: u64) -> Reading<'_> {
+        let mut reading_bytes = self.reading_bytes.lock();
+        let until = Instant::now() + limits::READING_WAIT;
+        while *reading_bytes > 0 && *reading_bytes + bytes > limits::READING_BYTES {
+            if self.was_read.wait_until(&mut reading_bytes, until).timed_out() {
+                break;
+            }
+        }
+        *reading_bytes += bytes;
+        Reading { shared: self, bytes }
+    }
+
     fn load(&self, id: SlotId, section: SectionRef, version: &Version) -> Notifications {
         let chunk = &version.manifest.chunks[section.chunk];
         let section = &chunk.sections[section.section];
         let began = Instant::now();
+        let reading = self.begin_reading(section.bytes.into());
         // A defect in loading one section must not end the thread that loads all of them.
         let read = || self.source.section(version, chunk, section);
         // A panic cannot leave broken state behind: the source gets only shared references, and the
         // lock is not held.
         let loaded = catch_unwind(AssertUnwindSafe(read));
+        drop(reading);
         let took = began.elapsed();
         let requests = &mut self.state.lock().requests;
         match loaded {
@@ -296,6 +328,13 @@ impl Shared {
                 waited,
             }));
         }
+    }
+}
+
+impl Drop for Reading<'_> {
+    fn drop(&mut self) {
+        *self.shared.reading_bytes.lock() -= self.bytes;
+        self.shared.was_read.notify_all();
     }
 }
 

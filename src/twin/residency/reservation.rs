@@ -16,7 +16,18 @@ use super::{ResidencyError, Resident, RigExtent};
 #[derive(Debug)]
 pub struct Reservation {
     claim: Claim,
+    /// Whether the memory is only enough for one view of a frame at a time.
+    is_by_view: bool,
     prefetcher: Arc<Prefetcher>,
+}
+
+/// The most memory that the scenes of frames of a rig anywhere in the twin need, in bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SceneBytes {
+    /// Of all views of a frame at once.
+    pub together: u64,
+    /// Of one view at a time, if frames may be drawn so.
+    pub by_view: Option<u64>,
 }
 
 /// Loads sections of a version before the frames that will need them. It is shared with the
@@ -56,30 +67,96 @@ impl Resident {
         profile: &RenderProfile,
         frame: FrameBytes,
     ) -> Result<Reservation, ResidencyError> {
-        Reservation::new(self.clone(), self.worst_case_bytes_with(extent, profile), frame)
+        let together = self.worst_case_bytes_with(extent, profile);
+        self.reserve_scenes(SceneBytes { together, by_view: None }, frame)
+    }
+
+    /// The memory for the scenes of a rig's frames. `may_split` tells whether they may be drawn
+    /// view by view.
+    pub fn scene_bytes(
+        &self,
+        extent: RigExtent,
+        profile: &RenderProfile,
+        may_split: bool,
+    ) -> SceneBytes {
+        let together = self.worst_case_bytes_with(extent, profile);
+        let by_view = || self.worst_case_bytes_with(extent.one_view(), profile);
+        SceneBytes { together, by_view: may_split.then(by_view) }
+    }
+
+    /// Reserves memory for frames: for all of their views at once if there is room, or else view by
+    /// view.
+    ///
+    /// # Errors
+    /// [`ResidencyError::NoRoom`] with the numbers.
+    pub fn reserve_scenes(
+        self: &Arc<Self>,
+        scenes: SceneBytes,
+        frame: FrameBytes,
+    ) -> Result<Reservation, ResidencyError> {
+        let (claim, is_by_view) =
+            scenes.admit(self, frame, |budget, claim| budget.reserve(claim))?;
+        Ok(Reservation { claim, is_by_view, prefetcher: Arc::new(Prefetcher::new(self.clone())) })
+    }
+}
+
+impl SceneBytes {
+    /// Changes the budget by the first claim that it accepts: for all views at once, or else view
+    /// by view.
+    fn admit(
+        self,
+        resident: &Resident,
+        frame: FrameBytes,
+        mut change: impl FnMut(&mut Budget, &Claim) -> Result<(), ResidencyError>,
+    ) -> Result<(Claim, bool), ResidencyError> {
+        let together = claim(resident, self.together, frame);
+        let refused = change_budget(resident, |budget| change(budget, &together));
+        let (Err(ResidencyError::NoRoom { .. }), Some(bytes)) = (&refused, self.by_view) else {
+            return refused.map(|()| (together, false));
+        };
+        let by_view = claim(resident, bytes, frame);
+        change_budget(resident, |budget| change(budget, &by_view))?;
+        Ok((by_view, true))
     }
 }
 
 impl Reservation {
-    fn new(resident: Arc<Resident>, bytes: u64, frame: FrameBytes) -> Result<Self, ResidencyError> {
-        let claim = claim(&resident, bytes, frame);
-        change_budget(&resident, |budget| budget.reserve(&claim))?;
-        Ok(Self { claim, prefetcher: Arc::new(Prefetcher::new(resident)) })
-    }
-
-    /// Reserves `bytes` for scenes of another version in place of this one, in one step: both need
-    /// not fit at the same time. Prefetching of the old version ends. The memory that frames take
-    /// in addition to their scenes stays reserved.
+    /// Reserves memory for frames of another version in place of this one, in one step: both need
+    /// not fit at the same time. Prefetching of the old version ends.
     ///
     /// # Errors
     /// [`ResidencyError::NoRoom`] with the numbers; nothing has changed then.
-    pub fn exchange(&mut self, resident: Arc<Resident>, bytes: u64) -> Result<(), ResidencyError> {
-        let claim = claim(&resident, bytes, self.claim.frame);
-        change_budget(&resident, |budget| budget.exchange(&self.claim, &claim))?;
+    pub fn exchange(
+        &mut self,
+        resident: Arc<Resident>,
+        scenes: SceneBytes,
+        frame: FrameBytes,
+    ) -> Result<(), ResidencyError> {
+        let old = &self.claim;
+        let exchange = |budget: &mut Budget, new: &Claim| budget.exchange(old, new);
+        let (claim, is_by_view) = scenes.admit(&resident, frame, exchange)?;
         self.prefetcher.end();
         self.claim = claim;
+        self.is_by_view = is_by_view;
         self.prefetcher = Arc::new(Prefetcher::new(resident));
         Ok(())
+    }
+
+    /// Most views that a frame may draw at a time: all, unless there was only room for one.
+    pub fn views_at_once(&self) -> usize {
+        if self.is_by_view { 1 } else { Viewpoint::MAX }
+    }
+
+    /// Whether the reserved memory is enough for frames with these needs.
+    pub fn covers(&self, scenes: SceneBytes, frame: FrameBytes) -> bool {
+        let FrameBytes { stages, beside, is_large, images } = self.claim.frame;
+        // Each purpose by itself: memory of one is not lent to another.
+        let frame_fits = frame.stages <= stages
+            && frame.beside <= beside
+            && (is_large || !frame.is_large)
+            && frame.images <= images;
+        let needed = if self.is_by_view { scenes.by_view } else { Some(scenes.together) };
+        frame_fits && needed.is_some_and(|needed| needed <= self.claim.bytes)
     }
 
     /// The version.

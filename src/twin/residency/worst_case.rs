@@ -40,6 +40,12 @@ impl RigExtent {
         }
     }
 
+    /// That of any one of the cameras: of the most demanding one, around itself.
+    pub(super) fn one_view(&self) -> Self {
+        // A longer focal length needs no less detail anywhere.
+        Self { views: 1, least_focal_px: self.focal_px, radius_m: 0.0, ..*self }
+    }
+
     /// An upper bound of the bytes of a block's levels that cameras need at once if the nearest is
     /// at least `nearest_m` away. `bytes` are those of each level.
     ///
@@ -70,11 +76,11 @@ impl RigExtent {
 
 /// An upper bound, in bytes, of the sections that a frame of a rig anywhere needs at once.
 ///
-/// No point in a square is nearer to a block than the square itself is. So the levels that cameras
-/// at the distance of the square or farther need add up to bytes that no frame in it exceeds. The
-/// square with the highest bound is halved repeatedly until it is as small as a cell; then no point
-/// anywhere needs more than its bound. A point outside of the bounding box needs no more than the
-/// nearest point in the box, which is nearer to everything.
+/// No point in an area is nearer to a block than the area itself is. So the levels that cameras at
+/// the distance of the area or farther need add up to bytes that no frame in it exceeds. The area
+/// with the highest bound is halved repeatedly until a rig in its middle needs nearly as much; then
+/// no point anywhere needs more than its bound. A point outside of the bounding box needs no more
+/// than the nearest point in the box, which is nearer to everything.
 pub(super) fn worst_case_bytes(
     index: &BlockIndex,
     manifest: &Manifest,
@@ -95,42 +101,43 @@ pub(super) fn worst_case_bytes(
             let levels = block.levels(manifest);
             bytes += extent.most_bytes(levels, distance_m, profile.tau_px, of_level);
         });
-        Square { bytes, area }
+        BoundedArea { bytes, area }
     };
-    // Invariant: the squares in the heap cover the whole map, so that the highest bound is one for
+    // Invariant: the areas in the heap cover the whole map, so that the highest bound is one for
     // every point.
-    let mut squares = BinaryHeap::from([bound(whole)]);
-    for _ in 0..limits::WORST_CASE_SQUARES {
-        let Some(worst) = squares.pop() else { break };
-        // The largest bound is at its finest: halving further would gain little. Height does not
-        // count, because only x and y are halved.
-        if worst.area.size_m().truncate().max_element() <= wildcity_scene::chunk::CELL_M {
-            squares.push(worst);
+    let mut areas = BinaryHeap::from([bound(whole)]);
+    for _ in 0..limits::WORST_CASE_AREAS {
+        let Some(worst) = areas.pop() else { break };
+        let middle_m = worst.area.center_m();
+        let in_middle = bound(Bounds { min_m: middle_m, max_m: middle_m });
+        // Halving further would gain a twentieth at most.
+        if in_middle.bytes >= worst.bytes - worst.bytes / 20 {
+            areas.push(worst);
             break;
         }
         let [low, high] = halves(&worst.area);
-        squares.extend([bound(low), bound(high)]);
+        areas.extend([bound(low), bound(high)]);
     }
     // A search that ends early leaves a bound that is valid but less tight.
-    squares.peek().map_or(0, |worst| worst.bytes)
+    areas.peek().map_or(0, |worst| worst.bytes)
 }
 
 /// An area and the most bytes that a frame in it can need, ordered by bytes.
 #[derive(Debug, PartialEq)]
-struct Square {
+struct BoundedArea {
     bytes: u64,
     area: Bounds,
 }
 
-impl Eq for Square {}
+impl Eq for BoundedArea {}
 
-impl PartialOrd for Square {
+impl PartialOrd for BoundedArea {
     fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
         Some(self.cmp(other))
     }
 }
 
-impl Ord for Square {
+impl Ord for BoundedArea {
     fn cmp(&self, other: &Self) -> Ordering {
         self.bytes.cmp(&other.bytes)
     }
@@ -142,11 +149,11 @@ fn gap_m(a: &Bounds, b: &Bounds) -> f64 {
     (a.min_m - b.max_m).max(b.min_m - a.max_m).max(DVec3::ZERO).length()
 }
 
-/// The two halves of a box, cut across the longer of its sides along x and y.
+/// The two halves of a box, cut across the longest of its sides.
 fn halves(area: &Bounds) -> [Bounds; 2] {
     let size_m = area.size_m();
     let middle_m = area.center_m();
-    let axis = usize::from(size_m.y > size_m.x);
+    let axis = size_m.max_position();
     let mut low = *area;
     let mut high = *area;
     low.max_m[axis] = middle_m[axis];

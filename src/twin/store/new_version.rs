@@ -1,5 +1,7 @@
 //! Commits a whole version in one call, for scenes that are in memory.
 
+use std::borrow::Cow;
+
 use crate::ingest::IngestError;
 use wildcity_scene::geo::GeoAnchor;
 use wildcity_scene::manifest::Provenance;
@@ -16,7 +18,9 @@ pub struct NewVersion<'a> {
     /// The twin's name, `[a-z0-9._-]+`; a new name makes a new twin.
     pub name: &'a str,
     /// The Gaussians, in metres along the twin's axes.
-    pub gaussians: &'a Gaussians,
+    ///
+    /// Owned, their memory is freed as they are written.
+    pub gaussians: Cow<'a, Gaussians>,
     /// How they must be rendered.
     pub profile: RenderProfile,
     /// The rig of the vehicle that recorded them.
@@ -37,7 +41,7 @@ impl<'a> NewVersion<'a> {
     pub fn from_gaussians(name: &'a str, gaussians: &'a Gaussians, provenance: Provenance) -> Self {
         Self {
             name,
-            gaussians,
+            gaussians: Cow::Borrowed(gaussians),
             profile: RenderProfile::DEFAULT,
             rig: None,
             trajectories: Vec::new(),
@@ -74,7 +78,7 @@ impl Catalog {
         } = new;
         check_name(name)?;
         // Before anything is written. `put` checks again, which costs little compared with packing.
-        validate::check(gaussians, &Field::twin_name).map_err(IngestError::from)?;
+        validate::check(&gaussians, &Field::twin_name).map_err(IngestError::from)?;
         let settings = VersionSettings {
             profile,
             rig,
@@ -87,7 +91,7 @@ impl Catalog {
         };
         settings.check()?;
         let mut commit = self.begin(name, CommitKind::Import, storage)?;
-        commit.put(gaussians, None, progress)?;
+        commit.put_all(gaussians, None, progress)?;
         commit.replace(None, settings)
     }
 }

@@ -1,7 +1,8 @@
 //! Packs the Gaussians of whole cells into chunk objects: the blocks of many cells in parallel,
 //! level by level.
 
-use std::collections::BTreeSet;
+use std::borrow::Cow;
+use std::collections::{BTreeSet, VecDeque};
 use std::io;
 use std::ops::Range;
 
@@ -10,8 +11,8 @@ use rayon::prelude::*;
 use wildcity_scene::chunk::{CellRun, Partition};
 use wildcity_scene::geometry::Bounds;
 use wildcity_scene::manifest::ChunkEntry;
-use wildcity_scene::record::Clamped;
-use wildcity_scene::{Chunk, Gaussians, RecordFormat, lod};
+use wildcity_scene::record::{Clamped, PART_GAUSSIANS};
+use wildcity_scene::{Chunk, Gaussians, RecordFormat, lod, sh};
 
 use super::StoreError;
 use super::backend::Staging;
@@ -21,7 +22,7 @@ use super::chunk_file::{self, ChunkHeader, LevelOfBlock, PackedSection};
 /// compared with a scene.
 const BATCH_GAUSSIANS: usize = 1 << 16;
 
-/// From this number of Gaussians on, a block is packed while no other is: its levels take about 200
+/// From this number of Gaussians on, a block is packed while no other is: its levels take about 100
 /// bytes for each, and dense captures have millions in a block.
 const LARGE_BLOCK: usize = 1 << 18;
 
@@ -46,22 +47,53 @@ impl Default for StorageOptions {
 /// Gaussians by cell, and how those cells are stored.
 #[derive(Debug)]
 pub(super) struct CellPacker<'a> {
-    gaussians: &'a Gaussians,
+    sh_degree: u8,
+    has_classes: bool,
     storage: StorageOptions,
     cells: Vec<CellRun>,
-    order: Vec<u32>,
+    gaussians: Source<'a>,
+}
+
+/// Where the Gaussians of blocks come from.
+#[derive(Debug)]
+enum Source<'a> {
+    /// The caller's, and their indices, cell after cell.
+    Kept(&'a Gaussians, Vec<u32>),
+    /// Those of each block that is still to be packed, in order.
+    Consumed(VecDeque<Vec<Gaussians>>),
+}
+
+/// The Gaussians of a block, part by part.
+enum BlockParts<'a> {
+    Kept(&'a Gaussians, &'a [u32]),
+    Consumed(Vec<Gaussians>),
+}
+
+/// A block that is to be packed.
+struct BlockToPack<'a> {
+    cell: &'a CellRun,
+    block: u8,
+    count: usize,
+    parts: BlockParts<'a>,
 }
 
 impl<'a> CellPacker<'a> {
-    /// Sorts Gaussians into cells, and keeps only the cells of `only`, if given.
+    /// Sorts Gaussians into cells, and keeps only the cells of `only`, if given. Memory of
+    /// Gaussians that are not the caller's is freed as they are packed.
     pub(super) fn new(
-        gaussians: &'a Gaussians,
+        gaussians: Cow<'a, Gaussians>,
         storage: StorageOptions,
         only: Option<&BTreeSet<[i32; 2]>>,
     ) -> Self {
         let Partition { mut cells, order } = Partition::new(&gaussians.means_m);
         cells.retain(|run| only.is_none_or(|only| only.contains(&run.cell)));
-        Self { gaussians, storage, cells, order }
+        let sh_degree = gaussians.sh_degree;
+        let has_classes = gaussians.classes.is_some();
+        let gaussians = match gaussians {
+            Cow::Borrowed(gaussians) => Source::Kept(gaussians, order),
+            Cow::Owned(gaussians) => Source::Consumed(by_block(gaussians, &cells, &order)),
+        };
+        Self { sh_degree, has_classes, storage, cells, gaussians }
     }
 
     /// The cells in order.
@@ -78,7 +110,7 @@ impl<'a> CellPacker<'a> {
     /// the record could not hold. `progress` gets the number of Gaussians written, from 0, and in
     /// all.
     pub(super) fn put(
-        &self,
+        mut self,
         staging: &mut dyn Staging,
         progress: &mut dyn FnMut(u64, u64),
     ) -> Result<(Vec<ChunkEntry>, Clamped), StoreError> {
@@ -87,7 +119,8 @@ impl<'a> CellPacker<'a> {
         let mut clamped = Clamped::default();
         let mut done = 0;
         let mut chunks = Vec::with_capacity(self.cells.len());
-        let mut rest = &self.cells[..];
+        let cells = std::mem::take(&mut self.cells);
+        let mut rest = &cells[..];
         // A batch bounds the memory: its packed sections are held, and not those of the whole
         // scene.
         while !rest.is_empty() {
@@ -95,11 +128,7 @@ impl<'a> CellPacker<'a> {
             rest = after;
 
             // The blocks of all cells of the batch, in parallel.
-            let blocks: Vec<(&CellRun, &(u8, Range<usize>))> = batch
-                .iter()
-                .flat_map(|cell| cell.blocks.iter().map(move |block| (cell, block)))
-                .collect();
-            let packed = self.pack_blocks(&blocks);
+            let packed = self.pack_blocks(batch);
             let packed = packed.map_err(StoreError::io("compress for", staging.dir()))?;
 
             // Their objects, one after the other.
@@ -119,48 +148,46 @@ impl<'a> CellPacker<'a> {
         Ok((chunks, clamped))
     }
 
-    /// All levels of some blocks, in order. Small ones are packed in parallel. Of large ones, there
-    /// is one in memory at a time; its Gaussians are merged in parallel.
-    fn pack_blocks(&self, blocks: &[(&CellRun, &(u8, Range<usize>))]) -> io::Result<Vec<Packed>> {
-        let is_small = |block: &(&CellRun, &(u8, Range<usize>))| block.1.1.len() < LARGE_BLOCK;
-        let mut packed = Vec::with_capacity(blocks.len());
-        for some in blocks.chunk_by(|a, b| is_small(a) && is_small(b)) {
-            let some = some.par_iter().map(|(cell, (block, run))| {
-                self.pack_block(cell, *block, &self.order[run.clone()])
-            });
-            packed.extend(some.collect::<io::Result<Vec<_>>>()?);
-        }
-        Ok(packed)
-    }
-
-    /// All levels of one block, and counts of the values that the record could not hold of level 0.
-    fn pack_block(&self, cell: &CellRun, block: u8, order: &[u32]) -> io::Result<Packed> {
-        let StorageOptions { record, levels } = self.storage;
-        let sh_degree = self.gaussians.sh_degree;
-        let mut full = Chunk::new(cell.cell, cell.origin_m, sh_degree, order.len());
-        for &index in order {
-            full.push(&cell.record(self.gaussians, index as usize));
-        }
-        let indices = order.iter().map(|&index| index as usize);
-        let full = full.with_classes(self.gaussians.select_classes(indices));
-        let mut clamped = Clamped::default();
-        let mut packed = vec![chunk_file::pack(
-            &full,
-            LevelOfBlock { block, level: 0, error_m: 0.0 },
-            record,
-            &mut clamped,
-        )?];
-        if levels {
-            let coarser = lod::levels(&full);
-            drop(full);
-            for (level, lod::Level { error_m, chunk }) in (1..).zip(coarser) {
-                // Not counted: merged Gaussians are approximations anyway.
-                let lost = &mut Clamped::default();
-                let level = LevelOfBlock { block, level, error_m };
-                packed.push(chunk_file::pack(&chunk, level, record, lost)?);
+    /// All levels of the blocks of some cells, in order. Small blocks are packed in parallel. Of
+    /// large ones, there is one in memory at a time; its Gaussians are merged in parallel.
+    fn pack_blocks(&mut self, cells: &[CellRun]) -> io::Result<Vec<Packed>> {
+        let Self { sh_degree, storage, .. } = *self;
+        let runs = cells.iter().flat_map(|cell| cell.blocks.iter().map(move |it| (cell, it)));
+        let parts: Vec<BlockParts<'_>> = match &mut self.gaussians {
+            Source::Kept(gaussians, order) => {
+                let kept = |(_, (_, run)): (_, &(u8, Range<usize>))| {
+                    BlockParts::Kept(gaussians, &order[run.clone()])
+                };
+                runs.clone().map(kept).collect()
             }
+            Source::Consumed(blocks) => {
+                blocks.drain(..runs.clone().count()).map(BlockParts::Consumed).collect()
+            }
+        };
+        let blocks = runs.zip(parts).map(|((cell, (block, run)), parts)| BlockToPack {
+            cell,
+            block: *block,
+            count: run.len(),
+            parts,
+        });
+        let mut packed = Vec::new();
+        let mut small = Vec::new();
+        let pack_small = |small: &mut Vec<BlockToPack<'_>>, packed: &mut Vec<Packed>| {
+            let blocks = std::mem::take(small).into_par_iter();
+            let all = blocks.map(|block| block.pack(sh_degree, storage));
+            packed.extend(all.collect::<io::Result<Vec<_>>>()?);
+            Ok::<_, io::Error>(())
+        };
+        for block in blocks {
+            if block.count < LARGE_BLOCK {
+                small.push(block);
+                continue;
+            }
+            pack_small(&mut small, &mut packed)?;
+            packed.push(block.pack(sh_degree, storage)?);
         }
-        Ok((packed, clamped))
+        pack_small(&mut small, &mut packed)?;
+        Ok(packed)
     }
 
     fn put_chunk(
@@ -176,9 +203,9 @@ impl<'a> CellPacker<'a> {
         let header = ChunkHeader {
             cell,
             origin_m,
-            sh_degree: self.gaussians.sh_degree,
+            sh_degree: self.sh_degree,
             record: self.storage.record,
-            classes: self.gaussians.classes.is_some(),
+            classes: self.has_classes,
         };
         let stored = staging.put(Box::new(|out| {
             (sections, bounds) = chunk_file::write(out, &header, packed)?;
@@ -194,6 +221,101 @@ impl<'a> CellPacker<'a> {
             classes: header.classes,
             sections,
         })
+    }
+}
+
+impl BlockToPack<'_> {
+    /// All levels of the block, and counts of the values that the record could not hold of level 0.
+    fn pack(self, sh_degree: u8, storage: StorageOptions) -> io::Result<Packed> {
+        let StorageOptions { record, levels } = storage;
+        let block = self.block;
+        let full = self.chunk(sh_degree);
+        let mut clamped = Clamped::default();
+        let mut packed = vec![chunk_file::pack(
+            &full,
+            LevelOfBlock { block, level: 0, error_m: 0.0 },
+            record,
+            &mut clamped,
+        )?];
+        if levels {
+            for (level, lod::Level { error_m, chunk }) in (1..).zip(lod::levels(&full)) {
+                // Not counted: merged Gaussians are approximations anyway.
+                let lost = &mut Clamped::default();
+                let level = LevelOfBlock { block, level, error_m };
+                packed.push(chunk_file::pack(&chunk, level, record, lost)?);
+            }
+        }
+        Ok((packed, clamped))
+    }
+
+    /// Its Gaussians at full detail. Each part is dropped as it is added.
+    fn chunk(self, sh_degree: u8) -> Chunk {
+        let Self { cell, count, parts, .. } = self;
+        let mut full = Chunk::new(cell.cell, cell.origin_m, sh_degree, count);
+        match parts {
+            BlockParts::Kept(gaussians, order) => {
+                for &index in order {
+                    full.push(&cell.record(gaussians, index as usize));
+                }
+                let indices = order.iter().map(|&index| index as usize);
+                full.with_classes(gaussians.select_classes(indices))
+            }
+            BlockParts::Consumed(parts) => {
+                let mut classes = Vec::new();
+                for part in parts {
+                    for index in 0..part.len() {
+                        full.push(&cell.record(&part, index));
+                    }
+                    classes.extend(part.classes.unwrap_or_default());
+                }
+                let has_classes = !classes.is_empty();
+                full.with_classes(has_classes.then_some(classes))
+            }
+        }
+    }
+}
+
+/// The Gaussians of each block of some cells, in parts of at most [`PART_GAUSSIANS`]. One column is
+/// sorted at a time, so that no more than one is in memory twice.
+fn by_block(gaussians: Gaussians, cells: &[CellRun], order: &[u32]) -> VecDeque<Vec<Gaussians>> {
+    let Gaussians { sh_degree, means_m, quats_wxyz, ln_scales, logit_opacities, sh, classes } =
+        gaussians;
+    let runs: Vec<&Range<usize>> =
+        cells.iter().flat_map(|cell| cell.blocks.iter().map(|(_, run)| run)).collect();
+    let indices: Vec<&[u32]> =
+        runs.iter().flat_map(|run| order[(*run).clone()].chunks(PART_GAUSSIANS)).collect();
+    let empty = || Gaussians { sh_degree, ..Gaussians::default() };
+    let mut parts: Vec<Gaussians> = indices.iter().map(|_| empty()).collect();
+    sort_column(&mut parts, &indices, means_m, |part| &mut part.means_m);
+    sort_column(&mut parts, &indices, quats_wxyz, |part| &mut part.quats_wxyz);
+    sort_column(&mut parts, &indices, ln_scales, |part| &mut part.ln_scales);
+    sort_column(&mut parts, &indices, logit_opacities, |part| &mut part.logit_opacities);
+    if let Some(classes) = classes {
+        sort_column(&mut parts, &indices, classes, |part| part.classes.insert(Vec::new()));
+    }
+    let stride = 3 * sh::coefficients(sh_degree);
+    for (part, indices) in parts.iter_mut().zip(&indices) {
+        part.sh.reserve_exact(stride * indices.len());
+        for &index in *indices {
+            part.sh.extend_from_slice(&sh[stride * index as usize..][..stride]);
+        }
+    }
+    let mut parts = parts.into_iter();
+    let of_run =
+        |run: &&Range<usize>| parts.by_ref().take(run.len().div_ceil(PART_GAUSSIANS)).collect();
+    runs.iter().map(of_run).collect()
+}
+
+/// Sorts a column into parts, by the indices of each. On one thread, which also packs large blocks:
+/// what another one allocates is not used again by this one after it was freed.
+fn sort_column<T: Copy>(
+    parts: &mut [Gaussians],
+    indices: &[&[u32]],
+    column: Vec<T>,
+    of_part: impl Fn(&mut Gaussians) -> &mut Vec<T>,
+) {
+    for (part, indices) in parts.iter_mut().zip(indices) {
+        *of_part(part) = indices.iter().map(|&index| column[index as usize]).collect();
     }
 }
 

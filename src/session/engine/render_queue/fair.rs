@@ -3,19 +3,29 @@
 //! Source: Goyal, Vin and Cheng, *Start-time fair queueing*, SIGCOMM 1996. Each frame has a start
 //! tag: the later of the queue's virtual time and the finish tag of its session's previous frame.
 //! Its finish tag is the start tag plus its cost. The frame with the smallest finish tag is next,
-//! and the virtual time becomes its start tag. So each session gets the same number of pixels, a
+//! and the virtual time becomes its start tag. So each session gets the same number of samples, a
 //! small frame passes the large ones that wait, and no frame is passed for ever: the tags of later
 //! frames grow with the virtual time.
 
 use std::collections::BTreeMap;
+
+use wildcity_render::{View, sample_count};
+use wildcity_scene::RenderProfile;
 
 /// Cost of a frame for the renderer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FrameCost {
     /// Number of the frame's session.
     pub session: u64,
-    /// Pixels of all its images.
-    pub pixels: u64,
+    /// Samples of all its images: of most images the pixels; of a sweep the beams.
+    pub samples: u64,
+}
+
+impl FrameCost {
+    /// That of images of some views.
+    pub fn new(session: u64, views: &[View], profile: &RenderProfile) -> Self {
+        Self { session, samples: sample_count(views, profile) }
+    }
 }
 
 /// Frames that wait.
@@ -53,17 +63,17 @@ impl<T> FairQueue<T> {
         // well.
         let before = self.finished.get(&cost.session).copied().unwrap_or_default();
         let start = before.max(self.virtual_time);
-        // A frame without pixels costs 1, so that its tag rises too. At 2²⁷ pixels a frame, tags
+        // A frame without samples costs 1, so that its tag rises too. At 2²⁷ samples a frame, tags
         // saturate after 2³⁷ frames.
-        let finish = start.saturating_add(cost.pixels.max(1));
+        let finish = start.saturating_add(cost.samples.max(1));
         self.finished.insert(cost.session, finish);
         self.arrivals += 1;
         self.waiting.insert((finish, self.arrivals), Waiting { cost, start, item });
     }
 
-    /// Takes the next frame that has at most `most_pixels` pixels.
-    pub(super) fn pop(&mut self, most_pixels: u64) -> Option<(FrameCost, T)> {
-        let fits = |waiting: &Waiting<T>| waiting.cost.pixels <= most_pixels;
+    /// Takes the next frame that has at most `most_samples` samples.
+    pub(super) fn pop(&mut self, most_samples: u64) -> Option<(FrameCost, T)> {
+        let fits = |waiting: &Waiting<T>| waiting.cost.samples <= most_samples;
         // The first one in nearly all cases. Only the side lane passes large frames, of which at
         // most `QUEUED_FRAMES` wait.
         let (&tag, _) = self.waiting.iter().find(|(_, waiting)| fits(waiting))?;
@@ -76,10 +86,10 @@ impl<T> FairQueue<T> {
         Some((cost, item))
     }
 
-    /// Pixels of all waiting frames that have more than `pixels` pixels.
-    pub(super) fn pixels_above(&self, pixels: u64) -> u64 {
-        let costs = self.waiting.values().map(|waiting| waiting.cost.pixels);
-        costs.filter(|&own| own > pixels).sum()
+    /// Samples of all waiting frames that have more than `samples` samples.
+    pub(super) fn samples_above(&self, samples: u64) -> u64 {
+        let costs = self.waiting.values().map(|waiting| waiting.cost.samples);
+        costs.filter(|&own| own > samples).sum()
     }
 }
 
@@ -94,8 +104,8 @@ mod tests {
     fn served(costs: &[u64], frames: usize) -> Vec<usize> {
         let mut queue = FairQueue::default();
         let mut counts = vec![0; costs.len()];
-        for (session, &pixels) in (0..).zip(costs) {
-            queue.push(FrameCost { session, pixels }, ());
+        for (session, &samples) in (0..).zip(costs) {
+            queue.push(FrameCost { session, samples }, ());
         }
         for _ in 0..frames {
             let (cost, ()) = queue.pop(ANY).unwrap();
@@ -106,8 +116,8 @@ mod tests {
     }
 
     #[test]
-    fn each_session_gets_the_same_number_of_pixels() {
-        // 10,000 pixels for each session are 100 + 1,000 + 1,000 + 200 = 2,300 frames.
+    fn each_session_gets_the_same_number_of_samples() {
+        // 10,000 samples for each session are 100 + 1,000 + 1,000 + 200 = 2,300 frames.
         let counts = served(&[100, 10, 10, 50], 2_300);
         for (count, wanted) in counts.iter().zip([100, 1_000, 1_000, 200]) {
             assert!(count.abs_diff(wanted) < 40, "{counts:?}");
@@ -118,12 +128,12 @@ mod tests {
     fn a_small_frame_passes_large_ones_that_came_before() {
         let mut queue = FairQueue::default();
         for session in 0..12 {
-            queue.push(FrameCost { session, pixels: 1 << 27 }, session);
+            queue.push(FrameCost { session, samples: 1 << 27 }, session);
         }
-        queue.push(FrameCost { session: 99, pixels: 768 }, 99);
+        queue.push(FrameCost { session: 99, samples: 768 }, 99);
         assert_eq!(queue.pop(ANY).unwrap().1, 99);
-        // Frames of exactly 768 pixels do not count.
-        assert_eq!(queue.pixels_above(768), 12 << 27);
+        // Frames of exactly 768 samples do not count.
+        assert_eq!(queue.samples_above(768), 12 << 27);
         // Frames of equal cost are served in order of arrival.
         let order: Vec<u64> = std::iter::from_fn(|| queue.pop(ANY)).map(|(_, item)| item).collect();
         assert_eq!(order, (0..12).collect::<Vec<_>>());
@@ -133,12 +143,12 @@ mod tests {
     #[test]
     fn a_large_frame_is_not_passed_for_ever() {
         let mut queue = FairQueue::default();
-        queue.push(FrameCost { session: 0, pixels: 1_000 }, 0);
+        queue.push(FrameCost { session: 0, samples: 1_000 }, 0);
         let mut passed = 0;
         loop {
             // The tag of the large frame is 1,000, and those of the small ones are 10, 20, 30 ..:
             // about a hundred come first.
-            queue.push(FrameCost { session: 1, pixels: 10 }, 1);
+            queue.push(FrameCost { session: 1, samples: 10 }, 1);
             match queue.pop(ANY).unwrap().1 {
                 0 => break,
                 _ => passed += 1,

@@ -10,7 +10,7 @@
 //! shares the cores among them.
 //!
 //! **A frame that cannot be ready in time is not started.** The time that large frames take per
-//! pixel is measured. A frame that cannot be done before its deadline is refused when it arrives,
+//! sample is measured. A frame that cannot be done before its deadline is refused when it arrives,
 //! or when it is next: otherwise a server with too many large frames would discard most of its
 //! frames.
 
@@ -61,11 +61,11 @@ struct Shared {
 struct State {
     queue: FairQueue<Job>,
     is_closed: bool,
-    /// Pixels of the large frames that are being rendered.
+    /// Samples of the large frames that are being rendered.
     rendering: u64,
-    /// Nanoseconds that a large frame takes per pixel: a moving average; 0 before the first large
+    /// Nanoseconds that a large frame takes per sample: a moving average; 0 before the first large
     /// frame.
-    ns_per_pixel: f64,
+    ns_per_sample: f64,
     /// Whether there is a thread for small frames.
     has_side_thread: bool,
     threads: Vec<JoinHandle<()>>,
@@ -136,7 +136,7 @@ impl RenderQueue {
             }
             // A panic in one session's frame must not end the thread that renders for all sessions.
             let work = || work(scratch, &*backend);
-            let rendering = debug_span!(parent: &within, "render", pixels = cost.pixels);
+            let rendering = debug_span!(parent: &within, "render", samples = cost.samples);
             let result = catch_unwind(AssertUnwindSafe(|| rendering.in_scope(work)));
             // Sending fails if the deadline has passed and the receiver is gone.
             let _ = reply.send(result.map(|result| (result, queued)));
@@ -199,10 +199,10 @@ impl Shared {
         // Small frames are not refused for their time: it is not measured, and short.
         if is_large(cost) {
             // On average, half of a frame that is being rendered is still to be done. The sum has
-            // at most 2⁹ frames of 2²⁷ pixels.
-            let before = state.rendering / 2 + state.queue.pixels_above(limits::LARGE_PIXELS);
-            if Instant::now() + state.time_for(before.saturating_add(cost.pixels)) > job.deadline {
-                return Err(SessionError::Busy { what: "pixels queued" });
+            // at most 2⁹ frames of 2²⁷ samples.
+            let before = state.rendering / 2 + state.queue.samples_above(limits::LARGE_SAMPLES);
+            if Instant::now() + state.time_for(before.saturating_add(cost.samples)) > job.deadline {
+                return Err(SessionError::Busy { what: "samples queued" });
             }
         }
         // The thread is only useful if the backend can render two frames at once, and only needed
@@ -243,13 +243,13 @@ impl Shared {
             if state.is_closed {
                 return None;
             }
-            let most_pixels = match lane {
+            let most_samples = match lane {
                 // While no large frame is rendered, the main lane serves all frames, and the side
                 // lane sleeps.
                 Lane::Main => Some(u64::MAX),
-                Lane::Side => (state.rendering > 0).then_some(limits::LARGE_PIXELS),
+                Lane::Side => (state.rendering > 0).then_some(limits::LARGE_SAMPLES),
             };
-            let Some((cost, job)) = most_pixels.and_then(|most| state.queue.pop(most)) else {
+            let Some((cost, job)) = most_samples.and_then(|most| state.queue.pop(most)) else {
                 // Every change wakes every thread; one that finds nothing for its lane sleeps
                 // again.
                 self.changed.wait(&mut state);
@@ -257,13 +257,13 @@ impl Shared {
             };
             // The time of a small frame is unknown: it begins unless its deadline has passed
             // already.
-            let needed = if is_large(cost) { state.time_for(cost.pixels) } else { Duration::ZERO };
+            let needed = if is_large(cost) { state.time_for(cost.samples) } else { Duration::ZERO };
             if Instant::now() + needed >= job.deadline {
                 // Dropping the job answers its session.
                 continue;
             }
             if is_large(cost) {
-                state.rendering += cost.pixels;
+                state.rendering += cost.samples;
                 // Unlocked first, so that the threads that wake up do not wait for the lock.
                 drop(state);
                 self.changed.notify_all();
@@ -274,27 +274,27 @@ impl Shared {
 }
 
 impl State {
-    /// Expected time to render `pixels` pixels of large frames.
-    fn time_for(&self, pixels: u64) -> Duration {
-        Duration::from_secs_f64(pixels as f64 * self.ns_per_pixel * 1e-9)
+    /// Expected time to render some samples of large frames.
+    fn time_for(&self, samples: u64) -> Duration {
+        Duration::from_secs_f64(samples as f64 * self.ns_per_sample * 1e-9)
     }
 
     /// Notes that a large frame was rendered.
     fn rendered(&mut self, cost: FrameCost, took: Duration) {
         // `next` added them, so that this does not underflow.
-        self.rendering -= cost.pixels;
-        let measured = took.as_secs_f64() * 1e9 / cost.pixels as f64;
+        self.rendering -= cost.samples;
+        let measured = took.as_secs_f64() * 1e9 / cost.samples as f64;
         // The last frame counts a quarter: after eight frames of another speed, the average is 90 %
         // theirs (1 - 0.75⁸).
-        let is_first = self.ns_per_pixel == 0.0;
-        self.ns_per_pixel =
-            if is_first { measured } else { 0.75 * self.ns_per_pixel + 0.25 * measured };
+        let is_first = self.ns_per_sample == 0.0;
+        self.ns_per_sample =
+            if is_first { measured } else { 0.75 * self.ns_per_sample + 0.25 * measured };
     }
 }
 
 /// Whether a frame takes so long that small ones do not wait for it.
 fn is_large(cost: FrameCost) -> bool {
-    cost.pixels > limits::LARGE_PIXELS
+    cost.samples > limits::LARGE_SAMPLES
 }
 
 #[cfg(test)]
@@ -330,7 +330,7 @@ mod tests {
         }
     }
 
-    const SMALL: FrameCost = FrameCost { session: 0, pixels: 768 };
+    const SMALL: FrameCost = FrameCost { session: 0, samples: 768 };
 
     /// How many jobs run now, and the most that ever ran at once.
     #[derive(Default)]
@@ -373,7 +373,7 @@ mod tests {
     }
 
     fn large(session: u64) -> FrameCost {
-        FrameCost { session, pixels: 2 * limits::LARGE_PIXELS }
+        FrameCost { session, samples: 2 * limits::LARGE_SAMPLES }
     }
 
     /// Twelve sessions with large frames of 100 ms, and one with small frames of 1 ms.

@@ -4,6 +4,7 @@
 mod manifest;
 mod publish;
 
+use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::ingest::IngestError;
@@ -116,8 +117,23 @@ impl Commit {
         only: Option<&BTreeSet<[i32; 2]>>,
         progress: &mut dyn FnMut(u64, u64),
     ) -> Result<StoredCells, StoreError> {
-        validate::check(gaussians, &Field::twin_name).map_err(IngestError::from)?;
+        self.put_all(Cow::Borrowed(gaussians), only, progress)
+    }
+
+    /// As [`Commit::put`]. Memory of Gaussians that are not the caller's is freed as they are
+    /// written.
+    ///
+    /// # Errors
+    /// As [`Commit::put`].
+    pub(super) fn put_all(
+        &mut self,
+        gaussians: Cow<'_, Gaussians>,
+        only: Option<&BTreeSet<[i32; 2]>>,
+        progress: &mut dyn FnMut(u64, u64),
+    ) -> Result<StoredCells, StoreError> {
+        validate::check(&gaussians, &Field::twin_name).map_err(IngestError::from)?;
         let sh_degree = gaussians.sh_degree;
+        let count = gaussians.len() as u64;
         // The first part decides the degree; this one is compared with it.
         self.check_field("sh_degree", Some(sh_degree), self.sh_degree.unwrap_or(sh_degree))?;
         let packer = CellPacker::new(gaussians, self.storage, only);
@@ -127,13 +143,14 @@ impl Commit {
         }
         // If this fails, the commit has changed in nothing: what was written is staged, but not
         // named.
+        // No underflow: the packer has a part of these Gaussians.
+        let left_out = count - packer.gaussians();
         let (chunks, clamped) = packer.put(&mut *self.staging, progress)?;
         self.sh_degree = Some(sh_degree);
         self.clamped.merge(&clamped);
         let by_cell = |chunk: &ChunkEntry| ([chunk.cell[1], chunk.cell[0]], chunk.clone());
         self.chunks.extend(chunks.iter().map(by_cell));
-        // No underflow: the packer has a part of these Gaussians.
-        Ok(StoredCells { left_out: gaussians.len() as u64 - packer.gaussians(), chunks })
+        Ok(StoredCells { left_out, chunks })
     }
 
     /// Puts the chunks of a manifest as they are, which `read` gives, in place of Gaussians.
