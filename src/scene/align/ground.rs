@@ -2,8 +2,8 @@
 //! little lies below.
 //!
 //! If the whole scene has no such plane, its core is searched: the half of the Gaussians that is
-//! nearest to its middle, and ever smaller cores. There the ground must also surround what stands on
-//! it.
+//! nearest to its middle, and ever smaller cores. There the ground must also surround what stands
+//! on it.
 //!
 //! RANSAC (Fischler and Bolles 1981) over one Gaussian for each occupied cube of a grid, so that a
 //! plane counts by its area and not by how densely it was captured. All lengths are relative to the
@@ -186,8 +186,8 @@ fn ground_in(
 }
 
 /// The Gaussians within a distance of a middle, in the same order. The middle is that of the
-/// smaller Gaussians: what cameras were near is made of small ones, on whatever side of the scene it
-/// stands.
+/// smaller Gaussians: what cameras were near is made of small ones, on whatever side of the scene
+/// it stands.
 struct Core {
     gaussians: Vec<usize>,
     reach: f64,
