@@ -10,16 +10,19 @@ from pathlib import Path
 
 FOLDER = "docs/reference/commands"
 HEAD = "<!-- Written by docs/generate.py from the help of the program. -->\n\n"
+GROUP = re.compile(r"^([A-Z][a-z ]+):\n((?:  .+\n)+)", re.MULTILINE)
 LISTED = re.compile(r"^  ([a-z][a-z0-9-]*)  +(\S.*)$")
 
 
 def pages(root: Path, program: Path) -> tuple[dict[str, str], str]:
     top = help_of(program, [])
-    index = f"{HEAD}# Commands\n\nThe pages have what `--help-all` prints.\n\n| command | |\n|---|---|\n"
+    index = f"{HEAD}# Commands\n\nThe pages have what `--help-all` prints.\n"
     written = {}
-    for name, summary in subcommands(top):
-        index += f"| [`{name}`]({name}.md) | {summary} |\n"
-        written[f"{FOLDER}/{name}.md"] = HEAD + page(program, [name]).rstrip() + "\n"
+    for heading, section in GROUP.findall(top.partition("\nOptions:\n")[0]):
+        index += f"\n## {heading}\n\n| command | |\n|---|---|\n"
+        for name, summary in listed(section):
+            index += f"| [`{name}`]({name}.md) | {summary} |\n"
+            written[f"{FOLDER}/{name}.md"] = HEAD + page(program, [name]).rstrip() + "\n"
     bench = program.with_name("wildcity-bench")
     written[f"{FOLDER}/wildcity-bench.md"] = HEAD + page(bench, []).rstrip() + "\n"
     index += "\n[`wildcity-bench`](wildcity-bench.md) is a program of its own, which releases do not have.\n"
@@ -32,7 +35,7 @@ def page(program: Path, path: list[str]) -> str:
     level = "#" * min(max(len(path), 1), 4)
     name = " ".join([program.name, *path])
     written = f"{level} {name}\n\n```text\n{text}```\n\n"
-    for name, _ in subcommands(text):
+    for name, _ in listed(text.partition("\nCommands:\n")[2].partition("\n\n")[0]):
         written += page(program, [*path, name])
     return written
 
@@ -58,9 +61,8 @@ def help_of(program: Path, path: list[str]) -> str:
     return "\n".join(line.rstrip() for line in done.stdout.strip().splitlines()) + "\n"
 
 
-def subcommands(text: str) -> list[tuple[str, str]]:
-    """Names and summaries of the section `Commands:`, without `help`."""
-    section = text.partition("\nCommands:\n")[2].partition("\n\n")[0]
+def listed(section: str) -> list[tuple[str, str]]:
+    """Names and summaries of the commands in a section of the help, without `help`."""
     found: list[tuple[str, str]] = []
     for line in section.splitlines():
         if listed := LISTED.match(line):

@@ -14,6 +14,7 @@ use wildcity_push::{SourceAxes, SourceScene, provenance, read_scene};
 use wildcity_scene::geo::GeoAnchor;
 use wildcity_scene::rig::is_name;
 use wildcity_scene::{RecordFormat, RenderProfile, Rig, Trajectory};
+use wildcity_twin::ingest::ReadLimits;
 use wildcity_twin::store::{Catalog, NewSky, NewVersion, StorageOptions, StoreError, Version};
 
 use super::directories::Twins;
@@ -24,9 +25,9 @@ use super::packed_folder::scene_file;
 use super::profile_options::ProfileOptions;
 use super::progress;
 use super::sky_source::SkySource;
-use super::twin::find_rig;
 #[cfg(feature = "log")]
 use super::twin::views::Views;
+use super::twin::{blind, find_rig};
 
 /// Make a twin from a trained scene, or a new version of an existing twin.
 ///
@@ -110,6 +111,12 @@ pub(super) struct Import {
     #[command(flatten)]
     bad: DropBad,
 
+    /// Level of detail of a streamed SOG to read: 0 is the finest, and each further one has
+    /// fewer Gaussians. A block without that level gives its next coarser one, or else its
+    /// coarsest. The version records it [default: 0]
+    #[arg(long, value_name = "N")]
+    level: Option<u32>,
+
     /// Record format in which Gaussians are stored: f32 (exact), h52, q32 or q24. For the last
     /// three the number is the bytes per Gaussian at SH degree 1, before compression.
     #[arg(long, value_name = "FORMAT", default_value_t)]
@@ -134,7 +141,8 @@ Formats, and their usual axes. Files of one format differ, so render the twin to
                       some tools keep the axes of the PLY; those that an
                       extension records are the default
   SOG 1 and 2         PlayCanvas; a folder, or one .sog or .zip             y-down-z-forward
-  streamed SOG        a folder, or one .zip; the finest level is read       y-down-z-forward
+  streamed SOG        a folder, or one .zip; the finest level is read,      y-down-z-forward
+                      unless --level says another one
   glTF, GLB           KHR_gaussian_splatting, with the transforms of its    '-1 0 0 0 0 1 0 1 0'
                       nodes; the standard has x left, y up, z to the front.
                       Also compressed as SPZ
@@ -147,6 +155,7 @@ Examples:
   wildcity import skull.ply --twin skull --axes y-down-z-forward --set near=0.2
   wildcity import street.safetensors --twin street --rig car.json --trajectory log.json
   wildcity import trained.ply --twin street --log log
+  wildcity import playbot --twin small --level 3       (the folder of a streamed SOG)
   wildcity import old.ply --twin old --axes '0 0 1 -1 0 0 0 -1 0' --scale 0.01
 
 Rig file: sizes and intrinsics are in pixels, camera_to_rig is in metres. Camera axes are x right,
@@ -187,14 +196,19 @@ impl Import {
         let mut trajectories = read_trajectories(&self.trajectory)?;
         trajectories.extend(recorded.drive);
         let geo = self.geo.clone().or(recorded.geo);
-        let source = scene_file(self.source)?;
+        let source = scene_file(self.source.clone())?;
 
         // 2. The scene.
         let cannot = || format!("cannot import {}", source.display());
         let mut phases = Phases::start();
         let bar = progress::bytes("reading");
         let show = &mut progress::show(&bar);
-        let read = read_scene(&source, &axes, &default_axes, self.bad.drop_bad, show);
+        let limits = ReadLimits {
+            drop_bad: self.bad.drop_bad,
+            level: self.level,
+            ..ReadLimits::for_own_file()
+        };
+        let read = read_scene(&source, &axes, &default_axes, &limits, show);
         let read = file_notes::explained(read).with_context(cannot)?;
         let SourceScene { gaussians, hash, options, notes, .. } = read;
         bar.finish_and_clear();
@@ -231,7 +245,7 @@ impl Import {
             trajectories,
             sky: sky.map(NewSky::Put),
             geo,
-            provenance: provenance(&[hash], options.to_vec(), levels),
+            provenance: provenance(&[hash], self.source_options(options), levels),
             storage: StorageOptions { record: self.record, levels },
         };
         let mut show = progress::show(&bar);
@@ -271,6 +285,7 @@ impl Import {
                 "note: there is no recorded drive, so sessions start at the origin: `wildcity twin drive` adds one"
             )?;
         }
+        blind::warn(&catalog, &version)?;
         let manifest = &version.manifest;
         let stored_bytes = manifest.stored_bytes();
         writeln!(
@@ -291,6 +306,12 @@ impl Import {
             return Views::from_log(&self.twin, log, self.twins).run();
         }
         Ok(())
+    }
+
+    /// The options of the reading that the version records.
+    fn source_options(&self, axes_and_scale: [String; 2]) -> Vec<String> {
+        let level = self.level.map(|level| format!("level={level}"));
+        axes_and_scale.into_iter().chain(level).collect()
     }
 
     /// What a twin takes from a log; nothing without `--log`.

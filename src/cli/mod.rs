@@ -28,6 +28,7 @@ mod episode;
 mod eval;
 pub mod exit;
 mod file_notes;
+mod groups;
 pub mod help_all;
 mod import;
 mod input_files;
@@ -81,7 +82,7 @@ Examples:
   wildcity help import                            (options and examples of one command)
   wildcity serve --help-all                       (also the options that few need)";
 
-// In the order of the tasks: to start, twins, drives, images and their errors, the program itself.
+// In the order of the groups of the help.
 subcommands! {
     Command;
     Demo(demo::Demo),
@@ -146,7 +147,7 @@ pub fn main() -> ExitCode {
 
 /// The program with the help of this build.
 fn program() -> clap::Command {
-    let program = Arguments::command();
+    let program = groups::grouped(Arguments::command());
     match left_out::help() {
         Some(left_out) => {
             let after = format!("{EXAMPLES}\n\n{left_out}");

@@ -12,7 +12,7 @@ use crate::frame::{Frame, twin_from_capture};
 use crate::limits;
 use crate::report::{FileReport, PushReport, Ranges};
 use crate::request::RequestedFile;
-use crate::source::{SourceAxes, SourceFile, SourceScene, read_limited};
+use crate::source::{SourceAxes, SourceFile, SourceScene, read_scene};
 use crate::status::Push;
 
 /// The joined files of a push.
@@ -201,9 +201,10 @@ impl<'a> Reader<'a> {
             stop: push.stop_flag().clone(),
             mesh_gaussians: self.bounds.mesh_gaussians,
             drop_bad: self.bounds.drop_bad,
+            level: None,
         };
         let default = self.default_axes;
-        let read = match read_limited(&file.path, &requested.axes, default, &limits, progress) {
+        let read = match read_scene(&file.path, &requested.axes, default, &limits, progress) {
             Ok(read) => read,
             // Only this error has something for the report: how many Gaussians are bad, and the
             // first of them.

@@ -178,28 +178,12 @@ impl SourceAxes {
     }
 }
 
-/// Reads a scene file of any format, checks every Gaussian, and converts them to the twin's axes.
-/// `default` has the axes and the scale that are used if none are given. The scene may name the
-/// files below its folder. `drop_bad` leaves out Gaussians outside their bounds.
-///
-/// # Errors
-/// As [`ingest::read`].
-pub fn read_scene(
-    path: &Path,
-    axes: &SourceAxes,
-    default: &SourceAxes,
-    drop_bad: bool,
-    progress: Progress<'_>,
-) -> Result<SourceScene, IngestError> {
-    let limits = ReadLimits { drop_bad, ..ReadLimits::for_own_file() };
-    read_limited(path, axes, default, &limits, progress)
-}
-
-/// As [`read_scene`], within limits. `default` has the axes of a file for which they are not given.
+/// Reads a scene file of any format within limits, checks every Gaussian, and converts them to the
+/// twin's axes. `default` has the axes and the scale that are used if none are given.
 ///
 /// # Errors
 /// As [`ingest::read_limited`].
-pub(crate) fn read_limited(
+pub fn read_scene(
     path: &Path,
     axes: &SourceAxes,
     default: &SourceAxes,
@@ -220,7 +204,7 @@ pub fn read_actor(
     progress: Progress<'_>,
 ) -> Result<SourceScene, IngestError> {
     let limits = ReadLimits { mesh_gaussians, ..ReadLimits::for_own_file() };
-    read_limited(path, axes, &SourceAxes::default(), &limits, progress)
+    read_scene(path, axes, &SourceAxes::default(), &limits, progress)
 }
 
 /// The tracked objects of a recorded drive, each in its own axes, and the file's BLAKE3 in hex.

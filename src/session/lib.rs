@@ -83,8 +83,8 @@ pub use repair::rendered_image::RenderedImage;
 pub use repair::session_repair::SessionRepair;
 pub use repair::status::{ImageRepair, RepairFailure, RepairStatus};
 pub use scenario::{
-    EpisodeTraffic, Event, EventKind, LoadedScenario, ScenarioError, ScenarioSource, Scenarios,
-    StoredAssets, generated_actors,
+    EpisodeTraffic, Event, EventKind, LoadedScenario, PlannedScenario, ScenarioError,
+    ScenarioSource, Scenarios, StoredAssets, TwinScenarios, generated_actors,
 };
 pub use sensors::{ImageSensor, SensorReason};
 pub use session::Session;

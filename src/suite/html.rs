@@ -1,6 +1,9 @@
 //! Common parts of the pages. Each page is one file that loads nothing else.
 
+use data_encoding::BASE64;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
+
+use crate::picture::Picture;
 
 const STYLE: &str = "\
 body{font:15px/1.45 system-ui,sans-serif;max-width:1160px;margin:2em auto;padding:0 1em;color:#111}
@@ -36,4 +39,10 @@ pub(crate) fn document(title: &str, body: &Markup) -> String {
 /// A share of 1 in percent.
 pub(crate) fn percent(share: f64) -> String {
     format!("{:.1} %", 100.0 * share)
+}
+
+/// A picture with a text below.
+pub(crate) fn image(picture: &Picture, text: &str) -> Markup {
+    let source = format!("data:image/jpeg;base64,{}", BASE64.encode(&picture.jpeg));
+    html! { div { img src=(source) alt=(text); br; small { (text) } } }
 }

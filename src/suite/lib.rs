@@ -57,7 +57,7 @@ pub use error::{AGENTS, SuiteError};
 pub use file::{SuiteFile, SuiteScenario, check_criteria};
 pub use junit::junit;
 pub use page::page;
-pub use picture::{Picture, pictures};
+pub use picture::{ComparedPictures, Picture, pictures};
 pub use result::{Counts, MeanEntry, Rate, SuiteResult};
 pub use run::{AgentChoice, RunSettings, run};
 pub use verify::verify;

@@ -3,12 +3,11 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use data_encoding::BASE64;
 use maud::{Markup, PreEscaped, html};
 
 use crate::ending::{Ending, ExitCode};
 use crate::entry::{EpisodeEntry, LEFT, Status, TechnicalEntry};
-use crate::html::{document, percent};
+use crate::html::{document, image, percent};
 use crate::picture::Picture;
 use crate::plot::plots;
 use crate::result::{Rate, SuiteResult};
@@ -165,7 +164,9 @@ fn worst(result: &SuiteResult, pictures: &[Picture], episodes: &Path) -> Markup 
                 figure {
                     figcaption { b { (viewer_link(episode)) } ": " (episode.fault_texts().join("; ")) }
                     @match pictures.iter().find(|picture| picture.episode == episode.name) {
-                        Some(picture) => (image(picture)),
+                        Some(picture) => {
+                            (image(picture, &format!("camera {}, step {}", picture.camera, picture.step)))
+                        }
                         None => p { "There is no picture: its frames cannot be rendered again." },
                     }
                     @if let Some(plots) = plots(episode, episodes) { div { (PreEscaped(plots)) } }
@@ -186,12 +187,6 @@ fn viewer_link(episode: &EpisodeEntry) -> Markup {
     let name = episode.record.trim_end_matches(".jsonl");
     let address = format!("http://{}/#/episode/{name}", wildcity_server::limits::LISTEN);
     html! { @if name.is_empty() { (episode.name) } @else { a href=(address) { (episode.name) } } }
-}
-
-fn image(picture: &Picture) -> Markup {
-    let source = format!("data:image/jpeg;base64,{}", BASE64.encode(&picture.jpeg));
-    let text = format!("camera {}, step {}", picture.camera, picture.step);
-    html! { div { img src=(source) alt=(text); br; small { (text) } } }
 }
 
 fn table(result: &SuiteResult) -> Markup {

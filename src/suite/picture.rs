@@ -1,5 +1,6 @@
 //! The picture of a fault: a recorded frame, rendered again.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use wildcity_episode::FaultLine;
@@ -20,10 +21,16 @@ pub struct Picture {
     /// Name of the episode.
     pub episode: String,
     pub step: u64,
+    /// Time of the episode, in microseconds.
+    pub time_us: i64,
     /// Name of the camera.
     pub camera: String,
     pub jpeg: Vec<u8>,
 }
+
+/// Pictures of the episodes that a comparison shows, before and now, by the name of the episode; or
+/// why there is none.
+pub type ComparedPictures = BTreeMap<String, [Result<Picture, String>; 2]>;
 
 /// The pictures of the worst episodes of a run: of the step of their worst fault, by their first
 /// camera. An episode that cannot be rendered again has no picture, which the report mentions.
@@ -37,14 +44,21 @@ pub fn pictures(
     let worst = result.worst();
     worst
         .into_iter()
-        .filter_map(|episode| match picture(episode, episodes, &cache, backend) {
-            Ok(picture) => picture,
-            Err(error) => {
-                tracing::warn!(episode = episode.name, "no picture of the fault: {error}");
-                None
+        .filter_map(|episode| {
+            match picture(episode, fault_us(episode), episodes, &cache, backend) {
+                Ok(picture) => Some(picture),
+                Err(error) => {
+                    tracing::warn!(episode = episode.name, "no picture of the fault: {error}");
+                    None
+                }
             }
         })
         .collect()
+}
+
+/// The time of the fault that an episode is shown by; the last one without a fault.
+pub(crate) fn fault_us(episode: &EpisodeEntry) -> i64 {
+    worst_fault(episode).map_or(i64::MAX, |fault| fault.time_us)
 }
 
 impl SuiteResult {
@@ -82,23 +96,25 @@ fn severity(fault: &FaultLine) -> u8 {
     }
 }
 
-fn picture(
+/// The first frame of an episode at or after a time, by its first camera.
+pub(crate) fn picture(
     episode: &EpisodeEntry,
+    from_us: i64,
     episodes: &Path,
     cache: &Cache,
     backend: &dyn Backend,
-) -> Result<Option<Picture>, String> {
+) -> Result<Picture, String> {
     let path = episodes.join(&episode.record);
     let mut recording = RecordedEpisode::read(&path).map_err(|error| error.to_string())?;
-    let fault_us = worst_fault(episode).map_or(i64::MAX, |fault| fault.time_us);
     // A request to look again shows a time that was shown before.
     let shown = |frame: &wildcity_session::FrameRecord| {
         frame.request != FrameRequest::Observe && !frame.images.is_empty()
     };
-    // The first frame at or after the fault.
-    let at = recording.frames.iter().position(|frame| shown(frame) && frame.time_us >= fault_us);
-    // A fault after the last frame is shown by the last one.
-    let Some(at) = at.or_else(|| recording.frames.iter().rposition(shown)) else { return Ok(None) };
+    let frames = &recording.frames;
+    let later = frames.iter().position(|frame| shown(frame) && frame.time_us >= from_us);
+    // What is after the last frame is shown by the last one.
+    let last = || frames.iter().rposition(shown);
+    let at = later.or_else(last).ok_or("its record has no images")?;
     // The earlier steps are executed, so that the ego has its pose, but not rendered.
     recording.frames.truncate(at + 1);
     // The record ends early now, and its end would contradict that.
@@ -110,6 +126,7 @@ fn picture(
     }
     recording.leave_out_sweeps();
     let step = recording.frames[at].step;
+    let time_us = recording.frames[at].time_us;
     let mut found: Option<Picture> = None;
     let report = recording.replay(cache, backend, ReplayUntil::End, &mut |replayed| {
         let Replayed::Image(image) = replayed else { return Ok(()) };
@@ -118,10 +135,10 @@ fn picture(
             let size = &image.camera.camera;
             let jpeg = jpeg(image.rgb8, size.width_px, size.height_px, session::JPEG_QUALITY)?;
             let camera = image.camera.name.clone();
-            found = Some(Picture { episode: episode.name.clone(), step, camera, jpeg });
+            found = Some(Picture { episode: episode.name.clone(), step, time_us, camera, jpeg });
         }
         Ok(())
     });
     report.map_err(|error| error.to_string())?;
-    Ok(found)
+    found.ok_or("its frame could not be rendered again".to_owned())
 }

@@ -13,7 +13,7 @@ use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{Gaussians, Rig, Trajectory};
 use wildcity_twin::store::{Catalog, CommitKind, StorageOptions, VersionChange};
 
-use crate::in_folder::{done, refused};
+use crate::in_folder::{done, refused, warned};
 use crate::scene_files::{inria_columns, ply};
 
 /// The axes of a capture: the street, upside down, tilted, moved, and half as large.
@@ -343,4 +343,62 @@ fn times_of_frames_are_those_of_the_drive() {
     assert!(times_us.eq((0..12).map(|i| Some(500_000 * i))), "{drive}");
     let told = String::from_utf8(run(&["--fps", "10"]).stderr).unwrap();
     assert!(told.contains("leave out --fps"), "{told}");
+}
+
+/// A camera ahead and one to the sky, on the ground of a small scene.
+#[test]
+fn cameras_that_see_nothing_are_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = dir.path();
+    let mut ground = Gaussians::with_capacity(0, 10_000);
+    for i in 0..10_000 {
+        let (x, y) = (0.2 * f64::from(i % 100), 0.2 * f64::from(i / 100) - 10.0);
+        ground.means_m.push([x, y, 0.0]);
+        ground.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+        ground.ln_scales.push([-1.5, -1.5, -4.0]);
+        ground.logit_opacities.push(4.0);
+        ground.sh.extend([0.3; 3]);
+    }
+    fs::write(at.join("ground.ply"), ply(&ground, &inria_columns(0, false))).unwrap();
+    let ahead = DMat3::from_cols(DVec3::NEG_Y, DVec3::NEG_Z, DVec3::X);
+    let upwards = DMat3::from_cols(DVec3::NEG_Y, DVec3::X, DVec3::Z);
+    let camera = |name: &str, rotation: &DMat3| {
+        let q = DQuat::from_mat3(rotation);
+        json!({"name": name, "width": 640, "height": 400, "fx": 500, "fy": 500, "cx": 320, "cy": 200,
+               "camera_to_rig": {"xyz": [0, 0, 1.5], "q": [q.w, q.x, q.y, q.z]}})
+    };
+    let rig = |cameras: Value| {
+        fs::write(at.join("rig.json"), json!({"name": "two", "cameras": cameras}).to_string())
+    };
+    let drive = |height_m: f64| {
+        let keyframe = |i: i64| {
+            json!({"time_us": 100_000 * i,
+                   "world_from_rig": {"xyz": [0.5 * i as f64, 0, height_m], "q": [1, 0, 0, 0]}})
+        };
+        let keyframes: Vec<Value> = (0..20).map(keyframe).collect();
+        let drive = json!({"name": "log", "keyframes": keyframes});
+        fs::write(at.join("drive.json"), drive.to_string()).unwrap();
+    };
+    drive(0.0);
+    rig(json!([camera("front", &ahead), camera("up", &upwards)])).unwrap();
+    let with = ["--rig", "rig.json", "--trajectory", "drive.json"];
+    let import = [&["import", "ground.ply", "--twin", "ground"][..], &with].concat();
+    let give = [&["twin", "drive", "ground"][..], &with].concat();
+    for command in [&import, &give] {
+        let told = warned(at, command);
+        let wanted =
+            "rig two: these cameras see nothing of the twin, wherever the drive is: up; look at";
+        assert!(told.contains(wanted), "{told}");
+    }
+    // Far above, in another unit, neither sees anything.
+    drive(3_000.0);
+    let told = warned(at, &give);
+    assert!(told.contains("wherever the drive is: front, up; look"), "{told}");
+    let told = warned(at, &["twin", "align", "ground", "--apply"]);
+    assert!(told.contains("wherever the drive is: front, up; look"), "{told}");
+    // A camera that sees the ground is not named.
+    drive(0.0);
+    rig(json!([camera("front", &ahead)])).unwrap();
+    let told = warned(at, &give);
+    assert!(!told.contains("see nothing"), "{told}");
 }

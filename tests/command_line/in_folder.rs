@@ -18,6 +18,13 @@ pub(crate) fn done(dir: &Path, arguments: &[&str]) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
+/// Standard error of a run that must succeed.
+pub(crate) fn warned(dir: &Path, arguments: &[&str]) -> String {
+    let output = run(dir, arguments);
+    assert!(output.status.success(), "{arguments:?}: {output:?}");
+    String::from_utf8(output.stderr).unwrap()
+}
+
 /// Standard error of a run that must fail with exit code 1.
 pub(crate) fn refused(dir: &Path, arguments: &[&str]) -> String {
     let output = run(dir, arguments);

@@ -139,6 +139,14 @@ async fn the_folder_of_a_sog_is_pushed_as_one_file() {
     let import = ["import", folder.to_str().unwrap(), "--twin", "sog", "--twins"];
     let (ok, said) = wildcity(&[&import[..], &[twins.to_str().unwrap()]].concat());
     assert!(ok && said.contains("twin sog version 1: 50 Gaussians"), "{said}");
+    // A level of it, which the version records.
+    let level = |number| [&import[..], &[twins.to_str().unwrap(), "--level", number]].concat();
+    let (ok, said) = wildcity(&level("1"));
+    assert!(ok && said.contains("twin sog version 2: 20 Gaussians"), "{said}");
+    let (_, shown) = wildcity(&["twin", "show", "sog", "--twins", twins.to_str().unwrap()]);
+    assert!(shown.contains("scale=1 level=1\n"), "{shown}");
+    let (ok, said) = wildcity(&level("7"));
+    assert!(!ok && said.contains("no level 7; the levels are 0, 1, 0 being the finest"), "{said}");
     // A single block.
     let block = folder.join("0/meta.json");
     let (ok, said) =

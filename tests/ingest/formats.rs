@@ -256,6 +256,42 @@ fn streamed_sog_gives_its_finest_level_and_its_environment() {
     assert_eq!(read(&zip(&files, true)).unwrap(), all);
 }
 
+/// Reads a level of a scene of several files.
+fn read_level(files: &Files, level: u32) -> Result<Gaussians, ingest::IngestError> {
+    let dir = written(files);
+    let limits = ReadLimits { level: Some(level), ..ReadLimits::for_own_file() };
+    let first = dir.path().join(&files[0].0);
+    ingest::read_limited(&first, &limits, &mut |_, _| {}).map(|read| read.gaussians)
+}
+
+#[test]
+fn a_level_of_a_streamed_sog_is_read() {
+    let files = streamed();
+    assert_eq!(read_level(&files, 0).unwrap(), read_files(&files).unwrap().0);
+    // Two leaves of 5, in the order of the file, and the environment.
+    let coarse = read_level(&files, 1).unwrap();
+    let file: Files = files
+        .iter()
+        .filter_map(|(name, bytes)| Some((name.strip_prefix("coarse/")?.to_owned(), bytes.clone())))
+        .collect();
+    assert_eq!(coarse.len(), 20);
+    assert_eq!(coarse.means_m[..10], read_files(&file).unwrap().0.means_m[..]);
+    let told = read_level(&files, 2).unwrap_err().to_string();
+    assert_eq!(told, "there is no level 2; the levels are 0, 1, 0 being the finest");
+
+    // A leaf that ends at level 0 gives that one.
+    let mut uneven = files;
+    let text = String::from_utf8(uneven[0].1.clone()).unwrap();
+    let cut = text.replacen(r#""1":{"file":0,"offset":5,"count":5},"#, "", 1);
+    assert_ne!(cut, text);
+    uneven[0].1 = cut.into_bytes();
+    assert_eq!(read_level(&uneven, 1).unwrap().len(), 5 + 20 + 10);
+
+    // Other scenes have no levels.
+    let told = read_level(&sog(&gaussians(10, 0, 20.0, 7), 2), 0).unwrap_err().to_string();
+    assert!(told.contains("only a streamed SOG (lod-meta.json) has levels"), "{told}");
+}
+
 /// Programs that pack a SOG pack what [`SogFiles`] names.
 #[test]
 fn the_files_of_a_sog_are_those_that_are_read() {

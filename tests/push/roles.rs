@@ -75,6 +75,7 @@ async fn every_route_needs_its_role() {
         ("GET /v1/twins/test/ground", "", &[PUSHER, ADMIN]),
         ("GET /v1/actors", "", &[DRIVER, PUSHER, ADMIN]),
         ("GET /v1/scenarios", "", &[DRIVER, PUSHER, ADMIN]),
+        ("GET /v1/twins/test/scenarios", "", &[DRIVER, PUSHER, ADMIN]),
         ("GET /v1/actors/x", "", &[DRIVER, PUSHER, ADMIN]),
         ("POST /v1/actors", actor, &[PUSHER, ADMIN]),
         ("GET /v1/sessions", "", &[ADMIN]),

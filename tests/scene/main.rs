@@ -1,9 +1,11 @@
-//! Routes: stations, chunks, pieces and clocks, against drives whose answers are known.
+//! Routes: stations, chunks, pieces and clocks, against drives whose answers are known; the ground
+//! of captures.
 
 #[path = "../support/drives.rs"]
 mod drives;
 
 mod clock;
+mod ground;
 
 use std::f64::consts::{PI, TAU};
 

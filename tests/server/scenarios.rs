@@ -58,6 +58,43 @@ async fn scenarios_are_listed_by_name() {
 }
 
 #[tokio::test]
+async fn the_scenarios_of_a_twin_have_the_lanes_of_their_maps() {
+    let server = server().await;
+    let dir = server.twins.path().join(".scenarios");
+    let lane = |id: &str, kind: &str, y_m: f64| {
+        let line = |y_m: f64| json!([[0, y_m, 0], [9, y_m, 0]]);
+        let edges = [y_m, y_m + 1.5, y_m - 1.5].map(line);
+        json!({"id": id, "kind": kind, "center": edges[0], "left": edges[1], "right": edges[2]})
+    };
+    let lanes = [lane("a", "driving", 0.0), lane("walk", "sidewalk", 4.0)];
+    let map = json!({"format": "wildcity.map/1", "lanes": lanes});
+    fs::write(dir.join("road.map.json"), map.to_string()).unwrap();
+    let write = |name: &str, twin: &str, map: Option<&str>| {
+        let mut scenario = scenario();
+        scenario["twin"]["name"] = json!(twin);
+        if let Some(file) = map {
+            scenario["map"] = json!({ "file": file });
+        }
+        fs::write(dir.join(format!("{name}.json")), scenario.to_string()).unwrap();
+    };
+    write("on-road", "test", Some("road.map.json"));
+    write("lost", "test", Some("gone.map.json"));
+    write("elsewhere", "city", Some("road.map.json"));
+    fs::write(dir.join("broken.json"), r#"{"format": "wildcity.scenario/1"}"#).unwrap();
+
+    let (status, answer) = get(&server, "/v1/twins/test/scenarios").await;
+    assert_eq!(status, 200, "{answer}");
+    let answer: Value = serde_json::from_str(answer.split("\r\n\r\n").nth(1).unwrap()).unwrap();
+    let ring = json!([[0.0, 1.5], [9.0, 1.5], [9.0, -1.5], [0.0, -1.5]]);
+    let wanted = json!({
+        "scenarios": [{"name": "lost", "map": "gone.map.json"},
+                      {"name": "on-road", "map": "road.map.json"}, {"name": "short"}],
+        "maps": {"road.map.json": [ring]},
+    });
+    assert_eq!(answer, wanted);
+}
+
+#[tokio::test]
 async fn an_episode_tells_actors_route_events_and_its_end() {
     let server = server().await;
     let mut agent = server.agent().await;

@@ -2,8 +2,8 @@
 
 use serde_json::{Value, json};
 use wildcity_suite::{
-    BuiltIn, Change, CompareError, ComparedEpisode, Comparison, Direction, DrivenRun, Ending,
-    ExitCode, Rule, SuiteResult, Tolerance,
+    BuiltIn, Change, CompareError, ComparedEpisode, ComparedPictures, Comparison, Direction,
+    DrivenRun, Ending, ExitCode, Rule, SuiteResult, Tolerance,
 };
 
 use crate::street::Bench;
@@ -111,14 +111,14 @@ async fn a_run_of_a_worse_driver_is_worse_and_the_other_way_round_better() {
     );
     let run = |result, out| DrivenRun { result, episodes: bench.path(out) };
     let runs = [run(&before, "log"), run(&stand, "stand")];
-    let page = worse.to_page(&runs);
+    let page = worse.to_page(&runs, &ComparedPictures::new());
     assert_eq!(page.matches("class=\"worse\">worse<").count(), 4, "{page}");
     assert!(page.contains("class=\"verdict worse\">worse than before: 4 episodes"), "{page}");
     // Each pair from above and its speed, before and now.
     assert_eq!(page.matches("<svg").count(), 4 * 2 * 2, "{page}");
     assert_eq!((page.matches("<b>before</b>").count(), page.matches("<b>now</b>").count()), (4, 4));
     let gone = runs.map(|run| DrivenRun { episodes: bench.path("nowhere"), ..run });
-    let page = worse.to_page(&gone);
+    let page = worse.to_page(&gone, &ComparedPictures::new());
     assert!(!page.contains("<svg") && page.matches("No record in ").count() == 8, "{page}");
 
     let better = compare(&stand, &log, &[]);

@@ -38,7 +38,7 @@ export class DrivePage implements Page {
   private readonly plot = new StagePlot();
   private readonly points = new PointsView();
   private readonly facts = new Facts();
-  private readonly settings = new Settings(() => void this.reopen());
+  private readonly settings: Settings;
   private readonly controls = new Controls((code) => this.key(code));
   private readonly pause = el("button", { type: "button", title: "P" }, "Pause");
   private readonly twin: string;
@@ -55,8 +55,9 @@ export class DrivePage implements Page {
   private requestMs = 0;
   private pace = 0;
 
-  constructor(twin: string) {
+  constructor(twin: string, scenario = "") {
     this.twin = twin;
+    this.settings = new Settings(() => void this.reopen(), scenario);
     this.pause.addEventListener("click", () => this.setPaused(!this.isPaused));
     const again = el("button", { type: "button", title: "R" }, "Start again");
     again.addEventListener("click", () => this.reset());

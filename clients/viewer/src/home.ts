@@ -37,7 +37,14 @@ export class HomePage implements Page {
   readonly element = el("div.home");
   private readonly adder = new Adder(() => void this.load());
   private readonly twins = el("section");
-  private readonly thumbnails = new Thumbnails();
+  private readonly thumbnails = new Thumbnails((twin, scenario) => {
+    this.scenarios.set(twin, scenario);
+    void this.load();
+  });
+  /** The scenario that is chosen for a twin. */
+  private readonly scenarios = new Map<string, string>();
+  /** What the table of twins was made of. */
+  private shownTwins = "";
   private readonly sessions = el("section");
   /** For tokens that cannot list sessions. */
   private readonly own = el("section", { hidden: true });
@@ -112,12 +119,18 @@ export class HomePage implements Page {
   }
 
   private showTwins(twins: TwinInfo[], damaged: { name: string; reason: string }[], role: Role | undefined): void {
+    // An open list of scenarios would close with each new table.
+    const shown = JSON.stringify([twins, damaged, role, [...this.scenarios]]);
+    if (shown === this.shownTwins) return;
+    this.shownTwins = shown;
     const rows = twins.flatMap((twin) => {
       const recorded = twin.trajectories.map(({ name, length_m: length }) => `${name} ${fixed(length, 0)} m`).join(", ");
       const link = (kind: string, text: string): HTMLElement => el("a.action", { href: `#/${kind}/${twin.name}` }, text);
+      const scenario = this.scenarios.get(twin.name);
+      const drive = `#/drive/${twin.name}${scenario ? `/${encodeURIComponent(scenario)}` : ""}`;
       // Placing makes a version, which the role drive may not.
-      const actions = [link("drive", "Drive"), link("fly", "Free camera"), ...(role === "drive" ? [] : [link("place", "Place a drive")])];
-      const name = el("a.name", { href: `#/drive/${twin.name}` }, twin.name);
+      const actions = [el("a.action", { href: drive }, "Drive"), link("fly", "Free camera"), ...(role === "drive" ? [] : [link("place", "Place a drive")])];
+      const name = el("a.name", { href: drive }, twin.name);
       const row = el("tr", {}, el("td", {}, name), el("td.number", {}, `v${twin.version}`),
         el("td.number", {}, count(twin.gaussians)), el("td.drives", {}, recorded || "no recorded drive"), el("td.actions", {}, ...actions));
       return [row, el("tr.shown", {}, el("td", { colSpan: 5 }, this.thumbnails.of(twin)))];

@@ -1,4 +1,4 @@
-// The page of the address: #/, #/drive/TWIN, #/fly/TWIN, #/place/TWIN, #/watch/SESSION, #/episode/NAME, #/episode/NAME/NAME,
+// The page of the address: #/, #/drive/TWIN, #/drive/TWIN/SCENARIO, #/fly/TWIN, #/place/TWIN, #/watch/SESSION, #/episode/NAME, #/episode/NAME/NAME,
 // #/report.
 
 import { byId, el, showStatus, showTitle } from "./dom";
@@ -28,7 +28,7 @@ function pageOf(address: string): Page {
   const [kind = "", name = "", other] = names;
   if (kind === "report") return new ReportPage();
   if (lacksToken()) return new TokenPage(false, show);
-  if (kind === "drive" && name) return new DrivePage(name);
+  if (kind === "drive" && name) return new DrivePage(name, other);
   if (kind === "fly" && name) return new FlyPage(name);
   if (kind === "place" && name) return new PlacePage(name);
   if (kind === "watch" && name) return new WatchPage(name);

@@ -30,11 +30,11 @@ export function parseStored(text: string | null): Stored {
   return stored;
 }
 
-/** Adds the scenarios of the server. */
-async function fillScenarios(select: HTMLSelectElement): Promise<void> {
+/** Adds the scenarios of the server; one may be chosen already. */
+async function fillScenarios(select: HTMLSelectElement, chosen: string): Promise<void> {
   try {
     const { scenarios } = await get<{ scenarios: string[] }>("v1/scenarios");
-    select.append(...scenarios.map((name) => el("option", { value: name }, name)));
+    select.append(...scenarios.map((name) => el("option", { value: name, selected: name === chosen }, name)));
   } catch (error) {
     select.title = `The scenarios cannot be listed: ${messageOf(error)}`;
   }
@@ -43,21 +43,22 @@ async function fillScenarios(select: HTMLSelectElement): Promise<void> {
 export class Settings {
   readonly element: HTMLElement;
   keepsPace: boolean;
-  scenario = "";
+  scenario: string;
   quality: number;
   private chosenWidth: number | undefined;
   private suitable = 480;
   private readonly widths = el("select", { title: "Smaller images are faster" });
 
-  constructor(onChange: () => void) {
+  constructor(onChange: () => void, scenario: string) {
+    this.scenario = scenario;
     const stored = parseStored(localStorage.getItem(KEY));
     this.chosenWidth = stored.width;
     this.quality = stored.quality ?? 85;
     this.keepsPace = stored.pace ?? true;
     const quality = el("input", { type: "number", min: "1", max: "100", value: String(this.quality) });
     const pace = el("input", { type: "checkbox", checked: this.keepsPace });
-    const scenario = el("select", {}, el("option", { value: "" }, "none"));
-    void fillScenarios(scenario);
+    const scenarios = el("select", {}, el("option", { value: "" }, "none"));
+    void fillScenarios(scenarios, scenario);
     const change = (then: () => void) => (): void => {
       then();
       this.store();
@@ -65,7 +66,7 @@ export class Settings {
     };
     this.widths.addEventListener("change", change(() => (this.chosenWidth = Number(this.widths.value))));
     quality.addEventListener("change", change(() => (this.quality = clamp(Math.round(Number(quality.value)) || 85, 1, 100))));
-    scenario.addEventListener("change", change(() => (this.scenario = scenario.value)));
+    scenarios.addEventListener("change", change(() => (this.scenario = scenarios.value)));
     pace.addEventListener("change", () => {
       this.keepsPace = pace.checked;
       this.store();
@@ -74,7 +75,7 @@ export class Settings {
     this.element = el("details.settings", {}, el("summary", {}, "Settings"),
       label("width of the front image", "Smaller images are faster; the other cameras are smaller still", this.widths),
       label("JPEG quality", "1 to 100", quality),
-      label("scenario", "One of the server's scenarios", scenario),
+      label("scenario", "One of the server's scenarios", scenarios),
       label("keep pace", "On a slow server, render fewer images rather than slow time down", pace));
     this.list();
   }

@@ -1,4 +1,5 @@
-// Two small pictures of each twin on the first page: ahead from the start of its drive, and from above with its drives.
+// Two small pictures of each twin on the first page: ahead from the start of its drive, and from above with its drives and
+// the lanes of its scenarios, of which one can be chosen.
 
 import { camera, over, picture } from "./aerial";
 import { Client } from "./client";
@@ -16,9 +17,17 @@ const EYE_M = 1.65;
 /** Points of a drive that are drawn: more than there are pixels. */
 const POINTS = 300;
 
+/** The scenarios that play in a twin; the lanes of each map are rings of x and y. */
+interface TwinScenarios {
+  scenarios: { name: string; map?: string }[];
+  maps: Record<string, [number, number][][]>;
+}
+
 const CAMERA = camera("thumbnail", WIDTH, HEIGHT);
 
 export class Thumbnails {
+  /** Called when a scenario of a twin is chosen, or none. */
+  private readonly onScenario: (twin: string, scenario: string) => void;
   /** The pictures of a version, by twin and version: the list of twins is made again every few seconds. */
   private readonly made = new Map<string, HTMLElement>();
   private readonly wanted = new Map<Element, TwinInfo>();
@@ -36,6 +45,10 @@ export class Thumbnails {
       this.last = this.last.then(() => this.fill(target, twin));
     }
   });
+
+  constructor(onScenario: (twin: string, scenario: string) => void) {
+    this.onScenario = onScenario;
+  }
 
   of(twin: TwinInfo): HTMLElement {
     const key = `${twin.name}@${twin.version}`;
@@ -68,19 +81,51 @@ export class Thumbnails {
       const yaw = heading(opened.start.q);
       const ahead: Pose = { xyz: [x, y, z + EYE_M], q: lookAt([Math.cos(yaw), Math.sin(yaw), 0], [0, 0, 1]) };
       element.append(await picture(client, ahead, `${twin.name} ahead`));
-      const drives = await Promise.all(twin.trajectories.map(({ name, length_m: length }) => points(twin, name, length)));
-      const above = over(drives.flat(), CAMERA);
-      if (above) {
-        const canvas = await picture(client, above, `${twin.name} from above, with its recorded drives`);
-        for (const drive of drives) draw(canvas, above, drive);
-        element.append(canvas);
-      }
+      element.append(...await this.above(client, twin, z));
     } catch (error) {
       if (!this.ended) element.append(el("span.dim", {}, `no picture: ${messageOf(error)}`));
     } finally {
       await this.client?.end();
       this.client = undefined;
     }
+  }
+
+  /** The picture from above, if the twin has a drive or lanes, and the list of its scenarios, if it has any. */
+  private async above(client: Client, twin: TwinInfo, ground: number): Promise<HTMLElement[]> {
+    const drives = await Promise.all(twin.trajectories.map(({ name, length_m: length }) => points(twin, name, length)));
+    const { scenarios, maps } = await get<TwinScenarios>(`v1/twins/${twin.name}/scenarios`);
+    const lanes = (map: string): Vector[][] => (maps[map] ?? []).map((ring) => ring.map(([east, north]) => [east, north, ground]));
+    const all = Object.keys(maps).flatMap(lanes);
+    const pose = over(drives.length ? drives.flat() : all.flat(), CAMERA);
+    const elements: HTMLElement[] = [];
+    let show: (rings: Vector[][]) => void = () => {};
+    if (pose) {
+      const shown = [...(drives.length ? ["its recorded drives"] : []), ...(all.length ? ["lanes"] : [])].join(" and ");
+      const canvas = await picture(client, pose, `${twin.name} from above, with ${shown}`);
+      const bare = el("canvas", { width: WIDTH, height: HEIGHT });
+      bare.getContext("2d")!.drawImage(canvas, 0, 0);
+      show = (rings) => {
+        canvas.getContext("2d")!.drawImage(bare, 0, 0);
+        canvas.dataset.lanes = String(rings.length);
+        for (const ring of rings) draw(canvas, pose, [...ring, ring[0]!], "#fff", 1);
+        for (const drive of drives) draw(canvas, pose, drive, colour("accent"), 2);
+      };
+      show(all);
+      elements.push(canvas);
+    }
+    if (scenarios.length) elements.push(this.chooser(twin.name, scenarios, (map) => show(map === undefined ? all : lanes(map))));
+    return elements;
+  }
+
+  /** The list of a twin's scenarios; `show` gets the map of the chosen one. */
+  private chooser(twin: string, scenarios: TwinScenarios["scenarios"], show: (map?: string) => void): HTMLElement {
+    const options = scenarios.map(({ name }) => el("option", { value: name }, name));
+    const select = el("select", { ariaLabel: `scenario of ${twin}` }, el("option", { value: "" }, "no scenario"), ...options);
+    select.addEventListener("change", () => {
+      show(scenarios.find(({ name }) => name === select.value)?.map);
+      this.onScenario(twin, select.value);
+    });
+    return el("label", {}, "Drive with ", select);
   }
 }
 
@@ -90,12 +135,12 @@ async function points(twin: TwinInfo, name: string, length: number): Promise<Vec
   return (await get<{ poses: { pose: Pose }[] }>(path)).poses.map(({ pose }) => pose.xyz);
 }
 
-function draw(canvas: HTMLCanvasElement, { xyz: [east, north, up] }: Pose, drive: Vector[]): void {
+function draw(canvas: HTMLCanvasElement, { xyz: [east, north, up] }: Pose, line: Vector[], style: string, width: number): void {
   const context = canvas.getContext("2d")!;
-  context.strokeStyle = colour("accent");
-  context.lineWidth = 2;
+  context.strokeStyle = style;
+  context.lineWidth = width;
   context.beginPath();
-  for (const [x, y, z] of drive) {
+  for (const [x, y, z] of line) {
     const scale = CAMERA.fx! / (up - z);
     context.lineTo(WIDTH / 2 + (x - east) * scale, HEIGHT / 2 - (y - north) * scale);
   }

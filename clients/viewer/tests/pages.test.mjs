@@ -117,6 +117,39 @@ test("a scenario is chosen from those of the server", async () => {
   await close();
 });
 
+test("lanes lie over the picture from above, and a scenario is chosen on the first page", async () => {
+  const line = (y) => [[20, y, 0], [160, y, 0]];
+  const lane = (id, y) => ({ id, center: line(y), left: line(y + 1.75), right: line(y - 1.75) });
+  const write = (name, value) => writeFile(join(place.folder, "scenarios", name), JSON.stringify(value));
+  const scenario = (name, file) => ({
+    format: "wildcity.scenario/1", name, twin: { name: "demo" }, ...(file ? { map: { file } } : {}),
+    ego: { start: { trajectory: "log", station_m: 20 }, dynamics: { model: "dynamic", speed: 3 } }, end: { time_s: 60 },
+  });
+  await mkdir(join(place.folder, "scenarios"), { recursive: true });
+  await write("road.map.json", { format: "wildcity.map/1", lanes: [lane("a", 0), lane("b", 3.5), lane("c", 40)] });
+  await write("one.map.json", { format: "wildcity.map/1", lanes: [lane("a", 0)] });
+  await Promise.all([write("on-road.json", scenario("on-road", "road.map.json")), write("one.json", scenario("one", "one.map.json"))]);
+
+  const { page, complaints, close } = await open(browser, server, "#/");
+  const above = page.locator(".pictures canvas").nth(1);
+  await above.waitFor();
+  assert.equal(await above.getAttribute("title"), "demo from above, with its recorded drives and lanes");
+  assert.equal(await above.getAttribute("data-lanes"), "4");
+  const pixels = () => above.evaluate((canvas) => canvas.toDataURL());
+  const all = await pixels();
+  await page.getByLabel("scenario of demo").selectOption("one");
+  assert.equal(await above.getAttribute("data-lanes"), "1");
+  assert.notEqual(await pixels(), all);
+  // The table is made again with the address of the scenario, and the list keeps it.
+  await page.click('a[href="#/drive/demo/one"]:has-text("Drive")');
+  await steps(page, 2);
+  assert.equal(await page.getByLabel("scenario").inputValue(), "one");
+  await page.click("#home");
+  await page.waitForSelector('tr:has-text("by-hand"):has-text("one")');
+  assert.deepEqual(complaints, []);
+  await close();
+});
+
 test("a page that is closed while it drives leaves no session", async () => {
   const { page, close } = await open(browser, server, "#/drive/demo");
   await steps(page, 2);

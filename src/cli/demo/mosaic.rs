@@ -1,32 +1,37 @@
-//! One image with all cameras, in the order in which they look: the front ones above, the others
-//! below. A line above them has the time and the speed, and each camera its name.
+//! One image with all cameras, in the order of the rig, as the viewer shows them: those that look
+//! ahead above, the others below. A line above them has the time and the speed, and each camera its
+//! name.
 
 use std::path::Path;
 
 use anyhow::Context;
+use glam::DVec3;
 use image::imageops::{self, FilterType};
 use image::{Rgb, RgbImage};
 
 use wildcity_client::{ImageView, Observation};
+use wildcity_scene::geometry::Pose;
 
 use super::caption;
 use crate::cli::output;
 
-/// Cameras of the demo's rig from left to right, row by row.
-const ROWS: [[&str; 3]; 2] = [["front_left", "front", "front_right"], ["left", "rear", "right"]];
+/// Cameras that look farther to the side than this, in radians, are in the second row.
+const FRONT_RAD: f64 = 1.2;
 /// Width of an image, in pixels: a third of the front cameras'.
 const WIDTH_PX: u32 = 480;
 /// Pixels between images, and around all of them.
 const GAP_PX: u32 = 4;
 const GROUND: Rgb<u8> = Rgb([16, 20, 24]);
 
-/// Writes a PNG of the six images.
+/// Writes a PNG of all images.
 pub(super) fn write(seen: &Observation, path: &Path) -> anyhow::Result<()> {
-    let rows = ROWS.iter().map(|cameras| row(seen, cameras)).collect::<anyhow::Result<Vec<_>>>()?;
+    let rows = rows(seen)?;
     let tallest =
         |row: &Row| row.iter().map(|(_, image)| image.height()).max().unwrap_or(0) + GAP_PX;
     let mut top = GAP_PX + caption::HEIGHT_PX;
-    let size_px = [3 * (WIDTH_PX + GAP_PX) + GAP_PX, top + rows.iter().map(tallest).sum::<u32>()];
+    let columns = rows.iter().map(Vec::len).max().unwrap_or(0) as u32;
+    let size_px =
+        [columns * (WIDTH_PX + GAP_PX) + GAP_PX, top + rows.iter().map(tallest).sum::<u32>()];
     let mut mosaic = RgbImage::from_pixel(size_px[0], size_px[1], GROUND);
     caption::draw(&mut mosaic, &headline(seen), [GAP_PX, GAP_PX / 2]);
     for row in &rows {
@@ -42,14 +47,23 @@ pub(super) fn write(seen: &Observation, path: &Path) -> anyhow::Result<()> {
 }
 
 /// The images of a row, with the names of their cameras.
-type Row = Vec<(&'static str, RgbImage)>;
+type Row = Vec<(String, RgbImage)>;
 
-fn row(seen: &Observation, cameras: &[&'static str]) -> anyhow::Result<Row> {
-    let named = cameras.iter().map(|camera| {
-        let image = seen.camera(camera).with_context(|| format!("no camera {camera:?}"))?;
-        Ok((*camera, fit(&image)?))
-    });
-    named.collect()
+fn rows(seen: &Observation) -> anyhow::Result<[Row; 2]> {
+    let mut rows = [Row::new(), Row::new()];
+    for image in seen.images() {
+        let metadata = image.metadata();
+        let mount = &metadata.camera_to_rig;
+        let row = row(&Pose::checked(mount.xyz, mount.q)?);
+        rows[row].push((metadata.camera.clone(), fit(&image)?));
+    }
+    Ok(rows)
+}
+
+/// The row of a camera: 0 if it looks ahead.
+fn row(rig_from_camera: &Pose) -> usize {
+    let toward = rig_from_camera.rotation * DVec3::Z;
+    usize::from(toward.y.atan2(toward.x).abs() >= FRONT_RAD)
 }
 
 /// The line above the images: the time and the speed at which they were taken.
@@ -69,4 +83,18 @@ fn fit(image: &ImageView<'_>) -> anyhow::Result<RgbImage> {
         .context("the image does not have the size that its metadata says")?;
     let scaled = (f64::from(WIDTH_PX) / f64::from(width) * f64::from(height)) as u32;
     Ok(imageops::resize(&rgb, WIDTH_PX, scaled.max(1), FilterType::Triangle))
+}
+
+#[cfg(test)]
+mod tests {
+    use wildcity_scene::Rig;
+
+    use super::*;
+
+    #[test]
+    fn three_cameras_of_the_demo_look_ahead() {
+        let rig = Rig::preset("vehicle6").unwrap();
+        let rows: Vec<usize> = rig.cameras.iter().map(|c| row(&c.rig_from_camera)).collect();
+        assert_eq!(rows, [0, 0, 0, 1, 1, 1]);
+    }
 }

@@ -3,8 +3,10 @@
 use std::io::Write;
 use std::path::PathBuf;
 
-use wildcity_suite::{Comparison, DrivenRun, SuiteResult, Tolerance};
+use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_suite::{ComparedPictures, Comparison, DrivenRun, SuiteResult, Tolerance};
 
+use crate::cli::directories::Twins;
 use crate::cli::exit::Exit;
 use crate::cli::output;
 
@@ -42,9 +44,13 @@ pub(super) struct Compare {
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
 
-    /// Write the comparison as a web page, with the drives of both runs side by side.
+    /// Write the comparison as a web page, with the drives of both runs side by side. Their
+    /// pictures are rendered again from the records, if the twins are there.
     #[arg(long, value_name = "FILE")]
     html: Option<PathBuf>,
+
+    #[command(flatten)]
+    twins: Twins,
 }
 
 const EXAMPLES: &str = "\
@@ -54,10 +60,20 @@ Examples:
   wildcity episode compare main run --worse-by bench2drive.driving=2 --worse-by alpasim.min_ade_5s=0.1";
 
 impl Compare {
+    /// Pictures of both runs for the page.
+    fn pictures(
+        &self,
+        comparison: &Comparison,
+        runs: &[DrivenRun<'_>; 2],
+    ) -> anyhow::Result<ComparedPictures> {
+        let backend = Cpu::new(0, Simd::Best)?;
+        Ok(comparison.pictures(runs, &self.twins.catalog()?, &backend))
+    }
+
     pub(super) fn run(self) -> anyhow::Result<()> {
         let before = SuiteResult::read(&self.before).map_err(bad_input)?;
         let after = SuiteResult::read(&self.after).map_err(bad_input)?;
-        let rule = self.worse_by.into_iter().collect();
+        let rule = self.worse_by.iter().cloned().collect();
         let comparison = Comparison::new(&before, &after, &rule).map_err(bad_input)?;
         if let Some(path) = &self.json {
             output::write(path, comparison.to_json().as_bytes())?;
@@ -65,7 +81,8 @@ impl Compare {
         if let Some(path) = &self.html {
             let run = |result, run| DrivenRun { result, episodes: SuiteResult::records(run) };
             let runs = [run(&before, &self.before), run(&after, &self.after)];
-            output::write(path, comparison.to_page(&runs).as_bytes())?;
+            let pictures = self.pictures(&comparison, &runs)?;
+            output::write(path, comparison.to_page(&runs, &pictures).as_bytes())?;
         }
         let conclusion = comparison.conclusion();
         let mut out = output::stdout();

@@ -199,7 +199,10 @@ impl Run {
         let comparison = compared.and_then(Result::ok);
         self.write_files(&result, &ending, &catalog, &*backend)?;
         if let (Some(comparison), Some(before)) = (&comparison, &before) {
-            self.write_comparison(comparison, before, &result)?;
+            let runs = self.compared_runs(before, &result);
+            let pictures = comparison.pictures(&runs, &catalog, &*backend);
+            self.write("comparison.json", &comparison.to_json())?;
+            self.write("comparison.html", &comparison.to_page(&runs, &pictures))?;
         }
         self.print(&result, &ending, comparison.as_ref())?;
         match ending.code {
@@ -243,19 +246,17 @@ impl Run {
         self.write("report.html", &page(result, ending, &pictures, &self.episodes()))
     }
 
-    fn write_comparison(
+    /// The earlier run, and this one.
+    fn compared_runs<'a>(
         &self,
-        comparison: &Comparison,
-        before: &SuiteResult,
-        after: &SuiteResult,
-    ) -> anyhow::Result<()> {
+        before: &'a SuiteResult,
+        after: &'a SuiteResult,
+    ) -> [DrivenRun<'a>; 2] {
         let earlier = self.against.as_deref().map_or(PathBuf::new(), SuiteResult::records);
-        let runs = [
+        [
             DrivenRun { result: before, episodes: earlier },
             DrivenRun { result: after, episodes: self.episodes() },
-        ];
-        self.write("comparison.json", &comparison.to_json())?;
-        self.write("comparison.html", &comparison.to_page(&runs))
+        ]
     }
 
     fn write(&self, name: &str, text: &str) -> anyhow::Result<()> {

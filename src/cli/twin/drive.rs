@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use wildcity_scene::align::Alignment;
 use wildcity_twin::store::Edit;
 
-use super::change;
+use super::{blind, change};
 use crate::cli::directories::{EditedTwin, Twins};
 use crate::cli::input_files::read_trajectories;
 use crate::cli::twin::find_rig;
@@ -47,6 +47,7 @@ impl Drive {
         let alignment = Alignment::IDENTITY;
         let edit = Edit { alignment, trajectories, rig };
         let version = catalog.edit(&base, edit, &mut |_, _| {})?;
+        blind::warn(&catalog, &version)?;
         let names: Vec<&str> =
             version.manifest.trajectories.iter().map(|drive| drive.name.as_str()).collect();
         let drives = if names.is_empty() { "none".to_owned() } else { names.join(", ") };

@@ -1,6 +1,7 @@
 //! `wildcity twin`.
 
 mod align;
+pub(super) mod blind;
 mod change;
 mod copy;
 mod diff;

@@ -1,6 +1,10 @@
 //! The ground of a scene whose axes are unknown: the plane that most of the scene lies on and
 //! little lies below.
 //!
+//! If the whole scene has no such plane, its core is searched: the half of the Gaussians that is
+//! nearest to its middle, and ever smaller cores. There the ground must also surround what stands
+//! on it.
+//!
 //! RANSAC (Fischler and Bolles 1981) over one Gaussian for each occupied cube of a grid, so that a
 //! plane counts by its area and not by how densely it was captured. All lengths are relative to the
 //! size of the scene: a capture has no metres yet. The random numbers have a fixed seed: the same
@@ -70,6 +74,17 @@ const LEAST_COSINE: f64 = 0.8;
 const COMPARED: usize = 12_000;
 const LEAST_PLACES: usize = 50;
 const LEAST_PERCENT: u32 = 4;
+/// Radius of a core as a share of that of the next larger one: the pavement of an object is a small
+/// part of cores that are much larger, and not in those that are smaller.
+const SHRINK: f64 = 0.75;
+/// The smallest core has this part of the scene's opaque Gaussians.
+const LEAST_CORE: usize = 16;
+/// Share of what stands above a plane that is its object; the rest is what stands around it.
+const OBJECT_SHARE: f64 = 0.8;
+/// Least share of a plane that is farther out than its object.
+const BESIDE_SHARE: f64 = 0.6;
+/// Most of the core's width that the object may have.
+const MOST_OBJECT: f64 = 0.6;
 
 impl Default for GroundSearch {
     fn default() -> Self {
@@ -103,7 +118,9 @@ fn opaque(gaussians: &Gaussians) -> Vec<usize> {
     (0..gaussians.len()).filter(|&i| gaussians.logit_opacities[i] >= LEAST_LOGIT).collect()
 }
 
-/// Finds the ground.
+/// Finds the ground: that of the whole scene, or else that of its core. A capture of one object has
+/// most of its Gaussians in the object and far behind it, so that the pavement below the object is
+/// too small a part of the scene.
 ///
 /// # Errors
 /// There are too few opaque Gaussians, or no plane has enough of them on it.
@@ -111,9 +128,32 @@ pub fn find_ground(
     gaussians: &Gaussians,
     search: &GroundSearch,
 ) -> Result<GroundPlane, GroundError> {
-    let opaque = opaque(gaussians);
-    let radius = extent(gaussians, &opaque).radius;
-    let places = places(gaussians, &opaque, radius / CUBES);
+    let whole = opaque(gaussians);
+    let none = match ground_in(gaussians, &whole, search, &|_, _, _| true) {
+        Err(error @ GroundError::NoPlane { .. }) => error,
+        found => return found,
+    };
+    let least = whole.len() / LEAST_CORE;
+    let mut core = Core::half(gaussians, &whole);
+    while core.gaussians.len() >= least.max(1) {
+        if let Ok(plane) = ground_in(gaussians, &core.gaussians, search, &surrounds) {
+            return Ok(plane);
+        }
+        core = core.shrunk(gaussians);
+    }
+    Err(none)
+}
+
+/// The ground of some Gaussians, among the planes that `is_ground` accepts of their places and the
+/// tolerance.
+fn ground_in(
+    gaussians: &Gaussians,
+    core: &[usize],
+    search: &GroundSearch,
+    is_ground: &dyn Fn(&[SurfaceSample], GroundPlane, f64) -> bool,
+) -> Result<GroundPlane, GroundError> {
+    let radius = extent(gaussians, core).radius;
+    let places = places(gaussians, core, radius / CUBES);
     if places.len() < LEAST_PLACES || radius <= 0.0 {
         return Err(GroundError::TooFew { count: places.len(), least: LEAST_PLACES });
     }
@@ -125,13 +165,14 @@ pub fn find_ground(
     let mut random = Random::new(search.seed, "ground", 0);
     let mut best: Option<(f64, GroundPlane)> = None;
     for at in 0..search.hypotheses {
-        let Some(plane) = hypothesis(&compared, at, &mut random) else { continue };
-        let (score, plane) = judge(&compared, plane, tolerance);
+        let Some(hypothesis) = hypothesis(&compared, at, &mut random) else { continue };
+        let (score, plane) = judge(&compared, hypothesis, tolerance);
         // 0.7 is about cos 45 degrees. An up direction of zero length refuses every plane.
         let is_wanted = search.up.is_none_or(|up| plane.up.dot(up.normalize_or_zero()) > 0.7);
         // Strictly greater: of equal planes the first one stays, so that the result is
         // deterministic.
-        if is_wanted && best.is_none_or(|(most, _)| score > most) {
+        let is_better = best.is_none_or(|(most, _)| score > most);
+        if is_wanted && is_better && is_ground(&compared, plane, tolerance) {
             best = Some((score, plane));
         }
     }
@@ -142,6 +183,68 @@ pub fn find_ground(
         Some((score, plane)) if score >= least => Ok(refine(&places, plane, tolerance)),
         _ => Err(GroundError::NoPlane { least_percent: LEAST_PERCENT }),
     }
+}
+
+/// The Gaussians within a distance of a middle, in the same order. The middle is that of the
+/// smaller Gaussians: what cameras were near is made of small ones, on whatever side of the scene
+/// it stands.
+struct Core {
+    gaussians: Vec<usize>,
+    reach: f64,
+}
+
+impl Core {
+    /// The nearest half of some Gaussians.
+    fn half(gaussians: &Gaussians, all: &[usize]) -> Self {
+        let middle = middle_of_small(gaussians, all);
+        let reach = median(all.iter().map(|&i| distance(gaussians, i, middle)).collect());
+        Self::within(gaussians, all, middle, reach)
+    }
+
+    /// The next smaller core, around its own middle.
+    fn shrunk(&self, gaussians: &Gaussians) -> Self {
+        let middle = middle_of_small(gaussians, &self.gaussians);
+        Self::within(gaussians, &self.gaussians, middle, SHRINK * self.reach)
+    }
+
+    fn within(gaussians: &Gaussians, all: &[usize], middle: DVec3, reach: f64) -> Self {
+        let near = all.iter().copied().filter(|&i| distance(gaussians, i, middle) < reach);
+        Self { gaussians: near.collect(), reach }
+    }
+}
+
+fn distance(gaussians: &Gaussians, i: usize, from: DVec3) -> f64 {
+    DVec3::from_array(gaussians.means_m[i]).distance(from)
+}
+
+/// The middle of the smaller half of some Gaussians; there is at least one.
+fn middle_of_small(gaussians: &Gaussians, some: &[usize]) -> DVec3 {
+    let size = |i: usize| gaussians.ln_scales[i].iter().map(|&ln| f64::from(ln)).sum::<f64>();
+    let usual = median(some.iter().map(|&i| size(i)).collect());
+    let small: Vec<usize> = some.iter().copied().filter(|&i| size(i) <= usual).collect();
+    extent(gaussians, &small).middle
+}
+
+/// Whether the plane surrounds what stands on it, as the ground does. The roof of a car is a plane
+/// too: most of the car is within its edges, or reaches as far as the core does if that cuts it.
+fn surrounds(places: &[SurfaceSample], plane: GroundPlane, tolerance: f64) -> bool {
+    let foot = |place: &SurfaceSample| place.at - plane.up * plane.up.dot(place.at - plane.point);
+    let height = |place: &&SurfaceSample| plane.up.dot(place.at - plane.point);
+    let above = places.iter().filter(|place| height(place) > 3.0 * tolerance);
+    let feet: Vec<DVec3> = above.map(foot).collect();
+    if feet.is_empty() {
+        return true;
+    }
+    let middle = feet.iter().sum::<DVec3>() / feet.len() as f64;
+    let away = |place: &SurfaceSample| foot(place).distance(middle);
+    let mut reaches: Vec<f64> = feet.iter().map(|foot| foot.distance(middle)).collect();
+    let edge = (OBJECT_SHARE * (reaches.len() - 1) as f64) as usize;
+    let object = *reaches.select_nth_unstable_by(edge, f64::total_cmp).1;
+    let farthest = places.iter().map(away).fold(0.0, f64::max);
+    let on = places.iter().filter(|place| height(place).abs() <= tolerance);
+    let on: Vec<f64> = on.map(away).collect();
+    let beside = on.iter().filter(|&&away| away > object).count();
+    object <= MOST_OBJECT * farthest && beside as f64 >= BESIDE_SHARE * on.len() as f64
 }
 
 fn extent(gaussians: &Gaussians, opaque: &[usize]) -> SceneExtent {

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use axum::extract::State as Shared;
+use axum::extract::{Path, State as Shared};
 use axum::response::IntoResponse as _;
 use axum::{Extension, Json};
 use serde_json::json;
@@ -24,4 +24,14 @@ pub(super) async fn list(
     let names = blocking(move || Ok::<_, Fault>(scenarios.names())).await?;
     let shown = if grant.allows_all_twins() { names } else { Vec::new() };
     Ok(Json(json!({ "scenarios": shown })).into_response())
+}
+
+/// `GET /v1/twins/{twin}/scenarios`: those that play in a twin, with the lanes of their maps.
+pub(super) async fn in_twin(
+    Shared(state): Shared<Arc<ServerState>>,
+    Path(twin): Path<String>,
+) -> HttpResult {
+    let scenarios = state.engine.scenarios().clone();
+    let found = blocking(move || Ok::<_, Fault>(scenarios.in_twin(&twin))).await?;
+    Ok(Json(found).into_response())
 }

@@ -360,6 +360,14 @@ pub(super) fn rows() -> Vec<Row> {
         )
         .answers(200, Content::Object)
         .does(scenarios::list),
+        op(
+            Get,
+            "/v1/twins/{twin}/scenarios",
+            AnyToken,
+            "The scenarios that play in a twin, and outlines of the lanes of their maps.",
+        )
+        .answers(200, Content::Object)
+        .does(scenarios::in_twin),
         op(Get, "/v1/actors", AnyToken, "All assets of actors, and the damaged ones.")
             .answers(200, Json("actors"))
             .does(actors::list),

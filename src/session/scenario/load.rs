@@ -337,7 +337,7 @@ impl Scenarios {
         ScenarioError::Read { field, file: file.to_owned(), reason }
     }
 
-    fn read(
+    pub(super) fn read(
         &self,
         field: &'static str,
         file: &str,

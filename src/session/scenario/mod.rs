@@ -4,6 +4,7 @@ pub(crate) mod assets;
 mod default_assets;
 pub(crate) mod load;
 pub(crate) mod past;
+mod plan;
 mod traffic;
 
 use std::collections::BTreeMap;
@@ -19,6 +20,7 @@ use wildcity_twin::store::Version;
 pub use assets::StoredAssets;
 pub use default_assets::generated_actors;
 pub use load::{LoadedScenario, ScenarioError, ScenarioSource, Scenarios};
+pub use plan::{PlannedScenario, TwinScenarios};
 pub(crate) use traffic::settle;
 pub use traffic::{EpisodeTraffic, Event, EventKind};
 

@@ -10,10 +10,11 @@
 //! | `pair` | finds the pairs, and what changed in each |
 //! | `scores` | the mean difference of each score over the pairs |
 //! | `rule` | when a run counts as worse |
-//! | `text`, `page` | the comparison for people |
+//! | `text`, `page`, `pictures` | the comparison for people |
 
 mod page;
 mod pair;
+mod pictures;
 mod rule;
 mod scores;
 mod text;
@@ -22,10 +23,13 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Serialize;
 
+use wildcity_render::Backend;
 use wildcity_score::own;
+use wildcity_twin::store::Catalog;
 
 use crate::case::Case;
 use crate::entry::{EpisodeEntry, Status};
+use crate::picture::ComparedPictures;
 use crate::result::SuiteResult;
 
 pub use page::DrivenRun;
@@ -260,9 +264,20 @@ impl Comparison {
     }
 
     /// The comparison as a page that loads nothing else. `runs` are the earlier and the later run:
-    /// the drives of the episodes that changed are drawn from their records, side by side.
-    pub fn to_page(&self, runs: &[DrivenRun<'_>; 2]) -> String {
-        page::page(self, runs)
+    /// the drives of the episodes that changed are drawn from their records, side by side, below
+    /// their pictures.
+    pub fn to_page(&self, runs: &[DrivenRun<'_>; 2], pictures: &ComparedPictures) -> String {
+        page::page(self, runs, pictures)
+    }
+
+    /// Pictures of the episodes that the page shows, rendered again from the records of both runs.
+    pub fn pictures(
+        &self,
+        runs: &[DrivenRun<'_>; 2],
+        catalog: &Catalog,
+        backend: &dyn Backend,
+    ) -> ComparedPictures {
+        pictures::compared_pictures(&page::shown(self), runs, catalog, backend)
     }
 }
 

@@ -5,8 +5,9 @@ use std::path::PathBuf;
 use maud::{Markup, PreEscaped, html};
 
 use crate::entry::EpisodeEntry;
-use crate::html::document;
+use crate::html::{document, image};
 use crate::limits;
+use crate::picture::{ComparedPictures, Picture};
 use crate::plot::plots;
 use crate::result::SuiteResult;
 
@@ -22,17 +23,26 @@ pub struct DrivenRun<'a> {
 }
 
 impl DrivenRun<'_> {
-    /// The drive of an episode as SVG; `None` if its record is not there.
-    fn plots(&self, of: &ComparedEpisode) -> Option<String> {
+    /// The entry of an episode of the comparison.
+    pub(crate) fn entry(&self, of: &ComparedEpisode) -> Option<&EpisodeEntry> {
         let is_it = |entry: &&EpisodeEntry| {
             (&entry.scenario, entry.seed, &entry.values) == (&of.scenario, of.seed, &of.values)
         };
-        plots(self.result.episodes.iter().find(is_it)?, &self.episodes)
+        self.result.episodes.iter().find(is_it)
+    }
+
+    /// The drive of an episode as SVG; `None` if its record is not there.
+    fn plots(&self, of: &ComparedEpisode) -> Option<String> {
+        plots(self.entry(of)?, &self.episodes)
     }
 }
 
 /// The page; `runs` are the earlier and the later run.
-pub(super) fn page(comparison: &Comparison, runs: &[DrivenRun<'_>; 2]) -> String {
+pub(super) fn page(
+    comparison: &Comparison,
+    runs: &[DrivenRun<'_>; 2],
+    pictures: &ComparedPictures,
+) -> String {
     let name = |run: &RunName| format!("{}: {}", run.suite, run.agent);
     let title = format!("{} against {}", name(&comparison.after), name(&comparison.before));
     let counts = &comparison.counts;
@@ -47,7 +57,7 @@ pub(super) fn page(comparison: &Comparison, runs: &[DrivenRun<'_>; 2]) -> String
         @if counts.duplicates > 0 { p { (counts.duplicates) " pairs repeat another one, and are in no rate and no mean." } }
         h2 { "Episodes that changed" }
         (episodes(comparison))
-        (drives(comparison, runs))
+        (drives(comparison, runs, pictures))
         h2 { "Scores" }
         (scores(comparison))
     };
@@ -79,28 +89,49 @@ fn episodes(comparison: &Comparison) -> Markup {
     }
 }
 
-/// The drives of the episodes that changed, before and now side by side: the worse ones first.
-fn drives(comparison: &Comparison, runs: &[DrivenRun<'_>; 2]) -> Markup {
+/// The episodes whose drives are shown: those that changed, the worse ones first.
+pub(super) fn shown(comparison: &Comparison) -> Vec<&ComparedEpisode> {
     let mut shown = changed(comparison);
     shown.sort_by_key(|one| one.change != Change::Worse);
     shown.truncate(limits::WORST);
+    shown
+}
+
+/// The drives of the episodes that changed, before and now side by side, with a picture of each.
+fn drives(
+    comparison: &Comparison,
+    runs: &[DrivenRun<'_>; 2],
+    pictures: &ComparedPictures,
+) -> Markup {
     html! {
-        @for episode in shown {
+        @for episode in shown(comparison) {
             h3 { (episode.name) }
             div.beside {
-                (side("before", episode, episode.before.as_ref(), &runs[0]))
-                (side("now", episode, episode.after.as_ref(), &runs[1]))
+                @let [before, now] = pictures.get(&episode.name).map_or([None; 2], |both| both.each_ref().map(Some));
+                (side("before", episode, episode.before.as_ref(), &runs[0], before))
+                (side("now", episode, episode.after.as_ref(), &runs[1], now))
             }
         }
     }
 }
 
-fn side(when: &str, episode: &ComparedEpisode, side: Option<&Side>, run: &DrivenRun<'_>) -> Markup {
+fn side(
+    when: &str,
+    episode: &ComparedEpisode,
+    side: Option<&Side>,
+    run: &DrivenRun<'_>,
+    picture: Option<&Result<Picture, String>>,
+) -> Markup {
     html! {
         div {
             @match side {
                 Some(side) => {
                     p { b { (when) } ": " span class=(side.status.name()) { (side.text()) } }
+                    @match picture {
+                        Some(Ok(picture)) => (shot(picture)),
+                        Some(Err(reason)) => p.unknown { "No picture: " (reason) "." },
+                        None => {}
+                    }
                     @match run.plots(episode) {
                         Some(plots) => (PreEscaped(plots)),
                         None => p.unknown { "No record in " (run.episodes.display()) "." },
@@ -110,6 +141,13 @@ fn side(when: &str, episode: &ComparedEpisode, side: Option<&Side>, run: &Driven
             }
         }
     }
+}
+
+/// A picture with its camera and time.
+fn shot(picture: &Picture) -> Markup {
+    let time_s = picture.time_us as f64 * 1e-6;
+    let text = format!("{} after {time_s:.1} s", picture.camera);
+    html! { figure { (image(picture, &text)) } }
 }
 
 fn scores(comparison: &Comparison) -> Markup {

@@ -88,6 +88,18 @@ pub enum IngestError {
         /// Bytes that may be used.
         limit: u64,
     },
+    /// A level of detail was asked for, of a file that has none.
+    #[error(
+        "level {level} is asked for, and only a streamed SOG (lod-meta.json) has levels: leave it out"
+    )]
+    NoLevels { level: u32 },
+    /// A level of detail was asked for that a streamed SOG does not have.
+    #[error("there is no level {level}; the levels are {}, 0 being the finest", names(levels))]
+    NoLevel {
+        level: u32,
+        /// Those that there are, in order.
+        levels: Vec<u32>,
+    },
     /// Reading was to stop.
     #[error("reading was stopped")]
     Stopped,
@@ -114,6 +126,10 @@ pub enum IngestError {
         /// The error, and the accepted values.
         reason: String,
     },
+}
+
+fn names(levels: &[u32]) -> String {
+    levels.iter().map(u32::to_string).collect::<Vec<_>>().join(", ")
 }
 
 // Not `#[from]`, which would make it the source, too, and a message with its sources would say it

@@ -116,7 +116,7 @@ pub fn read_limited(
     let (file, file_bytes) = file::open(path)?;
     let mut input =
         BufReader::with_capacity(BUFFER_BYTES, HashReader::new(file, limits.stop.clone()));
-    let mut reading = Reading::new(limits.drop_bad);
+    let mut reading = Reading::new(limits);
     let reader = &mut reading;
     let gaussians = match Format::detect(input.fill_buf()?)? {
         Format::Json => {
@@ -160,9 +160,10 @@ pub fn read_limited(
 /// The notes of a scene that was read.
 ///
 /// # Errors
-/// All of its Gaussians were left out: the file is no scene, or of another kind than it says.
+/// All of its Gaussians were left out: the file is no scene, or of another kind than it says. A
+/// level is asked for, and the file has none.
 fn check_dropped(gaussians: &Gaussians, reading: Reading) -> Result<FileNotes, IngestError> {
-    let notes = reading.into_notes();
+    let notes = reading.into_notes()?;
     if gaussians.is_empty() && notes.dropped > 0 {
         return Err(IngestError::AllDropped { count: notes.dropped });
     }

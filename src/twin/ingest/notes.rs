@@ -6,7 +6,7 @@ use serde_json::{Map, Value};
 use wildcity_scene::validate::{self, Field};
 use wildcity_scene::{Gaussians, ProfileOverrides};
 
-use super::{Axes, IngestError};
+use super::{Axes, IngestError, ReadLimits};
 
 /// Blur of trainers with opacity compensation that follow gsplat, in px².
 pub(super) const BLUR_PX2: f64 = 0.3;
@@ -77,17 +77,29 @@ impl FileNotes {
 /// The reading of one scene, of one file or several.
 pub(super) struct Reading {
     drop_bad: bool,
+    /// The level of detail that is asked for, until a reader that has levels takes it.
+    level: Option<u32>,
     notes: FileNotes,
 }
 
 impl Reading {
-    /// `drop_bad` leaves out Gaussians outside their bounds; without it they are errors.
-    pub(super) fn new(drop_bad: bool) -> Self {
-        Self { drop_bad, notes: FileNotes::default() }
+    /// The reading of a scene within limits.
+    pub(super) fn new(limits: &ReadLimits<'_>) -> Self {
+        Self { drop_bad: limits.drop_bad, level: limits.level, notes: FileNotes::default() }
     }
 
-    pub(super) fn into_notes(self) -> FileNotes {
-        self.notes
+    /// # Errors
+    /// [`IngestError::NoLevels`] if a level is asked for that no reader took.
+    pub(super) fn into_notes(self) -> Result<FileNotes, IngestError> {
+        match self.level {
+            Some(level) => Err(IngestError::NoLevels { level }),
+            None => Ok(self.notes),
+        }
+    }
+
+    /// Takes the level of detail that is asked for.
+    pub(super) fn take_level(&mut self) -> Option<u32> {
+        self.level.take()
     }
 
     /// Whether Gaussians outside their bounds are left out.

@@ -21,6 +21,8 @@ pub struct ReadLimits<'a> {
     pub mesh_gaussians: u32,
     /// Leaves out Gaussians outside their bounds; without it they are errors.
     pub drop_bad: bool,
+    /// The level of detail of a streamed SOG that is read, 0 being the finest; without it that one.
+    pub level: Option<u32>,
 }
 
 /// Tells readers of other threads to stop. Clones are one flag.
@@ -37,6 +39,7 @@ impl ReadLimits<'_> {
             stop: StopFlag::default(),
             mesh_gaussians: limits::MESH_GAUSSIANS,
             drop_bad: false,
+            level: None,
         }
     }
 }

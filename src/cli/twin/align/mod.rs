@@ -13,7 +13,7 @@ use wildcity_scene::Gaussians;
 use wildcity_scene::align::{Alignment, GroundPlane, GroundSearch, find_ground, scale_from_points};
 use wildcity_twin::store::Edit;
 
-use super::change;
+use super::{blind, change};
 use crate::cli::directories::{EditedTwin, Twins};
 use crate::cli::{output, progress};
 
@@ -160,6 +160,7 @@ impl Align {
                  `wildcity twin geo {name}` says it again"
             )?;
         }
+        blind::warn(&catalog, &version)?;
         change::print(&version, "the ground is level, at height 0")
     }
 

@@ -128,15 +128,16 @@ pub(super) fn warn_skipped(settings: &Value<'_>, layer: &str, reading: &mut Read
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ingest::ReadLimits;
 
     fn map<'a>(entries: Vec<(&'a str, Value<'a>)>) -> Value<'a> {
         Value::Map(entries.into_iter().map(|(key, value)| (Value::Text(key), value)).collect())
     }
 
     fn warned(check: impl Fn(&mut Reading)) -> String {
-        let mut reading = Reading::new(false);
+        let mut reading = Reading::new(&ReadLimits::for_own_file());
         check(&mut reading);
-        reading.into_notes().warnings.join("; ")
+        reading.into_notes().unwrap().warnings.join("; ")
     }
 
     #[test]

@@ -1,7 +1,9 @@
 //! Streamed SOG: lod-meta.json and a SOG folder per block of every level of detail.
 //!
 //! Every leaf of its tree has one range of Gaussians per level, 0 being the finest. A twin makes
-//! its own levels of detail, so only the finest range of every leaf is read.
+//! its own levels of detail, so only one range of every leaf is read: the finest, or that of a
+//! level that is asked for. A leaf without that level gives the next coarser one that it has, or
+//! else its coarsest.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -45,7 +47,7 @@ struct FileRange {
     count: u64,
 }
 
-/// Reads the finest level, and the environment around it.
+/// Reads one level, and the environment around it.
 pub(super) fn read(
     json: &[u8],
     folder: &str,
@@ -60,7 +62,8 @@ pub(super) fn read(
     if let Some(twice) = meta.filenames.iter().find(|name| !names.insert(name.as_str())) {
         return Err(bad(NAME, format!("file {twice:?} is named twice")));
     }
-    let places = ranges_by_file(&meta)?;
+    let level = reading.take_level();
+    let places = ranges_by_file(&meta, level.unwrap_or(0))?;
     let total = places.values().flatten().map(|place| u128::from(place.count)).sum::<u128>();
     check_count(u64::try_from(total).unwrap_or(u64::MAX))?;
     let mut all = Gaussians::default();
@@ -84,19 +87,29 @@ pub(super) fn read(
     reading.accept(all, &Field::plain_name)
 }
 
-/// The finest ranges of every file, in order, and checked not to overlap.
-fn ranges_by_file(meta: &LodMeta) -> Result<BTreeMap<usize, Vec<FileRange>>, IngestError> {
+/// The ranges of a level in every file, in order, and checked not to overlap.
+fn ranges_by_file(
+    meta: &LodMeta,
+    level: u32,
+) -> Result<BTreeMap<usize, Vec<FileRange>>, IngestError> {
     let mut places: BTreeMap<usize, Vec<FileRange>> = BTreeMap::new();
+    let mut levels = BTreeSet::new();
     let mut nodes = vec![&meta.tree];
     while let Some(node) = nodes.pop() {
         nodes.extend(&node.children);
-        if let Some(place) = node.lods.values().next() {
+        levels.extend(node.lods.keys());
+        let coarser = node.lods.range(level..).next();
+        if let Some((_, place)) = coarser.or_else(|| node.lods.last_key_value()) {
             if place.file >= meta.filenames.len() {
                 let reason = format!("file {}; there are {}", place.file, meta.filenames.len());
                 return Err(bad(NAME, reason));
             }
             places.entry(place.file).or_default().push(*place);
         }
+    }
+    // Level 0 is the finest that each leaf has, whatever its number is.
+    if level > 0 && !levels.contains(&level) {
+        return Err(IngestError::NoLevel { level, levels: levels.into_iter().collect() });
     }
     for (file, places) in &mut places {
         places.sort_by_key(|place| place.offset);

@@ -1,0 +1,95 @@
+//! Cameras that see nothing of their twin: a rig or a drive in other axes than the twin, which
+//! nothing else tells before the first session.
+
+use std::io::{self, Write};
+
+use wildcity_render::View;
+use wildcity_render::compare::images::render_images;
+use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_scene::Rig;
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::rig::RigCamera;
+use wildcity_session::OpenScene;
+use wildcity_twin::residency::Cache;
+use wildcity_twin::store::{Catalog, Version};
+
+/// Places that are looked from along each drive.
+const PLACES: usize = 6;
+/// Longer side of the images that are looked at, in pixels.
+const SIDE_PX: u32 = 64;
+/// Share of an image that must be opaque.
+const LEAST_SEEN: f64 = 0.01;
+
+/// Warns of the cameras of a version's rig that see nothing of it, at no place along its drives, or
+/// at the origin if it has none.
+pub(in crate::cli) fn warn(catalog: &Catalog, version: &Version) -> anyhow::Result<()> {
+    let Some(rig) = version.manifest.rig.as_ref().filter(|_| !version.manifest.chunks.is_empty())
+    else {
+        return Ok(());
+    };
+    // The version is published: what cannot be looked at is no error.
+    let text = match blind(catalog, version, rig) {
+        Ok(names) if names.is_empty() => return Ok(()),
+        Ok(names) => format!(
+            "these cameras see nothing of the twin, wherever the drive is: {}; look at the rig's camera_to_rig, and \
+             at the axes and the unit of the drive",
+            names.join(", ")
+        ),
+        Err(error) => format!("what the cameras see was not looked at: {error}"),
+    };
+    writeln!(io::stderr(), "warning: rig {}: {text}", rig.name)?;
+    Ok(())
+}
+
+/// The names of the cameras that see nothing.
+fn blind<'a>(catalog: &Catalog, version: &Version, rig: &'a Rig) -> anyhow::Result<Vec<&'a str>> {
+    let resident =
+        Cache::new(catalog.clone()).open(&version.manifest.twin, Some(version.number))?;
+    let scene = OpenScene::Twin(resident);
+    let profile = version.manifest.profile;
+    let backend = Cpu::new(0, Simd::Best)?;
+    let mut unseen: Vec<&RigCamera> = rig.cameras.iter().collect();
+    for place in places(version) {
+        let views = views(&unseen, &place)?;
+        let drawn = scene.scene(&views, &profile)?;
+        let images = render_images(&backend, &drawn, &profile, &views)?;
+        let mut seen = images.iter().map(|image| is_seen(&image.opacity));
+        // One image for each camera, in order.
+        unseen.retain(|_| !seen.next().unwrap_or(false));
+        if unseen.is_empty() {
+            break;
+        }
+    }
+    Ok(unseen.into_iter().map(|camera| camera.name.as_str()).collect())
+}
+
+fn is_seen(opacity: &[f32]) -> bool {
+    let opaque = opacity.iter().filter(|&&opacity| opacity > 0.5).count();
+    opaque as f64 >= LEAST_SEEN * opacity.len() as f64
+}
+
+/// Poses of the rig, evenly along each drive.
+fn places(version: &Version) -> Vec<Pose> {
+    let drives = &version.manifest.trajectories;
+    if drives.is_empty() {
+        return vec![Pose::IDENTITY];
+    }
+    let along = |at: usize, count: usize| at * (count - 1) / (PLACES - 1);
+    let keyframes = drives.iter().flat_map(|drive| {
+        let last = drive.keyframes.len();
+        (0..PLACES).map(move |at| drive.keyframes[along(at, last)].world_from_rig)
+    });
+    keyframes.collect()
+}
+
+fn views(cameras: &[&RigCamera], world_from_rig: &Pose) -> anyhow::Result<Vec<View>> {
+    cameras.iter().map(|camera| view(camera, world_from_rig)).collect()
+}
+
+fn view(camera: &RigCamera, world_from_rig: &Pose) -> anyhow::Result<View> {
+    let full = &camera.camera;
+    let shrink = f64::from(SIDE_PX) / f64::from(full.width_px.max(full.height_px));
+    let side = |full_px: u32| (f64::from(full_px) * shrink).ceil().max(1.0) as u64;
+    let small = full.scaled(side(full.width_px), side(full.height_px))?;
+    Ok(View::new(small, *world_from_rig * camera.rig_from_camera))
+}
