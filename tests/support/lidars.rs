@@ -246,7 +246,7 @@ pub(crate) fn coincident() -> (Scene, LidarView) {
         gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
         // An alpha of about a fifth, so that a return is made of some of them.
         gaussians.logit_opacities.push(-1.4);
-        gaussians.sh.extend([0.005 * at as f32; 3]);
+        gaussians.sh.extend([0.01 * (37 * at % 100) as f32; 3]);
     }
     let lidar = Arc::new(grid([0.2, -0.2], 32, [0.2, -0.2], 32));
     (Scene::from_gaussians(&gaussians), LidarView::at_rest(lidar, Pose::IDENTITY))

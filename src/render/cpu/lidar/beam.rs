@@ -6,9 +6,11 @@
 
 use fearless_simd::{f32x16, mask32x16, prelude::*, u32x16};
 
-use super::tile::LOOKS;
 use crate::lidar::HALF;
 use wildcity_scene::chunk::LANES;
+
+/// Candidates between two looks for the farthest beam of each row that has not returned nearer.
+pub(super) const LOOKS: usize = 16;
 
 /// Where 16 beams meet a Gaussian.
 pub(super) struct Crossing<S: Simd> {

@@ -278,8 +278,8 @@ impl Candidates {
         }
     }
 
-    /// The beams that may meet what is within bounds, in the tiles along a row that `see` it; `None`
-    /// if there is none.
+    /// The beams that may meet what is within bounds, in the tiles along a row that `see` it;
+    /// `None` if there is none.
     #[inline(always)]
     fn reach(
         &self,

@@ -2,7 +2,7 @@
 
 use fearless_simd::{f32x16, prelude::*};
 
-use super::beam::{BeamRow, Crossing};
+use super::beam::{BeamRow, Crossing, LOOKS};
 use super::candidates::{Candidate, Candidates};
 use super::sector::{BodySector, Sector};
 use crate::cpu::lanes::Vec3x16;
@@ -10,9 +10,6 @@ use crate::cpu::math::exp2;
 use crate::lidar::{Keys, LidarView, Sweep};
 use wildcity_scene::RenderProfile;
 use wildcity_scene::chunk::LANES;
-
-/// Candidates between two looks for the farthest beam of each row that has not returned nearer.
-pub(super) const LOOKS: usize = 16;
 
 /// The beams of a tile.
 pub(super) struct Tile {
