@@ -1,6 +1,6 @@
 //! Memory of chunks: pages of one cluster each, and a pool of pages that chunks have returned.
 //!
-//! Sections of a twin have 1 kB to 9 MB. If each is one block of the heap, sections that come and
+//! Sections of a twin have 1 kB to 140 MB. If each is one block of the heap, sections that come and
 //! go leave holes that the next ones do not fit into: 1,024 MiB of sections took 1,590 MiB of
 //! memory. All pages of an SH degree have one size, so any page fits in the place of another. Only
 //! the last page of a chunk may be smaller, so that a section of a few Gaussians takes no more than

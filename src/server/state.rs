@@ -47,6 +47,8 @@ pub(crate) struct ServerState {
     pub(crate) spool: Result<Arc<Spool>, String>,
     pub(crate) pushes: PushQueue,
     pub(crate) metrics: Metrics,
+    /// Held while the scenarios of a twin are listed.
+    pub(crate) scenario_listing: tokio::sync::Mutex<()>,
 }
 
 impl ServerState {

@@ -13,8 +13,12 @@ pub const EVENTS: usize = 64;
 // 2 x (64 x 600 + 20 x 80 + 1,000) = 82,000 bytes, of 98,304.
 pub const SCENARIO_HEADER_BYTES: usize = 96 << 10;
 
-/// Bytes of the maps whose lanes a listing of scenarios has, in all.
-pub const PLANNED_MAP_BYTES: usize = 16 << 20;
+/// Bytes of a map whose lanes a listing of scenarios has, and of all of them.
+pub const PLANNED_MAP_BYTES: usize = 4 << 20;
+pub const PLANNED_MAPS_BYTES: usize = 16 << 20;
+
+/// Scenarios that a listing reads.
+pub const PLANNED_SCENARIOS: usize = 256;
 
 /// Room for an actor: a name of 64 bytes, 14 numbers of at most 24 digits, and the names of the
 /// fields.

@@ -28,8 +28,8 @@ pub struct Picture {
     pub jpeg: Vec<u8>,
 }
 
-/// Pictures of the episodes that a comparison shows, before and now, by the name of the episode; or
-/// why there is none.
+/// Pictures of the episodes that a comparison shows, before and now, by scenario, values and seed;
+/// or why there is none.
 pub type ComparedPictures = BTreeMap<String, [Result<Picture, String>; 2]>;
 
 /// The pictures of the worst episodes of a run: of the step of their worst fault, by their first

@@ -184,12 +184,12 @@ pub const QUEUED_SECTIONS: usize = 1 << 18;
 /// MB and more, those of a street 100 kB.
 pub const READING_BYTES: u64 = 16 << 20;
 
-/// How long a section waits for others that are being read: longer than 100 MB take from a
-/// disk of 100 MB/s.
-pub const READING_WAIT: Duration = Duration::from_secs(2);
+/// How long a section waits for others that are being read: longer than 140 MB take from an object
+/// store of 20 MB/s.
+pub const READING_WAIT: Duration = Duration::from_secs(10);
 
-/// Most areas that the search for a twin's worst frame halves. 20 km of road are 320 cells of 64 m
-/// in a row; the larger areas above them are at most twice as many.
+/// Most areas that the search for a twin's worst frame halves. It is within the cells of 64 m: 20
+/// km of road have 320 of them in a row.
 pub const WORST_CASE_AREAS: usize = 4096;
 
 /// Number of worst frames, by rig and profile, that are remembered of a twin, so that further

@@ -15,7 +15,7 @@ use wildcity_scene::{Gaussians, RenderProfile, Scene};
 use crate::gpu::{bindings, gpu, gpu_with, gpu_with_limits};
 use crate::images::{cpu, view_along};
 use crate::lidars::{
-    check_classes, check_intensities, check_same, coincident, extremes, grid, in_motion,
+    check_classes, check_intensities, check_same, cloud, coincident, extremes, grid, in_motion,
     random_scene, same, spinning, stack, sweep, tables, turning, upright, with_actor,
 };
 use crate::shared_gpu;
@@ -41,7 +41,7 @@ fn sweeps_are_those_of_the_definition() {
     let mut cases = streets();
     cases.extend(extremes());
     cases.extend(turning());
-    cases.extend([faint(), crowded()]);
+    cases.extend([faint(), crowded(), cloud()]);
     for (number, (scene, view)) in cases.iter().enumerate() {
         let wanted = sweep(&Reference, scene, view);
         check_same(&sweep(&*gpu, scene, view), &wanted, &format!("case {number}"));

@@ -6,7 +6,7 @@ use wildcity_suite::{
     DrivenRun, Ending, ExitCode, Rule, SuiteResult, Tolerance,
 };
 
-use crate::street::Bench;
+use crate::street::{Bench, cpu};
 
 const DRIVING: &str = "bench2drive.driving@7ec25d1";
 const ADE: &str = "alpasim.min_ade_5s@3032e0c";
@@ -360,6 +360,26 @@ fn failures_for_another_reason_are_shown_and_not_counted() {
     let lines: Vec<&str> = text.lines().filter(|line| line.starts_with("other fault")).collect();
     assert_eq!(lines.len(), 1, "{text}");
     assert!(lines[0].contains("s-1") && lines[0].contains("contact.pedestrian"), "{text}");
+}
+
+#[test]
+fn pairs_of_one_name_have_their_own_pictures() {
+    let bench = Bench::new();
+    let before = statuses(&["failed"; 2]);
+    // Another value of the sweep at the same index, which alone is in the name.
+    let mut swept = Made { statuses: vec!["failed"; 2], ..Made::passing(0) }.value();
+    swept["episodes"][0]["values"] = json!({ "v": 8.0 });
+    let after = result(swept);
+    let found = compare(&before, &after, &[]);
+    let run = |result, out| DrivenRun { result, episodes: bench.path(out) };
+    let runs = [run(&before, "before"), run(&after, "after")];
+    let pictures = found.pictures(&runs, &bench.catalog(), &cpu());
+    assert_eq!(pictures.len(), 2, "{pictures:?}");
+    // Each pair says why its own record has no picture, not that the other run has none.
+    let page = found.to_page(&runs, &pictures);
+    assert_eq!(page.matches("<h3>s-0</h3>").count(), 2, "{page}");
+    assert_eq!(page.matches("No picture: ").count(), 2, "{page}");
+    assert!(!page.contains("it was not driven"), "{page}");
 }
 
 #[test]

@@ -13,7 +13,7 @@ use wildcity_render::{Backend, FIRST_ACTOR_INSTANCE};
 use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::geometry::{Lidar, Pose};
 use wildcity_scene::random::Random;
-use wildcity_scene::{Gaussians, RenderProfile, Scene, SemanticClass};
+use wildcity_scene::{Chunk, Gaussians, RenderProfile, Scene, SemanticClass};
 
 use crate::data::real;
 use crate::placed::labelled;
@@ -244,8 +244,9 @@ pub(crate) fn coincident() -> (Scene, LidarView) {
         gaussians.means_m.push([6.0, if at == 299 { 20.0 } else { 0.0 }, 0.0]);
         gaussians.ln_scales.push([0.0; 3]);
         gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
-        // An alpha of about a fifth, so that a return is made of some of them.
-        gaussians.logit_opacities.push(-1.4);
+        // An alpha of a fifth and less, so that a return is made of some of them, and others at its
+        // place leave more than half of the light in front of it.
+        gaussians.logit_opacities.push(-1.4 - 0.02 * at as f32);
         gaussians.sh.extend([0.01 * (37 * at % 100) as f32; 3]);
     }
     let lidar = Arc::new(grid([0.2, -0.2], 32, [0.2, -0.2], 32));
@@ -273,7 +274,30 @@ pub(crate) fn cloud() -> (Scene, LidarView) {
         world_from_lidar: Pose::IDENTITY,
         world_from_lidar_first: Pose { position_m: DVec3::new(-2.0, 0.5, 0.1), ..Pose::IDENTITY },
     };
-    (Scene::from_gaussians(&gaussians), view)
+    let mut scene = Scene::from_gaussians(&gaussians);
+    // Actors within the cloud, and behind it, that move during the sweep.
+    for (actor, x) in [7.0, 9.0, 40.0].into_iter().enumerate() {
+        let end = Pose { position_m: DVec3::new(x, 0.8, 0.0), ..Pose::IDENTITY };
+        let start = Pose { position_m: DVec3::new(x, -0.8, 0.0), ..Pose::IDENTITY };
+        let placed = PlacedChunk::at_rest(Arc::new(ball(500)), end, actor as u16);
+        scene.placed.push(PlacedChunk { world_from_actor_at_start: start, ..placed });
+    }
+    (scene, view)
+}
+
+/// A ball of a radius of 0.7 m.
+fn ball(count: usize) -> Chunk {
+    let mut gaussians = Gaussians::with_capacity(0, count);
+    let mut random = Random::new(6, "ball", 0);
+    for _ in 0..count {
+        let place = DVec3::from_array([0, 1, 2].map(|_| random.range(-1.0, 1.0)));
+        gaussians.means_m.push((0.7 * place.normalize_or(DVec3::X)).to_array());
+        gaussians.ln_scales.push([-3.0; 3]);
+        gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+        gaussians.logit_opacities.push(2.0);
+        gaussians.sh.extend([0.9; 3]);
+    }
+    Scene::single_chunk(&gaussians)
 }
 
 /// Requires that all beams see the same luminance.

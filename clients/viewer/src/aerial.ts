@@ -13,7 +13,7 @@ const SIDE_PX = 960;
 const MARGIN_M = 15;
 /** Around the drives under a map, which the ego at their end has in its middle. */
 const MAP_MARGIN_M = 60;
-/** A longer drive gets no picture: the server would load the whole city for it. */
+/** What is wider gets no picture: the server would load the whole city for it. */
 const MOST_M = 1500;
 
 /** A picture with north up. */
@@ -42,8 +42,18 @@ export function over(points: Vector[], { width, height, fx }: Camera, margin = M
 }
 
 function range(points: Vector[], axis: 0 | 1 | 2): [number, number] {
-  const values = points.map((point) => point[axis]);
-  return [Math.min(...values), Math.max(...values)];
+  let [low, high] = [Infinity, -Infinity];
+  // A loop: the points of a large map are too many for the arguments of one call.
+  for (const { [axis]: value } of points) {
+    low = Math.min(low, value);
+    high = Math.max(high, value);
+  }
+  return [low, high];
+}
+
+/** Whether points are too far apart for a picture of all of them. */
+export function isTooWide(points: Vector[]): boolean {
+  return [range(points, 0), range(points, 1)].some(([low, high]) => high - low > MOST_M);
 }
 
 /** What the camera of a session sees from a pose. */
@@ -65,7 +75,7 @@ export async function picture(client: Client, pose: Pose, text: string): Promise
 export async function aerial(twin: string, version: number, points: Vector[]): Promise<Aerial | undefined> {
   const from = camera("above", SIDE_PX, SIDE_PX);
   const pose = over(points, from, MAP_MARGIN_M);
-  if (!pose || [range(points, 0), range(points, 1)].some(([low, high]) => high - low > MOST_M)) return undefined;
+  if (!pose || isTooWide(points)) return undefined;
   const client = new Client();
   try {
     await client.connect();

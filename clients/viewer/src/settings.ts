@@ -32,12 +32,15 @@ export function parseStored(text: string | null): Stored {
 
 /** Adds the scenarios of the server; one may be chosen already. */
 async function fillScenarios(select: HTMLSelectElement, chosen: string): Promise<void> {
+  let names: string[] = [];
   try {
-    const { scenarios } = await get<{ scenarios: string[] }>("v1/scenarios");
-    select.append(...scenarios.map((name) => el("option", { value: name, selected: name === chosen }, name)));
+    names = (await get<{ scenarios: string[] }>("v1/scenarios")).scenarios;
   } catch (error) {
     select.title = `The scenarios cannot be listed: ${messageOf(error)}`;
   }
+  // The list is empty for a token of some twins; the scenario that is in use is shown all the same.
+  if (chosen !== "" && !names.includes(chosen)) names.push(chosen);
+  select.append(...names.map((name) => el("option", { value: name, selected: name === chosen }, name)));
 }
 
 export class Settings {

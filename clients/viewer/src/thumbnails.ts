@@ -1,7 +1,7 @@
 // Two small pictures of each twin on the first page: ahead from the start of its drive, and from above with its drives and
 // the lanes of its scenarios, of which one can be chosen.
 
-import { camera, over, picture } from "./aerial";
+import { camera, isTooWide, over, picture } from "./aerial";
 import { Client } from "./client";
 import { colour, el, messageOf } from "./dom";
 import type { TwinInfo } from "./messages";
@@ -90,13 +90,17 @@ export class Thumbnails {
     }
   }
 
-  /** The picture from above, if the twin has a drive or lanes, and the list of its scenarios, if it has any. */
+  /**
+   * The picture from above, if the twin has a drive or lanes that fit into one, and the list of its
+   * scenarios, if it has any.
+   */
   private async above(client: Client, twin: TwinInfo, ground: number): Promise<HTMLElement[]> {
     const drives = await Promise.all(twin.trajectories.map(({ name, length_m: length }) => points(twin, name, length)));
     const { scenarios, maps } = await get<TwinScenarios>(`v1/twins/${twin.name}/scenarios`);
     const lanes = (map: string): Vector[][] => (maps[map] ?? []).map((ring) => ring.map(([east, north]) => [east, north, ground]));
     const all = Object.keys(maps).flatMap(lanes);
-    const pose = over(drives.length ? drives.flat() : all.flat(), CAMERA);
+    const around = drives.length ? drives.flat() : all.flat();
+    const pose = isTooWide(around) ? undefined : over(around, CAMERA);
     const elements: HTMLElement[] = [];
     let show: (rings: Vector[][]) => void = () => {};
     if (pose) {

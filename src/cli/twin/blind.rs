@@ -13,8 +13,10 @@ use wildcity_session::OpenScene;
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, Version};
 
-/// Places that are looked from along each drive.
+/// Places that are looked from along each drive, at most.
 const PLACES: usize = 6;
+/// Places that are looked from in all, at most: each is rendered while a camera sees nothing.
+const MOST_PLACES: usize = 24;
 /// Longer side of the images that are looked at, in pixels.
 const SIDE_PX: u32 = 64;
 /// Share of an image that must be opaque.
@@ -27,13 +29,15 @@ pub(in crate::cli) fn warn(catalog: &Catalog, version: &Version) -> anyhow::Resu
     else {
         return Ok(());
     };
+    let places = places(version);
     // The version is published: what cannot be looked at is no error.
-    let text = match blind(catalog, version, rig) {
+    let text = match blind(catalog, version, rig, &places) {
         Ok(names) if names.is_empty() => return Ok(()),
         Ok(names) => format!(
             "these cameras see nothing of the twin, wherever the drive is: {}; look at the rig's camera_to_rig, and \
-             at the axes and the unit of the drive",
-            names.join(", ")
+             at the axes and the unit of the drive (places looked from: {})",
+            names.join(", "),
+            places.len()
         ),
         Err(error) => format!("what the cameras see was not looked at: {error}"),
     };
@@ -41,16 +45,21 @@ pub(in crate::cli) fn warn(catalog: &Catalog, version: &Version) -> anyhow::Resu
     Ok(())
 }
 
-/// The names of the cameras that see nothing.
-fn blind<'a>(catalog: &Catalog, version: &Version, rig: &'a Rig) -> anyhow::Result<Vec<&'a str>> {
+/// The names of the cameras that see nothing from any of the places.
+fn blind<'a>(
+    catalog: &Catalog,
+    version: &Version,
+    rig: &'a Rig,
+    places: &[Pose],
+) -> anyhow::Result<Vec<&'a str>> {
     let resident =
         Cache::new(catalog.clone()).open(&version.manifest.twin, Some(version.number))?;
     let scene = OpenScene::Twin(resident);
     let profile = version.manifest.profile;
     let backend = Cpu::new(0, Simd::Best)?;
     let mut unseen: Vec<&RigCamera> = rig.cameras.iter().collect();
-    for place in places(version) {
-        let views = views(&unseen, &place)?;
+    for place in places {
+        let views = views(&unseen, place)?;
         let drawn = scene.scene(&views, &profile)?;
         let images = render_images(&backend, &drawn, &profile, &views)?;
         let mut seen = images.iter().map(|image| is_seen(&image.opacity));
@@ -68,18 +77,24 @@ fn is_seen(opacity: &[f32]) -> bool {
     opaque as f64 >= LEAST_SEEN * opacity.len() as f64
 }
 
-/// Poses of the rig, evenly along each drive.
+/// Poses of the rig, evenly along each drive, and evenly over all drives if those are too many.
 fn places(version: &Version) -> Vec<Pose> {
     let drives = &version.manifest.trajectories;
     if drives.is_empty() {
         return vec![Pose::IDENTITY];
     }
-    let along = |at: usize, count: usize| at * (count - 1) / (PLACES - 1);
-    let keyframes = drives.iter().flat_map(|drive| {
-        let last = drive.keyframes.len();
-        (0..PLACES).map(move |at| drive.keyframes[along(at, last)].world_from_rig)
+    let along_each = drives.iter().flat_map(|drive| {
+        let chosen = spread(drive.keyframes.len(), PLACES);
+        chosen.map(move |at| drive.keyframes[at].world_from_rig)
     });
-    keyframes.collect()
+    let all: Vec<Pose> = along_each.collect();
+    spread(all.len(), MOST_PLACES).map(|at| all[at]).collect()
+}
+
+/// Indices of at most this many of `count` things, evenly from the first to the last one.
+fn spread(count: usize, most: usize) -> impl Iterator<Item = usize> {
+    let chosen = count.min(most);
+    (0..chosen).map(move |at| at * (count - 1) / (chosen - 1).max(1))
 }
 
 fn views(cameras: &[&RigCamera], world_from_rig: &Pose) -> anyhow::Result<Vec<View>> {

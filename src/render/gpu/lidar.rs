@@ -117,7 +117,7 @@ pub(super) struct SweepKernels {
 const IN_FLIGHT: usize = 4;
 
 /// Candidates of a sector that the device gets at a time, with room for a cluster more. They, and
-/// their places in the lists of tiles, are in memory at once, 6 to 15 MB.
+/// their places in the lists of tiles, are in memory at once, 6 to 23 MB.
 const BATCH: usize = 1 << 15;
 
 /// What the device gets of a sector at a time: candidates of one body.
@@ -455,7 +455,7 @@ mod tests {
             whiten_x,
             reach2,
             whiten_y,
-            nearest_m: reach.nearest_m,
+            nearest_m,
             whiten_z,
             luminance,
             rows,

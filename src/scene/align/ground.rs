@@ -77,8 +77,11 @@ const LEAST_PERCENT: u32 = 4;
 /// Radius of a core as a share of that of the next larger one: the pavement of an object is a small
 /// part of cores that are much larger, and not in those that are smaller.
 const SHRINK: f64 = 0.75;
-/// The smallest core has this part of the scene's opaque Gaussians.
-const LEAST_CORE: usize = 16;
+/// Share of the scene's opaque Gaussians that a core must have.
+const LEAST_CORE_SHARE: f64 = 1.0 / 16.0;
+/// Cores that are searched, at most: the last one has a thousandth of the first one's radius. Size
+/// alone would not end it soon, as Gaussians at one place are in each core around it.
+const MOST_CORES: usize = 24;
 /// Share of what stands above a plane that is its object; the rest is what stands around it.
 const OBJECT_SHARE: f64 = 0.8;
 /// Least share of a plane that is farther out than its object.
@@ -133,13 +136,18 @@ pub fn find_ground(
         Err(error @ GroundError::NoPlane { .. }) => error,
         found => return found,
     };
-    let least = whole.len() / LEAST_CORE;
+    let least = (LEAST_CORE_SHARE * whole.len() as f64) as usize;
     let mut core = Core::half(gaussians, &whole);
-    while core.gaussians.len() >= least.max(1) {
-        if let Ok(plane) = ground_in(gaussians, &core.gaussians, search, &surrounds) {
-            return Ok(plane);
+    for _ in 0..MOST_CORES {
+        if core.gaussians.len() < least.max(1) {
+            break;
         }
-        core = core.shrunk(gaussians);
+        match ground_in(gaussians, &core.gaussians, search, &surrounds) {
+            Ok(plane) => return Ok(plane),
+            // Nearly all of it is at one place, where the smaller cores are too.
+            Err(GroundError::TooFew { .. }) => break,
+            Err(GroundError::NoPlane { .. }) => core = core.shrunk(gaussians),
+        }
     }
     Err(none)
 }

@@ -60,7 +60,8 @@ const MOST_COST: f64 = 0.02;
 const BLUR_PX2: f64 = 0.3;
 
 /// The levels of a block above level 0, each coarser than the previous one; none if merging reduces
-/// the number of Gaussians too little. One is made at a time, and the block is no longer needed.
+/// the number of Gaussians too little. One is made at a time; unmerged Gaussians stay in the
+/// block.
 pub fn levels(block: &Chunk) -> impl Iterator<Item = Level> {
     let mut merging = Merging::new(block);
     let mut last = block.len();

@@ -55,8 +55,9 @@ const HEAD_RECORD: u64 = wildcity_episode::limits::HEAD_BYTES as u64
 const SCENARIO: u64 = 2 * PARSED * sim::SCENARIO_BYTES as u64 + sim::SCENARIO_OBJECTS as u64 * 1024;
 /// 12 bytes a pixel while overlays are decoded.
 const OVERLAYS: u64 = 12 * (1 << 24);
-/// A scenario at a time; maps as text, as values, as outlines, and as an answer.
-const PLAN: u64 = SCENARIO + 4 * session::PLANNED_MAP_BYTES as u64;
+/// A scenario and a map at a time as values; maps as outlines, and as an answer.
+const PLAN: u64 =
+    SCENARIO + PARSED * session::PLANNED_MAP_BYTES as u64 + 4 * session::PLANNED_MAPS_BYTES as u64;
 const LIST: u64 = limits::LISTED_EPISODES as u64 * 1024;
 
 /// Messages over the WebSocket.
@@ -109,7 +110,13 @@ const ROUTES: [Cost; 35] = [
     cost("GET /v1/twins/{twin}/pushes/{id}", MIB, NONE, 0, "a push"),
     cost("DELETE /v1/twins/{twin}/pushes/{id}", 0, NONE, 0, "a mark"),
     cost("GET /v1/scenarios", MIB, NONE, 0, "4 KiB of a file at a time"),
-    cost("GET /v1/twins/{twin}/scenarios", PLAN, NONE, 0, "maps of 16 MiB in all"),
+    cost(
+        "GET /v1/twins/{twin}/scenarios",
+        PLAN,
+        NONE,
+        0,
+        "one at a time; 256 scenarios, maps of 16 MiB",
+    ),
     cost("GET /v1/actors", MIB, NONE, 0, "assets"),
     cost("GET /v1/actors/{actor}", MIB, NONE, 0, "an asset"),
     cost("POST /v1/actors", JSON, CHECK, limits::UPLOAD_BYTES, "counts as a push"),

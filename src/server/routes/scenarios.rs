@@ -13,6 +13,7 @@ use crate::fault::Fault;
 use crate::state::ServerState;
 
 use super::refusal::HttpResult;
+use wildcity_twin::store::StoreError;
 
 /// `GET /v1/scenarios`: names that `open` knows. A token that is limited to some twins gets none,
 /// because a name may tell of others.
@@ -32,6 +33,13 @@ pub(super) async fn in_twin(
     Path(twin): Path<String>,
 ) -> HttpResult {
     let scenarios = state.engine.scenarios().clone();
-    let found = blocking(move || Ok::<_, Fault>(scenarios.in_twin(&twin))).await?;
-    Ok(Json(found).into_response())
+    let catalog = state.engine.catalog().clone();
+    // One listing at a time: each parses files of the server.
+    let _permit = state.scenario_listing.lock().await;
+    let listing = blocking(move || {
+        // A misspelt twin is an error, and not one without scenarios.
+        catalog.version(&twin, None)?;
+        Ok::<_, StoreError>(scenarios.in_twin(&twin))
+    });
+    Ok(Json(listing.await?).into_response())
 }

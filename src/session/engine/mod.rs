@@ -409,8 +409,13 @@ impl Engine {
     ) -> FrameBytes {
         let is_large = sample_count(views, profile) > limits::LARGE_SAMPLES;
         let backend = self.queue.backend();
-        // Only small frames are rendered beside another one, see `render_queue`.
-        let beside = if is_large { 0 } else { backend.bytes_beside(views, profile) + rendered };
+        // Only small frames are rendered beside another one, see `render_queue`: of a large frame,
+        // its cameras one by one.
+        let side_bytes = |views: &[View]| backend.bytes_beside(views, profile) + rendered;
+        let is_small = |views: &&[View]| sample_count(views, profile) <= limits::LARGE_SAMPLES;
+        let alone =
+            || views.iter().map(std::slice::from_ref).filter(is_small).map(side_bytes).max();
+        let beside = if is_large { alone().unwrap_or(0) } else { side_bytes(views) };
         let stages = backend.frame_bytes(views, profile) + rendered;
         FrameBytes { stages, beside, is_large, images }
     }

@@ -1,6 +1,6 @@
 //! What the scenarios of a twin look like from above, before one of them is opened.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Serialize;
 
@@ -15,6 +15,11 @@ pub struct TwinScenarios {
     pub scenarios: Vec<PlannedScenario>,
     /// By the name of a map: outlines of its lanes for cars, each a ring of x and y, in metres.
     pub maps: BTreeMap<String, Vec<Vec<[f64; 2]>>>,
+    /// Maps that cannot be read here, or that are too large.
+    pub omitted_maps: BTreeSet<String>,
+    /// Scenarios of the server that were not looked at: only the first
+    /// [`limits::PLANNED_SCENARIOS`] are.
+    pub omitted_scenarios: usize,
 }
 
 /// A scenario of a twin.
@@ -28,28 +33,51 @@ pub struct PlannedScenario {
 
 impl Scenarios {
     /// The scenarios that play in a twin, in order. A scenario that cannot be read is not listed:
-    /// it says no twin. A map is left out that cannot be read, or with which all maps would have
-    /// more than [`limits::PLANNED_MAP_BYTES`]; opening the scenario says what is wrong.
+    /// it says no twin. A map is omitted that cannot be read, that has more than
+    /// [`limits::PLANNED_MAP_BYTES`], or with which all have more than
+    /// [`limits::PLANNED_MAPS_BYTES`]; opening the scenario says what is wrong.
     pub fn in_twin(&self, twin: &str) -> TwinScenarios {
-        let mut found = TwinScenarios::default();
-        let mut left_bytes = limits::PLANNED_MAP_BYTES;
-        for name in self.names() {
+        let names = self.names();
+        let omitted_scenarios = names.len().saturating_sub(limits::PLANNED_SCENARIOS);
+        let mut found = TwinScenarios { omitted_scenarios, ..TwinScenarios::default() };
+        let mut left_bytes = limits::PLANNED_MAPS_BYTES;
+        for name in names.into_iter().take(limits::PLANNED_SCENARIOS) {
             let source = ScenarioSource::Named(name.clone());
             let Ok(file) = self.file(&source, &BTreeMap::new()) else { continue };
             if file.twin.name != twin {
                 continue;
             }
             let map = file.map.map(|pin| pin.file);
-            if let Some(map) = map.as_ref().filter(|map| !found.maps.contains_key(*map))
-                && let Ok(bytes) = self.read("map.file", map, left_bytes)
-                && let Ok(parsed) = MapFile::parse(&bytes)
-            {
-                left_bytes -= bytes.len();
-                found.maps.insert(map.clone(), outlines(&parsed));
+            if let Some(map) = map.as_ref().filter(|map| !found.has_tried(map)) {
+                match self.lanes(map, &mut left_bytes) {
+                    Some(lanes) => {
+                        found.maps.insert(map.clone(), lanes);
+                    }
+                    None => {
+                        found.omitted_maps.insert(map.clone());
+                    }
+                }
             }
             found.scenarios.push(PlannedScenario { name, map });
         }
         found
+    }
+
+    /// The lanes of a map; `None` if it cannot be read, or is longer than a map may be or than what
+    /// is left for maps.
+    fn lanes(&self, map: &str, left_bytes: &mut usize) -> Option<Vec<Vec<[f64; 2]>>> {
+        let most_bytes = limits::PLANNED_MAP_BYTES.min(*left_bytes);
+        let bytes = self.read("map.file", map, most_bytes).ok()?;
+        // Also of a map that cannot be parsed: it is read but once.
+        *left_bytes -= bytes.len();
+        Some(outlines(&MapFile::parse(&bytes).ok()?))
+    }
+}
+
+impl TwinScenarios {
+    /// Whether a map was looked at.
+    fn has_tried(&self, map: &str) -> bool {
+        self.maps.contains_key(map) || self.omitted_maps.contains(map)
     }
 }
 

@@ -413,7 +413,7 @@ impl Session {
         }
         for capture in captures {
             // All cameras, or one after the other if there is only memory for one view's scene.
-            for cameras in capture.cameras.chunks(self.reservation.views_at_once()) {
+            for cameras in capture.cameras.chunks(self.views_at_once(version)) {
                 let part = RigCapture { cameras: cameras.to_vec(), ..capture.clone() };
                 builder = self.render_part(version, simulation, part, builder, deadline).await?;
             }
@@ -434,6 +434,15 @@ impl Session {
         }
         let (held_bytes, limit_bytes) = version.resident.memory();
         builder.finish(history, held_bytes, limit_bytes)
+    }
+
+    /// Most views that a frame of a version may draw at a time.
+    fn views_at_once(&self, version: &PinnedVersion) -> usize {
+        // The memory for another version is reserved after its first frame.
+        if self.settings.may_split() && !version.has_same_version(&self.version) {
+            return 1;
+        }
+        self.reservation.views_at_once()
     }
 
     /// Renders the cameras of a part of a capture, in one frame.

@@ -107,7 +107,7 @@ fn drives(
         @for episode in shown(comparison) {
             h3 { (episode.name) }
             div.beside {
-                @let [before, now] = pictures.get(&episode.name).map_or([None; 2], |both| both.each_ref().map(Some));
+                @let [before, now] = pictures.get(&episode.picture_key()).map_or([None; 2], |both| both.each_ref().map(Some));
                 (side("before", episode, episode.before.as_ref(), &runs[0], before))
                 (side("now", episode, episode.after.as_ref(), &runs[1], now))
             }

@@ -239,6 +239,13 @@ impl Side {
 }
 
 impl ComparedEpisode {
+    /// What its pictures are found by: its scenario, values and seed as JSON. Two pairs may share a
+    /// name, which has the index of a sweep's values and not the values.
+    pub(super) fn picture_key(&self) -> String {
+        // A map with text keys: writing it into memory cannot fail.
+        serde_json::to_string(&(&self.scenario, &self.values, self.seed)).unwrap_or_default()
+    }
+
     /// The change, in words.
     pub(super) fn text(&self) -> String {
         match (&self.before, &self.after, &self.differs) {

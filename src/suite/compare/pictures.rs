@@ -27,7 +27,7 @@ pub(super) fn compared_pictures(
         let draw = |entry: Result<&EpisodeEntry, String>, run: &DrivenRun<'_>| {
             picture(entry?, time_us, &run.episodes, &cache, backend)
         };
-        (of.name.clone(), [draw(before, &runs[0]), draw(now, &runs[1])])
+        (of.picture_key(), [draw(before, &runs[0]), draw(now, &runs[1])])
     };
     shown.iter().map(of_pair).collect()
 }

@@ -118,7 +118,9 @@ pub fn read_limited(
         BufReader::with_capacity(BUFFER_BYTES, HashReader::new(file, limits.stop.clone()));
     let mut reading = Reading::new(limits);
     let reader = &mut reading;
-    let gaussians = match Format::detect(input.fill_buf()?)? {
+    let format = Format::detect(input.fill_buf()?)?;
+    format.check_level(limits.level)?;
+    let gaussians = match format {
         Format::Json => {
             let parts = PartFiles::new(path, limits, progress);
             return read_parts(input, file_bytes, parts, reading, MultiFileFormat::Json);
@@ -246,6 +248,15 @@ impl Format {
                 return Err(IngestError::UnknownFormat { start });
             }
         })
+    }
+
+    /// Refuses a level of detail, before all of the file is read, if the format has none. A JSON
+    /// file or an archive may still be another scene than a streamed SOG.
+    fn check_level(self, level: Option<u32>) -> Result<(), IngestError> {
+        match (self, level) {
+            (_, None) | (Self::Json | Self::Zip, _) => Ok(()),
+            (_, Some(level)) => Err(IngestError::NoLevels { level }),
+        }
     }
 }
 

@@ -301,8 +301,9 @@ impl Shared {
     fn load(&self, id: SlotId, section: SectionRef, version: &Version) -> Notifications {
         let chunk = &version.manifest.chunks[section.chunk];
         let section = &chunk.sections[section.section];
-        let began = Instant::now();
         let reading = self.begin_reading(section.bytes.into());
+        // Without the wait: prefetching looks as far ahead as loads take long.
+        let began = Instant::now();
         // A defect in loading one section must not end the thread that loads all of them.
         let read = || self.source.section(version, chunk, section);
         // A panic cannot leave broken state behind: the source gets only shared references, and the

@@ -86,6 +86,7 @@ impl Machine {
             engine: self.engine.clone(),
             sessions: SessionRegistry::new(limits.sessions, limits.resume_grace),
             websocket_permits: Arc::new(Semaphore::new(limits.connections)),
+            scenario_listing: tokio::sync::Mutex::default(),
             stopping,
             limits,
             profile: Default::default(),

@@ -126,7 +126,9 @@ impl BeamRow {
                 key: meets.select(key, u32x16::splat(simd, NO_KEY)),
             },
         );
-        let ends = meets & left.simd_le(f32x16::splat(simd, HALF as f32));
+        // The product is in the order of comparison, and `end` has it in the order of ranges: a
+        // little more than half, so that rounding leaves out no return.
+        let ends = meets & left.simd_le(f32x16::splat(simd, (1.0 + 1e-4) * HALF as f32));
         if ends.any_true() {
             self.end(simd, ends);
             return true;

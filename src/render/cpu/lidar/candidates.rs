@@ -5,8 +5,9 @@
 //! coordinates. No angle has to be computed, and no bound is linearised.
 //!
 //! Clusters are searched from the nearest, and beams are compared with what was found whenever it
-//! is a batch. So beams have returned from the fronts of houses before what is behind them is
-//! searched: most of it is never read.
+//! is a batch. So on the cpu, beams have returned from the fronts of houses before what is behind
+//! them is searched: most of it is never read. A device compares after the search, and beams are
+//! followed to the LiDAR's range meanwhile.
 
 use fearless_simd::{Level, dispatch, f32x16, prelude::*};
 use glam::{Vec2, Vec3};
@@ -209,7 +210,7 @@ impl Candidates {
             a.reach.nearest_m.total_cmp(&b.reach.nearest_m).then_with(by_place)
         });
         for SeenCluster { reach, chunk, cluster } in clusters.drain(..) {
-            if !self.is_followed(sector, &reach) {
+            if !self.is_followed(&reach, sector.tiles.len()) {
                 continue;
             }
             let (number, _, chunk) = search.chunks[chunk as usize];
@@ -225,6 +226,9 @@ impl Candidates {
 
     /// Compares beams with what was found, and forgets it.
     fn compare(&mut self, sector: &Sector, compare: &mut impl FnMut(&mut Self)) {
+        if self.list.is_empty() {
+            return;
+        }
         self.list_by_tile(sector.tiles.len());
         compare(self);
         self.list.clear();
@@ -305,13 +309,13 @@ impl Candidates {
                 reach.tiles |= 1 << tile;
             }
         }
-        self.is_followed(sector, &reach).then_some(reach)
+        self.is_followed(&reach, sector.tiles.len()).then_some(reach)
     }
 
-    /// Whether a beam is followed far enough to meet it.
+    /// Whether a beam is followed far enough to meet it; a row has so many tiles.
     #[inline(always)]
-    fn is_followed(&self, sector: &Sector, reach: &Reach) -> bool {
-        let mut lists = reach.lists(sector.tiles.len());
+    fn is_followed(&self, reach: &Reach, tiles: usize) -> bool {
+        let mut lists = reach.lists(tiles);
         lists.any(|list| self.ends_m[list] >= reach.nearest_m)
     }
 
@@ -613,4 +617,46 @@ fn quotient<S: Simd>(
     negative: f32x16<S>,
 ) -> f32x16<S> {
     edge / edge.simd_gt(f32x16::splat(simd, 0.0)).select(positive, negative)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn reach(nearest_m: f32, rows: [u16; 2], tiles: u16, middle_m: f32) -> Reach {
+        Reach { nearest_m, rows, tiles, bucket: bucket(middle_m) }
+    }
+
+    #[test]
+    fn tiles_list_what_begins_before_their_ends() {
+        // Two tiles along a row, and two rows of tiles.
+        let reaches = vec![
+            reach(9.9, [0, 16], 0b11, 12.0),
+            reach(10.0, [0, 17], 0b01, 11.0),
+            reach(10.001, [0, 32], 0b11, 10.5),
+            reach(1.0, [16, 32], 0b10, 5.0),
+        ];
+        let found = Candidates {
+            reaches,
+            lists: vec![Vec::new(); 4],
+            ends_m: vec![10.0, 10.0, 20.0, 0.5],
+            ..Candidates::default()
+        };
+        let follows: Vec<bool> =
+            found.reaches.iter().map(|reach| found.is_followed(reach, 2)).collect();
+        assert_eq!(follows, [true, true, true, false]);
+        let mut listed = found;
+        listed.list_by_tile(2);
+        assert_eq!(listed.lists, [vec![1, 0], vec![0], vec![2, 1], vec![]]);
+    }
+
+    #[test]
+    fn buckets_rise_with_distances() {
+        let distances = [0.0, 1e-9, 0.2, 0.26, 1.0, 1.02, 7.0, 100.0, 3e3, f32::MAX];
+        let found = distances.map(bucket);
+        assert!(found.is_sorted(), "{found:?}");
+        assert_eq!(found[..3], [0; 3]);
+        assert!(found[3] < found[4] && found[4] < found[5] && found[7] < found[8]);
+        assert!(usize::from(found[9]) < BUCKETS);
+    }
 }

@@ -63,8 +63,8 @@ impl<T> FairQueue<T> {
         // well.
         let before = self.finished.get(&cost.session).copied().unwrap_or_default();
         let start = before.max(self.virtual_time);
-        // A frame without samples costs 1, so that its tag rises too. At 2²⁷ samples a frame, tags
-        // saturate after 2³⁷ frames.
+        // A frame without samples costs 1, so that its tag rises too. At 2²⁹ samples a frame, tags
+        // saturate after 2³⁵ frames.
         let finish = start.saturating_add(cost.samples.max(1));
         self.finished.insert(cost.session, finish);
         self.arrivals += 1;

@@ -199,7 +199,7 @@ impl Shared {
         // Small frames are not refused for their time: it is not measured, and short.
         if is_large(cost) {
             // On average, half of a frame that is being rendered is still to be done. The sum has
-            // at most 2⁹ frames of 2²⁷ samples.
+            // at most 2⁹ frames of 2²⁹ samples.
             let before = state.rendering / 2 + state.queue.samples_above(limits::LARGE_SAMPLES);
             if Instant::now() + state.time_for(before.saturating_add(cost.samples)) > job.deadline {
                 return Err(SessionError::Busy { what: "samples queued" });
