@@ -246,7 +246,7 @@ pub(crate) fn coincident() -> (Scene, LidarView) {
         gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
         // An alpha of a fifth and less, so that a return is made of some of them, and others at its
         // place leave more than half of the light in front of it.
-        gaussians.logit_opacities.push(-1.4 - 0.02 * at as f32);
+        gaussians.logit_opacities.push(-1.4 - 0.012 * at as f32);
         gaussians.sh.extend([0.01 * (37 * at % 100) as f32; 3]);
     }
     let lidar = Arc::new(grid([0.2, -0.2], 32, [0.2, -0.2], 32));

@@ -206,6 +206,8 @@ def test_has_the_sweeps_of_its_lidar(connect: Connect, server: Server) -> None:
             here = session.opened.start
             observation = session.step(here @ Pose.flat(2.0, 0.0))
             cloud = observation.lidars["top"]
+            with pytest.raises(KeyError, match="'roof'.*there is top"):
+                _ = observation.lidars["roof"]
             assert not session.observe([here]).lidars
         with client.open("corridor", rig=rig, outputs=dataclasses.replace(RAW, semantics=True)) as session:
             labelled = session.reset().lidars["top"]

@@ -125,8 +125,9 @@ class Observation:
 
     @property
     def lidars(self) -> Mapping[str, PointCloud]:
-        """The sweep of each LiDAR of the rig, by its name; empty after `observe`."""
-        return {sweep.lidar: PointCloud(self._content, sweep) for sweep in self.metadata.sweeps}
+        """The sweep of each LiDAR of the rig, by its name; empty after `observe` and between decisions."""
+        sweeps = self.metadata.sweeps
+        return _Sweeps({sweep.lidar: PointCloud(self._content, sweep) for sweep in sweeps})
 
     def frames(self, camera: str) -> NDArray[np.uint8]:
         """uint8 [k, height, width, 3]: the last k frames of a camera, oldest first.
@@ -359,6 +360,14 @@ class PointCloud:
     def __repr__(self) -> str:
         m = self.metadata
         return f"<PointCloud {m.lidar}: {m.returns} of {m.rows} x {m.columns} beams, to {m.end_us} us>"
+
+
+class _Sweeps(dict[str, PointCloud]):
+    """Sweeps by the names of their LiDARs."""
+
+    def __missing__(self, name: str) -> PointCloud:
+        known = ", ".join(self) or "none: open the session with a rig that has one, such as 'vehicle6-lidar'"
+        raise KeyError(f"no sweep of a LiDAR {name!r} in this observation; there is {known}")
 
 
 class _LazyArrays(Mapping[str, NDArray[Any]]):
