@@ -79,6 +79,9 @@ async fn the_scenarios_of_a_twin_have_the_lanes_of_their_maps() {
     };
     write("on-road", "test", Some("road.map.json"));
     write("lost", "test", Some("gone.map.json"));
+    write("bad-map", "test", Some("bad.map.json"));
+    write("bad-map-too", "test", Some("bad.map.json"));
+    fs::write(dir.join("bad.map.json"), r#"{"format": "wildcity.map/1", "lanes": 3}"#).unwrap();
     write("elsewhere", "city", Some("road.map.json"));
     fs::write(dir.join("broken.json"), r#"{"format": "wildcity.scenario/1"}"#).unwrap();
 
@@ -87,11 +90,17 @@ async fn the_scenarios_of_a_twin_have_the_lanes_of_their_maps() {
     let answer: Value = serde_json::from_str(answer.split("\r\n\r\n").nth(1).unwrap()).unwrap();
     let ring = json!([[0.0, 1.5], [9.0, 1.5], [9.0, -1.5], [0.0, -1.5]]);
     let wanted = json!({
-        "scenarios": [{"name": "lost", "map": "gone.map.json"},
+        "scenarios": [{"name": "bad-map", "map": "bad.map.json"},
+                      {"name": "bad-map-too", "map": "bad.map.json"},
+                      {"name": "lost", "map": "gone.map.json"},
                       {"name": "on-road", "map": "road.map.json"}, {"name": "short"}],
         "maps": {"road.map.json": [ring]},
+        "omitted_maps": ["bad.map.json", "gone.map.json"],
+        "omitted_scenarios": 0,
     });
     assert_eq!(answer, wanted);
+    let (unknown, answer) = get(&server, "/v1/twins/nowhere/scenarios").await;
+    assert_eq!(unknown, 404, "{answer}");
 }
 
 #[tokio::test]
