@@ -201,7 +201,7 @@ impl Keys {
 
     /// The owner of a Gaussian.
     pub(crate) fn instance(&self, key: u32) -> u16 {
-        // As for chunks.
+        // The last one that begins at the key or before; an empty one begins where the next does.
         let after = self.owners.partition_point(|(first, _)| *first <= key);
         self.owners[after.saturating_sub(1)].1
     }

@@ -83,7 +83,7 @@ impl Cloud {
         self.gaussians.sh.extend([0.0; 3]);
     }
 
-    /// A unit vector.
+    /// Uniform on the unit sphere, of which equal slices along an axis have equal areas.
     fn direction(&mut self) -> DVec3 {
         let z = self.random.range(-1.0, 1.0);
         let angle = self.random.range(0.0, TAU);

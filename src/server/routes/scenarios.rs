@@ -35,7 +35,7 @@ pub(super) async fn in_twin(
     let scenarios = state.engine.scenarios().clone();
     let catalog = state.engine.catalog().clone();
     // One listing at a time: each parses files of the server.
-    let _permit = state.scenario_listing.lock().await;
+    let _turn = state.scenario_listing.lock().await;
     let listing = blocking(move || {
         // A misspelt twin is an error, and not one without scenarios.
         catalog.version(&twin, None)?;

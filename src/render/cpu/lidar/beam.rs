@@ -37,7 +37,7 @@ struct Slot {
 
 /// The hits of each beam from the nearest; at the same range, in the order of keys. A hit behind
 /// the return changes nothing and is dropped, so that few are kept.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 #[repr(align(64))]
 pub(super) struct BeamRow {
     /// The first `len` have hits; there is room for more.
@@ -105,7 +105,7 @@ impl BeamRow {
         }
     }
 
-    /// Adds the hits of a Gaussian. Returns whether a beam ends nearer than before.
+    /// Adds the hits of a Gaussian. Returns whether a beam may end nearer than before.
     #[inline(always)]
     pub(super) fn add<S: Simd>(&mut self, simd: S, crossing: &Crossing<S>) -> bool {
         let end_m = f32x16::load_array_ref(simd, &self.ends_m);
@@ -126,8 +126,8 @@ impl BeamRow {
                 key: meets.select(key, u32x16::splat(simd, NO_KEY)),
             },
         );
-        // The product is in the order of comparison, and `end` has it in the order of ranges: a
-        // little more than half, so that rounding leaves out no return.
+        // `left` is a product in the order in which hits were found, and rounded accordingly. `end`
+        // multiplies in the order of ranges and decides, also if a little more than half is left.
         let ends = meets & left.simd_le(f32x16::splat(simd, (1.0 + 1e-4) * HALF as f32));
         if ends.any_true() {
             self.end(simd, ends);
@@ -162,8 +162,7 @@ impl BeamRow {
         self.len += 1;
     }
 
-    /// Finds the returns of beams of which the hits in front of the old one leave half of the light
-    /// or less, and drops what is behind.
+    /// Finds the returns of some beams among all of their hits, and drops what is behind.
     #[inline(always)]
     fn end<S: Simd>(&mut self, simd: S, ends: mask32x16<S>) {
         let half = f32x16::splat(simd, HALF as f32);
@@ -261,18 +260,6 @@ impl<S: Simd> Hits<S> {
             alpha: chosen.select(self.alpha, other.alpha),
             luminance: chosen.select(self.luminance, other.luminance),
             key: chosen.select(self.key, other.key),
-        }
-    }
-}
-
-impl Default for BeamRow {
-    fn default() -> Self {
-        Self {
-            slots: Vec::new(),
-            len: 0,
-            light: [1.0; LANES],
-            ends_m: [0.0; LANES],
-            end_keys: [NO_KEY; LANES],
         }
     }
 }

@@ -146,7 +146,7 @@ struct Bounds<S: Simd> {
     lanes: u64,
     /// Their centres relative to the LiDAR's middle position in the sector, in metres.
     mean: Vec3x16<S>,
-    /// Their own axes.
+    /// Unit vectors along their principal axes, in the axes of their body.
     own: [Vec3x16<S>; 3],
     scale: Vec3x16<S>,
     azimuths: [[f32; LANES]; 2],
