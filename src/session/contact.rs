@@ -20,14 +20,16 @@ use parking_lot::Mutex;
 use wildcity_scene::Chunk;
 use wildcity_scene::chunk::{BLOCK_M, column};
 use wildcity_scene::geometry::Pose;
+use wildcity_scene::manifest::{ChunkEntry, Section};
 use wildcity_sim::Ego;
 use wildcity_sim::contact::{
-    MAX_SWEPT_SPEED_MPS, SOLID_OPACITY, SolidPoint, Solids, StaticLimit, TestedBox,
+    MAX_SWEPT_SPEED_MPS, SOLID_OPACITY, SolidPoint, SolidSums, Solids, StaticLimit, TestedBox,
 };
 use wildcity_sim::traffic::{EgoBox, EgoMotion, EgoState};
+use wildcity_twin::residency::ReadingBytes;
 use wildcity_twin::store::{Catalog, StoreError};
 
-use crate::engine::solid_blocks::SolidBlocks;
+use crate::engine::solid_blocks::{SectionKey, SolidBlocks};
 use crate::scenario::{Event, EventKind};
 use crate::spatial_index::{Block, SectionId, SpatialIndex, block_at};
 
@@ -48,6 +50,7 @@ pub(crate) struct TwinSolids {
     catalog: Catalog,
     index: Arc<SpatialIndex>,
     blocks: Arc<SolidBlocks>,
+    reading: Arc<ReadingBytes>,
     ego_box: EgoBox,
     limits: Arc<Mutex<HashMap<Block, StaticLimit>>>,
 }
@@ -69,9 +72,10 @@ impl TwinSolids {
         catalog: Catalog,
         index: Arc<SpatialIndex>,
         blocks: Arc<SolidBlocks>,
+        reading: Arc<ReadingBytes>,
         ego_box: EgoBox,
     ) -> Self {
-        Self { catalog, index, blocks, ego_box, limits: Arc::default() }
+        Self { catalog, index, blocks, reading, ego_box, limits: Arc::default() }
     }
 
     /// The contacts that begin while the ego goes from one state through others, step by step. Each
@@ -240,16 +244,33 @@ impl TwinSolids {
         let key = (section.hash, chunk.origin_m.to_array().map(f64::to_bits));
         let solids = match self.blocks.get(&key) {
             Some(solids) => solids,
-            // Read without a lock; threads that miss at the same time insert equal contents.
-            None => {
-                let read = self.catalog.section(self.index.version(), chunk, section)?;
-                let solid = (0..read.len()).filter_map(|index| solid_point(&read, index));
-                let solids = Arc::new(Solids::new(solid));
-                self.blocks.insert(key, solids.clone());
-                solids
-            }
+            None => self.read(key, chunk, section)?,
         };
         near.0.insert(id, solids.clone());
+        Ok(solids)
+    }
+
+    /// Reads the solid Gaussians of a section.
+    fn read(
+        &self,
+        key: SectionKey,
+        chunk: &ChunkEntry,
+        section: &Section,
+    ) -> Result<Arc<Solids>, StoreError> {
+        let _reading = self.reading.begin(section.bytes.into());
+        // Another thread may have read it while this one waited. Of two that read it at once, both
+        // insert equal contents.
+        if let Some(solids) = self.blocks.get(&key) {
+            return Ok(solids);
+        }
+        // Part by part: the sections of a dense capture have 90 MB each, and are read here in
+        // addition to those that are drawn.
+        let mut sums = SolidSums::default();
+        self.catalog.visit_parts(self.index.version(), chunk, section, &mut |part| {
+            sums.extend((0..part.len()).filter_map(|index| solid_point(part, index)));
+        })?;
+        let solids = Arc::new(sums.solids());
+        self.blocks.insert(key, solids.clone());
         Ok(solids)
     }
 }

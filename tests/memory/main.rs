@@ -14,6 +14,7 @@ use glam::{DQuat, DVec3};
 use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::RenderProfile;
+use wildcity_scene::chunk::column;
 use wildcity_scene::geometry::camera::{Fisheye, Lens, Pinhole};
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_twin::residency::{Cache, Viewpoint};
@@ -56,6 +57,8 @@ fn import_takes_twice_the_file_and_serving_120_bytes_a_gaussian() {
     assert!(peak > plain_bytes, "{peak} of {plain_bytes}: this cannot be the whole import");
     assert!(peak <= 2 * plain_bytes + CONSTANT_BYTES, "compressed import: {peak} bytes");
 
+    a_section_that_is_read_part_by_part_takes_the_memory_of_one(&Catalog::open(&twins).unwrap());
+
     let n = 600_000;
     let cache = Cache::new(Catalog::open(&twins).unwrap());
     let before = status_bytes("self", "VmRSS").unwrap();
@@ -94,6 +97,36 @@ fn import_takes_twice_the_file_and_serving_120_bytes_a_gaussian() {
     let allowed = backend.frame_bytes(&views, &everything) + CONSTANT_BYTES;
     assert!(taken <= allowed, "frames: {taken} bytes, {allowed} allowed");
     assert!(taken > 16 << 20, "frames: {taken} bytes cannot be all");
+}
+
+/// As contacts read the full detail of a dense capture: its 1.2 million Gaussians in parts.
+fn a_section_that_is_read_part_by_part_takes_the_memory_of_one(catalog: &Catalog) {
+    let version = catalog.version("dense", None).unwrap();
+    let full = version.manifest.chunks.iter().flat_map(|chunk| {
+        let sections = chunk.sections.iter().filter(|section| section.is_full_detail());
+        sections.map(move |section| (chunk, section))
+    });
+    let (chunk, section) = full.max_by_key(|(_, section)| section.count).unwrap();
+    assert!(section.count > 1_000_000, "{} Gaussians", section.count);
+    let before = status_bytes("self", "VmRSS").unwrap();
+    fs::write("/proc/self/clear_refs", "5").unwrap();
+    let mut means_m = Vec::with_capacity(3 * section.count as usize);
+    let mut parts = 0;
+    catalog
+        .visit_parts(&version, chunk, section, &mut |part| {
+            parts += 1;
+            let mean = |k| [0, 1, 2].map(|axis| part.value(k, column::MEAN + axis));
+            means_m.extend((0..part.len()).flat_map(mean));
+        })
+        .unwrap();
+    let taken = status_bytes("self", "VmHWM").unwrap() - before;
+    // The bytes as stored, the means, and one part of 65,536 Gaussians in 60 bytes and as stored.
+    let expected = u64::from(section.bytes) + 4 * means_m.len() as u64 + (6 << 20);
+    assert!(parts > 15, "{parts} parts");
+    assert!(taken < expected + (4 << 20), "{taken} bytes, expected {expected}");
+    let whole = catalog.section(&version, chunk, section).unwrap();
+    let mean = |k| [0, 1, 2].map(|axis| whole.value(k, column::MEAN + axis));
+    assert!((0..whole.len()).flat_map(mean).eq(means_m), "the same Gaussians in the same order");
 }
 
 /// Four cameras, with a lens and without, that see most of the scene, along its length.

@@ -31,5 +31,5 @@ pub use solid::{
     FREE_AREA_M2, GROUND_MARGIN_M, SIDE_MARGIN_M, SOLID_OPACITY, SolidPoint, StaticLimit,
     solid_area_m2,
 };
-pub use solids::{Solids, TestedBox};
+pub use solids::{SolidSums, Solids, TestedBox};
 pub use sweep::{Moving, overlap_s, time_to_contact_s};

@@ -1,7 +1,7 @@
 //! The solid Gaussians of a part of a twin in a grid, in which the ego's box finds those that it
 //! overlaps.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::f64::consts::FRAC_PI_2;
 
 use glam::{DQuat, DVec2, DVec3};
@@ -122,36 +122,9 @@ impl TestedBox {
 impl Solids {
     /// The Gaussians among `points` that are solid, each in world axes.
     pub fn new(points: impl IntoIterator<Item = SolidPoint>) -> Self {
-        let solid = points.into_iter().filter(|point| point.opacity >= SOLID_OPACITY);
-        let points: Vec<CubePoint> = solid.map(CubePoint::new).collect();
-        // By cube, and within a cube in the given order: a sum of areas depends on its order in the
-        // last digits.
-        let mut order: Vec<(CubeKey, usize)> =
-            points.iter().enumerate().map(|(index, point)| (point.key(), index)).collect();
-        order.sort_unstable();
-        let mut cells: BTreeMap<[i32; 2], Vec<Solid>> = BTreeMap::new();
-        // From here on the Gaussians of a cube are consecutive.
-        for cube in order.chunk_by(|a, b| a.0 == b.0) {
-            let of_cube = || cube.iter().map(|(_, index)| &points[*index]);
-            let area_m2: f64 = of_cube().map(|point| point.area_m2).sum();
-            // Weighted by area, so that a merged cube lies where most of its surface is.
-            let moment: DVec3 = of_cube().map(|point| point.area_m2 * point.from_corner_m).sum();
-            // A Gaussian without extent has no area, and no contact.
-            if area_m2 > 0.0 {
-                let mean_m = (moment / area_m2).as_vec3().to_array();
-                let solid = Solid { mean_m, area_m2: area_m2 as f32 };
-                // `chunk_by` yields no empty chunk, so there is a first key.
-                let (([x, y], _), _) = cube[0];
-                cells.entry([x, y]).or_default().push(solid);
-            }
-        }
-        for solids in cells.values_mut() {
-            // Stable, so that cubes of equal height keep their order.
-            solids.sort_by(|a, b| a.mean_m[2].total_cmp(&b.mean_m[2]));
-            // Solids count towards a memory budget, so that spare capacity would be a waste.
-            solids.shrink_to_fit();
-        }
-        Self { cells }
+        let mut sums = SolidSums::default();
+        sums.extend(points);
+        sums.solids()
     }
 
     /// The area of the Gaussians that a box overlaps, in m².
@@ -186,6 +159,59 @@ impl Solids {
         // full.
         let of_cell = |solids: &Vec<Solid>| solids.capacity() * size_of::<Solid>() + 64;
         self.cells.values().map(of_cell).sum()
+    }
+}
+
+/// Solids that are being added up. The memory is that of their cubes, however many Gaussians these
+/// have.
+#[derive(Debug, Default)]
+pub struct SolidSums {
+    cubes: HashMap<CubeKey, CubeSum>,
+}
+
+/// The sums of the Gaussians of a cube, in the order in which they came: the last digits of a sum
+/// depend on it.
+#[derive(Clone, Copy, Debug, Default)]
+struct CubeSum {
+    area_m2: f64,
+    /// Areas times means from the corner of the cell.
+    moment: DVec3,
+}
+
+impl Extend<SolidPoint> for SolidSums {
+    /// Adds the Gaussians that are solid, each in world axes.
+    fn extend<I: IntoIterator<Item = SolidPoint>>(&mut self, points: I) {
+        for point in points.into_iter().filter(|point| point.opacity >= SOLID_OPACITY) {
+            let point = CubePoint::new(point);
+            let sum = self.cubes.entry(point.key()).or_default();
+            sum.area_m2 += point.area_m2;
+            sum.moment += point.area_m2 * point.from_corner_m;
+        }
+    }
+}
+
+impl SolidSums {
+    /// The solids.
+    pub fn solids(self) -> Solids {
+        let mut cubes: Vec<(CubeKey, CubeSum)> = self.cubes.into_iter().collect();
+        cubes.sort_unstable_by_key(|(key, _)| *key);
+        let mut cells: BTreeMap<[i32; 2], Vec<Solid>> = BTreeMap::new();
+        for ((cell, _), CubeSum { area_m2, moment }) in cubes {
+            // A Gaussian without extent has no area, and no contact.
+            if area_m2 > 0.0 {
+                // Weighted by area, so that a merged cube lies where most of its surface is.
+                let mean_m = (moment / area_m2).as_vec3().to_array();
+                let solid = Solid { mean_m, area_m2: area_m2 as f32 };
+                cells.entry(cell).or_default().push(solid);
+            }
+        }
+        for solids in cells.values_mut() {
+            // Stable, so that cubes of equal height keep their order.
+            solids.sort_by(|a, b| a.mean_m[2].total_cmp(&b.mean_m[2]));
+            // Solids count towards a memory budget, so that spare capacity would be a waste.
+            solids.shrink_to_fit();
+        }
+        Solids { cells }
     }
 }
 

@@ -6,6 +6,7 @@
 //! pager               loads what frames request and hands each frame all of it at once
 //! requests            which request waits for which section, and which section is loaded next
 //! table               which sections are in memory, and which may be evicted
+//! reading             which sections are being read, in memory as they are stored
 //! reservation         a session's share of the memory, and what it prefetches
 //! budget, worst_case  which sessions may open: the most that one frame of a session can need
 //! actors              assets of scenarios, which are in memory as long as these are open
@@ -39,8 +40,8 @@
 //! Admission control only keeps sessions out of this slow state.
 //!
 //! **Memory is reserved before a load begins**, because the table has the size of each section.
-//! Sections that are being loaded count as in use. The budget covers chunks; outside it are the
-//! bytes of one section per loader thread (eight), and 64 B of bookkeeping per section.
+//! Sections that are being loaded count as in use. The budget covers chunks; outside it are 16 MiB
+//! of sections as they are stored, or one larger one, and 64 B of bookkeeping per section.
 //!
 //! **Memory is allocated in pages**: the next section is read into the pages of an evicted one
 //! (`wildcity_scene::pages`). The heap loses a few per cent of the budget between pages.
@@ -76,6 +77,7 @@ mod error;
 mod index;
 mod load_times;
 mod pager;
+mod reading;
 mod requests;
 mod reservation;
 mod resident;
@@ -91,6 +93,7 @@ pub use demand::{SectionRef, SelectedSections, Viewpoint};
 pub use error::ResidencyError;
 pub use index::BlockIndex;
 pub use pager::{PinnedScene, SceneCallback};
+pub use reading::{Reading, ReadingBytes};
 pub use requests::Urgency;
 pub use reservation::{Prefetcher, Reservation, SceneBytes};
 pub use resident::{Resident, SceneRequest};

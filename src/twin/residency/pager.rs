@@ -18,6 +18,7 @@ use wildcity_scene::actor::PlacedChunk;
 
 use super::demand::SectionRef;
 use super::load_times::LoadTimes;
+use super::reading::ReadingBytes;
 use super::requests::{self, CompleteFrame, LoadFailure, NextLoad, RequestedSections, Urgency};
 use super::table::{SectionTable, SlotId};
 use super::{ResidencyError, SectionSource, Stats};
@@ -53,16 +54,7 @@ struct Shared {
     state: Mutex<State>,
     /// Notified when there may be a section to load, or memory for one.
     work: Condvar,
-    /// Bytes, as stored, of the sections that are being read. They are not part of the budget.
-    reading_bytes: Mutex<u64>,
-    /// Notified when a section was read.
-    was_read: Condvar,
-}
-
-/// A section that is being read. Dropped when it was.
-struct Reading<'a> {
-    shared: &'a Shared,
-    bytes: u64,
+    reading: Arc<ReadingBytes>,
 }
 
 struct State {
@@ -79,8 +71,7 @@ impl Pager {
             source,
             state: Mutex::new(state),
             work: Condvar::new(),
-            reading_bytes: Mutex::default(),
-            was_read: Condvar::new(),
+            reading: Arc::default(),
         }))
     }
 
@@ -169,6 +160,11 @@ impl Pager {
     /// that failed, or for which there was no room.
     pub(super) fn pending(&self, number: u64) -> usize {
         self.0.state.lock().requests.pending(number)
+    }
+
+    /// The sections that are being read.
+    pub(super) fn reading(&self) -> Arc<ReadingBytes> {
+        self.0.reading.clone()
     }
 
     /// Bytes of memory in use, and bytes that may be used.
@@ -284,24 +280,10 @@ impl Shared {
         }
     }
 
-    /// Waits until the sections that are being read leave room for one of so many bytes, or there
-    /// are none; a read that hangs does not keep others waiting for ever.
-    fn begin_reading(&self, bytes: u64) -> Reading<'_> {
-        let mut reading_bytes = self.reading_bytes.lock();
-        let until = Instant::now() + limits::READING_WAIT;
-        while *reading_bytes > 0 && *reading_bytes + bytes > limits::READING_BYTES {
-            if self.was_read.wait_until(&mut reading_bytes, until).timed_out() {
-                break;
-            }
-        }
-        *reading_bytes += bytes;
-        Reading { shared: self, bytes }
-    }
-
     fn load(&self, id: SlotId, section: SectionRef, version: &Version) -> Notifications {
         let chunk = &version.manifest.chunks[section.chunk];
         let section = &chunk.sections[section.section];
-        let reading = self.begin_reading(section.bytes.into());
+        let reading = self.reading.begin(section.bytes.into());
         // Without the wait: prefetching looks as far ahead as loads take long.
         let began = Instant::now();
         // A defect in loading one section must not end the thread that loads all of them.
@@ -329,13 +311,6 @@ impl Shared {
                 waited,
             }));
         }
-    }
-}
-
-impl Drop for Reading<'_> {
-    fn drop(&mut self) {
-        *self.shared.reading_bytes.lock() -= self.bytes;
-        self.shared.was_read.notify_all();
     }
 }
 

@@ -278,7 +278,40 @@ impl Catalog {
         chunk: &ChunkEntry,
         section: &Section,
     ) -> Result<Chunk, StoreError> {
-        let Manifest { twin, sh_degree, record, .. } = &version.manifest;
+        let Manifest { sh_degree, record, .. } = version.manifest;
+        let pool = Some(self.pages.clone());
+        self.read_section(version, chunk, section, |bytes| {
+            chunk_file::unpack(bytes, chunk, section, sh_degree, record, pool)
+        })
+    }
+
+    /// As [`Catalog::section`], part by part: `visit` sees chunks of at most 65,536 Gaussians, in
+    /// order. Their memory is used again and again.
+    ///
+    /// # Errors
+    /// As [`Catalog::section`]. Parts before a damaged one have been shown by then.
+    pub fn visit_parts(
+        &self,
+        version: &Version,
+        chunk: &ChunkEntry,
+        section: &Section,
+        visit: &mut dyn FnMut(&Chunk),
+    ) -> Result<(), StoreError> {
+        let Manifest { sh_degree, record, .. } = version.manifest;
+        self.read_section(version, chunk, section, |bytes| {
+            chunk_file::unpack_parts(bytes, chunk, section, sh_degree, record, &self.pages, visit)
+        })
+    }
+
+    /// Reads the bytes of a section, and decodes them.
+    fn read_section<T>(
+        &self,
+        version: &Version,
+        chunk: &ChunkEntry,
+        section: &Section,
+        decode: impl FnOnce(&[u8]) -> Result<T, String>,
+    ) -> Result<T, StoreError> {
+        let twin = &version.manifest.twin;
         // A damaged manifest may have any offset. A sum that saturates lies beyond the end of the
         // object, which `read_range` refuses.
         let end = section.offset_bytes.saturating_add(section.bytes.into());
@@ -293,8 +326,7 @@ impl Catalog {
                 StoreError::Damaged { path, reason } => of_section(path, reason),
                 error => error,
             })?;
-        let pool = Some(self.pages.clone());
-        chunk_file::unpack(&bytes, chunk, section, *sh_degree, *record, pool)
+        decode(&bytes)
             .map_err(|reason| of_section(self.objects.object_path(twin, &chunk.object), reason))
     }
 

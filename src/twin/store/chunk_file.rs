@@ -229,9 +229,71 @@ pub(super) fn unpack(
     record: RecordFormat,
     pool: Option<Arc<PagePool>>,
 ) -> Result<Chunk, String> {
-    let count = section.count as usize;
     let mut lanes = LanePages::new(columns(sh_degree), pool);
     let mut classes = chunk.classes.then(Vec::new);
+    for_each_part(bytes, chunk, section, sh_degree, record, |part| {
+        part.decode(&mut lanes, classes.as_mut())
+    })?;
+    let count = section.count as usize;
+    let unpacked = Chunk::from_lanes(chunk.cell, chunk.origin_m, sh_degree, count, lanes);
+    Ok(unpacked.with_classes(classes))
+}
+
+/// As [`unpack`], part by part: `visit` sees chunks of at most [`PART_GAUSSIANS`], in order.
+///
+/// # Errors
+/// As [`unpack`]. Parts before a damaged one have been shown by then.
+pub(super) fn unpack_parts(
+    bytes: &[u8],
+    chunk: &ChunkEntry,
+    section: &Section,
+    sh_degree: u8,
+    record: RecordFormat,
+    pool: &Arc<PagePool>,
+    visit: &mut dyn FnMut(&Chunk),
+) -> Result<(), String> {
+    for_each_part(bytes, chunk, section, sh_degree, record, |part| {
+        let mut lanes = LanePages::new(columns(sh_degree), Some(pool.clone()));
+        let mut classes = chunk.classes.then(Vec::new);
+        part.decode(&mut lanes, classes.as_mut())?;
+        let unpacked = Chunk::from_lanes(chunk.cell, chunk.origin_m, sh_degree, part.count, lanes);
+        visit(&unpacked.with_classes(classes));
+        Ok(())
+    })
+}
+
+/// A part of a section, decompressed.
+struct Part<'a> {
+    records: &'a [u8],
+    /// One byte for each Gaussian, or none.
+    classes: &'a [u8],
+    sh_degree: u8,
+    record: RecordFormat,
+    count: usize,
+}
+
+impl Part<'_> {
+    fn decode(
+        &self,
+        lanes: &mut LanePages,
+        classes: Option<&mut Vec<SemanticClass>>,
+    ) -> Result<(), String> {
+        self.record.decode(self.records, self.sh_degree, self.count, lanes)?;
+        // Decoded, the records have their size, and so have the classes.
+        classes.map_or(Ok(()), |classes| read_classes(self.classes, classes))
+    }
+}
+
+/// Passes the parts of a section on, in order.
+fn for_each_part(
+    bytes: &[u8],
+    chunk: &ChunkEntry,
+    section: &Section,
+    sh_degree: u8,
+    record: RecordFormat,
+    mut visit: impl FnMut(&Part<'_>) -> Result<(), String>,
+) -> Result<(), String> {
+    let count = section.count as usize;
     let mut rest = bytes;
     // Invariant: `rest` begins with the length of the next part.
     for start in (0..count).step_by(PART_GAUSSIANS) {
@@ -246,17 +308,11 @@ pub(super) fn unpack(
         let capacity = record.part_bytes(sh_degree, here) + classes_bytes;
         decompressed(part, capacity, |raw| {
             let raw = raw.map_err(|error| format!("a part does not decompress: {error}"))?;
-            let (records, values) = raw.split_at(raw.len().saturating_sub(classes_bytes));
-            record.decode(records, sh_degree, here, &mut lanes)?;
-            // Decoded, the records have their size, and so have the classes.
-            classes.as_mut().map_or(Ok(()), |classes| read_classes(values, classes))
+            let (records, classes) = raw.split_at(raw.len().saturating_sub(classes_bytes));
+            visit(&Part { records, classes, sh_degree, record, count: here })
         })?;
     }
-    if !rest.is_empty() {
-        return Err(format!("{} bytes are left over", rest.len()));
-    }
-    let unpacked = Chunk::from_lanes(chunk.cell, chunk.origin_m, sh_degree, count, lanes);
-    Ok(unpacked.with_classes(classes))
+    if rest.is_empty() { Ok(()) } else { Err(format!("{} bytes are left over", rest.len())) }
 }
 
 /// Appends the classes of a part, given their values.
@@ -285,25 +341,27 @@ fn decompressed<T>(part: &[u8], capacity: usize, take: impl FnOnce(io::Result<&[
         static KEPT: RefCell<(Option<Decompressor<'static>>, Vec<u8>)> =
             const { RefCell::new((None, Vec::new())) };
     }
-    KEPT.with_borrow_mut(|(decompressor, kept)| {
-        // It grows to the largest part of the process and never shrinks: some megabytes a thread.
-        if kept.len() < capacity {
-            kept.reserve_exact(capacity - kept.len());
-            kept.resize(capacity, 0);
-        }
-        let raw = &mut kept[..capacity];
-        let mut decompress = || -> io::Result<usize> {
-            let decompressor = match decompressor {
-                Some(decompressor) => decompressor,
-                None => decompressor.insert(Decompressor::new()?),
-            };
-            decompressor.decompress_to_buffer(part, raw)
+    // Taken out, so that what receives the bytes may read another section.
+    let (mut decompressor, mut kept) = KEPT.take();
+    // It grows to the largest part of the process and never shrinks: some megabytes a thread.
+    if kept.len() < capacity {
+        kept.reserve_exact(capacity - kept.len());
+        kept.resize(capacity, 0);
+    }
+    let raw = &mut kept[..capacity];
+    let mut decompress = || -> io::Result<usize> {
+        let decompressor = match &mut decompressor {
+            Some(decompressor) => decompressor,
+            None => decompressor.insert(Decompressor::new()?),
         };
-        match decompress() {
-            Ok(length) => take(Ok(&kept[..length])),
-            Err(error) => take(Err(error)),
-        }
-    })
+        decompressor.decompress_to_buffer(part, raw)
+    };
+    let taken = match decompress() {
+        Ok(length) => take(Ok(&kept[..length])),
+        Err(error) => take(Err(error)),
+    };
+    KEPT.set((decompressor, kept));
+    taken
 }
 
 /// The table of all chunks.
