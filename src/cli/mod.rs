@@ -130,6 +130,7 @@ fn run_command(words: &[&std::ffi::OsStr], options: Options) -> anyhow::Result<(
 /// failure, and 3 for a recording that is cut (`episode verify`). A command line that cannot be
 /// parsed ends the process with code 2.
 pub fn main() -> ExitCode {
+    wildcity_heap::map_large_blocks();
     let whole = help_all::program(program(), help_all::is_asked());
     let parsed = whole.try_get_matches().and_then(|found| Arguments::from_arg_matches(&found));
     match parsed {

@@ -7,9 +7,24 @@ use std::hint::black_box;
 /// Small enough that glibc takes it from the heap, and large enough to contain whole pages.
 const BLOCK_BYTES: usize = 64 << 10;
 const BLOCKS: usize = 2_000;
+const MIB: usize = 1 << 20;
 
 #[test]
-fn free_pages_between_used_blocks_are_given_back() {
+fn free_pages_and_large_blocks_are_given_back() {
+    // First, while the heap has no free pages that a large block could have.
+    let mut small = Vec::new();
+    let mut remaining_mib = |mib: usize| {
+        let large = black_box(vec![1_u8; mib * MIB]);
+        small.push(black_box(vec![2_u8; 100]));
+        let full = resident_bytes();
+        drop(large);
+        mib as u64 - full.saturating_sub(resident_bytes()) / MIB as u64
+    };
+    assert!(remaining_mib(20) < 2, "the first one has pages of its own");
+    assert!(remaining_mib(16) > 8, "glibc takes the next one from the heap");
+    wildcity_heap::map_large_blocks();
+    assert!(remaining_mib(18) < 2, "it is given back");
+
     let mut short_lived = Vec::new();
     let mut kept = Vec::new();
     for _ in 0..BLOCKS {
