@@ -6,9 +6,9 @@
 //! `malloc_trim` gives back every page that is free, wherever it is in the heap.
 //!
 //! Large blocks have pages of their own, which are given back at once. But when such a block is
-//! freed, glibc takes the next ones of its size from the heap, up to 32 MiB, where they leave holes:
-//! a server of a dense capture that may use 0.6 GiB took 120 MB more. [`map_large_blocks`] fixes
-//! the size.
+//! freed, glibc takes the next ones of its size from the heap, up to 32 MiB. There they leave
+//! holes: a server of a dense capture that may use 0.6 GiB took 120 MB more. [`map_large_blocks`]
+//! fixes the size.
 //!
 //! This is the one place with `unsafe`: no well-maintained crate wraps the functions.
 
