@@ -301,8 +301,8 @@ impl<T> State<T> {
 
     /// What a thread of a lane does next.
     fn next(&mut self, lane: Lane, now: Instant, deadline: impl Fn(&T) -> Instant) -> Next<T> {
-        // First of all: frames that still wait are dropped with the queue, and their sessions get an
-        // error.
+        // First of all: frames that still wait are dropped with the queue, and their sessions get
+        // an error.
         if self.is_closed {
             return Next::Ends;
         }
