@@ -23,6 +23,8 @@
 //! test calls every method with the stubs of another package.
 
 pub mod camera;
+#[cfg(test)]
+mod costs;
 mod door;
 pub mod egodriver;
 pub mod export;

@@ -73,6 +73,7 @@ struct Row {
     steps_per_s: f64,
     step_ms: f64,
     step_p95_ms: f64,
+    step_p99_ms: f64,
     processor_ms: f64,
     beyond_pixels_ms: f64,
 }
@@ -86,8 +87,14 @@ impl Sessions {
         if !self.json {
             writeln!(
                 out,
-                "{:>8} {:>9} {:>9} {:>9} {:>14} {:>14}",
-                "sessions", "steps/s", "step ms", "p95 ms", "processor ms", "beyond pixels"
+                "{:>8} {:>9} {:>9} {:>9} {:>9} {:>14} {:>14}",
+                "sessions",
+                "steps/s",
+                "step ms",
+                "p95 ms",
+                "p99 ms",
+                "processor ms",
+                "beyond pixels"
             )?;
         }
         for &count in &self.sessions {
@@ -146,6 +153,7 @@ impl Sessions {
             steps_per_s: steps.len() as f64 / took.as_secs_f64(),
             step_ms: ms(&|step| step.whole, 0.5),
             step_p95_ms: ms(&|step| step.whole, 0.95),
+            step_p99_ms: ms(&|step| step.whole, 0.99),
             processor_ms: processor.as_secs_f64() * 1e3 / steps.len() as f64,
             beyond_pixels_ms: ms(&|step| step.beyond_pixels, 0.5),
         })
@@ -205,14 +213,22 @@ impl Driver {
 
 impl Row {
     fn print(&self, out: &mut impl Write, as_json: bool) -> io::Result<()> {
-        let Self { sessions, steps_per_s, step_ms, step_p95_ms, processor_ms, beyond_pixels_ms } =
-            self;
+        let Self {
+            sessions,
+            steps_per_s,
+            step_ms,
+            step_p95_ms,
+            step_p99_ms,
+            processor_ms,
+            beyond_pixels_ms,
+        } = self;
         if as_json {
             let row = json!({
                 "sessions": sessions,
                 "steps_per_s": steps_per_s,
                 "step_ms": step_ms,
                 "step_p95_ms": step_p95_ms,
+                "step_p99_ms": step_p99_ms,
                 "processor_ms": processor_ms,
                 "beyond_pixels_ms": beyond_pixels_ms,
             });
@@ -220,7 +236,7 @@ impl Row {
         }
         writeln!(
             out,
-            "{sessions:>8} {steps_per_s:>9.1} {step_ms:>9.2} {step_p95_ms:>9.2} {processor_ms:>14.2} \
+            "{sessions:>8} {steps_per_s:>9.1} {step_ms:>9.2} {step_p95_ms:>9.2} {step_p99_ms:>9.2} {processor_ms:>14.2} \
              {beyond_pixels_ms:>14.3}"
         )
     }

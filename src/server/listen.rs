@@ -111,7 +111,7 @@ impl Acceptor {
                 .with_upgrades()
                 .await;
         };
-        tokio::spawn(async move {
+        self.state.engine.polls().spawn("connection", async move {
             tokio::select! {
                 () = connection => {}
                 () = deadline.passed() => {}

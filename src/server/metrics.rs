@@ -6,7 +6,8 @@ use std::sync::atomic::AtomicU64;
 
 use prometheus_client::collector::Collector;
 use prometheus_client::encoding::text::encode;
-use prometheus_client::encoding::{DescriptorEncoder, EncodeMetric as _};
+use prometheus_client::encoding::{DescriptorEncoder, EncodeMetric as _, NoLabelSet};
+use prometheus_client::metrics::MetricType;
 use prometheus_client::metrics::counter::{ConstCounter, Counter};
 use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::{ConstGauge, Gauge};
@@ -14,7 +15,7 @@ use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::{Registry, Unit};
 
-use wildcity_session::Engine;
+use wildcity_session::{Engine, Polls};
 
 use crate::process::Process;
 
@@ -38,6 +39,7 @@ pub(crate) struct Metrics {
     sessions: Gauge,
     connections: Gauge,
     frames_queued: Gauge,
+    answer_bytes: Gauge<u64, AtomicU64>,
     uploads: Gauge,
     spool_bytes: Gauge<u64, AtomicU64>,
     pushes_open: Gauge,
@@ -50,6 +52,8 @@ pub(crate) struct GaugeValues {
     pub(crate) connections: usize,
     /// Frames that wait for the renderer.
     pub(crate) frames_queued: usize,
+    /// Memory of answers, in bytes.
+    pub(crate) answer_bytes: u64,
     pub(crate) uploads: usize,
     /// Their bytes, as announced.
     pub(crate) spool_bytes: u64,
@@ -86,6 +90,7 @@ impl Metrics {
             sessions: Gauge::default(),
             connections: Gauge::default(),
             frames_queued: Gauge::default(),
+            answer_bytes: Gauge::default(),
             uploads: Gauge::default(),
             spool_bytes: Gauge::default(),
             pushes_open: Gauge::default(),
@@ -114,6 +119,8 @@ impl Metrics {
         registry.register("sessions", help, m.sessions.clone());
         registry.register("connections", "WebSocket connections", m.connections.clone());
         registry.register("frames_queued", "Frames in the queue", m.frames_queued.clone());
+        let help = "Memory of answers that are made, sent or kept";
+        registry.register("answer_bytes", help, m.answer_bytes.clone());
         registry.register("uploads", "Uploads on disk", m.uploads.clone());
         registry.register(
             "spool_bytes",
@@ -121,6 +128,7 @@ impl Metrics {
             m.spool_bytes.clone(),
         );
         registry.register("pushes_open", "Pushes that wait or run", m.pushes_open.clone());
+        registry.register_collector(Box::new(LongestPolls(engine.polls().clone())));
         registry.register_collector(Box::new(Residency(engine)));
         Self { registry: all, ..metrics }
     }
@@ -134,6 +142,7 @@ impl Metrics {
         self.sessions.set(gauges.sessions as i64);
         self.connections.set(gauges.connections as i64);
         self.frames_queued.set(gauges.frames_queued as i64);
+        self.answer_bytes.set(gauges.answer_bytes);
         self.uploads.set(gauges.uploads as i64);
         self.spool_bytes.set(gauges.spool_bytes);
         self.pushes_open.set(gauges.pushes_open as i64);
@@ -150,6 +159,30 @@ impl Metrics {
     /// Counts a push that ended, by its outcome.
     pub(crate) fn push_ended(&self, outcome: &str) {
         self.pushes.get_or_create(&[("outcome", outcome.to_owned())]).inc();
+    }
+}
+
+/// How long tasks hold the threads that answer requests.
+#[derive(Debug)]
+struct LongestPolls(Arc<Polls>);
+
+impl Collector for LongestPolls {
+    fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> Result<(), std::fmt::Error> {
+        let times = self.0.times();
+        let polls: u64 = times.counts.iter().map(|(_, count)| count).sum();
+        // The encoder's infinity.
+        let buckets: Vec<_> =
+            times.counts.iter().map(|&(bound_s, count)| (bound_s.min(f64::MAX), count)).collect();
+        let help = "How long a task held a thread that answers requests";
+        let unit = Some(&Unit::Seconds);
+        let kind = MetricType::Histogram;
+        let mut histogram = encoder.encode_descriptor("poll", help, unit, kind)?;
+        let total_s = times.total.as_secs_f64();
+        histogram.encode_histogram::<NoLabelSet>(total_s, polls, &buckets, None)?;
+        let longest = ConstGauge::new(times.longest.as_secs_f64());
+        let help = "The longest of them since the start";
+        let kind = longest.metric_type();
+        longest.encode(encoder.encode_descriptor("poll_longest_seconds", help, None, kind)?)
     }
 }
 

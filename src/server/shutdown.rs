@@ -121,14 +121,15 @@ impl Running {
         let reloading = reload(tls.clone(), state.clone());
         // A task of its own, because `stop` waits for it: afterwards no connection is accepted.
         let app = routes::router(state.clone());
-        let listening = tokio::spawn(listen(state.clone(), listener.socket, tls, app));
+        let polls = state.engine.polls().clone();
+        let listening = polls.spawn("listener", listen(state.clone(), listener.socket, tls, app));
         let metrics_address = metrics_listener.as_ref().map(|listener| listener.address);
         if let Some(listener) = metrics_listener {
             let app = routes::open_router(state.clone());
-            tokio::spawn(listen(state.clone(), listener.socket, None, app));
+            polls.spawn("metrics listener", listen(state.clone(), listener.socket, None, app));
         }
         let periodic = state.clone();
-        tokio::spawn(async move {
+        polls.spawn("periodic", async move {
             // One task for all: none of them ends before the server, and each spends its time
             // waiting.
             tokio::select! {

@@ -12,6 +12,7 @@
 //! | `contact`, `spatial_index` | contact of the ego with the twin; what of a twin is near a place |
 //! | `snapshot` | named states, to return to and to open other sessions from |
 //! | `engine` | the twins in memory, the render queue, the budget for answers |
+//! | `polls` | how long requests hold up the threads that answer |
 //! | `observe` | which images are rendered, and how they become one message |
 //! | `record` | episodes' files, and their replay |
 //! | `prefetch` | loads what the next frames of the ego will need |
@@ -30,6 +31,7 @@ pub mod limits;
 mod observe;
 mod open_scene;
 mod pin;
+mod polls;
 mod prefetch;
 mod record;
 mod repair;
@@ -60,6 +62,7 @@ pub use observe::observation::{
 };
 pub use observe::trust::{RecordedPoses, TrainingCoverage, Trust};
 pub use open_scene::{FrameScene, OpenScene};
+pub use polls::{PollTimes, Polls};
 pub use record::command::RecordedCommand;
 pub use record::continuation::Continuation;
 pub use record::ego_replay::DivergedStep;

@@ -37,6 +37,9 @@ pub const EXPORTED_RECORD_BYTES: u64 = 64 << 20;
 /// Episodes whose failed export is remembered: more than a listing has.
 pub const FAILED_EXPORTS: usize = 1024;
 
+/// Longest time that a task may hold a thread that answers requests.
+pub const LONGEST_POLL: Duration = Duration::from_millis(50);
+
 /// Default simulated time per step, in microseconds: 10 Hz.
 pub const DT_US: i64 = 100_000;
 

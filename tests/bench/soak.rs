@@ -18,10 +18,13 @@ fn a_soak_repeats_rounds_and_compares_their_images() {
     let output = soak(&["--minutes", "0.05", "--growth", "1000"]);
     assert!(output.status.success(), "{output:?}");
     let text = String::from_utf8(output.stdout).unwrap();
-    let line = text.lines().last().unwrap();
+    let line = text.lines().find(|line| line.contains(" steps in ")).unwrap();
     let rounds = line.split(" steps in ").nth(1).and_then(|rest| rest.split(' ').next());
     assert!(rounds.unwrap().parse::<u32>().unwrap() > 3, "no session drove a second round: {line}");
     assert!(line.contains("every image as in its first round"), "{line}");
+    let polls =
+        text.lines().last().and_then(|line| line.split_once(" polls of the server's tasks"));
+    assert!(polls.unwrap().0.parse::<u64>().unwrap() > 100, "{text}");
 }
 
 #[test]

@@ -44,6 +44,7 @@ mod augment;
 mod bisect;
 mod bombs;
 mod capture;
+mod costs;
 mod crash;
 mod demo;
 mod devices;

@@ -38,6 +38,23 @@ fn commands_take_a_url() {
     assert!(said.contains("cannot use ftp://bucket/x for twins: one of s3://"), "{said}");
 }
 
+/// A store cannot send this machine to another service.
+#[test]
+fn a_redirect_to_another_place_is_refused() {
+    let s3 = S3::start();
+    commit(&s3.catalog(), &gaussians(100, 0, 50.0, 1));
+    let other = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    other.set_nonblocking(true).unwrap();
+    s3.fail("GET", "twins", 1000, Fault::Redirected(other.local_addr().unwrap().port()));
+    let mut command = wildcity();
+    command.args(["twin", "show", "street", "--twins", &S3::url()]);
+    let output = s3.environment(&mut command).output().unwrap();
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(!output.status.success() && said.contains("redirect"), "{said}");
+    let asked = other.accept();
+    assert!(asked.is_err(), "the other place was asked: {asked:?}");
+}
+
 #[test]
 fn a_killed_import_leaves_the_old_version_or_the_new_one() {
     let s3 = S3::start();

@@ -1,8 +1,10 @@
 //! A server as a process of its own, with a twin of its own.
 
 use std::ffi::OsStr;
+use std::fs;
 use std::io::{BufRead, BufReader};
 use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
@@ -15,7 +17,7 @@ pub(crate) struct Served {
     child: Child,
     pub(crate) address: SocketAddr,
     _dir: tempfile::TempDir,
-    _episodes: tempfile::TempDir,
+    pub(crate) episodes: tempfile::TempDir,
 }
 
 impl Served {
@@ -65,14 +67,39 @@ impl Served {
             .strip_prefix("listening on ws://")
             .and_then(|rest| rest.trim_end().strip_suffix("/v1/session"));
         let address = address.expect(&line).parse().unwrap();
-        Self { child, address, _dir: dir, _episodes: episodes }
+        Self { child, address, _dir: dir, episodes }
+    }
+
+    fn proc(&self, file: &str) -> PathBuf {
+        Path::new("/proc").join(self.child.id().to_string()).join(file)
+    }
+
+    fn memory(&self, field: &str) -> u64 {
+        let status = fs::read_to_string(self.proc("status")).unwrap();
+        let line = status.lines().find(|line| line.starts_with(field)).unwrap();
+        line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap() << 10
     }
 
     /// Resident memory, in bytes.
     pub(crate) fn rss(&self) -> u64 {
-        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).unwrap();
-        let line = status.lines().find(|line| line.starts_with("VmRSS:")).unwrap();
-        line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap() << 10
+        self.memory("VmRSS:")
+    }
+
+    /// The most resident memory since [`Self::forget_peak`], in bytes.
+    pub(crate) fn peak(&self) -> u64 {
+        self.memory("VmHWM:")
+    }
+
+    /// Lets the peak begin at the memory of now (`proc_pid_clear_refs(5)`).
+    pub(crate) fn forget_peak(&self) {
+        fs::write(self.proc("clear_refs"), "5").unwrap();
+    }
+
+    /// Processor time since the start, in seconds.
+    pub(crate) fn processor_s(&self) -> f64 {
+        let stat = fs::read_to_string(self.proc("stat")).unwrap();
+        let fields = stat[stat.rfind(')').unwrap()..].split_whitespace().skip(12).take(2);
+        fields.map(|ticks| ticks.parse::<f64>().unwrap() / 100.0).sum()
     }
 
     pub(crate) async fn whole_session(&self, steps: u32) {

@@ -42,6 +42,8 @@ pub(crate) struct Step {
     /// Seeds the chances of this step, so that they do not depend on earlier steps.
     pub(crate) seed: u64,
     pub(crate) operation: Operation,
+    /// Which of the two processes carries it out.
+    pub(crate) process: u8,
     /// The writes before the fault, and the fault.
     pub(crate) fault: Option<(u64, Fault)>,
     /// Reads that fail, in a step without another fault.
@@ -162,7 +164,8 @@ impl Step {
         let bad_reads = BadReads::random(random, reads);
         let one_in = if collects { 2 } else { 3 };
         let bad_reads = Some(bad_reads).filter(|_| fault.is_none() && random.once_in(one_in));
-        Self { seed: random.next(), operation, fault, bad_reads }
+        let process = u8::from(random.once_in(3));
+        Self { seed: random.next(), operation, process, fault, bad_reads }
     }
 }
 
@@ -181,7 +184,7 @@ impl fmt::Display for Failure {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "seed {}: {}", self.history.seed, self.reason)?;
         for (index, step) in self.history.operations.iter().enumerate() {
-            write!(f, "  {index} {:?}", step.operation)?;
+            write!(f, "  {index} process {} {:?}", step.process, step.operation)?;
             if let Some((writes, fault)) = step.fault {
                 write!(f, ", {fault:?} after {writes} writes")?;
             }

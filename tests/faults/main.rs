@@ -9,7 +9,10 @@
 //! same read succeeds. Wrong bits are simulated only in objects: log records, leases and the state
 //! of garbage collection have no digest.
 //!
-//! Not simulated: two processes that write at once, requests to the object store that are carried
+//! Two processes serve the twin in turns: one prepares a commit, opens versions or collects garbage
+//! between two operations of the other. A kill ends both.
+//!
+//! Not simulated: two processes within one operation each, requests to the object store that are carried
 //! out in another order than they began, the disk cache of remote twins, and wrong bits that stay.
 //!
 //! Uploads and connections are simulated in the package of the server, over the same disk:

@@ -23,7 +23,7 @@ const ROLLBACK: Operation = Operation::Rollback { back: 1 };
 const COLLECT: Operation = Operation::Collect { keep: 1, grace_s: 0 };
 
 fn step(seed: u64, operation: Operation, fault: Option<(u64, Fault)>) -> Step {
-    Step { seed, operation, fault, bad_reads: None }
+    Step { seed, operation, process: 0, fault, bad_reads: None }
 }
 
 /// Runs operations, one of which has a fault after a number of writes, and cuts the power.

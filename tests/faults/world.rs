@@ -44,7 +44,11 @@ struct Prepared {
 pub(crate) struct World {
     clock: Arc<SimClock>,
     medium: Box<dyn Medium>,
+    /// That of the process which carries out the operation.
     catalog: Catalog,
+    /// That of the other process, which knows nothing of the first.
+    other: Catalog,
+    process: u8,
     sessions: Vec<Session>,
     prepared: Option<Prepared>,
     /// Versions that were acknowledged to a client: they must stay, until garbage collection may
@@ -115,11 +119,13 @@ impl World {
     pub(crate) fn new(kind: Kind, plant: Option<Plant>) -> Result<Self, String> {
         let clock = Arc::new(SimClock::new());
         let medium = kind.empty(&clock, plant);
-        let catalog = open(&*medium, &clock)?;
+        let [catalog, other] = [open(&*medium, &clock)?, open(&*medium, &clock)?];
         Ok(Self {
             clock,
             medium,
             catalog,
+            other,
+            process: 0,
             sessions: Vec::new(),
             prepared: None,
             acknowledged: BTreeMap::new(),
@@ -141,6 +147,10 @@ impl World {
         }
         if let Some(reads) = step.bad_reads {
             self.medium.fail_reads(reads);
+        }
+        if step.process != self.process {
+            std::mem::swap(&mut self.catalog, &mut self.other);
+            self.process = step.process;
         }
         let is_full = matches!(step.fault, Some((_, Fault::Full)));
         let done = self.carry_out(step.operation);
@@ -420,6 +430,7 @@ impl World {
         self.prepared = None;
         self.medium = self.medium.restarted(&mut Random::new(seed));
         self.catalog = open(&*self.medium, &self.clock)?;
+        self.other = open(&*self.medium, &self.clock)?;
         let left = self.medium.commits_left();
         if !left.is_empty() {
             return Err(format!("the start left {left:?}"));

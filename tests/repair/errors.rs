@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::path::Path;
+use std::process::Command;
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
@@ -126,6 +127,18 @@ fn a_file_that_is_no_manifest_is_refused_as_that() {
         error,
         "m.json: format: \"wildcity.repair/1\"; \"wildcity.network/1\" is needed here"
     );
+}
+
+/// A pipe would wait for a writer.
+#[test]
+fn a_pipe_in_place_of_a_model_is_refused() {
+    let folder = Folder::new(&doubles::identity(), json!({}));
+    let model = folder.folder.path().join("model.onnx");
+    fs::remove_file(&model).unwrap();
+    assert!(Command::new("mkfifo").arg(&model).status().unwrap().success());
+    let error = folder.load().unwrap_err();
+    let RepairError::File { path, message } = &error else { panic!("{error}") };
+    assert_eq!((path, message.as_str()), (&model, "not a regular file"));
 }
 
 #[test]

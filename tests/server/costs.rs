@@ -212,3 +212,47 @@ async fn a_pipe_in_place_of_a_record_is_no_record() {
     };
     tokio::time::timeout(TEST_TIMEOUT, asked).await.expect("the pipe is not waited for");
 }
+
+/// A token that is limited to some twins learns no names of scenarios: of one of another twin as
+/// little as of one that is not there.
+#[tokio::test]
+async fn a_limited_token_learns_no_names_of_scenarios() {
+    let text = json!({ "tokens": [
+        { "name": "ann", "role": "drive", "token": ANN, "twins": ["test"] },
+    ]});
+    let tokens = Tokens::parse(text.to_string().as_bytes()).unwrap();
+    let server = TestServer::configured(|config| config.tokens = Some(tokens)).await;
+    let dir = server.twins.path().join(".scenarios");
+    fs::create_dir(&dir).unwrap();
+    let scenario = json!({ "format": "wildcity.scenario/1", "name": "heist",
+                           "twin": { "name": "vault" }, "actors": [] });
+    fs::write(dir.join("heist.json"), scenario.to_string()).unwrap();
+    let mut ann = greeted_agent(&server, ANN).await;
+    let mut answers = Vec::new();
+    for name in ["heist", "absent"] {
+        let answer = ann.try_open(json!({ "scenario": name })).await;
+        assert_eq!(answer["type"], "error", "{answer}");
+        let message = answer["message"].as_str().unwrap();
+        assert!(!message.contains("vault") && !message.contains("heist"), "{message}");
+        answers.push((answer["code"].clone(), message.to_owned()));
+    }
+    assert_eq!(answers[0], answers[1]);
+}
+
+/// Metrics count what happens on all twins.
+#[tokio::test]
+async fn a_limited_administrator_gets_no_metrics() {
+    let text = json!({ "tokens": [
+        { "name": "ann", "role": "admin", "token": ANN, "twins": ["test"] },
+        { "name": "bob", "role": "admin", "token": BOB },
+    ]});
+    let tokens = Tokens::parse(text.to_string().as_bytes()).unwrap();
+    let server = TestServer::configured(|config| config.tokens = Some(tokens)).await;
+    for (token, status) in [(ANN, 403), (BOB, 200)] {
+        let asked =
+            format!("GET /metrics HTTP/1.1\nHost: localhost\nAuthorization: Bearer {token}\n\n");
+        let (found, answer) = request(&server, &asked).await;
+        assert_eq!(found, status, "{answer}");
+        assert_eq!(answer.contains("wildcity_steps_total"), status == 200, "{answer}");
+    }
+}

@@ -167,6 +167,49 @@ async fn a_client_that_goes_away_leaves_no_session() {
     }
 }
 
+/// A page that is left closes with 1001 and reads nothing more, while an answer is being sent to it.
+#[tokio::test]
+async fn a_client_that_goes_away_during_an_answer_leaves_no_session() {
+    let server = TestServer::start().await;
+    let mut agent = server.agent().await;
+    // More than the sockets hold, so that sending waits for the client.
+    let camera = json!({ "name": "a", "width": 4096, "height": 2048, "fx": 900, "fy": 900,
+                         "cx": 2048, "cy": 1024, "camera_to_rig": pose(0.0) });
+    let rig = json!({ "name": "large", "cameras": [camera] });
+    agent.open(json!({ "rig": rig, "outputs": { "encoding": "raw" } })).await;
+    agent.send(json!({ "type": "step", "pose": pose(1.0) })).await;
+    // The answer has begun.
+    let mut first = [0; 100];
+    agent.tcp().peek(&mut first).await.unwrap();
+    let away = CloseFrame { code: 1001.into(), reason: "".into() };
+    agent.socket.send(Message::Close(Some(away))).await.unwrap();
+    drop(agent);
+    server.sessions_become(0).await;
+}
+
+/// A page that is left closes with 1001; but another connection already waits for its session.
+#[tokio::test]
+async fn a_session_that_another_connection_waits_for_goes_on() {
+    let server = TestServer::start().await;
+    let mut agent = server.driver("a").await;
+    let begun = server.painter.begun.load(Ordering::SeqCst);
+    server.painter.held.store(true, Ordering::SeqCst);
+    agent.send(json!({ "type": "step", "pose": pose(1.0) })).await;
+    server.painter.begins(begun + 1).await;
+    let mut other = server.agent().await;
+    other.send(json!({ "type": "resume", "session": "a", "last_seq": 1 })).await;
+    // Its request arrives: a ping that follows it is answered while it waits.
+    other.socket.send(Message::Ping("x".into())).await.unwrap();
+    assert_eq!(frame(&mut other).await, Some(Message::Pong("x".into())));
+    let away = CloseFrame { code: 1001.into(), reason: "".into() };
+    agent.socket.send(Message::Close(Some(away))).await.unwrap();
+    server.painter.held.store(false, Ordering::SeqCst);
+    let Reply::Text(resumed) = other.receive().await else { panic!("no text") };
+    assert_eq!((&resumed["type"], &resumed["step"]), (&json!("resumed"), &json!(1)), "{resumed}");
+    other.seq = 3;
+    assert_eq!(other.step(2.0).await.meta["step"], 2);
+}
+
 #[tokio::test]
 async fn the_servers_own_close_frame_says_why() {
     // A silent client.

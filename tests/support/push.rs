@@ -14,11 +14,12 @@ use wildcity_scene::Gaussians;
 use crate::scene_files::{self, inria_columns, ply};
 use crate::support::{self, TestServer};
 
-/// An HTTP answer: its status, its header lines, and its body if that is JSON.
+/// An HTTP answer: its status, its header lines, its body, and its body if that is JSON.
 #[derive(Debug)]
 pub(crate) struct Reply {
     pub(crate) status: u16,
     pub(crate) head: String,
+    pub(crate) text: String,
     pub(crate) body: Value,
 }
 
@@ -48,8 +49,9 @@ pub(crate) async fn send(address: SocketAddr, head: &str, body: &[u8]) -> Reply 
     let text = String::from_utf8(answer).unwrap();
     let (head, body) = text.split_once("\r\n\r\n").unwrap_or((&text, ""));
     let status = head.split(' ').nth(1).expect("a status").parse().unwrap();
+    let text = body.to_owned();
     let body = serde_json::from_str(body).unwrap_or(Value::Null);
-    Reply { status, head: head.to_owned(), body }
+    Reply { status, head: head.to_owned(), text, body }
 }
 
 /// Sends JSON.

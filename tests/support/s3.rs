@@ -13,7 +13,7 @@ use std::time::Duration;
 
 use http_body_util::BodyExt as _;
 use hyper::body::Incoming;
-use hyper::header::{CONTENT_LENGTH, HeaderValue};
+use hyper::header::{CONTENT_LENGTH, HeaderValue, LOCATION};
 use hyper::{Request, Response, StatusCode};
 use hyper_util::rt::TokioIo;
 use object_store::aws::AmazonS3Builder;
@@ -36,6 +36,8 @@ pub(crate) enum Fault {
     Denied(u16),
     /// The request is neither executed nor answered.
     Silence,
+    /// The request is redirected to the same path on a port of this machine.
+    Redirected(u16),
     /// The answer is truncated in the middle.
     Short,
     /// One bit of the answer is flipped.
@@ -176,6 +178,12 @@ async fn serve(listener: tokio::net::TcpListener, s3: S3Service, rules: Arc<Mute
             async move {
                 match fault {
                     Some(Fault::Status(status)) => return Ok(plain(status)),
+                    Some(Fault::Redirected(port)) => {
+                        let place = format!("http://127.0.0.1:{port}{}", request.uri());
+                        let mut answer = plain(307);
+                        answer.headers_mut().insert(LOCATION, place.parse().unwrap());
+                        return Ok(answer);
+                    }
                     Some(Fault::Silence) => std::future::pending::<()>().await,
                     _ => {}
                 }

@@ -44,12 +44,13 @@ const CRATES: &[(&str, &[&str])] = &[
 
 /// Files that may open files: those of a twin only `store/local`; the others scenes and settings of
 /// the user, training data, logs, episodes, uploads, scenarios, their catalogs and roads, pictures, and
-/// how much memory there is.
+/// how much memory and processor time there is.
 const FILES: &[&str] = &[
     "src/twin/store/local",
     "src/twin/residency/budget.rs",
     "src/twin/ingest",
     "src/augment/folder.rs",
+    "src/session/polls.rs",
     "src/session/record",
     "src/session/scenario/load.rs",
     "src/episode",

@@ -6,14 +6,15 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use hyper::rt::Executor;
 use hyper::server::conn::http2;
 use hyper::service::service_fn;
-use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
+use hyper_util::rt::{TokioIo, TokioTimer};
 use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
-use wildcity_session::Engine;
+use wildcity_session::{Engine, Polls};
 
 use super::methods::{Sensorsim, stopped};
 use crate::door::{Connection, Door};
@@ -69,14 +70,16 @@ pub async fn start(
     let listener = TcpListener::bind(listen).await.map_err(failed)?;
     let address = listener.local_addr().map_err(failed)?;
     let (stop, stopping) = watch::channel(false);
+    let polls = engine.polls().clone();
     let sensorsim = Arc::new(Sensorsim::new(engine, stopping.clone()));
     let door = Door::new(limits::CONNECTIONS);
     let entered = door.clone();
-    let listening = tokio::spawn(async move {
+    let spawner = Spawner(polls.clone());
+    let listening = polls.spawn("AlpaSim listener", async move {
         // All three run until the first ends, which is the stop: the other two never return. The
         // listener is closed as `accept` is dropped.
         tokio::select! {
-            () = accept(sensorsim.clone(), listener, entered, stopping.clone()) => {}
+            () = accept(sensorsim.clone(), spawner, listener, entered, stopping.clone()) => {}
             () = sensorsim.forget_idle() => {}
             () = stopped(stopping.clone()) => {}
         }
@@ -104,8 +107,19 @@ impl Running {
     }
 }
 
+/// Spawns the tasks of a connection, which answer its requests.
+#[derive(Clone)]
+struct Spawner(Arc<Polls>);
+
+impl<F: Future<Output: Send> + Send + 'static> Executor<F> for Spawner {
+    fn execute(&self, task: F) {
+        self.0.spawn("AlpaSim request", task);
+    }
+}
+
 async fn accept(
     sensorsim: Arc<Sensorsim>,
+    spawner: Spawner,
     listener: TcpListener,
     door: Arc<Door>,
     stopping: watch::Receiver<bool>,
@@ -128,7 +142,8 @@ async fn accept(
         }
         let sensorsim = sensorsim.clone();
         let stopping = stopping.clone();
-        tokio::spawn(async move {
+        let requests = spawner.clone();
+        spawner.0.spawn("AlpaSim connection", async move {
             // A closure for each connection, and a clone for each request: requests of one
             // connection run at once.
             let own = place.connection.clone();
@@ -137,7 +152,7 @@ async fn accept(
                 let own = own.clone();
                 async move { Ok::<_, Infallible>(call(sensorsim, &own, request).await) }
             });
-            let connection = http2::Builder::new(TokioExecutor::new())
+            let connection = http2::Builder::new(requests)
                 .timer(TokioTimer::new())
                 // The default window of 64 KiB would stop at each part of a large batch. What is
                 // in the windows is not counted yet.

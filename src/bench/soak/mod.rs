@@ -14,6 +14,7 @@ use tokio::task::JoinSet;
 use wildcity_client::Pose as WirePose;
 use wildcity_scene::Trajectory;
 use wildcity_server::Running;
+use wildcity_session::limits::LONGEST_POLL;
 use wildcity_twin::store::Catalog;
 
 use self::agent::{Agent, Driven};
@@ -24,14 +25,16 @@ use super::memory::{mib, rss_bytes};
 use wildcity::cli::exit::Exit;
 
 /// Drive many sessions of small cameras against a server for minutes or hours, and check that
-/// memory does not grow and images do not change.
+/// memory does not grow, images do not change and no request holds up the others.
 ///
 /// The server runs in this process. The twin needs a recorded drive: each session drives the same
 /// stretch of the first one again and again, and compares the hash of every image with that of its
-/// first round. Prints the memory of the process every minute. The exit code is 1 if a request
-/// fails, a hash changes, or memory grows by more than --growth. Growth is the largest median of a
-/// later sixth of the time, compared with the median of the first sixth. With --memory-gib below
-/// what the twin needs, the server evicts and loads all the time.
+/// first round. Prints the memory of the process every minute, and how much of it are sections of
+/// twins and answers, which have limits of their own. The exit code is 1 if a request fails, a hash
+/// changes, more than one task in a thousand holds a thread that answers requests for more than
+/// 50 ms, or the rest of the memory grows by more than --growth. Growth is the largest median of a
+/// later sixth of the time, compared with that of the second sixth: in the first one caches fill.
+/// With --memory-gib below what the twin needs, the server evicts and loads all the time.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Soak {
@@ -65,6 +68,11 @@ Examples:
   wildcity-bench soak street
   wildcity-bench soak street --minutes 2 --sessions 4 --memory-gib 0.1
   wildcity-bench soak street --minutes 30 --mixed";
+
+/// Polls that may take longer than [`LONGEST_POLL`]: three, and one in a thousand. A system that
+/// stops the thread which holds a lock makes those late that wait for it.
+const LATE_POLLS: u64 = 3;
+const LATE_ONE_IN: u64 = 1000;
 
 /// Time between two lines.
 const LINE_EVERY: Duration = Duration::from_secs(60);
@@ -161,9 +169,10 @@ impl Soak {
                 Ok(None)
             }
         };
-        let watched = self.watch(driving.until);
+        let watched = self.watch(running, driving.until);
         let (driven, others, memory) = tokio::try_join!(driven, others, watched)?;
-        self.judge(&driven, others.as_ref(), &memory)
+        self.judge(&driven, others.as_ref(), &memory)?;
+        judge_polls(running)
     }
 
     /// Disturbs the server until the end.
@@ -194,8 +203,8 @@ impl Soak {
         Ok(Others { pushes, damaged, unread })
     }
 
-    /// Measures the memory every second until the end, and prints it every minute.
-    async fn watch(&self, until: Instant) -> anyhow::Result<Memory> {
+    /// Measures the memory until the end, and prints it every minute.
+    async fn watch(&self, running: &Running, until: Instant) -> anyhow::Result<Memory> {
         let begun = Instant::now();
         let mut out = io::stdout();
         let mut memory = Memory::default();
@@ -205,11 +214,23 @@ impl Soak {
             tick.tick().await;
             let bytes = rss_bytes()?.now;
             let elapsed = begun.elapsed();
-            memory.add(elapsed.div_duration_f64(self.length()), bytes);
+            let sections = running.engine().residency().held_bytes;
+            let answers = running.engine().answer_bytes();
+            // Both have limits of their own.
+            memory.add(
+                elapsed.div_duration_f64(self.length()),
+                bytes.saturating_sub(sections + answers),
+            );
             if Instant::now() >= next_line {
                 next_line += LINE_EVERY;
                 let minutes = elapsed.as_secs_f64() / 60.0;
-                writeln!(out, "{minutes:>6.1} min  {:>8.1} MiB", mib(bytes))?;
+                writeln!(
+                    out,
+                    "{minutes:>6.1} min  {:>8.1} MiB, of it {:>8.1} MiB of sections, {:>7.1} MiB of answers",
+                    mib(bytes),
+                    mib(sections),
+                    mib(answers),
+                )?;
             }
         }
         Ok(memory)
@@ -239,12 +260,12 @@ impl Soak {
         let growth = memory.percent();
         writeln!(
             out,
-            "{} steps in {} rounds of {} sessions, every image as in its first round; memory {:.1} MiB in the first \
-             sixth of the time, at most {:.1} MiB in a later one ({growth:+.2} %), medians; {:.1} MiB at most",
+            "{} steps in {} rounds of {} sessions, every image as in its first round; memory without sections and answers {:.1} MiB in the \
+             second sixth of the time, at most {:.1} MiB in a later one ({growth:+.2} %), medians; {:.1} MiB at most",
             driven.steps,
             driven.rounds,
             self.sessions,
-            mib(memory.first),
+            mib(memory.early),
             mib(memory.later),
             mib(memory.most),
         )?;
@@ -255,6 +276,30 @@ impl Soak {
         }
         Ok(())
     }
+}
+
+/// Prints for how long tasks held the threads that answer requests.
+///
+/// # Errors
+/// Too many held their thread for too long.
+fn judge_polls(running: &Running) -> anyhow::Result<()> {
+    let times = running.engine().polls().times();
+    let polls: u64 = times.counts.iter().map(|(_, count)| count).sum();
+    let longest_ms = times.longest.as_secs_f64() * 1e3;
+    writeln!(
+        io::stdout(),
+        "{polls} polls of the server's tasks, the longest of {longest_ms:.1} ms"
+    )?;
+    let is_late = |(bound_s, _): &&(f64, u64)| *bound_s > LONGEST_POLL.as_secs_f64();
+    let late: u64 = times.counts.iter().filter(is_late).map(|(_, count)| count).sum();
+    if late > LATE_POLLS + polls / LATE_ONE_IN {
+        let most_ms = LONGEST_POLL.as_millis();
+        let message = format!(
+            "tasks held a thread that answers requests for more than {most_ms} ms {late} times"
+        );
+        return Err(Exit::finding(1, message).into());
+    }
+    Ok(())
 }
 
 fn minutes(text: &str) -> Result<f64, String> {

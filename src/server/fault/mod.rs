@@ -582,6 +582,7 @@ mod tests {
     use super::*;
     use wildcity_render::RenderError;
     use wildcity_scene::RecordFormat;
+    use wildcity_session::RecordError;
 
     /// Results of a commit, over WebSocket or over HTTP.
     #[test]
@@ -633,6 +634,21 @@ mod tests {
             let fault = Fault::from(error);
             let report = fault.report();
             assert_eq!((report.body.code, report.status.as_u16()), (code, status), "{fault}");
+        }
+    }
+
+    /// A folder of records that takes nothing is, to a client, a full disk.
+    #[test]
+    fn a_record_that_cannot_be_written_is_refused_as_on_a_full_disk() {
+        for (kind, code) in [
+            (io::ErrorKind::StorageFull, Code::StorageFull),
+            (io::ErrorKind::ReadOnlyFilesystem, Code::StorageFull),
+            (io::ErrorKind::PermissionDenied, Code::StorageFull),
+            (io::ErrorKind::NotFound, Code::Internal),
+        ] {
+            let error = RecordError { path: "episodes/a-1.jsonl".into(), cause: kind.into() };
+            let report = Fault::Session(error.into()).report();
+            assert_eq!(report.body.code, code, "{kind}");
         }
     }
 

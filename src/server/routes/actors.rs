@@ -14,7 +14,7 @@ use wildcity_twin::store::AddedActor;
 
 use crate::audit::{Change, Made, Target};
 use crate::auth::Grant;
-use crate::blocking::blocking;
+use crate::blocking::{blocking, parsed};
 use crate::convert;
 use crate::fault::Fault;
 use crate::idle_deadline::IdleDeadline;
@@ -55,7 +55,7 @@ pub(super) async fn push(
 ) -> HttpResult {
     // Any twin may show the asset, so a token for some twins must not add one.
     grant.require_all_twins()?;
-    let request = convert::new_actor(&body)?;
+    let request = parsed(body, convert::new_actor).await?;
     // The limit of the token first, and then that of the server, so that the error names the one
     // that is the client's own.
     let open = state.open_pushes.push(&grant)?;
@@ -65,7 +65,9 @@ pub(super) async fn push(
     // axum drops this future when the client disconnects. The push runs in a task of its own, which
     // sees the cancellation.
     let _cancelling = CancelWhenDropped(push.clone());
-    let made = tokio::spawn(run(state, push, OwnedPush { grant, _open: open }, request, files));
+    let polls = state.engine.polls().clone();
+    let run = run(state, push, OwnedPush { grant, _open: open }, request, files);
+    let made = polls.spawn("push of an asset", run);
     let made = deadline.extend_during(made).await.map_err(|_| PushError::Crashed)?;
     let AddedActor { actor, is_new } = made??;
     let status = if is_new { StatusCode::CREATED } else { StatusCode::OK };

@@ -12,8 +12,8 @@ use wildcity_sim::limits as sim;
 use crate::limits;
 
 /// Bytes of JSON in memory for each byte of its text: `[0],` takes 4 bytes as text, and a list with
-/// room for four values as a value.
-const PARSED: u64 = 40;
+/// room for four values as a value, beside the text and its copy.
+const PARSED: u64 = 48;
 
 /// Bytes of a step of an actor in a record.
 const ACTOR_LINE_BYTES: u64 = 200;
@@ -99,11 +99,11 @@ const ROUTES: [Cost; 35] = [
     cost("GET /v1/episodes", LIST + 4 * MIB, NONE, 0, "one tail of a record at a time"),
     cost("GET /v1/episodes/{episode}", limits::EPISODE_BYTES, NONE, 0, "counts as an answer"),
     cost("GET /v1/episodes/{episode}/mcap", limits::EPISODE_BYTES, NONE, 0, "counts as an answer"),
-    cost("GET /v1/twins", MIB, NONE, 0, "summaries, kept"),
-    cost("GET /v1/twins/{twin}", MIB, NONE, 0, "a summary, kept"),
+    cost("GET /v1/twins", 2 * MIB, NONE, 0, "summaries, kept"),
+    cost("GET /v1/twins/{twin}", 2 * MIB, NONE, 0, "a summary, kept"),
     cost("GET /v1/twins/{twin}/versions", MIB, NONE, 0, "the log of a twin"),
     cost("GET /v1/twins/{twin}/trajectories/{name}", 32 * MIB, NONE, 0, "a part of a drive"),
-    cost("GET /v1/twins/{twin}/ground", 0, CHECK, 0, "reads a twin; counts as a push"),
+    cost("GET /v1/twins/{twin}/ground", 2 * MIB, CHECK, 0, "reads a twin; counts as a push"),
     cost("POST /v1/twins/{twin}/edits", JSON, CHECK, MIB, "counts as a push"),
     cost("POST /v1/twins/{twin}/rollback", JSON, NONE, MIB, "a record of the log"),
     cost("POST /v1/twins/{twin}/pushes", JSON, CHECK, limits::UPLOAD_BYTES, "`--push-memory-gib`"),
@@ -129,7 +129,13 @@ const ROUTES: [Cost; 35] = [
     ),
     cost("HEAD /v1/uploads/{id}", 0, NONE, 0, "an upload"),
     cost("GET /v1/uploads/{id}", 0, NONE, 0, "an upload"),
-    cost("PATCH /v1/uploads/{id}", 2 * MIB, NONE, limits::UPLOAD_BYTES, "parts of 1 MiB"),
+    cost(
+        "PATCH /v1/uploads/{id}",
+        6 * MIB,
+        NONE,
+        limits::UPLOAD_BYTES,
+        "parts of 1 MiB, and what is received meanwhile",
+    ),
     cost("DELETE /v1/uploads/{id}", 0, NONE, 0, "an upload"),
 ];
 

@@ -40,6 +40,7 @@ pub(super) async fn show_all(State(state): State<Arc<ServerState>>) -> HttpResul
         // The semaphore began with as many permits as the limit, so the difference is not negative.
         connections: state.limits.connections - free_connections,
         frames_queued: state.engine.queued_frames(),
+        answer_bytes: state.engine.answer_bytes(),
         uploads: spooled.uploads,
         spool_bytes: spooled.bytes,
         pushes_open: state.pushes.open_count(),

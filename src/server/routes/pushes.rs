@@ -15,7 +15,7 @@ use wildcity_push::{Begun, Push, PushError, PushRequest, RequestedFile, SourceFi
 
 use crate::audit::{Change, Made, Target};
 use crate::auth::Grant;
-use crate::blocking::blocking;
+use crate::blocking::{blocking, parsed};
 use crate::convert;
 use crate::fault::Fault;
 use crate::state::ServerState;
@@ -31,7 +31,7 @@ pub(super) async fn begin(
     Path(twin): Path<String>,
     body: Bytes,
 ) -> HttpResult {
-    let request = convert::new_push(twin, &body)?;
+    let request = parsed(body, |body| convert::new_push(twin, body)).await?;
     // Before the push is begun: a conflict that is certain now needs no upload to be read.
     let latest = {
         let catalog = state.engine.catalog().clone();
@@ -55,7 +55,9 @@ pub(super) async fn begin(
             let owned = OwnedPush { grant, change, _open: open };
             // A task of its own: a client that disconnects drops this future, but not the push,
             // which is in the queue by then.
-            let logged = tokio::spawn(log_and_run(state, push.clone(), owned, request, files));
+            let polls = state.engine.polls().clone();
+            let run = log_and_run(state, push.clone(), owned, request, files);
+            let logged = polls.spawn("push", run);
             logged.await.map_err(|_| PushError::Crashed)??;
             push
         }
@@ -118,7 +120,8 @@ async fn log_and_run(
         push.end(Err(PushError::Abandoned { reason: fault.to_string() }));
         return Err(fault);
     }
-    tokio::spawn(run(state, push, owned, request, files));
+    let polls = state.engine.polls().clone();
+    polls.spawn("push", run(state, push, owned, request, files));
     Ok(())
 }
 

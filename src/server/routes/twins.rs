@@ -13,7 +13,7 @@ use wildcity_twin::store::StoreError;
 
 use crate::audit::{Change, Made, Target};
 use crate::auth::Grant;
-use crate::blocking::blocking;
+use crate::blocking::{blocking, parsed};
 use crate::convert;
 use crate::fault::Fault;
 use crate::state::ServerState;
@@ -108,11 +108,12 @@ pub(super) async fn edit(
     body: Bytes,
 ) -> HttpResult {
     check_twin(&name)?;
-    let request = convert::new_edit(name, &body)?;
+    let request = parsed(body, |body| convert::new_edit(name, body)).await?;
     let open = state.open_pushes.push(&grant)?;
     // If the client disconnects, the edit is still completed, so that there is never a part of a
     // version.
-    let edited = tokio::spawn(async move {
+    let polls = state.engine.polls().clone();
+    let edited = polls.spawn("edit", async move {
         let _open = open;
         let target = Target::Twin(request.twin.clone());
         let change = Change { what: "edit", target, id: None };
@@ -136,7 +137,7 @@ pub(super) async fn rollback(
     body: Bytes,
 ) -> HttpResult {
     check_twin(&name)?;
-    let number = convert::rollback(&body)?;
+    let number = parsed(body, convert::rollback).await?;
     let version = blocking(move || {
         let engine = &state.engine;
         let change = Change { what: "rollback", target: Target::Twin(name.clone()), id: None };

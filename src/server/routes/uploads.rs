@@ -15,7 +15,7 @@ use sha2::{Digest as _, Sha256};
 use tokio::time::timeout;
 
 use crate::auth::Grant;
-use crate::blocking::blocking;
+use crate::blocking::{blocking, parsed};
 use crate::convert;
 use crate::fault::Fault;
 use crate::idle_deadline::IdleDeadline;
@@ -35,7 +35,7 @@ pub(super) async fn begin(
     Extension(grant): Extension<Arc<Grant>>,
     body: Bytes,
 ) -> HttpResult {
-    let announced = convert::new_upload(&body)?;
+    let announced = parsed(body, convert::new_upload).await?;
     let spool = state.spool()?.clone();
     let upload = blocking(move || spool.begin(&grant.name, announced)).await?;
     state.metrics.uploads_begun.inc();

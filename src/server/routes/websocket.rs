@@ -114,7 +114,7 @@ where
     // This completes after the answer below was sent, so it is awaited in another task.
     let upgrade = hyper::upgrade::on(&mut request);
     let send_timeout = state.limits.send;
-    tokio::spawn(async move {
+    state.engine.polls().spawn("WebSocket", async move {
         // Held until the connection ends.
         let _slots = slots;
         match upgrade.await.map(into_stream) {

@@ -52,7 +52,6 @@ impl AnswerBudget {
     }
 
     /// Bytes that are reserved.
-    #[cfg(test)]
     pub(crate) fn reserved(&self) -> u64 {
         self.0.reserved.load(Ordering::Relaxed)
     }

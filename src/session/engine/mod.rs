@@ -44,6 +44,7 @@ use crate::blocking::run_blocking;
 use crate::contact::TwinSolids;
 use crate::error::SessionError;
 use crate::limits;
+use crate::polls::Polls;
 use crate::record::quota::{RecordLimits, RecordQuota};
 use crate::scenario::load::Scenarios;
 use crate::spatial_index::SpatialIndex;
@@ -84,6 +85,7 @@ pub struct Engine {
     record_quota: Arc<RecordQuota>,
     /// The turns of long simulations, and of records that are read whole.
     turns: Turns,
+    polls: Arc<Polls>,
     /// The versions that are open, by place; by the hashes of the versions.
     indexes: Mutex<BTreeMap<String, Weak<SpatialIndex>>>,
     solid_blocks: Arc<SolidBlocks>,
@@ -131,6 +133,7 @@ impl Engine {
             session_numbers: AtomicU64::new(PUSHES + 1),
             answer_budget: AnswerBudget::default(),
             turns: Turns::new(),
+            polls: Arc::default(),
             exports,
             pins: Mutex::default(),
             latest: LatestVersions::default(),
@@ -228,6 +231,11 @@ impl Engine {
         &self.cache
     }
 
+    /// The polls of the tasks of all services that use the engine.
+    pub fn polls(&self) -> &Arc<Polls> {
+        &self.polls
+    }
+
     /// Frames that wait for the renderer.
     pub fn queued_frames(&self) -> usize {
         self.queue.len()
@@ -309,6 +317,11 @@ impl Engine {
     /// instruction set.
     pub(crate) fn backend_detail(&self) -> String {
         self.queue.backend().detail()
+    }
+
+    /// Memory of the answers that are being made, sent or kept, and of overlays, in bytes.
+    pub fn answer_bytes(&self) -> u64 {
+        self.answer_budget.reserved()
     }
 
     /// Counters of the pager, and the memory that twins take now.

@@ -2,7 +2,8 @@
 //!
 //! | module | what it holds |
 //! |---|---|
-//! | `world` | all actors of an episode, advanced by sub-steps |
+//! | `world` | all actors of an episode, advanced by sub-steps; their triggers |
+//! | `ego_motion` | the ego between two states |
 //! | `behaviour` | how an actor moves, with the state of its motion |
 //! | `track` | actors that repeat recorded motion, or timed positions |
 //! | `follow`, `course`, `lateral` | actors on a course, with changes of offset |
@@ -17,6 +18,7 @@ mod behaviour;
 mod condition;
 mod course;
 mod distance;
+mod ego_motion;
 mod follow;
 mod idm;
 mod lateral;
@@ -33,6 +35,7 @@ pub use attack::Attack;
 pub use behaviour::Behaviour;
 pub use course::{Course, CourseFootPoint};
 pub use distance::{Bounds, Gap, KeepDistance, Side};
+pub use ego_motion::EgoMotion;
 pub use follow::CourseFollower;
 pub use idm::{Idm, rolled};
 pub use script::{
@@ -42,4 +45,4 @@ pub use script::{
 pub use state::{ActorSpec, ActorState, EgoBox, EgoState, SubStep};
 pub use together::{ArriveTogether, FinalSpeed};
 pub use track::{Track, TrackError, TrackKeyframe, Tracked};
-pub use world::{Actor, EgoMotion, Firing, Traffic, World};
+pub use world::{Actor, Firing, Traffic, World};

@@ -1,11 +1,14 @@
 //! Histories of connections: agents drive, each with a session of its own, over connections that
-//! are cut at any byte. They resume, and repeat the request whose answer they did not get.
+//! are cut at any byte, or that they leave after sending a request. They resume, and repeat the
+//! request whose answer they did not get; some never come back. In some histories a frame does not
+//! end, so that its deadline passes.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::fmt;
+use std::ops::RangeInclusive;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use futures_util::future::join_all;
 use futures_util::{SinkExt as _, StreamExt as _};
@@ -31,6 +34,17 @@ const CONNECTIONS: usize = 32;
 /// Largest number of connections of an agent: each of its cuts takes one, and so may a takeover.
 const MOST_CONNECTIONS: usize = 40;
 
+/// Deadline of an agent whose frames are late, in milliseconds, and the longest time until its answer:
+/// threads of other histories may have the processors meanwhile.
+const DEADLINE_MS: u64 = 30;
+const LATE_WITHIN: Duration = Duration::from_secs(5);
+
+/// As [`LATE_WITHIN`], of histories with a planted fault.
+const PLANTED_WITHIN: Duration = Duration::from_millis(500);
+
+/// Attempts of a request whose deadline passes on a busy machine.
+const ATTEMPTS: usize = 100;
+
 /// Names of sessions are used once: the episodes of all histories are in one directory.
 static NAMES: AtomicU64 = AtomicU64::new(0);
 
@@ -39,12 +53,24 @@ static NAMES: AtomicU64 = AtomicU64::new(0);
 pub(super) enum Plant {
     /// A request that was carried out is carried out again after `resume`.
     StepsTwice,
+    /// The permit of a connection is kept, if its client leaves without waiting for an answer.
+    PermitLeaked,
+    /// So is the memory of an answer.
+    ReservationForgotten,
+    /// Sessions have no deadline.
+    DeadlineIgnored,
 }
 
 /// A request of an agent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Request {
-    Step { x_m: u8 },
+    Step {
+        x_m: u8,
+    },
+    /// A step whose frame does not end before its deadline; it is repeated.
+    Late {
+        x_m: u8,
+    },
     Reset,
 }
 
@@ -60,14 +86,17 @@ struct ConnectionFaults {
     buffer_bytes: usize,
     /// Whether the client waits before it connects.
     waits: bool,
+    /// The message after which the client leaves without waiting for its answer.
+    leaves_after: Option<u64>,
 }
 
 /// An agent: its requests, and its connections.
 #[derive(Clone, Debug)]
 struct Agent {
     requests: Vec<Request>,
-    /// The last connection is not cut.
+    /// Then comes one that nothing happens to, unless the agent stays away.
     connections: Vec<ConnectionFaults>,
+    stays_away: bool,
 }
 
 /// A history of connections.
@@ -98,7 +127,9 @@ impl super::History for Connections {
         machine.runtime.block_on(async {
             let limits = Limits { connections: CONNECTIONS, ..Limits::default() };
             let server = machine.server(limits, None, Err("no uploads here".to_owned()));
-            let network = Network { server, unclosed: RefCell::default() };
+            // Long enough for a busy machine; what is planted never comes.
+            let patience = if plant.is_some() { PLANTED_WITHIN } else { LATE_WITHIN };
+            let network = Network { server, unclosed: RefCell::default(), patience };
             let agents = self.agents.iter().map(|agent| {
                 let name = format!("agent-{}", NAMES.fetch_add(1, Ordering::Relaxed));
                 let network = &network;
@@ -108,9 +139,12 @@ impl super::History for Connections {
                     driven.map_err(|reason| format!("{name}: {reason}"))
                 }
             });
-            join_all(agents).await.into_iter().collect::<Result<Vec<()>, String>>()?;
-            let steps: usize = self.agents.iter().map(Agent::steps).sum();
-            network.finish(steps as u64).await
+            let driven = join_all(agents).await.into_iter().collect::<Result<Vec<_>, String>>()?;
+            let least = |driven: &Driven| driven.steps;
+            let most = |driven: &Driven| driven.steps + driven.last_steps;
+            let steps = driven.iter().map(least).sum()..=driven.iter().map(most).sum();
+            let away = self.agents.iter().filter(|agent| agent.stays_away).count();
+            network.finish(steps, away).await
         })
     }
 
@@ -130,6 +164,9 @@ impl super::History for Connections {
                     agents[index].requests.remove(request);
                 });
             }
+            if self.agents[index].stays_away {
+                change(&|agents| agents[index].stays_away = false);
+            }
             for connection in 0..self.agents[index].connections.len() {
                 change(&|agents| {
                     agents[index].connections.remove(connection);
@@ -143,8 +180,9 @@ impl super::History for Connections {
 impl fmt::Display for Connections {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "seed {}", self.seed)?;
-        for Agent { requests, connections } in &self.agents {
-            writeln!(f, "  {requests:?}")?;
+        for Agent { requests, connections, stays_away } in &self.agents {
+            let end = if *stays_away { ", then away" } else { "" };
+            writeln!(f, "  {requests:?}{end}")?;
             for faults in connections {
                 writeln!(f, "    {faults:?}")?;
             }
@@ -161,14 +199,20 @@ impl Agent {
             0 => Request::Reset,
             _ => Request::Step { x_m: 1 + 3 * index + random.below(3) as u8 },
         };
-        let requests = (0..count).map(|_| request(random)).collect();
+        let mut requests: Vec<Request> = (0..count).map(|_| request(random)).collect();
         let count = random.below(5);
         let connections = (0..count).map(|_| ConnectionFaults::random(random)).collect();
-        Self { requests, connections }
+        // Of one agent only, since frames of all agents wait meanwhile; and seldom, since it takes
+        // time.
+        if index == 0 && random.once_in(8) {
+            let late = random.below(requests.len() as u64) as usize;
+            requests[late] = Request::Late { x_m: 1 };
+        }
+        Self { requests, connections, stays_away: random.once_in(4) }
     }
 
-    fn steps(&self) -> usize {
-        self.requests.iter().filter(|request| matches!(request, Request::Step { .. })).count()
+    fn is_late(&self) -> bool {
+        self.requests.iter().any(|request| matches!(request, Request::Late { .. }))
     }
 }
 
@@ -180,6 +224,7 @@ impl ConnectionFaults {
         repeats: false,
         buffer_bytes: 64 << 10,
         waits: false,
+        leaves_after: None,
     };
 
     fn random(random: &mut Random) -> Self {
@@ -192,9 +237,11 @@ impl ConnectionFaults {
         let is_unclosed = random.once_in(4);
         let buffer_bytes = [17, 300, 64 << 10][random.below(3) as usize];
         let repeats = random.once_in(4);
+        // Hello, resume, open, the requests, and close.
+        let leaves_after = random.once_in(3).then(|| random.below(9));
         // The server waits for a client that does not read, and the simulation would wait as well.
         let buffer_bytes = if is_unclosed || repeats { 64 << 10 } else { buffer_bytes };
-        Self { cut, is_unclosed, repeats, buffer_bytes, waits: random.once_in(4) }
+        Self { cut, is_unclosed, repeats, buffer_bytes, waits: random.once_in(4), leaves_after }
     }
 }
 
@@ -202,12 +249,42 @@ impl ConnectionFaults {
 struct Network {
     server: SimServer,
     unclosed: RefCell<Vec<DuplexStream>>,
+    /// How long it waits for what has to come.
+    patience: Duration,
 }
 
 /// One connection of an agent.
 struct Link {
     socket: WebSocketStream<CutStream>,
     faults: ConnectionFaults,
+    /// Requests that were sent.
+    sent: u64,
+    /// Whether the session has had another connection.
+    is_resumed: bool,
+}
+
+/// What came of an agent.
+struct Driven {
+    /// Steps that were answered.
+    steps: u64,
+    /// Steps that may have been carried out beyond them.
+    last_steps: u64,
+}
+
+/// Frames that have begun do not end, until this is dropped.
+struct HeldFrames<'a>(&'a Painter);
+
+impl<'a> HeldFrames<'a> {
+    fn new(painter: &'a Painter) -> Self {
+        painter.held.store(true, Ordering::SeqCst);
+        Self(painter)
+    }
+}
+
+impl Drop for HeldFrames<'_> {
+    fn drop(&mut self) {
+        self.0.held.store(false, Ordering::SeqCst);
+    }
 }
 
 /// The connection is cut.
@@ -222,6 +299,8 @@ struct Progress<'a> {
     answered: usize,
     /// Steps since the last reset.
     steps: u64,
+    /// Whether the frame of the next request was late once.
+    was_late: bool,
 }
 
 impl Agent {
@@ -231,21 +310,28 @@ impl Agent {
         network: &Network,
         name: &str,
         plant: Option<Plant>,
-    ) -> Result<(), String> {
-        let mut progress = Progress { name, opened_seq: None, answered: 0, steps: 0 };
+    ) -> Result<Driven, String> {
+        let mut progress =
+            Progress { name, opened_seq: None, answered: 0, steps: 0, was_late: false };
         let mut connections = self.connections.iter();
         for _ in 0..MOST_CONNECTIONS {
+            if self.stays_away && connections.len() == 0 {
+                return Ok(self.driven(&progress));
+            }
             let faults = *connections.next().unwrap_or(&ConnectionFaults::NONE);
             if faults.waits {
                 tokio::time::sleep(Duration::from_millis(1)).await;
             }
             let Ok(mut link) = network.connect(faults).await else { continue };
-            let driven = self.drive_link(&mut link, &mut progress, plant).await;
+            let driven = self.drive_link(&mut link, network, &mut progress, plant).await;
+            if link.has_left() {
+                network.plant(plant);
+            }
             if faults.is_unclosed {
                 network.unclosed.borrow_mut().push(link.socket.into_inner().into_unclosed());
             }
             match driven {
-                Ok(Ok(())) => return Ok(()),
+                Ok(Ok(())) => return Ok(self.driven(&progress)),
                 Ok(Err(promise)) => return Err(promise),
                 Err(Lost) => {}
             }
@@ -253,20 +339,32 @@ impl Agent {
         Err(format!("not at the end after {MOST_CONNECTIONS} connections"))
     }
 
+    /// What came of it, however it ended.
+    fn driven(&self, progress: &Progress<'_>) -> Driven {
+        let is_step = |request: &&Request| !matches!(request, Request::Reset);
+        let (answered, others) = self.requests.split_at(progress.answered);
+        let steps = answered.iter().filter(is_step).count() as u64;
+        Driven { steps, last_steps: others.iter().take(1).filter(is_step).count() as u64 }
+    }
+
     /// Continues to drive over one connection.
     async fn drive_link(
         &self,
         link: &mut Link,
+        network: &Network,
         progress: &mut Progress<'_>,
         plant: Option<Plant>,
     ) -> Result<Result<(), String>, Lost> {
         let client = json!({ "name": "simulation", "version": "1" });
         let hello = json!({ "type": "hello", "client": client, "protocols": ["wildcity.v1"] });
         link.ask(0, hello).await?;
-        let open = json!({
+        let mut open = json!({
             "type": "open", "twin": "test", "session": progress.name,
             "outputs": { "encoding": "raw" },
         });
+        if self.is_late() && plant != Some(Plant::DeadlineIgnored) {
+            open["deadline_ms"] = DEADLINE_MS.into();
+        }
         let mut seq = 1;
 
         // Continues the session, if it was opened.
@@ -276,6 +374,7 @@ impl Agent {
         let carried_out = resumed["last_seq"].as_u64();
         match (resumed["type"].as_str(), resumed["code"].as_str(), carried_out) {
             (Some("resumed"), _, Some(carried_out)) => {
+                link.is_resumed = true;
                 let opened = *progress.opened_seq.get_or_insert(carried_out);
                 let next = opened + progress.answered as u64 + 1;
                 if carried_out + 1 != next && carried_out != next {
@@ -302,13 +401,22 @@ impl Agent {
             let request = self.requests[progress.answered];
             let next = progress.next_seq();
             let body = match request {
-                Request::Step { x_m } => json!({ "type": "step", "pose": pose(x_m.into()) }),
+                Request::Step { x_m } | Request::Late { x_m } => {
+                    json!({ "type": "step", "pose": pose(x_m.into()) })
+                }
                 Request::Reset => json!({ "type": "reset" }),
             };
-            let seen = match link.observe(next, body).await? {
+            if matches!(request, Request::Late { .. }) && !progress.was_late {
+                progress.was_late = true;
+                if let Err(promise) = link.be_late(network, next, body.clone()).await? {
+                    return Ok(Err(promise));
+                }
+            }
+            let seen = match self.observed(link, next, body).await? {
                 Ok(seen) => seen,
                 Err(said) => return Ok(Err(format!("request {next} is answered with {said}"))),
             };
+            progress.was_late = false;
             progress.steps = if request == Request::Reset { 0 } else { progress.steps + 1 };
             if let Err(promise) = progress.check(&seen, next, request) {
                 return Ok(Err(promise));
@@ -321,6 +429,24 @@ impl Agent {
             Some("closed") if closed["summary"]["steps"] == json!(progress.steps) => Ok(Ok(())),
             _ => Ok(Err(format!("close after {} steps is answered with {closed}", progress.steps))),
         }
+    }
+
+    /// An observation. An agent with a short deadline asks again.
+    async fn observed(
+        &self,
+        link: &mut Link,
+        seq: u64,
+        body: Value,
+    ) -> Result<Result<Seen, String>, Lost> {
+        let mut answer = link.observe(seq, body.clone()).await?;
+        for _ in 0..ATTEMPTS {
+            match &answer {
+                Err(said) if self.is_late() && said.contains("deadline_exceeded") => {}
+                _ => break,
+            }
+            answer = link.observe(seq, body.clone()).await?;
+        }
+        Ok(answer)
     }
 }
 
@@ -338,7 +464,7 @@ impl Progress<'_> {
         if found.into_iter().ne(expected.iter()) {
             return Err(format!("{request:?}: seq, step and time are {found:?}, not {expected:?}"));
         }
-        let Request::Step { x_m } = request else { return Ok(()) };
+        let (Request::Step { x_m } | Request::Late { x_m }) = request else { return Ok(()) };
         let world_from_rig =
             Pose { position_m: DVec3::new(x_m.into(), 0.0, 0.0), rotation: DQuat::IDENTITY };
         let tensors = seen.tensors();
@@ -370,35 +496,89 @@ impl Network {
         request.headers_mut().insert("Sec-WebSocket-Protocol", subprotocol);
         let (socket, _) =
             tokio_tungstenite::client_async(request, stream).await.map_err(|_| Lost)?;
-        Ok(Link { socket, faults })
+        Ok(Link { socket, faults, sent: 0, is_resumed: false })
+    }
+
+    /// A fault of the server that shows after a client has left.
+    fn plant(&self, plant: Option<Plant>) {
+        let state = &self.server.state;
+        match plant {
+            Some(Plant::PermitLeaked) => {
+                std::mem::forget(state.websocket_permits.clone().try_acquire_owned());
+            }
+            Some(Plant::ReservationForgotten) => {
+                self.server.keep(state.engine.reserve_answer_bytes(1));
+            }
+            _ => {}
+        }
     }
 
     /// Checks that each step was carried out once, and that nothing is left of the connections and
-    /// sessions.
-    async fn finish(self, steps: u64) -> Result<(), String> {
-        let Self { server, unclosed } = self;
+    /// sessions. Some agents stayed `away`: their sessions end now.
+    async fn finish(self, steps: RangeInclusive<u64>, away: usize) -> Result<(), String> {
+        let Self { server, unclosed, patience } = self;
         drop(unclosed);
         let state = &server.state;
-        let ended = async {
-            while state.sessions.count() > 0
-                || state.websocket_permits.available_permits() < CONNECTIONS
-            {
-                tokio::time::sleep(Duration::from_millis(1)).await;
-            }
-        };
-        if timeout(CLIENT_TIMEOUT, ended).await.is_err() {
-            let sessions = state.sessions.count();
-            let permits = state.websocket_permits.available_permits();
+        let permits = || state.websocket_permits.available_permits();
+        settled(patience, || permits() == CONNECTIONS && state.sessions.count() <= away).await;
+        let sessions = state.sessions.count();
+        if permits() < CONNECTIONS || sessions > away {
+            let permits = permits();
             return Err(format!("{sessions} sessions stay, and {permits} permits are free"));
         }
+        state.sessions.end_all_parked().await;
+        let engine = &state.engine;
+        let left = || {
+            let sessions = state.sessions.count() as u64;
+            [sessions, engine.answer_bytes(), engine.residency().reserved_bytes]
+        };
+        // A frame that was late may still be drawn.
+        settled(patience, || left() == [0; 3] && engine.queued_frames() == 0).await;
+        if left() != [0; 3] {
+            let [sessions, answers, reserved] = left();
+            return Err(format!(
+                "{sessions} sessions stay, {answers} bytes of answers and {reserved} reserved bytes"
+            ));
+        }
         match state.metrics.steps.get() {
-            carried_out if carried_out == steps => Ok(()),
-            carried_out => Err(format!("{carried_out} steps were made, not {steps}")),
+            carried_out if steps.contains(&carried_out) => Ok(()),
+            carried_out => Err(format!("{carried_out} steps were made, not {steps:?}")),
         }
     }
 }
 
+/// Waits until a condition holds. The caller looks again, whether it does.
+async fn settled(patience: Duration, holds: impl Fn() -> bool) {
+    let waiting = async {
+        while !holds() {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+    };
+    let _ = timeout(patience, waiting).await;
+}
+
 impl Link {
+    /// Asks for a frame that does not end.
+    async fn be_late(
+        &mut self,
+        network: &Network,
+        seq: u64,
+        body: Value,
+    ) -> Result<Result<(), String>, Lost> {
+        let _held = HeldFrames::new(&network.server.painter);
+        let begun = Instant::now();
+        let Ok(answer) = timeout(network.patience, self.observe(seq, body)).await else {
+            return Ok(Err(format!("request {seq} has a deadline and no answer")));
+        };
+        match answer? {
+            Err(said) if said.contains("deadline_exceeded") => Ok(Ok(())),
+            // A connection before this one may have asked for it already.
+            Ok(_) if self.is_resumed => Ok(Ok(())),
+            Ok(_) => Ok(Err(format!("request {seq} has a frame after {:?}", begun.elapsed()))),
+            Err(said) => Ok(Err(format!("request {seq}, which is late, is answered with {said}"))),
+        }
+    }
+
     /// Sends a request several times. Each is answered, with the same bytes.
     async fn exchange(
         &mut self,
@@ -410,6 +590,10 @@ impl Link {
         let text = request.to_string();
         for _ in 0..times {
             self.socket.send(Message::text(text.clone())).await.map_err(|_| Lost)?;
+        }
+        self.sent += 1;
+        if self.has_left() {
+            return Err(Lost);
         }
         let mut answers = Vec::new();
         for _ in 0..times {
@@ -423,6 +607,11 @@ impl Link {
         answers.dedup();
         assert_eq!(answers.len(), 1, "a repeated request has two answers: {answers:?}");
         answers.pop().ok_or(Lost)
+    }
+
+    /// Whether the client has left after its last request.
+    fn has_left(&self) -> bool {
+        self.faults.leaves_after.is_some_and(|last| self.sent > last)
     }
 
     fn times(&self) -> usize {

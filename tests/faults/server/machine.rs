@@ -1,5 +1,6 @@
 //! A machine that runs servers: a runtime, a renderer, and one twin on a simulated disk.
 
+use std::cell::RefCell;
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::Path;
 use std::sync::Arc;
@@ -12,7 +13,7 @@ use tokio::task::JoinHandle;
 
 use wildcity_push::PushQueue;
 use wildcity_repair::Models;
-use wildcity_session::{Engine, EngineSettings, Scenarios};
+use wildcity_session::{BudgetShare, Engine, EngineSettings, Scenarios, SessionError};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::Catalog;
 
@@ -43,6 +44,7 @@ const RESIDENT_BYTES: u64 = 64 << 20;
 pub(super) struct Machine {
     pub(super) runtime: Runtime,
     engine: Arc<Engine>,
+    painter: Arc<Painter>,
     episodes: tempfile::TempDir,
 }
 
@@ -50,6 +52,10 @@ pub(super) struct Machine {
 pub(super) struct SimServer {
     pub(super) state: Arc<ServerState>,
     acceptor: Acceptor,
+    /// The backend of the server.
+    pub(super) painter: Arc<Painter>,
+    /// Memory of answers that a planted fault keeps.
+    kept: RefCell<Vec<BudgetShare>>,
     _stop: watch::Sender<bool>,
 }
 
@@ -60,17 +66,19 @@ impl Machine {
         let disk = Arc::new(SimDisk::new(clock.clone(), None));
         let catalog = Catalog::on(Path::new(ROOT), disk, clock).expect("a catalog");
         commit_twin_to(&catalog, 2.0);
+        let painter = Arc::new(Painter::default());
         let episodes = tempfile::tempdir().expect("a temporary directory");
         let engine = Engine::start(EngineSettings {
             cache: Cache::limited(catalog, Some(RESIDENT_BYTES)),
             episodes: episodes.path().to_owned(),
             scenarios: Scenarios::in_dir(episodes.path().join("scenarios")),
-            backend: Arc::new(Painter::default()),
+            backend: painter.clone(),
             step_timeout: CLIENT_TIMEOUT,
             repairs: Arc::new(Models::default()),
             mcap: false,
         });
-        Self { runtime: runtime.expect("a runtime"), engine: engine.expect("an engine"), episodes }
+        let runtime = runtime.expect("a runtime");
+        Self { runtime, engine: engine.expect("an engine"), painter, episodes }
     }
 
     /// A server with these limits.
@@ -104,6 +112,8 @@ impl Machine {
         });
         SimServer {
             acceptor: Acceptor::new(state.clone(), crate::routes::router(state.clone())),
+            painter: self.painter.clone(),
+            kept: RefCell::default(),
             state,
             _stop: stop,
         }
@@ -111,6 +121,11 @@ impl Machine {
 }
 
 impl SimServer {
+    /// Keeps the memory of an answer as long as the server.
+    pub(super) fn keep(&self, share: Result<BudgetShare, SessionError>) {
+        self.kept.borrow_mut().extend(share);
+    }
+
     /// Connects a client. The task ends when the connection does, or becomes a WebSocket.
     pub(super) async fn connect(&self, buffer_bytes: usize) -> (DuplexStream, JoinHandle<()>) {
         let (client, server) = tokio::io::duplex(buffer_bytes);

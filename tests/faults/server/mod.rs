@@ -172,8 +172,11 @@ fn planted_faults_are_found() {
         let Failure { history, said } = failure.unwrap_or_else(|| panic!("{plant:?} is not found"));
         assert!(history.steps.len() <= 6, "{plant:?} is not shrunk: {said}\n{history}");
     }
-    let plant = connections::Plant::StepsTwice;
-    let failure = run::<connections::Connections>(1, HISTORIES_TO_FIND, Some(plant));
-    let Failure { history, said } = failure.unwrap_or_else(|| panic!("{plant:?} is not found"));
-    assert!(history.parts() <= 4, "{plant:?} is not shrunk: {said}\n{history}");
+    use connections::Plant::{DeadlineIgnored, PermitLeaked, ReservationForgotten, StepsTwice};
+    for plant in [StepsTwice, PermitLeaked, ReservationForgotten, DeadlineIgnored] {
+        let failure = run::<connections::Connections>(1, HISTORIES_TO_FIND, Some(plant));
+        let Failure { history, said } = failure.unwrap_or_else(|| panic!("{plant:?} is not found"));
+        eprintln!("{plant:?}: {said}\n{history}");
+        assert!(history.parts() <= 4, "{plant:?} is not shrunk: {said}\n{history}");
+    }
 }

@@ -15,6 +15,8 @@
 //! frames.
 
 mod fair;
+#[cfg(test)]
+mod interleaved;
 mod scratch;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -57,9 +59,8 @@ struct Shared {
     changed: Condvar,
 }
 
-#[derive(Default)]
-struct State {
-    queue: FairQueue<Job>,
+struct State<T = Job> {
+    queue: FairQueue<T>,
     is_closed: bool,
     /// Samples of the large frames that are being rendered.
     rendering: u64,
@@ -69,6 +70,18 @@ struct State {
     /// Whether there is a thread for small frames.
     has_side_thread: bool,
     threads: Vec<JoinHandle<()>>,
+}
+
+/// What a render thread does next.
+enum Next<T> {
+    /// The queue is closed.
+    Ends,
+    /// There is nothing for its lane until the state changes.
+    Waits,
+    /// A frame that cannot be ready in time.
+    Drops(T),
+    /// A frame. `wakes`: other lanes have to look again.
+    Renders { cost: FrameCost, job: T, wakes: bool },
 }
 
 /// Which frames a render thread takes.
@@ -87,7 +100,8 @@ impl RenderQueue {
     pub(crate) fn start(backend: Arc<dyn Backend>) -> Result<Self, SessionError> {
         // A backend that reports 0 still needs a thread that calls it.
         let threads = backend.frames_in_flight().max(1);
-        let shared = Shared { backend, state: Mutex::default(), changed: Condvar::new() };
+        let state = Mutex::new(State::new());
+        let shared = Shared { backend, state, changed: Condvar::new() };
         let queue = Self { shared: Arc::new(shared) };
         for number in 0..threads {
             let mut state = queue.shared.state.lock();
@@ -193,24 +207,12 @@ impl Shared {
 
     fn add(self: &Arc<Self>, cost: FrameCost, job: Job) -> Result<(), SessionError> {
         let mut state = self.state.lock();
-        if state.queue.len() >= limits::QUEUED_FRAMES {
-            return Err(SessionError::Busy { what: "frames queued" });
-        }
-        // Small frames are not refused for their time: it is not measured, and short.
-        if is_large(cost) {
-            // On average, half of a frame that is being rendered is still to be done. The sum has
-            // at most 2⁹ frames of 2²⁹ samples.
-            let before = state.rendering / 2 + state.queue.samples_above(limits::LARGE_SAMPLES);
-            if Instant::now() + state.time_for(before.saturating_add(cost.samples)) > job.deadline {
-                return Err(SessionError::Busy { what: "samples queued" });
-            }
-        }
+        let deadline = job.deadline;
+        state.add(cost, job, Instant::now(), deadline)?;
         // The thread is only useful if the backend can render two frames at once, and only needed
         // once there is a large frame.
-        let needs_side_thread =
-            state.rendering > 0 && !state.has_side_thread && self.backend.renders_beside();
-        state.queue.push(cost, job);
-        if needs_side_thread {
+        let is_needed = state.rendering > 0 && !state.has_side_thread;
+        if is_needed && self.backend.renders_beside() {
             // Without the thread, small frames wait for the large one.
             let name = "render-side".to_owned();
             state.has_side_thread = self.clone().start_thread(&mut state, name, Lane::Side).is_ok();
@@ -238,42 +240,92 @@ impl Shared {
     fn next(&self, lane: Lane) -> Option<(FrameCost, Job)> {
         let mut state = self.state.lock();
         loop {
-            // First of all: frames that still wait are dropped with the queue, and their sessions
-            // get an error.
-            if state.is_closed {
-                return None;
-            }
-            let most_samples = match lane {
-                // While no large frame is rendered, the main lane serves all frames, and the side
-                // lane sleeps.
-                Lane::Main => Some(u64::MAX),
-                Lane::Side => (state.rendering > 0).then_some(limits::LARGE_SAMPLES),
-            };
-            let Some((cost, job)) = most_samples.and_then(|most| state.queue.pop(most)) else {
+            match state.next(lane, Instant::now(), |job| job.deadline) {
+                Next::Ends => return None,
                 // Every change wakes every thread; one that finds nothing for its lane sleeps
                 // again.
-                self.changed.wait(&mut state);
-                continue;
-            };
-            // The time of a small frame is unknown: it begins unless its deadline has passed
-            // already.
-            let needed = if is_large(cost) { state.time_for(cost.samples) } else { Duration::ZERO };
-            if Instant::now() + needed >= job.deadline {
-                // Dropping the job answers its session.
-                continue;
+                Next::Waits => self.changed.wait(&mut state),
+                // This answers its session.
+                Next::Drops(job) => drop(job),
+                Next::Renders { cost, job, wakes } => {
+                    // Unlocked first, so that the threads that wake up do not wait for the lock.
+                    drop(state);
+                    if wakes {
+                        self.changed.notify_all();
+                    }
+                    return Some((cost, job));
+                }
             }
-            if is_large(cost) {
-                state.rendering += cost.samples;
-                // Unlocked first, so that the threads that wake up do not wait for the lock.
-                drop(state);
-                self.changed.notify_all();
-            }
-            return Some((cost, job));
         }
     }
 }
 
-impl State {
+impl<T> State<T> {
+    fn new() -> Self {
+        Self {
+            queue: FairQueue::default(),
+            is_closed: false,
+            rendering: 0,
+            ns_per_sample: 0.0,
+            has_side_thread: false,
+            threads: Vec::new(),
+        }
+    }
+
+    /// Adds a frame. Afterwards every thread has to look at the queue.
+    ///
+    /// # Errors
+    /// [`SessionError::Busy`]: the queue is full, or the frame cannot be ready in time.
+    fn add(
+        &mut self,
+        cost: FrameCost,
+        job: T,
+        now: Instant,
+        deadline: Instant,
+    ) -> Result<(), SessionError> {
+        if self.queue.len() >= limits::QUEUED_FRAMES {
+            return Err(SessionError::Busy { what: "frames queued" });
+        }
+        // Small frames are not refused for their time: it is not measured, and short.
+        if is_large(cost) {
+            // On average, half of a frame that is being rendered is still to be done. The sum has
+            // at most 2⁹ frames of 2²⁹ samples.
+            let before = self.rendering / 2 + self.queue.samples_above(limits::LARGE_SAMPLES);
+            if now + self.time_for(before.saturating_add(cost.samples)) > deadline {
+                return Err(SessionError::Busy { what: "samples queued" });
+            }
+        }
+        self.queue.push(cost, job);
+        Ok(())
+    }
+
+    /// What a thread of a lane does next.
+    fn next(&mut self, lane: Lane, now: Instant, deadline: impl Fn(&T) -> Instant) -> Next<T> {
+        // First of all: frames that still wait are dropped with the queue, and their sessions get
+        // an error.
+        if self.is_closed {
+            return Next::Ends;
+        }
+        let most_samples = match lane {
+            // While no large frame is rendered, the main lane serves all frames, and the side lane
+            // sleeps.
+            Lane::Main => Some(u64::MAX),
+            Lane::Side => (self.rendering > 0).then_some(limits::LARGE_SAMPLES),
+        };
+        let Some((cost, job)) = most_samples.and_then(|most| self.queue.pop(most)) else {
+            return Next::Waits;
+        };
+        // The time of a small frame is unknown: it begins unless its deadline has passed already.
+        let needed = if is_large(cost) { self.time_for(cost.samples) } else { Duration::ZERO };
+        if now + needed >= deadline(&job) {
+            return Next::Drops(job);
+        }
+        if is_large(cost) {
+            self.rendering += cost.samples;
+        }
+        Next::Renders { cost, job, wakes: is_large(cost) }
+    }
+
     /// Expected time to render some samples of large frames.
     fn time_for(&self, samples: u64) -> Duration {
         Duration::from_secs_f64(samples as f64 * self.ns_per_sample * 1e-9)

@@ -151,10 +151,26 @@ impl Local {
         Ok(())
     }
 
-    /// Takes the publish lock; `None` if another process has it and this one does not wait. Its
-    /// file is never removed: otherwise two commits could lock two files of one name.
+    fn publish_lock_file(&self, name: &str) -> PathBuf {
+        self.root.join(STAGING).join(format!("{name}.lock"))
+    }
+
+    /// Removes the file of the publish lock, if its name has neither a twin nor a commit: otherwise
+    /// every refused import would leave one. The caller holds the lock.
+    pub(super) fn remove_unused_lock(&self, name: &str) {
+        let prefix = format!("{name}{SEPARATOR}");
+        let staged = entries(&*self.disk, &self.root.join(STAGING));
+        let has_commit = |all: Vec<String>| all.iter().any(|entry| entry.starts_with(&prefix));
+        let is_used = staged.map_or(true, has_commit);
+        if !is_used && matches!(self.exists(&self.root.join(name)), Ok(false)) {
+            // A file that stays does no harm.
+            let _ = self.disk.remove_file(&self.publish_lock_file(name));
+        }
+    }
+
+    /// Takes the publish lock; `None` if another process has it and this one does not wait.
     pub(super) fn publish_lock(&self, name: &str, wait: Wait) -> Result<Option<Lock>, StoreError> {
-        let path = self.root.join(STAGING).join(format!("{name}.lock"));
+        let path = self.publish_lock_file(name);
         self.disk.lock(&path, wait).map_err(StoreError::io("lock", &path))
     }
 

@@ -360,6 +360,7 @@ impl ObjectBackend for Local {
 mod tests {
     use super::directory::LOCK;
     use std::sync::Arc;
+    use std::sync::atomic::Ordering;
 
     use super::*;
 
@@ -390,6 +391,37 @@ mod tests {
         let lost = objects.object_path("street", &blake3::hash(b"second").to_hex());
         assert!(!lost.exists() && !lost.parent().unwrap().exists());
         assert_eq!(objects.unfinished_commits().unwrap(), [""; 0]);
+    }
+
+    /// A refused import of any name would leave a file otherwise.
+    #[test]
+    fn a_name_without_a_twin_leaves_no_lock() {
+        let dir = tempfile::tempdir().unwrap();
+        let objects = Local::new(dir.path(), Arc::new(RealDisk));
+        let staged = || entries(&RealDisk, &dir.path().join(STAGING)).unwrap();
+        let first = begin(&objects, "street", "a").unwrap();
+        let second = begin(&objects, "street", "b").unwrap();
+        drop(first);
+        assert_eq!(staged(), ["street.lock", "street@b"]);
+        drop(second);
+        assert_eq!(staged(), [""; 0]);
+        // Threads that begin and give up all get locks of one file.
+        let objects = &objects;
+        let held = &std::sync::atomic::AtomicUsize::new(0);
+        std::thread::scope(|scope| {
+            for thread in 0..4 {
+                scope.spawn(move || {
+                    for commit in 0..50 {
+                        let mut staging =
+                            begin(objects, "street", &format!("{thread}-{commit}")).unwrap();
+                        staging.lock_publishing().unwrap();
+                        assert_eq!(held.fetch_add(1, Ordering::SeqCst), 0, "two have the lock");
+                        held.fetch_sub(1, Ordering::SeqCst);
+                    }
+                });
+            }
+        });
+        assert_eq!(staged(), [""; 0]);
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io;
-use std::os::unix::fs::OpenOptionsExt as _;
+use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
 use std::path::Path;
 use std::time::UNIX_EPOCH;
 
@@ -81,16 +81,33 @@ impl Disk for RealDisk {
 
     fn lock(&self, path: &Path, wait: Wait) -> io::Result<Option<Lock>> {
         let create = wait != Wait::NoAndExisting;
-        let file = open_regular(File::options().create(create).append(true), path)?;
-        if wait == Wait::Yes {
-            file.lock()?;
-            return Ok(Some(Lock::held_by(LockedFile(file))));
+        loop {
+            let file = open_regular(File::options().create(create).append(true), path)?;
+            if wait == Wait::Yes {
+                file.lock()?;
+            } else {
+                match file.try_lock() {
+                    Ok(()) => {}
+                    Err(TryLockError::WouldBlock) => return Ok(None),
+                    Err(TryLockError::Error(error)) => return Err(error),
+                }
+            }
+            let locked = LockedFile(file);
+            // The process that held it may have removed the file before it let go.
+            if is_at(&locked.0, path)? {
+                return Ok(Some(Lock::held_by(locked)));
+            }
         }
-        match file.try_lock() {
-            Ok(()) => Ok(Some(Lock::held_by(LockedFile(file)))),
-            Err(TryLockError::WouldBlock) => Ok(None),
-            Err(TryLockError::Error(error)) => Err(error),
-        }
+    }
+}
+
+/// Whether an open file is the one at a path.
+fn is_at(file: &File, path: &Path) -> io::Result<bool> {
+    let own = file.metadata()?;
+    match fs::symlink_metadata(path) {
+        Ok(found) => Ok((found.dev(), found.ino()) == (own.dev(), own.ino())),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
+        Err(error) => Err(error),
     }
 }
 

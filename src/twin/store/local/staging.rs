@@ -159,5 +159,12 @@ impl Drop for LocalStaging {
             self.local.remove_empty(&self.name);
         }
         let _ = self.local.disk.remove_all(&self.dir);
+        let lock = match self.publish_lock.take() {
+            None => self.local.publish_lock(&self.name, Wait::No).ok().flatten(),
+            held => held,
+        };
+        if lock.is_some() {
+            self.local.remove_unused_lock(&self.name);
+        }
     }
 }

@@ -7,6 +7,7 @@
 
 mod client;
 mod retry;
+mod same_host;
 mod staging;
 mod url;
 

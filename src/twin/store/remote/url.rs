@@ -2,14 +2,15 @@
 
 use std::sync::{Arc, Once};
 
-use object_store::aws::{AmazonS3Builder, AmazonS3ConfigKey};
-use object_store::azure::{AzureConfigKey, MicrosoftAzureBuilder};
-use object_store::gcp::{GoogleCloudStorageBuilder, GoogleConfigKey};
+use object_store::aws::AmazonS3Builder;
+use object_store::azure::MicrosoftAzureBuilder;
+use object_store::gcp::GoogleCloudStorageBuilder;
 use object_store::path::Path as Key;
-use object_store::{ClientConfigKey, ObjectStore, RetryConfig};
+use object_store::{ObjectStore, RetryConfig};
 
-use crate::limits;
 use crate::store::StoreError;
+
+use super::same_host::SameHost;
 
 /// Opens the store of a URL, as `s3://bucket/twins`, with credentials and endpoints from the
 /// environment: `AWS_*`, `GOOGLE_*`, `AZURE_*`. Also returns the prefix of its keys.
@@ -25,25 +26,23 @@ pub(super) fn open(url: &str) -> Result<(Arc<dyn ObjectStore>, Key), StoreError>
     provide_tls();
     // Retries are made only in `retry.rs`.
     let retry = RetryConfig { max_retries: 0, ..RetryConfig::default() };
-    // The client's own time-out of 30 s would end a request before `retry.rs` does.
-    let timeout = format!("{} s", limits::REMOTE_TIMEOUT.as_secs());
     let store: object_store::Result<Arc<dyn ObjectStore>> = match scheme {
         "s3" | "s3a" => AmazonS3Builder::from_env()
             .with_url(url)
             .with_retry(retry)
-            .with_config(AmazonS3ConfigKey::Client(ClientConfigKey::Timeout), timeout)
+            .with_http_connector(SameHost)
             .build()
             .map(|store| Arc::new(store) as _),
         "gs" => GoogleCloudStorageBuilder::from_env()
             .with_url(url)
             .with_retry(retry)
-            .with_config(GoogleConfigKey::Client(ClientConfigKey::Timeout), timeout)
+            .with_http_connector(SameHost)
             .build()
             .map(|store| Arc::new(store) as _),
         "az" | "azure" | "abfs" | "abfss" => MicrosoftAzureBuilder::from_env()
             .with_url(url)
             .with_retry(retry)
-            .with_config(AzureConfigKey::Client(ClientConfigKey::Timeout), timeout)
+            .with_http_connector(SameHost)
             .build()
             .map(|store| Arc::new(store) as _),
         _ => return Err(unknown()),
