@@ -223,10 +223,10 @@ impl Building {
         let rear = |u_m: f64, t: f64| {
             wall.at(u_m, eaves_m + rise_m * (1.0 - t), -run_m - (run_m + 0.30) * t)
         };
-        let (us, vs) =
-            (painter.even(-0.1, wall.width_m + 0.1, 1.5), [0.04, 0.12, 0.25, 0.5, 0.75, 1.0]);
-        let us = us.iter().rev().map(|u_m| -u_m).collect::<Vec<f64>>();
-        painter.sheet(&us, &vs, |u, t| rear(-u, t), |u, t| Some(tiles.times(1.0 + courses(u, t))));
+        let wide = painter.even(-0.1, wall.width_m + 0.1, 1.5);
+        painter.sheet(&wide, &[0.04, 0.12, 0.25, 0.5, 0.75, 1.0], rear, |u_m, t| {
+            Some(tiles.times(1.0 + courses(u_m, t)))
+        });
 
         let gable = self.style.wall.times(0.92);
         let depths = [painter.even(-DEPTH_M, 0.0, 1.2), painter.even(0.0, DEPTH_M, 1.2)];

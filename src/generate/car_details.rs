@@ -22,9 +22,9 @@ impl Car {
         let black = Paint::matt(0.07, 0.07, 0.08);
         let seam = self.paint.times(0.42);
         let line_m = painter.fine(LINE_M);
-        for &[from, to] in side_glass {
+        for &[from, end] in side_glass {
             // Where the windscreen comes down, the window ends.
-            let to = if self.cabin_m(to) > LOW_M { to } else { to - 0.02 };
+            let to = if self.cabin_m(end) > LOW_M { end } else { end - 0.02 };
             let parts = ((to - from) * length_m / line_m).ceil().max(1.0);
             for v in WINDOW {
                 let along = |part: i32| cabin(from + (to - from) * f64::from(part) / parts, v);
@@ -154,8 +154,8 @@ impl Car {
         }
         for side in [-1.0, 1.0] {
             let lamp = |u: [f64; 2], v: [f64; 2]| {
-                let u = if side > 0.0 { u } else { [-u[1], -u[0]] };
-                [u[0], u[1], at_m(v[0]), at_m(v[1])]
+                let [from_m, to_m] = if side > 0.0 { u } else { [-u[1], -u[0]] };
+                [from_m, to_m, at_m(v[0]), at_m(v[1])]
             };
             let outer_m = half_m - 0.03;
             let parts: &[([f64; 4], Paint)] = if nose {

@@ -5,18 +5,18 @@
 //! origin. The same settings give the same bytes: nothing depends on a clock or on the order of
 //! threads, and each object has its own stream of random numbers (`random.rs`).
 //!
-//! Large surfaces have few cells. What has an edge in a picture, such as a letter, a window's frame,
-//! a seam of a car or a crack of the road, is a stroke on them: one thin Gaussian.
+//! Large surfaces have few cells. What has an edge in a picture, such as a letter, the frame of a
+//! window, a seam of a car or a crack of the road, is a stroke on them: one thin Gaussian.
 //!
-//! The 437,000 Gaussians of the default settings, and their spacing at a
+//! The 426,000 Gaussians of the default settings, and their spacing at a
 //! [`StreetSettings::density`] of 1 (at the default of 0.8, spacings are 12 % wider):
 //!
 //! | what | thousands | spacing |
 //! |---|---|---|
-//! | road, parking, kerbs, pavements | 71 | 3 cm at lines, asphalt 38 x 50 cm, slabs 90 cm |
+//! | road, parking, kerbs, pavements | 65 | 3 cm at lines, asphalt 38 x 50 cm, slabs 90 cm |
 //! | houses | 177 | panes 22 to 40 cm, walls 16 to 75 cm, 2.5 times that where there is no lane |
 //! | 65 parked cars | 90 | 3 to 21 cm |
-//! | 44 trees | 56 | leaves of 6 cm |
+//! | 44 trees | 52 | leaves of 6 cm |
 //! | yards behind the houses, with 20 trees | 25 | 1.2 to 2 m, leaves of 12 cm |
 //! | lamps, lights, signs, bins, planters | 12 | 4 to 40 cm |
 //! | skyline, land | 6 | 4.5 m, wider with the distance |
@@ -118,7 +118,7 @@ pub enum GenerateError {
     },
 }
 
-/// Makes the street: 437,000 Gaussians at the default settings, in a fraction of a second.
+/// Makes the street: 426,000 Gaussians at the default settings, in a fraction of a second.
 ///
 /// # Errors
 /// Names the first setting out of range.

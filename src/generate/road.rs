@@ -92,7 +92,7 @@ impl Ground<'_> {
     /// Both lanes, their lines included.
     fn lanes(&self, painter: &mut Painter, from_s_m: f64, to_s_m: f64) {
         // Narrow cells beside the lines keep their edges sharp.
-        let inner = painter.graded(LINE_M, LANES_M - 0.12, 0.035, 0.38);
+        let inner = painter.graded(LINE_M, LANES_M - 0.12, 0.06, 0.42);
         // From the right edge to the left: edge line, lane, centre line, lane, edge line.
         let edge = [LANES_M - 0.095, LANES_M - 0.025, LANES_M];
         let ts: Vec<_> = edge
@@ -238,7 +238,10 @@ impl Ground<'_> {
     fn verge(&self, painter: &mut Painter, side: f64, from_s_m: f64, to_s_m: f64) {
         let side_of = |ts: Vec<f64>| oriented(side, ts);
         let ss = painter.even(from_s_m, to_s_m, 0.52);
-        let bays = side_of(painter.graded(LANES_M, KERB_M, 0.035, 0.42));
+        let beside_m = LANES_M + 0.06;
+        let mut columns = vec![LANES_M];
+        columns.extend(painter.even(beside_m, KERB_M, 0.42));
+        let bays = side_of(columns);
         self.flat(painter, &ss, &bays, 0.0, |s_m, t_m| {
             let gutter = smooth((t_m.abs() - (KERB_M - 0.5)) / 0.5);
             // The pattern of the asphalt, three times as fine across.

@@ -169,9 +169,9 @@ impl Yard<'_> {
         let ss = [middle_m - half_m - eaves_m, middle_m, middle_m + half_m + eaves_m];
         let ts = [0.0, 0.33, 0.67, 1.0].map(|t| if self.side > 0.0 { t } else { t - 1.0 });
         let roof = |s_m: f64, t: f64| {
-            let t = t.abs();
-            let away_m = away_m - deep_m - eaves_m + t * (deep_m + 2.0 * eaves_m);
-            self.at(s_m, away_m, front_m + 0.06 + t * (rear_m - front_m))
+            let back = t.abs();
+            let behind_m = back * (deep_m + 2.0 * eaves_m) - deep_m - eaves_m;
+            self.at(s_m, away_m + behind_m, front_m + 0.06 + back * (rear_m - front_m))
         };
         painter.sheet(&ss, &ts, roof, |_, _| Some(Paint::matt(0.30, 0.29, 0.30)));
     }
