@@ -140,7 +140,8 @@ fn paint_shade(painter: &mut Painter, [length_m, width_m]: [f64; 2]) {
             let inside_m = (half_m[0] - x.abs()).min(half_m[1] - y.abs());
             let opacity = 0.03 + 0.19 * smooth(inside_m / 0.4);
             let sigmas_m = DVec3::new(0.6 * cell_m[0], 0.6 * cell_m[1], 0.002);
-            let (mean_m, rgb) = (DVec3::new(x, y, 0.02), DVec3::splat(0.05));
+            let mean_m = DVec3::new(x, y, 0.02);
+            let rgb = DVec3::splat(0.05);
             painter.gaussian(mean_m, DQuat::IDENTITY, sigmas_m, opacity, rgb, DVec3::ZERO);
         }
     }

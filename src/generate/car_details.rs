@@ -93,7 +93,8 @@ impl Car {
     pub(super) fn end(&self, painter: &mut Painter, x: f64) {
         let nose = x > 0.5;
         let outwards = if nose { 1.0 } else { -1.0 };
-        let (half_m, top_m) = (0.97 * self.half_width_m(x), self.kind.belt_m(x) + 0.01);
+        let half_m = 0.97 * self.half_width_m(x);
+        let top_m = self.kind.belt_m(x) + 0.01;
         // As seen from outside, u runs to the right: to the car's left for a viewer in front of its
         // nose.
         let ys = painter.graded(-half_m, half_m, 0.10, 0.24);
@@ -263,7 +264,8 @@ impl Car {
                 Paint::matt(0.11, 0.11, 0.12).times(if r > 0.9 { 0.75 } else { 1.0 })
             })
         });
-        let (place, out) = (disc(tyre_m, half_m - 0.022), side * self.left);
+        let place = disc(tyre_m, half_m - 0.022);
+        let out = side * self.left;
         for spoke in 0..5 {
             let angle_rad = std::f64::consts::TAU * (f64::from(spoke) + 0.25) / 5.0;
             let ends_m = [place(angle_rad, 0.06), place(angle_rad, 0.62)];
@@ -284,7 +286,8 @@ impl Car {
     pub(super) fn mirror(&self, painter: &mut Painter, side: f64) {
         // Just behind the lower end of the windscreen.
         let x = self.kind.windscreen[1] - 0.055;
-        let (x_m, z_m) = (x * self.kind.length_m, self.kind.belt_m(x) + 0.03);
+        let x_m = x * self.kind.length_m;
+        let z_m = self.kind.belt_m(x) + 0.03;
         let inner_m = self.half_width_m(x) - 0.04;
         let ys = painter.refined(&[0.0, 0.06, 0.12, 0.18]);
         let zs = painter.refined(&[0.0, 0.06, 0.12]);

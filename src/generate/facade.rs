@@ -207,7 +207,8 @@ impl Facade<'_, '_, '_> {
     /// The stone frame around an opening, with its sill and the reveals to the panes.
     pub(super) fn surround(&mut self, u: [f64; 2], v: [f64; 2]) {
         let trim = self.style.trim;
-        let (wide_m, out_m) = (0.13, 0.06);
+        let wide_m = 0.13;
+        let out_m = 0.06;
         // From far away, lintel and sill are enough.
         if !self.style.near {
             for v_m in [v[1] + 0.5 * wide_m, v[0] - 0.045] {
@@ -218,7 +219,8 @@ impl Facade<'_, '_, '_> {
         for at_m in [u[0] - 0.5 * wide_m, u[1] + 0.5 * wide_m] {
             self.bar([at_m, v[0] - 0.05], [at_m, v[1] + wide_m], out_m, [wide_m, 1.0], trim);
         }
-        let (left_m, right_m) = (u[0] - wide_m, u[1] + wide_m);
+        let left_m = u[0] - wide_m;
+        let right_m = u[1] + wide_m;
         let top_m = v[1] + 0.5 * wide_m + 0.01;
         self.bar([left_m, top_m], [right_m, top_m], out_m, [wide_m + 0.03, BAR_M], trim);
         // The sill stands out, and the wall below it is in its shade.

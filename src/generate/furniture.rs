@@ -68,7 +68,8 @@ fn traffic_light_head(painter: &mut Painter, base_m: DVec3, facing: DVec3, green
         painter.polyline(&arc, facing, [0.03, 1.0], case.times(0.7));
         if is_on {
             let axes = DMat3::from_cols(right, DVec3::Z, right.cross(DVec3::Z));
-            let (rgb, sigmas_m) = (DVec3::new(r, g, b), DVec3::new(0.14, 0.14, 0.02));
+            let rgb = DVec3::new(r, g, b);
+            let sigmas_m = DVec3::new(0.14, 0.14, 0.02);
             let at_m = center_m + 0.12 * facing;
             painter.gaussian(at_m, DQuat::from_mat3(&axes), sigmas_m, 0.51, rgb, DVec3::ZERO);
         }

@@ -95,7 +95,8 @@ impl Facade<'_, '_, '_> {
                 self.bar([u[0], shelf_m], [u[1], shelf_m], -0.16, [0.05, 0.4], board);
                 let mut at_m = u[0] + 0.12;
                 while at_m < u[1] - 0.16 {
-                    let [wide_m, high_m] = [random.range(0.08, 0.2), random.range(0.14, 0.42)];
+                    let wide_m = random.range(0.08, 0.2);
+                    let high_m = random.range(0.14, 0.42);
                     let at = |up_m: f64| wall.at(at_m + 0.5 * wide_m, shelf_m + 0.03 + up_m, -0.14);
                     let goods = random.pick(&GOODS);
                     self.painter.stroke([at(0.0), at(high_m)], wall.out, wide_m, goods);
@@ -128,7 +129,9 @@ impl Facade<'_, '_, '_> {
         // Light letters on a dark sign, dark ones on a light sign.
         let tone = if accent.rgb.element_sum() > 1.5 { 0.16 } else { 0.96 };
         let ink = Paint::matt(tone, tone, 0.93 * tone);
-        let (wall, [wide_m, high_m]) = (*self.wall, [0.62 * pitch_m, 0.38]);
+        let wall = *self.wall;
+        let wide_m = 0.62 * pitch_m;
+        let high_m = 0.38;
         let from = [0.5 * (u[0] + u[1] - pitch_m * (count - 0.38)), 0.5 * (v[0] + v[1] - high_m)];
         for (index, letter) in name.chars().enumerate() {
             let left_m = from[0] + pitch_m * index as f64;

@@ -137,7 +137,11 @@ impl Yard<'_> {
             Paint::matt(0.36, 0.42, 0.36),
             Paint::matt(0.60, 0.56, 0.48),
         ]);
-        let (half_m, deep_m, [front_m, rear_m]) = (1.5, 2.4, [2.3, 2.0]);
+        let half_m = 1.5;
+        let deep_m = 2.4;
+        // Its height in front and behind.
+        let front_m = 2.3;
+        let rear_m = 2.0;
         let middle_m = self.s_m[0] + random.range(2.5, self.s_m[1] - self.s_m[0] - 2.5);
         let away_m = YARDS_M[1] - 0.5;
         let corners = [
@@ -148,8 +152,10 @@ impl Yard<'_> {
         ];
         let tops_m = [front_m, front_m, rear_m, rear_m];
         for wall in 0..4 {
-            let [from, to] = [corners[wall], corners[(wall + 1) % 4]];
-            let [from_top_m, to_top_m] = [tops_m[wall], tops_m[(wall + 1) % 4]];
+            let from = corners[wall];
+            let to = corners[(wall + 1) % 4];
+            let from_top_m = tops_m[wall];
+            let to_top_m = tops_m[(wall + 1) % 4];
             // Outwards on the left of the street; on its right the corners turn the other way.
             let part = |u: f64| if self.side > 0.0 { u } else { 1.0 - u };
             let place = |u: f64, v: f64| {
@@ -179,7 +185,8 @@ impl Yard<'_> {
     /// Two posts, a line, and cloths that hang on it.
     fn washing(&self, painter: &mut Painter, random: &mut Random) {
         let away_m = PAVED_M + 1.5;
-        let [from_m, to_m] = [self.s_m[0] + 3.0, self.s_m[0] + 9.0];
+        let from_m = self.s_m[0] + 3.0;
+        let to_m = self.s_m[0] + 9.0;
         let out = self.side * self.route.at(from_m).left;
         for s_m in [from_m, to_m] {
             let ends_m = [self.at(s_m, away_m, 0.0), self.at(s_m, away_m, 2.0)];
@@ -189,7 +196,8 @@ impl Yard<'_> {
         painter.polyline(&line, out, [0.015, 1.5], Paint::matt(0.75, 0.75, 0.74));
         let mut s_m = from_m + 0.6;
         while s_m < to_m - 1.0 {
-            let [wide_m, long_m] = [random.range(0.5, 0.9), random.range(0.6, 1.2)];
+            let wide_m = random.range(0.5, 0.9);
+            let long_m = random.range(0.6, 1.2);
             let cloth = random.pick(&[
                 Paint::matt(0.92, 0.92, 0.90),
                 Paint::matt(0.70, 0.78, 0.88),
