@@ -84,12 +84,12 @@ impl Yard<'_> {
         let mut stretch =
             |[from_m, to_m]: [f64; 2], step_m: f64, paint: &dyn Fn(f64, f64) -> Paint| {
                 let ss = painter.even(self.s_m[0], self.s_m[1], step_m);
-                let mut aways: Vec<f64> = painter.even(from_m, to_m, step_m);
+                let mut depths_m: Vec<f64> = painter.even(from_m, to_m, step_m);
                 if self.side < 0.0 {
-                    aways = aways.iter().rev().map(|away_m| -away_m).collect();
+                    depths_m = depths_m.iter().rev().map(|away_m| -away_m).collect();
                 }
                 let place = |s_m: f64, t_m: f64| self.at(s_m, t_m * self.side, 0.0);
-                painter.sheet(&ss, &aways, place, |s_m, t_m| Some(paint(s_m, t_m)));
+                painter.sheet(&ss, &depths_m, place, |s_m, t_m| Some(paint(s_m, t_m)));
             };
         stretch([YARDS_M[0] - 0.6, PAVED_M], 1.2, &|s_m, t_m| {
             let slab = noise(self.seed + 31, s_m.floor(), t_m.floor());
