@@ -26,7 +26,7 @@ pub(super) fn draw(picture: &mut RgbImage, text: &str, [left, top]: [u32; 2]) {
         let character = if character == '_' { ' ' } else { character };
         let raster = [character, '?'].into_iter().find_map(|one| get_raster(one, FONT.0, FONT.1));
         let Some(raster) = raster else { continue };
-        for (row, lights) in raster.raster().iter().enumerate() {
+        for (row, lights) in raster.rows().enumerate() {
             for (at, light) in lights.iter().enumerate() {
                 let x = left + PAD_PX + advance * column as u32 + at as u32;
                 let y = top + PAD_PX + row as u32;
