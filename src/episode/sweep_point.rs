@@ -14,4 +14,6 @@ pub struct SweepPoint {
     pub column: u16,
     /// The owner of what was hit, as in the map of an image.
     pub instance: u16,
+    /// The class of what was hit; 0 if the session asked for none.
+    pub class: u8,
 }

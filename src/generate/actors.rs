@@ -4,7 +4,7 @@
 //! They are lit from above ([`Light::overhead`]), since an actor turns and its light does not.
 //! Pictures were used to check that they look right next to the parked cars.
 
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 
 use wildcity_scene::{ActorBox, ActorClass, Gaussians};
 
@@ -13,6 +13,7 @@ use super::cars::Car;
 use super::cyclist;
 use super::light::Light;
 use super::pedestrian;
+use super::random::smooth;
 use super::surface::{Paint, Painter};
 
 /// Cells along an edge, as a multiple of those of a parked car: spacings of 2 to 4 cm.
@@ -37,7 +38,7 @@ impl ActorModel {
 }
 
 /// Counts changes of the models: assets of another revision are made again.
-pub const ACTOR_REVISION: u32 = 3;
+pub const ACTOR_REVISION: u32 = 4;
 
 /// Cells along an edge of a truck and a bus: they have four times the surface of a car.
 const LARGE_DETAIL: usize = 2;
@@ -57,9 +58,9 @@ pub fn actor_models() -> Vec<ActorModel> {
     for (name, kind, paint, detail) in cars {
         let car = Car::model(kind, paint);
         let mut painter = Painter::detailed(&light, detail);
-        // Without the shade below: it belongs to the road, and the car will drive away.
         car.paint_model(&mut painter);
         let DVec3 { x: length_m, y: width_m, z: height_m } = car.size_m();
+        paint_shade(&mut painter, [length_m, width_m]);
         models.push(ActorModel {
             name,
             class: ActorClass::Vehicle,
@@ -70,6 +71,7 @@ pub fn actor_models() -> Vec<ActorModel> {
     // The spacings of these models are those of a near object already.
     let mut painter = Painter::detailed(&light, 1);
     pedestrian::paint(&mut painter);
+    paint_shade(&mut painter, [0.8, 0.5]);
     models.push(ActorModel {
         name: "pedestrian",
         class: ActorClass::Pedestrian,
@@ -78,6 +80,7 @@ pub fn actor_models() -> Vec<ActorModel> {
     });
     let mut painter = Painter::detailed(&light, 1);
     cyclist::paint(&mut painter);
+    paint_shade(&mut painter, [1.7, 0.4]);
     models.push(ActorModel {
         name: "bicycle",
         class: ActorClass::Bicycle,
@@ -121,6 +124,26 @@ fn paint_crate(painter: &mut Painter) {
                 (false, false) => wood,
             })
         });
+    }
+}
+
+/// The soft shade on the ground below an object with its middle on the origin, which moves with it.
+/// It covers a third of the road at most, so that what is there is still the road.
+fn paint_shade(painter: &mut Painter, [length_m, width_m]: [f64; 2]) {
+    let half_m = [0.5 * length_m + 0.15, 0.5 * width_m + 0.15];
+    let counts = half_m.map(|half_m| (2.0 * half_m / 0.25).ceil().max(2.0));
+    let cell_m = [0, 1].map(|axis| 2.0 * half_m[axis] / counts[axis]);
+    for row in 0..counts[1] as usize {
+        for column in 0..counts[0] as usize {
+            let x = (column as f64 + 0.5) * cell_m[0] - half_m[0];
+            let y = (row as f64 + 0.5) * cell_m[1] - half_m[1];
+            let inside_m = (half_m[0] - x.abs()).min(half_m[1] - y.abs());
+            let opacity = 0.03 + 0.19 * smooth(inside_m / 0.4);
+            let sigmas_m = DVec3::new(0.6 * cell_m[0], 0.6 * cell_m[1], 0.002);
+            let mean_m = DVec3::new(x, y, 0.02);
+            let rgb = DVec3::splat(0.05);
+            painter.gaussian(mean_m, DQuat::IDENTITY, sigmas_m, opacity, rgb, DVec3::ZERO);
+        }
     }
 }
 

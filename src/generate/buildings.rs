@@ -10,7 +10,7 @@ use super::route::Route;
 use super::surface::{Paint, Painter};
 
 /// Depth of a house behind its front, in metres.
-const DEPTH_M: f64 = 13.0;
+pub(super) const DEPTH_M: f64 = 13.0;
 /// Narrowest and widest front, in metres.
 const FRONTS_M: [f64; 2] = [9.0, 17.0];
 
@@ -136,6 +136,7 @@ impl Building {
             facade::paint(painter, &self.front, &self.style, &mut random);
             self.back(painter, &self.front);
             self.sides(painter, &mut random);
+            self.rear(painter, &mut random);
             self.roof(painter, &mut random);
         });
     }
@@ -168,6 +169,23 @@ impl Building {
         }
     }
 
+    /// The wall towards the yard, coarse: no camera drives there.
+    fn rear(&self, painter: &mut Painter, random: &mut Random) {
+        let at = |u_m: f64| self.front.at(u_m, 0.0, -DEPTH_M);
+        let wall = Wall::between(at(self.front.width_m), at(0.0));
+        let style = Style {
+            wall: self.style.wall.times(0.94),
+            balconies: false,
+            ground_floor: GroundFloor::Flats,
+            near: false,
+            bay_m: 1.45 * self.style.bay_m,
+            ..self.style
+        };
+        painter.coarser(3.2 / self.spacing.min(1.4), |painter| {
+            facade::paint(painter, &wall, &style, random);
+        });
+    }
+
     /// A dark surface 1.6 m behind a wall, which is visible through gaps between its surfels.
     fn back(&self, painter: &mut Painter, wall: &Wall) {
         let (inset_m, top_m) = (1.6, self.style.height_m() - 1.6);
@@ -196,20 +214,28 @@ impl Building {
         ]);
         let (run_m, rise_m) = (0.5 * DEPTH_M, random.range(2.8, 4.0));
         let us = painter.graded(-0.1, wall.width_m + 0.1, 0.3, 0.9);
-        let vs = painter.even(0.0, 1.0, 0.12);
+        let vs = painter.even(0.0, 1.0, 0.19);
         let place =
             |u_m: f64, t: f64| wall.at(u_m, eaves_m + rise_m * t, 0.30 - (run_m + 0.30) * t);
         let courses = |u_m: f64, t: f64| 0.07 * noise(11, 2.0 * u_m, (t * 24.0).floor());
         painter.sheet(&us, &vs, place, |u_m, t| Some(tiles.times(1.0 + courses(u_m, t))));
+        // The slope towards the yard, down from the ridge.
+        let rear = |u_m: f64, t: f64| {
+            wall.at(u_m, eaves_m + rise_m * (1.0 - t), -run_m - (run_m + 0.30) * t)
+        };
+        let wide = painter.even(-0.1, wall.width_m + 0.1, 1.5);
+        painter.sheet(&wide, &[0.04, 0.12, 0.25, 0.5, 0.75, 1.0], rear, |u_m, t| {
+            Some(tiles.times(1.0 + courses(u_m, t)))
+        });
 
         let gable = self.style.wall.times(0.92);
-        let depths = [painter.even(-DEPTH_M, 0.0, 0.9), painter.even(0.0, DEPTH_M, 0.9)];
+        let depths = [painter.even(-DEPTH_M, 0.0, 1.2), painter.even(0.0, DEPTH_M, 1.2)];
         for (u_m, depths, sign) in [(0.0, &depths[0], 1.0), (wall.width_m, &depths[1], -1.0)] {
             // A triangle: `rise` above the ridge in the middle of the depth, 0 at both ends.
             let top_m = |depth_m: f64| rise_m * (1.0 - (depth_m / run_m + 1.0).abs());
             let place =
                 |d_m: f64, t: f64| wall.at(u_m, eaves_m + t * top_m(sign * d_m), sign * d_m);
-            painter.sheet(depths, &[0.0, 0.35, 0.65, 0.85, 0.96, 1.0], place, |_, _| Some(gable));
+            painter.sheet(depths, &[0.0, 0.4, 0.75, 0.93, 1.0], place, |_, _| Some(gable));
         }
 
         let brick = Paint::matt(0.52, 0.36, 0.31);

@@ -34,8 +34,18 @@ impl Kind {
 
     /// The fractions of the length at which a knot or a window lies, in increasing order.
     pub(super) fn features(&self) -> Vec<f64> {
+        self.sorted(self.side_glass.iter().flatten())
+    }
+
+    /// Those of them that matter on the middle line, where no side window is.
+    pub(super) fn middle_features(&self) -> Vec<f64> {
+        self.sorted([].iter())
+    }
+
+    /// The knots and the ends of windscreen and rear window, with others.
+    fn sorted<'a>(&'a self, others: impl Iterator<Item = &'a f64>) -> Vec<f64> {
         let mut features: Vec<f64> = self.knots.iter().map(|knot| knot.0).collect();
-        features.extend(self.side_glass.iter().flatten());
+        features.extend(others);
         features.extend(self.rear_glass);
         features.extend(self.windscreen);
         features.sort_by(f64::total_cmp);

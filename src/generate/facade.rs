@@ -127,7 +127,12 @@ pub(super) struct Facade<'p, 'a, 'w> {
 }
 
 /// Spacing on plain wall, next to an opening and in between, in metres. Surrounds cover its edge.
-const WALL_M: [f64; 2] = [0.15, 0.52];
+const WALL_M: [f64; 2] = [0.16, 0.60];
+/// Width of wall that a surround hides, in metres.
+const HIDDEN_M: f64 = 0.07;
+/// Longest part of a level bar, in metres: a longer one would hide behind the wall beside it, for a
+/// camera that looks along the street.
+const BAR_M: f64 = 0.6;
 /// Depth of window panes in the wall, in metres.
 pub(super) const RECESS_M: f64 = 0.14;
 
@@ -140,18 +145,29 @@ impl Facade<'_, '_, '_> {
         let u = [middle_m - half_m, middle_m + half_m];
         // 35 cm of wall at least above the window.
         let v = [v_m[0] + sill_m, (v_m[0] + sill_m + self.style.window_m).min(v_m[1] - 0.35)];
-        self.pier([u_m, u[0]], v_m);
-        self.pier([u[1], u_m + self.bay_m], v_m);
-        self.plain(u, [v_m[0], v[0]]);
-        self.plain(u, [v[1], v_m[1]]);
+        self.around(u_m, u, v_m, v);
         self.surround(u, v);
         self.window(u, v, random);
+    }
+
+    /// Wall of a bay around an opening: it ends behind the surround, so that it does not blur the
+    /// opening's edge.
+    pub(super) fn around(&mut self, u_m: f64, u: [f64; 2], v_m: [f64; 2], v: [f64; 2]) {
+        let [left_m, right_m] = [u[0] - HIDDEN_M, u[1] + HIDDEN_M];
+        self.pier([u_m, left_m], v_m);
+        self.pier([right_m, u_m + self.bay_m], v_m);
+        if v[0] > v_m[0] {
+            self.plain([left_m, right_m], [v_m[0], v[0] - HIDDEN_M]);
+        }
+        self.plain([left_m, right_m], [v[1] + HIDDEN_M, v_m[1]]);
     }
 
     /// Wall next to openings: fine at its sides.
     pub(super) fn pier(&mut self, u: [f64; 2], v: [f64; 2]) {
         let us = self.painter.graded(u[0], u[1], WALL_M[0], WALL_M[1]);
-        let vs = self.painter.even(v[0], v[1], 0.62);
+        // Taller ones would reach above the eaves.
+        let step_m = if self.style.near { self.painter.at_most(0.75, 1.1) } else { 0.75 };
+        let vs = self.painter.even(v[0], v[1], step_m);
         self.wall(&us, &vs);
     }
 
@@ -191,22 +207,30 @@ impl Facade<'_, '_, '_> {
     /// The stone frame around an opening, with its sill and the reveals to the panes.
     pub(super) fn surround(&mut self, u: [f64; 2], v: [f64; 2]) {
         let trim = self.style.trim;
-        let (wide_m, out_m) = (0.13, 0.035);
-        for [u0, u1] in [[u[0] - wide_m, u[0]], [u[1], u[1] + wide_m]] {
-            let vs = self.painter.even(v[0], v[1], 0.32);
-            self.rect(&[u0, u1], &vs, out_m, |_, _| trim);
-        }
-        let us = self.painter.even(u[0] - wide_m, u[1] + wide_m, 0.30);
-        self.rect(&us, &[v[1], v[1] + wide_m + 0.03], out_m, |_, _| trim);
-        // The sill stands out: its top, its face, and the shade below it.
-        self.rect(&us, &[v[0] - 0.09, v[0]], 0.10, |_, _| trim.times(1.04));
+        let wide_m = 0.13;
+        let out_m = 0.06;
+        // From far away, lintel and sill are enough.
         if !self.style.near {
+            for v_m in [v[1] + 0.5 * wide_m, v[0] - 0.045] {
+                self.bar([u[0] - wide_m, v_m], [u[1] + wide_m, v_m], 0.12, [0.12, 2.0], trim);
+            }
             return;
         }
-        self.rect(&us, &[v[0] - 0.19, v[0] - 0.10], 0.01, |_, _| trim.times(0.72));
+        for at_m in [u[0] - 0.5 * wide_m, u[1] + 0.5 * wide_m] {
+            self.bar([at_m, v[0] - 0.05], [at_m, v[1] + wide_m], out_m, [wide_m, 1.0], trim);
+        }
+        let left_m = u[0] - wide_m;
+        let right_m = u[1] + wide_m;
+        let top_m = v[1] + 0.5 * wide_m + 0.01;
+        self.bar([left_m, top_m], [right_m, top_m], out_m, [wide_m + 0.03, BAR_M], trim);
+        // The sill stands out, and the wall below it is in its shade.
+        let sill_m = v[0] - 0.045;
+        self.bar([left_m, sill_m], [right_m, sill_m], 0.12, [0.09, BAR_M], trim.times(1.04));
+        let shade_m = v[0] - 0.14;
+        self.bar([left_m, shade_m], [right_m, shade_m], 0.03, [0.08, BAR_M], trim.times(0.62));
         // Reveals: the wall's thickness at the sides of the panes and above them.
         let shade = self.style.wall.open(0.6);
-        let vs = self.painter.even(v[0], v[1], 0.40);
+        let vs = self.painter.even(v[0], v[1], 0.85);
         for (at_m, outwards) in [(u[0], true), (u[1], false)] {
             let wall = *self.wall;
             // Seen from inside the opening: to the right goes inwards on its left side.
@@ -229,16 +253,12 @@ impl Facade<'_, '_, '_> {
             let vs = self.painter.even(v[0], v[1], 0.2);
             return self.rect(&us, &vs, depth_m, |_, _| glass());
         }
+        let out_m = depth_m + 0.05;
         for at_m in verticals {
-            let vs = self.painter.even(v[0], v[1], 0.34);
-            let us = [at_m - 0.5 * rim_m, at_m + 0.5 * rim_m];
-            self.rect(&us, &vs, depth_m + 0.02, |_, _| frame);
+            self.bar([at_m, v[0]], [at_m, v[1]], out_m, [rim_m, 1.0], frame);
         }
-        let horizontals = [v[0] + 0.5 * rim_m, transom_m, v[1] - 0.5 * rim_m];
-        for at_m in horizontals {
-            let us = self.painter.even(u[0], u[1], 0.30);
-            let vs = [at_m - 0.5 * rim_m, at_m + 0.5 * rim_m];
-            self.rect(&us, &vs, depth_m + 0.02, |_, _| frame);
+        for at_m in [v[0] + 0.5 * rim_m, transom_m, v[1] - 0.5 * rim_m] {
+            self.bar([u[0], at_m], [u[1], at_m], out_m, [rim_m, BAR_M], frame);
         }
         // Some rooms are lit, some have curtains; all other panes are dark and reflect the sky.
         let curtain = random.chance(0.45);
@@ -250,9 +270,9 @@ impl Facade<'_, '_, '_> {
             Paint::matt(0.58, 0.47, 0.40),
         ]);
         for [u0, u1] in [[u[0] + rim_m, middle_m], [middle_m, u[1] - rim_m]] {
-            let us = self.painter.graded(u0, u1, 0.12, 0.26);
+            let us = self.painter.even(u0, u1, 0.22);
             for [v0, v1] in [[v[0] + rim_m, transom_m], [transom_m, v[1] - rim_m]] {
-                let vs = self.painter.even(v0, v1, 0.27);
+                let vs = self.painter.even(v0, v1, 0.40);
                 let [left_m, right_m] = u;
                 let [low_m, high_m] = v;
                 self.rect(&us, &vs, depth_m, |u_m, v_m| {
@@ -285,14 +305,15 @@ impl Facade<'_, '_, '_> {
         self.rect(&us, &[floor_m + 0.98, floor_m + 1.05], deep_m, |_, _| rail);
         let bars = self.painter.even(u[0], u[1], 0.14);
         for at_m in bars {
-            let bar = [at_m - 0.015, at_m + 0.015];
-            self.rect(&bar, &[floor_m + 0.06, floor_m + 0.52, floor_m + 0.98], deep_m, |_, _| rail);
+            let ends_m = [[at_m, floor_m + 0.06], [at_m, floor_m + 0.98]];
+            self.bar(ends_m[0], ends_m[1], deep_m, [0.03, 1.0], rail);
         }
         for (at_m, side) in [(u[0], -1.0), (u[1], 1.0)] {
             let ds = if side < 0.0 { [0.0, 0.5, deep_m] } else { [deep_m, 0.5, 0.0] };
             let place = move |d_m: f64, v_m: f64| wall.at(at_m, v_m, d_m);
             self.painter.sheet(&ds, &[floor_m - 0.12, floor_m + 0.06], place, |_, _| Some(stone));
-            self.painter.sheet(&ds, &[floor_m + 0.98, floor_m + 1.05], place, |_, _| Some(rail));
+            let ends_m = [0.0, deep_m].map(|d_m| wall.at(at_m, floor_m + 1.015, d_m));
+            self.painter.polyline(&ends_m, side * wall.right, [0.07, 0.5], rail);
         }
     }
 
@@ -310,6 +331,20 @@ impl Facade<'_, '_, '_> {
         let wall = *self.wall;
         let below = move |u_m: f64, d_m: f64| wall.at(u_m, base_m + 0.24, d_m);
         self.painter.sheet(&us, &[0.0, 0.17, 0.34], below, |_, _| Some(trim.open(0.8)));
+    }
+
+    /// A bar from (u, v) to (u, v), `depth_m` out of the wall, of a width and of parts at most so
+    /// long.
+    pub(super) fn bar(
+        &mut self,
+        from: [f64; 2],
+        to: [f64; 2],
+        depth_m: f64,
+        width: [f64; 2],
+        paint: Paint,
+    ) {
+        let ends_m = [from, to].map(|[u_m, v_m]| self.wall.at(u_m, v_m, depth_m));
+        self.painter.polyline(&ends_m, self.wall.out, width, paint);
     }
 
     /// A flat part of the wall between break points, `depth_m` out of its plane.

@@ -1,6 +1,6 @@
 //! Lamp poles, traffic lights, signs, bins, planters and bollards.
 
-use glam::DVec3;
+use glam::{DMat3, DQuat, DVec3};
 
 use super::plants;
 use super::random::Random;
@@ -31,26 +31,49 @@ pub(super) fn lamp(painter: &mut Painter, foot_m: DVec3, towards_road: DVec3) {
     });
 }
 
-/// A traffic light on a pole; its lamps look along `facing`. `green` or red is on.
-pub(super) fn traffic_light(painter: &mut Painter, foot_m: DVec3, facing: DVec3, green: bool) {
-    pole(painter, [foot_m, foot_m + 3.5 * DVec3::Z], 0.065, STEEL);
+/// A pole with the heads of a traffic light: each looks along a direction, and is green or red.
+pub(super) fn traffic_light(painter: &mut Painter, foot_m: DVec3, heads: [(DVec3, bool); 2]) {
+    pole(painter, [foot_m, foot_m + 3.6 * DVec3::Z], 0.065, STEEL);
+    for (facing, green) in heads {
+        painter.labelled(SemanticClass::TrafficLight, |painter| {
+            traffic_light_head(painter, foot_m + 2.45 * DVec3::Z + 0.19 * facing, facing, green);
+        });
+    }
+}
+
+/// Three lamps in a box, each below a visor; the one that is on shines.
+fn traffic_light_head(painter: &mut Painter, base_m: DVec3, facing: DVec3, green: bool) {
     let right = DVec3::Z.cross(facing);
+    let case = Paint::matt(0.10, 0.11, 0.11);
+    block(painter, base_m, right, DVec3::new(0.17, 0.12, 1.02), case);
     // From top to bottom: red, yellow, green.
-    let dark = Paint::matt(0.11, 0.12, 0.12);
-    let base_m = foot_m + 2.45 * DVec3::Z + 0.17 * facing;
-    let size_m = DVec3::new(0.16, 0.13, 0.98);
     let lamps = [
-        (0.80, if green { Paint::matt(0.25, 0.06, 0.06) } else { Paint::glowing(1.0, 0.16, 0.10) }),
-        (0.49, Paint::matt(0.30, 0.22, 0.05)),
-        (0.18, if green { Paint::glowing(0.20, 1.0, 0.55) } else { Paint::matt(0.04, 0.22, 0.12) }),
+        (0.83, !green, [1.0, 0.20, 0.12], Paint::matt(0.34, 0.08, 0.07)),
+        (0.51, false, [1.0, 0.7, 0.1], Paint::matt(0.36, 0.27, 0.08)),
+        (0.19, green, [0.20, 1.0, 0.55], Paint::matt(0.07, 0.26, 0.16)),
     ];
-    painter.labelled(SemanticClass::TrafficLight, |painter| {
-        block(painter, base_m, right, size_m, dark);
-        for (height_m, paint) in lamps {
-            let center_m = base_m + height_m * DVec3::Z + 0.15 * facing;
-            disc(painter, center_m, facing, 0.105, |_| paint);
+    for (height_m, is_on, [r, g, b], dark) in lamps {
+        let center_m = base_m + height_m * DVec3::Z + 0.16 * facing;
+        let shining = Paint::glowing(r, g, b);
+        disc(painter, center_m, facing, 0.115, |part| match (is_on, part < 0.5) {
+            (true, true) => Paint::glowing(r.max(0.75), g.max(0.75), b.max(0.75)),
+            (true, false) => shining,
+            (false, _) => dark,
+        });
+        let visor = |angle_rad: f64| {
+            let (sin, cos) = angle_rad.sin_cos();
+            center_m + 0.135 * (cos * DVec3::Z + sin * right) + 0.05 * facing
+        };
+        let arc: Vec<DVec3> = (-2..=2).map(|part| visor(0.7 * f64::from(part))).collect();
+        painter.polyline(&arc, facing, [0.03, 1.0], case.times(0.7));
+        if is_on {
+            let axes = DMat3::from_cols(right, DVec3::Z, right.cross(DVec3::Z));
+            let rgb = DVec3::new(r, g, b);
+            let sigmas_m = DVec3::new(0.14, 0.14, 0.02);
+            let at_m = center_m + 0.12 * facing;
+            painter.gaussian(at_m, DQuat::from_mat3(&axes), sigmas_m, 0.51, rgb, DVec3::ZERO);
         }
-    });
+    }
 }
 
 /// A round sign on a pole: white in a red ring.

@@ -3,8 +3,20 @@
 use glam::DVec3;
 
 use super::facade::{Facade, GROUND_FLOOR_M, RECESS_M, glass};
-use super::random::{Random, noise, smooth};
+use super::letters;
+use super::random::{Random, smooth};
 use super::surface::{Paint, Patch};
+
+/// Colours of goods in shop windows.
+const GOODS: [Paint; 7] = [
+    Paint::matt(0.80, 0.24, 0.18),
+    Paint::matt(0.90, 0.74, 0.28),
+    Paint::matt(0.24, 0.42, 0.62),
+    Paint::matt(0.34, 0.54, 0.32),
+    Paint::matt(0.88, 0.86, 0.80),
+    Paint::matt(0.56, 0.30, 0.42),
+    Paint::matt(0.72, 0.50, 0.30),
+];
 
 impl Facade<'_, '_, '_> {
     /// A bay with the house's door, two steps and a lamp.
@@ -13,9 +25,7 @@ impl Facade<'_, '_, '_> {
         let middle_m = u_m + 0.5 * self.bay_m;
         let u = [middle_m - half_m, middle_m + half_m];
         let (door_m, light_m) = (2.35, 3.0);
-        self.pier([u_m, u[0]], [0.0, GROUND_FLOOR_M]);
-        self.pier([u[1], u_m + self.bay_m], [0.0, GROUND_FLOOR_M]);
-        self.plain(u, [light_m, GROUND_FLOOR_M]);
+        self.around(u_m, u, [0.0, GROUND_FLOOR_M], [0.0, light_m]);
         self.surround(u, [0.30, light_m]);
         let wood = self.style.accent.times(0.75);
         let us = self.painter.graded(u[0], u[1], 0.06, 0.16);
@@ -48,7 +58,7 @@ impl Facade<'_, '_, '_> {
 
     /// A bay of shop window: plinth, glass with goods behind it, sign, awning.
     pub(super) fn shop_bay(&mut self, u_m: f64, random: &mut Random) {
-        let (accent, frame) = (self.style.accent, self.style.frame);
+        let accent = self.style.accent;
         let pier_m = 0.22;
         let u = [u_m + pier_m, u_m + self.bay_m - pier_m];
         let (plinth_m, head_m, sign_m) = (0.45, 2.75, 3.45);
@@ -59,39 +69,76 @@ impl Facade<'_, '_, '_> {
         self.rect(&us, &[0.0, 0.15, plinth_m], -0.05, |_, v_m| {
             accent.times(0.7).open(0.7 + 0.5 * v_m)
         });
-        // Goods: blurred shelves of colours behind the glass.
-        // Below 2^30, so that adding a channel does not overflow.
-        let seed = random.below(1 << 30) as u64;
-        let panes = self.painter.graded(plinth_m, head_m, 0.08, 0.22);
-        self.rect(&us, &panes, -0.10, |at_m, v_m| {
-            let mullion = ((at_m - u[0]) / (u[1] - u[0]) - 0.5).abs() < 0.02;
-            if mullion || v_m > head_m - 0.09 || v_m < plinth_m + 0.08 {
-                return frame;
-            }
-            // Goods stand on shelves below eye height; above them is the lit room.
-            let shelf = (v_m / 0.5).floor();
-            let goods = |channel: u64| noise(seed + channel, 2.3 * at_m, 1.7 * shelf);
-            let room = smooth((v_m - 1.5) / 0.5);
-            let mut paint = Paint::matt(0.44, 0.40, 0.35).times(0.85 + 0.45 * room).gloss(0.26);
-            let hue = DVec3::new(goods(0), goods(1), goods(2)) * 0.07;
-            paint.rgb += (1.0 - room) * (hue + 0.12 * goods(3));
-            paint
-        });
-        // The sign, with blocks in place of letters.
-        let signs = self.painter.graded(head_m, sign_m, 0.09, 0.12);
-        let letters = self.painter.even(u[0], u[1], 0.13);
-        // Light letters on a dark sign, dark ones on a light sign.
-        let lettering = if accent.rgb.element_sum() > 1.5 { 0.25 } else { 0.93 };
-        self.rect(&letters, &signs, 0.06, |at_m, v_m| {
-            let inside = (v_m - 0.5 * (head_m + sign_m)).abs() < 0.17
-                && (at_m - 0.5 * (u[0] + u[1])).abs() < 0.36 * (u[1] - u[0]);
-            let ink = noise(seed + 5, 7.0 * at_m, 3.0 * v_m) > -0.05;
-            let letter = Paint::matt(lettering, lettering, 0.95 * lettering);
-            if inside && ink { letter } else { accent }
-        });
+        self.shop_window(u, [plinth_m, head_m], random);
+        self.sign(u, [head_m, sign_m], random);
         // Two of three shops have an awning.
-        if !seed.is_multiple_of(3) {
+        if random.below(3) > 0 {
             self.awning(u, head_m + 0.05, accent);
+        }
+    }
+
+    /// Glass in front of a lit room, with goods on two shelves, between bars.
+    fn shop_window(&mut self, u: [f64; 2], v: [f64; 2], random: &mut Random) {
+        let frame = self.style.frame;
+        let us = self.painter.even(u[0], u[1], 0.34);
+        let vs = self.painter.even(v[0], v[1], 0.28);
+        let warmth = random.range(0.9, 1.2);
+        self.rect(&us, &vs, -0.32, |_, v_m| {
+            // The room is lit from above.
+            let lit = smooth((v_m - v[0]) / (v[1] - v[0]));
+            Paint::matt(0.46, 0.38, 0.28).times(warmth * (0.55 + 0.75 * lit)).gloss(0.22)
+        });
+        let wall = *self.wall;
+        if self.style.near {
+            for shelf_m in [v[0] + 0.12, v[0] + 0.78] {
+                let board = Paint::matt(0.30, 0.24, 0.19);
+                self.bar([u[0], shelf_m], [u[1], shelf_m], -0.16, [0.05, 0.4], board);
+                let mut at_m = u[0] + 0.12;
+                while at_m < u[1] - 0.16 {
+                    let wide_m = random.range(0.08, 0.2);
+                    let high_m = random.range(0.14, 0.42);
+                    let at = |up_m: f64| wall.at(at_m + 0.5 * wide_m, shelf_m + 0.03 + up_m, -0.14);
+                    let goods = random.pick(&GOODS);
+                    self.painter.stroke([at(0.0), at(high_m)], wall.out, wide_m, goods);
+                    at_m += wide_m + random.range(0.05, 0.22);
+                }
+            }
+        }
+        let middle_m = 0.5 * (u[0] + u[1]);
+        for at_m in [u[0] + 0.03, middle_m, u[1] - 0.03] {
+            self.bar([at_m, v[0]], [at_m, v[1]], -0.06, [0.07, 0.8], frame);
+        }
+        for at_m in [v[0] + 0.03, v[1] - 0.04] {
+            self.bar([u[0], at_m], [u[1], at_m], -0.06, [0.08, 0.36], frame);
+        }
+    }
+
+    /// A board with a name in letters that stand off it.
+    fn sign(&mut self, u: [f64; 2], v: [f64; 2], random: &mut Random) {
+        let accent = self.style.accent;
+        let name = random.pick(&letters::NAMES);
+        let count = name.len() as f64;
+        let pitch_m = (0.92 * (u[1] - u[0]) / count).min(0.34);
+        let us = self.painter.even(u[0], u[1], 0.2);
+        let edge_m = 0.04;
+        let vs = [v[0], v[0] + edge_m, 0.5 * (v[0] + v[1]), v[1] - edge_m, v[1]];
+        self.rect(&us, &vs, 0.0, |_, v_m| {
+            let is_rim = v_m < v[0] + edge_m || v_m > v[1] - edge_m;
+            accent.times(if is_rim { 0.6 } else { 1.0 })
+        });
+        // Light letters on a dark sign, dark ones on a light sign.
+        let tone = if accent.rgb.element_sum() > 1.5 { 0.16 } else { 0.96 };
+        let ink = Paint::matt(tone, tone, 0.93 * tone);
+        let wall = *self.wall;
+        let wide_m = 0.62 * pitch_m;
+        let high_m = 0.38;
+        let from = [0.5 * (u[0] + u[1] - pitch_m * (count - 0.38)), 0.5 * (v[0] + v[1] - high_m)];
+        for (index, letter) in name.chars().enumerate() {
+            let left_m = from[0] + pitch_m * index as f64;
+            let at = |x: f64, y: f64| wall.at(left_m + wide_m * x, from[1] + high_m * y, 0.17);
+            for &[x0, y0, x1, y1] in letters::strokes(letter) {
+                self.painter.stroke([at(x0, y0), at(x1, y1)], wall.out, 0.075, ink);
+            }
         }
     }
 

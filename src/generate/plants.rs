@@ -57,9 +57,9 @@ impl Tree {
             Paint::matt(0.50, 0.57, 0.25),
             Paint::matt(0.34, 0.48, 0.27),
         ]);
-        // Far trees have fewer and larger leaves: 26 x 0.115^2 covers as much as 88 x
-        // 0.057^2 and a fifth more.
-        let (leaves, size_m) = if self.near { (88, 0.057) } else { (26, 0.115) };
+        // Far trees have fewer and larger leaves: 26 x 0.115^2 covers as much as 74 x
+        // 0.060^2 and a quarter more.
+        let (leaves, size_m) = if self.near { (74, 0.060) } else { (26, 0.115) };
         for _ in 0..14 {
             let away = ball(&mut random) * DVec3::new(0.64, 0.64, 0.72);
             let middle_m = self.middle_m() + self.crown_m * away;

@@ -52,6 +52,7 @@ pub(super) fn paint(
 ) {
     let ground = Ground { route, cross_s_m, seed, covers_seed };
     ground.covers().for_each(|(s_m, t_m)| ground.cover(painter, s_m, t_m));
+    ground.cracks(painter);
     let drive = route.driven_m;
     // The stretches with zebra and stop line before and after the crossing, ascending in s.
     let [approach, leave] = [-1.0, 1.0].map(|side| {
@@ -90,17 +91,21 @@ struct Ground<'a> {
 impl Ground<'_> {
     /// Both lanes, their lines included.
     fn lanes(&self, painter: &mut Painter, from_s_m: f64, to_s_m: f64) {
-        let inner = painter.graded(LINE_M, LANES_M - 0.12, 0.10, 0.30);
+        // Narrow cells beside the lines keep their edges sharp.
+        let inner = painter.graded(LINE_M, LANES_M - 0.12, 0.06, 0.42);
         // From the right edge to the left: edge line, lane, centre line, lane, edge line.
-        let ts: Vec<_> = [-LANES_M, -LANES_M + 0.06]
-            .into_iter()
-            .chain(inner.iter().rev().map(|t_m| -t_m))
-            .chain([0.0])
+        let edge = [LANES_M - 0.095, LANES_M - 0.025, LANES_M];
+        let ts: Vec<_> = edge
+            .iter()
+            .rev()
+            .chain(inner.iter().rev())
+            .map(|t_m| -t_m)
+            .chain([-LINE_M + 0.025, LINE_M - 0.025])
             .chain(inner.iter().copied())
-            .chain([LANES_M - 0.06, LANES_M])
+            .chain(edge)
             .collect();
-        // A dash is seven cells long; the phase holds from one stretch to the next.
-        let cell_m = (painter.even(0.0, DASH_M, DASH_M / 7.0)[1]).min(DASH_M);
+        // A dash is six cells long; the phase holds from one stretch to the next.
+        let cell_m = (painter.even(0.0, DASH_M, DASH_M / 6.0)[1]).min(DASH_M);
         let (first, last) = ((from_s_m / cell_m).ceil(), (to_s_m / cell_m).floor());
         let mut ss = vec![from_s_m];
         ss.extend((first as i64..=last as i64).map(|i| i as f64 * cell_m));
@@ -158,6 +163,29 @@ impl Ground<'_> {
         });
     }
 
+    /// Cracks that were filled with tar: dark lines that wander along the lanes.
+    fn cracks(&self, painter: &mut Painter) {
+        let [from_m, to_m] = self.route.driven_m;
+        for index in 0..((to_m - from_m) / CRACK_M) as usize {
+            let mut random = Random::new(self.covers_seed, "crack", index);
+            let mut s_m = from_m + CRACK_M * (index as f64 + random.range(0.0, 0.6));
+            let mut t_m = random.range(-LANES_M + 0.4, LANES_M - 0.4);
+            let along = random.chance(0.6);
+            let mut places_m = Vec::new();
+            for _ in 0..6 + random.below(9) {
+                places_m.push(self.route.at(s_m).beside(t_m, 0.012));
+                let [ahead_m, aside_m] = [random.range(0.25, 0.4), random.range(-0.14, 0.14)];
+                let [ds_m, dt_m] = if along { [ahead_m, aside_m] } else { [aside_m, ahead_m] };
+                (s_m, t_m) = (s_m + ds_m, t_m + dt_m);
+                if t_m.abs() > LANES_M - 0.25 || (t_m.abs() < 0.2) {
+                    break;
+                }
+            }
+            let tar = Paint::matt(0.24, 0.24, 0.25).gloss(0.06);
+            painter.polyline(&places_m, DVec3::Z, [0.035, 0.45], tar);
+        }
+    }
+
     /// Asphalt or marking at a point of the lanes.
     fn lane_paint(&self, s_m: f64, t_m: f64) -> Option<Paint> {
         let covered = |(at_s_m, at_t_m): (f64, f64)| {
@@ -193,7 +221,7 @@ impl Ground<'_> {
 
     /// Asphalt with grain, wheel tracks, repaired patches and oil in the middle of each lane.
     fn asphalt(&self, s_m: f64, t_m: f64) -> Paint {
-        let grain = 0.09 * noise(self.seed + 3, 4.0 * s_m, 4.0 * t_m)
+        let grain = 0.15 * noise(self.seed + 3, 4.0 * s_m, 4.0 * t_m)
             + 0.05 * noise(self.seed + 4, 0.35 * s_m, 0.9 * t_m)
             + 0.03 * noise(self.seed + 5, 0.05 * s_m, 0.3 * t_m);
         let off_lane_m = t_m.abs() - LANE_T_M.abs();
@@ -209,8 +237,11 @@ impl Ground<'_> {
     /// Parking, kerb and pavement of one side: `side` is 1 on the left, -1 on the right.
     fn verge(&self, painter: &mut Painter, side: f64, from_s_m: f64, to_s_m: f64) {
         let side_of = |ts: Vec<f64>| oriented(side, ts);
-        let ss = painter.even(from_s_m, to_s_m, 0.45);
-        let bays = side_of(painter.even(LANES_M, KERB_M, 0.36));
+        let ss = painter.even(from_s_m, to_s_m, 0.52);
+        let beside_m = LANES_M + 0.06;
+        let mut columns = vec![LANES_M];
+        columns.extend(painter.even(beside_m, KERB_M, 0.42));
+        let bays = side_of(columns);
         self.flat(painter, &ss, &bays, 0.0, |s_m, t_m| {
             let gutter = smooth((t_m.abs() - (KERB_M - 0.5)) / 0.5);
             // The pattern of the asphalt, three times as fine across.
@@ -340,6 +371,9 @@ impl Ground<'_> {
     }
 }
 
+/// Distance between two cracks along the street, in metres.
+const CRACK_M: f64 = 2.5;
+
 /// Radius of a manhole cover, in metres.
 const COVER_M: f64 = 0.37;
 
@@ -351,7 +385,7 @@ const JOINT_M: f64 = 0.03;
 fn joints(painter: &Painter, from_m: f64, to_m: f64) -> Vec<f64> {
     let long = to_m - from_m > 20.0;
     let first_m = if long { (from_m / SLAB_M).ceil() * SLAB_M } else { from_m };
-    let halves = painter.even(JOINT_M, SLAB_M, 0.5 * SLAB_M);
+    let halves = painter.even(JOINT_M, SLAB_M, SLAB_M);
     let mut breaks = vec![from_m];
     let mut at_m = first_m;
     while at_m < to_m {

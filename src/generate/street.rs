@@ -9,7 +9,7 @@ use super::random::Random;
 use super::road::{self, FRONT_M, KERB_M, LANE_T_M, PAVEMENT_M};
 use super::route::Route;
 use super::surface::Painter;
-use super::{Street, StreetSettings, backdrop};
+use super::{Street, StreetSettings, backdrop, yards};
 use wildcity_scene::SemanticClass;
 
 /// Middle of the parking bays, in metres from the centre line.
@@ -86,6 +86,7 @@ impl Plan {
         painter.labelled(SemanticClass::Static, |painter| {
             furnish(painter, &self.route, self.crossing_m, self.seed);
         });
+        yards::paint(painter, &self.route, self.crossing_m, self.seed);
     }
 }
 
@@ -160,12 +161,12 @@ fn furnish(painter: &mut Painter, route: &Route, crossing_m: f64, seed: u64) {
     for (ahead, side) in [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)] {
         let station = |away_m: f64| route.at(crossing_m + ahead * away_m);
         let at = |away_m: f64, t_m: f64| station(away_m).beside(side * t_m, PAVEMENT_M);
-        // Each lane's light stands on its own side before the zebra; the others look at the
-        // side street.
+        // The light of the lane that comes towards the crossing stands on its own side before the
+        // zebra; every pole has a head for the street, which is green, and one for the side street.
         let mine = ahead * side > 0.0;
-        let facing = if mine { ahead * station(10.6).forward } else { side * station(4.6).left };
         let away_m = if mine { 10.4 } else { 4.6 };
-        furniture::traffic_light(painter, at(away_m, KERB_M + 0.5), facing, mine);
+        let heads = [(ahead * station(away_m).forward, true), (side * station(away_m).left, false)];
+        furniture::traffic_light(painter, at(away_m, KERB_M + 0.5), heads);
         for post in 0..3 {
             let t_m = KERB_M + 0.35;
             furniture::bollard(painter, at(10.9 + 1.4 * f64::from(post + 1), t_m));

@@ -12,6 +12,15 @@ use super::light::Light;
 /// to `1 - (1 - 0.97 exp(-0.76²))⁴` = 96 %, and with the next ring of eight to 97.5 %.
 const OVERLAP: f64 = 0.66;
 
+/// Standard deviation of a stroke as a fraction of its length, if it is a line by itself: hardly
+/// longer than the line.
+const SINGLE: f64 = 0.36;
+/// The same of strokes that follow each other: they overlap as surfels do.
+const JOINED: f64 = 0.45;
+/// Standard deviation of a stroke as a fraction of its width: opacity falls to a half at its
+/// border.
+const ACROSS: f64 = 0.43;
+
 /// Half thickness of a surfel, in metres.
 const THICKNESS_M: f64 = 0.004;
 
@@ -109,11 +118,6 @@ impl<'a> Painter<'a> {
         Self { spacing: 1.0 / detail as f64, detail, ..Self::new(light, 1.0) }
     }
 
-    /// Whether it paints an object that is seen from near by.
-    pub(super) fn is_detailed(&self) -> bool {
-        self.detail > 1
-    }
-
     /// Break points with as many cells between two of them as the detail asks for.
     pub(super) fn refined(&self, points: &[f64]) -> Vec<f64> {
         let between = |pair: &[f64]| {
@@ -123,6 +127,16 @@ impl<'a> Painter<'a> {
         };
         let last = points.last().copied();
         points.windows(2).flat_map(between).chain(last).collect()
+    }
+
+    /// A spacing that stays below `most_m` on distant objects, too.
+    pub(super) fn at_most(&self, step_m: f64, most_m: f64) -> f64 {
+        step_m.min(most_m / self.spacing)
+    }
+
+    /// A length in proportion to the cells of an object that is seen from near by.
+    pub(super) fn fine(&self, length_m: f64) -> f64 {
+        length_m / self.detail as f64
     }
 
     /// Paints what `draw` paints with all spacings `factor` times as wide: for distant objects.
@@ -226,6 +240,62 @@ impl<'a> Painter<'a> {
         // Seen at 60° from the normal, d·n = -0.5, the mirror adds nothing.
         let rgb = self.lit(center_m, normal, &paint) + 0.3 * paint.gloss * MIRRORED_SKY;
         self.gaussian(center_m, rotation, sigmas_m, 0.97, rgb, mirror(normal, paint.gloss));
+    }
+
+    /// A straight line from end to end, `width_m` wide, on a surface with this normal: one thin
+    /// Gaussian, as sharp as it is narrow. It lies in front of the surfels beneath it if it is
+    /// off the surface by more than they are apart in depth: keep it short along the view.
+    pub(super) fn stroke(&mut self, ends_m: [DVec3; 2], normal: DVec3, width_m: f64, paint: Paint) {
+        self.thin(ends_m, normal, [SINGLE, width_m], paint);
+    }
+
+    /// A line through places, of strokes that are at most `most_m` long. The first and the last of
+    /// a straight line are half as long, so that it ends more sharply.
+    pub(super) fn polyline(
+        &mut self,
+        places_m: &[DVec3],
+        normal: DVec3,
+        [width_m, most_m]: [f64; 2],
+        paint: Paint,
+    ) {
+        // Those of a distant object may be longer.
+        let most_m = most_m * self.spacing.clamp(1.0, 1.5);
+        for pair in places_m.windows(2) {
+            let parts = (pair[0].distance(pair[1]) / most_m).ceil().max(1.0);
+            let mut breaks = vec![0.0];
+            if places_m.len() == 2 && parts > 1.0 {
+                breaks.extend((1..=parts as i32).map(|part| (f64::from(part) - 0.5) / parts));
+            } else {
+                breaks.extend((1..parts as i32).map(|part| f64::from(part) / parts));
+            }
+            breaks.push(1.0);
+            let share = if places_m.len() == 2 && parts == 1.0 { SINGLE } else { JOINED };
+            for ends in breaks.windows(2) {
+                let ends_m = [ends[0], ends[1]].map(|t| pair[0].lerp(pair[1], t));
+                self.thin(ends_m, normal, [share, width_m], paint);
+            }
+        }
+    }
+
+    /// A stroke whose standard deviation along it is this share of its length.
+    fn thin(
+        &mut self,
+        ends_m: [DVec3; 2],
+        normal: DVec3,
+        [share, width_m]: [f64; 2],
+        paint: Paint,
+    ) {
+        let along_m = ends_m[1] - ends_m[0];
+        let (along, center_m) = (along_m.normalize_or_zero(), 0.5 * (ends_m[0] + ends_m[1]));
+        let across = normal.cross(along).normalize_or_zero();
+        if across == DVec3::ZERO || width_m < 1e-3 {
+            return;
+        }
+        let axes = DMat3::from_cols(along, across, along.cross(across));
+        let sigmas_m = DVec3::new(share * along_m.length(), ACROSS * width_m, 0.002);
+        let rgb = self.lit(center_m, normal, &paint) + 0.3 * paint.gloss * MIRRORED_SKY;
+        let slope = mirror(normal, paint.gloss);
+        self.gaussian(center_m, DQuat::from_mat3(&axes), sigmas_m, 0.97, rgb, slope);
     }
 
     /// Display colour of a surface in this light.

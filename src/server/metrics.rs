@@ -205,6 +205,12 @@ impl Collector for Residency {
             ("retries", "Loads that were tried again".to_owned(), stats.retries),
             ("evictions", "Sections that made room for others".to_owned(), stats.evictions),
             ("prefetches_dropped", "Prefetches without room".to_owned(), stats.prefetches_dropped),
+            (
+                "by_camera",
+                "Sessions for which memory was so short that a frame is drawn camera by camera"
+                    .to_owned(),
+                stats.by_camera,
+            ),
             ("waits", "Frames that had to wait".to_owned(), stats.waits),
             (
                 "waits_given_up",

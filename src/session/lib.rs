@@ -76,7 +76,7 @@ pub use record::recorded_episode::RecordedEpisode;
 pub use record::repairs::{RecordedImageRepair, RecordedRepair};
 pub use record::replay_report::{
     ImageDifference, ProvenanceChange, RepairedImages, ReplayError, ReplayReport, ReplayUntil,
-    Replayed, ReplayedImage, ReplayedSweep, WrongValue,
+    Replayed, ReplayedImage, ReplayedSweep, Sensor, WrongValue,
 };
 pub use repair::offline::{
     NeededReferences, OfflineDrawing, OfflineReferences, OfflineView, ViewReferences,

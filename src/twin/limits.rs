@@ -146,7 +146,7 @@ pub const SKY_FILE_BYTES: u64 = 64 << 20;
 pub const SKY_IMAGE_BYTES: u64 = 256 << 20;
 
 /// Memory that all open twins may take if the size of the machine's memory is unknown, in bytes;
-/// otherwise they may take three quarters of it. The demo street has 439,000 Gaussians of 92 bytes,
+/// otherwise they may take three quarters of it. The demo street has 426,000 Gaussians of 92 bytes,
 /// 40 MB.
 pub const RESIDENT_BYTES: u64 = 16 << 30;
 

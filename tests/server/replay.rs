@@ -37,6 +37,7 @@ async fn what_was_recorded_is_rendered_again() {
         report,
         ReplayReport {
             images: 24,
+            sweeps: 0,
             changes: vec![],
             diverged: None,
             difference: None,

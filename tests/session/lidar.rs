@@ -260,7 +260,7 @@ async fn a_replay_casts_the_sweeps_again() {
     let changed = if hash.starts_with('0') { "1" } else { "0" };
     std::fs::write(&path, format!("{before}\"sweeps\":[\"{changed}{}", &hash[1..])).unwrap();
     let difference = replay(&path).difference.unwrap();
-    assert_eq!(difference.camera, "top");
+    assert_eq!(difference.sensor.to_string(), "LiDAR \"top\"");
 
     // Without the sweeps of a frame the record says less than was sent.
     let (head, rest) = text.split_once(",\"sweeps\":[\"").unwrap();

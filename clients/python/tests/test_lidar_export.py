@@ -38,7 +38,7 @@ class Drive:
         assert server.stdout is not None
         url = next(line.split()[-1] for line in server.stdout if line.startswith("listening on ws"))
         try:
-            small = Outputs(cameras=("front",), images={"front": ImagePart(size=(64, 40))})
+            small = Outputs(cameras=("front",), images={"front": ImagePart(size=(64, 40))}, semantics=True)
             with (
                 wildcity.connect(url) as client,
                 client.open("demo", rig="vehicle6-lidar", outputs=small, session="sweeps") as session,
@@ -81,6 +81,8 @@ def check(drive: Drive, sweeps: list[NDArray[Any]]) -> None:
         assert np.array_equal(found["row"], sent.rows)
         assert np.array_equal(found["column"], sent.columns)
         assert np.array_equal(found["instance"], sent.instances)
+        assert sent.classes is not None and len(np.unique(sent.classes)) > 3
+        assert np.array_equal(found["class"], sent.classes)
         assert np.array_equal(found["intensity"], sent.intensity)
         end_us = seen.metadata.time_us
         assert np.abs(found["offset_us"] + end_us - sent.times_us).max() <= 1

@@ -21,6 +21,7 @@ const POINTS = 300;
 interface TwinScenarios {
   scenarios: { name: string; map?: string }[];
   maps: Record<string, [number, number][][]>;
+  omitted_maps: string[];
 }
 
 const CAMERA = camera("thumbnail", WIDTH, HEIGHT);
@@ -96,7 +97,7 @@ export class Thumbnails {
    */
   private async above(client: Client, twin: TwinInfo, ground: number): Promise<HTMLElement[]> {
     const drives = await Promise.all(twin.trajectories.map(({ name, length_m: length }) => points(twin, name, length)));
-    const { scenarios, maps } = await get<TwinScenarios>(`v1/twins/${twin.name}/scenarios`);
+    const { scenarios, maps, omitted_maps: omitted } = await get<TwinScenarios>(`v1/twins/${twin.name}/scenarios`);
     const lanes = (map: string): Vector[][] => (maps[map] ?? []).map((ring) => ring.map(([east, north]) => [east, north, ground]));
     const all = Object.keys(maps).flatMap(lanes);
     const around = drives.length ? drives.flat() : all.flat();
@@ -117,6 +118,7 @@ export class Thumbnails {
       show(all);
       elements.push(canvas);
     }
+    if (omitted.length) elements.push(el("span.dim", {}, `lanes not drawn, too large or not readable: ${omitted.join(", ")}`));
     if (scenarios.length) elements.push(this.chooser(twin.name, scenarios, (map) => show(map === undefined ? all : lanes(map))));
     return elements;
   }

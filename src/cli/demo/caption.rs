@@ -1,107 +1,39 @@
-//! Text in pictures: a small font of 5 x 9 pixels, drawn twice as large on a dark ground.
+//! Text in pictures, on a dark ground.
 
 use image::{Rgb, RgbImage};
+use noto_sans_mono_bitmap::{FontWeight, RasterHeight, get_raster, get_raster_width};
 
-/// Width and height of a character with the space around it, in pixels of the font.
-const CELL: [u32; 2] = [6, 11];
-/// Pixels of the picture for a pixel of the font.
-const SCALE: u32 = 2;
-/// Pixels of the font around the text.
-const PAD: u32 = 2;
-const TEXT: Rgb<u8> = Rgb([255, 255, 255]);
-const GROUND: Rgb<u8> = Rgb([16, 20, 24]);
+const FONT: (FontWeight, RasterHeight) = (FontWeight::Regular, RasterHeight::Size20);
+/// Pixels around the text.
+const PAD_PX: u32 = 3;
+const GROUND: [u8; 3] = [16, 20, 24];
 
-/// Height of a caption, in pixels of the picture.
-pub(super) const HEIGHT_PX: u32 = SCALE * (CELL[1] + PAD);
+/// Height of a caption, in pixels.
+pub(super) const HEIGHT_PX: u32 = FONT.1.val() as u32 + 2 * PAD_PX;
 
-/// The rows of each letter from `a` to `z`, five bits each: seven above the line and two below it.
-const LETTERS: [[u8; 9]; 26] = [
-    [0x00, 0x00, 0x0e, 0x01, 0x0f, 0x11, 0x0f, 0x00, 0x00],
-    [0x10, 0x10, 0x1e, 0x11, 0x11, 0x11, 0x1e, 0x00, 0x00],
-    [0x00, 0x00, 0x0e, 0x11, 0x10, 0x11, 0x0e, 0x00, 0x00],
-    [0x01, 0x01, 0x0f, 0x11, 0x11, 0x11, 0x0f, 0x00, 0x00],
-    [0x00, 0x00, 0x0e, 0x11, 0x1f, 0x10, 0x0e, 0x00, 0x00],
-    [0x06, 0x09, 0x08, 0x1c, 0x08, 0x08, 0x08, 0x00, 0x00],
-    [0x00, 0x00, 0x0f, 0x11, 0x11, 0x11, 0x0f, 0x01, 0x0e],
-    [0x10, 0x10, 0x1e, 0x11, 0x11, 0x11, 0x11, 0x00, 0x00],
-    [0x04, 0x00, 0x0c, 0x04, 0x04, 0x04, 0x0e, 0x00, 0x00],
-    [0x02, 0x00, 0x06, 0x02, 0x02, 0x02, 0x02, 0x12, 0x0c],
-    [0x10, 0x10, 0x12, 0x14, 0x18, 0x14, 0x12, 0x00, 0x00],
-    [0x0c, 0x04, 0x04, 0x04, 0x04, 0x04, 0x0e, 0x00, 0x00],
-    [0x00, 0x00, 0x1a, 0x15, 0x15, 0x15, 0x15, 0x00, 0x00],
-    [0x00, 0x00, 0x1e, 0x11, 0x11, 0x11, 0x11, 0x00, 0x00],
-    [0x00, 0x00, 0x0e, 0x11, 0x11, 0x11, 0x0e, 0x00, 0x00],
-    [0x00, 0x00, 0x1e, 0x11, 0x11, 0x11, 0x1e, 0x10, 0x10],
-    [0x00, 0x00, 0x0f, 0x11, 0x11, 0x11, 0x0f, 0x01, 0x01],
-    [0x00, 0x00, 0x16, 0x19, 0x10, 0x10, 0x10, 0x00, 0x00],
-    [0x00, 0x00, 0x0f, 0x10, 0x0e, 0x01, 0x1e, 0x00, 0x00],
-    [0x08, 0x08, 0x1c, 0x08, 0x08, 0x09, 0x06, 0x00, 0x00],
-    [0x00, 0x00, 0x11, 0x11, 0x11, 0x11, 0x0f, 0x00, 0x00],
-    [0x00, 0x00, 0x11, 0x11, 0x11, 0x0a, 0x04, 0x00, 0x00],
-    [0x00, 0x00, 0x11, 0x11, 0x15, 0x15, 0x0a, 0x00, 0x00],
-    [0x00, 0x00, 0x11, 0x0a, 0x04, 0x0a, 0x11, 0x00, 0x00],
-    [0x00, 0x00, 0x11, 0x11, 0x11, 0x11, 0x0f, 0x01, 0x0e],
-    [0x00, 0x00, 0x1f, 0x02, 0x04, 0x08, 0x1f, 0x00, 0x00],
-];
-
-/// The same of the digits.
-const DIGITS: [[u8; 9]; 10] = [
-    [0x0e, 0x11, 0x13, 0x15, 0x19, 0x11, 0x0e, 0x00, 0x00],
-    [0x04, 0x0c, 0x04, 0x04, 0x04, 0x04, 0x0e, 0x00, 0x00],
-    [0x0e, 0x11, 0x01, 0x02, 0x04, 0x08, 0x1f, 0x00, 0x00],
-    [0x1f, 0x02, 0x04, 0x02, 0x01, 0x11, 0x0e, 0x00, 0x00],
-    [0x02, 0x06, 0x0a, 0x12, 0x1f, 0x02, 0x02, 0x00, 0x00],
-    [0x1f, 0x10, 0x1e, 0x01, 0x01, 0x11, 0x0e, 0x00, 0x00],
-    [0x06, 0x08, 0x10, 0x1e, 0x11, 0x11, 0x0e, 0x00, 0x00],
-    [0x1f, 0x01, 0x02, 0x04, 0x08, 0x08, 0x08, 0x00, 0x00],
-    [0x0e, 0x11, 0x11, 0x0e, 0x11, 0x11, 0x0e, 0x00, 0x00],
-    [0x0e, 0x11, 0x11, 0x0f, 0x01, 0x02, 0x0c, 0x00, 0x00],
-];
-
-const POINT: [u8; 9] = [0x00, 0x00, 0x00, 0x00, 0x00, 0x0c, 0x0c, 0x00, 0x00];
-const SLASH: [u8; 9] = [0x01, 0x01, 0x02, 0x04, 0x08, 0x10, 0x10, 0x00, 0x00];
-const MINUS: [u8; 9] = [0x00, 0x00, 0x00, 0x1f, 0x00, 0x00, 0x00, 0x00, 0x00];
-const SPACE: [u8; 9] = [0; 9];
-/// Stands for every other character.
-const BOX: [u8; 9] = [0x1f, 0x11, 0x11, 0x11, 0x11, 0x11, 0x1f, 0x00, 0x00];
-
-fn rows(character: char) -> [u8; 9] {
-    let from = |table: &[[u8; 9]], first: char| table[character as usize - first as usize];
-    match character {
-        'a'..='z' => from(&LETTERS, 'a'),
-        '0'..='9' => from(&DIGITS, '0'),
-        '.' => POINT,
-        '/' => SLASH,
-        '-' => MINUS,
-        ' ' | '_' => SPACE,
-        _ => BOX,
-    }
-}
-
-/// Draws a text, with its left upper corner at a place; what does not fit is cut off.
+/// Draws a text, with its left upper corner at a place; what does not fit is cut off. Characters
+/// that are not ASCII are drawn as question marks.
 pub(super) fn draw(picture: &mut RgbImage, text: &str, [left, top]: [u32; 2]) {
-    let width = SCALE * (CELL[0] * text.chars().count() as u32 + 2 * PAD - 1);
+    let advance = get_raster_width(FONT.0, FONT.1) as u32;
+    let width = advance * text.chars().count() as u32 + 2 * PAD_PX;
     for y in top..(top + HEIGHT_PX).min(picture.height()) {
         for x in left..(left + width).min(picture.width()) {
-            picture.put_pixel(x, y, GROUND);
+            picture.put_pixel(x, y, Rgb(GROUND));
         }
     }
     for (column, character) in text.chars().enumerate() {
-        let x = PAD + CELL[0] * column as u32;
-        for (row, bits) in rows(character).into_iter().enumerate() {
-            let y = PAD + row as u32;
-            for bit in (0..5).filter(|bit| bits & (0x10 >> bit) != 0) {
-                dot(picture, left + SCALE * (x + bit), top + SCALE * y);
+        // A camera's name has underscores for spaces.
+        let character = if character == '_' { ' ' } else { character };
+        let raster = [character, '?'].into_iter().find_map(|one| get_raster(one, FONT.0, FONT.1));
+        let Some(raster) = raster else { continue };
+        for (row, lights) in raster.rows().enumerate() {
+            for (at, light) in lights.iter().enumerate() {
+                let x = left + PAD_PX + advance * column as u32 + at as u32;
+                let y = top + PAD_PX + row as u32;
+                if let Some(pixel) = picture.get_pixel_mut_checked(x, y) {
+                    *pixel = Rgb(GROUND.map(|ground| ground.max(*light)));
+                }
             }
-        }
-    }
-}
-
-/// Draws a pixel of the font.
-fn dot(picture: &mut RgbImage, left: u32, top: u32) {
-    for (x, y) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
-        if let Some(pixel) = picture.get_pixel_mut_checked(left + x, top + y) {
-            *pixel = TEXT;
         }
     }
 }
@@ -110,33 +42,19 @@ fn dot(picture: &mut RgbImage, left: u32, top: u32) {
 mod tests {
     use super::*;
 
-    /// The bright pixels of a text on white, one character for each pixel of the font.
-    fn drawn(text: &str) -> Vec<String> {
-        let mut picture = RgbImage::from_pixel(60, 40, Rgb([90, 90, 90]));
+    /// Number of bright pixels of a text.
+    fn bright(text: &str) -> usize {
+        let mut picture = RgbImage::new(200, 40);
         draw(&mut picture, text, [4, 6]);
-        let bright = |x: u32, y: u32| *picture.get_pixel(4 + 2 * x, 6 + 2 * y) == TEXT;
-        let row = |y| (2..20).map(|x| if bright(x, y) { '#' } else { '.' }).collect();
-        (2..11).map(row).collect()
+        picture.pixels().filter(|pixel| pixel[0] > 128).count()
     }
 
     #[test]
-    fn letters_and_numbers_are_legible() {
-        let drawn = drawn("p1?");
-        let rows: Vec<&str> = drawn.iter().map(|row| &row[..17]).collect();
-        assert_eq!(
-            rows,
-            [
-                "........#...#####",
-                ".......##...#...#",
-                "####....#...#...#",
-                "#...#...#...#...#",
-                "#...#...#...#...#",
-                "#...#...#...#...#",
-                "####...###..#####",
-                "#................",
-                "#................",
-            ]
-        );
+    fn every_character_is_drawn_and_a_space_is_none() {
+        assert!(bright("front left 10.5 m/s").min(bright("?")) > 0);
+        assert_eq!(bright("front_left"), bright("front left"));
+        assert_eq!(bright("é"), bright("?"));
+        assert_eq!(bright(" "), 0);
     }
 
     #[test]
@@ -144,6 +62,6 @@ mod tests {
         let mut picture = RgbImage::new(20, 10);
         draw(&mut picture, "front left", [0, 0]);
         draw(&mut picture, "far away", [100, 100]);
-        assert!(picture.pixels().any(|pixel| *pixel == TEXT));
+        assert!(picture.pixels().any(|pixel| pixel[0] > 128));
     }
 }

@@ -99,7 +99,8 @@ impl Verify {
         if let Some(difference) = &report.difference {
             anyhow::bail!("differs at {difference}");
         }
-        writeln!(out, "verified    {} images, all as recorded", report.images)?;
+        let sweeps = with_sweeps(report.sweeps as usize);
+        writeln!(out, "verified    {} images{sweeps}, all as recorded", report.images)?;
         let RepairedImages { compared, not_compared } = report.repaired;
         if compared > 0 {
             writeln!(out, "repaired    {compared} images, repaired again and compared")?;
@@ -129,19 +130,22 @@ impl Verify {
 
 fn summary(out: &mut impl Write, recording: &RecordedEpisode) -> io::Result<()> {
     let RecordedEpisode { header, frames, versions, end, .. } = recording;
-    let cameras: Vec<_> = header.rig.cameras.iter().map(|camera| &*camera.name).collect();
+    let cameras = header.rig.cameras.iter().map(|camera| camera.name.clone());
+    let lidars = header.rig.lidars.iter().map(|lidar| format!("{} (LiDAR)", lidar.name));
+    let sensors: Vec<String> = cameras.chain(lidars).collect();
+    let sweeps = with_sweeps(frames.iter().map(|frame| frame.sweeps.len()).sum());
     let images: usize = frames.iter().map(|frame| frame.images.len()).sum();
     writeln!(out, "session     {}, seed {}", header.session, header.seed)?;
     writeln!(out, "twin        {} version {}", header.twin, header.version)?;
     writeln!(out, "manifest    {}", header.version_hash)?;
     writeln!(out, "recorded by {}, backend {}", header.build, header.backend)?;
-    writeln!(out, "rig         {}: {}", header.rig.name, cameras.join(", "))?;
+    writeln!(out, "rig         {}: {}", header.rig.name, sensors.join(", "))?;
     if let Some(repair) = &header.repair {
         let count = frames.iter().flat_map(|frame| &frame.repairs).flatten().count();
         let RecordedRepair { model, version, provider, .. } = repair;
         writeln!(out, "repair      {model} {version} on {provider}, {count} images")?;
     }
-    writeln!(out, "frames      {} with {images} images", frames.len())?;
+    writeln!(out, "frames      {} with {images} images{sweeps}", frames.len())?;
     for (before, version) in versions {
         writeln!(out, "switched    to version {} after {before} frames", version.version)?;
     }
@@ -158,6 +162,11 @@ fn summary(out: &mut impl Write, recording: &RecordedEpisode) -> io::Result<()> 
             writeln!(out, "end         not recorded: the episode still runs, or was interrupted")
         }
     }
+}
+
+/// The number of LiDAR sweeps beside that of images; nothing without LiDAR.
+fn with_sweeps(count: usize) -> String {
+    if count == 0 { String::new() } else { format!(" and {count} sweeps") }
 }
 
 fn write_png(dir: &Path, image: &ReplayedImage<'_>) -> anyhow::Result<()> {

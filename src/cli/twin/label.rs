@@ -72,8 +72,10 @@ fn parse_class(name: &str) -> Result<SemanticClass, String> {
 }
 
 fn parse_box(text: &str) -> Result<(SemanticClass, Region), String> {
-    let (class, region) = text.split_once(',').ok_or("expected a class and seven numbers")?;
-    Ok((parse_class(class)?, region.parse()?))
+    const FORM: &str = "a box is CLASS,X,Y,Z,DEGREES,L,W,H: a class, the middle of its bottom in metres, its heading, \
+                        and its length, width and height in metres";
+    let (class, region) = text.split_once(',').ok_or(FORM)?;
+    Ok((parse_class(class)?, region.parse().map_err(|error| format!("{error}; {FORM}"))?))
 }
 
 impl Label {

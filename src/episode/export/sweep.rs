@@ -21,11 +21,11 @@ pub(super) enum Number {
     F32,
 }
 
-/// Bytes of a point. The last two are padding, so that each number is at a multiple of its size.
+/// Bytes of a point; each number is at a multiple of its size.
 pub(super) const POINT_BYTES: u32 = 28;
 
 /// The numbers of a point and where they begin. Names are those that viewers look for.
-pub(super) const FIELDS: [(&str, u32, Number); 8] = [
+pub(super) const FIELDS: [(&str, u32, Number); 9] = [
     ("x", 0, Number::F32),
     ("y", 4, Number::F32),
     ("z", 8, Number::F32),
@@ -34,18 +34,19 @@ pub(super) const FIELDS: [(&str, u32, Number); 8] = [
     ("row", 20, Number::U16),
     ("column", 22, Number::U16),
     ("instance", 24, Number::U16),
+    ("class", 26, Number::U16),
 ];
 
 /// The points, one after the other, little endian.
 pub(super) fn packed(points: &[SweepPoint]) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(points.len() * POINT_BYTES as usize);
     for point in points {
-        let SweepPoint { xyz_m, intensity, offset_us, row, column, instance } = *point;
+        let SweepPoint { xyz_m, intensity, offset_us, row, column, instance, class } = *point;
         for value in xyz_m.into_iter().chain([intensity]) {
             bytes.extend(value.to_le_bytes());
         }
         bytes.extend(offset_us.to_le_bytes());
-        for value in [row, column, instance, 0] {
+        for value in [row, column, instance, u16::from(class)] {
             bytes.extend(value.to_le_bytes());
         }
     }

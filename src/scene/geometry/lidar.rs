@@ -55,7 +55,7 @@ pub enum LidarError {
     )]
     Jumps { jumps: usize, limit: usize },
     /// Azimuths that are given twice, or not at all.
-    #[error("give either column_azimuths_rad or columns")]
+    #[error("columns: give either columns or column_azimuths_rad, and not both")]
     Columns,
 }
 

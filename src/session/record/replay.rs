@@ -23,7 +23,7 @@ use super::repair_replay::{Drawing, ImageToRepair, RepairReplay};
 use super::repairs::RecordedImageRepair;
 use super::replay_report::{
     ImageDifference, ProvenanceChange, RepairedImages, ReplayError, ReplayReport, ReplayUntil,
-    Replayed, ReplayedImage, ReplayedSweep, WrongValue,
+    Replayed, ReplayedImage, ReplayedSweep, Sensor, WrongValue,
 };
 use super::sensor_replay::SensorReplay;
 use super::values;
@@ -177,6 +177,7 @@ impl<'a> Replay<'a> {
             images,
             report: ReplayReport {
                 images: 0,
+                sweeps: 0,
                 changes,
                 diverged: None,
                 difference: None,
@@ -312,7 +313,7 @@ impl<'a> Replay<'a> {
                     rgb8: repaired.as_deref().unwrap_or(rendered_pixels),
                 };
                 visit(&Replayed::Image(image)).map_err(|reason| {
-                    let sensor = format!("camera {:?}", image.camera.name);
+                    let sensor = Sensor::Camera(image.camera.name.clone());
                     ReplayError::Visit { step: frame.step, sensor, reason }
                 })?;
                 self.report.images += 1;
@@ -325,7 +326,7 @@ impl<'a> Replay<'a> {
                         request: frame.request,
                         step: frame.step,
                         pose,
-                        camera: image.camera.name.clone(),
+                        sensor: Sensor::Camera(image.camera.name.clone()),
                         recorded: recorded.clone(),
                         now,
                     });
@@ -385,9 +386,10 @@ impl<'a> Replay<'a> {
             let time_us = frame.time_us;
             let replayed = ReplayedSweep { lidar, time_us, mounted, view: &view, cloud: &cloud };
             visit(&Replayed::Sweep(replayed)).map_err(|reason| {
-                let sensor = format!("LiDAR {:?}", mounted.name);
+                let sensor = Sensor::Lidar(mounted.name.clone());
                 ReplayError::Visit { step, sensor, reason }
             })?;
+            self.report.sweeps += 1;
             let now = cloud.hash.to_hex().to_string();
             if now != *recorded && self.report.difference.is_none() {
                 self.report.difference = Some(ImageDifference {
@@ -395,7 +397,7 @@ impl<'a> Replay<'a> {
                     request: frame.request,
                     step,
                     pose: 0,
-                    camera: mounted.name.clone(),
+                    sensor: Sensor::Lidar(mounted.name.clone()),
                     recorded: recorded.clone(),
                     now,
                 });

@@ -21,11 +21,13 @@ use crate::observe::point_cloud::PointCloud;
 pub struct ReplayReport {
     /// Number of images that were rendered again.
     pub images: u64,
+    /// Number of LiDAR sweeps that were cast again.
+    pub sweeps: u64,
     /// Differences from the time of recording, which may explain differing images.
     pub changes: Vec<ProvenanceChange>,
     /// The first step at which the command leads to a pose that differs from the recorded one.
     pub diverged: Option<DivergedStep>,
-    /// The first image that differs.
+    /// The first image or sweep that differs.
     pub difference: Option<ImageDifference>,
     /// The first other value of the record that does not follow from the rest of it.
     pub wrong_value: Option<WrongValue>,
@@ -75,7 +77,7 @@ pub struct ProvenanceChange {
     pub now: String,
 }
 
-/// An image that differs from the recorded one.
+/// An image or a sweep that differs from the recorded one.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ImageDifference {
     /// Line of the episode's file, from 1.
@@ -86,10 +88,26 @@ pub struct ImageDifference {
     /// Index of the pose among those of the record; 0 but for `observe`, or for frames of a
     /// warm-up.
     pub pose: usize,
-    /// Name of the camera.
-    pub camera: String,
+    /// The camera or the LiDAR.
+    pub sensor: Sensor,
     pub recorded: String,
     pub now: String,
+}
+
+/// A sensor of the rig, by its name.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Sensor {
+    Camera(String),
+    Lidar(String),
+}
+
+impl std::fmt::Display for Sensor {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Camera(name) => write!(f, "camera {name:?}"),
+            Self::Lidar(name) => write!(f, "LiDAR {name:?}"),
+        }
+    }
 }
 
 /// An image that was rendered again.
@@ -142,6 +160,7 @@ impl ReplayedSweep<'_> {
                 row: cloud.rows[at],
                 column: cloud.columns[at],
                 instance: cloud.instances[at],
+                class: cloud.classes.get(at).map_or(0, |class| class.value()),
             }
         };
         (0..cloud.points_m.len()).map(point).collect()
@@ -213,18 +232,13 @@ pub enum ReplayError {
     Reference(String),
     /// The caller's function failed on an image or a sweep.
     #[error("step {step}, {sensor}: {reason:#}")]
-    Visit {
-        step: u64,
-        /// The camera or the LiDAR.
-        sensor: String,
-        reason: String,
-    },
+    Visit { step: u64, sensor: Sensor, reason: String },
 }
 
 impl std::fmt::Display for ImageDifference {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { line, step, pose, camera, recorded, now, request } = self;
-        write!(f, "step {step}, camera {camera:?}")?;
+        let Self { line, step, pose, sensor, recorded, now, request } = self;
+        write!(f, "step {step}, {sensor}")?;
         if *request == FrameRequest::Observe {
             write!(f, ", pose {pose} of observe")?;
         }

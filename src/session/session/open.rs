@@ -179,6 +179,12 @@ impl Session {
         state: EpisodeState,
     ) -> Self {
         let dt_us = settings.dt_us;
+        if reservation.views_at_once() == 1 && settings.layout.cameras().len() > 1 {
+            tracing::info!(
+                session = name,
+                "memory is short: frames are drawn camera by camera, which takes longer"
+            );
+        }
         let session = Self {
             number: engine.new_session_number(),
             engine,

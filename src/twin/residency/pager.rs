@@ -102,6 +102,11 @@ impl Pager {
         change(&mut self.0.state.lock().requests.table)
     }
 
+    /// Counts a reservation that is only enough for one camera at a time.
+    pub(super) fn count_by_camera(&self) {
+        self.0.state.lock().requests.count_by_camera();
+    }
+
     /// Requests the sections of a frame. `callback` is called once all are in memory; before this
     /// returns, if they are already.
     ///

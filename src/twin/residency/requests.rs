@@ -239,6 +239,11 @@ impl<C> Requests<C> {
         frame.map_or(0, |frame| frame.missing)
     }
 
+    /// Counts a reservation that is only enough for one camera at a time.
+    pub(super) fn count_by_camera(&mut self) {
+        self.stats.by_camera += 1;
+    }
+
     /// Counts, and what the table holds.
     pub(super) fn stats(&self) -> Stats {
         Stats {

@@ -116,6 +116,7 @@ impl SceneBytes {
         };
         let by_view = claim(resident, bytes, frame);
         change_budget(resident, |budget| change(budget, &by_view))?;
+        resident.shared.pager.count_by_camera();
         Ok((by_view, true))
     }
 }

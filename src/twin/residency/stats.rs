@@ -23,6 +23,9 @@ pub struct Stats {
     pub evictions: u64,
     /// Sections that were not prefetched because there was not enough memory.
     pub prefetches_dropped: u64,
+    /// Sessions and their changes of version for which there was only memory to draw a frame
+    /// camera by camera.
+    pub by_camera: u64,
     /// Frames that had to wait for a section.
     pub waits: u64,
     /// Total time that those frames waited.

@@ -12,7 +12,7 @@ use crate::cli::output;
 use wildcity_scene::Rig;
 use wildcity_scene::rig::RigCamera;
 
-/// Draw the cameras of a rig from above, as an SVG file.
+/// Draw the cameras and LiDARs of a rig from above, as an SVG file.
 ///
 /// The rig's front is at the top; grid squares have a side of one metre. Each camera is drawn with
 /// the horizontal field of view of its middle row.
@@ -62,6 +62,14 @@ fn draw(rig: &Rig, svg: &mut String) -> DrawResult {
     chart.configure_mesh().x_labels(20).y_labels(20).draw()?;
     for (index, camera) in rig.cameras.iter().enumerate() {
         draw_camera(&mut chart, camera, index)?;
+    }
+    for lidar in &rig.lidars {
+        let at_m = lidar.rig_from_lidar.position_m;
+        let at = (at_m.y, at_m.x);
+        chart.draw_series([
+            Circle::new(at, 6, BLACK.stroke_width(2)).into_dyn(),
+            Text::new(format!("{} (LiDAR)", lidar.name), at, ("sans-serif", 14)).into_dyn(),
+        ])?;
     }
     area.present()?;
     Ok(())

@@ -8,8 +8,9 @@ use super::lookup::{camera_view, find_rig};
 use crate::cli::output;
 use wildcity_render::View;
 use wildcity_scene::Rig;
+use wildcity_scene::rig::RigLidar;
 
-/// Print the cameras of a rig; without RIG, the names of the presets.
+/// Print the cameras and LiDARs of a rig; without RIG, the names of the presets.
 ///
 /// Positions are in the rig's axes, in metres: x forward, y left, z up. Yaw is positive to the left
 /// of straight ahead and pitch is positive above the horizon, both in degrees. A field of view is
@@ -35,7 +36,12 @@ impl Show {
             return Ok(());
         };
         let rig = find_rig(&name)?;
-        writeln!(out, "{}: {} cameras", rig.name, rig.cameras.len())?;
+        let lidars = match rig.lidars.len() {
+            0 => String::new(),
+            1 => ", 1 LiDAR".to_owned(),
+            count => format!(", {count} LiDARs"),
+        };
+        writeln!(out, "{}: {} cameras{lidars}", rig.name, rig.cameras.len())?;
         let headings =
             ["#", "camera", "size px", "field deg", "x m", "y m", "z m", "yaw deg", "pitch deg"];
         let [index, camera, size, field, x, y, z, yaw, pitch] = headings;
@@ -57,6 +63,18 @@ impl Show {
                 camera.name,
                 format!("{width_px}x{height_px}"),
                 fields_of_view(&view),
+            )?;
+        }
+        for RigLidar { name, lidar, rig_from_lidar } in &rig.lidars {
+            let [x, y, z] = rig_from_lidar.position_m.to_array();
+            writeln!(
+                out,
+                "LiDAR {name}: {} rows of {} beams, {} to {} m, at x {x:.2} y {y:.2} z {z:.2}, a sweep in {} ms",
+                lidar.rows(),
+                lidar.columns(),
+                lidar.min_range_m(),
+                lidar.max_range_m(),
+                lidar.duration_us() as f64 * 1e-3,
             )?;
         }
         Ok(())
