@@ -1,4 +1,5 @@
-//! The most that one request of AlpaSim's services may cost, from the constants of the code.
+//! The most that one request of AlpaSim's services may cost, from the limits and from sizes of
+//! decoded messages that were counted by hand; not measured.
 //! `docs/reference/alpasim-costs.md` is generated from this table, and a method without a row fails
 //! a test.
 
@@ -40,7 +41,7 @@ fn page() -> String {
     let mut text = String::from(
         "<!-- Generated from src/alpasim/costs.rs: WILDCITY_BLESS=1 cargo test -p wildcity-alpasim --lib costs -->\n\n\
          # Costs of AlpaSim's services\n\n\
-         The most that one request may cost, from the constants of the code, in addition to what its scene has reserved. All \
+         The most that one request may cost, from the limits of the code, in addition to what its scene has reserved. All \
          requests that are being received have at most 256 MiB together.\n\n\
          | method | memory, MiB | time, s | bound by |\n|---|---|---|---|\n",
     );

@@ -71,6 +71,8 @@ impl Bench {
 }
 
 fn main() -> ExitCode {
+    // As the program that it measures.
+    wildcity_heap::map_large_blocks();
     let matches = help_all::program(Bench::command(), help_all::is_asked()).get_matches();
     match Bench::from_arg_matches(&matches) {
         Ok(bench) => exit::code(bench.run()),

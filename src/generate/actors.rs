@@ -128,7 +128,8 @@ fn paint_crate(painter: &mut Painter) {
 }
 
 /// The soft shade on the ground below an object with its middle on the origin, which moves with it.
-/// It covers a third of the road at most, so that what is there is still the road.
+/// It hides 41 % of the road at most (1 - 0.78 · 0.945⁴ · 0.986⁴ of the cells around a place), so
+/// that what is there is still the road.
 fn paint_shade(painter: &mut Painter, [length_m, width_m]: [f64; 2]) {
     let half_m = [0.5 * length_m + 0.15, 0.5 * width_m + 0.15];
     let counts = half_m.map(|half_m| (2.0 * half_m / 0.25).ceil().max(2.0));

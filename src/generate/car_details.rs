@@ -120,13 +120,13 @@ impl Car {
         let line = |painter: &mut Painter,
                     [from_m, to_m]: [f64; 2],
                     z_m: f64,
-                    paint: [f64; 2],
-                    colour: Paint| {
-            let parts = ((to_m - from_m) / paint[1]).ceil().max(1.0);
+                    width_and_longest_m: [f64; 2],
+                    paint: Paint| {
+            let parts = ((to_m - from_m) / width_and_longest_m[1]).ceil().max(1.0);
             let at =
                 |part: i32| place(from_m + (to_m - from_m) * f64::from(part) / parts, z_m, 0.016);
             let places: Vec<DVec3> = (0..=parts as i32).map(at).collect();
-            painter.polyline(&places, normal, paint, colour);
+            painter.polyline(&places, normal, width_and_longest_m, paint);
         };
         if nose {
             // Grille with a bright bar, and the air intake below.
@@ -197,7 +197,7 @@ impl Car {
                 painter.sheet(&us, &vs, |u_m, z_m| place(u_m, z_m, off_m), |_, _| Some(*paint));
             }
         }
-        self.plate(painter, normal, |u_m, z_m, off_m| place(u_m, z_m, off_m), at_m(0.42));
+        self.plate(painter, normal, place, at_m(0.42));
     }
 
     /// A number plate with its middle at a height, and dark characters.

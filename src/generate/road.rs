@@ -385,12 +385,12 @@ const JOINT_M: f64 = 0.03;
 fn joints(painter: &Painter, from_m: f64, to_m: f64) -> Vec<f64> {
     let long = to_m - from_m > 20.0;
     let first_m = if long { (from_m / SLAB_M).ceil() * SLAB_M } else { from_m };
-    let halves = painter.even(JOINT_M, SLAB_M, SLAB_M);
+    let slabs = painter.even(JOINT_M, SLAB_M, SLAB_M);
     let mut breaks = vec![from_m];
     let mut at_m = first_m;
     while at_m < to_m {
         breaks.push(at_m);
-        breaks.extend(halves.iter().map(|step_m| at_m + step_m));
+        breaks.extend(slabs.iter().map(|step_m| at_m + step_m));
         at_m += SLAB_M;
     }
     breaks.push(to_m);

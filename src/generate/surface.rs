@@ -243,8 +243,8 @@ impl<'a> Painter<'a> {
     }
 
     /// A straight line from end to end, `width_m` wide, on a surface with this normal: one thin
-    /// Gaussian, as sharp as it is narrow. It lies in front of the surfels beneath it if it is
-    /// off the surface by more than they are apart in depth: keep it short along the view.
+    /// Gaussian, as sharp as it is narrow. It must lie farther off the surface than half of its
+    /// length reaches along the view, or the surfels beside it hide it.
     pub(super) fn stroke(&mut self, ends_m: [DVec3; 2], normal: DVec3, width_m: f64, paint: Paint) {
         self.thin(ends_m, normal, [SINGLE, width_m], paint);
     }

@@ -26,7 +26,6 @@ use wildcity_sim::contact::{
     MAX_SWEPT_SPEED_MPS, SOLID_OPACITY, SolidPoint, SolidSums, Solids, StaticLimit, TestedBox,
 };
 use wildcity_sim::traffic::{EgoBox, EgoMotion, EgoState};
-use wildcity_twin::residency::ReadingBytes;
 use wildcity_twin::store::{Catalog, StoreError};
 
 use crate::engine::solid_blocks::{SectionKey, SolidBlocks};
@@ -50,7 +49,6 @@ pub(crate) struct TwinSolids {
     catalog: Catalog,
     index: Arc<SpatialIndex>,
     blocks: Arc<SolidBlocks>,
-    reading: Arc<ReadingBytes>,
     ego_box: EgoBox,
     limits: Arc<Mutex<HashMap<Block, StaticLimit>>>,
 }
@@ -72,10 +70,9 @@ impl TwinSolids {
         catalog: Catalog,
         index: Arc<SpatialIndex>,
         blocks: Arc<SolidBlocks>,
-        reading: Arc<ReadingBytes>,
         ego_box: EgoBox,
     ) -> Self {
-        Self { catalog, index, blocks, reading, ego_box, limits: Arc::default() }
+        Self { catalog, index, blocks, ego_box, limits: Arc::default() }
     }
 
     /// The contacts that begin while the ego goes from one state through others, step by step. Each
@@ -257,7 +254,7 @@ impl TwinSolids {
         chunk: &ChunkEntry,
         section: &Section,
     ) -> Result<Arc<Solids>, StoreError> {
-        let _reading = self.reading.begin(section.bytes.into());
+        let _reading = self.blocks.reading.begin(section.bytes.into());
         // Another thread may have read it while this one waited. Of two that read it at once, both
         // insert equal contents.
         if let Some(solids) = self.blocks.get(&key) {

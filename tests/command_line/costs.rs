@@ -42,7 +42,9 @@ fn rows() -> BTreeMap<String, Row> {
         let time_s = cells.next()?.parse().ok()?;
         Some((of, Row { memory_bytes: (memory_mib * MIB as f64) as u64, time_s }))
     });
-    rows.collect()
+    let rows: BTreeMap<String, Row> = rows.collect();
+    assert!(rows.len() > 40, "only {} rows can be read", rows.len());
+    rows
 }
 
 /// What a server took for some work, and the most that a poll took in it.

@@ -50,7 +50,10 @@ fn a_redirect_to_another_place_is_refused() {
     command.args(["twin", "show", "street", "--twins", &S3::url()]);
     let output = s3.environment(&mut command).output().unwrap();
     let said = String::from_utf8(output.stderr).unwrap();
-    assert!(!output.status.success() && said.contains("redirect"), "{said}");
+    assert!(
+        !output.status.success() && said.contains("which is another place: name that one"),
+        "{said}"
+    );
     let asked = other.accept();
     assert!(asked.is_err(), "the other place was asked: {asked:?}");
 }

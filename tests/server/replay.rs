@@ -5,7 +5,9 @@ use std::path::{Path, PathBuf};
 use serde_json::{Value, json};
 use wildcity_render::Backend;
 use wildcity_render::cpu::{Cpu, Simd};
-use wildcity_session::{FrameRequest, RecordedEpisode, ReplayError, ReplayReport, ReplayUntil};
+use wildcity_session::{
+    FrameRequest, RecordedEpisode, ReplayError, ReplayReport, ReplayUntil, Sensor,
+};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::Catalog;
 
@@ -54,13 +56,14 @@ async fn the_first_differing_image_is_named() {
     tamper(&path, 4, 1);
     let report = replay(&server, &path, &Painter::default()).unwrap();
     let found = report.difference.unwrap();
-    assert_eq!((found.line, found.step, &*found.camera), (5, 4, "rear"));
+    assert_eq!((found.line, found.step, found.sensor), (5, 4, Sensor::Camera("rear".into())));
     assert_eq!(report.images, 8);
 
     let (server, path) = recorded().await;
     tamper(&path, 11, 2);
     let found = replay(&server, &path, &Painter::default()).unwrap().difference.unwrap();
-    assert_eq!((found.request, found.pose, &*found.camera), (FrameRequest::Observe, 1, "front"));
+    let front = Sensor::Camera("front".into());
+    assert_eq!((found.request, found.pose, found.sensor), (FrameRequest::Observe, 1, front));
 }
 
 #[tokio::test]

@@ -3,8 +3,8 @@
 //! A push takes memory for seconds. The maximum of a longer time therefore is higher, although
 //! nothing grows; the median of a window is not.
 
-/// Windows of equal length. The first is not compared: in it caches and pools fill, and so do the
-/// answers of clients that do not read, which are kept for a minute. That took 105 s.
+/// Windows of equal length. The first is not compared: in it caches and pools fill, which takes
+/// about two minutes.
 const WINDOWS: usize = 6;
 
 /// Resident memory, in bytes, sample by sample.

@@ -408,8 +408,7 @@ impl Engine {
 
     /// The solid Gaussians of a version, for an ego of a size.
     pub(crate) fn solids(&self, index: Arc<SpatialIndex>, ego_box: EgoBox) -> TwinSolids {
-        let reading = self.cache.reading();
-        TwinSolids::new(self.catalog().clone(), index, self.solid_blocks.clone(), reading, ego_box)
+        TwinSolids::new(self.catalog().clone(), index, self.solid_blocks.clone(), ego_box)
     }
 
     /// Buffers and images that a frame of some views needs in addition to its scene. The frame

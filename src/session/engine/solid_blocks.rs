@@ -6,6 +6,7 @@ use std::sync::Arc;
 use parking_lot::Mutex;
 
 use wildcity_sim::contact::Solids;
+use wildcity_twin::residency::ReadingBytes;
 
 /// A section by the hash of its bytes and the place of its origin: its bytes are relative to that.
 pub(crate) type SectionKey = ([u8; 32], [u64; 3]);
@@ -16,6 +17,8 @@ pub(crate) type SectionKey = ([u8; 32], [u64; 3]);
 pub(crate) struct SolidBlocks {
     limit_bytes: usize,
     held: Mutex<Held>,
+    /// Of its own, so that what sessions draw does not wait for what they may touch.
+    pub(crate) reading: ReadingBytes,
 }
 
 #[derive(Debug, Default)]
@@ -34,7 +37,7 @@ struct HeldBlock {
 
 impl SolidBlocks {
     pub(crate) fn new(limit_bytes: usize) -> Self {
-        Self { limit_bytes, held: Mutex::default() }
+        Self { limit_bytes, held: Mutex::default(), reading: ReadingBytes::default() }
     }
 
     /// The block of a section, if it is in memory.

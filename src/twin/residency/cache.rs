@@ -14,7 +14,7 @@ use super::actors::{ActorPool, ResidentActor};
 use super::budget::{Budget, default_memory_bytes};
 use super::pager::Pager;
 use super::resident::Shared;
-use super::{ReadingBytes, ResidencyError, Resident, SectionSource, Stats};
+use super::{ResidencyError, Resident, SectionSource, Stats};
 
 /// Opens versions of twins, and shares the memory for what their frames need.
 #[derive(Debug)]
@@ -74,11 +74,6 @@ impl Cache {
     /// The catalog that versions are read from.
     pub fn catalog(&self) -> &Catalog {
         &self.catalog
-    }
-
-    /// The sections that are being read, for readers beside this cache.
-    pub fn reading(&self) -> Arc<ReadingBytes> {
-        self.shared.pager.reading()
     }
 
     /// Bytes that twins may take, and the frames that show them.

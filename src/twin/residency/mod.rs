@@ -41,7 +41,8 @@
 //!
 //! **Memory is reserved before a load begins**, because the table has the size of each section.
 //! Sections that are being loaded count as in use. The budget covers chunks; outside it are 16 MiB
-//! of sections as they are stored, or one larger one, and 64 B of bookkeeping per section.
+//! of sections as they are stored, or one larger one, twice that with those in which sessions look
+//! for contacts, and 64 B of bookkeeping per section.
 //!
 //! **Memory is allocated in pages**: the next section is read into the pages of an evicted one
 //! (`wildcity_scene::pages`). The heap loses a few per cent of the budget between pages.

@@ -54,7 +54,7 @@ struct Shared {
     state: Mutex<State>,
     /// Notified when there may be a section to load, or memory for one.
     work: Condvar,
-    reading: Arc<ReadingBytes>,
+    reading: ReadingBytes,
 }
 
 struct State {
@@ -71,7 +71,7 @@ impl Pager {
             source,
             state: Mutex::new(state),
             work: Condvar::new(),
-            reading: Arc::default(),
+            reading: ReadingBytes::default(),
         }))
     }
 
@@ -165,11 +165,6 @@ impl Pager {
     /// that failed, or for which there was no room.
     pub(super) fn pending(&self, number: u64) -> usize {
         self.0.state.lock().requests.pending(number)
-    }
-
-    /// The sections that are being read.
-    pub(super) fn reading(&self) -> Arc<ReadingBytes> {
-        self.0.reading.clone()
     }
 
     /// Bytes of memory in use, and bytes that may be used.

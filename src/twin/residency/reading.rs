@@ -1,17 +1,29 @@
 //! Sections that are being read, as stored: memory in addition to the budget.
 
+use std::collections::VecDeque;
 use std::time::Instant;
 
 use parking_lot::{Condvar, Mutex};
 
 use crate::limits;
 
-/// Bounds the bytes, as stored, of the sections that are in memory until they are decoded.
+/// Bounds the bytes, as stored, of the sections that are in memory until they are decoded. They are
+/// read in the order in which they came: a large one, which needs all others to end, is not overtaken
+/// by small ones for ever.
 #[derive(Debug, Default)]
 pub struct ReadingBytes {
-    bytes: Mutex<u64>,
-    /// Notified when a section was read.
-    was_read: Condvar,
+    state: Mutex<State>,
+    /// Notified when a section was read, or does not wait any longer.
+    changed: Condvar,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    /// Of the sections that are being read.
+    bytes: u64,
+    /// Numbers of the readers that wait.
+    waiting: VecDeque<u64>,
+    next: u64,
 }
 
 /// A section that is being read. Dropped when it was.
@@ -23,23 +35,77 @@ pub struct Reading<'a> {
 
 impl ReadingBytes {
     /// Waits until the sections that are being read leave room for one of so many bytes, or there
-    /// are none; a read that hangs does not keep others waiting for ever.
+    /// are none; a read that hangs does not keep others waiting for longer than
+    /// [`limits::READING_WAIT`].
     pub fn begin(&self, bytes: u64) -> Reading<'_> {
-        let mut reading_bytes = self.bytes.lock();
+        let mut state = self.state.lock();
         let until = Instant::now() + limits::READING_WAIT;
-        while *reading_bytes > 0 && *reading_bytes + bytes > limits::READING_BYTES {
-            if self.was_read.wait_until(&mut reading_bytes, until).timed_out() {
+        let number = state.next;
+        state.next += 1;
+        state.waiting.push_back(number);
+        while !state.has_room(number, bytes) {
+            if self.changed.wait_until(&mut state, until).timed_out() {
                 break;
             }
         }
-        *reading_bytes += bytes;
+        state.waiting.retain(|&other| other != number);
+        state.bytes += bytes;
+        drop(state);
+        // The next one may have room beside this one.
+        self.changed.notify_all();
         Reading { all: self, bytes }
+    }
+}
+
+impl State {
+    /// Whether it is the turn of a reader, and there is room for its section.
+    fn has_room(&self, number: u64, bytes: u64) -> bool {
+        let is_next = self.waiting.front() == Some(&number);
+        is_next && (self.bytes == 0 || self.bytes + bytes <= limits::READING_BYTES)
     }
 }
 
 impl Drop for Reading<'_> {
     fn drop(&mut self) {
-        *self.all.bytes.lock() -= self.bytes;
-        self.all.was_read.notify_all();
+        self.all.state.lock().bytes -= self.bytes;
+        self.all.changed.notify_all();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::mpsc::{TryRecvError, channel};
+
+    use super::*;
+
+    #[test]
+    fn a_large_section_is_read_alone_and_is_not_overtaken() {
+        let all = ReadingBytes::default();
+        let small = all.begin(limits::READING_BYTES / 2);
+        let beside = all.begin(limits::READING_BYTES / 4);
+        let (begun, order) = channel();
+        std::thread::scope(|scope| {
+            let read = |name: &'static str, bytes| {
+                let begun = begun.clone();
+                let waiting = all.state.lock().waiting.len();
+                let all = &all;
+                scope.spawn(move || {
+                    let reading = all.begin(bytes);
+                    begun.send(name).unwrap();
+                    drop(reading);
+                });
+                while all.state.lock().waiting.len() == waiting {
+                    std::thread::yield_now();
+                }
+            };
+            read("large", 2 * limits::READING_BYTES);
+            // There is room for it, but the large one came first.
+            read("small", 1);
+            drop(small);
+            assert_eq!(order.try_recv(), Err(TryRecvError::Empty));
+            drop(beside);
+        });
+        assert_eq!(order.iter().take(2).collect::<Vec<_>>(), ["large", "small"]);
+        assert!(all.state.lock().bytes == 0 && all.state.lock().waiting.is_empty());
     }
 }

@@ -74,7 +74,7 @@ impl Show {
                 lidar.columns(),
                 lidar.min_range_m(),
                 lidar.max_range_m(),
-                lidar.duration_us() as f64 * 1e-3,
+                lidar.duration_us() as f64 / 1e3,
             )?;
         }
         Ok(())

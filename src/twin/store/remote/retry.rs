@@ -225,5 +225,15 @@ fn to_io(error: &object_store::Error) -> io::Error {
         // All else may be transient: a lost connection, an overloaded store.
         _ => ErrorKind::Other,
     };
-    io::Error::new(kind, error.to_string())
+    // The last cause names the reason; reqwest's own texts leave it out.
+    let mut said = error.to_string();
+    let mut cause = std::error::Error::source(error);
+    while let Some(next) = cause {
+        let text = next.to_string();
+        if !said.contains(&text) {
+            said = format!("{said}: {text}");
+        }
+        cause = next.source();
+    }
+    io::Error::new(kind, said)
 }
