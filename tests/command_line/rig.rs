@@ -28,9 +28,9 @@ fn presets_are_shown_checked_and_drawn() {
     let names = said(&wildcity(&["show"]));
     for name in Rig::preset_names() {
         assert!(names.lines().any(|line| line == name), "{names}");
-        let cameras = Rig::preset(name).unwrap().cameras;
+        let Rig { cameras, lidars, .. } = Rig::preset(name).unwrap();
         let shown = said(&wildcity(&["show", name]));
-        assert_eq!(shown.lines().count(), cameras.len() + 2, "{shown}");
+        assert_eq!(shown.lines().count(), cameras.len() + lidars.len() + 2, "{shown}");
         let checked = wildcity(&["check", name, "--backend", "cpu"]);
         assert!(checked.status.success(), "{}", said(&checked));
         assert_eq!(said(&checked).lines().count(), cameras.len());
@@ -39,8 +39,9 @@ fn presets_are_shown_checked_and_drawn() {
         assert!(drawn.status.success(), "{}", said(&drawn));
         let svg = std::fs::read_to_string(&picture).unwrap();
         assert!(svg.starts_with("<svg"), "{svg}");
-        for camera in cameras {
-            assert!(svg.contains(&camera.name), "{} is not in the picture", camera.name);
+        let cameras = cameras.into_iter().map(|camera| camera.name);
+        for sensor in cameras.chain(lidars.into_iter().map(|lidar| lidar.name)) {
+            assert!(svg.contains(&sensor), "{sensor} is not in the picture");
         }
     }
 }
