@@ -29,7 +29,7 @@
 //! | [`wildcity_report`] | error against run time of every setting of a twin | generate, render, repair, scene, session, stress, twin |
 //! | [`wildcity_alpasim`] | AlpaSim's gRPC services | client, options, render, scene, session, sim, twin |
 //! | [`wildcity_server`] | WebSocket and HTTP, and the viewer | episode, heap, options, protocol, push, render, repair, scene, session, sim, twin |
-//! | [`wildcity_bench`] | the program `wildcity-bench`: speed of steps, sessions, actors and loading | client, generate, protocol, render, scene, server, session, twin |
+//! | [`wildcity_bench`] | the program `wildcity-bench`: speed of steps, sessions, actors and loading | client, generate, heap, protocol, render, scene, server, session, twin |
 //! | [`wildcity_suite`] | suites of scenarios: drives, judges and reports them | episode, render, scene, score, server, session, sim, twin |
 //!
 //! Data goes one way: file, twin, render, session, server, agent. An agent's pose or action goes

@@ -172,8 +172,8 @@ mod tests {
                 high_m = high_m.max(DVec3::from_array(mean_m));
             }
             // Door mirrors reach beyond a car's width, as they do beyond the width in its papers.
-            // Surfels reach beyond the box by their size, too.
-            let beyond_m = DVec3::new(0.12, 0.2, 0.05);
+            // Surfels reach beyond the box by their size, too, and the shade by 0.15 m.
+            let beyond_m = DVec3::new(0.15, 0.2, 0.05);
             let wanted_low_m = DVec3::new(-half_m.x, -half_m.y, 0.0);
             let wanted_high_m = DVec3::new(half_m.x, half_m.y, 2.0 * half_m.z);
             assert!(low_m.cmpge(wanted_low_m - beyond_m).all(), "{name}: {low_m}");

@@ -42,7 +42,9 @@ pub struct GroundSearch {
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum GroundError {
     /// Too little of the scene is visible.
-    #[error("{count} places of the scene are opaque; at least {least} are needed to find a plane: train the scene for longer")]
+    #[error(
+        "{count} places of the scene are opaque; at least {least} are needed to find a plane: train the scene for longer"
+    )]
     TooFew { count: usize, least: usize },
     /// No plane has enough of the scene on it.
     #[error(

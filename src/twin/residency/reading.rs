@@ -8,8 +8,8 @@ use parking_lot::{Condvar, Mutex};
 use crate::limits;
 
 /// Bounds the bytes, as stored, of the sections that are in memory until they are decoded. They are
-/// read in the order in which they came: a large one, which needs all others to end, is not overtaken
-/// by small ones for ever.
+/// read in the order in which they came: a large one, which needs all others to end, is not
+/// overtaken by small ones for ever.
 #[derive(Debug, Default)]
 pub struct ReadingBytes {
     state: Mutex<State>,

@@ -131,6 +131,8 @@ mod tests {
 
     #[test]
     fn options_are_honoured_or_refused() {
+        // As `url.rs` does. It fails if another test was first.
+        let _ = rustls::crypto::ring::default_provider().install_default();
         let with = |key: ClientConfigKey, value: &str| {
             SameHost.connect(&ClientOptions::default().with_config(key, value)).map(|_| ())
         };
