@@ -138,20 +138,10 @@ impl Car {
             line(painter, [-half_m + 0.2, half_m - 0.2], at_m(0.24), [0.09, 0.3], black);
         } else {
             // The gap of the boot lid, and the bumper's edge.
-            line(
-                painter,
-                [-half_m + 0.3, half_m - 0.3],
-                at_m(0.60),
-                [0.014, 0.3],
-                self.paint.times(0.4),
-            );
-            line(
-                painter,
-                [-half_m + 0.1, half_m - 0.1],
-                at_m(0.27),
-                [0.02, 0.3],
-                self.paint.times(0.4),
-            );
+            for (inset_m, part, width_m) in [(0.3, 0.60, 0.014), (0.1, 0.27, 0.02)] {
+                let ends_m = [inset_m - half_m, half_m - inset_m];
+                line(painter, ends_m, at_m(part), [width_m, 0.3], self.paint.times(0.4));
+            }
         }
         for side in [-1.0, 1.0] {
             let lamp = |u: [f64; 2], v: [f64; 2]| {

@@ -170,7 +170,7 @@ impl Collector for LongestPolls {
     fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> Result<(), std::fmt::Error> {
         let times = self.0.times();
         let polls: u64 = times.counts.iter().map(|(_, count)| count).sum();
-        // The encoder's infinity.
+        // The encoder writes `+Inf` for this number only.
         let buckets: Vec<_> =
             times.counts.iter().map(|&(bound_s, count)| (bound_s.min(f64::MAX), count)).collect();
         let help = "How long a task held a thread that answers requests";

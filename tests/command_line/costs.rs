@@ -22,7 +22,7 @@ const MIB: u64 = 1 << 20;
 /// Pages of code that run for the first time, and of threads that start.
 const FIRST_TIME: u64 = 4 * MIB;
 
-/// Largest message.
+/// Largest message that a server receives.
 const MESSAGE_BYTES: usize = wildcity_protocol::limits::INBOUND_MESSAGE_BYTES;
 
 /// What a row allows.

@@ -27,14 +27,20 @@ async fn close_code(agent: &mut Agent) -> u16 {
     }
 }
 
-#[tokio::test]
-async fn pings_are_answered_while_a_request_runs() {
-    let server = TestServer::start().await;
+/// The driver of session "a", whose first step is drawn until the painter is no longer held.
+async fn held_step(server: &TestServer) -> Agent {
     let mut agent = server.driver("a").await;
     let begun = server.painter.begun.load(Ordering::SeqCst);
     server.painter.held.store(true, Ordering::SeqCst);
     agent.send(json!({ "type": "step", "pose": pose(1.0) })).await;
     server.painter.begins(begun + 1).await;
+    agent
+}
+
+#[tokio::test]
+async fn pings_are_answered_while_a_request_runs() {
+    let server = TestServer::start().await;
+    let mut agent = held_step(&server).await;
     for number in 0..5_u8 {
         agent.socket.send(Message::Ping(vec![number; 3].into())).await.unwrap();
         assert_eq!(frame(&mut agent).await, Some(Message::Pong(vec![number; 3].into())));
@@ -126,11 +132,7 @@ async fn a_close_frame_is_answered_with_its_code() {
 #[tokio::test]
 async fn a_close_frame_is_answered_while_a_request_runs() {
     let server = TestServer::start().await;
-    let mut agent = server.driver("a").await;
-    let begun = server.painter.begun.load(Ordering::SeqCst);
-    server.painter.held.store(true, Ordering::SeqCst);
-    agent.send(json!({ "type": "step", "pose": pose(1.0) })).await;
-    server.painter.begins(begun + 1).await;
+    let mut agent = held_step(&server).await;
     agent.socket.send(Message::Close(None)).await.unwrap();
     assert_eq!(frame(&mut agent).await, Some(Message::Close(None)));
     server.painter.held.store(false, Ordering::SeqCst);
@@ -191,11 +193,7 @@ async fn a_client_that_goes_away_during_an_answer_leaves_no_session() {
 #[tokio::test]
 async fn a_session_that_another_connection_waits_for_goes_on() {
     let server = TestServer::start().await;
-    let mut agent = server.driver("a").await;
-    let begun = server.painter.begun.load(Ordering::SeqCst);
-    server.painter.held.store(true, Ordering::SeqCst);
-    agent.send(json!({ "type": "step", "pose": pose(1.0) })).await;
-    server.painter.begins(begun + 1).await;
+    let mut agent = held_step(&server).await;
     let mut other = server.agent().await;
     other.send(json!({ "type": "resume", "session": "a", "last_seq": 1 })).await;
     // Its request arrives: a ping that follows it is answered while it waits.

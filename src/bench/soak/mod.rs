@@ -31,10 +31,11 @@ use wildcity::cli::exit::Exit;
 /// stretch of the first one again and again, and compares the hash of every image with that of its
 /// first round. Prints the memory of the process every minute, and how much of it are sections of
 /// twins and answers, which have limits of their own. The exit code is 1 if a request fails, a hash
-/// changes, more than one task in a thousand holds a thread that answers requests for more than
-/// 50 ms, or the rest of the memory grows by more than --growth. Growth is the largest median of a
-/// later sixth of the time, compared with that of the second sixth: in the first one caches fill.
-/// With --memory-gib below what the twin needs, the server evicts and loads all the time.
+/// changes, a task holds a thread that answers requests for more than 500 ms, or more than one task
+/// in a thousand for more than 50 ms, or the rest of the memory grows by more than --growth. Growth
+/// is the largest median of a later sixth of the time, compared with that of the second sixth: in
+/// the first one caches fill. With --memory-gib below what the twin needs, the server evicts and
+/// loads all the time.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Soak {

@@ -191,7 +191,7 @@ impl Extend<SolidPoint> for SolidSums {
 }
 
 impl SolidSums {
-    /// The solids.
+    /// The sums as solids, cell by cell.
     pub fn solids(self) -> Solids {
         let mut cubes: Vec<(CubeKey, CubeSum)> = self.cubes.into_iter().collect();
         cubes.sort_unstable_by_key(|(key, _)| *key);
