@@ -5,6 +5,8 @@
 //! As the renderer does, the sky is left out where less than 1/255 of it shows, which a loss of 8
 //! bits cannot see; a background of one colour is added everywhere.
 
+use rayon::prelude::*;
+
 use crate::loss::Real;
 
 /// What lies behind the Gaussians.
@@ -73,6 +75,13 @@ impl<T: Real> Background<'_, T> {
     }
 }
 
+/// Pixels of a part of an image. Sums of a part are added in the order of the parts, so that they
+/// are the same at any number of threads.
+const PART: usize = 1 << 12;
+
+/// Pixels whose products are summed in `T`: a million of them in f32 would lose three digits.
+const FEW: usize = 64;
+
 /// The image of a camera, `[height, width, 3]`.
 pub fn compose<T: Real>(
     rgb: &[T],
@@ -81,13 +90,20 @@ pub fn compose<T: Real>(
     exposure: &Exposure<T>,
 ) -> Vec<T> {
     let mut image = vec![T::zero(); rgb.len()];
-    for (pixel, to) in image.chunks_exact_mut(3).enumerate() {
-        let shows = T::one() - opacity[pixel];
-        let behind = background.rgb(pixel);
-        let before = std::array::from_fn(|c| rgb[3 * pixel + c] + shows * behind[c]);
-        to.copy_from_slice(&exposure.apply(before));
-    }
+    let parts = image.par_chunks_mut(3 * PART).zip(rgb.par_chunks(3 * PART)).enumerate();
+    parts.for_each(|(part, (image, rgb))| {
+        let pixels = image.as_chunks_mut().0.iter_mut().zip(rgb.as_chunks().0);
+        for (pixel, (to, rgb)) in (part * PART..).zip(pixels) {
+            let shows = T::one() - opacity[pixel];
+            *to = exposure.apply(before(rgb, shows, background.rgb(pixel)));
+        }
+    });
     image
+}
+
+/// A colour before the exposure.
+fn before<T: Real>(rgb: &[T; 3], shows: T, behind: [T; 3]) -> [T; 3] {
+    [0, 1, 2].map(|c| rgb[c] + shows * behind[c])
 }
 
 /// The derivatives of a loss by all that [`compose`] takes, given those by its image.
@@ -98,34 +114,59 @@ pub fn compose_gradient<T: Real>(
     exposure: &Exposure<T>,
     by_image: &[T],
 ) -> ComposedGradient<T> {
-    let mut gradient = ComposedGradient {
-        rgb: Vec::with_capacity(rgb.len()),
-        opacity: Vec::with_capacity(opacity.len()),
-        background: Vec::with_capacity(rgb.len()),
-        exposure: Exposure { matrix: [[T::zero(); 3]; 3], offset: [T::zero(); 3] },
-    };
-    // In f64: a million products in f32 would lose three digits.
-    let mut sums = [[0.0; 4]; 3];
-    for (pixel, by) in by_image.chunks_exact(3).enumerate() {
-        let shows = T::one() - opacity[pixel];
-        let behind = background.rgb(pixel);
-        let before: [T; 3] = std::array::from_fn(|c| rgb[3 * pixel + c] + shows * behind[c]);
-        for (row, &by) in by.iter().enumerate() {
-            for (to, value) in sums[row].iter_mut().zip([before[0], before[1], before[2], T::one()])
-            {
-                *to += by.to_double() * value.to_double();
+    let zeros = |of: &[T]| vec![T::zero(); of.len()];
+    let [mut by_rgb, mut by_background, mut by_opacity] = [rgb, rgb, opacity].map(zeros);
+    let parts = by_rgb
+        .par_chunks_mut(3 * PART)
+        .zip(by_background.par_chunks_mut(3 * PART))
+        .zip(by_opacity.par_chunks_mut(PART))
+        .enumerate();
+    let sums: Vec<[[f64; 4]; 3]> = parts
+        .map(|(part, ((by_rgb, by_background), by_opacity))| {
+            let mut sums = [[0.0; 4]; 3];
+            let few = by_rgb
+                .chunks_mut(3 * FEW)
+                .zip(by_background.chunks_mut(3 * FEW))
+                .zip(by_opacity.chunks_mut(FEW));
+            let first = (part * PART..).step_by(FEW);
+            for (first, ((by_rgb, by_background), by_opacity)) in first.zip(few) {
+                let range = 3 * first..3 * first + by_rgb.len();
+                let given =
+                    rgb[range.clone()].as_chunks().0.iter().zip(by_image[range].as_chunks().0);
+                let by = by_rgb.as_chunks_mut().0.iter_mut().zip(by_background.as_chunks_mut().0);
+                let mut few_sums = [[T::zero(); 4]; 3];
+                for (k, (given, (by_rgb, by_background))) in given.zip(by).enumerate() {
+                    let (rgb, by): (&[T; 3], &[T; 3]) = given;
+                    let shows = T::one() - opacity[first + k];
+                    let behind = background.rgb(first + k);
+                    let before = before(rgb, shows, behind);
+                    for (sums, &by) in few_sums.iter_mut().zip(by) {
+                        for (sum, before) in sums.iter_mut().zip(before) {
+                            *sum += by * before;
+                        }
+                        sums[3] += by;
+                    }
+                    let [r, g, b] = exposure.matrix;
+                    *by_rgb = [0, 1, 2].map(|c| r[c] * by[0] + g[c] * by[1] + b[c] * by[2]);
+                    *by_background = by_rgb.map(|by| shows * by);
+                    by_opacity[k] =
+                        -(by_rgb[0] * behind[0] + by_rgb[1] * behind[1] + by_rgb[2] * behind[2]);
+                }
+                for (sum, few) in sums.as_flattened_mut().iter_mut().zip(few_sums.as_flattened()) {
+                    *sum += few.to_double();
+                }
             }
-        }
-        let by_before: [T; 3] =
-            std::array::from_fn(|c| (0..3).map(|row| exposure.matrix[row][c] * by[row]).sum());
-        gradient.rgb.extend(by_before);
-        gradient.background.extend(by_before.map(|by| shows * by));
-        let by_opacity = by_before.iter().zip(behind).map(|(&by, behind)| by * behind).sum::<T>();
-        gradient.opacity.push(-by_opacity);
+            sums
+        })
+        .collect();
+    let sum = |row: usize, k: usize| T::from_f64(sums.iter().map(|sums| sums[row][k]).sum());
+    ComposedGradient {
+        rgb: by_rgb,
+        opacity: by_opacity,
+        background: by_background,
+        exposure: Exposure {
+            matrix: [0, 1, 2].map(|row| [0, 1, 2].map(|k| sum(row, k))),
+            offset: [0, 1, 2].map(|row| sum(row, 3)),
+        },
     }
-    for (row, [r, g, b, offset]) in sums.into_iter().enumerate() {
-        gradient.exposure.matrix[row] = [r, g, b].map(T::from_f64);
-        gradient.exposure.offset[row] = T::from_f64(offset);
-    }
-    gradient
 }
