@@ -606,7 +606,7 @@ fn block_index(mean_m: &[f64; 3], [y, x]: [i32; 2]) -> u8 {
 
 /// Morton code of a position: interleaves the bits of x, y, z in steps of 1/1024 of a cell, modulo
 /// 128 km.
-fn morton(mean_m: &[f64; 3]) -> u64 {
+pub fn morton(mean_m: &[f64; 3]) -> u64 {
     mean_m.iter().enumerate().fold(0, |code, (axis, &m)| {
         // Through i64, because a cast of a negative float to u64 gives 0. The mask takes the low 21
         // bits: positions repeat after 128 km, and negative ones come after positive ones.

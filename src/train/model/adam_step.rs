@@ -38,16 +38,18 @@ const DECAYS: [f32; 2] = [0.9, 0.999];
 const EPSILON: f32 = 1e-15;
 
 impl AdamStep {
-    /// Moves the visible Gaussians of a lane group.
+    /// Moves the visible Gaussians of a lane group, given the activated ones.
+    #[inline(always)]
     pub(super) fn apply(
         &self,
         values: &mut [Lanes],
+        activated: &[Lanes],
         moments: [&mut [Lanes]; 2],
         by: &[Lanes],
         visible: u16,
     ) {
         let [first, second] = moments;
-        let derivatives = self.raw(values, by);
+        let derivatives = self.raw(values, activated, by);
         let shown: [bool; LANES] = std::array::from_fn(|lane| visible >> lane & 1 == 1);
         for (column, Lanes(derivatives)) in derivatives.iter().enumerate().take(values.len()) {
             let rate = self.rates[column] / self.corrections[0];
@@ -69,22 +71,26 @@ impl AdamStep {
     }
 
     /// The derivatives by parameters before activation, with those of the regularisers.
-    fn raw(&self, values: &[Lanes], by: &[Lanes]) -> [Lanes; MAX_COLUMNS] {
+    #[inline(always)]
+    fn raw(&self, values: &[Lanes], activated: &[Lanes], by: &[Lanes]) -> [Lanes; MAX_COLUMNS] {
         let mut raw = [Lanes([0.0; LANES]); MAX_COLUMNS];
         raw[..by.len()].copy_from_slice(by);
-        for lane in 0..LANES {
-            let value = |column: usize| values[column].0[lane];
-            let square: f32 = (0..4).map(|k| value(column::QUAT + k).powi(2)).sum();
-            for lanes in &mut raw[column::QUAT..column::LOG2_OPACITY] {
-                lanes.0[lane] /= square.sqrt();
+        let lengths = quat_lengths(values);
+        for Lanes(by) in &mut raw[column::QUAT..column::LOG2_OPACITY] {
+            for (by, length) in by.iter_mut().zip(lengths) {
+                *by /= length;
             }
-            let opacity = sigmoid(value(LOGIT));
-            let [by_opacity, by_scale] = self.regularisers;
-            let by_log2 = raw[LOGIT].0[lane];
-            raw[LOGIT].0[lane] =
-                (1.0 - opacity) * (by_log2 * std::f32::consts::LOG2_E + by_opacity * opacity);
-            for k in 0..3 {
-                raw[LN_SCALE + k].0[lane] += by_scale * value(LN_SCALE + k).exp();
+        }
+        let [by_opacity, by_scale] = self.regularisers;
+        for (by, logit) in raw[LOGIT].0.iter_mut().zip(values[LOGIT].0) {
+            let opacity = sigmoid(logit);
+            let by_log2 = *by * std::f32::consts::LOG2_E;
+            *by = (1.0 - opacity) * (by_log2 + by_opacity * opacity);
+        }
+        for k in 0..3 {
+            let Lanes(scales) = activated[column::SCALE + k];
+            for (by, scale) in raw[LN_SCALE + k].0.iter_mut().zip(scales) {
+                *by += by_scale * scale;
             }
         }
         raw
@@ -93,6 +99,7 @@ impl AdamStep {
     /// Moves visible Gaussians that are nearly transparent at random, along their own shape, so
     /// that they find a place where they show something. (Its authors move all, visible or not.
     /// Those that no view shows any more become transparent by no derivative either, and stay.)
+    #[inline(always)]
     pub(super) fn add_noise(&self, values: &mut [Lanes], visible: u16, first_index: usize) {
         if self.noise == 0.0 {
             return;
@@ -117,16 +124,35 @@ impl AdamStep {
 }
 
 /// The first visible lane with a derivative that is not finite, or whose square is not.
+#[inline(always)]
 pub(super) fn not_finite(by: &[Lanes], visible: u16) -> Option<usize> {
-    let is_finite =
-        |lane: usize| by.iter().all(|lanes| (lanes.0[lane] * lanes.0[lane]).is_finite());
-    (0..LANES).find(|&lane| visible >> lane & 1 == 1 && !is_finite(lane))
+    let mut sums = [0.0; LANES];
+    for Lanes(by) in by {
+        for (sum, by) in sums.iter_mut().zip(by) {
+            // 0 for a finite number, and a NaN for every other.
+            *sum += by * by * 0.0;
+        }
+    }
+    (0..LANES).find(|&lane| visible >> lane & 1 == 1 && sums[lane] != 0.0)
+}
+
+/// The length of the quaternion of each lane.
+#[inline(always)]
+pub(super) fn quat_lengths(values: &[Lanes]) -> [f32; LANES] {
+    let mut squares = [0.0; LANES];
+    for Lanes(quats) in &values[column::QUAT..column::QUAT + 4] {
+        for (square, quat) in squares.iter_mut().zip(quats) {
+            *square += quat * quat;
+        }
+    }
+    squares.map(f32::sqrt)
 }
 
 /// Columns at the largest degree.
 const MAX_COLUMNS: usize = columns(sh::MAX_DEGREE);
 
 /// Three numbers of a normal distribution, by a seed and a Gaussian (Box and Muller 1958).
+#[inline(always)]
 fn normals(seed: u64, index: usize) -> Vec3 {
     let bits = |k: u64| mix(seed ^ mix(4 * index as u64 + k));
     let pair = |k: u64| {
@@ -140,6 +166,7 @@ fn normals(seed: u64, index: usize) -> Vec3 {
     Vec3::new(x, y, z)
 }
 
+#[inline(always)]
 pub(super) fn sigmoid(logit: f32) -> f32 {
     1.0 / (1.0 + (-logit).exp())
 }

@@ -11,18 +11,22 @@
 
 mod adam_step;
 mod saved;
+#[cfg(test)]
+mod tests;
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicUsize;
 use std::sync::atomic::Ordering::Relaxed;
 
+use fearless_simd::{Level, Simd, dispatch};
 use glam::{DVec3, Vec3};
+use rayon::prelude::*;
 use wildcity_render::gradient::ChunkGradients;
-use wildcity_scene::chunk::{CLUSTER, LANES, Lanes, column, columns};
+use wildcity_scene::chunk::{CLUSTER, LANES, Lanes, column, columns, morton};
 use wildcity_scene::{Chunk, Gaussians, LanePages, Scene, SemanticClass, sh};
 
 pub(crate) use adam_step::{AdamStep, rates};
-use adam_step::{LN_SCALE, LOGIT, not_finite, sigmoid};
+use adam_step::{LN_SCALE, LOGIT, not_finite, quat_lengths, sigmoid};
 use saved::Flat;
 pub(crate) use saved::{ModelState, SavedModel};
 
@@ -101,7 +105,7 @@ impl Model {
             model.set(i, column::SH, gaussians.sh_at(i));
         }
         model.is_ground = is_ground;
-        model.rebuild();
+        model.sort();
         model
     }
 
@@ -209,6 +213,8 @@ impl Model {
             .collect();
         // In place, unless a caller has kept a reference to the chunk: then this is a copy.
         let chunk = self.scene.chunks.first_mut().map(Arc::make_mut)?;
+        // All levels of instructions give the same numbers: none fuses a product with a sum.
+        let level = Level::new();
         chunk.rewrite(states, |state, lanes| {
             let mut changes = false;
             for group in 0..state.values.len() / width {
@@ -216,17 +222,28 @@ impl Model {
                     continue;
                 };
                 let first_index = (state.first_group + group) * LANES;
-                if let Some(lane) = not_finite(by, visible) {
-                    faulty.fetch_min(first_index + lane, Relaxed);
-                    continue;
-                }
-                changes = true;
                 let range = group * width..(group + 1) * width;
                 let values = &mut state.values[range.clone()];
                 let moments = [&mut state.first[range.clone()], &mut state.second[range.clone()]];
-                adam.apply(values, moments, by, visible);
-                adam.add_noise(values, visible, first_index);
-                activate(values, &mut lanes[range]);
+                let lanes = &mut lanes[range];
+                let moved = dispatch!(level, simd => simd.vectorize(
+                    #[inline(always)]
+                    || {
+                        if let Some(lane) = not_finite(by, visible) {
+                            return Err(first_index + lane);
+                        }
+                        adam.apply(values, lanes, moments, by, visible);
+                        adam.add_noise(values, visible, first_index);
+                        activate(values, lanes);
+                        Ok(())
+                    }
+                ));
+                match moved {
+                    Ok(()) => changes = true,
+                    Err(index) => {
+                        faulty.fetch_min(index, Relaxed);
+                    }
+                }
             }
             changes
         });
@@ -234,7 +251,7 @@ impl Model {
     }
 
     /// Takes some Gaussians anew: `to[k]` becomes a copy of `sources[k]`, new ones are appended,
-    /// and their moments are 0. Then the chunk is built anew.
+    /// and their moments are 0. Then all are sorted.
     pub(crate) fn copy(&mut self, sources: &[usize], to: &[usize]) {
         let width = columns(self.sh_degree);
         let most = to.iter().map(|&index| index + 1).max().unwrap_or(0);
@@ -251,6 +268,39 @@ impl Model {
                 classes[to] = classes[source];
             }
             self.forget(to);
+        }
+        self.sort();
+    }
+
+    /// Sorts the Gaussians by place and builds the chunk anew. Neighbours share clusters then, so
+    /// that a view passes over most clusters, and a step over the lane groups that it does not
+    /// show; copies at the end would make clusters as large as the scene.
+    fn sort(&mut self) {
+        let place = |index: usize| morton(&self.get(index, column::MEAN).map(f64::from));
+        let mut order: Vec<(u64, usize)> =
+            (0..self.count).into_par_iter().map(|index| (place(index), index)).collect();
+        // No two keys are equal, so that the order is the same at any number of threads.
+        order.par_sort_unstable();
+        let width = columns(self.sh_degree);
+        let sorted = |lanes: &[Lanes]| {
+            let mut to = vec![Lanes([0.0; LANES]); lanes.len()];
+            to.par_chunks_exact_mut(width).zip(order.par_chunks(LANES)).for_each(|(to, order)| {
+                for (lane, &(_, from)) in order.iter().enumerate() {
+                    let group = &lanes[from / LANES * width..][..width];
+                    for (to, from_lanes) in to.iter_mut().zip(group) {
+                        to.0[lane] = from_lanes.0[from % LANES];
+                    }
+                }
+            });
+            to
+        };
+        self.values = sorted(&self.values);
+        self.moments = self.moments.each_ref().map(|moments| sorted(moments));
+        if self.has_ground() {
+            self.is_ground = order.iter().map(|&(_, from)| self.is_ground[from]).collect();
+        }
+        if let Some(classes) = &mut self.classes {
+            *classes = order.iter().map(|&(_, from)| classes[from]).collect();
         }
         self.rebuild();
     }
@@ -333,6 +383,7 @@ impl Model {
 }
 
 /// Writes the activated values of a lane group.
+#[inline(always)]
 fn activate(values: &[Lanes], lanes: &mut [Lanes]) {
     lanes.copy_from_slice(values);
     for k in 0..3 {
@@ -340,14 +391,15 @@ fn activate(values: &[Lanes], lanes: &mut [Lanes]) {
             *value = value.exp();
         }
     }
-    for lane in 0..LANES {
-        let square: f32 = (0..4).map(|k| values[column::QUAT + k].0[lane].powi(2)).sum();
-        for k in 0..4 {
-            lanes[column::QUAT + k].0[lane] /= square.sqrt();
+    let lengths = quat_lengths(values);
+    for Lanes(quats) in &mut lanes[column::QUAT..column::QUAT + 4] {
+        for (quat, length) in quats.iter_mut().zip(lengths) {
+            *quat /= length;
         }
+    }
+    for (to, logit) in lanes[column::LOG2_OPACITY].0.iter_mut().zip(values[LOGIT].0) {
         // log2 of the sigmoid, without the loss of a small exponential.
-        let logit = values[LOGIT].0[lane];
         let ln = logit.min(0.0) - (-logit.abs()).exp().ln_1p();
-        lanes[column::LOG2_OPACITY].0[lane] = ln * std::f32::consts::LOG2_E;
+        *to = ln * std::f32::consts::LOG2_E;
     }
 }
