@@ -8,6 +8,7 @@
 //! | `images`, [`cache`] | its images, and those that are kept decoded |
 //! | [`held_out`] | the images that judge it |
 //! | [`history`], [`page`] | its curves, and all of it as a page |
+//! | [`compare`] | runs that differ in their settings |
 //! | [`blocks`] | a route in parts, each of which is a run |
 //! | [`start`] | from points to the Gaussians that it begins with |
 //! | [`trainer`] | a step: what one image teaches |
@@ -31,6 +32,7 @@ pub mod blocks;
 pub mod cache;
 pub mod check;
 pub mod checkpoint;
+pub mod compare;
 pub mod compose;
 mod error;
 mod exposures;

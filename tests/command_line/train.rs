@@ -117,6 +117,41 @@ fn a_run_that_is_stopped_goes_on_to_the_same_files() {
 }
 
 #[test]
+fn settings_are_compared_by_the_same_images() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    recorded(dir);
+    let fixed = ["train", "compare", "recorded/round_1", "--sky", "network", "--out", "compared"];
+    let settings = ["--held-out-every", "5", "--size", "1,0.5", "--steps", "60,20,20"];
+    let said = done(dir, &[&fixed[..], &settings, &["--cap", "1000"]].concat());
+    assert!(said.contains(" dB in ") && said.contains("wildcity train recorded/round_1"), "{said}");
+
+    #[derive(serde::Deserialize)]
+    struct Run {
+        size: f64,
+        steps: usize,
+        gaussians: usize,
+        seconds: f64,
+        held_out_db: f64,
+    }
+    let json = fs::read(dir.join("compared/compare.json")).unwrap();
+    let runs: Vec<Run> = serde_json::from_slice(&json).unwrap();
+    let settings: Vec<(f64, usize)> = runs.iter().map(|run| (run.size, run.steps)).collect();
+    assert_eq!(settings, [(0.5, 20), (0.5, 60), (1.0, 20), (1.0, 60)]);
+    assert!(runs.iter().all(|run| run.gaussians <= 1_000 && run.seconds > 0.0));
+    // More steps show more of the images.
+    assert!(runs[1].held_out_db > runs[0].held_out_db && runs[3].held_out_db > runs[2].held_out_db);
+    let page = fs::read_to_string(dir.join("compared/index.html")).unwrap();
+    let best = runs.iter().map(|run| run.held_out_db).fold(0.0, f64::max);
+    assert!(page.contains(&format!("{best:.2} dB in ")), "the page names the best run");
+    // Of one image: as recorded, and as each run shows it.
+    assert_eq!(page.matches("<img").count(), 5);
+
+    let error = refused(dir, &[&fixed[..], &["--held-out-every", "0"]].concat());
+    assert!(error.contains("give --held-out-every"), "{error}");
+}
+
+#[test]
 fn a_worn_twin_gets_better_by_its_recorded_images() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();

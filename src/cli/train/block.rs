@@ -21,7 +21,7 @@ use super::block_parts::Parts;
 use super::checkpoints::{self, Checkpoints};
 use super::images::ChosenImages;
 use super::options::{fraction, keep_cameras, read_settings};
-use super::progress::train;
+use super::progress::{evaluate_every, train};
 use super::recorded::{RecordedImages, Recording};
 use super::start;
 use crate::cli::backend_options::HardwareOptions;
@@ -256,7 +256,8 @@ impl Block {
         };
         let resumed_at = trainer.steps_done();
         let before = held_out_db(&trainer, images, backend)?;
-        let after = train(&mut trainer, images, backend, &mut |line, trainer| {
+        let every = evaluate_every(&trainer);
+        let after = train(&mut trainer, images, backend, every, &mut |line, trainer| {
             let is_time = line.step.is_multiple_of(checkpoints::EVERY);
             match &checkpoints {
                 Some(checkpoints) if is_time => checkpoints.write(trainer),

@@ -5,6 +5,7 @@ mod block;
 mod block_parts;
 mod check;
 mod checkpoints;
+mod compare;
 mod depths;
 mod images;
 mod lines;
@@ -54,6 +55,7 @@ Examples:
 
 subcommands! { TrainCommand;
     Plan(Box<plan::Plan>),
+    Compare(Box<compare::Compare>),
     Block(Box<block::Block>),
     Augment(Box<augment::Augment>),
     Refine(Box<refine::Refine>),

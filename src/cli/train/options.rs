@@ -23,6 +23,28 @@ use crate::cli::output;
 /// On what a run trains, and how.
 #[derive(Debug, clap::Args)]
 pub(super) struct RunOptions {
+    #[command(flatten)]
+    pub(super) source: SourceOptions,
+
+    /// Steps, each on one image. Learning rates and growth are scaled to this number.
+    /// [default: that of --settings, or 7000]
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
+    steps: Option<u32>,
+
+    /// Most Gaussians at any time; of more points some are chosen [default: that of --settings, or
+    /// 1000000]
+    #[arg(long, value_name = "COUNT", value_parser = clap::value_parser!(u32).range(1..))]
+    cap: Option<u32>,
+
+    /// Train on images of this fraction of their width, from 0.05 to 1: a quarter of the pixels at
+    /// 0.5 take a quarter of the time.
+    #[arg(long, value_name = "FRACTION", default_value_t = 1.0, value_parser = fraction)]
+    pub(super) size: f64,
+}
+
+/// On what runs train, whatever their length and the size of their images.
+#[derive(Debug, clap::Args)]
+pub(super) struct SourceOptions {
     /// The images and their cameras: a log (docs/logs.md), a COLMAP model (its folder, or one with
     /// sparse/0), a transforms.json, or its folder. Of a log, the poses of the rig, the sky and the
     /// ground are trained, too; points and depths are those of its LiDAR, and what moves is left
@@ -41,21 +63,6 @@ pub(super) struct RunOptions {
 
     #[command(flatten)]
     start: StartOptions,
-
-    /// Steps, each on one image. Learning rates and growth are scaled to this number.
-    /// [default: that of --settings, or 7000]
-    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
-    steps: Option<u32>,
-
-    /// Most Gaussians at any time; of more points some are chosen [default: that of --settings, or
-    /// 1000000]
-    #[arg(long, value_name = "COUNT", value_parser = clap::value_parser!(u32).range(1..))]
-    cap: Option<u32>,
-
-    /// Train on images of this fraction of their width, from 0.05 to 1: a quarter of the pixels at
-    /// 0.5 take a quarter of the time.
-    #[arg(long, value_name = "FRACTION", default_value_t = 1.0, value_parser = fraction)]
-    pub(super) size: f64,
 
     /// Hold out one image of N, in the order of their names: the scene is not trained on it but
     /// judged by it. 0 holds out none. Of a log that marks images as held out, it holds out these.
@@ -116,25 +123,38 @@ impl OpenedImages {
 }
 
 impl RunOptions {
+    /// Reads all that the run begins with but the images themselves.
+    pub(super) fn open(&self) -> anyhow::Result<Inputs> {
+        let mut settings = self.source.settings()?;
+        settings.steps = self.steps.map_or(settings.steps, |steps| steps as usize);
+        settings.growth.cap = self.cap.map_or(settings.growth.cap, |cap| cap as usize);
+        self.source.open(settings, self.size)
+    }
+}
+
+impl SourceOptions {
     /// The log or list of images.
-    pub(super) fn source(&self) -> anyhow::Result<&Path> {
+    pub(super) fn path(&self) -> anyhow::Result<&Path> {
         // clap requires it.
         self.source.as_deref().context("give SOURCE: a log, a COLMAP model or a transforms.json")
     }
 
-    /// Reads all that a run begins with but the images themselves.
-    pub(super) fn open(&self) -> anyhow::Result<Inputs> {
-        let source = self.source()?;
-        let settings = self.settings()?;
+    /// Reads all that a run on images of a fraction of their width begins with.
+    ///
+    /// # Errors
+    /// A setting is out of its range, or a file cannot be read.
+    pub(super) fn open(&self, settings: Settings, size: f64) -> anyhow::Result<Inputs> {
+        settings.check()?;
+        let source = self.path()?;
         if Log::is_log(source) {
-            return self.open_log(source, settings);
+            return self.open_log(source, settings, size);
         }
         let list = ImageList::read(source, self.image_dir.as_deref(), self.masks.as_deref())?;
         for warning in &list.warnings {
             writeln!(io::stderr(), "warning: {warning}")?;
         }
         let (mut start, profile) = self.start.read(source, &settings)?;
-        let mut images = ListedImages::new(self.size, self.held_out_every);
+        let mut images = ListedImages::new(size, self.held_out_every);
         images.add(&list, &Alignment::IDENTITY)?;
         start.world_from_camera = images.poses();
         let inputs = images.inputs();
@@ -142,13 +162,13 @@ impl RunOptions {
     }
 
     /// A log has poses of a rig, and points and depths of a LiDAR.
-    fn open_log(&self, source: &Path, settings: Settings) -> anyhow::Result<Inputs> {
+    fn open_log(&self, source: &Path, settings: Settings, size: f64) -> anyhow::Result<Inputs> {
         ensure!(
             self.image_dir.is_none() && self.masks.is_none(),
             "{} is a log, whose tables name the files: leave --image-dir and --masks out",
             source.display()
         );
-        let images = LogImages::new(Log::open(source)?, self.size, self.held_out_every)?;
+        let images = LogImages::new(Log::open(source)?, size, self.held_out_every)?;
         if images.left_out > 0 {
             let left_out = output::counted(images.left_out, "image");
             writeln!(io::stderr(), "{left_out} left out: there is no pose at the time")?;
@@ -159,16 +179,14 @@ impl RunOptions {
         Ok(Inputs { images, inputs, start, profile, settings })
     }
 
-    fn settings(&self) -> anyhow::Result<Settings> {
+    /// The settings of `--settings` with those of the options. They are not checked yet.
+    pub(super) fn settings(&self) -> anyhow::Result<Settings> {
         let mut settings = match &self.settings {
             None => Settings::default(),
             Some(path) => read_settings(path)?,
         };
-        settings.steps = self.steps.map_or(settings.steps, |steps| steps as usize);
-        settings.growth.cap = self.cap.map_or(settings.growth.cap, |cap| cap as usize);
         settings.seed = self.seed.unwrap_or(settings.seed);
         settings.sky.mode = self.sky.unwrap_or(settings.sky.mode);
-        settings.check()?;
         Ok(settings)
     }
 }

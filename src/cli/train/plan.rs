@@ -70,7 +70,7 @@ impl Plan {
             Blocks::new(&cells(&points_m), &path_m, self.blocks.into()).context("--blocks")?;
         let begin = start.gaussians.len();
         let end = settings.counts(begin).last().unwrap_or(begin);
-        let backend = &*self.run.hardware.training()?;
+        let backend = &*self.run.source.hardware.training()?;
         let mut trainer = Trainer::new(start, profile, settings.clone())?;
         let measured = Measured::new(&mut trainer, images, backend)?;
 

@@ -11,8 +11,13 @@ use super::checkpoints::StopsAtSignal;
 use super::lines::log;
 use crate::cli::progress;
 
-/// How often the images that are held out are looked at.
+/// How often the images that are held out are looked at in a run.
 pub(super) const EVALUATIONS: usize = 10;
+
+/// Steps from one look at the images that are held out to the next.
+pub(super) fn evaluate_every(trainer: &Trainer) -> usize {
+    (trainer.settings().steps / EVALUATIONS).max(1)
+}
 
 /// Held-out images on the page of a run.
 pub(super) const PICTURES: usize = 6;
@@ -20,16 +25,16 @@ pub(super) const PICTURES: usize = 6;
 /// Decoded images are kept up to this size: 1,800 of 360 x 232 px with depths.
 pub(super) const CACHE_BYTES: usize = 1 << 30;
 
-/// Goes on to the last step, or until the process is asked to stop. `each` is called after each
-/// step. Returns the PSNR of the images that are held out, when it was measured last, and the
+/// Goes on to the last step, or until the process is asked to stop. The images that are held out
+/// are looked at every `evaluate_every` steps, and `each` is called after each step. Returns the PSNR of the images that are held out, when it was measured last, and the
 /// seconds until then.
 pub(super) fn train(
     trainer: &mut Trainer,
     images: &dyn TrainingImages,
     backend: &dyn Differentiate,
+    evaluate_every: usize,
     each: &mut dyn FnMut(&Line, &Trainer) -> anyhow::Result<()>,
 ) -> anyhow::Result<Option<(f64, f64)>> {
-    let every = (trainer.settings().steps / EVALUATIONS).max(1);
     let signal = StopsAtSignal::new()?;
     let bar = progress::count("training");
     bar.set_length(trainer.settings().steps as u64);
@@ -43,14 +48,14 @@ pub(super) fn train(
         }
         let mut said = Ok(());
         // A log has no bar.
-        if line.step.is_multiple_of(every) && !io::stderr().is_terminal() {
+        if line.step.is_multiple_of(evaluate_every) && !io::stderr().is_terminal() {
             said = log(line).map_err(anyhow::Error::from);
         }
         failed = said.and_then(|()| each(line, trainer)).err();
         failed.is_none() && !signal.stops()
     };
     let images = CachedImages::new(images, CACHE_BYTES);
-    run(trainer, &images, backend, every, &mut on_step)?;
+    run(trainer, &images, backend, evaluate_every, &mut on_step)?;
     bar.finish_and_clear();
     failed.map_or(Ok(last), Err)
 }

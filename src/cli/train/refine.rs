@@ -21,7 +21,7 @@ use wildcity_twin::store::{Catalog, Version};
 
 use super::images::{ListedImages, WithAugmented};
 use super::options::{fraction, keep_cameras, read_settings};
-use super::progress::{PICTURES, train};
+use super::progress::{PICTURES, evaluate_every, train};
 use super::recorded::{RecordedImages, Recording};
 use crate::cli::backend_options::HardwareOptions;
 use crate::cli::directories::{EditedTwin, Twins};
@@ -190,7 +190,8 @@ impl Refine {
         let mut trainer = Trainer::new(start, profile, settings)?;
         let before = held_out_db(&trainer, images, backend)?;
         let before_off = judged(judges, &trainer, backend)?;
-        let after = train(&mut trainer, images, backend, &mut |_, _| Ok(()))?;
+        let every = evaluate_every(&trainer);
+        let after = train(&mut trainer, images, backend, every, &mut |_, _| Ok(()))?;
         let steps = trainer.settings().steps;
         let done = trainer.steps_done();
         ensure!(done == steps, "stopped after {done} of {steps} steps: the twin is as it was");

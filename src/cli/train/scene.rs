@@ -17,7 +17,7 @@ use super::checkpoints::{self, Checkpoints};
 use super::lines::LinesFile;
 use super::log_images::LogImages;
 use super::options::{Inputs, OpenedImages, RunOptions};
-use super::progress::{PICTURES, train};
+use super::progress::{PICTURES, evaluate_every, train};
 use super::result::Written;
 use super::start;
 use crate::cli;
@@ -59,7 +59,7 @@ pub(super) struct TrainScene {
 
 impl TrainScene {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let source = self.run.source()?;
+        let source = self.run.source.path()?;
         // clap requires it.
         let out = self.out.as_deref().context("give --out FILE.ply")?;
         check_out(out)?;
@@ -80,7 +80,7 @@ impl TrainScene {
     fn train(&self, out: &Path, inputs: Inputs) -> anyhow::Result<(Trained, OpenedImages)> {
         let Inputs { images: opened, inputs, start, profile, settings } = inputs;
         let images = opened.images();
-        let backend = &*self.run.hardware.training()?;
+        let backend = &*self.run.source.hardware.training()?;
         writeln!(
             io::stderr(),
             "{}, {} of them held out, {}, backend {}",
@@ -100,7 +100,8 @@ impl TrainScene {
         let done = trainer.steps_done();
         let open = |path: &PathBuf| LinesFile::open(path, done);
         let mut lines = self.lines.as_ref().map(open).transpose()?;
-        let last = train(&mut trainer, images, backend, &mut |line, trainer| {
+        let every = evaluate_every(&trainer);
+        let last = train(&mut trainer, images, backend, every, &mut |line, trainer| {
             lines.as_mut().map_or(Ok(()), |lines| lines.write(line))?;
             let is_time = line.step.is_multiple_of(checkpoints::EVERY);
             if is_time { checkpoints.write(trainer) } else { Ok(()) }

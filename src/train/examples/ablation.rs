@@ -11,6 +11,7 @@
 
 mod demo_street;
 
+use std::collections::BTreeMap;
 use std::error::Error;
 use std::sync::Arc;
 use std::time::Instant;
@@ -74,13 +75,14 @@ fn main() -> Result<(), Box<dyn Error>> {
 
     println!(
         "{steps} steps at 360 x 232, {} images, {} points\n\
-         {:20} {:>8} {:>9} {:>9} {:>10} {:>9} {:>7}",
+         {:20} {:>8} {:>9} {:>9} {:>9} {:>10} {:>9} {:>7}",
         recording.images.len(),
         points.len(),
         "",
         "PSNR dB",
         "depth m",
         "road mm",
+        "rough mm",
         "poses mm",
         "deg",
         "s"
@@ -99,11 +101,12 @@ fn main() -> Result<(), Box<dyn Error>> {
         let began = Instant::now();
         let (trainer, db) = train(&cpu, &recording, &points, settings)?;
         let seconds = began.elapsed().as_secs_f64();
-        let Judged { depth_m, road_m, position_m, angle_deg } =
+        let Judged { depth_m, road_m, rough_m, position_m, angle_deg } =
             Judged::new(&cpu, &trainer, &recording, &true_rig)?;
         println!(
-            "{name:20} {db:>8.2} {depth_m:>9.3} {:>9.1} {:>10.1} {angle_deg:>9.3} {seconds:>7.0}",
+            "{name:20} {db:>8.2} {depth_m:>9.3} {:>9.1} {:>9.1} {:>10.1} {angle_deg:>9.3} {seconds:>7.0}",
             1e3 * road_m,
+            1e3 * rough_m,
             1e3 * position_m,
         );
     }
@@ -145,6 +148,8 @@ struct Judged {
     depth_m: f64,
     /// Mean difference of heights to the truth, of the road.
     road_m: f64,
+    /// Standard deviation of these differences in a square of 1 m, the mean of all squares.
+    rough_m: f64,
     /// Means over all views, without what is common to all.
     position_m: f64,
     angle_deg: f64,
@@ -160,6 +165,7 @@ impl Judged {
         let scene = trainer.scene()?;
         let mut depth = Mean::default();
         let mut road = Mean::default();
+        let mut squares: BTreeMap<[i64; 2], Vec<f64>> = BTreeMap::new();
         let mut views = Vec::new();
         for (index, image) in recording.images.iter().enumerate() {
             let place = image.place;
@@ -178,16 +184,26 @@ impl Judged {
                     continue;
                 }
                 depth.add(f64::from(ours_m - theirs_m).abs());
-                let point = |depth_m: f32| up.transform_point(at(&image.view, pixel, depth_m));
-                let [ours, theirs] = [ours_m, theirs_m].map(point);
+                let [ours, theirs] = [ours_m, theirs_m].map(|m| at(&image.view, pixel, m));
+                let square = theirs.truncate().floor().to_array().map(|m| m as i64);
+                let [ours, theirs] = [ours, theirs].map(|point| up.transform_point(point));
                 // Within 15 m and 20 cm of the plane of the wheels.
                 if theirs.z.abs() < 0.2 && theirs.truncate().length() < 15.0 {
                     road.add((ours.z - theirs.z).abs());
+                    squares.entry(square).or_default().push(ours.z - theirs.z);
                 }
             }
         }
         let [position_m, angle_deg] = errors(&views);
-        Ok(Self { depth_m: depth.value(), road_m: road.value(), position_m, angle_deg })
+        let mut rough = Mean::default();
+        for heights_m in squares.values() {
+            let count = heights_m.len() as f64;
+            let mean_m = heights_m.iter().sum::<f64>() / count;
+            let variance = heights_m.iter().map(|m| (m - mean_m).powi(2)).sum::<f64>() / count;
+            rough.add(variance.sqrt());
+        }
+        let [depth_m, road_m, rough_m] = [depth, road, rough].map(|mean| mean.value());
+        Ok(Self { depth_m, road_m, rough_m, position_m, angle_deg })
     }
 }
 

@@ -9,10 +9,10 @@ use crate::history::{CurvePoint, History};
 
 const SIZE_PX: (u32, u32) = (1_100, 300);
 
-const LABEL: (&str, i32) = ("sans-serif", 13);
+pub(super) const LABEL: (&str, i32) = ("sans-serif", 13);
 
 /// Colours that also differ in lightness (Okabe and Ito 2008).
-const COLORS: [RGBColor; CURVES] = [
+pub(super) const COLORS: [RGBColor; CURVES] = [
     RGBColor(0, 114, 178),
     RGBColor(213, 94, 0),
     RGBColor(0, 158, 115),

@@ -1,5 +1,6 @@
-//! A run as one HTML page that loads nothing else: pictures are data URLs.
+//! A run, or several, as one HTML page that loads nothing else: pictures are data URLs.
 
+mod comparison;
 mod curves;
 mod error;
 mod pictures;
@@ -12,6 +13,7 @@ use crate::history::Evaluation;
 use crate::poses::PoseMoves;
 use crate::settings::PoseMode;
 use crate::trainer::Trainer;
+pub use comparison::{Comparison, comparison_page, verdict as compared};
 pub use error::PageError;
 
 const STYLE: &str = "\
@@ -46,6 +48,30 @@ pub fn page(contents: &Contents<'_>) -> Result<String, PageError> {
     let history = trainer.history();
     let pictures = held_out.iter().map(beside).collect::<Result<Vec<_>, PageError>>()?;
     let settings = toml::to_string_pretty(trainer.settings())?;
+    let body = html! {
+        p.verdict { (verdict(contents)) }
+        @if !pictures.is_empty() {
+            h2 { "Images that were held out" }
+            p {
+                "From the one with the lowest PSNR to the one with the highest: as recorded, as the scene shows it, the depth of \
+                 the scene (red is near, blue is " (pictures::FAR_M) " m away), and the normals of this depth."
+            }
+            @for picture in &pictures { (picture) }
+        }
+        h2 { "Curves" }
+        @if !history.evaluations.is_empty() { (PreEscaped(curves::psnr(history)?)) }
+        (PreEscaped(curves::losses(history)?))
+        (PreEscaped(curves::gaussians(history)?))
+        @if let Some(moves) = trainer.moves() { (poses(&moves, cameras, trainer.settings().poses.mode != PoseMode::Image)) }
+        h2 { "Settings" }
+        p { "As a file for " code { "--settings" } ":" }
+        pre { (settings) }
+    };
+    Ok(document(&title, &body))
+}
+
+/// A whole page.
+fn document(title: &str, body: &Markup) -> String {
     let markup = html! {
         (DOCTYPE)
         html lang="en" {
@@ -57,27 +83,11 @@ pub fn page(contents: &Contents<'_>) -> Result<String, PageError> {
             }
             body {
                 h1 { (title) }
-                p.verdict { (verdict(contents)) }
-                @if !pictures.is_empty() {
-                    h2 { "Images that were held out" }
-                    p {
-                        "From the one with the lowest PSNR to the one with the highest: as recorded, as the scene shows it, the depth of \
-                         the scene (red is near, blue is " (pictures::FAR_M) " m away), and the normals of this depth."
-                    }
-                    @for picture in &pictures { (picture) }
-                }
-                h2 { "Curves" }
-                @if !history.evaluations.is_empty() { (PreEscaped(curves::psnr(history)?)) }
-                (PreEscaped(curves::losses(history)?))
-                (PreEscaped(curves::gaussians(history)?))
-                @if let Some(moves) = trainer.moves() { (poses(&moves, cameras, trainer.settings().poses.mode != PoseMode::Image)) }
-                h2 { "Settings" }
-                p { "As a file for " code { "--settings" } ":" }
-                pre { (settings) }
+                (body)
             }
         }
     };
-    Ok(markup.into_string() + "\n")
+    markup.into_string() + "\n"
 }
 
 fn verdict(contents: &Contents<'_>) -> String {
@@ -97,25 +107,30 @@ fn verdict(contents: &Contents<'_>) -> String {
 }
 
 fn beside(image: &HeldOut) -> Result<Markup, PageError> {
-    let HeldOut { name, size_px: [width, height], recorded, drawn, psnr_db, .. } = image;
+    let HeldOut { name, recorded, drawn, psnr_db, .. } = image;
     let of_depth = pictures::depth(&image.depth_m);
     let of_normals = pictures::normals(&image.normals);
     let all =
         [("recorded", recorded), ("drawn", drawn), ("depth", &of_depth), ("normals", &of_normals)];
-    let figure = |(what, rgb8): (&str, &Vec<u8>)| {
-        let jpeg = pictures::jpeg(image.size_px, rgb8)?;
-        let address = format!("data:image/jpeg;base64,{}", BASE64.encode(&jpeg));
-        Ok(html! {
-            figure {
-                img src=(address) width=(width) height=(height) alt=(format!("{name}, {what}"));
-                figcaption { (what) }
-            }
-        })
-    };
-    let figures = all.map(figure).into_iter().collect::<Result<Vec<_>, PageError>>()?;
+    let figures: Result<Vec<Markup>, PageError> =
+        all.into_iter().map(|(what, rgb8)| figure(what, image.size_px, rgb8)).collect();
+    let figures = figures?;
     Ok(html! {
         p { b { (format!("{psnr_db:.2} dB")) } ", " (name) }
         div.pictures { @for figure in &figures { (figure) } }
+    })
+}
+
+/// A picture with its caption.
+fn figure(caption: &str, size_px: [u32; 2], rgb8: &[u8]) -> Result<Markup, PageError> {
+    let address =
+        format!("data:image/jpeg;base64,{}", BASE64.encode(&pictures::jpeg(size_px, rgb8)?));
+    let [width, height] = size_px;
+    Ok(html! {
+        figure {
+            img src=(address) width=(width) height=(height) alt=(caption);
+            figcaption { (caption) }
+        }
     })
 }
 
