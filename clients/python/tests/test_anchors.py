@@ -1,8 +1,8 @@
 """Other projects' own code on episodes that `wildcity episode run` drives, compared with the scores in their results.
 
 $WILDCITY_ANCHORS is a folder with checkouts of `Bench2Drive`, `alpasim`, `navsim` and `nuplan-devkit` at the commits
-that the scores' names have. A check whose checkout is missing, or whose packages are not installed, is listed as NOT
-RUN. What the anchors are given is computed here, from the poses of the records.
+that the scores' names have, and of `gsplat`. A check whose checkout is missing, or whose packages are not installed, is
+listed as NOT RUN. What the anchors are given is computed here, from the poses of the records.
 """
 
 from __future__ import annotations
@@ -259,3 +259,36 @@ def test_scene_scores_are_those_of_alpasim(driven: list[Driven]) -> None:
         assert abs(score["value"] - expected) < 1e-12, episode.name
         found[episode.name] = expected
     assert {0.0, 1.0} <= set(found.values()) and len(set(found.values())) > 2, found
+
+
+def test_gsplat_reads_the_ply_of_a_trained_scene(tmp_path: Path) -> None:
+    (folder,) = checkout("gsplat")
+    exporter = module("exporter", folder / "gsplat")
+
+    def wildcity(*arguments: str) -> None:
+        command = [os.environ["WILDCITY_BIN"], *arguments]
+        environment = {**os.environ, "XDG_DATA_HOME": str(tmp_path)}
+        subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+
+    wildcity("twin", "generate", "--twin", "lane", "--length-km", "0.1", "--density", "1")
+    wildcity("train", "augment", "lane", "--every", "25m", "--side", "160", "--cameras", "front", "--out", "views")
+    wildcity("train", "views/round_1", "--steps", "20", "--out", "scene.ply")
+    header, _, body = (tmp_path / "scene.ply").read_bytes().partition(b"end_header\n")
+    names = [line.split()[2].decode() for line in header.splitlines() if line.startswith(b"property float ")]
+    values = np.frombuffer(body, "<f4").reshape(-1, len(names))
+    assert len(values) > 1_000
+
+    def columns(prefix: str) -> np.ndarray:
+        numbers = [name for name in names if name.startswith(prefix)]
+        return values[:, [names.index(f"{prefix}{k}") for k in range(len(numbers))]]
+
+    splats = {name: tensor.numpy() for name, tensor in exporter.load_ply_to_splats(str(tmp_path / "scene.ply")).items()}
+    assert np.array_equal(splats["means"], values[:, [names.index(axis) for axis in "xyz"]])
+    assert np.array_equal(splats["scales"], columns("scale_"))
+    assert np.array_equal(splats["quats"], columns("rot_"))
+    assert np.array_equal(splats["opacities"], values[:, names.index("opacity")])
+    assert np.array_equal(splats["sh0"][:, 0], columns("f_dc_"))
+    # The file has all coefficients of red, then of green, then of blue.
+    rest = columns("f_rest_").reshape(len(values), 3, -1)
+    assert rest.shape[2] == 3
+    assert np.array_equal(splats["shN"], rest.swapaxes(1, 2))
