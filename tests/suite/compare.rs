@@ -241,7 +241,7 @@ fn scores_are_held_against_their_tolerance_in_their_direction() {
     );
     let lost = compare(&before, &made(&[80.0], &[]), &[]);
     assert_eq!((lost.scores[DRIVING].pairs, lost.scores[DRIVING].only_before), (1, 3));
-    assert!(lost.to_text().contains("3 pairs have it before alone"), "{}", lost.to_text());
+    assert!(lost.to_text().contains("pairs that have it before alone: 3"), "{}", lost.to_text());
     // Missing values in both runs do not count as equal.
     let gone = compare(&before, &made(&[], &[]), &[]);
     assert_eq!((gone.scores[DRIVING].difference, gone.scores[DRIVING].pairs), (None, 0));

@@ -115,7 +115,7 @@ pub(super) fn notes(score: &ScoreChange) -> String {
     }
     for (count, when) in [(score.only_before, "before"), (score.only_after, "now")] {
         if count > 0 {
-            notes.push(format!("{count} pairs have it {when} alone"));
+            notes.push(format!("pairs that have it {when} alone: {count}"));
         }
     }
     notes.join("; ")
