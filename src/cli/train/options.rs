@@ -122,6 +122,15 @@ impl RunOptions {
         self.source.as_deref().context("give SOURCE: a log, a COLMAP model or a transforms.json")
     }
 
+    /// What says how many steps a run makes, if it is not --steps: for the line of `train plan`.
+    pub(super) fn steps_origin(&self) -> &'static str {
+        match (self.steps, &self.settings) {
+            (Some(_), _) => "",
+            (None, Some(_)) => " (--settings; --steps changes it)",
+            (None, None) => " (the default; --steps changes it)",
+        }
+    }
+
     /// Reads all that a run begins with but the images themselves.
     pub(super) fn open(&self) -> anyhow::Result<Inputs> {
         let source = self.source()?;
