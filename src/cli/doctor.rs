@@ -148,8 +148,8 @@ fn twins_found(twins: &Twins) -> Vec<Finding> {
     match listed {
         Ok((list, actors)) => {
             let text = format!(
-                "{} twins in {}, listed in {} ms",
-                list.twins.len(),
+                "{} in {}, listed in {} ms",
+                output::counted(list.twins.len(), "twin"),
                 dir.display(),
                 begun.elapsed().as_millis()
             );

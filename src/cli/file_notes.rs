@@ -31,6 +31,9 @@ pub(super) fn print(file: &Path, notes: &FileNotes) -> io::Result<()> {
     print_warnings(file, &notes.warnings)?;
     let mut out = io::stderr().lock();
     let file = file.display();
+    for assumed in &notes.assumed {
+        writeln!(out, "note: {file}: {assumed}")?;
+    }
     if notes.dropped > 0 {
         let count = notes.dropped as usize;
         writeln!(

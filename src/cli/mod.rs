@@ -17,6 +17,7 @@ mod actor;
 mod alpasim;
 pub mod backend_options;
 mod browser;
+mod caption;
 mod completions;
 mod demo;
 mod dev;

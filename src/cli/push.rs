@@ -275,6 +275,9 @@ fn print_report(out: &mut impl Write, report: &PushReport) -> io::Result<()> {
         for warning in &file.warnings {
             writeln!(io::stderr(), "warning: {}: {warning}", file.name)?;
         }
+        for assumed in &file.assumed {
+            writeln!(out, "note        {}: {assumed}", file.name)?;
+        }
         let unnamed = file.bad - file.first_bad.len() as u64;
         if unnamed > 0 {
             writeln!(out, "bad         and {unnamed} more")?;

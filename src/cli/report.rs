@@ -1,5 +1,6 @@
 //! `wildcity report`.
 
+use std::cell::OnceCell;
 use std::fs;
 use std::io::{self, ErrorKind, Write};
 use std::path::{Path, PathBuf};
@@ -140,15 +141,6 @@ enum Measurable {
     Gpu,
 }
 
-impl From<Measurable> for BackendName {
-    fn from(measurable: Measurable) -> Self {
-        match measurable {
-            Measurable::Cpu => Self::Cpu,
-            Measurable::Gpu => Self::Gpu,
-        }
-    }
-}
-
 fn at_least_db(text: &str) -> Result<Goal, String> {
     match text.parse() {
         Ok(db) if (0.0..=1000.0).contains(&db) => Ok(Goal::AtLeastDb(db)),
@@ -226,7 +218,8 @@ impl Command {
     }
 
     fn measure(&self) -> anyhow::Result<Report> {
-        let Backends { present, absent } = self.open_backends()?;
+        let devices = Devices { hardware: &self.hardware, first: OnceCell::new() };
+        let Backends { present, absent } = self.open_backends(&devices)?;
         let cache = Cache::new(self.twins.catalog()?);
         let resident = cache.open(&self.twin.name, self.twin.number)?;
         let truth = self.truth.as_ref().map(|TwinVersion { name, number }| {
@@ -241,12 +234,14 @@ impl Command {
             models: self.repair.models()?,
             truth: truth.transpose()?,
         };
+        let is_wanted = self.backends.contains(&Measurable::Gpu);
+        let open_device = || if is_wanted { devices.open().ok() } else { None };
         let machine = Machine {
             backends: present,
             absent,
             cpu: self.hardware.cpu()?,
-            open_device: &|| self.open_device(),
-            stress: self.stress_candidates()?,
+            open_device: &open_device,
+            stress: self.stress_candidates(&devices)?,
         };
         let settings = Settings {
             sampling: Sampling { stations: self.stations, window_px: [self.window; 2] },
@@ -271,11 +266,11 @@ impl Command {
     }
 
     /// Opens the backends of `--backend`; at least one must be there.
-    fn open_backends(&self) -> anyhow::Result<Backends> {
+    fn open_backends(&self, devices: &Devices<'_>) -> anyhow::Result<Backends> {
         let mut present = Vec::new();
         let mut absent = Vec::new();
         for name in &self.backends {
-            match candidate((*name).into(), &self.hardware)? {
+            match self.candidate(*name, devices)? {
                 Ok(backend) => present.push(backend),
                 Err((name, why)) => absent.push(Skipped::new(format!("backend {name}"), why)),
             }
@@ -297,20 +292,40 @@ impl Command {
         named.or_else(own).or_else(default).context("the default rig preset is missing")
     }
 
-    /// A device that has rendered nothing yet, if `--backend` names gpu and there is one.
-    fn open_device(&self) -> Option<Gpu> {
-        let is_wanted = self.backends.contains(&Measurable::Gpu);
-        if is_wanted { self.hardware.gpu().ok() } else { None }
-    }
-
     /// Backends of the stress table: the reference, and every backend of the report.
-    fn stress_candidates(&self) -> anyhow::Result<Vec<Candidate>> {
+    fn stress_candidates(&self, devices: &Devices<'_>) -> anyhow::Result<Vec<Candidate>> {
         if self.no_stress {
             return Ok(Vec::new());
         }
-        let names = self.backends.iter().map(|name| BackendName::from(*name));
-        let all = [BackendName::Reference].into_iter().chain(names);
-        all.map(|name| candidate(name, &self.hardware)).collect()
+        let reference = candidate(BackendName::Reference, &self.hardware);
+        let others = self.backends.iter().map(|name| self.candidate(*name, devices));
+        [reference].into_iter().chain(others).collect()
+    }
+
+    /// A backend, or why this machine does not have it.
+    fn candidate(&self, name: Measurable, devices: &Devices<'_>) -> anyhow::Result<Candidate> {
+        match name {
+            Measurable::Cpu => candidate(BackendName::Cpu, &self.hardware),
+            Measurable::Gpu => Ok(match devices.open() {
+                Ok(gpu) => Ok(Box::new(gpu)),
+                Err(reason) => Err(("gpu", reason)),
+            }),
+        }
+    }
+}
+
+/// Devices that have rendered nothing yet. They are looked for once: each time a driver may print a
+/// warning.
+struct Devices<'a> {
+    hardware: &'a HardwareOptions,
+    first: OnceCell<Result<Gpu, String>>,
+}
+
+impl Devices<'_> {
+    fn open(&self) -> Result<Gpu, String> {
+        let find = || self.hardware.gpu().map_err(|error| error.to_string());
+        let first = self.first.get_or_init(find).as_ref().map_err(String::clone)?;
+        first.another().map_err(|error| error.to_string())
     }
 }
 

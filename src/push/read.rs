@@ -218,6 +218,7 @@ impl<'a> Reader<'a> {
                     first_bad: bad.first.clone(),
                     dropped: 0,
                     warnings: Vec::new(),
+                    assumed: Vec::new(),
                 });
                 self.push.set_report(report.clone());
                 return Err(PushError::Content {
@@ -264,6 +265,7 @@ impl<'a> Reader<'a> {
                 first_bad: Vec::new(),
                 dropped: notes.dropped,
                 warnings: notes.warnings,
+                assumed: notes.assumed,
             });
             let total = scene.report.gaussians;
             // Before the copy, so that the memory of one scene too many is never reserved.
@@ -341,6 +343,7 @@ mod tests {
             first_bad: Vec::new(),
             dropped: 0,
             warnings: Vec::new(),
+            assumed: Vec::new(),
         };
         let says = |blur_px2: Option<f64>, said_by: &str| {
             Some(Antialiasing { blur_px2, said_by: said_by.to_owned() })

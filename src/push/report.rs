@@ -60,6 +60,8 @@ pub struct FileReport {
     pub dropped: u64,
     /// What of the file was not read, or is drawn in another way than it says.
     pub warnings: Vec<String>,
+    /// What was taken where nothing was given.
+    pub assumed: Vec<String>,
 }
 
 /// Smallest and largest values of the numbers of some Gaussians.

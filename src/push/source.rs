@@ -118,6 +118,7 @@ impl SourceAxes {
         let of_file = notes.axes.as_ref();
         let other = |axes: &Axes| of_file.filter(|of_file| !axes.has_same_rotation(&of_file.axes));
         let is_assumed = of_file.is_some_and(|of_file| of_file.is_assumed);
+        let mut assumed = None;
         let (used, warning) = match (&self.axes, of_file, &default.axes) {
             // Programs that do not keep to a specification are why the option exists.
             (Some((axes, text)), ..) => {
@@ -137,10 +138,15 @@ impl SourceAxes {
                 let also = other(axes).map_or(String::new(), |of_file| {
                     format!("; {} says {}", of_file.said_by, of_file.axes.option_text())
                 });
-                let is_told = !axes.has_same_rotation(&Axes::IDENTITY) || !also.is_empty();
-                let warning = is_told.then(|| {
-                    format!("no axes are given: those of the twin, {text}, are used{also}")
-                });
+                let says = format!("no axes are given: those of the twin, {text}, are used{also}");
+                let warning = if also.is_empty() {
+                    // Nothing contradicts them, so that they are as expected.
+                    let is_told = !axes.has_same_rotation(&Axes::IDENTITY);
+                    assumed = is_told.then_some(says);
+                    None
+                } else {
+                    Some(says)
+                };
                 ((*axes, text.clone()), warning)
             }
             (None, Some(FileAxes { axes, said_by, .. }), None) => {
@@ -154,6 +160,7 @@ impl SourceAxes {
             (None, None, None) => ((Axes::IDENTITY, "identity".to_owned()), None),
         };
         notes.warnings.extend(warning);
+        notes.assumed.extend(assumed);
         if self.axes.is_none() {
             notes.warnings.append(&mut notes.axes_hints);
         }
@@ -165,7 +172,7 @@ impl SourceAxes {
         // No scene file gives its unit here, so there are only two sources.
         let inherited = default.metres_per_unit.filter(|_| self.metres_per_unit.is_none());
         if let Some(scale) = inherited.filter(|scale| *scale != 1.0) {
-            notes.warnings.push(format!("no scale is given: that of the twin, {scale}, is used"));
+            notes.assumed.push(format!("no scale is given: that of the twin, {scale}, is used"));
         }
         self.metres_per_unit.or(inherited).unwrap_or(1.0)
     }

@@ -18,10 +18,10 @@ const STYLE: &str = "\
 body{font:15px/1.45 system-ui,sans-serif;max-width:1160px;margin:2em auto;padding:0 1em;color:#111}
 h1{font-size:1.6em}h2{margin-top:2em;font-size:1.2em}
 table{border-collapse:collapse;font-size:13px;display:block;overflow-x:auto}td,th{padding:2px 8px;border-bottom:1px solid #ddd;text-align:right}
-td:first-child,th:first-child,td.text{text-align:left;vertical-align:top}.cases th{text-align:left}tr.dominated td{color:#999}
-tr.front td:first-child{font-weight:600}.miss{color:#b00020;font-weight:600}.off{color:#999}
+td:first-child,th:first-child,td.text{text-align:left;vertical-align:top}.cases th{text-align:left}tr.dominated td{color:#6b6b6b}
+tr.front td:first-child{font-weight:600}.miss{color:#b00020;font-weight:600}.off{color:#6b6b6b}
 figure{display:inline-block;margin:0 12px 14px 0}figcaption{font-size:12px}
-img{image-rendering:pixelated;margin-right:3px}.view{width:272px}.view img{image-rendering:auto;width:272px}svg{max-width:100%;height:auto}.wide{overflow-x:auto}
+img{image-rendering:pixelated;margin-right:3px}figure:not(.view) img{width:104px;height:auto}.view{width:272px}.view img{image-rendering:auto;width:272px}svg{max-width:100%;height:auto}.wide{overflow-x:auto}@media(max-width:760px){.wide svg{max-width:none;width:760px}}
 .key span{display:inline-block;padding:1px 8px;font-size:12px}
 .verdict{font-size:1.25em;padding:.6em .8em;border-left:6px solid;background:#f6f6f6;overflow-wrap:anywhere}";
 
@@ -51,7 +51,7 @@ pub fn render(report: &Report) -> Result<String, ReportError> {
                 (introduction(report))
                 h2 { "Error against time" }
                 (error_against_time_caption())
-                (PreEscaped(plot))
+                div.wide { (PreEscaped(plot)) }
                 (settings_table(&report.settings))
                 (not_compared(report))
                 (by_offset)
@@ -87,7 +87,7 @@ fn introduction(report: &Report) -> Markup {
         }
         p {
             b { "Times. " }
-            "A time is the median over whole steps of " (subject.cameras) " cameras, with "
+            "A time is the median over whole steps (cameras: " (subject.cameras) "), with "
             (subject.repeat) " steps at each sample point on the drive (at all sample points, for a \
              twin without a drive). It covers rendering; only settings that change the encoding \
              include encoding. Each step was timed in turn with a step of the twin as it is served \
@@ -222,7 +222,7 @@ fn by_offset(all: &[Measurement]) -> Result<Markup, ReportError> {
             "Each line is one setting, compared with the f64 reference at the same poses. Levels of \
              detail, record formats, and combinations are shown."
         }
-        (PreEscaped(plot))
+        div.wide { (PreEscaped(plot)) }
     })
 }
 
@@ -240,7 +240,7 @@ fn confidence(report: &Report) -> Result<Markup, ReportError> {
              images at one distance; the area reaches from the lowest to the highest. The images are \
              the rig's first camera at the middle station."
         }
-        (PreEscaped(plot))
+        div.wide { (PreEscaped(plot)) }
         @for confidence in &report.confidence {
             figure.view {
                 img alt="" src=(data_url("image/jpeg", &confidence.image.jpeg));

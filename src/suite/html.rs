@@ -9,7 +9,7 @@ const STYLE: &str = "\
 body{font:15px/1.45 system-ui,sans-serif;max-width:1160px;margin:2em auto;padding:0 1em;color:#111}
 h1{font-size:1.6em}h2{margin-top:2em;font-size:1.2em}
 table{border-collapse:collapse;font-size:13px;display:block;overflow-x:auto}td,th{padding:2px 8px;border-bottom:1px solid #ddd;text-align:left;vertical-align:top}
-pre{margin:0;white-space:pre-wrap;overflow-wrap:anywhere}
+td.text{min-width:13em}pre{margin:0;white-space:pre-wrap;overflow-wrap:anywhere}
 .passed,.better{color:#00703c}.failed,.worse{color:#b00020;font-weight:600}.technical{color:#b05a00}
 .off_model,.not_judged,.unknown,.changed{color:#777}
 figure{margin:0 0 1.5em 0}figure img{width:min(100%,760px);height:auto}svg{border:1px solid #eee;margin-right:6px;max-width:100%;height:auto}
@@ -34,6 +34,12 @@ pub(crate) fn document(title: &str, body: &Markup) -> String {
         }
     };
     markup.into_string() + "\n"
+}
+
+/// A sentence with its first letter in upper case.
+pub(crate) fn capitalized(text: &str) -> String {
+    let mut letters = text.chars();
+    letters.next().map_or(String::new(), |first| first.to_uppercase().chain(letters).collect())
 }
 
 /// A share of 1 in percent.

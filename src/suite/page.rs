@@ -82,7 +82,7 @@ fn unjudged(result: &SuiteResult) -> Markup {
                     tr {
                         td { (episode.name) }
                         td class=(episode.status.name()) { (episode.status.name()) }
-                        td { (why(episode)) }
+                        td.text { (why(episode)) }
                     }
                 }
             }
@@ -198,7 +198,7 @@ fn table(result: &SuiteResult) -> Markup {
                     td { (episode.name) }
                     td { (episode.seed) }
                     td class=(episode.status.name()) { (episode.status.name()) }
-                    td { (why(episode)) }
+                    td.text { (why(episode)) }
                     td { (episode.steps) }
                     td { (format!("{:.1}", episode.distance_m)) }
                     td {

@@ -145,6 +145,10 @@ fn a_capture_becomes_a_street_that_can_be_driven() {
     };
     let [above, below] = [mean(0), mean(picture.height() / 2)];
     assert!(above > 1e6 && below > 1e6, "{above} {below}");
+    // Each of the four pictures has a caption in its left upper corner, on this ground.
+    for [x, y] in [[0, 0], [726, 0], [0, 446], [726, 446]] {
+        assert_eq!(picture.get_pixel(x, y).0, [16, 20, 24], "{x} {y}");
+    }
     let catalog = Catalog::open(&at.join("wildcity/twins")).unwrap();
     assert_eq!(catalog.latest("street").unwrap(), 1);
     let said = done(at, &[&align[..], &["--apply"]].concat());

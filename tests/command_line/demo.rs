@@ -118,7 +118,7 @@ fn a_damaged_demo_twin_is_built_again() {
         assert_eq!(output.status.code(), Some(1), "{output:?}");
         String::from_utf8(output.stderr).unwrap()
     };
-    assert!(built().said.contains("building the demo twin in "));
+    assert!(built().said.contains("building the twin demo in "));
     copy_demo_twin(&dir.path().join("twins"));
     let catalog = Catalog::open(&dir.path().join("twins")).unwrap();
     assert!(!drive().contains("building"), "built once");

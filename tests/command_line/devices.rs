@@ -1,5 +1,7 @@
 //! Devices by name and number, and the errors where there is none.
 
+use wildcity_render::automatic::self_test;
+use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_render::gpu::{AdapterChoice, Gpu, GpuError, devices};
 
 use crate::gpu::{gpu, gpu_on};
@@ -32,6 +34,16 @@ fn software_is_not_taken_for_hardware() {
             assert_eq!((error, has_hardware), (GpuError::NoAdapter, false));
         }
     }
+}
+
+#[test]
+fn another_device_of_an_adapter_outlives_the_first() {
+    let first = gpu();
+    let name = first.usage().unwrap().name;
+    let another = first.another().unwrap();
+    drop(first);
+    assert_eq!(another.usage().unwrap().name, name);
+    self_test(&another, &Cpu::new(0, Simd::Best).unwrap()).unwrap();
 }
 
 /// `--device` requires the gpu backend: another backend is never used silently.

@@ -66,6 +66,7 @@ fn a_new_version_has_the_axes_and_the_scale_of_the_last() {
     let second = latest();
     let told = with(&[]);
     assert!(told.contains("those of the twin, y-down-z-forward, are used"), "{told}");
+    assert!(told.contains("note: ") && !told.contains("warning: "), "{told}");
     assert!(told.contains("that of the twin, 0.5, is used"), "{told}");
     assert_eq!(latest().manifest.chunks, second.manifest.chunks);
     assert_eq!(latest().manifest.provenance.options, second.manifest.provenance.options);

@@ -146,10 +146,10 @@ async fn only_a_session_that_asks_loads_the_library_and_its_record_is_repaired_a
         text
     };
     let text = replay(&repair);
-    assert!(text.contains("zero-dce 1 on cpu, 1 images"), "{text}");
-    assert!(text.contains("1 images, repaired again and compared"), "{text}");
+    assert!(text.contains("zero-dce 1 on cpu, 1 image\n"), "{text}");
+    assert!(text.contains("1 image, repaired again and compared"), "{text}");
     let text = replay(&[]);
-    assert!(text.contains("1 images, compared as rendered only"), "{text}");
+    assert!(text.contains("1 image, compared as rendered only"), "{text}");
 }
 
 #[test]

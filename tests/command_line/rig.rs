@@ -53,6 +53,7 @@ fn the_surround_rig_looks_all_around() {
         let line = shown.lines().find(|line| line.split_whitespace().nth(1) == Some(name));
         line.unwrap().split_whitespace().rev().nth(1).unwrap().parse::<f64>().unwrap()
     };
+    assert!(!shown.contains(" -0.0"), "{shown}");
     for (name, yaw_deg) in [("front", 0.0), ("front_left", 55.0), ("back_right", -110.0)] {
         assert!((yaw_of(name) - yaw_deg).abs() < 0.06, "{name}: {shown}");
     }

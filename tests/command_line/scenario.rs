@@ -56,8 +56,8 @@ fn a_scenario_is_checked_and_shown_with_its_map() {
         "--out",
         "test.map.json",
     ];
-    assert!(done(&[&strips[..], &twins].concat(), at).contains("1 lanes"));
-    assert!(done(&["twin", "map", "check", "test.map.json"], at).contains("1 lanes, 1 areas"));
+    assert!(done(&[&strips[..], &twins].concat(), at).contains("1 lane\n"));
+    assert!(done(&["twin", "map", "check", "test.map.json"], at).contains("1 lane, 1 area, "));
     fs::write(at.join("two.json"), scenario().to_string()).unwrap();
     let checked = done(&[&["scenario", "check", "two.json"][..], &twins].concat(), at);
     assert!(checked.contains("6 episodes in test@1, 2 actors"), "{checked}");
@@ -204,8 +204,8 @@ fn files_of_others_become_maps_and_scenarios() {
     let collection = json!({"type": "FeatureCollection", "features": [area]});
     fs::write(at.join("a.geojson"), collection.to_string()).unwrap();
     let import = ["twin", "map", "import", "a.geojson", "--out", "a.map.json"];
-    assert!(done(&import, at).contains("0 lanes, 1 areas"));
-    assert!(done(&["twin", "map", "check", "a.map.json"], at).contains("1 areas"));
+    assert!(done(&import, at).contains("0 lanes, 1 area\n"));
+    assert!(done(&["twin", "map", "check", "a.map.json"], at).contains(", 1 area, "));
     fs::write(at.join("a.geojson"), collection.to_string().replace("drivable", "lava")).unwrap();
     let error = refused(&import, at);
     assert!(

@@ -112,7 +112,7 @@ fn two_runs_are_compared_with_an_exit_code() {
     let comparison: Value = serde_json::from_str(&bench.out("c.json")).unwrap();
     assert_eq!((&comparison["worse"], &comparison["counts"]["worse"]), (&json!(true), &json!(2)));
     let page = bench.out("c.html");
-    assert!(page.contains("worse than before: 2 episodes"));
+    assert!(page.contains("Worse than before: 2 episodes"));
     // Without the twins, the page says why it has no pictures.
     assert_eq!(page.matches("No picture: there is no twin").count(), 4, "{page}");
     let twins = ["--twins", bench.twins.path().to_str().unwrap()];

@@ -183,6 +183,12 @@ fn a_worn_twin_gets_better_by_its_recorded_images() {
     assert_eq!(last.manifest.rig, first.manifest.rig);
     let options = &last.manifest.provenance.options;
     assert!(options.iter().any(|option| option == "refine=40 steps, round_2"), "{options:?}");
+    let log = done(dir, &["twin", "log", "worn", "--twins", "twins"]);
+    let last = log.lines().last().unwrap();
+    assert!(
+        last.contains("training of 2 ") && last.ends_with("  refine=40 steps, round_2"),
+        "{log}"
+    );
 
     let refine = ["train", "refine", "worn", "--twins", "twins"];
     let error = refused(dir, &[&refine[..], &images, &["--augmented", "nowhere"]].concat());
@@ -212,6 +218,12 @@ fn a_log_becomes_a_twin() {
     {
         assert!(said.lines().any(|said| said.starts_with(line)), "{said}");
     }
+    assert!(said.contains(": 40 steps of "), "{said}");
+    let by_default = done(dir, &["train", "plan", "log"]);
+    assert!(
+        by_default.contains(": 7000 steps (the default; --steps changes it) of "),
+        "{by_default}"
+    );
     let train = ["train", "log", "--out", "lane.ply", "--steps", "40", "--cap", "40000"];
     let twin = ["--twin", "again", "--twins", "twins"];
     let said = done(dir, &[&train[..], &twin].concat());

@@ -113,7 +113,7 @@ async fn a_run_of_a_worse_driver_is_worse_and_the_other_way_round_better() {
     let runs = [run(&before, "log"), run(&stand, "stand")];
     let page = worse.to_page(&runs, &ComparedPictures::new());
     assert_eq!(page.matches("class=\"worse\">worse<").count(), 4, "{page}");
-    assert!(page.contains("class=\"verdict worse\">worse than before: 4 episodes"), "{page}");
+    assert!(page.contains("class=\"verdict worse\">Worse than before: 4 episodes"), "{page}");
     // Each pair from above and its speed, before and now.
     assert_eq!(page.matches("<svg").count(), 4 * 2 * 2, "{page}");
     assert_eq!((page.matches("<b>before</b>").count(), page.matches("<b>now</b>").count()), (4, 4));
@@ -241,7 +241,7 @@ fn scores_are_held_against_their_tolerance_in_their_direction() {
     );
     let lost = compare(&before, &made(&[80.0], &[]), &[]);
     assert_eq!((lost.scores[DRIVING].pairs, lost.scores[DRIVING].only_before), (1, 3));
-    assert!(lost.to_text().contains("3 pairs have it before alone"), "{}", lost.to_text());
+    assert!(lost.to_text().contains("pairs that have it before alone: 3"), "{}", lost.to_text());
     // Missing values in both runs do not count as equal.
     let gone = compare(&before, &made(&[], &[]), &[]);
     assert_eq!((gone.scores[DRIVING].difference, gone.scores[DRIVING].pairs), (None, 0));
@@ -270,7 +270,10 @@ fn what_is_not_the_same_episode_is_not_compared() {
     let text = found.to_text();
     assert!(text.contains("the twin's version was aaaaaaaa before and is bbbbbbbb now"), "{text}");
     assert!(text.contains("the scenario was 00000000 before and is cccccccc now"), "{text}");
-    assert!(text.contains("2 pairs are not compared: their twin or scenario differs"), "{text}");
+    assert!(
+        text.contains("pairs that are not compared, because their twin or scenario differs: 2"),
+        "{text}"
+    );
 
     let error = |before: &SuiteResult, after: Value, tolerances: &[&str]| {
         let found = Comparison::new(before, &result(after), &rule(tolerances));

@@ -20,8 +20,13 @@ def main(photos: Path, out: Path) -> None:
     if database.exists():
         raise SystemExit(f"{database} is there: remove it, or give another folder")
     out.mkdir(parents=True, exist_ok=True)
+    # COLMAP writes a line for each image and each pair.
+    pycolmap.logging.minloglevel = 1
+    print("features", flush=True)
     pycolmap.extract_features(database, photos, camera_mode=pycolmap.CameraMode.SINGLE)
+    print("matches", flush=True)
     pycolmap.match_sequential(database)
+    print("cameras", flush=True)
     models = pycolmap.incremental_mapping(database, photos, out / "sparse")
     count = sum(1 for photo in photos.iterdir() if photo.is_file())
     if not models:

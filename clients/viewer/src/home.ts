@@ -132,7 +132,7 @@ export class HomePage implements Page {
       const actions = [el("a.action", { href: drive }, "Drive"), link("fly", "Free camera"), ...(role === "drive" ? [] : [link("place", "Place a drive")])];
       const name = el("a.name", { href: drive }, twin.name);
       const row = el("tr", {}, el("td", {}, name), el("td.number", {}, `v${twin.version}`),
-        el("td.number", {}, count(twin.gaussians)), el("td.drives", {}, recorded || "no recorded drive"), el("td.actions", {}, ...actions));
+        el("td.number.count", {}, count(twin.gaussians)), el("td.drives", {}, recorded || "no recorded drive"), el("td.actions", {}, ...actions));
       return [row, el("tr.shown", {}, el("td", { colSpan: 5 }, this.thumbnails.of(twin)))];
     });
     const broken = damaged.map(({ name, reason }) => el("p.bad", {}, `${name} is damaged: ${reason}`));
@@ -171,6 +171,7 @@ export class HomePage implements Page {
         el("td", {}, one.twin), el("td.number", {}, `${fixed(one.time_us * 1e-6, 1)} s`), el("td.drives", {}, result), el("td.number.dim", {}, when));
     });
     const table = rows.length ? el("table", {}, el("tbody", {}, ...rows)) : el("p.dim", {}, "None yet.");
-    this.episodes.replaceChildren(el("h2", {}, "Recorded episodes ", compare), table);
+    const hint = rows.length > 1 ? [el("p.dim", {}, "Open one, or choose two to see them side by side.")] : [];
+    this.episodes.replaceChildren(el("h2", {}, "Recorded episodes ", compare), table, ...hint);
   }
 }

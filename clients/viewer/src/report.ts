@@ -21,6 +21,8 @@ export class ReportPage implements Page {
   private readonly setting = el("select", { ariaLabel: "setting" });
   private readonly places = el("ol.events");
   private readonly window = el("div.windows");
+  /** Nothing is there before a report is opened. */
+  private readonly beside = el("div.beside", { hidden: true }, this.map.element, this.places);
   private report: Report | undefined;
   private windows = new Map<string, WorstWindow>();
   /** Where each place is; undefined where the server does not have the twin's drive. */
@@ -38,9 +40,9 @@ export class ReportPage implements Page {
     });
     this.setting.addEventListener("change", () => this.show());
     const chooser = el("div.adder", {}, el("label", {}, "Open report.json and report.html", input), this.setting,
-      el("span.dim", {}, "of wildcity report, or drop them here"));
+      el("span.dim", {}, "or drop them here: `wildcity report TWIN` writes them"));
     this.setting.hidden = true;
-    this.element = el("div.report", {}, chooser, this.window, el("div.beside", {}, this.map.element, this.places));
+    this.element = el("div.report", {}, chooser, this.window, this.beside);
     this.element.addEventListener("dragover", (event) => event.preventDefault());
     this.element.addEventListener("drop", (event) => {
       event.preventDefault();
@@ -64,7 +66,7 @@ export class ReportPage implements Page {
       if (this.ended) return;
       showTitle(el("b", {}, report.twin), ` v${report.version} · report`);
       this.setting.replaceChildren(...report.settings.map(({ name }) => el("option", { value: name }, name)));
-      this.setting.hidden = false;
+      this.setting.hidden = this.beside.hidden = false;
       this.show();
     } catch (error) {
       if (!this.ended) showStatus(messageOf(error), "bad");

@@ -1,4 +1,4 @@
-// Two small pictures of each twin on the first page: ahead from the start of its drive, and from above with its drives and
+// Two pictures of each twin on the first page: ahead from the start of its drive, and from above with its drives and
 // the lanes of its scenarios, of which one can be chosen.
 
 import { camera, isTooWide, over, picture } from "./aerial";
@@ -11,8 +11,8 @@ import type { Pose, Vector } from "./pose";
 import { get } from "./server";
 import { viewerSession } from "./session";
 
-const WIDTH = 240;
-const HEIGHT = 150;
+const WIDTH = 480;
+const HEIGHT = 300;
 const EYE_M = 1.65;
 /** Points of a drive that are drawn: more than there are pixels. */
 const POINTS = 300;
@@ -112,8 +112,8 @@ export class Thumbnails {
       show = (rings) => {
         canvas.getContext("2d")!.drawImage(bare, 0, 0);
         canvas.dataset.lanes = String(rings.length);
-        for (const ring of rings) draw(canvas, pose, [...ring, ring[0]!], "#fff", 1);
-        for (const drive of drives) draw(canvas, pose, drive, colour("accent"), 2);
+        for (const ring of rings) draw(canvas, pose, [...ring, ring[0]!], "#fff", 1.5);
+        for (const drive of drives) draw(canvas, pose, drive, colour("accent"), 3);
       };
       show(all);
       elements.push(canvas);

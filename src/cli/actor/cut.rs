@@ -120,15 +120,15 @@ impl Cut {
         let file = TracksFile::parse(&bytes).with_context(context)?;
         let places = swept(&file).with_context(context)?;
         let places: Vec<CutPlace> = places.into_iter().map(|(place, _)| place).collect();
-        let option = format!("cut={} tracks at {} places", file.tracks.len(), places.len());
+        let tracks = output::counted(file.tracks.len(), "track");
+        let option = format!("cut={tracks} at {}", output::counted(places.len(), "place"));
         let cut = catalog.cut_all(base, &places, option)?;
         writeln!(
             output::stdout(),
-            "twin {} version {}: without {} Gaussians that {} tracks swept\nblake3 {}",
+            "twin {} version {}: without {} Gaussians that {tracks} swept\nblake3 {}",
             self.twin.name,
             cut.version.number,
             cut.gaussians.len(),
-            file.tracks.len(),
             cut.version.hash,
         )?;
         Ok(())

@@ -3,6 +3,8 @@
 
 use std::fmt;
 
+use crate::cli::output;
+
 /// An asset, in two lines.
 pub(super) struct Summary<'a> {
     pub(super) name: &'a str,
@@ -23,7 +25,8 @@ impl fmt::Display for Summary<'_> {
         let megabytes = *bytes as f64 / 1e6;
         write!(f, "actor {name}: {class}, ")?;
         write!(f, "{length_m:.2} m long, {width_m:.2} m wide, {height_m:.2} m high; ")?;
-        write!(f, "{gaussians} Gaussians of SH degree {sh_degree} in {levels} levels of detail, ")?;
+        let levels = output::counted(*levels, "level");
+        write!(f, "{gaussians} Gaussians of SH degree {sh_degree} in {levels} of detail, ")?;
         write!(f, "{megabytes:.1} MB\nblake3 {hash}")
     }
 }

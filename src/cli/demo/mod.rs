@@ -1,6 +1,5 @@
 //! `wildcity demo`.
 
-mod caption;
 mod driver;
 mod mosaic;
 #[cfg(feature = "eval")]
@@ -372,7 +371,7 @@ fn demo_twin(
         Existing::Usable(version) => return Ok(*version),
         Existing::Rebuild(reason) => reason,
     };
-    writeln!(io::stderr(), "building the demo twin in {} ({reason})", twins.display())?;
+    writeln!(io::stderr(), "building the twin {name} in {} ({reason})", twins.display())?;
     let mut street = wildcity_generate::street(&settings)?;
     if let Some(amount) = spoil {
         let spoil = Spoil::new(amount, settings.seed, &street.trajectory)?;

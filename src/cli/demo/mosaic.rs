@@ -12,8 +12,7 @@ use image::{Rgb, RgbImage};
 use wildcity_client::{ImageView, Observation};
 use wildcity_scene::geometry::Pose;
 
-use super::caption;
-use crate::cli::output;
+use crate::cli::{caption, output};
 
 /// Cameras that look farther to the side than this, in radians, are in the second row.
 const FRONT_RAD: f64 = 1.2;

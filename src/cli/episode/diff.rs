@@ -48,7 +48,7 @@ impl Diff {
             return Err(Exit::finding(1, text).into());
         }
         let steps = a.driven().last().map_or(0, |frame| frame.step);
-        writeln!(output::stdout(), "alike       {steps} steps")?;
+        writeln!(output::stdout(), "alike       {}", output::counted(steps as usize, "step"))?;
         Ok(())
     }
 }

@@ -76,7 +76,10 @@ impl Prune {
             eprintln!("{} was not removed: {error}", path.display());
         }
         if failed > 0 {
-            return Err(exit(ExitCode::Driving, format!("{failed} records were not removed")));
+            return Err(exit(
+                ExitCode::Driving,
+                format!("not removed: {}", output::counted(failed, "record")),
+            ));
         }
         Ok(())
     }

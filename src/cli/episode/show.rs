@@ -40,9 +40,9 @@ impl Show {
         match &episode.end {
             Some(end) => writeln!(
                 out,
-                "end         {} after {} steps, {:.1} s, {:.1} m",
+                "end         {} after {}, {:.1} s, {:.1} m",
                 end.outcome,
-                end.steps,
+                output::counted(end.steps as usize, "step"),
                 end.time_us as f64 * 1e-6,
                 end.distance_m
             )?,

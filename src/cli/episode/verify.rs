@@ -14,8 +14,9 @@ use wildcity_twin::residency::Cache;
 use crate::cli::backend_options::BackendOptions;
 use crate::cli::directories::{Episodes, Twins};
 use crate::cli::exit::{self, Exit};
+use crate::cli::output::{self, counted};
+use crate::cli::progress;
 use crate::cli::repair_options::RepairOptions;
-use crate::cli::{output, progress};
 
 use super::folder::record_file;
 
@@ -100,16 +101,19 @@ impl Verify {
             anyhow::bail!("differs at {difference}");
         }
         let sweeps = with_sweeps(report.sweeps as usize);
-        writeln!(out, "verified    {} images{sweeps}, all as recorded", report.images)?;
+        let images = counted(report.images as usize, "image");
+        writeln!(out, "verified    {images}{sweeps}, all as recorded")?;
         let RepairedImages { compared, not_compared } = report.repaired;
         if compared > 0 {
-            writeln!(out, "repaired    {compared} images, repaired again and compared")?;
+            let compared = counted(compared as usize, "image");
+            writeln!(out, "repaired    {compared}, repaired again and compared")?;
         }
         if not_compared > 0 {
+            let images = counted(not_compared as usize, "image");
             let model = header.repair.as_ref().map_or("", |repair| &repair.model);
             writeln!(
                 out,
-                "repaired    {not_compared} images, compared as rendered only: give the model {model} with --repair"
+                "repaired    {images}, compared as rendered only: give the model {model} with --repair"
             )?;
         }
         if let Some(wrong) = &report.wrong_value {
@@ -143,18 +147,25 @@ fn summary(out: &mut impl Write, recording: &RecordedEpisode) -> io::Result<()> 
     if let Some(repair) = &header.repair {
         let count = frames.iter().flat_map(|frame| &frame.repairs).flatten().count();
         let RecordedRepair { model, version, provider, .. } = repair;
-        writeln!(out, "repair      {model} {version} on {provider}, {count} images")?;
+        let images = counted(count, "image");
+        writeln!(out, "repair      {model} {version} on {provider}, {images}")?;
     }
-    writeln!(out, "frames      {} with {images} images{sweeps}", frames.len())?;
+    let images = counted(images, "image");
+    writeln!(out, "frames      {} with {images}{sweeps}", frames.len())?;
     for (before, version) in versions {
-        writeln!(out, "switched    to version {} after {before} frames", version.version)?;
+        writeln!(
+            out,
+            "switched    to version {} after {}",
+            version.version,
+            counted(*before, "frame")
+        )?;
     }
     match end {
         Some(end) => writeln!(
             out,
-            "end         {:?} after {} steps, {:.1} s, {:.1} m",
+            "end         {:?} after {}, {:.1} s, {:.1} m",
             end.outcome,
-            end.steps,
+            counted(end.steps as usize, "step"),
             end.time_us as f64 * 1e-6,
             end.distance_m,
         ),
@@ -166,7 +177,7 @@ fn summary(out: &mut impl Write, recording: &RecordedEpisode) -> io::Result<()> 
 
 /// The number of LiDAR sweeps beside that of images; nothing without LiDAR.
 fn with_sweeps(count: usize) -> String {
-    if count == 0 { String::new() } else { format!(" and {count} sweeps") }
+    if count == 0 { String::new() } else { format!(" and {}", counted(count, "sweep")) }
 }
 
 fn write_png(dir: &Path, image: &ReplayedImage<'_>) -> anyhow::Result<()> {

@@ -2,11 +2,12 @@
 
 use std::io::{self, Write};
 
+use crate::cli::output::counted;
 use wildcity_eval::{Extrapolation, Gain, LidarMeans, Means, ScoreMeans};
 
 pub(super) fn print_means(out: &mut impl Write, means: &Means) -> io::Result<()> {
     let images = means.images;
-    print_scores(out, &format!("mean of {images} images"), &means.rendered)?;
+    print_scores(out, &format!("mean of {}", counted(images, "image")), &means.rendered)?;
     if let Some(repaired) = &means.repaired {
         print_scores(out, "repaired", repaired)?;
     }

@@ -166,11 +166,12 @@ impl Check {
             }
             writeln!(
                 out,
-                "{}: {} episodes in {}@{}, {actors} actors",
+                "{}: {} in {}@{}, {}",
                 path.display(),
-                cases.len(),
+                output::counted(cases.len(), "episode"),
                 opened.version.manifest.twin,
                 opened.version.number,
+                output::counted(actors, "actor"),
             )?;
             for line in unpinned {
                 writeln!(out, "  not pinned: {line}")?;

@@ -101,9 +101,9 @@ impl Import {
         }
         writeln!(
             out,
-            "{}: {} actors; next: wildcity scenario check {}",
+            "{}: {}; next: wildcity scenario check {}",
             self.out.display(),
-            scenario.actors.len(),
+            output::counted(scenario.actors.len(), "actor"),
             self.out.display()
         )?;
         Ok(())

@@ -9,7 +9,7 @@ use std::time::SystemTime;
 use wildcity_server::{TlsFiles, Tokens};
 
 use crate::cli::directories::ServerDirectories;
-use crate::cli::exit;
+use crate::cli::{exit, output};
 
 use super::{Serve, config_file};
 
@@ -84,7 +84,8 @@ impl Serve {
         let is_file = |name: &Path| name.extension().is_some_and(|extension| extension == "json");
         let count =
             entries.filter(|entry| entry.as_ref().is_ok_and(|entry| is_file(&entry.path())));
-        Ok(format!("{} files in {shown}; `wildcity scenario check` reads one", count.count()))
+        let files = output::counted(count.count(), "file");
+        Ok(format!("{files} in {shown}; `wildcity scenario check` reads one"))
     }
 }
 

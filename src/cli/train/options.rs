@@ -130,6 +130,15 @@ impl RunOptions {
         settings.growth.cap = self.cap.map_or(settings.growth.cap, |cap| cap as usize);
         self.source.open(settings, self.size)
     }
+
+    /// What says how many steps the run makes, if it is not --steps: for the line of `train plan`.
+    pub(super) fn steps_origin(&self) -> &'static str {
+        match (self.steps, &self.source.settings) {
+            (Some(_), _) => "",
+            (None, Some(_)) => " (--settings; --steps changes it)",
+            (None, None) => " (the default; --steps changes it)",
+        }
+    }
 }
 
 impl SourceOptions {

@@ -113,10 +113,11 @@ impl Plan {
         let [first_ms, last_ms] = [begin, end].map(|count| 1e3 * measured.step_s(count, begin));
         writeln!(
             stdout,
-            "time       about {}: {} steps of {first_ms:.0} to {last_ms:.0} ms, and {:.0} ms to decode an image; backend {}, \
+            "time       about {}: {} steps{} of {first_ms:.0} to {last_ms:.0} ms, and {:.0} ms to decode an image; backend {}, \
              measured on {MEASURED} images",
             duration(steps_s + evaluations_s),
             settings.steps,
+            self.run.steps_origin(),
             1e3 * measured.decode_s,
             backend.name()
         )?;

@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 
 use crate::cli::directories::Twins;
-use crate::cli::output;
+use crate::cli::output::{self, counted};
 use crate::cli::progress;
 use wildcity_twin::store::{FsckReport, RecordSetAside};
 
@@ -75,25 +75,21 @@ impl Fsck {
             writeln!(out, "lost version {number}: {error}")?;
         }
         if !checked.collected.is_empty() {
-            writeln!(out, "{} old versions were removed by gc", checked.collected.len())?;
+            let versions = counted(checked.collected.len(), "old version");
+            writeln!(out, "removed by gc: {versions}")?;
         }
         let garbage = checked.unreferenced;
         if garbage.objects > 0 {
-            let objects = garbage.objects;
-            let bytes = garbage.bytes;
-            writeln!(out, "{objects} objects of {bytes} bytes belong to no version")?;
+            let objects = counted(garbage.objects as usize, "object");
+            writeln!(out, "without a version: {objects}, {} bytes", garbage.bytes)?;
         }
         if checked.staging {
             writeln!(out, "a commit is being made, or was killed: the next start cleans up")?;
         }
         if checked.is_sound() {
-            let objects = checked.verified.objects;
+            let objects = counted(checked.verified.objects as usize, "object");
             let bytes = checked.verified.bytes;
-            writeln!(
-                out,
-                "twin {}: {objects} objects, {bytes} bytes of chunks, all sound",
-                self.twin
-            )?;
+            writeln!(out, "twin {}: {objects}, {bytes} bytes of chunks, all sound", self.twin)?;
         }
         Ok(())
     }

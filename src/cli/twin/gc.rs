@@ -51,11 +51,11 @@ impl Gc {
         let removed = if self.dry_run { "would be removed" } else { "removed" };
         writeln!(
             output::stdout(),
-            "kept versions {}\n{removed} {} objects, {} bytes\nnoted {} objects, {} bytes",
+            "kept versions {}\n{removed} {}, {} bytes\nnoted {}, {} bytes",
             kept.join(" "),
-            found.removed.objects,
+            output::counted(found.removed.objects as usize, "object"),
             found.removed.bytes,
-            found.noted.objects,
+            output::counted(found.noted.objects as usize, "object"),
             found.noted.bytes,
         )?;
         if let Some((number, damage)) = found.blocked_by {

@@ -99,7 +99,7 @@ impl Label {
             let bytes = ingest::read_whole(path, MAP_BYTES as u64).with_context(context)?;
             let file = TracksFile::parse(&bytes).with_context(context)?;
             let of_tracks = swept(&file).with_context(context)?;
-            options.push(format!("{} tracks", file.tracks.len()));
+            options.push(output::counted(file.tracks.len(), "track"));
             places.extend(
                 of_tracks
                     .into_iter()

@@ -112,16 +112,21 @@ fn summary(
         )?;
     }
     if let Some(views) = &manifest.views {
-        writeln!(out, "views       {} recorded images, {} bytes", views.images, views.image_bytes)?;
+        writeln!(
+            out,
+            "views       {}, {} bytes",
+            counted(views.images as usize, "recorded image"),
+            views.image_bytes
+        )?;
     }
     if let Some(rig) = &manifest.rig {
         let names: Vec<_> = rig.cameras.iter().map(|camera| camera.name.as_str()).collect();
         writeln!(out, "rig         {}: {}", rig.name, names.join(", "))?;
     }
     for trajectory in &manifest.trajectories {
-        let keyframes = trajectory.keyframes.len();
+        let keyframes = counted(trajectory.keyframes.len(), "keyframe");
         let length_m = trajectory.length_m();
-        writeln!(out, "trajectory  {}: {keyframes} keyframes, {length_m:.1} m", trajectory.name)?;
+        writeln!(out, "trajectory  {}: {keyframes}, {length_m:.1} m", trajectory.name)?;
     }
     if let Some(Alignment { new_from_old, metres_per_unit }) = alignment {
         let moved = new_from_old.position_m.to_array();

@@ -21,6 +21,7 @@ h1{font-size:1.6em}h2{margin-top:2em;font-size:1.2em}
 table{border-collapse:collapse;font-size:13px;display:block;overflow-x:auto}td,th{padding:2px 8px;border-bottom:1px solid #ddd;text-align:right}
 td:first-child,th:first-child{text-align:left}.wide{overflow-x:auto}
 figure{margin:0 0 18px}figure div{display:grid;grid-template-columns:repeat(3,1fr);gap:4px;align-items:start}
+@media(max-width:600px){figure div{grid-template-columns:repeat(2,1fr)}}
 figure div.row{grid-template-columns:repeat(auto-fit,minmax(180px,1fr))}figure img{width:100%;min-width:0;height:auto}
 .gain td{font-weight:600}
 figcaption{font-size:13px;margin-bottom:3px}.key span{display:inline-block;padding:1px 8px;font-size:12px}
@@ -48,11 +49,11 @@ pub fn render(evaluation: &Evaluation) -> String {
                 p.verdict { (verdict(evaluation, &worst_first)) }
                 (introduction(evaluation))
                 (means::table(evaluation))
+                (pictures(&worst_first))
                 (means::kid(evaluation))
                 (meanings(evaluation))
                 (means::lidar(evaluation))
                 (beside::section(evaluation))
-                (pictures(&worst_first))
                 (images_table(evaluation, &worst_first))
             }
         }
@@ -167,11 +168,11 @@ fn pictures(worst_first: &[&EvaluatedImage]) -> Markup {
         h2 { "The worst images" }
         @if evaluated_repaired(&shown) {
             p {
-                "Above, from left to right: real, rendered, repaired. Below: FLIP of each pixel of the rendered and of the \
-                 repaired image, grey where pixels do not count. Colours of FLIP:"
+                "In this order: real, rendered, repaired; then FLIP of each pixel of the rendered and of the repaired image, \
+                 grey where pixels do not count. Colours of FLIP:"
             }
         } @else {
-            p { "From left to right: real, rendered, and FLIP of each pixel, grey where pixels do not count. Colours of FLIP:" }
+            p { "In this order: real, rendered, and FLIP of each pixel, grey where pixels do not count. Colours of FLIP:" }
         }
         p.key {
             @for (step, [r, g, b]) in HEAT_RGB.iter().enumerate() {

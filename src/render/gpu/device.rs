@@ -191,6 +191,7 @@ fn may_have_hardware() -> bool {
 pub(super) struct Device {
     pub(super) device: wgpu::Device,
     pub(super) queue: Queue,
+    pub(super) adapter: Adapter,
     pub(super) info: AdapterInfo,
     shaders: Shaders,
     limits: Limits,
@@ -235,7 +236,19 @@ impl Device {
         binding_limit: u64,
         tuning: Option<Tuning>,
     ) -> Result<Self, GpuError> {
-        let adapter = choice.find()?;
+        Self::on(choice.find()?, shaders, binding_limit, tuning)
+    }
+
+    /// As [`Device::open`], on an adapter that was found before.
+    ///
+    /// # Errors
+    /// The driver does not open it.
+    pub(super) fn on(
+        adapter: Adapter,
+        shaders: &Shaders,
+        binding_limit: u64,
+        tuning: Option<Tuning>,
+    ) -> Result<Self, GpuError> {
         let info = adapter.get_info();
         let limits = adapter.limits();
         let descriptor = DeviceDescriptor {
@@ -265,6 +278,7 @@ impl Device {
         Ok(Self {
             device,
             queue,
+            adapter,
             info,
             shaders: shaders.clone(),
             limits,

@@ -58,7 +58,7 @@ use std::time::Instant;
 use parking_lot::Mutex;
 use rayon::ThreadPool;
 use rayon::prelude::*;
-use wgpu::AdapterInfo;
+use wgpu::{Adapter, AdapterInfo};
 
 pub use bandwidth::FrameCounts;
 pub use device::{AdapterChoice, DeviceInfo, DeviceTotals, GpuError, devices};
@@ -88,6 +88,8 @@ use wildcity_scene::{RenderProfile, Scene};
 #[derive(Debug)]
 pub struct Gpu {
     choice: AdapterChoice,
+    /// Opens more devices, for [`Gpu::another`].
+    adapter: Adapter,
     /// The device and its driver. A backend never changes to another device.
     info: AdapterInfo,
     /// Most bytes of its bindings.
@@ -210,6 +212,29 @@ impl Gpu {
             ..limits
         };
         let device = Device::open(choice, &shaders, limits.binding_bytes, tuning)?;
+        Self::with_device(device, choice, threads, shaders, limits, tuning)
+    }
+
+    /// A device of the same adapter, that has rendered nothing yet. Adapters are not looked for
+    /// again, which takes time, and for which a driver may print a warning each time.
+    ///
+    /// # Errors
+    /// The driver does not open it.
+    pub fn another(&self) -> Result<Self, GpuError> {
+        let Self { adapter, shaders, limits, tuning, .. } = self;
+        let device = Device::on(adapter.clone(), shaders, limits.binding_bytes, *tuning)?;
+        let threads = self.cull.current_num_threads();
+        Self::with_device(device, &self.choice, threads, shaders.clone(), *limits, *tuning)
+    }
+
+    fn with_device(
+        device: Device,
+        choice: &AdapterChoice,
+        threads: usize,
+        shaders: Shaders,
+        limits: MemoryLimits,
+        tuning: Option<Tuning>,
+    ) -> Result<Self, GpuError> {
         let pool = |name: &'static str| {
             let builder = rayon::ThreadPoolBuilder::new().num_threads(threads);
             let pool = builder.thread_name(move |i| format!("{name}-{i}")).build();
@@ -217,6 +242,7 @@ impl Gpu {
         };
         Ok(Self {
             choice: choice.clone(),
+            adapter: device.adapter.clone(),
             info: device.info.clone(),
             binding_bytes: device.binding_bytes(),
             limits,

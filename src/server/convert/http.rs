@@ -223,6 +223,7 @@ fn file(file: &FileReport) -> http::FileReport {
         first_bad: file.first_bad.iter().map(bad).collect(),
         dropped: file.dropped,
         warnings: file.warnings.clone(),
+        assumed: file.assumed.clone(),
     }
 }
 

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use maud::{Markup, PreEscaped, html};
 
 use crate::entry::EpisodeEntry;
-use crate::html::{document, image};
+use crate::html::{capitalized, document, image};
 use crate::limits;
 use crate::picture::{ComparedPictures, Picture};
 use crate::plot::plots;
@@ -48,13 +48,13 @@ pub(super) fn page(
     let counts = &comparison.counts;
     let class = if comparison.worse { "worse" } else { "better" };
     let body = html! {
-        p class=(format!("verdict {class}")) { (comparison.conclusion()) "." }
+        p class=(format!("verdict {class}")) { (capitalized(&comparison.conclusion())) "." }
         p {
             (counts.worse) " worse, " (counts.better) " better, " (counts.same) " as before, "
             (counts.unknown) " without a verdict. " (comparison.pass_rate.text()) "."
         }
-        @if counts.changed > 0 { p { (counts.changed) " pairs are not compared: their twin or scenario differs." } }
-        @if counts.duplicates > 0 { p { (counts.duplicates) " pairs repeat another one, and are in no rate and no mean." } }
+        @if counts.changed > 0 { p { "Pairs that are not compared, because their twin or scenario differs: " (counts.changed) "." } }
+        @if counts.duplicates > 0 { p { "Pairs that repeat another one, and are in no rate and no mean: " (counts.duplicates) "." } }
         h2 { "Episodes that changed" }
         (episodes(comparison))
         (drives(comparison, runs, pictures))
@@ -81,11 +81,11 @@ fn episodes(comparison: &Comparison) -> Markup {
                     td { (episode.name) }
                     td { (episode.seed) }
                     td class=(episode.change.name()) { (episode.change.name().replace('_', " ")) }
-                    td { (episode.text()) }
+                    td.text { (episode.text()) }
                 }
             }
         } }
-        p { (comparison.counts.same) " episodes have the verdict that they had before." }
+        p { "Episodes with the verdict that they had before: " (comparison.counts.same) "." }
     }
 }
 
@@ -174,7 +174,7 @@ fn score_row(name: &str, score: &ScoreChange) -> Markup {
             td { (number(score.after)) }
             td { (score.difference.map_or(String::new(), |value| format!("{value:+.4}"))) }
             td { (interval(score)) }
-            td class=(score.direction.name()) { (notes(score)) }
+            td class=(format!("text {}", score.direction.name())) { (notes(score)) }
         }
     }
 }

@@ -26,13 +26,13 @@ pub(super) fn text(comparison: &Comparison) -> String {
     );
     row("pass rate", &comparison.pass_rate.text());
     for (count, what) in [
-        (counts.changed, "pairs are not compared: their twin or scenario differs"),
-        (counts.only_before, "episodes were driven before alone"),
-        (counts.only_after, "episodes are driven now alone"),
-        (counts.duplicates, "pairs repeat another one, and are in no rate and no mean"),
+        (counts.changed, "pairs that are not compared, because their twin or scenario differs"),
+        (counts.only_before, "episodes that were driven before alone"),
+        (counts.only_after, "episodes that are driven now alone"),
+        (counts.duplicates, "pairs that repeat another one, and are in no rate and no mean"),
     ] {
         if count > 0 {
-            row("note", &format!("{count} {what}"));
+            row("note", &format!("{what}: {count}"));
         }
     }
     for line in &comparison.scores_not_compared {
@@ -115,7 +115,7 @@ pub(super) fn notes(score: &ScoreChange) -> String {
     }
     for (count, when) in [(score.only_before, "before"), (score.only_after, "now")] {
         if count > 0 {
-            notes.push(format!("{count} pairs have it {when} alone"));
+            notes.push(format!("pairs that have it {when} alone: {count}"));
         }
     }
     notes.join("; ")

@@ -60,6 +60,12 @@ pub(super) fn gaussians(history: &History) -> Result<String, PageError> {
     svg("step", "Gaussians", &[("Gaussians", points.collect())])
 }
 
+/// A number of an axis: 0.05, 20, 500 k.
+fn tick(value: &f64) -> String {
+    let rounded = (1e6 * value).round() / 1e6;
+    if rounded.abs() < 1e4 { rounded.to_string() } else { format!("{} k", rounded / 1e3) }
+}
+
 fn svg(x: &str, y: &str, curves: &[Curve<'_>]) -> Result<String, PageError> {
     let mut text = String::new();
     draw(x, y, curves, &mut text).map_err(|error| PageError::Plot(error.to_string().into()))?;
@@ -75,7 +81,8 @@ fn draw(x: &str, y: &str, curves: &[Curve<'_>], text: &mut String) -> Result<(),
         .map(|(_, y)| y)
         .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), y| (low.min(y), high.max(y)));
     // One value, or none, has a range, too.
-    let margin = (0.05 * (high - low)).max(1e-3 * high.abs()).max(1e-6);
+    let spread = if high > low { high - low } else { high.abs() };
+    let margin = (0.05 * spread).max(1e-6);
     let range = if low <= high { low - margin..high + margin } else { 0.0..1.0 };
     let area = SVGBackend::with_string(text, SIZE_PX).into_drawing_area();
     area.fill(&WHITE)?;
@@ -84,7 +91,9 @@ fn draw(x: &str, y: &str, curves: &[Curve<'_>], text: &mut String) -> Result<(),
         .x_label_area_size(40)
         .y_label_area_size(70)
         .build_cartesian_2d(0.0..last_x, range)?;
-    chart.configure_mesh().x_desc(x).y_desc(y).label_style(LABEL).light_line_style(WHITE).draw()?;
+    let mut mesh = chart.configure_mesh();
+    mesh.x_label_formatter(&tick).y_label_formatter(&tick);
+    mesh.x_desc(x).y_desc(y).label_style(LABEL).light_line_style(WHITE).draw()?;
     for ((name, points), color) in curves.iter().zip(COLORS) {
         let points: Vec<(f64, f64)> = points.iter().copied().filter(is_number).collect();
         chart

@@ -21,7 +21,7 @@ body{font:15px/1.45 system-ui,sans-serif;max-width:1160px;margin:2em auto;paddin
 h1{font-size:1.6em}h2{margin-top:2em;font-size:1.2em}.verdict{font-size:1.2em}
 table{border-collapse:collapse;font-size:13px;display:block;overflow-x:auto}td,th{padding:2px 8px;border-bottom:1px solid #ddd;text-align:right}
 td:first-child,th:first-child{text-align:left}
-.pictures{display:grid;grid-template-columns:repeat(auto-fit,minmax(260px,1fr));gap:6px;margin-bottom:1.5em}
+.pictures{display:grid;grid-template-columns:repeat(auto-fit,minmax(150px,1fr));gap:6px;margin-bottom:1.5em}
 figure{margin:0}figure img{width:100%;height:auto}figcaption{font-size:13px}
 svg{max-width:100%;height:auto}pre{font-size:12px;overflow-x:auto}";
 

@@ -29,6 +29,8 @@ pub struct FileNotes {
     /// What was not read, or is drawn in another way than its authors may expect. Each names a part
     /// of the file.
     pub warnings: Vec<String>,
+    /// What was taken where nothing was given, such as the axes of the twin's latest version.
+    pub assumed: Vec<String>,
     /// Number of Gaussians outside their bounds that were left out.
     pub dropped: u64,
 }

@@ -81,11 +81,11 @@ fn table(out: &mut impl Write, version: &Version) -> io::Result<()> {
     let stored: u64 = rows.iter().map(|row| row.bytes).sum();
     writeln!(
         out,
-        "twin {} version {}, record {}: {all} Gaussians in {} levels, {stored} bytes",
+        "twin {} version {}, record {}: {all} Gaussians in {}, {stored} bytes",
         manifest.twin,
         version.number,
         manifest.record,
-        rows.len()
+        output::counted(rows.len(), "level")
     )?;
     writeln!(
         out,

@@ -212,10 +212,11 @@ impl Augment {
         let mut out = output::stdout();
         writeln!(
             out,
-            "round {}: {} images of {cameras} cameras at {} m beside the drives; {} repaired, {kept} from an earlier run; \
+            "round {}: {} of {} at {} m beside the drives; {} repaired, {kept} from an earlier run; \
              mean trust {trust:.2}",
             self.round,
-            samples.len(),
+            output::counted(samples.len(), "image"),
+            output::counted(*cameras, "camera"),
             offsets_m.join(", "),
             samples.iter().filter(is_repaired).count()
         )?;

@@ -1,4 +1,5 @@
-//! A twin before and after an alignment: a slice from the side, and all of it from above.
+//! A twin before and after an alignment: a slice from the side, and all of it from above, each with
+//! a caption.
 
 use std::io::Cursor;
 
@@ -10,6 +11,8 @@ use wildcity_render::compare::images::{render_images, view_along};
 use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_scene::align::Alignment;
 use wildcity_scene::{Gaussians, RenderProfile, Scene};
+
+use crate::cli::caption;
 
 /// Size of one of the four pictures, in pixels.
 const SIZE_PX: [u32; 2] = [720, 440];
@@ -27,6 +30,11 @@ const MOST: usize = 2_000_000;
 const GRID: Rgb<u8> = Rgb([255, 96, 32]);
 /// Largest number of lines of the grid in each direction.
 const LINES: f64 = 24.0;
+/// What the pictures show, row by row. Before the alignment the axes are those of the capture.
+const CAPTIONS: [[&str; 2]; 2] = [
+    ["before: along y, z upwards", "before: against z, y upwards"],
+    ["after: from the south, up is up", "after: from above, north is up"],
+];
 
 /// Middle and half size of most of a scene.
 #[derive(Clone, Copy, Debug)]
@@ -68,6 +76,7 @@ pub(super) fn before_and_after(
             let x = column as u32 * (width + GAP_PX);
             let y = row as u32 * (height + GAP_PX);
             image::imageops::replace(&mut all, &picture, x.into(), y.into());
+            caption::draw(&mut all, CAPTIONS[row][column], [x, y]);
         }
     }
     let mut png = Cursor::new(Vec::new());

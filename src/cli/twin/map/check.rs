@@ -29,11 +29,11 @@ impl Check {
         let file = map.file();
         writeln!(
             output::stdout(),
-            "{}: {} lanes, {} areas, {} stop lines",
+            "{}: {}, {}, {}",
             self.file.display(),
-            file.lanes.len(),
-            file.areas.len(),
-            file.stop_lines.len()
+            output::counted(file.lanes.len(), "lane"),
+            output::counted(file.areas.len(), "area"),
+            output::counted(file.stop_lines.len(), "stop line")
         )?;
         Ok(())
     }

@@ -62,10 +62,10 @@ impl Import {
         }
         writeln!(
             out,
-            "{}: {} lanes, {} areas",
+            "{}: {}, {}",
             self.out.display(),
-            map.lanes.len(),
-            map.areas.len()
+            output::counted(map.lanes.len(), "lane"),
+            output::counted(map.areas.len(), "area")
         )?;
         if let Some(geo) = geo {
             writeln!(out, "next: wildcity twin geo TWIN {}", anchor_text(&geo))?;

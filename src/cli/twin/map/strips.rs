@@ -46,7 +46,8 @@ impl Strips {
             self.twin.name
         );
         output::write(&self.out, map.to_json().as_bytes())?;
-        writeln!(output::stdout(), "{}: {} lanes", self.out.display(), map.lanes.len())?;
+        let lanes = output::counted(map.lanes.len(), "lane");
+        writeln!(output::stdout(), "{}: {lanes}", self.out.display())?;
         Ok(())
     }
 }

@@ -38,10 +38,10 @@ impl Show {
         let rig = find_rig(&name)?;
         let lidars = match rig.lidars.len() {
             0 => String::new(),
-            1 => ", 1 LiDAR".to_owned(),
-            count => format!(", {count} LiDARs"),
+            count => format!(", {}", output::counted(count, "LiDAR")),
         };
-        writeln!(out, "{}: {} cameras{lidars}", rig.name, rig.cameras.len())?;
+        let cameras = output::counted(rig.cameras.len(), "camera");
+        writeln!(out, "{}: {cameras}{lidars}", rig.name)?;
         let headings =
             ["#", "camera", "size px", "field deg", "x m", "y m", "z m", "yaw deg", "pitch deg"];
         let [index, camera, size, field, x, y, z, yaw, pitch] = headings;
@@ -55,8 +55,8 @@ impl Show {
             let height_px = camera.camera.height_px;
             let [x, y, z] = camera.rig_from_camera.position_m.to_array();
             let forward = camera.rig_from_camera.rotation * DVec3::Z;
-            let yaw = forward.y.atan2(forward.x).to_degrees();
-            let pitch = forward.z.clamp(-1.0, 1.0).asin().to_degrees();
+            let yaw = tenths(forward.y.atan2(forward.x).to_degrees());
+            let pitch = tenths(forward.z.clamp(-1.0, 1.0).asin().to_degrees());
             writeln!(
                 out,
                 "{index:>2} {:<24} {:>9} {:>11} {x:>6.2} {y:>6.2} {z:>6.2} {yaw:>7.1} {pitch:>9.1}",
@@ -79,6 +79,11 @@ impl Show {
         }
         Ok(())
     }
+}
+
+/// Rounded as it is printed, without a minus before 0.0.
+fn tenths(value: f64) -> f64 {
+    (10.0 * value).round() / 10.0 + 0.0
 }
 
 /// Horizontal and vertical field of view in degrees, as text.

@@ -133,9 +133,9 @@ impl DriveOptions {
         let names: Vec<&str> = cameras.cameras.iter().map(|camera| camera.name.as_str()).collect();
         writeln!(
             output::stdout(),
-            "{} keyframes, {:.1} m; camera {camera_height_m:.2} m above the ground, tilted by up to {:.1} degrees\n\
+            "{}, {:.1} m; camera {camera_height_m:.2} m above the ground, tilted by up to {:.1} degrees\n\
              cameras {}\n{}\n{}",
-            trajectory.keyframes.len(),
+            output::counted(trajectory.keyframes.len(), "keyframe"),
             trajectory.length_m(),
             most_tilt_rad.to_degrees(),
             names.join(", "),

@@ -40,17 +40,17 @@ impl Measure {
         }
         writeln!(
             out,
-            "{}: {} keyframes, {:.1} m in {seconds:.1} s",
+            "{}: {}, {:.1} m in {seconds:.1} s",
             trajectory.name,
-            trajectory.keyframes.len(),
+            output::counted(trajectory.keyframes.len(), "keyframe"),
             route.length_m()
         )?;
         for chunk in route.chunks() {
             let [from_m, to_m] = chunk.stations_m;
-            let count = chunk.keyframes.len();
+            let keyframes = output::counted(chunk.keyframes.len(), "keyframe");
             writeln!(
                 out,
-                "chunk {:<4} {from_m:>10.1} to {to_m:>10.1} m, {count} keyframes",
+                "chunk {:<4} {from_m:>10.1} to {to_m:>10.1} m, {keyframes}",
                 chunk.number
             )?;
         }

@@ -33,8 +33,8 @@ impl Subsample {
         let kept = Route::new(&trajectory)?.subsample(self.step_m)?;
         output::write(&self.out, &to_json(&kept)?)?;
         let kept_count = kept.keyframes.len();
-        let all_count = trajectory.keyframes.len();
-        writeln!(output::stdout(), "{kept_count} of {all_count} keyframes")?;
+        let all = output::counted(trajectory.keyframes.len(), "keyframe");
+        writeln!(output::stdout(), "{kept_count} of {all}")?;
         Ok(())
     }
 }

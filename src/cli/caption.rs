@@ -9,11 +9,11 @@ const PAD_PX: u32 = 3;
 const GROUND: [u8; 3] = [16, 20, 24];
 
 /// Height of a caption, in pixels.
-pub(super) const HEIGHT_PX: u32 = FONT.1.val() as u32 + 2 * PAD_PX;
+pub(in crate::cli) const HEIGHT_PX: u32 = FONT.1.val() as u32 + 2 * PAD_PX;
 
 /// Draws a text, with its left upper corner at a place; what does not fit is cut off. Characters
 /// that are not ASCII are drawn as question marks.
-pub(super) fn draw(picture: &mut RgbImage, text: &str, [left, top]: [u32; 2]) {
+pub(in crate::cli) fn draw(picture: &mut RgbImage, text: &str, [left, top]: [u32; 2]) {
     let advance = get_raster_width(FONT.0, FONT.1) as u32;
     let width = advance * text.chars().count() as u32 + 2 * PAD_PX;
     for y in top..(top + HEIGHT_PX).min(picture.height()) {
