@@ -63,7 +63,8 @@ impl ReadingBytes {
         drop(state);
         // The next one may have room beside this one, or in its place.
         self.changed.notify_all();
-        wanted.then_some(Reading { all: self, bytes })
+        // Not `then_some`: a reading that is made and dropped gives bytes back.
+        wanted.then(|| Reading { all: self, bytes })
     }
 }
 
