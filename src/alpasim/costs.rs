@@ -1,7 +1,7 @@
 //! The most that one request of AlpaSim's services may cost, from the limits and from sizes of
-//! decoded messages that were counted by hand; `clients/python/tests/test_alpasim_costs.py` measures
-//! it. `docs/reference/alpasim-costs.md` is generated from this table, and a method without a row fails
-//! a test.
+//! decoded messages that were counted by hand; `clients/python/tests/test_alpasim_costs.py`
+//! measures it. `docs/reference/alpasim-costs.md` is generated from this table, and a method
+//! without a row fails a test.
 
 use std::time::Duration;
 

@@ -179,7 +179,7 @@ impl TwinSolids {
     /// Reads what an ego at a pose needs, as long as it is wanted. Blocks.
     ///
     /// # Errors
-    /// The twin cannot be read, or nobody wants it any more.
+    /// The twin cannot be read, or no session wants it any more.
     pub(crate) fn read_around(
         &self,
         world_from_rig: &Pose,

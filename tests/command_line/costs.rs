@@ -346,7 +346,7 @@ async fn connections_cost_what_the_table_says() {
         let looks = async {
             let path = "/v1/sessions/watched/watch";
             let watcher = connect_to(served.address, path, WATCH, None).await;
-            let seen = watcher.ok().expect("a watcher").seen().await;
+            let seen = watcher.expect("a watcher").seen().await;
             assert!(seen.bytes.len() as u64 > 12 * MIB, "{} bytes", seen.bytes.len());
         };
         taken(served, looks).await

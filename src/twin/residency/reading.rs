@@ -36,7 +36,7 @@ pub struct Reading<'a> {
 impl ReadingBytes {
     /// Waits until the sections that are being read leave room for one of so many bytes, or there
     /// are none; a read that hangs does not keep others waiting for longer than
-    /// [`limits::READING_WAIT`]. `None` if, while it waits, nobody wants the section any more.
+    /// [`limits::READING_WAIT`]. `None` if no request wants the section any more.
     pub fn begin(&self, bytes: u64, is_wanted: &dyn Fn() -> bool) -> Option<Reading<'_>> {
         let mut state = self.state.lock();
         let until = Instant::now() + limits::READING_WAIT;
@@ -50,7 +50,7 @@ impl ReadingBytes {
             if !wanted {
                 break;
             }
-            // It may have become its turn in between, and nobody notifies it again.
+            // It may have become its turn in between, and no notification follows.
             if !state.has_room(number, bytes) {
                 let poll = until.min(Instant::now() + limits::READING_POLL);
                 self.changed.wait_until(&mut state, poll);
@@ -122,7 +122,7 @@ mod tests {
         assert!(all.state.lock().bytes == 0 && all.state.lock().waiting.is_empty());
     }
 
-    /// A section that nobody wants leaves the queue at once, and the one behind it has its turn.
+    /// A section that no request wants leaves the queue at once, and the next one has its turn.
     #[test]
     fn what_is_not_wanted_does_not_wait() {
         let all = ReadingBytes::default();
