@@ -24,10 +24,16 @@
 
 pub mod camera;
 #[cfg(test)]
+#[path = "../../tests/support/cost_table.rs"]
+mod cost_table;
+#[cfg(test)]
 mod costs;
 mod door;
 pub mod egodriver;
 pub mod export;
+#[cfg(test)]
+#[path = "../../tests/support/generated.rs"]
+mod generated;
 mod grpc;
 mod lidar;
 pub mod limits;

@@ -23,6 +23,11 @@ pub(super) fn rss_bytes() -> anyhow::Result<Rss> {
     memory.context("/proc/self/status does not say how much memory is used")
 }
 
+/// Bytes of the blocks of the heap that are in use.
+pub(super) fn live_bytes() -> anyhow::Result<u64> {
+    wildcity_heap::live_bytes().context("the blocks of the heap are counted with glibc only")
+}
+
 pub(super) fn mib(bytes: u64) -> f64 {
     bytes as f64 / f64::from(1 << 20)
 }

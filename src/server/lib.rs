@@ -68,6 +68,12 @@ mod watchers;
 #[cfg(test)]
 extern crate self as wildcity_server;
 
+#[cfg(test)]
+#[path = "../../tests/support/cost_table.rs"]
+mod cost_table;
+#[cfg(test)]
+#[path = "../../tests/support/generated.rs"]
+mod generated;
 /// Simulated faults of uploads and connections.
 #[cfg(test)]
 #[path = "../../tests/faults/server/mod.rs"]

@@ -26,9 +26,11 @@ use wildcity_sim::contact::{
     MAX_SWEPT_SPEED_MPS, SOLID_OPACITY, SolidPoint, SolidSums, Solids, StaticLimit, TestedBox,
 };
 use wildcity_sim::traffic::{EgoBox, EgoMotion, EgoState};
-use wildcity_twin::store::{Catalog, StoreError};
+use wildcity_twin::store::Catalog;
 
+use crate::blocking::Stop;
 use crate::engine::solid_blocks::{SectionKey, SolidBlocks};
+use crate::error::SessionError;
 use crate::scenario::{Event, EventKind};
 use crate::spatial_index::{Block, SectionId, SpatialIndex, block_at};
 
@@ -62,8 +64,17 @@ struct Met {
 }
 
 /// Sections that a computation has looked up, so that it does not look them up for each pose.
-#[derive(Default)]
-struct Near(HashMap<SectionId, Arc<Solids>>);
+struct Near<'a> {
+    sections: HashMap<SectionId, Arc<Solids>>,
+    /// Whether the result is still of use: no section is read for a client that has left.
+    is_wanted: &'a dyn Fn() -> bool,
+}
+
+impl<'a> Near<'a> {
+    fn new(is_wanted: &'a dyn Fn() -> bool) -> Self {
+        Self { sections: HashMap::new(), is_wanted }
+    }
+}
 
 impl TwinSolids {
     pub(crate) fn new(
@@ -82,15 +93,17 @@ impl TwinSolids {
     /// switch of the version, is not a new contact before it has left it.
     ///
     /// # Errors
-    /// The twin cannot be read.
+    /// The twin cannot be read, or the result is of no use any more.
     pub(crate) fn contacts(
         &self,
         from: &Ego,
         egos: &[Ego],
         begin_us: i64,
         dt_us: i64,
-    ) -> Result<Vec<Vec<Event>>, StoreError> {
-        let mut near = Near::default();
+        stop: &Stop,
+    ) -> Result<Vec<Vec<Event>>, SessionError> {
+        let is_wanted = || stop.check().is_continue();
+        let mut near = Near::new(&is_wanted);
         let mut from = EgoState::new(from);
         // Unknown until the ego moves: the test reads sections that an ego at rest does not need.
         let mut touches: Option<bool> = None;
@@ -122,12 +135,12 @@ impl TwinSolids {
     /// start. Returns whether it does at its end.
     fn step_contacts(
         &self,
-        near: &mut Near,
+        near: &mut Near<'_>,
         motion: &EgoMotion,
         dt_us: i64,
         mut touched: bool,
         mut visit: impl FnMut(Met),
-    ) -> Result<bool, StoreError> {
+    ) -> Result<bool, SessionError> {
         if !motion.smooth && motion.mean_speed_mps(dt_us) > MAX_SWEPT_SPEED_MPS {
             // Of a jump only the end is tested, and whatever is met there is new.
             let state = motion.to;
@@ -163,20 +176,24 @@ impl TwinSolids {
         Ok(touched)
     }
 
-    /// Reads what an ego at a pose needs. Blocks.
+    /// Reads what an ego at a pose needs, as long as it is wanted. Blocks.
     ///
     /// # Errors
-    /// The twin cannot be read.
-    pub(crate) fn read_around(&self, world_from_rig: &Pose) -> Result<(), StoreError> {
-        self.contact_m2(&mut Near::default(), world_from_rig).map(|_| ())
+    /// The twin cannot be read, or no session wants it any more.
+    pub(crate) fn read_around(
+        &self,
+        world_from_rig: &Pose,
+        is_wanted: &dyn Fn() -> bool,
+    ) -> Result<(), SessionError> {
+        self.contact_m2(&mut Near::new(is_wanted), world_from_rig).map(|_| ())
     }
 
     /// The area that the ego meets at a pose, in m²; `None` if it is free.
     fn contact_m2(
         &self,
-        near: &mut Near,
+        near: &mut Near<'_>,
         world_from_rig: &Pose,
-    ) -> Result<Option<f64>, StoreError> {
+    ) -> Result<Option<f64>, SessionError> {
         let area_m2 = self.area_m2(near, world_from_rig)?;
         // Most places are free whatever the limit is.
         if !StaticLimit::default().is_exceeded_by(area_m2) {
@@ -187,7 +204,7 @@ impl TwinSolids {
     }
 
     /// The area that the ego overlaps at a pose, in m².
-    fn area_m2(&self, near: &mut Near, world_from_rig: &Pose) -> Result<f64, StoreError> {
+    fn area_m2(&self, near: &mut Near<'_>, world_from_rig: &Pose) -> Result<f64, SessionError> {
         let tested = TestedBox::new(world_from_rig, &self.ego_box);
         let [low_m, high_m] = tested.extent_m();
         let mut area_m2 = 0.0;
@@ -198,7 +215,7 @@ impl TwinSolids {
     }
 
     /// The area above which there is a contact in a block.
-    fn limit(&self, near: &mut Near, block: Block) -> Result<StaticLimit, StoreError> {
+    fn limit(&self, near: &mut Near<'_>, block: Block) -> Result<StaticLimit, SessionError> {
         // The lock is not held while sections are read. Two threads may compute the same limit,
         // with the same result.
         if let Some(limit) = self.limits.lock().get(&block) {
@@ -231,8 +248,8 @@ impl TwinSolids {
     }
 
     /// The solid Gaussians of a section.
-    fn section(&self, near: &mut Near, id: SectionId) -> Result<Arc<Solids>, StoreError> {
-        if let Some(solids) = near.0.get(&id) {
+    fn section(&self, near: &mut Near<'_>, id: SectionId) -> Result<Arc<Solids>, SessionError> {
+        if let Some(solids) = near.sections.get(&id) {
             return Ok(solids.clone());
         }
         let (chunk, section) = self.index.section(id);
@@ -241,9 +258,9 @@ impl TwinSolids {
         let key = (section.hash, chunk.origin_m.to_array().map(f64::to_bits));
         let solids = match self.blocks.get(&key) {
             Some(solids) => solids,
-            None => self.read(key, chunk, section)?,
+            None => self.read(key, chunk, section, near.is_wanted)?,
         };
-        near.0.insert(id, solids.clone());
+        near.sections.insert(id, solids.clone());
         Ok(solids)
     }
 
@@ -253,8 +270,14 @@ impl TwinSolids {
         key: SectionKey,
         chunk: &ChunkEntry,
         section: &Section,
-    ) -> Result<Arc<Solids>, StoreError> {
-        let _reading = self.blocks.reading.begin(section.bytes.into());
+        is_wanted: &dyn Fn() -> bool,
+    ) -> Result<Arc<Solids>, SessionError> {
+        // One of many: each is a reason to look.
+        if !is_wanted() {
+            return Err(SessionError::DeadlineExceeded);
+        }
+        let reading = self.blocks.reading.begin(section.bytes.into(), is_wanted);
+        let _reading = reading.ok_or(SessionError::DeadlineExceeded)?;
         // Another thread may have read it while this one waited. Of two that read it at once, both
         // insert equal contents.
         if let Some(solids) = self.blocks.get(&key) {

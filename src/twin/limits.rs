@@ -188,6 +188,9 @@ pub const READING_BYTES: u64 = 16 << 20;
 /// store of 20 MB/s.
 pub const READING_WAIT: Duration = Duration::from_secs(10);
 
+/// How often a section that waits for others asks whether it is still wanted.
+pub const READING_POLL: Duration = Duration::from_millis(50);
+
 /// Most areas that the search for a twin's worst frame halves. It is within the cells of 64 m: 20
 /// km of road have 320 of them in a row.
 pub const WORST_CASE_AREAS: usize = 4096;

@@ -1,5 +1,5 @@
 //! The table of costs, measured: a server of its own gets the worst message or request of each row,
-//! and its memory and processor time are compared with the row.
+//! and its memory, its processor time and what it writes to the disk are compared with the row.
 #![cfg(target_os = "linux")]
 
 use std::collections::BTreeMap;
@@ -10,7 +10,8 @@ use data_encoding::BASE64;
 use image::{GrayImage, ImageFormat};
 use serde_json::{Value, json};
 
-use wildcity_session::limits::LONGEST_POLL;
+use wildcity_client::{ConnectOptions, HttpClient};
+use wildcity_session::limits::{LONGEST_POLL, NOTES_BYTES};
 
 use crate::http;
 use crate::root::root;
@@ -30,6 +31,7 @@ const MESSAGE_BYTES: usize = wildcity_protocol::limits::INBOUND_MESSAGE_BYTES;
 struct Row {
     memory_bytes: u64,
     time_s: f64,
+    disk_bytes: u64,
 }
 
 /// The rows of the page, which is that of the code.
@@ -38,9 +40,11 @@ fn rows() -> BTreeMap<String, Row> {
     let rows = page.lines().filter_map(|line| {
         let mut cells = line.strip_prefix("| `")?.split(" | ");
         let of = cells.next()?.trim_end_matches('`').to_owned();
-        let memory_mib: f64 = cells.next()?.parse().ok()?;
-        let time_s = cells.next()?.parse().ok()?;
-        Some((of, Row { memory_bytes: (memory_mib * MIB as f64) as u64, time_s }))
+        let [memory_mib, time_s, disk_mib]: [f64; 3] =
+            [cells.next()?, cells.next()?, cells.next()?].map(|cell| cell.parse().unwrap_or(-1.0));
+        let bytes = |mib: f64| (mib * MIB as f64) as u64;
+        let row = Row { memory_bytes: bytes(memory_mib), time_s, disk_bytes: bytes(disk_mib) };
+        (time_s >= 0.0).then_some((of, row))
     });
     let rows: BTreeMap<String, Row> = rows.collect();
     assert!(rows.len() > 40, "only {} rows can be read", rows.len());
@@ -51,6 +55,7 @@ fn rows() -> BTreeMap<String, Row> {
 struct Taken {
     memory_bytes: u64,
     time_s: f64,
+    disk_bytes: u64,
     poll_s: f64,
 }
 
@@ -58,10 +63,13 @@ async fn taken<T>(served: &Served, work: impl Future<Output = T>) -> Taken {
     served.forget_peak();
     let memory = served.rss();
     let time_s = served.processor_s();
+    let disk = served.disk_bytes();
     work.await;
     let memory_bytes = served.peak().saturating_sub(memory);
     let time_s = served.processor_s() - time_s;
-    Taken { memory_bytes, time_s, poll_s: metric(served, "wildcity_poll_longest_seconds").await }
+    let disk_bytes = served.disk_bytes().saturating_sub(disk);
+    let poll_s = metric(served, "wildcity_poll_longest_seconds").await;
+    Taken { memory_bytes, time_s, disk_bytes, poll_s }
 }
 
 /// A number of `/metrics`.
@@ -74,14 +82,22 @@ async fn metric(served: &Served, name: &str) -> f64 {
 
 /// Fails if some work took more than its row allows.
 fn check(of: &str, row: Row, taken: &Taken) {
-    let Taken { memory_bytes, time_s, poll_s } = *taken;
-    let [mib, most_mib] = [memory_bytes, row.memory_bytes].map(|bytes| bytes as f64 / MIB as f64);
+    let Taken { memory_bytes, time_s, disk_bytes, poll_s } = *taken;
+    let in_mib = |bytes: u64| bytes as f64 / MIB as f64;
+    let [mib, most_mib] = [memory_bytes, row.memory_bytes].map(in_mib);
+    let [disk_mib, most_disk_mib] = [disk_bytes, row.disk_bytes].map(in_mib);
     eprintln!(
-        "{of}: {mib:.1} of {most_mib:.1} MiB, {time_s:.2} of {} s, longest poll {:.1} ms",
+        "{of}: {mib:.1} of {most_mib:.1} MiB, {time_s:.2} of {} s, {disk_mib:.2} of {most_disk_mib:.1} MiB on the disk, \
+         longest poll {:.1} ms",
         row.time_s,
         poll_s * 1e3
     );
     assert!(memory_bytes <= row.memory_bytes + FIRST_TIME, "{of}: {mib:.1} of {most_mib:.1} MiB");
+    // The page has tenths.
+    assert!(
+        disk_bytes <= row.disk_bytes + MIB / 10,
+        "{of}: {disk_mib:.2} of {most_disk_mib:.1} MiB on the disk"
+    );
     // Whole seconds, rounded down.
     assert!(time_s < row.time_s + 1.0, "{of}: {time_s} s of a processor");
 }
@@ -188,11 +204,14 @@ async fn the_worst_answers_cost_what_the_table_says() {
             "observe",
             json!({ "type": "observe", "poses": [pose(1.0), pose(2.0), pose(3.0), pose(4.0)] }),
         ),
-        ("step", json!({ "type": "step", "pose": pose(1.0) })),
+        (
+            "step",
+            json!({ "type": "step", "pose": pose(1.0), "notes": "n".repeat(NOTES_BYTES - 2) }),
+        ),
         ("reset", json!({ "type": "reset" })),
     ] {
-        let Row { memory_bytes, time_s } = rows[of];
-        let row = Row { memory_bytes: memory_bytes / PART + reserved, time_s };
+        let row = rows[of];
+        let row = Row { memory_bytes: row.memory_bytes / PART + reserved, ..row };
         let looked = async {
             agent.send(request).await;
             let Reply::Binary(bytes) = agent.receive().await else { panic!("no observation") };
@@ -257,22 +276,10 @@ async fn write_records(served: &Served, count: usize, bytes: u64) {
 /// Every route with a body that the server has to parse, and those whose answer is large.
 #[tokio::test]
 async fn the_worst_requests_cost_what_the_table_says() {
-    /// Rows that are not measured, and why.
-    const NOT_SENT: [(&str, &str); 9] = [
-        ("GET /v1/session", "the messages of the other tests"),
-        ("GET /v1/sessions/{session}/watch", "shares an answer"),
-        ("GET /v1/episodes/{episode}/mcap", "is read as the record is"),
-        ("GET /v1/twins/{twin}/scenarios", "tests/server/scenarios.rs"),
-        ("GET /v1/actors/{actor}", "an asset, as it is listed"),
-        ("GET /v1/twins/{twin}/pushes/{id}", "a line of JSON"),
-        ("DELETE /v1/twins/{twin}/pushes/{id}", "a mark"),
-        ("HEAD /v1/uploads/{id}", "a line of JSON"),
-        ("DELETE /v1/uploads/{id}", "a mark"),
-    ];
     let junk = format!(r#"{{"junk":{}}}"#, dense_json(MESSAGE_BYTES - 100));
     for (of, row) in rows() {
         let Some((method, path)) = of.split_once(' ') else { continue };
-        if NOT_SENT.iter().any(|(other, _)| *other == of) {
+        if NOT_REQUESTS.contains(&&*of) {
             continue;
         }
         let worst = async |served: &Served| {
@@ -281,12 +288,21 @@ async fn the_worst_requests_cost_what_the_table_says() {
                     if path == "/v1/episodes" { (20, 12 * MIB) } else { (1, 60 * MIB) };
                 write_records(served, count, bytes).await;
             }
+            if path.ends_with("/mcap") {
+                let file = served.episodes.path().join("large-1.mcap");
+                fs::write(file, vec![b'm'; 60 << 20]).unwrap();
+            }
+            if path.ends_with("{actor}") {
+                generate_actors(served);
+            }
             let upload = upload(served).await;
+            let id = if path.contains("/pushes/") { push(served).await } else { upload };
             let path = path
+                .replace("{actor}", &first_actor(served).await)
                 .replace("{twin}", "test")
                 .replace("{name}", "log")
                 .replace("{episode}", "large-1")
-                .replace("{id}", &upload);
+                .replace("{id}", &id);
             let part = vec![0; UPLOAD_BYTES];
             let (headers, body): (&str, &[u8]) = match method {
                 "POST" => ("", junk.as_bytes()),
@@ -298,12 +314,53 @@ async fn the_worst_requests_cost_what_the_table_says() {
             // Not found would cost nothing.
             let asked = async {
                 let reply = http::send(served.address, &head, body).await;
-                assert!(![401, 404, 405].contains(&reply.status), "{of}: {reply:?}");
+                assert!(![401, 404, 405].contains(&reply.status), "{of}: {}", reply.head);
             };
             taken(served, asked).await
         };
         measure(&of, row, worst).await;
     }
+}
+
+/// Routes that the test of requests leaves out: a test of its own, a shared answer, and
+/// `tests/server/scenarios.rs`.
+const NOT_REQUESTS: [&str; 3] =
+    ["GET /v1/session", "GET /v1/sessions/{session}/watch", "GET /v1/twins/{twin}/scenarios"];
+
+/// A connection.
+#[tokio::test]
+async fn connections_cost_what_the_table_says() {
+    let rows = rows();
+    let [connection, ..] = NOT_REQUESTS;
+    let connect = async |served: &Served| {
+        // The first one runs much code for the first time.
+        drop(greeted(served).await);
+        taken(served, greeted(served)).await
+    };
+    measure(connection, rows[connection], connect).await;
+}
+
+/// The assets that come with the program.
+fn generate_actors(served: &Served) {
+    let generate =
+        crate::wildcity().args(["actor", "generate", "--twins"]).arg(served.dir()).output();
+    assert!(generate.unwrap().status.success());
+}
+
+/// The hash of an asset; none before there are any.
+async fn first_actor(served: &Served) -> String {
+    let listed = http::send(served.address, "GET /v1/actors HTTP/1.1", b"").await;
+    listed.body["actors"][0]["hash"].as_str().unwrap_or("none").to_owned()
+}
+
+/// Begins a push, and returns its id.
+async fn push(served: &Served) -> String {
+    let address = format!("http://{}", served.address);
+    let client = HttpClient::new(&address, &ConnectOptions::default()).unwrap();
+    let scene = crate::scene_files::gaussians(1_000, 0, 8.0, 1);
+    let scene = http::write(served.dir(), "scene.ply", &scene);
+    let uploaded = client.upload(&scene, &mut |_, _| {}).await.unwrap();
+    client.push("test", &http::new_push(&[&uploaded.id])).await.unwrap().id
 }
 
 /// Bytes of an upload.

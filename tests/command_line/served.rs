@@ -16,7 +16,7 @@ use crate::support::{self, Agent};
 pub(crate) struct Served {
     child: Child,
     pub(crate) address: SocketAddr,
-    _dir: tempfile::TempDir,
+    dir: tempfile::TempDir,
     pub(crate) episodes: tempfile::TempDir,
 }
 
@@ -58,6 +58,8 @@ impl Served {
             .arg(episodes.path())
             .arg("--uploads")
             .arg(dir.path().join(".uploads"))
+            .arg("--scenarios")
+            .arg(dir.path().join(".scenarios"))
             .stdout(Stdio::piped())
             .spawn()
             .unwrap();
@@ -67,7 +69,7 @@ impl Served {
             .strip_prefix("listening on ws://")
             .and_then(|rest| rest.trim_end().strip_suffix("/v1/session"));
         let address = address.expect(&line).parse().unwrap();
-        Self { child, address, _dir: dir, episodes }
+        Self { child, address, dir, episodes }
     }
 
     fn proc(&self, file: &str) -> PathBuf {
@@ -93,6 +95,16 @@ impl Served {
     /// Lets the peak begin at the memory of now (`proc_pid_clear_refs(5)`).
     pub(crate) fn forget_peak(&self) {
         fs::write(self.proc("clear_refs"), "5").unwrap();
+    }
+
+    /// The directory of its twins, uploads and scenarios.
+    pub(crate) fn dir(&self) -> &Path {
+        self.dir.path()
+    }
+
+    /// Bytes of all files of its twins, uploads, scenarios and records.
+    pub(crate) fn disk_bytes(&self) -> u64 {
+        bytes_below(self.dir()) + bytes_below(self.episodes.path())
     }
 
     /// Processor time since the start, in seconds.
@@ -130,6 +142,17 @@ impl Served {
             }
         }
     }
+}
+
+fn bytes_below(dir: &Path) -> u64 {
+    let Ok(entries) = fs::read_dir(dir) else { return 0 };
+    let bytes = |entry: fs::DirEntry| match entry.metadata() {
+        Ok(metadata) if metadata.is_dir() => bytes_below(&entry.path()),
+        Ok(metadata) => metadata.len(),
+        // It was removed meanwhile.
+        Err(_) => 0,
+    };
+    entries.flatten().map(bytes).sum()
 }
 
 impl Drop for Served {

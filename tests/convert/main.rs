@@ -1,5 +1,7 @@
 //! Maps and scenarios of other formats, schemas of our own, and damaged files.
 
+#[path = "../support/generated.rs"]
+mod generated;
 #[path = "../support/root.rs"]
 mod root;
 

@@ -8,7 +8,7 @@ use serde_json::json;
 use wildcity_sim::map::MapFile;
 use wildcity_sim::scenario::{ScenarioFile, TracksFile};
 
-use crate::root::root;
+use crate::generated;
 
 #[test]
 fn schemas_of_files_are_up_to_date() {
@@ -51,18 +51,8 @@ fn swept(schema: &mut Schema) {
 }
 
 fn check(name: &str, schema: Schema) {
-    let path = root().join("src/sim/schema").join(format!("{name}.json"));
     let mut text = serde_json::to_string_pretty(&schema).unwrap();
     text.push('\n');
-    if std::env::var_os("WILDCITY_BLESS").is_some_and(|value| value == "1") {
-        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
-        std::fs::write(&path, text).unwrap();
-        return;
-    }
-    let found = std::fs::read_to_string(&path).unwrap_or_default();
-    assert!(
-        found == text,
-        "{} differs from the types: WILDCITY_BLESS=1 cargo test -p wildcity-convert --test convert schema",
-        path.display()
-    );
+    let file = format!("src/sim/schema/{name}.json");
+    generated::check(&file, &text, "-p wildcity-convert --test convert schema");
 }

@@ -42,6 +42,20 @@ fn free_pages_and_large_blocks_are_given_back() {
     let given_back = full.saturating_sub(resident_bytes());
     assert!(given_back > short_lived_bytes * 9 / 10, "{given_back} of {short_lived_bytes}");
     assert!(kept.iter().all(|block| block.iter().all(|&byte| byte == 2)));
+    live_bytes_are_those_of_blocks_in_use();
+}
+
+/// Small blocks and large ones, whether anything was written to them or not.
+fn live_bytes_are_those_of_blocks_in_use() {
+    let live = || wildcity_heap::live_bytes().unwrap();
+    let before = live();
+    let small: Vec<Vec<u8>> = (0..BLOCKS).map(|_| black_box(vec![1; BLOCK_BYTES])).collect();
+    let untouched = black_box(vec![0_u8; 64 * MIB]);
+    let wanted = (BLOCKS * BLOCK_BYTES + 64 * MIB) as u64;
+    let more = live() - before;
+    assert!(more.abs_diff(wanted) < wanted / 100, "{more}, and {wanted} were asked for");
+    drop((small, untouched));
+    assert!(live().abs_diff(before) < MIB as u64, "{} and {before}", live());
 }
 
 /// Memory of the process without files.

@@ -1,7 +1,7 @@
 //! Logs on disk: what is written is read, and what is not understood is named.
 
-#[path = "../support/root.rs"]
-mod root;
+#[path = "../support/generated.rs"]
+mod generated;
 
 mod projection;
 mod reading;

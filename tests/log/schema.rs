@@ -4,7 +4,7 @@
 use schemars::{Schema, schema_for};
 use wildcity_log::{GpsRow, Header, ImageRow, ImuRow, SweepRow, TrackRow};
 
-use crate::root::root;
+use crate::generated;
 
 #[test]
 fn schemas_of_files_are_up_to_date() {
@@ -17,17 +17,8 @@ fn schemas_of_files_are_up_to_date() {
 }
 
 fn check(name: &str, schema: &Schema) {
-    let path = root().join("src/log/schema").join(format!("{name}.json"));
     let mut text = serde_json::to_string_pretty(schema).unwrap();
     text.push('\n');
-    if std::env::var_os("WILDCITY_BLESS").is_some_and(|value| value == "1") {
-        std::fs::write(&path, text).unwrap();
-        return;
-    }
-    let found = std::fs::read_to_string(&path).unwrap_or_default();
-    assert!(
-        found == text,
-        "{} differs from the types: WILDCITY_BLESS=1 cargo test -p wildcity-log --test log schema",
-        path.display()
-    );
+    let file = format!("src/log/schema/{name}.json");
+    generated::check(&file, &text, "-p wildcity-log --test log schema");
 }

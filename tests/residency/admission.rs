@@ -121,6 +121,27 @@ fn an_exchanged_version_takes_the_memory_of_the_one_before() {
     assert_eq!(cache.stats().reserved_bytes, 0);
 }
 
+/// A reservation is counted when it begins to be enough for one view at a time only, and not again
+/// while it stays so.
+#[test]
+fn a_change_to_one_view_at_a_time_is_counted() {
+    let all = unlimited().open("demo", None).unwrap();
+    let together = all.worst_case_bytes(EXTENT);
+    let by_view = all.worst_case_bytes(RigExtent { views: 1, ..EXTENT });
+    assert!(by_view < together);
+    let cache = Cache::limited(demo().catalog(), Some(together));
+    let resident = cache.open("demo", None).unwrap();
+    let scenes = |together| SceneBytes { together, by_view: Some(by_view) };
+    let frame = FrameBytes::default();
+    let mut reservation = resident.reserve_scenes(scenes(together), frame).unwrap();
+    let mut exchanged = |bytes| {
+        reservation.exchange(resident.clone(), scenes(bytes), frame).unwrap();
+        (reservation.views_at_once() == 1, cache.stats().by_camera)
+    };
+    let changes = [together + 1, together + 1, together, together + 1].map(&mut exchanged);
+    assert_eq!(changes, [(true, 1), (true, 1), (false, 1), (true, 2)]);
+}
+
 #[test]
 fn a_twin_that_fits_as_a_whole_has_room_for_any_number_of_sessions() {
     let total_bytes = unlimited().open("demo", None).unwrap().total_bytes();

@@ -11,7 +11,6 @@ use tokio_tungstenite::tungstenite::protocol::CloseFrame;
 use wildcity_server::Limits;
 
 use crate::support::{Agent, Reply, TEST_TIMEOUT, TestServer, pose, refused};
-use crate::viewer::{WATCH, connect};
 
 /// The next frame, whatever it is.
 async fn frame(agent: &mut Agent) -> Option<Message> {

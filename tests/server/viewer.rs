@@ -1,13 +1,10 @@
 //! The viewer's files, tickets, watching, and recorded episodes over HTTP.
 
-use std::net::SocketAddr;
-
 use serde_json::{Value, json};
-use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
 use wildcity_server::{Limits, Origins, Tokens};
 
 use crate::http::request;
-use crate::support::{Agent, Reply, Seen, TEST_TIMEOUT, TestServer, client_limits};
+use crate::support::{Reply, Seen, TEST_TIMEOUT, TestServer, WATCH, connect};
 
 const DRIVER: &str = "driver-driver-driver";
 const RIVAL: &str = "rival-rival-rival";
@@ -32,33 +29,6 @@ async fn ask(server: &TestServer, line: &str, token: &str) -> (u16, Value) {
     let body = answer.split("\r\n\r\n").nth(1).unwrap();
     (status, serde_json::from_str(body).unwrap_or(Value::Null))
 }
-
-/// Connects to a path, or returns the status of the refusal.
-pub(crate) async fn connect(
-    address: SocketAddr,
-    path: &str,
-    protocol: &str,
-    token: Option<&str>,
-) -> Result<Agent, u16> {
-    let mut request = format!("ws://{address}{path}").into_client_request().unwrap();
-    request.headers_mut().insert("Sec-WebSocket-Protocol", protocol.parse().unwrap());
-    if let Some(token) = token {
-        let bearer = format!("Bearer {token}").parse().unwrap();
-        request.headers_mut().insert("Authorization", bearer);
-    }
-    let connected =
-        tokio_tungstenite::connect_async_with_config(request, client_limits(), true).await;
-    match connected {
-        Ok((socket, answer)) => {
-            assert_eq!(answer.headers()["sec-websocket-protocol"], protocol);
-            Ok(Agent { socket, seq: 0 })
-        }
-        Err(tokio_tungstenite::tungstenite::Error::Http(answer)) => Err(answer.status().as_u16()),
-        Err(other) => panic!("{other}"),
-    }
-}
-
-pub(crate) const WATCH: &str = "wildcity.watch.v1";
 
 #[tokio::test]
 async fn the_page_may_load_from_this_server_alone() {

@@ -312,6 +312,34 @@ pub(crate) fn client_limits() -> Option<WebSocketConfig> {
     Some(WebSocketConfig::default().max_message_size(bytes).max_frame_size(bytes))
 }
 
+/// The protocol of watchers.
+pub(crate) const WATCH: &str = "wildcity.watch.v1";
+
+/// Connects to a path, or returns the status of the refusal.
+pub(crate) async fn connect(
+    address: SocketAddr,
+    path: &str,
+    protocol: &str,
+    token: Option<&str>,
+) -> Result<Agent, u16> {
+    let mut request = format!("ws://{address}{path}").into_client_request().unwrap();
+    request.headers_mut().insert("Sec-WebSocket-Protocol", protocol.parse().unwrap());
+    if let Some(token) = token {
+        let bearer = format!("Bearer {token}").parse().unwrap();
+        request.headers_mut().insert("Authorization", bearer);
+    }
+    let connected =
+        tokio_tungstenite::connect_async_with_config(request, client_limits(), true).await;
+    match connected {
+        Ok((socket, answer)) => {
+            assert_eq!(answer.headers()["sec-websocket-protocol"], protocol);
+            Ok(Agent { socket, seq: 0 })
+        }
+        Err(tokio_tungstenite::tungstenite::Error::Http(answer)) => Err(answer.status().as_u16()),
+        Err(other) => panic!("{other}"),
+    }
+}
+
 impl Agent {
     pub(crate) async fn connect(address: SocketAddr) -> Self {
         Self::connect_as(address, None).await
@@ -319,17 +347,8 @@ impl Agent {
 
     /// Connects with a token.
     pub(crate) async fn connect_as(address: SocketAddr, token: Option<&str>) -> Self {
-        let mut request =
-            format!("ws://{address}/v1/session").into_client_request().expect("a request");
-        let subprotocol = "wildcity.v1".parse().expect("a header");
-        request.headers_mut().insert("Sec-WebSocket-Protocol", subprotocol);
-        if let Some(token) = token {
-            let bearer = format!("Bearer {token}").parse().expect("a header");
-            request.headers_mut().insert("Authorization", bearer);
-        }
-        let limits = client_limits();
-        let connected = tokio_tungstenite::connect_async_with_config(request, limits, true).await;
-        Self { socket: connected.expect("a connection").0, seq: 0 }
+        let connected = connect(address, "/v1/session", "wildcity.v1", token).await;
+        connected.expect("a connection")
     }
 
     pub(crate) async fn hello(&mut self) -> Value {

@@ -197,9 +197,8 @@ impl Renderer<'_> {
         }
         // Each index is in one group, so that afterwards every place has its image or its error.
         for Group { objects, indices, stills } in groups {
-            let encodings: Vec<ImageEncoding> = stills.iter().map(|still| still.encoding).collect();
             let answers: Vec<Image> = match self.render(&opened, scene, &objects, stills).await {
-                Ok(files) => files.into_iter().zip(encodings).map(image).collect(),
+                Ok(files) => files.into_iter().map(image).collect(),
                 Err(error) => repeated(&error, indices.len()).collect(),
             };
             for (index, answer) in indices.into_iter().zip(answers) {
@@ -244,15 +243,22 @@ impl Renderer<'_> {
         let views = StillViews { images: &views, sweep: None };
         let renderer = self.open.stills(self.engine, resident, scene, views).await?;
         let actors = self.assets.actors(self.engine, objects).await?;
-        Ok(renderer.render(stills, &actors, limits::RENDER_TIMEOUT).await?)
+        let are_raw: Vec<bool> =
+            stills.iter().map(|still| still.encoding == ImageEncoding::Raw).collect();
+        let files = renderer.render(stills, &actors, limits::RENDER_TIMEOUT).await?;
+        if !are_raw.contains(&true) {
+            return Ok(files);
+        }
+        // Up to 64 MiB: off the threads that answer.
+        let ordered = move || {
+            let both = files.into_iter().zip(are_raw);
+            both.map(|(file, is_raw)| if is_raw { planar(&file) } else { file }).collect()
+        };
+        tokio::task::spawn_blocking(ordered).await.map_err(|_| SessionError::Crashed.into())
     }
 }
 
-fn image((file, encoding): (Vec<u8>, ImageEncoding)) -> Image {
-    let image_bytes = match encoding {
-        ImageEncoding::Raw => planar(&file),
-        ImageEncoding::Jpeg(_) | ImageEncoding::Png => file,
-    };
+fn image(image_bytes: Vec<u8>) -> Image {
     Ok(wire::RgbRenderReturn { image_bytes })
 }
 
@@ -270,7 +276,11 @@ fn repeated(error: &SensorsimError, count: usize) -> impl Iterator<Item = Image>
 /// [3, height, width] from [height, width, 3].
 fn planar(rgb8: &[u8]) -> Vec<u8> {
     // All of red, then all of green, then all of blue.
-    (0..3).flat_map(|channel| rgb8.iter().skip(channel).step_by(3).copied()).collect()
+    let mut planes = Vec::with_capacity(rgb8.len());
+    for channel in 0..3 {
+        planes.extend(rgb8.iter().skip(channel).step_by(3));
+    }
+    planes
 }
 
 #[cfg(test)]

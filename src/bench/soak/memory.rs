@@ -7,7 +7,7 @@
 /// about two minutes.
 const WINDOWS: usize = 6;
 
-/// Resident memory, in bytes, sample by sample.
+/// Memory of one kind, in bytes, sample by sample.
 #[derive(Default)]
 pub(super) struct Memory {
     windows: [Vec<u64>; WINDOWS],

@@ -21,7 +21,7 @@ use self::agent::{Agent, Driven};
 use self::memory::Memory;
 use self::others::Pusher;
 use super::benched_twin::BenchedTwin;
-use super::memory::{mib, rss_bytes};
+use super::memory::{live_bytes, mib, rss_bytes};
 use wildcity::cli::exit::Exit;
 
 /// Drive many sessions of small cameras against a server for minutes or hours, and check that
@@ -29,13 +29,13 @@ use wildcity::cli::exit::Exit;
 ///
 /// The server runs in this process. The twin needs a recorded drive: each session drives the same
 /// stretch of the first one again and again, and compares the hash of every image with that of its
-/// first round. Prints the memory of the process every minute, and how much of it are sections of
-/// twins and answers, which have limits of their own. The exit code is 1 if a request fails, a hash
-/// changes, a task holds a thread that answers requests for more than 500 ms, or more than one task
-/// in a thousand for more than 50 ms, or the rest of the memory grows by more than --growth. Growth
-/// is the largest median of a later sixth of the time, compared with that of the second sixth: in
-/// the first one caches fill. With --memory-gib below what the twin needs, the server evicts and
-/// loads all the time.
+/// first round. Prints the memory of the process every minute: what is in RAM, and the blocks of
+/// the heap that are in use, with the parts of them that are sections of twins and answers, which
+/// have limits of their own. The exit code is 1 if a request fails, a hash changes, a task holds a
+/// thread that answers requests for more than 500 ms, or more than one task in a thousand for more
+/// than 50 ms, or the rest of the blocks grows by more than --growth. Growth is the largest median
+/// of a later sixth of the time, compared with that of the second sixth: in the first one caches
+/// fill. With --memory-gib below what the twin needs, the server evicts and loads all the time.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Soak {
@@ -59,7 +59,7 @@ pub(super) struct Soak {
     #[arg(long)]
     mixed: bool,
 
-    /// Largest growth of the memory that is accepted, in per cent.
+    /// Largest growth of the blocks that is accepted, in per cent.
     #[arg(long, value_name = "PERCENT", default_value_t = 2.0)]
     growth: f64,
 }
@@ -93,6 +93,15 @@ struct Driving {
     route: Trajectory,
     /// Time at which it ends.
     until: Instant,
+}
+
+/// Memory of the process, sample by sample.
+#[derive(Default)]
+struct Watched {
+    /// Blocks of the heap in use that are neither sections nor answers.
+    rest: Memory,
+    /// All memory in RAM.
+    resident: Memory,
 }
 
 /// Counts of the other load in a mixed soak.
@@ -210,30 +219,35 @@ impl Soak {
     }
 
     /// Measures the memory until the end, and prints it every minute.
-    async fn watch(&self, running: &Running, until: Instant) -> anyhow::Result<Memory> {
+    async fn watch(&self, running: &Running, until: Instant) -> anyhow::Result<Watched> {
         let begun = Instant::now();
         let mut out = io::stdout();
-        let mut memory = Memory::default();
+        let mut memory = Watched::default();
         let mut next_line = begun;
         let mut tick = tokio::time::interval(Duration::from_secs(1));
         while Instant::now() < until {
             tick.tick().await;
-            let bytes = rss_bytes()?.now;
+            let resident = rss_bytes()?.now;
             let elapsed = begun.elapsed();
-            let sections = running.engine().residency().held_bytes;
-            let answers = running.engine().answer_bytes();
-            // Both have limits of their own.
-            memory.add(
-                elapsed.div_duration_f64(self.length()),
-                bytes.saturating_sub(sections + answers),
-            );
+            let share = elapsed.div_duration_f64(self.length());
+            let engine = running.engine();
+            // Pages that sections have returned wait for the next ones.
+            let sections = engine.residency().held_bytes + engine.catalog().free_page_bytes();
+            let answers = engine.answer_bytes();
+            let live = live_bytes()?;
+            // Both have limits of their own. They are counted as they are allocated, and so is the
+            // sum: what is in RAM may have nothing of an answer that is not written yet.
+            memory.rest.add(share, live.saturating_sub(sections + answers));
+            memory.resident.add(share, resident);
             if Instant::now() >= next_line {
                 next_line += LINE_EVERY;
                 let minutes = elapsed.as_secs_f64() / 60.0;
                 writeln!(
                     out,
-                    "{minutes:>6.1} min  {:>8.1} MiB, of it {:>8.1} MiB of sections, {:>7.1} MiB of answers",
-                    mib(bytes),
+                    "{minutes:>6.1} min  {:>8.1} MiB in RAM; {:>8.1} MiB in use, of it {:>8.1} MiB of sections, \
+                     {:>7.1} MiB of answers",
+                    mib(resident),
+                    mib(live),
                     mib(sections),
                     mib(answers),
                 )?;
@@ -250,7 +264,7 @@ impl Soak {
         &self,
         driven: &Driven,
         others: Option<&Others>,
-        memory: &Memory,
+        memory: &Watched,
     ) -> anyhow::Result<()> {
         let mut out = io::stdout();
         if let Some(Others { pushes, damaged, unread }) = others {
@@ -260,20 +274,29 @@ impl Soak {
                  not read"
             )?;
         }
-        let memory = memory
-            .growth()
-            .context("the soak was too short to compare memory: give more --minutes")?;
+        let growths = memory.rest.growth().zip(memory.resident.growth());
+        let (memory, resident) =
+            growths.context("the soak was too short to compare memory: give more --minutes")?;
         let growth = memory.percent();
         writeln!(
             out,
-            "{} steps in {} rounds of {} sessions, every image as in its first round; memory without sections and answers {:.1} MiB in the \
-             second sixth of the time, at most {:.1} MiB in a later one ({growth:+.2} %), medians; {:.1} MiB at most",
+            "{} steps in {} rounds of {} sessions, every image as in its first round; blocks in use without sections and answers \
+             {:.1} MiB in the second sixth of the time, at most {:.1} MiB in a later one ({growth:+.2} %), medians; {:.1} MiB \
+             at most",
             driven.steps,
             driven.rounds,
             self.sessions,
             mib(memory.early),
             mib(memory.later),
             mib(memory.most),
+        )?;
+        writeln!(
+            out,
+            "all memory in RAM {:.1} MiB in the second sixth, at most {:.1} MiB in a later one ({:+.2} %), medians; {:.1} MiB at most",
+            mib(resident.early),
+            mib(resident.later),
+            resident.percent(),
+            mib(resident.most),
         )?;
         // Without any memory at first it is no number.
         if growth.is_nan() || growth > self.growth {

@@ -9,6 +9,7 @@ use wildcity_protocol::limits as protocol;
 use wildcity_session::limits as session;
 use wildcity_sim::limits as sim;
 
+use crate::cost_table::{Cost, Page, cost};
 use crate::limits;
 
 /// Bytes of JSON in memory for each byte of its text: `[0],` takes 4 bytes as text, and a list with
@@ -17,30 +18,6 @@ const PARSED: u64 = 48;
 
 /// Bytes of a step of an actor in a record.
 const ACTOR_LINE_BYTES: u64 = 200;
-
-/// What one message or request may cost.
-struct Cost {
-    /// Type of the message, or method and path of the route.
-    of: &'static str,
-    /// Bytes of memory, in addition to what its session or the server has reserved before.
-    memory_bytes: u64,
-    /// Longest time of a processor.
-    time: Duration,
-    /// Bytes that are written to the disk.
-    disk_bytes: u64,
-    /// What bounds it, in a few words.
-    why: &'static str,
-}
-
-const fn cost(
-    of: &'static str,
-    memory_bytes: u64,
-    time: Duration,
-    disk_bytes: u64,
-    why: &'static str,
-) -> Cost {
-    Cost { of, memory_bytes, time, disk_bytes, why }
-}
 
 const NONE: Duration = Duration::ZERO;
 const MESSAGE: u64 = protocol::INBOUND_MESSAGE_BYTES as u64;
@@ -139,48 +116,30 @@ const ROUTES: [Cost; 35] = [
     cost("DELETE /v1/uploads/{id}", 0, NONE, 0, "an upload"),
 ];
 
-/// The page of the documentation.
-fn page() -> String {
-    let mut text = String::from(
-        "<!-- Generated from src/server/routes/costs.rs: WILDCITY_BLESS=1 cargo test -p wildcity-server --lib costs -->\n\n\
-         # Costs\n\n\
-         The most that one message or one request may cost, from the constants of the code. Memory is in addition to what \
-         the session or the server has reserved before; a time is that of a processor, off the threads that answer.\n",
-    );
-    let mib = |bytes: u64| (bytes as f64 / MIB as f64 * 10.0).round() / 10.0;
-    for (title, costs) in [("Messages", &MESSAGES[..]), ("Routes", &ROUTES[..])] {
-        let head = "| of | memory, MiB | time, s | disk, MiB | bound by |\n|---|---|---|---|---|\n";
-        text.push_str(&format!("\n## {title}\n\n{head}"));
-        for Cost { of, memory_bytes, time, disk_bytes, why } in costs {
-            let memory = mib(*memory_bytes);
-            let disk = mib(*disk_bytes);
-            let seconds = time.as_secs();
-            text.push_str(&format!("| `{of}` | {memory} | {seconds} | {disk} | {why} |\n"));
-        }
+fn page() -> Page {
+    Page {
+        from: "src/server/routes/costs.rs",
+        test: "-p wildcity-server --lib costs",
+        title: "Costs",
+        introduction: "The most that one message or one request may cost, from the constants of the code. Memory is in \
+            addition to what the session or the server has reserved before; a time is that of a processor, off the threads \
+            that answer.",
+        tables: vec![("Messages", &MESSAGES), ("Routes", &ROUTES)],
     }
-    text
 }
 
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeSet;
-    use std::fs;
-    use std::path::Path;
 
     use super::*;
+    use crate::generated;
     use crate::routes::table;
 
     #[test]
     fn the_page_is_that_of_the_code() {
-        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/reference/costs.md");
-        if std::env::var_os("WILDCITY_BLESS").is_some_and(|value| value == "1") {
-            fs::write(path, page()).unwrap();
-            return;
-        }
-        assert!(
-            fs::read_to_string(path).unwrap() == page(),
-            "write it again with WILDCITY_BLESS=1"
-        );
+        let page = page();
+        generated::check("docs/reference/costs.md", &page.text(), page.test);
     }
 
     #[test]

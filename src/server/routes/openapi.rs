@@ -23,7 +23,6 @@ mod tests {
     use crate::auth::{Access, Role};
 
     use super::super::table::{self, Content, Kind, Method, Operation, Parameter};
-    use super::*;
 
     fn protocol() -> PathBuf {
         Path::new(env!("CARGO_MANIFEST_DIR")).join("../../protocol")
@@ -237,14 +236,8 @@ mod tests {
     #[test]
     fn the_document_is_that_of_the_routes() {
         let text = format!("{:#}\n", document());
-        if std::env::var_os("WILDCITY_BLESS").is_some_and(|value| value == "1") {
-            fs::write(protocol().join("openapi.json"), &text).unwrap();
-            return;
-        }
-        assert!(
-            text == DOCUMENT,
-            "write it again: WILDCITY_BLESS=1 cargo test -p wildcity-server --lib openapi"
-        );
+        let test = "-p wildcity-server --lib openapi";
+        crate::generated::check("protocol/openapi.json", &text, test);
     }
 
     #[test]

@@ -1,13 +1,18 @@
 //! Runs tasks in the background, one at a time. Only the latest task waits; a new one replaces it.
+//! The one that runs can ask whether its owner has ended.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
 use parking_lot::Mutex;
 
 /// Runs one task after the other in the background; its owner never waits for them.
 #[derive(Debug, Default)]
-pub(crate) struct LatestTask(Arc<Mutex<State>>);
+pub(crate) struct LatestTask {
+    state: Arc<Mutex<State>>,
+    has_ended: Arc<AtomicBool>,
+}
 
 #[derive(Default)]
 struct State {
@@ -16,20 +21,22 @@ struct State {
     next: Option<Task>,
 }
 
-type Task = Box<dyn FnOnce() + Send>;
+/// Gets what tells whether its owner still wants it.
+type Task = Box<dyn FnOnce(&dyn Fn() -> bool) + Send>;
 
 impl LatestTask {
     /// Runs a task soon, instead of a task that still waits.
-    pub(crate) fn submit(&self, task: impl FnOnce() + Send + 'static) {
+    pub(crate) fn submit(&self, task: impl FnOnce(&dyn Fn() -> bool) + Send + 'static) {
         let replaced = {
-            let mut state = self.0.lock();
+            let mut state = self.state.lock();
             // The flag changes only under the lock under which `next` is looked at: a task that
             // waits always has a thread that will take it.
             if !state.running {
                 state.running = true;
-                let shared = self.0.clone();
+                let shared = self.state.clone();
+                let has_ended = self.has_ended.clone();
                 // The end of the thread is not awaited.
-                drop(tokio::task::spawn_blocking(move || run_all(&shared)));
+                drop(tokio::task::spawn_blocking(move || run_all(&shared, &has_ended)));
             }
             state.next.replace(Box::new(task))
         };
@@ -40,14 +47,16 @@ impl LatestTask {
 
 impl Drop for LatestTask {
     fn drop(&mut self) {
-        // The owner has ended, so the waiting task has no use.
+        // The owner has ended, so neither the running task nor the waiting one has any use.
+        self.has_ended.store(true, Relaxed);
         // Bound to a name, so that it is dropped after the lock.
-        let _next = self.0.lock().next.take();
+        let _next = self.state.lock().next.take();
     }
 }
 
 /// Runs tasks until none waits.
-fn run_all(shared: &Mutex<State>) {
+fn run_all(shared: &Mutex<State>, has_ended: &AtomicBool) {
+    let is_wanted = || !has_ended.load(Relaxed);
     loop {
         let next = {
             let mut state = shared.lock();
@@ -57,7 +66,7 @@ fn run_all(shared: &Mutex<State>) {
         };
         let Some(task) = next else { return };
         // A panic is logged where it happens, and the next task runs all the same.
-        let _panic = catch_unwind(AssertUnwindSafe(task));
+        let _panic = catch_unwind(AssertUnwindSafe(|| task(&is_wanted)));
     }
 }
 
@@ -78,7 +87,7 @@ mod tests {
         let (first_started, wait_for_first) = channel();
         let (release_first, wait_for_release) = channel();
         let (report, reported) = channel();
-        tasks.submit(move || {
+        tasks.submit(move |_| {
             first_started.send(()).unwrap();
             wait_for_release.recv().unwrap();
             panic!("this panic is part of the test");
@@ -86,7 +95,7 @@ mod tests {
         wait_for_first.recv().unwrap();
         for number in 0..1000 {
             let report = report.clone();
-            tasks.submit(move || report.send(number).unwrap());
+            tasks.submit(move |_| report.send(number).unwrap());
         }
         assert!(reported.try_recv().is_err(), "the first task still runs");
         release_first.send(()).unwrap();
@@ -94,5 +103,22 @@ mod tests {
         assert_eq!(reported.recv().unwrap(), 999);
         drop(report);
         assert!(reported.recv().is_err(), "no other task was kept");
+    }
+
+    #[tokio::test]
+    async fn a_task_learns_that_its_owner_has_ended() {
+        let tasks = LatestTask::default();
+        let (report, reported) = channel();
+        tasks.submit(move |is_wanted| {
+            report.send(is_wanted()).unwrap();
+            while is_wanted() {
+                std::thread::sleep(std::time::Duration::from_millis(1));
+            }
+            report.send(is_wanted()).unwrap();
+        });
+        assert!(reported.recv().unwrap());
+        drop(tasks);
+        let wait = std::time::Duration::from_secs(10);
+        assert!(!reported.recv_timeout(wait).unwrap());
     }
 }

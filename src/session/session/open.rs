@@ -22,7 +22,9 @@ use wildcity_scene::{Manifest, ProfileOverrides, RenderProfile, Trajectory};
 use wildcity_sim::Dynamics;
 use wildcity_sim::scenario::Scenario;
 use wildcity_sim::traffic::EgoBox;
-use wildcity_twin::residency::{FrameBytes, Reservation, Resident, RigExtent, Urgency};
+use wildcity_twin::residency::{
+    FrameBytes, Reservation, Resident, RigExtent, SceneBytes, Urgency, Viewpoint,
+};
 
 use super::Session;
 use crate::blocking::run_blocking;
@@ -179,12 +181,6 @@ impl Session {
         state: EpisodeState,
     ) -> Self {
         let dt_us = settings.dt_us;
-        if reservation.views_at_once() == 1 && settings.layout.cameras().len() > 1 {
-            tracing::info!(
-                session = name,
-                "memory is short: frames are drawn camera by camera, which takes longer"
-            );
-        }
         let session = Self {
             number: engine.new_session_number(),
             engine,
@@ -206,10 +202,44 @@ impl Session {
             // Assume real time until a step shows the agent's pace.
             frame_interval: Duration::from_micros(dt_us.unsigned_abs()),
         };
+        session.log_views_at_once(Viewpoint::MAX);
         // The first frame is likely to be where the ego is: load that while the agent prepares.
         let here = session.state.episode.world_from_rig();
         session.prefetch_at(vec![(Urgency::Imminent, here)]);
         session
+    }
+
+    /// Reserves memory for another version in place of that of its own.
+    ///
+    /// # Errors
+    /// Its worst frame does not fit; nothing has changed then.
+    pub(super) fn exchange_memory(
+        &mut self,
+        resident: Arc<Resident>,
+        scenes: SceneBytes,
+        frame: FrameBytes,
+    ) -> Result<(), SessionError> {
+        let before = self.reservation.views_at_once();
+        self.reservation.exchange(resident, scenes, frame)?;
+        self.log_views_at_once(before);
+        Ok(())
+    }
+
+    /// Says that frames are drawn camera by camera, or no longer, if that has changed.
+    fn log_views_at_once(&self, before: usize) {
+        let now = self.reservation.views_at_once();
+        if now == before || self.settings.layout.cameras().len() == 1 {
+            return;
+        }
+        let session = &self.name;
+        if now == 1 {
+            tracing::info!(
+                session,
+                "memory is short: frames are drawn camera by camera, which takes longer"
+            );
+        } else {
+            tracing::info!(session, "frames are drawn with all cameras at once again");
+        }
     }
 
     /// Number of the twin's latest version, if it is newer than the session's own. It is known
@@ -260,7 +290,7 @@ impl Session {
         let frame = frame_bytes(&self.engine, &self.settings.layout, &version);
         let references = load_references(&self.engine, &resident, &self.settings).await?;
         // There is no `await` from here on, so that a dropped future cannot leave half a switch.
-        self.reservation.exchange(resident, scenes, frame)?;
+        self.exchange_memory(resident, scenes, frame)?;
         self.version = version.with_references(references);
         self.version_switched = true;
         // Where the ego is comes first, because the next frame is there.

@@ -56,12 +56,12 @@ impl Pending {
             // A file that was just created goes again.
             if let Some((scenes, frame)) = new.memory
                 && let Err(error) =
-                    session.reservation.exchange(new.version.resident.clone(), scenes, frame)
+                    session.exchange_memory(new.version.resident.clone(), scenes, frame)
             {
                 if let Some(created) = created {
                     created.recorder.discard();
                 }
-                return Err(error.into());
+                return Err(error);
             }
             session.version = new.version;
             session.end_recording(Outcome::Completed).await;

@@ -67,7 +67,7 @@ impl Session {
         // the disk.
         let velocity_mps = self.state.episode.ego().velocity_m_s();
         let onwards = [1.0, 2.0].map(|s| Pose { position_m: here_m + s * velocity_mps, ..here });
-        self.prefetch_task.submit(move || {
+        self.prefetch_task.submit(move |is_wanted| {
             // Poses of both lists, before `places` becomes viewpoints.
             let is_near = |pose: &&Pose| pose.position_m.distance(here_m) < limits::SOLIDS_AHEAD_M;
             let near: Vec<Pose> = places
@@ -85,7 +85,7 @@ impl Session {
             if let Some(solids) = solids {
                 for pose in near {
                     // A fault of the store is an error of the step that needs it.
-                    let _unread = solids.read_around(&pose);
+                    let _unread = solids.read_around(&pose, is_wanted);
                 }
             }
         });

@@ -15,7 +15,7 @@ use wildcity_sim::{Command, Dynamics, Ego, Ground};
 
 use super::Session;
 use super::pending::{EpisodeFile, NewEpisode, Pending};
-use crate::blocking::{run_blocking, run_until};
+use crate::blocking::{Stop, run_blocking, run_until};
 use crate::contact::TwinSolids;
 use crate::engine::render_queue::{FrameCost, Scratch};
 use crate::episode::{Episode, EpisodeSummary, Outcome};
@@ -201,7 +201,7 @@ impl Session {
             let ground = Ground::from_drives(drives).with_boxes(index.boxes()).and_lanes(lanes);
             let (episode, egos) = now.followed(&command, steps, &ground, terminate)?;
             stop.refusal()?;
-            let met = meetings(&now, &egos, solids.as_ref(), &index, dt_us)?;
+            let met = meetings(&now, &egos, solids.as_ref(), &index, dt_us, stop)?;
             stop.refusal()?;
             let traffic = traffic
                 .map(|traffic| traffic.followed(now.ego(), &egos, dt_us, &met.contacts, stop))
@@ -491,10 +491,11 @@ fn meetings(
     solids: Option<&TwinSolids>,
     index: &SpatialIndex,
     dt_us: i64,
+    stop: &Stop,
 ) -> Result<Meetings, SessionError> {
     let begin_us = now.time_us();
     let contacts = match solids {
-        Some(solids) => solids.contacts(now.ego(), egos, begin_us, dt_us)?,
+        Some(solids) => solids.contacts(now.ego(), egos, begin_us, dt_us, stop)?,
         None => vec![Vec::new(); egos.len()],
     };
     // An ego that has left the area once is not looked for again.

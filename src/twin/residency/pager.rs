@@ -257,10 +257,10 @@ impl Shared {
         // notification is lost.
         while !state.closed {
             match state.requests.next(Instant::now()) {
-                NextLoad::Load { id, section, version } => {
+                NextLoad::Load { id, section, version, request } => {
                     // Reading takes milliseconds to seconds, and the other loaders need the lock.
                     drop(state);
-                    let notifications = self.load(id, section, &version);
+                    let notifications = self.load(id, request, section, &version);
                     // The others are woken before the callbacks run, which may take long: a
                     // finished load may have made sections of other requests loadable.
                     self.work.notify_all();
@@ -280,10 +280,21 @@ impl Shared {
         }
     }
 
-    fn load(&self, id: SlotId, section: SectionRef, version: &Version) -> Notifications {
+    fn load(
+        &self,
+        id: SlotId,
+        request: u64,
+        section: SectionRef,
+        version: &Version,
+    ) -> Notifications {
         let chunk = &version.manifest.chunks[section.chunk];
         let section = &chunk.sections[section.section];
-        let reading = self.reading.begin(section.bytes.into());
+        let is_wanted = || self.state.lock().requests.is_wanted(id, request);
+        let Some(reading) = self.reading.begin(section.bytes.into(), &is_wanted) else {
+            // A request since then finds it absent.
+            self.state.lock().requests.table.load_failed(id);
+            return Notifications::new();
+        };
         // Without the wait: prefetching looks as far ahead as loads take long.
         let began = Instant::now();
         // A defect in loading one section must not end the thread that loads all of them.

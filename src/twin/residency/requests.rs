@@ -96,6 +96,8 @@ pub(super) enum NextLoad {
         id: SlotId,
         section: SectionRef,
         version: Arc<Version>,
+        /// Number of the request that it is loaded for.
+        request: u64,
     },
     /// Wait for a notification, at most until the given time.
     Wait(Option<Instant>),
@@ -320,7 +322,7 @@ impl<C> Requests<C> {
             };
             match self.table.reserve(id, *requester) {
                 Some(evicted) => {
-                    found = Some((id, *section, requested.version.clone(), evicted));
+                    found = Some((*key, *section, requested.version.clone(), evicted));
                     break;
                 }
                 // No younger frame may take the memory that this one waits for.
@@ -340,7 +342,7 @@ impl<C> Requests<C> {
         });
         self.forget_unrequested_failures();
 
-        let Some((id, section, version, evicted)) = found else {
+        let Some((QueueKey { id, request, .. }, section, version, evicted)) = found else {
             return NextLoad::Wait(next_retry);
         };
         self.stats.evictions += evicted.len() as u64;
@@ -348,7 +350,15 @@ impl<C> Requests<C> {
         if self.failures.contains_key(&id) {
             self.stats.retries += 1;
         }
-        NextLoad::Load { id, section, version }
+        NextLoad::Load { id, section, version, request }
+    }
+
+    /// Whether a section that is being loaded for a request is needed by that one or by another.
+    pub(super) fn is_wanted(&self, id: SlotId, request: u64) -> bool {
+        self.requests.contains_key(&request)
+            || !self.table.waiters(id).is_empty()
+            // The whole queue, but only for a request that was cancelled.
+            || self.queue.keys().any(|key| key.id == id)
     }
 
     /// A section was evicted that younger frames need: it is queued again for them.

@@ -96,6 +96,9 @@ impl Resident {
     ) -> Result<Reservation, ResidencyError> {
         let (claim, is_by_view) =
             scenes.admit(self, frame, |budget, claim| budget.reserve(claim))?;
+        if is_by_view {
+            self.shared.pager.count_by_camera();
+        }
         Ok(Reservation { claim, is_by_view, prefetcher: Arc::new(Prefetcher::new(self.clone())) })
     }
 }
@@ -116,7 +119,6 @@ impl SceneBytes {
         };
         let by_view = claim(resident, bytes, frame);
         change_budget(resident, |budget| change(budget, &by_view))?;
-        resident.shared.pager.count_by_camera();
         Ok((by_view, true))
     }
 }
@@ -136,6 +138,9 @@ impl Reservation {
         let old = &self.claim;
         let exchange = |budget: &mut Budget, new: &Claim| budget.exchange(old, new);
         let (claim, is_by_view) = scenes.admit(&resident, frame, exchange)?;
+        if is_by_view && !self.is_by_view {
+            resident.shared.pager.count_by_camera();
+        }
         self.prefetcher.end();
         self.claim = claim;
         self.is_by_view = is_by_view;

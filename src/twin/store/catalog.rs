@@ -303,6 +303,11 @@ impl Catalog {
         })
     }
 
+    /// Bytes of memory that sections have returned and the next ones take.
+    pub fn free_page_bytes(&self) -> u64 {
+        self.pages.free_bytes() as u64
+    }
+
     /// Reads the bytes of a section, and decodes them.
     fn read_section<T>(
         &self,

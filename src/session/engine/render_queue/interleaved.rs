@@ -2,9 +2,11 @@
 //!
 //! All shared state is behind one lock, so that an order of the critical sections is all that
 //! threads can differ in. The threads of this simulation are those of the queue as far as the lock
-//! goes: each takes it once, does what [`State`] says, and sleeps until it is woken.
+//! goes: each takes it once, does what [`Frames`] says, and sleeps until [`Frames`] wakes it.
 
+use std::cell::Cell;
 use std::collections::BTreeMap;
+use std::rc::Rc;
 
 use wildcity_scene::random::Random;
 
@@ -21,8 +23,14 @@ const SESSIONS: usize = 6;
 /// What a render thread does.
 enum Doing {
     Awake,
-    Asleep,
-    Rendering { frame: u64, cost: FrameCost, until: Instant },
+    /// Since this many notifications.
+    Asleep(u64),
+    Ended,
+    Rendering {
+        frame: u64,
+        cost: FrameCost,
+        until: Instant,
+    },
 }
 
 #[derive(Clone, Copy)]
@@ -31,16 +39,27 @@ struct Frame {
     deadline: Instant,
 }
 
+/// Counts the notifications: a thread is awake if there was one after it fell asleep.
+#[derive(Default)]
+struct Notifications(Cell<u64>);
+
+impl Signal for Notifications {
+    fn wake_all(&self) {
+        self.0.set(self.0.get() + 1);
+    }
+}
+
 struct Simulation {
     random: Random,
     now: Instant,
-    state: State<Frame>,
+    frames: Rc<Frames<Frame, Notifications>>,
     threads: [(Lane, Doing); 3],
     /// The frame that each session waits for.
     waiting: [Option<u64>; SESSIONS],
     /// What became of each frame: whether it was rendered.
     answered: BTreeMap<u64, bool>,
-    frames: u64,
+    asked: u64,
+    is_closed: bool,
 }
 
 impl Simulation {
@@ -50,38 +69,41 @@ impl Simulation {
         Self {
             random: Random::new(seed, "order", 0),
             now: Instant::now(),
-            state: State::new(),
+            frames: Rc::new(Frames::new(Notifications::default())),
             threads,
             waiting: [None; SESSIONS],
             answered: BTreeMap::new(),
-            frames: 0,
+            asked: 0,
+            is_closed: false,
         }
     }
 
-    fn wake(&mut self) {
-        for (_, doing) in &mut self.threads {
-            if matches!(doing, Doing::Asleep) {
-                *doing = Doing::Awake;
-            }
-        }
+    /// Whether a thread sleeps, and nothing has woken it.
+    fn is_asleep(&self, thread: usize) -> bool {
+        let notifications = self.frames.changed.0.get();
+        matches!(self.threads[thread].1, Doing::Asleep(since) if since == notifications)
     }
 
-    /// A session asks for a frame, if it does not wait for one.
+    /// A session asks for a frame, if it does not wait for one. A closed queue has no users.
     fn ask(&mut self, session: usize) {
-        if self.waiting[session].is_some() {
+        if self.waiting[session].is_some() || self.is_closed {
             return;
         }
         let is_large = self.random.below(3) == 0;
         let samples = if is_large { 2 * limits::LARGE_SAMPLES } else { 100 };
         let cost = FrameCost { session: session as u64, samples };
         let deadline = self.now + Duration::from_millis(1 + self.random.below(40) as u64);
-        let number = self.frames;
-        self.frames += 1;
+        let number = self.asked;
+        self.asked += 1;
         let frame = Frame { number, deadline };
-        if self.state.add(cost, frame, self.now, deadline).is_ok() {
+        if self.frames.add(cost, frame, self.now, deadline, |_| ()).is_ok() {
             self.waiting[session] = Some(number);
-            self.wake();
         }
+    }
+
+    fn close(&mut self) {
+        self.is_closed = true;
+        self.frames.close();
     }
 
     fn answer(&mut self, frame: u64, is_rendered: bool) {
@@ -93,47 +115,67 @@ impl Simulation {
     /// A render thread has its turn.
     fn turn(&mut self, thread: usize) {
         let lane = self.threads[thread].0;
+        if self.is_asleep(thread) {
+            return;
+        }
         match self.threads[thread].1 {
-            Doing::Asleep => {}
+            Doing::Ended => {}
             Doing::Rendering { until, .. } if until > self.now => {}
             Doing::Rendering { frame, cost, .. } => {
                 if is_large(cost) {
-                    self.state.rendered(cost, Duration::from_millis(3));
+                    self.frames.state.lock().rendered(cost, Duration::from_millis(3));
                 }
                 self.answer(frame, true);
                 self.threads[thread].1 = Doing::Awake;
             }
-            Doing::Awake => match self.state.next(lane, self.now, |frame| frame.deadline) {
-                Next::Ends => unreachable!("it is open"),
-                Next::Waits => self.threads[thread].1 = Doing::Asleep,
-                Next::Drops(frame) => {
-                    // A large frame takes 3 ms, and the estimate of that is exact here.
-                    let left = frame.deadline.saturating_duration_since(self.now);
-                    assert!(left <= Duration::from_millis(4), "dropped with {left:?} left");
-                    self.answer(frame.number, false);
-                }
-                Next::Renders { cost, job, wakes } => {
-                    assert!(lane == Lane::Main || !is_large(cost), "a large frame beside another");
-                    assert!(self.now < job.deadline, "a frame begins after its deadline");
-                    if wakes {
-                        self.wake();
-                    }
-                    let took = Duration::from_millis(if is_large(cost) { 3 } else { 1 });
-                    let until = self.now + took;
-                    self.threads[thread].1 = Doing::Rendering { frame: job.number, cost, until };
-                }
-            },
+            Doing::Awake | Doing::Asleep(_) => {
+                self.threads[thread].1 = Doing::Awake;
+                self.look(thread, lane);
+            }
         }
     }
 
-    /// No thread sleeps while there is a frame for it.
-    fn check(&mut self) {
-        let is_asleep = |(_, doing): &(Lane, Doing)| matches!(doing, Doing::Asleep);
-        let all_sleep = self.threads.iter().all(is_asleep);
-        assert!(!all_sleep || self.state.queue.len() == 0, "a frame waits, and all threads sleep");
-        let has_large = self.state.rendering > 0;
-        if has_large && is_asleep(&self.threads[2]) {
-            let small = self.state.queue.pop(limits::LARGE_SAMPLES);
+    /// A render thread looks at the frames.
+    fn look(&mut self, thread: usize, lane: Lane) {
+        let frames = self.frames.clone();
+        match frames.look(frames.state.lock(), lane, self.now, |frame| frame.deadline) {
+            Looked::Ends => {
+                assert!(self.is_closed, "it is open");
+                self.threads[thread].1 = Doing::Ended;
+            }
+            // The lock is held until it sleeps.
+            Looked::Waits(_locked) => {
+                self.threads[thread].1 = Doing::Asleep(frames.changed.0.get());
+            }
+            Looked::Drops(frame) => {
+                // A large frame takes 3 ms, and the estimate of that is exact here.
+                let left = frame.deadline.saturating_duration_since(self.now);
+                assert!(left <= Duration::from_millis(4), "dropped with {left:?} left");
+                self.answer(frame.number, false);
+            }
+            Looked::Renders { cost, job } => {
+                assert!(!self.is_closed, "a frame begins after the end");
+                assert!(lane == Lane::Main || !is_large(cost), "a large frame beside another");
+                assert!(self.now < job.deadline, "a frame begins after its deadline");
+                let took = Duration::from_millis(if is_large(cost) { 3 } else { 1 });
+                let until = self.now + took;
+                self.threads[thread].1 = Doing::Rendering { frame: job.number, cost, until };
+            }
+        }
+    }
+
+    /// No thread sleeps while there is a frame for it, or after the end.
+    fn check(&self) {
+        let asleep = [0, 1, 2].map(|thread| self.is_asleep(thread));
+        if self.is_closed {
+            assert_eq!(asleep, [false; 3], "a thread sleeps, and the queue is closed");
+            return;
+        }
+        let mut state = self.frames.state.lock();
+        let all_sleep = asleep == [true; 3];
+        assert!(!all_sleep || state.queue.len() == 0, "a frame waits, and all threads sleep");
+        if state.rendering > 0 && asleep[2] {
+            let small = state.queue.pop(limits::LARGE_SAMPLES);
             assert!(small.is_none(), "a small frame waits for a large one");
         }
     }
@@ -141,10 +183,15 @@ impl Simulation {
 
 #[test]
 fn no_order_of_threads_loses_a_frame() {
-    let [mut rendered, mut frames] = [0, 0];
+    let [mut rendered, mut frames, mut dropped] = [0, 0, 0];
     for seed in 0..ORDERS {
         let mut simulation = Simulation::new(seed);
+        // The queue of every other order is closed, at any time.
+        let close_at = (seed % 2 == 0).then(|| simulation.random.below(TURNS / 2));
         for turn in 0..TURNS {
+            if close_at == Some(turn) {
+                simulation.close();
+            }
             // No session asks at the end, so that all frames are answered.
             let choices = if turn < TURNS / 2 { 3 + SESSIONS } else { 3 };
             match simulation.random.below(choices) {
@@ -155,10 +202,20 @@ fn no_order_of_threads_loses_a_frame() {
             simulation.now += Duration::from_micros(300);
         }
         let left: Vec<_> = simulation.waiting.iter().flatten().collect();
-        assert!(left.is_empty(), "seed {seed}: frames {left:?} have no answer");
-        assert_eq!(simulation.state.rendering, 0, "seed {seed}: samples are counted for good");
+        let state = simulation.frames.state.lock();
+        if simulation.is_closed {
+            let ended = |(_, doing): &(Lane, Doing)| matches!(doing, Doing::Ended);
+            assert!(simulation.threads.iter().all(ended), "seed {seed}: a thread has no end");
+            // They are dropped with the queue, which answers their sessions.
+            assert_eq!(left.len(), state.queue.len(), "seed {seed}: frames {left:?} are lost");
+            dropped += left.len();
+        } else {
+            assert!(left.is_empty(), "seed {seed}: frames {left:?} have no answer");
+        }
+        assert_eq!(state.rendering, 0, "seed {seed}: samples are counted for good");
         rendered += simulation.answered.values().filter(|&&is_rendered| is_rendered).count();
         frames += simulation.answered.len();
     }
     assert!(rendered > frames / 2, "{rendered} of {frames} frames were rendered");
+    assert!(dropped > 100, "{dropped} frames waited at the end");
 }

@@ -24,7 +24,7 @@ use std::sync::Arc;
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use parking_lot::{Condvar, Mutex};
+use parking_lot::{Condvar, Mutex, MutexGuard};
 use tokio::sync::oneshot;
 use tokio::time::{Instant, timeout_at};
 use tracing::{Span, debug_span};
@@ -53,13 +53,30 @@ pub(crate) struct RenderQueue {
 
 struct Shared {
     backend: Arc<dyn Backend>,
-    state: Mutex<State>,
-    /// Signalled when a frame arrives, when a large frame is started, and when the queue is
-    /// dropped.
-    changed: Condvar,
+    frames: Frames<Job, Condvar>,
 }
 
-struct State<T = Job> {
+/// The frames that wait, and what wakes the threads that wait for them. A test has another kind of
+/// frames and another signal, and otherwise this code: a notification that is missing here is
+/// missing there.
+struct Frames<T, S> {
+    state: Mutex<State<T>>,
+    /// Signalled when a frame arrives, when a large frame is started, and when the queue is closed.
+    changed: S,
+}
+
+/// Wakes all threads that wait for a change.
+trait Signal {
+    fn wake_all(&self);
+}
+
+impl Signal for Condvar {
+    fn wake_all(&self) {
+        self.notify_all();
+    }
+}
+
+struct State<T> {
     queue: FairQueue<T>,
     is_closed: bool,
     /// Samples of the large frames that are being rendered.
@@ -70,6 +87,20 @@ struct State<T = Job> {
     /// Whether there is a thread for small frames.
     has_side_thread: bool,
     threads: Vec<JoinHandle<()>>,
+}
+
+/// What a render thread does after it has looked at the frames.
+enum Looked<'a, T> {
+    /// The queue is closed.
+    Ends,
+    /// It sleeps until it is woken; the lock is released when it does.
+    Waits(MutexGuard<'a, State<T>>),
+    /// It drops a frame that cannot be ready in time.
+    Drops(T),
+    Renders {
+        cost: FrameCost,
+        job: T,
+    },
 }
 
 /// What a render thread does next.
@@ -100,11 +131,10 @@ impl RenderQueue {
     pub(crate) fn start(backend: Arc<dyn Backend>) -> Result<Self, SessionError> {
         // A backend that reports 0 still needs a thread that calls it.
         let threads = backend.frames_in_flight().max(1);
-        let state = Mutex::new(State::new());
-        let shared = Shared { backend, state, changed: Condvar::new() };
+        let shared = Shared { backend, frames: Frames::new(Condvar::new()) };
         let queue = Self { shared: Arc::new(shared) };
         for number in 0..threads {
-            let mut state = queue.shared.state.lock();
+            let mut state = queue.shared.frames.state.lock();
             let name = format!("render-{number}");
             queue.shared.clone().start_thread(&mut state, name, Lane::Main)?;
         }
@@ -118,7 +148,7 @@ impl RenderQueue {
 
     /// Jobs that wait for a render thread.
     pub(crate) fn len(&self) -> usize {
-        self.shared.state.lock().queue.len()
+        self.shared.frames.state.lock().queue.len()
     }
 
     /// Runs `work` on a render thread. Returns its result and how long it was queued.
@@ -167,13 +197,7 @@ impl RenderQueue {
 
 impl Drop for RenderQueue {
     fn drop(&mut self) {
-        let mut state = self.shared.state.lock();
-        state.is_closed = true;
-        // The threads need the lock to see that the queue is closed, so it is not held while they
-        // end.
-        let threads = std::mem::take(&mut state.threads);
-        drop(state);
-        self.shared.changed.notify_all();
+        let threads = self.shared.frames.close();
         // A driver that hangs must not keep the process alive.
         let deadline = Instant::now() + limits::LAST_FRAME_TIMEOUT;
         for thread in threads {
@@ -192,7 +216,7 @@ impl Drop for RenderQueue {
 impl Shared {
     fn start_thread(
         self: Arc<Self>,
-        state: &mut State,
+        state: &mut State<Job>,
         name: String,
         lane: Lane,
     ) -> Result<(), SessionError> {
@@ -206,20 +230,17 @@ impl Shared {
     }
 
     fn add(self: &Arc<Self>, cost: FrameCost, job: Job) -> Result<(), SessionError> {
-        let mut state = self.state.lock();
         let deadline = job.deadline;
-        state.add(cost, job, Instant::now(), deadline)?;
-        // The thread is only useful if the backend can render two frames at once, and only needed
-        // once there is a large frame.
-        let is_needed = state.rendering > 0 && !state.has_side_thread;
-        if is_needed && self.backend.renders_beside() {
-            // Without the thread, small frames wait for the large one.
-            let name = "render-side".to_owned();
-            state.has_side_thread = self.clone().start_thread(&mut state, name, Lane::Side).is_ok();
-        }
-        drop(state);
-        self.changed.notify_all();
-        Ok(())
+        self.frames.add(cost, job, Instant::now(), deadline, |state| {
+            // The thread is only useful if the backend can render two frames at once, and only
+            // needed once there is a large frame.
+            let is_needed = state.rendering > 0 && !state.has_side_thread;
+            if is_needed && self.backend.renders_beside() {
+                // Without the thread, small frames wait for the large one.
+                let name = "render-side".to_owned();
+                state.has_side_thread = self.clone().start_thread(state, name, Lane::Side).is_ok();
+            }
+        })
     }
 
     /// The body of a render thread: runs one job after the other until the queue is closed.
@@ -231,32 +252,93 @@ impl Shared {
             // After the answer, which does not wait for memory to be freed.
             scratch.free_excess();
             if is_large(cost) {
-                self.state.lock().rendered(cost, begun.elapsed());
+                self.frames.state.lock().rendered(cost, begun.elapsed());
             }
         }
     }
 
     /// Waits for the next job of a lane that can be done in time; `None` once the queue is closed.
     fn next(&self, lane: Lane) -> Option<(FrameCost, Job)> {
-        let mut state = self.state.lock();
+        let Frames { state, changed } = &self.frames;
+        let mut locked = state.lock();
         loop {
-            match state.next(lane, Instant::now(), |job| job.deadline) {
-                Next::Ends => return None,
+            match self.frames.look(locked, lane, Instant::now(), |job| job.deadline) {
+                Looked::Ends => return None,
                 // Every change wakes every thread; one that finds nothing for its lane sleeps
                 // again.
-                Next::Waits => self.changed.wait(&mut state),
-                // This answers its session.
-                Next::Drops(job) => drop(job),
-                Next::Renders { cost, job, wakes } => {
-                    // Unlocked first, so that the threads that wake up do not wait for the lock.
-                    drop(state);
-                    if wakes {
-                        self.changed.notify_all();
-                    }
-                    return Some((cost, job));
+                Looked::Waits(mut waiting) => {
+                    changed.wait(&mut waiting);
+                    locked = waiting;
                 }
+                Looked::Drops(job) => {
+                    // This answers its session.
+                    drop(job);
+                    locked = state.lock();
+                }
+                Looked::Renders { cost, job } => return Some((cost, job)),
             }
         }
+    }
+}
+
+impl<T, S: Signal> Frames<T, S> {
+    fn new(changed: S) -> Self {
+        Self { state: Mutex::new(State::new()), changed }
+    }
+
+    /// Adds a frame. `also` changes the state with it.
+    ///
+    /// # Errors
+    /// As [`State::add`].
+    fn add(
+        &self,
+        cost: FrameCost,
+        job: T,
+        now: Instant,
+        deadline: Instant,
+        also: impl FnOnce(&mut State<T>),
+    ) -> Result<(), SessionError> {
+        let mut state = self.state.lock();
+        state.add(cost, job, now, deadline)?;
+        also(&mut state);
+        drop(state);
+        self.changed.wake_all();
+        Ok(())
+    }
+
+    /// What a thread of a lane does, which has the lock.
+    fn look<'a>(
+        &'a self,
+        mut state: MutexGuard<'a, State<T>>,
+        lane: Lane,
+        now: Instant,
+        deadline: impl Fn(&T) -> Instant,
+    ) -> Looked<'a, T> {
+        match state.next(lane, now, deadline) {
+            Next::Ends => Looked::Ends,
+            Next::Waits => Looked::Waits(state),
+            Next::Drops(job) => Looked::Drops(job),
+            Next::Renders { cost, job, wakes } => {
+                // Unlocked first, so that the threads that wake up do not wait for the lock.
+                drop(state);
+                if wakes {
+                    self.changed.wake_all();
+                }
+                Looked::Renders { cost, job }
+            }
+        }
+    }
+
+    /// Closes the queue: all threads end. Returns them.
+    fn close(&self) -> Vec<JoinHandle<()>> {
+        let mut state = self.state.lock();
+        state.is_closed = true;
+        // The threads need the lock to see that the queue is closed, so it is not held while they
+        // end.
+        let threads = std::mem::take(&mut state.threads);
+        drop(state);
+        self.changed.wake_all();
+        threads
     }
 }
 
@@ -272,7 +354,7 @@ impl<T> State<T> {
         }
     }
 
-    /// Adds a frame. Afterwards every thread has to look at the queue.
+    /// Adds a frame, after which every thread has to look at the queue.
     ///
     /// # Errors
     /// [`SessionError::Busy`]: the queue is full, or the frame cannot be ready in time.
