@@ -64,7 +64,7 @@ pub(super) fn command(arguments: impl Iterator<Item = OsString>) -> Option<Exit>
 }
 
 /// A word as a shell reads it.
-fn quoted(word: &str) -> String {
+pub(super) fn quoted(word: &str) -> String {
     let is_plain = |c: char| c.is_ascii_alphanumeric() || "_-./:=@,+%~".contains(c);
     if !word.is_empty() && word.chars().all(is_plain) {
         return word.to_owned();

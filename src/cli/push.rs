@@ -276,7 +276,7 @@ fn print_report(out: &mut impl Write, report: &PushReport) -> io::Result<()> {
             writeln!(io::stderr(), "warning: {}: {warning}", file.name)?;
         }
         for assumed in &file.assumed {
-            writeln!(out, "note        {}: {assumed}", file.name)?;
+            writeln!(io::stderr(), "note: {}: {assumed}", file.name)?;
         }
         let unnamed = file.bad - file.first_bad.len() as u64;
         if unnamed > 0 {

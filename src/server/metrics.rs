@@ -207,7 +207,7 @@ impl Collector for Residency {
             ("prefetches_dropped", "Prefetches without room".to_owned(), stats.prefetches_dropped),
             (
                 "by_camera",
-                "Sessions for which memory was so short that a frame is drawn camera by camera"
+                "Times that a session began to draw frames camera by camera, for lack of memory"
                     .to_owned(),
                 stats.by_camera,
             ),

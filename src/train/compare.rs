@@ -30,23 +30,31 @@ pub struct Advice<'a> {
 /// A difference that few see in two pictures side by side.
 pub const SMALL_LOSS_DB: f64 = 0.5;
 
+impl ComparedRun {
+    /// Whether its images are images: a scene that is none has no PSNR.
+    pub fn is_judged(&self) -> bool {
+        self.held_out_db.is_finite()
+    }
+}
+
 /// Whether no other run is as good in less time, or better in as much.
 pub fn pareto_front(runs: &[ComparedRun]) -> Vec<bool> {
     let is_dominated = |run: &ComparedRun| {
         runs.iter().any(|other| {
-            let [seconds, db] = [other.seconds, other.held_out_db];
-            (seconds < run.seconds && db >= run.held_out_db)
-                || (seconds <= run.seconds && db > run.held_out_db)
+            let db = other.held_out_db;
+            (other.seconds < run.seconds && db >= run.held_out_db)
+                || (other.seconds <= run.seconds && db > run.held_out_db)
         })
     };
-    runs.iter().map(|run| !is_dominated(run)).collect()
+    runs.iter().map(|run| run.is_judged() && !is_dominated(run)).collect()
 }
 
 /// What to use; `None` without any run.
 pub fn advice(runs: &[ComparedRun]) -> Option<Advice<'_>> {
-    let best = runs.iter().max_by(|a, b| a.held_out_db.total_cmp(&b.held_out_db))?;
+    let judged = || runs.iter().filter(|run| run.is_judged());
+    let best = judged().max_by(|a, b| a.held_out_db.total_cmp(&b.held_out_db))?;
     let is_as_good = |run: &&ComparedRun| run.held_out_db >= best.held_out_db - SMALL_LOSS_DB;
-    let quickest = runs.iter().filter(is_as_good).min_by(|a, b| a.seconds.total_cmp(&b.seconds))?;
+    let quickest = judged().filter(is_as_good).min_by(|a, b| a.seconds.total_cmp(&b.seconds))?;
     Some(Advice { best, quick: (quickest.seconds < best.seconds).then_some(quickest) })
 }
 
@@ -72,5 +80,9 @@ mod tests {
         assert_eq!(advice(&runs), Some(Advice { best: &runs[2], quick: Some(&runs[1]) }));
         assert_eq!(advice(&runs[..1]), Some(Advice { best: &runs[0], quick: None }));
         assert_eq!(advice(&[]), None);
+        // A run without a PSNR is neither good nor in the way of others.
+        let runs = [run(1.0, f64::NAN), run(50.0, 25.0)];
+        assert_eq!(advice(&runs).map(|advice| advice.best), Some(&runs[1]));
+        assert_eq!(pareto_front(&runs), [false, true]);
     }
 }

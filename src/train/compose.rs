@@ -83,12 +83,16 @@ const PART: usize = 1 << 12;
 const FEW: usize = 64;
 
 /// The image of a camera, `[height, width, 3]`.
+///
+/// # Panics
+/// The images are not of one size.
 pub fn compose<T: Real>(
     rgb: &[T],
     opacity: &[T],
     background: Background<'_, T>,
     exposure: &Exposure<T>,
 ) -> Vec<T> {
+    assert_eq!(rgb.len(), 3 * opacity.len(), "colours and opacities of as many pixels");
     let mut image = vec![T::zero(); rgb.len()];
     let parts = image.par_chunks_mut(3 * PART).zip(rgb.par_chunks(3 * PART)).enumerate();
     parts.for_each(|(part, (image, rgb))| {
@@ -107,6 +111,9 @@ fn before<T: Real>(rgb: &[T; 3], shows: T, behind: [T; 3]) -> [T; 3] {
 }
 
 /// The derivatives of a loss by all that [`compose`] takes, given those by its image.
+///
+/// # Panics
+/// The images are not of one size.
 pub fn compose_gradient<T: Real>(
     rgb: &[T],
     opacity: &[T],
@@ -114,6 +121,8 @@ pub fn compose_gradient<T: Real>(
     exposure: &Exposure<T>,
     by_image: &[T],
 ) -> ComposedGradient<T> {
+    let lengths = [rgb.len(), by_image.len()];
+    assert_eq!(lengths, [3 * opacity.len(); 2], "colours and opacities of as many pixels");
     let zeros = |of: &[T]| vec![T::zero(); of.len()];
     let [mut by_rgb, mut by_background, mut by_opacity] = [rgb, rgb, opacity].map(zeros);
     let parts = by_rgb

@@ -52,8 +52,18 @@ pub fn scene_db(
     Ok(mean(&Evaluator::new(images, backend).each_db(scene, trainer)?))
 }
 
-/// The mean PSNR of the images that are held out, and the one in the middle of their order, which
-/// is the same for all runs; `None` without any.
+/// What the images that are held out say of a run.
+#[derive(Clone, Debug)]
+pub struct Judged {
+    /// The mean PSNR of those with a pixel that counts.
+    pub mean_db: f64,
+    /// Their number.
+    pub images: usize,
+    /// The one in the middle of their order, which is the same for all runs.
+    pub middle: HeldOut,
+}
+
+/// Judges a run by the images that are held out; `None` without any.
 ///
 /// # Errors
 /// An image cannot be read or drawn.
@@ -61,13 +71,14 @@ pub fn judge(
     trainer: &Trainer,
     images: &dyn TrainingImages,
     backend: &dyn Differentiate,
-) -> Result<Option<(f64, HeldOut)>, TrainError> {
+) -> Result<Option<Judged>, TrainError> {
     let evaluator = Evaluator::new(images, backend);
     let scene = trainer.scene()?;
     let all_db = evaluator.each_db(&scene, trainer)?;
     let Some(mean_db) = mean(&all_db) else { return Ok(None) };
     let (index, psnr_db) = all_db[all_db.len() / 2];
-    Ok(Some((mean_db, evaluator.beside(trainer, &scene, index, psnr_db)?)))
+    let middle = evaluator.beside(trainer, &scene, index, psnr_db)?;
+    Ok(Some(Judged { mean_db, images: all_db.len(), middle }))
 }
 
 /// Up to `most` of the images that are held out, from the one with the lowest PSNR to the one with

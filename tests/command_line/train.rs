@@ -125,6 +125,7 @@ fn settings_are_compared_by_the_same_images() {
     let settings = ["--held-out-every", "5", "--size", "1,0.5", "--steps", "60,20,20"];
     let said = done(dir, &[&fixed[..], &settings, &["--cap", "1000"]].concat());
     assert!(said.contains(" dB in ") && said.contains("wildcity train recorded/round_1"), "{said}");
+    assert!(said.contains("--sky network --held-out-every 5 --out scene.ply --size"), "{said}");
 
     #[derive(serde::Deserialize)]
     struct Run {
@@ -146,6 +147,7 @@ fn settings_are_compared_by_the_same_images() {
     assert!(page.contains(&format!("{best:.2} dB in ")), "the page names the best run");
     // Of one image: as recorded, and as each run shows it.
     assert_eq!(page.matches("<img").count(), 5);
+    assert_eq!(page.matches(r#"width="160" "#).count(), 5, "all are as large");
 
     let error = refused(dir, &[&fixed[..], &["--held-out-every", "0"]].concat());
     assert!(error.contains("give --held-out-every"), "{error}");

@@ -2,8 +2,6 @@
 
 #[path = "../support/generated.rs"]
 mod generated;
-#[path = "../support/root.rs"]
-mod root;
 
 #[path = "../support/data.rs"]
 mod data;
@@ -15,6 +13,8 @@ mod opendrive;
 mod openscenario;
 mod openscenario_motion;
 mod schema;
+
+use generated::root;
 
 /// A file of the small inputs with expected values.
 fn case(name: &str) -> Option<Vec<u8>> {

@@ -10,7 +10,7 @@ use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::protocol::CloseFrame;
 use wildcity_server::Limits;
 
-use crate::support::{Agent, Reply, TEST_TIMEOUT, TestServer, pose, refused};
+use crate::support::{Agent, Reply, TEST_TIMEOUT, TestServer, WATCH, connect, pose, refused};
 
 /// The next frame, whatever it is.
 async fn frame(agent: &mut Agent) -> Option<Message> {

@@ -3,7 +3,7 @@
 use std::fs;
 
 #[path = "root.rs"]
-mod root;
+pub(crate) mod root;
 
 /// Compares a file of the repository with the text that the code has for it. With
 /// `WILDCITY_BLESS=1` writes it instead; `test` are the arguments of `cargo test` that do.

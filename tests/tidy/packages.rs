@@ -23,6 +23,8 @@ const CRATES: &[(&str, &[&str])] = &[
             "src/scene/record",
             "src/scene/sky",
             "src/repair/reference/warp.rs",
+            "src/train/loss/ssim.rs",
+            "src/train/model",
         ],
     ),
     ("wgpu", &["src/render/gpu"]),

@@ -229,3 +229,34 @@ fn colours_over_a_background_with_an_exposure() {
     let same = compose(&rgb, &[1.0; PIXELS], Background::Color([0.3; 3]), &Exposure::identity());
     assert_eq!(same, rgb);
 }
+
+#[test]
+fn large_images_are_composed_as_their_pixels_are() {
+    // Two parts, and a rest of the few pixels that are summed first.
+    const COUNT: usize = 97 * 61;
+    let [rgb, behind, by] = [20, 21, 22].map(|seed| numbers(3 * COUNT, seed, -1.0, 1.0));
+    let opacity = numbers(COUNT, 23, 0.0, 1.0);
+    let exposure =
+        Exposure { matrix: [[0.9, 0.1, 0.0], [0.2, 1.1, -0.1], [0.0, 0.3, 0.8]], offset: [0.1; 3] };
+    let background = Background::Image(&behind);
+    let image = compose(&rgb, &opacity, background, &exposure);
+    let gradient = compose_gradient(&rgb, &opacity, background, &exposure, &by);
+    let mut sums = [0.0; 12];
+    for pixel in 0..COUNT {
+        let at = 3 * pixel..3 * pixel + 3;
+        let [rgb, behind, by] = [&rgb, &behind, &by].map(|values| &values[at.clone()]);
+        let opacity = &opacity[pixel..=pixel];
+        let background = Background::Image(behind);
+        assert_eq!(image[at.clone()], compose(rgb, opacity, background, &exposure), "{pixel}");
+        let own = compose_gradient(rgb, opacity, background, &exposure, by);
+        assert_eq!(gradient.rgb[at.clone()], own.rgb, "{pixel}");
+        assert_eq!(gradient.background[at], own.background, "{pixel}");
+        assert_eq!(gradient.opacity[pixel], own.opacity[0], "{pixel}");
+        let own = own.exposure.matrix.as_flattened().iter().chain(&own.exposure.offset);
+        sums.iter_mut().zip(own).for_each(|(sum, own)| *sum += own);
+    }
+    let found = gradient.exposure.matrix.as_flattened().iter().chain(&gradient.exposure.offset);
+    for (found, sum) in found.zip(sums) {
+        assert!((found - sum).abs() < 1e-9 * COUNT as f64, "{found} {sum}");
+    }
+}

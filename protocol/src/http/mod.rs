@@ -296,7 +296,7 @@ pub struct FileReport {
     /// What of the file was not read, or is drawn in another way than it says; for people.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub warnings: Vec<String>,
-    /// What was taken where the request gives nothing, as the axes of the twin; for people.
+    /// What was taken where the request gives nothing, such as the axes of the twin; for people.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub assumed: Vec<String>,
 }

@@ -1,17 +1,20 @@
 //! `wildcity train compare`.
 
+use std::env;
+use std::ffi::OsString;
 use std::io::{self, Write};
 use std::path::PathBuf;
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
 use wildcity_render::gradient::Differentiate;
 use wildcity_train::compare::ComparedRun;
-use wildcity_train::held_out::{HeldOut, judge};
+use wildcity_train::held_out::judge;
 use wildcity_train::page::{Comparison, compared, comparison_page};
 use wildcity_train::trainer::Trainer;
 
 use super::options::{Inputs, SourceOptions, fraction};
 use super::progress::train;
+use crate::cli::moved::quoted;
 use crate::cli::output;
 
 /// Train with several sizes of images, numbers of steps and caps, and say which to use.
@@ -42,14 +45,6 @@ pub(in crate::cli) struct Compare {
     out: PathBuf,
 }
 
-/// A run, and what it shows.
-struct Judged {
-    run: ComparedRun,
-    picture: HeldOut,
-    /// Number of images.
-    by: usize,
-}
-
 const EXAMPLE: &str = "\
 Example:
   wildcity train compare log --size 0.25,0.5 --steps 500,1500 --cap 100000,300000 --out compared";
@@ -66,7 +61,14 @@ impl Compare {
         let backend = &*self.source.hardware.training()?;
         let all = self.combinations()?;
         let largest = all.iter().map(|run| run.0).fold(0.0, f64::max);
+        let opened = self.source.open(self.source.settings()?, largest)?.images;
+        let judges = opened.images();
+        ensure!(
+            !judges.held_out().is_empty(),
+            "no image is held out, so that nothing judges the runs: give --held-out-every"
+        );
         let source = self.source.path()?.display().to_string();
+        let command = command_of_a_run(env::args_os());
         let mut runs = Vec::new();
         let mut pictures = Vec::new();
         for &(size, steps, cap) in &all {
@@ -76,17 +78,29 @@ impl Compare {
                 "run {number} of {}: size {size}, {steps} steps, cap {cap}",
                 all.len()
             )?;
-            let Judged { run, picture, by } = self.one(backend, size, steps, cap, largest)?;
-            runs.push(run);
-            pictures.push(picture);
-            let comparison = Comparison {
+            let Some(trainer) = self.train(backend, size, steps, cap)? else {
+                let done = output::counted(runs.len(), "run");
+                bail!("stopped: {done} of {} complete", all.len());
+            };
+            let judged = judge(&trainer, judges, backend)?
+                .context("no image that is held out has a pixel that counts")?;
+            runs.push(ComparedRun {
+                size,
+                steps,
+                cap,
+                gaussians: trainer.model().len(),
+                seconds: trainer.history().seconds(),
+                held_out_db: judged.mean_db,
+            });
+            pictures.push(judged.middle);
+            self.write(&Comparison {
                 source: &source,
+                command: &command,
                 backend: backend.name(),
-                judged_by: (by, largest),
+                judged_by: (judged.images, largest),
                 runs: &runs,
                 images: &pictures,
-            };
-            self.write(&comparison)?;
+            })?;
         }
         let mut stdout = output::stdout();
         writeln!(stdout, "size  steps      cap  Gaussians   time, s  held out, dB")?;
@@ -96,7 +110,7 @@ impl Compare {
                 "{size:<4} {steps:>6} {cap:>8} {gaussians:>10} {seconds:>9.1} {held_out_db:>13.2}"
             )?;
         }
-        writeln!(stdout, "{}", compared(&source, &runs))?;
+        writeln!(stdout, "{}", compared(&command, &runs))?;
         writeln!(stdout, "{}", self.out.join("index.html").display())?;
         Ok(())
     }
@@ -116,44 +130,64 @@ impl Compare {
         Ok(all)
     }
 
-    /// Makes one run, judged by images of another size.
-    fn one(
+    /// Makes one run; `None` if the process was asked to stop before its end.
+    fn train(
         &self,
         backend: &dyn Differentiate,
         size: f64,
         steps: usize,
         cap: usize,
-        judged_size: f64,
-    ) -> anyhow::Result<Judged> {
+    ) -> anyhow::Result<Option<Trainer>> {
         let mut settings = self.source.settings()?;
         settings.steps = steps;
         settings.growth.cap = cap;
         let Inputs { images, start, profile, settings, .. } = self.source.open(settings, size)?;
-        ensure!(
-            !images.images().held_out().is_empty(),
-            "no image is held out, so that nothing judges the runs: give --held-out-every"
-        );
-        let mut trainer = Trainer::new(start, profile, settings.clone())?;
+        let mut trainer = Trainer::new(start, profile, settings)?;
         train(&mut trainer, images.images(), backend, steps, &mut |_, _| Ok(()))?;
-        let done = trainer.steps_done();
-        ensure!(done == steps, "stopped: {} has the runs before this one", self.out.display());
-        let judges = self.source.open(settings, judged_size)?.images;
-        let judges = judges.images();
-        let judged = judge(&trainer, judges, backend)?;
-        let (held_out_db, picture) = judged.context("no image that is held out has a pixel")?;
-        let run = ComparedRun {
-            size,
-            steps,
-            cap,
-            gaussians: trainer.model().len(),
-            seconds: trainer.history().seconds(),
-            held_out_db,
-        };
-        Ok(Judged { run, picture, by: judges.held_out().len() })
+        let is_done = trainer.steps_done() == steps;
+        Ok(is_done.then_some(trainer))
     }
 
     fn write(&self, comparison: &Comparison<'_>) -> anyhow::Result<()> {
         output::write(&self.out.join("index.html"), comparison_page(comparison)?.as_bytes())?;
         output::write(&self.out.join("compare.json"), &serde_json::to_vec_pretty(comparison.runs)?)
+    }
+}
+
+/// The command that makes one of the runs, but for its size, steps and cap: that of a comparison
+/// with its other options.
+fn command_of_a_run(arguments: impl Iterator<Item = OsString>) -> String {
+    let words = arguments.map(|word| word.to_string_lossy().into_owned());
+    let mut words = words.skip_while(|word| word != "compare").skip(1);
+    let mut command = "wildcity train".to_owned();
+    while let Some(word) = words.next() {
+        let (name, has_value) = match word.split_once('=') {
+            Some((name, _)) => (name, true),
+            None => (&word[..], false),
+        };
+        if ["--size", "--steps", "--cap", "--out"].contains(&name) {
+            if !has_value {
+                words.next();
+            }
+            continue;
+        }
+        command += &format!(" {}", quoted(&word));
+    }
+    command + " --out scene.ply"
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_command_of_a_run_keeps_what_is_not_compared() {
+        let given = "wildcity train compare --cap 9 my log --steps=1,2 --sky off --out there";
+        let words: Vec<&str> = given.split(' ').collect();
+        let mut words: Vec<OsString> = words.into_iter().map(OsString::from).collect();
+        words[5] = "my log".into();
+        words.remove(6);
+        let command = command_of_a_run(words.into_iter());
+        assert_eq!(command, "wildcity train 'my log' --sky off --out scene.ply");
     }
 }

@@ -26,8 +26,8 @@ pub(super) const PICTURES: usize = 6;
 pub(super) const CACHE_BYTES: usize = 1 << 30;
 
 /// Goes on to the last step, or until the process is asked to stop. The images that are held out
-/// are looked at every `evaluate_every` steps, and `each` is called after each step. Returns the PSNR of the images that are held out, when it was measured last, and the
-/// seconds until then.
+/// are looked at every `evaluate_every` steps, and `each` is called after each step. Returns their
+/// PSNR, when it was measured last, and the seconds until then.
 pub(super) fn train(
     trainer: &mut Trainer,
     images: &dyn TrainingImages,

@@ -87,7 +87,7 @@ impl Fsck {
             writeln!(out, "a commit is being made, or was killed: the next start cleans up")?;
         }
         if checked.is_sound() {
-            let objects = counted(checked.verified.objects as usize, "object");
+            let objects = counted(checked.verified.objects, "object");
             let bytes = checked.verified.bytes;
             writeln!(out, "twin {}: {objects}, {bytes} bytes of chunks, all sound", self.twin)?;
         }

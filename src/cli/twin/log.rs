@@ -53,7 +53,8 @@ impl Log {
             if self.json {
                 let line = serde_json::json!({
                     "number": number, "hash": hash, "created_us": created_us, "kind": how,
-                    "parent": parent, "commit": commit, "note": note, "change": change,
+                    "parent": parent, "commit": commit, "note": note,
+                    "change": (!change.is_empty()).then_some(&change),
                 });
                 writeln!(out, "{line}")?;
             } else {

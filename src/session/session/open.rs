@@ -228,7 +228,7 @@ impl Session {
     /// Says that frames are drawn camera by camera, or no longer, if that has changed.
     fn log_views_at_once(&self, before: usize) {
         let now = self.reservation.views_at_once();
-        if now == before || self.settings.layout.cameras().len() == 1 {
+        if now == before || self.settings.layout.cameras().len() <= 1 {
             return;
         }
         let session = &self.name;

@@ -35,6 +35,9 @@ const DERIVATIVES: usize = 3;
 
 /// `1 - mean S` of two images of this size, in [0, 2].
 pub fn dssim<T: Real>(size_px: [usize; 2], image: &[T], target: &[T]) -> Loss<T> {
+    if image.is_empty() {
+        return Loss { value: 0.0, by: Vec::new() };
+    }
     let window = Window::new(size_px);
     let width = window.width;
     // All levels of instructions give the same numbers: none fuses a product with a sum.
@@ -155,17 +158,11 @@ impl<T: Real> Window<T> {
 
     #[inline(always)]
     fn convolve(&self, taps: [&[T]; TAPS], to: &mut [T]) {
-        let [a, b, c, d, e, middle, f, g, h, i, j] = taps;
-        let [a, b, c, d, e, middle] = [
-            &a[..to.len()],
-            &b[..to.len()],
-            &c[..to.len()],
-            &d[..to.len()],
-            &e[..to.len()],
-            &middle[..to.len()],
-        ];
-        let [f, g, h, i, j] =
-            [&f[..to.len()], &g[..to.len()], &h[..to.len()], &i[..to.len()], &j[..to.len()]];
+        let mut rows = taps;
+        for row in &mut rows {
+            *row = &row[..to.len()];
+        }
+        let [a, b, c, d, e, middle, f, g, h, i, j] = rows;
         let [w0, w1, w2, w3, w4, w5] = self.weights;
         for k in 0..to.len() {
             to[k] = w0 * middle[k]
@@ -183,16 +180,19 @@ impl<T: Real> Window<T> {
         let c1 = T::from_f64(0.01 * 0.01);
         let c2 = T::from_f64(0.03 * 0.03);
         let two = T::one() + T::one();
-        let [mx, my, xx, yy, xy] = sums.each_ref().map(|sums| &sums[..self.width]);
+        let [x, y, xx, yy, xy] = sums.each_ref().map(|sums| &sums[..self.width]);
         let mut rows = [const { Vec::new() }; DERIVATIVES + 1];
         for row in &mut rows {
             row.resize(self.width, T::zero());
         }
-        let [by_mean, by_xx, by_xy, all] = &mut rows;
-        let [by_mean, by_xx] = [&mut by_mean[..self.width], &mut by_xx[..self.width]];
-        let [by_xy, all] = [&mut by_xy[..self.width], &mut all[..self.width]];
+        let [mean_row, xx_row, xy_row, all_row] = &mut rows;
+        let by_mean = &mut mean_row[..self.width];
+        let by_xx = &mut xx_row[..self.width];
+        let by_xy = &mut xy_row[..self.width];
+        let all = &mut all_row[..self.width];
         for i in 0..self.width {
-            let [mx, my] = [mx[i], my[i]];
+            let mx = x[i];
+            let my = y[i];
             let a1 = two * mx * my + c1;
             let a2 = two * (xy[i] - mx * my) + c2;
             let b1 = mx * mx + my * my + c1;

@@ -6,11 +6,17 @@ fn scattered() -> Gaussians {
     for i in 0..100_u32 {
         let far = f64::from(i * 37 % 100);
         gaussians.means_m.push([far, f64::from(i % 7), 0.0]);
-        gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+        gaussians.quats_wxyz.push(if i * 37 % 100 < 50 {
+            [1.0, 0.0, 0.0, 0.0]
+        } else {
+            [0.0, 1.0, 0.0, 0.0]
+        });
         gaussians.ln_scales.push([-(far as f32) / 50.0; 3]);
         gaussians.logit_opacities.push(far as f32 / 100.0);
         gaussians.sh.extend([far as f32 / 100.0; 12]);
     }
+    let class = |m: &[f64; 3]| if m[0] < 50.0 { SemanticClass::Road } else { SemanticClass::Car };
+    gaussians.classes = Some(gaussians.means_m.iter().map(class).collect());
     gaussians
 }
 
@@ -28,7 +34,12 @@ fn is_sorted(model: &Model) -> bool {
         (ln_scale + far / 50.0).abs() < 1e-5
             && (logit - far / 100.0).abs() < 1e-5
             && (moments == [0.0; 2] || moments == [far, -far])
+            && (model.get::<1>(i, column::SH + 11)[0] - far / 100.0).abs() < 1e-5
+            && (model.get::<4>(i, column::QUAT)[0] == 1.0) == (far < 50.0)
             && model.is_ground(i) == (far < 50.0)
+            && model.classes.as_ref().is_some_and(|classes| {
+                classes[i] == if far < 50.0 { SemanticClass::Road } else { SemanticClass::Car }
+            })
     };
     codes.is_sorted() && (0..model.len()).all(has_own_values)
 }

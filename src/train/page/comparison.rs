@@ -16,6 +16,8 @@ use crate::held_out::HeldOut;
 pub struct Comparison<'a> {
     /// What the runs have learned from, for a person.
     pub source: &'a str,
+    /// The command of a run, but for its size, steps and cap.
+    pub command: &'a str,
     /// The backend that they ran on.
     pub backend: &'a str,
     /// Number of images that judge them, and their width as a fraction of the recorded one.
@@ -30,10 +32,11 @@ pub struct Comparison<'a> {
 /// # Errors
 /// The plot or a picture cannot be made.
 pub fn comparison_page(comparison: &Comparison<'_>) -> Result<String, PageError> {
-    let Comparison { source, backend, judged_by: (count, size), runs, images } = *comparison;
+    let Comparison { source, command, backend, judged_by: (count, size), runs, images } =
+        *comparison;
     let on_front = pareto_front(runs);
     let body = html! {
-        p.verdict { (verdict(source, runs)) }
+        p.verdict { (verdict(command, runs)) }
         h2 { "Error against time" }
         (PreEscaped(error_against_time(runs, &on_front)?))
         p {
@@ -50,11 +53,13 @@ pub fn comparison_page(comparison: &Comparison<'_>) -> Result<String, PageError>
 }
 
 /// What to use, in a sentence or two.
-pub fn verdict(source: &str, runs: &[ComparedRun]) -> String {
-    let Some(Advice { best, quick }) = advice(runs) else { return String::new() };
+pub fn verdict(command: &str, runs: &[ComparedRun]) -> String {
+    let Some(Advice { best, quick }) = advice(runs) else {
+        return "No run has made a scene that can be judged.".to_owned();
+    };
     let options = |run: &ComparedRun| {
         let ComparedRun { size, steps, cap, .. } = run;
-        format!("wildcity train {source} --size {size} --steps {steps} --cap {cap}")
+        format!("{command} --size {size} --steps {steps} --cap {cap}")
     };
     let ComparedRun { held_out_db, seconds, .. } = best;
     let mut text = format!("{held_out_db:.2} dB in {seconds:.0} s is the best: {}.", options(best));
@@ -114,13 +119,14 @@ fn error_against_time(runs: &[ComparedRun], on_front: &[bool]) -> Result<String,
 fn draw(runs: &[ComparedRun], on_front: &[bool], text: &mut String) -> Result<(), Box<dyn Error>> {
     // The time axis is logarithmic: its coordinate is the exponent of 10.
     let point = |run: &ComparedRun| (run.seconds.max(1e-3).log10(), run.held_out_db);
+    let judged = || runs.iter().zip(on_front).filter(|(run, _)| run.is_judged());
     let range = |values: &mut dyn Iterator<Item = f64>, margin: f64| {
         let ends = (f64::INFINITY, f64::NEG_INFINITY);
         let (low, high) = values.fold(ends, |(low, high), v| (low.min(v), high.max(v)));
         if low <= high { low - margin..high + margin } else { 0.0..1.0 }
     };
-    let x = range(&mut runs.iter().map(|run| point(run).0), 0.05);
-    let y = range(&mut runs.iter().map(|run| point(run).1), 0.5);
+    let x = range(&mut judged().map(|(run, _)| point(run).0), 0.05);
+    let y = range(&mut judged().map(|(run, _)| point(run).1), 0.5);
     let area = SVGBackend::with_string(text, SIZE_PX).into_drawing_area();
     area.fill(&WHITE)?;
     let mut chart = ChartBuilder::on(&area)
@@ -147,7 +153,7 @@ fn draw(runs: &[ComparedRun], on_front: &[bool], text: &mut String) -> Result<()
     }
     for ((size, cap), color) in lines.into_iter().zip(COLORS.into_iter().cycle()) {
         let is_own = |(run, _): &(&ComparedRun, &bool)| (run.size, run.cap) == (size, cap);
-        let own = || runs.iter().zip(on_front).filter(is_own);
+        let own = || judged().filter(is_own);
         let mut points: Vec<(f64, f64)> = own().map(|(run, _)| point(run)).collect();
         points.sort_by(|a, b| a.0.total_cmp(&b.0));
         chart

@@ -62,7 +62,8 @@ pub(super) fn gaussians(history: &History) -> Result<String, PageError> {
 
 /// A number of an axis: 0.05, 20, 500 k.
 fn tick(value: &f64) -> String {
-    let rounded = (1e6 * value).round() / 1e6;
+    // Without the sign of a zero.
+    let rounded = (1e6 * value).round() / 1e6 + 0.0;
     if rounded.abs() < 1e4 { rounded.to_string() } else { format!("{} k", rounded / 1e3) }
 }
 

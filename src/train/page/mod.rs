@@ -112,9 +112,10 @@ fn beside(image: &HeldOut) -> Result<Markup, PageError> {
     let of_normals = pictures::normals(&image.normals);
     let all =
         [("recorded", recorded), ("drawn", drawn), ("depth", &of_depth), ("normals", &of_normals)];
-    let figures: Result<Vec<Markup>, PageError> =
-        all.into_iter().map(|(what, rgb8)| figure(what, image.size_px, rgb8)).collect();
-    let figures = figures?;
+    let figures = all
+        .into_iter()
+        .map(|(what, rgb8)| figure(what, image.size_px, rgb8))
+        .collect::<Result<Vec<Markup>, PageError>>()?;
     Ok(html! {
         p { b { (format!("{psnr_db:.2} dB")) } ", " (name) }
         div.pictures { @for figure in &figures { (figure) } }

@@ -133,7 +133,7 @@ def push(
         if answer["state"] in ("ready", "refused", "failed"):
             push = _finished_push(answer)
             for file in push.report.get("files", []):
-                for warning in file.get("warnings", []):
+                for warning in [*file.get("warnings", []), *file.get("assumed", [])]:
                     warnings.warn(f"{file['name']}: {warning}", stacklevel=2)
             if frame is None and push.report.get("aligned"):
                 warnings.warn(
