@@ -182,12 +182,20 @@ mod tests {
 
     #[test]
     fn the_command_of_a_run_keeps_what_is_not_compared() {
-        let given = "wildcity train compare --cap 9 my log --steps=1,2 --sky off --out there";
-        let words: Vec<&str> = given.split(' ').collect();
-        let mut words: Vec<OsString> = words.into_iter().map(OsString::from).collect();
-        words[5] = "my log".into();
-        words.remove(6);
-        let command = command_of_a_run(words.into_iter());
+        let words = [
+            "wildcity",
+            "train",
+            "compare",
+            "--cap",
+            "9",
+            "my log",
+            "--steps=1,2",
+            "--sky",
+            "off",
+            "--out",
+            "there",
+        ];
+        let command = command_of_a_run(words.into_iter().map(OsString::from));
         assert_eq!(command, "wildcity train 'my log' --sky off --out scene.ply");
     }
 }

@@ -49,13 +49,18 @@ const ROWS: [(&str, Change); 8] = [
     ("recorded poses", |settings, _, _| settings.poses.mode = PoseMode::Off),
     ("a pose per image", |settings, _, _| settings.poses.mode = PoseMode::Image),
     ("no sky", |settings, _, _| settings.sky.mode = SkyMode::Off),
-    ("no ground", |settings, _, _| settings.ground.until = 0),
+    ("no ground", |settings, _, _| leave_out_ground(settings)),
     ("no depth", |_, recording, _| recording.has_depth = false),
     ("no depth, no ground", |settings, recording, _| {
         recording.has_depth = false;
-        settings.ground.until = 0;
+        leave_out_ground(settings);
     }),
 ];
+
+fn leave_out_ground(settings: &mut Settings) {
+    settings.ground.whole_until = 0;
+    settings.ground.until = 0;
+}
 
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
