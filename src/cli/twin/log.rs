@@ -45,8 +45,11 @@ impl Log {
             let own = provenances.get(&entry.number);
             let note = own.and_then(Provenance::note).filter(|_| !is_edit);
             let base = entry.parent.and_then(|parent| provenances.get(&parent));
-            let change = own.zip(base).filter(|_| is_edit);
-            let change = change.map(|(own, base)| added(own, base).join(", ")).unwrap_or_default();
+            let change = own
+                .zip(base)
+                .filter(|_| is_edit)
+                .map(|(own, base)| added(own, base).join(", "))
+                .unwrap_or_default();
             let is_training = ["blocks=", "refine="].iter().any(|how| change.starts_with(how));
             let how = if is_training { "training" } else { entry.kind_name() };
             let LogEntry { number, hash, created_us, commit, parent, .. } = &entry;
