@@ -94,7 +94,8 @@ async fn the_frame_of_a_push_is_said_and_the_log_has_its_note() {
     let (ok, log) = wildcity(&["twin", "log", "test", "--twins", &twins]);
     let notes: Vec<&str> = log.lines().map(|line| line[46..].trim_start()[64..].trim()).collect();
     assert!(ok, "{log}");
-    assert_eq!(notes, ["", "first", "first", "", "in metres", "epoch 30"], "{log}");
+    let aligned = "align=0,0,0,1,0,0,0,2";
+    assert_eq!(notes, ["", "first", "first", aligned, "in metres", "epoch 30"], "{log}");
     let (_, log) = wildcity(&["twin", "log", "test", "--twins", &twins, "--json"]);
     let notes: Vec<Value> = log
         .lines()
