@@ -327,7 +327,6 @@ async fn the_worst_requests_cost_what_the_table_says() {
 const NOT_REQUESTS: [&str; 3] =
     ["GET /v1/session", "GET /v1/sessions/{session}/watch", "GET /v1/twins/{twin}/scenarios"];
 
-/// A connection.
 #[tokio::test]
 async fn connections_cost_what_the_table_says() {
     let rows = rows();

@@ -61,7 +61,6 @@ impl Page {
     }
 }
 
-/// With one decimal.
 fn mib(bytes: u64) -> f64 {
     (bytes as f64 / f64::from(1 << 20) * 10.0).round() / 10.0
 }

@@ -70,7 +70,7 @@ pub fn page(contents: &Contents<'_>) -> Result<String, PageError> {
     Ok(document(&title, &body))
 }
 
-/// A whole page.
+/// The frame that a run and a comparison share: title, style, and a body.
 fn document(title: &str, body: &Markup) -> String {
     let markup = html! {
         (DOCTYPE)
