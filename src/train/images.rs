@@ -1,6 +1,7 @@
 //! The images of a run.
 
 use wildcity_render::View;
+use wildcity_scene::geometry::CameraError;
 
 use crate::poses::Place;
 
@@ -29,10 +30,96 @@ impl TrainingImage {
         self.rgb8.len() + flags + 4 * self.depth_m.as_ref().map_or(0, Vec::len)
     }
 
+    /// The image after it was halved some times, as far as its sides stay at least [`MIN_SIDE_PX`]:
+    /// each pixel is the mean of those that it covers. What is left over at the right and below
+    /// is cut off.
+    ///
+    /// # Errors
+    /// The camera cannot be scaled.
+    pub(crate) fn halved(self, times: u32) -> Result<Self, CameraError> {
+        let [width, height] = self.view.camera.size_px().to_array().map(|px| px as usize);
+        let times = (0..=times).rev().find(|times| width.min(height) >> times >= MIN_SIDE_PX);
+        let factor = 1_usize << times.unwrap_or(0);
+        if factor == 1 {
+            return Ok(self);
+        }
+        let small = [width / factor, height / factor];
+        let [small_width, small_height] = small.map(|px| px as u64);
+        let covered = small.map(|px| (px * factor) as u64);
+        let mut camera = self.view.camera.cropped([0, 0], covered)?;
+        camera = camera.scaled(small_width, small_height)?;
+        // As a photograph of this size: no filter of a larger one is part of it.
+        camera.native_size_px = None;
+        let blocks = Blocks { width, small, factor };
+        let all = |flags: Vec<bool>| blocks.reduce(&flags, 1, |flags| flags.iter().all(|&is| is));
+        Ok(Self {
+            view: View { camera, ..self.view },
+            rgb8: blocks.reduce(&self.rgb8, 3, mean),
+            mask: self.mask.map(all),
+            sky: self.sky.map(all),
+            depth_m: self.depth_m.map(|depth_m| blocks.reduce(&depth_m, 1, middle)),
+            ..self
+        })
+    }
+
     /// Whether some pixel counts: what moves may hide all of an image.
     pub(crate) fn counts(&self) -> bool {
         self.mask.as_ref().is_none_or(|mask| mask.contains(&true))
     }
+}
+
+/// Sides of an image that is not halved any more: a window of D-SSIM has 11 pixels.
+const MIN_SIDE_PX: usize = 48;
+
+/// Squares of pixels of an image, each of which is a pixel of a smaller one.
+#[derive(Clone, Copy)]
+struct Blocks {
+    /// Of the large image.
+    width: usize,
+    /// Width and height of the smaller one.
+    small: [usize; 2],
+    factor: usize,
+}
+
+impl Blocks {
+    /// A value for each block and channel of an image.
+    fn reduce<T: Copy>(
+        self,
+        values: &[T],
+        channels: usize,
+        one: impl Fn(&mut Vec<T>) -> T,
+    ) -> Vec<T> {
+        let Self { width, small: [small_width, small_height], factor } = self;
+        let mut block = Vec::with_capacity(factor * factor);
+        let mut reduced = Vec::with_capacity(small_width * small_height * channels);
+        for y in 0..small_height {
+            for x in 0..small_width {
+                for channel in 0..channels {
+                    block.clear();
+                    for row in y * factor..(y + 1) * factor {
+                        let begin = (row * width + x * factor) * channels + channel;
+                        block.extend(values[begin..].iter().step_by(channels).take(factor));
+                    }
+                    reduced.push(one(&mut block));
+                }
+            }
+        }
+        reduced
+    }
+}
+
+fn mean(values: &mut Vec<u8>) -> u8 {
+    let sum: u32 = values.iter().copied().map(u32::from).sum();
+    let count = values.len() as u32;
+    ((sum + count / 2) / count) as u8
+}
+
+/// The depth in the middle of those that were measured: the mean of a pole and what is behind it
+/// would be a depth that nothing has.
+fn middle(depths_m: &mut Vec<f32>) -> f32 {
+    depths_m.retain(|&depth_m| depth_m > 0.0);
+    depths_m.sort_by(f32::total_cmp);
+    depths_m.get(depths_m.len().saturating_sub(1) / 2).copied().unwrap_or(0.0)
 }
 
 /// The images of a run, by their numbers.
@@ -68,4 +155,61 @@ pub trait TrainingImages: Sync {
     /// # Errors
     /// The error names the file, for a person.
     fn load(&self, index: usize) -> Result<TrainingImage, String>;
+}
+
+#[cfg(test)]
+mod tests {
+    use wildcity_scene::geometry::camera::Pinhole;
+    use wildcity_scene::geometry::{Camera, Pose};
+
+    use super::*;
+
+    /// 201 x 99 px, with a value of its own for each pixel.
+    fn image() -> TrainingImage {
+        let pinhole = Pinhole { fx: 120.0, fy: 110.0, cx: 90.0, cy: 50.0 };
+        let camera = Camera::from_pinhole(201, 99, pinhole);
+        let pixels = camera.pixels();
+        TrainingImage {
+            view: View::new(camera, Pose::IDENTITY),
+            rgb8: (0..3 * pixels).map(|k| (k * 7 % 251) as u8).collect(),
+            mask: Some((0..pixels).map(|k| k != 202).collect()),
+            sky: None,
+            // Of every other square, half of the pixels have one.
+            depth_m: Some((0..pixels).map(|k| [9.0, 0.0, 4.0, 5.0][k % 201 % 4]).collect()),
+            weight: 0.5,
+            exposure: 2.0,
+        }
+    }
+
+    #[test]
+    fn a_pixel_is_the_mean_of_those_that_it_covers() {
+        let whole = image();
+        let half = image().halved(1).unwrap();
+        let camera = &half.view.camera;
+        assert_eq!([camera.width_px, camera.height_px], [100, 49]);
+        assert_eq!(camera.native_size_px, None);
+        let at = |x: usize, y: usize| u32::from(whole.rgb8[(y * 201 + x) * 3 + 1]);
+        let sum = at(198, 96) + at(199, 96) + at(198, 97) + at(199, 97);
+        assert_eq!(u32::from(half.rgb8[(48 * 100 + 99) * 3 + 1]), (sum + 2) / 4);
+        // The middle of the pixel is seen where the corner of the four is.
+        let ray = camera.unproject([99.5, 48.5].into()).unwrap();
+        let same = whole.view.camera.unproject([199.0, 97.0].into()).unwrap();
+        assert!((ray - same).length() < 1e-12, "{ray} {same}");
+        // One pixel that does not count: the whole square does not.
+        let mask = half.mask.unwrap();
+        assert_eq!(mask.iter().position(|counts| !counts), Some(0));
+        assert_eq!(mask.iter().filter(|counts| !**counts).count(), 1);
+        let depth_m = half.depth_m.unwrap();
+        assert_eq!(depth_m[..4], [9.0, 4.0, 9.0, 4.0]);
+        assert_eq!([half.weight, half.exposure], [0.5, 2.0]);
+    }
+
+    #[test]
+    fn a_small_image_is_not_halved() {
+        // A quarter would be 24 px high.
+        assert_eq!(image().halved(2).unwrap(), image().halved(1).unwrap());
+        let small = image().halved(1).unwrap();
+        assert_eq!(small.clone().halved(3).unwrap(), small);
+        assert_eq!(image().halved(0).unwrap(), image());
+    }
 }

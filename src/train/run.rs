@@ -40,13 +40,18 @@ pub fn run(
     }
     let steps = trainer.settings().steps;
     let first = trainer.steps_done();
-    let order = Order::new(&learned, images, trainer.settings()).take(steps).skip(first);
+    let settings = trainer.settings().clone();
+    let order = Order::new(&learned, images, &settings);
+    let order = (1..=steps).zip(order).skip(first);
     let evaluator = Evaluator::new(images, backend);
     thread::scope(|scope| {
         let (sender, next) = sync_channel(AHEAD);
         scope.spawn(move || {
             // A receiver that is gone has ended the run.
-            let load = |index| images.load(index).map(|image| (index, image));
+            let load = |(step, index)| {
+                let image = images.load(index)?.halved(settings.halvings_at(step));
+                Ok((index, image.map_err(|e| format!("{}: {e}", images.name(index)))?))
+            };
             order.map(load).all(|image| sender.send(image).is_ok())
         });
         let begin = Instant::now();

@@ -23,6 +23,7 @@ pub struct Settings {
     pub augmented_share: f64,
     pub rates: Rates,
     pub loss: Weights,
+    pub coarse: CoarseSettings,
     pub growth: Growth,
     pub poses: PoseSettings,
     pub sky: SkySettings,
@@ -59,6 +60,17 @@ pub struct Weights {
     pub disparity: f64,
     /// Of the mean opacity of the pixels that show the sky.
     pub sky: f64,
+}
+
+/// How many steps learn from small images. They cost less, and what lies wrong by many pixels moves
+/// towards its place: a large image has detail on the way.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CoarseSettings {
+    /// How often the images of the first steps are halved: 2 begins with a quarter of the width.
+    pub halvings: u32,
+    /// The first step of 30,000 on whole images. All smaller sizes have as many steps before it.
+    pub until: usize,
 }
 
 /// How the number of Gaussians grows, after 3D Gaussian splatting as Markov chain Monte Carlo
@@ -171,12 +183,19 @@ impl Default for Settings {
             augmented_share: 0.3,
             rates: Rates::default(),
             loss: Weights::default(),
+            coarse: CoarseSettings::default(),
             growth: Growth::default(),
             poses: PoseSettings::default(),
             sky: SkySettings::default(),
             exposure: ExposureSettings::default(),
             ground: GroundSettings::default(),
         }
+    }
+}
+
+impl Default for CoarseSettings {
+    fn default() -> Self {
+        Self { halvings: 2, until: 12_000 }
     }
 }
 
@@ -275,7 +294,7 @@ impl Settings {
     /// # Errors
     /// The first field out of its range.
     pub fn check(&self) -> Result<(), SettingError> {
-        let Self { rates, loss, growth, poses, sky, exposure, ground, .. } = self;
+        let Self { rates, loss, coarse, growth, poses, sky, exposure, ground, .. } = self;
         let rates = [
             ("rates.mean", rates.mean.into()),
             ("rates.ln_scale", rates.ln_scale.into()),
@@ -309,6 +328,8 @@ impl Settings {
             range("sh_degree", self.sh_degree.into(), 0, 3),
             ("augmented_share", self.augmented_share, 0.0, 1.0),
             ("loss.dssim", loss.dssim, 0.0, 1.0),
+            range("coarse.halvings", coarse.halvings as usize, 0, 8),
+            range("coarse.until", coarse.until, 0, SCHEDULE),
             range("growth.cap", growth.cap, 1, 100_000_000),
             ("growth.rate", growth.rate, 0.0, 1.0),
             ("growth.least_opacity", growth.least_opacity.into(), 0.0, 0.5),
@@ -343,6 +364,15 @@ impl Settings {
             }
             count
         })
+    }
+
+    /// How often the image of a step is halved, from 1 for the first step.
+    pub fn halvings_at(&self, step: usize) -> u32 {
+        let CoarseSettings { halvings, until } = self.coarse;
+        let until = self.scaled(until);
+        // All sizes have the same number of steps, and the last of them ends before `until`.
+        let left = until.saturating_sub(step);
+        (left as f64 * f64::from(halvings) / until.max(1) as f64).ceil() as u32
     }
 
     /// Whether Gaussians are moved and added after a step.
@@ -381,5 +411,21 @@ impl GroundSettings {
         }
         let fading = (self.until - self.whole_until).max(1) as f32;
         (self.until.saturating_sub(step) as f32 / fading).min(1.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn images_become_larger_in_equal_parts() {
+        let coarse = CoarseSettings { halvings: 2, until: 12_000 };
+        let settings = Settings { steps: 300, coarse, ..Settings::default() };
+        let count = |halvings| (1..=300).filter(|&k| settings.halvings_at(k) == halvings).count();
+        assert_eq!([2, 1, 0].map(count), [59, 60, 181]);
+        assert_eq!([1, 60, 120, 300].map(|step| settings.halvings_at(step)), [2, 1, 0, 0]);
+        let whole = Settings { coarse: CoarseSettings { halvings: 0, ..coarse }, ..settings };
+        assert_eq!(whole.halvings_at(1), 0);
     }
 }

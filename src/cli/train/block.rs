@@ -20,7 +20,7 @@ use wildcity_twin::store::{Catalog, Version};
 use super::block_parts::Parts;
 use super::checkpoints::{self, Checkpoints};
 use super::images::ChosenImages;
-use super::options::{fraction, keep_cameras, read_settings};
+use super::options::{fraction, keep_trained, read_settings};
 use super::progress::{evaluate_every, train};
 use super::recorded::{RecordedImages, Recording};
 use super::start;
@@ -347,7 +347,7 @@ impl Block {
         );
         settings.steps = self.steps.map_or(settings.steps, |steps| steps as usize);
         settings.growth.cap = self.cap.map_or(settings.growth.cap, |cap| cap as usize);
-        keep_cameras(&mut settings);
+        keep_trained(&mut settings);
         settings.check()?;
         Ok(settings)
     }

@@ -215,11 +215,13 @@ fn sky_mode(text: &str) -> Result<SkyMode, String> {
     }
 }
 
-/// Leaves all but the Gaussians as it is: the poses, the sky and the exposures.
-pub(super) fn keep_cameras(settings: &mut Settings) {
+/// Leaves all but the Gaussians as it is: the poses, the sky and the exposures. The Gaussians have
+/// their shape already, so that no step learns from a small image.
+pub(super) fn keep_trained(settings: &mut Settings) {
     settings.poses.mode = PoseMode::Off;
     settings.sky.mode = SkyMode::Off;
     settings.exposure.on = false;
+    settings.coarse.halvings = 0;
 }
 
 /// Reads the file of `--settings`.

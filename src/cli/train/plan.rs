@@ -71,7 +71,9 @@ impl Plan {
         let begin = start.gaussians.len();
         let end = settings.counts(begin).last().unwrap_or(begin);
         let backend = &*self.run.source.hardware.training()?;
-        let mut trainer = Trainer::new(start, profile, settings.clone())?;
+        let mut whole = settings.clone();
+        whole.coarse.halvings = 0;
+        let mut trainer = Trainer::new(start, profile, whole)?;
         let measured = Measured::new(&mut trainer, images, backend)?;
 
         let held_out = images.held_out().len();
@@ -105,12 +107,16 @@ impl Plan {
         // Images that are not kept are decoded again each time, beside the step.
         let is_decoded = |step: usize| step < learned || decoded > CACHE_BYTES;
         let step_s = |(step, count): (usize, usize)| {
-            let step_s = measured.step_s(count, begin);
+            let pixels = 0.25_f64.powi(settings.halvings_at(step + 1) as i32);
+            let step_s = measured.step_s(count, begin, pixels);
             if is_decoded(step) { step_s.max(measured.decode_s) } else { step_s }
         };
         let steps_s: f64 = settings.counts(begin).enumerate().map(step_s).sum();
-        let evaluations_s = (EVALUATIONS * held_out) as f64 * measured.step_s(end, begin) / 2.0;
-        let [first_ms, last_ms] = [begin, end].map(|count| 1e3 * measured.step_s(count, begin));
+        let evaluations_s =
+            (EVALUATIONS * held_out) as f64 * measured.step_s(end, begin, 1.0) / 2.0;
+        let first_pixels = 0.25_f64.powi(settings.halvings_at(1) as i32);
+        let first_ms = 1e3 * measured.step_s(begin, begin, first_pixels);
+        let last_ms = 1e3 * measured.step_s(end, begin, 1.0);
         writeln!(
             stdout,
             "time       about {}: {} steps{} of {first_ms:.0} to {last_ms:.0} ms, and {:.0} ms to decode an image; backend {}, \
@@ -191,9 +197,10 @@ impl Measured {
         Ok(Self { decode_s, fixed_s, gaussians_s: step_s - fixed_s })
     }
 
-    /// The time of a step with some Gaussians, if those that were measured were `measured`.
-    fn step_s(&self, count: usize, measured: usize) -> f64 {
-        self.fixed_s + self.gaussians_s * count as f64 / measured.max(1) as f64
+    /// The time of a step with some Gaussians, if those that were measured were `measured`, on an
+    /// image with a share of the pixels.
+    fn step_s(&self, count: usize, measured: usize, pixels: f64) -> f64 {
+        pixels * self.fixed_s + self.gaussians_s * count as f64 / measured.max(1) as f64
     }
 }
 

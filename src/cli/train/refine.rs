@@ -20,7 +20,7 @@ use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, Version};
 
 use super::images::{ListedImages, WithAugmented};
-use super::options::{fraction, keep_cameras, read_settings};
+use super::options::{fraction, keep_trained, read_settings};
 use super::progress::{PICTURES, evaluate_every, train};
 use super::recorded::{RecordedImages, Recording};
 use crate::cli::backend_options::HardwareOptions;
@@ -270,7 +270,7 @@ impl Refine {
             settings = read_settings(path)?;
         }
         settings.steps = self.steps as usize;
-        keep_cameras(&mut settings);
+        keep_trained(&mut settings);
         settings.growth.from = 0;
         settings.growth.until = 0;
         settings.growth.noise = 0.0;

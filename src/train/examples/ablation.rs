@@ -33,14 +33,10 @@ use wildcity_train::trainer::{Fixed, Start, Trainer};
 
 use demo_street::{Recording, points, render};
 
-/// Learning rates of the poses, in metres and radians: each has some hundred steps here, and
-/// thousands in the paper.
-const POSE_RATES: [f64; 2] = [1e-2, 2e-3];
-
 /// A row of the table: how its run differs from the whole method.
 type Change = fn(&mut Settings, &mut Recording, &RigPoses);
 
-const ROWS: [(&str, Change); 8] = [
+const ROWS: [(&str, Change); 9] = [
     ("all", |_, _, _| {}),
     ("true poses", |settings, recording, truth| {
         recording.rig = truth.clone();
@@ -48,6 +44,7 @@ const ROWS: [(&str, Change); 8] = [
     }),
     ("recorded poses", |settings, _, _| settings.poses.mode = PoseMode::Off),
     ("a pose per image", |settings, _, _| settings.poses.mode = PoseMode::Image),
+    ("no small images", |settings, _, _| settings.coarse.halvings = 0),
     ("no sky", |settings, _, _| settings.sky.mode = SkyMode::Off),
     ("no ground", |settings, _, _| leave_out_ground(settings)),
     ("no depth", |_, recording, _| recording.has_depth = false),
@@ -98,7 +95,6 @@ fn main() -> Result<(), Box<dyn Error>> {
         }
         let growth = Growth { cap: 150_000, from: 500, until: 24_000, ..Growth::default() };
         let mut settings = Settings { steps, growth, ..Settings::default() };
-        [settings.poses.rate, settings.poses.rotation_rate] = POSE_RATES;
         settings.sky.mode = SkyMode::Network;
         recording.rig = shaken.clone();
         recording.has_depth = true;
