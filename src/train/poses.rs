@@ -12,6 +12,14 @@
 //! A twist is folded into its pose after each step, so that derivatives are always those at 0. What
 //! keeps a pose near its recorded one is `weight (|t|² + |φ|²)`, with the translation t in metres
 //! and the rotation φ in radians between the two. A sky moves no pose: it is smooth.
+//!
+//! The steps of Adam have the size of the learning rate, whatever the derivative is, and the rate
+//! falls to a hundredth during a run: n steps at a rate r go no farther than 0.215 n r. A pose of
+//! the rig has a step for each of its images, and a camera has one for each of its own, which are
+//! many more. With one rate for both, the first cannot reach a place that is 10 cm off in 1,500
+//! steps, and the second leave the 1 cm within which they were known, with the street that they
+//! alone see. So settings say how far each may go, and the rates follow from the number of steps. A
+//! pose with few steps goes less far: the first images of a run say little about its place.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -21,6 +29,7 @@ use wildcity_render::{RollingShutter, View};
 use wildcity_scene::geometry::Pose;
 
 use crate::adam::Adam;
+use crate::settings::PoseSettings;
 
 /// The poses of a rig at all times, and of its cameras.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -63,8 +72,8 @@ pub(crate) struct PoseStep {
     pub(crate) place: Place,
     /// The derivatives by the view's twist.
     pub(crate) by: Twist,
-    /// In metres, and in radians.
-    pub(crate) rates: [f64; 2],
+    /// Of the ego and of the camera, each in metres and in radians.
+    pub(crate) rates: [[f64; 2]; 2],
     /// Of the squared distance to the recorded pose.
     pub(crate) weight: f64,
 }
@@ -123,6 +132,20 @@ impl TrainedPoses {
         }
     }
 
+    /// The learning rates of the first step of a run for a pose of the rig and for a camera, each in
+    /// metres and in radians.
+    pub(crate) fn rates(&self, settings: &PoseSettings, steps: usize) -> [[f64; 2]; 2] {
+        let PoseSettings { reach_m, reach_rad, camera_reach_m, camera_reach_rad, .. } = *settings;
+        let rates = |reaches: [f64; 2], poses: usize| {
+            let share = share_of_reach(steps as f64 / poses.max(1) as f64);
+            reaches.map(|reach| share * reach)
+        };
+        [
+            rates([reach_m, reach_rad], self.now.world_from_ego.len()),
+            rates([camera_reach_m, camera_reach_rad], self.now.ego_from_camera.len()),
+        ]
+    }
+
     /// A view at the pose that it has now, with both ends of its exposure moved alike.
     pub(crate) fn view(&self, view: View, place: Place) -> View {
         let world_from_camera = self.now.world_from_camera(place);
@@ -137,13 +160,13 @@ impl TrainedPoses {
 
     /// Moves the two poses of a view.
     pub(crate) fn step(&mut self, step: &PoseStep) {
-        let PoseStep { place, by, rates: [rate, rotation_rate], weight } = *step;
+        let PoseStep { place, by, rates, weight } = *step;
         let Place { ego, camera, motion } = place;
         let twists = by.on_rig(&(motion * self.now.ego_from_camera[camera]));
         let RigTwists { ego: by_ego, camera: by_camera } = twists;
         let RigPoses { world_from_ego, ego_from_camera } = &mut self.now;
         let recorded = &self.recorded;
-        for (pose, recorded, by, adam) in [
+        let both = [
             (&mut world_from_ego[ego], recorded.world_from_ego[ego], by_ego, &mut self.egos[ego]),
             (
                 &mut ego_from_camera[camera],
@@ -151,7 +174,8 @@ impl TrainedPoses {
                 by_camera,
                 &mut self.cameras[camera],
             ),
-        ] {
+        ];
+        for ((pose, recorded, by, adam), [rate, rotation_rate]) in both.into_iter().zip(rates) {
             let Pose { position_m, rotation } = recorded.inverse() * *pose;
             let off = Twist { rho: position_m, phi: rotation.to_scaled_axis() };
             // Of |t|² in the axes of the pose that moves.
@@ -164,6 +188,14 @@ impl TrainedPoses {
             *pose = Pose { position_m, rotation: rotation.normalize() };
         }
     }
+}
+
+/// The first learning rate of a pose with some steps, as a share of how far it may go.
+fn share_of_reach(steps: f64) -> f64 {
+    // The mean of a rate that falls to a hundredth, in first rates: (1 - 0.01) / ln 100.
+    const MEAN: f64 = 0.215;
+    // From 37 steps on a pose can go as far as it may: 1 / (0.215 x 37) = 37 / 300.
+    (1.0 / (MEAN * steps)).min(steps / 300.0)
 }
 
 /// Poses as seven numbers each, so that a file keeps every bit of them.

@@ -110,11 +110,14 @@ pub enum PoseMode {
 #[serde(deny_unknown_fields, default)]
 pub struct PoseSettings {
     pub mode: PoseMode,
-    /// Learning rate of positions in metres. It falls exponentially to a hundredth, as that of
-    /// rotations does.
-    pub rate: f64,
-    /// Learning rate of rotations in radians.
-    pub rotation_rate: f64,
+    /// How far a pose of the rig, or of an image, can move in a run, in metres.
+    pub reach_m: f64,
+    /// How far it can turn, in radians.
+    pub reach_rad: f64,
+    /// How far a camera can move on its rig, in metres.
+    pub camera_reach_m: f64,
+    /// How far it can turn there, in radians.
+    pub camera_reach_rad: f64,
     /// Of the squared distance to the recorded pose, in metres and radians.
     pub weight: f64,
 }
@@ -201,7 +204,14 @@ impl Default for CoarseSettings {
 
 impl Default for PoseSettings {
     fn default() -> Self {
-        Self { mode: PoseMode::Auto, rate: 1e-3, rotation_rate: 1e-3, weight: 1e-5 }
+        Self {
+            mode: PoseMode::Auto,
+            reach_m: 0.3,
+            reach_rad: 0.06,
+            camera_reach_m: 0.01,
+            camera_reach_rad: 0.015,
+            weight: 1e-5,
+        }
     }
 }
 
@@ -283,6 +293,9 @@ pub struct SettingError {
 /// A rate of 10 leaves the street in a step.
 const MOST_RATE: f64 = 10.0;
 
+/// In metres and radians: a recording that is farther off has to be placed first.
+const MOST_REACH: f64 = 100.0;
+
 const MOST_WEIGHT: f64 = 1e6;
 
 /// Steps for which the schedules are given.
@@ -302,8 +315,6 @@ impl Settings {
             ("rates.logit", rates.logit.into()),
             ("rates.sh", rates.sh.into()),
             ("rates.sh_rest", rates.sh_rest.into()),
-            ("poses.rate", poses.rate),
-            ("poses.rotation_rate", poses.rotation_rate),
             ("sky.rate", sky.rate),
             ("sky.embedding_rate", sky.embedding_rate),
             ("exposure.rate", exposure.rate),
@@ -330,6 +341,10 @@ impl Settings {
             ("loss.dssim", loss.dssim, 0.0, 1.0),
             range("coarse.halvings", coarse.halvings as usize, 0, 8),
             range("coarse.until", coarse.until, 0, SCHEDULE),
+            ("poses.reach_m", poses.reach_m, 0.0, MOST_REACH),
+            ("poses.reach_rad", poses.reach_rad, 0.0, MOST_REACH),
+            ("poses.camera_reach_m", poses.camera_reach_m, 0.0, MOST_REACH),
+            ("poses.camera_reach_rad", poses.camera_reach_rad, 0.0, MOST_REACH),
             range("growth.cap", growth.cap, 1, 100_000_000),
             ("growth.rate", growth.rate, 0.0, 1.0),
             ("growth.least_opacity", growth.least_opacity.into(), 0.0, 0.5),

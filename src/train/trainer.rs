@@ -297,7 +297,8 @@ impl Trainer {
                 return not_finite("its pose");
             }
             let settings = &self.settings.poses;
-            let rates = [settings.rate, settings.rotation_rate].map(|rate| rate * fall);
+            let rates = poses.rates(settings, self.settings.steps);
+            let rates = rates.map(|rates| rates.map(|rate| rate * fall));
             poses.step(&PoseStep { place, by, rates, weight: settings.weight });
         }
         if let Some(exposures) = &mut self.exposures {

@@ -132,8 +132,7 @@ fn a_shaken_rig_is_found_again() {
     let run = |mode: PoseMode| {
         let mut settings = settings(800);
         settings.poses.mode = mode;
-        settings.poses.rate = 5e-3;
-        settings.poses.rotation_rate = 5e-3;
+        [settings.poses.camera_reach_m, settings.poses.camera_reach_rad] = [0.3, 0.3];
         // The wall would learn the wrong poses meanwhile.
         let none = 0.0;
         settings.rates =

@@ -126,7 +126,7 @@ fn what_a_run_cannot_use_is_named() {
         ("growth.until", with_growth(|growth| growth.until = 30_001)),
         ("growth.noise", with_growth(|growth| growth.noise = -1.0)),
         ("growth.rate", with_growth(|growth| growth.rate = 1.5)),
-        ("poses.rate", changed(|settings| settings.poses.rate = 11.0)),
+        ("poses.reach_m", changed(|settings| settings.poses.reach_m = 101.0)),
         ("sky.width", changed(|settings| settings.sky.width = 0)),
         ("sky.embedding", changed(|settings| settings.sky.embedding = 257)),
         ("exposure.weight", changed(|settings| settings.exposure.weight = f64::NAN)),
