@@ -61,6 +61,11 @@ pub struct Episodes {
 }
 
 impl Episodes {
+    /// Whether the user's own directory is meant, and does not exist yet: nothing was recorded.
+    pub fn is_unused(&self) -> anyhow::Result<bool> {
+        Ok(self.episodes.is_none() && !self.dir()?.exists())
+    }
+
     /// The directory of `--episodes`, or the user's own.
     pub fn dir(&self) -> anyhow::Result<PathBuf> {
         state_dir(self.episodes.as_ref(), "episodes")

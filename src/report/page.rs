@@ -17,13 +17,18 @@ use wildcity_stress::Verdict;
 const STYLE: &str = "\
 body{font:15px/1.45 system-ui,sans-serif;max-width:1160px;margin:2em auto;padding:0 1em;color:#111}
 h1{font-size:1.6em}h2{margin-top:2em;font-size:1.2em}
-table{border-collapse:collapse;font-size:13px;display:block;overflow-x:auto}td,th{padding:2px 8px;border-bottom:1px solid #ddd;text-align:right}
-td:first-child,th:first-child,td.text{text-align:left;vertical-align:top}.cases th{text-align:left}tr.dominated td{color:#6b6b6b}
+table{border-collapse:collapse;font-size:13px;display:block;overflow-x:auto}td,th{padding:2px 5px;border-bottom:1px solid #ddd;text-align:right;vertical-align:top}th{vertical-align:bottom}
+td:first-child,th:first-child{position:sticky;left:0;background:#fff}td:first-child,th:first-child,.text{text-align:left}.cases th{text-align:left}tr.dominated td{color:#6b6b6b}
 tr.front td:first-child{font-weight:600}.miss{color:#b00020;font-weight:600}.off{color:#6b6b6b}
 figure{display:inline-block;margin:0 12px 14px 0}figcaption{font-size:12px}
 img{image-rendering:pixelated;margin-right:3px}figure:not(.view) img{width:104px;height:auto}.view{width:272px}.view img{image-rendering:auto;width:272px}svg{max-width:100%;height:auto}.wide{overflow-x:auto}@media(max-width:760px){.wide svg{max-width:none;width:760px}}
 .key span{display:inline-block;padding:1px 8px;font-size:12px}
 .verdict{font-size:1.25em;padding:.6em .8em;border-left:6px solid;background:#f6f6f6;overflow-wrap:anywhere}";
+
+/// A number of steps.
+fn counted(steps: u32) -> String {
+    format!("{steps} {}", if steps == 1 { "step" } else { "steps" })
+}
 
 /// The whole page.
 ///
@@ -88,7 +93,7 @@ fn introduction(report: &Report) -> Markup {
         p {
             b { "Times. " }
             "A time is the median over whole steps (cameras: " (subject.cameras) "), with "
-            (subject.repeat) " steps at each sample point on the drive (at all sample points, for a \
+            (counted(subject.repeat)) " at each sample point on the drive (at all sample points, for a \
              twin without a drive). It covers rendering; only settings that change the encoding \
              include encoding. Each step was timed in turn with a step of the twin as it is served \
              on " (baseline) ", and all times are scaled to the machine speed at which those steps \
@@ -148,7 +153,7 @@ fn settings_table(all: &[Measurement]) -> Markup {
         div.wide {
             table {
                 tr {
-                    th { "setting" } th { "what it changes" }
+                    th { "setting" } th.text { "what it changes" }
                     th { "step time, ms" } th { "95th percentile, ms" }
                     th { "PSNR, dB" } th { "least PSNR, dB" } th { "SSIM" }
                     th { "largest error (0 to 1)" } th { "99.9th percentile of the error" }

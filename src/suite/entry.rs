@@ -237,7 +237,7 @@ impl EpisodeEntry {
     /// For a duplicate, that it is one.
     pub fn duplicate_text(&self) -> Option<String> {
         let first = self.duplicate_of.as_ref()?;
-        Some(format!("driven as {first} was, and not counted"))
+        Some(format!("the same drive as {first}, not counted again"))
     }
 }
 

@@ -7,10 +7,10 @@ use maud::{Markup, PreEscaped, html};
 
 use crate::ending::{Ending, ExitCode};
 use crate::entry::{EpisodeEntry, LEFT, Status, TechnicalEntry};
-use crate::html::{document, image, percent};
+use crate::html::{SCORE_NAMES, document, image, percent};
 use crate::picture::Picture;
 use crate::plot::plots;
-use crate::result::{Rate, SuiteResult};
+use crate::result::{MeanEntry, Rate, SuiteResult};
 
 /// The page. `episodes` has the records, of which the worst are drawn.
 pub fn page(
@@ -81,7 +81,7 @@ fn unjudged(result: &SuiteResult) -> Markup {
                 @for episode in episodes {
                     tr {
                         td { (episode.name) }
-                        td class=(episode.status.name()) { (episode.status.name()) }
+                        td class=(episode.status.name()) { (episode.status.name().replace('_', " ")) }
                         td.text { (why(episode)) }
                     }
                 }
@@ -105,7 +105,7 @@ fn scenarios(result: &SuiteResult) -> Markup {
                 tr {
                     td { (name) }
                     td { (rate(of)) }
-                    td { (not_judged(result, name).join("; ")) }
+                    td data-name="not judged" { (not_judged(result, name).join("; ")) }
                 }
             }
         }
@@ -126,17 +126,24 @@ fn means(result: &SuiteResult) -> Markup {
             tr { th { "score" } th { "mean over scenarios" } th { "95 %" } th { "scenarios" } }
             @for (name, mean) in &result.means {
                 tr {
-                    td { (name) }
-                    td { (format!("{:.4}", mean.mean)) }
-                    td { @if let Some([low, high]) = mean.interval { (format!("{low:.4} to {high:.4}")) } }
-                    td { (mean.scenarios) }
+                    td.score { (name) }
+                    td data-name="mean" { (format!("{:.4}", mean.mean)) }
+                    td data-name="95 %" { (mean_interval(mean)) }
+                    td data-name="scenarios" { (mean.scenarios) }
                 }
             }
             @for (name, reason) in without_value(result) {
-                tr { td { (name) } td colspan="3" { "none: " (reason) } }
+                tr { td.score { (name) } td colspan="3" { "none: " (reason) } }
             }
         }
-        p { "Intervals of means: Student's t over the scenarios, clipped to the range of the score; none below three." }
+        p { "Intervals of means: Student's t over the scenarios, clipped to the range of the score; none below three. " (SCORE_NAMES) }
+    }
+}
+
+fn mean_interval(mean: &MeanEntry) -> String {
+    match mean.interval {
+        Some([low, high]) => format!("{low:.4} to {high:.4}"),
+        None => "too few scenarios".to_owned(),
     }
 }
 
@@ -192,15 +199,15 @@ fn viewer_link(episode: &EpisodeEntry) -> Markup {
 fn table(result: &SuiteResult) -> Markup {
     html! {
         table {
-            tr { th { "episode" } th { "seed" } th { "result" } th { "why" } th { "steps" } th { "m" } th { "record" } }
+            tr { th { "episode" } th { "seed" } th { "result" } th { "why" } th { "steps" } th { "distance" } th { "record" } }
             @for episode in &result.episodes {
                 tr {
                     td { (episode.name) }
-                    td { (episode.seed) }
-                    td class=(episode.status.name()) { (episode.status.name()) }
+                    td data-name="seed" { (episode.seed) }
+                    td class=(episode.status.name()) { (episode.status.name().replace('_', " ")) }
                     td.text { (why(episode)) }
-                    td { (episode.steps) }
-                    td { (format!("{:.1}", episode.distance_m)) }
+                    td data-name="steps" { (episode.steps) }
+                    td data-name="distance" { (format!("{:.1} m", episode.distance_m)) }
                     td {
                         @if !episode.record.is_empty() { a href=(format!("episodes/{}", episode.record)) { (episode.record) } }
                         @match &episode.mcap {

@@ -212,8 +212,11 @@ impl SuiteResult {
         let Counts { duplicates, episodes, .. } = self.counts;
         (duplicates > 0).then(|| {
             format!(
-                "{duplicates} of {episodes} episodes were driven as another one of their scenario was, and are in no rate \
-                 and no mean: a seed changes nothing but jitter"
+                "{duplicates} of {episodes} episodes {} the same drive as an earlier seed of their scenario, and {} not \
+                 counted again in rates and means. A seed changes a scenario only by its `jitter` or `jitter_frames`: add \
+                 one of these, or drive one seed",
+                if duplicates == 1 { "is" } else { "are" },
+                if duplicates == 1 { "is" } else { "are" },
             )
         })
     }

@@ -173,3 +173,22 @@ fn old_records_are_pruned() {
     assert_eq!(stdout(&done), said.replace("would be removed", "removed"), "{done:?}");
     assert!(dir.path().join("new-1.jsonl").exists() && !dir.path().join("old-1.jsonl").exists());
 }
+
+#[test]
+fn before_the_first_drive_there_is_nothing_to_prune() {
+    let dir = tempfile::tempdir().unwrap();
+    let prune = |more: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_wildcity"));
+        command.args(["episode", "prune", "--keep", "5"]).args(more);
+        command.current_dir(dir.path()).env("XDG_STATE_HOME", dir.path()).output().unwrap()
+    };
+    let default = prune(&[]);
+    let said = format!(
+        "nothing to remove: there is no folder {}\n",
+        dir.path().join("wildcity/episodes").display()
+    );
+    assert_eq!((default.status.code(), stdout(&default)), (Some(0), said), "{default:?}");
+    // A folder that is named may be misspelt.
+    let named = prune(&["--episodes", "epsiodes"]);
+    assert_eq!(named.status.code(), Some(2), "{named:?}");
+}

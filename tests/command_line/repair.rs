@@ -153,6 +153,22 @@ async fn only_a_session_that_asks_loads_the_library_and_its_record_is_repaired_a
 }
 
 #[test]
+fn the_demo_says_what_its_repair_needs() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut command = wildcity();
+    command.args(["demo", "--off-trajectory", "3", "--repair", "--twins", "twins"]);
+    command.env_remove("ORT_DYLIB_PATH").current_dir(folder.path());
+    let output = command.output().unwrap();
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    let said = String::from_utf8_lossy(&output.stderr);
+    for what in ["pip install onnxruntime", "--onnxruntime PATH", "ORT_DYLIB_PATH"] {
+        assert!(said.contains(what), "no {what} in: {said}");
+    }
+    // Before the street is built, which takes a minute.
+    assert!(!folder.path().join("twins").exists());
+}
+
+#[test]
 fn a_manifest_that_is_wrong_stops_the_server_before_it_listens() {
     let folder = folder();
     let refused = |arguments: &[&str]| {

@@ -187,9 +187,12 @@ fn a_run_says_why_it_ended_so() {
     let (out, _) = ends(&passed, 0);
     // Two seeds without jitter are one episode: Wilson of 1 of 1.
     assert!(out.contains("passed      1 of 1 (95 %: 20.7 to 100.0 %)"), "{out}");
-    assert!(out.contains("note        1 of 2 episodes were driven as another one"), "{out}");
     assert!(
-        out.contains("short-1") && out.contains("driven as short-0 was, and not counted"),
+        out.contains("note        1 of 2 episodes is the same drive as an earlier seed"),
+        "{out}"
+    );
+    assert!(
+        out.contains("short-1") && out.contains("the same drive as short-0, not counted again"),
         "{out}"
     );
     assert!(out.contains("the pass rate is at least 0.207, as wanted (0.1)"), "{out}");

@@ -169,9 +169,9 @@ async fn the_report_shows_the_worst_episodes_with_pictures() {
     assert!(html.contains("href=\"http://127.0.0.1:8080/#/episode/car-3-1\""), "{html}");
     assert!(html.contains("wildcity serve --episodes /"), "{html}");
     assert!(html.contains("name=\"viewport\""), "{html}");
-    assert!(html.contains("Note: 2 of 4 episodes were driven as another one"), "{html}");
+    assert!(html.contains("Note: 2 of 4 episodes are the same drive as an earlier seed"), "{html}");
     assert!(html.contains("off_road: the scenario has no map"), "what was not judged: {html}");
-    assert_eq!(html.matches("driven as car-3 was, and not counted").count(), 1, "{html}");
+    assert_eq!(html.matches("the same drive as car-3, not counted again").count(), 1, "{html}");
 
     let xml = junit(&run, &ending);
     assert_eq!(xml.matches("<testcase").count(), 4);
@@ -179,7 +179,7 @@ async fn the_report_shows_the_worst_episodes_with_pictures() {
     assert!(xml.contains("failures=\"4\" errors=\"0\" skipped=\"0\""), "{xml}");
     assert!(xml.contains("<property name=\"exit_code\" value=\"1\"/>"), "{xml}");
     assert_eq!(xml.matches("not judged: off_road: the scenario has no map").count(), 4, "{xml}");
-    assert_eq!(xml.matches("driven as car-3 was, and not counted").count(), 1, "{xml}");
+    assert_eq!(xml.matches("the same drive as car-3, not counted again").count(), 1, "{xml}");
 }
 
 /// A title that is wider than its plot is cut: 420 px, at 7 px for a character.

@@ -21,8 +21,9 @@ export interface Aerial {
   picture: HTMLCanvasElement;
   /** East and north of its middle. */
   middle: [number, number];
-  /** Metres on the ground for a pixel. */
-  metresPerPixel: number;
+  /** Its sides on the ground. */
+  widthM: number;
+  heightM: number;
 }
 
 /** A pinhole camera that sees 72° across. */
@@ -83,7 +84,8 @@ export async function aerial(twin: string, version: number, points: Vector[]): P
     await client.open({ twin, version, session: viewerSession("map"), record: false, rig: { name: "map", cameras: [from] }, outputs });
     const canvas = await picture(client, pose, `${twin} from above`);
     const [east, north, up] = pose.xyz;
-    return { picture: canvas, middle: [east, north], metresPerPixel: (up - points[0]![2]) / from.fx! };
+    const metresPerPixel = (up - points[0]![2]) / from.fx!;
+    return { picture: canvas, middle: [east, north], widthM: canvas.width * metresPerPixel, heightM: canvas.height * metresPerPixel };
   } finally {
     await client.end();
   }

@@ -13,6 +13,7 @@ import { PointsView } from "./points";
 import { clamp, rotate } from "./pose";
 import type { Camera, Metadata, Opened, TwinInfo } from "./messages";
 import type { Observation } from "./protocol";
+import { lanesOf, omittedText, scenariosOf } from "./scenarios";
 import { Refused } from "./server";
 import { drivenSession } from "./session";
 import { Settings } from "./settings";
@@ -37,6 +38,8 @@ export class DrivePage implements Page {
   private readonly map = new MapView();
   private readonly plot = new StagePlot();
   private readonly points = new PointsView();
+  /** What the server left out of the map. */
+  private readonly omitted = el("p.omitted", { hidden: true });
   private readonly facts = new Facts();
   private readonly settings: Settings;
   private readonly controls = new Controls((code) => this.key(code));
@@ -68,7 +71,7 @@ export class DrivePage implements Page {
     const keys = el("p.keys", {}, "W A S D or arrows: drive · Space: stop · P: pause · R: start again · click a camera: enlarge · click the drive on the map: start there");
     this.element = el("div.view", {},
       el("div.left", {}, this.mosaic.element, this.controls.pads),
-      el("aside.right", {}, this.map.element, this.points.element, this.facts.element, this.plot.element,
+      el("aside.right", {}, this.map.element, this.omitted, this.points.element, this.facts.element, this.plot.element,
         el("div.buttons", {}, this.pause, again), this.settings.element, keys));
     showTitle(el("b", {}, twin), " · drive");
     void this.run();
@@ -139,8 +142,20 @@ export class DrivePage implements Page {
     // The rig may have other LiDARs than before, or none.
     this.points.clear();
     await this.map.load(twin.name, this.opened.version, twin.trajectories.map(({ name }) => name));
+    await this.showLanes(twin.name, scenario, this.opened.start.xyz[2]);
     showTitle(el("b", {}, twin.name), ` v${this.opened.version} · ${count(twin.gaussians)} Gaussians · drive`);
     await this.show(await client.observation({ type: "reset", ...this.start }));
+  }
+
+  /** The lanes of the chosen scenario's map; without a scenario, those of all maps. They are not needed to drive. */
+  private async showLanes(twin: string, scenario: string, ground: number): Promise<void> {
+    const found = await scenariosOf(twin).catch(() => ({ scenarios: [], maps: {}, omitted_maps: [] }));
+    const { map } = found.scenarios.find(({ name }) => name === scenario) ?? {};
+    const maps = scenario ? [map ?? ""] : Object.keys(found.maps);
+    this.map.lanes(lanesOf(found, maps, ground));
+    const omitted = omittedText(found.omitted_maps.filter((name) => !scenario || name === map));
+    this.omitted.textContent = omitted;
+    this.omitted.hidden = omitted === "";
   }
 
   private async drive(twin: TwinInfo): Promise<void> {

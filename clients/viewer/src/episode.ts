@@ -25,11 +25,13 @@ class Player {
   private works = false;
   private ended = false;
 
-  constructor(recording: Recording) {
+  /** The bar has the name of a single episode. */
+  constructor(recording: Recording, isNamed: boolean) {
     this.recording = recording;
     const { name, twin, outcome, frames } = recording;
     const end = outcome?.replaceAll("_", " ") ?? "no end";
-    const title = el("p.title", {}, el("b", {}, name), ` · ${twin} · ${frames.length} frames · ${end} `, this.verdict);
+    const named = isNamed ? [el("b", {}, name), " · "] : [];
+    const title = el("p.title", {}, ...named, `${twin} · ${frames.length} ${frames.length === 1 ? "frame" : "frames"} · ${end} `, this.verdict);
     this.element = el("div.player", {}, title, this.mosaic.element);
   }
 
@@ -91,13 +93,15 @@ class Player {
       return recorded === undefined ? "not recorded" : recorded === hash ? "" : "differs";
     });
     // The rows of a rolling shutter depend on the motion, which a pose alone does not have.
-    const reasons = [cameras.some(({ shutter }) => shutter) ? "rolling shutter" : "", this.recording.drawsActors ? "without the actors" : ""];
-    const reason = reasons.filter(Boolean).join(", ");
+    const reasons = [cameras.some(({ shutter }) => shutter) ? "has no rolling shutter" : "", this.recording.drawsActors ? "draws no actors" : ""];
+    const reason = reasons.filter(Boolean).join(" and ");
     const isSame = equal.length === compared.length && compared.length > 0;
-    this.verdict.className = isSame ? "verdict good" : "verdict bad";
+    this.verdict.className = isSame ? "verdict good" : compared.length === 0 || reason ? "verdict" : "verdict bad";
+    const other = compared.length - equal.length;
+    const images = compared.length === 1 ? "image" : "images";
     this.verdict.textContent = compared.length === 0 ? "no images recorded here"
-      : isSame ? `${equal.length} of ${compared.length} images have the recorded hash`
-      : `${compared.length - equal.length} of ${compared.length} images differ${reason && ` (${reason})`}`;
+      : isSame ? `${equal.length} of ${compared.length} ${images} ${equal.length === 1 ? "has" : "have"} the recorded hash`
+      : `${other} of ${compared.length} ${images} ${other === 1 ? "differs" : "differ"}${reason && `: this page ${reason}`}`;
     this.mosaic.drives(frame.time_us, this.speedAt(frame));
     await this.mosaic.show(observation);
     this.element.dataset.same = String(isSame);
@@ -152,7 +156,7 @@ export class EpisodePage implements Page {
       if (this.ended) return;
       const empty = recordings.find(({ frames }) => frames.length === 0);
       if (empty) throw new Error(`${empty.name} has no frames`);
-      this.players = recordings.map((recording) => new Player(recording));
+      this.players = recordings.map((recording) => new Player(recording, recordings.length > 1));
       this.times = [...new Set(recordings.flatMap(({ frames }) => frames.map((frame) => frame.time_us)))].sort((a, b) => a - b);
       this.slider.max = String(this.times.length - 1);
       const [first] = recordings;

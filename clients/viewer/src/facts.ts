@@ -24,7 +24,7 @@ export class Facts {
   }
 
   set(rows: [string, string][]): void {
-    this.element.replaceChildren(...rows.map(([name, value]) => el("div", {}, el("dt", {}, name), el("dd", {}, value))));
+    this.element.replaceChildren(...rows.map(([name, value]) => el(name === "route" ? "div.route" : "div", {}, el("dt", {}, name), el("dd", {}, value))));
   }
 }
 

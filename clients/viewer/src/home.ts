@@ -168,7 +168,7 @@ export class HomePage implements Page {
       const when = one.modified_us ? new Date(one.modified_us / 1000).toLocaleString([], { dateStyle: "short", timeStyle: "short" }) : "";
       const result = [one.scenario, one.verdict ?? one.outcome?.replaceAll("_", " ")].filter(Boolean).join(": ");
       return el("tr", {}, el("td", {}, box), el("td", {}, el("a", { href: `#/episode/${one.episode}` }, one.episode)),
-        el("td", {}, one.twin), el("td.number", {}, `${fixed(one.time_us * 1e-6, 1)} s`), el("td.drives", {}, result), el("td.number.dim", {}, when));
+        el("td", {}, one.twin), el("td.number", {}, `${fixed(one.time_us * 1e-6, 1)} s`), el(one.verdict === "failed" ? "td.bad" : "td.drives", {}, result), el("td.number.dim", {}, when));
     });
     const table = rows.length ? el("table", {}, el("tbody", {}, ...rows)) : el("p.dim", {}, "None yet.");
     const hint = rows.length > 1 ? [el("p.dim", {}, "Open one, or choose two to see them side by side.")] : [];

@@ -37,6 +37,8 @@ const TRAIL_POINTS = 20_000;
 /** How far beside a drive a click still means it, in pixels. */
 const CLICK_PX = 14;
 const MARK_PX = 5;
+/** Of a map that the user has not zoomed, at the least. */
+const PIXELS_PER_M = 4;
 /** Of the picture from above, so that what is drawn over it is seen. */
 const GROUND_ALPHA = 0.75;
 const FIT_SHARE = 0.8;
@@ -60,7 +62,8 @@ export class MapView {
   private fitted: Vector[] | undefined;
   /** Middle of the map: a place, or the ego. */
   private centre: [number, number] | undefined;
-  private pixelsPerM = 4;
+  /** None until the user zooms. */
+  private chosenScale: number | undefined;
 
   get element(): HTMLCanvasElement {
     return this.drawing.canvas;
@@ -129,6 +132,7 @@ export class MapView {
   /** Outlines of lanes. */
   lanes(outlines: Vector[][]): void {
     this.outlines = outlines;
+    this.element.dataset.lanes = String(outlines.length);
     this.drawing.redraw();
   }
 
@@ -163,12 +167,12 @@ export class MapView {
     const [south, north] = range(1);
     this.centre = [(west + east) / 2, (south + north) / 2];
     const pixelsPerM = FIT_SHARE * Math.min(width / (east - west || 1), height / (north - south || 1));
-    this.pixelsPerM = clamp(pixelsPerM, 0.02, 60);
+    this.chosenScale = clamp(pixelsPerM, 0.02, 60);
   }
 
   private zoom(factor: number): void {
     this.fitted = undefined;
-    this.pixelsPerM = clamp(this.pixelsPerM * factor, 0.02, 60);
+    this.chosenScale = clamp(this.pixelsPerM * factor, 0.02, 60);
     this.drawing.redraw();
   }
 
@@ -221,9 +225,29 @@ export class MapView {
     this.onPose?.(best.point.pose);
   }
 
+  /** Until the user zooms, a wide map is nearer, so that the picture from above reaches its edges. */
+  private get pixelsPerM(): number {
+    if (this.chosenScale !== undefined) return this.chosenScale;
+    const { clientWidth: width, clientHeight: height } = this.element;
+    const cover = this.ground ? Math.max(width / this.ground.widthM, height / this.ground.heightM) : 0;
+    return Math.max(PIXELS_PER_M, cover);
+  }
+
+  /** The place of the user, or the ego. Near an end of the picture from above the ego is not in the middle: the map would be empty beside it. */
   private middle(): [number, number] {
+    if (this.centre) return this.centre;
     const [x, y] = this.now?.ego.pose.xyz ?? this.drives[0]?.points[0]?.pose.xyz ?? [0, 0];
-    return this.centre ?? [x, y];
+    if (!this.ground) return [x, y];
+    const { middle: [east, north], widthM, heightM } = this.ground;
+    const within = (value: number, centre: number, picture: number, map: number): number => {
+      const spare = Math.max(0, (picture - map / this.pixelsPerM) / 2);
+      return clamp(value, centre - spare, centre + spare);
+    };
+    const { clientWidth: width, clientHeight: height } = this.element;
+    const place: [number, number] = [within(x, east, widthM, width), within(y, north, heightM, height)];
+    // An ego that has left the picture is followed all the same.
+    const isSeen = Math.abs(x - place[0]) * this.pixelsPerM < width / 2 && Math.abs(y - place[1]) * this.pixelsPerM < height / 2;
+    return isSeen ? place : [x, y];
   }
 
   private projection(width: number, height: number): (point: Vector) => [number, number] {
@@ -247,7 +271,8 @@ export class MapView {
     context.lineJoin = "round";
     context.lineCap = "round";
     if (this.ground) this.paint(context, toScreen, this.ground);
-    for (const outline of this.outlines) line([...outline, outline[0]!], colour("dim"), 0.5);
+    const edges = this.ground ? "#fffc" : colour("dim");
+    for (const outline of this.outlines) line([...outline, outline[0]!], edges, this.ground ? 1 : 0.5);
     for (const { points } of this.drives) {
       const path = points.map(({ pose }) => pose.xyz);
       if (!this.ground) line(path, colour("line"), Math.max(5, 3 * this.pixelsPerM));
@@ -282,10 +307,9 @@ export class MapView {
   }
 
   private paint(context: CanvasRenderingContext2D, toScreen: (point: Vector) => [number, number], ground: Aerial): void {
-    const { picture, middle, metresPerPixel } = ground;
-    const scale = metresPerPixel * this.pixelsPerM;
+    const { picture, middle, widthM, heightM } = ground;
     const [x, y] = toScreen([...middle, 0]);
-    const [width, height] = [picture.width * scale, picture.height * scale];
+    const [width, height] = [widthM * this.pixelsPerM, heightM * this.pixelsPerM];
     context.globalAlpha = GROUND_ALPHA;
     context.drawImage(picture, x - width / 2, y - height / 2, width, height);
     context.globalAlpha = 1;

@@ -142,7 +142,7 @@ export class PlacePage implements Page {
       this.canvas.width = w;
       this.canvas.height = h;
       showTitle(el("b", {}, this.twin), ` v${this.version} · place a drive`);
-      showStatus(this.proposal ? "a ground was found" : "no ground was found: click three places of it", "good");
+      showStatus(this.proposal ? "a ground was found" : "no ground was found: click three places of it", this.proposal ? "good" : "");
       this.refresh();
       await this.draw();
     } catch (error) {

@@ -8,6 +8,8 @@ import type { TwinInfo } from "./messages";
 import { lookAt } from "./orbit";
 import { heading } from "./pose";
 import type { Pose, Vector } from "./pose";
+import { lanesOf, omittedText, scenariosOf } from "./scenarios";
+import type { TwinScenarios } from "./scenarios";
 import { get } from "./server";
 import { viewerSession } from "./session";
 
@@ -16,13 +18,6 @@ const HEIGHT = 300;
 const EYE_M = 1.65;
 /** Points of a drive that are drawn: more than there are pixels. */
 const POINTS = 300;
-
-/** The scenarios that play in a twin; the lanes of each map are rings of x and y. */
-interface TwinScenarios {
-  scenarios: { name: string; map?: string }[];
-  maps: Record<string, [number, number][][]>;
-  omitted_maps: string[];
-}
 
 const CAMERA = camera("thumbnail", WIDTH, HEIGHT);
 
@@ -97,9 +92,8 @@ export class Thumbnails {
    */
   private async above(client: Client, twin: TwinInfo, ground: number): Promise<HTMLElement[]> {
     const drives = await Promise.all(twin.trajectories.map(({ name, length_m: length }) => points(twin, name, length)));
-    const { scenarios, maps, omitted_maps: omitted } = await get<TwinScenarios>(`v1/twins/${twin.name}/scenarios`);
-    const lanes = (map: string): Vector[][] => (maps[map] ?? []).map((ring) => ring.map(([east, north]) => [east, north, ground]));
-    const all = Object.keys(maps).flatMap(lanes);
+    const found = await scenariosOf(twin.name);
+    const all = lanesOf(found, Object.keys(found.maps), ground);
     const around = drives.length ? drives.flat() : all.flat();
     const pose = isTooWide(around) ? undefined : over(around, CAMERA);
     const elements: HTMLElement[] = [];
@@ -118,8 +112,12 @@ export class Thumbnails {
       show(all);
       elements.push(canvas);
     }
-    if (omitted.length) elements.push(el("span.dim", {}, `lanes not drawn, too large or not readable: ${omitted.join(", ")}`));
-    if (scenarios.length) elements.push(this.chooser(twin.name, scenarios, (map) => show(map === undefined ? all : lanes(map))));
+    const omitted = omittedText(found.omitted_maps);
+    if (omitted) elements.push(el("span.dim", {}, omitted));
+    const { scenarios } = found;
+    if (scenarios.length) {
+      elements.push(this.chooser(twin.name, scenarios, (map) => show(map === undefined ? all : lanesOf(found, [map], ground))));
+    }
     return elements;
   }
 

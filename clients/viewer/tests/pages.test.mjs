@@ -128,7 +128,8 @@ test("lanes lie over the picture from above, and a scenario is chosen on the fir
   await mkdir(join(place.folder, "scenarios"), { recursive: true });
   await write("road.map.json", { format: "wildcity.map/1", lanes: [lane("a", 0), lane("b", 3.5), lane("c", 40)] });
   await write("one.map.json", { format: "wildcity.map/1", lanes: [lane("a", 0)] });
-  await Promise.all([write("on-road.json", scenario("on-road", "road.map.json")), write("one.json", scenario("one", "one.map.json"))]);
+  const files = [["on-road", "road.map.json"], ["one", "one.map.json"], ["lost", "gone.map.json"]];
+  await Promise.all(files.map(([name, file]) => write(`${name}.json`, scenario(name, file))));
 
   const { page, complaints, close } = await open(browser, server, "#/");
   const above = page.locator(".pictures canvas").nth(1);
@@ -144,8 +145,15 @@ test("lanes lie over the picture from above, and a scenario is chosen on the fir
   await page.click('a[href="#/drive/demo/one"]:has-text("Drive")');
   await steps(page, 2);
   assert.equal(await page.getByLabel("scenario").inputValue(), "one");
+  assert.equal(await page.getAttribute(".map", "data-lanes"), "1");
+  assert.ok(!(await page.isVisible(".omitted")));
   await page.click("#home");
   await page.waitForSelector('tr:has-text("by-hand"):has-text("one")');
+  // Without a scenario the map has all lanes, and says which it has not.
+  await page.click('a[href="#/drive/demo"]:has-text("Drive")');
+  await steps(page, 1);
+  assert.equal(await page.getAttribute(".map", "data-lanes"), "4");
+  assert.equal(await page.textContent(".omitted"), "lanes not drawn, too large or not readable: gone.map.json");
   assert.deepEqual(complaints, []);
   await close();
 });

@@ -173,6 +173,15 @@ test("keys move the car, watchers see it, and the record has its hashes", async 
   await page.click(`text=${start.session}-1`);
   await page.waitForSelector(".player[data-same=true]");
   assert.match(await page.textContent(".verdict"), /^6 of 6 images have the recorded hash$/);
+  assert.equal(await page.locator(`text=${start.session}-1`).count(), 1, "the name stands once");
+  // The drive begins near an end of the picture from above, which reaches the edges of the map all the same.
+  await page.waitForSelector(".map:not([data-ground=''])[data-ground]");
+  await page.waitForTimeout(200);
+  const opacities = await page.$eval(".map", (map) => {
+    const { data } = map.getContext("2d").getImageData(0, Math.round(map.height / 2), map.width, 1);
+    return [data[3], data.at(-1)];
+  });
+  assert.ok(Math.min(...opacities) > 100, String(opacities));
   const last = Number(await page.getAttribute(".track input", "max"));
   assert.ok(last > 3, `${last} frames`);
   for (const at of [last, Math.floor(last / 2)]) {

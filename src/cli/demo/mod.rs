@@ -79,7 +79,9 @@ pub(super) struct Demo {
     #[arg(long, value_name = "M", conflicts_with_all = ["steps", "scenario", "view"], allow_negative_numbers = true)]
     off_trajectory: Option<f64>,
 
-    /// Also repair these views, with the model that comes with the program.
+    /// Also repair these views, with the model that comes with the program. This needs the ONNX
+    /// Runtime: `pip install onnxruntime`, and --onnxruntime or ORT_DYLIB_PATH with the path of its
+    /// library (docs/repair.md has the commands).
     #[arg(long, requires = "off_trajectory")]
     repair: bool,
 

@@ -48,6 +48,17 @@ pub(super) struct Prune {
 
 impl Prune {
     pub(super) fn run(self) -> anyhow::Result<()> {
+        let mut out = output::stdout();
+        // A job that prunes each night must not fail before the first drive. A folder that was
+        // named and is missing is a mistake.
+        if self.episodes.is_unused()? {
+            writeln!(
+                out,
+                "nothing to remove: there is no folder {}",
+                self.episodes.dir()?.display()
+            )?;
+            return Ok(());
+        }
         let dir = records(&self.episodes)?;
         let keep = Keep {
             records: self.keep,
@@ -56,7 +67,6 @@ impl Prune {
         };
         let pruned = prune(&dir, keep, SystemTime::now(), self.dry_run)
             .map_err(|error| bad_input(format!("cannot read {}: {error}", dir.display())))?;
-        let mut out = output::stdout();
         let removed = if self.dry_run { "would be removed" } else { "removed" };
         for name in &pruned.removed {
             writeln!(out, "{removed} {name}")?;

@@ -19,7 +19,7 @@ const STYLE: &str = "\
 body{font:15px/1.45 system-ui,sans-serif;max-width:1160px;margin:2em auto;padding:0 1em;color:#111}
 h1{font-size:1.6em}h2{margin-top:2em;font-size:1.2em}
 table{border-collapse:collapse;font-size:13px;display:block;overflow-x:auto}td,th{padding:2px 8px;border-bottom:1px solid #ddd;text-align:right}
-td:first-child,th:first-child{text-align:left}.wide{overflow-x:auto}
+td:first-child,th:first-child{text-align:left;position:sticky;left:0;background:#fff}.wide{overflow-x:auto}
 figure{margin:0 0 18px}figure div{display:grid;grid-template-columns:repeat(3,1fr);gap:4px;align-items:start}
 @media(max-width:600px){figure div{grid-template-columns:repeat(2,1fr)}}
 figure div.row{grid-template-columns:repeat(auto-fit,minmax(180px,1fr))}figure img{width:100%;min-width:0;height:auto}

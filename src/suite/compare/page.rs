@@ -5,14 +5,14 @@ use std::path::PathBuf;
 use maud::{Markup, PreEscaped, html};
 
 use crate::entry::EpisodeEntry;
-use crate::html::{capitalized, document, image};
+use crate::html::{SCORE_NAMES, capitalized, document, image};
 use crate::limits;
 use crate::picture::{ComparedPictures, Picture};
 use crate::plot::plots;
 use crate::result::SuiteResult;
 
 use super::pair::Side;
-use super::text::{has_changed, interval, is_alike, notes};
+use super::text::{alike_text, has_changed, interval, is_alike, notes};
 use super::{Change, ComparedEpisode, Comparison, RunName, ScoreChange};
 
 /// A run, and the folder of its records, from which its drives are drawn.
@@ -54,7 +54,7 @@ pub(super) fn page(
             (counts.unknown) " without a verdict. " (comparison.pass_rate.text()) "."
         }
         @if counts.changed > 0 { p { "Pairs that are not compared, because their twin or scenario differs: " (counts.changed) "." } }
-        @if counts.duplicates > 0 { p { "Pairs that repeat another one, and are in no rate and no mean: " (counts.duplicates) "." } }
+        @if counts.duplicates > 0 { p { "Pairs with the same drives as an earlier seed of their scenario, not counted again in rates and means: " (counts.duplicates) "." } }
         h2 { "Episodes that changed" }
         (episodes(comparison))
         (drives(comparison, runs, pictures))
@@ -79,8 +79,8 @@ fn episodes(comparison: &Comparison) -> Markup {
             @for episode in &changed {
                 tr {
                     td { (episode.name) }
-                    td { (episode.seed) }
-                    td class=(episode.change.name()) { (episode.change.name().replace('_', " ")) }
+                    td data-name="seed" { (episode.seed) }
+                    td class=(episode.change.name()) { (change_text(episode)) }
                     td.text { (episode.text()) }
                 }
             }
@@ -89,9 +89,20 @@ fn episodes(comparison: &Comparison) -> Markup {
     }
 }
 
-/// The episodes whose drives are shown: those that changed, the worse ones first.
+/// What changed, in words.
+fn change_text(episode: &ComparedEpisode) -> String {
+    // Such an episode would be listed as changed and called the same.
+    if episode.has_other_faults() {
+        return "other fault".to_owned();
+    }
+    episode.change.name().replace('_', " ")
+}
+
+/// The episodes whose drives are shown: those that changed, the worse ones first. Not a second seed
+/// with the same drives: it would have the same pictures.
 pub(super) fn shown(comparison: &Comparison) -> Vec<&ComparedEpisode> {
     let mut shown = changed(comparison);
+    shown.retain(|one| !one.duplicate);
     shown.sort_by_key(|one| one.change != Change::Worse);
     shown.truncate(limits::WORST);
     shown
@@ -158,9 +169,9 @@ fn scores(comparison: &Comparison) -> Markup {
             tr { th { "score" } th { "pairs" } th { "before" } th { "now" } th { "difference" } th { "95 %" } th { "the interval says" } }
             @for (name, score) in changed { (score_row(name, score)) }
         }
-        p { (alike) " scores have the same value in every pair." }
+        @if alike > 0 { p { (alike_text(alike)) "." } }
         @for line in &comparison.scores_not_compared { p { "Score not compared: " (line) "." } }
-        p { "Means over the pairs with a value in both runs. Intervals: Student's t of the differences; none below three pairs." }
+        p { "Means over the pairs with a value in both runs. Intervals: Student's t of the differences; none below three pairs. " (SCORE_NAMES) }
     }
 }
 
@@ -168,12 +179,12 @@ fn score_row(name: &str, score: &ScoreChange) -> Markup {
     let number = |value: Option<f64>| value.map_or(String::new(), |value| format!("{value:.4}"));
     html! {
         tr {
-            td { (name) }
-            td { (score.pairs) }
-            td { (number(score.before)) }
-            td { (number(score.after)) }
-            td { (score.difference.map_or(String::new(), |value| format!("{value:+.4}"))) }
-            td { (interval(score)) }
+            td.score { (name) }
+            td data-name="pairs" { (score.pairs) }
+            td data-name="before" { (number(score.before)) }
+            td data-name="now" { (number(score.after)) }
+            td data-name="difference" { (score.difference.map_or(String::new(), |value| format!("{value:+.4}"))) }
+            td data-name="95 %" { (interval(score)) }
             td class=(format!("text {}", score.direction.name())) { (notes(score)) }
         }
     }

@@ -140,6 +140,6 @@ impl PairedRate {
     /// Both rates, in words.
     pub(super) fn text(&self) -> String {
         let Self { pairs, before, after } = self;
-        format!("{before} of {pairs} episodes passed before and {after} pass now")
+        format!("{before} of {pairs} episodes passed before, and {after} now")
     }
 }

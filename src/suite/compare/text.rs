@@ -29,7 +29,10 @@ pub(super) fn text(comparison: &Comparison) -> String {
         (counts.changed, "pairs that are not compared, because their twin or scenario differs"),
         (counts.only_before, "episodes that were driven before alone"),
         (counts.only_after, "episodes that are driven now alone"),
-        (counts.duplicates, "pairs that repeat another one, and are in no rate and no mean"),
+        (
+            counts.duplicates,
+            "pairs with the same drives as an earlier seed, not counted again in rates and means",
+        ),
     ] {
         if count > 0 {
             row("note", &format!("{what}: {count}"));
@@ -84,8 +87,14 @@ fn scores(text: &mut String, comparison: &Comparison) {
         );
     }
     if alike > 0 {
-        let _ = writeln!(text, "{alike} scores have the same value in every pair");
+        let _ = writeln!(text, "{}", alike_text(alike));
     }
+}
+
+/// How many scores did not change.
+pub(super) fn alike_text(alike: usize) -> String {
+    let scores = if alike == 1 { "score has" } else { "scores have" };
+    format!("{alike} {scores} the same value in every pair")
 }
 
 /// Whether some pair has different values, or a value in only one run.
