@@ -63,7 +63,7 @@ pub struct Episodes {
 impl Episodes {
     /// Whether the user's own directory is meant, and does not exist yet: nothing was recorded.
     pub fn is_unused(&self) -> anyhow::Result<bool> {
-        Ok(self.episodes.is_none() && !self.dir()?.exists())
+        Ok(self.episodes.is_none() && !self.dir()?.try_exists()?)
     }
 
     /// The directory of `--episodes`, or the user's own.

@@ -212,11 +212,10 @@ impl SuiteResult {
         let Counts { duplicates, episodes, .. } = self.counts;
         (duplicates > 0).then(|| {
             format!(
-                "{duplicates} of {episodes} episodes {} the same drive as an earlier seed of their scenario, and {} not \
-                 counted again in rates and means. A seed changes a scenario only by its `jitter` or `jitter_frames`: add \
-                 one of these, or drive one seed",
-                if duplicates == 1 { "is" } else { "are" },
-                if duplicates == 1 { "is" } else { "are" },
+                "{duplicates} of {episodes} episodes {} the drive of an earlier seed of the scenario: rates and means count it \
+                 once. Without `jitter`, `jitter_frames` or sensor effects a seed changes nothing: add one of these, or drive \
+                 one seed",
+                if duplicates == 1 { "repeats" } else { "repeat" },
             )
         })
     }

@@ -22,7 +22,7 @@ use crate::sky::TrainedSky;
 use crate::trainer::{Fixed, Trainer};
 
 /// The first line of a file.
-const FORMAT: &[u8] = b"wildcity.checkpoint/3\n";
+const FORMAT: &[u8] = b"wildcity.checkpoint/4\n";
 
 /// Bytes that are hashed at a time.
 const BUFFER: usize = 1 << 16;

@@ -30,16 +30,16 @@ impl TrainingImage {
         self.rgb8.len() + flags + 4 * self.depth_m.as_ref().map_or(0, Vec::len)
     }
 
-    /// The image after it was halved some times, as far as its sides stay at least [`MIN_SIDE_PX`]:
-    /// each pixel is the mean of those that it covers. What is left over at the right and below
-    /// is cut off.
+    /// The image after it was halved some times, as far as it can be ([`halvings`]): each pixel is
+    /// the mean of those that it covers. What is left over at the right and below is cut off. A
+    /// clipped value may become one that is not, and its pixel darker than it was, until whole images
+    /// correct it.
     ///
     /// # Errors
     /// The camera cannot be scaled.
     pub(crate) fn halved(self, times: u32) -> Result<Self, CameraError> {
         let [width, height] = self.view.camera.size_px().to_array().map(|px| px as usize);
-        let times = (0..=times).rev().find(|times| width.min(height) >> times >= MIN_SIDE_PX);
-        let factor = 1_usize << times.unwrap_or(0);
+        let factor = 1_usize << halvings(&self.view, times);
         if factor == 1 {
             return Ok(self);
         }
@@ -54,7 +54,7 @@ impl TrainingImage {
         let all = |flags: Vec<bool>| blocks.reduce(&flags, 1, |flags| flags.iter().all(|&is| is));
         Ok(Self {
             view: View { camera, ..self.view },
-            rgb8: blocks.reduce(&self.rgb8, 3, mean),
+            rgb8: blocks.reduce(&self.rgb8, 3, |values| mean(values)),
             mask: self.mask.map(all),
             sky: self.sky.map(all),
             depth_m: self.depth_m.map(|depth_m| blocks.reduce(&depth_m, 1, middle)),
@@ -68,8 +68,21 @@ impl TrainingImage {
     }
 }
 
-/// Sides of an image that is not halved any more: a window of D-SSIM has 11 pixels.
-const MIN_SIDE_PX: usize = 48;
+/// Least side of an image that was halved: four windows of D-SSIM, of 11 pixels each, and some
+/// more.
+const MIN_SIDE_PX: u32 = 48;
+
+/// How often the image of a view is halved if it should be so many times. It stays large enough, and
+/// one that is exposed row by row is divided evenly: a row that is cut off takes its share of the
+/// exposure with it.
+pub fn halvings(view: &View, wanted: u32) -> u32 {
+    let [width, height] = [view.camera.width_px, view.camera.height_px];
+    let is_even = |times: u32| {
+        view.rolling_shutter.is_none() || [width, height].iter().all(|px| px % (1 << times) == 0)
+    };
+    let is_large = |times: u32| width.min(height) >> times >= MIN_SIDE_PX;
+    (1..=wanted).take_while(|&times| is_large(times) && is_even(times)).last().unwrap_or(0)
+}
 
 /// Squares of pixels of an image, each of which is a pixel of a smaller one.
 #[derive(Clone, Copy)]
@@ -108,7 +121,7 @@ impl Blocks {
     }
 }
 
-fn mean(values: &mut Vec<u8>) -> u8 {
+fn mean(values: &[u8]) -> u8 {
     let sum: u32 = values.iter().copied().map(u32::from).sum();
     let count = values.len() as u32;
     ((sum + count / 2) / count) as u8
@@ -159,7 +172,8 @@ pub trait TrainingImages: Sync {
 
 #[cfg(test)]
 mod tests {
-    use wildcity_scene::geometry::camera::Pinhole;
+    use wildcity_render::RollingShutter;
+    use wildcity_scene::geometry::camera::{Pinhole, ShutterDirection};
     use wildcity_scene::geometry::{Camera, Pose};
 
     use super::*;
@@ -173,7 +187,7 @@ mod tests {
             view: View::new(camera, Pose::IDENTITY),
             rgb8: (0..3 * pixels).map(|k| (k * 7 % 251) as u8).collect(),
             mask: Some((0..pixels).map(|k| k != 202).collect()),
-            sky: None,
+            sky: Some((0..pixels).map(|k| k % 201 < 3).collect()),
             // Of every other square, half of the pixels have one.
             depth_m: Some((0..pixels).map(|k| [9.0, 0.0, 4.0, 5.0][k % 201 % 4]).collect()),
             weight: 0.5,
@@ -199,6 +213,9 @@ mod tests {
         let mask = half.mask.unwrap();
         assert_eq!(mask.iter().position(|counts| !counts), Some(0));
         assert_eq!(mask.iter().filter(|counts| !**counts).count(), 1);
+        // Of the sky's three columns one square is whole.
+        let sky = half.sky.unwrap();
+        assert_eq!(sky[..3], [true, false, false]);
         let depth_m = half.depth_m.unwrap();
         assert_eq!(depth_m[..4], [9.0, 4.0, 9.0, 4.0]);
         assert_eq!([half.weight, half.exposure], [0.5, 2.0]);
@@ -211,5 +228,12 @@ mod tests {
         let small = image().halved(1).unwrap();
         assert_eq!(small.clone().halved(3).unwrap(), small);
         assert_eq!(image().halved(0).unwrap(), image());
+        // Row by row, and 201 px wide: a half would not have the last column.
+        let mut rolling = image();
+        rolling.view.rolling_shutter = Some(RollingShutter {
+            direction: ShutterDirection::TopToBottom,
+            world_from_camera_first: Pose::IDENTITY,
+        });
+        assert_eq!(rolling.clone().halved(1).unwrap(), rolling);
     }
 }

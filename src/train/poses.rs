@@ -14,12 +14,16 @@
 //! and the rotation φ in radians between the two. A sky moves no pose: it is smooth.
 //!
 //! The steps of Adam have the size of the learning rate, whatever the derivative is, and the rate
-//! falls to a hundredth during a run: n steps at a rate r go no farther than 0.215 n r. A pose of
-//! the rig has a step for each of its images, and a camera has one for each of its own, which are
-//! many more. With one rate for both, the first cannot reach a place that is 10 cm off in 1,500
-//! steps, and the second leave the 1 cm within which they were known, with the street that they
-//! alone see. So settings say how far each may go, and the rates follow from the number of steps. A
-//! pose with few steps goes less far: the first images of a run say little about its place.
+//! falls to a hundredth during a run: n steps at a rate r go about 0.215 n r along each axis, if all
+//! have one direction. A pose of the rig has a step for each of its images, and a camera has one for
+//! each of its own, which are many more. With one rate for both, the first cannot reach a place that
+//! is 10 cm off in 1,500 steps. The second go several centimetres, and take the part of the street
+//! that they alone see with them. So settings say how far each goes, and the rates follow from the
+//! number of steps. A pose with few steps goes less far: the first images say little about its place.
+//!
+//! The demo street after 1,500 steps from poses that are wrong by 10 cm and 0.5°, and cameras by 1 cm
+//! and 0.2°: 83 mm and 0.24° on average with one rate, 36 mm and 0.13° with a reach for each. The
+//! paper's rate of 1e-3 would move a pose by 9 mm here.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -29,7 +33,7 @@ use wildcity_render::{RollingShutter, View};
 use wildcity_scene::geometry::Pose;
 
 use crate::adam::Adam;
-use crate::settings::PoseSettings;
+use crate::settings::{PoseMode, PoseSettings};
 
 /// The poses of a rig at all times, and of its cameras.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -64,6 +68,8 @@ pub(crate) struct TrainedPoses {
     now: RigPoses,
     egos: Vec<Adam>,
     cameras: Vec<Adam>,
+    /// Which part of all steps moves each pose of the rig, and each camera.
+    shares: [Vec<f64>; 2],
 }
 
 /// Which poses one step moves, and how.
@@ -107,6 +113,8 @@ impl TrainedPoses {
         Self {
             egos: moments(&recorded.world_from_ego),
             cameras: moments(&recorded.ego_from_camera),
+            shares: [&recorded.world_from_ego, &recorded.ego_from_camera]
+                .map(|poses| vec![1.0 / poses.len().max(1) as f64; poses.len()]),
             now: recorded.clone(),
             recorded,
         }
@@ -132,18 +140,41 @@ impl TrainedPoses {
         }
     }
 
-    /// The learning rates of the first step of a run for a pose of the rig and for a camera, each in
-    /// metres and in radians.
-    pub(crate) fn rates(&self, settings: &PoseSettings, steps: usize) -> [[f64; 2]; 2] {
-        let PoseSettings { reach_m, reach_rad, camera_reach_m, camera_reach_rad, .. } = *settings;
-        let rates = |reaches: [f64; 2], poses: usize| {
-            let share = share_of_reach(steps as f64 / poses.max(1) as f64);
-            reaches.map(|reach| share * reach)
+    /// Counts the images from which each pose learns; until then all have as many.
+    pub(crate) fn count(&mut self, places: &[Option<Place>]) {
+        for shares in &mut self.shares {
+            shares.fill(0.0);
+        }
+        let each = 1.0 / places.len().max(1) as f64;
+        for place in places.iter().flatten() {
+            for (shares, pose) in self.shares.iter_mut().zip([place.ego, place.camera]) {
+                if let Some(share) = shares.get_mut(pose) {
+                    *share += each;
+                }
+            }
+        }
+    }
+
+    /// The learning rates of the first step of a run for the two poses of an image, each in metres
+    /// and in radians.
+    pub(crate) fn rates(
+        &self,
+        place: Place,
+        settings: &PoseSettings,
+        steps: usize,
+    ) -> [[f64; 2]; 2] {
+        let PoseSettings { reach_m, reach_rad, camera_reach_m, camera_reach_rad, mode, .. } =
+            *settings;
+        let rates = |share: f64, reaches: [f64; 2]| {
+            let of_reach = share_of_reach(share * steps as f64);
+            reaches.map(|reach| of_reach * reach)
         };
-        [
-            rates([reach_m, reach_rad], self.now.world_from_ego.len()),
-            rates([camera_reach_m, camera_reach_rad], self.now.ego_from_camera.len()),
-        ]
+        let of_ego = rates(self.shares[0][place.ego], [reach_m, reach_rad]);
+        // An image with a pose of its own has no camera on a rig.
+        if mode == PoseMode::Image {
+            return [of_ego, [0.0; 2]];
+        }
+        [of_ego, rates(self.shares[1][place.camera], [camera_reach_m, camera_reach_rad])]
     }
 
     /// A view at the pose that it has now, with both ends of its exposure moved alike.
@@ -190,12 +221,12 @@ impl TrainedPoses {
     }
 }
 
-/// The first learning rate of a pose with some steps, as a share of how far it may go.
+/// The first learning rate of a pose with some steps, as a share of how far it goes.
 fn share_of_reach(steps: f64) -> f64 {
     // The mean of a rate that falls to a hundredth, in first rates: (1 - 0.01) / ln 100.
     const MEAN: f64 = 0.215;
-    // From 37 steps on a pose can go as far as it may: 1 / (0.215 x 37) = 37 / 300.
-    (1.0 / (MEAN * steps)).min(steps / 300.0)
+    // From 37 steps on it goes as far as it may: 1 / (0.215 x 37) = 37 / 300.
+    (1.0 / (MEAN * steps.max(1.0))).min(steps / 300.0)
 }
 
 /// Poses as seven numbers each, so that a file keeps every bit of them.
@@ -216,5 +247,52 @@ mod numbers {
             rotation: DQuat::from_array(rotation),
         };
         Ok(numbers.into_iter().map(pose).collect())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// How far a pose of the rig and a camera go in a run whose derivatives all have one direction.
+    fn gone(steps: usize, mode: PoseMode) -> [f64; 2] {
+        let settings =
+            PoseSettings { mode, reach_m: 1.0, camera_reach_m: 0.01, ..PoseSettings::default() };
+        let mut poses = TrainedPoses::new(RigPoses {
+            world_from_ego: vec![Pose::IDENTITY; 5],
+            // The rig has four, of which one took images.
+            ego_from_camera: vec![Pose::IDENTITY; 4],
+        });
+        let place = |step: usize| Place::new(step % 5, 2);
+        let places: Vec<Option<Place>> = (0..5).map(|step| Some(place(step))).collect();
+        poses.count(&places);
+        let by = Twist { rho: DVec3::X, phi: DVec3::ZERO };
+        for step in 0..steps {
+            let fall = 0.01_f64.powf(step as f64 / steps as f64);
+            let rates = poses.rates(place(step), &settings, steps);
+            let rates = rates.map(|rates| rates.map(|rate| rate * fall));
+            poses.step(&PoseStep { place: place(step), by, rates, weight: 0.0 });
+        }
+        let moves = poses.moves();
+        [moves.egos[1][0], moves.cameras[2][0]]
+    }
+
+    #[test]
+    fn a_pose_goes_as_far_as_it_may_and_less_with_few_steps() {
+        for steps in [200, 1_000, 5_000] {
+            let [ego_m, camera_m] = gone(steps, PoseMode::Rig);
+            assert!((0.95..1.05).contains(&ego_m), "{steps} steps: {ego_m}");
+            assert!((0.0095..0.0105).contains(&camera_m), "{steps} steps: {camera_m}");
+        }
+        // Five steps of each: 0.215 x 5 x 5 / 300 of the way, and somewhat more as they are few.
+        let [ego_m, camera_m] = gone(25, PoseMode::Rig);
+        assert!((0.015..0.05).contains(&ego_m), "{ego_m}");
+        assert!((0.003..0.01).contains(&camera_m), "{camera_m}");
+    }
+
+    #[test]
+    fn a_camera_of_images_with_poses_of_their_own_stays() {
+        let [ego_m, camera_m] = gone(1_000, PoseMode::Image);
+        assert!(ego_m > 0.9 && camera_m == 0.0, "{ego_m} {camera_m}");
     }
 }

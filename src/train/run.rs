@@ -12,7 +12,7 @@ use wildcity_scene::random::{mix, to_unit};
 
 use crate::held_out::Evaluator;
 pub use crate::history::Line;
-pub use crate::images::{TrainingImage, TrainingImages};
+pub use crate::images::{TrainingImage, TrainingImages, halvings};
 use crate::sample::Sample;
 use crate::settings::Settings;
 use crate::trainer::{StepReport, TrainError, Trainer};
@@ -38,6 +38,8 @@ pub fn run(
     if learned.is_empty() {
         return Err(TrainError::NoImages { images: count, held_out: count });
     }
+    let places: Vec<_> = learned.iter().map(|&index| (index, images.place(index))).collect();
+    trainer.count(&places);
     let steps = trainer.settings().steps;
     let first = trainer.steps_done();
     let settings = trainer.settings().clone();

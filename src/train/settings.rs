@@ -1,9 +1,12 @@
 //! The settings of a training run, and where each default is from.
 //!
-//! The project's paper: the learning rate of means and its fall, the degree, the weight of depths,
+//! The reaches of poses and the small images: measured on the demo street. The project's paper: the
+//! learning rate of means and its fall, the degree, the weight of depths,
 //! the least opacity. gsplat's trainer by Markov chain Monte Carlo: the other learning rates, the
 //! losses, 30,000 steps and the growth within them, which make a small twin; the paper's 600,000
 //! steps grow by 0.5 % from step 10,000 to 60,000. The first author's code: the noise.
+
+use std::f64::consts::PI;
 
 use serde::{Deserialize, Serialize};
 use wildcity_scene::sky::Network;
@@ -62,8 +65,8 @@ pub struct Weights {
     pub sky: f64,
 }
 
-/// How many steps learn from small images. They cost less, and what lies wrong by many pixels moves
-/// towards its place: a large image has detail on the way.
+/// How many steps learn from small images. They cost less, and the gradient of what lies wrong by
+/// many pixels points to its place; on a large image it points to some detail that is nearer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CoarseSettings {
@@ -110,13 +113,14 @@ pub enum PoseMode {
 #[serde(deny_unknown_fields, default)]
 pub struct PoseSettings {
     pub mode: PoseMode,
-    /// How far a pose of the rig, or of an image, can move in a run, in metres.
+    /// About how far a pose of the rig, or of an image, moves along each axis if all steps of a run
+    /// agree, in metres.
     pub reach_m: f64,
-    /// How far it can turn, in radians.
+    /// About how far it turns about each axis, in radians.
     pub reach_rad: f64,
-    /// How far a camera can move on its rig, in metres.
+    /// About how far a camera moves on its rig along each axis, in metres.
     pub camera_reach_m: f64,
-    /// How far it can turn there, in radians.
+    /// About how far it turns there about each axis, in radians.
     pub camera_reach_rad: f64,
     /// Of the squared distance to the recorded pose, in metres and radians.
     pub weight: f64,
@@ -293,8 +297,8 @@ pub struct SettingError {
 /// A rate of 10 leaves the street in a step.
 const MOST_RATE: f64 = 10.0;
 
-/// In metres and radians: a recording that is farther off has to be placed first.
-const MOST_REACH: f64 = 100.0;
+/// In metres: a recording that is farther off has to be placed first.
+const MOST_REACH_M: f64 = 100.0;
 
 const MOST_WEIGHT: f64 = 1e6;
 
@@ -341,10 +345,10 @@ impl Settings {
             ("loss.dssim", loss.dssim, 0.0, 1.0),
             range("coarse.halvings", coarse.halvings as usize, 0, 8),
             range("coarse.until", coarse.until, 0, SCHEDULE),
-            ("poses.reach_m", poses.reach_m, 0.0, MOST_REACH),
-            ("poses.reach_rad", poses.reach_rad, 0.0, MOST_REACH),
-            ("poses.camera_reach_m", poses.camera_reach_m, 0.0, MOST_REACH),
-            ("poses.camera_reach_rad", poses.camera_reach_rad, 0.0, MOST_REACH),
+            ("poses.reach_m", poses.reach_m, 0.0, MOST_REACH_M),
+            ("poses.reach_rad", poses.reach_rad, 0.0, PI),
+            ("poses.camera_reach_m", poses.camera_reach_m, 0.0, MOST_REACH_M),
+            ("poses.camera_reach_rad", poses.camera_reach_rad, 0.0, PI),
             range("growth.cap", growth.cap, 1, 100_000_000),
             ("growth.rate", growth.rate, 0.0, 1.0),
             ("growth.least_opacity", growth.least_opacity.into(), 0.0, 0.5),
@@ -388,6 +392,11 @@ impl Settings {
         // All sizes have the same number of steps, and the last of them ends before `until`.
         let left = until.saturating_sub(step);
         (left as f64 * f64::from(halvings) / until.max(1) as f64).ceil() as u32
+    }
+
+    /// The first step on whole images.
+    pub(crate) fn first_whole_step(&self) -> usize {
+        if self.coarse.halvings == 0 { 1 } else { self.scaled(self.coarse.until).max(1) }
     }
 
     /// Whether Gaussians are moved and added after a step.
@@ -440,7 +449,8 @@ mod tests {
         let count = |halvings| (1..=300).filter(|&k| settings.halvings_at(k) == halvings).count();
         assert_eq!([2, 1, 0].map(count), [59, 60, 181]);
         assert_eq!([1, 60, 120, 300].map(|step| settings.halvings_at(step)), [2, 1, 0, 0]);
+        assert_eq!(settings.first_whole_step(), 120);
         let whole = Settings { coarse: CoarseSettings { halvings: 0, ..coarse }, ..settings };
-        assert_eq!(whole.halvings_at(1), 0);
+        assert_eq!([whole.halvings_at(1) as usize, whole.first_whole_step()], [0, 1]);
     }
 }

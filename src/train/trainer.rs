@@ -190,6 +190,15 @@ impl Trainer {
         self.poses.as_ref().map(TrainedPoses::moves)
     }
 
+    /// Says from which images the run learns, and which poses of its rig they have.
+    pub(crate) fn count(&mut self, images: &[(usize, Option<Place>)]) {
+        let place = |&(image, place): &(usize, Option<Place>)| self.trained_place(image, place);
+        let places: Vec<Option<Place>> = images.iter().map(place).collect();
+        if let Some(poses) = &mut self.poses {
+            poses.count(&places);
+        }
+    }
+
     /// Number of steps that have been made.
     pub fn steps_done(&self) -> usize {
         self.step
@@ -297,7 +306,7 @@ impl Trainer {
                 return not_finite("its pose");
             }
             let settings = &self.settings.poses;
-            let rates = poses.rates(settings, self.settings.steps);
+            let rates = poses.rates(place, settings, self.settings.steps);
             let rates = rates.map(|rates| rates.map(|rate| rate * fall));
             poses.step(&PoseStep { place, by, rates, weight: settings.weight });
         }

@@ -189,6 +189,6 @@ fn before_the_first_drive_there_is_nothing_to_prune() {
     );
     assert_eq!((default.status.code(), stdout(&default)), (Some(0), said), "{default:?}");
     // A folder that is named may be misspelt.
-    let named = prune(&["--episodes", "epsiodes"]);
+    let named = prune(&["--episodes", "no-such-folder"]);
     assert_eq!(named.status.code(), Some(2), "{named:?}");
 }

@@ -188,7 +188,7 @@ fn a_run_says_why_it_ended_so() {
     // Two seeds without jitter are one episode: Wilson of 1 of 1.
     assert!(out.contains("passed      1 of 1 (95 %: 20.7 to 100.0 %)"), "{out}");
     assert!(
-        out.contains("note        1 of 2 episodes is the same drive as an earlier seed"),
+        out.contains("note        1 of 2 episodes repeats the drive of an earlier seed"),
         "{out}"
     );
     assert!(

@@ -169,7 +169,7 @@ async fn the_report_shows_the_worst_episodes_with_pictures() {
     assert!(html.contains("href=\"http://127.0.0.1:8080/#/episode/car-3-1\""), "{html}");
     assert!(html.contains("wildcity serve --episodes /"), "{html}");
     assert!(html.contains("name=\"viewport\""), "{html}");
-    assert!(html.contains("Note: 2 of 4 episodes are the same drive as an earlier seed"), "{html}");
+    assert!(html.contains("Note: 2 of 4 episodes repeat the drive of an earlier seed"), "{html}");
     assert!(html.contains("off_road: the scenario has no map"), "what was not judged: {html}");
     assert_eq!(html.matches("the same drive as car-3, not counted again").count(), 1, "{html}");
 

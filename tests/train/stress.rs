@@ -174,7 +174,7 @@ fn poses_that_are_far_off_end_in_a_finite_scene() {
     }
     let mut settings = settings(60);
     settings.poses.mode = PoseMode::Image;
-    [settings.poses.reach_m, settings.poses.reach_rad] = [50.0, 10.0];
+    [settings.poses.reach_m, settings.poses.reach_rad] = [50.0, 3.0];
     trained(&cpu, changed(&wall), &images, settings).unwrap();
 }
 

@@ -37,7 +37,7 @@ const TRAIL_POINTS = 20_000;
 /** How far beside a drive a click still means it, in pixels. */
 const CLICK_PX = 14;
 const MARK_PX = 5;
-/** Of a map that the user has not zoomed, at the least. */
+/** Least scale of a map that the user has not zoomed. */
 const PIXELS_PER_M = 4;
 /** Of the picture from above, so that what is drawn over it is seen. */
 const GROUND_ALPHA = 0.75;
@@ -62,7 +62,7 @@ export class MapView {
   private fitted: Vector[] | undefined;
   /** Middle of the map: a place, or the ego. */
   private centre: [number, number] | undefined;
-  /** None until the user zooms. */
+  /** None until the user zooms or a place is fitted. */
   private chosenScale: number | undefined;
 
   get element(): HTMLCanvasElement {
@@ -245,9 +245,12 @@ export class MapView {
     };
     const { clientWidth: width, clientHeight: height } = this.element;
     const place: [number, number] = [within(x, east, widthM, width), within(y, north, heightM, height)];
-    // An ego that has left the picture is followed all the same.
-    const isSeen = Math.abs(x - place[0]) * this.pixelsPerM < width / 2 && Math.abs(y - place[1]) * this.pixelsPerM < height / 2;
-    return isSeen ? place : [x, y];
+    // An ego that leaves the picture takes the map with it.
+    const follow = (value: number, centre: number, map: number): number => {
+      const reach = (0.45 * map) / this.pixelsPerM;
+      return clamp(centre, value - reach, value + reach);
+    };
+    return [follow(x, place[0], width), follow(y, place[1], height)];
   }
 
   private projection(width: number, height: number): (point: Vector) => [number, number] {

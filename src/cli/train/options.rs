@@ -194,6 +194,10 @@ impl SourceOptions {
             None => Settings::default(),
             Some(path) => read_settings(path)?,
         };
+        if self.settings.is_none() && self.start.is_scene() {
+            // It has its shape already: small images would blur it.
+            settings.coarse.halvings = 0;
+        }
         settings.seed = self.seed.unwrap_or(settings.seed);
         settings.sky.mode = self.sky.unwrap_or(settings.sky.mode);
         Ok(settings)

@@ -6,12 +6,13 @@ use std::time::Instant;
 
 use anyhow::Context;
 use glam::DVec3;
+use wildcity_render::View;
 use wildcity_render::gradient::Differentiate;
 use wildcity_scene::chunk::cell_at;
 use wildcity_train::blocks::{Blocks, sees};
 use wildcity_train::cache::CachedImages;
 use wildcity_train::model::peak_bytes;
-use wildcity_train::run::{Line, TrainingImages, run};
+use wildcity_train::run::{Line, TrainingImages, halvings, run};
 use wildcity_train::trainer::Trainer;
 
 use super::block_parts::sample;
@@ -71,6 +72,7 @@ impl Plan {
         let begin = start.gaussians.len();
         let end = settings.counts(begin).last().unwrap_or(begin);
         let backend = &*self.run.source.hardware.training()?;
+        // Whole images are measured: the time of smaller ones follows from their pixels.
         let mut whole = settings.clone();
         whole.coarse.halvings = 0;
         let mut trainer = Trainer::new(start, profile, whole)?;
@@ -104,17 +106,18 @@ impl Plan {
             )?,
             None => writeln!(stdout, "memory     {each} B for each Gaussian")?,
         }
+        let shares = shares(images, self.run.size, settings.coarse.halvings)?;
         // Images that are not kept are decoded again each time, beside the step.
         let is_decoded = |step: usize| step < learned || decoded > CACHE_BYTES;
         let step_s = |(step, count): (usize, usize)| {
-            let pixels = 0.25_f64.powi(settings.halvings_at(step + 1) as i32);
+            let pixels = shares[settings.halvings_at(step + 1) as usize];
             let step_s = measured.step_s(count, begin, pixels);
             if is_decoded(step) { step_s.max(measured.decode_s) } else { step_s }
         };
         let steps_s: f64 = settings.counts(begin).enumerate().map(step_s).sum();
         let evaluations_s =
             (EVALUATIONS * held_out) as f64 * measured.step_s(end, begin, 1.0) / 2.0;
-        let first_pixels = 0.25_f64.powi(settings.halvings_at(1) as i32);
+        let first_pixels = shares[settings.halvings_at(1) as usize];
         let first_ms = 1e3 * measured.step_s(begin, begin, first_pixels);
         let last_ms = 1e3 * measured.step_s(end, begin, 1.0);
         writeln!(
@@ -129,6 +132,23 @@ impl Plan {
         )?;
         print_blocks(&mut stdout, &blocks, images, &points_m)
     }
+}
+
+/// The share of its pixels that an image has on average after it was halved up to so many times, from
+/// 0 times.
+fn shares(images: &dyn TrainingImages, size: f64, most: u32) -> anyhow::Result<Vec<f64>> {
+    let small = |index: usize| {
+        let view = images.view(index);
+        let side = |px: u32| ((f64::from(px) * size).round() as u64).max(1);
+        let camera = view.camera.scaled(side(view.camera.width_px), side(view.camera.height_px))?;
+        anyhow::Ok(View { camera, ..view })
+    };
+    let views = (0..images.count()).map(small).collect::<anyhow::Result<Vec<View>>>()?;
+    let share = |wanted: u32| {
+        let all = views.iter().map(|view| 0.25_f64.powi(halvings(view, wanted) as i32));
+        all.sum::<f64>() / views.len().max(1) as f64
+    };
+    Ok((0..=most).map(share).collect())
 }
 
 /// The cells of some points, with their numbers.

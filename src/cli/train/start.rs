@@ -32,6 +32,11 @@ pub(super) struct StartOptions {
 }
 
 impl StartOptions {
+    /// Whether the run begins with a scene, and not with points.
+    pub(super) fn is_scene(&self) -> bool {
+        self.start.is_some()
+    }
+
     /// The Gaussians that the run begins with, and its image formation.
     pub(super) fn read(
         &self,

@@ -48,6 +48,7 @@ pub fn page(contents: &Contents<'_>) -> Result<String, PageError> {
     let history = trainer.history();
     let pictures = held_out.iter().map(beside).collect::<Result<Vec<_>, PageError>>()?;
     let settings = toml::to_string_pretty(trainer.settings())?;
+    let first_whole = trainer.settings().first_whole_step();
     let body = html! {
         p.verdict { (verdict(contents)) }
         @if !pictures.is_empty() {
@@ -61,6 +62,9 @@ pub fn page(contents: &Contents<'_>) -> Result<String, PageError> {
         h2 { "Curves" }
         @if !history.evaluations.is_empty() { (PreEscaped(curves::psnr(history)?)) }
         (PreEscaped(curves::losses(history)?))
+        @if first_whole > 1 {
+            p { "Losses before step " (first_whole) " are of images that were made smaller, if they were large enough." }
+        }
         (PreEscaped(curves::gaussians(history)?))
         @if let Some(moves) = trainer.moves() { (poses(&moves, cameras, trainer.settings().poses.mode != PoseMode::Image)) }
         h2 { "Settings" }
