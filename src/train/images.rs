@@ -32,8 +32,8 @@ impl TrainingImage {
 
     /// The image after it was halved some times, as far as it can be ([`halvings`]): each pixel is
     /// the mean of those that it covers. What is left over at the right and below is cut off. A
-    /// clipped value may become one that is not, and its pixel darker than it was, until whole images
-    /// correct it.
+    /// clipped value may become one that is not, and its pixel darker than it was, until whole
+    /// images correct it.
     ///
     /// # Errors
     /// The camera cannot be scaled.
@@ -44,10 +44,9 @@ impl TrainingImage {
             return Ok(self);
         }
         let small = [width / factor, height / factor];
-        let [small_width, small_height] = small.map(|px| px as u64);
         let covered = small.map(|px| (px * factor) as u64);
-        let mut camera = self.view.camera.cropped([0, 0], covered)?;
-        camera = camera.scaled(small_width, small_height)?;
+        let covering = self.view.camera.cropped([0, 0], covered)?;
+        let mut camera = covering.scaled(small[0] as u64, small[1] as u64)?;
         // As a photograph of this size: no filter of a larger one is part of it.
         camera.native_size_px = None;
         let blocks = Blocks { width, small, factor };
@@ -72,15 +71,15 @@ impl TrainingImage {
 /// more.
 const MIN_SIDE_PX: u32 = 48;
 
-/// How often the image of a view is halved if it should be so many times. It stays large enough, and
-/// one that is exposed row by row is divided evenly: a row that is cut off takes its share of the
-/// exposure with it.
+/// How often the image of a view is halved if it should be so many times. It stays large enough,
+/// and one that is exposed row by row is divided evenly: a row that is cut off takes its share of
+/// the exposure with it.
 pub fn halvings(view: &View, wanted: u32) -> u32 {
-    let [width, height] = [view.camera.width_px, view.camera.height_px];
+    let sides_px = [view.camera.width_px, view.camera.height_px];
     let is_even = |times: u32| {
-        view.rolling_shutter.is_none() || [width, height].iter().all(|px| px % (1 << times) == 0)
+        view.rolling_shutter.is_none() || sides_px.iter().all(|px| px % (1 << times) == 0)
     };
-    let is_large = |times: u32| width.min(height) >> times >= MIN_SIDE_PX;
+    let is_large = |times: u32| sides_px.iter().all(|px| px >> times >= MIN_SIDE_PX);
     (1..=wanted).take_while(|&times| is_large(times) && is_even(times)).last().unwrap_or(0)
 }
 

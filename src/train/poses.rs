@@ -14,16 +14,17 @@
 //! and the rotation φ in radians between the two. A sky moves no pose: it is smooth.
 //!
 //! The steps of Adam have the size of the learning rate, whatever the derivative is, and the rate
-//! falls to a hundredth during a run: n steps at a rate r go about 0.215 n r along each axis, if all
-//! have one direction. A pose of the rig has a step for each of its images, and a camera has one for
-//! each of its own, which are many more. With one rate for both, the first cannot reach a place that
-//! is 10 cm off in 1,500 steps. The second go several centimetres, and take the part of the street
-//! that they alone see with them. So settings say how far each goes, and the rates follow from the
-//! number of steps. A pose with few steps goes less far: the first images say little about its place.
+//! falls to a hundredth during a run: n steps at a rate r go about 0.215 n r along each axis, if
+//! all have one direction. A pose of the rig has a step for each of its images, and a camera has
+//! one for each of its own, which are many more. With one rate for both, the first cannot reach a
+//! place that is 10 cm off in 1,500 steps. The second go several centimetres, and take the part of
+//! the street that they alone see with them. So settings say how far each goes, and the rates
+//! follow from the number of steps. A pose with few steps goes less far: the first images say
+//! little about its place.
 //!
-//! The demo street after 1,500 steps from poses that are wrong by 10 cm and 0.5°, and cameras by 1 cm
-//! and 0.2°: 83 mm and 0.24° on average with one rate, 36 mm and 0.13° with a reach for each. The
-//! paper's rate of 1e-3 would move a pose by 9 mm here.
+//! The demo street after 1,500 steps from poses that are wrong by 10 cm and 0.5°, and cameras by
+//! 1 cm and 0.2°: 83 mm and 0.24° on average with one rate, 36 mm and 0.13° with a reach for each.
+//! The paper's rate of 1e-3 would move a pose by 9 mm here.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -269,8 +270,8 @@ mod tests {
         let by = Twist { rho: DVec3::X, phi: DVec3::ZERO };
         for step in 0..steps {
             let fall = 0.01_f64.powf(step as f64 / steps as f64);
-            let rates = poses.rates(place(step), &settings, steps);
-            let rates = rates.map(|rates| rates.map(|rate| rate * fall));
+            let first_rates = poses.rates(place(step), &settings, steps);
+            let rates = first_rates.map(|rates| rates.map(|rate| rate * fall));
             poses.step(&PoseStep { place: place(step), by, rates, weight: 0.0 });
         }
         let moves = poses.moves();

@@ -43,8 +43,7 @@ pub fn run(
     let steps = trainer.settings().steps;
     let first = trainer.steps_done();
     let settings = trainer.settings().clone();
-    let order = Order::new(&learned, images, &settings);
-    let order = (1..=steps).zip(order).skip(first);
+    let order = (1..=steps).zip(Order::new(&learned, images, &settings)).skip(first);
     let evaluator = Evaluator::new(images, backend);
     thread::scope(|scope| {
         let (sender, next) = sync_channel(AHEAD);

@@ -306,8 +306,8 @@ impl Trainer {
                 return not_finite("its pose");
             }
             let settings = &self.settings.poses;
-            let rates = poses.rates(place, settings, self.settings.steps);
-            let rates = rates.map(|rates| rates.map(|rate| rate * fall));
+            let first_rates = poses.rates(place, settings, self.settings.steps);
+            let rates = first_rates.map(|rates| rates.map(|rate| rate * fall));
             poses.step(&PoseStep { place, by, rates, weight: settings.weight });
         }
         if let Some(exposures) = &mut self.exposures {

@@ -459,7 +459,8 @@ fn an_episode_is_scored_in_a_time_in_proportion_to_its_steps() {
         let once = || thread_time(|| assert_eq!(score(&record).len(), 17));
         (0..3).map(|_| once()).min().unwrap().as_secs_f64()
     };
-    // 32 times the steps take about 32 times as long; if each step looked at all others, up to 1,024.
+    // 32 times the steps take about 32 times as long; if each step looked at all others, up to
+    // 1,024 times.
     let ratio = least(9_632) / least(301);
     assert!(ratio < 80.0, "{ratio}");
 }

@@ -134,8 +134,8 @@ impl Plan {
     }
 }
 
-/// The share of its pixels that an image has on average after it was halved up to so many times, from
-/// 0 times.
+/// The share of its pixels that an image has on average after it was halved up to so many times,
+/// from 0 times.
 fn shares(images: &dyn TrainingImages, size: f64, most: u32) -> anyhow::Result<Vec<f64>> {
     let small = |index: usize| {
         let view = images.view(index);
