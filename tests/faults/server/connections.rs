@@ -605,6 +605,13 @@ impl Link {
             }
         }
         answers.dedup();
+        // On a busy machine the deadline of the first may pass. It was not carried out, and the
+        // second one may be.
+        if let [first, _] = answers.as_slice()
+            && first.to_text().is_ok_and(|said| said.contains("deadline_exceeded"))
+        {
+            answers.remove(0);
+        }
         assert_eq!(answers.len(), 1, "a repeated request has two answers: {answers:?}");
         answers.pop().ok_or(Lost)
     }
