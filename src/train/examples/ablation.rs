@@ -1,7 +1,7 @@
 //! What each part of the method gains on the demo street: a table of runs that lack one of them.
 //!
 //! ```text
-//! cargo run --release -p wildcity-train --example ablation -- STEPS [ROW ..]
+//! cargo run --release -p wildcity-train --example ablation -- STEPS [SCALE] [ROW ..]
 //! ```
 //!
 //! The recording is wrong by 10 cm and 0.5° at each keyframe, and by 1 cm and 0.2° at each camera.
@@ -62,12 +62,15 @@ fn leave_out_ground(settings: &mut Settings) {
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let steps: usize = arguments.first().map_or("3000", String::as_str).parse()?;
-    let chosen = &arguments[1.min(arguments.len())..];
+    // Of the cameras of 1440 x 928.
+    let scale = arguments.get(1).and_then(|scale| scale.parse::<f64>().ok());
+    let chosen = arguments.get(if scale.is_some() { 2 } else { 1 }..).unwrap_or_default();
+    let scale = scale.unwrap_or(0.25);
     let cpu = Cpu::new(0, Simd::Best)?;
     let street = wildcity_generate::street(&StreetSettings::default())?;
     let sky = Sky::new(SkyModel::Cube(Arc::new(evening()?)), DMat3::IDENTITY);
     let truth = Scene { sky: Some(Arc::new(sky)), ..Scene::from_gaussians(&street.gaussians) };
-    let mut recording = Recording::new(&cpu, &truth, &street.trajectory, 0.25)?;
+    let mut recording = Recording::new(&cpu, &truth, &street.trajectory, scale)?;
     for (index, image) in recording.images.iter_mut().enumerate() {
         image.is_held_out = index % 8 == 3;
     }
@@ -76,8 +79,10 @@ fn main() -> Result<(), Box<dyn Error>> {
     let shaken = shaken(&true_rig);
 
     println!(
-        "{steps} steps at 360 x 232, {} images, {} points\n\
+        "{steps} steps at {} x {}, {} images, {} points\n\
          {:20} {:>8} {:>9} {:>9} {:>9} {:>10} {:>9} {:>7}",
+        recording.images[0].view.camera.width_px,
+        recording.images[0].view.camera.height_px,
         recording.images.len(),
         points.len(),
         "",
