@@ -125,9 +125,15 @@ impl DeviceInfo {
     }
 }
 
+/// The interfaces to devices that the program was built for: Vulkan, and with the features `metal`
+/// and `dx12` those of macOS and Windows.
+const BACKENDS: Backends = Backends::VULKAN
+    .union(if cfg!(feature = "metal") { Backends::METAL } else { Backends::empty() })
+    .union(if cfg!(feature = "dx12") { Backends::DX12 } else { Backends::empty() });
+
 fn adapters() -> Vec<Adapter> {
     let instance = Instance::new(InstanceDescriptor {
-        backends: Backends::VULKAN,
+        backends: BACKENDS,
         // wgpu's validation of indirect dispatches costs one more dispatch each. It is not needed:
         // `plan.wgsl` computes all workgroup counts within the limits that it would check.
         // WGPU_VALIDATION=1 in the environment enables the Vulkan validation layer.
@@ -135,7 +141,7 @@ fn adapters() -> Vec<Adapter> {
         ..InstanceDescriptor::new_without_display_handle()
     });
     // Outside of browsers this future is ready at once.
-    let found = instance.enumerate_adapters(Backends::VULKAN).now_or_never();
+    let found = instance.enumerate_adapters(BACKENDS).now_or_never();
     let mut found = found.unwrap_or_default();
     found.sort_by_key(|adapter| match adapter.get_info().device_type {
         DeviceType::DiscreteGpu => 0,
