@@ -8,49 +8,61 @@
 
 use std::f64::consts::PI;
 
+use documented::DocumentedFields;
 use serde::{Deserialize, Serialize};
 use wildcity_scene::sky::Network;
 
 /// The settings of a run, as in a file `train.toml`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, DocumentedFields)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
     /// Steps, each on one image. Schedules are given for 30,000 and scaled to this number.
     pub steps: usize,
-    /// Of the order of images, and of all random numbers.
+    /// Seed of the order of images, and of all random numbers.
     pub seed: u64,
     /// Degree of the spherical harmonics, 0 to 3.
     pub sh_degree: u8,
     /// Share of the steps that are made on images which were rendered and repaired, if there are
     /// such.
     pub augmented_share: f64,
+    /// Learning rates of Adam, with decay 0.9 and 0.999.
     pub rates: Rates,
+    /// Weights of the losses.
     pub loss: Weights,
+    /// How many steps learn from small images.
     pub coarse: CoarseSettings,
+    /// How the number of Gaussians grows.
     pub growth: Growth,
+    /// How poses are trained.
     pub poses: PoseSettings,
+    /// What lies behind the Gaussians: a network.
     pub sky: SkySettings,
+    /// An exposure for each image.
     pub exposure: ExposureSettings,
+    /// Terms of the Gaussians that begin on the ground.
     pub ground: GroundSettings,
 }
 
 /// Learning rates of Adam, with decay 0.9 and 0.999.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, DocumentedFields)]
 #[serde(deny_unknown_fields, default)]
 pub struct Rates {
-    /// In metres. It falls exponentially to a hundredth.
+    /// Of the means, in metres. It falls exponentially to a hundredth.
     pub mean: f32,
+    /// Of the logarithms of the standard deviations.
     pub ln_scale: f32,
+    /// Of the quaternions of the rotations.
     pub quat: f32,
+    /// Of the logits of the opacities.
     pub logit: f32,
-    /// Of the constant coefficient.
+    /// Of the constant coefficient of the colours.
     pub sh: f32,
-    /// Of the other coefficients.
+    /// Of their other coefficients.
     pub sh_rest: f32,
 }
 
 /// Weights of the losses.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, DocumentedFields)]
 #[serde(deny_unknown_fields, default)]
 pub struct Weights {
     /// Of D-SSIM; that of L1 is the rest to 1.
@@ -67,7 +79,7 @@ pub struct Weights {
 
 /// How many steps learn from small images. They cost less, and the gradient of what lies wrong by
 /// many pixels points to its place; on a large image it points to some detail that is nearer.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, DocumentedFields)]
 #[serde(deny_unknown_fields, default)]
 pub struct CoarseSettings {
     /// How often the images of the first steps are halved: 2 begins with a quarter of the width.
@@ -78,16 +90,18 @@ pub struct CoarseSettings {
 
 /// How the number of Gaussians grows, after 3D Gaussian splatting as Markov chain Monte Carlo
 /// (Kheradmand et al. 2024).
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, DocumentedFields)]
 #[serde(deny_unknown_fields, default)]
 pub struct Growth {
+    /// Largest number of Gaussians.
     pub cap: usize,
     /// Growth of their number each time of a run of 30,000 steps; of shorter ones more.
     pub rate: f64,
     /// Steps from one time to the next, whatever the number of steps.
     pub every: usize,
-    /// First and last step, of 30,000.
+    /// First step of growth, of 30,000.
     pub from: usize,
+    /// Last step of growth, of 30,000.
     pub until: usize,
     /// Gaussians with a smaller opacity are moved to others.
     pub least_opacity: f32,
@@ -109,9 +123,11 @@ pub enum PoseMode {
 }
 
 /// How poses are trained.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, DocumentedFields)]
 #[serde(deny_unknown_fields, default)]
 pub struct PoseSettings {
+    /// Which: `rig`, one for each time of the rig and one for each of its cameras; `image`, one
+    /// for each image; `off`, none; `auto`, `rig` for images of a rig and `off` for others.
     pub mode: PoseMode,
     /// About how far a pose of the rig, or of an image, moves along each axis if all steps of a run
     /// agree, in metres.
@@ -122,7 +138,7 @@ pub struct PoseSettings {
     pub camera_reach_m: f64,
     /// About how far it turns there about each axis, in radians.
     pub camera_reach_rad: f64,
-    /// Of the squared distance to the recorded pose, in metres and radians.
+    /// Weight of the squared distance to the recorded pose, in metres and radians.
     pub weight: f64,
 }
 
@@ -139,9 +155,10 @@ pub enum SkyMode {
 }
 
 /// The network of a sky, and how it is trained.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, DocumentedFields)]
 #[serde(deny_unknown_fields, default)]
 pub struct SkySettings {
+    /// `network`, trained; `off`, none; `auto`, `network` for images of a rig and `off` for others.
     pub mode: SkyMode,
     /// Octaves of sines and cosines of a direction.
     pub octaves: usize,
@@ -149,22 +166,26 @@ pub struct SkySettings {
     pub width: usize,
     /// Numbers of an image's appearance.
     pub embedding: usize,
+    /// Learning rate of the network.
     pub rate: f64,
+    /// Learning rate of the appearances.
     pub embedding_rate: f64,
 }
 
 /// Whether each image has an exposure of its own, and how it is trained.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, DocumentedFields)]
 #[serde(deny_unknown_fields, default)]
 pub struct ExposureSettings {
+    /// Whether exposures are trained.
     pub on: bool,
+    /// Learning rate of the exposures.
     pub rate: f64,
-    /// Of the squared distance to the identity.
+    /// Weight of the squared distance to the identity.
     pub weight: f64,
 }
 
 /// The terms of the ground, of Gaussians that began on it.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, DocumentedFields)]
 #[serde(deny_unknown_fields, default)]
 pub struct GroundSettings {
     /// Weight of the standard deviation of heights in a slice, in 1/m.
@@ -259,7 +280,7 @@ impl Default for Rates {
             quat: 1e-3,
             logit: 5e-2,
             sh: 2.5e-3,
-            sh_rest: 2.5e-3 / 20.0,
+            sh_rest: 1.25e-4,
         }
     }
 }
@@ -281,6 +302,21 @@ impl Default for Growth {
             least_opacity: 0.005,
             noise: 5e2,
         }
+    }
+}
+
+/// What a field is, of a section or, with "", of the settings themselves.
+fn doc(section: &str, field: &str) -> Result<&'static str, documented::Error> {
+    match section {
+        "rates" => Rates::get_field_docs(field),
+        "loss" => Weights::get_field_docs(field),
+        "coarse" => CoarseSettings::get_field_docs(field),
+        "growth" => Growth::get_field_docs(field),
+        "poses" => PoseSettings::get_field_docs(field),
+        "sky" => SkySettings::get_field_docs(field),
+        "exposure" => ExposureSettings::get_field_docs(field),
+        "ground" => GroundSettings::get_field_docs(field),
+        _ => Settings::get_field_docs(field),
     }
 }
 
@@ -306,6 +342,32 @@ const MOST_WEIGHT: f64 = 1e6;
 const SCHEDULE: usize = 30_000;
 
 impl Settings {
+    /// The settings as a TOML file, with a comment above each.
+    ///
+    /// # Errors
+    /// A value that TOML does not have.
+    pub fn to_commented_toml(&self) -> Result<String, toml::ser::Error> {
+        let mut text = String::new();
+        let mut section = "";
+        let plain = toml::to_string_pretty(self)?;
+        for line in plain.lines() {
+            let name = line.strip_prefix('[').and_then(|line| line.strip_suffix(']'));
+            let doc = match (name, line.split_once(" = ")) {
+                (Some(name), _) => {
+                    section = name;
+                    Self::get_field_docs(name)
+                }
+                (None, Some((field, _))) => doc(section, field),
+                (None, None) => Ok(""),
+            };
+            for doc in doc.unwrap_or_default().lines() {
+                text.extend(["# ", doc.trim(), "\n"]);
+            }
+            text.extend([line, "\n"]);
+        }
+        Ok(text)
+    }
+
     /// Checks that every field is in its range.
     ///
     /// # Errors
@@ -441,6 +503,20 @@ impl GroundSettings {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn each_setting_has_a_comment() {
+        let settings = Settings::default();
+        let text = settings.to_commented_toml().unwrap();
+        assert_eq!(toml::from_str::<Settings>(&text).unwrap(), settings);
+        let mut above = "";
+        for line in text.lines() {
+            let is_named = line.contains(" = ") || line.starts_with('[');
+            assert!(!is_named || above.starts_with("# "), "{line} below {above:?}");
+            above = line;
+        }
+        assert!(text.contains("# Gaussians with a smaller opacity are moved to others.\nleast_"));
+    }
 
     #[test]
     fn images_become_larger_in_equal_parts() {

@@ -16,7 +16,7 @@ Example:
 
 impl PrintSettings {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let text = toml::to_string_pretty(&Settings::default())?;
+        let text = Settings::default().to_commented_toml()?;
         write!(output::stdout(), "{text}")?;
         Ok(())
     }
