@@ -4,8 +4,7 @@
     python ray_drive.py [ACTORS] [TWIN]
 
 Prints the hash of all frames of each actor: with the same seed they are equal. On a machine with GPUs, `num_gpus=1`
-gives each actor a GPU and a server of its own. For RLlib, `register_env("wildcity", lambda config: DriveEnv(**config))`
-registers the environment.
+gives each actor a GPU and a server of its own. For RLlib see rllib_train.py.
 """
 
 import contextlib

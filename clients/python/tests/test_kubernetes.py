@@ -85,6 +85,17 @@ def test_the_program_has_the_options() -> None:
         assert printed[name] == value, name
 
 
+def test_only_the_autoscaler_sets_the_number_of_pods() -> None:
+    # `kubectl apply` would set it back.
+    assert "replicas" not in manifest("statefulset.yaml")["spec"]
+
+
+def test_old_records_go_before_episodes_are_refused() -> None:
+    printing = [os.environ["WILDCITY_BIN"], "serve", "--config", str(MANIFESTS / "wildcity.toml"), "--print-config"]
+    printed = parsed(subprocess.run(printing, capture_output=True, text=True, check=True).stdout)
+    assert printed["keep_records_gib"] < min(printed["token_records_gib"], printed["records_gib"])
+
+
 def test_ports_mounts_and_secrets_are_those_of_the_options() -> None:
     pods = manifest("statefulset.yaml")["spec"]["template"]
     ports = {port["name"]: port["containerPort"] for port in container()["ports"]}

@@ -3,11 +3,11 @@
 
 use std::error::Error;
 
-use maud::{Markup, PreEscaped, html};
+use maud::{Markup, html};
 use plotters::prelude::*;
 
 use super::curves::{COLORS, LABEL};
-use super::{PageError, document, figure};
+use super::{PageError, document, figure, plot};
 use crate::compare::{Advice, ComparedRun, SMALL_LOSS_DB, advice, pareto_front};
 use crate::held_out::HeldOut;
 
@@ -36,12 +36,18 @@ pub fn comparison_page(comparison: &Comparison<'_>) -> Result<String, PageError>
         *comparison;
     let on_front = pareto_front(runs);
     let body = html! {
-        p.verdict { (verdict(command, runs)) }
+        @match answers(command, runs).as_slice() {
+            [] => { p.verdict { (NO_ANSWER) } }
+            all => {
+                @for (answer, line) in all { p.verdict { (answer) ":" } pre.command { (line) } }
+            }
+        }
         h2 { "Error against time" }
-        (PreEscaped(error_against_time(runs, &on_front)?))
+        (plot(error_against_time(runs, &on_front)?))
         p {
             "Mean PSNR of " (count) " images that were held out, at " (size) " x their recorded width, over the time of all \
-             steps on backend " (backend) ". A line joins runs of the same size and cap. Filled: no other run is as good in less time."
+             steps on backend " (backend) ". A line joins runs of the same size and cap. Filled, and ● in the table: no other \
+             run is as good in less time."
         }
         (table(runs, &on_front))
         @if !images.is_empty() {
@@ -52,25 +58,31 @@ pub fn comparison_page(comparison: &Comparison<'_>) -> Result<String, PageError>
     Ok(document(&format!("Training on {source}: settings compared"), &body))
 }
 
+const NO_ANSWER: &str = "No run has made a scene that can be judged.";
+
 /// What to use, in a sentence or two.
 pub fn verdict(command: &str, runs: &[ComparedRun]) -> String {
-    let Some(Advice { best, quick }) = advice(runs) else {
-        return "No run has made a scene that can be judged.".to_owned();
+    let sentences: Vec<String> = answers(command, runs)
+        .into_iter()
+        .map(|(answer, command)| format!("{answer}: {command}."))
+        .collect();
+    if sentences.is_empty() { NO_ANSWER.to_owned() } else { sentences.join(" ") }
+}
+
+/// The best run and, if it is another one, the quick one: what is said of it, and its command.
+fn answers(command: &str, runs: &[ComparedRun]) -> Vec<(String, String)> {
+    let Some(Advice { best, quick }) = advice(runs) else { return Vec::new() };
+    let answer = |run: &ComparedRun, what: &str| {
+        let ComparedRun { size, steps, cap, held_out_db, seconds, .. } = run;
+        (
+            format!("{held_out_db:.2} dB in {seconds:.0} s is {what}"),
+            format!("{command} --size {size} --steps {steps} --cap {cap}"),
+        )
     };
-    let options = |run: &ComparedRun| {
-        let ComparedRun { size, steps, cap, .. } = run;
-        format!("{command} --size {size} --steps {steps} --cap {cap}")
-    };
-    let ComparedRun { held_out_db, seconds, .. } = best;
-    let mut text = format!("{held_out_db:.2} dB in {seconds:.0} s is the best: {}.", options(best));
-    if let Some(quick) = quick {
-        let ComparedRun { held_out_db, seconds, .. } = quick;
-        text += &format!(
-            " {held_out_db:.2} dB in {seconds:.0} s is the quickest within {SMALL_LOSS_DB} dB: {}.",
-            options(quick)
-        );
-    }
-    text
+    let quickest = format!("the quickest within {SMALL_LOSS_DB} dB");
+    let mut all = vec![answer(best, "the best")];
+    all.extend(quick.map(|quick| answer(quick, &quickest)));
+    all
 }
 
 fn table(runs: &[ComparedRun], on_front: &[bool]) -> Markup {
@@ -78,13 +90,12 @@ fn table(runs: &[ComparedRun], on_front: &[bool]) -> Markup {
         table {
             tr {
                 th { "size" } th { "steps" } th { "cap" } th { "Gaussians" } th { "time, s" } th { "held out, dB" }
-                th { "none as good is quicker" }
             }
             @for (run, on_front) in runs.iter().zip(on_front) {
                 tr {
                     td { (run.size) } td { (run.steps) } td { (run.cap) } td { (run.gaussians) }
-                    td { (format!("{:.1}", run.seconds)) } td { (format!("{:.2}", run.held_out_db)) }
-                    td { @if *on_front { "●" } }
+                    td { (format!("{:.1}", run.seconds)) }
+                    td { @if *on_front { "●\u{a0}" } (format!("{:.2}", run.held_out_db)) }
                 }
             }
         }

@@ -23,7 +23,8 @@ table{border-collapse:collapse;font-size:13px;display:block;overflow-x:auto}td,t
 td:first-child,th:first-child{text-align:left}
 .pictures{display:grid;grid-template-columns:repeat(auto-fit,minmax(150px,1fr));gap:6px;margin-bottom:1.5em}
 figure{margin:0}figure img{width:100%;height:auto}figcaption{font-size:13px}
-svg{max-width:100%;height:auto}pre{font-size:12px;overflow-x:auto}";
+svg{max-width:100%;height:auto}.wide{overflow-x:auto}@media(max-width:760px){.wide svg{max-width:none;width:880px}}
+pre{font-size:12px;overflow-x:auto}.command{font-size:14px;white-space:pre-wrap;overflow-wrap:anywhere;padding:.6em .8em;background:#f6f6f6}";
 
 /// What a page shows.
 #[derive(Clone, Copy, Debug)]
@@ -60,12 +61,12 @@ pub fn page(contents: &Contents<'_>) -> Result<String, PageError> {
             @for picture in &pictures { (picture) }
         }
         h2 { "Curves" }
-        @if !history.evaluations.is_empty() { (PreEscaped(curves::psnr(history)?)) }
-        (PreEscaped(curves::losses(history)?))
+        @if !history.evaluations.is_empty() { (plot(curves::psnr(history)?)) }
+        (plot(curves::losses(history)?))
         @if first_whole > 1 {
             p { "Losses before step " (first_whole) " are of images that were made smaller, if they were large enough." }
         }
-        (PreEscaped(curves::gaussians(history)?))
+        (plot(curves::gaussians(history)?))
         @if let Some(moves) = trainer.moves() { (poses(&moves, cameras, trainer.settings().poses.mode != PoseMode::Image)) }
         h2 { "Settings" }
         p { "As a file for " code { "--settings" } ":" }
@@ -92,6 +93,11 @@ fn document(title: &str, body: &Markup) -> String {
         }
     };
     markup.into_string() + "\n"
+}
+
+/// A plot, which a phone shows at a size that one can read, and scrolls.
+fn plot(svg: String) -> Markup {
+    html! { div.wide { (PreEscaped(svg)) } }
 }
 
 fn verdict(contents: &Contents<'_>) -> String {

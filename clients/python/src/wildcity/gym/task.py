@@ -136,9 +136,13 @@ class DriveConfig:
     timeout: float = 90.0
 
     def __post_init__(self) -> None:
+        if isinstance(self.cameras, str):
+            raise ValueError(f"cameras is {self.cameras!r}; give a tuple of names, as ({self.cameras!r},)")
         object.__setattr__(self, "cameras", tuple(self.cameras))
         if not self.cameras:
             raise ValueError("cameras is empty; name at least one camera")
+        if np.shape(self.size) != (2,):
+            raise ValueError(f"size is {self.size!r}; give width and height of the images, as (96, 60)")
         keys = [*map(image_key, self.cameras), *map(lidar_key, self.lidars)]
         if len(set(keys)) < len(keys):
             raise ValueError(f"cameras and lidars: two of them have one key, in {', '.join(keys)}")
@@ -151,6 +155,15 @@ class DriveConfig:
             raise ValueError("dynamics is 'teleport'; actions need 'kinematic' or 'dynamic'")
         if self.horizon < 1:
             raise ValueError(f"horizon is {self.horizon}; an episode has at least one step")
+        for name in ("off_route_m", "waypoint_m"):
+            # Not `<=`, which NaN passes.
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is {getattr(self, name)}; give a distance above 0, in metres")
+        start_m = (0.0, 0.0) if self.start_m is None else self.start_m
+        if np.shape(start_m) != (2,) or not 0 <= start_m[0] <= start_m[1]:
+            raise ValueError(f"start_m is {start_m}; give the least and the greatest distance, as (0.0, 50.0)")
+        if not callable(self.reward):
+            raise ValueError(f"reward is {self.reward!r}; give a `Reward` or a function of two states")
 
     def open_options(self, welcome: Welcome) -> dict[str, Any]:
         """Arguments of `Client.open`. Raises `ValueError` if there is no such twin, or it has no drive to follow."""
@@ -261,7 +274,10 @@ class Task(ABC):
 
     def movement(self, action: Any) -> Action:
         """An action of the environment as one of the protocol."""
-        acceleration, curvature = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
+        given = np.asarray(action, np.float64)
+        if given.shape != (2,):
+            raise ValueError(f"action has the shape {given.shape}; it is two numbers: acceleration and curvature")
+        acceleration, curvature = np.clip(given, -1.0, 1.0)
         return Action(float(acceleration) * ACCELERATION_M_S2, float(curvature) * CURVATURE_1_M)
 
     def advance(self, seen: Observation) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
