@@ -36,7 +36,8 @@ pub(in crate::cli) struct Compare {
     #[arg(long, value_name = "N", value_delimiter = ',', default_values_t = [500, 1_500, 4_500], value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
     steps: Vec<u32>,
 
-    /// Most Gaussians at any time [default: that of --settings, or 1000000]
+    /// Most Gaussians at any time [default: that of --settings, or one for each 32 pixels of the
+    /// largest images, at most 1000000]
     #[arg(long, value_name = "COUNT", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..))]
     cap: Vec<u32>,
 
@@ -59,9 +60,10 @@ impl Compare {
             numbers.dedup();
         }
         let backend = &*self.source.hardware.training()?;
-        let all = self.combinations()?;
-        let largest = all.iter().map(|run| run.0).fold(0.0, f64::max);
-        let opened = self.source.open(self.source.settings()?, largest)?.images;
+        let largest = self.size.iter().copied().fold(0.0, f64::max);
+        let Inputs { images: opened, settings, .. } =
+            self.source.open(self.source.settings()?, largest, None)?;
+        let all = self.combinations(settings.growth.cap);
         let judges = opened.images();
         ensure!(
             !judges.held_out().is_empty(),
@@ -115,11 +117,11 @@ impl Compare {
         Ok(())
     }
 
-    /// Size, steps and cap of each run.
-    fn combinations(&self) -> anyhow::Result<Vec<(f64, usize, usize)>> {
+    /// Size, steps and cap of each run. Without `--cap` all have the one of the largest images.
+    fn combinations(&self, cap: usize) -> Vec<(f64, usize, usize)> {
         let mut caps: Vec<usize> = self.cap.iter().map(|&cap| cap as usize).collect();
         if caps.is_empty() {
-            caps.push(self.source.settings()?.growth.cap);
+            caps.push(cap);
         }
         let mut all = Vec::new();
         for &size in &self.size {
@@ -127,7 +129,7 @@ impl Compare {
                 all.extend(self.steps.iter().map(|&steps| (size, steps as usize, cap)));
             }
         }
-        Ok(all)
+        all
     }
 
     /// Makes one run; `None` if the process was asked to stop before its end.
@@ -140,8 +142,8 @@ impl Compare {
     ) -> anyhow::Result<Option<Trainer>> {
         let mut settings = self.source.settings()?;
         settings.steps = steps;
-        settings.growth.cap = cap;
-        let Inputs { images, start, profile, settings, .. } = self.source.open(settings, size)?;
+        let Inputs { images, start, profile, settings, .. } =
+            self.source.open(settings, size, Some(cap))?;
         let mut trainer = Trainer::new(start, profile, settings)?;
         train(&mut trainer, images.images(), backend, steps, &mut |_, _| Ok(()))?;
         let is_done = trainer.steps_done() == steps;

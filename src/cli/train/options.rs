@@ -32,7 +32,7 @@ pub(super) struct RunOptions {
     steps: Option<u32>,
 
     /// Most Gaussians at any time; of more points some are chosen [default: that of --settings, or
-    /// 1000000]
+    /// one for each 32 pixels of the images, at most 1000000]
     #[arg(long, value_name = "COUNT", value_parser = clap::value_parser!(u32).range(1..))]
     cap: Option<u32>,
 
@@ -127,8 +127,7 @@ impl RunOptions {
     pub(super) fn open(&self) -> anyhow::Result<Inputs> {
         let mut settings = self.source.settings()?;
         settings.steps = self.steps.map_or(settings.steps, |steps| steps as usize);
-        settings.growth.cap = self.cap.map_or(settings.growth.cap, |cap| cap as usize);
-        self.source.open(settings, self.size)
+        self.source.open(settings, self.size, self.cap.map(|cap| cap as usize))
     }
 
     /// What says how many steps the run makes, if it is not --steps: for the line of `train plan`.
@@ -152,26 +151,43 @@ impl SourceOptions {
     ///
     /// # Errors
     /// A setting is out of its range, or a file cannot be read.
-    pub(super) fn open(&self, settings: Settings, size: f64) -> anyhow::Result<Inputs> {
+    pub(super) fn open(
+        &self,
+        mut settings: Settings,
+        size: f64,
+        cap: Option<usize>,
+    ) -> anyhow::Result<Inputs> {
+        settings.growth.cap = cap.unwrap_or(settings.growth.cap);
         settings.check()?;
+        // A scene to begin with has as many as it needs.
+        let has_cap = cap.is_some() || self.settings.is_some() || self.start.is_scene();
         let source = self.path()?;
         if Log::is_log(source) {
-            return self.open_log(source, settings, size);
+            return self.open_log(source, settings, size, has_cap);
         }
         let list = ImageList::read(source, self.image_dir.as_deref(), self.masks.as_deref())?;
         for warning in &list.warnings {
             writeln!(io::stderr(), "warning: {warning}")?;
         }
-        let (mut start, profile) = self.start.read(source, &settings)?;
         let mut images = ListedImages::new(size, self.held_out_every);
         images.add(&list, &Alignment::IDENTITY)?;
+        if !has_cap {
+            settings.growth.cap = settings.growth.cap.min(most_determined(&images, size));
+        }
+        let (mut start, profile) = self.start.read(source, &settings)?;
         start.world_from_camera = images.poses();
         let inputs = images.inputs();
         Ok(Inputs { images: OpenedImages::Listed(images), inputs, start, profile, settings })
     }
 
     /// A log has poses of a rig, and points and depths of a LiDAR.
-    fn open_log(&self, source: &Path, settings: Settings, size: f64) -> anyhow::Result<Inputs> {
+    fn open_log(
+        &self,
+        source: &Path,
+        mut settings: Settings,
+        size: f64,
+        has_cap: bool,
+    ) -> anyhow::Result<Inputs> {
         ensure!(
             self.image_dir.is_none() && self.masks.is_none(),
             "{} is a log, whose tables name the files: leave --image-dir and --masks out",
@@ -181,6 +197,9 @@ impl SourceOptions {
         if images.left_out > 0 {
             let left_out = output::counted(images.left_out, "image");
             writeln!(io::stderr(), "{left_out} left out: there is no pose at the time")?;
+        }
+        if !has_cap {
+            settings.growth.cap = settings.growth.cap.min(most_determined(&images, size));
         }
         let (start, profile) = self.start.read_for_log(source, &images, &settings)?;
         let inputs = images.inputs()?;
@@ -202,6 +221,17 @@ impl SourceOptions {
         settings.sky.mode = self.sky.unwrap_or(settings.sky.mode);
         Ok(settings)
     }
+}
+
+/// Pixels of the images for each Gaussian: 96 values, most of which the images beside it have, too,
+/// for the 23 of a Gaussian of degree 1. Eleven photographs of 0.38 megapixels would have a million
+/// otherwise, four pixels for each.
+const PIXELS_PER_GAUSSIAN: f64 = 32.0;
+
+/// How many Gaussians the images determine, at a fraction of their width.
+fn most_determined(images: &dyn TrainingImages, size: f64) -> usize {
+    let pixels: usize = (0..images.count()).map(|k| images.view(k).camera.pixels()).sum();
+    (size * size * pixels as f64 / PIXELS_PER_GAUSSIAN).ceil().max(1.0) as usize
 }
 
 pub(super) fn fraction(text: &str) -> Result<f64, String> {
