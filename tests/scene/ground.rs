@@ -5,7 +5,10 @@ use std::f64::consts::{PI, TAU};
 
 use glam::{DQuat, DVec3};
 use wildcity_scene::Gaussians;
-use wildcity_scene::align::{GroundError, GroundSearch, find_ground};
+use wildcity_scene::align::{
+    CamerasError, CaptureCameras, GroundError, GroundSearch, find_ground, find_ground_below,
+};
+use wildcity_scene::geometry::Pose;
 use wildcity_scene::random::Random;
 
 /// A truck on a pavement, as it is before the capture's axes: metres, z up, the pavement at z = 0.
@@ -189,10 +192,7 @@ fn the_pavement_below_one_object_is_found() {
             DQuat::from_axis_angle(DVec3::new(0.6, 0.0, 0.8), capture.tilt_degrees.to_radians());
         let rotation = tilt * y_down;
         let mut gaussians = capture.gaussians();
-        gaussians.transform(&wildcity_scene::geometry::Pose {
-            position_m: DVec3::new(3.0, 1.0, -5.0),
-            rotation,
-        });
+        gaussians.transform(&Pose { position_m: DVec3::new(3.0, 1.0, -5.0), rotation });
         gaussians.scale(capture.scale);
         let up = rotation * DVec3::Z;
         let point = capture.scale * DVec3::new(3.0, 1.0, -5.0);
@@ -227,4 +227,98 @@ fn an_object_without_a_pavement_has_no_ground() {
         let found = find_ground(&bare.gaussians(), &GroundSearch::default());
         assert!(matches!(found, Err(GroundError::NoPlane { .. })), "{}: {found:?}", bare.name);
     }
+}
+
+/// A house with ledges, of which photographs show little of the ground before it, and more that
+/// hangs below it than lies on it.
+fn house() -> Gaussians {
+    let mut cloud = Cloud { gaussians: Gaussians::default(), random: Random::new(41, "house", 0) };
+    for index in 0..12_000 {
+        let x_m = cloud.random.range(-12.0, 12.0);
+        let z_m = cloud.random.range(0.0, 10.0);
+        if index % 8 == 0 {
+            // On one of three ledges.
+            let ledge_m = [1.3, 4.0, 8.0][index / 8 % 3];
+            let y_m = cloud.random.range(11.2, 12.0);
+            cloud.push(DVec3::new(x_m, y_m, ledge_m), DVec3::Z, 0.05, 0.1);
+        } else {
+            let y_m = 12.0 + cloud.random.range(-0.05, 0.05);
+            cloud.push(DVec3::new(x_m, y_m, z_m), DVec3::NEG_Y, 0.05, 0.1);
+        }
+    }
+    for index in 0..900 {
+        let at_m = DVec3::new(
+            cloud.random.range(-10.0, 10.0),
+            cloud.random.range(3.0, 11.0),
+            cloud.random.range(-0.03, 0.03),
+        );
+        cloud.push(at_m, DVec3::Z, 0.1, if index % 2 == 0 { 0.9 } else { 0.1 });
+    }
+    for _ in 0..1_500 {
+        let at_m = DVec3::new(
+            cloud.random.range(-14.0, 14.0),
+            cloud.random.range(2.0, 16.0),
+            cloud.random.range(-8.0, -0.3),
+        );
+        let normal = cloud.direction();
+        cloud.push(at_m, normal, 0.2, 0.4);
+    }
+    cloud.gaussians
+}
+
+/// Photographs of the house by somebody who walks around it, tilted to its roof by 8 degrees.
+fn photographs() -> Vec<Pose> {
+    let pose = |index: usize| {
+        let angle = -0.9 + 0.18 * index as f64;
+        let position_m = DVec3::new(13.0 * angle.sin(), 12.0 - 13.0 * angle.cos(), 1.6);
+        // From x right, y down, z forward to x right, y forward, z up, and turned to the house.
+        let level = DQuat::from_rotation_z(angle) * DQuat::from_rotation_x(-0.5 * PI);
+        let tilt = DQuat::from_rotation_x(8_f64.to_radians());
+        let roll = DQuat::from_rotation_z(0.03 * (index as f64).sin());
+        Pose { position_m, rotation: level * tilt * roll }
+    };
+    (0..11).map(pose).collect()
+}
+
+#[test]
+fn the_ground_before_a_house_is_below_its_photographs() {
+    let turned = Pose {
+        position_m: DVec3::new(-2.0, 0.5, 4.0),
+        rotation: DQuat::from_axis_angle(DVec3::new(0.6, 0.0, 0.8), 1.9),
+    };
+    let mut gaussians = house();
+    gaussians.transform(&turned);
+    gaussians.scale(0.25);
+    let in_capture = |pose: Pose| {
+        let mut pose = turned * pose;
+        pose.position_m *= 0.25;
+        pose
+    };
+    let poses: Vec<Pose> = photographs().into_iter().map(in_capture).collect();
+    let cameras = CaptureCameras::new(&poses).unwrap();
+    let search = GroundSearch::default();
+    let alone = find_ground(&gaussians, &search);
+    let up = turned.rotation * DVec3::Z;
+    let off_degrees = cameras.up.angle_between(up).to_degrees();
+    assert!(off_degrees < 2.0, "the tilt does not matter: {off_degrees}");
+    let straight = CaptureCameras::new(&vec![poses[5]; 4]).unwrap();
+    let off_degrees = straight.up.angle_between(up).to_degrees();
+    assert!((off_degrees - 8.0).abs() < 2.0, "one direction has its own up: {off_degrees}");
+    let is_ground = |up_found: DVec3| up_found.angle_between(up).to_degrees() < 1.0;
+    assert!(!alone.is_ok_and(|plane| is_ground(plane.up)), "the cameras are not needed");
+    let found = find_ground_below(&gaussians, &cameras, &search).unwrap();
+    assert!(is_ground(found.up), "{:?} of {up:?}", found.up);
+    let height_m = cameras.height_above(&found) / 0.25;
+    assert!((height_m - 1.6).abs() < 0.03, "{height_m}");
+}
+
+#[test]
+fn cameras_in_all_directions_have_no_up() {
+    let pose = |index: usize| Pose {
+        position_m: DVec3::ZERO,
+        rotation: DQuat::from_rotation_z(0.5 * PI * index as f64),
+    };
+    let refused = CaptureCameras::new(&(0..4).map(pose).collect::<Vec<_>>());
+    assert_eq!(refused, Err(CamerasError::NoCommonUp { count: 4 }));
+    assert_eq!(CaptureCameras::new(&[]), Err(CamerasError::NoCommonUp { count: 0 }));
 }

@@ -17,6 +17,7 @@ use glam::{DMat3, DQuat, DVec3};
 use crate::Gaussians;
 use crate::random::Random;
 
+use super::cameras::CaptureCameras;
 use super::median;
 
 /// A plane, and which of its sides is up.
@@ -25,6 +26,13 @@ pub struct GroundPlane {
     /// A point of it, in the unit of the scene.
     pub point: DVec3,
     pub up: DVec3,
+}
+
+impl GroundPlane {
+    /// With the other side up.
+    fn turned(self) -> Self {
+        Self { up: -self.up, ..self }
+    }
 }
 
 /// How the ground is searched.
@@ -46,6 +54,15 @@ pub enum GroundError {
         "{count} places of the scene are opaque; at least {least} are needed to find a plane: train the scene for longer"
     )]
     TooFew { count: usize, least: usize },
+    /// No plane below the cameras has enough of the scene on it.
+    #[error(
+        "found no ground below the cameras: no plane has {least_percent} % of the scene near them on it; choose three \
+         points of the ground in the viewer (docs/scenes.md), or train on photographs that show more of it"
+    )]
+    NoneBelow {
+        /// Least share of what is near the cameras, in percent.
+        least_percent: u32,
+    },
     /// No plane has enough of the scene on it.
     #[error(
         "found no ground: no plane has {least_percent} % of the scene on it and little of it below; choose three \
@@ -90,6 +107,9 @@ const OBJECT_SHARE: f64 = 0.8;
 const BESIDE_SHARE: f64 = 0.6;
 /// Most of the core's width that the object may have.
 const MOST_OBJECT: f64 = 0.6;
+/// Least cosine between the normal of the ground and the up direction of the cameras, 25 degrees:
+/// photographs in one direction may all be tilted to a roof.
+const LEAST_LEVEL: f64 = 0.9;
 
 impl Default for GroundSearch {
     fn default() -> Self {
@@ -134,33 +154,129 @@ pub fn find_ground(
     search: &GroundSearch,
 ) -> Result<GroundPlane, GroundError> {
     let whole = opaque(gaussians);
-    let none = match ground_in(gaussians, &whole, search, &|_, _, _| true) {
+    let mut rule = SceneRule { up: search.up, is_core: false };
+    let none = match ground_in(gaussians, &whole, search, &rule) {
         Err(error @ GroundError::NoPlane { .. }) => error,
         found => return found,
     };
-    let least = (LEAST_CORE_SHARE * whole.len() as f64) as usize;
-    let mut core = Core::half(gaussians, &whole);
-    for _ in 0..MOST_CORES {
-        if core.gaussians.len() < least.max(1) {
-            break;
-        }
-        match ground_in(gaussians, &core.gaussians, search, &surrounds) {
-            Ok(plane) => return Ok(plane),
-            // Nearly all of it is at one place, where the smaller cores are too.
-            Err(GroundError::TooFew { .. }) => break,
-            Err(GroundError::NoPlane { .. }) => core = core.shrunk(gaussians),
-        }
-    }
-    Err(none)
+    rule.is_core = true;
+    let middle = |some: &[usize]| middle_of_small(gaussians, some);
+    ground_in_cores(gaussians, &whole, &middle, search, &rule).ok_or(none)
 }
 
-/// The ground of some Gaussians, among the planes that `is_ground` accepts of their places and the
-/// tolerance.
+/// Finds the ground below the cameras that a scene was trained from: they are above it, and know
+/// about where up is. So little of the scene may be on it, as of photographs of a house, and what
+/// hangs below it, where no camera looked, hides it less.
+///
+/// # Errors
+/// As [`find_ground`].
+pub fn find_ground_below(
+    gaussians: &Gaussians,
+    cameras: &CaptureCameras,
+    search: &GroundSearch,
+) -> Result<GroundPlane, GroundError> {
+    let whole = opaque(gaussians);
+    let middle = |_: &[usize]| cameras.middle();
+    ground_in_cores(gaussians, &whole, &middle, search, cameras)
+        .ok_or(GroundError::NoneBelow { least_percent: LEAST_PERCENT })
+}
+
+/// The ground of the largest core that has one: the half of some Gaussians that is nearest to their
+/// middle, and ever smaller cores of it.
+fn ground_in_cores(
+    gaussians: &Gaussians,
+    whole: &[usize],
+    middle: &dyn Fn(&[usize]) -> DVec3,
+    search: &GroundSearch,
+    rule: &dyn Rule,
+) -> Option<GroundPlane> {
+    let least = (LEAST_CORE_SHARE * whole.len() as f64).max(1.0) as usize;
+    if whole.is_empty() {
+        return None;
+    }
+    let from = middle(whole);
+    let half = median(whole.iter().map(|&i| distance(gaussians, i, from)).collect());
+    let mut core = Core::within(gaussians, whole, from, half);
+    for _ in 0..MOST_CORES {
+        if core.gaussians.len() < least {
+            break;
+        }
+        match ground_in(gaussians, &core.gaussians, search, rule) {
+            Ok(plane) => return Some(plane),
+            // Nearly all of it is at one place, where the smaller cores are too.
+            Err(GroundError::TooFew { .. }) => break,
+            Err(_) => {
+                let from = middle(&core.gaussians);
+                core = Core::within(gaussians, &core.gaussians, from, SHRINK * core.reach);
+            }
+        }
+    }
+    None
+}
+
+/// What makes a plane the ground.
+trait Rule {
+    /// The plane with its up side, by what is on it and beside it; `None` if it is not the ground.
+    fn score(&self, plane: GroundPlane, beside: Beside) -> Option<Scored>;
+
+    /// Whether the plane is the ground by what costs more to know.
+    fn accepts(&self, places: &[SurfaceSample], plane: GroundPlane, tolerance: f64) -> bool;
+}
+
+/// How good a plane is, with its up side.
+#[derive(Clone, Copy, Debug)]
+struct Scored {
+    /// The largest one is the ground.
+    score: f64,
+    /// What at least [`LEAST_PERCENT`] of all places must be.
+    counted: f64,
+    plane: GroundPlane,
+}
+
+/// The ground of a scene of which nothing but, perhaps, the direction of up is known.
+struct SceneRule {
+    up: Option<DVec3>,
+    /// Whether only a part of the scene is searched, in which a roof is a plane, too.
+    is_core: bool,
+}
+
+impl Rule for SceneRule {
+    fn score(&self, plane: GroundPlane, Beside { on, above, below }: Beside) -> Option<Scored> {
+        // Up is the side with more of the scene. Only the smaller side is a penalty: the ground may
+        // have all of the scene above it, but not much below. A table top has too few places, and a
+        // plane through the middle of a scene has as many below as above.
+        let plane = if below > above { plane.turned() } else { plane };
+        let score = on - above.min(below);
+        // 0.7 is about cos 45 degrees. An up direction of zero length refuses every plane.
+        let is_wanted = self.up.is_none_or(|up| plane.up.dot(up.normalize_or_zero()) > 0.7);
+        is_wanted.then_some(Scored { score, counted: score, plane })
+    }
+
+    fn accepts(&self, places: &[SurfaceSample], plane: GroundPlane, tolerance: f64) -> bool {
+        !self.is_core || surrounds(places, plane, tolerance)
+    }
+}
+
+impl Rule for CaptureCameras {
+    fn score(&self, plane: GroundPlane, Beside { on, above, below }: Beside) -> Option<Scored> {
+        let is_turned = plane.up.dot(self.up) < 0.0;
+        let (plane, below) = if is_turned { (plane.turned(), above) } else { (plane, below) };
+        let is_level = plane.up.dot(self.up) >= LEAST_LEVEL;
+        let is_ground = is_level && self.are_above(&plane);
+        is_ground.then_some(Scored { score: on - below, counted: on, plane })
+    }
+
+    fn accepts(&self, _: &[SurfaceSample], _: GroundPlane, _: f64) -> bool {
+        true
+    }
+}
+
+/// The ground of some Gaussians.
 fn ground_in(
     gaussians: &Gaussians,
     core: &[usize],
     search: &GroundSearch,
-    is_ground: &dyn Fn(&[SurfaceSample], GroundPlane, f64) -> bool,
+    rule: &dyn Rule,
 ) -> Result<GroundPlane, GroundError> {
     let radius = extent(gaussians, core).radius;
     let places = places(gaussians, core, radius / CUBES);
@@ -173,24 +289,23 @@ fn ground_in(
     let stride = places.len().div_ceil(COMPARED);
     let compared: Vec<SurfaceSample> = places.iter().copied().step_by(stride).collect();
     let mut random = Random::new(search.seed, "ground", 0);
-    let mut best: Option<(f64, GroundPlane)> = None;
+    let mut best: Option<Scored> = None;
     for at in 0..search.hypotheses {
-        let Some(hypothesis) = hypothesis(&compared, at, &mut random) else { continue };
-        let (score, plane) = judge(&compared, hypothesis, tolerance);
-        // 0.7 is about cos 45 degrees. An up direction of zero length refuses every plane.
-        let is_wanted = search.up.is_none_or(|up| plane.up.dot(up.normalize_or_zero()) > 0.7);
+        let Some(plane) = hypothesis(&compared, at, &mut random) else { continue };
+        let beside = Beside::new(&compared, &plane, tolerance);
+        let Some(scored) = rule.score(plane, beside) else { continue };
         // Strictly greater: of equal planes the first one stays, so that the result is
         // deterministic.
-        let is_better = best.is_none_or(|(most, _)| score > most);
-        if is_wanted && is_better && is_ground(&compared, plane, tolerance) {
-            best = Some((score, plane));
+        let is_better = best.is_none_or(|best| scored.score > best.score);
+        if is_better && rule.accepts(&compared, scored.plane, tolerance) {
+            best = Some(scored);
         }
     }
-    // The score is places on the plane less those on its wrong side: a table top has too few, and a
-    // plane through the middle of a scene has as many below as above.
     let least = f64::from(LEAST_PERCENT) / 100.0 * compared.len() as f64;
     match best {
-        Some((score, plane)) if score >= least => Ok(refine(&places, plane, tolerance)),
+        Some(Scored { counted, plane, .. }) if counted >= least => {
+            Ok(refine(&places, plane, tolerance))
+        }
         _ => Err(GroundError::NoPlane { least_percent: LEAST_PERCENT }),
     }
 }
@@ -204,19 +319,6 @@ struct Core {
 }
 
 impl Core {
-    /// The nearest half of some Gaussians.
-    fn half(gaussians: &Gaussians, all: &[usize]) -> Self {
-        let middle = middle_of_small(gaussians, all);
-        let reach = median(all.iter().map(|&i| distance(gaussians, i, middle)).collect());
-        Self::within(gaussians, all, middle, reach)
-    }
-
-    /// The next smaller core, around its own middle.
-    fn shrunk(&self, gaussians: &Gaussians) -> Self {
-        let middle = middle_of_small(gaussians, &self.gaussians);
-        Self::within(gaussians, &self.gaussians, middle, SHRINK * self.reach)
-    }
-
     fn within(gaussians: &Gaussians, all: &[usize], middle: DVec3, reach: f64) -> Self {
         let near = all.iter().copied().filter(|&i| distance(gaussians, i, middle) < reach);
         Self { gaussians: near.collect(), reach }
@@ -308,32 +410,36 @@ fn hypothesis(places: &[SurfaceSample], at: usize, random: &mut Random) -> Optio
     Some(GroundPlane { point: a.at, up })
 }
 
-/// Counts places on the plane, less those below it; up is the side with more of the scene.
-fn judge(places: &[SurfaceSample], plane: GroundPlane, tolerance: f64) -> (f64, GroundPlane) {
-    let mut on = 0.0;
-    let mut above = 0.0_f64;
-    let mut below = 0.0_f64;
-    for place in places {
-        let height = plane.up.dot(place.at - plane.point);
-        if height.abs() <= tolerance {
-            on += match place.normal {
-                Some(normal) if normal.dot(plane.up).abs() >= LEAST_COSINE => 1.0,
-                Some(_) => 0.0,
-                // A round Gaussian has no information about the direction of its surface.
-                None => 0.5,
-            };
-        } else if height > 3.0 * tolerance {
-            // Between one and three tolerances a place counts neither as on the plane nor beside
-            // it: kerbs and the ground's own roughness.
-            above += 1.0;
-        } else if height < -3.0 * tolerance {
-            below += 1.0;
+/// The places on a plane, and on each of its sides.
+#[derive(Clone, Copy, Debug, Default)]
+struct Beside {
+    on: f64,
+    above: f64,
+    below: f64,
+}
+
+impl Beside {
+    fn new(places: &[SurfaceSample], plane: &GroundPlane, tolerance: f64) -> Self {
+        let mut beside = Self::default();
+        for place in places {
+            let height = plane.up.dot(place.at - plane.point);
+            if height.abs() <= tolerance {
+                beside.on += match place.normal {
+                    Some(normal) if normal.dot(plane.up).abs() >= LEAST_COSINE => 1.0,
+                    Some(_) => 0.0,
+                    // A round Gaussian has no information about the direction of its surface.
+                    None => 0.5,
+                };
+            } else if height > 3.0 * tolerance {
+                // Between one and three tolerances a place counts neither as on the plane nor
+                // beside it: kerbs and the ground's own roughness.
+                beside.above += 1.0;
+            } else if height < -3.0 * tolerance {
+                beside.below += 1.0;
+            }
         }
+        beside
     }
-    // Only the smaller side is a penalty: the ground may have all of the scene above it, but not
-    // much below.
-    let up = if below > above { -plane.up } else { plane.up };
-    (on - above.min(below), GroundPlane { up, ..plane })
 }
 
 /// Fits the plane with a falling tolerance. Each round first moves the plane to the height that has
@@ -395,7 +501,7 @@ fn densest(mut heights: Vec<f64>, width: f64) -> Option<f64> {
 
 /// The plane with the least squares of distances: through the mean, normal to the two main axes of
 /// the points.
-fn fit(points: &[DVec3]) -> Option<GroundPlane> {
+pub(super) fn fit(points: &[DVec3]) -> Option<GroundPlane> {
     if points.len() < 3 {
         return None;
     }

@@ -1,5 +1,6 @@
 //! Putting a capture on the ground: x and y level, z up, the ground at z = 0, metres.
 
+mod cameras;
 mod capture;
 mod ground;
 mod path;
@@ -13,10 +14,14 @@ use crate::geometry::{Pose, PoseError};
 use crate::trajectory::Keyframe;
 use crate::{Gaussians, Trajectory};
 
+pub use cameras::{CamerasError, CaptureCameras};
 pub use capture::{
     CaptureOptions, CapturedDrive, CapturedDriveError, DEFAULT_FPS, PosedImage, captured_drive,
 };
-pub use ground::{GroundError, GroundPlane, GroundSearch, SceneExtent, find_ground, scene_extent};
+pub use ground::{
+    GroundError, GroundPlane, GroundSearch, SceneExtent, find_ground, find_ground_below,
+    scene_extent,
+};
 pub use path::{DEFAULT_SPEED_M_S, PathError, drive_through};
 
 /// A change of a twin's axes and unit: `p_new = metres_per_unit * (new_from_old * p_old)`.

@@ -3,19 +3,24 @@
 mod picture;
 
 use std::io::{self, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use anyhow::Context;
 use glam::DVec3;
 
 use wildcity_scene::Gaussians;
-use wildcity_scene::align::{Alignment, GroundPlane, GroundSearch, find_ground, scale_from_points};
+use wildcity_scene::align::{
+    Alignment, CaptureCameras, GroundPlane, GroundSearch, find_ground, find_ground_below,
+    scale_from_points,
+};
+use wildcity_scene::geometry::Pose;
+use wildcity_twin::ingest::capture;
 use wildcity_twin::store::Edit;
 
 use super::{blind, change};
 use crate::cli::directories::{EditedTwin, Twins};
-use crate::cli::{output, progress};
+use crate::cli::{file_notes, output, placement, progress};
 
 /// Put a capture on the ground: find the plane that the scene stands on, and make it level, at
 /// height 0, in metres.
@@ -27,7 +32,8 @@ use crate::cli::{output, progress};
 /// sessions keep the version that they have. The version records the change:
 /// `wildcity push --frame capture` pushes files that are still in the axes of the capture.
 ///
-/// The ground is the plane with most of the scene on it and little of it below. The same twin gives
+/// The ground is the plane with most of the scene on it and little of it below. With --cameras, of
+/// photographs, it is below all of them, and little of the scene may be on it. The same twin gives
 /// the same plane. All Gaussians are in memory at once: 56 bytes each without SH, 236 with SH
 /// degree 3, and as much for the picture.
 #[derive(Debug, clap::Args)]
@@ -40,6 +46,16 @@ pub(in crate::cli) struct Align {
     /// directions.
     #[arg(long, value_name = "AXIS", default_value = "auto", allow_hyphen_values = true)]
     up: Up,
+
+    /// The COLMAP model or the transforms.json that the scene was trained from: its cameras are
+    /// above the ground, and most of them level.
+    #[arg(long, value_name = "SOURCE", conflicts_with = "up")]
+    cameras: Option<PathBuf>,
+
+    /// Height of most of these cameras above the ground, in metres, which gives the scale: 1.6 for
+    /// a person who walks.
+    #[arg(long, value_name = "M", requires = "cameras", conflicts_with_all = ["from", "scale"])]
+    camera_height_m: Option<f64>,
 
     /// First of two points whose real distance is known, in the twin's axes and unit; see --to and
     /// --distance-m.
@@ -79,6 +95,7 @@ const EXAMPLES: &str = "\
 Examples:
   wildcity twin align street                                  (look at street-align.png)
   wildcity twin align street --apply
+  wildcity twin align capture --cameras sparse/0 --camera-height-m 1.6
   wildcity twin align capture --up -y --from 0.1,0,2 --to 0.1,0,2.7 --distance-m 1.2 --apply";
 
 /// A direction that is up, or any.
@@ -130,9 +147,27 @@ impl Align {
         catalog.visit_full_detail(&base, &|_| true, &mut |section| gaussians.append(&section))?;
 
         let search = GroundSearch { up: self.up.0, seed: self.seed, ..GroundSearch::default() };
-        let ground = find_ground(&gaussians, &search)
-            .with_context(|| format!("twin {}", self.edited.twin.name))?;
-        let alignment = Alignment::onto(&ground).scaled(metres_per_unit)?;
+        let about = || format!("twin {}", self.edited.twin.name);
+        let (ground, metres_per_unit) = match &self.cameras {
+            None => (find_ground(&gaussians, &search).with_context(about)?, metres_per_unit),
+            Some(source) => {
+                let in_twin = placement::from_version(&catalog, &base)?;
+                let poses = read_poses(source)?;
+                let poses: Vec<Pose> = poses.iter().map(|pose| in_twin.pose(pose)).collect();
+                let cameras = CaptureCameras::new(&poses).context("--cameras")?;
+                let ground =
+                    find_ground_below(&gaussians, &cameras, &search).with_context(about)?;
+                let height = cameras.height_above(&ground);
+                let scale = self.camera_height_m.map_or(metres_per_unit, |m| m / height);
+                let count = output::counted(poses.len(), "camera");
+                let height_m = scale * height;
+                writeln!(output::stdout(), "cameras     {count}, {height_m:.2} m above it")?;
+                (ground, scale)
+            }
+        };
+        let alignment = Alignment::onto(&ground).scaled(metres_per_unit).with_context(|| {
+            if self.cameras.is_some() { "--camera-height-m" } else { "--scale" }
+        })?;
         print_proposal(&ground, &alignment)?;
 
         let picture = self.picture.clone();
@@ -178,6 +213,19 @@ impl Align {
             }
         }
     }
+}
+
+/// The poses of the cameras of a COLMAP model or a transforms.json.
+fn read_poses(source: &Path) -> anyhow::Result<Vec<Pose>> {
+    let is_colmap = source.is_dir() && !source.join("transforms.json").is_file();
+    let images = if is_colmap {
+        capture::read_colmap(source)?
+    } else {
+        let capture::NerfstudioCapture { frames, warnings } = capture::read_nerfstudio(source)?;
+        file_notes::print_warnings(source, &warnings)?;
+        frames.into_iter().map(|frame| frame.posed).collect()
+    };
+    Ok(images.into_iter().map(|image| image.world_from_camera).collect())
 }
 
 /// Without the rounding errors of a power of ten: 0.1 for 0.10000000000000003.
