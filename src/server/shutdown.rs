@@ -204,14 +204,14 @@ impl Running {
         if longest.is_zero() || count() == 0 {
             return;
         }
-        tracing::info!("{} sessions may go on for {longest:?}", count());
+        tracing::info!("sessions may go on for {longest:?}, of which there are {}", count());
         let end = Instant::now() + longest;
         while count() > 0 && Instant::now() < end {
             tokio::time::sleep(SESSIONS_LOOK).await;
         }
         match count() {
             0 => tracing::info!("no session is left"),
-            count => tracing::warn!("{count} sessions did not end in time"),
+            count => tracing::warn!("sessions did not end in time: {count}"),
         }
     }
 

@@ -162,6 +162,11 @@ impl SourceOptions {
         // A scene to begin with has as many as it needs.
         let has_cap = cap.is_some() || self.settings.is_some() || self.start.is_scene();
         let source = self.path()?;
+        ensure!(
+            source.exists(),
+            "there is no {}: give a log, a COLMAP model or a transforms.json",
+            source.display()
+        );
         if Log::is_log(source) {
             return self.open_log(source, settings, size, has_cap);
         }

@@ -126,7 +126,7 @@ fn logged_start(images: &LogImages, settings: &Settings) -> anyhow::Result<Start
     let points = wildcity_log::colored_points(images.log(), images.poses(), STARTING_IMAGES, most)?;
     ensure!(
         !points.is_empty(),
-        "the log has no points of a LiDAR that its images show: give --points, a PLY file"
+        "the log has no points of a LiDAR that its images show: give --points, a PLY file or a COLMAP model"
     );
     let point = |point: &ColoredPoint| Point {
         at_m: point.at_m,
