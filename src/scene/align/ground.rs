@@ -177,7 +177,13 @@ pub fn find_ground_below(
 ) -> Result<GroundPlane, GroundError> {
     let whole = opaque(gaussians);
     let middle = |_: &[usize]| cameras.middle();
-    ground_in_cores(gaussians, &whole, &middle, search, cameras)
+    let below = |&up: &DVec3| {
+        ground_in_cores(gaussians, &whole, &middle, search, &CameraRule { cameras, up })
+    };
+    cameras
+        .ups()
+        .iter()
+        .find_map(below)
         .ok_or(GroundError::NoneBelow { least_percent: LEAST_PERCENT })
 }
 
@@ -257,12 +263,18 @@ impl Rule for SceneRule {
     }
 }
 
-impl Rule for CaptureCameras {
+/// The ground below cameras.
+struct CameraRule<'a> {
+    cameras: &'a CaptureCameras,
+    up: DVec3,
+}
+
+impl Rule for CameraRule<'_> {
     fn score(&self, plane: GroundPlane, Beside { on, above, below }: Beside) -> Option<Scored> {
         let is_turned = plane.up.dot(self.up) < 0.0;
         let (plane, below) = if is_turned { (plane.turned(), above) } else { (plane, below) };
         let is_level = plane.up.dot(self.up) >= LEAST_LEVEL;
-        let is_ground = is_level && self.are_above(&plane);
+        let is_ground = is_level && self.cameras.are_above(&plane);
         is_ground.then_some(Scored { score: on - below, counted: on, plane })
     }
 
