@@ -129,6 +129,16 @@ def test_a_reset_leaves_a_record_only_if_asked_to(tmp_path: Path, record: bool) 
     assert len(list((tmp_path / "episodes").glob("*.jsonl"))) == (2 if record else 0)
 
 
+def test_the_profile_is_that_of_the_session(server: Server) -> None:
+    env = DriveEnv(server=server.url, **SMALL, profile={"tau_px": 4.0})
+    env.reset(seed=1)
+    session, _ = env._opened()
+    assert session.opened.profile["tau_px"] == 4.0
+    env.close()
+    with pytest.raises(wildcity.Refused, match="tau"):
+        DriveEnv(server=server.url, **SMALL, profile={"tau": 4.0}).reset(seed=1)
+
+
 def test_a_twin_that_is_not_there_is_named_when_it_is_asked_for(server: Server) -> None:
     threads = threading.active_count()
     for make in (gymnasium.make, gymnasium.make_vec):

@@ -108,6 +108,7 @@ class DriveConfig:
     start_m: episodes start at a random distance along the drive between these two; the default ends 20 m before its
         end.
     waypoint_m: distance between two of the 20 points of the route ahead.
+    profile: changes of the twin's render profile, as for `Client.open`: {"tau_px": 4.0} draws small images faster.
     record: whether the server records the episodes. A training makes a file with each reset.
     reward: a `Reward` with weights of your own, or any function of the states before and after a step.
 
@@ -130,6 +131,7 @@ class DriveConfig:
     off_route_m: float = 4.0
     start_m: tuple[float, float] | None = None
     waypoint_m: float = 4.0
+    profile: Mapping[str, Any] | None = field(default=None, hash=False)
     record: bool = False
     reward: Callable[[DriveState, DriveState], float] = Reward()
     token: str | None = None
@@ -178,6 +180,7 @@ class DriveConfig:
             # Raw, because small images cost more time to decode than to transfer.
             "outputs": Outputs(cameras=self.cameras, encoding="raw", images=images),
             "dt_us": self.dt_us,
+            "profile": None if self.profile is None else dict(self.profile),
             "record": self.record,
         }
         if self.scenario is not None:
