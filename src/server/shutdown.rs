@@ -204,14 +204,14 @@ impl Running {
         if longest.is_zero() || count() == 0 {
             return;
         }
-        tracing::info!("sessions may go on for {longest:?}, of which there are {}", count());
+        tracing::info!("open sessions: {}; they may go on for {longest:?}", count());
         let end = Instant::now() + longest;
         while count() > 0 && Instant::now() < end {
             tokio::time::sleep(SESSIONS_LOOK).await;
         }
         match count() {
             0 => tracing::info!("no session is left"),
-            count => tracing::warn!("sessions did not end in time: {count}"),
+            count => tracing::warn!("open sessions at the end of the wait: {count}"),
         }
     }
 

@@ -93,7 +93,8 @@ pub struct CoarseSettings {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, DocumentedFields)]
 #[serde(deny_unknown_fields, default)]
 pub struct Growth {
-    /// Largest number of Gaussians.
+    /// Largest number of Gaussians. If neither a settings file nor --cap says it, there is at most
+    /// one for each 32 pixels of the images, too.
     pub cap: usize,
     /// Growth of their number each time of a run of 30,000 steps; of shorter ones more.
     pub rate: f64,
@@ -280,7 +281,7 @@ impl Default for Rates {
             quat: 1e-3,
             logit: 5e-2,
             sh: 2.5e-3,
-            sh_rest: 1.25e-4,
+            sh_rest: 2.5e-3 / 20.0,
         }
     }
 }

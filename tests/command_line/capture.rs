@@ -13,7 +13,7 @@ use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{Gaussians, Rig, Trajectory};
 use wildcity_twin::store::{Catalog, CommitKind, StorageOptions, VersionChange};
 
-use crate::in_folder::{done, refused, warned};
+use crate::in_folder::{done, misused, refused, warned};
 use crate::scene_files::{inria_columns, ply};
 
 /// The axes of a capture: the street, upside down, tilted, moved, and half as large.
@@ -252,6 +252,49 @@ fn a_capture_becomes_a_street_that_can_be_driven() {
         ["import", "edit of 1", "edit of 2", "push of 3", "push of 4", "edit of 5"],
         "{log}"
     );
+}
+
+/// The cameras that a scene was trained from say where the ground is, and how long its unit is.
+#[test]
+fn the_ground_is_found_below_the_cameras() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = dir.path();
+    let (gaussians, street_drive) = captured_street();
+    let columns = inria_columns(gaussians.sh_degree, false);
+    fs::write(at.join("street.ply"), ply(&gaussians, &columns)).unwrap();
+    done(at, &["import", "street.ply", "--twin", "street", "--axes", "y-down-z-forward"]);
+    let poses = camera_poses(&street_drive);
+    write_colmap_text(&at.join("model/sparse/0"), &poses);
+    fs::write(at.join("transforms.json"), transforms(&poses).to_string()).unwrap();
+
+    let preset = Rig::preset("vehicle6").unwrap();
+    let front = preset.cameras.iter().find(|camera| camera.name == "front").unwrap();
+    let height_m = front.rig_from_camera.position_m.z.to_string();
+    let align = ["twin", "align", "street", "--cameras"];
+    for source in ["model", "transforms.json"] {
+        let said = done(at, &[&align[..], &[source, "--camera-height-m", &height_m]].concat());
+        let scale = said.lines().find_map(|line| line.strip_prefix("scale       ")).unwrap();
+        let metres: f64 = scale.strip_suffix(" m per unit").unwrap().parse().unwrap();
+        // The pavements are a kerb higher than the road.
+        assert!((metres - 2.0).abs() < 0.12, "{said}");
+        assert!(said.contains(" m above the ground (median)"), "{said}");
+    }
+    let said = done(at, &[&align[..], &["model"]].concat());
+    assert!(said.contains("scale       1 m per unit"), "{said}");
+
+    let error = refused(at, &[&align[..], &["nowhere"]].concat());
+    assert!(error.contains("--cameras") && error.contains("nowhere"), "{error}");
+    let error = refused(at, &[&align[..], &["model", "--up", "x"]].concat());
+    assert!(error.contains("no ground below the cameras"), "{error}");
+    let both = ["model", "--camera-height-m", &height_m, "--scale", "2"];
+    for (options, said) in [
+        (&["model", "--camera-height-m", "0"][..], "a height above the ground in metres"),
+        (&["model", "--camera-height-m", "NaN"], "a height above the ground in metres"),
+        (&both, "cannot be used with"),
+    ] {
+        let error = misused(at, &[&align[..], options].concat());
+        assert!(error.contains(said), "{error}");
+    }
 }
 
 #[test]

@@ -25,6 +25,13 @@ pub(crate) fn warned(dir: &Path, arguments: &[&str]) -> String {
     String::from_utf8(output.stderr).unwrap()
 }
 
+/// Standard error of a command whose options are refused.
+pub(crate) fn misused(dir: &Path, arguments: &[&str]) -> String {
+    let output = run(dir, arguments);
+    assert_eq!(output.status.code(), Some(2), "{arguments:?}: {output:?}");
+    String::from_utf8(output.stderr).unwrap()
+}
+
 /// Standard error of a run that must fail with exit code 1.
 pub(crate) fn refused(dir: &Path, arguments: &[&str]) -> String {
     let output = run(dir, arguments);

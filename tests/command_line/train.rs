@@ -116,6 +116,35 @@ fn a_run_that_is_stopped_goes_on_to_the_same_files() {
     assert!(error.contains("more than --cap 9"), "{error}");
 }
 
+/// Few images determine few Gaussians, unless --cap or a settings file says how many.
+#[test]
+fn without_a_cap_the_pixels_bound_the_gaussians() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    recorded(dir);
+    let text = fs::read(dir.join("recorded/round_1/transforms.json")).unwrap();
+    let transforms: serde_json::Value = serde_json::from_slice(&text).unwrap();
+    let frames = transforms["frames"].as_array().unwrap().iter();
+    let pixels: u64 =
+        frames.map(|frame| frame["w"].as_u64().unwrap() * frame["h"].as_u64().unwrap()).sum();
+    let by_pixels = pixels.div_ceil(32);
+    fs::write(dir.join("degree.toml"), "sh_degree = 0\n").unwrap();
+    fs::write(dir.join("cap.toml"), "[growth]\ncap = 5000\n").unwrap();
+    let plan = ["train", "plan", "recorded/round_1", "--steps", "4000"];
+    let cap = |options: &[&str]| -> u64 {
+        let said = done(dir, &[&plan[..], options].concat());
+        let cap = said.split("(--cap ").nth(1).and_then(|rest| rest.split(')').next());
+        cap.unwrap().parse().unwrap()
+    };
+    assert!(by_pixels < 100_000, "{by_pixels}");
+    assert_eq!(cap(&[]), by_pixels);
+    assert_eq!(cap(&["--settings", "degree.toml"]), by_pixels);
+    assert_eq!(cap(&["--settings", "cap.toml"]), 5_000);
+    assert_eq!(cap(&["--settings", "cap.toml", "--cap", "6000"]), 6_000);
+    // A quarter of the pixels, of each image rounded.
+    assert!(cap(&["--size", "0.5"]).abs_diff(by_pixels / 4) < 10);
+}
+
 #[test]
 fn settings_are_compared_by_the_same_images() {
     let dir = tempfile::tempdir().unwrap();

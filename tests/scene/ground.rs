@@ -266,7 +266,7 @@ fn house() -> Gaussians {
     cloud.gaussians
 }
 
-/// Photographs of the house by somebody who walks around it, tilted to its roof by 8 degrees.
+/// Photographs from around the house, tilted to its roof by 8 degrees.
 fn photographs() -> Vec<Pose> {
     let pose = |index: usize| {
         let angle = -0.9 + 0.18 * index as f64;
@@ -306,6 +306,16 @@ fn the_ground_before_a_house_is_below_its_photographs() {
     assert!((off_degrees - 8.0).abs() < 2.0, "one direction has its own up: {off_degrees}");
     let is_ground = |up_found: DVec3| up_found.angle_between(up).to_degrees() < 1.0;
     assert!(!alone.is_ok_and(|plane| is_ground(plane.up)), "the cameras are not needed");
+    // One camera that was placed wrongly, far below.
+    let mut wrong = poses.clone();
+    wrong[3].position_m -= 20.0 * up;
+    let with_wrong = CaptureCameras::new(&wrong).unwrap();
+    let found = find_ground_below(&gaussians, &with_wrong, &search).unwrap();
+    assert!(is_ground(found.up), "{:?} of {up:?}", found.up);
+    // Up that is known wrongly.
+    let sideways = CaptureCameras::with_up(&poses, turned.rotation * DVec3::X).unwrap();
+    let refused = find_ground_below(&gaussians, &sideways, &search);
+    assert!(!refused.is_ok_and(|plane| is_ground(plane.up)));
     // Wide, and upright in files that are turned to the left or to the right.
     for quarters in [0.0, 1.0, -1.0] {
         let file = DQuat::from_rotation_z(0.5 * PI * quarters);
@@ -315,6 +325,35 @@ fn the_ground_before_a_house_is_below_its_photographs() {
         assert!(is_ground(found.up), "{quarters}: {:?} of {up:?}", found.up);
         let height_m = cameras.height_above(&found) / 0.25;
         assert!((height_m - 1.6).abs() < 0.03, "{quarters}: {height_m}");
+    }
+}
+
+/// Rows of photographs that are rolled more than they are turned are not level, and photographs
+/// that are tilted more than they are turned are no portraits.
+#[test]
+fn up_is_that_of_most_photographs() {
+    let mut random = Random::new(43, "cameras", 0);
+    let mut camera = |roll_degrees: f64, yaw_degrees: f64, tilt_degrees: [f64; 2]| {
+        let mut angle =
+            |degrees: [f64; 2]| random.range(degrees[0] - 1e-9, degrees[1]).to_radians();
+        let rotation = DQuat::from_rotation_z(angle([-yaw_degrees, yaw_degrees]))
+            * DQuat::from_rotation_x(-0.5 * PI + angle(tilt_degrees))
+            * DQuat::from_rotation_z(angle([-roll_degrees, roll_degrees]));
+        // Along a house.
+        Pose {
+            position_m: DVec3::new(random.range(0.0, 9.0), random.range(0.0, 2.0), 1.6),
+            rotation,
+        }
+    };
+    for (case, [roll, yaw], tilt) in [
+        ("rolled", [16.0, 5.0], [-2.0, 2.0]),
+        ("tilted", [1.0, 2.0], [0.0, 50.0]),
+        ("turned", [2.0, 40.0], [10.0, 20.0]),
+    ] {
+        let poses: Vec<Pose> = (0..20).map(|_| camera(roll, yaw, tilt)).collect();
+        let cameras = CaptureCameras::new(&poses).unwrap();
+        let off = cameras.ups()[0].angle_between(DVec3::Z).to_degrees();
+        assert!(cameras.ups().len() == 1 && off < 28.0, "{case}: {off} degrees");
     }
 }
 

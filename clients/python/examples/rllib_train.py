@@ -4,7 +4,7 @@
     python rllib_train.py [STEPS] [TWIN]
 
 RLlib has no default network for images beside numbers, so `Policy` is one. Each of the two workers has an environment
-of one server, and so a session of it. Prints the mean return of the episodes that have ended, once an iteration.
+of its own, and both use one server. Prints the mean return of the episodes that have ended, once an iteration.
 """
 
 import sys

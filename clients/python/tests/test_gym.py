@@ -338,6 +338,8 @@ def test_an_action_of_another_shape_is_refused(env: DriveEnv) -> None:
     for action in ([0.0, 0.0, 0.0], 0.5):
         with pytest.raises(ValueError, match="action has the shape"):
             env.step(action)
+    with pytest.raises(ValueError, match="action is .*nan"):
+        env.step([math.nan, 0.0])
 
 
 @pytest.mark.parametrize(
@@ -345,6 +347,8 @@ def test_an_action_of_another_shape_is_refused(env: DriveEnv) -> None:
     [
         ({"cameras": ()}, "cameras is empty"),
         ({"cameras": "front"}, "cameras is 'front'; give a tuple"),
+        ({"lidars": "top"}, "lidars is 'top'; give rows"),
+        ({"horizon": math.nan}, "horizon is nan"),
         ({"size": 96}, "size is 96; give width and height"),
         ({"dynamics": "teleport"}, "teleport"),
         ({"horizon": 0}, "horizon is 0"),

@@ -106,7 +106,7 @@ def test_ports_mounts_and_secrets_are_those_of_the_options() -> None:
     mounts = [mount["mountPath"] for mount in container()["volumeMounts"]]
     for name in ("cache_dir", "episodes", "uploads", "tokens"):
         assert any(options()[name].startswith(mount) for mount in mounts), name
-    # The image has a program, and no shell tools: nothing else runs in a pod.
+    # The image has a program, and no tools but bash: nothing else runs in a pod.
     assert "lifecycle" not in container()
     # The server ends before it is killed.
     grace_s = pods["spec"]["terminationGracePeriodSeconds"]

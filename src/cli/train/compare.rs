@@ -61,8 +61,10 @@ impl Compare {
         }
         let backend = &*self.source.hardware.training()?;
         let largest = self.size.iter().copied().fold(0.0, f64::max);
+        // Sorted: a scene to begin with may have as many as the largest one.
+        let largest_cap = self.cap.last().map(|&cap| cap as usize);
         let Inputs { images: opened, settings, .. } =
-            self.source.open(self.source.settings()?, largest, None)?;
+            self.source.open(self.source.settings()?, largest, largest_cap)?;
         let all = self.combinations(settings.growth.cap);
         let judges = opened.images();
         ensure!(

@@ -5,6 +5,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
+use serde::de::DeserializeOwned;
 
 use wildcity_eval::images::ImageList;
 use wildcity_log::Log;
@@ -159,8 +160,8 @@ impl SourceOptions {
     ) -> anyhow::Result<Inputs> {
         settings.growth.cap = cap.unwrap_or(settings.growth.cap);
         settings.check()?;
-        // A scene to begin with has as many as it needs.
-        let has_cap = cap.is_some() || self.settings.is_some() || self.start.is_scene();
+        // A scene to begin with is not cut.
+        let has_cap = cap.is_some() || self.start.is_scene() || self.settings_have_cap()?;
         let source = self.path()?;
         ensure!(
             source.exists(),
@@ -212,6 +213,13 @@ impl SourceOptions {
         Ok(Inputs { images, inputs, start, profile, settings })
     }
 
+    /// Whether the file of `--settings` says how many Gaussians there may be.
+    fn settings_have_cap(&self) -> anyhow::Result<bool> {
+        let Some(path) = &self.settings else { return Ok(false) };
+        let table: toml::Table = read_toml(path)?;
+        Ok(table.get("growth").is_some_and(|growth| growth.get("cap").is_some()))
+    }
+
     /// The settings of `--settings` with those of the options. They are not checked yet.
     pub(super) fn settings(&self) -> anyhow::Result<Settings> {
         let mut settings = match &self.settings {
@@ -228,8 +236,8 @@ impl SourceOptions {
     }
 }
 
-/// Pixels of the images for each Gaussian: 96 values, most of which the images beside it have, too,
-/// for the 23 of a Gaussian of degree 1. Eleven photographs of 0.38 megapixels would have a million
+/// Pixels of the images for each Gaussian: 96 values, most of which neighbouring images repeat. A
+/// Gaussian of degree 1 has 23. Eleven photographs of 0.38 megapixels would have a million
 /// otherwise, four pixels for each.
 const PIXELS_PER_GAUSSIAN: f64 = 32.0;
 
@@ -265,6 +273,10 @@ pub(super) fn keep_trained(settings: &mut Settings) {
 
 /// Reads the file of `--settings`.
 pub(super) fn read_settings(path: &Path) -> anyhow::Result<Settings> {
+    read_toml(path)
+}
+
+fn read_toml<T: DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
     let cannot = || format!("--settings {}", path.display());
     let text = fs::read_to_string(path).with_context(cannot)?;
     toml::from_str(&text).with_context(cannot)

@@ -66,7 +66,7 @@ impl StartOptions {
         let all = points.len();
         if all > cap {
             choose(&mut points, cap, settings.seed);
-            writeln!(io::stderr(), "{cap} of {all} points are chosen: --cap")?;
+            writeln!(io::stderr(), "{cap} of {all} points are chosen; --cap changes it")?;
         }
         let gaussians = gaussians_from_points(&points);
         Ok((Start { gaussians, ..Start::default() }, profile))

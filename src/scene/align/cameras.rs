@@ -5,14 +5,16 @@ use glam::DVec3;
 
 use crate::geometry::Pose;
 
-use super::ground::fit;
-use super::{GroundPlane, median};
+use super::median;
+use super::plane::{GroundPlane, fit};
 
 /// The cameras of a capture, in the axes and the unit of its scene.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CaptureCameras {
-    /// Directions that may be up, the most likely first; at least one.
+    /// Directions that may be up; at least one.
     ups: Vec<DVec3>,
+    /// Whether up is across the rows of images in several directions.
+    has_level_rows: bool,
     /// Where they are; at least one.
     positions: Vec<DVec3>,
 }
@@ -20,10 +22,8 @@ pub struct CaptureCameras {
 /// Why cameras say nothing of the ground.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum CamerasError {
-    /// They are turned in all directions: a drone that looks down, or none at all.
-    #[error(
-        "the {count} cameras have no common direction that is up: leave out --cameras, and give --up"
-    )]
+    /// They are turned in all directions, or there are none.
+    #[error("the {count} cameras have no common direction that is up: give --up, too")]
     NoCommonUp { count: usize },
 }
 
@@ -35,51 +35,76 @@ const LEAST_COMMON: f64 = 0.7;
 /// are spread by 8 degrees. Photographs in one direction do not say how far they are tilted.
 const MOST_PARALLEL: f64 = 0.99;
 
-/// Photographs are upright in files that are not: of those that walk around something, the axis
-/// that is up is more parallel by at least this.
-const MORE_PARALLEL: f64 = 0.02;
+/// Least cosine between up by the rows and by the mean: rows that are spread by rolled cameras are
+/// not level.
+const LEAST_AGREEMENT: f64 = 0.7;
+
+/// Share of the cameras that are above the ground: COLMAP may place one of them wrongly, and a road
+/// may have a crest.
+const ABOVE_SHARE: f64 = 0.9;
 
 impl CaptureCameras {
     /// Cameras with these poses: x right, y down, z forward, of the image as it is in its file.
     ///
     /// Photographs are tilted up to the roof of a house or down to an object, and hardly ever
     /// rolled: up is across the rows of all images. Only if all look in one direction, it is the
-    /// mean of their up directions. Of upright photographs, whose files are turned by a quarter, up
-    /// is across the columns.
+    /// mean of their up directions. Of portrait photographs, whose files are turned by a quarter to
+    /// either side, it is across the columns. A camera is carried along the ground: up is the
+    /// direction of the two in which the cameras differ less.
     ///
     /// # Errors
     /// [`CamerasError::NoCommonUp`].
     pub fn new(world_from_camera: &[Pose]) -> Result<Self, CamerasError> {
-        let wide = Up::new(world_from_camera, DVec3::NEG_Y, DVec3::X);
-        let upright = Up::new(world_from_camera, DVec3::NEG_X, DVec3::Y);
-        let is_upright = upright.parallel > wide.parallel + MORE_PARALLEL;
-        let mut ups = vec![wide];
-        // The file may be turned to either side.
-        let turned = [upright, Up { direction: -upright.direction, ..upright }];
-        let at = if is_upright { 0 } else { ups.len() };
-        ups.splice(at..at, turned);
-        ups.retain(|up| up.parallel >= LEAST_COMMON);
-        if ups.is_empty() {
-            return Err(CamerasError::NoCommonUp { count: world_from_camera.len() });
-        }
-        let ups = ups.into_iter().map(|up| up.direction).collect();
-        let positions = world_from_camera.iter().map(|pose| pose.position_m).collect();
-        Ok(Self { ups, positions })
+        let positions: Vec<DVec3> = world_from_camera.iter().map(|pose| pose.position_m).collect();
+        let landscape = up_by_axes(world_from_camera, DVec3::NEG_Y, DVec3::X);
+        let portrait = up_by_axes(world_from_camera, DVec3::NEG_X, DVec3::Y);
+        let is_portrait = match (landscape, portrait) {
+            (Some((up, _)), Some((turned, _))) => {
+                spread(&positions, turned) < spread(&positions, up)
+            }
+            (landscape, _) => landscape.is_none(),
+        };
+        let chosen = if is_portrait { portrait } else { landscape };
+        let none = CamerasError::NoCommonUp { count: positions.len() };
+        let (up, has_level_rows) = chosen.ok_or(none)?;
+        let ups = if is_portrait { vec![up, -up] } else { vec![up] };
+        Ok(Self { ups, has_level_rows, positions })
     }
 
-    /// Directions that may be up, the most likely first.
+    /// As [`Self::new`], if it is known where up is.
+    ///
+    /// # Errors
+    /// [`CamerasError::NoCommonUp`]: there are no cameras.
+    pub fn with_up(world_from_camera: &[Pose], up: DVec3) -> Result<Self, CamerasError> {
+        if world_from_camera.is_empty() {
+            return Err(CamerasError::NoCommonUp { count: 0 });
+        }
+        let positions = world_from_camera.iter().map(|pose| pose.position_m).collect();
+        Ok(Self { ups: vec![up.normalize_or_zero()], has_level_rows: false, positions })
+    }
+
+    /// Directions that may be up: two of portrait photographs.
     pub fn ups(&self) -> &[DVec3] {
         &self.ups
     }
 
-    /// The middle of the cameras.
-    pub(super) fn middle(&self) -> DVec3 {
-        self.positions.iter().sum::<DVec3>() / self.positions.len() as f64
+    /// Whether up is known to a few degrees.
+    pub(super) fn have_level_rows(&self) -> bool {
+        self.has_level_rows
     }
 
-    /// Whether all cameras are above a plane.
+    /// The middle of the cameras, by axis.
+    pub(super) fn middle(&self) -> DVec3 {
+        DVec3::from_array(
+            [0, 1, 2]
+                .map(|axis| median(self.positions.iter().map(|position| position[axis]).collect())),
+        )
+    }
+
+    /// Whether nearly all cameras are above a plane.
     pub(super) fn are_above(&self, plane: &GroundPlane) -> bool {
-        self.heights(plane).all(|height| height > 0.0)
+        let above = self.heights(plane).filter(|&height| height > 0.0).count();
+        above as f64 >= ABOVE_SHARE * self.positions.len() as f64
     }
 
     /// Median height of the cameras above a plane, in the unit of the scene.
@@ -93,25 +118,29 @@ impl CaptureCameras {
     }
 }
 
-/// A direction that may be up.
-#[derive(Clone, Copy, Debug)]
-struct Up {
-    /// Length of the mean of the cameras' axes that point up, from 0 to 1.
-    parallel: f64,
-    direction: DVec3,
+/// Up, if the axis `upright` of the cameras points there and their axis `level` is horizontal, and
+/// whether it is across the latter.
+fn up_by_axes(world_from_camera: &[Pose], upright: DVec3, level: DVec3) -> Option<(DVec3, bool)> {
+    let count = world_from_camera.len().max(1) as f64;
+    let axes = |axis: DVec3| world_from_camera.iter().map(move |pose| pose.rotation * axis);
+    let mean = axes(upright).sum::<DVec3>() / count;
+    if mean.length() < LEAST_COMMON {
+        return None;
+    }
+    let is_spread = axes(level).sum::<DVec3>().length() <= MOST_PARALLEL * count;
+    // A plane through the origin: each direction and the opposite one have their mean there.
+    let rows: Vec<DVec3> = axes(level).chain(axes(-level)).collect();
+    let agrees = |up: &DVec3| up.dot(mean) >= LEAST_AGREEMENT * mean.length();
+    let across = fit(&rows)
+        .filter(|_| is_spread)
+        .map(|plane| plane.up * plane.up.dot(mean).signum())
+        .filter(agrees);
+    Some((across.unwrap_or(mean).normalize(), across.is_some()))
 }
 
-impl Up {
-    /// Up, if the axis `upright` of the cameras points there and their axis `level` is horizontal.
-    fn new(world_from_camera: &[Pose], upright: DVec3, level: DVec3) -> Self {
-        let count = world_from_camera.len().max(1) as f64;
-        let axes = |axis: DVec3| world_from_camera.iter().map(move |pose| pose.rotation * axis);
-        let mean = axes(upright).sum::<DVec3>() / count;
-        let is_spread = axes(level).sum::<DVec3>().length() <= MOST_PARALLEL * count;
-        // A plane through the origin: each direction and the opposite one have their mean there.
-        let rows: Vec<DVec3> = axes(level).chain(axes(-level)).collect();
-        let across = fit(&rows).filter(|_| is_spread).map(|plane| plane.up);
-        let direction = across.map_or(mean, |across| across * across.dot(mean).signum());
-        Self { parallel: mean.length(), direction: direction.normalize_or_zero() }
-    }
+/// How far most positions differ along a direction: the median distance from their median.
+fn spread(positions: &[DVec3], along: DVec3) -> f64 {
+    let at: Vec<f64> = positions.iter().map(|position| along.dot(*position)).collect();
+    let middle = median(at.clone());
+    median(at.into_iter().map(|at| (at - middle).abs()).collect())
 }

@@ -12,28 +12,14 @@
 
 use std::collections::HashSet;
 
-use glam::{DMat3, DQuat, DVec3};
+use glam::{DQuat, DVec3};
 
 use crate::Gaussians;
 use crate::random::Random;
 
 use super::cameras::CaptureCameras;
 use super::median;
-
-/// A plane, and which of its sides is up.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct GroundPlane {
-    /// A point of it, in the unit of the scene.
-    pub point: DVec3,
-    pub up: DVec3,
-}
-
-impl GroundPlane {
-    /// With the other side up.
-    fn turned(self) -> Self {
-        Self { up: -self.up, ..self }
-    }
-}
+use super::plane::{GroundPlane, fit};
 
 /// How the ground is searched.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -78,6 +64,8 @@ pub enum GroundError {
 const CUBES: f64 = 120.0;
 /// Distance from the plane that counts as on it at first, as a share of the scene's radius.
 const TOLERANCE: f64 = 0.01;
+/// As [`TOLERANCE`], of the ground below cameras: a few photographs leave it rough.
+const TOLERANCE_BELOW: f64 = 0.02;
 /// How often the tolerance is halved while the plane is fitted, at most.
 const REFINEMENTS: i32 = 5;
 /// Share of the first round's places that a round must have: below it the tolerance is less than
@@ -93,6 +81,8 @@ const LEAST_COSINE: f64 = 0.8;
 const COMPARED: usize = 12_000;
 const LEAST_PLACES: usize = 50;
 const LEAST_PERCENT: u32 = 4;
+/// As [`LEAST_PERCENT`], of the ground below cameras, of which more is known.
+const LEAST_PERCENT_BELOW: u32 = 2;
 /// Radius of a core as a share of that of the next larger one: the pavement of an object is a small
 /// part of cores that are much larger, and not in those that are smaller.
 const SHRINK: f64 = 0.75;
@@ -107,9 +97,11 @@ const OBJECT_SHARE: f64 = 0.8;
 const BESIDE_SHARE: f64 = 0.6;
 /// Most of the core's width that the object may have.
 const MOST_OBJECT: f64 = 0.6;
-/// Least cosine between the normal of the ground and the up direction of the cameras, 25 degrees:
-/// photographs in one direction may all be tilted to a roof.
-const LEAST_LEVEL: f64 = 0.9;
+/// Largest angle between the normal of the ground and up across the rows of photographs, in
+/// degrees.
+const MOST_SLOPE: f64 = 8.0;
+/// As [`MOST_SLOPE`], if photographs in one direction may all be tilted to a roof.
+const MOST_TILT: f64 = 26.0;
 
 impl Default for GroundSearch {
     fn default() -> Self {
@@ -157,19 +149,21 @@ pub fn find_ground(
     let mut rule = SceneRule { up: search.up, is_core: false };
     let none = match ground_in(gaussians, &whole, search, &rule) {
         Err(error @ GroundError::NoPlane { .. }) => error,
-        found => return found,
+        found => return found.map(|found| found.plane),
     };
     rule.is_core = true;
     let middle = |some: &[usize]| middle_of_small(gaussians, some);
-    ground_in_cores(gaussians, &whole, &middle, search, &rule).ok_or(none)
+    let found = ground_in_cores(gaussians, &whole, &middle, search, &rule);
+    found.map(|found| found.plane).map_err(|_| none)
 }
 
-/// Finds the ground below the cameras that a scene was trained from: they are above it, and know
-/// about where up is. So little of the scene may be on it, as of photographs of a house, and what
-/// hangs below it, where no camera looked, hides it less.
+/// Finds the ground below the cameras that a scene was trained from: they are above it, and say
+/// about where up is. A small part of the scene is enough, as of photographs of a house, and what
+/// hangs below it, where no camera looked, hides it less. Of several directions that may be up, the
+/// one with more of the scene on its ground is.
 ///
 /// # Errors
-/// As [`find_ground`].
+/// There are too few opaque Gaussians, or no plane below the cameras has enough of them on it.
 pub fn find_ground_below(
     gaussians: &Gaussians,
     cameras: &CaptureCameras,
@@ -177,14 +171,17 @@ pub fn find_ground_below(
 ) -> Result<GroundPlane, GroundError> {
     let whole = opaque(gaussians);
     let middle = |_: &[usize]| cameras.middle();
-    let below = |&up: &DVec3| {
-        ground_in_cores(gaussians, &whole, &middle, search, &CameraRule { cameras, up })
-    };
-    cameras
-        .ups()
-        .iter()
-        .find_map(below)
-        .ok_or(GroundError::NoneBelow { least_percent: LEAST_PERCENT })
+    let mut best: Option<Scored> = None;
+    for &up in cameras.ups() {
+        let rule = CameraRule { cameras, up };
+        match ground_in_cores(gaussians, &whole, &middle, search, &rule) {
+            Ok(found) if best.is_none_or(|best| found.share > best.share) => best = Some(found),
+            Ok(_) | Err(GroundError::NoPlane { .. }) => {}
+            Err(too_few) => return Err(too_few),
+        }
+    }
+    let none = GroundError::NoneBelow { least_percent: LEAST_PERCENT_BELOW };
+    best.map(|best| best.plane).ok_or(none)
 }
 
 /// The ground of the largest core that has one: the half of some Gaussians that is nearest to their
@@ -195,35 +192,44 @@ fn ground_in_cores(
     middle: &dyn Fn(&[usize]) -> DVec3,
     search: &GroundSearch,
     rule: &dyn Rule,
-) -> Option<GroundPlane> {
-    let least = (LEAST_CORE_SHARE * whole.len() as f64).max(1.0) as usize;
+) -> Result<Scored, GroundError> {
     if whole.is_empty() {
-        return None;
+        return Err(GroundError::TooFew { count: 0, least: LEAST_PLACES });
     }
+    let least = (LEAST_CORE_SHARE * whole.len() as f64).max(1.0) as usize;
     let from = middle(whole);
     let half = median(whole.iter().map(|&i| distance(gaussians, i, from)).collect());
     let mut core = Core::within(gaussians, whole, from, half);
+    let mut first = None;
     for _ in 0..MOST_CORES {
         if core.gaussians.len() < least {
             break;
         }
         match ground_in(gaussians, &core.gaussians, search, rule) {
-            Ok(plane) => return Some(plane),
+            Ok(found) => return Ok(found),
             // Nearly all of it is at one place, where the smaller cores are too.
-            Err(GroundError::TooFew { .. }) => break,
-            Err(_) => {
+            Err(error @ GroundError::TooFew { .. }) => return Err(first.unwrap_or(error)),
+            Err(error) => {
+                first = first.or(Some(error));
                 let from = middle(&core.gaussians);
                 core = Core::within(gaussians, &core.gaussians, from, SHRINK * core.reach);
             }
         }
     }
-    None
+    Err(first.unwrap_or(GroundError::NoPlane { least_percent: LEAST_PERCENT }))
 }
 
 /// What makes a plane the ground.
 trait Rule {
     /// The plane with its up side, by what is on it and beside it; `None` if it is not the ground.
-    fn score(&self, plane: GroundPlane, beside: Beside) -> Option<Scored>;
+    /// `count` is the number of all places.
+    fn score(&self, plane: GroundPlane, beside: Beside, count: f64) -> Option<Scored>;
+
+    /// Least share of all places that lie on the ground.
+    fn least_share(&self) -> f64;
+
+    /// Distance from the plane that counts as on it at first, as a share of the scene's radius.
+    fn tolerance(&self) -> f64;
 
     /// Whether the plane is the ground by what costs more to know.
     fn accepts(&self, places: &[SurfaceSample], plane: GroundPlane, tolerance: f64) -> bool;
@@ -234,8 +240,8 @@ trait Rule {
 struct Scored {
     /// The largest one is the ground.
     score: f64,
-    /// What at least [`LEAST_PERCENT`] of all places must be.
-    counted: f64,
+    /// Share of the places that lie on it, which is at least [`Rule::least_share`].
+    share: f64,
     plane: GroundPlane,
 }
 
@@ -247,15 +253,28 @@ struct SceneRule {
 }
 
 impl Rule for SceneRule {
-    fn score(&self, plane: GroundPlane, Beside { on, above, below }: Beside) -> Option<Scored> {
+    fn score(
+        &self,
+        plane: GroundPlane,
+        Beside { on, above, below, .. }: Beside,
+        count: f64,
+    ) -> Option<Scored> {
         // Up is the side with more of the scene. Only the smaller side is a penalty: the ground may
         // have all of the scene above it, but not much below. A table top has too few places, and a
         // plane through the middle of a scene has as many below as above.
-        let plane = if below > above { plane.turned() } else { plane };
+        let upper = if below > above { plane.turned() } else { plane };
         let score = on - above.min(below);
         // 0.7 is about cos 45 degrees. An up direction of zero length refuses every plane.
-        let is_wanted = self.up.is_none_or(|up| plane.up.dot(up.normalize_or_zero()) > 0.7);
-        is_wanted.then_some(Scored { score, counted: score, plane })
+        let is_wanted = self.up.is_none_or(|up| upper.up.dot(up.normalize_or_zero()) > 0.7);
+        is_wanted.then_some(Scored { score, share: score / count, plane: upper })
+    }
+
+    fn least_share(&self) -> f64 {
+        f64::from(LEAST_PERCENT) / 100.0
+    }
+
+    fn tolerance(&self) -> f64 {
+        TOLERANCE
     }
 
     fn accepts(&self, places: &[SurfaceSample], plane: GroundPlane, tolerance: f64) -> bool {
@@ -270,12 +289,28 @@ struct CameraRule<'a> {
 }
 
 impl Rule for CameraRule<'_> {
-    fn score(&self, plane: GroundPlane, Beside { on, above, below }: Beside) -> Option<Scored> {
+    fn score(
+        &self,
+        plane: GroundPlane,
+        Beside { near, above, below, .. }: Beside,
+        count: f64,
+    ) -> Option<Scored> {
         let is_turned = plane.up.dot(self.up) < 0.0;
-        let (plane, below) = if is_turned { (plane.turned(), above) } else { (plane, below) };
-        let is_level = plane.up.dot(self.up) >= LEAST_LEVEL;
-        let is_ground = is_level && self.cameras.are_above(&plane);
-        is_ground.then_some(Scored { score: on - below, counted: on, plane })
+        let (upper, hanging) = if is_turned { (plane.turned(), above) } else { (plane, below) };
+        let most = if self.cameras.have_level_rows() { MOST_SLOPE } else { MOST_TILT };
+        // Of planes with as much on them, the one that is most level is the ground.
+        let level = 1.0 - (upper.up.angle_between(self.up).to_degrees() / most).powi(2);
+        let is_ground = level > 0.0 && self.cameras.are_above(&upper);
+        let score = level * near - hanging;
+        is_ground.then_some(Scored { score, share: near / count, plane: upper })
+    }
+
+    fn least_share(&self) -> f64 {
+        f64::from(LEAST_PERCENT_BELOW) / 100.0
+    }
+
+    fn tolerance(&self) -> f64 {
+        TOLERANCE_BELOW
     }
 
     fn accepts(&self, _: &[SurfaceSample], _: GroundPlane, _: f64) -> bool {
@@ -289,13 +324,13 @@ fn ground_in(
     core: &[usize],
     search: &GroundSearch,
     rule: &dyn Rule,
-) -> Result<GroundPlane, GroundError> {
+) -> Result<Scored, GroundError> {
     let radius = extent(gaussians, core).radius;
     let places = places(gaussians, core, radius / CUBES);
     if places.len() < LEAST_PLACES || radius <= 0.0 {
         return Err(GroundError::TooFew { count: places.len(), least: LEAST_PLACES });
     }
-    let tolerance = TOLERANCE * radius;
+    let tolerance = rule.tolerance() * radius;
     // Every `stride`-th place, so that at most COMPARED of them are judged: 3,000 planes times
     // 12,000 places are 36 million products.
     let stride = places.len().div_ceil(COMPARED);
@@ -305,7 +340,11 @@ fn ground_in(
     for at in 0..search.hypotheses {
         let Some(plane) = hypothesis(&compared, at, &mut random) else { continue };
         let beside = Beside::new(&compared, &plane, tolerance);
-        let Some(scored) = rule.score(plane, beside) else { continue };
+        let scored = rule.score(plane, beside, compared.len() as f64);
+        // A plane with too little on it must not hide the ground, which may have much below it.
+        let Some(scored) = scored.filter(|scored| scored.share >= rule.least_share()) else {
+            continue;
+        };
         // Strictly greater: of equal planes the first one stays, so that the result is
         // deterministic.
         let is_better = best.is_none_or(|best| scored.score > best.score);
@@ -313,13 +352,8 @@ fn ground_in(
             best = Some(scored);
         }
     }
-    let least = f64::from(LEAST_PERCENT) / 100.0 * compared.len() as f64;
-    match best {
-        Some(Scored { counted, plane, .. }) if counted >= least => {
-            Ok(refine(&places, plane, tolerance))
-        }
-        _ => Err(GroundError::NoPlane { least_percent: LEAST_PERCENT }),
-    }
+    let best = best.ok_or(GroundError::NoPlane { least_percent: LEAST_PERCENT })?;
+    Ok(Scored { plane: refine(&places, best.plane, tolerance), ..best })
 }
 
 /// The Gaussians within a distance of a middle, in the same order. The middle is that of the
@@ -425,7 +459,10 @@ fn hypothesis(places: &[SurfaceSample], at: usize, random: &mut Random) -> Optio
 /// The places on a plane, and on each of its sides.
 #[derive(Clone, Copy, Debug, Default)]
 struct Beside {
+    /// By what their normals say.
     on: f64,
+    /// All of them.
+    near: f64,
     above: f64,
     below: f64,
 }
@@ -436,6 +473,7 @@ impl Beside {
         for place in places {
             let height = plane.up.dot(place.at - plane.point);
             if height.abs() <= tolerance {
+                beside.near += 1.0;
                 beside.on += match place.normal {
                     Some(normal) if normal.dot(plane.up).abs() >= LEAST_COSINE => 1.0,
                     Some(_) => 0.0,
@@ -509,38 +547,6 @@ fn densest(mut heights: Vec<f64>, width: f64) -> Option<f64> {
     }
     let window = &heights[best.0..best.1];
     (!window.is_empty()).then(|| window[window.len() / 2])
-}
-
-/// The plane with the least squares of distances: through the mean, normal to the two main axes of
-/// the points.
-pub(super) fn fit(points: &[DVec3]) -> Option<GroundPlane> {
-    if points.len() < 3 {
-        return None;
-    }
-    let mean = points.iter().sum::<DVec3>() / points.len() as f64;
-    let covariance = points.iter().fold(DMat3::ZERO, |sum, &point| {
-        let d = point - mean;
-        sum + DMat3::from_cols(d * d.x, d * d.y, d * d.z)
-    });
-    // The eigenvector of the smallest eigenvalue: power iteration on the adjugate, whose largest
-    // eigenvalue belongs to it. The adjugate of a symmetric matrix with columns a, b, c has the
-    // columns b x c, c x a, a x b.
-    let scale = covariance.to_cols_array().iter().fold(0.0_f64, |most, e| most.max(e.abs()));
-    let [a, b, c] = [covariance.x_axis, covariance.y_axis, covariance.z_axis].map(|v| v / scale);
-    let mut adjugate = DMat3::from_cols(b.cross(c), c.cross(a), a.cross(b));
-    // Each round squares the matrix: 12 rounds are the power 2^12 = 4096. Two eigenvalues that
-    // differ by 1 % then differ by a factor of e^40.
-    for _ in 0..12 {
-        let norm = adjugate.to_cols_array().iter().fold(0.0_f64, |most, e| most.max(e.abs()));
-        if !(norm > 0.0 && norm.is_finite()) {
-            return None;
-        }
-        adjugate *= 1.0 / norm;
-        adjugate = adjugate * adjugate;
-    }
-    let columns = [adjugate.x_axis, adjugate.y_axis, adjugate.z_axis];
-    let longest = columns.into_iter().max_by(|a, b| a.length().total_cmp(&b.length()))?;
-    longest.try_normalize().map(|up| GroundPlane { point: mean, up })
 }
 
 #[cfg(test)]

@@ -4,6 +4,7 @@ mod cameras;
 mod capture;
 mod ground;
 mod path;
+mod plane;
 
 use std::str::FromStr;
 
@@ -19,10 +20,10 @@ pub use capture::{
     CaptureOptions, CapturedDrive, CapturedDriveError, DEFAULT_FPS, PosedImage, captured_drive,
 };
 pub use ground::{
-    GroundError, GroundPlane, GroundSearch, SceneExtent, find_ground, find_ground_below,
-    scene_extent,
+    GroundError, GroundSearch, SceneExtent, find_ground, find_ground_below, scene_extent,
 };
 pub use path::{DEFAULT_SPEED_M_S, PathError, drive_through};
+pub use plane::GroundPlane;
 
 /// A change of a twin's axes and unit: `p_new = metres_per_unit * (new_from_old * p_old)`.
 ///

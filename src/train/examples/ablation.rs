@@ -66,6 +66,11 @@ fn main() -> Result<(), Box<dyn Error>> {
     let scale = arguments.get(1).and_then(|scale| scale.parse::<f64>().ok());
     let chosen = arguments.get(if scale.is_some() { 2 } else { 1 }..).unwrap_or_default();
     let scale = scale.unwrap_or(0.25);
+    if let Some(row) = chosen.iter().find(|row| !ROWS.iter().any(|(name, _)| name == row)) {
+        return Err(
+            format!("{row:?} is no row; the rows are {:?}", ROWS.map(|(name, _)| name)).into()
+        );
+    }
     let cpu = Cpu::new(0, Simd::Best)?;
     let street = wildcity_generate::street(&StreetSettings::default())?;
     let sky = Sky::new(SkyModel::Cube(Arc::new(evening()?)), DMat3::IDENTITY);

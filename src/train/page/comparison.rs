@@ -64,7 +64,7 @@ const NO_ANSWER: &str = "No run has made a scene that can be judged.";
 pub fn verdict(command: &str, runs: &[ComparedRun]) -> String {
     let sentences: Vec<String> = answers(command, runs)
         .into_iter()
-        .map(|(answer, command)| format!("{answer}: {command}."))
+        .map(|(answer, line)| format!("{answer}: {line}."))
         .collect();
     if sentences.is_empty() { NO_ANSWER.to_owned() } else { sentences.join(" ") }
 }

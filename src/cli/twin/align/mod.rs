@@ -16,7 +16,7 @@ use wildcity_scene::align::{
 };
 use wildcity_scene::geometry::Pose;
 use wildcity_twin::ingest::capture;
-use wildcity_twin::store::Edit;
+use wildcity_twin::store::{Catalog, Edit, Version};
 
 use super::{blind, change};
 use crate::cli::directories::{EditedTwin, Twins};
@@ -48,13 +48,14 @@ pub(in crate::cli) struct Align {
     up: Up,
 
     /// The COLMAP model or the transforms.json that the scene was trained from: its cameras are
-    /// above the ground, and most of them level.
-    #[arg(long, value_name = "SOURCE", conflicts_with = "up")]
+    /// above the ground, and say where up is, unless --up does.
+    #[arg(long, value_name = "SOURCE")]
     cameras: Option<PathBuf>,
 
-    /// Height of most of these cameras above the ground, in metres, which gives the scale: 1.6 for
-    /// a person who walks.
-    #[arg(long, value_name = "M", requires = "cameras", conflicts_with_all = ["from", "scale"])]
+    /// Median height of these cameras above the ground, in metres, which gives the scale: 1.6 if
+    /// they were held at the eyes.
+    #[arg(long, value_name = "M", requires = "cameras", conflicts_with_all = ["from", "scale"],
+        value_parser = height_m)]
     camera_height_m: Option<f64>,
 
     /// First of two points whose real distance is known, in the twin's axes and unit; see --to and
@@ -142,33 +143,28 @@ impl Align {
         let metres_per_unit = self.metres_per_unit()?;
         let catalog = self.twins.catalog()?;
         let base = catalog.version(&self.edited.twin.name, self.edited.twin.number)?;
+        let cameras = self.read_cameras(&catalog, &base)?;
         let sh_degree = base.manifest.sh_degree;
         let mut gaussians = Gaussians { sh_degree, ..Gaussians::default() };
         catalog.visit_full_detail(&base, &|_| true, &mut |section| gaussians.append(&section))?;
 
         let search = GroundSearch { up: self.up.0, seed: self.seed, ..GroundSearch::default() };
-        let about = || format!("twin {}", self.edited.twin.name);
-        let (ground, metres_per_unit) = match &self.cameras {
-            None => (find_ground(&gaussians, &search).with_context(about)?, metres_per_unit),
-            Some(source) => {
-                let in_twin = placement::from_version(&catalog, &base)?;
-                let poses = read_poses(source)?;
-                let poses: Vec<Pose> = poses.iter().map(|pose| in_twin.pose(pose)).collect();
-                let cameras = CaptureCameras::new(&poses).context("--cameras")?;
-                let ground =
-                    find_ground_below(&gaussians, &cameras, &search).with_context(about)?;
-                let height = cameras.height_above(&ground);
-                let scale = self.camera_height_m.map_or(metres_per_unit, |m| m / height);
-                let count = output::counted(poses.len(), "camera");
-                let height_m = scale * height;
-                writeln!(output::stdout(), "cameras     {count}, {height_m:.2} m above it")?;
-                (ground, scale)
-            }
+        let found = match &cameras {
+            None => find_ground(&gaussians, &search),
+            Some(cameras) => find_ground_below(&gaussians, cameras, &search),
         };
-        let alignment = Alignment::onto(&ground).scaled(metres_per_unit).with_context(|| {
-            if self.cameras.is_some() { "--camera-height-m" } else { "--scale" }
-        })?;
+        let ground = found.with_context(|| format!("twin {}", self.edited.twin.name))?;
+        let height = cameras.map(|cameras| cameras.height_above(&ground));
+        let scale = match (self.camera_height_m, height) {
+            (Some(height_m), Some(height)) => height_m / height,
+            _ => metres_per_unit,
+        };
+        let alignment = Alignment::onto(&ground).scaled(scale).context("--camera-height-m")?;
         print_proposal(&ground, &alignment)?;
+        if let Some(height) = height {
+            let height_m = scale * height;
+            writeln!(output::stdout(), "cameras     {height_m:.2} m above the ground (median)")?;
+        }
 
         let picture = self.picture.clone();
         let picture =
@@ -199,6 +195,25 @@ impl Align {
         change::print(&version, "the ground is level, at height 0")
     }
 
+    /// The cameras of `--cameras`, in the axes of the twin.
+    fn read_cameras(
+        &self,
+        catalog: &Catalog,
+        base: &Version,
+    ) -> anyhow::Result<Option<CaptureCameras>> {
+        let Some(source) = &self.cameras else { return Ok(None) };
+        let in_twin = placement::from_version(catalog, base).context(
+            "--cameras: their poses cannot be placed in the twin; leave it out, and give --up",
+        )?;
+        let poses = read_poses(source).context("--cameras")?;
+        let poses: Vec<Pose> = poses.iter().map(|pose| in_twin.pose(pose)).collect();
+        let cameras = match self.up.0 {
+            None => CaptureCameras::new(&poses),
+            Some(up) => CaptureCameras::with_up(&poses, up),
+        };
+        cameras.context("--cameras").map(Some)
+    }
+
     /// The scale of the options.
     fn metres_per_unit(&self) -> anyhow::Result<f64> {
         match (self.from, self.to, self.distance_m) {
@@ -226,6 +241,13 @@ fn read_poses(source: &Path) -> anyhow::Result<Vec<Pose>> {
         frames.into_iter().map(|frame| frame.posed).collect()
     };
     Ok(images.into_iter().map(|image| image.world_from_camera).collect())
+}
+
+fn height_m(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(height_m) if (1e-3..=1e4).contains(&height_m) => Ok(height_m),
+        _ => Err("expected a height above the ground in metres, such as 1.6".to_owned()),
+    }
 }
 
 /// Without the rounding errors of a power of ten: 0.1 for 0.10000000000000003.

@@ -143,6 +143,8 @@ class DriveConfig:
         object.__setattr__(self, "cameras", tuple(self.cameras))
         if not self.cameras:
             raise ValueError("cameras is empty; name at least one camera")
+        if not isinstance(self.lidars, Mapping):
+            raise ValueError(f"lidars is {self.lidars!r}; give rows and columns by name, as {{'top': (64, 1800)}}")
         if np.shape(self.size) != (2,):
             raise ValueError(f"size is {self.size!r}; give width and height of the images, as (96, 60)")
         keys = [*map(image_key, self.cameras), *map(lidar_key, self.lidars)]
@@ -155,10 +157,10 @@ class DriveConfig:
                 raise ValueError(f"with scenario, {', '.join(given)} cannot be set: the scenario defines them")
         if self.dynamics == "teleport":
             raise ValueError("dynamics is 'teleport'; actions need 'kinematic' or 'dynamic'")
-        if self.horizon < 1:
+        # Not `<`, which NaN passes.
+        if not self.horizon >= 1:
             raise ValueError(f"horizon is {self.horizon}; an episode has at least one step")
         for name in ("off_route_m", "waypoint_m"):
-            # Not `<=`, which NaN passes.
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; give a distance above 0, in metres")
         start_m = (0.0, 0.0) if self.start_m is None else self.start_m
@@ -280,6 +282,8 @@ class Task(ABC):
         given = np.asarray(action, np.float64)
         if given.shape != (2,):
             raise ValueError(f"action has the shape {given.shape}; it is two numbers: acceleration and curvature")
+        if not np.isfinite(given).all():
+            raise ValueError(f"action is {given}; give numbers from -1 to 1")
         acceleration, curvature = np.clip(given, -1.0, 1.0)
         return Action(float(acceleration) * ACCELERATION_M_S2, float(curvature) * CURVATURE_1_M)
 
