@@ -357,12 +357,12 @@ async fn a_frame_with_too_much_to_draw_is_refused() {
 
 #[tokio::test]
 async fn pings_are_answered_and_count_as_life() {
-    // A busy machine may delay a ping by a second.
-    let idle = Duration::from_secs(2);
+    // A busy machine may delay a ping by seconds.
+    let idle = Duration::from_secs(5);
     let server = TestServer::with(Limits { idle, ..Limits::default() }).await;
     let mut agent = server.driver("a").await;
-    for _ in 0..15 {
-        tokio::time::sleep(idle / 10).await;
+    for _ in 0..30 {
+        tokio::time::sleep(idle / 20).await;
         agent.socket.send(Message::Ping("x".into())).await.unwrap();
         let pong = futures_util::StreamExt::next(&mut agent.socket).await;
         assert!(matches!(pong, Some(Ok(Message::Pong(_)))), "{pong:?}");

@@ -116,12 +116,16 @@ def test_ports_mounts_and_secrets_are_those_of_the_options() -> None:
 
 
 def test_the_commands_of_the_readme_fit_the_manifests() -> None:
-    (block,) = re.findall(r"```\n(.*?)```", (MANIFESTS / "README.md").read_text(), re.DOTALL)
+    block, signal = re.findall(r"```\n(.*?)```", (MANIFESTS / "README.md").read_text(), re.DOTALL)
+    labels = manifest("statefulset.yaml")["spec"]["template"]["metadata"]["labels"]
+    (selector,) = re.findall(r"--selector (\S+)=(\S+)", signal)
+    assert labels[selector[0]] == selector[1]
     commands = [shlex.split(line) for line in block.replace("\\\n", " ").splitlines()]
     namespace = manifest("namespace.yaml")["metadata"]["name"]
     assert KUSTOMIZATION["namespace"] == namespace
     kinds = [command[1:3] for command in commands]
     # Secrets need the namespace, and pods the secrets.
+    assert f"--namespace {namespace} " in signal
     assert kinds == [["apply", "-f"], ["create", "secret"], ["create", "secret"], ["apply", "-k"]]
     root = MANIFESTS.parents[1]
     assert root / commands[0][3] == MANIFESTS / "namespace.yaml" and root / commands[3][3] == MANIFESTS
