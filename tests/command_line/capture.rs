@@ -32,6 +32,15 @@ fn captured_street() -> (Gaussians, Trajectory) {
     (gaussians, street.trajectory)
 }
 
+/// Imports the street in the axes of its capture. Returns its drive, in its own.
+fn import_street(at: &Path, options: &[&str]) -> Trajectory {
+    let (gaussians, drive) = captured_street();
+    let columns = inria_columns(gaussians.sh_degree, false);
+    fs::write(at.join("street.ply"), ply(&gaussians, &columns)).unwrap();
+    done(at, &[&["import", "street.ply", "--twin", "street"][..], options].concat());
+    drive
+}
+
 /// Camera poses of the first keyframes of the street's drive, in the axes of the capture.
 fn camera_poses(drive: &Trajectory) -> Vec<Pose> {
     let rig = Rig::preset("vehicle6").unwrap();
@@ -119,10 +128,7 @@ fn read<T: serde::de::DeserializeOwned>(path: &Path) -> T {
 fn a_capture_becomes_a_street_that_can_be_driven() {
     let dir = tempfile::tempdir().unwrap();
     let at = dir.path();
-    let (gaussians, street_drive) = captured_street();
-    let columns = inria_columns(gaussians.sh_degree, false);
-    fs::write(at.join("street.ply"), ply(&gaussians, &columns)).unwrap();
-    done(at, &["import", "street.ply", "--twin", "street"]);
+    let street_drive = import_street(at, &[]);
 
     // 1. The ground is proposed, and nothing changes before it is confirmed.
     let ends = street_drive.keyframes.iter().map(|keyframe| keyframe.world_from_rig.position_m);
@@ -259,10 +265,7 @@ fn a_capture_becomes_a_street_that_can_be_driven() {
 fn the_ground_is_found_below_the_cameras() {
     let dir = tempfile::tempdir().unwrap();
     let at = dir.path();
-    let (gaussians, street_drive) = captured_street();
-    let columns = inria_columns(gaussians.sh_degree, false);
-    fs::write(at.join("street.ply"), ply(&gaussians, &columns)).unwrap();
-    done(at, &["import", "street.ply", "--twin", "street", "--axes", "y-down-z-forward"]);
+    let street_drive = import_street(at, &["--axes", "y-down-z-forward"]);
     let poses = camera_poses(&street_drive);
     write_colmap_text(&at.join("model/sparse/0"), &poses);
     fs::write(at.join("transforms.json"), transforms(&poses).to_string()).unwrap();

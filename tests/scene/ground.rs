@@ -339,7 +339,7 @@ fn up_is_that_of_most_photographs() {
         let rotation = DQuat::from_rotation_z(angle([-yaw_degrees, yaw_degrees]))
             * DQuat::from_rotation_x(-0.5 * PI + angle(tilt_degrees))
             * DQuat::from_rotation_z(angle([-roll_degrees, roll_degrees]));
-        // Along a house.
+        // A walk along a house, at the height of the eyes.
         Pose {
             position_m: DVec3::new(random.range(0.0, 9.0), random.range(0.0, 2.0), 1.6),
             rotation,

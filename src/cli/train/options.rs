@@ -160,8 +160,6 @@ impl SourceOptions {
     ) -> anyhow::Result<Inputs> {
         settings.growth.cap = cap.unwrap_or(settings.growth.cap);
         settings.check()?;
-        // A scene to begin with is not cut.
-        let has_cap = cap.is_some() || self.start.is_scene() || self.settings_have_cap()?;
         let source = self.path()?;
         ensure!(
             source.exists(),
@@ -169,7 +167,7 @@ impl SourceOptions {
             source.display()
         );
         if Log::is_log(source) {
-            return self.open_log(source, settings, size, has_cap);
+            return self.open_log(source, settings, size, cap);
         }
         let list = ImageList::read(source, self.image_dir.as_deref(), self.masks.as_deref())?;
         for warning in &list.warnings {
@@ -177,9 +175,7 @@ impl SourceOptions {
         }
         let mut images = ListedImages::new(size, self.held_out_every);
         images.add(&list, &Alignment::IDENTITY)?;
-        if !has_cap {
-            settings.growth.cap = settings.growth.cap.min(most_determined(&images, size));
-        }
+        self.bound_by_pixels(&mut settings, cap, image_pixels(&images, size))?;
         let (mut start, profile) = self.start.read(source, &settings)?;
         start.world_from_camera = images.poses();
         let inputs = images.inputs();
@@ -192,7 +188,7 @@ impl SourceOptions {
         source: &Path,
         mut settings: Settings,
         size: f64,
-        has_cap: bool,
+        cap: Option<usize>,
     ) -> anyhow::Result<Inputs> {
         ensure!(
             self.image_dir.is_none() && self.masks.is_none(),
@@ -204,13 +200,26 @@ impl SourceOptions {
             let left_out = output::counted(images.left_out, "image");
             writeln!(io::stderr(), "{left_out} left out: there is no pose at the time")?;
         }
-        if !has_cap {
-            settings.growth.cap = settings.growth.cap.min(most_determined(&images, size));
-        }
+        self.bound_by_pixels(&mut settings, cap, image_pixels(&images, size))?;
         let (start, profile) = self.start.read_for_log(source, &images, &settings)?;
         let inputs = images.inputs()?;
         let images = OpenedImages::Logged(Box::new(images));
         Ok(Inputs { images, inputs, start, profile, settings })
+    }
+
+    /// Bounds the Gaussians by what the images determine, unless an option or a file says how many
+    /// there may be, or the run begins with a scene, which is not cut.
+    fn bound_by_pixels(
+        &self,
+        settings: &mut Settings,
+        cap: Option<usize>,
+        pixels: f64,
+    ) -> anyhow::Result<()> {
+        if cap.is_none() && !self.start.is_scene() && !self.settings_have_cap()? {
+            let determined = (pixels / PIXELS_PER_GAUSSIAN).ceil().max(1.0) as usize;
+            settings.growth.cap = settings.growth.cap.min(determined);
+        }
+        Ok(())
     }
 
     /// Whether the file of `--settings` says how many Gaussians there may be.
@@ -241,10 +250,10 @@ impl SourceOptions {
 /// otherwise, four pixels for each.
 const PIXELS_PER_GAUSSIAN: f64 = 32.0;
 
-/// How many Gaussians the images determine, at a fraction of their width.
-fn most_determined(images: &dyn TrainingImages, size: f64) -> usize {
-    let pixels: usize = (0..images.count()).map(|k| images.view(k).camera.pixels()).sum();
-    (size * size * pixels as f64 / PIXELS_PER_GAUSSIAN).ceil().max(1.0) as usize
+/// The pixels of all images, at a fraction of their width.
+pub(super) fn image_pixels(images: &dyn TrainingImages, size: f64) -> f64 {
+    let whole: usize = (0..images.count()).map(|k| images.view(k).camera.pixels()).sum();
+    size * size * whole as f64
 }
 
 pub(super) fn fraction(text: &str) -> Result<f64, String> {

@@ -17,7 +17,7 @@ use wildcity_train::trainer::Trainer;
 
 use super::block_parts::sample;
 use super::images::ChosenImages;
-use super::options::{Inputs, RunOptions};
+use super::options::{Inputs, RunOptions, image_pixels};
 use super::progress::{CACHE_BYTES, EVALUATIONS};
 use crate::cli::{memory, output};
 
@@ -80,8 +80,7 @@ impl Plan {
 
         let held_out = images.held_out().len();
         let learned = images.count() - held_out;
-        let pixels: usize = (0..images.count()).map(|k| images.view(k).camera.pixels()).sum();
-        let pixels = self.run.size * self.run.size * pixels as f64;
+        let pixels = image_pixels(images, self.run.size);
         // Colours, a mask, and depths.
         let decoded = (8.0 * pixels) as usize;
         writeln!(

@@ -171,7 +171,7 @@ pub fn find_ground_below(
 ) -> Result<GroundPlane, GroundError> {
     let whole = opaque(gaussians);
     let middle = |_: &[usize]| cameras.middle();
-    let mut best: Option<Scored> = None;
+    let mut best: Option<FoundGround> = None;
     for &up in cameras.ups() {
         let rule = CameraRule { cameras, up };
         match ground_in_cores(gaussians, &whole, &middle, search, &rule) {
@@ -192,7 +192,7 @@ fn ground_in_cores(
     middle: &dyn Fn(&[usize]) -> DVec3,
     search: &GroundSearch,
     rule: &dyn Rule,
-) -> Result<Scored, GroundError> {
+) -> Result<FoundGround, GroundError> {
     if whole.is_empty() {
         return Err(GroundError::TooFew { count: 0, least: LEAST_PLACES });
     }
@@ -216,23 +216,24 @@ fn ground_in_cores(
             }
         }
     }
-    Err(first.unwrap_or(GroundError::NoPlane { least_percent: LEAST_PERCENT }))
+    Err(first.unwrap_or(GroundError::NoPlane { least_percent: rule.least_percent() }))
 }
 
 /// What makes a plane the ground.
 trait Rule {
     /// The plane with its up side, by what is on it and beside it; `None` if it is not the ground.
-    /// `count` is the number of all places.
-    fn score(&self, plane: GroundPlane, beside: Beside, count: f64) -> Option<Scored>;
+    fn score(&self, plane: GroundPlane, beside: &Beside) -> Option<Scored>;
 
-    /// Least share of all places that lie on the ground.
-    fn least_share(&self) -> f64;
+    /// Least share of all places that lie on the ground, in percent.
+    fn least_percent(&self) -> u32;
 
     /// Distance from the plane that counts as on it at first, as a share of the scene's radius.
     fn tolerance(&self) -> f64;
 
-    /// Whether the plane is the ground by what costs more to know.
-    fn accepts(&self, places: &[SurfaceSample], plane: GroundPlane, tolerance: f64) -> bool;
+    /// Whether the plane is the ground by what costs more to know, if there is anything.
+    fn accepts(&self, _: &[SurfaceSample], _: GroundPlane, _: f64) -> bool {
+        true
+    }
 }
 
 /// How good a plane is, with its up side.
@@ -240,7 +241,14 @@ trait Rule {
 struct Scored {
     /// The largest one is the ground.
     score: f64,
-    /// Share of the places that lie on it, which is at least [`Rule::least_share`].
+    /// The places that count as its own, of which there are at least [`Rule::least_percent`].
+    counted: f64,
+    plane: GroundPlane,
+}
+
+/// The ground, and the share of the places that it was found by.
+#[derive(Clone, Copy, Debug)]
+struct FoundGround {
     share: f64,
     plane: GroundPlane,
 }
@@ -253,12 +261,8 @@ struct SceneRule {
 }
 
 impl Rule for SceneRule {
-    fn score(
-        &self,
-        plane: GroundPlane,
-        Beside { on, above, below, .. }: Beside,
-        count: f64,
-    ) -> Option<Scored> {
+    fn score(&self, plane: GroundPlane, beside: &Beside) -> Option<Scored> {
+        let Beside { on, above, below, .. } = *beside;
         // Up is the side with more of the scene. Only the smaller side is a penalty: the ground may
         // have all of the scene above it, but not much below. A table top has too few places, and a
         // plane through the middle of a scene has as many below as above.
@@ -266,11 +270,11 @@ impl Rule for SceneRule {
         let score = on - above.min(below);
         // 0.7 is about cos 45 degrees. An up direction of zero length refuses every plane.
         let is_wanted = self.up.is_none_or(|up| upper.up.dot(up.normalize_or_zero()) > 0.7);
-        is_wanted.then_some(Scored { score, share: score / count, plane: upper })
+        is_wanted.then_some(Scored { score, counted: score, plane: upper })
     }
 
-    fn least_share(&self) -> f64 {
-        f64::from(LEAST_PERCENT) / 100.0
+    fn least_percent(&self) -> u32 {
+        LEAST_PERCENT
     }
 
     fn tolerance(&self) -> f64 {
@@ -289,12 +293,8 @@ struct CameraRule<'a> {
 }
 
 impl Rule for CameraRule<'_> {
-    fn score(
-        &self,
-        plane: GroundPlane,
-        Beside { near, above, below, .. }: Beside,
-        count: f64,
-    ) -> Option<Scored> {
+    fn score(&self, plane: GroundPlane, beside: &Beside) -> Option<Scored> {
+        let Beside { near, above, below, .. } = *beside;
         let is_turned = plane.up.dot(self.up) < 0.0;
         let (upper, hanging) = if is_turned { (plane.turned(), above) } else { (plane, below) };
         let most = if self.cameras.have_level_rows() { MOST_SLOPE } else { MOST_TILT };
@@ -302,19 +302,15 @@ impl Rule for CameraRule<'_> {
         let level = 1.0 - (upper.up.angle_between(self.up).to_degrees() / most).powi(2);
         let is_ground = level > 0.0 && self.cameras.are_above(&upper);
         let score = level * near - hanging;
-        is_ground.then_some(Scored { score, share: near / count, plane: upper })
+        is_ground.then_some(Scored { score, counted: near, plane: upper })
     }
 
-    fn least_share(&self) -> f64 {
-        f64::from(LEAST_PERCENT_BELOW) / 100.0
+    fn least_percent(&self) -> u32 {
+        LEAST_PERCENT_BELOW
     }
 
     fn tolerance(&self) -> f64 {
         TOLERANCE_BELOW
-    }
-
-    fn accepts(&self, _: &[SurfaceSample], _: GroundPlane, _: f64) -> bool {
-        true
     }
 }
 
@@ -324,7 +320,7 @@ fn ground_in(
     core: &[usize],
     search: &GroundSearch,
     rule: &dyn Rule,
-) -> Result<Scored, GroundError> {
+) -> Result<FoundGround, GroundError> {
     let radius = extent(gaussians, core).radius;
     let places = places(gaussians, core, radius / CUBES);
     if places.len() < LEAST_PLACES || radius <= 0.0 {
@@ -336,15 +332,14 @@ fn ground_in(
     let stride = places.len().div_ceil(COMPARED);
     let compared: Vec<SurfaceSample> = places.iter().copied().step_by(stride).collect();
     let mut random = Random::new(search.seed, "ground", 0);
+    let least = f64::from(rule.least_percent()) / 100.0 * compared.len() as f64;
     let mut best: Option<Scored> = None;
     for at in 0..search.hypotheses {
         let Some(plane) = hypothesis(&compared, at, &mut random) else { continue };
         let beside = Beside::new(&compared, &plane, tolerance);
-        let scored = rule.score(plane, beside, compared.len() as f64);
         // A plane with too little on it must not hide the ground, which may have much below it.
-        let Some(scored) = scored.filter(|scored| scored.share >= rule.least_share()) else {
-            continue;
-        };
+        let scored = rule.score(plane, &beside).filter(|scored| scored.counted >= least);
+        let Some(scored) = scored else { continue };
         // Strictly greater: of equal planes the first one stays, so that the result is
         // deterministic.
         let is_better = best.is_none_or(|best| scored.score > best.score);
@@ -352,13 +347,12 @@ fn ground_in(
             best = Some(scored);
         }
     }
-    let best = best.ok_or(GroundError::NoPlane { least_percent: LEAST_PERCENT })?;
-    Ok(Scored { plane: refine(&places, best.plane, tolerance), ..best })
+    let best = best.ok_or(GroundError::NoPlane { least_percent: rule.least_percent() })?;
+    let share = best.counted / compared.len() as f64;
+    Ok(FoundGround { share, plane: refine(&places, best.plane, tolerance) })
 }
 
-/// The Gaussians within a distance of a middle, in the same order. The middle is that of the
-/// smaller Gaussians: what cameras were near is made of small ones, on whatever side of the scene
-/// it stands.
+/// The Gaussians within a distance of a middle, in the same order.
 struct Core {
     gaussians: Vec<usize>,
     reach: f64,
@@ -375,7 +369,8 @@ fn distance(gaussians: &Gaussians, i: usize, from: DVec3) -> f64 {
     DVec3::from_array(gaussians.means_m[i]).distance(from)
 }
 
-/// The middle of the smaller half of some Gaussians; there is at least one.
+/// The middle of the smaller half of some Gaussians, of which there is at least one: what cameras
+/// were near is made of small ones, on whatever side of the scene it stands.
 fn middle_of_small(gaussians: &Gaussians, some: &[usize]) -> DVec3 {
     let size = |i: usize| gaussians.ln_scales[i].iter().map(|&ln| f64::from(ln)).sum::<f64>();
     let usual = median(some.iter().map(|&i| size(i)).collect());
@@ -459,9 +454,9 @@ fn hypothesis(places: &[SurfaceSample], at: usize, random: &mut Random) -> Optio
 /// The places on a plane, and on each of its sides.
 #[derive(Clone, Copy, Debug, Default)]
 struct Beside {
-    /// By what their normals say.
+    /// Places on it, of which those with another normal do not count, and round ones by half.
     on: f64,
-    /// All of them.
+    /// Places on it, whatever their normals.
     near: f64,
     above: f64,
     below: f64,

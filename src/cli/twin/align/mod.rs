@@ -32,9 +32,9 @@ use crate::cli::{file_notes, output, placement, progress};
 /// sessions keep the version that they have. The version records the change:
 /// `wildcity push --frame capture` pushes files that are still in the axes of the capture.
 ///
-/// The ground is the plane with most of the scene on it and little of it below. With --cameras, of
-/// photographs, it is below all of them, and little of the scene may be on it. The same twin gives
-/// the same plane. All Gaussians are in memory at once: 56 bytes each without SH, 236 with SH
+/// The ground is the plane with most of the scene on it and little of it below. With --cameras it
+/// is the plane below the cameras, and a small part of the scene on it is enough. The same twin
+/// gives the same plane. All Gaussians are in memory at once: 56 bytes each without SH, 236 with SH
 /// degree 3, and as much for the picture.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
