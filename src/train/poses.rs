@@ -25,6 +25,13 @@
 //! The demo street after 1,500 steps from poses that are wrong by 10 cm and 0.5°, and cameras by
 //! 1 cm and 0.2°: 83 mm and 0.24° on average with one rate, 36 mm and 0.13° with a reach for each.
 //! The paper's rate of 1e-3 would move a pose by 9 mm here.
+//!
+//! What remains does not come from the start: a run from the true poses ends 27 mm and 0.13° away
+//! from them. While the Gaussians are still round, roofs are drawn too thick, and all cameras turn
+//! away from them; the street follows, and comes back slowly. Poses that wait for a tenth of the
+//! run end 20 mm and 0.09° away if they were true, and 56 mm and 0.15° if they were wrong, since
+//! the Gaussians have learned these. Normal equations of each image (Kerl et al. 2013, robust
+//! visual odometry) in place of Adam have the same bias: 74 mm and 0.27°.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
