@@ -9,7 +9,7 @@
 use serde::Serialize;
 
 use wildcity_scene::ActorClass;
-use wildcity_sim::contact::{Moving, STANDING_MPS, time_to_contact_s};
+use wildcity_sim::contact::{MAX_SWEPT_SPEED_MPS, Moving, STANDING_MPS, time_to_contact_s};
 
 use super::record::{DriveRecord, EgoSample, Track};
 use super::scored::{Missing, Score};
@@ -19,6 +19,8 @@ pub const NAME: &str = "wildcity.verdict@2";
 
 /// Default for the progress that is required to pass.
 pub const LEAST_PROGRESS: f64 = 0.8;
+/// Why contacts are not judged after a jump.
+const JUMPS: &str = "the ego jumped faster than 60 m/s, and what was on its way was not tested";
 /// Progress is not measured along a recording that moves less than this, in metres.
 const LEAST_WAY_M: f64 = 2.0;
 
@@ -147,14 +149,21 @@ pub fn verdict(record: &DriveRecord) -> Verdict {
     let mut faults = contact_faults(record);
     if record.tracks.is_none() {
         lacks(Criterion::Contact, "the record has no scenario");
+    } else if jumps(record) {
+        lacks(Criterion::Contact, JUMPS);
     }
     match &record.static_contacts {
         None => lacks(Criterion::Static, "contact with the twin was not looked for"),
-        Some(contacts) => faults.extend(contacts.iter().map(|contact| FaultAt {
-            fault: Fault::Static,
-            time_us: contact.time_us,
-            actor: None,
-        })),
+        Some(contacts) => {
+            faults.extend(contacts.iter().map(|contact| FaultAt {
+                fault: Fault::Static,
+                time_us: contact.time_us,
+                actor: None,
+            }));
+            if jumps(record) {
+                lacks(Criterion::Static, JUMPS);
+            }
+        }
     }
     match (&record.map, &record.shape) {
         (Some(map), Some(shape)) => {
@@ -209,6 +218,14 @@ fn judgement(record: &DriveRecord, faults: &[FaultAt], not_judged: &[NotJudged])
     } else {
         Judgement::Passed
     }
+}
+
+/// Whether a teleported ego was put farther away within a step than contacts are looked for on the
+/// way: it may have passed through an actor or a wall.
+fn jumps(record: &DriveRecord) -> bool {
+    let most_m = MAX_SWEPT_SPEED_MPS * record.dt_us as f64 * 1e-6;
+    let is_far = |pair: &[EgoSample]| pair[0].origin_m.distance(pair[1].origin_m) > most_m;
+    !record.is_driven && record.ego.windows(2).any(is_far)
 }
 
 /// Contacts at fault, and those of a moving ego with a pedestrian. Boxes that overlapped at the

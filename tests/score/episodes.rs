@@ -155,6 +155,26 @@ fn a_criterion_that_is_not_judged_is_no_pass_and_hides_no_fault() {
 }
 
 #[test]
+fn contacts_are_not_judged_after_a_jump() {
+    let mut record = on_road(drive(10.0));
+    // From 50 m on it is 7 m ahead, which takes 80 m/s within a step.
+    for sample in &mut record.ego[50..] {
+        sample.origin_m.x += 7.0;
+    }
+    assert_eq!(verdict(&record).judgement, Judgement::Passed, "driven, so that it was swept");
+    record.is_driven = false;
+    let judged = verdict(&record);
+    let missing: Vec<Criterion> = judged.not_judged.iter().map(|one| one.criterion).collect();
+    assert_eq!(judged.judgement, Judgement::NotJudged);
+    assert_eq!(missing, [Criterion::Contact, Criterion::Static]);
+    // 4 m more than its 1 m are 50 m/s, which was swept.
+    for sample in &mut record.ego[50..] {
+        sample.origin_m.x -= 3.0;
+    }
+    assert_eq!(verdict(&record).judgement, Judgement::Passed);
+}
+
+#[test]
 fn contacts_fail_by_fault_and_pedestrians_always() {
     let with = |class: ActorClass, contact: Contact| {
         let mut record = on_road(drive(10.0));
