@@ -189,3 +189,16 @@ fn entities_arrive_together() {
     let (states, _) = driven(&text, 8.0, 12.5);
     assert!((states[124].0.x - 201.4).abs() < 0.1, "{}", states[124].0);
 }
+
+#[test]
+fn a_place_relative_to_what_moves_is_refused_in_an_event() {
+    for entity in ["Ego", "Van"] {
+        let action = format!(
+            "<TeleportAction><Position><RelativeObjectPosition entityRef=\"{entity}\" dx=\"5\" dy=\"0\"/>\
+             </Position></TeleportAction>"
+        );
+        let error = on_roads(&with_action(&action), &[]).unwrap_err();
+        assert!(error.contains("<RelativeObjectPosition>: is relative to where"), "{error}");
+        assert!(error.contains("<LanePosition>"), "{error}");
+    }
+}

@@ -58,6 +58,14 @@ pub(super) struct Entity {
     pub(super) present: bool,
 }
 
+impl Entity {
+    /// Whether what was read so far moves it.
+    pub(super) fn moves(&self) -> bool {
+        let acts = || self.script.iter().flat_map(|draft| &draft.then);
+        self.begin_mps > 0.0 || self.line.is_some() || acts().any(Act::is_motion)
+    }
+}
+
 /// A trajectory.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Line {

@@ -70,10 +70,22 @@ fn roads<'c>(kind: &Element<'_>, context: &'c Context<'_>) -> Result<&'c RoadMap
     })
 }
 
-/// The entity of `entityRef`, and its place.
+/// The entity of `entityRef`, and its place at the start.
 fn base_place(kind: &Element<'_>, context: &Context<'_>) -> Result<(String, Place), ConvertError> {
     let name = kind.text("entityRef")?;
-    let place = context.entities.get(&name).and_then(|entity| entity.place);
+    let entity = context.entities.get(&name);
+    // An event happens when the entity may be elsewhere, and where is known only then.
+    if context.is_in_story && entity.is_some_and(|entity| name == context.ego || entity.moves()) {
+        let message = format!(
+            "is relative to where {name:?} is at that time, which is known only when the scenario runs; give a \
+             <LanePosition> or a <WorldPosition>"
+        );
+        return Err(kind.wrong(&message));
+    }
+    if context.is_in_story && entity.is_some() {
+        kind.note(&format!("is relative to where {name:?} is at the start"));
+    }
+    let place = entity.and_then(|entity| entity.place);
     let place = place.ok_or_else(|| {
         kind.wrong(&format!("{name:?} has no position before this one; place it first"))
     })?;
