@@ -202,3 +202,18 @@ fn a_place_relative_to_what_moves_is_refused_in_an_event() {
         assert!(error.contains("<LanePosition>"), "{error}");
     }
 }
+
+#[test]
+fn a_maneuver_is_over_although_an_event_was_replaced() {
+    // The change of lane takes 4 s; the brake replaces it after 1 s.
+    let replaced = |kind: &str, name: &str| {
+        let text = stopped_by(kind, name, "endTransition");
+        let text = text.replace("priority=\"parallel\"", "priority=\"override\"");
+        text.replacen("state=\"endTransition\"", "state=\"startTransition\"", 1)
+    };
+    // It fires at 3 s and brakes within 2 s; the trigger waits for 1 s more.
+    let (_, ended_s) = driven(&replaced("maneuver", "m"), 0.0, 9.0);
+    assert!(ended_s.is_some_and(|end_s| (end_s - 6.0).abs() < 0.05), "{ended_s:?}");
+    // The event itself was not done.
+    assert_eq!(driven(&replaced("event", "change"), 0.0, 9.0).1, None);
+}

@@ -243,6 +243,11 @@ impl Elements {
         if is_fired && !is_one {
             return Err(format!("waits for the start of a {kind}; name its act or an event"));
         }
+        // What contains events is over when each of them is, also if another one has replaced it.
+        let phase = match phase {
+            PhaseSection::Done if !is_one => PhaseSection::Ended,
+            phase => phase,
+        };
         let mut parts = Vec::new();
         for event in events.iter().map(|index| &self.events[*index]) {
             let triggers = event.triggers.iter();
