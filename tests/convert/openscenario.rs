@@ -393,6 +393,12 @@ fn places_on_lanes_have_their_points_and_headings() {
         [20.0, 1.5, 0.0],
         0.3,
     );
+    // In a file of 1.2, a heading without a type is absolute.
+    near(
+        "<LanePosition roadId=\"1\" laneId=\"1\" s=\"20\"><Orientation h=\"0.3\"/></LanePosition>",
+        [20.0, 1.5, 0.0],
+        0.3,
+    );
     near("<RoadPosition roadId=\"1\" s=\"20\" t=\"-2\"/>", [20.0, -2.0, 0.0], 0.0);
     for (wrong, expected) in [
         ("<LanePosition roadId=\"7\" laneId=\"-1\" s=\"20\"/>", "no road \"7\""),

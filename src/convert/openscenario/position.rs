@@ -29,12 +29,12 @@ pub(super) fn place_from(
             let found = roads.road_place(&kind.text("roadId")?, s?, t?);
             // Without an orientation, the heading is that of the road.
             let (xyz_m, yaw_rad, _) = found.map_err(|message| kind.wrong(&message))?;
-            on_roads(xyz_m, heading_rad(&kind, yaw_rad)?, context)
+            on_roads(xyz_m, heading_rad(&kind, yaw_rad, context)?, context)
         }
         "RoutePosition" => {
             let roads = roads(&kind, context)?;
             let at = place_on_route(&kind, context, roads, place_from)?;
-            lane_facing(&kind, at, roads)?
+            lane_facing(&kind, at, roads, context)?
         }
         "RelativeLanePosition" => relative_lane_place(&kind, context)?,
         "RelativeRoadPosition" => {
@@ -49,7 +49,7 @@ pub(super) fn place_from(
             // Both are to the left of the road.
             at.offset += dt?;
             let road_rad = roads.heading_rad(at);
-            on_roads(roads.point(at), heading_rad(&kind, road_rad)?, context)
+            on_roads(roads.point(at), heading_rad(&kind, road_rad, context)?, context)
         }
         _ => return Err(kind.unread()),
     };
@@ -102,7 +102,7 @@ fn relative_place(kind: &Element<'_>, context: &Context<'_>) -> Result<Place, Co
         _ => [base.xyz_m[0] + dx, base.xyz_m[1] + dy, base.xyz_m[2]],
     };
     xyz_m[2] += dz;
-    Ok(on_roads(xyz_m, heading_rad(kind, base.yaw_rad)?, context))
+    Ok(on_roads(xyz_m, heading_rad(kind, base.yaw_rad, context)?, context))
 }
 
 fn lane_place(kind: &Element<'_>, context: &Context<'_>) -> Result<Place, ConvertError> {
@@ -111,7 +111,7 @@ fn lane_place(kind: &Element<'_>, context: &Context<'_>) -> Result<Place, Conver
     let lane = kind.whole("laneId")?;
     let at = roads.place(&kind.text("roadId")?, lane, s, offset);
     let at = at.map_err(|message| kind.wrong(&message))?;
-    lane_facing(kind, at, roads)
+    lane_facing(kind, at, roads, context)
 }
 
 /// A place on a lane with the heading of an `<Orientation>`; without one it faces as its traffic
@@ -120,11 +120,12 @@ fn lane_facing(
     kind: &Element<'_>,
     at: xodr::LanePosition,
     roads: &RoadMap,
+    context: &Context<'_>,
 ) -> Result<Place, ConvertError> {
     // Where traffic drives against s, it turns its back on the direction of the road.
     let half_turn = if roads.drives_up(at.lane) { 0.0 } else { std::f64::consts::PI };
     let traffic_rad = roads.heading_rad(at) + half_turn;
-    let yaw_rad = heading_rad(kind, traffic_rad)?;
+    let yaw_rad = heading_rad(kind, traffic_rad, context)?;
     Ok(Place { xyz_m: roads.point(at), yaw_rad, spot: roads.spot(at, yaw_rad) })
 }
 
@@ -149,17 +150,24 @@ fn relative_lane_place(kind: &Element<'_>, context: &Context<'_>) -> Result<Plac
     let moved = roads.moved(from, way_m, is_along_lane).map_err(wrong)?;
     let mut at = roads.beside(moved, sign * count).map_err(wrong)?;
     at.offset = f64::from(sign) * offset_m;
-    lane_facing(kind, at, roads)
+    lane_facing(kind, at, roads, context)
 }
 
 /// The heading of an `<Orientation>`: absolute, or relative to a heading, which is returned without
 /// an `<Orientation>`.
-fn heading_rad(kind: &Element<'_>, base_rad: f64) -> Result<f64, ConvertError> {
+fn heading_rad(
+    kind: &Element<'_>,
+    base_rad: f64,
+    context: &Context<'_>,
+) -> Result<f64, ConvertError> {
     kind.only(&["Orientation", "RouteRef", "InRoutePosition"])?;
     let Some(orientation) = kind.find("Orientation")? else { return Ok(base_rad) };
     note_tilt(&orientation)?;
     let heading_rad = orientation.find_number("h")?;
+    // Without a type, a heading is absolute up to version 1.2, and relative from 1.3 on.
+    let is_old = context.minor_version <= 2;
     match orientation.find_text("type")?.as_deref() {
+        None if is_old => Ok(heading_rad.unwrap_or(base_rad)),
         None | Some("relative") => Ok(base_rad + heading_rad.unwrap_or(0.0)),
         Some("absolute") => Ok(heading_rad.unwrap_or(0.0)),
         Some(other) => Err(orientation.wrong(&format!("type={other:?}; relative or absolute"))),
