@@ -217,3 +217,27 @@ fn a_maneuver_is_over_although_an_event_was_replaced() {
     // The event itself was not done.
     assert_eq!(driven(&replaced("event", "change"), 0.0, 9.0).1, None);
 }
+
+#[test]
+fn timed_points_are_those_of_the_reference_point() {
+    let vertex = |time_s: f64, x: f64| {
+        format!(
+            "<Vertex time=\"{time_s}\"><Position><WorldPosition x=\"{x}\" y=\"-4.5\"/></Position></Vertex>"
+        )
+    };
+    let follow = format!(
+        "<PrivateAction><RoutingAction><FollowTrajectoryAction><Trajectory name=\"t\" closed=\"false\"><Shape>\
+         <Polyline>{}{}</Polyline></Shape></Trajectory><TimeReference><Timing domainAbsoluteRelative=\"absolute\" \
+         scale=\"1\" offset=\"0\"/></TimeReference><TrajectoryFollowingMode followingMode=\"position\"/>\
+         </FollowTrajectoryAction></RoutingAction></PrivateAction></Private></Actions>",
+        vertex(0.0, 20.0),
+        vertex(10.0, 120.0)
+    );
+    // Without events that move it.
+    let story = LANES.find("<Story ").unwrap();
+    let text = format!("{}<StopTrigger/></Storyboard></OpenSCENARIO>", &LANES[..story]);
+    let text = text.replacen("</Private></Actions>", &follow, 1);
+    let (states, _) = driven(&text, 0.0, 1.0);
+    // 10 m/s for 1 s, and the middle of the box is 1.4 m ahead.
+    assert!((states[9].0 - DVec3::new(31.4, -4.5, 0.0)).length() < 0.01, "{}", states[9].0);
+}

@@ -126,7 +126,8 @@ impl Builder<'_, '_> {
         self.ledger.note(format!("entity {:?}: {message}", entity.name));
     }
 
-    /// Timed positions of the box's middle, which is ahead of the reference point.
+    /// Timed positions of the box's middle, which is ahead of the reference point of the file's
+    /// points.
     fn timed(
         &self,
         entity: &Entity,
@@ -137,8 +138,19 @@ impl Builder<'_, '_> {
         if self.end_s.is_none_or(|end_s| times_s.last().is_some_and(|last_s| *last_s < end_s)) {
             self.note(entity, "stands at the end of its timed trajectory");
         }
-        let positions = points.iter().zip(times_s);
-        let positions = positions.map(|(xyz, time_s)| TimedPosition { time_s: *time_s, xyz: *xyz });
+        let [ahead_m, left_m, _] = entity.center_m;
+        let mut yaw_rad = place.yaw_rad;
+        let last = points.len().saturating_sub(1);
+        let positions = points.iter().zip(times_s).enumerate().map(|(index, (xyz, time_s))| {
+            // It faces the next point, at the last one as before. One that stands keeps its heading.
+            let next = points[(index + 1).min(last)];
+            let way = [next[0] - xyz[0], next[1] - xyz[1]];
+            if way[0].hypot(way[1]) > 1e-3 {
+                yaw_rad = way[1].atan2(way[0]);
+            }
+            let at = Place { xyz_m: *xyz, yaw_rad, spot: None };
+            TimedPosition { time_s: *time_s, xyz: at.shifted(ahead_m, left_m).xyz_m }
+        });
         CollideSection {
             positions: Some(positions.collect()),
             yaw_rad: Some(place.yaw_rad),
