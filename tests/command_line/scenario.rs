@@ -222,6 +222,8 @@ fn files_of_others_become_maps_and_scenarios() {
     fs::write(at.join("a.xosc"), &xosc).unwrap();
     let error = refused(&["twin", "map", "import", "a.xosc", "--out", "b.map.json"], at);
     assert!(error.contains("a.xosc is OpenSCENARIO: `wildcity scenario import`"), "{error}");
+    let capital = ["scenario", "import", "a.xosc", "--twin", "street", "--out", "A.json"];
+    assert!(refused(&capital, at).contains("\"A\" is no name"), "what check would refuse");
     let import = ["scenario", "import", "a.xosc", "--twin", "street", "--out", "a.json"];
     assert!(done(&import, at).contains("wildcity scenario check"));
     let file: Value = serde_json::from_slice(&fs::read(at.join("a.json")).unwrap()).unwrap();

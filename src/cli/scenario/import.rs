@@ -72,9 +72,8 @@ impl Import {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let context = || format!("{}", self.file.display());
         let bytes = ingest::read_whole(&self.file, openscenario_bytes()).with_context(context)?;
-        let name = self.out.file_stem().and_then(|stem| stem.to_str()).unwrap_or("scenario");
         let settings = openscenario::Settings {
-            name: name.to_owned(),
+            name: super::name_of(&self.out)?,
             twin: self.twin.clone(),
             ego: self.ego.clone(),
             directory: Some(self.file.parent().unwrap_or(Path::new("")).to_owned()),

@@ -14,6 +14,7 @@ use std::sync::Arc;
 use anyhow::Context;
 use serde_json::Value;
 
+use wildcity_scene::rig::is_name;
 use wildcity_session::{ScenarioSource, Scenarios};
 use wildcity_sim::scenario::{Document, Values};
 use wildcity_twin::store::{Catalog, Version};
@@ -63,10 +64,10 @@ fn opened(path: &Path, catalog: &Catalog) -> anyhow::Result<Opened> {
     let context = || format!("{}", path.display());
     let dir = path.parent().map_or_else(|| PathBuf::from("."), Path::to_owned);
     let scenarios = Scenarios::in_dir(dir);
-    let stem = path.file_stem().and_then(|stem| stem.to_str()).unwrap_or_default().to_owned();
     let has_extension = path.extension().is_some_and(|extension| extension == "json");
     anyhow::ensure!(has_extension, "{}: a scenario is a .json file", path.display());
-    let document = scenarios.document(&ScenarioSource::Named(stem)).with_context(context)?;
+    let name = name_of(path)?;
+    let document = scenarios.document(&ScenarioSource::Named(name)).with_context(context)?;
     let file = document.with(&document.first_values()).with_context(context)?;
     let version = match &file.twin.version_hash {
         None => catalog.version(&file.twin.name, None),
@@ -74,6 +75,18 @@ fn opened(path: &Path, catalog: &Catalog) -> anyhow::Result<Opened> {
     };
     let version = version.with_context(context)?;
     Ok(Opened { scenarios, document, version })
+}
+
+/// The name of a scenario, which is that of its file.
+fn name_of(path: &Path) -> anyhow::Result<String> {
+    let stem = path.file_stem().and_then(|stem| stem.to_str()).unwrap_or_default();
+    anyhow::ensure!(
+        is_name(stem),
+        "{}: a scenario has the name of its file, and {stem:?} is no name: use 1 to 64 of a-z 0-9 . _ - that do not \
+         start with a dot",
+        path.display()
+    );
+    Ok(stem.to_owned())
 }
 
 /// The version with a hash. If there is none, the latest version, which the check of the hash then
