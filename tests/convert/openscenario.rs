@@ -196,6 +196,7 @@ fn what_is_not_read_is_refused_by_name_and_line() {
             "<CollisionCondition/>",
             "<CollisionCondition>",
         ),
+        ("triggeringEntitiesRule=\"any\"", "triggeringEntitiesRule=\"none\"", "any or all"),
         ("priority=\"parallel\"", "priority=\"skip\"", "<Event>"),
         ("priority=\"parallel\"", "priority=\"first\"", "<Event>"),
         // Attributes too.

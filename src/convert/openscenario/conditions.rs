@@ -221,8 +221,8 @@ fn by_entity(by: &Element<'_>, context: &Context<'_>) -> Result<ConditionSection
         parts.push(ConditionSection { measure: Some(measure), held_s, ..Default::default() });
     }
     match (rule.as_str(), parts.len()) {
-        (_, 0) => Err(triggering.wrong("is empty")),
-        (_, 1) => Ok(parts.remove(0)),
+        ("any" | "all", 0) => Err(triggering.wrong("is empty")),
+        ("any" | "all", 1) => Ok(parts.remove(0)),
         ("any", _) => Ok(join_any(parts)),
         ("all", _) => Ok(join_all(parts)),
         _ => Err(triggering.wrong(&format!("triggeringEntitiesRule={rule:?}; any or all"))),
