@@ -37,11 +37,11 @@ pub(super) fn read_texts(
 ) -> Result<Vec<CatalogText>, ConvertError> {
     // Catalogs to which nothing refers need not exist.
     let is_used = node.descendants().any(|node| node.has_tag_name("CatalogReference"));
-    let Some(locations) = root.find("CatalogLocations")? else { return Ok(Vec::new()) };
+    let locations = root.find("CatalogLocations")?;
     let dir = settings.directory.as_ref();
     let mut directories: BTreeSet<PathBuf> = BTreeSet::new();
     directories.extend(settings.catalogs.iter().filter(|_| is_used).cloned());
-    for catalog in locations.children() {
+    for catalog in locations.iter().flat_map(Element::children) {
         catalog.only(&["Directory"])?;
         let directory = catalog.need("Directory")?;
         let path = directory.text("path")?;
@@ -116,8 +116,14 @@ impl<'a> Catalogs<'a> {
         if let Some(assignments) = reference.find("ParameterAssignments")? {
             assignments.only(&["ParameterAssignment"])?;
             for assignment in assignments.children() {
-                let name = assignment.raw("parameterRef")?;
-                parameters.insert(plain_parameter(&name), assignment.text("value")?);
+                let name = plain_parameter(&assignment.raw("parameterRef")?);
+                if !parameters.contains_key(&name) {
+                    let message = format!(
+                        "the entry declares no parameter {name:?}; declare it, or correct the name"
+                    );
+                    return Err(assignment.wrong(&message));
+                }
+                parameters.insert(name, assignment.text("value")?);
             }
         }
         Ok(entry.with_parameters(Rc::new(parameters)))
