@@ -18,8 +18,17 @@ pub(super) fn place_from(
             note_tilt(&kind)?;
             let [dx_m, dy_m] = context.shift_m;
             let [x_m, y_m] = [kind.number("x")? + dx_m, kind.number("y")? + dy_m];
-            let xyz_m = [x_m, y_m, kind.number_or_0("z")?];
-            on_roads(xyz_m, kind.number_or_0("h")?, context)
+            let z_m = kind.find_number("z")?;
+            let mut place =
+                on_roads([x_m, y_m, z_m.unwrap_or(0.0)], kind.number_or_0("h")?, context);
+            // Without a height, it is on the road.
+            let roads = context.roads.as_ref().filter(|_| z_m.is_none());
+            if let Some((roads, at)) =
+                roads.and_then(|roads| Some((roads, roads.lane_near(place.xyz_m)?)))
+            {
+                place.xyz_m[2] = roads.point(at)[2];
+            }
+            place
         }
         "RelativeWorldPosition" | "RelativeObjectPosition" => relative_place(&kind, context)?,
         "LanePosition" => lane_place(&kind, context)?,
