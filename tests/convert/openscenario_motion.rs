@@ -57,6 +57,23 @@ fn a_stop_trigger_waits_for_elements_of_the_storyboard() {
 }
 
 #[test]
+fn elements_of_one_name_cannot_be_waited_for() {
+    // A second story with an act of the same name that begins later.
+    let later = "<Story name=\"later\"><Act name=\"act\"><ManeuverGroup name=\"g\" maximumExecutionCount=\"1\">\
+        <Actors selectTriggeringEntities=\"false\"><EntityRef entityRef=\"Van\"/></Actors></ManeuverGroup>\
+        <StartTrigger><ConditionGroup><Condition name=\"t\" delay=\"0\" conditionEdge=\"none\"><ByValueCondition>\
+        <SimulationTimeCondition value=\"7\" rule=\"greaterThan\"/></ByValueCondition></Condition></ConditionGroup>\
+        </StartTrigger></Act></Story><StopTrigger>";
+    for state in ["startTransition", "completeState"] {
+        let text = stopped_by("act", "s::act", state).replacen("<StopTrigger>", later, 1);
+        let error = on_roads(&text, &[]).unwrap_err();
+        assert!(error.contains("act \"act\" is there several times"), "{error}");
+    }
+    let error = on_roads(&stopped_by("story", "other", "startTransition"), &[]).unwrap_err();
+    assert!(error.contains("there is no story \"other\""), "{error}");
+}
+
+#[test]
 fn a_stop_trigger_measures_entities() {
     let reach = "<StopTrigger><ConditionGroup><Condition name=\"c\" delay=\"0\" conditionEdge=\"rising\">\
         <ByEntityCondition><TriggeringEntities triggeringEntitiesRule=\"any\"><EntityRef entityRef=\"Ego\"/>\

@@ -16,6 +16,8 @@ pub(super) struct Elements {
     pub(super) events: Vec<Event>,
     /// Indices of events by the type and the name of an element.
     pub(super) by_name: BTreeMap<(String, String), Vec<usize>>,
+    /// How many stories, acts, groups and maneuvers have a name, by type and name.
+    counts: BTreeMap<(String, String), usize>,
     /// The triggers that fire when an act starts; `None` for an act that starts with the scenario.
     pub(super) acts: BTreeMap<String, Option<String>>,
     /// Triggers that only mark an instant.
@@ -33,6 +35,11 @@ pub(super) struct Event {
 }
 
 impl Elements {
+    /// Counts an element that contains events.
+    pub(super) fn count(&mut self, kind: &str, name: &str) {
+        *self.counts.entry((kind.to_owned(), name.to_owned())).or_default() += 1;
+    }
+
     /// Adds a trigger that only marks an instant. Returns `ACTOR/TRIGGER`.
     pub(super) fn mark(
         &mut self,
@@ -217,6 +224,11 @@ impl Elements {
         let unmarked = || {
             Err(format!("waits for {kind} {name:?}, but there is no entity but the ego to mark it"))
         };
+        let key = (kind.to_owned(), name.to_owned());
+        // Of a path only the last name counts, so that two elements of one name cannot be told apart.
+        if self.counts.get(&key).is_some_and(|count| *count > 1) {
+            return Err(format!("{kind} {name:?} is there several times; rename them"));
+        }
         if kind == "act" && is_fired {
             return match self.acts.get(name) {
                 None => Err(format!("there is no act {name:?}")),
@@ -225,13 +237,12 @@ impl Elements {
                 Some(Some(gate)) => Ok(vec![after(gate, phase, delay_s)]),
             };
         }
-        if kind == "story" && is_fired {
+        if kind == "story" && is_fired && self.counts.contains_key(&key) {
             return Ok(vec![at_start()]);
         }
         if kind == "unread" {
             return Err("waits for an event of the ego whose condition is not read".to_owned());
         }
-        let key = (kind.to_owned(), name.to_owned());
         let Some(events) = self.by_name.get(&key) else {
             return Err(format!("there is no {kind} {name:?}"));
         };

@@ -32,6 +32,7 @@ pub(super) fn read_story<'a>(
     let story = declared(story)?;
     story.only(&["ParameterDeclarations", "Act"])?;
     let story_name = story.find_text("name")?.unwrap_or_default();
+    elements.count("story", &story_name);
     for act in story.all("Act") {
         act.only(&["ManeuverGroup", "StartTrigger", "StopTrigger"])?;
         if let Some(stop) = act.find("StopTrigger")?
@@ -40,6 +41,7 @@ pub(super) fn read_story<'a>(
             stop.leave_out(Part::Stop)?;
         }
         let act_name = act.find_text("name")?.unwrap_or_default();
+        elements.count("act", &act_name);
         let gate = act_gate(&act, &act_name, context, elements)?;
         for group in act.all("ManeuverGroup") {
             group.only(&["Actors", "Maneuver", "CatalogReference"])?;
@@ -51,6 +53,7 @@ pub(super) fn read_story<'a>(
                 actors.children().map(|actor| actor.text("entityRef")).collect();
             let names = names?;
             let group_name = group.find_text("name")?.unwrap_or_default();
+            elements.count("maneuverGroup", &group_name);
             for maneuver in group.children().filter(|child| child.name() != "Actors") {
                 let maneuver = match maneuver.name() {
                     "CatalogReference" => context.catalogs.entry(&maneuver)?,
@@ -58,6 +61,7 @@ pub(super) fn read_story<'a>(
                 };
                 maneuver.only(&["ParameterDeclarations", "Event"])?;
                 let maneuver_name = maneuver.find_text("name")?.unwrap_or_default();
+                elements.count("maneuver", &maneuver_name);
                 let around = [
                     ("story", &story_name),
                     ("act", &act_name),
