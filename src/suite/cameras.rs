@@ -7,6 +7,7 @@ use wildcity_twin::store::Version;
 
 use crate::error::SuiteError;
 use crate::file::SuiteFile;
+use crate::limits;
 
 /// Checks cameras, size and length of steps against a twin. A session would refuse them, once for
 /// each episode.
@@ -23,7 +24,7 @@ pub(crate) fn check(suite: &SuiteFile, version: &Version) -> Result<(), SuiteErr
 }
 
 fn check_step(suite: &SuiteFile) -> Result<(), FileError> {
-    let accepted_us = session::DT_MIN_US..=session::DT_MAX_US;
+    let accepted_us = session::DT_MIN_US..=limits::STEP_US;
     match suite.dt_us {
         Some(dt_us) if !accepted_us.contains(&dt_us) => {
             Err(FileError::new("dt_us", format!("{dt_us} µs; {accepted_us:?} µs are accepted")))

@@ -62,6 +62,7 @@ fn mistakes_name_the_file_and_the_place() {
         ),
         (suite(&|value| value["size"] = json!([0, 24])), "size: [0, 24]"),
         (suite(&|value| value["dt_us"] = json!(0)), "dt_us: 0"),
+        (suite(&|value| value["dt_us"] = json!(1_000_000)), "dt_us: 1000000"),
     ] {
         assert!(change.contains("changed.json") && change.contains(wanted), "{change}");
     }
