@@ -206,6 +206,25 @@ impl EpisodeFile {
             .collect()
     }
 
+    /// What the episode did not test, although its scenario is about it: triggers that did not
+    /// fire, and actors that overlapped the ego when they appeared, whose contact is not judged.
+    pub fn untested(&self) -> Vec<String> {
+        let actors = self.scenario.as_ref().map_or(&[][..], |scenario| &scenario.actors);
+        let overlaps = self.events.iter().filter_map(|line| match &line.event {
+            Event::Contact(contact) if contact.at_start => {
+                let actor = actors.get(usize::from(contact.actor))?;
+                let time_s = line.time_us as f64 * 1e-6;
+                Some(format!("{} overlaps the ego when it appears, at {time_s:.1} s", actor.name))
+            }
+            _ => None,
+        });
+        let unfired = self.unfired_triggers().into_iter().map(|(actor, trigger)| {
+            let name = self.trigger_name(actor, trigger).unwrap_or_else(|| trigger.to_string());
+            format!("trigger {name} of {actor} did not fire")
+        });
+        overlaps.chain(unfired).collect()
+    }
+
     /// The format that this build reads.
     pub const FORMAT: u32 = 0;
 

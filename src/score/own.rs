@@ -1,4 +1,4 @@
-//! `wildcity.verdict@2`: whether an episode passed.
+//! `wildcity.verdict@3`: whether an episode passed.
 //!
 //! It passes if the ego had no contact at fault (`wildcity.fault@1`), with a pedestrian, or with
 //! the twin (`wildcity.static@1`), stayed on the drivable area, and made enough progress. A
@@ -15,12 +15,20 @@ use super::record::{DriveRecord, EgoSample, Track};
 use super::scored::{Missing, Score};
 
 /// The name of the score: 1 passed, 0 failed.
-pub const NAME: &str = "wildcity.verdict@2";
+pub const NAME: &str = "wildcity.verdict@3";
 
 /// Default for the progress that is required to pass.
 pub const LEAST_PROGRESS: f64 = 0.8;
+/// Longest step within which contacts are found, in microseconds. They are looked for along the
+/// cubic between the ends of a step, which leaves the driven motion by 0.1 mm in half a second and
+/// by metres in several; the road is looked at at the ends only.
+pub const MOST_STEP_US: i64 = 500_000;
+
 /// Why contacts are not judged after a jump.
 const JUMPS: &str = "the ego jumped faster than 60 m/s, and what was on its way was not tested";
+/// Why nothing that an ego meets is judged in long steps.
+const LONG_STEPS: &str = "what is on the way within a step of more than 0.5 s was not tested";
+
 /// Progress is not measured along a recording that moves less than this, in metres.
 const LEAST_WAY_M: f64 = 2.0;
 
@@ -149,8 +157,8 @@ pub fn verdict(record: &DriveRecord) -> Verdict {
     let mut faults = contact_faults(record);
     if record.tracks.is_none() {
         lacks(Criterion::Contact, "the record has no scenario");
-    } else if jumps(record) {
-        lacks(Criterion::Contact, JUMPS);
+    } else if let Some(reason) = untested(record) {
+        lacks(Criterion::Contact, reason);
     }
     match &record.static_contacts {
         None => lacks(Criterion::Static, "contact with the twin was not looked for"),
@@ -160,8 +168,8 @@ pub fn verdict(record: &DriveRecord) -> Verdict {
                 time_us: contact.time_us,
                 actor: None,
             }));
-            if jumps(record) {
-                lacks(Criterion::Static, JUMPS);
+            if let Some(reason) = untested(record) {
+                lacks(Criterion::Static, reason);
             }
         }
     }
@@ -175,6 +183,9 @@ pub fn verdict(record: &DriveRecord) -> Verdict {
                 time_us: step as i64 * record.dt_us,
                 actor: None,
             }));
+            if record.dt_us > MOST_STEP_US {
+                lacks(Criterion::OffRoad, LONG_STEPS);
+            }
         }
         (Some(_), None) => lacks(Criterion::OffRoad, "the record has no size of the ego"),
         (None, _) => lacks(Criterion::OffRoad, record.no_map),
@@ -220,12 +231,18 @@ fn judgement(record: &DriveRecord, faults: &[FaultAt], not_judged: &[NotJudged])
     }
 }
 
-/// Whether a teleported ego was put farther away within a step than contacts are looked for on the
-/// way: it may have passed through an actor or a wall.
-fn jumps(record: &DriveRecord) -> bool {
+/// Why contacts may have been missed: within long steps, or by a teleported ego that was put farther
+/// away within a step than the way is swept, and may have passed through an actor or a wall.
+fn untested(record: &DriveRecord) -> Option<&'static str> {
     let most_m = MAX_SWEPT_SPEED_MPS * record.dt_us as f64 * 1e-6;
     let is_far = |pair: &[EgoSample]| pair[0].origin_m.distance(pair[1].origin_m) > most_m;
-    !record.is_driven && record.ego.windows(2).any(is_far)
+    if record.dt_us > MOST_STEP_US {
+        Some(LONG_STEPS)
+    } else if !record.is_driven && record.ego.windows(2).any(is_far) {
+        Some(JUMPS)
+    } else {
+        None
+    }
 }
 
 /// Contacts at fault, and those of a moving ego with a pedestrian. Boxes that overlapped at the

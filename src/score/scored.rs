@@ -17,7 +17,7 @@ pub type Measured = Result<f64, Missing>;
 /// A score of one episode.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Score {
-    /// Its name and version: `alpasim.scene@3032e0c`, `wildcity.verdict@2`.
+    /// Its name and version: `alpasim.scene@3032e0c`, `wildcity.verdict@3`.
     pub name: &'static str,
     /// Its value; null if it lacks an input.
     pub value: Option<f64>,

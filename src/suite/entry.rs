@@ -37,6 +37,10 @@ pub struct EpisodeEntry {
     /// Criteria that were not judged, and why: `off_road: the scenario has no map`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub not_judged: Vec<String>,
+    /// What the scenario is about and did not happen, or could not be judged
+    /// ([`EpisodeFile::untested`]). It changes no status.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub untested: Vec<String>,
     pub scores: BTreeMap<String, ScoreLine>,
     pub steps: u64,
     /// Distance driven, in metres.
@@ -116,6 +120,7 @@ impl EpisodeEntry {
             status: Status::Technical,
             faults: Vec::new(),
             not_judged: Vec::new(),
+            untested: Vec::new(),
             scores: BTreeMap::new(),
             steps: 0,
             distance_m: 0.0,
@@ -127,7 +132,8 @@ impl EpisodeEntry {
             mcap: None,
             errors: errors.collect(),
         };
-        if let Some(Finished { record, end, mut result, frames_hash, drive_hash }) = finished {
+        if let Some(finished) = finished {
+            let Finished { record, end, mut result, untested, frames_hash, drive_hash } = finished;
             if case.options.outputs.trust != Some(true) {
                 // Without a recorded drive nothing says where the twin was trained.
                 result.not_judged.push(format!("{OFF_MODEL}: {NO_TRUST}"));
@@ -143,6 +149,7 @@ impl EpisodeEntry {
             };
             entry.faults = result.faults;
             entry.not_judged = result.not_judged;
+            entry.untested = untested;
             entry.scores = result.scores;
             // The score must agree with the status, which the suite may have changed.
             match (entry.status, entry.scores.get_mut(own::NAME)) {
@@ -203,6 +210,11 @@ impl EpisodeEntry {
         let is_not_judged = self.status == Status::NotJudged;
         let reasons = self.not_judged.iter().filter(|_| is_not_judged);
         reasons.map(|reason| format!("{reason} ({})", fix(reason))).collect()
+    }
+
+    /// What the episode did not test, as lines of a report.
+    pub fn untested_texts(&self) -> impl Iterator<Item = String> {
+        self.untested.iter().map(|text| format!("not tested: {text}"))
     }
 
     /// Says where the MCAP file of the record is, or why there is none.

@@ -21,6 +21,8 @@ pub(crate) struct Finished {
     /// The end that the session wrote.
     pub(crate) end: EndLine,
     pub(crate) result: EpisodeResult,
+    /// [`EpisodeFile::untested`].
+    pub(crate) untested: Vec<String>,
     /// BLAKE3 of all frame hashes, in hex: equal for equal drives.
     pub(crate) frames_hash: String,
     /// BLAKE3 of poses, actors and images, in hex.
@@ -74,6 +76,7 @@ fn finish_file(case: &Case, record: &Path) -> Result<Finished, Technical> {
         record: name.unwrap_or_default(),
         end,
         result: judged,
+        untested: episode.untested(),
         frames_hash: frames.finalize().to_hex().to_string(),
         drive_hash: drive_hash(&episode),
     })

@@ -98,12 +98,13 @@ fn case(text: &mut String, result: &SuiteResult, episode: &EpisodeEntry) {
     }
 }
 
-/// Notes in addition to the status: criteria that were not judged, and whether the episode is a
-/// duplicate.
+/// Notes in addition to the status: criteria that were not judged, what the scenario did not test,
+/// and whether the episode is a duplicate.
 fn notes(episode: &EpisodeEntry) -> String {
     let is_told = episode.status == Status::NotJudged;
     let not_judged = episode.not_judged.iter().filter(|_| !is_told);
     let mut lines: Vec<String> = not_judged.map(|reason| format!("not judged: {reason}")).collect();
+    lines.extend(episode.untested_texts());
     lines.extend(episode.duplicate_text());
     if lines.is_empty() {
         String::new()

@@ -229,6 +229,7 @@ fn why(episode: &EpisodeEntry) -> Markup {
     if episode.status == Status::OffModel {
         texts.push(LEFT.to_owned());
     }
+    texts.extend(episode.untested_texts());
     texts.extend(episode.duplicate_text());
     html! {
         (texts.join("; "))

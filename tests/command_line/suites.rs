@@ -107,7 +107,7 @@ fn two_runs_are_compared_with_an_exit_code() {
         out.contains("worse       short-0 ") && out.contains("passed before, now failed"),
         "{out}"
     );
-    assert!(out.contains("wildcity.verdict@2") && out.contains("-1.0000"), "{out}");
+    assert!(out.contains("wildcity.verdict@3") && out.contains("-1.0000"), "{out}");
     assert!(error.starts_with("worse than before: 2 episodes that passed"), "{error}");
     let comparison: Value = serde_json::from_str(&bench.out("c.json")).unwrap();
     assert_eq!((&comparison["worse"], &comparison["counts"]["worse"]), (&json!(true), &json!(2)));

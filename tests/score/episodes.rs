@@ -175,6 +175,20 @@ fn contacts_are_not_judged_after_a_jump() {
 }
 
 #[test]
+fn what_lies_within_long_steps_is_not_judged() {
+    let mut record = on_road(drive(10.0));
+    record.dt_us = 500_000;
+    let criteria = |record: &DriveRecord| {
+        let not_judged = verdict(record).not_judged;
+        not_judged.iter().map(|one| one.criterion).collect::<Vec<_>>()
+    };
+    assert_eq!(criteria(&record), []);
+    record.dt_us = 500_001;
+    assert_eq!(criteria(&record), [Criterion::Contact, Criterion::Static, Criterion::OffRoad]);
+    assert_ne!(verdict(&record).judgement, Judgement::Passed);
+}
+
+#[test]
 fn contacts_fail_by_fault_and_pedestrians_always() {
     let with = |class: ActorClass, contact: Contact| {
         let mut record = on_road(drive(10.0));
@@ -352,7 +366,7 @@ fn off_model_counts_only_before_the_fault() {
     assert_eq!(verdict(&record).judgement, Judgement::OffModel);
     record.off_model_us = Some(2_000_000);
     assert_eq!(verdict(&record).judgement, Judgement::Failed);
-    assert!(value(&record, "wildcity.verdict@2") == Some(0.0));
+    assert!(value(&record, "wildcity.verdict@3") == Some(0.0));
 }
 
 #[test]
@@ -406,7 +420,7 @@ fn every_score_has_a_range_and_stays_in_it() {
         }
     }
     // Shares, stars, percents and metres.
-    assert_eq!(score_range("wildcity.verdict@2"), [0.0, 1.0]);
+    assert_eq!(score_range("wildcity.verdict@3"), [0.0, 1.0]);
     assert_eq!(score_range("neuroncap.score@ecdcf28"), [0.0, 5.0]);
     assert_eq!(score_range("bench2drive.driving@7ec25d1"), [0.0, 100.0]);
     assert_eq!(score_range("alpasim.open_loop_collision@3032e0c"), [0.0, 1.0]);

@@ -10,7 +10,7 @@ use crate::street::{Bench, cpu};
 
 const DRIVING: &str = "bench2drive.driving@7ec25d1";
 const ADE: &str = "alpasim.min_ade_5s@3032e0c";
-const VERDICT: &str = "wildcity.verdict@2";
+const VERDICT: &str = "wildcity.verdict@3";
 
 /// A result by hand: episodes of the scenario `s` with the seeds 0, 1, .. and these statuses.
 struct Made {
@@ -330,7 +330,7 @@ fn scores_of_two_versions_are_not_compared() {
     let wanted = [format!("{DRIVING} before alone"), "bench2drive.new@1 now alone".to_owned()];
     assert_eq!(gone.scores_not_compared, wanted);
     // A changed verdict could be caused by its rules.
-    let later = renamed(VERDICT, "wildcity.verdict@3");
+    let later = renamed(VERDICT, "wildcity.verdict@4");
     let error = Comparison::new(&before.result(), &later, &Rule::default()).unwrap_err();
     assert!(matches!(error, CompareError::VerdictVersion { .. }), "{error}");
 }

@@ -8,7 +8,7 @@ use wildcity_suite::{
 
 use crate::street::{Bench, cpu, scenario};
 
-const VERDICT: &str = "wildcity.verdict@2";
+const VERDICT: &str = "wildcity.verdict@3";
 
 fn code(result: &SuiteResult) -> ExitCode {
     Ending::new(result, None).code
@@ -274,6 +274,28 @@ async fn what_was_not_looked_for_is_no_pass() {
         "accept_unjudged": ["offroad"] });
     let error = bench.cases(&bench.write("unknown.json", &unknown)).unwrap_err().to_string();
     assert!(error.contains("accept_unjudged") && error.contains("off_road"), "{error}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_was_not_tested_is_said() {
+    let bench = Bench::new();
+    let mut value = scenario("hidden", &json!({ "model": "kinematic", "speed": 10.0 }));
+    // It stands where the ego starts, and would appear elsewhere only after the end.
+    value["actors"] = json!([{ "name": "ghost", "path": { "along": "log", "station_m": 21.0, "speed": 10.0 },
+        "script": [{ "name": "late", "when": { "time_s": 9.0 }, "do": [{ "speed": { "to": 0.0, "rate": 1.0 } }] }] }]);
+    bench.write("hidden.json", &value);
+    let suite = json!({ "format": "wildcity.suite/1", "name": "hidden", "scenarios": ["hidden.json"],
+        "cameras": ["front"] });
+    let cases = bench.cases(&bench.write("suite.json", &suite)).unwrap();
+    let settings = bench.settings(AgentChoice::BuiltIn(BuiltIn::Log), 1, "out");
+    let run = wildcity_suite::run(settings, cases).await.unwrap();
+    let untested =
+        ["ghost overlaps the ego when it appears, at 0.0 s", "trigger late of ghost did not fire"];
+    assert_eq!(run.episodes[0].untested, untested, "{}", run.to_json());
+    let ending = Ending::new(&run, None);
+    for text in [junit(&run, &ending), page(&run, &ending, &[], &bench.path("out")).to_string()] {
+        assert!(untested.iter().all(|one| text.contains(&format!("not tested: {one}"))), "{text}");
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]

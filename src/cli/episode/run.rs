@@ -276,6 +276,7 @@ impl Run {
                 episode.faults.iter().map(|fault| fault.fault.clone()).collect();
             why.extend(episode.not_judged_texts());
             why.extend(episode.errors.last().map(TechnicalEntry::text));
+            why.extend(episode.untested_texts());
             why.extend(episode.duplicate_text());
             let status = episode.status.name();
             let line = format!("{status:<12} {:<32} {}", episode.name, why.join(", "));
