@@ -1,7 +1,12 @@
 //! Options that choose the backend and the hardware that it runs on.
 
 use std::io::{self, Write};
+#[cfg(feature = "gpu")]
+use std::num::NonZero;
+use std::sync::Arc;
 
+#[cfg(feature = "gpu")]
+use anyhow::Context as _;
 use clap::ValueEnum;
 
 use wildcity_render::Backend;
@@ -15,6 +20,7 @@ use wildcity_render::{
     automatic::{self, Selection},
     gpu::{AdapterChoice, Gpu, GpuError, MemoryLimits},
     hybrid::HybridBackend,
+    several::SeveralDevices,
 };
 
 #[cfg(not(feature = "gpu"))]
@@ -43,6 +49,16 @@ pub struct BackendOptions {
 
     #[command(flatten)]
     hardware: HardwareOptions,
+}
+
+/// `--devices`, for commands that serve many sessions.
+#[derive(Clone, Debug, Default, clap::Args)]
+pub struct Devices {
+    /// Several GPUs of one kind, by their numbers in `wildcity dev devices`. A session is placed on
+    /// the one with the fewest sessions, and stays there; each has a copy of the twins that its
+    /// sessions see.
+    #[arg(long, value_name = "N,..", value_delimiter = ',', conflicts_with = "device")]
+    devices: Vec<usize>,
 }
 
 /// The hardware that the backends run on.
@@ -74,7 +90,7 @@ enum BackendName {
     /// backend does; otherwise cpu. The choice is printed on standard error.
     #[default]
     Auto,
-    /// wgpu on Vulkan, on `--device`.
+    /// wgpu on Vulkan (on macOS Metal, on Windows DX12, where the build has it), on `--device`.
     Gpu,
     /// f32, SIMD, all cores.
     Cpu,
@@ -143,6 +159,18 @@ impl BackendOptions {
         }
     }
 
+    /// As [`Self::backend`], on several devices if they are named.
+    pub fn backend_on(&self, Devices { devices }: &Devices) -> anyhow::Result<Arc<dyn Backend>> {
+        if devices.is_empty() {
+            return Ok(Arc::from(self.backend()?));
+        }
+        anyhow::ensure!(
+            matches!(self.backend, BackendName::Auto | BackendName::Gpu),
+            "--devices belongs to the gpu backend: add --backend gpu, or omit --devices"
+        );
+        self.hardware.gpus(devices)
+    }
+
     /// Creates the backend that rendered a recording, unless `--backend` names another one.
     pub fn replay_backend(&self, recorded: &str) -> anyhow::Result<Box<dyn Backend>> {
         let recorded = BackendName::from_str(recorded, false);
@@ -188,6 +216,31 @@ impl HardwareOptions {
     #[cfg(not(feature = "gpu"))]
     fn gpu(&self) -> anyhow::Result<Cpu> {
         anyhow::bail!("--backend gpu: {}", built_without("gpu"))
+    }
+
+    /// Creates a gpu backend on each of several devices, which share the render threads.
+    #[cfg(feature = "gpu")]
+    fn gpus(&self, devices: &[usize]) -> anyhow::Result<Arc<dyn Backend>> {
+        let cores = std::thread::available_parallelism().map_or(1, NonZero::get);
+        let threads = if self.threads == 0 { cores } else { self.threads };
+        let gpu = |number: &usize| {
+            let choice = AdapterChoice::Named(number.to_string());
+            let share = threads.div_ceil(devices.len());
+            let gpu = Gpu::with_limits(&choice, share, self.memory_limits())
+                .with_context(|| format!("--devices {number}"))?;
+            Ok(Arc::new(gpu) as Arc<dyn Backend>)
+        };
+        let gpus: anyhow::Result<Vec<_>> = devices.iter().map(gpu).collect();
+        Ok(Arc::new(SeveralDevices::new(gpus?).context("--devices")?))
+    }
+
+    /// The gpu backend is not in this build.
+    ///
+    /// # Errors
+    /// Always: it says what to build.
+    #[cfg(not(feature = "gpu"))]
+    fn gpus(&self, _devices: &[usize]) -> anyhow::Result<Arc<dyn Backend>> {
+        anyhow::bail!("--devices: {}", built_without("gpu"))
     }
 
     /// Creates the gpu backend.

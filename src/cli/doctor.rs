@@ -186,11 +186,7 @@ fn devices_found() -> Finding {
             Finding::new(Level::Good, "gpu", text)
         }
         None => {
-            let found = if devices.is_empty() {
-                "no Vulkan device"
-            } else {
-                "no Vulkan device except software"
-            };
+            let found = if devices.is_empty() { "no GPU" } else { "no GPU, except software" };
             let text = format!(
                 "{found}: the server renders on the CPU. For a GPU install its driver with Vulkan, and in a \
                  container NVIDIA_DRIVER_CAPABILITIES=graphics"

@@ -8,8 +8,9 @@
 //! | [`gpu`] | f32, WGSL compute shaders, one per stage | the fastest |
 //!
 //! The stages project, sort, bin, rasterize and resolve have the same names in the cpu and the gpu
-//! backend. Two combinations exist: [`automatic`] chooses a backend, and [`hybrid`] runs the first
-//! stages on the cpu and the rest on the gpu. [`compare`] measures how far images differ.
+//! backend. Three combinations exist: [`automatic`] chooses a backend, [`hybrid`] runs the first
+//! stages on the cpu and the rest on the gpu, and [`several`] draws on several devices. [`compare`]
+//! measures how far images differ.
 //!
 //! An image is a function of (scene, render profile, views). It depends on no clock, no cache and
 //! no number of threads.
@@ -32,6 +33,7 @@ pub mod limits;
 mod normals;
 pub mod reference;
 mod samples;
+pub mod several;
 pub mod stage;
 pub mod unscented;
 pub mod view;
@@ -257,6 +259,12 @@ pub trait Backend: Send + Sync {
     /// empty.
     fn detail(&self) -> String {
         String::new()
+    }
+
+    /// The devices that it draws on, if there are several: each draws frames beside the others,
+    /// with the same pixels, and has a memory of its own.
+    fn devices(&self) -> Vec<Arc<dyn Backend>> {
+        Vec::new()
     }
 
     /// Number of threads that it renders with. Pixels do not depend on it.

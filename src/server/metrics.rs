@@ -15,7 +15,7 @@ use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::{Registry, Unit};
 
-use wildcity_session::{Engine, Polls};
+use wildcity_session::{DeviceLoad, Engine, Polls};
 
 use crate::process::Process;
 
@@ -129,6 +129,7 @@ impl Metrics {
         );
         registry.register("pushes_open", "Pushes that wait or run", m.pushes_open.clone());
         registry.register_collector(Box::new(LongestPolls(engine.polls().clone())));
+        registry.register_collector(Box::new(Devices(engine.clone())));
         registry.register_collector(Box::new(Residency(engine)));
         Self { registry: all, ..metrics }
     }
@@ -183,6 +184,28 @@ impl Collector for LongestPolls {
         let help = "The longest of them since the start";
         let kind = longest.metric_type();
         longest.encode(encoder.encode_descriptor("poll_longest_seconds", help, None, kind)?)
+    }
+}
+
+/// What each device of the backend does.
+#[derive(Debug)]
+struct Devices(Arc<Engine>);
+
+impl Collector for Devices {
+    fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> Result<(), std::fmt::Error> {
+        let loads = self.0.device_loads();
+        let counts: [(&str, &str, fn(&DeviceLoad) -> usize); 2] = [
+            ("device_sessions", "Sessions by the device that draws them", |load| load.sessions),
+            ("device_frames_queued", "Frames in the queue of a device", |load| load.queued_frames),
+        ];
+        for (name, help, count) in counts {
+            let mut gauge = encoder.encode_descriptor(name, help, None, MetricType::Gauge)?;
+            for (device, load) in loads.iter().enumerate() {
+                let labels = [("device", device.to_string())];
+                gauge.encode_family(&labels)?.encode_gauge(&(count(load) as i64))?;
+            }
+        }
+        Ok(())
     }
 }
 

@@ -49,7 +49,7 @@ pub use blocking::run_blocking;
 pub use engine::answer_budget::BudgetShare;
 pub use engine::render_queue::{FrameCost, Scratch};
 pub use engine::twin_summaries::{DamagedSummary, TrajectorySummary, TwinSummaries, TwinSummary};
-pub use engine::{Engine, EngineSettings, LatestPin, PUSHES};
+pub use engine::{DeviceLoad, Engine, EngineSettings, LatestPin, PUSHES};
 pub use episode::{EgoHistory, Episode, EpisodeSummary, Outcome};
 pub use error::SessionError;
 pub use observe::buffer::ObservationBuffer;

@@ -17,6 +17,7 @@ use wildcity_twin::residency::{FrameBytes, Reservation, Resident, ResidentActor,
 
 use crate::blocking::run_blocking;
 use crate::engine::Engine;
+use crate::engine::devices::DeviceSlot;
 use crate::engine::render_queue::FrameCost;
 use crate::error::SessionError;
 use crate::observe::encode::{ImageEncoding, encode};
@@ -64,8 +65,8 @@ pub struct Stills {
     engine: Arc<Engine>,
     reservation: Reservation,
     profile: RenderProfile,
-    /// Number by which its frames are scheduled, like that of a session.
-    number: u64,
+    /// The device that draws its frames, as of a session.
+    slot: DeviceSlot,
 }
 
 impl Stills {
@@ -83,8 +84,8 @@ impl Stills {
         let frame = frame_bytes(&engine, views, &profile);
         let scenes = Engine::scene_bytes(resident.clone(), extent(views), profile, true).await?;
         let reservation = resident.reserve_scenes(scenes, frame)?;
-        let number = engine.new_session_number();
-        Ok(Self { engine, reservation, profile, number })
+        let slot = engine.place_session();
+        Ok(Self { engine, reservation, profile, slot })
     }
 
     /// Whether the reserved memory is enough for these views.
@@ -145,7 +146,7 @@ impl Stills {
         let work = move |_: &mut _, backend: &dyn wildcity_render::Backend| {
             backend.sweep(&scene, &profile, &view)
         };
-        let cost = FrameCost { session: self.number, samples: beams };
+        let cost = FrameCost { session: self.slot.number(), samples: beams };
         let (sweep, _queued) = self.engine.run(cost, deadline, work).await?;
         Ok(sweep?)
     }
@@ -171,7 +172,7 @@ impl Stills {
         let placed = detail.placed(placements(actors, views.len()));
         let mut scene = pin(resident, profile, deadline, viewpoints).await?;
         scene.place(placed);
-        let cost = FrameCost::new(self.number, &views, &profile);
+        let cost = FrameCost::new(self.slot.number(), &views, &profile);
         let work = move |_: &mut _, backend: &dyn wildcity_render::Backend| {
             // The renderer writes every pixel; zeros are only there to make the memory valid.
             let zeroed = |view: &View| vec![0; 3 * view.camera.pixels()];

@@ -5,7 +5,7 @@ use std::io::Write;
 use serde_json::json;
 
 use crate::cli::output;
-use wildcity_render::gpu::{DeviceInfo, devices};
+use wildcity_render::gpu::{DeviceInfo, NO_DEVICE, devices};
 
 /// List the devices that the gpu backend can use, the fastest kind first.
 ///
@@ -35,11 +35,7 @@ impl Devices {
             return Ok(());
         }
         if devices.is_empty() {
-            writeln!(
-                out,
-                "no Vulkan device: install the GPU's driver, or mesa-vulkan-drivers for a software \
-                 device"
-            )?;
+            writeln!(out, "{NO_DEVICE}")?;
         }
         for (number, device) in devices.iter().enumerate() {
             let DeviceInfo { name, kind, driver, .. } = device;

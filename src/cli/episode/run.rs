@@ -2,7 +2,6 @@
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use wildcity_render::Backend;
@@ -13,7 +12,7 @@ use wildcity_suite::{
 };
 use wildcity_twin::store::Catalog;
 
-use crate::cli::backend_options::BackendOptions;
+use crate::cli::backend_options::{BackendOptions, Devices};
 use crate::cli::directories::Twins;
 use crate::cli::exit::Exit;
 use crate::cli::{output, progress};
@@ -114,6 +113,9 @@ pub(super) struct Run {
 
     #[command(flatten)]
     backend: BackendOptions,
+
+    #[command(flatten)]
+    devices: Devices,
 }
 
 const EXAMPLES: &str = "\
@@ -152,7 +154,7 @@ impl Run {
         wait_for_driver(&agent)?;
 
         // Drive.
-        let backend: Arc<dyn Backend> = Arc::from(self.backend.backend()?);
+        let backend = self.backend.backend_on(&self.devices)?;
         let bar = progress::count("driving");
         bar.set_length(cases.len() as u64);
         let counted = bar.clone();

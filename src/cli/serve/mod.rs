@@ -8,7 +8,6 @@ mod log;
 use std::io::Write;
 use std::net::SocketAddr;
 use std::path::PathBuf;
-use std::sync::Arc;
 
 use anyhow::Context as _;
 
@@ -20,7 +19,7 @@ use wildcity_twin::store::DamagedTwin;
 
 use limit_options::{LimitOptions, bytes_as_gib};
 
-use super::backend_options::{BackendOptions, bytes_of_gib, gib};
+use super::backend_options::{BackendOptions, Devices, bytes_of_gib, gib};
 use super::directories::ServerDirectories;
 use super::left_out::built_without;
 use super::profile_options::read_profile;
@@ -133,6 +132,9 @@ pub(super) struct Serve {
 
     #[command(flatten)]
     backend: BackendOptions,
+
+    #[command(flatten)]
+    devices: Devices,
 
     #[command(flatten)]
     repair: RepairOptions,
@@ -276,7 +278,7 @@ impl Serve {
             tls,
             audit: self.audit_log,
             mcap: self.mcap,
-            backend: Arc::from(self.backend.backend()?),
+            backend: self.backend.backend_on(&self.devices)?,
             repairs: self.repair.models()?,
             profile: self.profile.as_deref().map(read_profile).transpose()?.unwrap_or_default(),
             shared_memory: !self.no_shared_memory,

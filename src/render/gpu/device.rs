@@ -19,8 +19,9 @@ use std::time::Duration;
 use futures_util::FutureExt;
 use parking_lot::Mutex;
 use wgpu::{
-    Adapter, AdapterInfo, Backends, Buffer, BufferDescriptor, BufferUsages, DeviceDescriptor,
-    DeviceType, Features, Instance, InstanceDescriptor, InstanceFlags, Limits, PollType, Queue,
+    Adapter, AdapterInfo, Backend, Backends, Buffer, BufferDescriptor, BufferUsages,
+    DeviceDescriptor, DeviceType, Features, Instance, InstanceDescriptor, InstanceFlags, Limits,
+    PollType, Queue,
 };
 
 use super::layout::{MACRO_COLUMNS, MACRO_ROWS, WORKGROUP};
@@ -29,14 +30,18 @@ use super::tuning::Tuning;
 use crate::RenderError;
 use crate::lidar::MOST_HITS;
 
+/// What to do without any device.
+pub const NO_DEVICE: &str = if cfg!(any(feature = "metal", feature = "dx12")) {
+    "no Vulkan, Metal or DX12 device: install the GPU's driver"
+} else {
+    "no Vulkan device: install the GPU's driver, or mesa-vulkan-drivers for a software device"
+};
+
 /// Why there is no GPU to render on.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum GpuError {
-    /// The machine has no Vulkan driver, or the driver has no device.
-    #[error(
-        "no Vulkan device: install the GPU's driver, or mesa-vulkan-drivers for a software device; \
-         `wildcity dev devices` lists the devices that are found"
-    )]
+    /// The machine has no driver, or the driver has no device.
+    #[error("{}; `wildcity dev devices` lists the devices that are found", NO_DEVICE)]
     NoAdapter,
     /// No device has this name or number.
     #[error("no device is called {choice:?}; the devices are {}", found.join(", "))]
@@ -143,6 +148,9 @@ fn adapters() -> Vec<Adapter> {
     // Outside of browsers this future is ready at once.
     let found = instance.enumerate_adapters(BACKENDS).now_or_never();
     let mut found = found.unwrap_or_default();
+    let infos: Vec<AdapterInfo> = found.iter().map(Adapter::get_info).collect();
+    let mut index = 0..;
+    found.retain(|_| index.next().is_none_or(|index| !is_listed_twice(&infos, index)));
     found.sort_by_key(|adapter| match adapter.get_info().device_type {
         DeviceType::DiscreteGpu => 0,
         DeviceType::IntegratedGpu => 1,
@@ -151,6 +159,15 @@ fn adapters() -> Vec<Adapter> {
         DeviceType::Cpu => 4,
     });
     found
+}
+
+/// Whether a device of Vulkan is also one of the system's own interface, which is preferred: with
+/// the driver of macOS and Windows, Vulkan is a layer upon that, or beside it. Devices of one
+/// interface that have the same name are several cards.
+fn is_listed_twice(infos: &[AdapterInfo], index: usize) -> bool {
+    let AdapterInfo { backend, name, .. } = &infos[index];
+    let is_own = |info: &AdapterInfo| info.backend != Backend::Vulkan && info.name == *name;
+    *backend == Backend::Vulkan && infos.iter().any(is_own)
 }
 
 impl AdapterChoice {
@@ -441,5 +458,27 @@ impl Device {
         self.queue.write_buffer(buffer, offset, bytes);
         self.queue.submit([]);
         let _ = self.device.poll(PollType::Poll);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_card_is_listed_once_and_two_cards_twice() {
+        let info = |backend, name: &str| AdapterInfo {
+            name: name.to_owned(),
+            ..AdapterInfo::new(DeviceType::DiscreteGpu, backend)
+        };
+        let listed = |infos: &[AdapterInfo]| {
+            (0..infos.len()).filter(|index| !is_listed_twice(infos, *index)).collect::<Vec<_>>()
+        };
+        let both = [info(Backend::Vulkan, "M2"), info(Backend::Metal, "M2")];
+        assert_eq!(listed(&both), [1]);
+        let cards = [info(Backend::Vulkan, "H200"), info(Backend::Vulkan, "H200")];
+        assert_eq!(listed(&cards), [0, 1]);
+        let other = [info(Backend::Vulkan, "llvmpipe"), info(Backend::Dx12, "RTX")];
+        assert_eq!(listed(&other), [0, 1]);
     }
 }

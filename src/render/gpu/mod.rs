@@ -61,7 +61,7 @@ use rayon::prelude::*;
 use wgpu::{Adapter, AdapterInfo};
 
 pub use bandwidth::FrameCounts;
-pub use device::{AdapterChoice, DeviceInfo, DeviceTotals, GpuError, devices};
+pub use device::{AdapterChoice, DeviceInfo, DeviceTotals, GpuError, NO_DEVICE, devices};
 pub use roofline::Roofline;
 pub use tuning::{Scatter, Tuning};
 

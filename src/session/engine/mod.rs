@@ -2,6 +2,7 @@
 //! answers.
 
 pub(crate) mod answer_budget;
+pub(crate) mod devices;
 mod exports;
 mod latest;
 mod leases;
@@ -13,7 +14,6 @@ pub(crate) mod twin_summaries;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Weak};
 use std::time::Duration;
 
@@ -33,10 +33,12 @@ use wildcity_twin::residency::{
 use wildcity_twin::store::Catalog;
 
 use self::answer_budget::{AnswerBudget, BudgetShare};
+pub use self::devices::DeviceLoad;
+use self::devices::{DeviceSlot, Devices};
 use self::exports::Exports;
 use self::latest::LatestVersions;
 use self::leases::Leases;
-use self::render_queue::{FrameCost, RenderQueue, Scratch};
+use self::render_queue::{FrameCost, Scratch};
 use self::solid_blocks::SolidBlocks;
 use self::turns::{Turn, Turns};
 use self::twin_summaries::{SummaryCache, TwinSummaries};
@@ -49,7 +51,8 @@ use crate::record::quota::{RecordLimits, RecordQuota};
 use crate::scenario::load::Scenarios;
 use crate::spatial_index::SpatialIndex;
 
-/// The [`FrameCost::session`] of frames that are rendered for pushes.
+/// The [`FrameCost::session`] of frames that are rendered for pushes, which no session has. They
+/// are drawn on device 0.
 pub const PUSHES: u64 = 0;
 
 /// The parts and settings of an [`Engine`].
@@ -79,8 +82,7 @@ pub struct Engine {
     scenarios: Scenarios,
     step_timeout: Duration,
     repairs: Arc<Models>,
-    queue: RenderQueue,
-    session_numbers: AtomicU64,
+    devices: Devices,
     answer_budget: AnswerBudget,
     record_quota: Arc<RecordQuota>,
     /// The turns of long simulations, and of records that are read whole.
@@ -103,8 +105,8 @@ pub struct LatestPin {
 }
 
 impl Engine {
-    /// Starts the render threads, as many as the backend renders frames at once. They end when the
-    /// engine is dropped.
+    /// Starts the render threads of each device, as many as it renders frames at once. They end
+    /// when the engine is dropped.
     ///
     /// # Errors
     /// [`SessionError::Thread`] if a thread cannot be started.
@@ -128,9 +130,7 @@ impl Engine {
             scenarios,
             step_timeout,
             repairs,
-            queue: RenderQueue::start(backend)?,
-            // The first number belongs to the frames of pushes.
-            session_numbers: AtomicU64::new(PUSHES + 1),
+            devices: Devices::start(backend)?,
             answer_budget: AnswerBudget::default(),
             turns: Turns::new(),
             polls: Arc::default(),
@@ -238,7 +238,12 @@ impl Engine {
 
     /// Frames that wait for the renderer.
     pub fn queued_frames(&self) -> usize {
-        self.queue.len()
+        self.device_loads().iter().map(|load| load.queued_frames).sum()
+    }
+
+    /// What each device of the backend does, in their order.
+    pub fn device_loads(&self) -> Vec<DeviceLoad> {
+        self.devices.loads()
     }
 
     /// Lets a version count as the latest of its twin, whatever is committed, until the pin is
@@ -301,7 +306,7 @@ impl Engine {
     /// # Errors
     /// [`RenderError::ExactRays`].
     pub(crate) fn check_profile(&self, profile: &RenderProfile) -> Result<(), SessionError> {
-        let backend = self.queue.backend();
+        let backend = self.devices.backend();
         if profile.rays == Rays::Exact && !backend.draws_exact_rays() {
             return Err(RenderError::ExactRays { backend: backend.name() }.into());
         }
@@ -310,13 +315,13 @@ impl Engine {
 
     /// Name of the backend.
     pub fn backend(&self) -> &'static str {
-        self.queue.backend().name()
+        self.devices.backend().name()
     }
 
     /// Properties of the backend on which pixels depend in addition to its name, such as its
     /// instruction set.
     pub(crate) fn backend_detail(&self) -> String {
-        self.queue.backend().detail()
+        self.devices.backend().detail()
     }
 
     /// Memory of the answers that are being made, sent or kept, and of overlays, in bytes.
@@ -421,7 +426,7 @@ impl Engine {
         images: u64,
     ) -> FrameBytes {
         let is_large = sample_count(views, profile) > limits::LARGE_SAMPLES;
-        let backend = self.queue.backend();
+        let backend = self.devices.backend();
         // Only small frames are rendered beside another one, see `render_queue`: of a large frame,
         // its cameras one by one.
         let side_bytes = |views: &[View]| backend.bytes_beside(views, profile) + rendered;
@@ -435,7 +440,7 @@ impl Engine {
 
     /// Buffers that a sweep of a LiDAR needs in addition to its scene, in bytes.
     pub(crate) fn sweep_bytes(&self, lidar: &Lidar) -> u64 {
-        self.queue.backend().sweep_bytes(lidar)
+        self.devices.backend().sweep_bytes(lidar)
     }
 
     /// Memory that the scene of a rig's worst frame needs, wherever in the twin the rig is.
@@ -463,13 +468,13 @@ impl Engine {
         deadline: Instant,
         work: impl FnOnce(&mut Scratch, &dyn Backend) -> T + Send + 'static,
     ) -> Result<(T, Duration), SessionError> {
-        self.queue.run(cost, deadline, work).await
+        self.devices.run(cost, deadline, work).await
     }
 
-    /// Returns a unique number for a session, by which its frames are scheduled.
-    pub(crate) fn new_session_number(&self) -> u64 {
-        // Only that numbers differ matters, and no order with other memory.
-        self.session_numbers.fetch_add(1, Ordering::Relaxed)
+    /// Places a session on the device with the fewest, by a number that its frames are scheduled
+    /// by.
+    pub(crate) fn place_session(&self) -> DeviceSlot {
+        self.devices.place()
     }
 
     /// How long one step may take, time in queues included.

@@ -31,6 +31,7 @@ use wildcity_sim::Dynamics;
 use wildcity_twin::residency::{Reservation, Resident, Viewpoint};
 
 use crate::engine::Engine;
+use crate::engine::devices::DeviceSlot;
 use crate::episode::Episode;
 use crate::observe::encode::{ImageEncoding, PixelMaps};
 use crate::prefetch::latest_task::LatestTask;
@@ -53,8 +54,8 @@ pub struct Session {
     name: String,
     /// Name of the token that its records belong to; empty if there is none.
     owner: String,
-    /// Tells the render queue whose frames are whose.
-    number: u64,
+    /// The device that draws its frames, and their number in its queue.
+    slot: DeviceSlot,
     settings: Arc<SessionSettings>,
     version: PinnedVersion,
     state: EpisodeState,

@@ -182,7 +182,7 @@ impl Session {
     ) -> Self {
         let dt_us = settings.dt_us;
         let session = Self {
-            number: engine.new_session_number(),
+            slot: engine.place_session(),
             engine,
             reservation,
             prefetch_task: LatestTask::default(),

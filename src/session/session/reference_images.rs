@@ -89,7 +89,7 @@ impl Session {
         let places = viewpoints(&[view.view()]);
         // Pinned until it is drawn, as the scene of any frame is.
         let pinned = pin(version.resident.clone(), profile, deadline, places).await?;
-        let cost = FrameCost::new(self.number, &[view.view()], &profile);
+        let cost = FrameCost::new(self.slot.number(), &[view.view()], &profile);
         let work = move |_: &mut Scratch, backend: &dyn wildcity_render::Backend| {
             drawn::draw(&view, image, projection, &pinned, &profile, backend)
         };

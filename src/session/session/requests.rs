@@ -470,7 +470,7 @@ impl Session {
         let mut pinned = pinned.instrument(debug_span!("load")).await?;
         pinned.place(placed.unwrap_or_default());
         builder.add_load(pinned.waited_for, pinned.waited);
-        let cost = FrameCost::new(self.number, &views, &profile);
+        let cost = FrameCost::new(self.slot.number(), &views, &profile);
         // The builder goes to the render thread with the work, and comes back with the result.
         let work = move |scratch: &mut Scratch, backend: &dyn Backend| {
             let frame = Frame { scene: &pinned, profile: &profile, views: &views };

@@ -62,7 +62,7 @@ impl Session {
             let load = (scene.waited_for, scene.waited);
             scene.place(placed.unwrap_or_default());
             let samples = mounted.lidar.beams() as u64;
-            let cost = FrameCost { session: self.number, samples };
+            let cost = FrameCost { session: self.slot.number(), samples };
             let seed = EffectSeed::from_episode(episode);
             let has_classes = layout.maps().semantics;
             let sensor = layout.lidar_sensor(index).copied();

@@ -141,11 +141,6 @@ impl RenderQueue {
         Ok(queue)
     }
 
-    /// The backend that the render threads use.
-    pub(crate) fn backend(&self) -> &dyn Backend {
-        &*self.shared.backend
-    }
-
     /// Jobs that wait for a render thread.
     pub(crate) fn len(&self) -> usize {
         self.shared.frames.state.lock().queue.len()
