@@ -76,7 +76,8 @@ impl Car {
             let places: Vec<DVec3> = corners
                 .windows(2)
                 .flat_map(|pair| {
-                    let [(from, v0), (to, v1)] = [pair[0], pair[1]];
+                    let (from, v0) = pair[0];
+                    let (to, v1) = pair[1];
                     (0..3).map(move |part| (from, v0, to, v1, f64::from(part) / 3.0))
                 })
                 .map(|(from, v0, to, v1, t)| at(from + t * (to - from), v0 + t * (v1 - v0)))

@@ -59,7 +59,8 @@ impl Kind {
         let last = self.knots.len() - 1;
         // Between two knots, at an end the outer ones: `after` is 1 or more.
         let after = self.knots.iter().position(|knot| knot.0 >= x).unwrap_or(last).max(1);
-        let (low, high) = (&self.knots[after - 1], &self.knots[after]);
+        let low = &self.knots[after - 1];
+        let high = &self.knots[after];
         let t = ((x - low.0) / (high.0 - low.0)).clamp(0.0, 1.0);
         column(low) + t * (column(high) - column(low))
     }

@@ -54,7 +54,9 @@ fn bar(painter: &mut Painter, from: [f64; 3], to: [f64; 3], radius_m: f64, paint
 
 fn frame(painter: &mut Painter) {
     let [rear, front] = AXLES_M.map(|x_m| [x_m, 0.0, WHEEL_M]);
-    let (pedals, saddle, head) = ([-0.05, 0.0, 0.30], [-0.22, 0.0, 0.92], [0.38, 0.0, 0.86]);
+    let pedals = [-0.05, 0.0, 0.30];
+    let saddle = [-0.22, 0.0, 0.92];
+    let head = [0.38, 0.0, 0.86];
     for (from, to) in
         [(rear, pedals), (rear, saddle), (pedals, saddle), (pedals, head), (front, head)]
     {

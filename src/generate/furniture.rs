@@ -147,7 +147,8 @@ fn block(painter: &mut Painter, base_m: DVec3, along: DVec3, size_m: DVec3, pain
     let corners = [corner(-1.0, -1.0), corner(1.0, -1.0), corner(1.0, 1.0), corner(-1.0, 1.0)];
     let vs = painter.graded(0.0, size_m.z, 0.10, 0.22);
     for side in 0..4 {
-        let (from_m, to_m) = (corners[side], corners[(side + 1) % 4]);
+        let from_m = corners[side];
+        let to_m = corners[(side + 1) % 4];
         let width_m = from_m.distance(to_m);
         let right = (to_m - from_m) / width_m;
         let us = painter.graded(0.0, width_m, 0.10, 0.24);
@@ -158,7 +159,8 @@ fn block(painter: &mut Painter, base_m: DVec3, along: DVec3, size_m: DVec3, pain
             |_, v_m| Some(paint.open(0.75 + 0.25 * (v_m / size_m.z))),
         );
     }
-    let (us, vs) = ([-1.0, -0.4, 0.4, 1.0], [-1.0, 0.0, 1.0]);
+    let us = [-1.0, -0.4, 0.4, 1.0];
+    let vs = [-1.0, 0.0, 1.0];
     let lid = |i: f64, j: f64| corner(i, j) + size_m.z * DVec3::Z;
     painter.sheet(&us, &vs, lid, |_, _| Some(paint));
 }

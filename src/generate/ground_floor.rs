@@ -24,7 +24,8 @@ impl Facade<'_, '_, '_> {
         let half_m = 0.65_f64.min(0.3 * self.bay_m);
         let middle_m = u_m + 0.5 * self.bay_m;
         let u = [middle_m - half_m, middle_m + half_m];
-        let (door_m, light_m) = (2.35, 3.0);
+        let door_m = 2.35;
+        let light_m = 3.0;
         self.around(u_m, u, [0.0, GROUND_FLOOR_M], [0.0, light_m]);
         self.surround(u, [0.30, light_m]);
         let wood = self.style.accent.times(0.75);
@@ -61,7 +62,9 @@ impl Facade<'_, '_, '_> {
         let accent = self.style.accent;
         let pier_m = 0.22;
         let u = [u_m + pier_m, u_m + self.bay_m - pier_m];
-        let (plinth_m, head_m, sign_m) = (0.45, 2.75, 3.45);
+        let plinth_m = 0.45;
+        let head_m = 2.75;
+        let sign_m = 3.45;
         self.pier([u_m, u[0]], [0.0, GROUND_FLOOR_M]);
         self.pier([u[1], u_m + self.bay_m], [0.0, GROUND_FLOOR_M]);
         self.plain(u, [sign_m, GROUND_FLOOR_M]);

@@ -128,7 +128,8 @@ impl Spoil {
 
     /// Indices of a range of camera positions that contains the nearest one of each point.
     fn near(&self, means_m: &[[f64; 3]]) -> Range<usize> {
-        let [mut low_m, mut high_m] = [DVec3::INFINITY, DVec3::NEG_INFINITY];
+        let mut low_m = DVec3::INFINITY;
+        let mut high_m = DVec3::NEG_INFINITY;
         for mean_m in means_m {
             let mean_m = DVec3::from_array(*mean_m);
             (low_m, high_m) = (low_m.min(mean_m), high_m.max(mean_m));

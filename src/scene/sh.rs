@@ -45,7 +45,9 @@ pub const fn coefficients(degree: u8) -> usize {
 /// The 16 basis functions up to degree 3 at a unit direction, in coefficient order.
 pub fn basis(direction: DVec3) -> [f64; 16] {
     let DVec3 { x, y, z } = direction;
-    let (xx, yy, zz) = (x * x, y * y, z * z);
+    let xx = x * x;
+    let yy = y * y;
+    let zz = z * z;
     [
         C0,
         -C1 * y,
@@ -182,9 +184,10 @@ mod tests {
                 ShRotation::new(matrix, degree).apply(&mut turned);
                 for step in 0..50 {
                     let t = f64::from(step);
-                    let d = DVec3::new((1.3 * t).sin(), (0.9 * t).cos(), (2.1 * t).sin());
-                    let d = d.normalize();
-                    let (seen, wanted) = (colour(&turned, matrix * d), colour(&plain, d));
+                    let away = DVec3::new((1.3 * t).sin(), (0.9 * t).cos(), (2.1 * t).sin());
+                    let d = away.normalize();
+                    let seen = colour(&turned, matrix * d);
+                    let wanted = colour(&plain, d);
                     let error = (seen - wanted).abs().max_element();
                     assert!(error < 1e-6, "degree {degree}, from {d}: {seen}, not {wanted}");
                 }

@@ -211,9 +211,9 @@ impl TryFrom<ViewFields> for RecordedView {
             windshield: fields.windshield,
             native_size_px: fields.native_size,
         };
-        let camera = intrinsics.camera();
+        let made = intrinsics.camera();
         let camera =
-            camera.map_err(|cause| ViewError::Camera { name: fields.camera.clone(), cause })?;
+            made.map_err(|cause| ViewError::Camera { name: fields.camera.clone(), cause })?;
         let view = Self {
             trajectory: fields.trajectory,
             station_m: fields.station_m,

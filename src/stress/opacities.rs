@@ -182,7 +182,7 @@ pub(super) const T28: Case = Case {
 };
 
 fn t28(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    let fog = (0..70_000).map(|i| GaussianSpec {
+    let layers = (0..70_000).map(|i| GaussianSpec {
         mean_m: DVec3::new(0.0, 0.0, 5.0 + 1e-4 * f64::from(i)),
         // 80 px wide, so that alpha is just above the cut in the whole tile, and no pixel stops
         // before the last layer.
@@ -190,7 +190,7 @@ fn t28(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         opacity: 1.05 / 255.0,
         ..GaussianSpec::default()
     });
-    let fog = scene_from_specs(&fog.collect::<Vec<_>>());
+    let fog = scene_from_specs(&layers.collect::<Vec<_>>());
     let profile = RenderProfile { stop: 1e-300, ..RenderProfile::default() };
     match run.render_and_compare("the fog", &fog, &profile, forward_view([16, 16], 4.0)) {
         Err(error) => run.accept_limit(error)?,

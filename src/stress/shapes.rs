@@ -100,13 +100,13 @@ fn t3(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         let off = image.opacity.iter().fold(0.0_f32, |most, o| most.max((o - 0.9).abs()));
         run.check_at_most(format!("{what}: opacity from 0.9"), off.into(), 0.15);
         // Forty walls on the 4 x 5 macro tiles of a device, so that a whole workgroup lists them.
-        let walls = (0..40_u32).map(|i| GaussianSpec {
+        let specs = (0..40_u32).map(|i| GaussianSpec {
             mean_m: DVec3::new(0.1 * f64::from(i), 0.0, 5.0 + 0.1 * f64::from(i)),
             // 0.97^40 = 0.30 of the light is left, so that no pixel stops before the last wall.
             opacity: 0.03,
             ..wall
         });
-        let walls = scene_from_specs(&walls.collect::<Vec<_>>());
+        let walls = scene_from_specs(&specs.collect::<Vec<_>>());
         let what = format!("forty of {sigma_m} m");
         let view = forward_view([444, 280], 300.0);
         run.render_and_compare(what.clone(), &walls, &profile, view)?;

@@ -141,8 +141,8 @@ fn adapters() -> Vec<Adapter> {
         ..InstanceDescriptor::new_without_display_handle()
     });
     // Outside of browsers this future is ready at once.
-    let found = instance.enumerate_adapters(BACKENDS).now_or_never();
-    let mut found = found.unwrap_or_default();
+    let listed = instance.enumerate_adapters(BACKENDS).now_or_never();
+    let mut found = listed.unwrap_or_default();
     found.sort_by_key(|adapter| match adapter.get_info().device_type {
         DeviceType::DiscreteGpu => 0,
         DeviceType::IntegratedGpu => 1,
@@ -175,8 +175,9 @@ impl AdapterChoice {
         match (index.and_then(|index| found.into_iter().nth(index)), self) {
             (Some(adapter), _) => Ok(adapter),
             (None, Self::Named(choice)) if !infos.is_empty() => {
-                let found = infos.iter().enumerate();
-                let found = found.map(|(index, info)| format!("{index}: {}", info.name)).collect();
+                let numbered = infos.iter().enumerate();
+                let found =
+                    numbered.map(|(index, info)| format!("{index}: {}", info.name)).collect();
                 Err(GpuError::NoSuchAdapter { choice: choice.clone(), found })
             }
             (None, _) => Err(GpuError::NoAdapter),
@@ -264,8 +265,8 @@ impl Device {
             ..DeviceDescriptor::default()
         };
         let failed = |reason: String| GpuError::Device { name: info.name.clone(), reason };
-        let opened = adapter.request_device(&descriptor).now_or_never();
-        let opened = opened.ok_or_else(|| failed("the driver does not respond".into()))?;
+        let answer = adapter.request_device(&descriptor).now_or_never();
+        let opened = answer.ok_or_else(|| failed("the driver does not respond".into()))?;
         let (device, queue) = opened.map_err(|error| failed(error.to_string()))?;
 
         let tuning = tuning.unwrap_or_else(|| Tuning::new(&info, device.features(), &limits));

@@ -40,9 +40,9 @@ impl Lenses {
     /// [`LensIndices`].
     pub(super) fn upload(&mut self, device: &Device, frame: &Frame<'_>, actors: &ActorViews) {
         let is_own = |(view, relative): &(&View, &View)| has_own_lens(view, relative);
-        let pairs = frame.views.iter().zip(actors.all());
+        let views = frame.views.iter().zip(actors.all());
         let pairs =
-            pairs.flat_map(|(view, relative)| relative.iter().map(move |from| (view, from)));
+            views.flat_map(|(view, relative)| relative.iter().map(move |from| (view, from)));
         let mut own =
             pairs.filter(is_own).map(|(_, relative)| Lens::new(relative, frame.profile)).peekable();
         if frame.views.iter().all(View::is_static_pinhole) && own.peek().is_none() {

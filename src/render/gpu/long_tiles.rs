@@ -73,8 +73,8 @@ impl LongTiles {
         let wants = [planes.has_depth(), planes.has_owners()];
         let variant = usize::from(wants[0]) + 2 * usize::from(wants[1]);
         let blend = self.blend.variant(device, variant, |module| {
-            let constants = [("DEPTH", wants[0]), ("OWNERS", wants[1])];
-            let constants = constants.map(|(name, on)| (name, f64::from(u8::from(on))));
+            let flags = [("DEPTH", wants[0]), ("OWNERS", wants[1])];
+            let constants = flags.map(|(name, on)| (name, f64::from(u8::from(on))));
             Kernel::new(device, module, "main", &constants)
         });
         let resources = [

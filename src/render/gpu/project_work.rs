@@ -126,9 +126,9 @@ impl ProjectWork {
                 ChunkInView { chunk, number, view, relative, of: Owner::Twin { shadows } }
             });
             let lenses = &lenses;
-            let placed = frame.scene.placed.iter().zip(actors.for_view(view)).enumerate();
-            let placed = placed.filter(move |(_, (placed, _))| placed.views.contains(view));
-            let placed = placed.map(move |(index, (placed, relative))| {
+            let actors = frame.scene.placed.iter().zip(actors.for_view(view)).enumerate();
+            let drawn = actors.filter(move |(_, (placed, _))| placed.views.contains(view));
+            let placed = drawn.map(move |(index, (placed, relative))| {
                 let of = Owner::Actor { placed, lens: lenses.index(view, index) };
                 let number = (frame.scene.chunks.len() + index) as u32;
                 ChunkInView { chunk: &placed.chunk, number, view, relative, of }
@@ -332,11 +332,11 @@ impl ChunkInView<'_> {
     /// The view relative to the chunk.
     fn chunk_view(&self, variant: Variant, profile: &RenderProfile) -> ChunkView {
         let Self { chunk, relative, .. } = *self;
-        let view = self.view as u32;
+        let number = self.view as u32;
         let view = match self.of {
-            _ if !variant.actors => view,
-            Owner::Twin { .. } => view | view << VIEW_BITS,
-            Owner::Actor { lens, .. } => view | lens << VIEW_BITS,
+            _ if !variant.actors => number,
+            Owner::Twin { .. } => number | number << VIEW_BITS,
+            Owner::Actor { lens, .. } => number | lens << VIEW_BITS,
         };
         let chunk_view = ChunkView::new(view, &CpuChunkView::new(relative, chunk, profile));
         if !relative.camera.depth_is_distance() {

@@ -276,7 +276,8 @@ impl Rasterize {
             ]);
             kernels.blend.run(device, pass, Groups::Count(tiles.len() as u32), &resources);
         }
-        let (Some(finish), Some(long_tiles)) = (&kernels.finish, &self.long_tiles) else { return };
+        let Some(finish) = &kernels.finish else { return };
+        let Some(long_tiles) = &self.long_tiles else { return };
         for (index, (page, tiles)) in pages(tiles, *tiles_per_page).enumerate() {
             let mut resources = page_resources(index, page, &tiles);
             resources.push(long_tiles.bind_sums());

@@ -113,8 +113,8 @@ impl Stopwatch {
             let host_s = start.elapsed().as_secs_f64();
             device.check()?;
             polled.map_err(|error| device.failed(error.to_string()))?;
-            let view = read_back.slice(..).get_mapped_range();
-            let view = view.map_err(|error| device.failed(error.to_string()))?;
+            let mapped = read_back.slice(..).get_mapped_range();
+            let view = mapped.map_err(|error| device.failed(error.to_string()))?;
             let [first, last] = [0, 8].map(|at| bytemuck::pod_read_unaligned(&view[at..at + 8]));
             let ticks = u64::saturating_sub(last, first) as f64;
             drop(view);

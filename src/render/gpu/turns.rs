@@ -88,13 +88,13 @@ impl Gpu {
     fn reopen(&self) -> Result<Chain, RenderError> {
         let opened =
             Device::open(&self.choice, &self.shaders, self.limits.binding_bytes, self.tuning);
-        let device = match opened {
+        let checked = match opened {
             Ok(device) if device.info == self.info => Ok(device),
             // Another device would draw other bytes, and was not requested.
             Ok(other) => Err(format!("it was lost, and in its place is {}", other.info.name)),
             Err(error) => Err(error.to_string()),
         };
-        let device = device
+        let device = checked
             .map_err(|reason| RenderError::Device { device: self.info.name.clone(), reason })?;
         tracing::info!(device = device.info.name, "the GPU was opened again");
         Chain::new(device, self.limits.mirror_bytes)

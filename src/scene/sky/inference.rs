@@ -219,7 +219,7 @@ impl Dense {
                 if output < layer.outputs { value(output) } else { 0.0 }
             })
         };
-        let weight = (0..groups * inputs).map(|at| {
+        let weights = (0..groups * inputs).map(|at| {
             let group = at / inputs;
             let input = at % inputs;
             let weight = |output: usize| {
@@ -227,7 +227,7 @@ impl Dense {
             };
             of(group, &weight)
         });
-        let weight = weight.collect();
+        let weight = weights.collect();
         Self { inputs, weight, bias: (0..groups).map(|group| of(group, &bias)).collect() }
     }
 

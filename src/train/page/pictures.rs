@@ -17,8 +17,8 @@ const QUALITY: u8 = 88;
 /// An image as JPEG, at a width that a page shows.
 pub(super) fn jpeg(size_px: [u32; 2], rgb8: &[u8]) -> Result<Vec<u8>, PageError> {
     let [width, height] = size_px;
-    let image = RgbImage::from_raw(width, height, rgb8.to_vec());
-    let image = image.ok_or(PageError::Size(width, height))?;
+    let made = RgbImage::from_raw(width, height, rgb8.to_vec());
+    let image = made.ok_or(PageError::Size(width, height))?;
     let shown = if width > MOST_PX {
         let shown_height = (height * MOST_PX).div_ceil(width);
         imageops::resize(&image, MOST_PX, shown_height, FilterType::Triangle)

@@ -53,8 +53,8 @@ impl Chain {
         gradients: &mut Gradients,
         pool: &ThreadPool,
     ) -> Result<FrameStats, GradientError> {
-        let stages = self.gradient.take();
-        let mut stages = stages.unwrap_or_else(|| GradientStages::new(&self.device));
+        let kept = self.gradient.take();
+        let mut stages = kept.unwrap_or_else(|| GradientStages::new(&self.device));
         let done = self.differentiate_in(&mut stages, frame, depth, loss, gradients, pool);
         // After a failure of the device they are not used again: some buffers may still be mapped.
         if !matches!(done, Err(GradientError::Render(RenderError::Device { .. }))) {

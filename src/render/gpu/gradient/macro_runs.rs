@@ -250,7 +250,8 @@ mod tests {
 
     /// Ranges of touches and instances as the device has them: those of nothing are 0.
     fn ranges(random: &mut Random) -> (Vec<[u32; 2]>, Vec<[u32; 2]>) {
-        let (mut touches, mut instances) = (vec![[0; 2]; 7], vec![[0; 2]; 19 * 6 + 5 * 3]);
+        let mut touches = vec![[0; 2]; 7];
+        let mut instances = vec![[0; 2]; 19 * 6 + 5 * 3];
         let mut next = [0, 0];
         for (macro_tile, range) in touches.iter_mut().enumerate() {
             if random.below(3) == 0 {

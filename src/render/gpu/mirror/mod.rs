@@ -220,8 +220,8 @@ impl Mirror {
     /// Evicts the least recently drawn chunk, unless this frame draws it.
     fn evict_oldest(&mut self) -> Result<(), Full> {
         let oldest = self.by_last_frame.first();
-        let oldest = oldest.filter(|(last_frame, _)| *last_frame < self.frame);
-        let &(_, address) = oldest.ok_or(Full)?;
+        let evictable = oldest.filter(|(last_frame, _)| *last_frame < self.frame);
+        let &(_, address) = evictable.ok_or(Full)?;
         self.evict(address);
         Ok(())
     }
