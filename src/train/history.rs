@@ -83,6 +83,7 @@ impl History {
         self.sums.sky += line.sky;
         self.sums.ground += line.ground;
         self.steps += 1;
+        // The last step of a run ends a point, however few steps that has.
         if self.steps < steps.div_ceil(POINTS) && line.step < steps {
             return;
         }
