@@ -353,6 +353,7 @@ impl Settings {
         let plain = toml::to_string_pretty(self)?;
         for line in plain.lines() {
             let name = line.strip_prefix('[').and_then(|line| line.strip_suffix(']'));
+            // A line is the header of a section, a field with its value, or empty.
             let doc = match (name, line.split_once(" = ")) {
                 (Some(name), _) => {
                     section = name;
@@ -417,6 +418,7 @@ impl Settings {
             ("growth.least_opacity", growth.least_opacity.into(), 0.0, 0.5),
             range("growth.every", growth.every, 1, SCHEDULE),
             range("growth.until", growth.until, 0, SCHEDULE),
+            // After `until`, which is its bound.
             range("growth.from", growth.from, 0, growth.until),
             range("sky.octaves", sky.octaves, 0, Network::MAX_OCTAVES),
             range("sky.width", sky.width, 1, Network::MAX_WIDTH),

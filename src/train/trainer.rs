@@ -248,10 +248,10 @@ impl Trainer {
             by_images
         };
         let stats = backend.differentiate(&frame, depth, &mut loss, &mut self.gradients)?;
+        // Before anything moves: Adam divides by 1 - decay^step, which is 0 at step 0.
         self.step += 1;
         let mut report = StepReport::default();
         if let Some(outcome) = outcome {
-            // The step counts from 1 here: Adam divides by 1 - decay^step.
             self.move_cameras(sample, place, &outcome)?;
             report = outcome.report;
         }

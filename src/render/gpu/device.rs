@@ -143,6 +143,7 @@ fn adapters() -> Vec<Adapter> {
     // Outside of browsers this future is ready at once.
     let listed = instance.enumerate_adapters(BACKENDS).now_or_never();
     let mut found = listed.unwrap_or_default();
+    // Stable: devices of one kind keep the driver's order, by which `AdapterChoice::Named` counts.
     found.sort_by_key(|adapter| match adapter.get_info().device_type {
         DeviceType::DiscreteGpu => 0,
         DeviceType::IntegratedGpu => 1,
@@ -167,6 +168,8 @@ impl AdapterChoice {
                 let name = choice.to_lowercase();
                 let has_name = |info: &AdapterInfo| info.name.to_lowercase().contains(&name);
                 match choice.parse::<usize>() {
+                    // A number that no device has is an error, even if it is a part of a device's
+                    // name.
                     Ok(number) => (number < found.len()).then_some(number),
                     Err(_) => infos.iter().position(has_name),
                 }
@@ -261,6 +264,7 @@ impl Device {
         let descriptor = DeviceDescriptor {
             required_features: adapter.features()
                 & (Features::TIMESTAMP_QUERY | Features::SUBGROUP),
+            // wgpu's default limits are far below those of graphics cards.
             required_limits: limits.clone(),
             ..DeviceDescriptor::default()
         };
@@ -417,6 +421,7 @@ impl Device {
 
     /// Counts a kernel that is compiled.
     pub(super) fn count_pipeline(&self) {
+        // No other data depends on the counts: relaxed order is enough.
         self.totals.pipelines.fetch_add(1, Relaxed);
     }
 
@@ -430,6 +435,7 @@ impl Device {
         self.totals.buffers.fetch_add(1, Relaxed);
         self.device.create_buffer(&BufferDescriptor {
             label: Some(label),
+            // An empty buffer cannot be bound, and copies take whole words.
             size: bytes.next_multiple_of(256).max(256),
             usage,
             mapped_at_creation: false,

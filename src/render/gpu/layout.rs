@@ -152,10 +152,12 @@ impl Frame {
         let views = rows.views(region);
         for (index, view) in self.view[..self.views as usize].iter_mut().enumerate() {
             let Range { start, end } = rows.for_view(index, region);
+            // Empty for a view outside of the region.
             view.rows = [start, end];
         }
         let first = &self.view[views.start];
         let last = &self.view[views.end - 1];
+        // Only the first and the last view of a region may lack rows, so its tiles are consecutive.
         let start = first.first_tile + first.rows[0] * first.columns;
         let end = last.first_tile + last.rows[1] * last.columns;
         start..end

@@ -152,10 +152,12 @@ impl ProjectWork {
 
         // Chunk views, and the cluster views of each page by kernel.
         let mut work = Self::default();
+        // Ordered, so that the dispatches are the same in every run.
         let mut by_kernel: BTreeMap<(usize, Variant), Vec<u32>> = BTreeMap::new();
         let mut last = None;
         let mut chunk_views = [None; 2];
         for ((pair, _), clusters) in parts.iter().zip(&visible) {
+            // The parts of a pair follow each other and share its chunk views.
             if last != Some(*pair) {
                 last = Some(*pair);
                 chunk_views = [None; 2];
@@ -187,6 +189,7 @@ impl ProjectWork {
         let runs = clusters.chunk_by(|a, b| (a.page, a.shadowed) == (b.page, b.shadowed));
         for run in runs {
             let ClusterPlace { page, shadowed, .. } = run[0];
+            // The first visible cluster of the pair: owners are ranges of cluster views.
             if *chunk_views == [None; 2] {
                 self.add_owner(pair);
             }

@@ -49,6 +49,7 @@ pub fn dssim<T: Real>(size_px: [usize; 2], image: &[T], target: &[T]) -> Loss<T>
         dispatch!(level, simd => simd.vectorize(#[inline(always)] || window.sums(x, y, to)));
     });
 
+    // The loss is 1 minus the mean over all values.
     let per_value = T::from_f64(-1.0 / image.len() as f64);
     let mut by_sums = vec![T::zero(); DERIVATIVES * image.len()];
     let rows = by_sums.par_chunks_mut(DERIVATIVES * width).enumerate();

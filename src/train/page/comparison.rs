@@ -134,6 +134,7 @@ fn draw(runs: &[ComparedRun], on_front: &[bool], text: &mut String) -> Result<()
     let range = |values: &mut dyn Iterator<Item = f64>, margin: f64| {
         let ends = (f64::INFINITY, f64::NEG_INFINITY);
         let (low, high) = values.fold(ends, |(low, high), v| (low.min(v), high.max(v)));
+        // Without any run that is judged, `low` is infinite, which is no range for an axis.
         if low <= high { low - margin..high + margin } else { 0.0..1.0 }
     };
     let x = range(&mut judged().map(|(run, _)| point(run).0), 0.05);

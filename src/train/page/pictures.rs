@@ -38,6 +38,8 @@ pub(super) fn depth(depth_m: &[f32]) -> Vec<u8> {
         if depth_m <= 0.0 {
             return [0; 3];
         }
+        // 0 is red, 1 yellow, 2 green, 3 cyan and 4 blue: a channel is full within 1 of its own
+        // hue.
         let hue = 4.0 * (depth_m / FAR_M).clamp(0.0, 1.0).sqrt();
         [0.0_f32, 2.0, 4.0]
             .map(|middle| (255.0 * (2.0 - (hue - middle).abs()).clamp(0.0, 1.0)) as u8)
