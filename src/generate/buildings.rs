@@ -132,6 +132,7 @@ impl Building {
 
     /// Paints front, sides and roof.
     pub(super) fn paint(&self, painter: &mut Painter) {
+        // A copy of the stream: a house that is painted twice looks the same.
         let mut random = self.random.clone();
         painter.coarser(self.spacing, |painter| {
             facade::paint(painter, &self.front, &self.style, &mut random);
@@ -274,6 +275,7 @@ impl Building {
 fn fronts(random: &mut Random, [from_m, to_m]: [f64; 2]) -> Vec<f64> {
     let mut breaks_m = vec![from_m];
     let mut at_m = from_m;
+    // Ends when the rest is no wider than a house may be.
     while to_m - at_m > FRONTS_M[1] {
         at_m += random.range(FRONTS_M[0], FRONTS_M[1]);
         breaks_m.push(at_m);

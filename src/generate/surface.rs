@@ -151,6 +151,7 @@ impl<'a> Painter<'a> {
     /// Paints what `draw` paints as Gaussians of a class, if the canvas has classes.
     pub(super) fn labelled(&mut self, class: SemanticClass, draw: impl FnOnce(&mut Self)) {
         let around = self.class;
+        // `None` stays `None`: a canvas without classes gets none here.
         self.class = around.map(|_| class);
         draw(self);
         self.class = around;
@@ -239,6 +240,7 @@ impl<'a> Painter<'a> {
         // Eigenvalues of [xx xy; xy yy]: half the trace plus and minus this.
         let apart = (0.5 * (xx - yy)).hypot(xy);
         let major = 0.5 * (xx + yy) + apart;
+        // The difference may round to 0 or below, which has no root and no logarithm.
         let minor = (0.5 * (xx + yy) - apart).max(1e-6);
         // The angle of the major axis: tan 2a = 2 xy/(xx - yy).
         let (sin, cos) = (0.5 * (2.0 * xy).atan2(xx - yy)).sin_cos();
@@ -297,6 +299,7 @@ impl<'a> Painter<'a> {
         let along = along_m.normalize_or_zero();
         let center_m = 0.5 * (ends_m[0] + ends_m[1]);
         let across = normal.cross(along).normalize_or_zero();
+        // Ends in one place, or a line along the normal, have no direction across.
         if across == DVec3::ZERO || width_m < 1e-3 {
             return;
         }

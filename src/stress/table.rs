@@ -59,6 +59,7 @@ pub fn run(
         let outcomes = tried.collect();
         Row { case: case.number, what: case.what, bound: case.bound, outcomes }
     });
+    // The cases run here: the iterators above are lazy.
     let rows = made.collect();
     let column = |candidate: &Candidate| match candidate {
         Ok(backend) => Column { backend: backend.name(), detail: backend.detail() },

@@ -44,7 +44,6 @@ impl Route<'_> {
             return Err(RouteError::Value { field: "from_m", value: first_m, must });
         }
         let last_m = to_m.unwrap_or(length_m).min(length_m);
-        // Both stations are on the route here: the first by the test above, the last by `min`.
         if !(first_m..).contains(&last_m) {
             let must = "it is not less than from_m";
             return Err(RouteError::Value { field: "to_m", value: last_m, must });

@@ -242,6 +242,7 @@ impl Model {
                 match moved {
                     Ok(()) => changes = true,
                     Err(index) => {
+                        // The least index of all, whichever thread finds one first.
                         faulty.fetch_min(index, Relaxed);
                     }
                 }
