@@ -186,7 +186,7 @@ pub(super) const TRUCK: Kind = Kind {
     windscreen: [0.934, 0.972],
 };
 
-/// A city bus.
+/// A city bus with windows along its whole side.
 pub(super) const BUS: Kind = Kind {
     length_m: 12.0,
     width_m: 2.55,

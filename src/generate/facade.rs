@@ -10,11 +10,10 @@ use super::surface::{Paint, Painter};
 pub(super) struct Wall {
     /// Left lower corner as seen from outside, in metres.
     pub(super) corner_m: DVec3,
-    /// Unit, to the right.
+    /// Unit vector along the wall, to the right as seen from outside.
     pub(super) right: DVec3,
-    /// Unit, outwards.
+    /// Unit vector out of the wall, towards the viewer.
     pub(super) out: DVec3,
-    /// Width, in metres.
     pub(super) width_m: f64,
 }
 

@@ -88,7 +88,7 @@ pub(super) fn sign(painter: &mut Painter, foot_m: DVec3, facing: DVec3) {
     });
 }
 
-/// A litter bin.
+/// A litter bin, 0.95 m high with its rim.
 pub(super) fn bin(painter: &mut Painter, foot_m: DVec3) {
     let green = Paint::matt(0.17, 0.30, 0.24);
     tube(painter, [foot_m, foot_m + 0.85 * DVec3::Z], 0.21, green);

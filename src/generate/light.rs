@@ -33,9 +33,7 @@ pub(super) enum Occluder {
     },
     /// A tree's crown, which lets some light through.
     Crown {
-        /// Middle, in metres.
         center_m: DVec3,
-        /// Radius, in metres.
         radius_m: f64,
     },
 }

@@ -52,9 +52,9 @@ pub(super) struct Bends {
 /// A sine wave of the heading.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Wave {
-    /// Amplitude, in radians.
+    /// Largest turn of the heading to either side, in radians.
     pub(super) swing_rad: f64,
-    /// Period, in metres.
+    /// Arc length of a whole wave, in metres.
     pub(super) period_m: f64,
     /// Phase at s = 0, in radians.
     pub(super) phase_rad: f64,
@@ -211,7 +211,7 @@ impl Wave {
 }
 
 impl Default for Wave {
-    /// A straight street.
+    /// No turn: the street is straight. A period of 0 would divide by 0.
     fn default() -> Self {
         Self { swing_rad: 0.0, period_m: 1.0, phase_rad: 0.0 }
     }

@@ -62,7 +62,7 @@ impl Paint {
         Self { open: self.open * open, ..self }
     }
 
-    /// A light source.
+    /// A light source: its colour is the same in sun and shade.
     pub(super) const fn glowing(r: f64, g: f64, b: f64) -> Self {
         Self { glows: true, ..Self::matt(r, g, b) }
     }
@@ -71,7 +71,6 @@ impl Paint {
 /// A flat patch: a parallelogram with its outward normal `edge_u x edge_v`.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Patch {
-    /// Middle, in metres.
     pub(super) center_m: DVec3,
     /// The whole edge along u, in metres.
     pub(super) edge_u_m: DVec3,

@@ -57,7 +57,7 @@ pub enum AppearanceError {
     /// An exposure coefficient outside -100 to 100.
     #[error("exposure.{field} is {value:?}; it must be a number from -100 to 100")]
     Exposure {
-        /// `matrix` or `offset`.
+        /// The field: `matrix` or `offset`.
         field: &'static str,
         value: f64,
     },

@@ -292,7 +292,7 @@ impl Chunk {
         self.sh_degree
     }
 
-    /// Number of Gaussians.
+    /// Number of Gaussians, without the empty lanes of the last group.
     pub fn len(&self) -> usize {
         self.count
     }

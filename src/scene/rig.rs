@@ -96,7 +96,7 @@ impl RigCamera {
 /// ```
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Rig {
-    /// Name, `[a-z0-9._-]+`.
+    /// Name of the rig, `[a-z0-9._-]+`.
     pub name: String,
     /// At least one camera.
     pub cameras: Vec<RigCamera>,

@@ -8,12 +8,12 @@ use std::f64::consts::FRAC_PI_4;
 
 use glam::{DMat3, DVec3};
 
-/// Largest supported degree.
+/// Largest supported degree: 16 coefficients per channel.
 pub const MAX_DEGREE: u8 = 3;
 /// Largest accepted magnitude of a coefficient in a scene: a colour of 282, where 1 is white.
 pub const MAX_COEFFICIENT: f32 = 1e3;
 
-/// `½ √(1/π)`.
+/// `½ √(1/π)`, the basis function of degree 0.
 pub const C0: f64 = 0.282_094_791_773_878_14;
 /// `½ √(3/π)`: -y, z, -x.
 pub const C1: f64 = 0.488_602_511_902_919_9;

@@ -52,14 +52,14 @@ pub enum ViewError {
     /// A name is empty, too long, or has other characters than `[a-z0-9._-]`.
     #[error("{field} {name:?} is not a name: 1 to 64 of a-z 0-9 . _ -, not beginning with .")]
     Name {
-        /// `camera` or `trajectory`.
+        /// The field: `camera` or `trajectory`.
         field: &'static str,
         name: String,
     },
     /// A number is not finite.
     #[error("{field} is {value:?}; give a finite number")]
     Number {
-        /// `station_m` or `exposure_stops`.
+        /// The field: `station_m` or `exposure_stops`.
         field: &'static str,
         value: f64,
     },

@@ -57,7 +57,7 @@ pub fn scene_db(
 pub struct Judged {
     /// The mean PSNR of those with a pixel that counts.
     pub mean_db: f64,
-    /// Their number.
+    /// Number of images with a pixel that counts.
     pub images: usize,
     /// The one in the middle of their order, which is the same for all runs.
     pub middle: HeldOut,

@@ -37,7 +37,7 @@ pub struct CurvePoint {
     pub seconds: f64,
     pub l1: f64,
     pub dssim: f64,
-    /// In 1/m.
+    /// In 1/m; 0 without measured depths.
     pub disparity: f64,
     /// The mean opacity where the sky is.
     pub sky: f64,

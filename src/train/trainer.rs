@@ -46,7 +46,7 @@ pub struct Start {
 pub struct Fixed {
     /// A sky. With one, no other is trained.
     pub sky: Option<Arc<Sky>>,
-    /// Gaussians.
+    /// Gaussians that surround those of the run.
     pub chunks: Vec<Arc<Chunk>>,
 }
 

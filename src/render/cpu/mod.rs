@@ -64,7 +64,7 @@ use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target, View};
 use wildcity_scene::geometry::Lidar;
 use wildcity_scene::{RenderProfile, Scene};
 
-/// The f32 backend.
+/// The backend that draws in f32 with vector instructions, on threads of its own.
 #[derive(Debug)]
 pub struct Cpu {
     main: Lane,

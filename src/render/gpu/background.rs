@@ -23,7 +23,7 @@ use wildcity_scene::sky::{DrawableSky, InferenceNetwork};
 /// Background and appearances of the current frame.
 #[derive(Debug)]
 pub(super) struct Background {
-    /// One [`layout::Background`].
+    /// One [`layout::Background`], which all views share.
     parameters: GrowableBuffer,
     /// Texels of a cube map, or weights of a network.
     sky_values: GrowableBuffer,

@@ -84,7 +84,7 @@ use crate::samples::SampledViews;
 use wildcity_scene::geometry::Lidar;
 use wildcity_scene::{RenderProfile, Scene};
 
-/// The wgpu backend.
+/// The backend that draws on a device of wgpu, and opens it again after a failure.
 #[derive(Debug)]
 pub struct Gpu {
     choice: AdapterChoice,

@@ -26,11 +26,11 @@ pub(super) type Region = Range<u32>;
 /// Counts of what a region needs on a device, or of what the device's buffers can hold.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Capacity {
-    /// (Gaussian, view) pairs.
+    /// (Gaussian, view) pairs that reach into the region.
     pub(super) splats: u64,
     /// (Splat, macro tile) pairs.
     pub(super) touches: u64,
-    /// (Splat, tile) pairs.
+    /// (Splat, tile) pairs in the region.
     pub(super) instances: u64,
 }
 

@@ -50,7 +50,7 @@ pub(super) struct ProjectDispatch {
     /// Page of the mirror.
     pub(super) page: usize,
     pub(super) variant: Variant,
-    /// Range of `page_cluster_views`.
+    /// Range of [`ProjectWork::page_cluster_views`] that it projects.
     pub(super) span: Span,
 }
 
@@ -292,6 +292,7 @@ impl ChunkInView<'_> {
             (Owner::Actor { .. }, None) => UnscentedView::new(relative, frame.profile),
         };
         self.visible_if(clusters, mirror, |min_m, max_m, sigma_m| {
+            // Where there is no test for a view, the device tests each Gaussian.
             moved.is_none_or(|view| view.may_see(chunk.origin_m(), min_m, max_m, sigma_m))
         })
     }
@@ -338,6 +339,7 @@ impl ChunkInView<'_> {
         let number = self.view as u32;
         let view = match self.of {
             _ if !variant.actors => number,
+            // The twin is seen with the lens of the view, which has the same index.
             Owner::Twin { .. } => number | number << VIEW_BITS,
             Owner::Actor { lens, .. } => number | lens << VIEW_BITS,
         };

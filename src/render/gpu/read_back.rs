@@ -183,7 +183,7 @@ impl ReadBack {
         })
     }
 
-    /// The pixels.
+    /// The mapped pages, in order.
     pub(super) fn pages(&self, device: &Device) -> Result<Vec<BufferView>, RenderError> {
         self.pages.iter().map(|page| view(device, page)).collect()
     }

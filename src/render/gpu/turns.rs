@@ -50,14 +50,17 @@ impl Gpu {
     ) -> Result<MappedFrame, RenderError> {
         let called = Instant::now();
         let ticket = self.queue.wait();
+        // After the ticket, so that slots are taken in the order of the calls.
         let slot = self.slots.wait();
         let wait = called.elapsed();
         let turn = self.with_chain(|chain| chain.take_turn(frame, outputs, &self.cull))?;
+        // The next frame is prepared while the device draws this one.
         drop(ticket);
         let waited = match turn {
             Turn::Drawn(drawn) => Waited::Drawn(drawn),
             Turn::InFlight(in_flight) => self.finish(*in_flight)?,
         };
+        // The device is done with the frame, even if it must be drawn again.
         drop(slot);
         let mut drawn = match waited {
             Waited::Drawn(drawn) => drawn,

@@ -12,9 +12,9 @@ pub const DEFAULT_SPEED_M_S: f64 = 5.0;
 /// Distance between two keyframes, in metres; a short drive has at least [`LEAST_STEPS`].
 const STEP_M: f64 = 0.5;
 const LEAST_STEPS: f64 = 8.0;
-/// Most keyframes.
+/// Most steps between keyframes: 100 km at [`STEP_M`].
 const MOST_STEPS: f64 = 200_000.0;
-/// Most points.
+/// Most points that a path may be drawn through.
 const MOST_POINTS: usize = 1_000;
 /// Points that are closer together than this are one, in metres.
 const SAME_M: f64 = 1e-3;
@@ -34,7 +34,7 @@ pub enum PathError {
     /// The speed is out of range.
     #[error("a speed of {0:?} m/s; from 0.1 to 100 are accepted")]
     Speed(f64),
-    /// Not a name.
+    /// A name is empty, too long, or has other characters than `[a-z0-9._-]`.
     #[error(
         "{0:?} is not a name of a trajectory: a name has 1 to 64 of a-z 0-9 . _ - and does not start with ."
     )]

@@ -14,10 +14,10 @@ const UTM_EASTING_M: f64 = 500_000.0;
 /// False northing of UTM in the southern hemisphere, in metres.
 const UTM_SOUTH_NORTHING_M: f64 = 1e7;
 
-/// A UTM zone.
+/// A UTM zone of one hemisphere.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct UtmZone {
-    /// 1 to 60.
+    /// From 1 at 180° west to 60, each 6° wide.
     number: u32,
     is_south: bool,
 }

@@ -51,15 +51,13 @@ impl StoredNode {
 /// A Gaussian with its moments.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Node {
-    /// Mean, in metres.
     pub(super) mean_m: DVec3,
-    /// Covariance, in m².
     pub(super) cov_m2: DMat3,
     /// Standard deviations along the principal axes, in metres.
     pub(super) scale_m: DVec3,
     /// Principal axes, as columns.
     pub(super) axes: DMat3,
-    /// Opacity times [`area_m2`].
+    /// Opacity times [`area_m2`]: how much of an image the Gaussian takes.
     pub(super) weight: f64,
     /// The part of the weight that the Gaussians of level 0 that it represents hide: the sum of
     /// weight times [`hidden_share`].

@@ -5,9 +5,9 @@ use half::f16;
 /// The encoding of a field.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Code {
-    /// f32 without loss.
+    /// The bits of each f32, without loss.
     Float,
-    /// f16.
+    /// Each value rounded to f16.
     Half,
     /// This many bits: a multiple of a step, from the part's smallest value to its largest.
     Steps(u32),
@@ -85,7 +85,7 @@ impl Measure {
 }
 
 impl Code {
-    /// Bits per Gaussian.
+    /// Bits that the columns of a field take of a Gaussian.
     pub(super) fn bits(self, columns: usize) -> usize {
         match self {
             Self::Float => 32 * columns,

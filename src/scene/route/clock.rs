@@ -12,7 +12,7 @@ pub struct Association {
     pub unmatched: Vec<usize>,
 }
 
-/// Two associated times.
+/// A time of each of two clocks that belong together.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TimePair {
     /// Index in the first clock's times.

@@ -11,7 +11,7 @@ use wildcity_scene::sky::Layer;
 /// Nodes whose derivatives are summed apart, so that the sum is the same at any number of threads.
 const PART: usize = 256;
 
-/// Three layers.
+/// Three linear layers with ReLU between them, the second of which sees the inputs again.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Layers {
     octaves: usize,

@@ -101,6 +101,7 @@ impl TrainedSky {
         for ShownPixel { pixel, nodes, weights } in &sky.pixels {
             for (node, weight) in nodes.iter().zip(weights) {
                 for channel in 0..3 {
+                    // The transpose of the interpolation.
                     by_colors[3 * node + channel] += weight * by_rgb[3 * pixel + channel];
                 }
             }

@@ -73,7 +73,7 @@ struct RoundDerivatives {
     curvature: ChebyshevSeries,
 }
 
-/// Image points.
+/// The images of sixteen points, and how far they are within the field.
 #[derive(Clone, Copy)]
 pub(super) struct LensPixels<S: Simd> {
     pub(super) x_px: f32x16<S>,
@@ -359,7 +359,7 @@ fn round_slope(radius: &dyn Fn(f64) -> f64, max_rad: f64, rad: f64) -> f64 {
     (radius(rad + h) - radius(rad - h)) / (2.0 * h)
 }
 
-/// `r″`, likewise.
+/// `r″` of a radius at an angle, by the second difference within the field.
 fn round_curvature(radius: &dyn Fn(f64) -> f64, max_rad: f64, rad: f64) -> f64 {
     // Rounding adds about 4e-16/h^2 = 2e-9 of the radius, the difference h^2/12 of r''''.
     let h = 5e-4;

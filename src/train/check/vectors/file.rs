@@ -26,7 +26,7 @@ pub enum VectorError {
 
 pub(super) const SIZE_PX: [u32; 2] = [64, 48];
 pub(super) const PIXELS: usize = 64 * 48;
-/// Number of Gaussians.
+/// Number of Gaussians in the vectors.
 pub(super) const COUNT: usize = 100;
 
 /// Derivatives by groups of parameters.
