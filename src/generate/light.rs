@@ -32,10 +32,7 @@ pub(super) enum Occluder {
         size_m: DVec3,
     },
     /// A tree's crown, which lets some light through.
-    Crown {
-        center_m: DVec3,
-        radius_m: f64,
-    },
+    Crown { center_m: DVec3, radius_m: f64 },
 }
 
 /// The sun, the sky, and the objects that cast shadows.
