@@ -51,6 +51,7 @@ impl Car {
         for wheel in WHEELS {
             // The upper half of a ring, down to the sill.
             let radius_m = tyre_m + 0.055;
+            // Eight parts at the usual length, and more of them where lines are finer.
             let parts = (8.0 * LINE_M / line_m).round();
             let at = |part: i32| {
                 let (sin, cos) = (std::f64::consts::PI * f64::from(part) / parts).sin_cos();

@@ -86,6 +86,7 @@ fn sampled(camera: &Camera, gaussian: &GaussianSpec) -> (DVec2, [f64; 3]) {
 /// Mean of weighted points, and their covariance: along x, along y, and mixed.
 fn moments(places: impl Iterator<Item = (f64, DVec2)> + Clone) -> (DVec2, [f64; 3]) {
     let sum: f64 = places.clone().map(|(weight, _)| weight).sum();
+    // The mean first, in a pass of its own: squares less the squared mean would cancel digits.
     let mean = places.clone().map(|(weight, at)| weight * at).sum::<DVec2>() / sum;
     let variance = |of: fn(DVec2) -> f64| {
         places.clone().map(|(weight, at)| weight * of(at - mean)).sum::<f64>() / sum

@@ -20,10 +20,12 @@ fn t1(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let profile = RenderProfile::default();
     let view = forward_view([320, 240], 500.0);
     for sigma_px in [1e3, 3e3, 1e4] {
+        // After half a turn a needle looks as before.
         for degrees in (0..180).step_by(2) {
             let needle = scene_from_specs(&[GaussianSpec {
                 rotation: DQuat::from_rotation_z(f64::from(degrees).to_radians()),
                 // 5 m at 500 px: a standard deviation of `sigma_px` pixels.
+                // Across, 0.1 mm are 0.01 px: the blur alone makes the width.
                 sigma_m: DVec3::new(sigma_px * 5.0 / 500.0, 1e-4, 1e-4),
                 ..GaussianSpec::default()
             }]);
