@@ -13,7 +13,7 @@ pub(super) const F: f64 = 1.0 / 298.257_223_563;
 /// Square of the first eccentricity.
 pub(super) const E2: f64 = F * (2.0 - F);
 
-/// Third flattening, `(a - b)/(a + b)`, in whose powers the series of UTM are.
+/// Third flattening, `(a - b)/(a + b)`: the series of UTM are in its powers.
 pub(super) const N: f64 = F / (2.0 - F);
 
 /// Earth-centred coordinates of a point, in metres.

@@ -119,8 +119,8 @@ impl Chain {
                 keys: plan.job(job::SPLATS_SORT),
                 counters: plan.job(job::SPLATS_DIGITS),
             };
-            // A key has the number of the view above the depth, so few views may take fewer passes of
-            // the sort.
+            // A key has the number of the view above the depth, so few views may take fewer passes
+            // of the sort.
             let depth_bits = DEPTH_BITS + bits(parameters.views - 1);
             let data = Columns { keys: &splats.keys, values: &splats.indices, masks: None };
             sorted.splats = self.sort.run(device, &mut pass, scan, jobs, data, depth_bits);
