@@ -166,7 +166,8 @@ mod tests {
         for ActorModel { name, box_, gaussians, .. } in models {
             box_.check().unwrap();
             let half_m = 0.5 * DVec3::new(box_.length_m, box_.width_m, box_.height_m);
-            let (mut low_m, mut high_m) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
+            let mut low_m = DVec3::INFINITY;
+            let mut high_m = DVec3::NEG_INFINITY;
             for &mean_m in &gaussians.means_m {
                 low_m = low_m.min(DVec3::from_array(mean_m));
                 high_m = high_m.max(DVec3::from_array(mean_m));

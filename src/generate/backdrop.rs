@@ -34,7 +34,8 @@ fn skyline(painter: &mut Painter, middle_m: DVec3, seed: u64) {
         let wall = DVec3::new(0.60, 0.58, 0.57).lerp(DVec3::new(0.80, 0.84, 0.88), haze) * tone;
         let (sin, cos) = (azimuth_rad + 0.5 * width_rad).sin_cos();
         // Seen from the middle, to the right and towards it: right x up looks inwards.
-        let (right, inwards) = (DVec3::new(sin, -cos, 0.0), DVec3::new(-cos, -sin, 0.0));
+        let right = DVec3::new(sin, -cos, 0.0);
+        let inwards = DVec3::new(-cos, -sin, 0.0);
         // 3 m below the road, so that there is no gap at its foot.
         let foot_m = middle_m - away_m * inwards - 3.0 * DVec3::Z;
         let half_m = 0.5 * width_rad * away_m;

@@ -90,7 +90,8 @@ pub(super) fn plan(route: &Route, cross_s_m: f64, seed: u64) -> Vec<Building> {
     let crossing = route.at(cross_s_m);
     // In the axes of the crossing, since the side street is straight.
     let side_point = |t_m: f64, d_m: f64| crossing.beside(t_m, 0.0) + d_m * crossing.forward;
-    let (near_m, far_m) = (FRONT_M + DEPTH_M, SIDE_REACH_M);
+    let near_m = FRONT_M + DEPTH_M;
+    let far_m = SIDE_REACH_M;
     let before = |t_m: f64| side_point(t_m, -SIDE_FRONT_M);
     let after = |t_m: f64| side_point(-t_m, SIDE_FRONT_M);
     row("side left, before", [near_m, far_m], &before, [false; 2]);
@@ -131,6 +132,7 @@ impl Building {
 
     /// Paints front, sides and roof.
     pub(super) fn paint(&self, painter: &mut Painter) {
+        // A copy of the stream: a house that is painted twice looks the same.
         let mut random = self.random.clone();
         painter.coarser(self.spacing, |painter| {
             facade::paint(painter, &self.front, &self.style, &mut random);
@@ -188,7 +190,8 @@ impl Building {
 
     /// A dark surface 1.6 m behind a wall, which is visible through gaps between its surfels.
     fn back(&self, painter: &mut Painter, wall: &Wall) {
-        let (inset_m, top_m) = (1.6, self.style.height_m() - 1.6);
+        let inset_m = 1.6;
+        let top_m = self.style.height_m() - 1.6;
         let rotation = DQuat::from_mat3(&DMat3::from_cols(wall.right, DVec3::Z, wall.out));
         // 2.2 m: nothing but a dark colour is seen of it.
         let us = painter.even(inset_m, wall.width_m - inset_m, 2.2);
@@ -205,14 +208,16 @@ impl Building {
 
     /// A tiled slope behind the eaves up to the ridge, gables on both sides, and chimneys.
     fn roof(&self, painter: &mut Painter, random: &mut Random) {
-        let (wall, eaves_m) = (self.front, self.style.height_m());
+        let wall = self.front;
+        let eaves_m = self.style.height_m();
         let tiles = random.pick(&[
             Paint::matt(0.55, 0.33, 0.26),
             Paint::matt(0.50, 0.29, 0.24),
             Paint::matt(0.36, 0.36, 0.39),
             Paint::matt(0.42, 0.38, 0.36),
         ]);
-        let (run_m, rise_m) = (0.5 * DEPTH_M, random.range(2.8, 4.0));
+        let run_m = 0.5 * DEPTH_M;
+        let rise_m = random.range(2.8, 4.0);
         let us = painter.graded(-0.1, wall.width_m + 0.1, 0.3, 0.9);
         let vs = painter.even(0.0, 1.0, 0.19);
         let place =
@@ -243,7 +248,8 @@ impl Building {
             let u_m = random.range(1.5, wall.width_m - 1.5);
             // Just in front of the ridge, which is half the depth behind the front.
             let at_m = wall.at(u_m, eaves_m, -run_m + 0.3);
-            let (half_m, top_m) = (0.38, rise_m + 1.1);
+            let half_m = 0.38;
+            let top_m = rise_m + 1.1;
             let vs = painter.even(rise_m - 1.0, top_m, 0.35);
             let corners = [
                 at_m - half_m * wall.right + half_m * wall.out,
@@ -269,6 +275,7 @@ impl Building {
 fn fronts(random: &mut Random, [from_m, to_m]: [f64; 2]) -> Vec<f64> {
     let mut breaks_m = vec![from_m];
     let mut at_m = from_m;
+    // Ends when the rest is no wider than a house may be.
     while to_m - at_m > FRONTS_M[1] {
         at_m += random.range(FRONTS_M[0], FRONTS_M[1]);
         breaks_m.push(at_m);

@@ -34,9 +34,10 @@ pub fn canyon(count: usize, progress: &mut dyn FnMut(u64, u64)) -> Gaussians {
         }
         // All numbers are drawn for every Gaussian, used or not, so that the stream does not depend
         // on which surface it lies on.
-        let (x, y) =
-            (random.range(-half_length, half_length), random.range(-half_width, half_width));
-        let (z, off) = (random.range(0.0, HEIGHT_M), random.range(-ROUGH_M, ROUGH_M));
+        let x = random.range(-half_length, half_length);
+        let y = random.range(-half_width, half_width);
+        let z = random.range(0.0, HEIGHT_M);
+        let off = random.range(-ROUGH_M, ROUGH_M);
         let side = if random.chance(0.5) { -1.0 } else { 1.0 };
         let at = random.range(0.0, area_m2);
         // `across` is the axis that is perpendicular to the surface, along which the Gaussian is

@@ -51,6 +51,7 @@ impl Car {
         for wheel in WHEELS {
             // The upper half of a ring, down to the sill.
             let radius_m = tyre_m + 0.055;
+            // Eight parts at the usual length, and more of them where lines are finer.
             let parts = (8.0 * LINE_M / line_m).round();
             let at = |part: i32| {
                 let (sin, cos) = (std::f64::consts::PI * f64::from(part) / parts).sin_cos();
@@ -76,7 +77,8 @@ impl Car {
             let places: Vec<DVec3> = corners
                 .windows(2)
                 .flat_map(|pair| {
-                    let [(from, v0), (to, v1)] = [pair[0], pair[1]];
+                    let (from, v0) = pair[0];
+                    let (to, v1) = pair[1];
                     (0..3).map(move |part| (from, v0, to, v1, f64::from(part) / 3.0))
                 })
                 .map(|(from, v0, to, v1, t)| at(from + t * (to - from), v0 + t * (v1 - v0)))

@@ -50,6 +50,7 @@ impl Kind {
         features.extend(self.windscreen);
         features.sort_by(f64::total_cmp);
         // Features closer than 1.2 % of the length, 5 cm of a car, are one.
+        // `dedup_by` passes the later element first.
         features.dedup_by(|b, a| *b - *a < 0.012);
         features
     }
@@ -59,7 +60,9 @@ impl Kind {
         let last = self.knots.len() - 1;
         // Between two knots, at an end the outer ones: `after` is 1 or more.
         let after = self.knots.iter().position(|knot| knot.0 >= x).unwrap_or(last).max(1);
-        let (low, high) = (&self.knots[after - 1], &self.knots[after]);
+        let low = &self.knots[after - 1];
+        let high = &self.knots[after];
+        // The knots of a kind lie at different places, so that the length between two is not 0.
         let t = ((x - low.0) / (high.0 - low.0)).clamp(0.0, 1.0);
         column(low) + t * (column(high) - column(low))
     }
@@ -181,11 +184,12 @@ pub(super) const TRUCK: Kind = Kind {
         (1.000, 1.00, 1.04),
     ],
     side_glass: &[[0.77, 0.91]],
+    // A box body has no rear window: the range is empty.
     rear_glass: [0.0, 0.0],
     windscreen: [0.934, 0.972],
 };
 
-/// A city bus.
+/// A city bus with windows along its whole side.
 pub(super) const BUS: Kind = Kind {
     length_m: 12.0,
     width_m: 2.55,

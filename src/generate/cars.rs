@@ -150,7 +150,8 @@ impl Car {
     fn lengthwise(&self, painter: &Painter, features: &[f64], step_m: f64) -> Vec<f64> {
         let mut xs = vec![0.0];
         for pair in features.windows(2) {
-            let [from_m, to_m] = [pair[0] * self.kind.length_m, pair[1] * self.kind.length_m];
+            let from_m = pair[0] * self.kind.length_m;
+            let to_m = pair[1] * self.kind.length_m;
             let count = painter.even(0.0, self.slope_m(from_m, to_m), step_m).len() - 1;
             let step_m = (to_m - from_m) / count as f64;
             xs.extend((1..=count).map(|k| from_m + k as f64 * step_m));
@@ -227,7 +228,8 @@ impl Car {
     /// A point of the cabin: `v` is 0 at the shoulder, 1 at the roof's edge, 2 on the middle line.
     pub(super) fn cabin_at(&self, x_m: f64, v: f64, side: f64) -> DVec3 {
         let x = x_m / self.kind.length_m;
-        let (belt_m, top_m) = (self.kind.belt_m(x), self.kind.middle_line_m(x));
+        let belt_m = self.kind.belt_m(x);
+        let top_m = self.kind.middle_line_m(x);
         let half_m = 0.97 * self.half_width_m(x);
         // The roof's crown is 12 % of the cabin's height above its edge.
         let cabin_m = (top_m - belt_m).max(0.0);
@@ -297,7 +299,8 @@ impl Car {
 
     /// The shaded ground between the wheels, 2 cm above the road.
     fn shade_below(&self, painter: &mut Painter) {
-        let (half_m, length_m) = (0.5 * self.kind.width_m, self.kind.length_m);
+        let half_m = 0.5 * self.kind.width_m;
+        let length_m = self.kind.length_m;
         let xs = painter.even(0.02, length_m - 0.02, 0.26);
         let ys = painter.even(-half_m + 0.02, half_m - 0.02, 0.26);
         painter.sheet(

@@ -54,12 +54,15 @@ fn bar(painter: &mut Painter, from: [f64; 3], to: [f64; 3], radius_m: f64, paint
 
 fn frame(painter: &mut Painter) {
     let [rear, front] = AXLES_M.map(|x_m| [x_m, 0.0, WHEEL_M]);
-    let (pedals, saddle, head) = ([-0.05, 0.0, 0.30], [-0.22, 0.0, 0.92], [0.38, 0.0, 0.86]);
+    let pedals = [-0.05, 0.0, 0.30];
+    let saddle = [-0.22, 0.0, 0.92];
+    let head = [0.38, 0.0, 0.86];
     for (from, to) in
         [(rear, pedals), (rear, saddle), (pedals, saddle), (pedals, head), (front, head)]
     {
         bar(painter, from, to, 0.020, FRAME);
     }
+    // Top tube, stem and saddle; then both halves of the handlebar.
     bar(painter, [-0.21, 0.0, 0.80], head, 0.020, FRAME);
     bar(painter, head, [0.36, 0.0, 1.04], 0.016, RUBBER);
     bar(painter, [-0.36, 0.0, 0.95], [-0.12, 0.0, 0.95], 0.045, RUBBER);
@@ -70,6 +73,7 @@ fn frame(painter: &mut Painter) {
 
 /// Legs on the pedals, trunk, arms to the handlebar, and head with helmet.
 fn rider(painter: &mut Painter) {
+    // The feet are on opposite sides of the pedals' axle, which is at (-0.05, 0.30).
     for (side, knee, foot) in
         [(1.0, [0.18, 0.80], [0.05, 0.46]), (-1.0, [0.10, 0.60], [-0.14, 0.18])]
     {
@@ -90,6 +94,7 @@ fn rider(painter: &mut Painter) {
             SHOES,
         );
         let rings: [Ring; 4] = [
+            // An arm, from the shoulder to the grip at (0.30, 0.27, 1.06).
             ring(0.10, 0.17 * side, 1.40, 0.050, 0.060),
             ring(0.16, 0.22 * side, 1.24, 0.046, 0.050),
             ring(0.22, 0.25 * side, 1.14, 0.040, 0.043),
@@ -107,6 +112,7 @@ fn rider(painter: &mut Painter) {
     ];
     tube(painter, &rings, |_| COAT);
     let rings: [Ring; 6] = [
+        // Neck and head; from 1.62 m up it is the helmet.
         ring(0.13, 0.0, 1.47, 0.054, 0.056),
         ring(0.17, 0.0, 1.53, 0.060, 0.078),
         ring(0.17, 0.0, 1.60, 0.076, 0.098),

@@ -10,11 +10,10 @@ use super::surface::{Paint, Painter};
 pub(super) struct Wall {
     /// Left lower corner as seen from outside, in metres.
     pub(super) corner_m: DVec3,
-    /// Unit, to the right.
+    /// Unit vector along the wall, to the right as seen from outside.
     pub(super) right: DVec3,
-    /// Unit, outwards.
+    /// Unit vector out of the wall, towards the viewer.
     pub(super) out: DVec3,
-    /// Width, in metres.
     pub(super) width_m: f64,
 }
 
@@ -153,7 +152,8 @@ impl Facade<'_, '_, '_> {
     /// Wall of a bay around an opening: it ends behind the surround, so that it does not blur the
     /// opening's edge.
     pub(super) fn around(&mut self, u_m: f64, u: [f64; 2], v_m: [f64; 2], v: [f64; 2]) {
-        let [left_m, right_m] = [u[0] - HIDDEN_M, u[1] + HIDDEN_M];
+        let left_m = u[0] - HIDDEN_M;
+        let right_m = u[1] + HIDDEN_M;
         self.pier([u_m, left_m], v_m);
         self.pier([right_m, u_m + self.bay_m], v_m);
         if v[0] > v_m[0] {
@@ -243,7 +243,8 @@ impl Facade<'_, '_, '_> {
     /// Frame and panes in an opening.
     fn window(&mut self, u: [f64; 2], v: [f64; 2], random: &mut Random) {
         let frame = self.style.frame;
-        let (rim_m, depth_m) = (0.065, -RECESS_M);
+        let rim_m = 0.065;
+        let depth_m = -RECESS_M;
         let middle_m = 0.5 * (u[0] + u[1]);
         let transom_m = v[1] - 0.30 * (v[1] - v[0]);
         let verticals = [u[0] + 0.5 * rim_m, middle_m, u[1] - 0.5 * rim_m];
@@ -292,7 +293,8 @@ impl Facade<'_, '_, '_> {
 
     /// A balcony in front of a window: slab, rails, and plants in a box.
     fn balcony(&mut self, middle_m: f64, floor_m: f64) {
-        let (half_m, deep_m) = ((0.42 * self.bay_m).min(1.3), 0.95);
+        let half_m = (0.42 * self.bay_m).min(1.3);
+        let deep_m = 0.95;
         let u = [middle_m - half_m, middle_m + half_m];
         // Slab, its lower side, upper rail, bars, and both ends.
         let stone = self.style.trim;
@@ -319,13 +321,15 @@ impl Facade<'_, '_, '_> {
 
     /// Bands across the whole wall: plinth line above the ground floor, cornice below the eaves.
     fn bands(&mut self) {
-        let (width_m, top_m) = (self.wall.width_m, self.style.height_m());
+        let width_m = self.wall.width_m;
+        let top_m = self.style.height_m();
         let trim = self.style.trim;
         let us = self.painter.even(0.0, width_m, 0.6);
         let band = [GROUND_FLOOR_M - 0.16, GROUND_FLOOR_M - 0.03, GROUND_FLOOR_M + 0.10];
         self.rect(&us, &band, 0.09, |_, v_m| trim.times(0.8 + 0.2 * smooth((v_m - band[0]) / 0.1)));
         let base_m = top_m - CORNICE_M;
-        let (mould, lip) = ([base_m, base_m + 0.12, base_m + 0.24], [base_m + 0.24, top_m]);
+        let mould = [base_m, base_m + 0.12, base_m + 0.24];
+        let lip = [base_m + 0.24, top_m];
         self.rect(&us, &mould, 0.10, |_, _| trim.times(0.86));
         self.rect(&us, &lip, 0.34, |_, _| trim);
         let wall = *self.wall;

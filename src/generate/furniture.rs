@@ -19,6 +19,7 @@ pub(super) fn lamp(painter: &mut Painter, foot_m: DVec3, towards_road: DVec3) {
     let along = towards_road.cross(DVec3::Z);
     // The lamp's head hangs over the road.
     let head_size_m = DVec3::new(0.13, 0.34, 0.09);
+    // A block has four sides and a lid: the glowing patch is its bottom, and looks down.
     let glow = Patch {
         center_m: head_m + 0.30 * towards_road - 0.012 * DVec3::Z,
         edge_u_m: 0.5 * towards_road,
@@ -70,6 +71,7 @@ fn traffic_light_head(painter: &mut Painter, base_m: DVec3, facing: DVec3, green
             let axes = DMat3::from_cols(right, DVec3::Z, right.cross(DVec3::Z));
             let rgb = DVec3::new(r, g, b);
             let sigmas_m = DVec3::new(0.14, 0.14, 0.02);
+            // A halo in front of the lamp: wide, flat and half transparent.
             let at_m = center_m + 0.12 * facing;
             painter.gaussian(at_m, DQuat::from_mat3(&axes), sigmas_m, 0.51, rgb, DVec3::ZERO);
         }
@@ -88,7 +90,7 @@ pub(super) fn sign(painter: &mut Painter, foot_m: DVec3, facing: DVec3) {
     });
 }
 
-/// A litter bin.
+/// A litter bin, 0.95 m high with its rim.
 pub(super) fn bin(painter: &mut Painter, foot_m: DVec3) {
     let green = Paint::matt(0.17, 0.30, 0.24);
     tube(painter, [foot_m, foot_m + 0.85 * DVec3::Z], 0.21, green);
@@ -113,6 +115,7 @@ pub(super) fn planter(
 ) {
     let concrete = Paint::matt(0.62, 0.61, 0.58);
     block(painter, base_m, along, DVec3::new(half_m, 0.32, 0.5), concrete);
+    // Within the box of 0.32 m and 0.5 m height: the hedge begins 8 cm below its rim.
     let size_m = DVec3::new(half_m - 0.05, 0.30, 0.75);
     painter.labelled(SemanticClass::Vegetation, |painter| {
         plants::hedge(painter, base_m + 0.42 * DVec3::Z, along, size_m, random);
@@ -147,7 +150,8 @@ fn block(painter: &mut Painter, base_m: DVec3, along: DVec3, size_m: DVec3, pain
     let corners = [corner(-1.0, -1.0), corner(1.0, -1.0), corner(1.0, 1.0), corner(-1.0, 1.0)];
     let vs = painter.graded(0.0, size_m.z, 0.10, 0.22);
     for side in 0..4 {
-        let (from_m, to_m) = (corners[side], corners[(side + 1) % 4]);
+        let from_m = corners[side];
+        let to_m = corners[(side + 1) % 4];
         let width_m = from_m.distance(to_m);
         let right = (to_m - from_m) / width_m;
         let us = painter.graded(0.0, width_m, 0.10, 0.24);
@@ -158,7 +162,8 @@ fn block(painter: &mut Painter, base_m: DVec3, along: DVec3, size_m: DVec3, pain
             |_, v_m| Some(paint.open(0.75 + 0.25 * (v_m / size_m.z))),
         );
     }
-    let (us, vs) = ([-1.0, -0.4, 0.4, 1.0], [-1.0, 0.0, 1.0]);
+    let us = [-1.0, -0.4, 0.4, 1.0];
+    let vs = [-1.0, 0.0, 1.0];
     let lid = |i: f64, j: f64| corner(i, j) + size_m.z * DVec3::Z;
     painter.sheet(&us, &vs, lid, |_, _| Some(paint));
 }

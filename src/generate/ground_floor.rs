@@ -19,12 +19,14 @@ const GOODS: [Paint; 7] = [
 ];
 
 impl Facade<'_, '_, '_> {
-    /// A bay with the house's door, two steps and a lamp.
+    /// A bay with the house's door, a step and a lamp.
     pub(super) fn door_bay(&mut self, u_m: f64) {
+        // In a narrow bay the door takes 60 % of the width.
         let half_m = 0.65_f64.min(0.3 * self.bay_m);
         let middle_m = u_m + 0.5 * self.bay_m;
         let u = [middle_m - half_m, middle_m + half_m];
-        let (door_m, light_m) = (2.35, 3.0);
+        let door_m = 2.35;
+        let light_m = 3.0;
         self.around(u_m, u, [0.0, GROUND_FLOOR_M], [0.0, light_m]);
         self.surround(u, [0.30, light_m]);
         let wood = self.style.accent.times(0.75);
@@ -46,6 +48,7 @@ impl Facade<'_, '_, '_> {
         let wall = *self.wall;
         let us = self.painter.even(u[0] - 0.15, u[1] + 0.15, 0.3);
         let top = move |at_m: f64, d_m: f64| wall.at(at_m, 0.15, -d_m);
+        // From the front edge towards the wall, so that the normal points up.
         self.painter.sheet(&us, &[-0.45, -0.2, 0.1], top, |_, _| Some(step));
         self.rect(&us, &[0.0, 0.15], 0.45, |_, _| step.times(0.9).open(0.7));
         let lamp = Patch {
@@ -61,7 +64,9 @@ impl Facade<'_, '_, '_> {
         let accent = self.style.accent;
         let pier_m = 0.22;
         let u = [u_m + pier_m, u_m + self.bay_m - pier_m];
-        let (plinth_m, head_m, sign_m) = (0.45, 2.75, 3.45);
+        let plinth_m = 0.45;
+        let head_m = 2.75;
+        let sign_m = 3.45;
         self.pier([u_m, u[0]], [0.0, GROUND_FLOOR_M]);
         self.pier([u[1], u_m + self.bay_m], [0.0, GROUND_FLOOR_M]);
         self.plain(u, [sign_m, GROUND_FLOOR_M]);
@@ -117,7 +122,9 @@ impl Facade<'_, '_, '_> {
     fn sign(&mut self, u: [f64; 2], v: [f64; 2], random: &mut Random) {
         let accent = self.style.accent;
         let name = random.pick(&letters::NAMES);
+        // Names are ASCII: a byte is a letter.
         let count = name.len() as f64;
+        // Long names fill the sign; short ones keep the letters at their usual width.
         let pitch_m = (0.92 * (u[1] - u[0]) / count).min(0.34);
         let us = self.painter.even(u[0], u[1], 0.2);
         let edge_m = 0.04;
@@ -132,6 +139,8 @@ impl Facade<'_, '_, '_> {
         let wall = *self.wall;
         let wide_m = 0.62 * pitch_m;
         let high_m = 0.38;
+        // A letter is 0.62 of the pitch wide, and the gap of 0.38 after the last one does not
+        // count.
         let from = [0.5 * (u[0] + u[1] - pitch_m * (count - 0.38)), 0.5 * (v[0] + v[1] - high_m)];
         for (index, letter) in name.chars().enumerate() {
             let left_m = from[0] + pitch_m * index as f64;
@@ -149,6 +158,8 @@ impl Facade<'_, '_, '_> {
         // From the outer edge up to the wall, so that the normal points out and up.
         let out = self.painter.even(0.0, 1.0, 0.2);
         let slope = move |at_m: f64, t: f64| wall.at(at_m, v_m - 0.40 + 0.40 * t, 1.1 * (1.0 - t));
+        // Stripes count from the first column: a negative quotient would round towards 0 and make
+        // the stripe there twice as wide.
         let first_m = us[0];
         let cloth = |at_m: f64| {
             let light = ((at_m - first_m) / 0.32) as i64 % 2 == 0;

@@ -211,7 +211,8 @@ impl CitySettings {
         // The segment around the number; beyond the ends of the list the outer segments go on.
         let above = counted.iter().rposition(|(millions, _)| *millions <= self.millions_per_km);
         let from = above.unwrap_or(0).min(counted.len() - 2);
-        let [(low, low_density), (high, high_density)] = [counted[from], counted[from + 1]];
+        let (low, low_density) = counted[from];
+        let (high, high_density) = counted[from + 1];
         let t = (self.millions_per_km - low) / (high - low);
         low_density + t * (high_density - low_density)
     }

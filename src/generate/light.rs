@@ -32,12 +32,7 @@ pub(super) enum Occluder {
         size_m: DVec3,
     },
     /// A tree's crown, which lets some light through.
-    Crown {
-        /// Middle, in metres.
-        center_m: DVec3,
-        /// Radius, in metres.
-        radius_m: f64,
-    },
+    Crown { center_m: DVec3, radius_m: f64 },
 }
 
 /// The sun, the sky, and the objects that cast shadows.
@@ -76,11 +71,13 @@ impl Light {
         let rows = (last_cell[1] - first_cell[1] + 1) as usize;
         let mut cells = vec![Vec::new(); columns * rows];
         for (index, [low_m, high_m]) in reaches.into_iter().enumerate() {
-            let (low, high) = (cell_index(low_m), cell_index(high_m));
+            let low = cell_index(low_m);
+            let high = cell_index(high_m);
             // Into every cell that its box touches: a point is looked up in one cell only.
             for row in low[1]..=high[1] {
                 for column in low[0]..=high[0] {
-                    let (row, column) = (row - first_cell[1], column - first_cell[0]);
+                    let row = row - first_cell[1];
+                    let column = column - first_cell[0];
                     cells[row as usize * columns + column as usize].push(index as u32);
                 }
             }
@@ -115,7 +112,8 @@ impl Light {
         // own does.
         let shadow_m = on_ground(point_m);
         let cell = cell_index(shadow_m);
-        let (column, row) = (cell[0] - self.first_cell[0], cell[1] - self.first_cell[1]);
+        let column = cell[0] - self.first_cell[0];
+        let row = cell[1] - self.first_cell[1];
         // A row beyond the last is caught by `get`; a column would be taken for one of the
         // next row.
         if column < 0 || row < 0 || column >= self.columns as i64 {
@@ -144,12 +142,14 @@ impl Occluder {
                 ];
                 // The slab method (Kay and Kajiya 1986): the ray is within the box between the last
                 // entry and the first exit.
-                let (mut enter_m, mut leave_m) = (0.0_f64, f64::INFINITY);
+                let mut enter_m = 0.0_f64;
+                let mut leave_m = f64::INFINITY;
                 for (position_m, slope, low_m, high_m) in slabs {
                     // A ray parallel to a slab never leaves it: a tiny slope puts entry and
                     // exit far away.
                     let slope = if slope.abs() < 1e-9 { 1e-9 } else { slope };
-                    let (a_m, b_m) = ((low_m - position_m) / slope, (high_m - position_m) / slope);
+                    let a_m = (low_m - position_m) / slope;
+                    let b_m = (high_m - position_m) / slope;
                     enter_m = enter_m.max(a_m.min(b_m));
                     leave_m = leave_m.min(a_m.max(b_m));
                 }

@@ -77,7 +77,8 @@ impl MappedStreet<'_> {
     /// leave it out.
     fn add_strip(&self, map: &mut MapFile, index: usize, is_last: bool, strip: &Strip) {
         let [from_m, to_m] = self.route.driven_m;
-        let [before_m, after_m] = [self.crossing_m - STOP_M[1], self.crossing_m + STOP_M[1]];
+        let before_m = self.crossing_m - STOP_M[1];
+        let after_m = self.crossing_m + STOP_M[1];
         // Before, in and after the intersection: a lane of the map lies in it or does not.
         let parts = [[from_m, before_m], [before_m, after_m], [after_m, to_m]];
         let id = |street: usize, side: &str, part: usize| {
@@ -90,12 +91,12 @@ impl MappedStreet<'_> {
             }
             let drives = strip.kind == LaneKind::Driving;
             // Eastwards in the right lane, to the right of the centre line.
-            let next = match part {
+            let following = match part {
                 2 if is_last => None,
                 2 => Some(id(index + 1, "right", 0)),
                 _ => Some(id(index, "right", part + 1)),
             };
-            let next = next.into_iter().filter(|_| drives).collect();
+            let next = following.into_iter().filter(|_| drives).collect();
             // The right side of the street runs with s, so its left edge is the inner one.
             let edges_m = [-strip.inner_m, -strip.middle_m, -strip.outer_m];
             let [left, center, right] = edges_m.map(|t_m| self.line(span_m, t_m, strip.height_m));
@@ -112,12 +113,12 @@ impl MappedStreet<'_> {
                 limit_mps,
             });
             // And back.
-            let next = match (part, index) {
+            let following = match (part, index) {
                 (0, 0) => None,
                 (0, _) => Some(id(index - 1, "left", 2)),
                 _ => Some(id(index, "left", part - 1)),
             };
-            let next = next.into_iter().filter(|_| drives).collect();
+            let next = following.into_iter().filter(|_| drives).collect();
             let edges_m = [strip.inner_m, strip.middle_m, strip.outer_m];
             // Against s: the same points in the opposite order.
             let [left, center, right] = edges_m.map(|t_m| {

@@ -38,6 +38,7 @@ impl Tree {
 
     /// Paints trunk, branches and leaves.
     pub(super) fn paint(&self, painter: &mut Painter) {
+        // A copy, so that a tree that is painted again is the same.
         let mut random = self.random.clone();
         let bark = Paint::matt(0.40, 0.34, 0.28).times(random.range(0.85, 1.2));
         let top_m = self.foot_m + self.trunk_m * DVec3::Z;
@@ -122,6 +123,7 @@ impl Foliage {
             let mean_m = middle_m + depth * away * radii_m;
             // Leaves face in random directions, mostly outwards and up.
             let normal = (away + 0.9 * ball(random) + 0.4 * DVec3::Z).normalize_or(DVec3::Z);
+            // Leaves deep in a clump are darker.
             let tone = random.range(0.72, 1.28) * (0.5 + 0.5 * depth);
             let mut paint = green.times(tone);
             paint.rgb.x *= random.range(0.82, 1.18);
@@ -131,6 +133,8 @@ impl Foliage {
             let sigmas_m = DVec3::new(1.4 * size_m, size_m, 0.012);
             let turn_rad = random.range(0.0, std::f64::consts::PI);
             let rotation =
+                // First a turn within the leaf's plane: the arc alone would align all leaves of one
+                // normal.
                 DQuat::from_rotation_arc(DVec3::Z, normal) * DQuat::from_rotation_z(turn_rad);
             painter.gaussian(mean_m, rotation, sigmas_m, 0.93, rgb, DVec3::ZERO);
         }

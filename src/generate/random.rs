@@ -6,8 +6,10 @@ use wildcity_scene::random::{mix, to_unit};
 /// Smooth noise over the plane, in [-1, 1], one lattice cell per unit: hashed corners, blended
 /// with `3t² - 2t³`.
 pub(super) fn noise(seed: u64, x: f64, y: f64) -> f64 {
-    let (column, row) = (x.floor(), y.floor());
-    let (tx, ty) = (smooth(x - column), smooth(y - row));
+    let column = x.floor();
+    let row = y.floor();
+    let tx = smooth(x - column);
+    let ty = smooth(y - row);
     let corner = |i: f64, j: f64| {
         // Two rounds of the hash, or points of one diagonal would share their value.
         let key = mix(seed ^ ((column + i) as i64 as u64)) ^ ((row + j) as i64 as u64);
@@ -31,7 +33,8 @@ mod tests {
     #[test]
     fn noise_is_continuous_across_lattice_lines() {
         for i in -5..5 {
-            let (x, y) = (f64::from(i), 0.37 * f64::from(i));
+            let x = f64::from(i);
+            let y = 0.37 * f64::from(i);
             assert!((noise(3, x - 1e-9, y) - noise(3, x + 1e-9, y)).abs() < 1e-6);
             assert!(noise(3, x + 0.3, y).abs() <= 1.0);
         }

@@ -56,7 +56,8 @@ pub(super) fn paint(
     let drive = route.driven_m;
     // The stretches with zebra and stop line before and after the crossing, ascending in s.
     let [approach, leave] = [-1.0, 1.0].map(|side| {
-        let (near, far) = (cross_s_m + side * ZEBRA_M[0], cross_s_m + side * STOP_M[1]);
+        let near = cross_s_m + side * ZEBRA_M[0];
+        let far = cross_s_m + side * STOP_M[1];
         [near.min(far), near.max(far)]
     });
     ground.lanes(painter, drive[0], approach[0]);
@@ -106,7 +107,8 @@ impl Ground<'_> {
             .collect();
         // A dash is six cells long; the phase holds from one stretch to the next.
         let cell_m = (painter.even(0.0, DASH_M, DASH_M / 6.0)[1]).min(DASH_M);
-        let (first, last) = ((from_s_m / cell_m).ceil(), (to_s_m / cell_m).floor());
+        let first = (from_s_m / cell_m).ceil();
+        let last = (to_s_m / cell_m).floor();
         let mut ss = vec![from_s_m];
         ss.extend((first as i64..=last as i64).map(|i| i as f64 * cell_m));
         // Not closer to an end than 0.3 cells: no sliver there.
@@ -129,8 +131,9 @@ impl Ground<'_> {
 
     /// Positions of manholes: one every 31 m, next to the wheel tracks of either lane.
     fn covers(&self) -> impl Iterator<Item = (f64, f64)> + use<> {
-        let (seed, cross_s_m, [from_m, to_m]) =
-            (self.covers_seed, self.cross_s_m, self.route.driven_m);
+        let seed = self.covers_seed;
+        let cross_s_m = self.cross_s_m;
+        let [from_m, to_m] = self.route.driven_m;
         (0..((to_m - from_m) / 31.0) as usize).filter_map(move |index| {
             let mut random = Random::new(seed, "manhole", index);
             let s_m = from_m + 31.0 * (index as f64 + random.range(0.2, 0.8));
@@ -174,7 +177,8 @@ impl Ground<'_> {
             let mut places_m = Vec::new();
             for _ in 0..6 + random.below(9) {
                 places_m.push(self.route.at(s_m).beside(t_m, 0.012));
-                let [ahead_m, aside_m] = [random.range(0.25, 0.4), random.range(-0.14, 0.14)];
+                let ahead_m = random.range(0.25, 0.4);
+                let aside_m = random.range(-0.14, 0.14);
                 let [ds_m, dt_m] = if along { [ahead_m, aside_m] } else { [aside_m, ahead_m] };
                 (s_m, t_m) = (s_m + ds_m, t_m + dt_m);
                 if t_m.abs() > LANES_M - 0.25 || (t_m.abs() < 0.2) {
@@ -266,7 +270,8 @@ impl Ground<'_> {
             Some(stone(s_m))
         });
         // The kerb faces the road.
-        let (along, up) = (oriented(side, stones), [0.0, 0.5 * PAVEMENT_M, PAVEMENT_M]);
+        let along = oriented(side, stones);
+        let up = [0.0, 0.5 * PAVEMENT_M, PAVEMENT_M];
         painter.sheet(
             &along,
             &up,
@@ -277,7 +282,8 @@ impl Ground<'_> {
 
     /// The pavement: slabs in slightly different tones with dark joints.
     fn slabs(&self, painter: &mut Painter, side: f64, from_s_m: f64, to_s_m: f64) {
-        let (near_m, far_m) = (KERB_M + KERB_STONE_M, FRONT_M);
+        let near_m = KERB_M + KERB_STONE_M;
+        let far_m = FRONT_M;
         let slab = |s_m: f64, t_m: f64| {
             let tone = noise(self.seed + 8, (s_m / SLAB_M).floor(), (t_m / SLAB_M).floor());
             let dirt = 0.04 * noise(self.seed + 9, 0.8 * s_m, 0.8 * t_m);

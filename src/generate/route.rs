@@ -52,9 +52,9 @@ pub(super) struct Bends {
 /// A sine wave of the heading.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Wave {
-    /// Amplitude, in radians.
+    /// Largest turn of the heading to either side, in radians.
     pub(super) swing_rad: f64,
-    /// Period, in metres.
+    /// Arc length of a whole wave, in metres.
     pub(super) period_m: f64,
     /// Phase at s = 0, in radians.
     pub(super) phase_rad: f64,
@@ -211,7 +211,7 @@ impl Wave {
 }
 
 impl Default for Wave {
-    /// A straight street.
+    /// No turn: the street is straight. A period of 0 would divide by 0.
     fn default() -> Self {
         Self { swing_rad: 0.0, period_m: 1.0, phase_rad: 0.0 }
     }
@@ -227,7 +227,8 @@ mod tests {
         assert_eq!(route.at(0.0).point_m, DVec3::ZERO);
         for i in -100..700 {
             let s_m = 0.5 * f64::from(i) + 0.1;
-            let (before, after) = (route.at(s_m - 0.05), route.at(s_m + 0.05));
+            let before = route.at(s_m - 0.05);
+            let after = route.at(s_m + 0.05);
             let step_m = after.point_m - before.point_m;
             assert!((step_m.length() - 0.1).abs() < 1e-6, "at {s_m}");
             assert!((step_m / 0.1 - route.at(s_m).forward).length() < 1e-4, "at {s_m}");
@@ -249,7 +250,8 @@ mod tests {
         assert!(drive.length_m() > 250.0, "{} m", drive.length_m());
         assert_eq!(drive.check(), Ok(()));
         for pair in drive.keyframes.windows(2) {
-            let [from, to] = [pair[0].world_from_rig, pair[1].world_from_rig];
+            let from = pair[0].world_from_rig;
+            let to = pair[1].world_from_rig;
             let step_m = to.position_m - from.position_m;
             assert!((step_m.length() - 0.5).abs() < 1e-3, "{step_m}");
             assert!((step_m.normalize() - from.rotation * DVec3::X).length() < 3e-3);

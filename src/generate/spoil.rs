@@ -47,7 +47,7 @@ const MOVED: f64 = 0.014;
 /// Largest change of a colour (1 is white) from the plane to its normal; the smallest is
 /// [`TINT_LEAST`] of it.
 const TINT: f64 = 4.0;
-/// See [`TINT`].
+/// Smallest change of a colour, as a share of the largest one, [`TINT`].
 const TINT_LEAST: f64 = 0.4;
 /// Share of the change that is equal in all three channels; the rest is drawn for each channel.
 const TINT_GREY: f64 = 0.8;
@@ -56,7 +56,7 @@ const TINT_PATCH: f64 = 0.9;
 /// Share of the Gaussians that are needles along the ray, up to [`NEEDLE_LENGTH`] times as long as
 /// they were wide.
 const NEEDLES: f64 = 0.05;
-/// See [`NEEDLES`].
+/// Length of the longest needle, in widths of the Gaussian that it is made of.
 const NEEDLE_LENGTH: f64 = 4.0;
 /// Number of floating sheets per Gaussian.
 const SHEETS: f64 = 0.06;
@@ -128,7 +128,8 @@ impl Spoil {
 
     /// Indices of a range of camera positions that contains the nearest one of each point.
     fn near(&self, means_m: &[[f64; 3]]) -> Range<usize> {
-        let [mut low_m, mut high_m] = [DVec3::INFINITY, DVec3::NEG_INFINITY];
+        let mut low_m = DVec3::INFINITY;
+        let mut high_m = DVec3::NEG_INFINITY;
         for mean_m in means_m {
             let mean_m = DVec3::from_array(*mean_m);
             (low_m, high_m) = (low_m.min(mean_m), high_m.max(mean_m));

@@ -178,11 +178,13 @@ fn furnish(painter: &mut Painter, route: &Route, crossing_m: f64, seed: u64) {
 /// ends; at an open end, the distance to the next street's first station is the same.
 fn along(route: &Route, step_m: f64) -> impl Iterator<Item = f64> + use<> {
     // 14 m at the start, 10 m at the end; at an open end half a step.
-    let [clear, ends] = [[14.0, 10.0], route.ends_m];
+    let clear = [14.0, 10.0];
+    let ends = route.ends_m;
     let clear_m = |end: usize| if route.closed[end] { clear[end] } else { 0.5 * step_m };
-    let (from_m, to_m) = (ends[0] + clear_m(0), ends[1] - clear_m(1));
-    let count = ((to_m - from_m) / step_m) as usize;
+    let from_m = ends[0] + clear_m(0);
+    let to_m = ends[1] - clear_m(1);
+    let steps = ((to_m - from_m) / step_m) as usize;
     // Half a step from either end there is one station more than steps between them.
-    let count = if route.closed[1] { count } else { count + 1 };
+    let count = if route.closed[1] { steps } else { steps + 1 };
     (0..count).map(move |i| from_m + step_m * i as f64)
 }

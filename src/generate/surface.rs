@@ -62,7 +62,7 @@ impl Paint {
         Self { open: self.open * open, ..self }
     }
 
-    /// A light source.
+    /// A light source: its colour is the same in sun and shade.
     pub(super) const fn glowing(r: f64, g: f64, b: f64) -> Self {
         Self { glows: true, ..Self::matt(r, g, b) }
     }
@@ -71,7 +71,6 @@ impl Paint {
 /// A flat patch: a parallelogram with its outward normal `edge_u x edge_v`.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Patch {
-    /// Middle, in metres.
     pub(super) center_m: DVec3,
     /// The whole edge along u, in metres.
     pub(super) edge_u_m: DVec3,
@@ -121,7 +120,8 @@ impl<'a> Painter<'a> {
     /// Break points with as many cells between two of them as the detail asks for.
     pub(super) fn refined(&self, points: &[f64]) -> Vec<f64> {
         let between = |pair: &[f64]| {
-            let [from, to] = [pair[0], pair[1]];
+            let from = pair[0];
+            let to = pair[1];
             // The first point of each pair and those between; the last of all is added below.
             (0..self.detail).map(move |k| from + (to - from) * k as f64 / self.detail as f64)
         };
@@ -150,6 +150,7 @@ impl<'a> Painter<'a> {
     /// Paints what `draw` paints as Gaussians of a class, if the canvas has classes.
     pub(super) fn labelled(&mut self, class: SemanticClass, draw: impl FnOnce(&mut Self)) {
         let around = self.class;
+        // `None` stays `None`: a canvas without classes gets none here.
         self.class = around.map(|_| class);
         draw(self);
         self.class = around;
@@ -164,13 +165,15 @@ impl<'a> Painter<'a> {
 
     /// `from` to `to`, in steps of `edge_m` at both ends that grow to `most_m` between.
     pub(super) fn graded(&self, from_m: f64, to_m: f64, edge_m: f64, most_m: f64) -> Vec<f64> {
-        let (edge_m, most_m) = (edge_m * self.spacing, most_m * self.spacing);
+        let edge_m = edge_m * self.spacing;
+        let most_m = most_m * self.spacing;
         let half_m = 0.5 * (to_m - from_m);
         // Too short for two graded ends.
         if half_m < 0.8 * edge_m {
             return vec![from_m, to_m];
         }
-        let (mut reached_m, mut step_m) = (0.0, edge_m);
+        let mut reached_m = 0.0;
+        let mut step_m = edge_m;
         let mut ends_m = vec![0.0];
         // From one end to the middle; less than 0.3 of a step is left to the stretch below.
         while reached_m < half_m - 0.3 * step_m {
@@ -223,15 +226,21 @@ impl<'a> Painter<'a> {
         let along = edge_u_m.normalize_or_zero();
         let across = normal.cross(along);
         // In the basis (along, across): u = (a, 0), v = (shear, b).
-        let (a, b, shear) = (edge_u_m.length(), edge_v_m.dot(across), edge_v_m.dot(along));
+        let a = edge_u_m.length();
+        let b = edge_v_m.dot(across);
+        let shear = edge_v_m.dot(along);
         let has_area = a > 2e-3 && b > 2e-3;
         if !has_area {
             return;
         }
-        let (xx, xy, yy) = (a * a + shear * shear, shear * b, b * b);
+        let xx = a * a + shear * shear;
+        let xy = shear * b;
+        let yy = b * b;
         // Eigenvalues of [xx xy; xy yy]: half the trace plus and minus this.
         let apart = (0.5 * (xx - yy)).hypot(xy);
-        let (major, minor) = (0.5 * (xx + yy) + apart, (0.5 * (xx + yy) - apart).max(1e-6));
+        let major = 0.5 * (xx + yy) + apart;
+        // The difference may round to 0 or below, which has no root and no logarithm.
+        let minor = (0.5 * (xx + yy) - apart).max(1e-6);
         // The angle of the major axis: tan 2a = 2 xy/(xx - yy).
         let (sin, cos) = (0.5 * (2.0 * xy).atan2(xx - yy)).sin_cos();
         let axes = DMat3::from_cols(cos * along + sin * across, cos * across - sin * along, normal);
@@ -286,8 +295,10 @@ impl<'a> Painter<'a> {
         paint: Paint,
     ) {
         let along_m = ends_m[1] - ends_m[0];
-        let (along, center_m) = (along_m.normalize_or_zero(), 0.5 * (ends_m[0] + ends_m[1]));
+        let along = along_m.normalize_or_zero();
+        let center_m = 0.5 * (ends_m[0] + ends_m[1]);
         let across = normal.cross(along).normalize_or_zero();
+        // Ends in one place, or a line along the normal, have no direction across.
         if across == DVec3::ZERO || width_m < 1e-3 {
             return;
         }

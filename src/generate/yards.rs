@@ -30,6 +30,7 @@ pub(super) fn paint(painter: &mut Painter, route: &Route, crossing_m: f64, seed:
         let mut index = 0;
         for [from_m, to_m] in stretches.into_iter().filter(|[from_m, to_m]| to_m - from_m > YARD_M)
         {
+            // At least one: shorter stretches are left out above.
             let count = ((to_m - from_m) / YARD_M) as usize;
             let width_m = (to_m - from_m) / count as f64;
             for plot in 0..count {
@@ -86,6 +87,8 @@ impl Yard<'_> {
                 let ss = painter.even(self.s_m[0], self.s_m[1], step_m);
                 let mut depths_m: Vec<f64> = painter.even(from_m, to_m, step_m);
                 if self.side < 0.0 {
+                    // On the right, too, t is the distance to the left: with s along the street, it
+                    // faces up.
                     depths_m = depths_m.iter().rev().map(|away_m| -away_m).collect();
                 }
                 let place = |s_m: f64, t_m: f64| self.at(s_m, t_m * self.side, 0.0);
@@ -113,6 +116,7 @@ impl Yard<'_> {
         for sign in [1.0, -1.0] {
             let off = 0.02 * sign * along.cross(DVec3::Z);
             let place = |u_m: f64, v_m: f64| {
+                // The other side runs backwards, so that it faces the other way.
                 let along_m = if sign > 0.0 { u_m } else { length_m - u_m };
                 from_m + along_m * along + v_m * DVec3::Z + off
             };

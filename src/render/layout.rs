@@ -113,7 +113,7 @@ pub(super) struct Filtered {
     pub(super) xx: f64,
     /// Variance along y, in px².
     pub(super) yy: f64,
-    /// Determinant, in px⁴.
+    /// Determinant of the filtered covariance, in px⁴.
     pub(super) det: f64,
     /// Determinant before the blur of native pixels as a share of the one after it.
     pub(super) blur_share: f64,

@@ -127,6 +127,7 @@ impl Body<'_> {
     pub(crate) fn is_same(&self, other: &Self) -> bool {
         match (self.placed, other.placed) {
             (None, None) => true,
+            // Each placed chunk is a body of its own, even if two have the same pose.
             (Some(one), Some(other)) => std::ptr::eq(one, other),
             _ => false,
         }
@@ -235,6 +236,7 @@ fn by_body(scene: &Scene) -> Vec<ChunksOfBody<'_>> {
     let mut bodies: Vec<ChunksOfBody<'_>> = Vec::new();
     for (number, (body, chunk)) in chunks(scene).enumerate() {
         match bodies.last_mut() {
+            // The chunks of the twin come first, one after the other.
             Some(last) if last[0].1.is_same(&body) => last.push((number, body, chunk)),
             _ => bodies.push(vec![(number, body, chunk)]),
         }

@@ -75,6 +75,7 @@ impl<'a> SampledViews<'a> {
             views.iter().map(|view| sample_view(view, profile)).collect();
         let sampled = (0..).zip(&samples).filter_map(|(view, samples)| samples.and(Some(view)));
         let sampled: ViewSet = sampled.collect();
+        // Most frames have no small image.
         if sampled == ViewSet::default() {
             return Self { views: Cow::Borrowed(views), sampled };
         }
@@ -95,5 +96,6 @@ pub(crate) fn most_frequent<T: Copy + PartialEq>(samples: [T; 4]) -> T {
     let [first, ..] = samples;
     samples
         .into_iter()
+        // Strictly more, so that the first of equally frequent ones stays.
         .fold(first, |best, value| if count(value) > count(best) { value } else { best })
 }

@@ -56,7 +56,7 @@ pub struct StageOutputs {
 pub struct SplatOwner {
     /// Index of the first splat.
     pub first_splat: u32,
-    /// As in [`Target::instances`](crate::Target::instances).
+    /// The instance that [`Target::instances`](crate::Target::instances) shows of these splats.
     pub instance: u16,
     /// The class that [`Target::semantics`](crate::Target::semantics) shows of these splats.
     pub class: SemanticClass,

@@ -52,7 +52,7 @@ pub struct UnscentedView<'a> {
 /// A Gaussian on the image.
 #[derive(Clone, Copy, Debug)]
 pub struct Footprint {
-    /// Mean, in pixels.
+    /// Mean of the six projected points, in pixels.
     pub mean_px: DVec2,
     /// Columns of a square root of the covariance before the blur: `Σ column columnᵀ`, in pixels.
     pub root_px: [DVec2; 6],

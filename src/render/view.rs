@@ -269,10 +269,10 @@ impl View {
         let translation_world_m = last.position_m - first.position_m;
         // In the camera's own axes. The axis is the same in those of the first pose and of the
         // last.
-        let rotation = first.rotation.inverse() * last.rotation;
+        let turn = first.rotation.inverse() * last.rotation;
         // Take the quaternion of the rotation that has the smaller angle; the other has the
         // opposite sign.
-        let rotation = if rotation.w < 0.0 { -rotation } else { rotation };
+        let rotation = if turn.w < 0.0 { -turn } else { turn };
         let sine = rotation.xyz().length();
         Some(ShutterMotion {
             remaining,

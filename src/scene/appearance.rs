@@ -57,7 +57,7 @@ pub enum AppearanceError {
     /// An exposure coefficient outside -100 to 100.
     #[error("exposure.{field} is {value:?}; it must be a number from -100 to 100")]
     Exposure {
-        /// `matrix` or `offset`.
+        /// The field: `matrix` or `offset`.
         field: &'static str,
         value: f64,
     },
@@ -95,6 +95,7 @@ impl Exposure {
     ) -> Result<Self, AppearanceError> {
         let matrix = match (matrix, gain) {
             (Some(matrix), None) => matrix,
+            // Only a matrix is kept, so backends know one form of an exposure.
             (None, Some([r, g, b])) => [[r, 0.0, 0.0], [0.0, g, 0.0], [0.0, 0.0, b]],
             _ => return Err(AppearanceError::MatrixOrGain),
         };
@@ -249,6 +250,7 @@ impl Overlay {
         });
         let resized = resize(&premultiplied, to_width, to_height, FilterType::Triangle);
         let unpremultiplied = |&Rgba([r, g, b, a]): &Rgba<f32>| {
+            // A transparent pixel shows nothing, so its colour may be black.
             let scale = if a > 0.0 { 1.0 / a } else { 0.0 };
             let rgba = [r * scale, g * scale, b * scale, a];
             rgba.map(|value| (255.0 * value.clamp(0.0, 1.0)).round() as u8)

@@ -71,6 +71,7 @@ impl BoxTree {
         let mut found: Option<Extent> = None;
         let mut add = |extent: Extent| found = Some(found.map_or(extent, |all| all.with(extent)));
         let mut at = things.start;
+        // A range may reach beyond the list.
         let end = things.end.min(self.levels.first().map_or(0, Vec::len));
         while at < end {
             // The largest box that begins here and does not reach beyond the end.

@@ -292,7 +292,7 @@ impl Chunk {
         self.sh_degree
     }
 
-    /// Number of Gaussians.
+    /// Number of Gaussians, without the empty lanes of the last group.
     pub fn len(&self) -> usize {
         self.count
     }
@@ -429,7 +429,8 @@ impl LaneBounds {
                 let low_m = if drawable[lane] { mean_m[lane] } else { f32::INFINITY };
                 let high_m = if drawable[lane] { mean_m[lane] } else { f32::NEG_INFINITY };
                 let size_m = if drawable[lane] { scale_m[lane] } else { 0.0 };
-                let [min_m, max_m] = [&mut self.min_m[axis][lane], &mut self.max_m[axis][lane]];
+                let min_m = &mut self.min_m[axis][lane];
+                let max_m = &mut self.max_m[axis][lane];
                 *min_m = if low_m < *min_m { low_m } else { *min_m };
                 *max_m = if high_m > *max_m { high_m } else { *max_m };
                 let sigma_m = &mut self.sigma_m[lane];
@@ -706,9 +707,9 @@ impl Scene {
             return Cow::Borrowed(self);
         }
         let chunks = self.chunks.iter().enumerate().filter(|(chunk, _)| self.draws(*chunk, view));
-        let placed = self.placed.iter().filter(|placed| placed.views.contains(view));
+        let seen = self.placed.iter().filter(|placed| placed.views.contains(view));
         // Drawn by every view of a frame, whatever their number there.
-        let placed = placed.map(|placed| PlacedChunk { views: ViewSet::ALL, ..placed.clone() });
+        let placed = seen.map(|placed| PlacedChunk { views: ViewSet::ALL, ..placed.clone() });
         Cow::Owned(Self {
             chunks: chunks.map(|(_, chunk)| chunk.clone()).collect(),
             selection: None,
@@ -885,7 +886,8 @@ mod tests {
                 let off = again.ln_scales[index][axis] - raw.ln_scales[from][axis];
                 assert!(off.abs() < 1e-6, "{off}");
             }
-            let [was, is] = [raw.logit_opacities[from], again.logit_opacities[index]];
+            let was = raw.logit_opacities[from];
+            let is = again.logit_opacities[index];
             // A logit of 100 comes back as 30, where the inverse is clamped.
             assert!((was.clamp(-100.0, 30.0) - is).abs() < 1e-4, "{was} became {is}");
         }

@@ -205,7 +205,7 @@ impl Gaussians {
         }
     }
 
-    /// Number of Gaussians.
+    /// Number of Gaussians: the length of each column.
     pub fn len(&self) -> usize {
         self.means_m.len()
     }

@@ -322,6 +322,7 @@ impl ProfileOverrides {
             };
             let was = fields.insert(field.clone(), value.clone());
             let whole = serde_json::from_value(Value::Object(fields));
+            // The value that was there tells which type the field has.
             changed = whole.map_err(|_| {
                 bad(match was {
                     _ if !RenderProfile::KEYS.contains(&field.as_str()) => {

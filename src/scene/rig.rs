@@ -96,7 +96,7 @@ impl RigCamera {
 /// ```
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Rig {
-    /// Name, `[a-z0-9._-]+`.
+    /// Name of the rig, `[a-z0-9._-]+`.
     pub name: String,
     /// At least one camera.
     pub cameras: Vec<RigCamera>,
@@ -375,6 +375,7 @@ impl UnreadRig {
             cameras.push(camera);
             overlays.extend(overlay.map(|overlay| (index, overlay)));
             let pixels = overlays.iter().map(|(_, overlay)| overlay.pixels()).sum();
+            // From the headers alone: a rig with too many pixels is refused before one is decoded.
             check_overlay_pixels(pixels).map_err(at(&format!("{part}.overlay")))?;
         }
         if !is_name(&rig.name) {
@@ -394,6 +395,7 @@ impl UnreadRig {
             lidars.push(lidar);
         }
         let rig = Rig { name: rig.name, cameras, lidars };
+        // Each camera and each LiDAR was checked above; what is left concerns all of them.
         rig.check().map_err(|cause| {
             let part = if matches!(cause, RigError::Beams { .. }) { "lidars" } else { "cameras" };
             RigFieldError { part: part.to_owned(), cause }
@@ -449,6 +451,7 @@ impl RigCamera {
         let overlay = uri.map(|uri| UnreadOverlay::from_data_uri(uri, size_px)).transpose();
         let (appearance, overlay) = Appearance::new(fields.exposure, None, size_px)
             .and_then(|appearance| appearance.check(size_px).map(|()| appearance))
+            // An error of the overlay waits until the exposure has been checked.
             .and_then(|appearance| Ok((appearance, overlay?)))
             .map_err(|cause| {
                 let field = match &cause {

@@ -147,6 +147,7 @@ impl SemanticClass {
             ActorClass::Vehicle => Self::Vehicle,
             ActorClass::Pedestrian => Self::Person,
             ActorClass::Bicycle => Self::Bicycle,
+            // An actor may move, whatever it is: `Static` is for the scene.
             ActorClass::Object => Self::Dynamic,
         }
     }

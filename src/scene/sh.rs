@@ -8,12 +8,12 @@ use std::f64::consts::FRAC_PI_4;
 
 use glam::{DMat3, DVec3};
 
-/// Largest supported degree.
+/// Largest supported degree: 16 coefficients per channel.
 pub const MAX_DEGREE: u8 = 3;
 /// Largest accepted magnitude of a coefficient in a scene: a colour of 282, where 1 is white.
 pub const MAX_COEFFICIENT: f32 = 1e3;
 
-/// `½ √(1/π)`.
+/// `½ √(1/π)`, the basis function of degree 0.
 pub const C0: f64 = 0.282_094_791_773_878_14;
 /// `½ √(3/π)`: -y, z, -x.
 pub const C1: f64 = 0.488_602_511_902_919_9;
@@ -45,7 +45,9 @@ pub const fn coefficients(degree: u8) -> usize {
 /// The 16 basis functions up to degree 3 at a unit direction, in coefficient order.
 pub fn basis(direction: DVec3) -> [f64; 16] {
     let DVec3 { x, y, z } = direction;
-    let (xx, yy, zz) = (x * x, y * y, z * z);
+    let xx = x * x;
+    let yy = y * y;
+    let zz = z * z;
     [
         C0,
         -C1 * y,
@@ -182,9 +184,10 @@ mod tests {
                 ShRotation::new(matrix, degree).apply(&mut turned);
                 for step in 0..50 {
                     let t = f64::from(step);
-                    let d = DVec3::new((1.3 * t).sin(), (0.9 * t).cos(), (2.1 * t).sin());
-                    let d = d.normalize();
-                    let (seen, wanted) = (colour(&turned, matrix * d), colour(&plain, d));
+                    let away = DVec3::new((1.3 * t).sin(), (0.9 * t).cos(), (2.1 * t).sin());
+                    let d = away.normalize();
+                    let seen = colour(&turned, matrix * d);
+                    let wanted = colour(&plain, d);
                     let error = (seen - wanted).abs().max_element();
                     assert!(error < 1e-6, "degree {degree}, from {d}: {seen}, not {wanted}");
                 }

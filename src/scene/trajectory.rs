@@ -111,8 +111,8 @@ impl Trajectory {
             // place is the end of the segment before.
             if length_m > 0.0 {
                 // Foot of the perpendicular, as a share of the segment.
-                let share = (point_m - position_m(from)).dot(along_m) / along_m.length_squared();
-                let share = share.clamp(0.0, 1.0);
+                let foot = (point_m - position_m(from)).dot(along_m) / along_m.length_squared();
+                let share = foot.clamp(0.0, 1.0);
                 let distance_m = (position_m(from) + share * along_m).distance(point_m);
                 // Strictly nearer, so that the first of equal places stays.
                 if distance_m < nearest.distance_m {

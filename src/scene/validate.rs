@@ -39,7 +39,7 @@ pub enum Field {
     Scale(usize),
     /// Opacity before the sigmoid.
     Opacity,
-    /// Colour: coefficient, channel.
+    /// A coefficient of the colour, and its channel.
     Sh(usize, usize),
 }
 

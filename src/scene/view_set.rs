@@ -9,7 +9,7 @@ pub struct ViewSet(u16);
 const _: () = assert!(Rig::MAX_CAMERAS == u16::BITS as usize);
 
 impl ViewSet {
-    /// Every view.
+    /// Every view that a frame may have.
     pub const ALL: Self = Self(u16::MAX);
 
     /// Whether a view is one of them.

@@ -52,14 +52,14 @@ pub enum ViewError {
     /// A name is empty, too long, or has other characters than `[a-z0-9._-]`.
     #[error("{field} {name:?} is not a name: 1 to 64 of a-z 0-9 . _ -, not beginning with .")]
     Name {
-        /// `camera` or `trajectory`.
+        /// The field: `camera` or `trajectory`.
         field: &'static str,
         name: String,
     },
     /// A number is not finite.
     #[error("{field} is {value:?}; give a finite number")]
     Number {
-        /// `station_m` or `exposure_stops`.
+        /// The field: `station_m` or `exposure_stops`.
         field: &'static str,
         value: f64,
     },
@@ -211,9 +211,9 @@ impl TryFrom<ViewFields> for RecordedView {
             windshield: fields.windshield,
             native_size_px: fields.native_size,
         };
-        let camera = intrinsics.camera();
+        let made = intrinsics.camera();
         let camera =
-            camera.map_err(|cause| ViewError::Camera { name: fields.camera.clone(), cause })?;
+            made.map_err(|cause| ViewError::Camera { name: fields.camera.clone(), cause })?;
         let view = Self {
             trajectory: fields.trajectory,
             station_m: fields.station_m,

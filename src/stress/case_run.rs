@@ -133,6 +133,7 @@ impl<'a> CaseRun<'a> {
         profile: &RenderProfile,
         view: View,
     ) -> Result<RenderedImage, RenderError> {
+        // One image for each view, of which there is one.
         Ok(render_images(self.backend, scene, profile, &[view])?.remove(0))
     }
 

@@ -24,6 +24,8 @@ fn t32(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         };
         let gradients = match case.gradients(backend) {
             Ok(gradients) => gradients,
+            // A frame that fails ends the case. After any other refusal the remaining scenes still
+            // run.
             Err(GradientError::Render(error)) => return Err(error),
             Err(error) => {
                 run.check(format!("{name}: {error}"), false);

@@ -86,6 +86,7 @@ fn sampled(camera: &Camera, gaussian: &GaussianSpec) -> (DVec2, [f64; 3]) {
 /// Mean of weighted points, and their covariance: along x, along y, and mixed.
 fn moments(places: impl Iterator<Item = (f64, DVec2)> + Clone) -> (DVec2, [f64; 3]) {
     let sum: f64 = places.clone().map(|(weight, _)| weight).sum();
+    // The mean first, in a pass of its own: squares less the squared mean would cancel digits.
     let mean = places.clone().map(|(weight, at)| weight * at).sum::<DVec2>() / sum;
     let variance = |of: fn(DVec2) -> f64| {
         places.clone().map(|(weight, at)| weight * of(at - mean)).sum::<f64>() / sum
@@ -119,9 +120,9 @@ fn t23(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         run.render_and_compare("at 100°", &ball(3.0 * DVec3::new(sin, 0.0, cos)), &profile, view)?;
     run.check("seen at 100°", beside.opacity.iter().any(|&o| o > 0.5));
 
-    let wall =
+    let shell =
         GaussianSpec { sigma_m: DVec3::splat(50.0), mean_m: DVec3::Z, ..GaussianSpec::default() };
-    let wall = run.render_and_compare("all around", &scene_from_specs(&[wall]), &profile, view)?;
+    let wall = run.render_and_compare("all around", &scene_from_specs(&[shell]), &profile, view)?;
     let wrong = wall.opacity.iter().enumerate().filter(|&(pixel, &opacity)| {
         let at_px = DVec2::new((pixel % 120) as f64 + 0.5, (pixel / 120) as f64 + 0.5);
         (opacity > 0.0) != camera.unproject(at_px).is_some()
@@ -157,8 +158,8 @@ fn folded(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     // The polynomial alone would put these balls within 0.65 focal lengths of the axis. A ball
     // beyond the field may reach over the edge of the field, which is at 0.68, by as much as the
     // blur.
-    let beyond = [0.9, 0.95, 1.0, 1.05, 1.1, 1.15];
-    let beyond = (0..36).map(|i| ball(beyond[i % 6], 0.7 * i as f64));
+    let angles_rad = [0.9, 0.95, 1.0, 1.05, 1.1, 1.15];
+    let beyond = (0..36).map(|i| ball(angles_rad[i % 6], 0.7 * i as f64));
     let image = run.render_and_compare(
         "beyond the fold",
         &scene_from_specs(&beyond.collect::<Vec<_>>()),
@@ -293,8 +294,8 @@ mod tests {
             assert!(center_px < most_px && spread < most, "{rule:?}: {center_px} px, {spread}");
         }
         let beside_m = DVec3::new(0.1, 0.0, -0.1);
-        let ((six_px, six_spread), (taylor_px, taylor_spread)) =
-            (off(beside_m, six), off(beside_m, taylor));
+        let (six_px, six_spread) = off(beside_m, six);
+        let (taylor_px, taylor_spread) = off(beside_m, taylor);
         assert!(six_px < 200.0 && six_spread < 0.5, "{six_px} px, {six_spread}");
         assert!(taylor_px > 1_500.0 && taylor_spread > 50.0, "{taylor_px} px, {taylor_spread}");
     }

@@ -21,6 +21,8 @@ pub(super) const T11: Case = Case {
 
 fn t11(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let profile = RenderProfile::default();
+    // An odd width: the centre of the middle pixel is the Gaussian's, where alpha is the whole
+    // opacity.
     let view = forward_view([65, 65], 100.0);
     let peak = |run: &mut CaseRun<'_>, logit: f32| {
         // The logit is set afterwards, because a specification has opacities and no infinite
@@ -47,7 +49,9 @@ fn t11(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     for logit in [cut + 1e-3, -5.0, 0.0, 2.0, 6.0, 100.0, f32::INFINITY] {
         peaks.push(peak(run, logit)?);
     }
+    // Four logits below the cut and the one at it come before.
     run.check("1e-3 above the logit of 1/255: seen", peaks[5] > 0.0);
+    // A NaN has no order, so that the check fails for it as well.
     run.check("monotone", peaks.is_sorted());
     let cap_off = f64::from(peaks[peaks.len() - 1]) - profile.alpha_cap;
     run.check_at_most("logit inf: off the cap by", cap_off.abs(), 1e-6);
@@ -66,6 +70,7 @@ fn t12(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let view = street_view([160, 100]);
     let profile = RenderProfile::default();
     let right = run.render(&Scene::from_gaussians(&good), &profile, view)?;
+    // 2 m ahead of the camera of `street_view`.
     let more = with_one_more(&good, [-18.0, 0.3, 1.6]);
     let seen = run.render(&Scene::from_gaussians(&more), &profile, view)?;
     let apart = max_difference(&seen.rgba, &right.rgba);
@@ -90,6 +95,7 @@ fn with_one_more(good: &Gaussians, mean_m: [f64; 3]) -> Gaussians {
     more.quats_wxyz.insert(0, [1.0, 0.0, 0.0, 0.0]);
     more.ln_scales.insert(0, [-2.0; 3]);
     more.logit_opacities.insert(0, 4.0);
+    // Degree 1 has four coefficients of three channels.
     more.sh.splice(0..0, [1.0; 12]);
     more
 }
@@ -102,6 +108,8 @@ const INVALIDATE: [(&str, Invalidate); 5] = [
     ("quaternion", |g, bad| g.quats_wxyz[0][2] = bad),
     ("scale", |g, bad| g.ln_scales[0][0] = bad),
     ("colour", |g, bad| g.sh[0] = bad),
+    // The first three values are the constant coefficient; from the fourth on, colours depend on
+    // the direction.
     ("colour by direction", |g, bad| g.sh[4] = bad),
 ];
 
@@ -182,7 +190,7 @@ pub(super) const T28: Case = Case {
 };
 
 fn t28(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
-    let fog = (0..70_000).map(|i| GaussianSpec {
+    let layers = (0..70_000).map(|i| GaussianSpec {
         mean_m: DVec3::new(0.0, 0.0, 5.0 + 1e-4 * f64::from(i)),
         // 80 px wide, so that alpha is just above the cut in the whole tile, and no pixel stops
         // before the last layer.
@@ -190,7 +198,7 @@ fn t28(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         opacity: 1.05 / 255.0,
         ..GaussianSpec::default()
     });
-    let fog = scene_from_specs(&fog.collect::<Vec<_>>());
+    let fog = scene_from_specs(&layers.collect::<Vec<_>>());
     let profile = RenderProfile { stop: 1e-300, ..RenderProfile::default() };
     match run.render_and_compare("the fog", &fog, &profile, forward_view([16, 16], 4.0)) {
         Err(error) => run.accept_limit(error)?,

@@ -34,6 +34,7 @@ fn t6(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let [red, green] = [0, 1].map(|channel| image.rgba[center + channel]);
     run.check("the first of each pair is in front", red > green);
     let mut equal = true;
+    // An order that depends on the timing of threads need not differ in the second image.
     for _ in 1..100 {
         equal &= run.render(&scene, &profile, view)? == image;
     }
@@ -79,6 +80,7 @@ fn t8(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         last = Some((image.rgba, truth.rgba));
     }
     let [pop, popped_truth] = pops.map(f64::from);
+    // If nothing jumped, the bound below would hold in any order.
     run.check("it pops", pop > 0.1);
     let what = format!("pops by {pop:.3}, by definition {popped_truth:.3}: apart");
     run.check_at_most(what, (pop - popped_truth).abs(), 2.0 / 255.0);
@@ -112,22 +114,27 @@ pub(super) const T21: Case = Case {
 
 /// Sixteen views of 4,400,000 Gaussians in one frame, and each view alone.
 fn t21(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
+    // In sixteen views 70.4 million keys.
     let n = 4_400_000;
     let mut dust = Gaussians::with_capacity(0, n);
     for i in 0..n {
         let [x, y, z, red, green, blue] = low_discrepancy(i);
         let z_m = 5.0 + 100.0 * z;
-        dust.means_m.push([0.8 * (x - 0.5) * z_m, 0.8 * (y - 0.5) * z_m, z_m]);
         // The positions fill the view's pyramid, so that every Gaussian makes keys in every view.
+        dust.means_m.push([0.8 * (x - 0.5) * z_m, 0.8 * (y - 0.5) * z_m, z_m]);
         dust.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
         dust.ln_scales.push([-4.0; 3]);
+        // An opacity of 1.7 / 255: above the cut, without which there would be no key.
         dust.logit_opacities.push(-5.0);
         dust.sh.extend([red, green, blue].map(|c| (2.0 * c - 1.0) as f32));
     }
     let scene = Scene::from_gaussians(&dust);
+    // The scene has copies of all values. Both together would double the memory of the case.
     drop(dust);
     let views: Vec<View> = (0..16)
         .map(|i| {
+            // Few pixels, since the keys are under test, and the reference backend draws all
+            // Gaussians of one view.
             view_along([16, 16], 15.0, DVec3::new(0.0, 0.0, 0.1 * f64::from(i)), DVec3::Z, DVec3::Y)
         })
         .collect();

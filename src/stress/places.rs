@@ -21,6 +21,7 @@ pub(super) const T4: Case = Case {
 fn t4(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     for near in [0.01, 0.2] {
         let profile = RenderProfile { near, ..RenderProfile::default() };
+        // The first is 1e-7 m beyond the nearer plane: a hundred steps of f32 at 1 cm.
         for z in [0.0100001, 0.011, 0.05, 0.19, 0.21] {
             let close = scene_from_specs(&[GaussianSpec {
                 mean_m: DVec3::new(0.002, -0.001, z),
@@ -57,6 +58,7 @@ fn t5(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let inside =
         run.render_and_compare("inside", &scene_from_specs(&[at(0.3, 2.0)]), &profile, view)?;
     run.check("inside: seen", inside.opacity.iter().any(|&o| o > 0.5));
+    // The ball reaches past the camera: only its centre is behind.
     let behind =
         run.render_and_compare("behind", &scene_from_specs(&[at(-1.0, 3.0)]), &profile, view)?;
     let most = behind.opacity.iter().fold(0.0_f32, |most, &o| most.max(o));
@@ -83,6 +85,7 @@ fn t7(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         for (x, rgb) in [(x.next_up(), [0.0, 1.0, 0.0]), (x, [1.0, 0.0, 0.0])] {
             let x = f64::from(x);
             specs.push(GaussianSpec {
+                // The view looks along +x with +z up, so that its right is -y.
                 mean_m: DVec3::new(x, -slope * x, 0.0),
                 // The size grows with the distance: each has a standard deviation of 2 px in the
                 // image.
@@ -92,6 +95,8 @@ fn t7(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
                 ..GaussianSpec::default()
             });
         }
+        // Row 50 of an image of 200 px width is its middle. Column 100 is straight ahead, and a
+        // slope of 1 is 100 px.
         centers.push((x, 200 * 50 + (slope * 100.0 + 100.0) as usize));
     }
     let view = view_along([200, 100], 100.0, DVec3::ZERO, DVec3::X, DVec3::NEG_Z);
@@ -121,6 +126,8 @@ fn t9(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let profile = RenderProfile::default();
     let here = run.render(&Scene::from_gaussians(&near), &profile, view)?;
     run.check("something is seen", here.opacity.iter().any(|&o| o > 0.9));
+    // At 4.5e6 m a step of f32 is half a metre: a backend that placed Gaussians in world
+    // coordinates would show it.
     for away_m in [1e4, 5e5, 4.5e6] {
         // Multiples of a cell's size, so that the chunks hold the same numbers.
         let away = DVec3::new(1.0, -1.0, 1.0) * (away_m / 64.0_f64).round() * 64.0;
@@ -151,6 +158,8 @@ fn t10(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
 /// T10 with any record.
 fn encoded_street(run: &mut CaseRun<'_>, record: RecordFormat) -> Result<(), RenderError> {
     let mut street = wildcity_generate::canyon(20_000, &mut |_, _| {});
+    // 15,625 cells of 64 m are 1,000 km: the cells cut the street at the same places as at the
+    // origin.
     let away = DVec3::new(64.0 * 15_625.0, 64.0 * 15_625.0, 0.0);
     for mean in &mut street.means_m {
         *mean = (DVec3::from_array(*mean) + away).to_array();

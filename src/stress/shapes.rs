@@ -20,10 +20,12 @@ fn t1(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let profile = RenderProfile::default();
     let view = forward_view([320, 240], 500.0);
     for sigma_px in [1e3, 3e3, 1e4] {
+        // After half a turn a needle looks as before.
         for degrees in (0..180).step_by(2) {
             let needle = scene_from_specs(&[GaussianSpec {
                 rotation: DQuat::from_rotation_z(f64::from(degrees).to_radians()),
                 // 5 m at 500 px: a standard deviation of `sigma_px` pixels.
+                // Across, 0.1 mm are 0.01 px: the blur alone makes the width.
                 sigma_m: DVec3::new(sigma_px * 5.0 / 500.0, 1e-4, 1e-4),
                 ..GaussianSpec::default()
             }]);
@@ -100,13 +102,13 @@ fn t3(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         let off = image.opacity.iter().fold(0.0_f32, |most, o| most.max((o - 0.9).abs()));
         run.check_at_most(format!("{what}: opacity from 0.9"), off.into(), 0.15);
         // Forty walls on the 4 x 5 macro tiles of a device, so that a whole workgroup lists them.
-        let walls = (0..40_u32).map(|i| GaussianSpec {
+        let specs = (0..40_u32).map(|i| GaussianSpec {
             mean_m: DVec3::new(0.1 * f64::from(i), 0.0, 5.0 + 0.1 * f64::from(i)),
             // 0.97^40 = 0.30 of the light is left, so that no pixel stops before the last wall.
             opacity: 0.03,
             ..wall
         });
-        let walls = scene_from_specs(&walls.collect::<Vec<_>>());
+        let walls = scene_from_specs(&specs.collect::<Vec<_>>());
         let what = format!("forty of {sigma_m} m");
         let view = forward_view([444, 280], 300.0);
         run.render_and_compare(what.clone(), &walls, &profile, view)?;

@@ -23,17 +23,18 @@ fn t14(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     // on the edge of a tile of 16 px. With a sigma of 16 px / √(2 ln(255 · 0.9)) the splat reaches
     // the next edge.
     let exact_m = 16.0 * 5.0 / 160.0 / (2.0 * (255.0_f64 * 0.9).ln()).sqrt();
-    let splats = (0..800_i32).map(|i| {
+    let specs = (0..800_i32).map(|i| {
         // From -20 to 20 ulp, in a different order from that of the places.
         let ulps = f64::from(i % 41 - 20) * f64::from(f32::EPSILON);
-        let [x, y] = [f64::from(i % 16 - 8), f64::from(i / 16 % 10 - 5)];
+        let x = f64::from(i % 16 - 8);
+        let y = f64::from(i / 16 % 10 - 5);
         GaussianSpec {
             mean_m: DVec3::new(0.5 * x * (1.0 + ulps), 0.5 * y, 5.0),
             sigma_m: DVec3::splat(exact_m * (1.0 + ulps)),
             ..GaussianSpec::default()
         }
     });
-    let splats = scene_from_specs(&splats.collect::<Vec<_>>());
+    let splats = scene_from_specs(&specs.collect::<Vec<_>>());
     let profile = RenderProfile::default();
     let view = forward_view([256, 160], 160.0);
     let image = run.render_and_compare("edges", &splats, &profile, view)?;
@@ -155,8 +156,8 @@ fn t17(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         // which is not compared.
         let padded_at = at.map(|px| px as i32 - margin_px as i32);
         let padded = crop_view(whole, padded_at, part_px.map(|px| px + 2 * margin_px));
-        let truth = run.render_reference(&balls, &profile, padded)?;
-        let truth = crop_rgba(&truth, padded.camera.width_px, [margin_px; 2], part_px);
+        let padded_truth = run.render_reference(&balls, &profile, padded)?;
+        let truth = crop_rgba(&padded_truth, padded.camera.width_px, [margin_px; 2], part_px);
         let own = crop_rgba(&image, size_px[0], at, part_px);
         let what = format!("at {at:?}");
         let seen = own.chunks_exact(4).any(|rgba| rgba[3] > 0.2);
@@ -204,9 +205,9 @@ fn t18(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let image = run.render(&balls, &profile, whole)?;
     for at in [[0, 0], [430, 300]] {
         let part = crop_view(whole, at.map(|px| px as i32), [170, 100]);
-        let own = run.render_and_compare(format!("crop at {at:?}"), &balls, &profile, part)?;
+        let drawn = run.render_and_compare(format!("crop at {at:?}"), &balls, &profile, part)?;
         // The margin is explained in T17.
-        let own = crop_rgba(&own, 170, [40, 20], [90, 60]);
+        let own = crop_rgba(&drawn, 170, [40, 20], [90, 60]);
         let of_whole = crop_rgba(&image, 600, [at[0] + 40, at[1] + 20], [90, 60]);
         run.check(format!("crop at {at:?}: seen"), own.chunks_exact(4).any(|rgba| rgba[3] > 0.2));
         let off = max_difference(&own, &of_whole);

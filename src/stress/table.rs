@@ -47,8 +47,8 @@ pub fn run(
     progress: &mut dyn FnMut(usize, &str),
 ) -> Table {
     let mut done = 0;
-    let rows = cases.iter().map(|case| {
-        let outcomes = backends.iter().map(|candidate| {
+    let made = cases.iter().map(|case| {
+        let tried = backends.iter().map(|candidate| {
             progress(done, case.number);
             done += 1;
             match candidate {
@@ -56,10 +56,11 @@ pub fn run(
                 Err((name, why)) => case.not_run(name, why),
             }
         });
-        let outcomes = outcomes.collect();
+        let outcomes = tried.collect();
         Row { case: case.number, what: case.what, bound: case.bound, outcomes }
     });
-    let rows = rows.collect();
+    // The cases run here: the iterators above are lazy.
+    let rows = made.collect();
     let column = |candidate: &Candidate| match candidate {
         Ok(backend) => Column { backend: backend.name(), detail: backend.detail() },
         Err((name, why)) => Column { backend: name, detail: why.clone() },

@@ -22,6 +22,7 @@ impl Adam {
     /// What to add to each parameter, given the derivatives by all of them.
     pub(crate) fn step(&mut self, by: &[f64], rate: f64) -> Vec<f64> {
         self.steps += 1;
+        // Both means begin at 0, and are too small by these factors.
         let corrections = DECAYS.map(|decay| 1.0 - decay.powi(self.steps));
         let mut moves = Vec::with_capacity(by.len());
         for ([mean, square], &by) in self.moments.iter_mut().zip(by) {

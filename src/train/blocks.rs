@@ -53,6 +53,8 @@ impl Blocks {
             all.min_by(|a, b| a.1.total_cmp(&b.1)).map(|(index, _)| index)
         };
         let mut ordered: Vec<([i32; 2], u64)> = cells.to_vec();
+        // Cells beside the same point of the path, and all cells without a path, go by their
+        // numbers.
         ordered.sort_by_cached_key(|(cell, _)| (place(cell), *cell));
         let all: u64 = ordered.iter().map(|(_, count)| count).sum();
         let mut divided = vec![BTreeSet::new(); blocks];
@@ -86,6 +88,7 @@ impl Blocks {
     /// How far a point lies from the cells of a block, in metres; 0 within.
     pub fn distance_m(&self, block: usize, at_m: DVec3) -> f64 {
         let distance = |cell: &[i32; 2]| {
+            // A cell reaches half its width to each side of its middle.
             let off = (at_m.truncate() - middle_m(cell)).abs() - DVec2::splat(0.5 * CELL_M);
             off.max(DVec2::ZERO).length()
         };

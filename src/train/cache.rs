@@ -57,6 +57,7 @@ impl TrainingImages for CachedImages<'_> {
     }
 
     fn load(&self, index: usize) -> Result<TrainingImage, String> {
+        // A panic of another thread leaves whole images, which are as good as before.
         let lock = || self.kept.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(image) = lock().images.get(&index) {
             return Ok(image.clone());
@@ -65,6 +66,7 @@ impl TrainingImages for CachedImages<'_> {
         let image = self.images.load(index)?;
         let mut kept = lock();
         let bytes = image.bytes();
+        // Another thread may have decoded the same image meanwhile, and its bytes count once.
         if kept.bytes + bytes <= self.budget_bytes && !kept.images.contains_key(&index) {
             kept.bytes += bytes;
             kept.images.insert(index, image.clone());

@@ -114,6 +114,7 @@ impl Trainer {
             model: self.model.saved(),
         };
         bincode::serde::encode_into_std_write(&state, &mut hashed, encoding())?;
+        // The hash itself is written past the hasher.
         let (_, hash) = hashed.end();
         Ok(to.write_all(hash.as_bytes())?)
     }
@@ -132,6 +133,7 @@ impl Trainer {
     ) -> Result<Self, CheckpointError> {
         let mut hashed = Hashed::new(from);
         let mut format = [0; FORMAT.len()];
+        // A file that is shorter than the first line is another file as well.
         if hashed.read_exact(&mut format).is_err() || format != FORMAT {
             return Err(CheckpointError::Format);
         }
@@ -146,6 +148,7 @@ impl Trainer {
         let state: State = decode(&mut hashed)?;
         let (mut inner, hash) = hashed.end();
         let mut end = Vec::new();
+        // A byte more than the hash, so that a file with something behind it is found out.
         inner.by_ref().take(HASH as u64 + 1).read_to_end(&mut end)?;
         if end != hash.as_bytes() {
             return Err(CheckpointError::Damaged("its hash is another".to_owned()));
@@ -200,6 +203,7 @@ impl<T> Hashed<T> {
 impl<T: Write> Write for Hashed<T> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let written = self.inner.write(bytes)?;
+        // A writer may take fewer bytes than it is given; the rest comes again.
         self.add(&bytes[..written]);
         Ok(written)
     }

@@ -55,6 +55,7 @@ pub fn advice(runs: &[ComparedRun]) -> Option<Advice<'_>> {
     let best = judged().max_by(|a, b| a.held_out_db.total_cmp(&b.held_out_db))?;
     let is_as_good = |run: &&ComparedRun| run.held_out_db >= best.held_out_db - SMALL_LOSS_DB;
     let quickest = judged().filter(is_as_good).min_by(|a, b| a.seconds.total_cmp(&b.seconds))?;
+    // The best run is as good as itself, and may be the quickest.
     Some(Advice { best, quick: (quickest.seconds < best.seconds).then_some(quickest) })
 }
 

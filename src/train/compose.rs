@@ -97,6 +97,8 @@ pub fn compose<T: Real>(
     let parts = image.par_chunks_mut(3 * PART).zip(rgb.par_chunks(3 * PART)).enumerate();
     parts.for_each(|(part, (image, rgb))| {
         let pixels = image.as_chunks_mut().0.iter_mut().zip(rgb.as_chunks().0);
+        // Pixels are counted through the image, since the opacity and the background are not
+        // divided.
         for (pixel, (to, rgb)) in (part * PART..).zip(pixels) {
             let shows = T::one() - opacity[pixel];
             *to = exposure.apply(before(rgb, shows, background.rgb(pixel)));
@@ -151,13 +153,17 @@ pub fn compose_gradient<T: Real>(
                     let before = before(rgb, shows, behind);
                     for (sums, &by) in few_sums.iter_mut().zip(by) {
                         for (sum, before) in sums.iter_mut().zip(before) {
+                            // A row of the matrix takes the colour before the exposure, and the
+                            // offset takes 1.
                             *sum += by * before;
                         }
                         sums[3] += by;
                     }
                     let [r, g, b] = exposure.matrix;
+                    // The transpose of the exposure's matrix leads the derivatives back.
                     *by_rgb = [0, 1, 2].map(|c| r[c] * by[0] + g[c] * by[1] + b[c] * by[2]);
                     *by_background = by_rgb.map(|by| shows * by);
+                    // The background is weighted by 1 - opacity, hence the sign.
                     by_opacity[k] =
                         -(by_rgb[0] * behind[0] + by_rgb[1] * behind[1] + by_rgb[2] * behind[2]);
                 }

@@ -45,6 +45,7 @@ impl TrainedExposures {
         [rate, weight]: [f64; 2],
     ) {
         let (values, adam) = &mut self.images[image];
+        // The recorded factor multiplies the matrix and not the offset.
         let by = by.matrix.iter().flatten().map(|by| recorded * by).chain(by.offset);
         let pull = |k: usize| 2.0 * weight * (values[k] - IDENTITY[k]);
         let by: Vec<f64> = by.enumerate().map(|(k, by)| f64::from(by) + pull(k)).collect();

@@ -55,6 +55,7 @@ pub(crate) fn add_terms(model: &Model, terms: &Terms<f32>, gradients: &mut Chunk
             mean_m: by.mean_m.map(f64::from),
             quat_wxyz: [w, x, y, z],
             ln_scale: [0.0; 3],
+            // The opacity is 2^x, and the derivative of 2^x by x is ln 2 times 2^x.
             log2_opacity: f64::from(by.opacity * gaussian.opacity) * std::f64::consts::LN_2,
         };
         gradients.add(index, &geometry, &[DVec3::ZERO; 16]);

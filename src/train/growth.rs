@@ -42,6 +42,7 @@ pub(crate) fn relocate_and_grow(model: &mut Model, settings: &Settings, seed: u6
     let draw = |k: usize| {
         let at = to_unit(mix(seed ^ mix(k as u64))) * sum;
         let place = sums.partition_point(|&sum| sum <= at);
+        // A product that is rounded up to the whole sum lies behind the last one.
         alive[place.min(alive.len() - 1)]
     };
     let sources: Vec<usize> = (0..dead.len() + added).map(draw).collect();
@@ -71,6 +72,7 @@ fn shared(opacity: f64, n: usize, least_opacity: f64) -> [f64; 2] {
         for k in 0..i {
             let sign = if k % 2 == 0 { 1.0 } else { -1.0 };
             sum += sign * binomial * each.powi(k as i32 + 1) / (k as f64 + 1.0).sqrt();
+            // C(i-1, k+1) from C(i-1, k).
             binomial *= (i - 1 - k) as f64 / (k + 1) as f64;
         }
     }

@@ -57,7 +57,7 @@ pub fn scene_db(
 pub struct Judged {
     /// The mean PSNR of those with a pixel that counts.
     pub mean_db: f64,
-    /// Their number.
+    /// Number of images with a pixel that counts.
     pub images: usize,
     /// The one in the middle of their order, which is the same for all runs.
     pub middle: HeldOut,
@@ -98,6 +98,7 @@ pub fn held_out_images(
     all_db.sort_by(|a, b| a.1.total_cmp(&b.1));
     let count = all_db.len().min(most);
     // The first and the last of all are among them.
+    // Evenly spaced between them, and the first one if only one is asked for.
     let place = |k: usize| k * (all_db.len() - 1) / (count - 1).max(1);
     (0..count)
         .map(|k| {
@@ -181,6 +182,7 @@ impl<'a> Evaluator<'a> {
         let pixels = image.view.camera.pixels();
         let mut rgba = vec![0.0; 4 * pixels];
         let [mut depth_m, mut normals] =
+            // An empty image is not bound to the target below.
             [1, 3].map(|n| vec![0.0; if all { n * pixels } else { 0 }]);
         // The sky is evaluated for every pixel: a map would be made for a few images.
         let profile = RenderProfile { sky_error: 0.0, ..*trainer.profile() };
@@ -208,6 +210,7 @@ fn mean(all_db: &[(usize, f64)]) -> Option<f64> {
 
 /// Of the pixels that count.
 fn psnr_db(image: &TrainingImage, drawn: &[u8]) -> f64 {
+    // A mask has one value per pixel, and an index is that of a channel.
     let counts = |&index: &usize| image.mask.as_ref().is_none_or(|mask| mask[index / 3]);
     let values = (0..drawn.len()).filter(counts);
     psnr_db_u8(values.map(|i| (&drawn[i], &image.rgb8[i])))

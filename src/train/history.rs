@@ -37,7 +37,7 @@ pub struct CurvePoint {
     pub seconds: f64,
     pub l1: f64,
     pub dssim: f64,
-    /// In 1/m.
+    /// In 1/m; 0 without measured depths.
     pub disparity: f64,
     /// The mean opacity where the sky is.
     pub sky: f64,
@@ -83,6 +83,7 @@ impl History {
         self.sums.sky += line.sky;
         self.sums.ground += line.ground;
         self.steps += 1;
+        // The last step of a run ends a point, however few steps that has.
         if self.steps < steps.div_ceil(POINTS) && line.step < steps {
             return;
         }

@@ -45,6 +45,7 @@ impl TrainingImage {
         }
         let small = [width / factor, height / factor];
         let covered = small.map(|px| (px * factor) as u64);
+        // Whole blocks only, so that the camera is scaled by the factor exactly.
         let covering = self.view.camera.cropped([0, 0], covered)?;
         let mut camera = covering.scaled(small[0] as u64, small[1] as u64)?;
         // As a photograph of this size: no filter of a larger one is part of it.
@@ -131,6 +132,7 @@ fn mean(values: &[u8]) -> u8 {
 fn middle(depths_m: &mut Vec<f32>) -> f32 {
     depths_m.retain(|&depth_m| depth_m > 0.0);
     depths_m.sort_by(f32::total_cmp);
+    // Of an even number the nearer of the two in the middle, since their mean was not measured.
     depths_m.get(depths_m.len().saturating_sub(1) / 2).copied().unwrap_or(0.0)
 }
 

@@ -55,6 +55,7 @@ impl Objective<'_> {
         let sky = self.sky.map(|sky| sky.image(&self.view, sample.image, &images.opacity));
         let fixed = self.fixed_sky.map(|sky| fixed_image(sky, &self.view, &images.opacity));
         let background = match (&sky, &fixed) {
+            // A sky that is trained and a fixed one do not occur together (`Fixed::sky`).
             (Some(SkyImage { rgb, .. }), _) | (None, Some(rgb)) => Background::Image(rgb),
             (None, None) => Background::Color(sample.background),
         };
@@ -64,6 +65,7 @@ impl Objective<'_> {
         let clipped = clip(&mut image, sample.rgb);
         let mut by_image = self.by_colors(&image, &mut report);
         for index in clipped {
+            // A clipped value does not change with the colours that it is made of.
             by_image[index] = 0.0;
         }
         let by = compose_gradient(rgb, opacity, background, &self.exposure, &by_image);
@@ -106,10 +108,12 @@ impl Objective<'_> {
         }
         let size_px = self.sample.size_px();
         // Masked pixels are 0 on both sides.
+        // D-SSIM compares windows, so that a pixel cannot be left out of a sum as L1 does.
         let similarity = match weights {
             None => dssim(size_px, image, rgb),
             Some(mask) => {
                 let mut similarity = dssim(size_px, &masked(image, mask), &masked(rgb, mask));
+                // The masked image is a product with the mask, and so are the derivatives by it.
                 similarity.by = masked(&similarity.by, mask);
                 similarity
             }

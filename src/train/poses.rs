@@ -220,10 +220,12 @@ impl TrainedPoses {
             // Of |t|² in the axes of the pose that moves.
             let pull = |off: DVec3| 2.0 * weight * (rotation.inverse() * off);
             let by = Twist { rho: by.rho + pull(off.rho), phi: by.phi + pull(off.phi) };
+            // At a rate of 1, since metres and radians have rates of their own.
             let moves = adam.step(&by.to_array(), 1.0);
             let [moved_m, turned] = [0, 3].map(|k| DVec3::from_slice(&moves[k..]));
             let twist = Twist { rho: rate * moved_m, phi: rotation_rate * turned };
             let Pose { position_m, rotation } = *pose * twist.exp();
+            // A product of many rotations drifts from unit length.
             *pose = Pose { position_m, rotation: rotation.normalize() };
         }
     }

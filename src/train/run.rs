@@ -43,9 +43,12 @@ pub fn run(
     let steps = trainer.settings().steps;
     let first = trainer.steps_done();
     let settings = trainer.settings().clone();
+    // A run that goes on draws the images of its earlier steps, too, so that the next ones are
+    // those of a run that was never stopped.
     let order = (1..=steps).zip(Order::new(&learned, images, &settings)).skip(first);
     let evaluator = Evaluator::new(images, backend);
     thread::scope(|scope| {
+        // The thread waits with one more image, and ends when `next` is dropped.
         let (sender, next) = sync_channel(AHEAD);
         scope.spawn(move || {
             // A receiver that is gone has ended the run.
@@ -66,6 +69,7 @@ pub fn run(
             if done == steps || done.is_multiple_of(evaluate_every.max(1)) {
                 held_out_db = evaluator.mean_db(trainer)?;
             }
+            // What has passed beyond the time of the steps.
             evaluated_s = earlier_s + begin.elapsed().as_secs_f64() - seconds;
             let line = Line::new(trainer, report, seconds, held_out_db);
             trainer.remember(&line);
@@ -123,6 +127,8 @@ impl Iterator for Order {
         let place = self.done[kind] % images.len();
         if place == 0 {
             let round = (self.done[kind] / images.len()) as u64;
+            // A shuffle without a state: a run that goes on in the middle of a round finds the same
+            // order.
             images.sort_by_key(|&image| mix(self.seed ^ mix(round << 32 ^ image as u64)));
         }
         self.done[kind] += 1;

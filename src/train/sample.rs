@@ -63,6 +63,7 @@ impl Sample<'_> {
             }
         }
         let counts = |index: usize| self.weights.is_none_or(|weights| weights[index / 3] > 0.0);
+        // A pixel that is left out may hold anything.
         let is_fault = |index: &usize| !self.rgb[*index].is_finite() && counts(*index);
         match (0..self.rgb.len()).find(is_fault) {
             Some(index) => Err(TrainError::Value { image: "image", index, value: self.rgb[index] }),

@@ -281,6 +281,7 @@ impl Default for Rates {
             quat: 1e-3,
             logit: 5e-2,
             sh: 2.5e-3,
+            // A twentieth of the constant's, as in the code of Kerbl et al. 2023.
             sh_rest: 2.5e-3 / 20.0,
         }
     }
@@ -349,10 +350,12 @@ impl Settings {
     /// A value that TOML does not have.
     pub fn to_commented_toml(&self) -> Result<String, toml::ser::Error> {
         let mut text = String::new();
+        // Plain fields come before all tables in TOML, and so have no section.
         let mut section = "";
         let plain = toml::to_string_pretty(self)?;
         for line in plain.lines() {
             let name = line.strip_prefix('[').and_then(|line| line.strip_suffix(']'));
+            // A line is the header of a section, a field with its value, or empty.
             let doc = match (name, line.split_once(" = ")) {
                 (Some(name), _) => {
                     section = name;
@@ -398,6 +401,7 @@ impl Settings {
             ("ground.upright", ground.upright.into()),
             ("ground.opaque", ground.opaque.into()),
         ];
+        // f64 holds every integer up to 2^53, which is far above these bounds.
         let range = |field, value: usize, least: usize, most: usize| {
             (field, value as f64, least as f64, most as f64)
         };
@@ -417,6 +421,7 @@ impl Settings {
             ("growth.least_opacity", growth.least_opacity.into(), 0.0, 0.5),
             range("growth.every", growth.every, 1, SCHEDULE),
             range("growth.until", growth.until, 0, SCHEDULE),
+            // After `until`, which is its bound.
             range("growth.from", growth.from, 0, growth.until),
             range("sky.octaves", sky.octaves, 0, Network::MAX_OCTAVES),
             range("sky.width", sky.width, 1, Network::MAX_WIDTH),
@@ -496,6 +501,8 @@ impl GroundSettings {
         if step < self.whole_until {
             return 1.0;
         }
+        // `check` has found `until` not below `whole_until`. If they are equal, the terms end at
+        // once, and 1 avoids 0 / 0.
         let fading = (self.until - self.whole_until).max(1) as f32;
         (self.until.saturating_sub(step) as f32 / fading).min(1.0)
     }

@@ -32,6 +32,7 @@ pub fn gaussians_from_points(points: &[Point]) -> Gaussians {
         gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
         gaussians.ln_scales.push([size_m.ln() as f32; 3]);
         gaussians.logit_opacities.push((OPACITY / (1.0 - OPACITY)).ln());
+        // The colour of degree 0 is 0.5 + C0 times the coefficient.
         gaussians.sh.extend(point.rgb.map(|value| ((value - 0.5) / sh::C0) as f32));
     }
     gaussians
@@ -56,10 +57,12 @@ fn arrange(order: &mut [usize], at_m: &[DVec3], axis: usize) {
     }
     let middle = order.len() / 2;
     order.select_nth_unstable_by(middle, |&a, &b| {
+        // Equal coordinates are ordered by index, so that the tree is the same on every run.
         at_m[a][axis].total_cmp(&at_m[b][axis]).then(a.cmp(&b))
     });
     let (left, right) = order.split_at_mut(middle);
     let next = (axis + 1) % 3;
+    // The middle point itself stays where it is.
     rayon::join(|| arrange(left, at_m, next), || arrange(&mut right[1..], at_m, next));
 }
 
@@ -76,6 +79,7 @@ fn find_nearest(
     let distance2 = at_m[index].distance_squared(center_m);
     let place = nearest2.partition_point(|&other| other <= distance2);
     if place < nearest2.len() {
+        // The largest one rotates to `place` and is overwritten there.
         nearest2[place..].rotate_right(1);
         nearest2[place] = distance2;
     }
@@ -87,6 +91,7 @@ fn find_nearest(
     }
     let [near, far] = sides;
     find_nearest(near, at_m, next, center_m, nearest2);
+    // All points on the far side are at least `off` away.
     if off * off <= nearest2[NEIGHBOURS] {
         find_nearest(far, at_m, next, center_m, nearest2);
     }

@@ -46,7 +46,7 @@ pub struct Start {
 pub struct Fixed {
     /// A sky. With one, no other is trained.
     pub sky: Option<Arc<Sky>>,
-    /// Gaussians.
+    /// Gaussians that surround those of the run.
     pub chunks: Vec<Arc<Chunk>>,
 }
 
@@ -96,10 +96,12 @@ impl Trainer {
         }
         let images = world_from_camera.len();
         let own =
+            // A pose per image is a rig that was in as many places, with one camera at its origin.
             RigPoses { world_from_ego: world_from_camera, ego_from_camera: vec![Pose::IDENTITY] };
         let poses = match settings.poses.mode {
             PoseMode::Off => None,
             PoseMode::Image => Some(own),
+            // `Auto` without a rig trains no poses; `Rig` without one was refused above.
             PoseMode::Auto | PoseMode::Rig => rig.clone(),
         };
         let trains_sky = match settings.sky.mode {
@@ -237,6 +239,7 @@ impl Trainer {
         let mut outcome = None;
         let mut loss = |images: &[GaussianImages]| {
             let mut by_images = Vec::new();
+            // The frame has one view, so the loop runs once.
             for images in images {
                 let (by, at) = objective.at(images);
                 by_images.push(by);
@@ -245,12 +248,14 @@ impl Trainer {
             by_images
         };
         let stats = backend.differentiate(&frame, depth, &mut loss, &mut self.gradients)?;
+        // Before anything moves: Adam divides by 1 - decay^step, which is 0 at step 0.
         self.step += 1;
         let mut report = StepReport::default();
         if let Some(outcome) = outcome {
             self.move_cameras(sample, place, &outcome)?;
             report = outcome.report;
         }
+        // Before the Gaussians move, since the terms add to their gradients.
         report.ground = self.add_ground(sample);
         self.move_gaussians(sample)?;
         self.grow();
@@ -302,6 +307,7 @@ impl Trainer {
         let fall = f64::from(self.fall());
         if let Some((poses, place)) = self.poses.as_mut().zip(place) {
             let by = self.gradients.twists.first().copied().unwrap_or_default();
+            // Adam keeps the mean of squares, and the square of a finite number may overflow.
             if !by.to_array().iter().all(|by| (by * by).is_finite()) {
                 return not_finite("its pose");
             }
@@ -333,6 +339,7 @@ impl Trainer {
         let share = settings.share(self.settings.unscaled(self.step));
         let ego = sample.place.and_then(|place| self.rig.as_ref()?.world_from_ego.get(place.ego));
         let Some(ego) = ego else { return 0.0 };
+        // The first chunk is the one that is trained; what is fixed follows it.
         let Some(gradients) = self.gradients.chunks.first_mut() else { return 0.0 };
         if share == 0.0 || !self.model.has_ground() {
             return 0.0;
@@ -376,6 +383,7 @@ impl Trainer {
         AdamStep {
             rates: rates(&self.settings, mean, degree, columns(self.model.sh_degree())),
             corrections: [0.9_f32, 0.999].map(|decay| 1.0 - decay.powi(self.step as i32)),
+            // Means: over the opacities, and over three scales of each Gaussian.
             regularisers: [loss.opacity / count, loss.scale / (3.0 * count)],
             noise: growth.noise * mean,
             least_opacity: growth.least_opacity,
@@ -385,6 +393,7 @@ impl Trainer {
 
     fn grow(&mut self) {
         if self.settings.grows_at(self.step) {
+            // The complement keeps these draws apart from the noise of the same step.
             let seed = mix(self.settings.seed ^ mix(!(self.step as u64)));
             relocate_and_grow(&mut self.model, &self.settings, seed);
         }

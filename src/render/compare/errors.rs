@@ -37,7 +37,7 @@ pub struct Image {
     pub rgb: Vec<f32>,
     /// `[height, width]`, in metres.
     pub depth_m: Vec<f32>,
-    /// `[height, width]`.
+    /// `[height, width]`, from 0 to 1.
     pub opacity: Vec<f32>,
 }
 

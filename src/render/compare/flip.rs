@@ -60,11 +60,11 @@ pub fn flip(image: &[f32], truth: &[f32], size_px: [u32; 2]) -> Vec<f32> {
     let error = |pixel: usize| {
         // A line from 0 to the knee takes 95 % of the range, and a flatter one the rest: large
         // differences of colour are all about equally visible.
-        let color = hyab(image.lab[pixel], truth.lab[pixel]).powf(COLOR_EXPONENT);
-        let color = if color < knee {
-            KNEE_VALUE / knee * color
+        let distance = hyab(image.lab[pixel], truth.lab[pixel]).powf(COLOR_EXPONENT);
+        let color = if distance < knee {
+            KNEE_VALUE / knee * distance
         } else {
-            KNEE_VALUE + (color - knee) / (most - knee) * (1.0 - KNEE_VALUE)
+            KNEE_VALUE + (distance - knee) / (most - knee) * (1.0 - KNEE_VALUE)
         };
         let edges = (image.edges[pixel] - truth.edges[pixel]).abs();
         let points = (image.points[pixel] - truth.points[pixel]).abs();
@@ -93,12 +93,12 @@ impl Perceived {
             .collect();
         let channel = |c: usize| -> Plane { opponent.iter().map(|color| color[c]).collect() };
         let blurred = [0, 1, 2].map(|c| blur(&channel(c), width, SENSITIVITY[c]));
-        let lab = |pixel: usize| {
+        let lab_at = |pixel: usize| {
             let color = [0, 1, 2].map(|c: usize| blurred[c][pixel]);
             // The blur of the opponent channels may leave the gamut of the display.
             hunt_lab(linear_of_opponent(color).map(|value| value.clamp(0.0, 1.0)))
         };
-        let lab = (0..opponent.len()).into_par_iter().map(lab).collect();
+        let lab = (0..opponent.len()).into_par_iter().map(lab_at).collect();
         let brightness: Plane = opponent.iter().map(|[y, ..]| (y + 16.0) / 116.0).collect();
         // A feature's kernel along one axis, and the smooth one along the other: both directions.
         let [smooth, edge, point] = feature_kernels();

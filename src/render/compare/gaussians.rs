@@ -11,7 +11,6 @@ use wildcity_scene::{Gaussians, Scene, sh};
 /// [`forward_view`].
 #[derive(Clone, Copy, Debug)]
 pub struct GaussianSpec {
-    /// Centre, in metres.
     pub mean_m: DVec3,
     /// Rotation from its own axes to the world's.
     pub rotation: DQuat,

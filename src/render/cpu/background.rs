@@ -185,7 +185,10 @@ fn sample_cube_map<S: Simd>(simd: S, map: &Arc<CubeMap>, direction: Vec3x16<S>) 
     let of_y = [positive_y.select(splat(2.0), splat(3.0)), x, positive_y.select(z, -z), ay];
     let of_z = [positive_z.select(splat(4.0), splat(5.0)), positive_z.select(x, -x), -y, az];
     let choose = |k: usize| is_x.select(of_x[k], is_y.select(of_y[k], of_z[k]));
-    let [face, right, down, ahead] = [choose(0), choose(1), choose(2), choose(3)];
+    let face = choose(0);
+    let right = choose(1);
+    let down = choose(2);
+    let ahead = choose(3);
 
     // The cell of texels, and the place within it.
     let [scale, offset] = map.lookup_scale_offset();

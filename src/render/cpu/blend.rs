@@ -57,8 +57,8 @@ pub(super) fn blend<S: Simd, const DEPTH: bool, const OWNERS: bool>(
         let u = load(&matched.lane_u) + splat(matched.u[block]);
         let v = load(&matched.lane_v) + splat(matched.v[block]);
         let exponent = (-v).mul_add(v, (-u).mul_add(u, splat(matched.log2_opacity)));
-        let alpha = exp2(simd, exponent).min(cap);
-        let alpha = exponent.simd_ge(cut).select(alpha, splat(0.0));
+        let uncut = exp2(simd, exponent).min(cap);
+        let alpha = exponent.simd_ge(cut).select(uncut, splat(0.0));
 
         // The weight; 0 in pixels that stop here or stopped before.
         // Each splat is weighted by the transmittance before it: T (1 - alpha) is that after it.

@@ -74,8 +74,8 @@ impl Stages<'_> {
         // The time of a failed attempt counts, too: the errors are returned after `finish`.
         let mut timer = StageTimer::start();
         // Each splat has one pair at least, nearly always.
-        let most_places = most_bytes / (limits::LEAST_SPLAT_BYTES + u64::from(classes));
-        let most_places = usize::try_from(most_places).unwrap_or(usize::MAX);
+        let places = most_bytes / (limits::LEAST_SPLAT_BYTES + u64::from(classes));
+        let most_places = usize::try_from(places).unwrap_or(usize::MAX);
         let limits = ProjectLimits { most_places, classes };
         let done = projected.project(level, jobs, cutoffs, slab, limits);
         timer.finish("project", stats);

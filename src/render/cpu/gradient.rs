@@ -264,6 +264,7 @@ impl Kept<'_> {
             self.walkers.lock().push(walker);
         });
         if !is_finite.into_inner() {
+            // The walk has found that a value is not finite; this finds which one.
             check_finite(view, by_images)?;
         }
         Ok(sums.into_iter().map(Mutex::into_inner).collect())
@@ -304,12 +305,15 @@ impl Kept<'_> {
                 return None;
             }
             for indices in macro_tile.tile(within).chunks(BATCH) {
+                // All pixels have stopped, as they had when the tile was drawn.
                 if walk.live == 0 {
                     break;
                 }
                 batch.read(macro_tile, projected, indices);
                 batch.match_blocks(simd, cutoffs, indices.len(), at_px);
                 for (k, &index) in indices.iter().enumerate() {
+                    // `k` is below BATCH; the remainder shows this to the compiler, which then
+                    // tests no index.
                     let touching = batch.blocks[k % BATCH] & walk.live;
                     if touching == 0 {
                         continue;
@@ -398,6 +402,7 @@ impl TileDerivatives {
     fn read(&mut self, images: &GaussianImages, view: &View, at_px: [u32; 2]) {
         let [right, bottom] = at_px.map(|px| px + TILE_PX);
         if right > view.camera.width_px || bottom > view.camera.height_px {
+            // A tile within the image overwrites all values; beyond the edge the 0 remains.
             *self = Self::default();
         }
         let has_depth = !images.depth_sum_m.is_empty();

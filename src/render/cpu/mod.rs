@@ -64,7 +64,7 @@ use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target, View};
 use wildcity_scene::geometry::Lidar;
 use wildcity_scene::{RenderProfile, Scene};
 
-/// The f32 backend.
+/// The backend that draws in f32 with vector instructions, on threads of its own.
 #[derive(Debug)]
 pub struct Cpu {
     main: Lane,
@@ -143,7 +143,7 @@ impl Cpu {
         }
         // A level is only made from the detected one: its existence proves that the machine has it.
         let best = Level::new();
-        let level = match simd {
+        let supported = match simd {
             Simd::Best => Some(best),
             #[cfg(target_arch = "x86_64")]
             Simd::Avx512 => best.as_avx512().map(Level::Avx512),
@@ -154,7 +154,7 @@ impl Cpu {
             #[cfg(not(target_arch = "x86_64"))]
             _ => None,
         };
-        let level = level.ok_or(CpuError::NoSuchSimd(simd))?;
+        let level = supported.ok_or(CpuError::NoSuchSimd(simd))?;
         let main = Lane::new(threads, "render").map_err(CpuError::Threads)?;
         let lane_bytes = AtomicU64::new(limits::LANE_BYTES);
         Ok(Self { main, side: OnceLock::new(), level, lane_bytes })
@@ -169,8 +169,8 @@ impl Cpu {
         }
         let threads = self.main.pool.current_num_threads();
         // Made when two frames first meet. A failure is remembered as well, and such frames wait.
-        let side = self.side.get_or_init(|| Lane::new(threads, "render-side").ok());
-        let side = side.as_ref().and_then(|side| side.try_take(most_bytes / SIDE_LANE_DIVISOR));
+        let lane = self.side.get_or_init(|| Lane::new(threads, "render-side").ok());
+        let side = lane.as_ref().and_then(|lane| lane.try_take(most_bytes / SIDE_LANE_DIVISOR));
         side.unwrap_or_else(|| self.main.take(most_bytes))
     }
 

@@ -293,7 +293,10 @@ fn resolve_block<S: Simd>(simd: S, sums: &TileSums, block: usize, left: u32, ban
             let first = 3 * ((row + y) * band.width + column);
             // Four pixels of three bytes each.
             let mut bytes = [0; 3 * BLOCK_PX as usize];
-            let [a, b, c, d] = [of_row[0], of_row[1], of_row[2], of_row[3]];
+            let a = of_row[0];
+            let b = of_row[1];
+            let c = of_row[2];
+            let d = of_row[3];
             bytes[..4].copy_from_slice(&(a | b << 24).to_le_bytes());
             bytes[4..8].copy_from_slice(&(b >> 8 | c << 16).to_le_bytes());
             bytes[8..].copy_from_slice(&(c >> 16 | d << 8).to_le_bytes());

@@ -87,11 +87,11 @@ impl DepthClusters {
         };
         let of_job = |job| visible_clusters(job).map(cluster).collect();
         let by_job: Vec<Vec<DepthCluster>> = (0..jobs).into_par_iter().map(of_job).collect();
-        let ends = by_job.iter().scan(0, |end, clusters| {
+        let totals = by_job.iter().scan(0, |end, clusters| {
             *end += clusters.len();
             Some(*end)
         });
-        let ends = ends.collect();
+        let ends = totals.collect();
         Self::counted(by_job.concat(), ends)
     }
 
@@ -133,9 +133,9 @@ impl DepthClusters {
         let first_step = (first_key.saturating_sub(self.first_key) / self.step) as usize;
         // Gaussians of nearer steps: these are drawn already.
         let before = first_step.checked_sub(1).map_or(0.0, |step| self.up_to[step.min(STEPS - 1)]);
-        let end_step = self.up_to.partition_point(|&up_to| up_to <= before + gaussians);
+        let filled = self.up_to.partition_point(|&up_to| up_to <= before + gaussians);
         // One step at least, so that every cut makes progress; `halves` takes care of a full step.
-        let end_step = end_step.max(first_step + 1);
+        let end_step = filled.max(first_step + 1);
         let end_key = if end_step >= STEPS {
             self.end_key
         } else {

@@ -83,7 +83,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         times.sort_by(f64::total_cmp);
         times[times.len() / 2]
     };
-    let [sweep, frame] = [median(&mut sweeps_ms), median(&mut frames_ms)];
+    let sweep = median(&mut sweeps_ms);
+    let frame = median(&mut frames_ms);
     println!("medians: sweep {sweep:.1} ms, cameras {frame:.1} ms, ratio {:.2}", sweep / frame);
     Ok(())
 }

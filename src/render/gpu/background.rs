@@ -23,7 +23,7 @@ use wildcity_scene::sky::{DrawableSky, InferenceNetwork};
 /// Background and appearances of the current frame.
 #[derive(Debug)]
 pub(super) struct Background {
-    /// One [`layout::Background`].
+    /// One [`layout::Background`], which all views share.
     parameters: GrowableBuffer,
     /// Texels of a cube map, or weights of a network.
     sky_values: GrowableBuffer,
@@ -126,6 +126,7 @@ impl Background {
         device: &Device,
         appearances: &[Appearance],
     ) -> Result<(), RenderError> {
+        // Zeroed, a view has neither an exposure nor an overlay.
         let mut slots = [layout::CameraAppearance::zeroed(); MAX_VIEWS];
         let mut overlays: Vec<Arc<Overlay>> = Vec::new();
         let mut bytes = 0;
@@ -140,6 +141,7 @@ impl Background {
             }
             if let Some(overlay) = overlay {
                 slot.overlay_px = overlay.size_px();
+                // The shader counts pixels of four bytes.
                 slot.first_overlay = (bytes / 4) as u32;
                 bytes += overlay.rgba8().len();
                 overlays.push(overlay.clone());
@@ -153,6 +155,7 @@ impl Background {
         self.appearances.fill(device, bytemuck::cast_slice(&slots));
         let is_same = |(one, other): (&Arc<Overlay>, &Arc<Overlay>)| Arc::ptr_eq(one, other);
         let held = &self.overlays;
+        // A zip ends with the shorter list, so the lengths are compared, too.
         if overlays.len() != held.len() || !overlays.iter().zip(held).all(is_same) {
             let pixels: Vec<u8> = overlays.iter().flat_map(|o| o.rgba8()).copied().collect();
             self.overlay_pixels.fill(device, &pixels);

@@ -34,7 +34,7 @@ pub struct FrameCounts {
     pub splats: u64,
     /// (Splat, macro tile) pairs.
     pub touches: u64,
-    /// (Splat, tile) pairs.
+    /// (Splat, tile) pairs of all views.
     pub instances: u64,
     /// Evaluations of a splat at a pixel.
     pub evaluations: u64,

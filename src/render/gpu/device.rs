@@ -146,11 +146,12 @@ fn adapters() -> Vec<Adapter> {
         ..InstanceDescriptor::new_without_display_handle()
     });
     // Outside of browsers this future is ready at once.
-    let found = instance.enumerate_adapters(BACKENDS).now_or_never();
-    let mut found = found.unwrap_or_default();
+    let listed = instance.enumerate_adapters(BACKENDS).now_or_never();
+    let mut found = listed.unwrap_or_default();
     let infos: Vec<AdapterInfo> = found.iter().map(Adapter::get_info).collect();
     let mut index = 0..;
     found.retain(|_| index.next().is_none_or(|index| !is_listed_twice(&infos, index)));
+    // Stable: devices of one kind keep the driver's order, by which `AdapterChoice::Named` counts.
     found.sort_by_key(|adapter| match adapter.get_info().device_type {
         DeviceType::DiscreteGpu => 0,
         DeviceType::IntegratedGpu => 1,
@@ -184,6 +185,8 @@ impl AdapterChoice {
                 let name = choice.to_lowercase();
                 let has_name = |info: &AdapterInfo| info.name.to_lowercase().contains(&name);
                 match choice.parse::<usize>() {
+                    // A number that no device has is an error, even if it is a part of a device's
+                    // name.
                     Ok(number) => (number < found.len()).then_some(number),
                     Err(_) => infos.iter().position(has_name),
                 }
@@ -192,8 +195,9 @@ impl AdapterChoice {
         match (index.and_then(|index| found.into_iter().nth(index)), self) {
             (Some(adapter), _) => Ok(adapter),
             (None, Self::Named(choice)) if !infos.is_empty() => {
-                let found = infos.iter().enumerate();
-                let found = found.map(|(index, info)| format!("{index}: {}", info.name)).collect();
+                let numbered = infos.iter().enumerate();
+                let found =
+                    numbered.map(|(index, info)| format!("{index}: {}", info.name)).collect();
                 Err(GpuError::NoSuchAdapter { choice: choice.clone(), found })
             }
             (None, _) => Err(GpuError::NoAdapter),
@@ -277,12 +281,13 @@ impl Device {
         let descriptor = DeviceDescriptor {
             required_features: adapter.features()
                 & (Features::TIMESTAMP_QUERY | Features::SUBGROUP),
+            // wgpu's default limits are far below those of graphics cards.
             required_limits: limits.clone(),
             ..DeviceDescriptor::default()
         };
         let failed = |reason: String| GpuError::Device { name: info.name.clone(), reason };
-        let opened = adapter.request_device(&descriptor).now_or_never();
-        let opened = opened.ok_or_else(|| failed("the driver does not respond".into()))?;
+        let answer = adapter.request_device(&descriptor).now_or_never();
+        let opened = answer.ok_or_else(|| failed("the driver does not respond".into()))?;
         let (device, queue) = opened.map_err(|error| failed(error.to_string()))?;
 
         let tuning = tuning.unwrap_or_else(|| Tuning::new(&info, device.features(), &limits));
@@ -433,6 +438,7 @@ impl Device {
 
     /// Counts a kernel that is compiled.
     pub(super) fn count_pipeline(&self) {
+        // No other data depends on the counts: relaxed order is enough.
         self.totals.pipelines.fetch_add(1, Relaxed);
     }
 
@@ -446,6 +452,7 @@ impl Device {
         self.totals.buffers.fetch_add(1, Relaxed);
         self.device.create_buffer(&BufferDescriptor {
             label: Some(label),
+            // An empty buffer cannot be bound, and copies take whole words.
             size: bytes.next_multiple_of(256).max(256),
             usage,
             mapped_at_creation: false,

@@ -26,7 +26,9 @@ impl GrowableBuffer {
     /// a growing scene does not reallocate in every frame.
     pub(super) fn reserve(&mut self, device: &Device, bytes: u64) {
         if self.buffer.size() < bytes {
+            // No margin beyond what a shader can bind, and never less than what is needed.
             let with_margin = (bytes + bytes / 4).min(device.binding_bytes()).max(bytes);
+            // At once: the bind groups that kernels keep would hold its memory.
             self.buffer.destroy();
             self.buffer = device.buffer(self.label, with_margin, self.usage);
         }

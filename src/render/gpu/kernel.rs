@@ -95,6 +95,8 @@ impl Kernel {
         device.count_pipeline();
         let pipeline = device.device.create_compute_pipeline(&ComputePipelineDescriptor {
             label: Some(entry),
+            // Derived from the shader: exactly the bindings that this entry point uses must be
+            // given to `run`.
             layout: None,
             module,
             entry_point: Some(entry),
@@ -160,8 +162,10 @@ impl Kernel {
             entries: &entries,
         });
         let bound = resources.iter().map(|(binding, from)| BoundBuffer::new(*binding, from));
+        // `None` if a resource is no buffer: such a group is used once and not kept.
         if let Some(bound) = bound.collect() {
             if kept.len() == BIND_GROUPS {
+                // The first one has not been used for the longest time.
                 kept.remove(0);
             }
             kept.push((bound, bind_group.clone()));
@@ -173,6 +177,7 @@ impl Kernel {
 /// Folds workgroups into rows of at most [`MAX_GROUPS`], of about equal length, as `job` in
 /// `plan.wgsl` does. The last row may have surplus workgroups, which do nothing.
 pub(super) fn fold_groups(count: u32) -> [u32; 3] {
+    // A count of 0 makes one row without columns, which dispatches nothing.
     let rows = count.div_ceil(MAX_GROUPS).max(1);
     [count.div_ceil(rows), rows, 1]
 }
@@ -195,6 +200,7 @@ pub(super) fn slots(values: impl Iterator<Item = impl NoUninit>) -> Vec<u8> {
     for value in values {
         let end = bytes.len() + SLOT_BYTES as usize;
         bytes.extend_from_slice(bytemuck::bytes_of(&value));
+        // No kernel sees the padding: a binding of a slot ends with the value.
         bytes.resize(end, 0);
     }
     bytes

@@ -57,7 +57,7 @@ pub const GEOMETRY_WORDS: u32 = 9;
 pub struct FrameView {
     /// Image size, in pixels.
     pub size_px: [u32; 2],
-    /// Tiles per row.
+    /// Tiles in a row, the last of which may reach beyond the image.
     pub columns: u32,
     /// Index of the first tile among those of all views.
     pub first_tile: u32,
@@ -67,9 +67,9 @@ pub struct FrameView {
     pub first_macro_tile: u32,
     /// Rows of tiles that are drawn: first, and end (exclusive).
     pub rows: [u32; 2],
-    /// Variances of [`PixelFilter::native_px2`].
+    /// [`PixelFilter::native_px2`] along x and y, in px².
     pub native_px2: [f32; 2],
-    /// Variances of [`PixelFilter::total_px2`].
+    /// [`PixelFilter::total_px2`] along x and y, in px².
     pub total_px2: [f32; 2],
 }
 
@@ -152,10 +152,12 @@ impl Frame {
         let views = rows.views(region);
         for (index, view) in self.view[..self.views as usize].iter_mut().enumerate() {
             let Range { start, end } = rows.for_view(index, region);
+            // Empty for a view outside of the region.
             view.rows = [start, end];
         }
         let first = &self.view[views.start];
         let last = &self.view[views.end - 1];
+        // Only the first and the last view of a region may lack rows, so its tiles are consecutive.
         let start = first.first_tile + first.rows[0] * first.columns;
         let end = last.first_tile + last.rows[1] * last.columns;
         start..end
@@ -356,7 +358,7 @@ pub fn packed_owner(instance: u16, class: SemanticClass) -> u32 {
 pub struct Owner {
     /// Index of the cluster view.
     pub cluster_view: u32,
-    /// As in [`Target::instances`](crate::Target::instances).
+    /// The instance, as [`Target::instances`](crate::Target::instances) counts them.
     pub instance: u32,
 }
 

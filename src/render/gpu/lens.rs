@@ -40,14 +40,18 @@ impl Lenses {
     /// [`LensIndices`].
     pub(super) fn upload(&mut self, device: &Device, frame: &Frame<'_>, actors: &ActorViews) {
         let is_own = |(view, relative): &(&View, &View)| has_own_lens(view, relative);
-        let pairs = frame.views.iter().zip(actors.all());
+        let views = frame.views.iter().zip(actors.all());
         let pairs =
-            pairs.flat_map(|(view, relative)| relative.iter().map(move |from| (view, from)));
+            views.flat_map(|(view, relative)| relative.iter().map(move |from| (view, from)));
         let mut own =
             pairs.filter(is_own).map(|(_, relative)| Lens::new(relative, frame.profile)).peekable();
+        // The shaders of such a frame bind no lenses: what an earlier frame has uploaded is not
+        // read.
         if frame.views.iter().all(View::is_static_pinhole) && own.peek().is_none() {
             return;
         }
+        // A place for every view that a frame may have, so that the lenses of actors begin at
+        // MAX_VIEWS whatever the number of views.
         let mut lenses = vec![Lens::zeroed(); MAX_VIEWS];
         for (lens, view) in lenses.iter_mut().zip(frame.views) {
             if !view.is_static_pinhole() {
@@ -74,6 +78,8 @@ pub(super) struct LensIndices(Vec<Vec<u32>>);
 
 impl LensIndices {
     pub(super) fn new(frame: &Frame<'_>, actors: &ActorViews) -> Self {
+        // Counts view by view and, in a view, actor by actor: the order in which `Lenses::upload`
+        // appends.
         let mut next = MAX_VIEWS as u32;
         let mut of_view = |(index, (view, relative)): (usize, (&View, &[View]))| {
             let mut lens = |relative: &View| {
@@ -115,6 +121,7 @@ impl Lens {
             ..Self::zeroed()
         };
         match &camera.lens {
+            // The model stays 0, which the shader takes for a pinhole.
             camera::Lens::Pinhole => lens.set_end(camera.extrapolation_slope()),
             camera::Lens::OpenCv(of) => {
                 lens.set_opencv(of);
@@ -174,6 +181,8 @@ impl Lens {
         self.end_slope = polynomial.slope(end) as f32;
         let scaled =
             polynomial.coefficients().iter().zip(0..).map(|(c, power)| c * end.powi(power));
+        // A polynomial that does not vanish at 0 has an end of 0, so the constant term has no
+        // place.
         for (to, c) in self.coefficients.as_flattened_mut().iter_mut().zip(scaled.skip(1)) {
             *to = c as f32;
         }
@@ -191,6 +200,8 @@ impl Lens {
             let mut index = 0;
             for j in 0..=5 {
                 for i in 0..=5 - j {
+                    // The identity is the first power of the polynomial's own angle: i of the
+                    // horizontal one, j of the vertical one.
                     let identity = if [i, j] == [1 - axis, axis] { 1.0 } else { 0.0 };
                     let shift = polynomial.coefficient(i, j) - identity;
                     self.windshield_shift[index][axis] = shift as f32;

@@ -224,6 +224,7 @@ impl SweepKernels {
         self.rows.fill(device, bytemuck::cast_slice(&angles));
         let descriptor = CommandEncoderDescriptor { label: Some("sweep") };
         let mut encoder = device.device.create_command_encoder(&descriptor);
+        // A sector without candidates runs no kernel, and its beams have no returns.
         encoder.clear_buffer(self.returns.buffer(), 0, None);
         device.queue.submit([encoder.finish()]);
     }
@@ -235,6 +236,7 @@ impl SweepKernels {
         self.entries.fill(device, bytemuck::cast_slice(&batch.entries));
         self.columns.fill(device, bytemuck::cast_slice(&batch.columns));
         let at_once = device.max_traced_candidates() as usize;
+        // A software device leaves long loops early, so long lists take several dispatches.
         for first in (0..batch.longest).step_by(at_once) {
             let sector = GpuSector {
                 first_entry: first as u32,
@@ -306,10 +308,13 @@ impl SweepKernels {
         let sources = [(self.returns.buffer(), bytes)];
         let (_, submission) = self.read_back.submit(device, recorder, &sources, timestamps);
         self.read_back.map(device, submission)?;
+        // Submissions run in order, so these are done as well as the last one, which was waited
+        // for.
         self.pending.clear();
         let mut sweep = Sweep::empty(beams);
         {
             let pages = self.read_back.pages(device)?;
+            // The page may be larger than this sweep.
             let found: &[GpuReturn] = mapped(device, &pages[0][..bytes as usize])?;
             for (at, found) in found.iter().enumerate().filter(|(_, found)| found.range_m > 0.0) {
                 sweep.range_m[at] = found.range_m;
@@ -346,6 +351,7 @@ impl Batch {
         let mut count = 0;
         for entries in &candidates.lists {
             count += entries.len() as u32;
+            // The list of a tile ends where that of the next one begins.
             lists.push(count);
         }
         Some(Self {
@@ -377,6 +383,7 @@ impl GpuCandidate {
             nearest_m: reach.nearest_m,
             whiten_z: [zx, zy, zz],
             luminance,
+            // A LiDAR has at most 256 rows, so both numbers fit 16 bits.
             rows: first | end << 16,
             key,
             padding: [0; 2],

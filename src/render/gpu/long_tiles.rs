@@ -44,6 +44,7 @@ impl LongTiles {
 
     /// Makes room for a frame with this number of tiles.
     pub(super) fn reserve(&mut self, device: &Device, tiles: u32) {
+        // Further long tiles have no place here, and are blended as those with short lists.
         let most = u64::from(LONG_TILES.min(tiles));
         self.tiles.reserve(device, 4 * most);
         self.places.reserve(device, 4 * u64::from(tiles));
@@ -71,10 +72,11 @@ impl LongTiles {
         self.find.run(device, pass, Groups::Count(tiles.div_ceil(WORKGROUP)), &found);
 
         let wants = [planes.has_depth(), planes.has_owners()];
+        // Each combination of the two constants is a kernel of its own, numbered from 0 to 3.
         let variant = usize::from(wants[0]) + 2 * usize::from(wants[1]);
         let blend = self.blend.variant(device, variant, |module| {
-            let constants = [("DEPTH", wants[0]), ("OWNERS", wants[1])];
-            let constants = constants.map(|(name, on)| (name, f64::from(u8::from(on))));
+            let flags = [("DEPTH", wants[0]), ("OWNERS", wants[1])];
+            let constants = flags.map(|(name, on)| (name, f64::from(u8::from(on))));
             Kernel::new(device, module, "main", &constants)
         });
         let resources = [
@@ -87,6 +89,7 @@ impl LongTiles {
             (6, self.sums.bind()),
             (7, self.places.bind()),
         ];
+        // The host does not know how many tiles are long: `find` has counted them into the job.
         blend.run(device, pass, Groups::Job(long_job), &resources);
     }
 

@@ -84,7 +84,7 @@ use crate::samples::SampledViews;
 use wildcity_scene::geometry::Lidar;
 use wildcity_scene::{RenderProfile, Scene};
 
-/// The wgpu backend.
+/// The backend that draws on a device of wgpu, and opens it again after a failure.
 #[derive(Debug)]
 pub struct Gpu {
     choice: AdapterChoice,
@@ -345,6 +345,7 @@ impl Gpu {
         let start = Instant::now();
         let words: Result<Vec<&[u32]>, _> =
             drawn.pages.iter().map(|page| bytemuck::try_cast_slice(page)).collect();
+        // Memory that a driver has not aligned is an error of the device, and no panic.
         let words = words.map_err(|error| RenderError::Device {
             device: "the GPU".to_owned(),
             reason: format!("its memory cannot be read: {error}"),
@@ -356,6 +357,7 @@ impl Gpu {
         };
         self.deliver.install(|| {
             let views = drawn.views.par_iter().zip(targets.par_iter_mut()).enumerate();
+            // One view per task, so that a finished view is handed on before the others are.
             views.with_max_len(1).for_each(|(index, (view, target))| {
                 pixels.copy_to(view, outputs.sampled.contains(index), target);
                 target.finish(&frame.views[index]);

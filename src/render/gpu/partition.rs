@@ -26,11 +26,11 @@ pub(super) type Region = Range<u32>;
 /// Counts of what a region needs on a device, or of what the device's buffers can hold.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Capacity {
-    /// (Gaussian, view) pairs.
+    /// (Gaussian, view) pairs that reach into the region.
     pub(super) splats: u64,
     /// (Splat, macro tile) pairs.
     pub(super) touches: u64,
-    /// (Splat, tile) pairs.
+    /// (Splat, tile) pairs in the region.
     pub(super) instances: u64,
 }
 
@@ -90,6 +90,7 @@ impl TileRows {
     /// The views of which a region has rows.
     pub(super) fn views(&self, region: &Region) -> Range<usize> {
         let view_of = |row: u32| self.ends.partition_point(|&end| end <= row);
+        // A region has at least one row, so `end - 1` is a row of it.
         view_of(region.start)..view_of(region.end - 1) + 1
     }
 
@@ -114,6 +115,7 @@ impl TileRows {
         if units < 2 {
             return None;
         }
+        // At least two parts: a region that is not split would overflow the device again.
         let count = count.clamp(2, units);
         let bound = |index: u64| bounds[(index * units / count) as usize];
         Some((0..count).map(|index| bound(index)..bound(index + 1)).collect())
@@ -166,6 +168,7 @@ impl PartitionCache {
         let mut merged: Vec<(Region, Capacity)> = Vec::with_capacity(drawn.len());
         for (region, needs) in drawn {
             match merged.last_mut() {
+                // The sum is an upper bound: a splat on the border of two bands counts in both.
                 Some((before, sum)) if sum.plus(needs).min_regions(limit) <= 1 => {
                     before.end = region.end;
                     *sum = sum.plus(needs);
@@ -174,9 +177,11 @@ impl PartitionCache {
             }
         }
         self.entries.retain(|(known, _)| *known != key);
+        // One region is what `get` returns for an unknown frame.
         if merged.len() > 1 {
             let regions = merged.into_iter().map(|(region, _)| region).collect();
             self.entries.insert(0, (key, regions));
+            // The latest entry comes first, so the oldest ones are cut off.
             self.entries.truncate(limits::PARTITION_CACHE_ENTRIES);
         }
     }

@@ -86,16 +86,20 @@ impl Plan {
     pub(super) fn start(&self, device: &Device, frame: &Frame, counts: &Counts) {
         let Counts { cluster_views, splats, instances } = *counts;
         let mut jobs: [JobSlot; job::COUNT] = bytemuck::Zeroable::zeroed();
+        // Splats are counted here only if another backend has projected them; otherwise these
+        // lengths are 0 until the device sets them.
         for (slot, length, per_group) in [
             (job::CLUSTER_VIEWS, cluster_views, SCAN_BLOCK),
             (job::SPLATS, splats, WORKGROUP),
             (job::SPLATS_SCAN, splats, SCAN_BLOCK),
             (job::SPLATS_SORT, splats, SORT_BLOCK),
+            // A counter for each digit of each block of keys.
             (job::SPLATS_DIGITS, DIGITS * splats.div_ceil(SORT_BLOCK), SCAN_BLOCK),
             (job::MACRO_TILES, frame.macro_tiles, SCAN_BLOCK),
         ] {
             jobs[slot as usize].job = job(length, per_group);
         }
+        // `long_tiles.wgsl` counts up from no tiles, in one row of workgroups.
         jobs[job::LONG_TILES as usize].job = Job { length: 0, groups: [0, 1, 1] };
         let counters = Counters { splats, instances, ..bytemuck::Zeroable::zeroed() };
         let write = |to: &GrowableBuffer, bytes| device.queue.write_buffer(to.buffer(), 0, bytes);

@@ -160,6 +160,7 @@ impl Project {
             lights.fill(device, bytemuck::cast_slice(&work.lights));
             shadows.fill(device, bytemuck::cast_slice(&work.shadows));
         }
+        // A bit for each of a cluster's 256 Gaussians.
         self.visible.reserve(device, 32 * u64::from(work.cluster_views()));
         self.offsets.reserve(device, 4 * u64::from(work.cluster_views()));
     }
@@ -208,6 +209,8 @@ impl Project {
         for (kernels, _, groups, resources) in &dispatches {
             kernels.cull.run(device, pass, *groups, resources);
         }
+        // Splats lie in the order of cluster views: all are counted before the first one is
+        // written.
         scan.run(device, pass, plan.job(job::CLUSTER_VIEWS), self.offsets.buffer());
         plan.set_splats(device, pass, scan.block_sums());
         for (kernels, variant, groups, mut resources) in dispatches {

@@ -50,7 +50,7 @@ pub(super) struct ProjectDispatch {
     /// Page of the mirror.
     pub(super) page: usize,
     pub(super) variant: Variant,
-    /// Range of `page_cluster_views`.
+    /// Range of [`ProjectWork::page_cluster_views`] that it projects.
     pub(super) span: Span,
 }
 
@@ -126,9 +126,9 @@ impl ProjectWork {
                 ChunkInView { chunk, number, view, relative, of: Owner::Twin { shadows } }
             });
             let lenses = &lenses;
-            let placed = frame.scene.placed.iter().zip(actors.for_view(view)).enumerate();
-            let placed = placed.filter(move |(_, (placed, _))| placed.views.contains(view));
-            let placed = placed.map(move |(index, (placed, relative))| {
+            let actors = frame.scene.placed.iter().zip(actors.for_view(view)).enumerate();
+            let drawn = actors.filter(move |(_, (placed, _))| placed.views.contains(view));
+            let placed = drawn.map(move |(index, (placed, relative))| {
                 let of = Owner::Actor { placed, lens: lenses.index(view, index) };
                 let number = (frame.scene.chunks.len() + index) as u32;
                 ChunkInView { chunk: &placed.chunk, number, view, relative, of }
@@ -152,10 +152,12 @@ impl ProjectWork {
 
         // Chunk views, and the cluster views of each page by kernel.
         let mut work = Self::default();
+        // Ordered, so that the dispatches are the same in every run.
         let mut by_kernel: BTreeMap<(usize, Variant), Vec<u32>> = BTreeMap::new();
         let mut last = None;
         let mut chunk_views = [None; 2];
         for ((pair, _), clusters) in parts.iter().zip(&visible) {
+            // The parts of a pair follow each other and share its chunk views.
             if last != Some(*pair) {
                 last = Some(*pair);
                 chunk_views = [None; 2];
@@ -187,6 +189,7 @@ impl ProjectWork {
         let runs = clusters.chunk_by(|a, b| (a.page, a.shadowed) == (b.page, b.shadowed));
         for run in runs {
             let ClusterPlace { page, shadowed, .. } = run[0];
+            // The first visible cluster of the pair: owners are ranges of cluster views.
             if *chunk_views == [None; 2] {
                 self.add_owner(pair);
             }
@@ -289,6 +292,7 @@ impl ChunkInView<'_> {
             (Owner::Actor { .. }, None) => UnscentedView::new(relative, frame.profile),
         };
         self.visible_if(clusters, mirror, |min_m, max_m, sigma_m| {
+            // Where there is no test for a view, the device tests each Gaussian.
             moved.is_none_or(|view| view.may_see(chunk.origin_m(), min_m, max_m, sigma_m))
         })
     }
@@ -332,11 +336,12 @@ impl ChunkInView<'_> {
     /// The view relative to the chunk.
     fn chunk_view(&self, variant: Variant, profile: &RenderProfile) -> ChunkView {
         let Self { chunk, relative, .. } = *self;
-        let view = self.view as u32;
+        let number = self.view as u32;
         let view = match self.of {
-            _ if !variant.actors => view,
-            Owner::Twin { .. } => view | view << VIEW_BITS,
-            Owner::Actor { lens, .. } => view | lens << VIEW_BITS,
+            _ if !variant.actors => number,
+            // The twin is seen with the lens of the view, which has the same index.
+            Owner::Twin { .. } => number | number << VIEW_BITS,
+            Owner::Actor { lens, .. } => number | lens << VIEW_BITS,
         };
         let chunk_view = ChunkView::new(view, &CpuChunkView::new(relative, chunk, profile));
         if !relative.camera.depth_is_distance() {

@@ -177,6 +177,8 @@ impl Rasterize {
         outputs: &Outputs,
     ) -> Result<(), RenderError> {
         let background = match frame.background()? {
+            // Exposures and overlays are applied by the shaders with a background: a black sky adds
+            // nothing.
             None if !outputs.appearances.is_empty() => {
                 let black =
                     self.black.get_or_insert_with(|| Arc::new(CubeMap::uniform(DVec3::ZERO)));
@@ -202,6 +204,7 @@ impl Rasterize {
             long_tiles.reserve(device, tiles);
         }
         let tile_bytes = planes.tile_bytes();
+        // A page is one binding, so it may not be longer than a binding.
         let per_page = (device.binding_bytes() / tile_bytes).min(u64::from(u32::MAX)) as u32;
         for (page, tiles) in pages(&(0..tiles), per_page) {
             if page == self.pages.len() {
@@ -228,6 +231,7 @@ impl Rasterize {
         self.compile(device, *planes);
         if planes.has_owners() && !planes.has_semantics() {
             let instances = self.instances.get_or_insert_with(|| Instances::new(device));
+            // The shader has no length of its own for the list, so its first element is the count.
             let count = Owner { cluster_view: 0, instance: owners.len() as u32 };
             let list: Vec<Owner> = [count].iter().chain(owners).copied().collect();
             instances.owners.fill(device, bytemuck::cast_slice(&list));
@@ -243,6 +247,7 @@ impl Rasterize {
         // One dispatch per page of pixels.
         let places = match &self.long_tiles {
             Some(long_tiles) => long_tiles.bind_places(),
+            // The shader names the binding even where it never reads it.
             None => (15, self.no_places.bind()),
         };
         let mut composite = self.composite_resources(*planes, lenses, first_splats);
@@ -276,7 +281,8 @@ impl Rasterize {
             ]);
             kernels.blend.run(device, pass, Groups::Count(tiles.len() as u32), &resources);
         }
-        let (Some(finish), Some(long_tiles)) = (&kernels.finish, &self.long_tiles) else { return };
+        let Some(finish) = &kernels.finish else { return };
+        let Some(long_tiles) = &self.long_tiles else { return };
         for (index, (page, tiles)) in pages(tiles, *tiles_per_page).enumerate() {
             let mut resources = page_resources(index, page, &tiles);
             resources.push(long_tiles.bind_sums());

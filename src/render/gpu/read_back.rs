@@ -152,6 +152,8 @@ impl ReadBack {
                 let _ = mapped.send(result.is_ok());
             });
         }
+        // With no sender left but those of the callbacks, callbacks that are dropped end the wait
+        // below.
         drop(mapped);
         let timeout = Some(device.frame_timeout());
         let wait = PollType::Wait { submission_index: Some(submission), timeout };
@@ -181,7 +183,7 @@ impl ReadBack {
         })
     }
 
-    /// The pixels.
+    /// The mapped pages, in order.
     pub(super) fn pages(&self, device: &Device) -> Result<Vec<BufferView>, RenderError> {
         self.pages.iter().map(|page| view(device, page)).collect()
     }

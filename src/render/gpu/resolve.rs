@@ -58,6 +58,7 @@ impl Outputs {
         let appearances = targets.iter().map(|t| t.appearance.cloned().unwrap_or_default());
         let appearances: Vec<Appearance> = appearances.collect();
         let all_identity = appearances.iter().all(Appearance::is_identity);
+        // Without any, the shaders that have no background can run.
         let appearances = if all_identity { Vec::new() } else { appearances };
         Self { planes: Planes::from_targets(targets, sampled), appearances, sampled }
     }
@@ -70,7 +71,7 @@ impl Outputs {
 }
 
 impl Planes {
-    /// Number of combinations.
+    /// Three kinds of tiles, with or without each of five values.
     pub(super) const VARIANTS: usize = 3 * 32;
 
     /// The values that these targets request.
@@ -85,6 +86,7 @@ impl Planes {
         Self {
             rgb8: any(|t| t.rgb8.is_some()),
             rgb: any(|t| t.rgba.is_some()),
+            // Opacity is the fourth channel of rgba.
             opacity: any(|t| t.rgba.is_some() || t.opacity.is_some()),
             depth: any(|t| t.depth_m.is_some()),
             owners: any(|t| t.instances.is_some() || t.semantics.is_some()),
@@ -162,6 +164,7 @@ impl Planes {
     /// takes of a tile.
     fn parts(self) -> [(bool, usize); 5] {
         [
+            // Three bytes of a pixel, in words of four.
             (self.rgb8, 3 * self.plane() / 4),
             (self.rgb, 3 * self.plane()),
             (self.opacity, self.plane()),
@@ -282,6 +285,7 @@ impl Pixels<'_> {
                 let words = self.tile(tile);
                 let left = column as usize * edge;
                 let columns = edge.min(width - left);
+                // Tiles at the lower edge reach beyond the image.
                 for y in 0..edge.min(height - tile_row * edge) {
                     copy(band, y * width + left, words, y * stride..y * stride + columns);
                 }

@@ -67,6 +67,7 @@ impl Roofline {
             }
             count *= 4;
         };
+        // Each byte is read once and written once.
         Ok(Self { bytes_per_s: 2.0 * bytes as f64 / copy_s, multiply_adds_per_s })
     }
 }
@@ -113,13 +114,15 @@ impl Stopwatch {
             let host_s = start.elapsed().as_secs_f64();
             device.check()?;
             polled.map_err(|error| device.failed(error.to_string()))?;
-            let view = read_back.slice(..).get_mapped_range();
-            let view = view.map_err(|error| device.failed(error.to_string()))?;
+            let mapped = read_back.slice(..).get_mapped_range();
+            let view = mapped.map_err(|error| device.failed(error.to_string()))?;
             let [first, last] = [0, 8].map(|at| bytemuck::pod_read_unaligned(&view[at..at + 8]));
             let ticks = u64::saturating_sub(last, first) as f64;
+            // A buffer cannot be unmapped while a view of it exists.
             drop(view);
             read_back.unmap();
             let device_s = device.tick_ns().map(|tick_ns| ticks * f64::from(tick_ns) * 1e-9);
+            // A run within one tick of the device's clock is timed by the host.
             best_s = best_s.min(device_s.filter(|&s| s > 0.0).unwrap_or(host_s));
         }
         Ok(best_s)

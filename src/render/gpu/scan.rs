@@ -30,6 +30,7 @@ impl Scan {
 
     /// Makes room for sums over `length` elements.
     pub(super) fn reserve(&mut self, device: &Device, length: u64) {
+        // One more for the total.
         let blocks = length.div_ceil(u64::from(SCAN_BLOCK)) + 1;
         self.block_sums.reserve(device, 4 * blocks);
     }

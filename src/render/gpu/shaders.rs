@@ -182,6 +182,7 @@ impl Shaders {
         original: &str,
         replacement: &str,
     ) -> Option<Self> {
+        // Clones share the sources; these are copied first, so that only this one is broken.
         let linked = Arc::make_mut(&mut self.linked);
         let Linked { source, .. } = linked.iter_mut().find(|linked| linked.name == shader)?;
         if !source.contains(original) {
@@ -212,6 +213,8 @@ fn append(name: &str, choices: &[Choice], appended: &mut Vec<&'static str>, sour
         match line.strip_prefix("#import ") {
             Some(import) => {
                 let choice = choices.iter().find(|choice| choice.placeholder == import);
+                // A placeholder and a file are imported alike: a name without a choice is that of a
+                // file.
                 let file = choice.map_or(import, |choice| choice.file);
                 append(file, choices, appended, source);
             }

@@ -29,6 +29,7 @@ impl Slots {
 impl Drop for Slot<'_> {
     fn drop(&mut self) {
         *self.0.taken.lock() -= 1;
+        // One slot is free, and any of the callers can take it.
         self.0.freed.notify_one();
     }
 }

@@ -120,6 +120,7 @@ impl Sort {
     ) -> usize {
         let mut from = 0;
         let Columns { keys, values, masks } = columns;
+        // Digits above the highest bit of any key are 0 in all keys, and change no order.
         for Pass { histogram, scatter, scatter_masked } in
             &self.passes[..bits.div_ceil(DIGIT_BITS) as usize]
         {
@@ -130,6 +131,7 @@ impl Sort {
             match ballots {
                 Some(Ballots { scan, totals }) => {
                     let resources = [counts[0].clone(), counts[1].clone(), (6, totals.bind())];
+                    // One workgroup for each value of a digit.
                     scan.run(device, pass, Groups::Count(DIGITS), &resources);
                 }
                 None => scan.run(device, pass, jobs.counters, self.offsets.buffer()),

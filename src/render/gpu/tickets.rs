@@ -28,6 +28,8 @@ impl TicketQueue {
         let mut counts = self.counts.lock();
         let own = counts.issued;
         counts.issued += 1;
+        // The number is drawn and the wait begins under one lock: no turn can end unnoticed in
+        // between.
         self.advanced.wait_while(&mut counts, |counts| counts.served != own);
         Ticket(self)
     }
@@ -36,6 +38,8 @@ impl TicketQueue {
 impl Drop for Ticket<'_> {
     fn drop(&mut self) {
         self.0.counts.lock().served += 1;
+        // Each caller waits for a number of its own: one that is woken alone might have a later
+        // number.
         self.0.advanced.notify_all();
     }
 }
@@ -57,6 +61,8 @@ mod tests {
                     let _ticket = queue.wait();
                     served.lock().push(caller);
                 });
+                // The first ticket counts as well: with that of this caller, `caller` + 1 are
+                // issued.
                 while queue.counts.lock().issued <= caller {
                     std::thread::yield_now();
                 }

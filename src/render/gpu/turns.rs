@@ -50,14 +50,17 @@ impl Gpu {
     ) -> Result<MappedFrame, RenderError> {
         let called = Instant::now();
         let ticket = self.queue.wait();
+        // After the ticket, so that slots are taken in the order of the calls.
         let slot = self.slots.wait();
         let wait = called.elapsed();
         let turn = self.with_chain(|chain| chain.take_turn(frame, outputs, &self.cull))?;
+        // The next frame is prepared while the device draws this one.
         drop(ticket);
         let waited = match turn {
             Turn::Drawn(drawn) => Waited::Drawn(drawn),
             Turn::InFlight(in_flight) => self.finish(*in_flight)?,
         };
+        // The device is done with the frame, even if it must be drawn again.
         drop(slot);
         let mut drawn = match waited {
             Waited::Drawn(drawn) => drawn,
@@ -88,13 +91,13 @@ impl Gpu {
     fn reopen(&self) -> Result<Chain, RenderError> {
         let opened =
             Device::open(&self.choice, &self.shaders, self.limits.binding_bytes, self.tuning);
-        let device = match opened {
+        let checked = match opened {
             Ok(device) if device.info == self.info => Ok(device),
             // Another device would draw other bytes, and was not requested.
             Ok(other) => Err(format!("it was lost, and in its place is {}", other.info.name)),
             Err(error) => Err(error.to_string()),
         };
-        let device = device
+        let device = checked
             .map_err(|reason| RenderError::Device { device: self.info.name.clone(), reason })?;
         tracing::info!(device = device.info.name, "the GPU was opened again");
         Chain::new(device, self.limits.mirror_bytes)

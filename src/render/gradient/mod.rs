@@ -234,6 +234,7 @@ impl ChunkGradients {
         let visible = &mut self.visible[index / LANES];
         let lanes = &mut self.lanes[index / LANES * width..][..width];
         if *visible == 0 {
+            // The columns of a group hold any value until one of its Gaussians is visible.
             lanes.fill(Lanes([0.0; LANES]));
         }
         *visible |= 1 << (index % LANES);

@@ -126,6 +126,7 @@ impl<'a> Sources<'a> {
             .splats()
             .into_iter()
             .enumerate()
+            // The index leads back to the source; the order of splats does not depend on it.
             .filter_map(|(index, splat)| splat.map(|splat| Splat { gaussian: [0, index], ..splat }))
             .collect();
         sort(&mut splats);
@@ -139,6 +140,7 @@ impl<'a> Sources<'a> {
                     continue;
                 }
                 let after = transmittance * (1.0 - alpha.min(self.profile.alpha_cap));
+                // The splat that would bring the pixel to the stop is left out, like all behind it.
                 if after <= self.profile.stop {
                     break;
                 }
@@ -394,6 +396,7 @@ impl Differentiate for Reference {
             let is_drawn: Vec<bool> =
                 sources.splats().iter().map(|splat| is_on_image(splat, view_size_px)).collect();
             stats.visible_pairs += is_drawn.iter().filter(|&&is_drawn| is_drawn).count() as u64;
+            // The sources are in the order of the chunks, and of the Gaussians of each.
             let mut first = 0;
             for chunk in &mut gradients.chunks {
                 for index in 0..chunk.len() {

@@ -103,6 +103,7 @@ fn beam(
         luminance += transmittance * hit.alpha * f64::from(hit.luminance);
         transmittance *= 1.0 - hit.alpha;
         if transmittance <= HALF {
+            // The weights of all hits up to the return add up to 1 - T.
             let luminance = (luminance / (1.0 - transmittance)) as f32;
             return Some(Hit { luminance, ..hit });
         }

@@ -26,7 +26,7 @@ use crate::gradient::Differentiate;
 use crate::lidar::{LidarView, Sweep};
 use wildcity_scene::{Rays, RenderProfile, Scene};
 
-/// The f64 backend.
+/// The backend in f64, which defines the images of all others.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Reference;
 

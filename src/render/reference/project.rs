@@ -27,7 +27,6 @@ pub struct Splat {
     pub class: SemanticClass,
     /// Depth of the centre, in metres, by which splats are sorted.
     pub depth_m: f64,
-    /// Centre, in pixels.
     pub mean_px: DVec2,
     /// Inverse screen covariance (xx, xy, yy), in px⁻².
     pub conic: DVec3,
@@ -188,7 +187,7 @@ impl Gaussian {
 pub(super) struct Footprint {
     pub(super) depth_m: f64,
     pub(super) mean_px: DVec2,
-    /// Covariance, in px².
+    /// Variance along x before the blur, in px².
     pub(super) xx: f64,
     pub(super) xy: f64,
     pub(super) yy: f64,

@@ -95,7 +95,8 @@ impl ActorBox {
             // `contains` is false for NaN.
             let accepted = (Self::LEAST_M..=Self::MOST_M).contains(&value);
             if !accepted {
-                let [least, most] = [Self::LEAST_M, Self::MOST_M];
+                let least = Self::LEAST_M;
+                let most = Self::MOST_M;
                 return Err(ActorBoxError { field, value, least, most });
             }
         }

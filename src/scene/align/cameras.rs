@@ -60,6 +60,7 @@ impl CaptureCameras {
         let portrait = up_by_axes(world_from_camera, DVec3::NEG_X, DVec3::Y);
         let is_portrait = match (landscape, portrait) {
             (Some((up, _)), Some((turned, _))) => {
+                // Both are plausible: the camera moved along the ground, and hardly up and down.
                 spread(&positions, turned) < spread(&positions, up)
             }
             (landscape, _) => landscape.is_none(),
@@ -67,6 +68,7 @@ impl CaptureCameras {
         let chosen = if is_portrait { portrait } else { landscape };
         let none = CamerasError::NoCommonUp { count: positions.len() };
         let (up, has_level_rows) = chosen.ok_or(none)?;
+        // The files of portrait photographs do not say to which side they were turned.
         let ups = if is_portrait { vec![up, -up] } else { vec![up] };
         Ok(Self { ups, has_level_rows, positions })
     }
@@ -127,12 +129,14 @@ fn up_by_axes(world_from_camera: &[Pose], upright: DVec3, level: DVec3) -> Optio
     if mean.length() < LEAST_COMMON {
         return None;
     }
+    // Unit vectors in one direction have a sum as long as their number.
     let is_spread = axes(level).sum::<DVec3>().length() <= MOST_PARALLEL * count;
     // A plane through the origin: each direction and the opposite one have their mean there.
     let rows: Vec<DVec3> = axes(level).chain(axes(-level)).collect();
     let agrees = |up: &DVec3| up.dot(mean) >= LEAST_AGREEMENT * mean.length();
     let across = fit(&rows)
         .filter(|_| is_spread)
+        // The normal of a fit may point to either side.
         .map(|plane| plane.up * plane.up.dot(mean).signum())
         .filter(agrees);
     Some((across.unwrap_or(mean).normalize(), across.is_some()))

@@ -215,7 +215,8 @@ fn timed<'a>(
         return Ok((images, times_us.collect()));
     }
     if let Some(image) = images.iter().find(|image| image.time_us.is_none()) {
-        let (name, folder) = (image.name.clone(), folder.to_owned());
+        let name = image.name.clone();
+        let folder = folder.to_owned();
         return Err(CapturedDriveError::NoTime { name, folder });
     }
     if let Some(fps) = fps {
@@ -227,7 +228,8 @@ fn timed<'a>(
     let all_us: Vec<i64> = images.iter().filter_map(|image| image.time_us).collect();
     // A trajectory needs rising times.
     if let Some(at) = all_us.windows(2).position(|pair| pair[0] == pair[1]) {
-        let (name, time_us) = (images[at + 1].name.clone(), all_us[at]);
+        let name = images[at + 1].name.clone();
+        let time_us = all_us[at];
         return Err(CapturedDriveError::SameTime { name, time_us });
     }
     let first_us = all_us.first().copied().unwrap_or(0);
@@ -295,14 +297,16 @@ fn by_number(a: &str, b: &str) -> Ordering {
         text.find(|c: char| c.is_ascii_digit() != in_number).unwrap_or(text.len())
     };
     // Compares run by run: a run is all digits or has none. Both texts lose one run in each round.
-    let (mut left, mut right) = (a, b);
+    let mut left = a;
+    let mut right = b;
     while !left.is_empty() && !right.is_empty() {
         let (l, left_rest) = left.split_at(split(left));
         let (r, right_rest) = right.split_at(split(right));
         let order = if is_digit(l) && is_digit(r) {
             // Numbers compare as texts, without leading zeros first: a name may have more digits
             // than any integer type holds. Then the longer number is the larger one.
-            let (l, r) = (l.trim_start_matches('0'), r.trim_start_matches('0'));
+            let l = l.trim_start_matches('0');
+            let r = r.trim_start_matches('0');
             l.len().cmp(&r.len()).then_with(|| l.cmp(r))
         } else {
             l.cmp(r)

@@ -441,7 +441,9 @@ fn normal(gaussians: &Gaussians, i: usize) -> Option<DVec3> {
 /// A plane through three random places, or through one along its Gaussian.
 fn hypothesis(places: &[SurfaceSample], at: usize, random: &mut Random) -> Option<GroundPlane> {
     let mut pick = || places[random.below(places.len())];
-    let [a, b, c] = [pick(), pick(), pick()];
+    let a = pick();
+    let b = pick();
+    let c = pick();
     // Half of the hypotheses use one normal, which is right with one lucky draw and not three; the
     // other half also serve scenes of round Gaussians.
     if at.is_multiple_of(2) {
@@ -554,7 +556,8 @@ mod tests {
         let mut random = Random::new(7, "room", 0);
         let mut gaussians = Gaussians::with_capacity(0, count);
         for i in 0..count {
-            let (x, y) = (random.range(-5.0, 5.0), random.range(-5.0, 5.0));
+            let x = random.range(-5.0, 5.0);
+            let y = random.range(-5.0, 5.0);
             // Six tenths floor (rough by 1 cm), two tenths wall, two tenths round noise above the
             // floor.
             let (at, turn) = match i % 10 {

@@ -66,7 +66,7 @@ pub enum AlignmentError {
 }
 
 impl Alignment {
-    /// Changes nothing.
+    /// The alignment that leaves axes and unit as they are.
     pub const IDENTITY: Self = Self { new_from_old: Pose::IDENTITY, metres_per_unit: 1.0 };
 
     /// Puts a plane at z = 0 with the shortest rotation, which keeps headings as far as possible.

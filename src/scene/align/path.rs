@@ -12,9 +12,9 @@ pub const DEFAULT_SPEED_M_S: f64 = 5.0;
 /// Distance between two keyframes, in metres; a short drive has at least [`LEAST_STEPS`].
 const STEP_M: f64 = 0.5;
 const LEAST_STEPS: f64 = 8.0;
-/// Most keyframes.
+/// Most steps between keyframes: 100 km at [`STEP_M`].
 const MOST_STEPS: f64 = 200_000.0;
-/// Most points.
+/// Most points that a path may be drawn through.
 const MOST_POINTS: usize = 1_000;
 /// Points that are closer together than this are one, in metres.
 const SAME_M: f64 = 1e-3;
@@ -34,7 +34,7 @@ pub enum PathError {
     /// The speed is out of range.
     #[error("a speed of {0:?} m/s; from 0.1 to 100 are accepted")]
     Speed(f64),
-    /// Not a name.
+    /// A name is empty, too long, or has other characters than `[a-z0-9._-]`.
     #[error(
         "{0:?} is not a name of a trajectory: a name has 1 to 64 of a-z 0-9 . _ - and does not start with ."
     )]
@@ -92,7 +92,8 @@ pub fn drive_through(
     let fine_m = STEP_M.min(straight_m / LEAST_STEPS) / 8.0;
     let mut curve = vec![knots[0]];
     for at in 0..knots.len() - 1 {
-        let [from, to] = [knots[at], knots[at + 1]];
+        let from = knots[at];
+        let to = knots[at + 1];
         // Beyond the ends the curve goes on as it came.
         let before = if at > 0 { knots[at - 1] } else { 2.0 * from - to };
         let after = knots.get(at + 2).copied().unwrap_or(2.0 * to - from);
@@ -111,7 +112,8 @@ pub fn drive_through(
     let steps = (length_m / STEP_M).ceil().max(LEAST_STEPS) as usize;
     let at_m = |station_m: f64| {
         let next = stations_m.partition_point(|&m| m < station_m).clamp(1, curve.len() - 1);
-        let [from_m, to_m] = [stations_m[next - 1], stations_m[next]];
+        let from_m = stations_m[next - 1];
+        let to_m = stations_m[next];
         curve[next - 1].lerp(curve[next], ((station_m - from_m) / (to_m - from_m)).clamp(0.0, 1.0))
     };
     let mut heading_rad = 0.0;
@@ -152,7 +154,9 @@ fn catmull_rom([a, b, c, d]: [DVec3; 4], t: f64) -> DVec3 {
     let mix = |from: DVec3, to: DVec3, start: f64, end: f64| {
         from + (to - from) * ((t - start) / (end - start))
     };
-    let (ab, bc, cd) = (mix(a, b, 0.0, t1), mix(b, c, t1, t2), mix(c, d, t2, t3));
+    let ab = mix(a, b, 0.0, t1);
+    let bc = mix(b, c, t1, t2);
+    let cd = mix(c, d, t2, t3);
     mix(mix(ab, bc, 0.0, t2), mix(bc, cd, t1, t3), t1, t2)
 }
 

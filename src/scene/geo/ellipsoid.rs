@@ -7,13 +7,13 @@ use super::GeoPoint;
 /// Semi-major axis of WGS84, in metres.
 pub(super) const A_M: f64 = 6_378_137.0;
 
-/// Flattening of WGS84.
+/// Flattening of WGS84: by how much of the semi-major axis the poles are nearer.
 pub(super) const F: f64 = 1.0 / 298.257_223_563;
 
 /// Square of the first eccentricity.
 pub(super) const E2: f64 = F * (2.0 - F);
 
-/// Third flattening.
+/// Third flattening, `(a - b)/(a + b)`: the series of UTM are in its powers.
 pub(super) const N: f64 = F / (2.0 - F);
 
 /// Earth-centred coordinates of a point, in metres.

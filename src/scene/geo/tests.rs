@@ -133,8 +133,9 @@ fn headings_are_from_north_to_the_east() {
     }
     // 40 km to the east, the meridian is turned by 0.59 degrees of longitude times the sine of the
     // latitude.
-    let far = anchor.locate(&facing(DVec3::new(40_000.0, 0.0, 0.0), std::f64::consts::FRAC_PI_2));
-    let far = far.unwrap();
+    let located =
+        anchor.locate(&facing(DVec3::new(40_000.0, 0.0, 0.0), std::f64::consts::FRAC_PI_2));
+    let far = located.unwrap();
     let turned_deg = (far.point.longitude_deg - 13.4) * 52.5f64.to_radians().sin();
     assert!((far.heading_deg - turned_deg).abs() < 2e-3, "{far:?}, {turned_deg}");
 }

@@ -14,10 +14,10 @@ const UTM_EASTING_M: f64 = 500_000.0;
 /// False northing of UTM in the southern hemisphere, in metres.
 const UTM_SOUTH_NORTHING_M: f64 = 1e7;
 
-/// A UTM zone.
+/// A UTM zone of one hemisphere.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct UtmZone {
-    /// 1 to 60.
+    /// From 1 at 180° west to 60, each 6° wide.
     number: u32,
     is_south: bool,
 }
@@ -92,7 +92,8 @@ impl UtmZone {
         // 11 and 24).
         let mut xi_sphere = xi;
         let mut eta_sphere = eta;
-        let (mut p, mut q) = (1.0, 0.0);
+        let mut p = 1.0;
+        let mut q = 0.0;
         // Terms of order 2, 4, .., 12 of ξ and η, and at the same time of their derivative p - i q,
         // whose argument is a part of the convergence.
         for (index, beta) in at_n(&BETA).into_iter().enumerate() {
@@ -102,7 +103,8 @@ impl UtmZone {
             p -= k * beta * (k * xi).cos() * (k * eta).cosh();
             q += k * beta * (k * xi).sin() * (k * eta).sinh();
         }
-        let (sinh, cos) = (eta_sphere.sinh(), xi_sphere.cos());
+        let sinh = eta_sphere.sinh();
+        let cos = xi_sphere.cos();
         let conformal_tan = xi_sphere.sin() / sinh.hypot(cos);
         let longitude_rad = sinh.atan2(cos);
         let latitude_rad = geodetic_latitude(conformal_tan);
@@ -124,7 +126,8 @@ impl UtmZone {
         // The transverse projection of the sphere; its inverse is at the end of `to_geodetic`.
         let xi_sphere = tan.atan2(cos_lon);
         let eta_sphere = (sin_lon / tan.hypot(cos_lon)).asinh();
-        let (mut xi, mut eta) = (xi_sphere, eta_sphere);
+        let mut xi = xi_sphere;
+        let mut eta = eta_sphere;
         for (index, alpha) in at_n(&ALPHA).into_iter().enumerate() {
             let k = 2.0 * (index + 1) as f64;
             xi += alpha * (k * xi_sphere).sin() * (k * eta_sphere).cosh();

@@ -112,6 +112,7 @@ impl Lidar {
             }
             (None, Some(options::LidarColumns { count: columns, first_rad, last_rad })) => {
                 count("columns.count", columns, Self::MAX_COLUMNS)?;
+                // A single column has no step, and is at the first azimuth.
                 let step = (last_rad - first_rad) / (columns.max(2) - 1) as f64;
                 let azimuths = (0..columns).map(|column| first_rad + step * column as f64);
                 (azimuths.collect(), Columns::Even { first_rad, last_rad })

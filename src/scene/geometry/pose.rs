@@ -71,7 +71,7 @@ impl PoseError {
 }
 
 impl Pose {
-    /// The identity transform.
+    /// The pose of a frame in itself.
     pub const IDENTITY: Self = Self { position_m: DVec3::ZERO, rotation: DQuat::IDENTITY };
 
     /// Largest accepted magnitude of a coordinate, in metres. A city spans 1e5 m; UTM northings

@@ -51,15 +51,13 @@ impl StoredNode {
 /// A Gaussian with its moments.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Node {
-    /// Mean, in metres.
     pub(super) mean_m: DVec3,
-    /// Covariance, in m².
     pub(super) cov_m2: DMat3,
     /// Standard deviations along the principal axes, in metres.
     pub(super) scale_m: DVec3,
     /// Principal axes, as columns.
     pub(super) axes: DMat3,
-    /// Opacity times [`area_m2`].
+    /// Opacity times [`area_m2`]: how much of an image the Gaussian takes.
     pub(super) weight: f64,
     /// The part of the weight that the Gaussians of level 0 that it represents hide: the sum of
     /// weight times [`hidden_share`].
@@ -159,7 +157,8 @@ pub(super) fn cost(a: &Node, b: &Node, merged: &Node, colours: [DVec3; 2], blur_
         // difference.
         [(a, a.weight, colours[0]), (b, b.weight, colours[1]), (merged, -merged.weight, colour)];
     let term = |i: usize, j: usize| {
-        let ((p, weight_p, colour_p), (q, weight_q, colour_q)) = (fields[i], fields[j]);
+        let (p, weight_p, colour_p) = fields[i];
+        let (q, weight_q, colour_q) = fields[j];
         // 1 + p·q is the inner product of (1, colour) with (1, colour): opacity counts as much as a
         // channel of colour.
         weight_p * weight_q * (1.0 + colour_p.dot(colour_q)) * overlap(p, q, blur_m2)
@@ -175,8 +174,12 @@ fn overlap(a: &Node, b: &Node, blur_m2: f64) -> f64 {
     let sum = a.cov_m2 + b.cov_m2 + DMat3::from_diagonal(DVec3::splat(2.0 * blur_m2));
     let offset = b.mean_m - a.mean_m;
     // Solve by Cramer's rule: the cofactor rows are the inverse times the determinant.
-    let [x, y, z] = [sum.x_axis, sum.y_axis, sum.z_axis];
-    let (yz, zx, xy) = (y.cross(z), z.cross(x), x.cross(y));
+    let x = sum.x_axis;
+    let y = sum.y_axis;
+    let z = sum.z_axis;
+    let yz = y.cross(z);
+    let zx = z.cross(x);
+    let xy = x.cross(y);
     let determinant = x.dot(yz);
     let solved = DVec3::new(yz.dot(offset), zx.dot(offset), xy.dot(offset));
     (-0.5 * offset.dot(solved) / determinant).exp() / determinant.sqrt()
@@ -192,7 +195,9 @@ fn eigen(mut matrix: DMat3) -> (DVec3, DMat3) {
     let mut vectors = DMat3::IDENTITY;
     for _ in 0..8 {
         for (p, q) in [(0, 1), (0, 2), (1, 2)] {
-            let (pp, qq, pq) = (matrix.col(p)[p], matrix.col(q)[q], matrix.col(q)[p]);
+            let pp = matrix.col(p)[p];
+            let qq = matrix.col(q)[q];
+            let pq = matrix.col(q)[p];
             if pq.abs() <= 1e-18 * (pp.abs() + qq.abs()) {
                 continue;
             }
@@ -255,7 +260,8 @@ mod tests {
 
     #[test]
     fn twins_on_one_spot_cost_nothing_and_become_twice_as_opaque() {
-        let (a, b) = (ball(0.0, 0.5, 0.8), ball(0.0, 0.5, 0.8));
+        let a = ball(0.0, 0.5, 0.8);
+        let b = ball(0.0, 0.5, 0.8);
         let mut merged = joined(&a, &b);
         merged.diagonalise();
         let opacity = merged.stored().opacity();
@@ -266,13 +272,15 @@ mod tests {
     #[test]
     fn distance_and_colour_cost() {
         let price = |x: f64, colours: [DVec3; 2], blur_m2: f64| {
-            let (a, b) = (ball(0.0, 0.1, 0.8), ball(x, 0.1, 0.8));
+            let a = ball(0.0, 0.1, 0.8);
+            let b = ball(x, 0.1, 0.8);
             let mut merged = joined(&a, &b);
             merged.diagonalise();
             cost(&a, &b, &merged, colours, blur_m2)
         };
         let grey = [DVec3::splat(0.5); 2];
-        let (near, far) = (price(0.1, grey, 1e-4), price(1.0, grey, 1e-4));
+        let near = price(0.1, grey, 1e-4);
+        let far = price(1.0, grey, 1e-4);
         assert!(near < 0.01 && far > 0.3, "{near}, {far}");
         assert!(price(1.0, grey, 1.0) < 0.01, "what a blur hides is free");
         assert!(price(0.1, [DVec3::ZERO, DVec3::ONE], 1e-4) > near);

@@ -328,7 +328,8 @@ impl<'a> Merging<'a> {
         let distance_m = stored_a.mean_m.distance(stored_b.mean_m);
         let total = stored_a.weight + stored_b.weight;
         let share = if total > 0.0 { stored_b.weight / total } else { 0.5 };
-        let [sigma_a, sigma_b] = [stored_a.sigma_m(), stored_b.sigma_m()];
+        let sigma_a = stored_a.sigma_m();
+        let sigma_b = stored_b.sigma_m();
         let widest_m = ((1.0 - share) * sigma_a * sigma_a
             + share * (sigma_b * sigma_b + (1.0 - share) * distance_m * distance_m))
             .sqrt();
@@ -339,7 +340,8 @@ impl<'a> Merging<'a> {
         }
         priced.compute(first);
         priced.compute(second);
-        let (Some(a), Some(b)) = (&priced.nodes[first], &priced.nodes[second]) else { return None };
+        let Some(a) = &priced.nodes[first] else { return None };
+        let Some(b) = &priced.nodes[second] else { return None };
         let merged = joined(a, b);
         // A lower bound of the merged node's largest standard deviation: that along the longest
         // axis of the larger node.

@@ -5,9 +5,9 @@ use half::f16;
 /// The encoding of a field.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Code {
-    /// f32 without loss.
+    /// The bits of each f32, without loss.
     Float,
-    /// f16.
+    /// Each value rounded to f16.
     Half,
     /// This many bits: a multiple of a step, from the part's smallest value to its largest.
     Steps(u32),
@@ -85,7 +85,7 @@ impl Measure {
 }
 
 impl Code {
-    /// Bits per Gaussian.
+    /// Bits that the columns of a field take of a Gaussian.
     pub(super) fn bits(self, columns: usize) -> usize {
         match self {
             Self::Float => 32 * columns,
@@ -192,7 +192,8 @@ impl Grid {
         let fold = |from: f64, pick: fn(f64, f64) -> f64| {
             values.iter().fold(from, |all, &value| pick(all, f64::from(value)))
         };
-        let (low, high) = (fold(f64::INFINITY, f64::min), fold(f64::NEG_INFINITY, f64::max));
+        let low = fold(f64::INFINITY, f64::min);
+        let high = fold(f64::NEG_INFINITY, f64::max);
         // 2^bits numbers are 2^bits - 1 steps, of which one is used up by rounding the start down.
         let steps = f64::from((1_u32 << bits) - 2);
         let finest = low.abs().max(high.abs()) / f64::from(1 << 30);

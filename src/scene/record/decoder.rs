@@ -48,12 +48,12 @@ impl<'a> FieldDecoder<'a> {
     ) -> Self {
         // The planes of a column follow each other; splitting them off in order gives each column
         // its own.
-        let stored = code.planes(columns).into_iter().map(|bytes| {
+        let split = code.planes(columns).into_iter().map(|bytes| {
             let (own, rest) = planes.split_at(bytes * count);
             planes = rest;
             StoredColumn { planes: own, count }
         });
-        let stored = stored.collect();
+        let stored = split.collect();
         let grid = matches!(code, Code::Steps(_) | Code::Binary(_)).then(|| Grid::read(grid));
         let curved = matches!(measure, Measure::Logarithm | Measure::Opacity);
         let table = match (code, grid) {

@@ -308,8 +308,8 @@ mod tests {
         let mut chunk = Chunk::new([0, 0], DVec3::ZERO, 1, count);
         for i in 0..count {
             let share = |k: usize| (i * k % 1_009) as f32 / 1_009.0;
-            let quat = Quat::from_xyzw(share(3), share(5) - 0.5, share(7), 0.6 + share(11));
-            let quat = quat.normalize();
+            let turned = Quat::from_xyzw(share(3), share(5) - 0.5, share(7), 0.6 + share(11));
+            let quat = turned.normalize();
             let sh: Vec<f32> = (0..12).map(|k| share(13 + k) - 0.5).collect();
             chunk.push_activated(&ActivatedGaussian {
                 mean_m: [30.0 * share(37), 30.0 * share(101), -share(467)],

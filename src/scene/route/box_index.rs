@@ -84,14 +84,15 @@ mod tests {
         let boxes = BoxIndex::new(&drive.iter().map(point).collect::<Vec<_>>());
         let looked_at = Cell::new(0);
         for i in 0..400 {
-            let (x_m, y_m) = (f64::from(i % 20) * 7.0 - 20.0, f64::from(i / 20) * 5.0 - 20.0);
+            let x_m = f64::from(i % 20) * 7.0 - 20.0;
+            let y_m = f64::from(i / 20) * 5.0 - 20.0;
             let place_m = DVec3::new(x_m, y_m, 1.0);
             let cost_m = |item: usize| {
                 looked_at.set(looked_at.get() + 1);
                 drive[item].distance(place_m)
             };
-            let slow = drive.iter().map(|at_m| at_m.distance(place_m)).enumerate();
-            let slow = slow.min_by(|(_, a), (_, b)| a.total_cmp(b));
+            let distances = drive.iter().map(|at_m| at_m.distance(place_m)).enumerate();
+            let slow = distances.min_by(|(_, a), (_, b)| a.total_cmp(b));
             assert_eq!(boxes.min_cost(place_m, cost_m), slow, "{place_m}");
         }
         // Fewer than half of all items are looked at, where a linear search looks at all.

@@ -12,7 +12,7 @@ pub struct Association {
     pub unmatched: Vec<usize>,
 }
 
-/// Two associated times.
+/// A time of each of two clocks that belong together.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TimePair {
     /// Index in the first clock's times.
@@ -38,7 +38,8 @@ pub fn associate(
     check_order("first", first_us)?;
     check_order("second", second_us)?;
     if tolerance_us < 0 {
-        let (field, value) = ("tolerance_us", tolerance_us as f64);
+        let field = "tolerance_us";
+        let value = tolerance_us as f64;
         return Err(RouteError::Value { field, value, must: "a tolerance is 0 µs or more" });
     }
     let mut pairs = Vec::new();
@@ -70,7 +71,8 @@ impl Route<'_> {
     /// [`RouteError::Outside`] before the first keyframe or after the last one.
     pub fn pose_at(&self, time_us: i64) -> Result<Pose, RouteError> {
         let keyframes = &self.trajectory.keyframes;
-        let (from_us, to_us) = (keyframes[0].time_us, keyframes[keyframes.len() - 1].time_us);
+        let from_us = keyframes[0].time_us;
+        let to_us = keyframes[keyframes.len() - 1].time_us;
         if !(from_us..=to_us).contains(&time_us) {
             let name = self.trajectory.name.clone();
             return Err(RouteError::Outside { name, time_us, from_us, to_us });

@@ -138,8 +138,8 @@ impl<'a> Route<'a> {
         let keyframes = &self.trajectory.keyframes;
         // The first keyframe at or after the station. It is keyframe 0 only if the station is at or
         // before the start.
-        let after = self.stations_m.partition_point(|&s_m| s_m < station_m);
-        let after = after.min(keyframes.len() - 1);
+        let reached = self.stations_m.partition_point(|&s_m| s_m < station_m);
+        let after = reached.min(keyframes.len() - 1);
         let Some(before) = after.checked_sub(1) else { return keyframes[0] };
         let from_m = self.stations_m[before];
         let to_m = self.stations_m[after];

@@ -71,7 +71,8 @@ impl Route<'_> {
             // The tolerance may put the last station a micrometre beyond the end of the section.
             let station_m = (first_m + index as f64 * every_m).min(last_m);
             let keyframe = self.at(station_m);
-            let (time_us, world_from_rig) = (keyframe.time_us, keyframe.world_from_rig);
+            let time_us = keyframe.time_us;
+            let world_from_rig = keyframe.world_from_rig;
             RoutePose { station_m, time_us, world_from_rig }
         };
         Ok((0..=spaces as usize).map(pose).collect())

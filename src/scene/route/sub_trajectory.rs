@@ -58,8 +58,8 @@ fn piece(
     let [first, last] = stations_m.map(|station_m| route.at(station_m));
     // Keyframes strictly between the ends in space, and also in time: the two may differ where the
     // vehicle stood still, or where an end was rounded to a microsecond.
-    let inner = route.trajectory.keyframes.iter().zip(&route.stations_m);
-    let inner = inner
+    let places = route.trajectory.keyframes.iter().zip(&route.stations_m);
+    let inner = places
         .skip(route.stations_m.partition_point(|&s_m| s_m <= from_m))
         .take_while(|(_, s_m)| **s_m < to_m)
         .map(|(keyframe, _)| *keyframe)

@@ -74,8 +74,8 @@ impl Maps {
                 Err(level) => level,
             };
             let fits = |grid: &Grid| grid.edge == edge(level);
-            let grid = next.take().filter(fits);
-            let grid = grid.unwrap_or_else(|| Grid::new(simd, network, edge(level)));
+            let kept = next.take().filter(fits);
+            let grid = kept.unwrap_or_else(|| Grid::new(simd, network, edge(level)));
             let known = self.levels().get(level).map(|level| level.error);
             let error = known.unwrap_or_else(|| {
                 let finer = next.insert(Grid::new(simd, network, edge(level + 1)));

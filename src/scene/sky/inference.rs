@@ -29,9 +29,9 @@ pub struct InferenceNetwork {
 #[derive(Clone, Debug)]
 struct Dense {
     inputs: usize,
-    /// `[groups, inputs]`.
+    /// `[groups, inputs]`, eight outputs at a time.
     weight: Vec<[f32; GROUP]>,
-    /// `[groups]`.
+    /// `[groups]`, eight outputs at a time.
     bias: Vec<[f32; GROUP]>,
 }
 
@@ -139,7 +139,7 @@ impl InferenceNetwork {
         self.layers.iter().map(of_layer).sum()
     }
 
-    /// Buffers for [`InferenceNetwork::rgb`].
+    /// Buffers for [`InferenceNetwork::rgb`], of one thread at a time.
     pub fn scratch(&self) -> Scratch {
         let zero = |len| vec![Lanes([0.0; LANES]); len];
         Scratch {
@@ -219,7 +219,7 @@ impl Dense {
                 if output < layer.outputs { value(output) } else { 0.0 }
             })
         };
-        let weight = (0..groups * inputs).map(|at| {
+        let weights = (0..groups * inputs).map(|at| {
             let group = at / inputs;
             let input = at % inputs;
             let weight = |output: usize| {
@@ -227,7 +227,7 @@ impl Dense {
             };
             of(group, &weight)
         });
-        let weight = weight.collect();
+        let weight = weights.collect();
         Self { inputs, weight, bias: (0..groups).map(|group| of(group, &bias)).collect() }
     }
 

@@ -158,7 +158,7 @@ impl Sky {
         self.sky_from_world
     }
 
-    /// The model.
+    /// The network or the cube map, in its own axes.
     pub fn model(&self) -> &SkyModel {
         &self.model
     }
@@ -186,6 +186,7 @@ impl Sky {
     pub fn bytes(&self) -> usize {
         self.baked.bytes()
             + match &self.model {
+                // Its fast form has about as many weights.
                 SkyModel::Network(network, _) => 2 * network.bytes(),
                 SkyModel::Cube(map) => map.bytes(),
             }

@@ -19,14 +19,13 @@ pub struct Network {
     appearance: Vec<f32>,
 }
 
-/// One linear layer.
+/// One linear layer: `weight inputs + bias`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Layer {
     pub outputs: usize,
     pub inputs: usize,
-    /// `[outputs, inputs]`.
+    /// `[outputs, inputs]`, row by row.
     pub weight: Vec<f32>,
-    /// `[outputs]`.
     pub bias: Vec<f32>,
 }
 
@@ -156,7 +155,7 @@ impl Network {
         &self.layers
     }
 
-    /// The appearance embedding.
+    /// The appearance embedding: the last inputs of the network, the same for all directions.
     pub fn appearance(&self) -> &[f32] {
         &self.appearance
     }

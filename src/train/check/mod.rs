@@ -101,6 +101,7 @@ impl fmt::Display for Table {
         writeln!(f, "  bound")?;
         for row in &self.rows {
             write!(f, "{:22}  {:9}  {:9}", row.case, row.backend, row.against)?;
+            // A case without a group, such as one without depths, leaves its column empty.
             for name in groups {
                 match row.groups.iter().find(|group| group.group == name) {
                     Some(group) => write!(f, "  {:7.0e}", group.error)?,

@@ -68,6 +68,7 @@ fn time(
     let mut forward_ms = f64::INFINITY;
     let mut backward_ms = f64::INFINITY;
     let mut stats = FrameStats::default();
+    // Other work on the machine only adds time, so the least of the runs is closest to the truth.
     for _ in 0..RUNS {
         let mut targets: Vec<Target<'_>> = images
             .iter_mut()
@@ -81,6 +82,7 @@ fn time(
         let run = backend.differentiate(&frame, false, &mut loss, &mut gradients)?;
         let loss = run.stages_ms.iter().position(|(stage, _)| *stage == "loss").unwrap_or(0);
         let sum = |stages: &[(&str, f64)]| stages.iter().map(|(_, ms)| ms).sum::<f64>();
+        // Stages are in the order in which they ran, and the loss lies between the two ways.
         forward_ms = forward_ms.min(sum(&run.stages_ms[..loss]));
         let ms = sum(&run.stages_ms[loss + 1..]);
         if ms < backward_ms {
@@ -106,6 +108,8 @@ fn view([width, height]: [u32; 2], yaw: f64) -> View {
     let focal_px = 0.55 * f64::from(width);
     let center_px = [width, height].map(|size| 0.5 * f64::from(size));
     let pinhole = Pinhole { fx: focal_px, fy: focal_px, cx: center_px[0], cy: center_px[1] };
+    // The world has x ahead, y to the left and z up; a camera has x to the right, y down and z
+    // ahead.
     let axes = DMat3::from_cols(DVec3::NEG_Y, DVec3::NEG_Z, DVec3::X);
     let rotation = DQuat::from_rotation_z(yaw) * DQuat::from_mat3(&axes);
     let pose = Pose { position_m: DVec3::new(50.0, 0.0, 1.6), rotation };

@@ -149,6 +149,7 @@ fn train(
         db = line.held_out_db.unwrap_or(db);
         true
     };
+    // Only the last step is evaluated.
     run(&mut trainer, recording, cpu, steps, &mut on_step)?;
     Ok((trainer, db))
 }

@@ -80,6 +80,7 @@ fn start(truth: &Gaussians, recording: &Recording) -> Gaussians {
     let count = 6_000.0;
     for k in 0..6_000 {
         let z = 1.0 - (f64::from(k) + 0.5) / count;
+        // Turns by the golden ratio at even heights cover the sphere evenly.
         let angle = PI * (1.0 + 5.0_f64.sqrt()) * (f64::from(k) + 0.5);
         let across = (1.0 - z * z).sqrt();
         let direction = DVec3::new(across * angle.cos(), across * angle.sin(), z);

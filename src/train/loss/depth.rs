@@ -23,6 +23,7 @@ impl<T: Real> DepthLoss<T> {
     pub fn scaled(self, weight: f64) -> Self {
         let scale = |value: f64, by: Vec<T>| Loss { value, by }.scaled(weight);
         let by_opacity = scale(self.value, self.by_opacity);
+        // The value is scaled once, with the derivatives by the opacity.
         let by_depth_sum = scale(0.0, self.by_depth_sum);
         Self {
             value: by_opacity.value,
@@ -47,6 +48,7 @@ pub fn disparity<T: Real>(opacity: &[T], depth_sum_m: &[T], measured_m: &[T]) ->
 pub fn metric_depth<T: Real>(opacity: &[T], depth_sum_m: &[T], measured_m: &[T]) -> DepthLoss<T> {
     depth_mean(opacity, depth_sum_m, measured_m, |opacity, sum_m, measured_m| {
         let depth_m = sum_m / opacity;
+        // d(D/A) = dD/A - D dA/A².
         (depth_m - measured_m, -depth_m / opacity, T::one() / opacity)
     })
 }

@@ -68,6 +68,7 @@ impl<T: Real> Terms<T> {
         for (gaussian, by) in gaussians.iter().zip(&mut loss.by) {
             let cosine = dot(self.up, gaussian.normal);
             upright += (T::one() - cosine.abs()).to_double();
+            // The derivative of 1 - |c| by c.
             let sign = if cosine < T::zero() { T::one() } else { -T::one() };
             by.normal = scaled(self.up, sign * self.upright * share);
             let missing = T::one() - gaussian.opacity;

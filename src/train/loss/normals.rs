@@ -62,6 +62,7 @@ pub fn normals<T: Real>(
             }
         }
     }
+    // Known only now: pixels without a normal do not count.
     let share = T::from_f64(1.0 / loss.pixels.max(1) as f64);
     loss.value *= share.to_double();
     for (i, &by) in by_depth.iter().enumerate() {

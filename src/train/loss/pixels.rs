@@ -46,6 +46,7 @@ fn pixel_mean<T: Real>(
     // Pixels of a part of the image, so that its sum is the same at any number of threads.
     const PART: usize = 3 << 12;
     let total = match weights {
+        // The weight of a pixel counts for each of its three channels.
         Some(weights) => weights.iter().map(|weight| weight.to_double()).sum::<f64>() * 3.0,
         None => image.len() as f64,
     };

@@ -49,6 +49,7 @@ pub fn dssim<T: Real>(size_px: [usize; 2], image: &[T], target: &[T]) -> Loss<T>
         dispatch!(level, simd => simd.vectorize(#[inline(always)] || window.sums(x, y, to)));
     });
 
+    // The loss is 1 minus the mean over all values.
     let per_value = T::from_f64(-1.0 / image.len() as f64);
     let mut by_sums = vec![T::zero(); DERIVATIVES * image.len()];
     let rows = by_sums.par_chunks_mut(DERIVATIVES * width).enumerate();
@@ -101,6 +102,7 @@ impl<T: Real> Window<T> {
     fn sums(&self, x: &[T], y: &[T], to: &mut [T]) {
         let mut products = vec![T::zero(); x.len()];
         for (number, to) in to.chunks_exact_mut(self.width).enumerate() {
+            // In the order of the sums: x, y, x², y², x y.
             let [a, b] = match number {
                 0 => {
                     self.across(x, to);
@@ -139,6 +141,7 @@ impl<T: Real> Window<T> {
     #[inline(always)]
     fn down<const N: usize>(&self, rows: &[T], row: usize) -> [Vec<T>; N] {
         let width = self.width;
+        // Rows without any width are none.
         let height = rows.len() / (N * width).max(1);
         let beyond = vec![T::zero(); width];
         let mut all = [const { Vec::new() }; N];

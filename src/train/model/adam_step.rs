@@ -78,6 +78,8 @@ impl AdamStep {
         let lengths = quat_lengths(values);
         for Lanes(by) in &mut raw[column::QUAT..column::LOG2_OPACITY] {
             for (by, length) in by.iter_mut().zip(lengths) {
+                // The derivatives are by the unit quaternion: a longer one turns less by the same
+                // step.
                 *by /= length;
             }
         }
@@ -85,11 +87,13 @@ impl AdamStep {
         for (by, logit) in raw[LOGIT].0.iter_mut().zip(values[LOGIT].0) {
             let opacity = sigmoid(logit);
             let by_log2 = *by * std::f32::consts::LOG2_E;
+            // By the logit, log2 o has the derivative (1 - o)/ln 2, and o has o (1 - o).
             *by = (1.0 - opacity) * (by_log2 + by_opacity * opacity);
         }
         for k in 0..3 {
             let Lanes(scales) = activated[column::SCALE + k];
             for (by, scale) in raw[LN_SCALE + k].0.iter_mut().zip(scales) {
+                // The derivative of a scale by its logarithm is the scale.
                 *by += by_scale * scale;
             }
         }
@@ -107,6 +111,7 @@ impl AdamStep {
         for lane in (0..LANES).filter(|lane| visible >> lane & 1 == 1) {
             let value = |column: usize| values[column].0[lane];
             let opacity = sigmoid(value(LOGIT));
+            // A half at the least opacity, and 1e-4 at 0.09 above it.
             let gate = sigmoid(-100.0 * (opacity - self.least_opacity));
             if gate < 1e-4 {
                 continue;

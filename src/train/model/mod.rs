@@ -126,6 +126,7 @@ impl Model {
         let ModelState { sh_degree, count, origin_m, values, moments, is_ground, classes } = state;
         let count = count as usize;
         let is_known = sh_degree <= sh::MAX_DEGREE;
+        // The count is read from a file, and may be any number.
         let wanted = count.div_ceil(LANES).checked_mul(columns(sh_degree) * LANES)?;
         let fits = moments.iter().chain([&values]).all(|values| values.len() == wanted);
         if !is_known || !fits || ![0, count].contains(&is_ground.len()) {
@@ -241,6 +242,7 @@ impl Model {
                 match moved {
                     Ok(()) => changes = true,
                     Err(index) => {
+                        // The least index of all, whichever thread finds one first.
                         faulty.fetch_min(index, Relaxed);
                     }
                 }

@@ -104,6 +104,7 @@ fn table(runs: &[ComparedRun], on_front: &[bool]) -> Markup {
 
 fn pictures(runs: &[ComparedRun], images: &[HeldOut]) -> Result<Markup, PageError> {
     let mut figures = Vec::new();
+    // All runs show the same recorded image, so that the first one's copy serves for all.
     if let Some(HeldOut { name, size_px, recorded, .. }) = images.first() {
         figures.push(figure(&format!("recorded: {name}"), *size_px, recorded)?);
     }
@@ -129,13 +130,16 @@ fn error_against_time(runs: &[ComparedRun], on_front: &[bool]) -> Result<String,
 
 fn draw(runs: &[ComparedRun], on_front: &[bool], text: &mut String) -> Result<(), Box<dyn Error>> {
     // The time axis is logarithmic: its coordinate is the exponent of 10.
+    // A run of no time counts as one of 1 ms: 0 has no logarithm.
     let point = |run: &ComparedRun| (run.seconds.max(1e-3).log10(), run.held_out_db);
     let judged = || runs.iter().zip(on_front).filter(|(run, _)| run.is_judged());
     let range = |values: &mut dyn Iterator<Item = f64>, margin: f64| {
         let ends = (f64::INFINITY, f64::NEG_INFINITY);
         let (low, high) = values.fold(ends, |(low, high), v| (low.min(v), high.max(v)));
+        // Without any run that is judged, `low` is infinite, which is no range for an axis.
         if low <= high { low - margin..high + margin } else { 0.0..1.0 }
     };
+    // Margins of 12 % in time (10^0.05) and of 0.5 dB keep the circles off the frame.
     let x = range(&mut judged().map(|(run, _)| point(run).0), 0.05);
     let y = range(&mut judged().map(|(run, _)| point(run).1), 0.5);
     let area = SVGBackend::with_string(text, SIZE_PX).into_drawing_area();
@@ -154,8 +158,11 @@ fn draw(runs: &[ComparedRun], on_front: &[bool], text: &mut String) -> Result<()
             seconds => format!("{seconds:.0}"),
         })
         .label_style(LABEL)
+        // White on white: only the lines that have a label are seen.
         .light_line_style(WHITE)
         .draw()?;
+    // In the order of the runs and not of a hash, so that the same runs have the same colours on
+    // every page.
     let mut lines: Vec<(f64, usize)> = Vec::new();
     for run in runs {
         if !lines.contains(&(run.size, run.cap)) {
@@ -166,6 +173,7 @@ fn draw(runs: &[ComparedRun], on_front: &[bool], text: &mut String) -> Result<()
         let is_own = |(run, _): &(&ComparedRun, &bool)| (run.size, run.cap) == (size, cap);
         let own = || judged().filter(is_own);
         let mut points: Vec<(f64, f64)> = own().map(|(run, _)| point(run)).collect();
+        // A line leads from the quick runs to the slow ones, in whatever order they were made.
         points.sort_by(|a, b| a.0.total_cmp(&b.0));
         chart
             .draw_series(LineSeries::new(points, color.stroke_width(2)))?
@@ -173,6 +181,7 @@ fn draw(runs: &[ComparedRun], on_front: &[bool], text: &mut String) -> Result<()
             .legend(move |(x, y)| PathElement::new([(x, y), (x + 20, y)], color.stroke_width(2)));
         chart.draw_series(own().map(|(run, on_front)| {
             let fill = if *on_front { color } else { WHITE };
+            // The filling comes first: below its outline it hides the line through the circle.
             EmptyElement::at(point(run))
                 + Circle::new((0, 0), 5, fill.filled())
                 + Circle::new((0, 0), 5, color.stroke_width(2))

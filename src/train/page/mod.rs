@@ -150,6 +150,7 @@ fn poses(moves: &PoseMoves, cameras: &[String], of_rig: bool) -> Markup {
         let part = |axis: usize| -> [f64; 2] {
             let mut all: Vec<f64> = moved.iter().map(|moved| moved[axis]).collect();
             all.sort_by(f64::total_cmp);
+            // Both are 0 if there is no pose of the kind.
             [all.len() / 2, all.len().saturating_sub(1)].map(|k| all.get(k).copied().unwrap_or(0.0))
         };
         let [middle_m, most_m] = part(0);

@@ -17,8 +17,8 @@ const QUALITY: u8 = 88;
 /// An image as JPEG, at a width that a page shows.
 pub(super) fn jpeg(size_px: [u32; 2], rgb8: &[u8]) -> Result<Vec<u8>, PageError> {
     let [width, height] = size_px;
-    let image = RgbImage::from_raw(width, height, rgb8.to_vec());
-    let image = image.ok_or(PageError::Size(width, height))?;
+    let made = RgbImage::from_raw(width, height, rgb8.to_vec());
+    let image = made.ok_or(PageError::Size(width, height))?;
     let shown = if width > MOST_PX {
         let shown_height = (height * MOST_PX).div_ceil(width);
         imageops::resize(&image, MOST_PX, shown_height, FilterType::Triangle)
@@ -38,6 +38,8 @@ pub(super) fn depth(depth_m: &[f32]) -> Vec<u8> {
         if depth_m <= 0.0 {
             return [0; 3];
         }
+        // 0 is red, 1 yellow, 2 green, 3 cyan and 4 blue: a channel is full within 1 of its own
+        // hue.
         let hue = 4.0 * (depth_m / FAR_M).clamp(0.0, 1.0).sqrt();
         [0.0_f32, 2.0, 4.0]
             .map(|middle| (255.0 * (2.0 - (hue - middle).abs()).clamp(0.0, 1.0)) as u8)

@@ -11,7 +11,7 @@ use wildcity_scene::sky::Layer;
 /// Nodes whose derivatives are summed apart, so that the sum is the same at any number of threads.
 const PART: usize = 256;
 
-/// Three layers.
+/// Three linear layers with ReLU between them, the second of which sees the inputs again.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Layers {
     octaves: usize,
@@ -56,6 +56,8 @@ impl Layers {
         let mut index = 0;
         for (layer, [outputs, inputs]) in layers.shapes().into_iter().enumerate() {
             let mut random = |count: usize| -> Vec<f32> {
+                // The index runs on through all layers, so that no two values share a random
+                // number.
                 let first = index;
                 index += count as u64;
                 let value = |k| (2.0 * unit(first + k) - 1.0) / (inputs as f64).sqrt();
@@ -157,6 +159,8 @@ impl Layers {
         let shapes = self.shapes();
         std::array::from_fn(|layer| {
             let [outputs, inputs] = shapes[layer];
+            // `k` counts the transposed matrix row by row: its row is an input, its column an
+            // output.
             let weight = |k: usize| self.weights[layer][k % outputs * inputs + k / outputs];
             (0..inputs * outputs).map(weight).collect()
         })
@@ -191,6 +195,7 @@ impl Layers {
     ) {
         let Values { joined, hidden, rgb } = self.values(by_input, inputs);
         let by_logit: Vec<f32> =
+            // The derivative of the sigmoid s is s (1 - s).
             rgb.iter().zip(by_color).map(|(rgb, by)| by * rgb * (1.0 - rgb)).collect();
         let mut by_hidden = self.back(2, &hidden, &by_logit, sums);
         // What ReLU cut off passes nothing on.
@@ -199,6 +204,7 @@ impl Layers {
         };
         keep(&mut by_hidden, &hidden);
         let mut by_joined = self.back(1, &joined, &by_hidden, sums);
+        // The second layer sees the inputs once more, so they have derivatives by two ways.
         let (by_first, by_inputs) = by_joined.split_at_mut(self.width);
         keep(by_first, &joined);
         add_scaled(&mut sums.inputs, 1.0, by_inputs);

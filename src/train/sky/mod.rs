@@ -101,6 +101,7 @@ impl TrainedSky {
         for ShownPixel { pixel, nodes, weights } in &sky.pixels {
             for (node, weight) in nodes.iter().zip(weights) {
                 for channel in 0..3 {
+                    // The transpose of the interpolation.
                     by_colors[3 * node + channel] += weight * by_rgb[3 * pixel + channel];
                 }
             }
@@ -216,9 +217,11 @@ impl<'a> Nodes<'a> {
             return Some(ShownPixel { pixel, nodes: [node; 4], weights: [1.0, 0.0, 0.0, 0.0] });
         };
         let share = |axis: usize| {
+            // At the last row or column both corners are the same pixel, and the share is 0.
             let length = (next[axis] - cell[axis]).max(1);
             (at[axis] - cell[axis]) as f32 / length as f32
         };
+        // Bilinear between the four corners.
         let x = share(0);
         let y = share(1);
         let weights = [(1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y];

@@ -43,6 +43,7 @@ impl Bins {
         for segment in segments {
             firsts.push(first.clone());
             for (number, first) in first.iter_mut().enumerate() {
+                // The pairs of a macro tile lie segment after segment.
                 *first += segment.macro_tile(number).len();
             }
         }

@@ -8,7 +8,7 @@ use crate::constants::TILE_PX;
 pub(in crate::cpu) struct Grid {
     /// Image size, in pixels.
     pub(super) size_px: [u32; 2],
-    /// Tiles per row.
+    /// Tiles in a row, the last of which may reach beyond the image.
     pub(in crate::cpu) columns: u32,
     pub(in crate::cpu) rows: u32,
     /// Base-2 logarithm of a macro tile's width and height in tiles.
@@ -31,7 +31,6 @@ impl Grid {
         Self { size_px, columns, rows, macro_bits }
     }
 
-    /// Number of tiles.
     pub(in crate::cpu) fn tiles(&self) -> usize {
         self.columns as usize * self.rows as usize
     }

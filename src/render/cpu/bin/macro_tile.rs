@@ -182,7 +182,7 @@ impl MacroTile {
         (self.copies.len() == self.pairs.len()).then_some(&self.copies)
     }
 
-    /// Bytes of memory.
+    /// Bytes of all buffers, with the room that they have left.
     pub(in crate::cpu) fn held_bytes(&self) -> usize {
         let Self { pairs, copies, instances, keys, other, .. } = self;
         pairs.capacity() * size_of::<Pair>()

@@ -87,10 +87,10 @@ fn tiles(center: f32, low: f32, high: f32, size_px: u32) -> Option<(u32, u32)> {
     // A pixel k has its centre at k + 0.5: the first is the ceiling, the last the floor.
     let last_px = (size_px - 1) as f32;
     // Use comparisons and not `max` and `min`, which take additional instructions for a NaN.
-    let first = (center + low - 0.5).ceil();
-    let first = if first > 0.0 { first } else { 0.0 };
-    let last = (center + high - 0.5).floor();
-    let last = if last < last_px { last } else { last_px };
+    let from = (center + low - 0.5).ceil();
+    let first = if from > 0.0 { from } else { 0.0 };
+    let to = (center + high - 0.5).floor();
+    let last = if to < last_px { to } else { last_px };
     (first <= last).then(|| (whole(first) / TILE_PX, whole(last) / TILE_PX))
 }
 

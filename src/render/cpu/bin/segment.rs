@@ -36,7 +36,7 @@ pub(super) struct Pair {
 pub(super) struct Counts {
     /// First the number of pairs, then the end of them in the segment.
     pairs: u32,
-    /// (Splat, tile) pairs.
+    /// Number of (splat, tile) pairs in the macro tile.
     pub(super) instances: u32,
 }
 impl Segment {
@@ -183,7 +183,7 @@ impl Segment {
         }
     }
 
-    /// Bytes of memory.
+    /// Bytes of all buffers, with the room that they have left.
     pub(super) fn held_bytes(&self) -> usize {
         self.pairs.capacity() * size_of::<Pair>() + self.counts.capacity() * size_of::<Counts>()
     }

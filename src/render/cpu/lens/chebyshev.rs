@@ -19,7 +19,6 @@ pub(super) struct ChebyshevSeries {
     /// Coefficients of an even power and of the odd one above it, from the highest powers to the
     /// lowest.
     pairs: Vec<[f32; 2]>,
-    /// `2/limit`.
     v_per_x: f32,
 }
 

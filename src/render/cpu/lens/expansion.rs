@@ -123,8 +123,8 @@ impl LensProjection {
         let motion_px = expansion.first_order(motion);
         // Beyond the first and last row the moment is clamped and does not change with the place.
         let unclamped = shutter.unclamped_remaining_at(simd, x_px, y_px);
-        let rolls = unclamped.simd_gt(splat(0.0)) & unclamped.simd_lt(splat(1.0));
-        let rolls = rolls.select(splat(1.0), splat(0.0));
+        let is_unclamped = unclamped.simd_gt(splat(0.0)) & unclamped.simd_lt(splat(1.0));
+        let rolls = is_unclamped.select(splat(1.0), splat(0.0));
         let [x, y] = splats(simd, shutter.remaining_per_px());
         let per_px = Px { x, y };
         // The moment depends on the place, and the place on the moment: a geometric series with the
@@ -223,7 +223,10 @@ impl LensProjection {
                 let mu = (alpha - beta * cos) * per_sin;
 
                 let [[c, d], [e, f]] = *px_from_round;
-                let [c, d, e, f] = [splat(c), splat(d), splat(e), splat(f)];
+                let c = splat(c);
+                let d = splat(d);
+                let e = splat(e);
+                let f = splat(f);
                 // px_from_round times the rotation by the azimuth.
                 let plane = [
                     [
@@ -259,9 +262,9 @@ impl LensProjection {
                 let [fx, fy] = splats(simd, *focal_px);
                 let in_front = z.simd_gt(zero);
                 // In slopes, as a and b of this lens are.
-                let room = splat(max_slope2.sqrt()) - x.mul_add(x, y * y).sqrt();
+                let to_limit = splat(max_slope2.sqrt()) - x.mul_add(x, y * y).sqrt();
                 // Behind the camera there is no expansion: a negative room fails every bound.
-                let room = in_front.select(room, splat(-1.0));
+                let room = in_front.select(to_limit, splat(-1.0));
                 let plane = [[fx, zero], [zero, fy]];
                 Some(Expansion::from_slopes(simd, [x, y], inverse, plane, room))
             }

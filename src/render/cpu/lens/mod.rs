@@ -73,7 +73,7 @@ struct RoundDerivatives {
     curvature: ChebyshevSeries,
 }
 
-/// Image points.
+/// The images of sixteen points, and how far they are within the field.
 #[derive(Clone, Copy)]
 pub(super) struct LensPixels<S: Simd> {
     pub(super) x_px: f32x16<S>,
@@ -201,7 +201,8 @@ impl LensProjection {
         let splat = |value: f32| f32x16::splat(simd, value);
         let Vec3x16 { x, y, z } = point_m;
         let [cx, cy] = self.center_px;
-        let [cx, cy] = [splat(cx), splat(cy)];
+        let cx = splat(cx);
+        let cy = splat(cy);
         match &self.model {
             Model::Round { px_from_round, series, max_t, beyond, .. } => {
                 let off_axis2 = x.mul_add(x, y * y);
@@ -224,7 +225,10 @@ impl LensProjection {
                     margin = within.select(margin, Tangent::margin(simd, t));
                 }
                 let [[c, d], [e, f]] = *px_from_round;
-                let [c, d, e, f] = [splat(c), splat(d), splat(e), splat(f)];
+                let c = splat(c);
+                let d = splat(d);
+                let e = splat(e);
+                let f = splat(f);
                 LensPixels {
                     x_px: c.mul_add(x, d * y).mul_add(radius, cx),
                     y_px: e.mul_add(x, f * y).mul_add(radius, cy),
@@ -355,7 +359,7 @@ fn round_slope(radius: &dyn Fn(f64) -> f64, max_rad: f64, rad: f64) -> f64 {
     (radius(rad + h) - radius(rad - h)) / (2.0 * h)
 }
 
-/// `r″`, likewise.
+/// `r″` of a radius at an angle, by the second difference within the field.
 fn round_curvature(radius: &dyn Fn(f64) -> f64, max_rad: f64, rad: f64) -> f64 {
     // Rounding adds about 4e-16/h^2 = 2e-9 of the radius, the difference h^2/12 of r''''.
     let h = 5e-4;
@@ -440,13 +444,13 @@ mod tests {
                     let row = step * 11 % camera.height_px;
                     let at_px = DVec2::new(f64::from(column), f64::from(row)) + 0.5;
                     let Some(ray) = view.ray_world(at_px) else { continue };
-                    let away = dispatch!(Level::new(), simd => {
+                    let direction = dispatch!(Level::new(), simd => {
                         let x = f32x16::splat(simd, at_px.x as f32);
                         let y = f32x16::splat(simd, at_px.y as f32);
                         let Vec3x16 { x, y, z } = rays.directions(simd, x, y);
                         [x.to_array()[0], y.to_array()[0], z.to_array()[0]].map(f64::from)
                     });
-                    let away = DVec3::from_array(away).normalize();
+                    let away = DVec3::from_array(direction).normalize();
                     max_error_rad = max_error_rad.max((axes * ray).distance(away));
                     seen += 1;
                 }

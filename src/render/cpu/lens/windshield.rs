@@ -192,11 +192,11 @@ fn sine_change<S: Simd>(simd: S, [sine, cosine]: [f32x16<S>; 2], by_rad: f32x16<
         .mul_add(square, splat(1.0 / 720.0))
         .mul_add(square, splat(-1.0 / 24.0))
         .mul_add(square, splat(0.5));
-    let rise = splat(1.0 / 362_880.0)
+    let series = splat(1.0 / 362_880.0)
         .mul_add(square, splat(-1.0 / 5_040.0))
         .mul_add(square, splat(1.0 / 120.0))
         .mul_add(square, splat(-1.0 / 6.0));
-    let rise = (rise * square).mul_add(by_rad, by_rad);
+    let rise = (series * square).mul_add(by_rad, by_rad);
     cosine * rise - sine * (fall * square)
 }
 

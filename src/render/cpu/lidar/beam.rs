@@ -111,6 +111,7 @@ impl BeamRow {
         let end_m = f32x16::load_array_ref(simd, &self.ends_m);
         let end_key = u32x16::load_array_ref(simd, &self.end_keys);
         let key = u32x16::splat(simd, crossing.key);
+        // At the range of the return, the order of keys decides.
         let is_behind = crossing.range_m.simd_eq(end_m) & key.simd_gt(end_key);
         let meets = crossing.meets & !is_behind;
         let light = f32x16::load_array_ref(simd, &self.light);
@@ -180,6 +181,7 @@ impl BeamRow {
             light = is_end.select(before, light);
             end_m = is_end.select(hit.range_m, end_m);
             end_key = is_end.select(hit.key, end_key);
+            // Nothing is behind a return in most slots, which are then not written.
             if is_behind.any_true() {
                 slot.range_m = is_behind.select(never, hit.range_m).to_array();
                 slot.alpha = is_behind.select(f32x16::splat(simd, 0.0), hit.alpha).to_array();
@@ -213,6 +215,8 @@ impl BeamRow {
         let zero = f32x16::splat(simd, 0.0);
         Returns {
             range_m: returns.select(load(&self.ends_m), zero).to_array(),
+            // At a return, half of the light is lost: this divides by 0 only where no value is
+            // taken.
             luminance: returns.select(sum / (one - before), zero).to_array(),
             key: returns.select(end_keys, u32x16::splat(simd, 0)).to_array(),
         }

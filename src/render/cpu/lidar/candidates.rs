@@ -205,11 +205,13 @@ impl Candidates {
         compare: &mut impl FnMut(&mut Self),
     ) {
         let sector = search.seen.sector;
+        // Equally near clusters go by their places, so that an unstable sort has one result.
         clusters.sort_unstable_by(|a, b| {
             let by_place = || (a.chunk, a.cluster).cmp(&(b.chunk, b.cluster));
             a.reach.nearest_m.total_cmp(&b.reach.nearest_m).then_with(by_place)
         });
         for SeenCluster { reach, chunk, cluster } in clusters.drain(..) {
+            // Beams may have returned nearer since the cluster was found.
             if !self.is_followed(&reach, sector.tiles.len()) {
                 continue;
             }
@@ -326,6 +328,7 @@ impl Candidates {
         self.buckets.clear();
         self.buckets.resize(BUCKETS + 1, 0);
         for reach in &self.reaches {
+            // Counted one place further, so that the sums are the places at which buckets begin.
             self.buckets[usize::from(reach.bucket) + 1] += 1;
         }
         let mut sum = 0;
@@ -506,6 +509,8 @@ impl<S: Simd> Bounds<S> {
         let unbounded = near_x.simd_le(splat(1e-3));
         let divisor = near_x.max(splat(1e-3));
         let huge = splat(f32::MAX);
+        // The least tangent: a positive edge over the far side, a negative one over the near side.
+        // The largest is the other way round.
         let azimuth_low = unbounded.select(-huge, quotient(simd, y - half_y, far_x, divisor));
         let azimuth_high = unbounded.select(huge, quotient(simd, y + half_y, divisor, far_x));
         // Horizontal distances of the box. Behind the LiDAR nothing is seen, so that 0 is the

@@ -31,14 +31,18 @@ pub(super) fn sweep(
     let tiles = sector.tiles.len();
     let Scratch { candidates, tiles: beams } = scratch;
     let count = tiles * rows.div_ceil(LANES);
+    // It never shrinks: a later sector with more tiles finds the memory of an earlier one.
     beams.resize_with(count.max(beams.len()), Tile::default);
     let beams = &mut beams[..count];
     for (at, tile) in beams.iter_mut().enumerate() {
         let first_column = sector.columns.start + at % tiles * LANES;
+        // Tiles are numbered row by row: `at % tiles` counts them along the columns.
         tile.begin(sector, view, at / tiles * LANES, first_column);
     }
     let mut last = None;
     search(level, sector, candidates, task, BATCH, |number, seen, candidates| {
+        // The first batch of a body: the rays of tiles are still those in the axes of the body
+        // before.
         if last.replace(number) != Some(number) {
             beams.iter_mut().for_each(Tile::leave_body);
         }

@@ -54,6 +54,7 @@ pub(crate) fn sweep(level: Level, task: &Task<'_>) -> Sweep {
         free.lock().push(scratch);
         part
     };
+    // In the order of the sectors, whatever thread has made them.
     let parts: Vec<Sweep> = sectors.par_iter().map(part).collect();
     let columns = view.lidar.columns();
     let mut sweep = Sweep::empty(view.lidar.beams());
@@ -89,6 +90,7 @@ pub(crate) fn most_candidate_bytes(lidar: &Lidar, batch: usize) -> usize {
     let tiles = most_beams(lidar) / (LANES * LANES);
     let place = size_of::<u32>();
     let candidate = size_of::<Candidate>() + size_of::<Reach>() + place + place * tiles;
+    // A batch is compared after the cluster that fills it; vectors grow to twice what they hold.
     2 * (batch + CLUSTER) * candidate + MOST_CLUSTERS * size_of::<SeenCluster>()
 }
 

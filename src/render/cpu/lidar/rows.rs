@@ -40,6 +40,7 @@ impl Rows {
         let buckets_from = tangents[0].clamp(-BUCKETS_TO, BUCKETS_TO);
         let buckets_to = tangents[tangents.len() - 1].clamp(-BUCKETS_TO, BUCKETS_TO);
         let count = 16 * tangents.len();
+        // A LiDAR of one row has no span to divide.
         let buckets_per_tangent = count as f32 / (buckets_to - buckets_from).max(1e-6);
         let below = |bucket: usize| {
             // All tangents of the first two buckets may be in question.
@@ -74,6 +75,7 @@ impl Rows {
         while first < count && self.tangents[first] < low {
             first += 1;
         }
+        // Not before `first`, so that a range between two rows is empty.
         let mut end = self.start(high).max(first);
         while end < count && self.tangents[end] <= high {
             end += 1;

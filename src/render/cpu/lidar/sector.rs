@@ -64,6 +64,7 @@ pub(crate) struct BodySector<'a> {
 impl TileColumns {
     /// `tangents` has the smallest and the largest of each column.
     fn new(tangents: &[[f32; 2]]) -> Self {
+        // A missing column has an interval that ends before it begins, which meets no other.
         let mut lanes = [[f32::INFINITY; LANES], [f32::NEG_INFINITY; LANES]];
         for (lane, [low, high]) in tangents.iter().enumerate() {
             lanes[0][lane] = *low;
@@ -72,6 +73,7 @@ impl TileColumns {
         let mut sorted = tangents.to_vec();
         sorted.sort_by(|a, b| a[0].total_cmp(&b[0]));
         let mut widest_gap: f32 = 0.0;
+        // A tile has at least one column.
         let mut reached = sorted[0][1];
         for [low, high] in &sorted {
             widest_gap = widest_gap.max(low - reached);
@@ -124,6 +126,7 @@ impl Sector {
             let [low, high] = azimuths(column);
             let wider = [span[0].min(low), span[1].max(high)];
             let is_full = column - start == MOST_COLUMNS || wider[1] - wider[0] > MOST_RAD;
+            // One column is always taken, however far the offsets of its rows spread it.
             if is_full && column > start {
                 sectors.push(Self::new(rows.clone(), view, start..column, span, &azimuths));
                 start = column;
@@ -143,6 +146,7 @@ impl Sector {
         [low, high]: [f64; 2],
         azimuths: &dyn Fn(usize) -> [f64; 2],
     ) -> Self {
+        // Tangents rise only within a quarter turn of the middle; half of MOST_RAD is far less.
         let middle_rad = 0.5 * (low + high);
         let tangents = |column| {
             let [low, high] = azimuths(column).map(|azimuth| (azimuth - middle_rad).tan());

@@ -116,6 +116,8 @@ impl Tile {
         let list = &candidates.lists[tile];
         let rays = match self.rays.take() {
             Some(rays) => rays,
+            // Rays take longer to make than a comparison, so that tiles that see nothing of a body
+            // make none.
             None if list.is_empty() => return,
             None => Box::new(self.rays(seen)),
         };
@@ -132,6 +134,7 @@ impl Tile {
                 let [first, end] = reach.rows.map(usize::from);
                 for row in first.max(self.first_row)..end.min(last_row) {
                     let row = row - self.first_row;
+                    // All beams of the row have returned before the candidate.
                     if reach.nearest_m > self.row_ends_m[row] {
                         continue;
                     }
@@ -144,6 +147,7 @@ impl Tile {
                     }
                 }
             }
+            // Once per piece of the list: the farthest end of a row takes a pass over its beams.
             while changed_rows != 0 {
                 let row = changed_rows.trailing_zeros() as usize % LANES;
                 changed_rows &= changed_rows - 1;
@@ -173,6 +177,7 @@ impl Tile {
             part.gaussian[to.clone()].copy_from_slice(&returns.key[..columns]);
             let found = returns.range_m.iter().zip(&returns.key);
             for (instance, (range_m, key)) in part.instance[to].iter_mut().zip(found) {
+                // A beam without a return has range 0 and no Gaussian.
                 if *range_m > 0.0 {
                     *instance = keys.instance(*key);
                 }
@@ -226,6 +231,7 @@ impl<S: Simd> Aim<S> {
     ) -> Option<Crossing<S>> {
         let simd = self.simd;
         let step = whitened(self.whiten, direction);
+        // `step` is one metre along the beam, in standard deviations.
         let step2 = step.dot(step);
         // The distance of the beam from the centre, as that of a line from a point. It loses no
         // digits to a Gaussian that is flat, unlike a difference of two long vectors.

@@ -45,8 +45,8 @@ impl<S: Simd> CenterAngles<S> {
         let along = (distance_m + center_m.z).max(splat(1e-30));
         let steep = across.simd_gt(along);
         let low = across.min(along) / across.max(along);
-        let half = low * splat(-0.273).mul_add(low, splat(std::f64::consts::FRAC_PI_4 + 0.273));
-        let half = steep.select(splat(std::f64::consts::FRAC_PI_2) - half, half);
+        let flat = low * splat(-0.273).mul_add(low, splat(std::f64::consts::FRAC_PI_4 + 0.273));
+        let half = steep.select(splat(std::f64::consts::FRAC_PI_2) - flat, flat);
         let off_axis = half + half;
 
         // Below s = 1/2, asin s is at most s π/3.

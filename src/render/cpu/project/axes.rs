@@ -41,7 +41,7 @@ pub(in crate::cpu) fn rotation_columns<S: Simd>(simd: S, columns: &[Lanes]) -> [
     matrix_columns(simd, Quaternions::load(simd, columns))
 }
 
-/// Sixteen unit quaternions.
+/// Sixteen unit quaternions, with the real part apart from the vector.
 #[derive(Clone, Copy)]
 pub(super) struct Quaternions<S: Simd> {
     w: f32x16<S>,

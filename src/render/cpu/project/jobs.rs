@@ -26,9 +26,7 @@ pub(in crate::cpu) struct Job<'a> {
     pub(in crate::cpu) clusters: Range<usize>,
     pub(super) projection: ChunkProjection<'a>,
     pub(super) light: Light<'a>,
-    /// As in [`Unit`](super::Unit).
     pub(super) instance: u16,
-    /// As in [`Unit`](super::Unit).
     pub(super) class: SemanticClass,
 }
 

@@ -79,7 +79,7 @@ fn shadow_factor<S: Simd>(simd: S, mean: Vec3x16<S>, shadow: &ChunkShadow) -> f3
 #[inline(always)]
 fn falling<S: Simd>(simd: S, from: f32, to: f32, x: f32x16<S>) -> f32x16<S> {
     let splat = |value: f32| f32x16::splat(simd, value);
-    let t = (x - splat(from)) * splat(1.0 / (to - from));
-    let t = t.max(splat(0.0)).min(splat(1.0));
+    let share = (x - splat(from)) * splat(1.0 / (to - from));
+    let t = share.max(splat(0.0)).min(splat(1.0));
     splat(1.0) - t * t * (splat(3.0) - t - t)
 }

@@ -186,7 +186,6 @@ impl Projected {
         Ok(())
     }
 
-    /// Number of splats.
     pub(super) fn len(&self) -> usize {
         self.units.iter().map(|unit| unit.len).sum()
     }

@@ -138,9 +138,8 @@ pub(super) struct Moments<S: Simd> {
 
 /// Sixteen projected Gaussians, not yet tested against the image.
 pub(super) struct ProjectedBlock<S: Simd> {
-    /// Centre, in pixels.
     pub(super) mean_x: f32x16<S>,
-    /// Centre, in pixels.
+    /// Row of the centre, in pixels from the top of the image.
     pub(super) mean_y: f32x16<S>,
     /// Depth of the centre, in metres.
     pub(super) depth_m: f32x16<S>,

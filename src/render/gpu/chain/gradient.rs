@@ -53,8 +53,9 @@ impl Chain {
         gradients: &mut Gradients,
         pool: &ThreadPool,
     ) -> Result<FrameStats, GradientError> {
-        let stages = self.gradient.take();
-        let mut stages = stages.unwrap_or_else(|| GradientStages::new(&self.device));
+        // Taken out, so that they can be borrowed beside the rest of the chain.
+        let kept = self.gradient.take();
+        let mut stages = kept.unwrap_or_else(|| GradientStages::new(&self.device));
         let done = self.differentiate_in(&mut stages, frame, depth, loss, gradients, pool);
         // After a failure of the device they are not used again: some buffers may still be mapped.
         if !matches!(done, Err(GradientError::Render(RenderError::Device { .. }))) {
@@ -113,6 +114,7 @@ impl Chain {
         let PreparedRegion::Ready(work, tiles) =
             self.prepare_region(input, &rows.all(), pool, &mut current)?
         else {
+            // A frame in regions overwrites the splats that the way back reads.
             return Err(memory);
         };
         let needs = self.draw_region(Source::Gaussians(&work), tiles, &mut current)?;
@@ -140,6 +142,7 @@ impl Chain {
             tally.last_frame = current.counts;
         }
         current.read_back.unmap();
+        // The frame lives on with its parameters and times; its buffers are free for others.
         let read_back = std::mem::replace(&mut current.read_back, ReadBack::new(&self.device));
         self.read_backs.give_back(read_back);
         Ok((Drawn { frame, actors, current, work, clusters, runs, splat_count }, images))
@@ -156,6 +159,7 @@ impl Chain {
         let limit = self.device.max_gradient_macro_tiles();
         let parameters = &current.parameters;
         let firsts = parameters.view[..parameters.views as usize].iter();
+        // A view ends where the next one begins, and the last one where the frame does.
         let ends = firsts.clone().skip(1).map(|view| view.first_macro_tile);
         let most = firsts
             .zip(ends.chain([parameters.macro_tiles]))

@@ -68,6 +68,7 @@ impl Chain {
         cull: &ThreadPool,
     ) -> Result<Turn, RenderError> {
         let rows = TileRows::from_frame(frame);
+        // A frame of this kind did not fit at once, and this one would hardly do.
         if self.partitions.get(&PartitionKey::from_frame(frame), &rows).len() > 1 {
             return Ok(Turn::Drawn(self.draw(frame, outputs, cull)?));
         }
@@ -135,6 +136,8 @@ impl InFlight {
         let Self { device, read_backs, tally, mut current, cluster_views, submitted } = self;
         let head = submitted.wait(&device, &mut current)?;
         if !fits(&head.counters, &current.parameters) {
+            // The next frame that takes these buffers copies into them, which a mapped buffer
+            // forbids.
             current.read_back.unmap();
             read_backs.give_back(current.read_back);
             return Ok(Waited::Overflowed(needs(&head.counters)));
@@ -142,6 +145,7 @@ impl InFlight {
         current.count(cluster_views, &head)?;
         {
             let mut tally = tally.lock();
+            // The lock ends before the pixels are mapped: the next frame takes it in its turn.
             tally.regions += 1;
             tally.last_frame = current.counts;
         }
@@ -158,6 +162,7 @@ impl Submitted {
     ) -> Result<Head, RenderError> {
         current.read_back.map(device, self.index)?;
         device.check()?;
+        // After the check: what a failed submission has left in the buffers is not read.
         let head = current.read_back.head(device)?;
         super::record::add_stage_times(
             device,

@@ -95,6 +95,7 @@ impl Chain {
     /// Makes sure that the buffers will be large enough for another backend's outputs.
     fn make_room(&mut self, outputs: &StageOutputs) -> Result<(), RenderError> {
         let Counts { splats, instances, .. } = counts(outputs);
+        // No stage of another backend has touches: stage bin counts those that it needs.
         let needs = Capacity { splats: splats.into(), touches: 0, instances: instances.into() };
         self.check_room(needs)?;
         self.high_water = self.high_water.max(needs);
@@ -168,6 +169,7 @@ impl Chain {
         read_back.map(device, submission)?;
         device.check()?;
         let pages = read_back.pages(device)?;
+        // A page may be larger than what was copied to it.
         let page = |k: usize| &pages[k][..sources[k].1 as usize];
 
         // Decode them.

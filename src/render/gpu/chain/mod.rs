@@ -175,6 +175,7 @@ impl Chain {
             tally: Arc::default(),
             device: Arc::new(device),
         };
+        // The kernels above report the errors of their shaders to the device only.
         chain.device.check()?;
         Ok(chain)
     }
@@ -192,6 +193,8 @@ impl Chain {
         self.timestamps.reserve(device, TIMESTAMP_BYTES);
         let kernels = self.sweeps.get_or_insert_with(|| SweepKernels::new(device));
         device.check()?;
+        // A shader that does not compile is an error of this sweep, and not of the device's next
+        // frame.
         kernels.sweep(device, self.timestamps.buffer(), pool, task)
     }
 
@@ -211,6 +214,7 @@ impl Chain {
         let background_iterations = self.rasterize.background_iterations();
         parameters.batch_limit = self.device.max_tile_batches(background_iterations);
         parameters.long_tile_splats = self.device.tuning().long_tile_splats;
+        // No more places than tiles: the buffers of long tiles are reserved for as many.
         parameters.long_tiles = LONG_TILES.min(parameters.tiles);
         let tiles_per_page = self.rasterize.reserve(&self.device, planes, parameters.tiles);
         let mut read_back = self.read_backs.take().unwrap_or_else(|| ReadBack::new(&self.device));
@@ -252,13 +256,16 @@ impl Chain {
         let Capacity { splats, touches, instances } = self.high_water;
         let device = &self.device;
         parameters.splat_capacity = self.splats.reserve(device, splats);
+        // The buffers may hold more splats than were asked for, and those may all reach stage bin.
         let splats = u64::from(parameters.splat_capacity);
         let GpuFrame { macro_tiles, tiles, .. } = *parameters;
         let sizes = BinSizes { splats, macro_tiles, tiles, touches, instances };
         let BinCapacity { touches, instances } = self.bin.reserve(device, &mut self.scan, sizes);
         parameters.touch_capacity = touches;
         parameters.instance_capacity = instances;
+        // Stage project scans the counts of cluster views, and stage bin those of splats.
         self.scan.reserve(device, splats.max(cluster_views.into()));
+        // Splats and touches are sorted one after the other in the same buffers.
         self.sort.reserve(device, &mut self.scan, splats.max(touches.into()));
         self.timestamps.reserve(device, TIMESTAMP_BYTES);
     }
@@ -310,6 +317,7 @@ fn fits(counters: &Counters, parameters: &GpuFrame) -> bool {
 fn add_time(stats: &mut FrameStats, stage: &'static str, time: Duration) {
     let ms = time.as_secs_f64() * 1e3;
     match stats.stages_ms.iter_mut().find(|(name, _)| *name == stage) {
+        // A frame of several regions runs each stage several times.
         Some((_, sum)) => *sum += ms,
         None => stats.stages_ms.push((stage, ms)),
     }

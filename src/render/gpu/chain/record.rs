@@ -59,6 +59,7 @@ impl Chain {
         let inputs =
             RasterizeInputs { plan, splats, bin, lenses, owners, first_splats, splat_owners };
         self.rasterize.run(device, &mut pass, inputs, output, current.parameters.tiles);
+        // The pass borrows the encoder until here.
         drop(pass);
 
         // Copy all values that the host reads.
@@ -87,6 +88,7 @@ impl Chain {
         last: Stage,
         with_classes: bool,
     ) {
+        // Stages that another backend has run are skipped, and so are those beyond the last one.
         let must_run = |stage| stage <= last && source.needs(stage);
         let counts = match source {
             Source::Gaussians(work) => {
@@ -117,12 +119,16 @@ impl Chain {
                 keys: plan.job(job::SPLATS_SORT),
                 counters: plan.job(job::SPLATS_DIGITS),
             };
+            // A key has the number of the view above the depth, so few views may take fewer passes
+            // of the sort.
             let depth_bits = DEPTH_BITS + bits(parameters.views - 1);
             let data = Columns { keys: &splats.keys, values: &splats.indices, masks: None };
             sorted.splats = self.sort.run(device, &mut pass, scan, jobs, data, depth_bits);
         }
 
         if must_run(Stage::Bin) {
+            // Outside of a pass, since a buffer is cleared by the encoder. Tiles without splats
+            // write no range.
             self.bin.clear_ranges(&mut recorder.encoder);
             let mut pass = recorder.stage("bin");
             self.bin.list_touches(device, &mut pass, plan, scan, splats, sorted.splats);
@@ -162,6 +168,7 @@ pub(super) fn add_stage_times(
         return;
     };
     for (stage, ticks) in stages.iter().zip(timestamps.chunks_exact(2)) {
+        // A clock that was reset in between gives 0, and not a time of years.
         let ns = ticks[1].saturating_sub(ticks[0]) as f64 * f64::from(tick_ns);
         add_time(stats, stage, Duration::from_nanos(ns as u64));
     }

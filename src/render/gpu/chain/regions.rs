@@ -70,9 +70,12 @@ impl Chain {
                 RegionOutcome::Drawn(needs) => {
                     drawn.push((region, needs));
                     if !remaining.is_empty() {
+                        // The next region copies into the same buffers; those of the last one stay
+                        // mapped.
                         current.read_back.unmap();
                     }
                 }
+                // The parts are popped next, so pixels and counts are those of the order of rows.
                 RegionOutcome::Split(regions) => remaining.extend(regions.into_iter().rev()),
             }
         }
@@ -101,6 +104,7 @@ impl Chain {
             return Ok(RegionOutcome::Drawn(needs));
         }
         let regions = input.rows.split(region, count).ok_or_else(|| self.too_many(needs))?;
+        // The pixels of a region that was too large are not valid.
         current.read_back.unmap();
         Ok(RegionOutcome::Split(regions))
     }

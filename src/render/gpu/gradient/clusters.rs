@@ -36,6 +36,8 @@ struct GradientCluster {
 impl GradientClusters {
     pub(in crate::gpu) fn new(work: &ProjectWork, scene: &Scene, mirror: &Mirror) -> Self {
         let chunks = chunks(scene);
+        // A cluster view has its line in a page of the mirror, and only the dispatches name the
+        // page.
         let mut pages = vec![0; work.cluster_views.len()];
         for dispatch in &work.dispatches {
             for &cluster_view in work.cluster_views_in(dispatch.span) {
@@ -100,6 +102,7 @@ impl GradientClusters {
             for &cluster_view in work.cluster_views_in(dispatch.span) {
                 let seen = &mut seen[self.by_view[cluster_view as usize] as usize];
                 for (seen, word) in seen.iter_mut().zip(words[cluster_view as usize]) {
+                    // A cluster may be seen by several views, and each sees other Gaussians of it.
                     *seen |= word;
                 }
             }
@@ -110,6 +113,7 @@ impl GradientClusters {
             let width = columns(chunk.sh_degree());
             let lines = &lines[cluster.first_line as usize * CLUSTER..][..width * CLUSTER];
             for group in 0..CLUSTER / LANES {
+                // A word has the bits of two groups of 16 lanes.
                 let bits = (seen[group / 2] >> (16 * (group % 2))) as u16;
                 if bits == 0 {
                     continue;
@@ -146,6 +150,7 @@ fn by_view(work: &ProjectWork) -> Vec<ProjectDispatch> {
         }
         let mut first = dispatch.span.first;
         let cluster_views = work.cluster_views_in(dispatch.span);
+        // A dispatch has the cluster views of several views one after the other.
         for run in cluster_views.chunk_by(|&a, &b| work.view(a) == work.view(b)) {
             let span = Span { first, count: run.len() as u32 };
             first += span.count;

@@ -76,6 +76,7 @@ pub(in crate::gpu) fn back_project(
         let words = &splats.visible[index * CLUSTER / 32..][..CLUSTER / 32];
         let is_visible = |lane: &usize| words[lane / 32] >> (lane % 32) & 1 == 1;
         let visible = (0..CLUSTER).filter(is_visible);
+        // The splats of a cluster view follow each other in the order of its visible lanes.
         let own = visible.zip(splats.first_splats[index] as usize..);
         own.map(|(lane, splat)| {
             let gaussian = Gaussian::from_chunk(chunks[number], first + lane);
@@ -88,6 +89,8 @@ pub(in crate::gpu) fn back_project(
     };
     for cluster_views in cluster_views.chunks(AT_A_TIME) {
         let all: Vec<Vec<OfSplat>> = cluster_views.par_iter().map(of_cluster_view).collect();
+        // By one thread in order: a Gaussian that several views see has several summands, and the
+        // sum of floats depends on their order.
         for (&cluster_view, of_splats) in cluster_views.iter().zip(all) {
             let (chunk, _) = clusters.first_gaussian(cluster_view as usize);
             let view = work.view(cluster_view);
@@ -122,6 +125,7 @@ impl Seen<'_> {
             mean_m: shape.mean_m.to_array(),
             quat_wxyz,
             ln_scale,
+            // The sum is by the natural logarithm of alpha, and ln x = ln 2 log2 x.
             log2_opacity: f64::from(sums[partial::G]) * std::f64::consts::LN_2,
         };
         (geometry, sh, shape.twist)

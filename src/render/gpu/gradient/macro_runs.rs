@@ -83,9 +83,11 @@ impl MacroRuns {
         limits: RunLimits,
     ) -> Self {
         let most_bytes = (BYTES_PER_SPLAT * u64::from(limits.splats)).max(LEAST_BYTES);
+        // The shader sees the sums of a run as one binding.
         let most = most_bytes.min(limits.binding_bytes) / SUMS_BYTES;
         let mut runs = Self { runs: Vec::new(), pages: Vec::new() };
         // A run that would begin at the next macro tile.
+        // The tile mask of a whole macro tile has all its bits, which tells it from a part.
         let mut next = MacroRun { macro_tiles: 1, tiles: u32::MAX, ..MacroRun::default() };
         for row in views.iter().flat_map(macro_rows) {
             next.first_tile = runs.add_to_page(&row.tiles, limits.tiles_per_page);
@@ -125,6 +127,7 @@ impl MacroRuns {
         match self.runs.last_mut() {
             Some(run)
                 if run.page == page
+                    // A run of some tiles of a macro tile takes no other macro tile.
                     && run.layout.tiles == u32::MAX
                     && run.sums() + sums <= most =>
             {
@@ -146,6 +149,7 @@ impl MacroRuns {
         let empty = MacroRun { tiles: 0, ..own };
         let mut run = Run { layout: empty, page, is_last: false, instances: 0 };
         for (tile, &instances) in macro_tile.instances.iter().enumerate() {
+            // A run has at least one tile with instances, even if these are more than `most`.
             if run.instances > 0 && run.sums() + u64::from(instances) > most {
                 self.runs.push(run);
                 let first_instance = run.layout.first_instance + run.instances;
@@ -250,7 +254,8 @@ mod tests {
 
     /// Ranges of touches and instances as the device has them: those of nothing are 0.
     fn ranges(random: &mut Random) -> (Vec<[u32; 2]>, Vec<[u32; 2]>) {
-        let (mut touches, mut instances) = (vec![[0; 2]; 7], vec![[0; 2]; 19 * 6 + 5 * 3]);
+        let mut touches = vec![[0; 2]; 7];
+        let mut instances = vec![[0; 2]; 19 * 6 + 5 * 3];
         let mut next = [0, 0];
         for (macro_tile, range) in touches.iter_mut().enumerate() {
             if random.below(3) == 0 {

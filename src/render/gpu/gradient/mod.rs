@@ -56,6 +56,7 @@ impl Differentiate for Gpu {
         let frame = Frame { scene: &scene, profile: &profile, views: frame.views };
         self.in_turn(|chain| {
             match chain.differentiate(&frame, depth, loss, gradients, &self.cull) {
+                // An error of the device must reach the turn, which then opens the device again.
                 Err(GradientError::Render(error)) => Err(error),
                 done => Ok(done),
             }

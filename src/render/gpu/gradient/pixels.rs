@@ -66,11 +66,13 @@ fn pack_tile(
     let edge = TILE_PX as usize;
     let left = tile % columns * edge;
     let top = tile / columns * edge;
+    // A tile begins within the image, so neither difference wraps around.
     for y in 0..edge.min(height - top) {
         for x in 0..edge.min(width - left) {
             let pixel = (top + y) * width + left + x;
             let at = y * edge + x;
             let transmittance = 1.0 - images.opacity[pixel];
+            // Opacity is 1 - T, so a derivative by it is one by T with the other sign.
             let mut whole = -transmittance * by.opacity[pixel];
             for channel in 0..3 {
                 let by_channel = by.rgb[3 * pixel + channel];

@@ -122,6 +122,7 @@ impl GradientStages {
         let touches = mapped(device, &pages[0])?;
         let instances = mapped(device, &pages[1])?;
         let runs = MacroRuns::new(views, touches, instances, limits);
+        // A buffer cannot be unmapped while views of it exist.
         drop(pages);
         self.lists.unmap();
         Ok(runs)
@@ -150,6 +151,7 @@ impl GradientStages {
                 let buffer = GrowableBuffer::new(device, "derivatives by pixels", INTERMEDIATE);
                 self.derivatives.push(buffer);
             }
+            // Tiles are counted through all pages, as the derivatives are.
             let [start, end] = [tiles.start, tiles.end].map(|t| t as usize * TILE_DERIVATIVES);
             self.derivatives[page].fill(device, bytemuck::cast_slice(&derivatives[start..end]));
         }
@@ -173,6 +175,7 @@ impl GradientStages {
         self.splat_sums.reserve(device, SUMS_BYTES * splats);
         self.first_lines.fill(device, bytemuck::cast_slice(&clusters.first_lines()));
         self.lines.reserve(device, clusters.lines * 4 * CLUSTER as u64);
+        // A twist has six f32.
         self.twists.reserve(device, 24 * u64::from(work.cluster_views()));
         let spans = slots(clusters.dispatches.iter().map(|dispatch| dispatch.span));
         self.project_spans.fill(device, &spans);
@@ -184,6 +187,7 @@ impl GradientStages {
         let mut pass = recorder.stage("blend backwards");
         self.rank(device, &mut pass, inputs);
         for (index, run) in runs.runs.iter().enumerate() {
+            // All runs share the buffer of sums: each is gathered before the next one writes there.
             self.blend(device, &mut pass, inputs, index, run);
             self.gather(device, &mut pass, inputs, index, run);
         }
@@ -246,6 +250,8 @@ impl GradientStages {
         let touches: Vec<(u32, BindingResource<'_>)> = touches.collect();
         self.gather_touches.run(device, pass, Groups::Count(run.layout.batches), &touches);
 
+        // The sums of a macro tile that goes on in the next run are not complete, and neither are
+        // those of its splats.
         if !run.is_last {
             return;
         }

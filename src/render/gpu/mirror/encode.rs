@@ -62,6 +62,7 @@ pub(super) fn encode(chunk: &Chunk, index: usize, lines: &mut [u32]) {
     // the number of Gaussians.
     let largest = |range: Range<usize>| {
         let of = |i| range.clone().map(move |c| chunk.value(first + i, column::SH + c).abs());
+        // Fractions of a largest value of 0 would be NaN.
         (0..count).flat_map(of).fold(0.0, f32::max).max(f32::MIN_POSITIVE)
     };
     let scales = [largest(0..3), largest(3..values)];
@@ -90,10 +91,12 @@ pub(super) fn encode(chunk: &Chunk, index: usize, lines: &mut [u32]) {
             set(8, high);
             let fraction = |j: usize| {
                 let fraction = value(column::SH + j) / scales[usize::from(j >= 3)];
+                // Signed, in two's complement.
                 (fraction * 32_767.0).round() as i16 as u16
             };
             for j in (0..values).step_by(2) {
                 let low = u32::from(fraction(j));
+                // At even degrees the number of values is odd.
                 let high = if j + 1 < values { u32::from(fraction(j + 1)) } else { 0 };
                 set(GEOMETRY_WORDS as usize + j / 2, low | high << 16);
             }
@@ -122,6 +125,7 @@ fn quat_bits(wxyz: [f32; 4]) -> [u32; 2] {
     let (index, sign) = largest_component(wxyz);
     let sign = f64::from(sign);
     let steps = |value: f32| {
+        // √½ becomes 1, and -√½ becomes 0.
         let fraction = sign * f64::from(value) * std::f64::consts::SQRT_2 * 0.5 + 0.5;
         (fraction.clamp(0.0, 1.0) * 1_048_575.0).round() as u64
     };

@@ -155,6 +155,7 @@ impl Mirror {
                 match self.allocate(device, lines, needed) {
                     Ok(place) => places.push(place),
                     Err(full) => {
+                        // The clusters that found a place; the chunk itself is not resident.
                         self.free(&places);
                         return Err(full);
                     }
@@ -210,6 +211,7 @@ impl Mirror {
         let usage = BufferUsages::STORAGE | BufferUsages::COPY_DST;
         let buffer = device.buffer("gaussians", u64::from(lines) * LINE_BYTES, usage);
         let page = Page { buffer, lines, free: FreeLines::all(lines) };
+        // Locations name pages by their index, so the indices of other pages must not change.
         match self.pages.iter_mut().find(|page| page.is_none()) {
             Some(slot) => *slot = Some(page),
             None => self.pages.push(Some(page)),
@@ -220,8 +222,8 @@ impl Mirror {
     /// Evicts the least recently drawn chunk, unless this frame draws it.
     fn evict_oldest(&mut self) -> Result<(), Full> {
         let oldest = self.by_last_frame.first();
-        let oldest = oldest.filter(|(last_frame, _)| *last_frame < self.frame);
-        let &(_, address) = oldest.ok_or(Full)?;
+        let evictable = oldest.filter(|(last_frame, _)| *last_frame < self.frame);
+        let &(_, address) = evictable.ok_or(Full)?;
         self.evict(address);
         Ok(())
     }
@@ -263,6 +265,7 @@ impl Mirror {
         let mut next_cluster = 0;
         for run in places.chunk_by(|a, b| a.page == b.page && a.lines.end == b.lines.start) {
             let Some(buffer) = self.page(run[0].page) else { continue };
+            // A cluster has at most MAX_LINES, so that this many clusters stay within UPLOAD_LINES.
             for batch in run.chunks((UPLOAD_LINES / MAX_LINES) as usize) {
                 let lines = batch[0].lines.start..batch[batch.len() - 1].lines.end;
                 let mut words = vec![0; lines.len() * SOA_BLOCK as usize];

@@ -30,7 +30,7 @@ impl Fisheye {
         Self { k, max_angle_rad, radius }
     }
 
-    /// k1 to k4.
+    /// The coefficients k1 to k4 of the angle to the powers 3, 5, 7 and 9.
     pub fn k(&self) -> [f64; 4] {
         self.k
     }

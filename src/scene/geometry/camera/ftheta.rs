@@ -58,7 +58,7 @@ impl FTheta {
         self.polynomial
     }
 
-    /// `[c, d, e]`.
+    /// The entries `[c, d, e]` of the matrix [`FTheta::linear`].
     pub fn linear_cde(&self) -> [f64; 3] {
         self.linear_cde
     }

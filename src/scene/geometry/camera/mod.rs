@@ -105,7 +105,7 @@ pub enum CameraError {
     /// A side is zero or above the limit.
     #[error("{field} is {value}; a side is from 1 to {limit} pixels")]
     Size {
-        /// `width` or `height`.
+        /// The field: `width` or `height`.
         field: &'static str,
         /// The refused value, in pixels.
         value: u64,
@@ -124,7 +124,7 @@ pub enum CameraError {
     /// A focal length is missing.
     #[error("{field} is missing; only an f-theta lens takes its focal lengths from its polynomial")]
     Missing {
-        /// `fx` or `fy`.
+        /// The field: `fx` or `fy`.
         field: &'static str,
     },
     /// A crop is not within the image.

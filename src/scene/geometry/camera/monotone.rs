@@ -101,10 +101,10 @@ pub(super) fn invert_monotone(
         } else {
             low = x;
         }
-        // A slope of 0 or NaN makes `next` infinite or NaN, which fails the comparison: the
+        // A slope of 0 or NaN makes `newton` infinite or NaN, which fails the comparison: the
         // midpoint takes over.
-        let next = x - off / slope;
-        let next = if next > low && next < high { next } else { 0.5 * (low + high) };
+        let newton = x - off / slope;
+        let next = if newton > low && newton < high { newton } else { 0.5 * (low + high) };
         let done = (next - x).abs() <= tolerance * end;
         x = next;
         if done {

@@ -13,7 +13,6 @@ pub struct OpenCv {
     k: [f64; 6],
     p: [f64; 2],
     s: [f64; 4],
-    /// See [`OpenCv::limit_slope`].
     limit_slope: f64,
 }
 
@@ -61,17 +60,17 @@ impl OpenCv {
         self.k.iter().chain(&self.p).chain(&self.s).all(|&c| c == 0.0)
     }
 
-    /// k1 to k6.
+    /// The radial coefficients k1 to k6.
     pub fn k(&self) -> [f64; 6] {
         self.k
     }
 
-    /// p1 and p2.
+    /// The tangential coefficients p1 and p2.
     pub fn p(&self) -> [f64; 2] {
         self.p
     }
 
-    /// s1 to s4.
+    /// The coefficients s1 to s4 of the thin prism.
     pub fn s(&self) -> [f64; 4] {
         self.s
     }
@@ -216,7 +215,7 @@ impl OpenCv {
         )
     }
 
-    /// `∂distort/∂slope`.
+    /// The derivative of [`OpenCv::distort`] by the slope.
     fn jacobian(&self, slope: DVec2) -> DMat2 {
         let DVec2 { x, y } = slope;
         let [p1, p2] = self.p;

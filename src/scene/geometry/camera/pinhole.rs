@@ -12,9 +12,9 @@ pub struct Pinhole {
     pub fx: f64,
     /// Focal length along y.
     pub fy: f64,
-    /// Principal point, x.
+    /// Where the optical axis meets the image, from its left edge.
     pub cx: f64,
-    /// Principal point, y.
+    /// Where the optical axis meets the image, from its upper edge.
     pub cy: f64,
 }
 

@@ -72,7 +72,8 @@ impl Windshield {
             let (y, x) = (std::f64::consts::TAU * f64::from(azimuth) / 32.0).sin_cos();
             let ray = DVec3::new(x * sin, y * sin, cos);
             let to = self.turned(angles(ray));
-            let (x, y) = (to.x.sin(), to.y.sin());
+            let x = to.x.sin();
+            let y = to.y.sin();
             DVec3::new(x, y, (1.0 - x * x - y * y).max(0.0).sqrt()).angle_between(ray)
         };
         let samples = (0..32).flat_map(|ring| (0..32).map(move |azimuth| by(ring, azimuth)));
@@ -132,10 +133,10 @@ impl Windshield {
         // Central differences have an error of h² times the third derivative, and a rounding error
         // of about 1e-12: both are far below the bound of 0.5.
         let h = 1e-4;
-        let change = [DVec2::X, DVec2::Y]
+        let by_axis = [DVec2::X, DVec2::Y]
             .map(|axis| (by(at + h * axis) - by(at - h * axis)).length() / (2.0 * h));
         // The Frobenius norm, which bounds the change in any direction.
-        let change = change[0].hypot(change[1]);
+        let change = by_axis[0].hypot(by_axis[1]);
         let even = change <= Self::MOST_CHANGE;
         if !even {
             return refused(
@@ -183,7 +184,8 @@ impl Windshield {
         };
         // From angles back to a unit direction. The clamp is for angles whose sines exceed the unit
         // circle by rounding.
-        let (x, y) = (to.x.sin(), to.y.sin());
+        let x = to.x.sin();
+        let y = to.y.sin();
         DVec3::new(x, y, (1.0 - x * x - y * y).max(0.0).sqrt()).normalize()
     }
 

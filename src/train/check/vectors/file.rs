@@ -26,7 +26,7 @@ pub enum VectorError {
 
 pub(super) const SIZE_PX: [u32; 2] = [64, 48];
 pub(super) const PIXELS: usize = 64 * 48;
-/// Number of Gaussians.
+/// Number of Gaussians in the vectors.
 pub(super) const COUNT: usize = 100;
 
 /// Derivatives by groups of parameters.
@@ -38,6 +38,7 @@ const TENSORS: [(&str, &str, usize); 8] = [
     ("ln scale", "d.log_scales", 3 * COUNT),
     ("quat", "d.quats", 4 * COUNT),
     ("opacity", "d.logits", COUNT),
+    // 16 coefficients of three channels.
     ("sh", "d.sh", 48 * COUNT),
     ("twist", "d.twist", 6),
     ("background", "d.background", 3),
@@ -102,6 +103,7 @@ impl Vectors {
 
     pub(super) fn pinhole(&self) -> Result<Camera, VectorError> {
         let k = self.values("K", 9)?;
+        // The matrix row by row: fx 0 cx, 0 fy cy, 0 0 1.
         let pinhole = Pinhole { fx: k[0], fy: k[4], cx: k[2], cy: k[5] };
         Ok(Camera::from_pinhole(SIZE_PX[0], SIZE_PX[1], pinhole))
     }
@@ -124,6 +126,7 @@ impl Vectors {
                 mean_m,
                 rotation: DQuat::from_xyzw(x, y, z, w),
                 scale_m: scales[i].exp(),
+                // The base-2 logarithm of the sigmoid 1/(1 + exp(-x)) of a logit.
                 log2_opacity: -(1.0 + (-logits[i]).exp()).log2(),
                 sh: std::array::from_fn(|k| sh[16 * i + k]),
             };

@@ -60,6 +60,7 @@ impl ImageLoss {
             Self::TrainingStep(step) => step.at(&image, images),
         };
         let by = compose_gradient(&rgb, &images.opacity, color, &exposure, &loss.by_rgb);
+        // One colour is behind all pixels, so the derivatives by it add up.
         let sum = |channel: usize| by.background.iter().skip(channel).step_by(3).sum();
         let opacity = by.opacity.iter().zip(&loss.by_opacity).map(|(a, b)| a + b).collect();
         LossAt {
@@ -86,6 +87,7 @@ impl Products {
         let of_depths = dot(&self.by_depth_sum, &images.depth_sum_m);
         Derivatives {
             value: dot(&self.by_rgb, image) + dot(&self.by_opacity, &images.opacity) + of_depths,
+            // The loss is linear: its factors are its derivatives.
             by_rgb: self.by_rgb.clone(),
             by_opacity: self.by_opacity.clone(),
             by_depth_sum: self.by_depth_sum.clone(),
@@ -102,6 +104,8 @@ impl TrainingStep {
         Derivatives {
             value: colors.value + depths.value,
             by_rgb: colors.by,
+            // Colours depend on the opacity through the background only, which `compose_gradient`
+            // adds.
             by_opacity: depths.by_opacity,
             by_depth_sum: depths.by_depth_sum,
         }

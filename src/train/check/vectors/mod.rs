@@ -114,6 +114,8 @@ impl Vectors {
             let mut our_value = 0.0;
             for (time, ego) in egos.iter().enumerate() {
                 for (number, camera) in cameras.iter().enumerate() {
+                    // A weight of its own for each of the four images, so that none passes for
+                    // another.
                     let weight = (1 + time + 2 * number) as f64;
                     let loss = ImageLoss::Products(products.colors_alone(weight));
                     let view = View::new(self.pinhole()?, *ego * *camera);
@@ -231,7 +233,9 @@ impl RawGradient {
         let opacity = gaussian.log2_opacity.exp2();
         let length = gaussian.rotation.length();
         Self {
+            // A quaternion is normalised, and a longer one turns less by the same step.
             quat_wxyz: quat_wxyz.map(|value| value / length),
+            // The derivative of log2 o by the logit is (1 - o)/ln 2.
             logit: log2_opacity * (1.0 - opacity) / std::f64::consts::LN_2,
         }
     }

@@ -92,6 +92,7 @@ fn back_project_unit<S: Simd>(
     let mut twist = [0.0_f64; 6];
     let mut next = by_splats.iter();
     for (k, cluster) in (job.clusters.clone()).zip(&job.chunk.clusters()[job.clusters.clone()]) {
+        // The test of the way there: the splats must be the same ones.
         if !job.projection.may_see(job.chunk, cluster) {
             continue;
         }
@@ -124,6 +125,7 @@ fn back_project_unit<S: Simd>(
             let local = block - first_block;
             let to = &mut gradients.lanes[local * width..(local + 1) * width];
             if gradients.visible[local] == 0 {
+                // No other view has shown the group, and its columns hold any value.
                 to.fill(Lanes([0.0; LANES]));
             }
             gradients.visible[local] |= splats.visible as u16;

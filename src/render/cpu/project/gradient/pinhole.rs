@@ -96,6 +96,7 @@ pub(super) fn back_project<S: Simd>(
     let by_slope = |focal: f32x16<S>, by_mean: f32x16<S>, q: Vec3x16<S>, slope, axis: usize| {
         let is_free = f32x16::simd_ge(slope, splat(view.slope_min[axis].into()))
             & f32x16::simd_le(slope, splat(view.slope_max[axis].into()));
+        // The linearisation does not follow a slope that is clamped.
         let of_shape = is_free.select(inverse_z * q.dot(forward), splat(0.0));
         focal * (by_mean - of_shape)
     };
