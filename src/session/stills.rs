@@ -215,9 +215,9 @@ fn encoded(index: usize, rgb8: Vec<u8>, still: &Still) -> Result<Vec<u8>, Sessio
         return Ok(rgb8);
     }
     let camera = &still.view.camera;
-    let image = encode(&rgb8, camera.width_px, camera.height_px, still.encoding, false);
-    let image = image.map_err(|reason| SessionError::Encode { camera: index.to_string(), reason });
-    image.map(|image| image.file)
+    encode(&rgb8, camera.width_px, camera.height_px, still.encoding, false)
+        .map(|image| image.file)
+        .map_err(|reason| SessionError::Encode { camera: index.to_string(), reason })
 }
 
 /// Buffers and images that a frame of stills needs in addition to its scene. More than

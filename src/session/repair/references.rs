@@ -196,8 +196,8 @@ impl ReferenceViews {
             let of = trajectories.iter().position(|drive| drive.name == view.trajectory);
             // Images along a drive that the version does not have cannot be placed.
             let Some(drive) = of.and_then(|index| drives.get_mut(index)) else { continue };
-            let at = drive.cameras.iter().position(|(name, _)| *name == view.camera_name);
-            let at = at.unwrap_or_else(|| {
+            let known = drive.cameras.iter().position(|(name, _)| *name == view.camera_name);
+            let at = known.unwrap_or_else(|| {
                 drive.cameras.push((view.camera_name.clone(), Vec::new()));
                 drive.cameras.len() - 1
             });
@@ -270,8 +270,10 @@ impl ReferenceViews {
             self.camera_views(&place, &camera.name).into_iter().filter(fits).collect();
         let nearest = all.iter().min_by(|a, b| distance_m(a).total_cmp(&distance_m(b)))?;
         // The image of before is only kept while it fits.
-        let kept = all.iter().find(|view| Some(&*view.name) == kept);
-        let kept = kept.filter(|kept| distance_m(kept) - distance_m(nearest) < SWITCH_HYSTERESIS_M);
+        let kept = all
+            .iter()
+            .find(|view| Some(&*view.name) == kept)
+            .filter(|kept| distance_m(kept) - distance_m(nearest) < SWITCH_HYSTERESIS_M);
         Some(kept.unwrap_or(nearest).clone().exposed_for(camera))
     }
 

@@ -25,7 +25,7 @@ pub struct Scenarios {
     is_inline: bool,
 }
 
-/// Which scenario.
+/// Where the document of a scenario comes from.
 #[derive(Clone, Debug, PartialEq)]
 pub enum ScenarioSource {
     /// A file of the server's directory, by its name without `.json`.

@@ -108,8 +108,8 @@ impl Session {
             asked.seed,
             opened.as_ref().and_then(|opened| opened.episode.loaded.lanes()),
         )?;
-        let drive = drive_to_follow(&manifest.trajectories, ego.start.as_ref());
-        let drive = drive.map(|drive| Arc::new(RecordedDrive::new(drive)));
+        let drive = drive_to_follow(&manifest.trajectories, ego.start.as_ref())
+            .map(|drive| Arc::new(RecordedDrive::new(drive)));
 
         // The same seed as for the start, as in every later episode.
         let episode = start
@@ -375,8 +375,11 @@ impl Asked {
         if let Some(Start::Pose { pose }) = &options.start {
             checked_pose(*pose)?;
         }
-        let dynamics = options.dynamics.map(wildcity_options::Dynamics::from);
-        let dynamics = dynamics.map(Dynamics::try_from).transpose()?;
+        let dynamics = options
+            .dynamics
+            .map(wildcity_options::Dynamics::from)
+            .map(Dynamics::try_from)
+            .transpose()?;
         // How long a step takes in simulated time, and an answer in real time.
         let dt_us = check_dt(options.dt_us)?;
         let deadline =
@@ -551,7 +554,8 @@ pub(super) async fn prepare(
 ) -> Result<PinnedVersion, SessionError> {
     Engine::bake_sky(resident.clone(), profile).await?;
     let index = {
-        let (engine, resident) = (engine.clone(), resident.clone());
+        let engine = engine.clone();
+        let resident = resident.clone();
         run_blocking(move || engine.spatial_index(&resident)).await?
     };
     let solids = solid_ego.map(|ego_box| engine.solids(index.clone(), ego_box));

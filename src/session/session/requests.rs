@@ -424,8 +424,8 @@ impl Session {
                 if let Some(references) = &version.references {
                     builder = self.find_references(version, references, builder, deadline).await?;
                 }
-                let repaired = run_blocking(move || builder.repair().map(|()| builder));
-                let repaired = repaired.instrument(debug_span!("repair"));
+                let repaired = run_blocking(move || builder.repair().map(|()| builder))
+                    .instrument(debug_span!("repair"));
                 // A model that hangs ends with its own timeout; the session does not wait for it
                 // longer than for a frame.
                 let in_time = timeout_at(deadline, repaired).await;
@@ -466,8 +466,8 @@ impl Session {
         });
         // Load before the job is queued, so that no render thread waits for a disk.
         let resident = version.resident.clone();
-        let pinned = pin(resident, profile, deadline, viewpoints);
-        let mut pinned = pinned.instrument(debug_span!("load")).await?;
+        let mut pinned =
+            pin(resident, profile, deadline, viewpoints).instrument(debug_span!("load")).await?;
         pinned.place(placed.unwrap_or_default());
         builder.add_load(pinned.waited_for, pinned.waited);
         let cost = FrameCost::new(self.number, &views, &profile);

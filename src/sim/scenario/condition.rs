@@ -51,7 +51,8 @@ fn part(
 ) -> Result<Condition, FileError> {
     *count += 1;
     if *count > limits::CONDITIONS || depth > limits::CONDITION_DEPTH {
-        let [most, deepest] = [limits::CONDITIONS, limits::CONDITION_DEPTH];
+        let most = limits::CONDITIONS;
+        let deepest = limits::CONDITION_DEPTH;
         let message = format!("at most {most} conditions, {deepest} deep, are accepted");
         return Err(FileError::new("all", message));
     }
@@ -104,8 +105,12 @@ fn part(
     };
     let later_s = in_range("later_s", section.later_s.unwrap_or(0.0), [0.0, limits::LATER_S])?;
     let held_us = microseconds("held_s", section.held_s.unwrap_or(0.0))?;
-    let measure = section.measure.as_ref().map(|section| measure(section, references));
-    let measure = measure.transpose().map_err(|error| error.within("measure"))?;
+    let measure = section
+        .measure
+        .as_ref()
+        .map(|section| measure(section, references))
+        .transpose()
+        .map_err(|error| error.within("measure"))?;
     Ok(Condition {
         time_us: section.time_s.map(|time_s| microseconds("time_s", time_s)).transpose()?,
         near,

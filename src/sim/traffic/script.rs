@@ -175,7 +175,7 @@ pub enum Shape {
     Linear,
     /// A half wave: `(1 - cos πx) / 2`.
     Sinusoidal,
-    /// `3x² - 2x³`.
+    /// `3x² - 2x³`: its slope is 0 at both ends.
     Cubic,
 }
 
@@ -233,7 +233,7 @@ pub struct Measure {
     pub below: Option<f64>,
 }
 
-/// What is measured.
+/// A number of a body, in its place or relative to another body.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Quantity {
     /// The speed, in m/s.

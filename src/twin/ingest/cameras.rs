@@ -234,7 +234,9 @@ fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
         windshield,
         native_size_px: None,
     };
-    let camera = intrinsics.camera().and_then(|camera| camera.check().map(|()| camera));
-    let camera = camera.map_err(|cause| CamerasError::Camera { name: name.clone(), cause })?;
+    let camera = intrinsics
+        .camera()
+        .and_then(|camera| camera.check().map(|()| camera))
+        .map_err(|cause| CamerasError::Camera { name: name.clone(), cause })?;
     Ok(ListedCamera { name, camera, world_from_camera, near, image, mask, time_us, exposure_stops })
 }

@@ -92,7 +92,7 @@ impl Header {
     }
 }
 
-/// A section's header.
+/// The header of a section: a run of Gaussians of one SH degree.
 struct Section {
     index: u32,
     count: u32,

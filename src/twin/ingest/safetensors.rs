@@ -99,8 +99,9 @@ pub(super) fn read_tracked(
     let place = "tensor point_ids";
     let info = metadata.info(POINT_IDS).ok_or_else(|| bad(place, "is missing".into()))?;
     let (start, end) = info.data_offsets;
-    let body = bytes.get(body_start as usize + start..body_start as usize + end);
-    let body = body.ok_or_else(|| bad(place, "reaches beyond the file".into()))?;
+    let body = bytes
+        .get(body_start as usize + start..body_start as usize + end)
+        .ok_or_else(|| bad(place, "reaches beyond the file".into()))?;
     let ids: Vec<i64> = match info.dtype {
         Dtype::I32 => body.as_chunks().0.iter().map(|id| i32::from_le_bytes(*id).into()).collect(),
         Dtype::I64 => body.as_chunks().0.iter().map(|id| i64::from_le_bytes(*id)).collect(),
@@ -209,13 +210,14 @@ impl<'a> ReadPlan<'a> {
         };
         // Saturating, because a shape with a zero may have any other dimension.
         let coefficients = colours.iter().fold(0, |sum: usize, c| sum.saturating_add(c.shape[1]));
-        let sh_degree = (0..=sh::MAX_DEGREE).find(|&d| sh::coefficients(d) == coefficients);
-        let sh_degree = sh_degree.ok_or_else(|| {
-            let (name, before) = if one_tensor { ("coeffs", 0) } else { ("shN", 1) };
-            let allowed = [1, 4, 9, 16].map(|k: usize| (k - before).to_string()).join(", ");
-            let reason = format!("has {} coefficients, not {allowed}", coefficients - before);
-            bad(&format!("tensor {name}"), reason)
-        })?;
+        let sh_degree = (0..=sh::MAX_DEGREE)
+            .find(|&d| sh::coefficients(d) == coefficients)
+            .ok_or_else(|| {
+                let (name, before) = if one_tensor { ("coeffs", 0) } else { ("shN", 1) };
+                let allowed = [1, 4, 9, 16].map(|k: usize| (k - before).to_string()).join(", ");
+                let reason = format!("has {} coefficients, not {allowed}", coefficients - before);
+                bad(&format!("tensor {name}"), reason)
+            })?;
         let mut tensors = vec![
             (Column::Means, means),
             (Column::Quats, shaped("quats", &[n, Some(4)])?),

@@ -275,8 +275,7 @@ fn folder(path: &Path) -> Result<RgbImage, IngestError> {
     let mut strip: Option<RgbImage> = None;
     for (face, name) in (0..).zip(["px", "nx", "py", "ny", "pz", "nz"]) {
         let candidates = ["png", "jpg", "jpeg"].map(|kind| path.join(format!("{name}.{kind}")));
-        let found = candidates.iter().find(|candidate| candidate.exists());
-        let found = found.ok_or_else(|| {
+        let found = candidates.iter().find(|candidate| candidate.exists()).ok_or_else(|| {
             bad(name, format!("there is no {name}.png or {name}.jpg in {}", path.display()))
         })?;
         let part =

@@ -64,7 +64,7 @@ pub(super) fn read(
     reading.accept(gaussians, &Field::plain_name)
 }
 
-/// Position and scales.
+/// Position and scales of a record, each as x, y, z in metres.
 fn numbers(record: &[u8; RECORD_BYTES]) -> [[f32; 3]; 2] {
     let words = record.as_chunks::<4>().0;
     [0, 3].map(|first| std::array::from_fn(|i| f32::from_le_bytes(words[first + i])))

@@ -72,9 +72,14 @@ pub(super) struct Claim {
 
 impl Budget {
     pub(super) fn new(limit_bytes: u64) -> Self {
-        let versions = BTreeMap::new();
-        let (stages, beside) = (BTreeMap::new(), BTreeMap::new());
-        Self { limit_bytes, versions, stages, beside, large: 0, images_bytes: 0 }
+        Self {
+            limit_bytes,
+            versions: BTreeMap::new(),
+            stages: BTreeMap::new(),
+            beside: BTreeMap::new(),
+            large: 0,
+            images_bytes: 0,
+        }
     }
 
     /// Reserves memory.

@@ -187,7 +187,7 @@ impl BlockIndex {
         }
     }
 
-    /// Number of blocks.
+    /// Number of blocks of all cells.
     pub(super) fn blocks(&self) -> usize {
         self.blocks.len()
     }

@@ -189,8 +189,8 @@ impl Catalog {
         };
         let removable = found.iter().filter(is_removable).map(|object| object.hash.clone());
         let mut plan = CollectionPlan { remove: removable.collect(), ..CollectionPlan::default() };
-        let others = numbers.into_iter();
-        let others = others.filter(|number| !kept.contains(number) && !gone.contains(number));
+        let others =
+            numbers.into_iter().filter(|number| !kept.contains(number) && !gone.contains(number));
         self.keep_whole_versions(name, others.collect(), &is_old, &mut plan)?;
         for object in &found {
             let noted_us = before.get(&object.hash).copied();

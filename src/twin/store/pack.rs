@@ -128,15 +128,15 @@ impl<'a> CellPacker<'a> {
             rest = after;
 
             // The blocks of all cells of the batch, in parallel.
-            let packed = self.pack_blocks(batch);
-            let packed = packed.map_err(StoreError::io("compress for", staging.dir()))?;
+            let packed =
+                self.pack_blocks(batch).map_err(StoreError::io("compress for", staging.dir()))?;
 
             // Their objects, one after the other.
-            let mut packed = packed.into_iter();
+            let mut results = packed.into_iter();
             for cell in batch {
                 let mut sections = Vec::new();
                 // The results are in the order of `blocks`, cell by cell.
-                for (block, lost) in packed.by_ref().take(cell.blocks.len()) {
+                for (block, lost) in results.by_ref().take(cell.blocks.len()) {
                     sections.extend(block);
                     clamped.merge(&lost);
                 }

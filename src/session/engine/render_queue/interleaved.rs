@@ -183,7 +183,9 @@ impl Simulation {
 
 #[test]
 fn no_order_of_threads_loses_a_frame() {
-    let [mut rendered, mut frames, mut dropped] = [0, 0, 0];
+    let mut rendered = 0;
+    let mut frames = 0;
+    let mut dropped = 0;
     for seed in 0..ORDERS {
         let mut simulation = Simulation::new(seed);
         // The queue of every other order is closed, at any time.

@@ -41,8 +41,12 @@ impl<'a> Bytes<'a> {
     }
 
     fn take<const N: usize>(&mut self) -> Result<[u8; N], CaptureError> {
-        let taken = self.bytes.get(self.at..).and_then(|rest| rest.first_chunk::<N>()).copied();
-        let taken = taken.ok_or_else(|| self.ended())?;
+        let taken = self
+            .bytes
+            .get(self.at..)
+            .and_then(|rest| rest.first_chunk::<N>())
+            .copied()
+            .ok_or_else(|| self.ended())?;
         self.at += N;
         Ok(taken)
     }
@@ -76,8 +80,8 @@ impl<'a> Bytes<'a> {
     fn text(&mut self) -> Result<String, CaptureError> {
         let rest = &self.bytes[self.at..];
         let length = rest.iter().position(|&byte| byte == 0).ok_or_else(|| self.ended())?;
-        let text = String::from_utf8(rest[..length].to_vec());
-        let text = text.map_err(|_| self.wrong("the name of the image is not UTF-8: rename it"))?;
+        let text = String::from_utf8(rest[..length].to_vec())
+            .map_err(|_| self.wrong("the name of the image is not UTF-8: rename it"))?;
         self.at += length + 1;
         Ok(text)
     }
@@ -106,8 +110,9 @@ fn read_cameras(path: &Path) -> Result<BTreeMap<i32, Camera>, CaptureError> {
         };
         model.check_supported().map_err(|reason| bytes.wrong(format!("camera {id}: {reason}")))?;
         let parameters: Result<Vec<f64>, _> = (0..model.parameters).map(|_| bytes.f64()).collect();
-        let camera = model.camera(size, &parameters?);
-        let camera = camera.map_err(|reason| bytes.wrong(format!("camera {id}: {reason}")))?;
+        let camera = model
+            .camera(size, &parameters?)
+            .map_err(|reason| bytes.wrong(format!("camera {id}: {reason}")))?;
         if cameras.insert(id, camera).is_some() {
             return Err(bytes.wrong(format!("camera {id} occurs twice: write the model again")));
         }

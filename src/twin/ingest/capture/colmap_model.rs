@@ -7,7 +7,7 @@ use glam::DQuat;
 use wildcity_scene::geometry::camera::{Fisheye, Lens, OpenCv, Pinhole};
 use wildcity_scene::geometry::{Camera, Pose};
 
-/// A camera model.
+/// A camera model of COLMAP, by its names in text and binary files.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Model {
     /// Its number in binary files.

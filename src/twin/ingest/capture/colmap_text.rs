@@ -50,7 +50,8 @@ fn read_cameras(path: &Path) -> Result<BTreeMap<u64, Camera>, CaptureError> {
         };
         model.check_supported().map_err(wrong)?;
         if parameters.len() != model.parameters {
-            let (given, needed) = (parameters.len(), model.parameters);
+            let given = parameters.len();
+            let needed = model.parameters;
             return Err(wrong(format!("{given} parameters; {name} has {needed}")));
         }
         let camera = model.camera(size, &parameters).map_err(wrong)?;

@@ -40,14 +40,15 @@ impl<'a> Column<'a> {
         if accessor.sparse.is_some() {
             return Err(format!("accessor {index} is sparse; export it dense"));
         }
-        let view = accessor.buffer_view.and_then(|view| document.buffer_views.get(view));
-        let view = view.ok_or(format!("accessor {index} has no bufferView that exists"))?;
+        let view = accessor
+            .buffer_view
+            .and_then(|view| document.buffer_views.get(view))
+            .ok_or(format!("accessor {index} has no bufferView that exists"))?;
         if let Some(name) = view.extensions.keys().next() {
             return Err(format!("its bufferView is compressed by {name}; export it without"));
         }
-        let component = Component::from_number(accessor.component_type);
-        let component =
-            component.ok_or(format!("componentType {} is not read", accessor.component_type))?;
+        let component = Component::from_number(accessor.component_type)
+            .ok_or(format!("componentType {} is not read", accessor.component_type))?;
         let row_bytes = (component.bytes() * width) as u64;
         let stride = view.byte_stride.unwrap_or(row_bytes);
         // glTF allows 4 to 252. A stride shorter than a row would make rows overlap, so that few

@@ -37,8 +37,10 @@ pub(super) fn mesh_instances(document: &Document) -> Result<Vec<MeshInstance<'_>
         let scene_from_mesh = scene_from_parent * parent_from_node(node);
         waiting.extend(node.children.iter().rev().map(|&child| (child, scene_from_mesh)));
         if let Some(own) = node.mesh {
-            let mesh = document.meshes.get(own);
-            let mesh = mesh.ok_or_else(|| bad(&place, "its mesh does not exist".into()))?;
+            let mesh = document
+                .meshes
+                .get(own)
+                .ok_or_else(|| bad(&place, "its mesh does not exist".into()))?;
             placed.push(MeshInstance { node: index, index: own, mesh, scene_from_mesh });
         }
     }

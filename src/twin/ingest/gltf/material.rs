@@ -168,7 +168,7 @@ impl TextureArea {
     }
 }
 
-/// Reads an image.
+/// Decodes the file of an image, from a buffer or from its URI.
 pub(super) fn decode(
     image: &gltf::Image<'_>,
     buffers: &[&[u8]],

@@ -150,8 +150,11 @@ pub(super) fn read(
     }
     let mut buffers: Vec<&[u8]> = Vec::new();
     for (index, (bytes, buffer)) in fetched.iter().zip(&document.buffers).enumerate() {
-        let bytes = bytes.as_ref().map(|bytes| &bytes[..]);
-        let bytes = bytes.or(own_buffer.filter(|_| index == 0)).unwrap_or_default();
+        let bytes = bytes
+            .as_ref()
+            .map(|bytes| &bytes[..])
+            .or(own_buffer.filter(|_| index == 0))
+            .unwrap_or_default();
         let Some(bytes) = bytes.get(..buffer.byte_length as usize) else {
             return Err(IngestError::Size {
                 format: FORMAT,
@@ -201,9 +204,9 @@ fn read_primitive(
     match primitive.compressed_by() {
         Some((SPZ, settings)) => {
             let view = settings.get("bufferView").and_then(Value::as_u64);
-            let bytes = view.and_then(|view| document.view_bytes(buffers, view as usize));
-            let bytes =
-                bytes.ok_or_else(|| bad(place, format!("{SPZ} has no bufferView that exists")))?;
+            let bytes = view
+                .and_then(|view| document.view_bytes(buffers, view as usize))
+                .ok_or_else(|| bad(place, format!("{SPZ} has no bufferView that exists")))?;
             let mut part =
                 spz::read_gzip_within(bytes, bytes.len() as u64, parts.budget(), reading)?;
             turn_compressed(&mut part, reading);
@@ -215,8 +218,10 @@ fn read_primitive(
         None => {}
     }
     let column = |name: &str, width: usize| {
-        let index = primitive.attributes.get(name);
-        let index = *index.ok_or_else(|| bad(place, format!("has no attribute {name}")))?;
+        let index = *primitive
+            .attributes
+            .get(name)
+            .ok_or_else(|| bad(place, format!("has no attribute {name}")))?;
         Column::find(document, buffers, index, width)
             .map_err(|reason| bad(&format!("{place}, {name}"), reason))
     };

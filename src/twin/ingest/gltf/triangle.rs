@@ -149,7 +149,9 @@ impl Triangle {
         covariance *= (WIDER / f64::from(cuts)).powi(2) / 12.0;
         // The eigenvectors and eigenvalues of a symmetric 2 x 2 matrix: the angle of the major axis
         // is atan2(2 xy, xx - yy) / 2, the variances are (xx + yy) / 2 ± √((xx - yy)² / 4 + xy²).
-        let [xx, xy, yy] = [covariance.x_axis.x, covariance.x_axis.y, covariance.y_axis.y];
+        let xx = covariance.x_axis.x;
+        let xy = covariance.x_axis.y;
+        let yy = covariance.y_axis.y;
         let angle = 0.5 * (2.0 * xy).atan2(xx - yy);
         let spread = (0.25 * (xx - yy).powi(2) + xy * xy).sqrt();
         let middle = 0.5 * (xx + yy);
@@ -291,11 +293,11 @@ mod tests {
         assert!((100..=1 << HALVINGS).contains(&parts.len()), "{}", parts.len());
         let sum_m2: f64 = parts.iter().map(Triangle::area_m2).sum();
         assert!((sum_m2 / area_m2 - 1.0).abs() < 1e-12);
-        let longest_m = parts.iter().flat_map(|part| {
+        let sides_m = parts.iter().flat_map(|part| {
             let [a, b, c] = part.corners_m;
             [a.distance(b), b.distance(c), c.distance(a)]
         });
-        let longest_m = longest_m.fold(0.0, f64::max);
+        let longest_m = sides_m.fold(0.0, f64::max);
         assert!(longest_m <= 0.1, "{longest_m}");
         // However long, and however thin; and what is not thin stays whole.
         let line = triangle([[0.0; 3], [1e9, 0.0, 0.0], [2e9, 0.0, 0.0]]);

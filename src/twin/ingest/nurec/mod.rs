@@ -154,8 +154,8 @@ impl<'a> Payload<'a> {
         let state = data.get("state_dict").ok_or_else(|| missing("nre_data.state_dict"))?;
         let tracks = state.get("._extra_state").and_then(|extra| extra.get("obj_track_ids"));
         let settings = data.get("config").and_then(|config| config.get("layers"));
-        let names = state.keys();
-        let names = names.filter_map(|key| key.strip_prefix(LAYERS)?.strip_suffix(".positions"));
+        let keys = state.keys();
+        let names = keys.filter_map(|key| key.strip_prefix(LAYERS)?.strip_suffix(".positions"));
         // A key may be repeated: the first one counts.
         let mut seen = BTreeSet::new();
         let names: Vec<&str> = names.filter(|&name| seen.insert(name)).collect();
@@ -216,12 +216,13 @@ impl Layer<'_> {
         let densities = self.array("densities", Some(1), rows)?;
         let albedo = self.array("features_albedo", Some(3), rows)?;
         let specular = self.array("features_specular", None, rows)?;
-        let held =
-            (0..=sh::MAX_DEGREE).find(|&d| 3 * (sh::coefficients(d) - 1) == specular.columns);
-        let held = held.ok_or_else(|| {
-            let reason = format!("{} columns; 0, 9, 24 or 45 make an SH degree", specular.columns);
-            bad(&self.key("features_specular"), reason)
-        })?;
+        let held = (0..=sh::MAX_DEGREE)
+            .find(|&d| 3 * (sh::coefficients(d) - 1) == specular.columns)
+            .ok_or_else(|| {
+                let reason =
+                    format!("{} columns; 0, 9, 24 or 45 make an SH degree", specular.columns);
+                bad(&self.key("features_specular"), reason)
+            })?;
         let sh_degree = self.active_degree().map_or(held, |active| held.min(active));
         let count = check_count(means.rows as u64)?;
         let mut g = Gaussians::with_capacity(sh_degree, count);

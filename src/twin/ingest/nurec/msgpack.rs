@@ -166,8 +166,8 @@ impl<'a> Parser<'a> {
 
     fn take(&mut self, length: u64) -> Result<&'a [u8], String> {
         let left = &self.bytes[self.at..];
-        let taken = usize::try_from(length).ok().and_then(|length| left.get(..length));
-        let taken = taken.ok_or_else(|| {
+        let found = usize::try_from(length).ok().and_then(|length| left.get(..length));
+        let taken = found.ok_or_else(|| {
             format!("byte {}: {length} bytes are wanted, {} are left", self.at, left.len())
         })?;
         self.at += taken.len();

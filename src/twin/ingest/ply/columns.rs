@@ -110,9 +110,9 @@ impl Columns {
         gaussians.means_m.push(std::array::from_fn(|i| value(&self.means[i])));
         gaussians.quats_wxyz.push(std::array::from_fn(|i| single(&self.quats[i])));
         let scale = |i: usize| self.scales.get(i).map_or(LN_SCALE[0], single);
-        let (ln_scales, logit) = (std::array::from_fn(scale), single(&self.opacity));
         let filter = self.filter.as_ref().map_or(0.0, value);
-        let (ln_scales, logit) = filtered(ln_scales, logit, filter);
+        let (ln_scales, logit) =
+            filtered(std::array::from_fn(scale), single(&self.opacity), filter);
         gaussians.ln_scales.push(ln_scales);
         gaussians.logit_opacities.push(logit);
         match &self.dc {

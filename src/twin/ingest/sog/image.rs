@@ -16,7 +16,7 @@ pub(super) struct NamedFile {
     pub(super) bytes: Vec<u8>,
 }
 
-/// A decoded image.
+/// The pixels of a decoded WebP file, row by row.
 pub(super) struct Image {
     bytes: Vec<u8>,
     /// Bytes of a pixel: 3, or 4 with alpha.

@@ -83,7 +83,8 @@ fn read_one(
         let bytes = parts.read(&file, limits::SCENE_PART_BYTES)?;
         Ok(NamedFile { name: file, bytes })
     };
-    let [means_l, means_u] = [fetch(&meta.means.files.0)?, fetch(&meta.means.files.1)?];
+    let means_l = fetch(&meta.means.files.0)?;
+    let means_u = fetch(&meta.means.files.1)?;
     let scales = fetch(&meta.scales.files.0)?;
     let quats = fetch(&meta.quats.files.0)?;
     let sh0 = fetch(&meta.sh0.files.0)?;
@@ -94,7 +95,8 @@ fn read_one(
     let mut decode = |file: NamedFile| Image::decode(file, count, parts.budget());
 
     // Centres: 16 bits between mins and maxs, of the signed logarithm.
-    let [low, high] = [decode(means_l)?, decode(means_u)?];
+    let low = decode(means_l)?;
+    let high = decode(means_u)?;
     let mut gaussians = Gaussians { means_m: Vec::with_capacity(count), ..Gaussians::default() };
     for (low, high) in low.pixels(count).zip(high.pixels(count)) {
         let mean = std::array::from_fn(|axis| {

@@ -125,8 +125,8 @@ pub(super) fn read_gzip_within(
     }
     extensions::assume_system(reading);
     let left = limit - (after.len() as u64).min(limit);
-    let more = io::copy(&mut (&mut input).take(left), &mut io::sink());
-    let more = more.map_err(damaged)? + after.len() as u64;
+    let rest = io::copy(&mut (&mut input).take(left), &mut io::sink()).map_err(damaged)?;
+    let more = rest + after.len() as u64;
     if more > 0 && header.flags & FLAG_EXTENSIONS == 0 {
         let reason = format!("more than the {unpacked_bytes} bytes that the header promises");
         return Err(body("the end", reason));
@@ -198,8 +198,10 @@ impl Header {
             ("rotations", rotation_bytes),
             ("colour coefficients", sh_bytes),
         ];
-        let attributes = attributes.into_iter().enumerate().filter(|(_, (_, stride))| *stride > 0);
         attributes
+            .into_iter()
+            .enumerate()
+            .filter(|(_, (_, stride))| *stride > 0)
             .map(|(index, (name, stride))| Attribute { index, name, stride, count: self.count })
             .collect()
     }

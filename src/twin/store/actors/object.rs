@@ -128,15 +128,16 @@ impl Header {
         let mut levels = Vec::with_capacity(self.levels.len());
         for (index, level) in self.levels.iter().enumerate() {
             let of_level = |reason: String| format!("level {index}: {reason}");
-            let own = rest.get(..level.bytes as usize);
-            let own = own.ok_or_else(|| of_level("it ends before its last byte".to_owned()))?;
+            let own = rest
+                .get(..level.bytes as usize)
+                .ok_or_else(|| of_level("it ends before its last byte".to_owned()))?;
             // Levels follow each other without gaps: what is left after the last one is damage.
             rest = &rest[own.len()..];
             let (entry, section) = section(level, self.classes);
-            let (degree, record) = (self.sh_degree, self.record);
-            let chunk = chunk_file::unpack(own, &entry, &section, degree, record, None);
-            let chunk = Arc::new(chunk.map_err(of_level)?);
-            levels.push(AssetLevel { error_m: level.error_m, chunk });
+            let chunk =
+                chunk_file::unpack(own, &entry, &section, self.sh_degree, self.record, None)
+                    .map_err(of_level)?;
+            levels.push(AssetLevel { error_m: level.error_m, chunk: Arc::new(chunk) });
         }
         if rest.is_empty() {
             Ok(levels)

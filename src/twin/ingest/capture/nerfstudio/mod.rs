@@ -168,8 +168,10 @@ fn posed(
     let position = [rows[0][3], rows[1][3], rows[2][3]];
     let world_from_camera =
         Pose::checked(position, q_wxyz).map_err(|cause| matrix(&cause.to_string()))?;
-    let camera = shared.joined_with(frame.intrinsics).and_then(|fields| fields.camera());
-    let camera = camera.map_err(|Wrong { field, reason }| wrong(field, reason))?;
+    let camera = shared
+        .joined_with(frame.intrinsics)
+        .and_then(|fields| fields.camera())
+        .map_err(|Wrong { field, reason }| wrong(field, reason))?;
     let time_us = match frame.time_us {
         None | Some(Value::Null) => None,
         Some(time) => Some(time.as_i64().ok_or_else(|| {
