@@ -68,6 +68,7 @@ impl<'a> Bytes<'a> {
     }
 
     fn skip(&mut self, bytes: u64) -> Result<(), CaptureError> {
+        // The length comes from the file: a sum that overflows is an end beyond the file, too.
         let end = usize::try_from(bytes).ok().and_then(|bytes| self.at.checked_add(bytes));
         match end.filter(|&end| end <= self.bytes.len()) {
             Some(end) => self.at = end,
@@ -99,6 +100,8 @@ impl<'a> Bytes<'a> {
 fn read_cameras(path: &Path) -> Result<BTreeMap<i32, Camera>, CaptureError> {
     let mut bytes = Bytes::open(path)?;
     let mut cameras = BTreeMap::new();
+    // The count is untrusted, so nothing is allocated for it: a count that is too large ends at
+    // `ended`.
     for _ in 0..bytes.u64()? {
         let id = bytes.i32()?;
         let number = bytes.i32()?;
@@ -109,6 +112,7 @@ fn read_cameras(path: &Path) -> Result<BTreeMap<i32, Camera>, CaptureError> {
             )));
         };
         model.check_supported().map_err(|reason| bytes.wrong(format!("camera {id}: {reason}")))?;
+        // The number of parameters follows from the model and is not in the file.
         let parameters: Result<Vec<f64>, _> = (0..model.parameters).map(|_| bytes.f64()).collect();
         let camera = model
             .camera(size, &parameters?)
@@ -137,6 +141,7 @@ fn read_images(
         let world_from_camera = pose(q_wxyz, translation)
             .map_err(|reason| bytes.wrong(format!("image {id}: {reason}")))?;
         let points = bytes.u64()?;
+        // Features of an image are not used. Saturated, a count that is too large fails in `skip`.
         bytes.skip(points.saturating_mul(POINT_BYTES))?;
         let Some(camera) = cameras.get(&camera_id) else {
             return Err(bytes.wrong(format!(
@@ -168,6 +173,7 @@ pub(super) fn read_points(path: &Path) -> Result<Vec<CapturePoint>, CaptureError
             return Err(bytes.wrong(format!("point {id} is at {at:?}: write the model again")));
         }
         let rgb8 = bytes.take::<3>()?;
+        // Read only to pass over it: the error of reprojection is not used.
         let _error_px = bytes.f64()?;
         let track = bytes.u64()?;
         bytes.skip(track.saturating_mul(TRACK_BYTES))?;

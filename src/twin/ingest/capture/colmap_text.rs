@@ -104,6 +104,8 @@ fn read_images(
             continue;
         }
         let wrong = |reason: String| CaptureError::at(path, Place::Line(index + 1), reason);
+        // The name is the rest of the line and may contain spaces, so only the nine words before it
+        // are split.
         let mut rest = line.trim_start();
         let mut words = [""; 9];
         for word in &mut words {
