@@ -455,6 +455,8 @@ impl ObservationLayout {
         let PixelMaps { depth, opacity, normals, .. } = self.maps;
         // Raw pixels are rendered into the answer itself.
         let pixels = if self.encoding == ImageEncoding::Raw { 0 } else { 3 };
+        // Trust is computed from opacity, and normals from depth: both are rendered even if the
+        // answer has neither.
         let opacity = if has_trust && !opacity { 4 } else { 0 };
         let depth = if normals && !depth { 4 } else { 0 };
         self.rig_pixels() * (pixels + opacity + depth)
@@ -469,6 +471,7 @@ impl ObservationLayout {
         let with_normals =
             if self.maps.normals { limits::ANSWER_PIXELS / 2 } else { limits::ANSWER_PIXELS };
         let has_owners = self.maps.instances || self.maps.semantics;
+        // With instances or classes a pixel takes 4/3 of the bytes.
         if has_owners { with_normals / 4 * 3 } else { with_normals }
     }
 
@@ -519,6 +522,7 @@ impl ObservationLayout {
 
     /// Whether a later observation shows a camera's image of a capture.
     pub(crate) fn is_shown_later(&self, capture: &RigCapture, camera: usize) -> bool {
+        // A picture that is not shown now was rendered for a later observation.
         !capture.shown || self.schedule.is_shown_after(camera, capture.due_us, capture.due_us)
     }
 

@@ -125,6 +125,7 @@ impl ReferenceView {
 
     /// Returns this image with the exposure of a camera, if its own exposure is known.
     pub(crate) fn exposed_for(mut self, camera: &RigCamera) -> Self {
+        // From an unknown exposure the picture cannot be brought to another one.
         if self.recorded.as_ref().is_some_and(|view| view.exposure_stops.is_some()) {
             self.appearance.exposure = camera.appearance.exposure;
         }
@@ -289,6 +290,7 @@ impl ReferenceViews {
         // only takes memory.
         let projection = Arc::new(Projection::from_camera(camera));
         let mut all = self.projections.lock();
+        // Beyond the limit a table is used once and not kept, so that the memory is bounded.
         if all.len() < PROJECTIONS {
             all.push((*camera, projection.clone()));
         }
@@ -333,6 +335,7 @@ impl ReferenceViews {
                 of.flat_map(|(_, views)| views).map(recorded).collect()
             }
             ReferenceSource::Rendered => {
+                // 15 steps in either direction.
                 let around = (REFERENCE_WITHIN_M / STEP_M) as usize;
                 let middle = self.step(place.drive, place.station_m);
                 let of: Vec<&RigCamera> =

@@ -67,6 +67,7 @@ fn part(
     };
     let all = parts("all", &section.all)?;
     let any = parts("any", &section.any)?;
+    // The bound keeps the product far within 64 bits.
     let microseconds = |path: &str, value_s: f64| -> Result<i64, FileError> {
         Ok((in_range(path, value_s, [0.0, limits::END_S])? * 1e6).round() as i64)
     };
@@ -217,6 +218,7 @@ fn trigger_named(
     };
     // Both lists have an entry for each actor, so the index is valid.
     let triggers = &references.triggers[actor];
+    // A trigger without a name has an empty one in the list, which no reference may find.
     let trigger = triggers.iter().position(|other| !name.is_empty() && other == name);
     Ok(After { actor, trigger: trigger.ok_or_else(missing)?, phase: Phase::Fired, delay_us: 0 })
 }

@@ -189,6 +189,7 @@ fn shifted(drive: &Trajectory, station_m: f64, seed: u64, frames: u32) -> Result
     // `Route::new` has checked that the drive has keyframes.
     let first_us = drive.keyframes[0].time_us;
     let last_us = drive.keyframes[drive.keyframes.len() - 1].time_us;
+    // A shift beyond the ends of the drive starts at its end.
     let time_us = route.at(station_m).time_us.saturating_add(shift_us).clamp(first_us, last_us);
     // Between the two keyframes around that time.
     let last = drive.keyframes.len() - 1;
@@ -274,6 +275,7 @@ fn end_rules(section: &EndSection, has_route: bool) -> Result<EndRules, FileErro
         off_route_m,
         contact: section.contact,
         stuck_us: microseconds("stuck_s", section.stuck_s)?,
+        // By default an episode ends with its route, if there is one.
         route_done: section.route_done.unwrap_or(true) && has_route,
     })
 }

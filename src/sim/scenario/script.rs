@@ -28,6 +28,7 @@ pub(super) fn add_script(
         if let Some(name) = &trigger.name {
             named(&format!("{path}.name"), name)?;
             let names = &references.triggers[own];
+            // The list has this trigger's own name, too.
             if names.iter().filter(|other| *other == name).count() > 1 {
                 let message = format!("{name:?} is there twice; give each trigger its own name");
                 return Err(FileError::new(format!("{path}.name"), message));
@@ -48,6 +49,7 @@ pub(super) fn add_script(
         // Actions stay in order: later ones replace what earlier ones of the same sub-step began.
         let mut then = Vec::with_capacity(trigger.then.len());
         for (at, action) in trigger.then.iter().enumerate() {
+            // An action may add a course to the follower, and then names it by its index.
             let action = action_from(action, &mut actor.behaviour, courses, (references, own));
             then.push(action.map_err(|error| error.within(&format!("{path}.do[{at}]")))?);
         }
@@ -74,6 +76,7 @@ fn profile(section: &ProfileSection) -> Result<(Over, Shape), FileError> {
             .map(|most| Ok(Over::Acceleration(in_range("acceleration", most, [1e-3, 1e3])?))),
     ];
     let mut written = given.into_iter().flatten();
+    // The first two tell whether there is none, one, or too many.
     match (shape, written.next(), written.next()) {
         (Shape::Step, None, _) => Ok((Over::Time(0.0), shape)),
         (Shape::Linear | Shape::Sinusoidal | Shape::Cubic, Some(over), None) => Ok((over?, shape)),

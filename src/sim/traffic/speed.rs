@@ -62,6 +62,7 @@ impl SpeedProfile {
         let extent = shape.extent(to_mps - from_mps, over);
         let over_s = match over {
             // Every shape here is symmetric, so that its mean speed is that of its ends.
+            // The minimum keeps the time finite for a change from standing to standing.
             Over::Distance(_) => 2.0 * extent / (from_mps + to_mps).max(1e-3),
             _ => extent,
         };

@@ -122,6 +122,8 @@ impl Budget {
     /// # Errors
     /// As [`Budget::reserve`].
     pub(super) fn exchange(&mut self, old: &Claim, new: &Claim) -> Result<(), ResidencyError> {
+        // The old claim goes first, because both need not fit at the same time. The copy undoes
+        // that.
         let before = self.clone();
         self.release(old);
         self.reserve(new).inspect_err(|_| *self = before)

@@ -91,6 +91,7 @@ impl<'a> CellPacker<'a> {
         let has_classes = gaussians.classes.is_some();
         let gaussians = match gaussians {
             Cow::Borrowed(gaussians) => Source::Kept(gaussians, order),
+            // Split into blocks at once, so that the memory of each is freed as it is packed.
             Cow::Owned(gaussians) => Source::Consumed(by_block(gaussians, &cells, &order)),
         };
         Self { sh_degree, has_classes, storage, cells, gaussians }
@@ -161,6 +162,8 @@ impl<'a> CellPacker<'a> {
                 runs.clone().map(kept).collect()
             }
             Source::Consumed(blocks) => {
+                // Batches come in the order of the blocks, so that those of this one are at the
+                // front.
                 blocks.drain(..runs.clone().count()).map(BlockParts::Consumed).collect()
             }
         };
@@ -183,6 +186,8 @@ impl<'a> CellPacker<'a> {
                 small.push(block);
                 continue;
             }
+            // The small blocks before it go first, so that the results stay in the order of the
+            // blocks.
             pack_small(&mut small, &mut packed)?;
             packed.push(block.pack(sh_degree, storage)?);
         }
