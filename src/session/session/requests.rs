@@ -110,6 +110,7 @@ impl Session {
     ) -> Result<Observation, SessionError> {
         let steps = self.plan_steps(&command, options.until_us)?;
         check_notes(options.notes.as_ref())?;
+        // Before the deadline begins: to open a newer version is no part of the step.
         self.follow_latest().await;
         let deadline = Instant::now() + self.settings.deadline;
         let now = &self.state.episode;
@@ -200,6 +201,7 @@ impl Session {
             let drives = &index.version().manifest.trajectories;
             let ground = Ground::from_drives(drives).with_boxes(index.boxes()).and_lanes(lanes);
             let (episode, egos) = now.followed(&command, steps, &ground, terminate)?;
+            // Each part may take long, so that a stop is looked for between them.
             stop.refusal()?;
             let met = meetings(&now, &egos, solids.as_ref(), &index, dt_us, stop)?;
             stop.refusal()?;
@@ -500,6 +502,7 @@ fn meetings(
     };
     // An ego that has left the area once is not looked for again.
     let recorded = index.recorded().filter(|_| !now.is_off_model());
+    // Lazy, so that the search ends at the first pose that is off.
     let mut trusts = egos.iter().zip(1..).filter_map(|(ego, step)| {
         Some((begin_us + step * dt_us, recorded?.trust(&ego.world_from_rig())))
     });

@@ -139,6 +139,7 @@ fn recorded<'a>(
 
 /// When the recorded drive passed the ego's start, in microseconds.
 fn start_time_us(around: &Surroundings<'_>, start: Option<&EgoStart>) -> i64 {
+    // Without a place on a recorded drive, the clock of the tracks is that of the episode.
     let Some(EgoStart::Station { trajectory, station_m }) = start else { return 0 };
     let drive = around.drives.iter().find(|drive| drive.name == *trajectory);
     let route = drive.and_then(|drive| Route::new(drive).ok());

@@ -195,6 +195,7 @@ impl Shape {
     pub(super) fn slope(self, x: f64) -> f64 {
         use std::f64::consts::PI;
         match self {
+            // Before its begin and after its end a change stands still.
             _ if !(0.0..=1.0).contains(&x) => 0.0,
             Self::Step => 0.0,
             Self::Linear => 1.0,

@@ -57,6 +57,7 @@ impl Catalog {
         for chunk in &manifest.chunks {
             let near: Vec<_> =
                 places.iter().filter(|(place, ..)| place.is_near(&chunk.bounds)).collect();
+            // Only the ground reaches cells that no box is near.
             if near.is_empty() && labels.ground.is_none() {
                 continue;
             }

@@ -40,6 +40,7 @@ impl Catalog {
             }
             let version = self.version(from, Some(entry.number))?;
             let (commit, settings) = self.begin_copy(&version, entry.kind, to)?;
+            // The first copy makes the twin. Each further one is based on the one before it.
             let copied = match last {
                 None => commit.create(settings)?,
                 Some(_) => commit.replace(last, settings)?,

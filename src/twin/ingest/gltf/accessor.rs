@@ -74,6 +74,8 @@ impl<'a> Column<'a> {
                 buffer.len()
             ));
         }
+        // Both offsets lie within the buffer by the checks above, so that the sum does not
+        // overflow.
         let start = (view.byte_offset + accessor.byte_offset) as usize;
         Ok(Self {
             count: accessor.count as usize,
@@ -89,6 +91,7 @@ impl<'a> Column<'a> {
         let start = self.stride * index;
         let bytes = self.component.bytes();
         std::array::from_fn(|i| {
+            // Of signed integers the smallest one stands for -1, as the next one does.
             let value = self.component.value(&self.bytes[start + bytes * i..]);
             if self.normalized { (value / self.component.most()).max(-1.0) } else { value }
         })

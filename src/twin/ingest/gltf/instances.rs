@@ -35,6 +35,7 @@ pub(super) fn mesh_instances(document: &Document) -> Result<Vec<MeshInstance<'_>
             ));
         }
         let scene_from_mesh = scene_from_parent * parent_from_node(node);
+        // Reversed, because the last one that is pushed is the first to be visited.
         waiting.extend(node.children.iter().rev().map(|&child| (child, scene_from_mesh)));
         if let Some(own) = node.mesh {
             let mesh = document
@@ -75,6 +76,7 @@ impl MeshInstance<'_> {
             return Ok(());
         }
         let turn = DMat3::from_mat4(self.scene_from_mesh);
+        // A uniform scale s has the determinant s³, and a reflection changes only its sign.
         let scale = turn.determinant().abs().cbrt();
         let rows = (turn * scale.recip()).transpose().to_cols_array_2d();
         let axes = Axes::from_rows(rows).and_then(|axes| axes.scaled(scale));

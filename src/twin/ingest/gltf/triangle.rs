@@ -83,6 +83,7 @@ impl Triangle {
                 parts.push(triangle);
                 continue;
             }
+            // Each end of the edge is moved to its middle in turn, which makes the two halves.
             for replaced in [k, (k + 1) % 3] {
                 let mut half = triangle.clone();
                 let other = if replaced == k { (k + 1) % 3 } else { k };
@@ -114,6 +115,8 @@ impl Triangle {
             for j in 0..cuts - i {
                 let centre = |third: f64| [f64::from(i) + third, f64::from(j) + third];
                 let upright = Some(centre(1.0 / 3.0));
+                // Beside each upright part lies an inverted one, except at the edge opposite the
+                // first corner.
                 let turned = (j + 1 < cuts - i).then(|| centre(2.0 / 3.0));
                 for [u, v] in upright.into_iter().chain(turned) {
                     let [u, v] = [u, v].map(|share| share / f64::from(cuts));
@@ -155,6 +158,7 @@ impl Triangle {
         let angle = 0.5 * (2.0 * xy).atan2(xx - yy);
         let spread = (0.25 * (xx - yy).powi(2) + xy * xy).sqrt();
         let middle = 0.5 * (xx + yy);
+        // Rounding may bring the smaller variance below 0.
         let [long_m, short_m] = [middle + spread, (middle - spread).max(0.0)].map(f64::sqrt);
         let long = angle.cos() * across + angle.sin() * up;
         let axes = DMat3::from_cols(long, normal.cross(long), normal);
@@ -184,6 +188,7 @@ impl Triangle {
         }
         let opacity = match color.w {
             _ if *is_solid => 1.0,
+            // The condition says what is visible, so that NaN is not.
             alpha if alpha >= *cutoff => alpha.clamp(0.0, 1.0),
             _ => 0.0,
         };
@@ -195,6 +200,7 @@ impl Triangle {
 /// Linear red, green and blue, and alpha, at a point of an image.
 fn sample(image: &RgbaImage, uv: DVec2) -> DVec4 {
     // Repeated, which is glTF's default.
+    // Just below 0, `rem_euclid` rounds up to 1, hence the minimum.
     let place =
         |share: f64, size: u32| ((share.rem_euclid(1.0) * f64::from(size)) as u32).min(size - 1);
     let texel = image.get_pixel(place(uv.x, image.width()), place(uv.y, image.height()));

@@ -49,6 +49,7 @@ pub(super) fn read(
     let mut gaussians = Gaussians::with_capacity(sh_degree, count);
     body.rows(vertex, |row| {
         let word = |property: &Property| property.value(row) as u32;
+        // `tables` has compared the lengths: there is a chunk for every 256 vertices.
         let [low, high] = chunks[gaussians.len() / CHUNK];
         let between = |first: usize, unit: [f64; 3]| -> [f64; 3] {
             let mix = |i| low[first + i] + (high[first + i] - low[first + i]) * unit[i];
@@ -58,6 +59,7 @@ pub(super) fn read(
         gaussians.quats_wxyz.push(unpack_rotation(word(&rotation)));
         let scale = between(3, unpack_11_10_11(word(&scale)));
         gaussians.ln_scales.push(scale.map(|ln| ln as f32));
+        // Red is in the highest byte.
         let [r, g, b, opacity] = word(&color).to_be_bytes().map(|byte| f64::from(byte) / 255.0);
         gaussians.logit_opacities.push(activation::logit(opacity));
         gaussians.sh.extend(between(6, [r, g, b]).map(activation::dc));

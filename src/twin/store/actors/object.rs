@@ -50,6 +50,7 @@ impl Catalog {
     ) -> Result<(Header, Vec<u8>), StoreError> {
         let mut content = Vec::new();
         let mut levels = Vec::with_capacity(asset.levels.len());
+        // Degree and classes are those of level 0, and the header has them once for all levels.
         let sh_degree = asset.levels.first().map_or(0, |level| level.chunk.sh_degree());
         let classes = asset.levels.first().is_some_and(|level| level.chunk.classes().is_some());
         for (index, AssetLevel { error_m, chunk }) in asset.levels.iter().enumerate() {
@@ -114,6 +115,8 @@ impl Header {
             return Err(format!("SH degree is {}, not 0 to 3", self.sh_degree));
         }
         let first = self.levels.first().ok_or("it has no levels")?;
+        // The counts fall from level to level, which is checked below, so that this bounds all of
+        // them.
         if first.count as usize > ActorAsset::MOST_GAUSSIANS {
             return Err(format!("{} Gaussians are too many for an actor", first.count));
         }

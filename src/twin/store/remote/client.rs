@@ -130,6 +130,7 @@ impl Remote {
         let short = match &read {
             Ok(part) => (part.len() as u64) < bytes.end - bytes.start,
             Err(StoreError::Io { cause, .. }) => cause.kind() == ErrorKind::Other,
+            // Other kinds, such as a missing object, say enough by themselves.
             Err(_) => false,
         };
         // Stores differ in how they answer a range past the end: with fewer bytes, or with an
