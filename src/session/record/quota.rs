@@ -119,7 +119,7 @@ impl Held {
         let mut held = Self { looked: Some(Instant::now()), ..Self::default() };
         let entries = match std::fs::read_dir(dir) {
             Ok(entries) => entries,
-            // The directory is made with the first record.
+            // Without the directory there are no records.
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(held),
             Err(error) => return Err(error),
         };

@@ -140,7 +140,7 @@ impl Session {
         let rendered =
             self.render(&self.version, simulation, captures, Some(frame_history), deadline).await?;
         // An ego that failed first has not left the area by what came after.
-        let failed_us = next.is_failed().then(|| match &traffic {
+        let failure_us = next.is_failed().then(|| match &traffic {
             // Only the end tells which of the contacts the scenario judges.
             Some(traffic) => {
                 let is_end = |event: &&Event| matches!(event.kind, EventKind::End(_));
@@ -149,8 +149,7 @@ impl Session {
             // Without a scenario, any contact fails, and the first one did.
             None => events.iter().map(|event| event.time_us).min(),
         });
-        let failed_us = failed_us.flatten();
-        let left = left_model(&mut next, met.off_model, &rendered, failed_us);
+        let left = left_model(&mut next, met.off_model, &rendered, failure_us.flatten());
         if let Some(event) = left {
             add_event(traffic.as_mut(), &mut events, event);
         }

@@ -70,8 +70,8 @@ impl FileNotes {
         let is_new = !self.warnings.contains(&warning);
         if is_new && self.warnings.len() < MAX_WARNINGS {
             self.warnings.push(warning);
-        // The last entry says that there were more. After it, nothing is added.
         } else if is_new && self.warnings.len() == MAX_WARNINGS {
+            // The last entry says that there were more. After it, nothing is added.
             self.warnings.push("further parts are not read".to_owned());
         }
     }

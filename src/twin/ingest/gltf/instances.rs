@@ -79,8 +79,8 @@ impl MeshInstance<'_> {
         // A uniform scale s has the determinant s³, and a reflection changes only its sign.
         let scale = turn.determinant().abs().cbrt();
         let rows = (turn * scale.recip()).transpose().to_cols_array_2d();
-        let axes = Axes::from_rows(rows).and_then(|axes| axes.scaled(scale));
-        let axes = axes.map_err(|_| {
+        let found = Axes::from_rows(rows).and_then(|axes| axes.scaled(scale));
+        let axes = found.map_err(|_| {
             let reason = "its matrix is not a rotation, perhaps with a reflection and a uniform scale from 1e-6 to 1e6; bake \
                           it into the splats";
             bad(&format!("node {}", self.node), reason.into())
