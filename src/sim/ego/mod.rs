@@ -520,6 +520,7 @@ impl Ego {
         let from_s = from_us as f64 * 1e-6;
         let lag_s = match self.dynamics.model {
             DynamicsModel::Dynamic => Vehicle::DEFAULT.lag_s,
+            // The kinematic model reaches a command at once.
             DynamicsModel::Teleport | DynamicsModel::Kinematic => 0.0,
         };
         // Ticks of equal length of at most `TRACKER_TICK_US`, so that the last one is not a

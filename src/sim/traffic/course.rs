@@ -105,6 +105,7 @@ impl Course {
 
     /// This line in the opposite direction.
     pub fn reversed(&self) -> Self {
+        // About the own z axis, so that up stays up.
         let half_turn = DQuat::from_rotation_z(std::f64::consts::PI);
         let length_m = self.length_m();
         let turned = |pose: &Pose| Pose {
@@ -158,6 +159,8 @@ impl Course {
 
     /// The nearest place to a point between two stations.
     pub fn nearest_between(&self, point_m: DVec3, from_m: f64, to_m: f64) -> CourseFootPoint {
+        // Whole segments are tested, so that the place may lie a little outside of the two
+        // stations.
         let (first, _) = self.segment(from_m);
         let (last, _) = self.segment(to_m);
         let mut best =

@@ -34,6 +34,7 @@ pub(super) fn read(
     file_bytes: u64,
     reading: &mut Reading,
 ) -> Result<Gaussians, IngestError> {
+    // Rounded up, so that a file with a part of a record holds less than it promises.
     let count = file_bytes.div_ceil(RECORD_BYTES as u64);
     let promised = u128::from(count) * RECORD_BYTES as u128;
     if promised != u128::from(file_bytes) {
