@@ -115,6 +115,7 @@ fn surface_points(lane: &Lane) -> Vec<SurfacePoint> {
     let points = center.iter().zip(shares).enumerate();
     points
         .map(|(index, (position_m, share))| {
+            // The central difference; at an end of the line, the only segment there.
             let ahead = center[(index + 1).min(last)] - center[index.saturating_sub(1)];
             let across = left.at(share) - right.at(share);
             SurfacePoint { position_m: *position_m, up: normal(ahead, across) }

@@ -49,6 +49,7 @@ fn part(
     references: &References<'_>,
     (depth, count): (usize, &mut usize),
 ) -> Result<Condition, FileError> {
+    // Counted before its parts, so that the limit also ends the recursion.
     *count += 1;
     if *count > limits::CONDITIONS || depth > limits::CONDITION_DEPTH {
         let most = limits::CONDITIONS;

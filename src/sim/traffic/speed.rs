@@ -132,6 +132,7 @@ impl SpeedCommand {
         match self {
             Self::To { to_mps, .. } => speed_mps == *to_mps,
             Self::Profile(profile) => profile.elapsed_s >= profile.over_s,
+            // Never: the other may change its speed at any time.
             Self::Match(_) => false,
             Self::Keep(keep) => keep.is_over(place, bodies),
             Self::Arrive(arrive) => arrive.is_over(place, bodies),

@@ -86,6 +86,8 @@ impl<'a> CellPacker<'a> {
         only: Option<&BTreeSet<[i32; 2]>>,
     ) -> Self {
         let Partition { mut cells, order } = Partition::new(&gaussians.means_m);
+        // `order` keeps the indices of all cells, because the runs of those that stay are ranges of
+        // it.
         cells.retain(|run| only.is_none_or(|only| only.contains(&run.cell)));
         let sh_degree = gaussians.sh_degree;
         let has_classes = gaussians.classes.is_some();
@@ -273,6 +275,7 @@ impl BlockToPack<'_> {
                     }
                     classes.extend(part.classes.unwrap_or_default());
                 }
+                // All parts have classes or none has, as the scene.
                 let has_classes = !classes.is_empty();
                 full.with_classes(has_classes.then_some(classes))
             }
@@ -298,6 +301,7 @@ fn by_block(gaussians: Gaussians, cells: &[CellRun], order: &[u32]) -> VecDeque<
     if let Some(classes) = classes {
         sort_column(&mut parts, &indices, classes, |part| part.classes.insert(Vec::new()));
     }
+    // Unlike the other columns, this one has many values for each Gaussian.
     let stride = 3 * sh::coefficients(sh_degree);
     for (part, indices) in parts.iter_mut().zip(&indices) {
         part.sh.reserve_exact(stride * indices.len());
@@ -306,6 +310,7 @@ fn by_block(gaussians: Gaussians, cells: &[CellRun], order: &[u32]) -> VecDeque<
         }
     }
     let mut parts = parts.into_iter();
+    // `indices` has the parts of each run one after the other, in the order of the runs.
     let of_run =
         |run: &&Range<usize>| parts.by_ref().take(run.len().div_ceil(PART_GAUSSIANS)).collect();
     runs.iter().map(of_run).collect()

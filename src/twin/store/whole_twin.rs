@@ -35,6 +35,7 @@ impl Catalog {
         let gone = self.collected(from)?;
         let mut last = None;
         for entry in self.versions(from)? {
+            // Its objects are removed, so that there is nothing to copy.
             if gone.contains(&entry.number) {
                 continue;
             }
@@ -47,6 +48,7 @@ impl Catalog {
             };
             last = Some(copied.number);
         }
+        // Last, so that a copy that fails leaves the old twin whole.
         self.remove(from)?;
         self.version(to, None)
     }
@@ -59,6 +61,7 @@ impl Catalog {
     /// removed; or what cannot be removed.
     pub fn remove(&self, name: &str) -> Result<(), StoreError> {
         check_name(name)?;
+        // Only for the error of a twin that does not exist.
         self.latest(name)?;
         self.check_unused(name)?;
         self.objects.remove_twin(name, &mut || {
@@ -93,6 +96,7 @@ impl Catalog {
         let manifest = &version.manifest;
         let storage = StorageOptions { record: manifest.record, levels: manifest.has_levels() };
         let mut commit = self.begin(to, kind, storage)?;
+        // An object longer than the manifest says is damaged, and is not read further.
         let read = |hash: &str, bytes: u64| self.objects.read_object(&manifest.twin, hash, bytes);
         commit.put_chunks(manifest, &mut |chunk| read(&chunk.object, chunk.bytes))?;
         if let Some(sky) = &manifest.sky {
